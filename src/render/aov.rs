@@ -6,13 +6,13 @@ use std::time::Instant;
 
 use rayon::prelude::*;
 
-use super::gl::{self, Buffer, Framebuffer, Texture};
 use super::region::Region;
 use super::scene_buffers::{SceneBuffers, VertexValues};
 use super::shaders::{self, VALUE_UNIT};
 use super::target::{TargetDesc, create_image};
-use super::visibility_id::VisibilityId;
 use super::{FrameParams, FrameStats, Renderer, frame_uniforms, passes};
+use crate::device::gl::{self, Buffer, Framebuffer, Texture};
+use crate::types::VisibilityId;
 use modalcast_model::error::{Result, fault_in};
 
 /// Attribute to read back. Blended triangles are ignored; the surface behind them is read. Only depth includes the
@@ -46,7 +46,7 @@ pub struct AovImage {
 
 /// Render target of a readback, and the buffers of its words.
 #[derive(Debug)]
-pub(super) struct AovTarget {
+pub(crate) struct AovTarget {
     desc: TargetDesc,
     words: u64,
     ids: Texture,

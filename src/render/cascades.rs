@@ -16,7 +16,7 @@ const MIN_NEAR_FRACTION: f64 = 1e-3;
 /// Uniform block of the cascades. Twin of `SplitBlock` in `shaders/shared/shadow_cascades.glsl`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-pub(super) struct ShadowCascades {
+pub(crate) struct ShadowCascades {
     scale_offsets: [[f32; 4]; 4],
     end_depths: [f32; 4],
 }
@@ -26,7 +26,7 @@ const _: () =
 
 impl ShadowCascades {
     /// Fits the cascades of one shot. `fit` is the input of the whole box, relative to `origin` like the positions.
-    pub(super) fn new(scene: &Scene, shot: &FrameParams, fit: &LightBoxParams, origin: [f64; 3]) -> Self {
+    pub(crate) fn new(scene: &Scene, shot: &FrameParams, fit: &LightBoxParams, origin: [f64; 3]) -> Self {
         let count = scene.look.shadow.unwrap_or_default().splits as usize;
         let whole = LightBox::fit(fit);
         let camera = shot.camera.relative_to(origin);

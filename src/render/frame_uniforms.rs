@@ -11,7 +11,7 @@ use modalcast_model::scene::{Bounds, LightSpaceBox, Scene};
 /// Uniform block of a frame; matrices are column-major. Twin of `FrameBlock` in `shaders/shared/frame.glsl`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-pub(super) struct FrameUniforms {
+pub(crate) struct FrameUniforms {
     clip_from_world: [[f32; 4]; 4],
     shadow_from_world: [[f32; 4]; 4],
     world_from_ndc: [[f32; 4]; 4],
@@ -45,7 +45,7 @@ impl FrameUniforms {
     ///
     /// # Errors
     /// `Invalid` when the camera's matrices overflow.
-    pub(super) fn new(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> Result<Self> {
+    pub(crate) fn new(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> Result<Self> {
         let bounds = finite_bounds(scene, shot);
         let rebased_rest_bounds = rebased_rest_bounds(scene, bounds, origin);
         let look = &scene.look;
@@ -88,7 +88,7 @@ impl FrameUniforms {
 
     /// Whether the view ray through (x, y) in normalized device coordinates meets the ground. Used for samples without
     /// an id, whose ground was not rasterized. Twin of `ray_hits_ground` in `shaders/shared/ground_plane.glsl`.
-    pub(super) fn ray_hits_ground(&self, image: [f64; 2]) -> bool {
+    pub(crate) fn ray_hits_ground(&self, image: [f64; 2]) -> bool {
         let vector = |four: [f32; 4]| Vector3::new(four[0], four[1], four[2]).cast::<f64>();
         let [x, y, one] = [0, 1, 2].map(|column| vector(self.world_from_ndc[column]));
         let (direction, eye, up) = (x * image[0] + y * image[1] + one, vector(self.eye), vector(self.up));
@@ -109,12 +109,12 @@ fn clip_from_camera(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> Matr
 }
 
 /// Clip space of a shot from positions relative to `origin`.
-pub(super) fn clip_from_positions(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
+pub(crate) fn clip_from_positions(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
     clip_from_camera(scene, shot, origin) * shot.camera.relative_to(origin).camera_from_world()
 }
 
 /// Clip space of the shadow map from positions relative to `origin`. The sun looks along z; z = -1 is nearest to it.
-pub(super) fn shadow_clip_from_positions(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
+pub(crate) fn shadow_clip_from_positions(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
     let map = LightBox::fit(&light_box_params(scene, shot, origin)).shadow_from_world;
     Matrix4::new_translation(&Vector3::repeat(-1.0)) * Matrix4::new_scaling(2.0) * map
 }
@@ -132,7 +132,7 @@ fn finite_light_bounds(shot: &FrameParams) -> Option<LightSpaceBox> {
 }
 
 /// Inputs of the shadow map fit, relative to `origin` like the positions.
-pub(super) fn light_box_params(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> LightBoxParams {
+pub(crate) fn light_box_params(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> LightBoxParams {
     let bounds = finite_bounds(scene, shot);
     let height = rebased_rest_bounds(scene, bounds, origin).min[scene.up.index()];
     let shadow = scene.look.shadow.unwrap_or_default();
@@ -166,14 +166,14 @@ pub fn shadow_clip_from_world(scene: &Scene, shot: &FrameParams) -> Option<Matri
 }
 
 /// Whether the camera is above the ground; the ground is not visible from below.
-pub(super) fn camera_is_above_ground(scene: &Scene, shot: &FrameParams) -> bool {
+pub(crate) fn camera_is_above_ground(scene: &Scene, shot: &FrameParams) -> bool {
     let up = scene.up.index();
     shot.camera.eye()[up] > scene.rest_bounds.min[up]
 }
 
 /// Whether the ground is behind everything else: the camera is above it and no vertex is below it. Samples without an
 /// id that look down then see the ground, and it need not be rasterized.
-pub(super) fn ground_is_behind_scene(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> bool {
+pub(crate) fn ground_is_behind_scene(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> bool {
     let (up, bounds) = (scene.up.index(), shot.bounds);
     let height = rebased_rest_bounds(scene, bounds, origin).min[up];
     let largest = [height, bounds.min[up], bounds.max[up]].map(f64::abs).into_iter().fold(0.0, f64::max);

@@ -10,7 +10,7 @@ use modalcast_model::scene::{DomainLayout, Scene};
 
 /// The pass that draws a triangle, from its material's alpha mode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum BlendMode {
+pub(crate) enum BlendMode {
     Opaque,
     Mask,
     Blend,
@@ -18,25 +18,25 @@ pub(super) enum BlendMode {
 
 /// A contiguous range of triangles that one call draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct DrawGroup {
-    pub(super) blend_mode: BlendMode,
-    pub(super) double_sided: bool,
-    pub(super) first_triangle: usize,
-    pub(super) triangles: usize,
+pub(crate) struct DrawGroup {
+    pub(crate) blend_mode: BlendMode,
+    pub(crate) double_sided: bool,
+    pub(crate) first_triangle: usize,
+    pub(crate) triangles: usize,
 }
 
 /// A range of triangles that is contiguous both in a mesh and in the draw order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct TriangleSpan {
+pub(crate) struct TriangleSpan {
     /// Its first triangle in the draw order.
-    pub(super) first: usize,
-    pub(super) domain: usize,
+    pub(crate) first: usize,
+    pub(crate) domain: usize,
     /// The same triangle in the domain's mesh.
-    pub(super) triangle: usize,
+    pub(crate) triangle: usize,
 }
 
 /// Domain of a triangle, and its index in the domain's mesh; `place` is the triangle's index in the draw order.
-pub(super) fn locate_triangle(spans: &[TriangleSpan], place: usize) -> Option<(usize, usize)> {
+pub(crate) fn locate_triangle(spans: &[TriangleSpan], place: usize) -> Option<(usize, usize)> {
     let after = spans.partition_point(|stretch| stretch.first <= place);
     let stretch = spans.get(after.checked_sub(1)?)?;
     Some((stretch.domain, stretch.triangle + place - stretch.first))
@@ -44,31 +44,31 @@ pub(super) fn locate_triangle(spans: &[TriangleSpan], place: usize) -> Option<(u
 
 /// The static arrays, packed as the scene's layout says; triangles are in draw order.
 #[derive(Debug, Default)]
-pub(super) struct Geometry {
+pub(crate) struct Geometry {
     /// Per corner: its vertex in the packed positions.
-    pub(super) vertices: Vec<u32>,
+    pub(crate) vertices: Vec<u32>,
     /// Per corner; empty when nothing samples a texture.
-    pub(super) uvs: Vec<[f32; 2]>,
+    pub(crate) uvs: Vec<[f32; 2]>,
     /// Per triangle: three corners in the packed normals.
-    pub(super) triangles: Vec<[u32; 3]>,
+    pub(crate) triangles: Vec<[u32; 3]>,
     /// Per triangle: the vertices of its corners.
-    pub(super) triangle_vertices: Vec<[u32; 3]>,
+    pub(crate) triangle_vertices: Vec<[u32; 3]>,
     /// Per triangle: index of its material among the used ones; empty when all triangles have the same material.
-    pub(super) materials: Vec<u32>,
-    pub(super) groups: Vec<DrawGroup>,
+    pub(crate) materials: Vec<u32>,
+    pub(crate) groups: Vec<DrawGroup>,
     /// Sorted by the first triangle.
-    pub(super) spans: Vec<TriangleSpan>,
+    pub(crate) spans: Vec<TriangleSpan>,
     /// Group of each material.
     group_of: Vec<usize>,
 }
 
 /// Whether the shaders look up the material of each triangle.
-pub(super) fn uses_material_table(scene: &Scene) -> bool {
+pub(crate) fn uses_material_table(scene: &Scene) -> bool {
     used_materials(scene).len() > 1
 }
 
 /// The groups of a scene, opaque, then mask, then blend, six at most; and the group of each material.
-pub(super) fn groups(scene: &Scene) -> (Vec<DrawGroup>, Vec<usize>) {
+pub(crate) fn groups(scene: &Scene) -> (Vec<DrawGroup>, Vec<usize>) {
     let mut groups: Vec<DrawGroup> = Vec::new();
     let mut of_material = vec![0; scene.materials.len()];
     let mut used = used_materials(scene);
@@ -98,7 +98,7 @@ fn pipeline_key(material: &Material) -> (BlendMode, bool) {
     (blend_mode(material), material.double_sided)
 }
 
-pub(super) const fn blend_mode(material: &Material) -> BlendMode {
+pub(crate) const fn blend_mode(material: &Material) -> BlendMode {
     match material.alpha_mode {
         AlphaMode::Opaque => BlendMode::Opaque,
         AlphaMode::Mask { .. } => BlendMode::Mask,
@@ -107,13 +107,13 @@ pub(super) const fn blend_mode(material: &Material) -> BlendMode {
 }
 
 /// Indices of the materials that triangles use, ascending.
-pub(super) fn used_materials(scene: &Scene) -> Vec<usize> {
+pub(crate) fn used_materials(scene: &Scene) -> Vec<usize> {
     let used: std::collections::BTreeSet<usize> = scene.domains.iter().flat_map(Domain::materials).collect();
     used.into_iter().collect()
 }
 
 impl Geometry {
-    pub(super) fn new(scene: &Scene) -> Self {
+    pub(crate) fn new(scene: &Scene) -> Self {
         let (groups, group_of) = groups(scene);
         let layout = &scene.layout;
         let textured = scene.needs.textures || scene.needs.normal_maps;
@@ -196,7 +196,7 @@ fn winding_disagrees(mesh: &modalcast_model::domain::Mesh, triangle: [u32; 3]) -
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(crate) mod tests {
     use super::*;
     use modalcast_model::domain::{MaterialRange, Mesh, Metadata, Modes, Shape, Transform};
     use modalcast_model::scene::SceneParts;

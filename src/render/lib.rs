@@ -37,10 +37,8 @@ mod aov;
 mod cascades;
 mod cull;
 mod device;
-mod egl;
 mod frame_uniforms;
 mod geometry;
-mod gl;
 mod light;
 mod oit;
 mod passes;
@@ -49,7 +47,6 @@ mod plan;
 mod post;
 mod programs;
 mod raster_backends;
-mod readback_ring;
 mod region;
 mod scene_buffers;
 mod shaders;
@@ -57,7 +54,7 @@ mod shadow;
 mod submit;
 mod target;
 mod textures;
-mod visibility_id;
+mod types;
 
 use std::collections::HashMap;
 use std::rc::Rc;
@@ -65,107 +62,24 @@ use std::sync::Arc;
 use std::time::Duration;
 
 pub use self::aov::{Aov, AovImage};
-pub use self::cull::{CullStats, FrameCullStats};
 pub use self::device::{EglDevice, devices};
 pub use self::frame_uniforms::{shadow_clip_from_world, shadow_texel_axes};
-use self::gl::{Gl, Program};
-pub use self::oit::OitStats;
 pub use self::pick::{PendingPick, PickHit};
 pub use self::plan::{Allocation, OmittedFeature, RenderPlan, plan};
-pub use self::raster_backends::{RasterBackend, RasterBackends};
-pub use self::readback_ring::MAX_FRAMES_IN_FLIGHT;
 use self::scene_buffers::RebasedPositions;
 pub use self::scene_buffers::SceneBuffers;
 use self::shaders::ProgramSource;
 pub use self::submit::{MappedPixels, PendingFrame};
 use self::target::{RenderTarget, TargetDesc};
-pub use self::visibility_id::VisibilityId;
+pub use self::types::{
+    CullStats, DevicePreference, FrameCullStats, FrameImage, FrameParams, FrameStats, OitStats, RasterBackend,
+    RasterBackends, RendererInfo, SharedBuffers, VisibilityId,
+};
+use crate::device::gl::{self, Gl, Program};
+pub use crate::device::readback_ring::MAX_FRAMES_IN_FLIGHT;
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::{Result, fault_in};
-use modalcast_model::scene::{Bounds, Camera, LightSpaceBox, Scene};
-
-/// Preference for the EGL device that draws.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum DevicePreference {
-    /// The EGL device that corresponds to this CUDA device ordinal.
-    Cuda(i32),
-    /// Any hardware device; Mesa's software rasterizer when there is none.
-    Any,
-    /// Mesa's software rasterizer.
-    Software,
-}
-
-/// Description of the OpenGL device and driver.
-#[derive(Debug, Clone, serde::Serialize)]
-pub struct RendererInfo {
-    /// The GL_RENDERER string.
-    pub renderer: String,
-    /// The GL_VERSION string.
-    pub version: String,
-    /// Whether OpenGL runs on the CPU.
-    pub software: bool,
-    /// Ordinal of the corresponding CUDA device, from EGL_CUDA_DEVICE_NV.
-    pub cuda_device: Option<i32>,
-    /// Longest side of a frame, in pixels.
-    pub max_side: u32,
-}
-
-/// Parameters of one frame; the geometry is the current content of the scene's buffers.
-#[derive(Debug, Clone, Copy)]
-pub struct FrameParams {
-    pub camera: Camera,
-    pub width: u32,
-    pub height: u32,
-    /// Bounds of all deformed vertices, in scene units. The frame draws nothing outside them; bounds that are not
-    /// finite are ignored.
-    pub bounds: Bounds,
-    /// Bounds of the same vertices in light space, to which the shadow map is fitted. Without them, the map is fitted
-    /// to the corners of `bounds`.
-    pub light: Option<LightSpaceBox>,
-}
-
-/// RGBA8 sRGB pixels of a frame, top row first.
-#[derive(Debug, Clone, PartialEq)]
-pub struct FrameImage {
-    pub width: u32,
-    pub height: u32,
-    pub rgba: Vec<u8>,
-    /// Milliseconds by name. The stages are "shadow", "draw" and "read". "raster" (the compute rasterizer, including
-    /// the visibility when it draws both) and "blur" are part of the shadow stage. "ids" (the compute rasterizer when
-    /// it draws visibility only), "cull" (with the occluders), "visibility" (with the ground), "blended" (with the
-    /// fragment lists), "shade" (with the backdrop), "bloom" and "encode" are part of the draw stage.
-    pub passes: Vec<(&'static str, f64)>,
-    pub raster_backends: RasterBackends,
-}
-
-/// Names of the OpenGL buffers that a deformer can write directly, instead of an upload.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct SharedBuffers {
-    /// 3 f32 per vertex.
-    pub positions: u32,
-    /// 3 f32 per corner.
-    pub normals: u32,
-    /// 4 f32 per corner; present when the scene has normal maps.
-    pub tangents: Option<u32>,
-}
-
-/// Statistics of the last frame that was collected: the passes that ran and how many triangles they processed.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct FrameStats {
-    /// Passes in execution order. When several frames of one step share a shadow, only the first of them has "shadow"
-    /// and "blur"; see [`SceneBuffers::set_step`].
-    pub passes: Vec<&'static str>,
-    /// The rasterizer that drew the shadow map and the visibility.
-    pub raster_backends: RasterBackends,
-    /// Number of draw calls of the visibility and blended passes.
-    pub draw_calls: usize,
-    /// Samples per pixel.
-    pub samples: u32,
-    /// Fragment list statistics; present with exact transparency.
-    pub oit: Option<OitStats>,
-    /// Culling statistics; present when triangles are culled.
-    pub culled: Option<FrameCullStats>,
-}
+use modalcast_model::scene::Scene;
 
 /// Longest side of a frame in pixels, even on devices that support more.
 const MAX_SIDE: u32 = 8192;

@@ -18,45 +18,45 @@ const MAX_GROUND_PULL: f64 = 8.0;
 
 /// The fitted shadow map.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct LightBox {
+pub(crate) struct LightBox {
     /// World space to the map: x and y are 0 to 1 across the map, z is 0 at the plane nearest to the sun and 1 at the
     /// farthest.
-    pub(super) shadow_from_world: Matrix4<f64>,
+    pub(crate) shadow_from_world: Matrix4<f64>,
     /// Depth of the ground at (x, y) of the map: a x + b y + c; (0, 0, 1) without a ground.
-    pub(super) ground: [f64; 3],
+    pub(crate) ground: [f64; 3],
     /// Axes x, y and z of light space.
-    pub(super) axes: [Vector3<f64>; 3],
+    pub(crate) axes: [Vector3<f64>; 3],
     /// Extent of the map along x and y of light space.
-    pub(super) sides: [TexelSpan; 2],
+    pub(crate) sides: [TexelSpan; 2],
 }
 
 /// Inputs of the fit.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct LightBoxParams {
-    pub(super) to_sun: Vector3<f64>,
-    pub(super) up: UpAxis,
-    pub(super) bounds: Bounds,
+pub(crate) struct LightBoxParams {
+    pub(crate) to_sun: Vector3<f64>,
+    pub(crate) up: UpAxis,
+    pub(crate) bounds: Bounds,
     /// Light-space bounds of the same vertices; without them, the corners of `bounds` are used.
-    pub(super) light: Option<LightSpaceBox>,
+    pub(crate) light: Option<LightSpaceBox>,
     /// Height of the ground along the up axis.
-    pub(super) ground: Option<f64>,
+    pub(crate) ground: Option<f64>,
     /// Side of the map and the empty rim that the blur needs, both in texels.
-    pub(super) size: f64,
-    pub(super) rim: f64,
+    pub(crate) size: f64,
+    pub(crate) rim: f64,
 }
 
 /// One side of a map on a texel grid that is fixed in the world: its lower end and half its length. When the fitted
 /// bounds grow or move, the length changes in few discrete steps and the side moves by whole texels, so that shadows do
 /// not crawl.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct TexelSpan {
-    pub(super) low: f64,
-    pub(super) half: f64,
+pub(crate) struct TexelSpan {
+    pub(crate) low: f64,
+    pub(crate) half: f64,
 }
 
 impl TexelSpan {
     /// Covers `reach` to each side of the center, inside the rim.
-    pub(super) fn snap(center: f64, reach: f64, fit: &LightBoxParams) -> Self {
+    pub(crate) fn snap(center: f64, reach: f64, fit: &LightBoxParams) -> Self {
         let half = next_length_step(reach) * fit.size / (fit.size - 2.0 * fit.rim).max(1.0);
         let texel = 2.0 * half / fit.size;
         Self { low: (center / texel).round() * texel - half, half }
@@ -70,7 +70,7 @@ fn next_length_step(length: f64) -> f64 {
 }
 
 impl LightBox {
-    pub(super) fn fit(fit: &LightBoxParams) -> Self {
+    pub(crate) fn fit(fit: &LightBoxParams) -> Self {
         let axes = light_axes(fit.to_sun, fit.up);
         let LightSpaceBox(held) = fit.light.unwrap_or_else(|| LightSpaceBox::enclosing(&axes, &fit.bounds));
         let diagonal = diagonal(fit);
@@ -99,7 +99,7 @@ impl LightBox {
     }
 
     /// The longer side of a texel, in scene units.
-    pub(super) fn texel(&self, size: f64) -> f64 {
+    pub(crate) fn texel(&self, size: f64) -> f64 {
         2.0 * self.sides[0].half.max(self.sides[1].half) / size
     }
 }

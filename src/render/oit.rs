@@ -10,16 +10,16 @@ use std::rc::Rc;
 
 use bytemuck::{Pod, Zeroable};
 
-use super::FrameStats;
 use super::cull::command_offset;
 use super::geometry::BlendMode;
-use super::gl::{self, Buffer, ClearOp, Framebuffer, Gl, Limits, PipelineState, Program, Texture, TextureDesc};
 use super::passes::{EMPTY_TILE_LIST, TILES, bind_shadow, draw_group, first_triangle_of, triangle_set};
 use super::region::{DirtyRegion, Region};
 use super::scene_buffers::SceneBuffers;
 use super::shaders::oit::{BINS, HISTOGRAM_TILE};
 use super::shaders::{self, ShaderOptions, TILE};
 use super::target::{BlendStorage, TargetDesc};
+use crate::device::gl::{self, Buffer, ClearOp, Framebuffer, Gl, Limits, PipelineState, Program, Texture, TextureDesc};
+use crate::types::{FrameStats, OitStats};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{MAX_FRAGMENTS, RenderSettings};
 
@@ -38,26 +38,6 @@ const PHASE_COUNT: i32 = 0;
 const PHASE_FILL: i32 = 1;
 const PHASE_JOIN_IDS: i32 = 2;
 
-/// Fragment statistics of a frame.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
-pub struct OitStats {
-    /// Blended fragments that are not wholly transparent and not hidden by something opaque.
-    pub fragments: u64,
-    /// Fragments within the budget. The others, the farthest of their pixels, are missing in the picture.
-    pub stored: u64,
-    /// Largest number of fragments in a pixel.
-    pub max_per_pixel: u32,
-    /// Maximum number of fragments per pixel, when the budget was exceeded.
-    pub per_pixel_limit: Option<u32>,
-}
-
-impl OitStats {
-    /// Fragments that are missing in the picture.
-    pub const fn dropped(&self) -> u64 {
-        self.fragments - self.stored
-    }
-}
-
 /// Counters and indirect draws of a frame. Twin of `OitCounters` in `shaders/shared/oit_lists.glsl`, up to its bins.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
@@ -71,14 +51,14 @@ struct OitCounters {
     commands: [[u32; 5]; 2],
 }
 
-pub(super) const COUNTERS_HEADER_BYTES: usize = size_of::<OitCounters>();
+pub(crate) const COUNTERS_HEADER_BYTES: usize = size_of::<OitCounters>();
 const COMMANDS_OFFSET: usize = 24;
 const COUNTERS_BYTES: usize = COUNTERS_HEADER_BYTES + 4 * BINS;
 const _: () = assert!(COUNTERS_HEADER_BYTES == 64, "OitCounters differs from shaders/shared/oit_lists.glsl");
 
 /// Programs of exact transparency.
 #[derive(Debug, Clone)]
-pub(super) struct OitPrograms {
+pub(crate) struct OitPrograms {
     gather: Rc<Program>,
     histogram: Rc<Program>,
     allocate: Rc<Program>,
@@ -87,19 +67,19 @@ pub(super) struct OitPrograms {
 
 /// Images and buffers of exact transparency for frames of one form.
 #[derive(Debug)]
-pub(super) struct OitTarget {
+pub(crate) struct OitTarget {
     /// Blended fragments of each pixel.
-    pub(super) counts: Texture,
+    pub(crate) counts: Texture,
     cursors: Texture,
     /// One array layer per sample.
-    pub(super) layers: Texture,
+    pub(crate) layers: Texture,
     /// Framebuffer that clears the counts.
     clear_framebuffer: Framebuffer,
     dirty: DirtyRegion,
     /// Framebuffer with depth only, for the depth test.
     depth_only: Framebuffer,
     records: Buffer,
-    pub(super) counters: Buffer,
+    pub(crate) counters: Buffer,
     tiles: Buffer,
 }
 
@@ -107,7 +87,7 @@ pub(super) struct OitTarget {
 ///
 /// # Errors
 /// `Invalid` when the look asks for more records than fit into one buffer of the device.
-pub(super) fn budget(limits: &Limits, look: &RenderSettings, [width, height]: [u32; 2]) -> Result<u32> {
+pub(crate) fn budget(limits: &Limits, look: &RenderSettings, [width, height]: [u32; 2]) -> Result<u32> {
     let most = u64::from(MAX_FRAGMENTS).min(limits.max_storage_bytes / RECORD_BYTES);
     if let Some(fragments) = look.fragments {
         let fits = u64::from(fragments) <= most;
@@ -117,7 +97,7 @@ pub(super) fn budget(limits: &Limits, look: &RenderSettings, [width, height]: [u
 }
 
 impl OitPrograms {
-    pub(super) fn compile(
+    pub(crate) fn compile(
         options: &ShaderOptions,
         samples: u32,
         compile: &mut super::programs::ProgramCompiler<'_>,
@@ -132,7 +112,7 @@ impl OitPrograms {
 }
 
 impl OitTarget {
-    pub(super) fn new(gl: &Rc<Gl>, desc: TargetDesc, budget: u32, depth: &Texture) -> Result<Self> {
+    pub(crate) fn new(gl: &Rc<Gl>, desc: TargetDesc, budget: u32, depth: &Texture) -> Result<Self> {
         let TargetDesc { width, height, samples, .. } = desc;
         let image = |target: u32, format: u32, depth: u32| {
             let texture = gl.texture(TextureDesc { target, format, width, height, depth, levels: 1 })?;
@@ -188,7 +168,7 @@ impl OitTarget {
 }
 
 /// Fragment statistics of a frame, from the head of its ledger.
-pub(super) fn parse_stats(head: &[u8]) -> OitStats {
+pub(crate) fn parse_stats(head: &[u8]) -> OitStats {
     let mut counters = OitCounters::zeroed();
     // A byte copy, because `head` may be unaligned; it has the length of the ledger.
     bytemuck::bytes_of_mut(&mut counters).iter_mut().zip(head).for_each(|(to, from)| *to = *from);
@@ -203,7 +183,7 @@ pub(super) fn parse_stats(head: &[u8]) -> OitStats {
 }
 
 /// Draws the layers of the blended triangles in front of the opaque ones, against whose depth they are tested.
-pub(super) fn draw(
+pub(crate) fn draw(
     gl: &Gl,
     buffers: &SceneBuffers,
     (target, part): (&OitTarget, Region),
@@ -233,7 +213,7 @@ pub(super) fn draw(
 }
 
 /// The passes of exact transparency.
-pub(super) const PASSES: [&str; 4] = ["oit count", "oit allocate", "oit fill", "oit resolve"];
+pub(crate) const PASSES: [&str; 4] = ["oit count", "oit allocate", "oit fill", "oit resolve"];
 
 /// Draws all blended triangles for one phase. In the last phase the ledger gives the number of instances: none when all
 /// fragments fit.
@@ -264,7 +244,7 @@ fn gather(
 }
 
 /// How a frame of this look draws blended triangles.
-pub(super) fn blend_storage(gl: &Gl, scene: &modalcast_model::scene::Scene, size: [u32; 2]) -> Result<BlendStorage> {
+pub(crate) fn blend_storage(gl: &Gl, scene: &modalcast_model::scene::Scene, size: [u32; 2]) -> Result<BlendStorage> {
     match scene.look.transparency {
         _ if !scene.needs.blend => Ok(BlendStorage::None),
         modalcast_model::scene::Transparency::TwoPass => Ok(BlendStorage::SingleLayer),

@@ -5,9 +5,7 @@ use super::cascades::ShadowCascades;
 use super::cull::{SHADOW_CULL, command_offset};
 use super::frame_uniforms::{FrameUniforms, camera_is_above_ground};
 use super::geometry::{BlendMode, DrawGroup};
-use super::gl::{Buffer, ClearOp, Framebuffer, Gl, PipelineState, Program, Texture};
 use super::programs::SampleCountPrograms;
-use super::raster_backends::RasterBackend;
 use super::region::Region;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::{
@@ -16,12 +14,14 @@ use super::shaders::{
 };
 use super::target::RenderTarget;
 use super::{FrameParams, FrameStats};
+use crate::device::gl::{Buffer, ClearOp, Framebuffer, Gl, PipelineState, Program, Texture};
+use crate::types::RasterBackend;
 use modalcast_model::error::Result;
 
-pub(super) const PIXELS: u32 = 0;
-pub(super) const TILES: u32 = 1;
+pub(crate) const PIXELS: u32 = 0;
+pub(crate) const TILES: u32 = 1;
 /// Initial indirect dispatch over listed tiles: group counts (TILE_ROW, 0 rows, 1), then the tile count 0.
-pub(super) const EMPTY_TILE_LIST: [u32; 4] = [TILE_ROW, 0, 1, 0];
+pub(crate) const EMPTY_TILE_LIST: [u32; 4] = [TILE_ROW, 0, 1, 0];
 const FRAME: u32 = 0;
 const CASCADES: u32 = 2;
 /// Cleared layer: no light, full transmittance.
@@ -29,14 +29,14 @@ const CLEAR_LAYER: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
 /// Which triangles of a kind a pass draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum TriangleSet {
+pub(crate) enum TriangleSet {
     All,
     /// The triangles in the culled lists.
     Visible,
 }
 
 /// Binds the buffers and textures that all passes read.
-pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
+pub(crate) fn bind(buffers: &SceneBuffers) -> Result<()> {
     buffers.position_texture().bind(POSITION_UNIT);
     for (unit, view) in &buffers.buffer_textures.others {
         view.bind(*unit);
@@ -55,7 +55,7 @@ pub(super) fn bind(buffers: &SceneBuffers) -> Result<()> {
 }
 
 /// Draws the depth of the shadow map, unless the compute rasterizer has drawn it.
-pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, stats: &mut FrameStats) -> Result<()> {
+pub(crate) fn shadow(gl: &Gl, buffers: &SceneBuffers, stats: &mut FrameStats) -> Result<()> {
     let Some(map) = buffers.shadow.as_ref().filter(|_| buffers.shadow_rasterizer().is_none()) else { return Ok(()) };
     stats.raster_backends.shadow = Some(RasterBackend::OpenGl);
     super::shadow::depth(gl, buffers, map)?;
@@ -65,7 +65,7 @@ pub(super) fn shadow(gl: &Gl, buffers: &SceneBuffers, stats: &mut FrameStats) ->
 }
 
 /// Blurs the moments of a variance map. Other shadow methods need depth only.
-pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, stats: &mut FrameStats) -> Result<()> {
+pub(crate) fn blur(gl: &Gl, buffers: &SceneBuffers, stats: &mut FrameStats) -> Result<()> {
     let Some(map) = &buffers.shadow else { return Ok(()) };
     if super::shadow::blur(gl, buffers, map)? {
         stats.passes.push("blur");
@@ -74,7 +74,7 @@ pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, stats: &mut FrameStats) -> R
 }
 
 /// Draws the id and depth of each sample.
-pub(super) fn visibility(
+pub(crate) fn visibility(
     gl: &Gl,
     buffers: &SceneBuffers,
     target: &RenderTarget,
@@ -94,7 +94,7 @@ pub(super) fn visibility(
 
 /// Draws ids and depth into `part` of a framebuffer that is at least as large as the part's frame: of opaque triangles,
 /// of cut-outs with the first program, and of the opaque parts of blended triangles with the second.
-pub(super) fn draw_ids(
+pub(crate) fn draw_ids(
     gl: &Gl,
     buffers: &SceneBuffers,
     (into, clear, part, drawn): (&Framebuffer, ClearOp<'_>, Region, TriangleSet),
@@ -126,7 +126,7 @@ pub(super) fn draw_ids(
 
 /// Draws the ground into ids and depth. A picture draws it only when something lies below it; otherwise the shading
 /// finds the ground.
-pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &FrameParams, stats: &mut FrameStats) -> Result<()> {
+pub(crate) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &FrameParams, stats: &mut FrameStats) -> Result<()> {
     let Some(program) = buffers.programs.ground.as_ref().filter(|_| camera_is_above_ground(&buffers.scene, shot))
     else {
         return Ok(());
@@ -144,7 +144,7 @@ pub(super) fn ground(gl: &Gl, buffers: &SceneBuffers, shot: &FrameParams, stats:
 }
 
 /// Draws the layer of the blended triangles in front of the opaque ones.
-pub(super) fn blended(
+pub(crate) fn blended(
     gl: &Gl,
     buffers: &SceneBuffers,
     target: &RenderTarget,
@@ -164,7 +164,7 @@ pub(super) fn blended(
 }
 
 /// Shades the visible surfaces to linear light.
-pub(super) fn shade(
+pub(crate) fn shade(
     gl: &Gl,
     buffers: &SceneBuffers,
     target: &RenderTarget,
@@ -199,14 +199,14 @@ pub(super) fn shade(
 }
 
 /// Binds ids and depth. Depth says which samples hold a valid id.
-pub(super) fn bind_visibility(target: &RenderTarget) {
+pub(crate) fn bind_visibility(target: &RenderTarget) {
     target.ids.bind(ID_UNIT);
     target.depth.bind(DEPTH_UNIT);
 }
 
 /// Converts ids to words in a buffer that can be copied to the host. `number` is the uniform at location 0 of programs
 /// that have one.
-pub(super) fn run_readback(
+pub(crate) fn run_readback(
     gl: &Gl,
     (ids, into): (&Texture, &Buffer),
     (program, number): (&Program, Option<u32>),
@@ -220,7 +220,7 @@ pub(super) fn run_readback(
 }
 
 /// Packs the ids of each pixel's first sample into a buffer that can be copied to the host.
-pub(super) fn resolve_ids(gl: &Gl, target: &RenderTarget, program: &Program) -> Result<()> {
+pub(crate) fn resolve_ids(gl: &Gl, target: &RenderTarget, program: &Program) -> Result<()> {
     program.bind(None);
     bind_visibility(target);
     target.readback_source.bind_storage(PIXELS);
@@ -245,7 +245,7 @@ fn draw(
 }
 
 /// Draws the depth of one kind of triangle into the bound framebuffer.
-pub(super) fn draw_depth(
+pub(crate) fn draw_depth(
     gl: &Gl,
     buffers: &SceneBuffers,
     (blend_mode, program): (BlendMode, &Program),
@@ -263,7 +263,7 @@ pub(super) fn draw_depth(
 
 /// Draws the triangles of one kind, single- and double-sided alike, with the bound program: in one call, or in one call
 /// per culled list.
-pub(super) fn draw_blend_mode(
+pub(crate) fn draw_blend_mode(
     gl: &Gl,
     buffers: &SceneBuffers,
     (blend_mode, program): (BlendMode, &Program),
@@ -289,13 +289,13 @@ pub(super) fn draw_blend_mode(
 }
 
 /// The culled lists when the scene is culled, else all triangles.
-pub(super) fn triangle_set(buffers: &SceneBuffers) -> TriangleSet {
+pub(crate) fn triangle_set(buffers: &SceneBuffers) -> TriangleSet {
     if buffers.culler.is_some() { TriangleSet::Visible } else { TriangleSet::All }
 }
 
 /// Offset of a group for the shaders: its first triangle, or the complement of it for a list
 /// (`shaders/shared/triangle_id.glsl`).
-pub(super) const fn first_triangle_of(group: &DrawGroup, drawn: TriangleSet) -> u32 {
+pub(crate) const fn first_triangle_of(group: &DrawGroup, drawn: TriangleSet) -> u32 {
     match drawn {
         TriangleSet::All => group.first_triangle as u32,
         TriangleSet::Visible => !(group.first_triangle as u32),
@@ -303,7 +303,7 @@ pub(super) const fn first_triangle_of(group: &DrawGroup, drawn: TriangleSet) -> 
 }
 
 /// Draws a group, or the culled list of the group.
-pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, index: usize, drawn: TriangleSet) {
+pub(crate) fn draw_group(gl: &Gl, buffers: &SceneBuffers, index: usize, drawn: TriangleSet) {
     let group = buffers.groups[index];
     match drawn {
         TriangleSet::All => {
@@ -319,7 +319,7 @@ pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, index: usize, drawn: T
     }
 }
 
-pub(super) fn bind_shadow(buffers: &SceneBuffers) {
+pub(crate) fn bind_shadow(buffers: &SceneBuffers) {
     if let Some(map) = &buffers.shadow {
         map.lookup().bind(SHADOW_UNIT);
     }

@@ -12,13 +12,13 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Matrix4, Vector3};
 
 use super::geometry::{TriangleSpan, locate_triangle};
-use super::gl::{self, Buffer, Fence, Framebuffer, Gl, Texture};
 use super::region::Region;
 use super::scene_buffers::SceneBuffers;
 use super::shaders;
 use super::target::{TargetDesc, create_image};
-use super::visibility_id::VisibilityId;
 use super::{FrameParams, FrameStats, Renderer, frame_uniforms, passes};
+use crate::device::gl::{self, Buffer, Fence, Framebuffer, Gl, Texture};
+use crate::types::VisibilityId;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Camera, PixelRect, Scene};
 
@@ -49,7 +49,7 @@ pub struct PickHit {
 
 /// Render target and buffers of picks.
 #[derive(Debug)]
-pub(super) struct PickTarget {
+pub(crate) struct PickTarget {
     ids: Texture,
     visibility_fbo: Framebuffer,
     readback_source: Buffer,

@@ -6,9 +6,9 @@
 
 use super::cull::{self, allocations, select_culling};
 use super::geometry::{BlendMode, DrawGroup, blend_mode, groups, used_materials, uses_material_table};
-use super::gl::Limits;
 use super::shadow::resolve_blurring;
 use super::textures::{TextureRole, arrays};
+use crate::device::gl::Limits;
 use modalcast_model::scene::{Antialiasing, Culling, Scene, ShadowSettings, ToneMapping, Transparency};
 
 /// A buffer or texture and its size.
@@ -67,7 +67,7 @@ pub fn plan(scene: &Scene) -> RenderPlan {
 }
 
 /// Plans a scene for a device, which may be a software rasterizer.
-pub(super) fn plan_for_device(scene: &Scene, limits: &Limits) -> RenderPlan {
+pub(crate) fn plan_for_device(scene: &Scene, limits: &Limits) -> RenderPlan {
     let (groups, _) = groups(scene);
     let has = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
     let mut passes = Vec::new();

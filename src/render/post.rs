@@ -5,10 +5,10 @@ use std::fmt::Write as _;
 use std::rc::Rc;
 
 use super::FrameStats;
-use super::gl::{self, Gl, Program, Texture, TextureDesc};
 use super::programs::ProgramCompiler;
 use super::shaders::{ProgramSource, TILE, WORKGROUP_SIZE};
 use super::target::{RenderTarget, TargetDesc};
+use crate::device::gl::{self, Gl, Program, Texture, TextureDesc};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Antialiasing, Bloom, RenderSettings, ToneMapping};
 
@@ -21,7 +21,7 @@ const MAX_RADIANCE: f32 = 1000.0;
 
 /// The post-processing programs of one look.
 #[derive(Debug)]
-pub(super) struct PostProcess {
+pub(crate) struct PostProcess {
     encode: Rc<Program>,
     bloom: Option<BloomPrograms>,
 }
@@ -35,7 +35,7 @@ struct BloomPrograms {
 }
 
 impl PostProcess {
-    pub(super) fn compile(look: &RenderSettings, compile: &mut ProgramCompiler<'_>) -> Result<Self> {
+    pub(crate) fn compile(look: &RenderSettings, compile: &mut ProgramCompiler<'_>) -> Result<Self> {
         let bloom = match look.bloom {
             Some(bloom) => Some(BloomPrograms {
                 down: compile(bloom_downsample())?,
@@ -48,7 +48,7 @@ impl PostProcess {
     }
 
     /// Spreads the bright light over the picture and applies the tone curve, in place.
-    pub(super) fn bloom(&self, gl: &Gl, target: &RenderTarget, stats: &mut FrameStats) -> Result<()> {
+    pub(crate) fn bloom(&self, gl: &Gl, target: &RenderTarget, stats: &mut FrameStats) -> Result<()> {
         let (Some(bloom), Some(coarsest)) = (&self.bloom, target.bloom_mips.last()) else { return Ok(()) };
         bloom.down.bind(None);
         for (from, to) in target.bloom_mips.iter().zip(target.bloom_mips.iter().skip(1)) {
@@ -74,7 +74,7 @@ impl PostProcess {
     }
 
     /// Encodes the picture to bytes in a buffer that can be copied to the host.
-    pub(super) fn encode(&self, gl: &Gl, target: &RenderTarget, stats: &mut FrameStats) -> Result<()> {
+    pub(crate) fn encode(&self, gl: &Gl, target: &RenderTarget, stats: &mut FrameStats) -> Result<()> {
         self.encode.bind(None);
         target.scene_color.bind(0);
         target.readback_source.bind_storage(super::passes::PIXELS);
@@ -89,7 +89,7 @@ fn dispatch_tiles(gl: &Gl, of: &Texture) {
 }
 
 /// The bloom pyramid: the bright light of each pixel, then levels of half the size, rounded up.
-pub(super) fn bloom_mips(gl: &Rc<Gl>, desc: TargetDesc) -> Result<Vec<Texture>> {
+pub(crate) fn bloom_mips(gl: &Rc<Gl>, desc: TargetDesc) -> Result<Vec<Texture>> {
     if desc.bloom_levels == 0 {
         return Ok(Vec::new());
     }
@@ -104,7 +104,7 @@ pub(super) fn bloom_mips(gl: &Rc<Gl>, desc: TargetDesc) -> Result<Vec<Texture>> 
 }
 
 /// Shader source that the shading applies to the light of each sample.
-pub(super) fn sample_resolve(look: &RenderSettings) -> String {
+pub(crate) fn sample_resolve(look: &RenderSettings) -> String {
     let mut text = String::new();
     if look.exposure != 1.0 {
         writeln!(text, "#define EXPOSURE {:?}", look.exposure).ok();

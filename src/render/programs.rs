@@ -4,47 +4,47 @@ use std::rc::Rc;
 
 use super::cull::{CullPrograms, ShadowCullPrograms};
 use super::geometry::{BlendMode, DrawGroup};
-use super::gl::Program;
 use super::oit::OitPrograms;
 use super::plan::RenderPlan;
 use super::shaders::{ProgramSource, ShaderOptions};
+use crate::device::gl::Program;
 use modalcast_model::error::Result;
 
 /// Returns the program of a source, compiled or from the cache.
-pub(super) type ProgramCompiler<'a> = dyn FnMut(ProgramSource) -> Result<Rc<Program>> + 'a;
+pub(crate) type ProgramCompiler<'a> = dyn FnMut(ProgramSource) -> Result<Rc<Program>> + 'a;
 
 /// Programs that do not depend on the samples per pixel; none where the scene has no such pass or triangles.
 #[derive(Debug)]
-pub(super) struct ScenePrograms {
+pub(crate) struct ScenePrograms {
     /// In execution order; empty when the shadow map has no moments.
-    pub(super) blur: Vec<Rc<Program>>,
+    pub(crate) blur: Vec<Rc<Program>>,
     /// Shadow casters of each kind.
-    pub(super) shadow: [Option<Rc<Program>>; 3],
-    pub(super) opaque: Option<Rc<Program>>,
-    pub(super) ground: Option<Rc<Program>>,
+    pub(crate) shadow: [Option<Rc<Program>>; 3],
+    pub(crate) opaque: Option<Rc<Program>>,
+    pub(crate) ground: Option<Rc<Program>>,
     /// Culling of shadow casters.
-    pub(super) shadow_cull: Option<ShadowCullPrograms>,
+    pub(crate) shadow_cull: Option<ShadowCullPrograms>,
 }
 
 /// Programs for one number of samples per pixel.
 #[derive(Debug, Clone)]
-pub(super) struct SampleCountPrograms {
-    pub(super) samples: u32,
-    pub(super) mask: Option<Rc<Program>>,
+pub(crate) struct SampleCountPrograms {
+    pub(crate) samples: u32,
+    pub(crate) mask: Option<Rc<Program>>,
     /// Two-pass transparency: the opaque parts of blended triangles, if there may be any. `blended` draws the rest of
     /// them.
-    pub(super) opaque_parts: Option<Rc<Program>>,
-    pub(super) blended: Option<Rc<Program>>,
+    pub(crate) opaque_parts: Option<Rc<Program>>,
+    pub(crate) blended: Option<Rc<Program>>,
     /// Exact transparency.
-    pub(super) oit: Option<OitPrograms>,
-    pub(super) background: Rc<Program>,
-    pub(super) shade: Option<Rc<Program>>,
+    pub(crate) oit: Option<OitPrograms>,
+    pub(crate) background: Rc<Program>,
+    pub(crate) shade: Option<Rc<Program>>,
     /// Triangle culling.
-    pub(super) cull: Option<CullPrograms>,
+    pub(crate) cull: Option<CullPrograms>,
 }
 
 impl ScenePrograms {
-    pub(super) fn compile(
+    pub(crate) fn compile(
         options: &ShaderOptions,
         plan: &RenderPlan,
         groups: &[DrawGroup],
@@ -75,7 +75,7 @@ impl ScenePrograms {
 }
 
 impl SampleCountPrograms {
-    pub(super) fn compile(
+    pub(crate) fn compile(
         options: &ShaderOptions,
         groups: &[DrawGroup],
         samples: u32,

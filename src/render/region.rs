@@ -9,7 +9,7 @@ use modalcast_model::scene::Bounds;
 
 /// A rectangle of a frame's pixels; (0, 0) is the bottom left pixel. It may be empty.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Region {
+pub(crate) struct Region {
     frame: [u32; 2],
     corner: [u32; 2],
     size: [u32; 2],
@@ -17,7 +17,7 @@ pub(super) struct Region {
 
 /// Dirty region of an image: the pixels that may differ from the clear value. Initially all of them.
 #[derive(Debug, Default)]
-pub(super) struct DirtyRegion(Cell<Option<Region>>);
+pub(crate) struct DirtyRegion(Cell<Option<Region>>);
 
 /// Bound on the f32 rounding error of a clip coordinate, relative to the sum of the magnitudes of its products: each
 /// matrix element, each product and three sums are rounded.
@@ -30,13 +30,13 @@ const MARGIN: f64 = 1.0;
 const SLACK: u32 = 2;
 
 impl Region {
-    pub(super) const fn whole(frame: [u32; 2]) -> Self {
+    pub(crate) const fn whole(frame: [u32; 2]) -> Self {
         Self { frame, corner: [0; 2], size: frame }
     }
 
     /// Region of the frame that can show points in `bounds` when `clip` transforms positions in f32. The whole frame if
     /// the bounds reach behind the eye or overflow.
-    pub(super) fn project(clip: &Matrix4<f64>, bounds: &Bounds, frame: [u32; 2]) -> Self {
+    pub(crate) fn project(clip: &Matrix4<f64>, bounds: &Bounds, frame: [u32; 2]) -> Self {
         let corners = bounds.corners().map(|corner| corner.to_homogeneous());
         let magnitudes = corners.iter().map(|corner| clip.abs() * corner.abs());
         let rounded = magnitudes.fold(Vector4::zeros(), |most: Vector4<f64>, one| most.sup(&one)) * CLIP_RELATIVE_ERROR;
@@ -66,12 +66,12 @@ impl Region {
     }
 
     /// Width and height of the frame.
-    pub(super) const fn frame(&self) -> [u32; 2] {
+    pub(crate) const fn frame(&self) -> [u32; 2] {
         self.frame
     }
 
     /// Column and row of the bottom left pixel, width and height.
-    pub(super) const fn rect(&self) -> [u32; 4] {
+    pub(crate) const fn rect(&self) -> [u32; 4] {
         let ([x, y], [width, height]) = (self.corner, self.size);
         [x, y, width, height]
     }
@@ -79,12 +79,12 @@ impl Region {
 
 impl DirtyRegion {
     /// Returns the dirty region, none for all pixels, and replaces it by `by`.
-    pub(super) fn replace(&self, by: Region) -> Option<Region> {
+    pub(crate) fn replace(&self, by: Region) -> Option<Region> {
         self.0.replace(Some(by.expanded(SLACK)))
     }
 
     /// Marks all pixels as dirty.
-    pub(super) fn mark_all(&self) {
+    pub(crate) fn mark_all(&self) {
         self.0.set(None);
     }
 }

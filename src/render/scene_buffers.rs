@@ -10,7 +10,6 @@ use rayon::prelude::*;
 use super::SharedBuffers;
 use super::cull::{TriangleCuller, VISIBLE_INDICES};
 use super::geometry::{BlendMode, DrawGroup, Geometry, TriangleSpan, blend_mode, locate_triangle, used_materials};
-use super::gl::{self, Buffer, Gl, Program, Texture, TextureDesc, VertexArray, VertexAttribute};
 use super::plan::{Allocation, RenderPlan, plan_for_device};
 use super::post::PostProcess;
 use super::programs::{ProgramCompiler, SampleCountPrograms, ScenePrograms};
@@ -18,6 +17,7 @@ use super::raster_backends::ComputeRasterizer;
 use super::shaders::{self, FIXED_TEXTURE_READS, MaterialUse, ShaderOptions};
 use super::shadow::{ShadowCache, ShadowMap, resolve_blurring};
 use super::textures::{TextureArray, TextureRole, arrays, check_texture_budget, cutoff, find_layer, mip_levels};
+use crate::device::gl::{self, Buffer, Gl, Program, Texture, TextureDesc, VertexArray, VertexAttribute};
 use modalcast_model::domain::AlphaMode;
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::Scene;
@@ -36,7 +36,7 @@ struct PackedMaterial {
     cut: [f32; 4],
 }
 
-pub(super) const MATERIAL_BYTES: usize = size_of::<PackedMaterial>();
+pub(crate) const MATERIAL_BYTES: usize = size_of::<PackedMaterial>();
 const _: () = assert!(MATERIAL_BYTES == 64, "PackedMaterial differs from shaders/shared/material.glsl");
 
 /// A scene's buffers, textures and programs on the device; freed when dropped.
@@ -46,42 +46,42 @@ pub struct SceneBuffers {
     pub shared: SharedBuffers,
     /// Compute rasterizer that draws some passes instead of OpenGL; present when the look asks for it and one was
     /// given. Declared before the buffers that it has registered, so that it is dropped first.
-    pub(super) compute_rasterizer: Option<ComputeRasterizer>,
-    pub(super) scene: Arc<Scene>,
-    pub(super) buffers: BTreeMap<String, Buffer>,
-    pub(super) buffer_textures: BufferTextures,
-    pub(super) groups: Vec<DrawGroup>,
+    pub(crate) compute_rasterizer: Option<ComputeRasterizer>,
+    pub(crate) scene: Arc<Scene>,
+    pub(crate) buffers: BTreeMap<String, Buffer>,
+    pub(crate) buffer_textures: BufferTextures,
+    pub(crate) groups: Vec<DrawGroup>,
     /// Vertex array of opaque triangles.
     position_array: VertexArray,
     /// Vertex array of cut-out and blended triangles; none without such triangles.
     corners: Option<VertexArray>,
     /// Vertex array without attributes, for triangles that a vertex shader generates.
-    pub(super) empty_vertex_array: VertexArray,
-    pub(super) color_arrays: Vec<Texture>,
-    pub(super) normals: Vec<Texture>,
-    pub(super) shadow: Option<ShadowMap>,
-    pub(super) shadow_cache: ShadowCache,
-    pub(super) programs: ScenePrograms,
-    pub(super) post: PostProcess,
+    pub(crate) empty_vertex_array: VertexArray,
+    pub(crate) color_arrays: Vec<Texture>,
+    pub(crate) normals: Vec<Texture>,
+    pub(crate) shadow: Option<ShadowMap>,
+    pub(crate) shadow_cache: ShadowCache,
+    pub(crate) programs: ScenePrograms,
+    pub(crate) post: PostProcess,
     /// Lists of culled triangles; present when triangles are culled.
-    pub(super) culler: Option<TriangleCuller>,
+    pub(crate) culler: Option<TriangleCuller>,
     /// Programs for the number of samples per pixel that the look asks for.
     sample_programs: SampleCountPrograms,
     options: ShaderOptions,
-    pub(super) spans: Rc<[TriangleSpan]>,
+    pub(crate) spans: Rc<[TriangleSpan]>,
     /// Origin of the positions, in scene units from the scene's origin.
-    pub(super) origin: [f64; 3],
+    pub(crate) origin: [f64; 3],
     /// Rebased positions that are drawn instead of the shared ones.
-    pub(super) rebased: Option<RebasedPositions>,
+    pub(crate) rebased: Option<RebasedPositions>,
     /// A scalar per vertex for AOV readbacks; allocated by the first upload.
-    pub(super) values: Option<VertexValues>,
+    pub(crate) values: Option<VertexValues>,
     plan: RenderPlan,
 }
 
 /// Positions rebased to one origin, for scenes whose domains have separate local origins.
 #[derive(Debug)]
-pub(super) struct RebasedPositions {
-    pub(super) buffer: Buffer,
+pub(crate) struct RebasedPositions {
+    pub(crate) buffer: Buffer,
     view: Texture,
     position_array: VertexArray,
     /// Vertex array of the culled lists, when triangles are culled.
@@ -89,7 +89,7 @@ pub(super) struct RebasedPositions {
 }
 
 impl RebasedPositions {
-    pub(super) fn new(gl: &Rc<Gl>, scene: &SceneBuffers) -> Result<Self> {
+    pub(crate) fn new(gl: &Rc<Gl>, scene: &SceneBuffers) -> Result<Self> {
         let buffer = gl.buffer(scene.buffer("positions")?.bytes, gl::DYNAMIC_DRAW, None)?;
         let view = gl.buffer_texture(&buffer, gl::RGB32F)?;
         let array = |index: &Buffer| gl.vertex_array(Some(index), &[attribute(0, &buffer, 3, false)]);
@@ -101,22 +101,22 @@ impl RebasedPositions {
 
 /// A scalar per vertex, which the shader of an AOV readback interpolates.
 #[derive(Debug)]
-pub(super) struct VertexValues {
-    pub(super) buffer: Buffer,
-    pub(super) view: Texture,
+pub(crate) struct VertexValues {
+    pub(crate) buffer: Buffer,
+    pub(crate) view: Texture,
 }
 
 /// Buffer textures over the scene's buffers.
 #[derive(Debug)]
-pub(super) struct BufferTextures {
+pub(crate) struct BufferTextures {
     positions: Texture,
     /// Texture unit and view.
-    pub(super) others: Vec<(u32, Texture)>,
+    pub(crate) others: Vec<(u32, Texture)>,
 }
 
 impl SceneBuffers {
     /// Allocates and fills the buffers that the scene's plan lists. `compile` returns programs, which scenes may share.
-    pub(super) fn new(
+    pub(crate) fn new(
         gl: &Rc<Gl>,
         scene: &Arc<Scene>,
         sample_positions: &[[f32; 2]],
@@ -176,12 +176,12 @@ impl SceneBuffers {
         })
     }
 
-    pub(super) const fn options(&self) -> &ShaderOptions {
+    pub(crate) const fn options(&self) -> &ShaderOptions {
         &self.options
     }
 
     /// The programs for this number of samples per pixel; compiled now unless the look asked for the same number.
-    pub(super) fn sample_programs(
+    pub(crate) fn sample_programs(
         &self,
         samples: u32,
         compile: &mut ProgramCompiler<'_>,
@@ -194,7 +194,7 @@ impl SceneBuffers {
 
     /// The program that draws ids of cut-out triangles with this number of samples per pixel; none without such
     /// triangles.
-    pub(super) fn mask_program(&self, samples: u32, compile: &mut ProgramCompiler<'_>) -> Result<Option<Rc<Program>>> {
+    pub(crate) fn mask_program(&self, samples: u32, compile: &mut ProgramCompiler<'_>) -> Result<Option<Rc<Program>>> {
         if self.sample_programs.samples == samples {
             return Ok(self.sample_programs.mask.clone());
         }
@@ -203,7 +203,7 @@ impl SceneBuffers {
     }
 
     /// The program that reads an AOV field from ids with this number of samples per pixel.
-    pub(super) fn aov_program(
+    pub(crate) fn aov_program(
         &self,
         field: &'static str,
         samples: u32,
@@ -213,7 +213,7 @@ impl SceneBuffers {
     }
 
     /// First triangle and number of triangles of one kind; they are contiguous.
-    pub(super) fn triangles(&self, blend_mode: BlendMode) -> (usize, usize) {
+    pub(crate) fn triangles(&self, blend_mode: BlendMode) -> (usize, usize) {
         let mut of_kind = self.groups.iter().filter(|group| group.blend_mode == blend_mode);
         let first = of_kind.next().map_or((0, 0), |group| (group.first_triangle, group.triangles));
         of_kind.fold(first, |(first, count), group| (first, count + group.triangles))
@@ -233,12 +233,12 @@ impl SceneBuffers {
     }
 
     /// The positions that are drawn: the rebased ones if there are any, else the shared ones.
-    pub(super) fn position_texture(&self) -> &Texture {
+    pub(crate) fn position_texture(&self) -> &Texture {
         self.rebased.as_ref().map_or(&self.buffer_textures.positions, |rebased| &rebased.view)
     }
 
     /// Vertex array of one kind of triangle, for ids and depth; none without such triangles.
-    pub(super) fn vertex_array(&self, blend_mode: BlendMode) -> Option<&VertexArray> {
+    pub(crate) fn vertex_array(&self, blend_mode: BlendMode) -> Option<&VertexArray> {
         match blend_mode {
             BlendMode::Opaque => {
                 Some(self.rebased.as_ref().map_or(&self.position_array, |rebased| &rebased.position_array))
@@ -249,7 +249,7 @@ impl SceneBuffers {
 
     /// Vertex array of the culled list of one kind, and the buffer with the indirect draw commands; none when triangles
     /// are not culled.
-    pub(super) fn visible_draws(&self, blend_mode: BlendMode) -> Option<(&VertexArray, &Buffer)> {
+    pub(crate) fn visible_draws(&self, blend_mode: BlendMode) -> Option<(&VertexArray, &Buffer)> {
         let (culler, ledger) = (self.culler.as_ref()?, self.buffers.get("cull draws")?);
         let rebased = self
             .rebased
@@ -282,7 +282,7 @@ impl SceneBuffers {
         self.color_arrays.len() + self.normals.len() + self.shadow.as_ref().map_or(0, ShadowMap::texture_count)
     }
 
-    pub(super) fn buffer(&self, name: &'static str) -> Result<&Buffer> {
+    pub(crate) fn buffer(&self, name: &'static str) -> Result<&Buffer> {
         find_buffer(&self.buffers, name)
     }
 }

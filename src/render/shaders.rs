@@ -1,25 +1,25 @@
 //! Assembles the shader sources from the files under `shaders/`, with only the branches that a scene needs.
 
-pub(super) mod oit;
+pub(crate) mod oit;
 mod readback;
 
-pub(super) use self::readback::pick;
+pub(crate) use self::readback::pick;
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use super::geometry::BlendMode;
-use super::gl;
 use super::textures::TextureRole;
+use crate::device::gl;
 use modalcast_model::scene::ShadowSettings;
 
-pub(super) const FRAME: &str = include_str!("../../shaders/shared/frame.glsl");
+pub(crate) const FRAME: &str = include_str!("../../shaders/shared/frame.glsl");
 const CLIP: &str = include_str!("../../shaders/shared/clip.glsl");
 const MATERIAL: &str = include_str!("../../shaders/shared/material.glsl");
-pub(super) const TRIANGLE_ID: &str = include_str!("../../shaders/shared/triangle_id.glsl");
-pub(super) const VISIBILITY_IDS: &str = include_str!("../../shaders/shared/visibility_ids.glsl");
+pub(crate) const TRIANGLE_ID: &str = include_str!("../../shaders/shared/triangle_id.glsl");
+pub(crate) const VISIBILITY_IDS: &str = include_str!("../../shaders/shared/visibility_ids.glsl");
 const ALPHA_COVERAGE: &str = include_str!("../../shaders/shared/alpha_coverage.glsl");
-pub(super) const SHADOW_CASTER: &str = include_str!("../../shaders/shared/shadow_caster.glsl");
+pub(crate) const SHADOW_CASTER: &str = include_str!("../../shaders/shared/shadow_caster.glsl");
 const OIT_LISTS: &str = include_str!("../../shaders/shared/oit_lists.glsl");
 const SKY: &str = include_str!("../../shaders/shared/sky.glsl");
 const GROUND: &str = include_str!("../../shaders/shared/ground_shading.glsl");
@@ -29,68 +29,68 @@ const BARYCENTRICS: &str = include_str!("../../shaders/shared/barycentrics.glsl"
 const TRIANGLE_SHADING: &str = include_str!("../../shaders/shared/triangle_shading.glsl");
 
 /// First texture unit of each use.
-pub(super) const SHADOW_UNIT: u32 = 0;
-pub(super) const COLOR_UNIT: u32 = 1;
-pub(super) const NORMAL_UNIT: u32 = COLOR_UNIT + super::textures::MAX_ARRAYS as u32;
+pub(crate) const SHADOW_UNIT: u32 = 0;
+pub(crate) const COLOR_UNIT: u32 = 1;
+pub(crate) const NORMAL_UNIT: u32 = COLOR_UNIT + super::textures::MAX_ARRAYS as u32;
 /// Units of the buffer textures and of the frame's images, the same as in the shaders.
-pub(super) const POSITION_UNIT: u32 = 13;
-pub(super) const MATERIAL_UNIT: u32 = 14;
-pub(super) const TRIANGLE_MATERIAL_UNIT: u32 = 15;
-pub(super) const CORNER_NORMAL_UNIT: u32 = 16;
-pub(super) const TRIANGLE_UNIT: u32 = 17;
-pub(super) const TRIANGLE_VERTEX_UNIT: u32 = 18;
-pub(super) const UV_UNIT: u32 = 19;
-pub(super) const TANGENT_UNIT: u32 = 20;
-pub(super) const ID_UNIT: u32 = 21;
+pub(crate) const POSITION_UNIT: u32 = 13;
+pub(crate) const MATERIAL_UNIT: u32 = 14;
+pub(crate) const TRIANGLE_MATERIAL_UNIT: u32 = 15;
+pub(crate) const CORNER_NORMAL_UNIT: u32 = 16;
+pub(crate) const TRIANGLE_UNIT: u32 = 17;
+pub(crate) const TRIANGLE_VERTEX_UNIT: u32 = 18;
+pub(crate) const UV_UNIT: u32 = 19;
+pub(crate) const TANGENT_UNIT: u32 = 20;
+pub(crate) const ID_UNIT: u32 = 21;
 /// Depth of the samples whose ids are at [`ID_UNIT`].
-pub(super) const DEPTH_UNIT: u32 = 26;
-pub(super) const LAYER_UNIT: u32 = 22;
-pub(super) const COUNT_UNIT: u32 = 23;
-pub(super) const VALUE_UNIT: u32 = 24;
+pub(crate) const DEPTH_UNIT: u32 = 26;
+pub(crate) const LAYER_UNIT: u32 = 22;
+pub(crate) const COUNT_UNIT: u32 = 23;
+pub(crate) const VALUE_UNIT: u32 = 24;
 /// Maximum number of textures that the shading reads in addition to the scene's images.
-pub(super) const FIXED_TEXTURE_READS: usize = 13;
+pub(crate) const FIXED_TEXTURE_READS: usize = 13;
 const _: () = assert!(NORMAL_UNIT + super::textures::MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
 
 /// Lanes of a compute workgroup, along x.
-pub(super) const WORKGROUP_SIZE: u32 = 64;
+pub(crate) const WORKGROUP_SIZE: u32 = 64;
 /// Side of the square of pixels that a workgroup shades.
-pub(super) const TILE: u32 = 8;
+pub(crate) const TILE: u32 = 8;
 /// Workgroups in a row of the dispatch over listed tiles.
-pub(super) const TILE_ROW: u32 = 64;
+pub(crate) const TILE_ROW: u32 = 64;
 
 /// Parameters of the shader sources.
 #[derive(Debug, Clone)]
-pub(super) struct ShaderOptions {
-    pub(super) defines: Vec<&'static str>,
+pub(crate) struct ShaderOptions {
+    pub(crate) defines: Vec<&'static str>,
     /// The materials that triangles use.
-    pub(super) used: Vec<MaterialUse>,
+    pub(crate) used: Vec<MaterialUse>,
     /// Shadow settings as resolved for the device; used only when the defines contain SHADOWS.
-    pub(super) shadow: ShadowSettings,
+    pub(crate) shadow: ShadowSettings,
     /// Sample positions within a multisampled pixel.
-    pub(super) sample_positions: Vec<[f32; 2]>,
+    pub(crate) sample_positions: Vec<[f32; 2]>,
     /// Source that is applied to the light of each sample.
-    pub(super) sample_resolve: String,
+    pub(crate) sample_resolve: String,
     /// Whether a fragment can read its coverage after the depth test.
-    pub(super) post_depth_coverage: bool,
+    pub(crate) post_depth_coverage: bool,
 }
 
 /// A material that triangles use: the pipeline that draws them, and the arrays of its images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct MaterialUse {
-    pub(super) blend_mode: BlendMode,
-    pub(super) color: Option<usize>,
-    pub(super) normal: Option<usize>,
+pub(crate) struct MaterialUse {
+    pub(crate) blend_mode: BlendMode,
+    pub(crate) color: Option<usize>,
+    pub(crate) normal: Option<usize>,
 }
 
 /// The source text of a program's stages.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(super) struct ProgramSource {
-    pub(super) label: String,
-    pub(super) stages: Vec<(u32, String)>,
+pub(crate) struct ProgramSource {
+    pub(crate) label: String,
+    pub(crate) stages: Vec<(u32, String)>,
 }
 
 impl ShaderOptions {
-    pub(super) fn head(&self, more: &[&str]) -> String {
+    pub(crate) fn head(&self, more: &[&str]) -> String {
         let mut text = String::from("#version 430 core\n");
         for define in self.defines.iter().chain(more) {
             writeln!(text, "#define {define}").ok();
@@ -101,7 +101,7 @@ impl ShaderOptions {
 
     /// Defines for triangles of these kinds: for their images, and for the material lookup if they have several
     /// materials.
-    pub(super) fn material_defines(&self, kinds: &[BlendMode]) -> String {
+    pub(crate) fn material_defines(&self, kinds: &[BlendMode]) -> String {
         let mut own = (0..).zip(&self.used).filter(|(_, used)| kinds.contains(&used.blend_mode));
         let mut text = match (own.next(), own.next()) {
             (Some((only, _)), None) => format!("#undef MATERIAL_TABLE\n#define SINGLE_MATERIAL {only}\n"),
@@ -121,7 +121,7 @@ impl ShaderOptions {
     }
 
     /// Lookup functions for the images and materials of these kinds.
-    pub(super) fn material_lookups(&self, kinds: &[BlendMode], slopes: UvDerivatives) -> String {
+    pub(crate) fn material_lookups(&self, kinds: &[BlendMode], slopes: UvDerivatives) -> String {
         let colors = sampler("color", COLOR_UNIT, &self.arrays(kinds, TextureRole::Color), slopes);
         let normals = sampler("normal", NORMAL_UNIT, &self.arrays(kinds, TextureRole::Normal), slopes);
         [MATERIAL, &colors, &normals].concat()
@@ -137,12 +137,12 @@ impl ShaderOptions {
     }
 
     /// Whether two-pass transparency draws parts of blended triangles as opaque.
-    pub(super) fn opaque_parts(&self) -> bool {
+    pub(crate) fn opaque_parts(&self) -> bool {
         self.defines.contains(&"OPAQUE_PARTS")
     }
 
     /// Defines that depend on the samples per pixel.
-    pub(super) fn sample_defines(&self, samples: u32) -> String {
+    pub(crate) fn sample_defines(&self, samples: u32) -> String {
         let middle = vec![[0.5; 2]];
         let places = if samples > 1 { &self.sample_positions } else { &middle };
         let places: Vec<String> = places.iter().map(|[x, y]| format!("vec2({x:?}, {y:?})")).collect();
@@ -151,7 +151,7 @@ impl ShaderOptions {
     }
 
     /// Draws ids and depth of one kind of triangle.
-    pub(super) fn visibility(&self, blend_mode: BlendMode, samples: u32) -> ProgramSource {
+    pub(crate) fn visibility(&self, blend_mode: BlendMode, samples: u32) -> ProgramSource {
         let label = format!("visibility, {blend_mode:?}, {samples} samples");
         let (vertex, body) =
             (include_str!("../../shaders/visibility.vert"), include_str!("../../shaders/visibility.frag"));
@@ -170,7 +170,7 @@ impl ShaderOptions {
     }
 
     /// Draws the layer of the blended triangles, except the parts that were drawn as opaque.
-    pub(super) fn blended(&self, samples: u32) -> ProgramSource {
+    pub(crate) fn blended(&self, samples: u32) -> ProgramSource {
         let head = self.head(&[]) + &self.material_defines(&[BlendMode::Blend]);
         let material_lookups = self.material_lookups(&[BlendMode::Blend], UvDerivatives::Implicit);
         let vertex = [&head, FRAME, CLIP, include_str!("../../shaders/blended.vert")].concat();
@@ -181,14 +181,14 @@ impl ShaderOptions {
     }
 
     /// Shades tiles in which no triangle is visible.
-    pub(super) fn background(&self, samples: u32) -> ProgramSource {
+    pub(crate) fn background(&self, samples: u32) -> ProgramSource {
         let mut text = self.shading(samples, &["BACKGROUND"]);
         text += include_str!("../../shaders/shade.comp");
         ProgramSource { label: format!("background, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
 
     /// Shades the other tiles.
-    pub(super) fn shade(&self, samples: u32) -> ProgramSource {
+    pub(crate) fn shade(&self, samples: u32) -> ProgramSource {
         let all = [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend];
         let kinds = if self.opaque_parts() { &all } else { &all[..2] };
         let mut text = self.shading(samples, &[]) + &self.material_defines(kinds);
@@ -218,7 +218,7 @@ impl ShaderOptions {
     }
 
     /// Converts the keys of the compute rasterizer to ids.
-    pub(super) fn unpack(&self) -> ProgramSource {
+    pub(crate) fn unpack(&self) -> ProgramSource {
         let mut head = self.head(&[]);
         writeln!(head, "#define TILE {TILE}").ok();
         let text =
@@ -226,7 +226,7 @@ impl ShaderOptions {
         ProgramSource { label: "unpack".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
     }
 
-    pub(super) fn ground(&self) -> ProgramSource {
+    pub(crate) fn ground(&self) -> ProgramSource {
         let head = self.head(&[]);
         let vertex = [&head, FRAME, GROUND_PLANE, include_str!("../../shaders/ground.vert")].concat();
         let fragment = [&head, FRAME, VISIBILITY_IDS, GROUND_PLANE, include_str!("../../shaders/ground.frag")].concat();
@@ -234,7 +234,7 @@ impl ShaderOptions {
     }
 }
 
-pub(super) fn vertex_and_fragment(vertex: String, fragment: String) -> Vec<(u32, String)> {
+pub(crate) fn vertex_and_fragment(vertex: String, fragment: String) -> Vec<(u32, String)> {
     vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)]
 }
 
@@ -266,7 +266,7 @@ fn sampler(name: &str, unit: u32, arrays: &BTreeSet<usize>, slopes: UvDerivative
 
 /// Source of the derivatives of texture coordinates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum UvDerivatives {
+pub(crate) enum UvDerivatives {
     /// Differences between the fragments of a quad.
     Implicit,
     /// Arguments of the lookup.
@@ -274,7 +274,7 @@ pub(super) enum UvDerivatives {
 }
 
 /// Packs the ids of each pixel's first sample.
-pub(super) fn visibility_readback(samples: u32) -> ProgramSource {
+pub(crate) fn visibility_readback(samples: u32) -> ProgramSource {
     let head = format!("#version 430 core\n#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define SAMPLES {samples}\n");
     let body = [&head, VISIBILITY_IDS, include_str!("../../shaders/visibility_readback.comp")].concat();
     ProgramSource { label: format!("visibility readback, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, body)] }

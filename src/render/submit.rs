@@ -11,16 +11,16 @@ use std::time::{Duration, Instant};
 use rayon::prelude::*;
 
 use super::cascades::ShadowCascades;
-use super::gl::{Fence, PassTimer, ReadbackView};
 use super::oit;
 use super::programs::SampleCountPrograms;
-use super::readback_ring::ReadbackSlot;
 use super::region::Region;
 use super::scene_buffers::SceneBuffers;
 use super::target::{RenderTarget, TargetDesc};
 use super::{
     FrameImage, FrameParams, FrameStats, RasterBackend, RasterBackends, Renderer, cull, frame_uniforms, passes,
 };
+use crate::device::gl::{Fence, PassTimer, ReadbackView};
+use crate::device::readback_ring::ReadbackSlot;
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 
 /// Bytes that one thread copies at a time: large enough that the cost of starting a task is small in comparison.
@@ -162,7 +162,7 @@ impl Renderer {
         })
     }
 
-    pub(super) fn check_size(&self, shot: &FrameParams) -> Result<()> {
+    pub(crate) fn check_size(&self, shot: &FrameParams) -> Result<()> {
         let limit = self.info.max_side;
         if [shot.width, shot.height].iter().all(|side| (1..=limit).contains(side)) {
             return Ok(());

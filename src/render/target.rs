@@ -6,11 +6,11 @@ use std::ops::Range;
 use std::rc::Rc;
 
 use super::cull::{COUNTER_BYTES, DepthPyramid};
-use super::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureDesc, VisibilityDirty};
 use super::oit::{COUNTERS_HEADER_BYTES, OitTarget};
-use super::readback_ring::ReadbackRing;
 use super::region::{DirtyRegion, Region};
 use super::shaders::TILE;
+use crate::device::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureDesc, VisibilityDirty};
+use crate::device::readback_ring::ReadbackRing;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Culling, RenderSettings};
 
@@ -20,20 +20,20 @@ const MULTISAMPLED_PIXELS: u64 = 11 << 20;
 
 /// Properties of a frame that determine its images and buffers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct TargetDesc {
-    pub(super) width: u32,
-    pub(super) height: u32,
-    pub(super) samples: u32,
-    pub(super) blended: BlendStorage,
+pub(crate) struct TargetDesc {
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+    pub(crate) samples: u32,
+    pub(crate) blended: BlendStorage,
     /// Levels of the bloom pyramid below the picture's size.
-    pub(super) bloom_levels: u32,
+    pub(crate) bloom_levels: u32,
     /// Culling method; never the automatic choice.
-    pub(super) culling: Culling,
+    pub(crate) culling: Culling,
 }
 
 /// Resources that a frame needs for blended triangles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum BlendStorage {
+pub(crate) enum BlendStorage {
     None,
     /// A layer into which they are blended in draw order.
     SingleLayer,
@@ -43,66 +43,66 @@ pub(super) enum BlendStorage {
 
 /// The images and buffers of frames of one form.
 #[derive(Debug)]
-pub(super) struct RenderTarget {
-    pub(super) desc: TargetDesc,
+pub(crate) struct RenderTarget {
+    pub(crate) desc: TargetDesc,
     /// Id of each sample; kept until the next frame, like depth.
-    pub(super) ids: Texture,
-    pub(super) visibility_fbo: Framebuffer,
-    pub(super) dirty: VisibilityDirty,
+    pub(crate) ids: Texture,
+    pub(crate) visibility_fbo: Framebuffer,
+    pub(crate) dirty: VisibilityDirty,
     /// Region of the current frame that may show triangles or rasterized ground.
-    pub(super) draw_region: Cell<Region>,
-    pub(super) layer: Option<BlendLayer>,
-    pub(super) oit: Option<OitTarget>,
+    pub(crate) draw_region: Cell<Region>,
+    pub(crate) layer: Option<BlendLayer>,
+    pub(crate) oit: Option<OitTarget>,
     /// Indirect dispatch arguments, then the tiles that see triangles.
-    pub(super) tiles: Buffer,
+    pub(crate) tiles: Buffer,
     /// Linear light, one value per pixel.
-    pub(super) scene_color: Texture,
+    pub(crate) scene_color: Texture,
     /// Bright light of each pixel, then levels of half the size; empty without bloom.
-    pub(super) bloom_mips: Vec<Texture>,
+    pub(crate) bloom_mips: Vec<Texture>,
     /// RGBA8, top row first, as the encoder writes it.
-    pub(super) readback_source: Buffer,
+    pub(crate) readback_source: Buffer,
     /// Staging buffers for the readback of `readback_source`.
-    pub(super) readback_ring: Rc<ReadbackRing>,
+    pub(crate) readback_ring: Rc<ReadbackRing>,
     /// Depth pyramid of occlusion culling.
-    pub(super) pyramid: Option<DepthPyramid>,
+    pub(crate) pyramid: Option<DepthPyramid>,
     // Attached to framebuffers, which must not outlive it.
-    pub(super) depth: Texture,
+    pub(crate) depth: Texture,
 }
 
 /// Blended light of the translucent triangles per sample, and their transmittance in alpha.
 #[derive(Debug)]
-pub(super) struct BlendLayer {
-    pub(super) framebuffer: Framebuffer,
-    pub(super) color: Texture,
-    pub(super) dirty: DirtyRegion,
+pub(crate) struct BlendLayer {
+    pub(crate) framebuffer: Framebuffer,
+    pub(crate) color: Texture,
+    pub(crate) dirty: DirtyRegion,
 }
 
 impl TargetDesc {
     /// No pixels and no optional features.
-    pub(super) const EMPTY: Self =
+    pub(crate) const EMPTY: Self =
         Self { width: 0, height: 0, samples: 1, blended: BlendStorage::None, bloom_levels: 0, culling: Culling::None };
 
     /// The form of a frame of a look.
-    pub(super) fn new(gl: &Gl, [width, height]: [u32; 2], look: &RenderSettings, blended: BlendStorage) -> Self {
+    pub(crate) fn new(gl: &Gl, [width, height]: [u32; 2], look: &RenderSettings, blended: BlendStorage) -> Self {
         let bloom_levels = look.bloom.map_or(0, |bloom| bloom.levels);
         Self { blended, bloom_levels, ..Self::plain(gl, [width, height], look.samples_per_pixel()) }
     }
 
     /// The form of a frame with ids and depth only, with `wanted` samples per pixel if the device and the frame size
     /// allow it, else one.
-    pub(super) fn plain(gl: &Gl, [width, height]: [u32; 2], wanted: u32) -> Self {
+    pub(crate) fn plain(gl: &Gl, [width, height]: [u32; 2], wanted: u32) -> Self {
         let fits = u64::from(width) * u64::from(height) <= MULTISAMPLED_PIXELS && wanted <= gl.limits.max_samples;
         Self { width, height, samples: if fits { wanted } else { 1 }, ..Self::EMPTY }
     }
 
     /// Bytes of the encoded picture.
-    pub(super) fn bytes(&self) -> u64 {
+    pub(crate) fn bytes(&self) -> u64 {
         4 * u64::from(self.width) * u64::from(self.height)
     }
 
     /// Byte ranges of the list and culling statistics, which follow the picture in the staging buffer; empty without
     /// lists or culling.
-    pub(super) fn readback_ranges(&self) -> [Range<u64>; 2] {
+    pub(crate) fn readback_ranges(&self) -> [Range<u64>; 2] {
         let lists =
             if matches!(self.blended, BlendStorage::FragmentLists(_)) { COUNTERS_HEADER_BYTES as u64 } else { 0 };
         let culled = if self.culling == Culling::None { 0 } else { COUNTER_BYTES as u64 };
@@ -112,7 +112,7 @@ impl TargetDesc {
 }
 
 impl RenderTarget {
-    pub(super) fn new(gl: &Rc<Gl>, desc: TargetDesc) -> Result<Self> {
+    pub(crate) fn new(gl: &Rc<Gl>, desc: TargetDesc) -> Result<Self> {
         let TargetDesc { width, height, samples, blended, .. } = desc;
         let (ids, depth) = (create_image(gl, desc, gl::R32UI)?, create_image(gl, desc, gl::DEPTH_COMPONENT32F)?);
         let layer = |color: Texture| {
@@ -152,7 +152,7 @@ impl RenderTarget {
 }
 
 /// Sample positions within a pixel with four samples; empty on a device without 4x multisampling.
-pub(super) fn sample_positions(gl: &Rc<Gl>) -> Result<Vec<[f32; 2]>> {
+pub(crate) fn sample_positions(gl: &Rc<Gl>) -> Result<Vec<[f32; 2]>> {
     let desc = TargetDesc { width: 1, height: 1, samples: 4, ..TargetDesc::EMPTY };
     if gl.limits.max_samples < desc.samples {
         return Ok(Vec::new());
@@ -161,7 +161,7 @@ pub(super) fn sample_positions(gl: &Rc<Gl>) -> Result<Vec<[f32; 2]>> {
     gl.sample_positions(&gl.framebuffer(Some(&ids), &depth)?, desc.samples)
 }
 
-pub(super) fn create_image(gl: &Rc<Gl>, desc: TargetDesc, format: u32) -> Result<Texture> {
+pub(crate) fn create_image(gl: &Rc<Gl>, desc: TargetDesc, format: u32) -> Result<Texture> {
     let TargetDesc { width, height, samples, .. } = desc;
     let target = if samples > 1 { gl::TEXTURE_2D_MULTISAMPLE } else { gl::TEXTURE_2D };
     let texture = gl.texture(TextureDesc { target, format, width, height, depth: samples, levels: 1 })?;

@@ -17,44 +17,44 @@ use super::geometry::used_materials;
 
 /// Maximum number of arrays per use. The color arrays, the normal arrays and the shadow map together stay below the
 /// sixteen texture units that OpenGL guarantees to a fragment shader.
-pub(super) const MAX_ARRAYS: usize = 6;
+pub(crate) const MAX_ARRAYS: usize = 6;
 
 /// Maximum bytes of all arrays with their mipmap levels. 512 images of 4096 x 4096 would take 46 GB.
 const MAX_TEXTURE_BYTES: u64 = 8 << 30;
 
 /// What an image contains.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum TextureRole {
+pub(crate) enum TextureRole {
     Color,
     Normal,
 }
 
 /// One texture array: its size, and the scene's texture in each layer.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct TextureArray {
-    pub(super) width: u32,
-    pub(super) height: u32,
-    pub(super) layers: Vec<usize>,
+pub(crate) struct TextureArray {
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+    pub(crate) layers: Vec<usize>,
 }
 
 /// Location of a material's image: array and layer.
-pub(super) type ArrayLayer = (usize, usize);
+pub(crate) type ArrayLayer = (usize, usize);
 
 impl TextureArray {
     /// Levels of a full mipmap chain.
-    pub(super) fn levels(&self) -> u32 {
+    pub(crate) fn levels(&self) -> u32 {
         self.width.max(self.height).ilog2() + 1
     }
 
     /// Bytes of all levels and layers.
-    pub(super) fn bytes(&self) -> u64 {
+    pub(crate) fn bytes(&self) -> u64 {
         let texels = |level: u32| u64::from((self.width >> level).max(1)) * u64::from((self.height >> level).max(1));
         4 * self.layers.len() as u64 * (0..self.levels()).map(texels).sum::<u64>()
     }
 }
 
 /// The arrays that a scene needs for one use; empty when no used material has such an image.
-pub(super) fn arrays(scene: &Scene, purpose: TextureRole) -> Vec<TextureArray> {
+pub(crate) fn arrays(scene: &Scene, purpose: TextureRole) -> Vec<TextureArray> {
     let wanted = match purpose {
         TextureRole::Color => scene.needs.textures,
         TextureRole::Normal => scene.needs.normal_maps,
@@ -76,7 +76,7 @@ pub(super) fn arrays(scene: &Scene, purpose: TextureRole) -> Vec<TextureArray> {
 ///
 /// # Errors
 /// `Invalid` with the number of bytes and a list of the arrays, largest first.
-pub(super) fn check_texture_budget(images: &[Vec<TextureArray>; 2]) -> Result<()> {
+pub(crate) fn check_texture_budget(images: &[Vec<TextureArray>; 2]) -> Result<()> {
     let mut arrays: Vec<&TextureArray> = images.iter().flatten().collect();
     let bytes: u64 = arrays.iter().map(|array| array.bytes()).sum();
     if bytes <= MAX_TEXTURE_BYTES {
@@ -93,7 +93,7 @@ pub(super) fn check_texture_budget(images: &[Vec<TextureArray>; 2]) -> Result<()
 }
 
 /// Location of a texture in its arrays.
-pub(super) fn find_layer(arrays: &[TextureArray], texture: usize) -> Option<ArrayLayer> {
+pub(crate) fn find_layer(arrays: &[TextureArray], texture: usize) -> Option<ArrayLayer> {
     arrays
         .iter()
         .enumerate()
@@ -131,7 +131,7 @@ fn merge(mut arrays: Vec<TextureArray>, limit: usize) -> Vec<TextureArray> {
 }
 
 /// Alpha threshold of a texture's texels, if only cut-outs with one cutoff use the texture.
-pub(super) fn cutoff(scene: &Scene, texture: usize) -> Option<f32> {
+pub(crate) fn cutoff(scene: &Scene, texture: usize) -> Option<f32> {
     let materials = used_materials(scene).into_iter().map(|material| &scene.materials[material]);
     let of_material = |material: &modalcast_model::domain::Material| match material.alpha_mode {
         AlphaMode::Mask { cutoff } => Some(cutoff / material.alpha),
@@ -144,7 +144,7 @@ pub(super) fn cutoff(scene: &Scene, texture: usize) -> Option<f32> {
 
 /// All mipmap levels of an image at the size of its array, level 0 first, RGBA8. With a cutoff, all levels cover the
 /// same share.
-pub(super) fn mip_levels(
+pub(crate) fn mip_levels(
     texture: &Texture,
     array: &TextureArray,
     purpose: TextureRole,
@@ -296,7 +296,7 @@ fn bleed_colors(chain: &mut [LinearImage]) {
 }
 
 /// sRGB transfer function, IEC 61966-2-1.
-pub(super) fn linear_from_srgb(encoded: f32) -> f32 {
+pub(crate) fn linear_from_srgb(encoded: f32) -> f32 {
     if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
 }
 

@@ -39,61 +39,31 @@ mod tests;
 use std::collections::BTreeMap;
 use std::rc::Rc;
 
-pub(super) use self::blocks::command_offset;
+pub(crate) use self::blocks::command_offset;
 use self::blocks::{CullUniforms, MAX_GROUPS};
-pub(super) use self::pyramid::DepthPyramid;
-pub(super) use self::run::{clear_counters, cull_for_camera, cull_shadow_casters, record_visible};
+pub(crate) use self::pyramid::DepthPyramid;
+pub(crate) use self::run::{clear_counters, cull_for_camera, cull_shadow_casters, record_visible};
 use super::geometry::{BlendMode, DrawGroup, groups};
-use super::gl::{self, Buffer, Gl, Limits, Program, Texture, VertexArray};
 use super::plan::{Allocation, RenderPlan};
 use super::programs::ProgramCompiler;
 use super::shaders::ShaderOptions;
+use crate::device::gl::{self, Buffer, Gl, Limits, Program, Texture, VertexArray};
+use crate::types::{CullStats, FrameCullStats};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Culling, Scene};
 
 /// The buffer of listed triangles, three indices each.
-pub(super) const VISIBLE_INDICES: &str = "visible indices";
+pub(crate) const VISIBLE_INDICES: &str = "visible indices";
 /// The pass that builds the lists of shadow casters.
-pub(super) const SHADOW_CULL: &str = "shadow cull";
+pub(crate) const SHADOW_CULL: &str = "shadow cull";
 /// Words of the counts: five verdicts for the camera, five for the sun.
 const COUNTER_WORDS: usize = 10;
-pub(super) const COUNTER_BYTES: usize = 4 * COUNTER_WORDS;
+pub(crate) const COUNTER_BYTES: usize = 4 * COUNTER_WORDS;
 /// The buffer of the counts.
-pub(super) const COUNTERS: &str = "cull counters";
+pub(crate) const COUNTERS: &str = "cull counters";
 /// Number of triangles from which a scene is culled on hardware by default; lies between the measurements given at
 /// `select_culling`.
 const MIN_TRIANGLES: usize = 1 << 20;
-
-/// Culling result of one view. For the sun, the counts add up over all cascades; they are zero in frames that reuse a
-/// shadow map.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
-pub struct CullStats {
-    /// Passed on to the rasterizer.
-    pub visible: u32,
-    /// Outside the view volume, or outside the box of the shadow map.
-    pub outside_view: u32,
-    /// Back faces of single-sided materials.
-    pub back_facing: u32,
-    /// Triangles that cover no sample or have no area.
-    pub no_sample: u32,
-    /// Behind the depth of the triangles that the last frame saw.
-    pub occluded: u32,
-}
-
-/// Culling results of a frame.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
-pub struct FrameCullStats {
-    pub camera: CullStats,
-    /// Casters of the shadow map.
-    pub shadow: CullStats,
-}
-
-impl CullStats {
-    /// Triangles that the rasterizer does not process.
-    pub const fn culled(&self) -> u32 {
-        self.outside_view + self.back_facing + self.no_sample + self.occluded
-    }
-}
 
 /// Culling method of a scene on a device: the look's choice, or the one that suits both. None if the lists exceed the
 /// largest buffer of the device.
@@ -106,7 +76,7 @@ impl CullStats {
 /// In software it does not pay either: on two cores, the visibility pass of the almond tree (37,560 triangles, 1080p,
 /// four samples) takes 83 ms instead of 80 ms when the 3 % of triangles without a sample are culled, and four times as
 /// long with occlusion culling.
-pub(super) fn select_culling(scene: &Scene, limits: &Limits) -> Culling {
+pub(crate) fn select_culling(scene: &Scene, limits: &Limits) -> Culling {
     let software = limits.software;
     let wanted = match scene.look.culling {
         Culling::Auto if software || scene.layout.triangles < MIN_TRIANGLES => Culling::None,
@@ -126,7 +96,7 @@ fn interpolates_at_centroid(scene: &Scene) -> bool {
 }
 
 /// Culling method of a plan.
-pub(super) fn culling_of(plan: &RenderPlan) -> Culling {
+pub(crate) fn culling_of(plan: &RenderPlan) -> Culling {
     match (plan.defines("CULLED"), plan.defines("OCCLUSION_CULLING")) {
         (_, true) => Culling::Occlusion,
         (true, false) => Culling::Triangles,
@@ -135,7 +105,7 @@ pub(super) fn culling_of(plan: &RenderPlan) -> Culling {
 }
 
 /// The passes of the camera's lists, in execution order.
-pub(super) fn passes(culling: Culling) -> Vec<&'static str> {
+pub(crate) fn passes(culling: Culling) -> Vec<&'static str> {
     match culling {
         Culling::Occlusion => vec!["occluders", "cull"],
         Culling::Triangles => vec!["cull"],
@@ -144,7 +114,7 @@ pub(super) fn passes(culling: Culling) -> Vec<&'static str> {
 }
 
 /// The buffers of a culled scene.
-pub(super) fn allocations(scene: &Scene, culling: Culling) -> Vec<Allocation> {
+pub(crate) fn allocations(scene: &Scene, culling: Culling) -> Vec<Allocation> {
     if culling == Culling::None {
         return Vec::new();
     }
@@ -165,7 +135,7 @@ pub(super) fn allocations(scene: &Scene, culling: Culling) -> Vec<Allocation> {
 
 /// Programs of the camera's lists, for one number of samples per pixel.
 #[derive(Debug, Clone)]
-pub(super) struct CullPrograms {
+pub(crate) struct CullPrograms {
     cull_triangles: Rc<Program>,
     compact: Rc<Program>,
     /// Programs of occlusion culling.
@@ -175,7 +145,7 @@ pub(super) struct CullPrograms {
 }
 
 impl CullPrograms {
-    pub(super) fn compile(
+    pub(crate) fn compile(
         options: &ShaderOptions,
         samples: u32,
         compile: &mut ProgramCompiler<'_>,
@@ -201,20 +171,20 @@ impl CullPrograms {
 
 /// Programs of the shadow casters' lists.
 #[derive(Debug)]
-pub(super) struct ShadowCullPrograms {
+pub(crate) struct ShadowCullPrograms {
     cull_triangles: Rc<Program>,
     compact: Rc<Program>,
 }
 
 impl ShadowCullPrograms {
-    pub(super) fn compile(options: &ShaderOptions, compile: &mut ProgramCompiler<'_>) -> Result<Self> {
+    pub(crate) fn compile(options: &ShaderOptions, compile: &mut ProgramCompiler<'_>) -> Result<Self> {
         Ok(Self { cull_triangles: compile(options.cull_casters())?, compact: compile(options.compact())? })
     }
 }
 
 /// The lists of a culled scene, one per group, and the vertex arrays that draw them.
 #[derive(Debug)]
-pub(super) struct TriangleCuller {
+pub(crate) struct TriangleCuller {
     uniforms: CullUniforms,
     triangle_ids: Texture,
     position_array: VertexArray,
@@ -223,7 +193,7 @@ pub(super) struct TriangleCuller {
 
 impl TriangleCuller {
     /// Creates the lists of a scene whose plan has buffers for them; none otherwise. The vertex arrays index the lists.
-    pub(super) fn new(
+    pub(crate) fn new(
         gl: &Rc<Gl>,
         buffers: &BTreeMap<String, Buffer>,
         groups: &[DrawGroup],
@@ -243,7 +213,7 @@ impl TriangleCuller {
     }
 
     /// Vertex array of one kind of listed triangle.
-    pub(super) const fn vertex_array(&self, blend_mode: BlendMode) -> Option<&VertexArray> {
+    pub(crate) const fn vertex_array(&self, blend_mode: BlendMode) -> Option<&VertexArray> {
         match blend_mode {
             BlendMode::Opaque => Some(&self.position_array),
             BlendMode::Mask | BlendMode::Blend => self.corners.as_ref(),
@@ -252,7 +222,7 @@ impl TriangleCuller {
 }
 
 /// Culling results of a frame, from its counts.
-pub(super) fn parse_stats(counts: &[u8]) -> FrameCullStats {
+pub(crate) fn parse_stats(counts: &[u8]) -> FrameCullStats {
     let words: Vec<u32> = bytemuck::pod_collect_to_vec(counts);
     let sifted = |first: usize| {
         let at = |index: usize| words.get(first + index).copied().unwrap_or_default();

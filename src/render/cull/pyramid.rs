@@ -2,14 +2,14 @@
 
 use std::rc::Rc;
 
-use super::super::gl::{self, Buffer, Framebuffer, Gl, Texture};
 use super::super::programs::SampleCountPrograms;
 use super::super::shaders::DEPTH_UNIT;
 use super::super::target::TargetDesc;
+use crate::device::gl::{self, Buffer, Framebuffer, Gl, Texture};
 use modalcast_model::error::Result;
 
 /// The coarsest level: squares of 2^8 pixels.
-pub(super) const MAX_LEVEL: u32 = 8;
+pub(crate) const MAX_LEVEL: u32 = 8;
 /// Levels that one dispatch adds to its first level, and the side of the square of texels that a workgroup reduces.
 const LEVELS_PER_PASS: u32 = 4;
 const WORKGROUP_SIDE: u32 = 1 << LEVELS_PER_PASS;
@@ -19,7 +19,7 @@ const PYRAMID: u32 = 4;
 #[derive(Debug)]
 pub(crate) struct DepthPyramid {
     /// Framebuffer with the frame's depth only.
-    pub(super) occluders: Framebuffer,
+    pub(crate) occluders: Framebuffer,
     depths: Buffer,
 }
 
@@ -40,7 +40,7 @@ impl DepthPyramid {
     }
 
     /// Builds all levels from the current depth.
-    pub(super) fn build(&self, gl: &Gl, (depth, desc): (&Texture, TargetDesc), sample_programs: &SampleCountPrograms) {
+    pub(crate) fn build(&self, gl: &Gl, (depth, desc): (&Texture, TargetDesc), sample_programs: &SampleCountPrograms) {
         let Some([fine, coarse]) = sample_programs.cull.as_ref().and_then(|cull| cull.pyramid.as_ref()) else { return };
         let groups = [desc.width, desc.height].map(|side| side.div_ceil(WORKGROUP_SIDE));
         self.bind();
@@ -51,13 +51,13 @@ impl DepthPyramid {
         gl.dispatch(groups[0].div_ceil(WORKGROUP_SIDE), groups[1].div_ceil(WORKGROUP_SIDE));
     }
 
-    pub(super) fn bind(&self) {
+    pub(crate) fn bind(&self) {
         self.depths.bind_storage(PYRAMID);
     }
 }
 
 /// Width and height in one word, as the shaders expect them.
-pub(super) const fn pack_size(desc: TargetDesc) -> u32 {
+pub(crate) const fn pack_size(desc: TargetDesc) -> u32 {
     desc.width | desc.height << 16
 }
 

@@ -2,7 +2,6 @@
 
 use super::super::FrameStats;
 use super::super::geometry::BlendMode;
-use super::super::gl::{ClearOp, Gl, Program};
 use super::super::passes::{TriangleSet, bind_visibility, draw_depth};
 use super::super::programs::SampleCountPrograms;
 use super::super::scene_buffers::SceneBuffers;
@@ -10,6 +9,7 @@ use super::super::target::RenderTarget;
 use super::blocks::CullUniforms;
 use super::pyramid::pack_size;
 use super::{COUNTER_BYTES, COUNTERS, TriangleCuller};
+use crate::device::gl::{ClearOp, Gl, Program};
 use modalcast_model::error::Result;
 
 const TRIANGLE_ID_UNIT: u32 = 25;

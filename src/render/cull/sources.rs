@@ -2,20 +2,20 @@
 
 use std::fmt::Write as _;
 
-use super::super::gl;
 use super::super::shaders::{FRAME, ProgramSource, ShaderOptions, VISIBILITY_IDS};
 use super::blocks::{MAX_GROUPS, SUPERBLOCK, WORKGROUP_SIZE};
 use super::pyramid::MAX_LEVEL;
+use crate::device::gl;
 
 const CULL: &str = include_str!("../../../shaders/shared/cull.glsl");
 
 /// First word of each view's counts.
-pub(super) const CAMERA_COUNTERS: usize = 0;
-pub(super) const SHADOW_COUNTERS: usize = 5;
+pub(crate) const CAMERA_COUNTERS: usize = 0;
+pub(crate) const SHADOW_COUNTERS: usize = 5;
 
 impl ShaderOptions {
     /// Tests which triangles the camera may see; with occlusion culling also against the depth pyramid.
-    pub(super) fn cull_triangles(&self, samples: u32) -> ProgramSource {
+    pub(crate) fn cull_triangles(&self, samples: u32) -> ProgramSource {
         let more: &[&str] = if self.has_occlusion_culling() { &["CULL_OCCLUDED"] } else { &[] };
         let head = self.cull_head(more)
             + &format!("#define FIRST_COUNTER {CAMERA_COUNTERS}\n")
@@ -25,7 +25,7 @@ impl ShaderOptions {
     }
 
     /// Tests which triangles may cast a shadow.
-    pub(super) fn cull_casters(&self) -> ProgramSource {
+    pub(crate) fn cull_casters(&self) -> ProgramSource {
         let head = self.cull_head(&["CULL_SHADOW"])
             + &format!("#define FIRST_COUNTER {SHADOW_COUNTERS}\n")
             + &self.sample_defines(1);
@@ -34,7 +34,7 @@ impl ShaderOptions {
     }
 
     /// Selects the triangles that the last frame saw.
-    pub(super) fn cull_previously_visible(&self) -> ProgramSource {
+    pub(crate) fn cull_previously_visible(&self) -> ProgramSource {
         let head = self.cull_head(&["CULL_PREVIOUS"]);
         compute(
             "cull triangles, previous".into(),
@@ -43,20 +43,20 @@ impl ShaderOptions {
     }
 
     /// Compacts the selected triangles to index lists.
-    pub(super) fn compact(&self) -> ProgramSource {
+    pub(crate) fn compact(&self) -> ProgramSource {
         let head = self.cull_head(&[]);
         compute("cull compact".into(), [&head, CULL, include_str!("../../../shaders/cull_compact.comp")].concat())
     }
 
     /// Records which triangles the ids of a frame name.
-    pub(super) fn record_visible(&self, samples: u32) -> ProgramSource {
+    pub(crate) fn record_visible(&self, samples: u32) -> ProgramSource {
         let head = self.cull_head(&[]) + &self.sample_defines(samples);
         let body = include_str!("../../../shaders/cull_record_visible.comp");
         compute(format!("cull record visible, {samples} samples"), [&head, VISIBILITY_IDS, CULL, body].concat())
     }
 
     /// Builds the first levels of the depth cull depth pyramid, or the remaining ones from them.
-    pub(super) fn pyramid(&self, samples: u32, first: bool) -> ProgramSource {
+    pub(crate) fn pyramid(&self, samples: u32, first: bool) -> ProgramSource {
         let head = self.cull_head(if first { &["FROM_DEPTH"] } else { &[] }) + &self.sample_defines(samples);
         let label = format!("cull depth pyramid, {samples} samples, {}", if first { "fine" } else { "coarse" });
         compute(label, head + include_str!("../../../shaders/cull_depth_pyramid.comp"))

@@ -4,11 +4,11 @@ use std::rc::Rc;
 use std::sync::Arc;
 
 use super::super::geometry::tests::squares;
-use super::super::gl::Limits;
 use super::super::plan::plan_for_device;
 use super::super::shaders::ProgramSource;
 use super::super::{DevicePreference, FrameParams, Renderer, SceneBuffers};
 use super::{VISIBLE_INDICES, allocations, select_culling};
+use crate::device::gl::Limits;
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{Material, Mesh, Modes, Shape};
 use modalcast_model::scene::{Camera, Culling, Lens, Scene, View};

@@ -2,7 +2,7 @@
 
 use super::super::scene_buffers::SceneBuffers;
 use super::super::{FrameImage, FrameParams, Renderer};
-use super::{RasterBackend, RasterBackends};
+use crate::types::{RasterBackend, RasterBackends};
 use modalcast_model::error::Result;
 
 /// Frames per combination; the first one warms up, and the median of the others counts.

@@ -9,7 +9,7 @@ use modalcast_model::raster::{AlphaImage, AlphaMaterial, CutOuts, GlBuffer, Rast
 use modalcast_model::scene::{CullMode, DrawRange, Scene};
 
 /// The mesh of a scene, over the shared position buffer.
-pub(super) fn of(buffers: &SceneBuffers, anisotropy: f32) -> Result<RasterGeometry> {
+pub(crate) fn of(buffers: &SceneBuffers, anisotropy: f32) -> Result<RasterGeometry> {
     let (scene, positions) = (&buffers.scene, buffers.buffer("positions")?);
     let geometry = Geometry::new(scene);
     let groups = geometry.groups.iter().map(|group| DrawRange {

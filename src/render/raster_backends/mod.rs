@@ -10,34 +10,20 @@ mod mesh;
 use std::cell::{Cell, RefCell};
 use std::rc::Rc;
 
+use super::Renderer;
 use super::frame_uniforms::{clip_from_positions, shadow_clip_from_positions};
-use super::gl::{self, Buffer, Gl, Program};
 use super::scene_buffers::SceneBuffers;
 use super::shaders::TILE;
 use super::target::RenderTarget;
-use super::{FrameParams, FrameStats, Renderer};
+use crate::device::gl::{self, Buffer, Gl, Program};
+use crate::types::{FrameParams, FrameStats, RasterBackend};
 use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::raster::{GlBuffer, RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Scene, Viewport};
 
-/// A rasterizer that can draw a pass.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum RasterBackend {
-    OpenGl,
-    Cuda,
-}
-
-/// The rasterizers of a frame's passes; none where the frame has no such pass.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
-pub struct RasterBackends {
-    pub shadow: Option<RasterBackend>,
-    pub visibility: Option<RasterBackend>,
-}
-
 /// A compute rasterizer and its output buffers.
 #[derive(Debug)]
-pub(super) struct ComputeRasterizer {
+pub(crate) struct ComputeRasterizer {
     // Declared before the buffers that it has registered, so that it is dropped first.
     rasterizer: RefCell<Box<dyn Rasterizer>>,
     shadow: Option<ShadowDepths>,
@@ -64,16 +50,6 @@ struct VisibilityKeys {
 
 /// Bytes of a key.
 const KEY_BYTES: u64 = 8;
-
-impl RasterBackend {
-    /// Name in looks and on the wire.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::OpenGl => "opengl",
-            Self::Cuda => "cuda",
-        }
-    }
-}
 
 /// Whether a compute rasterizer may draw the shadow map and the visibility. The shadow map must have moments and only
 /// one cascade. Frames must have one sample per pixel and no blended triangles, which are tested against depth.
@@ -125,21 +101,21 @@ impl Renderer {
 impl SceneBuffers {
     /// The compute rasterizer, and whether it draws the shadow map and the visibility. None where OpenGL draws both, as
     /// in rebased scenes: the rasterizer has registered the shared positions only.
-    pub(super) fn active_rasterizer(&self) -> Option<(&ComputeRasterizer, [bool; 2])> {
+    pub(crate) fn active_rasterizer(&self) -> Option<(&ComputeRasterizer, [bool; 2])> {
         let compute_rasterizer = self.compute_rasterizer.as_ref().filter(|_| self.rebased.is_none())?;
         let enabled = compute_rasterizer.enabled.get();
         enabled.contains(&true).then_some((compute_rasterizer, enabled))
     }
 
     /// The compute rasterizer if it draws the depth of the shadow map.
-    pub(super) fn shadow_rasterizer(&self) -> Option<&ComputeRasterizer> {
+    pub(crate) fn shadow_rasterizer(&self) -> Option<&ComputeRasterizer> {
         self.active_rasterizer().filter(|(_, enabled)| enabled[0]).map(|(compute_rasterizer, _)| compute_rasterizer)
     }
 }
 
 impl ComputeRasterizer {
     /// Draws the requested outputs of this frame into the buffers.
-    pub(super) fn draw(
+    pub(crate) fn draw(
         &self,
         gl: &Rc<Gl>,
         (buffers, shot): (&SceneBuffers, &FrameParams),
@@ -166,18 +142,18 @@ impl ComputeRasterizer {
     }
 
     /// Disables the compute rasterizer after an error; OpenGL draws the scene from now on.
-    pub(super) fn disable(&self, error: &Error) {
+    pub(crate) fn disable(&self, error: &Error) {
         tracing::warn!(%error, "OpenGL draws from now on: the rasterizer beside it failed");
         self.enabled.set([false; 2]);
     }
 
     /// Input buffer and program of the first blur pass.
-    pub(super) fn blur_input(&self) -> Option<(&Buffer, &Program)> {
+    pub(crate) fn blur_input(&self) -> Option<(&Buffer, &Program)> {
         self.shadow.as_ref().map(|depths| (&depths.buffer, depths.blur.as_ref()))
     }
 
     /// Converts the keys to the ids that the camera sees, including the ground.
-    pub(super) fn unpack(&self, gl: &Gl, target: &RenderTarget, stats: &mut FrameStats) -> Result<()> {
+    pub(crate) fn unpack(&self, gl: &Gl, target: &RenderTarget, stats: &mut FrameStats) -> Result<()> {
         let missing = || fault_in("unpack")("no keys were drawn");
         let keys = self.visibility.as_ref().ok_or_else(missing)?;
         keys.unpack.bind(None);
@@ -190,7 +166,7 @@ impl ComputeRasterizer {
     }
 
     /// Buffers that it holds, by name and bytes.
-    pub(super) fn allocations(&self) -> impl Iterator<Item = (&'static str, u64)> {
+    pub(crate) fn allocations(&self) -> impl Iterator<Item = (&'static str, u64)> {
         let keys = self.visibility.as_ref().and_then(|keys| keys.buffer.borrow().as_ref().map(|buffer| buffer.bytes));
         let depths = self.shadow.as_ref().map(|depths| depths.buffer.bytes);
         [("raster shadow depths", depths), ("raster visibility keys", keys)]

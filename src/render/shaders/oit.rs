@@ -6,8 +6,8 @@ use super::{
     BARYCENTRICS, CLIP, FRAME, OIT_LISTS, PHONG, ProgramSource, ShaderOptions, TILE, TILE_ROW, TRIANGLE_ID,
     TRIANGLE_SHADING, UvDerivatives, vertex_and_fragment,
 };
+use crate::device::gl;
 use crate::geometry::BlendMode;
-use crate::gl;
 
 /// Side of the square of pixels whose fragments a workgroup counts.
 pub(crate) const HISTOGRAM_TILE: u32 = 16;

@@ -1,7 +1,7 @@
 //! Shader sources of outputs that are drawn only on request: picks and AOV readbacks.
 
 use super::{BARYCENTRICS, CLIP, FRAME, ProgramSource, ShaderOptions, VISIBILITY_IDS, WORKGROUP_SIZE};
-use crate::gl;
+use crate::device::gl;
 
 impl ShaderOptions {
     /// Reads an AOV field from the ids: `DEPTH` and `NORMALS` of one sample per pixel, `VALUES` of all samples.

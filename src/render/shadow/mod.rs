@@ -7,22 +7,22 @@ mod sources;
 
 use std::rc::Rc;
 
-pub(super) use self::cache::ShadowCache;
-pub(super) use self::sources::defines;
+pub(crate) use self::cache::ShadowCache;
+pub(crate) use self::sources::defines;
 use self::sources::{TEXELS_PER_INVOCATION, texels_per_workgroup};
 use super::geometry::BlendMode;
-use super::gl::{self, ClearOp, Framebuffer, Gl, PipelineState, Program, Texture, TextureDesc};
 use super::passes::{draw_blend_mode, triangle_set};
 use super::raster_backends::ComputeRasterizer;
 use super::region::Region;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::WORKGROUP_SIZE;
+use crate::device::gl::{self, ClearOp, Framebuffer, Gl, PipelineState, Program, Texture, TextureDesc};
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{BlurMethod, MomentFormat, ShadowSettings};
 
 /// Textures and framebuffers of a shadow map.
 #[derive(Debug)]
-pub(super) struct ShadowMap {
+pub(crate) struct ShadowMap {
     shadow: ShadowSettings,
     depth: Texture,
     /// One per layer of the depth.
@@ -41,7 +41,7 @@ struct BlurredMoments {
 }
 
 /// Resolves the settings that depend on the kind of device.
-pub(super) fn resolve_blurring(shadow: ShadowSettings, software: bool) -> ShadowSettings {
+pub(crate) fn resolve_blurring(shadow: ShadowSettings, software: bool) -> ShadowSettings {
     let blur_method = match shadow.blur_method {
         BlurMethod::Auto if software => BlurMethod::Rows,
         BlurMethod::Auto => BlurMethod::Tiles,
@@ -51,7 +51,7 @@ pub(super) fn resolve_blurring(shadow: ShadowSettings, software: bool) -> Shadow
 }
 
 /// Textures of a map: name, bytes per texel, layers.
-pub(super) fn textures(shadow: &ShadowSettings) -> Vec<(&'static str, u32, u32)> {
+pub(crate) fn textures(shadow: &ShadowSettings) -> Vec<(&'static str, u32, u32)> {
     let pair = if shadow.moments == MomentFormat::F16 { 4 } else { 8 };
     let mut textures = vec![("shadow depth", 4, shadow.splits)];
     if shadow.has_moments() {
@@ -64,7 +64,7 @@ pub(super) fn textures(shadow: &ShadowSettings) -> Vec<(&'static str, u32, u32)>
 }
 
 impl ShadowMap {
-    pub(super) fn new(gl: &Rc<Gl>, shadow: ShadowSettings) -> Result<Self> {
+    pub(crate) fn new(gl: &Rc<Gl>, shadow: ShadowSettings) -> Result<Self> {
         let most = gl.limits.max_side;
         if shadow.size > most {
             return Err(gl::too_large("look.shadow.size", u64::from(most), u64::from(shadow.size)));
@@ -77,12 +77,12 @@ impl ShadowMap {
     }
 
     /// The texture that the shading samples: moments if there are any, else depth.
-    pub(super) fn lookup(&self) -> &Texture {
+    pub(crate) fn lookup(&self) -> &Texture {
         self.blurred.as_ref().map_or(&self.depth, |blurred| &blurred.moments)
     }
 
     /// Number of textures that the map holds.
-    pub(super) fn texture_count(&self) -> usize {
+    pub(crate) fn texture_count(&self) -> usize {
         textures(&self.shadow).len()
     }
 }
@@ -121,7 +121,7 @@ fn create_image(gl: &Rc<Gl>, shadow: &ShadowSettings, format: u32, filter: u32, 
 }
 
 /// Draws the depth from the sun, layer by layer.
-pub(super) fn depth(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<()> {
+pub(crate) fn depth(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<()> {
     let size = map.shadow.size;
     let drawn = triangle_set(buffers);
     for (layer, framebuffer) in (0..).zip(&map.framebuffers) {
@@ -141,7 +141,7 @@ pub(super) fn depth(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<
 }
 
 /// Blurs the moments of the depth, layer by layer. Returns whether the map has moments.
-pub(super) fn blur(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<bool> {
+pub(crate) fn blur(gl: &Gl, buffers: &SceneBuffers, map: &ShadowMap) -> Result<bool> {
     let Some(blurred) = &map.blurred else { return Ok(false) };
     let mut programs: Vec<&Program> = buffers.programs.blur.iter().map(AsRef::as_ref).collect();
     if let (Some((depths, program)), Some(first)) =

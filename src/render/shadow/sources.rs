@@ -4,11 +4,11 @@
 use std::fmt::Write as _;
 
 use super::super::geometry::BlendMode;
-use super::super::gl;
 use super::super::shaders::{
     FRAME, ProgramSource, SHADOW_CASTER, ShaderOptions, TRIANGLE_ID, UvDerivatives, WORKGROUP_SIZE, vertex_and_fragment,
 };
 use super::blur_strip::BlurStrip;
+use crate::device::gl;
 use modalcast_model::scene::{BlurMethod, MomentFormat, ShadowMethod, ShadowSettings};
 
 const SUN_VISIBILITY: &str = include_str!("../../../shaders/shared/sun_visibility.glsl");
@@ -20,7 +20,7 @@ pub(crate) const TEXELS_PER_INVOCATION: u32 = 8;
 /// Lanes of a workgroup that blurs a tile.
 const TILE_WORKGROUP_SIZE: u32 = 256;
 /// Bytes of shared memory that every device gives a workgroup.
-pub(super) const SHARED_BYTES: u32 = 32 << 10;
+pub(crate) const SHARED_BYTES: u32 = 32 << 10;
 
 /// Defines of a shadow method.
 pub(crate) fn defines(shadow: &ShadowSettings) -> impl Iterator<Item = &'static str> {

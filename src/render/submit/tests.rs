@@ -6,8 +6,8 @@ use std::thread;
 use std::time::Duration;
 
 use super::super::geometry::tests::squares;
-use super::super::readback_ring::MAX_FRAMES_IN_FLIGHT;
 use super::super::{DevicePreference, FrameImage, FrameParams, Renderer, SceneBuffers};
+use crate::device::readback_ring::MAX_FRAMES_IN_FLIGHT;
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::error::Error;

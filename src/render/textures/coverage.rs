@@ -12,7 +12,7 @@ use super::LinearImage;
 const MIN_SAMPLES_PER_SIDE: u32 = 256;
 
 /// Scales the alpha of all levels but the first.
-pub(super) fn preserve_coverage(chain: &mut [LinearImage], cutoff: f32) {
+pub(crate) fn preserve_coverage(chain: &mut [LinearImage], cutoff: f32) {
     let Some((first, rest)) = chain.split_first_mut() else { return };
     let share = coverage(first, cutoff);
     for level in rest {
@@ -25,7 +25,7 @@ pub(super) fn preserve_coverage(chain: &mut [LinearImage], cutoff: f32) {
 }
 
 /// Share of an image whose alpha is at or above the cutoff.
-pub(super) fn coverage(image: &LinearImage, cutoff: f32) -> f32 {
+pub(crate) fn coverage(image: &LinearImage, cutoff: f32) -> f32 {
     let samples = samples(image);
     samples.iter().filter(|alpha| **alpha >= cutoff).count() as f32 / samples.len() as f32
 }

@@ -13,7 +13,7 @@ pub const MAX_FRAMES_IN_FLIGHT: usize = 3;
 
 /// The staging buffers of one form.
 #[derive(Debug)]
-pub(super) struct ReadbackRing {
+pub(crate) struct ReadbackRing {
     gl: Rc<Gl>,
     bytes: u64,
     allocated: Cell<usize>,
@@ -23,13 +23,13 @@ pub(super) struct ReadbackRing {
 
 /// Staging buffer of one frame. Dropping the slot returns the buffer to the ring.
 #[derive(Debug)]
-pub(super) struct ReadbackSlot {
+pub(crate) struct ReadbackSlot {
     readback_ring: Rc<ReadbackRing>,
     staging: Option<StagingBuffer>,
 }
 
 impl ReadbackRing {
-    pub(super) fn new(gl: &Rc<Gl>, bytes: u64) -> Rc<Self> {
+    pub(crate) fn new(gl: &Rc<Gl>, bytes: u64) -> Rc<Self> {
         Rc::new(Self { gl: Rc::clone(gl), bytes, allocated: Cell::new(0), free: RefCell::default() })
     }
 
@@ -38,7 +38,7 @@ impl ReadbackRing {
     ///
     /// # Errors
     /// `Busy` when all buffers have frames in flight or the reader exceeds `limit`; `Fault` of OpenGL.
-    pub(super) fn acquire(self: &Rc<Self>, limit: Duration) -> Result<ReadbackSlot> {
+    pub(crate) fn acquire(self: &Rc<Self>, limit: Duration) -> Result<ReadbackSlot> {
         let slot = |staging: StagingBuffer| ReadbackSlot { readback_ring: Rc::clone(self), staging: Some(staging) };
         let free = self.free.borrow().iter().position(|staging| staging.is_read(Duration::ZERO));
         if let Some(staging) = free.and_then(|at| self.free.borrow_mut().remove(at)) {
@@ -56,14 +56,14 @@ impl ReadbackRing {
 
     /// Number of buffers in the ring.
     #[cfg(test)]
-    pub(super) fn count(&self) -> usize {
+    pub(crate) fn count(&self) -> usize {
         self.allocated.get()
     }
 }
 
 impl ReadbackSlot {
     /// The staging buffer.
-    pub(super) fn staging(&self) -> Option<&StagingBuffer> {
+    pub(crate) fn staging(&self) -> Option<&StagingBuffer> {
         self.staging.as_ref()
     }
 }

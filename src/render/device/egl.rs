@@ -41,25 +41,25 @@ thread_local! {
 
 /// A display on which a context can be created.
 #[derive(Debug, Clone)]
-pub(super) struct Candidate {
+pub(crate) struct Candidate {
     /// Index among EGL's devices; `None` for Mesa's surfaceless platform.
-    pub(super) index: Option<usize>,
-    pub(super) vendor: String,
-    pub(super) extensions: Vec<String>,
-    pub(super) cuda_device: Option<i32>,
-    pub(super) drm_node: Option<String>,
+    pub(crate) index: Option<usize>,
+    pub(crate) vendor: String,
+    pub(crate) extensions: Vec<String>,
+    pub(crate) cuda_device: Option<i32>,
+    pub(crate) drm_node: Option<String>,
     /// Whether the device reports that it is a software renderer.
-    pub(super) software: bool,
+    pub(crate) software: bool,
     display: egl::Display,
 }
 
 /// A surfaceless OpenGL context; its users make it current.
-pub(super) struct Context {
+pub(crate) struct Context {
     number: u64,
     display: egl::Display,
     context: egl::Context,
     /// Whether it is a debug context.
-    pub(super) is_debug: bool,
+    pub(crate) is_debug: bool,
 }
 
 struct EglApi {
@@ -169,7 +169,7 @@ impl EglApi {
 ///
 /// # Errors
 /// `Unavailable` when libEGL cannot be loaded.
-pub(super) fn candidates() -> Result<Vec<Candidate>> {
+pub(crate) fn candidates() -> Result<Vec<Candidate>> {
     let api = api()?;
     let _door = lock_contexts();
     let mut found: Vec<Candidate> =
@@ -188,14 +188,14 @@ pub(super) fn candidates() -> Result<Vec<Candidate>> {
 }
 
 /// Error when no candidate is suitable.
-pub(super) fn no_device_error(wanted: &str, tried: &[String]) -> Error {
+pub(crate) fn no_device_error(wanted: &str, tried: &[String]) -> Error {
     let tried = if tried.is_empty() { "no EGL device is there".to_string() } else { tried.join("; ") };
     unavailable(format!("no context on {wanted}: {tried}"))
 }
 
 impl Context {
     /// Creates a context on a candidate and makes it current on this thread.
-    pub(super) fn open(candidate: &Candidate) -> Result<Self> {
+    pub(crate) fn open(candidate: &Candidate) -> Result<Self> {
         let is_debug = super::gl::is_debug_enabled();
         let made = Self::make(candidate.display, is_debug)?;
         // Outside the lock: on failure the context is dropped, which takes the lock.
@@ -230,7 +230,7 @@ impl Context {
     }
 
     /// Makes the context current on this thread unless it already is.
-    pub(super) fn make_current(&self) -> Result<()> {
+    pub(crate) fn make_current(&self) -> Result<()> {
         if CURRENT_CONTEXT.get() == self.number {
             return Ok(());
         }
@@ -241,7 +241,7 @@ impl Context {
     }
 
     /// Address of an OpenGL function, or null.
-    pub(super) fn address(&self, name: &str) -> *const c_void {
+    pub(crate) fn address(&self, name: &str) -> *const c_void {
         let found = api().ok().and_then(|api| api.instance.get_proc_address(name));
         found.map_or(std::ptr::null(), |found| found as *const c_void)
     }

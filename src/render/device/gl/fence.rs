@@ -87,9 +87,9 @@ impl Gl {
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::target::{TargetDesc, create_image};
-    use super::super::super::{DevicePreference, device};
     use super::*;
+    use crate::target::{TargetDesc, create_image};
+    use crate::{DevicePreference, device};
 
     /// Draws a picture that takes long; in software, on threads of the driver.
     fn draw_for_long(gl: &Rc<Gl>, turns: u32) {

@@ -2,8 +2,8 @@
 
 use glow::HasContext as _;
 
-use super::super::region::{DirtyRegion, Region};
 use super::{Framebuffer, Gl};
+use crate::region::{DirtyRegion, Region};
 
 /// Dirty regions of an id image and its depth image.
 #[derive(Debug, Default)]

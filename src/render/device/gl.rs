@@ -20,18 +20,18 @@ use std::rc::Rc;
 
 use glow::HasContext as _;
 
-pub(super) use self::clear::{ClearOp, VisibilityDirty};
-pub(super) use self::debug::is_enabled as is_debug_enabled;
-pub(super) use self::fence::Fence;
-pub(super) use self::limits::Limits;
-pub(super) use self::object::{Buffer, Framebuffer, Program, Texture, TextureDesc, VertexArray};
-pub(super) use self::staging::{ReadbackView, StagingBuffer};
-pub(super) use self::timer::PassTimer;
+pub(crate) use self::clear::{ClearOp, VisibilityDirty};
+pub(crate) use self::debug::is_enabled as is_debug_enabled;
+pub(crate) use self::fence::Fence;
+pub(crate) use self::limits::Limits;
+pub(crate) use self::object::{Buffer, Framebuffer, Program, Texture, TextureDesc, VertexArray};
+pub(crate) use self::staging::{ReadbackView, StagingBuffer};
+pub(crate) use self::timer::PassTimer;
 use super::egl::Context;
 use modalcast_model::error::{Error, Result, fault_in};
 
 /// OpenGL constants that other modules use.
-pub(super) use glow::{
+pub(crate) use glow::{
     CLAMP_TO_EDGE, COMPUTE_SHADER, DEPTH_COMPONENT32F, DYNAMIC_DRAW, FRAGMENT_SHADER, LINEAR, LINEAR_MIPMAP_LINEAR,
     LINEAR_MIPMAP_NEAREST, NEAREST, R32F, R32UI, REPEAT, RG16F, RG32F, RGB32F, RGB32UI, RGBA8, RGBA16F, RGBA32F,
     SRGB8_ALPHA8, STATIC_DRAW, STREAM_COPY, STREAM_READ, TEXTURE_2D, TEXTURE_2D_ARRAY, TEXTURE_2D_MULTISAMPLE,
@@ -39,11 +39,11 @@ pub(super) use glow::{
 };
 
 /// An OpenGL context and its functions.
-pub(super) struct Gl {
+pub(crate) struct Gl {
     // Declared before the context, so that it is dropped while the context exists.
     glow: glow::Context,
     context: Context,
-    pub(super) limits: Limits,
+    pub(crate) limits: Limits,
     /// Pool of timer queries that are not in use.
     free_queries: RefCell<Vec<glow::Query>>,
     /// Buffers that will be freed once their readers are done.
@@ -64,29 +64,29 @@ impl std::fmt::Debug for Gl {
 }
 
 /// A vertex attribute: location, buffer, number of 32-bit components, and whether it is an integer.
-pub(super) struct VertexAttribute<'a> {
-    pub(super) location: u32,
-    pub(super) buffer: &'a Buffer,
-    pub(super) components: i32,
-    pub(super) integer: bool,
+pub(crate) struct VertexAttribute<'a> {
+    pub(crate) location: u32,
+    pub(crate) buffer: &'a Buffer,
+    pub(crate) components: i32,
+    pub(crate) integer: bool,
 }
 
 /// The fixed-function state of a pass.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct PipelineState {
-    pub(super) depth_write: bool,
+pub(crate) struct PipelineState {
+    pub(crate) depth_write: bool,
     /// Depth outside near and far is clamped instead of clipped.
-    pub(super) depth_clamp: bool,
+    pub(crate) depth_clamp: bool,
     /// Depth is offset away from the camera, so that surfaces in the same plane stay visible.
-    pub(super) polygon_offset: bool,
-    pub(super) cull: bool,
+    pub(crate) polygon_offset: bool,
+    pub(crate) cull: bool,
     /// Colors are blended over the existing ones; alpha becomes the transmittance: the share of the background that
     /// remains visible.
-    pub(super) blend: bool,
+    pub(crate) blend: bool,
 }
 
 impl Gl {
-    pub(super) fn new(context: Context) -> Result<Rc<Self>> {
+    pub(crate) fn new(context: Context) -> Result<Rc<Self>> {
         context.make_current()?;
         let address = |name: &std::ffi::CStr| name.to_str().map_or(std::ptr::null(), |name| context.address(name));
         // SAFETY: the context is current on this thread, and EGL returned the addresses for this context.
@@ -106,7 +106,7 @@ impl Gl {
     }
 
     /// Fails if OpenGL reported an error since the last check.
-    pub(super) fn check(&self, stage: &'static str) -> Result<()> {
+    pub(crate) fn check(&self, stage: &'static str) -> Result<()> {
         // SAFETY: a query without side effects on memory; the context is current.
         match unsafe { self.current().get_error() } {
             glow::NO_ERROR => Ok(()),
@@ -117,7 +117,7 @@ impl Gl {
 
     /// Creates a buffer of `bytes`, at least 4 because OpenGL has no empty buffers. It is filled from `data` if that
     /// has exactly `bytes` bytes.
-    pub(super) fn buffer(self: &Rc<Self>, bytes: u64, usage: u32, data: Option<&[u8]>) -> Result<Buffer> {
+    pub(crate) fn buffer(self: &Rc<Self>, bytes: u64, usage: u32, data: Option<&[u8]>) -> Result<Buffer> {
         let size = i32::try_from(bytes.max(4))
             .map_err(|_| fault_in("buffer")(format!("{bytes} bytes is over the 2 GiB that one buffer may have")))?;
         let gl = self.current();
@@ -138,7 +138,7 @@ impl Gl {
         self.check("buffer").map(|()| buffer)
     }
 
-    pub(super) fn texture(self: &Rc<Self>, desc: TextureDesc) -> Result<Texture> {
+    pub(crate) fn texture(self: &Rc<Self>, desc: TextureDesc) -> Result<Texture> {
         let gl = self.current();
         let [width, height, depth, levels] = [desc.width, desc.height, desc.depth, desc.levels].map(|side| side as i32);
         // SAFETY: allocates storage for a new texture; OpenGL reports sizes above the limits as errors.
@@ -159,7 +159,7 @@ impl Gl {
     }
 
     /// Creates a buffer texture over a whole buffer. The buffer must outlive it.
-    pub(super) fn buffer_texture(self: &Rc<Self>, buffer: &Buffer, format: u32) -> Result<Texture> {
+    pub(crate) fn buffer_texture(self: &Rc<Self>, buffer: &Buffer, format: u32) -> Result<Texture> {
         let gl = self.current();
         let target = glow::TEXTURE_BUFFER;
         // SAFETY: a new texture over a buffer of this context.
@@ -175,7 +175,7 @@ impl Gl {
     }
 
     /// Compiles and links a program from pairs of stage and source.
-    pub(super) fn program(self: &Rc<Self>, label: &str, stages: &[(u32, &str)]) -> Result<Program> {
+    pub(crate) fn program(self: &Rc<Self>, label: &str, stages: &[(u32, &str)]) -> Result<Program> {
         let gl = self.current();
         let fail = |log: String| fault_in("shader")(format!("{label}: {log}"));
         // SAFETY: new objects; the shaders are flagged for deletion and live until the program is deleted.
@@ -197,7 +197,7 @@ impl Gl {
         }
     }
 
-    pub(super) fn framebuffer(self: &Rc<Self>, color: Option<&Texture>, depth: &Texture) -> Result<Framebuffer> {
+    pub(crate) fn framebuffer(self: &Rc<Self>, color: Option<&Texture>, depth: &Texture) -> Result<Framebuffer> {
         self.attach_framebuffer(color, Some(depth))
     }
 
@@ -222,7 +222,7 @@ impl Gl {
         }
     }
 
-    pub(super) fn vertex_array(
+    pub(crate) fn vertex_array(
         self: &Rc<Self>,
         index: Option<&Buffer>,
         from: &[VertexAttribute<'_>],
@@ -249,7 +249,7 @@ impl Gl {
     }
 
     /// Sample positions within the pixels of a framebuffer, 0 to 1 from the lower left.
-    pub(super) fn sample_positions(&self, of: &Framebuffer, samples: u32) -> Result<Vec<[f32; 2]>> {
+    pub(crate) fn sample_positions(&self, of: &Framebuffer, samples: u32) -> Result<Vec<[f32; 2]>> {
         type GetMultisample = unsafe extern "system" fn(u32, u32, *mut f32);
         let gl = self.current();
         let address = self.context.address("glGetMultisamplefv");
@@ -268,7 +268,7 @@ impl Gl {
         }
     }
 
-    pub(super) fn set_pipeline_state(&self, fixed: PipelineState) {
+    pub(crate) fn set_pipeline_state(&self, fixed: PipelineState) {
         let gl = self.current();
         let flip = |flag: u32, on: bool| {
             // SAFETY: flags that every 4.3 core context accepts.
@@ -290,7 +290,7 @@ impl Gl {
     }
 
     /// Draws `triangles` triangles of an array's index buffer from triangle `first` on.
-    pub(super) fn draw_indexed(&self, array: &VertexArray, first: usize, triangles: usize) {
+    pub(crate) fn draw_indexed(&self, array: &VertexArray, first: usize, triangles: usize) {
         let gl = self.current();
         // SAFETY: the indices come from validated meshes and stay below the number of elements of each attribute.
         unsafe {
@@ -301,7 +301,7 @@ impl Gl {
     }
 
     /// Draws vertices that the vertex shader derives from their index.
-    pub(super) fn draw_procedural(&self, array: &VertexArray, vertices: u32) {
+    pub(crate) fn draw_procedural(&self, array: &VertexArray, vertices: u32) {
         let gl = self.current();
         // SAFETY: no attribute is read.
         unsafe {
@@ -312,7 +312,7 @@ impl Gl {
     }
 
     /// Runs the bound compute program, followed by a barrier that makes its writes visible to later commands.
-    pub(super) fn dispatch(&self, groups_x: u32, groups_y: u32) {
+    pub(crate) fn dispatch(&self, groups_x: u32, groups_y: u32) {
         let gl = self.current();
         // SAFETY: the shaders check their own bounds.
         unsafe {
@@ -322,7 +322,7 @@ impl Gl {
     }
 
     /// Like [`Self::dispatch`]; the first three words of a buffer give the number of workgroups.
-    pub(super) fn dispatch_indirect(&self, groups: &Buffer) {
+    pub(crate) fn dispatch_indirect(&self, groups: &Buffer) {
         let gl = self.current();
         // SAFETY: the buffer holds more than three words; the shaders check their own bounds.
         unsafe {
@@ -332,12 +332,12 @@ impl Gl {
         }
     }
 
-    pub(super) fn copy(&self, from: &Buffer, to: &Buffer, bytes: u64) {
+    pub(crate) fn copy(&self, from: &Buffer, to: &Buffer, bytes: u64) {
         self.copy_to_offset(from, (to, 0), bytes);
     }
 
     /// Copies the first `bytes` bytes to byte offset `place` of the other buffer.
-    pub(super) fn copy_to_offset(&self, from: &Buffer, (to, place): (&Buffer, u64), bytes: u64) {
+    pub(crate) fn copy_to_offset(&self, from: &Buffer, (to, place): (&Buffer, u64), bytes: u64) {
         let gl = self.current();
         let (read, write) = (glow::COPY_READ_BUFFER, glow::COPY_WRITE_BUFFER);
         // SAFETY: OpenGL rejects ranges outside either buffer.
@@ -350,6 +350,6 @@ impl Gl {
 }
 
 /// Error for a size above a device limit, which the caller can act on.
-pub(super) fn too_large(what: &str, limit: u64, given: u64) -> Error {
+pub(crate) fn too_large(what: &str, limit: u64, given: u64) -> Error {
     modalcast_model::error::invalid(what, format!("at most {limit} on this device"), given)
 }

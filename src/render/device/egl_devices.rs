@@ -1,8 +1,8 @@
 //! EGL devices: describes all of them for `doctor`, and selects one.
 
-use super::DevicePreference;
 use super::egl::{Candidate, Context, candidates, no_device_error};
 use super::gl::Gl;
+use crate::types::DevicePreference;
 use modalcast_model::error::{Error, Result};
 
 /// A device that may offer OpenGL, as EGL describes it.
@@ -55,7 +55,7 @@ fn describe(candidate: Candidate) -> EglDevice {
 }
 
 /// Opens the preferred device and returns it with the ordinal of its CUDA device.
-pub(super) fn open(prefer: DevicePreference) -> Result<(std::rc::Rc<Gl>, Option<i32>)> {
+pub(crate) fn open(prefer: DevicePreference) -> Result<(std::rc::Rc<Gl>, Option<i32>)> {
     let mut tried = Vec::new();
     for (candidate, software) in rank_candidates(candidates()?, prefer) {
         let name = candidate.index.map_or("surfaceless".to_string(), |index| format!("device {index}"));

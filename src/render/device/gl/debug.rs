@@ -96,8 +96,8 @@ mod tests {
 
     use tracing::Dispatch;
 
-    use super::super::super::{DevicePreference, device};
     use super::*;
+    use crate::{DevicePreference, device};
 
     #[derive(Clone, Default)]
     struct Lines(Arc<Mutex<Vec<u8>>>);

@@ -1,0 +1,196 @@
+//! Values that the renderer takes and returns. They refer to no device.
+
+use modalcast_model::scene::{Bounds, Camera, LightSpaceBox};
+
+/// Preference for the EGL device that draws.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DevicePreference {
+    /// The EGL device that corresponds to this CUDA device ordinal.
+    Cuda(i32),
+    /// Any hardware device; Mesa's software rasterizer when there is none.
+    Any,
+    /// Mesa's software rasterizer.
+    Software,
+}
+
+/// Description of the OpenGL device and driver.
+#[derive(Debug, Clone, serde::Serialize)]
+pub struct RendererInfo {
+    /// The GL_RENDERER string.
+    pub renderer: String,
+    /// The GL_VERSION string.
+    pub version: String,
+    /// Whether OpenGL runs on the CPU.
+    pub software: bool,
+    /// Ordinal of the corresponding CUDA device, from EGL_CUDA_DEVICE_NV.
+    pub cuda_device: Option<i32>,
+    /// Longest side of a frame, in pixels.
+    pub max_side: u32,
+}
+
+/// Parameters of one frame; the geometry is the current content of the scene's buffers.
+#[derive(Debug, Clone, Copy)]
+pub struct FrameParams {
+    pub camera: Camera,
+    pub width: u32,
+    pub height: u32,
+    /// Bounds of all deformed vertices, in scene units. The frame draws nothing outside them; bounds that are not
+    /// finite are ignored.
+    pub bounds: Bounds,
+    /// Bounds of the same vertices in light space, to which the shadow map is fitted. Without them, the map is fitted
+    /// to the corners of `bounds`.
+    pub light: Option<LightSpaceBox>,
+}
+
+/// RGBA8 sRGB pixels of a frame, top row first.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FrameImage {
+    pub width: u32,
+    pub height: u32,
+    pub rgba: Vec<u8>,
+    /// Milliseconds by name. The stages are "shadow", "draw" and "read". "raster" (the compute rasterizer, including
+    /// the visibility when it draws both) and "blur" are part of the shadow stage. "ids" (the compute rasterizer when
+    /// it draws visibility only), "cull" (with the occluders), "visibility" (with the ground), "blended" (with the
+    /// fragment lists), "shade" (with the backdrop), "bloom" and "encode" are part of the draw stage.
+    pub passes: Vec<(&'static str, f64)>,
+    pub raster_backends: RasterBackends,
+}
+
+/// Names of the OpenGL buffers that a deformer can write directly, instead of an upload.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SharedBuffers {
+    /// 3 f32 per vertex.
+    pub positions: u32,
+    /// 3 f32 per corner.
+    pub normals: u32,
+    /// 4 f32 per corner; present when the scene has normal maps.
+    pub tangents: Option<u32>,
+}
+
+/// Statistics of the last frame that was collected: the passes that ran and how many triangles they processed.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct FrameStats {
+    /// Passes in execution order. When several frames of one step share a shadow, only the first of them has "shadow"
+    /// and "blur"; see [`crate::SceneBuffers::set_step`].
+    pub passes: Vec<&'static str>,
+    /// The rasterizer that drew the shadow map and the visibility.
+    pub raster_backends: RasterBackends,
+    /// Number of draw calls of the visibility and blended passes.
+    pub draw_calls: usize,
+    /// Samples per pixel.
+    pub samples: u32,
+    /// Fragment list statistics; present with exact transparency.
+    pub oit: Option<OitStats>,
+    /// Culling statistics; present when triangles are culled.
+    pub culled: Option<FrameCullStats>,
+}
+
+/// A rasterizer that can draw a pass.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RasterBackend {
+    OpenGl,
+    Cuda,
+}
+
+/// The rasterizers of a frame's passes; none where the frame has no such pass.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
+pub struct RasterBackends {
+    pub shadow: Option<RasterBackend>,
+    pub visibility: Option<RasterBackend>,
+}
+
+impl RasterBackend {
+    /// Name in looks and on the wire.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::OpenGl => "opengl",
+            Self::Cuda => "cuda",
+        }
+    }
+}
+
+/// Fragment statistics of a frame.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
+pub struct OitStats {
+    /// Blended fragments that are not wholly transparent and not hidden by something opaque.
+    pub fragments: u64,
+    /// Fragments within the budget. The others, the farthest of their pixels, are missing in the picture.
+    pub stored: u64,
+    /// Largest number of fragments in a pixel.
+    pub max_per_pixel: u32,
+    /// Maximum number of fragments per pixel, when the budget was exceeded.
+    pub per_pixel_limit: Option<u32>,
+}
+
+impl OitStats {
+    /// Fragments that are missing in the picture.
+    pub const fn dropped(&self) -> u64 {
+        self.fragments - self.stored
+    }
+}
+
+/// Culling result of one view. For the sun, the counts add up over all cascades; they are zero in frames that reuse a
+/// shadow map.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
+pub struct CullStats {
+    /// Passed on to the rasterizer.
+    pub visible: u32,
+    /// Outside the view volume, or outside the box of the shadow map.
+    pub outside_view: u32,
+    /// Back faces of single-sided materials.
+    pub back_facing: u32,
+    /// Triangles that cover no sample or have no area.
+    pub no_sample: u32,
+    /// Behind the depth of the triangles that the last frame saw.
+    pub occluded: u32,
+}
+
+/// Culling results of a frame.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
+pub struct FrameCullStats {
+    pub camera: CullStats,
+    /// Casters of the shadow map.
+    pub shadow: CullStats,
+}
+
+impl CullStats {
+    /// Triangles that the rasterizer does not process.
+    pub const fn culled(&self) -> u32 {
+        self.outside_view + self.back_facing + self.no_sample + self.occluded
+    }
+}
+
+/// What a sample of a frame sees.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum VisibilityId {
+    /// Neither triangle nor ground, that is, the sky.
+    Background,
+    Ground,
+    /// A triangle, by its index in the renderer's draw order; [`crate::SceneBuffers::source_triangle`] maps it to its domain.
+    Triangle(usize),
+}
+
+impl VisibilityId {
+    /// Twin of `shaders/shared/visibility_ids.glsl`.
+    pub(crate) const fn from_id(id: u32) -> Self {
+        match id {
+            0 => Self::Background,
+            u32::MAX => Self::Ground,
+            place => Self::Triangle(place as usize - 1),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ids_of_the_sky_the_ground_and_the_first_triangle_are_told_apart() {
+        assert_eq!(
+            [0, 1, u32::MAX].map(VisibilityId::from_id),
+            [VisibilityId::Background, VisibilityId::Triangle(0), VisibilityId::Ground]
+        );
+    }
+}
