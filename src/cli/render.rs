@@ -4,14 +4,14 @@ use std::fs;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use super::options::{ImageSize, parse_point, with_spinner};
+use super::options::{parse_point, with_spinner};
 use super::{Outcome, print_line};
 use crate::config::{BackendChoice, Config, RendererChoice};
 use crate::engine::{DeviceContext, FrameOutput, LoadedScene, validate_mode};
 use crate::frame;
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 use modalcast_model::load;
-use modalcast_model::scene::{Camera, Lens, Scene, SceneState, View};
+use modalcast_model::scene::{Camera, FrameSize, Lens, Scene, SceneState, View};
 
 /// Renders one frame of a scene to a PNG file.
 #[derive(Debug, clap::Args)]
@@ -31,7 +31,7 @@ pub(super) struct Args {
     out: PathBuf,
     /// Image size in pixels.
     #[arg(long, default_value = "1280x720")]
-    size: ImageSize,
+    size: FrameSize,
     /// Camera position in scene units. Default: a camera that frames the scene.
     #[arg(long, value_parser = parse_point, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "target")]
     eye: Option<[f64; 3]>,
@@ -67,7 +67,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     loaded_scene.deform(&Arc::new(state))?;
     let bytes = match args.map {
         None => {
-            let image = bench.draw(&mut loaded_scene, &camera(args, &scene), args.size.width, args.size.height)?;
+            let image = bench.draw(&mut loaded_scene, &camera(args, &scene), args.size)?;
             frame::encode_png(image.width, image.height, &image.rgba)?
         }
         Some(frame_output) => render_color_map(args, &mut bench, &mut loaded_scene, frame_output)?,
@@ -93,11 +93,10 @@ fn render_color_map(
         }
         _ => FrameOutput::Displacement { largest: args.largest },
     };
-    let size = [args.size.width, args.size.height];
-    let (survey, legend) = bench.render_aov(loaded_scene, &camera(args, &scene), size, frame_output)?;
+    let (aov, legend) = bench.render_aov(loaded_scene, &camera(args, &scene), args.size, frame_output)?;
     let legend = legend.ok_or_else(|| fault_in("encode")("a colour map without legend"))?;
-    let rgba = frame::color_map(&survey.bytes, survey.samples, size, &legend)?;
-    frame::encode_png(size[0], size[1], &rgba)
+    let rgba = frame::color_map(&aov.bytes, aov.samples, args.size.to_array(), &legend)?;
+    frame::encode_png(args.size.width, args.size.height, &rgba)
 }
 
 fn map(text: &str) -> Result<FrameOutput, String> {

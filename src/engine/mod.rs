@@ -6,44 +6,31 @@
 //! writer for too long, yields an error that names the limit.
 
 mod blocking;
-mod checkpoint_store;
-mod command;
-mod device_context;
-mod device_handle;
-mod device_loop;
-mod encoded_subscription;
-mod frame_encoder;
-mod in_flight;
-mod loaded_scene;
-mod pack;
-mod pick_result;
+mod device;
+mod output;
 mod registry;
-mod scalar_field;
-mod scene_actor;
-mod scene_catalog;
-mod scene_handle;
+mod scene;
 mod source;
-mod step_output;
-mod step_queue;
-mod subscriber;
+mod storage;
 #[cfg(test)]
 mod testing;
-mod upload;
 
-pub use device_context::{DeviceContext, EngineInfo};
-pub use encoded_subscription::EncodedSubscription;
-pub use frame_encoder::{ColorFrame, EncodedOutput, FrameEncoder, FrameFormat};
-pub use loaded_scene::LoadedScene;
-pub use pack::{PackedVertices, VertexSelection, pack_vertices, validate_domains};
-pub use pick_result::{ModalHit, PickResult, resolve_picks};
-pub use scalar_field::validate_mode;
-pub use scene_actor::StepSelector;
-pub use scene_catalog::{SceneProvenance, validate_scene_name};
-pub use scene_handle::{SceneHandle, WriterSession};
+pub use device::context::{DeviceContext, EngineInfo};
+pub use device::loaded_scene::LoadedScene;
+pub use device::scalar_field::validate_mode;
+pub use output::color_frame::ColorFrame;
+pub use output::frame_encoder::{EncodedOutput, FrameEncoder, FrameFormat};
+pub use output::pack::{PackedVertices, VertexSelection, pack_vertices, validate_domains};
+pub use output::pick_result::{PickResult, resolve_picks};
+pub use output::step_output::{FrameOutput, ModalHit, OutputBody, OutputSpec, StepId, StepOutput};
+pub use scene::actor::StepSelector;
+pub use scene::encoded_subscription::EncodedSubscription;
+pub use scene::handle::{SceneHandle, WriterSession};
+pub use scene::step_queue::{Policy, StepReport};
+pub use scene::subscriber::{Delivery, Subscription};
 pub use source::SceneSource;
-pub use step_queue::{Policy, StepReport};
-pub use subscriber::{Delivery, FrameOutput, OutputBody, OutputSpec, StepId, StepOutput, Subscription};
-pub use upload::{Upload, UploadHeader};
+pub use storage::scene_catalog::{SceneProvenance, validate_scene_name};
+pub use storage::upload::{Upload, UploadHeader};
 
 pub use modalcast_render::{RasterBackend, RasterBackends};
 
@@ -54,12 +41,12 @@ use std::thread::JoinHandle;
 use tokio::sync::Semaphore;
 
 use self::blocking::run_blocking;
-use self::checkpoint_store::CheckpointStore;
-use self::device_handle::DeviceHandle;
+use self::device::handle::DeviceHandle;
 use self::registry::Registry;
-use self::scene_actor::SceneServices;
-use self::scene_catalog::SceneCatalog;
-use self::scene_handle::OpenParams;
+use self::scene::actor::SceneServices;
+use self::scene::handle::OpenParams;
+use self::storage::checkpoint_store::CheckpointStore;
+use self::storage::scene_catalog::SceneCatalog;
 use crate::config::Config;
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::Scene;
@@ -155,7 +142,7 @@ impl Engine {
     /// [`SceneSource::open`].
     pub async fn open(&self, source: &str, name: &str) -> Result<Arc<SceneHandle>> {
         let name = if name.is_empty() {
-            scene_catalog::default_scene_name(source)?
+            storage::scene_catalog::default_scene_name(source)?
         } else {
             validate_scene_name(name)?.to_owned()
         };

@@ -7,9 +7,9 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::OnceCell;
 
-use super::scene_catalog::SceneProvenance;
-use super::scene_handle::SceneHandle;
 use super::scene_not_open;
+use crate::engine::scene::handle::SceneHandle;
+use crate::engine::storage::scene_catalog::SceneProvenance;
 use modalcast_model::error::{Error, Result};
 
 /// A reserved name, and its scene once the scene is loaded.

@@ -8,7 +8,7 @@ use crate::engine::{
 };
 use crate::telemetry::StageTimes;
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::scene::{Camera, PixelRect, RawStepUpdate, Scene, TransformFormat};
+use modalcast_model::scene::{Camera, FrameSize, PixelRect, RawStepUpdate, Scene, TransformFormat};
 
 mod camera;
 mod output;
@@ -137,7 +137,7 @@ pub(super) fn picture(
         None => fit_to_scene,
         Some(camera) => camera::parse(fit_to_scene, camera).map_err(|error| error.prefix_field("picture"))?,
     };
-    Ok((OutputSpec::Frame { camera, width, height, frame_output }, format))
+    Ok((OutputSpec::Frame { camera, size: FrameSize::new(width, height), frame_output }, format))
 }
 
 /// Validates a pick request; returns the view that picks in its rectangle.
@@ -148,15 +148,14 @@ pub(super) fn pick(engine: &Engine, scene: &Scene, request: &v1::PickRequest) ->
         camera: wire.camera,
         ..v1::Picture::default()
     });
-    let (OutputSpec::Frame { camera, width, height, .. }, _) = picture(engine, scene, bare)? else {
+    let (OutputSpec::Frame { camera, size: picture, .. }, _) = picture(engine, scene, bare)? else {
         return Err(invalid("picture", "a picture", "none"));
     };
     let size = match (request.width, request.height) {
         (0, 0) => [1, 1],
         (width, height) => [width, height],
     };
-    let picture = [width, height];
-    let rectangle = PixelRect::within(picture, [request.x, request.y], size)?;
+    let rectangle = PixelRect::within(picture.to_array(), [request.x, request.y], size)?;
     Ok(OutputSpec::Pick { camera, picture, rectangle })
 }
 

@@ -102,7 +102,7 @@ fn chunks(
     most: usize,
 ) -> impl Iterator<Item = v1::FrameChunk> + use<> {
     let (width, height) = match view {
-        OutputSpec::Frame { width, height, .. } => (width, height),
+        OutputSpec::Frame { size, .. } => (size.width, size.height),
         OutputSpec::Vertices(_) | OutputSpec::Pick { .. } => (0, 0),
     };
     let head = v1::FrameHead {

@@ -10,7 +10,7 @@ use modalcast_compute::gpu::{CudaRasterizer, Device};
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{
-    Antialiasing, Camera, RasterPolicy, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings,
+    Antialiasing, Camera, FrameSize, RasterPolicy, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings,
 };
 use modalcast_render::{
     DevicePreference, FrameImage, FrameParams, MappedPixels, RasterBackend, RasterBackends, Renderer, VisibilityId,
@@ -45,7 +45,7 @@ fn frames(scene: &Scene, raster: RasterPolicy, states: &[SceneState]) -> Vec<Fra
     let mut staged = bench.load_scene(&scene).expect("staged");
     let draw = |state: &SceneState| {
         staged.deform(state).expect("deforms");
-        bench.draw(&mut staged, &camera, SIZE[0], SIZE[1]).expect("draws")
+        bench.draw(&mut staged, &camera, FrameSize::new(SIZE[0], SIZE[1])).expect("draws")
     };
     let images = states.iter().map(draw).collect();
     bench.unload_scene(staged);
@@ -171,7 +171,7 @@ fn gpu_cuda_frames_in_flight_keep_their_step() {
         if under_way.len() == 3 {
             images.extend(under_way.pop_front().map(|oldest| bench.finish_draw(oldest).map(MappedPixels::into_image)));
         }
-        under_way.push_back(bench.begin_draw(&mut staged, &camera, SIZE[0], SIZE[1]).expect("begins"));
+        under_way.push_back(bench.begin_draw(&mut staged, &camera, FrameSize::new(SIZE[0], SIZE[1])).expect("begins"));
     }
     images.extend(under_way.into_iter().map(|drawing| bench.finish_draw(drawing).map(MappedPixels::into_image)));
     for (at, (got, want)) in images.into_iter().zip(&want).enumerate() {
@@ -198,7 +198,9 @@ fn gpu_ground_hides_geometry_below_on_both_paths() {
 fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
     let scene = drawn_by(&scenes::scene(&[(3000, 12), (700, 3)], 3, false, false), RasterPolicy::Cuda);
     let draw = |bench: &mut DeviceContext, staged: &mut modalcast::engine::LoadedScene, [width, height]: [u32; 2]| {
-        let image = bench.draw(staged, &Camera::fit_to_scene(&scene, width, height), width, height).expect("draws");
+        let image = bench
+            .draw(staged, &Camera::fit_to_scene(&scene, width, height), FrameSize::new(width, height))
+            .expect("draws");
         assert_eq!(image.raster_backends.visibility, Some(RasterBackend::Cuda));
         image.rgba
     };
@@ -223,7 +225,7 @@ fn gpu_fastest_path_draws_frames_of_every_size() {
     let mut staged = bench.load_scene(&scene).expect("staged");
     for [width, height] in [[64, 48], [1920, 1080], [1, 1], [333, 77]] {
         let camera = Camera::fit_to_scene(&scene, width, height);
-        let image = bench.draw(&mut staged, &camera, width, height).expect("draws");
+        let image = bench.draw(&mut staged, &camera, FrameSize::new(width, height)).expect("draws");
         eprintln!("{width} x {height}: {:?}", image.raster_backends);
         assert!(image.raster_backends.visibility.is_some());
         assert_eq!(image.rgba.len(), 4 * (width * height) as usize);

@@ -5,25 +5,25 @@ use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::engine::{Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, StepOutput};
-use modalcast_model::scene::{Camera, Lens};
+use modalcast_model::scene::{Camera, FrameSize, Lens};
 use modalcast_proto::v1;
 use v1::Policy;
 use v1::drive_scene_response::Kind as ResponseKind;
 
 use crate::service_harness::{Server, state_after, step, strips_with_attributes, within};
 
-const SIZE: (u32, u32) = (48, 32);
+const SIZE: FrameSize = FrameSize::new(48, 32);
 const STEPS: u64 = 30;
 /// Number of the step that is refused.
 const BAD: u64 = 13;
 
 fn cameras(count: usize) -> Vec<Camera> {
-    let first = Camera::fit_to_scene(&strips_with_attributes(), SIZE.0, SIZE.1);
+    let first = Camera::fit_to_scene(&strips_with_attributes(), SIZE.width, SIZE.height);
     (0..count).map(|at| Camera { lens: Lens::FieldOfView(30.0 + 4.0 * at as f64), ..first }).collect()
 }
 
 fn view(camera: Camera) -> OutputSpec {
-    OutputSpec::Frame { camera, width: SIZE.0, height: SIZE.1, frame_output: FrameOutput::Color }
+    OutputSpec::Frame { camera, size: SIZE, frame_output: FrameOutput::Color }
 }
 
 fn steps() -> Vec<v1::Step> {
@@ -40,7 +40,7 @@ fn expected(cameras: &[Camera]) -> Vec<(u64, Vec<Vec<u8>>)> {
     let mut pictures = Vec::new();
     for step in steps.iter().filter(|step| step.number != BAD) {
         staged.deform(&state_after(&scene, std::slice::from_ref(step))).expect("deforms");
-        let mut draw = |camera: &Camera| bench.draw(&mut staged, camera, SIZE.0, SIZE.1).expect("draws").rgba;
+        let mut draw = |camera: &Camera| bench.draw(&mut staged, camera, SIZE).expect("draws").rgba;
         pictures.push((step.number, cameras.iter().map(&mut draw).collect()));
     }
     bench.unload_scene(staged);

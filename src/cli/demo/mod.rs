@@ -11,13 +11,13 @@ use std::time::{Duration, Instant};
 
 use clap::ValueEnum as _;
 
-use super::options::ImageSize;
 use super::options::with_spinner;
 use super::{Outcome, print_line};
 use crate::config::BackendChoice;
 use evaluation::Evaluation;
 use input::DemoScene;
 use modalcast_model::error::{Result, fault_in};
+use modalcast_model::scene::FrameSize;
 use processes::{Process, program_path};
 
 /// Drives a scene with a physics process, receives its frames and vertices over the network, and checks them.
@@ -35,7 +35,7 @@ pub(super) struct Args {
     frames: u32,
     /// Frame size in pixels.
     #[arg(long, default_value = "1280x720")]
-    size: ImageSize,
+    size: FrameSize,
     /// Simulated time between frames, in seconds.
     #[arg(long, default_value_t = 1.0 / 24.0)]
     dt: f64,

@@ -6,8 +6,8 @@ use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::DeviceContext;
 use modalcast_model::domain::Material;
 use modalcast_model::scene::{
-    Camera, Lens, ORIGIN_GRID, RawStepUpdate, RenderSettings, Scene, SceneState, ShadowMethod, ShadowSettings,
-    StepUpdate, TransformFormat, View,
+    Camera, FrameSize, Lens, ORIGIN_GRID, RawStepUpdate, RenderSettings, Scene, SceneState, ShadowMethod,
+    ShadowSettings, StepUpdate, TransformFormat, View,
 };
 use modalcast_render::FrameImage;
 
@@ -47,7 +47,7 @@ fn camera(at: [f64; 3]) -> Camera {
 fn picture(bench: &mut DeviceContext, scene: &Arc<Scene>, state: &SceneState, camera: &Camera) -> FrameImage {
     let mut staged = bench.load_scene(scene).expect("stages");
     staged.deform(state).expect("deforms");
-    let image = bench.draw(&mut staged, camera, 96, 96).expect("draws");
+    let image = bench.draw(&mut staged, camera, FrameSize::new(96, 96)).expect("draws");
     bench.unload_scene(staged);
     image
 }
@@ -117,7 +117,7 @@ fn distant_domains_are_seen_by_nearby_cameras() {
     let mut staged = bench.load_scene(&scene).expect("stages");
     let mut seen = |state: &SceneState, at| {
         staged.deform(state).expect("deforms");
-        let image = bench.draw(&mut staged, &camera(at), 96, 96).expect("draws");
+        let image = bench.draw(&mut staged, &camera(at), FrameSize::new(96, 96)).expect("draws");
         [&gray, &red, &both].map(|want| difference(&image, want).0)
     };
     let is_only = |levels: [u8; 3], which: usize| (0..3).all(|at| (levels[at] <= 1) == (at == which));

@@ -7,7 +7,7 @@ use modalcast::engine::DeviceContext;
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::scene::{Bounds, Camera, Lens, LightSpaceBox, Scene, SceneState, ShadowSettings};
+use modalcast_model::scene::{Bounds, Camera, FrameSize, Lens, LightSpaceBox, Scene, SceneState, ShadowSettings};
 use modalcast_render::{FrameParams, Renderer, SceneBuffers};
 
 use super::harness::open;
@@ -133,7 +133,7 @@ fn engine_steps_share_a_shadow_and_refused_ones_have_none() {
     let mut staged = bench.load_scene(&scene).expect("stages");
     let frames = |bench: &mut DeviceContext, staged: &mut modalcast::engine::LoadedScene| {
         cameras(&scene).map(|camera| {
-            let rgba = bench.draw(staged, &camera, 64, 64).expect("draws").rgba;
+            let rgba = bench.draw(staged, &camera, FrameSize::new(64, 64)).expect("draws").rgba;
             let stats = bench.stats().expect("draws").passes.clone();
             (rgba, stats.iter().filter(|pass| **pass == "shadow").count())
         })

@@ -5,9 +5,10 @@ use std::path::PathBuf;
 use crate::render::workloads::RenderWorkload;
 use crate::render::{self, RenderReport, RenderReportOptions, variants};
 use crate::thesis::PLANTS;
-use modalcast::cli::options::{ImageSize, with_spinner};
+use modalcast::cli::options::with_spinner;
 use modalcast::cli::{Outcome, print_line};
 use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::FrameSize;
 
 const LOADS: &str = "Loads:
   square       a square that floats over the ground
@@ -45,10 +46,10 @@ pub(super) struct Args {
     /// Measure only this variant, or all variants with this prefix: "variance 512*"; repeatable.
     #[arg(long = "variant", value_name = "GLOB")]
     variants: Vec<String>,
-    /// ImageSize of still pictures in pixels [default: 640x360]; moving pictures have a quarter of it on each side. With
+    /// Size of still pictures in pixels [default: 640x360]; moving pictures have a quarter of it on each side. With
     /// --figures the size of single pictures [default: 640x480].
     #[arg(long)]
-    size: Option<ImageSize>,
+    size: Option<FrameSize>,
     /// Frames per median, at least 20 [default: 100, 20 with --quick].
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     replays: Option<u32>,
@@ -70,7 +71,7 @@ pub(super) struct Args {
 }
 
 /// Default sizes: of the report, and of the figures' pictures.
-const USUAL: [ImageSize; 2] = [ImageSize { width: 640, height: 360 }, ImageSize { width: 640, height: 480 }];
+const USUAL: [FrameSize; 2] = [FrameSize { width: 640, height: 360 }, FrameSize { width: 640, height: 480 }];
 
 /// Upper limit of a picture's side in pixels, because the references trace 16 to 64 samples per pixel.
 const LARGEST: u32 = 4096;
@@ -135,11 +136,11 @@ fn timed(args: &Args) -> Outcome {
 ///
 /// # Errors
 /// `Invalid` when a side is not in 1 to [`LARGEST`].
-fn size(args: &Args, usual: ImageSize) -> Result<render::Size> {
-    let ImageSize { width, height } = args.size.unwrap_or(usual);
+fn size(args: &Args, usual: FrameSize) -> Result<render::Size> {
+    let FrameSize { width, height } = args.size.unwrap_or(usual);
     match [width, height].iter().all(|side| (1..=LARGEST).contains(side)) {
         true => Ok(render::Size { width, height }),
-        false => Err(invalid("size", format!("1 to {LARGEST} pixels a side"), ImageSize { width, height })),
+        false => Err(invalid("size", format!("1 to {LARGEST} pixels a side"), FrameSize { width, height })),
     }
 }
 
@@ -237,7 +238,7 @@ mod tests {
     use super::*;
 
     fn args() -> Args {
-        let size = Some(ImageSize { width: 64, height: 48 });
+        let size = Some(FrameSize { width: 64, height: 48 });
         Args {
             out: PathBuf::from("out"),
             loads: vec![],
@@ -270,8 +271,8 @@ mod tests {
             Args { loads: vec!["cube".into()], ..args() },
             Args { loads: vec!["plant-13".into()], ..args() },
             Args { variants: vec!["varience*".into()], ..args() },
-            Args { size: Some(ImageSize { width: 0, height: 5 }), ..args() },
-            Args { size: Some(ImageSize { width: 5, height: 5000 }), ..args() },
+            Args { size: Some(FrameSize { width: 0, height: 5 }), ..args() },
+            Args { size: Some(FrameSize { width: 5, height: 5000 }), ..args() },
         ] {
             assert!(request(&wrong).is_err(), "{wrong:?}");
         }

@@ -4,34 +4,35 @@
 use std::sync::Arc;
 
 use super::scalar_field;
-use super::subscriber::FrameOutput;
+use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{Bounds, Camera, LightSpaceBox, Scene, SceneState, snap_to_origin_grid};
+use modalcast_model::scene::{Bounds, Camera, FrameSize, LightSpaceBox, Scene, SceneState, snap_to_origin_grid};
 use modalcast_render::{FrameParams, Renderer, SceneBuffers};
 
 /// Positions beyond this bound (scene units) are rejected like infinite ones, because their squares overflow f32 in the
 /// shaders.
 const MAX_COORDINATE: f64 = 1e18;
 
-/// Size in pixels of the frames that are measured to choose between the rasterizers.
-const BENCHMARK_SIZE: [u32; 2] = [1920, 1080];
+/// Size of the frames that are measured to choose between the rasterizers.
+const BENCHMARK_SIZE: FrameSize = FrameSize::new(1920, 1080);
 
 /// Description of the content of the buffers, in the coordinate frame that the camera needs.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct BufferContents {
+pub(in crate::engine) struct BufferContents {
     bounds: Bounds,
     /// `None` in a camera-relative frame, because the deformer computed them in the frames of the domains' cells.
     light: Option<LightSpaceBox>,
     /// Whether vertices were uploaded.
-    pub(super) uploaded: bool,
+    pub(in crate::engine) uploaded: bool,
 }
 
 impl BufferContents {
-    /// The parameters of a frame of these buffers; the size is in pixels.
-    pub(super) const fn shot(&self, camera: Camera, [width, height]: [u32; 2]) -> FrameParams {
+    /// The parameters of a frame of these buffers.
+    pub(in crate::engine) const fn frame_params(&self, camera: Camera, size: FrameSize) -> FrameParams {
+        let FrameSize { width, height } = size;
         FrameParams { camera, width, height, bounds: self.bounds, light: self.light }
     }
 }
@@ -57,7 +58,11 @@ pub struct LoadedScene {
 
 impl LoadedScene {
     /// A scene without output. [`Self::rest`] must be called before any other method.
-    pub(super) fn new(scene: &Arc<Scene>, deformer: Box<dyn Deformer>, buffers: Option<SceneBuffers>) -> Self {
+    pub(in crate::engine) fn new(
+        scene: &Arc<Scene>,
+        deformer: Box<dyn Deformer>,
+        buffers: Option<SceneBuffers>,
+    ) -> Self {
         let current_state = Arc::new(SceneState::rest(scene));
         Self {
             scene: Arc::clone(scene),
@@ -73,7 +78,7 @@ impl LoadedScene {
     }
 
     /// Deforms the rest state.
-    pub(super) fn rest(&mut self) -> Result<()> {
+    pub(in crate::engine) fn rest(&mut self) -> Result<()> {
         let deformed = self.run(&Arc::clone(&self.current_state))?;
         if !is_in_range(&deformed.bounds) {
             return Err(invalid("scene.rest", "finite vertices", format!("{:?}", deformed.bounds)));
@@ -102,7 +107,7 @@ impl LoadedScene {
     }
 
     /// [`Self::deform`] of a shared state, without a copy.
-    pub(super) fn deform_shared(&mut self, state: &Arc<SceneState>) -> Result<DeformSummary> {
+    pub(in crate::engine) fn deform_shared(&mut self, state: &Arc<SceneState>) -> Result<DeformSummary> {
         self.filled = false;
         let deformed = match self.run(state) {
             Ok(deformed) => deformed,
@@ -137,7 +142,11 @@ impl LoadedScene {
 
     /// Creates the buffers on first use and fills them with the last deformation. If the domains have different cells,
     /// the positions are rebased to the cell nearest the camera.
-    pub(super) fn fill_buffers(&mut self, renderer: &mut Renderer, camera: &Camera) -> Result<BufferContents> {
+    pub(in crate::engine) fn fill_buffers(
+        &mut self,
+        renderer: &mut Renderer,
+        camera: &Camera,
+    ) -> Result<BufferContents> {
         let uploaded = self.fill_shared(renderer)?;
         let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
         let rebased = match &self.current_state.origins {
@@ -158,19 +167,19 @@ impl LoadedScene {
 
     /// Starts copying the wanted attributes of the last deformation to host memory. The copy overlaps with the next
     /// deformation.
-    pub(super) fn readback(&mut self, wanted: VertexAttributes) -> Result<VertexReadback> {
+    pub(in crate::engine) fn readback(&mut self, wanted: VertexAttributes) -> Result<VertexReadback> {
         self.deformer.readback(wanted)
     }
 
     /// Waits until the copy is complete.
-    pub(super) fn wait_readback(&mut self, readback: &VertexReadback) -> Result<Arc<DeformedSurface>> {
+    pub(in crate::engine) fn wait_readback(&mut self, readback: &VertexReadback) -> Result<Arc<DeformedSurface>> {
         self.deformer.wait_readback(readback)
     }
 
     /// Uploads the values of a color map into the buffers, which must be filled, and returns the legend; `None` if
     /// `frame_output` is not a color map. A mode shape does not depend on the state, so it is not recomputed while its
     /// values are in the buffers.
-    pub(super) fn upload_scalar_field(
+    pub(in crate::engine) fn upload_scalar_field(
         &mut self,
         renderer: &mut Renderer,
         frame_output: FrameOutput,
@@ -214,7 +223,7 @@ impl LoadedScene {
     }
 
     /// Adds a compute rasterizer to the scene's buffers, next to OpenGL.
-    pub(super) fn attach_rasterizer(
+    pub(in crate::engine) fn attach_rasterizer(
         &mut self,
         renderer: &mut Renderer,
         make: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
@@ -224,21 +233,21 @@ impl LoadedScene {
         renderer.attach_rasterizer(buffers, make)
     }
 
-    /// Measures both rasterizers on frames of [`BENCHMARK_SIZE`] pixels of the current state and selects the faster one per
+    /// Measures both rasterizers on frames of [`BENCHMARK_SIZE`] of the current state and selects the faster one per
     /// pass.
-    pub(super) fn select_raster_backends(&mut self, renderer: &mut Renderer) -> Result<()> {
-        let camera = Camera::fit_to_scene(&self.scene, BENCHMARK_SIZE[0], BENCHMARK_SIZE[1]);
+    pub(in crate::engine) fn select_raster_backends(&mut self, renderer: &mut Renderer) -> Result<()> {
+        let camera = Camera::fit_to_scene(&self.scene, BENCHMARK_SIZE.width, BENCHMARK_SIZE.height);
         let filled = self.fill_buffers(renderer, &camera)?;
         let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
-        renderer.select_raster_backends(buffers, &filled.shot(camera, BENCHMARK_SIZE)).map(drop)
+        renderer.select_raster_backends(buffers, &filled.frame_params(camera, BENCHMARK_SIZE)).map(drop)
     }
 
-    pub(super) fn buffers(&self) -> Result<&SceneBuffers> {
+    pub(in crate::engine) fn buffers(&self) -> Result<&SceneBuffers> {
         self.buffers.as_ref().ok_or_else(no_buffers)
     }
 
     /// Drops the deformer first, because it may have the buffers registered with CUDA.
-    pub(super) fn into_buffers(self) -> Option<SceneBuffers> {
+    pub(in crate::engine) fn into_buffers(self) -> Option<SceneBuffers> {
         drop(self.deformer);
         self.buffers
     }
@@ -273,8 +282,8 @@ fn is_in_range(bounds: &Bounds) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing;
     use super::*;
+    use crate::engine::testing;
     use modalcast_compute::reference::ReferenceDeformer;
 
     fn loaded_scene() -> LoadedScene {

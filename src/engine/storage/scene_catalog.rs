@@ -32,7 +32,7 @@ impl SceneProvenance {
 
 /// The catalog of open scenes: names and origins, written to disk at every change.
 #[derive(Debug)]
-pub(super) struct SceneCatalog {
+pub(in crate::engine) struct SceneCatalog {
     folder: PathBuf,
     entries: Mutex<BTreeMap<String, SceneProvenance>>,
     /// File lock of the server that uses the folder. The operating system releases it when the process dies.
@@ -44,7 +44,7 @@ impl SceneCatalog {
     ///
     /// # Errors
     /// `Unavailable` when another server uses the folder, or when the folder cannot be created or read.
-    pub(super) fn open(folder: &Path) -> Result<Self> {
+    pub(in crate::engine) fn open(folder: &Path) -> Result<Self> {
         let unusable = |reason: String| Error::Unavailable {
             what: "state folder",
             reason,
@@ -59,32 +59,32 @@ impl SceneCatalog {
         Ok(Self { folder: folder.to_owned(), entries: Mutex::new(entries), lock: Mutex::new(Some(lock)) })
     }
 
-    pub(super) fn entries(&self) -> BTreeMap<String, SceneProvenance> {
+    pub(in crate::engine) fn entries(&self) -> BTreeMap<String, SceneProvenance> {
         self.guard().clone()
     }
 
     /// Adds a scene. Writes to disk; a failure leaves the catalog unchanged.
-    pub(super) fn add(&self, name: &str, provenance: &SceneProvenance) -> Result<()> {
+    pub(in crate::engine) fn add(&self, name: &str, provenance: &SceneProvenance) -> Result<()> {
         self.change(|entries| entries.insert(name.to_owned(), provenance.clone())).map(drop)
     }
 
     /// Removes a scene; returns whether it was listed. Writes to disk; a failure leaves the catalog unchanged.
-    pub(super) fn remove(&self, name: &str) -> Result<bool> {
+    pub(in crate::engine) fn remove(&self, name: &str) -> Result<bool> {
         self.change(|entries| entries.remove(name)).map(|entry| entry.is_some())
     }
 
     /// The folder of the checkpoints.
-    pub(super) fn checkpoint_folder(&self) -> PathBuf {
+    pub(in crate::engine) fn checkpoint_folder(&self) -> PathBuf {
         self.folder.join("steps")
     }
 
     /// The folder of an upload's files.
-    pub(super) fn upload_folder(&self, name: &str) -> PathBuf {
+    pub(in crate::engine) fn upload_folder(&self, name: &str) -> PathBuf {
         self.folder.join("uploads").join(name)
     }
 
     /// Releases the lock, so that another server may use the folder.
-    pub(super) fn release(&self) {
+    pub(in crate::engine) fn release(&self) {
         self.lock.lock().unwrap_or_else(PoisonError::into_inner).take();
     }
 
@@ -147,7 +147,7 @@ pub fn validate_scene_name(name: &str) -> Result<&str> {
 ///
 /// # Errors
 /// `Invalid` when the source yields no valid name.
-pub(super) fn default_scene_name(source: &str) -> Result<String> {
+pub(in crate::engine) fn default_scene_name(source: &str) -> Result<String> {
     let last = source.trim_end_matches('/').rsplit('/').next().unwrap_or_default();
     let stem = last.rsplit_once('.').map_or(last, |(stem, _)| if stem.is_empty() { last } else { stem });
     let fit = |letter: char| if letter.is_ascii_alphanumeric() || "._-".contains(letter) { letter } else { '-' };

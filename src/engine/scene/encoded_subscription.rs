@@ -4,8 +4,9 @@ use std::collections::VecDeque;
 
 use tokio::task::JoinHandle;
 
-use super::frame_encoder::{EncodedOutput, FrameEncoder, FrameFormat};
-use super::subscriber::{Delivery, OutputBody, StepOutput, Subscription};
+use super::subscriber::{Delivery, Subscription};
+use crate::engine::output::frame_encoder::{EncodedOutput, FrameEncoder, FrameFormat};
+use crate::engine::output::step_output::{OutputBody, StepOutput};
 use modalcast_model::error::{Error, Result, fault_in};
 
 /// Budget of pixel bytes that one stream may hold before it accepts no further frame. A single larger frame is encoded
@@ -113,9 +114,10 @@ mod tests {
 
     use tokio::time::timeout;
 
-    use super::super::frame_encoder::tests::{noise, paused};
-    use super::super::subscriber::{OutputSpec, Subscriber};
+    use super::super::subscriber::Subscriber;
     use super::*;
+    use crate::engine::output::frame_encoder::tests::{noise, paused};
+    use crate::engine::output::step_output::OutputSpec;
     use modalcast_model::deform::VertexAttributes;
 
     fn subscription(delivery: Delivery) -> (Subscriber, Subscription) {

@@ -7,11 +7,12 @@ use std::time::Instant;
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 
-use super::command::SceneId;
-use super::scene_actor::{ActorParams, Message, SceneActor, SceneServices, StepRequest, StepSelector};
-use super::scene_catalog::SceneProvenance;
+use super::actor::{ActorParams, Message, SceneActor, SceneServices, StepRequest, StepSelector};
 use super::step_queue::{Policy, QueuedStep, StepReport, WriterLease};
-use super::subscriber::{Delivery, OutputSpec, StepId, StepOutput, Subscription};
+use super::subscriber::{Delivery, Subscription};
+use crate::engine::device::command::SceneId;
+use crate::engine::output::step_output::{OutputSpec, StepId, StepOutput};
+use crate::engine::storage::scene_catalog::SceneProvenance;
 use crate::telemetry::ms_since;
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::{RawStepUpdate, Scene, SceneState, StepUpdate};
@@ -35,7 +36,7 @@ pub struct SceneHandle {
 }
 
 /// Arguments of [`SceneHandle::open`].
-pub(super) struct OpenParams {
+pub(in crate::engine) struct OpenParams {
     pub name: String,
     pub provenance: SceneProvenance,
     pub scene: Arc<Scene>,
@@ -51,7 +52,7 @@ impl SceneHandle {
     ///
     /// # Errors
     /// `Fault` of the device, `Invalid` when the rest state overflows, `Busy` when the command queue is full.
-    pub(super) async fn open(params: OpenParams, services: SceneServices) -> Result<Self> {
+    pub(in crate::engine) async fn open(params: OpenParams, services: SceneServices) -> Result<Self> {
         let OpenParams { name, provenance, scene, id, state, frames_unavailable } = params;
         services.device_handle.load_scene(id, &scene).await?;
         let state = match state.map(Arc::new) {
@@ -114,7 +115,7 @@ impl SceneHandle {
     }
 
     /// Ends every stream of the scene with `error` and frees the scene. Returns after the scene is freed.
-    pub(super) async fn stop(&self, error: Error) {
+    pub(in crate::engine) async fn stop(&self, error: Error) {
         self.closing.store(true, Ordering::Release);
         let (done, stopped) = oneshot::channel();
         // A closed mailbox means that the scene's task has already ended.
@@ -124,7 +125,7 @@ impl SceneHandle {
     }
 
     /// Whether [`Self::stop`] was called.
-    pub(super) fn is_closing(&self) -> bool {
+    pub(in crate::engine) fn is_closing(&self) -> bool {
         self.closing.load(Ordering::Acquire)
     }
 

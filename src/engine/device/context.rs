@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::loaded_scene::LoadedScene;
-use super::subscriber::FrameOutput;
 use crate::config::{BackendChoice, Config, RendererChoice};
+use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use crate::telemetry::{Stage, ms_since};
 use modalcast_compute::cpu::CpuDeformer;
@@ -14,7 +14,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{Camera, PixelRect, RasterPolicy, Scene};
+use modalcast_model::scene::{Camera, FrameSize, PixelRect, RasterPolicy, Scene};
 use modalcast_render::{
     Aov, AovImage, DevicePreference, FrameImage, MappedPixels, PendingFrame, PendingPick, PickHit, Renderer,
     SceneBuffers,
@@ -149,19 +149,13 @@ impl DeviceContext {
         self.unload(buffers);
     }
 
-    /// Draws the vertices of the last deformation; `width` and `height` are in pixels. The image's passes include
-    /// "upload" if the vertices had to be uploaded.
+    /// Draws the vertices of the last deformation. The image's passes include "upload" if the vertices had to be
+    /// uploaded.
     ///
     /// # Errors
     /// `Unavailable` without a renderer, `Invalid` for an invalid camera or size, `Fault` of OpenGL.
-    pub fn draw(
-        &mut self,
-        loaded_scene: &mut LoadedScene,
-        camera: &Camera,
-        width: u32,
-        height: u32,
-    ) -> Result<FrameImage> {
-        let drawing = self.begin_draw(loaded_scene, camera, width, height)?;
+    pub fn draw(&mut self, loaded_scene: &mut LoadedScene, camera: &Camera, size: FrameSize) -> Result<FrameImage> {
+        let drawing = self.begin_draw(loaded_scene, camera, size)?;
         self.finish_draw(drawing).map(MappedPixels::into_image)
     }
 
@@ -174,16 +168,15 @@ impl DeviceContext {
         &mut self,
         loaded_scene: &mut LoadedScene,
         camera: &Camera,
-        width: u32,
-        height: u32,
+        size: FrameSize,
     ) -> Result<PendingDraw> {
         let camera = camera.validated()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
         let begin = Instant::now();
         let filled = loaded_scene.fill_buffers(renderer, &camera)?;
         let upload_ms = filled.uploaded.then(|| ms_since(begin));
-        let shot = filled.shot(camera, [width, height]);
-        Ok(PendingDraw { ticket: renderer.submit(loaded_scene.buffers()?, &shot)?, upload_ms })
+        let params = filled.frame_params(camera, size);
+        Ok(PendingDraw { ticket: renderer.submit(loaded_scene.buffers()?, &params)?, upload_ms })
     }
 
     /// Waits for a frame. Any thread may then copy its pixels.
@@ -199,8 +192,8 @@ impl DeviceContext {
         })
     }
 
-    /// Renders an AOV: depth, domains, normals or the values of a color map, and the legend of a color map. `size` is
-    /// in pixels. For color frames use [`Self::draw`].
+    /// Renders an AOV: depth, domains, normals or the values of a color map, and the legend of a color map. For
+    /// color frames use [`Self::draw`].
     ///
     /// # Errors
     /// As [`Self::draw`].
@@ -208,12 +201,12 @@ impl DeviceContext {
         &mut self,
         loaded_scene: &mut LoadedScene,
         camera: &Camera,
-        size: [u32; 2],
+        size: FrameSize,
         frame_output: FrameOutput,
     ) -> Result<(AovImage, Option<Legend>)> {
         let camera = camera.validated()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
-        let shot = loaded_scene.fill_buffers(renderer, &camera)?.shot(camera, size);
+        let params = loaded_scene.fill_buffers(renderer, &camera)?.frame_params(camera, size);
         let legend = loaded_scene.upload_scalar_field(renderer, frame_output)?;
         let field = match (frame_output, &legend) {
             (_, Some(legend)) => Aov::Values { largest: legend.largest as f32 },
@@ -221,11 +214,11 @@ impl DeviceContext {
             (FrameOutput::Normals, _) => Aov::Normals,
             _ => Aov::Domains,
         };
-        let survey = renderer.render_aov(loaded_scene.buffers()?, &shot, field)?;
+        let survey = renderer.render_aov(loaded_scene.buffers()?, &params, field)?;
         Ok((survey, legend))
     }
 
-    /// Submits a pick in a rectangle of a picture of `size` pixels without waiting for the device.
+    /// Submits a pick in a rectangle of a picture of this size without waiting for the device.
     ///
     /// # Errors
     /// As [`Self::draw`].
@@ -233,13 +226,13 @@ impl DeviceContext {
         &mut self,
         loaded_scene: &mut LoadedScene,
         camera: &Camera,
-        size: [u32; 2],
+        size: FrameSize,
         rectangle: PixelRect,
     ) -> Result<PendingPick> {
         let camera = camera.validated()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
-        let shot = loaded_scene.fill_buffers(renderer, &camera)?.shot(camera, size);
-        renderer.begin_pick(loaded_scene.buffers()?, &shot, rectangle)
+        let params = loaded_scene.fill_buffers(renderer, &camera)?.frame_params(camera, size);
+        renderer.begin_pick(loaded_scene.buffers()?, &params, rectangle)
     }
 
     /// Waits for a pick; returns the hits row by row.

@@ -14,12 +14,12 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 use tokio::sync::mpsc;
 
 use super::command::{Command, Reply, SceneId, TimedVertices};
-use super::device_context::{DeviceContext, EngineInfo, PendingDraw};
+use super::context::{DeviceContext, EngineInfo, PendingDraw};
 use super::loaded_scene::LoadedScene;
 use crate::telemetry::ms_since;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
 use modalcast_model::error::{Result, fault_in};
-use modalcast_model::scene::Camera;
+use modalcast_model::scene::{Camera, FrameSize};
 use modalcast_render::{FrameImage, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
 
 /// How long the thread waits for a frame before it polls the command queue again.
@@ -28,7 +28,7 @@ const POLL_INTERVAL: Duration = Duration::from_micros(100);
 const COPY_THREADS: usize = 2;
 
 /// State owned by the device thread: the device context, the loaded scenes and the readbacks in flight.
-pub(super) struct DeviceLoop {
+pub(in crate::engine) struct DeviceLoop {
     device_context: DeviceContext,
     copy_pool: ThreadPool,
     scenes: HashMap<SceneId, LoadedScene>,
@@ -49,7 +49,7 @@ struct PendingVertices {
 }
 
 /// Executes commands until `Quit` arrives or every sender is dropped.
-pub(super) fn run_device_loop(mut device_loop: DeviceLoop, mut inbox: mpsc::Receiver<Command>) {
+pub(in crate::engine) fn run_device_loop(mut device_loop: DeviceLoop, mut inbox: mpsc::Receiver<Command>) {
     while let Some(command) = next(&mut device_loop, &mut inbox) {
         if matches!(command, Command::Quit) {
             break;
@@ -99,7 +99,7 @@ impl DeviceLoop {
     ///
     /// # Errors
     /// `Fault` when the threads cannot be started.
-    pub(super) fn new(device_context: DeviceContext) -> Result<Self> {
+    pub(in crate::engine) fn new(device_context: DeviceContext) -> Result<Self> {
         let copy_pool =
             ThreadPoolBuilder::new().num_threads(COPY_THREADS).thread_name(|index| format!("pixels {index}"));
         let copy_pool = copy_pool.build().map_err(fault_in("threads that copy pixels"))?;
@@ -108,7 +108,7 @@ impl DeviceLoop {
     }
 
     /// The backend that deforms and the renderer that draws.
-    pub(super) const fn info(&self) -> &EngineInfo {
+    pub(in crate::engine) const fn info(&self) -> &EngineInfo {
         self.device_context.info()
     }
 
@@ -129,7 +129,7 @@ impl DeviceLoop {
             Command::Deform { id, state, reply } => {
                 reply.send(find(scenes, id).and_then(|loaded_scene| loaded_scene.deform_shared(&state))).ok();
             }
-            Command::Draw { id, camera, size, reply } if !reply.is_closed() => self.draw((id, camera, size), reply),
+            Command::Draw { id, camera, size, reply } if !reply.is_closed() => self.draw(id, camera, size, reply),
             Command::RenderAov { id, camera, size, frame_output, reply } if !reply.is_closed() => {
                 reply
                     .send(
@@ -149,7 +149,7 @@ impl DeviceLoop {
                 }
             }
             Command::ReadVertices { id, wanted, reply } if !reply.is_closed() => {
-                self.begin_vertex_readback((id, wanted), reply)
+                self.begin_vertex_readback(id, wanted, reply)
             }
             // The caller no longer waits, so the work is skipped.
             Command::Draw { .. }
@@ -167,13 +167,13 @@ impl DeviceLoop {
     }
 
     /// Submits a frame. Waits for the oldest frame first if the ring is full.
-    fn draw(&mut self, (id, camera, (width, height)): (SceneId, Camera, (u32, u32)), reply: Reply<FrameImage>) {
+    fn draw(&mut self, id: SceneId, camera: Camera, size: FrameSize, reply: Reply<FrameImage>) {
         while self.frames.len() >= MAX_FRAMES_IN_FLIGHT {
             self.finish_oldest_frame();
         }
         let device_context = &mut self.device_context;
-        let drawing = find(&mut self.scenes, id)
-            .and_then(|loaded_scene| device_context.begin_draw(loaded_scene, &camera, width, height));
+        let drawing =
+            find(&mut self.scenes, id).and_then(|loaded_scene| device_context.begin_draw(loaded_scene, &camera, size));
         match drawing {
             Ok(drawing) => self.frames.push_back((drawing, reply)),
             Err(error) => {
@@ -183,7 +183,7 @@ impl DeviceLoop {
     }
 
     /// Starts a vertex readback; answers immediately if the vertices are already in host memory.
-    fn begin_vertex_readback(&mut self, (id, wanted): (SceneId, VertexAttributes), reply: Reply<TimedVertices>) {
+    fn begin_vertex_readback(&mut self, id: SceneId, wanted: VertexAttributes, reply: Reply<TimedVertices>) {
         let begin = Instant::now();
         match find(&mut self.scenes, id).and_then(|loaded_scene| loaded_scene.readback(wanted)) {
             Ok(readback) => {

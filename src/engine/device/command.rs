@@ -4,24 +4,24 @@ use std::sync::Arc;
 
 use tokio::sync::oneshot;
 
-use super::subscriber::FrameOutput;
+use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, VertexAttributes};
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Camera, PixelRect, Scene, SceneState};
+use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
 use modalcast_render::{AovImage, FrameImage, PickHit};
 
 /// Identifies a loaded scene on the device thread.
-pub(super) type SceneId = u64;
+pub(in crate::engine) type SceneId = u64;
 
 /// The channel that carries a command's answer.
-pub(super) type Reply<T> = oneshot::Sender<Result<T>>;
+pub(in crate::engine) type Reply<T> = oneshot::Sender<Result<T>>;
 
 /// Vertices in host memory, and the milliseconds from the start of the copy to its completion.
-pub(super) type TimedVertices = (Arc<DeformedSurface>, f64);
+pub(in crate::engine) type TimedVertices = (Arc<DeformedSurface>, f64);
 
 /// A command to the device thread with the channel for its answer.
-pub(super) enum Command {
+pub(in crate::engine) enum Command {
     LoadScene {
         id: SceneId,
         scene: Arc<Scene>,
@@ -35,21 +35,21 @@ pub(super) enum Command {
     Draw {
         id: SceneId,
         camera: Camera,
-        size: (u32, u32),
+        size: FrameSize,
         reply: Reply<FrameImage>,
     },
     /// Renders an AOV (arbitrary output variable): values instead of colors, with a legend if they form a color map.
     RenderAov {
         id: SceneId,
         camera: Camera,
-        size: [u32; 2],
+        size: FrameSize,
         frame_output: FrameOutput,
         reply: Reply<(AovImage, Option<Legend>)>,
     },
     Pick {
         id: SceneId,
         camera: Camera,
-        picture: [u32; 2],
+        picture: FrameSize,
         rectangle: PixelRect,
         reply: Reply<Vec<PickHit>>,
     },

@@ -3,9 +3,9 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::blocking::run_blocking;
 use super::frame_encoder::EncodedOutput;
-use super::subscriber::{OutputBody, StepOutput};
+use super::step_output::{OutputBody, StepOutput};
+use crate::engine::blocking::run_blocking;
 use crate::telemetry::{Stage, ms_since};
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Result, fault_in, invalid};
@@ -188,8 +188,8 @@ fn pack(surface: &DeformedSurface, selection: &VertexSelection) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing;
     use super::*;
+    use crate::engine::testing;
 
     #[test]
     fn a_selection_packs_positions_then_normals_of_its_domains_in_order() {

@@ -5,17 +5,18 @@ use std::mem;
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::in_flight::Readback;
-use super::pick_result::with_transforms;
-use super::scene_actor::{CachedVertices, SceneActor};
-use super::subscriber::{Delivery, FrameOutput, OutputBody, OutputSpec, StepId, StepOutput, Subscriber};
+use super::actor::{CachedVertices, SceneActor};
+use super::readback_queue::Readback;
+use super::subscriber::{Delivery, Subscriber};
+use crate::engine::output::pick_result::with_transforms;
+use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, StepId, StepOutput};
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Error, Result};
 
 impl SceneActor {
     /// Answers every request whose step has been reached or passed; drops requests whose caller no longer waits.
-    pub(super) async fn answer_requests(&mut self) {
+    pub(in crate::engine) async fn answer_requests(&mut self) {
         for request in mem::take(&mut self.pending_requests) {
             if request.reply.is_closed() {
                 continue;
@@ -36,7 +37,7 @@ impl SceneActor {
     /// capacity blocks the writer (back-pressure) and is cut off after `Config::stall_timeout`. If another step is queued,
     /// vertices and at most [`modalcast_render::MAX_FRAMES_IN_FLIGHT`] frames are only started here; they are delivered
     /// while that step is computed.
-    pub(super) async fn serve_subscribers(&mut self, applies_back_pressure: bool) {
+    pub(in crate::engine) async fn serve_subscribers(&mut self, applies_back_pressure: bool) {
         let subscribers = mem::take(&mut self.subscribers);
         let wanted = self.combined_attributes(&subscribers);
         let overlaps_next_step = self.has_queued_step();
@@ -134,14 +135,14 @@ impl SceneActor {
     ) -> Result<StepOutput> {
         let mut stages = self.stages.clone();
         let body = match *spec {
-            OutputSpec::Frame { camera, width, height, frame_output: FrameOutput::Color } => {
-                let image = self.services.device_handle.begin_draw(self.id, camera, (width, height)).wait().await?;
+            OutputSpec::Frame { camera, size, frame_output: FrameOutput::Color } => {
+                let image = self.services.device_handle.begin_draw(self.id, camera, size).wait().await?;
                 stages.extend(stage_times_of_passes(&image.passes));
                 OutputBody::Frame(Arc::new(image.into()))
             }
-            OutputSpec::Frame { camera, width, height, frame_output } => {
+            OutputSpec::Frame { camera, size, frame_output } => {
                 let (survey, legend) =
-                    self.services.device_handle.render_aov(self.id, camera, [width, height], frame_output).await?;
+                    self.services.device_handle.render_aov(self.id, camera, size, frame_output).await?;
                 stages.extend(stage_times_of_passes(&survey.passes));
                 OutputBody::Aov(survey, legend)
             }
@@ -183,7 +184,7 @@ impl SceneActor {
 
 /// The passes of a frame that are stages. The renderer's pass "encode" converts linear light to sRGB bytes and is not
 /// [`Stage::Encode`], which is the PNG encoding.
-pub(super) fn stage_times_of_passes(passes: &[(&'static str, f64)]) -> StageTimes {
+pub(in crate::engine) fn stage_times_of_passes(passes: &[(&'static str, f64)]) -> StageTimes {
     let stage = |name: &str| Stage::from_name(name).filter(|stage| *stage != Stage::Encode);
     passes.iter().filter_map(|(name, ms)| Some((stage(name)?, *ms))).collect()
 }
@@ -195,14 +196,15 @@ mod tests {
     use tokio::sync::{Notify, mpsc};
     use tokio::time::timeout;
 
-    use super::super::checkpoint_store::CheckpointStore;
-    use super::super::command::{Command, Reply};
-    use super::super::scene_actor::{ActorParams, SceneServices};
+    use super::super::actor::{ActorParams, SceneServices};
     use super::super::subscriber::Subscription;
-    use super::super::{device_handle::DeviceHandle, testing};
     use super::*;
     use crate::config::Config;
-    use modalcast_model::scene::{Camera, SceneState};
+    use crate::engine::device::command::{Command, Reply};
+    use crate::engine::device::handle::DeviceHandle;
+    use crate::engine::storage::checkpoint_store::CheckpointStore;
+    use crate::engine::testing;
+    use modalcast_model::scene::{Camera, FrameSize, SceneState};
     use modalcast_render::{FrameImage, RasterBackends};
 
     /// A scene at its first step, and the receiver of its device commands.
@@ -220,7 +222,7 @@ mod tests {
     fn subscriber(delivery: Delivery, width: u32) -> (Subscriber, Subscription) {
         let camera = Camera::fit_to_scene(&testing::two_strips(), width, 8);
         Subscription::new(
-            OutputSpec::Frame { camera, width, height: 8, frame_output: FrameOutput::Color },
+            OutputSpec::Frame { camera, size: FrameSize::new(width, 8), frame_output: FrameOutput::Color },
             delivery,
             Arc::default(),
         )
@@ -229,7 +231,7 @@ mod tests {
     /// The next frame that is requested from the device within `ms` milliseconds: its width and its reply channel.
     async fn asked(device: &mut mpsc::Receiver<Command>, ms: u64) -> Option<(u32, Reply<FrameImage>)> {
         match timeout(Duration::from_millis(ms), device.recv()).await.ok()?? {
-            Command::Draw { size, reply, .. } => Some((size.0, reply)),
+            Command::Draw { size, reply, .. } => Some((size.width, reply)),
             _ => None,
         }
     }

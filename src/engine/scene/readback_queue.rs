@@ -22,18 +22,19 @@
 
 use std::sync::Arc;
 
-use super::command::TimedVertices;
-use super::device_handle::PendingReply;
-use super::scene_actor::{CompletedStep, SceneActor, acknowledge};
-use super::step_output::stage_times_of_passes;
-use super::subscriber::{OutputBody, OutputSpec, SendPermit, StepId, StepOutput, Subscriber};
+use super::actor::{CompletedStep, SceneActor, acknowledge};
+use super::output_delivery::stage_times_of_passes;
+use super::subscriber::{SendPermit, Subscriber};
+use crate::engine::device::command::TimedVertices;
+use crate::engine::device::handle::PendingReply;
+use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, StepId, StepOutput};
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::error::Result;
-use modalcast_model::scene::FloatingOrigins;
+use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize};
 use modalcast_render::{FrameImage, MAX_FRAMES_IN_FLIGHT};
 
 /// A device-to-host readback in flight and its subscribers.
-pub(super) struct PendingReadback {
+pub(in crate::engine) struct PendingReadback {
     readback: Readback,
     /// The scene's step count when the readback was started.
     pub count: u64,
@@ -47,7 +48,7 @@ pub(super) struct PendingReadback {
 }
 
 /// The pending result of a readback.
-pub(super) enum Readback {
+pub(in crate::engine) enum Readback {
     Vertices(PendingReply<TimedVertices>),
     Frame(OutputSpec, PendingReply<FrameImage>),
 }
@@ -75,7 +76,11 @@ impl Readback {
 
 impl SceneActor {
     /// A readback of the current step that was just started.
-    pub(super) fn new_readback(&self, readback: Readback, permits: Vec<(SendPermit, u64)>) -> PendingReadback {
+    pub(in crate::engine) fn new_readback(
+        &self,
+        readback: Readback,
+        permits: Vec<(SendPermit, u64)>,
+    ) -> PendingReadback {
         PendingReadback {
             readback,
             count: self.count,
@@ -91,7 +96,11 @@ impl SceneActor {
     /// the same view in flight for another viewer, else a new frame, unless [`MAX_FRAMES_IN_FLIGHT`] were begun already.
     /// `begun` holds frames of this step that are not in the queue of readbacks yet. Returns whether the viewer gets a
     /// frame.
-    pub(super) fn begin_frame(&mut self, subscriber: &mut Subscriber, begun: &mut Vec<PendingReadback>) -> bool {
+    pub(in crate::engine) fn begin_frame(
+        &mut self,
+        subscriber: &mut Subscriber,
+        begun: &mut Vec<PendingReadback>,
+    ) -> bool {
         let Some((camera, size)) = subscriber.spec.frame() else { return false };
         if subscriber.delivered_count == self.count || !subscriber.has_credit() {
             return false;
@@ -116,7 +125,7 @@ impl SceneActor {
     }
 
     /// Waits for the oldest readback in flight and delivers it. Cancel-safe.
-    pub(super) async fn deliver_oldest_readback(&mut self) {
+    pub(in crate::engine) async fn deliver_oldest_readback(&mut self) {
         let Some(pending) = self.in_flight.front_mut() else { return };
         let result = pending.readback.recv().await;
         let Some(PendingReadback { step, stages, origins, permits, done, .. }) = self.in_flight.pop_front() else {
@@ -135,27 +144,27 @@ impl SceneActor {
     }
 
     /// Delivers all readbacks of steps whose count is below `count`.
-    pub(super) async fn flush_readbacks_before(&mut self, count: u64) {
+    pub(in crate::engine) async fn flush_readbacks_before(&mut self, count: u64) {
         while self.in_flight.front().is_some_and(|pending| pending.count < count) {
             self.deliver_oldest_readback().await;
         }
     }
 
     /// Delivers all readbacks in flight.
-    pub(super) async fn flush_readbacks(&mut self) {
+    pub(in crate::engine) async fn flush_readbacks(&mut self) {
         self.flush_readbacks_before(u64::MAX).await;
     }
 
     /// Delivers readbacks until no vertices are in flight. The submission of the next step does not wait for vertices,
     /// but its results must not overtake them.
-    pub(super) async fn flush_vertex_readbacks(&mut self) {
+    pub(in crate::engine) async fn flush_vertex_readbacks(&mut self) {
         while self.in_flight.iter().any(|pending| matches!(pending.readback, Readback::Vertices(_))) {
             self.deliver_oldest_readback().await;
         }
     }
 
     /// Delivers readbacks until none is in flight for `subscriber`, so that the viewer can then be served synchronously.
-    pub(super) async fn flush_readbacks_for(&mut self, subscriber: &Subscriber) {
+    pub(in crate::engine) async fn flush_readbacks_for(&mut self, subscriber: &Subscriber) {
         while self
             .in_flight
             .iter()
@@ -168,11 +177,9 @@ impl SceneActor {
 
 impl OutputSpec {
     /// Camera and size in pixels of a color frame; `None` for other views.
-    const fn frame(&self) -> Option<(modalcast_model::scene::Camera, (u32, u32))> {
+    const fn frame(&self) -> Option<(Camera, FrameSize)> {
         match *self {
-            Self::Frame { camera, width, height, frame_output: super::subscriber::FrameOutput::Color } => {
-                Some((camera, (width, height)))
-            }
+            Self::Frame { camera, size, frame_output: FrameOutput::Color } => Some((camera, size)),
             _ => None,
         }
     }

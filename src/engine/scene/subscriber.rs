@@ -8,14 +8,8 @@ use std::time::Instant;
 
 use tokio::sync::{Notify, mpsc, watch};
 
-use super::frame_encoder::ColorFrame;
-use super::pick_result::ModalHit;
-use crate::frame::Legend;
-use crate::telemetry::StageTimes;
-use modalcast_model::deform::{DeformedSurface, VertexAttributes};
+use crate::engine::output::step_output::{OutputSpec, StepOutput};
 use modalcast_model::error::{Error, Result, fault_in};
-use modalcast_model::scene::{Camera, FloatingOrigins, PixelRect, SceneState};
-use modalcast_render::AovImage;
 
 /// Results that a lossless subscriber may leave unread before it blocks the writer.
 const LOSSLESS_CREDITS: usize = 2;
@@ -30,82 +24,6 @@ pub enum Delivery {
     Latest,
 }
 
-/// The result that a subscriber requests of a step.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum OutputSpec {
-    Frame {
-        camera: Camera,
-        width: u32,
-        height: u32,
-        frame_output: FrameOutput,
-    },
-    Vertices(VertexAttributes),
-    /// The surface points at the pixels of a rectangle in a picture of this size in pixels.
-    Pick {
-        camera: Camera,
-        picture: [u32; 2],
-        rectangle: PixelRect,
-    },
-}
-
-/// The quantity that a frame shows.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub enum FrameOutput {
-    #[default]
-    Color,
-    /// See [`modalcast_render::Aov`].
-    Depth,
-    Domains,
-    Normals,
-    /// |u| as a color map. `largest` is the value at its bright end in meters; 0 fits the scale to each frame.
-    Displacement {
-        largest: f64,
-    },
-    /// One column of U as a color map, in meters per unit of its coordinate; `largest` as above.
-    ModeShape {
-        mode: u32,
-        largest: f64,
-    },
-}
-
-/// Identifies a step. Step numbers are unique within one run; each writer starts a new run.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct StepId {
-    /// 0 before the scene's first step.
-    pub run: u64,
-    pub number: u64,
-    /// Simulation time in seconds.
-    pub time: f64,
-}
-
-impl StepId {
-    pub(super) const fn of(state: &SceneState) -> Self {
-        Self { run: state.run, number: state.step, time: state.time }
-    }
-}
-
-/// The content of a result.
-#[derive(Debug, Clone)]
-pub enum OutputBody {
-    Frame(Arc<ColorFrame>),
-    Vertices(Arc<DeformedSurface>),
-    /// Values instead of colors; to be shown as a color map if a legend is present.
-    Aov(AovImage, Option<Legend>),
-    Pick(Vec<ModalHit>),
-}
-
-/// The result of one view of one step.
-#[derive(Debug, Clone)]
-pub struct StepOutput {
-    pub step: StepId,
-    /// Steps that this subscriber skipped since its last result.
-    pub skipped: u64,
-    pub stages: StageTimes,
-    /// The cells that the vertices are relative to; `None` if all are relative to the scene's origin.
-    pub origins: Option<Arc<FloatingOrigins>>,
-    pub body: OutputBody,
-}
-
 /// Why a feed ends. `immediate` aborts a reply that is being sent.
 #[derive(Debug, Clone)]
 struct EndReason {
@@ -115,7 +33,7 @@ struct EndReason {
 
 /// The scene's end of a subscription.
 #[derive(Debug)]
-pub(super) struct Subscriber {
+pub(in crate::engine) struct Subscriber {
     pub spec: OutputSpec,
     pub delivery: Delivery,
     /// The scene's step count at this viewer's last result.
@@ -131,14 +49,14 @@ pub(super) struct Subscriber {
 
 /// A permit to send one result to a viewer; it consumes one credit.
 #[derive(Debug)]
-pub(super) struct SendPermit {
+pub(in crate::engine) struct SendPermit {
     items: mpsc::Sender<Result<StepOutput>>,
     error_sent: Arc<AtomicBool>,
 }
 
 impl SendPermit {
     /// Sends a result; an error ends the feed. Returns false when the viewer is to be dropped.
-    pub(super) fn send(self, output: Result<StepOutput>) -> bool {
+    pub(in crate::engine) fn send(self, output: Result<StepOutput>) -> bool {
         let lives = output.is_ok();
         if !lives {
             self.error_sent.store(true, Ordering::Release);
@@ -148,24 +66,24 @@ impl SendPermit {
     }
 
     /// Whether the permit belongs to this viewer.
-    pub(super) fn belongs_to(&self, subscriber: &Subscriber) -> bool {
+    pub(in crate::engine) fn belongs_to(&self, subscriber: &Subscriber) -> bool {
         self.items.same_channel(&subscriber.items)
     }
 }
 
 impl Subscriber {
     /// Whether the viewer has a credit for a further result.
-    pub(super) fn has_credit(&self) -> bool {
+    pub(in crate::engine) fn has_credit(&self) -> bool {
         self.credits.load(Ordering::Acquire) > 0
     }
 
     /// Whether the feed was dropped or has received a final error.
-    pub(super) fn is_closed(&self) -> bool {
+    pub(in crate::engine) fn is_closed(&self) -> bool {
         self.items.is_closed() || self.error_sent.load(Ordering::Acquire)
     }
 
     /// Records that the viewer receives step number `count` of the scene. Returns how many steps it skipped.
-    pub(super) fn mark_delivered(&mut self, count: u64) -> u64 {
+    pub(in crate::engine) fn mark_delivered(&mut self, count: u64) -> u64 {
         let skipped = count - self.delivered_count - 1;
         self.delivered_count = count;
         self.stalled_since = None;
@@ -173,18 +91,18 @@ impl Subscriber {
     }
 
     /// Consumes one credit for a result that is sent now or later.
-    pub(super) fn take_permit(&self) -> SendPermit {
+    pub(in crate::engine) fn take_permit(&self) -> SendPermit {
         self.credits.fetch_sub(1, Ordering::AcqRel);
         SendPermit { items: self.items.clone(), error_sent: Arc::clone(&self.error_sent) }
     }
 
     /// Ends the feed after its buffered results.
-    pub(super) fn end(&self, error: Error) {
+    pub(in crate::engine) fn end(&self, error: Error) {
         self.end.send_replace(Some(EndReason { error, immediate: false }));
     }
 
     /// Ends the feed immediately; see [`Subscription::cut_off`].
-    pub(super) fn disconnect(&self, error: Error) {
+    pub(in crate::engine) fn disconnect(&self, error: Error) {
         self.end.send_replace(Some(EndReason { error, immediate: true }));
     }
 }
@@ -202,7 +120,7 @@ pub struct Subscription {
 
 impl Subscription {
     /// Creates both ends of a subscription. `scene` is notified whenever the feed grants a credit.
-    pub(super) fn new(spec: OutputSpec, delivery: Delivery, scene: Arc<Notify>) -> (Subscriber, Self) {
+    pub(in crate::engine) fn new(spec: OutputSpec, delivery: Delivery, scene: Arc<Notify>) -> (Subscriber, Self) {
         let ahead = if delivery == Delivery::Lossless { LOSSLESS_CREDITS } else { 0 };
         let credits = Arc::new(AtomicUsize::new(ahead));
         let (items, inbox) = mpsc::channel(LOSSLESS_CREDITS);
@@ -222,7 +140,7 @@ impl Subscription {
     }
 
     /// Which steps the feed receives.
-    pub(super) const fn delivery(&self) -> Delivery {
+    pub(in crate::engine) const fn delivery(&self) -> Delivery {
         self.delivery
     }
 
@@ -276,6 +194,8 @@ impl Drop for Subscription {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::output::step_output::{OutputBody, StepId};
+    use modalcast_model::deform::VertexAttributes;
 
     fn output(number: u64) -> Result<StepOutput> {
         let step = StepId { run: 1, number, time: 0.0 };

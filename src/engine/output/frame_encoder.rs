@@ -6,14 +6,15 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use bytes::Bytes;
-use tokio::sync::{OnceCell, Semaphore};
+use tokio::sync::Semaphore;
 
-use super::blocking::run_blocking;
-use super::subscriber::{OutputBody, StepId, StepOutput};
+use super::color_frame::ColorFrame;
+use super::step_output::{OutputBody, StepId, StepOutput};
+use crate::engine::blocking::run_blocking;
 use crate::frame::{self, Legend};
 use crate::telemetry::{Stage, StageTimes, ms_since};
 use modalcast_model::error::{Result, fault_in};
-use modalcast_render::{AovImage, FrameImage, RasterBackends};
+use modalcast_render::{AovImage, RasterBackends};
 
 /// Wire format of pixels. Multi-byte values are little-endian; the top row comes first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,25 +41,6 @@ pub struct EncodedOutput {
     pub bytes: Bytes,
 }
 
-/// Color pixels of one step, shared by all subscribers with the same view. The PNG is encoded once, on first use.
-#[derive(Debug)]
-pub struct ColorFrame {
-    pub width: u32,
-    pub height: u32,
-    /// RGBA8 sRGB, top row first.
-    pub rgba: Bytes,
-    raster_backends: RasterBackends,
-    /// The PNG and the milliseconds that encoding took.
-    png: OnceCell<(Bytes, f64)>,
-}
-
-impl From<FrameImage> for ColorFrame {
-    fn from(image: FrameImage) -> Self {
-        let FrameImage { width, height, rgba, raster_backends, .. } = image;
-        Self { width, height, rgba: rgba.into(), raster_backends, png: OnceCell::new() }
-    }
-}
-
 /// Encodes frames off the device thread. Clones share one limit on threads.
 #[derive(Debug, Clone)]
 pub struct FrameEncoder {
@@ -68,7 +50,7 @@ pub struct FrameEncoder {
 
 impl FrameEncoder {
     /// An encoder for this machine: one thread per core.
-    pub(super) fn per_core() -> Self {
+    pub(in crate::engine) fn per_core() -> Self {
         Self::new(std::thread::available_parallelism().map_or(1, NonZero::get))
     }
 
@@ -77,7 +59,7 @@ impl FrameEncoder {
     }
 
     /// Number of frames that are encoded concurrently.
-    pub(super) const fn cores(&self) -> usize {
+    pub(in crate::engine) const fn cores(&self) -> usize {
         self.cores
     }
 
@@ -137,8 +119,9 @@ fn color_map(image: &AovImage, legend: &Legend, format: FrameFormat) -> Result<V
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(in crate::engine) mod tests {
     use super::*;
+    use modalcast_render::FrameImage;
 
     /// A frame of noise, so that its PNG takes time.
     pub(in crate::engine) fn noise(number: u64, side: u32) -> StepOutput {

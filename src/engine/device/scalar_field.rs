@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::subscriber::FrameOutput;
+use crate::engine::output::step_output::FrameOutput;
 use crate::frame::{Legend, nice_ceiling};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::{Result, invalid};
@@ -30,7 +30,11 @@ pub fn validate_mode(scene: &Scene, mode: u32) -> Result<u32> {
 /// The error is that of the deformer's positions, because T x0 and the difference are computed in f64. The positions
 /// are f32 relative to the domain's cell, so a vertex one kilometer from the cell's origin has an error of up to 0.1
 /// mm.
-pub(super) fn displacement_magnitudes(scene: &Scene, state: &SceneState, surface: &DeformedSurface) -> Vec<f32> {
+pub(in crate::engine) fn displacement_magnitudes(
+    scene: &Scene,
+    state: &SceneState,
+    surface: &DeformedSurface,
+) -> Vec<f32> {
     let domains = scene.domains.par_iter().zip(&scene.layout.slots).enumerate();
     let of_domain = domains.flat_map_iter(|(index, (domain, slot))| {
         let placed = state.composed_transform(scene, index);
@@ -48,7 +52,7 @@ pub(super) fn displacement_magnitudes(scene: &Scene, state: &SceneState, surface
 
 /// The norm of every vertex's three entries of one column of U, times the scene's unit: the displacement in meters per
 /// unit of the coordinate, before T. Zero in domains without the mode.
-pub(super) fn mode_shape_magnitudes(scene: &Scene, mode: usize) -> Vec<f32> {
+pub(in crate::engine) fn mode_shape_magnitudes(scene: &Scene, mode: usize) -> Vec<f32> {
     let of_domain = scene.domains.par_iter().zip(&scene.layout.slots).flat_map_iter(|(domain, slot)| {
         let modes = &scene.shapes[domain.shape].modes;
         let column = if mode < modes.rank() { modes.column(mode) } else { &[] };
@@ -61,7 +65,7 @@ pub(super) fn mode_shape_magnitudes(scene: &Scene, mode: usize) -> Vec<f32> {
 
 /// The legend of a color map of these values. The end of the scale is that of `frame_output`, or is fitted to the largest
 /// value if that is 0.
-pub(super) fn fit_legend(scene: &Scene, frame_output: FrameOutput, values: &[f32]) -> Legend {
+pub(in crate::engine) fn fit_legend(scene: &Scene, frame_output: FrameOutput, values: &[f32]) -> Legend {
     let most = f64::from(values.iter().copied().fold(0.0, f32::max));
     let (title, asked, least) = match frame_output {
         FrameOutput::ModeShape { mode, largest } => (format!("shape of mode {mode}, m per unit of q"), largest, 1e-30),
@@ -78,8 +82,8 @@ pub(super) fn fit_legend(scene: &Scene, frame_output: FrameOutput, values: &[f32
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing;
     use super::*;
+    use crate::engine::testing;
     use modalcast_compute::reference;
 
     #[test]

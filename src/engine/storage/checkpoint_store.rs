@@ -31,7 +31,7 @@ const HASH_BYTES: usize = 32;
 
 /// Writes checkpoints in the background.
 #[derive(Debug)]
-pub(super) struct CheckpointStore {
+pub(in crate::engine) struct CheckpointStore {
     folder: PathBuf,
     shared: Arc<Shared>,
     thread: Mutex<Option<JoinHandle<()>>>,
@@ -57,7 +57,7 @@ impl CheckpointStore {
     ///
     /// # Errors
     /// `Fault` when the folder or the thread cannot be created.
-    pub(super) fn start(folder: PathBuf) -> Result<Self> {
+    pub(in crate::engine) fn start(folder: PathBuf) -> Result<Self> {
         fs::create_dir_all(&folder).map_err(fault_in("state folder"))?;
         let shared = Arc::new(Shared::default());
         let (theirs, place) = (Arc::clone(&shared), folder.clone());
@@ -69,7 +69,7 @@ impl CheckpointStore {
     }
 
     /// Records the newest state of a scene. Never waits for the disk.
-    pub(super) fn enqueue(&self, name: &str, state: &Arc<SceneState>) {
+    pub(in crate::engine) fn enqueue(&self, name: &str, state: &Arc<SceneState>) {
         lock(&self.shared.pending).dirty.insert(name.to_owned(), Arc::clone(state));
         self.shared.changed.notify_one();
     }
@@ -78,7 +78,7 @@ impl CheckpointStore {
     ///
     /// # Errors
     /// `Invalid` when the file is damaged or its size does not match the scene; `Fault` of the disk.
-    pub(super) fn load(&self, name: &str, scene: &Scene) -> Result<Option<SceneState>> {
+    pub(in crate::engine) fn load(&self, name: &str, scene: &Scene) -> Result<Option<SceneState>> {
         match fs::read(path_of(&self.folder, name)) {
             Ok(bytes) => decode(&bytes, scene).map(Some),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
@@ -87,7 +87,7 @@ impl CheckpointStore {
     }
 
     /// Removes a scene's file. Waits for the disk.
-    pub(super) fn remove(&self, name: &str) {
+    pub(in crate::engine) fn remove(&self, name: &str) {
         let _files = lock(&self.shared.files);
         lock(&self.shared.pending).dirty.remove(name);
         // Usually the scene had no step, so there is no file.
@@ -95,7 +95,7 @@ impl CheckpointStore {
     }
 
     /// Writes the dirty states and ends the thread. Waits for the disk.
-    pub(super) fn finish(&self) {
+    pub(in crate::engine) fn finish(&self) {
         lock(&self.shared.pending).stopping = true;
         self.shared.changed.notify_one();
         if let Some(thread) = lock(&self.thread).take() {
@@ -134,7 +134,7 @@ fn write_loop(shared: &Shared, folder: &Path) {
 
 /// Replaces a file atomically: writes a temporary file in the same folder, syncs and renames it. A reader sees either
 /// the old or the new content.
-pub(super) fn write_atomic(path: &Path, bytes: &[u8]) -> io::Result<()> {
+pub(in crate::engine) fn write_atomic(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let temporary = path.with_extension("new");
     let mut file = fs::File::create(&temporary)?;
     file.write_all(bytes)?;
@@ -224,8 +224,8 @@ fn decode_cells(bytes: &[u8]) -> Result<FloatingOrigins> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing;
     use super::*;
+    use crate::engine::testing;
 
     fn moved(scene: &Scene) -> SceneState {
         let mut state = SceneState { run: 3, step: 41, time: 0.25, ..SceneState::rest(scene) };

@@ -32,7 +32,7 @@ pub struct UploadHeader {
 /// An upload in progress. Its methods block on the disk.
 #[derive(Debug)]
 pub struct Upload {
-    pub(super) header: UploadHeader,
+    pub(in crate::engine) header: UploadHeader,
     folder: PathBuf,
     paths: BTreeSet<String>,
     /// Sum of the declared sizes of the files so far, in bytes.
@@ -58,7 +58,7 @@ impl Upload {
     ///
     /// # Errors
     /// `Invalid` for a malformed entry path, `Fault` of the disk.
-    pub(super) fn begin(uploads: &Path, header: UploadHeader, place: OwnedSemaphorePermit) -> Result<Self> {
+    pub(in crate::engine) fn begin(uploads: &Path, header: UploadHeader, place: OwnedSemaphorePermit) -> Result<Self> {
         if !header.entry.is_empty() {
             validate_path("header.entry", &header.entry)?;
         }
@@ -125,7 +125,7 @@ impl Upload {
     ///
     /// # Errors
     /// `Invalid` naming the header field or file that does not match.
-    pub(super) fn finish(&mut self) -> Result<()> {
+    pub(in crate::engine) fn finish(&mut self) -> Result<()> {
         self.check_file_complete()?;
         if self.paths.len() != self.header.files as usize {
             return Err(invalid("header.files", self.header.files.to_string(), self.paths.len()));
@@ -137,7 +137,7 @@ impl Upload {
     }
 
     /// Moves the folder to `place` and replaces an earlier upload of that name.
-    pub(super) fn commit(mut self, place: &Path) -> Result<()> {
+    pub(in crate::engine) fn commit(mut self, place: &Path) -> Result<()> {
         if place.exists() {
             fs::remove_dir_all(place).map_err(fault_in("upload"))?;
         }

@@ -8,19 +8,19 @@ use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 
 use super::command::{Command, Reply, SceneId, TimedVertices};
-use super::device_context::{DeviceContext, EngineInfo};
+use super::context::{DeviceContext, EngineInfo};
 use super::device_loop::{DeviceLoop, run_device_loop};
-use super::subscriber::FrameOutput;
 use crate::config::Config;
+use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
 use modalcast_model::error::{Error, Result, fault_in};
-use modalcast_model::scene::{Camera, PixelRect, Scene, SceneState};
+use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
 use modalcast_render::{AovImage, FrameImage, MAX_FRAMES_IN_FLIGHT, PickHit};
 
 /// Sends commands to the device thread. The thread ends when the last clone is dropped.
 #[derive(Debug, Clone)]
-pub(super) struct DeviceHandle {
+pub(in crate::engine) struct DeviceHandle {
     commands: mpsc::Sender<Command>,
     limit: usize,
 }
@@ -30,7 +30,9 @@ impl DeviceHandle {
     ///
     /// # Errors
     /// `Unavailable` when the requested backend cannot be opened, `Fault` when a thread cannot be started.
-    pub(super) async fn start(config: &Arc<Config>) -> Result<(Self, EngineInfo, std::thread::JoinHandle<()>)> {
+    pub(in crate::engine) async fn start(
+        config: &Arc<Config>,
+    ) -> Result<(Self, EngineInfo, std::thread::JoinHandle<()>)> {
         // A scene queues at most FRAMES_UNDER_WAY frames, one copy and the next step, and an opening queues one command
         // more. The queue is therefore full only when scenes are opened faster than the limit on open scenes allows.
         let limit = (3 + MAX_FRAMES_IN_FLIGHT) * config.open_scenes + 8;
@@ -55,54 +57,63 @@ impl DeviceHandle {
 
     /// A handle for tests that play the device thread, and the receiver of its commands.
     #[cfg(test)]
-    pub(super) fn mock() -> (Self, mpsc::Receiver<Command>) {
+    pub(in crate::engine) fn mock() -> (Self, mpsc::Receiver<Command>) {
         let (commands, inbox) = mpsc::channel(16);
         (Self { commands, limit: 16 }, inbox)
     }
 
-    pub(super) async fn load_scene(&self, id: SceneId, scene: &Arc<Scene>) -> Result<()> {
+    pub(in crate::engine) async fn load_scene(&self, id: SceneId, scene: &Arc<Scene>) -> Result<()> {
         let scene = Arc::clone(scene);
         self.call(|reply| Command::LoadScene { id, scene, reply }).await
     }
 
     /// Starts deforming a scene to a state.
-    pub(super) fn deform(&self, id: SceneId, state: &Arc<SceneState>) -> PendingReply<DeformSummary> {
+    pub(in crate::engine) fn deform(&self, id: SceneId, state: &Arc<SceneState>) -> PendingReply<DeformSummary> {
         let state = Arc::clone(state);
         self.submit(|reply| Command::Deform { id, state, reply })
     }
 
     /// Starts drawing the last deformation. Later commands do not affect the frame.
-    pub(super) fn begin_draw(&self, id: SceneId, camera: Camera, size: (u32, u32)) -> PendingReply<FrameImage> {
-        self.submit(|reply| Command::Draw { id, camera, size, reply })
-    }
-
-    pub(super) async fn render_aov(
+    pub(in crate::engine) fn begin_draw(
         &self,
         id: SceneId,
         camera: Camera,
-        size: [u32; 2],
+        size: FrameSize,
+    ) -> PendingReply<FrameImage> {
+        self.submit(|reply| Command::Draw { id, camera, size, reply })
+    }
+
+    pub(in crate::engine) async fn render_aov(
+        &self,
+        id: SceneId,
+        camera: Camera,
+        size: FrameSize,
         frame_output: FrameOutput,
     ) -> Result<(AovImage, Option<Legend>)> {
         self.call(|reply| Command::RenderAov { id, camera, size, frame_output, reply }).await
     }
 
-    pub(super) async fn pick(
+    pub(in crate::engine) async fn pick(
         &self,
         id: SceneId,
         camera: Camera,
-        picture: [u32; 2],
+        picture: FrameSize,
         rectangle: PixelRect,
     ) -> Result<Vec<PickHit>> {
         self.call(|reply| Command::Pick { id, camera, picture, rectangle, reply }).await
     }
 
     /// Starts copying the wanted attributes of the last deformation. Later commands do not affect the copy.
-    pub(super) fn read_vertices(&self, id: SceneId, wanted: VertexAttributes) -> PendingReply<TimedVertices> {
+    pub(in crate::engine) fn read_vertices(
+        &self,
+        id: SceneId,
+        wanted: VertexAttributes,
+    ) -> PendingReply<TimedVertices> {
         self.submit(|reply| Command::ReadVertices { id, wanted, reply })
     }
 
     /// Waits for queue capacity, so that a scene never remains on the device because the queue was full.
-    pub(super) async fn unload_scene(&self, id: SceneId) -> Result<()> {
+    pub(in crate::engine) async fn unload_scene(&self, id: SceneId) -> Result<()> {
         let (reply, answer) = oneshot::channel();
         self.commands.send(Command::UnloadScene { id, reply }).await.map_err(|_| gone())?;
         answer.await.map_err(|_| gone())?
@@ -110,7 +121,7 @@ impl DeviceHandle {
 
     /// Ends the thread after the commands already queued. Blocks until the queue has capacity, so it must not be called
     /// on a runtime thread.
-    pub(super) fn quit(&self) {
+    pub(in crate::engine) fn quit(&self) {
         // A closed queue means that the thread has ended.
         self.commands.blocking_send(Command::Quit).ok();
     }
@@ -132,15 +143,15 @@ impl DeviceHandle {
 
 /// The pending answer to a command that was sent to the device thread.
 #[derive(Debug)]
-pub(super) struct PendingReply<T>(Result<oneshot::Receiver<Result<T>>>);
+pub(in crate::engine) struct PendingReply<T>(Result<oneshot::Receiver<Result<T>>>);
 
 impl<T> PendingReply<T> {
-    pub(super) async fn wait(mut self) -> Result<T> {
+    pub(in crate::engine) async fn wait(mut self) -> Result<T> {
         self.recv().await
     }
 
     /// As [`Self::wait`], but cancel-safe. Must not be called again after it has returned.
-    pub(super) async fn recv(&mut self) -> Result<T> {
+    pub(in crate::engine) async fn recv(&mut self) -> Result<T> {
         match &mut self.0 {
             Ok(answer) => answer.await.map_err(|_| gone())?,
             Err(error) => Err(error.clone()),

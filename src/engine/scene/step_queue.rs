@@ -22,7 +22,7 @@ pub enum Policy {
 
 /// An accepted step in the queue.
 #[derive(Debug)]
-pub(super) struct QueuedStep {
+pub(in crate::engine) struct QueuedStep {
     pub update: StepUpdate,
     /// Number of older steps that were merged into this one.
     pub merged: u64,
@@ -31,12 +31,12 @@ pub(super) struct QueuedStep {
 }
 
 impl QueuedStep {
-    pub(super) fn new(update: StepUpdate, parse_ms: f64) -> Self {
+    pub(in crate::engine) fn new(update: StepUpdate, parse_ms: f64) -> Self {
         Self { update, merged: 0, parse_ms, since: Instant::now() }
     }
 
     /// Parse time, and queue time until now.
-    pub(super) fn stages(&self) -> StageTimes {
+    pub(in crate::engine) fn stages(&self) -> StageTimes {
         vec![(Stage::Parse, self.parse_ms), (Stage::Queue, ms_since(self.since))]
     }
 }
@@ -52,7 +52,7 @@ pub enum StepReport {
 
 /// The step queue, shared by a writer's handle and its scene. The lock is never held across an await.
 #[derive(Debug)]
-pub(super) struct StepQueue {
+pub(in crate::engine) struct StepQueue {
     policy: Policy,
     window: usize,
     inner: Mutex<QueueState>,
@@ -65,7 +65,7 @@ pub(super) struct StepQueue {
 /// The writer's lease on a scene. Dropping it closes the queue and admits the next writer, also if the reply that
 /// carries the lease is dropped because the client has disconnected.
 #[derive(Debug)]
-pub(super) struct WriterLease(pub Arc<StepQueue>);
+pub(in crate::engine) struct WriterLease(pub Arc<StepQueue>);
 
 impl Drop for WriterLease {
     fn drop(&mut self) {
@@ -87,11 +87,11 @@ struct QueueState {
 }
 
 impl StepQueue {
-    pub(super) fn new(policy: Policy, window: u32, scene: Arc<Notify>) -> Self {
+    pub(in crate::engine) fn new(policy: Policy, window: u32, scene: Arc<Notify>) -> Self {
         Self { policy, window: window.max(1) as usize, inner: Mutex::default(), scene, writer: Notify::new() }
     }
 
-    pub(super) const fn policy(&self) -> Policy {
+    pub(in crate::engine) const fn policy(&self) -> Policy {
         self.policy
     }
 
@@ -99,7 +99,7 @@ impl StepQueue {
     ///
     /// # Errors
     /// `Invalid` naming the window when the step is beyond it, or the error that ended the queue.
-    pub(super) fn push(&self, step: QueuedStep) -> Result<()> {
+    pub(in crate::engine) fn push(&self, step: QueuedStep) -> Result<()> {
         let mut inner = self.lock();
         if let Some(error) = &inner.ended {
             return Err(error.clone());
@@ -121,7 +121,7 @@ impl StepQueue {
     }
 
     /// Removes the next step to compute. The step counts against the window until its report is taken.
-    pub(super) fn take(&self) -> Option<QueuedStep> {
+    pub(in crate::engine) fn take(&self) -> Option<QueuedStep> {
         let mut inner = self.lock();
         let step = inner.queued.pop_front()?;
         inner.in_progress += 1;
@@ -129,12 +129,12 @@ impl StepQueue {
     }
 
     /// Whether a step is queued.
-    pub(super) fn has_queued(&self) -> bool {
+    pub(in crate::engine) fn has_queued(&self) -> bool {
         !self.lock().queued.is_empty()
     }
 
     /// Reports the outcome of the oldest step in work.
-    pub(super) fn report(&self, step: u64, outcome: Result<StageTimes>) {
+    pub(in crate::engine) fn report(&self, step: u64, outcome: Result<StageTimes>) {
         let mut inner = self.lock();
         inner.in_progress = inner.in_progress.saturating_sub(1);
         let skipped = inner.skipped;
@@ -161,7 +161,7 @@ impl StepQueue {
     ///
     /// # Errors
     /// The error that ended the queue, after all reports were taken.
-    pub(super) async fn next_report(&self) -> Result<StepReport> {
+    pub(in crate::engine) async fn next_report(&self) -> Result<StepReport> {
         loop {
             {
                 let mut inner = self.lock();
@@ -177,26 +177,26 @@ impl StepQueue {
     }
 
     /// Whether every accepted step is reported and every report is taken.
-    pub(super) fn is_drained(&self) -> bool {
+    pub(in crate::engine) fn is_drained(&self) -> bool {
         let inner = self.lock();
         inner.in_progress == 0 && inner.queued.is_empty() && inner.reports.is_empty()
     }
 
     /// Called when the writer drops its lease. Drops the queued steps.
-    pub(super) fn close(&self) {
+    pub(in crate::engine) fn close(&self) {
         let mut inner = self.lock();
         inner.closed = true;
         inner.queued.clear();
         self.scene.notify_one();
     }
 
-    pub(super) fn is_closed(&self) -> bool {
+    pub(in crate::engine) fn is_closed(&self) -> bool {
         let inner = self.lock();
         inner.closed || inner.ended.is_some()
     }
 
     /// Ends the queue with an error from the scene. Drops the queued steps.
-    pub(super) fn end(&self, error: Error) {
+    pub(in crate::engine) fn end(&self, error: Error) {
         let mut inner = self.lock();
         inner.ended.get_or_insert(error);
         inner.queued.clear();
@@ -221,8 +221,8 @@ impl StepQueue {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing;
     use super::*;
+    use crate::engine::testing;
     use modalcast_model::scene::{RawStepUpdate, SceneState};
 
     fn step(number: u64, domain: u32, q: [f32; 2]) -> QueuedStep {

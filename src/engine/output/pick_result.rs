@@ -3,24 +3,12 @@
 
 use std::sync::Arc;
 
-use super::blocking::run_blocking;
-use super::subscriber::{OutputBody, StepId, StepOutput};
+use super::step_output::{ModalHit, OutputBody, StepId, StepOutput};
+use crate::engine::blocking::run_blocking;
 use crate::telemetry::StageTimes;
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Scene, SceneState};
 use modalcast_render::PickHit;
-
-/// One hit of a pick.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ModalHit {
-    /// Lengths are in scene units.
-    pub hit: PickHit,
-    /// A, the linear part of `world_from_domain` at the step, row-major.
-    pub linear: [f32; 9],
-    /// The 3 x r block of U at the point, row-major. A force f at the point (world axes) acts on the coordinates as
-    /// f_q = U^T A^T f.
-    pub modes: Vec<f32>,
-}
 
 /// All hits of a pick in one step.
 #[derive(Debug, Clone)]
@@ -31,7 +19,7 @@ pub struct PickResult {
 }
 
 /// Adds the linear parts of the domains' transforms to hits. [`resolve_picks`] adds the modes outside the scene's task.
-pub(super) fn with_transforms(state: &SceneState, scene: &Scene, hits: Vec<PickHit>) -> Vec<ModalHit> {
+pub(in crate::engine) fn with_transforms(state: &SceneState, scene: &Scene, hits: Vec<PickHit>) -> Vec<ModalHit> {
     let one = |hit: PickHit| {
         let rows = state.transform_of(scene, hit.domain).0;
         let linear = [0, 1, 2, 4, 5, 6, 8, 9, 10].map(|entry: usize| rows[entry]);

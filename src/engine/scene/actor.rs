@@ -9,13 +9,14 @@ use std::time::Instant;
 
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 
-use super::checkpoint_store::CheckpointStore;
-use super::command::SceneId;
-use super::device_handle::DeviceHandle;
-use super::in_flight::PendingReadback;
+use super::readback_queue::PendingReadback;
 use super::step_queue::{Policy, QueuedStep, StepQueue, WriterLease};
-use super::subscriber::{Delivery, OutputSpec, StepId, StepOutput, Subscriber};
+use super::subscriber::{Delivery, Subscriber};
 use crate::config::Config;
+use crate::engine::device::command::SceneId;
+use crate::engine::device::handle::DeviceHandle;
+use crate::engine::output::step_output::{OutputSpec, StepId, StepOutput};
+use crate::engine::storage::checkpoint_store::CheckpointStore;
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Error, Result};
@@ -31,7 +32,7 @@ pub enum StepSelector {
 
 /// A single request that is waiting for its step.
 #[derive(Debug)]
-pub(super) struct StepRequest {
+pub(in crate::engine) struct StepRequest {
     pub selector: StepSelector,
     pub spec: OutputSpec,
     pub reply: oneshot::Sender<Result<StepOutput>>,
@@ -39,7 +40,7 @@ pub(super) struct StepRequest {
 
 /// A message to a scene's task. The mailbox is bounded: a request that finds it full fails with `Busy`; `Stop` waits
 /// for capacity.
-pub(super) enum Message {
+pub(in crate::engine) enum Message {
     AcquireWriter { peer: String, policy: Policy, window: u32, reply: oneshot::Sender<Result<(WriterLease, u64)>> },
     Subscribe { subscriber: Subscriber, reply: oneshot::Sender<Result<()>> },
     Request(StepRequest),
@@ -48,7 +49,7 @@ pub(super) enum Message {
 
 /// Services that all scenes share.
 #[derive(Debug, Clone)]
-pub(super) struct SceneServices {
+pub(in crate::engine) struct SceneServices {
     pub device_handle: DeviceHandle,
     pub checkpoints: Arc<CheckpointStore>,
     pub config: Arc<Config>,
@@ -62,41 +63,41 @@ struct Writer {
 }
 
 /// A completed step that is not acknowledged yet.
-pub(super) struct CompletedStep {
+pub(in crate::engine) struct CompletedStep {
     step_queue: Arc<StepQueue>,
     step: u64,
     stages: StageTimes,
 }
 
 /// The state machine of one open scene.
-pub(super) struct SceneActor {
-    pub(super) name: String,
-    pub(super) id: SceneId,
-    pub(super) scene: Arc<Scene>,
-    pub(super) services: SceneServices,
-    pub(super) state: Arc<SceneState>,
+pub(in crate::engine) struct SceneActor {
+    pub(in crate::engine) name: String,
+    pub(in crate::engine) id: SceneId,
+    pub(in crate::engine) scene: Arc<Scene>,
+    pub(in crate::engine) services: SceneServices,
+    pub(in crate::engine) state: Arc<SceneState>,
     /// The run of the latest writer; 0 before the first writer.
     run: u64,
     /// Number of steps applied to the scene, merged ones included.
-    pub(super) count: u64,
+    pub(in crate::engine) count: u64,
     writer: Option<Writer>,
-    pub(super) subscribers: Vec<Subscriber>,
-    pub(super) pending_requests: Vec<StepRequest>,
+    pub(in crate::engine) subscribers: Vec<Subscriber>,
+    pub(in crate::engine) pending_requests: Vec<StepRequest>,
     /// A completed step that is not yet delivered to every lossless viewer.
     undelivered: Option<(Arc<StepQueue>, u64)>,
     /// Stage times of the current step up to the end of its deformation.
-    pub(super) stages: StageTimes,
+    pub(in crate::engine) stages: StageTimes,
     /// Readbacks in flight, oldest first: those of the current step, and frames of the step before it.
-    pub(super) in_flight: VecDeque<PendingReadback>,
+    pub(in crate::engine) in_flight: VecDeque<PendingReadback>,
     /// Vertex attributes of the current step that a single copy brought to the host, cached for later readers.
-    pub(super) surface: Option<CachedVertices>,
+    pub(in crate::engine) surface: Option<CachedVertices>,
     last_step: watch::Sender<Option<StepId>>,
     wake: Arc<Notify>,
 }
 
 /// Vertices in host memory.
 #[derive(Debug, Clone)]
-pub(super) struct CachedVertices {
+pub(in crate::engine) struct CachedVertices {
     pub surface: Arc<DeformedSurface>,
     /// The attributes that `surface` contains.
     pub parts: VertexAttributes,
@@ -105,7 +106,7 @@ pub(super) struct CachedVertices {
 }
 
 /// Initial values of a scene's task.
-pub(super) struct ActorParams {
+pub(in crate::engine) struct ActorParams {
     pub name: String,
     pub id: SceneId,
     pub scene: Arc<Scene>,
@@ -116,7 +117,10 @@ pub(super) struct ActorParams {
 impl SceneActor {
     /// The task of a scene that is loaded on the device and deformed to `params.state`. Also returns the channel
     /// that carries the last completed step.
-    pub(super) fn new(params: ActorParams, services: SceneServices) -> (Self, watch::Receiver<Option<StepId>>) {
+    pub(in crate::engine) fn new(
+        params: ActorParams,
+        services: SceneServices,
+    ) -> (Self, watch::Receiver<Option<StepId>>) {
         let ActorParams { name, id, scene, state, wake } = params;
         let has_step = state.run > 0;
         let (last_step, last_step_receiver) = watch::channel(has_step.then(|| StepId::of(&state)));
@@ -142,7 +146,7 @@ impl SceneActor {
     }
 
     /// Runs until it receives `Stop` or every sender of the mailbox is dropped.
-    pub(super) async fn run_until_stopped(mut self, mut mailbox: mpsc::Receiver<Message>) {
+    pub(in crate::engine) async fn run_until_stopped(mut self, mut mailbox: mpsc::Receiver<Message>) {
         let (error, done) = loop {
             self.advance().await;
             let stall_timeout = self.next_stall_deadline();
@@ -289,7 +293,7 @@ impl SceneActor {
 
     /// Whether another step is queued. If so, readbacks of the current step are only begun and overlap with computing
     /// it.
-    pub(super) fn has_queued_step(&self) -> bool {
+    pub(in crate::engine) fn has_queued_step(&self) -> bool {
         self.writer.as_ref().is_some_and(|writer| !writer.step_queue.is_closed() && writer.step_queue.has_queued())
     }
 
@@ -317,7 +321,7 @@ impl SceneActor {
     ///
     /// # Errors
     /// `Gone` when the scene has passed the exact step that is asked for.
-    pub(super) fn is_ready(&self, selector: StepSelector) -> Result<bool> {
+    pub(in crate::engine) fn is_ready(&self, selector: StepSelector) -> Result<bool> {
         let of_this_run = self.state.run == self.run && self.run > 0;
         let here = of_this_run.then_some(self.state.step);
         match (selector, here) {
@@ -351,7 +355,7 @@ impl SceneActor {
     }
 }
 
-pub(super) fn acknowledge(done: Option<CompletedStep>) {
+pub(in crate::engine) fn acknowledge(done: Option<CompletedStep>) {
     if let Some(CompletedStep { step_queue, step, stages }) = done {
         step_queue.report(step, Ok(stages));
     }

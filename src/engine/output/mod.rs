@@ -1,0 +1,7 @@
+//! Outputs of steps: frames, AOVs, picks and vertices, and their encoding for the wire off the device thread.
+
+pub(super) mod color_frame;
+pub(super) mod frame_encoder;
+pub(super) mod pack;
+pub(super) mod pick_result;
+pub(super) mod step_output;

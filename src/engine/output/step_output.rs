@@ -1,0 +1,97 @@
+//! The output of one step: what a reader requests ([`OutputSpec`]) and what it receives ([`StepOutput`]).
+
+use std::sync::Arc;
+
+use super::color_frame::ColorFrame;
+use crate::frame::Legend;
+use crate::telemetry::StageTimes;
+use modalcast_model::deform::{DeformedSurface, VertexAttributes};
+use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize, PixelRect, SceneState};
+use modalcast_render::{AovImage, PickHit};
+
+/// The result that a subscriber requests of a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum OutputSpec {
+    Frame {
+        camera: Camera,
+        size: FrameSize,
+        frame_output: FrameOutput,
+    },
+    Vertices(VertexAttributes),
+    /// The surface points at the pixels of a rectangle in a picture of this size in pixels.
+    Pick {
+        camera: Camera,
+        picture: FrameSize,
+        rectangle: PixelRect,
+    },
+}
+
+/// The quantity that a frame shows.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub enum FrameOutput {
+    #[default]
+    Color,
+    /// See [`modalcast_render::Aov`].
+    Depth,
+    Domains,
+    Normals,
+    /// |u| as a color map. `largest` is the value at its bright end in meters; 0 fits the scale to each frame.
+    Displacement {
+        largest: f64,
+    },
+    /// One column of U as a color map, in meters per unit of its coordinate; `largest` as above.
+    ModeShape {
+        mode: u32,
+        largest: f64,
+    },
+}
+
+/// Identifies a step. Step numbers are unique within one run; each writer starts a new run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepId {
+    /// 0 before the scene's first step.
+    pub run: u64,
+    pub number: u64,
+    /// Simulation time in seconds.
+    pub time: f64,
+}
+
+impl StepId {
+    pub(in crate::engine) const fn of(state: &SceneState) -> Self {
+        Self { run: state.run, number: state.step, time: state.time }
+    }
+}
+
+/// The content of a result.
+#[derive(Debug, Clone)]
+pub enum OutputBody {
+    Frame(Arc<ColorFrame>),
+    Vertices(Arc<DeformedSurface>),
+    /// Values instead of colors; to be shown as a color map if a legend is present.
+    Aov(AovImage, Option<Legend>),
+    Pick(Vec<ModalHit>),
+}
+
+/// The result of one view of one step.
+#[derive(Debug, Clone)]
+pub struct StepOutput {
+    pub step: StepId,
+    /// Steps that this subscriber skipped since its last result.
+    pub skipped: u64,
+    pub stages: StageTimes,
+    /// The cells that the vertices are relative to; `None` if all are relative to the scene's origin.
+    pub origins: Option<Arc<FloatingOrigins>>,
+    pub body: OutputBody,
+}
+
+/// One hit of a pick.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModalHit {
+    /// Lengths are in scene units.
+    pub hit: PickHit,
+    /// A, the linear part of `world_from_domain` at the step, row-major.
+    pub linear: [f32; 9],
+    /// The 3 x r block of U at the point, row-major. A force f at the point (world axes) acts on the coordinates as
+    /// f_q = U^T A^T f.
+    pub modes: Vec<f32>,
+}

@@ -1,0 +1,9 @@
+//! One open scene: its actor, the queue of steps from the writer, and the delivery of outputs to subscribers.
+
+pub(super) mod actor;
+pub(super) mod encoded_subscription;
+pub(super) mod handle;
+mod output_delivery;
+mod readback_queue;
+pub(super) mod step_queue;
+pub(super) mod subscriber;

@@ -1,0 +1,5 @@
+//! The state folder: the catalog of open scenes, the checkpoints of their steps, and uploaded files.
+
+pub(super) mod checkpoint_store;
+pub(super) mod scene_catalog;
+pub(super) mod upload;
