@@ -2,7 +2,7 @@
 
 use modalcast::config::{Config, RendererChoice};
 use modalcast_client::{
-    Camera, Client, Code, FrameFormat, FrameRequest, Hit, Lens, Output, PickRequest, Picture, View,
+    Camera, Client, Code, FrameFormat, FrameRequest, Hit, Lens, Output, PickRectangle, PickRequest, Picture, View,
 };
 use modalcast_compute::reference;
 use modalcast_model::scene::Scene;
@@ -72,12 +72,13 @@ async fn reduced_force_of_a_pick_equals_the_force_of_the_scene() {
         step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3]),
         rigid_step(2, v1::TransformFormat::RigidF32, &[(1, [0.0, 0.0, half, half], [1.0, 0.25, -0.5])]),
     ];
-    let before = client.pick(&PickRequest::new("strips", picture(), 44, 37)).await.expect("at rest");
+    let before =
+        client.pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 44, 37))).await.expect("at rest");
     assert_eq!((before.step.run, before.hits.len()), (0, 1));
     for step in steps.clone() {
         driver.step_acknowledged(step).await;
     }
-    let request = PickRequest::new("strips", picture(), 0, 0).rectangle(64, 64).exact_step(2);
+    let request = PickRequest::new("strips", PickRectangle::pixel(picture(), 0, 0).size(64, 64)).exact_step(2);
     let picks = client.pick(&request).await.expect("picks");
     assert_eq!(picks.step.number, 2);
     let state = state_after(&scene, &steps);
@@ -96,7 +97,7 @@ async fn reduced_force_of_a_pick_equals_the_force_of_the_scene() {
     let without_turn = whole_force(&scene, turned, Matrix3::identity(), force);
     let got = DVector::from_vec(turned.reduced_force(force.into()));
     assert!((got - without_turn).norm() > 0.1, "control: A matters");
-    let now = client.pick(&PickRequest::new("strips", picture(), 44, 37)).await.expect("now");
+    let now = client.pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 44, 37))).await.expect("now");
     assert!((Vector3::from(now.hits[0].position) - Vector3::from(before.hits[0].position)).norm() > 0.01, "it moved");
 }
 
@@ -108,7 +109,10 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
     let view = View::LookAt { eye: [150.0, 150.0, 40.0], target: [150.0, 150.0, 0.0], up: [0.0, 1.0, 0.0] };
     let camera = Some(Camera { view, lens: Lens::FieldOfView(20.0), clip: None });
     let picture = Picture { width: 640, height: 480, camera, ..Picture::default() };
-    let all = client.pick(&PickRequest::new("sheet", picture, 100, 100).rectangle(64, 64)).await.expect("picks");
+    let all = client
+        .pick(&PickRequest::new("sheet", PickRectangle::pixel(picture, 100, 100).size(64, 64)))
+        .await
+        .expect("picks");
     assert_eq!(all.hits.len(), 64 * 64, "the sheet fills the view");
     let scene = sheet();
     for hit in all.hits.iter().step_by(97) {
@@ -116,8 +120,13 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
         let got = DVector::from_vec(hit.reduced_force([1.0, 2.0, -3.0]));
         assert!((got - want).norm() < 1e-5);
     }
-    let bare =
-        client.pick(&PickRequest::new("sheet", picture, 0, 0).rectangle(2, 1).without_modes()).await.expect("picks");
+    let bare = client
+        .pick(&PickRequest::new(
+            "sheet",
+            PickRectangle { without_modes: true, ..PickRectangle::pixel(picture, 0, 0).size(2, 1) },
+        ))
+        .await
+        .expect("picks");
     assert!(bare.hits.iter().all(|hit| hit.modes.is_empty() && hit.rank == 4));
 
     let (server, client) = server_of_far().await;
@@ -131,7 +140,12 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
     let view = View::LookAt { eye: near(0.4, 0.45, 3.0), target: near(0.4, 0.45, 0.0), up: [0.0, 1.0, 0.0] };
     let camera = Some(Camera { view, lens: Lens::FieldOfView(40.0), clip: None });
     let picture = Picture { width: 65, height: 65, camera, ..Picture::default() };
-    let hit = client.pick(&PickRequest::new("far", picture, 32, 32)).await.expect("picks").hits.remove(0);
+    let hit = client
+        .pick(&PickRequest::new("far", PickRectangle::pixel(picture, 32, 32)))
+        .await
+        .expect("picks")
+        .hits
+        .remove(0);
     let off = (Vector3::from(hit.position) - Vector3::from(near(0.4, 0.45, 0.0))).norm();
     assert!(off < 1e-3, "{off} units at {at:?}");
     assert!((hit.depth - 1.5).abs() < 1e-3, "half metres: {}", hit.depth);
@@ -150,13 +164,17 @@ async fn bad_rectangles_outputs_and_steps_are_refused() {
         ([95, 79], [2, 1], "rectangle"),
         ([96, 0], [1, 1], "rectangle"),
     ] {
-        let request = PickRequest::new("strips", picture(), corner[0], corner[1]).rectangle(size[0], size[1]);
+        let request =
+            PickRequest::new("strips", PickRectangle::pixel(picture(), corner[0], corner[1]).size(size[0], size[1]));
         let error = client.pick(&request).await.expect_err(field);
         assert_eq!(error.rejection().map(|refusal| refusal.field.as_str()), Some(field), "{error}");
     }
-    let corner = client.pick(&PickRequest::new("strips", picture(), 95, 79)).await.expect("the last pixel");
+    let corner = client
+        .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 95, 79)))
+        .await
+        .expect("the last pixel");
     assert!(corner.hits.is_empty(), "nothing is there");
-    let late = PickRequest::new("strips", picture(), 0, 0).minimum_step(1).deadline_ms(60);
+    let late = PickRequest::new("strips", PickRectangle::pixel(picture(), 0, 0)).minimum_step(1).deadline_ms(60);
     let error = client.pick(&late).await.expect_err("no step yet");
     assert!(matches!(error, modalcast_client::Error::Status { code: Code::DeadlineExceeded, .. }), "{error}");
 
@@ -193,9 +211,8 @@ async fn outputs_have_their_format_and_agree_with_picks() {
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
     driver.step_acknowledged(step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3])).await;
     let show = async |output| {
-        let mut request = FrameRequest::new("strips").minimum_step(1);
-        request.picture = Picture { output, ..picture() };
-        client.frame(&request).await.expect("a frame")
+        let request = FrameRequest::new("strips", Picture { output, ..picture() });
+        client.frame(&request.minimum_step(1)).await.expect("a frame")
     };
     let (depth, domains, normals) =
         (show(Output::Depth).await, show(Output::Domains).await, show(Output::Normals).await);
@@ -203,7 +220,10 @@ async fn outputs_have_their_format_and_agree_with_picks() {
         [depth.format, domains.format, normals.format],
         [FrameFormat::F32, FrameFormat::U32, FrameFormat::F32x3]
     );
-    let picks = client.pick(&PickRequest::new("strips", picture(), 20, 10).rectangle(64, 64)).await.expect("picks");
+    let picks = client
+        .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 20, 10).size(64, 64)))
+        .await
+        .expect("picks");
     let word = |bytes: &[u8], at: usize| <[u8; 4]>::try_from(&bytes[4 * at..][..4]).expect("four bytes");
     let mut differ = 0;
     for hit in &picks.hits {
@@ -240,7 +260,8 @@ async fn distant_domains_are_picked_by_nearby_cameras() {
         let view = View::LookAt { eye: near(0.4, 0.45, 3.0), target: near(0.4, 0.45, 0.0), up: [0.0, 1.0, 0.0] };
         let camera = Some(Camera { view, lens: Lens::FieldOfView(40.0), clip: None });
         let picture = Picture { width: 65, height: 65, camera, ..Picture::default() };
-        let hits = client.pick(&PickRequest::new("strips", picture, 32, 32)).await.expect("picks").hits;
+        let hits =
+            client.pick(&PickRequest::new("strips", PickRectangle::pixel(picture, 32, 32))).await.expect("picks").hits;
         let off = (Vector3::from(hits[0].position) - Vector3::from(near(0.4, 0.45, 0.0))).norm();
         assert!(hits[0].domain == domain && off < 1e-3, "{off} units from {at:?}: {hits:?}");
     }

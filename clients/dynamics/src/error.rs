@@ -10,11 +10,11 @@ pub enum Error {
     #[error(transparent)]
     Client(#[from] modalcast_client::Error),
     /// A file, an option or a scene is not valid here.
-    #[error("{field}: expected {expected}, given {given}")]
+    #[error("{field}: expected {expected}, got {given}")]
     Invalid { field: String, expected: String, given: String },
 }
 
-/// An `Invalid` error with the field, the expected and the given value.
+/// An `Invalid` error: at `field`, `expected` was expected and `given` was found.
 pub fn invalid(field: impl Into<String>, expected: impl ToString, given: impl ToString) -> Error {
     Error::Invalid { field: field.into(), expected: expected.to_string(), given: given.to_string() }
 }

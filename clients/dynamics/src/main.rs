@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser as _;
-use modalcast_client::{Client, Code, Error as ClientError};
+use modalcast_client::{Client, program};
 use modalcast_dynamics::bridge::{Bridge, Options as BridgeOptions};
 use modalcast_dynamics::cubic::ReducedForce;
 use modalcast_dynamics::model::Model;
@@ -25,34 +25,24 @@ use cli::{Cli, Command, CommonOptions, ForceFileOptions};
 const TREE_SAMPLES: usize = 24;
 const MAX_SAMPLES: usize = 1 << 16;
 
+/// The exit code of a complete run in which the server rejected steps.
+const REJECTED: u8 = 6;
+
 fn main() -> ExitCode {
     let arguments = Cli::parse();
-    let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
-        Ok(runtime) => runtime,
-        Err(fault) => {
-            eprintln!("modalcast-sim: no runtime: {fault}");
-            return ExitCode::from(4);
-        }
+    let main = async {
+        let summary = drive(&arguments).await?;
+        print(&summary, arguments.command.common().json);
+        Ok(if summary.rejected > 0 { REJECTED } else { 0 })
     };
-    match runtime.block_on(drive(&arguments)) {
-        Ok(summary) => {
-            print(&summary, arguments.command.common().json);
-            ExitCode::from(if summary.rejected > 0 { 6 } else { 0 })
-        }
-        Err(error) => {
-            eprintln!("modalcast-sim: {error}");
-            ExitCode::from(code(&error))
-        }
-    }
+    program::run("modalcast-sim", main, exit_code)
 }
 
 /// The documented exit code of an error.
-const fn code(error: &Error) -> u8 {
+const fn exit_code(error: &Error) -> u8 {
     match error {
-        Error::Client(ClientError::Connect { .. } | ClientError::Status { code: Code::Unavailable, .. }) => 3,
-        Error::Client(ClientError::Status { .. } | ClientError::Rejected(_)) => 1,
-        Error::Client(ClientError::File { .. }) => 4,
-        Error::Client(_) | Error::Invalid { .. } => 5,
+        Error::Client(error) => program::exit_code(error),
+        Error::Invalid { .. } => 5,
     }
 }
 

@@ -1,13 +1,12 @@
 //! Drives a scene with a scenario: sends changed values as a step stream, optionally in real time and with records, and
 //! summarizes the run.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use modalcast_client::npy::Writer;
-use modalcast_client::{Ack, Client, Error as ClientError, Policy, Step, StepStream};
+use modalcast_client::{Client, Error as ClientError, Policy, StageSamples, Step, StepStream};
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
@@ -17,8 +16,7 @@ use crate::model::Model;
 /// Named results of a scenario or a run.
 pub type ScenarioReport = serde_json::Map<String, Value>;
 
-/// The most times per stage, and the most refusals, that are kept for the summary.
-const MAX_STAGE_SAMPLES: usize = 1 << 16;
+/// The most refusals that are kept for the summary.
 const MAX_REJECTIONS: usize = 16;
 
 /// The state at one step: all coordinates, and `world_from_domain` of every part, row-major 3x4.
@@ -70,7 +68,7 @@ pub struct Summary {
 /// Statistics of a run: acknowledgements, refusals and sent bytes.
 #[derive(Default)]
 struct RunStats {
-    stages: BTreeMap<String, Vec<f32>>,
+    stages: StageSamples,
     rejections: Vec<String>,
     acks: u64,
     bytes: u64,
@@ -169,32 +167,20 @@ impl RunStats {
 
     fn add(&mut self, drive: &StepStream, bytes: usize) {
         self.bytes += bytes as u64;
-        for Ack { stages, .. } in drive.take_acks() {
+        for ack in drive.take_acks() {
             self.acks += 1;
-            for (stage, milliseconds) in stages {
-                let times = self.stages.entry(stage).or_default();
-                if times.len() < MAX_STAGE_SAMPLES {
-                    times.push(milliseconds);
-                }
-            }
+            self.stages.add(&ack.stages);
         }
     }
 
-    fn report(mut self) -> ScenarioReport {
-        let medians: BTreeMap<_, _> = self.stages.iter_mut().map(|(stage, times)| (stage, median(times))).collect();
+    fn report(self) -> ScenarioReport {
         ScenarioReport::from_iter([
-            ("stages_ms".to_owned(), json!(medians)),
+            ("stages_ms".to_owned(), json!(self.stages.medians())),
             ("acknowledgements".to_owned(), json!(self.acks)),
             ("payload_bytes".to_owned(), json!(self.bytes)),
             ("rejections".to_owned(), json!(self.rejections)),
         ])
     }
-}
-
-/// The median of some times; 0 for none.
-fn median(times: &mut [f32]) -> f32 {
-    times.sort_by(f32::total_cmp);
-    times.get(times.len() / 2).copied().unwrap_or(0.0)
 }
 
 /// A progress bar, or a counter for an unlimited run, on standard error; hidden unless standard error is a terminal.
@@ -223,7 +209,7 @@ impl Recorder {
 
     fn add(&mut self, motion: &Motion) -> Result<()> {
         self.q.row(&motion.q)?;
-        Ok(self.transforms.row(&motion.transforms.concat())?)
+        Ok(self.transforms.row(motion.transforms.as_flattened())?)
     }
 
     fn finish(self) -> Result<()> {

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use fake::{FakeDomain, FakeServer, IDENTITY, pack, serve};
-use modalcast_client::{Client, VertexStreamRequest};
+use modalcast_client::{Client, VertexSelection, VertexStreamRequest};
 
 /// A beam of length 1 along y with two bending modes. Each of its sections has six vertices.
 fn beam(index: u32, radius: f32) -> FakeDomain {
@@ -92,7 +92,7 @@ async fn tree_sways_and_subscribers_receive_closed_joints() {
     let url = serve(Arc::clone(&world)).await;
     let client = Client::connect(&url).await.expect("connects");
     let rest = world.now().positions;
-    let request = VertexStreamRequest { scene: "toy".into(), steps: 90, ..VertexStreamRequest::default() };
+    let request = VertexStreamRequest::new("toy", VertexSelection::default()).replies(90);
     let mut sets = client.stream_vertices(&request).await.expect("accepted");
     let folder = tempfile::tempdir().expect("folder");
     let record = folder.path().display().to_string();

@@ -2,12 +2,51 @@
 //! the total is bounded before any byte is stored.
 
 use std::pin::Pin;
+use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 
+use bytemuck::Pod;
 use bytes::Bytes;
 use tokio_stream::Stream;
 
 use crate::error::{Error, Result, malformed_reply};
+
+/// Numbers are little-endian on the wire and are copied without conversion.
+const _: () = assert!(cfg!(target_endian = "little"), "the client supports little-endian hosts only");
+
+/// Decodes an array of little-endian numbers, or of fixed-size arrays of them, at any alignment.
+///
+/// # Errors
+/// `Malformed` unless the length is a multiple of the size of `T`.
+pub(crate) fn decode<T: Pod>(field: &str, bytes: &[u8]) -> Result<Vec<T>> {
+    let size = size_of::<T>();
+    if !bytes.len().is_multiple_of(size) {
+        return Err(malformed_reply(field, format!("a multiple of {size} bytes"), bytes.len()));
+    }
+    Ok(bytemuck::pod_collect_to_vec(bytes))
+}
+
+/// The messages of a server stream. Its errors name the server.
+pub(crate) struct Replies<M> {
+    messages: tonic::Streaming<M>,
+    server: Arc<str>,
+}
+
+impl<M> Replies<M> {
+    pub(crate) const fn new(messages: tonic::Streaming<M>, server: Arc<str>) -> Self {
+        Self { messages, server }
+    }
+
+    /// The next message, or `None` at the end of the stream.
+    pub(crate) async fn next(&mut self) -> Result<Option<M>> {
+        self.messages.message().await.map_err(|status| Error::from_status(status, &self.server))
+    }
+
+    fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<M>>> {
+        let message = ready!(Pin::new(&mut self.messages).poll_next(context));
+        Poll::Ready(message.map(|message| message.map_err(|status| Error::from_status(status, &self.server))))
+    }
+}
 
 /// One message of a chunked reply.
 pub(crate) struct Chunk<H> {
@@ -17,26 +56,26 @@ pub(crate) struct Chunk<H> {
     pub(crate) data: Bytes,
 }
 
-/// A reply message that carries a chunk.
-pub(crate) trait ChunkMessage: Sized {
+/// A chunk in its wire format, and the reply that its kind of chunks forms.
+pub(crate) trait WireChunk: Sized {
     type Head;
     type Reply;
-    const WHAT: &'static str;
-    fn into_chunk(self) -> Result<Chunk<Self::Head>>;
-    fn from_chunks(head: Self::Head, bytes: Bytes) -> Result<Self::Reply>;
+    const NAME: &'static str;
+    fn into_chunk(self) -> Chunk<Self::Head>;
+    fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<Self::Reply>;
 }
 
 /// Collects the chunks of consecutive replies.
 pub(crate) struct Assembler<H> {
-    what: &'static str,
+    name: &'static str,
     limit: u64,
     open: Option<(H, u64)>,
     bytes: Vec<u8>,
 }
 
 impl<H> Assembler<H> {
-    pub(crate) const fn new(what: &'static str, limit: u64) -> Self {
-        Self { what, limit, open: None, bytes: Vec::new() }
+    pub(crate) const fn new(name: &'static str, limit: u64) -> Self {
+        Self { name, limit, open: None, bytes: Vec::new() }
     }
 
     /// Whether a reply has begun and not ended.
@@ -45,9 +84,9 @@ impl<H> Assembler<H> {
     }
 
     /// Adds a chunk. Returns the complete reply after its last chunk.
-    pub(crate) fn push(&mut self, piece: Chunk<H>) -> Result<Option<(H, Bytes)>> {
-        let field = |name: &str| format!("{}.{name}", self.what);
-        match (piece.head, self.open.is_some()) {
+    pub(crate) fn push(&mut self, chunk: Chunk<H>) -> Result<Option<(H, Bytes)>> {
+        let field = |name: &str| format!("{}.{name}", self.name);
+        match (chunk.head, self.open.is_some()) {
             (Some((_, total)), false) if total > self.limit => {
                 return Err(malformed_reply(field("total"), format!("at most {} bytes", self.limit), total));
             }
@@ -57,19 +96,28 @@ impl<H> Assembler<H> {
             (None, false) => return Err(malformed_reply(field("head"), "a head on the first chunk", "none")),
         }
         let Some((_, total)) = &self.open else { return Ok(None) };
-        let (total, kept) = (*total, self.bytes.len() as u64);
-        if piece.offset != kept {
-            return Err(malformed_reply(field("offset"), kept, piece.offset));
+        let (total, received) = (*total, self.bytes.len() as u64);
+        if chunk.offset != received {
+            return Err(malformed_reply(field("offset"), received, chunk.offset));
         }
-        let end = kept.saturating_add(piece.data.len() as u64);
+        let end = received.saturating_add(chunk.data.len() as u64);
         if end > total {
             return Err(malformed_reply(field("data"), format!("{total} bytes in all"), end));
         }
         if end < total {
-            self.bytes.extend_from_slice(&piece.data);
+            if self.bytes.capacity() == 0 {
+                self.reserve(total)?;
+            }
+            self.bytes.extend_from_slice(&chunk.data);
             return Ok(None);
         }
-        Ok(self.close(piece.data))
+        Ok(self.close(chunk.data))
+    }
+
+    /// Reserves memory for the whole reply. A total that this machine cannot hold is an error, not an abort.
+    fn reserve(&mut self, total: u64) -> Result<()> {
+        let reserved = usize::try_from(total).ok().and_then(|total| self.bytes.try_reserve_exact(total).ok());
+        reserved.ok_or_else(|| malformed_reply(format!("{}.total", self.name), "a size that fits in memory", total))
     }
 
     /// Completes the reply. A reply of a single chunk is returned without a copy.
@@ -84,113 +132,126 @@ impl<H> Assembler<H> {
     }
 }
 
-/// Turns a server stream of chunks into a stream of complete replies. An error ends the stream.
-pub(crate) struct ChunkedReplies<M: ChunkMessage> {
-    inner: tonic::Streaming<M>,
-    assembler: Assembler<M::Head>,
+/// Turns a server stream of messages `M` with chunks `C` into a stream of complete replies. An error ends the stream.
+pub(crate) struct ChunkedReplies<M, C: WireChunk> {
+    messages: Replies<M>,
+    chunk_of: fn(M) -> Option<C>,
+    assembler: Assembler<C::Head>,
     ended: bool,
 }
 
-impl<M: ChunkMessage> ChunkedReplies<M> {
-    pub(crate) const fn new(inner: tonic::Streaming<M>, limit: u64) -> Self {
-        Self { inner, assembler: Assembler::new(M::WHAT, limit), ended: false }
+impl<M, C: WireChunk> ChunkedReplies<M, C> {
+    pub(crate) const fn new(messages: Replies<M>, chunk_of: fn(M) -> Option<C>, limit: u64) -> Self {
+        Self { messages, chunk_of, assembler: Assembler::new(C::NAME, limit), ended: false }
     }
 
     /// Polls for the next complete reply.
-    pub(crate) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<M::Reply>>> {
+    pub(crate) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<C::Reply>>> {
         while !self.ended {
-            let whole = match ready!(Pin::new(&mut self.inner).poll_next(context)) {
+            let reply = match ready!(self.messages.poll(context)) {
                 Some(Ok(message)) => self.accept(message),
-                Some(Err(status)) => Err(status.into()),
+                Some(Err(error)) => Err(error),
                 None if self.assembler.is_open() => Err(Error::StreamEnded { what: "the last chunk of a reply" }),
                 None => {
                     self.ended = true;
                     return Poll::Ready(None);
                 }
             };
-            self.ended = whole.is_err();
-            if let Some(whole) = whole.transpose() {
-                return Poll::Ready(Some(whole));
+            self.ended = reply.is_err();
+            if let Some(reply) = reply.transpose() {
+                return Poll::Ready(Some(reply));
             }
         }
         Poll::Ready(None)
     }
 
     /// The next complete reply.
-    pub(crate) async fn next(&mut self) -> Option<Result<M::Reply>> {
+    pub(crate) async fn next(&mut self) -> Option<Result<C::Reply>> {
         std::future::poll_fn(|context| self.poll(context)).await
     }
 
-    fn accept(&mut self, message: M) -> Result<Option<M::Reply>> {
-        match self.assembler.push(message.into_chunk()?)? {
-            Some((head, bytes)) => M::from_chunks(head, bytes).map(Some),
+    fn accept(&mut self, message: M) -> Result<Option<C::Reply>> {
+        let missing = || malformed_reply(format!("{}.chunk", C::NAME), "a chunk", "none");
+        let chunk = (self.chunk_of)(message).ok_or_else(missing)?;
+        match self.assembler.push(chunk.into_chunk())? {
+            Some((head, bytes)) => C::decode_reply(head, bytes).map(Some),
             None => Ok(None),
         }
     }
-}
-
-/// Decodes little-endian f32 at any alignment.
-pub(crate) fn floats(bytes: &[u8]) -> Vec<f32> {
-    bytes.chunks_exact(4).map(|word| f32::from_le_bytes([word[0], word[1], word[2], word[3]])).collect()
-}
-
-/// Decodes little-endian u32 at any alignment.
-pub(crate) fn words(bytes: &[u8]) -> Vec<u32> {
-    bytes.chunks_exact(4).map(|word| u32::from_le_bytes([word[0], word[1], word[2], word[3]])).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn piece(head: Option<u64>, offset: u64, data: &'static [u8]) -> Chunk<()> {
+    fn chunk(head: Option<u64>, offset: u64, data: &'static [u8]) -> Chunk<()> {
         Chunk { head: head.map(|total| ((), total)), offset, data: Bytes::from_static(data) }
     }
 
-    fn all(pieces: Vec<Chunk<()>>) -> Result<Vec<Bytes>> {
+    fn assemble(chunks: Vec<Chunk<()>>) -> Result<Vec<Bytes>> {
         let mut assembler = Assembler::new("frame", 8);
-        let mut whole = vec![];
-        for piece in pieces {
-            whole.extend(assembler.push(piece)?.map(|((), bytes)| bytes));
+        let mut replies = vec![];
+        for chunk in chunks {
+            replies.extend(assembler.push(chunk)?.map(|((), bytes)| bytes));
         }
-        if assembler.is_open() { Err(Error::StreamEnded { what: "chunk" }) } else { Ok(whole) }
+        if assembler.is_open() { Err(Error::StreamEnded { what: "chunk" }) } else { Ok(replies) }
     }
 
     #[test]
     fn chunks_become_replies_in_order() {
-        let whole = all(vec![
-            piece(Some(5), 0, b"ab"),
-            piece(None, 2, b""),
-            piece(None, 2, b"cde"),
-            piece(Some(0), 0, b""),
-            piece(Some(2), 0, b"fg"),
+        let replies = assemble(vec![
+            chunk(Some(5), 0, b"ab"),
+            chunk(None, 2, b""),
+            chunk(None, 2, b"cde"),
+            chunk(Some(0), 0, b""),
+            chunk(Some(2), 0, b"fg"),
         ]);
-        assert_eq!(whole.expect("fits"), [&b"abcde"[..], b"", b"fg"]);
+        assert_eq!(replies.expect("fits"), [&b"abcde"[..], b"", b"fg"]);
+    }
+
+    #[test]
+    fn first_chunk_reserves_the_announced_total() {
+        let mut assembler = Assembler::new("frame", 1 << 20);
+        assert!(assembler.push(chunk(Some(1 << 20), 0, b"ab")).expect("fits").is_none());
+        let (start, capacity) = (assembler.bytes.as_ptr(), assembler.bytes.capacity());
+        assert!(capacity >= 1 << 20, "{capacity}");
+        assembler.push(Chunk { head: None, offset: 2, data: vec![0; 1 << 19].into() }).expect("fits");
+        assert_eq!((assembler.bytes.as_ptr(), assembler.bytes.capacity()), (start, capacity));
     }
 
     #[test]
     fn wrong_chunks_are_refused_by_field() {
-        for (pieces, field) in [
-            (vec![piece(Some(9), 0, b"")], "frame.total"),
-            (vec![piece(Some(u64::MAX), 0, b"")], "frame.total"),
-            (vec![piece(Some(4), 1, b"ab")], "frame.offset"),
-            (vec![piece(Some(4), 0, b"ab"), piece(None, 3, b"c")], "frame.offset"),
-            (vec![piece(Some(4), 0, b"ab"), piece(None, 2, b"cde")], "frame.data"),
-            (vec![piece(None, 0, b"ab")], "frame.head"),
-            (vec![piece(Some(4), 0, b"ab"), piece(Some(4), 0, b"ab")], "frame.head"),
-            (vec![piece(Some(4), 0, b"ab")], "the stream ended"),
+        for (chunks, field) in [
+            (vec![chunk(Some(9), 0, b"")], "frame.total"),
+            (vec![chunk(Some(u64::MAX), 0, b"")], "frame.total"),
+            (vec![chunk(Some(4), 1, b"ab")], "frame.offset"),
+            (vec![chunk(Some(4), 0, b"ab"), chunk(None, 3, b"c")], "frame.offset"),
+            (vec![chunk(Some(4), 0, b"ab"), chunk(None, 2, b"cde")], "frame.data"),
+            (vec![chunk(None, 0, b"ab")], "frame.head"),
+            (vec![chunk(Some(4), 0, b"ab"), chunk(Some(4), 0, b"ab")], "frame.head"),
+            (vec![chunk(Some(4), 0, b"ab")], "the stream ended"),
         ] {
-            let refusal = all(pieces).expect_err("wrong").to_string();
+            let refusal = assemble(chunks).expect_err("wrong").to_string();
             assert!(refusal.contains(field), "{refusal} does not name {field}");
         }
     }
 
     #[test]
-    fn numbers_are_read_at_any_alignment() {
+    fn total_beyond_the_memory_is_refused() {
+        let mut assembler = Assembler::new("frame", u64::MAX);
+        let refusal = assembler.push(chunk(Some(u64::MAX), 0, b"ab")).expect_err("too much").to_string();
+        assert!(refusal.contains("frame.total"), "{refusal}");
+    }
+
+    #[test]
+    fn numbers_are_decoded_at_any_alignment() {
         let mut bytes = vec![0];
         bytes.extend(1.5_f32.to_le_bytes());
         bytes.extend((-2.0_f32).to_le_bytes());
-        assert_eq!(floats(&bytes[1..]), [1.5, -2.0]);
-        assert_eq!(words(&7_u32.to_le_bytes()), [7]);
+        assert_eq!(decode::<f32>("q", &bytes[1..]).expect("whole"), [1.5, -2.0]);
+        assert_eq!(decode::<[f32; 2]>("q", &bytes[1..]).expect("whole"), [[1.5, -2.0]]);
+        assert_eq!(decode::<u32>("q", &7_u32.to_le_bytes()).expect("whole"), [7]);
+        let refusal = decode::<f32>("q", &bytes).expect_err("nine bytes").to_string();
+        assert!(refusal.contains("a multiple of 4 bytes"), "{refusal}");
     }
 }

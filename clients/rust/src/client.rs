@@ -1,12 +1,14 @@
 //! The connection to a server. Unary calls return values, streams return handles; clones share the connection.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use modalcast_proto::v1;
 use tonic::transport::{Channel, Endpoint};
+use tonic::{Response, Status, Streaming};
 
-use crate::error::{Error, Result, malformed_reply};
-use crate::scene::ServerInfo;
+use crate::assemble::Replies;
+use crate::error::{Error, Result, describe_causes, malformed_reply};
 
 /// The default limit of one reply assembled from chunks, in bytes.
 pub const REPLY_LIMIT: u64 = 1 << 30;
@@ -24,6 +26,23 @@ const FRAME_SIZE: u32 = 1 << 20;
 pub struct Client {
     pub(crate) channel: Channel,
     pub(crate) reply_limit: u64,
+    /// The URL of the server, as the caller wrote it; errors name it.
+    server: Arc<str>,
+}
+
+/// Version, devices and limits of a server.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ServerInfo {
+    pub version: String,
+    /// The deformer in use: `cpu`, `cuda` or `reference`.
+    pub backend: String,
+    /// The CUDA device, or the reason why there is none.
+    pub device: String,
+    /// The name that the OpenGL renderer reports.
+    pub renderer: String,
+    /// Whether that renderer runs on the CPU.
+    pub software: bool,
+    pub limits: v1::Limits,
 }
 
 impl Client {
@@ -32,7 +51,8 @@ impl Client {
     /// # Errors
     /// `Connect` if the URL is invalid or no server answers.
     pub async fn connect(url: &str) -> Result<Self> {
-        let refused = |fault: tonic::transport::Error| Error::Connect { url: url.to_owned(), reason: chain(&fault) };
+        let refused =
+            |fault: tonic::transport::Error| Error::Connect { url: url.to_owned(), reason: describe_causes(&fault) };
         let whole = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
         let endpoint = Endpoint::from_shared(whole)
             .map_err(refused)?
@@ -43,7 +63,7 @@ impl Client {
             .http2_keep_alive_interval(Duration::from_secs(20))
             .keep_alive_timeout(Duration::from_secs(20));
         let channel = endpoint.connect().await.map_err(refused)?;
-        Ok(Self { channel, reply_limit: REPLY_LIMIT })
+        Ok(Self { channel, reply_limit: REPLY_LIMIT, server: url.into() })
     }
 
     /// Connects, and retries until a server answers or `timeout` has passed.
@@ -73,7 +93,7 @@ impl Client {
     /// `Status`, `Connect` or `Malformed`, as for every call.
     pub async fn server_info(&self) -> Result<ServerInfo> {
         let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
-        let wire = service.get_server_info(v1::GetServerInfoRequest {}).await?.into_inner();
+        let wire = self.reply(service.get_server_info(v1::GetServerInfoRequest {}).await)?;
         Ok(ServerInfo {
             version: wire.version,
             backend: wire.backend,
@@ -91,7 +111,7 @@ impl Client {
     /// `Status` if the source does not exist; `Connect`; `Malformed`.
     pub async fn open_scene(&self, source: &str, name: &str) -> Result<v1::SceneInfo> {
         let request = v1::OpenSceneRequest { source: source.to_owned(), scene: name.to_owned() };
-        let reply = self.scenes().open_scene(request).await?.into_inner();
+        let reply = self.reply(self.scenes().open_scene(request).await)?;
         reply.scene.ok_or_else(|| malformed_reply("open_scene.scene", "a scene", "none"))
     }
 
@@ -100,7 +120,7 @@ impl Client {
     /// # Errors
     /// `Status` or `Connect`.
     pub async fn list_scenes(&self) -> Result<(Vec<v1::SceneInfo>, Vec<String>)> {
-        let reply = self.scenes().list_scenes(v1::ListScenesRequest {}).await?.into_inner();
+        let reply = self.reply(self.scenes().list_scenes(v1::ListScenesRequest {}).await)?;
         Ok((reply.scenes, reply.sources))
     }
 
@@ -109,17 +129,21 @@ impl Client {
     /// # Errors
     /// `Status` if the scene does not exist; `Connect`.
     pub async fn delete_scene(&self, scene: &str) -> Result<()> {
-        self.scenes().delete_scene(v1::DeleteSceneRequest { scene: scene.to_owned() }).await?;
-        Ok(())
+        let request = v1::DeleteSceneRequest { scene: scene.to_owned() };
+        self.reply(self.scenes().delete_scene(request).await).map(drop)
     }
 
     pub(crate) fn scenes(&self) -> v1::scene_service_client::SceneServiceClient<Channel> {
         v1::scene_service_client::SceneServiceClient::new(self.channel.clone())
     }
-}
 
-/// An error with its causes in one line, because the message of tonic's error is only "transport error".
-fn chain(fault: &dyn std::error::Error) -> String {
-    let causes = std::iter::successors(Some(fault), |error| error.source());
-    causes.map(ToString::to_string).collect::<Vec<_>>().join(": ")
+    /// The reply of a call; an error names the server.
+    pub(crate) fn reply<M>(&self, response: Result<Response<M>, Status>) -> Result<M> {
+        response.map(Response::into_inner).map_err(|status| Error::from_status(status, &self.server))
+    }
+
+    /// The reply messages of a call; errors name the server.
+    pub(crate) fn replies<M>(&self, response: Result<Response<Streaming<M>>, Status>) -> Result<Replies<M>> {
+        Ok(Replies::new(self.reply(response)?, Arc::clone(&self.server)))
+    }
 }

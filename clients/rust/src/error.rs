@@ -1,4 +1,5 @@
-//! Errors of the client, by who can act on them. A refusal of the server has its field, expected and given value.
+//! Errors of the client, by who can act on them. A refusal of the server names the field, what the server expected and
+//! what it got.
 
 use modalcast_proto::v1;
 use prost::Message as _;
@@ -27,7 +28,7 @@ impl std::fmt::Display for Rejection {
         if let Some(step) = self.step {
             write!(out, "step {step}: ")?;
         }
-        write!(out, "{}: expected {}, given {}", self.field, self.expected, self.given)
+        write!(out, "{}: expected {}, got {}", self.field, self.expected, self.given)
     }
 }
 
@@ -44,7 +45,7 @@ pub enum Error {
     #[error("rejected: {0}")]
     Rejected(Box<Rejection>),
     /// The reply of the server contradicts itself or the contract.
-    #[error("malformed reply: {field}: expected {expected}, given {given}")]
+    #[error("malformed reply: {field}: expected {expected}, got {given}")]
     Malformed { field: String, expected: String, given: String },
     /// A stream ended too early.
     #[error("the stream ended before {what}")]
@@ -81,13 +82,11 @@ pub(crate) fn malformed_reply(field: impl Into<String>, expected: impl ToString,
     Error::Malformed { field: field.into(), expected: expected.to_string(), given: given.to_string() }
 }
 
-impl From<tonic::Status> for Error {
-    fn from(status: tonic::Status) -> Self {
-        // The transport reports a lost connection as `Unavailable` without details; a refusal with that code has
-        // details.
-        let lost = status.code() == tonic::Code::Unavailable && status.details().is_empty();
-        if lost {
-            return Self::Connect { url: "server".into(), reason: status.message().to_owned() };
+impl Error {
+    /// Converts the status of a call to the server with this URL.
+    pub(crate) fn from_status(status: tonic::Status, server: &str) -> Self {
+        if is_connection_lost(&status) {
+            return Self::Connect { url: server.to_owned(), reason: describe_causes(&status) };
         }
         let decoded = (!status.details().is_empty()).then(|| v1::Rejection::decode(status.details()).ok()).flatten();
         Self::Status {
@@ -98,6 +97,24 @@ impl From<tonic::Status> for Error {
     }
 }
 
+/// Whether the connection failed. The transport reports a broken connection as `Unknown` or `Unavailable` with a cause;
+/// a status that the server sent has no cause. A proxy answers `Unavailable` without details for a server that it cannot
+/// reach; a refusal of the server with that code has details.
+fn is_connection_lost(status: &tonic::Status) -> bool {
+    let local = std::error::Error::source(status).is_some();
+    match status.code() {
+        tonic::Code::Unknown => local,
+        tonic::Code::Unavailable => local || status.details().is_empty(),
+        _ => false,
+    }
+}
+
+/// An error and its causes in one line, because the message of an error of tonic is only "transport error".
+pub(crate) fn describe_causes(error: &dyn std::error::Error) -> String {
+    let causes = std::iter::successors(Some(error), |error| error.source());
+    causes.map(ToString::to_string).collect::<Vec<_>>().join(": ")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -106,9 +123,9 @@ mod tests {
     fn only_valid_status_details_become_a_refusal() {
         let wire = v1::Rejection { step: Some(4), field: "q".into(), expected: "80".into(), given: "79".into() };
         let with = |details: Vec<u8>| tonic::Status::with_details(tonic::Code::InvalidArgument, "no", details.into());
-        let error = Error::from(with(wire.encode_to_vec()));
-        assert_eq!(error.rejection().map(ToString::to_string).as_deref(), Some("step 4: q: expected 80, given 79"));
-        assert_eq!(Error::from(with(vec![0xff, 0xff, 0xff])).rejection(), None);
-        assert_eq!(Error::from(tonic::Status::not_found("scene")).rejection(), None);
+        let error = Error::from_status(with(wire.encode_to_vec()), "server:1");
+        assert_eq!(error.rejection().map(ToString::to_string).as_deref(), Some("step 4: q: expected 80, got 79"));
+        assert_eq!(Error::from_status(with(vec![0xff, 0xff, 0xff]), "server:1").rejection(), None);
+        assert_eq!(Error::from_status(tonic::Status::not_found("scene"), "server:1").rejection(), None);
     }
 }

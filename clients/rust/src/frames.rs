@@ -7,12 +7,17 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use v1::frame_service_client::FrameServiceClient;
 
-use crate::assemble::{Chunk, ChunkMessage, ChunkedReplies};
+use crate::assemble::{Chunk, ChunkedReplies, WireChunk};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed_reply};
+use crate::request::{StepRequest, Subscription};
+use crate::stages::{self, StageTimes};
 
-/// Milliseconds per processing stage, under the server's stage names and in its order.
-pub type StageTimes = Vec<(String, f32)>;
+/// A request for one frame.
+pub type FrameRequest = StepRequest<Picture>;
+
+/// A subscription to one frame per step.
+pub type FrameStreamRequest = Subscription<Picture>;
 
 /// Encoding of the bytes of a frame, top row first: 8-bit sRGB, or numbers.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -43,16 +48,6 @@ pub enum Output {
     Displacement { largest: f64 },
     /// One column of U as a color map with a legend.
     ModeShape { mode: u32, largest: f64 },
-}
-
-/// Which steps a subscriber receives.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Delivery {
-    /// Every step, in order; back-pressure from a slow reader slows the writer.
-    #[default]
-    Lossless,
-    /// The newest step; skipped steps are counted.
-    Latest,
 }
 
 /// The pose of the camera.
@@ -94,66 +89,20 @@ pub struct Picture {
     pub output: Output,
 }
 
-/// Which step a single reply must show.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) enum StepSelector {
-    #[default]
-    Current,
-    Exact(u64),
-    Minimum(u64),
-}
-
-/// A request for one frame.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct FrameRequest {
-    pub scene: String,
-    pub picture: Picture,
-    at: StepSelector,
-    deadline_ms: u32,
-}
-
-impl FrameRequest {
-    /// A PNG of the newest state of a scene, 1280 x 720.
-    pub fn new(scene: &str) -> Self {
-        Self { scene: scene.to_owned(), ..Self::default() }
-    }
-
+impl Picture {
     /// Sets the size in pixels.
     #[must_use]
     pub const fn size(mut self, width: u32, height: u32) -> Self {
-        (self.picture.width, self.picture.height) = (width, height);
+        (self.width, self.height) = (width, height);
         self
     }
 
-    /// Exactly this step of the current run. The server refuses a step that it no longer has.
+    /// Sets the encoding.
     #[must_use]
-    pub const fn exact_step(mut self, step: u64) -> Self {
-        self.at = StepSelector::Exact(step);
+    pub const fn format(mut self, format: FrameFormat) -> Self {
+        self.format = format;
         self
     }
-
-    /// This step of the current run or a later one.
-    #[must_use]
-    pub const fn minimum_step(mut self, step: u64) -> Self {
-        self.at = StepSelector::Minimum(step);
-        self
-    }
-
-    /// How long the server may wait for the step and the picture, in milliseconds; 0 selects the server's default.
-    #[must_use]
-    pub const fn deadline_ms(mut self, milliseconds: u32) -> Self {
-        self.deadline_ms = milliseconds;
-        self
-    }
-}
-
-/// A subscription to frames; with `frames` = 0 it never ends.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct FrameStreamRequest {
-    pub scene: String,
-    pub picture: Picture,
-    pub delivery: Delivery,
-    pub frames: u64,
 }
 
 /// One frame.
@@ -191,16 +140,12 @@ impl Client {
         use v1::render_frame_request::Step;
         let wire = v1::RenderFrameRequest {
             scene: request.scene.clone(),
-            picture: Some(request.picture.into()),
-            step: match request.at {
-                StepSelector::Current => None,
-                StepSelector::Exact(step) => Some(Step::ExactStep(step)),
-                StepSelector::Minimum(step) => Some(Step::MinimumStep(step)),
-            },
+            picture: Some(request.query.into()),
+            step: request.step.to_wire(Step::ExactStep, Step::MinimumStep),
             deadline_ms: request.deadline_ms,
         };
-        let stream = FrameServiceClient::new(self.channel.clone()).render_frame(wire).await?.into_inner();
-        let frame = ChunkedReplies::new(stream, self.reply_limit).next().await;
+        let messages = self.replies(FrameServiceClient::new(self.channel.clone()).render_frame(wire).await)?;
+        let frame = ChunkedReplies::new(messages, |message| message.chunk, self.reply_limit).next().await;
         frame.unwrap_or(Err(Error::StreamEnded { what: "the frame" }))
     }
 
@@ -212,17 +157,17 @@ impl Client {
     pub async fn stream_frames(&self, request: &FrameStreamRequest) -> Result<FrameStream> {
         let wire = v1::StreamFramesRequest {
             scene: request.scene.clone(),
-            picture: Some(request.picture.into()),
+            picture: Some(request.query.into()),
             delivery: v1::Delivery::from(request.delivery).into(),
-            frames: request.frames,
+            frames: request.replies,
         };
-        let stream = FrameServiceClient::new(self.channel.clone()).stream_frames(wire).await?.into_inner();
-        Ok(FrameStream(ChunkedReplies::new(stream, self.reply_limit)))
+        let messages = self.replies(FrameServiceClient::new(self.channel.clone()).stream_frames(wire).await)?;
+        Ok(FrameStream(ChunkedReplies::new(messages, |message| message.chunk, self.reply_limit)))
     }
 }
 
 /// A stream of frames; dropping it unsubscribes.
-pub struct FrameStream(ChunkedReplies<v1::StreamFramesResponse>);
+pub struct FrameStream(ChunkedReplies<v1::StreamFramesResponse, v1::FrameChunk>);
 
 impl FrameStream {
     /// The next frame, or `None` after the requested number of frames.
@@ -239,65 +184,47 @@ impl tokio_stream::Stream for FrameStream {
     }
 }
 
-impl ChunkMessage for v1::RenderFrameResponse {
+impl WireChunk for v1::FrameChunk {
     type Head = v1::FrameHead;
     type Reply = Frame;
-    const WHAT: &'static str = "frame";
+    const NAME: &'static str = "frame";
 
-    fn into_chunk(self) -> Result<Chunk<Self::Head>> {
-        piece(self.chunk)
+    fn into_chunk(self) -> Chunk<Self::Head> {
+        let head = self.head.map(|head| {
+            let total = head.total;
+            (head, total)
+        });
+        Chunk { head, offset: self.offset, data: self.data }
     }
 
-    fn from_chunks(head: Self::Head, bytes: Bytes) -> Result<Frame> {
-        frame(head, bytes)
+    fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<Frame> {
+        let (format, size) = match head.format() {
+            v1::Format::Png => (FrameFormat::Png, None),
+            v1::Format::Rgba => (FrameFormat::Rgba, Some(4)),
+            v1::Format::F32 => (FrameFormat::F32, Some(4)),
+            v1::Format::U32 => (FrameFormat::U32, Some(4)),
+            v1::Format::F32x3 => (FrameFormat::F32x3, Some(12)),
+            v1::Format::Unspecified => {
+                return Err(malformed_reply("frame.format", "a format that is named", head.format));
+            }
+        };
+        let pixels = u64::from(head.width) * u64::from(head.height);
+        if let Some(total) = size.map(|size: u64| size * pixels).filter(|total| *total != bytes.len() as u64) {
+            return Err(malformed_reply("frame.total", format!("{total} bytes"), bytes.len()));
+        }
+        let step = head.step.ok_or_else(|| malformed_reply("frame.step", "a step", "none"))?;
+        Ok(Frame {
+            step,
+            width: head.width,
+            height: head.height,
+            format,
+            bytes,
+            skipped: head.skipped,
+            shadow_drawn_by: drawn_by(head.shadow_drawn_by()),
+            visibility_drawn_by: drawn_by(head.visibility_drawn_by()),
+            stages: stages::from_wire(head.stages),
+        })
     }
-}
-
-impl ChunkMessage for v1::StreamFramesResponse {
-    type Head = v1::FrameHead;
-    type Reply = Frame;
-    const WHAT: &'static str = "frame";
-
-    fn into_chunk(self) -> Result<Chunk<Self::Head>> {
-        piece(self.chunk)
-    }
-
-    fn from_chunks(head: Self::Head, bytes: Bytes) -> Result<Frame> {
-        frame(head, bytes)
-    }
-}
-
-fn piece(chunk: Option<v1::FrameChunk>) -> Result<Chunk<v1::FrameHead>> {
-    let chunk = chunk.ok_or_else(|| malformed_reply("frame.chunk", "a chunk", "none"))?;
-    let head = chunk.head.map(|head| (head.total, head)).map(|(total, head)| (head, total));
-    Ok(Chunk { head, offset: chunk.offset, data: chunk.data })
-}
-
-fn frame(head: v1::FrameHead, bytes: Bytes) -> Result<Frame> {
-    let (format, size) = match head.format() {
-        v1::Format::Png => (FrameFormat::Png, None),
-        v1::Format::Rgba => (FrameFormat::Rgba, Some(4)),
-        v1::Format::F32 => (FrameFormat::F32, Some(4)),
-        v1::Format::U32 => (FrameFormat::U32, Some(4)),
-        v1::Format::F32x3 => (FrameFormat::F32x3, Some(12)),
-        v1::Format::Unspecified => return Err(malformed_reply("frame.format", "a format that is named", head.format)),
-    };
-    let pixels = u64::from(head.width) * u64::from(head.height);
-    if let Some(total) = size.map(|size: u64| size * pixels).filter(|total| *total != bytes.len() as u64) {
-        return Err(malformed_reply("frame.total", format!("{total} bytes"), bytes.len()));
-    }
-    let step = head.step.ok_or_else(|| malformed_reply("frame.step", "a step", "none"))?;
-    Ok(Frame {
-        step,
-        width: head.width,
-        height: head.height,
-        format,
-        bytes,
-        skipped: head.skipped,
-        shadow_drawn_by: drawn_by(head.shadow_drawn_by()),
-        visibility_drawn_by: drawn_by(head.visibility_drawn_by()),
-        stages: stages(head.stages),
-    })
 }
 
 const fn drawn_by(wire: v1::DrawnBy) -> Option<DrawnBy> {
@@ -305,19 +232,6 @@ const fn drawn_by(wire: v1::DrawnBy) -> Option<DrawnBy> {
         v1::DrawnBy::Unspecified => None,
         v1::DrawnBy::Opengl => Some(DrawnBy::OpenGl),
         v1::DrawnBy::Cuda => Some(DrawnBy::Cuda),
-    }
-}
-
-pub(crate) fn stages(wire: Vec<v1::StageTime>) -> StageTimes {
-    wire.into_iter().map(|time| (time.stage, time.milliseconds)).collect()
-}
-
-impl From<Delivery> for v1::Delivery {
-    fn from(delivery: Delivery) -> Self {
-        match delivery {
-            Delivery::Lossless => Self::Lossless,
-            Delivery::Latest => Self::Latest,
-        }
     }
 }
 

@@ -3,30 +3,34 @@
 
 mod assemble;
 mod client;
-mod drive;
 mod error;
 mod frames;
 pub mod npy;
 mod pick;
+pub mod program;
+mod request;
 mod scene;
+mod stages;
 mod step;
+mod step_stream;
 mod upload;
 mod vertices;
 
-pub use client::{Client, REPLY_LIMIT};
-pub use drive::{Ack, Policy, StepStream, StreamSummary};
+pub use client::{Client, REPLY_LIMIT, ServerInfo};
 pub use error::{Error, Rejection, Result};
 pub use frames::{
-    Camera, Delivery, DrawnBy, Frame, FrameFormat, FrameRequest, FrameStream, FrameStreamRequest, Lens, Output,
-    Picture, StageTimes, View,
+    Camera, DrawnBy, Frame, FrameFormat, FrameRequest, FrameStream, FrameStreamRequest, Lens, Output, Picture, View,
 };
 pub use modalcast_proto::v1;
 pub use modalcast_proto::v1::{SceneInfo, StepId};
-pub use pick::{Hit, PickRequest, PickResult};
-pub use scene::{Array, Attachment, Domain, ModeRows, SceneDescription, ServerInfo};
+pub use pick::{Hit, PickRectangle, PickRequest, PickResult};
+pub use request::{Delivery, StepRequest, StepSelector, Subscription};
+pub use scene::{Array, Attachment, Domain, ModeRows, SceneDescription};
+pub use stages::{StageSamples, StageTimes};
 pub use step::{DomainTransform, Step};
+pub use step_stream::{Ack, Policy, StepStream, StreamSummary};
 pub use tonic::Code;
-pub use vertices::{ReadbackOptions, VertexRequest, VertexSet, VertexStream, VertexStreamRequest};
+pub use vertices::{VertexRequest, VertexSelection, VertexSet, VertexSetDomain, VertexStream, VertexStreamRequest};
 
 /// Compiles the client code in the project's README as a doctest.
 #[cfg(doctest)]

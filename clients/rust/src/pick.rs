@@ -3,82 +3,41 @@
 use modalcast_proto::v1;
 use v1::frame_service_client::FrameServiceClient;
 
-use crate::assemble::floats;
+use crate::assemble::decode;
 use crate::client::Client;
 use crate::error::{Result, malformed_reply};
-use crate::frames::{Picture, StageTimes, StepSelector, stages};
+use crate::frames::Picture;
+use crate::request::StepRequest;
+use crate::stages::{self, StageTimes};
 
 /// A request for the surface points in a small rectangle of a picture.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct PickRequest {
-    pub scene: String,
+pub type PickRequest = StepRequest<PickRectangle>;
+
+/// A rectangle of pixels of a picture; at most 64 pixels a side.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PickRectangle {
     /// Size and camera of the picture to which the pixel coordinates refer.
     pub picture: Picture,
-    corner: [u32; 2],
-    size: [u32; 2],
-    without_modes: bool,
-    at: StepSelector,
-    deadline_ms: u32,
+    /// The top left pixel; (0, 0) is the top left pixel of the picture.
+    pub x: u32,
+    pub y: u32,
+    pub width: u32,
+    pub height: u32,
+    /// Omits [`Hit::modes`].
+    pub without_modes: bool,
 }
 
-impl PickRequest {
-    /// One pixel of a picture of the newest state; (0, 0) is the top left.
-    pub fn new(scene: &str, picture: Picture, x: u32, y: u32) -> Self {
-        Self { scene: scene.to_owned(), picture, corner: [x, y], size: [1, 1], ..Self::default() }
+impl PickRectangle {
+    /// One pixel of a picture, with [`Hit::modes`].
+    pub const fn pixel(picture: Picture, x: u32, y: u32) -> Self {
+        Self { picture, x, y, width: 1, height: 1, without_modes: false }
     }
 
-    /// Extends the pick to a rectangle with the pixel as its top left corner; at most 64 pixels a side.
+    /// Sets the size in pixels.
     #[must_use]
-    pub const fn rectangle(mut self, width: u32, height: u32) -> Self {
-        self.size = [width, height];
+    pub const fn size(mut self, width: u32, height: u32) -> Self {
+        (self.width, self.height) = (width, height);
         self
-    }
-
-    /// Omits [`Hit::modes`].
-    #[must_use]
-    pub const fn without_modes(mut self) -> Self {
-        self.without_modes = true;
-        self
-    }
-
-    /// Exactly this step of the current run. The server refuses a step that it no longer has.
-    #[must_use]
-    pub const fn exact_step(mut self, step: u64) -> Self {
-        self.at = StepSelector::Exact(step);
-        self
-    }
-
-    /// This step of the current run or a later one.
-    #[must_use]
-    pub const fn minimum_step(mut self, step: u64) -> Self {
-        self.at = StepSelector::Minimum(step);
-        self
-    }
-
-    /// How long the server may wait for the step, in milliseconds; 0 selects the server's default.
-    #[must_use]
-    pub const fn deadline_ms(mut self, milliseconds: u32) -> Self {
-        self.deadline_ms = milliseconds;
-        self
-    }
-
-    fn wire(&self) -> v1::PickRequest {
-        use v1::pick_request::Step;
-        v1::PickRequest {
-            scene: self.scene.clone(),
-            picture: Some(self.picture.into()),
-            step: match self.at {
-                StepSelector::Current => None,
-                StepSelector::Exact(step) => Some(Step::ExactStep(step)),
-                StepSelector::Minimum(step) => Some(Step::MinimumStep(step)),
-            },
-            deadline_ms: self.deadline_ms,
-            x: self.corner[0],
-            y: self.corner[1],
-            width: self.size[0],
-            height: self.size[1],
-            without_modes: self.without_modes,
-        }
     }
 }
 
@@ -131,11 +90,23 @@ impl Client {
     /// `Status` if the scene or the step does not exist, the rectangle is outside the picture, or the deadline passed;
     /// `Malformed`; `Connect`.
     pub async fn pick(&self, request: &PickRequest) -> Result<PickResult> {
-        let wire = request.wire();
-        let mut stream = FrameServiceClient::new(self.channel.clone()).pick(wire).await?.into_inner();
+        use v1::pick_request::Step;
+        let PickRectangle { picture, x, y, width, height, without_modes } = request.query;
+        let wire = v1::PickRequest {
+            scene: request.scene.clone(),
+            picture: Some(picture.into()),
+            step: request.step.to_wire(Step::ExactStep, Step::MinimumStep),
+            deadline_ms: request.deadline_ms,
+            x,
+            y,
+            width,
+            height,
+            without_modes,
+        };
+        let mut messages = self.replies(FrameServiceClient::new(self.channel.clone()).pick(wire).await)?;
         let mut head = None;
         let mut hits = Vec::new();
-        while let Some(response) = stream.message().await? {
+        while let Some(response) = messages.next().await? {
             head = head.or(response.head);
             for wire in response.hits {
                 hits.push(hit(wire)?);
@@ -150,7 +121,7 @@ impl Client {
             return Err(malformed_reply("pick.hits", head.hits, hits.len()));
         }
         let step = head.step.ok_or_else(|| malformed_reply("pick.step", "a step", "none"))?;
-        Ok(PickResult { step, hits, stages: stages(head.stages) })
+        Ok(PickResult { step, hits, stages: stages::from_wire(head.stages) })
     }
 }
 
@@ -170,7 +141,7 @@ fn hit(wire: v1::Hit) -> Result<Hit> {
         depth: wire.depth,
         linear: exactly("hit.linear", wire.linear)?,
         rank: wire.rank as usize,
-        modes: floats(&wire.modes),
+        modes: decode("hit.modes", &wire.modes)?,
     })
 }
 

@@ -5,24 +5,9 @@ use std::collections::BTreeMap;
 use bytes::Bytes;
 use modalcast_proto::v1;
 
-use crate::assemble::{Assembler, Chunk, floats, words};
+use crate::assemble::{Assembler, Chunk, decode};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed_reply};
-
-/// Version, devices and limits of a server.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ServerInfo {
-    pub version: String,
-    /// The deformer in use: `cpu`, `cuda` or `reference`.
-    pub backend: String,
-    /// The CUDA device, or the reason why there is none.
-    pub device: String,
-    /// The name that the OpenGL renderer reports.
-    pub renderer: String,
-    /// Whether that renderer runs on the CPU.
-    pub software: bool,
-    pub limits: v1::Limits,
-}
 
 /// The arrays that [`Client::describe`] can fetch.
 pub use modalcast_proto::v1::Array;
@@ -100,7 +85,7 @@ impl Client {
         self.describe_domains(scene, &[], arrays).await
     }
 
-    /// As [`Self::describe`], for the given domain indices; an empty list selects all.
+    /// As [`Self::describe`], for selected domain indices; an empty list selects all.
     ///
     /// # Errors
     /// As [`Self::describe`].
@@ -110,9 +95,9 @@ impl Client {
             domains: domains.to_vec(),
             arrays: arrays.iter().map(|array| *array as i32).collect(),
         };
-        let mut stream = self.scenes().describe_scene(request).await?.into_inner();
+        let mut messages = self.replies(self.scenes().describe_scene(request).await)?;
         let mut collected = DescriptionBuilder::new(self.reply_limit);
-        while let Some(message) = stream.message().await? {
+        while let Some(message) = messages.next().await? {
             collected.add(message)?;
         }
         collected.finish(arrays)
@@ -126,10 +111,10 @@ impl Client {
     pub async fn modes(&self, scene: &str, domain: usize, vertices: &[u32]) -> Result<ModeRows> {
         let domain = u32::try_from(domain).map_err(|_| malformed_reply("modes.domain", "a 32-bit index", domain))?;
         let request = v1::ReadModesRequest { scene: scene.to_owned(), domain, vertices: vertices.to_vec() };
-        let mut stream = self.scenes().read_modes(request).await?.into_inner();
+        let mut messages = self.replies(self.scenes().read_modes(request).await)?;
         let mut assembler = Assembler::new("modes", self.reply_limit);
         let mut whole = None;
-        while let Some(message) = stream.message().await? {
+        while let Some(message) = messages.next().await? {
             let head = (!assembler.is_open()).then_some((message.rank, message.total));
             let done = assembler.push(Chunk { head, offset: message.offset, data: message.data })?;
             whole = done.or(whole);
@@ -139,12 +124,15 @@ impl Client {
         }
         // A rigid domain has no rows; a server may answer without any message.
         let (rank, bytes) = whole.unwrap_or((0, Bytes::new()));
-        let rows = ModeRows { rank: rank as usize, rows: floats(&bytes) };
-        let expected = 12_u64.saturating_mul(u64::from(rank)).saturating_mul(vertices.len() as u64);
+        let per_vertex = 12 * u64::from(rank);
+        let expected = per_vertex.saturating_mul(vertices.len() as u64);
         if !vertices.is_empty() && bytes.len() as u64 != expected {
             return Err(malformed_reply("modes.total", format!("{expected} bytes"), bytes.len()));
         }
-        Ok(rows)
+        if !(bytes.len() as u64).is_multiple_of(per_vertex) {
+            return Err(malformed_reply("modes.total", format!("a multiple of {per_vertex} bytes"), bytes.len()));
+        }
+        Ok(ModeRows { rank: rank as usize, rows: decode("modes.data", &bytes)? })
     }
 }
 
@@ -198,6 +186,7 @@ impl DescriptionBuilder {
     }
 
     fn store(&mut self, (index, array): (u32, i32), bytes: &[u8]) -> Result<()> {
+        const FIELD: &str = "describe.chunk.data";
         self.kept = self.kept.saturating_add(bytes.len() as u64);
         if self.kept > self.limit {
             return Err(malformed_reply("describe.chunk", format!("at most {} bytes in all", self.limit), self.kept));
@@ -207,11 +196,11 @@ impl DescriptionBuilder {
             return Err(malformed_reply("describe.chunk.domain", "a domain described before", index));
         };
         match Array::try_from(array) {
-            Ok(Array::Indices) => domain.indices = words(bytes),
-            Ok(Array::CornerVertices) => domain.corner_vertices = words(bytes),
-            Ok(Array::RestPositions) => domain.rest_positions = floats(bytes),
-            Ok(Array::Uvs) => domain.uvs = floats(bytes),
-            Ok(Array::RestNormals) => domain.rest_normals = floats(bytes),
+            Ok(Array::Indices) => domain.indices = decode(FIELD, bytes)?,
+            Ok(Array::CornerVertices) => domain.corner_vertices = decode(FIELD, bytes)?,
+            Ok(Array::RestPositions) => domain.rest_positions = decode(FIELD, bytes)?,
+            Ok(Array::Uvs) => domain.uvs = decode(FIELD, bytes)?,
+            Ok(Array::RestNormals) => domain.rest_normals = decode(FIELD, bytes)?,
             _ => return Err(malformed_reply("describe.chunk.array", "a known array", array)),
         }
         Ok(())
@@ -261,9 +250,9 @@ impl Domain {
 
 /// Converts a domain from its wire format.
 fn domain(wire: v1::DomainDescription) -> Result<Domain> {
-    let place = |field: &str, bytes: &[u8]| match <[f32; 12]>::try_from(floats(bytes)) {
-        Ok(entries) if bytes.len() == 48 => Ok(entries),
-        _ => Err(malformed_reply(format!("domain '{}': {field}", wire.name), "48 bytes", bytes.len())),
+    let place = |field: &str, bytes: &[u8]| {
+        let refusal = |_| malformed_reply(format!("domain '{}': {field}", wire.name), "48 bytes", bytes.len());
+        bytemuck::try_pod_read_unaligned::<[f32; 12]>(bytes).map_err(refusal)
     };
     let attachment = match wire.parent {
         None => None,

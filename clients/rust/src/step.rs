@@ -1,6 +1,6 @@
 //! One step of a physics process: r coordinates and a transform per domain, packed little-endian.
 
-use bytes::{BufMut as _, BytesMut};
+use bytes::BytesMut;
 use modalcast_proto::v1;
 
 use crate::error::{Error, Result};
@@ -30,19 +30,23 @@ impl DomainTransform {
     }
 
     fn put(&self, bytes: &mut BytesMut) {
-        let mut floats = |list: &[f32]| list.iter().for_each(|number| bytes.put_f32_le(*number));
         match self {
-            Self::Affine(entries) => floats(entries),
+            Self::Affine(entries) => put_array(bytes, entries),
             Self::RigidF32 { rotation, translation } => {
-                floats(rotation);
-                floats(translation);
+                put_array(bytes, rotation);
+                put_array(bytes, translation);
             }
             Self::RigidF64 { rotation, translation } => {
-                floats(rotation);
-                translation.iter().for_each(|number| bytes.put_f64_le(*number));
+                put_array(bytes, rotation);
+                put_array(bytes, translation);
             }
         }
     }
+}
+
+/// Appends the bytes of numbers; `assemble` checks at compile time that the host is little-endian.
+fn put_array<T: bytemuck::NoUninit>(bytes: &mut BytesMut, numbers: &[T]) {
+    bytes.extend_from_slice(bytemuck::cast_slice(numbers));
 }
 
 /// Builds a step. Values that are not set keep their value on the server.
@@ -91,7 +95,7 @@ impl Step {
     /// As [`Self::q`], in place.
     pub fn set_q(&mut self, domain: u32, coordinates: &[f32]) {
         self.q_domains.push(domain);
-        coordinates.iter().for_each(|number| self.q.put_f32_le(*number));
+        put_array(&mut self.q, coordinates);
     }
 
     /// As [`Self::transform`], in place.

@@ -12,9 +12,10 @@ use tokio_stream::wrappers::ReceiverStream;
 use v1::drive_scene_request::Kind as RequestKind;
 use v1::drive_scene_response::Kind as ResponseKind;
 
+use crate::assemble::Replies;
 use crate::client::Client;
 use crate::error::{Error, Rejection, Result, malformed_reply};
-use crate::frames::{StageTimes, stages};
+use crate::stages::{self, StageTimes};
 use crate::step::Step;
 
 /// The most acknowledgements, and the most refusals, that are kept until the caller takes them. Older ones are dropped;
@@ -51,7 +52,7 @@ pub struct StreamSummary {
     pub skipped: u64,
 }
 
-/// State shared between the reading task and the [`Drive`].
+/// State shared between the reading task and the [`StepStream`].
 #[derive(Default)]
 struct Progress {
     outstanding: VecDeque<u64>,
@@ -94,8 +95,8 @@ impl Client {
         let opening = v1::DriveSceneRequest { kind: Some(RequestKind::Open(open)) };
         requests.send(opening).await.map_err(|_| Error::StreamEnded { what: "the stream opened" })?;
         let mut service = v1::step_service_client::StepServiceClient::new(self.channel.clone());
-        let mut replies = service.drive_scene(ReceiverStream::new(queue)).await?.into_inner();
-        let opened = match replies.message().await?.and_then(|reply| reply.kind) {
+        let mut replies = self.replies(service.drive_scene(ReceiverStream::new(queue)).await)?;
+        let opened = match replies.next().await?.and_then(|reply| reply.kind) {
             Some(ResponseKind::Opened(opened)) => opened,
             Some(ResponseKind::Rejection(rejection)) => return Err(Error::Rejected(Box::new(rejection.into()))),
             Some(ResponseKind::Ack(_)) => {
@@ -222,13 +223,9 @@ impl Drop for StepStream {
 }
 
 /// Reads replies until the stream ends.
-async fn read(
-    mut replies: tonic::Streaming<v1::DriveSceneResponse>,
-    progress: Arc<Mutex<Progress>>,
-    change: watch::Sender<()>,
-) {
+async fn read(mut replies: Replies<v1::DriveSceneResponse>, progress: Arc<Mutex<Progress>>, change: watch::Sender<()>) {
     loop {
-        let reply = replies.message().await;
+        let reply = replies.next().await;
         let mut progress = lock(&progress);
         match reply {
             Ok(Some(reply)) => match reply.kind {
@@ -237,7 +234,7 @@ async fn read(
                 Some(ResponseKind::Opened(_)) | None => {}
             },
             Ok(None) => progress.ended = Some(None),
-            Err(status) => progress.ended = Some(Some(status.into())),
+            Err(error) => progress.ended = Some(Some(error)),
         }
         change.send_replace(());
         if progress.ended.is_some() {
@@ -251,7 +248,10 @@ impl Progress {
         self.outstanding.retain(|step| *step > ack.step);
         self.acknowledged = self.acknowledged.max(Some(ack.step));
         self.skipped = ack.skipped;
-        push_bounded(&mut self.acks, Ack { step: ack.step, skipped: ack.skipped, stages: stages(ack.stages) });
+        push_bounded(
+            &mut self.acks,
+            Ack { step: ack.step, skipped: ack.skipped, stages: stages::from_wire(ack.stages) },
+        );
     }
 
     /// Removes the refused step from the steps in flight. If several have its number, the oldest one is meant.

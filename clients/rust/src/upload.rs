@@ -51,10 +51,10 @@ impl Client {
         };
         let (sender, queue) = mpsc::channel(4);
         let reading = tokio::task::spawn_blocking(move || send_all(&sender, header, &entries));
-        let reply = self.scenes().upload_scene(ReceiverStream::new(queue)).await;
+        let reply = self.reply(self.scenes().upload_scene(ReceiverStream::new(queue)).await);
         // A read error truncates the upload, and the server refuses it. Report the read error, which is the cause.
         reading.await.map_err(|fault| Error::file(&root, fault))??;
-        reply?.into_inner().scene.ok_or_else(|| malformed_reply("upload.scene", "a scene", "none"))
+        reply?.scene.ok_or_else(|| malformed_reply("upload.scene", "a scene", "none"))
     }
 }
 

@@ -9,72 +9,28 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use v1::vertex_service_client::VertexServiceClient;
 
-use crate::assemble::{Chunk, ChunkMessage, ChunkedReplies, floats};
+use crate::assemble::{Chunk, ChunkedReplies, WireChunk, decode};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed_reply};
-use crate::frames::{Delivery, StageTimes, StepSelector, stages};
+use crate::request::{StepRequest, Subscription};
+use crate::stages::{self, StageTimes};
 
-/// Additional attributes to read back with a step, for example for collision detection. The server refuses attributes
-/// that the scene does not keep.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct ReadbackOptions {
-    /// u = U q of each vertex; requires `deform.displacements` in the scene.
-    pub displacements: bool,
-    /// A bounding box of each selected domain; requires `deform.boxes` in the scene.
-    pub boxes: bool,
-    /// Omits positions and normals.
-    pub without_vertices: bool,
-}
+/// The domains and attributes to return. The default is positions and normals of all domains. The server refuses
+/// attributes that the scene does not keep.
+pub use modalcast_proto::v1::VertexSelection;
 
-/// A request for one step's vertices.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct VertexRequest {
-    pub scene: String,
-    /// Domain indices; empty selects all.
-    pub domains: Vec<u32>,
-    pub positions_only: bool,
-    pub readback: ReadbackOptions,
-    at: StepSelector,
-    deadline_ms: u32,
-}
+/// A request for the vertices of one step.
+pub type VertexRequest = StepRequest<VertexSelection>;
 
-impl VertexRequest {
-    /// All vertices of a scene's newest state, with normals.
-    pub fn new(scene: &str) -> Self {
-        Self { scene: scene.to_owned(), ..Self::default() }
-    }
+/// A subscription to the vertices of every step.
+pub type VertexStreamRequest = Subscription<VertexSelection>;
 
-    /// Exactly this step of the current run. The server refuses a step that it no longer has.
-    #[must_use]
-    pub const fn exact_step(mut self, step: u64) -> Self {
-        self.at = StepSelector::Exact(step);
-        self
-    }
-
-    /// This step of the current run or a later one.
-    #[must_use]
-    pub const fn minimum_step(mut self, step: u64) -> Self {
-        self.at = StepSelector::Minimum(step);
-        self
-    }
-
-    /// How long the server may wait for the step, in milliseconds; 0 selects the server's default.
-    #[must_use]
-    pub const fn deadline_ms(mut self, milliseconds: u32) -> Self {
-        self.deadline_ms = milliseconds;
-        self
-    }
-}
-
-/// A subscription to vertices; with `steps` = 0 it never ends.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct VertexStreamRequest {
-    pub scene: String,
-    pub domains: Vec<u32>,
-    pub positions_only: bool,
-    pub readback: ReadbackOptions,
-    pub delivery: Delivery,
-    pub steps: u64,
+/// A selected domain of a [`VertexSet`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct VertexSetDomain {
+    pub index: u32,
+    pub vertices: u32,
+    pub corners: u32,
 }
 
 /// The vertices of one step.
@@ -86,8 +42,8 @@ pub struct VertexSet {
     pub origin: Vec<f64>,
     /// The origin of each selected domain if the origins differ; otherwise empty.
     pub origins: Vec<[f64; 3]>,
-    /// Per selected domain: its index, its number of vertices and its number of corners.
-    pub domains: Vec<(u32, u32, u32)>,
+    /// The selected domains, in the order of all arrays.
+    pub domains: Vec<VertexSetDomain>,
     /// Three per vertex, selected domains concatenated; empty if omitted.
     pub positions: Vec<f32>,
     /// Three per corner; empty if omitted.
@@ -103,8 +59,8 @@ pub struct VertexSet {
 impl VertexSet {
     /// The range of the `place`-th selected domain in `positions` and in `displacements`.
     pub fn range(&self, place: usize) -> Range<usize> {
-        let before: usize = self.domains[..place].iter().map(|(_, vertices, _)| 3 * *vertices as usize).sum();
-        before..before + 3 * self.domains[place].1 as usize
+        let before: usize = self.domains[..place].iter().map(|domain| 3 * domain.vertices as usize).sum();
+        before..before + 3 * self.domains[place].vertices as usize
     }
 
     /// World position of the origin of the `place`-th selected domain, in meters. A vertex is at
@@ -125,16 +81,12 @@ impl Client {
         use v1::get_vertices_request::Step;
         let wire = v1::GetVerticesRequest {
             scene: request.scene.clone(),
-            selection: Some(selection(&request.domains, request.positions_only, request.readback)),
-            step: match request.at {
-                StepSelector::Current => None,
-                StepSelector::Exact(step) => Some(Step::ExactStep(step)),
-                StepSelector::Minimum(step) => Some(Step::MinimumStep(step)),
-            },
+            selection: Some(request.query.clone()),
+            step: request.step.to_wire(Step::ExactStep, Step::MinimumStep),
             deadline_ms: request.deadline_ms,
         };
-        let stream = VertexServiceClient::new(self.channel.clone()).get_vertices(wire).await?.into_inner();
-        let set = ChunkedReplies::new(stream, self.reply_limit).next().await;
+        let messages = self.replies(VertexServiceClient::new(self.channel.clone()).get_vertices(wire).await)?;
+        let set = ChunkedReplies::new(messages, |message| message.chunk, self.reply_limit).next().await;
         set.unwrap_or(Err(Error::StreamEnded { what: "the vertices" }))
     }
 
@@ -145,17 +97,17 @@ impl Client {
     pub async fn stream_vertices(&self, request: &VertexStreamRequest) -> Result<VertexStream> {
         let wire = v1::StreamVerticesRequest {
             scene: request.scene.clone(),
-            selection: Some(selection(&request.domains, request.positions_only, request.readback)),
+            selection: Some(request.query.clone()),
             delivery: v1::Delivery::from(request.delivery).into(),
-            steps: request.steps,
+            steps: request.replies,
         };
-        let stream = VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await?.into_inner();
-        Ok(VertexStream(ChunkedReplies::new(stream, self.reply_limit)))
+        let messages = self.replies(VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await)?;
+        Ok(VertexStream(ChunkedReplies::new(messages, |message| message.chunk, self.reply_limit)))
     }
 }
 
 /// A stream of vertex sets; dropping it unsubscribes.
-pub struct VertexStream(ChunkedReplies<v1::StreamVerticesResponse>);
+pub struct VertexStream(ChunkedReplies<v1::StreamVerticesResponse, v1::VertexChunk>);
 
 impl VertexStream {
     /// The vertices of the next step, or `None` after the requested number of steps.
@@ -172,43 +124,22 @@ impl tokio_stream::Stream for VertexStream {
     }
 }
 
-impl ChunkMessage for v1::GetVerticesResponse {
+impl WireChunk for v1::VertexChunk {
     type Head = v1::VertexHead;
     type Reply = VertexSet;
-    const WHAT: &'static str = "vertices";
+    const NAME: &'static str = "vertices";
 
-    fn into_chunk(self) -> Result<Chunk<Self::Head>> {
-        piece(self.chunk)
+    fn into_chunk(self) -> Chunk<Self::Head> {
+        let head = self.head.map(|head| {
+            let total = head.total;
+            (head, total)
+        });
+        Chunk { head, offset: self.offset, data: self.data }
     }
 
-    fn from_chunks(head: Self::Head, bytes: Bytes) -> Result<VertexSet> {
+    fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<VertexSet> {
         set(head, &bytes)
     }
-}
-
-impl ChunkMessage for v1::StreamVerticesResponse {
-    type Head = v1::VertexHead;
-    type Reply = VertexSet;
-    const WHAT: &'static str = "vertices";
-
-    fn into_chunk(self) -> Result<Chunk<Self::Head>> {
-        piece(self.chunk)
-    }
-
-    fn from_chunks(head: Self::Head, bytes: Bytes) -> Result<VertexSet> {
-        set(head, &bytes)
-    }
-}
-
-fn selection(domains: &[u32], positions_only: bool, readback: ReadbackOptions) -> v1::VertexSelection {
-    let ReadbackOptions { displacements, boxes, without_vertices } = readback;
-    v1::VertexSelection { domains: domains.to_vec(), positions_only, displacements, boxes, without_vertices }
-}
-
-fn piece(chunk: Option<v1::VertexChunk>) -> Result<Chunk<v1::VertexHead>> {
-    let chunk = chunk.ok_or_else(|| malformed_reply("vertices.chunk", "a chunk", "none"))?;
-    let head = chunk.head.map(|head| (head.total, head)).map(|(total, head)| (head, total));
-    Ok(Chunk { head, offset: chunk.offset, data: chunk.data })
 }
 
 fn set(head: v1::VertexHead, bytes: &[u8]) -> Result<VertexSet> {
@@ -221,18 +152,24 @@ fn set(head: v1::VertexHead, bytes: &[u8]) -> Result<VertexSet> {
         ));
     }
     let parts = parts(&head, bytes)?;
-    let domains = head.domains.iter().zip(&head.vertices).zip(&head.corners);
+    let counts = head.vertices.iter().zip(&head.corners);
+    let domains = head.domains.iter().zip(counts);
+    let domain = |(index, (vertices, corners)): (&u32, (&u32, &u32))| VertexSetDomain {
+        index: *index,
+        vertices: *vertices,
+        corners: *corners,
+    };
     Ok(VertexSet {
         step: head.step.ok_or_else(|| malformed_reply("vertices.step", "a step", "none"))?,
         origin: head.origin,
-        origins: points(parts.origins),
-        domains: domains.map(|((domain, vertices), corners)| (*domain, *vertices, *corners)).collect(),
-        positions: floats(parts.positions),
-        normals: floats(parts.normals),
-        displacements: floats(parts.displacements),
-        boxes: boxes(&floats(parts.boxes)),
+        origins: decode("vertices.origins", parts.origins)?,
+        domains: domains.map(domain).collect(),
+        positions: decode("vertices.positions", parts.positions)?,
+        normals: decode("vertices.normals", parts.normals)?,
+        displacements: decode("vertices.displacements", parts.displacements)?,
+        boxes: decode("vertices.boxes", parts.boxes)?,
         skipped: head.skipped,
-        stages: stages(head.stages),
+        stages: stages::from_wire(head.stages),
     })
 }
 
@@ -269,22 +206,6 @@ fn parts<'a>(head: &v1::VertexHead, bytes: &'a [u8]) -> Result<Parts<'a>> {
     let (displacements, rest) = rest.split_at(head.displacement_bytes as usize);
     let (boxes, origins) = rest.split_at(head.box_bytes as usize);
     Ok(Parts { positions, normals, displacements, boxes, origins })
-}
-
-/// Six numbers per box.
-fn boxes(numbers: &[f32]) -> Vec<[[f32; 3]; 2]> {
-    let corner = |six: &[f32], first: usize| [0, 1, 2].map(|axis| six[first + axis]);
-    numbers.chunks_exact(6).map(|six| [corner(six, 0), corner(six, 3)]).collect()
-}
-
-/// Little-endian f64 at any alignment, three per point.
-fn points(bytes: &[u8]) -> Vec<[f64; 3]> {
-    let number = |bytes: &[u8]| {
-        let mut word = [0; 8];
-        word.copy_from_slice(bytes);
-        f64::from_le_bytes(word)
-    };
-    bytes.chunks_exact(24).map(|point| [0, 8, 16].map(|at| number(&point[at..at + 8]))).collect()
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use fake::{FakeDomain, FakeServer, serve};
 use modalcast_client::{
     Array, Client, DrawnBy, Error, FrameFormat, FrameRequest, FrameStreamRequest, Picture, Policy, Step,
 };
-use modalcast_client::{VertexRequest, VertexStreamRequest};
+use modalcast_client::{VertexRequest, VertexSelection, VertexStreamRequest};
 use tokio::sync::Semaphore;
 
 /// One domain of n vertices and two modes. Each entry encodes its own index.
@@ -17,6 +17,10 @@ fn world(vertices: usize) -> FakeServer {
     let rest = (0..3 * vertices).map(|at| at as f32).collect();
     let modes = (0..6 * vertices).map(|at| (at % 1000) as f32).collect();
     FakeServer::new(vec![FakeDomain::new(0, rest, 2, modes)])
+}
+
+fn picture(width: u32, height: u32) -> Picture {
+    Picture::default().size(width, height).format(FrameFormat::Rgba)
 }
 
 async fn connected(world: FakeServer) -> (Arc<FakeServer>, Client) {
@@ -47,8 +51,7 @@ async fn frame_above_4_mib_arrives_complete_and_names_its_step() {
     let mut drive = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
     drive.step(&Step::new(5, 0.1).q(0, &[1.0, 2.0])).await.expect("sent");
     drive.flush().await.expect("acknowledged");
-    let mut request = FrameRequest::new("toy").size(1920, 1080).minimum_step(5);
-    request.picture.format = FrameFormat::Rgba;
+    let request = FrameRequest::new("toy", picture(1920, 1080)).minimum_step(5);
     let frame = client.frame(&request).await.expect("comes");
     assert_eq!((frame.step.number, frame.width, frame.bytes.len()), (5, 1920, 1920 * 1080 * 4));
     assert!(frame.bytes.iter().all(|byte| *byte == 5));
@@ -59,10 +62,9 @@ async fn frame_above_4_mib_arrives_complete_and_names_its_step() {
 #[tokio::test]
 async fn subscription_before_the_first_step_receives_every_step() {
     let (world, client) = connected(world(4)).await;
-    let picture = Picture { width: 600, height: 600, format: FrameFormat::Rgba, ..Picture::default() };
-    let request = FrameStreamRequest { scene: "toy".into(), picture, frames: 20, ..FrameStreamRequest::default() };
+    let request = FrameStreamRequest::new("toy", picture(600, 600)).replies(20);
     let mut frames = client.stream_frames(&request).await.expect("accepted");
-    let request = VertexStreamRequest { scene: "toy".into(), steps: 20, ..VertexStreamRequest::default() };
+    let request = VertexStreamRequest::new("toy", VertexSelection::default()).replies(20);
     let mut sets = client.stream_vertices(&request).await.expect("accepted");
     let mut drive = client.drive("toy", Policy::Lossless, 3).await.expect("opens");
     assert_eq!((drive.run, drive.window), (1, 3));
@@ -134,8 +136,8 @@ async fn refused_calls_report_the_details_of_the_server() {
     for error in [
         client.describe("none", &[]).await.expect_err("unknown"),
         client.modes("none", 0, &[]).await.expect_err("unknown"),
-        client.frame(&FrameRequest::new("none")).await.expect_err("unknown"),
-        client.vertices(&VertexRequest::new("none")).await.expect_err("unknown"),
+        client.frame(&FrameRequest::new("none", Picture::default())).await.expect_err("unknown"),
+        client.vertices(&VertexRequest::new("none", VertexSelection::default())).await.expect_err("unknown"),
         client.open_scene("none", "").await.expect_err("unknown"),
     ] {
         let Error::Status { code, .. } = &error else { panic!("{error}") };
@@ -144,6 +146,39 @@ async fn refused_calls_report_the_details_of_the_server() {
     }
     assert!(matches!(Client::connect("http://127.0.0.1:1").await, Err(Error::Connect { .. })));
     assert!(matches!(Client::connect("not a url").await, Err(Error::Connect { .. })));
+}
+
+/// Forwards connections to a server on loopback. Dropping the set closes every connection and the listener.
+async fn forward(server: &str) -> (String, tokio::task::JoinSet<()>) {
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a free port");
+    let url = format!("http://{}", listener.local_addr().expect("bound"));
+    let server = server.trim_start_matches("http://").to_owned();
+    let mut tasks = tokio::task::JoinSet::new();
+    tasks.spawn(async move {
+        let mut connections = tokio::task::JoinSet::new();
+        while let Ok((mut from, _)) = listener.accept().await {
+            let mut to = tokio::net::TcpStream::connect(&server).await.expect("connects");
+            connections.spawn(async move { drop(tokio::io::copy_bidirectional(&mut from, &mut to).await) });
+        }
+    });
+    (url, tasks)
+}
+
+#[tokio::test]
+async fn lost_connection_names_the_server_in_calls_and_streams() {
+    let server = serve(Arc::new(world(4))).await;
+    let (url, mut connections) = forward(&server).await;
+    let client = Client::connect(&url).await.expect("connects");
+    let mut drive = client.drive("toy", Policy::Lossless, 0).await.expect("opens");
+    let request = FrameStreamRequest::new("toy", picture(8, 8));
+    let mut frames = client.stream_frames(&request).await.expect("accepted");
+    connections.shutdown().await;
+    let frame = frames.next().await.expect("an error").expect_err("lost");
+    let step = Step::new(0, 0.0).q(0, &[0.0, 0.0]);
+    drive.step(&step).await.ok();
+    for error in [frame, drive.flush().await.expect_err("lost"), client.server_info().await.expect_err("lost")] {
+        assert!(matches!(&error, Error::Connect { url: named, .. } if *named == url), "{error:?}");
+    }
 }
 
 #[tokio::test]

@@ -207,10 +207,12 @@ fn refuse(code: tonic::Code, rejection: &v1::Rejection) -> Status {
     Status::with_details(code, format!("{}: {}", rejection.field, rejection.given), details.into())
 }
 
+/// Decodes little-endian f32 at any alignment.
 pub(crate) fn floats(bytes: &[u8]) -> Vec<f32> {
-    bytes.chunks_exact(4).map(|word| f32::from_le_bytes(word.try_into().unwrap())).collect()
+    bytemuck::pod_collect_to_vec(bytes)
 }
 
-pub(crate) fn pack(numbers: &[f32]) -> Vec<u8> {
-    numbers.iter().flat_map(|number| number.to_le_bytes()).collect()
+/// The bytes of little-endian numbers.
+pub(crate) fn pack<T: bytemuck::NoUninit>(numbers: &[T]) -> Vec<u8> {
+    bytemuck::cast_slice(numbers).to_vec()
 }

@@ -138,8 +138,8 @@ impl SceneService for FakeService {
         for domain in &self.0.domains {
             for array in &request.arrays {
                 let bytes = match v1::Array::try_from(*array) {
-                    Ok(v1::Array::Indices) => words(&domain.indices),
-                    Ok(v1::Array::CornerVertices) => words(&(0..domain.wire.vertices).collect::<Vec<_>>()),
+                    Ok(v1::Array::Indices) => pack(&domain.indices),
+                    Ok(v1::Array::CornerVertices) => pack(&(0..domain.wire.vertices).collect::<Vec<_>>()),
                     Ok(v1::Array::RestPositions) => pack(&domain.rest),
                     _ => vec![],
                 };
@@ -361,10 +361,6 @@ fn chunks(bytes: Vec<u8>) -> Vec<(u64, (Bytes, u64))> {
     let total = total + bytes.len() as u64;
     let starts = (0..bytes.len().max(1)).step_by(CHUNK);
     starts.map(|at| (at as u64, (bytes.slice(at..(at + CHUNK).min(bytes.len())), total))).collect()
-}
-
-fn words(numbers: &[u32]) -> Vec<u8> {
-    numbers.iter().flat_map(|number| number.to_le_bytes()).collect()
 }
 
 fn replies<T: Send + 'static>(messages: Vec<T>) -> Response<Replies<T>> {

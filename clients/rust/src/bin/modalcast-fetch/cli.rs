@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use modalcast_client::{Camera, Delivery, FrameFormat, Lens, Output, Picture, View};
+use modalcast_client::{Camera, Delivery, FrameFormat, Lens, Output, Picture, StepSelector, View};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -12,11 +12,11 @@ Examples:
   modalcast-fetch vertices --scene tree --count 60 --out vertices.npy --json
   modalcast-fetch --server http://10.0.0.2:50051 info
 
-`frames`, and `vertices` with --count, print a line `ready` on standard output once the server has accepted the
-subscription: a physics process started after that line loses no step.
+`frames`, and `vertices` with --count, print the line `ready` on standard output when the server has accepted the
+subscription. A physics process that starts after that line loses no step.
 
-Exit codes: 0 done; 1 the server refused; 2 bad command line; 3 no connection, or lost; 4 a local file;
-5 the reply was malformed, ended early or did not come in time.";
+Exit codes: 0 done; 1 refused by the server; 2 invalid command line; 3 no connection, or connection lost; 4 error of a
+local file; 5 the reply was malformed, ended early or did not arrive in time.";
 
 /// Saves frames or vertices of a modalcast server.
 #[derive(Debug, Parser)]
@@ -72,32 +72,32 @@ pub(crate) struct SceneOptions {
 /// Options of the picture.
 #[derive(Debug, Args)]
 pub(crate) struct PictureOptions {
-    /// Size in pixels.
+    /// Image size in pixels.
     #[arg(long, default_value = "1280x720", value_name = "WxH", value_parser = size)]
     size: (u32, u32),
     /// What the picture shows: color, depth (f32 meters), domains (u32), normals (3 f32), or a color map with legend.
     #[arg(long, value_enum, default_value = "color")]
     output: OutputOption,
-    /// Column of U for `--output mode-shape`.
-    #[arg(long, default_value_t = 0)]
+    /// Index of the column of U for `--output mode-shape`, from 0.
+    #[arg(long, requires = "output", default_value_t = 0)]
     mode: u32,
-    /// Value at the bright end of a color map; 0 fits it to each frame.
-    #[arg(long, default_value_t = 0.0)]
+    /// Value at the bright end of the color map; 0 fits it to each frame.
+    #[arg(long, requires = "output", default_value_t = 0.0)]
     largest: f64,
     /// Encoding of color pictures: PNG, or raw RGBA8 (top row first, sRGB).
     #[arg(long, value_enum, default_value = "png")]
     pub(crate) format: FormatOption,
-    /// Position of the camera; the default camera frames the scene.
-    #[arg(long, value_name = "X,Y,Z", value_parser = triple, requires = "target", allow_hyphen_values = true)]
+    /// Position of the camera in scene units. Default: a camera that frames the scene.
+    #[arg(long, value_name = "X,Y,Z", value_parser = point, requires = "target", allow_hyphen_values = true)]
     camera_eye: Option<[f64; 3]>,
-    /// Point that the camera looks at.
-    #[arg(long, value_name = "X,Y,Z", value_parser = triple, requires = "camera_eye", allow_hyphen_values = true)]
+    /// Point that the camera looks at, in scene units.
+    #[arg(long, value_name = "X,Y,Z", value_parser = point, requires = "camera_eye", allow_hyphen_values = true)]
     target: Option<[f64; 3]>,
     /// Up direction of the camera.
-    #[arg(long, value_name = "X,Y,Z", value_parser = triple, default_value = "0,1,0", allow_hyphen_values = true)]
+    #[arg(long, value_name = "X,Y,Z", value_parser = point, default_value = "0,1,0", allow_hyphen_values = true)]
     up: [f64; 3],
-    /// Vertical field of view in degrees; default 35.
-    #[arg(long, requires = "camera_eye")]
+    /// Vertical field of view in degrees. Default: 35.
+    #[arg(long, requires = "camera_eye", value_name = "DEGREES")]
     fov: Option<f64>,
 }
 
@@ -120,7 +120,8 @@ enum OutputOption {
 impl PictureOptions {
     pub(crate) fn picture(&self) -> Picture {
         let view = self.camera_eye.zip(self.target).map(|(eye, target)| View::LookAt { eye, target, up: self.up });
-        let camera = view.map(|view| Camera { view, lens: Lens::FieldOfView(self.fov.unwrap_or(35.0)), clip: None });
+        let camera =
+            view.map(|view| Camera { view, lens: Lens::FieldOfView(self.fov.unwrap_or(35.0)), clip: None });
         let format = match self.format {
             FormatOption::Png => FrameFormat::Png,
             FormatOption::Raw => FrameFormat::Rgba,
@@ -187,6 +188,13 @@ pub(crate) struct StepOptions {
     pub(crate) deadline_ms: u32,
 }
 
+impl StepOptions {
+    pub(crate) fn selector(&self) -> StepSelector {
+        let exact = self.step.map(StepSelector::Exact);
+        exact.or(self.min_step.map(StepSelector::Minimum)).unwrap_or_default()
+    }
+}
+
 #[derive(Debug, Args)]
 pub(crate) struct FrameOptions {
     #[command(flatten)]
@@ -234,13 +242,17 @@ pub(crate) struct VerticesOptions {
 
 fn size(text: &str) -> Result<(u32, u32), String> {
     let parsed = text.split_once('x').and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
-    parsed.filter(|(width, height)| *width > 0 && *height > 0).ok_or_else(|| "expected WIDTHxHEIGHT".into())
+    parsed
+        .filter(|(width, height)| *width > 0 && *height > 0)
+        .ok_or_else(|| "expected WIDTHxHEIGHT, such as 1280x720".into())
 }
 
-fn triple(text: &str) -> Result<[f64; 3], String> {
+fn point(text: &str) -> Result<[f64; 3], String> {
     let numbers: Option<Vec<f64>> = text.split(',').map(|number| number.trim().parse().ok()).collect();
-    let triple = numbers.and_then(|numbers| <[f64; 3]>::try_from(numbers).ok());
-    triple.filter(|numbers| numbers.iter().all(|number| number.is_finite())).ok_or_else(|| "expected X,Y,Z".into())
+    let point = numbers.and_then(|numbers| <[f64; 3]>::try_from(numbers).ok());
+    point
+        .filter(|numbers| numbers.iter().all(|number| number.is_finite()))
+        .ok_or_else(|| "expected three finite numbers X,Y,Z".into())
 }
 
 fn seconds(text: &str) -> Result<f64, String> {
@@ -259,14 +271,14 @@ mod tests {
     }
 
     #[test]
-    fn sizes_and_triples_are_parsed_and_invalid_ones_refused() {
+    fn sizes_and_points_are_parsed_and_invalid_ones_refused() {
         assert_eq!(size("1280x720"), Ok((1280, 720)));
-        assert_eq!(triple("1, -2,.5"), Ok([1.0, -2.0, 0.5]));
+        assert_eq!(point("1, -2,.5"), Ok([1.0, -2.0, 0.5]));
         for wrong in ["", "1280", "0x5", "-1x5", "axb", "5x5x5"] {
             assert!(size(wrong).is_err(), "{wrong}");
         }
         for wrong in ["", "1,2", "1,2,3,4", "1,2,nan", "inf,0,0"] {
-            assert!(triple(wrong).is_err(), "{wrong}");
+            assert!(point(wrong).is_err(), "{wrong}");
         }
         assert!(seconds("-1").is_err() && seconds("nan").is_err());
     }

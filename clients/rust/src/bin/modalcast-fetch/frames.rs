@@ -5,18 +5,14 @@ use std::time::Duration;
 
 use modalcast_client::{Client, Error, Frame, FrameFormat, FrameRequest, FrameStreamRequest, Result};
 
-use crate::cli::{FrameOptions, FramesOptions, StepOptions};
-use crate::output::{Summary, bar, scene};
+use crate::cli::{FrameOptions, FramesOptions};
+use crate::output::{ReceivedStep, Summary, bar, scene};
 
 pub(crate) async fn stream(client: &Client, options: &FramesOptions, json: bool) -> Result<()> {
     let name = scene(client, &options.scene).await?;
     std::fs::create_dir_all(&options.out).map_err(|fault| Error::file(&options.out, fault))?;
-    let request = FrameStreamRequest {
-        scene: name,
-        picture: options.picture.picture(),
-        delivery: options.delivery.into(),
-        frames: options.count,
-    };
+    let request = FrameStreamRequest::new(&name, options.picture.picture());
+    let request = request.delivery(options.delivery.into()).replies(options.count);
     let mut frames = client.stream_frames(&request).await?;
     println!("ready");
     let timeout = Duration::from_secs_f64(options.timeout);
@@ -26,7 +22,7 @@ pub(crate) async fn stream(client: &Client, options: &FramesOptions, json: bool)
         let next = tokio::time::timeout(timeout, frames.next()).await.map_err(|_| late)?;
         let frame = next.unwrap_or(Err(Error::StreamEnded { what: "the last frame" }))?;
         write(&options.out.join(format!("frame_{index:05}.{}", extension(frame.format))), &frame)?;
-        summary.add((frame.step.run, frame.step.number), frame.bytes.len() as u64, frame.skipped, &frame.stages);
+        summary.add(&received(&frame));
         bar.inc(1);
     }
     bar.finish_and_clear();
@@ -36,17 +32,18 @@ pub(crate) async fn stream(client: &Client, options: &FramesOptions, json: bool)
 
 pub(crate) async fn single(client: &Client, options: &FrameOptions, json: bool) -> Result<()> {
     let name = scene(client, &options.scene).await?;
-    let mut request = FrameRequest::new(&name).deadline_ms(options.step.deadline_ms);
-    request.picture = options.picture.picture();
-    let StepOptions { step, min_step, .. } = options.step;
-    request = step.map_or(request.clone(), |step| request.exact_step(step));
-    request = min_step.map_or(request.clone(), |step| request.minimum_step(step));
+    let request = FrameRequest::new(&name, options.picture.picture());
+    let request = request.at(options.step.selector()).deadline_ms(options.step.deadline_ms);
     let mut summary = Summary::new();
     let frame = client.frame(&request).await?;
     write(&options.out, &frame)?;
-    summary.add((frame.step.run, frame.step.number), frame.bytes.len() as u64, frame.skipped, &frame.stages);
+    summary.add(&received(&frame));
     summary.print("frames", &options.out, None, json);
     Ok(())
+}
+
+fn received(frame: &Frame) -> ReceivedStep<'_> {
+    ReceivedStep { step: frame.step, bytes: frame.bytes.len() as u64, skipped: frame.skipped, stages: &frame.stages }
 }
 
 fn write(path: &Path, frame: &Frame) -> Result<()> {

@@ -10,36 +10,13 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Parser as _;
-use modalcast_client::{Client, Error, Result};
+use modalcast_client::{Client, Result, program};
 
 use cli::{Cli, Command};
 
 fn main() -> ExitCode {
     let arguments = Cli::parse();
-    let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
-        Ok(runtime) => runtime,
-        Err(fault) => {
-            eprintln!("modalcast-fetch: no runtime: {fault}");
-            return ExitCode::from(4);
-        }
-    };
-    match runtime.block_on(run(&arguments)) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("modalcast-fetch: {error}");
-            ExitCode::from(code(&error))
-        }
-    }
-}
-
-/// The documented exit code of an error.
-const fn code(error: &Error) -> u8 {
-    match error {
-        Error::Connect { .. } | Error::Status { code: modalcast_client::Code::Unavailable, .. } => 3,
-        Error::Status { .. } | Error::Rejected(_) | Error::Step { .. } => 1,
-        Error::File { .. } => 4,
-        Error::Malformed { .. } | Error::StreamEnded { .. } | Error::Deadline { .. } => 5,
-    }
+    program::run("modalcast-fetch", async { run(&arguments).await.map(|()| 0) }, program::exit_code)
 }
 
 async fn run(arguments: &Cli) -> Result<()> {

@@ -1,13 +1,20 @@
 //! Prints summaries on standard output, as text or as one line of JSON.
 
-use std::collections::BTreeMap;
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use modalcast_client::{Client, Result, SceneInfo, StageTimes};
+use modalcast_client::{Client, Result, SceneInfo, StageSamples, StageTimes, StepId};
 use serde_json::{Value, json};
 
 use crate::cli::SceneOptions;
+
+/// A received reply, as the summary counts it.
+pub(crate) struct ReceivedStep<'a> {
+    pub(crate) step: StepId,
+    pub(crate) bytes: u64,
+    pub(crate) skipped: u64,
+    pub(crate) stages: &'a StageTimes,
+}
 
 /// Totals of the received frames or vertices.
 pub(crate) struct Summary {
@@ -18,7 +25,7 @@ pub(crate) struct Summary {
     runs: Vec<u64>,
     bytes: u64,
     skipped: u64,
-    stages: BTreeMap<String, Vec<f32>>,
+    stages: StageSamples,
 }
 
 impl Summary {
@@ -30,21 +37,19 @@ impl Summary {
             runs: vec![],
             bytes: 0,
             skipped: 0,
-            stages: BTreeMap::new(),
+            stages: StageSamples::default(),
         }
     }
 
     /// Counts one reply.
-    pub(crate) fn add(&mut self, step: (u64, u64), bytes: u64, skipped: u64, stages: &StageTimes) {
+    pub(crate) fn add(&mut self, reply: &ReceivedStep<'_>) {
         let now = Instant::now();
         self.replies = Some((self.replies.map_or(now, |(first, _)| first), now));
-        self.runs.push(step.0);
-        self.steps.push(step.1);
-        self.bytes += bytes;
-        self.skipped += skipped;
-        for (stage, milliseconds) in stages {
-            self.stages.entry(stage.clone()).or_default().push(*milliseconds);
-        }
+        self.runs.push(reply.step.run);
+        self.steps.push(reply.step.number);
+        self.bytes += reply.bytes;
+        self.skipped += reply.skipped;
+        self.stages.add(reply.stages);
     }
 
     /// Replies per second from the first to the last, which excludes the wait for the first; 0 for fewer than two.
@@ -54,9 +59,9 @@ impl Summary {
     }
 
     /// Prints the number of `what` (frames, steps), the output path, and the origin of vertices in meters.
-    pub(crate) fn print(mut self, what: &str, out: &std::path::Path, origin: Option<Vec<f64>>, json: bool) {
+    pub(crate) fn print(self, what: &str, out: &std::path::Path, origin: Option<Vec<f64>>, json: bool) {
         let rate = self.rate();
-        let medians: BTreeMap<_, _> = self.stages.iter_mut().map(|(stage, times)| (stage, median(times))).collect();
+        let medians = self.stages.medians();
         let elapsed = self.start.elapsed().as_secs_f64();
         let count = self.steps.len();
         if json {
@@ -79,19 +84,13 @@ impl Summary {
     }
 }
 
-/// The median of some times; 0 for none.
-fn median(times: &mut [f32]) -> f32 {
-    times.sort_by(f32::total_cmp);
-    times.get(times.len() / 2).copied().unwrap_or(0.0)
-}
-
 /// A progress bar on standard error; hidden unless standard error is a terminal.
 pub(crate) fn bar(count: u64, what: &'static str) -> ProgressBar {
     let style = ProgressStyle::with_template("{msg} [{bar:32}] {pos}/{len} {per_sec} eta {eta}");
     ProgressBar::new(count).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())).with_message(what)
 }
 
-/// Opens the scene first if `--open` is given. Returns the name for other calls.
+/// With `--open`, opens the scene first. Returns the name for other calls.
 pub(crate) async fn scene(client: &Client, options: &SceneOptions) -> Result<String> {
     match &options.open {
         None => Ok(options.scene.clone()),
@@ -167,17 +166,12 @@ mod tests {
         let mut summary = Summary::new();
         assert_eq!(summary.rate(), 0.0);
         for step in 0..3 {
-            summary.add((1, step), 8, 0, &vec![]);
+            let step = StepId { run: 1, number: step, time: 0.0 };
+            summary.add(&ReceivedStep { step, bytes: 8, skipped: 0, stages: &vec![] });
         }
         let start = summary.start;
         let after = |seconds| start + std::time::Duration::from_secs(seconds);
         summary.replies = Some((after(60), after(64)));
         assert_eq!(summary.rate(), 0.5);
-    }
-
-    #[test]
-    fn median_of_none_is_zero() {
-        assert_eq!(median(&mut [3.0, 1.0, 2.0]), 2.0);
-        assert_eq!(median(&mut []), 0.0);
     }
 }

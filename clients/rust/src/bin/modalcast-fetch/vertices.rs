@@ -1,13 +1,13 @@
 //! Saves vertices as NumPy files, with one row of vertices x 3 per step.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use modalcast_client::npy::Writer;
-use modalcast_client::{Client, Error, ReadbackOptions, Result, VertexRequest, VertexSet, VertexStreamRequest};
+use modalcast_client::{Client, Error, Result, VertexRequest, VertexSelection, VertexSet, VertexStreamRequest};
 
 use crate::cli::VerticesOptions;
-use crate::output::{Summary, bar, scene};
+use crate::output::{ReceivedStep, Summary, bar, scene};
 
 pub(crate) async fn fetch(client: &Client, options: &VerticesOptions, json: bool) -> Result<()> {
     let name = scene(client, &options.scene).await?;
@@ -20,25 +20,15 @@ pub(crate) async fn fetch(client: &Client, options: &VerticesOptions, json: bool
 }
 
 async fn single(client: &Client, options: &VerticesOptions, scene: &str) -> Result<VertexSet> {
-    let mut request = VertexRequest::new(scene).deadline_ms(options.step.deadline_ms);
-    request.domains = options.domains.clone();
-    request.positions_only = options.normals.is_none();
-    request.readback = readback(options);
-    request = options.step.step.map_or(request.clone(), |step| request.exact_step(step));
-    request = options.step.min_step.map_or(request.clone(), |step| request.minimum_step(step));
+    let request = VertexRequest::new(scene, selection(options));
+    let request = request.at(options.step.selector()).deadline_ms(options.step.deadline_ms);
     client.vertices(&request).await
 }
 
 async fn stream(client: &Client, scene: &str, count: u64, files: &mut Files<'_>) -> Result<()> {
     let options = files.options;
-    let request = VertexStreamRequest {
-        scene: scene.to_owned(),
-        domains: options.domains.clone(),
-        positions_only: options.normals.is_none(),
-        readback: readback(options),
-        delivery: options.delivery.into(),
-        steps: count,
-    };
+    let request = VertexStreamRequest::new(scene, selection(options));
+    let request = request.delivery(options.delivery.into()).replies(count);
     let mut sets = client.stream_vertices(&request).await?;
     println!("ready");
     let timeout = Duration::from_secs_f64(options.timeout);
@@ -53,25 +43,35 @@ async fn stream(client: &Client, scene: &str, count: u64, files: &mut Files<'_>)
     Ok(())
 }
 
-fn readback(options: &VerticesOptions) -> ReadbackOptions {
-    let (displacements, boxes) = (options.displacements.is_some(), options.boxes.is_some());
-    ReadbackOptions { displacements, boxes, without_vertices: false }
+fn selection(options: &VerticesOptions) -> VertexSelection {
+    VertexSelection {
+        domains: options.domains.clone(),
+        positions_only: options.normals.is_none(),
+        displacements: options.displacements.is_some(),
+        boxes: options.boxes.is_some(),
+        without_vertices: false,
+    }
 }
 
-/// The file of one array, the shape of its rows, and the row of one step.
-type Array<'a> = (&'a Path, Vec<usize>, &'a [f32]);
+/// One step of an array that is saved.
+struct ArrayRow<'a> {
+    file: &'a Path,
+    shape: Vec<usize>,
+    numbers: &'a [f32],
+}
 
-fn arrays<'a>(options: &'a VerticesOptions, set: &'a VertexSet) -> Vec<Array<'a>> {
-    let triples = |numbers: &'a [f32]| (vec![numbers.len() / 3, 3], numbers);
+fn array_rows<'a>(options: &'a VerticesOptions, set: &'a VertexSet) -> Vec<ArrayRow<'a>> {
     let boxes = set.boxes.as_flattened().as_flattened();
+    let triples = |file: Option<&'a PathBuf>, numbers: &'a [f32]| {
+        file.map(|file| ArrayRow { file, shape: vec![numbers.len() / 3, 3], numbers })
+    };
     let all = [
-        (Some(&options.out), triples(&set.positions)),
-        (options.normals.as_ref(), triples(&set.normals)),
-        (options.displacements.as_ref(), triples(&set.displacements)),
-        (options.boxes.as_ref(), (vec![boxes.len() / 6, 2, 3], boxes)),
+        triples(Some(&options.out), &set.positions),
+        triples(options.normals.as_ref(), &set.normals),
+        triples(options.displacements.as_ref(), &set.displacements),
+        options.boxes.as_ref().map(|file| ArrayRow { file, shape: vec![boxes.len() / 6, 2, 3], numbers: boxes }),
     ];
-    let named = all.into_iter().filter_map(|(path, (shape, row))| Some((path?.as_path(), shape, row)));
-    named.collect()
+    all.into_iter().flatten().collect()
 }
 
 /// The output files. They are created with the first step, which has the number of vertices.
@@ -85,21 +85,19 @@ struct Files<'a> {
 
 impl Files<'_> {
     fn add(&mut self, set: &VertexSet) -> Result<()> {
-        let arrays = arrays(self.options, set);
+        let rows = array_rows(self.options, set);
         if self.open.is_empty() {
-            let create = |(path, shape, _): &Array<'_>| Writer::create(path, shape);
-            self.open = arrays.iter().map(create).collect::<Result<_>>()?;
+            self.open = rows.iter().map(|row| Writer::create(row.file, &row.shape)).collect::<Result<_>>()?;
             self.origin = set.origin.clone();
         }
         if set.origin != self.origin || !set.origins.is_empty() {
             let step = set.step.number;
-            let fault = format!("at step {step} positions have another origin than the rows before, or several");
+            let fault = format!("step {step}: expected the origin of the rows before, got another one or several");
             return Err(Error::file(&self.options.out, fault));
         }
-        let rows = arrays.iter().map(|(_, _, row)| *row);
-        self.open.iter_mut().zip(rows).try_for_each(|(file, row)| file.row(row))?;
-        let bytes = arrays.iter().map(|(_, _, row)| size_of_val(*row) as u64).sum();
-        self.summary.add((set.step.run, set.step.number), bytes, set.skipped, &set.stages);
+        self.open.iter_mut().zip(&rows).try_for_each(|(file, row)| file.row(row.numbers))?;
+        let bytes = rows.iter().map(|row| size_of_val(row.numbers) as u64).sum();
+        self.summary.add(&ReceivedStep { step: set.step, bytes, skipped: set.skipped, stages: &set.stages });
         Ok(())
     }
 

@@ -1,0 +1,41 @@
+//! Shared parts of the programs `modalcast-fetch` and `modalcast-sim`: the start and the exit codes.
+
+use std::fmt::Display;
+use std::process::ExitCode;
+
+use crate::error::Error;
+
+/// The exit code of a program that cannot use a local file or resource.
+const LOCAL_ERROR: u8 = 4;
+
+/// Runs the main task of a program on a new multi-threaded runtime and returns its exit code. An error is printed on
+/// standard error after `name`, and `exit_code` selects its exit code.
+pub fn run<E: Display>(
+    name: &str,
+    main: impl Future<Output = Result<u8, E>>,
+    exit_code: impl FnOnce(&E) -> u8,
+) -> ExitCode {
+    let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => runtime,
+        Err(fault) => {
+            eprintln!("{name}: no runtime: {fault}");
+            return ExitCode::from(LOCAL_ERROR);
+        }
+    };
+    let code = runtime.block_on(main).unwrap_or_else(|error| {
+        eprintln!("{name}: {error}");
+        exit_code(&error)
+    });
+    ExitCode::from(code)
+}
+
+/// The exit code of an error of the client, as the help texts document it: 1 refused by the server, 3 no connection, 4
+/// local file, 5 malformed, incomplete or late reply.
+pub const fn exit_code(error: &Error) -> u8 {
+    match error {
+        Error::Connect { .. } | Error::Status { code: tonic::Code::Unavailable, .. } => 3,
+        Error::Status { .. } | Error::Rejected(_) | Error::Step { .. } => 1,
+        Error::File { .. } => LOCAL_ERROR,
+        Error::Malformed { .. } | Error::StreamEnded { .. } | Error::Deadline { .. } => 5,
+    }
+}
