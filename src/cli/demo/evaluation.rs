@@ -40,12 +40,12 @@ impl Evaluation {
     /// Compares every received vertex of every step with the reference.
     ///
     /// # Errors
-    /// `Invalid` when the recorded arrays have different step or vertex counts.
+    /// `Invalid` when the recorded arrays have different step counts or do not have the scene's shapes.
     pub(super) fn of(scene: &Scene, ran: &DemoRun, wanted: u32) -> Result<Self> {
         let steps = ran.vertices.shape()[0];
-        if ran.q.shape()[0] != steps
-            || ran.transforms.shape()[0] != steps
-            || ran.vertices.shape()[1] != scene.layout.vertices
+        if ran.q.shape() != [steps, scene.layout.coordinates]
+            || ran.transforms.shape() != [steps, scene.domains.len(), 12]
+            || ran.vertices.shape() != [steps, scene.layout.vertices, 3]
         {
             let given = format!("{:?}, {:?}, {:?}", ran.q.shape(), ran.transforms.shape(), ran.vertices.shape());
             return Err(invalid("demo", "as many steps of q, transforms and vertices as frames", given));
@@ -57,10 +57,10 @@ impl Evaluation {
         for step in 0..steps {
             let state = state(scene, ran, step);
             let want = reference::deform(scene, &state);
-            let got = ran.vertices.index_axis(ndarray::Axis(0), step);
-            gap = joints.iter().fold(gap, |gap, joint| max_error(gap, joint.gap(&got, &state)));
-            for (vertex, got) in got.outer_iter().enumerate() {
-                let got = [got[0], got[1], got[2]].map(f64::from);
+            let (got, _) = ran.vertices.row(step).as_chunks::<3>();
+            gap = joints.iter().fold(gap, |gap, joint| max_error(gap, joint.gap(got, &state)));
+            for (vertex, got) in got.iter().enumerate() {
+                let got = got.map(f64::from);
                 error = max_error(error, distance(got, want[vertex]));
                 let moved = distance(got, rest[vertex]);
                 displacement = max_error(displacement, moved);
@@ -209,8 +209,8 @@ impl Joint {
     }
 
     /// Distance in scene units of the child's origin, as sent, from the center of the ring, as received.
-    fn gap(&self, got: &ndarray::ArrayView2<'_, f32>, state: &SceneState) -> f64 {
-        let ring = self.ring.iter().map(|vertex| [0, 1, 2].map(|axis| f64::from(got[[*vertex, axis]])));
+    fn gap(&self, got: &[[f32; 3]], state: &SceneState) -> f64 {
+        let ring = self.ring.iter().map(|vertex| got[*vertex].map(f64::from));
         distance(center(ring), self.origin(state))
     }
 }
@@ -224,11 +224,10 @@ fn center(points: impl ExactSizeIterator<Item = [f64; 3]>) -> [f64; 3] {
 /// The state that the physics process sent at one step.
 fn state(scene: &Scene, ran: &DemoRun, step: usize) -> SceneState {
     let mut state = SceneState::rest(scene);
-    state.q = ran.q.index_axis(ndarray::Axis(0), step).to_vec();
-    for (transform, sent) in
-        state.transforms.iter_mut().zip(ran.transforms.index_axis(ndarray::Axis(0), step).outer_iter())
-    {
-        *transform = Transform(std::array::from_fn(|entry| sent[entry]));
+    state.q = ran.q.row(step).to_vec();
+    let (sent, _) = ran.transforms.row(step).as_chunks::<12>();
+    for (transform, sent) in state.transforms.iter_mut().zip(sent) {
+        *transform = Transform(*sent);
     }
     state
 }
@@ -257,6 +256,7 @@ fn stages(frames: &Value) -> Vec<(String, f64)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::demo::step_records::StepRecords;
 
     #[test]
     fn a_distance_that_is_not_a_number_is_the_worst() {
@@ -270,15 +270,16 @@ mod tests {
         let (domains, vertices) = (scene.domains.len(), scene.layout.vertices);
         let state = SceneState::rest(scene);
         let rest = reference::deform(scene, &state);
+        let transforms = state.transforms.iter().flat_map(|transform| transform.0).collect();
+        let positions = rest.iter().flatten().map(|entry| *entry as f32).collect();
+        let two = |row: Vec<f32>| [row.clone(), row];
         DemoRun {
             frames: json!({}),
             sim: json!({}),
             server: json!({}),
-            q: ndarray::Array2::zeros((2, scene.layout.coordinates)),
-            transforms: ndarray::Array3::from_shape_fn((2, domains, 12), |(_, domain, at)| {
-                state.transforms[domain].0[at]
-            }),
-            vertices: ndarray::Array3::from_shape_fn((2, vertices, 3), |(_, vertex, axis)| rest[vertex][axis] as f32),
+            q: StepRecords::from_rows(&[scene.layout.coordinates], &two(vec![0.0; scene.layout.coordinates])),
+            transforms: StepRecords::from_rows(&[domains, 12], &two(transforms)),
+            vertices: StepRecords::from_rows(&[vertices, 3], &two(positions)),
             frames_on_disk: 2,
         }
     }
@@ -294,9 +295,9 @@ mod tests {
         let still = failed_checks(&|_| {});
         assert_eq!(still, "a sway of 3 % of the height; a displacement of 2 % of the diagonal");
         assert!(failed_checks(&|ran| ran.frames_on_disk = 1).contains("2 frames"));
-        assert!(failed_checks(&|ran| ran.vertices[[1, 77, 0]] += 0.01).contains("vertices within"));
-        assert!(failed_checks(&|ran| ran.vertices[[1, 77, 0]] = f32::NAN).contains("vertices within"));
+        assert!(failed_checks(&|ran| ran.vertices.row_mut(1)[3 * 77] += 0.01).contains("vertices within"));
+        assert!(failed_checks(&|ran| ran.vertices.row_mut(1)[3 * 77] = f32::NAN).contains("vertices within"));
         let child = scene.domains.iter().position(|domain| domain.attachment.is_some()).expect("a child");
-        assert!(failed_checks(&|ran| ran.transforms[[1, child, 3]] += 0.1).contains("joints within"));
+        assert!(failed_checks(&|ran| ran.transforms.row_mut(1)[12 * child + 3] += 0.1).contains("joints within"));
     }
 }

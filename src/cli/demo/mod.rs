@@ -4,6 +4,7 @@
 mod evaluation;
 mod input;
 mod processes;
+mod step_records;
 
 use std::fs;
 use std::path::PathBuf;
@@ -19,6 +20,7 @@ use input::DemoScene;
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::FrameSize;
 use processes::{Process, program_path};
+use step_records::StepRecords;
 
 /// Drives a scene with a physics process, receives its frames and vertices over the network, and checks them.
 #[derive(Debug, clap::Args)]
@@ -89,11 +91,11 @@ struct DemoRun {
     sim: serde_json::Value,
     server: serde_json::Value,
     /// Shape (steps, coordinates), as sent by the physics process.
-    q: ndarray::Array2<f32>,
+    q: StepRecords,
     /// Shape (steps, domains, 12), as sent by the physics process.
-    transforms: ndarray::Array3<f32>,
+    transforms: StepRecords,
     /// Shape (steps, vertices, 3), as received over the network.
-    vertices: ndarray::Array3<f32>,
+    vertices: StepRecords,
     frames_on_disk: usize,
 }
 
@@ -140,9 +142,9 @@ fn drive(args: &Args, input: &DemoScene, scratch: &std::path::Path) -> Result<De
         frames,
         sim,
         server: told,
-        q: read(&record.join("q.npy"))?,
-        transforms: read(&record.join("transforms.npy"))?,
-        vertices: read(&scratch.join("vertices.npy"))?,
+        q: StepRecords::read(&record.join("q.npy"))?,
+        transforms: StepRecords::read(&record.join("transforms.npy"))?,
+        vertices: StepRecords::read(&scratch.join("vertices.npy"))?,
         frames_on_disk: frame_files(&args.out)?.len(),
     })
 }
@@ -156,10 +158,6 @@ fn server_flags<'a>(args: &'a Args, input: &'a DemoScene, scratch: &'a std::path
         flags.extend(["--scenes".into(), repository.to_string_lossy().into_owned()]);
     }
     flags
-}
-
-fn read<D: ndarray::Dimension>(path: &std::path::Path) -> Result<ndarray::Array<f32, D>> {
-    ndarray_npy::read_npy(path).map_err(|error| fault_in("demo")(format!("{}: {error}", path.display())))
 }
 
 /// The frame files of a demo in a folder: `frame_00000.png` and so on. Other files are ignored.
