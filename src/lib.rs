@@ -36,10 +36,11 @@
 //! | `modalcast-compute::cpu` | the f32 deformer for machines without a GPU | `storage` |
 //! | `modalcast-compute::reference` | the f64 reference deformer, which the others are tested against | |
 //! | `modalcast-compute::storage` | tiled storage of U for CPU and GPU: storage types, a-priori bounds, mode truncation; pure functions | |
-//! | `modalcast-model::load` | scene loaders: OBJ, glTF, Vega, NumPy, safetensors, SOFA, plants, `scene.toml`; the repository | `tree`, `scene`, `domain`, `error` |
+//! | `modalcast-model::load` | scene loaders: OBJ, glTF, Vega, NumPy, safetensors, SOFA, plants, `scene.toml`; the repository | `tree`, `backend_settings`, `scene`, `domain`, `error` |
 //! | `modalcast-model::tree` | the built-in scene: a tree of beams, their modes, and the skin they deform | `scene`, `domain`, `error` |
 //! | `modalcast-model::deform` | the trait of deformers | `scene`, `error` |
 //! | `modalcast-model::raster` | the trait of compute rasterizers, which replace OpenGL in selected passes | `scene`, `error` |
+//! | `modalcast-model::backend_settings` | settings of deformers and rasterizers that a scene does not contain | `scene` |
 //! | `modalcast-model::scene` | the set of domains, its memory layout and feature set; steps; cameras | `domain`, `error` |
 //! | `modalcast-model::domain` | mesh, modes U, material, texture; validated once, immutable | `error` |
 //! | `modalcast-model::error` | the error type; its variants distinguish who can act on an error | |

@@ -6,8 +6,9 @@ use serde_json::{Value, json};
 use super::options::with_spinner;
 use super::{Outcome, print_line};
 use modalcast_compute::gpu;
+use modalcast_model::backend_settings::LookTable;
 use modalcast_model::error::fault_in;
-use modalcast_model::load;
+use modalcast_model::load::{self, OpenedScene};
 use modalcast_model::scene::Scene;
 
 /// Number of domains that the text table lists; `--json` lists all.
@@ -27,11 +28,11 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let scene = with_spinner("loading", || load::open(&args.scene))?;
+    let opened = with_spinner("loading", || load::open(&args.scene))?;
     if args.json {
-        print_line(serde_json::to_string_pretty(&json(&scene)).map_err(fault_in("inspect"))?);
+        print_line(serde_json::to_string_pretty(&json(&opened)).map_err(fault_in("inspect"))?);
     } else {
-        lines(&scene).into_iter().for_each(print_line);
+        lines(&opened.scene).into_iter().for_each(print_line);
     }
     Ok(true)
 }
@@ -50,7 +51,7 @@ fn bytes_of(scene: &Scene, domain: usize) -> usize {
         + shape.smoothing().map_or(0, |smoothing| smoothing.bytes() as usize)
 }
 
-fn json(scene: &Scene) -> Value {
+fn json(OpenedScene { scene, backends }: &OpenedScene) -> Value {
     let domain = |index: usize| {
         let (domain, slot) = (&scene.domains[index], scene.layout.slots[index]);
         json!({
@@ -74,8 +75,7 @@ fn json(scene: &Scene) -> Value {
         "origin": scene.origin,
         "totals": totals(scene),
         "needs": scene.needs,
-        "look": scene.look,
-        "deform": scene.deformation,
+        "look": LookTable { settings: scene.look, raster: backends.raster },
         "remarks": scene.remarks,
         "deform": gpu::plan(scene),
         "render": modalcast_render::plan(scene),

@@ -10,7 +10,7 @@ use crate::config::{BackendChoice, Config, RendererChoice};
 use crate::engine::{DeviceContext, FrameOutput, LoadedScene, validate_mode};
 use crate::frame;
 use modalcast_model::error::{Error, Result, fault_in, invalid};
-use modalcast_model::load;
+use modalcast_model::load::{self, OpenedScene};
 use modalcast_model::scene::{Camera, FrameSize, Lens, Scene, SceneState, View};
 
 /// Renders one frame of a scene to a PNG file.
@@ -56,14 +56,14 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let scene = with_spinner("loading", || load::open(&args.scene))?;
+    let OpenedScene { scene, backends } = with_spinner("loading", || load::open(&args.scene))?;
     let mut state = SceneState::rest(&scene);
     if let Some(path) = &args.q {
         state.q = coordinates(&scene, path)?;
     }
     let mut bench =
         DeviceContext::open(&Config { backend: args.backend, renderer: args.renderer, ..Config::default() })?;
-    let mut loaded_scene = bench.load_scene(&scene)?;
+    let mut loaded_scene = bench.load_scene(&scene, backends)?;
     loaded_scene.deform(&Arc::new(state))?;
     let bytes = match args.map {
         None => {

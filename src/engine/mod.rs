@@ -49,7 +49,7 @@ use self::storage::checkpoint_store::CheckpointStore;
 use self::storage::scene_catalog::SceneCatalog;
 use crate::config::Config;
 use modalcast_model::error::{Error, Result, invalid};
-use modalcast_model::scene::Scene;
+use modalcast_model::load::OpenedScene;
 
 /// Scenes that are read from disk concurrently.
 const MAX_CONCURRENT_LOADS: usize = 2;
@@ -302,7 +302,7 @@ impl Engine {
         provenance: &SceneProvenance,
         upload: Option<Upload>,
     ) -> Result<SceneHandle> {
-        let scene = self.load(name, provenance, upload).await?;
+        let OpenedScene { scene, backends } = self.load(name, provenance, upload).await?;
         let (engine, key, kept) = (self.clone(), name.to_owned(), Arc::clone(&scene));
         let state = run_blocking("kept step", move || Ok(engine.shared.services.checkpoints.load(&key, &kept))).await?;
         let state = state.unwrap_or_else(|error| {
@@ -313,6 +313,7 @@ impl Engine {
             name: name.into(),
             provenance: provenance.clone(),
             scene,
+            backends,
             id: self.shared.next_id.fetch_add(1, Ordering::Relaxed),
             state,
             frames_unavailable: self.shared.info.renderer.as_ref().err().cloned(),
@@ -331,7 +332,7 @@ impl Engine {
     }
 
     /// Reads a scene's files. A panic in a loader becomes a `Fault` of this call.
-    async fn load(&self, name: &str, provenance: &SceneProvenance, upload: Option<Upload>) -> Result<Arc<Scene>> {
+    async fn load(&self, name: &str, provenance: &SceneProvenance, upload: Option<Upload>) -> Result<OpenedScene> {
         let stopped = |_| stopping();
         let _permit = self.shared.loads.acquire().await.map_err(stopped)?;
         let source = Arc::clone(&self.shared.source);

@@ -1,11 +1,9 @@
 //! The source of scenes: resolves a name or path to a validated scene.
 
 use std::path::Path;
-use std::sync::Arc;
 
 use modalcast_model::error::Result;
-use modalcast_model::load::SceneRepository;
-use modalcast_model::scene::Scene;
+use modalcast_model::load::{OpenedScene, SceneRepository};
 
 /// Opens scenes for the engine. The engine calls it on threads that may block on the disk.
 pub trait SceneSource: Send + Sync + 'static {
@@ -13,24 +11,24 @@ pub trait SceneSource: Send + Sync + 'static {
     ///
     /// # Errors
     /// `NotFound` when there is no such scene, `Invalid` naming the problem in the path or the files.
-    fn open(&self, source: &str) -> Result<Arc<Scene>>;
+    fn open(&self, source: &str) -> Result<OpenedScene>;
 
     /// Opens `entry` of an uploaded folder, or the folder itself if `entry` is empty. Reads nothing outside the folder.
     ///
     /// # Errors
     /// As [`Self::open`].
-    fn open_within(&self, folder: &Path, entry: &str) -> Result<Arc<Scene>>;
+    fn open_within(&self, folder: &Path, entry: &str) -> Result<OpenedScene>;
 
     /// The sources that [`Self::open`] accepts.
     fn list(&self) -> Vec<String>;
 }
 
 impl SceneSource for SceneRepository {
-    fn open(&self, source: &str) -> Result<Arc<Scene>> {
+    fn open(&self, source: &str) -> Result<OpenedScene> {
         Self::open(self, source)
     }
 
-    fn open_within(&self, folder: &Path, entry: &str) -> Result<Arc<Scene>> {
+    fn open_within(&self, folder: &Path, entry: &str) -> Result<OpenedScene> {
         // With the leading "./" a file name is never resolved as a built-in name.
         Self::new(Some(folder))?.open(&format!("./{entry}"))
     }

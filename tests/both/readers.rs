@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::engine::DeviceContext;
+use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{Deformer, VertexAttributes};
 use modalcast_model::domain::{Domain, Transform};
 use modalcast_model::scene::{Bounds, DeformationSettings, Scene, SceneState, StorageType};
@@ -219,7 +220,7 @@ pub(crate) fn lost_displacements_are_refused_by_name(backend: BackendChoice) {
     let config = Config { backend, renderer: RendererChoice::Off, ..Config::default() };
     let mut bench = DeviceContext::open(&config).expect("a workbench");
     let scene = scene(kept(DeformationSettings::default()), false);
-    let (mut staged, mut random) = (bench.load_scene(&scene).expect("stages"), Random(107));
+    let (mut staged, mut random) = (bench.load_scene(&scene, BackendSettings::default()).expect("stages"), Random(107));
     let mut good = SceneState::rest(&scene);
     changes::apply(&scene, &mut good, &mut random, (&[1, 4], &[4]));
     staged.deform(&good).expect("a good step");

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::engine::DeviceContext;
+use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::Transform;
 use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType};
@@ -55,7 +56,7 @@ pub(crate) fn overflow_is_refused_by_name(backend: BackendChoice) {
     let config = Config { backend, renderer: RendererChoice::Off, ..Config::default() };
     let mut bench = DeviceContext::open(&config).expect("a workbench");
     let scene = scene(StorageType::F32);
-    let (mut staged, mut random) = (bench.load_scene(&scene).expect("stages"), Random(74));
+    let (mut staged, mut random) = (bench.load_scene(&scene, BackendSettings::default()).expect("stages"), Random(74));
     let mut good = SceneState::rest(&scene);
     changes::apply(&scene, &mut good, &mut random, (&[0, 5], &[5]));
     staged.deform(&good).expect("a good step");
@@ -75,7 +76,7 @@ pub(crate) fn overflow_is_refused_by_name(backend: BackendChoice) {
     staged.deform(&good).expect("a good step");
     let after = staged.surface().expect("vertices").clone();
     assert_ne!(after, before, "the judge can fail");
-    let mut fresh = bench.load_scene(&scene).expect("stages");
+    let mut fresh = bench.load_scene(&scene, BackendSettings::default()).expect("stages");
     fresh.deform(&good).expect("a good step");
     assert_eq!(fresh.surface().expect("vertices"), &after);
     bench.unload_scene(staged);

@@ -7,10 +7,11 @@ use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::DeviceContext;
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{CudaRasterizer, Device};
+use modalcast_model::backend_settings::{BackendSettings, RasterPolicy};
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{
-    Antialiasing, Camera, FrameSize, RasterPolicy, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings,
+    Antialiasing, Camera, FrameSize, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings,
 };
 use modalcast_render::{
     DevicePreference, FrameImage, FrameParams, MappedPixels, RasterBackend, RasterBackends, Renderer, VisibilityId,
@@ -32,17 +33,17 @@ fn open() -> DeviceContext {
     DeviceContext::open(&Config { backend: BackendChoice::Cuda, ..Config::default() }).expect("a CUDA device")
 }
 
-/// The same scene with one sample per pixel and this rasterizer.
-fn drawn_by(scene: &Scene, raster: RasterPolicy) -> Arc<Scene> {
-    let look = RenderSettings { raster, antialias: Antialiasing::Fxaa, ..scene.look };
+/// The same scene with one sample per pixel, which the CUDA rasterizer requires.
+fn with_one_sample(scene: &Scene) -> Arc<Scene> {
+    let look = RenderSettings { antialias: Antialiasing::Fxaa, ..scene.look };
     Scene::new(SceneParts { look, ..scene.parts() }).expect("a good scene")
 }
 
 /// Frames of some states, each drawn before the next is deformed.
 fn frames(scene: &Scene, raster: RasterPolicy, states: &[SceneState]) -> Vec<FrameImage> {
-    let (mut bench, scene) = (open(), drawn_by(scene, raster));
+    let (mut bench, scene) = (open(), with_one_sample(scene));
     let camera = Camera::fit_to_scene(&scene, SIZE[0], SIZE[1]);
-    let mut staged = bench.load_scene(&scene).expect("staged");
+    let mut staged = bench.load_scene(&scene, BackendSettings { raster }).expect("staged");
     let draw = |state: &SceneState| {
         staged.deform(state).expect("deforms");
         bench.draw(&mut staged, &camera, FrameSize::new(SIZE[0], SIZE[1])).expect("draws")
@@ -92,7 +93,7 @@ fn still(scene: &Arc<Scene>, state: &SceneState, by_cuda: bool) -> Still {
 /// A soup of intersecting triangles, moved and mirrored, and a tree with cut-out leaves.
 fn scenes_and_states() -> [(&'static str, Arc<Scene>, SceneState); 2] {
     let soup = scenes::scene(&[(3000, 12), (50, 0), (700, 3)], 5, true, false);
-    let tree = modalcast_model::load::open("tree").expect("built in");
+    let tree = modalcast_model::load::open("tree").expect("built in").scene;
     let (moved, rest) = (scenes::state(&soup, 1), SceneState::rest(&tree));
     [("soup", soup, moved), ("tree", tree, rest)]
 }
@@ -161,9 +162,9 @@ fn gpu_cuda_frames_in_flight_keep_their_step() {
     let scene = scenes::scene(&[(3000, 12), (700, 3)], 5, false, false);
     let states: Vec<SceneState> = (0..6).map(|seed| scenes::state(&scene, seed)).collect();
     let want = frames(&scene, RasterPolicy::Cuda, &states);
-    let (mut bench, drawn) = (open(), drawn_by(&scene, RasterPolicy::Cuda));
+    let (mut bench, drawn) = (open(), with_one_sample(&scene));
     let camera = Camera::fit_to_scene(&drawn, SIZE[0], SIZE[1]);
-    let mut staged = bench.load_scene(&drawn).expect("staged");
+    let mut staged = bench.load_scene(&drawn, BackendSettings { raster: RasterPolicy::Cuda }).expect("staged");
     let mut images = Vec::new();
     let mut under_way = std::collections::VecDeque::new();
     for state in &states {
@@ -196,7 +197,7 @@ fn gpu_ground_hides_geometry_below_on_both_paths() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
-    let scene = drawn_by(&scenes::scene(&[(3000, 12), (700, 3)], 3, false, false), RasterPolicy::Cuda);
+    let scene = with_one_sample(&scenes::scene(&[(3000, 12), (700, 3)], 3, false, false));
     let draw = |bench: &mut DeviceContext, staged: &mut modalcast::engine::LoadedScene, [width, height]: [u32; 2]| {
         let image = bench
             .draw(staged, &Camera::fit_to_scene(&scene, width, height), FrameSize::new(width, height))
@@ -205,11 +206,11 @@ fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
         image.rgba
     };
     let mut bench = open();
-    let mut staged = bench.load_scene(&scene).expect("staged");
+    let mut staged = bench.load_scene(&scene, BackendSettings { raster: RasterPolicy::Cuda }).expect("staged");
     for size in [[64, 48], [1920, 1080], [1, 1], [333, 77], [64, 48]] {
         let got = draw(&mut bench, &mut staged, size);
         let mut fresh = open();
-        let mut alone = fresh.load_scene(&scene).expect("staged");
+        let mut alone = fresh.load_scene(&scene, BackendSettings { raster: RasterPolicy::Cuda }).expect("staged");
         assert!(got == draw(&mut fresh, &mut alone, size), "{size:?}");
         fresh.unload_scene(alone);
     }
@@ -220,9 +221,9 @@ fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_fastest_path_draws_frames_of_every_size() {
-    let scene = drawn_by(&scenes::scene(&[(3000, 12), (700, 3)], 3, false, false), RasterPolicy::Fastest);
+    let scene = with_one_sample(&scenes::scene(&[(3000, 12), (700, 3)], 3, false, false));
     let mut bench = open();
-    let mut staged = bench.load_scene(&scene).expect("staged");
+    let mut staged = bench.load_scene(&scene, BackendSettings { raster: RasterPolicy::Fastest }).expect("staged");
     for [width, height] in [[64, 48], [1920, 1080], [1, 1], [333, 77]] {
         let camera = Camera::fit_to_scene(&scene, width, height);
         let image = bench.draw(&mut staged, &camera, FrameSize::new(width, height)).expect("draws");

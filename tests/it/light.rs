@@ -25,7 +25,7 @@ fn texel(scene: &Scene, deformed: &DeformSummary, is_lit: bool) -> [f64; 2] {
 /// bounds, and less than 1.2 times the area of texels fitted to the exact vertices.
 #[test]
 fn fitted_shadow_texels_of_the_tree_have_half_the_area() {
-    let scene = load::open("tree").expect("built in");
+    let scene = load::open("tree").expect("built in").scene;
     let state = SceneState::rest(&scene);
     let exact = ReferenceDeformer::new(&scene).deform(&state).expect("deforms");
     let tiled = CpuDeformer::new(&scene).deform(&state).expect("deforms");

@@ -73,14 +73,14 @@ fn agrees(scene: &Arc<Scene>) {
 
 #[test]
 fn tree_agrees_with_its_reference() {
-    agrees(&load::open("tree").expect("the tree"));
+    agrees(&load::open("tree").expect("the tree").scene);
 }
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 fn real_modal_inputs_agree_with_their_reference() {
     for path in MODAL {
-        let scene = load::open(&data(path)).unwrap_or_else(|error| panic!("{path}: {error}"));
+        let scene = load::open(&data(path)).unwrap_or_else(|error| panic!("{path}: {error}")).scene;
         assert!(scene.needs.modes, "{path} has modes");
         agrees(&scene);
     }
@@ -94,7 +94,7 @@ async fn streamed_agrees(backend: BackendChoice) {
     let server = Server::start_from(Config { backend, ..config(state.path()) }, repository).await;
     for source in MODAL.iter().chain(&["tree"]) {
         let path = if *source == "tree" { (*source).to_owned() } else { data(source) };
-        let scene = load::open(&path).unwrap_or_else(|error| panic!("{path}: {error}"));
+        let scene = load::open(&path).unwrap_or_else(|error| panic!("{path}: {error}")).scene;
         let name = server.open(source).await.scene;
         let bent = bent(&scene, 0.0501);
         let q: Vec<u8> = bent.q.iter().flat_map(|number| number.to_le_bytes()).collect();

@@ -2,7 +2,7 @@
 
 use modalcast::engine::SceneSource;
 use modalcast_model::error::Result;
-use modalcast_model::scene::Scene;
+use modalcast_model::load::OpenedScene;
 use modalcast_proto::v1;
 use prost::Message as _;
 use tokio_stream::StreamExt as _;
@@ -18,16 +18,16 @@ struct FailsOnce {
 }
 
 impl SceneSource for FailsOnce {
-    fn open(&self, source: &str) -> Result<std::sync::Arc<Scene>> {
+    fn open(&self, source: &str) -> Result<OpenedScene> {
         if self.opened.fetch_add(1, std::sync::atomic::Ordering::SeqCst) == 0 {
             self.fail.lock().expect("unpoisoned").recv().expect("a word");
             return Err(modalcast_model::error::invalid("source", "a second try", source));
         }
         std::thread::sleep(std::time::Duration::from_millis(100));
-        Ok(strips())
+        Ok(strips().into())
     }
 
-    fn open_within(&self, _: &std::path::Path, entry: &str) -> Result<std::sync::Arc<Scene>> {
+    fn open_within(&self, _: &std::path::Path, entry: &str) -> Result<OpenedScene> {
         self.open(entry)
     }
 

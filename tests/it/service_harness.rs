@@ -12,6 +12,7 @@ use modalcast_model::domain::{
     Attachment, Domain, FollowConstraint, Material, Mesh, Metadata, Modes, Shape, Transform,
 };
 use modalcast_model::error::{Error, Result, invalid};
+use modalcast_model::load::OpenedScene;
 use modalcast_model::scene::{
     DeformationSettings, RawStepUpdate, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings, StepUpdate,
     TransformFormat,
@@ -40,19 +41,20 @@ pub(crate) const TIMEOUT: Duration = Duration::from_secs(60);
 pub(crate) struct SyntheticScenes;
 
 impl SceneSource for SyntheticScenes {
-    fn open(&self, source: &str) -> Result<Arc<Scene>> {
-        match source {
-            "strips" => Ok(strips()),
-            "far" => Ok(far_strips()),
-            "twig" => Ok(twig()),
-            "kept" => Ok(strips_with_attributes()),
-            "sheet" => Ok(sheet()),
+    fn open(&self, source: &str) -> Result<OpenedScene> {
+        let scene = match source {
+            "strips" => strips(),
+            "far" => far_strips(),
+            "twig" => twig(),
+            "kept" => strips_with_attributes(),
+            "sheet" => sheet(),
             "panic" => panic!("a planted panic of a loader"),
-            _ => Err(Error::NotFound { what: "scene", given: source.into() }),
-        }
+            _ => return Err(Error::NotFound { what: "scene", given: source.into() }),
+        };
+        Ok(scene.into())
     }
 
-    fn open_within(&self, folder: &Path, entry: &str) -> Result<Arc<Scene>> {
+    fn open_within(&self, folder: &Path, entry: &str) -> Result<OpenedScene> {
         let path = folder.join(if entry.is_empty() { "scene.txt" } else { entry });
         let text = std::fs::read_to_string(path).map_err(|error| invalid("entry", "a file", error))?;
         self.open(text.trim())

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::engine::{Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, StepOutput};
+use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::scene::{Camera, FrameSize, Lens};
 use modalcast_proto::v1;
 use v1::Policy;
@@ -36,7 +37,7 @@ fn expected(cameras: &[Camera]) -> Vec<(u64, Vec<Vec<u8>>)> {
     let (scene, steps) = (strips_with_attributes(), steps());
     let config = Config { backend: BackendChoice::Cpu, ..Config::default() };
     let mut bench = DeviceContext::open(&config).expect("opens");
-    let mut staged = bench.load_scene(&scene).expect("stages");
+    let mut staged = bench.load_scene(&scene, BackendSettings::default()).expect("stages");
     let mut pictures = Vec::new();
     for step in steps.iter().filter(|step| step.number != BAD) {
         staged.deform(&state_after(&scene, std::slice::from_ref(step))).expect("deforms");

@@ -286,7 +286,7 @@ mod tests {
 
     #[test]
     fn every_broken_promise_is_named_and_kept_ones_are_not() {
-        let scene = modalcast_model::load::open("tree").expect("the tree");
+        let scene = modalcast_model::load::open("tree").expect("the tree").scene;
         let failed_checks = |spoil: &dyn Fn(&mut DemoRun)| {
             let mut ran = at_rest(&scene);
             spoil(&mut ran);

@@ -25,7 +25,7 @@ impl DemoScene {
     /// # Errors
     /// Those of loading the scene.
     pub(super) fn find(source: &str) -> Result<Self> {
-        let scene = with_spinner("loading", || load::open(source))?;
+        let scene = with_spinner("loading", || load::open(source))?.scene;
         let path = Path::new(source);
         let Some(path) = path.canonicalize().ok().filter(|_| path.exists()) else {
             return Ok(Self { scene, source: source.into(), repository: None, cubic: None, vega_config: None });

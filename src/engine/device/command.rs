@@ -6,6 +6,7 @@ use tokio::sync::oneshot;
 
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
+use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, VertexAttributes};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
@@ -25,6 +26,7 @@ pub(in crate::engine) enum Command {
     LoadScene {
         id: SceneId,
         scene: Arc<Scene>,
+        backends: BackendSettings,
         reply: Reply<()>,
     },
     Deform {

@@ -11,10 +11,11 @@ use crate::telemetry::{Stage, ms_since};
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{self, CudaDeformer, CudaRasterizer, GlVertexBuffers};
 use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::backend_settings::{BackendSettings, RasterPolicy};
 use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{Camera, FrameSize, PixelRect, RasterPolicy, Scene};
+use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene};
 use modalcast_render::{
     Aov, AovImage, DevicePreference, FrameImage, MappedPixels, PendingFrame, PendingPick, PickHit, Renderer,
     SceneBuffers,
@@ -93,7 +94,7 @@ impl DeviceContext {
     ///
     /// # Errors
     /// `Fault` of the device; `Invalid` when the rest state overflows.
-    pub fn load_scene(&mut self, scene: &Arc<Scene>) -> Result<LoadedScene> {
+    pub fn load_scene(&mut self, scene: &Arc<Scene>, backends: BackendSettings) -> Result<LoadedScene> {
         let mut buffers = None;
         let deformer: Box<dyn Deformer> = match (self.device.clone(), self.info.backend) {
             (Some(device), Backend::Cuda) => {
@@ -111,7 +112,7 @@ impl DeviceContext {
             _ => Box::new(CpuDeformer::new(scene)),
         };
         let mut loaded_scene = LoadedScene::new(scene, deformer, buffers);
-        let ready = loaded_scene.rest().and_then(|()| self.attach_rasterizer(&mut loaded_scene));
+        let ready = loaded_scene.rest().and_then(|()| self.attach_rasterizer(&mut loaded_scene, backends.raster));
         match ready {
             Ok(()) => Ok(loaded_scene),
             Err(error) => {
@@ -121,18 +122,15 @@ impl DeviceContext {
         }
     }
 
-    /// Creates the compute (CUDA) rasterizer of a scene if its look requests one, and, for [`RasterPolicy::Fastest`],
+    /// Creates the compute (CUDA) rasterizer of a scene unless `policy` is OpenGL, and, for [`RasterPolicy::Fastest`],
     /// measures both rasterizers and selects the faster one per pass. If the compute rasterizer cannot be created,
     /// OpenGL draws and the reason is logged.
     ///
     /// # Errors
     /// The errors of drawing the measured frames.
-    fn attach_rasterizer(&mut self, loaded_scene: &mut LoadedScene) -> Result<()> {
-        let scene = Arc::clone(loaded_scene.scene());
-        let (wanted, Some(device), Ok(renderer)) = (scene.look.raster, &self.device, &mut self.renderer) else {
-            return Ok(());
-        };
-        if wanted == RasterPolicy::OpenGl || renderer.info().cuda_device.is_none() {
+    fn attach_rasterizer(&mut self, loaded_scene: &mut LoadedScene, policy: RasterPolicy) -> Result<()> {
+        let (Some(device), Ok(renderer)) = (&self.device, &mut self.renderer) else { return Ok(()) };
+        if policy == RasterPolicy::OpenGl || renderer.info().cuda_device.is_none() {
             return Ok(());
         }
         let make = |mesh: RasterGeometry| Ok(Box::new(CudaRasterizer::new(device, mesh)?) as Box<dyn Rasterizer>);
@@ -140,7 +138,7 @@ impl DeviceContext {
             tracing::warn!(%error, "OpenGL draws: its buffers have no rasteriser in CUDA");
             return Ok(());
         }
-        if wanted == RasterPolicy::Fastest { loaded_scene.select_raster_backends(renderer) } else { Ok(()) }
+        if policy == RasterPolicy::Fastest { loaded_scene.select_raster_backends(renderer) } else { Ok(()) }
     }
 
     /// Frees a loaded scene.

@@ -116,9 +116,9 @@ impl DeviceLoop {
         let Self { device_context, scenes, .. } = self;
         // A failed send below means that the caller no longer waits; its reply is dropped.
         match command {
-            Command::LoadScene { id, scene, reply } => {
+            Command::LoadScene { id, scene, backends, reply } => {
                 let loaded_scene =
-                    device_context.load_scene(&scene).map(|loaded_scene| scenes.insert(id, loaded_scene));
+                    device_context.load_scene(&scene, backends).map(|loaded_scene| scenes.insert(id, loaded_scene));
                 // The caller has gone, so no `UnloadScene` would ever follow.
                 if reply.send(loaded_scene.map(|_| ())).is_err()
                     && let Some(loaded_scene) = scenes.remove(&id)

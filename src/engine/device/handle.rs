@@ -13,6 +13,7 @@ use super::device_loop::{DeviceLoop, run_device_loop};
 use crate::config::Config;
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
+use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
 use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
@@ -62,9 +63,14 @@ impl DeviceHandle {
         (Self { commands, limit: 16 }, inbox)
     }
 
-    pub(in crate::engine) async fn load_scene(&self, id: SceneId, scene: &Arc<Scene>) -> Result<()> {
+    pub(in crate::engine) async fn load_scene(
+        &self,
+        id: SceneId,
+        scene: &Arc<Scene>,
+        backends: BackendSettings,
+    ) -> Result<()> {
         let scene = Arc::clone(scene);
-        self.call(|reply| Command::LoadScene { id, scene, reply }).await
+        self.call(|reply| Command::LoadScene { id, scene, backends, reply }).await
     }
 
     /// Starts deforming a scene to a state.

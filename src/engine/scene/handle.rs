@@ -14,6 +14,7 @@ use crate::engine::device::command::SceneId;
 use crate::engine::output::step_output::{OutputSpec, StepId, StepOutput};
 use crate::engine::storage::scene_catalog::SceneProvenance;
 use crate::telemetry::ms_since;
+use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::{RawStepUpdate, Scene, SceneState, StepUpdate};
 
@@ -40,6 +41,7 @@ pub(in crate::engine) struct OpenParams {
     pub name: String,
     pub provenance: SceneProvenance,
     pub scene: Arc<Scene>,
+    pub backends: BackendSettings,
     pub id: SceneId,
     /// The state restored from a checkpoint, if there is one.
     pub state: Option<SceneState>,
@@ -53,8 +55,8 @@ impl SceneHandle {
     /// # Errors
     /// `Fault` of the device, `Invalid` when the rest state overflows, `Busy` when the command queue is full.
     pub(in crate::engine) async fn open(params: OpenParams, services: SceneServices) -> Result<Self> {
-        let OpenParams { name, provenance, scene, id, state, frames_unavailable } = params;
-        services.device_handle.load_scene(id, &scene).await?;
+        let OpenParams { name, provenance, scene, backends, id, state, frames_unavailable } = params;
+        services.device_handle.load_scene(id, &scene, backends).await?;
         let state = match state.map(Arc::new) {
             Some(state) => match services.device_handle.deform(id, &state).wait().await {
                 Ok(_) => state,

@@ -12,14 +12,14 @@ fn data(path: &str) -> String {
 }
 
 fn open(path: &str) -> Arc<Scene> {
-    super::open(&data(path)).unwrap_or_else(|error| panic!("{path}: {error}"))
+    super::open(&data(path)).unwrap_or_else(|error| panic!("{path}: {error}")).scene
 }
 
 /// Opens a folder that contains this scene.toml.
 fn manifest(text: &str) -> crate::error::Result<Arc<Scene>> {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::write(folder.path().join("scene.toml"), text).expect("written");
-    super::open(folder.path().to_str().expect("UTF-8"))
+    super::open(folder.path().to_str().expect("UTF-8")).map(|opened| opened.scene)
 }
 
 fn fixed_rows(scene: &Scene) -> usize {
@@ -158,7 +158,7 @@ fn real_inputs_are_listed_and_those_outside_the_repository_are_not_reached() {
         assert!(names.iter().any(|listed| listed == name), "{name} is not among {names:?}");
     }
     assert!(!names.iter().any(|name| name == "sofa/ball" || name == "vega/volumetric/beam3"));
-    assert_eq!(repository.open("vega/A").expect("opens").rank_of(0), 20);
+    assert_eq!(repository.open("vega/A").expect("opens").scene.rank_of(0), 20);
     let refusal = super::open(&data("vega/volumetric/beam3")).expect_err("two models").to_string();
     assert!(refusal.ends_with("given 2: beam3.obj, beam3_tet.obj"), "{refusal}");
 }

@@ -31,14 +31,52 @@ pub use repository::SceneRepository;
 use std::path::Path;
 use std::sync::Arc;
 
+use crate::backend_settings::BackendSettings;
 use crate::error::Result;
-use crate::scene::Scene;
+use crate::scene::{Scene, SceneParts};
+
+/// A scene that was opened by name or path.
+#[derive(Debug, Clone)]
+pub struct OpenedScene {
+    pub scene: Arc<Scene>,
+    /// Read from `scene.toml`; the defaults for scenes without one.
+    pub backends: BackendSettings,
+}
+
+impl OpenedScene {
+    /// # Errors
+    /// Those of [`Scene::new`].
+    fn new(SceneDescription { parts, backends }: SceneDescription) -> Result<Self> {
+        Ok(Self { scene: Scene::new(parts)?, backends })
+    }
+}
+
+impl From<Arc<Scene>> for OpenedScene {
+    /// A scene with the default settings of the backends.
+    fn from(scene: Arc<Scene>) -> Self {
+        Self { scene, backends: BackendSettings::default() }
+    }
+}
+
+/// The content of a scene's files, not yet validated.
+#[derive(Debug)]
+struct SceneDescription {
+    parts: SceneParts,
+    backends: BackendSettings,
+}
+
+impl From<SceneParts> for SceneDescription {
+    /// A scene with the default settings of the backends.
+    fn from(parts: SceneParts) -> Self {
+        Self { parts, backends: BackendSettings::default() }
+    }
+}
 
 /// Opens `SCENE` of the command line: a built-in name, a folder with `scene.toml`, a `.glb`, `.gltf` or `.obj` file, or
 /// a folder with exactly one recognized model. Paths are not confined to a root.
 ///
 /// # Errors
 /// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
-pub fn open(source: &str) -> Result<Arc<Scene>> {
-    Scene::new(source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?)
+pub fn open(source: &str) -> Result<OpenedScene> {
+    OpenedScene::new(source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?)
 }

@@ -1,12 +1,10 @@
 //! The server's folder of scenes: opens scenes by name and lists their names.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use super::asset_dir::{AssetDir, EntryKind};
-use super::{manifest, source};
+use super::{OpenedScene, manifest, source};
 use crate::error::{Error, Result};
-use crate::scene::Scene;
 
 /// Depth of folders, below the root, up to which scenes are listed. Deeper scenes can still be opened by their path.
 const MAX_LIST_DEPTH: usize = 4;
@@ -42,9 +40,9 @@ impl SceneRepository {
     ///
     /// # Errors
     /// As for [`super::open`], and `Invalid` for a path that leaves the repository.
-    pub fn open(&self, source: &str) -> Result<Arc<Scene>> {
+    pub fn open(&self, source: &str) -> Result<OpenedScene> {
         match &self.root {
-            Some(root) => Scene::new(source::read(&AssetDir::confined_to(root), source)?),
+            Some(root) => OpenedScene::new(source::read(&AssetDir::confined_to(root), source)?),
             None if source::BUILT_IN.contains(&source) => super::open(source),
             None => Err(Error::NotFound { what: "scene", given: source.into() }),
         }
@@ -120,9 +118,9 @@ mod tests {
         assert_eq!(names, ["tree", "deep/er/scene", "one", "one/a.obj", "two/b.obj", "two/c.obj"]);
         for name in &names[1..] {
             let scene = repository.open(name).unwrap_or_else(|error| panic!("{name}: {error}"));
-            assert_eq!(scene.domains.len(), 1);
+            assert_eq!(scene.scene.domains.len(), 1);
         }
-        assert_eq!(repository.open("deep/er/scene").expect("there").name, "scene");
+        assert_eq!(repository.open("deep/er/scene").expect("there").scene.name, "scene");
         assert!(repository.open("a/b/c/d/e/f/far.obj").is_ok(), "too deep for the list, not for its path");
     }
 

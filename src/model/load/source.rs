@@ -2,7 +2,7 @@
 
 use super::asset_dir::{AssetDir, EntryKind, file_name_of, parent_of};
 use super::obj::ModesSource;
-use super::{gltf, manifest, obj, plant};
+use super::{SceneDescription, gltf, manifest, obj, plant};
 use crate::error::{Error, Result, invalid};
 use crate::scene::SceneParts;
 
@@ -18,13 +18,13 @@ pub(super) enum ModelFile {
     Plant(String),
 }
 
-/// The parts of any scene.
+/// A scene of any kind. Only `scene.toml` contains settings of the backends; those of other scenes are the defaults.
 ///
 /// # Errors
 /// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
-pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneParts> {
+pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneDescription> {
     if BUILT_IN.contains(&source) {
-        return crate::tree::generate(&crate::tree::TreeParameters::default());
+        return crate::tree::generate(&crate::tree::TreeParameters::default()).map(SceneDescription::from);
     }
     match files.kind(source)? {
         None => Err(Error::NotFound { what: "scene", given: source.into() }),
@@ -36,10 +36,10 @@ pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneParts> {
             let folder = files.within(source)?;
             match folder.kind(manifest::MANIFEST_FILE)? {
                 Some(EntryKind::File) => manifest::read(&folder, manifest::MANIFEST_FILE, &files.resolved_name(source)),
-                _ => model(files, source, ModesSource::Sidecar),
+                _ => model(files, source, ModesSource::Sidecar).map(SceneDescription::from),
             }
         }
-        Some(EntryKind::File) => model(files, source, ModesSource::Sidecar),
+        Some(EntryKind::File) => model(files, source, ModesSource::Sidecar).map(SceneDescription::from),
     }
 }
 

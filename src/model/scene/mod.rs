@@ -30,7 +30,7 @@ pub use light_space::{LightSpaceBox, light_axes};
 pub use pixel_rect::PixelRect;
 pub use post_processing::{Antialiasing, Bloom, ToneMapping};
 pub use raster_input::{CullMode, DrawRange, MAX_VIEWPORT_SIDE, Viewport};
-pub use render_settings::{Culling, Ground, MAX_FRAGMENTS, RasterPolicy, RenderSettings, Transparency, UpAxis};
+pub use render_settings::{Culling, Ground, MAX_FRAGMENTS, RenderSettings, Transparency, UpAxis};
 pub use shadow::{BlurMethod, MomentFormat, ShadowFit, ShadowMethod, ShadowSettings};
 pub use state::{DirtyDomains, SceneState};
 pub use step_update::{RawStepUpdate, StepUpdate};

@@ -88,25 +88,8 @@ pub enum Culling {
     Occlusion,
 }
 
-/// Which rasterizer draws the shadow map's depth pass and the camera's pass.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum RasterPolicy {
-    /// OpenGL's rasterizer, the reference.
-    #[default]
-    OpenGl,
-    /// The compute rasterizer in CUDA, where it is supported: on a CUDA device that also draws, for variance shadow
-    /// maps without splits, and for frames with one sample per pixel and no blended triangles. OpenGL draws everything
-    /// else, and each frame reports which rasterizer drew it. The visible triangle of a sample may differ only where
-    /// depths tie, within 1/256 pixel of an edge, and at the border of textured cut-outs.
-    Cuda,
-    /// For each pass the faster of both, measured when the scene is loaded.
-    Fastest,
-}
-
 /// Light, shadow, ground, sky and rasterization settings. Colors are linear.
-#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct RenderSettings {
     /// Direction towards the sun in Y-up coordinates; rotated to the scene's up axis.
     pub sun: [f32; 3],
@@ -141,8 +124,6 @@ pub struct RenderSettings {
     pub fragments: Option<u32>,
     /// Which triangles are culled.
     pub culling: Culling,
-    /// Which rasterizer draws.
-    pub raster: RasterPolicy,
 }
 
 impl Default for RenderSettings {
@@ -166,7 +147,6 @@ impl Default for RenderSettings {
             opaque_alpha: 0.95,
             fragments: None,
             culling: Culling::default(),
-            raster: RasterPolicy::default(),
         }
     }
 }

@@ -320,7 +320,7 @@ mod tests {
 
     /// A yardstick for which one pixel is a hundredth of a unit at the target.
     fn yardstick() -> ErrorScale {
-        let scene = modalcast_model::load::open("tree").expect("the tree");
+        let scene = modalcast_model::load::open("tree").expect("the tree").scene;
         let view = View::LookAt { eye: [0.0, 0.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
         let (width, height) = (f64::from(IMAGE_SIZE.0), f64::from(IMAGE_SIZE.1));
         let lens = Lens::Intrinsics { fx: 1000.0, fy: 1000.0, cx: width / 2.0, cy: height / 2.0 };

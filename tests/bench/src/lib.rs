@@ -273,7 +273,7 @@ fn open(source: &WorkloadSource, size: Size) -> Result<(Workload, WorkloadMotion
             Ok((load, motion))
         }
         WorkloadSource::Scene { source, record } => {
-            let scene = load::open(source)?;
+            let scene = load::open(source)?.scene;
             let record = match record {
                 Some(path) => Some(RecordedTrajectory::read(path, &scene)?),
                 None => RecordedTrajectory::beside(source, &scene)?,

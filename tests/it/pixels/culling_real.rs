@@ -46,7 +46,7 @@ fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'stati
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 fn real_almond_with_culling_is_the_same_picture() {
     let root = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
-    let scene = modalcast_model::load::open(&root.join("plants/almond").to_string_lossy()).expect("the almond");
+    let scene = modalcast_model::load::open(&root.join("plants/almond").to_string_lossy()).expect("the almond").scene;
     let mut renderer = open();
     for transparency in [Transparency::OrderIndependent, Transparency::TwoPass] {
         let look = RenderSettings {

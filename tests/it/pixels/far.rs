@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::DeviceContext;
+use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::domain::Material;
 use modalcast_model::scene::{
     Camera, FrameSize, Lens, ORIGIN_GRID, RawStepUpdate, RenderSettings, Scene, SceneState, ShadowMethod,
@@ -45,7 +46,7 @@ fn camera(at: [f64; 3]) -> Camera {
 }
 
 fn picture(bench: &mut DeviceContext, scene: &Arc<Scene>, state: &SceneState, camera: &Camera) -> FrameImage {
-    let mut staged = bench.load_scene(scene).expect("stages");
+    let mut staged = bench.load_scene(scene, BackendSettings::default()).expect("stages");
     staged.deform(state).expect("deforms");
     let image = bench.draw(&mut staged, camera, FrameSize::new(96, 96)).expect("draws");
     bench.unload_scene(staged);
@@ -114,7 +115,7 @@ fn distant_domains_are_seen_by_nearby_cameras() {
     let (gray, red, both) = (at_rest(&gray), at_rest(&red), at_rest(&scene));
     let apart = moved(&scene, &[1], AWAY);
     assert!(apart.origins.as_ref().is_some_and(|origins| !origins.is_uniform()));
-    let mut staged = bench.load_scene(&scene).expect("stages");
+    let mut staged = bench.load_scene(&scene, BackendSettings::default()).expect("stages");
     let mut seen = |state: &SceneState, at| {
         staged.deform(state).expect("deforms");
         let image = bench.draw(&mut staged, &camera(at), FrameSize::new(96, 96)).expect("draws");

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::DeviceContext;
 use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Bounds, Camera, FrameSize, Lens, LightSpaceBox, Scene, SceneState, ShadowSettings};
@@ -130,7 +131,7 @@ fn upload_bounds_or_origin_invalidate_the_shadow() {
 fn engine_steps_share_a_shadow_and_refused_ones_have_none() {
     let scene = scene(1);
     let mut bench = DeviceContext::open(&Config { backend: BackendChoice::Cpu, ..Config::default() }).expect("opens");
-    let mut staged = bench.load_scene(&scene).expect("stages");
+    let mut staged = bench.load_scene(&scene, BackendSettings::default()).expect("stages");
     let frames = |bench: &mut DeviceContext, staged: &mut modalcast::engine::LoadedScene| {
         cameras(&scene).map(|camera| {
             let rgba = bench.draw(staged, &camera, FrameSize::new(64, 64)).expect("draws").rgba;

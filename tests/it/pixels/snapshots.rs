@@ -20,7 +20,7 @@ fn difference(one: &[u8], other: &[u8]) -> (f64, u8, u8) {
 
 /// The tree close to its trunk: normal map of the bark, cut-out leaves, shadow, ground and sky.
 fn tree(eye: [f64; 3]) -> FrameImage {
-    let scene = load::open("tree").expect("built in");
+    let scene = load::open("tree").expect("built in").scene;
     let view = View::LookAt { eye, target: [0.0, 1.8, 0.0], up: [0.0, 1.0, 0.0] };
     let camera = Camera { view, lens: Lens::FieldOfView(45.0), near: 0.0, far: 0.0 };
     draw_sized(&mut open(), &scene, camera, [104, 78]).image

@@ -5,9 +5,12 @@ use std::collections::{HashMap, HashSet};
 use std::path::PathBuf;
 
 use super::patch::{MaterialPatch, TextureLookup};
+use super::settings::LookKeys;
 use super::{DomainEntry, Manifest, TransformKind};
+use crate::backend_settings::{BackendSettings, RasterPolicy};
 use crate::domain::{Attachment, Domain, FollowConstraint, Material, Modes, Shape, Texture, Transform};
 use crate::error::{Result, invalid};
+use crate::load::SceneDescription;
 use crate::load::asset_dir::AssetDir;
 use crate::load::obj::ModesSource;
 use crate::load::{modes, source, texture_cache};
@@ -16,7 +19,7 @@ use crate::scene::{MAX_DOMAINS, SceneParts, UpAxis};
 /// Number of carrying vertices of a deformable parent for an entry without `rows`.
 const DEFAULT_ATTACHMENT_ROWS: usize = 8;
 
-/// The parts of the scene of all entries.
+/// The scene of all entries, and the settings of the backends.
 ///
 /// # Errors
 /// `Invalid` with the entry.
@@ -25,7 +28,7 @@ pub(super) fn assemble(
     manifest: &Manifest,
     entries: &[DomainEntry],
     own_name: &str,
-) -> Result<SceneParts> {
+) -> Result<SceneDescription> {
     let name = manifest.name.clone().unwrap_or_else(|| own_name.to_owned());
     let mut assembly = ManifestAssembler {
         files,
@@ -46,7 +49,7 @@ pub(super) fn assemble(
     parts.up = manifest.up.unwrap_or(parts.up);
     parts.unit = manifest.unit.unwrap_or(parts.unit);
     parts.origin = manifest.origin;
-    parts.look = manifest.look.unwrap_or(parts.look);
+    parts.look = manifest.look.as_ref().map_or(parts.look, LookKeys::render_settings);
     parts.deformation = manifest.deform;
     match manifest.shadows {
         Some(false) => parts.look.shadow = None,
@@ -60,7 +63,9 @@ pub(super) fn assemble(
     }
     parts.rigid_transforms = manifest.transforms == TransformKind::Rigid;
     drop_unused(&mut parts);
-    Ok(parts)
+    let backends =
+        BackendSettings { raster: manifest.look.as_ref().map_or_else(RasterPolicy::default, |look| look.raster) };
+    Ok(SceneDescription { parts, backends })
 }
 
 /// A model that was read. The indices in its domains refer to the lists of the whole scene, except indices of other

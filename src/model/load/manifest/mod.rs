@@ -61,15 +61,18 @@
 mod assemble;
 mod patch;
 mod placement;
+mod settings;
 
 use std::collections::BTreeMap;
 
 use patch::MaterialPatch;
 use placement::Placement;
+use settings::LookKeys;
 
+use super::SceneDescription;
 use super::asset_dir::AssetDir;
 use crate::error::{Result, invalid};
-use crate::scene::{DeformationSettings, RenderSettings, SceneParts, UpAxis};
+use crate::scene::{DeformationSettings, UpAxis};
 
 /// The file name that makes a folder a scene.
 pub(super) const MANIFEST_FILE: &str = "scene.toml";
@@ -86,7 +89,7 @@ struct Manifest {
     origin: [f64; 3],
     #[serde(default)]
     transforms: TransformKind,
-    look: Option<RenderSettings>,
+    look: Option<LookKeys>,
     shadows: Option<bool>,
     ground: Option<bool>,
     #[serde(default)]
@@ -136,7 +139,7 @@ struct DomainEntry {
 ///
 /// # Errors
 /// `Invalid` with the manifest, the line or entry, and the expected and given value.
-pub(super) fn read(files: &AssetDir, file: &str, own_name: &str) -> Result<SceneParts> {
+pub(super) fn read(files: &AssetDir, file: &str, own_name: &str) -> Result<SceneDescription> {
     let place = format!("file '{file}'");
     let bytes = files.read(file, MAX_MANIFEST_BYTES)?;
     let mut manifest = parse(&bytes).map_err(|error| error.prefix_field(&place))?;

@@ -3,15 +3,16 @@
 use std::path::Path;
 
 use super::*;
+use crate::backend_settings::{BackendSettings, RasterPolicy};
 use crate::domain::{AlphaMode, Transform};
 use crate::scene::{
-    Antialiasing, BatchPolicy, Bloom, Culling, DeformationSettings, MomentFormat, NormalMethod, RasterPolicy,
-    ShadowMethod, ShadowSettings, StorageType, ToneMapping,
+    Antialiasing, BatchPolicy, Bloom, Culling, DeformationSettings, MomentFormat, NormalMethod, RenderSettings,
+    SceneParts, ShadowMethod, ShadowSettings, StorageType, ToneMapping,
 };
 
 const TRIANGLE: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
 
-fn scene(toml: &str) -> Result<SceneParts> {
+fn description(toml: &str) -> Result<SceneDescription> {
     let folder = tempfile::tempdir().expect("a folder");
     let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).expect("written");
     write("a.obj", TRIANGLE);
@@ -27,9 +28,13 @@ fn scene(toml: &str) -> Result<SceneParts> {
     read(&AssetDir::unrestricted(folder.path()), MANIFEST_FILE, "folder")
 }
 
+fn scene(toml: &str) -> Result<SceneParts> {
+    description(toml).map(|description| description.parts)
+}
+
 #[test]
 fn one_model_with_everything_said_about_the_scene() {
-    let parts = scene(
+    let SceneDescription { parts, backends } = description(
         "name = 'n'\nup = 'z'\nunit = 0.01\norigin = [1.5, 0, 0]\ntransforms = 'rigid'\nshadows = false\n\
          model = 'a.obj'\nmodes = 'u.txt'\nplacement = { translation = [1, 2, 3] }\nlook.sunlight = [2, 2, 2]\n\
          look.antialias = 'fxaa'\nlook.bloom.strength = 0.25\nlook.tone = 'aces'\nlook.exposure = 1.5\n\
@@ -40,11 +45,11 @@ fn one_model_with_everything_said_about_the_scene() {
     assert_eq!((parts.name.as_str(), parts.up, parts.unit), ("n", UpAxis::Z, 0.01));
     assert_eq!((parts.origin, parts.rigid_transforms), ([1.5, 0.0, 0.0], true));
     assert!(parts.look.shadow.is_none() && parts.look.ground.is_some());
+    assert_eq!(backends, BackendSettings { raster: RasterPolicy::Fastest });
     assert_eq!(parts.look.sunlight, [2.0; 3]);
     assert_eq!(parts.look.bloom, Some(Bloom { strength: 0.25, ..Bloom::default() }));
     assert_eq!((parts.look.antialias, parts.look.tone), (Antialiasing::Fxaa, ToneMapping::Aces));
     assert_eq!((parts.look.exposure, parts.look.dither, parts.look.culling), (1.5, true, Culling::Occlusion));
-    assert_eq!(parts.look.raster, RasterPolicy::Fastest);
     let deformation = DeformationSettings {
         storage: StorageType::Int8,
         normals: NormalMethod::Exact,
@@ -68,7 +73,8 @@ fn one_model_with_everything_said_about_the_scene() {
         let refusal = scene(&format!("model = 'a.obj'\nlook.shadow = {{ {wrong} }}\n")).expect_err(wrong).to_string();
         assert!(refusal.contains("line 2"), "{refusal}");
     }
-    let plain = scene("model = 'a.obj'\n").expect("good");
+    let SceneDescription { parts: plain, backends } = description("model = 'a.obj'\n").expect("good");
+    assert_eq!((plain.look, backends), (RenderSettings::default(), BackendSettings::default()));
     assert_eq!((plain.name.as_str(), plain.up, plain.rigid_transforms), ("folder", UpAxis::Y, false));
     assert_eq!(plain.deformation, DeformationSettings::default());
     let refusal = scene("model = 'a.obj'\ndeform.storage = 'int3'\n").expect_err("no such type").to_string();

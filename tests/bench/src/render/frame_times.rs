@@ -10,9 +10,10 @@ use super::harness::{PassTime, RenderHarness, Size};
 use super::image_files::{self, ImageFile};
 use crate::provenance::Provenance;
 use crate::timing::{MIN_REPETITIONS, Timing};
+use modalcast_model::backend_settings::LookTable;
 use modalcast_model::error::{Result, fault_in};
-use modalcast_model::load;
-use modalcast_model::scene::{Camera, RenderSettings, SceneState};
+use modalcast_model::load::{self, OpenedScene};
+use modalcast_model::scene::{Camera, SceneState};
 use modalcast_render::{RasterBackends, RendererInfo};
 
 /// Settings of the timing.
@@ -31,7 +32,7 @@ pub struct SceneFrameTimes {
     pub name: String,
     pub vertices: usize,
     pub triangles: usize,
-    pub look: RenderSettings,
+    pub look: LookTable,
     /// Samples per pixel.
     pub samples: u32,
     /// Rasterizers that drew it.
@@ -77,12 +78,12 @@ pub fn timed(request: &Request, mut progress: impl FnMut(&str)) -> Result<FrameT
 }
 
 fn sample(studio: &mut RenderHarness, request: &Request, source: &str) -> Result<(SceneFrameTimes, ImageFile)> {
-    let (scene, size) = (load::open(source)?, request.size);
+    let (OpenedScene { scene, backends }, size) = (load::open(source)?, request.size);
     let name = Path::new(source).file_stem().map_or_else(|| "scene".into(), |stem| stem.to_string_lossy());
     let mut set = studio.set(&scene)?;
     studio.pose(&mut set, &SceneState::rest(&scene))?;
     let camera = Camera::fit_to_scene(&scene, size.width, size.height);
-    studio.draw_as_named(&mut set, camera, size)?;
+    studio.select_rasterizer(&mut set, backends.raster, camera, size)?;
     let passes = studio.time(&set, camera, size, request.replays)?;
     let mut times = Vec::new();
     for _ in 0..request.replays.max(MIN_REPETITIONS) {
@@ -97,7 +98,7 @@ fn sample(studio: &mut RenderHarness, request: &Request, source: &str) -> Result
         name: name.into_owned(),
         vertices: scene.layout.vertices,
         triangles: scene.layout.triangles,
-        look: scene.look,
+        look: LookTable { settings: scene.look, raster: backends.raster },
         samples: studio.renderer.stats().samples,
         raster_backends: studio.renderer.stats().raster_backends,
         clip_from_world: clip.iter().copied().collect(),
@@ -135,7 +136,7 @@ mod tests {
         let sample = &timed.scenes[0];
         assert!(sample.whole.median_us > 0.0 && sample.whole.replays == MIN_REPETITIONS);
         assert!(sample.passes.iter().any(|pass| pass.name == "frame"));
-        let scene = load::open("tree").expect("built");
+        let scene = load::open("tree").expect("built").scene;
         let clip = nalgebra::Matrix4::from_column_slice(&sample.clip_from_world);
         let middle = clip.transform_point(&scene.rest_bounds.center());
         assert!(middle.x.abs() < 1e-9 && middle.y.abs() < 1e-9, "{middle}");

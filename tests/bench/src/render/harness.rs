@@ -9,10 +9,11 @@ use super::plants;
 use crate::timing::{MIN_REPETITIONS, Timing};
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{CudaRasterizer, Device};
+use modalcast_model::backend_settings::RasterPolicy;
 use modalcast_model::deform::{DeformedSurface, Deformer};
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{Bounds, Camera, LightSpaceBox, RasterPolicy, Scene, SceneState};
+use modalcast_model::scene::{Bounds, Camera, LightSpaceBox, Scene, SceneState};
 use modalcast_render::{DevicePreference, FrameImage, FrameParams, Renderer, SceneBuffers};
 
 /// Size of a picture in pixels.
@@ -66,15 +67,20 @@ impl RenderHarness {
         self.renderer.attach_rasterizer(&mut set.buffers, make)
     }
 
-    /// Selects the rasterizers of a posed scene as its look requests, as far as they are available.
+    /// Selects the rasterizers of a posed scene by `policy`, as far as they are available.
     ///
     /// # Errors
     /// Errors of the device and of drawing.
-    pub(super) fn draw_as_named(&mut self, set: &mut HarnessScene, camera: Camera, size: Size) -> Result<()> {
-        let wanted = set.scene.look.raster;
-        let Some(device) = plants::device().filter(|_| wanted != RasterPolicy::OpenGl) else { return Ok(()) };
+    pub(super) fn select_rasterizer(
+        &mut self,
+        set: &mut HarnessScene,
+        policy: RasterPolicy,
+        camera: Camera,
+        size: Size,
+    ) -> Result<()> {
+        let Some(device) = plants::device().filter(|_| policy != RasterPolicy::OpenGl) else { return Ok(()) };
         self.attach_rasterizer(set, &device)?;
-        if wanted == RasterPolicy::Fastest {
+        if policy == RasterPolicy::Fastest {
             let shot = set.shot(camera, size);
             self.renderer.select_raster_backends(&mut set.buffers, &shot)?;
         }

@@ -109,8 +109,8 @@ impl RenderWorkload {
             Self::Shelf => (Scene::new(shelf()?)?, None),
             Self::Panes => (Scene::new(panes()?)?, Some(1)),
             Self::Images => (Scene::new(texture_panels::panels()?)?, Some(0)),
-            Self::Tree => (load::open("tree")?, None),
-            Self::Grove => (Scene::new(grove(load::open("tree")?.as_ref()))?, None),
+            Self::Tree => (load::open("tree")?.scene, None),
+            Self::Grove => (Scene::new(grove(load::open("tree")?.scene.as_ref()))?, None),
             Self::Triangles(count) => (Scene::new(field(count)?)?, Some(1)),
         };
         Ok(AnimatedScene::new(self, scene, slides))

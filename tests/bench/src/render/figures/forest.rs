@@ -92,7 +92,7 @@ mod tests {
 
     #[test]
     fn plants_share_species_data_and_keep_parents_of_their_own() {
-        let tree = load::open("tree").expect("built").parts();
+        let tree = load::open("tree").expect("built").scene.parts();
         let blossom = in_blossom(&tree).expect("tinted");
         assert_ne!(blossom.textures, tree.textures);
         let stand = |species: usize, right: f64| PlantInstance { species, right, near: 0.0, turn: 1.0, scale: 0.5 };

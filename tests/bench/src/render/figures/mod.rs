@@ -105,7 +105,7 @@ struct FigurePlants {
 
 impl FigurePlants {
     fn grow() -> Result<Self> {
-        let tree = load::open("tree")?.parts();
+        let tree = load::open("tree")?.scene.parts();
         let bark = bark(&tree)?;
         let conifer = |habit: &conifer::ConiferParameters| conifer::grow(habit, bark);
         let (fir, hemlock, spruce) = (conifer(&conifer::FIR)?, conifer(&conifer::HEMLOCK)?, conifer(&conifer::SPRUCE)?);
@@ -272,7 +272,7 @@ fn leaves(atelier: &mut FigureRenderer, species: &FigurePlants) -> Result<()> {
 
 /// A scene of the user with its own look, and default shadows if it has none.
 fn own(atelier: &mut FigureRenderer, source: &str) -> Result<()> {
-    let scene = load::open(source)?;
+    let scene = load::open(source)?.scene;
     let scene = light_meter::relit(
         &scene,
         RenderSettings { shadow: scene.look.shadow.or(Some(ShadowSettings::default())), ..scene.look },
