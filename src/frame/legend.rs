@@ -1,6 +1,7 @@
 //! The legend of a color map: a color bar with ticks, labels and a title, composited over a picture.
 
-use std::fmt::Write as _;
+use ab_glyph::{Font as _, FontRef, PxScale, ScaleFont as _};
+use ab_glyph_rasterizer::{Point, Rasterizer, point};
 
 use super::colormap::viridis;
 use modalcast_model::error::{Result, fault_in};
@@ -16,44 +17,146 @@ pub struct Legend {
 
 /// The smallest width and height in pixels of a picture that gets a legend.
 const MIN_SIZE: [u32; 2] = [240, 160];
-/// Width and height of the legend's box in pixels of a picture with 720 rows; scaled for other sizes.
-const WIDTH: f64 = 330.0;
-const HEIGHT: f64 = 84.0;
-/// The color bar inside the box: left, top, width, height, in the same unit.
-const BAR: (f64, f64, f64, f64) = (26.0, 34.0, 278.0, 16.0);
-/// Number of intervals of the color bar's gradient.
-const STOPS: u32 = 64;
+/// Width and height of the legend's box in layout units. A unit is a pixel of a picture with 720 rows and is scaled for
+/// other sizes.
+const WIDTH: f32 = 330.0;
+const HEIGHT: f32 = 84.0;
+/// The color bar inside the box.
+const BAR: Rectangle = Rectangle { left: 26.0, top: 34.0, width: 278.0, height: 16.0 };
+/// sRGB of text and ticks.
+const INK: [u8; 3] = [0x1a; 3];
 
 /// Draws the legend into the lower left corner of RGBA8 pixels, top row first. A picture smaller than 240 x 160 remains
 /// unchanged.
 ///
 /// # Errors
-/// `Fault` when the legend cannot be rasterized.
+/// `Fault` when the embedded font cannot be read.
 pub fn draw(rgba: &mut [u8], [width, height]: [u32; 2], legend: &Legend) -> Result<()> {
     if width < MIN_SIZE[0] || height < MIN_SIZE[1] {
         return Ok(());
     }
-    let scale = (f64::from(height) / 720.0).max(0.62).min(f64::from(width) / (1.15 * WIDTH));
-    let mut options = resvg::usvg::Options::default();
-    options.fontdb_mut().load_font_data(dejavu::sans::regular().to_vec());
-    let tree = resvg::usvg::Tree::from_str(&svg(legend), &options).map_err(fault_in("legend"))?;
-    let size = [(WIDTH * scale).ceil() as u32, (HEIGHT * scale).ceil() as u32];
-    let too_large = || fault_in("legend")("it is too large");
-    let mut pixels = resvg::tiny_skia::Pixmap::new(size[0], size[1]).ok_or_else(too_large)?;
-    let scaled = resvg::tiny_skia::Transform::from_scale(scale as f32, scale as f32);
-    resvg::render(&tree, scaled, &mut pixels.as_mut());
-    let margin = (12.0 * scale) as u32;
-    let top = height.saturating_sub(size[1] + margin);
-    for (row, own) in (top..height).zip(pixels.data().chunks_exact(4 * size[0] as usize)) {
-        let first = 4 * (row as usize * width as usize + margin as usize);
-        let end = first.max(4 * (row as usize + 1) * width as usize).min(first + own.len());
-        for (under, over) in rgba[first..end].chunks_exact_mut(4).zip(own.chunks_exact(4)) {
-            // Premultiplied alpha, "over" operator.
-            let left = 255 - u32::from(over[3]);
-            (0..3).for_each(|at| under[at] = (u32::from(over[at]) + u32::from(under[at]) * left / 255).min(255) as u8);
-        }
+    let font = FontRef::try_from_slice(dejavu::sans::regular()).map_err(fault_in("legend"))?;
+    let scale = (height as f32 / 720.0).max(0.62).min(width as f32 / (1.15 * WIDTH));
+    let size = [(WIDTH * scale).ceil() as usize, (HEIGHT * scale).ceil() as usize];
+    let margin = (12.0 * scale) as usize;
+    let corner = [margin, (height as usize).saturating_sub(size[1] + margin)];
+    let mut canvas = Canvas { rgba, width: width as usize, corner, size, scale, font };
+
+    let background = Rectangle { left: 0.0, top: 0.0, width: WIDTH, height: HEIGHT };
+    canvas.fill(&background, 6.0, 0.86, |_| [255; 3]);
+    canvas.text(&legend.title, Baseline { x: BAR.left, y: 23.0, centered: false }, 15.0);
+    canvas.fill(&BAR, 0.0, 1.0, |x| viridis((x - BAR.left) / BAR.width).map(|channel| (255.0 * channel).round() as u8));
+    for (share, label) in ticks(legend.largest) {
+        let (x, y) = (BAR.left + share as f32 * BAR.width, BAR.top + BAR.height);
+        canvas.fill(&Rectangle { left: x - 0.6, top: y, width: 1.2, height: 5.0 }, 0.0, 1.0, |_| INK);
+        canvas.text(&label, Baseline { x, y: y + 19.0, centered: true }, 13.0);
     }
     Ok(())
+}
+
+/// A rectangle in layout units.
+struct Rectangle {
+    left: f32,
+    top: f32,
+    width: f32,
+    height: f32,
+}
+
+/// Where a line of text starts, or its middle if it is centered, in layout units.
+struct Baseline {
+    x: f32,
+    y: f32,
+    centered: bool,
+}
+
+/// The part of a picture that the legend covers. Nothing is drawn outside of it.
+struct Canvas<'a> {
+    /// The picture: RGBA8, `width` pixels per row.
+    rgba: &'a mut [u8],
+    width: usize,
+    /// Top left corner and size of the legend's box in pixels.
+    corner: [usize; 2],
+    size: [usize; 2],
+    /// Pixels per layout unit.
+    scale: f32,
+    font: FontRef<'static>,
+}
+
+impl Canvas<'_> {
+    /// Fills a rectangle with rounded corners, antialiased. `color` maps x in layout units to sRGB.
+    fn fill(&mut self, rectangle: &Rectangle, radius: f32, opacity: f32, color: impl Fn(f32) -> [u8; 3]) {
+        let mut coverage = Rasterizer::new(self.size[0], self.size[1]);
+        let [left, top] = [rectangle.left * self.scale, rectangle.top * self.scale];
+        let [right, bottom] = [left + rectangle.width * self.scale, top + rectangle.height * self.scale];
+        let radius = radius * self.scale;
+        // Each corner: its point, and the directions of the incoming and the outgoing edge.
+        let corners = [
+            (point(right, top), point(1.0, 0.0), point(0.0, 1.0)),
+            (point(right, bottom), point(0.0, 1.0), point(-1.0, 0.0)),
+            (point(left, bottom), point(-1.0, 0.0), point(0.0, -1.0)),
+            (point(left, top), point(0.0, -1.0), point(1.0, 0.0)),
+        ];
+        let along = |start: Point, direction: Point, length: f32| {
+            point(start.x + length * direction.x, start.y + length * direction.y)
+        };
+        let mut last = along(point(left, top), point(1.0, 0.0), radius);
+        for (corner, incoming, outgoing) in corners {
+            // A cubic whose control points are this fraction of the radius from the corner approximates a circular arc.
+            let control = (1.0 - 0.552_284_8) * radius;
+            let start = along(corner, incoming, -radius);
+            let end = along(corner, outgoing, radius);
+            coverage.draw_line(last, start);
+            coverage.draw_cubic(start, along(corner, incoming, -control), along(corner, outgoing, control), end);
+            last = end;
+        }
+        let (width, scale) = (self.size[0], self.scale);
+        coverage.for_each_pixel_2d(|x, y, share| {
+            if share > 0.0 && (x as usize) < width {
+                self.blend([x as usize, y as usize], color((x as f32 + 0.5) / scale), share * opacity);
+            }
+        });
+    }
+
+    /// Draws a line of text. `font_size` is the size of the em square in layout units.
+    fn text(&mut self, text: &str, baseline: Baseline, font_size: f32) {
+        let font = self.font.clone();
+        let em = font.units_per_em().unwrap_or(font.height_unscaled());
+        let scale = PxScale::from(font_size * self.scale * font.height_unscaled() / em);
+        let scaled = font.as_scaled(scale);
+        let mut end = 0.0;
+        let mut last = None;
+        let mut glyphs = Vec::new();
+        for id in text.chars().map(|letter| font.glyph_id(letter)) {
+            end += last.map_or(0.0, |last| scaled.kern(last, id));
+            glyphs.push((id, end));
+            end += scaled.h_advance(id);
+            last = Some(id);
+        }
+        let start = baseline.x * self.scale - if baseline.centered { end / 2.0 } else { 0.0 };
+        for (id, offset) in glyphs {
+            let glyph = id.with_scale_and_position(scale, ab_glyph::point(start + offset, baseline.y * self.scale));
+            let Some(outline) = font.outline_glyph(glyph) else { continue };
+            let corner = outline.px_bounds().min;
+            outline.draw(|x, y, share| {
+                let at = [corner.x + x as f32, corner.y + y as f32];
+                if at[0] >= 0.0 && at[1] >= 0.0 {
+                    self.blend([at[0] as usize, at[1] as usize], INK, share);
+                }
+            });
+        }
+    }
+
+    /// Blends a color over a pixel of the box. Pixels outside of the box are ignored.
+    fn blend(&mut self, [x, y]: [usize; 2], color: [u8; 3], opacity: f32) {
+        if x >= self.size[0] || y >= self.size[1] {
+            return;
+        }
+        let first = 4 * ((self.corner[1] + y) * self.width + self.corner[0] + x);
+        let opacity = opacity.clamp(0.0, 1.0);
+        for (under, over) in self.rgba[first..first + 3].iter_mut().zip(color) {
+            *under = (f32::from(over) * opacity + f32::from(*under) * (1.0 - opacity)).round() as u8;
+        }
+    }
 }
 
 /// Rounds up to 1, 2, 2.5 or 5 times a power of ten, so that the scale has readable ticks. Returns 1 for values that
@@ -66,31 +169,6 @@ pub fn nice_ceiling(value: f64) -> f64 {
     let steps = [1.0, 2.0, 2.5, 5.0, 10.0].map(|step| step * decade);
     // With a relative tolerance, so that rounding errors do not push 0.2 to 0.25.
     steps.into_iter().find(|step| *step >= value * (1.0 - 1e-9)).unwrap_or(10.0 * decade)
-}
-
-fn svg(legend: &Legend) -> String {
-    let (left, top, width, height) = BAR;
-    let mut text = format!(
-        "<svg xmlns='http://www.w3.org/2000/svg' width='{WIDTH}' height='{HEIGHT}' font-family='DejaVu Sans'>\
-         <rect width='{WIDTH}' height='{HEIGHT}' rx='6' fill='#ffffff' fill-opacity='0.86'/>\
-         <text x='{left}' y='23' font-size='15' fill='#1a1a1a'>{}</text>",
-        escaped(&legend.title)
-    );
-    text += "<defs><linearGradient id='map'>";
-    for stop in 0..=STOPS {
-        let share = stop as f32 / STOPS as f32;
-        let [r, g, b] = viridis(share).map(|channel| (255.0 * channel).round() as u8);
-        write!(text, "<stop offset='{share}' stop-color='rgb({r},{g},{b})'/>").ok();
-    }
-    text += "</linearGradient></defs>";
-    write!(text, "<rect x='{left}' y='{top}' width='{width}' height='{height}' fill='url(#map)'/>").ok();
-    for (share, label) in ticks(legend.largest) {
-        let (x, y) = (left + share * width, top + height);
-        write!(text, "<path d='M{x:.2} {y} v5' stroke='#1a1a1a' stroke-width='1.2'/>").ok();
-        let y = y + 19.0;
-        write!(text, "<text x='{x:.2}' y='{y}' font-size='13' text-anchor='middle' fill='#1a1a1a'>{label}</text>").ok();
-    }
-    text + "</svg>"
 }
 
 /// Tick positions from 0 to 1 and their labels: three to five equal intervals from 0 to the largest value.
@@ -122,10 +200,6 @@ fn label(value: f64) -> String {
     let places = (2 - exponent).max(0);
     let power = 10f64.powi(places);
     format!("{}", (value * power).round() / power)
-}
-
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;")
 }
 
 #[cfg(test)]

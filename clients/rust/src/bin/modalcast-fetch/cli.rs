@@ -120,8 +120,7 @@ enum OutputOption {
 impl PictureOptions {
     pub(crate) fn picture(&self) -> Picture {
         let view = self.camera_eye.zip(self.target).map(|(eye, target)| View::LookAt { eye, target, up: self.up });
-        let camera =
-            view.map(|view| Camera { view, lens: Lens::FieldOfView(self.fov.unwrap_or(35.0)), clip: None });
+        let camera = view.map(|view| Camera { view, lens: Lens::FieldOfView(self.fov.unwrap_or(35.0)), clip: None });
         let format = match self.format {
             FormatOption::Png => FrameFormat::Png,
             FormatOption::Raw => FrameFormat::Rgba,
