@@ -72,8 +72,8 @@ use self::shaders::ProgramSource;
 pub use self::submit::{MappedPixels, PendingFrame};
 use self::target::{RenderTarget, TargetDesc};
 pub use self::types::{
-    CullStats, DevicePreference, FrameCullStats, FrameImage, FrameParams, FrameStats, OitStats, RasterBackend,
-    RasterBackends, RendererInfo, SharedBuffers, VisibilityId,
+    BlurMethod, CullStats, DevicePreference, FrameCullStats, FrameImage, FrameParams, FrameStats, OitStats,
+    RasterBackend, RasterBackends, RendererInfo, SharedBuffers, VisibilityId,
 };
 use crate::device::gl::{self, Gl, Program};
 pub use crate::device::readback_ring::MAX_FRAMES_IN_FLIGHT;
@@ -100,6 +100,7 @@ pub struct Renderer {
     gl: Rc<Gl>,
     programs: HashMap<ProgramSource, Rc<Program>>,
     sample_positions: Vec<[f32; 2]>,
+    blur_method: BlurMethod,
     /// Least recently used first.
     targets: Vec<RenderTarget>,
     stats: FrameStats,
@@ -132,6 +133,7 @@ impl Renderer {
             gl,
             programs: HashMap::new(),
             sample_positions,
+            blur_method: BlurMethod::default(),
             targets: Vec::new(),
             stats: FrameStats::default(),
             last_uniforms: None,
@@ -151,17 +153,22 @@ impl Renderer {
         &self.stats
     }
 
+    /// Selects the implementation of the shadow blur for all scenes that are loaded after this call.
+    pub fn set_blur_method(&mut self, method: BlurMethod) {
+        self.blur_method = method;
+    }
+
     /// Uploads the static data of a scene and allocates the buffers of the deformed data.
     ///
     /// # Errors
     /// `Invalid` when the scene is over a limit of the device, `Fault` when a shader or a buffer is refused.
     pub fn load(&mut self, scene: &Arc<Scene>) -> Result<SceneBuffers> {
-        let (gl, places) = (Rc::clone(&self.gl), self.sample_positions.clone());
+        let (gl, places, blur_method) = (Rc::clone(&self.gl), self.sample_positions.clone(), self.blur_method);
         if self.programs.len() > MAX_PROGRAMS {
             self.programs.clear();
         }
         let compile: &mut programs::ProgramCompiler<'_> = &mut |source| self.program(source);
-        let buffers = SceneBuffers::new(&gl, scene, &places, compile)?;
+        let buffers = SceneBuffers::new(&gl, scene, &places, blur_method, compile)?;
         gl.check("load").map(|()| buffers)
     }
 

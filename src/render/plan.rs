@@ -6,8 +6,8 @@
 
 use super::cull::{self, allocations, select_culling};
 use super::geometry::{BlendMode, DrawGroup, blend_mode, groups, used_materials, uses_material_table};
-use super::shadow::resolve_blurring;
 use super::textures::{TextureRole, arrays};
+use super::types::BlurMethod;
 use crate::device::gl::Limits;
 use modalcast_model::scene::{Antialiasing, Culling, Scene, ShadowSettings, ToneMapping, Transparency};
 
@@ -63,11 +63,11 @@ impl RenderPlan {
 
 /// Plans a scene for a GPU without limits.
 pub fn plan(scene: &Scene) -> RenderPlan {
-    plan_for_device(scene, &Limits { max_storage_bytes: u64::MAX, ..Limits::default() })
+    plan_for_device(scene, &Limits { max_storage_bytes: u64::MAX, ..Limits::default() }, BlurMethod::Auto)
 }
 
 /// Plans a scene for a device, which may be a software rasterizer.
-pub(crate) fn plan_for_device(scene: &Scene, limits: &Limits) -> RenderPlan {
+pub(crate) fn plan_for_device(scene: &Scene, limits: &Limits, blur_method: BlurMethod) -> RenderPlan {
     let (groups, _) = groups(scene);
     let has = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
     let mut passes = Vec::new();
@@ -94,7 +94,7 @@ pub(crate) fn plan_for_device(scene: &Scene, limits: &Limits) -> RenderPlan {
     passes.push("encode");
     RenderPlan {
         buffers: [buffers(scene), allocations(scene, culling)].concat(),
-        textures: textures(scene, limits.software),
+        textures: textures(scene, blur_method.resolve(limits.software)),
         passes,
         draw_calls: draw_calls(scene, &groups) + occluder_draw_calls(&groups, culling),
         defines: [defines(scene), cull_defines(culling)].concat(),
@@ -177,7 +177,7 @@ fn buffers(scene: &Scene) -> Vec<Allocation> {
     buffers
 }
 
-fn textures(scene: &Scene, software: bool) -> Vec<Allocation> {
+fn textures(scene: &Scene, blur_method: BlurMethod) -> Vec<Allocation> {
     let mut textures = Vec::new();
     for (purpose, word) in [(TextureRole::Color, "colors"), (TextureRole::Normal, "normals")] {
         for array in arrays(scene, purpose) {
@@ -186,16 +186,16 @@ fn textures(scene: &Scene, software: bool) -> Vec<Allocation> {
         }
     }
     if let Some(shadow) = scene.look.shadow {
-        textures.extend(shadow_textures(resolve_blurring(shadow, software)));
+        textures.extend(shadow_textures(&shadow, blur_method));
     }
     textures
 }
 
-fn shadow_textures(shadow: ShadowSettings) -> Vec<Allocation> {
+fn shadow_textures(shadow: &ShadowSettings, blur_method: BlurMethod) -> Vec<Allocation> {
     let texels = shadow.size as usize * shadow.size as usize;
     let allocation_of =
         |(name, bytes, layers): (&'static str, u32, u32)| allocation_of(name, (bytes * layers) as usize * texels);
-    super::shadow::textures(&shadow).into_iter().map(allocation_of).collect()
+    super::shadow::textures(shadow, blur_method).into_iter().map(allocation_of).collect()
 }
 
 fn defines(scene: &Scene) -> Vec<&'static str> {
@@ -216,7 +216,8 @@ fn defines(scene: &Scene) -> Vec<&'static str> {
 
 fn omitted(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
     let (needs, layout, look) = (scene.needs, &scene.layout, &scene.look);
-    let map: u64 = shadow_textures(look.shadow.unwrap_or_default()).iter().map(|part| part.bytes).sum();
+    let map: u64 =
+        shadow_textures(&look.shadow.unwrap_or_default(), BlurMethod::Auto).iter().map(|part| part.bytes).sum();
     let per_corner = |bytes: usize| (bytes * layout.corners) as u64;
     let uvs = if needs.textures || needs.normal_maps { 0 } else { per_corner(8) };
     let all = [

@@ -15,8 +15,9 @@ use super::post::PostProcess;
 use super::programs::{ProgramCompiler, SampleCountPrograms, ScenePrograms};
 use super::raster_backends::ComputeRasterizer;
 use super::shaders::{self, FIXED_TEXTURE_READS, MaterialUse, ShaderOptions};
-use super::shadow::{ShadowCache, ShadowMap, resolve_blurring};
+use super::shadow::{ShadowCache, ShadowMap};
 use super::textures::{TextureArray, TextureRole, arrays, check_texture_budget, cutoff, find_layer, mip_levels};
+use super::types::BlurMethod;
 use crate::device::gl::{self, Buffer, Gl, Program, Texture, TextureDesc, VertexArray, VertexAttribute};
 use modalcast_model::domain::AlphaMode;
 use modalcast_model::error::{Result, fault_in};
@@ -120,10 +121,11 @@ impl SceneBuffers {
         gl: &Rc<Gl>,
         scene: &Arc<Scene>,
         sample_positions: &[[f32; 2]],
+        blur_method: BlurMethod,
         compile: &mut ProgramCompiler<'_>,
     ) -> Result<Self> {
-        let plan = plan_for_device(scene, &gl.limits);
-        let shadow = scene.look.shadow.map(|shadow| resolve_blurring(shadow, gl.limits.software));
+        let plan = plan_for_device(scene, &gl.limits, blur_method);
+        let (shadow, blur_method) = (scene.look.shadow, blur_method.resolve(gl.limits.software));
         let images = [arrays(scene, TextureRole::Color), arrays(scene, TextureRole::Normal)];
         check_texture_budget(&images)?;
         let reads = FIXED_TEXTURE_READS + images[0].len() + images[1].len();
@@ -141,6 +143,7 @@ impl SceneBuffers {
             defines: plan.defines.clone(),
             used: used(scene, &images),
             shadow: shadow.unwrap_or_default(),
+            blur_method,
             sample_positions: sample_positions.to_vec(),
             sample_resolve: super::post::sample_resolve(&scene.look),
             post_depth_coverage: gl.limits.post_depth_coverage,
@@ -162,7 +165,7 @@ impl SceneBuffers {
             empty_vertex_array: gl.vertex_array(None, &[])?,
             color_arrays: upload_arrays(gl, scene, &color_arrays, TextureRole::Color)?,
             normals: upload_arrays(gl, scene, &normals, TextureRole::Normal)?,
-            shadow: shadow.map(|shadow| ShadowMap::new(gl, shadow)).transpose()?,
+            shadow: shadow.map(|shadow| ShadowMap::new(gl, shadow, blur_method)).transpose()?,
             shadow_cache: ShadowCache::default(),
             programs,
             post: PostProcess::compile(&scene.look, compile)?,

@@ -10,6 +10,7 @@ use std::fmt::Write as _;
 
 use super::geometry::BlendMode;
 use super::textures::TextureRole;
+use super::types::BlurMethod;
 use crate::device::gl;
 use modalcast_model::scene::ShadowSettings;
 
@@ -64,8 +65,10 @@ pub(crate) struct ShaderOptions {
     pub(crate) defines: Vec<&'static str>,
     /// The materials that triangles use.
     pub(crate) used: Vec<MaterialUse>,
-    /// Shadow settings as resolved for the device; used only when the defines contain SHADOWS.
+    /// Used only when the defines contain SHADOWS.
     pub(crate) shadow: ShadowSettings,
+    /// As resolved for the device.
+    pub(crate) blur_method: BlurMethod,
     /// Sample positions within a multisampled pixel.
     pub(crate) sample_positions: Vec<[f32; 2]>,
     /// Source that is applied to the light of each sample.
@@ -297,6 +300,7 @@ mod tests {
             defines: plan.defines,
             used,
             shadow: ShadowSettings::default(),
+            blur_method: BlurMethod::Tiles,
             sample_positions,
             sample_resolve,
             post_depth_coverage: false,

@@ -194,3 +194,29 @@ mod tests {
         );
     }
 }
+
+/// The implementation of the moments' blur. All of them yield the same map up to rounding.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum BlurMethod {
+    /// `Tiles` on hardware, `Rows` on software implementations.
+    #[default]
+    Auto,
+    /// One compute pass. It works on strips with sums in registers; for a blur above 8, whose radius is too
+    /// large for this, on tiles in shared memory.
+    Tiles,
+    /// Two compute passes without shared memory.
+    Rows,
+    /// Two fragment passes, as in the thesis; a baseline for the benchmark report.
+    Fragments,
+}
+
+impl BlurMethod {
+    /// The method that `Auto` stands for on a device of this kind; the others stand for themselves.
+    pub(crate) fn resolve(self, software: bool) -> Self {
+        match self {
+            Self::Auto if software => Self::Rows,
+            Self::Auto => Self::Tiles,
+            method => method,
+        }
+    }
+}

@@ -31,7 +31,7 @@ pub use pixel_rect::PixelRect;
 pub use post_processing::{Antialiasing, Bloom, ToneMapping};
 pub use raster_input::{CullMode, DrawRange, MAX_VIEWPORT_SIDE, Viewport};
 pub use render_settings::{Culling, Ground, MAX_FRAGMENTS, RenderSettings, Transparency, UpAxis};
-pub use shadow::{BlurMethod, MomentFormat, ShadowFit, ShadowMethod, ShadowSettings};
+pub use shadow::{MomentFormat, ShadowFit, ShadowMethod, ShadowSettings};
 pub use state::{DirtyDomains, SceneState};
 pub use step_update::{RawStepUpdate, StepUpdate};
 pub use transform_format::TransformFormat;

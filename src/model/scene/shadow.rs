@@ -46,21 +46,6 @@ pub enum ShadowFit {
     Corners,
 }
 
-/// The implementation of the moments' blur. All of them yield the same map up to rounding.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum BlurMethod {
-    /// `Tiles` on hardware, `Rows` on software implementations.
-    #[default]
-    Auto,
-    /// One compute pass. It works on strips with sums in registers; for a blur above 8, whose radius is too
-    /// large for this, on tiles in shared memory.
-    Tiles,
-    /// Two compute passes without shared memory.
-    Rows,
-    /// Two fragment passes, as in the thesis; a baseline for the benchmark report.
-    Fragments,
-}
-
 /// Settings of the shadow map.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -84,9 +69,6 @@ pub struct ShadowSettings {
     /// sharper nearby.
     pub splits: u32,
     pub fit: ShadowFit,
-    /// For benchmarks only; not part of the file format.
-    #[serde(skip)]
-    pub blur_method: BlurMethod,
 }
 
 impl Default for ShadowSettings {
@@ -101,7 +83,6 @@ impl Default for ShadowSettings {
             moments: MomentFormat::default(),
             splits: 1,
             fit: ShadowFit::default(),
-            blur_method: BlurMethod::default(),
         }
     }
 }

@@ -9,6 +9,7 @@ use super::super::shaders::ProgramSource;
 use super::super::{DevicePreference, FrameParams, Renderer, SceneBuffers};
 use super::{VISIBLE_INDICES, allocations, select_culling};
 use crate::device::gl::Limits;
+use crate::types::BlurMethod;
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{Material, Mesh, Modes, Shape};
 use modalcast_model::scene::{Camera, Culling, Lens, Scene, View};
@@ -46,7 +47,7 @@ fn picture(scene: &Arc<Scene>, (just, greedy): (&str, &str)) -> Vec<u8> {
         }
         renderer.program(source)
     };
-    let buffers = SceneBuffers::new(&gl, scene, &places, compile).expect("loads");
+    let buffers = SceneBuffers::new(&gl, scene, &places, BlurMethod::Auto, compile).expect("loads");
     assert!(found, "the shader says no '{just}'");
     let corners = scene.shapes[0].mesh.corners();
     let (positions, normals) = (scene.shapes[0].mesh.rest().as_flattened(), corners.normals.as_flattened());
@@ -75,7 +76,8 @@ fn a_scene_whose_lists_are_larger_than_a_buffer_may_be_is_not_culled_and_says_so
         assert_eq!(listed, 12 * scene.layout.triangles as u64);
         let on = |max_storage_bytes: u64| select_culling(&scene, &Limits { max_storage_bytes, ..Limits::default() });
         assert_eq!((on(largest), on(largest - 1)), (culling, Culling::None));
-        let plan = plan_for_device(&scene, &Limits { max_storage_bytes: largest - 1, ..Limits::default() });
+        let limits = Limits { max_storage_bytes: largest - 1, ..Limits::default() };
+        let plan = plan_for_device(&scene, &limits, BlurMethod::Auto);
         assert!(!plan.defines("CULLED") && !plan.passes.contains(&"cull"));
         assert!(plan.omitted.iter().any(|saving| saving.feature == "culling"));
     }

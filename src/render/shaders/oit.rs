@@ -87,6 +87,7 @@ mod tests {
             defines: vec!["BLEND_LAYERS", "OIT"],
             used,
             shadow: ShadowSettings::default(),
+            blur_method: crate::types::BlurMethod::Tiles,
             sample_positions: vec![[0.5; 2]; 4],
             sample_resolve: String::new(),
             post_depth_coverage,

@@ -17,13 +17,15 @@ use super::region::Region;
 use super::scene_buffers::SceneBuffers;
 use super::shaders::WORKGROUP_SIZE;
 use crate::device::gl::{self, ClearOp, Framebuffer, Gl, PipelineState, Program, Texture, TextureDesc};
+use crate::types::BlurMethod;
 use modalcast_model::error::{Result, fault_in};
-use modalcast_model::scene::{BlurMethod, MomentFormat, ShadowSettings};
+use modalcast_model::scene::{MomentFormat, ShadowSettings};
 
 /// Textures and framebuffers of a shadow map.
 #[derive(Debug)]
 pub(crate) struct ShadowMap {
     shadow: ShadowSettings,
+    blur_method: BlurMethod,
     depth: Texture,
     /// One per layer of the depth.
     framebuffers: Vec<Framebuffer>,
@@ -40,23 +42,13 @@ struct BlurredMoments {
     framebuffers: Vec<Framebuffer>,
 }
 
-/// Resolves the settings that depend on the kind of device.
-pub(crate) fn resolve_blurring(shadow: ShadowSettings, software: bool) -> ShadowSettings {
-    let blur_method = match shadow.blur_method {
-        BlurMethod::Auto if software => BlurMethod::Rows,
-        BlurMethod::Auto => BlurMethod::Tiles,
-        chosen => chosen,
-    };
-    ShadowSettings { blur_method, ..shadow }
-}
-
 /// Textures of a map: name, bytes per texel, layers.
-pub(crate) fn textures(shadow: &ShadowSettings) -> Vec<(&'static str, u32, u32)> {
+pub(crate) fn textures(shadow: &ShadowSettings, blur_method: BlurMethod) -> Vec<(&'static str, u32, u32)> {
     let pair = if shadow.moments == MomentFormat::F16 { 4 } else { 8 };
     let mut textures = vec![("shadow depth", 4, shadow.splits)];
     if shadow.has_moments() {
         textures.push(("shadow moments", pair, shadow.splits));
-        if matches!(shadow.blur_method, BlurMethod::Rows | BlurMethod::Fragments) {
+        if matches!(blur_method, BlurMethod::Rows | BlurMethod::Fragments) {
             textures.push(("shadow moments, blurred in x", pair, 1));
         }
     }
@@ -64,7 +56,7 @@ pub(crate) fn textures(shadow: &ShadowSettings) -> Vec<(&'static str, u32, u32)>
 }
 
 impl ShadowMap {
-    pub(crate) fn new(gl: &Rc<Gl>, shadow: ShadowSettings) -> Result<Self> {
+    pub(crate) fn new(gl: &Rc<Gl>, shadow: ShadowSettings, blur_method: BlurMethod) -> Result<Self> {
         let most = gl.limits.max_side;
         if shadow.size > most {
             return Err(gl::too_large("look.shadow.size", u64::from(most), u64::from(shadow.size)));
@@ -72,8 +64,8 @@ impl ShadowMap {
         let depth = create_image(gl, &shadow, gl::DEPTH_COMPONENT32F, gl::NEAREST, shadow.splits)?;
         let framebuffers =
             (0..shadow.splits).map(|layer| gl.layer_framebuffer(&depth, true, layer)).collect::<Result<_>>()?;
-        let blurred = if shadow.has_moments() { Some(BlurredMoments::new(gl, &shadow)?) } else { None };
-        Ok(Self { shadow, depth, framebuffers, blurred })
+        let blurred = if shadow.has_moments() { Some(BlurredMoments::new(gl, &shadow, blur_method)?) } else { None };
+        Ok(Self { shadow, blur_method, depth, framebuffers, blurred })
     }
 
     /// The texture that the shading samples: moments if there are any, else depth.
@@ -83,20 +75,20 @@ impl ShadowMap {
 
     /// Number of textures that the map holds.
     pub(crate) fn texture_count(&self) -> usize {
-        textures(&self.shadow).len()
+        textures(&self.shadow, self.blur_method).len()
     }
 }
 
 impl BlurredMoments {
-    fn new(gl: &Rc<Gl>, shadow: &ShadowSettings) -> Result<Self> {
+    fn new(gl: &Rc<Gl>, shadow: &ShadowSettings, blur_method: BlurMethod) -> Result<Self> {
         let format = if shadow.moments == MomentFormat::F16 { gl::RG16F } else { gl::RG32F };
         let moments = create_image(gl, shadow, format, gl::LINEAR, shadow.splits)?;
-        let horizontal = match shadow.blur_method {
+        let horizontal = match blur_method {
             BlurMethod::Auto | BlurMethod::Tiles => None,
             BlurMethod::Rows | BlurMethod::Fragments => Some(create_image(gl, shadow, format, gl::NEAREST, 1)?),
         };
         let mut framebuffers = Vec::new();
-        if let Some(horizontal) = horizontal.as_ref().filter(|_| shadow.blur_method == BlurMethod::Fragments) {
+        if let Some(horizontal) = horizontal.as_ref().filter(|_| blur_method == BlurMethod::Fragments) {
             framebuffers.push(gl.layer_framebuffer(horizontal, false, 0)?);
             for layer in 0..shadow.splits {
                 framebuffers.push(gl.layer_framebuffer(&moments, false, layer)?);

@@ -9,7 +9,8 @@ use super::super::shaders::{
 };
 use super::blur_strip::BlurStrip;
 use crate::device::gl;
-use modalcast_model::scene::{BlurMethod, MomentFormat, ShadowMethod, ShadowSettings};
+use crate::types::BlurMethod;
+use modalcast_model::scene::{MomentFormat, ShadowMethod, ShadowSettings};
 
 const SUN_VISIBILITY: &str = include_str!("../../../shaders/shared/sun_visibility.glsl");
 const CASCADES: &str = include_str!("../../../shaders/shared/shadow_cascades.glsl");
@@ -114,7 +115,7 @@ impl ShaderOptions {
 
     /// The programs that blur the moments of depth, in execution order.
     pub(crate) fn blur(&self) -> Vec<ProgramSource> {
-        match self.shadow.blur_method {
+        match self.blur_method {
             BlurMethod::Auto | BlurMethod::Tiles => vec![self.blur_single_pass()],
             BlurMethod::Rows | BlurMethod::Fragments => vec![self.blur_separable(true), self.blur_separable(false)],
         }
@@ -139,7 +140,7 @@ impl ShaderOptions {
     /// One direction of the blur; the first direction also converts depth to moments.
     fn blur_separable(&self, first: bool) -> ProgramSource {
         let more: &[&str] = if first { &["FROM_DEPTH"] } else { &[] };
-        let fragments = self.shadow.blur_method == BlurMethod::Fragments;
+        let fragments = self.blur_method == BlurMethod::Fragments;
         let run = if fragments { 1 } else { TEXELS_PER_INVOCATION };
         let arguments = "ivec2 at, ivec2 along, int side";
         let taps = taps("blur", arguments, &gaussian_weights(self.shadow.blur), run, |tap| {
@@ -255,6 +256,7 @@ mod tests {
                 defines: names,
                 used: vec![],
                 shadow,
+                blur_method: BlurMethod::Rows,
                 sample_positions: vec![],
                 sample_resolve: String::new(),
                 post_depth_coverage: false,

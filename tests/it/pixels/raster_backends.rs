@@ -10,11 +10,10 @@ use modalcast_model::deform::Deformer as _;
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::raster::{DrawTarget, GlBuffer, RasterGeometry, Rasterizer};
-use modalcast_model::scene::{
-    BlurMethod, Camera, CullMode, DrawRange, Lens, Scene, SceneState, ShadowSettings, View, Viewport,
-};
+use modalcast_model::scene::{Camera, CullMode, DrawRange, Lens, Scene, SceneState, ShadowSettings, View, Viewport};
 use modalcast_render::{
-    FrameImage, FrameParams, FrameStats, RasterBackend, RasterBackends, Renderer, SceneBuffers, VisibilityId,
+    BlurMethod, FrameImage, FrameParams, FrameStats, RasterBackend, RasterBackends, Renderer, SceneBuffers,
+    VisibilityId,
 };
 use nalgebra::{Matrix4, Vector3};
 
@@ -116,11 +115,15 @@ struct DrawnFrame {
 const SIZE: [u32; 2] = [192, 128];
 
 fn show(scene: &Arc<Scene>, camera: Camera, by: Backend) -> DrawnFrame {
-    let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(scene));
+    show_with(&mut open(), scene, camera, by)
+}
+
+fn show_with(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, by: Backend) -> DrawnFrame {
+    let mut deformer = ReferenceDeformer::new(scene);
     let bounds = deformer.deform(&SceneState::rest(scene)).expect("deforms").bounds;
     let mut buffers = renderer.load(scene).expect("loads");
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    attach(&mut renderer, &mut buffers, by);
+    attach(renderer, &mut buffers, by);
     let [width, height] = SIZE;
     let image = renderer.draw(&buffers, &FrameParams { camera, width, height, bounds, light: None }).expect("draws");
     let (seen, stats) = (renderer.read_visibility().expect("reads"), renderer.stats().clone());
@@ -164,10 +167,15 @@ fn far_off(one: &FrameImage, other: &FrameImage) -> usize {
 #[test]
 fn compute_rasterized_frame_equals_opengl() {
     for blur_method in [BlurMethod::Tiles, BlurMethod::Rows, BlurMethod::Fragments] {
-        let shadow = ShadowSettings { size: 256, blur_method, ..ShadowSettings::default() };
+        let shadow = ShadowSettings { size: 256, ..ShadowSettings::default() };
         let scene = yard(Some(shadow), 1).scene();
-        let want = show(&scene, from_above(), Backend::OpenGl);
-        let got = show(&scene, from_above(), Backend::Compute(0.0));
+        let show = |by| {
+            let mut renderer = open();
+            renderer.set_blur_method(blur_method);
+            show_with(&mut renderer, &scene, from_above(), by)
+        };
+        let want = show(Backend::OpenGl);
+        let got = show(Backend::Compute(0.0));
         let cuda = Some(RasterBackend::Cuda);
         assert_eq!(got.stats.raster_backends, RasterBackends { shadow: cuda, visibility: cuda });
         assert_eq!(
@@ -189,7 +197,7 @@ fn compute_rasterized_frame_equals_opengl() {
         );
         let (ids, pixels) = (differing(&got.seen, &want.seen), far_off(&got.image, &want.image));
         assert!(ids <= 12 && pixels <= 60, "{blur_method:?}: {ids} ids, {pixels} bytes differ");
-        let aside = show(&scene, from_above(), Backend::Compute(0.02));
+        let aside = show(Backend::Compute(0.02));
         let (ids, pixels) = (differing(&aside.seen, &want.seen), far_off(&aside.image, &want.image));
         assert!(ids > 100 && pixels > 300, "control: two pixels aside: {ids} ids, {pixels} bytes");
     }

@@ -2,41 +2,44 @@
 //! the contact line of a wall.
 
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::scene::{BlurMethod, Camera, Lens, ShadowMethod, ShadowSettings, View};
+use modalcast_model::scene::{Camera, Lens, ShadowMethod, ShadowSettings, View};
+use modalcast_render::{BlurMethod, Renderer};
 
 use super::harness::{Picture, close, draw, facing, open};
 use super::shadow::{stage, with_square};
 
 /// The part of the ground that the map covers, seen from above, with the given shadow map or none.
-fn from_high_above(shadow: Option<ShadowSettings>, caster: bool) -> Picture {
+fn from_high_above(renderer: &mut Renderer, shadow: Option<ShadowSettings>, caster: bool) -> Picture {
     let mut stage = stage();
     stage.0.look.sun = [3.0, 4.0, 0.0];
     stage.0.look.shadow = shadow;
     let stage = if caster { with_square(stage, AlphaMode::Opaque, 1.0) } else { stage };
     let view = View::LookAt { eye: [0.0, 20.0, 0.0], target: [0.0; 3], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 120.0, fy: 120.0, cx: 80.0, cy: 80.0 };
-    draw(&mut open(), &stage.scene(), Camera { view, lens, near: 0.0, far: 0.0 }, 160)
+    draw(renderer, &stage.scene(), Camera { view, lens, near: 0.0, far: 0.0 }, 160)
 }
 
 #[test]
 fn ground_is_lit_at_the_border_of_the_map() {
     let base = ShadowSettings { size: 64, blur: 4.0, bleeding: 0.2, ..ShadowSettings::default() };
     let kinds = [
-        ShadowSettings { blur_method: BlurMethod::Rows, ..base },
-        ShadowSettings { blur_method: BlurMethod::Tiles, ..base },
-        ShadowSettings { blur_method: BlurMethod::Fragments, ..base },
-        ShadowSettings { method: ShadowMethod::PercentageCloser, ..base },
-        ShadowSettings { splits: 2, ..base },
+        (BlurMethod::Rows, base),
+        (BlurMethod::Tiles, base),
+        (BlurMethod::Fragments, base),
+        (BlurMethod::Auto, ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }),
+        (BlurMethod::Auto, ShadowSettings { splits: 2, ..base }),
     ];
-    let bright = from_high_above(None, false);
+    let bright = from_high_above(&mut open(), None, false);
     let darker = |shown: &Picture| {
         let pairs = shown.image.rgba.iter().zip(&bright.image.rgba);
         pairs.filter(|(own, bright)| bright.abs_diff(**own) > 2).count()
     };
-    for shadow in kinds {
-        assert_eq!(darker(&from_high_above(Some(shadow), false)), 0, "{shadow:?}");
+    for (method, shadow) in kinds {
+        let mut renderer = open();
+        renderer.set_blur_method(method);
+        assert_eq!(darker(&from_high_above(&mut renderer, Some(shadow), false)), 0, "{method:?}, {shadow:?}");
     }
-    assert!(darker(&from_high_above(Some(base), true)) > 300, "control: a caster is seen");
+    assert!(darker(&from_high_above(&mut open(), Some(base), true)) > 300, "control: a caster is seen");
 }
 
 /// Number of pixels of a wall on the ground that are not fully lit, and number that are not fully dark.

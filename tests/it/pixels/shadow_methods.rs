@@ -1,8 +1,8 @@
 //! Every kind of shadow map compared with the same arithmetic: the shadow of a straight edge on the ground.
 
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
-use modalcast_model::scene::{BlurMethod, Camera, Lens, MomentFormat, Scene, ShadowMethod, ShadowSettings, View};
-use modalcast_render::plan;
+use modalcast_model::scene::{Camera, Lens, MomentFormat, Scene, ShadowMethod, ShadowSettings, View};
+use modalcast_render::{BlurMethod, plan};
 
 use super::harness::{Picture, close, draw, floor_mesh, open, planned_above};
 use super::shadow::{stage, with_square};
@@ -31,9 +31,16 @@ fn scene(shadow: ShadowSettings) -> std::sync::Arc<Scene> {
 
 /// Picture from straight above of the edge at z = 1 of the shadow of the square.
 fn edge(shadow: ShadowSettings) -> Picture {
+    edge_blurred_by(BlurMethod::Auto, shadow)
+}
+
+/// [`edge`] with this implementation of the blur.
+fn edge_blurred_by(method: BlurMethod, shadow: ShadowSettings) -> Picture {
+    let mut renderer = open();
+    renderer.set_blur_method(method);
     let view = View::LookAt { eye: [0.0, 20.0, 1.0], target: [0.0, 0.0, 1.0], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 20.0 * SCALE, fy: 20.0 * SCALE, cx: 32.0, cy: 32.0 };
-    draw(&mut open(), &scene(shadow), Camera { view, lens, near: 0.0, far: 0.0 }, 64)
+    draw(&mut renderer, &scene(shadow), Camera { view, lens, near: 0.0, far: 0.0 }, 64)
 }
 
 /// z of the ground at the center of a row.
@@ -71,21 +78,21 @@ fn expected(shadow: &ShadowSettings, z: f64) -> f64 {
 fn filtered_and_variance_maps_give_the_blurred_edge() {
     let base = variance();
     let kinds = [
-        ShadowSettings { method: ShadowMethod::PercentageCloser, ..base },
-        ShadowSettings { method: ShadowMethod::PercentageCloser, blur: 0.7, ..base },
-        ShadowSettings { blur_method: BlurMethod::Rows, ..base },
-        ShadowSettings { blur_method: BlurMethod::Tiles, ..base },
-        ShadowSettings { blur_method: BlurMethod::Tiles, blur: 0.0, ..base },
-        ShadowSettings { blur_method: BlurMethod::Tiles, blur: 4.0, ..base },
-        ShadowSettings { blur_method: BlurMethod::Fragments, ..base },
+        (BlurMethod::Auto, ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }),
+        (BlurMethod::Auto, ShadowSettings { method: ShadowMethod::PercentageCloser, blur: 0.7, ..base }),
+        (BlurMethod::Rows, base),
+        (BlurMethod::Tiles, base),
+        (BlurMethod::Tiles, ShadowSettings { blur: 0.0, ..base }),
+        (BlurMethod::Tiles, ShadowSettings { blur: 4.0, ..base }),
+        (BlurMethod::Fragments, base),
     ];
-    for shadow in kinds {
-        let seen = profile(&edge(shadow), 32);
+    for (method, shadow) in kinds {
+        let seen = profile(&edge_blurred_by(method, shadow), 32);
         let wrong = |shift: f64| {
             let error = |row: u32| (seen[row as usize] - expected(&shadow, z_of(row) + shift)).abs();
             (0..64).map(error).fold(0.0, f64::max)
         };
-        assert!(wrong(0.0) < 0.012, "{shadow:?}: {} at the worst", wrong(0.0));
+        assert!(wrong(0.0) < 0.012, "{method:?}, {shadow:?}: {} at the worst", wrong(0.0));
         assert!(wrong(0.5 * texel(&shadow)) > 0.02, "control: half a texel aside is seen");
     }
 }
@@ -95,7 +102,7 @@ fn all_blur_implementations_agree() {
     // Blurs of up to 8 texels use strips, which are taller in larger maps; wider blurs use tiles.
     for (blur, size) in [(0.0, 200), (1.5, 200), (4.0, 200), (8.0, 200), (9.0, 200), (16.0, 200), (2.3, 1100)] {
         let [tiles, rows, fragments] = [BlurMethod::Tiles, BlurMethod::Rows, BlurMethod::Fragments]
-            .map(|blur_method| edge(ShadowSettings { size, blur, blur_method, ..variance() }).image.rgba);
+            .map(|method| edge_blurred_by(method, ShadowSettings { size, blur, ..variance() }).image.rgba);
         let most = |other: &[u8]| tiles.iter().zip(other).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
         assert!(most(&rows) <= 1 && most(&fragments) <= 1, "blur {blur}: {} {}", most(&rows), most(&fragments));
         let wider = edge(ShadowSettings { size, blur: (blur + 1.0).min(15.0), ..variance() }).image.rgba;

@@ -4,7 +4,8 @@
 use serde::Serialize;
 
 use super::RenderRow;
-use modalcast_model::scene::{BlurMethod, ShadowSettings};
+use modalcast_model::scene::ShadowSettings;
+use modalcast_render::BlurMethod;
 
 /// Times of one map by both methods.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -28,15 +29,11 @@ pub(super) const MOST_US: f64 = 200.0;
 impl BlurComparison {
     /// Every map that was timed with both methods.
     pub(super) fn of(rows: &[RenderRow]) -> Vec<Self> {
-        let by =
-            |row: &RenderRow, wanted: fn(BlurMethod) -> bool| row.shadow.filter(|shadow| wanted(shadow.blur_method));
-        let fragments = rows.iter().filter_map(|row| Some((row, by(row, |way| way == BlurMethod::Fragments)?)));
+        let is_by_fragments = |row: &RenderRow| row.blur_method == BlurMethod::Fragments;
+        let fragments = rows.iter().filter(|row| is_by_fragments(row)).filter_map(|row| Some((row, row.shadow?)));
         let comparison_tables = |(row, shadow): (&RenderRow, ShadowSettings)| {
-            let same = |other: &&RenderRow| {
-                let own = by(other, |way| way != BlurMethod::Fragments);
-                other.load == row.load
-                    && own.map(|own| ShadowSettings { blur_method: shadow.blur_method, ..own }) == Some(shadow)
-            };
+            let same =
+                |other: &&RenderRow| other.load == row.load && other.shadow == Some(shadow) && !is_by_fragments(other);
             let compute_us = rows.iter().filter(same).filter_map(blur_us).min_by(f64::total_cmp)?;
             let fragments_us = blur_us(row)?;
             let ratio = fragments_us / compute_us;
@@ -60,13 +57,14 @@ mod tests {
     use crate::timing::Timing;
     use modalcast_model::scene::Culling;
 
-    fn row(load: &str, shadow: ShadowSettings, us: f64) -> RenderRow {
+    fn row(load: &str, (size, blur_method): (u32, BlurMethod), us: f64) -> RenderRow {
         let timing = Timing::of(vec![us]).expect("one");
         RenderRow {
             load: load.into(),
             name: String::new(),
             method: ShadowVariant::Variance,
-            shadow: Some(shadow),
+            shadow: Some(ShadowSettings { size, blur: 2.3, ..ShadowSettings::default() }),
+            blur_method,
             packing: None,
             culling: Culling::default(),
             bounds: ERROR_LIMITS,
@@ -91,19 +89,13 @@ mod tests {
 
     #[test]
     fn compares_fragments_with_fastest_compute_of_same_map() {
-        let map = |size: u32, blur_method: BlurMethod| ShadowSettings {
-            size,
-            blur: 2.3,
-            blur_method,
-            ..ShadowSettings::default()
-        };
         let rows = [
-            row("a", map(4096, BlurMethod::Tiles), 200.0),
-            row("a", map(4096, BlurMethod::Rows), 400.0),
-            row("a", map(4096, BlurMethod::Fragments), 9000.0),
-            row("a", map(1024, BlurMethod::Tiles), 1.0),
-            row("b", map(4096, BlurMethod::Tiles), 1.0),
-            row("b", map(1024, BlurMethod::Fragments), 50.0),
+            row("a", (4096, BlurMethod::Tiles), 200.0),
+            row("a", (4096, BlurMethod::Rows), 400.0),
+            row("a", (4096, BlurMethod::Fragments), 9000.0),
+            row("a", (1024, BlurMethod::Tiles), 1.0),
+            row("b", (4096, BlurMethod::Tiles), 1.0),
+            row("b", (1024, BlurMethod::Fragments), 50.0),
         ];
         let [only] = &BlurComparison::of(&rows)[..] else { panic!("one map was made both ways") };
         assert_eq!((only.load.as_str(), only.size, only.taps), ("a", 4096, 15));

@@ -20,7 +20,7 @@ use super::workloads::{AnimatedScene, RenderWorkload};
 use super::{RenderReportOptions, RenderWorkloadSummary, ShadowTexelSize, light_meter};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Camera, Culling, RenderSettings, Scene, ShadowSettings};
-use modalcast_render::{FrameCullStats, FrameImage, shadow_texel_axes};
+use modalcast_render::{BlurMethod, FrameCullStats, FrameImage, shadow_texel_axes};
 
 /// Step of the motion that still pictures show.
 pub(super) const STILL: usize = 10;
@@ -36,6 +36,9 @@ pub struct RenderRow {
     pub name: String,
     pub method: ShadowVariant,
     pub shadow: Option<ShadowSettings>,
+    /// Implementation of the shadow blur; part of the variant's name.
+    #[serde(skip)]
+    pub blur_method: BlurMethod,
     /// Packing of images in arrays, for variants that compare it.
     pub packing: Option<Packing>,
     /// Culling of the variant's look.
@@ -145,10 +148,12 @@ pub(super) fn load(
     let mut rows = Vec::new();
     for at in 0..job.variants.len() {
         progress(&format!("{}: {}", job.stage.name, job.variants[at].name));
+        studio.renderer.set_blur_method(job.variants[at].blur_method);
         let (row, file) = job.measure(studio, at)?;
         rows.push(row);
         files.push(file);
     }
+    studio.renderer.set_blur_method(BlurMethod::Auto);
     progress(&format!("{}: bare passes", job.stage.name));
     let bare = job.bare(studio, &rows)?;
     Ok(WorkloadResult { entry: job.entry(reference_ms), rows, bare, files })
@@ -375,6 +380,7 @@ impl WorkloadContext<'_> {
             name: variant.name.clone(),
             method: variant.method,
             shadow: variant.shadow,
+            blur_method: variant.blur_method,
             packing: variant.packing,
             culling: variant.look(self.stage.scene.look).culling,
             bounds,

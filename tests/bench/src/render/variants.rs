@@ -7,8 +7,9 @@ use serde::Serialize;
 use super::packing::Packing;
 use super::workloads::RenderWorkload;
 use modalcast_model::scene::{
-    BlurMethod, Culling, MomentFormat, RenderSettings, ShadowFit, ShadowMethod, ShadowSettings, Transparency,
+    Culling, MomentFormat, RenderSettings, ShadowFit, ShadowMethod, ShadowSettings, Transparency,
 };
+use modalcast_render::BlurMethod;
 
 /// Shadow technique.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -62,6 +63,8 @@ pub struct RenderVariant {
     pub packing: Option<Packing>,
     /// Culling, for variants that compare it. It does not change the picture.
     pub culling: Option<Culling>,
+    /// Implementation of the shadow blur. It does not change the picture beyond rounding.
+    pub blur_method: BlurMethod,
     pub aim: ReferenceKind,
 }
 
@@ -122,6 +125,7 @@ impl RenderVariant {
             transparency: None,
             packing: None,
             culling: None,
+            blur_method: BlurMethod::Auto,
             aim: ReferenceKind::Unshadowed,
         }
     }
@@ -136,6 +140,7 @@ impl RenderVariant {
             transparency: None,
             packing: None,
             culling: None,
+            blur_method: BlurMethod::Auto,
             aim: ReferenceKind::Hard,
         }
     }
@@ -171,8 +176,9 @@ impl RenderVariant {
 
     /// The same picture with the blur in other passes: a baseline for times.
     fn blurred((size, blur): (u32, f32), (name, blur_method): (&str, BlurMethod)) -> Self {
-        let shadow = ShadowSettings { size, blur, blur_method, ..ShadowSettings::default() };
-        Self::soft(format!("variance {size}, blur {blur}, {name}"), ShadowVariant::Variance, shadow)
+        let shadow = ShadowSettings { size, blur, ..ShadowSettings::default() };
+        let name = format!("variance {size}, blur {blur}, {name}");
+        Self { blur_method, ..Self::soft(name, ShadowVariant::Variance, shadow) }
     }
 
     /// Cascaded maps, sharper near the camera. The intended result is the hard shadow.
@@ -186,6 +192,7 @@ impl RenderVariant {
             transparency: None,
             packing: None,
             culling: None,
+            blur_method: BlurMethod::Auto,
             aim: ReferenceKind::Hard,
         }
     }
@@ -207,7 +214,16 @@ impl RenderVariant {
 
     fn soft(name: String, method: ShadowVariant, shadow: ShadowSettings) -> Self {
         let aim = ReferenceKind::Filtered { texels: shadow.filter_deviation() };
-        Self { name, method, shadow: Some(shadow), transparency: None, packing: None, culling: None, aim }
+        Self {
+            name,
+            method,
+            shadow: Some(shadow),
+            transparency: None,
+            packing: None,
+            culling: None,
+            blur_method: BlurMethod::Auto,
+            aim,
+        }
     }
 }
 
