@@ -41,7 +41,7 @@ use std::thread::JoinHandle;
 use tokio::sync::Semaphore;
 
 use self::blocking::run_blocking;
-use self::device::handle::DeviceHandle;
+use self::device::handle::DeviceThread;
 use self::registry::Registry;
 use self::scene::actor::SceneServices;
 use self::scene::handle::OpenParams;
@@ -86,6 +86,16 @@ impl Engine {
     /// `Unavailable` when a backend requested by name cannot be opened, or another server uses the state folder.
     pub async fn start(config: Config, source: Arc<dyn SceneSource>) -> Result<Self> {
         let config = Arc::new(config);
+        let device_config = Arc::clone(&config);
+        Self::start_with_device(config, source, move || DeviceContext::open(&device_config)).await
+    }
+
+    /// [`Self::start`] with the function that opens the devices on the device thread.
+    async fn start_with_device(
+        config: Arc<Config>,
+        source: Arc<dyn SceneSource>,
+        open_device: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
+    ) -> Result<Self> {
         let state = config.state.clone();
         let (scene_catalog, checkpoints) = run_blocking("state folder", move || {
             let scene_catalog = SceneCatalog::open(&state)?;
@@ -93,7 +103,8 @@ impl Engine {
             Ok((scene_catalog, Arc::new(checkpoints)))
         })
         .await?;
-        let (device_handle, info, device) = DeviceHandle::start(&config).await?;
+        let DeviceThread { handle: device_handle, info, thread: device } =
+            DeviceThread::start(config.open_scenes, open_device).await?;
         let shared = Shared {
             services: SceneServices { device_handle, checkpoints, config: Arc::clone(&config) },
             registry: Registry::new(config.open_scenes),
@@ -152,11 +163,9 @@ impl Engine {
     /// The open scene with this name.
     ///
     /// # Errors
-    /// `NotFound` when no open scene has this name, `Unavailable` when the server is shutting down.
+    /// `NotFound` when no open scene has this name, `Unavailable` when the server is shutting down, `DeviceLost`.
     pub fn find(&self, name: &str) -> Result<Arc<SceneHandle>> {
-        if self.is_stopping() {
-            return Err(stopping());
-        }
+        self.check_running()?;
         self.shared.registry.find(name)
     }
 
@@ -180,6 +189,7 @@ impl Engine {
     /// `Invalid` for a malformed name or entry path and for counts or sizes over the limits; `Taken` when the name is
     /// in use; `Busy` when too many uploads are in progress; `Fault` of the disk.
     pub async fn begin_upload(&self, header: UploadHeader) -> Result<Upload> {
+        self.check_running()?;
         validate_scene_name(&header.scene)?;
         let config = &self.shared.config;
         if header.files == 0 || header.files > config.upload_files {
@@ -246,6 +256,21 @@ impl Engine {
         self.shared.stopping.load(Ordering::Acquire)
     }
 
+    /// Waits until the device is lost: the server cannot go on, every scene fails with this error, and new ones are
+    /// refused. Cancel-safe.
+    pub async fn device_lost(&self) -> Error {
+        self.shared.services.device_handle.loss().wait().await
+    }
+
+    /// # Errors
+    /// `Unavailable` when the server is shutting down, `DeviceLost`.
+    fn check_running(&self) -> Result<()> {
+        if self.is_stopping() {
+            return Err(stopping());
+        }
+        self.shared.services.device_handle.loss().error().map_or(Ok(()), Err)
+    }
+
     async fn restore(&self) {
         let mut openings = tokio::task::JoinSet::new();
         for (name, provenance) in self.shared.scene_catalog.entries() {
@@ -268,9 +293,7 @@ impl Engine {
         provenance: SceneProvenance,
         upload: Option<Upload>,
     ) -> Result<Arc<SceneHandle>> {
-        if self.is_stopping() {
-            return Err(stopping());
-        }
+        self.check_running()?;
         let engine = self.clone();
         let work = async move {
             let entry = engine.shared.registry.entry(&name, &provenance, upload.is_some())?;

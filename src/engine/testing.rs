@@ -1,9 +1,12 @@
-//! Test scenes for the unit tests of the engine.
+//! Test scenes and a faulty deformer for the unit tests of the engine.
 
 use std::sync::Arc;
 
+use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
 use modalcast_model::domain::{Attachment, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
-use modalcast_model::scene::{DeformationSettings, Scene, SceneParts};
+use modalcast_model::error::{Error, Result};
+use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState};
 
 /// Two strips of two triangles with two modes each; the second is attached to the first.
 pub(super) fn two_strips() -> Arc<Scene> {
@@ -37,4 +40,72 @@ fn strips(deformation: DeformationSettings) -> Arc<Scene> {
     let domains = vec![domain("left", None), domain("right", Some(joint))];
     let (shapes, materials) = (vec![shape], vec![Material::default()]);
     Scene::new(SceneParts { shapes, materials, domains, deformation, ..SceneParts::named("strips") }).expect("a scene")
+}
+
+/// A fault that [`FaultyDeformer`] injects while it holds a state whose first coordinate is [`Self::q`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum InjectedFault {
+    PanicInDeform,
+    PanicInReadback,
+    PanicInWait,
+    DeviceLost,
+}
+
+impl InjectedFault {
+    const ALL: [Self; 4] = [Self::PanicInDeform, Self::PanicInReadback, Self::PanicInWait, Self::DeviceLost];
+
+    /// The first coordinate of a state that triggers the fault.
+    pub(super) fn q(self) -> f32 {
+        1000.0 + self as u8 as f32
+    }
+}
+
+/// The reference deformer with faults that the state triggers. Its readbacks are in flight until they are awaited.
+pub(super) struct FaultyDeformer {
+    inner: ReferenceDeformer,
+    fault: Option<InjectedFault>,
+    readbacks: Vec<Arc<DeformedSurface>>,
+}
+
+impl FaultyDeformer {
+    pub(super) fn boxed(scene: &Arc<Scene>) -> Box<dyn Deformer> {
+        Box::new(Self { inner: ReferenceDeformer::new(scene), fault: None, readbacks: Vec::new() })
+    }
+}
+
+impl Deformer for FaultyDeformer {
+    fn backend(&self) -> Backend {
+        Backend::Reference
+    }
+
+    fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
+        self.fault = InjectedFault::ALL.into_iter().find(|fault| state.q[0] == fault.q());
+        match self.fault {
+            Some(InjectedFault::PanicInDeform) => panic!("injected into deform"),
+            Some(InjectedFault::DeviceLost) => Err(device_lost()),
+            _ => self.inner.deform(state),
+        }
+    }
+
+    fn surface(&mut self) -> Result<&DeformedSurface> {
+        self.inner.surface()
+    }
+
+    fn readback(&mut self, _wanted: VertexAttributes) -> Result<VertexReadback> {
+        assert_ne!(self.fault, Some(InjectedFault::PanicInReadback), "injected into readback");
+        let surface = Arc::new(self.inner.surface()?.clone());
+        self.readbacks.push(Arc::clone(&surface));
+        Ok(VertexReadback::pending(surface))
+    }
+
+    fn wait_readback(&mut self, readback: &VertexReadback) -> Result<Arc<DeformedSurface>> {
+        assert_ne!(self.fault, Some(InjectedFault::PanicInWait), "injected into wait");
+        let at = self.readbacks.iter().position(|surface| readback.is_of(surface)).expect("its own readback");
+        Ok(self.readbacks.swap_remove(at))
+    }
+}
+
+/// The error of an injected device loss.
+pub(super) fn device_lost() -> Error {
+    Error::DeviceLost { stage: "deform", reason: "injected".into() }
 }

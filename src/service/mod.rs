@@ -43,7 +43,8 @@ pub async fn bind(config: &Config) -> Result<TcpListener> {
 }
 
 /// Serves until `shutdown` completes. Then reports "not serving" to health checks, ends every stream and returns within
-/// the configured drain time, whether or not clients close their connections.
+/// the configured drain time, whether or not clients close their connections. A lost device does not end the server,
+/// but health checks get "not serving" from then on, so that a supervisor can restart it.
 ///
 /// # Errors
 /// `Fault` when the transport fails.
@@ -58,13 +59,19 @@ pub async fn serve(
     let routes = routes(&engine, &config)?.with(health_server);
     let connections = listen::connections(listener, config.connections, config.first_byte_timeout);
     let (stop, stopped) = oneshot::channel();
-    let draining = engine.clone();
     let drain = async move {
-        shutdown.await;
+        let mut shutdown = std::pin::pin!(shutdown);
+        tokio::select! {
+            () = &mut shutdown => {}
+            _ = engine.device_lost() => {
+                set_health(&health, false).await;
+                shutdown.await;
+            }
+        }
         tracing::info!("the server stops");
-        let end = Instant::now() + draining.config().drain_timeout;
+        let end = Instant::now() + engine.config().drain_timeout;
         set_health(&health, false).await;
-        if tokio::time::timeout_at(end, draining.shutdown()).await.is_err() {
+        if tokio::time::timeout_at(end, engine.shutdown()).await.is_err() {
             tracing::warn!("the device did not stop in time");
         }
         stop.send(()).ok(); // Fails only if the transport has failed and dropped the receiver.

@@ -8,7 +8,7 @@ use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, VertexAttributes};
-use modalcast_model::error::Result;
+use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
 use modalcast_render::{AovImage, FrameImage, PickHit};
 
@@ -67,4 +67,20 @@ pub(in crate::engine) enum Command {
     },
     /// Ends the thread.
     Quit,
+}
+
+impl Command {
+    /// Answers the command with an error instead of executing it.
+    pub(super) fn refuse(self, error: Error) {
+        // A failed send means that the caller no longer waits.
+        match self {
+            Self::LoadScene { reply, .. } | Self::UnloadScene { reply, .. } => reply.send(Err(error)).ok(),
+            Self::Deform { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
+            Self::Draw { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
+            Self::RenderAov { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
+            Self::Pick { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
+            Self::ReadVertices { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
+            Self::Quit => None,
+        };
+    }
 }

@@ -46,6 +46,10 @@ impl PendingDraw {
     }
 }
 
+/// Creates the deformer of a scene in tests.
+#[cfg(test)]
+type CreateDeformer = fn(&Arc<Scene>) -> Box<dyn Deformer>;
+
 /// Owns the CUDA device and the renderer. Must remain on the thread that created it: the device thread of the server,
 /// or the main thread of `modalcast render`.
 #[derive(Debug)]
@@ -55,6 +59,8 @@ pub struct DeviceContext {
     renderer: Result<Renderer>,
     device: Option<Arc<gpu::Device>>,
     info: EngineInfo,
+    #[cfg(test)]
+    test_deformer: Option<CreateDeformer>,
 }
 
 impl DeviceContext {
@@ -71,7 +77,20 @@ impl DeviceContext {
             device: note,
             renderer: renderer.as_ref().map(|renderer| renderer.info().clone()).map_err(Clone::clone),
         };
-        Ok(Self { renderer, device, info })
+        Ok(Self {
+            renderer,
+            device,
+            info,
+            #[cfg(test)]
+            test_deformer: None,
+        })
+    }
+
+    /// A context without renderer whose scenes use the given deformer.
+    #[cfg(test)]
+    pub(in crate::engine) fn with_deformer(create: CreateDeformer) -> Result<Self> {
+        let config = Config { backend: BackendChoice::Reference, renderer: RendererChoice::Off, ..Config::default() };
+        Ok(Self { test_deformer: Some(create), ..Self::open(&config)? })
     }
 
     /// The backend in use.
@@ -95,22 +114,7 @@ impl DeviceContext {
     /// # Errors
     /// `Fault` of the device; `Invalid` when the rest state overflows.
     pub fn load_scene(&mut self, scene: &Arc<Scene>, backends: BackendSettings) -> Result<LoadedScene> {
-        let mut buffers = None;
-        let deformer: Box<dyn Deformer> = match (self.device.clone(), self.info.backend) {
-            (Some(device), Backend::Cuda) => {
-                buffers = self.shareable_buffers(scene)?;
-                let gl = buffers.as_ref().map(gl_buffers);
-                match CudaDeformer::new(&device, scene, gl) {
-                    Ok(deformer) => Box::new(deformer),
-                    Err(error) => {
-                        self.unload(buffers);
-                        return Err(error);
-                    }
-                }
-            }
-            (_, Backend::Reference) => Box::new(ReferenceDeformer::new(scene)),
-            _ => Box::new(CpuDeformer::new(scene)),
-        };
+        let (deformer, buffers) = self.create_deformer(scene)?;
         let mut loaded_scene = LoadedScene::new(scene, deformer, buffers);
         let ready = loaded_scene.rest().and_then(|()| self.attach_rasterizer(&mut loaded_scene, backends.raster));
         match ready {
@@ -122,21 +126,46 @@ impl DeviceContext {
         }
     }
 
+    /// Creates the deformer of a scene, and the OpenGL buffers that it writes to, if it writes to any.
+    fn create_deformer(&mut self, scene: &Arc<Scene>) -> Result<(Box<dyn Deformer>, Option<SceneBuffers>)> {
+        #[cfg(test)]
+        if let Some(create) = self.test_deformer {
+            return Ok((create(scene), None));
+        }
+        let device = match (self.device.clone(), self.info.backend) {
+            (Some(device), Backend::Cuda) => device,
+            (_, Backend::Reference) => return Ok((Box::new(ReferenceDeformer::new(scene)), None)),
+            _ => return Ok((Box::new(CpuDeformer::new(scene)), None)),
+        };
+        let buffers = self.shareable_buffers(scene)?;
+        match CudaDeformer::new(&device, scene, buffers.as_ref().map(gl_buffers)) {
+            Ok(deformer) => Ok((Box::new(deformer), buffers)),
+            Err(error) => {
+                self.unload(buffers);
+                Err(error)
+            }
+        }
+    }
+
     /// Creates the compute (CUDA) rasterizer of a scene unless `policy` is OpenGL, and, for [`RasterPolicy::Fastest`],
     /// measures both rasterizers and selects the faster one per pass. If the compute rasterizer cannot be created,
     /// OpenGL draws and the reason is logged.
     ///
     /// # Errors
-    /// The errors of drawing the measured frames.
+    /// `DeviceLost`; the errors of drawing the measured frames.
     fn attach_rasterizer(&mut self, loaded_scene: &mut LoadedScene, policy: RasterPolicy) -> Result<()> {
         let (Some(device), Ok(renderer)) = (&self.device, &mut self.renderer) else { return Ok(()) };
         if policy == RasterPolicy::OpenGl || renderer.info().cuda_device.is_none() {
             return Ok(());
         }
         let make = |mesh: RasterGeometry| Ok(Box::new(CudaRasterizer::new(device, mesh)?) as Box<dyn Rasterizer>);
-        if let Err(error) = loaded_scene.attach_rasterizer(renderer, make) {
-            tracing::warn!(%error, "OpenGL draws: its buffers have no rasteriser in CUDA");
-            return Ok(());
+        match loaded_scene.attach_rasterizer(renderer, make) {
+            Ok(()) => {}
+            Err(error @ Error::DeviceLost { .. }) => return Err(error),
+            Err(error) => {
+                tracing::warn!(%error, "OpenGL draws: its buffers have no rasterizer in CUDA");
+                return Ok(());
+            }
         }
         if policy == RasterPolicy::Fastest { loaded_scene.select_raster_backends(renderer) } else { Ok(()) }
     }

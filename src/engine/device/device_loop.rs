@@ -1,12 +1,22 @@
 //! The command loop of the device thread: executes commands and decides in which order it answers them.
 //!
+//! Frames, picks and vertex readbacks are answered asynchronously, each type from its own bounded queue
+//! ([`InFlightQueue`]). The loop polls readbacks that were started before a command, not those that the command starts;
+//! they overlap with the next command. AOVs are read back while their command is executed, because the renderer has no
+//! asynchronous readback for them, so no AOV is ever in flight.
+//!
 //! Frames pass through the renderer's ring buffer. The loop submits a frame, executes the commands after it, and
 //! answers the frame once the device has drawn it, or before the next submission when every ring slot is in flight. Two
 //! dedicated threads copy the pixels, so that the next command does not wait for the copy. They are separate from
 //! rayon's global thread pool because a long job in that pool, such as building a scene, would delay the copies. A
 //! delayed copy occupies its ring slot and so delays the frames of all scenes.
+//!
+//! # Failures
+//! A panic in a command, in a poll or in a copy costs that command: its reply channel is dropped, so its caller gets an
+//! error, and the loop continues. After the first `Error::DeviceLost` the loop refuses every command with that error
+//! except `UnloadScene`.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
@@ -15,29 +25,33 @@ use tokio::sync::mpsc;
 
 use super::command::{Command, Reply, SceneId, TimedVertices};
 use super::context::{DeviceContext, EngineInfo, PendingDraw};
+use super::device_loss::DeviceLossSender;
+use super::in_flight::{InFlight, InFlightQueue, Pollable};
 use super::loaded_scene::LoadedScene;
 use crate::telemetry::ms_since;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
 use modalcast_model::error::{Result, fault_in};
-use modalcast_model::scene::{Camera, FrameSize};
+use modalcast_model::scene::{Camera, FrameSize, PixelRect};
 use modalcast_render::{FrameImage, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
 
 /// How long the thread waits for a frame before it polls the command queue again.
 const POLL_INTERVAL: Duration = Duration::from_micros(100);
 /// Threads that copy pixels.
 const COPY_THREADS: usize = 2;
+/// Picks in flight. A further pick first waits for the oldest one.
+const MAX_PICKS_IN_FLIGHT: usize = 16;
+/// Vertex readbacks in flight: one that was started by the last command, and one by the command before it.
+const MAX_VERTEX_READBACKS_IN_FLIGHT: usize = 2;
 
 /// State owned by the device thread: the device context, the loaded scenes and the readbacks in flight.
-pub(in crate::engine) struct DeviceLoop {
-    device_context: DeviceContext,
+pub(super) struct DeviceLoop {
+    context: DeviceContext,
+    loss: DeviceLossSender,
     copy_pool: ThreadPool,
     scenes: HashMap<SceneId, LoadedScene>,
-    /// Vertex readbacks in flight, oldest first.
-    pending_vertices: VecDeque<PendingVertices>,
-    /// Picks in flight, oldest first.
-    picks: VecDeque<(PendingPick, Reply<Vec<PickHit>>)>,
-    /// Frames in flight, oldest first; at most [`MAX_FRAMES_IN_FLIGHT`].
-    frames: VecDeque<(PendingDraw, Reply<FrameImage>)>,
+    vertices: InFlightQueue<PendingVertices, TimedVertices>,
+    picks: InFlightQueue<PendingPick, Vec<PickHit>>,
+    frames: InFlightQueue<PendingDraw, FrameImage>,
 }
 
 /// A vertex readback in flight.
@@ -45,53 +59,31 @@ struct PendingVertices {
     id: SceneId,
     readback: VertexReadback,
     begin: Instant,
-    reply: Reply<TimedVertices>,
 }
 
-/// Executes commands until `Quit` arrives or every sender is dropped.
-pub(in crate::engine) fn run_device_loop(mut device_loop: DeviceLoop, mut inbox: mpsc::Receiver<Command>) {
-    while let Some(command) = next(&mut device_loop, &mut inbox) {
-        if matches!(command, Command::Quit) {
-            break;
-        }
-        // Wait for readbacks that were started before this command. Readbacks that it starts overlap with the next one.
-        let pending_vertices = device_loop.pending_vertices.len();
-        catch_panic(|| device_loop.execute(command));
-        for _ in 0..pending_vertices {
-            catch_panic(|| device_loop.finish_oldest_vertices());
-        }
-        while device_loop.picks.front().is_some_and(|(pick, _)| pick.is_ready()) {
-            catch_panic(|| device_loop.finish_oldest_pick());
-        }
-        while device_loop.frames.front().is_some_and(|(drawing, _)| drawing.is_ready_within(Duration::ZERO)) {
-            catch_panic(|| device_loop.finish_oldest_frame());
-        }
-    }
-    device_loop.pending_vertices.clear();
-    device_loop.picks.clear();
-    device_loop.frames.clear();
-    for (_, loaded_scene) in device_loop.scenes.drain() {
-        device_loop.device_context.unload_scene(loaded_scene);
+impl Pollable for PendingPick {
+    /// Ignores `limit`, because a pick can only be polled.
+    fn is_ready_within(&self, _limit: Duration) -> bool {
+        self.is_ready()
     }
 }
 
-/// The next command. While the queue is empty, waits for readbacks in flight and answers them.
-fn next(device_loop: &mut DeviceLoop, inbox: &mut mpsc::Receiver<Command>) -> Option<Command> {
-    while !(device_loop.pending_vertices.is_empty() && device_loop.picks.is_empty() && device_loop.frames.is_empty()) {
-        match inbox.try_recv() {
-            Ok(command) => return Some(command),
-            Err(_) => catch_panic(|| device_loop.poll_pending()),
-        }
+impl Pollable for PendingDraw {
+    fn is_ready_within(&self, limit: Duration) -> bool {
+        Self::is_ready_within(self, limit)
     }
-    inbox.blocking_recv()
 }
 
-/// Catches a panic of one command. The panicking command drops its reply channel, so its caller gets an error; the
-/// thread continues with the next command.
+/// Calls `act` and catches its panic. The panicking command drops its reply channel, so its caller gets an error.
 fn catch_panic(act: impl FnOnce()) {
     if catch_unwind(AssertUnwindSafe(act)).is_err() {
         tracing::error!("a command panicked on the device thread");
     }
+}
+
+/// Sends an answer and drops it if the caller no longer waits.
+fn answer<T>(reply: Reply<T>, result: Result<T>) {
+    reply.send(result).ok();
 }
 
 impl DeviceLoop {
@@ -99,152 +91,283 @@ impl DeviceLoop {
     ///
     /// # Errors
     /// `Fault` when the threads cannot be started.
-    pub(in crate::engine) fn new(device_context: DeviceContext) -> Result<Self> {
+    pub(super) fn new(context: DeviceContext, loss: DeviceLossSender) -> Result<Self> {
         let copy_pool =
             ThreadPoolBuilder::new().num_threads(COPY_THREADS).thread_name(|index| format!("pixels {index}"));
-        let copy_pool = copy_pool.build().map_err(fault_in("threads that copy pixels"))?;
-        let (pending_vertices, picks, frames) = (VecDeque::new(), VecDeque::new(), VecDeque::new());
-        Ok(Self { device_context, copy_pool, scenes: HashMap::new(), pending_vertices, picks, frames })
+        Ok(Self {
+            context,
+            loss,
+            copy_pool: copy_pool.build().map_err(fault_in("threads that copy pixels"))?,
+            scenes: HashMap::new(),
+            vertices: InFlightQueue::new(MAX_VERTEX_READBACKS_IN_FLIGHT),
+            picks: InFlightQueue::new(MAX_PICKS_IN_FLIGHT),
+            frames: InFlightQueue::new(MAX_FRAMES_IN_FLIGHT),
+        })
     }
 
     /// The backend that deforms and the renderer that draws.
-    pub(in crate::engine) const fn info(&self) -> &EngineInfo {
-        self.device_context.info()
+    pub(super) const fn info(&self) -> &EngineInfo {
+        self.context.info()
+    }
+
+    /// Executes commands until `Quit` arrives or every sender is dropped, then unloads all scenes.
+    pub(super) fn run(mut self, mut inbox: mpsc::Receiver<Command>) {
+        while let Some(command) = self.next_command(&mut inbox) {
+            if matches!(command, Command::Quit) {
+                break;
+            }
+            let older_vertices = self.vertices.len();
+            catch_panic(|| self.execute(command));
+            for _ in 0..older_vertices {
+                catch_panic(|| self.finish_oldest_vertices());
+            }
+            while self.picks.is_oldest_ready(Duration::ZERO) {
+                catch_panic(|| self.finish_oldest_pick());
+            }
+            while self.frames.is_oldest_ready(Duration::ZERO) {
+                catch_panic(|| self.finish_oldest_frame());
+            }
+        }
+        self.vertices.clear();
+        self.picks.clear();
+        self.frames.clear();
+        for (_, scene) in self.scenes.drain() {
+            catch_panic(|| self.context.unload_scene(scene));
+        }
+    }
+
+    /// The next command. While the command queue is empty, waits for readbacks in flight and answers them.
+    fn next_command(&mut self, inbox: &mut mpsc::Receiver<Command>) -> Option<Command> {
+        while !(self.vertices.is_empty() && self.picks.is_empty() && self.frames.is_empty()) {
+            match inbox.try_recv() {
+                Ok(command) => return Some(command),
+                Err(_) => catch_panic(|| self.finish_one()),
+            }
+        }
+        inbox.blocking_recv()
     }
 
     fn execute(&mut self, command: Command) {
-        let Self { device_context, scenes, .. } = self;
-        // A failed send below means that the caller no longer waits; its reply is dropped.
+        if let Some(error) = self.loss.error().filter(|_| !matches!(command, Command::UnloadScene { .. })) {
+            return command.refuse(error);
+        }
         match command {
             Command::LoadScene { id, scene, backends, reply } => {
-                let loaded_scene =
-                    device_context.load_scene(&scene, backends).map(|loaded_scene| scenes.insert(id, loaded_scene));
-                // The caller has gone, so no `UnloadScene` would ever follow.
-                if reply.send(loaded_scene.map(|_| ())).is_err()
-                    && let Some(loaded_scene) = scenes.remove(&id)
-                {
-                    device_context.unload_scene(loaded_scene);
+                let loaded = self.loss.note(self.context.load_scene(&scene, backends)).map(|scene| {
+                    self.scenes.insert(id, scene);
+                });
+                // If the caller has gone, no `UnloadScene` will follow.
+                if reply.send(loaded).is_err() {
+                    self.unload(id);
                 }
             }
             Command::Deform { id, state, reply } => {
-                reply.send(find(scenes, id).and_then(|loaded_scene| loaded_scene.deform_shared(&state))).ok();
+                let deformed = self.scene(id).and_then(|scene| scene.deform_shared(&state));
+                answer(reply, self.loss.note(deformed));
+            }
+            Command::UnloadScene { id, reply } => {
+                self.unload(id);
+                answer(reply, Ok(()));
             }
             Command::Draw { id, camera, size, reply } if !reply.is_closed() => self.draw(id, camera, size, reply),
             Command::RenderAov { id, camera, size, frame_output, reply } if !reply.is_closed() => {
-                reply
-                    .send(
-                        find(scenes, id).and_then(|loaded_scene| {
-                            device_context.render_aov(loaded_scene, &camera, size, frame_output)
-                        }),
-                    )
-                    .ok();
+                let Self { context, scenes, .. } = self;
+                let aov = find(scenes, id).and_then(|scene| context.render_aov(scene, &camera, size, frame_output));
+                answer(reply, self.loss.note(aov));
             }
             Command::Pick { id, camera, picture, rectangle, reply } if !reply.is_closed() => {
-                let pick = |loaded_scene| device_context.begin_pick(loaded_scene, &camera, picture, rectangle);
-                match find(scenes, id).and_then(pick) {
-                    Ok(pick) => self.picks.push_back((pick, reply)),
-                    Err(error) => {
-                        reply.send(Err(error)).ok();
-                    }
-                }
+                self.pick(id, camera, picture, rectangle, reply);
             }
-            Command::ReadVertices { id, wanted, reply } if !reply.is_closed() => {
-                self.begin_vertex_readback(id, wanted, reply)
-            }
+            Command::ReadVertices { id, wanted, reply } if !reply.is_closed() => self.read_vertices(id, wanted, reply),
             // The caller no longer waits, so the work is skipped.
             Command::Draw { .. }
             | Command::RenderAov { .. }
             | Command::Pick { .. }
             | Command::ReadVertices { .. }
             | Command::Quit => {}
-            Command::UnloadScene { id, reply } => {
-                if let Some(loaded_scene) = scenes.remove(&id) {
-                    device_context.unload_scene(loaded_scene);
-                }
-                reply.send(Ok(())).ok();
-            }
+        }
+    }
+
+    fn unload(&mut self, id: SceneId) {
+        if let Some(scene) = self.scenes.remove(&id) {
+            self.context.unload_scene(scene);
         }
     }
 
     /// Submits a frame. Waits for the oldest frame first if the ring is full.
     fn draw(&mut self, id: SceneId, camera: Camera, size: FrameSize, reply: Reply<FrameImage>) {
-        while self.frames.len() >= MAX_FRAMES_IN_FLIGHT {
+        while self.frames.is_full() {
             self.finish_oldest_frame();
         }
-        let device_context = &mut self.device_context;
-        let drawing =
-            find(&mut self.scenes, id).and_then(|loaded_scene| device_context.begin_draw(loaded_scene, &camera, size));
-        match drawing {
-            Ok(drawing) => self.frames.push_back((drawing, reply)),
-            Err(error) => {
-                reply.send(Err(error)).ok(); // Fails only if the caller no longer waits.
-            }
+        let Self { context, scenes, .. } = self;
+        let drawing = find(scenes, id).and_then(|scene| context.begin_draw(scene, &camera, size));
+        match self.loss.note(drawing) {
+            Ok(drawing) => self.frames.push(drawing, reply),
+            Err(error) => answer(reply, Err(error)),
+        }
+    }
+
+    /// Submits a pick. Waits for the oldest pick first if the queue is full.
+    fn pick(
+        &mut self,
+        id: SceneId,
+        camera: Camera,
+        picture: FrameSize,
+        rectangle: PixelRect,
+        reply: Reply<Vec<PickHit>>,
+    ) {
+        while self.picks.is_full() {
+            self.finish_oldest_pick();
+        }
+        let Self { context, scenes, .. } = self;
+        let pick = find(scenes, id).and_then(|scene| context.begin_pick(scene, &camera, picture, rectangle));
+        match self.loss.note(pick) {
+            Ok(pick) => self.picks.push(pick, reply),
+            Err(error) => answer(reply, Err(error)),
         }
     }
 
     /// Starts a vertex readback; answers immediately if the vertices are already in host memory.
-    fn begin_vertex_readback(&mut self, id: SceneId, wanted: VertexAttributes, reply: Reply<TimedVertices>) {
+    fn read_vertices(&mut self, id: SceneId, wanted: VertexAttributes, reply: Reply<TimedVertices>) {
+        while self.vertices.is_full() {
+            self.finish_oldest_vertices();
+        }
         let begin = Instant::now();
-        match find(&mut self.scenes, id).and_then(|loaded_scene| loaded_scene.readback(wanted)) {
-            Ok(readback) => {
-                let is_ready = readback.is_ready();
-                self.pending_vertices.push_back(PendingVertices { id, readback, begin, reply });
-                if is_ready {
-                    self.pending_vertices.rotate_right(1);
-                    self.finish_oldest_vertices();
-                }
+        let readback = self.scene(id).and_then(|scene| scene.readback(wanted));
+        match self.loss.note(readback) {
+            Ok(readback) if readback.is_ready() => {
+                self.finish_vertices(InFlight { pending: PendingVertices { id, readback, begin }, reply });
             }
-            Err(error) => {
-                reply.send(Err(error)).ok(); // As above.
-            }
+            Ok(readback) => self.vertices.push(PendingVertices { id, readback, begin }, reply),
+            Err(error) => answer(reply, Err(error)),
         }
     }
 
     /// Answers one readback in flight, or waits for a frame for at most [`POLL_INTERVAL`].
-    fn poll_pending(&mut self) {
-        if !self.pending_vertices.is_empty() {
-            return self.finish_oldest_vertices();
-        }
-        match (self.picks.front(), self.frames.front()) {
-            (Some((pick, _)), _) if pick.is_ready() => self.finish_oldest_pick(),
-            (_, Some((drawing, _))) if drawing.is_ready_within(POLL_INTERVAL) => self.finish_oldest_frame(),
-            (Some(_), None) => self.finish_oldest_pick(),
-            _ => {}
+    fn finish_one(&mut self) {
+        if !self.vertices.is_empty() {
+            self.finish_oldest_vertices();
+        } else if self.picks.is_oldest_ready(Duration::ZERO) {
+            self.finish_oldest_pick();
+        } else if self.frames.is_oldest_ready(POLL_INTERVAL) {
+            self.finish_oldest_frame();
+        } else if self.frames.is_empty() {
+            self.finish_oldest_pick();
         }
     }
 
     /// Waits for the oldest pick in flight and answers it.
     fn finish_oldest_pick(&mut self) {
-        let Some((pick, reply)) = self.picks.pop_front() else { return };
-        reply.send(self.device_context.finish_pick(pick)).ok(); // As above.
+        let Some(InFlight { pending, reply }) = self.picks.pop_oldest() else { return };
+        let hits = self.context.finish_pick(pending);
+        answer(reply, self.loss.note(hits));
     }
 
     /// Waits for the oldest frame in flight; a copy thread then copies and sends its pixels.
     fn finish_oldest_frame(&mut self) {
-        let Some((drawing, reply)) = self.frames.pop_front() else { return };
+        let Some(InFlight { pending, reply }) = self.frames.pop_oldest() else { return };
         if reply.is_closed() {
             return; // The caller no longer waits.
         }
-        match self.device_context.finish_draw(drawing) {
-            Ok(pixels) => self.copy_pool.spawn(move || {
-                catch_panic(|| {
-                    reply.send(Ok(pixels.into_image())).ok(); // As above.
-                });
-            }),
-            Err(error) => {
-                reply.send(Err(error)).ok(); // As above.
-            }
+        let pixels = self.context.finish_draw(pending);
+        match self.loss.note(pixels) {
+            Ok(pixels) => self.copy_pool.spawn(move || catch_panic(|| answer(reply, Ok(pixels.into_image())))),
+            Err(error) => answer(reply, Err(error)),
         }
     }
 
     /// Waits for the oldest vertex readback in flight and answers it.
     fn finish_oldest_vertices(&mut self) {
-        let Some(PendingVertices { id, readback, begin, reply }) = self.pending_vertices.pop_front() else { return };
-        let surface = find(&mut self.scenes, id).and_then(|loaded_scene| loaded_scene.wait_readback(&readback));
-        reply.send(surface.map(|surface| (surface, ms_since(begin)))).ok(); // As above.
+        if let Some(oldest) = self.vertices.pop_oldest() {
+            self.finish_vertices(oldest);
+        }
+    }
+
+    fn finish_vertices(&mut self, readback: InFlight<PendingVertices, TimedVertices>) {
+        let InFlight { pending: PendingVertices { id, readback, begin }, reply } = readback;
+        let surface = self.scene(id).and_then(|scene| scene.wait_readback(&readback));
+        answer(reply, self.loss.note(surface).map(|surface| (surface, ms_since(begin))));
+    }
+
+    fn scene(&mut self, id: SceneId) -> Result<&mut LoadedScene> {
+        find(&mut self.scenes, id)
     }
 }
 
 fn find(scenes: &mut HashMap<SceneId, LoadedScene>, id: SceneId) -> Result<&mut LoadedScene> {
-    scenes.get_mut(&id).ok_or_else(|| fault_in("device")(format!("scene {id} is not staged")))
+    scenes.get_mut(&id).ok_or_else(|| fault_in("device")(format!("scene {id} is not loaded")))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::super::handle::{DeviceHandle, DeviceThread};
+    use super::*;
+    use crate::engine::testing::{self, FaultyDeformer, InjectedFault};
+    use modalcast_model::backend_settings::BackendSettings;
+    use modalcast_model::error::Error;
+    use modalcast_model::scene::{Scene, SceneState};
+
+    const FAULTY: SceneId = 1;
+    const CONTROL: SceneId = 2;
+    const POSITIONS: VertexAttributes =
+        VertexAttributes { positions: true, normals: false, displacements: false, boxes: false };
+
+    /// A device thread with two loaded scenes.
+    async fn two_scenes() -> (DeviceHandle, Arc<Scene>) {
+        let open = || DeviceContext::with_deformer(FaultyDeformer::boxed);
+        let handle = DeviceThread::start(2, open).await.expect("starts").handle;
+        let scene = testing::two_strips();
+        for id in [FAULTY, CONTROL] {
+            handle.load_scene(id, &scene, BackendSettings::default()).await.expect("loads");
+        }
+        (handle, scene)
+    }
+
+    fn state(scene: &Scene, q: f32) -> Arc<SceneState> {
+        let mut state = SceneState::rest(scene);
+        state.q[0] = q;
+        Arc::new(state)
+    }
+
+    /// Deforms to `q` and returns the first positions.
+    async fn positions(handle: &DeviceHandle, id: SceneId, state: &Arc<SceneState>) -> Result<Vec<f32>> {
+        handle.deform(id, state).wait().await?;
+        handle.read_vertices(id, POSITIONS).wait().await.map(|(surface, _)| surface.positions.clone())
+    }
+
+    #[tokio::test]
+    async fn panicking_command_costs_only_that_command() {
+        use InjectedFault::{PanicInDeform, PanicInReadback, PanicInWait};
+        for fault in [PanicInDeform, PanicInReadback, PanicInWait] {
+            let (handle, scene) = two_scenes().await;
+            let good = state(&scene, 0.5);
+            let before = positions(&handle, FAULTY, &good).await.expect("deforms");
+            let error = positions(&handle, FAULTY, &state(&scene, fault.q())).await.expect_err("panics");
+            assert!(matches!(&error, Error::Fault { reason, .. } if reason.contains("panicked")), "{fault:?}: {error}");
+            let control = positions(&handle, CONTROL, &good).await;
+            assert_eq!(control.as_ref(), Ok(&before), "{fault:?}: the other scene goes on");
+            if fault == PanicInDeform {
+                // The state before the panic was restored.
+                let after = handle.read_vertices(FAULTY, POSITIONS).wait().await.expect("reads").0;
+                assert_eq!(after.positions, before);
+            }
+            assert_eq!(positions(&handle, FAULTY, &good).await.as_ref(), Ok(&before), "{fault:?}: the scene goes on");
+        }
+    }
+
+    #[tokio::test]
+    async fn lost_device_refuses_every_later_command() {
+        let (handle, scene) = two_scenes().await;
+        let good = state(&scene, 0.5);
+        positions(&handle, CONTROL, &good).await.expect("control: the device works");
+        assert_eq!(handle.loss().error(), None);
+        let lost = positions(&handle, FAULTY, &state(&scene, InjectedFault::DeviceLost.q())).await;
+        assert_eq!(lost, Err(testing::device_lost()));
+        assert_eq!(handle.loss().wait().await, testing::device_lost());
+        assert_eq!(positions(&handle, CONTROL, &good).await, Err(testing::device_lost()));
+        assert_eq!(handle.load_scene(3, &scene, BackendSettings::default()).await, Err(testing::device_lost()));
+        handle.unload_scene(CONTROL).await.expect("scenes are freed all the same");
+    }
 }

@@ -9,8 +9,8 @@ use tokio::sync::{mpsc, oneshot};
 
 use super::command::{Command, Reply, SceneId, TimedVertices};
 use super::context::{DeviceContext, EngineInfo};
-use super::device_loop::{DeviceLoop, run_device_loop};
-use crate::config::Config;
+use super::device_loop::DeviceLoop;
+use super::device_loss::{DeviceLoss, device_loss};
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use modalcast_model::backend_settings::BackendSettings;
@@ -24,43 +24,60 @@ use modalcast_render::{AovImage, FrameImage, MAX_FRAMES_IN_FLIGHT, PickHit};
 pub(in crate::engine) struct DeviceHandle {
     commands: mpsc::Sender<Command>,
     limit: usize,
+    loss: DeviceLoss,
 }
 
-impl DeviceHandle {
-    /// Starts the thread and waits until it has opened its devices.
+/// A running device thread.
+pub(in crate::engine) struct DeviceThread {
+    pub handle: DeviceHandle,
+    pub info: EngineInfo,
+    pub thread: std::thread::JoinHandle<()>,
+}
+
+impl DeviceThread {
+    /// Starts the thread for up to `open_scenes` scenes; waits until `open` has opened its devices.
     ///
     /// # Errors
-    /// `Unavailable` when the requested backend cannot be opened, `Fault` when a thread cannot be started.
+    /// The errors of `open`; `Fault` when a thread cannot be started.
     pub(in crate::engine) async fn start(
-        config: &Arc<Config>,
-    ) -> Result<(Self, EngineInfo, std::thread::JoinHandle<()>)> {
-        // A scene queues at most FRAMES_UNDER_WAY frames, one copy and the next step, and an opening queues one command
-        // more. The queue is therefore full only when scenes are opened faster than the limit on open scenes allows.
-        let limit = (3 + MAX_FRAMES_IN_FLIGHT) * config.open_scenes + 8;
+        open_scenes: usize,
+        open: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
+    ) -> Result<Self> {
+        // A scene queues at most MAX_FRAMES_IN_FLIGHT frames, one copy and the next step, and an opening queues one
+        // command more. The queue is therefore full only when scenes are opened faster than the limit on open scenes
+        // allows.
+        let limit = (3 + MAX_FRAMES_IN_FLIGHT) * open_scenes + 8;
         let (commands, inbox) = mpsc::channel(limit);
         let (info_sender, info_receiver) = oneshot::channel();
-        let config = Arc::clone(config);
+        let (loss_sender, loss) = device_loss();
         let thread = std::thread::Builder::new()
             .name("device".into())
-            .spawn(move || match DeviceContext::open(&config).and_then(DeviceLoop::new) {
+            .spawn(move || match open().and_then(|context| DeviceLoop::new(context, loss_sender)) {
                 Ok(device_loop) => {
                     info_sender.send(Ok(device_loop.info().clone())).ok(); // Fails if the caller has gone; the queue is closed then.
-                    run_device_loop(device_loop, inbox);
+                    device_loop.run(inbox);
                 }
                 Err(error) => {
                     info_sender.send(Err(error)).ok(); // As above.
                 }
             })
             .map_err(fault_in("device thread"))?;
-        let info = info_receiver.await.map_err(|_| gone())??;
-        Ok((Self { commands, limit }, info, thread))
+        let info = info_receiver.await.map_err(|_| no_answer())??;
+        Ok(Self { handle: DeviceHandle { commands, limit, loss }, info, thread })
     }
+}
 
+impl DeviceHandle {
     /// A handle for tests that play the device thread, and the receiver of its commands.
     #[cfg(test)]
     pub(in crate::engine) fn mock() -> (Self, mpsc::Receiver<Command>) {
         let (commands, inbox) = mpsc::channel(16);
-        (Self { commands, limit: 16 }, inbox)
+        (Self { commands, limit: 16, loss: device_loss().1 }, inbox)
+    }
+
+    /// Whether the device is lost.
+    pub(in crate::engine) const fn loss(&self) -> &DeviceLoss {
+        &self.loss
     }
 
     pub(in crate::engine) async fn load_scene(
@@ -121,8 +138,8 @@ impl DeviceHandle {
     /// Waits for queue capacity, so that a scene never remains on the device because the queue was full.
     pub(in crate::engine) async fn unload_scene(&self, id: SceneId) -> Result<()> {
         let (reply, answer) = oneshot::channel();
-        self.commands.send(Command::UnloadScene { id, reply }).await.map_err(|_| gone())?;
-        answer.await.map_err(|_| gone())?
+        self.commands.send(Command::UnloadScene { id, reply }).await.map_err(|_| no_answer())?;
+        answer.await.map_err(|_| no_answer())?
     }
 
     /// Ends the thread after the commands already queued. Blocks until the queue has capacity, so it must not be called
@@ -142,7 +159,7 @@ impl DeviceHandle {
         PendingReply(match self.commands.try_send(make(reply)) {
             Ok(()) => Ok(answer),
             Err(TrySendError::Full(_)) => Err(Error::Busy { queue: "device", limit: self.limit }),
-            Err(TrySendError::Closed(_)) => Err(gone()),
+            Err(TrySendError::Closed(_)) => Err(no_answer()),
         })
     }
 }
@@ -159,13 +176,13 @@ impl<T> PendingReply<T> {
     /// As [`Self::wait`], but cancel-safe. Must not be called again after it has returned.
     pub(in crate::engine) async fn recv(&mut self) -> Result<T> {
         match &mut self.0 {
-            Ok(answer) => answer.await.map_err(|_| gone())?,
+            Ok(answer) => answer.await.map_err(|_| no_answer())?,
             Err(error) => Err(error.clone()),
         }
     }
 }
 
-/// The error for a dropped reply channel: the command panicked or the thread has ended.
-fn gone() -> Error {
-    fault_in("device")("the device thread gave no answer")
+/// The error for a dropped reply channel.
+fn no_answer() -> Error {
+    fault_in("device")("the command panicked or the device thread has ended")
 }

@@ -1,6 +1,7 @@
 //! A scene loaded on the device thread: its deformer, its OpenGL buffers (created on first use), and the last valid
 //! state.
 
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::Arc;
 
 use super::scalar_field;
@@ -109,22 +110,20 @@ impl LoadedScene {
     /// [`Self::deform`] of a shared state, without a copy.
     pub(in crate::engine) fn deform_shared(&mut self, state: &Arc<SceneState>) -> Result<DeformSummary> {
         self.filled = false;
-        let deformed = match self.run(state) {
-            Ok(deformed) => deformed,
-            Err(error) => {
-                // The output may be partially written, so restore it. If that fails too, the first error says more.
-                self.run(&Arc::clone(&self.current_state)).ok();
-                return Err(error);
-            }
-        };
+        let attempt = catch_unwind(AssertUnwindSafe(|| self.run(state)));
+        if !matches!(attempt, Ok(Ok(_) | Err(Error::DeviceLost { .. }))) {
+            // The output may be partially written, so restore it. If that fails too, the first error says more.
+            self.run(&Arc::clone(&self.current_state)).ok();
+        }
+        let deformed = attempt.unwrap_or_else(|panic| resume_unwind(panic))?;
         if is_in_range(&deformed.bounds) {
             (self.bounds, self.light) = (deformed.bounds, deformed.light);
             self.current_state = Arc::clone(state);
             return Ok(deformed);
         }
-        let refusal = self.overflow_error(state)?;
+        let refusal = self.overflow_error(state);
         self.run(&Arc::clone(&self.current_state))?;
-        Err(refusal)
+        Err(refusal.unwrap_or_else(|error| error))
     }
 
     fn run(&mut self, state: &SceneState) -> Result<DeformSummary> {

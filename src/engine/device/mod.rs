@@ -5,6 +5,8 @@
 pub(super) mod command;
 pub(super) mod context;
 mod device_loop;
+mod device_loss;
 pub(super) mod handle;
+mod in_flight;
 pub(super) mod loaded_scene;
 pub(super) mod scalar_field;

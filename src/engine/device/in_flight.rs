@@ -1,0 +1,119 @@
+//! A bounded queue of readbacks that the device has not finished yet, each with the channel for its answer.
+
+use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::Duration;
+
+use super::command::Reply;
+
+/// Work on the device whose completion can be polled.
+pub(super) trait Pollable {
+    /// Waits at most `limit`. Returns whether the result can then be collected without waiting.
+    fn is_ready_within(&self, limit: Duration) -> bool;
+}
+
+/// A readback in flight.
+pub(super) struct InFlight<P, T> {
+    pub pending: P,
+    pub reply: Reply<T>,
+}
+
+/// Readbacks of one type, oldest first. The caller collects the oldest one before it pushes into a full queue.
+pub(super) struct InFlightQueue<P, T> {
+    entries: VecDeque<InFlight<P, T>>,
+    capacity: usize,
+}
+
+impl<P, T> InFlightQueue<P, T> {
+    pub(super) fn new(capacity: usize) -> Self {
+        Self { entries: VecDeque::with_capacity(capacity), capacity }
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.entries.len()
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.entries.is_empty()
+    }
+
+    pub(super) fn is_full(&self) -> bool {
+        self.entries.len() >= self.capacity
+    }
+
+    /// Adds the newest readback. The queue must not be full.
+    pub(super) fn push(&mut self, pending: P, reply: Reply<T>) {
+        debug_assert!(!self.is_full(), "the oldest readback is collected first");
+        self.entries.push_back(InFlight { pending, reply });
+    }
+
+    pub(super) fn pop_oldest(&mut self) -> Option<InFlight<P, T>> {
+        self.entries.pop_front()
+    }
+
+    /// Drops all readbacks; their callers get an error.
+    pub(super) fn clear(&mut self) {
+        self.entries.clear();
+    }
+}
+
+impl<P: Pollable, T> InFlightQueue<P, T> {
+    /// Waits at most `limit` for the oldest readback; returns whether it is ready. If the poll panics, the oldest
+    /// readback is dropped, so that its caller gets an error and the next poll does not panic again.
+    pub(super) fn is_oldest_ready(&mut self, limit: Duration) -> bool {
+        let Some(oldest) = self.entries.front() else { return false };
+        match catch_unwind(AssertUnwindSafe(|| oldest.pending.is_ready_within(limit))) {
+            Ok(is_ready) => is_ready,
+            Err(_) => {
+                tracing::error!("polling a readback panicked on the device thread");
+                self.entries.pop_front();
+                false
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::sync::oneshot;
+
+    use super::*;
+
+    enum Fake {
+        Ready,
+        Busy,
+        Panics,
+    }
+
+    impl Pollable for Fake {
+        fn is_ready_within(&self, _: Duration) -> bool {
+            match self {
+                Self::Ready => true,
+                Self::Busy => false,
+                Self::Panics => panic!("injected"),
+            }
+        }
+    }
+
+    #[test]
+    fn panicking_poll_costs_only_the_polled_readback() {
+        let mut queue = InFlightQueue::<Fake, u32>::new(3);
+        let mut answers = Vec::new();
+        for pending in [Fake::Panics, Fake::Ready, Fake::Busy] {
+            let (reply, answer) = oneshot::channel();
+            queue.push(pending, reply);
+            answers.push(answer);
+        }
+        assert!(queue.is_full());
+        assert!(!queue.is_oldest_ready(Duration::ZERO));
+        assert_eq!(queue.len(), 2);
+        answers[0].try_recv().expect_err("its reply is dropped");
+        assert!(queue.is_oldest_ready(Duration::ZERO), "the next one is polled");
+        let ready = queue.pop_oldest().expect("the second");
+        ready.reply.send(Ok(7)).expect("its caller waits");
+        assert_eq!(answers[1].try_recv(), Ok(Ok(7)));
+        assert!(!queue.is_oldest_ready(Duration::ZERO));
+        assert_eq!(queue.len(), 1, "a readback that is not ready stays");
+        assert!(matches!(answers[2].try_recv(), Err(oneshot::error::TryRecvError::Empty)));
+    }
+}
