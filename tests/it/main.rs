@@ -8,6 +8,7 @@ mod far;
 mod following;
 mod frames;
 mod hostile;
+mod import_cycles;
 mod layering;
 mod light;
 mod normals;
