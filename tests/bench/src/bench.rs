@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::UploadTiming;
 use super::cuda_variants;
 use super::error_model::ErrorModelCache;
-use super::variant::{DeformerVariant, Variant, VariantLabel};
+use super::variant::{DeformerVariant, VariantCandidate, VariantFilter, VariantLabel, make_candidate};
 use super::workloads::Workload;
 use crate::kernels;
 use modalcast_compute::cpu::{CpuDeformer, read_bandwidth};
@@ -30,12 +30,6 @@ pub struct MemoryBandwidth {
     pub pinned_h2d_gbs: Option<f64>,
     pub pinned_d2h_gbs: Option<f64>,
 }
-
-/// Predicate: whether the request selects a variant of this name.
-pub type VariantFilter<'a> = &'a dyn Fn(&str) -> bool;
-
-/// A variant, or the reason why it could not be created.
-pub type VariantCandidate = (VariantLabel, Result<Box<dyn Variant>>);
 
 /// Source of variants and of reference rates; the tests have one of their own.
 pub trait BenchTarget {
@@ -204,19 +198,6 @@ fn exact_normals(scene: &Scene) -> Option<DeformationSettings> {
     let rigid =
         scene.needs.modes && cuda_variants::has_normals(scene) && scene.deformation.normals == NormalMethod::Rigid;
     rigid.then_some(DeformationSettings { normals: NormalMethod::Exact, ..scene.deformation })
-}
-
-/// Creates a variant if it is wanted; otherwise, and on failure, keeps the reason.
-pub fn make_candidate<V: Variant + 'static>(
-    wanted: VariantFilter<'_>,
-    label: VariantLabel,
-    make: impl FnOnce(VariantLabel) -> Result<V>,
-) -> VariantCandidate {
-    if !wanted(&label.name) {
-        let given = label.name.clone();
-        return (label, Err(Error::NotFound { what: "variant that is asked for", given }));
-    }
-    (label.clone(), make(label).map(|variant| Box::new(variant) as Box<dyn Variant>))
 }
 
 fn entries(scene: &Scene) -> usize {

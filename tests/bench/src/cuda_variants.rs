@@ -2,11 +2,10 @@
 
 use std::sync::Arc;
 
-use super::bench::{VariantCandidate, VariantFilter, make_candidate};
 use super::error_model::{ErrorModel, ErrorModelCache};
 use super::memory_traffic::Operand;
 use super::timing::{CacheState, Timing};
-use super::variant::{Variant, VariantLabel};
+use super::variant::{Variant, VariantCandidate, VariantFilter, VariantLabel, make_candidate};
 use crate::kernels;
 use crate::kernels::{
     BatchMmaBenchmark, CublasBenchmark, CublasMethod, DeformerBenchmark, KernelAttributes, KernelBenchmark,

@@ -9,7 +9,7 @@ use serde::Serialize;
 use super::error_model::ErrorModel;
 use super::errors::{ErrorNorms, NormAccumulator, in_pieces};
 use super::exact_positions::{ErrorModelTerms, positions};
-use super::motion::ExactState;
+use super::exact_state::ExactState;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
 
 /// Displacement of a vertex by each source alone, meters.

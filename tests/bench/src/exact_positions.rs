@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use super::double_double::DoubleDouble;
 use super::error_model::ErrorModel;
-use super::motion::ExactState;
+use super::exact_state::ExactState;
 use modalcast_compute::storage::TiledModes;
 use modalcast_model::domain::Modes;
 use modalcast_model::scene::{Scene, SceneState};

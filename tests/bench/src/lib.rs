@@ -20,6 +20,7 @@ pub mod error_model;
 pub mod error_sources;
 pub mod errors;
 pub mod exact_positions;
+mod exact_state;
 pub mod kernels;
 mod markdown;
 pub mod memory_traffic;

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::motion::ExactState;
+use super::exact_state::ExactState;
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::load::parse_numpy;
 use modalcast_model::scene::Scene;

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use super::error_model::ErrorModel;
 use super::exact_positions::{ErrorModelTerms, positions};
+use super::exact_state::ExactState;
 use super::memory_traffic::Operand;
-use super::motion::ExactState;
 use super::timing::{CacheState, Timing};
 use super::variant::{Variant, VariantLabel};
 use modalcast_model::deform::DeformedSurface;

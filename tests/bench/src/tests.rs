@@ -1,9 +1,9 @@
 use super::*;
-use bench::{VariantCandidate, VariantFilter, make_candidate};
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_model::error::invalid;
 use testing::Damaged;
 use variant::{DeformerVariant, VariantLabel};
+use variant::{VariantCandidate, VariantFilter, make_candidate};
 
 /// A bench with the CPU deformer, intact and damaged, and a variant that cannot be created.
 struct Mixed {

@@ -7,7 +7,7 @@ use super::memory_traffic::{self, Operand};
 use super::timing::{CacheState, Timing};
 use crate::kernels::KernelAttributes;
 use modalcast_model::deform::{Backend, DeformedSurface, Deformer};
-use modalcast_model::error::Result;
+use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneState};
 
 /// Identity of a variant.
@@ -124,4 +124,23 @@ impl Variant for DeformerVariant {
         let deformer = &mut self.deformer;
         Timing::by_wall_clock(cache, replays, |replay| deformer.deform(&states[replay % states.len()]).map(drop))
     }
+}
+
+/// Predicate: whether the request selects a variant of this name.
+pub type VariantFilter<'a> = &'a dyn Fn(&str) -> bool;
+
+/// A variant, or the reason why it could not be created.
+pub type VariantCandidate = (VariantLabel, Result<Box<dyn Variant>>);
+
+/// Creates a variant if it is wanted; otherwise, and on failure, keeps the reason.
+pub fn make_candidate<V: Variant + 'static>(
+    wanted: VariantFilter<'_>,
+    label: VariantLabel,
+    make: impl FnOnce(VariantLabel) -> Result<V>,
+) -> VariantCandidate {
+    if !wanted(&label.name) {
+        let given = label.name.clone();
+        return (label, Err(Error::NotFound { what: "variant that is asked for", given }));
+    }
+    (label.clone(), make(label).map(|variant| Box::new(variant) as Box<dyn Variant>))
 }

@@ -10,7 +10,8 @@ use super::light_meter::relit;
 use super::measure::STILL;
 use super::metrics::{ErrorDistribution, colors};
 use super::raster_comparison::{MAPS, MOST_DIFFERING};
-use super::workloads::{add, room, screen};
+use super::rigid_domain::add_rigid_domain;
+use super::workloads::{room, screen};
 use super::{RenderReportOptions, harness};
 use modalcast_compute::gpu::Device;
 use modalcast_model::error::Result;
@@ -102,7 +103,7 @@ pub(super) fn measure(
     }
     for (name, (mesh, camera)) in [("room", room()?), ("screen", screen()?)] {
         let mut parts = SceneParts::named(name);
-        add(&mut parts, name, mesh, modalcast_model::domain::Material::default())?;
+        add_rigid_domain(&mut parts, name, mesh, modalcast_model::domain::Material::default())?;
         let scene = Scene::new(parts)?;
         jobs.push(FrameSetup::new(name, &scene, (SceneState::rest(&scene), camera), request)?);
     }

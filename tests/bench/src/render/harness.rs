@@ -5,7 +5,6 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use super::plants;
 use crate::timing::{MIN_REPETITIONS, Timing};
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{CudaRasterizer, Device};
@@ -15,6 +14,11 @@ use modalcast_model::error::{Result, fault_in};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Bounds, Camera, LightSpaceBox, Scene, SceneState};
 use modalcast_render::{DevicePreference, FrameImage, FrameParams, Renderer, SceneBuffers};
+
+/// The first CUDA device with a working compiler, if there is one.
+pub(super) fn cuda_device() -> Option<Arc<Device>> {
+    Device::open(0).ok().filter(|device| device.check_compiler().is_ok())
+}
 
 /// Size of a picture in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -78,7 +82,7 @@ impl RenderHarness {
         camera: Camera,
         size: Size,
     ) -> Result<()> {
-        let Some(device) = plants::device().filter(|_| policy != RasterPolicy::OpenGl) else { return Ok(()) };
+        let Some(device) = cuda_device().filter(|_| policy != RasterPolicy::OpenGl) else { return Ok(()) };
         self.attach_rasterizer(set, &device)?;
         if policy == RasterPolicy::Fastest {
             let shot = set.shot(camera, size);

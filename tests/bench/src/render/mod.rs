@@ -44,6 +44,7 @@ mod reference_image;
 mod reference_material;
 mod reference_texture;
 mod reference_view;
+mod rigid_domain;
 mod sample_pattern;
 mod shade;
 #[cfg(test)]
@@ -187,7 +188,7 @@ pub fn render(request: &RenderReportOptions, mut progress: impl FnMut(&str)) -> 
         progress(&format!("{}: reading back", kind.name()));
         readback.push(readback::measure(&mut studio, request, *kind)?);
     }
-    let device = plants::device();
+    let device = harness::cuda_device();
     let raster = match &device {
         Some(device) => raster_comparison::measure(&mut studio, device, request, &mut progress)?,
         None => Vec::new(),

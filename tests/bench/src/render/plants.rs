@@ -61,11 +61,6 @@ const STATES: usize = 8;
 /// Sides of the shadow map in a full and in a quick run.
 const MAPS: (u32, u32) = (4096, 1024);
 
-/// The first CUDA device with a working compiler, if there is one.
-pub(super) fn device() -> Option<Arc<Device>> {
-    Device::open(0).ok().filter(|device| device.check_compiler().is_ok())
-}
-
 /// A plant's deformer and renderer buffers. The deformer is dropped first, because it may write the buffers.
 struct PlantSetup {
     deformer: Box<dyn Deformer>,

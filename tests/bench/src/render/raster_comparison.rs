@@ -10,7 +10,8 @@ use serde::Serialize;
 use super::frame_comparison::{self, FrameComparison};
 use super::harness::{HarnessScene, RenderHarness, Size};
 use super::measure::STILL;
-use super::workloads::{RenderWorkload, add, room, screen};
+use super::rigid_domain::add_rigid_domain;
+use super::workloads::{RenderWorkload, room, screen};
 use super::{RenderReportOptions, comparison_tables, minimal_passes};
 use crate::kernels;
 use crate::kernels::{KernelBenchmark as _, RasterBenchmark, RasterCounts, RasterMesh};
@@ -193,7 +194,7 @@ pub(super) fn measure(
     for (name, (mesh, camera)) in [("room", room()?), ("screen", screen()?)] {
         progress(&format!("{name}: raster"));
         let mut parts = SceneParts { look: RenderSettings::default(), ..SceneParts::named(name) };
-        add(&mut parts, name, mesh, modalcast_model::domain::Material::default())?;
+        add_rigid_domain(&mut parts, name, mesh, modalcast_model::domain::Material::default())?;
         let scene = Scene::new(parts)?;
         let state = SceneState::rest(&scene);
         list.push(RasterSetup::new(name, &scene, (state, camera), request)?.measure(studio, device)?);
@@ -337,7 +338,7 @@ mod tests {
         let mut studio = RenderHarness::open().expect("OpenGL");
         let (mesh, camera) = room().expect("a room");
         let mut parts = SceneParts::named("room");
-        add(&mut parts, "room", mesh, modalcast_model::domain::Material::default()).expect("added");
+        add_rigid_domain(&mut parts, "room", mesh, modalcast_model::domain::Material::default()).expect("added");
         let scene = Scene::new(parts).expect("a scene");
         let request = RenderReportOptions {
             loads: vec![],

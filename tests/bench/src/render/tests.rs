@@ -11,8 +11,9 @@ use super::ray_scene::{Ray, RayScene};
 use super::reference_image::{ReferenceImage, SampleCounts, SunTerm, trace};
 use super::reference_texture::linear_from_srgb;
 use super::reference_view::View;
+use super::rigid_domain::add_rigid_domain;
 use super::variants;
-use super::workloads::{RenderWorkload, add, lying, quad};
+use super::workloads::{RenderWorkload, lying, quad};
 use super::{RenderReportOptions, render};
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
@@ -69,7 +70,7 @@ fn pixels_are_as_bright_as_their_covered_area() {
     let mut parts = bare();
     let white = Material { ambient: [1.0; 3], diffuse: [0.0; 3], ..Material::default() };
     // 10.35 by 7.8 pixels; the left edge bisects a column of pixels.
-    add(&mut parts, "square", facing([-0.55, -0.38, 0.485, 0.4], 0.0), white).expect("added");
+    add_rigid_domain(&mut parts, "square", facing([-0.55, -0.38, 0.485, 0.4], 0.0), white).expect("added");
     parts.look.skylight = [1.0; 3];
     let picture = pictures(parts, false, &[SunTerm::Unshadowed], 32).remove(0);
     let area: f64 = (0..32 * 32).map(|at| linear(&picture, at).x).sum();
@@ -89,7 +90,7 @@ fn shades_one_pixel_by_equation_3_12() {
         shininess: 3.0,
         ..Material::default()
     };
-    add(&mut parts, "square", facing([-3.0, -3.0, 3.0, 3.0], 0.0), material).expect("added");
+    add_rigid_domain(&mut parts, "square", facing([-3.0, -3.0, 3.0, 3.0], 0.0), material).expect("added");
     parts.look.sun = [3.0, 0.0, 4.0];
     let picture = pictures(parts, false, &[SunTerm::Unshadowed], 41).remove(0);
     // The center of the middle pixel is the origin, so the eye is straight ahead and v_e' is n.
@@ -108,7 +109,7 @@ fn back_face_is_visible_only_if_double_sided() {
         let mut parts = bare();
         let turned = quad([[1.0, -1.0, 0.0], [-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, 1.0, 0.0]], [0.0, 0.0, -1.0]);
         let material = Material { double_sided, ..Material::default() };
-        add(&mut parts, "square", turned.expect("a square"), material).expect("added");
+        add_rigid_domain(&mut parts, "square", turned.expect("a square"), material).expect("added");
         linear(&pictures(parts, false, &[SunTerm::Unshadowed], 9).remove(0), 40).x
     };
     assert!((shown(true) - 0.75).abs() < 1e-6 && shown(false) == 0.0);
@@ -122,10 +123,10 @@ fn sorts_transparent_layers_in_any_order() {
         for (ambient, z) in [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]].into_iter().zip(depths) {
             let (diffuse, alpha_mode) = ([0.0; 3], AlphaMode::Blend);
             let glass = Material { ambient, diffuse, alpha: 0.5, alpha_mode, ..Material::default() };
-            add(&mut parts, "pane", facing([-1.0, -1.0, 1.0, 1.0], z), glass).expect("added");
+            add_rigid_domain(&mut parts, "pane", facing([-1.0, -1.0, 1.0, 1.0], z), glass).expect("added");
         }
         let behind = Material { ambient: [0.0, 0.0, 1.0], diffuse: [0.0; 3], ..Material::default() };
-        add(&mut parts, "behind", facing([-2.0, -2.0, 2.0, 2.0], -0.5), behind).expect("added");
+        add_rigid_domain(&mut parts, "behind", facing([-2.0, -2.0, 2.0, 2.0], -0.5), behind).expect("added");
         linear(&pictures(parts, false, &[SunTerm::Unshadowed], 9).remove(0), 40)
     };
     let red_first = shown([0.5, 0.0]);
@@ -144,8 +145,8 @@ fn edge(caster: Material) -> SceneParts {
     let rest = [[3.3, 4.0, 9.0], [9.0, 4.0, 9.0], [9.0, 4.0, -9.0], [3.3, 4.0, -9.0]];
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
     let mesh = Mesh::from_indexed(rest.to_vec(), vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
-    add(&mut parts, "caster", mesh.expect("a square"), caster).expect("added");
-    add(&mut parts, "peg", lying(0.01, 0.0).expect("a square"), Material::default()).expect("added");
+    add_rigid_domain(&mut parts, "caster", mesh.expect("a square"), caster).expect("added");
+    add_rigid_domain(&mut parts, "peg", lying(0.01, 0.0).expect("a square"), Material::default()).expect("added");
     parts
 }
 

@@ -2,7 +2,7 @@
 
 use std::f32::consts::TAU;
 
-use super::workloads::add;
+use super::rigid_domain::add_rigid_domain;
 use modalcast_model::domain::{Material, Mesh, Texture};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{RenderSettings, SceneParts};
@@ -36,7 +36,7 @@ pub(super) fn panels() -> Result<SceneParts> {
 fn hang(parts: &mut SceneParts, name: &str, mesh: Mesh, [width, height]: [u32; 2]) -> Result<()> {
     parts.textures.push(weave(name, width, height)?);
     let color_texture = Some(parts.textures.len() - 1);
-    add(parts, name, mesh, Material { color_texture, double_sided: true, ..Material::default() })
+    add_rigid_domain(parts, name, mesh, Material { color_texture, double_sided: true, ..Material::default() })
 }
 
 /// A parallelogram of `turns` x `turns` cells. Each cell shows the image once and has its own corners.

@@ -17,10 +17,11 @@ use std::sync::Arc;
 use nalgebra::{Matrix4, Rotation3, Vector3};
 
 use super::harness::Size;
+use super::rigid_domain::add_rigid_domain;
 use super::texture_panels;
 use crate::motion::WorkloadMotion;
 use crate::workloads::Workload;
-use modalcast_model::domain::{AlphaMode, Domain, Material, Mesh, Metadata, Modes, Shape, Transform, smooth_normals};
+use modalcast_model::domain::{AlphaMode, Material, Mesh, Transform, smooth_normals};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::load;
 use modalcast_model::scene::{Camera, Lens, RenderSettings, Scene, SceneParts, SceneState, View};
@@ -171,25 +172,6 @@ pub(super) fn swaying(scene: &Arc<Scene>) -> SceneState {
     state
 }
 
-/// Adds a rigid domain with a shape and a material of its own.
-pub(super) fn add(parts: &mut SceneParts, name: &str, mesh: Mesh, material: Material) -> Result<()> {
-    parts.shapes.push(Shape::new(mesh, Modes::rigid())?);
-    parts.materials.push(Material { name: name.into(), ..material });
-    parts.domains.push(Domain {
-        name: name.into(),
-        shape: parts.shapes.len() - 1,
-        material: parts.materials.len() - 1,
-        material_ranges: Vec::new(),
-        placement: Transform::IDENTITY,
-        attachment: None,
-        follows: None,
-        rest_q: Vec::new(),
-        shares_q_with: None,
-        metadata: Metadata::default(),
-    });
-    Ok(())
-}
-
 /// Four corners, counter-clockwise, as two triangles.
 pub(super) fn quad(corners: [[f32; 3]; 4], normal: [f32; 3]) -> Result<Mesh> {
     Mesh::from_indexed(corners.to_vec(), vec![normal; 4], Vec::new(), vec![[0, 1, 2], [0, 2, 3]])
@@ -246,8 +228,8 @@ fn paint(diffuse: [f32; 3]) -> Material {
 /// A square of 1.4 units at height 1, and a slab that keeps the ground at height 0.
 fn square() -> Result<SceneParts> {
     let mut parts = SceneParts::named("square");
-    add(&mut parts, "slab", lying(1.6, 0.0)?, paint([0.75, 0.72, 0.68]))?;
-    add(&mut parts, "square", lying(0.7, 1.0)?, paint([0.80, 0.35, 0.25]))?;
+    add_rigid_domain(&mut parts, "slab", lying(1.6, 0.0)?, paint([0.75, 0.72, 0.68]))?;
+    add_rigid_domain(&mut parts, "square", lying(0.7, 1.0)?, paint([0.80, 0.35, 0.25]))?;
     parts.look = RenderSettings { sun: [0.45, 0.8, 0.3], ..RenderSettings::default() };
     Ok(parts)
 }
@@ -263,9 +245,9 @@ fn shelf() -> Result<SceneParts> {
         let at = |dx: f32, dz: f32| [x + dx * half, height, z + dz * half];
         quad([at(-1.0, 1.0), at(1.0, 1.0), at(1.0, -1.0), at(-1.0, -1.0)], [0.0, 1.0, 0.0])
     };
-    add(&mut parts, "near slab", moved(0.1, 0.0, 5.0, 5.0)?, paint([0.75, 0.72, 0.68]))?;
-    add(&mut parts, "far slab", moved(0.1, 0.0, -5.0, -5.0)?, paint([0.75, 0.72, 0.68]))?;
-    add(&mut parts, "shelf", moved(1.0, 0.03, SHELF_EDGE + 1.0, 0.0)?, paint([0.80, 0.35, 0.25]))?;
+    add_rigid_domain(&mut parts, "near slab", moved(0.1, 0.0, 5.0, 5.0)?, paint([0.75, 0.72, 0.68]))?;
+    add_rigid_domain(&mut parts, "far slab", moved(0.1, 0.0, -5.0, -5.0)?, paint([0.75, 0.72, 0.68]))?;
+    add_rigid_domain(&mut parts, "shelf", moved(1.0, 0.03, SHELF_EDGE + 1.0, 0.0)?, paint([0.80, 0.35, 0.25]))?;
     parts.look = RenderSettings { sun: [3.0, 1.0, 0.0], ..RenderSettings::default() };
     Ok(parts)
 }
@@ -276,11 +258,11 @@ fn panes() -> Result<SceneParts> {
     let upright = |[left, bottom, right, top]: [f32; 4], z: f32| {
         quad([[left, bottom, z], [right, bottom, z], [right, top, z], [left, top, z]], [0.0, 0.0, 1.0])
     };
-    add(&mut parts, "wall", upright([-1.4, 0.0, 1.4, 1.9], -0.8)?, paint([0.85, 0.84, 0.80]))?;
+    add_rigid_domain(&mut parts, "wall", upright([-1.4, 0.0, 1.4, 1.9], -0.8)?, paint([0.85, 0.84, 0.80]))?;
     let glass = |color: [f32; 3], alpha: f32| Material { alpha, alpha_mode: AlphaMode::Blend, ..paint(color) };
-    add(&mut parts, "red", upright([-1.1, 0.3, 0.3, 1.3], 0.6)?, glass([0.85, 0.12, 0.10], 0.6))?;
-    add(&mut parts, "green", upright([-0.6, 0.5, 0.8, 1.6], 0.2)?, glass([0.10, 0.70, 0.20], 0.45))?;
-    add(&mut parts, "blue", upright([-0.2, 0.2, 1.2, 1.2], -0.2)?, glass([0.12, 0.25, 0.85], 0.7))?;
+    add_rigid_domain(&mut parts, "red", upright([-1.1, 0.3, 0.3, 1.3], 0.6)?, glass([0.85, 0.12, 0.10], 0.6))?;
+    add_rigid_domain(&mut parts, "green", upright([-0.6, 0.5, 0.8, 1.6], 0.2)?, glass([0.10, 0.70, 0.20], 0.45))?;
+    add_rigid_domain(&mut parts, "blue", upright([-0.2, 0.2, 1.2, 1.2], -0.2)?, glass([0.12, 0.25, 0.85], 0.7))?;
     parts.look = RenderSettings { sun: [0.35, 0.6, 0.7], ..RenderSettings::default() };
     Ok(parts)
 }
@@ -335,13 +317,13 @@ fn field(count: usize) -> Result<SceneParts> {
     let corners: Vec<u32> = (0..rest.len() as u32).collect();
     let normals = smooth_normals(&rest, &corners, &triangles);
     let mesh = Mesh::from_indexed(rest, normals, Vec::new(), triangles)?;
-    add(&mut parts, "field", mesh, Material { double_sided: false, ..paint([0.52, 0.60, 0.34]) })?;
+    add_rigid_domain(&mut parts, "field", mesh, Material { double_sided: false, ..paint([0.52, 0.60, 0.34]) })?;
     let pole = |x: f32, z: f32| [[x - 0.05, 0.2, z], [x + 0.05, 0.2, z], [x + 0.05, 1.5, z], [x - 0.05, 1.5, z]];
     let places = [[-0.9, 0.0], [0.9, 0.2], [0.0, -0.9], [0.1, 0.8]];
     let rest: Vec<[f32; 3]> = places.iter().flat_map(|[x, z]| pole(*x, *z)).collect();
     let triangles = (0..4).flat_map(|pole| [[0, 1, 2], [0, 2, 3]].map(|three: [u32; 3]| three.map(|at| at + 4 * pole)));
     let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 16], Vec::new(), triangles.collect())?;
-    add(&mut parts, "poles", mesh, paint([0.70, 0.30, 0.22]))?;
+    add_rigid_domain(&mut parts, "poles", mesh, paint([0.70, 0.30, 0.22]))?;
     parts.look = RenderSettings { sun: [0.55, 0.5, 0.45], ..RenderSettings::default() };
     Ok(parts)
 }

@@ -16,6 +16,7 @@
 //! only the plant with the most domains.
 
 mod build;
+mod patch;
 mod plant;
 
 use std::sync::Arc;

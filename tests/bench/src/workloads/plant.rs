@@ -7,7 +7,7 @@
 use fastrand::Rng;
 use rayon::prelude::*;
 
-use super::build::{PatchSpec, PatchTopology, QUICK, scene, seed_of, shape};
+use super::patch::{PatchSpec, PatchTopology, QUICK, scene, seed_of, shape};
 use super::{Size, Workload, WorkloadKind};
 use crate::thesis::{PLANTS, ThesisPlant};
 use modalcast_model::domain::FollowConstraint;

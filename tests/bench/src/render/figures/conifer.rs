@@ -9,7 +9,7 @@ use fastrand::Rng;
 use nalgebra::{Matrix4, Rotation3, Translation3, Vector3};
 
 use super::needles;
-use crate::render::workloads::add;
+use crate::render::rigid_domain::add_rigid_domain;
 use modalcast_model::domain::{
     AlphaMode, Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform, smooth_normals,
 };
@@ -93,7 +93,7 @@ pub(super) fn grow(habit: &ConiferParameters, bark: [&Texture; 2]) -> Result<Sce
         normal_texture: Some(1),
         ..Material::default()
     };
-    add(&mut parts, "trunk", trunk(habit)?, wood)?;
+    add_rigid_domain(&mut parts, "trunk", trunk(habit)?, wood)?;
     parts.materials.push(Material {
         name: "needles".into(),
         specular: [0.05; 3],

@@ -1,0 +1,59 @@
+//! A state in f64. A physics process computes in f64 and sends f32, so the truth of an error is f64, and the state that a
+//! deformer receives is its rounding.
+
+use modalcast_model::domain::Transform;
+use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
+
+/// A state in f64, as a physics process computes it before rounding; relative to the scene's origin.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ExactState {
+    /// Packed coordinates.
+    pub q: Vec<f64>,
+    /// `world_from_domain` of each mover ([`modalcast_model::scene::TransformRoots`]), 3x4 row-major.
+    pub transforms: Vec<[f64; 12]>,
+}
+
+impl ExactState {
+    /// The state that a deformer receives: every number rounded to f32.
+    pub fn state(&self) -> SceneState {
+        let transforms = self.transforms.iter().map(|entries| Transform(entries.map(|entry| entry as f32)));
+        let q = self.q.iter().map(|number| *number as f32).collect();
+        let transforms = transforms.collect();
+        SceneState { run: 0, step: 0, time: 0.0, q, transforms, origins: None, serial: 0, changed: DirtyDomains::All }
+    }
+
+    /// A truth that equals a state exactly.
+    pub fn of(state: &SceneState) -> Self {
+        Self {
+            q: state.q.iter().map(|number| f64::from(*number)).collect(),
+            transforms: state.transforms.iter().map(|transform| transform.0.map(f64::from)).collect(),
+        }
+    }
+
+    /// `world_from_domain` of a domain; for a follower the product of its mover's transform and its frame.
+    pub fn transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
+        let mover = &self.transforms[scene.movers.of(domain)];
+        match scene.movers.frame_of(domain) {
+            None => *mover,
+            Some(frame) => product(mover, &frame.0.map(f64::from)),
+        }
+    }
+
+    /// The same with absolute values. Entries of the exact product do not exceed it in magnitude.
+    pub(super) fn size_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
+        let mover = self.transforms[scene.movers.of(domain)].map(f64::abs);
+        match scene.movers.frame_of(domain) {
+            None => mover,
+            Some(frame) => product(&mover, &frame.0.map(|entry| f64::from(entry.abs()))),
+        }
+    }
+}
+
+/// The product of two affine transforms, 3x4 row-major.
+fn product(t: &[f64; 12], f: &[f64; 12]) -> [f64; 12] {
+    std::array::from_fn(|at| {
+        let (row, column) = (&t[at / 4 * 4..][..4], at % 4);
+        let sum = row[0] * f[column] + row[1] * f[4 + column] + row[2] * f[8 + column];
+        if column == 3 { sum + row[3] } else { sum }
+    })
+}
