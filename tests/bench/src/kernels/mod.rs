@@ -6,7 +6,8 @@
 //! | `kernel_benchmark` | the `KernelBenchmark` trait, and the driver's facts about kernels |
 //! | `turns` | inputs of several steps, uploaded before timing starts |
 //! | `timer` | timing by CUDA graphs and events |
-//! | `bandwidth` | the best memory rates of the device, for comparison |
+//! | `bandwidth` | kernels that copy, read and fill device memory |
+//! | `memory_roofs` | the best memory rates of the device, for comparison |
 //! | `deformer_kernels` | the deformer's own kernels as a trial |
 //! | `batch_mma` | many vectors q of one U at once by tensor cores, with their own summation order and rounding |
 //! | `ingest` | host-to-device upload of a step's values |
@@ -21,6 +22,7 @@ mod cublas;
 mod deformer_kernels;
 mod input_sets;
 mod kernel_benchmark;
+mod memory_roofs;
 mod overlap;
 mod plain_update;
 mod raster;
@@ -28,12 +30,12 @@ mod thesis;
 mod timer;
 mod upload_time;
 
-pub use bandwidth::{Roofs, roofs};
 pub use batch_mma::BatchMmaBenchmark;
 pub use cublas::{CublasBenchmark, CublasMethod, cublas_version};
 pub use deformer_kernels::{DeformerBenchmark, StepOutputs};
 pub use input_sets::Part;
 pub use kernel_benchmark::{KernelAttributes, KernelBenchmark};
+pub use memory_roofs::{Roofs, roofs};
 pub use overlap::{HostWrite, Overlap, host_writes, overlap};
 pub use raster::{RasterBenchmark, RasterCounts, RasterMesh};
 pub use thesis::{KernelSplit, LaneCounts, ThesisBenchmark, count_lanes, idle_lanes_per_warp};

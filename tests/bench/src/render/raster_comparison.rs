@@ -1,26 +1,23 @@
 //! Compares the CUDA rasterizer with OpenGL on two passes, ids with depth and depth alone: the scene stripped to its
 //! mesh, one sample per pixel, both in one run. Ids are compared before anything is timed.
 
-use std::path::Path;
 use std::sync::Arc;
 
 use nalgebra::Matrix4;
 use serde::Serialize;
 
-use super::frame_comparison::{self, FrameComparison};
 use super::harness::{HarnessScene, RenderHarness, Size};
 use super::measure::STILL;
 use super::rigid_domain::add_rigid_domain;
 use super::workloads::{RenderWorkload, room, screen};
-use super::{RenderReportOptions, comparison_tables, minimal_passes};
+use super::{RenderReportOptions, minimal_passes};
 use crate::kernels;
 use crate::kernels::{KernelBenchmark as _, RasterBenchmark, RasterCounts, RasterMesh};
-use crate::provenance::Provenance;
 use crate::timing::{MIN_REPETITIONS, Timing};
 use modalcast_compute::gpu::{Device, RasterVariant};
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Camera, CullMode, DrawRange, RenderSettings, Scene, SceneParts, SceneState, Viewport};
-use modalcast_render::{FrameParams, RendererInfo, VisibilityId, shadow_clip_from_world};
+use modalcast_render::{FrameParams, VisibilityId, shadow_clip_from_world};
 
 /// Side of the depth map: in a full and in a quick run.
 pub(super) const MAPS: (u32, u32) = (4096, 1024);
@@ -109,60 +106,6 @@ impl RasterComparison {
         });
         format!("{:<18}{times}; {} of {} ids differ", self.load, self.differing, self.samples)
     }
-}
-
-/// Results of these passes alone, for several loads.
-#[derive(Debug, Clone, Serialize)]
-pub struct RasterReport {
-    pub made: Provenance,
-    pub renderer: RendererInfo,
-    pub size: Size,
-    pub rows: Vec<RasterComparison>,
-    /// Whole frames.
-    pub frames: Vec<FrameComparison>,
-}
-
-impl RasterReport {
-    /// Writes `raster.json` and `raster.md` into a folder, which is created.
-    ///
-    /// # Errors
-    /// `Fault` when a file cannot be written.
-    pub fn write(&self, folder: &Path) -> Result<()> {
-        std::fs::create_dir_all(folder).map_err(fault_in("report"))?;
-        let json = serde_json::to_vec_pretty(self).map_err(fault_in("report"))?;
-        let markdown = format!(
-            "{}\n\n{}; {} x {} pixels.\n{}{}",
-            self.made.line(),
-            self.renderer.renderer,
-            self.size.width,
-            self.size.height,
-            comparison_tables::raster(&self.rows),
-            frame_comparison::markdown(&self.frames)
-        );
-        for (name, bytes) in [("raster.json", json), ("raster.md", markdown.into_bytes())] {
-            std::fs::write(folder.join(name), bytes).map_err(fault_in("report"))?;
-        }
-        Ok(())
-    }
-
-    /// Whether everything was timed.
-    pub fn passed(&self) -> bool {
-        self.rows.iter().all(|row| row.passes.is_some()) && frame_comparison::faults(&self.frames).is_empty()
-    }
-}
-
-/// Measures these passes and nothing else; `progress` receives a description of each stage.
-///
-/// # Errors
-/// `Unavailable` without OpenGL, a CUDA device or NVRTC; errors of loading and drawing a scene.
-pub fn rasters(request: &RenderReportOptions, mut progress: impl FnMut(&str)) -> Result<RasterReport> {
-    let device = Device::open(0)?;
-    device.check_compiler()?;
-    let mut studio = RenderHarness::open()?;
-    let rows = measure(&mut studio, &device, request, &mut progress)?;
-    let frames = frame_comparison::measure(&mut studio, &device, request, &mut progress)?;
-    let renderer = studio.renderer.info().clone();
-    Ok(RasterReport { made: Provenance::here(), renderer, size: request.size, rows, frames })
 }
 
 /// A stripped scene with its state and camera.

@@ -1,0 +1,161 @@
+//! Measures the best rates of device memory, and the transfer rates between host and device. The rate of a deformer is only
+//! meaningful relative to the best rate of the same run.
+
+use cudarc::driver::{CudaFunction, CudaSlice, PinnedHostSlice, result};
+use serde::Serialize;
+
+use super::bandwidth::{CODE, filled, launch, tile, variants};
+use super::kernel_benchmark::KernelBenchmark;
+use super::timer::{Cache, EventPair, Timing, empty_replay, gigabytes_per_second, time};
+use modalcast_compute::gpu::Device;
+use modalcast_compute::gpu::memory::{address, alloc_zeroed, download};
+use modalcast_model::error::{Error, Result, fault_in};
+
+/// Largest buffer of `copy` and `read`, bytes.
+const LARGEST: u64 = 4 << 30;
+
+/// Bytes of a pinned copy, and the number of timed copies.
+const PINNED: usize = 64 << 20;
+const PINNED_COPIES: usize = 15;
+
+const REPLAYS: usize = 20;
+
+/// Measured memory rates of the device.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Roofs {
+    /// Best copy kernel, GB/s (1e9 bytes), read plus written.
+    pub copy_gbs: f64,
+    /// Best pure read, GB/s.
+    pub read_gbs: f64,
+    /// A replay of a graph with one empty kernel, microseconds.
+    pub empty_us: f64,
+    /// Copies from pinned host memory to the device, 64 MiB each, GB/s.
+    pub pinned_h2d_gbs: f64,
+    pub pinned_d2h_gbs: f64,
+}
+
+/// Measures the rates of a device. `copy` and `read` process 4 GiB, or an eighth of the free memory if that is less.
+///
+/// # Errors
+/// `Unavailable` when NVRTC is missing; `Fault` when the device fails or a copy did not copy.
+pub fn roofs(device: &Device) -> Result<Roofs> {
+    let (free, _) = device.memory()?;
+    let unit = tile(16);
+    let bytes = (LARGEST.min(free as u64 / 8) / unit).max(1) * unit;
+    let from = filled(device, bytes)?;
+    let to = alloc_zeroed(device, bytes)?;
+    let best = |function: &'static str, moved: u64| -> Result<f64> {
+        let mut best = 0.0_f64;
+        for (loads, defines) in variants() {
+            let stream = CopyBenchmark::new(device, function, defines, [&from, &to], bytes / tile(loads))?;
+            if function == "copy" {
+                stream.check(device, &from, &to)?;
+            }
+            let timing = time(device, &stream, Cache::Warm, REPLAYS)?;
+            best = best.max(gigabytes_per_second(moved, timing.median_us));
+        }
+        Ok(best)
+    };
+    let (copy_gbs, read_gbs) = (best("copy", 2 * bytes)?, best("read", bytes)?);
+    let empty_us = empty_replay(device, 200)?.median_us;
+    let (pinned_h2d_gbs, pinned_d2h_gbs) = pinned(device)?;
+    Ok(Roofs { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs })
+}
+
+/// One variant of `copy` or `read`.
+struct CopyBenchmark {
+    function: CudaFunction,
+    name: String,
+    buffers: [u64; 2],
+    blocks: u32,
+}
+
+impl CopyBenchmark {
+    fn new(
+        device: &Device,
+        function: &str,
+        defines: &[&str],
+        buffers: [&CudaSlice<u8>; 2],
+        blocks: u64,
+    ) -> Result<Self> {
+        Ok(Self {
+            function: device.function(function, CODE.source, defines)?,
+            name: format!("{function} {}", defines.join(" ")),
+            buffers: buffers.map(|buffer| address(device, buffer)),
+            blocks: blocks as u32,
+        })
+    }
+
+    /// Copies once and compares both ends, because a copy that does nothing would be fast.
+    fn check(&self, device: &Device, from: &CudaSlice<u8>, to: &CudaSlice<u8>) -> Result<()> {
+        const END: usize = 4096;
+        let (last, fail) = (to.len() - END, fault_in("roof"));
+        let ends = |buffer: &CudaSlice<u8>| -> Result<[Vec<u8>; 2]> {
+            let end = |first: usize| {
+                let mut bytes = vec![0_u8; END];
+                // SAFETY: the buffer has at least one tile, which is more than END bytes, from both ends.
+                unsafe { download(device, address(device, buffer) + first as u64, &mut bytes) }.map(|()| bytes)
+            };
+            Ok([end(0)?, end(last)?])
+        };
+        for first in [0, last] {
+            // SAFETY: as above; nothing else runs on the stream's buffers.
+            unsafe { result::memset_d8_async(address(device, to) + first as u64, 0, END, device.stream().cu_stream()) }
+                .map_err(&fail)?;
+        }
+        launch(device, &self.function, self.blocks, self.buffers)?;
+        if ends(from)? == ends(to)? {
+            return Ok(());
+        }
+        Err(Error::Fault { stage: "roof", reason: format!("{} did not copy", self.name) })
+    }
+}
+
+impl KernelBenchmark for CopyBenchmark {
+    fn name(&self) -> String {
+        self.name.clone()
+    }
+
+    fn turns(&self) -> usize {
+        1
+    }
+
+    fn launch(&self, device: &Device, _: usize) -> Result<()> {
+        launch(device, &self.function, self.blocks, self.buffers)
+    }
+
+    fn launches(&self) -> usize {
+        1
+    }
+}
+
+/// Rates of pinned copies to and from the device, GB/s.
+fn pinned(device: &Device) -> Result<(f64, f64)> {
+    let fail = fault_in("pinned copy");
+    // SAFETY: every byte is written just below before anything reads it.
+    let mut host: PinnedHostSlice<u8> =
+        unsafe { device.context().alloc_pinned_with_flags(PINNED, 0) }.map_err(fault_in("allocate"))?;
+    let host = host.as_mut_slice().map_err(&fail)?;
+    host.fill(0x5a);
+    let buffer = alloc_zeroed(device, PINNED as u64)?;
+    let (there, stream) = (address(device, &buffer), device.stream().cu_stream());
+    let mut rate = |copy: &mut dyn FnMut(&mut [u8]) -> Result<()>| -> Result<f64> {
+        let mut times = Vec::with_capacity(PINNED_COPIES);
+        // The first copy is a warm-up and does not count.
+        for count in 0..=PINNED_COPIES {
+            let span = EventPair::new(device)?;
+            span.around(device, || copy(host))?;
+            let us = span.microseconds()?;
+            if count > 0 {
+                times.push(us);
+            }
+        }
+        Ok(gigabytes_per_second(PINNED as u64, Timing::of(times)?.median_us))
+    };
+    // SAFETY: both sides have the bytes of `host`. Reading the span waits for each copy, before the next one and before
+    // either side is dropped.
+    let to = rate(&mut |host| unsafe { result::memcpy_htod_async(there, host, stream) }.map_err(&fail))?;
+    // SAFETY: as above.
+    let from = rate(&mut |host| unsafe { result::memcpy_dtoh_async(host, there, stream) }.map_err(&fail))?;
+    Ok((to, from))
+}
