@@ -1,15 +1,17 @@
 //! `modalcast inspect`: prints the content of a scene, the features it needs, and the memory and passes saved by
 //! omitting the other features.
 
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::options::with_spinner;
 use super::{Outcome, print_line};
-use modalcast_compute::gpu;
+use modalcast_compute::gpu::{self, DeformPlan};
 use modalcast_model::backend_settings::LookTable;
 use modalcast_model::error::fault_in;
 use modalcast_model::load::{self, OpenedScene};
-use modalcast_model::scene::Scene;
+use modalcast_model::scene::{DeformationSettings, Scene, SceneFeatures, UpAxis};
+use modalcast_render::RenderPlan;
 
 /// Number of domains that the text table lists; `--json` lists all.
 const MAX_LISTED_DOMAINS: usize = 24;
@@ -30,7 +32,8 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args) -> Outcome {
     let opened = with_spinner("loading", || load::open(&args.scene))?;
     if args.json {
-        print_line(serde_json::to_string_pretty(&json(&opened)).map_err(fault_in("inspect"))?);
+        let report = serde_json::to_value(SceneReport::new(&opened)).map_err(fault_in("inspect"))?;
+        print_line(serde_json::to_string_pretty(&report).map_err(fault_in("inspect"))?);
     } else {
         lines(&opened.scene).into_iter().for_each(print_line);
     }
@@ -51,36 +54,76 @@ fn bytes_of(scene: &Scene, domain: usize) -> usize {
         + shape.smoothing().map_or(0, |smoothing| smoothing.bytes() as usize)
 }
 
-fn json(OpenedScene { scene, backends }: &OpenedScene) -> Value {
-    let domain = |index: usize| {
+/// The JSON output. Fields of a struct cannot repeat a key, unlike the entries of `json!`.
+#[derive(Serialize)]
+struct SceneReport<'a> {
+    scene: &'a str,
+    up: UpAxis,
+    #[serde(rename = "unit_metres")]
+    unit: f64,
+    origin: [f64; 3],
+    totals: Value,
+    needs: SceneFeatures,
+    look: LookTable,
+    /// The settings in the `deform` table of `scene.toml`.
+    deformation: &'a DeformationSettings,
+    remarks: &'a [String],
+    /// The plan of the deformer.
+    deform: DeformPlan,
+    /// The plan of the renderer.
+    render: RenderPlan,
+    domains: Vec<DomainReport<'a>>,
+}
+
+#[derive(Serialize)]
+struct DomainReport<'a> {
+    name: &'a str,
+    vertices: usize,
+    rank: usize,
+    triangles: usize,
+    corners: usize,
+    bytes: usize,
+    shape: usize,
+    parent: Option<usize>,
+    follows: Option<usize>,
+    material: &'a str,
+}
+
+impl<'a> SceneReport<'a> {
+    fn new(OpenedScene { scene, backends }: &'a OpenedScene) -> Self {
+        Self {
+            scene: &scene.name,
+            up: scene.up,
+            unit: scene.unit,
+            origin: scene.origin,
+            totals: totals(scene),
+            needs: scene.needs,
+            look: LookTable { settings: scene.look, raster: backends.raster },
+            deformation: &scene.deformation,
+            remarks: &scene.remarks,
+            deform: gpu::plan(scene),
+            render: modalcast_render::plan(scene),
+            domains: (0..scene.domains.len()).map(|index| DomainReport::new(scene, index)).collect(),
+        }
+    }
+}
+
+impl<'a> DomainReport<'a> {
+    fn new(scene: &'a Scene, index: usize) -> Self {
         let (domain, slot) = (&scene.domains[index], scene.layout.slots[index]);
-        json!({
-            "name": domain.name,
-            "vertices": slot.vertices,
-            "rank": slot.rank,
-            "triangles": slot.triangles,
-            "corners": slot.corners,
-            "bytes": bytes_of(scene, index),
-            "shape": domain.shape,
-            "parent": domain.attachment.as_ref().map(|attachment| attachment.parent),
-            "follows": domain.follows.map(|follow| follow.parent),
-            "material": scene.materials[domain.material].name,
-        })
-    };
-    let domains: Vec<Value> = (0..scene.domains.len()).map(domain).collect();
-    json!({
-        "scene": scene.name,
-        "up": scene.up,
-        "unit_metres": scene.unit,
-        "origin": scene.origin,
-        "totals": totals(scene),
-        "needs": scene.needs,
-        "look": LookTable { settings: scene.look, raster: backends.raster },
-        "remarks": scene.remarks,
-        "deform": gpu::plan(scene),
-        "render": modalcast_render::plan(scene),
-        "domains": domains,
-    })
+        Self {
+            name: &domain.name,
+            vertices: slot.vertices,
+            rank: slot.rank,
+            triangles: slot.triangles,
+            corners: slot.corners,
+            bytes: bytes_of(scene, index),
+            shape: domain.shape,
+            parent: domain.attachment.as_ref().map(|attachment| attachment.parent),
+            follows: domain.follows.map(|follow| follow.parent),
+            material: &scene.materials[domain.material].name,
+        }
+    }
 }
 
 fn totals(scene: &Scene) -> Value {
@@ -154,4 +197,80 @@ fn plans(scene: &Scene) -> Vec<String> {
         ));
     }
     lines
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use serde::de::{Deserialize, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
+
+    use super::*;
+
+    /// Any JSON value. Its deserialization fails at an object that contains a key twice.
+    struct UniqueKeys;
+
+    impl<'de> Deserialize<'de> for UniqueKeys {
+        fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+            deserializer.deserialize_any(Self)
+        }
+    }
+
+    impl<'de> Visitor<'de> for UniqueKeys {
+        type Value = Self;
+
+        fn expecting(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+            out.write_str("JSON")
+        }
+
+        fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Self, A::Error> {
+            let mut keys = BTreeSet::new();
+            while let Some((key, Self)) = map.next_entry::<String, Self>()? {
+                if !keys.insert(key.clone()) {
+                    return Err(A::Error::custom(format!("the key {key} twice")));
+                }
+            }
+            Ok(self)
+        }
+
+        fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Self, A::Error> {
+            while list.next_element::<Self>()?.is_some() {}
+            Ok(self)
+        }
+
+        fn visit_str<E>(self, _: &str) -> Result<Self, E> {
+            Ok(self)
+        }
+
+        fn visit_f64<E>(self, _: f64) -> Result<Self, E> {
+            Ok(self)
+        }
+
+        fn visit_u64<E>(self, _: u64) -> Result<Self, E> {
+            Ok(self)
+        }
+
+        fn visit_i64<E>(self, _: i64) -> Result<Self, E> {
+            Ok(self)
+        }
+
+        fn visit_bool<E>(self, _: bool) -> Result<Self, E> {
+            Ok(self)
+        }
+
+        fn visit_unit<E>(self) -> Result<Self, E> {
+            Ok(self)
+        }
+    }
+
+    #[test]
+    fn json_has_each_key_once_and_the_deform_settings() {
+        let opened = load::open("tree").expect("loads");
+        let text = serde_json::to_string(&SceneReport::new(&opened)).expect("serializes");
+        serde_json::from_str::<UniqueKeys>(&text).map(drop).expect("unique keys");
+        assert!(serde_json::from_str::<UniqueKeys>(r#"[{"a": {"b": 1, "b": null}}]"#).is_err(), "control");
+        let value: Value = serde_json::from_str(&text).expect("JSON");
+        assert!(value["deformation"]["storage"].is_string(), "{}", value["deformation"]);
+        assert!(value["deform"]["kernels"].is_array() && value["render"]["passes"].is_array(), "{text}");
+    }
 }

@@ -36,13 +36,13 @@ enum Command {
 pub const EXIT_CODES: &str = "\
 Exit codes:
   0  done
-  1  the check that the command makes did not pass (doctor: no frame can be drawn; demo: a promise was not kept; report: a
-     variant exceeds its error bound)
-  2  the command line is wrong
-  3  the input is wrong: the message names field, expected and given
+  1  a check failed (doctor: no frame can be drawn; demo: a criterion is not met; report: a variant exceeds its error
+     bound)
+  2  invalid command line
+  3  invalid input; the message names the field, the expected value and the actual one
   4  not found
-  5  something must be installed or freed: the message says what
-  6  a fault of the server or the device";
+  5  a resource or a program is missing or in use; the message names it
+  6  error of the server or the device";
 
 /// Result of a command: whether its own check passed, or an error.
 pub type Outcome = modalcast_model::error::Result<bool>;

@@ -14,8 +14,9 @@ pub fn with_spinner<T>(what: &'static str, work: impl FnOnce() -> T) -> T {
 /// Parses a point written as X,Y,Z.
 pub fn parse_point(text: &str) -> Result<[f64; 3]> {
     let numbers: Option<Vec<f64>> = text.split(',').map(|number| number.trim().parse().ok()).collect();
-    let parse_point = numbers.and_then(|numbers| <[f64; 3]>::try_from(numbers).ok());
-    parse_point.ok_or_else(|| invalid("point", "three numbers X,Y,Z", text))
+    let point = numbers.and_then(|numbers| <[f64; 3]>::try_from(numbers).ok());
+    let finite = point.filter(|point| point.iter().all(|number| number.is_finite()));
+    finite.ok_or_else(|| invalid("point", "three finite numbers X,Y,Z", text))
 }
 
 #[cfg(test)]
@@ -25,6 +26,6 @@ mod tests {
     #[test]
     fn points_are_three_numbers_and_two_commas() {
         assert_eq!(parse_point("4, -1,.5"), Ok([4.0, -1.0, 0.5]));
-        assert!(parse_point("1,2").is_err() && parse_point("a,b,c").is_err());
+        assert!(parse_point("1,2").is_err() && parse_point("a,b,c").is_err() && parse_point("0,nan,0").is_err());
     }
 }

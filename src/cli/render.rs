@@ -18,7 +18,8 @@ use modalcast_model::scene::{Camera, FrameSize, Lens, Scene, SceneState, View};
 #[command(after_help = "Examples:
   modalcast render tree --out tree.png
   modalcast render path/to/simpleBridge --q bent.npy --out bridge.png --size 1920x1080
-  modalcast render model.glb --out side.png --eye 4,1,0 --target 0,1,0")]
+  modalcast render model.glb --out side.png --eye 4,1,0 --target 0,1,0
+  modalcast render tree --q bent.npy --output displacement --largest 0.5 --out moved.png")]
 pub(super) struct Args {
     /// A built-in name, a folder with scene.toml, a .glb, .gltf or .obj file, or a folder with one model.
     scene: String,
@@ -32,20 +33,26 @@ pub(super) struct Args {
     /// Image size in pixels.
     #[arg(long, default_value = "1280x720")]
     size: FrameSize,
-    /// Camera position in scene units. Default: a camera that frames the scene.
+    /// Position of the camera in scene units. Default: a camera that frames the scene.
     #[arg(long, value_parser = parse_point, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "target")]
     eye: Option<[f64; 3]>,
     /// Point that the camera looks at, in scene units.
     #[arg(long, value_parser = parse_point, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "eye")]
     target: Option<[f64; 3]>,
+    /// Up direction of the camera. Default: the scene's up axis.
+    #[arg(long, value_parser = parse_point, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "eye")]
+    up: Option<[f64; 3]>,
     /// Vertical field of view in degrees. Default: 35.
-    #[arg(long, requires = "eye")]
+    #[arg(long, requires = "eye", value_name = "DEGREES")]
     field_of_view: Option<f64>,
-    /// Render a color map with a legend: `displacement`, or the index of a column of U, from 0.
-    #[arg(long, value_parser = map, value_name = "MAP")]
-    map: Option<FrameOutput>,
+    /// What the picture shows: color, or a color map with a legend.
+    #[arg(long, value_enum, default_value_t)]
+    output: OutputOption,
+    /// Index of the column of U for `--output mode-shape`, from 0.
+    #[arg(long, requires = "output", default_value_t = 0)]
+    mode: u32,
     /// Value at the bright end of the color map; 0 fits it to the frame.
-    #[arg(long, requires = "map", default_value_t = 0.0)]
+    #[arg(long, requires = "output", default_value_t = 0.0)]
     largest: f64,
     /// Deformation backend.
     #[arg(long, value_enum, default_value_t)]
@@ -53,6 +60,15 @@ pub(super) struct Args {
     /// OpenGL renderer.
     #[arg(long, value_enum, default_value_t)]
     renderer: RendererChoice,
+}
+
+/// The values of `--output`.
+#[derive(Debug, Clone, Copy, Default, clap::ValueEnum)]
+enum OutputOption {
+    #[default]
+    Color,
+    Displacement,
+    ModeShape,
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
@@ -65,12 +81,19 @@ pub(super) fn run(args: &Args) -> Outcome {
         DeviceContext::open(&Config { backend: args.backend, renderer: args.renderer, ..Config::default() })?;
     let mut loaded_scene = bench.load_scene(&scene, backends)?;
     loaded_scene.deform(&Arc::new(state))?;
-    let bytes = match args.map {
-        None => {
+    let largest = args.largest;
+    let bytes = match args.output {
+        OutputOption::Color => {
             let image = bench.draw(&mut loaded_scene, &camera(args, &scene), args.size)?;
             frame::encode_png(image.width, image.height, &image.rgba)?
         }
-        Some(frame_output) => render_color_map(args, &mut bench, &mut loaded_scene, frame_output)?,
+        OutputOption::Displacement => {
+            render_color_map(args, &mut bench, &mut loaded_scene, FrameOutput::Displacement { largest })?
+        }
+        OutputOption::ModeShape => {
+            let mode = validate_mode(&scene, args.mode)?;
+            render_color_map(args, &mut bench, &mut loaded_scene, FrameOutput::ModeShape { mode, largest })?
+        }
     };
     let place = format!("--out {}", args.out.display());
     fs::write(&args.out, bytes).map_err(|error| invalid(place, "a file that can be written", error))?;
@@ -87,31 +110,18 @@ fn render_color_map(
     frame_output: FrameOutput,
 ) -> Result<Vec<u8>> {
     let scene = Arc::clone(loaded_scene.scene());
-    let frame_output = match frame_output {
-        FrameOutput::ModeShape { mode, .. } => {
-            FrameOutput::ModeShape { mode: validate_mode(&scene, mode)?, largest: args.largest }
-        }
-        _ => FrameOutput::Displacement { largest: args.largest },
-    };
     let (aov, legend) = bench.render_aov(loaded_scene, &camera(args, &scene), args.size, frame_output)?;
-    let legend = legend.ok_or_else(|| fault_in("encode")("a colour map without legend"))?;
+    let legend = legend.ok_or_else(|| fault_in("encode")("a color map without a legend"))?;
     let rgba = frame::color_map(&aov.bytes, aov.samples, args.size.to_array(), &legend)?;
     frame::encode_png(args.size.width, args.size.height, &rgba)
-}
-
-fn map(text: &str) -> Result<FrameOutput, String> {
-    if text == "displacement" {
-        return Ok(FrameOutput::Displacement { largest: 0.0 });
-    }
-    let mode = text.parse().map_err(|_| "expected `displacement` or the number of a column of U".to_owned())?;
-    Ok(FrameOutput::ModeShape { mode, largest: 0.0 })
 }
 
 fn camera(args: &Args, scene: &Scene) -> Camera {
     let (Some(eye), Some(target)) = (args.eye, args.target) else {
         return Camera::fit_to_scene(scene, args.size.width, args.size.height);
     };
-    let view = View::LookAt { eye, target, up: scene.up.vector().into() };
+    let up = args.up.unwrap_or_else(|| scene.up.vector().into());
+    let view = View::LookAt { eye, target, up };
     Camera { view, lens: Lens::FieldOfView(args.field_of_view.unwrap_or(35.0)), near: 0.0, far: 0.0 }
 }
 

@@ -89,16 +89,16 @@ pub(crate) struct PictureOptions {
     pub(crate) format: FormatOption,
     /// Position of the camera in scene units. Default: a camera that frames the scene.
     #[arg(long, value_name = "X,Y,Z", value_parser = point, requires = "target", allow_hyphen_values = true)]
-    camera_eye: Option<[f64; 3]>,
+    eye: Option<[f64; 3]>,
     /// Point that the camera looks at, in scene units.
-    #[arg(long, value_name = "X,Y,Z", value_parser = point, requires = "camera_eye", allow_hyphen_values = true)]
+    #[arg(long, value_name = "X,Y,Z", value_parser = point, requires = "eye", allow_hyphen_values = true)]
     target: Option<[f64; 3]>,
     /// Up direction of the camera.
     #[arg(long, value_name = "X,Y,Z", value_parser = point, default_value = "0,1,0", allow_hyphen_values = true)]
     up: [f64; 3],
     /// Vertical field of view in degrees. Default: 35.
-    #[arg(long, requires = "camera_eye", value_name = "DEGREES")]
-    fov: Option<f64>,
+    #[arg(long, requires = "eye", value_name = "DEGREES")]
+    field_of_view: Option<f64>,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -119,8 +119,9 @@ enum OutputOption {
 
 impl PictureOptions {
     pub(crate) fn picture(&self) -> Picture {
-        let view = self.camera_eye.zip(self.target).map(|(eye, target)| View::LookAt { eye, target, up: self.up });
-        let camera = view.map(|view| Camera { view, lens: Lens::FieldOfView(self.fov.unwrap_or(35.0)), clip: None });
+        let view = self.eye.zip(self.target).map(|(eye, target)| View::LookAt { eye, target, up: self.up });
+        let camera =
+            view.map(|view| Camera { view, lens: Lens::FieldOfView(self.field_of_view.unwrap_or(35.0)), clip: None });
         let format = match self.format {
             FormatOption::Png => FrameFormat::Png,
             FormatOption::Raw => FrameFormat::Rgba,

@@ -142,7 +142,7 @@ pub(crate) async fn list(client: &Client, json: bool) -> Result<()> {
         );
     }
     for source in sources {
-        println!("could open: {source}");
+        println!("available source: {source}");
     }
     Ok(())
 }
