@@ -5,14 +5,49 @@
 //! covers, their depths, and which samples of cut-outs survive the alpha test. Implementations may differ from it in
 //! the last bits of filtered images.
 
+use std::any::Any;
+use std::rc::Rc;
+
 use crate::error::Result;
 use crate::scene::{DrawRange, Viewport};
 
-/// A buffer of the OpenGL context that is current on the calling thread.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// The owner of an OpenGL buffer. The buffer is deleted once its owner is dropped.
+pub trait GlBufferOwner: std::fmt::Debug {
+    /// Makes the buffer's context current on the calling thread until the returned guard is dropped. Registering and
+    /// mapping a buffer need its context.
+    ///
+    /// # Errors
+    /// `Fault` if the context cannot be made current.
+    fn make_current(&self) -> Result<Box<dyn Any>>;
+}
+
+/// A handle to an OpenGL buffer, which exists at least as long as the handle. An API that registers the buffer keeps a
+/// handle, so that the buffer is not deleted while it is registered.
+#[derive(Debug, Clone)]
 pub struct GlBuffer {
+    /// OpenGL name of the buffer in its context.
     pub name: u32,
     pub bytes: u64,
+    pub owner: Rc<dyn GlBufferOwner>,
+}
+
+/// The OpenGL buffers that receive deformed vertices, so that no upload is needed.
+#[derive(Debug, Clone)]
+pub struct GlVertexBuffers {
+    /// 3 f32 per vertex.
+    pub positions: GlBuffer,
+    /// 3 f32 per corner.
+    pub normals: GlBuffer,
+    /// 4 f32 per corner; only if the scene has normal maps.
+    pub tangents: Option<GlBuffer>,
+}
+
+impl PartialEq for GlBuffer {
+    fn eq(&self, other: &Self) -> bool {
+        // Compares addresses only: the vtables of one type may differ.
+        let is_same_owner = std::ptr::addr_eq(Rc::as_ptr(&self.owner), Rc::as_ptr(&other.owner));
+        is_same_owner && (self.name, self.bytes) == (other.name, other.bytes)
+    }
 }
 
 /// The geometry to draw.
@@ -63,12 +98,10 @@ pub struct AlphaImage {
 }
 
 /// A window and the buffer that receives its samples.
-pub type DrawTarget<'a> = (&'a Viewport, GlBuffer);
+pub type DrawTarget<'a> = (&'a Viewport, &'a GlBuffer);
 
 /// Draws one mesh. Buffer accesses are ordered with OpenGL commands before and after each call without blocking the
-/// host. The implementation may keep the position buffer and the target buffers registered. The caller must therefore
-/// delete the position buffer only after it drops the rasterizer, and a target only after
-/// `release_target`.
+/// host. The implementation may keep the position buffer and the target buffers registered, with their handles.
 pub trait Rasterizer: std::fmt::Debug {
     /// Draws depths, ids, or both. One call for both is cheaper, because the switch from OpenGL to CUDA and back takes
     /// longer than either pass.
@@ -86,7 +119,4 @@ pub trait Rasterizer: std::fmt::Debug {
     /// # Errors
     /// `Unavailable` if there is no compiler; `Fault` if compilation fails.
     fn precompile(&mut self, depth: bool, ids: bool) -> Result<()>;
-
-    /// Releases a target buffer. Call it before OpenGL deletes the buffer, because OpenGL may reuse the name.
-    fn release_target(&mut self, _name: u32) {}
 }

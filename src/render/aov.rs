@@ -11,7 +11,7 @@ use super::scene_buffers::{SceneBuffers, VertexValues};
 use super::shaders::{self, VALUE_UNIT};
 use super::target::{TargetDesc, create_image};
 use super::{FrameParams, FrameStats, Renderer, frame_uniforms, passes};
-use crate::device::gl::{self, Buffer, Framebuffer, Texture};
+use crate::device::gl::{self, Buffer, BufferCopy, Framebuffer, Texture};
 use crate::types::VisibilityId;
 use modalcast_model::error::{Result, fault_in};
 
@@ -146,7 +146,7 @@ impl Renderer {
             )
         })?;
         let bytes = (4 * words) as usize * desc.width as usize * desc.height as usize;
-        gl.copy(&aov_target.readback_source, &aov_target.staging, bytes as u64);
+        gl.copy(BufferCopy::first(bytes as u64, &aov_target.readback_source, &aov_target.staging));
         gl.wait("aov", self.frame_timeout)?;
         let begin = Instant::now();
         let bytes = aov_target.staging.read(bytes)?;

@@ -73,7 +73,7 @@ pub use self::submit::{MappedPixels, PendingFrame};
 use self::target::{RenderTarget, TargetDesc};
 pub use self::types::{
     BlurMethod, CullStats, DevicePreference, FrameCullStats, FrameImage, FrameParams, FrameStats, OitStats,
-    RasterBackend, RasterBackends, RendererInfo, SharedBuffers, VisibilityId,
+    RasterBackend, RasterBackends, RendererInfo, VisibilityId,
 };
 use crate::device::gl::{self, Gl, Program};
 pub use crate::device::readback_ring::MAX_FRAMES_IN_FLIGHT;
@@ -237,7 +237,7 @@ impl Renderer {
         // A temporary staging buffer, because the ring may be full of frames in flight.
         let bytes = target.desc.bytes();
         let staging = self.gl.buffer(bytes, gl::STREAM_READ, None)?;
-        self.gl.copy(&target.readback_source, &staging, bytes);
+        self.gl.copy(gl::BufferCopy::first(bytes, &target.readback_source, &staging));
         self.gl.wait("visibility readback", self.frame_timeout)?;
         let words = staging.read(bytes as usize)?;
         let id = |word: &[u8]| word.iter().rev().fold(0, |id, byte| id << 8 | u32::from(*byte));

@@ -18,7 +18,9 @@ use super::scene_buffers::SceneBuffers;
 use super::shaders::oit::{BINS, HISTOGRAM_TILE};
 use super::shaders::{self, ShaderOptions, TILE};
 use super::target::{BlendStorage, TargetDesc};
-use crate::device::gl::{self, Buffer, ClearOp, Framebuffer, Gl, Limits, PipelineState, Program, Texture, TextureDesc};
+use crate::device::gl::{
+    self, Buffer, BufferCopy, ClearOp, Framebuffer, Gl, Limits, PipelineState, Program, Texture, TextureDesc,
+};
 use crate::types::{FrameStats, OitStats};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{MAX_FRAGMENTS, RenderSettings};
@@ -160,7 +162,13 @@ impl OitTarget {
             // A culled scene draws only as many indices as are listed.
             if let Some((_, listed)) = buffers.visible_draws(BlendMode::Blend) {
                 let to = COMMANDS_OFFSET + size_of::<[u32; 5]>() * index;
-                gl.copy_range((listed, command_offset(place)), (&self.counters, to), size_of::<u32>());
+                gl.copy(BufferCopy {
+                    from: listed,
+                    from_offset: command_offset(place) as u64,
+                    to: &self.counters,
+                    to_offset: to as u64,
+                    bytes: size_of::<u32>() as u64,
+                });
             }
         }
         self.tiles.write(bytemuck::cast_slice(&EMPTY_TILE_LIST));

@@ -41,9 +41,9 @@ pub(crate) fn bind(buffers: &SceneBuffers) -> Result<()> {
     for (unit, view) in &buffers.buffer_textures.others {
         view.bind(*unit);
     }
-    buffers.buffer("frame uniforms")?.bind_uniform(FRAME, 0, size_of::<FrameUniforms>());
+    buffers.buffer("frame uniforms")?.bind_uniform(FRAME, size_of::<FrameUniforms>());
     if let Ok(splits) = buffers.buffer("shadow cascades") {
-        splits.bind_uniform(CASCADES, 0, size_of::<ShadowCascades>());
+        splits.bind_uniform(CASCADES, size_of::<ShadowCascades>());
     }
     for (unit, texture) in (COLOR_UNIT..).zip(&buffers.color_arrays) {
         texture.bind(unit);

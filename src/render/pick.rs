@@ -17,7 +17,7 @@ use super::scene_buffers::SceneBuffers;
 use super::shaders;
 use super::target::{TargetDesc, create_image};
 use super::{FrameParams, FrameStats, Renderer, frame_uniforms, passes};
-use crate::device::gl::{self, Buffer, Fence, Framebuffer, Gl, Texture};
+use crate::device::gl::{self, Buffer, BufferCopy, Fence, Framebuffer, Gl, Texture};
 use crate::types::VisibilityId;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Camera, PixelRect, Scene};
@@ -127,11 +127,8 @@ impl Renderer {
         )?;
         let size = Some(width | height << 16);
         passes::run_readback(gl, (&pick_target.ids, &pick_target.readback_source), (&program, size), [width, height])?;
-        gl.copy(
-            &pick_target.readback_source,
-            &staging,
-            4 * (WORDS_PER_PIXEL * width as usize * height as usize) as u64,
-        );
+        let bytes = 4 * (WORDS_PER_PIXEL * width as usize * height as usize) as u64;
+        gl.copy(BufferCopy::first(bytes, &pick_target.readback_source, &staging));
         Ok(PendingPick {
             staging,
             fence: gl.fence("pick")?,

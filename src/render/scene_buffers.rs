@@ -7,7 +7,6 @@ use std::sync::Arc;
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
-use super::SharedBuffers;
 use super::cull::{TriangleCuller, VISIBLE_INDICES};
 use super::geometry::{BlendMode, DrawGroup, Geometry, TriangleSpan, blend_mode, locate_triangle, used_materials};
 use super::plan::{Allocation, RenderPlan, plan_for_device};
@@ -21,6 +20,7 @@ use super::types::BlurMethod;
 use crate::device::gl::{self, Buffer, Gl, Program, Texture, TextureDesc, VertexArray, VertexAttribute};
 use modalcast_model::domain::AlphaMode;
 use modalcast_model::error::{Result, fault_in};
+use modalcast_model::raster::GlVertexBuffers;
 use modalcast_model::scene::Scene;
 
 /// GPU layout of a material. Twin of `material_of` in `shaders/shared/material.glsl`.
@@ -43,10 +43,8 @@ const _: () = assert!(MATERIAL_BYTES == 64, "PackedMaterial differs from shaders
 /// A scene's buffers, textures and programs on the device; freed when dropped.
 #[derive(Debug)]
 pub struct SceneBuffers {
-    /// Names of the buffers that a deformer can write directly, instead of an upload.
-    pub shared: SharedBuffers,
     /// Compute rasterizer that draws some passes instead of OpenGL; present when the look asks for it and one was
-    /// given. Declared before the buffers that it has registered, so that it is dropped first.
+    /// given. It keeps the buffers alive that it has registered.
     pub(crate) compute_rasterizer: Option<ComputeRasterizer>,
     pub(crate) scene: Arc<Scene>,
     pub(crate) buffers: BTreeMap<String, Buffer>,
@@ -138,7 +136,7 @@ impl SceneBuffers {
         }
         let geometry = Geometry::new(scene);
         let buffers = allocate(gl, &plan, &geometry, &pack_materials(scene, &images))?;
-        let (buffer_textures, shared) = (BufferTextures::new(gl, scene, &buffers)?, shared(&buffers)?);
+        let buffer_textures = BufferTextures::new(gl, scene, &buffers)?;
         let options = ShaderOptions {
             defines: plan.defines.clone(),
             used: used(scene, &images),
@@ -153,7 +151,6 @@ impl SceneBuffers {
         let sample_programs = SampleCountPrograms::compile(&options, &geometry.groups, samples, compile)?;
         let [color_arrays, normals] = images;
         Ok(Self {
-            shared,
             compute_rasterizer: None,
             scene: Arc::clone(scene),
             buffer_textures,
@@ -280,6 +277,18 @@ impl SceneBuffers {
         buffers.chain(rebased).chain(values).chain(compute_rasterizer).collect()
     }
 
+    /// The buffers that a deformer can write directly, instead of an upload. The handles keep them alive.
+    ///
+    /// # Errors
+    /// `Fault` when the scene has no vertices.
+    pub fn vertex_buffers(&self) -> Result<GlVertexBuffers> {
+        Ok(GlVertexBuffers {
+            positions: self.buffer("positions")?.shared(),
+            normals: self.buffer("normals")?.shared(),
+            tangents: self.buffers.get("tangents").map(Buffer::shared),
+        })
+    }
+
     /// Number of textures that the device holds for this scene: texture arrays and shadow map textures.
     pub fn texture_count(&self) -> usize {
         self.color_arrays.len() + self.normals.len() + self.shadow.as_ref().map_or(0, ShadowMap::texture_count)
@@ -351,14 +360,6 @@ fn allocate(
         buffers.insert(allocation.name.clone(), buffer);
     }
     Ok(buffers)
-}
-
-fn shared(buffers: &BTreeMap<String, Buffer>) -> Result<SharedBuffers> {
-    Ok(SharedBuffers {
-        positions: find_buffer(buffers, "positions")?.name(),
-        normals: find_buffer(buffers, "normals")?.name(),
-        tangents: buffers.get("tangents").map(Buffer::name),
-    })
 }
 
 impl BufferTextures {

@@ -19,7 +19,7 @@ use super::target::{RenderTarget, TargetDesc};
 use super::{
     FrameImage, FrameParams, FrameStats, RasterBackend, RasterBackends, Renderer, cull, frame_uniforms, passes,
 };
-use crate::device::gl::{Fence, PassTimer, ReadbackView};
+use crate::device::gl::{BufferCopy, Fence, PassTimer, ReadbackView};
 use crate::device::readback_ring::ReadbackSlot;
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 
@@ -234,13 +234,14 @@ impl Renderer {
         let Some(staging) = slot.and_then(ReadbackSlot::staging) else { return Ok(None) };
         let bytes = target.desc.bytes();
         let copy = || {
-            self.gl.copy(&target.readback_source, &staging.buffer, bytes);
+            self.gl.copy(BufferCopy::first(bytes, &target.readback_source, &staging.buffer));
             let counters = target.oit.as_ref().map(|oit| &oit.counters);
             for (from, to) in
                 [counters, buffers.buffers.get(cull::COUNTERS)].into_iter().zip(target.desc.readback_ranges())
             {
                 if let Some(from) = from.filter(|_| !to.is_empty()) {
-                    self.gl.copy_to_offset(from, (&staging.buffer, to.start), to.end - to.start);
+                    let copy = BufferCopy::first(to.end - to.start, from, &staging.buffer);
+                    self.gl.copy(BufferCopy { to_offset: to.start, ..copy });
                 }
             }
             self.gl.check("read")

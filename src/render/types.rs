@@ -56,17 +56,6 @@ pub struct FrameImage {
     pub raster_backends: RasterBackends,
 }
 
-/// Names of the OpenGL buffers that a deformer can write directly, instead of an upload.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct SharedBuffers {
-    /// 3 f32 per vertex.
-    pub positions: u32,
-    /// 3 f32 per corner.
-    pub normals: u32,
-    /// 4 f32 per corner; present when the scene has normal maps.
-    pub tangents: Option<u32>,
-}
-
 /// Statistics of the last frame that was collected: the passes that ran and how many triangles they processed.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct FrameStats {

@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::gpu::{CudaDeformer, Device, GlVertexBuffers};
+use modalcast_compute::gpu::{CudaDeformer, Device};
 use modalcast_model::deform::{Deformer, VertexAttributes};
+use modalcast_model::raster::{GlBuffer, GlVertexBuffers};
 use modalcast_model::scene::{Camera, Scene};
 use modalcast_render::{DevicePreference, FrameParams, MAX_FRAMES_IN_FLIGHT, Renderer, SceneBuffers};
 
@@ -11,8 +12,7 @@ use crate::accuracy::{check, same_bits};
 use crate::scenes;
 
 fn shared(buffers: &SceneBuffers) -> GlVertexBuffers {
-    let modalcast_render::SharedBuffers { positions, normals, tangents } = buffers.shared;
-    GlVertexBuffers { positions, normals, tangents }
+    buffers.vertex_buffers().expect("buffers")
 }
 
 fn stage() -> (Renderer, Arc<Device>, Arc<Scene>) {
@@ -144,10 +144,15 @@ fn gpu_unknown_or_small_buffers_fall_back_to_copies() {
     let (mut renderer, device, scene) = stage();
     let small = renderer.load(&scenes::scene(&[(4, 0)], 1, true, false)).expect("loads");
     let good = renderer.load(&scene).expect("loads");
-    let unknown = GlVertexBuffers { positions: 999_999, normals: 999_998, tangents: Some(999_997) };
+    let GlVertexBuffers { positions, normals, .. } = shared(&good);
+    let unknown = GlVertexBuffers {
+        positions: GlBuffer { name: 999_999, ..positions.clone() },
+        normals: GlBuffer { name: 999_998, ..normals },
+        tangents: Some(GlBuffer { name: 999_997, ..positions }),
+    };
     let without_tangents = GlVertexBuffers { tangents: None, ..shared(&good) };
     for buffers in [shared(&small), unknown, without_tangents] {
-        let mut deformer = CudaDeformer::new(&device, &scene, Some(buffers)).expect("a deformer");
+        let mut deformer = CudaDeformer::new(&device, &scene, Some(buffers.clone())).expect("a deformer");
         assert!(!deformer.shares_buffers(), "{buffers:?}");
         check("fallen back", &scene, &scenes::state(&scene, 3), &mut deformer);
     }

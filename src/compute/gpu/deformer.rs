@@ -10,7 +10,6 @@ use std::time::Instant;
 
 use cudarc::driver::CudaSlice;
 
-use super::GlVertexBuffers;
 use super::apply::{ApplyKernel, ChangeListLengths, max_changed_domains};
 use super::bounds::BoundsKernel;
 use super::deform::DeformKernel;
@@ -27,6 +26,7 @@ use super::readback::{AttributeLengths, ReadbackPool, ReadbackRequest};
 use super::step_slot::{StepKernels, StepSlot};
 use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
 use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::raster::GlVertexBuffers;
 use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
 
 /// Maximum number of steps in flight.

@@ -14,11 +14,10 @@ use cudarc::driver::sys::{self, CUgraphicsResource, CUresult};
 use cudarc::driver::{CudaContext, DriverError};
 use libloading::Library;
 
-use super::GlVertexBuffers;
 use super::device::Device;
 use super::output::OutputAddresses;
 use modalcast_model::error::{Error, Result, fault_in};
-use modalcast_model::raster::GlBuffer;
+use modalcast_model::raster::{GlBuffer, GlVertexBuffers};
 
 const STAGE: &str = "interop";
 
@@ -69,6 +68,7 @@ impl GlInterop {
     /// # Errors
     /// `Fault` with the name of the buffer that the driver refused.
     pub(super) fn register(&self, device: &Device, buffer: GlBuffer) -> Result<RegisteredBuffer> {
+        let _current = buffer.owner.make_current()?;
         let mut resource = std::ptr::null_mut();
         // SAFETY: `resource` is a live pointer; the driver refuses an unknown buffer name.
         let answer = unsafe { (self.register)(&mut resource, buffer.name, 0) };
@@ -77,7 +77,8 @@ impl GlInterop {
     }
 }
 
-/// An OpenGL buffer that CUDA may map; unregistered on drop.
+/// An OpenGL buffer that CUDA may map; unregistered on drop. Its handle keeps the buffer and its context alive until
+/// then.
 #[derive(Debug)]
 pub(super) struct RegisteredBuffer {
     resource: CUgraphicsResource,
@@ -87,8 +88,8 @@ pub(super) struct RegisteredBuffer {
 }
 
 impl RegisteredBuffer {
-    pub(super) const fn buffer(&self) -> GlBuffer {
-        self.buffer
+    pub(super) const fn buffer(&self) -> &GlBuffer {
+        &self.buffer
     }
 
     /// Announces the purpose of the next mapping to the driver, if it differs from the last one.
@@ -115,7 +116,7 @@ impl RegisteredBuffer {
     /// `Fault` when the buffer is smaller than expected.
     fn address(&self) -> Result<u64> {
         let fail = fault_in(STAGE);
-        let GlBuffer { name, bytes: expected } = self.buffer;
+        let GlBuffer { name, bytes: expected, .. } = self.buffer;
         let (mut place, mut bytes) = (0, 0);
         // SAFETY: both pointers are live and the resource is a mapped buffer.
         unsafe { sys::cuGraphicsResourceGetMappedPointer_v2(&mut place, &mut bytes, self.resource) }
@@ -132,6 +133,7 @@ impl Drop for RegisteredBuffer {
     fn drop(&mut self) {
         // Errors are ignored: no cleanup remains, and a failed device reports its error at the next call.
         self.context.bind_to_thread().ok();
+        let _current = self.buffer.owner.make_current();
         // SAFETY: the resource was registered once and is unregistered once.
         unsafe { sys::cuGraphicsUnregisterResource(self.resource) }.result().ok();
     }
@@ -153,6 +155,7 @@ pub(super) fn with_mapped(
         registered.set_map_flags(*access).map_err(&fail)?;
         *place = registered.resource;
     }
+    let _current = uses.first().map(|(registered, _)| registered.buffer.owner.make_current()).transpose()?;
     let stream = device.stream().cu_stream();
     let (count, resources) = (uses.len().min(MAX_MAPPED_BUFFERS) as c_uint, resources.as_mut_ptr());
     // SAFETY: all resources are registered and unmapped, and the stream belongs to the same device. OpenGL frames that
@@ -181,7 +184,7 @@ pub(super) struct RegisteredOutputs {
 }
 
 impl RegisteredOutputs {
-    /// Registers the buffers of the OpenGL context that is current on this thread. `sizes`: bytes of positions, normals
+    /// Registers the buffers. `sizes`: bytes of positions, normals
     /// and tangents; 0 bytes of tangents means no tangents.
     ///
     /// # Errors
@@ -189,8 +192,9 @@ impl RegisteredOutputs {
     pub(super) fn register(device: &Device, buffers: GlVertexBuffers, sizes: [u64; 3]) -> Result<Self> {
         let missing = || fault_in(STAGE)("the renderer gave no buffer for tangents");
         let [positions, normals, tangents] = sizes;
+        let _current = buffers.positions.owner.make_current()?;
         let sharing = GlInterop::open(device)?;
-        let register = |name, bytes| sharing.register(device, GlBuffer { name, bytes });
+        let register = |buffer, bytes| sharing.register(device, GlBuffer { bytes, ..buffer });
         let mut interop = Self {
             positions: register(buffers.positions, positions)?,
             normals: register(buffers.normals, normals)?,

@@ -64,13 +64,3 @@ pub use layout_check::device_layout_values;
 pub use plan::{BufferDescriptor, BufferRole, DeformPlan, KernelDescriptor, KernelKind, OmittedFeature, plan};
 pub use probe::{DeviceInfo, Probe, probe};
 pub use raster::{CudaRasterizer, RasterGranularity, RasterVariant};
-/// Names of the OpenGL buffers that receive the output.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct GlVertexBuffers {
-    /// 3 f32 per vertex.
-    pub positions: u32,
-    /// 3 f32 per corner.
-    pub normals: u32,
-    /// 4 f32 per corner; only if the scene has normal maps.
-    pub tangents: Option<u32>,
-}

@@ -2,13 +2,13 @@
 
 use cudarc::driver::CudaSlice;
 
-use super::GlVertexBuffers;
 use super::device::Device;
 use super::interop::{MapAccess, RegisteredOutputs};
 use super::memory::{address, alloc_zeroed, download};
 use super::plan::{BufferRole, DeformPlan};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::Result;
+use modalcast_model::raster::GlVertexBuffers;
 
 /// Device addresses of the outputs, valid while the outputs are mapped; `tangents` is 0 when the scene has none.
 #[derive(Debug, Clone, Copy)]

@@ -9,7 +9,7 @@ use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use crate::telemetry::{Stage, ms_since};
 use modalcast_compute::cpu::CpuDeformer;
-use modalcast_compute::gpu::{self, CudaDeformer, CudaRasterizer, GlVertexBuffers};
+use modalcast_compute::gpu::{self, CudaDeformer, CudaRasterizer};
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::backend_settings::{BackendSettings, RasterPolicy};
 use modalcast_model::deform::{Backend, Deformer};
@@ -138,7 +138,7 @@ impl DeviceContext {
             _ => return Ok((Box::new(CpuDeformer::new(scene)), None)),
         };
         let buffers = self.shareable_buffers(scene)?;
-        match CudaDeformer::new(&device, scene, buffers.as_ref().map(gl_buffers)) {
+        match CudaDeformer::new(&device, scene, buffers.as_ref().map(SceneBuffers::vertex_buffers).transpose()?) {
             Ok(deformer) => Ok((Box::new(deformer), buffers)),
             Err(error) => {
                 self.unload(buffers);
@@ -283,11 +283,6 @@ impl DeviceContext {
             renderer.unload(buffers);
         }
     }
-}
-
-fn gl_buffers(buffers: &SceneBuffers) -> GlVertexBuffers {
-    let shared = buffers.shared;
-    GlVertexBuffers { positions: shared.positions, normals: shared.normals, tangents: shared.tangents }
 }
 
 fn open_backend(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, String)> {

@@ -204,7 +204,7 @@ impl TriangleCuller {
             return Ok(None);
         };
         debug_assert!(groups.len() <= MAX_GROUPS);
-        let uniforms = CullUniforms::new(groups, gl.subpixel_step());
+        let uniforms = CullUniforms::new(groups, gl.limits.subpixel_step());
         own.write(bytemuck::bytes_of(&uniforms));
         if let Some(seen) = buffers.get("cull previously visible") {
             seen.write(&vec![0; uniforms.mask_bytes()]);

@@ -40,7 +40,7 @@ fn bind(buffers: &SceneBuffers) {
         }
     }
     if let Some(groups) = buffers.buffers.get("cull uniforms") {
-        groups.bind_uniform(GROUP_BLOCK, 0, size_of::<CullUniforms>());
+        groups.bind_uniform(GROUP_BLOCK, size_of::<CullUniforms>());
     }
 }
 

@@ -3,9 +3,10 @@
 //! Displays are initialized once and never terminated: EGL returns the same display of a device to all callers in a
 //! process, so terminating it would invalidate the other renderers' contexts.
 
-use std::cell::Cell;
+use std::cell::RefCell;
 use std::ffi::{CStr, c_char, c_void};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::mem::ManuallyDrop;
+use std::rc::{Rc, Weak};
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use khronos_egl as egl;
@@ -32,11 +33,12 @@ const REMEDY: &str = "Install libegl1 with libegl-mesa0 and libgl1-mesa-dri (Mes
 
 /// Serializes display queries and the creation and destruction of contexts: drivers are known to race there.
 static CONTEXT_LOCK: Mutex<()> = Mutex::new(());
-static NEXT_CONTEXT_ID: AtomicU64 = AtomicU64::new(1);
 
 thread_local! {
-    /// Number of the context that is current on this thread; 0 for none.
-    static CURRENT_CONTEXT: Cell<u64> = const { Cell::new(0) };
+    /// The context that is current on this thread; dangling if there is none or EGL has to be asked again. It has no
+    /// destructor, so that it is also valid while other thread-local values are dropped.
+    static CURRENT_CONTEXT: ManuallyDrop<RefCell<Weak<ContextHandle>>> =
+        const { ManuallyDrop::new(RefCell::new(Weak::new())) };
 }
 
 /// A display on which a context can be created.
@@ -53,13 +55,29 @@ pub(crate) struct Candidate {
     display: egl::Display,
 }
 
-/// A surfaceless OpenGL context; its users make it current.
+/// A surfaceless OpenGL context. It is current while a guard of [`Self::make_current`] exists.
+#[derive(Debug)]
 pub(crate) struct Context {
-    number: u64,
-    display: egl::Display,
-    context: egl::Context,
+    handle: Rc<ContextHandle>,
     /// Whether it is a debug context.
     pub(crate) is_debug: bool,
+}
+
+/// Keeps a context current on this thread. When the guard is dropped, also by a panic that unwinds, the context that was
+/// current before becomes current again. If there was none, the context stays current: nothing relies on a thread without
+/// a context, and each switch flushes the commands of the device.
+#[derive(Debug)]
+#[must_use = "the previous context becomes current again when the guard is dropped"]
+pub(crate) struct CurrentContext {
+    /// The context to restore; none if nothing has to be restored.
+    previous: Option<Weak<ContextHandle>>,
+}
+
+/// An EGL context, which is destroyed when dropped.
+#[derive(Debug)]
+struct ContextHandle {
+    display: egl::Display,
+    context: egl::Context,
 }
 
 struct EglApi {
@@ -194,17 +212,13 @@ pub(crate) fn no_device_error(wanted: &str, tried: &[String]) -> Error {
 }
 
 impl Context {
-    /// Creates a context on a candidate and makes it current on this thread.
-    pub(crate) fn open(candidate: &Candidate) -> Result<Self> {
-        let is_debug = super::gl::is_debug_enabled();
-        let made = Self::make(candidate.display, is_debug)?;
-        // Outside the lock: on failure the context is dropped, which takes the lock.
-        made.make_current()?;
-        Ok(made)
-    }
-
-    fn make(display: egl::Display, is_debug: bool) -> Result<Self> {
+    /// Creates a context on a candidate, on request a debug context, which reports more and can be slower.
+    ///
+    /// # Errors
+    /// `Unavailable` without libEGL; `Fault` when EGL refuses the context.
+    pub(crate) fn open(candidate: &Candidate, is_debug: bool) -> Result<Self> {
         let instance = &api()?.instance;
+        let display = candidate.display;
         let fail = fault_in::<egl::Error>("EGL context");
         let _door = lock_contexts();
         instance.initialize(display).map_err(fault_in("EGL initialize"))?;
@@ -226,18 +240,21 @@ impl Context {
             egl::NONE,
         ];
         let context = instance.create_context(display, config, None, &wanted).map_err(&fail)?;
-        Ok(Self { number: NEXT_CONTEXT_ID.fetch_add(1, Ordering::Relaxed), display, context, is_debug })
+        Ok(Self { handle: Rc::new(ContextHandle { display, context }), is_debug })
     }
 
-    /// Makes the context current on this thread unless it already is.
-    pub(crate) fn make_current(&self) -> Result<()> {
-        if CURRENT_CONTEXT.get() == self.number {
-            return Ok(());
+    /// Makes the context current on this thread.
+    ///
+    /// # Errors
+    /// `Fault` when EGL refuses, for example because the context is current on another thread. No command of this
+    /// context may be issued then.
+    pub(crate) fn make_current(&self) -> Result<CurrentContext> {
+        let previous = CURRENT_CONTEXT.with(|current| current.borrow().clone());
+        if std::ptr::eq(previous.as_ptr(), Rc::as_ptr(&self.handle)) {
+            return Ok(CurrentContext { previous: None });
         }
-        let made = api()?.instance.make_current(self.display, None, None, Some(self.context));
-        made.map_err(fault_in("eglMakeCurrent"))?;
-        CURRENT_CONTEXT.set(self.number);
-        Ok(())
+        self.handle.bind()?;
+        Ok(CurrentContext { previous: (previous.strong_count() > 0).then_some(previous) })
     }
 
     /// Address of an OpenGL function, or null.
@@ -247,14 +264,42 @@ impl Context {
     }
 }
 
-impl Drop for Context {
+impl CurrentContext {
+    /// Leaves the context current on this thread.
+    pub(crate) fn keep(mut self) {
+        self.previous = None;
+    }
+}
+
+impl Drop for CurrentContext {
+    fn drop(&mut self) {
+        let Some(previous) = self.previous.as_ref().and_then(Weak::upgrade) else { return };
+        if let Err(error) = previous.bind() {
+            // Each use of the previous context makes it current first, and then returns the error.
+            tracing::warn!(%error, "the OpenGL context that was current before is not current again");
+        }
+    }
+}
+
+impl ContextHandle {
+    /// Asks EGL to make the context current on this thread.
+    fn bind(self: &Rc<Self>) -> Result<()> {
+        // After a failure EGL is asked again, whichever context is used next.
+        CURRENT_CONTEXT.with(|current| current.replace(Weak::new()));
+        let made = api()?.instance.make_current(self.display, None, None, Some(self.context));
+        made.map_err(fault_in("eglMakeCurrent"))?;
+        CURRENT_CONTEXT.with(|current| current.replace(Rc::downgrade(self)));
+        Ok(())
+    }
+}
+
+impl Drop for ContextHandle {
     fn drop(&mut self) {
         let Ok(api) = api() else { return };
         let _door = lock_contexts();
-        // A thread that exits may have lost its thread-locals already; then no context is current on it either.
-        if CURRENT_CONTEXT.try_with(Cell::get) == Ok(self.number) {
+        // The count of a context is 0 while it is dropped. If another context is current, it stays current.
+        if CURRENT_CONTEXT.with(|current| current.borrow().strong_count()) == 0 {
             api.instance.make_current(self.display, None, None, None).ok();
-            CURRENT_CONTEXT.set(0);
         }
         // Destroying fails only for a context that no longer exists, which is the wanted state.
         api.instance.destroy_context(self.display, self.context).ok();

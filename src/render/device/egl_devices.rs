@@ -1,7 +1,9 @@
 //! EGL devices: describes all of them for `doctor`, and selects one.
 
+use std::rc::Rc;
+
 use super::egl::{Candidate, Context, candidates, no_device_error};
-use super::gl::Gl;
+use super::gl::{self, Gl};
 use crate::types::DevicePreference;
 use modalcast_model::error::{Error, Result};
 
@@ -36,7 +38,7 @@ pub fn devices() -> Result<Vec<EglDevice>> {
 }
 
 fn describe(candidate: Candidate) -> EglDevice {
-    let tried = Context::open(&candidate).and_then(Gl::new);
+    let tried = open_candidate(&candidate);
     let (limits, problem) = match tried {
         Ok(gl) => (Some(gl.limits.clone()), None),
         Err(error) => (None, Some(error.to_string())),
@@ -54,13 +56,18 @@ fn describe(candidate: Candidate) -> EglDevice {
     }
 }
 
-/// Opens the preferred device and returns it with the ordinal of its CUDA device.
-pub(crate) fn open(prefer: DevicePreference) -> Result<(std::rc::Rc<Gl>, Option<i32>)> {
+fn open_candidate(candidate: &Candidate) -> Result<Rc<Gl>> {
+    Gl::new(Context::open(candidate, gl::is_debug_enabled())?)
+}
+
+/// Opens the preferred device, leaves its context current on this thread and returns it with the ordinal of its CUDA device.
+pub(crate) fn open(prefer: DevicePreference) -> Result<(Rc<Gl>, Option<i32>)> {
     let mut tried = Vec::new();
     for (candidate, software) in rank_candidates(candidates()?, prefer) {
         let name = candidate.index.map_or("surfaceless".to_string(), |index| format!("device {index}"));
-        match Context::open(&candidate).and_then(Gl::new) {
+        match open_candidate(&candidate) {
             Ok(gl) if software.is_none_or(|software| software == gl.limits.software) => {
+                gl.stay_current()?;
                 return Ok((gl, candidate.cuda_device));
             }
             Ok(gl) => tried.push(format!("{name} ({}) draws with {}", candidate.vendor, gl.limits.renderer)),

@@ -5,7 +5,7 @@ use super::super::scene_buffers::SceneBuffers;
 use super::super::textures::{TextureArray, TextureRole, arrays, cutoff, find_layer, mip_levels};
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::error::Result;
-use modalcast_model::raster::{AlphaImage, AlphaMaterial, CutOuts, GlBuffer, RasterGeometry};
+use modalcast_model::raster::{AlphaImage, AlphaMaterial, CutOuts, RasterGeometry};
 use modalcast_model::scene::{CullMode, DrawRange, Scene};
 
 /// The mesh of a scene, over the shared position buffer.
@@ -18,7 +18,7 @@ pub(crate) fn of(buffers: &SceneBuffers, anisotropy: f32) -> Result<RasterGeomet
         faces: if group.double_sided { CullMode::None } else { CullMode::Back },
     });
     Ok(RasterGeometry {
-        positions: GlBuffer { name: positions.name(), bytes: positions.bytes },
+        positions: positions.shared(),
         groups: groups.collect(),
         cut_outs: cut_outs(scene, &geometry, anisotropy),
         triangles: geometry.triangle_vertices,

@@ -24,7 +24,7 @@ use modalcast_model::scene::{Scene, Viewport};
 /// A compute rasterizer and its output buffers.
 #[derive(Debug)]
 pub(crate) struct ComputeRasterizer {
-    // Declared before the buffers that it has registered, so that it is dropped first.
+    /// Keeps handles to the buffers that it has registered.
     rasterizer: RefCell<Box<dyn Rasterizer>>,
     shadow: Option<ShadowDepths>,
     visibility: Option<VisibilityKeys>,
@@ -127,14 +127,12 @@ impl ComputeRasterizer {
         let map = || Viewport::new(&shadow_clip_from_positions(scene, shot, origin), side, side);
         let map = if shadow { Some(map()?) } else { None };
         let frame = Viewport::new(&clip_from_positions(scene, shot, origin), shot.width, shot.height)?;
-        let depth = self.shadow.as_ref().zip(map.as_ref()).map(|(depths, map)| (map, of(&depths.buffer)));
+        let depth = self.shadow.as_ref().zip(map.as_ref()).map(|(depths, map)| (map, depths.buffer.shared()));
         let keys = self.visibility.as_ref().filter(|_| visibility);
-        let replaced = keys.map(|keys| keys.reserve(gl, KEY_BYTES * frame.pixel_count() as u64)).transpose()?.flatten();
-        if let Some(replaced) = replaced {
-            self.rasterizer.borrow_mut().release_target(replaced.name());
-        }
-        let into = keys.and_then(|keys| keys.buffer.borrow().as_ref().map(of));
-        self.rasterizer.borrow_mut().draw(depth, into.map(|into| (&frame, into)))?;
+        let bytes = KEY_BYTES * frame.pixel_count() as u64;
+        let into = keys.map(|keys| keys.reserve(gl, bytes)).transpose()?;
+        let depth_target = depth.as_ref().map(|(map, buffer)| (*map, buffer));
+        self.rasterizer.borrow_mut().draw(depth_target, into.as_ref().map(|into| (&frame, into)))?;
         stats.passes.push(if depth.is_some() { "raster shadow" } else { "raster visibility" });
         stats.raster_backends.shadow = depth.map(|_| RasterBackend::Cuda);
         stats.raster_backends.visibility = into.map(|_| RasterBackend::Cuda);
@@ -176,16 +174,12 @@ impl ComputeRasterizer {
 }
 
 impl VisibilityKeys {
-    /// Grows the buffer to at least `bytes` bytes and returns the buffer that was replaced, if any.
-    fn reserve(&self, gl: &Rc<Gl>, bytes: u64) -> Result<Option<Buffer>> {
+    /// A handle to the buffer, which grows to at least `bytes` bytes.
+    fn reserve(&self, gl: &Rc<Gl>, bytes: u64) -> Result<GlBuffer> {
         let mut buffer = self.buffer.borrow_mut();
-        if buffer.as_ref().is_some_and(|buffer| buffer.bytes >= bytes) {
-            return Ok(None);
+        match buffer.take().filter(|buffer| buffer.bytes >= bytes) {
+            Some(large) => Ok(buffer.insert(large).shared()),
+            None => Ok(buffer.insert(gl.buffer(bytes, gl::STREAM_COPY, None)?).shared()),
         }
-        Ok(buffer.replace(gl.buffer(bytes, gl::STREAM_COPY, None)?))
     }
-}
-
-fn of(buffer: &Buffer) -> GlBuffer {
-    GlBuffer { name: buffer.name(), bytes: buffer.bytes }
 }

@@ -125,7 +125,7 @@ fn a_frame_that_does_not_end_is_an_error_with_the_name_of_the_pass_and_the_next_
         renderer.gl.wait("test", Duration::from_secs(60)).expect("all of it");
         let names: Vec<&str> = ticket.passes.iter().map(|(name, _)| *name).collect();
         assert_eq!(names, passes);
-        ticket.fence = renderer.gl.lost_fence();
+        ticket.fence = renderer.gl.broken_fence();
         for (_, timer) in &mut ticket.passes[stuck..] {
             *timer = renderer.gl.unstarted_timer();
         }

@@ -46,7 +46,7 @@ impl ReferenceRasterizer {
     }
 
     fn positions(&self) -> Vec<f32> {
-        let GlBuffer { name, bytes } = self.mesh.positions;
+        let GlBuffer { name, bytes, .. } = self.mesh.positions;
         let mut positions = vec![0_f32; bytes as usize / 4];
         // SAFETY: the buffer belongs to the current context, and `positions` has the size of the buffer.
         unsafe {
@@ -65,7 +65,7 @@ impl ReferenceRasterizer {
         raster
     }
 
-    fn write(&self, into: GlBuffer, bytes: &[u8]) -> Result<()> {
+    fn write(&self, into: &GlBuffer, bytes: &[u8]) -> Result<()> {
         if (bytes.len() as u64) > into.bytes {
             return Err(invalid("raster.buffer", format!("{} bytes", bytes.len()), into.bytes));
         }

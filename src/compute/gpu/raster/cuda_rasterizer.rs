@@ -12,11 +12,9 @@ use modalcast_model::scene::{CullMode, DrawRange};
 /// Bytes of a vertex position.
 const POSITION_BYTES: u64 = 12;
 
-/// Draws one mesh with CUDA. Create and drop it on the thread that owns the OpenGL context, and drop it before the
-/// OpenGL buffers.
+/// Draws one mesh with CUDA. It belongs to the thread that owns the OpenGL context.
 #[derive(Debug)]
 pub struct CudaRasterizer {
-    // First, so dropped first: unregisters the OpenGL buffers.
     positions: RegisteredBuffer,
     depth: PassState,
     ids: PassState,
@@ -57,7 +55,7 @@ impl PassState {
         &mut self,
         device: &Device,
         (sharing, core): (&GlInterop, &RasterPipeline),
-        target: GlBuffer,
+        target: &GlBuffer,
     ) -> Result<PreparedPass<'_>> {
         self.ensure_compiled(device, core)?;
         if self.target.as_ref().is_some_and(|own| own.buffer() != target) {
@@ -65,7 +63,7 @@ impl PassState {
         }
         let registered = match self.target.take() {
             Some(own) => own,
-            None => sharing.register(device, target)?,
+            None => sharing.register(device, target.clone())?,
         };
         let missing = || fault_in("raster")("no kernels were compiled");
         Ok((self.functions.as_ref().ok_or_else(missing)?, &self.groups, self.target.insert(registered)))
@@ -80,8 +78,7 @@ impl PassState {
 }
 
 impl CudaRasterizer {
-    /// Uploads a mesh's triangles and registers its positions, a buffer of the OpenGL context that is current on this
-    /// thread. Kernels are compiled by [`Rasterizer::precompile`], or at the first pass that needs them.
+    /// Uploads a mesh's triangles and registers its positions, a buffer of OpenGL. Kernels are compiled by [`Rasterizer::precompile`], or at the first pass that needs them.
     ///
     /// # Errors
     /// `Invalid` when there are 2^24 triangles or more, a triangle refers to a missing vertex, a group to missing
@@ -94,6 +91,7 @@ impl CudaRasterizer {
             check_cut_outs(mesh.triangles.len(), cut_outs)?;
         }
         device.context().bind_to_thread().map_err(fault_in("device"))?;
+        let _current = mesh.positions.owner.make_current()?;
         let sharing = GlInterop::open(device)?;
         let all = DrawRange { first: 0, triangles: mesh.triangles.len() as u32, faces: CullMode::None };
         let raster = Self {
@@ -158,14 +156,6 @@ impl Rasterizer for CudaRasterizer {
             }
         }
         Ok(())
-    }
-
-    fn release_target(&mut self, name: u32) {
-        for kind in [&mut self.depth, &mut self.ids] {
-            if kind.target.as_ref().is_some_and(|own| own.buffer().name == name) {
-                kind.release(&self.device);
-            }
-        }
     }
 }
 

@@ -39,7 +39,7 @@ enum ClearValue {
 impl Gl {
     /// Binds a framebuffer, clears it and sets the scissor: later draws reach only `part`.
     pub(crate) fn begin_pass(&self, into: &Framebuffer, part: Region, clear: ClearOp<'_>) {
-        let gl = self.current();
+        let Some(gl) = self.functions_or_skip() else { return };
         let [width, height] = part.frame().map(|side| side as i32);
         // SAFETY: sets state with a complete framebuffer.
         unsafe {
@@ -65,7 +65,7 @@ impl Gl {
     fn fill(&self, part: Region, dirty: Option<&DirtyRegion>, with: ClearValue) {
         let last = dirty.and_then(|dirty| dirty.replace(part));
         self.set_scissor(last.unwrap_or_else(|| Region::whole(part.frame())));
-        let gl = self.current();
+        let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: a clear of a complete framebuffer.
         unsafe {
             match with {
@@ -78,7 +78,8 @@ impl Gl {
 
     fn set_scissor(&self, to: Region) {
         let [x, y, width, height] = to.rect().map(|number| number as i32);
+        let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: sets state; no memory is accessed.
-        unsafe { self.current().scissor(x, y, width, height) };
+        unsafe { gl.scissor(x, y, width, height) };
     }
 }

@@ -2,6 +2,7 @@
 //! outside debug contexts, which can be slower; a debug context is created only if the log level asks for it.
 
 use std::collections::HashMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Mutex, PoisonError};
 
 use glow::HasContext as _;
@@ -26,17 +27,21 @@ pub(super) fn install_debug_callback(gl: &mut glow::Context) {
         return;
     }
     let (log, heard) = (dispatcher::get_default(Clone::clone), MessageCounts::default());
-    // SAFETY: the callback owns all its data, may be called on any thread and does not panic; if a log subscriber
-    // panics, glow catches it at the callback.
+    // A panic must not unwind into the driver. The state behind it is a counter and the log, which both stay usable.
+    let forward = move |source, kind, id, severity, text: &str| {
+        catch_unwind(AssertUnwindSafe(|| {
+            if let Some(times) = heard.record([source, kind, id]) {
+                dispatcher::with_default(&log, || log_message((source, kind, id), severity, times, text));
+            }
+        }))
+        .ok();
+    };
+    // SAFETY: the callback owns all its data, may be called on any thread and does not unwind.
     unsafe {
         gl.enable(glow::DEBUG_OUTPUT);
         // Asynchronous output: the driver need not stop for its messages.
         gl.disable(glow::DEBUG_OUTPUT_SYNCHRONOUS);
-        gl.debug_message_callback(move |source, kind, id, severity, text| {
-            if let Some(times) = heard.record([source, kind, id]) {
-                dispatcher::with_default(&log, || log_message((source, kind, id), severity, times, text));
-            }
-        });
+        gl.debug_message_callback(forward);
     }
 }
 
@@ -136,11 +141,11 @@ mod tests {
             let (gl, _) = device::open(DevicePreference::Any).expect("EGL");
             for _ in 0..wrong {
                 // SAFETY: the flag does not exist, and OpenGL rejects it.
-                unsafe { gl.current().enable(0xFFFF) }
+                unsafe { gl.functions().expect("current").enable(0xFFFF) }
                 assert!(gl.check("test").is_err(), "the error is seen without the log too");
             }
             // SAFETY: waits for the commands, so that a driver with delayed messages has sent them.
-            unsafe { gl.current().finish() }
+            unsafe { gl.functions().expect("current").finish() }
         });
         String::from_utf8(lines.0.lock().expect("whole").clone()).expect("text")
     }

@@ -13,19 +13,26 @@ use modalcast_model::error::{Result, fault_in};
 pub(crate) struct Fence {
     gl: Rc<Gl>,
     name: glow::Fence,
+    /// Whether each wait fails.
+    #[cfg(test)]
+    is_broken: bool,
 }
 
 impl Gl {
     /// Inserts a fence after all commands so far and flushes them to the device.
     pub(crate) fn fence(self: &Rc<Self>, stage: &'static str) -> Result<Fence> {
-        let gl = self.current();
+        let gl = self.functions()?;
         // SAFETY: a new fence, owned by the returned value.
-        let name = unsafe {
-            let name = gl.fence_sync(glow::SYNC_GPU_COMMANDS_COMPLETE, 0).map_err(fault_in(stage))?;
-            gl.flush();
-            name
+        let name = unsafe { gl.fence_sync(glow::SYNC_GPU_COMMANDS_COMPLETE, 0) }.map_err(fault_in(stage))?;
+        let fence = Fence {
+            gl: Rc::clone(self),
+            name,
+            #[cfg(test)]
+            is_broken: false,
         };
-        Ok(Fence { gl: Rc::clone(self), name })
+        // SAFETY: only submits commands.
+        unsafe { gl.flush() }
+        Ok(fence)
     }
 }
 
@@ -37,50 +44,54 @@ impl Fence {
 
     /// Like [`Self::is_done`], after waiting at most `limit`.
     pub(crate) fn is_done_within(&self, limit: Duration) -> bool {
-        self.state(limit) != glow::TIMEOUT_EXPIRED
+        self.poll("fence", limit).unwrap_or(true)
     }
 
     /// Waits until the commands are complete.
     ///
     /// # Errors
-    /// `Fault` of `stage` when the device does not finish within `limit` or is lost.
+    /// `Fault` of `stage` when the device does not finish within `limit` or cannot be asked; `DeviceLost` when the
+    /// context is lost.
     pub(crate) fn wait(&self, stage: &'static str, limit: Duration) -> Result<()> {
         let begin = Instant::now();
-        loop {
-            match self.state(limit.saturating_sub(begin.elapsed())) {
-                glow::ALREADY_SIGNALED | glow::CONDITION_SATISFIED => return Ok(()),
-                glow::TIMEOUT_EXPIRED if begin.elapsed() < limit => {}
-                glow::TIMEOUT_EXPIRED => {
-                    return Err(fault_in(stage)(format!("the device did not finish within {limit:?}")));
-                }
-                _ => return Err(fault_in(stage)("the device was lost")),
+        while !self.poll(stage, limit.saturating_sub(begin.elapsed()))? {
+            if begin.elapsed() >= limit {
+                return Err(fault_in(stage)(format!("the device did not finish within {limit:?}")));
             }
         }
+        Ok(())
     }
 
-    /// Status of the fence after waiting at most `limit` or one second.
-    fn state(&self, limit: Duration) -> u32 {
+    /// Whether the commands are complete, after waiting at most `limit` or one second.
+    fn poll(&self, stage: &'static str, limit: Duration) -> Result<bool> {
         // One second fits into glow's 32-bit nanoseconds.
         let slice = limit.min(Duration::from_secs(1)).as_nanos() as i32;
+        let gl = self.gl.functions().map_err(fault_in(stage))?;
         // SAFETY: the fence lives as long as this value.
-        unsafe { self.gl.current().client_wait_sync(self.name, glow::SYNC_FLUSH_COMMANDS_BIT, slice) }
+        let status = unsafe { gl.client_wait_sync(self.name, glow::SYNC_FLUSH_COMMANDS_BIT, slice) };
+        #[cfg(test)]
+        let status = if self.is_broken { glow::WAIT_FAILED } else { status };
+        match status {
+            glow::ALREADY_SIGNALED | glow::CONDITION_SATISFIED => Ok(true),
+            glow::TIMEOUT_EXPIRED => Ok(false),
+            _ => Err(self.gl.loss(stage).unwrap_or_else(|| fault_in(stage)("the wait for the device failed"))),
+        }
     }
 }
 
 impl Drop for Fence {
     fn drop(&mut self) {
         // SAFETY: this value owns the name, which is not used afterwards.
-        unsafe { self.gl.current().delete_sync(self.name) }
+        self.gl.delete(|gl| unsafe { gl.delete_sync(self.name) });
     }
 }
 
 #[cfg(test)]
 impl Gl {
-    /// A fence that the device has lost.
-    pub(crate) fn lost_fence(self: &Rc<Self>) -> Fence {
-        let fence = self.fence("test").expect("a fence");
-        // SAFETY: using a deleted name is an OpenGL error without other effects.
-        unsafe { self.current().delete_sync(fence.name) }
+    /// A fence for which no wait succeeds.
+    pub(crate) fn broken_fence(self: &Rc<Self>) -> Fence {
+        let mut fence = self.fence("test").expect("a fence");
+        fence.is_broken = true;
         fence
     }
 }
@@ -121,7 +132,7 @@ mod tests {
         fence.wait("long", Duration::from_secs(60)).expect("it ends");
         assert!(fence.is_done() && fence.is_done_within(Duration::from_secs(9)));
         fence.wait("long", Duration::ZERO).expect("what is over is never late");
-        let lost = gl.lost_fence().wait("gone", Duration::from_secs(60)).expect_err("lost").to_string();
-        assert!(lost.contains("gone") && lost.contains("the device was lost"), "{lost}");
+        let lost = gl.broken_fence().wait("gone", Duration::from_secs(60)).expect_err("lost").to_string();
+        assert!(lost.contains("gone") && lost.contains("the wait for the device failed"), "{lost}");
     }
 }

@@ -1,26 +1,18 @@
 //! OpenGL commands for lists that shaders write: indirect draws and their barriers.
 
-use std::rc::Rc;
-
 use glow::HasContext as _;
 
-use super::{Buffer, Framebuffer, Gl, Texture, VertexArray};
-use modalcast_model::error::Result;
+use super::{Buffer, Gl, VertexArray};
 
 impl Gl {
-    /// Creates a framebuffer with a color attachment and no depth.
-    pub(crate) fn color_framebuffer(self: &Rc<Self>, color: &Texture) -> Result<Framebuffer> {
-        self.attach_framebuffer(Some(color), None)
-    }
-
     /// Draws triangles of an array's index buffer with an indirect command, which a shader may have written.
     pub(crate) fn draw_indexed_indirect(&self, array: &VertexArray, commands: &Buffer, offset: usize) {
-        let gl = self.current();
+        let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: the command names a checked range of the index buffer. Shaders change only the number of instances or
         // of indices; they write the indices themselves, from checked ones and never beyond the range.
         unsafe {
             gl.bind_vertex_array(Some(array.name));
-            gl.bind_buffer(glow::DRAW_INDIRECT_BUFFER, Some(commands.name));
+            gl.bind_buffer(glow::DRAW_INDIRECT_BUFFER, Some(commands.name()));
             gl.draw_elements_indirect_offset(glow::TRIANGLES, glow::UNSIGNED_INT, offset as i32);
             gl.bind_vertex_array(None);
         }
@@ -28,7 +20,8 @@ impl Gl {
 
     /// Memory barrier: later commands see what shaders wrote.
     pub(crate) fn barrier(&self) {
+        let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: only orders memory accesses.
-        unsafe { self.current().memory_barrier(glow::ALL_BARRIER_BITS) }
+        unsafe { gl.memory_barrier(glow::ALL_BARRIER_BITS) }
     }
 }

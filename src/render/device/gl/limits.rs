@@ -2,6 +2,9 @@
 
 use glow::HasContext as _;
 
+/// GL_SUBPIXEL_BITS, which glow does not define.
+const SUBPIXEL_BITS: u32 = 0x0D50;
+
 /// Limits and features of an OpenGL context.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Limits {
@@ -22,6 +25,8 @@ pub(crate) struct Limits {
     pub(crate) post_depth_coverage: bool,
     /// Whether buffers can stay mapped while the device writes them (OpenGL 4.4).
     pub(crate) persistent_mapping: bool,
+    /// Bits of a vertex position below the pixel, at least 4.
+    pub(crate) subpixel_bits: u32,
     /// Largest anisotropy; 1 if it is not supported or runs on the CPU.
     pub(crate) anisotropy: f32,
 }
@@ -55,11 +60,25 @@ impl Limits {
                 max_texels: u64::from(number(glow::MAX_TEXTURE_BUFFER_SIZE)),
                 max_storage_bytes: u64::from(number(glow::MAX_SHADER_STORAGE_BLOCK_SIZE)),
                 persistent_mapping: is_persistent(gl),
+                subpixel_bits: number(SUBPIXEL_BITS),
                 post_depth_coverage: gl.supported_extensions().contains("GL_ARB_post_depth_coverage"),
                 anisotropy: if anisotropic && !software { 8.0 } else { 1.0 },
             }
         }
     }
+}
+
+impl Limits {
+    /// Largest step of the rasterizer's subpixel grid, in pixels.
+    pub(crate) fn subpixel_step(&self) -> f32 {
+        0.5_f32.powi(self.subpixel_bits.min(16) as i32)
+    }
+}
+
+/// Whether the context has glGetGraphicsResetStatus.
+pub(super) fn has_reset_status(gl: &glow::Context) -> bool {
+    let version = gl.version();
+    (version.major, version.minor) >= (4, 5) || gl.supported_extensions().contains("GL_KHR_robustness")
 }
 
 fn is_persistent(gl: &glow::Context) -> bool {

@@ -1,4 +1,5 @@
 //! Buffers, textures, programs, framebuffers and vertex arrays. Each owns its OpenGL name and deletes it when dropped.
+//! An object that refers to others shares their names, so that they are deleted after it.
 
 use std::rc::Rc;
 
@@ -6,13 +7,21 @@ use glow::HasContext as _;
 
 use super::Gl;
 use modalcast_model::error::{Result, fault_in};
+use modalcast_model::raster::{GlBuffer, GlBufferOwner};
 
 /// A buffer object of fixed size.
 #[derive(Debug)]
 pub(crate) struct Buffer {
-    pub(super) gl: Rc<Gl>,
-    pub(super) name: glow::Buffer,
+    object: Rc<BufferObject>,
     pub(crate) bytes: u64,
+}
+
+/// The name of a buffer, which is deleted once nothing refers to it: no [`Buffer`], no object that reads it, and no other
+/// API that registered it.
+#[derive(Debug)]
+pub(super) struct BufferObject {
+    pub(super) gl: Rc<Gl>,
+    name: glow::Buffer,
 }
 
 /// Storage parameters of a texture.
@@ -27,12 +36,20 @@ pub(crate) struct TextureDesc {
     pub(crate) levels: u32,
 }
 
-/// A texture object with immutable storage.
+/// A texture object: immutable storage, or a view of a buffer.
 #[derive(Debug)]
 pub(crate) struct Texture {
-    pub(super) gl: Rc<Gl>,
-    pub(super) name: glow::Texture,
+    object: Rc<TextureObject>,
     pub(crate) desc: TextureDesc,
+}
+
+/// The name of a texture, which is deleted once no [`Texture`] and no framebuffer refers to it.
+#[derive(Debug)]
+struct TextureObject {
+    gl: Rc<Gl>,
+    name: glow::Texture,
+    /// The buffer of a buffer texture.
+    _buffer: Option<Rc<BufferObject>>,
 }
 
 #[derive(Debug)]
@@ -43,88 +60,188 @@ pub(crate) struct Program {
 
 #[derive(Debug)]
 pub(crate) struct Framebuffer {
-    pub(super) gl: Rc<Gl>,
+    gl: Rc<Gl>,
     pub(super) name: glow::Framebuffer,
+    _attachments: Vec<Rc<TextureObject>>,
 }
 
 #[derive(Debug)]
 pub(crate) struct VertexArray {
-    pub(super) gl: Rc<Gl>,
+    gl: Rc<Gl>,
     pub(super) name: glow::VertexArray,
+    _buffers: Vec<Rc<BufferObject>>,
+}
+
+/// A buffer range that is mapped for reading; unmapped when dropped.
+struct ReadMapping<'a> {
+    gl: super::Functions<'a>,
+    name: glow::Buffer,
+    first: *const u8,
+    bytes: usize,
+}
+
+impl<'a> ReadMapping<'a> {
+    /// Maps the first bytes of a buffer, at least one. Waits for pending writes.
+    fn new(buffer: &'a Buffer, bytes: usize) -> Result<Self> {
+        let (gl, name) = (buffer.object.gl.functions()?, buffer.name());
+        // SAFETY: OpenGL refuses a range that is not inside the buffer or that is mapped already.
+        let first = unsafe {
+            gl.bind_buffer(glow::COPY_READ_BUFFER, Some(name));
+            gl.map_buffer_range(glow::COPY_READ_BUFFER, 0, bytes as i32, glow::MAP_READ_BIT)
+        };
+        if first.is_null() {
+            return Err(fault_in("read")("the pixels cannot be mapped"));
+        }
+        Ok(Self { gl, name, first, bytes })
+    }
+
+    fn bytes(&self) -> &[u8] {
+        // SAFETY: the range is mapped while this value exists, and no command that writes it is issued meanwhile: the
+        // only user copies it at once.
+        unsafe { std::slice::from_raw_parts(self.first, self.bytes) }
+    }
+}
+
+impl Drop for ReadMapping<'_> {
+    fn drop(&mut self) {
+        // SAFETY: the buffer is mapped, and the bytes are not used afterwards.
+        unsafe {
+            self.gl.bind_buffer(glow::COPY_READ_BUFFER, Some(self.name));
+            self.gl.unmap_buffer(glow::COPY_READ_BUFFER);
+        }
+    }
 }
 
 impl Buffer {
-    /// The name with which other APIs register the buffer.
-    pub(crate) fn name(&self) -> u32 {
-        self.name.0.get()
+    /// Takes ownership of a name whose storage has `bytes` bytes.
+    pub(super) fn new(gl: &Rc<Gl>, name: glow::Buffer, bytes: u64) -> Self {
+        Self { object: Rc::new(BufferObject { gl: Rc::clone(gl), name }), bytes }
+    }
+
+    pub(super) fn name(&self) -> glow::Buffer {
+        self.object.name
+    }
+
+    pub(super) const fn object(&self) -> &Rc<BufferObject> {
+        &self.object
+    }
+
+    /// A handle with which other APIs register the buffer. It keeps the buffer alive.
+    pub(crate) fn shared(&self) -> GlBuffer {
+        let owner = Rc::clone(&self.object);
+        GlBuffer { name: self.object.name.0.get(), bytes: self.bytes, owner }
     }
 
     /// Overwrites the first `data.len()` bytes.
     pub(crate) fn write(&self, data: &[u8]) {
-        let gl = self.gl.current();
-        // SAFETY: OpenGL rejects data that is larger than the buffer.
+        let gl = &self.object.gl;
+        if data.len() as u64 > self.bytes {
+            return gl.skip(format!("a write of {} bytes to a buffer of {}", data.len(), self.bytes));
+        }
+        let Some(gl) = gl.functions_or_skip() else { return };
+        // SAFETY: the data fits into the buffer.
         unsafe {
-            gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(self.name));
+            gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(self.object.name));
             gl.buffer_sub_data_u8_slice(glow::COPY_WRITE_BUFFER, 0, data);
         }
     }
 
     /// Copies the first bytes to the host. Waits for pending writes.
+    ///
+    /// # Errors
+    /// `Fault` when the buffer is smaller or cannot be mapped.
     pub(crate) fn read(&self, bytes: usize) -> Result<Vec<u8>> {
-        let gl = self.gl.current();
-        let bytes = bytes.min(self.bytes as usize);
-        // SAFETY: the mapped range is inside the buffer, is only read, and is unmapped before any other use.
-        unsafe {
-            gl.bind_buffer(glow::COPY_READ_BUFFER, Some(self.name));
-            let mapped = gl.map_buffer_range(glow::COPY_READ_BUFFER, 0, bytes as i32, glow::MAP_READ_BIT);
-            if mapped.is_null() {
-                return Err(fault_in("read")("the pixels cannot be mapped"));
-            }
-            let copied = std::slice::from_raw_parts(mapped, bytes).to_vec();
-            gl.unmap_buffer(glow::COPY_READ_BUFFER);
-            Ok(copied)
+        if bytes as u64 > self.bytes {
+            return Err(fault_in("read")(format!("expected at most {} bytes, got {bytes}", self.bytes)));
         }
+        if bytes == 0 {
+            return Ok(Vec::new());
+        }
+        Ok(ReadMapping::new(self, bytes)?.bytes().to_vec())
     }
 
     pub(crate) fn bind_storage(&self, binding: u32) {
+        let Some(gl) = self.object.gl.functions_or_skip() else { return };
         // SAFETY: binding points below the eight that every context has.
-        unsafe { self.gl.current().bind_buffer_base(glow::SHADER_STORAGE_BUFFER, binding, Some(self.name)) }
+        unsafe { gl.bind_buffer_base(glow::SHADER_STORAGE_BUFFER, binding, Some(self.object.name)) }
     }
 
-    /// Binds `bytes` bytes from `offset`, a multiple of 256.
-    pub(crate) fn bind_uniform(&self, binding: u32, offset: usize, bytes: usize) {
-        let (offset, bytes) = (offset as i32, bytes as i32);
-        // SAFETY: binding points below the 36 that every context has; OpenGL rejects ranges outside the buffer.
-        unsafe { self.gl.current().bind_buffer_range(glow::UNIFORM_BUFFER, binding, Some(self.name), offset, bytes) }
+    /// Binds the first `bytes` bytes.
+    pub(crate) fn bind_uniform(&self, binding: u32, bytes: usize) {
+        let gl = &self.object.gl;
+        if bytes as u64 > self.bytes {
+            return gl.skip(format!("{bytes} bytes of uniforms from a buffer of {}", self.bytes));
+        }
+        let Some(gl) = gl.functions_or_skip() else { return };
+        // SAFETY: binding points below the 36 that every context has; the range is inside the buffer.
+        unsafe { gl.bind_buffer_range(glow::UNIFORM_BUFFER, binding, Some(self.object.name), 0, bytes as i32) }
+    }
+}
+
+impl GlBufferOwner for BufferObject {
+    fn make_current(&self) -> Result<Box<dyn std::any::Any>> {
+        Ok(Box::new(self.gl.make_current()?))
+    }
+}
+
+impl Framebuffer {
+    /// Takes ownership of a name, and shares the textures that will be attached.
+    pub(super) fn new<'a>(
+        gl: &Rc<Gl>,
+        name: glow::Framebuffer,
+        attachments: impl Iterator<Item = &'a Texture>,
+    ) -> Self {
+        Self { gl: Rc::clone(gl), name, _attachments: attachments.map(|image| Rc::clone(&image.object)).collect() }
+    }
+}
+
+impl VertexArray {
+    /// Takes ownership of a name, and shares the buffers that will be attached.
+    pub(super) fn new<'a>(gl: &Rc<Gl>, name: glow::VertexArray, buffers: impl Iterator<Item = &'a Buffer>) -> Self {
+        Self { gl: Rc::clone(gl), name, _buffers: buffers.map(|buffer| Rc::clone(&buffer.object)).collect() }
     }
 }
 
 impl Texture {
+    /// Takes ownership of a name, and shares the buffer of a buffer texture.
+    pub(super) fn new(gl: &Rc<Gl>, name: glow::Texture, desc: TextureDesc, buffer: Option<&Buffer>) -> Self {
+        let _buffer = buffer.map(|buffer| Rc::clone(&buffer.object));
+        Self { object: Rc::new(TextureObject { gl: Rc::clone(gl), name, _buffer }), desc }
+    }
+
+    pub(super) fn name(&self) -> glow::Texture {
+        self.object.name
+    }
+
+    fn gl(&self) -> &Rc<Gl> {
+        &self.object.gl
+    }
+
     /// Uploads RGBA8 pixels to one layer of one mipmap level, first row first.
     pub(crate) fn fill(&self, level: u32, layer: u32, size: [u32; 2], rgba: &[u8]) -> Result<()> {
         let [width, height] = size.map(|side| side as i32);
         if rgba.len() != 4 * width as usize * height as usize {
             return Err(fault_in("texture")(format!("{} bytes for {width} x {height} pixels", rgba.len())));
         }
-        let gl = self.gl.current();
+        let gl = self.gl().functions()?;
         let pixels = glow::PixelUnpackData::Slice(Some(rgba));
         let (level, layer) = (level as i32, layer as i32);
         // SAFETY: the pixels fill the box (checked above), which OpenGL checks against the storage.
         unsafe {
-            gl.bind_texture(self.desc.target, Some(self.name));
+            gl.bind_texture(self.desc.target, Some(self.name()));
             gl.pixel_store_i32(glow::UNPACK_ALIGNMENT, 1);
             let (format, ty) = (glow::RGBA, glow::UNSIGNED_BYTE);
             gl.tex_sub_image_3d(self.desc.target, level, 0, 0, layer, width, height, 1, format, ty, pixels);
         }
-        self.gl.check("texture")
+        self.gl().check("texture")
     }
 
     /// Sets sampler parameters: pairs of OpenGL parameter and value.
     pub(crate) fn set_sampling(&self, parameters: &[(u32, u32)], anisotropy: f32) {
-        let gl = self.gl.current();
+        let Some(gl) = self.gl().functions_or_skip() else { return };
         // SAFETY: plain parameters of a texture of this context.
         unsafe {
-            gl.bind_texture(self.desc.target, Some(self.name));
+            gl.bind_texture(self.desc.target, Some(self.name()));
             for (parameter, value) in parameters {
                 gl.tex_parameter_i32(self.desc.target, *parameter, *value as i32);
             }
@@ -135,11 +252,11 @@ impl Texture {
     }
 
     pub(crate) fn bind(&self, unit: u32) {
-        let gl = self.gl.current();
+        let Some(gl) = self.gl().functions_or_skip() else { return };
         // SAFETY: units below the 96 that every context has over all stages.
         unsafe {
             gl.active_texture(glow::TEXTURE0 + unit);
-            gl.bind_texture(self.desc.target, Some(self.name));
+            gl.bind_texture(self.desc.target, Some(self.name()));
         }
     }
 
@@ -154,11 +271,21 @@ impl Texture {
     }
 
     fn bind_image_for(&self, unit: u32, access: u32) {
+        let Some(gl) = self.gl().functions_or_skip() else { return };
         // SAFETY: level 0 of a texture whose format the shader declares.
         unsafe {
-            let gl = self.gl.current();
             let layered = self.desc.target == glow::TEXTURE_2D_ARRAY;
-            gl.bind_image_texture(unit, Some(self.name), 0, layered, 0, access, self.desc.format);
+            gl.bind_image_texture(unit, Some(self.name()), 0, layered, 0, access, self.desc.format);
+        }
+    }
+
+    /// Binds one layer as an image that a compute shader writes.
+    pub(crate) fn bind_image_layer(&self, unit: u32, layer: u32) {
+        let Some(gl) = self.gl().functions_or_skip() else { return };
+        // SAFETY: level 0 of a texture whose format the shader declares.
+        unsafe {
+            let format = self.desc.format;
+            gl.bind_image_texture(unit, Some(self.name()), 0, false, layer as i32, glow::WRITE_ONLY, format);
         }
     }
 }
@@ -167,28 +294,33 @@ impl Program {
     /// Makes the program current. `number`, for example the first triangle, goes to location 0 of programs that declare
     /// one.
     pub(crate) fn bind(&self, number: Option<u32>) {
-        let gl = self.gl.current();
-        // SAFETY: a linked program; shaders that get a number declare location 0.
-        unsafe {
-            gl.use_program(Some(self.name));
-            if let Some(number) = number {
-                gl.uniform_1_i32(Some(&glow::NativeUniformLocation(0)), number as i32);
-            }
+        let Some(gl) = self.gl.functions_or_skip() else { return };
+        // SAFETY: a linked program.
+        unsafe { gl.use_program(Some(self.name)) }
+        if let Some(number) = number {
+            self.set_uniform(0, number as i32);
         }
     }
-}
 
-impl Program {
     /// Sets the first triangle of the next draw (location 0). This must be the bound program.
     pub(crate) fn set_first_triangle(&self, number: u32) {
-        // SAFETY: shaders that get a number declare location 0.
-        unsafe { self.gl.current().uniform_1_i32(Some(&glow::NativeUniformLocation(0)), number as i32) }
+        self.set_uniform(0, number as i32);
     }
 
     /// Sets the phase of a program with several phases (location 1). This must be the bound program.
     pub(crate) fn set_phase(&self, phase: i32) {
-        // SAFETY: a linked, bound program; shaders with several phases declare location 1.
-        unsafe { self.gl.current().uniform_1_i32(Some(&glow::NativeUniformLocation(1)), phase) }
+        self.set_uniform(1, phase);
+    }
+
+    /// Sets the layer (location 1) that this program writes. This must be the bound program.
+    pub(crate) fn set_layer(&self, layer: u32) {
+        self.set_uniform(1, layer as i32);
+    }
+
+    fn set_uniform(&self, location: u32, number: i32) {
+        let Some(gl) = self.gl.functions_or_skip() else { return };
+        // SAFETY: OpenGL reports an error unless a bound program declares an integer at the location.
+        unsafe { gl.uniform_1_i32(Some(&glow::NativeUniformLocation(location)), number) }
     }
 }
 
@@ -197,15 +329,15 @@ macro_rules! freed_by {
         impl Drop for $object {
             fn drop(&mut self) {
                 // SAFETY: this value owns the name, which is not used afterwards.
-                unsafe { self.gl.current().$delete(self.name) }
+                self.gl.delete(|gl| unsafe { gl.$delete(self.name) });
             }
         }
     )*};
 }
 
 freed_by!(
-    Buffer => delete_buffer,
-    Texture => delete_texture,
+    BufferObject => delete_buffer,
+    TextureObject => delete_texture,
     Program => delete_program,
     Framebuffer => delete_framebuffer,
     VertexArray => delete_vertex_array

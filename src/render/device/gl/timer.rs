@@ -26,7 +26,7 @@ impl Gl {
     }
 
     /// Runs the commands of a pass and measures their device time. In software this waits for them, at most `limit`.
-    /// Each pass owns a query until its stopwatch is dropped, so that several frames can be in flight.
+    /// Each pass owns a query until its timer is dropped, so that several frames can be in flight.
     ///
     /// # Errors
     /// Those of the commands; `Fault` of the pass when software does not finish in time.
@@ -42,32 +42,56 @@ impl Gl {
             self.wait(pass, limit)?;
             return Ok(PassTimer::Wall(begin.elapsed().as_secs_f64() * 1e3));
         }
-        let gl = self.current();
+        let timer = PassTimer::Query(Rc::clone(self), self.query()?);
+        let active = ActiveQuery::begin(&timer)?;
+        commands()?;
+        drop(active);
+        Ok(timer)
+    }
+
+    /// A query that no timer uses.
+    fn query(&self) -> Result<glow::Query> {
         let free = self.free_queries.borrow_mut().pop();
-        // SAFETY: queries do not nest: this one is ended before the function returns, even if the commands fail. A
-        // query from the pool has no other user.
-        let query = unsafe {
-            let query = free.map_or_else(|| gl.create_query(), Ok).map_err(fault_in("timer"))?;
-            gl.begin_query(glow::TIME_ELAPSED, query);
-            query
-        };
-        let timer = PassTimer::Query(Rc::clone(self), query);
-        let done = commands();
-        // SAFETY: ends the query that was begun above.
-        unsafe { self.current().end_query(glow::TIME_ELAPSED) }
-        done.map(|()| timer)
+        let gl = self.functions()?;
+        // SAFETY: a new name, which stays in the pool until the context is destroyed.
+        free.map_or_else(|| unsafe { gl.create_query() }.map_err(fault_in("timer")), Ok)
+    }
+}
+
+/// A query that measures the commands while this value exists. It ends also if the commands fail or panic, so that the
+/// next query can begin.
+struct ActiveQuery<'a> {
+    gl: &'a Gl,
+}
+
+impl<'a> ActiveQuery<'a> {
+    /// Begins the query of a timer; none is active meanwhile.
+    fn begin(timer: &'a PassTimer) -> Result<Option<Self>> {
+        let PassTimer::Query(gl, query) = timer else { return Ok(None) };
+        // SAFETY: the query belongs to the timer alone. OpenGL reports an error if another one is active.
+        unsafe { gl.functions()?.begin_query(glow::TIME_ELAPSED, *query) }
+        Ok(Some(Self { gl }))
+    }
+}
+
+impl Drop for ActiveQuery<'_> {
+    fn drop(&mut self) {
+        let Some(gl) = self.gl.functions_or_skip() else { return };
+        // SAFETY: ends the query that `begin` has begun.
+        unsafe { gl.end_query(glow::TIME_ELAPSED) }
     }
 }
 
 impl PassTimer {
-    /// Milliseconds. Waits for the result if the device has not finished.
+    /// Milliseconds. Waits for the result if the device has not finished. 0 if the context cannot be made current.
     pub(crate) fn ms(&self) -> f64 {
         match self {
             Self::Wall(ms) => *ms,
-            // SAFETY: the query was ended; reading its result waits until it is available.
-            Self::Query(gl, query) => unsafe {
-                gl.current().get_query_parameter_u64(*query, glow::QUERY_RESULT) as f64 * 1e-6
-            },
+            Self::Query(gl, query) => {
+                let Some(gl) = gl.functions_or_skip() else { return 0.0 };
+                // SAFETY: the query was ended; reading its result waits until it is available.
+                unsafe { gl.get_query_parameter_u64(*query, glow::QUERY_RESULT) as f64 * 1e-6 }
+            }
         }
     }
 
@@ -75,10 +99,11 @@ impl PassTimer {
     pub(crate) fn is_done(&self) -> bool {
         match self {
             Self::Wall(_) => true,
-            // SAFETY: the query was ended; this asks for availability only.
-            Self::Query(gl, query) => unsafe {
-                gl.current().get_query_parameter_u32(*query, glow::QUERY_RESULT_AVAILABLE) != 0
-            },
+            Self::Query(gl, query) => {
+                let Some(gl) = gl.functions_or_skip() else { return false };
+                // SAFETY: the query was ended; this asks for availability only.
+                unsafe { gl.get_query_parameter_u32(*query, glow::QUERY_RESULT_AVAILABLE) != 0 }
+            }
         }
     }
 }
@@ -94,10 +119,10 @@ impl Drop for PassTimer {
 
 #[cfg(test)]
 impl Gl {
-    /// A stopwatch for commands that the device never reaches.
+    /// A timer of commands that the device never reaches.
     pub(crate) fn unstarted_timer(self: &Rc<Self>) -> PassTimer {
         // SAFETY: a new name; reading a query that was never begun is an OpenGL error without a result.
-        let query = unsafe { self.current().create_query() }.expect("a query");
+        let query = unsafe { self.functions().expect("current").create_query() }.expect("a query");
         PassTimer::Query(Rc::clone(self), query)
     }
 }

@@ -19,7 +19,7 @@ use crate::thesis::{PLANTS, ThesisPlant};
 use crate::timing::{MIN_REPETITIONS, Timing};
 use crate::workloads::{Size as Scale, Workload, WorkloadKind};
 use modalcast_compute::cpu::CpuDeformer;
-use modalcast_compute::gpu::{self, BufferRole, CudaDeformer, Device, GlVertexBuffers};
+use modalcast_compute::gpu::{self, BufferRole, CudaDeformer, Device};
 use modalcast_model::deform::{Backend, DeformSummary, Deformer, VertexAttributes};
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Camera, RenderSettings, Scene, SceneState, ShadowSettings};
@@ -123,10 +123,9 @@ fn rig(studio: &mut RenderHarness, device: Option<&Arc<Device>>, scene: &Arc<Sce
     let Some(device) = device else {
         return Ok(PlantSetup { deformer: Box::new(CpuDeformer::new(scene)), bytes: 0, buffers });
     };
-    let shared = buffers.shared;
-    let gl = GlVertexBuffers { positions: shared.positions, normals: shared.normals, tangents: shared.tangents };
     let draws = studio.renderer.info().cuda_device.map(|ordinal| usize::try_from(ordinal).ok());
-    let gl = (draws == Some(Some(device.ordinal()))).then_some(gl);
+    let is_shared = draws == Some(Some(device.ordinal()));
+    let gl = if is_shared { Some(buffers.vertex_buffers()?) } else { None };
     let deformer = CudaDeformer::new(device, scene, gl)?;
     Ok(PlantSetup { bytes: beside(deformer.plan(), deformer.shares_buffers()), deformer: Box::new(deformer), buffers })
 }
