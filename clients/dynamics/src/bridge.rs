@@ -13,7 +13,7 @@ use crate::affine::Affine;
 use crate::cubic::ReducedForce;
 use crate::error::{Result, invalid};
 use crate::model::{DomainModel, Model};
-use crate::newmark::{NewmarkState, ReducedSystem};
+use crate::newmark::{LoadChange, NewmarkState, ReducedSystem};
 use crate::run::{Motion, Scenario, ScenarioReport};
 use crate::vega::VegaSettings;
 
@@ -48,6 +48,7 @@ pub struct Bridge {
     part: usize,
     /// The full reduced load.
     load: DVector<f64>,
+    /// The state at step `next`, the step of the next motion.
     motion: NewmarkState,
     next: u64,
     strength: f64,
@@ -76,6 +77,14 @@ impl Bridge {
         Ok(Self { model, system, options, part, load, motion, next: 0, strength, static_deflection, peak: 0.0 })
     }
 
+    /// Integrates the state to the next step.
+    fn advance(&mut self) {
+        let (before, after) = (self.load(self.next), self.load(self.next + 1));
+        let load = LoadChange { before: &before, after: &after };
+        self.motion = self.system.step(&self.motion, self.options.dt, load);
+        self.next += 1;
+    }
+
     /// The reduced load at a step.
     fn load(&self, step: u64) -> DVector<f64> {
         let time = step as f64 * self.options.dt;
@@ -88,12 +97,7 @@ impl Scenario for Bridge {
         &self.model
     }
 
-    fn motion_at(&mut self, number: u64, motion: &mut Motion) -> Result<()> {
-        while self.next < number {
-            let (before, after) = (self.load(self.next), self.load(self.next + 1));
-            self.motion = self.system.step(&self.motion, self.options.dt, (&before, &after));
-            self.next += 1;
-        }
+    fn next_motion(&mut self, motion: &mut Motion) -> Result<()> {
         let part = &self.model.parts[self.part];
         motion.q = vec![0.0; self.model.coordinates];
         for (place, number) in motion.q[part.first..].iter_mut().zip(self.motion.q.iter()) {
@@ -103,6 +107,7 @@ impl Scenario for Bridge {
         let q: Vec<f64> = motion.q.iter().map(|number| f64::from(*number)).collect();
         let world: Vec<Affine> = motion.transforms.iter().map(Affine::from_entries).collect();
         self.peak = self.peak.max(self.model.peak(&q, &world));
+        self.advance();
         Ok(())
     }
 
@@ -217,9 +222,9 @@ mod tests {
         let mut bridge = span(OPTIONS);
         assert!((bridge.static_deflection - 0.03).abs() <= 1e-6, "{}", bridge.static_deflection);
         let (mut first, mut later) = (Motion::default(), Motion::default());
-        bridge.motion_at(0, &mut first).expect("moves");
+        bridge.next_motion(&mut first).expect("moves");
         assert!(bridge.peak / bridge.model.diagonal() >= 0.0299);
-        bridge.motion_at(40, &mut later).expect("moves");
+        (0..40).for_each(|_| bridge.next_motion(&mut later).expect("moves"));
         assert!(first.q != later.q && first.transforms == later.transforms);
         assert!(bridge.peak / bridge.model.diagonal() < 0.2);
     }

@@ -13,8 +13,9 @@ Examples:
   modalcast-sim sweep --open MorphStressTest --scene morph --record out/record
   modalcast-sim auto --scene demo --files ../data/vega/simpleBridge --seconds 0 --realtime
 
-Exit codes: 0 done; 1 the server refused (no such scene, or another writer holds it); 2 bad command line;
-3 no connection, or lost; 4 a local file; 5 a file, a scene or a reply does not fit; 6 done, but steps were rejected.";
+Exit codes: 0 done; 1 refused by the server (unknown scene, or a scene with another writer); 2 invalid command line;
+3 no connection, or connection lost; 4 error of a local file; 5 invalid content of a file, a scene or a reply; 6 done,
+but steps were rejected.";
 
 /// Drives a scene of a modalcast server: wind on trees, a load on a bridge, or a sweep through all coordinates.
 #[derive(Debug, Parser)]

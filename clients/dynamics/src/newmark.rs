@@ -38,6 +38,13 @@ pub struct ReducedSystem {
     damping: DMatrix<f64>,
 }
 
+/// The load at the start and at the end of a step; it changes linearly in between.
+#[derive(Debug, Clone, Copy)]
+pub struct LoadChange<'a> {
+    pub before: &'a DVector<f64>,
+    pub after: &'a DVector<f64>,
+}
+
 /// Coordinates, velocities and accelerations at one time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NewmarkState {
@@ -112,14 +119,10 @@ impl ReducedSystem {
         self.minimize(&Problem { inertia: 0.0, rate: 0.0, q: near.clone(), v: zero, load }, near)
     }
 
-    /// The motion `dt` seconds later, under a load that changes from `before` to `after`.
+    /// The motion `dt` seconds later, under a changing load.
     #[must_use]
-    pub fn step(
-        &self,
-        motion: &NewmarkState,
-        dt: f64,
-        (before, after): (&DVector<f64>, &DVector<f64>),
-    ) -> NewmarkState {
+    pub fn step(&self, motion: &NewmarkState, dt: f64, load: LoadChange<'_>) -> NewmarkState {
+        let LoadChange { before, after } = load;
         let next = self.newmark(motion, dt, after);
         let legal = |next: &NewmarkState| {
             let moved = &next.q - &motion.q;
@@ -239,6 +242,10 @@ mod tests {
         (2.0 * std::f64::consts::PI * hertz).powi(2)
     }
 
+    fn constant(load: &DVector<f64>) -> LoadChange<'_> {
+        LoadChange { before: load, after: load }
+    }
+
     fn undamped(force: ReducedForce) -> ReducedSystem {
         ReducedSystem::new(force, &VegaSettings::default()).expect("definite")
     }
@@ -251,7 +258,7 @@ mod tests {
         let mut motion = system.static_state(DVector::from_column_slice(&[0.8, -0.3]));
         // The holding load is removed, so the initial acceleration is not 0.
         motion.a = -system.force.force(&motion.q);
-        let end = (0..count).fold(motion, |motion, _| system.step(&motion, dt, (&none, &none)));
+        let end = (0..count).fold(motion, |motion, _| system.step(&motion, dt, constant(&none)));
         (system, end)
     }
 
@@ -274,7 +281,7 @@ mod tests {
         let none = DVector::zeros(2);
         let mut motion = damped.static_state(DVector::from_column_slice(&[0.8, -0.3]));
         for _ in 0..2000 {
-            let next = damped.step(&motion, 0.01, (&none, &none));
+            let next = damped.step(&motion, 0.01, constant(&none));
             assert!(damped.energy(&next) <= damped.energy(&motion) * (1.0 + 1e-3) + 1e-12);
             motion = next;
         }
@@ -290,7 +297,7 @@ mod tests {
         assert!((system.force.force(&still) - &load).norm() <= 1e-9);
         let mut motion = system.at_rest();
         for _ in 0..4000 {
-            motion = system.step(&motion, 0.02, (&load, &load));
+            motion = system.step(&motion, 0.02, constant(&load));
         }
         assert!((motion.q - still).norm() <= 1e-6);
     }
@@ -306,7 +313,7 @@ mod tests {
             let (mut motion, mut work) = (system.at_rest(), 0.0_f64);
             for at in 0..3000 {
                 let (before, after) = (load(at), load(at + 1));
-                let next = system.step(&motion, dt, (&before, &after));
+                let next = system.step(&motion, dt, LoadChange { before: &before, after: &after });
                 work += (before + after).dot(&(&next.q - &motion.q)).abs();
                 let energy = system.energy(&next);
                 assert!(energy.is_finite() && energy <= 2.0 * work + 1e-6, "dt {dt}, step {at}: {energy} from {work}");
@@ -326,7 +333,7 @@ mod tests {
                 motion.v = noise(seed, 3) * 20.0;
                 let limit = 1.1 * system.energy(&motion);
                 for at in 0..1500 {
-                    motion = system.step(&motion, dt, (&none, &none));
+                    motion = system.step(&motion, dt, constant(&none));
                     let energy = system.energy(&motion);
                     assert!(energy <= limit, "dt {dt}, seed {seed}, step {at}: {energy} above {limit}");
                 }
@@ -352,7 +359,7 @@ mod tests {
             let mut motion = system.at_rest();
             for at in 0..400 {
                 let sway = &load * (f64::from(at) * 0.37).sin();
-                motion = system.step(&motion, dt, (&sway, &sway));
+                motion = system.step(&motion, dt, constant(&sway));
                 assert!(motion.q.norm() <= 1e4, "dt {dt}, step {at}: {}", motion.q.norm());
             }
         }

@@ -168,7 +168,7 @@ mod tests {
     }
 
     /// An independent solution: fourth-order Runge-Kutta in 20,000 small steps.
-    fn reference(w2: f64, damping: f64, start: State, (before, after): (f64, f64), h: f64) -> State {
+    fn reference(w2: f64, damping: f64, start: State, before: f64, after: f64, h: f64) -> State {
         let count = 20_000;
         let dt = h / f64::from(count);
         let rate = |time: f64, s: State| {
@@ -196,7 +196,7 @@ mod tests {
                 if damping * h > 2000.0 {
                     continue;
                 }
-                let want = reference(eigenvalue, damping, start, (1.0, -2.5), h);
+                let want = reference(eigenvalue, damping, start, 1.0, -2.5, h);
                 let got = Oscillator::new(eigenvalue, zeta, h).expect("valid").advance(start, 1.0, -2.5);
                 let close = (got.q - want.q).abs() <= 1e-9 && (got.v - want.v).abs() <= 1e-8;
                 assert!(close, "w {w} zeta {zeta}: {got:?} is not {want:?}");

@@ -26,16 +26,16 @@ pub struct Motion {
     pub transforms: Vec<[f32; 12]>,
 }
 
-/// A source of motion for a scene.
+/// A source of motion for a scene. It counts the steps itself, so that they cannot be skipped or repeated.
 pub trait Scenario {
     /// The model of the scene.
     fn model(&self) -> &Model;
 
-    /// Computes the motion at a step. The steps of consecutive calls are 0, 1, 2 and so on.
+    /// Computes the motion of the next step and overwrites `motion` with it. The first call computes step 0.
     ///
     /// # Errors
     /// If the motion cannot be continued.
-    fn motion_at(&mut self, number: u64, motion: &mut Motion) -> Result<()>;
+    fn next_motion(&mut self, motion: &mut Motion) -> Result<()>;
 
     /// Load, peak displacements and joint gaps up to now.
     fn report(&self) -> ScenarioReport;
@@ -92,12 +92,13 @@ pub async fn run(
     let mut motion = Motion::default();
     let mut number = 0;
     while options.steps.is_none_or(|steps| number < steps) && !*stop.borrow() {
-        scenario.motion_at(number, &mut motion)?;
+        scenario.next_motion(&mut motion)?;
         if options.realtime {
             let due = start + Duration::try_from_secs_f64(number as f64 * options.dt).unwrap_or(Duration::MAX / 4);
             tokio::time::sleep_until(due.into()).await;
         }
-        let step = encode_changes(scenario.model(), number, number as f64 * options.dt, (last.as_ref(), &motion));
+        let step = Step::new(number, number as f64 * options.dt);
+        let step = encode_changes(scenario.model(), step, last.as_ref(), &motion);
         let rejected = tally.record_rejection(drive.step(&step).await)?;
         tally.add(&drive, step.payload_bytes());
         if let Some(record) = &mut record {
@@ -133,9 +134,8 @@ pub async fn run(
     Ok(Summary { sent: end.sent, rejected: end.rejected, value: Value::Object(value) })
 }
 
-/// A step with the values whose bits differ from the last motion; with all values if there is none.
-fn encode_changes(model: &Model, number: u64, time: f64, (last, now): (Option<&Motion>, &Motion)) -> Step {
-    let mut step = Step::new(number, time);
+/// Adds to a step the values whose bits differ from the last motion, or all values if there is none.
+fn encode_changes(model: &Model, mut step: Step, last: Option<&Motion>, now: &Motion) -> Step {
     let same = |old: &[f32], new: &[f32]| old.iter().map(|x| x.to_bits()).eq(new.iter().map(|x| x.to_bits()));
     for (index, part) in model.parts.iter().enumerate() {
         let range = part.first..part.first + part.rank;
@@ -228,7 +228,7 @@ mod tests {
     fn first_step_sends_everything_and_later_ones_changes() {
         let model = plant();
         let still = Motion { q: vec![0.0; 6], transforms: vec![[0.0; 12]; 4] };
-        let wire = |last, now| encode_changes(&model, 3, 0.5, (last, now)).to_wire();
+        let wire = |last, now| encode_changes(&model, Step::new(3, 0.5), last, now).to_wire();
         let first = wire(None, &still);
         assert_eq!((first.q_domains, first.transform_domains), (vec![0, 1, 2], vec![0, 1, 2, 3]));
         assert_eq!((first.q.len(), first.transforms.len()), (24, 192));

@@ -34,6 +34,8 @@ pub struct Sweep {
     steps_per_coordinate: u64,
     /// Per coordinate: the value that displaces a sample by the requested share.
     amplitudes: Vec<f64>,
+    /// The step of the next motion.
+    next: u64,
     peak: f64,
 }
 
@@ -53,7 +55,7 @@ impl Sweep {
         let turns = model.parts.iter().map(|part| part.rank as u64).max().unwrap_or(0).max(1);
         let second = (1.0 / options.dt).clamp(1.0, 1e6) as u64;
         let steps_per_coordinate = options.steps.map_or(second, |steps| steps / turns).clamp(1, second.max(1));
-        Self { model, options, steps_per_coordinate, amplitudes, peak: 0.0 }
+        Self { model, options, steps_per_coordinate, amplitudes, next: 0, peak: 0.0 }
     }
 
     /// The sine at a step within a turn, scaled so that its largest value at a step is 1.
@@ -90,13 +92,14 @@ impl Scenario for Sweep {
         &self.model
     }
 
-    fn motion_at(&mut self, number: u64, motion: &mut Motion) -> Result<()> {
-        let rocking = self.rocking(number as f64 * self.options.dt);
-        motion.q = self.coordinates(number);
+    fn next_motion(&mut self, motion: &mut Motion) -> Result<()> {
+        let rocking = self.rocking(self.next as f64 * self.options.dt);
+        motion.q = self.coordinates(self.next);
         motion.transforms = self.model.parts.iter().map(|part| rocking.compose(&part.placement).entries()).collect();
         let q: Vec<f64> = motion.q.iter().map(|number| f64::from(*number)).collect();
         let world: Vec<Affine> = motion.transforms.iter().map(Affine::from_entries).collect();
         self.peak = self.peak.max(self.model.peak(&q, &world));
+        self.next += 1;
         Ok(())
     }
 
@@ -126,9 +129,9 @@ mod tests {
         let options = Options { dt: 1.0 / 60.0, steps: Some(60), share: 0.06 };
         let mut sweep = Sweep::new(plant(), options);
         let mut shown = [0.0_f32; 6];
-        for number in 0..60 {
+        for _ in 0..60 {
             let mut motion = Motion::default();
-            sweep.motion_at(number, &mut motion).expect("moves");
+            sweep.next_motion(&mut motion).expect("moves");
             shown.iter_mut().zip(motion.q).for_each(|(most, now)| *most = most.max(now));
         }
         for (most, amplitude) in shown.iter().zip(&sweep.amplitudes) {
@@ -140,7 +143,7 @@ mod tests {
     #[test]
     fn fewer_steps_than_coordinates_still_reach_the_full_share() {
         let mut sweep = Sweep::new(plant(), Options { dt: 1.0, steps: Some(1), share: 0.06 });
-        sweep.motion_at(0, &mut Motion::default()).expect("moves");
+        sweep.next_motion(&mut Motion::default()).expect("moves");
         assert!((sweep.peak / sweep.model.diagonal() - 0.06).abs() <= 1e-6, "{}", sweep.peak);
     }
 
@@ -151,7 +154,7 @@ mod tests {
         model.coordinates = 0;
         let mut sweep = Sweep::new(model, Options { dt: 0.5, steps: None, share: 0.06 });
         let mut motion = Motion::default();
-        sweep.motion_at(1, &mut motion).expect("moves");
+        (0..2).for_each(|_| sweep.next_motion(&mut motion).expect("moves"));
         let turned = Affine::from_entries(&motion.transforms[0]);
         let base = 0.5 * (sweep.model.low + sweep.model.high) - sweep.model.up * (0.5 * sweep.model.height());
         assert!((turned.apply(&base) - base).norm() <= 1e-6);

@@ -62,6 +62,7 @@ pub struct TreeScenario {
     modes: Vec<Oscillator>,
     loads: Vec<WindLoad>,
     gains: Vec<f64>,
+    /// States and forces at step `next`, the step of the next motion.
     states: Vec<State>,
     forces: Vec<f64>,
     next: u64,
@@ -274,15 +275,12 @@ impl Scenario for TreeScenario {
         &self.model
     }
 
-    fn motion_at(&mut self, number: u64, motion: &mut Motion) -> Result<()> {
-        while self.next < number {
-            self.advance();
-        }
+    fn next_motion(&mut self, motion: &mut Motion) -> Result<()> {
         let states: Vec<f64> = self.states.iter().map(|state| state.q).collect();
         let q = self.coordinates(&states, &self.gains);
-        let world = transforms(&self.model, &q, &self.flutter(self.options.dt * number as f64));
+        let world = transforms(&self.model, &q, &self.flutter(self.options.dt * self.next as f64));
         if !q.iter().all(|number| number.is_finite()) {
-            return Err(invalid("q", "finite numbers", "others: the motion left what numbers can hold"));
+            return Err(invalid("q", "finite numbers", "an overflow of the motion"));
         }
         motion.q = q.iter().map(|number| *number as f32).collect();
         motion.transforms = world.iter().map(Affine::entries).collect();
@@ -291,6 +289,7 @@ impl Scenario for TreeScenario {
         self.sway = self.sway.max(self.crown_in(&q, &sent));
         self.peak = self.peak.max(self.model.peak(&q, &sent));
         self.gap = self.gap.max(self.gauge.gap(&self.model, &q, &sent));
+        self.advance();
         Ok(())
     }
 
@@ -372,9 +371,9 @@ mod tests {
 
     fn blown(options: Options) -> (TreeScenario, Vec<Motion>) {
         let mut sway = TreeScenario::new(plant(), options).expect("valid");
-        let motion = |number| {
+        let motion = |_| {
             let mut motion = Motion::default();
-            sway.motion_at(number, &mut motion).expect("finite");
+            sway.next_motion(&mut motion).expect("finite");
             motion
         };
         let motions = (0..options.steps.unwrap_or(60)).map(motion).collect();
@@ -414,8 +413,8 @@ mod tests {
             let options = Options { dt, steps: Some(400), ..CALM };
             let mut sway = TreeScenario::new(model.clone(), options).expect("valid");
             let mut motion = Motion::default();
-            for number in 0..400 {
-                sway.motion_at(number, &mut motion).expect("finite");
+            for _ in 0..400 {
+                sway.next_motion(&mut motion).expect("finite");
             }
             assert!(sway.peak <= 0.5 * sway.model.diagonal() && sway.sway > 0.0, "dt {dt}: {}", sway.peak);
         }
