@@ -1,9 +1,14 @@
 //! Loads cuBLAS at run time and wraps its handle. Only benchmarks use it, so the server does not depend on it.
+//!
+//! The functions are those of cudarc. cudarc searches the library by its name only and panics if it finds none.
+//! Therefore [`load`] loads the library first, from the path in `MODALCAST_CUBLAS` if it is set, and checks that cudarc
+//! uses the same one.
 
-use std::ffi::{CStr, c_char, c_int, c_void};
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
+use cudarc::cublas::result::{self, CublasError};
+use cudarc::cublas::sys::{self, cublasHandle_t, cublasOperation_t, libraryPropertyType};
 use cudarc::driver::CudaSlice;
 use libloading::Library;
 
@@ -18,118 +23,19 @@ const REMEDY: &str = "Install the PyPI wheel nvidia-cublas==13.* and set MODALCA
 /// Workspace of cuBLAS, bytes, as its manual recommends for Hopper. With it, calls can be captured in graphs.
 const WORKSPACE: u64 = 32 << 20;
 
-type Handle = *mut c_void;
+const NO_TRANSPOSE: cublasOperation_t = cublasOperation_t::CUBLAS_OP_N;
+const TRANSPOSE: cublasOperation_t = cublasOperation_t::CUBLAS_OP_T;
 
-/// The used functions, in the types of cublas_v2.h; device pointers are `u64` addresses. Old versions lack the two
-/// optional ones.
-#[allow(clippy::type_complexity, reason = "the types are those of a C header")]
-struct CublasFunctions {
-    property: unsafe extern "C" fn(c_int, *mut c_int) -> c_int,
-    status: unsafe extern "C" fn(c_int) -> *const c_char,
-    create: unsafe extern "C" fn(*mut Handle) -> c_int,
-    destroy: unsafe extern "C" fn(Handle) -> c_int,
-    set_stream: unsafe extern "C" fn(Handle, *mut c_void) -> c_int,
-    set_workspace: unsafe extern "C" fn(Handle, u64, usize) -> c_int,
-    sgemv: unsafe extern "C" fn(
-        Handle,
-        c_int,
-        c_int,
-        c_int,
-        *const f32,
-        u64,
-        c_int,
-        u64,
-        c_int,
-        *const f32,
-        u64,
-        c_int,
-    ) -> c_int,
-    sgemm: unsafe extern "C" fn(
-        Handle,
-        c_int,
-        c_int,
-        c_int,
-        c_int,
-        c_int,
-        *const f32,
-        u64,
-        c_int,
-        u64,
-        c_int,
-        *const f32,
-        u64,
-        c_int,
-    ) -> c_int,
-    sgemm_strided: unsafe extern "C" fn(
-        Handle,
-        c_int,
-        c_int,
-        c_int,
-        c_int,
-        c_int,
-        *const f32,
-        u64,
-        c_int,
-        i64,
-        u64,
-        c_int,
-        i64,
-        *const f32,
-        u64,
-        c_int,
-        i64,
-        c_int,
-    ) -> c_int,
-    sgemv_strided: Option<
-        unsafe extern "C" fn(
-            Handle,
-            c_int,
-            c_int,
-            c_int,
-            *const f32,
-            u64,
-            c_int,
-            i64,
-            u64,
-            c_int,
-            i64,
-            *const f32,
-            u64,
-            c_int,
-            i64,
-            c_int,
-        ) -> c_int,
-    >,
-    sgemm_grouped: Option<
-        unsafe extern "C" fn(
-            Handle,
-            *const c_int,
-            *const c_int,
-            *const c_int,
-            *const c_int,
-            *const c_int,
-            *const f32,
-            u64,
-            *const c_int,
-            u64,
-            *const c_int,
-            *const f32,
-            u64,
-            *const c_int,
-            c_int,
-            *const c_int,
-        ) -> c_int,
-    >,
-    _libraries: Vec<Library>,
+/// cuBLAS, which stays loaded until the process ends.
+struct CublasLibrary {
+    library: Library,
+    _dependency: Option<Library>,
 }
 
-const NO_TRANSPOSE: c_int = 0;
-const TRANSPOSE: c_int = 1;
-
-/// The cuBLAS functions of this process, loaded at the first call.
-fn functions() -> Result<&'static CublasFunctions> {
-    static LOADED: OnceLock<Result<CublasFunctions>> = OnceLock::new();
-    LOADED.get_or_init(|| CublasFunctions::find(&candidates())).as_ref().map_err(Clone::clone)
+/// The library of this process, loaded at the first call.
+fn library() -> Result<&'static CublasLibrary> {
+    static LOADED: OnceLock<Result<CublasLibrary>> = OnceLock::new();
+    LOADED.get_or_init(|| load(&candidates())).as_ref().map_err(Clone::clone)
 }
 
 /// Version of cuBLAS: major, minor, patch.
@@ -137,11 +43,13 @@ fn functions() -> Result<&'static CublasFunctions> {
 /// # Errors
 /// `Unavailable` when there is no cuBLAS; it lists the paths that were tried.
 pub fn cublas_version() -> Result<[i32; 3]> {
-    let functions = functions()?;
+    library()?;
+    let kinds =
+        [libraryPropertyType::MAJOR_VERSION, libraryPropertyType::MINOR_VERSION, libraryPropertyType::PATCH_LEVEL];
     let mut version = [0; 3];
-    for (kind, number) in version.iter_mut().enumerate() {
-        // SAFETY: `number` is a live integer, and the kinds 0 to 2 are major, minor and patch.
-        functions.check(unsafe { (functions.property)(kind as c_int, number) })?;
+    for (kind, number) in kinds.into_iter().zip(&mut version) {
+        // SAFETY: `number` is a live integer.
+        unsafe { sys::cublasGetProperty(kind, number) }.result().map_err(fault_in("cublas"))?;
     }
     Ok(version)
 }
@@ -160,52 +68,62 @@ fn candidates() -> Vec<PathBuf> {
     names.iter().map(PathBuf::from).chain(names.iter().map(|name| toolkit.join(name))).collect()
 }
 
-impl CublasFunctions {
-    fn find(candidates: &[PathBuf]) -> Result<Self> {
-        let mut reasons = Vec::new();
-        for candidate in candidates {
-            match Self::load(candidate) {
-                Ok(functions) => return Ok(functions),
-                Err(error) => reasons.push(format!("{}: {error}", candidate.display())),
-            }
+/// Loads the first candidate that can be loaded and checks that cudarc uses it.
+///
+/// # Errors
+/// `Unavailable` when no candidate can be loaded, or cudarc finds another library.
+fn load(candidates: &[PathBuf]) -> Result<CublasLibrary> {
+    let mut reasons = Vec::new();
+    for candidate in candidates {
+        match CublasLibrary::open(candidate) {
+            Ok(opened) if opened.is_used_by_cudarc() => return Ok(opened),
+            Ok(_) => reasons.push(format!("{}: cudarc finds another cuBLAS or none", candidate.display())),
+            Err(error) => reasons.push(format!("{}: {error}", candidate.display())),
         }
-        Err(unavailable(reasons.join("; ")))
     }
+    Err(unavailable(reasons.join("; ")))
+}
 
-    fn load(path: &Path) -> Result<Self, libloading::Error> {
+impl CublasLibrary {
+    fn open(path: &Path) -> Result<Self, libloading::Error> {
         // cuBLAS needs cublasLt. The loader does not find it off the search path unless it is loaded already.
-        let beside = |name: &str| Some(path.parent()?.join(name.replace("libcublas.", "libcublasLt.")));
-        let second = path.file_name().and_then(|name| beside(&name.to_string_lossy())).filter(|file| file.is_file());
+        let sibling = |name: &str| Some(path.parent()?.join(name.replace("libcublas.", "libcublasLt.")));
+        let dependency =
+            path.file_name().and_then(|name| sibling(&name.to_string_lossy())).filter(|file| file.is_file());
         // SAFETY: the libraries' initializers only set them up; the operator chooses the name or path.
-        let (second, library) = unsafe { (second.and_then(|file| Library::new(file).ok()), Library::new(path)?) };
-        // SAFETY: the types are those of cublas_v2.h of CUDA 12 and 13 on 64-bit systems, where a device pointer is an
-        // address. The libraries are kept as long as the functions.
-        unsafe {
-            Ok(Self {
-                property: *library.get(b"cublasGetProperty\0")?,
-                status: *library.get(b"cublasGetStatusString\0")?,
-                create: *library.get(b"cublasCreate_v2\0")?,
-                destroy: *library.get(b"cublasDestroy_v2\0")?,
-                set_stream: *library.get(b"cublasSetStream_v2\0")?,
-                set_workspace: *library.get(b"cublasSetWorkspace_v2\0")?,
-                sgemv: *library.get(b"cublasSgemv_v2\0")?,
-                sgemm: *library.get(b"cublasSgemm_v2\0")?,
-                sgemm_strided: *library.get(b"cublasSgemmStridedBatched\0")?,
-                sgemv_strided: library.get(b"cublasSgemvStridedBatched\0").ok().map(|function| *function),
-                sgemm_grouped: library.get(b"cublasSgemmGroupedBatched\0").ok().map(|function| *function),
-                _libraries: std::iter::once(library).chain(second).collect(),
-            })
-        }
+        let (dependency, library) =
+            unsafe { (dependency.and_then(|file| Library::new(file).ok()), Library::new(path)?) };
+        Ok(Self { library, _dependency: dependency })
     }
 
-    fn check(&self, code: c_int) -> Result<()> {
-        if code == 0 {
-            return Ok(());
+    /// Whether cudarc resolves its functions in this library. The system's loader identifies libraries by their name
+    /// (`SONAME`), so that it returns this one unless an earlier name of cudarc's list exists on the search path.
+    fn is_used_by_cudarc(&self) -> bool {
+        // SAFETY: as in `open`.
+        if !unsafe { sys::is_culib_present() } {
+            return false;
         }
-        // SAFETY: cuBLAS returns a NUL-terminated string of static lifetime for any code.
-        let text = unsafe { CStr::from_ptr((self.status)(code)) }.to_string_lossy().into_owned();
-        Err(fault_in("cublas")(text))
+        // SAFETY: a library is present, so `culib` does not panic; it runs the initializers of a cuBLAS.
+        let other = unsafe { sys::culib() };
+        let create = address_of(&self.library, CREATE);
+        create.is_some() && create == address_of(other, CREATE)
     }
+
+    /// Whether this version has a function. cudarc panics when it calls a missing one.
+    fn has(&self, function: &[u8]) -> bool {
+        address_of(&self.library, function).is_some()
+    }
+}
+
+/// Names of functions as the system's loader expects them.
+const CREATE: &[u8] = b"cublasCreate_v2\0";
+const SGEMV_STRIDED: &[u8] = b"cublasSgemvStridedBatched\0";
+const SGEMM_GROUPED: &[u8] = b"cublasSgemmGroupedBatched\0";
+
+fn address_of(library: &Library, function: &[u8]) -> Option<usize> {
+    // SAFETY: the symbol is not called; only its address is read.
+    let symbol = unsafe { library.get::<unsafe extern "C" fn()>(function) };
+    symbol.ok().map(|symbol| *symbol as usize)
 }
 
 /// C = A B for column-major matrices on the device: A is rows x inner, B inner x columns. `count` such products lie at
@@ -232,14 +150,14 @@ pub(super) struct GroupedGemm<'a> {
 
 /// A cuBLAS handle on the device's stream.
 pub(super) struct CublasHandle {
-    functions: &'static CublasFunctions,
-    handle: Handle,
+    library: &'static CublasLibrary,
+    handle: cublasHandle_t,
     _workspace: CudaSlice<u8>,
 }
 
 impl std::fmt::Debug for CublasHandle {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        formatter.debug_struct("Blas").finish_non_exhaustive()
+        formatter.debug_struct("CublasHandle").finish_non_exhaustive()
     }
 }
 
@@ -250,19 +168,17 @@ impl CublasHandle {
     /// # Errors
     /// `Unavailable` when cuBLAS is missing or does not start; `Fault` when the device fails.
     pub(super) fn new(device: &Device) -> Result<Self> {
-        let functions = functions()?;
+        let library = library()?;
         device.context().bind_to_thread().map_err(fault_in("device"))?;
         let workspace = alloc_zeroed(device, WORKSPACE)?;
-        let mut handle = std::ptr::null_mut();
-        // SAFETY: `handle` is a live pointer, and the device's context is current.
-        functions.check(unsafe { (functions.create)(&mut handle) }).map_err(|error| unavailable(error.to_string()))?;
-        let blas = Self { functions, handle, _workspace: workspace };
+        let handle = result::create_handle().map_err(|error| unavailable(error.to_string()))?;
+        let blas = Self { library, handle, _workspace: workspace };
         let (stream, memory) = (device.stream().cu_stream().cast(), address(device, &blas._workspace));
         // SAFETY: handle and stream are live, and the workspace has the stated size. The stream is set first because
         // setting it resets the workspace.
         unsafe {
-            functions.check((functions.set_stream)(handle, stream))?;
-            functions.check((functions.set_workspace)(handle, memory, WORKSPACE as usize))?;
+            checked(result::set_stream(handle, stream))?;
+            checked(sys::cublasSetWorkspace_v2(handle, memory as *mut _, WORKSPACE as usize).result())?;
         }
         Ok(blas)
     }
@@ -270,11 +186,13 @@ impl CublasHandle {
     /// Checks that this version has the grouped and strided functions, if required; otherwise `Unavailable`.
     pub(super) fn check_has(&self, grouped: bool, vectors: bool) -> Result<()> {
         let missing = |name: &str| Err(unavailable(format!("this version has no {name}")));
-        match self.functions {
-            CublasFunctions { sgemm_grouped: None, .. } if grouped => missing("cublasSgemmGroupedBatched"),
-            CublasFunctions { sgemv_strided: None, .. } if vectors => missing("cublasSgemvStridedBatched"),
-            _ => Ok(()),
+        if grouped && !self.library.has(SGEMM_GROUPED) {
+            return missing("cublasSgemmGroupedBatched");
         }
+        if vectors && !self.library.has(SGEMV_STRIDED) {
+            return missing("cublasSgemvStridedBatched");
+        }
+        Ok(())
     }
 
     /// y = A x with `sgemv`, A column-major or, with `by_rows`, row-major.
@@ -287,9 +205,10 @@ impl CublasHandle {
             true => (TRANSPOSE, of.inner, of.rows, of.inner),
             false => (NO_TRANSPOSE, of.rows, of.inner, of.lead),
         };
-        // SAFETY: the handle is live; the caller vouches for the matrices.
-        self.functions.check(unsafe {
-            (self.functions.sgemv)(self.handle, transpose, rows, columns, &ONE, a, lead, x, 1, &ZERO, y, 1)
+        // SAFETY: the handle is live; the caller guarantees the matrices.
+        checked(unsafe {
+            let (a, x, y) = (a as *const f32, x as *const f32, y as *mut f32);
+            result::sgemv(self.handle, transpose, rows, columns, &ONE, a, lead, x, 1, &ZERO, y, 1)
         })
     }
 
@@ -300,9 +219,10 @@ impl CublasHandle {
     pub(super) unsafe fn gemm(&self, of: GemmCall, [a, b, c]: [u64; 3]) -> Result<()> {
         let GemmCall { rows, inner, columns, lead, .. } = of;
         let (handle, no) = (self.handle, NO_TRANSPOSE);
-        // SAFETY: the handle is live; the caller vouches for the matrices.
-        self.functions.check(unsafe {
-            (self.functions.sgemm)(handle, no, no, rows, columns, inner, &ONE, a, lead, b, inner, &ZERO, c, lead)
+        // SAFETY: the handle is live; the caller guarantees the matrices.
+        checked(unsafe {
+            let (a, b, c) = (a as *const f32, b as *const f32, c as *mut f32);
+            result::sgemm(handle, no, no, rows, columns, inner, &ONE, a, lead, b, inner, &ZERO, c, lead)
         })
     }
 
@@ -313,20 +233,23 @@ impl CublasHandle {
     pub(super) unsafe fn strided(&self, of: GemmCall, as_vectors: bool, [a, b, c]: [u64; 3]) -> Result<()> {
         let GemmCall { rows, inner, columns, lead, count, strides: [to_a, to_b, to_c] } = of;
         let (handle, no) = (self.handle, NO_TRANSPOSE);
-        let code = match self.functions.sgemv_strided.filter(|_| as_vectors) {
-            // SAFETY: the handle is live; the caller vouches for the matrices.
-            Some(sgemv) => unsafe {
-                sgemv(handle, no, rows, inner, &ONE, a, lead, to_a, b, 1, to_b, &ZERO, c, 1, to_c, count)
-            },
-            // SAFETY: as above.
-            None => unsafe {
-                (self.functions.sgemm_strided)(
-                    handle, no, no, rows, columns, inner, &ONE, a, lead, to_a, b, inner, to_b, &ZERO, c, lead, to_c,
-                    count,
+        let (a, b, c) = (a as *const f32, b as *const f32, c as *mut f32);
+        if as_vectors {
+            self.check_has(false, true)?;
+            // SAFETY: the handle is live and the function exists; the caller guarantees the matrices.
+            let status = unsafe {
+                sys::cublasSgemvStridedBatched(
+                    handle, no, rows, inner, &ONE, a, lead, to_a, b, 1, to_b, &ZERO, c, 1, to_c, count,
                 )
-            },
-        };
-        self.functions.check(code)
+            };
+            return checked(status.result());
+        }
+        // SAFETY: the handle is live; the caller guarantees the matrices.
+        checked(unsafe {
+            result::sgemm_strided_batched(
+                handle, no, no, rows, columns, inner, &ONE, a, lead, to_a, b, inner, to_b, &ZERO, c, lead, to_c, count,
+            )
+        })
     }
 
     /// Grouped products; each group has `count` problems of one size.
@@ -334,17 +257,17 @@ impl CublasHandle {
     /// # Safety
     /// The device arrays hold the device address of a matrix for each problem, in the order of the groups.
     pub(super) unsafe fn grouped(&self, of: &GroupedGemm) -> Result<()> {
-        let Some(grouped) = self.functions.sgemm_grouped else {
-            return self.check_has(true, false);
-        };
-        let list = |of_group: fn(&GemmCall) -> c_int| of.groups.iter().map(of_group).collect::<Vec<c_int>>();
+        self.check_has(true, false)?;
+        let list = |of_group: fn(&GemmCall) -> i32| of.groups.iter().map(of_group).collect::<Vec<i32>>();
         let (rows, columns, inner) = (list(|group| group.rows), list(|group| group.columns), list(|group| group.inner));
-        let (lead, counts, no) = (list(|group| group.lead), list(|group| group.count), list(|_| NO_TRANSPOSE));
+        let (lead, counts, no) =
+            (list(|group| group.lead), list(|group| group.count), vec![NO_TRANSPOSE; of.groups.len()]);
         let (ones, zeros) = (vec![ONE; of.groups.len()], vec![ZERO; of.groups.len()]);
         let [a, b, c] = of.pointers;
-        // SAFETY: the handle is live and every host array has an entry per group; the caller vouches for the rest.
-        self.functions.check(unsafe {
-            grouped(
+        // SAFETY: the handle is live, the function exists and every host array has an entry per group; the caller
+        // guarantees the device arrays.
+        let status = unsafe {
+            sys::cublasSgemmGroupedBatched(
                 self.handle,
                 no.as_ptr(),
                 no.as_ptr(),
@@ -352,26 +275,31 @@ impl CublasHandle {
                 columns.as_ptr(),
                 inner.as_ptr(),
                 ones.as_ptr(),
-                a,
+                a as *const *const f32,
                 lead.as_ptr(),
-                b,
+                b as *const *const f32,
                 inner.as_ptr(),
                 zeros.as_ptr(),
-                c,
+                c as *const *mut f32,
                 lead.as_ptr(),
-                of.groups.len() as c_int,
+                of.groups.len() as i32,
                 counts.as_ptr(),
             )
-        })
+        };
+        checked(status.result())
     }
 }
 
 impl Drop for CublasHandle {
     fn drop(&mut self) {
-        // SAFETY: the handle came from `create` and is destroyed once; destroying waits for its work. A failure here
-        // cannot be handled, so its code is ignored.
-        let _ = unsafe { (self.functions.destroy)(self.handle) };
+        // SAFETY: the handle came from `create_handle` and is destroyed once; destroying waits for its work. A failure
+        // here cannot be handled, so its code is ignored.
+        let _ = unsafe { result::destroy_handle(self.handle) };
     }
+}
+
+fn checked(result: Result<(), CublasError>) -> Result<()> {
+    result.map_err(fault_in("cublas"))
 }
 
 #[cfg(test)]
@@ -384,10 +312,19 @@ mod tests {
         let broken = folder.path().join("libcublas.so.13");
         std::fs::write(&broken, b"no library").expect("a file");
         for path in [folder.path().join("nowhere.so"), broken] {
-            let refusal = CublasFunctions::find(std::slice::from_ref(&path)).err().expect("refused");
+            let refusal = load(std::slice::from_ref(&path)).err().expect("refused");
             assert!(matches!(refusal, Error::Unavailable { what: "cuBLAS", .. }), "{refusal}");
             let text = refusal.to_string();
             assert!(text.contains(&path.display().to_string()) && text.contains("nvidia-cublas"), "{text}");
         }
+    }
+    /// No `gpu_` test, because the library can be loaded without a device.
+    #[test]
+    #[ignore = "needs cuBLAS"]
+    fn cudarc_uses_the_library_of_the_variable() {
+        let path = PathBuf::from(std::env::var_os("MODALCAST_CUBLAS").expect("MODALCAST_CUBLAS"));
+        let loaded = load(&[path]).map_err(|error| error.to_string()).expect("cuBLAS");
+        assert!(loaded.has(SGEMM_GROUPED) && loaded.has(SGEMV_STRIDED) && !loaded.has(b"cublasNothing\0"));
+        assert!(cublas_version().expect("a version")[0] >= 12);
     }
 }
