@@ -5,7 +5,7 @@
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     /// The caller sent a value that is never acceptable.
-    #[error("{field}: expected {expected}, given {given}")]
+    #[error("{field}: expected {expected}, got {given}")]
     Invalid { field: String, expected: String, given: String },
     /// The caller named an object that does not exist.
     #[error("{what} not found: {given}")]
@@ -14,7 +14,7 @@ pub enum Error {
     #[error("{what} is taken: {holder}")]
     Taken { what: &'static str, holder: String },
     /// The requested step has already been superseded.
-    #[error("{what}: expected {expected}, given {given}")]
+    #[error("{what}: expected {expected}, got {given}")]
     Gone { what: &'static str, expected: String, given: String },
     /// A queue is full; a later attempt may succeed.
     #[error("{queue} is full ({limit})")]

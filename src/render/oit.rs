@@ -282,7 +282,7 @@ mod tests {
         assert_eq!(of(None, 1 << 27, [8192, 8192]).expect("less"), 1 << 24, "as many as fit");
         assert_eq!(of(Some(100), 1 << 27, [8192, 8192]).expect("fits"), 100);
         let refusal = of(Some(1 << 25), 1 << 27, [64, 64]).expect_err("refused").to_string();
-        assert_eq!(refusal, "look.fragments: expected at most 16777216 on this device, given 33554432");
+        assert_eq!(refusal, "look.fragments: expected at most 16777216 on this device, got 33554432");
     }
 
     /// Draws a glass square in front of an opaque square and another behind it, 64 pixels wide; returns the pixels and

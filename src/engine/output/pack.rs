@@ -212,7 +212,7 @@ mod tests {
         let scene = testing::two_strips();
         let refusal =
             VertexSelection::new(&scene, vec![0, 2], VertexAttributes::VERTICES).expect_err("out of range").to_string();
-        assert!(refusal.starts_with("selection.domains[1]: expected an index below 2, given 2"), "{refusal}");
+        assert!(refusal.starts_with("selection.domains[1]: expected an index below 2, got 2"), "{refusal}");
         assert!(VertexSelection::new(&scene, vec![0; 3], VertexAttributes::VERTICES).is_err());
     }
 

@@ -82,7 +82,7 @@ mod tests {
     #[test]
     fn an_alpha_of_seven_is_refused_with_field_expected_and_given() {
         let refusal = Material { alpha: 7.0, ..Material::default() }.validated().expect_err("7 is no alpha");
-        assert_eq!(refusal.to_string(), "material 'white': alpha: expected 0 to 1, given 7");
+        assert_eq!(refusal.to_string(), "material 'white': alpha: expected 0 to 1, got 7");
         let nan = Material { diffuse: [0.0, f32::NAN, 0.0], ..Material::default() };
         assert!(nan.validated().is_err());
         assert!(Material::default().validated().is_ok());

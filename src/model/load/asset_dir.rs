@@ -189,11 +189,11 @@ mod tests {
         let secret = outer.path().join("secret.txt");
         for path in ["../../secret.txt", "../link.txt", "../folder/secret.txt", secret.to_str().expect("utf-8")] {
             let refusal = files.read(path, 100).expect_err(path).to_string();
-            let expected = format!("file '{path}': expected a path inside the repository, given one that leaves it");
+            let expected = format!("file '{path}': expected a path inside the repository, got one that leaves it");
             assert_eq!(refusal, expected);
         }
         let absent = files.read("../../absent.txt", 100).expect_err("absent").to_string();
-        assert!(absent.ends_with("expected a path inside the repository, given one that leaves it"), "{absent}");
+        assert!(absent.ends_with("expected a path inside the repository, got one that leaves it"), "{absent}");
         assert_eq!(AssetDir::unrestricted(&root).read("../secret.txt", 100).expect("unconfined"), b"secret");
     }
 
@@ -204,11 +204,11 @@ mod tests {
         std::fs::create_dir(root.path().join("d")).expect("made");
         let files = AssetDir::unrestricted(root.path());
         for (path, refusal) in [
-            ("a.bin", "file 'a.bin': expected at most 4 bytes, given 5"),
-            ("b.bin", "file 'b.bin': expected a file that is there, given entity not found"),
-            ("d", "file 'd': expected a readable file, given something that is no regular file"),
-            ("", "file '': expected a path, given \"\""),
-            ("a\0b", "file 'a\0b': expected a path, given \"a\\0b\""),
+            ("a.bin", "file 'a.bin': expected at most 4 bytes, got 5"),
+            ("b.bin", "file 'b.bin': expected a file that is there, got entity not found"),
+            ("d", "file 'd': expected a readable file, got something that is no regular file"),
+            ("", "file '': expected a path, got \"\""),
+            ("a\0b", "file 'a\0b': expected a path, got \"a\\0b\""),
         ] {
             assert_eq!(files.read(path, 4).expect_err(path).to_string(), refusal);
         }

@@ -90,12 +90,12 @@ fn real_sofa_models_open_with_their_binary_modes_which_the_text_confirms() {
 fn real_ball_is_refused_with_what_is_declared_and_what_is_delivered() {
     let folder = super::open(&data("sofa/ball")).expect_err("no mesh that is read").to_string();
     assert!(
-        folder.contains("expected scene.toml or one .glb, .gltf or .obj file, given none among: modes.txt"),
+        folder.contains("expected scene.toml or one .glb, .gltf or .obj file, got none among: modes.txt"),
         "{folder}"
     );
     let (model, modes) = (data("sofa/finger/finger.derived.obj"), data("sofa/ball/modes.txt"));
     let refusal = manifest(&format!("model = '{model}'\nmodes = '{modes}'\n")).expect_err("malformed").to_string();
-    assert!(refusal.ends_with("values: expected 684 x 32 values as the header declares, given 684 x 35"), "{refusal}");
+    assert!(refusal.ends_with("values: expected 684 x 32 values as the header declares, got 684 x 35"), "{refusal}");
 }
 
 #[test]
@@ -160,7 +160,7 @@ fn real_inputs_are_listed_and_those_outside_the_repository_are_not_reached() {
     assert!(!names.iter().any(|name| name == "sofa/ball" || name == "vega/volumetric/beam3"));
     assert_eq!(repository.open("vega/A").expect("opens").scene.rank_of(0), 20);
     let refusal = super::open(&data("vega/volumetric/beam3")).expect_err("two models").to_string();
-    assert!(refusal.ends_with("given 2: beam3.obj, beam3_tet.obj"), "{refusal}");
+    assert!(refusal.ends_with("got 2: beam3.obj, beam3_tet.obj"), "{refusal}");
 }
 
 #[test]

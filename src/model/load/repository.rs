@@ -162,9 +162,9 @@ mod tests {
         let absent = repository.open("absent").expect_err("absent");
         assert_eq!(absent, Error::NotFound { what: "scene", given: "absent".into() });
         let ambiguous = repository.open("two").expect_err("two models").to_string();
-        assert_eq!(ambiguous, "folder 'two': expected scene.toml, or one model to choose, given 2: b.obj, c.obj");
+        assert_eq!(ambiguous, "folder 'two': expected scene.toml, or one model to choose, got 2: b.obj, c.obj");
         let empty = repository.open("none").expect_err("no model").to_string();
-        assert!(empty.ends_with("given none among: x.txt"), "{empty}");
+        assert!(empty.ends_with("got none among: x.txt"), "{empty}");
         assert!(matches!(SceneRepository::new(Some(&outer.path().join("no"))), Err(Error::Unavailable { .. })));
         let built_in = SceneRepository::new(None).expect("built-in scenes only");
         assert_eq!(built_in.list(), ["tree"]);

@@ -56,7 +56,7 @@ mod tests {
         let config = folder.path().join("a.config");
         std::fs::write(&config, "*baseFrequency\r\n0.25\n\n*windowWidth\n800\n*dampingMassCoef\n").expect("written");
         let refusal = notes(&files, "a.obj").expect_err("no value").to_string();
-        assert_eq!(refusal, "file 'a.config': dampingMassCoef: expected a finite number, given ");
+        assert_eq!(refusal, "file 'a.config': dampingMassCoef: expected a finite number, got ");
         std::fs::write(&config, "*baseFrequency\n0.25\n*windowWidth\n800\n").expect("written");
         std::fs::write(folder.path().join("a.cub"), "").expect("written");
         let found: Vec<_> = notes(&files, "a.obj").expect("good").into_iter().collect();

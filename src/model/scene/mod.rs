@@ -436,7 +436,7 @@ mod tests {
             Scene::new(parts).map(drop).map_err(|error| error.to_string())
         };
         assert_eq!(with(4096, 65536, 4096), Ok(()));
-        let refusal = |field, most, given| Err(format!("domain 1: {field}: expected at most {most}, given {given}"));
+        let refusal = |field, most, given| Err(format!("domain 1: {field}: expected at most {most}, got {given}"));
         assert_eq!(with(4097, 65536, 4096), refusal("name", "4096 bytes", 4097));
         assert_eq!(with(4096, 65537, 4096), refusal("notes", "65536 bytes in all", 65537));
         assert_eq!(with(4096, 65536, 4097), refusal("attachment.rows", "4096 vertices", 4097));

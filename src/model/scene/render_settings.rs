@@ -189,7 +189,7 @@ mod tests {
         for samples in [0, 2, 8, u32::MAX] {
             let refusal =
                 RenderSettings { samples, ..RenderSettings::default() }.check().expect_err("refused").to_string();
-            assert_eq!(refusal, format!("look.samples: expected 1 or 4 a pixel, given {samples}"));
+            assert_eq!(refusal, format!("look.samples: expected 1 or 4 a pixel, got {samples}"));
         }
     }
 
@@ -198,7 +198,7 @@ mod tests {
         for opaque_alpha in [0.0, -1.0, f32::NAN, f32::INFINITY] {
             let refusal =
                 RenderSettings { opaque_alpha, ..RenderSettings::default() }.check().expect_err("refused").to_string();
-            assert_eq!(refusal, format!("look.opaque_alpha: expected a number above 0, given {opaque_alpha}"));
+            assert_eq!(refusal, format!("look.opaque_alpha: expected a number above 0, got {opaque_alpha}"));
         }
         for fragments in [0, MAX_FRAGMENTS + 1, u32::MAX] {
             RenderSettings { fragments: Some(fragments), ..RenderSettings::default() }.check().expect_err("refused");

@@ -142,7 +142,7 @@ mod tests {
     #[test]
     fn rejects_bad_records_with_the_reason() {
         for (text, part) in [
-            ("time,q0\n0,1\n", "q[0]: expected 2 numbers, given 1"),
+            ("time,q0\n0,1\n", "q[0]: expected 2 numbers, got 1"),
             ("time,q0,q1\n", "steps: expected at least one"),
             ("time,q0,q1\n0,1,x\n", "expected rows of time,q0,q1"),
             ("time,q0,q1\n0,1,inf\n", "expected finite numbers"),

@@ -112,7 +112,7 @@ fn variant_that_cannot_be_created_fails_report() {
     }
     let report = deform(&request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &Broken, |_| Ok(()))
         .expect("a report");
-    assert_eq!(report.failed, ["c: lost: kernel: expected one that compiles, given none"]);
+    assert_eq!(report.failed, ["c: lost: kernel: expected one that compiles, got none"]);
     assert!(plot::png(&plot::svg(&report)).is_ok(), "an empty plot is still a plot");
 }
 

@@ -85,7 +85,7 @@ fn empty_and_oversized_frames_are_refused() {
     for (width, height) in [(0, 0), (0, 5), (5, 0), (limit + 1, 1), (16384, 16384), (u32::MAX, u32::MAX)] {
         let shot = FrameParams { camera: camera(64), width, height, bounds: scene.rest_bounds, light: None };
         let refusal = renderer.draw(&buffers, &shot).expect_err("refused").to_string();
-        let expected = format!("frame.size: expected 1 to {limit} pixels a side, given {width} x {height}");
+        let expected = format!("frame.size: expected 1 to {limit} pixels a side, got {width} x {height}");
         assert_eq!(refusal, expected);
     }
     let shot = FrameParams { camera: camera(64), width: 1, height: 1, bounds: scene.rest_bounds, light: None };

@@ -139,8 +139,8 @@ mod tests {
         for (text, start) in [
             ("colour_texture = 'no'", "material 'white': colour_texture: file 'no': expected a file that is there"),
             ("cutoff = 0.5", "material 'white': cutoff: expected the alpha_mode mask with it"),
-            ("color_texture = 'leaf'", "toml: expected a patch, given unknown field `color_texture`"),
-            ("alpha_mode = 'cut'", "toml: expected a patch, given unknown variant `cut`"),
+            ("color_texture = 'leaf'", "toml: expected a patch, got unknown field `color_texture`"),
+            ("alpha_mode = 'cut'", "toml: expected a patch, got unknown variant `cut`"),
         ] {
             let refusal = patched(text, Material::default()).expect_err(text).to_string();
             assert!(refusal.starts_with(start), "{refusal}");

@@ -107,7 +107,7 @@ mod tests {
             ("quaternion = [0,0,0,nan]", "quaternion: expected"),
             ("translation = [inf,0,0]", "transform[3]: expected a finite number"),
             ("scale = 1e300", "transform[0]: expected a finite number"),
-            ("scale = 'big'", "toml: expected a placement, given a number or three"),
+            ("scale = 'big'", "toml: expected a placement, got a number or three"),
             ("matrix = [1]", "toml:"),
             ("rotation = 1", "toml:"),
         ] {

@@ -170,20 +170,20 @@ fn metadata_is_kept() {
 #[test]
 fn what_a_manifest_cannot_mean_is_refused_by_line_or_entry() {
     for (text, start) in [
-        ("", "model: expected a model, or [[domain]] entries, given neither"),
-        ("colour = 1\n", "line 1: expected the keys and values of a scene, given unknown field `colour`"),
-        ("model = 'a.obj'\nup = 'w'\n", "line 2: expected the keys and values of a scene, given unknown variant `w`"),
+        ("", "model: expected a model, or [[domain]] entries, got neither"),
+        ("colour = 1\n", "line 1: expected the keys and values of a scene, got unknown field `colour`"),
+        ("model = 'a.obj'\nup = 'w'\n", "line 2: expected the keys and values of a scene, got unknown variant `w`"),
         ("model = \n", "line 1: expected the keys and values of a scene"),
-        ("model = 'a.obj'\n[look]\nsky = 1\n", "line 3: expected the keys and values of a scene, given unknown field"),
+        ("model = 'a.obj'\n[look]\nsky = 1\n", "line 3: expected the keys and values of a scene, got unknown field"),
         ("model = 'a.obj'\n[[domain]]\nmodel = 'b.obj'\n", "model: expected either one model"),
         ("modes = 'u.txt'\n[[domain]]\nmodel = 'b.obj'\n", "modes, placement, follows: expected none beside"),
-        ("[[domain]]\nname = 'x'\n", "line 1: expected the keys and values of a scene, given missing field `model`"),
+        ("[[domain]]\nname = 'x'\n", "line 1: expected the keys and values of a scene, got missing field `model`"),
         ("model = 'c.obj'\n", "domain 0 ('c.obj'): file 'c.obj': expected a file that is there"),
         ("model = 'a.mtl'\n", "domain 0 ('a.mtl'): file 'a.mtl': expected a file ending in .glb"),
         ("model = 'a.obj'\nmodes = 'wide.txt'\n", "domain 0 ('a.obj'): file 'wide.txt': values: expected 9 x 1 values"),
         ("model = 'a.obj'\nmodes = 'no.npy'\n", "domain 0 ('a.obj'): file 'no.npy': expected a file that is there"),
         ("model = 'a.obj'\nplacement.scale = inf\n", "domain 0 ('a.obj'): placement: transform[0]"),
-        ("model = 'a.obj'\nmaterial.green.alpha = 1\n", "material: expected * or one of red, given green"),
+        ("model = 'a.obj'\nmaterial.green.alpha = 1\n", "material: expected * or one of red, got green"),
         (
             "model = 'a.obj'\nmaterial.red.colour_texture = 'x.png'\n",
             "domain 0 ('a.obj'): material 'red': colour_texture: file 'x.png'",
@@ -193,7 +193,7 @@ fn what_a_manifest_cannot_mean_is_refused_by_line_or_entry() {
         ("[[domain]]\nmodel = 'a.obj'\neigenvalues = [1]\n", "domain 0 ('a.obj'): eigenvalues: expected finite"),
         (
             "[[domain]]\nname = 'x'\nmodel = 'a.obj'\n[[domain]]\nname = 'x'\nmodel = 'b.obj'\n",
-            "domain 1 ('b.obj'): name: expected a name that no earlier domain has, given x",
+            "domain 1 ('b.obj'): name: expected a name that no earlier domain has, got x",
         ),
         (
             "[[domain]]\nname = 'x'\nmodel = 'a.obj'\nplacement.scale = 0\n[[domain]]\nmodel = 'b.obj'\nparent = 'x'\n",
@@ -211,7 +211,7 @@ fn what_a_manifest_cannot_mean_is_refused_by_line_or_entry() {
     assert!(scene(&format!("model = {}", "[".repeat(100_000))).is_err(), "deep nesting is no way to end the program");
     let range = "model = 'a.obj'\nmaterial.red.alpha = 7\n";
     let refusal = crate::scene::Scene::new(scene(range).expect("read")).expect_err("7 is no alpha").to_string();
-    assert_eq!(refusal, "material 'red': alpha: expected 0 to 1, given 7");
+    assert_eq!(refusal, "material 'red': alpha: expected 0 to 1, got 7");
 }
 
 #[test]

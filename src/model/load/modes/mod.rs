@@ -114,13 +114,13 @@ mod tests {
     #[test]
     fn two_candidates_of_one_ending_are_refused_by_name() {
         let refusal = found(&["a.obj", "x.npy", "y.npy"], "a.obj").expect_err("ambiguous").to_string();
-        assert_eq!(refusal, "modes: expected one file ending in .npy, given x.npy, y.npy");
+        assert_eq!(refusal, "modes: expected one file ending in .npy, got x.npy, y.npy");
     }
 
     #[test]
     fn an_unknown_ending_is_refused_before_anything_is_read() {
         let refusal =
             read(&AssetDir::unrestricted(std::path::Path::new(".")), "u.mat").expect_err("unknown").to_string();
-        assert!(refusal.ends_with(".npy, .safetensors or .txt, given u.mat"), "{refusal}");
+        assert!(refusal.ends_with(".npy, .safetensors or .txt, got u.mat"), "{refusal}");
     }
 }

@@ -133,20 +133,17 @@ mod tests {
             |text: &str| file(&format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {text}, }}"), 12);
         let brackets = "(".repeat(4000);
         for (bytes, start) in [
-            (b"\x93NUMPY".to_vec(), "header: expected a whole .npy header, given 6 bytes"),
+            (b"\x93NUMPY".to_vec(), "header: expected a whole .npy header, got 6 bytes"),
             (b"PK\x03\x04aaaa".to_vec(), "header: expected the magic"),
-            (b"\x93NUMPY\x02\x00\xff\xff\xff\xff".to_vec(), "header: expected at most 4096 bytes, given 4294967295"),
+            (b"\x93NUMPY\x02\x00\xff\xff\xff\xff".to_vec(), "header: expected at most 4096 bytes, got 4294967295"),
             (b"\x93NUMPY\x01\x00\x40\x00ab".to_vec(), "header: expected a whole"),
-            (described("(3, 2)"), "data: expected 4 bytes for each entry of [3, 2], given 12"),
-            (described("(3, 0)"), "data: expected 4 bytes for each entry of [3, 0], given 12"),
+            (described("(3, 2)"), "data: expected 4 bytes for each entry of [3, 2], got 12"),
+            (described("(3, 0)"), "data: expected 4 bytes for each entry of [3, 0], got 12"),
             (described("(4294967296, 4294967296)"), "data: expected"),
             (described("(9223372036854775807, 3)"), "data: expected"),
             (described("(3, -1)"), "shape: expected a tuple of whole numbers"),
             (described(&brackets), "header: expected the key 'shape'"),
-            (
-                file("{'descr': '<i4', 'fortran_order': False, 'shape': (3,1)}", 12),
-                "descr: expected f4 or f8, given <i4",
-            ),
+            (file("{'descr': '<i4', 'fortran_order': False, 'shape': (3,1)}", 12), "descr: expected f4 or f8, got <i4"),
             (file("{'descr': '<f4', 'fortran_order': No, 'shape': (3,1)}", 12), "fortran_order: expected"),
             (file("{}", 0), "header: expected the key 'descr'"),
         ] {
@@ -154,6 +151,6 @@ mod tests {
             assert!(refusal.starts_with(start), "{refusal}");
         }
         let flat = super::super::parse_npy(&described("(3,)")).expect_err("flat").to_string();
-        assert_eq!(flat, "shape: expected two dimensions, 3n x r, given [3]");
+        assert_eq!(flat, "shape: expected two dimensions, 3n x r, got [3]");
     }
 }

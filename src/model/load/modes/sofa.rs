@@ -70,19 +70,19 @@ mod tests {
     #[test]
     fn what_is_delivered_is_compared_with_what_is_declared() {
         for (text, refusal) in [
-            ("", "header: expected rows and columns, given an empty file"),
-            ("3\n1\n", "header: expected rows and columns, two whole numbers, given 3"),
-            ("3 -1\n1\n", "header: expected rows and columns, two whole numbers, given 3 -1"),
-            ("3 1\n1 2\n3 4\n5 6\n", "values: expected 3 x 1 values as the header declares, given 3 x 2"),
-            ("3 2\n1 2\n3 4 5\n6\n", "values: expected 3 x 2 values as the header declares, given 6 values in 3 lines"),
-            ("3 2\n1 2\n3 4\n", "values: expected 3 x 2 values as the header declares, given 2 x 2"),
+            ("", "header: expected rows and columns, got an empty file"),
+            ("3\n1\n", "header: expected rows and columns, two whole numbers, got 3"),
+            ("3 -1\n1\n", "header: expected rows and columns, two whole numbers, got 3 -1"),
+            ("3 1\n1 2\n3 4\n5 6\n", "values: expected 3 x 1 values as the header declares, got 3 x 2"),
+            ("3 2\n1 2\n3 4 5\n6\n", "values: expected 3 x 2 values as the header declares, got 6 values in 3 lines"),
+            ("3 2\n1 2\n3 4\n", "values: expected 3 x 2 values as the header declares, got 2 x 2"),
             (
                 "9223372036854775807 9223372036854775807\n1\n",
-                "values: expected 9223372036854775807 x 9223372036854775807 values as the header declares, given 1 x 1",
+                "values: expected 9223372036854775807 x 9223372036854775807 values as the header declares, got 1 x 1",
             ),
-            ("3 1\n1\nx\n3\n", "line 3: expected a number, given x"),
-            ("3 1\n1\nnan\n3\n", "modes[1, 0]: expected a finite number, given NaN"),
-            ("4 1\n1 2 3 4\n", "modes.rows: expected a positive multiple of 3, given 4"),
+            ("3 1\n1\nx\n3\n", "line 3: expected a number, got x"),
+            ("3 1\n1\nnan\n3\n", "modes[1, 0]: expected a finite number, got NaN"),
+            ("4 1\n1 2 3 4\n", "modes.rows: expected a positive multiple of 3, got 4"),
         ] {
             assert_eq!(parse(text.as_bytes()).expect_err(text).to_string(), refusal);
         }

@@ -63,19 +63,19 @@ mod tests {
     #[test]
     fn hostile_headers_and_cut_off_bodies_are_refused_before_anything_is_allocated() {
         for (bytes, refusal) in [
-            (vec![1, 2, 3], "header: expected 8 bytes, given 3"),
-            (file(-3, 1, &[]), "rows: expected no negative number, given -3"),
-            (file(3, i32::MIN, &[]), "columns: expected no negative number, given -2147483648"),
+            (vec![1, 2, 3], "header: expected 8 bytes, got 3"),
+            (file(-3, 1, &[]), "rows: expected no negative number, got -3"),
+            (file(3, i32::MIN, &[]), "columns: expected no negative number, got -2147483648"),
             (
                 file(i32::MAX, i32::MAX, &[0; 12]),
                 "size: expected 18446744056529682444 bytes (f32) or 36893488113059364880 (f64) for 2147483647 x \
-                 2147483647, given 20",
+                 2147483647, got 20",
             ),
-            (file(3, 2, &[0; 20]), "size: expected 32 bytes (f32) or 56 (f64) for 3 x 2, given 28"),
-            (file(3, 2, &[0; 25]), "size: expected 32 bytes (f32) or 56 (f64) for 3 x 2, given 33"),
-            (file(4, 1, &[0; 16]), "modes.rows: expected a positive multiple of 3, given 4"),
-            (file(3, 600, &[0; 7200]), "modes.columns: expected 0 to 512, given 600"),
-            (file(3, 1, &[255; 12]), "modes[0, 0]: expected a finite number, given NaN"),
+            (file(3, 2, &[0; 20]), "size: expected 32 bytes (f32) or 56 (f64) for 3 x 2, got 28"),
+            (file(3, 2, &[0; 25]), "size: expected 32 bytes (f32) or 56 (f64) for 3 x 2, got 33"),
+            (file(4, 1, &[0; 16]), "modes.rows: expected a positive multiple of 3, got 4"),
+            (file(3, 600, &[0; 7200]), "modes.columns: expected 0 to 512, got 600"),
+            (file(3, 1, &[255; 12]), "modes[0, 0]: expected a finite number, got NaN"),
         ] {
             assert_eq!(parse(&bytes).expect_err(refusal).to_string(), refusal);
         }

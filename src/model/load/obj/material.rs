@@ -181,8 +181,8 @@ mod tests {
             ("map_Kd no.png", "material 'm': map_Kd, map_d: file 'no.png': expected a file that is there"),
             ("map_Kd broken.png", "material 'm': map_Kd, map_d: texture 'broken.png': expected a PNG or JPEG image"),
             ("norm no.png", "material 'm': normal map: file 'no.png': expected a file that is there"),
-            ("d 7", "material 'm': alpha: expected 0 to 1, given 7"),
-            ("Ka 0 0 0\nKd 1 1 2", "material 'm': diffuse: expected 0 to 1, given 2"),
+            ("d 7", "material 'm': alpha: expected 0 to 1, got 7"),
+            ("Ka 0 0 0\nKd 1 1 2", "material 'm': diffuse: expected 0 to 1, got 2"),
         ] {
             let refusal = read(&format!("newmtl m\n{statement}\n"), folder.path()).expect_err(statement).to_string();
             assert!(refusal.starts_with(start), "{refusal}");

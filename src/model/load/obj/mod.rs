@@ -168,10 +168,10 @@ mod tests {
         std::fs::write(folder.path().join("rows.U.float"), modes).expect("written");
         let files = AssetDir::unrestricted(folder.path());
         for (name, refusal) in [
-            ("lib.obj", "file 'no.mtl': expected a file that is there, given entity not found"),
-            ("use.obj", "usemtl: expected a material of the libraries (red), given green"),
-            ("bad.obj", "file 'bad.obj': line 4: f: index of v: expected 1 to 3, given 9"),
-            ("rows.obj", "file 'rows.U.float': modes.rows: expected 9 (3 x 3 vertices), given 6"),
+            ("lib.obj", "file 'no.mtl': expected a file that is there, got entity not found"),
+            ("use.obj", "usemtl: expected a material of the libraries (red), got green"),
+            ("bad.obj", "file 'bad.obj': line 4: f: index of v: expected 1 to 3, got 9"),
+            ("rows.obj", "file 'rows.U.float': modes.rows: expected 9 (3 x 3 vertices), got 6"),
         ] {
             assert_eq!(read(&files, name, ModesSource::Sidecar).expect_err(name).to_string(), refusal);
         }

@@ -137,13 +137,13 @@ mod tests {
     #[test]
     fn bad_statements_are_refused_with_their_line() {
         for (statement, refusal) in [
-            ("Kd 1 2", "line 2: Kd: colour: expected one or three finite numbers, given 1 2"),
-            ("Kd spectral a.rfl", "line 2: Kd: colour: expected one or three finite numbers, given spectral a.rfl"),
-            ("Ns", "line 2: Ns: value: expected a finite number, given "),
-            ("d inf", "line 2: d: value: expected a finite number, given inf"),
-            ("map_Kd", "line 2: map_Kd: path: expected the name of an image file, given none"),
-            ("map_Kd -clamp on", "line 2: map_Kd: path: expected the name of an image file, given none"),
-            ("map_Kd -zoom a.png", "line 2: map_Kd: option: expected an image option of MTL, given -zoom"),
+            ("Kd 1 2", "line 2: Kd: colour: expected one or three finite numbers, got 1 2"),
+            ("Kd spectral a.rfl", "line 2: Kd: colour: expected one or three finite numbers, got spectral a.rfl"),
+            ("Ns", "line 2: Ns: value: expected a finite number, got "),
+            ("d inf", "line 2: d: value: expected a finite number, got inf"),
+            ("map_Kd", "line 2: map_Kd: path: expected the name of an image file, got none"),
+            ("map_Kd -clamp on", "line 2: map_Kd: path: expected the name of an image file, got none"),
+            ("map_Kd -zoom a.png", "line 2: map_Kd: option: expected an image option of MTL, got -zoom"),
         ] {
             let text = format!("newmtl a\n{statement}\n");
             assert_eq!(parse(text.as_bytes()).expect_err(statement).to_string(), refusal);

@@ -189,7 +189,7 @@ mod tests {
     #[test]
     fn files_that_do_not_belong_together_are_refused_by_name() {
         for (name, text, start) in [
-            ("p_object_id.dat", "1\n4\n", "file 'p_object_id.dat': lines: expected 5, one per face, given 2"),
+            ("p_object_id.dat", "1\n4\n", "file 'p_object_id.dat': lines: expected 5, one per face, got 2"),
             ("p_object_id.dat", "1\n4\n2\n3\n6\n", "file 'p.structure.json': object: expected one of the structure"),
             ("p_object_id.dat", "1\n4\n2\n2\n5\n", "leaf 3: mesh: expected at least one vertex and one triangle"),
             ("p.structure.json", "{}", "file 'p.structure.json': json: expected objects"),

@@ -136,10 +136,10 @@ mod tests {
     fn unknown_objects_and_missing_internodes_are_refused() {
         let structure = PlantStructure::parse(STRUCTURE.as_bytes()).expect("good");
         let refusal = assign_organs(&structure, &BTreeMap::from([(77, vec![])])).expect_err("unknown").to_string();
-        assert_eq!(refusal, "object: expected one of the structure, given 77");
+        assert_eq!(refusal, "object: expected one of the structure, got 77");
         let text = STRUCTURE.replace(r#""9": "internode", "#, "");
         let structure = PlantStructure::parse(text.as_bytes()).expect("good");
         let refusal = assign_organs(&structure, &BTreeMap::new()).expect_err("one internode").to_string();
-        assert_eq!(refusal, "objects: expected 2 internodes, one per shoot, given 1");
+        assert_eq!(refusal, "objects: expected 2 internodes, one per shoot, got 1");
     }
 }

@@ -184,11 +184,11 @@ mod tests {
     #[test]
     fn broken_structures_are_refused_by_entry() {
         for (shoots, leaves, start) in [
-            (shoot(0, 5), String::new(), "shoot 0: parent: expected the id of a shoot, or -1, given 5"),
+            (shoot(0, 5), String::new(), "shoot 0: parent: expected the id of a shoot, or -1, got 5"),
             ([shoot(0, 1), shoot(1, 0)].join(","), String::new(), "shoot 0: expected an ancestor without parent"),
             ([shoot(0, -1), shoot(0, -1)].join(","), String::new(), "shoots: expected each id once"),
             (r#"{"id": 0, "parent": -1, "vertices": []}"#.into(), String::new(), "shoot 0: expected a line"),
-            (shoot(0, -1), leaf(2, 1, "[0,0,0]"), "leaf 2: expected the id of a shoot, given 1"),
+            (shoot(0, -1), leaf(2, 1, "[0,0,0]"), "leaf 2: expected the id of a shoot, got 1"),
             (shoot(0, -1), leaf(1, 0, "[0,0,0]"), "leaf 1: expected the object_id of a leaf"),
             (shoot(0, -1), leaf(2, 0, "[0,1e300,0]"), "leaf 2: expected a line of finite points"),
             (shoot(0, -1), [leaf(2, 0, "[0,0,0]"), leaf(2, 0, "[0,0,0]")].join(","), "leaf 2: expected the object_id"),
@@ -207,8 +207,8 @@ mod tests {
     fn one_number_per_face() {
         assert_eq!(parse_object_ids(b"1\n2\r\n 3 \n\n", 3).expect("good"), [1, 2, 3]);
         let few = parse_object_ids(b"1\n", 2).expect_err("too few").to_string();
-        assert_eq!(few, "lines: expected 2, one per face, given 1");
+        assert_eq!(few, "lines: expected 2, one per face, got 1");
         let odd = parse_object_ids(b"1\n-2\n", 2).expect_err("negative").to_string();
-        assert_eq!(odd, "line 2: expected a whole number, given -2");
+        assert_eq!(odd, "line 2: expected a whole number, got -2");
     }
 }
