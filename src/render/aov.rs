@@ -74,6 +74,7 @@ impl Renderer {
     /// # Errors
     /// `Fault` when the count differs from the scene's number of vertices, or OpenGL reports an error.
     pub fn upload_vertex_values(&mut self, buffers: &mut SceneBuffers, values: &[f32]) -> Result<()> {
+        let _current = self.gl.make_current()?;
         let count = buffers.scene.layout.vertices;
         if values.len() != count {
             return Err(fault_in("upload")(format!("{} numbers of values, {count} expected", values.len())));
@@ -97,6 +98,7 @@ impl Renderer {
     /// `Invalid` for a size above the limit or a camera whose matrices overflow; `Fault` when no values were uploaded,
     /// OpenGL reports an error or the device does not finish in time.
     pub fn render_aov(&mut self, buffers: &SceneBuffers, shot: &FrameParams, field: Aov) -> Result<AovImage> {
+        let _current = self.gl.make_current()?;
         self.check_size(shot)?;
         let samples = if matches!(field, Aov::Values { .. }) { buffers.scene.look.samples_per_pixel() } else { 1 };
         let desc = TargetDesc::plain(&self.gl, [shot.width, shot.height], samples);

@@ -163,6 +163,7 @@ impl Renderer {
     /// # Errors
     /// `Invalid` when the scene is over a limit of the device, `Fault` when a shader or a buffer is refused.
     pub fn load(&mut self, scene: &Arc<Scene>) -> Result<SceneBuffers> {
+        let _current = self.gl.make_current()?;
         let (gl, places, blur_method) = (Rc::clone(&self.gl), self.sample_positions.clone(), self.blur_method);
         if self.programs.len() > MAX_PROGRAMS {
             self.programs.clear();
@@ -174,8 +175,7 @@ impl Renderer {
 
     /// Frees a scene's buffers.
     pub fn unload(&mut self, buffers: SceneBuffers) {
-        // `check` makes this context current: the compute rasterizer unregisters its buffers from the current context.
-        self.gl.check("unload").ok();
+        let _current = self.gl.make_current();
         drop(buffers);
     }
 
@@ -184,6 +184,7 @@ impl Renderer {
     /// # Errors
     /// `Fault` when an array of the surface has another length than its buffer, or OpenGL reports an error.
     pub fn upload(&mut self, buffers: &SceneBuffers, surface: &DeformedSurface) -> Result<()> {
+        let _current = self.gl.make_current()?;
         buffers.shadow_cache.invalidate();
         for (name, list) in
             [("positions", &surface.positions), ("normals", &surface.normals), ("tangents", &surface.tangents)]
@@ -208,6 +209,7 @@ impl Renderer {
     /// # Errors
     /// `Fault` when the number of positions differs from the scene's, or OpenGL reports an error.
     pub fn upload_rebased(&mut self, buffers: &mut SceneBuffers, positions: &[f32], origin: [f64; 3]) -> Result<()> {
+        let _current = self.gl.make_current()?;
         let bytes = buffers.buffer("positions")?.bytes;
         if 4 * positions.len() as u64 != bytes {
             let given = format!("{} numbers of positions, {} expected", positions.len(), bytes / 4);
@@ -229,6 +231,7 @@ impl Renderer {
     /// # Errors
     /// `Fault` when no frame was drawn, or the device does not finish in time.
     pub fn read_visibility(&mut self) -> Result<Vec<VisibilityId>> {
+        let _current = self.gl.make_current()?;
         let nothing = || fault_in("visibility readback")("no frame was drawn");
         let samples = self.targets.last().ok_or_else(nothing)?.desc.samples;
         let program = self.program(shaders::visibility_readback(samples))?;

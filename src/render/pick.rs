@@ -93,6 +93,7 @@ impl Renderer {
         shot: &FrameParams,
         rectangle: PixelRect,
     ) -> Result<PendingPick> {
+        let _current = self.gl.make_current()?;
         let [width, height] = rectangle.size();
         let camera = shot.camera.cropped_to([shot.width, shot.height], rectangle);
         let shot = FrameParams { camera, width, height, ..*shot };
@@ -145,6 +146,7 @@ impl Renderer {
     /// # Errors
     /// `Fault` when the device does not finish in time.
     pub fn finish_pick(&mut self, pick: PendingPick) -> Result<Vec<PickHit>> {
+        let _current = self.gl.make_current()?;
         pick.fence.wait("pick", self.frame_timeout)?;
         let [width, height] = pick.rectangle.size();
         let words = WORDS_PER_PIXEL * width as usize * height as usize;

@@ -95,6 +95,7 @@ impl Renderer {
     /// # Errors
     /// `Fault` naming the pass that did not finish within the time limit, or the OpenGL error.
     pub fn map_pixels(&mut self, ticket: PendingFrame) -> Result<MappedPixels> {
+        let _current = self.gl.make_current()?;
         ticket.wait()?;
         let PendingFrame { desc, slot, passes, mut stats, .. } = ticket;
         let staging = slot.as_ref().and_then(ReadbackSlot::staging);
@@ -120,6 +121,7 @@ impl Renderer {
     }
 
     fn submit_frame(&mut self, buffers: &SceneBuffers, shot: &FrameParams, is_read: bool) -> Result<PendingFrame> {
+        let _current = self.gl.make_current()?;
         self.check_size(shot)?;
         let numbers = frame_uniforms::FrameUniforms::new(&buffers.scene, shot, buffers.origin)?;
         let look = &buffers.scene.look;
@@ -130,6 +132,8 @@ impl Renderer {
         let sample_programs = buffers.sample_programs(desc.samples, &mut |source| self.program(source))?;
         let Some(target) = self.targets.last() else { return Err(fault_in("draw")("no target")) };
         let slot = if is_read { Some(target.readback_ring.acquire(self.frame_timeout)?) } else { None };
+        // A pass that fails or panics leaves the images undefined, so the target is cached again only after all passes.
+        let Some(target) = self.targets.pop() else { return Err(fault_in("draw")("no target")) };
         let ground = draws_ground(buffers, shot);
         target.draw_region.set(draw_region(buffers, shot, ground));
         buffers.buffer("frame uniforms")?.write(bytemuck::bytes_of(&numbers));
@@ -140,16 +144,14 @@ impl Renderer {
             splits.write(bytemuck::bytes_of(&ShadowCascades::new(&buffers.scene, shot, &fit, buffers.origin)));
         }
         let mut stats = FrameStats { samples: desc.samples, ..FrameStats::default() };
-        let passes =
-            self.record_passes(buffers, shot, (target, &sample_programs, ground), &mut stats).and_then(|mut passes| {
-                passes.extend(self.record_readback(buffers, target, slot.as_ref())?);
+        let passes = self.record_passes(buffers, shot, (&target, &sample_programs, ground), &mut stats).and_then(
+            |mut passes| {
+                passes.extend(self.record_readback(buffers, &target, slot.as_ref())?);
                 Ok(passes)
-            });
-        if passes.is_err() {
-            // A failed pass leaves the images of the target undefined.
-            self.targets.pop();
-        }
+            },
+        );
         let passes = passes?;
+        self.targets.push(target);
         self.last_uniforms = Some(numbers);
         Ok(PendingFrame {
             desc,

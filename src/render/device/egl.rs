@@ -306,6 +306,58 @@ impl Drop for ContextHandle {
     }
 }
 
+#[cfg(test)]
+pub(crate) mod testing {
+    use std::sync::mpsc::{Sender, channel};
+    use std::thread::JoinHandle;
+
+    use super::*;
+
+    /// Keeps a context current on another thread, so that EGL refuses to make it current on this one.
+    pub(crate) struct OccupiedContext {
+        release: Option<Sender<()>>,
+        thread: Option<JoinHandle<()>>,
+    }
+
+    impl Context {
+        pub(crate) fn occupy(&self) -> OccupiedContext {
+            let handles = [self.handle.display.as_ptr() as usize, self.handle.context.as_ptr() as usize];
+            let instance = &api().expect("EGL").instance;
+            if self.is_current() {
+                CURRENT_CONTEXT.with(|current| current.replace(Weak::new()));
+                instance.make_current(self.handle.display, None, None, None).expect("released");
+            }
+            let ((release, released), (occupied, is_occupied)) = (channel::<()>(), channel());
+            let thread = std::thread::spawn(move || {
+                // SAFETY: the handles of a context and its display, which outlive the thread: it is joined on drop.
+                let (display, context) = unsafe {
+                    (egl::Display::from_ptr(handles[0] as EglHandle), egl::Context::from_ptr(handles[1] as EglHandle))
+                };
+                instance.bind_api(egl::OPENGL_API).expect("OpenGL");
+                instance.make_current(display, None, None, Some(context)).expect("current");
+                occupied.send(()).expect("awaited");
+                released.recv().ok();
+                instance.make_current(display, None, None, None).expect("released");
+            });
+            is_occupied.recv().expect("occupied");
+            OccupiedContext { release: Some(release), thread: Some(thread) }
+        }
+
+        /// Whether EGL says that the context is current on this thread.
+        pub(crate) fn is_current(&self) -> bool {
+            let current = api().expect("EGL").instance.get_current_context();
+            current.is_some_and(|current| current.as_ptr() == self.handle.context.as_ptr())
+        }
+    }
+
+    impl Drop for OccupiedContext {
+        fn drop(&mut self) {
+            self.release.take();
+            self.thread.take().map(JoinHandle::join).expect("one thread").expect("no panic");
+        }
+    }
+}
+
 /// A config without window support: the default surface type is WINDOW, which headless devices do not offer.
 fn config(instance: &Instance, display: egl::Display) -> Result<egl::Config> {
     for surface in [egl::PBUFFER_BIT, 0] {

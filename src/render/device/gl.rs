@@ -561,7 +561,18 @@ impl Gl {
     }
 }
 
+#[cfg(test)]
+impl Gl {
+    /// Makes the context current on another thread, so that no command can be issued on this one.
+    pub(crate) fn occupy(&self) -> super::egl::testing::OccupiedContext {
+        self.context.occupy()
+    }
+}
+
 /// Error for a size above a device limit, which the caller can act on.
 pub(crate) fn too_large(what: &str, limit: u64, given: u64) -> Error {
     modalcast_model::error::invalid(what, format!("at most {limit} on this device"), given)
 }
+
+#[cfg(test)]
+mod tests;

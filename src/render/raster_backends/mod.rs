@@ -71,6 +71,7 @@ impl Renderer {
         buffers: &mut SceneBuffers,
         make: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
     ) -> Result<()> {
+        let _current = self.gl.make_current()?;
         let [shadow, visibility] = supported_passes(&buffers.scene);
         if !shadow && !visibility {
             return Ok(());

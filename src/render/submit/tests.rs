@@ -1,5 +1,6 @@
 //! Tests of frames in flight, with a renderer that does not wait between passes, like one on hardware.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::rc::Rc;
 use std::sync::Arc;
 use std::thread;
@@ -10,7 +11,8 @@ use super::super::{DevicePreference, FrameImage, FrameParams, Renderer, SceneBuf
 use crate::device::readback_ring::MAX_FRAMES_IN_FLIGHT;
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::error::Error;
+use modalcast_model::error::{Error, Result};
+use modalcast_model::raster::{DrawTarget, Rasterizer};
 use modalcast_model::scene::{Camera, Scene, Transparency};
 
 /// A renderer that times its passes with queries on any device, so that its frames are in flight after they were
@@ -227,4 +229,62 @@ fn pixels_that_are_held_for_too_long_refuse_frames_and_block_none_for_ever() {
     let images: Vec<FrameImage> = held.into_iter().map(super::MappedPixels::into_image).collect();
     let after = renderer.draw(&buffers, &shot).expect("there is room again");
     assert!(images.iter().all(|image| image.rgba == after.rgba));
+}
+
+/// Panics instead of drawing.
+#[derive(Debug)]
+struct PanickingRasterizer;
+
+impl Rasterizer for PanickingRasterizer {
+    fn draw(&mut self, _: Option<DrawTarget<'_>>, _: Option<DrawTarget<'_>>) -> Result<()> {
+        panic!("injected")
+    }
+
+    fn precompile(&mut self, _: bool, _: bool) -> Result<()> {
+        Ok(())
+    }
+}
+
+/// The panic happens while the context is current, a timer query is active and a target is in use.
+#[test]
+fn other_scenes_are_drawn_after_a_panic_within_a_frame() {
+    let (mut renderer, scene, buffers) = loaded();
+    let want = renderer.draw(&buffers, &shot(&scene, 64)).expect("draws").rgba;
+    let mut parts = squares(vec![Material { double_sided: true, ..Material::default() }]);
+    parts.look.samples = 1;
+    let other = Scene::new(parts).expect("good");
+    let mut panicking = renderer.load(&other).expect("loads");
+    let make = |_| Ok(Box::new(PanickingRasterizer) as Box<dyn Rasterizer>);
+    renderer.attach_rasterizer(&mut panicking, make).expect("attached");
+    // A second renderer, whose context is current before and after.
+    let (mut bystander, _, bystander_buffers) = loaded();
+    for _ in 0..MAX_FRAMES_IN_FLIGHT + 2 {
+        let drawn = catch_unwind(AssertUnwindSafe(|| renderer.draw(&panicking, &shot(&other, 64))));
+        assert!(drawn.is_err(), "the rasterizer is asked");
+        renderer.gl.check("test").expect("no error remains");
+        assert!(renderer.draw(&buffers, &shot(&scene, 64)).expect("draws").rgba == want);
+        assert!(bystander.draw(&bystander_buffers, &shot(&scene, 64)).expect("draws").rgba == want);
+    }
+}
+
+#[test]
+fn frames_without_their_context_are_errors_and_later_ones_are_drawn() {
+    let (mut renderer, scene, buffers) = loaded();
+    let want = renderer.draw(&buffers, &shot(&scene, 64)).expect("draws").rgba;
+    let (mut bystander, _, bystander_buffers) = loaded();
+    let in_flight = renderer.submit(&buffers, &shot(&scene, 64)).expect("submits");
+    let occupied = renderer.gl.occupy();
+    let refused = [
+        renderer.draw(&buffers, &shot(&scene, 64)).err(),
+        renderer.upload(&buffers, &surface(0.5)).err(),
+        renderer.load(&scene).err(),
+        renderer.read_image(in_flight).err(),
+    ];
+    for error in refused {
+        let error = error.expect("no context").to_string();
+        assert!(error.contains("eglMakeCurrent"), "{error}");
+    }
+    assert!(bystander.draw(&bystander_buffers, &shot(&scene, 64)).expect("draws").rgba == want);
+    drop(occupied);
+    assert!(renderer.draw(&buffers, &shot(&scene, 64)).expect("draws").rgba == want, "the upload was not issued");
 }

@@ -193,4 +193,27 @@ mod tests {
         assert_eq!(name_of_source(glow::DEBUG_SOURCE_SHADER_COMPILER), "shader compiler");
         assert_eq!((name_of_type(glow::DEBUG_TYPE_PERFORMANCE), name_of_type(0)), ("performance", "other"));
     }
+
+    #[test]
+    fn panics_of_the_log_do_not_reach_the_driver() {
+        keep_a_second_log();
+        let panics = std::sync::Arc::new(std::sync::atomic::AtomicUsize::new(0));
+        let counter = Arc::clone(&panics);
+        let writer = move || -> std::io::Sink {
+            counter.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+            panic!("injected")
+        };
+        let log = tracing_subscriber::fmt().with_max_level(Level::DEBUG).with_writer(writer).finish();
+        let dispatch = Dispatch::new(log);
+        let gl = dispatcher::with_default(&dispatch, || device::open(DevicePreference::Any).expect("EGL").0);
+        // SAFETY: the flag does not exist, and OpenGL rejects it; `finish` waits for the driver's messages.
+        unsafe {
+            let functions = gl.functions().expect("current");
+            functions.enable(0xFFFF);
+            functions.finish();
+        }
+        assert!(gl.check("test").is_err(), "the error is seen without the log too");
+        gl.check("test").expect("commands go on");
+        assert!(panics.load(std::sync::atomic::Ordering::Relaxed) > 0, "the log was reached");
+    }
 }
