@@ -10,7 +10,7 @@
 //   boxes      [tiles of deform][4][6] u32, as `deform` writes them; the boxes of half a tile without
 //              vertices keep the zeros of their allocation                                              (out)
 // Launch: a block of WARPS warps for each run of tiles of a group, with shared memory for WARPS Own, Common and q.
-// CPU twin: the tests of src/compute/gpu/batch.rs.
+// CPU twin: the tests of src/compute/gpu/executor/launchers/batch.rs.
 //
 // Each vertex sums its modes in order, from +0, by fused multiply-adds, as `deform` does: the same bits. A result that
 // is not finite in f32 is computed again in f64.

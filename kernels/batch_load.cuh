@@ -1,4 +1,4 @@
-// Shared memory of a block of `batch`, and the loads of U, x0, T and q. Twin: the tests of src/compute/gpu/batch.rs.
+// Shared memory of a block of `batch`, and the loads of U, x0, T and q. Twin: the tests of src/compute/gpu/executor/launchers/batch.rs.
 #pragma once
 #include "chunk.cuh"
 #include "transform.cuh"
@@ -24,7 +24,7 @@ struct WarpStorage {
     uint4 ring[STAGES * STAGE_WORDS];
     float4 rest[3 * WARP_QUADS];
 };
-static_assert(sizeof(WarpStorage) == 9984, "WarpStorage differs from src/compute/gpu/batch.rs");
+static_assert(sizeof(WarpStorage) == 9984, "WarpStorage differs from src/compute/gpu/tables/kernels.rs");
 
 __device__ __forceinline__ unsigned lane_id() {
     return threadIdx.x % 32;
@@ -87,7 +87,7 @@ struct BlockStorage {
     BatchMember members[BATCH_SIZE];
     WarpSlice parts[WARPS];
 };
-static_assert(sizeof(WarpSlice) == 72 && sizeof(BlockStorage) == 64 * BATCH_SIZE + 72 * WARPS, "BlockStorage differs from src/compute/gpu/batch.rs");
+static_assert(sizeof(WarpSlice) == 72 && sizeof(BlockStorage) == 64 * BATCH_SIZE + 72 * WARPS, "BlockStorage differs from src/compute/gpu/tables/kernels.rs");
 
 __device__ __forceinline__ WarpStorage& warp_storage(uint4* shared) {
     return ((WarpStorage*)shared)[threadIdx.x / 32];

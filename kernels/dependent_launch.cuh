@@ -1,4 +1,4 @@
-// Programmatic dependent launch (compute capability 9.0 and later; src/compute/gpu/dependent_launch.rs): a kernel may be scheduled
+// Programmatic dependent launch (compute capability 9.0 and later; src/compute/gpu/launch/kernel.rs): a kernel may be scheduled
 // while the last blocks of the previous kernel on its stream still run. It accesses no memory before `wait_on_dependent_grids`,
 // and calls `launch_dependent_grids` only after that. The third kernel of a chain therefore finds the results of the first
 // complete.

@@ -1,4 +1,4 @@
-// Structs and constants that host and kernels share. Twin: src/compute/gpu/layout.rs; tests compare the size and the
+// Structs and constants that host and kernels share. Twin: src/compute/gpu/tables/layout.rs; tests compare the size and the
 // offset of every field.
 #pragma once
 
@@ -30,7 +30,7 @@ struct Header {
     unsigned reserved[3];
     unsigned bounds[12]; // `float_to_ordered` maxima of -x, -y, -z, x, y, z; with LIGHT_BOUNDS also in light space; sent as zeros
 };
-static_assert(sizeof(Header) == 112, "Header differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(Header) == 112, "Header differs from src/compute/gpu/tables/layout.rs");
 
 // Bit fields of a tile's `kind`: the number of items of its last quad (0 in a mixed tile); whether it computes
 // positions; whether it computes normals and tangents. A tile of both computes corner i of a shape together with vertex
@@ -51,7 +51,7 @@ struct WarpTile {
     unsigned char width; // quads
     unsigned char kind;
 };
-static_assert(sizeof(WarpTile) == 32, "WarpTile differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(WarpTile) == 32, "WarpTile differs from src/compute/gpu/tables/layout.rs");
 
 // A quad of a mixed tile.
 struct MixedQuad {
@@ -60,7 +60,7 @@ struct MixedQuad {
     unsigned domain; // 4 * index of the domain + items of the quad - 1
     unsigned first_q;
 };
-static_assert(sizeof(MixedQuad) == 16, "MixedQuad differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(MixedQuad) == 16, "MixedQuad differs from src/compute/gpu/tables/layout.rs");
 
 // Offsets of a domain for `normals`. Instances share all but `first` and `first_vertex`.
 struct NormalSlot {
@@ -70,7 +70,7 @@ struct NormalSlot {
     unsigned first_vertex; // packed vertex
     unsigned first_member;
 };
-static_assert(sizeof(NormalSlot) == 20, "NormalSlot differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(NormalSlot) == 20, "NormalSlot differs from src/compute/gpu/tables/layout.rs");
 
 // An entry of the list of changed domains that `apply` reads.
 struct Change {
@@ -79,14 +79,14 @@ struct Change {
     unsigned count;   // number of coordinates
     unsigned source;  // offset of its coordinates in `new_q`
 };
-static_assert(sizeof(Change) == 16, "Change differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(Change) == 16, "Change differs from src/compute/gpu/tables/layout.rs");
 
 // The transform root of a domain, and its frame relative to that root; with FOLLOWERS.
 struct TransformLink {
     unsigned root; // index in the transforms
     unsigned frame;
 };
-static_assert(sizeof(TransformLink) == 8, "TransformLink differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(TransformLink) == 8, "TransformLink differs from src/compute/gpu/tables/layout.rs");
 
 struct DeformArgs {
     const Header* header;
@@ -110,7 +110,7 @@ struct DeformArgs {
     unsigned count; // of tiles
     unsigned reserved;
 };
-static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/compute/gpu/tables/layout.rs");
 
 // Domains of one shape, for which `batch` reads U once.
 struct BatchGroup {
@@ -122,7 +122,7 @@ struct BatchGroup {
     unsigned chunks;
     unsigned members;
 };
-static_assert(sizeof(BatchGroup) == 32, "BatchGroup differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(BatchGroup) == 32, "BatchGroup differs from src/compute/gpu/tables/layout.rs");
 
 // A domain of a group.
 struct BatchMember {
@@ -131,7 +131,7 @@ struct BatchMember {
     unsigned domain;
     unsigned first_tile; // first tile of the domain in `deform`, for its boxes
 };
-static_assert(sizeof(BatchMember) == 16, "BatchMember differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(BatchMember) == 16, "BatchMember differs from src/compute/gpu/tables/layout.rs");
 
 // The work of one block of `batch`.
 struct BatchBlock {
@@ -140,7 +140,7 @@ struct BatchBlock {
     unsigned end;  // tile after the last one
     unsigned reserved;
 };
-static_assert(sizeof(BatchBlock) == 16, "BatchBlock differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(BatchBlock) == 16, "BatchBlock differs from src/compute/gpu/tables/layout.rs");
 
 struct BatchArgs {
     const Header* header;
@@ -156,7 +156,7 @@ struct BatchArgs {
     const float* q;
     unsigned* boxes;
 };
-static_assert(sizeof(BatchArgs) == 96, "BatchArgs differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(BatchArgs) == 96, "BatchArgs differs from src/compute/gpu/tables/layout.rs");
 
 // A part of a domain that `bounds` reduces to one box.
 struct BoxSegment {
@@ -165,7 +165,7 @@ struct BoxSegment {
     unsigned domain;
     unsigned from_vertices; // 1: a range of vertices, 0: a range of boxes
 };
-static_assert(sizeof(BoxSegment) == 16, "BoxSegment differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(BoxSegment) == 16, "BoxSegment differs from src/compute/gpu/tables/layout.rs");
 
 struct BoundsArgs {
     Header* header;
@@ -178,7 +178,7 @@ struct BoundsArgs {
     float light[9]; // with LIGHT_BOUNDS: the three axes of light space
     unsigned reserved;
 };
-static_assert(sizeof(BoundsArgs) == 88, "BoundsArgs differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(BoundsArgs) == 88, "BoundsArgs differs from src/compute/gpu/tables/layout.rs");
 
 struct ApplyArgs {
     const Header* header;
@@ -192,7 +192,7 @@ struct ApplyArgs {
     unsigned* change_steps;
     unsigned* list;
 };
-static_assert(sizeof(ApplyArgs) == 80, "ApplyArgs differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(ApplyArgs) == 80, "ApplyArgs differs from src/compute/gpu/tables/layout.rs");
 
 struct NormalsArgs {
     const Header* header;
@@ -213,7 +213,7 @@ struct NormalsArgs {
     unsigned groups;
     unsigned reserved;
 };
-static_assert(sizeof(NormalsArgs) == 120, "NormalsArgs differs from src/compute/gpu/layout.rs");
+static_assert(sizeof(NormalsArgs) == 120, "NormalsArgs differs from src/compute/gpu/tables/layout.rs");
 
 // Whether a domain changed after this output was last written.
 __device__ inline bool is_dirty(const Header* header, const unsigned* change_steps, unsigned domain) {

@@ -1,4 +1,4 @@
-// Order-preserving integer keys of floats, so that integer maxima give float maxima. Twin: src/compute/gpu/bounds.rs.
+// Order-preserving integer keys of floats, so that integer maxima give float maxima. Twin: src/compute/gpu/tables/box_keys.rs.
 #pragma once
 
 // The key of a number: increases with x and is never 0. x must not be NaN.

@@ -32,7 +32,10 @@
 //! | `modalcast::frame` | PNG encoding, color maps with legends; pure functions | |
 //! | `modalcast::telemetry` | stage names and times, logging | |
 //! | `modalcast::config` | all limits and paths, validated once | |
-//! | `modalcast-compute::gpu` | the CUDA deformer: one launcher per kernel, with the kernel's name | `storage` |
+//! | `modalcast-compute::gpu` | the CUDA deformer and rasterizer, in the three tiers below | `storage` |
+//! | `modalcast-compute::gpu::executor` | one launcher per kernel, with the kernel's name; steps in flight, outputs, readbacks, interop | `tables`, `launch` |
+//! | `modalcast-compute::gpu::tables` | the tables and the plan of a scene, the values of a step; pure functions | `launch` |
+//! | `modalcast-compute::gpu::launch` | access to a CUDA device: context, memory, compilation, launches, graphs | |
 //! | `modalcast-compute::cpu` | the f32 deformer for machines without a GPU | `storage` |
 //! | `modalcast-compute::reference` | the f64 reference deformer, which the others are tested against | |
 //! | `modalcast-compute::storage` | tiled storage of U for CPU and GPU: storage types, a-priori bounds, mode truncation; pure functions | |

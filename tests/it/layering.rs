@@ -53,12 +53,17 @@ fn module_of(path: &Path) -> Option<(String, String)> {
 
 /// Every module that a source text names as `crate::name` or in `crate::{...}`, except in comment lines.
 fn uses(text: &str) -> BTreeSet<String> {
+    uses_after(text, "crate::")
+}
+
+/// Every name that follows `prefix` in a source text, alone or in a group, except in comment lines.
+fn uses_after(text: &str, prefix: &str) -> BTreeSet<String> {
     let code: Vec<&str> = text.lines().filter(|line| !line.trim_start().starts_with("//")).collect();
     let name = |rest: &str| -> String {
         rest.trim_start().chars().take_while(|letter| letter.is_alphanumeric() || *letter == '_').collect()
     };
     let code = code.join("\n");
-    let names = code.split("crate::").skip(1).flat_map(|rest| match rest.strip_prefix('{') {
+    let names = code.split(prefix).skip(1).flat_map(|rest| match rest.strip_prefix('{') {
         Some(group) => first_names(group).into_iter().map(name).collect::<Vec<_>>(),
         None => vec![name(rest)],
     });
@@ -113,6 +118,43 @@ fn modules_use_only_what_their_row_names() {
         let wrong = illegal((&package, &module), &fs::read_to_string(&path).expect("a file"), &table);
         assert_eq!(wrong, Vec::<String>::new(), "{}", path.display());
     }
+}
+
+/// Tiers of a module that a source text of one of them uses without permission, as `crate::module::tier` or through
+/// `super`.
+fn illegal_tiers(row: &str, text: &str, table: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
+    let (parent, tier) = row.rsplit_once("::").expect("a tier of a module");
+    let module = parent.rsplit("::").next().unwrap_or_default();
+    let is_tier = |name: &String| name != tier && table.contains_key(&format!("{parent}::{name}"));
+    let used = [uses_after(text, &format!("crate::{module}::")), uses_after(text, "super::")];
+    let used: BTreeSet<String> = used.into_iter().flatten().filter(is_tier).collect();
+    used.difference(&table[row]).map(|name| format!("{tier} uses {name}")).collect()
+}
+
+#[test]
+fn tiers_of_a_module_use_only_what_their_row_names() {
+    let table = table(&fs::read_to_string(root().join("src/lib.rs")).expect("the page"));
+    let tiers: Vec<&String> = table.keys().filter(|row| row.starts_with("modalcast-compute::gpu::")).collect();
+    assert_eq!(tiers.len(), 3, "{tiers:?}");
+    for row in tiers {
+        let folder = root().join("src").join(row.trim_start_matches("modalcast-").replace("::", "/"));
+        let found = files(&folder, &["rs"]);
+        assert!(!found.is_empty(), "{}", folder.display());
+        for path in found {
+            let wrong = illegal_tiers(row, &fs::read_to_string(&path).expect("a file"), &table);
+            assert_eq!(wrong, Vec::<String>::new(), "{}", path.display());
+        }
+    }
+}
+
+#[test]
+fn forbidden_uses_of_tiers_are_detected() {
+    let table = table("//! | `a::m::low` | x | |\n//! | `a::m::high` | x | `low` |\n");
+    let none = Vec::<String>::new();
+    assert_eq!(illegal_tiers("a::m::high", "use crate::m::low::Thing;", &table), none);
+    assert_eq!(illegal_tiers("a::m::low", "use crate::m::high::Thing;", &table), ["low uses high"]);
+    assert_eq!(illegal_tiers("a::m::low", "use super::super::{other, high};", &table), ["low uses high"]);
+    assert_eq!(illegal_tiers("a::m::low", "use super::own; use crate::other::high;", &table), none);
 }
 
 #[test]

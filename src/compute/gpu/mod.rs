@@ -1,4 +1,5 @@
-//! The CUDA backend: one launcher module per kernel, with the name of the kernel.
+//! The CUDA backend, in three tiers: `launch` (access to the device), `tables` (the tables and the plan of a scene, pure)
+//! and `executor` (the deformer and the rasterizer).
 //!
 //! The kernels are in `kernels/*.cu`. NVRTC compiles them at run time for the device that is present, with only the
 //! features that the scene needs ([`plan()`]), and a disk cache keeps the machine code. A step is one CUDA graph: a
@@ -6,61 +7,46 @@
 //! kernels write directly into OpenGL's buffers when the driver shares them.
 //!
 //! ```text
-//! inputs -> [apply or batch] -> deform -> bounds -> [normals] -> answer
+//! inputs -> [apply or batch] -> deform -> bounds -> [normals] -> readback of the bounds
 //! ```
 //! A partial step, which changes few domains, launches `apply`. A full step launches `batch` if the scene has domains
 //! that share a large U. `normals` is launched if normals follow the deformed surface.
 //!
-//! | file | content |
-//! |---|---|
-//! | `plan` | derives the kernels with their macros, the buffers and the launches from the scene |
-//! | `work`, `normal_tables`, `rings`, `layout` | derive the tables that the kernels read from the scene; pure |
-//! | `inputs`, `staging` | the input values of a step and their upload |
-//! | `apply`, `batch`, `deform`, `bounds`, `normals` | the launchers |
-//! | `dependent_launch` | programmatic dependent launch: a launch that overlaps the end of the kernel before it |
-//! | `deformer`, `step_slot` | the graph of a step, its pinned memory and the readback of its bounds |
-//! | `output`, `interop` | the output buffers |
-//! | `boxes` | a bounding box per domain, if the scene asks for them |
-//! | `output_ring` | double buffering of the outputs: which one a step writes and which domains it lacks; pure |
-//! | `readback` | asynchronous readback of vertices, concurrent with the next step |
-//! | `raster` | compute rasterizer: triangles to samples in OpenGL's buffers, next to OpenGL's own rasterizer |
-//! | `device`, `memory`, `compile` | the device, its buffers, its machine code |
-//! | `probe`, `layout_check` | device capabilities; check that host and device agree on struct layouts |
-//! | `benchmarks` | benchmark kernels |
+//! The server uses this module. Programs that measure single kernels also use [`launch`], [`launchers`] and
+//! [`step_input`].
 
-pub mod apply;
-mod batch;
-pub mod bounds;
-mod boxes;
-mod compile;
-pub mod deform;
-mod deformer;
-mod dependent_launch;
-mod device;
-pub mod inputs;
-mod interop;
-pub mod layout;
-mod layout_check;
-pub mod memory;
-mod normal_tables;
-pub mod normals;
-mod output;
-mod output_ring;
-pub mod plan;
-mod probe;
-pub mod raster;
-mod readback;
-mod rings;
-pub mod staging;
-mod step_slot;
-pub mod work;
+mod executor;
+#[cfg(test)]
+mod kernel_tests;
+pub mod launch;
+mod tables;
 
+pub use executor::raster::{CudaRasterizer, RasterGranularity, RasterVariant};
+pub use executor::{CudaDeformer, MAX_STEPS_IN_FLIGHT, device_layout_values};
 #[cfg(any(test, feature = "testing"))]
-pub use compile::{CompiledVariant, assert_compiles};
-pub use deformer::{CudaDeformer, MAX_STEPS_IN_FLIGHT};
-pub use device::Device;
-pub use layout::{LayoutConstant, layout_constants};
-pub use layout_check::device_layout_values;
-pub use plan::{BufferDescriptor, BufferRole, DeformPlan, KernelDescriptor, KernelKind, OmittedFeature, plan};
-pub use probe::{DeviceInfo, Probe, probe};
-pub use raster::{CudaRasterizer, RasterGranularity, RasterVariant};
+pub use launch::{CompiledVariant, assert_compiles};
+pub use launch::{Device, DeviceInfo, KernelDescriptor, KernelKind, Probe, probe};
+pub use tables::layout::{LayoutConstant, layout_constants};
+pub use tables::plan::{BufferDescriptor, BufferRole, DeformPlan, OmittedFeature, plan};
+
+/// The launchers of the kernels, for programs that measure single kernels. The launch functions are unsafe: the header of
+/// a step's values contains the addresses of its outputs.
+pub mod launchers {
+    pub use super::executor::launchers::apply::{ApplyKernel, ChangeListBuffer};
+    pub use super::executor::launchers::bounds::BoundsKernel;
+    pub use super::executor::launchers::deform::{DeformKernel, PositionKernels};
+    pub use super::executor::launchers::normals::NormalsKernel;
+    pub use super::executor::raster::{RasterFunctions, RasterPass, RasterPipeline, check, check_cut_outs};
+    pub use super::tables::change_list::{ChangeListLengths, ChangedDomains};
+    pub use super::tables::device_tables::DeviceTables;
+    pub use super::tables::kernels::storage_define;
+    pub use super::tables::plan::plan_from_tables;
+}
+
+/// The input values of a step, for programs that measure their upload.
+pub mod step_input {
+    pub use super::executor::inputs::{InputPart, StagingBuffer, StepInputs};
+    pub use super::tables::input_packing::{InputPacker, InputWriter};
+    pub use super::tables::layout::Header;
+    pub use super::tables::staging::{PARALLEL_THRESHOLD, parallel_copy};
+}

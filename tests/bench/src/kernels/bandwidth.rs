@@ -1,10 +1,10 @@
 //! Launches `kernels/bandwidth.cu`: kernels that copy, read and fill device memory, and kernels that keep a stream busy.
 
-use cudarc::driver::{CudaFunction, CudaSlice, LaunchConfig, PushKernelArg as _};
+use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg as _};
 
 use super::kernel_benchmark::BenchmarkSource;
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, alloc_zeroed};
+use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, fault_in};
 
 /// Threads per block, and bytes per word.
@@ -57,10 +57,10 @@ pub(super) fn variants() -> impl Iterator<Item = (u64, &'static [&'static str])>
 }
 
 /// A buffer of pseudo-random numbers, because memory that holds zeros may be faster than memory in use.
-pub(super) fn filled(device: &Device, bytes: u64) -> Result<CudaSlice<u8>> {
-    let buffer = alloc_zeroed(device, bytes)?;
+pub(super) fn filled(device: &Device, bytes: u64) -> Result<DeviceBuffer> {
+    let buffer = DeviceBuffer::zeroed(device, bytes)?;
     let function = device.function("fill", CODE.source, &[])?;
-    let (to, words) = (address(device, &buffer), bytes / 4);
+    let (to, words) = (buffer.address(), bytes / 4);
     let mut launch = device.stream().launch_builder(&function);
     let config = config(words.div_ceil(BLOCK) as u32);
     // SAFETY: the kernel's arguments are the address of `buffer` and its number of words.

@@ -5,13 +5,13 @@
 use std::sync::Arc;
 
 use bytemuck::{Pod, Zeroable};
-use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
+use cudarc::driver::{DeviceRepr, LaunchConfig, PushKernelArg as _};
 
 use super::input_sets::{InputAddresses, InputSets};
 use super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes, KernelBenchmark};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, alloc_zeroed, download, upload};
-use modalcast_compute::gpu::plan::storage_define;
+use modalcast_compute::gpu::launch::DeviceBuffer;
+use modalcast_compute::gpu::launchers::storage_define;
 use modalcast_compute::storage::{QUAD, SplitCoordinates, TiledModes};
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 use modalcast_model::scene::{Scene, SceneState, StorageType};
@@ -64,9 +64,9 @@ unsafe impl DeviceRepr for BatchMmaArgs {}
 pub struct BatchMmaBenchmark {
     name: String,
     compiled: CompiledKernel,
-    words: CudaSlice<u8>,
-    rest: CudaSlice<u8>,
-    positions: CudaSlice<u8>,
+    words: DeviceBuffer,
+    rest: DeviceBuffer,
+    positions: DeviceBuffer,
     turns: InputSets,
     /// Kernel arguments with null addresses; [`Self::args`] fills them in.
     args: BatchMmaArgs,
@@ -95,9 +95,9 @@ impl BatchMmaBenchmark {
         Ok(Self {
             name: format!("batch_mma{}_{}", scene.domains.len(), storage.name()),
             compiled: CompiledKernel::new(device, &CODE, &defines)?,
-            words: upload(device, tiles.packed_words())?,
-            rest: upload(device, tiles.rest())?,
-            positions: alloc_zeroed(device, 12 * scene.layout.vertices as u64)?,
+            words: DeviceBuffer::upload(device, tiles.packed_words())?,
+            rest: DeviceBuffer::upload(device, tiles.rest())?,
+            positions: DeviceBuffer::zeroed(device, 12 * scene.layout.vertices as u64)?,
             turns: InputSets::new(device, scene, states, |state| {
                 let halves = halves(scene, state, &tiles);
                 [bytemuck::cast_vec(fragments(&halves, tiles.rank(), vectors)), placements(state, &halves, vectors)]
@@ -109,14 +109,14 @@ impl BatchMmaBenchmark {
         })
     }
 
-    fn args(&self, device: &Device, values: InputAddresses) -> BatchMmaArgs {
+    fn args(&self, values: InputAddresses) -> BatchMmaArgs {
         BatchMmaArgs {
-            words: address(device, &self.words),
-            rest: address(device, &self.rest),
+            words: self.words.address(),
+            rest: self.rest.address(),
             transforms: values.transforms,
             shrinks: values.transforms + 48 * self.vectors as u64,
             halves: values.q,
-            positions: address(device, &self.positions),
+            positions: self.positions.address(),
             ..self.args
         }
     }
@@ -132,7 +132,7 @@ impl KernelBenchmark for BatchMmaBenchmark {
     }
 
     fn launch(&self, device: &Device, turn: usize) -> Result<()> {
-        let args = self.args(device, self.turns.start(device, turn));
+        let args = self.args(self.turns.start(turn));
         let mut launch = device.stream().launch_builder(&self.compiled.function);
         let config =
             LaunchConfig { grid_dim: (self.tiles, 1, 1), block_dim: (32 * WARPS as u32, 1, 1), shared_mem_bytes: 0 };
@@ -145,8 +145,7 @@ impl KernelBenchmark for BatchMmaBenchmark {
 
     fn positions(&self, device: &Device) -> Result<Vec<f32>> {
         let mut positions = vec![0.0_f32; 3 * (self.args.vertices * self.args.domains) as usize];
-        // SAFETY: the buffer has three floats for each vertex of each domain.
-        unsafe { download(device, address(device, &self.positions), &mut positions) }?;
+        self.positions.read(device, 0, &mut positions)?;
         Ok(positions)
     }
 

@@ -2,23 +2,18 @@
 
 use std::sync::Arc;
 
-use cudarc::driver::CudaSlice;
 use serde::Serialize;
 
 use super::input_sets::InputSets;
 use super::kernel_benchmark::{KernelAttributes, KernelBenchmark};
 use super::timer::MAX_GRAPHS;
-use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::apply::{ApplyKernel, ChangeListLengths};
-use modalcast_compute::gpu::bounds::BoundsKernel;
-use modalcast_compute::gpu::deform::DeformKernel;
-use modalcast_compute::gpu::inputs::{InputAddresses, StagingBuffer, StepInputs};
-use modalcast_compute::gpu::layout::Header;
-use modalcast_compute::gpu::memory::{address, alloc_zeroed, download};
-use modalcast_compute::gpu::normals::NormalsKernel;
-use modalcast_compute::gpu::plan::{
-    BufferRole, DeformPlan, DeviceTables, KernelDescriptor, KernelKind, plan_from_tables,
+use modalcast_compute::gpu::launch::DeviceBuffer;
+use modalcast_compute::gpu::launchers::{
+    ApplyKernel, BoundsKernel, ChangeListLengths, ChangedDomains, DeformKernel, DeviceTables, NormalsKernel,
+    PositionKernels, plan_from_tables,
 };
+use modalcast_compute::gpu::step_input::{Header, InputPart, StagingBuffer, StepInputs};
+use modalcast_compute::gpu::{BufferRole, DeformPlan, Device, KernelDescriptor, KernelKind};
 use modalcast_compute::storage::modes_per_chunk;
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::{Scene, SceneState};
@@ -56,7 +51,7 @@ pub struct DeformerBenchmark {
     normals: Option<NormalsKernel>,
     listed: bool,
     inputs: Vec<StepInputs>,
-    outputs: CudaSlice<u8>,
+    outputs: DeviceBuffer,
     turns: InputSets,
     plan: DeformPlan,
     /// Vertices and coordinates that a step computes, and the data that it reads.
@@ -100,16 +95,17 @@ impl DeformerBenchmark {
             return Err(invalid("deform.batches", "never, where u alone is computed", "batches"));
         }
         let normals = plan.kernel(KernelKind::Normals).filter(|_| extent == StepOutputs::Whole);
-        let normals = normals.map(|kernel| NormalsKernel::new(device, scene, kernel)).transpose()?;
+        let normals = normals.map(|kernel| NormalsKernel::new(device, scene, &tables, kernel)).transpose()?;
         let mut deform = plan.require_kernel(KernelKind::Deform)?.clone();
         leave_out(&mut deform, extent);
-        let deform = DeformKernel::new(device, scene, (&deform, plan.kernel(KernelKind::Batch)), tables)?;
-        let outputs = alloc_zeroed(device, outputs_of(&plan).iter().sum())?;
+        let kernels = PositionKernels { deform: &deform, batch: plan.kernel(KernelKind::Batch) };
+        let deform = DeformKernel::new(device, scene, kernels, tables)?;
+        let outputs = DeviceBuffer::zeroed(device, outputs_of(&plan).iter().sum())?;
         let mut ours = Self {
             name: format!("ours_{}{}", scene.deformation.storage.name(), extent.suffix()),
             extent,
             scene: Arc::clone(scene),
-            bounds: BoundsKernel::new(device, scene, plan.require_kernel(KernelKind::Bounds)?, deform.segments())?,
+            bounds: BoundsKernel::new(device, scene, plan.require_kernel(KernelKind::Bounds)?, &deform)?,
             normals,
             listed: changed.is_some(),
             inputs: Vec::new(),
@@ -121,7 +117,7 @@ impl DeformerBenchmark {
         };
         let mut staging = None;
         for state in states {
-            let header = Header { last_full_step: 1, step: 1, ..ours.header(device) };
+            let header = Header { last_full_step: 1, step: 1, ..ours.header() };
             let mut inputs = StepInputs::new(device, ours.deform.packing())?;
             let staging = match &mut staging {
                 Some(staging) => staging,
@@ -141,22 +137,25 @@ impl DeformerBenchmark {
         let mut apply =
             ApplyKernel::new(device, self.deform.packing(), self.plan.kernel(KernelKind::Apply).ok_or_else(too_many)?)?;
         let mut list = apply.list(device)?;
-        let old = Header { last_full_step: 1, ..self.header(device) };
+        let old = Header { last_full_step: 1, ..self.header() };
         for (inputs, state) in self.inputs.iter_mut().zip(states) {
             let mut staging = inputs.staging(device)?;
-            let lengths = apply.write(&mut list, self.deform.packing(), state, (changed, &[]))?;
+            let lengths =
+                apply.write(&mut list, self.deform.packing(), state, ChangedDomains { changed, outdated: &[] })?;
             let ChangeListLengths { changed, dirty_tiles } = lengths.ok_or_else(too_many)?;
             let header = Header { output_step: 1, step: 2, changed, dirty_tiles, ..old };
             send(device, (inputs, &mut staging), &header, state)?;
-            apply.launch(device, &mut list, inputs.values(device), self.deform.list(device))?;
+            // SAFETY: the lists were written above for the packing of `deform` and of the inputs, and the next statement
+            // waits for the kernel.
+            unsafe { apply.launch(device, &list, inputs, &self.deform) }?;
             device.stream().synchronize().map_err(fault_in("upload"))?;
         }
         Ok(())
     }
 
-    fn header(&self, device: &Device) -> Header {
+    fn header(&self) -> Header {
         let [positions, normals, tangents, _] = outputs_of(&self.plan);
-        let begin = address(device, &self.outputs);
+        let begin = self.outputs.address();
         debug_assert!(positions + normals + tangents > 0);
         Header {
             positions: begin,
@@ -185,8 +184,15 @@ impl DeformerBenchmark {
         Some(shares.iter().sum::<f64>() / shares.len().max(1) as f64)
     }
 
-    fn values(&self, device: &Device, turn: usize) -> InputAddresses {
-        self.inputs[turn % self.inputs.len()].values(device)
+    fn inputs(&self, turn: usize) -> &StepInputs {
+        &self.inputs[turn % self.inputs.len()]
+    }
+
+    /// Computes the positions of all domains.
+    fn launch_all_positions(&self, device: &Device, turn: usize) -> Result<()> {
+        // SAFETY: the inputs are whole steps of this scene, whose header has the addresses of `outputs`. `self` owns the
+        // inputs and the outputs, and device memory is released in the order of the stream.
+        unsafe { self.deform.launch(device, self.inputs(turn)) }
     }
 }
 
@@ -208,7 +214,8 @@ fn send(
     state: &SceneState,
 ) -> Result<()> {
     inputs.write(staging, header, state)?;
-    inputs.send(device, staging, None)?;
+    // SAFETY: the next statement waits for the copy.
+    unsafe { inputs.send(device, staging, InputPart::Whole) }?;
     device.stream().synchronize().map_err(fault_in("upload"))
 }
 
@@ -257,27 +264,29 @@ impl KernelBenchmark for DeformerBenchmark {
     }
 
     fn complete(&self, device: &Device, turn: usize) -> Result<()> {
-        if self.listed { self.deform.launch(device, self.values(device, turn)) } else { Ok(()) }
+        if self.listed { self.launch_all_positions(device, turn) } else { Ok(()) }
     }
 
     fn launch(&self, device: &Device, turn: usize) -> Result<()> {
-        let values = self.values(device, turn);
-        self.turns.start(device, turn);
+        let inputs = self.inputs(turn);
+        self.turns.start(turn);
         if self.listed {
-            self.deform.launch_tile_list(device, values)?;
+            // SAFETY: as in `launch_all_positions`; `apply` has written the tile list.
+            unsafe { self.deform.launch_tile_list(device, inputs) }?;
         } else {
-            self.deform.launch(device, values)?;
+            self.launch_all_positions(device, turn)?;
         }
         if self.extent == StepOutputs::Whole {
-            self.bounds.launch(device, values, self.deform.boxes(device))?;
+            // SAFETY: as in `launch_all_positions`.
+            unsafe { self.bounds.launch(device, inputs, &self.deform) }?;
         }
-        self.normals.as_ref().map_or(Ok(()), |normals| normals.launch(device, values))
+        // SAFETY: as in `launch_all_positions`.
+        self.normals.as_ref().map_or(Ok(()), |normals| unsafe { normals.launch(device, inputs) })
     }
 
     fn positions(&self, device: &Device) -> Result<Vec<f32>> {
         let mut numbers = vec![0.0_f32; (self.plan.bytes(BufferRole::Positions) / 4) as usize];
-        // SAFETY: the outputs begin with three floats per vertex.
-        unsafe { download(device, address(device, &self.outputs), &mut numbers) }?;
+        self.outputs.read(device, 0, &mut numbers)?;
         if self.extent != StepOutputs::Uq {
             return Ok(numbers);
         }
@@ -312,8 +321,8 @@ impl KernelBenchmark for DeformerBenchmark {
     }
 
     fn kernels(&self) -> Vec<KernelAttributes> {
-        let functions = self.deform.kernels().into_iter().chain([("bounds", &self.bounds.function)]);
-        let functions = functions.chain(self.normals.iter().map(|normals| ("normals", &normals.function)));
+        let functions = self.deform.kernels().into_iter().chain([("bounds", self.bounds.function())]);
+        let functions = functions.chain(self.normals.iter().map(|normals| ("normals", normals.function())));
         functions.filter_map(|(name, function)| KernelAttributes::of(name, function).ok()).collect()
     }
 }

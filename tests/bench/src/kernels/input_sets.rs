@@ -3,12 +3,11 @@
 use std::cell::Cell;
 use std::sync::Arc;
 
-use cudarc::driver::CudaSlice;
 use rayon::prelude::*;
 use serde::Serialize;
 
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, upload};
+use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Scene, SceneState};
 
@@ -47,8 +46,8 @@ pub(super) struct InputAddresses {
 pub(super) struct InputSets {
     scene: Arc<Scene>,
     states: Vec<SceneState>,
-    q: CudaSlice<u8>,
-    transforms: CudaSlice<u8>,
+    q: DeviceBuffer,
+    transforms: DeviceBuffer,
     /// Bytes from one turn to the next, of q and of the transforms.
     strides: [u64; 2],
     last: Cell<usize>,
@@ -86,7 +85,7 @@ impl InputSets {
             }
         }
         let strides = [&q, &transforms].map(|all| 4 * (all.len() / states.len()) as u64);
-        let (q, transforms) = (upload(device, &q)?, upload(device, &transforms)?);
+        let (q, transforms) = (DeviceBuffer::upload(device, &q)?, DeviceBuffer::upload(device, &transforms)?);
         let (scene, states) = (Arc::clone(scene), states.to_vec());
         Ok(Self { scene, states, q, transforms, strides, last: Cell::new(0) })
     }
@@ -96,11 +95,11 @@ impl InputSets {
     }
 
     /// The inputs of a turn. Records it as the last turn.
-    pub(super) fn start(&self, device: &Device, turn: usize) -> InputAddresses {
+    pub(super) fn start(&self, turn: usize) -> InputAddresses {
         let turn = turn % self.states.len();
         self.last.set(turn);
         let [q, transforms] = self.strides.map(|stride| stride * turn as u64);
-        InputAddresses { q: address(device, &self.q) + q, transforms: address(device, &self.transforms) + transforms }
+        InputAddresses { q: self.q.address() + q, transforms: self.transforms.address() + transforms }
     }
 
     /// x = T (x0 + u) of the last turn, in f64 and rounded once, so that only the error of u remains. Three f32 per

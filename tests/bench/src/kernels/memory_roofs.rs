@@ -1,14 +1,14 @@
 //! Measures the best rates of device memory, and the transfer rates between host and device. The rate of a deformer is only
 //! meaningful relative to the best rate of the same run.
 
-use cudarc::driver::{CudaFunction, CudaSlice, PinnedHostSlice, result};
+use cudarc::driver::{CudaFunction, result};
 use serde::Serialize;
 
 use super::bandwidth::{CODE, filled, launch, tile, variants};
 use super::kernel_benchmark::KernelBenchmark;
 use super::timer::{Cache, EventPair, Timing, empty_replay, gigabytes_per_second, time};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, alloc_zeroed, download};
+use modalcast_compute::gpu::launch::{DeviceBuffer, PinnedBuffer, PinnedUse};
 use modalcast_model::error::{Error, Result, fault_in};
 
 /// Largest buffer of `copy` and `read`, bytes.
@@ -43,7 +43,7 @@ pub fn roofs(device: &Device) -> Result<Roofs> {
     let unit = tile(16);
     let bytes = (LARGEST.min(free as u64 / 8) / unit).max(1) * unit;
     let from = filled(device, bytes)?;
-    let to = alloc_zeroed(device, bytes)?;
+    let to = DeviceBuffer::zeroed(device, bytes)?;
     let best = |function: &'static str, moved: u64| -> Result<f64> {
         let mut best = 0.0_f64;
         for (loads, defines) in variants() {
@@ -75,32 +75,31 @@ impl CopyBenchmark {
         device: &Device,
         function: &str,
         defines: &[&str],
-        buffers: [&CudaSlice<u8>; 2],
+        buffers: [&DeviceBuffer; 2],
         blocks: u64,
     ) -> Result<Self> {
         Ok(Self {
             function: device.function(function, CODE.source, defines)?,
             name: format!("{function} {}", defines.join(" ")),
-            buffers: buffers.map(|buffer| address(device, buffer)),
+            buffers: buffers.map(|buffer| buffer.address()),
             blocks: blocks as u32,
         })
     }
 
     /// Copies once and compares both ends, because a copy that does nothing would be fast.
-    fn check(&self, device: &Device, from: &CudaSlice<u8>, to: &CudaSlice<u8>) -> Result<()> {
+    fn check(&self, device: &Device, from: &DeviceBuffer, to: &DeviceBuffer) -> Result<()> {
         const END: usize = 4096;
-        let (last, fail) = (to.len() - END, fault_in("roof"));
-        let ends = |buffer: &CudaSlice<u8>| -> Result<[Vec<u8>; 2]> {
-            let end = |first: usize| {
+        let (last, fail) = (to.bytes() - END as u64, fault_in("roof"));
+        let ends = |buffer: &DeviceBuffer| -> Result<[Vec<u8>; 2]> {
+            let end = |first: u64| {
                 let mut bytes = vec![0_u8; END];
-                // SAFETY: the buffer has at least one tile, which is more than END bytes, from both ends.
-                unsafe { download(device, address(device, buffer) + first as u64, &mut bytes) }.map(|()| bytes)
+                buffer.read(device, first, &mut bytes).map(|()| bytes)
             };
             Ok([end(0)?, end(last)?])
         };
         for first in [0, last] {
-            // SAFETY: as above; nothing else runs on the stream's buffers.
-            unsafe { result::memset_d8_async(address(device, to) + first as u64, 0, END, device.stream().cu_stream()) }
+            // SAFETY: the buffer has at least one tile, which is more than END bytes, from both ends.
+            unsafe { result::memset_d8_async(to.address() + first, 0, END, device.stream().cu_stream()) }
                 .map_err(&fail)?;
         }
         launch(device, &self.function, self.blocks, self.buffers)?;
@@ -132,13 +131,11 @@ impl KernelBenchmark for CopyBenchmark {
 /// Rates of pinned copies to and from the device, GB/s.
 fn pinned(device: &Device) -> Result<(f64, f64)> {
     let fail = fault_in("pinned copy");
-    // SAFETY: every byte is written just below before anything reads it.
-    let mut host: PinnedHostSlice<u8> =
-        unsafe { device.context().alloc_pinned_with_flags(PINNED, 0) }.map_err(fault_in("allocate"))?;
-    let host = host.as_mut_slice().map_err(&fail)?;
+    let mut host = PinnedBuffer::<u8>::zeroed(device, PINNED, PinnedUse::FromDevice)?;
+    let host = host.as_mut_slice()?;
     host.fill(0x5a);
-    let buffer = alloc_zeroed(device, PINNED as u64)?;
-    let (there, stream) = (address(device, &buffer), device.stream().cu_stream());
+    let buffer = DeviceBuffer::zeroed(device, PINNED as u64)?;
+    let (there, stream) = (buffer.address(), device.stream().cu_stream());
     let mut rate = |copy: &mut dyn FnMut(&mut [u8]) -> Result<()>| -> Result<f64> {
         let mut times = Vec::with_capacity(PINNED_COPIES);
         // The first copy is a warm-up and does not count.

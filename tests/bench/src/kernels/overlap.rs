@@ -10,15 +10,14 @@ use std::hint::black_box;
 use std::sync::Arc;
 use std::time::Instant;
 
-use cudarc::driver::PinnedHostSlice;
 use serde::Serialize;
 
 use super::timer::{EventPair, Timing};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::inputs::{DirtyTileLayout, InputPacker, InputWriter, StepInputs};
-use modalcast_compute::gpu::layout::Header;
-use modalcast_compute::gpu::staging::{PARALLEL_THRESHOLD, parallel_copy};
-use modalcast_compute::gpu::work::CoordinateLayout;
+use modalcast_compute::gpu::launch::{PinnedBuffer, PinnedUse};
+use modalcast_compute::gpu::step_input::{
+    Header, InputPacker, InputWriter, PARALLEL_THRESHOLD, StepInputs, parallel_copy,
+};
 use modalcast_compute::gpu::{CudaDeformer, MAX_STEPS_IN_FLIGHT};
 use modalcast_model::deform::{DeformedSurface, Deformer as _, VertexAttributes};
 use modalcast_model::error::{Result, fault_in, invalid};
@@ -193,13 +192,9 @@ fn alone(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize) -> Re
 
 /// Bytes of a step's values, and median times of writing them on one core and on all.
 fn writes(device: &Device, scene: &Arc<Scene>, states: &[SceneState], steps: usize) -> Result<(u64, [f64; 2])> {
-    // Only the number of bytes matters here, so factors and tiles are empty.
-    let (coordinates, factors) = (CoordinateLayout::new(scene), vec![Vec::new(); scene.shapes.len()]);
-    let packing =
-        InputPacker { scene: Arc::clone(scene), coordinates, factors, dirty_tile_layout: DirtyTileLayout::default() };
-    let packing = Arc::new(packing);
+    let packing = Arc::new(InputPacker::sizes_only(scene));
     let mut staging = StepInputs::new(device, &packing)?.staging(device)?;
-    let words = staging.as_mut_slice().map_err(fault_in("write"))?;
+    let words = staging.as_mut_slice()?;
     let mut writer = InputWriter::new(&packing);
     let bytes = size_of_val(words) as u64;
     let mut run = move || {
@@ -250,10 +245,8 @@ pub struct HostWrite {
 /// `Invalid` when `replays` is 0; `Fault` when the driver cannot allocate memory.
 pub fn host_writes(device: &Device, replays: usize) -> Result<Vec<HostWrite>> {
     const LARGEST: usize = 64 << 20;
-    // SAFETY: the memory is only written here.
-    let staging: std::result::Result<PinnedHostSlice<f32>, _> = unsafe { device.context().alloc_pinned(LARGEST / 4) };
-    let mut staging = staging.map_err(fault_in("write"))?;
-    let to = staging.as_mut_slice().map_err(fault_in("write"))?;
+    let mut staging = PinnedBuffer::<f32>::zeroed(device, LARGEST / 4, PinnedUse::ToDevice)?;
+    let to = staging.as_mut_slice()?;
     let from = vec![1.0_f32; LARGEST / 4];
     let mut row = |bytes: usize| {
         let (to, from) = (&mut to[..bytes / 4], &from[..bytes / 4]);

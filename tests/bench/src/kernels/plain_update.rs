@@ -1,11 +1,11 @@
 //! Launches `kernels/plain_update.cu`: x = T (x0 + u) after a library computed u. Only benchmarks use it.
 
 use bytemuck::{Pod, Zeroable};
-use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
+use cudarc::driver::{DeviceRepr, LaunchConfig, PushKernelArg as _};
 
 use super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, alloc_zeroed, download, upload};
+use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::Scene;
 
@@ -53,10 +53,10 @@ unsafe impl DeviceRepr for PlainArgs {}
 #[derive(Debug)]
 pub(super) struct PlainUpdate {
     compiled: CompiledKernel,
-    slots: CudaSlice<u8>,
-    domains: Option<CudaSlice<u8>>,
-    rest: CudaSlice<u8>,
-    positions: CudaSlice<u8>,
+    slots: DeviceBuffer,
+    domains: Option<DeviceBuffer>,
+    rest: DeviceBuffer,
+    positions: DeviceBuffer,
     vertices: usize,
     /// Bytes of the transforms, and of u.
     read: [u64; 2],
@@ -70,10 +70,10 @@ impl PlainUpdate {
         let moving = scene.layout.slots.iter().filter(|slot| slot.rank > 0).map(|slot| 12 * slot.vertices as u64);
         Ok(Self {
             compiled: CompiledKernel::new(device, &CODE, defines)?,
-            slots: upload(device, &slots(scene, first_u))?,
-            domains: (!single).then(|| upload(device, &domains(scene))).transpose()?,
-            rest: upload(device, &rest(scene))?,
-            positions: alloc_zeroed(device, 12 * vertices as u64)?,
+            slots: DeviceBuffer::upload(device, &slots(scene, first_u))?,
+            domains: (!single).then(|| DeviceBuffer::upload(device, &domains(scene))).transpose()?,
+            rest: DeviceBuffer::upload(device, &rest(scene))?,
+            positions: DeviceBuffer::zeroed(device, 12 * vertices as u64)?,
             vertices,
             read: [48 * scene.domains.len() as u64, moving.sum()],
         })
@@ -81,12 +81,12 @@ impl PlainUpdate {
 
     pub(super) fn launch(&self, device: &Device, transforms: u64, u: u64) -> Result<()> {
         let args = PlainArgs {
-            slots: address(device, &self.slots),
-            domains: self.domains.as_ref().map_or(0, |domains| address(device, domains)),
-            rest: address(device, &self.rest),
+            slots: self.slots.address(),
+            domains: self.domains.as_ref().map_or(0, |domains| domains.address()),
+            rest: self.rest.address(),
             transforms,
             u,
-            positions: address(device, &self.positions),
+            positions: self.positions.address(),
             vertices: self.vertices as u32,
             reserved: 0,
         };
@@ -101,8 +101,7 @@ impl PlainUpdate {
 
     pub(super) fn positions(&self, device: &Device) -> Result<Vec<f32>> {
         let mut positions = vec![0.0_f32; 3 * self.vertices];
-        // SAFETY: the buffer has three floats for each vertex.
-        unsafe { download(device, address(device, &self.positions), &mut positions) }?;
+        self.positions.read(device, 0, &mut positions)?;
         Ok(positions)
     }
 

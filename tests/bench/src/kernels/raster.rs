@@ -1,14 +1,11 @@
 //! The CUDA rasterizer as a trial: it has its own positions and samples on the device, so that it can be timed without
 //! OpenGL and read back.
 
-use cudarc::driver::CudaSlice;
-
 use super::kernel_benchmark::{KernelAttributes, KernelBenchmark};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, alloc_zeroed, download, upload};
-use modalcast_compute::gpu::raster::{
-    RasterFunctions, RasterPass, RasterPipeline, RasterVariant, check, check_cut_outs,
-};
+use modalcast_compute::gpu::RasterVariant;
+use modalcast_compute::gpu::launch::DeviceBuffer;
+use modalcast_compute::gpu::launchers::{RasterFunctions, RasterPass, RasterPipeline, check, check_cut_outs};
 use modalcast_model::error::Result;
 use modalcast_model::raster::CutOuts;
 use modalcast_model::scene::{DrawRange, Viewport};
@@ -52,8 +49,8 @@ pub struct RasterBenchmark {
     functions: RasterFunctions,
     facts: Vec<KernelAttributes>,
     groups: Vec<DrawRange>,
-    positions: CudaSlice<u8>,
-    target: CudaSlice<u8>,
+    positions: DeviceBuffer,
+    target: DeviceBuffer,
     core: RasterPipeline,
     window: Viewport,
     bytes: Vec<(&'static str, u64)>,
@@ -82,8 +79,8 @@ impl RasterBenchmark {
             functions,
             facts,
             groups: mesh.groups.to_vec(),
-            positions: upload(device, mesh.positions)?,
-            target: alloc_zeroed(device, target)?,
+            positions: DeviceBuffer::upload(device, mesh.positions)?,
+            target: DeviceBuffer::zeroed(device, target)?,
             core,
             window,
             bytes: vec![("samples", target), ("x", size_of_val(mesh.positions) as u64), ("triangles", triangles)],
@@ -97,8 +94,7 @@ impl RasterBenchmark {
     /// `Fault` when the device fails.
     pub fn keys(&self, device: &Device) -> Result<Vec<u64>> {
         let mut keys = vec![0; if self.variant.depth_only { 0 } else { self.window.pixel_count() }];
-        // SAFETY: the buffer has a key for each sample unless the target is depth-only.
-        unsafe { download(device, address(device, &self.target), &mut keys) }?;
+        self.target.read(device, 0, &mut keys)?;
         Ok(keys)
     }
 
@@ -108,8 +104,7 @@ impl RasterBenchmark {
     /// `Fault` when the device fails.
     pub fn depths(&self, device: &Device) -> Result<Vec<f32>> {
         let mut depths = vec![0.0; if self.variant.depth_only { self.window.pixel_count() } else { 0 }];
-        // SAFETY: the buffer has a depth for each sample when the target is depth-only.
-        unsafe { download(device, address(device, &self.target), &mut depths) }?;
+        self.target.read(device, 0, &mut depths)?;
         Ok(depths)
     }
 
@@ -138,10 +133,12 @@ impl KernelBenchmark for RasterBenchmark {
             functions: &self.functions,
             groups: &self.groups,
             window: &self.window,
-            positions: address(device, &self.positions),
-            target: address(device, &self.target),
+            positions: self.positions.address(),
+            target: self.target.address(),
         };
-        self.core.draw(device, &pass)
+        // SAFETY: `new` checked mesh and groups; both buffers have the sizes of the pass, and device memory is
+        // released in the order of the stream.
+        unsafe { self.core.draw(device, &pass) }
     }
 
     fn bytes(&self) -> Vec<(&'static str, u64)> {

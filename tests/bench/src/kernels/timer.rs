@@ -2,15 +2,15 @@
 
 use std::time::{Duration, Instant};
 
-use cudarc::driver::sys::{CUdevice_attribute, CUevent_flags, CUgraphInstantiate_flags, CUstreamCaptureMode};
-use cudarc::driver::{CudaEvent, CudaFunction, CudaGraph, CudaSlice, LaunchConfig, PushKernelArg as _};
+use cudarc::driver::sys::{CUdevice_attribute, CUevent_flags};
+use cudarc::driver::{CudaEvent, CudaFunction, CudaGraph, LaunchConfig, PushKernelArg as _};
 use serde::Serialize;
 
 use super::bandwidth;
 use super::kernel_benchmark::KernelBenchmark;
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, alloc_zeroed};
-use modalcast_model::error::{Error, Result, fault_in, invalid};
+use modalcast_compute::gpu::launch::{DeviceBuffer, capture};
+use modalcast_model::error::{Result, fault_in, invalid};
 
 /// Replays that are enqueued together, behind a kernel that blocks the stream meanwhile, so that the host's launch
 /// overhead does not affect the times. The stream takes about a thousand entries before it blocks the host.
@@ -83,7 +83,7 @@ pub fn time(device: &Device, kernel_benchmark: &dyn KernelBenchmark, cache: Cach
     // allows.
     kernel_benchmark.launch(device, 0)?;
     let turns = kernel_benchmark.turns().min(MAX_GRAPHS);
-    let graphs = (0..turns).map(|turn| capture(device, kernel_benchmark, turn)).collect::<Result<Vec<_>>>()?;
+    let graphs = (0..turns).map(|turn| capture_turn(device, kernel_benchmark, turn)).collect::<Result<Vec<_>>>()?;
     let begin = Instant::now();
     while begin.elapsed() < WARM_UP {
         graphs.iter().try_for_each(|graph| graph.launch().map_err(fault_in("replay")))?;
@@ -133,19 +133,10 @@ pub fn empty_replay(device: &Device, replays: usize) -> Result<Timing> {
 
 const SINGLE: LaunchConfig = LaunchConfig { grid_dim: (1, 1, 1), block_dim: (1, 1, 1), shared_mem_bytes: 0 };
 
-/// Captures one step as a graph.
-fn capture(device: &Device, kernel_benchmark: &dyn KernelBenchmark, turn: usize) -> Result<CudaGraph> {
-    let fail = fault_in("capture");
-    let stream = device.stream();
-    // Relaxed, because libraries may query the driver in their calls, which the stricter modes refuse.
-    stream.begin_capture(CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_RELAXED).map_err(&fail)?;
-    let launched = kernel_benchmark.launch(device, turn);
-    // End the capture even if the launch failed; otherwise the stream stays in capture mode.
-    let graph = stream.end_capture(CUgraphInstantiate_flags(0));
-    launched?;
-    let nothing = || Error::Fault { stage: "capture", reason: format!("{} launches nothing", kernel_benchmark.name()) };
-    let graph = graph.map_err(&fail)?.ok_or_else(nothing)?;
-    graph.upload().map_err(&fail)?;
+/// Captures one step as a graph and uploads it.
+fn capture_turn(device: &Device, kernel_benchmark: &dyn KernelBenchmark, turn: usize) -> Result<CudaGraph> {
+    let graph = capture(device, || kernel_benchmark.launch(device, turn))?;
+    graph.upload().map_err(fault_in("capture"))?;
     Ok(graph)
 }
 
@@ -194,7 +185,7 @@ impl StreamDelay {
 /// Evicts the L2 by reading a buffer that nothing else uses.
 struct L2Flush {
     function: CudaFunction,
-    buffer: CudaSlice<u8>,
+    buffer: DeviceBuffer,
     blocks: u32,
 }
 
@@ -205,7 +196,7 @@ impl L2Flush {
         let tiles = (SWEEPS * l2).div_ceil(bandwidth::tile(bandwidth::SWEEP_LOADS)).max(1);
         Ok(Self {
             function: device.function("read", bandwidth::CODE.source, bandwidth::SWEEP)?,
-            buffer: alloc_zeroed(device, tiles * bandwidth::tile(bandwidth::SWEEP_LOADS))?,
+            buffer: DeviceBuffer::zeroed(device, tiles * bandwidth::tile(bandwidth::SWEEP_LOADS))?,
             blocks: tiles as u32,
         })
     }
@@ -213,7 +204,7 @@ impl L2Flush {
     fn launch(&self, device: &Device) -> Result<()> {
         // The kernel writes only if all bits that it read are ones. The buffer holds zeros, so input and output may be
         // the same.
-        let from = address(device, &self.buffer);
+        let from = self.buffer.address();
         bandwidth::launch(device, &self.function, self.blocks, [from, from])
     }
 }

@@ -9,11 +9,10 @@ use std::sync::OnceLock;
 
 use cudarc::cublas::result::{self, CublasError};
 use cudarc::cublas::sys::{self, cublasHandle_t, cublasOperation_t, libraryPropertyType};
-use cudarc::driver::CudaSlice;
 use libloading::Library;
 
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, alloc_zeroed};
+use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Error, Result, fault_in};
 
 /// Remedy in the error message when cuBLAS is missing.
@@ -152,7 +151,7 @@ pub(super) struct GroupedGemm<'a> {
 pub(super) struct CublasHandle {
     library: &'static CublasLibrary,
     handle: cublasHandle_t,
-    _workspace: CudaSlice<u8>,
+    _workspace: DeviceBuffer,
 }
 
 impl std::fmt::Debug for CublasHandle {
@@ -170,10 +169,10 @@ impl CublasHandle {
     pub(super) fn new(device: &Device) -> Result<Self> {
         let library = library()?;
         device.context().bind_to_thread().map_err(fault_in("device"))?;
-        let workspace = alloc_zeroed(device, WORKSPACE)?;
+        let workspace = DeviceBuffer::zeroed(device, WORKSPACE)?;
         let handle = result::create_handle().map_err(|error| unavailable(error.to_string()))?;
         let blas = Self { library, handle, _workspace: workspace };
-        let (stream, memory) = (device.stream().cu_stream().cast(), address(device, &blas._workspace));
+        let (stream, memory) = (device.stream().cu_stream().cast(), blas._workspace.address());
         // SAFETY: handle and stream are live, and the workspace has the stated size. The stream is set first because
         // setting it resets the workspace.
         unsafe {

@@ -9,16 +9,14 @@ pub use library::cublas_version;
 
 use std::sync::Arc;
 
-use cudarc::driver::CudaSlice;
-
 use super::input_sets::{InputSets, Part};
 use super::kernel_benchmark::{KernelAttributes, KernelBenchmark};
 use super::plain_update::PlainUpdate;
 use batch::GemmBatches;
 use library::{CublasHandle, GemmCall, GroupedGemm};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, alloc_zeroed, download, upload};
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_compute::gpu::launch::DeviceBuffer;
+use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{Scene, SceneState};
 
 /// cuBLAS for a scene, with the inputs of several steps.
@@ -29,8 +27,8 @@ pub struct CublasBenchmark {
     peer: CublasMethod,
     part: Part,
     batches: GemmBatches,
-    u_matrices: CudaSlice<u8>,
-    u: CudaSlice<u8>,
+    u_matrices: DeviceBuffer,
+    u: DeviceBuffer,
     update: Option<PlainUpdate>,
     /// First float of each domain's u; `None` for domains without modes.
     places: Vec<Option<u64>>,
@@ -41,9 +39,9 @@ pub struct CublasBenchmark {
 /// Device arrays with one pointer per problem: to U, to u, and to q for each turn.
 #[derive(Debug)]
 struct PointerArrays {
-    matrices: CudaSlice<u8>,
-    outputs: CudaSlice<u8>,
-    q: CudaSlice<u8>,
+    matrices: DeviceBuffer,
+    outputs: DeviceBuffer,
+    q: DeviceBuffer,
     problems: u64,
 }
 
@@ -65,7 +63,7 @@ impl CublasBenchmark {
         blas.check_has(peer == CublasMethod::Grouped, peer.as_vectors())?;
         let places = batches.places_of_u(scene.domains.len());
         let u_matrices = upload_matrices(device, scene, &batches, peer)?;
-        let u = alloc_zeroed(device, 4 * batches.floats[2])?;
+        let u = DeviceBuffer::zeroed(device, 4 * batches.floats[2])?;
         let transforms = |state: &SceneState| bytemuck::cast_slice(&state.world_transforms(scene)).to_vec();
         let turns = InputSets::new(device, scene, states, |state| [batches.pack_q(scene, state), transforms(state)])?;
         let pointers =
@@ -74,16 +72,16 @@ impl CublasBenchmark {
         Ok(Self { blas, peer, part, pointers: pointers.transpose()?, batches, u_matrices, u, update, places, turns })
     }
 
-    fn multiply(&self, device: &Device, q: u64, turn: usize) -> Result<()> {
+    fn multiply(&self, q: u64, turn: usize) -> Result<()> {
         if let Some(pointers) = &self.pointers {
             let groups: Vec<GemmCall> = self.batches.list.iter().map(|batch| batch.product).collect();
-            let q = address(device, &pointers.q) + 8 * pointers.problems * (turn % self.turns.count()) as u64;
-            let pointers = [address(device, &pointers.matrices), q, address(device, &pointers.outputs)];
+            let q = pointers.q.address() + 8 * pointers.problems * (turn % self.turns.count()) as u64;
+            let pointers = [pointers.matrices.address(), q, pointers.outputs.address()];
             // SAFETY: the arrays have a pointer for each problem, in the order of the groups, each to memory of the
             // size that `GemmBatches` planned.
             return unsafe { self.blas.grouped(&GroupedGemm { groups: &groups, pointers }) };
         }
-        let bases = [address(device, &self.u_matrices), q, address(device, &self.u)];
+        let bases = [self.u_matrices.address(), q, self.u.address()];
         for batch in &self.batches.list {
             let at: [u64; 3] = std::array::from_fn(|of| bases[of] + 4 * batch.first[of]);
             // SAFETY: the three buffers have the sizes that `GemmBatches` planned, and this batch lies inside them. The
@@ -112,9 +110,9 @@ impl KernelBenchmark for CublasBenchmark {
     }
 
     fn launch(&self, device: &Device, turn: usize) -> Result<()> {
-        let values = self.turns.start(device, turn);
-        self.multiply(device, values.q, turn)?;
-        let u = address(device, &self.u);
+        let values = self.turns.start(turn);
+        self.multiply(values.q, turn)?;
+        let u = self.u.address();
         self.update.as_ref().map_or(Ok(()), |update| update.launch(device, values.transforms, u))
     }
 
@@ -123,8 +121,7 @@ impl KernelBenchmark for CublasBenchmark {
             return update.positions(device);
         }
         let mut u = vec![0.0_f32; self.batches.floats[2] as usize];
-        // SAFETY: the buffer has as many floats as `u`.
-        unsafe { download(device, address(device, &self.u), &mut u) }?;
+        self.u.read(device, 0, &mut u)?;
         let places = &self.places;
         Ok(self.turns.finish_on_host(|domain, vertex| {
             let of = |first: u64| [0, 1, 2].map(|axis| u[first as usize + 3 * vertex + axis]);
@@ -157,32 +154,29 @@ impl PointerArrays {
     fn new(
         device: &Device,
         batches: &GemmBatches,
-        [matrices, u]: [&CudaSlice<u8>; 2],
+        [matrices, u]: [&DeviceBuffer; 2],
         turns: &InputSets,
     ) -> Result<Self> {
         let problems =
             || batches.list.iter().flat_map(|batch| (0..batch.domains.len()).map(move |index| (batch, index)));
         let list = |base: u64, of: usize| problems().map(move |(batch, index)| base + 4 * batch.place(index, of));
-        let of_turn = |turn: usize| list(turns.start(device, turn).q, 1);
+        let of_turn = |turn: usize| list(turns.start(turn).q, 1);
         Ok(Self {
-            matrices: upload(device, &list(address(device, matrices), 0).collect::<Vec<u64>>())?,
-            outputs: upload(device, &list(address(device, u), 2).collect::<Vec<u64>>())?,
-            q: upload(device, &(0..turns.count()).flat_map(of_turn).collect::<Vec<u64>>())?,
+            matrices: DeviceBuffer::upload(device, &list(matrices.address(), 0).collect::<Vec<u64>>())?,
+            outputs: DeviceBuffer::upload(device, &list(u.address(), 2).collect::<Vec<u64>>())?,
+            q: DeviceBuffer::upload(device, &(0..turns.count()).flat_map(of_turn).collect::<Vec<u64>>())?,
             problems: problems().count() as u64,
         })
     }
 }
 
-fn upload_matrices(device: &Device, scene: &Scene, batches: &GemmBatches, peer: CublasMethod) -> Result<CudaSlice<u8>> {
-    let mut buffer = alloc_zeroed(device, 4 * batches.floats[0])?;
+fn upload_matrices(device: &Device, scene: &Scene, batches: &GemmBatches, peer: CublasMethod) -> Result<DeviceBuffer> {
+    let mut buffer = DeviceBuffer::zeroed(device, 4 * batches.floats[0])?;
     for batch in &batches.list {
         let stored = if peer == CublasMethod::Instances { 1 } else { batch.domains.len() };
         for (index, domain) in batch.domains.iter().enumerate().take(stored) {
             let matrix = batch.matrix(scene, *domain, peer == CublasMethod::SgemvRows);
-            let begin = 4 * batch.place(index, 0) as usize;
-            let mut part = buffer.slice_mut(begin..begin + size_of_val(matrix.as_slice()));
-            let bytes = bytemuck::cast_slice::<f32, u8>(&matrix);
-            device.stream().memcpy_htod(bytes, &mut part).map_err(fault_in("upload"))?;
+            buffer.write(device, 4 * batch.place(index, 0), &matrix)?;
         }
     }
     Ok(buffer)

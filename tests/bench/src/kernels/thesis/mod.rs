@@ -18,13 +18,11 @@ pub use group::{KernelSplit, LaneCounts, count_lanes, idle_lanes_per_warp};
 
 use std::sync::Arc;
 
-use cudarc::driver::CudaSlice;
-
 use super::input_sets::{InputSets, Part};
 use super::kernel_benchmark::{KernelAttributes, KernelBenchmark};
 use group::{packed_q, places_of_u};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, alloc_zeroed, download};
+use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Scene, SceneState};
 use thesis_multi::MultiDomainKernel;
@@ -44,7 +42,7 @@ pub struct ThesisBenchmark {
     name: String,
     uq: UqKernel,
     update: Option<UpdateKernel>,
-    u: CudaSlice<u8>,
+    u: DeviceBuffer,
     /// First vertex of each domain's u (`None` without modes), and the number of vertices that have a u.
     places: (Vec<Option<u32>>, usize),
     turns: InputSets,
@@ -95,7 +93,7 @@ impl ThesisBenchmark {
             name,
             uq,
             update,
-            u: alloc_zeroed(device, 16 * places.1 as u64)?,
+            u: DeviceBuffer::zeroed(device, 16 * places.1 as u64)?,
             places,
             turns: InputSets::new(device, scene, states, |state| [packed_q(scene, state), matrices(scene, state)])?,
             vertices: scene.layout.vertices,
@@ -114,7 +112,7 @@ impl KernelBenchmark for ThesisBenchmark {
     }
 
     fn launch(&self, device: &Device, turn: usize) -> Result<()> {
-        let (values, u) = (self.turns.start(device, turn), address(device, &self.u));
+        let (values, u) = (self.turns.start(turn), self.u.address());
         match &self.uq {
             UqKernel::Single(single) => single.launch(device, values.q, u)?,
             UqKernel::Multi(multi) => multi.launch(device, values.q, u)?,
@@ -129,8 +127,7 @@ impl KernelBenchmark for ThesisBenchmark {
         }
         let (places, count) = &self.places;
         let mut u = vec![[0.0_f32; 4]; *count];
-        // SAFETY: the buffer has a float4 for each vertex that has a u.
-        unsafe { download(device, address(device, &self.u), &mut u) }?;
+        self.u.read(device, 0, &mut u)?;
         Ok(self.turns.finish_on_host(|domain, vertex| {
             let [x, y, z, _] = places[domain].map_or([0.0; 4], |first| u[first as usize + vertex]);
             [x, y, z]

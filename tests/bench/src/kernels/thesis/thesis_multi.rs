@@ -2,12 +2,12 @@
 //!
 //! The kernels of a split run one after the other. In the text they overlap in streams (figure 3.5).
 
-use cudarc::driver::{CudaSlice, LaunchConfig, PushKernelArg as _};
+use cudarc::driver::{LaunchConfig, PushKernelArg as _};
 
 use super::super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes};
 use super::group::{BLOCK, KernelSplit, LARGEST_RANK, pack};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, upload};
+use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::Scene;
 
@@ -21,8 +21,8 @@ pub(super) const CODE: BenchmarkSource = BenchmarkSource {
 #[derive(Debug)]
 struct GroupKernel {
     compiled: CompiledKernel,
-    entries: CudaSlice<u8>,
-    meta: CudaSlice<u8>,
+    entries: DeviceBuffer,
+    meta: DeviceBuffer,
     lanes: usize,
     busy: u64,
 }
@@ -54,8 +54,8 @@ impl MultiDomainKernel {
             let define = format!("WIDTH={width}");
             kernels.push(GroupKernel {
                 compiled: CompiledKernel::new(device, &CODE, &[&define])?,
-                entries: upload(device, &packed.entries)?,
-                meta: upload(device, &packed.meta)?,
+                entries: DeviceBuffer::upload(device, &packed.entries)?,
+                meta: DeviceBuffer::upload(device, &packed.meta)?,
                 lanes: packed.meta.len(),
                 busy: packed.busy(),
             });
@@ -68,7 +68,7 @@ impl MultiDomainKernel {
             let blocks = (kernel.lanes / BLOCK) as u32;
             let config =
                 LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK as u32, 1, 1), shared_mem_bytes: 0 };
-            let (entries, meta) = (address(device, &kernel.entries), address(device, &kernel.meta));
+            let (entries, meta) = (kernel.entries.address(), kernel.meta.address());
             let mut launch = device.stream().launch_builder(&kernel.compiled.function);
             launch.arg(&entries).arg(&meta).arg(&q).arg(&u);
             // SAFETY: these are the kernel's arguments. Entries and metadata have a float4 and a uint4 for each thread

@@ -1,11 +1,11 @@
 //! BASELINE. Launches `kernels/thesis_single.cu`: u = U q of one domain (chapter 3.2.1).
 
-use cudarc::driver::{CudaSlice, LaunchConfig, PushKernelArg as _};
+use cudarc::driver::{LaunchConfig, PushKernelArg as _};
 
 use super::super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes};
 use super::group::{BLOCK, WARP, entry, fours};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, upload};
+use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::Scene;
 
@@ -54,7 +54,7 @@ impl RowLines {
 #[derive(Debug)]
 pub(super) struct SingleDomainKernel {
     compiled: CompiledKernel,
-    buffer: CudaSlice<u8>,
+    buffer: DeviceBuffer,
     lines: RowLines,
 }
 
@@ -70,13 +70,13 @@ impl SingleDomainKernel {
         }
         let lines = RowLines::of(slot.vertices, slot.rank);
         let compiled = CompiledKernel::new(device, &CODE, &[])?;
-        Ok(Self { compiled, buffer: upload(device, &lines.pack(scene))?, lines })
+        Ok(Self { compiled, buffer: DeviceBuffer::upload(device, &lines.pack(scene))?, lines })
     }
 
     pub(super) fn launch(&self, device: &Device, q: u64, u: u64) -> Result<()> {
         let blocks = self.lines.lines.div_ceil(BLOCK / WARP) as u32;
         let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK as u32, 1, 1), shared_mem_bytes: 0 };
-        let (lines, rank, rows) = (address(device, &self.buffer), self.lines.rank as u32, self.lines.rows as u32);
+        let (lines, rank, rows) = (self.buffer.address(), self.lines.rank as u32, self.lines.rows as u32);
         let mut launch = device.stream().launch_builder(&self.compiled.function);
         launch.arg(&lines).arg(&q).arg(&u).arg(&rank).arg(&rows);
         // SAFETY: these are the kernel's arguments. `buffer` has every line of `lines`, `q` as many floats as the rank

@@ -1,12 +1,12 @@
 //! BASELINE. Launches `kernels/thesis_update.cu`: the vertex update of unfolded triangles (chapter 3.2.3).
 
 use bytemuck::{Pod, Zeroable};
-use cudarc::driver::{CudaSlice, DeviceRepr, LaunchConfig, PushKernelArg as _};
+use cudarc::driver::{DeviceRepr, LaunchConfig, PushKernelArg as _};
 
 use super::super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes};
 use super::group::{BLOCK, places_of_u};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::memory::{address, alloc_zeroed, download, upload};
+use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Scene, SceneState};
 
@@ -115,9 +115,9 @@ pub(super) fn matrices(scene: &Scene, state: &SceneState) -> Vec<f32> {
 pub(super) struct UpdateKernel {
     compiled: CompiledKernel,
     /// Warps, sources, rest positions, normals and tangents.
-    tables: [CudaSlice<u8>; 5],
+    tables: [DeviceBuffer; 5],
     /// Positions, normals and tangents.
-    outputs: [CudaSlice<u8>; 3],
+    outputs: [DeviceBuffer; 3],
     targets: Vec<u32>,
     tangents: bool,
     /// Bytes of the transforms, and of u.
@@ -132,16 +132,16 @@ impl UpdateKernel {
         Ok(Self {
             compiled: CompiledKernel::new(device, &CODE, defines)?,
             tables: [
-                upload(device, &unfolded.warps)?,
-                upload(device, &unfolded.sources)?,
-                upload(device, &unfolded.positions)?,
-                upload(device, &unfolded.normals)?,
-                upload(device, &unfolded.tangents)?,
+                DeviceBuffer::upload(device, &unfolded.warps)?,
+                DeviceBuffer::upload(device, &unfolded.sources)?,
+                DeviceBuffer::upload(device, &unfolded.positions)?,
+                DeviceBuffer::upload(device, &unfolded.normals)?,
+                DeviceBuffer::upload(device, &unfolded.tangents)?,
             ],
             outputs: [
-                alloc_zeroed(device, bytes)?,
-                alloc_zeroed(device, bytes)?,
-                alloc_zeroed(device, if tangents { bytes } else { 0 })?,
+                DeviceBuffer::zeroed(device, bytes)?,
+                DeviceBuffer::zeroed(device, bytes)?,
+                DeviceBuffer::zeroed(device, if tangents { bytes } else { 0 })?,
             ],
             targets: unfolded.targets,
             tangents,
@@ -151,8 +151,8 @@ impl UpdateKernel {
 
     pub(super) fn launch(&self, device: &Device, transforms: u64, u: u64) -> Result<()> {
         let [warps, sources, rest_positions, rest_normals, rest_tangents] =
-            self.tables.each_ref().map(|table| address(device, table));
-        let [positions, normals, tangents] = self.outputs.each_ref().map(|output| address(device, output));
+            self.tables.each_ref().map(|table| table.address());
+        let [positions, normals, tangents] = self.outputs.each_ref().map(|output| output.address());
         let vertices = self.targets.len();
         let args = UpdateArgs {
             warps,
@@ -182,8 +182,7 @@ impl UpdateKernel {
     /// to was not computed and is NaN.
     pub(super) fn positions(&self, device: &Device, vertices: usize) -> Result<Vec<f32>> {
         let mut unfolded = vec![[0.0_f32; 4]; self.targets.len()];
-        // SAFETY: the buffer has a float4 for each target.
-        unsafe { download(device, address(device, &self.outputs[0]), &mut unfolded) }?;
+        self.outputs[0].read(device, 0, &mut unfolded)?;
         Ok(fold(&unfolded, &self.targets, vertices))
     }
 

@@ -1,0 +1,149 @@
+//! The device buffers of a step's input values, and their upload from pinned memory.
+
+use std::sync::Arc;
+
+use cudarc::driver::result;
+
+use crate::gpu::launch::error::cuda_error;
+use crate::gpu::launch::{Device, DeviceBuffer, PinnedBuffer, PinnedUse};
+use crate::gpu::tables::input_packing::{InputPacker, InputSizes, InputWriter, transform_links};
+use crate::gpu::tables::layout::Header;
+use crate::gpu::tables::staging::SliceWriter;
+use modalcast_model::error::{Error, Result};
+use modalcast_model::scene::SceneState;
+
+/// Device addresses of a step's values.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct InputAddresses {
+    pub header: u64,
+    pub transforms: u64,
+    /// Constant: each follower's transform root and frame. Only in scenes with followers.
+    pub transform_links: u64,
+    pub frames: u64,
+    pub q: u64,
+    /// Per domain, the step that last changed it.
+    pub change_steps: u64,
+    /// 0 without truncation.
+    pub retained_counts: u64,
+    pub retained: u64,
+}
+
+/// The device buffers of a step's values, and their writer.
+#[derive(Debug)]
+pub struct StepInputs {
+    writer: InputWriter,
+    buffer: DeviceBuffer,
+    change_steps: DeviceBuffer,
+    transform_links: DeviceBuffer,
+    frames: DeviceBuffer,
+    sizes: InputSizes,
+}
+
+/// Pinned staging buffer for the values of one step.
+pub type StagingBuffer = PinnedBuffer<f32>;
+
+/// The part of the staging buffer to copy.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum InputPart {
+    /// The header alone, for a partial step: `apply` reads the other values from pinned memory.
+    Header,
+    /// All values.
+    Whole,
+}
+
+impl StepInputs {
+    /// Allocates the buffers for steps in the layout of `packing`.
+    ///
+    /// # Errors
+    /// `Fault` when the device has not enough memory.
+    pub fn new(device: &Device, packing: &Arc<InputPacker>) -> Result<Self> {
+        let (scene, sizes) = (&packing.scene, InputSizes::of(&packing.scene, &packing.coordinates));
+        Ok(Self {
+            writer: InputWriter::new(packing),
+            buffer: DeviceBuffer::zeroed(device, sizes.total())?,
+            change_steps: DeviceBuffer::zeroed(device, 4 * scene.domains.len() as u64)?,
+            transform_links: DeviceBuffer::upload(device, &transform_links(scene))?,
+            frames: DeviceBuffer::upload(device, scene.movers.frames())?,
+            sizes,
+        })
+    }
+
+    /// Allocates a staging buffer for the values of a step.
+    ///
+    /// # Errors
+    /// `Fault` when the driver cannot lock so much memory.
+    pub fn staging(&self, device: &Device) -> Result<StagingBuffer> {
+        PinnedBuffer::zeroed(device, self.sizes.total() as usize / 4, PinnedUse::ToDevice)
+    }
+
+    pub(crate) fn addresses(&self) -> InputAddresses {
+        let header = self.buffer.address();
+        let transforms = header + size_of::<Header>() as u64;
+        let q = transforms + self.sizes.transforms;
+        let retained_counts = q + self.sizes.q;
+        InputAddresses {
+            header,
+            transforms,
+            transform_links: self.transform_links.address(),
+            frames: self.frames.address(),
+            q,
+            change_steps: self.change_steps.address(),
+            retained_counts,
+            retained: retained_counts + self.sizes.retained_counts,
+        }
+    }
+
+    /// Writes a full step. The caller has waited for the last copy from this memory, so nothing reads it.
+    ///
+    /// # Errors
+    /// `Fault` when the device fails.
+    pub fn write(&mut self, to: &mut StagingBuffer, header: &Header, state: &SceneState) -> Result<()> {
+        self.writer.write(to.as_mut_slice()?, header, state);
+        Ok(())
+    }
+
+    /// Writes only the header.
+    pub(crate) fn write_header(to: &mut StagingBuffer, header: &Header) -> Result<()> {
+        SliceWriter::new(to.as_mut_slice()?).put(std::slice::from_ref(header));
+        Ok(())
+    }
+
+    /// Starts the copy of a part of `from` to the device, on the device's stream, so that a graph can capture it.
+    ///
+    /// # Safety
+    /// `from` is neither written nor dropped before the copy has ended. If the copy is captured in a graph, this holds
+    /// for each launch of the graph, and `self` exists until the last one has ended.
+    ///
+    /// # Errors
+    /// `Fault` when `from` is not a staging buffer of these inputs, or when the device fails.
+    pub unsafe fn send(&self, device: &Device, from: &StagingBuffer, part: InputPart) -> Result<()> {
+        let host: &[u8] = bytemuck::cast_slice(from.as_slice()?);
+        if host.len() as u64 != self.buffer.bytes() {
+            let reason = format!("expected a staging buffer of {} bytes, got {}", self.buffer.bytes(), host.len());
+            return Err(Error::Fault { stage: "upload", reason });
+        }
+        let host = match part {
+            InputPart::Header => &host[..size_of::<Header>()],
+            InputPart::Whole => host,
+        };
+        let _current = device.enter()?;
+        // SAFETY: both buffers have the bytes of `host`, as checked above; the caller keeps them.
+        unsafe { result::memcpy_htod_async(self.buffer.address(), host, device.stream().cu_stream()) }
+            .map_err(cuda_error("upload"))
+    }
+
+    /// Bytes that a full step copies.
+    pub const fn bytes(&self) -> u64 {
+        self.sizes.total()
+    }
+
+    /// Number of chunks of modes that each domain sums in the last step; `None` when all are summed.
+    pub fn retained_chunk_counts(&self) -> Option<&[u32]> {
+        self.writer.retained_chunk_counts()
+    }
+
+    /// Bound of the displacement that the truncated modes cause at any vertex in the last step, scene units.
+    pub(crate) fn truncation_bound(&self) -> f64 {
+        self.writer.truncation_bound()
+    }
+}

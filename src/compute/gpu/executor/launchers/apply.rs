@@ -1,0 +1,94 @@
+//! Launches `kernels/apply.cu`, which reads new transforms and coordinates of changed domains directly from pinned
+//! memory.
+
+use cudarc::driver::{CudaFunction, LaunchConfig};
+
+use super::deform::DeformKernel;
+use crate::gpu::executor::inputs::StepInputs;
+use crate::gpu::launch::{Device, KernelDescriptor, LaunchOrder, PinnedBuffer, PinnedUse, launch_kernel};
+use crate::gpu::tables::change_list::{ChangeListLengths, ChangeListWriter, ChangedDomains};
+use crate::gpu::tables::input_packing::InputPacker;
+use crate::gpu::tables::layout::ApplyArgs;
+use modalcast_model::error::Result;
+use modalcast_model::scene::SceneState;
+
+/// The kernel, and the writer of the lists that it reads over the bus.
+#[derive(Debug)]
+pub struct ApplyKernel {
+    function: CudaFunction,
+    config: LaunchConfig,
+    writer: ChangeListWriter,
+}
+
+/// Pinned memory for the lists of one step.
+pub type ChangeListBuffer = PinnedBuffer<u32>;
+
+impl ApplyKernel {
+    /// Compiles the kernel for scenes in the layout of `packing`.
+    ///
+    /// # Errors
+    /// As [`Device::function`].
+    pub fn new(device: &Device, packing: &InputPacker, kernel: &KernelDescriptor) -> Result<Self> {
+        Ok(Self { function: kernel.compile(device)?, config: kernel.config(), writer: ChangeListWriter::new(packing) })
+    }
+
+    /// Allocates pinned memory for the lists of a step.
+    ///
+    /// # Errors
+    /// `Fault` when the driver cannot lock so much memory.
+    pub fn list(&self, device: &Device) -> Result<ChangeListBuffer> {
+        PinnedBuffer::zeroed(device, self.writer.layout().end, PinnedUse::ToDevice)
+    }
+
+    /// Writes the lists of a partial step. The caller has waited for the last launch with `list`. Returns `None` when
+    /// the lists have no capacity for the changes, or when a full step is less work.
+    ///
+    /// # Errors
+    /// `Fault` when the device fails.
+    pub fn write(
+        &mut self,
+        list: &mut ChangeListBuffer,
+        packing: &InputPacker,
+        state: &SceneState,
+        domains: ChangedDomains<'_>,
+    ) -> Result<Option<ChangeListLengths>> {
+        Ok(self.writer.write(list.as_mut_slice()?, packing, state, domains))
+    }
+
+    /// Starts the kernel, which updates the values of `inputs` and copies the tile list to that of `deform`. The header
+    /// among the values has the lengths of the lists.
+    ///
+    /// # Safety
+    /// `list` is from [`Self::list`], and [`Self::write`] wrote it for the packing of `inputs` and `deform`, or the
+    /// header has lengths of 0. All of them exist, and `list` is not written, until the kernel has ended.
+    ///
+    /// # Errors
+    /// `Fault` when the device fails.
+    pub unsafe fn launch(
+        &self,
+        device: &Device,
+        list: &ChangeListBuffer,
+        inputs: &StepInputs,
+        deform: &DeformKernel,
+    ) -> Result<()> {
+        let (values, layout) = (inputs.addresses(), self.writer.layout());
+        let changes = list.address()?;
+        let part = |first: usize| changes + 4 * first as u64;
+        let args = ApplyArgs {
+            header: values.header,
+            changes,
+            new_transforms: part(layout.transforms),
+            new_q: part(layout.q),
+            dirty_tiles: part(layout.tiles),
+            transform_links: values.transform_links,
+            transforms: values.transforms,
+            q: values.q,
+            change_steps: values.change_steps,
+            list: deform.tile_list(),
+        };
+        // SAFETY: the kernel's only argument is an `ApplyArgs`. Pinned memory has the same address on host and device
+        // (unified addressing). The lists refer to domains and coordinates of the scene that the buffers were made for,
+        // and the caller keeps all of them.
+        unsafe { launch_kernel(device, &self.function, self.config, LaunchOrder::Serial, &args) }
+    }
+}

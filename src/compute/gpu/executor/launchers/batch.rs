@@ -1,0 +1,237 @@
+//! Launches `kernels/batch.cu`: x = T_b (x0 + U q_b) for groups of domains b that share a shape. The kernel reads U
+//! once per group, and also computes a box of each warp's vertices.
+
+use cudarc::driver::sys::CUfunction_attribute;
+use cudarc::driver::{CudaFunction, LaunchConfig};
+
+use crate::gpu::executor::inputs::InputAddresses;
+use crate::gpu::launch::error::cuda_error;
+use crate::gpu::launch::{Device, DeviceBuffer, KernelDescriptor, LaunchOrder, launch_kernel};
+use crate::gpu::tables::kernels::batch_shared_bytes;
+use crate::gpu::tables::layout::BatchArgs;
+use crate::gpu::tables::work::batches::BatchTables;
+use modalcast_model::error::Result;
+
+/// The kernel and its work list.
+#[derive(Debug)]
+pub(super) struct BatchKernel {
+    pub function: CudaFunction,
+    config: LaunchConfig,
+    blocks: DeviceBuffer,
+    groups: DeviceBuffer,
+    members: DeviceBuffer,
+}
+
+/// Buffers of `deform` that `batch` reads and writes.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SharedTables<'a> {
+    pub words: &'a DeviceBuffer,
+    pub rest: &'a DeviceBuffer,
+    pub scales: &'a DeviceBuffer,
+    pub boxes: &'a DeviceBuffer,
+}
+
+impl BatchKernel {
+    /// Compiles the kernel and uploads its work list.
+    pub(super) fn new(device: &Device, kernel: &KernelDescriptor, batched: &BatchTables) -> Result<Self> {
+        let function = kernel.compile(device)?;
+        let shared = batch_shared_bytes(batched, &kernel.defines);
+        // Give all of the L1 cache to shared memory, so that registers alone limit the number of resident blocks.
+        let carveout = CUfunction_attribute::CU_FUNC_ATTRIBUTE_PREFERRED_SHARED_MEMORY_CARVEOUT;
+        let most = CUfunction_attribute::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES;
+        for (attribute, value) in [(carveout, 100), (most, shared as i32)] {
+            function.set_attribute(attribute, value).map_err(cuda_error("batch"))?;
+        }
+        Ok(Self {
+            function,
+            config: LaunchConfig { shared_mem_bytes: shared as u32, ..kernel.config() },
+            blocks: DeviceBuffer::upload(device, &batched.blocks)?,
+            groups: DeviceBuffer::upload(device, &batched.groups)?,
+            members: DeviceBuffer::upload(device, &batched.members)?,
+        })
+    }
+
+    /// Starts the kernel.
+    ///
+    /// # Safety
+    /// `values` and `shared` are those of the scene of this launcher. The header among the values has the address of
+    /// positions of this scene. All of them exist until the kernel has ended.
+    pub(super) unsafe fn launch(
+        &self,
+        device: &Device,
+        values: InputAddresses,
+        shared: SharedTables<'_>,
+    ) -> Result<()> {
+        let args = BatchArgs {
+            header: values.header,
+            blocks: self.blocks.address(),
+            groups: self.groups.address(),
+            members: self.members.address(),
+            words: shared.words.address(),
+            rest: shared.rest.address(),
+            scales: shared.scales.address(),
+            transforms: values.transforms,
+            transform_links: values.transform_links,
+            frames: values.frames,
+            q: values.q,
+            boxes: shared.boxes.address(),
+        };
+        // SAFETY: the kernel's only argument is a `BatchArgs`. Blocks refer to groups and groups to members. Groups and
+        // members refer to the words, x0, scales, transforms, q and boxes of `WorkList`, from which the buffers were
+        // made. A group has no more members than the kernel was compiled for, and shared memory has capacity for the
+        // longest group. The caller guarantees the positions.
+        unsafe { launch_kernel(device, &self.function, self.config, LaunchOrder::Serial, &args) }
+    }
+}
+
+#[cfg(test)]
+mod warp;
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::warp::{Tables, Warp};
+    use crate::gpu::launch::KernelKind;
+    use crate::gpu::tables::plan::{BufferRole, plan};
+    use crate::gpu::tables::test_scenes::corners_match;
+    use crate::gpu::tables::work::{CoordinateLayout, WorkList};
+    use crate::testing::{TestRng, scene_and_state, transformed_axis};
+    use modalcast_model::scene::{BatchPolicy, DeformationSettings, Scene, SceneParts, SceneState, StorageType};
+
+    /// A scene with shapes of so many vertices and modes, each used by `instances` domains, and a random state of it.
+    fn ensemble(storage: StorageType, shapes: &[(usize, usize)], instances: usize) -> (Arc<Scene>, SceneState) {
+        let one = scene_and_state(&shapes.iter().map(|(vertices, rank)| (*vertices, *rank, 1)).collect::<Vec<_>>()).0;
+        let mut parts = SceneParts::named("ensemble");
+        (parts.shapes, parts.materials) = (one.shapes.clone(), one.materials.clone());
+        parts.deformation =
+            DeformationSettings { storage, batches: BatchPolicy::Always, ..DeformationSettings::default() };
+        parts.domains = (0..instances * shapes.len()).map(|at| one.domains[at % shapes.len()].clone()).collect();
+        let scene = Scene::new(parts).expect("a scene");
+        let (mut random, mut state) = (TestRng(instances as u64), SceneState::rest(&scene));
+        state.q.iter_mut().for_each(|coordinate| *coordinate = random.next());
+        state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| random.next()));
+        (scene, state)
+    }
+
+    /// Emulates `batch` block by block, with its ring of stages and its coalesced stores.
+    fn twin_of_batch(tables: &Tables) -> Vec<f32> {
+        let mut positions = vec![f32::NAN; 3 * tables.scene.layout.vertices];
+        let tiles =
+            tables.work.batched.blocks.iter().flat_map(|block| (block.tile..block.end).map(|tile| (block.group, tile)));
+        for (place, warp) in tiles.flat_map(|place| [0, 1].map(|warp| (place, warp))) {
+            let mut warp = Warp::new(tables, place, warp);
+            if warp.quads > 0 {
+                let sums = warp.sums();
+                for member in (0..warp.group.members as usize).step_by(2) {
+                    warp.store(&warp.staged(&sums, member), member, &mut positions);
+                }
+            }
+        }
+        positions
+    }
+
+    /// x of a vertex by the same arithmetic, directly from the U of the shape.
+    fn x_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usize) -> [f32; 3] {
+        let (shape, q) = (scene.shape_of(domain), state.q_of(scene, domain));
+        let rest = shape.mesh.rest()[vertex];
+        let bent = [0, 1, 2].map(|axis| {
+            let entry = |(mode, q): (usize, &f32)| (shape.modes.at(vertex, axis, mode), *q);
+            rest[axis] + q.iter().enumerate().map(entry).fold(0.0_f32, |sum, (entry, q)| entry.mul_add(q, sum))
+        });
+        [0, 1, 2].map(|row| transformed_axis(&state.transforms[domain].0[4 * row..], bent))
+    }
+
+    /// Shapes, and the number of domains of each.
+    const LOADS: [(&[(usize, usize)], usize); 6] = [
+        (&[(1, 3), (63, 13)], 2),
+        (&[(64, 4), (300, 0)], 16),
+        (&[(65, 16), (128, 32), (7, 1)], 3),
+        (&[(129, 5)], 8),
+        (&[(192, 17), (256, 33)], 21),
+        (&[(261, 12), (320, 50)], 40),
+    ];
+
+    #[test]
+    fn every_number_of_a_batch_is_written_once_and_has_the_bits_of_the_plain_sum() {
+        for (shapes, instances) in LOADS {
+            let (scene, state) = ensemble(StorageType::F32, shapes, instances);
+            let got = twin_of_batch(&Tables::of(&scene, &state));
+            for (domain, slot) in scene.layout.slots.iter().enumerate() {
+                for vertex in 0..slot.vertices {
+                    let got = &got[3 * (slot.first_vertex + vertex)..][..3];
+                    if slot.rank == 0 {
+                        assert!(got.iter().all(|number| number.is_nan()), "left to `deform`");
+                        continue;
+                    }
+                    let bits = |x: &[f32]| x.iter().map(|number| number.to_bits()).collect::<Vec<_>>();
+                    assert_eq!(bits(got), bits(&x_of(&scene, &state, domain, vertex)), "{shapes:?} {domain} {vertex}");
+                    let next = (domain + shapes.len()) % scene.domains.len();
+                    assert_ne!(bits(got), bits(&x_of(&scene, &state, next, vertex)), "the judge can fail");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn every_storage_finds_its_entries_scales_and_factors_in_a_batch() {
+        for (storage, tolerance) in StorageType::ALL.into_iter().zip([1e-5, 1e-2, 8e-2, 8e-2]) {
+            for (shapes, instances) in LOADS {
+                let (scene, state) = ensemble(storage, shapes, instances);
+                let got = twin_of_batch(&Tables::of(&scene, &state));
+                for (domain, slot) in scene.layout.slots.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
+                    for vertex in 0..slot.vertices {
+                        let (got, want) =
+                            (&got[3 * (slot.first_vertex + vertex)..][..3], x_of(&scene, &state, domain, vertex));
+                        let near = got.iter().zip(want).all(|(got, want)| (got - want).abs() < tolerance);
+                        assert!(near, "{storage:?} {shapes:?}: {got:?} not {want:?}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn groups_are_as_large_as_each_other_and_side_by_side_in_each_tile() {
+        let (scene, _) = ensemble(StorageType::F32, &[(261, 12)], 40);
+        let work = WorkList::new(&scene, &CoordinateLayout::new(&scene));
+        let sizes: Vec<u32> = work.batched.groups.iter().map(|group| group.members).collect();
+        assert_eq!(sizes, [14, 14, 12]);
+        let blocks: Vec<(u32, u32)> = work.batched.blocks.iter().map(|block| (block.tile, block.group)).collect();
+        assert_eq!(blocks, [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0), (2, 1), (2, 2)]);
+        assert_eq!(
+            (work.full_step_tiles, work.tiles.len()),
+            (120, 240),
+            "three tiles of corners and three of vertices each"
+        );
+        let members: Vec<u32> = work.batched.members.iter().map(|member| member.first_tile).collect();
+        assert!(members.iter().zip(&work.spans).all(|(first, spans)| *first == spans[0].0), "boxes lie by tiles");
+    }
+
+    #[test]
+    fn blocks_of_large_scenes_have_runs_of_tiles_that_cover_each_shape_once() {
+        let (scene, _) = ensemble(StorageType::F32, &[(128 * 6001, 1), (128 * 3000, 1)], 2);
+        let batched = WorkList::new(&scene, &CoordinateLayout::new(&scene)).batched;
+        assert!(batched.blocks.iter().all(|block| (1..=2).contains(&(block.end - block.tile))), "9001 tiles");
+        for (group, tiles) in [6001, 3000].into_iter().enumerate() {
+            let own = batched.blocks.iter().filter(|block| block.group == group as u32);
+            let covered: Vec<u32> = own.flat_map(|block| block.tile..block.end).collect();
+            assert_eq!(covered, (0..tiles).collect::<Vec<u32>>());
+        }
+    }
+
+    #[test]
+    fn a_scene_compiles_batches_when_it_has_any_and_for_as_many_vectors_as_it_needs() {
+        let defines = |instances: usize| {
+            let plan = plan(&ensemble(StorageType::F16, &[(261, 12)], instances).0);
+            let kernel = plan.kernel(KernelKind::Batch).expect("a batch").clone();
+            (kernel.defines.join(" "), kernel.blocks)
+        };
+        assert_eq!(defines(2), ("STORE_F16 BATCH_4".into(), 3));
+        assert_eq!(defines(8), ("STORE_F16 BATCH_8".into(), 3));
+        assert_eq!(defines(17), ("STORE_F16".into(), 6));
+        let none = plan(&corners_match(&[(261, 12)]));
+        assert!(none.kernel(KernelKind::Batch).is_none(), "too few to pay");
+        assert_eq!(none.bytes(BufferRole::Batches), 0);
+    }
+}

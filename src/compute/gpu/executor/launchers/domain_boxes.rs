@@ -1,0 +1,60 @@
+//! The bounding box of each domain on the device, and its readback.
+
+use crate::gpu::launch::{Device, DeviceBuffer, PinnedBuffer, PinnedUse};
+use crate::gpu::tables::box_segments::{BOX_KEYS, box_bytes, union_per_domain};
+use crate::gpu::tables::layout::BoxSegment;
+use modalcast_model::error::Result;
+use modalcast_model::scene::Bounds;
+
+/// Pieces of domains and their boxes on the device.
+#[derive(Debug)]
+pub(crate) struct DomainBoxes {
+    segments: DeviceBuffer,
+    boxes: DeviceBuffer,
+    /// The domain of each piece.
+    domains: Vec<u32>,
+    /// Pinned memory for the readback, allocated on the first read.
+    keys: Option<PinnedBuffer<u32>>,
+}
+
+/// Addresses of the pieces and their boxes, and the number of pieces; zeros without boxes.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct DomainBoxAddresses {
+    pub segments: u64,
+    pub boxes: u64,
+    pub count: u32,
+}
+
+impl DomainBoxes {
+    pub(super) fn new(device: &Device, list: &[BoxSegment]) -> Result<Self> {
+        Ok(Self {
+            segments: DeviceBuffer::upload(device, list)?,
+            boxes: DeviceBuffer::zeroed(device, box_bytes(list.len()))?,
+            domains: list.iter().map(|piece| piece.domain).collect(),
+            keys: None,
+        })
+    }
+
+    pub(super) fn addresses(&self) -> DomainBoxAddresses {
+        DomainBoxAddresses {
+            segments: self.segments.address(),
+            boxes: self.boxes.address(),
+            count: self.domains.len() as u32,
+        }
+    }
+
+    /// Copies the boxes of all domains, and waits for the copy.
+    pub(crate) fn read(&mut self, device: &Device, to: &mut Vec<Bounds>) -> Result<()> {
+        let keys = match &mut self.keys {
+            Some(keys) => keys,
+            none => {
+                let length = BOX_KEYS * self.domains.len();
+                none.insert(PinnedBuffer::zeroed(device, length, PinnedUse::FromDevice)?)
+            }
+        };
+        let keys = keys.as_mut_slice()?;
+        self.boxes.read(device, 0, keys)?;
+        union_per_domain(&self.domains, keys, to);
+        Ok(())
+    }
+}

@@ -1,0 +1,99 @@
+//! Launches `kernels/normals.cu`: world normals and tangents of all corners, which follow the deformed triangles.
+
+use cudarc::driver::{CudaFunction, LaunchConfig};
+
+use crate::gpu::executor::inputs::StepInputs;
+use crate::gpu::launch::{Device, DeviceBuffer, KernelDescriptor, LaunchOrder, launch_kernel};
+use crate::gpu::tables::device_tables::{DeviceTables, NormalTables};
+use crate::gpu::tables::layout::NormalsArgs;
+use modalcast_model::error::{Error, Result};
+use modalcast_model::scene::Scene;
+
+/// The kernel and its constant tables.
+#[derive(Debug)]
+pub struct NormalsKernel {
+    function: CudaFunction,
+    config: LaunchConfig,
+    slots: DeviceBuffer,
+    first_domains: DeviceBuffer,
+    rest_normals: DeviceBuffer,
+    rest_tangents: Option<DeviceBuffer>,
+    members: DeviceBuffer,
+    ring_offsets: DeviceBuffer,
+    rings: DeviceBuffer,
+    group_normals: DeviceBuffer,
+    corners: u32,
+    rest_corners: u32,
+    groups: u32,
+}
+
+impl NormalsKernel {
+    /// Compiles the kernel and uploads its tables.
+    ///
+    /// # Errors
+    /// As [`Device::function`]; `Fault` when the scene's normals do not follow the surface, or when the device has not
+    /// enough memory.
+    pub fn new(device: &Device, scene: &Scene, tables: &DeviceTables, kernel: &KernelDescriptor) -> Result<Self> {
+        let missing = || Error::Fault { stage: "normals", reason: "the scene has rigid normals".into() };
+        let NormalTables { slots, first_domains, rest_normals, rest_tangents, rings } =
+            tables.normals.as_ref().ok_or_else(missing)?;
+        let tangents = || DeviceBuffer::upload(device, rest_tangents);
+        Ok(Self {
+            function: kernel.compile(device)?,
+            config: kernel.config(),
+            slots: DeviceBuffer::upload(device, slots)?,
+            first_domains: DeviceBuffer::upload(device, first_domains)?,
+            rest_normals: DeviceBuffer::upload(device, rest_normals)?,
+            rest_tangents: scene.needs.normal_maps.then(tangents).transpose()?,
+            members: DeviceBuffer::upload(device, &rings.members)?,
+            ring_offsets: DeviceBuffer::upload(device, &rings.ring_offsets)?,
+            rings: DeviceBuffer::upload(device, &rings.rings)?,
+            group_normals: DeviceBuffer::upload(device, &rings.normals)?,
+            corners: scene.layout.corners as u32,
+            rest_corners: (rest_normals.len() / 3) as u32,
+            groups: (rings.normals.len() / 3) as u32,
+        })
+    }
+
+    /// The compiled function, for reports.
+    pub const fn function(&self) -> &CudaFunction {
+        &self.function
+    }
+
+    /// Starts the kernel after the one that writes the positions.
+    ///
+    /// # Safety
+    /// `inputs` is of the scene of this launcher. The header among its values has the addresses of positions, normals
+    /// and, with normal maps, tangents of the sizes of this scene. All of them exist until the kernel has ended.
+    ///
+    /// # Errors
+    /// `Fault` when the device fails.
+    pub unsafe fn launch(&self, device: &Device, inputs: &StepInputs) -> Result<()> {
+        let values = inputs.addresses();
+        let args = NormalsArgs {
+            header: values.header,
+            slots: self.slots.address(),
+            first_domains: self.first_domains.address(),
+            rest_normals: self.rest_normals.address(),
+            rest_tangents: self.rest_tangents.as_ref().map_or(0, DeviceBuffer::address),
+            transforms: values.transforms,
+            transform_links: values.transform_links,
+            frames: values.frames,
+            change_steps: values.change_steps,
+            members: self.members.address(),
+            ring_offsets: self.ring_offsets.address(),
+            rings: self.rings.address(),
+            group_normals: self.group_normals.address(),
+            corners: self.corners,
+            rest_corners: self.rest_corners,
+            groups: self.groups,
+            reserved: 0,
+        };
+        // SAFETY: the kernel's only argument is a `NormalsArgs`, and the kernel calls `wait_on_dependent_grids` before it
+        // accesses memory. The tables come from `NormalTables`: members refer to groups, rings refer to vertices of
+        // their shape, and slots lie inside the rest normals, tangents, positions and transforms of the same scene.
+        // Tangents are read and written only by a kernel that was compiled for a scene with normal maps. The caller
+        // guarantees the outputs.
+        unsafe { launch_kernel(device, &self.function, self.config, LaunchOrder::Dependent, &args) }
+    }
+}

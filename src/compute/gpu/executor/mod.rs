@@ -1,0 +1,27 @@
+//! The deformer and the rasterizer on the device: launchers, steps in flight, outputs, readbacks and interop.
+//!
+//! | file | content |
+//! |---|---|
+//! | `deformer`, `step_slot` | the graph of a step, its pinned memory and the readback of its bounds |
+//! | `launchers` | one launcher per kernel of a step |
+//! | `inputs` | the input values of a step on the device |
+//! | `output`, `interop` | the output buffers |
+//! | `output_ring` | double buffering of the outputs: which one a step writes and which domains it lacks; pure |
+//! | `readback`, `pinned_surface` | asynchronous readback of vertices, concurrent with the next step |
+//! | `raster` | compute rasterizer: triangles to samples in OpenGL's buffers, next to OpenGL's own rasterizer |
+//! | `layout_check` | check that host and device agree on struct layouts |
+
+mod deformer;
+pub(crate) mod inputs;
+mod interop;
+pub(crate) mod launchers;
+mod layout_check;
+mod output;
+mod output_ring;
+mod pinned_surface;
+pub(crate) mod raster;
+mod readback;
+mod step_slot;
+
+pub use deformer::{CudaDeformer, MAX_STEPS_IN_FLIGHT};
+pub use layout_check::device_layout_values;

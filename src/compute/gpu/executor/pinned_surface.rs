@@ -1,0 +1,92 @@
+//! Host memory that receives vertices from the device.
+
+use std::sync::Arc;
+
+use crate::gpu::launch::{Device, PageLock};
+use modalcast_model::deform::DeformedSurface;
+use modalcast_model::error::{Error, Result};
+use modalcast_model::scene::Bounds;
+
+/// Lengths of the lists of a surface, in f32; 0 for a list that is not wanted.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct SurfaceLengths {
+    pub positions: usize,
+    pub normals: usize,
+    pub tangents: usize,
+    pub displacements: usize,
+}
+
+/// A surface whose large lists are page-locked. The lists keep their lengths, because a page lock covers a fixed range.
+#[derive(Debug)]
+pub(super) struct PinnedSurface {
+    surface: Arc<DeformedSurface>,
+    locks: Vec<PageLock>,
+}
+
+/// The lists of a surface, to write. The lengths are fixed, except that of the boxes, which are never page-locked.
+#[derive(Debug)]
+pub(super) struct SurfaceLists<'a> {
+    pub positions: &'a mut [f32],
+    pub normals: &'a mut [f32],
+    pub tangents: &'a mut [f32],
+    pub displacements: &'a mut [f32],
+    pub boxes: &'a mut Vec<Bounds>,
+}
+
+impl PinnedSurface {
+    /// A surface without lists.
+    pub(super) fn empty() -> Self {
+        Self { surface: Arc::new(DeformedSurface::default()), locks: Vec::new() }
+    }
+
+    /// Allocates lists of these lengths and page-locks them. Lists that exist already remain as they are.
+    ///
+    /// # Errors
+    /// `Fault` when a reader has a reference to the surface.
+    pub(super) fn allocate(&mut self, device: &Device, lengths: SurfaceLengths) -> Result<()> {
+        let surface = Self::exclusive(&mut self.surface)?;
+        let DeformedSurface { positions, normals, tangents, displacements, .. } = surface;
+        let SurfaceLengths { positions: first, normals: second, tangents: third, displacements: fourth } = lengths;
+        for (list, length) in [(positions, first), (normals, second), (tangents, third), (displacements, fourth)] {
+            if list.is_empty() && length > 0 {
+                list.resize(length, 0.0);
+                // SAFETY: nothing else changes the length of the list, so it is not moved. `drop` drops the lock before
+                // `surface`, and the memory is freed after that: with `surface`, or with the last reference to it.
+                self.locks.extend(unsafe { PageLock::new(device, list) });
+            }
+        }
+        Ok(())
+    }
+
+    /// The lists, to write. The caller has waited for the last copy into them.
+    ///
+    /// # Errors
+    /// `Fault` when a reader has a reference to the surface.
+    pub(super) fn lists(&mut self) -> Result<SurfaceLists<'_>> {
+        let DeformedSurface { positions, normals, tangents, displacements, boxes } =
+            Self::exclusive(&mut self.surface)?;
+        Ok(SurfaceLists { positions, normals, tangents, displacements, boxes })
+    }
+
+    /// The surface. The caller has waited for the last copy into it before it reads the lists.
+    pub(super) const fn surface(&self) -> &Arc<DeformedSurface> {
+        &self.surface
+    }
+
+    /// Whether this is the only reference to the surface.
+    pub(super) fn is_unused(&self) -> bool {
+        Arc::strong_count(&self.surface) == 1
+    }
+
+    fn exclusive(surface: &mut Arc<DeformedSurface>) -> Result<&mut DeformedSurface> {
+        let taken = || Error::Fault { stage: "fetch", reason: "the memory is in use".into() };
+        Arc::get_mut(surface).ok_or_else(taken)
+    }
+}
+
+impl Drop for PinnedSurface {
+    fn drop(&mut self) {
+        // The locks cover memory of `surface`, so they end first.
+        self.locks.clear();
+    }
+}

@@ -1,0 +1,141 @@
+//! A ring slot: the memory of one step in flight. It holds the input values and lists, the pinned memory for the bounds
+//! that are read back, and the graphs that refer to this memory. A second slot is made when a step is submitted before
+//! the previous one has ended.
+
+use cudarc::driver::sys::CUevent_flags;
+use cudarc::driver::{CudaEvent, CudaGraph, result};
+
+use super::inputs::{InputPart, StagingBuffer, StepInputs};
+use super::launchers::apply::{ApplyKernel, ChangeListBuffer};
+use super::launchers::bounds::BoundsKernel;
+use super::launchers::deform::DeformKernel;
+use super::launchers::normals::NormalsKernel;
+use crate::gpu::launch::error::cuda_error;
+use crate::gpu::launch::{Device, PinnedBuffer, PinnedUse, capture};
+use crate::gpu::tables::box_keys::{bounds_from_keys, light_bounds_from_keys};
+use crate::gpu::tables::layout::Header;
+use modalcast_model::error::{Error, Result};
+use modalcast_model::scene::{Bounds, LightSpaceBox};
+
+/// The kernels of a scene.
+#[derive(Debug)]
+pub(super) struct StepKernels {
+    pub deform: DeformKernel,
+    pub bounds: BoundsKernel,
+    /// Only in a scene whose normals follow the surface.
+    pub normals: Option<NormalsKernel>,
+    /// Only in a scene that can have partial steps.
+    pub apply: Option<ApplyKernel>,
+}
+
+/// Pinned memory of a step, and its graphs. The graphs refer to this memory and to the buffers of the deformer: they are
+/// launched only by the deformer, which owns all of it and waits for its steps before it drops anything. An idle graph
+/// accesses no memory, so the order in which the fields are dropped does not matter.
+pub(super) struct StepSlot {
+    full_graph: CudaGraph,
+    /// Graph of a partial step.
+    change_list_graph: Option<CudaGraph>,
+    pub values: StagingBuffer,
+    pub list: Option<ChangeListBuffer>,
+    bounds_keys: PinnedBuffer<u32>,
+    /// Recorded after each step.
+    pub done: CudaEvent,
+    /// Only with OpenGL's buffers: recorded after each mapping, which waits for frames in flight.
+    mapped_event: Option<CudaEvent>,
+    /// Host milliseconds of the step before it requested the mapping.
+    pub host_ms: f64,
+}
+
+impl StepSlot {
+    /// `is_timed`: measure the time of steps on the device, from the end of the mapping.
+    pub(super) fn new(device: &Device, kernels: &StepKernels, inputs: &StepInputs, is_timed: bool) -> Result<Self> {
+        let values = inputs.staging(device)?;
+        let list = kernels.apply.as_ref().map(|apply| apply.list(device)).transpose()?;
+        let mut bounds_keys = PinnedBuffer::zeroed(device, kernels.bounds.words(), PinnedUse::FromDevice)?;
+        let mut submission = StepSubmission { kernels, inputs, values: &values, bounds_keys: &mut bounds_keys };
+        let full_graph = capture(device, || submission.submit(device, None))?;
+        let change_list_graph =
+            list.as_ref().map(|list| capture(device, || submission.submit(device, Some(list)))).transpose()?;
+        let event = |flags| device.context().new_event(flags).map_err(cuda_error("allocate"));
+        let flags = is_timed.then_some(CUevent_flags::CU_EVENT_DEFAULT);
+        let (mapped_event, done) = (flags.map(|flags| event(Some(flags))).transpose()?, event(flags)?);
+        Ok(Self { full_graph, change_list_graph, values, list, bounds_keys, done, mapped_event, host_ms: 0.0 })
+    }
+
+    /// Records on the stream that the mapping has ended, after which the step may write its outputs.
+    pub(super) fn record_mapped(&self, device: &Device) -> Result<()> {
+        match &self.mapped_event {
+            Some(mapped_event) => mapped_event.record(device.stream()).map_err(cuda_error("deform")),
+            None => Ok(()),
+        }
+    }
+
+    /// Milliseconds of a step that has ended, without the wait for frames; `None` if steps are not timed. Host work
+    /// after the mapping counts only as far as the device waited for it.
+    pub(super) fn device_ms(&self) -> Result<Option<f64>> {
+        let Some(mapped_event) = &self.mapped_event else { return Ok(None) };
+        let ms = mapped_event.elapsed_ms(&self.done).map_err(cuda_error("deform"))?;
+        Ok(Some(self.host_ms + f64::from(ms)))
+    }
+
+    /// Starts the graph of a full step, or that of a partial step, on the device's stream; its values are already
+    /// written.
+    pub(super) fn launch(&self, kind: StepKind) -> Result<()> {
+        let graph = match kind {
+            StepKind::Full => Some(&self.full_graph),
+            StepKind::Partial => self.change_list_graph.as_ref(),
+        };
+        let missing = || Error::Fault { stage: "deform", reason: "no graph was captured".into() };
+        graph.ok_or_else(missing)?.launch().map_err(cuda_error("deform"))
+    }
+
+    /// Waits for the end of the step. Returns its bounds, and its bounds in light space if the scene has a shadow.
+    pub(super) fn wait(&self) -> Result<(Bounds, Option<LightSpaceBox>)> {
+        self.done.synchronize().map_err(cuda_error("deform"))?;
+        let keys = self.bounds_keys.as_slice()?;
+        Ok((bounds_from_keys(keys), light_bounds_from_keys(keys)))
+    }
+}
+
+/// Whether a step computes all domains, or those of its change list.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum StepKind {
+    Full,
+    Partial,
+}
+
+/// The work of a step and the memory that it uses.
+struct StepSubmission<'a> {
+    kernels: &'a StepKernels,
+    inputs: &'a StepInputs,
+    values: &'a StagingBuffer,
+    bounds_keys: &'a mut PinnedBuffer<u32>,
+}
+
+impl StepSubmission<'_> {
+    /// Submits a step: upload, kernels, readback of the bounds. `list`: the change list of a partial step.
+    fn submit(&mut self, device: &Device, list: Option<&ChangeListBuffer>) -> Result<()> {
+        let Self { kernels, inputs, values, bounds_keys } = self;
+        let part = if list.is_some() { InputPart::Header } else { InputPart::Whole };
+        // SAFETY: the work is captured in a graph. The deformer owns the graph, the kernels, the inputs and the pinned
+        // memory, all for one scene. It writes a header with the addresses of outputs of the plan's sizes, and valid
+        // lists, before each launch, and waits for the launch before it writes or drops the memory.
+        unsafe {
+            inputs.send(device, values, part)?;
+            match (list, &kernels.apply) {
+                (Some(list), Some(apply)) => {
+                    apply.launch(device, list, inputs, &kernels.deform)?;
+                    kernels.deform.launch_tile_list(device, inputs)?;
+                }
+                _ => kernels.deform.launch(device, inputs)?,
+            }
+            kernels.bounds.launch(device, inputs, &kernels.deform)?;
+            kernels.normals.as_ref().map_or(Ok(()), |normals| normals.launch(device, inputs))?;
+        }
+        let bounds = inputs.addresses().header + std::mem::offset_of!(Header, bounds) as u64;
+        let keys = bounds_keys.as_mut_slice()?;
+        // SAFETY: the header has twelve words of bounds and `keys` at most as many. The deformer waits for the step
+        // before it reads or drops them.
+        unsafe { result::memcpy_dtoh_async(keys, bounds, device.stream().cu_stream()) }.map_err(cuda_error("capture"))
+    }
+}

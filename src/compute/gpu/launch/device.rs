@@ -1,0 +1,194 @@
+//! A CUDA device: its context on this thread, its stream, and compiled kernels.
+
+use std::sync::Arc;
+
+use cudarc::driver::{CudaContext, CudaFunction, CudaModule, CudaStream, DriverError, result, sys};
+use cudarc::nvrtc::Ptx;
+
+use super::compile::{cubin, nvrtc};
+use super::context::CurrentContext;
+use super::error::cuda_error;
+use modalcast_model::error::{Error, Result};
+
+/// Minimum CUDA driver version, as cuDriverGetVersion counts (12.0).
+const MIN_DRIVER_VERSION: i32 = 12_000;
+
+/// A CUDA device with its context current on this thread. All work is ordered by one stream. Only the readback of
+/// vertices has a stream of its own, which is ordered by events.
+#[derive(Debug)]
+pub struct Device {
+    context: Arc<CudaContext>,
+    stream: Arc<CudaStream>,
+    name: String,
+    ordinal: usize,
+    capability: (i32, i32),
+}
+
+impl Device {
+    /// Opens a device by ordinal.
+    ///
+    /// # Errors
+    /// `Unavailable` with the missing library and how to install it; never a panic.
+    pub fn open(ordinal: usize) -> Result<Arc<Self>> {
+        let version = driver_version()?;
+        if version < MIN_DRIVER_VERSION {
+            let reason = format!("the driver knows CUDA {}.{}", version / 1000, version % 1000 / 10);
+            return Err(Error::Unavailable { what: "CUDA 12.0", reason, remedy: UPDATE.into() });
+        }
+        let count = CudaContext::device_count().map_err(|error| no_device(ordinal, &error.to_string()))?;
+        if ordinal >= usize::try_from(count).unwrap_or(0) {
+            return Err(no_device(ordinal, &format!("this machine has {count}")));
+        }
+        Self::with_context(ordinal).map_err(|error| no_device(ordinal, &error.to_string()))
+    }
+
+    fn with_context(ordinal: usize) -> Result<Arc<Self>, DriverError> {
+        let context = CudaContext::new(ordinal)?;
+        // SAFETY: event tracking orders accesses from several streams. All work on this device goes through the one
+        // stream below, which orders it; `readback` has a second stream and orders its copies by its own events.
+        unsafe { context.disable_event_tracking() };
+        let stream = context.new_stream()?;
+        let name = context.name()?;
+        let capability = context.compute_capability()?;
+        Ok(Arc::new(Self { context, stream, name, ordinal, capability }))
+    }
+
+    /// The device's name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The ordinal by which it was opened.
+    pub const fn ordinal(&self) -> usize {
+        self.ordinal
+    }
+
+    /// Compute capability, major and minor.
+    pub const fn capability(&self) -> (i32, i32) {
+        self.capability
+    }
+
+    /// Free and total device memory in bytes.
+    ///
+    /// # Errors
+    /// `Fault` when the driver reports one.
+    pub fn memory(&self) -> Result<(usize, usize)> {
+        self.context.mem_get_info().map_err(cuda_error("device"))
+    }
+
+    /// Checks that kernels can be compiled for this device, so that a server can choose another backend before it loads
+    /// a scene.
+    ///
+    /// # Errors
+    /// `Unavailable` with the remedy when NVRTC is missing or does not fit the driver.
+    pub fn check_compiler(&self) -> Result<()> {
+        check_driver(nvrtc()?.version, driver_version()?)
+    }
+
+    /// The context, for calls of the driver that this crate does not wrap.
+    pub const fn context(&self) -> &Arc<CudaContext> {
+        &self.context
+    }
+
+    /// Makes the context current on this thread until the guard is dropped.
+    pub(crate) fn enter(&self) -> Result<CurrentContext> {
+        CurrentContext::enter(&self.context)
+    }
+
+    /// Waits for all work that was submitted to the stream.
+    ///
+    /// # Errors
+    /// `DeviceLost` or `Fault` of that work, in `stage`.
+    pub fn synchronize(&self, stage: &'static str) -> Result<()> {
+        self.stream.synchronize().map_err(cuda_error(stage))
+    }
+
+    /// The stream that orders all work.
+    pub const fn stream(&self) -> &Arc<CudaStream> {
+        &self.stream
+    }
+
+    /// The function `name` of a source, compiled for this device or taken from the cache.
+    ///
+    /// # Errors
+    /// `Unavailable` when NVRTC is missing or does not fit the driver; `Fault` when compiling or loading fails.
+    pub fn function(&self, name: &str, source: &str, defines: &[&str]) -> Result<CudaFunction> {
+        let module = self.module(name, source, defines)?;
+        module.load_function(name).map_err(cuda_error("load kernel"))
+    }
+
+    /// Several functions of a source that is compiled once; the first function names the module.
+    ///
+    /// # Errors
+    /// As [`Self::function`].
+    pub(crate) fn functions(&self, names: &[&str], source: &str, defines: &[&str]) -> Result<Vec<CudaFunction>> {
+        let module = self.module(names.first().unwrap_or(&""), source, defines)?;
+        names.iter().map(|name| module.load_function(name).map_err(cuda_error("load kernel"))).collect()
+    }
+
+    fn module(&self, name: &str, source: &str, defines: &[&str]) -> Result<Arc<CudaModule>> {
+        self.check_compiler()?;
+        let cubin = cubin(name, source, defines, self.capability)?;
+        self.context.load_module(Ptx::from_binary(cubin)).map_err(cuda_error("load kernel"))
+    }
+}
+
+const INSTALL: &str = "Install the NVIDIA driver (it brings libcuda.so.1), or use the cpu backend";
+const UPDATE: &str = "Update the NVIDIA driver, or use the cpu backend";
+
+fn no_device(ordinal: usize, reason: &str) -> Error {
+    let remedy = "List devices with `modalcast doctor`, check CUDA_VISIBLE_DEVICES, or use the cpu backend";
+    Error::Unavailable { what: "CUDA device", reason: format!("device {ordinal}: {reason}"), remedy: remedy.into() }
+}
+
+/// The CUDA version of the driver, as cuDriverGetVersion counts: 13000 is 13.0.
+///
+/// # Errors
+/// `Unavailable` when there is no driver or it does not start.
+pub(crate) fn driver_version() -> Result<i32> {
+    // SAFETY: the call only tries to load libcuda under its usual names. Without this check the calls below would
+    // panic.
+    if !unsafe { sys::is_culib_present() } {
+        let reason = "libcuda.so.1 cannot be loaded".into();
+        return Err(Error::Unavailable { what: "CUDA", reason, remedy: INSTALL.into() });
+    }
+    let mut version = 0;
+    // SAFETY: the library is loaded, and `version` is a live integer.
+    let answer = unsafe { sys::cuDriverGetVersion(&mut version) }.result().and_then(|()| result::init());
+    let broken = |error: DriverError| Error::Unavailable {
+        what: "CUDA",
+        reason: format!("the driver does not start: {error}"),
+        remedy: INSTALL.into(),
+    };
+    answer.map_err(broken).map(|()| version)
+}
+
+/// Checks the NVRTC version: the driver does not load machine code of a newer major version.
+fn check_driver(nvrtc: (i32, i32), driver: i32) -> Result<()> {
+    if nvrtc.0 <= driver / 1000 {
+        return Ok(());
+    }
+    let reason = format!("NVRTC is {}.{}, the driver only knows CUDA {}.x", nvrtc.0, nvrtc.1, driver / 1000);
+    let remedy = format!("{UPDATE}, or set MODALCAST_NVRTC to the libnvrtc.so of CUDA {}", driver / 1000);
+    Err(Error::Unavailable { what: "NVRTC for this driver", reason, remedy })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_device_that_is_not_there_is_unavailable_and_no_panic() {
+        let refusal = Device::open(4096).expect_err("nobody has so many");
+        assert!(matches!(refusal, Error::Unavailable { .. }), "{refusal}");
+        assert!(refusal.to_string().contains("cpu backend"), "{refusal}");
+    }
+
+    #[test]
+    fn an_nvrtc_of_a_newer_major_version_than_the_driver_is_refused_with_both_versions() {
+        check_driver((12, 9), 13_000).expect("older machine code loads");
+        check_driver((13, 1), 13_000).expect("minor versions are compatible");
+        let refusal = check_driver((13, 0), 12_040).expect_err("newer machine code does not").to_string();
+        assert!(refusal.contains("13.0") && refusal.contains("CUDA 12"), "{refusal}");
+    }
+}

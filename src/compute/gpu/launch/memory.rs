@@ -1,0 +1,196 @@
+//! Device buffers, pinned host memory, and page locks of host memory.
+
+use std::ffi::c_void;
+use std::sync::Arc;
+
+use bytemuck::Pod;
+use cudarc::driver::{
+    CudaContext, CudaSlice, DevicePtr as _, DeviceRepr, PinnedHostSlice, ValidAsZeroBits, result, sys,
+};
+
+use super::context::CurrentContext;
+use super::device::Device;
+use super::error::cuda_error;
+use modalcast_model::error::{Error, Result, fault_in};
+
+/// Bytes in device memory. All accesses by kernels and copies are ordered by the device's one stream, and so is the
+/// release of the memory when the buffer is dropped: work that was submitted before still finds the memory.
+#[derive(Debug)]
+pub struct DeviceBuffer {
+    slice: CudaSlice<u8>,
+    /// Requested bytes; the driver refuses an allocation of none, so `slice` may be longer.
+    bytes: u64,
+}
+
+impl DeviceBuffer {
+    /// Allocates `bytes` bytes of zeros.
+    ///
+    /// # Errors
+    /// `Fault` when the device has not enough memory.
+    pub fn zeroed(device: &Device, bytes: u64) -> Result<Self> {
+        // A kernel that reads nothing still needs a valid address.
+        let room = usize::try_from(bytes.max(16)).map_err(fault_in("allocate"))?;
+        Ok(Self { slice: device.stream().alloc_zeros(room).map_err(cuda_error("allocate"))?, bytes })
+    }
+
+    /// Allocates a buffer with the content of `list`, and waits for the copy.
+    ///
+    /// # Errors
+    /// As [`Self::zeroed`] and [`Self::write`].
+    pub fn upload<T: Pod>(device: &Device, list: &[T]) -> Result<Self> {
+        let mut buffer = Self::zeroed(device, size_of_val(list) as u64)?;
+        buffer.write(device, 0, list)?;
+        Ok(buffer)
+    }
+
+    /// Copies `list` to the bytes from `first` on, and waits for the copy, so that the caller may free or change the
+    /// list: the driver does not promise that it stages pageable memory before it returns.
+    ///
+    /// # Errors
+    /// `Fault` when the range exceeds the buffer, or when the device fails.
+    pub fn write<T: Pod>(&mut self, device: &Device, first: u64, list: &[T]) -> Result<()> {
+        let range = self.range(first, size_of_val(list) as u64)?;
+        if range.is_empty() {
+            return Ok(());
+        }
+        let stream = device.stream();
+        let copied = stream.memcpy_htod(bytemuck::cast_slice::<T, u8>(list), &mut self.slice.slice_mut(range));
+        copied.and(stream.synchronize()).map_err(cuda_error("upload"))
+    }
+
+    /// Copies the bytes from `first` on to `to`, after all work that was submitted before, and waits for the copy.
+    ///
+    /// # Errors
+    /// `Fault` when the range exceeds the buffer, or when the device fails.
+    pub fn read<T: Pod>(&self, device: &Device, first: u64, to: &mut [T]) -> Result<()> {
+        self.range(first, size_of_val(to) as u64)?;
+        // SAFETY: `range` checked that the buffer has so many bytes from `first` on.
+        unsafe { download(device, self.address() + first, to) }
+    }
+
+    /// The device address of the first byte, for arguments of kernels. It is valid while the buffer exists.
+    pub fn address(&self) -> u64 {
+        self.slice.device_ptr(self.slice.stream()).0
+    }
+
+    /// Size in bytes.
+    pub const fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    fn range(&self, first: u64, bytes: u64) -> Result<std::ops::Range<usize>> {
+        match first.checked_add(bytes) {
+            Some(end) if end <= self.bytes => Ok(first as usize..end as usize),
+            _ => {
+                let reason = format!("expected a range within {} bytes, got {bytes} bytes from {first}", self.bytes);
+                Err(Error::Fault { stage: "device memory", reason })
+            }
+        }
+    }
+}
+
+/// Copies from the device and waits for the copy.
+///
+/// # Safety
+/// `from` is the address of at least as many bytes of device memory as `to` has.
+pub(crate) unsafe fn download<T: Pod>(device: &Device, from: u64, to: &mut [T]) -> Result<()> {
+    if to.is_empty() {
+        return Ok(());
+    }
+    let _current = device.enter()?;
+    let stream = device.stream();
+    // SAFETY: the caller guarantees `from`; `to` remains borrowed until the stream is synchronized.
+    let copied = unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) };
+    let waited = stream.synchronize();
+    copied.and(waited).map_err(cuda_error("download"))
+}
+
+/// Use of pinned host memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PinnedUse {
+    /// The host writes, the device reads by copies or kernels. Write-combined: reads by the host are slow.
+    ToDevice,
+    /// The device writes, the host reads.
+    FromDevice,
+}
+
+/// Pinned host memory, which is also mapped for kernels at the same address (unified addressing).
+#[derive(Debug)]
+pub struct PinnedBuffer<T>(PinnedHostSlice<T>);
+
+impl<T: DeviceRepr + ValidAsZeroBits> PinnedBuffer<T> {
+    /// Allocates `length` zeros.
+    ///
+    /// # Errors
+    /// `Fault` when the driver cannot lock so much memory.
+    pub fn zeroed(device: &Device, length: usize, pinned_use: PinnedUse) -> Result<Self> {
+        let flags = match pinned_use {
+            PinnedUse::ToDevice => sys::CU_MEMHOSTALLOC_WRITECOMBINED | sys::CU_MEMHOSTALLOC_DEVICEMAP,
+            PinnedUse::FromDevice => 0,
+        };
+        // SAFETY: the memory is uninitialized; the lines below write all of it before anything reads it.
+        let pinned = unsafe { device.context().alloc_pinned_with_flags::<T>(length, flags) };
+        let mut pinned = pinned.map_err(cuda_error("allocate"))?;
+        let begin = pinned.as_mut_ptr().map_err(cuda_error("allocate"))?;
+        // SAFETY: the allocation has `length` aligned elements, and zero bits are a valid `T`.
+        unsafe { begin.write_bytes(0, length) };
+        Ok(Self(pinned))
+    }
+
+    /// The content. The caller has waited for the last copy or kernel that accesses the memory.
+    ///
+    /// # Errors
+    /// `Fault` when the device fails.
+    pub fn as_slice(&self) -> Result<&[T]> {
+        self.0.as_slice().map_err(cuda_error("pinned memory"))
+    }
+
+    /// The content, to write. The caller has waited for the last copy or kernel that accesses the memory.
+    ///
+    /// # Errors
+    /// `Fault` when the device fails.
+    pub fn as_mut_slice(&mut self) -> Result<&mut [T]> {
+        self.0.as_mut_slice().map_err(cuda_error("pinned memory"))
+    }
+
+    /// The address of the first element, for kernels.
+    pub(crate) fn address(&self) -> Result<u64> {
+        self.0.as_ptr().map(|begin| begin as u64).map_err(cuda_error("pinned memory"))
+    }
+}
+
+/// A lock of host memory in physical memory, so that the device copies into it at full speed.
+#[derive(Debug)]
+pub(crate) struct PageLock {
+    address: *mut c_void,
+    context: Arc<CudaContext>,
+}
+
+impl PageLock {
+    /// Page-locks a list if it is large enough. A refusal is no error: copies work without the lock, only slower.
+    ///
+    /// # Safety
+    /// The list is neither moved nor freed before the lock is dropped.
+    pub(crate) unsafe fn new(device: &Device, list: &mut [f32]) -> Option<Self> {
+        // Smaller lists share their pages with other allocations, and copying them is fast anyway.
+        const MIN_LOCKED_BYTES: usize = 1 << 20;
+        let bytes = size_of_val(list);
+        if bytes < MIN_LOCKED_BYTES {
+            return None;
+        }
+        let _current = device.enter().ok()?;
+        let address = list.as_mut_ptr().cast();
+        // SAFETY: the range is that of a live list, which the caller keeps in place.
+        let locked = unsafe { sys::cuMemHostRegister_v2(address, bytes, 0) }.result();
+        locked.ok().map(|()| Self { address, context: Arc::clone(device.context()) })
+    }
+}
+
+impl Drop for PageLock {
+    fn drop(&mut self) {
+        // Errors are ignored: no cleanup remains, and a failed device reports its error at the next call.
+        let _current = CurrentContext::enter(&self.context);
+        // SAFETY: `new` registered the range, and it is unregistered once.
+        unsafe { sys::cuMemHostUnregister(self.address) }.result().ok();
+    }
+}

@@ -1,0 +1,33 @@
+//! Access to a CUDA device: context, memory, compilation, launches and graphs. Knows nothing of scenes.
+//!
+//! | file | content |
+//! |---|---|
+//! | `device` | the device and its stream |
+//! | `context` | a context that is current on a thread |
+//! | `memory` | device buffers and pinned host memory |
+//! | `kernel` | kernels as planned and as compiled, and their launch |
+//! | `capture` | CUDA graphs |
+//! | `compile` | machine code by NVRTC, and its cache |
+//! | `cleanup` | cleanup that also runs when work panics |
+//! | `error` | errors of the driver; tells a lost device from other faults |
+//! | `probe` | what this machine has |
+
+mod capture;
+pub(crate) mod cleanup;
+pub(crate) mod compile;
+pub(crate) mod context;
+mod device;
+pub(crate) mod error;
+mod kernel;
+mod memory;
+mod probe;
+
+pub use capture::capture;
+#[cfg(any(test, feature = "testing"))]
+pub use compile::{CompiledVariant, assert_compiles};
+pub use device::Device;
+pub use kernel::{KernelDescriptor, KernelKind, LaunchOrder, launch_kernel};
+pub(crate) use kernel::{KernelSource, KernelText};
+pub use memory::{DeviceBuffer, PinnedBuffer, PinnedUse};
+pub(crate) use memory::{PageLock, download};
+pub use probe::{DeviceInfo, Probe, probe};

@@ -1,0 +1,79 @@
+//! All constant tables of a scene on the device. The plan counts their bytes, and the launchers upload them. Pure.
+
+use super::box_segments;
+use super::change_list::max_change_entries;
+use super::input_packing::{InputSizes, transform_links};
+use super::layout::{BoxSegment, NormalSlot, TransformLink};
+use super::normal_tables;
+use super::rings::{self, RingTables};
+use super::work::{CoordinateLayout, WorkList, rest_directions, rest_positions};
+use modalcast_model::scene::Scene;
+
+/// The constant tables of a scene, built once for the plan and the upload. U itself is packed during its upload, because
+/// it is large.
+#[derive(Debug)]
+pub struct DeviceTables {
+    pub(crate) coordinates: CoordinateLayout,
+    pub(crate) work: WorkList,
+    /// The parts of domains that `bounds` reduces to boxes.
+    pub(crate) segments: Vec<BoxSegment>,
+    /// x0, three float4 per quad.
+    pub(crate) rest: Vec<[f32; 4]>,
+    /// Rigid normals and tangents at rest, three and four float4 per quad; empty where `deform` computes none.
+    pub(crate) rest_normals: Vec<[f32; 4]>,
+    pub(crate) rest_tangents: Vec<[f32; 4]>,
+    /// Only if normals follow the surface.
+    pub(crate) normals: Option<NormalTables>,
+    pub(crate) transform_links: Vec<TransformLink>,
+    /// Sizes of the values of a step.
+    pub(crate) inputs: InputSizes,
+    /// Number of entries of the tile list of a partial step; 0 for a scene whose steps are always full.
+    pub(crate) listed_tiles: usize,
+}
+
+impl DeviceTables {
+    /// Builds the tables of a scene.
+    pub fn new(scene: &Scene) -> Self {
+        let coordinates = CoordinateLayout::new(scene);
+        let work = WorkList::new(scene, &coordinates);
+        let [rest_normals, rest_tangents] = rest_directions(scene, &work);
+        Self {
+            segments: box_segments::segments(scene, &work),
+            rest: rest_positions(scene, &work),
+            rest_normals,
+            rest_tangents,
+            normals: scene.needs.exact_normals.then(|| NormalTables::new(scene)),
+            transform_links: transform_links(scene),
+            inputs: InputSizes::of(scene, &coordinates),
+            listed_tiles: if max_change_entries(scene) > 0 { work.tiles.len() } else { 0 },
+            work,
+            coordinates,
+        }
+    }
+}
+
+/// The tables of `normals`.
+#[derive(Debug)]
+pub(crate) struct NormalTables {
+    pub slots: Vec<NormalSlot>,
+    /// The first domain of each block of corners.
+    pub first_domains: Vec<u32>,
+    /// One plane per axis.
+    pub rest_normals: Vec<f32>,
+    /// Empty without normal maps.
+    pub rest_tangents: Vec<[f32; 4]>,
+    pub rings: RingTables,
+}
+
+impl NormalTables {
+    fn new(scene: &Scene) -> Self {
+        let slots = rings::slots(scene);
+        Self {
+            first_domains: normal_tables::first_domains(slots.iter().map(|slot| slot.first), scene.layout.corners),
+            rest_normals: normal_tables::rest_normals(scene),
+            rest_tangents: if scene.needs.normal_maps { normal_tables::rest_tangents(scene) } else { Vec::new() },
+            rings: RingTables::new(scene),
+            slots,
+        }
+    }
+}

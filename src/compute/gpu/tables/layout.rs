@@ -1,0 +1,328 @@
+//! The structs that host and kernels share, field by field as in `kernels/layout.cuh`. Both sides assert the sizes, and
+//! tests compare the offsets.
+
+use bytemuck::{Pod, Zeroable};
+
+use crate::storage::TILE_QUADS;
+use modalcast_model::domain::RING_START;
+use modalcast_model::scene::TransformRoots;
+
+/// Threads per block of every kernel but `deform`, and packed corners per block of `normals`.
+pub(crate) const BLOCK: u32 = 256;
+
+/// `first_tangent` of a shape without tangents.
+pub(crate) const NO_TANGENTS: u32 = u32::MAX;
+
+/// `first_member` of a shape without smoothing groups.
+pub(crate) const NO_GROUPS: u32 = u32::MAX;
+
+/// `frame` of a domain that follows no other domain.
+pub(crate) const NO_FRAME: u32 = TransformRoots::NO_FRAME;
+
+/// Bit fields of [`WarpTile::kind`]: the number of items of the last quad (0 in a mixed tile), and flags for whether the
+/// tile computes vertices and corners.
+pub(crate) const TILE_LAST: u8 = 7;
+pub(crate) const TILE_VERTICES: u8 = 8;
+pub(crate) const TILE_CORNERS: u8 = 16;
+
+/// The start of a step's inputs; pointers are device addresses.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
+pub struct Header {
+    pub positions: u64,
+    pub normals: u64,
+    pub tangents: u64,
+    pub displacements: u64,
+    pub output_step: u32,
+    pub last_full_step: u32,
+    pub step: u32,
+    pub changed: u32,
+    pub dirty_tiles: u32,
+    pub reserved: [u32; 3],
+    pub bounds: [u32; 12],
+}
+
+/// The work of one warp of `deform`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(crate) struct WarpTile {
+    pub first_word: u64,
+    pub first: u32,
+    pub rest: u32,
+    pub domain: u32,
+    pub first_q: u32,
+    pub first_scale: u32,
+    pub chunks: u16,
+    pub width: u8,
+    pub kind: u8,
+}
+
+/// A quad of a mixed tile.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(crate) struct MixedQuad {
+    pub item: u32,
+    pub rest: u32,
+    pub domain: u32,
+    pub first_q: u32,
+}
+
+/// An entry of the list of changed domains that `apply` reads.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(crate) struct Change {
+    pub domain: u32,
+    pub first_q: u32,
+    pub count: u32,
+    pub source: u32,
+}
+
+/// The transform root of a domain and its frame relative to that root; only in scenes with followers.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(crate) struct TransformLink {
+    pub root: u32,
+    pub frame: u32,
+}
+
+/// Arguments of `deform`. Pointers are device addresses, as in all arguments below.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(crate) struct DeformArgs {
+    pub header: u64,
+    pub tiles: u64,
+    pub mixed_quads: u64,
+    pub words: u64,
+    pub rest: u64,
+    pub rest_normals: u64,
+    pub rest_tangents: u64,
+    pub corner_offsets: u64,
+    pub scales: u64,
+    pub mixed_quad_scales: u64,
+    pub transforms: u64,
+    pub transform_links: u64,
+    pub frames: u64,
+    pub q: u64,
+    pub list: u64,
+    pub retained_counts: u64,
+    pub retained: u64,
+    pub boxes: u64,
+    pub count: u32,
+    pub reserved: u32,
+}
+
+/// Domains of one shape, for which `batch` reads U once.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(crate) struct BatchGroup {
+    pub first_word: u64,
+    pub rest: u32,
+    pub first_scale: u32,
+    pub vertices: u32,
+    pub first_member: u32,
+    pub chunks: u32,
+    pub members: u32,
+}
+
+/// A domain of a [`BatchGroup`].
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(crate) struct BatchMember {
+    pub first: u32,
+    pub first_q: u32,
+    pub domain: u32,
+    pub first_tile: u32,
+}
+
+/// The work of one block of `batch`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(crate) struct BatchBlock {
+    pub group: u32,
+    pub tile: u32,
+    pub end: u32,
+    pub reserved: u32,
+}
+
+/// Arguments of `batch`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(crate) struct BatchArgs {
+    pub header: u64,
+    pub blocks: u64,
+    pub groups: u64,
+    pub members: u64,
+    pub words: u64,
+    pub rest: u64,
+    pub scales: u64,
+    pub transforms: u64,
+    pub transform_links: u64,
+    pub frames: u64,
+    pub q: u64,
+    pub boxes: u64,
+}
+
+/// A part of a domain that `bounds` reduces to one box.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(crate) struct BoxSegment {
+    pub first: u32,
+    pub count: u32,
+    pub domain: u32,
+    pub from_vertices: u32,
+}
+
+/// Arguments of `bounds`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(crate) struct BoundsArgs {
+    pub header: u64,
+    pub boxes: u64,
+    pub segments: u64,
+    pub change_steps: u64,
+    pub segment_boxes: u64,
+    pub count: u32,
+    pub segment_count: u32,
+    pub light: [f32; 9],
+    pub reserved: u32,
+}
+
+/// Arguments of `apply`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(crate) struct ApplyArgs {
+    pub header: u64,
+    pub changes: u64,
+    pub new_transforms: u64,
+    pub new_q: u64,
+    pub dirty_tiles: u64,
+    pub transform_links: u64,
+    pub transforms: u64,
+    pub q: u64,
+    pub change_steps: u64,
+    pub list: u64,
+}
+
+/// Offsets of the corners of one domain, and of the vertices that `normals` gathers around them.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+pub(crate) struct NormalSlot {
+    pub first: u32,
+    pub first_normal: u32,
+    pub first_tangent: u32,
+    pub first_vertex: u32,
+    pub first_member: u32,
+}
+
+/// Arguments of `normals`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(crate) struct NormalsArgs {
+    pub header: u64,
+    pub slots: u64,
+    pub first_domains: u64,
+    pub rest_normals: u64,
+    pub rest_tangents: u64,
+    pub transforms: u64,
+    pub transform_links: u64,
+    pub frames: u64,
+    pub change_steps: u64,
+    pub members: u64,
+    pub ring_offsets: u64,
+    pub rings: u64,
+    pub group_normals: u64,
+    pub corners: u32,
+    pub rest_corners: u32,
+    pub groups: u32,
+    pub reserved: u32,
+}
+
+const _: () = assert!(size_of::<Header>() == 112, "Header differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<WarpTile>() == 32, "WarpTile differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<MixedQuad>() == 16, "MixedQuad differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<Change>() == 16, "Change differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<TransformLink>() == 8, "TransformLink differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<DeformArgs>() == 152, "DeformArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BatchGroup>() == 32, "BatchGroup differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BatchMember>() == 16, "BatchMember differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BatchBlock>() == 16, "BatchBlock differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BatchArgs>() == 96, "BatchArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BoxSegment>() == 16, "BoxSegment differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<BoundsArgs>() == 88, "BoundsArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<ApplyArgs>() == 80, "ApplyArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<NormalSlot>() == 20, "NormalSlot differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<NormalsArgs>() == 120, "NormalsArgs differs from kernels/layout.cuh");
+
+/// A size, offset or constant that must be the same on host and device.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LayoutConstant {
+    /// The C++ expression, e.g. `OFFSET(WarpTile, rest)`.
+    pub expression: String,
+    /// Its value on the host.
+    pub host: u32,
+}
+
+macro_rules! layout_constants {
+    ($($of:ident { $($field:ident),* })*) => {
+        vec![$(
+            LayoutConstant { expression: concat!("sizeof(", stringify!($of), ")").into(), host: size_of::<$of>() as u32 },
+            $(LayoutConstant {
+                expression: concat!("OFFSET(", stringify!($of), ", ", stringify!($field), ")").into(),
+                host: std::mem::offset_of!($of, $field) as u32,
+            },)*
+        )*]
+    };
+}
+
+/// Every size, offset and constant that host and device share, with the host's value.
+pub fn layout_constants() -> Vec<LayoutConstant> {
+    let mut list = layout_constants! {
+        Header {
+            positions, normals, tangents, displacements, output_step, last_full_step, step, changed, dirty_tiles, reserved, bounds
+        }
+        WarpTile { first_word, first, rest, domain, first_q, first_scale, chunks, width, kind }
+        MixedQuad { item, rest, domain, first_q }
+        Change { domain, first_q, count, source }
+        TransformLink { root, frame }
+        DeformArgs {
+            header, tiles, mixed_quads, words, rest, rest_normals, rest_tangents, corner_offsets, scales, mixed_quad_scales,
+            transforms, transform_links, frames, q, list, retained_counts, retained, boxes, count, reserved
+        }
+        BatchGroup { first_word, rest, first_scale, vertices, first_member, chunks, members }
+        BatchMember { first, first_q, domain, first_tile }
+        BatchBlock { group, tile, end, reserved }
+        BatchArgs {
+            header, blocks, groups, members, words, rest, scales, transforms, transform_links, frames, q, boxes
+        }
+        BoxSegment { first, count, domain, from_vertices }
+        BoundsArgs { header, boxes, segments, change_steps, segment_boxes, count, segment_count, light, reserved }
+        ApplyArgs { header, changes, new_transforms, new_q, dirty_tiles, transform_links, transforms, q, change_steps, list }
+        NormalSlot { first, first_normal, first_tangent, first_vertex, first_member }
+        NormalsArgs {
+            header, slots, first_domains, rest_normals, rest_tangents, transforms, transform_links, frames, change_steps, members,
+            ring_offsets, rings, group_normals, corners, rest_corners, groups, reserved
+        }
+    };
+    for (name, host) in [("TILE_LAST", TILE_LAST), ("TILE_VERTICES", TILE_VERTICES), ("TILE_CORNERS", TILE_CORNERS)] {
+        list.push(LayoutConstant { expression: name.into(), host: u32::from(host) });
+    }
+    list.push(LayoutConstant { expression: "TILE_QUADS".into(), host: TILE_QUADS as u32 });
+    list.push(LayoutConstant { expression: "BLOCK".into(), host: BLOCK });
+    list.push(LayoutConstant { expression: "NO_TANGENTS".into(), host: NO_TANGENTS });
+    list.push(LayoutConstant { expression: "NO_GROUPS".into(), host: NO_GROUPS });
+    list.push(LayoutConstant { expression: "NO_FRAME".into(), host: NO_FRAME });
+    list.push(LayoutConstant { expression: "RING_START".into(), host: RING_START });
+    list
+}
+
+/// The start of a source that contains agreements. NVRTC has no `offsetof`; `OFFSET` is what that macro expands to.
+pub(crate) const PRELUDE: &str = "#include \"layout.cuh\"\n#define OFFSET(of, field) __INTADDR__(&(((of*)0)->field))\n";
+
+/// Source of a kernel `report` that writes the device's value of every agreement, in order, to its only argument.
+pub(crate) fn layout_kernel_source() -> String {
+    let line = |(index, agreement): (usize, &LayoutConstant)| {
+        format!("    values[{index}] = (unsigned)({});\n", agreement.expression)
+    };
+    let lines: String = layout_constants().iter().enumerate().map(line).collect();
+    format!("{PRELUDE}extern \"C\" __global__ void layout_values(unsigned* values) {{\n{lines}}}\n")
+}

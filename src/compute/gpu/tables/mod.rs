@@ -1,0 +1,28 @@
+//! The tables of a scene on the device, the plan of its kernels and buffers, and the values of its steps. Pure: tested
+//! without a GPU.
+//!
+//! | file | content |
+//! |---|---|
+//! | `layout` | the structs that host and kernels share |
+//! | `work`, `normal_tables`, `rings`, `box_segments` | the tables that the kernels read |
+//! | `device_tables` | all tables of a scene, built once |
+//! | `kernels` | macros and grids of the kernels |
+//! | `plan` | kernels, buffers in bytes, launches |
+//! | `input_packing`, `staging` | the input values of a step |
+//! | `change_list` | the lists of a partial step |
+//! | `box_keys` | boxes as the kernels write them |
+
+pub(crate) mod box_keys;
+pub(crate) mod box_segments;
+pub(crate) mod change_list;
+pub(crate) mod device_tables;
+pub(crate) mod input_packing;
+pub(crate) mod kernels;
+pub(crate) mod layout;
+mod normal_tables;
+pub(crate) mod plan;
+mod rings;
+pub(crate) mod staging;
+#[cfg(test)]
+pub(crate) mod test_scenes;
+pub(crate) mod work;

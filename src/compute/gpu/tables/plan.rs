@@ -1,0 +1,235 @@
+//! The plan of a scene on the device: kernels with their macros, buffers in bytes, launches and copies. Pure.
+
+use serde::Serialize;
+
+use super::box_segments::box_bytes;
+use super::change_list::{ChangeListLayout, max_change_entries};
+use super::device_tables::{DeviceTables, NormalTables};
+use super::kernels::kernels;
+use super::layout::NormalSlot;
+use super::normal_tables;
+use super::rings::possible_corner_group_bytes;
+use super::work::batches::BatchTables;
+use crate::gpu::launch::{KernelDescriptor, KernelKind};
+use modalcast_model::error::{Error, Result};
+use modalcast_model::scene::Scene;
+
+/// Content of a device buffer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BufferRole {
+    /// U of every shape, in tiles.
+    ModeWords,
+    /// x0 of every shape.
+    RestPositions,
+    /// Scales of U; only with `Int8`.
+    Scales,
+    /// The work of each warp, and the tile list of partial steps if the scene can have them.
+    WarpTiles,
+    MixedQuads,
+    /// Per domain, offset from its first vertex to its first corner; only if an offset differs from zero.
+    CornerOffsets,
+    /// Groups of domains, and the work of each block of `batch`.
+    Batches,
+    /// A bounding box of each warp's vertices.
+    WarpBoxes,
+    /// The step that last changed each domain.
+    ChangeSteps,
+    /// Transform root of each domain, and the frames of followers.
+    FollowerFrames,
+    RestNormals,
+    RestTangents,
+    /// The smoothing group of each corner; only if normals follow the surface.
+    CornerGroups,
+    /// Vertices around each smoothing group, and the offset of each group's ring.
+    RingTables,
+    /// The geometric normal of each smoothing group at rest.
+    GroupNormals,
+    /// Offsets of each domain's corners.
+    CornerSlots,
+    /// The first domain of each block of corners.
+    CornerBlocks,
+    /// Header, transforms and q of a step.
+    Inputs,
+    Positions,
+    Normals,
+    Tangents,
+    /// u; only if the scene keeps displacements.
+    Displacements,
+    /// The pieces of domains that `bounds` reduces to boxes, and their boxes; only if the scene keeps boxes.
+    BoxSegments,
+    DomainBoxes,
+}
+
+/// One device buffer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct BufferDescriptor {
+    pub role: BufferRole,
+    pub bytes: u64,
+}
+
+/// An optional feature that the scene does not use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct OmittedFeature {
+    /// The flag of [`modalcast_model::scene::SceneFeatures`] that is off, or "batches".
+    pub feature: &'static str,
+    /// Features that are not compiled, computed or stored.
+    pub what: &'static str,
+    /// Device bytes saved, as far as they are known: the length of rings is unknown until they are built.
+    pub bytes: u64,
+}
+
+/// What the CUDA deformer compiles, allocates and launches for a scene.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct DeformPlan {
+    /// The kernels of the scene in launch order, except `apply`, which is last here and first in a partial step.
+    pub kernels: Vec<KernelDescriptor>,
+    pub buffers: Vec<BufferDescriptor>,
+    /// Bytes that each step copies to the device and back, without the vertices.
+    pub bytes_in: u64,
+    pub bytes_out: u64,
+    /// Pinned bytes of the lists of a partial step; 0 for a scene whose steps are always full.
+    pub change_list_bytes: u64,
+    pub omitted: Vec<OmittedFeature>,
+}
+
+/// The plan of a scene.
+pub fn plan(scene: &Scene) -> DeformPlan {
+    plan_from_tables(scene, &DeviceTables::new(scene))
+}
+
+/// The plan of a scene from existing tables.
+pub fn plan_from_tables(scene: &Scene, tables: &DeviceTables) -> DeformPlan {
+    let changes = match max_change_entries(scene) {
+        0 => 0,
+        entries => ChangeListLayout::new(entries, tables.coordinates.total, tables.work.tiles.len()).bytes(),
+    };
+    DeformPlan {
+        kernels: kernels(scene, &tables.work, &tables.segments),
+        buffers: buffers(scene, tables),
+        bytes_in: tables.inputs.total(),
+        bytes_out: if scene.light_axes().is_some() { 48 } else { 24 },
+        change_list_bytes: changes,
+        omitted: omitted(scene, tables),
+    }
+}
+
+fn bytes_of<T>(table: &[T]) -> u64 {
+    size_of_val(table) as u64
+}
+
+/// The buffers of a scene with the bytes of their tables.
+fn buffers(scene: &Scene, tables: &DeviceTables) -> Vec<BufferDescriptor> {
+    let (needs, layout, work) = (scene.needs, &scene.layout, &tables.work);
+    let normals = tables.normals.as_ref();
+    let (vertices, corners) = (layout.vertices as u64, layout.corners as u64);
+    let mut buffers = vec![
+        (BufferRole::ModeWords, 16 * work.words),
+        (BufferRole::RestPositions, bytes_of(&tables.rest)),
+        (BufferRole::Scales, 4 * work.scales),
+        (BufferRole::WarpTiles, bytes_of(&work.tiles) + 4 * tables.listed_tiles as u64),
+        (BufferRole::MixedQuads, bytes_of(&work.mixed_quads) + bytes_of(&work.mixed_quad_scales)),
+        (BufferRole::CornerOffsets, bytes_of(&work.corner_offsets)),
+        (BufferRole::WarpBoxes, work.box_bytes()),
+        (BufferRole::ChangeSteps, 4 * scene.domains.len() as u64),
+        (
+            BufferRole::RestNormals,
+            normals.map_or(bytes_of(&tables.rest_normals), |normals| bytes_of(&normals.rest_normals)),
+        ),
+        (BufferRole::Inputs, tables.inputs.total()),
+        (BufferRole::Positions, 12 * vertices),
+        (BufferRole::Normals, 12 * corners),
+    ];
+    if needs.normal_maps {
+        let bytes = normals.map_or(bytes_of(&tables.rest_tangents), |normals| bytes_of(&normals.rest_tangents));
+        buffers.push((BufferRole::RestTangents, bytes));
+        buffers.push((BufferRole::Tangents, 16 * corners));
+    }
+    if needs.displacements {
+        buffers.push((BufferRole::Displacements, 12 * vertices));
+    }
+    if !work.batched.blocks.is_empty() {
+        let BatchTables { groups, members, blocks, .. } = &work.batched;
+        buffers.push((BufferRole::Batches, bytes_of(groups) + bytes_of(members) + bytes_of(blocks)));
+    }
+    if needs.boxes {
+        let boxes = (BufferRole::DomainBoxes, box_bytes(tables.segments.len()));
+        buffers.extend([(BufferRole::BoxSegments, bytes_of(&tables.segments)), boxes]);
+    }
+    if let Some(NormalTables { slots, first_domains, rings, .. }) = normals {
+        buffers.push((BufferRole::CornerSlots, bytes_of(slots)));
+        buffers.push((BufferRole::CornerBlocks, bytes_of(first_domains)));
+        buffers.push((BufferRole::CornerGroups, bytes_of(&rings.members)));
+        buffers.push((BufferRole::RingTables, bytes_of(&rings.ring_offsets) + bytes_of(&rings.rings)));
+        buffers.push((BufferRole::GroupNormals, bytes_of(&rings.normals)));
+    }
+    if needs.followers {
+        let frames = bytes_of(scene.movers.frames()) + bytes_of(&tables.transform_links);
+        buffers.push((BufferRole::FollowerFrames, frames));
+    }
+    buffers.into_iter().map(|(role, bytes)| BufferDescriptor { role, bytes }).collect()
+}
+
+fn omitted(scene: &Scene, tables: &DeviceTables) -> Vec<OmittedFeature> {
+    let (needs, layout) = (scene.needs, &scene.layout);
+    let is_batched = !tables.work.batched.blocks.is_empty();
+    let slots = size_of::<NormalSlot>() * scene.domains.len();
+    let tangents = 16 * (normal_tables::rest_corners(scene) + layout.corners) as u64;
+    let boxes = bytes_of(&tables.segments) + box_bytes(tables.segments.len());
+    let feature = |feature, what, bytes| OmittedFeature { feature, what, bytes };
+    let all = [
+        (needs.modes, feature("modes", "the sum U q in `deform`", 0)),
+        (needs.normal_maps, feature("normal_maps", "tangents and their two buffers", tangents)),
+        (needs.shear, feature("shear", "the inverse transpose", 0)),
+        (needs.truncation, feature("truncation", "lists of modes in `deform`", 0)),
+        (
+            needs.exact_normals,
+            feature(
+                "exact_normals",
+                "`normals` behind `deform`, and its rings",
+                possible_corner_group_bytes(scene) + slots as u64,
+            ),
+        ),
+        (needs.compensated, feature("compensated", "the compensation in `deform`", 0)),
+        (needs.followers, feature("followers", "frames, and products of transforms", 0)),
+        (needs.displacements, feature("displacements", "u as an output of `deform`", 12 * layout.vertices as u64)),
+        (scene.light_axes().is_some(), feature("shadows", "bounds in light space", 0)),
+        (needs.boxes, feature("boxes", "a box of each domain in `bounds`", boxes)),
+        (is_batched, feature("batches", "`batch`, and groups of domains", 0)),
+    ];
+    all.into_iter().filter(|(is_used, _)| !is_used).map(|(_, omitted)| omitted).collect()
+}
+
+impl DeformPlan {
+    /// Bytes of a buffer; 0 when the scene does not have it.
+    pub fn bytes(&self, role: BufferRole) -> u64 {
+        self.buffers.iter().filter(|buffer| buffer.role == role).map(|buffer| buffer.bytes).sum()
+    }
+
+    /// Bytes of all buffers, outputs included.
+    pub fn total_bytes(&self) -> u64 {
+        self.buffers.iter().map(|buffer| buffer.bytes).sum()
+    }
+
+    /// The kernel of a launch, if the scene has it.
+    pub fn kernel(&self, kind: KernelKind) -> Option<&KernelDescriptor> {
+        self.kernels.iter().find(|kernel| kernel.kind == kind)
+    }
+
+    /// The kernel of a launch that every scene has.
+    pub fn require_kernel(&self, kind: KernelKind) -> Result<&KernelDescriptor> {
+        let missing = || Error::Fault { stage: "plan", reason: format!("no kernel for {kind:?}") };
+        self.kernel(kind).ok_or_else(missing)
+    }
+
+    /// Maximum number of kernel launches of one step, for any number of domains.
+    pub fn launches(&self) -> usize {
+        // A full step may launch `batch` but not `apply`; a partial step may launch `apply` but not `batch`.
+        let whole = self.kernels.iter().filter(|kernel| kernel.kind != KernelKind::Apply).count();
+        let listed = self.kernels.iter().filter(|kernel| kernel.kind != KernelKind::Batch).count();
+        if self.kernel(KernelKind::Apply).is_some() { whole.max(listed) } else { whole }
+    }
+}
+
+#[cfg(test)]
+mod tests;
