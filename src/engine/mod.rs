@@ -6,6 +6,7 @@
 //! writer for too long, yields an error that names the limit.
 
 mod blocking;
+mod catch_unwind;
 mod device;
 mod output;
 mod registry;
@@ -23,9 +24,9 @@ pub use output::frame_encoder::{EncodedOutput, FrameEncoder, FrameFormat};
 pub use output::pack::{PackedVertices, VertexSelection, pack_vertices, validate_domains};
 pub use output::pick_result::{PickResult, resolve_picks};
 pub use output::step_output::{FrameOutput, ModalHit, OutputBody, OutputSpec, StepId, StepOutput};
-pub use scene::actor::StepSelector;
 pub use scene::encoded_subscription::EncodedSubscription;
 pub use scene::handle::{SceneHandle, WriterSession};
+pub use scene::message::StepSelector;
 pub use scene::step_queue::{Policy, StepReport};
 pub use scene::subscriber::{Delivery, Subscription};
 pub use source::SceneSource;
@@ -41,6 +42,7 @@ use std::thread::JoinHandle;
 use tokio::sync::Semaphore;
 
 use self::blocking::run_blocking;
+use self::device::command::SceneId;
 use self::device::handle::DeviceThread;
 use self::registry::Registry;
 use self::scene::actor::SceneServices;
@@ -103,10 +105,10 @@ impl Engine {
             Ok((scene_catalog, Arc::new(checkpoints)))
         })
         .await?;
-        let DeviceThread { handle: device_handle, info, thread: device } =
+        let DeviceThread { handle, info, thread: device } =
             DeviceThread::start(config.open_scenes, open_device).await?;
         let shared = Shared {
-            services: SceneServices { device_handle, checkpoints, config: Arc::clone(&config) },
+            services: SceneServices { device: handle, checkpoints, config: Arc::clone(&config) },
             registry: Registry::new(config.open_scenes),
             config,
             source,
@@ -241,7 +243,7 @@ impl Engine {
         let finish = move || {
             engine.shared.services.checkpoints.finish();
             let device = engine.shared.device.lock().unwrap_or_else(PoisonError::into_inner).take();
-            engine.shared.services.device_handle.quit();
+            engine.shared.services.device.quit();
             device.map(JoinHandle::join);
             engine.shared.scene_catalog.release();
             Ok(())
@@ -259,7 +261,7 @@ impl Engine {
     /// Waits until the device is lost: the server cannot go on, every scene fails with this error, and new ones are
     /// refused. Cancel-safe.
     pub async fn device_lost(&self) -> Error {
-        self.shared.services.device_handle.loss().wait().await
+        self.shared.services.device.loss().wait().await
     }
 
     /// # Errors
@@ -268,7 +270,7 @@ impl Engine {
         if self.is_stopping() {
             return Err(stopping());
         }
-        self.shared.services.device_handle.loss().error().map_or(Ok(()), Err)
+        self.shared.services.device.loss().error().map_or(Ok(()), Err)
     }
 
     async fn restore(&self) {
@@ -299,6 +301,10 @@ impl Engine {
             let entry = engine.shared.registry.entry(&name, &provenance, upload.is_some())?;
             let opened = entry.get_or_open(|| engine.open_or_discard(name.clone(), provenance, upload)).await;
             engine.shared.registry.release(&name, &entry);
+            // The scene may have failed before the registry had its handle.
+            if opened.as_ref().is_ok_and(|scene_handle| scene_handle.failure().is_some()) {
+                engine.shared.registry.remove(&name, &entry);
+            }
             opened
         };
         tokio::spawn(work).await.map_err(modalcast_model::error::fault_in("open"))?
@@ -332,13 +338,15 @@ impl Engine {
             tracing::warn!(scene = name, %error, "the scene begins at rest");
             None
         });
+        let id = self.shared.next_id.fetch_add(1, Ordering::Relaxed);
         let params = OpenParams {
             name: name.into(),
             provenance: provenance.clone(),
             scene,
             backends,
-            id: self.shared.next_id.fetch_add(1, Ordering::Relaxed),
+            id,
             state,
+            on_failure: self.release_name_of(name, id),
             frames_unavailable: self.shared.info.renderer.as_ref().err().cloned(),
         };
         let scene_handle = SceneHandle::open(params, self.shared.services.clone()).await?;
@@ -352,6 +360,17 @@ impl Engine {
         let layout = &scene_handle.scene.layout;
         tracing::info!(scene = name, domains = layout.slots.len(), vertices = layout.vertices, "opened");
         Ok(scene_handle)
+    }
+
+    /// What a failing scene calls: removes it from the registry. The catalog keeps the scene, so that the next start
+    /// opens it again. The callback does not keep the engine alive.
+    fn release_name_of(&self, name: &str, id: SceneId) -> Box<dyn FnOnce() + Send> {
+        let (shared, name) = (Arc::downgrade(&self.shared), name.to_owned());
+        Box::new(move || {
+            if let Some(shared) = shared.upgrade() {
+                shared.registry.remove_scene(&name, id);
+            }
+        })
     }
 
     /// Reads a scene's files. A panic in a loader becomes a `Fault` of this call.
@@ -406,4 +425,116 @@ fn scene_not_open(name: &str) -> Error {
 
 fn stopping() -> Error {
     Error::Unavailable { what: "server", reason: "it stops".into(), remedy: "Try again when it is back".into() }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use modalcast_model::deform::VertexAttributes;
+    use modalcast_model::scene::RawStepUpdate;
+
+    use super::testing::{FaultyDeformer, InjectedFault, StripsSource};
+    use super::*;
+
+    const POSITIONS: OutputSpec =
+        OutputSpec::Vertices(VertexAttributes { positions: true, normals: false, displacements: false, boxes: false });
+
+    /// An engine whose deformer injects faults, with the open scenes "faulty" and "control".
+    async fn engine(state: &std::path::Path) -> (Engine, Arc<SceneHandle>, Arc<SceneHandle>) {
+        let config = Config { state: state.to_owned(), ..Config::default() }.validated().expect("a good configuration");
+        let open = || DeviceContext::with_deformer(FaultyDeformer::boxed);
+        let engine = Engine::start_with_device(Arc::new(config), Arc::new(StripsSource), open).await.expect("starts");
+        let faulty = engine.open("strips", "faulty").await.expect("opens");
+        let control = engine.open("strips", "control").await.expect("opens");
+        (engine, faulty, control)
+    }
+
+    fn step(number: u64, q: f32) -> RawStepUpdate {
+        let q = bytes::Bytes::copy_from_slice(bytemuck::cast_slice(&[q, 0.0]));
+        RawStepUpdate { number, q_domains: vec![0], q, ..RawStepUpdate::default() }
+    }
+
+    /// Drives one step and waits for its report.
+    async fn drive(writer: &mut WriterSession, number: u64, q: f32) -> Result<StepReport> {
+        writer.step(&step(number, q))?;
+        within(writer.next_report()).await
+    }
+
+    async fn within<T>(work: impl Future<Output = T>) -> T {
+        tokio::time::timeout(Duration::from_secs(60), work).await.expect("an answer in time")
+    }
+
+    fn is_done(report: &Result<StepReport>) -> bool {
+        matches!(report, Ok(StepReport::Done { .. }))
+    }
+
+    #[tokio::test]
+    async fn panicking_scene_fails_alone_and_can_be_opened_again() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (engine, faulty, control) = engine(folder.path()).await;
+        let mut writer = faulty.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
+        let mut other = control.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
+        let mut feed = faulty.subscribe(POSITIONS, Delivery::Lossless).await.expect("subscribes");
+        assert!(is_done(&drive(&mut writer, 1, 0.25).await) && is_done(&drive(&mut other, 1, 0.25).await));
+        within(feed.next()).await.expect("control: the first step");
+        let waiting = faulty.request_output(StepSelector::Exact(99), POSITIONS);
+        let (waiting, ()) = within(async { tokio::join!(waiting, faulty.inject_panic()) }).await;
+
+        let is_panic = |error: &Error| matches!(error, Error::Fault { reason, .. } if reason.contains("panicked"));
+        assert!(waiting.as_ref().is_err_and(is_panic), "{waiting:?}");
+        let report = within(writer.next_report()).await;
+        assert!(report.as_ref().is_err_and(is_panic), "{report:?}");
+        assert!(writer.step(&step(2, 0.5)).is_err_and(|error| is_panic(&error)));
+        let end = within(feed.next()).await;
+        assert!(end.as_ref().is_err_and(is_panic), "{end:?}");
+        let late = within(faulty.subscribe(POSITIONS, Delivery::Latest)).await;
+        assert!(late.as_ref().is_err_and(is_panic), "{late:?}");
+
+        let gone = engine.find("faulty").expect_err("the name is free");
+        assert!(matches!(gone, Error::NotFound { .. }), "{gone}");
+        let names = engine.list().iter().map(|scene| scene.name.clone()).collect::<Vec<_>>();
+        assert_eq!(names, ["control"]);
+        let device = &engine.shared.services.device;
+        let unloaded = device.deform(faulty.id(), &Arc::new(modalcast_model::scene::SceneState::rest(&faulty.scene)));
+        assert!(within(unloaded.wait()).await.is_err_and(|error| error.to_string().contains("not loaded")));
+        assert!(is_done(&drive(&mut other, 2, 0.5).await), "the other scene goes on");
+        let again = within(engine.open("strips", "faulty")).await.expect("opens again");
+        assert_eq!(again.last_step().map(|step| step.number), Some(1), "with the step of its checkpoint");
+        engine.shutdown().await;
+    }
+
+    #[tokio::test]
+    async fn panicking_device_command_rejects_only_its_step() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (engine, faulty, control) = engine(folder.path()).await;
+        let mut writer = faulty.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
+        let mut other = control.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
+        let rejected = drive(&mut writer, 1, InjectedFault::PanicInDeform.q()).await;
+        assert!(matches!(rejected, Ok(StepReport::Rejected { step: 1, error: Error::Fault { .. } })), "{rejected:?}");
+        assert!(is_done(&drive(&mut other, 1, 0.25).await));
+        assert!(is_done(&drive(&mut writer, 2, 0.25).await), "the scene goes on");
+        engine.shutdown().await;
+    }
+
+    #[tokio::test]
+    async fn lost_device_fails_every_scene_and_refuses_new_ones() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (engine, faulty, control) = engine(folder.path()).await;
+        let mut writer = faulty.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
+        let mut other = control.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
+        let mut feed = control.subscribe(POSITIONS, Delivery::Latest).await.expect("subscribes");
+        assert!(is_done(&drive(&mut other, 1, 0.25).await));
+        within(feed.next()).await.expect("control: the device works");
+        let rejected = drive(&mut writer, 1, InjectedFault::DeviceLost.q()).await;
+        let lost = testing::device_lost();
+        assert_eq!(rejected, Ok(StepReport::Rejected { step: 1, error: lost.clone() }));
+        assert_eq!(within(writer.next_report()).await, Err(lost.clone()));
+        assert_eq!(within(other.next_report()).await, Err(lost.clone()), "an idle scene fails, too");
+        assert_eq!(within(feed.next()).await.expect_err("ends"), lost);
+        assert_eq!(within(engine.device_lost()).await, lost);
+        assert_eq!(engine.find("control").expect_err("refused"), lost);
+        assert_eq!(within(engine.open("strips", "new")).await.expect_err("refused"), lost);
+        within(engine.shutdown()).await;
+    }
 }

@@ -8,6 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use tokio::sync::OnceCell;
 
 use super::scene_not_open;
+use crate::engine::device::command::SceneId;
 use crate::engine::scene::handle::SceneHandle;
 use crate::engine::storage::scene_catalog::SceneProvenance;
 use modalcast_model::error::{Error, Result};
@@ -117,6 +118,14 @@ impl Registry {
     pub(super) fn remove(&self, name: &str, entry: &Arc<RegistryEntry>) {
         let mut entries = self.lock();
         if entries.get(name).is_some_and(|held| Arc::ptr_eq(held, entry)) {
+            entries.remove(name);
+        }
+    }
+
+    /// Releases the name of a scene that has failed.
+    pub(super) fn remove_scene(&self, name: &str, id: SceneId) {
+        let mut entries = self.lock();
+        if entries.get(name).and_then(|entry| entry.scene_handle()).is_some_and(|held| held.id() == id) {
             entries.remove(name);
         }
     }

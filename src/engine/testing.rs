@@ -1,11 +1,15 @@
 //! Test scenes and a faulty deformer for the unit tests of the engine.
 
+use std::path::Path;
 use std::sync::Arc;
 
+use super::source::SceneSource;
 use modalcast_compute::reference::ReferenceDeformer;
+use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
 use modalcast_model::domain::{Attachment, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
 use modalcast_model::error::{Error, Result};
+use modalcast_model::load::OpenedScene;
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState};
 
 /// Two strips of two triangles with two modes each; the second is attached to the first.
@@ -108,4 +112,21 @@ impl Deformer for FaultyDeformer {
 /// The error of an injected device loss.
 pub(super) fn device_lost() -> Error {
     Error::DeviceLost { stage: "deform", reason: "injected".into() }
+}
+
+/// A source with the single scene "strips".
+pub(super) struct StripsSource;
+
+impl SceneSource for StripsSource {
+    fn open(&self, _source: &str) -> Result<OpenedScene> {
+        Ok(OpenedScene { scene: two_strips(), backends: BackendSettings::default() })
+    }
+
+    fn open_within(&self, _folder: &Path, entry: &str) -> Result<OpenedScene> {
+        self.open(entry)
+    }
+
+    fn list(&self) -> Vec<String> {
+        vec!["strips".into()]
+    }
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::color_frame::ColorFrame;
 use crate::frame::Legend;
-use crate::telemetry::StageTimes;
+use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize, PixelRect, SceneState};
 use modalcast_render::{AovImage, PickHit};
@@ -94,4 +94,11 @@ pub struct ModalHit {
     /// The 3 x r block of U at the point, row-major. A force f at the point (world axes) acts on the coordinates as
     /// f_q = U^T A^T f.
     pub modes: Vec<f32>,
+}
+
+/// The passes of a frame that are stages. The renderer's pass "encode" converts linear light to sRGB bytes and is not
+/// [`Stage::Encode`], which is the PNG encoding.
+pub(in crate::engine) fn stage_times_of_passes(passes: &[(&'static str, f64)]) -> StageTimes {
+    let stage = |name: &str| Stage::from_name(name).filter(|stage| *stage != Stage::Encode);
+    passes.iter().filter_map(|(name, ms)| Some((stage(name)?, *ms))).collect()
 }

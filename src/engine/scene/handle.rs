@@ -1,13 +1,14 @@
 //! Handle to one open scene: its immutable description and a sender to the bounded mailbox of its task.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 
-use super::actor::{ActorParams, Message, SceneActor, SceneServices, StepRequest, StepSelector};
+use super::actor::{ActorParams, SceneActor, SceneServices};
+use super::message::{AcquiredLease, Message, StepRequest, StepSelector};
 use super::step_queue::{Policy, QueuedStep, StepReport, WriterLease};
 use super::subscriber::{Delivery, Subscription};
 use crate::engine::device::command::SceneId;
@@ -27,6 +28,7 @@ pub struct SceneHandle {
     pub name: String,
     pub provenance: SceneProvenance,
     pub scene: Arc<Scene>,
+    id: SceneId,
     /// The reason why no frame can be drawn; `None` if frames can be drawn.
     frames_unavailable: Option<Error>,
     max_window: u32,
@@ -34,6 +36,8 @@ pub struct SceneHandle {
     last_step: watch::Receiver<Option<StepId>>,
     wake: Arc<Notify>,
     closing: AtomicBool,
+    /// The error with which the scene has failed.
+    failure: Arc<OnceLock<Error>>,
 }
 
 /// Arguments of [`SceneHandle::open`].
@@ -43,6 +47,8 @@ pub(in crate::engine) struct OpenParams {
     pub scene: Arc<Scene>,
     pub backends: BackendSettings,
     pub id: SceneId,
+    /// Called when the scene has failed.
+    pub on_failure: Box<dyn FnOnce() + Send>,
     /// The state restored from a checkpoint, if there is one.
     pub state: Option<SceneState>,
     pub frames_unavailable: Option<Error>,
@@ -55,10 +61,10 @@ impl SceneHandle {
     /// # Errors
     /// `Fault` of the device, `Invalid` when the rest state overflows, `Busy` when the command queue is full.
     pub(in crate::engine) async fn open(params: OpenParams, services: SceneServices) -> Result<Self> {
-        let OpenParams { name, provenance, scene, backends, id, state, frames_unavailable } = params;
-        services.device_handle.load_scene(id, &scene, backends).await?;
+        let OpenParams { name, provenance, scene, backends, id, on_failure, state, frames_unavailable } = params;
+        services.device.load_scene(id, &scene, backends).await?;
         let state = match state.map(Arc::new) {
-            Some(state) => match services.device_handle.deform(id, &state).wait().await {
+            Some(state) => match services.device.deform(id, &state).wait().await {
                 Ok(_) => state,
                 Err(error) => {
                     tracing::warn!(scene = name, %error, "the kept step is not usable; the scene begins at rest");
@@ -69,12 +75,34 @@ impl SceneHandle {
         };
         let wake = Arc::new(Notify::new());
         let max_window = services.config.max_window;
-        let params = ActorParams { name: name.clone(), id, scene: Arc::clone(&scene), state, wake: Arc::clone(&wake) };
-        let (scene_actor, last_step) = SceneActor::new(params, services);
+        let failure = Arc::new(OnceLock::new());
+        let (last_step_sender, last_step) = watch::channel((state.run > 0).then(|| StepId::of(&state)));
+        let actor = ActorParams {
+            name: name.clone(),
+            id,
+            scene: Arc::clone(&scene),
+            state,
+            wake: Arc::clone(&wake),
+            last_step: last_step_sender,
+            failure: Arc::clone(&failure),
+            on_failure,
+        };
         let (mailbox, inbox) = mpsc::channel(MAILBOX_CAPACITY);
-        tokio::spawn(scene_actor.run_until_stopped(inbox));
+        tokio::spawn(SceneActor::new(actor, services).run(inbox));
         let closing = AtomicBool::new(false);
-        Ok(Self { name, provenance, scene, frames_unavailable, max_window, mailbox, last_step, wake, closing })
+        Ok(Self {
+            name,
+            provenance,
+            scene,
+            id,
+            frames_unavailable,
+            max_window,
+            mailbox,
+            last_step,
+            wake,
+            closing,
+            failure,
+        })
     }
 
     /// The last completed step, if there is one.
@@ -89,7 +117,8 @@ impl SceneHandle {
     /// `Busy` when the mailbox is full.
     pub async fn drive(&self, peer: String, policy: Policy, window: u32) -> Result<WriterSession> {
         let window = window.clamp(1, self.max_window);
-        let (lease, run) = self.call(|reply| Message::AcquireWriter { peer, policy, window, reply }).await?;
+        let AcquiredLease { lease, run } =
+            self.call(|reply| Message::AcquireWriter { peer, policy, window, reply }).await?;
         tracing::info!(scene = self.name, run, ?policy, "driven by a new writer");
         Ok(WriterSession { lease, scene: Arc::clone(&self.scene), run, window, policy, last: None })
     }
@@ -126,9 +155,9 @@ impl SceneHandle {
         }
     }
 
-    /// Whether [`Self::stop`] was called.
+    /// Whether [`Self::stop`] was called or the scene has failed.
     pub(in crate::engine) fn is_closing(&self) -> bool {
-        self.closing.load(Ordering::Acquire)
+        self.closing.load(Ordering::Acquire) || self.failure().is_some()
     }
 
     fn check_spec(&self, spec: &OutputSpec) -> Result<()> {
@@ -138,14 +167,41 @@ impl SceneHandle {
         }
     }
 
+    /// The error with which the scene has failed; `None` if it has not.
+    pub(in crate::engine) fn failure(&self) -> Option<&Error> {
+        self.failure.get()
+    }
+
+    pub(in crate::engine) const fn id(&self) -> SceneId {
+        self.id
+    }
+
+    /// Makes the actor panic.
+    #[cfg(test)]
+    pub(in crate::engine) async fn inject_panic(&self) {
+        self.mailbox.send(Message::Panic).await.ok();
+    }
+
     async fn call<T>(&self, make: impl FnOnce(oneshot::Sender<Result<T>>) -> Message) -> Result<T> {
-        let gone = || Error::NotFound { what: "scene", given: format!("'{}', which was closed", self.name) };
         let (reply, answer) = oneshot::channel();
         match self.mailbox.try_send(make(reply)) {
-            Ok(()) => answer.await.map_err(|_| gone())?,
+            Ok(()) => match answer.await {
+                Ok(answer) => answer,
+                Err(_) => {
+                    // The actor has ended. It publishes the reason before it closes the mailbox.
+                    self.mailbox.closed().await;
+                    Err(self.end_error())
+                }
+            },
             Err(TrySendError::Full(_)) => Err(Error::Busy { queue: "requests to the scene", limit: MAILBOX_CAPACITY }),
-            Err(TrySendError::Closed(_)) => Err(gone()),
+            Err(TrySendError::Closed(_)) => Err(self.end_error()),
         }
+    }
+
+    /// The error of calls after the actor has ended.
+    fn end_error(&self) -> Error {
+        let closed = || Error::NotFound { what: "scene", given: format!("'{}', which was closed", self.name) };
+        self.failure().cloned().unwrap_or_else(closed)
     }
 }
 

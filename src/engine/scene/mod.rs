@@ -1,8 +1,10 @@
 //! One open scene: its actor, the queue of steps from the writer, and the delivery of outputs to subscribers.
 
 pub(super) mod actor;
+mod current_step;
 pub(super) mod encoded_subscription;
 pub(super) mod handle;
+pub(super) mod message;
 mod output_delivery;
 mod readback_queue;
 pub(super) mod step_queue;

@@ -1,30 +1,115 @@
-//! Delivers the scene's current step: to single requests whose step has been reached, and to viewers that have not
-//! received the step yet.
+//! Delivery of a scene's outputs: to single requests whose step has been reached, and to subscribers that have not
+//! received the current step yet.
 
 use std::mem;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use super::actor::{CachedVertices, SceneActor};
-use super::readback_queue::Readback;
+use super::current_step::CurrentStep;
+use super::message::{StepRequest, StepSelector};
+use super::readback_queue::{PendingReadback, Readback, ReadbackQueue, Recipient};
+use super::step_queue::CompletedStep;
 use super::subscriber::{Delivery, Subscriber};
+use crate::config::Config;
+use crate::engine::device::command::SceneId;
+use crate::engine::device::handle::{DeviceHandle, PendingReply};
 use crate::engine::output::pick_result::with_transforms;
-use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, StepId, StepOutput};
-use crate::telemetry::{Stage, StageTimes};
+use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, StepOutput, stage_times_of_passes};
+use crate::telemetry::Stage;
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Error, Result};
+use modalcast_model::scene::Scene;
+use modalcast_render::MAX_FRAMES_IN_FLIGHT;
 
-impl SceneActor {
-    /// Answers every request whose step has been reached or passed; drops requests whose caller no longer waits.
-    pub(in crate::engine) async fn answer_requests(&mut self) {
-        for request in mem::take(&mut self.pending_requests) {
+/// Owns everything that waits for outputs of one scene: subscribers, single requests, and the readbacks in flight.
+pub(super) struct OutputDelivery {
+    subscribers: Vec<Subscriber>,
+    requests: Vec<StepRequest>,
+    max_subscribers: usize,
+    max_pending_requests: usize,
+    producer: OutputProducer,
+}
+
+/// How the current step is delivered to subscribers.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct DeliveryMode {
+    /// A lossless subscriber without capacity blocks the writer and is cut off after `Config::stall_timeout`.
+    pub applies_back_pressure: bool,
+    /// Another step is queued: vertices and at most [`MAX_FRAMES_IN_FLIGHT`] frames are only started; they are delivered
+    /// while that step is computed.
+    pub overlaps_next_step: bool,
+}
+
+impl OutputDelivery {
+    pub(super) fn new(scene: SceneOnDevice, device: DeviceHandle, config: &Config) -> Self {
+        Self {
+            subscribers: Vec::new(),
+            requests: Vec::new(),
+            max_subscribers: config.max_subscribers,
+            max_pending_requests: config.max_pending_requests,
+            producer: OutputProducer {
+                scene,
+                device,
+                stall_timeout: config.stall_timeout,
+                readbacks: ReadbackQueue::default(),
+                cached: None,
+            },
+        }
+    }
+
+    /// Adds a subscriber. With [`Delivery::Latest`] it receives the current step if the scene has had one.
+    ///
+    /// # Errors
+    /// `Busy` when the scene has too many subscribers.
+    pub(super) fn add_subscriber(&mut self, mut subscriber: Subscriber, current: &CurrentStep) -> Result<()> {
+        self.drop_closed();
+        let limit = self.max_subscribers;
+        if self.subscribers.len() >= limit {
+            return Err(Error::Busy { queue: "subscribers of the scene", limit });
+        }
+        let shows_current = subscriber.delivery == Delivery::Latest && current.state.run > 0;
+        subscriber.delivered_count = if shows_current { current.count.saturating_sub(1) } else { current.count };
+        self.subscribers.push(subscriber);
+        Ok(())
+    }
+
+    /// Adds a request; answers it with `Busy` when too many requests wait.
+    pub(super) fn add_request(&mut self, request: StepRequest) {
+        self.requests.retain(|request| !request.reply.is_closed());
+        let limit = self.max_pending_requests;
+        if self.requests.len() < limit {
+            self.requests.push(request);
+        } else {
+            let full = Error::Busy { queue: "requests that wait for a step", limit };
+            request.reply.send(Err(full)).ok(); // Fails only if the caller no longer waits.
+        }
+    }
+
+    /// Whether a lossless subscriber has not received the current step.
+    pub(super) fn owes_lossless(&self, current: &CurrentStep) -> bool {
+        let owes = |subscriber: &Subscriber| {
+            subscriber.delivery == Delivery::Lossless && subscriber.delivered_count < current.count
+        };
+        self.subscribers.iter().any(owes)
+    }
+
+    /// Deadline at which the subscriber that has blocked the writer for the longest is cut off.
+    pub(super) fn next_stall_deadline(&self) -> Option<Instant> {
+        let first = self.subscribers.iter().filter_map(|subscriber| subscriber.stalled_since).min()?;
+        Some(first + self.producer.stall_timeout)
+    }
+
+    /// Answers every request whose step has been reached or passed; drops requests whose caller no longer waits. `run`
+    /// is the run of the latest writer.
+    pub(super) async fn answer_requests(&mut self, current: &CurrentStep, run: u64) {
+        for request in mem::take(&mut self.requests) {
             if request.reply.is_closed() {
                 continue;
             }
-            let answer = match self.is_ready(request.selector) {
-                Ok(true) => self.produce_output(&request.spec, 0, VertexAttributes::default()).await,
+            let answer = match self.producer.is_reached(request.selector, current, run) {
+                Ok(true) => self.producer.produce(&request.spec, current, VertexAttributes::default()).await,
                 Ok(false) => {
-                    self.pending_requests.push(request);
+                    self.requests.push(request);
                     continue;
                 }
                 Err(error) => Err(error),
@@ -33,189 +118,325 @@ impl SceneActor {
         }
     }
 
-    /// Delivers the current step to every viewer with capacity. While `applies_back_pressure` is true, a lossless viewer without
-    /// capacity blocks the writer (back-pressure) and is cut off after `Config::stall_timeout`. If another step is queued,
-    /// vertices and at most [`modalcast_render::MAX_FRAMES_IN_FLIGHT`] frames are only started here; they are delivered
-    /// while that step is computed.
-    pub(in crate::engine) async fn serve_subscribers(&mut self, applies_back_pressure: bool) {
-        let subscribers = mem::take(&mut self.subscribers);
-        let wanted = self.combined_attributes(&subscribers);
-        let overlaps_next_step = self.has_queued_step();
-        let copied = overlaps_next_step && !self.cached_attributes().contains(wanted);
-        let (mut readers, mut frames, mut drawn) = (Vec::new(), Vec::new(), Vec::new());
-        for mut subscriber in subscribers {
-            if subscriber.is_closed() {
-                continue;
-            }
-            // The viewer may have gained capacity after `wanted` was computed, so its own attributes are checked again.
-            if copied && self.attributes_for(&subscriber).is_some_and(|own| wanted.contains(own)) {
-                let skipped = subscriber.mark_delivered(self.count);
-                readers.push((subscriber.take_permit(), skipped));
+    /// Delivers the current step to every subscriber with capacity. Subscribers of the same view share one frame, and
+    /// readers of vertices share one copy.
+    pub(super) async fn serve_subscribers(&mut self, current: &CurrentStep, mode: DeliveryMode) {
+        let wanted = self.combined_attributes(current);
+        let starts_copy = mode.overlaps_next_step && !self.producer.cached_attributes().contains(wanted);
+        let mut round = DeliveryRound {
+            current,
+            mode,
+            wanted,
+            starts_copy,
+            readers: Vec::new(),
+            started_frames: Vec::new(),
+            drawn_frames: Vec::new(),
+        };
+        let mut at = 0;
+        while let Some(subscriber) = self.subscribers.get_mut(at) {
+            if !subscriber.is_closed() && self.producer.serve(subscriber, &mut round).await {
+                at += 1;
             } else {
-                let is_begun = overlaps_next_step && self.begin_frame(&mut subscriber, &mut frames);
-                if !is_begun
-                    && !self.serve_subscriber(&mut subscriber, applies_back_pressure, (wanted, &mut drawn)).await
-                {
-                    continue;
-                }
+                self.subscribers.remove(at);
             }
-            self.subscribers.push(subscriber);
         }
+        let DeliveryRound { readers, started_frames, .. } = round;
         if !readers.is_empty() {
-            let copying = self.services.device_handle.read_vertices(self.id, wanted);
-            self.in_flight.push_back(self.new_readback(Readback::Vertices(copying), readers));
+            let copying = self.producer.device.read_vertices(self.producer.scene.id, wanted);
+            self.producer.readbacks.push(PendingReadback::new(current, Readback::Vertices(copying), readers));
         }
-        self.in_flight.extend(frames);
+        started_frames.into_iter().for_each(|frame| self.producer.readbacks.push(frame));
+        self.drop_closed();
     }
 
-    /// The vertex attributes that a viewer requests of the current step; `None` if it has no capacity or has received
-    /// it.
-    fn attributes_for(&self, subscriber: &Subscriber) -> Option<VertexAttributes> {
-        match subscriber.spec {
-            OutputSpec::Vertices(wanted) if subscriber.delivered_count < self.count && subscriber.has_credit() => {
-                Some(wanted)
+    /// Delivers all readbacks in flight.
+    pub(super) async fn flush(&mut self) {
+        self.producer.readbacks.flush().await;
+        self.drop_closed();
+    }
+
+    /// Waits for the device to compute the next step and delivers readbacks meanwhile. Afterwards at most frames of the
+    /// current step are in flight.
+    pub(super) async fn deliver_during<T>(&mut self, next: &mut PendingReply<T>, current: &CurrentStep) -> Result<T> {
+        let readbacks = &mut self.producer.readbacks;
+        readbacks.flush_vertices().await;
+        let computed = loop {
+            tokio::select! {
+                biased;
+                computed = next.recv() => break computed,
+                () = readbacks.deliver_oldest(), if !readbacks.is_empty() => {}
             }
-            _ => None,
+        };
+        readbacks.flush_before(current.count).await;
+        self.drop_closed();
+        computed
+    }
+
+    /// Acknowledges the current step after its last readback in flight.
+    pub(super) async fn acknowledge(&mut self, current: &CurrentStep, step: CompletedStep) {
+        if let Some(step) = self.producer.readbacks.attach(current.count, step) {
+            self.flush().await;
+            step.acknowledge();
         }
     }
 
-    /// The union of the vertex attributes that all viewers request, so that one copy serves them all.
-    fn combined_attributes(&self, subscribers: &[Subscriber]) -> VertexAttributes {
-        let open = subscribers.iter().filter(|subscriber| !subscriber.is_closed());
-        open.filter_map(|subscriber| self.attributes_for(subscriber))
+    /// Forgets what was cached of the previous step.
+    pub(super) fn begin_step(&mut self) {
+        self.producer.cached = None;
+    }
+
+    /// Ends every subscription and every request with `error`.
+    pub(super) fn end(self, error: &Error) {
+        self.subscribers.iter().for_each(|subscriber| subscriber.end(error.clone()));
+        for request in self.requests {
+            request.reply.send(Err(error.clone())).ok(); // Fails only if the caller no longer waits.
+        }
+    }
+
+    /// The union of the vertex attributes that all subscribers request, so that one copy serves them all.
+    fn combined_attributes(&self, current: &CurrentStep) -> VertexAttributes {
+        let open = self.subscribers.iter().filter(|subscriber| !subscriber.is_closed());
+        open.filter_map(|subscriber| attributes_for(subscriber, current))
             .fold(VertexAttributes::default(), VertexAttributes::union)
     }
 
-    /// Delivers the current step to one viewer and waits for it. Returns false when the viewer is to be dropped.
-    /// `others` are the vertex attributes that all viewers request. `drawn` holds the frames of this step that were
-    /// drawn for earlier viewers; viewers with the same view share them.
-    async fn serve_subscriber(
-        &mut self,
-        subscriber: &mut Subscriber,
-        applies_back_pressure: bool,
-        (others, drawn): (VertexAttributes, &mut Vec<(OutputSpec, StepOutput)>),
-    ) -> bool {
-        if subscriber.delivered_count == self.count {
+    fn drop_closed(&mut self) {
+        self.subscribers.retain(|subscriber| !subscriber.is_closed());
+    }
+}
+
+/// The vertex attributes that a subscriber requests of the current step; `None` if it has no capacity or has received
+/// it.
+fn attributes_for(subscriber: &Subscriber, current: &CurrentStep) -> Option<VertexAttributes> {
+    match subscriber.spec {
+        OutputSpec::Vertices(wanted) if subscriber.delivered_count < current.count && subscriber.has_credit() => {
+            Some(wanted)
+        }
+        _ => None,
+    }
+}
+
+/// One round over all subscribers of a scene.
+struct DeliveryRound<'a> {
+    current: &'a CurrentStep,
+    mode: DeliveryMode,
+    /// Vertex attributes that all subscribers request.
+    wanted: VertexAttributes,
+    /// Whether one copy of `wanted` is started for all readers at the end of the round.
+    starts_copy: bool,
+    readers: Vec<Recipient>,
+    /// Frames that this round started.
+    started_frames: Vec<PendingReadback>,
+    /// Frames that this round has drawn and delivered; subscribers with the same view share them.
+    drawn_frames: Vec<(OutputSpec, StepOutput)>,
+}
+
+/// A scene that is loaded on the device.
+pub(super) struct SceneOnDevice {
+    pub name: String,
+    pub id: SceneId,
+    pub scene: Arc<Scene>,
+}
+
+/// Produces outputs of the current step: draws, picks and copies. Owns the readbacks in flight.
+struct OutputProducer {
+    scene: SceneOnDevice,
+    device: DeviceHandle,
+    stall_timeout: Duration,
+    readbacks: ReadbackQueue,
+    /// Vertices of the current step that a single copy brought to the host, cached for later readers.
+    cached: Option<CachedVertices>,
+}
+
+/// Vertices in host memory.
+#[derive(Debug, Clone)]
+struct CachedVertices {
+    surface: Arc<DeformedSurface>,
+    /// The attributes that `surface` contains.
+    attributes: VertexAttributes,
+    /// Duration of the copy in milliseconds.
+    ms: f64,
+}
+
+impl OutputProducer {
+    /// Delivers the current step to one subscriber, or starts the delivery. Returns false when the subscriber is to be
+    /// dropped.
+    async fn serve(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
+        // The subscriber may have gained capacity after `wanted` was computed, so its attributes are checked again.
+        let is_reader = |own: VertexAttributes| round.wanted.contains(own);
+        if round.starts_copy && attributes_for(subscriber, round.current).is_some_and(is_reader) {
+            round.readers.push(Recipient::of(subscriber, round.current.count));
             return true;
         }
-        // Wait for the viewer's readbacks in flight only if it has capacity for a further result.
-        if subscriber.has_credit() {
-            self.flush_readbacks_for(subscriber).await;
-            let skipped = subscriber.mark_delivered(self.count);
-            let shared = drawn.iter().find(|(spec, _)| *spec == subscriber.spec);
-            let output = match shared {
-                Some((_, output)) => Ok(StepOutput { skipped, ..output.clone() }),
-                None => self.produce_output(&subscriber.spec, skipped, others).await,
-            };
-            if let (None, Ok(output @ StepOutput { body: OutputBody::Frame(_), .. })) = (shared, &output) {
-                drawn.push((subscriber.spec, output.clone()));
-            }
-            return subscriber.take_permit().send(output);
+        if round.mode.overlaps_next_step && self.start_frame(subscriber, round) {
+            return true;
         }
-        if !(applies_back_pressure && subscriber.delivery == Delivery::Lossless) {
+        self.serve_now(subscriber, round).await
+    }
+
+    /// Subscribes a subscriber with capacity to a frame of the current step that is delivered asynchronously: a frame of
+    /// the same view in flight for another subscriber, else a new frame, unless the round has started
+    /// [`MAX_FRAMES_IN_FLIGHT`] already. Returns whether the subscriber gets a frame.
+    fn start_frame(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
+        let OutputSpec::Frame { camera, size, frame_output: FrameOutput::Color } = subscriber.spec else {
+            return false;
+        };
+        let count = round.current.count;
+        if subscriber.delivered_count == count || !subscriber.has_credit() {
+            return false;
+        }
+        let is_shared = |pending: &&mut PendingReadback| pending.is_frame_of(count, &subscriber.spec);
+        if let Some(shared) = self.readbacks.iter_mut().chain(&mut round.started_frames).find(is_shared) {
+            shared.add_recipient(Recipient::of(subscriber, count));
+            return true;
+        }
+        if round.started_frames.len() >= MAX_FRAMES_IN_FLIGHT {
+            return false;
+        }
+        let drawing = self.device.begin_draw(self.scene.id, camera, size);
+        let readback = Readback::Frame(subscriber.spec, drawing);
+        let recipients = vec![Recipient::of(subscriber, count)];
+        round.started_frames.push(PendingReadback::new(round.current, readback, recipients));
+        true
+    }
+
+    /// Delivers the current step to one subscriber and waits for it. Returns false when the subscriber is to be dropped.
+    async fn serve_now(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
+        let current = round.current;
+        if subscriber.delivered_count == current.count {
+            return true;
+        }
+        if !subscriber.has_credit() {
+            return self.check_stall(subscriber, round.mode);
+        }
+        // Readbacks in flight for the subscriber come first.
+        self.readbacks.flush_for(subscriber).await;
+        let skipped = subscriber.mark_delivered(current.count);
+        let shared = round.drawn_frames.iter().find(|(spec, _)| *spec == subscriber.spec);
+        let output = match shared {
+            Some((_, output)) => Ok(output.clone()),
+            None => self.produce(&subscriber.spec, current, round.wanted).await,
+        };
+        if let (None, Ok(output @ StepOutput { body: OutputBody::Frame(_), .. })) = (shared, &output) {
+            round.drawn_frames.push((subscriber.spec, output.clone()));
+        }
+        subscriber.take_permit().send(output.map(|output| StepOutput { skipped, ..output }))
+    }
+
+    /// Measures for how long a subscriber without capacity has blocked the writer. Returns false when it is cut off.
+    fn check_stall(&self, subscriber: &mut Subscriber, mode: DeliveryMode) -> bool {
+        if !(mode.applies_back_pressure && subscriber.delivery == Delivery::Lossless) {
             subscriber.stalled_since = None;
             return true;
         }
         let since = *subscriber.stalled_since.get_or_insert_with(Instant::now);
-        let is_within_timeout = since.elapsed() < self.services.config.stall_timeout;
+        let is_within_timeout = since.elapsed() < self.stall_timeout;
         if !is_within_timeout {
-            let seconds = self.services.config.stall_timeout.as_secs();
-            tracing::warn!(scene = self.name, seconds, "a lossless subscriber did not read and is cut off");
+            let (scene, seconds) = (&self.scene.name, self.stall_timeout.as_secs());
+            tracing::warn!(scene, seconds, "a lossless subscriber did not read and is cut off");
             subscriber.disconnect(Error::Busy { queue: "this lossless subscriber, which did not read,", limit: 2 });
         }
         is_within_timeout
     }
 
     /// Draws, picks or copies the current step. A copy also covers the attributes in `others`.
-    async fn produce_output(
+    async fn produce(
         &mut self,
         spec: &OutputSpec,
-        skipped: u64,
+        current: &CurrentStep,
         others: VertexAttributes,
     ) -> Result<StepOutput> {
-        let mut stages = self.stages.clone();
+        let mut stages = current.stages.clone();
+        let (id, device) = (self.scene.id, &self.device);
         let body = match *spec {
             OutputSpec::Frame { camera, size, frame_output: FrameOutput::Color } => {
-                let image = self.services.device_handle.begin_draw(self.id, camera, size).wait().await?;
+                let image = device.begin_draw(id, camera, size).wait().await?;
                 stages.extend(stage_times_of_passes(&image.passes));
                 OutputBody::Frame(Arc::new(image.into()))
             }
             OutputSpec::Frame { camera, size, frame_output } => {
-                let (survey, legend) =
-                    self.services.device_handle.render_aov(self.id, camera, size, frame_output).await?;
-                stages.extend(stage_times_of_passes(&survey.passes));
-                OutputBody::Aov(survey, legend)
+                let (aov, legend) = device.render_aov(id, camera, size, frame_output).await?;
+                stages.extend(stage_times_of_passes(&aov.passes));
+                OutputBody::Aov(aov, legend)
             }
             OutputSpec::Pick { camera, picture, rectangle } => {
-                let hits = self.services.device_handle.pick(self.id, camera, picture, rectangle).await?;
-                OutputBody::Pick(with_transforms(&self.state, &self.scene, hits))
+                let hits = device.pick(id, camera, picture, rectangle).await?;
+                OutputBody::Pick(with_transforms(&current.state, &self.scene.scene, hits))
             }
             OutputSpec::Vertices(wanted) => {
-                let (surface, copy_ms) = self.vertices((wanted, others)).await?;
-                stages.push((Stage::Copy, copy_ms));
+                let CachedVertices { surface, ms, .. } = self.vertices(wanted, others).await?;
+                stages.push((Stage::Copy, ms));
                 OutputBody::Vertices(surface)
             }
         };
-        Ok(StepOutput { step: StepId::of(&self.state), skipped, stages, origins: self.state.origins.clone(), body })
+        Ok(StepOutput { step: current.id(), skipped: 0, stages, origins: current.state.origins.clone(), body })
+    }
+
+    /// Whether a request can be answered now. `run` is the run of the latest writer.
+    ///
+    /// # Errors
+    /// `Gone` when the scene has passed the exact step that is asked for.
+    fn is_reached(&self, selector: StepSelector, current: &CurrentStep, run: u64) -> Result<bool> {
+        let is_of_this_run = current.state.run == run && run > 0;
+        let here = is_of_this_run.then_some(current.state.step);
+        match (selector, here) {
+            (StepSelector::Current, _) => Ok(true),
+            (StepSelector::Exact(want), Some(here)) if here > want => Err(Error::Gone {
+                what: "exact_step",
+                expected: format!("{here}, the step that scene '{}' shows, or a later one", self.scene.name),
+                given: want.to_string(),
+            }),
+            (StepSelector::Exact(want), Some(here)) => Ok(here == want),
+            (StepSelector::Minimum(want), Some(here)) => Ok(here >= want),
+            (StepSelector::Exact(_) | StepSelector::Minimum(_), None) => Ok(false),
+        }
     }
 
     /// The attributes of the current vertices that are cached in host memory.
     fn cached_attributes(&self) -> VertexAttributes {
-        self.surface.as_ref().map_or(VertexAttributes::default(), |held| held.parts)
+        self.cached.as_ref().map_or(VertexAttributes::default(), |cached| cached.attributes)
     }
 
-    /// The current vertices with at least the wanted attributes, and the copy's duration in milliseconds. They are
-    /// copied from the device once per step unless a later request needs further attributes.
-    async fn vertices(
-        &mut self,
-        (wanted, others): (VertexAttributes, VertexAttributes),
-    ) -> Result<(Arc<DeformedSurface>, f64)> {
-        let cached = self.cached_attributes();
-        if let Some(held) = self.surface.as_ref().filter(|_| cached.contains(wanted)) {
-            return Ok((Arc::clone(&held.surface), held.ms));
+    /// The current vertices with at least the wanted attributes. They are copied from the device once per step unless a
+    /// later request needs further attributes; a copy also covers `others`.
+    async fn vertices(&mut self, wanted: VertexAttributes, others: VertexAttributes) -> Result<CachedVertices> {
+        if let Some(cached) = self.cached.as_ref().filter(|cached| cached.attributes.contains(wanted)) {
+            return Ok(cached.clone());
         }
         // The cached attributes are copied again, so that alternating readers do not evict each other's attributes.
-        let parts = cached.union(wanted).union(others);
-        let (surface, ms) = self.services.device_handle.read_vertices(self.id, parts).wait().await?;
-        self.surface = Some(CachedVertices { surface: Arc::clone(&surface), parts, ms });
-        Ok((surface, ms))
+        let attributes = self.cached_attributes().union(wanted).union(others);
+        let (surface, ms) = self.device.read_vertices(self.scene.id, attributes).wait().await?;
+        Ok(self.cached.insert(CachedVertices { surface, attributes, ms }).clone())
     }
-}
-
-/// The passes of a frame that are stages. The renderer's pass "encode" converts linear light to sRGB bytes and is not
-/// [`Stage::Encode`], which is the PNG encoding.
-pub(in crate::engine) fn stage_times_of_passes(passes: &[(&'static str, f64)]) -> StageTimes {
-    let stage = |name: &str| Stage::from_name(name).filter(|stage| *stage != Stage::Encode);
-    passes.iter().filter_map(|(name, ms)| Some((stage(name)?, *ms))).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
-    use tokio::sync::{Notify, mpsc};
+    use tokio::sync::mpsc;
     use tokio::time::timeout;
 
-    use super::super::actor::{ActorParams, SceneServices};
     use super::super::subscriber::Subscription;
     use super::*;
-    use crate::config::Config;
     use crate::engine::device::command::{Command, Reply};
-    use crate::engine::device::handle::DeviceHandle;
-    use crate::engine::storage::checkpoint_store::CheckpointStore;
     use crate::engine::testing;
     use modalcast_model::scene::{Camera, FrameSize, SceneState};
     use modalcast_render::{FrameImage, RasterBackends};
 
-    /// A scene at its first step, and the receiver of its device commands.
-    fn scene(folder: &std::path::Path) -> (SceneActor, mpsc::Receiver<Command>) {
-        let scene = testing::two_strips();
-        let state = Arc::new(SceneState { run: 1, step: 1, ..SceneState::rest(&scene) });
-        let (device_handle, device) = DeviceHandle::mock();
-        let checkpoints = Arc::new(CheckpointStore::start(folder.to_owned()).expect("starts"));
-        let services = SceneServices { device_handle, checkpoints, config: Arc::new(Config::default()) };
-        let params = ActorParams { name: "strips".into(), id: 1, scene, state, wake: Arc::new(Notify::new()) };
-        (SceneActor::new(params, services).0, device)
+    const ALONE: DeliveryMode = DeliveryMode { applies_back_pressure: false, overlaps_next_step: false };
+    const OVERLAPPED: DeliveryMode = DeliveryMode { overlaps_next_step: true, ..ALONE };
+
+    /// The delivery of a scene to some subscribers, and the receiver of its device commands.
+    fn delivery_to(subscribers: Vec<Subscriber>) -> (OutputDelivery, mpsc::Receiver<Command>) {
+        let (device, commands) = DeviceHandle::mock();
+        let scene = SceneOnDevice { name: "strips".into(), id: 1, scene: testing::two_strips() };
+        let delivery = OutputDelivery::new(scene, device, &Config::default());
+        (OutputDelivery { subscribers, ..delivery }, commands)
+    }
+
+    /// The scene's step with this number, which is also its count.
+    fn current(step: u64) -> CurrentStep {
+        let state = SceneState { run: 1, step, ..SceneState::rest(&testing::two_strips()) };
+        CurrentStep { state: Arc::new(state), count: step, stages: Vec::new() }
     }
 
     /// A subscriber to frames of this width in pixels.
@@ -252,22 +473,18 @@ mod tests {
     /// Returns the width of the frame that is requested before the frame in flight completes, if any, and the widths
     /// and steps that both viewers receive.
     async fn served(delivery: Delivery) -> (Option<u32>, Vec<(u32, u64)>) {
-        let folder = tempfile::tempdir().expect("a folder");
-        let (mut scene_actor, mut device) = scene(folder.path());
-        let ((mut slow, mut slow_feed), (fast, mut fast_feed)) =
+        let ((slow, mut slow_feed), (fast, mut fast_feed)) =
             (subscriber(delivery, 16), subscriber(Delivery::Lossless, 24));
         // Polling grants a `Latest` feed one credit; a lossless feed has credits from the start.
         timeout(Duration::ZERO, slow_feed.next()).await.expect_err("nothing yet");
-        let mut begun = Vec::new();
-        assert!(scene_actor.begin_frame(&mut slow, &mut begun));
-        scene_actor.in_flight.extend(begun);
+        let (mut delivery, mut device) = delivery_to(vec![slow]);
+        delivery.serve_subscribers(&current(1), OVERLAPPED).await;
         let first = asked(&mut device, 10_000).await.expect("the first frame");
-        (scene_actor.count, scene_actor.subscribers) = (2, vec![slow, fast]);
-        let state = SceneState { step: 2, ..SceneState::clone(&scene_actor.state) };
-        scene_actor.state = Arc::new(state);
+        delivery.subscribers.push(fast);
+        let second = current(2);
         let serving = async {
-            scene_actor.serve_subscribers(false).await;
-            scene_actor.flush_readbacks().await;
+            delivery.serve_subscribers(&second, ALONE).await;
+            delivery.flush().await;
         };
         let playing = async {
             let before = asked(&mut device, 500).await;
@@ -299,22 +516,13 @@ mod tests {
     /// Delivers a step to three viewers, two of which share a view. Returns how many frames the device draws and the
     /// widths that the viewers receive.
     async fn drawn_for_three(has_next: bool) -> (usize, Vec<u32>) {
-        let folder = tempfile::tempdir().expect("a folder");
-        let (mut scene_actor, mut device) = scene(folder.path());
         let (subscribers, feeds): (Vec<_>, Vec<_>) =
             [16, 24, 16].map(|width| subscriber(Delivery::Lossless, width)).into_iter().unzip();
-        (scene_actor.count, scene_actor.subscribers) = (1, subscribers);
+        let (mut delivery, mut device) = delivery_to(subscribers);
+        let first = current(1);
         let serving = async {
-            if has_next {
-                let mut begun = Vec::new();
-                let mut subscribers = mem::take(&mut scene_actor.subscribers);
-                assert!(subscribers.iter_mut().all(|subscriber| scene_actor.begin_frame(subscriber, &mut begun)));
-                scene_actor.in_flight.extend(begun);
-                scene_actor.subscribers = subscribers;
-            } else {
-                scene_actor.serve_subscribers(false).await;
-            }
-            scene_actor.flush_readbacks().await;
+            delivery.serve_subscribers(&first, if has_next { OVERLAPPED } else { ALONE }).await;
+            delivery.flush().await;
         };
         let drawing = async {
             let mut drawn = 0;

@@ -20,44 +20,27 @@
 //! frame k                                [copy out, encode, send]
 //! ```
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 
-use super::actor::{CompletedStep, SceneActor, acknowledge};
-use super::output_delivery::stage_times_of_passes;
+use super::current_step::CurrentStep;
+use super::step_queue::CompletedStep;
 use super::subscriber::{SendPermit, Subscriber};
 use crate::engine::device::command::TimedVertices;
 use crate::engine::device::handle::PendingReply;
-use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, StepId, StepOutput};
+use crate::engine::output::step_output::{OutputBody, OutputSpec, StepId, StepOutput, stage_times_of_passes};
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize};
-use modalcast_render::{FrameImage, MAX_FRAMES_IN_FLIGHT};
-
-/// A device-to-host readback in flight and its subscribers.
-pub(in crate::engine) struct PendingReadback {
-    readback: Readback,
-    /// The scene's step count when the readback was started.
-    pub count: u64,
-    step: StepId,
-    stages: StageTimes,
-    origins: Option<Arc<FloatingOrigins>>,
-    /// A reserved slot per subscriber, and the number of steps that the subscriber skipped.
-    permits: Vec<(SendPermit, u64)>,
-    /// The step's acknowledgement, attached to the last readback of the step and sent after it.
-    pub done: Option<CompletedStep>,
-}
+use modalcast_model::scene::FloatingOrigins;
+use modalcast_render::FrameImage;
 
 /// The pending result of a readback.
-pub(in crate::engine) enum Readback {
+pub(super) enum Readback {
     Vertices(PendingReply<TimedVertices>),
     Frame(OutputSpec, PendingReply<FrameImage>),
 }
 
 impl Readback {
-    fn is_frame_of(&self, wanted: &OutputSpec) -> bool {
-        matches!(self, Self::Frame(spec, _) if spec == wanted)
-    }
-
     /// Waits for the result; returns it with its stage times. Cancel-safe.
     async fn recv(&mut self) -> Result<(OutputBody, StageTimes)> {
         match self {
@@ -74,64 +57,102 @@ impl Readback {
     }
 }
 
-impl SceneActor {
+/// A subscriber of a readback in flight.
+#[derive(Debug)]
+pub(super) struct Recipient {
+    permit: SendPermit,
+    /// Steps that the subscriber skipped since its last result.
+    skipped: u64,
+}
+
+impl Recipient {
+    /// Takes one of the subscriber's credits for the result of step number `count`.
+    pub(super) fn of(subscriber: &mut Subscriber, count: u64) -> Self {
+        Self { skipped: subscriber.mark_delivered(count), permit: subscriber.take_permit() }
+    }
+}
+
+/// A device-to-host readback in flight and its subscribers.
+pub(super) struct PendingReadback {
+    readback: Readback,
+    /// The scene's step count when the readback was started.
+    count: u64,
+    step: StepId,
+    stages: StageTimes,
+    origins: Option<Arc<FloatingOrigins>>,
+    recipients: Vec<Recipient>,
+    /// The step whose acknowledgement follows this readback, because it is the last one of the step.
+    acknowledges: Option<CompletedStep>,
+}
+
+impl PendingReadback {
     /// A readback of the current step that was just started.
-    pub(in crate::engine) fn new_readback(
-        &self,
-        readback: Readback,
-        permits: Vec<(SendPermit, u64)>,
-    ) -> PendingReadback {
-        PendingReadback {
+    pub(super) fn new(current: &CurrentStep, readback: Readback, recipients: Vec<Recipient>) -> Self {
+        Self {
             readback,
-            count: self.count,
-            step: StepId::of(&self.state),
-            stages: self.stages.clone(),
-            origins: self.state.origins.clone(),
-            permits,
-            done: None,
+            count: current.count,
+            step: current.id(),
+            stages: current.stages.clone(),
+            origins: current.state.origins.clone(),
+            recipients,
+            acknowledges: None,
         }
     }
 
-    /// Subscribes a viewer with capacity to a frame of the current step that is delivered asynchronously: a frame of
-    /// the same view in flight for another viewer, else a new frame, unless [`MAX_FRAMES_IN_FLIGHT`] were begun already.
-    /// `begun` holds frames of this step that are not in the queue of readbacks yet. Returns whether the viewer gets a
-    /// frame.
-    pub(in crate::engine) fn begin_frame(
-        &mut self,
-        subscriber: &mut Subscriber,
-        begun: &mut Vec<PendingReadback>,
-    ) -> bool {
-        let Some((camera, size)) = subscriber.spec.frame() else { return false };
-        if subscriber.delivered_count == self.count || !subscriber.has_credit() {
-            return false;
-        }
-        let count = self.count;
-        let of_view =
-            |pending: &&mut PendingReadback| pending.count == count && pending.readback.is_frame_of(&subscriber.spec);
-        if let Some(shared) = self.in_flight.iter_mut().chain(begun.iter_mut()).find(of_view) {
-            let skipped = subscriber.mark_delivered(count);
-            shared.permits.push((subscriber.take_permit(), skipped));
-            return true;
-        }
-        if begun.len() >= MAX_FRAMES_IN_FLIGHT {
-            return false;
-        }
-        let skipped = subscriber.mark_delivered(count);
-        let drawing = self.services.device_handle.begin_draw(self.id, camera, size);
-        begun.push(
-            self.new_readback(Readback::Frame(subscriber.spec, drawing), vec![(subscriber.take_permit(), skipped)]),
-        );
-        true
+    /// Whether this is a color frame of the view in step number `count`.
+    pub(super) fn is_frame_of(&self, count: u64, view: &OutputSpec) -> bool {
+        self.count == count && matches!(&self.readback, Readback::Frame(spec, _) if spec == view)
     }
 
-    /// Waits for the oldest readback in flight and delivers it. Cancel-safe.
-    pub(in crate::engine) async fn deliver_oldest_readback(&mut self) {
-        let Some(pending) = self.in_flight.front_mut() else { return };
+    pub(super) fn add_recipient(&mut self, recipient: Recipient) {
+        self.recipients.push(recipient);
+    }
+
+    fn is_for(&self, subscriber: &Subscriber) -> bool {
+        self.recipients.iter().any(|recipient| recipient.permit.belongs_to(subscriber))
+    }
+}
+
+/// Readbacks in flight, oldest first: those of the current step, and frames of the step before it.
+#[derive(Default)]
+pub(super) struct ReadbackQueue {
+    pending: VecDeque<PendingReadback>,
+}
+
+impl ReadbackQueue {
+    pub(super) fn is_empty(&self) -> bool {
+        self.pending.is_empty()
+    }
+
+    pub(super) fn push(&mut self, readback: PendingReadback) {
+        self.pending.push_back(readback);
+    }
+
+    pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = &mut PendingReadback> {
+        self.pending.iter_mut()
+    }
+
+    /// Attaches the acknowledgement of the step with this count to its last readback in flight. Returns the step if none
+    /// is in flight.
+    pub(super) fn attach(&mut self, count: u64, step: CompletedStep) -> Option<CompletedStep> {
+        match self.pending.back_mut().filter(|pending| pending.count == count) {
+            Some(pending) => {
+                pending.acknowledges = Some(step);
+                None
+            }
+            None => Some(step),
+        }
+    }
+
+    /// Waits for the oldest readback and delivers it. Cancel-safe.
+    pub(super) async fn deliver_oldest(&mut self) {
+        let Some(pending) = self.pending.front_mut() else { return };
         let result = pending.readback.recv().await;
-        let Some(PendingReadback { step, stages, origins, permits, done, .. }) = self.in_flight.pop_front() else {
+        let Some(PendingReadback { step, stages, origins, recipients, acknowledges, .. }) = self.pending.pop_front()
+        else {
             return;
         };
-        for (permit, skipped) in permits {
+        for Recipient { permit, skipped } in recipients {
             let (before, origins) = (stages.clone(), origins.clone());
             let output = result.clone().map(|(body, own)| {
                 let stages = before.into_iter().chain(own).collect();
@@ -139,48 +160,35 @@ impl SceneActor {
             });
             permit.send(output);
         }
-        self.subscribers.retain(|subscriber| !subscriber.is_closed());
-        acknowledge(done);
-    }
-
-    /// Delivers all readbacks of steps whose count is below `count`.
-    pub(in crate::engine) async fn flush_readbacks_before(&mut self, count: u64) {
-        while self.in_flight.front().is_some_and(|pending| pending.count < count) {
-            self.deliver_oldest_readback().await;
+        if let Some(step) = acknowledges {
+            step.acknowledge();
         }
     }
 
-    /// Delivers all readbacks in flight.
-    pub(in crate::engine) async fn flush_readbacks(&mut self) {
-        self.flush_readbacks_before(u64::MAX).await;
+    /// Delivers all readbacks of steps whose count is below `count`.
+    pub(super) async fn flush_before(&mut self, count: u64) {
+        while self.pending.front().is_some_and(|pending| pending.count < count) {
+            self.deliver_oldest().await;
+        }
+    }
+
+    /// Delivers all readbacks.
+    pub(super) async fn flush(&mut self) {
+        self.flush_before(u64::MAX).await;
     }
 
     /// Delivers readbacks until no vertices are in flight. The submission of the next step does not wait for vertices,
     /// but its results must not overtake them.
-    pub(in crate::engine) async fn flush_vertex_readbacks(&mut self) {
-        while self.in_flight.iter().any(|pending| matches!(pending.readback, Readback::Vertices(_))) {
-            self.deliver_oldest_readback().await;
+    pub(super) async fn flush_vertices(&mut self) {
+        while self.pending.iter().any(|pending| matches!(pending.readback, Readback::Vertices(_))) {
+            self.deliver_oldest().await;
         }
     }
 
-    /// Delivers readbacks until none is in flight for `subscriber`, so that the viewer can then be served synchronously.
-    pub(in crate::engine) async fn flush_readbacks_for(&mut self, subscriber: &Subscriber) {
-        while self
-            .in_flight
-            .iter()
-            .any(|pending| pending.permits.iter().any(|(permit, _)| permit.belongs_to(subscriber)))
-        {
-            self.deliver_oldest_readback().await;
-        }
-    }
-}
-
-impl OutputSpec {
-    /// Camera and size in pixels of a color frame; `None` for other views.
-    const fn frame(&self) -> Option<(Camera, FrameSize)> {
-        match *self {
-            Self::Frame { camera, size, frame_output: FrameOutput::Color } => Some((camera, size)),
-            _ => None,
+    /// Delivers readbacks until none is in flight for `subscriber`, so that it can then be served synchronously.
+    pub(super) async fn flush_for(&mut self, subscriber: &Subscriber) {
+        while self.pending.iter().any(|pending| pending.is_for(subscriber)) {
+            self.deliver_oldest().await;
         }
     }
 }

@@ -62,6 +62,29 @@ pub(in crate::engine) struct StepQueue {
     writer: Notify,
 }
 
+/// A computed step whose acknowledgement is outstanding.
+#[derive(Debug)]
+pub(super) struct CompletedStep {
+    step_queue: Arc<StepQueue>,
+    stages: StageTimes,
+}
+
+impl CompletedStep {
+    pub(super) const fn new(step_queue: Arc<StepQueue>, stages: StageTimes) -> Self {
+        Self { step_queue, stages }
+    }
+
+    /// Whether subscribers may block the writer: it is lossless and still connected.
+    pub(super) fn applies_back_pressure(&self) -> bool {
+        self.step_queue.policy() == Policy::Lossless && !self.step_queue.is_closed()
+    }
+
+    /// Reports the step to its writer as done. Steps of a queue are acknowledged in the order in which they were taken.
+    pub(super) fn acknowledge(self) {
+        self.step_queue.report(Ok(self.stages));
+    }
+}
+
 /// The writer's lease on a scene. Dropping it closes the queue and admits the next writer, also if the reply that
 /// carries the lease is dropped because the client has disconnected.
 #[derive(Debug)]
@@ -76,8 +99,9 @@ impl Drop for WriterLease {
 #[derive(Debug, Default)]
 struct QueueState {
     queued: VecDeque<QueuedStep>,
-    /// Steps taken and not yet reported. More than one while readbacks of the earlier ones are in flight.
-    in_progress: usize,
+    /// Numbers of the steps taken and not yet reported, oldest first. More than one while readbacks of the earlier ones
+    /// are in flight.
+    in_progress: VecDeque<u64>,
     reports: VecDeque<StepReport>,
     skipped: u64,
     /// The writer has dropped its lease.
@@ -124,7 +148,7 @@ impl StepQueue {
     pub(in crate::engine) fn take(&self) -> Option<QueuedStep> {
         let mut inner = self.lock();
         let step = inner.queued.pop_front()?;
-        inner.in_progress += 1;
+        inner.in_progress.push_back(step.update.number);
         Some(step)
     }
 
@@ -133,17 +157,18 @@ impl StepQueue {
         !self.lock().queued.is_empty()
     }
 
-    /// Reports the outcome of the oldest step in work.
-    pub(in crate::engine) fn report(&self, step: u64, outcome: Result<StageTimes>) {
+    /// Reports the outcome of the oldest step in progress; does nothing if there is none.
+    pub(super) fn report(&self, outcome: Result<StageTimes>) {
         let mut inner = self.lock();
-        inner.in_progress = inner.in_progress.saturating_sub(1);
+        let Some(step) = inner.in_progress.pop_front() else { return };
         let skipped = inner.skipped;
         let report = match outcome {
             Ok(stages) => StepReport::Done { step, skipped, stages },
             Err(error) => StepReport::Rejected { step, error },
         };
         // Under `latest` a writer may read reports slowly. A newer `Done` covers the older one and replaces it.
-        // `Rejected` is never dropped, so a writer that reads none of them is cut off eventually.
+        // `Rejected` is never replaced. A writer that reads none of them is cut off with the rejection that exceeds the
+        // window; that one and later reports are dropped.
         let supersedes =
             matches!((inner.reports.back(), &report), (Some(StepReport::Done { .. }), StepReport::Done { .. }));
         if inner.reports.len() >= self.window && supersedes {
@@ -179,7 +204,7 @@ impl StepQueue {
     /// Whether every accepted step is reported and every report is taken.
     pub(in crate::engine) fn is_drained(&self) -> bool {
         let inner = self.lock();
-        inner.in_progress == 0 && inner.queued.is_empty() && inner.reports.is_empty()
+        inner.in_progress.is_empty() && inner.queued.is_empty() && inner.reports.is_empty()
     }
 
     /// Called when the writer drops its lease. Drops the queued steps.
@@ -204,7 +229,7 @@ impl StepQueue {
     }
 
     fn check_window(&self, inner: &QueueState, number: u64) -> Result<()> {
-        let open = inner.queued.len() + inner.in_progress + inner.reports.len();
+        let open = inner.queued.len() + inner.in_progress.len() + inner.reports.len();
         if self.policy == Policy::Lossless && open >= self.window {
             let expected = format!("at most {} steps without acknowledgement", self.window);
             return Err(invalid("window", expected, format!("step {number} as number {}", open + 1)));
@@ -240,7 +265,7 @@ mod tests {
         let refusal = step_queue.push(step(3, 0, [0.0; 2])).expect_err("beyond").to_string();
         assert!(refusal.starts_with("window: expected at most 2"), "{refusal}");
         assert_eq!(step_queue.take().map(|step| step.update.number), Some(1));
-        step_queue.report(1, Ok(vec![]));
+        step_queue.report(Ok(vec![]));
         assert!(step_queue.push(step(3, 0, [0.0; 2])).is_err(), "the report was not taken yet");
         step_queue.inner.lock().expect("sound").reports.clear();
         step_queue.push(step(3, 0, [0.0; 2])).expect("room again");
@@ -269,7 +294,7 @@ mod tests {
         for number in 1..=9 {
             step_queue.push(step(number, 0, [0.0; 2])).expect("taken");
             step_queue.take().expect("in work");
-            step_queue.report(number, Ok(vec![]));
+            step_queue.report(Ok(vec![]));
         }
         let mut heard = Vec::new();
         while !step_queue.is_drained() {
@@ -286,7 +311,7 @@ mod tests {
         for number in 1..=3 {
             if step_queue.push(step(number, 0, [0.0; 2])).is_ok() {
                 step_queue.take();
-                step_queue.report(number, Err(invalid("step.q", "less", "more")));
+                step_queue.report(Err(invalid("step.q", "less", "more")));
             }
         }
         assert!(matches!(step_queue.next_report().await, Ok(StepReport::Rejected { step: 1, .. })));

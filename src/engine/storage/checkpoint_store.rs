@@ -74,11 +74,16 @@ impl CheckpointStore {
         self.shared.changed.notify_one();
     }
 
-    /// The checkpoint of a scene, if there is one. Reads from disk.
+    /// The checkpoint of a scene, if there is one: the newest recorded state, on disk or not. Waits for the disk.
     ///
     /// # Errors
     /// `Invalid` when the file is damaged or its size does not match the scene; `Fault` of the disk.
     pub(in crate::engine) fn load(&self, name: &str, scene: &Scene) -> Result<Option<SceneState>> {
+        let _files = lock(&self.shared.files);
+        // A scene that failed and is opened again may have a state that is not on disk yet.
+        if let Some(state) = lock(&self.shared.pending).dirty.get(name) {
+            return decode(&encode(state), scene).map(Some);
+        }
         match fs::read(path_of(&self.folder, name)) {
             Ok(bytes) => decode(&bytes, scene).map(Some),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
@@ -101,6 +106,24 @@ impl CheckpointStore {
         if let Some(thread) = lock(&self.thread).take() {
             thread.join().ok(); // The panic hook has already printed a panic of the thread.
         }
+    }
+}
+
+/// The checkpoints of one scene.
+#[derive(Debug)]
+pub(in crate::engine) struct SceneCheckpoints {
+    store: Arc<CheckpointStore>,
+    name: String,
+}
+
+impl SceneCheckpoints {
+    pub(in crate::engine) const fn new(store: Arc<CheckpointStore>, name: String) -> Self {
+        Self { store, name }
+    }
+
+    /// Records the newest state of the scene. Never waits for the disk.
+    pub(in crate::engine) fn save(&self, state: &Arc<SceneState>) {
+        self.store.enqueue(&self.name, state);
     }
 }
 

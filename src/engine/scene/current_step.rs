@@ -1,0 +1,29 @@
+//! The step that a scene shows.
+
+use std::sync::Arc;
+
+use crate::engine::output::step_output::StepId;
+use crate::telemetry::StageTimes;
+use modalcast_model::scene::SceneState;
+
+/// The step whose vertices the device holds.
+#[derive(Debug, Clone)]
+pub(super) struct CurrentStep {
+    pub state: Arc<SceneState>,
+    /// Number of steps applied to the scene, merged ones included.
+    pub count: u64,
+    /// Stage times up to the end of the deformation.
+    pub stages: StageTimes,
+}
+
+impl CurrentStep {
+    /// The state that a scene is opened with: the restored step, or the rest state.
+    pub(super) fn opened_with(state: Arc<SceneState>) -> Self {
+        let count = u64::from(state.run > 0);
+        Self { state, count, stages: Vec::new() }
+    }
+
+    pub(super) fn id(&self) -> StepId {
+        StepId::of(&self.state)
+    }
+}
