@@ -306,16 +306,27 @@ impl Drop for ContextHandle {
     }
 }
 
+/// A config without window support: the default surface type is WINDOW, which headless devices do not offer.
+fn config(instance: &Instance, display: egl::Display) -> Result<egl::Config> {
+    for surface in [egl::PBUFFER_BIT, 0] {
+        let wanted = [egl::SURFACE_TYPE, surface, egl::RENDERABLE_TYPE, egl::OPENGL_BIT, egl::NONE];
+        if let Ok(Some(config)) = instance.choose_first_config(display, &wanted) {
+            return Ok(config);
+        }
+    }
+    Err(fault_in("EGL config")("no config renders desktop OpenGL, with a pbuffer or without"))
+}
+
 #[cfg(test)]
 pub(crate) mod testing {
-    use std::sync::mpsc::{Sender, channel};
+    use std::sync::mpsc::{SyncSender, sync_channel};
     use std::thread::JoinHandle;
 
     use super::*;
 
     /// Keeps a context current on another thread, so that EGL refuses to make it current on this one.
     pub(crate) struct OccupiedContext {
-        release: Option<Sender<()>>,
+        release: Option<SyncSender<()>>,
         thread: Option<JoinHandle<()>>,
     }
 
@@ -327,7 +338,7 @@ pub(crate) mod testing {
                 CURRENT_CONTEXT.with(|current| current.replace(Weak::new()));
                 instance.make_current(self.handle.display, None, None, None).expect("released");
             }
-            let ((release, released), (occupied, is_occupied)) = (channel::<()>(), channel());
+            let ((release, released), (occupied, is_occupied)) = (sync_channel::<()>(1), sync_channel(1));
             let thread = std::thread::spawn(move || {
                 // SAFETY: the handles of a context and its display, which outlive the thread: it is joined on drop.
                 let (display, context) = unsafe {
@@ -356,15 +367,4 @@ pub(crate) mod testing {
             self.thread.take().map(JoinHandle::join).expect("one thread").expect("no panic");
         }
     }
-}
-
-/// A config without window support: the default surface type is WINDOW, which headless devices do not offer.
-fn config(instance: &Instance, display: egl::Display) -> Result<egl::Config> {
-    for surface in [egl::PBUFFER_BIT, 0] {
-        let wanted = [egl::SURFACE_TYPE, surface, egl::RENDERABLE_TYPE, egl::OPENGL_BIT, egl::NONE];
-        if let Ok(Some(config)) = instance.choose_first_config(display, &wanted) {
-            return Ok(config);
-        }
-    }
-    Err(fault_in("EGL config")("no config renders desktop OpenGL, with a pbuffer or without"))
 }
