@@ -53,8 +53,6 @@ pub(crate) struct AovTarget {
     visibility_fbo: Framebuffer,
     readback_source: Buffer,
     staging: Buffer,
-    // Attached to the framebuffer, which must not outlive it.
-    _depth: Texture,
 }
 
 impl Aov {
@@ -174,7 +172,6 @@ impl Renderer {
             ids,
             readback_source: gl.buffer(bytes, gl::STREAM_COPY, None)?,
             staging: gl.buffer(bytes, gl::STREAM_READ, None)?,
-            _depth: depth,
         });
         Ok(())
     }

@@ -55,8 +55,6 @@ pub(crate) struct PickTarget {
     readback_source: Buffer,
     /// Staging buffers of finished picks, for reuse.
     free: Vec<Buffer>,
-    // Attached to the framebuffer, which must not outlive it.
-    _depth: Texture,
 }
 
 /// A pick in flight.
@@ -78,7 +76,7 @@ impl PickTarget {
         let (ids, depth) = (create_image(gl, desc, gl::R32UI)?, create_image(gl, desc, gl::DEPTH_COMPONENT32F)?);
         let visibility_fbo = gl.framebuffer(Some(&ids), &depth)?;
         let readback_source = gl.buffer(MAX_BYTES, gl::STREAM_COPY, None)?;
-        Ok(Self { ids, visibility_fbo, readback_source, free: Vec::new(), _depth: depth })
+        Ok(Self { ids, visibility_fbo, readback_source, free: Vec::new() })
     }
 }
 

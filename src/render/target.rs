@@ -65,7 +65,6 @@ pub(crate) struct RenderTarget {
     pub(crate) readback_ring: Rc<ReadbackRing>,
     /// Depth pyramid of occlusion culling.
     pub(crate) pyramid: Option<DepthPyramid>,
-    // Attached to framebuffers, which must not outlive it.
     pub(crate) depth: Texture,
 }
 

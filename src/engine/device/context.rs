@@ -54,8 +54,6 @@ type CreateDeformer = fn(&Arc<Scene>) -> Box<dyn Deformer>;
 /// or the main thread of `modalcast render`.
 #[derive(Debug)]
 pub struct DeviceContext {
-    // Field order is drop order: the OpenGL context is dropped before the CUDA context that maps its buffers. Scenes
-    // must be freed by `unload_scene` before either is dropped.
     renderer: Result<Renderer>,
     device: Option<Arc<gpu::Device>>,
     info: EngineInfo,
