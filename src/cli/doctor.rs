@@ -83,7 +83,7 @@ fn lines(report: &Value) -> Vec<String> {
         Some(false) => "hardware",
         None => "none",
     };
-    line("drawn in", &how.into(), "");
+    line("rendering", &how.into(), "");
     line("largest frame", &renderer["max_side"], "none");
     line("deforms on", &report["deforms_on"], "cpu");
     let verdict = if report["can_draw"] == true { "frames can be drawn" } else { "no frame can be drawn" };

@@ -77,40 +77,40 @@ pub(super) fn run(args: &Args) -> Outcome {
     if let Some(path) = &args.q {
         state.q = coordinates(&scene, path)?;
     }
-    let mut bench =
+    let mut device =
         DeviceContext::open(&Config { backend: args.backend, renderer: args.renderer, ..Config::default() })?;
-    let mut loaded_scene = bench.load_scene(&scene, backends)?;
+    let mut loaded_scene = device.load_scene(&scene, backends)?;
     loaded_scene.deform(&Arc::new(state))?;
     let largest = args.largest;
     let bytes = match args.output {
         OutputOption::Color => {
-            let image = bench.draw(&mut loaded_scene, &camera(args, &scene), args.size)?;
+            let image = device.draw(&mut loaded_scene, &camera(args, &scene), args.size)?;
             frame::encode_png(image.width, image.height, &image.rgba)?
         }
         OutputOption::Displacement => {
-            render_color_map(args, &mut bench, &mut loaded_scene, FrameOutput::Displacement { largest })?
+            render_color_map(args, &mut device, &mut loaded_scene, FrameOutput::Displacement { largest })?
         }
         OutputOption::ModeShape => {
             let mode = validate_mode(&scene, args.mode)?;
-            render_color_map(args, &mut bench, &mut loaded_scene, FrameOutput::ModeShape { mode, largest })?
+            render_color_map(args, &mut device, &mut loaded_scene, FrameOutput::ModeShape { mode, largest })?
         }
     };
     let place = format!("--out {}", args.out.display());
     fs::write(&args.out, bytes).map_err(|error| invalid(place, "a file that can be written", error))?;
-    bench.unload_scene(loaded_scene);
-    print_line(format!("{} ({}, {})", args.out.display(), args.size, bench.backend().name()));
+    device.unload_scene(loaded_scene);
+    print_line(format!("{} ({}, {})", args.out.display(), args.size, device.backend().name()));
     Ok(true)
 }
 
 /// Renders a color map to PNG.
 fn render_color_map(
     args: &Args,
-    bench: &mut DeviceContext,
+    device: &mut DeviceContext,
     loaded_scene: &mut LoadedScene,
     frame_output: FrameOutput,
 ) -> Result<Vec<u8>> {
     let scene = Arc::clone(loaded_scene.scene());
-    let (aov, legend) = bench.render_aov(loaded_scene, &camera(args, &scene), args.size, frame_output)?;
+    let (aov, legend) = device.render_aov(loaded_scene, &camera(args, &scene), args.size, frame_output)?;
     let legend = legend.ok_or_else(|| fault_in("encode")("a color map without a legend"))?;
     let rgba = frame::color_map(&aov.bytes, aov.samples, args.size.to_array(), &legend)?;
     frame::encode_png(args.size.width, args.size.height, &rgba)

@@ -121,7 +121,7 @@ async fn scenario(client: &Client, scene: &str, command: &Command) -> Result<Box
             } else {
                 Command::Sweep { common: common.clone(), share: *share }
             };
-            eprintln!("modalcast-sim: {scene} is driven as `{}`", command.name());
+            eprintln!("modalcast-sim: {scene}: scenario `{}`", command.name());
             Box::pin(scenario(client, scene, &command)).await
         }
     }

@@ -75,7 +75,7 @@ impl ReducedSystem {
         let scale = settings.base_frequency * settings.base_frequency;
         let stiffness = (force.linear() + force.linear().transpose()) * (0.5 * scale);
         if Cholesky::new(stiffness.clone()).is_none() {
-            return Err(invalid("cub.linear", "a positive definite stiffness", "one that is not"));
+            return Err(invalid("cub.linear", "a positive definite stiffness", "an indefinite one"));
         }
         let unit = DMatrix::identity(force.rank(), force.rank());
         let damping = unit * settings.damping_mass + stiffness * settings.damping_stiffness;

@@ -51,7 +51,7 @@ pub enum Error {
     #[error("the stream ended before {what}")]
     StreamEnded { what: &'static str },
     /// A reply did not arrive in time.
-    #[error("{what} did not come within {ms} ms")]
+    #[error("{what} did not arrive within {ms} ms")]
     Deadline { what: &'static str, ms: u64 },
     /// A step that cannot be encoded as one message; nothing was sent.
     #[error("step {step} cannot be sent: {reason}")]

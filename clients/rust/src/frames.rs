@@ -205,7 +205,7 @@ impl WireChunk for v1::FrameChunk {
             v1::Format::U32 => (FrameFormat::U32, Some(4)),
             v1::Format::F32x3 => (FrameFormat::F32x3, Some(12)),
             v1::Format::Unspecified => {
-                return Err(malformed_reply("frame.format", "a format that is named", head.format));
+                return Err(malformed_reply("frame.format", "a known format", head.format));
             }
         };
         let pixels = u64::from(head.width) * u64::from(head.height);

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::{BufWriter, Seek as _, SeekFrom, Write as _};
 use std::path::{Path, PathBuf};
 
-use crate::error::{Error, Result, malformed_reply};
+use crate::error::{Error, Result};
 
 /// The start of a file of format version 1.0, which stores the length of the rest of the header as u16.
 const MAGIC: &[u8] = b"\x93NUMPY\x01\x00";
@@ -43,11 +43,12 @@ impl Writer {
     /// Adds one row.
     ///
     /// # Errors
-    /// `Malformed` if its length does not match the shape; `File` if it cannot be written.
+    /// `File` if its length does not match the shape, or if it cannot be written.
     pub fn row(&mut self, numbers: &[f32]) -> Result<()> {
         let expected: usize = self.shape.iter().product();
         if numbers.len() != expected {
-            return Err(malformed_reply("npy.row", expected, numbers.len()));
+            let reason = format!("expected rows of {expected} numbers, got {}", numbers.len());
+            return Err(Error::file(&self.path, reason));
         }
         self.rows += 1;
         self.put(bytemuck::cast_slice(numbers))

@@ -46,7 +46,7 @@ impl Client {
         let header = v1::UploadHeader {
             scene: scene.to_owned(),
             entry: if entry.is_empty() { single.unwrap_or_default() } else { entry.to_owned() },
-            files: u32::try_from(entries.len()).map_err(|_| malformed_reply("upload.files", "fewer", entries.len()))?,
+            files: u32::try_from(entries.len()).map_err(|_| Error::file(&root, "more than 2^32 files"))?,
             total_bytes: entries.iter().map(|entry| entry.file.bytes).sum(),
         };
         let (sender, queue) = mpsc::channel(4);

@@ -41,13 +41,13 @@ impl Evaluation {
     ///
     /// # Errors
     /// `Invalid` when the recorded arrays have different step counts or do not have the scene's shapes.
-    pub(super) fn of(scene: &Scene, ran: &DemoRun, wanted: u32) -> Result<Self> {
-        let steps = ran.vertices.shape()[0];
-        if ran.q.shape() != [steps, scene.layout.coordinates]
-            || ran.transforms.shape() != [steps, scene.domains.len(), 12]
-            || ran.vertices.shape() != [steps, scene.layout.vertices, 3]
+    pub(super) fn of(scene: &Scene, run: &DemoRun, wanted: u32) -> Result<Self> {
+        let steps = run.vertices.shape()[0];
+        if run.q.shape() != [steps, scene.layout.coordinates]
+            || run.transforms.shape() != [steps, scene.domains.len(), 12]
+            || run.vertices.shape() != [steps, scene.layout.vertices, 3]
         {
-            let given = format!("{:?}, {:?}, {:?}", ran.q.shape(), ran.transforms.shape(), ran.vertices.shape());
+            let given = format!("{:?}, {:?}, {:?}", run.q.shape(), run.transforms.shape(), run.vertices.shape());
             return Err(invalid("demo", "as many steps of q, transforms and vertices as frames", given));
         }
         let rest = reference::deform(scene, &SceneState::rest(scene));
@@ -55,9 +55,9 @@ impl Evaluation {
         let joints = Joint::all(scene, &rest);
         let (mut error, mut displacement, mut sway, mut gap) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64);
         for step in 0..steps {
-            let state = state(scene, ran, step);
+            let state = state(scene, run, step);
             let want = reference::deform(scene, &state);
-            let (got, _) = ran.vertices.row(step).as_chunks::<3>();
+            let (got, _) = run.vertices.row(step).as_chunks::<3>();
             gap = joints.iter().fold(gap, |gap, joint| max_error(gap, joint.gap(got, &state)));
             for (vertex, got) in got.iter().enumerate() {
                 let got = got.map(f64::from);
@@ -71,11 +71,11 @@ impl Evaluation {
         }
         let diagonal = scene.rest_bounds.diagonal();
         Ok(Self {
-            backend: text(&ran.server, "backend"),
-            renderer: text(&ran.server, "renderer"),
+            backend: text(&run.server, "backend"),
+            renderer: text(&run.server, "renderer"),
             steps,
-            steps_per_second: ran.sim["steps_per_second"].as_f64().unwrap_or(f64::NAN),
-            stages: stages(&ran.frames),
+            steps_per_second: run.sim["steps_per_second"].as_f64().unwrap_or(f64::NAN),
+            stages: stages(&run.frames),
             error,
             relative_error: error / diagonal,
             displacement,
@@ -83,14 +83,14 @@ impl Evaluation {
             sway: sway / crown.height,
             joint_gap: (!joints.is_empty()).then_some(gap / diagonal),
             least: MinimumMotion::of(scene),
-            frames: ran.frames_on_disk,
+            frames: run.frames_on_disk,
             frames_wanted: wanted as usize,
         })
     }
 
     /// The acceptance criteria that are not met.
     pub(super) fn failed_checks(&self) -> Vec<String> {
-        let promises = [
+        let criteria = [
             (self.relative_error <= LARGEST_ERROR, format!("vertices within {LARGEST_ERROR:.0e} of the diagonal")),
             (self.joint_gap.is_none_or(|gap| gap <= LARGEST_GAP), format!("joints within {LARGEST_GAP:.0e}")),
             (self.frames == self.frames_wanted, format!("{} frames", self.frames_wanted)),
@@ -100,7 +100,7 @@ impl Evaluation {
                 format!("a displacement of {} % of the diagonal", 100.0 * self.least.displacement),
             ),
         ];
-        promises.into_iter().filter_map(|(kept, promise)| (!kept).then_some(promise)).collect()
+        criteria.into_iter().filter_map(|(met, criterion)| (!met).then_some(criterion)).collect()
     }
 
     pub(super) fn table(&self) -> Vec<String> {
@@ -121,7 +121,7 @@ impl Evaluation {
         ]);
         rows.extend(self.joint_gap.map(|gap| ("largest joint gap".into(), format!("{gap:.1e} of the diagonal"))));
         rows.push(("frames written".into(), format!("{} of {}", self.frames, self.frames_wanted)));
-        rows.extend(self.failed_checks().into_iter().map(|promise| ("NOT KEPT".into(), promise)));
+        rows.extend(self.failed_checks().into_iter().map(|criterion| ("NOT MET".into(), criterion)));
         rows.into_iter().map(|(name, value): (String, String)| format!("{name:<22}{value}")).collect()
     }
 
@@ -222,10 +222,10 @@ fn center(points: impl ExactSizeIterator<Item = [f64; 3]>) -> [f64; 3] {
 }
 
 /// The state that the physics process sent at one step.
-fn state(scene: &Scene, ran: &DemoRun, step: usize) -> SceneState {
+fn state(scene: &Scene, run: &DemoRun, step: usize) -> SceneState {
     let mut state = SceneState::rest(scene);
-    state.q = ran.q.row(step).to_vec();
-    let (sent, _) = ran.transforms.row(step).as_chunks::<12>();
+    state.q = run.q.row(step).to_vec();
+    let (sent, _) = run.transforms.row(step).as_chunks::<12>();
     for (transform, sent) in state.transforms.iter_mut().zip(sent) {
         *transform = Transform(*sent);
     }
@@ -285,19 +285,19 @@ mod tests {
     }
 
     #[test]
-    fn every_broken_promise_is_named_and_kept_ones_are_not() {
+    fn failed_checks_names_exactly_the_criteria_that_are_not_met() {
         let scene = modalcast_model::load::open("tree").expect("the tree").scene;
         let failed_checks = |spoil: &dyn Fn(&mut DemoRun)| {
-            let mut ran = at_rest(&scene);
-            spoil(&mut ran);
-            Evaluation::of(&scene, &ran, 2).expect("as many steps").failed_checks().join("; ")
+            let mut run = at_rest(&scene);
+            spoil(&mut run);
+            Evaluation::of(&scene, &run, 2).expect("as many steps").failed_checks().join("; ")
         };
         let still = failed_checks(&|_| {});
         assert_eq!(still, "a sway of 3 % of the height; a displacement of 2 % of the diagonal");
-        assert!(failed_checks(&|ran| ran.frames_on_disk = 1).contains("2 frames"));
-        assert!(failed_checks(&|ran| ran.vertices.row_mut(1)[3 * 77] += 0.01).contains("vertices within"));
-        assert!(failed_checks(&|ran| ran.vertices.row_mut(1)[3 * 77] = f32::NAN).contains("vertices within"));
+        assert!(failed_checks(&|run| run.frames_on_disk = 1).contains("2 frames"));
+        assert!(failed_checks(&|run| run.vertices.row_mut(1)[3 * 77] += 0.01).contains("vertices within"));
+        assert!(failed_checks(&|run| run.vertices.row_mut(1)[3 * 77] = f32::NAN).contains("vertices within"));
         let child = scene.domains.iter().position(|domain| domain.attachment.is_some()).expect("a child");
-        assert!(failed_checks(&|ran| ran.transforms.row_mut(1)[12 * child + 3] += 0.1).contains("joints within"));
+        assert!(failed_checks(&|run| run.transforms.row_mut(1)[12 * child + 3] += 0.1).contains("joints within"));
     }
 }

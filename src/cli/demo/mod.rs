@@ -59,9 +59,9 @@ pub(super) fn run(args: &Args) -> Outcome {
     let input = DemoScene::find(&args.scene)?;
     // Temporary files of the processes; removed with the folder.
     let scratch = tempfile::tempdir().map_err(fault_in("demo"))?;
-    let ran = drive(args, &input, scratch.path())?;
+    let run = drive(args, &input, scratch.path())?;
     let evaluation =
-        with_spinner("comparing with the f64 reference", || Evaluation::of(&input.scene, &ran, args.frames))?;
+        with_spinner("comparing with the f64 reference", || Evaluation::of(&input.scene, &run, args.frames))?;
     for line in evaluation.table() {
         print_line(line);
     }
@@ -134,14 +134,14 @@ fn drive(args: &Args, input: &DemoScene, scratch: &std::path::Path) -> Result<De
     let sim = sim.finish(end)?;
     let frames = frames.finish(end)?;
     vertices.finish(end)?;
-    let told = Process::start("info", &program_path("modalcast-fetch")?, &["info", "--server", &url, "--json"])?;
-    let told = told.finish(end)?;
+    let info = Process::start("info", &program_path("modalcast-fetch")?, &["info", "--server", &url, "--json"])?;
+    let info = info.finish(end)?;
     server.stop();
     let record = scratch.join("record");
     Ok(DemoRun {
         frames,
         sim,
-        server: told,
+        server: info,
         q: StepRecords::read(&record.join("q.npy"))?,
         transforms: StepRecords::read(&record.join("transforms.npy"))?,
         vertices: StepRecords::read(&scratch.join("vertices.npy"))?,

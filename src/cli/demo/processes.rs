@@ -25,7 +25,7 @@ pub(super) fn program_path(name: &str) -> Result<PathBuf> {
     }
     Err(Error::Unavailable {
         what: "a program of the demo",
-        reason: format!("{} is not there", path.display()),
+        reason: format!("{} does not exist", path.display()),
         remedy: "Build it with: cargo build --release --workspace --bins".into(),
     })
 }
@@ -83,7 +83,8 @@ impl Process {
         if !status.success() {
             return Err(fault_in("demo")(format!("{} ended with {status}", self.name)));
         }
-        serde_json::from_str(&last).map_err(|error| fault_in("demo")(format!("{} said '{last}': {error}", self.name)))
+        serde_json::from_str(&last)
+            .map_err(|error| fault_in("demo")(format!("{}: expected a line of JSON, got '{last}': {error}", self.name)))
     }
 
     /// Sends SIGTERM and waits for at most 15 s; dropping the process kills it if it is still running.
@@ -100,7 +101,7 @@ impl Process {
     fn next_line(&mut self, end: Instant, what: &str) -> Result<String> {
         self.line_or_end(end, what)?.ok_or_else(|| {
             let status = self.child.wait().map(|status| status.to_string()).unwrap_or_default();
-            fault_in("demo")(format!("{} ended with {status} before it said '{what}'", self.name))
+            fault_in("demo")(format!("{} ended with {status} before it printed '{what}'", self.name))
         })
     }
 
