@@ -303,13 +303,7 @@ impl Variant for BenchmarkVariant {
     }
 
     fn time(&mut self, _states: &[SceneState], cache: CacheState, replays: usize) -> Result<Option<Timing>> {
-        let cache = match cache {
-            CacheState::Warm => kernels::Cache::Warm,
-            CacheState::Cold => kernels::Cache::Cold,
-        };
-        let kernels::Timing { median_us, q1_us, q3_us, replays } =
-            kernels::time(&self.device, self.trial()?, cache, replays)?;
-        Ok(Some(Timing { median_us, q1_us, q3_us, replays }))
+        kernels::time(&self.device, self.trial()?, cache, replays).map(Some)
     }
 
     fn kernels(&self) -> (usize, Vec<KernelAttributes>) {

@@ -1,4 +1,4 @@
-//! Wall-clock timing of steps with warm or cold caches.
+//! Times of steps with warm or cold caches, their median and quartiles, and timing by the wall clock.
 
 use std::time::Instant;
 
@@ -13,7 +13,8 @@ use modalcast_model::error::Result;
 pub enum CacheState {
     /// The previous step's data.
     Warm,
-    /// No data of the step: a buffer larger than the last-level cache was written before.
+    /// No data of the step: a buffer larger than the last-level cache was written before. On a GPU, it was read, so that
+    /// the step does not pay for writing back dirty lines.
     Cold,
 }
 
@@ -44,16 +45,14 @@ const TIME_BUDGET_S: f64 = 5.0;
 const SWEEP: usize = 64 << 20;
 
 impl Timing {
-    /// Median and quartiles of times in microseconds; `None` when there are none.
+    /// Median and quartiles of times in microseconds, in any order; `None` when there are none.
     pub fn of(mut times: Vec<f64>) -> Option<Self> {
-        times.sort_by(f64::total_cmp);
-        let last = times.len().checked_sub(1)?;
-        let at = |share: f64| {
-            let place = share * last as f64;
-            let (below, above) = (times[place.floor() as usize], times[place.ceil() as usize]);
-            below + (above - below) * place.fract()
-        };
-        Some(Self { median_us: at(0.5), q1_us: at(0.25), q3_us: at(0.75), replays: times.len() })
+        Some(Self {
+            median_us: quantile(&mut times, 0.5)?,
+            q1_us: quantile(&mut times, 0.25)?,
+            q3_us: quantile(&mut times, 0.75)?,
+            replays: times.len(),
+        })
     }
 
     /// Times `step`, called with 0, 1, 2, ..., by the wall clock: one untimed run, then [`MIN_REPETITIONS`] to `replays` runs.
@@ -81,6 +80,16 @@ impl Timing {
         }
         Ok(Self::of(times))
     }
+}
+
+/// Quantile of numbers in any order, which are reordered: the median for a `share` of 0.5, the first quartile for 0.25.
+/// Interpolates linearly between neighbors; `None` without numbers.
+pub fn quantile(numbers: &mut [f64], share: f64) -> Option<f64> {
+    let place = share * numbers.len().checked_sub(1)? as f64;
+    let (_, below, rest) = numbers.select_nth_unstable_by(place.floor() as usize, f64::total_cmp);
+    let above = rest.iter().copied().min_by(f64::total_cmp).unwrap_or(*below);
+    // Without a fraction the next number has no weight; it may be infinite.
+    Some(if place.fract() == 0.0 { *below } else { *below + (above - *below) * place.fract() })
 }
 
 /// A buffer larger than the caches.
@@ -126,6 +135,15 @@ mod tests {
         assert_eq!((timing.q1_us, timing.median_us, timing.q3_us, timing.replays), (2.0, 3.0, 4.0, 5));
         assert_eq!(Timing::of(vec![1.0, 2.0]).map(|timing| timing.median_us), Some(1.5));
         assert_eq!(Timing::of(vec![]), None);
+        let even = Timing::of(vec![4.0, 1.0, 2.0, 3.0]).expect("four");
+        assert_eq!(even, Timing { median_us: 2.5, q1_us: 1.75, q3_us: 3.25, replays: 4 });
+        let one = Timing::of(vec![7.0]).expect("one");
+        assert_eq!((one.q1_us, one.median_us, one.q3_us), (7.0, 7.0, 7.0));
+    }
+
+    #[test]
+    fn quantile_ignores_an_infinite_neighbor_without_weight() {
+        assert_eq!(quantile(&mut [f64::INFINITY, 2.0, 1.0], 0.5), Some(2.0));
     }
 
     #[test]

@@ -14,6 +14,7 @@ use super::errors::{
 };
 use super::exact_positions::{ReferenceVertex, reference_vertices, widen};
 use super::motion::WorkloadMotion;
+use super::timing::quantile;
 use super::variant::Variant;
 use super::workloads::{Workload, with_deformation};
 use modalcast_compute::reference;
@@ -343,7 +344,7 @@ impl StateCondition {
         let count = all.len();
         all.retain(|condition| condition.is_finite());
         let largest = all.iter().copied().fold(0.0, f64::max);
-        Self { largest, infinite: (count - all.len()) as u64, median: median(&mut all) }
+        Self { largest, infinite: (count - all.len()) as u64, median: quantile(&mut all, 0.5) }
     }
 }
 
@@ -363,14 +364,9 @@ impl ConditionAccumulator {
     }
 
     fn condition(mut self) -> ConditionNumbers {
-        let median = median(&mut self.medians).unwrap_or(0.0);
+        let median = quantile(&mut self.medians, 0.5).unwrap_or(0.0);
         ConditionNumbers { largest: self.largest, median, infinite: self.infinite }
     }
-}
-
-fn median(numbers: &mut [f64]) -> Option<f64> {
-    let middle = numbers.len().checked_sub(1)? / 2;
-    Some(*numbers.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 #[cfg(test)]

@@ -6,10 +6,11 @@ use serde::Serialize;
 
 use super::bandwidth::{CODE, filled, launch, tile, variants};
 use super::kernel_benchmark::KernelBenchmark;
-use super::timer::{Cache, EventPair, Timing, empty_replay, gigabytes_per_second, time};
+use super::timer::{EventPair, empty_replay, gigabytes_per_second, time};
+use crate::timing::{CacheState, Timing};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::{DeviceBuffer, PinnedBuffer, PinnedUse};
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result, fault_in, invalid};
 
 /// Largest buffer of `copy` and `read`, bytes.
 const LARGEST: u64 = 4 << 30;
@@ -51,7 +52,7 @@ pub fn roofs(device: &Device) -> Result<Roofs> {
             if function == "copy" {
                 stream.check(device, &from, &to)?;
             }
-            let timing = time(device, &stream, Cache::Warm, REPLAYS)?;
+            let timing = time(device, &stream, CacheState::Warm, REPLAYS)?;
             best = best.max(gigabytes_per_second(moved, timing.median_us));
         }
         Ok(best)
@@ -147,7 +148,8 @@ fn pinned(device: &Device) -> Result<(f64, f64)> {
                 times.push(us);
             }
         }
-        Ok(gigabytes_per_second(PINNED as u64, Timing::of(times)?.median_us))
+        let timing = Timing::of(times).ok_or_else(|| invalid("replays", "at least 1", 0))?;
+        Ok(gigabytes_per_second(PINNED as u64, timing.median_us))
     };
     // SAFETY: both sides have the bytes of `host`. Reading the span waits for each copy, before the next one and before
     // either side is dropped.

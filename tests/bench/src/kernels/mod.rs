@@ -39,5 +39,5 @@ pub use memory_roofs::{Roofs, roofs};
 pub use overlap::{HostWrite, Overlap, host_writes, overlap};
 pub use raster::{RasterBenchmark, RasterCounts, RasterMesh};
 pub use thesis::{KernelSplit, LaneCounts, ThesisBenchmark, count_lanes, idle_lanes_per_warp};
-pub use timer::{Cache, Timing, empty_replay, gigabytes_per_second, time};
+pub use timer::{empty_replay, gigabytes_per_second, time};
 pub use upload_time::ingest;

@@ -12,7 +12,8 @@ use std::time::Instant;
 
 use serde::Serialize;
 
-use super::timer::{EventPair, Timing};
+use super::timer::EventPair;
+use crate::timing::{Timing, quantile};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::{PinnedBuffer, PinnedUse};
 use modalcast_compute::gpu::step_input::{
@@ -225,8 +226,8 @@ fn since(begin: Instant) -> f64 {
     begin.elapsed().as_secs_f64() * 1e6
 }
 
-fn median(times: Vec<f64>) -> f64 {
-    Timing::of(times).map_or(f64::NAN, |timing| timing.median_us)
+fn median(mut times: Vec<f64>) -> f64 {
+    quantile(&mut times, 0.5).unwrap_or(f64::NAN)
 }
 
 /// Times of copying `bytes` to pinned, write-combined memory, microseconds.
@@ -256,7 +257,8 @@ pub fn host_writes(device: &Device, replays: usize) -> Result<Vec<HostWrite>> {
                 copy(to, from);
                 since(begin)
             };
-            Timing::of((0..replays).map(once).collect()).map(|timing| timing.median_us)
+            let timing = Timing::of((0..replays).map(once).collect());
+            timing.map(|timing| timing.median_us).ok_or_else(|| invalid("replays", "at least 1", 0))
         };
         Ok(HostWrite {
             bytes: bytes as u64,

@@ -4,10 +4,10 @@ use std::time::{Duration, Instant};
 
 use cudarc::driver::sys::{CUdevice_attribute, CUevent_flags};
 use cudarc::driver::{CudaEvent, CudaFunction, CudaGraph, LaunchConfig, PushKernelArg as _};
-use serde::Serialize;
 
 use super::bandwidth;
 use super::kernel_benchmark::KernelBenchmark;
+use crate::timing::{CacheState, Timing};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::{DeviceBuffer, capture};
 use modalcast_model::error::{Result, fault_in, invalid};
@@ -28,57 +28,22 @@ const WARM_UP: Duration = Duration::from_millis(30);
 /// Size of the buffer that the cold sweep reads, in multiples of the L2 size.
 const SWEEPS: u64 = 4;
 
-/// State of the L2 cache when a replay begins.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Cache {
-    /// The previous replay's data.
-    Warm,
-    /// No data of the trial: between replays, outside the timed span, a buffer several times the size of the L2 is
-    /// read. It is read rather than written, so that the trial does not pay for writing back dirty lines.
-    Cold,
-}
-
-/// Times of one step, microseconds.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Timing {
-    pub median_us: f64,
-    /// The first and the third quartile.
-    pub q1_us: f64,
-    pub q3_us: f64,
-    pub replays: usize,
-}
-
-impl Timing {
-    /// Median and quartiles of times in any order, with linear interpolation between neighbors.
-    ///
-    /// # Errors
-    /// `Invalid` when `times_us` is empty.
-    pub fn of(mut times_us: Vec<f64>) -> Result<Self> {
-        if times_us.is_empty() {
-            return Err(invalid("replays", "at least 1", 0));
-        }
-        times_us.sort_by(f64::total_cmp);
-        let at = |part: f64| {
-            let place = part * (times_us.len() - 1) as f64;
-            let (below, above) = (place.floor() as usize, place.ceil() as usize);
-            times_us[below] + (times_us[above] - times_us[below]) * place.fract()
-        };
-        Ok(Self { median_us: at(0.5), q1_us: at(0.25), q3_us: at(0.75), replays: times_us.len() })
-    }
-}
-
 /// Times a trial's step: one CUDA graph per turn, replayed in rotation, each replay between two events.
 ///
 /// # Errors
 /// `Invalid` when `replays` is 0; `Unavailable` when NVRTC is missing; `Fault` when the device fails or a launch cannot
 /// be captured.
-pub fn time(device: &Device, kernel_benchmark: &dyn KernelBenchmark, cache: Cache, replays: usize) -> Result<Timing> {
+pub fn time(
+    device: &Device,
+    kernel_benchmark: &dyn KernelBenchmark,
+    cache: CacheState,
+    replays: usize,
+) -> Result<Timing> {
     if replays == 0 {
         return Err(invalid("replays", "at least 1", 0));
     }
     let hold = StreamDelay::new(device)?;
-    let sweep = matches!(cache, Cache::Cold).then(|| L2Flush::new(device)).transpose()?;
+    let sweep = matches!(cache, CacheState::Cold).then(|| L2Flush::new(device)).transpose()?;
     // The first launch is outside of a graph: it loads code and allocates workspaces, neither of which a capture
     // allows.
     kernel_benchmark.launch(device, 0)?;
@@ -104,7 +69,7 @@ pub fn time(device: &Device, kernel_benchmark: &dyn KernelBenchmark, cache: Cach
             times.push(span.microseconds()?);
         }
     }
-    Timing::of(times)
+    Timing::of(times).ok_or_else(|| invalid("replays", "at least 1", 0))
 }
 
 /// Times a graph with one empty kernel: the lower limit of any step's time.
@@ -128,7 +93,7 @@ pub fn empty_replay(device: &Device, replays: usize) -> Result<Timing> {
         }
     }
     let nothing = Nothing(device.function("nothing", bandwidth::CODE.source, &[])?);
-    time(device, &nothing, Cache::Warm, replays)
+    time(device, &nothing, CacheState::Warm, replays)
 }
 
 const SINGLE: LaunchConfig = LaunchConfig { grid_dim: (1, 1, 1), block_dim: (1, 1, 1), shared_mem_bytes: 0 };
@@ -217,17 +182,6 @@ pub fn gigabytes_per_second(bytes: u64, us: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn quartiles_do_not_depend_on_input_order() {
-        let timing = Timing::of(vec![5.0, 1.0, 4.0, 2.0, 3.0]).expect("times");
-        assert_eq!(timing, Timing { median_us: 3.0, q1_us: 2.0, q3_us: 4.0, replays: 5 });
-        let even = Timing::of(vec![4.0, 1.0, 2.0, 3.0]).expect("times");
-        assert_eq!(even, Timing { median_us: 2.5, q1_us: 1.75, q3_us: 3.25, replays: 4 });
-        let one = Timing::of(vec![7.0]).expect("a time");
-        assert_eq!((one.q1_us, one.median_us, one.q3_us), (7.0, 7.0, 7.0));
-        assert!(Timing::of(Vec::new()).is_err());
-    }
 
     #[test]
     fn rate_is_bytes_per_time() {

@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use super::kernel_benchmark::KernelBenchmark;
-use super::timer::{Cache, Timing, time};
+use super::timer::time;
+use crate::timing::{CacheState, Timing};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::step_input::{Header, InputPacker, InputPart, StagingBuffer, StepInputs};
 use modalcast_model::error::Result;
@@ -45,5 +46,5 @@ pub fn ingest(device: &Device, scene: &Arc<Scene>, state: &SceneState, replays: 
     inputs.write(&mut staging, &Header::default(), state)?;
     let bytes = inputs.bytes();
     let ingest = UploadBenchmark { inputs, staging };
-    Ok((bytes, time(device, &ingest, Cache::Warm, replays)?))
+    Ok((bytes, time(device, &ingest, CacheState::Warm, replays)?))
 }

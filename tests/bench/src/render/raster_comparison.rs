@@ -13,7 +13,7 @@ use super::workloads::{RenderWorkload, room, screen};
 use super::{RenderReportOptions, minimal_passes};
 use crate::kernels;
 use crate::kernels::{KernelBenchmark as _, RasterBenchmark, RasterCounts, RasterMesh};
-use crate::timing::{MIN_REPETITIONS, Timing};
+use crate::timing::{CacheState, MIN_REPETITIONS, Timing};
 use modalcast_compute::gpu::{Device, RasterVariant};
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Camera, CullMode, DrawRange, RenderSettings, Scene, SceneParts, SceneState, Viewport};
@@ -250,9 +250,8 @@ impl RasterSetup {
         let pair = |name: &str, raster: &RasterBenchmark| {
             let opengl = passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
             let opengl = opengl.ok_or_else(|| fault_in("raster")(format!("no pass {name}")))?;
-            let kernels::Timing { median_us, q1_us, q3_us, replays } =
-                kernels::time(device, raster, kernels::Cache::Warm, self.replays)?;
-            Ok(TimingPair { opengl, cuda: Timing { median_us, q1_us, q3_us, replays } })
+            let cuda = kernels::time(device, raster, CacheState::Warm, self.replays)?;
+            Ok(TimingPair { opengl, cuda })
         };
         Ok(PassPairs { depth: pair("shadow", ours[0])?, visibility: pair("visibility", ours[1])? })
     }

@@ -20,7 +20,7 @@ use super::harness::{HarnessScene, RenderHarness, Size};
 use super::measure::STILL;
 use super::workloads::{AnimatedScene, RenderWorkload};
 use crate::thesis_comparison::{line, rule};
-use crate::timing::MIN_REPETITIONS;
+use crate::timing::{MIN_REPETITIONS, quantile};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Camera, View};
@@ -144,8 +144,7 @@ fn loss(all: f64, left: f64) -> f64 {
 }
 
 fn median(mut list: Vec<f64>) -> f64 {
-    list.sort_by(f64::total_cmp);
-    list[list.len() / 2]
+    quantile(&mut list, 0.5).unwrap_or(f64::NAN)
 }
 
 /// Checks that frames through the full ring equal those that are drawn one by one, in order.

@@ -3,8 +3,9 @@
 use std::sync::Arc;
 
 use modalcast_bench::kernels::{
-    BatchMmaBenchmark, Cache, DeformerBenchmark, KernelBenchmark, StepOutputs, gigabytes_per_second, time,
+    BatchMmaBenchmark, DeformerBenchmark, KernelBenchmark, StepOutputs, gigabytes_per_second, time,
 };
+use modalcast_bench::timing::CacheState;
 use modalcast_compute::gpu::{Device, KernelKind};
 use modalcast_compute::storage::bound::{ErrorBoundInput, ShapeErrorModel};
 use modalcast_compute::storage::{QUAD, TILE_QUADS, TensorCoreError, TiledModes};
@@ -82,7 +83,7 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
 fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
     let device = Device::open(0).expect("a CUDA device");
     let measure = |trial: &dyn KernelBenchmark| {
-        let us = time(&device, trial, Cache::Warm, 200).expect("times").median_us;
+        let us = time(&device, trial, CacheState::Warm, 200).expect("times").median_us;
         let bytes: u64 = trial.bytes().iter().map(|(_, bytes)| bytes).sum();
         let rate = gigabytes_per_second(bytes, us);
         eprintln!("{}: {us:.1} us, {rate:.0} GB/s, {:?}", trial.name(), trial.kernels());
@@ -130,7 +131,7 @@ fn gpu_auto_mode_batches_where_it_is_faster() {
             let measured = |scene: &Arc<Scene>| {
                 let ours = DeformerBenchmark::new(&device, scene, std::slice::from_ref(&state), StepOutputs::Positions)
                     .expect("a trial");
-                time(&device, &ours, Cache::Warm, 100).expect("times").median_us
+                time(&device, &ours, CacheState::Warm, 100).expect("times").median_us
             };
             let [batch, alone] = [&together, &apart].map(measured);
             let chooses = modalcast_compute::gpu::plan(&chosen).kernel(KernelKind::Batch).is_some();

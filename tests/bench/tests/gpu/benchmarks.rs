@@ -3,9 +3,9 @@
 use std::sync::Arc;
 
 use modalcast_bench::kernels::{
-    Cache, CublasBenchmark, CublasMethod, KernelBenchmark, KernelSplit, Part, ThesisBenchmark, empty_replay, roofs,
-    time,
+    CublasBenchmark, CublasMethod, KernelBenchmark, KernelSplit, Part, ThesisBenchmark, empty_replay, roofs, time,
 };
+use modalcast_bench::timing::CacheState;
 use modalcast_compute::gpu::Device;
 use modalcast_model::error::Error;
 use modalcast_model::scene::{Bounds, Scene, SceneState};
@@ -68,7 +68,7 @@ fn check(device: &Device, scene: &Arc<Scene>, states: &[SceneState], trial: &dyn
         eprintln!("{name} turn {turn}: {error:.2e} of the diagonal");
     }
     // The last replay runs the last turn.
-    for cache in [Cache::Warm, Cache::Cold] {
+    for cache in [CacheState::Warm, CacheState::Cold] {
         trial.launch(device, 0).expect("launches");
         let timing = time(device, trial, cache, 10 * states.len()).unwrap_or_else(|error| panic!("{name}: {error}"));
         let positions = trial.positions(device).expect("copies");

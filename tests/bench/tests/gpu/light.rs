@@ -1,6 +1,7 @@
 //! Cost of computing light-space bounds in a step.
 
-use modalcast_bench::kernels::{Cache, DeformerBenchmark, KernelBenchmark, StepOutputs, time};
+use modalcast_bench::kernels::{DeformerBenchmark, KernelBenchmark, StepOutputs, time};
+use modalcast_bench::timing::CacheState;
 use modalcast_compute::gpu::Device;
 use modalcast_model::scene::Scene;
 
@@ -17,7 +18,7 @@ fn costs(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64
         let trial =
             DeformerBenchmark::new(&device, &scene, &[scenes::state(&scene, 1)], StepOutputs::Whole).expect("a trial");
         trial.kernels().iter().for_each(|facts| eprintln!("{name}, shadow {is_lit}: {facts:?}"));
-        time(&device, &trial, Cache::Warm, 300).expect("times").median_us
+        time(&device, &trial, CacheState::Warm, 300).expect("times").median_us
     });
     eprintln!("{name}: {:.2} us a step with light space, {:.2} us without", with[0], with[1]);
     with
