@@ -1,4 +1,4 @@
-//! Comparisons with the f64 twin. They are written such that a NaN cannot pass.
+//! Comparisons with the f64 reference. A NaN always fails.
 
 use modalcast_compute::gpu::CudaDeformer;
 use modalcast_compute::reference::{rigid_normals, rigid_tangents};
@@ -6,48 +6,54 @@ use modalcast_model::deform::{DeformSummary, Deformer};
 use modalcast_model::scene::{Bounds, Scene, SceneState};
 
 /// Largest accepted error of a position, relative to the scene's diagonal.
-pub(crate) const POSITION: f64 = 1e-5;
+pub(crate) const MAX_POSITION_ERROR: f64 = 1e-5;
 /// Largest accepted error of a component of a unit vector.
-pub(crate) const DIRECTION: f64 = 1e-5;
+pub(crate) const MAX_DIRECTION_ERROR: f64 = 1e-5;
 
-/// The largest error, or a description of the first number that exceeds `limit`. The limit is absolute.
-pub(crate) fn largest_error<const N: usize>(got: &[f32], want: &[[f64; N]], limit: f64) -> Result<f64, String> {
+/// The largest absolute error, or a description of the first number whose error exceeds `limit`.
+pub(crate) fn max_error<const N: usize>(got: &[f32], want: &[[f64; N]], limit: f64) -> Result<f64, String> {
     let want = want.as_flattened();
     if got.len() != want.len() {
-        return Err(format!("{} numbers, expected {}", got.len(), want.len()));
+        return Err(format!("expected {} numbers, got {}", want.len(), got.len()));
     }
-    let mut largest = 0.0_f64;
+    let mut max = 0.0_f64;
     for (index, (got, want)) in got.iter().zip(want).enumerate() {
         let error = (f64::from(*got) - want).abs();
-        let close = error <= limit;
-        if !close {
-            return Err(format!("[{}] component {} is {got}, expected {want} within {limit}", index / N, index % N));
+        let is_close = error <= limit;
+        if !is_close {
+            let (vector, component) = (index / N, index % N);
+            return Err(format!("[{vector}] component {component}: expected {want} within {limit}, got {got}"));
         }
-        largest = largest.max(error);
+        max = max.max(error);
     }
-    Ok(largest)
+    Ok(max)
 }
 
-/// Deforms a state and compares positions, bounds, normals and tangents with the twin.
-pub(crate) fn check(name: &str, scene: &Scene, state: &SceneState, deformer: &mut CudaDeformer) -> DeformSummary {
-    let deformed = deformer.deform(state).expect("deforms");
-    let surface = deformer.surface().expect("copies");
-    let want = modalcast_compute::reference::deform(scene, state);
+/// Deforms a state and asserts that positions, bounds, normals and tangents equal those of the reference.
+pub(crate) fn assert_equals_reference(
+    name: &str,
+    scene: &Scene,
+    state: &SceneState,
+    deformer: &mut CudaDeformer,
+) -> DeformSummary {
+    let summary = deformer.deform(state).expect("expected the step to succeed");
+    let surface = deformer.surface().expect("expected a surface");
+    let reference_positions = modalcast_compute::reference::deform(scene, state);
     let mut bounds = Bounds::EMPTY;
-    want.iter().for_each(|position| bounds.include(*position));
+    reference_positions.iter().for_each(|position_error| bounds.include(*position_error));
     let diagonal = bounds.diagonal().max(f64::from(f32::MIN_POSITIVE));
-    let position =
-        largest_error(&surface.positions, &want, POSITION * diagonal).unwrap_or_else(|e| panic!("{name}: {e}"));
-    let normal = largest_error(&surface.normals, &rigid_normals(scene, state), DIRECTION)
+    let position_error = max_error(&surface.positions, &reference_positions, MAX_POSITION_ERROR * diagonal)
+        .unwrap_or_else(|error| panic!("{name}: {error}"));
+    let normal_error = max_error(&surface.normals, &rigid_normals(scene, state), MAX_DIRECTION_ERROR)
         .unwrap_or_else(|error| panic!("{name}: normal {error}"));
-    let tangent = largest_error(&surface.tangents, &rigid_tangents(scene, state), DIRECTION)
+    let tangent_error = max_error(&surface.tangents, &rigid_tangents(scene, state), MAX_DIRECTION_ERROR)
         .unwrap_or_else(|error| panic!("{name}: tangent {error}"));
-    assert_eq!(deformed.bounds, bounds_of(&surface.positions), "{name}: bounds are those of the positions");
+    assert_eq!(summary.bounds, bounds_of(&surface.positions), "{name}: expected the bounds of the positions");
     eprintln!(
-        "{name}: position {:.2e} of the diagonal, normal {normal:.2e}, tangent {tangent:.2e}",
-        position / diagonal
+        "{name}: error of positions {:.2e} of the diagonal, of normals {normal_error:.2e}, of tangents {tangent_error:.2e}",
+        position_error / diagonal
     );
-    deformed
+    summary
 }
 
 fn bounds_of(positions: &[f32]) -> Bounds {
@@ -59,15 +65,15 @@ fn bounds_of(positions: &[f32]) -> Bounds {
 }
 
 /// Whether two lists are equal bit by bit.
-pub(crate) fn same_bits(got: &[f32], want: &[f32]) -> bool {
+pub(crate) fn have_equal_bits(got: &[f32], want: &[f32]) -> bool {
     got.len() == want.len() && got.iter().zip(want).all(|(got, want)| got.to_bits() == want.to_bits())
 }
 
 #[test]
-fn judge_refuses_wrong_missing_and_non_finite_numbers() {
+fn max_error_rejects_wrong_missing_and_non_finite_numbers() {
     let want = [[1.0, 2.0], [3.0, 4.0]];
-    assert_eq!(largest_error(&[1.0, 2.0, 3.0, 4.0], &want, 1e-5), Ok(0.0));
-    let slightly_off = largest_error(&[1.0, 2.0, 3.0, 4.000_005], &want, 1e-5).expect("within the limit");
+    assert_eq!(max_error(&[1.0, 2.0, 3.0, 4.0], &want, 1e-5), Ok(0.0));
+    let slightly_off = max_error(&[1.0, 2.0, 3.0, 4.000_005], &want, 1e-5).expect("within the limit");
     assert!(slightly_off > 1e-6);
     let wrong: [&[f32]; 7] = [
         &[1.0, 2.0, 3.0, 4.1],
@@ -79,10 +85,10 @@ fn judge_refuses_wrong_missing_and_non_finite_numbers() {
         &[],
     ];
     for got in wrong {
-        assert!(largest_error(got, &want, 1e-5).is_err(), "{got:?} passed");
+        assert!(max_error(got, &want, 1e-5).is_err(), "{got:?} passed");
     }
-    assert!(largest_error(&[1.0], &[[f64::NAN]], 1e-5).is_err(), "a NaN is not near anything");
-    assert!(same_bits(&[0.0], &[0.0]));
-    assert!(!same_bits(&[0.0], &[-0.0]));
-    assert!(!same_bits(&[0.0], &[]));
+    assert!(max_error(&[1.0], &[[f64::NAN]], 1e-5).is_err(), "expected a NaN in the reference to fail");
+    assert!(have_equal_bits(&[0.0], &[0.0]));
+    assert!(!have_equal_bits(&[0.0], &[-0.0]));
+    assert!(!have_equal_bits(&[0.0], &[]));
 }

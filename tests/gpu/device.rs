@@ -1,4 +1,4 @@
-//! The device: struct layouts agree with the host, missing devices are refused, and memory is released.
+//! The CUDA device: struct layouts equal those of the host, unknown ordinals are rejected, and memory is released.
 
 use modalcast_compute::gpu::{CudaDeformer, Device, device_layout_values, layout_constants, probe};
 use modalcast_model::deform::Deformer;
@@ -9,50 +9,50 @@ use crate::scenes;
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_host_and_device_agree_on_every_size_and_offset() {
-    let device = Device::open(0).expect("a CUDA device");
-    let values = device_layout_values(&device).expect("reports");
-    for (agreement, device) in layout_constants().iter().zip(&values) {
-        assert_eq!(agreement.host, *device, "{}", agreement.expression);
+    let device = Device::open(0).expect("expected a CUDA device");
+    let values = device_layout_values(&device).expect("expected the layout report");
+    for (constant, device_value) in layout_constants().iter().zip(&values) {
+        assert_eq!(constant.host, *device_value, "{}", constant.expression);
     }
     assert_eq!(values.len(), layout_constants().len());
-    assert!(values.iter().any(|value| *value > 0), "the report was written");
+    assert!(values.iter().any(|value| *value > 0), "expected nonzero values");
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_probe_names_the_opened_device() {
-    let (probe, device) = (probe(), Device::open(0).expect("a CUDA device"));
+    let (probe, device) = (probe(), Device::open(0).expect("expected a CUDA device"));
     assert_eq!(probe.devices[0].name, device.name());
     assert_eq!(probe.devices[0].capability, format!("{}.{}", device.capability().0, device.capability().1));
     assert_eq!((probe.cuda_problem, probe.nvrtc_problem), (None, None));
-    device.check_compiler().expect("NVRTC fits the driver");
+    device.check_compiler().expect("expected an NVRTC version that the driver supports");
     assert!(probe.driver.is_some() && probe.cuda.is_some() && probe.nvrtc.is_some());
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_ordinal_beyond_the_last_device_is_refused() {
-    let refusal = Device::open(probe().devices.len()).expect_err("beyond the last");
-    assert!(matches!(&refusal, Error::Unavailable { what: "CUDA device", .. }), "{refusal}");
+fn gpu_ordinal_beyond_the_last_device_is_rejected() {
+    let error = Device::open(probe().devices.len()).expect_err("expected an unknown-device error");
+    assert!(matches!(&error, Error::Unavailable { what: "CUDA device", .. }), "{error}");
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_dropped_deformers_release_their_memory() {
-    let device = Device::open(0).expect("a CUDA device");
-    let scene = scenes::scene(&[(20_000, 30)], 2, true, false);
-    let state = scenes::state(&scene, 1);
-    let once = || {
-        let mut deformer = CudaDeformer::new(&device, &scene, None).expect("a deformer");
-        deformer.deform(&state).expect("deforms");
-        deformer.surface().expect("copies");
+    let device = Device::open(0).expect("expected a CUDA device");
+    let scene = scenes::random_scene(&[(20_000, 30)], 2, true, false);
+    let state = scenes::random_state(&scene, 1);
+    let deform_once = || {
+        let mut deformer = CudaDeformer::new(&device, &scene, None).expect("expected a CUDA deformer");
+        deformer.deform(&state).expect("expected the step to succeed");
+        deformer.surface().expect("expected a surface");
         deformer.plan().total_bytes()
     };
-    let bytes = once();
-    let (before, _) = device.memory().expect("memory");
+    let bytes = deform_once();
+    let (before, _) = device.memory().expect("expected the free memory");
     for _ in 0..200 {
-        once();
+        deform_once();
     }
-    let (after, _) = device.memory().expect("memory");
+    let (after, _) = device.memory().expect("expected the free memory");
     assert!((before as u64) < after as u64 + 8 * bytes, "{before} bytes free before, {after} after 200 scenes");
 }

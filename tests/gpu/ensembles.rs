@@ -6,22 +6,28 @@ use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState,
 
 use crate::scenes::{self, Random};
 
-/// Parts with `count` domains of one shape and this deformation.
-pub(crate) fn ensemble((vertices, rank, count): (usize, usize, usize), deformation: DeformationSettings) -> SceneParts {
-    let mut parts = scenes::parts(vec![scenes::shape(&mut Random(7), vertices, rank)]);
-    parts.domains = vec![scenes::domain(0, 0); count];
+/// Parts of a scene with `domains` domains of one random shape.
+pub(crate) fn instanced_parts(
+    vertices: usize,
+    rank: usize,
+    domains: usize,
+    deformation: DeformationSettings,
+) -> SceneParts {
+    let mut parts = scenes::parts_of_shapes(vec![scenes::random_shape(&mut Random(7), vertices, rank)]);
+    parts.domains = vec![scenes::new_domain(0, 0); domains];
     parts.deformation = deformation;
     parts
 }
 
-pub(crate) fn stored(storage: StorageType) -> DeformationSettings {
+pub(crate) fn with_storage(storage: StorageType) -> DeformationSettings {
     DeformationSettings { storage, ..DeformationSettings::default() }
 }
 
-pub(crate) fn made(parts: SceneParts) -> Arc<Scene> {
-    Scene::new(parts).expect("a scene")
+pub(crate) fn build_scene(parts: SceneParts) -> Arc<Scene> {
+    Scene::new(parts).expect("expected a valid scene")
 }
 
-pub(crate) fn states(scene: &Scene) -> Vec<SceneState> {
-    (1..=3).map(|seed| scenes::state(scene, seed)).collect()
+/// Three random states.
+pub(crate) fn random_states(scene: &Scene) -> Vec<SceneState> {
+    (1..=3).map(|seed| scenes::random_state(scene, seed)).collect()
 }

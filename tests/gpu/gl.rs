@@ -10,7 +10,7 @@ use modalcast_model::raster::{GlBuffer, GlBufferOwner};
 use modalcast_render::{DevicePreference, Renderer};
 
 /// The context of a renderer, which stays current on this thread.
-pub(crate) struct Gl {
+pub(crate) struct GlContext {
     pub(crate) renderer: Renderer,
     api: Rc<glow::Context>,
 }
@@ -22,8 +22,8 @@ struct OwnedBuffer {
 }
 
 impl std::fmt::Debug for OwnedBuffer {
-    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(out, "buffer {}", self.name)
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(formatter, "buffer {}", self.name)
     }
 }
 
@@ -36,68 +36,68 @@ impl GlBufferOwner for OwnedBuffer {
 impl Drop for OwnedBuffer {
     fn drop(&mut self) {
         // SAFETY: the context is current on this thread. OpenGL ignores names that it does not know.
-        unsafe { self.api.delete_buffer(native(self.name)) };
+        unsafe { self.api.delete_buffer(native_buffer(self.name)) };
     }
 }
 
-impl Gl {
+impl GlContext {
     pub(crate) fn open() -> Self {
-        let renderer = Renderer::open(DevicePreference::Cuda(0)).expect("OpenGL on the CUDA device");
-        // SAFETY: loading runs the initializers of libEGL. They have run already, because the renderer has loaded the
-        // library.
-        let egl = unsafe { khronos_egl::DynamicInstance::<khronos_egl::EGL1_4>::load_required() }.expect("EGL");
-        let address = |name: &str| egl.get_proc_address(name).map_or(std::ptr::null(), |found| found as *const _);
+        let renderer =
+            Renderer::open(DevicePreference::Cuda(0)).expect("expected an OpenGL context on the CUDA device");
+        // SAFETY: loading runs the initializers of libEGL. They have already run, because the renderer loaded libEGL.
+        let egl =
+            unsafe { khronos_egl::DynamicInstance::<khronos_egl::EGL1_4>::load_required() }.expect("expected libEGL");
+        let address = |name: &str| egl.get_proc_address(name).map_or(std::ptr::null(), |function| function as *const _);
         // SAFETY: the renderer's context is current on this thread and outlives `api`.
         let api = unsafe { glow::Context::from_loader_function(address) };
         Self { renderer, api: Rc::new(api) }
     }
 
-    /// A buffer that contains these numbers.
-    pub(crate) fn filled<T: bytemuck::Pod>(&self, list: &[T]) -> GlBuffer {
-        let buffer = self.room(size_of_val(list) as u64);
-        self.write(&buffer, list);
+    /// Creates a buffer with these items.
+    pub(crate) fn create_buffer_from<T: bytemuck::Pod>(&self, items: &[T]) -> GlBuffer {
+        let buffer = self.create_buffer(size_of_val(items) as u64);
+        self.write(&buffer, items);
         buffer
     }
 
-    /// A buffer in which all bits are one.
-    pub(crate) fn room(&self, bytes: u64) -> GlBuffer {
+    /// Creates a buffer of at least 16 bytes in which all bits are one.
+    pub(crate) fn create_buffer(&self, bytes: u64) -> GlBuffer {
         let ones = vec![u8::MAX; bytes.max(16) as usize];
         // SAFETY: the context is current on this thread, as in all calls below.
         let name = unsafe {
-            let buffer = self.api.create_buffer().expect("a buffer");
+            let buffer = self.api.create_buffer().expect("expected a buffer");
             self.api.bind_buffer(glow::COPY_WRITE_BUFFER, Some(buffer));
             self.api.buffer_data_u8_slice(glow::COPY_WRITE_BUFFER, &ones, glow::DYNAMIC_DRAW);
             buffer.0.get()
         };
-        self.handle(name, ones.len() as u64)
+        self.buffer_handle(name, ones.len() as u64)
     }
 
-    /// A handle that owns the buffer of this name, if there is one.
-    pub(crate) fn handle(&self, name: u32, bytes: u64) -> GlBuffer {
+    /// A handle of `bytes` bytes that owns the buffer of this name, which may be unknown to OpenGL.
+    pub(crate) fn buffer_handle(&self, name: u32, bytes: u64) -> GlBuffer {
         GlBuffer { name, bytes, owner: Rc::new(OwnedBuffer { api: Rc::clone(&self.api), name }) }
     }
 
-    pub(crate) fn write<T: bytemuck::Pod>(&self, to: &GlBuffer, list: &[T]) {
-        // SAFETY: as above; OpenGL refuses writes beyond the end of the buffer.
+    pub(crate) fn write<T: bytemuck::Pod>(&self, buffer: &GlBuffer, items: &[T]) {
+        // SAFETY: as above; OpenGL rejects writes beyond the end of the buffer.
         unsafe {
-            self.api.bind_buffer(glow::COPY_WRITE_BUFFER, Some(native(to.name)));
-            self.api.buffer_sub_data_u8_slice(glow::COPY_WRITE_BUFFER, 0, bytemuck::cast_slice(list));
+            self.api.bind_buffer(glow::COPY_WRITE_BUFFER, Some(native_buffer(buffer.name)));
+            self.api.buffer_sub_data_u8_slice(glow::COPY_WRITE_BUFFER, 0, bytemuck::cast_slice(items));
         }
     }
 
-    /// Reads the first `count` numbers of a buffer, in the order of OpenGL commands. The call does not synchronize with
-    /// CUDA.
-    pub(crate) fn read<T: bytemuck::Pod>(&self, from: &GlBuffer, count: usize) -> Vec<T> {
-        let mut list = vec![T::zeroed(); count];
-        // SAFETY: as above; `list` has exactly the requested size.
+    /// Reads the first `count` items of a buffer, ordered after earlier OpenGL commands. Does not synchronize with CUDA.
+    pub(crate) fn read<T: bytemuck::Pod>(&self, buffer: &GlBuffer, count: usize) -> Vec<T> {
+        let mut items = vec![T::zeroed(); count];
+        // SAFETY: as above; `items` has exactly the requested size.
         unsafe {
-            self.api.bind_buffer(glow::COPY_READ_BUFFER, Some(native(from.name)));
-            self.api.get_buffer_sub_data(glow::COPY_READ_BUFFER, 0, bytemuck::cast_slice_mut(&mut list));
+            self.api.bind_buffer(glow::COPY_READ_BUFFER, Some(native_buffer(buffer.name)));
+            self.api.get_buffer_sub_data(glow::COPY_READ_BUFFER, 0, bytemuck::cast_slice_mut(&mut items));
         }
-        list
+        items
     }
 }
 
-fn native(name: u32) -> glow::NativeBuffer {
-    glow::NativeBuffer(NonZeroU32::new(name).expect("a name"))
+fn native_buffer(name: u32) -> glow::NativeBuffer {
+    glow::NativeBuffer(NonZeroU32::new(name).expect("expected a name"))
 }

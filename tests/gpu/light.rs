@@ -1,29 +1,31 @@
-//! Light-space bounds from the kernel `bounds`, compared with its twin for each tile.
+//! Light-space bounds from the kernel `bounds`, compared with bounds computed from the positions of each tile.
 
 use modalcast_model::deform::Deformer;
 use modalcast_model::scene::{DeformationSettings, SceneState};
 
-use crate::both::light::{self, TILE, along, beyond, coil, reach};
-use crate::both::scene_of;
-use crate::scenes::{self};
-use crate::twins::deformer;
+use crate::common::light_bounds::{
+    self, TILE_VERTICES, bounds_in_light_space, coil_shape, coordinate_magnitude, max_excess,
+};
+use crate::common::scene_of_shapes;
+use crate::reference_comparison::cuda_deformer;
+use crate::scenes;
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_light_bounds_contain_every_vertex() {
-    light::every_vertex_is_held(deformer);
+    light_bounds::check_containment(cuda_deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_thin_scene_is_fitted_closely_in_light_space() {
-    light::a_thin_scene_is_fitted_closely(deformer);
+    light_bounds::check_tightness(cuda_deformer);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_light_bounds_need_a_shadow_and_report_overflow() {
-    light::nothing_is_measured_without_a_shadow_and_overflow_is_told(deformer);
+    light_bounds::check_missing_shadow_and_overflow(cuda_deformer);
 }
 
 /// The scene has one domain, so each tile is 128 consecutive vertices.
@@ -31,18 +33,32 @@ fn gpu_light_bounds_need_a_shadow_and_report_overflow() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_light_bounds_equal_those_of_tile_boxes() {
     for vertices in [2, 31, 32, 33, 127, 128, 129, 257, 5000, 16085, 200_000] {
-        let scene = scene_of(vec![coil(vertices, 3)], 1, DeformationSettings::default(), false);
-        let mut deformer = deformer(&scene);
+        let scene = scene_of_shapes(vec![coil_shape(vertices, 3)], 1, DeformationSettings::default(), false);
+        let mut deformer = cuda_deformer(&scene);
         for seed in 0..3 {
-            let deformed = deformer.deform(&scenes::state(&scene, seed)).expect("deforms");
-            let (light, positions) =
-                (deformed.light.expect("measured"), &deformer.surface().expect("copies").positions);
-            let (want, allowed) = (along(&scene, positions, TILE), 4e-7 * reach(&deformed.bounds));
-            let (inside, outside) = (beyond(&light, &want), beyond(&want, &light));
-            assert!(inside <= 0.0 && outside <= allowed, "n {vertices}: {light:?}, expected {want:?}");
+            let summary = deformer.deform(&scenes::random_state(&scene, seed)).expect("expected the step to succeed");
+            let (light, positions) = (
+                summary.light.expect("expected light-space bounds"),
+                &deformer.surface().expect("expected a surface").positions,
+            );
+            let (expected, tolerance) =
+                (bounds_in_light_space(&scene, positions, TILE_VERTICES), 4e-7 * coordinate_magnitude(&summary.bounds));
+            let (missing, excess) = (max_excess(&light, &expected), max_excess(&expected, &light));
+            assert!(missing <= 0.0 && excess <= tolerance, "n {vertices}: expected {expected:?}, got {light:?}");
         }
-        let other = deformer.deform(&SceneState::rest(&scene)).expect("deforms").light.expect("measured");
-        let moved = deformer.deform(&scenes::state(&scene, 0)).expect("deforms").light.expect("measured");
-        assert!(beyond(&other, &moved).max(beyond(&moved, &other)) > 1e-3, "control");
+        let rest_bounds = deformer
+            .deform(&SceneState::rest(&scene))
+            .expect("expected the step to succeed")
+            .light
+            .expect("expected light-space bounds");
+        let moved_bounds = deformer
+            .deform(&scenes::random_state(&scene, 0))
+            .expect("expected the step to succeed")
+            .light
+            .expect("expected light-space bounds");
+        assert!(
+            max_excess(&rest_bounds, &moved_bounds).max(max_excess(&moved_bounds, &rest_bounds)) > 1e-3,
+            "negative control"
+        );
     }
 }

@@ -1,11 +1,11 @@
-//! The CUDA deformer compared with its f64 twin on a real device. Tests that need a device are ignored by default; run
-//! them with `--include-ignored --test-threads=1`. The binary needs no build tree; real inputs come from
+//! Tests of the CUDA deformer and the CUDA rasterizer. They are ignored by default because they need a GPU; run them with
+//! `--include-ignored --test-threads=1`. The binary needs no build tree. Real inputs are read from the folder
 //! MODALCAST_DATA.
 
 mod accuracy;
 mod batch;
-#[path = "../both/mod.rs"]
-mod both;
+#[path = "../common/mod.rs"]
+mod common;
 mod device;
 #[expect(dead_code, reason = "shared with the benchmarks")]
 mod ensembles;
@@ -18,6 +18,6 @@ mod overlap;
 mod raster_backends;
 mod raster_gl;
 mod real;
+mod reference_comparison;
 mod scenes;
 mod stability;
-mod twins;

@@ -1,4 +1,4 @@
-//! Exact normals and tangents of the CUDA deformer equal those of the f64 twin for the same positions.
+//! Exact normals and tangents of the CUDA deformer equal those of the f64 reference for the same positions.
 
 use std::sync::Arc;
 
@@ -9,69 +9,77 @@ use modalcast_model::domain::{Corners, Mesh, Modes, Shape, Transform};
 use modalcast_model::scene::{NormalMethod, Scene, SceneState};
 use nalgebra::Vector3;
 
-use crate::accuracy::{DIRECTION, largest_error, same_bits};
-use crate::scenes::{self, NORMAL_MAPPED, Random, domain};
-use crate::twins::deformer;
+use crate::accuracy::{MAX_DIRECTION_ERROR, have_equal_bits, max_error};
+use crate::reference_comparison::cuda_deformer;
+use crate::scenes::{self, NORMAL_MAPPED, Random, new_domain};
 
-/// A tube of `around` x `rows` vertices with a seam, a hard ring every fifth row, and `rank` smooth modes.
-fn tube(random: &mut Random, around: u32, rows: u32, rank: usize) -> Shape {
-    let angle = |column: u32| column as f32 / around as f32 * std::f32::consts::TAU;
-    let place = |row: u32, column: u32| {
+/// A tube of `columns` x `rows` vertices with a texture seam, a hard edge along every fifth row, and `rank` smooth modes.
+fn tube(random: &mut Random, columns: u32, rows: u32, rank: usize) -> Shape {
+    let column_angle = |column: u32| column as f32 / columns as f32 * std::f32::consts::TAU;
+    let position = |row: u32, column: u32| {
         let radius = 1.0 + 0.2 * (row as f32).sin();
-        [radius * angle(column).cos(), 6.0 * row as f32 / rows as f32 - 3.0, -radius * angle(column).sin()]
+        [
+            radius * column_angle(column).cos(),
+            6.0 * row as f32 / rows as f32 - 3.0,
+            -radius * column_angle(column).sin(),
+        ]
     };
-    let rest: Vec<_> = (0..rows).flat_map(|row| (0..around).map(move |column| place(row, column))).collect();
+    let rest: Vec<_> = (0..rows).flat_map(|row| (0..columns).map(move |column| position(row, column))).collect();
     let mut corners = Corners::default();
-    for (row, lower) in (0..rows).flat_map(|row| [(row, true), (row, false)]) {
-        let tilt = if row % 5 == 0 && !lower { 0.4 } else { 0.0 };
-        for column in 0..=around {
-            let turn = angle(column % around);
-            corners.vertices.push(row * around + column % around);
-            corners.normals.push([turn.cos(), tilt, -turn.sin()]);
-            corners.uvs.push([column as f32 / around as f32, row as f32 / rows as f32]);
+    for (row, is_lower) in (0..rows).flat_map(|row| [(row, true), (row, false)]) {
+        let normal_y = if row % 5 == 0 && !is_lower { 0.4 } else { 0.0 };
+        for column in 0..=columns {
+            let angle = column_angle(column % columns);
+            corners.vertices.push(row * columns + column % columns);
+            corners.normals.push([angle.cos(), normal_y, -angle.sin()]);
+            corners.uvs.push([column as f32 / columns as f32, row as f32 / rows as f32]);
         }
     }
     let triangle = |row: u32, column: u32| {
-        let (low, high) = ((2 * row + 1) * (around + 1) + column, (2 * row + 2) * (around + 1) + column);
-        [[low, low + 1, high + 1], [low, high + 1, high]]
+        let (lower_corner, upper_corner) =
+            ((2 * row + 1) * (columns + 1) + column, (2 * row + 2) * (columns + 1) + column);
+        [[lower_corner, lower_corner + 1, upper_corner + 1], [lower_corner, upper_corner + 1, upper_corner]]
     };
-    let triangles = (0..rows - 1).flat_map(|row| (0..around).flat_map(move |column| triangle(row, column))).collect();
+    let triangles = (0..rows - 1).flat_map(|row| (0..columns).flat_map(move |column| triangle(row, column))).collect();
     let mut column = Vec::with_capacity(3 * rest.len() * rank);
     for _ in 0..rank {
-        let (waves, amounts) = (random.triple(), random.triple());
-        let phase = |place: &[f32; 3]| (0..3).map(|axis| 2.0 * waves[axis] * place[axis]).sum::<f32>();
-        let size = 0.3 / (rank as f32).sqrt();
-        column.extend(rest.iter().flat_map(|place| amounts.map(|amount| size * amount * phase(place).sin())));
+        let (wave_vector, amplitudes) = (random.next_triple(), random.next_triple());
+        let phase = |position: &[f32; 3]| (0..3).map(|axis| 2.0 * wave_vector[axis] * position[axis]).sum::<f32>();
+        let scale = 0.3 / (rank as f32).sqrt();
+        column.extend(
+            rest.iter().flat_map(|position| amplitudes.map(|amplitude| scale * amplitude * phase(position).sin())),
+        );
     }
-    let modes = Modes::from_columns(3 * rest.len(), rank, column).expect("modes");
-    Shape::new(Mesh::new(rest, corners, triangles).expect("a tube"), modes).expect("a shape")
+    let modes = Modes::from_columns(3 * rest.len(), rank, column).expect("expected valid modes");
+    Shape::new(Mesh::new(rest, corners, triangles).expect("expected a valid mesh"), modes)
+        .expect("expected a valid shape")
 }
 
-/// A scene of shapes with exact normals, `instances` domains per shape, and optional normal maps.
-fn scene_of(shapes: Vec<Shape>, instances: usize, normal_maps: bool, rigid: bool) -> Arc<Scene> {
+/// A scene with exact normals, `instances` domains per shape, and optional normal maps.
+fn scene_with_exact_normals(shapes: Vec<Shape>, instances: usize, normal_maps: bool, rigid: bool) -> Arc<Scene> {
     let count = shapes.len();
-    let mut parts = scenes::parts(shapes);
+    let mut parts = scenes::parts_of_shapes(shapes);
     parts.deformation.normals = NormalMethod::Exact;
     parts.rigid_transforms = rigid;
     let material = if normal_maps { NORMAL_MAPPED } else { 0 };
-    parts.domains = (0..instances * count).map(|index| domain(index % count, material)).collect();
-    Scene::new(parts).expect("a scene")
+    parts.domains = (0..instances * count).map(|index| new_domain(index % count, material)).collect();
+    Scene::new(parts).expect("expected a valid scene")
 }
 
-/// Normals and tangents of the device, and those of the twin for the device's positions.
-struct Both {
+/// Normals and tangents of the device, and those of the reference for the device's positions.
+struct NormalComparison {
     normals: Vec<f32>,
     tangents: Vec<f32>,
     want_normals: Vec<[f64; 3]>,
     want_tangents: Vec<[f64; 4]>,
 }
 
-fn both(scene: &Scene, state: &SceneState, deformer: &mut CudaDeformer) -> Both {
-    deformer.deform(state).expect("deforms");
-    let surface = deformer.surface().expect("copies");
+fn compare_normals(scene: &Scene, state: &SceneState, deformer: &mut CudaDeformer) -> NormalComparison {
+    deformer.deform(state).expect("expected the step to succeed");
+    let surface = deformer.surface().expect("expected a surface");
     let positions: Vec<[f64; 3]> =
         surface.positions.chunks_exact(3).map(|place| [0, 1, 2].map(|axis| f64::from(place[axis]))).collect();
-    Both {
+    NormalComparison {
         normals: surface.normals.clone(),
         tangents: surface.tangents.clone(),
         want_normals: exact_normals(scene, state, &positions),
@@ -79,8 +87,8 @@ fn both(scene: &Scene, state: &SceneState, deformer: &mut CudaDeformer) -> Both 
     }
 }
 
-/// Largest angle between unit vectors of the device and of the twin, in degrees.
-fn largest_angle(got: &[f32], want: &[[f64; 3]]) -> f64 {
+/// Largest angle between unit vectors of the device and of the reference, in degrees.
+fn max_angle_degrees(got: &[f32], want: &[[f64; 3]]) -> f64 {
     let angle = |(got, want): (&[f32], &[f64; 3])| {
         let (got, want) = (Vector3::new(got[0], got[1], got[2]).cast::<f64>(), Vector3::from(*want));
         let angle = got.cross(&want).norm().atan2(got.dot(&want)).to_degrees();
@@ -89,35 +97,37 @@ fn largest_angle(got: &[f32], want: &[[f64; 3]]) -> f64 {
     got.chunks_exact(3).zip(want).map(angle).fold(0.0, f64::max)
 }
 
-/// Compares the device with the twin, and with rigid normals as a control.
-fn check(name: &str, scene: &Scene, state: &SceneState, deformer: &mut CudaDeformer) {
-    let both = both(scene, state, deformer);
-    let normal = largest_error(&both.normals, &both.want_normals, DIRECTION);
-    let normal = normal.unwrap_or_else(|error| panic!("{name}: normal {error}"));
-    let tangent = largest_error(&both.tangents, &both.want_tangents, DIRECTION);
-    let tangent = tangent.unwrap_or_else(|error| panic!("{name}: tangent {error}"));
-    let rigid = largest_angle(&both.normals, &rigid_normals(scene, state));
-    assert!(rigid > 5.0, "{name}: rigid normals are only {rigid} degrees off");
-    let off = largest_angle(&both.normals, &both.want_normals);
-    eprintln!("{name}: normal {normal:.2e} ({off:.1e} degrees), tangent {tangent:.2e}; rigid ones {rigid:.1} degrees");
+/// Asserts that exact normals and tangents equal the reference. As a negative control, rigid normals differ.
+fn assert_equals_reference(name: &str, scene: &Scene, state: &SceneState, deformer: &mut CudaDeformer) {
+    let comparison = compare_normals(scene, state, deformer);
+    let normal_error = max_error(&comparison.normals, &comparison.want_normals, MAX_DIRECTION_ERROR);
+    let normal_error = normal_error.unwrap_or_else(|error| panic!("{name}: normal {error}"));
+    let tangent_error = max_error(&comparison.tangents, &comparison.want_tangents, MAX_DIRECTION_ERROR);
+    let tangent_error = tangent_error.unwrap_or_else(|error| panic!("{name}: tangent {error}"));
+    let rigid_angle = max_angle_degrees(&comparison.normals, &rigid_normals(scene, state));
+    assert!(rigid_angle > 5.0, "{name}: rigid normals are only {rigid_angle} degrees off");
+    let angle = max_angle_degrees(&comparison.normals, &comparison.want_normals);
+    eprintln!(
+        "{name}: error of normals {normal_error:.2e} ({angle:.1e} degrees), of tangents {tangent_error:.2e}; rigid {rigid_angle:.1} degrees"
+    );
 }
 
-/// Runs on the CPU deformer, so that the assumption is checked without a device: the scenes are far from rest, and far
-/// from half a turn, where f32 cannot determine the axis of a rotation.
+/// Checks the test scenes on the CPU: deformation rotates normals by at least 5 degrees, and by less than 150 degrees.
+/// Near 180 degrees, f32 cannot determine the axis of a rotation.
 #[test]
 fn test_scenes_bend_but_do_not_fold() {
     for (seed, around, rows, rank) in [(1, 16, 9, 3), (4, 24, 12, 3), (5, 16, 6, 2), (6, 70, 72, 8)] {
-        let scene = scene_of(vec![tube(&mut Random(seed), around, rows, rank)], 3, true, false);
+        let scene = scene_with_exact_normals(vec![tube(&mut Random(seed), around, rows, rank)], 3, true, false);
         for seed in 5..11 {
-            let state = scenes::state(&scene, seed);
+            let state = scenes::random_state(&scene, seed);
             let mut cpu = modalcast_compute::cpu::CpuDeformer::new(&scene);
-            cpu.deform(&state).expect("deforms");
-            let surface = cpu.surface().expect("a surface");
+            cpu.deform(&state).expect("expected the step to succeed");
+            let surface = cpu.surface().expect("expected a surface");
             let positions = modalcast_compute::reference::deform(&scene, &state);
             let want = exact_normals(&scene, &state, &positions);
-            let turned = largest_angle(&surface.normals, &rigid_normals(&scene, &state));
-            assert!((5.0..150.0).contains(&turned), "{turned} degrees");
-            assert!(largest_angle(&surface.normals, &want) < 0.01);
+            let rigid_angle = max_angle_degrees(&surface.normals, &rigid_normals(&scene, &state));
+            assert!((5.0..150.0).contains(&rigid_angle), "expected 5 to 150 degrees, got {rigid_angle}");
+            assert!(max_angle_degrees(&surface.normals, &want) < 0.01);
         }
     }
 }
@@ -125,18 +135,18 @@ fn test_scenes_bend_but_do_not_fold() {
 /// With and without normal maps and shear.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_exact_normals_equal_their_twin() {
+fn gpu_exact_normals_equal_the_reference() {
     let mut random = Random(1);
     let shapes = [(16, 9, 3), (5, 2, 1), (40, 31, 12)];
     let shapes: Vec<_> = shapes.map(|(around, rows, rank)| tube(&mut random, around, rows, rank)).into();
     for (normal_maps, rigid) in [(false, false), (false, true), (true, false), (true, true)] {
-        let scene = scene_of(shapes.clone(), 4, normal_maps, rigid);
-        let mut deformer = deformer(&scene);
+        let scene = scene_with_exact_normals(shapes.clone(), 4, normal_maps, rigid);
+        let mut deformer = cuda_deformer(&scene);
         assert!(deformer.plan().kernels.iter().any(|kernel| kernel.name == "normals"));
         assert!(deformer.plan().bytes(BufferRole::RingTables) > 0);
         let name = format!("normal maps {normal_maps}, rigid {rigid}");
-        check(&name, &scene, &scenes::state(&scene, 5), &mut deformer);
-        assert_eq!(deformer.surface().expect("copies").tangents.is_empty(), !normal_maps);
+        assert_equals_reference(&name, &scene, &scenes::random_state(&scene, 5), &mut deformer);
+        assert_eq!(deformer.surface().expect("expected a surface").tangents.is_empty(), !normal_maps);
     }
 }
 
@@ -145,105 +155,129 @@ fn gpu_exact_normals_equal_their_twin() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_exact_normals_equal_rigid_ones_without_deformation() {
     let mut random = Random(2);
-    let (bends, stiff) = (tube(&mut random, 20, 11, 2), tube(&mut random, 9, 7, 0));
-    let scene = scene_of(vec![bends, stiff], 3, true, false);
-    let mut deformer = deformer(&scene);
-    let mut state = scenes::state(&scene, 6);
+    let (modal_shape, rigid_shape) = (tube(&mut random, 20, 11, 2), tube(&mut random, 9, 7, 0));
+    let scene = scene_with_exact_normals(vec![modal_shape, rigid_shape], 3, true, false);
+    let mut deformer = cuda_deformer(&scene);
+    let mut state = scenes::random_state(&scene, 6);
     state.q.fill(0.0);
-    let both = both(&scene, &state, &mut deformer);
-    // Rounded positions turn a normal by about the rounding error divided by the size of a triangle.
-    let still = |at: usize, got: &[f32], want: &[f64], width: usize, limit: f64| {
-        let slot = scene.layout.slots[at];
-        let (first, count) = (width * slot.first_corner, width * slot.corners);
+    let comparison = compare_normals(&scene, &state, &mut deformer);
+    // Rounded positions rotate a normal by about the rounding error divided by the size of a triangle.
+    let assert_equal = |domain: usize, got: &[f32], want: &[f64], components: usize, limit: f64| {
+        let slot = scene.layout.slots[domain];
+        let (first, count) = (components * slot.first_corner, components * slot.corners);
         let want: Vec<[f64; 1]> = want[first..][..count].iter().map(|number| [*number]).collect();
-        largest_error(&got[first..][..count], &want, limit).unwrap_or_else(|error| panic!("domain {at}: {error}"));
+        max_error(&got[first..][..count], &want, limit).unwrap_or_else(|error| panic!("domain {domain}: {error}"));
     };
     let (normals, tangents) = (rigid_normals(&scene, &state).into_flattened(), rigid_tangents(&scene, &state));
     let tangents = tangents.into_flattened();
-    for at in 0..scene.domains.len() {
-        let limit = if at % 2 == 0 { 1e-3 } else { DIRECTION };
-        still(at, &both.normals, &normals, 3, limit);
-        still(at, &both.tangents, &tangents, 4, limit);
+    for domain in 0..scene.domains.len() {
+        let limit = if domain % 2 == 0 { 1e-3 } else { MAX_DIRECTION_ERROR };
+        assert_equal(domain, &comparison.normals, &normals, 3, limit);
+        assert_equal(domain, &comparison.tangents, &tangents, 4, limit);
     }
     state.q.fill(1.0);
-    deformer.deform(&state).expect("deforms");
-    let bent = &deformer.surface().expect("copies").normals;
-    assert!(largest_angle(bent, &rigid_normals(&scene, &state)) > 5.0, "the judge can fail");
+    deformer.deform(&state).expect("expected the step to succeed");
+    let deformed = &deformer.surface().expect("expected a surface").normals;
+    assert!(max_angle_degrees(deformed, &rigid_normals(&scene, &state)) > 5.0, "negative control");
 }
 
-/// Bits do not depend on earlier steps or on the place of an instance in the packing.
+/// Bits depend neither on earlier steps nor on the packed position of an instance.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_exact_normals_are_unit_and_deterministic() {
     let mut random = Random(3);
-    let scene = scene_of(vec![scenes::shape(&mut random, 700, 9), tube(&mut random, 33, 8, 5)], 3, true, false);
-    let (mut state, other) = (scenes::state(&scene, 7), scenes::state(&scene, 8));
+    let scene = scene_with_exact_normals(
+        vec![scenes::random_shape(&mut random, 700, 9), tube(&mut random, 33, 8, 5)],
+        3,
+        true,
+        false,
+    );
+    let (mut state, other) = (scenes::random_state(&scene, 7), scenes::random_state(&scene, 8));
     let q = state.q_of(&scene, 1).to_vec();
-    for at in [3, 5] {
-        state.transforms[at] = state.transforms[1];
-        state.q[scene.layout.slots[at].first_q..][..5].copy_from_slice(&q);
+    for domain in [3, 5] {
+        state.transforms[domain] = state.transforms[1];
+        state.q[scene.layout.slots[domain].first_q..][..5].copy_from_slice(&q);
     }
-    let mut deformer = deformer(&scene);
-    let mut run = |state: &SceneState| {
-        deformer.deform(state).expect("deforms");
-        deformer.surface().expect("copies").clone()
+    let mut deformer = cuda_deformer(&scene);
+    let mut deform = |state: &SceneState| {
+        deformer.deform(state).expect("expected the step to succeed");
+        deformer.surface().expect("expected a surface").clone()
     };
-    let (first, between, again) = (run(&state), run(&other), run(&state));
-    assert!(!same_bits(&first.normals, &between.normals), "the judge can fail");
-    assert!(same_bits(&first.normals, &again.normals) && same_bits(&first.tangents, &again.tangents));
-    for surface in [&first, &between] {
-        for normal in surface.normals.chunks_exact(3).chain(surface.tangents.chunks_exact(4).map(|all| &all[..3])) {
+    let (first, other_surface, repeated) = (deform(&state), deform(&other), deform(&state));
+    assert!(!have_equal_bits(&first.normals, &other_surface.normals), "expected states with different normals");
+    assert!(have_equal_bits(&first.normals, &repeated.normals) && have_equal_bits(&first.tangents, &repeated.tangents));
+    for surface in [&first, &other_surface] {
+        for normal in
+            surface.normals.chunks_exact(3).chain(surface.tangents.chunks_exact(4).map(|tangent| &tangent[..3]))
+        {
             let length = normal.iter().map(|number| number * number).sum::<f32>().sqrt();
             assert!((length - 1.0).abs() < 1e-5, "{normal:?}");
         }
     }
-    let of = |at: usize| {
-        let slot = scene.layout.slots[at];
+    let normals_of = |domain: usize| {
+        let slot = scene.layout.slots[domain];
         &first.normals[3 * slot.first_corner..][..3 * slot.corners]
     };
-    assert!(same_bits(of(1), of(3)) && same_bits(of(1), of(5)), "instances");
+    assert!(
+        have_equal_bits(normals_of(1), normals_of(3)) && have_equal_bits(normals_of(1), normals_of(5)),
+        "instances"
+    );
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_seams_share_a_normal_and_hard_edges_stay_hard() {
     let mut random = Random(4);
-    let scene = scene_of(vec![tube(&mut random, 24, 12, 3)], 1, false, false);
-    let mut deformer = deformer(&scene);
-    deformer.deform(&scenes::state(&scene, 9)).expect("deforms");
-    let normals = &deformer.surface().expect("copies").normals;
-    let at = |line: usize, column: usize| &normals[3 * (25 * line + column)..][..3];
-    for line in 1..23 {
-        assert!(same_bits(at(line, 0), at(line, 24)), "line {line}");
+    let scene = scene_with_exact_normals(vec![tube(&mut random, 24, 12, 3)], 1, false, false);
+    let mut deformer = cuda_deformer(&scene);
+    deformer.deform(&scenes::random_state(&scene, 9)).expect("expected the step to succeed");
+    let normals = &deformer.surface().expect("expected a surface").normals;
+    let normal_at = |corner_row: usize, column: usize| &normals[3 * (25 * corner_row + column)..][..3];
+    for corner_row in 1..23 {
+        assert!(have_equal_bits(normal_at(corner_row, 0), normal_at(corner_row, 24)), "line {corner_row}");
     }
-    let apart = |line: usize| (0..3).map(|axis| (at(line, 5)[axis] - at(line + 1, 5)[axis]).powi(2)).sum::<f32>();
-    assert!(apart(10) > 1e-3, "rows 5 and 10 are hard");
-    assert!(same_bits(at(12, 5), at(13, 5)), "row 6 is smooth");
+    let squared_distance = |corner_row: usize| {
+        (0..3).map(|axis| (normal_at(corner_row, 5)[axis] - normal_at(corner_row + 1, 5)[axis]).powi(2)).sum::<f32>()
+    };
+    assert!(squared_distance(10) > 1e-3, "expected a hard edge along row 5");
+    assert!(have_equal_bits(normal_at(12, 5), normal_at(13, 5)), "expected smooth normals along row 6");
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_exact_normals_survive_collapse_overflow_and_scale() {
     let mut random = Random(5);
-    let scene = scene_of(vec![tube(&mut random, 16, 6, 2)], 1, true, false);
-    let mut deformer = deformer(&scene);
+    let scene = scene_with_exact_normals(vec![tube(&mut random, 16, 6, 2)], 1, true, false);
+    let mut deformer = cuda_deformer(&scene);
     for scale in [1e-40, 1e-30, 1e-20, 1.0, 1e18, 1e30, 1e37_f32] {
-        for far in [0.0, 1e7] {
+        for offset in [0.0, 1e7] {
             for q in [0.0, 0.7, 1e30, -3e38] {
                 let mut state = SceneState::rest(&scene);
                 state.q.fill(q);
-                state.transforms[0] =
-                    Transform([scale, 0.0, 0.0, far, 0.0, -scale, 0.5 * scale, -far, 0.2 * scale, 0.0, scale, far]);
-                let both = both(&scene, &state, &mut deformer);
-                let name = format!("scale {scale:e} far {far:e} q {q:e}");
-                let unit = |part: &[f32]| {
-                    let length = part.iter().map(|number| number * number).sum::<f32>().sqrt();
-                    assert!((length - 1.0).abs() < 1e-5, "{name}: {part:?}");
+                state.transforms[0] = Transform([
+                    scale,
+                    0.0,
+                    0.0,
+                    offset,
+                    0.0,
+                    -scale,
+                    0.5 * scale,
+                    -offset,
+                    0.2 * scale,
+                    0.0,
+                    scale,
+                    offset,
+                ]);
+                let comparison = compare_normals(&scene, &state, &mut deformer);
+                let name = format!("scale {scale:e} far {offset:e} q {q:e}");
+                let assert_unit = |vector: &[f32]| {
+                    let length = vector.iter().map(|number| number * number).sum::<f32>().sqrt();
+                    assert!((length - 1.0).abs() < 1e-5, "{name}: {vector:?}");
                 };
-                both.normals.chunks_exact(3).for_each(unit);
-                both.tangents.chunks_exact(4).for_each(|tangent| unit(&tangent[..3]));
+                comparison.normals.chunks_exact(3).for_each(assert_unit);
+                comparison.tangents.chunks_exact(4).for_each(|tangent| assert_unit(&tangent[..3]));
                 if q.abs() < 1.0 {
-                    largest_error(&both.normals, &both.want_normals, DIRECTION)
+                    max_error(&comparison.normals, &comparison.want_normals, MAX_DIRECTION_ERROR)
                         .unwrap_or_else(|error| panic!("{name}: {error}"));
                 }
             }
@@ -254,25 +288,26 @@ fn gpu_exact_normals_survive_collapse_overflow_and_scale() {
 /// Also prints the times of steps with rigid and with exact normals.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_exact_normals_of_a_million_corners_equal_the_twin() {
+fn gpu_exact_normals_of_a_million_corners_equal_the_reference() {
     let mut random = Random(6);
     let shape = tube(&mut random, 700, 720, 8);
     let mut times = [NormalMethod::Rigid, NormalMethod::Exact].map(|normals| {
-        let mut parts = scenes::parts(vec![shape.clone()]);
+        let mut parts = scenes::parts_of_shapes(vec![shape.clone()]);
         parts.deformation.normals = normals;
-        parts.domains = vec![domain(0, 0)];
-        let scene = Scene::new(parts).expect("a scene");
-        let state = scenes::state(&scene, 10);
-        let mut deformer = deformer(&scene);
+        parts.domains = vec![new_domain(0, 0)];
+        let scene = Scene::new(parts).expect("expected a valid scene");
+        let state = scenes::random_state(&scene, 10);
+        let mut deformer = cuda_deformer(&scene);
         if normals == NormalMethod::Exact {
-            check("a million corners", &scene, &state, &mut deformer);
+            assert_equals_reference("a million corners", &scene, &state, &mut deformer);
         }
-        let mut times: Vec<f64> = (0..50).map(|_| deformer.deform(&state).expect("deforms").ms).collect();
+        let mut times: Vec<f64> =
+            (0..50).map(|_| deformer.deform(&state).expect("expected the step to succeed").ms).collect();
         times.sort_by(f64::total_cmp);
         times[25]
     });
     times.iter_mut().for_each(|time| *time *= 1e3);
     let corners = shape.mesh.corners().vertices.len();
     let [rigid, exact] = times;
-    eprintln!("{corners} corners: {rigid:.0} microseconds a step with rigid normals, {exact:.0} with exact ones");
+    eprintln!("{corners} corners, microseconds per step: {rigid:.0} with rigid normals, {exact:.0} with exact normals");
 }

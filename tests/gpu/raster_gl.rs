@@ -1,4 +1,4 @@
-//! The compute rasterizer on OpenGL buffers, compared with its definition.
+//! The CUDA rasterizer on OpenGL buffers, compared with the reference rasterizer.
 
 use std::sync::Arc;
 
@@ -8,57 +8,58 @@ use modalcast_model::deform::Deformer as _;
 use modalcast_model::raster::{CutOuts, GlBuffer, RasterGeometry, Rasterizer};
 use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
-use crate::both::cut_outs::plain_holes;
-use crate::both::soups::{Soup, flat, soups};
-use crate::gl::Gl;
+use crate::common::cut_outs::uniform_cut_out_soups;
+use crate::common::soups::{Soup, all_soups, clip_space_viewport};
+use crate::gl::GlContext;
 use crate::scenes;
 
 /// A CUDA device and an OpenGL context on it.
-struct Stage {
+struct GpuContext {
     device: Arc<Device>,
-    gl: Gl,
+    gl: GlContext,
 }
 
-impl Stage {
+impl GpuContext {
     fn open() -> Self {
-        let gl = Gl::open();
-        Self { device: Device::open(0).expect("a CUDA device"), gl }
+        let gl = GlContext::open();
+        Self { device: Device::open(0).expect("expected a CUDA device"), gl }
     }
 
-    fn raster(&self, soup: &Soup, cut_outs: Option<CutOuts>) -> (CudaRasterizer, GlBuffer) {
-        let positions = self.gl.filled(&soup.positions);
-        let mesh = mesh(positions.clone(), soup, cut_outs);
-        (CudaRasterizer::new(&self.device, mesh).expect("a rasteriser"), positions)
+    fn create_rasterizer(&self, soup: &Soup, cut_outs: Option<CutOuts>) -> (CudaRasterizer, GlBuffer) {
+        let positions = self.gl.create_buffer_from(&soup.positions);
+        let geometry = soup_geometry(positions.clone(), soup, cut_outs);
+        (CudaRasterizer::new(&self.device, geometry).expect("expected a rasterizer"), positions)
     }
 
-    fn ids(&self, raster: &mut CudaRasterizer, window: &Viewport, into: &GlBuffer) -> Vec<u64> {
-        raster.draw(None, Some((window, into))).expect("draws");
-        self.gl.read(into, window.pixel_count())
+    fn draw_ids(&self, rasterizer: &mut CudaRasterizer, viewport: &Viewport, target: &GlBuffer) -> Vec<u64> {
+        rasterizer.draw(None, Some((viewport, target))).expect("expected a frame");
+        self.gl.read(target, viewport.pixel_count())
     }
 
-    /// Depths as bits.
-    fn depth(&self, raster: &mut CudaRasterizer, window: &Viewport, into: &GlBuffer) -> Vec<u32> {
-        raster.draw(Some((window, into)), None).expect("draws");
-        self.gl.read(into, window.pixel_count())
+    /// The bits of the depths.
+    fn draw_depths(&self, rasterizer: &mut CudaRasterizer, viewport: &Viewport, target: &GlBuffer) -> Vec<u32> {
+        rasterizer.draw(Some((viewport, target)), None).expect("expected a frame");
+        self.gl.read(target, viewport.pixel_count())
     }
 }
 
-fn mesh(positions: GlBuffer, soup: &Soup, cut_outs: Option<CutOuts>) -> RasterGeometry {
+fn soup_geometry(positions: GlBuffer, soup: &Soup, cut_outs: Option<CutOuts>) -> RasterGeometry {
     RasterGeometry { positions, triangles: soup.triangles.clone(), groups: soup.groups.clone(), cut_outs }
 }
 
-/// Depths of all triangles with both faces, as in a depth-only pass.
-fn from_both_sides(soup: &Soup, cut_outs: Option<&CutOuts>) -> Vec<u32> {
-    let mut raster = VisibilityBuffer::new(soup.window);
+/// The bits of the reference depths of all triangles with both faces, as in a depth-only pass.
+fn two_sided_depths(soup: &Soup, cut_outs: Option<&CutOuts>) -> Vec<u32> {
+    let mut rasterizer = VisibilityBuffer::new(soup.viewport);
     let all = DrawRange { first: 0, triangles: soup.triangles.len() as u32, faces: CullMode::None };
     match cut_outs {
-        Some(cut_outs) => raster.draw_cut_out(&soup.positions, &soup.triangles, all, cut_outs),
-        None => raster.draw(&soup.positions, &soup.triangles, all),
+        Some(cut_outs) => rasterizer.draw_cut_out(&soup.positions, &soup.triangles, all, cut_outs),
+        None => rasterizer.draw(&soup.positions, &soup.triangles, all),
     }
-    raster.depths().into_iter().map(f32::to_bits).collect()
+    rasterizer.depths().into_iter().map(f32::to_bits).collect()
 }
 
-fn differing<T: PartialEq>(got: &[T], want: &[T]) -> usize {
+/// Number of items that differ.
+fn count_differences<T: PartialEq>(got: &[T], want: &[T]) -> usize {
     assert_eq!(got.len(), want.len());
     got.iter().zip(want).filter(|(got, want)| got != want).count()
 }
@@ -66,134 +67,163 @@ fn differing<T: PartialEq>(got: &[T], want: &[T]) -> usize {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_samples_have_the_bits_of_the_definition() {
-    let stage = Stage::open();
-    let mut backs = 0;
-    for soup in soups() {
-        let (mut raster, positions) = stage.raster(&soup, None);
-        let pixel_count = soup.window.pixel_count() as u64;
-        let (keys, depths) = (stage.gl.room(8 * pixel_count), stage.gl.room(4 * pixel_count));
-        let (want, want_depths) = (soup.drawn(), from_both_sides(&soup, None));
-        backs += differing(&want_depths, &want.depths().into_iter().map(f32::to_bits).collect::<Vec<_>>());
+    let context = GpuContext::open();
+    let mut back_faces = 0;
+    for soup in all_soups() {
+        let (mut rasterizer, positions) = context.create_rasterizer(&soup, None);
+        let pixel_count = soup.viewport.pixel_count() as u64;
+        let (keys, depths) = (context.gl.create_buffer(8 * pixel_count), context.gl.create_buffer(4 * pixel_count));
+        let (want, want_depths) = (soup.rasterize(), two_sided_depths(&soup, None));
+        back_faces += count_differences(&want_depths, &want.depths().into_iter().map(f32::to_bits).collect::<Vec<_>>());
         for run in 0..3 {
-            let got = stage.ids(&mut raster, &soup.window, &keys);
-            assert_eq!(differing(&got, &want.keys), 0, "{}, run {run}", soup.name);
-            let got = stage.depth(&mut raster, &soup.window, &depths);
-            assert_eq!(differing(&got, &want_depths), 0, "{}, depth, run {run}", soup.name);
+            let got = context.draw_ids(&mut rasterizer, &soup.viewport, &keys);
+            assert_eq!(count_differences(&got, &want.keys), 0, "{}, run {run}", soup.name);
+            let got = context.draw_depths(&mut rasterizer, &soup.viewport, &depths);
+            assert_eq!(count_differences(&got, &want_depths), 0, "{}, depth, run {run}", soup.name);
         }
-        drop(raster);
+        drop(rasterizer);
         drop((positions, keys, depths));
     }
-    assert!(backs > 1000, "control: {backs} samples see a back in depth alone");
+    assert!(back_faces > 1000, "control: {back_faces} samples see a back in depth alone");
 }
 
-/// In the id pass and in the depth pass.
+/// Compares the id pass and the depth pass.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_uniform_cut_outs_have_the_bits_of_the_definition() {
-    let stage = Stage::open();
-    for holes in plain_holes() {
-        let soup = &holes.soup;
-        let (mut raster, _) = stage.raster(soup, Some(holes.cut_outs.clone()));
-        let pixel_count = soup.window.pixel_count() as u64;
-        let got = stage.ids(&mut raster, &soup.window, &stage.gl.room(8 * pixel_count));
-        assert_eq!(differing(&got, &holes.drawn().keys), 0, "{}", soup.name);
-        let got = stage.depth(&mut raster, &soup.window, &stage.gl.room(4 * pixel_count));
-        assert_eq!(differing(&got, &from_both_sides(soup, Some(&holes.cut_outs))), 0, "{}, depth", soup.name);
+    let context = GpuContext::open();
+    for cut_out_soup in uniform_cut_out_soups() {
+        let soup = &cut_out_soup.soup;
+        let (mut rasterizer, _) = context.create_rasterizer(soup, Some(cut_out_soup.cut_outs.clone()));
+        let pixel_count = soup.viewport.pixel_count() as u64;
+        let got = context.draw_ids(&mut rasterizer, &soup.viewport, &context.gl.create_buffer(8 * pixel_count));
+        assert_eq!(count_differences(&got, &cut_out_soup.rasterize().keys), 0, "{}", soup.name);
+        let got = context.draw_depths(&mut rasterizer, &soup.viewport, &context.gl.create_buffer(4 * pixel_count));
+        assert_eq!(
+            count_differences(&got, &two_sided_depths(soup, Some(&cut_out_soup.cut_outs))),
+            0,
+            "{}, depth",
+            soup.name
+        );
     }
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_positions_written_by_opengl_need_no_wait() {
-    let stage = Stage::open();
-    let mut soup = soups().into_iter().find(|soup| soup.name == "a few pixels").expect("there");
-    let (mut raster, positions) = stage.raster(&soup, None);
-    let keys = stage.gl.room(8 * soup.window.pixel_count() as u64);
+    let context = GpuContext::open();
+    let mut soup = all_soups().into_iter().find(|soup| soup.name == "a few pixels").expect("expected the named soup");
+    let (mut rasterizer, positions) = context.create_rasterizer(&soup, None);
+    let keys = context.gl.create_buffer(8 * soup.viewport.pixel_count() as u64);
     let mut before = Vec::new();
     for step in 0..20 {
         soup.positions
             .iter_mut()
             .enumerate()
             .for_each(|(at, number)| *number += 0.01 * ((at + step) % 7) as f32 - 0.03);
-        stage.gl.write(&positions, &soup.positions);
-        let got = stage.ids(&mut raster, &soup.window, &keys);
-        assert_eq!(differing(&got, &soup.drawn().keys), 0, "step {step}");
-        assert!(got != before, "the judge can fail");
+        context.gl.write(&positions, &soup.positions);
+        let got = context.draw_ids(&mut rasterizer, &soup.viewport, &keys);
+        assert_eq!(count_differences(&got, &soup.rasterize().keys), 0, "step {step}");
+        assert!(got != before, "step {step}: expected other samples than before");
         before = got;
     }
 }
 
-/// OpenGL may give a new target the name of a deleted one.
+/// Targets may change their size, and OpenGL may give a new target the name of a deleted one.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_targets_may_be_resized_and_reuse_buffer_names() {
-    let stage = Stage::open();
-    let mut soup = soups().into_iter().find(|soup| soup.name == "large").expect("there");
-    let (mut raster, _) = stage.raster(&soup, None);
+    let context = GpuContext::open();
+    let mut soup = all_soups().into_iter().find(|soup| soup.name == "large").expect("expected the named soup");
+    let (mut rasterizer, _) = context.create_rasterizer(&soup, None);
     for (width, height) in [(64, 64), (640, 480), (640, 480), (33, 7), (1, 1), (640, 480)] {
-        soup.window = flat(width, height);
-        let keys = stage.gl.room(8 * soup.window.pixel_count() as u64);
-        let want = soup.drawn();
+        soup.viewport = clip_space_viewport(width, height);
+        let keys = context.gl.create_buffer(8 * soup.viewport.pixel_count() as u64);
+        let want = soup.rasterize();
         for _ in 0..2 {
-            assert_eq!(differing(&stage.ids(&mut raster, &soup.window, &keys), &want.keys), 0, "{width} x {height}");
+            assert_eq!(
+                count_differences(&context.draw_ids(&mut rasterizer, &soup.viewport, &keys), &want.keys),
+                0,
+                "{width} x {height}"
+            );
         }
     }
-    // Targets larger than needed, and two targets that alternate without being forgotten.
-    let list = [0, 100].map(|more| stage.gl.room(8 * soup.window.pixel_count() as u64 + more));
-    for keys in [&list[0], &list[1], &list[0], &list[1]] {
-        stage.gl.write(keys, &vec![0_u64; soup.window.pixel_count()]);
-        assert_eq!(differing(&stage.ids(&mut raster, &soup.window, keys), &soup.drawn().keys), 0);
+    // Two registered targets that alternate; one is larger than needed.
+    let buffers = [0, 100].map(|more| context.gl.create_buffer(8 * soup.viewport.pixel_count() as u64 + more));
+    for keys in [&buffers[0], &buffers[1], &buffers[0], &buffers[1]] {
+        context.gl.write(keys, &vec![0_u64; soup.viewport.pixel_count()]);
+        assert_eq!(
+            count_differences(&context.draw_ids(&mut rasterizer, &soup.viewport, keys), &soup.rasterize().keys),
+            0
+        );
     }
 }
 
-/// The rasterizer stays usable afterwards.
+/// Unknown or small buffers return errors, and the rasterizer stays usable.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_unknown_or_small_buffers_are_refused() {
-    let stage = Stage::open();
-    let soup = soups().into_iter().find(|soup| soup.name == "a few pixels").expect("there");
-    let pixel_count = soup.window.pixel_count() as u64;
-    let unknown = |bytes| stage.gl.handle(999_999, bytes);
-    let refused = CudaRasterizer::new(&stage.device, mesh(unknown(4 * soup.positions.len() as u64), &soup, None));
-    assert!(refused.expect_err("unknown").to_string().contains("999999"));
-    let (mut raster, positions) = stage.raster(&soup, None);
-    raster.draw(None, Some((&soup.window, &unknown(8 * pixel_count)))).expect_err("unknown");
-    let small = stage.gl.room(4 * pixel_count);
-    raster.draw(None, Some((&soup.window, &small))).expect_err("too small, and it says so");
-    raster
-        .draw(None, Some((&soup.window, &GlBuffer { bytes: 8 * pixel_count, ..small.clone() })))
-        .expect_err("smaller than it says");
-    let fewer = GlBuffer { bytes: 3 * 4 * 2, ..positions };
-    CudaRasterizer::new(&stage.device, mesh(fewer, &soup, None)).expect_err("vertices that are not there");
-    let keys = stage.gl.room(8 * pixel_count);
-    assert_eq!(differing(&stage.ids(&mut raster, &soup.window, &keys), &soup.drawn().keys), 0, "after refusals");
-    assert_eq!(differing(&stage.depth(&mut raster, &soup.window, &small), &from_both_sides(&soup, None)), 0);
+fn gpu_unknown_or_small_buffers_return_errors() {
+    let context = GpuContext::open();
+    let soup = all_soups().into_iter().find(|soup| soup.name == "a few pixels").expect("expected the named soup");
+    let pixel_count = soup.viewport.pixel_count() as u64;
+    let unknown = |bytes| context.gl.buffer_handle(999_999, bytes);
+    let result =
+        CudaRasterizer::new(&context.device, soup_geometry(unknown(4 * soup.positions.len() as u64), &soup, None));
+    assert!(result.expect_err("expected an unknown-buffer error").to_string().contains("999999"));
+    let (mut rasterizer, positions) = context.create_rasterizer(&soup, None);
+    rasterizer
+        .draw(None, Some((&soup.viewport, &unknown(8 * pixel_count))))
+        .expect_err("expected an unknown-buffer error");
+    let small = context.gl.create_buffer(4 * pixel_count);
+    rasterizer
+        .draw(None, Some((&soup.viewport, &small)))
+        .expect_err("expected an error for a target that is too small");
+    rasterizer
+        .draw(None, Some((&soup.viewport, &GlBuffer { bytes: 8 * pixel_count, ..small.clone() })))
+        .expect_err("expected an error for a target smaller than its stated size");
+    let too_few_positions = GlBuffer { bytes: 3 * 4 * 2, ..positions };
+    CudaRasterizer::new(&context.device, soup_geometry(too_few_positions, &soup, None))
+        .expect_err("expected an error for vertices beyond the buffer");
+    let keys = context.gl.create_buffer(8 * pixel_count);
+    assert_eq!(
+        count_differences(&context.draw_ids(&mut rasterizer, &soup.viewport, &keys), &soup.rasterize().keys),
+        0,
+        "after errors"
+    );
+    assert_eq!(
+        count_differences(
+            &context.draw_depths(&mut rasterizer, &soup.viewport, &small),
+            &two_sided_depths(&soup, None)
+        ),
+        0
+    );
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_positions_shared_with_a_deformer_are_drawn() {
-    let mut stage = Stage::open();
-    let scene = scenes::scene(&[(3000, 12), (50, 0), (7, 3)], 5, true, false);
-    let buffers = stage.gl.renderer.load(&scene).expect("loads");
-    let shared = buffers.vertex_buffers().expect("buffers");
+    let mut context = GpuContext::open();
+    let scene = scenes::random_scene(&[(3000, 12), (50, 0), (7, 3)], 5, true, false);
+    let buffers = context.gl.renderer.load(&scene).expect("expected the scene to load");
+    let shared = buffers.vertex_buffers().expect("expected vertex buffers");
     let positions = shared.positions.clone();
-    let mut deformer = CudaDeformer::new(&stage.device, &scene, Some(shared)).expect("a deformer");
-    assert!(deformer.shares_buffers(), "interop was refused");
-    let list = scene.triangle_vertices();
-    let all = DrawRange { first: 0, triangles: list.len() as u32, faces: CullMode::None };
-    let mesh = RasterGeometry { positions, triangles: list.clone(), groups: vec![all], cut_outs: None };
-    let mut raster = CudaRasterizer::new(&stage.device, mesh).expect("a buffer that is registered twice");
-    let window = flat(300, 200);
-    let keys = stage.gl.room(8 * window.pixel_count() as u64);
+    let mut deformer = CudaDeformer::new(&context.device, &scene, Some(shared)).expect("expected a CUDA deformer");
+    assert!(deformer.shares_buffers(), "expected shared buffers");
+    let triangles = scene.triangle_vertices();
+    let all = DrawRange { first: 0, triangles: triangles.len() as u32, faces: CullMode::None };
+    let geometry = RasterGeometry { positions, triangles: triangles.clone(), groups: vec![all], cut_outs: None };
+    let mut rasterizer = CudaRasterizer::new(&context.device, geometry)
+        .expect("expected a rasterizer on a buffer that the deformer registered");
+    let viewport = clip_space_viewport(300, 200);
+    let keys = context.gl.create_buffer(8 * viewport.pixel_count() as u64);
     for seed in 0..10 {
-        deformer.deform(&scenes::state(&scene, seed)).expect("deforms");
-        let got = stage.ids(&mut raster, &window, &keys);
-        let mut want = VisibilityBuffer::new(window);
-        want.draw(&deformer.surface().expect("copies").positions, &list, all);
-        assert_eq!(differing(&got, &want.keys), 0, "step {seed}");
-        assert!(got.iter().any(|key| *key != u64::MAX), "something is seen");
+        deformer.deform(&scenes::random_state(&scene, seed)).expect("expected the step to succeed");
+        let got = context.draw_ids(&mut rasterizer, &viewport, &keys);
+        let mut want = VisibilityBuffer::new(viewport);
+        want.draw(&deformer.surface().expect("expected a surface").positions, &triangles, all);
+        assert_eq!(count_differences(&got, &want.keys), 0, "step {seed}");
+        assert!(got.iter().any(|key| *key != u64::MAX), "expected visible triangles");
     }
-    drop((raster, deformer));
-    stage.gl.renderer.unload(buffers);
+    drop((rasterizer, deformer));
+    context.gl.renderer.unload(buffers);
 }

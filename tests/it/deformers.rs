@@ -1,4 +1,4 @@
-//! The CPU deformer equals its f64 twin, and the twin equals the algebra.
+//! The CPU deformer equals its f64 reference, and the twin equals the algebra.
 
 use std::sync::Arc;
 

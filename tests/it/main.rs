@@ -1,7 +1,7 @@
 //! Tests that need no GPU, in one binary. The tests that render need an EGL driver; a software driver is enough.
 
-#[path = "../both/mod.rs"]
-mod both;
+#[path = "../common/mod.rs"]
+mod common;
 mod cut_outs;
 mod deformers;
 mod far;

@@ -7,7 +7,7 @@ use modalcast_compute::reference::raster::{
 };
 use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
-use crate::both::soups::{Soup, fan, flat, perspective, soups};
+use crate::common::soups::{Soup, all_soups, clip_space_viewport, fan_soup, perspective_viewport};
 
 /// Constants of `kernels/raster.cu`; a test compares them with its text.
 const MAX_THREAD_SAMPLES: i32 = 32;
@@ -30,12 +30,12 @@ struct Walk<'a> {
 
 impl Walk<'_> {
     fn put(&mut self, column: i32, row: i32, depth: f32, triangle: u32) {
-        let at = row as usize * self.soup.window.size()[0] as usize + column as usize;
+        let at = row as usize * self.soup.viewport.size()[0] as usize + column as usize;
         self.keys[at] = self.keys[at].min(u64::from(depth.to_bits()) << 32 | u64::from(triangle));
     }
 
     fn clipped_polygon(&self, triangle: u32, faces: CullMode) -> Result<ClippedPolygon, CullReason> {
-        clipped_polygon(&self.soup.window, &self.soup.positions, self.soup.triangles[triangle as usize], faces)
+        clipped_polygon(&self.soup.viewport, &self.soup.positions, self.soup.triangles[triangle as usize], faces)
     }
 
     /// `raster`: the narrow tests of `setup_unclipped`, and the entries that each path pushes.
@@ -140,7 +140,7 @@ impl Walk<'_> {
 /// Runs `raster`, `raster_warps` and `raster_tiles` in sequence, with reversed queues and tiles halved `strip_splits`
 /// times.
 fn twin_of_raster(soup: &Soup, strip_splits: u32) -> (Vec<u64>, [usize; 3]) {
-    let keys = vec![EMPTY_KEY; soup.window.pixel_count()];
+    let keys = vec![EMPTY_KEY; soup.viewport.pixel_count()];
     let mut walk = Walk { soup, keys, medium: vec![], large: vec![], tally: 0, paths: [0; 3] };
     for group in &soup.groups {
         (group.first..group.first + group.triangles).rev().for_each(|triangle| walk.aim(triangle, group.faces));
@@ -168,8 +168,8 @@ fn all_raster_paths_equal_the_definition() {
         assert!(text.contains(&line), "the kernel has another {line}");
     }
     let mut all = [0; 3];
-    for soup in soups() {
-        let want = soup.drawn().keys;
+    for soup in all_soups() {
+        let want = soup.rasterize().keys;
         for strip_splits in 0..=MAX_STRIP_SPLITS {
             let (keys, paths) = twin_of_raster(&soup, strip_splits);
             assert!(keys == want, "{}, {strip_splits} halvings", soup.name);
@@ -181,9 +181,9 @@ fn all_raster_paths_equal_the_definition() {
 
 /// Number of pieces that cover each sample, with the top-left rule or with all edges closed.
 fn takers(soup: &Soup, closed: bool) -> Vec<usize> {
-    let [width, height] = soup.window.size().map(|side| side as i32);
+    let [width, height] = soup.viewport.size().map(|side| side as i32);
     let all: Vec<[SnappedVertex; 3]> = (soup.triangles.iter())
-        .filter_map(|triangle| clipped_polygon(&soup.window, &soup.positions, *triangle, CullMode::None).ok())
+        .filter_map(|triangle| clipped_polygon(&soup.viewport, &soup.positions, *triangle, CullMode::None).ok())
         .flat_map(|clipped_polygon| fan_triangles(&clipped_polygon))
         .collect();
     let takes = |piece: &[SnappedVertex; 3], column: i32, row: i32| {
@@ -197,7 +197,7 @@ fn takers(soup: &Soup, closed: bool) -> Vec<usize> {
 
 #[test]
 fn fan_covers_every_sample_once() {
-    let mut soup = fan(flat(128, 128));
+    let mut soup = fan_soup(clip_space_viewport(128, 128));
     // The center is on a sample and some spokes run along rows and columns, so many samples lie on edges.
     soup.positions[..2].copy_from_slice(&[1.0 / 128.0, 1.0 / 128.0]);
     for spoke in [0, 10, 20, 30] {
@@ -213,7 +213,7 @@ fn fan_covers_every_sample_once() {
 
 #[test]
 fn fan_clipped_by_near_plane_covers_every_sample_once() {
-    let mut soup = fan(perspective(96, 64, 0.5, 100.0));
+    let mut soup = fan_soup(perspective_viewport(96, 64, 0.5, 100.0));
     // A floor one unit below the eye that continues behind it.
     for position in soup.positions.chunks_exact_mut(3) {
         let [x, y] = [position[0], position[1]];
@@ -233,7 +233,7 @@ fn depth_ties_go_to_the_lower_id() {
     let square = |z: f32| [[-1.0, -1.0, z], [3.0, -1.0, z], [-1.0, 3.0, z]].concat();
     let positions = [square(0.5), square(0.5), square(0.25), square(0.25)].concat();
     let drawn = |triangles: &[[u32; 3]]| {
-        let mut raster = VisibilityBuffer::new(flat(4, 4));
+        let mut raster = VisibilityBuffer::new(clip_space_viewport(4, 4));
         let group = DrawRange { first: 0, triangles: triangles.len() as u32, faces: CullMode::None };
         raster.draw(&positions, triangles, group);
         (raster.ids(), raster.depths())
@@ -246,9 +246,9 @@ fn depth_ties_go_to_the_lower_id() {
 
 #[test]
 fn dropped_triangles_report_the_reason() {
-    let window = flat(10, 10);
+    let viewport = clip_space_viewport(10, 10);
     let why =
-        |corners: [[f32; 3]; 3], faces: CullMode| clipped_polygon(&window, &corners.concat(), [0, 1, 2], faces).err();
+        |corners: [[f32; 3]; 3], faces: CullMode| clipped_polygon(&viewport, &corners.concat(), [0, 1, 2], faces).err();
     let front = [[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.5, 0.0]];
     let back = [front[1], front[0], front[2]];
     assert_eq!(why(front, CullMode::Back), None);
@@ -264,9 +264,9 @@ fn dropped_triangles_report_the_reason() {
 #[test]
 fn plane_depth_and_rectangle_coverage_are_exact() {
     let (near, far) = (0.5, 50.0);
-    let window: Viewport = perspective(200, 200, near, far);
+    let viewport: Viewport = perspective_viewport(200, 200, near, far);
     let corners = [[-2.0, -2.0, -4.0], [2.0, -2.0, -9.0], [-1.0, 3.0, -20.0]];
-    let mut raster = VisibilityBuffer::new(window);
+    let mut raster = VisibilityBuffer::new(viewport);
     let positions = corners.map(|corner| corner.map(|number: f64| number as f32)).concat();
     raster.draw(&positions, &[[0, 1, 2]], DrawRange { first: 0, triangles: 1, faces: CullMode::None });
     let [a, b, c] = corners.map(nalgebra::Vector3::from);
@@ -285,7 +285,7 @@ fn plane_depth_and_rectangle_coverage_are_exact() {
     // per pixel.
     assert!(seen > 1000 && worst < 4e-6, "{seen} samples, off by up to {worst:e}");
 
-    let mut raster = VisibilityBuffer::new(flat(100, 100));
+    let mut raster = VisibilityBuffer::new(clip_space_viewport(100, 100));
     let square = [[-0.6, -0.4, 0.0], [0.2, -0.4, 0.0], [0.2, 0.8, 0.0], [-0.6, 0.8, 0.0]].concat();
     raster.draw(&square, &[[0, 1, 2], [0, 2, 3]], DrawRange { first: 0, triangles: 2, faces: CullMode::Back });
     assert_eq!(raster.ids().iter().flatten().count(), 40 * 60);

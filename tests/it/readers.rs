@@ -11,7 +11,7 @@ use tonic::Code;
 use v1::Policy;
 use v1::drive_scene_response::Kind as ResponseKind;
 
-use crate::both::readers;
+use crate::common::attributes;
 use crate::service_harness::{
     ReceivedVertices, Server, details, expected, get_vertices, next_vertices, state_after, step,
     strips_with_attributes, within,
@@ -29,7 +29,7 @@ fn alone(domains: &[u32]) -> v1::VertexSelection {
     v1::VertexSelection { without_vertices: true, ..all(domains) }
 }
 
-/// Displacements u of the f64 twin after some steps.
+/// Displacements u of the f64 reference after some steps.
 fn expected_u(steps: &[v1::Step]) -> Vec<f32> {
     let scene = strips_with_attributes();
     let u = reference::displacements(&scene, &state_after(&scene, steps));
@@ -236,7 +236,7 @@ async fn displacement_overflow_refuses_the_step() {
 #[test]
 fn reference_keeps_displacements_and_boxes() {
     let reference = |scene: &std::sync::Arc<_>| ReferenceDeformer::new(scene);
-    readers::displacements_and_boxes_equal_their_twins(reference);
-    readers::a_scene_without_modes_has_zeros(reference);
+    attributes::check_displacements_and_boxes(reference);
+    attributes::check_scene_without_modes(reference);
     assert!(!reference(&strips_with_attributes()).shares_buffers());
 }

@@ -1,4 +1,4 @@
-//! Runs the checks of `tests/both` on the CPU deformer.
+//! Runs the checks of `tests/common` on the CPU deformer.
 
 use std::sync::Arc;
 
@@ -7,146 +7,148 @@ use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::storage::Truncation;
 use modalcast_model::scene::Scene;
 
-use crate::both::{changes, extremes, following, light, neighbors, readers, refusal, surfaces, truncation};
+use crate::common::{
+    attributes, extreme_values, followers, light_bounds, neighbors, overflow, partial_steps, surfaces, truncation,
+};
 
-fn deformer(scene: &Arc<Scene>) -> CpuDeformer {
+fn cpu_deformer(scene: &Arc<Scene>) -> CpuDeformer {
     CpuDeformer::new(scene)
 }
 
-/// Bound on the error of a vertex from truncated modes, the largest of all domains.
-fn left_out(deformer: &CpuDeformer, scene: &Scene) -> f64 {
+/// Largest bound of all domains on the error from truncated modes, in scene units.
+fn truncation_bound(deformer: &CpuDeformer, scene: &Scene) -> f64 {
     let bound = |domain| deformer.truncation(domain).map_or(0.0, Truncation::bound);
     (0..scene.domains.len()).map(bound).fold(0.0, f64::max)
 }
 
 #[test]
 fn huge_tiny_and_denormal_q_stay_within_the_bound() {
-    extremes::huge_and_tiny_amounts(deformer);
+    extreme_values::check_huge_and_tiny_q(cpu_deformer);
 }
 
 #[test]
 fn columns_that_differ_by_1e12_stay_within_the_bound() {
-    extremes::columns_of_every_scale(deformer);
+    extreme_values::check_column_scales(cpu_deformer);
 }
 
 #[test]
 fn nearly_canceling_modes_need_compensated_sums() {
-    extremes::modes_that_nearly_cancel(deformer);
+    extreme_values::check_canceling_modes(cpu_deformer);
 }
 
 #[test]
 fn finite_sums_survive_intermediate_overflow() {
-    extremes::finite_sums_that_overflow_on_their_way(deformer);
+    extreme_values::check_intermediate_overflow(cpu_deformer);
 }
 
 #[test]
 fn zero_tiles_do_not_move() {
-    extremes::tiles_of_zeros(deformer);
+    extreme_values::check_zero_tiles(cpu_deformer);
 }
 
 #[test]
 fn every_rank_and_storage_stays_within_its_bound() {
-    extremes::ranks_of_all_sizes(deformer);
+    extreme_values::check_ranks(cpu_deformer);
 }
 
 #[test]
-fn shears_and_mirrors_equal_the_twin() {
-    surfaces::shears_and_mirrors(deformer);
+fn shears_and_mirrors_equal_the_reference() {
+    surfaces::check_shears_and_mirrors(cpu_deformer);
 }
 
 #[test]
 fn zero_area_and_missing_uvs_give_unit_directions() {
-    surfaces::no_area_and_no_uvs(deformer);
+    surfaces::check_zero_area_and_missing_uvs(cpu_deformer);
 }
 
 #[test]
 fn overflow_is_reported_for_its_step_only() {
-    refusal::overflow_is_told_and_forgotten(deformer);
+    overflow::check_overflow_affects_one_step(cpu_deformer);
 }
 
 #[test]
-fn overflow_refusal_names_the_domain() {
-    refusal::overflow_is_refused_by_name(BackendChoice::Cpu);
+fn overflow_error_names_the_domain() {
+    overflow::check_overflow_rejection(BackendChoice::Cpu);
 }
 
 #[test]
-fn errors_of_twenty_truncated_states_stay_within_the_budget() {
-    truncation::errors_within_the_budget(deformer, left_out);
+fn truncation_errors_stay_within_the_budget() {
+    truncation::check_error_budget(cpu_deformer, truncation_bound);
 }
 
 #[test]
 fn mode_near_the_truncation_limit_does_not_flicker() {
-    truncation::no_flicker(deformer);
+    truncation::check_hysteresis(cpu_deformer);
 }
 
 #[test]
 fn partial_steps_have_the_bits_of_full_steps() {
-    changes::steps_of_a_few_domains(deformer);
-    assert!(!changes::trusts_change_lists(deformer), "the cpu compares values");
+    partial_steps::check_partial_steps(cpu_deformer);
+    assert!(!partial_steps::relies_on_dirty_list(cpu_deformer), "expected the CPU deformer to compare values");
 }
 
 #[test]
 fn displacements_and_boxes_equal_their_twins() {
-    readers::displacements_and_boxes_equal_their_twins(deformer);
+    attributes::check_displacements_and_boxes(cpu_deformer);
 }
 
 #[test]
 fn scene_without_modes_has_zero_displacements() {
-    readers::a_scene_without_modes_has_zeros(deformer);
+    attributes::check_scene_without_modes(cpu_deformer);
 }
 
 #[test]
-fn displacements_and_boxes_are_read_alone() {
-    readers::parts_are_read_alone(deformer);
-    readers::parts_are_fetched_alone(deformer);
+fn displacements_and_boxes_are_read_separately() {
+    attributes::check_separate_reads(cpu_deformer);
+    attributes::check_separate_readbacks(cpu_deformer);
 }
 
 #[test]
-fn displacement_overflow_is_reported_and_others_survive() {
-    readers::lost_displacements_are_told_and_others_survive(deformer);
+fn displacement_overflow_is_reported() {
+    attributes::check_displacement_overflow(cpu_deformer);
 }
 
 #[test]
-fn displacement_overflow_refusal_names_the_domain() {
-    readers::lost_displacements_are_refused_by_name(BackendChoice::Cpu);
+fn displacement_overflow_error_names_the_domain() {
+    attributes::check_displacement_overflow_rejection(BackendChoice::Cpu);
 }
 
 #[test]
-fn domain_has_the_same_bits_alone_and_among_others() {
-    neighbors::alone_and_among_others(deformer);
+fn domain_bits_do_not_depend_on_neighbors() {
+    neighbors::check_independence_of_neighbors(cpu_deformer);
 }
 
 #[test]
-fn followers_have_the_bits_of_roots_in_their_places() {
-    following::frames_of_all_sizes(deformer);
+fn followers_have_the_bits_of_equivalent_roots() {
+    followers::check_frames(cpu_deformer);
 }
 
 #[test]
 fn partial_steps_of_roots_move_their_followers() {
-    following::steps_of_movers(deformer);
+    followers::check_partial_steps_of_roots(cpu_deformer);
 }
 
 #[test]
 fn followers_10000_km_away_keep_the_millimeter() {
-    following::far_away(deformer);
+    followers::check_far_followers(cpu_deformer);
 }
 
 #[test]
 fn overflowing_frame_products_keep_finite_vertices() {
-    following::products_that_overflow(deformer);
+    followers::check_overflowing_frame_products(cpu_deformer);
 }
 
 #[test]
 fn light_bounds_contain_every_vertex() {
-    light::every_vertex_is_held(deformer);
+    light_bounds::check_containment(cpu_deformer);
 }
 
 #[test]
 fn thin_scene_is_fitted_closely_in_light_space() {
-    light::a_thin_scene_is_fitted_closely(deformer);
+    light_bounds::check_tightness(cpu_deformer);
 }
 
 #[test]
 fn light_bounds_need_a_shadow_and_report_overflow() {
-    light::nothing_is_measured_without_a_shadow_and_overflow_is_told(deformer);
+    light_bounds::check_missing_shadow_and_overflow(cpu_deformer);
 }

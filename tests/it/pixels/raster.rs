@@ -12,7 +12,7 @@ use modalcast_render::{FrameParams, VisibilityId};
 use nalgebra::Matrix4;
 
 use super::harness::{SceneBuilder, open};
-use crate::both::exact::{Exact, compare};
+use crate::common::exact_triangle::{ExactTriangle, compare_ids};
 use crate::scenes::Random;
 
 const SIZE: [u32; 2] = [320, 240];
@@ -24,9 +24,9 @@ fn scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
     let mut rest = Vec::new();
     for at in 0..1500 {
         let size = [0.02, 0.1, 0.5, 3.0][at % 4] * if at % 4 == 3 { f32::from(u8::from(at % 60 == 3)) } else { 1.0 };
-        let middle = random.triple().map(|number| 3.0 * number);
+        let middle = random.next_triple().map(|number| 3.0 * number);
         for _ in 0..3 {
-            let aside = random.triple();
+            let aside = random.next_triple();
             rest.push(std::array::from_fn(|axis| middle[axis] + size * aside[axis]));
         }
     }
@@ -63,14 +63,15 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
 
         let clip = camera.clip_from_camera(width, height, &bounds) * camera.camera_from_world();
         let corner = |vertex: u32| std::array::from_fn(|axis| surface.positions[3 * vertex as usize + axis]);
-        let exact: Vec<Exact> = triangles.iter().map(|own| Exact::new(&clip, SIZE, own.map(corner))).collect();
+        let exact: Vec<ExactTriangle> =
+            triangles.iter().map(|own| ExactTriangle::new(&clip, SIZE, own.map(corner))).collect();
         let ids = |clip: &Matrix4<f64>| {
             let mut raster = VisibilityBuffer::new(Viewport::new(clip, width, height).expect("a window"));
             let group = DrawRange { first: 0, triangles: triangles.len() as u32, faces: CullMode::None };
             raster.draw(&surface.positions, &triangles, group);
             raster.ids()
         };
-        let found = compare(&ids(&clip), &want, &exact, (SIZE, TIE));
+        let found = compare_ids(&ids(&clip), &want, &exact, SIZE[0], TIE);
         let covered = want.iter().flatten().count();
         eprintln!("eye {eye:?}: {covered} samples see a triangle; {found:?}");
         assert!(covered > 5000 && found.wrong == 0, "{covered} covered, {found:?}");
@@ -78,7 +79,7 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
 
         let mut shifted = Matrix4::identity();
         shifted[(0, 3)] = 0.1 / f64::from(width);
-        let control = compare(&ids(&(shifted * clip)), &want, &exact, (SIZE, TIE));
+        let control = compare_ids(&ids(&(shifted * clip)), &want, &exact, SIZE[0], TIE);
         assert!(control.wrong > 5, "control: a twentieth of a pixel aside is told: {control:?}");
     }
 }

@@ -11,8 +11,8 @@ use modalcast_compute::storage::bound::{ErrorBoundInput, ShapeErrorModel};
 use modalcast_compute::storage::{QUAD, TILE_QUADS, TensorCoreError, TiledModes};
 use modalcast_model::scene::{BatchPolicy, DeformationSettings, Scene, SceneState, StorageType};
 
-use crate::accuracy::same_bits;
-use crate::ensembles::{ensemble, made, states, stored};
+use crate::accuracy::have_equal_bits;
+use crate::ensembles::{build_scene, instanced_parts, random_states, with_storage};
 use crate::scenes;
 
 /// Largest quotient of a vertex's error and the bound of its tile. The bound covers U in 16 bits, q as pairs of 16-bit
@@ -41,7 +41,7 @@ fn of_bound(scene: &Scene, state: &SceneState, positions: &[f32]) -> f64 {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_tensor_core_batches_stay_within_their_bound() {
-    let device = Device::open(0).expect("a CUDA device");
+    let device = Device::open(0).expect("expected a CUDA device");
     for storage in [StorageType::F16, StorageType::Bf16] {
         for (vertices, rank, count) in [
             (1, 3, 1),
@@ -54,34 +54,46 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
             (2000, 32, 16),
             (5003, 512, 13),
         ] {
-            let scene = made(ensemble((vertices, rank, count), stored(storage)));
-            let states = states(&scene);
+            let scene = build_scene(instanced_parts(vertices, rank, count, with_storage(storage)));
+            let states = random_states(&scene);
             let batch = BatchMmaBenchmark::new(&device, &scene, &states).expect("a trial");
             let name = format!("{} n {vertices} r {rank}", batch.name());
             for (turn, state) in states.iter().enumerate() {
                 batch.launch(&device, turn).expect("launches");
-                let got = batch.positions(&device).expect("copies");
+                let got = batch.positions(&device).expect("expected a surface");
                 let share = of_bound(&scene, state, &got);
                 assert!(share <= 1.0, "{name} turn {turn}: {share} of the bound");
                 let other = of_bound(&scene, &states[(turn + 1) % states.len()], &got);
                 assert!(other > 1.0, "{name}: the judge can fail");
                 batch.launch(&device, turn).expect("launches");
-                assert!(same_bits(&got, &batch.positions(&device).expect("copies")), "{name}: run after run");
+                assert!(
+                    have_equal_bits(&got, &batch.positions(&device).expect("expected a surface")),
+                    "{name}: run after run"
+                );
             }
             for facts in batch.kernels() {
                 assert!(facts.spilled_bytes == 0, "{name}: {facts:?}");
             }
         }
     }
-    let refused = |scene: &Arc<Scene>| BatchMmaBenchmark::new(&device, scene, &states(scene)).expect_err("refused");
-    assert!(refused(&made(ensemble((9, 2, 2), stored(StorageType::F32)))).to_string().contains("f16 or bf16"));
-    assert!(refused(&made(ensemble((9, 2, 33), stored(StorageType::F16)))).to_string().contains("at most 32"));
+    let refused =
+        |scene: &Arc<Scene>| BatchMmaBenchmark::new(&device, scene, &random_states(scene)).expect_err("refused");
+    assert!(
+        refused(&build_scene(instanced_parts(9, 2, 2, with_storage(StorageType::F32))))
+            .to_string()
+            .contains("f16 or bf16")
+    );
+    assert!(
+        refused(&build_scene(instanced_parts(9, 2, 33, with_storage(StorageType::F16))))
+            .to_string()
+            .contains("at most 32")
+    );
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
-    let device = Device::open(0).expect("a CUDA device");
+    let device = Device::open(0).expect("expected a CUDA device");
     let measure = |trial: &dyn KernelBenchmark| {
         let us = time(&device, trial, CacheState::Warm, 200).expect("times").median_us;
         let bytes: u64 = trial.bytes().iter().map(|(_, bytes)| bytes).sum();
@@ -90,12 +102,12 @@ fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
         us
     };
     for storage in StorageType::ALL {
-        let batched = DeformationSettings { batches: BatchPolicy::Always, ..stored(storage) };
-        let scene = made(ensemble((1_500_000, 32, 1), batched));
-        let state = scenes::state(&scene, 1);
+        let batched = DeformationSettings { batches: BatchPolicy::Always, ..with_storage(storage) };
+        let scene = build_scene(instanced_parts(1_500_000, 32, 1, batched));
+        let state = scenes::random_state(&scene, 1);
         let one = measure(&DeformerBenchmark::new(&device, &scene, &[state], StepOutputs::Positions).expect("a trial"));
-        let scene = made(ensemble((1_500_000, 32, 16), batched));
-        let state = scenes::state(&scene, 1);
+        let scene = build_scene(instanced_parts(1_500_000, 32, 16, batched));
+        let state = scenes::random_state(&scene, 1);
         let sixteen = DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), StepOutputs::Positions)
             .expect("a trial");
         assert_eq!(sixteen.kernels()[0].name, "batch");
@@ -113,7 +125,7 @@ fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_auto_mode_batches_where_it_is_faster() {
-    let device = Device::open(0).expect("a CUDA device");
+    let device = Device::open(0).expect("expected a CUDA device");
     let mut slow = Vec::new();
     for (vertices, rank) in [(1000, 32), (4000, 32), (16_000, 8), (16_000, 32), (64_000, 32), (500_000, 32)] {
         for count in [2, 3, 4, 8, 16, 64] {
@@ -121,13 +133,15 @@ fn gpu_auto_mode_batches_where_it_is_faster() {
                 continue;
             }
             let of = |batches| {
-                made(ensemble(
-                    (vertices, rank, count),
+                build_scene(instanced_parts(
+                    vertices,
+                    rank,
+                    count,
                     DeformationSettings { batches, ..DeformationSettings::default() },
                 ))
             };
             let [together, apart, chosen] = [BatchPolicy::Always, BatchPolicy::Never, BatchPolicy::Auto].map(of);
-            let state = scenes::state(&together, 1);
+            let state = scenes::random_state(&together, 1);
             let measured = |scene: &Arc<Scene>| {
                 let ours = DeformerBenchmark::new(&device, scene, std::slice::from_ref(&state), StepOutputs::Positions)
                     .expect("a trial");

@@ -10,13 +10,13 @@ use modalcast_compute::gpu::Device;
 use modalcast_model::error::Error;
 use modalcast_model::scene::{Bounds, Scene, SceneState};
 
-use crate::accuracy::{POSITION, largest_error};
+use crate::accuracy::{MAX_POSITION_ERROR, max_error};
 use crate::scenes;
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_memory_rates_are_plausible_and_empty_replay_takes_time() {
-    let device = Device::open(0).expect("a CUDA device");
+    let device = Device::open(0).expect("expected a CUDA device");
     let roofs = roofs(&device).expect("roofs");
     eprintln!("{}: {roofs:?}", device.name());
     assert!(roofs.copy_gbs > 20.0 && roofs.pinned_h2d_gbs > 1.0 && roofs.pinned_d2h_gbs > 1.0, "{roofs:?}");
@@ -53,7 +53,7 @@ fn judge(scene: &Scene, state: &SceneState, positions: &[f32]) -> Result<f64, St
     let kept = |vertex: &usize| named[*vertex];
     let got: Vec<f32> = (0..named.len()).filter(kept).flat_map(|at| positions[3 * at..][..3].to_vec()).collect();
     let want: Vec<[f64; 3]> = (0..named.len()).filter(kept).map(|vertex| want[vertex]).collect();
-    largest_error(&got, &want, POSITION * diagonal).map(|error| error / diagonal)
+    max_error(&got, &want, MAX_POSITION_ERROR * diagonal).map(|error| error / diagonal)
 }
 
 /// Checks every turn of a trial, launched directly and replayed.
@@ -62,7 +62,7 @@ fn check(device: &Device, scene: &Arc<Scene>, states: &[SceneState], trial: &dyn
     assert_eq!(trial.turns(), states.len(), "{name}");
     for (turn, state) in states.iter().enumerate() {
         trial.launch(device, turn).unwrap_or_else(|error| panic!("{name}: {error}"));
-        let positions = trial.positions(device).expect("copies");
+        let positions = trial.positions(device).expect("expected a surface");
         let error = judge(scene, state, &positions).unwrap_or_else(|error| panic!("{name} turn {turn}: {error}"));
         assert!(judge(scene, &states[(turn + 1) % states.len()], &positions).is_err(), "{name}: the judge can fail");
         eprintln!("{name} turn {turn}: {error:.2e} of the diagonal");
@@ -71,7 +71,7 @@ fn check(device: &Device, scene: &Arc<Scene>, states: &[SceneState], trial: &dyn
     for cache in [CacheState::Warm, CacheState::Cold] {
         trial.launch(device, 0).expect("launches");
         let timing = time(device, trial, cache, 10 * states.len()).unwrap_or_else(|error| panic!("{name}: {error}"));
-        let positions = trial.positions(device).expect("copies");
+        let positions = trial.positions(device).expect("expected a surface");
         let last = states.len() - 1;
         judge(scene, &states[last], &positions).unwrap_or_else(|error| panic!("{name} replayed: {error}"));
         eprintln!("{name} {cache:?}: {timing:?}, {} launches", trial.launches());
@@ -83,7 +83,7 @@ fn check(device: &Device, scene: &Arc<Scene>, states: &[SceneState], trial: &dyn
 }
 
 fn states(scene: &Scene) -> Vec<SceneState> {
-    (1..=3).map(|seed| scenes::state(scene, seed)).collect()
+    (1..=3).map(|seed| scenes::random_state(scene, seed)).collect()
 }
 
 #[test]
@@ -99,10 +99,10 @@ fn gpu_thesis_single_matches_reference_up_to_rank_512() {
 }
 
 fn single(ranks: &[usize]) {
-    let device = Device::open(0).expect("a CUDA device");
+    let device = Device::open(0).expect("expected a CUDA device");
     for rank in ranks.iter().copied() {
         for (vertices, normal_maps) in [(1, false), (33, true), (5003, false)] {
-            let scene = scenes::scene(&[(vertices, rank)], 1, normal_maps, false);
+            let scene = scenes::random_scene(&[(vertices, rank)], 1, normal_maps, false);
             for part in [Part::Uq, Part::Whole] {
                 let trial = ThesisBenchmark::single(&device, &scene, &states(&scene), part).expect("a trial");
                 check(&device, &scene, &states(&scene), &trial);
@@ -114,9 +114,9 @@ fn single(ranks: &[usize]) {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
-    let device = Device::open(0).expect("a CUDA device");
+    let device = Device::open(0).expect("expected a CUDA device");
     let shapes: Vec<_> = (0..66).map(|index| (1 + index * 29 % 611, index % 33)).collect();
-    let scene = scenes::scene(&shapes, 2, true, false);
+    let scene = scenes::random_scene(&shapes, 2, true, false);
     for split in KernelSplit::ALL {
         for part in [Part::Uq, Part::Whole] {
             let trial = ThesisBenchmark::multi(&device, &scene, &states(&scene), (split, part)).expect("a trial");
@@ -124,7 +124,7 @@ fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
             assert_eq!(trial.launches(), split.widths().len() + usize::from(part == Part::Whole));
         }
     }
-    let rigid = scenes::scene(&[(40, 0)], 3, false, true);
+    let rigid = scenes::random_scene(&[(40, 0)], 3, false, true);
     let update_alone =
         ThesisBenchmark::multi(&device, &rigid, &states(&rigid), (KernelSplit::Two, Part::Whole)).expect("a trial");
     check(&device, &rigid, &states(&rigid), &update_alone);
@@ -133,11 +133,11 @@ fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_cublas_matches_reference_with_every_product_kind() {
-    let device = Device::open(0).expect("a CUDA device");
+    let device = Device::open(0).expect("expected a CUDA device");
     let shapes: Vec<_> = (0..40).map(|index| (1 + index * 29 % 611, index * 7 % 65)).collect();
-    let many = scenes::scene(&shapes, 2, false, false);
+    let many = scenes::random_scene(&shapes, 2, false, false);
     let (one, instances) =
-        (scenes::scene(&[(5003, 30)], 1, false, false), scenes::scene(&[(5003, 32)], 16, false, false));
+        (scenes::random_scene(&[(5003, 30)], 1, false, false), scenes::random_scene(&[(5003, 32)], 16, false, false));
     for peer in CublasMethod::ALL {
         let scene = match peer {
             CublasMethod::SgemvColumns | CublasMethod::SgemvRows => &one,
@@ -159,8 +159,9 @@ fn gpu_cublas_matches_reference_with_every_product_kind() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_trials_reject_unsupported_scenes() {
-    let device = Device::open(0).expect("a CUDA device");
-    let (large, two) = (scenes::scene(&[(40, 33)], 1, false, false), scenes::scene(&[(40, 3)], 2, false, false));
+    let device = Device::open(0).expect("expected a CUDA device");
+    let (large, two) =
+        (scenes::random_scene(&[(40, 33)], 1, false, false), scenes::random_scene(&[(40, 3)], 2, false, false));
     let field = |refusal: Result<ThesisBenchmark, Error>| match refusal {
         Err(Error::Invalid { field, .. }) => field,
         other => panic!("{other:?}"),

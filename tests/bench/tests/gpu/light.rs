@@ -9,14 +9,14 @@ use crate::scenes::{self, Random};
 
 /// Times of a whole step with and without a shadow, microseconds.
 fn costs(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64; 2] {
-    let device = Device::open(0).expect("a CUDA device");
+    let device = Device::open(0).expect("expected a CUDA device");
     let with = [true, false].map(|is_lit| {
-        let mut parts = scenes::parts(vec![scenes::shape(&mut Random(9), vertices, rank)]);
-        parts.domains = vec![scenes::domain(0, 0); instances];
+        let mut parts = scenes::parts_of_shapes(vec![scenes::random_shape(&mut Random(9), vertices, rank)]);
+        parts.domains = vec![scenes::new_domain(0, 0); instances];
         parts.look.shadow = parts.look.shadow.filter(|_| is_lit);
-        let scene = Scene::new(parts).expect("a scene");
-        let trial =
-            DeformerBenchmark::new(&device, &scene, &[scenes::state(&scene, 1)], StepOutputs::Whole).expect("a trial");
+        let scene = Scene::new(parts).expect("expected a valid scene");
+        let trial = DeformerBenchmark::new(&device, &scene, &[scenes::random_state(&scene, 1)], StepOutputs::Whole)
+            .expect("a trial");
         trial.kernels().iter().for_each(|facts| eprintln!("{name}, shadow {is_lit}: {facts:?}"));
         time(&device, &trial, CacheState::Warm, 300).expect("times").median_us
     });

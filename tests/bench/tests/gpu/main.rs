@@ -6,7 +6,7 @@
 mod accuracy;
 mod batch;
 mod benchmarks;
-#[path = "../../../both/cut_outs.rs"]
+#[path = "../../../common/cut_outs.rs"]
 mod cut_outs;
 #[path = "../../../gpu/ensembles.rs"]
 mod ensembles;
@@ -17,5 +17,5 @@ mod raster_cut_outs;
 mod report;
 #[path = "../../../gpu/scenes.rs"]
 mod scenes;
-#[path = "../../../both/soups.rs"]
+#[path = "../../../common/soups.rs"]
 mod soups;

@@ -9,9 +9,9 @@ use crate::scenes;
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_overlapped_steps_are_faster_with_identical_vertices() {
-    let device = Device::open(0).expect("a CUDA device");
-    let scene = scenes::scene(&[(200_000, 8), (7, 0), (40, 3)], 4, false, false);
-    let states: Vec<SceneState> = (0..4).map(|seed| scenes::state(&scene, seed)).collect();
+    let device = Device::open(0).expect("expected a CUDA device");
+    let scene = scenes::random_scene(&[(200_000, 8), (7, 0), (40, 3)], 4, false, false);
+    let states: Vec<SceneState> = (0..4).map(|seed| scenes::random_state(&scene, seed)).collect();
     let found = overlap(&device, &scene, &states, 50).expect("measures");
     eprintln!("{found:#?}");
     assert_eq!(found.differing, 0);

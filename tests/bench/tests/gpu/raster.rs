@@ -6,12 +6,12 @@ use modalcast_bench::render::{RenderReportOptions, Size, rasters};
 use modalcast_compute::gpu::{Device, RasterGranularity, RasterVariant};
 use modalcast_compute::reference::raster::{CullReason, clipped_polygon};
 
-use crate::soups::{Soup, soups};
+use crate::soups::{Soup, all_soups};
 
 fn launched(device: &Device, soup: &Soup, form: RasterVariant) -> RasterBenchmark {
     let mesh =
         RasterMesh { positions: &soup.positions, triangles: &soup.triangles, groups: &soup.groups, cut_outs: None };
-    let raster = RasterBenchmark::new(device, mesh, soup.window, form).expect("a raster");
+    let raster = RasterBenchmark::new(device, mesh, soup.viewport, form).expect("expected a rasterizer");
     // Twice, to check that queues and samples of the first launch are cleared.
     (0..2).for_each(|_| raster.launch(device, 0).expect("launches"));
     raster
@@ -22,7 +22,7 @@ fn dropped(soup: &Soup) -> ([u32; 5], u32) {
     let (mut counts, mut drawn) = ([0; 5], 0);
     for group in &soup.groups {
         for triangle in &soup.triangles[group.first as usize..][..group.triangles as usize] {
-            match clipped_polygon(&soup.window, &soup.positions, *triangle, group.faces) {
+            match clipped_polygon(&soup.viewport, &soup.positions, *triangle, group.faces) {
                 Ok(_) => drawn += 1,
                 Err(CullReason::NotFinite) => counts[0] += 1,
                 Err(CullReason::OutsideFrustum) => counts[1] += 1,
@@ -38,13 +38,13 @@ fn dropped(soup: &Soup) -> ([u32; 5], u32) {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_samples_match_the_definition_bitwise_on_every_path() {
-    let device = Device::open(0).expect("a CUDA device");
-    for soup in soups() {
-        let want = soup.drawn();
+    let device = Device::open(0).expect("expected a CUDA device");
+    for soup in all_soups() {
+        let want = soup.rasterize();
         for granularity in [RasterGranularity::BySize, RasterGranularity::Warps, RasterGranularity::Tiles] {
             for count_triangles in [false, true] {
                 let form = RasterVariant { granularity, count_triangles, ..RasterVariant::default() };
-                let keys = launched(&device, &soup, form).keys(&device).expect("keys");
+                let keys = launched(&device, &soup, form).keys(&device).expect("expected the id keys");
                 let wrong = keys.iter().zip(&want.keys).filter(|(got, want)| got != want).count();
                 assert_eq!(wrong, 0, "{} by {form:?}: of {} samples", soup.name, keys.len());
             }
@@ -59,9 +59,9 @@ fn gpu_samples_match_the_definition_bitwise_on_every_path() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_counts_every_triangle_once_and_takes_every_path() {
-    let device = Device::open(0).expect("a CUDA device");
+    let device = Device::open(0).expect("expected a CUDA device");
     let mut all = [0; 3];
-    for soup in soups() {
+    for soup in all_soups() {
         for granularity in [RasterGranularity::BySize, RasterGranularity::Warps, RasterGranularity::Tiles] {
             let form = RasterVariant { count_triangles: true, granularity, ..RasterVariant::default() };
             let counts = launched(&device, &soup, form).counts(&device).expect("counts");
@@ -77,7 +77,7 @@ fn gpu_counts_every_triangle_once_and_takes_every_path() {
         }
     }
     assert!(all.iter().all(|path| *path > 10), "{all:?}");
-    let quiet = launched(&device, &soups()[1], RasterVariant::default()).counts(&device).expect("counts");
+    let quiet = launched(&device, &all_soups()[1], RasterVariant::default()).counts(&device).expect("counts");
     assert_eq!(quiet, RasterCounts::default(), "nothing is counted unasked");
 }
 
@@ -92,7 +92,7 @@ fn gpu_ids_of_scenes_match_opengl_and_both_are_timed() {
         quick: true,
         replays: 20,
     };
-    let report = rasters(&request, |_| {}).expect("a report");
+    let report = rasters(&request, |_| {}).expect("expected a report");
     report.rows.iter().for_each(|row| eprintln!("{}", row.line()));
     assert_eq!(report.rows.len(), 4);
     for row in &report.rows {

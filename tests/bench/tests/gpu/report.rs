@@ -13,7 +13,7 @@ fn gpu_all_variants_of_quick_loads_pass_and_are_timed() {
     let sources = kinds.map(WorkloadSource::Synthetic).collect();
     let (steps, variants) = (usize::MAX, Vec::new());
     let request = DeformReportOptions { sources, seeds: 4, replays: 20, steps, variants, size: Size::Quick };
-    let report = deform(&request, &LocalMachine::open(), |_| Ok(())).expect("a report");
+    let report = deform(&request, &LocalMachine::open(), |_| Ok(())).expect("expected a report");
     assert!(report.passed(), "{:#?}", report.failed);
     assert!(report.remarks.is_empty(), "{:?}", report.remarks);
     for load in names {

@@ -1,0 +1,282 @@
+//! Optional vertex attributes of a scene: displacements, and a bounding box per domain.
+
+use std::sync::Arc;
+
+use modalcast::config::{BackendChoice, Config, RendererChoice};
+use modalcast::engine::DeviceContext;
+use modalcast_model::backend_settings::BackendSettings;
+use modalcast_model::deform::{Deformer, VertexAttributes};
+use modalcast_model::domain::{Domain, Transform};
+use modalcast_model::scene::{Bounds, DeformationSettings, Scene, SceneState, StorageType};
+
+use super::extreme_values::scene_from_columns;
+use super::neighbors::has_one_item_per_lane;
+use super::{
+    StepResult, assert_displacements_within_bound, domains_beyond_displacement_bound, partial_steps, run_step,
+    scene_of_shapes, strip_shape,
+};
+use crate::scenes::{self, NORMAL_MAPPED, Random};
+
+/// The same deformation with displacements and boxes.
+pub(crate) fn with_displacements_and_boxes(deformation: DeformationSettings) -> DeformationSettings {
+    DeformationSettings { displacements: true, boxes: true, ..deformation }
+}
+
+/// The first domain whose box differs from the bounds of its positions.
+pub(crate) fn find_wrong_box(scene: &Scene, result: &StepResult) -> Option<usize> {
+    let slots = &scene.layout.slots;
+    assert_eq!(result.surface.boxes.len(), slots.len(), "expected a box per domain");
+    let position_bounds = |domain: usize| {
+        let positions = &result.surface.positions[3 * slots[domain].first_vertex..][..3 * slots[domain].vertices];
+        Bounds::from_positions(positions)
+    };
+    (0..slots.len()).find(|domain| result.surface.boxes[*domain] != position_bounds(*domain))
+}
+
+/// Number of vertices and rank of each shape, for every kind of tile: shared by domains, used by one domain, and several
+/// per domain. With `many` there are so many domains that a lane computes four vertices.
+fn shape_sizes(many: bool) -> Vec<(usize, usize)> {
+    let small_count = [(1, 3), (7, 2), (9, 0), (31, 1), (64, 5), (65, 0), (130, 33), (1, 0), (300, 4)];
+    let large_count = (0..900).map(|index| (3 + index % 9, index % 4)).chain([(4097, 0), (5000, 3)]);
+    if many { large_count.collect() } else { small_count.to_vec() }
+}
+
+/// A scene with two domains per shape, or with `many` one domain per shape and 30 of the last.
+fn scene(deformation: DeformationSettings, many: bool) -> Arc<Scene> {
+    let mut random = Random(101);
+    let shape = |(index, (vertices, rank)): (usize, (usize, usize))| match index % 2 {
+        0 => strip_shape(&mut random, vertices, rank),
+        _ => scenes::random_shape(&mut random, vertices, rank),
+    };
+    let mut parts = scenes::parts_of_shapes(shape_sizes(many).into_iter().enumerate().map(shape).collect());
+    parts.deformation = deformation;
+    let count = parts.shapes.len();
+    let further_domains = if many { vec![count - 1; 29] } else { (0..count).collect() };
+    let domain = |(index, shape): (usize, usize)| Domain {
+        name: format!("domain {index}"),
+        ..scenes::new_domain(shape, if many { 0 } else { NORMAL_MAPPED })
+    };
+    parts.domains = (0..count).chain(further_domains).enumerate().map(domain).collect();
+    Scene::new(parts).expect("expected a valid scene")
+}
+
+/// Displacements are within their bound, boxes are tight, and vertices have the bits that they have without these
+/// attributes.
+pub(crate) fn check_displacements_and_boxes<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    for (storage, compensated, many) in StorageType::ALL.into_iter().flat_map(|storage| {
+        [(storage, false, false), (storage, true, false), (storage, storage == StorageType::Bf16, true)]
+    }) {
+        let deformation = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
+        let (plain_scene, scene) = (scene(deformation, many), scene(with_displacements_and_boxes(deformation), many));
+        let state = scenes::random_state(&scene, 102);
+        let (plain_result, result) =
+            (run_step(&mut create_deformer(&plain_scene), &state), run_step(&mut create_deformer(&scene), &state));
+        assert_eq!(has_one_item_per_lane(&scene), !many);
+        let name = format!("{}, compensated {compensated}, {} domains", storage.name(), scene.domains.len());
+        assert!(plain_result.surface.displacements.is_empty() && plain_result.surface.boxes.is_empty(), "{name}");
+        let mut vertices_only = result.clone();
+        (vertices_only.surface.displacements, vertices_only.surface.boxes) = (vec![], vec![]);
+        assert_eq!(
+            vertices_only.difference(&plain_result),
+            None,
+            "{name}: expected the same vertices with and without attributes"
+        );
+        assert_displacements_within_bound(&name, &scene, &state, &result.surface.displacements);
+        assert_eq!(find_wrong_box(&scene, &result), None, "{name}");
+        // Negative control: the opposite q exceeds the bound of each domain with modes. Other domains have zeros.
+        let mut negated_state = state.clone();
+        negated_state.q.iter_mut().for_each(|number| *number = -*number);
+        let modal_domains: Vec<usize> = (0..scene.domains.len()).filter(|domain| scene.rank_of(*domain) > 0).collect();
+        assert_eq!(
+            domains_beyond_displacement_bound(&scene, &negated_state, &result.surface.displacements),
+            modal_domains,
+            "{name}"
+        );
+        let mut modified = result.clone();
+        modified.surface.positions[3 * scene.layout.slots[3].first_vertex] += 100.0;
+        assert_eq!(find_wrong_box(&scene, &modified), Some(3), "{name}");
+    }
+}
+
+/// A scene in which no domain has modes has zero displacements and correct boxes.
+pub(crate) fn check_scene_without_modes<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    let mut random = Random(103);
+    let shapes = vec![strip_shape(&mut random, 7, 0), scenes::random_shape(&mut random, 300, 0)];
+    let scene = scene_of_shapes(shapes, 2, with_displacements_and_boxes(DeformationSettings::default()), false);
+    assert!(!scene.needs.modes && scene.needs.displacements);
+    let result = run_step(&mut create_deformer(&scene), &scenes::random_state(&scene, 104));
+    assert_eq!(result.surface.displacements, vec![0.0; 3 * scene.layout.vertices]);
+    assert_eq!(find_wrong_box(&scene, &result), None);
+}
+
+/// Reading some attributes returns those of the last step, and the other attributes can be read afterwards.
+pub(crate) fn check_separate_reads<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    let scene = scene(with_displacements_and_boxes(DeformationSettings::default()), false);
+    let (mut deformer, mut random) = (create_deformer(&scene), Random(105));
+    let mut state = scenes::random_state(&scene, 106);
+    let mut last = run_step(&mut deformer, &state);
+    let none = VertexAttributes::default();
+    for (step, requested) in [
+        VertexAttributes { boxes: true, ..none },
+        VertexAttributes { displacements: true, ..none },
+        VertexAttributes { positions: true, ..none },
+        VertexAttributes { displacements: true, boxes: true, ..none },
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        partial_steps::apply_random_step(&scene, &mut state, &mut random, &[1, 6, step as u32 + 8], &[2, 6]);
+        let want = run_step(&mut create_deformer(&scene), &state);
+        deformer.deform(&state).expect("expected the step to succeed");
+        let got = deformer.read(requested).expect("expected a surface").clone();
+        let [new, old] = [&want.surface, &last.surface];
+        if requested.boxes {
+            assert!(got.boxes == new.boxes && new.boxes != old.boxes, "step {step}");
+        }
+        if requested.displacements {
+            let is_new = new.displacements != old.displacements;
+            assert!(got.displacements == new.displacements && is_new, "step {step}");
+        }
+        if requested.positions {
+            assert!(got.positions == new.positions && new.positions != old.positions, "step {step}");
+        }
+        let full_result = StepResult {
+            bounds: want.bounds,
+            light: want.light,
+            surface: deformer.surface().expect("expected a surface").clone(),
+        };
+        assert_eq!(full_result.difference(&want), None, "step {step}: after a partial read");
+        last = want;
+    }
+}
+
+/// A readback returns the requested attributes of its own step and no others. Other requests for the same step succeed
+/// too, and readbacks stay valid when later steps are computed.
+pub(crate) fn check_separate_readbacks<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    let scene = scene(with_displacements_and_boxes(DeformationSettings::default()), false);
+    let (mut deformer, mut random, mut state) =
+        (create_deformer(&scene), Random(108), scenes::random_state(&scene, 109));
+    let mut pending = Vec::new();
+    for step in 0..20 {
+        partial_steps::apply_random_step(&scene, &mut state, &mut random, &[1, 6, step % 4 + 8], &[2, 6]);
+        let want = run_step(&mut create_deformer(&scene), &state).surface;
+        deformer.deform(&state).expect("expected the step to succeed");
+        let requests = [step, step / 4 * 3 + 1, step * 7 + 2].map(|bits| attributes_of_bits(bits as usize % 16));
+        let readbacks =
+            requests.map(|requested| (requested, deformer.readback(requested).expect("expected a readback to start")));
+        for (want, readbacks) in std::mem::replace(&mut pending, vec![(want, readbacks)]) {
+            for (requested, readback) in readbacks.iter().rev() {
+                let got = deformer.wait_readback(readback).expect("expected the readback to complete");
+                let comparisons = [
+                    (requested.positions, got.positions == want.positions, got.positions.is_empty()),
+                    (requested.normals, got.normals == want.normals, got.normals.is_empty()),
+                    (requested.displacements, got.displacements == want.displacements, got.displacements.is_empty()),
+                    (requested.boxes, got.boxes == want.boxes, got.boxes.is_empty()),
+                ];
+                // A request may also receive attributes that an earlier request for the same step included.
+                let is_valid = |(requested, same, empty): &(bool, bool, bool)| *same || !requested && *empty;
+                assert!(
+                    comparisons.iter().all(is_valid) && got.tangents.is_empty(),
+                    "before step {step}: {requested:?}, {comparisons:?}"
+                );
+            }
+        }
+    }
+    // Negative control: the next step has other attributes.
+    let (last, _) = pending.pop().expect("expected a valid step");
+    partial_steps::apply_random_step(&scene, &mut state, &mut random, &[1, 6], &[2, 6]);
+    let next = run_step(&mut deformer, &state).surface;
+    assert!(last.positions != next.positions && last.normals != next.normals);
+    assert!(last.displacements != next.displacements && last.boxes != next.boxes);
+}
+
+/// The combination of attributes given by the lowest four bits.
+fn attributes_of_bits(bits: usize) -> VertexAttributes {
+    let bit = |index: usize| bits >> index & 1 == 1;
+    VertexAttributes { positions: bit(0), normals: bit(1), displacements: bit(2), boxes: bit(3) }
+}
+
+/// A scene with u = (q0 + q1, q0 + q1, q2) at every vertex.
+fn scene_of_ones(deformation: DeformationSettings) -> Arc<Scene> {
+    let column = |row: [f32; 3]| row.repeat(5);
+    let columns = [column([1.0, 1.0, 0.0]), column([1.0, 1.0, 0.0]), column([0.0, 0.0, 1.0])].concat();
+    scene_from_columns(5, columns, deformation)
+}
+
+/// A transform that scales so much down that x is finite where u overflows.
+const TINY_SCALE: Transform = Transform([1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6, 0.0]);
+
+/// A displacement in the range of f32 survives intermediate overflow. One that overflows is reported, even if x is
+/// finite.
+pub(crate) fn check_displacement_overflow<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    for (storage, compensated) in StorageType::ALL.into_iter().flat_map(|storage| [(storage, false), (storage, true)]) {
+        let deformation = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
+        let name = format!("{}, compensated {compensated}", storage.name());
+        let (plain_scene, scene) =
+            (scene_of_ones(deformation), scene_of_ones(with_displacements_and_boxes(deformation)));
+        let (mut plain_deformer, mut deformer) = (create_deformer(&plain_scene), create_deformer(&scene));
+        let mut state = SceneState::rest(&scene);
+        state.transforms[0] = TINY_SCALE;
+        // u is 6e38, which exceeds f32.
+        state.q = vec![3e38, 3e38, 0.75];
+        assert!(run_step(&mut plain_deformer, &state).bounds.is_finite(), "{name}: expected a finite x");
+        assert!(
+            !run_step(&mut deformer, &state).bounds.is_finite(),
+            "{name}: expected the overflow of u to be reported"
+        );
+        state.q = vec![1e38, 2e38, 0.75];
+        let result = run_step(&mut deformer, &state);
+        assert!(result.bounds.is_finite() && find_wrong_box(&scene, &result).is_none(), "{name}: {:?}", result.bounds);
+        assert_displacements_within_bound(&name, &scene, &state, &result.surface.displacements);
+    }
+    // Partial sums overflow although the total is finite.
+    let row = [1.0_f32, -1.0, 0.5].repeat(5);
+    let scene = scene_from_columns(
+        5,
+        [row.clone(), row.clone(), row.clone(), row].concat(),
+        with_displacements_and_boxes(DeformationSettings::default()),
+    );
+    let mut state = SceneState::rest(&scene);
+    (state.transforms[0], state.q) = (TINY_SCALE, vec![3e38, 3e38, -3e38, -2.5e38]);
+    let result = run_step(&mut create_deformer(&scene), &state);
+    assert!(result.bounds.is_finite() && find_wrong_box(&scene, &result).is_none(), "{:?}", result.bounds);
+    for u in result.surface.displacements.chunks_exact(3) {
+        let relative_error = |got: f32, want: f32| (got - want).abs() / want.abs();
+        let max_error = relative_error(u[0], 5e37).max(relative_error(u[1], -5e37)).max(relative_error(u[2], 2.5e37));
+        assert!(max_error < 1e-6, "{u:?}");
+    }
+}
+
+/// A step with an overflowing displacement is rejected with the name of its domain, and readers keep the last valid step.
+pub(crate) fn check_displacement_overflow_rejection(backend: BackendChoice) {
+    let config = Config { backend, renderer: RendererChoice::Off, ..Config::default() };
+    let mut context = DeviceContext::open(&config).expect("expected a device context");
+    let scene = scene(with_displacements_and_boxes(DeformationSettings::default()), false);
+    let (mut loaded_scene, mut random) =
+        (context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load"), Random(107));
+    let mut valid_state = SceneState::rest(&scene);
+    partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[1, 4], &[4]);
+    loaded_scene.deform(&valid_state).expect("expected a valid step");
+    let before = loaded_scene.surface().expect("vertices").clone();
+    for domain in [4, 6] {
+        let mut overflowing_state = valid_state.clone();
+        partial_steps::apply_random_step(
+            &scene,
+            &mut overflowing_state,
+            &mut random,
+            &[domain as u32],
+            &[domain as u32],
+        );
+        overflowing_state.transforms[domain] = Transform(TINY_SCALE.0.map(|number| number * 1e-18));
+        let slot = scene.layout.slots[domain];
+        overflowing_state.q[slot.first_q..][..slot.rank].fill(f32::MAX);
+        let error = loaded_scene.deform(&overflowing_state).expect_err("expected an overflow error").to_string();
+        eprintln!("{error}");
+        assert!(error.starts_with(&format!("step.q of domain 'domain {domain}'")), "{error}");
+        assert_eq!(loaded_scene.surface().expect("vertices"), &before);
+    }
+    partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[8], &[]);
+    loaded_scene.deform(&valid_state).expect("expected a valid step");
+    assert_ne!(loaded_scene.surface().expect("vertices"), &before, "expected the step to change vertices");
+    context.unload_scene(loaded_scene);
+}

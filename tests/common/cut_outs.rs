@@ -1,0 +1,156 @@
+//! Triangle soups with alpha-tested triangles, and the samples where two texture filters may disagree.
+
+use modalcast_compute::reference::raster::cut_out::{alpha, footprint};
+use modalcast_compute::reference::raster::{VisibilityBuffer, clipped_polygon, corners, depth_at, fan_triangles};
+use modalcast_model::raster::{AlphaImage, AlphaMaterial, CutOuts};
+use modalcast_model::scene::{CullMode, DrawRange, Viewport};
+
+use super::soups::{Soup, all_soups, clip_space_viewport, perspective_viewport};
+use crate::scenes::Random;
+
+/// A soup whose triangles from `cut_outs.first` on are alpha-tested.
+pub(crate) struct CutOutSoup {
+    pub(crate) soup: Soup,
+    pub(crate) cut_outs: CutOuts,
+}
+
+impl CutOutSoup {
+    /// Ids and depths by the reference rasterizer.
+    pub(crate) fn rasterize(&self) -> VisibilityBuffer {
+        let Soup { viewport, positions, triangles, groups, .. } = &self.soup;
+        let mut raster = VisibilityBuffer::new(*viewport);
+        groups.iter().for_each(|group| raster.draw_cut_out(positions, triangles, *group, &self.cut_outs));
+        raster
+    }
+
+    /// Whether each sample has an alpha value within `tolerance` of its threshold.
+    pub(crate) fn ambiguous_samples(&self, tolerance: f32) -> Vec<bool> {
+        let (soup, cut_outs) = (&self.soup, &self.cut_outs);
+        let mut is_ambiguous = vec![false; soup.viewport.pixel_count()];
+        for (triangle, faces) in soup
+            .groups
+            .iter()
+            .flat_map(|group| (group.first..group.first + group.triangles).map(move |triangle| (triangle, group.faces)))
+        {
+            let Some(cut_out) = triangle.checked_sub(cut_outs.first) else { continue };
+            let vertices = soup.triangles[triangle as usize];
+            let Ok(clipped_polygon) = clipped_polygon(&soup.viewport, &soup.positions, vertices, faces) else {
+                continue;
+            };
+            let (corners, uvs) = (corners(&soup.viewport, &soup.positions, vertices), &cut_outs.uvs[cut_out as usize]);
+            let cutoff = cut_outs.materials[cut_outs.material_indices[cut_out as usize] as usize].cutoff;
+            let [x0, y0, x1, y1] = clipped_polygon.samples;
+            for triangle_piece in fan_triangles(&clipped_polygon) {
+                for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
+                    if depth_at(&triangle_piece, column, row).is_some() {
+                        let footprint = footprint(&soup.viewport, &corners, uvs, [column, row]);
+                        let is_near = (alpha(cut_outs, triangle, &footprint) - cutoff).abs() <= tolerance;
+                        is_ambiguous[row as usize * soup.viewport.size()[0] as usize + column as usize] |= is_near;
+                    }
+                }
+            }
+        }
+        is_ambiguous
+    }
+}
+
+/// An image with a full mip chain; `texel` returns the alpha of a level, column and row.
+pub(crate) fn alpha_image(width: u32, height: u32, mut texel: impl FnMut(u32, u32, u32) -> u8) -> AlphaImage {
+    let levels = (0..=width.max(height).ilog2()).map(|level| {
+        let [width, height] = [width, height].map(|side| (side >> level).max(1));
+        (0..width * height).map(|index| texel(level, index % width, index / width)).collect()
+    });
+    AlphaImage { width, height, levels: levels.collect() }
+}
+
+/// All soups with uniform images or without images, so that the result does not depend on the texture filter. All
+/// but the first third of the triangles are alpha-tested.
+pub(crate) fn uniform_cut_out_soups() -> Vec<CutOutSoup> {
+    let mut random = Random(21);
+    let material = |alpha, cutoff, image| AlphaMaterial { alpha, cutoff, image };
+    let materials = vec![
+        material(1.0, 0.5, Some(0)),
+        material(1.0, 0.5, Some(1)),
+        material(0.25, 0.5, Some(1)),
+        material(1.0, 0.0, Some(0)),
+        material(0.75, 0.75, None),
+        material(0.5, 0.75, None),
+        material(1.0, f32::NAN, None),
+    ];
+    let images = vec![alpha_image(5, 3, |_, _, _| 0), alpha_image(8, 1, |_, _, _| 255)];
+    let with_cut_outs = |soup: Soup| {
+        let first = soup.triangles.len() as u32 / 3;
+        let count = soup.triangles.len() - first as usize;
+        let mut uv = || [random.next_number(), random.next_number()].map(|number| 3.0 * number);
+        let uvs = (0..count).map(|_| [uv(), uv(), uv()]).collect();
+        let material_indices = (0..count).map(|index| (index % materials.len()) as u32).collect();
+        let (materials, images) = (materials.clone(), images.clone());
+        CutOutSoup { soup, cut_outs: CutOuts { first, uvs, material_indices, materials, images, anisotropy: 8.0 } }
+    };
+    all_soups().into_iter().map(with_cut_outs).collect()
+}
+
+/// Two triangles that fill a viewport of `side` x `side` pixels with one image; u grows to the right, v downwards. If the
+/// viewport has the size of the image, each sample is the center of a texel.
+pub(crate) fn sheet_soup(side: u32, image: AlphaImage) -> CutOutSoup {
+    let positions = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]].map(|[x, y]| [x, y, 0.0]).concat();
+    let triangles = vec![[0, 1, 2], [0, 2, 3]];
+    let uv = |corner: u32| [[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]][corner as usize];
+    let cut_outs = CutOuts {
+        first: 0,
+        uvs: triangles.iter().map(|corners: &[u32; 3]| corners.map(uv)).collect(),
+        material_indices: vec![0; 2],
+        materials: vec![AlphaMaterial { alpha: 1.0, cutoff: 0.5, image: Some(0) }],
+        images: vec![image],
+        anisotropy: 1.0,
+    };
+    let groups = vec![DrawRange { first: 0, triangles: 2, faces: CullMode::Back }];
+    CutOutSoup {
+        soup: Soup { name: "sheet", positions, triangles, groups, viewport: clip_space_viewport(side, side) },
+        cut_outs,
+    }
+}
+
+/// A floor one unit below the eye that continues behind it, split into `cuts` x `cuts` rectangles, and an opaque wall at
+/// its end. The floor's image is smooth, so that filters of low precision differ little.
+pub(crate) fn floor_soup(cuts: u32) -> CutOutSoup {
+    let mut positions = [[-20.0, -9.0, -20.5], [20.0, -9.0, -20.5], [20.0, 9.0, -20.5], [-20.0, 9.0, -20.5]].concat();
+    let mut triangles = vec![[0, 1, 2], [0, 2, 3]];
+    let fraction = |index: u32| index as f32 / cuts as f32;
+    let grid = (0..=cuts).flat_map(|row| (0..=cuts).map(move |column| (column, row)));
+    positions.extend(grid.flat_map(|(x, z)| [18.0 * fraction(x) - 9.0, -1.0, 9.0 - 29.0 * fraction(z)]));
+    let mut uvs = Vec::new();
+    for (column, row) in (0..cuts).flat_map(|row| (0..cuts).map(move |column| (column, row))) {
+        let corners =
+            [(0, 0), (1, 0), (1, 1), (0, 1)].map(|(next_column, next_row)| (column + next_column, row + next_row));
+        for vertex_order in [[0, 1, 2], [0, 2, 3]] {
+            let corners = vertex_order.map(|corner: usize| corners[corner]);
+            triangles.push(corners.map(|(x, z)| 4 + z * (cuts + 1) + x));
+            uvs.push(corners.map(|(x, z)| [3.0 * fraction(x), 5.0 * fraction(z)]));
+        }
+    }
+    let cut_outs = CutOuts {
+        first: 2,
+        material_indices: vec![0; uvs.len()],
+        uvs,
+        materials: vec![AlphaMaterial { alpha: 1.0, cutoff: 0.4, image: Some(0) }],
+        images: vec![waves()],
+        anisotropy: 1.0,
+    };
+    let viewport: Viewport = perspective_viewport(192, 128, 0.1, 100.0);
+    let groups = vec![
+        DrawRange { first: 0, triangles: 2, faces: CullMode::Back },
+        DrawRange { first: 2, triangles: triangles.len() as u32 - 2, faces: CullMode::None },
+    ];
+    CutOutSoup { soup: Soup { name: "floor", positions, triangles, groups, viewport }, cut_outs }
+}
+
+/// One sine wave per axis. The amplitude differs per mip level, so that reading a wrong level is detected.
+fn waves() -> AlphaImage {
+    let wave = |texel: u32, side: u32| (std::f32::consts::TAU * (texel as f32 + 0.5) / side as f32).sin();
+    alpha_image(64, 32, |level, column, row| {
+        let sides = [64, 32].map(|side: u32| (side >> level).max(1));
+        let amplitude = 60.0 - 4.0 * level as f32;
+        (127.5 + amplitude * (wave(column, sides[0]) + wave(row, sides[1]))).round() as u8
+    })
+}

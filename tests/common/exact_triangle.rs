@@ -1,0 +1,94 @@
+//! Comparison of the ids of two rasterizers. Exact arithmetic in f64 finds samples on an edge and samples where depths
+//! tie, because two rasterizers may see different triangles there.
+
+use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
+
+/// Grid spacing of snapped corners in pixels.
+const SNAP_STEP: f64 = 1.0 / 256.0;
+
+/// A triangle in homogeneous window coordinates (x, y in pixels times w), with the precision of f64.
+pub(crate) struct ExactTriangle {
+    /// Edge functions: the dot product with (x, y, 1) is zero on the edge.
+    edges: [Vector3<f64>; 3],
+    /// Clip-space z of the corners.
+    depths: Vector3<f64>,
+    /// Clip-space w of the corners.
+    weights: Vector3<f64>,
+    /// Determinant of the corners; its sign is the winding order.
+    signed_area: f64,
+}
+
+impl ExactTriangle {
+    /// `clip` maps scene to clip coordinates; `size` is that of the viewport in pixels.
+    pub(crate) fn new(clip: &Matrix4<f64>, size: [u32; 2], corners: [[f32; 3]; 3]) -> Self {
+        let clip_corners =
+            corners.map(|corner| clip * Vector4::new(corner[0].into(), corner[1].into(), corner[2].into(), 1.0));
+        let [half_width, half_height] = size.map(|side| 0.5 * f64::from(side));
+        let [a, b, c] = clip_corners.map(|v| Vector3::new(half_width * (v.x + v.w), half_height * (v.w - v.y), v.w));
+        let component_vector =
+            |component: fn(&Vector4<f64>) -> f64| Vector3::from(clip_corners.each_ref().map(component));
+        let signed_area = Matrix3::from_columns(&[a, b, c]).determinant();
+        Self {
+            edges: [b.cross(&c), c.cross(&a), a.cross(&b)],
+            depths: component_vector(|v| v.z),
+            weights: component_vector(|v| v.w),
+            signed_area,
+        }
+    }
+
+    /// Distances to the edges in pixels, positive inside.
+    pub(crate) fn distances(&self, sample: Vector3<f64>) -> [f64; 3] {
+        self.edges.map(|edge| self.signed_area.signum() * edge.dot(&sample) / edge.xy().norm())
+    }
+
+    /// Whether a sample lies within one snapping step of an edge.
+    fn is_on_edge(&self, sample: Vector3<f64>) -> bool {
+        let distances = self.distances(sample);
+        distances.iter().all(|distance| *distance >= -SNAP_STEP)
+            && distances.iter().any(|distance| distance.abs() <= SNAP_STEP)
+    }
+
+    /// Depth at a sample, from 0 (near) to 1 (far).
+    pub(crate) fn depth(&self, sample: Vector3<f64>) -> f64 {
+        let edge_values = Vector3::from(self.edges.map(|edge| edge.dot(&sample)));
+        0.5 * edge_values.dot(&self.depths) / edge_values.dot(&self.weights) + 0.5
+    }
+}
+
+/// Numbers of differing samples.
+#[derive(Debug, Default, PartialEq)]
+pub(crate) struct Differences {
+    /// Samples on an edge of one of the two triangles.
+    pub(crate) edges: usize,
+    /// Samples where the depths of the two triangles tie.
+    pub(crate) ties: usize,
+    /// Other samples.
+    pub(crate) wrong: usize,
+}
+
+/// Compares the triangle indices that two rasterizers see in a viewport of `width` pixels. Depths tie if they differ by
+/// `depth_tolerance` or less.
+pub(crate) fn compare_ids(
+    got: &[Option<u32>],
+    want: &[Option<u32>],
+    triangles: &[ExactTriangle],
+    width: u32,
+    depth_tolerance: f64,
+) -> Differences {
+    let mut differences = Differences::default();
+    for (index, (got, want)) in got.iter().zip(want).enumerate().filter(|(_, (got, want))| got != want) {
+        let (x, y) = (index % width as usize, index / width as usize);
+        let sample = Vector3::new(x as f64 + 0.5, y as f64 + 0.5, 1.0);
+        let hits: Vec<&ExactTriangle> = [got, want].into_iter().flatten().map(|id| &triangles[*id as usize]).collect();
+        let is_tie =
+            |a: &ExactTriangle, b: &ExactTriangle| (a.depth(sample) - b.depth(sample)).abs() <= depth_tolerance;
+        if hits.iter().any(|triangle| triangle.is_on_edge(sample)) {
+            differences.edges += 1;
+        } else if hits.len() == 2 && is_tie(hits[0], hits[1]) {
+            differences.ties += 1;
+        } else {
+            differences.wrong += 1;
+        }
+    }
+    differences
+}

@@ -1,0 +1,155 @@
+//! Light-space bounds: they contain every vertex, they are tight, and a scene without a shadow has none.
+
+use std::sync::Arc;
+
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::{Mesh, Modes, Shape};
+use modalcast_model::scene::{BatchPolicy, Bounds, DeformationSettings, LightSpaceBox, Scene, SceneState};
+
+use super::{StepResult, run_step, scene_of_shapes};
+use crate::scenes::{self, Random};
+
+/// Vertices per tile; each tile contributes one box.
+pub(crate) const TILE_VERTICES: usize = 128;
+
+/// A thin coil along the diagonal of a cube of side 2, bent by smooth waves. The box of each of its tiles is small,
+/// while the box of the whole coil is not.
+pub(crate) fn coil_shape(vertices: usize, rank: usize) -> Shape {
+    let fraction = |vertex: usize| vertex as f32 / vertices as f32;
+    let position = |vertex: usize| {
+        let (t, angle) = (2.0 * fraction(vertex) - 1.0, 300.0 * fraction(vertex));
+        [t + 0.02 * angle.cos(), t + 0.02 * angle.sin(), t]
+    };
+    let rest: Vec<[f32; 3]> = (0..vertices).map(position).collect();
+    let entry_value =
+        |entry: usize| 0.05 * ((entry / (3 * vertices) + 1) as f32 * 3.0 * fraction(entry / 3 % vertices)).sin();
+    let modes = Modes::from_columns(3 * vertices, rank, (0..3 * vertices * rank).map(entry_value).collect())
+        .expect("expected valid modes");
+    let last = vertices as u32 - 1;
+    let triangles = (0..=last).map(|index| [index, (index + 1).min(last), (index + 2).min(last)]).collect();
+    let mesh =
+        Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; vertices], vec![], triangles).expect("expected a valid mesh");
+    Shape::new(mesh, modes).expect("expected a valid shape")
+}
+
+/// Coils that fill tiles of their own and coils that share tiles.
+pub(crate) fn coil_scene(deformation: DeformationSettings) -> Arc<Scene> {
+    scene_of_shapes(vec![coil_shape(5000, 4), coil_shape(700, 2), coil_shape(9, 1)], 2, deformation, false)
+}
+
+/// The smallest light-space box that contains the bounding boxes of all tiles of `tile_vertices` packed positions.
+pub(crate) fn bounds_in_light_space(scene: &Scene, positions: &[f32], tile_vertices: usize) -> LightSpaceBox {
+    let axes = scene.light_axes().expect("expected a scene with a shadow");
+    let tile_box = |positions: &[f32]| LightSpaceBox::enclosing(&axes, &Bounds::from_positions(positions));
+    positions.chunks(3 * tile_vertices).map(tile_box).fold(LightSpaceBox::EMPTY, LightSpaceBox::union)
+}
+
+/// Distance by which `inner` exceeds `outer`, or NaN if either contains a NaN.
+pub(crate) fn max_excess(outer: &LightSpaceBox, inner: &LightSpaceBox) -> f64 {
+    let excesses =
+        (0..3).flat_map(|axis| [outer.0.min[axis] - inner.0.min[axis], inner.0.max[axis] - outer.0.max[axis]]);
+    excesses.fold(0.0, |max: f64, excess| if excess.is_nan() || max.is_nan() { f64::NAN } else { max.max(excess) })
+}
+
+/// Sum of the largest absolute coordinates; the rounding error of f32 is proportional to it.
+pub(crate) fn coordinate_magnitude(bounds: &Bounds) -> f64 {
+    bounds.min.iter().zip(&bounds.max).map(|(min, max)| min.abs().max(max.abs())).sum()
+}
+
+/// Largest diagonal of the box of a tile.
+fn max_tile_diagonal(positions: &[f32]) -> f64 {
+    positions.chunks(3 * TILE_VERTICES).map(|tile| Bounds::from_positions(tile).diagonal()).fold(0.0, f64::max)
+}
+
+/// The light-space bounds of a step. Asserts that they contain every vertex, and that they exceed the light-space box of
+/// the scene bounds only by rounding.
+fn checked_light_bounds(name: &str, scene: &Scene, result: &StepResult) -> LightSpaceBox {
+    let light_box = result.light.expect("expected a scene with a shadow");
+    let (vertex_box, corner_box) =
+        (bounds_in_light_space(scene, &result.surface.positions, 1), bounds_of_corners(scene, &result.bounds));
+    let magnitude = coordinate_magnitude(&result.bounds);
+    assert!(
+        max_excess(&light_box, &vertex_box) <= 1e-12 * magnitude,
+        "{name}: expected {light_box:?} to contain {vertex_box:?}"
+    );
+    assert!(
+        max_excess(&corner_box, &light_box) <= 4e-7 * magnitude,
+        "{name}: expected {light_box:?} within {corner_box:?}"
+    );
+    let shrunken_box = vertex_box.expanded_by(-1e-3 * result.bounds.diagonal());
+    assert!(
+        result.bounds.diagonal() == 0.0 || max_excess(&shrunken_box, &vertex_box) > 0.0,
+        "{name}: negative control"
+    );
+    light_box
+}
+
+fn bounds_of_corners(scene: &Scene, bounds: &Bounds) -> LightSpaceBox {
+    LightSpaceBox::enclosing(&scene.light_axes().expect("expected a scene with a shadow"), bounds)
+}
+
+/// Light bounds contain every vertex of scenes that are random, smooth, far from the origin or tiny, that have one
+/// vertex, or whose domains share tiles.
+pub(crate) fn check_containment<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    let batched = DeformationSettings { batches: BatchPolicy::Always, ..DeformationSettings::default() };
+    let scenes = [
+        ("coils", coil_scene(DeformationSettings::default())),
+        ("batched coils", coil_scene(batched)),
+        ("one vertex", scenes::random_scene(&[(1, 1)], 1, false, true)),
+        ("small domains", scenes::random_scene(&[(7, 3), (40, 0), (300, 5)], 5, false, false)),
+    ];
+    for (name, scene) in scenes {
+        let mut deformer = create_deformer(&scene);
+        for seed in 0..3 {
+            let mut state = scenes::random_state(&scene, seed);
+            checked_light_bounds(name, &scene, &run_step(&mut deformer, &state));
+            state.transforms.iter_mut().for_each(|transform| transform.0[3] += 1e6);
+            checked_light_bounds(&format!("{name}, far"), &scene, &run_step(&mut deformer, &state));
+            state.transforms.iter_mut().for_each(|transform| transform.0.iter_mut().for_each(|entry| *entry *= 1e-20));
+            checked_light_bounds(&format!("{name}, tiny"), &scene, &run_step(&mut deformer, &state));
+        }
+    }
+}
+
+/// Light bounds of a thin scene have less than half the volume of the light-space box of the scene bounds, and exceed
+/// the vertices by less than the diagonal of a tile.
+pub(crate) fn check_tightness<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    let scene = scene_of_shapes(vec![coil_shape(5000, 4)], 1, DeformationSettings::default(), false);
+    let result = run_step(&mut create_deformer(&scene), &SceneState::rest(&scene));
+    let light_box = checked_light_bounds("coil", &scene, &result);
+    let (vertex_box, corner_box) =
+        (bounds_in_light_space(&scene, &result.surface.positions, 1), bounds_of_corners(&scene, &result.bounds));
+    let tile_diagonal = max_tile_diagonal(&result.surface.positions);
+    assert!(
+        max_excess(&vertex_box, &light_box) < tile_diagonal,
+        "{light_box:?} beyond {vertex_box:?}, tiles of {tile_diagonal}"
+    );
+    let volume =
+        |LightSpaceBox(bounds): &LightSpaceBox| (0..3).map(|axis| bounds.max[axis] - bounds.min[axis]).product::<f64>();
+    let [light_box, vertex_box, corner_box] = [light_box, vertex_box, corner_box].map(|bounds| volume(&bounds));
+    eprintln!(
+        "coil, volume relative to the box of the scene bounds: light bounds {:.3}, vertices {:.3}",
+        light_box / corner_box,
+        vertex_box / corner_box
+    );
+    assert!(light_box < 0.5 * corner_box && vertex_box <= light_box);
+}
+
+/// A scene without a shadow has no light bounds. Light bounds of a step that overflows are invalid, for that step only.
+pub(crate) fn check_missing_shadow_and_overflow<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    let mut parts = scenes::parts_of_shapes(vec![scenes::random_shape(&mut Random(3), 300, 2)]);
+    parts.domains = vec![scenes::new_domain(0, 0); 2];
+    parts.look.shadow = None;
+    let unshadowed_scene = Scene::new(parts).expect("expected a valid scene");
+    assert_eq!(run_step(&mut create_deformer(&unshadowed_scene), &SceneState::rest(&unshadowed_scene)).light, None);
+    let scene = scenes::random_scene(&[(300, 2)], 2, false, false);
+    let (mut deformer, valid_state) = (create_deformer(&scene), SceneState::rest(&scene));
+    let before = run_step(&mut deformer, &valid_state).light;
+    assert!(before.is_some_and(|light| light.is_valid()));
+    for entry in [f32::NAN, f32::INFINITY, f32::MAX] {
+        let mut overflowing_state = valid_state.clone();
+        overflowing_state.transforms[1].0.fill(entry);
+        assert!(run_step(&mut deformer, &overflowing_state).light.is_some_and(|light| !light.is_valid()), "{entry}");
+        assert_eq!(run_step(&mut deformer, &valid_state).light, before, "forgotten");
+    }
+}

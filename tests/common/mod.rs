@@ -1,0 +1,111 @@
+//! Checks that every deformer must pass: extreme values, partial steps, followers and optional attributes. Each check
+//! takes a function that creates the deformer of a scene, and prints the errors that it measured. `tests/it` runs all
+//! checks on the CPU, `tests/gpu` on the GPU.
+
+pub(crate) mod attributes;
+#[allow(dead_code, reason = "each test binary uses a part")]
+pub(crate) mod cut_outs;
+mod error_bounds;
+pub(crate) mod exact_triangle;
+pub(crate) mod extreme_values;
+pub(crate) mod followers;
+pub(crate) mod light_bounds;
+pub(crate) mod neighbors;
+pub(crate) mod overflow;
+pub(crate) mod partial_steps;
+pub(crate) mod soups;
+pub(crate) mod surfaces;
+pub(crate) mod truncation;
+
+use std::sync::Arc;
+
+use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer};
+use modalcast_model::domain::{Domain, Mesh, Shape};
+use modalcast_model::scene::{Bounds, DeformationSettings, LightSpaceBox, Scene, SceneState};
+
+use crate::scenes::{self, NORMAL_MAPPED, Random};
+pub(crate) use error_bounds::{
+    assert_displacements_within_bound, assert_within_bound, domains_beyond_bound, domains_beyond_displacement_bound,
+};
+
+/// Results of a step.
+#[derive(Debug, Clone)]
+pub(crate) struct StepResult {
+    pub(crate) bounds: Bounds,
+    pub(crate) light: Option<LightSpaceBox>,
+    pub(crate) surface: DeformedSurface,
+}
+
+/// Deforms a state and reads back all attributes.
+pub(crate) fn run_step(deformer: &mut dyn Deformer, state: &SceneState) -> StepResult {
+    let DeformSummary { bounds, light, .. } = deformer.deform(state).expect("expected the step to succeed");
+    StepResult { bounds, light, surface: deformer.surface().expect("expected a surface").clone() }
+}
+
+impl StepResult {
+    /// Describes the first difference in vertex bits, boxes or bounds. Light-space bounds are not compared.
+    pub(crate) fn difference(&self, other: &Self) -> Option<String> {
+        let attribute_lists = |result: &Self| {
+            let DeformedSurface { positions, normals, tangents, displacements, .. } = result.surface.clone();
+            [("position", positions), ("normal", normals), ("tangent", tangents), ("displacement", displacements)]
+        };
+        for ((name, left), (_, right)) in attribute_lists(self).into_iter().zip(attribute_lists(other)) {
+            if left.len() != right.len() {
+                return Some(format!("{name}s have {} and {} numbers", left.len(), right.len()));
+            }
+            if let Some(index) = (0..left.len()).find(|index| left[*index].to_bits() != right[*index].to_bits()) {
+                return Some(format!("{name}s differ at number {index}: {} and {}", left[index], right[index]));
+            }
+        }
+        if self.surface.boxes != other.surface.boxes {
+            return Some("boxes differ".into());
+        }
+        (self.bounds != other.bounds).then(|| format!("bounds differ: {:?} and {:?}", self.bounds, other.bounds))
+    }
+}
+
+/// A strip of triangles between random vertices with coordinates in -1 to 1. Its corner i is its vertex i.
+pub(crate) fn strip_shape(random: &mut Random, vertices: usize, rank: usize) -> Shape {
+    let shape = scenes::random_shape(random, vertices, rank);
+    let normals = (0..vertices).map(|_| random.next_triple()).collect();
+    let last = vertices as u32 - 1;
+    let triangles = (0..=last).map(|index| [index, (index + 1).min(last), (index + 2).min(last)]).collect();
+    let uvs = shape.mesh.corners().uvs[..vertices].to_vec();
+    let mesh = Mesh::from_indexed(shape.mesh.rest().to_vec(), normals, uvs, triangles).expect("a valid mesh");
+    Shape::new(mesh, shape.modes).expect("a valid shape")
+}
+
+/// A scene with `instances` domains per shape. Domain i is named "domain i" and has shape i % (number of shapes).
+pub(crate) fn scene_of_shapes(
+    shapes: Vec<Shape>,
+    instances: usize,
+    deformation: DeformationSettings,
+    normal_maps: bool,
+) -> Arc<Scene> {
+    let count = shapes.len();
+    let mut parts = scenes::parts_of_shapes(shapes);
+    parts.deformation = deformation;
+    let material = if normal_maps { NORMAL_MAPPED } else { 0 };
+    let domain =
+        |index: usize| Domain { name: format!("domain {index}"), ..scenes::new_domain(index % count, material) };
+    parts.domains = (0..instances * count).map(domain).collect();
+    Scene::new(parts).expect("a valid scene")
+}
+
+#[test]
+fn difference_detects_bits_lengths_and_bounds() {
+    let surface = DeformedSurface { positions: vec![0.0; 3], normals: vec![1.0; 3], ..DeformedSurface::default() };
+    let result = StepResult { bounds: Bounds { min: [0.0; 3], max: [0.0; 3] }, light: None, surface };
+    assert_eq!(result.difference(&result), None);
+    let difference_after = |modify: &dyn Fn(&mut StepResult)| {
+        let mut other = result.clone();
+        modify(&mut other);
+        result.difference(&other)
+    };
+    assert!(difference_after(&|other| other.surface.positions[1] = -0.0).is_some());
+    assert!(difference_after(&|other| other.surface.normals[2] = 1.000_000_1).is_some());
+    assert!(difference_after(&|other| other.surface.tangents.push(0.0)).is_some());
+    assert!(difference_after(&|other| other.surface.displacements.push(0.0)).is_some());
+    assert!(difference_after(&|other| other.surface.boxes.push(Bounds::EMPTY)).is_some());
+    assert!(difference_after(&|other| other.bounds.max[0] = f64::NAN).is_some());
+}

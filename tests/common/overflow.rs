@@ -1,0 +1,94 @@
+//! Steps that overflow: they are rejected with the name of the domain, and they do not affect later steps.
+
+use std::sync::Arc;
+
+use modalcast::config::{BackendChoice, Config, RendererChoice};
+use modalcast::engine::DeviceContext;
+use modalcast_model::backend_settings::BackendSettings;
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::Transform;
+use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType};
+
+use super::{partial_steps, run_step, scene_of_shapes, strip_shape};
+use crate::scenes::{self, Random};
+
+/// A scene with so many domains that a step that changes two of them is a partial step.
+fn test_scene(storage: StorageType) -> Arc<Scene> {
+    let mut random = Random(71);
+    let shapes = vec![
+        strip_shape(&mut random, 7, 2),
+        scenes::random_shape(&mut random, 300, 2),
+        strip_shape(&mut random, 9, 3),
+        scenes::random_shape(&mut random, 30, 0),
+    ];
+    scene_of_shapes(shapes, 2, DeformationSettings { storage, ..DeformationSettings::default() }, true)
+}
+
+/// A transform so large that T x overflows f32 if the sum x0 + U q does not.
+const LARGE_SHEAR: Transform = Transform([1e3, -2e3, 1e3, 0.0, 1e3, 1e3, -3e3, 0.0, -1e3, 1e3, 1e3, 0.0]);
+
+/// A step that overflows gives bounds that are not finite. The next valid step equals that of a new deformer.
+pub(crate) fn check_overflow_affects_one_step<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    for storage in StorageType::ALL {
+        let scene = test_scene(storage);
+        let (mut deformer, mut random) = (create_deformer(&scene), Random(72));
+        let mut valid_state = scenes::random_state(&scene, 73);
+        let before = run_step(&mut deformer, &valid_state);
+        assert!(before.bounds.is_finite());
+        for coordinate in [f32::MAX, -f32::MAX] {
+            let mut overflowing_state = valid_state.clone();
+            partial_steps::apply_random_step(&scene, &mut overflowing_state, &mut random, &[1], &[1]);
+            let first_q = scene.layout.slots[1].first_q;
+            overflowing_state.q[first_q..first_q + 2].fill(coordinate);
+            overflowing_state.transforms[1] = LARGE_SHEAR;
+            assert!(
+                !deformer.deform(&overflowing_state).expect("expected the step to succeed").bounds.is_finite(),
+                "{}: {coordinate:e}",
+                storage.name()
+            );
+            // The next valid state has no overflow in its history, and its step changes another domain.
+            partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[2], &[]);
+            let after = run_step(&mut deformer, &valid_state);
+            assert!(after.bounds.is_finite() && after.difference(&before).is_some());
+            assert_eq!(
+                after.difference(&run_step(&mut create_deformer(&scene), &valid_state)),
+                None,
+                "{}: {coordinate:e}",
+                storage.name()
+            );
+        }
+    }
+}
+
+/// A step that overflows is rejected with the name of its domain, and the vertices stay those of the last valid step.
+pub(crate) fn check_overflow_rejection(backend: BackendChoice) {
+    let config = Config { backend, renderer: RendererChoice::Off, ..Config::default() };
+    let mut context = DeviceContext::open(&config).expect("expected a device context");
+    let scene = test_scene(StorageType::F32);
+    let (mut loaded_scene, mut random) =
+        (context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load"), Random(74));
+    let mut valid_state = SceneState::rest(&scene);
+    partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[0, 5], &[5]);
+    loaded_scene.deform(&valid_state).expect("expected a valid step");
+    let before = loaded_scene.surface().expect("vertices").clone();
+    for (domain, coordinate) in [(5, f32::MAX), (2, -f32::MAX), (5, 1e30)] {
+        let mut overflowing_state = valid_state.clone();
+        partial_steps::apply_random_step(&scene, &mut overflowing_state, &mut random, &[domain], &[]);
+        overflowing_state.q[scene.layout.slots[domain as usize].first_q] = coordinate;
+        let error = loaded_scene.deform(&overflowing_state).expect_err("expected an overflow error").to_string();
+        eprintln!("{error}");
+        assert!(error.starts_with(&format!("step.q of domain 'domain {domain}'")), "{error}");
+        assert_eq!(loaded_scene.surface().expect("vertices"), &before);
+        assert!(loaded_scene.bounds().is_finite());
+    }
+    // The next step applies to the last valid step.
+    partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[6], &[]);
+    loaded_scene.deform(&valid_state).expect("expected a valid step");
+    let after = loaded_scene.surface().expect("vertices").clone();
+    assert_ne!(after, before, "expected the step to change vertices");
+    let mut new_scene = context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
+    new_scene.deform(&valid_state).expect("expected a valid step");
+    assert_eq!(new_scene.surface().expect("vertices"), &after);
+    context.unload_scene(loaded_scene);
+    context.unload_scene(new_scene);
+}

@@ -1,0 +1,258 @@
+//! Partial steps: computing only the domains that a step changes gives the same bits as computing all domains.
+
+use std::sync::Arc;
+
+use modalcast_model::deform::Deformer;
+use modalcast_model::domain::{Domain, Shape};
+use modalcast_model::scene::{
+    BatchPolicy, DeformationSettings, DirtyDomains, NormalMethod, RawStepUpdate, Scene, SceneState, StepUpdate,
+    StorageType,
+};
+
+use super::attributes::{find_wrong_box, with_displacements_and_boxes};
+use super::{StepResult, run_step, strip_shape};
+use crate::scenes::{self, NORMAL_MAPPED, Random};
+
+/// A random step that sets the coordinates of `q_domains` and the transforms of `transform_domains`.
+fn random_step(scene: &Scene, random: &mut Random, q_domains: &[u32], transform_domains: &[u32]) -> StepUpdate {
+    let coordinates: usize = q_domains.iter().map(|domain| scene.rank_of(*domain as usize)).sum();
+    let q: Vec<f32> = (0..coordinates).map(|_| random.next_number()).collect();
+    let transform = |domain: &u32| match domain % 3 {
+        0 => random.next_similarity(true).0,
+        1 if scene.needs.shear => random.next_shear().0,
+        _ => random.next_similarity(false).0,
+    };
+    let transforms: Vec<f32> = transform_domains.iter().flat_map(transform).collect();
+    let to_bytes =
+        |numbers: Vec<f32>| -> bytes::Bytes { numbers.iter().flat_map(|number| number.to_le_bytes()).collect() };
+    let raw = RawStepUpdate {
+        q_domains: q_domains.to_vec(),
+        q: to_bytes(q),
+        transform_domains: transform_domains.to_vec(),
+        transforms: to_bytes(transforms),
+        ..RawStepUpdate::default()
+    };
+    StepUpdate::parse(scene, &raw).expect("expected a valid step")
+}
+
+/// Applies a random step that sets the coordinates of `q_domains` and the transforms of `transform_domains`.
+pub(crate) fn apply_random_step(
+    scene: &Scene,
+    state: &mut SceneState,
+    random: &mut Random,
+    q_domains: &[u32],
+    transform_domains: &[u32],
+) {
+    state.apply(scene, &random_step(scene, random, q_domains, transform_domains));
+}
+
+/// A domain of several tiles.
+const LARGE: u32 = 26;
+/// A domain without modes.
+const RIGID: u32 = 27;
+/// A domain that shares the coordinates of the domain before it.
+const SHARER: u32 = 29;
+/// Number of domains of [`mixed_scene`]. A step that changes more than a quarter of them is computed in full.
+const DOMAINS: u32 = 40;
+
+/// A scene of small domains of many ranks, with and without separate corners, a large domain, one without modes,
+/// instances, and domains of one shape or of two shapes that share coordinates.
+fn mixed_scene(deformation: DeformationSettings, normal_maps: bool) -> Arc<Scene> {
+    let mut random = Random(50);
+    let mut shapes: Vec<Shape> = (0..20).map(|index| strip_shape(&mut random, 5 + index % 9, index % 5)).collect();
+    shapes.extend((0..6).map(|index| scenes::random_shape(&mut random, 3 + 7 * index, 3)));
+    shapes.push(scenes::random_shape(&mut random, 300, 33));
+    shapes.push(strip_shape(&mut random, 200, 0));
+    shapes.push(strip_shape(&mut random, 40, 4));
+    let mut domain_shapes: Vec<usize> = (0..29).collect();
+    // A domain that shares the coordinates of another shape, then instances.
+    domain_shapes.extend([9, 28, 28, 28, 4, 4, 28, 28, 28, 0, 27]);
+    let mut parts = scenes::parts_of_shapes(shapes);
+    parts.deformation = deformation;
+    let material = |index: usize| if normal_maps && index % 3 != 1 { NORMAL_MAPPED } else { 0 };
+    let domain = |(index, shape): (usize, usize)| Domain {
+        name: format!("{index}"),
+        ..scenes::new_domain(shape, material(index))
+    };
+    parts.domains = domain_shapes.into_iter().enumerate().map(domain).collect();
+    parts.domains[SHARER as usize].shares_q_with = Some(28);
+    parts.domains[31].shares_q_with = Some(28);
+    parts.domains[34].shares_q_with = Some(33);
+    let scene = Scene::new(parts).expect("expected a valid scene");
+    assert_eq!(scene.domains.len(), DOMAINS as usize);
+    scene
+}
+
+/// Event between two deformed states.
+#[derive(Clone, Copy, PartialEq)]
+enum Interruption {
+    None,
+    /// A step is applied but its state is not deformed.
+    SkippedStep,
+    /// A state that overflows is deformed, then the state before it again.
+    Overflow,
+    /// A state with another history is deformed.
+    OtherHistory,
+}
+
+/// A step of the test sequence.
+struct ScriptedStep {
+    q_domains: Vec<u32>,
+    transform_domains: Vec<u32>,
+    /// Event before the step.
+    interruption: Interruption,
+}
+
+fn scripted_steps() -> Vec<ScriptedStep> {
+    use Interruption::{None, OtherHistory, Overflow, SkippedStep};
+    let all: Vec<u32> = (0..DOMAINS).collect();
+    let quarter = (0..DOMAINS / 4).collect();
+    let above_quarter = (3..4 + DOMAINS / 4).collect();
+    let step =
+        |(q_domains, transform_domains, interruption)| ScriptedStep { q_domains, transform_domains, interruption };
+    [
+        (vec![], vec![], None),
+        (vec![3], vec![], None),
+        (vec![], vec![3], None),
+        (vec![3], vec![3], None),
+        (vec![], vec![RIGID], None),
+        (vec![LARGE], vec![1], None),
+        (all.clone(), all, None),
+        (vec![22, 24], vec![22], None),
+        (vec![SHARER - 1], vec![], None),
+        (vec![SHARER], vec![SHARER], None),
+        (quarter, vec![], None),
+        (vec![], above_quarter, None),
+        (vec![], vec![], None),
+        (vec![7], vec![], SkippedStep),
+        (vec![8, 33], vec![9], None),
+        (vec![LARGE], vec![], Overflow),
+        (vec![30], vec![32], None),
+        (vec![11], vec![], OtherHistory),
+        (vec![11, 38], vec![LARGE, 39], None),
+        (vec![], vec![], OtherHistory),
+    ]
+    .map(step)
+    .into()
+}
+
+/// A deformer that computes only changed domains, and one that receives the same states with every domain marked dirty.
+struct DeformerPair<D> {
+    partial: D,
+    full: D,
+    scene: Arc<Scene>,
+    /// Number of deformed states.
+    states: usize,
+}
+
+impl<D: Deformer> DeformerPair<D> {
+    /// Deforms a state with both deformers, compares the results and returns that of the partial step.
+    fn deform(&mut self, state: &SceneState, name: &str) -> StepResult {
+        let mut dirty_state = state.clone();
+        dirty_state.mark_all_dirty();
+        let (partial, full) = (run_step(&mut self.partial, state), run_step(&mut self.full, &dirty_state));
+        assert_eq!(partial.bounds.is_finite(), full.bounds.is_finite(), "{name}");
+        // The numbers of an overflowing state are not compared, because they contain NaNs.
+        if partial.bounds.is_finite() {
+            if !partial.surface.boxes.is_empty() {
+                assert_eq!(find_wrong_box(&self.scene, &partial), None, "{name}, state {}", self.states);
+            }
+            assert_eq!(partial.difference(&full), None, "{name}, state {}", self.states);
+            assert!(partial.light.is_some() && partial.light == full.light, "{name}, state {}", self.states);
+        }
+        self.states += 1;
+        partial
+    }
+}
+
+fn compare_scripted_steps<D: Deformer>(name: &str, scene: &Arc<Scene>, create_deformer: &impl Fn(&Arc<Scene>) -> D) {
+    let mut random = Random(51);
+    let mut deformers = DeformerPair {
+        partial: create_deformer(scene),
+        full: create_deformer(scene),
+        scene: Arc::clone(scene),
+        states: 0,
+    };
+    let (mut state, mut other_state) = (scenes::random_state(scene, 52), scenes::random_state(scene, 53));
+    let (mut last, mut changed_steps) = (deformers.deform(&state, name), 0);
+    for ScriptedStep { q_domains, transform_domains, interruption } in scripted_steps() {
+        match interruption {
+            Interruption::None => {}
+            Interruption::SkippedStep => apply_random_step(scene, &mut state, &mut random, &[5, 6], &[RIGID]),
+            Interruption::Overflow => {
+                let mut overflowing = state.clone();
+                apply_random_step(scene, &mut overflowing, &mut random, &[12], &[4]);
+                overflowing.transforms[4].0.fill(f32::MAX);
+                assert!(!deformers.deform(&overflowing, name).bounds.is_finite());
+                assert_eq!(deformers.deform(&state, name).difference(&last), None, "{name}: after an overflow");
+            }
+            Interruption::OtherHistory => {
+                apply_random_step(scene, &mut other_state, &mut random, &[2], &[]);
+                assert!(deformers.deform(&other_state, name).difference(&last).is_some());
+            }
+        }
+        apply_random_step(scene, &mut state, &mut random, &q_domains, &transform_domains);
+        let result = deformers.deform(&state, name);
+        if !q_domains.is_empty() || !transform_domains.is_empty() {
+            assert!(result.difference(&last).is_some(), "{name}: expected the step to change vertices");
+            changed_steps += 1;
+        }
+        last = result;
+    }
+    assert_eq!(deformers.deform(&state, name).difference(&last), None, "{name}: the same state again");
+    // Without truncation the result does not depend on earlier steps.
+    if !scene.needs.truncation {
+        let new_result = run_step(&mut create_deformer(scene), &state);
+        assert_eq!(new_result.difference(&last), None, "{name}: a new deformer");
+    }
+    eprintln!("{name}: {} states, {changed_steps} of them after changes, have equal bits", deformers.states);
+}
+
+/// Runs the scripted steps for every storage type and every deformation feature.
+pub(crate) fn check_partial_steps<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    let stored = |storage| DeformationSettings { storage, ..DeformationSettings::default() };
+    let exact = |storage| DeformationSettings { normals: NormalMethod::Exact, ..stored(storage) };
+    let compensated = |deformation| DeformationSettings { compensated: true, ..deformation };
+    let batched = |deformation| DeformationSettings { batches: BatchPolicy::Always, ..deformation };
+    let truncated = |storage| DeformationSettings { truncation: Some(0.2), ..stored(storage) };
+    for (deformation, normal_maps) in [
+        (stored(StorageType::F32), true),
+        (exact(StorageType::F32), true),
+        (compensated(exact(StorageType::F32)), false),
+        (truncated(StorageType::F32), false),
+        (stored(StorageType::F16), true),
+        (truncated(StorageType::F16), true),
+        (exact(StorageType::Bf16), true),
+        (stored(StorageType::Int8), true),
+        (compensated(exact(StorageType::Int8)), false),
+        (with_displacements_and_boxes(stored(StorageType::F32)), true),
+        (with_displacements_and_boxes(truncated(StorageType::F16)), false),
+        (with_displacements_and_boxes(compensated(exact(StorageType::Int8))), false),
+        (batched(stored(StorageType::F32)), true),
+        (batched(exact(StorageType::F16)), true),
+        (DeformationSettings { boxes: true, ..batched(stored(StorageType::Int8)) }, true),
+    ] {
+        let name = format!("{deformation:?}, normal maps {normal_maps}");
+        compare_scripted_steps(&name, &mixed_scene(deformation, normal_maps), &create_deformer);
+    }
+}
+
+/// Whether a deformer skips a changed domain that is missing from the state's list of dirty domains. Asserts that a
+/// listed domain is computed.
+pub(crate) fn relies_on_dirty_list<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) -> bool {
+    let scene = mixed_scene(DeformationSettings::default(), false);
+    let mut deformer = create_deformer(&scene);
+    let mut state = scenes::random_state(&scene, 54);
+    let before = run_step(&mut deformer, &state).surface.positions;
+    apply_random_step(&scene, &mut state, &mut Random(55), &[LARGE, 3], &[]);
+    assert_eq!(state.changed, DirtyDomains::Some(vec![3, LARGE]));
+    state.changed = DirtyDomains::Some(vec![3]);
+    let after = run_step(&mut deformer, &state).surface.positions;
+    let is_unchanged = |domain: u32| {
+        let slot = scene.layout.slots[domain as usize];
+        let range = 3 * slot.first_vertex..3 * (slot.first_vertex + slot.vertices);
+        before[range.clone()] == after[range]
+    };
+    assert!(!is_unchanged(3), "expected the listed domain to be computed");
+    is_unchanged(LARGE)
+}

@@ -1,0 +1,194 @@
+//! Triangle soups that are hard to rasterize, and their viewports.
+
+use modalcast_compute::reference::raster::VisibilityBuffer;
+use modalcast_model::scene::{CullMode, DrawRange, Viewport};
+use nalgebra::{Matrix4, Point3, Vector3};
+
+use crate::scenes::Random;
+
+/// Triangles and the viewport that they are drawn in.
+pub(crate) struct Soup {
+    pub(crate) name: &'static str,
+    pub(crate) positions: Vec<f32>,
+    pub(crate) triangles: Vec<[u32; 3]>,
+    pub(crate) groups: Vec<DrawRange>,
+    pub(crate) viewport: Viewport,
+}
+
+impl Soup {
+    fn new(name: &'static str, positions: Vec<f32>, triangles: Vec<[u32; 3]>, viewport: Viewport) -> Self {
+        let first_half = triangles.len() as u32 / 2;
+        let second_half = triangles.len() as u32 - first_half;
+        let groups = vec![
+            DrawRange { first: 0, triangles: first_half, faces: CullMode::None },
+            DrawRange { first: first_half, triangles: second_half, faces: CullMode::Back },
+        ];
+        Self { name, positions, triangles, groups, viewport }
+    }
+
+    /// Triangles without shared vertices.
+    fn with_separate_triangles(name: &'static str, positions: Vec<f32>, viewport: Viewport) -> Self {
+        let count = positions.len() as u32 / 9;
+        Self::new(
+            name,
+            positions,
+            (0..count).map(|triangle| [3 * triangle, 3 * triangle + 1, 3 * triangle + 2]).collect(),
+            viewport,
+        )
+    }
+
+    /// Ids and depths by the reference rasterizer.
+    pub(crate) fn rasterize(&self) -> VisibilityBuffer {
+        let mut raster = VisibilityBuffer::new(self.viewport);
+        self.groups.iter().for_each(|group| raster.draw(&self.positions, &self.triangles, *group));
+        raster
+    }
+}
+
+/// A camera at the origin that looks along -z with a vertical field of view of 60 degrees.
+pub(crate) fn perspective_viewport(width: u32, height: u32, near: f64, far: f64) -> Viewport {
+    let aspect = f64::from(width) / f64::from(height);
+    let clip = nalgebra::Perspective3::new(aspect, 60.0_f64.to_radians(), near, far);
+    Viewport::new(&clip.to_homogeneous(), width, height).expect("expected a valid viewport")
+}
+
+/// A viewport whose scene coordinates are clip space.
+pub(crate) fn clip_space_viewport(width: u32, height: u32) -> Viewport {
+    Viewport::new(&Matrix4::identity(), width, height).expect("expected a valid viewport")
+}
+
+/// Positions of triangles with random corners around random centers. Centers are within `extent` of the origin, corners
+/// within `size` of their center per axis.
+fn scattered(random: &mut Random, count: usize, extent: f32, size: [f32; 3]) -> Vec<f32> {
+    let mut positions = Vec::with_capacity(9 * count);
+    for _ in 0..count {
+        let center = random.next_triple().map(|number| extent * number);
+        for _ in 0..3 {
+            let offset = random.next_triple();
+            positions.extend((0..3).map(|axis| center[axis] + size[axis] * offset[axis]));
+        }
+    }
+    positions
+}
+
+/// A fan around a center; its rim lies beyond the border of [`clip_space_viewport`].
+pub(crate) fn fan_soup(viewport: Viewport) -> Soup {
+    let mut random = Random(11);
+    let mut positions = vec![0.05, -0.03, 0.0];
+    let spokes = 40_u32;
+    for spoke in 0..spokes {
+        let angle = std::f32::consts::TAU * spoke as f32 / spokes as f32;
+        positions.extend([1.9 * angle.cos(), 1.9 * angle.sin(), 0.5 * random.next_number()]);
+    }
+    let triangles = (0..spokes).map(|spoke| [0, 1 + spoke, 1 + (spoke + 1) % spokes]).collect();
+    let mut soup = Soup::new("fan", positions, triangles, viewport);
+    soup.groups = vec![DrawRange { first: 0, triangles: spokes, faces: CullMode::None }];
+    soup
+}
+
+/// Triangles without area: repeated vertices or collinear corners. Some triangles between them have an area.
+fn degenerate() -> Soup {
+    let mut positions = scattered(&mut Random(9), 8, 0.8, [0.6; 3]);
+    positions.extend([[-0.9, -0.9, 0.0], [0.0, 0.0, 0.1], [0.9, 0.9, 0.2]].concat());
+    let triangles = (0..24).flat_map(|vertex: u32| {
+        let (a, b) = (vertex, (vertex + 7) % 24);
+        [[a, a, a], [a, a, b], [a, b, a], [b, a, a], [24, 25, 26], [26, 25, 24], [a, b, 25]]
+    });
+    Soup::new("degenerate", positions, triangles.collect(), clip_space_viewport(160, 90))
+}
+
+/// All soups.
+pub(crate) fn all_soups() -> Vec<Soup> {
+    let mut random = Random(5);
+    let random = &mut random;
+    let mut non_finite = scattered(random, 600, 1.0, [0.3; 3]);
+    for (index, value) in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX].into_iter().enumerate() {
+        (index..non_finite.len()).step_by(61 + index).for_each(|number| non_finite[number] = value);
+    }
+    let coincident = scattered(random, 40, 0.7, [0.4; 3]).repeat(3);
+    let far_projection = {
+        let eye = Point3::new(1e7, 1e7, 1e7 + 8.0);
+        let view = Matrix4::look_at_rh(&eye, &Point3::new(1e7, 1e7, 1e7), &Vector3::y());
+        nalgebra::Perspective3::new(1.5, 0.9, 0.1, 100.0).to_homogeneous() * view
+    };
+    let far_positions: Vec<f32> =
+        scattered(random, 300, 3.0, [2.0; 3]).into_iter().map(|number| number + 1e7).collect();
+    let positions_behind = scattered(random, 100, 1.0, [0.5; 3]);
+    let positions_behind = positions_behind.chunks_exact(3).flat_map(|p| [p[0], p[1], p[2] + 5.0]).collect();
+    vec![
+        Soup::with_separate_triangles(
+            "smaller than a pixel",
+            scattered(random, 6000, 1.1, [0.004; 3]),
+            clip_space_viewport(200, 120),
+        ),
+        Soup::with_separate_triangles(
+            "a few pixels",
+            scattered(random, 2000, 1.1, [0.04; 3]),
+            clip_space_viewport(301, 177),
+        ),
+        Soup::with_separate_triangles(
+            "slivers",
+            scattered(random, 400, 1.0, [0.9, 0.001, 0.3]),
+            clip_space_viewport(311, 97),
+        ),
+        Soup::with_separate_triangles(
+            "vertical slivers",
+            scattered(random, 400, 1.0, [0.0005, 1.9, 0.3]),
+            clip_space_viewport(311, 97),
+        ),
+        Soup::with_separate_triangles(
+            "large",
+            scattered(random, 60, 1.0, [3.0, 3.0, 0.9]),
+            clip_space_viewport(257, 255),
+        ),
+        Soup::with_separate_triangles(
+            "huge",
+            scattered(random, 60, 1.0, [1e4, 1e4, 0.9]),
+            clip_space_viewport(129, 65),
+        ),
+        Soup::with_separate_triangles(
+            "through the near plane",
+            scattered(random, 300, 1.0, [2.0; 3]),
+            perspective_viewport(160, 120, 0.1, 10.0),
+        ),
+        Soup::with_separate_triangles(
+            "near 1e-6, far 1e9",
+            scattered(random, 100, 1.0, [9.0; 3]),
+            perspective_viewport(160, 120, 1e-6, 1e9),
+        ),
+        Soup::with_separate_triangles("behind the eye", positions_behind, perspective_viewport(64, 64, 0.1, 10.0)),
+        Soup::with_separate_triangles(
+            "beyond the far plane",
+            scattered(random, 200, 6.0, [4.0; 3]),
+            perspective_viewport(90, 90, 0.1, 4.0),
+        ),
+        Soup::with_separate_triangles("non-finite positions", non_finite, clip_space_viewport(97, 101)),
+        Soup::with_separate_triangles("coincident", coincident, clip_space_viewport(64, 64)),
+        Soup::with_separate_triangles(
+            "1e7 from the origin",
+            far_positions,
+            Viewport::new(&far_projection, 150, 100).expect("expected a valid viewport"),
+        ),
+        Soup::with_separate_triangles(
+            "one-pixel viewport",
+            scattered(random, 200, 1.0, [2.0; 3]),
+            clip_space_viewport(1, 1),
+        ),
+        Soup::with_separate_triangles(
+            "wide viewport",
+            scattered(random, 40, 1.0, [1.0; 3]),
+            clip_space_viewport(16384, 2),
+        ),
+        Soup::with_separate_triangles(
+            "tall viewport",
+            scattered(random, 40, 1.0, [1.0; 3]),
+            clip_space_viewport(2, 16384),
+        ),
+        Soup::with_separate_triangles("NaN viewport", scattered(random, 9, 1.0, [1.0; 3]), {
+            Viewport::new(&Matrix4::from_element(f64::NAN), 8, 8).expect("expected a valid viewport")
+        }),
+        Soup::with_separate_triangles("no triangles", Vec::new(), clip_space_viewport(8, 8)),
+        degenerate(),
+        fan_soup(clip_space_viewport(128, 128)),
+    ]
+}

@@ -1,0 +1,110 @@
+//! Mode truncation within an error budget.
+
+use std::sync::Arc;
+
+use modalcast_model::deform::Deformer;
+use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType};
+
+use super::extreme_values::scene_from_columns;
+use super::{assert_within_bound, domains_beyond_bound, partial_steps, run_step, scene_of_shapes, strip_shape};
+use crate::scenes::{self, Random};
+
+/// Budget in meters, which are scene units here.
+const BUDGET: f64 = 0.02;
+
+/// Deforms twenty random states, each of which changes two domains. Errors stay within their bounds plus the reported
+/// truncation bound, and that bound stays within the budget. `truncation_bound` reads it from a deformer, in scene
+/// units.
+pub(crate) fn check_error_budget<D: Deformer>(
+    create_deformer: impl Fn(&Arc<Scene>) -> D,
+    truncation_bound: impl Fn(&D, &Scene) -> f64,
+) {
+    for storage in StorageType::ALL {
+        let mut random = Random(81);
+        let shapes = vec![
+            scenes::random_shape(&mut random, 300, 24),
+            strip_shape(&mut random, 40, 12),
+            strip_shape(&mut random, 7, 5),
+            strip_shape(&mut random, 60, 0),
+        ];
+        let deformation = DeformationSettings { storage, truncation: Some(BUDGET), ..DeformationSettings::default() };
+        let scene = scene_of_shapes(shapes, 2, deformation, false);
+        assert_eq!(scene.unit, 1.0);
+        let (mut deformer, mut state) = (create_deformer(&scene), scenes::random_state(&scene, 82));
+        run_step(&mut deformer, &state);
+        let (mut max_bound, mut visible_states) = (0.0_f64, 0);
+        for step in 0..20 {
+            let domains = [step % 8, (step + 5) % 8];
+            partial_steps::apply_random_step(&scene, &mut state, &mut random, &domains, &domains);
+            // Amplitudes decrease with the mode, as for a vibrating body.
+            for domain in domains {
+                let slot = scene.layout.slots[domain as usize];
+                let q = &mut state.q[slot.first_q..][..slot.rank];
+                q.iter_mut().enumerate().for_each(|(mode, amplitude)| *amplitude *= f32::exp2(-(mode as f32)));
+            }
+            let positions = run_step(&mut deformer, &state).surface.positions;
+            let bound = truncation_bound(&deformer, &scene);
+            assert!((0.0..=BUDGET).contains(&bound), "{}: expected at most {BUDGET}, got {bound}", storage.name());
+            let name = format!("{}, state {step}, truncation bound {bound:.2e}", storage.name());
+            assert_within_bound(&name, &scene, &state, &positions, bound);
+            max_bound = max_bound.max(bound);
+            visible_states += usize::from(!domains_beyond_bound(&scene, &state, &positions, 0.0).is_empty());
+        }
+        eprintln!(
+            "{}: truncation bound at most {max_bound:.2e} of {BUDGET}, beyond the rounding bound in {visible_states} of 20 \
+             states",
+            storage.name()
+        );
+        assert!(max_bound > BUDGET / 10.0, "expected truncated modes, got a largest bound of {max_bound}");
+        assert!(storage != StorageType::F32 || visible_states > 10, "negative control: {visible_states} states");
+    }
+}
+
+/// Number of times that one of two modes is truncated or restored while its amplitude oscillates around half of the
+/// budget.
+fn count_mode_toggles(storage: StorageType, mut deform: impl FnMut(&Arc<Scene>, &SceneState) -> Vec<f32>) -> usize {
+    let (vertices, rank, oscillating_mode) = (5, 8, 4);
+    let mut columns = vec![0.0; 3 * vertices * rank];
+    for vertex in 0..vertices {
+        columns[3 * vertex + 1] = 1.0;
+        // A chunk is summed with all of its modes. This mode is in another chunk than mode 0 for every storage type.
+        columns[3 * vertices * oscillating_mode + 3 * vertex] = 1.0;
+    }
+    let scene = scene_from_columns(
+        vertices,
+        columns,
+        DeformationSettings { storage, truncation: Some(1.0), ..DeformationSettings::default() },
+    );
+    let mut state = SceneState::rest(&scene);
+    state.q[0] = 10.0;
+    let (mut toggles, mut previous) = (0, None);
+    for step in 0..60 {
+        state.q[oscillating_mode] = 0.5 + 0.1 * (0.7 * step as f32).sin();
+        state.mark_all_dirty();
+        let positions = deform(&scene, &state);
+        assert!((positions[1] - 10.0).abs() < 1e-3, "expected mode 0 not to be truncated");
+        let is_truncated = positions[0] == 0.0;
+        assert!(is_truncated || (positions[0] - state.q[oscillating_mode]).abs() < 0.01);
+        toggles += usize::from(previous.is_some_and(|previous| previous != is_truncated));
+        previous = Some(is_truncated);
+    }
+    toggles
+}
+
+/// Hysteresis: a mode near the limit stays truncated. Negative control: with a new deformer per step, the mode is
+/// truncated and restored many times.
+pub(crate) fn check_hysteresis<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    for storage in StorageType::ALL {
+        let mut deformer: Option<D> = None;
+        let toggles = count_mode_toggles(storage, |scene, state| {
+            run_step(deformer.get_or_insert_with(|| create_deformer(scene)), state).surface.positions
+        });
+        eprintln!("{}: the mode was truncated or restored {toggles} times in 60 steps", storage.name());
+        assert!(toggles <= 1, "expected at most one change, got {toggles}");
+    }
+    let toggles = count_mode_toggles(StorageType::F32, |scene, state| {
+        run_step(&mut create_deformer(scene), state).surface.positions
+    });
+    eprintln!("without hysteresis the mode was truncated or restored {toggles} times");
+    assert!(toggles > 10, "negative control: expected more than 10 changes, got {toggles}");
+}
