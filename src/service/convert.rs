@@ -169,29 +169,22 @@ pub(super) const fn wire_format(format: FrameFormat) -> v1::Format {
     }
 }
 
-pub(super) const fn pick_step_selector(step: Option<&v1::pick_request::Step>) -> StepSelector {
-    match step {
-        None => StepSelector::Current,
-        Some(v1::pick_request::Step::ExactStep(number)) => StepSelector::Exact(*number),
-        Some(v1::pick_request::Step::MinimumStep(number)) => StepSelector::Minimum(*number),
-    }
+/// Implements the conversion of the optional `step` of a request. A macro, because every request has its own type of it.
+macro_rules! step_selector_from {
+    ($($step:path),+) => {$(
+        impl From<Option<$step>> for StepSelector {
+            fn from(step: Option<$step>) -> Self {
+                use $step as Step;
+                match step {
+                    None => Self::Current,
+                    Some(Step::ExactStep(number)) => Self::Exact(number),
+                    Some(Step::MinimumStep(number)) => Self::Minimum(number),
+                }
+            }
+        }
+    )+};
 }
-
-pub(super) const fn frame_step_selector(step: Option<&v1::render_frame_request::Step>) -> StepSelector {
-    match step {
-        None => StepSelector::Current,
-        Some(v1::render_frame_request::Step::ExactStep(number)) => StepSelector::Exact(*number),
-        Some(v1::render_frame_request::Step::MinimumStep(number)) => StepSelector::Minimum(*number),
-    }
-}
-
-pub(super) const fn vertices_step_selector(step: Option<&v1::get_vertices_request::Step>) -> StepSelector {
-    match step {
-        None => StepSelector::Current,
-        Some(v1::get_vertices_request::Step::ExactStep(number)) => StepSelector::Exact(*number),
-        Some(v1::get_vertices_request::Step::MinimumStep(number)) => StepSelector::Minimum(*number),
-    }
-}
+step_selector_from!(v1::pick_request::Step, v1::render_frame_request::Step, v1::get_vertices_request::Step);
 
 /// A readable name of the requested step, for errors.
 pub(super) fn describe_step_selector(selector: StepSelector, scene: &str) -> String {

@@ -10,7 +10,7 @@ use prost::Message as _;
 use tonic::{Response, Status};
 
 use super::convert::scene_info;
-use super::stream::{ReplySender, ReplyStream, respond, split_into_chunks};
+use super::stream::{ReplySender, ReplyStream, respond};
 use crate::engine::{SceneHandle, validate_domains};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::Scene;
@@ -33,7 +33,10 @@ pub(super) fn scene(
             for array in &arrays {
                 let bytes = array_bytes(&scene_handle.scene, domain as usize, *array);
                 let total = bytes.len() as u64;
-                for (offset, data) in split_into_chunks(bytes, most) {
+                // Copies one chunk at a time. An empty array is one empty chunk.
+                for start in (0..bytes.len().max(1)).step_by(most) {
+                    let data = Bytes::copy_from_slice(&bytes[start..bytes.len().min(start + most)]);
+                    let offset = start as u64;
                     let chunk = v1::ArrayChunk { domain, array: (*array).into(), offset, total, data };
                     reply_sender.send(part(Part::Chunk(chunk))).await?;
                 }
@@ -142,16 +145,15 @@ fn describe(scene: &Scene, index: u32) -> v1::DomainDescription {
     }
 }
 
-fn array_bytes(scene: &Scene, domain: usize, array: v1::Array) -> Bytes {
+fn array_bytes(scene: &Scene, domain: usize, array: v1::Array) -> &[u8] {
     let mesh = &scene.shape_of(domain).mesh;
     let corners = mesh.corners();
-    let bytes: &[u8] = match array {
+    match array {
         v1::Array::Unspecified => &[],
         v1::Array::Indices => bytemuck::cast_slice(mesh.triangles()),
         v1::Array::CornerVertices => bytemuck::cast_slice(&corners.vertices),
         v1::Array::RestPositions => bytemuck::cast_slice(mesh.rest()),
         v1::Array::Uvs => bytemuck::cast_slice(&corners.uvs),
         v1::Array::RestNormals => bytemuck::cast_slice(&corners.normals),
-    };
-    Bytes::copy_from_slice(bytes)
+    }
 }

@@ -1,17 +1,14 @@
 //! `FrameService`: single frames with a deadline, frame streams and picks. Every frame names its step and is sent in
 //! chunks.
 
-use bytes::Bytes;
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
-use super::convert::{
-    delivery, describe_step_selector, drawn_by, frame_step_selector, picture, stages, step_id, wire_format,
-};
+use super::convert::{delivery, describe_step_selector, drawn_by, picture, stages, step_id, wire_format};
 use super::picks;
 use super::status::status;
-use super::stream::{Deadline, ReplySender, ReplyStream, respond, split_into_chunks};
-use crate::engine::{EncodedOutput, EncodedSubscription, Engine, FrameFormat, OutputSpec};
+use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
+use crate::engine::{EncodedOutput, EncodedSubscription, Engine, FrameFormat, OutputSpec, StepSelector};
 
 /// Implementation of `FrameService`.
 pub(super) struct FrameServiceImpl(pub(super) Engine);
@@ -29,7 +26,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(status)?;
         let (view, format) = picture(&self.0, &scene_handle.scene, request.picture).map_err(status)?;
-        let selector = frame_step_selector(request.step.as_ref());
+        let selector = StepSelector::from(request.step);
         let (most, encoder) = (config.chunk_bytes, self.0.encoder().clone());
         Ok(respond(move |reply_sender| async move {
             let work = async {
@@ -116,7 +113,5 @@ fn chunks(
         shadow_drawn_by: drawn_by(frame.raster_backends.shadow).into(),
         visibility_drawn_by: drawn_by(frame.raster_backends.visibility).into(),
     };
-    let mut head = Some(head);
-    let cut = move |(offset, data): (u64, Bytes)| v1::FrameChunk { head: head.take(), offset, data };
-    split_into_chunks(frame.bytes.clone(), most).map(cut)
+    chunks_with_head(head, frame.bytes.clone(), most, |head, offset, data| v1::FrameChunk { head, offset, data })
 }

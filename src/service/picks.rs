@@ -4,10 +4,10 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use tonic::Status;
 
-use super::convert::{describe_step_selector, pick, pick_step_selector, stages, step_id};
+use super::convert::{describe_step_selector, pick, stages, step_id};
 use super::status::status;
 use super::stream::{Deadline, ReplyStream, respond};
-use crate::engine::{Engine, ModalHit, PickResult, resolve_picks};
+use crate::engine::{Engine, ModalHit, PickResult, StepSelector, resolve_picks};
 use modalcast_model::scene::Scene;
 
 /// Upper bound on the size of a hit without its modes, in bytes.
@@ -21,7 +21,7 @@ pub(super) fn answer(
 ) -> Result<tonic::Response<ReplyStream<v1::PickResponse>>, Status> {
     let scene_handle = engine.find(&request.scene).map_err(status)?;
     let view = pick(engine, &scene_handle.scene, &request).map_err(status)?;
-    let selector = pick_step_selector(request.step.as_ref());
+    let selector = StepSelector::from(request.step);
     let most = engine.config().chunk_bytes;
     Ok(respond(move |reply_sender| async move {
         let work = async {

@@ -29,7 +29,7 @@ impl<T> ReplySender<T> {
     /// Sends one message.
     ///
     /// # Errors
-    /// `CANCELLATION_RATIO` when the client has disconnected.
+    /// `CANCELLED` when the client has disconnected.
     pub(super) async fn send(&self, message: T) -> Result<(), Status> {
         self.0.send(Ok(message)).await.map_err(|_| gone())
     }
@@ -37,7 +37,7 @@ impl<T> ReplySender<T> {
     /// Waits until the channel has capacity for a message. Cancel-safe.
     ///
     /// # Errors
-    /// `CANCELLATION_RATIO` when the client has disconnected.
+    /// `CANCELLED` when the client has disconnected.
     pub(super) async fn reserve(&self) -> Result<mpsc::Permit<'_, Result<T, Status>>, Status> {
         self.0.reserve().await.map_err(|_| gone())
     }
@@ -93,6 +93,17 @@ pub(super) async fn catch_panic<T: Send + 'static>(
 pub(super) fn split_into_chunks(bytes: Bytes, most: usize) -> impl Iterator<Item = (u64, Bytes)> {
     let starts = (0..bytes.len().max(1)).step_by(most.max(1));
     starts.map(move |start| (start as u64, bytes.slice(start..bytes.len().min(start + most))))
+}
+
+/// Splits a reply as [`split_into_chunks`] does; the first chunk carries the head.
+pub(super) fn chunks_with_head<H, C>(
+    head: H,
+    bytes: Bytes,
+    most: usize,
+    chunk: impl Fn(Option<H>, u64, Bytes) -> C,
+) -> impl Iterator<Item = C> {
+    let mut head = Some(head);
+    split_into_chunks(bytes, most).map(move |(offset, data)| chunk(head.take(), offset, data))
 }
 
 /// The deadline of a call.

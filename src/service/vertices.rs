@@ -3,14 +3,15 @@
 
 use std::sync::Arc;
 
-use bytes::Bytes;
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
-use super::convert::{delivery, describe_step_selector, stages, step_id, vertices_step_selector};
+use super::convert::{delivery, describe_step_selector, stages, step_id};
 use super::status::status;
-use super::stream::{Deadline, ReplySender, ReplyStream, respond, split_into_chunks};
-use crate::engine::{Engine, OutputSpec, PackedVertices, SceneHandle, Subscription, VertexSelection, pack_vertices};
+use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
+use crate::engine::{
+    Engine, OutputSpec, PackedVertices, SceneHandle, StepSelector, Subscription, VertexSelection, pack_vertices,
+};
 use modalcast_model::deform::VertexAttributes;
 
 /// Implementation of `VertexService`.
@@ -29,7 +30,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(status)?;
         let selection = select(&scene_handle, request.selection)?;
-        let selector = vertices_step_selector(request.step.as_ref());
+        let selector = StepSelector::from(request.step);
         let most = config.chunk_bytes;
         Ok(respond(move |reply_sender| async move {
             let work = async {
@@ -129,7 +130,5 @@ fn chunks(
         displacement_bytes: selection.displacement_bytes(),
         box_bytes: selection.box_bytes(),
     };
-    let mut head = Some(head);
-    let cut = move |(offset, data): (u64, Bytes)| v1::VertexChunk { head: head.take(), offset, data };
-    split_into_chunks(vertices.bytes.clone(), most).map(cut)
+    chunks_with_head(head, vertices.bytes.clone(), most, |head, offset, data| v1::VertexChunk { head, offset, data })
 }
