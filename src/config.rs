@@ -1,4 +1,6 @@
-//! The server's configuration: all limits and paths in one value, validated once and immutable afterwards. The name or
+//! The server's configuration: paths and the limits that depend on the deployment, in one value that is validated once
+//! and immutable afterwards. Limits that no deployment needs to change are constants beside the code that enforces
+//! them. The name or
 //! documentation of a field gives its unit: bytes, pixels or a count.
 
 use std::net::{Ipv4Addr, SocketAddr};
@@ -124,7 +126,7 @@ impl Config {
     ///
     /// # Errors
     /// `Invalid` naming the limit and its range.
-    pub fn validated(self) -> Result<Self> {
+    pub fn validated(self) -> Result<ValidatedConfig> {
         let number = |field: &str, given: u64, least: u64, most: u64| match (least..=most).contains(&given) {
             true => Ok(()),
             false => Err(invalid(format!("config.{field}"), format!("{least} to {most}"), given)),
@@ -152,7 +154,19 @@ impl Config {
         if self.state.as_os_str().is_empty() {
             return Err(invalid("config.state", "a folder", "nothing"));
         }
-        Ok(self)
+        Ok(ValidatedConfig(self))
+    }
+}
+
+/// A configuration whose limits are in their ranges. Only [`Config::validated`] creates one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ValidatedConfig(Config);
+
+impl std::ops::Deref for ValidatedConfig {
+    type Target = Config;
+
+    fn deref(&self) -> &Config {
+        &self.0
     }
 }
 

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::{Outcome, print_line};
-use crate::config::{BackendChoice, Config, RendererChoice};
+use crate::config::{BackendChoice, Config, RendererChoice, ValidatedConfig};
 use crate::engine::{Engine, EngineInfo};
 use crate::service;
 use modalcast_model::error::{Result, fault_in};
@@ -62,7 +62,7 @@ pub(super) struct Args {
 }
 
 impl Args {
-    fn config(&self) -> Result<Config> {
+    fn config(&self) -> Result<ValidatedConfig> {
         let defaults = Config::default();
         Config {
             listen: self.listen,
@@ -92,7 +92,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     Ok(true)
 }
 
-async fn serve(config: Config) -> Result<()> {
+async fn serve(config: ValidatedConfig) -> Result<()> {
     let repository = Arc::new(SceneRepository::new(config.scenes.as_deref())?);
     // Bind before scenes are loaded, so that a second server on the same address fails immediately.
     let listener = service::bind(&config).await?;

@@ -8,6 +8,7 @@
 mod blocking;
 mod catch_unwind;
 mod device;
+mod lock;
 mod output;
 mod registry;
 mod scene;
@@ -36,7 +37,7 @@ pub use storage::upload::{Upload, UploadHeader};
 pub use modalcast_render::{RasterBackend, RasterBackends};
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
 use tokio::sync::Semaphore;
@@ -44,12 +45,13 @@ use tokio::sync::Semaphore;
 use self::blocking::run_blocking;
 use self::device::command::SceneId;
 use self::device::handle::DeviceThread;
+use self::lock::lock;
 use self::registry::Registry;
 use self::scene::actor::SceneServices;
 use self::scene::handle::OpenParams;
 use self::storage::checkpoint_store::CheckpointStore;
 use self::storage::scene_catalog::SceneCatalog;
-use crate::config::Config;
+use crate::config::{Config, ValidatedConfig};
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::load::OpenedScene;
 
@@ -66,7 +68,7 @@ pub struct Engine {
 }
 
 struct Shared {
-    config: Arc<Config>,
+    config: Arc<ValidatedConfig>,
     source: Arc<dyn SceneSource>,
     info: EngineInfo,
     encoder: FrameEncoder,
@@ -86,7 +88,7 @@ impl Engine {
     ///
     /// # Errors
     /// `Unavailable` when a backend requested by name cannot be opened, or another server uses the state folder.
-    pub async fn start(config: Config, source: Arc<dyn SceneSource>) -> Result<Self> {
+    pub async fn start(config: ValidatedConfig, source: Arc<dyn SceneSource>) -> Result<Self> {
         let config = Arc::new(config);
         let device_config = Arc::clone(&config);
         Self::start_with_device(config, source, move || DeviceContext::open(&device_config)).await
@@ -94,7 +96,7 @@ impl Engine {
 
     /// [`Self::start`] with the function that opens the devices on the device thread.
     async fn start_with_device(
-        config: Arc<Config>,
+        config: Arc<ValidatedConfig>,
         source: Arc<dyn SceneSource>,
         open_device: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
     ) -> Result<Self> {
@@ -213,7 +215,14 @@ impl Engine {
     /// # Errors
     /// `Invalid` naming the missing or malformed file; `Taken` when the name was claimed in the meantime.
     pub async fn finish_upload(&self, mut upload: Upload) -> Result<Arc<SceneHandle>> {
-        upload.finish()?;
+        let finish = move || match upload.finish() {
+            Ok(()) => Ok(upload),
+            Err(error) => {
+                upload.discard();
+                Err(error)
+            }
+        };
+        let upload = run_blocking("upload", finish).await?;
         let (name, entry) = (upload.header.scene.clone(), upload.header.entry.clone());
         self.open_once(name, SceneProvenance::Upload { entry }, Some(upload)).await
     }
@@ -242,7 +251,7 @@ impl Engine {
         let engine = self.clone();
         let finish = move || {
             engine.shared.services.checkpoints.finish();
-            let device = engine.shared.device.lock().unwrap_or_else(PoisonError::into_inner).take();
+            let device = lock(&engine.shared.device).take();
             engine.shared.services.device.quit();
             device.map(JoinHandle::join);
             engine.shared.scene_catalog.release();

@@ -3,10 +3,11 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use tokio::sync::OnceCell;
 
+use super::lock::lock;
 use super::scene_not_open;
 use crate::engine::device::command::SceneId;
 use crate::engine::scene::handle::SceneHandle;
@@ -131,8 +132,7 @@ impl Registry {
     }
 
     fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Arc<RegistryEntry>>> {
-        // Every change under the lock is one insertion or removal, so the map behind a poisoned lock is valid.
-        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.entries)
     }
 }
 

@@ -42,14 +42,12 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         &self,
         request: Request<Streaming<v1::UploadSceneRequest>>,
     ) -> Result<Response<v1::UploadSceneResponse>, Status> {
-        let mut parts = request.into_inner();
-        let limit = self.0.config().message_bytes;
-        let mut budget = UploadTimeBudget::new(self.0.config().stall_timeout);
         let mut upload = None;
-        while let Some(request) = budget.wait(parts.message()).await?.map_err(|fault| transport_status(fault, limit))? {
-            budget.refill(request.encoded_len());
-            let part = request.part.ok_or_else(|| status(invalid("part", "header, file or chunk", "none")))?;
-            upload = Some(receive(&self.0, upload, part).await.map_err(status)?);
+        if let Err(status) = receive_parts(&self.0, request.into_inner(), &mut upload).await {
+            if let Some(upload) = upload {
+                tokio::task::spawn_blocking(move || upload.discard()).await.ok(); // The next start removes leftovers.
+            }
+            return Err(status);
         }
         let upload = upload.ok_or_else(|| status(invalid("part", "a header first", "nothing")))?;
         let engine = self.0.clone();
@@ -137,21 +135,42 @@ impl UploadTimeBudget {
     }
 }
 
-/// Processes one part of an upload. Disk access runs on a blocking thread.
+/// Receives the parts of an upload until the client closes its side. After an error `upload` is what is to be discarded.
+async fn receive_parts(
+    engine: &Engine,
+    mut parts: Streaming<v1::UploadSceneRequest>,
+    upload: &mut Option<Upload>,
+) -> Result<(), Status> {
+    let limit = engine.config().message_bytes;
+    let mut budget = UploadTimeBudget::new(engine.config().stall_timeout);
+    while let Some(request) = budget.wait(parts.message()).await?.map_err(|fault| transport_status(fault, limit))? {
+        budget.refill(request.encoded_len());
+        let part = request.part.ok_or_else(|| status(invalid("part", "header, file or chunk", "none")))?;
+        *upload = Some(receive(engine, upload.take(), part).await.map_err(status)?);
+    }
+    Ok(())
+}
+
+/// Processes one part of an upload, and discards the upload if that fails. Disk access runs on a blocking thread.
 async fn receive(engine: &Engine, upload: Option<Upload>, part: Part) -> Result<Upload> {
-    let mut upload = match (upload, part) {
+    let (mut upload, part) = match (upload, part) {
         (None, Part::Header(header)) => return engine.begin_upload(upload_header(header)).await,
         (None, _) => return Err(invalid("part", "a header first", "a file or chunk")),
-        (Some(_), Part::Header(_)) => return Err(invalid("part", "one header", "a second")),
         (Some(upload), part) => (upload, part),
     };
-    let work = move || -> Result<Upload, Error> {
-        match upload.1 {
-            Part::File(file) => upload.0.begin_file(&file.path, file.bytes, &file.sha256)?,
-            Part::Chunk(bytes) => upload.0.write_chunk(&bytes)?,
-            Part::Header(_) => {}
+    let work = move || {
+        let received = match part {
+            Part::File(file) => upload.begin_file(&file.path, file.bytes, &file.sha256),
+            Part::Chunk(bytes) => upload.write_chunk(&bytes),
+            Part::Header(_) => Err(invalid("part", "one header", "a second")),
+        };
+        match received {
+            Ok(()) => Ok(upload),
+            Err(error) => {
+                upload.discard();
+                Err(error)
+            }
         }
-        Ok(upload.0)
     };
     tokio::task::spawn_blocking(work).await.map_err(fault_in("upload"))?
 }

@@ -38,7 +38,7 @@ use super::current_step::CurrentStep;
 use super::message::{AcquiredLease, Message};
 use super::output_delivery::{DeliveryMode, OutputDelivery, SceneOnDevice};
 use super::step_queue::{CompletedStep, Policy, QueuedStep, StepQueue, WriterLease};
-use crate::config::Config;
+use crate::config::ValidatedConfig;
 use crate::engine::catch_unwind::catch_unwind_async;
 use crate::engine::device::command::SceneId;
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
@@ -54,7 +54,7 @@ use modalcast_model::scene::{Scene, SceneState};
 pub(in crate::engine) struct SceneServices {
     pub device: DeviceHandle,
     pub checkpoints: Arc<CheckpointStore>,
-    pub config: Arc<Config>,
+    pub config: Arc<ValidatedConfig>,
 }
 
 /// Arguments of [`SceneActor::new`]: a scene that is loaded on the device and deformed to `state`.

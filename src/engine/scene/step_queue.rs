@@ -2,11 +2,12 @@
 //! bounds both: `lossless` rejects a step beyond the window, `latest` merges a step into the one already queued.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Instant;
 
 use tokio::sync::Notify;
 
+use crate::engine::lock::lock;
 use crate::telemetry::{Stage, StageTimes, ms_since};
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::StepUpdate;
@@ -238,9 +239,7 @@ impl StepQueue {
     }
 
     fn lock(&self) -> MutexGuard<'_, QueueState> {
-        // Every change under the lock completes before anything can panic, so the state behind a poisoned lock is
-        // valid.
-        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.inner)
     }
 }
 

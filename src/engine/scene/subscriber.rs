@@ -1,6 +1,7 @@
 //! A subscription to a scene: the scene's end ([`Subscriber`]) and the reply stream's end ([`Subscription`]) of a bounded channel
 //! with credit-based flow control. A feed buffers at most two results. With [`Delivery::Latest`] a result is produced
-//! only when the feed is polled.
+//! only when the feed is polled. If the future of that poll is dropped, the next poll returns the result that the first
+//! one requested, even if the scene shows a later step by then.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};

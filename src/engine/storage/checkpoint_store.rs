@@ -1,17 +1,19 @@
 //! Checkpoint store: persists the last step of every scene, one file per scene. A background thread writes at most ten
-//! times per second and replaces files by an atomic rename. A killed server therefore loses about the last 0.1 s plus
-//! the duration of a write, and never leaves a partial file.
+//! times per second and replaces files by an atomic rename. A killed server therefore loses the last 0.1 s plus the
+//! time of one round, which syncs a file and its folder per changed scene; it never leaves a partial file.
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::{self, Write as _};
+use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use sha2::{Digest as _, Sha256};
 
+use super::atomic_file::write_atomic;
+use crate::engine::lock::lock;
 use modalcast_model::domain::Transform;
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::{FloatingOrigins, Scene, SceneState};
@@ -62,9 +64,9 @@ impl CheckpointStore {
         let shared = Arc::new(Shared::default());
         let (theirs, place) = (Arc::clone(&shared), folder.clone());
         let thread = std::thread::Builder::new()
-            .name("keeper".into())
+            .name("checkpoints".into())
             .spawn(move || write_loop(&theirs, &place))
-            .map_err(fault_in("keeper thread"))?;
+            .map_err(fault_in("checkpoint thread"))?;
         Ok(Self { folder, shared, thread: Mutex::new(Some(thread)) })
     }
 
@@ -155,24 +157,8 @@ fn write_loop(shared: &Shared, folder: &Path) {
     }
 }
 
-/// Replaces a file atomically: writes a temporary file in the same folder, syncs and renames it. A reader sees either
-/// the old or the new content.
-pub(in crate::engine) fn write_atomic(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let temporary = path.with_extension("new");
-    let mut file = fs::File::create(&temporary)?;
-    file.write_all(bytes)?;
-    // Without the sync a power failure could leave an empty file under the new name.
-    file.sync_all()?;
-    fs::rename(&temporary, path)
-}
-
 fn path_of(folder: &Path, name: &str) -> PathBuf {
     folder.join(format!("{name}.step"))
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every change under these locks is a single operation, so the state behind a poisoned lock is valid.
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn encode(state: &SceneState) -> Vec<u8> {

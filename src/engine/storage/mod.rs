@@ -1,5 +1,6 @@
 //! The state folder: the catalog of open scenes, the checkpoints of their steps, and uploaded files.
 
+mod atomic_file;
 pub(super) mod checkpoint_store;
 pub(super) mod scene_catalog;
 pub(super) mod upload;

@@ -4,9 +4,10 @@ use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 
-use super::checkpoint_store::write_atomic;
+use super::atomic_file::write_atomic;
+use crate::engine::lock::lock;
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 
 /// The origin of a scene.
@@ -85,7 +86,7 @@ impl SceneCatalog {
 
     /// Releases the lock, so that another server may use the folder.
     pub(in crate::engine) fn release(&self) {
-        self.lock.lock().unwrap_or_else(PoisonError::into_inner).take();
+        lock(&self.lock).take();
     }
 
     /// Changes the catalog on disk first and in memory only if that succeeds, so that both agree.
@@ -100,22 +101,33 @@ impl SceneCatalog {
     }
 
     fn guard(&self) -> MutexGuard<'_, BTreeMap<String, SceneProvenance>> {
-        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.entries)
     }
 }
 
-/// Reads the catalog; empty if there is none. A damaged file is renamed to `scenes.json.damaged`, so that it is kept
-/// and the server can start.
+/// Reads the catalog; empty if there is none. A damaged file is renamed to `scenes.json.damaged`, or to
+/// `scenes.json.damaged.1` and so on if that exists, so that it is kept and the server can start.
 fn read(path: &Path) -> io::Result<BTreeMap<String, SceneProvenance>> {
     let bytes = match fs::read(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(BTreeMap::new()),
         read => read?,
     };
     serde_json::from_slice(&bytes).or_else(|error| {
-        let backup = path.with_extension("json.damaged");
+        let backup = unused_backup_path(path);
         tracing::warn!(%error, "the list of open scenes is damaged; it is kept as {} and begins empty", backup.display());
         fs::rename(path, backup).map(|()| BTreeMap::new())
     })
+}
+
+/// The first of `scenes.json.damaged`, `scenes.json.damaged.1`, ... that does not exist.
+fn unused_backup_path(path: &Path) -> PathBuf {
+    let mut backup = path.with_extension("json.damaged");
+    let mut number = 0;
+    while backup.exists() {
+        number += 1;
+        backup = path.with_extension(format!("json.damaged.{number}"));
+    }
+    backup
 }
 
 /// Removes uploads that a killed server did not finish.
@@ -195,6 +207,11 @@ mod tests {
         assert!(scene_catalog.entries().is_empty() && !list.exists());
         assert_eq!(fs::read(folder.path().join("scenes.json.damaged")).expect("set aside"), b"{\"a\":");
         drop(scene_catalog);
+        fs::write(&list, b"[").expect("written");
+        drop(SceneCatalog::open(folder.path()).expect("it starts"));
+        let backup = |name: &str| fs::read(folder.path().join(name)).expect("set aside");
+        assert_eq!(backup("scenes.json.damaged"), b"{\"a\":", "the first one is not overwritten");
+        assert_eq!(backup("scenes.json.damaged.1"), b"[");
         // A folder in place of the file is unreadable for every user, root included.
         fs::create_dir(&list).expect("a folder");
         assert!(matches!(SceneCatalog::open(folder.path()), Err(Error::Unavailable { .. })));

@@ -1,9 +1,11 @@
 //! Writes uploaded files to disk. Paths cannot leave a new temporary folder; sizes and SHA-256 hashes are checked
-//! against the declared ones. Dropping an unfinished [`Upload`] removes its folder.
+//! against the declared ones. Dropping an unfinished [`Upload`] removes its folder, on a
+//! thread of its own; [`Upload::discard`] removes it before it returns.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{self, ErrorKind, Write as _};
+use std::mem;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -38,8 +40,8 @@ pub struct Upload {
     /// Sum of the declared sizes of the files so far, in bytes.
     declared_bytes: u64,
     open: Option<OpenFile>,
-    /// Permit that counts against the limit on concurrent uploads.
-    _permit: OwnedSemaphorePermit,
+    /// Permit that counts against the limit on concurrent uploads, until the folder is moved or removed.
+    permit: Option<OwnedSemaphorePermit>,
 }
 
 /// The file that is being received.
@@ -65,7 +67,7 @@ impl Upload {
         let count = COUNTER.fetch_add(1, Ordering::Relaxed);
         let folder = uploads.join(format!(".{}-{count}", header.scene));
         fs::create_dir_all(&folder).map_err(fault_in("upload"))?;
-        Ok(Self { header, folder, paths: BTreeSet::new(), declared_bytes: 0, open: None, _permit: place })
+        Ok(Self { header, folder, paths: BTreeSet::new(), declared_bytes: 0, open: None, permit: Some(place) })
     }
 
     /// Begins the next file. `bytes` is its size; `sha256` must have 32 bytes.
@@ -146,6 +148,11 @@ impl Upload {
         Ok(())
     }
 
+    /// Removes the folder. Blocks on the disk.
+    pub fn discard(mut self) {
+        fs::remove_dir_all(mem::take(&mut self.folder)).ok(); // The next start removes leftovers.
+    }
+
     fn finish_file(&mut self) -> Result<()> {
         let Some(open) = self.open.take_if(|open| open.left == 0) else { return Ok(()) };
         let given: [u8; 32] = open.hasher.finalize().into();
@@ -167,9 +174,20 @@ impl Upload {
 }
 
 impl Drop for Upload {
+    /// Removes the folder on a thread that may block if this is a thread of a runtime.
     fn drop(&mut self) {
-        if !self.folder.as_os_str().is_empty() {
-            fs::remove_dir_all(&self.folder).ok(); // The next start removes leftovers.
+        let folder = mem::take(&mut self.folder);
+        if folder.as_os_str().is_empty() {
+            return;
+        }
+        let permit = self.permit.take();
+        let remove = move || {
+            fs::remove_dir_all(folder).ok(); // The next start removes leftovers.
+            drop(permit);
+        };
+        match tokio::runtime::Handle::try_current() {
+            Ok(runtime) => drop(runtime.spawn_blocking(remove)),
+            Err(_) => remove(),
         }
     }
 }

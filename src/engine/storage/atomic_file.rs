@@ -1,0 +1,20 @@
+//! Atomic replacement of files.
+
+use std::fs::{self, File};
+use std::io::{self, Write as _};
+use std::path::Path;
+
+/// Replaces a file atomically: writes a temporary file in the same folder, syncs it, renames it, and syncs the folder. A
+/// reader sees either the old or the new content, and after a power failure the file has one of both.
+pub(super) fn write_atomic(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let temporary = path.with_extension("new");
+    let mut file = File::create(&temporary)?;
+    file.write_all(bytes)?;
+    // Without the sync a power failure could leave an empty file under the new name.
+    file.sync_all()?;
+    fs::rename(&temporary, path)?;
+    match path.parent() {
+        Some(folder) => File::open(folder)?.sync_all(),
+        None => Ok(()),
+    }
+}
