@@ -55,7 +55,7 @@ fn grow((bends, length, leaves, size): (bool, f64, usize, f64), random: &mut Spl
     let radii = (0..count).map(|ring| 0.0036 - 0.0022 * centerline.fraction(ring)).collect();
     let mut mold = PartTemplate {
         kind: PartKind::Leaf,
-        level: 0,
+        level: None,
         centerline,
         radii,
         sides: 3,

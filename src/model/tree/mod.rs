@@ -289,9 +289,11 @@ mod tests {
                 domain.metadata.eigenvalues.iter().map(|value| value.sqrt() / std::f64::consts::TAU).collect();
             assert!(hertz.windows(2).all(|pair| pair[0] <= pair[1]));
             let Some(lowest) = hertz.first() else { continue };
-            let range = match note(domain, "level") {
-                "0" if note(domain, "kind") == "trunk" => 0.4..1.5,
-                "1" => 0.6..6.0,
+            let level = domain.metadata.notes.get("level").map(String::as_str);
+            assert_eq!(level.is_none(), note(domain, "kind") == "leaf", "only leaves have no level");
+            let range = match level {
+                Some("0") => 0.4..1.5,
+                Some("1") => 0.6..6.0,
                 _ => 1.5..15.0,
             };
             assert!(range.contains(lowest), "{}: {lowest} Hz", domain.name);

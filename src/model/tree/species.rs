@@ -119,7 +119,7 @@ fn bough(
     let base = (0.008 + 0.0105 * length).min(thickest);
     let radii = tapering(&centerline, base, 0.0045);
     let mut mold = wooden(PartKind::Branch, centerline, radii, [10, 6]);
-    mold.level = 1;
+    mold.level = Some(1);
     mold.damping = 0.07;
     mold.add_skin(UvMapping::Bark { repeats: 1 }, |_, _| 1.0);
     let count = (length / 0.42).round().max(3.0) as usize;
@@ -152,7 +152,7 @@ fn twig(length: f64, leaves: &[PartTemplate], random: &mut SplitMix64) -> PartTe
     let centerline = Centerline::grow(&growth, random);
     let radii = tapering(&centerline, 0.0040 + 0.0055 * length, 0.0028);
     let mut mold = wooden(PartKind::Branch, centerline, radii, [5, 4]);
-    mold.level = 2;
+    mold.level = Some(2);
     mold.damping = 0.09;
     mold.add_skin(UvMapping::Bark { repeats: 1 }, |_, _| 1.0);
     let count = (0.6 + length / 0.33).round() as usize;
@@ -183,7 +183,7 @@ fn hang_leaves(
 fn wooden(kind: PartKind, centerline: Centerline, radii: Vec<f64>, [sides, rank]: [usize; 2]) -> PartTemplate {
     PartTemplate {
         kind,
-        level: 0,
+        level: Some(0),
         centerline,
         radii,
         sides,

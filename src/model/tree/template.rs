@@ -36,8 +36,9 @@ pub(super) struct ChildJoint {
 #[derive(Debug, Clone)]
 pub(super) struct PartTemplate {
     pub(super) kind: PartKind,
-    /// 0 for the trunk, 1 for boughs, 2 for twigs; 0 for leaf clusters.
-    pub(super) level: usize,
+    /// Branching level: 0 for the trunk, 1 for boughs, 2 for twigs. `None` for leaf clusters, whose templates are used at
+    /// several levels.
+    pub(super) level: Option<usize>,
     pub(super) centerline: Centerline,
     /// One radius per ring, meters.
     pub(super) radii: Vec<f64>,
@@ -126,7 +127,6 @@ impl PartTemplate {
         };
         let mut notes = BTreeMap::from([
             ("kind".into(), kind.into()),
-            ("level".into(), self.level.to_string()),
             ("length".into(), format!("{:.4}", self.centerline.length())),
             ("mass".into(), format!("{:.5}", beam.own_mass())),
             ("carried_mass".into(), format!("{:.5}", self.carried_mass())),
@@ -134,6 +134,9 @@ impl PartTemplate {
             ("youngs_modulus".into(), self.elastic.youngs_modulus.to_string()),
             ("density".into(), self.elastic.density.to_string()),
         ]);
+        if let Some(level) = self.level {
+            notes.insert("level".into(), level.to_string());
+        }
         if self.rank > 0 {
             notes.insert("mass_normalised".into(), "true".into());
         }
@@ -158,8 +161,8 @@ mod tests {
             let beam = mold.beam();
             let modes = beam.modes(mold.rank).expect("converges");
             let (residual, skew) = eigen_residuals(&beam, &modes);
-            assert!(residual <= 1e-6, "level {}: residual {residual}", mold.level);
-            assert!(skew <= 1e-6, "level {}: departure from mass-orthonormality {skew}", mold.level);
+            assert!(residual <= 1e-6, "level {:?}: residual {residual}", mold.level);
+            assert!(skew <= 1e-6, "level {:?}: departure from mass-orthonormality {skew}", mold.level);
         }
     }
 
@@ -202,7 +205,7 @@ mod tests {
                 let place = Vector3::from(mesh.rest()[*vertex as usize]).cast::<f64>();
                 let center = mold.centerline.points[(*vertex as usize / mold.sides).min(last)];
                 let outwards = (place - center).normalize().dot(&Vector3::from(*normal).cast());
-                assert!(outwards > 0.2, "level {}: {outwards}", mold.level);
+                assert!(outwards > 0.2, "level {:?}: {outwards}", mold.level);
                 assert!((Vector3::from(*normal).norm() - 1.0).abs() < 1e-5);
             }
             assert!(mesh.corners().uvs.as_flattened().iter().all(|number| number.is_finite()));
