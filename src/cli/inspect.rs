@@ -101,7 +101,7 @@ impl<'a> SceneReport<'a> {
             look: LookTable { settings: scene.look, raster: backends.raster },
             deformation: &scene.deformation,
             remarks: &scene.remarks,
-            deform: gpu::plan(scene),
+            deform: gpu::plan(scene, scene.light_axes()),
             render: modalcast_render::plan(scene),
             domains: (0..scene.domains.len()).map(|index| DomainReport::new(scene, index)).collect(),
         }
@@ -173,7 +173,7 @@ fn lines(scene: &Scene) -> Vec<String> {
 
 /// The kernels, passes and memory that the deformer and the renderer plan for the scene, and the parts that they omit.
 fn plans(scene: &Scene) -> Vec<String> {
-    let (deform, render) = (gpu::plan(scene), modalcast_render::plan(scene));
+    let (deform, render) = (gpu::plan(scene, scene.light_axes()), modalcast_render::plan(scene));
     let kernels: Vec<String> =
         deform.kernels.iter().map(|kernel| format!("{} [{}]", kernel.name, kernel.defines.join(" "))).collect();
     let mut lines = vec![

@@ -136,18 +136,20 @@ impl Backend {
     }
 }
 
+/// Orthogonal unit vectors in the world, along which a deformer bounds the positions in addition to the world's axes.
+pub type BoundingAxes = [nalgebra::Vector3<f64>; 3];
+
 /// The result of [`Deformer::deform`] apart from the vertices.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DeformSummary {
     /// Bounds of all deformed positions in the coordinates of [`DeformedSurface::positions`]. Not finite if f32 overflowed in a
     /// position or in a stored displacement.
     pub bounds: Bounds,
-    /// Bounds of the same positions along the axes of light space ([`Scene::light_axes`](crate::scene::Scene)),
-    /// relative to the same origin. `None` if the look has no shadow map that is fitted to the vertices. The bounds
-    /// contain every vertex. `reference` returns the tight bounds. The other backends bound boxes of up to 128 vertices
+    /// Bounds of the same positions along the [`BoundingAxes`] of the deformer, relative to the same origin. `None` if
+    /// it was constructed without axes. The bounds contain every vertex. `reference` returns the tight bounds. The other backends bound boxes of up to 128 vertices
     /// each: they exceed the tight bounds by less than the diagonal of such a box, and never extend beyond the corners
     /// of `bounds` by more than rounding.
-    pub light: Option<LightSpaceBox>,
+    pub oriented_bounds: Option<LightSpaceBox>,
     /// Milliseconds from the call until the vertices were complete. If they are written to the renderer's own buffers,
     /// the wait for frames that still read these buffers is not included.
     pub ms: f64,
@@ -227,7 +229,7 @@ mod tests {
         }
 
         fn deform(&mut self, _: &SceneState) -> Result<DeformSummary> {
-            Ok(DeformSummary { bounds: Bounds::EMPTY, light: None, ms: 0.0 })
+            Ok(DeformSummary { bounds: Bounds::EMPTY, oriented_bounds: None, ms: 0.0 })
         }
 
         fn surface(&mut self) -> Result<&DeformedSurface> {

@@ -38,7 +38,8 @@ pub(crate) struct StepResult {
 
 /// Deforms a state and reads back all attributes.
 pub(crate) fn run_step(deformer: &mut dyn Deformer, state: &SceneState) -> StepResult {
-    let DeformSummary { bounds, light, .. } = deformer.deform(state).expect("expected the step to succeed");
+    let DeformSummary { bounds, oriented_bounds: light, .. } =
+        deformer.deform(state).expect("expected the step to succeed");
     StepResult { bounds, light, surface: deformer.surface().expect("expected a surface").clone() }
 }
 

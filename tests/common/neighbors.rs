@@ -76,7 +76,11 @@ fn bits_of(result: &StepResult, scene: &Scene, domain: usize) -> [Vec<u32>; 3] {
 
 /// Whether the GPU plan has so few tiles that each lane computes one vertex instead of four.
 pub(crate) fn has_one_item_per_lane(scene: &Scene) -> bool {
-    plan(scene).kernel(KernelKind::Deform).expect("expected a deform kernel").defines.contains(&"ONE_ITEM_PER_LANE")
+    plan(scene, None)
+        .kernel(KernelKind::Deform)
+        .expect("expected a deform kernel")
+        .defines
+        .contains(&"ONE_ITEM_PER_LANE")
 }
 
 /// Compares the bits of the domains under test in a scene of their own, among a thousand other domains, and with 270

@@ -80,9 +80,10 @@ fn gpu_multi_tile_blocks_have_the_bits_of_separate_domains() {
         let scenes = batched_and_separate(|| {
             instanced_parts(vertices, 5, 3, DeformationSettings { boxes: true, ..with_storage(storage) })
         });
-        let blocks =
-            modalcast_compute::gpu::plan(&scenes[0]).kernel(KernelKind::Batch).expect("expected a batch kernel").blocks
-                as usize;
+        let blocks = modalcast_compute::gpu::plan(&scenes[0], None)
+            .kernel(KernelKind::Batch)
+            .expect("expected a batch kernel")
+            .blocks as usize;
         assert!(2 * blocks <= vertices.div_ceil(QUAD * TILE_QUADS) + 1, "{name}: {blocks} blocks");
         assert_eq!(count_differing_states(&name, &scenes), 0, "{name}");
     }

@@ -43,7 +43,8 @@ fn gpu_dropped_deformers_release_their_memory() {
     let scene = scenes::random_scene(&[(20_000, 30)], 2, true, false);
     let state = scenes::random_state(&scene, 1);
     let deform_once = || {
-        let mut deformer = CudaDeformer::new(&device, &scene, None).expect("expected a CUDA deformer");
+        let mut deformer =
+            CudaDeformer::new(&device, &scene, None, scene.light_axes()).expect("expected a CUDA deformer");
         deformer.deform(&state).expect("expected the step to succeed");
         deformer.surface().expect("expected a surface");
         deformer.plan().total_bytes()

@@ -26,9 +26,10 @@ fn open_renderer() -> (Renderer, Arc<Device>, Arc<Scene>) {
 fn gpu_shared_buffers_have_the_bits_of_copied_buffers() {
     let (mut renderer, device, scene) = open_renderer();
     let buffers = renderer.load(&scene).expect("expected the scene to load");
-    let mut sharing_deformer =
-        CudaDeformer::new(&device, &scene, Some(shared_buffers(&buffers))).expect("expected a CUDA deformer");
-    let mut copying_deformer = CudaDeformer::new(&device, &scene, None).expect("expected a CUDA deformer");
+    let mut sharing_deformer = CudaDeformer::new(&device, &scene, Some(shared_buffers(&buffers)), scene.light_axes())
+        .expect("expected a CUDA deformer");
+    let mut copying_deformer =
+        CudaDeformer::new(&device, &scene, None, scene.light_axes()).expect("expected a CUDA deformer");
     assert!(sharing_deformer.shares_buffers(), "expected shared buffers");
     assert!(!copying_deformer.shares_buffers());
     for seed in 0..3 {
@@ -53,9 +54,10 @@ fn gpu_shared_buffers_have_the_bits_of_copied_buffers() {
 fn gpu_shared_buffers_are_read_back_during_the_next_step() {
     let (mut renderer, device, scene) = open_renderer();
     let buffers = renderer.load(&scene).expect("expected the scene to load");
-    let mut sharing_deformer =
-        CudaDeformer::new(&device, &scene, Some(shared_buffers(&buffers))).expect("expected a CUDA deformer");
-    let mut copying_deformer = CudaDeformer::new(&device, &scene, None).expect("expected a CUDA deformer");
+    let mut sharing_deformer = CudaDeformer::new(&device, &scene, Some(shared_buffers(&buffers)), scene.light_axes())
+        .expect("expected a CUDA deformer");
+    let mut copying_deformer =
+        CudaDeformer::new(&device, &scene, None, scene.light_axes()).expect("expected a CUDA deformer");
     assert!(sharing_deformer.shares_buffers(), "expected shared buffers");
     let mut pending = None;
     for seed in 0..50 {
@@ -91,7 +93,8 @@ fn gpu_frames_of_shared_and_uploaded_buffers_are_equal() {
         renderer.load(&scene).expect("expected the scene to load"),
     );
     let mut sharing_deformer =
-        CudaDeformer::new(&device, &scene, Some(shared_buffers(&shared_scene))).expect("expected a CUDA deformer");
+        CudaDeformer::new(&device, &scene, Some(shared_buffers(&shared_scene)), scene.light_axes())
+            .expect("expected a CUDA deformer");
     let bounds = sharing_deformer.deform(&state).expect("expected the step to succeed").bounds;
     let params =
         FrameParams { camera: Camera::fit_to_scene(&scene, 64, 64), width: 320, height: 240, bounds, light: None };
@@ -121,8 +124,10 @@ fn gpu_frames_in_flight_keep_the_vertices_of_their_step() {
         renderer.load(&scene).expect("expected the scene to load"),
     );
     let mut sharing_deformer =
-        CudaDeformer::new(&device, &scene, Some(shared_buffers(&shared_scene))).expect("expected a CUDA deformer");
-    let mut copying_deformer = CudaDeformer::new(&device, &scene, None).expect("expected a CUDA deformer");
+        CudaDeformer::new(&device, &scene, Some(shared_buffers(&shared_scene)), scene.light_axes())
+            .expect("expected a CUDA deformer");
+    let mut copying_deformer =
+        CudaDeformer::new(&device, &scene, None, scene.light_axes()).expect("expected a CUDA deformer");
     assert!(sharing_deformer.shares_buffers(), "expected shared buffers");
     // A large image, so that a frame takes longer than a step.
     let params = |bounds| FrameParams {
@@ -177,12 +182,13 @@ fn gpu_unknown_or_small_buffers_fall_back_to_copies() {
     };
     let without_tangents = GlVertexBuffers { tangents: None, ..shared_buffers(&good) };
     for buffers in [shared_buffers(&small), unknown, without_tangents] {
-        let mut deformer = CudaDeformer::new(&device, &scene, Some(buffers.clone())).expect("expected a CUDA deformer");
+        let mut deformer = CudaDeformer::new(&device, &scene, Some(buffers.clone()), scene.light_axes())
+            .expect("expected a CUDA deformer");
         assert!(!deformer.shares_buffers(), "{buffers:?}");
         assert_equals_reference("copied buffers", &scene, &scenes::random_state(&scene, 3), &mut deformer);
     }
-    let mut sharing_deformer =
-        CudaDeformer::new(&device, &scene, Some(shared_buffers(&good))).expect("expected a CUDA deformer");
+    let mut sharing_deformer = CudaDeformer::new(&device, &scene, Some(shared_buffers(&good)), scene.light_axes())
+        .expect("expected a CUDA deformer");
     assert!(sharing_deformer.shares_buffers(), "expected shared buffers after rejected ones");
     assert_equals_reference("after rejected buffers", &scene, &scenes::random_state(&scene, 3), &mut sharing_deformer);
 }

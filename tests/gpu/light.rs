@@ -38,7 +38,7 @@ fn gpu_light_bounds_equal_those_of_tile_boxes() {
         for seed in 0..3 {
             let summary = deformer.deform(&scenes::random_state(&scene, seed)).expect("expected the step to succeed");
             let (light, positions) = (
-                summary.light.expect("expected light-space bounds"),
+                summary.oriented_bounds.expect("expected light-space bounds"),
                 &deformer.surface().expect("expected a surface").positions,
             );
             let (expected, tolerance) =
@@ -49,12 +49,12 @@ fn gpu_light_bounds_equal_those_of_tile_boxes() {
         let rest_bounds = deformer
             .deform(&SceneState::rest(&scene))
             .expect("expected the step to succeed")
-            .light
+            .oriented_bounds
             .expect("expected light-space bounds");
         let moved_bounds = deformer
             .deform(&scenes::random_state(&scene, 0))
             .expect("expected the step to succeed")
-            .light
+            .oriented_bounds
             .expect("expected light-space bounds");
         assert!(
             max_excess(&rest_bounds, &moved_bounds).max(max_excess(&moved_bounds, &rest_bounds)) > 1e-3,

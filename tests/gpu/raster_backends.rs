@@ -64,8 +64,10 @@ struct StillImage {
 
 fn draw_still(scene: &Arc<Scene>, state: &SceneState, uses_cuda: bool) -> StillImage {
     let device = Device::open(0).expect("expected a CUDA device");
-    let (mut renderer, mut deformer) =
-        (Renderer::open(DevicePreference::Cuda(0)).expect("expected an OpenGL context"), CpuDeformer::new(scene));
+    let (mut renderer, mut deformer) = (
+        Renderer::open(DevicePreference::Cuda(0)).expect("expected an OpenGL context"),
+        CpuDeformer::new(scene).with_bounding_axes(scene.light_axes()),
+    );
     let summary = deformer.deform(state).expect("expected the step to succeed");
     let mut buffers = renderer.load(scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
@@ -76,7 +78,8 @@ fn draw_still(scene: &Arc<Scene>, state: &SceneState, uses_cuda: bool) -> StillI
     }
     // The near plane is far enough away that depth precision separates the surfaces.
     let camera = Camera { near: 1.0, far: 40.0, ..Camera::fit_to_scene(scene, SIZE[0], SIZE[1]) };
-    let params = FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds: summary.bounds, light: summary.light };
+    let params =
+        FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds: summary.bounds, light: summary.oriented_bounds };
     let image = renderer.draw(&buffers, &params).expect("expected a frame");
     let triangle_of =
         |id: &VisibilityId| if let VisibilityId::Triangle(index) = id { Some(*index as u32) } else { None };

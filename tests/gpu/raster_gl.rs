@@ -207,7 +207,8 @@ fn gpu_positions_shared_with_a_deformer_are_drawn() {
     let buffers = context.gl.renderer.load(&scene).expect("expected the scene to load");
     let shared = buffers.vertex_buffers().expect("expected vertex buffers");
     let positions = shared.positions.clone();
-    let mut deformer = CudaDeformer::new(&context.device, &scene, Some(shared)).expect("expected a CUDA deformer");
+    let mut deformer =
+        CudaDeformer::new(&context.device, &scene, Some(shared), scene.light_axes()).expect("expected a CUDA deformer");
     assert!(deformer.shares_buffers(), "expected shared buffers");
     let triangles = scene.triangle_vertices();
     let all = DrawRange { first: 0, triangles: triangles.len() as u32, faces: CullMode::None };

@@ -11,7 +11,7 @@ use crate::scenes::{self, NORMAL_MAPPED, Random};
 
 pub(crate) fn cuda_deformer(scene: &Arc<Scene>) -> CudaDeformer {
     let device = Device::open(0).expect("expected a CUDA device");
-    CudaDeformer::new(&device, scene, None).expect("expected a CUDA deformer")
+    CudaDeformer::new(&device, scene, None, scene.light_axes()).expect("expected a CUDA deformer")
 }
 
 #[test]

@@ -10,7 +10,7 @@ use modalcast_render::{FrameParams, shadow_texel_axes};
 
 /// Side lengths of a shadow map texel in scene units, for a deformation.
 fn texel(scene: &Scene, deformed: &DeformSummary, is_lit: bool) -> [f64; 2] {
-    let light = deformed.light.filter(|_| is_lit);
+    let light = deformed.oriented_bounds.filter(|_| is_lit);
     let shot = FrameParams {
         camera: Camera::fit_to_scene(scene, 64, 64),
         width: 64,
@@ -27,8 +27,8 @@ fn texel(scene: &Scene, deformed: &DeformSummary, is_lit: bool) -> [f64; 2] {
 fn fitted_shadow_texels_of_the_tree_have_half_the_area() {
     let scene = load::open("tree").expect("built in").scene;
     let state = SceneState::rest(&scene);
-    let exact = ReferenceDeformer::new(&scene).deform(&state).expect("deforms");
-    let tiled = CpuDeformer::new(&scene).deform(&state).expect("deforms");
+    let exact = ReferenceDeformer::new(&scene).with_bounding_axes(scene.light_axes()).deform(&state).expect("deforms");
+    let tiled = CpuDeformer::new(&scene).with_bounding_axes(scene.light_axes()).deform(&state).expect("deforms");
     let [corners, tiled, exact] =
         [texel(&scene, &exact, false), texel(&scene, &tiled, true), texel(&scene, &exact, true)];
     eprintln!("texel of the tree: {corners:?} by corners, {tiled:?} by boxes of tiles, {exact:?} by vertices");

@@ -12,7 +12,7 @@ use crate::common::{
 };
 
 fn cpu_deformer(scene: &Arc<Scene>) -> CpuDeformer {
-    CpuDeformer::new(scene)
+    CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())
 }
 
 /// Largest bound of all domains on the error from truncated modes, in scene units.

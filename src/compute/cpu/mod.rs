@@ -32,7 +32,7 @@ pub use bandwidth::read_bandwidth;
 use crate::storage::{TiledModes, Truncation};
 use changes::ChangeTracker;
 use deform::{DeformInputs, MAX_TILE_VERTICES};
-use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer};
+use modalcast_model::deform::{Backend, BoundingAxes, DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Bounds, Scene, SceneState};
 use retained_modes::RetainedModes;
@@ -46,6 +46,7 @@ const CORNER_TILE: usize = 256;
 #[derive(Debug)]
 pub struct CpuDeformer {
     scene: Arc<Scene>,
+    bounding_axes: Option<BoundingAxes>,
     /// Per shape.
     shapes: Vec<TiledModes>,
     all_chunks: Vec<u16>,
@@ -69,6 +70,7 @@ impl CpuDeformer {
         let vertex_work = WorkList::new(layout.slots.iter().map(|slot| slot.vertices), MAX_TILE_VERTICES);
         Self {
             scene: Arc::clone(scene),
+            bounding_axes: None,
             all_chunks: (0..most_chunks as u16).collect(),
             retained_modes: RetainedModes::new(scene),
             changes: ChangeTracker::default(),
@@ -84,6 +86,12 @@ impl CpuDeformer {
                 boxes: vec![Bounds::EMPTY; if scene.needs.boxes { layout.slots.len() } else { 0 }],
             },
         }
+    }
+
+    /// Also bounds the positions of every step along these axes.
+    #[must_use]
+    pub fn with_bounding_axes(self, axes: Option<BoundingAxes>) -> Self {
+        Self { bounding_axes: axes, ..self }
     }
 
     /// Bytes of stored U and x0: what a step of all domains reads if no two domains share a shape.
@@ -142,8 +150,9 @@ impl Deformer for CpuDeformer {
         } else {
             rigid_normals::rigid_normals(&self.scene, state, corners, &mut self.surface);
         }
-        let light = self.scene.light_axes().map(|axes| TileBounds::along(&self.extents, &axes));
-        Ok(DeformSummary { bounds: TileBounds::all(&self.extents), light, ms: begin.elapsed().as_secs_f64() * 1e3 })
+        let oriented_bounds = self.bounding_axes.map(|axes| TileBounds::along(&self.extents, &axes));
+        let bounds = TileBounds::all(&self.extents);
+        Ok(DeformSummary { bounds, oriented_bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
     }
 
     fn surface(&mut self) -> Result<&DeformedSurface> {

@@ -12,7 +12,7 @@ pub use deform::{deform, displacements};
 pub use normals::{exact_normals, exact_tangents};
 pub use rigid_normals::{rigid_normals, rigid_tangents};
 
-use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer};
+use modalcast_model::deform::{Backend, BoundingAxes, DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Bounds, DomainLayout, LightSpaceBox, Scene, SceneState};
 
@@ -20,13 +20,20 @@ use modalcast_model::scene::{Bounds, DomainLayout, LightSpaceBox, Scene, SceneSt
 #[derive(Debug)]
 pub struct ReferenceDeformer {
     scene: Arc<Scene>,
+    bounding_axes: Option<BoundingAxes>,
     surface: DeformedSurface,
 }
 
 impl ReferenceDeformer {
     /// Creates a deformer of one scene.
     pub fn new(scene: &Arc<Scene>) -> Self {
-        Self { scene: Arc::clone(scene), surface: DeformedSurface::default() }
+        Self { scene: Arc::clone(scene), bounding_axes: None, surface: DeformedSurface::default() }
+    }
+
+    /// Also bounds the positions of every step along these axes.
+    #[must_use]
+    pub fn with_bounding_axes(self, axes: Option<BoundingAxes>) -> Self {
+        Self { bounding_axes: axes, ..self }
     }
 
     /// Computes displacements and boxes if the scene keeps them. A displacement that overflows f32 makes the bounds
@@ -56,7 +63,7 @@ impl Deformer for ReferenceDeformer {
     fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
         let begin = Instant::now();
         let positions = deform(&self.scene, state);
-        let light = self.scene.light_axes().map(|axes| {
+        let oriented_bounds = self.bounding_axes.map(|axes| {
             let one = |position: &[f64; 3]| LightSpaceBox::enclosing(&axes, &Bounds { min: *position, max: *position });
             positions.iter().map(one).fold(LightSpaceBox::EMPTY, LightSpaceBox::union)
         });
@@ -70,7 +77,7 @@ impl Deformer for ReferenceDeformer {
         self.surface.tangents = round(tangents);
         let mut bounds = Bounds::from_positions(&self.surface.positions);
         self.compute_attributes(state, &mut bounds);
-        Ok(DeformSummary { bounds, light, ms: begin.elapsed().as_secs_f64() * 1e3 })
+        Ok(DeformSummary { bounds, oriented_bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
     }
 
     fn surface(&mut self) -> Result<&DeformedSurface> {

@@ -132,11 +132,18 @@ impl DeviceContext {
         }
         let device = match (self.device.clone(), self.info.backend) {
             (Some(device), Backend::Cuda) => device,
-            (_, Backend::Reference) => return Ok((Box::new(ReferenceDeformer::new(scene)), None)),
-            _ => return Ok((Box::new(CpuDeformer::new(scene)), None)),
+            (_, Backend::Reference) => {
+                return Ok((Box::new(ReferenceDeformer::new(scene).with_bounding_axes(scene.light_axes())), None));
+            }
+            _ => return Ok((Box::new(CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())), None)),
         };
         let buffers = self.shareable_buffers(scene)?;
-        match CudaDeformer::new(&device, scene, buffers.as_ref().map(SceneBuffers::vertex_buffers).transpose()?) {
+        match CudaDeformer::new(
+            &device,
+            scene,
+            buffers.as_ref().map(SceneBuffers::vertex_buffers).transpose()?,
+            scene.light_axes(),
+        ) {
             Ok(deformer) => Ok((Box::new(deformer), buffers)),
             Err(error) => {
                 self.unload(buffers);

@@ -84,7 +84,7 @@ impl LoadedScene {
         if !is_in_range(&deformed.bounds) {
             return Err(invalid("scene.rest", "finite vertices", format!("{:?}", deformed.bounds)));
         }
-        (self.bounds, self.light) = (deformed.bounds, deformed.light);
+        (self.bounds, self.light) = (deformed.bounds, deformed.oriented_bounds);
         Ok(())
     }
 
@@ -117,7 +117,7 @@ impl LoadedScene {
         }
         let deformed = attempt.unwrap_or_else(|panic| resume_unwind(panic))?;
         if is_in_range(&deformed.bounds) {
-            (self.bounds, self.light) = (deformed.bounds, deformed.light);
+            (self.bounds, self.light) = (deformed.bounds, deformed.oriented_bounds);
             self.current_state = Arc::clone(state);
             return Ok(deformed);
         }
@@ -287,7 +287,7 @@ mod tests {
 
     fn loaded_scene() -> LoadedScene {
         let scene = testing::two_strips();
-        let deformer = Box::new(ReferenceDeformer::new(&scene));
+        let deformer = Box::new(ReferenceDeformer::new(&scene).with_bounding_axes(scene.light_axes()));
         let mut loaded_scene = LoadedScene::new(&scene, deformer, None);
         loaded_scene.rest().expect("a scene at rest");
         loaded_scene

@@ -21,8 +21,8 @@ pub fn light_axes(to_sun: Vector3<f64>, up: UpAxis) -> [Vector3<f64>; 3] {
 }
 
 impl Scene {
-    /// The axes along which deformers compute [`LightSpaceBox`]. `None` if the look has no shadow map that is fitted to
-    /// the vertices.
+    /// The axes along which the renderer needs bounds of the vertices. `None` if the look has no shadow map that is
+    /// fitted to the vertices.
     pub fn light_axes(&self) -> Option<[Vector3<f64>; 3]> {
         let fitted = self.look.shadow.filter(|shadow| shadow.fit == ShadowFit::Vertices);
         fitted.map(|_| light_axes(self.look.to_sun(self.up), self.up))

@@ -124,7 +124,9 @@ impl BenchTarget for LocalMachine {
         }
         if let Ok(device) = &self.device {
             // A whole step as the server runs it: upload of q and T, kernels, readback of the bounds.
-            let cuda = |scene: &Arc<Scene>| -> Made { Ok(Box::new(CudaDeformer::new(device, scene, None)?)) };
+            let cuda = |scene: &Arc<Scene>| -> Made {
+                Ok(Box::new(CudaDeformer::new(device, scene, None, scene.light_axes())?))
+            };
             offers.push(driven("cuda f32 step", Backend::Cuda, plain, &cuda));
             if let Some(exact) = exact_normals(scene) {
                 offers.push(driven("cuda f32 step, exact normals", Backend::Cuda, exact, &cuda));

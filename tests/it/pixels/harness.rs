@@ -104,8 +104,9 @@ pub(super) fn draw_sized(
     camera: Camera,
     [width, height]: [u32; 2],
 ) -> Picture {
-    let mut deformer = ReferenceDeformer::new(scene);
-    let DeformSummary { bounds, light, .. } = deformer.deform(&SceneState::rest(scene)).expect("deforms");
+    let mut deformer = ReferenceDeformer::new(scene).with_bounding_axes(scene.light_axes());
+    let DeformSummary { bounds, oriented_bounds: light, .. } =
+        deformer.deform(&SceneState::rest(scene)).expect("deforms");
     let buffers = renderer.load(scene).expect("loads");
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
     let shot = FrameParams { camera, width, height, bounds, light };

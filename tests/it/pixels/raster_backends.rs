@@ -297,7 +297,7 @@ fn opengl_draws_what_the_compute_rasterizer_cannot() {
 #[test]
 fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     let scene = yard(Some(ShadowSettings { size: 256, ..ShadowSettings::default() }), 1).scene();
-    let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene));
+    let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene).with_bounding_axes(scene.light_axes()));
     let deformed = deformer.deform(&SceneState::rest(&scene)).expect("deforms");
     let mut buffers = renderer.load(&scene).expect("loads");
     renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
@@ -305,7 +305,13 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     let shot = |eye: [f64; 3]| {
         let view = View::LookAt { eye, target: [0.0, 0.2, 0.0], up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, ..from_above() };
-        FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds: deformed.bounds, light: deformed.light }
+        FrameParams {
+            camera,
+            width: SIZE[0],
+            height: SIZE[1],
+            bounds: deformed.bounds,
+            light: deformed.oriented_bounds,
+        }
     };
     let (one, other) = (shot([1.4, 1.9, 4.0]), shot([-2.0, 1.2, 3.0]));
     let alone = renderer.draw(&buffers, &other).expect("draws");

@@ -26,7 +26,9 @@ use crate::gpu::tables::change_list::{ChangeListLengths, ChangedDomains, max_cha
 use crate::gpu::tables::device_tables::DeviceTables;
 use crate::gpu::tables::layout::Header;
 use crate::gpu::tables::plan::{BufferRole, DeformPlan, plan_from_tables};
-use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
+use modalcast_model::deform::{
+    Backend, BoundingAxes, DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback,
+};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::raster::GlVertexBuffers;
 use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
@@ -61,12 +63,18 @@ pub struct CudaDeformer {
 }
 
 impl CudaDeformer {
-    /// Packs a scene onto the device. With `gl`, steps write directly into those buffers when the driver allows it.
+    /// Packs a scene onto the device. With `gl`, steps write directly into those buffers when the driver allows it. With
+    /// `bounding_axes`, every step also bounds the positions along them.
     ///
     /// # Errors
     /// `Fault` when the device refuses; `Unavailable` when NVRTC is missing or the device's memory is too small.
-    pub fn new(device: &Arc<Device>, scene: &Arc<Scene>, gl: Option<GlVertexBuffers>) -> Result<Self> {
-        let tables = DeviceTables::new(scene);
+    pub fn new(
+        device: &Arc<Device>,
+        scene: &Arc<Scene>,
+        gl: Option<GlVertexBuffers>,
+        bounding_axes: Option<BoundingAxes>,
+    ) -> Result<Self> {
+        let tables = DeviceTables::new(scene, bounding_axes);
         let plan = plan_from_tables(scene, &tables);
         let _current = device.enter()?;
         check_memory(device, &plan)?;
@@ -77,7 +85,7 @@ impl CudaDeformer {
         let deform = DeformKernel::new(device, scene, kernels, tables)?;
         let apply = plan.kernel(KernelKind::Apply);
         let kernels = StepKernels {
-            bounds: BoundsKernel::new(device, scene, plan.require_kernel(KernelKind::Bounds)?, &deform)?,
+            bounds: BoundsKernel::new(device, plan.require_kernel(KernelKind::Bounds)?, bounding_axes, &deform)?,
             normals,
             apply: apply.map(|apply| ApplyKernel::new(device, deform.packing(), apply)).transpose()?,
             deform,
@@ -150,10 +158,10 @@ impl CudaDeformer {
     pub fn finish(&mut self) -> Result<DeformSummary> {
         let none = || Error::Fault { stage: "deform", reason: "no step is under way".into() };
         let (step_slot, begin) = self.in_flight.pop_front().ok_or_else(none)?;
-        let (bounds, light) = self.step_slots[step_slot].wait().inspect_err(|_| self.invalidate())?;
+        let (bounds, oriented_bounds) = self.step_slots[step_slot].wait().inspect_err(|_| self.invalidate())?;
         let whole = begin.elapsed().as_secs_f64() * 1e3;
         let own = self.step_slots[step_slot].device_ms().inspect_err(|_| self.invalidate())?;
-        Ok(DeformSummary { bounds, light, ms: own.unwrap_or(whole) })
+        Ok(DeformSummary { bounds, oriented_bounds, ms: own.unwrap_or(whole) })
     }
 
     /// Starts the graph of the last full step again, to measure the graph alone.

@@ -7,6 +7,7 @@ use super::layout::{BoxSegment, NormalSlot, TransformLink};
 use super::normal_tables;
 use super::rings::{self, RingTables};
 use super::work::{CoordinateLayout, WorkList, rest_directions, rest_positions};
+use modalcast_model::deform::BoundingAxes;
 use modalcast_model::scene::Scene;
 
 /// The constant tables of a scene, built once for the plan and the upload. U itself is packed during its upload, because
@@ -29,15 +30,18 @@ pub struct DeviceTables {
     pub(crate) inputs: InputSizes,
     /// Number of entries of the tile list of a partial step; 0 for a scene whose steps are always full.
     pub(crate) listed_tiles: usize,
+    /// Axes along which `bounds` reduces the boxes in addition to the world's axes.
+    pub(crate) bounding_axes: Option<BoundingAxes>,
 }
 
 impl DeviceTables {
     /// Builds the tables of a scene.
-    pub fn new(scene: &Scene) -> Self {
+    pub fn new(scene: &Scene, bounding_axes: Option<BoundingAxes>) -> Self {
         let coordinates = CoordinateLayout::new(scene);
         let work = WorkList::new(scene, &coordinates);
         let [rest_normals, rest_tangents] = rest_directions(scene, &work);
         Self {
+            bounding_axes,
             segments: box_segments::segments(scene, &work),
             rest: rest_positions(scene, &work),
             rest_normals,

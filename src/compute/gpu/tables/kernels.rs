@@ -1,7 +1,8 @@
 //! The kernels of a step: their sources, and the macros and grids that a scene needs. Pure.
 
 use super::change_list::max_change_entries;
-use super::layout::{BLOCK, BoxSegment};
+use super::device_tables::DeviceTables;
+use super::layout::BLOCK;
 use super::work::batches::{BatchTables, MAX_BATCH_SIZE};
 use super::work::{WorkList, has_rigid_normals};
 use crate::gpu::launch::{KernelDescriptor, KernelKind, KernelSource, KernelText};
@@ -88,8 +89,8 @@ pub(crate) fn deform_blocks(kernel: &KernelDescriptor, tiles: usize) -> u32 {
 }
 
 /// The kernels of a scene in launch order, except `apply`, which is last.
-pub(crate) fn kernels(scene: &Scene, work: &WorkList, segments: &[BoxSegment]) -> Vec<KernelDescriptor> {
-    let needs = scene.needs;
+pub(crate) fn kernels(scene: &Scene, tables: &DeviceTables) -> Vec<KernelDescriptor> {
+    let (needs, work, segments) = (scene.needs, &tables.work, &tables.segments);
     let [deform, batch, bounds, apply, normals] = KERNELS;
     let defines = deform_defines(scene, work);
     let threads = block_threads(&defines);
@@ -102,7 +103,7 @@ pub(crate) fn kernels(scene: &Scene, work: &WorkList, segments: &[BoxSegment]) -
             ("NORMAL_MAPS", needs.normal_maps),
             ("SHEAR", needs.shear),
             ("FOLLOWERS", needs.followers),
-            ("LIGHT_BOUNDS", scene.light_axes().is_some()),
+            ("LIGHT_BOUNDS", tables.bounding_axes.is_some()),
             ("DOMAIN_BOXES", needs.boxes),
         ];
         let on = defines.iter().filter(|(name, on)| *on && kernel.features.contains(name));

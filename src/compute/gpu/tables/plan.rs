@@ -11,6 +11,7 @@ use super::normal_tables;
 use super::rings::possible_corner_group_bytes;
 use super::work::batches::BatchTables;
 use crate::gpu::launch::{KernelDescriptor, KernelKind};
+use modalcast_model::deform::BoundingAxes;
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::Scene;
 
@@ -93,9 +94,9 @@ pub struct DeformPlan {
     pub omitted: Vec<OmittedFeature>,
 }
 
-/// The plan of a scene.
-pub fn plan(scene: &Scene) -> DeformPlan {
-    plan_from_tables(scene, &DeviceTables::new(scene))
+/// The plan of a scene, for a deformer that also bounds the positions along `bounding_axes`.
+pub fn plan(scene: &Scene, bounding_axes: Option<BoundingAxes>) -> DeformPlan {
+    plan_from_tables(scene, &DeviceTables::new(scene, bounding_axes))
 }
 
 /// The plan of a scene from existing tables.
@@ -105,10 +106,10 @@ pub fn plan_from_tables(scene: &Scene, tables: &DeviceTables) -> DeformPlan {
         entries => ChangeListLayout::new(entries, tables.coordinates.total, tables.work.tiles.len()).bytes(),
     };
     DeformPlan {
-        kernels: kernels(scene, &tables.work, &tables.segments),
+        kernels: kernels(scene, tables),
         buffers: buffers(scene, tables),
         bytes_in: tables.inputs.total(),
-        bytes_out: if scene.light_axes().is_some() { 48 } else { 24 },
+        bytes_out: if tables.bounding_axes.is_some() { 48 } else { 24 },
         change_list_bytes: changes,
         omitted: omitted(scene, tables),
     }
@@ -193,7 +194,7 @@ fn omitted(scene: &Scene, tables: &DeviceTables) -> Vec<OmittedFeature> {
         (needs.compensated, feature("compensated", "the compensation in `deform`", 0)),
         (needs.followers, feature("followers", "frames, and products of transforms", 0)),
         (needs.displacements, feature("displacements", "u as an output of `deform`", 12 * layout.vertices as u64)),
-        (scene.light_axes().is_some(), feature("shadows", "bounds in light space", 0)),
+        (tables.bounding_axes.is_some(), feature("shadows", "bounds in light space", 0)),
         (needs.boxes, feature("boxes", "a box of each domain in `bounds`", boxes)),
         (is_batched, feature("batches", "`batch`, and groups of domains", 0)),
     ];

@@ -89,7 +89,7 @@ impl DeformerBenchmark {
         states: &[SceneState],
         (extent, changed): (StepOutputs, Option<&[u32]>),
     ) -> Result<Self> {
-        let tables = DeviceTables::new(scene);
+        let tables = DeviceTables::new(scene, scene.light_axes());
         let plan = plan_from_tables(scene, &tables);
         if extent == StepOutputs::Uq && plan.kernel(KernelKind::Batch).is_some() {
             return Err(invalid("deform.batches", "never, where u alone is computed", "batches"));
@@ -105,7 +105,7 @@ impl DeformerBenchmark {
             name: format!("ours_{}{}", scene.deformation.storage.name(), extent.suffix()),
             extent,
             scene: Arc::clone(scene),
-            bounds: BoundsKernel::new(device, scene, plan.require_kernel(KernelKind::Bounds)?, &deform)?,
+            bounds: BoundsKernel::new(device, plan.require_kernel(KernelKind::Bounds)?, scene.light_axes(), &deform)?,
             normals,
             listed: changed.is_some(),
             inputs: Vec::new(),

@@ -69,7 +69,7 @@ pub fn overlap(device: &Arc<Device>, scene: &Arc<Scene>, states: &[SceneState], 
     if states.is_empty() || steps == 0 {
         return Err(invalid("states and steps", "at least 1", format!("{} and {steps}", states.len())));
     }
-    let mut deformer = CudaDeformer::new(device, scene, None)?;
+    let mut deformer = CudaDeformer::new(device, scene, None, scene.light_axes())?;
     let differing = differing(&mut deformer, states, steps)?;
     let mut times = [Vec::new(), Vec::new(), Vec::new()];
     for _ in 0..ROUNDS {

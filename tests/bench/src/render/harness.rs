@@ -58,7 +58,8 @@ impl RenderHarness {
 
     /// Loads a scene.
     pub(super) fn set(&mut self, scene: &Arc<Scene>) -> Result<HarnessScene> {
-        let (buffers, deformer) = (self.renderer.load(scene)?, CpuDeformer::new(scene));
+        let (buffers, deformer) =
+            (self.renderer.load(scene)?, CpuDeformer::new(scene).with_bounding_axes(scene.light_axes()));
         Ok(HarnessScene { scene: Arc::clone(scene), buffers, deformer, bounds: Bounds::EMPTY, light: None })
     }
 
@@ -94,7 +95,7 @@ impl RenderHarness {
     /// Deforms the scene to a state and uploads the vertices.
     pub(super) fn pose(&mut self, set: &mut HarnessScene, state: &SceneState) -> Result<()> {
         let deformed = set.deformer.deform(state)?;
-        (set.bounds, set.light) = (deformed.bounds, deformed.light);
+        (set.bounds, set.light) = (deformed.bounds, deformed.oriented_bounds);
         self.renderer.upload(&set.buffers, set.deformer.surface()?)
     }
 

@@ -121,12 +121,16 @@ fn states(load: &Workload) -> Vec<SceneState> {
 fn rig(studio: &mut RenderHarness, device: Option<&Arc<Device>>, scene: &Arc<Scene>) -> Result<PlantSetup> {
     let buffers = studio.renderer.load(scene)?;
     let Some(device) = device else {
-        return Ok(PlantSetup { deformer: Box::new(CpuDeformer::new(scene)), bytes: 0, buffers });
+        return Ok(PlantSetup {
+            deformer: Box::new(CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())),
+            bytes: 0,
+            buffers,
+        });
     };
     let draws = studio.renderer.info().cuda_device.map(|ordinal| usize::try_from(ordinal).ok());
     let is_shared = draws == Some(Some(device.ordinal()));
     let gl = if is_shared { Some(buffers.vertex_buffers()?) } else { None };
-    let deformer = CudaDeformer::new(device, scene, gl)?;
+    let deformer = CudaDeformer::new(device, scene, gl, scene.light_axes())?;
     Ok(PlantSetup { bytes: beside(deformer.plan(), deformer.shares_buffers()), deformer: Box::new(deformer), buffers })
 }
 
@@ -171,7 +175,7 @@ fn frame(
 ) -> Result<[f64; 5]> {
     let us = |begin: Instant| begin.elapsed().as_secs_f64() * 1e6;
     let whole = Instant::now();
-    let DeformSummary { bounds, light, .. } = rig.deformer.deform(state)?;
+    let DeformSummary { bounds, oriented_bounds: light, .. } = rig.deformer.deform(state)?;
     let deform = us(whole);
     let begin = Instant::now();
     let mut upload = 0.0;
@@ -217,7 +221,7 @@ mod tests {
     #[test]
     fn shared_output_buffers_count_once() {
         let scene = WorkloadKind::Plant(0).build(Scale::Quick).expect("built").scene;
-        let plan = gpu::plan(&scene);
+        let plan = gpu::plan(&scene, scene.light_axes());
         let outputs = 12 * (scene.layout.vertices + scene.layout.corners) as u64;
         assert_eq!(beside(&plan, false) - beside(&plan, true), outputs);
     }

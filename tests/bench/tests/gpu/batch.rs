@@ -148,7 +148,7 @@ fn gpu_auto_mode_batches_where_it_is_faster() {
                 time(&device, &ours, CacheState::Warm, 100).expect("times").median_us
             };
             let [batch, alone] = [&together, &apart].map(measured);
-            let chooses = modalcast_compute::gpu::plan(&chosen).kernel(KernelKind::Batch).is_some();
+            let chooses = modalcast_compute::gpu::plan(&chosen, None).kernel(KernelKind::Batch).is_some();
             eprintln!("n {vertices} r {rank} x {count}: {batch:.1} us batched, {alone:.1} apart, chosen {chooses}");
             let (own, other) = if chooses { (batch, alone) } else { (alone, batch) };
             if own > 1.5 * other + 2.0 {

@@ -223,14 +223,14 @@ mod tests {
     #[test]
     fn a_scene_compiles_batches_when_it_has_any_and_for_as_many_vectors_as_it_needs() {
         let defines = |instances: usize| {
-            let plan = plan(&ensemble(StorageType::F16, &[(261, 12)], instances).0);
+            let plan = plan(&ensemble(StorageType::F16, &[(261, 12)], instances).0, None);
             let kernel = plan.kernel(KernelKind::Batch).expect("a batch").clone();
             (kernel.defines.join(" "), kernel.blocks)
         };
         assert_eq!(defines(2), ("STORE_F16 BATCH_4".into(), 3));
         assert_eq!(defines(8), ("STORE_F16 BATCH_8".into(), 3));
         assert_eq!(defines(17), ("STORE_F16".into(), 6));
-        let none = plan(&corners_match(&[(261, 12)]));
+        let none = plan(&corners_match(&[(261, 12)]), None);
         assert!(none.kernel(KernelKind::Batch).is_none(), "too few to pay");
         assert_eq!(none.bytes(BufferRole::Batches), 0);
     }

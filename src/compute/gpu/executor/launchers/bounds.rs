@@ -2,7 +2,6 @@
 //! the bounds in light space if the scene has a shadow, and the box of each domain if the scene keeps boxes.
 
 use cudarc::driver::{CudaFunction, LaunchConfig};
-use nalgebra::Vector3;
 
 use super::deform::DeformKernel;
 use super::domain_boxes::DomainBoxes;
@@ -10,16 +9,16 @@ use crate::gpu::executor::inputs::StepInputs;
 use crate::gpu::launch::{Device, KernelDescriptor, LaunchOrder, launch_kernel};
 use crate::gpu::tables::box_keys::axes_to_f32;
 use crate::gpu::tables::layout::BoundsArgs;
+use modalcast_model::deform::BoundingAxes;
 use modalcast_model::error::Result;
-use modalcast_model::scene::Scene;
 
 /// The kernel and its buffers.
 #[derive(Debug)]
 pub struct BoundsKernel {
     function: CudaFunction,
     config: LaunchConfig,
-    /// The axes of light space, if the scene has a shadow.
-    light: Option<[Vector3<f64>; 3]>,
+    /// Axes of the second box of the result; none without it.
+    axes: Option<BoundingAxes>,
     /// Only in a scene that keeps boxes.
     pub(crate) boxes: Option<DomainBoxes>,
 }
@@ -29,11 +28,16 @@ impl BoundsKernel {
     ///
     /// # Errors
     /// As [`Device::function`]; `Fault` when the device has not enough memory.
-    pub fn new(device: &Device, scene: &Scene, kernel: &KernelDescriptor, deform: &DeformKernel) -> Result<Self> {
+    pub fn new(
+        device: &Device,
+        kernel: &KernelDescriptor,
+        axes: Option<BoundingAxes>,
+        deform: &DeformKernel,
+    ) -> Result<Self> {
         Ok(Self {
             function: kernel.compile(device)?,
             config: kernel.config(),
-            light: scene.light_axes(),
+            axes,
             boxes: deform.segments().map(|segments| DomainBoxes::new(device, segments)).transpose()?,
         })
     }
@@ -43,9 +47,9 @@ impl BoundsKernel {
         &self.function
     }
 
-    /// Words of the result: keys of one box, or of two in a scene with a shadow.
+    /// Words of the result: keys of one box, or of two with axes.
     pub(crate) const fn words(&self) -> usize {
-        if self.light.is_some() { 12 } else { 6 }
+        if self.axes.is_some() { 12 } else { 6 }
     }
 
     /// Starts the kernel on the boxes of `deform`; it writes its result into the header among the values of `inputs`.
@@ -67,7 +71,7 @@ impl BoundsKernel {
             segment_boxes: domains.boxes,
             count: warp_boxes.count,
             segment_count: domains.count,
-            light: axes_to_f32(self.light),
+            light: axes_to_f32(self.axes),
             reserved: 0,
         };
         // SAFETY: the kernel's only argument is a `BoundsArgs`; `boxes` has six words for each of `count`, as

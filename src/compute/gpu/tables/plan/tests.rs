@@ -7,6 +7,11 @@ use super::super::work::{CoordinateLayout, WorkList};
 use super::*;
 use modalcast_model::scene::{DeformationSettings, StorageType};
 
+/// The plan for a deformer that bounds the positions along the axes of the scene's shadow, if it has one.
+fn plan(scene: &Scene) -> DeformPlan {
+    super::plan(scene, scene.light_axes())
+}
+
 fn defines(plan: &DeformPlan) -> Vec<(&str, Vec<&str>)> {
     plan.kernels.iter().map(|kernel| (kernel.name, kernel.defines.clone())).collect()
 }
@@ -83,7 +88,7 @@ fn exact_normals_come_behind_the_positions_and_their_tables_are_planned() {
         assert_eq!(plan.bytes(role), bytes as u64, "{role:?}");
     }
     assert_eq!(plan.bytes(BufferRole::CornerGroups), 4 * (9 + 515), "the shape without modes has no groups");
-    let rigid = super::plan(&stored(&[(7, 2), (300, 0), (513, 4)], StorageType::F32));
+    let rigid = super::plan(&stored(&[(7, 2), (300, 0), (513, 4)], StorageType::F32), None);
     assert_eq!(
         rigid.bytes(BufferRole::CornerGroups)
             + rigid.bytes(BufferRole::RingTables)
