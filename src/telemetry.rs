@@ -17,24 +17,6 @@ pub enum Stage {
 }
 
 impl Stage {
-    /// All stages in processing order.
-    pub const ALL: [Self; 9] = [
-        Self::Parse,
-        Self::Queue,
-        Self::Deform,
-        Self::Upload,
-        Self::Shadow,
-        Self::Draw,
-        Self::Read,
-        Self::Encode,
-        Self::Copy,
-    ];
-
-    /// The stage with this name.
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|stage| stage.name() == name)
-    }
-
     /// Name of the stage in logs and replies.
     pub const fn name(self) -> &'static str {
         match self {
@@ -70,17 +52,4 @@ pub fn init_logging() {
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(colors);
     // Fails only if a logger is already installed, which is kept.
     log.try_init().ok();
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_stage_is_found_by_its_name_and_nothing_else_is() {
-        for stage in Stage::ALL {
-            assert_eq!(Stage::from_name(stage.name()), Some(stage));
-        }
-        assert_eq!(Stage::from_name("lunch"), None);
-    }
 }

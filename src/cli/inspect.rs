@@ -11,7 +11,7 @@ use modalcast_model::backend_settings::LookTable;
 use modalcast_model::error::fault_in;
 use modalcast_model::load::{self, OpenedScene};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneFeatures, UpAxis};
-use modalcast_render::RenderPlan;
+use modalcast_render::{Pass, RenderPlan};
 
 /// Number of domains that the text table lists; `--json` lists all.
 const MAX_LISTED_DOMAINS: usize = 24;
@@ -172,6 +172,10 @@ fn lines(scene: &Scene) -> Vec<String> {
 }
 
 /// The kernels, passes and memory that the deformer and the renderer plan for the scene, and the parts that they omit.
+fn pass_names(passes: &[Pass]) -> Vec<&str> {
+    passes.iter().map(|pass| pass.name()).collect()
+}
+
 fn plans(scene: &Scene) -> Vec<String> {
     let (deform, render) = (gpu::plan(scene, scene.light_axes()), modalcast_render::plan(scene));
     let kernels: Vec<String> =
@@ -180,7 +184,7 @@ fn plans(scene: &Scene) -> Vec<String> {
         format!("kernels: {}; {} launches a step", kernels.join(", "), deform.launches()),
         format!(
             "passes: {}; {} draw calls; shaders [{}]",
-            render.passes.join(", "),
+            pass_names(&render.passes).join(", "),
             render.draw_calls,
             render.defines.join(" ")
         ),
@@ -190,7 +194,7 @@ fn plans(scene: &Scene) -> Vec<String> {
         lines.push(format!("left out of deforming, {}: {}; saved {} bytes", part.feature, part.what, part.bytes));
     }
     for part in &render.omitted {
-        let passes = if part.passes.is_empty() { "no pass".into() } else { part.passes.join(" and ") };
+        let passes = if part.passes.is_empty() { "no pass".into() } else { pass_names(&part.passes).join(" and ") };
         lines.push(format!(
             "left out of rendering, {}: {}; saved {} bytes and {passes}",
             part.feature, part.shaders, part.bytes

@@ -1,5 +1,6 @@
 //! Values that the renderer takes and returns. They refer to no device.
 
+use crate::pass::{FrameTimes, Pass};
 use modalcast_model::scene::{Bounds, Camera, LightSpaceBox};
 
 /// Preference for the EGL device that draws.
@@ -48,11 +49,7 @@ pub struct FrameImage {
     pub width: u32,
     pub height: u32,
     pub rgba: Vec<u8>,
-    /// Milliseconds by name. The stages are "shadow", "draw" and "read". "raster" (the compute rasterizer, including
-    /// the visibility when it draws both) and "blur" are part of the shadow stage. "ids" (the compute rasterizer when
-    /// it draws visibility only), "cull" (with the occluders), "visibility" (with the ground), "blended" (with the
-    /// fragment lists), "shade" (with the backdrop), "bloom" and "encode" are part of the draw stage.
-    pub passes: Vec<(&'static str, f64)>,
+    pub times: FrameTimes,
     pub raster_backends: RasterBackends,
 }
 
@@ -61,7 +58,7 @@ pub struct FrameImage {
 pub struct FrameStats {
     /// Passes in execution order. When several frames of one step share a shadow, only the first of them has "shadow"
     /// and "blur"; see [`crate::SceneBuffers::set_step`].
-    pub passes: Vec<&'static str>,
+    pub passes: Vec<Pass>,
     /// The rasterizer that drew the shadow map and the visibility.
     pub raster_backends: RasterBackends,
     /// Number of draw calls of the visibility and blended passes.

@@ -205,7 +205,7 @@ fn gpu_positions_shared_with_a_deformer_are_drawn() {
     let mut context = GpuContext::open();
     let scene = scenes::random_scene(&[(3000, 12), (50, 0), (7, 3)], 5, true, false);
     let buffers = context.gl.renderer.load(&scene).expect("expected the scene to load");
-    let shared = buffers.vertex_buffers().expect("expected vertex buffers");
+    let shared = buffers.vertex_buffers();
     let positions = shared.positions.clone();
     let mut deformer =
         CudaDeformer::new(&context.device, &scene, Some(shared), scene.light_axes()).expect("expected a CUDA deformer");

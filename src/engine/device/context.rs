@@ -7,7 +7,7 @@ use super::loaded_scene::LoadedScene;
 use crate::config::{BackendChoice, Config, RendererChoice};
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
-use crate::telemetry::{Stage, ms_since};
+use crate::telemetry::ms_since;
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{self, CudaDeformer, CudaRasterizer};
 use modalcast_compute::reference::ReferenceDeformer;
@@ -138,12 +138,8 @@ impl DeviceContext {
             _ => return Ok((Box::new(CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())), None)),
         };
         let buffers = self.shareable_buffers(scene)?;
-        match CudaDeformer::new(
-            &device,
-            scene,
-            buffers.as_ref().map(SceneBuffers::vertex_buffers).transpose()?,
-            scene.light_axes(),
-        ) {
+        match CudaDeformer::new(&device, scene, buffers.as_ref().map(SceneBuffers::vertex_buffers), scene.light_axes())
+        {
             Ok(deformer) => Ok((Box::new(deformer), buffers)),
             Err(error) => {
                 self.unload(buffers);
@@ -219,7 +215,7 @@ impl DeviceContext {
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
         let pixels = renderer.map_pixels(drawing.ticket)?;
         Ok(match drawing.upload_ms {
-            Some(ms) => pixels.with_stage(Stage::Upload.name(), ms),
+            Some(ms) => pixels.with_upload_time(ms),
             None => pixels,
         })
     }

@@ -127,8 +127,13 @@ pub(in crate::engine) mod tests {
     pub(in crate::engine) fn noise(number: u64, side: u32) -> StepOutput {
         let mut random = fastrand::Rng::with_seed(number);
         let rgba = (0..side * side).flat_map(|_| [random.u8(..), random.u8(..), random.u8(..), 255]).collect();
-        let image =
-            FrameImage { width: side, height: side, rgba, passes: vec![], raster_backends: RasterBackends::default() };
+        let image = FrameImage {
+            width: side,
+            height: side,
+            rgba,
+            times: modalcast_render::FrameTimes::default(),
+            raster_backends: RasterBackends::default(),
+        };
         let step = StepId { run: 1, number, time: 0.0 };
         StepOutput { step, skipped: 0, stages: vec![], origins: None, body: OutputBody::Frame(Arc::new(image.into())) }
     }

@@ -7,7 +7,7 @@ use crate::frame::Legend;
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize, PixelRect, SceneState};
-use modalcast_render::{AovImage, PickHit};
+use modalcast_render::{AovImage, FrameTimes, PickHit, RenderStage, TimeKey};
 
 /// The result that a subscriber requests of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -96,9 +96,14 @@ pub struct ModalHit {
     pub modes: Vec<f32>,
 }
 
-/// The passes of a frame that are stages. The renderer's pass "encode" converts linear light to sRGB bytes and is not
-/// [`Stage::Encode`], which is the PNG encoding.
-pub(in crate::engine) fn stage_times_of_passes(passes: &[(&'static str, f64)]) -> StageTimes {
-    let stage = |name: &str| Stage::from_name(name).filter(|stage| *stage != Stage::Encode);
-    passes.iter().filter_map(|(name, ms)| Some((stage(name)?, *ms))).collect()
+/// The times of a frame's stages, without those of its passes.
+pub(in crate::engine) fn stage_times(times: &FrameTimes) -> StageTimes {
+    let stage = |key: TimeKey| match key {
+        TimeKey::Stage(RenderStage::Upload) => Some(Stage::Upload),
+        TimeKey::Stage(RenderStage::Shadow) => Some(Stage::Shadow),
+        TimeKey::Stage(RenderStage::Draw) => Some(Stage::Draw),
+        TimeKey::Stage(RenderStage::Read) => Some(Stage::Read),
+        TimeKey::Pass(_) => None,
+    };
+    times.iter().filter_map(|(key, ms)| Some((stage(key)?, ms))).collect()
 }

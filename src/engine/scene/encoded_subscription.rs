@@ -167,7 +167,7 @@ mod tests {
                 width: 1,
                 height: 1,
                 rgba: vec![0; IN_FLIGHT_BYTES],
-                passes: vec![],
+                times: modalcast_render::FrameTimes::default(),
                 raster_backends: modalcast_render::RasterBackends::default(),
             };
             output.body = OutputBody::Frame(Arc::new(image.into()));

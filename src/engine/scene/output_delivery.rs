@@ -14,7 +14,7 @@ use crate::config::Config;
 use crate::engine::device::command::SceneId;
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
 use crate::engine::output::pick_result::with_transforms;
-use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, StepOutput, stage_times_of_passes};
+use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, StepOutput, stage_times};
 use crate::telemetry::Stage;
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Error, Result};
@@ -351,12 +351,12 @@ impl OutputProducer {
         let body = match *spec {
             OutputSpec::Frame { camera, size, frame_output: FrameOutput::Color } => {
                 let image = device.begin_draw(id, camera, size).wait().await?;
-                stages.extend(stage_times_of_passes(&image.passes));
+                stages.extend(stage_times(&image.times));
                 OutputBody::Frame(Arc::new(image.into()))
             }
             OutputSpec::Frame { camera, size, frame_output } => {
                 let (aov, legend) = device.render_aov(id, camera, size, frame_output).await?;
-                stages.extend(stage_times_of_passes(&aov.passes));
+                stages.extend(stage_times(&aov.times));
                 OutputBody::Aov(aov, legend)
             }
             OutputSpec::Pick { camera, picture, rectangle } => {
@@ -463,7 +463,7 @@ mod tests {
                 width,
                 height: 8,
                 rgba: vec![],
-                passes: vec![],
+                times: modalcast_render::FrameTimes::default(),
                 raster_backends: RasterBackends::default(),
             }))
             .expect("somebody waits");

@@ -28,7 +28,7 @@ use super::step_queue::CompletedStep;
 use super::subscriber::{SendPermit, Subscriber};
 use crate::engine::device::command::TimedVertices;
 use crate::engine::device::handle::PendingReply;
-use crate::engine::output::step_output::{OutputBody, OutputSpec, StepId, StepOutput, stage_times_of_passes};
+use crate::engine::output::step_output::{OutputBody, OutputSpec, StepId, StepOutput, stage_times};
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::error::Result;
 use modalcast_model::scene::FloatingOrigins;
@@ -50,7 +50,7 @@ impl Readback {
             }
             Self::Frame(_, drawing) => {
                 let image = drawing.recv().await?;
-                let stages = stage_times_of_passes(&image.passes);
+                let stages = stage_times(&image.times);
                 Ok((OutputBody::Frame(Arc::new(image.into())), stages))
             }
         }

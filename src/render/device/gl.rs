@@ -10,6 +10,7 @@
 //! Object names stay private. Other APIs get a [`GlBuffer`](modalcast_model::raster::GlBuffer), which keeps the buffer
 //! alive.
 
+mod barrier;
 mod clear;
 mod debug;
 mod fence;
@@ -27,6 +28,7 @@ use std::rc::Rc;
 
 use glow::HasContext as _;
 
+pub(crate) use self::barrier::MemoryBarriers;
 pub(crate) use self::clear::{ClearOp, VisibilityDirty};
 pub(crate) use self::debug::is_enabled as is_debug_enabled;
 pub(crate) use self::fence::Fence;
@@ -522,14 +524,12 @@ impl Gl {
         }
     }
 
-    /// Runs the bound compute program, followed by a barrier that makes its writes visible to later commands.
+    /// Runs the bound compute program. Its writes are visible to later accesses only after a [`Self::barrier`] of their
+    /// kind.
     pub(crate) fn dispatch(&self, groups_x: u32, groups_y: u32) {
         let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: the shaders check their own bounds.
-        unsafe {
-            gl.dispatch_compute(groups_x, groups_y, 1);
-            gl.memory_barrier(glow::ALL_BARRIER_BITS);
-        }
+        unsafe { gl.dispatch_compute(groups_x, groups_y, 1) }
     }
 
     /// Like [`Self::dispatch`]; the first three words of a buffer give the number of workgroups.
@@ -539,7 +539,6 @@ impl Gl {
         unsafe {
             gl.bind_buffer(glow::DISPATCH_INDIRECT_BUFFER, Some(groups.name()));
             gl.dispatch_compute_indirect(0);
-            gl.memory_barrier(glow::ALL_BARRIER_BITS);
         }
     }
 

@@ -1,18 +1,14 @@
-//! Shader sources of exact transparency: gather, tally, place and resolve.
+//! Shader sources of exact transparency: gather, histogram, allocate and resolve.
 
 use std::fmt::Write as _;
 
 use super::{
-    BARYCENTRICS, CLIP, FRAME, OIT_LISTS, PHONG, ProgramSource, ShaderOptions, TILE, TILE_ROW, TRIANGLE_ID,
-    TRIANGLE_SHADING, UvDerivatives, vertex_and_fragment,
+    BARYCENTRICS, CLIP, FRAME, OIT_LISTS, PHONG, ProgramSource, ShaderOptions, TRIANGLE_ID, TRIANGLE_SHADING,
+    UvDerivatives, VERSION, vertex_and_fragment,
 };
-use crate::device::gl;
-use crate::geometry::BlendMode;
-
-/// Side of the square of pixels whose fragments a workgroup counts.
-pub(crate) const HISTOGRAM_TILE: u32 = 16;
-/// Bins of the histogram over fragments per pixel; the last bin also counts pixels with more fragments.
-pub(crate) const BINS: usize = 256;
+use crate::layout::oit::{BINS, HISTOGRAM_TILE};
+use crate::layout::{TILE, TILE_ROW};
+use crate::scene_data::geometry::BlendMode;
 
 impl ShaderOptions {
     /// Counts the blended fragments of each pixel, and adds them to the lists.
@@ -47,22 +43,22 @@ impl ShaderOptions {
         ]
         .concat();
         text += include_str!("../../../shaders/oit_resolve.comp");
-        ProgramSource { label: format!("oit resolve, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
+        ProgramSource::compute(format!("oit resolve, {samples} samples"), text)
     }
 }
 
 /// Builds the histogram of fragments per pixel.
 pub(crate) fn histogram() -> ProgramSource {
-    let head = format!("#version 430 core\n#define TILE_SIDE {HISTOGRAM_TILE}\n{}", bins());
+    let head = format!("{VERSION}#define TILE_SIDE {HISTOGRAM_TILE}\n{}", bins());
     let text = [&head, OIT_LISTS, include_str!("../../../shaders/oit_histogram.comp")].concat();
-    ProgramSource { label: "oit histogram".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
+    ProgramSource::compute("oit histogram", text)
 }
 
 /// Allocates the list of each pixel.
-pub(crate) fn oit_allocate() -> ProgramSource {
-    let head = format!("#version 430 core\n{}{}", tiles(), bins());
+pub(crate) fn allocate() -> ProgramSource {
+    let head = format!("{VERSION}{}{}", tiles(), bins());
     let text = [&head, OIT_LISTS, include_str!("../../../shaders/oit_allocate.comp")].concat();
-    ProgramSource { label: "oit allocate".into(), stages: vec![(gl::COMPUTE_SHADER, text)] }
+    ProgramSource::compute("oit allocate", text)
 }
 
 fn bins() -> String {
@@ -78,16 +74,14 @@ fn tiles() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::plan::features::ShaderFeatures;
     use crate::shaders::MaterialUse;
-    use modalcast_model::scene::ShadowSettings;
 
     fn options(post_depth_coverage: bool) -> ShaderOptions {
         let used = vec![MaterialUse { blend_mode: BlendMode::Blend, color: None, normal: None }];
         ShaderOptions {
-            defines: vec!["BLEND_LAYERS", "OIT"],
+            features: ShaderFeatures { blend_layers: true, oit: true, ..ShaderFeatures::NONE },
             used,
-            shadow: ShadowSettings::default(),
-            blur_method: crate::types::BlurMethod::Tiles,
             sample_positions: vec![[0.5; 2]; 4],
             sample_resolve: String::new(),
             post_depth_coverage,

@@ -1,24 +1,31 @@
 //! Shader sources of outputs that are drawn only on request: picks and AOV readbacks.
 
-use super::{BARYCENTRICS, CLIP, FRAME, ProgramSource, ShaderOptions, VISIBILITY_IDS, WORKGROUP_SIZE};
-use crate::device::gl;
+use super::{BARYCENTRICS, CLIP, FRAME, ProgramSource, ShaderOptions, VERSION, VISIBILITY_IDS};
+use crate::layout::WORKGROUP_SIZE;
 
 impl ShaderOptions {
     /// Reads an AOV field from the ids: `DEPTH` and `NORMALS` of one sample per pixel, `VALUES` of all samples.
     pub(crate) fn aov(&self, field: &'static str, samples: u32) -> ProgramSource {
-        let mut text = format!("#version 430 core\n#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define {field}\n");
+        let mut text = format!("{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define {field}\n");
         // Only the depth field draws the ground, and only if the look has one.
-        let has_ground = field == "DEPTH" && self.defines.contains(&"HAS_GROUND");
+        let has_ground = field == "DEPTH" && self.features.ground;
         text += if has_ground { "#define HAS_GROUND\n" } else { "" };
         text += &self.sample_defines(samples);
         text += &[FRAME, CLIP, VISIBILITY_IDS, BARYCENTRICS, include_str!("../../../shaders/aov.comp")].concat();
-        ProgramSource { label: format!("aov {field}, {samples} samples"), stages: vec![(gl::COMPUTE_SHADER, text)] }
+        ProgramSource::compute(format!("aov {field}, {samples} samples"), text)
     }
 }
 
 /// Reads back the triangles of a few pixels.
 pub(crate) fn pick() -> ProgramSource {
-    let head = format!("#version 430 core\n#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define SAMPLES 1\n");
+    let head = format!("{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define SAMPLES 1\n");
     let body = [&head, VISIBILITY_IDS, BARYCENTRICS, include_str!("../../../shaders/pick.comp")].concat();
-    ProgramSource { label: "pick".into(), stages: vec![(gl::COMPUTE_SHADER, body)] }
+    ProgramSource::compute("pick", body)
+}
+
+/// Packs the ids of each pixel's first sample.
+pub(crate) fn visibility_readback(samples: u32) -> ProgramSource {
+    let head = format!("{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define SAMPLES {samples}\n");
+    let body = [&head, VISIBILITY_IDS, include_str!("../../../shaders/visibility_readback.comp")].concat();
+    ProgramSource::compute(format!("visibility readback, {samples} samples"), body)
 }

@@ -8,7 +8,7 @@ use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{
     Camera, Culling, Ground, Lens, PixelRect, Scene, ShadowMethod, ShadowSettings, Transparency, View,
 };
-use modalcast_render::{Aov, FrameCullStats, FrameParams, FrameStats, Renderer, SceneBuffers, VisibilityId};
+use modalcast_render::{Aov, FrameCullStats, FrameParams, FrameStats, Pass, Renderer, SceneBuffers, VisibilityId};
 
 use super::harness::{SceneBuilder, camera, facing, open};
 
@@ -337,7 +337,7 @@ fn software_renderers_draw_hidden_multisampled_cut_outs() {
         let image = Some(stage.texture(1, 1, |_, _| [255; 4]));
         let paint = Material { color_texture: image, ..material(alpha_mode, true, [1.0; 3]) };
         let mut show = CullHarness::new(stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), paint), Culling::Occlusion);
-        let hides = show.frame(camera(64), [64, 64]).stats.passes.contains(&"occluders");
+        let hides = show.frame(camera(64), [64, 64]).stats.passes.contains(&Pass::Occluders);
         assert_eq!(hides, !(falls && show.renderer.info().software));
     }
 }

@@ -8,7 +8,7 @@ use modalcast_model::deform::Deformer as _;
 use modalcast_model::scene::{
     Camera, Culling, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings, Transparency,
 };
-use modalcast_render::{FrameCullStats, FrameParams, Renderer};
+use modalcast_render::{FrameCullStats, FrameParams, FrameTimes, Renderer};
 
 use super::harness::open;
 
@@ -31,8 +31,8 @@ fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'stati
     let images: Vec<_> = (0..FRAMES).map(|_| renderer.draw(&buffers, &shot).expect("draws")).collect();
     assert!(images.iter().all(|image| image.rgba == images[0].rgba), "frames differ");
     let median = |name: &'static str| {
-        let of = |passes: &[(&'static str, f64)]| passes.iter().find(|pass| pass.0 == name).map_or(0.0, |pass| pass.1);
-        let mut all: Vec<f64> = images[1..].iter().map(|image| of(&image.passes)).collect();
+        let of = |times: &FrameTimes| times.iter().find(|(key, _)| key.name() == name).map_or(0.0, |(_, ms)| ms);
+        let mut all: Vec<f64> = images[1..].iter().map(|image| of(&image.times)).collect();
         all.sort_by(f64::total_cmp);
         (name, all[all.len() / 2])
     };

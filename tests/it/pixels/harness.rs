@@ -6,7 +6,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformSummary, Deformer as _};
 use modalcast_model::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
 use modalcast_model::scene::{Camera, Lens, Scene, SceneParts, SceneState, View};
-use modalcast_render::{Allocation, DevicePreference, FrameImage, FrameParams, FrameStats, Renderer, plan};
+use modalcast_render::{Allocation, DevicePreference, FrameImage, FrameParams, FrameStats, Pass, Renderer, plan};
 
 /// A scene under construction: no shadow, no ground, a black sky, and the sun behind the camera.
 pub(super) struct SceneBuilder(pub(super) SceneParts);
@@ -140,8 +140,8 @@ impl Picture {
 }
 
 /// Planned passes of a scene with no geometry below its ground; the ground pass is skipped in this case.
-pub(super) fn planned_above(scene: &Scene) -> Vec<&'static str> {
-    plan(scene).passes.into_iter().filter(|pass| *pass != "ground").collect()
+pub(super) fn planned_above(scene: &Scene) -> Vec<Pass> {
+    plan(scene).passes.into_iter().filter(|pass| *pass != Pass::Ground).collect()
 }
 
 /// sRGB value in 0 to 255 of a linear value.

@@ -4,7 +4,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh, Transform};
 use modalcast_model::scene::{Bounds, Camera, RenderSettings, SceneState, View};
-use modalcast_render::{DevicePreference, FrameParams, Renderer, devices, plan};
+use modalcast_render::{DevicePreference, FrameParams, Pass, Renderer, devices, plan};
 
 use super::harness::{SceneBuilder, camera, draw, facing, floor_mesh, open, picture, planned_above};
 
@@ -24,7 +24,10 @@ fn unused_features_allocate_and_run_nothing() {
     for absent in ["tangents", "uvs", "triangle materials"] {
         assert!(!names(&plain.allocations).contains(&absent.to_string()), "{absent}");
     }
-    assert_eq!(plain.stats.passes, ["shadow", "blur", "visibility", "background", "shade", "encode"]);
+    assert_eq!(
+        plain.stats.passes,
+        [Pass::Shadow, Pass::Blur, Pass::Visibility, Pass::Background, Pass::Shade, Pass::Encode]
+    );
 
     let mut stage = full();
     let image = stage.texture(1, 1, |_, _| [128, 128, 255, 255]);
@@ -42,16 +45,16 @@ fn unused_features_allocate_and_run_nothing() {
     assert_eq!(
         rich.stats.passes,
         [
-            "shadow",
-            "blur",
-            "visibility",
-            "oit count",
-            "oit allocate",
-            "oit fill",
-            "oit resolve",
-            "background",
-            "shade",
-            "encode"
+            Pass::Shadow,
+            Pass::Blur,
+            Pass::Visibility,
+            Pass::OitCount,
+            Pass::OitAllocate,
+            Pass::OitFill,
+            Pass::OitResolve,
+            Pass::Background,
+            Pass::Shade,
+            Pass::Encode
         ]
     );
     let mut planned = plan(&scene).buffers;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Scene, Transparency};
-use modalcast_render::OitStats;
+use modalcast_render::{OitStats, Pass};
 
 use super::harness::{Picture, SceneBuilder, camera, close, draw, facing, open, picture};
 
@@ -279,6 +279,6 @@ fn two_passes_draw_alpha_above_threshold_as_opaque() {
     // Near the center of the half-transparent texel; the other texel is opaque around its center.
     assert!(close(parts.at(22, 30), wrong, 2.0), "blended in the order of the scene: {:?}", parts.at(22, 30));
     assert_eq!((parts.stats.draw_calls, none.stats.draw_calls), (2, 1));
-    assert_eq!(none.stats.passes, ["blended", "background", "encode"]);
-    assert_eq!(parts.stats.passes, ["visibility", "blended", "background", "shade", "encode"]);
+    assert_eq!(none.stats.passes, [Pass::Blended, Pass::Background, Pass::Encode]);
+    assert_eq!(parts.stats.passes, [Pass::Visibility, Pass::Blended, Pass::Background, Pass::Shade, Pass::Encode]);
 }

@@ -4,7 +4,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Antialiasing, Bloom, Camera, Lens, RenderSettings, SceneState, ToneMapping};
-use modalcast_render::FrameParams;
+use modalcast_render::{FrameParams, Pass};
 
 use super::harness::{
     Picture, SceneBuilder, camera, close, draw, draw_sized, facing, open, picture, planned_above, srgb,
@@ -257,9 +257,9 @@ fn post_processing_is_deterministic() {
     let mut renderer = open();
     let first = draw(&mut renderer, &rich, camera(96), 96);
     assert_eq!(first.stats.passes, planned_above(&rich));
-    assert!(first.stats.passes.contains(&"bloom"));
+    assert!(first.stats.passes.contains(&Pass::Bloom));
     let plain = draw(&mut renderer, &scene(RenderSettings::default()), camera(96), 96);
-    assert!(!plain.stats.passes.contains(&"bloom"));
+    assert!(!plain.stats.passes.contains(&Pass::Bloom));
     assert!(draw(&mut renderer, &rich, camera(96), 96).image.rgba == first.image.rgba);
     assert!(draw(&mut open(), &rich, camera(96), 96).image.rgba == first.image.rgba, "another context");
     assert!(plain.image.rgba != first.image.rgba, "control");

@@ -12,7 +12,7 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::raster::{DrawTarget, GlBuffer, RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Camera, CullMode, DrawRange, Lens, Scene, SceneState, ShadowSettings, View, Viewport};
 use modalcast_render::{
-    BlurMethod, FrameImage, FrameParams, FrameStats, RasterBackend, RasterBackends, Renderer, SceneBuffers,
+    BlurMethod, FrameImage, FrameParams, FrameStats, Pass, RasterBackend, RasterBackends, Renderer, SceneBuffers,
     VisibilityId,
 };
 use nalgebra::{Matrix4, Vector3};
@@ -182,9 +182,10 @@ fn compute_rasterized_frame_equals_opengl() {
             want.stats.raster_backends,
             RasterBackends { shadow: Some(RasterBackend::OpenGl), visibility: Some(RasterBackend::OpenGl) }
         );
-        assert_eq!(got.stats.passes[..3], ["raster shadow", "blur", "unpack"]);
+        assert_eq!(got.stats.passes[..3], [Pass::RasterShadow, Pass::Blur, Pass::Unpack]);
         assert!(
-            !got.stats.passes.contains(&"ground") && got.allocations.iter().any(|name| name == "raster shadow depths")
+            !got.stats.passes.contains(&Pass::Ground)
+                && got.allocations.iter().any(|name| name == "raster shadow depths")
         );
         assert!(
             !want.allocations.iter().any(|name| name == "raster visibility keys" || name == "raster shadow depths"),
@@ -320,9 +321,9 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
         let image = renderer.draw(buffers, shot).expect("draws");
         (image, renderer.stats().passes[..2].to_vec())
     };
-    assert_eq!(draw(&mut renderer, &buffers, &one).1, ["raster shadow", "blur"]);
+    assert_eq!(draw(&mut renderer, &buffers, &one).1, [Pass::RasterShadow, Pass::Blur]);
     let (shared, passes) = draw(&mut renderer, &buffers, &other);
-    assert_eq!(passes, ["raster visibility", "unpack"], "the shadow is there");
+    assert_eq!(passes, [Pass::RasterVisibility, Pass::Unpack], "the shadow is there");
     assert_eq!(shared.raster_backends, RasterBackends { shadow: None, visibility: Some(RasterBackend::Cuda) });
     assert!(shared.rgba == alone.rgba, "the same picture");
     let positions = deformer.surface().expect("there").positions.clone();
@@ -330,7 +331,7 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     let (apart, passes) = draw(&mut renderer, &buffers, &other);
     assert_eq!(
         (passes[0], apart.raster_backends.visibility),
-        ("shadow", Some(RasterBackend::OpenGl)),
+        (Pass::Shadow, Some(RasterBackend::OpenGl)),
         "it knows the shared ones alone"
     );
     assert!(far_off(&apart, &alone) <= 60, "{}", far_off(&apart, &alone));

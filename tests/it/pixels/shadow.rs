@@ -2,6 +2,7 @@
 
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Ground, Lens, ShadowSettings, UpAxis, View};
+use modalcast_render::Pass;
 
 use super::harness::{Picture, SceneBuilder, close, draw, facing, floor_mesh, open};
 
@@ -68,7 +69,7 @@ fn shadow_of_a_floating_square_has_only_ambient_light() {
     off.0.look.shadow = None;
     let unshaded = aside(off, AlphaMode::Opaque, 1.0);
     assert!(close(unshaded.at(32, 32), ground(1.0, 0.8), 2.0), "control: shadows off");
-    assert!(!unshaded.stats.passes.contains(&"shadow") && shaded.stats.passes.contains(&"shadow"));
+    assert!(!unshaded.stats.passes.contains(&Pass::Shadow) && shaded.stats.passes.contains(&Pass::Shadow));
     let mut empty = stage();
     empty.0.look.sun = [3.0, 4.0, 0.0];
     assert!(close(from_above(empty).at(32, 32), ground(1.0, 0.8), 2.0), "control: no caster");

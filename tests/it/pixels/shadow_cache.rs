@@ -9,7 +9,7 @@ use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Bounds, Camera, FrameSize, Lens, LightSpaceBox, Scene, SceneState, ShadowSettings};
-use modalcast_render::{FrameParams, Renderer, SceneBuffers};
+use modalcast_render::{FrameParams, Pass, Renderer, SceneBuffers};
 
 use super::harness::open;
 use super::shadow::{stage, with_square};
@@ -42,7 +42,7 @@ fn shot(camera: Camera, bounds: Bounds) -> FrameParams {
 }
 
 fn shadows(renderer: &Renderer) -> usize {
-    renderer.stats().passes.iter().filter(|pass| ["shadow", "blur"].contains(pass)).count()
+    renderer.stats().passes.iter().filter(|pass| [Pass::Shadow, Pass::Blur].contains(pass)).count()
 }
 
 /// The picture of a renderer of its own.
@@ -136,7 +136,7 @@ fn engine_steps_share_a_shadow_and_refused_ones_have_none() {
         cameras(&scene).map(|camera| {
             let rgba = bench.draw(staged, &camera, FrameSize::new(64, 64)).expect("draws").rgba;
             let stats = bench.stats().expect("draws").passes.clone();
-            (rgba, stats.iter().filter(|pass| **pass == "shadow").count())
+            (rgba, stats.iter().filter(|pass| **pass == Pass::Shadow).count())
         })
     };
     let mut state = SceneState::rest(&scene);

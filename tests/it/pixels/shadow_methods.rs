@@ -2,7 +2,7 @@
 
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Camera, Lens, MomentFormat, Scene, ShadowMethod, ShadowSettings, View};
-use modalcast_render::{BlurMethod, plan};
+use modalcast_render::{BlurMethod, Pass, plan};
 
 use super::harness::{Picture, close, draw, floor_mesh, open, planned_above};
 use super::shadow::{stage, with_square};
@@ -239,7 +239,7 @@ fn unused_shadow_resources_are_not_allocated() {
         let textures: Vec<String> = plan.textures.iter().map(|part| part.name.clone()).collect();
         let maps: Vec<String> = textures.into_iter().filter(|name| name.starts_with("shadow")).collect();
         let splits = shown.allocations.iter().any(|part| part.name == "shadow cascades");
-        (shown.stats.passes.contains(&"blur"), maps, splits)
+        (shown.stats.passes.contains(&Pass::Blur), maps, splits)
     };
     let base = ShadowSettings { size: 64, ..ShadowSettings::default() };
     let depth = vec!["shadow depth".to_string()];

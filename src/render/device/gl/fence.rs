@@ -99,13 +99,14 @@ impl Gl {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::target::{TargetDesc, create_image};
+    use crate::device::gl::TextureDesc;
     use crate::{DevicePreference, device};
 
     /// Draws a picture that takes long; in software, on threads of the driver.
     fn draw_for_long(gl: &Rc<Gl>, turns: u32) {
-        let desc = TargetDesc { width: 2048, height: 2048, samples: 1, ..TargetDesc::EMPTY };
-        let color = create_image(gl, desc, glow::RGBA8).expect("an image");
+        let (target, format) = (glow::TEXTURE_2D, glow::RGBA8);
+        let desc = TextureDesc { target, format, width: 2048, height: 2048, depth: 1, levels: 1 };
+        let color = gl.texture(desc).expect("a texture");
         let into = gl.color_framebuffer(&color).expect("complete");
         let vertex = "#version 430 core\nvoid main() { gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2) - 1, \
                       0, 1); }";

@@ -1,4 +1,4 @@
-//! OpenGL commands for lists that shaders write: indirect draws and their barriers.
+//! OpenGL commands for lists that shaders write: indirect draws.
 
 use glow::HasContext as _;
 
@@ -16,12 +16,5 @@ impl Gl {
             gl.draw_elements_indirect_offset(glow::TRIANGLES, glow::UNSIGNED_INT, offset as i32);
             gl.bind_vertex_array(None);
         }
-    }
-
-    /// Memory barrier: later commands see what shaders wrote.
-    pub(crate) fn barrier(&self) {
-        let Some(gl) = self.functions_or_skip() else { return };
-        // SAFETY: only orders memory accesses.
-        unsafe { gl.memory_barrier(glow::ALL_BARRIER_BITS) }
     }
 }

@@ -116,11 +116,10 @@ impl RenderHarness {
         self.warm_up(set, camera, size)?;
         for _ in 0..replays.max(MIN_REPETITIONS) {
             let image = self.draw(set, camera, size)?;
-            // "shadow" and "draw" are whole stages; the other times are parts of them.
-            let frame = image.passes.iter().filter(|(name, _)| ["shadow", "draw"].contains(name));
-            times[0].1.push(frame.map(|(_, ms)| 1e3 * ms).sum());
-            for (name, ms) in &image.passes {
-                match times.iter_mut().find(|(own, _)| own == name) {
+            times[0].1.push(1e3 * image.times.drawing_ms());
+            for (key, ms) in image.times.iter() {
+                let name = key.name();
+                match times.iter_mut().find(|(own, _)| *own == name) {
                     Some((_, list)) => list.push(1e3 * ms),
                     None => times.push((name, vec![1e3 * ms])),
                 }

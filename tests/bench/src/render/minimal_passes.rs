@@ -10,7 +10,7 @@ use crate::timing::Timing;
 use modalcast_model::domain::Material;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Culling, RenderSettings, Scene, SceneParts, ShadowMethod, ShadowSettings};
-use modalcast_render::FrameStats;
+use modalcast_render::{FrameStats, Pass};
 
 /// Times of both passes on one load.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -73,7 +73,7 @@ pub(super) fn stripped(scene: &Scene, map: u32) -> Result<Arc<Scene>> {
 
 /// Whether a frame consisted of one draw of ids and one of depth, without a pass that uses the depth.
 pub(super) fn is_bare(stats: &FrameStats) -> bool {
-    stats.draw_calls == 1 && stats.passes.starts_with(&["shadow", "visibility"])
+    stats.draw_calls == 1 && stats.passes.starts_with(&[Pass::Shadow, Pass::Visibility])
 }
 
 #[cfg(test)]

@@ -222,7 +222,8 @@ mod tests {
         let mut set = studio.set(&relit(&stage.scene, look).expect("fits")).expect("loads");
         studio.pose(&mut set, &stage.state(0)).expect("poses");
         let size = Size { width: 64, height: 36 };
-        let passes = studio.draw(&set, stage.camera(size), size).expect("draws").passes;
+        let times = studio.draw(&set, stage.camera(size), size).expect("draws").times;
+        let passes: Vec<(&str, f64)> = times.iter().map(|(key, ms)| (key.name(), ms)).collect();
         for (name, _) in &passes {
             assert!(COLUMNS.iter().any(|(_, place)| place == name), "{name}");
         }

@@ -129,7 +129,7 @@ fn rig(studio: &mut RenderHarness, device: Option<&Arc<Device>>, scene: &Arc<Sce
     };
     let draws = studio.renderer.info().cuda_device.map(|ordinal| usize::try_from(ordinal).ok());
     let is_shared = draws == Some(Some(device.ordinal()));
-    let gl = if is_shared { Some(buffers.vertex_buffers()?) } else { None };
+    let gl = if is_shared { Some(buffers.vertex_buffers()) } else { None };
     let deformer = CudaDeformer::new(device, scene, gl, scene.light_axes())?;
     Ok(PlantSetup { bytes: beside(deformer.plan(), deformer.shares_buffers()), deformer: Box::new(deformer), buffers })
 }
@@ -186,8 +186,7 @@ fn frame(
     let shot = FrameParams { camera, width: size.width, height: size.height, bounds, light };
     let image = studio.renderer.draw(&rig.buffers, &shot)?;
     let frame = us(whole);
-    let passes = image.passes.iter().filter(|(name, _)| ["shadow", "draw"].contains(name));
-    let render: f64 = passes.map(|(_, ms)| 1e3 * ms).sum();
+    let render = 1e3 * image.times.drawing_ms();
     Ok([deform, upload, render, deform + upload + render, frame])
 }
 

@@ -1,0 +1,284 @@
+//! Names of the passes and stages of a frame, and their times.
+//!
+//! [`Pass`] is the only source of these names: plans, statistics, times and error stages take them from it.
+
+use std::fmt;
+
+use serde::{Serialize, Serializer};
+
+/// A pass of the renderer. The order of the variants is the order of execution; the last ones run only on request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Pass {
+    /// Writes the uniforms of the frame and resets its counters.
+    UniformUpload,
+    /// Draws the shadow depth with the compute rasterizer, and the visibility if it draws that too.
+    RasterShadow,
+    /// Draws the visibility with the compute rasterizer.
+    RasterVisibility,
+    /// Lists the triangles that may cast a shadow.
+    ShadowCull,
+    /// Draws the depth as seen from the sun.
+    Shadow,
+    /// Converts shadow depth to moments and blurs them.
+    Blur,
+    /// Draws the depth of the triangles that the last frame saw, and builds the pyramid of that depth.
+    Occluders,
+    /// Lists the triangles that the camera may see.
+    Cull,
+    /// Draws the triangle id and the depth of each sample.
+    Visibility,
+    /// Records the triangles that the ids name, for the occluders of the next frame.
+    RecordVisible,
+    /// Converts the keys of the compute rasterizer to ids.
+    Unpack,
+    /// Draws the id and the depth of the ground.
+    Ground,
+    /// Blends translucent triangles in draw order.
+    Blended,
+    /// Counts the blended fragments of each pixel.
+    OitCount,
+    /// Allocates the fragment list of each pixel.
+    OitAllocate,
+    /// Fills the fragment lists.
+    OitFill,
+    /// Sorts, shades and blends the fragment lists.
+    OitResolve,
+    /// Shades tiles that see no opaque triangle, and lists the other tiles.
+    Background,
+    /// Shades the listed tiles.
+    Shade,
+    /// Spreads bright light and applies the tone curve.
+    Bloom,
+    /// Encodes linear light to sRGB bytes.
+    Encode,
+    /// Copies the bytes and the statistics to the staging buffer.
+    Read,
+    /// Packs the ids of each pixel's first sample, on request.
+    VisibilityReadback,
+    /// Draws and reads the triangles of a few pixels, on request.
+    Pick,
+    /// Draws and reads numbers instead of colors, on request.
+    Aov,
+}
+
+/// A part of a frame whose time is reported as one number: the sum over its passes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum RenderStage {
+    /// Upload of deformed vertices from host memory; measured by the caller.
+    Upload,
+    Shadow,
+    Draw,
+    Read,
+}
+
+impl Pass {
+    /// All passes, in execution order.
+    pub const ALL: [Self; 25] = [
+        Self::UniformUpload,
+        Self::RasterShadow,
+        Self::RasterVisibility,
+        Self::ShadowCull,
+        Self::Shadow,
+        Self::Blur,
+        Self::Occluders,
+        Self::Cull,
+        Self::Visibility,
+        Self::RecordVisible,
+        Self::Unpack,
+        Self::Ground,
+        Self::Blended,
+        Self::OitCount,
+        Self::OitAllocate,
+        Self::OitFill,
+        Self::OitResolve,
+        Self::Background,
+        Self::Shade,
+        Self::Bloom,
+        Self::Encode,
+        Self::Read,
+        Self::VisibilityReadback,
+        Self::Pick,
+        Self::Aov,
+    ];
+
+    /// Name in plans, statistics, times and errors.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::UniformUpload => "uniform upload",
+            Self::RasterShadow => "raster shadow",
+            Self::RasterVisibility => "raster visibility",
+            Self::ShadowCull => "shadow cull",
+            Self::Shadow => "shadow",
+            Self::Blur => "blur",
+            Self::Occluders => "occluders",
+            Self::Cull => "cull",
+            Self::Visibility => "visibility",
+            Self::RecordVisible => "record visible",
+            Self::Unpack => "unpack",
+            Self::Ground => "ground",
+            Self::Blended => "blended",
+            Self::OitCount => "oit count",
+            Self::OitAllocate => "oit allocate",
+            Self::OitFill => "oit fill",
+            Self::OitResolve => "oit resolve",
+            Self::Background => "background",
+            Self::Shade => "shade",
+            Self::Bloom => "bloom",
+            Self::Encode => "encode",
+            Self::Read => "read",
+            Self::VisibilityReadback => "visibility readback",
+            Self::Pick => "pick",
+            Self::Aov => "aov",
+        }
+    }
+
+    /// The stage to whose time the pass adds.
+    pub const fn stage(self) -> RenderStage {
+        match self {
+            Self::RasterShadow | Self::ShadowCull | Self::Shadow | Self::Blur => RenderStage::Shadow,
+            Self::Read => RenderStage::Read,
+            _ => RenderStage::Draw,
+        }
+    }
+}
+
+impl fmt::Display for Pass {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(self.name())
+    }
+}
+
+impl Serialize for Pass {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name())
+    }
+}
+
+impl RenderStage {
+    /// Name in times.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Upload => "upload",
+            Self::Shadow => "shadow",
+            Self::Draw => "draw",
+            Self::Read => "read",
+        }
+    }
+}
+
+/// What a measured time belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TimeKey {
+    Stage(RenderStage),
+    /// One or several passes that are timed together, by the name of one of them. "visibility" includes the ground and
+    /// the conversion of keys, "cull" the occluders, "blended" the fragment lists, "shade" the backdrop, and
+    /// "raster shadow" the visibility if the compute rasterizer draws both at once.
+    Pass(Pass),
+}
+
+impl TimeKey {
+    /// Name of the stage or pass.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Stage(stage) => stage.name(),
+            Self::Pass(pass) => pass.name(),
+        }
+    }
+}
+
+/// Milliseconds of the stages of a frame and of their passes. A stage precedes its passes.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct FrameTimes(Vec<(TimeKey, f64)>);
+
+impl FrameTimes {
+    /// Sums the passes of a frame to stages. The shadow pass is not listed on its own: its name is that of its stage.
+    pub(crate) fn of_passes(passes: &[(Pass, f64)]) -> Self {
+        let of = |stage: RenderStage| passes.iter().filter(move |(pass, _)| pass.stage() == stage);
+        let sum = |stage: RenderStage| of(stage).map(|(_, ms)| ms).fold(0.0, |sum, ms| sum + ms);
+        let entry = |(pass, ms): &(Pass, f64)| (TimeKey::Pass(*pass), *ms);
+        let mut times = vec![(TimeKey::Stage(RenderStage::Shadow), sum(RenderStage::Shadow))];
+        times.extend(of(RenderStage::Shadow).filter(|(pass, _)| *pass != Pass::Shadow).map(entry));
+        times.push((TimeKey::Stage(RenderStage::Draw), sum(RenderStage::Draw)));
+        times.extend(of(RenderStage::Draw).map(entry));
+        times.extend(of(RenderStage::Read).map(|(_, ms)| (TimeKey::Stage(RenderStage::Read), *ms)));
+        Self(times)
+    }
+
+    /// Times of stages without passes.
+    pub(crate) fn of_stages(stages: &[(RenderStage, f64)]) -> Self {
+        Self(stages.iter().map(|(stage, ms)| (TimeKey::Stage(*stage), *ms)).collect())
+    }
+
+    /// Inserts the time of a stage before all others.
+    pub(crate) fn insert_first(&mut self, stage: RenderStage, ms: f64) {
+        self.0.insert(0, (TimeKey::Stage(stage), ms));
+    }
+
+    /// Adds to the time of a stage; does nothing if the frame has no such stage.
+    pub(crate) fn add(&mut self, stage: RenderStage, ms: f64) {
+        if let Some((_, sum)) = self.0.iter_mut().find(|(key, _)| *key == TimeKey::Stage(stage)) {
+            *sum += ms;
+        }
+    }
+
+    /// Milliseconds of a stage; none if the frame has no such stage.
+    pub fn stage(&self, stage: RenderStage) -> Option<f64> {
+        self.0.iter().find(|(key, _)| *key == TimeKey::Stage(stage)).map(|(_, ms)| *ms)
+    }
+
+    /// Milliseconds of the shadow and draw stages: the device time of a frame without its readback.
+    pub fn drawing_ms(&self) -> f64 {
+        [RenderStage::Shadow, RenderStage::Draw].into_iter().filter_map(|stage| self.stage(stage)).sum()
+    }
+
+    /// Milliseconds of a timed pass; none if the frame did not time it.
+    pub fn pass(&self, pass: Pass) -> Option<f64> {
+        self.0.iter().find(|(key, _)| *key == TimeKey::Pass(pass)).map(|(_, ms)| *ms)
+    }
+
+    /// All times, in order.
+    pub fn iter(&self) -> impl Iterator<Item = (TimeKey, f64)> {
+        self.0.iter().copied()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_lists_every_pass_once_with_its_own_name() {
+        assert!(Pass::ALL.is_sorted_by(|one, next| one < next));
+        assert_eq!(Pass::ALL.len(), Pass::Aov as usize + 1);
+        let mut names = Pass::ALL.map(Pass::name);
+        names.sort_unstable();
+        assert!(names.windows(2).all(|pair| pair[0] != pair[1]), "{names:?}");
+    }
+
+    #[test]
+    fn stages_are_the_sums_of_their_passes() {
+        let passes = [
+            (Pass::RasterShadow, 1.0),
+            (Pass::Shadow, 2.0),
+            (Pass::Blur, 4.0),
+            (Pass::Visibility, 8.0),
+            (Pass::Encode, 16.0),
+            (Pass::Read, 32.0),
+        ];
+        let mut times = FrameTimes::of_passes(&passes);
+        times.add(RenderStage::Read, 64.0);
+        let named: Vec<(&str, f64)> = times.iter().map(|(key, ms)| (key.name(), ms)).collect();
+        let expected = [
+            ("shadow", 7.0),
+            ("raster shadow", 1.0),
+            ("blur", 4.0),
+            ("draw", 24.0),
+            ("visibility", 8.0),
+            ("encode", 16.0),
+            ("read", 96.0),
+        ];
+        assert_eq!(named, expected);
+        assert_eq!((times.pass(Pass::Blur), times.pass(Pass::Shadow)), (Some(4.0), None));
+        assert_eq!((times.stage(RenderStage::Shadow), times.drawing_ms()), (Some(7.0), 31.0));
+    }
+}

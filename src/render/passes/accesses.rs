@@ -1,0 +1,369 @@
+//! The resources that each pass reads and writes, and the memory barriers that follow from them.
+//!
+//! OpenGL orders all accesses by itself, except those of shaders that write images or storage buffers. Each pass issues
+//! one barrier before its first command ([`barrier_before`]), and one between its own dispatches or draws where a later
+//! one uses the result of an earlier one ([`barrier_within`]).
+
+use std::sync::LazyLock;
+
+use crate::device::gl::MemoryBarriers;
+use crate::pass::Pass;
+
+/// A buffer or an image of a scene or of a frame. Pictures of several frames share them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Resource {
+    ShadowDepth,
+    /// Depth in a buffer, from the compute rasterizer.
+    RasterShadowDepth,
+    /// Moments that are blurred in x.
+    HorizontalMoments,
+    ShadowMoments,
+    CullDraws,
+    CullVisibleBits,
+    CullCounters,
+    PreviouslyVisible,
+    VisibleTriangleIds,
+    VisibleIndices,
+    DepthPyramid,
+    /// Keys from the compute rasterizer.
+    RasterKeys,
+    Ids,
+    Depth,
+    BlendLayer,
+    OitCounts,
+    OitCursors,
+    OitRecords,
+    OitCounters,
+    OitTiles,
+    OitLayers,
+    Tiles,
+    SceneColor,
+    BloomMips,
+    /// What is copied to the staging buffer: pixels, ids or numbers.
+    ReadbackSource,
+}
+
+/// How a pass uses a resource.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Access {
+    /// Texture lookup, also of buffer textures.
+    Sampled,
+    ImageRead,
+    /// Image stores or atomics, possibly loads too.
+    ImageWrite,
+    StorageRead,
+    /// Stores or atomics of a storage buffer, possibly loads too.
+    StorageWrite,
+    /// Arguments of an indirect draw or dispatch.
+    Indirect,
+    /// Index buffer of a draw.
+    Index,
+    /// Draws, depth tests and clears of a framebuffer.
+    Attachment,
+    /// Writes and copies by API calls.
+    Transfer,
+    /// Accesses of the compute rasterizer. Its interoperation with OpenGL orders them.
+    External,
+}
+
+impl Access {
+    /// Whether OpenGL does not order the access with others.
+    const fn is_shader_write(self) -> bool {
+        matches!(self, Self::ImageWrite | Self::StorageWrite)
+    }
+
+    const fn barrier(self) -> MemoryBarriers {
+        match self {
+            Self::Sampled => MemoryBarriers::TEXTURE_FETCH,
+            Self::ImageRead | Self::ImageWrite => MemoryBarriers::SHADER_IMAGE,
+            Self::StorageRead | Self::StorageWrite => MemoryBarriers::SHADER_STORAGE,
+            Self::Indirect => MemoryBarriers::COMMAND,
+            Self::Index => MemoryBarriers::ELEMENT_ARRAY,
+            Self::Attachment => MemoryBarriers::FRAMEBUFFER,
+            Self::Transfer => MemoryBarriers::BUFFER_UPDATE,
+            Self::External => MemoryBarriers::NONE,
+        }
+    }
+}
+
+type Accesses = &'static [(Resource, Access)];
+
+/// Draws of listed triangles.
+const VISIBLE_LISTS: Accesses = &[
+    (Resource::CullDraws, Access::Indirect),
+    (Resource::VisibleIndices, Access::Index),
+    (Resource::VisibleTriangleIds, Access::Sampled),
+];
+
+/// Resets, fills and compacts the lists.
+const LIST_TRIANGLES: Accesses = &[
+    (Resource::CullDraws, Access::Transfer),
+    (Resource::CullDraws, Access::StorageWrite),
+    (Resource::CullVisibleBits, Access::StorageWrite),
+    (Resource::CullCounters, Access::StorageWrite),
+    (Resource::VisibleTriangleIds, Access::StorageWrite),
+    (Resource::VisibleIndices, Access::StorageWrite),
+];
+
+/// Lookups of the shadow map.
+const SHADOW_LOOKUP: Accesses = &[(Resource::ShadowDepth, Access::Sampled), (Resource::ShadowMoments, Access::Sampled)];
+
+/// Inputs of the shading, and its outputs.
+const SHADING: Accesses = &[
+    (Resource::Ids, Access::Sampled),
+    (Resource::Depth, Access::Sampled),
+    (Resource::BlendLayer, Access::Sampled),
+    (Resource::OitLayers, Access::Sampled),
+    (Resource::OitCounts, Access::Sampled),
+    (Resource::SceneColor, Access::ImageWrite),
+    (Resource::BloomMips, Access::ImageWrite),
+];
+
+/// Ids and depth that a pass draws.
+const DRAW_IDS: Accesses = &[(Resource::Ids, Access::Attachment), (Resource::Depth, Access::Attachment)];
+
+/// Ids to words, and their copy.
+const READ_IDS: Accesses = &[
+    (Resource::Ids, Access::Sampled),
+    (Resource::Depth, Access::Sampled),
+    (Resource::ReadbackSource, Access::StorageWrite),
+    (Resource::ReadbackSource, Access::Transfer),
+];
+
+/// Everything that a pass reads and writes and that some shader writes, in groups, in the order of [`Pass::ALL`].
+/// Resources that no shader writes need no entry; those whose writer is optional have one.
+const DECLARED: [(Pass, &[Accesses]); Pass::ALL.len()] = [
+    (Pass::UniformUpload, &[&[(Resource::CullCounters, Access::Transfer)]]),
+    (
+        Pass::RasterShadow,
+        &[&[(Resource::RasterShadowDepth, Access::External), (Resource::RasterKeys, Access::External)]],
+    ),
+    (Pass::RasterVisibility, &[&[(Resource::RasterKeys, Access::External)]]),
+    (Pass::ShadowCull, &[LIST_TRIANGLES]),
+    (Pass::Shadow, &[VISIBLE_LISTS, &[(Resource::ShadowDepth, Access::Attachment)]]),
+    (
+        Pass::Blur,
+        &[&[
+            (Resource::ShadowDepth, Access::Sampled),
+            (Resource::RasterShadowDepth, Access::StorageRead),
+            (Resource::HorizontalMoments, Access::ImageWrite),
+            (Resource::HorizontalMoments, Access::Sampled),
+            (Resource::HorizontalMoments, Access::Attachment),
+            (Resource::ShadowMoments, Access::ImageWrite),
+            (Resource::ShadowMoments, Access::Attachment),
+        ]],
+    ),
+    (
+        Pass::Occluders,
+        &[
+            LIST_TRIANGLES,
+            VISIBLE_LISTS,
+            &[
+                (Resource::PreviouslyVisible, Access::StorageWrite),
+                (Resource::Depth, Access::Attachment),
+                (Resource::Depth, Access::Sampled),
+                (Resource::DepthPyramid, Access::StorageWrite),
+            ],
+        ],
+    ),
+    (
+        Pass::Cull,
+        &[
+            LIST_TRIANGLES,
+            &[(Resource::PreviouslyVisible, Access::StorageWrite), (Resource::DepthPyramid, Access::StorageRead)],
+        ],
+    ),
+    (Pass::Visibility, &[VISIBLE_LISTS, DRAW_IDS]),
+    (
+        Pass::RecordVisible,
+        &[&[
+            (Resource::Ids, Access::Sampled),
+            (Resource::Depth, Access::Sampled),
+            (Resource::PreviouslyVisible, Access::StorageWrite),
+        ]],
+    ),
+    (Pass::Unpack, &[&[(Resource::RasterKeys, Access::StorageRead), (Resource::Ids, Access::ImageWrite)]]),
+    (Pass::Ground, &[DRAW_IDS]),
+    (
+        Pass::Blended,
+        &[
+            VISIBLE_LISTS,
+            SHADOW_LOOKUP,
+            &[(Resource::Depth, Access::Attachment), (Resource::BlendLayer, Access::Attachment)],
+        ],
+    ),
+    (
+        Pass::OitCount,
+        &[
+            VISIBLE_LISTS,
+            &[
+                (Resource::CullDraws, Access::Transfer),
+                (Resource::OitCounters, Access::Transfer),
+                (Resource::OitTiles, Access::Transfer),
+                (Resource::OitCounts, Access::Attachment),
+                (Resource::Depth, Access::Attachment),
+                (Resource::OitCounts, Access::ImageWrite),
+            ],
+        ],
+    ),
+    (
+        Pass::OitAllocate,
+        &[&[
+            (Resource::OitCounts, Access::ImageRead),
+            (Resource::OitCounters, Access::StorageWrite),
+            (Resource::OitRecords, Access::StorageWrite),
+            (Resource::OitCursors, Access::ImageWrite),
+            (Resource::OitTiles, Access::StorageWrite),
+        ]],
+    ),
+    (
+        Pass::OitFill,
+        &[
+            VISIBLE_LISTS,
+            &[
+                (Resource::Depth, Access::Attachment),
+                (Resource::OitCounts, Access::ImageRead),
+                (Resource::OitCounters, Access::StorageRead),
+                (Resource::OitCounters, Access::Indirect),
+                (Resource::OitRecords, Access::StorageWrite),
+                (Resource::OitCursors, Access::ImageWrite),
+            ],
+        ],
+    ),
+    (
+        Pass::OitResolve,
+        &[
+            SHADOW_LOOKUP,
+            &[
+                (Resource::OitTiles, Access::Indirect),
+                (Resource::OitTiles, Access::StorageRead),
+                (Resource::OitCounts, Access::ImageRead),
+                (Resource::OitCursors, Access::ImageRead),
+                (Resource::OitCounters, Access::StorageRead),
+                (Resource::OitRecords, Access::StorageWrite),
+                (Resource::OitLayers, Access::ImageWrite),
+            ],
+        ],
+    ),
+    (
+        Pass::Background,
+        &[SHADOW_LOOKUP, SHADING, &[(Resource::Tiles, Access::Transfer), (Resource::Tiles, Access::StorageWrite)]],
+    ),
+    (
+        Pass::Shade,
+        &[SHADOW_LOOKUP, SHADING, &[(Resource::Tiles, Access::Indirect), (Resource::Tiles, Access::StorageRead)]],
+    ),
+    (
+        Pass::Bloom,
+        &[&[
+            (Resource::BloomMips, Access::Sampled),
+            (Resource::BloomMips, Access::ImageWrite),
+            (Resource::SceneColor, Access::ImageWrite),
+        ]],
+    ),
+    (Pass::Encode, &[&[(Resource::SceneColor, Access::Sampled), (Resource::ReadbackSource, Access::StorageWrite)]]),
+    (
+        Pass::Read,
+        &[&[
+            (Resource::ReadbackSource, Access::Transfer),
+            (Resource::OitCounters, Access::Transfer),
+            (Resource::CullCounters, Access::Transfer),
+        ]],
+    ),
+    (Pass::VisibilityReadback, &[READ_IDS]),
+    (Pass::Pick, &[DRAW_IDS, READ_IDS]),
+    (Pass::Aov, &[DRAW_IDS, READ_IDS]),
+];
+
+fn each_access(pass: Pass) -> impl Iterator<Item = (Resource, Access)> {
+    DECLARED[pass as usize].1.iter().flat_map(|group| group.iter().copied())
+}
+
+fn is_written_by_shaders(pass: Pass, resource: Resource) -> bool {
+    each_access(pass).any(|(own, access)| own == resource && access.is_shader_write())
+}
+
+/// The barrier of these accesses. All barriers come from here: to compare with a build in which each barrier orders
+/// all accesses, or in which one kind is left out, change the returned value here.
+fn barrier_of(accesses: impl Iterator<Item = Access>) -> MemoryBarriers {
+    accesses.fold(MemoryBarriers::NONE, |kinds, access| kinds | access.barrier())
+}
+
+fn compute_barrier_before(pass: Pass) -> MemoryBarriers {
+    let is_written = |resource| Pass::ALL.into_iter().any(|pass| is_written_by_shaders(pass, resource));
+    barrier_of(each_access(pass).filter(|(resource, _)| is_written(*resource)).map(|(_, access)| access))
+}
+
+fn compute_barrier_within(pass: Pass) -> MemoryBarriers {
+    let own = each_access(pass).filter(|(resource, _)| is_written_by_shaders(pass, *resource));
+    barrier_of(own.map(|(_, access)| access))
+}
+
+/// The barrier before the first command of a pass: for its accesses of resources that shaders write in any pass, this
+/// one included, because the resources outlive the frame.
+pub(super) fn barrier_before(pass: Pass) -> MemoryBarriers {
+    static BARRIERS: LazyLock<[MemoryBarriers; Pass::ALL.len()]> =
+        LazyLock::new(|| Pass::ALL.map(compute_barrier_before));
+    BARRIERS[pass as usize]
+}
+
+/// The barrier between the commands of a pass: for its accesses of resources that its own shaders write.
+pub(super) fn barrier_within(pass: Pass) -> MemoryBarriers {
+    static BARRIERS: LazyLock<[MemoryBarriers; Pass::ALL.len()]> =
+        LazyLock::new(|| Pass::ALL.map(compute_barrier_within));
+    BARRIERS[pass as usize]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_pass_has_its_own_declaration() {
+        assert_eq!(DECLARED.map(|(pass, _)| pass), Pass::ALL);
+    }
+
+    #[test]
+    fn every_shader_write_is_followed_by_the_barrier_of_each_reader() {
+        let covers = |kinds: MemoryBarriers, one: MemoryBarriers| kinds | one == kinds;
+        let mut pairs = 0;
+        for writer in Pass::ALL {
+            for reader in Pass::ALL {
+                for (resource, access) in each_access(reader) {
+                    if is_written_by_shaders(writer, resource) {
+                        pairs += 1;
+                        assert!(covers(barrier_before(reader), access.barrier()), "{writer} to {reader}: {resource:?}");
+                    }
+                }
+            }
+        }
+        assert!(pairs > 100, "{pairs}");
+    }
+
+    #[test]
+    fn overwriting_waits_for_earlier_readers() {
+        // A store waits for earlier accesses of any kind only behind a barrier of its own kind.
+        for pass in Pass::ALL {
+            for (resource, access) in each_access(pass).filter(|(_, access)| access.is_shader_write()) {
+                assert_eq!(barrier_before(pass) | access.barrier(), barrier_before(pass), "{pass}: {resource:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn barriers_name_only_the_kinds_of_their_consumers() {
+        use MemoryBarriers as Kinds;
+        assert_eq!(barrier_before(Pass::UniformUpload), Kinds::BUFFER_UPDATE);
+        assert_eq!(barrier_before(Pass::RasterShadow), Kinds::NONE);
+        let lists = Kinds::COMMAND | Kinds::ELEMENT_ARRAY | Kinds::TEXTURE_FETCH;
+        assert_eq!(barrier_before(Pass::Shadow), lists);
+        assert_eq!(barrier_before(Pass::Visibility), lists | Kinds::FRAMEBUFFER);
+        assert_eq!(barrier_before(Pass::Ground), Kinds::FRAMEBUFFER);
+        assert_eq!(barrier_before(Pass::Encode), Kinds::TEXTURE_FETCH | Kinds::SHADER_STORAGE);
+        assert_eq!(barrier_before(Pass::Read), Kinds::BUFFER_UPDATE);
+        assert_eq!(barrier_within(Pass::Visibility), Kinds::NONE);
+        assert_eq!(barrier_within(Pass::OitAllocate), Kinds::SHADER_STORAGE | Kinds::SHADER_IMAGE);
+        assert_eq!(barrier_within(Pass::Bloom), Kinds::TEXTURE_FETCH | Kinds::SHADER_IMAGE);
+        assert_eq!(barrier_within(Pass::Pick), Kinds::SHADER_STORAGE | Kinds::BUFFER_UPDATE);
+    }
+}

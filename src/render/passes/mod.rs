@@ -1,0 +1,22 @@
+//! Records the OpenGL commands of each pass.
+//!
+//! A pass is one value of [`Pass`]: its inputs, outputs and barriers are in `accesses`, its commands in the file of its
+//! technique. [`PassRecorder`] issues the barriers, checks for errors and lists the passes that ran.
+
+mod accesses;
+pub(crate) mod aov;
+pub(crate) mod blended;
+pub(crate) mod cull;
+mod draw;
+mod oit;
+pub(crate) mod picking;
+pub(crate) mod post;
+pub(crate) mod raster;
+pub(crate) mod readback;
+mod recorder;
+pub(crate) mod shade;
+pub(crate) mod shadow;
+pub(crate) mod uniforms;
+pub(crate) mod visibility;
+
+pub(crate) use self::recorder::{FrameContext, PassRecorder};

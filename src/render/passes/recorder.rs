@@ -1,0 +1,57 @@
+//! What all passes of a frame use, and the bookkeeping of a pass.
+
+use std::rc::Rc;
+
+use super::accesses::{barrier_before, barrier_within};
+use crate::device::gl::Gl;
+use crate::pass::Pass;
+use crate::resources::programs::SampleCountPrograms;
+use crate::resources::scene_buffers::SceneBuffers;
+use crate::resources::target::RenderTarget;
+use crate::types::{FrameParams, FrameStats};
+use modalcast_model::error::Result;
+
+/// The inputs of the passes of a frame.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct FrameContext<'a> {
+    pub(crate) buffers: &'a SceneBuffers,
+    pub(crate) target: &'a RenderTarget,
+    pub(crate) programs: &'a SampleCountPrograms,
+    pub(crate) shot: &'a FrameParams,
+}
+
+/// Records passes, and collects the statistics of those that ran.
+#[derive(Debug)]
+pub(crate) struct PassRecorder<'a> {
+    pub(crate) gl: &'a Rc<Gl>,
+    pub(crate) stats: &'a mut FrameStats,
+}
+
+impl PassRecorder<'_> {
+    /// Issues the barrier of a pass before its first command.
+    pub(super) fn begin(&self, pass: Pass) {
+        self.gl.barrier(barrier_before(pass));
+    }
+
+    /// Issues the barrier between two commands of a pass, the later of which uses what the earlier one wrote.
+    pub(super) fn continue_pass(&self, pass: Pass) {
+        self.gl.barrier(barrier_within(pass));
+    }
+
+    /// Lists a pass as one that ran.
+    ///
+    /// # Errors
+    /// `Fault` of the pass when OpenGL reported an error.
+    pub(super) fn finish(&mut self, pass: Pass) -> Result<()> {
+        self.stats.passes.push(pass);
+        self.check(pass)
+    }
+
+    /// Fails if OpenGL reported an error in a pass.
+    ///
+    /// # Errors
+    /// `Fault` of the pass.
+    pub(super) fn check(&self, pass: Pass) -> Result<()> {
+        self.gl.check(pass.name())
+    }
+}

@@ -1,0 +1,104 @@
+//! Draws the shadow map: depth from the sun and, for a variance map, its blurred moments.
+
+use super::cull::cull_shadow_casters;
+use super::draw::{KindDraw, draw_kind, triangle_set};
+use super::recorder::PassRecorder;
+use crate::device::gl::{ClearOp, PipelineState, Program, Texture};
+use crate::layout::{SOURCE_UNIT, WORDS_BINDING, WORKGROUP_SIZE};
+use crate::pass::Pass;
+use crate::region::Region;
+use crate::resources::compute_rasterizer::ComputeRasterizer;
+use crate::resources::scene_buffers::SceneBuffers;
+use crate::resources::shadow_map::ShadowMap;
+use crate::scene_data::geometry::BlendMode;
+use crate::shaders::shadow::{TEXELS_PER_INVOCATION, texels_per_workgroup};
+use crate::types::RasterBackend;
+use modalcast_model::error::{Result, fault_in};
+
+/// Image unit that the blur writes.
+const DESTINATION_IMAGE: u32 = 0;
+
+/// Draws the depth from the sun, layer by layer, unless the compute rasterizer has drawn it.
+pub(crate) fn draw_depth(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> Result<()> {
+    let Some(map) = buffers.shadow.as_ref().filter(|_| buffers.shadow_rasterizer().is_none()) else { return Ok(()) };
+    recorder.stats.raster_backends.shadow = Some(RasterBackend::OpenGl);
+    let (size, set) = (map.shadow.size, triangle_set(buffers));
+    for (layer, framebuffer) in (0..).zip(&map.framebuffers) {
+        cull_shadow_casters(recorder, buffers, size, |program| set_layer(program, map, layer))?;
+        recorder.begin(Pass::Shadow);
+        recorder.gl.begin_pass(framebuffer, Region::whole([size; 2]), ClearOp::Depth(None));
+        recorder.gl.set_pipeline_state(PipelineState { depth_write: true, ..PipelineState::default() });
+        for (blend_mode, program) in
+            [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend].into_iter().zip(&buffers.programs.shadow)
+        {
+            let Some(program) = program else { continue };
+            program.bind(None);
+            set_layer(program, map, layer);
+            draw_kind(recorder.gl, buffers, KindDraw { blend_mode, program, set });
+        }
+    }
+    if buffers.culler.is_some() {
+        recorder.stats.passes.push(Pass::ShadowCull);
+    }
+    recorder.finish(Pass::Shadow)
+}
+
+/// Blurs the moments of the depth, layer by layer. Does nothing for maps without moments.
+pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> Result<()> {
+    let Some(map) = &buffers.shadow else { return Ok(()) };
+    let Some(blurred) = &map.blurred else { return Ok(()) };
+    let gl = recorder.gl;
+    let mut programs: Vec<&Program> = buffers.programs.blur.iter().map(AsRef::as_ref).collect();
+    recorder.begin(Pass::Blur);
+    if let (Some((depths, program)), Some(first)) =
+        (buffers.shadow_rasterizer().and_then(ComputeRasterizer::blur_input), programs.first_mut())
+    {
+        *first = program;
+        depths.bind_storage(WORDS_BINDING);
+    }
+    for layer in 0..map.shadow.splits {
+        match (programs.as_slice(), &blurred.horizontal) {
+            ([both], None) => {
+                let groups = texels_per_workgroup(&map.shadow).map(|side| map.shadow.size.div_ceil(side));
+                bind_blur(both, &map.depth, map, layer);
+                blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
+                gl.dispatch(groups[0], groups[1]);
+            }
+            ([x, y], Some(horizontal)) if blurred.framebuffers.is_empty() => {
+                let (size, runs) = (map.shadow.size, map.shadow.size.div_ceil(TEXELS_PER_INVOCATION));
+                // The previous layer has read the image that this one writes.
+                recorder.continue_pass(Pass::Blur);
+                bind_blur(x, &map.depth, map, layer);
+                horizontal.bind_image(DESTINATION_IMAGE);
+                gl.dispatch(runs.div_ceil(WORKGROUP_SIZE), size);
+                recorder.continue_pass(Pass::Blur);
+                bind_blur(y, horizontal, map, layer);
+                blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
+                gl.dispatch(size.div_ceil(WORKGROUP_SIZE), runs);
+            }
+            ([x, y], Some(horizontal)) => {
+                gl.set_pipeline_state(PipelineState::default());
+                let into = [&blurred.framebuffers[0], &blurred.framebuffers[1 + layer as usize]];
+                for ((program, from), into) in [(x, &map.depth), (y, horizontal)].into_iter().zip(into) {
+                    bind_blur(program, from, map, layer);
+                    gl.draw_fullscreen_triangle(into, map.shadow.size, &buffers.empty_vertex_array);
+                }
+            }
+            _ => return Err(fault_in(Pass::Blur.name())("the plan has no program for this map")),
+        }
+    }
+    recorder.finish(Pass::Blur)
+}
+
+fn bind_blur(program: &Program, from: &Texture, map: &ShadowMap, layer: u32) {
+    program.bind(None);
+    from.bind(SOURCE_UNIT);
+    set_layer(program, map, layer);
+}
+
+/// Sets the layer of the bound program, which has that uniform only when the map is split.
+fn set_layer(program: &Program, map: &ShadowMap, layer: u32) {
+    if map.shadow.splits > 1 {
+        program.set_layer(layer);
+    }
+}

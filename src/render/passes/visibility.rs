@@ -1,0 +1,91 @@
+//! Visibility buffer: the triangle id and the depth of each sample.
+
+use super::draw::{KindDraw, TriangleSet, draw_groups, triangle_set};
+use super::recorder::{FrameContext, PassRecorder};
+use crate::device::gl::{ClearOp, Framebuffer, PipelineState, Program};
+use crate::pass::Pass;
+use crate::region::Region;
+use crate::resources::scene_buffers::SceneBuffers;
+use crate::scene_data::geometry::BlendMode;
+use crate::types::{FrameParams, RasterBackend};
+use crate::uniforms::frame::camera_is_above_ground;
+use modalcast_model::error::Result;
+
+/// A draw of ids and depth into `region` of a framebuffer that is at least as large as the region's frame.
+#[derive(Debug)]
+pub(super) struct IdDraw<'a> {
+    pub(super) framebuffer: &'a Framebuffer,
+    pub(super) clear: ClearOp<'a>,
+    pub(super) region: Region,
+    pub(super) set: TriangleSet,
+    /// Draws cut-outs; none without such triangles.
+    pub(super) mask: Option<&'a Program>,
+    /// Draws the opaque parts of blended triangles; none if they are ignored.
+    pub(super) opaque_parts: Option<&'a Program>,
+}
+
+/// Draws the id and depth of each sample, of the ground too if it must be rasterized.
+pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, ground: bool) -> Result<()> {
+    let FrameContext { buffers, target, programs, shot } = *frame;
+    // With several samples, depth says where an id is valid; the ids need no clear.
+    let clear = match target.desc.samples {
+        1 => ClearOp::DepthAndIds(Some(&target.dirty)),
+        _ => ClearOp::Depth(Some(&target.dirty.depth)),
+    };
+    recorder.begin(Pass::Visibility);
+    let ids = IdDraw {
+        framebuffer: &target.visibility_fbo,
+        clear,
+        region: target.draw_region.get(),
+        set: triangle_set(buffers),
+        mask: programs.mask.as_deref(),
+        opaque_parts: programs.opaque_parts.as_deref(),
+    };
+    draw_ids(recorder, buffers, &ids)?;
+    super::cull::record_visible(recorder, frame)?;
+    if ground { draw_ground(recorder, buffers, shot) } else { Ok(()) }
+}
+
+/// Draws ids and depth of all kinds of triangles that have a program.
+pub(super) fn draw_ids(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, ids: &IdDraw<'_>) -> Result<()> {
+    recorder.gl.begin_pass(ids.framebuffer, ids.region, ids.clear);
+    // Cut-outs come after opaque triangles: where something opaque is nearer, the depth test saves their texture
+    // lookups.
+    let kinds = [
+        (BlendMode::Opaque, buffers.programs.opaque.as_deref()),
+        (BlendMode::Mask, ids.mask),
+        (BlendMode::Blend, ids.opaque_parts),
+    ];
+    let state = PipelineState { depth_write: true, ..PipelineState::default() };
+    let mut any = false;
+    for (blend_mode, program) in kinds {
+        if let Some(program) = program {
+            draw_groups(recorder, buffers, KindDraw { blend_mode, program, set: ids.set }, state);
+            any = true;
+        }
+    }
+    if any {
+        recorder.stats.passes.push(Pass::Visibility);
+        recorder.stats.raster_backends.visibility = Some(RasterBackend::OpenGl);
+    }
+    recorder.check(Pass::Visibility)
+}
+
+/// Draws the ground into ids and depth of the bound framebuffer. A picture draws it only when something lies below it;
+/// otherwise the shading finds the ground.
+pub(super) fn draw_ground(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, shot: &FrameParams) -> Result<()> {
+    let Some(program) = buffers.programs.ground.as_ref().filter(|_| camera_is_above_ground(&buffers.scene, shot))
+    else {
+        return Ok(());
+    };
+    recorder.begin(Pass::Ground);
+    recorder.gl.set_pipeline_state(PipelineState {
+        depth_clamp: true,
+        depth_write: true,
+        polygon_offset: true,
+        ..PipelineState::default()
+    });
+    program.bind(None);
+    recorder.gl.draw_procedural(&buffers.empty_vertex_array, 3);
+    recorder.finish(Pass::Ground)
+}

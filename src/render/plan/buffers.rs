@@ -1,0 +1,249 @@
+//! The buffers of a scene by purpose. A plan holds their sizes, a loaded scene the buffers themselves.
+
+use std::fmt;
+
+use modalcast_model::error::Result;
+
+/// A buffer of a scene. The order of the variants is the order of plans.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum BufferName {
+    Positions,
+    Normals,
+    Triangles,
+    TriangleVertices,
+    Materials,
+    FrameUniforms,
+    CornerVertices,
+    Tangents,
+    Uvs,
+    TriangleMaterials,
+    ShadowCascades,
+    CullUniforms,
+    CullDraws,
+    CullCounters,
+    CullVisibleBits,
+    VisibleTriangleIds,
+    VisibleIndices,
+    PreviouslyVisible,
+}
+
+/// Vertices, corners and triangles.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct GeometryBuffers<T> {
+    /// 3 f32 per vertex, deformed.
+    pub(crate) positions: T,
+    /// 3 f32 per corner, deformed.
+    pub(crate) normals: T,
+    /// 4 f32 per corner, deformed; only with normal maps.
+    pub(crate) tangents: Option<T>,
+    /// 2 f32 per corner; only with textures or normal maps.
+    pub(crate) uvs: Option<T>,
+    /// Three corners per triangle.
+    pub(crate) triangles: T,
+    /// Three vertices per triangle.
+    pub(crate) triangle_vertices: T,
+    /// Vertex of each corner; only with cut-out or blended triangles.
+    pub(crate) corner_vertices: Option<T>,
+}
+
+/// Material table.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct MaterialBuffers<T> {
+    pub(crate) materials: T,
+    /// Index of the material of each triangle; only with several materials.
+    pub(crate) triangle_materials: Option<T>,
+}
+
+/// Uniform blocks that change with every frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct UniformBuffers<T> {
+    pub(crate) frame: T,
+    /// Only when the shadow map is split.
+    pub(crate) cascades: Option<T>,
+}
+
+/// Input and output of triangle culling.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct CullBuffers<T> {
+    pub(crate) uniforms: T,
+    /// Indirect draws of the groups, then the number of visible triangles per super block.
+    pub(crate) draws: T,
+    pub(crate) counters: T,
+    /// One bit per triangle that passed the tests.
+    pub(crate) visible_bits: T,
+    /// Ids of the visible triangles.
+    pub(crate) triangle_ids: T,
+    /// Three indices per visible triangle.
+    pub(crate) indices: T,
+    /// One bit per triangle that the last frame saw; only with occlusion culling.
+    pub(crate) previously_visible: Option<T>,
+}
+
+/// All buffers of a scene.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct SceneBufferSet<T> {
+    pub(crate) geometry: GeometryBuffers<T>,
+    pub(crate) materials: MaterialBuffers<T>,
+    pub(crate) uniforms: UniformBuffers<T>,
+    /// Only when triangles are culled.
+    pub(crate) culling: Option<CullBuffers<T>>,
+}
+
+impl BufferName {
+    /// Name in plans.
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Positions => "positions",
+            Self::Normals => "normals",
+            Self::Triangles => "triangles",
+            Self::TriangleVertices => "triangle vertices",
+            Self::Materials => "materials",
+            Self::FrameUniforms => "frame uniforms",
+            Self::CornerVertices => "corner vertices",
+            Self::Tangents => "tangents",
+            Self::Uvs => "uvs",
+            Self::TriangleMaterials => "triangle materials",
+            Self::ShadowCascades => "shadow cascades",
+            Self::CullUniforms => "cull uniforms",
+            Self::CullDraws => "cull draws",
+            Self::CullCounters => "cull counters",
+            Self::CullVisibleBits => "cull visible bits",
+            Self::VisibleTriangleIds => "visible triangle ids",
+            Self::VisibleIndices => "visible indices",
+            Self::PreviouslyVisible => "cull previously visible",
+        }
+    }
+}
+
+impl fmt::Display for BufferName {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(self.name())
+    }
+}
+
+impl<T> CullBuffers<T> {
+    /// The buffers with their names, in the order of plans.
+    pub(crate) fn named(&self) -> impl Iterator<Item = (BufferName, &T)> {
+        let always = [
+            (BufferName::CullUniforms, &self.uniforms),
+            (BufferName::CullDraws, &self.draws),
+            (BufferName::CullCounters, &self.counters),
+            (BufferName::CullVisibleBits, &self.visible_bits),
+            (BufferName::VisibleTriangleIds, &self.triangle_ids),
+            (BufferName::VisibleIndices, &self.indices),
+        ];
+        let previous = self.previously_visible.as_ref().map(|buffer| (BufferName::PreviouslyVisible, buffer));
+        always.into_iter().chain(previous)
+    }
+}
+
+impl<T> SceneBufferSet<T> {
+    /// The buffers with their names, in the order of plans.
+    pub(crate) fn named(&self) -> impl Iterator<Item = (BufferName, &T)> {
+        let Self { geometry, materials, uniforms, culling } = self;
+        let all = [
+            (BufferName::Positions, Some(&geometry.positions)),
+            (BufferName::Normals, Some(&geometry.normals)),
+            (BufferName::Triangles, Some(&geometry.triangles)),
+            (BufferName::TriangleVertices, Some(&geometry.triangle_vertices)),
+            (BufferName::Materials, Some(&materials.materials)),
+            (BufferName::FrameUniforms, Some(&uniforms.frame)),
+            (BufferName::CornerVertices, geometry.corner_vertices.as_ref()),
+            (BufferName::Tangents, geometry.tangents.as_ref()),
+            (BufferName::Uvs, geometry.uvs.as_ref()),
+            (BufferName::TriangleMaterials, materials.triangle_materials.as_ref()),
+            (BufferName::ShadowCascades, uniforms.cascades.as_ref()),
+        ];
+        let all = all.into_iter().filter_map(|(name, buffer)| Some((name, buffer?)));
+        all.chain(culling.iter().flat_map(CullBuffers::named))
+    }
+
+    /// Converts each buffer, for example its size to an allocated buffer.
+    ///
+    /// # Errors
+    /// The first error of `convert`.
+    pub(crate) fn try_map<U>(&self, mut convert: impl FnMut(BufferName, &T) -> Result<U>) -> Result<SceneBufferSet<U>> {
+        let mut one = |name, buffer: &T| convert(name, buffer);
+        let Self { geometry, materials, uniforms, culling } = self;
+        let geometry = GeometryBuffers {
+            positions: one(BufferName::Positions, &geometry.positions)?,
+            normals: one(BufferName::Normals, &geometry.normals)?,
+            tangents: geometry.tangents.as_ref().map(|own| one(BufferName::Tangents, own)).transpose()?,
+            uvs: geometry.uvs.as_ref().map(|own| one(BufferName::Uvs, own)).transpose()?,
+            triangles: one(BufferName::Triangles, &geometry.triangles)?,
+            triangle_vertices: one(BufferName::TriangleVertices, &geometry.triangle_vertices)?,
+            corner_vertices: geometry
+                .corner_vertices
+                .as_ref()
+                .map(|own| one(BufferName::CornerVertices, own))
+                .transpose()?,
+        };
+        let materials = MaterialBuffers {
+            materials: one(BufferName::Materials, &materials.materials)?,
+            triangle_materials: materials
+                .triangle_materials
+                .as_ref()
+                .map(|own| one(BufferName::TriangleMaterials, own))
+                .transpose()?,
+        };
+        let uniforms = UniformBuffers {
+            frame: one(BufferName::FrameUniforms, &uniforms.frame)?,
+            cascades: uniforms.cascades.as_ref().map(|own| one(BufferName::ShadowCascades, own)).transpose()?,
+        };
+        let culling = match culling {
+            Some(culling) => Some(CullBuffers {
+                uniforms: one(BufferName::CullUniforms, &culling.uniforms)?,
+                draws: one(BufferName::CullDraws, &culling.draws)?,
+                counters: one(BufferName::CullCounters, &culling.counters)?,
+                visible_bits: one(BufferName::CullVisibleBits, &culling.visible_bits)?,
+                triangle_ids: one(BufferName::VisibleTriangleIds, &culling.triangle_ids)?,
+                indices: one(BufferName::VisibleIndices, &culling.indices)?,
+                previously_visible: culling
+                    .previously_visible
+                    .as_ref()
+                    .map(|own| one(BufferName::PreviouslyVisible, own))
+                    .transpose()?,
+            }),
+            None => None,
+        };
+        Ok(SceneBufferSet { geometry, materials, uniforms, culling })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn try_map_keeps_each_buffer_in_its_field() {
+        let sizes = SceneBufferSet {
+            geometry: GeometryBuffers {
+                positions: 0,
+                normals: 1,
+                tangents: Some(7),
+                uvs: Some(8),
+                triangles: 2,
+                triangle_vertices: 3,
+                corner_vertices: Some(6),
+            },
+            materials: MaterialBuffers { materials: 4, triangle_materials: Some(9) },
+            uniforms: UniformBuffers { frame: 5, cascades: Some(10) },
+            culling: Some(CullBuffers {
+                uniforms: 11,
+                draws: 12,
+                counters: 13,
+                visible_bits: 14,
+                triangle_ids: 15,
+                indices: 16,
+                previously_visible: Some(17),
+            }),
+        };
+        let numbers = sizes.try_map(|name, number| {
+            assert_eq!(name as usize, *number, "{name}");
+            Ok(*number)
+        });
+        assert_eq!(numbers.expect("no errors"), sizes);
+        assert!(sizes.named().zip(0..).all(|((name, number), at)| name as usize == at && *number == at));
+        assert_eq!(sizes.named().count(), 18);
+    }
+}

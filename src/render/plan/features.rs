@@ -1,0 +1,99 @@
+//! Features of a scene's shaders. The defines of the sources are derived from them.
+
+use crate::types::BlurMethod;
+use modalcast_model::scene::{Culling, ShadowMethod, ShadowSettings};
+
+/// What the shaders of a scene must do; everything else is compiled out.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct ShaderFeatures {
+    /// Some triangle has a color texture.
+    pub(crate) textures: bool,
+    pub(crate) normal_maps: bool,
+    /// Triangles have several materials.
+    pub(crate) material_table: bool,
+    pub(crate) ground: bool,
+    /// Some triangle is blended.
+    pub(crate) blend_layers: bool,
+    /// Blended triangles are sorted per pixel; implies `blend_layers`.
+    pub(crate) oit: bool,
+    /// Two-pass transparency may draw parts of blended triangles as opaque.
+    pub(crate) opaque_parts: bool,
+    pub(crate) shadow: Option<ShadowSettings>,
+    /// As resolved for the device; never the automatic choice.
+    pub(crate) blur_method: BlurMethod,
+    /// Never the automatic choice.
+    pub(crate) culling: Culling,
+}
+
+impl ShaderFeatures {
+    /// No feature.
+    #[cfg(test)]
+    pub(crate) const NONE: Self = Self {
+        textures: false,
+        normal_maps: false,
+        material_table: false,
+        ground: false,
+        blend_layers: false,
+        oit: false,
+        opaque_parts: false,
+        shadow: None,
+        blur_method: BlurMethod::Tiles,
+        culling: Culling::None,
+    };
+
+    /// The defines of the shader sources.
+    pub(crate) fn defines(&self) -> Vec<&'static str> {
+        let branches = [
+            ("TEXTURES", self.textures),
+            ("NORMAL_MAPS", self.normal_maps),
+            ("UVS", self.textures || self.normal_maps),
+            ("MATERIAL_TABLE", self.material_table),
+            ("HAS_GROUND", self.ground),
+            ("BLEND_LAYERS", self.blend_layers),
+            ("OIT", self.oit),
+            ("OPAQUE_PARTS", self.opaque_parts),
+        ];
+        let branches = branches.into_iter().filter_map(|(name, on)| on.then_some(name));
+        let shadow = self.shadow.iter().flat_map(shadow_defines);
+        let culling: &[&str] = match self.culling {
+            Culling::Occlusion => &["CULLED", "OCCLUSION_CULLING"],
+            Culling::Triangles => &["CULLED"],
+            Culling::None | Culling::Auto => &[],
+        };
+        branches.chain(shadow).chain(culling.iter().copied()).collect()
+    }
+
+    /// Shadow settings when the map is a variance map.
+    pub(crate) fn variance_shadow(&self) -> Option<&ShadowSettings> {
+        self.shadow.as_ref().filter(|shadow| shadow.method == ShadowMethod::Variance)
+    }
+
+    /// Define of the number of cascades, when the shadow map is split.
+    pub(crate) fn cascade_define(&self) -> Option<&'static str> {
+        self.shadow.as_ref().and_then(cascade_define)
+    }
+
+    /// Whether triangles are culled at all.
+    pub(crate) fn has_culling(&self) -> bool {
+        self.culling != Culling::None
+    }
+
+    /// Whether hidden triangles are culled.
+    pub(crate) fn has_occlusion_culling(&self) -> bool {
+        self.culling == Culling::Occlusion
+    }
+}
+
+/// Defines of a shadow method.
+pub(crate) fn shadow_defines(shadow: &ShadowSettings) -> impl Iterator<Item = &'static str> {
+    let method = match shadow.method {
+        ShadowMethod::Variance => "SHADOW_VARIANCE",
+        ShadowMethod::Standard => "SHADOW_STANDARD",
+        ShadowMethod::PercentageCloser => "SHADOW_FILTERED",
+    };
+    ["SHADOWS", method].into_iter().chain(cascade_define(shadow))
+}
+
+fn cascade_define(shadow: &ShadowSettings) -> Option<&'static str> {
+    ["CASCADES 2", "CASCADES 3", "CASCADES 4"].get((shadow.splits as usize).wrapping_sub(2)).copied()
+}

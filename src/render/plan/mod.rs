@@ -1,0 +1,357 @@
+//! Plan of the device resources of a scene, derived once from its [`modalcast_model::scene::SceneFeatures`]: buffers, textures,
+//! passes and shader branches. It also lists the features that were left out, and what each saves compared with a scene
+//! that uses every feature.
+//!
+//! The renderer allocates and compiles exactly what the plan lists. Planning is pure and needs no device.
+
+pub(crate) mod buffers;
+pub(crate) mod culling;
+pub(crate) mod features;
+pub(crate) mod shadow_map;
+
+use self::buffers::{CullBuffers, GeometryBuffers, MaterialBuffers, SceneBufferSet, UniformBuffers};
+use self::culling::{cull_buffer_sizes, cull_passes, select_culling};
+use self::features::ShaderFeatures;
+use self::shadow_map::shadow_textures;
+use crate::device::gl::Limits;
+use crate::layout::material::MATERIAL_BYTES;
+use crate::pass::Pass;
+use crate::scene_data::geometry::{BlendMode, DrawGroup, blend_mode, groups, used_materials, uses_material_table};
+use crate::scene_data::textures::{TextureRole, arrays};
+use crate::types::BlurMethod;
+use crate::uniforms::cascades::ShadowCascades;
+use crate::uniforms::frame::FrameUniforms;
+use modalcast_model::scene::{Antialiasing, Culling, Scene, ShadowSettings, ToneMapping, Transparency};
+
+/// A buffer or texture and its size.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub struct Allocation {
+    pub name: String,
+    pub bytes: u64,
+}
+
+/// A feature that the scene does not need, and the savings from leaving it out.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub struct OmittedFeature {
+    /// Name of the feature.
+    pub feature: &'static str,
+    /// Device memory that is not allocated.
+    pub bytes: u64,
+    /// Passes that do not run.
+    pub passes: Vec<Pass>,
+    /// Description of the shader work that is saved.
+    pub shaders: &'static str,
+}
+
+/// All device resources and passes of a scene.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub struct RenderPlan {
+    /// Buffers of the scene, by name.
+    pub buffers: Vec<Allocation>,
+    /// Textures of the scene, by name.
+    pub textures: Vec<Allocation>,
+    /// Passes of a frame, in execution order. The ground pass runs only when the camera is above the ground and
+    /// something lies below it.
+    pub passes: Vec<Pass>,
+    /// Draw calls of the occluders, visibility and blended passes, fourteen at most; independent of the number of
+    /// domains and materials.
+    pub draw_calls: usize,
+    /// Defines that the shaders are compiled with.
+    pub defines: Vec<&'static str>,
+    pub omitted: Vec<OmittedFeature>,
+}
+
+impl RenderPlan {
+    /// Whether the shaders are compiled with a define.
+    pub fn defines(&self, name: &str) -> bool {
+        self.defines.contains(&name)
+    }
+
+    /// Bytes of all buffers and textures.
+    pub fn bytes(&self) -> u64 {
+        self.buffers.iter().chain(&self.textures).map(|allocation| allocation.bytes).sum()
+    }
+}
+
+/// The plan of a scene for one device, with typed buffers and features.
+#[derive(Debug)]
+pub(crate) struct ScenePlan {
+    /// Sizes in bytes.
+    pub(crate) buffers: SceneBufferSet<u64>,
+    pub(crate) features: ShaderFeatures,
+    /// The same plan by name.
+    pub(crate) report: RenderPlan,
+}
+
+/// Plans a scene for a GPU without limits.
+pub fn plan(scene: &Scene) -> RenderPlan {
+    let limits = Limits { max_storage_bytes: u64::MAX, ..Limits::default() };
+    ScenePlan::new(scene, &limits, BlurMethod::Auto).report
+}
+
+impl ScenePlan {
+    /// Plans a scene for a device, which may be a software rasterizer.
+    pub(crate) fn new(scene: &Scene, limits: &Limits, blur_method: BlurMethod) -> Self {
+        let (groups, _) = groups(scene);
+        let culling = select_culling(scene, limits);
+        let features = features(scene, blur_method.resolve(limits.software), culling);
+        let buffers = buffer_sizes(scene, culling);
+        let named = buffers.named().map(|(name, bytes)| Allocation { name: name.to_string(), bytes: *bytes });
+        let report = RenderPlan {
+            buffers: named.collect(),
+            textures: textures(scene, features.blur_method),
+            passes: passes(scene, &groups, &features),
+            draw_calls: draw_calls(scene, &groups) + occluder_draw_calls(&groups, culling),
+            defines: features.defines(),
+            omitted: omitted(scene, culling),
+        };
+        Self { buffers, features, report }
+    }
+}
+
+/// The passes of a frame, in execution order.
+fn passes(scene: &Scene, groups: &[DrawGroup], features: &ShaderFeatures) -> Vec<Pass> {
+    let has = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
+    let mut passes = Vec::new();
+    if let Some(shadow) = features.shadow {
+        passes.extend(features.has_culling().then_some(Pass::ShadowCull));
+        passes.push(Pass::Shadow);
+        passes.extend(shadow.has_moments().then_some(Pass::Blur));
+    }
+    let has_visibility = has(BlendMode::Opaque) || has(BlendMode::Mask) || features.opaque_parts;
+    passes.extend(cull_passes(features.culling));
+    passes.extend(has_visibility.then_some(Pass::Visibility));
+    passes.extend(features.ground.then_some(Pass::Ground));
+    passes.extend(if features.blend_layers { blend_passes(scene) } else { &[] });
+    passes.push(Pass::Background);
+    passes.extend(has_visibility.then_some(Pass::Shade));
+    passes.extend(scene.look.bloom.map(|_| Pass::Bloom));
+    passes.push(Pass::Encode);
+    passes
+}
+
+/// The passes of blended triangles.
+const fn blend_passes(scene: &Scene) -> &'static [Pass] {
+    match scene.look.transparency {
+        Transparency::TwoPass => &[Pass::Blended],
+        Transparency::OrderIndependent => &[Pass::OitCount, Pass::OitAllocate, Pass::OitFill, Pass::OitResolve],
+    }
+}
+
+/// Whether some blended triangle may reach the alpha threshold above which two-pass transparency draws it as opaque.
+fn opaque_parts(scene: &Scene) -> bool {
+    let (look, materials) = (scene.look, used_materials(scene));
+    let dense = |material: usize| {
+        let material = &scene.materials[material];
+        blend_mode(material) == BlendMode::Blend && material.alpha >= look.opaque_alpha
+    };
+    look.transparency == Transparency::TwoPass && materials.into_iter().any(dense)
+}
+
+/// Draw calls of the occluder pass: culling by depth draws opaque and cut-out groups twice.
+fn occluder_draw_calls(groups: &[DrawGroup], culling: Culling) -> usize {
+    let hiding = groups.iter().filter(|group| group.blend_mode != BlendMode::Blend).count();
+    if culling == Culling::Occlusion { hiding } else { 0 }
+}
+
+/// Draw calls without occluders. Exact transparency draws blended triangles in three phases, the third only on demand;
+/// two-pass transparency draws their opaque parts in a second phase.
+fn draw_calls(scene: &Scene, groups: &[DrawGroup]) -> usize {
+    let blended = groups.iter().filter(|group| group.blend_mode == BlendMode::Blend).count();
+    let turns = match scene.look.transparency {
+        Transparency::OrderIndependent => 3,
+        Transparency::TwoPass => 1 + usize::from(opaque_parts(scene)),
+    };
+    groups.len() + (turns - 1) * blended
+}
+
+fn buffer_sizes(scene: &Scene, culling: Culling) -> SceneBufferSet<u64> {
+    let (layout, needs) = (&scene.layout, scene.needs);
+    let [vertices, corners, triangles] = [layout.vertices, layout.corners, layout.triangles].map(|count| count as u64);
+    let cascades = scene.look.shadow.filter(|shadow| shadow.splits > 1);
+    SceneBufferSet {
+        geometry: GeometryBuffers {
+            positions: 12 * vertices,
+            normals: 12 * corners,
+            tangents: needs.normal_maps.then_some(16 * corners),
+            uvs: (needs.textures || needs.normal_maps).then_some(8 * corners),
+            triangles: 12 * triangles,
+            triangle_vertices: 12 * triangles,
+            corner_vertices: (needs.mask || needs.blend).then_some(4 * corners),
+        },
+        materials: MaterialBuffers {
+            materials: (MATERIAL_BYTES * used_materials(scene).len()) as u64,
+            triangle_materials: uses_material_table(scene).then_some(4 * triangles),
+        },
+        uniforms: UniformBuffers {
+            frame: size_of::<FrameUniforms>() as u64,
+            cascades: cascades.map(|_| size_of::<ShadowCascades>() as u64),
+        },
+        culling: cull_buffer_sizes(scene, culling),
+    }
+}
+
+fn textures(scene: &Scene, blur_method: BlurMethod) -> Vec<Allocation> {
+    let mut textures = Vec::new();
+    for (purpose, word) in [(TextureRole::Color, "colors"), (TextureRole::Normal, "normals")] {
+        for array in arrays(scene, purpose) {
+            let name = format!("{word} {} x {} x {}", array.width, array.height, array.layers.len());
+            textures.push(Allocation { name, bytes: array.bytes() });
+        }
+    }
+    if let Some(shadow) = scene.look.shadow {
+        textures.extend(shadow_allocations(&shadow, blur_method));
+    }
+    textures
+}
+
+fn shadow_allocations(shadow: &ShadowSettings, blur_method: BlurMethod) -> impl Iterator<Item = Allocation> {
+    let texels = u64::from(shadow.size) * u64::from(shadow.size);
+    shadow_textures(shadow, blur_method).into_iter().map(move |texture| Allocation {
+        name: texture.name.into(),
+        bytes: u64::from(texture.texel_bytes * texture.layers) * texels,
+    })
+}
+
+fn features(scene: &Scene, blur_method: BlurMethod, culling: Culling) -> ShaderFeatures {
+    let (needs, look) = (scene.needs, &scene.look);
+    ShaderFeatures {
+        textures: needs.textures,
+        normal_maps: needs.normal_maps,
+        material_table: uses_material_table(scene),
+        ground: look.ground.is_some(),
+        blend_layers: needs.blend,
+        oit: needs.blend && look.transparency == Transparency::OrderIndependent,
+        opaque_parts: opaque_parts(scene),
+        shadow: look.shadow,
+        blur_method,
+        culling,
+    }
+}
+
+fn omitted(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
+    let (needs, layout, look) = (scene.needs, &scene.layout, &scene.look);
+    let map: u64 = shadow_allocations(&look.shadow.unwrap_or_default(), BlurMethod::Auto).map(|part| part.bytes).sum();
+    let per_corner = |bytes: usize| (bytes * layout.corners) as u64;
+    let uvs = if needs.textures || needs.normal_maps { 0 } else { per_corner(8) };
+    let all: [(bool, &str, u64, &[Pass], &str); 12] = [
+        (needs.normal_maps, "normal maps", per_corner(16), &[], "no tangent frame, no normal map lookup"),
+        (needs.textures, "textures", uvs, &[], "no colour lookup"),
+        (needs.mask, "mask", 0, &[], "no discard, no sample mask; depth needs no fragment shader"),
+        (needs.blend, "blend", 0, blend_passes(scene), "no layers in the shading, 8 bytes a sample less"),
+        (needs.shadows, "shadows", map, &[Pass::Shadow, Pass::Blur], "no shadow lookup"),
+        (uses_material_table(scene), "many materials", 4 * layout.triangles as u64, &[], "no lookup per triangle"),
+        (look.ground.is_some(), "ground", 0, &[Pass::Ground], "no ground program"),
+        (look.bloom.is_some(), "bloom", 0, &[Pass::Bloom], "what glows is not kept, 10.7 bytes a pixel less"),
+        (look.tone != ToneMapping::None, "tone curve", 0, &[], "light is shown as it is"),
+        (look.antialias == Antialiasing::Fxaa, "fxaa", 0, &[], "no search for edges in the picture"),
+        (
+            culling != Culling::None,
+            "culling",
+            cull_buffer_sizes(scene, Culling::Triangles)
+                .iter()
+                .flat_map(CullBuffers::named)
+                .map(|(_, bytes)| *bytes)
+                .sum(),
+            cull_passes(Culling::Triangles),
+            "fragments know their triangle without a lookup",
+        ),
+        (look.dither, "dither", 0, &[], "levels are rounded without a pattern"),
+    ];
+    let unneeded = all.into_iter().filter(|row| !row.0);
+    unneeded
+        .map(|(_, feature, bytes, passes, shaders)| OmittedFeature { feature, bytes, passes: passes.to_vec(), shaders })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene_data::geometry::tests::squares;
+    use modalcast_model::domain::{AlphaMode, Material, Texture};
+    use modalcast_model::scene::{Bloom, RenderSettings};
+
+    fn names(allocations: &[Allocation]) -> Vec<&str> {
+        allocations.iter().map(|allocation| allocation.name.as_str()).collect()
+    }
+
+    fn pass_names(plan: &RenderPlan) -> Vec<&str> {
+        plan.passes.iter().map(|pass| pass.name()).collect()
+    }
+
+    fn everything() -> modalcast_model::scene::SceneParts {
+        let materials = vec![
+            Material { color_texture: Some(0), normal_texture: Some(0), ..Material::default() },
+            Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() },
+            Material { alpha_mode: AlphaMode::Blend, ..Material::default() },
+        ];
+        let mut parts = squares(materials);
+        parts.textures.push(Texture::new("one", 1, 1, vec![255; 4]).expect("fits"));
+        let look =
+            RenderSettings { bloom: Some(Bloom::default()), tone: ToneMapping::Aces, dither: true, ..parts.look };
+        parts.look = RenderSettings { antialias: Antialiasing::Fxaa, culling: Culling::Occlusion, ..look };
+        parts
+    }
+
+    #[test]
+    fn a_plain_scene_without_shadow_leaves_out_everything_and_says_what_that_saved() {
+        let mut parts = squares(vec![Material::default()]);
+        parts.look.shadow = None;
+        parts.look.ground = None;
+        let scene = Scene::new(parts).expect("good");
+        let plan = plan(&scene);
+        assert_eq!(pass_names(&plan), ["visibility", "background", "shade", "encode"]);
+        let expected = ["positions", "normals", "triangles", "triangle vertices", "materials", "frame uniforms"];
+        assert_eq!(names(&plan.buffers), expected);
+        assert!(plan.textures.is_empty() && plan.defines.is_empty());
+        let left: Vec<&str> = plan.omitted.iter().map(|saving| saving.feature).collect();
+        let materials = ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"];
+        assert_eq!(left, [&materials[..], &["bloom", "tone curve", "fxaa", "culling", "dither"]].concat());
+        assert_eq!(plan.omitted[0].bytes, 16 * 4, "tangents of four corners");
+        assert_eq!(plan.omitted[4].bytes, 12 * 1024 * 1024, "map and moments");
+    }
+
+    #[test]
+    fn a_scene_that_is_all_glass_rasterises_no_ids_and_shades_no_triangle_that_hides_others() {
+        let glass = |transparency, alpha| {
+            let mut parts = squares(vec![Material { alpha_mode: AlphaMode::Blend, alpha, ..Material::default() }]);
+            (parts.look.shadow, parts.look.transparency) = (None, transparency);
+            plan(&Scene::new(parts).expect("good"))
+        };
+        let passes = glass(Transparency::TwoPass, 0.5);
+        assert_eq!(pass_names(&passes), ["ground", "blended", "background", "encode"]);
+        assert_eq!((passes.draw_calls, passes.defines), (1, vec!["HAS_GROUND", "BLEND_LAYERS"]));
+        assert_eq!(passes.buffers.last().map(|last| last.name.as_str()), Some("corner vertices"));
+        let exact = glass(Transparency::OrderIndependent, 1.0);
+        assert_eq!(
+            pass_names(&exact),
+            ["ground", "oit count", "oit allocate", "oit fill", "oit resolve", "background", "encode"]
+        );
+        assert_eq!((exact.draw_calls, exact.defines), (3, vec!["HAS_GROUND", "BLEND_LAYERS", "OIT"]));
+        let dense = glass(Transparency::TwoPass, 1.0);
+        assert_eq!(
+            pass_names(&dense),
+            ["visibility", "ground", "blended", "background", "shade", "encode"],
+            "it may be opaque"
+        );
+        assert_eq!((dense.draw_calls, dense.defines), (2, vec!["HAS_GROUND", "BLEND_LAYERS", "OPAQUE_PARTS"]));
+    }
+
+    #[test]
+    fn a_scene_that_needs_all_leaves_out_nothing() {
+        let mut parts = everything();
+        parts.look.transparency = Transparency::TwoPass;
+        let plan = plan(&Scene::new(parts).expect("good"));
+        assert_eq!(
+            pass_names(&plan),
+            [
+                &["shadow cull", "shadow", "blur", "occluders", "cull", "visibility", "ground", "blended"][..],
+                &["background", "shade", "bloom", "encode"]
+            ]
+            .concat()
+        );
+        assert!(plan.omitted.is_empty(), "{:?}", plan.omitted);
+        assert!(names(&plan.buffers).contains(&"tangents") && names(&plan.buffers).contains(&"uvs"));
+        assert_eq!(plan.textures[0], Allocation { name: "colors 1 x 1 x 1".into(), bytes: 4 });
+    }
+}

@@ -1,0 +1,26 @@
+//! Textures of the shadow map.
+
+use crate::types::BlurMethod;
+use modalcast_model::scene::{MomentFormat, ShadowSettings};
+
+/// A texture of a shadow map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct ShadowTexture {
+    pub(crate) name: &'static str,
+    pub(crate) texel_bytes: u32,
+    pub(crate) layers: u32,
+}
+
+/// The textures of a map.
+pub(crate) fn shadow_textures(shadow: &ShadowSettings, blur_method: BlurMethod) -> Vec<ShadowTexture> {
+    let texture = |name, texel_bytes, layers| ShadowTexture { name, texel_bytes, layers };
+    let pair = if shadow.moments == MomentFormat::F16 { 4 } else { 8 };
+    let mut textures = vec![texture("shadow depth", 4, shadow.splits)];
+    if shadow.has_moments() {
+        textures.push(texture("shadow moments", pair, shadow.splits));
+        if matches!(blur_method, BlurMethod::Rows | BlurMethod::Fragments) {
+            textures.push(texture("shadow moments, blurred in x", pair, 1));
+        }
+    }
+    textures
+}

@@ -1,0 +1,97 @@
+//! Frames in flight, and pixels that any thread may copy.
+
+use std::cell::Cell;
+use std::time::{Duration, Instant};
+
+use rayon::prelude::*;
+
+use crate::device::gl::{Fence, PassTimer, ReadbackView};
+use crate::device::readback_ring::ReadbackSlot;
+use crate::pass::{FrameTimes, Pass, RenderStage};
+use crate::resources::target_desc::TargetDesc;
+use crate::types::{FrameImage, FrameStats, RasterBackends};
+use modalcast_model::error::{Error, Result};
+
+/// Bytes that one thread copies at a time: large enough that the cost of starting a task is small in comparison.
+const COPY_CHUNK_BYTES: usize = 1 << 20;
+
+/// A frame in flight. Dropping the ticket abandons the frame.
+#[derive(Debug)]
+pub struct PendingFrame {
+    pub(super) desc: TargetDesc,
+    /// None for a frame whose pixels are not read back.
+    pub(super) slot: Option<ReadbackSlot>,
+    pub(super) fence: Fence,
+    /// Passes in execution order, each with its timer.
+    pub(super) passes: Vec<(Pass, PassTimer)>,
+    pub(super) stats: FrameStats,
+    pub(super) limit: Duration,
+    /// When the host first polled or waited for the frame.
+    pub(super) first_wait: Cell<Option<Instant>>,
+}
+
+/// Pixels of a finished frame, still in the staging buffer that the device wrote. Any thread may copy them. The ring
+/// cannot reuse the staging buffer until then, so copy them soon.
+#[derive(Debug)]
+pub struct MappedPixels {
+    pub(super) width: u32,
+    pub(super) height: u32,
+    pub(super) view: Option<ReadbackView>,
+    pub(super) times: FrameTimes,
+    pub(super) raster_backends: RasterBackends,
+}
+
+impl PendingFrame {
+    /// Whether [`super::Renderer::map_pixels`] would return without waiting.
+    pub fn is_ready(&self) -> bool {
+        self.is_ready_within(Duration::ZERO)
+    }
+
+    /// Waits at most `limit` for the frame and returns whether it is ready. A frame that exceeds the watchdog's limit
+    /// counts as ready: retrieving it reports the timeout.
+    pub fn is_ready_within(&self, limit: Duration) -> bool {
+        self.time_left().is_zero() || self.fence.is_done_within(limit)
+    }
+
+    /// Remaining watchdog time. The clock starts at the first poll or wait.
+    pub(super) fn time_left(&self) -> Duration {
+        let begin = self.first_wait.get().unwrap_or_else(Instant::now);
+        self.first_wait.set(Some(begin));
+        self.limit.saturating_sub(begin.elapsed())
+    }
+
+    pub(super) fn wait(&self) -> Result<()> {
+        self.fence.wait(Pass::Read.name(), self.time_left()).map_err(|error| self.name_failed_pass(error))
+    }
+
+    /// Names the pass at which the device stopped: the one after the last pass that is known to be finished.
+    fn name_failed_pass(&self, error: Error) -> Error {
+        let Error::Fault { stage, reason } = error else { return error };
+        let over = self.passes.iter().take_while(|(_, timer)| timer.is_done()).count();
+        let stage = self.passes.get(over).map_or(stage, |(pass, _)| pass.name());
+        let last = over.checked_sub(1).map_or("none".into(), |last| format!("'{}'", self.passes[last].0));
+        Error::Fault { stage, reason: format!("{reason} ({:?}); the last pass that it finished: {last}", self.limit) }
+    }
+}
+
+impl MappedPixels {
+    /// Adds the milliseconds of the upload that preceded the frame.
+    #[must_use]
+    pub fn with_upload_time(mut self, ms: f64) -> Self {
+        self.times.insert_first(RenderStage::Upload, ms);
+        self
+    }
+
+    /// Copies the pixels; several threads share the work when there are many.
+    pub fn into_image(self) -> FrameImage {
+        let begin = Instant::now();
+        let Self { width, height, view, mut times, raster_backends } = self;
+        let bytes = view.as_ref().map_or(&[][..], ReadbackView::bytes);
+        let mut rgba = vec![0; bytes.len()];
+        let stretches = rgba.par_chunks_mut(COPY_CHUNK_BYTES).zip(bytes.par_chunks(COPY_CHUNK_BYTES));
+        stretches.for_each(|(to, from)| to.copy_from_slice(from));
+        drop(view);
+        times.add(RenderStage::Read, begin.elapsed().as_secs_f64() * 1e3);
+        FrameImage { width, height, rgba, times, raster_backends }
+    }
+}

@@ -1,0 +1,73 @@
+//! Lists of the triangles that passed the culling tests.
+
+use std::rc::Rc;
+
+use crate::device::gl::{self, Buffer, Gl, Texture, VertexArray};
+use crate::layout::CULL_BLOCK;
+use crate::layout::cull::{
+    COUNTERS_BINDING, CullUniforms, DRAWS_BINDING, INDICES_BINDING, MAX_GROUPS, PREVIOUSLY_VISIBLE_BINDING,
+    TRIANGLE_IDS_BINDING, VISIBLE_BITS_BINDING,
+};
+use crate::plan::buffers::CullBuffers;
+use crate::scene_data::geometry::{BlendMode, DrawGroup};
+use modalcast_model::error::Result;
+
+/// The lists of a culled scene, one per group, and the vertex arrays that draw them.
+#[derive(Debug)]
+pub(crate) struct TriangleCuller {
+    pub(crate) buffers: CullBuffers<Buffer>,
+    pub(crate) uniforms: CullUniforms,
+    /// Buffer texture over the ids of the listed triangles.
+    pub(crate) triangle_ids: Texture,
+    arrays: CullVertexArrays,
+}
+
+/// Vertex arrays that index the lists.
+#[derive(Debug)]
+pub(crate) struct CullVertexArrays {
+    /// Of opaque triangles.
+    pub(crate) positions: VertexArray,
+    /// Of cut-out and blended triangles; none without such triangles.
+    pub(crate) corners: Option<VertexArray>,
+}
+
+impl TriangleCuller {
+    /// Initializes the buffers of the lists: no triangle was visible before.
+    pub(crate) fn new(
+        gl: &Rc<Gl>,
+        buffers: CullBuffers<Buffer>,
+        groups: &[DrawGroup],
+        arrays: CullVertexArrays,
+    ) -> Result<Self> {
+        debug_assert!(groups.len() <= MAX_GROUPS);
+        let uniforms = CullUniforms::new(groups, gl.limits.subpixel_step());
+        buffers.uniforms.write(bytemuck::bytes_of(&uniforms));
+        if let Some(previous) = &buffers.previously_visible {
+            previous.write(&vec![0; uniforms.mask_bytes()]);
+        }
+        Ok(Self { triangle_ids: gl.buffer_texture(&buffers.triangle_ids, gl::R32UI)?, buffers, uniforms, arrays })
+    }
+
+    /// Vertex array of one kind of listed triangle.
+    pub(crate) const fn vertex_array(&self, blend_mode: BlendMode) -> Option<&VertexArray> {
+        match blend_mode {
+            BlendMode::Opaque => Some(&self.arrays.positions),
+            BlendMode::Mask | BlendMode::Blend => self.arrays.corners.as_ref(),
+        }
+    }
+
+    /// Binds the buffers for the culling programs.
+    pub(crate) fn bind(&self) {
+        let CullBuffers { uniforms, draws, counters, visible_bits, triangle_ids, indices, previously_visible } =
+            &self.buffers;
+        draws.bind_storage(DRAWS_BINDING);
+        visible_bits.bind_storage(VISIBLE_BITS_BINDING);
+        counters.bind_storage(COUNTERS_BINDING);
+        if let Some(previous) = previously_visible {
+            previous.bind_storage(PREVIOUSLY_VISIBLE_BINDING);
+        }
+        triangle_ids.bind_storage(TRIANGLE_IDS_BINDING);
+        indices.bind_storage(INDICES_BINDING);
+        uniforms.bind_uniform(CULL_BLOCK, size_of::<CullUniforms>());
+    }
+}

@@ -1,0 +1,242 @@
+//! Shader programs of a scene's passes, with the branches that its materials need, and the cache that shares them
+//! between scenes.
+
+use std::collections::HashMap;
+use std::rc::Rc;
+
+use crate::device::gl::{Gl, Program};
+use crate::scene_data::geometry::{BlendMode, DrawGroup};
+use crate::shaders::{self, ProgramSource, ShaderOptions};
+use modalcast_model::error::Result;
+use modalcast_model::scene::RenderSettings;
+
+/// Maximum number of programs in the cache.
+const MAX_PROGRAMS: usize = 128;
+
+/// Returns the program of a source, compiled or from the cache.
+pub(crate) type ProgramCompiler<'a> = dyn FnMut(ProgramSource) -> Result<Rc<Program>> + 'a;
+
+/// Compiled programs by source, at most [`MAX_PROGRAMS`].
+#[derive(Debug)]
+pub(crate) struct ProgramCache {
+    gl: Rc<Gl>,
+    programs: HashMap<ProgramSource, Rc<Program>>,
+}
+
+/// Programs that do not depend on the samples per pixel; none where the scene has no such pass or triangles.
+#[derive(Debug)]
+pub(crate) struct ScenePrograms {
+    /// In execution order; empty when the shadow map has no moments.
+    pub(crate) blur: Vec<Rc<Program>>,
+    /// Shadow casters of each kind.
+    pub(crate) shadow: [Option<Rc<Program>>; 3],
+    pub(crate) opaque: Option<Rc<Program>>,
+    pub(crate) ground: Option<Rc<Program>>,
+    /// Culling of shadow casters.
+    pub(crate) shadow_cull: Option<ShadowCullPrograms>,
+}
+
+/// Programs for one number of samples per pixel.
+#[derive(Debug, Clone)]
+pub(crate) struct SampleCountPrograms {
+    pub(crate) samples: u32,
+    pub(crate) mask: Option<Rc<Program>>,
+    /// Two-pass transparency: the opaque parts of blended triangles, if there may be any. `blended` draws the rest of
+    /// them.
+    pub(crate) opaque_parts: Option<Rc<Program>>,
+    pub(crate) blended: Option<Rc<Program>>,
+    /// Exact transparency.
+    pub(crate) oit: Option<OitPrograms>,
+    pub(crate) background: Rc<Program>,
+    pub(crate) shade: Option<Rc<Program>>,
+    /// Triangle culling.
+    pub(crate) cull: Option<CullPrograms>,
+}
+
+/// Programs of the camera's lists, for one number of samples per pixel.
+#[derive(Debug, Clone)]
+pub(crate) struct CullPrograms {
+    pub(crate) cull_triangles: Rc<Program>,
+    pub(crate) compact: Rc<Program>,
+    pub(crate) occlusion: Option<OcclusionPrograms>,
+}
+
+/// Further programs of occlusion culling.
+#[derive(Debug, Clone)]
+pub(crate) struct OcclusionPrograms {
+    pub(crate) cull_previous: Rc<Program>,
+    pub(crate) record_visible: Rc<Program>,
+    /// Builds the first levels of the depth pyramid.
+    pub(crate) fine_levels: Rc<Program>,
+    /// Builds the remaining levels from them.
+    pub(crate) coarse_levels: Rc<Program>,
+}
+
+/// Programs of the shadow casters' lists.
+#[derive(Debug)]
+pub(crate) struct ShadowCullPrograms {
+    pub(crate) cull_triangles: Rc<Program>,
+    pub(crate) compact: Rc<Program>,
+}
+
+/// Programs of exact transparency.
+#[derive(Debug, Clone)]
+pub(crate) struct OitPrograms {
+    pub(crate) gather: Rc<Program>,
+    pub(crate) histogram: Rc<Program>,
+    pub(crate) allocate: Rc<Program>,
+    pub(crate) resolve: Rc<Program>,
+}
+
+/// The post-processing programs of one look.
+#[derive(Debug)]
+pub(crate) struct PostPrograms {
+    pub(crate) encode: Rc<Program>,
+    pub(crate) bloom: Option<BloomPrograms>,
+}
+
+/// The bloom programs: downsample, upsample, and the last upsample onto the picture.
+#[derive(Debug)]
+pub(crate) struct BloomPrograms {
+    pub(crate) down: Rc<Program>,
+    pub(crate) up: Rc<Program>,
+    pub(crate) last: Rc<Program>,
+}
+
+impl ProgramCache {
+    pub(crate) fn new(gl: &Rc<Gl>) -> Self {
+        Self { gl: Rc::clone(gl), programs: HashMap::new() }
+    }
+
+    /// The program of a source, compiled unless it is cached. A full cache first drops the programs that no scene uses,
+    /// or all of them if scenes use all.
+    ///
+    /// # Errors
+    /// `Fault` with the compiler's log.
+    pub(crate) fn program(&mut self, source: ProgramSource) -> Result<Rc<Program>> {
+        if let Some(program) = self.programs.get(&source) {
+            return Ok(Rc::clone(program));
+        }
+        if self.programs.len() >= MAX_PROGRAMS {
+            self.programs.retain(|_, program| Rc::strong_count(program) > 1);
+        }
+        if self.programs.len() >= MAX_PROGRAMS {
+            self.programs.clear();
+        }
+        let stages: Vec<(u32, &str)> = source.stages.iter().map(|(stage, text)| (*stage, text.as_str())).collect();
+        let program = Rc::new(self.gl.program(&source.label, &stages)?);
+        self.programs.insert(source, Rc::clone(&program));
+        Ok(program)
+    }
+
+    /// Labels of the cached programs.
+    #[cfg(test)]
+    pub(crate) fn labels(&self) -> impl Iterator<Item = &str> {
+        self.programs.keys().map(|source| source.label.as_str())
+    }
+}
+
+/// Compiles a program if it is wanted.
+fn compile_if(
+    wanted: bool,
+    compile: &mut ProgramCompiler<'_>,
+    source: impl FnOnce() -> ProgramSource,
+) -> Result<Option<Rc<Program>>> {
+    if wanted { compile(source()).map(Some) } else { Ok(None) }
+}
+
+impl ScenePrograms {
+    pub(crate) fn compile(
+        options: &ShaderOptions,
+        groups: &[DrawGroup],
+        compile: &mut ProgramCompiler<'_>,
+    ) -> Result<Self> {
+        let any = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
+        let has_shadow = options.features.shadow.is_some();
+        let mut caster =
+            |blend_mode: BlendMode| compile_if(has_shadow && any(blend_mode), compile, || options.shadow(blend_mode));
+        let shadow = [caster(BlendMode::Opaque)?, caster(BlendMode::Mask)?, caster(BlendMode::Blend)?];
+        let shadow_cull = match has_shadow && options.features.has_culling() {
+            true => Some(ShadowCullPrograms {
+                cull_triangles: compile(options.cull_casters())?,
+                compact: compile(options.compact())?,
+            }),
+            false => None,
+        };
+        Ok(Self {
+            blur: options.blur().into_iter().map(&mut *compile).collect::<Result<_>>()?,
+            shadow,
+            opaque: compile_if(any(BlendMode::Opaque), compile, || options.visibility(BlendMode::Opaque, 1))?,
+            ground: compile_if(options.features.ground, compile, || options.ground())?,
+            shadow_cull,
+        })
+    }
+}
+
+impl SampleCountPrograms {
+    pub(crate) fn compile(
+        options: &ShaderOptions,
+        groups: &[DrawGroup],
+        samples: u32,
+        compile: &mut ProgramCompiler<'_>,
+    ) -> Result<Self> {
+        let any = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
+        let (oit, opaque_parts) = (options.features.oit, options.features.opaque_parts);
+        let has_visibility = any(BlendMode::Opaque) || any(BlendMode::Mask) || opaque_parts;
+        Ok(Self {
+            samples,
+            mask: compile_if(any(BlendMode::Mask), compile, || options.visibility(BlendMode::Mask, samples))?,
+            opaque_parts: compile_if(opaque_parts, compile, || options.visibility(BlendMode::Blend, samples))?,
+            blended: compile_if(any(BlendMode::Blend) && !oit, compile, || options.blended(samples))?,
+            oit: if oit { Some(OitPrograms::compile(options, samples, compile)?) } else { None },
+            background: compile(options.background(samples))?,
+            shade: compile_if(has_visibility, compile, || options.shade(samples))?,
+            cull: if options.features.has_culling() {
+                Some(CullPrograms::compile(options, samples, compile)?)
+            } else {
+                None
+            },
+        })
+    }
+}
+
+impl CullPrograms {
+    fn compile(options: &ShaderOptions, samples: u32, compile: &mut ProgramCompiler<'_>) -> Result<Self> {
+        let (cull_triangles, compact) = (compile(options.cull_triangles(samples))?, compile(options.compact())?);
+        let occlusion = match options.features.has_occlusion_culling() {
+            true => Some(OcclusionPrograms {
+                cull_previous: compile(options.cull_previously_visible())?,
+                record_visible: compile(options.record_visible(samples))?,
+                fine_levels: compile(options.pyramid(samples, true))?,
+                coarse_levels: compile(options.pyramid(samples, false))?,
+            }),
+            false => None,
+        };
+        Ok(Self { cull_triangles, compact, occlusion })
+    }
+}
+
+impl OitPrograms {
+    fn compile(options: &ShaderOptions, samples: u32, compile: &mut ProgramCompiler<'_>) -> Result<Self> {
+        Ok(Self {
+            gather: compile(options.oit_gather(samples))?,
+            histogram: compile(shaders::oit::histogram())?,
+            allocate: compile(shaders::oit::allocate())?,
+            resolve: compile(options.oit_resolve(samples))?,
+        })
+    }
+}
+
+impl PostPrograms {
+    pub(crate) fn compile(look: &RenderSettings, compile: &mut ProgramCompiler<'_>) -> Result<Self> {
+        let bloom = match look.bloom {
+            Some(bloom) => Some(BloomPrograms {
+                down: compile(shaders::post::bloom_downsample())?,
+                up: compile(shaders::post::bloom_upsample(look, bloom, false))?,
+                last: compile(shaders::post::bloom_upsample(look, bloom, true))?,
+            }),
+            None => None,
+        };
+        Ok(Self { encode: compile(shaders::post::encode(look))?, bloom })
+    }
+}

@@ -1,0 +1,433 @@
+//! Device resources of one scene: buffers, texture arrays, shadow map and programs, exactly as its plan says.
+
+use std::rc::Rc;
+use std::sync::Arc;
+
+use super::compute_rasterizer::{ComputeRasterizer, RasterOutputs, RasterPasses};
+use super::cull::{CullVertexArrays, TriangleCuller};
+use super::programs::{PostPrograms, ProgramCompiler, SampleCountPrograms, ScenePrograms};
+use super::raster_mesh;
+use super::shadow_cache::{ShadowCache, ShadowKey};
+use super::shadow_map::ShadowMap;
+use super::texture_arrays::upload_arrays;
+use crate::device::gl::{self, Buffer, Gl, Program, Texture, VertexArray, VertexAttribute};
+use crate::layout::material::{PackedMaterial, pack_materials};
+use crate::layout::{
+    CORNER_NORMAL_UNIT, FIXED_TEXTURE_READS, MATERIAL_UNIT, TANGENT_UNIT, TRIANGLE_MATERIAL_UNIT, TRIANGLE_UNIT,
+    TRIANGLE_VERTEX_UNIT, UV_UNIT,
+};
+use crate::plan::buffers::{BufferName, GeometryBuffers, MaterialBuffers, SceneBufferSet, UniformBuffers};
+use crate::plan::{Allocation, RenderPlan, ScenePlan};
+use crate::scene_data::geometry::{
+    BlendMode, DrawGroup, Geometry, TriangleSpan, blend_mode, locate_triangle, used_materials,
+};
+use crate::scene_data::textures::{TextureArray, TextureRole, arrays, check_texture_budget, find_layer};
+use crate::shaders::{MaterialUse, ShaderOptions, post};
+use crate::types::{BlurMethod, FrameParams};
+use modalcast_model::error::Result;
+use modalcast_model::raster::{GlVertexBuffers, RasterGeometry, Rasterizer};
+use modalcast_model::scene::{Culling, Scene};
+
+/// A scene's buffers, textures and programs on the device; freed when dropped.
+#[derive(Debug)]
+pub struct SceneBuffers {
+    /// Compute rasterizer that draws some passes instead of OpenGL; present when the look asks for it and one was
+    /// given. It keeps the buffers alive that it has registered.
+    pub(crate) compute_rasterizer: Option<ComputeRasterizer>,
+    pub(crate) scene: Arc<Scene>,
+    pub(crate) geometry: GeometryBuffers<Buffer>,
+    /// Read through buffer textures only.
+    _materials: MaterialBuffers<Buffer>,
+    pub(crate) uniforms: UniformBuffers<Buffer>,
+    /// Lists of culled triangles; present when triangles are culled.
+    pub(crate) culler: Option<TriangleCuller>,
+    pub(crate) buffer_textures: BufferTextures,
+    pub(crate) groups: Vec<DrawGroup>,
+    /// Vertex array of opaque triangles.
+    position_array: VertexArray,
+    /// Vertex array of cut-out and blended triangles; none without such triangles.
+    corners: Option<VertexArray>,
+    /// Vertex array without attributes, for triangles that a vertex shader generates.
+    pub(crate) empty_vertex_array: VertexArray,
+    pub(crate) color_arrays: Vec<Texture>,
+    pub(crate) normals: Vec<Texture>,
+    pub(crate) shadow: Option<ShadowMap>,
+    pub(crate) shadow_cache: ShadowCache,
+    pub(crate) programs: ScenePrograms,
+    pub(crate) post: PostPrograms,
+    /// Programs for the number of samples per pixel that the look asks for.
+    sample_programs: SampleCountPrograms,
+    options: ShaderOptions,
+    pub(crate) spans: Rc<[TriangleSpan]>,
+    /// Origin of the positions, in scene units from the scene's origin.
+    pub(crate) origin: [f64; 3],
+    /// Rebased positions that are drawn instead of the shared ones.
+    pub(crate) rebased: Option<RebasedPositions>,
+    /// A scalar per vertex for AOV readbacks; allocated by the first upload.
+    pub(crate) values: Option<VertexValues>,
+    plan: RenderPlan,
+    /// The buffers of the plan as they were allocated, by name.
+    allocated: Vec<Allocation>,
+}
+
+/// Positions rebased to one origin, for scenes whose domains have separate local origins.
+#[derive(Debug)]
+pub(crate) struct RebasedPositions {
+    pub(crate) buffer: Buffer,
+    view: Texture,
+    position_array: VertexArray,
+    /// Vertex array of the culled lists, when triangles are culled.
+    listed: Option<VertexArray>,
+}
+
+impl RebasedPositions {
+    pub(crate) fn new(gl: &Rc<Gl>, scene: &SceneBuffers) -> Result<Self> {
+        let buffer = gl.buffer(scene.geometry.positions.bytes, gl::DYNAMIC_DRAW, None)?;
+        let view = gl.buffer_texture(&buffer, gl::RGB32F)?;
+        let position_array = self::position_array(gl, &buffer, &scene.geometry.triangle_vertices)?;
+        let lists = scene.culler.as_ref().map(|culler| &culler.buffers.indices);
+        let listed = lists.map(|indices| self::position_array(gl, &buffer, indices)).transpose()?;
+        Ok(Self { view, position_array, listed, buffer })
+    }
+}
+
+/// A scalar per vertex, which the shader of an AOV readback interpolates.
+#[derive(Debug)]
+pub(crate) struct VertexValues {
+    pub(crate) buffer: Buffer,
+    pub(crate) view: Texture,
+}
+
+/// Buffer textures over the scene's buffers.
+#[derive(Debug)]
+pub(crate) struct BufferTextures {
+    positions: Texture,
+    /// Texture unit and view.
+    pub(crate) others: Vec<(u32, Texture)>,
+}
+
+impl SceneBuffers {
+    /// Allocates and fills the buffers that the scene's plan lists. `compile` returns programs, which scenes may share.
+    pub(crate) fn new(
+        gl: &Rc<Gl>,
+        scene: &Arc<Scene>,
+        sample_positions: &[[f32; 2]],
+        blur_method: BlurMethod,
+        compile: &mut ProgramCompiler<'_>,
+    ) -> Result<Self> {
+        let ScenePlan { buffers: sizes, features, report: plan } = ScenePlan::new(scene, &gl.limits, blur_method);
+        let images = [arrays(scene, TextureRole::Color), arrays(scene, TextureRole::Normal)];
+        check_texture_limits(gl, scene, &images)?;
+        let mesh = Geometry::new(scene);
+        let buffers = allocate(gl, &sizes, &mesh, &pack_materials(scene, &images))?;
+        let allocation =
+            |(name, buffer): (BufferName, &Buffer)| Allocation { name: name.to_string(), bytes: buffer.bytes };
+        let mut allocated: Vec<Allocation> = buffers.named().map(allocation).collect();
+        allocated.sort_by(|one, other| one.name.cmp(&other.name));
+        let SceneBufferSet { geometry, materials, uniforms, culling } = buffers;
+        let options = ShaderOptions {
+            features,
+            used: used(scene, &images),
+            sample_positions: sample_positions.to_vec(),
+            sample_resolve: post::sample_resolve(&scene.look),
+            post_depth_coverage: gl.limits.post_depth_coverage,
+        };
+        let samples = if sample_positions.is_empty() { 1 } else { scene.look.samples_per_pixel() };
+        let culler = match culling {
+            Some(culling) => {
+                let arrays = CullVertexArrays {
+                    positions: position_array(gl, &geometry.positions, &culling.indices)?,
+                    corners: corner_array(gl, &geometry, &culling.indices)?,
+                };
+                Some(TriangleCuller::new(gl, culling, &mesh.groups, arrays)?)
+            }
+            None => None,
+        };
+        let [color_arrays, normals] = &images;
+        Ok(Self {
+            compute_rasterizer: None,
+            scene: Arc::clone(scene),
+            buffer_textures: BufferTextures::new(gl, &geometry, &materials)?,
+            position_array: position_array(gl, &geometry.positions, &geometry.triangle_vertices)?,
+            corners: corner_array(gl, &geometry, &geometry.triangles)?,
+            culler,
+            geometry,
+            _materials: materials,
+            uniforms,
+            empty_vertex_array: gl.vertex_array(None, &[])?,
+            color_arrays: upload_arrays(gl, scene, color_arrays, TextureRole::Color)?,
+            normals: upload_arrays(gl, scene, normals, TextureRole::Normal)?,
+            shadow: features.shadow.map(|shadow| ShadowMap::new(gl, shadow, features.blur_method)).transpose()?,
+            shadow_cache: ShadowCache::default(),
+            programs: ScenePrograms::compile(&options, &mesh.groups, compile)?,
+            post: PostPrograms::compile(&scene.look, compile)?,
+            sample_programs: SampleCountPrograms::compile(&options, &mesh.groups, samples, compile)?,
+            options,
+            groups: mesh.groups,
+            spans: mesh.spans.into(),
+            origin: [0.0; 3],
+            rebased: None,
+            values: None,
+            plan,
+            allocated,
+        })
+    }
+
+    /// The programs for this number of samples per pixel; compiled now unless the look asked for the same number.
+    pub(crate) fn sample_programs(
+        &self,
+        samples: u32,
+        compile: &mut ProgramCompiler<'_>,
+    ) -> Result<SampleCountPrograms> {
+        match self.sample_programs.samples == samples {
+            true => Ok(self.sample_programs.clone()),
+            false => SampleCountPrograms::compile(&self.options, &self.groups, samples, compile),
+        }
+    }
+
+    /// The program that draws ids of cut-out triangles with this number of samples per pixel; none without such
+    /// triangles.
+    pub(crate) fn mask_program(&self, samples: u32, compile: &mut ProgramCompiler<'_>) -> Result<Option<Rc<Program>>> {
+        if self.sample_programs.samples == samples {
+            return Ok(self.sample_programs.mask.clone());
+        }
+        let any = self.groups.iter().any(|group| group.blend_mode == BlendMode::Mask);
+        if any { compile(self.options.visibility(BlendMode::Mask, samples)).map(Some) } else { Ok(None) }
+    }
+
+    /// The program that reads an AOV field from ids with this number of samples per pixel.
+    pub(crate) fn aov_program(
+        &self,
+        field: &'static str,
+        samples: u32,
+        compile: &mut ProgramCompiler<'_>,
+    ) -> Result<Rc<Program>> {
+        compile(self.options.aov(field, samples))
+    }
+
+    /// First triangle and number of triangles of one kind; they are contiguous.
+    pub(crate) fn triangles(&self, blend_mode: BlendMode) -> (usize, usize) {
+        let mut of_kind = self.groups.iter().filter(|group| group.blend_mode == blend_mode);
+        let first = of_kind.next().map_or((0, 0), |group| (group.first_triangle, group.triangles));
+        of_kind.fold(first, |(first, count), group| (first, count + group.triangles))
+    }
+
+    /// Domain of a triangle that an id of a frame names (`place` is the id minus 1), and its index in the domain's
+    /// mesh.
+    pub fn source_triangle(&self, place: usize) -> Option<(usize, usize)> {
+        if place < self.scene.layout.triangles { locate_triangle(&self.spans, place) } else { None }
+    }
+
+    /// Sets the origin of the shared positions, in scene units from the scene's origin, and draws the shared positions
+    /// from now on. Before the first call, positions are relative to the scene's origin.
+    pub fn set_origin(&mut self, origin: [f64; 3]) {
+        self.origin = origin;
+        self.rebased = None;
+    }
+
+    /// The positions that are drawn: the rebased ones if there are any, else the shared ones.
+    pub(crate) fn position_texture(&self) -> &Texture {
+        self.rebased.as_ref().map_or(&self.buffer_textures.positions, |rebased| &rebased.view)
+    }
+
+    /// Vertex array of one kind of triangle, for ids and depth; none without such triangles.
+    pub(crate) fn vertex_array(&self, blend_mode: BlendMode) -> Option<&VertexArray> {
+        match blend_mode {
+            BlendMode::Opaque => {
+                Some(self.rebased.as_ref().map_or(&self.position_array, |rebased| &rebased.position_array))
+            }
+            BlendMode::Mask | BlendMode::Blend => self.corners.as_ref(),
+        }
+    }
+
+    /// Vertex array of the culled list of one kind, and the buffer with the indirect draw commands; none when triangles
+    /// are not culled.
+    pub(crate) fn visible_draws(&self, blend_mode: BlendMode) -> Option<(&VertexArray, &Buffer)> {
+        let culler = self.culler.as_ref()?;
+        let rebased = self
+            .rebased
+            .as_ref()
+            .and_then(|rebased| rebased.listed.as_ref())
+            .filter(|_| blend_mode == BlendMode::Opaque);
+        rebased.or_else(|| culler.vertex_array(blend_mode)).map(|array| (array, &culler.buffers.draws))
+    }
+
+    /// Attaches a compute rasterizer that draws the passes that it supports; `make` creates it from the scene's mesh.
+    /// Nothing is created for a scene without such passes.
+    ///
+    /// # Errors
+    /// Those of `make` and of [`Rasterizer::precompile`], and `Fault` of OpenGL; OpenGL then still draws the scene.
+    pub(crate) fn attach_rasterizer(
+        &mut self,
+        gl: &Rc<Gl>,
+        compile: &mut ProgramCompiler<'_>,
+        make: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
+    ) -> Result<()> {
+        let supported = RasterPasses::supported(&self.scene);
+        if !supported.any() {
+            return Ok(());
+        }
+        let outputs = RasterOutputs::new(gl, supported, &self.options, compile)?;
+        let passes = outputs.passes();
+        let positions = self.geometry.positions.shared();
+        let mut rasterizer = make(raster_mesh::raster_geometry(&self.scene, positions, gl.limits.anisotropy))?;
+        rasterizer.precompile(passes.shadow, passes.visibility)?;
+        self.compute_rasterizer = Some(ComputeRasterizer::new(rasterizer, outputs));
+        Ok(())
+    }
+
+    /// The compute rasterizer, and the passes that it draws. None where OpenGL draws all, as in rebased scenes: the
+    /// rasterizer has registered the shared positions only.
+    pub(crate) fn active_rasterizer(&self) -> Option<(&ComputeRasterizer, RasterPasses)> {
+        let compute_rasterizer = self.compute_rasterizer.as_ref().filter(|_| self.rebased.is_none())?;
+        let enabled = compute_rasterizer.enabled();
+        enabled.any().then_some((compute_rasterizer, enabled))
+    }
+
+    /// The compute rasterizer if it draws the depth of the shadow map.
+    pub(crate) fn shadow_rasterizer(&self) -> Option<&ComputeRasterizer> {
+        self.active_rasterizer().filter(|(_, enabled)| enabled.shadow).map(|(compute_rasterizer, _)| compute_rasterizer)
+    }
+
+    /// The compute rasterizer if it draws the visibility.
+    pub(crate) fn visibility_rasterizer(&self) -> Option<&ComputeRasterizer> {
+        let active = self.active_rasterizer().filter(|(_, enabled)| enabled.visibility);
+        active.map(|(compute_rasterizer, _)| compute_rasterizer)
+    }
+
+    /// Names the step whose vertices the buffers hold. Frames of the same step, bounds and origin share one shadow map,
+    /// unless the map is split into cascades, which follow the camera. Code that writes the buffers directly must name
+    /// another step afterwards; an upload clears the name. Without a name, every frame draws its shadow map.
+    pub fn set_step(&self, step: u64) {
+        self.shadow_cache.set_step(step);
+    }
+
+    /// Content of the shadow map for this frame; none when it cannot be shared with other frames.
+    pub(crate) fn shadow_key(&self, shot: &FrameParams) -> Option<ShadowKey> {
+        let splits = self.scene.look.shadow.map_or(1, |shadow| shadow.splits);
+        self.shadow_cache.key(shot, self.origin).filter(|_| splits == 1)
+    }
+
+    /// Culling method; never the automatic choice.
+    pub(crate) const fn culling(&self) -> Culling {
+        self.options.features.culling
+    }
+
+    /// The plan that the buffers follow.
+    pub const fn plan(&self) -> &RenderPlan {
+        &self.plan
+    }
+
+    /// The buffers that the device holds for this scene, by name.
+    pub fn allocations(&self) -> Vec<Allocation> {
+        let rebased = self
+            .rebased
+            .iter()
+            .map(|rebased| Allocation { name: "rebased positions".into(), bytes: rebased.buffer.bytes });
+        let values = self.values.iter().map(|own| Allocation { name: "vertex values".into(), bytes: own.buffer.bytes });
+        let compute_rasterizer = self.compute_rasterizer.iter().flat_map(ComputeRasterizer::allocations);
+        let compute_rasterizer = compute_rasterizer.map(|(name, bytes)| Allocation { name: name.into(), bytes });
+        self.allocated.iter().cloned().chain(rebased).chain(values).chain(compute_rasterizer).collect()
+    }
+
+    /// The buffers that a deformer can write directly, instead of an upload. The handles keep them alive.
+    pub fn vertex_buffers(&self) -> GlVertexBuffers {
+        GlVertexBuffers {
+            positions: self.geometry.positions.shared(),
+            normals: self.geometry.normals.shared(),
+            tangents: self.geometry.tangents.as_ref().map(Buffer::shared),
+        }
+    }
+
+    /// Number of textures that the device holds for this scene: texture arrays and shadow map textures.
+    pub fn texture_count(&self) -> usize {
+        self.color_arrays.len() + self.normals.len() + self.shadow.as_ref().map_or(0, ShadowMap::texture_count)
+    }
+}
+
+/// The properties of each material that the shader sources depend on.
+fn used(scene: &Scene, images: &[Vec<TextureArray>; 2]) -> Vec<MaterialUse> {
+    let array = |arrays: &[TextureArray], texture: Option<usize>| Some(find_layer(arrays, texture?)?.0);
+    let one = |material: usize| {
+        let material = &scene.materials[material];
+        let (color, normal) = (array(&images[0], material.color_texture), array(&images[1], material.normal_texture));
+        MaterialUse { blend_mode: blend_mode(material), color, normal }
+    };
+    used_materials(scene).into_iter().map(one).collect()
+}
+
+/// Checks the number and size of the texture arrays against the limits of the device.
+fn check_texture_limits(gl: &Gl, scene: &Scene, images: &[Vec<TextureArray>; 2]) -> Result<()> {
+    check_texture_budget(images)?;
+    let (reads, most) = (FIXED_TEXTURE_READS + images[0].len() + images[1].len(), gl.limits.max_compute_textures);
+    if reads > most as usize {
+        return Err(gl::too_large("textures read by the shading", most.into(), reads as u64));
+    }
+    let layout = &scene.layout;
+    for (field, count) in [("vertices", layout.vertices), ("corners", layout.corners), ("triangles", layout.triangles)]
+    {
+        if count as u64 > gl.limits.max_texels {
+            return Err(gl::too_large(&format!("scene.{field}"), gl.limits.max_texels, count as u64));
+        }
+    }
+    Ok(())
+}
+
+fn allocate(
+    gl: &Rc<Gl>,
+    sizes: &SceneBufferSet<u64>,
+    mesh: &Geometry,
+    materials: &[PackedMaterial],
+) -> Result<SceneBufferSet<Buffer>> {
+    sizes.try_map(|name, bytes| {
+        let content: Option<&[u8]> = match name {
+            BufferName::CornerVertices => Some(bytemuck::cast_slice(&mesh.vertices)),
+            BufferName::Triangles => Some(bytemuck::cast_slice(&mesh.triangles)),
+            BufferName::TriangleVertices => Some(bytemuck::cast_slice(&mesh.triangle_vertices)),
+            BufferName::Uvs => Some(bytemuck::cast_slice(&mesh.uvs)),
+            BufferName::TriangleMaterials => Some(bytemuck::cast_slice(&mesh.materials)),
+            BufferName::Materials => Some(bytemuck::cast_slice(materials)),
+            _ => None,
+        };
+        gl.buffer(*bytes, if content.is_some() { gl::STATIC_DRAW } else { gl::DYNAMIC_DRAW }, content)
+    })
+}
+
+impl BufferTextures {
+    fn new(gl: &Rc<Gl>, geometry: &GeometryBuffers<Buffer>, materials: &MaterialBuffers<Buffer>) -> Result<Self> {
+        let read = [
+            (MATERIAL_UNIT, gl::RGBA32F, Some(&materials.materials)),
+            (TRIANGLE_MATERIAL_UNIT, gl::R32UI, materials.triangle_materials.as_ref()),
+            (CORNER_NORMAL_UNIT, gl::RGB32F, Some(&geometry.normals)),
+            (TRIANGLE_UNIT, gl::RGB32UI, Some(&geometry.triangles)),
+            (TRIANGLE_VERTEX_UNIT, gl::RGB32UI, Some(&geometry.triangle_vertices)),
+            (UV_UNIT, gl::RG32F, geometry.uvs.as_ref()),
+            (TANGENT_UNIT, gl::RGBA32F, geometry.tangents.as_ref()),
+        ];
+        let mut others = Vec::new();
+        for (unit, format, buffer) in read {
+            if let Some(buffer) = buffer {
+                others.push((unit, gl.buffer_texture(buffer, format)?));
+            }
+        }
+        Ok(Self { positions: gl.buffer_texture(&geometry.positions, gl::RGB32F)?, others })
+    }
+}
+
+const fn attribute(location: u32, buffer: &Buffer, components: i32, integer: bool) -> VertexAttribute<'_> {
+    VertexAttribute { location, buffer, components, integer }
+}
+
+/// Vertex array of opaque triangles, which need positions only.
+fn position_array(gl: &Rc<Gl>, positions: &Buffer, index: &Buffer) -> Result<VertexArray> {
+    gl.vertex_array(Some(index), &[attribute(0, positions, 3, false)])
+}
+
+/// Vertex array over the corners of cut-out and blended triangles; none without such triangles.
+fn corner_array(gl: &Rc<Gl>, geometry: &GeometryBuffers<Buffer>, index: &Buffer) -> Result<Option<VertexArray>> {
+    let Some(vertices) = &geometry.corner_vertices else { return Ok(None) };
+    let mut from = vec![attribute(0, vertices, 1, true), attribute(1, &geometry.normals, 3, false)];
+    from.extend(geometry.uvs.as_ref().map(|buffer| attribute(2, buffer, 2, false)));
+    from.extend(geometry.tangents.as_ref().map(|buffer| attribute(3, buffer, 4, false)));
+    gl.vertex_array(Some(index), &from).map(Some)
+}

@@ -1,0 +1,87 @@
+//! Shadow map of a scene: depth from the sun and, for a variance map, its blurred moments. One array layer per cascade.
+
+use std::rc::Rc;
+
+use crate::device::gl::{self, Framebuffer, Gl, Texture, TextureDesc};
+use crate::plan::shadow_map::shadow_textures;
+use crate::types::BlurMethod;
+use modalcast_model::error::Result;
+use modalcast_model::scene::{MomentFormat, ShadowSettings};
+
+/// Textures and framebuffers of a shadow map.
+#[derive(Debug)]
+pub(crate) struct ShadowMap {
+    pub(crate) shadow: ShadowSettings,
+    blur_method: BlurMethod,
+    pub(crate) depth: Texture,
+    /// One per layer of the depth.
+    pub(crate) framebuffers: Vec<Framebuffer>,
+    pub(crate) blurred: Option<BlurredMoments>,
+}
+
+/// The blurred moments of a variance map.
+#[derive(Debug)]
+pub(crate) struct BlurredMoments {
+    pub(crate) moments: Texture,
+    /// One layer of moments blurred in x; none when tiles are blurred in both directions at once.
+    pub(crate) horizontal: Option<Texture>,
+    /// For `horizontal`, then for each layer of the moments; empty when compute shaders blur.
+    pub(crate) framebuffers: Vec<Framebuffer>,
+}
+
+impl ShadowMap {
+    pub(crate) fn new(gl: &Rc<Gl>, shadow: ShadowSettings, blur_method: BlurMethod) -> Result<Self> {
+        let most = gl.limits.max_side;
+        if shadow.size > most {
+            return Err(gl::too_large("look.shadow.size", u64::from(most), u64::from(shadow.size)));
+        }
+        let depth = create_image(gl, &shadow, gl::DEPTH_COMPONENT32F, gl::NEAREST, shadow.splits)?;
+        let framebuffers =
+            (0..shadow.splits).map(|layer| gl.layer_framebuffer(&depth, true, layer)).collect::<Result<_>>()?;
+        let blurred = if shadow.has_moments() { Some(BlurredMoments::new(gl, &shadow, blur_method)?) } else { None };
+        Ok(Self { shadow, blur_method, depth, framebuffers, blurred })
+    }
+
+    /// The texture that the shading samples: moments if there are any, else depth.
+    pub(crate) fn lookup(&self) -> &Texture {
+        self.blurred.as_ref().map_or(&self.depth, |blurred| &blurred.moments)
+    }
+
+    /// Number of textures that the map holds.
+    pub(crate) fn texture_count(&self) -> usize {
+        shadow_textures(&self.shadow, self.blur_method).len()
+    }
+}
+
+impl BlurredMoments {
+    fn new(gl: &Rc<Gl>, shadow: &ShadowSettings, blur_method: BlurMethod) -> Result<Self> {
+        let format = if shadow.moments == MomentFormat::F16 { gl::RG16F } else { gl::RG32F };
+        let moments = create_image(gl, shadow, format, gl::LINEAR, shadow.splits)?;
+        let horizontal = match blur_method {
+            BlurMethod::Auto | BlurMethod::Tiles => None,
+            BlurMethod::Rows | BlurMethod::Fragments => Some(create_image(gl, shadow, format, gl::NEAREST, 1)?),
+        };
+        let mut framebuffers = Vec::new();
+        if let Some(horizontal) = horizontal.as_ref().filter(|_| blur_method == BlurMethod::Fragments) {
+            framebuffers.push(gl.layer_framebuffer(horizontal, false, 0)?);
+            for layer in 0..shadow.splits {
+                framebuffers.push(gl.layer_framebuffer(&moments, false, layer)?);
+            }
+        }
+        Ok(Self { moments, horizontal, framebuffers })
+    }
+}
+
+fn create_image(gl: &Rc<Gl>, shadow: &ShadowSettings, format: u32, filter: u32, layers: u32) -> Result<Texture> {
+    let size = shadow.size;
+    let target = gl::TEXTURE_2D_ARRAY;
+    let texture = gl.texture(TextureDesc { target, format, width: size, height: size, depth: layers, levels: 1 })?;
+    let sampling = [
+        (gl::TEXTURE_MIN_FILTER, filter),
+        (gl::TEXTURE_MAG_FILTER, filter),
+        (gl::TEXTURE_WRAP_S, gl::CLAMP_TO_EDGE),
+        (gl::TEXTURE_WRAP_T, gl::CLAMP_TO_EDGE),
+    ];
+    texture.set_sampling(&sampling, 1.0);
+    Ok(texture)
+}
