@@ -23,6 +23,7 @@ pub mod exact_positions;
 mod exact_state;
 pub mod kernels;
 mod markdown;
+mod markdown_table;
 pub mod memory_traffic;
 pub mod motion;
 pub mod plot;

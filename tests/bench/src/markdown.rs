@@ -1,7 +1,7 @@
 //! Formats a report as Markdown tables (`report.md`).
 
+use super::markdown_table::{dash, table};
 use super::table::DeformRow;
-use super::thesis_comparison::{dash, line, rule};
 use super::{DeformReport, WorkloadSummary};
 use crate::kernels::Overlap;
 
@@ -59,17 +59,15 @@ fn section<'a>(load: &WorkloadSummary, rows: impl Iterator<Item = &'a DeformRow>
         text.push_str(&format!("\n- {}\n", load.remarks.join("\n- ")));
     }
     text.push('\n');
-    text.push_str(&line(HEAD.map(String::from)));
-    text.push_str(&rule(HEAD.len()));
-    rows.for_each(|row| text.push_str(&line(cells(row))));
+    text.push_str(&table(&HEAD, rows.map(cells)));
     if let Some(overlap) = &load.overlap {
-        text.push_str(&overlapped(overlap));
+        text.push_str(&overlap_paragraph(overlap));
     }
     text
 }
 
-/// The paragraph on the cost of reading every step back, serial and overlapped.
-fn overlapped(overlap: &Overlap) -> String {
+/// The time per step if the host reads every step back, serially and overlapped.
+fn overlap_paragraph(overlap: &Overlap) -> String {
     let Overlap { write_one_core_us: one, write_us: all, cores, graph_us, copy_out_us, step_us, .. } = overlap;
     let Overlap { serial_us, fetched_us, overlapped_us, gain, ideal_us, differing, .. } = overlap;
     format!(

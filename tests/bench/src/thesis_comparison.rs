@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::markdown_table::{dash, table};
 use super::table::DeformRow;
 use super::thesis::{CPU_OVER_GPU, PLANTS, POWERS, RANKS, ThesisPlant};
 use super::timing::CacheState;
@@ -35,77 +36,83 @@ pub struct ThesisComparison {
 }
 
 impl ThesisComparison {
-    /// Selects the rows of full-size loads; `full` returns whether a load has its full size.
-    pub fn of(rows: &[DeformRow], full: impl Fn(&str) -> bool) -> Self {
-        let warm = |load: &str| -> Vec<&DeformRow> {
-            let fits = |row: &&DeformRow| {
-                row.load == load && row.cache == CacheState::Warm && row.timing.is_some() && full(load)
+    /// Selects the rows of full-size loads.
+    pub fn of(rows: &[DeformRow], is_full_size: impl Fn(&str) -> bool) -> Self {
+        let warm_rows = |load: &str| -> Vec<&DeformRow> {
+            let is_comparable = |row: &&DeformRow| {
+                row.load == load && row.cache == CacheState::Warm && row.timing.is_some() && is_full_size(load)
             };
-            rows.iter().filter(fits).collect()
+            rows.iter().filter(is_comparable).collect()
         };
-        let single = |(at, rank): (usize, usize), (column, power): (usize, u32)| {
-            let rows = warm(&format!("single-{power}-{rank}"));
-            let fastest = |backend: Backend| {
-                let exact = |row: &&&DeformRow| {
+        let compare_single = |row: usize, column: usize| {
+            let (power, rank) = (POWERS[column], RANKS[row]);
+            let timed_rows = warm_rows(&format!("single-{power}-{rank}"));
+            let fastest_us = |backend: Backend| {
+                let is_exact = |row: &&&DeformRow| {
                     row.backend == backend && row.storage == Default::default() && row.truncation_meters.is_none()
                 };
-                rows.iter().filter(exact).filter_map(|row| Some(row.timing?.median_us)).min_by(f64::total_cmp)
+                timed_rows.iter().filter(is_exact).filter_map(|row| Some(row.timing?.median_us)).min_by(f64::total_cmp)
             };
-            let ours = fastest(Backend::Cpu).zip(fastest(Backend::Cuda)).map(|(cpu, cuda)| cpu / cuda);
-            SingleDomainComparison { power, rank, thesis: CPU_OVER_GPU[at][column], ours }
+            let ours = fastest_us(Backend::Cpu).zip(fastest_us(Backend::Cuda)).map(|(cpu, cuda)| cpu / cuda);
+            SingleDomainComparison { power, rank, thesis: CPU_OVER_GPU[row][column], ours }
         };
-        let ranks = RANKS.into_iter().enumerate();
-        let plant = |(index, thesis): (usize, ThesisPlant)| {
-            let ours = warm(&format!("plant-{}", index + 1)).into_iter();
+        let cells = (0..RANKS.len()).flat_map(|row| (0..POWERS.len()).map(move |column| (row, column)));
+        let compare_plant = |(index, thesis): (usize, ThesisPlant)| {
+            let ours = warm_rows(&format!("plant-{}", index + 1)).into_iter();
             let ours = ours.filter_map(|row| Some((row.name.clone(), row.timing?.median_us / 1e3)));
             PlantComparison { thesis, ours: ours.collect() }
         };
         Self {
             source: "thesis, chapter 4: GeForce GTX 680; CPU with OpenMP, 16 threads",
-            table_4_4: ranks
-                .flat_map(|rank| POWERS.into_iter().enumerate().map(move |power| single(rank, power)))
-                .collect(),
-            tables_4_5_to_4_7: PLANTS.into_iter().enumerate().map(plant).collect(),
+            table_4_4: cells.map(|(row, column)| compare_single(row, column)).collect(),
+            tables_4_5_to_4_7: PLANTS.into_iter().enumerate().map(compare_plant).collect(),
         }
     }
 
     /// Both tables as Markdown.
     pub fn markdown(&self) -> String {
-        let mut text = format!(
-            "## Beside the thesis\n\nSource: {}. Loads of reduced size leave our columns empty.\n\n",
-            self.source
-        );
-        text.push_str("Table 4.4, CPU time over GPU time, thesis / ours:\n\n");
-        let columns = POWERS.map(|power| format!("2^{power}"));
-        text.push_str(&line(std::iter::once("r".to_owned()).chain(columns)));
-        text.push_str(&rule(1 + POWERS.len()));
-        for (at, rank) in RANKS.iter().enumerate() {
-            let cells = &self.table_4_4[at * POWERS.len()..][..POWERS.len()];
-            let cell = |single: &SingleDomainComparison| {
-                format!("{} / {}", single.thesis, single.ours.map_or_else(dash, |ours| format!("{ours:.2}")))
-            };
-            text.push_str(&line(std::iter::once(rank.to_string()).chain(cells.iter().map(cell))));
-        }
-        let mut names: Vec<&str> = Vec::new();
-        for (name, _) in self.tables_4_5_to_4_7.iter().flat_map(|plant| &plant.ours) {
-            if !names.contains(&name.as_str()) {
-                names.push(name);
-            }
-        }
-        text.push_str("\nTables 4.5 to 4.7, milliseconds of the thesis, then of ours (whole vertex update):\n\n");
-        let thesis = ["species", "u", "CPU t_uq", "GPU t_uq", "GPU t_vb", "kernels", "k_uq", "CPU O_uq", "GPU O_uq"];
-        text.push_str(&line(thesis.iter().chain(&names).map(ToString::to_string)));
-        text.push_str(&rule(thesis.len() + names.len()));
-        for PlantComparison { thesis, ours } in &self.tables_4_5_to_4_7 {
-            let time =
-                |name: &&str| ours.iter().find(|(own, _)| own == name).map_or_else(dash, |(_, ms)| format!("{ms:.4}"));
-            text.push_str(&line(printed(thesis).into_iter().chain(names.iter().map(time))));
-        }
-        text
+        format!(
+            "## Comparison with the thesis\n\nSource: {}. Our results of loads of reduced size are omitted.\n\n\
+             Table 4.4, CPU time over GPU time, thesis / ours:\n\n{}\n\
+             Tables 4.5 to 4.7, milliseconds of the thesis, then ours (complete vertex update):\n\n{}",
+            self.source,
+            single_domain_table(&self.table_4_4),
+            plant_table(&self.tables_4_5_to_4_7)
+        )
     }
 }
 
-fn printed(thesis: &ThesisPlant) -> [String; 9] {
+fn single_domain_table(comparisons: &[SingleDomainComparison]) -> String {
+    let powers = POWERS.map(|power| format!("2^{power}"));
+    let head: Vec<&str> = std::iter::once("r").chain(powers.iter().map(String::as_str)).collect();
+    let cell = |comparison: &SingleDomainComparison| {
+        format!("{} / {}", comparison.thesis, comparison.ours.map_or_else(dash, |ours| format!("{ours:.2}")))
+    };
+    let rows = RANKS.iter().zip(comparisons.chunks_exact(POWERS.len()));
+    table(&head, rows.map(|(rank, row)| std::iter::once(rank.to_string()).chain(row.iter().map(cell))))
+}
+
+fn plant_table(comparisons: &[PlantComparison]) -> String {
+    let mut variants: Vec<&str> = Vec::new();
+    for (name, _) in comparisons.iter().flat_map(|comparison| &comparison.ours) {
+        if !variants.contains(&name.as_str()) {
+            variants.push(name);
+        }
+    }
+    let thesis = ["species", "u", "CPU t_uq", "GPU t_uq", "GPU t_vb", "kernels", "k_uq", "CPU O_uq", "GPU O_uq"];
+    let head = [&thesis[..], &variants].concat();
+    let row = |comparison: &PlantComparison| {
+        let times = comparison.ours.clone();
+        let time = move |variant: &&str| {
+            let time = times.iter().find(|(name, _)| name == variant);
+            time.map_or_else(dash, |(_, ms)| format!("{ms:.4}"))
+        };
+        thesis_cells(&comparison.thesis).into_iter().chain(variants.iter().map(time)).collect::<Vec<String>>()
+    };
+    table(&head, comparisons.iter().map(row))
+}
+
+fn thesis_cells(thesis: &ThesisPlant) -> [String; 9] {
     let percent = |share: f64| format!("{:.2} %", 100.0 * share);
     [
         thesis.name.into(),
@@ -118,22 +125,6 @@ fn printed(thesis: &ThesisPlant) -> [String; 9] {
         percent(thesis.cpu_occupation),
         percent(thesis.gpu_occupation),
     ]
-}
-
-/// A line of a Markdown table.
-pub(super) fn line(cells: impl IntoIterator<Item = String>) -> String {
-    let cells: Vec<String> = cells.into_iter().map(|cell| cell.replace('|', "\\|")).collect();
-    format!("| {} |\n", cells.join(" | "))
-}
-
-/// The separator line below the header of a Markdown table.
-pub(super) fn rule(columns: usize) -> String {
-    format!("|{}\n", "---|".repeat(columns))
-}
-
-/// Placeholder for a missing value.
-pub(super) fn dash() -> String {
-    "-".into()
 }
 
 #[cfg(test)]
@@ -150,11 +141,11 @@ mod tests {
             cuda,
             row("plant-2", "cpu", CacheState::Warm, (250.0, 1e-7)),
         ];
-        let thesis_comparison = ThesisComparison::of(&rows, |_| true);
-        let last = thesis_comparison.table_4_4.last().expect("cells");
+        let comparison = ThesisComparison::of(&rows, |_| true);
+        let last = comparison.table_4_4.last().expect("a cell");
         assert_eq!((last.thesis, last.ours), (9.69, Some(5.0)));
-        assert_eq!(thesis_comparison.tables_4_5_to_4_7[1].ours, [("cpu".to_owned(), 0.25)]);
-        let text = thesis_comparison.markdown();
+        assert_eq!(comparison.tables_4_5_to_4_7[1].ours, [("cpu".to_owned(), 0.25)]);
+        let text = comparison.markdown();
         assert!(text.contains("| 30 | 5.32 / - | 3.67 / - | 6.6 / - | 8.02 / - | 9.69 / 5.00 |"), "{text}");
         assert!(
             text.contains("| Conifer | 41652 | 0.261 | 0.165 | 1.059 | 1 | 1.58 | 1.57 % | 0.91 % | 0.2500 |"),

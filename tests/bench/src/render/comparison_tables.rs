@@ -6,7 +6,7 @@ use super::blur_comparison::{BlurComparison, MOST_US, TIMES_AS_FAST};
 use super::minimal_passes::{BEYOND_US, MinimalPasses};
 use super::plants::PlantResult;
 use super::raster_comparison::{MOST_DIFFERING, RasterComparison, TimingPair, TriangleCounts};
-use crate::thesis_comparison::{dash, line, rule};
+use crate::markdown_table::{dash, table};
 
 /// All sections for which the report has data.
 pub(super) fn markdown(report: &RenderReport) -> String {
@@ -36,11 +36,9 @@ fn bare(list: &[MinimalPasses]) -> String {
          {BEYOND_US} us at most for 3,000,000 triangles and a map of 4096 on an H200 at 1920 x 1080; the other has fewer \
          triangles to draw than the passes have.\n\n"
     );
-    text.push_str(&line(head.map(String::from)));
-    text.push_str(&rule(head.len()));
-    for own in list {
+    let row = |own: &MinimalPasses| {
         let us = |us: f64| format!("{us:.1}");
-        text.push_str(&line([
+        [
             own.load.clone(),
             own.triangles.to_string(),
             us(own.depth.median_us),
@@ -51,8 +49,9 @@ fn bare(list: &[MinimalPasses]) -> String {
             us(own.unculled.beyond_us),
             us(own.usual.frame_us),
             us(own.usual.beyond_us),
-        ]));
-    }
+        ]
+    };
+    text.push_str(&table(&head, list.iter().map(row)));
     text
 }
 
@@ -61,19 +60,27 @@ pub(super) fn raster(list: &[RasterComparison]) -> String {
     if list.is_empty() {
         return String::new();
     }
-    let head = ["load", "triangles", "ids that differ", "depth us: OpenGL", "CUDA", "times as fast"];
-    let head = head.into_iter().chain(["of", "ids us: OpenGL", "CUDA", "times as fast", "in the map", "in the frame"]);
-    let head: Vec<String> = head.map(String::from).collect();
+    let head = [
+        "load",
+        "triangles",
+        "ids that differ",
+        "depth us: OpenGL",
+        "CUDA",
+        "times as fast",
+        "of",
+        "ids us: OpenGL",
+        "CUDA",
+        "times as fast",
+        "in the map",
+        "in the frame",
+    ];
     let mut text = format!(
         "\n## Raster\n\nThe bare passes at one sample a pixel, by OpenGL and by CUDA's own kernels, in the same run. Where \
          more than {} % of the ids differ nothing is timed. Triangles: drawn by a thread + a warp + tile by tile; between \
          the samples; dropped for another reason.\n\n",
         100.0 * MOST_DIFFERING
     );
-    let columns = head.len();
-    text.push_str(&line(head));
-    text.push_str(&rule(columns));
-    for own in list {
+    let row = |own: &RasterComparison| {
         let count = |own: TriangleCounts| {
             format!("{} + {} + {}; {}; {}", own.small, own.medium, own.large, own.missed, own.dropped)
         };
@@ -84,8 +91,9 @@ pub(super) fn raster(list: &[RasterComparison]) -> String {
         let first = [own.load.clone(), own.triangles.to_string(), format!("{} of {}", own.differing, own.samples)];
         let cells = first.into_iter().chain(pair(own.passes.map(|passes| passes.depth))).chain([own.map.to_string()]);
         let cells = cells.chain(pair(own.passes.map(|passes| passes.visibility)));
-        text.push_str(&line(cells.chain([count(own.in_map), count(own.in_frame)])));
-    }
+        cells.chain([count(own.in_map), count(own.in_frame)])
+    };
+    text.push_str(&table(&head, list.iter().map(row)));
     text
 }
 
@@ -99,13 +107,12 @@ fn blurs(list: &[BlurComparison]) -> String {
          passes of fragments. At 4096 on an H200 compute is to take {MOST_US} us at most and to be {TIMES_AS_FAST} times as \
          fast.\n\n"
     );
-    text.push_str(&line(head.map(String::from)));
-    text.push_str(&rule(head.len()));
-    for own in list {
+    let row = |own: &BlurComparison| {
         let [compute, fragments, ratio] = [own.compute_us, own.fragments_us, own.ratio].map(|us| format!("{us:.1}"));
         let [size, taps] = [own.size, own.taps].map(|number| number.to_string());
-        text.push_str(&line([own.load.clone(), size, taps, compute, fragments, ratio]));
-    }
+        [own.load.clone(), size, taps, compute, fragments, ratio]
+    };
+    text.push_str(&table(&head, list.iter().map(row)));
     text
 }
 
@@ -141,9 +148,7 @@ fn plants(list: &[PlantResult]) -> String {
             " These plants are smaller than the thesis's: its figures are not to be compared."
         }
     );
-    text.push_str(&line(head.map(String::from)));
-    text.push_str(&rule(head.len()));
-    list.iter().for_each(|own| text.push_str(&line(plant(own))));
+    text.push_str(&table(&head, list.iter().map(plant)));
     text
 }
 

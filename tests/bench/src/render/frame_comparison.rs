@@ -189,7 +189,7 @@ pub(super) fn faults(list: &[FrameComparison]) -> Vec<String> {
 
 /// The section of whole frames in `raster.md`.
 pub(super) fn markdown(list: &[FrameComparison]) -> String {
-    use crate::thesis_comparison::{dash, line, rule};
+    use crate::markdown_table::{dash, table};
     let head = [
         "load",
         "triangles",
@@ -216,9 +216,7 @@ pub(super) fn markdown(list: &[FrameComparison]) -> String {
          CUDA and counted to \"shadow\", as is the blur. Where more than {} % of the ids differ nothing is timed.\n\n",
         100.0 * MOST_DIFFERING
     );
-    text.push_str(&line(head.map(String::from)));
-    text.push_str(&rule(head.len()));
-    for own in list {
+    let row = |own: &FrameComparison| {
         let of = |passes: &[harness::PassTime], name: &str| {
             passes
                 .iter()
@@ -239,8 +237,8 @@ pub(super) fn markdown(list: &[FrameComparison]) -> String {
         let passes = ["raster", "shadow", "blur", "visibility", "shade", "encode"].map(both);
         let ids = format!("{} of {}", own.differing, own.pixels);
         let colors = [own.colors.mean, own.colors.p99, own.colors.largest].map(|own| format!("{own:.3}"));
-        let cells = first.into_iter().chain(frames).chain([ratio]).chain(passes).chain([ids]).chain(colors);
-        text.push_str(&line(cells));
-    }
+        first.into_iter().chain(frames).chain([ratio]).chain(passes).chain([ids]).chain(colors)
+    };
+    text.push_str(&table(&head, list.iter().map(row)));
     text
 }

@@ -1,7 +1,7 @@
 //! Formats a report as Markdown tables (`report.md`).
 
 use super::{RenderReport, RenderRow, RenderWorkloadSummary, ShadowTexelSize, comparison_tables};
-use crate::thesis_comparison::{dash, line, rule};
+use crate::markdown_table::{dash, table};
 use modalcast_render::CullStats;
 
 /// The whole page.
@@ -81,9 +81,7 @@ fn section<'a>(load: &RenderWorkloadSummary, rows: impl Iterator<Item = &'a Rend
             " A texel of a map of {size} is {side:.5} long, {by_corners:.5} if it were fitted to the corners of the bounds."
         ))
     );
-    text.push_str(&line(HEAD.map(String::from)));
-    text.push_str(&rule(HEAD.len()));
-    rows.for_each(|row| text.push_str(&line(cells(row))));
+    text.push_str(&table(&HEAD, rows.map(cells)));
     text
 }
 

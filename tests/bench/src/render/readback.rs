@@ -19,7 +19,7 @@ use super::RenderReportOptions;
 use super::harness::{HarnessScene, RenderHarness, Size};
 use super::measure::STILL;
 use super::workloads::{AnimatedScene, RenderWorkload};
-use crate::thesis_comparison::{line, rule};
+use crate::markdown_table::table;
 use crate::timing::{MIN_REPETITIONS, quantile};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::{Result, fault_in};
@@ -245,11 +245,9 @@ pub(super) fn section(list: &[ReadbackRates]) -> String {
         "\n## Reading every frame back\n\nThe same vertices again and again; and with those of another step uploaded from host \
          memory before every frame.\n\n",
     );
-    text.push_str(&line(head.iter().map(|name| String::from(*name))));
-    text.push_str(&rule(head.len()));
-    for row in list {
+    let cells = |row: &ReadbackRates| {
         let percent = |loss: f64| format!("{loss:.1} %");
-        text.push_str(&line([
+        [
             row.load.clone(),
             format!("{:.1}", row.unread_fps),
             format!("{:.1}", row.at_once_fps),
@@ -259,8 +257,9 @@ pub(super) fn section(list: &[ReadbackRates]) -> String {
             format!("{:.1}", row.stepped_unread_fps),
             format!("{:.1}", row.stepped_ring_fps),
             percent(row.stepped_ring_loss),
-        ]));
-    }
+        ]
+    };
+    text.push_str(&table(&head, list.iter().map(cells)));
     text
 }
 
