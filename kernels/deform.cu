@@ -38,45 +38,14 @@
 #else
 #define PREFETCH_CHUNKS 4
 #endif
-// Warps per block, and target number of resident blocks per multiprocessor. Fewer blocks would not saturate the memory,
-// more would spill registers, so variants that need more registers have fewer blocks. Tiles with modes read long runs
-// and are fastest in blocks of one warp.
-#if defined(ONE_ITEM_PER_LANE) && defined(MODES)
+// Warps per block. Tiles with modes read long runs and are fastest in blocks of one warp.
+#if defined(MODES) || defined(SHEAR) || defined(TILE_LIST)
 constexpr unsigned WARPS = 1;
-#if defined(MODE_TRUNCATION) && defined(TILE_LIST)
-constexpr unsigned MIN_BLOCKS_PER_SM = 8;
-#else
-constexpr unsigned MIN_BLOCKS_PER_SM = 10;
-#endif
-#elif defined(SHEAR) || defined(TILE_LIST)
-constexpr unsigned WARPS = 1;
-constexpr unsigned MIN_BLOCKS_PER_SM = 16;
-#elif defined(MODES)
-constexpr unsigned WARPS = 1;
-#if defined(COMPENSATED_SUM) && defined(STORE_INT8)
-constexpr unsigned MIN_BLOCKS_PER_SM = 16;
-#elif defined(COMPENSATED_SUM) || (defined(RIGID_NORMALS) && defined(STORE_INT8)) || \
-    (defined(NORMAL_MAPS) && (defined(MODE_TRUNCATION) || defined(FOLLOWERS)))
-constexpr unsigned MIN_BLOCKS_PER_SM = 20;
-#elif defined(DISPLACEMENTS) && (defined(STORE_F16) || defined(STORE_BF16) || defined(STORE_INT8))
-constexpr unsigned MIN_BLOCKS_PER_SM = 20;
-#elif defined(DISPLACEMENTS) && defined(RIGID_NORMALS)
-constexpr unsigned MIN_BLOCKS_PER_SM = 24;
-#elif defined(NORMAL_MAPS) || \
-    (defined(RIGID_NORMALS) && (defined(STORE_F16) || defined(STORE_BF16) || defined(FOLLOWERS))) || \
-    (defined(MODE_TRUNCATION) && defined(STORE_INT8)) || __CUDA_ARCH__ < 900
-constexpr unsigned MIN_BLOCKS_PER_SM = 24;
-#else
-constexpr unsigned MIN_BLOCKS_PER_SM = 28;
-#endif
 #else
 constexpr unsigned WARPS = 2;
-#if defined(DISPLACEMENTS) || (defined(RIGID_NORMALS) && defined(FOLLOWERS))
-constexpr unsigned MIN_BLOCKS_PER_SM = 12;
-#else
-constexpr unsigned MIN_BLOCKS_PER_SM = 16;
 #endif
-#endif
+// The launcher defines MIN_BLOCKS_PER_SM, the number of resident blocks per multiprocessor for the variant and the
+// architecture (src/compute/gpu/tables/occupancy.rs).
 
 #ifdef MODES
 // Factors of the entries of a chunk, one per mode.

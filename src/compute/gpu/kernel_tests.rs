@@ -4,6 +4,7 @@ use rayon::prelude::*;
 
 use super::launch::compile::{CompileJob, nvrtc};
 use super::launch::{CompiledVariant, KernelSource};
+use super::tables::occupancy::deform_tuning;
 use super::tables::{kernels, layout};
 use modalcast_model::error::Error;
 
@@ -89,8 +90,15 @@ fn variants_of_others(features: &[&'static str]) -> Vec<Variant> {
 
 /// Compiles all variants on all cores. NVRTC programs are independent of each other.
 fn compiled(kernel: &KernelSource, variants: &[Variant]) -> Vec<CompiledVariant> {
-    let one = |(defines, capability): &Variant| CompiledVariant::new(kernel.name, kernel.source, defines, *capability);
+    let one = |(defines, capability): &Variant| compile(kernel, defines, *capability);
     variants.par_iter().map(one).collect()
+}
+
+/// Compiles a variant as its launcher does.
+fn compile(kernel: &KernelSource, defines: &[&str], capability: (i32, i32)) -> CompiledVariant {
+    let tuning = (kernel.name == "deform").then(|| deform_tuning(defines, capability));
+    let defines: Vec<&str> = defines.iter().copied().chain(tuning.as_deref()).collect();
+    CompiledVariant::new(kernel.name, kernel.source, &defines, capability)
 }
 
 #[test]
@@ -143,8 +151,7 @@ const ALTERNATIVES: [(&str, &str); 5] = [
 #[ignore = "needs NVRTC: deploy/check installs it"]
 fn nvrtc_leaves_out_the_code_of_a_feature_that_is_left_out() {
     for kernel in kernels::KERNELS {
-        let bytes =
-            |defines: &[&'static str]| CompiledVariant::new(kernel.name, kernel.source, defines, (9, 0)).cubin.len();
+        let bytes = |defines: &[&'static str]| compile(&kernel, defines, (9, 0)).cubin.len();
         assert_eq!(bytes(&["UNKNOWN"]), bytes(&[]), "a macro that nothing reads changes nothing");
         for feature in kernel.features.iter().filter(|feature| !ALTERNATIVES.contains(&(kernel.name, feature))) {
             let (.., base) =

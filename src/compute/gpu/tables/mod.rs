@@ -6,7 +6,7 @@
 //! | `layout` | the structs that host and kernels share |
 //! | `work`, `normal_tables`, `rings`, `box_segments` | the tables that the kernels read |
 //! | `device_tables` | all tables of a scene, built once |
-//! | `kernels` | macros and grids of the kernels |
+//! | `kernels`, `occupancy` | macros, grids and tuning of the kernels |
 //! | `plan` | kernels, buffers in bytes, launches |
 //! | `input_packing`, `staging` | the input values of a step |
 //! | `change_list` | the lists of a partial step |
@@ -20,6 +20,7 @@ pub(crate) mod input_packing;
 pub(crate) mod kernels;
 pub(crate) mod layout;
 mod normal_tables;
+pub(crate) mod occupancy;
 pub(crate) mod plan;
 mod rings;
 pub(crate) mod staging;

@@ -13,6 +13,7 @@ use crate::gpu::tables::device_tables::DeviceTables;
 use crate::gpu::tables::input_packing::{DirtyTileLayout, InputPacker};
 use crate::gpu::tables::kernels::deform_blocks;
 use crate::gpu::tables::layout::{BoxSegment, DeformArgs};
+use crate::gpu::tables::occupancy::deform_tuning;
 use crate::gpu::tables::work::{WordSource, WorkList, side_by_side};
 use crate::storage::{PackedWord, TILE_QUADS, TiledModes};
 use modalcast_model::error::{Error, Result};
@@ -231,12 +232,19 @@ impl DeformKernel {
     }
 }
 
+/// Compiles a variant with the tuning for the device.
+fn compile(device: &Device, kernel: &KernelDescriptor, defines: &[&str]) -> Result<CudaFunction> {
+    let tuning = deform_tuning(defines, device.capability());
+    let defines: Vec<&str> = defines.iter().copied().chain([tuning.as_str()]).collect();
+    device.function(kernel.name, kernel.source.0, &defines)
+}
+
 /// The function of a kernel.
 ///
 /// # Errors
 /// `Fault` when it is compiled for another block size than planned.
 fn function(device: &Device, kernel: &KernelDescriptor) -> Result<CudaFunction> {
-    let function = kernel.compile(device)?;
+    let function = compile(device, kernel, &kernel.defines)?;
     let most = function.max_threads_per_block().map_err(cuda_error("deform"))?;
     if most == kernel.threads as i32 {
         return Ok(function);
@@ -250,7 +258,7 @@ fn list_function(device: &Device, kernel: &KernelDescriptor) -> Result<CudaFunct
     // One lane per item: lists are short, and would otherwise leave most of the device idle.
     let defines = kernel.defines.iter().copied().filter(|define| *define != "ONE_ITEM_PER_LANE");
     let list_function: Vec<&str> = defines.chain(["ONE_ITEM_PER_LANE", "TILE_LIST"]).collect();
-    device.function(kernel.name, kernel.source.0, &list_function)
+    compile(device, kernel, &list_function)
 }
 
 /// Blocks that loop over a tile list: as many as are resident on a large device.
