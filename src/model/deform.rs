@@ -83,10 +83,17 @@ impl VertexAttributes {
 ///
 /// A pending readback does not expose its vertices, because the device may still write them. Only the deformer that
 /// started it can complete it.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct VertexReadback {
     surface: Arc<DeformedSurface>,
     is_ready: bool,
+}
+
+impl std::fmt::Debug for VertexReadback {
+    /// Does not print the vertices, because the device may still write them.
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.debug_struct("VertexReadback").field("is_ready", &self.is_ready).finish_non_exhaustive()
+    }
 }
 
 impl VertexReadback {
@@ -245,6 +252,8 @@ mod tests {
         let pending = VertexReadback::pending(Arc::new(DeformedSurface::default()));
         let error = deformer.wait_readback(&pending).expect_err("a device may be writing it").to_string();
         assert!(error.contains("another deformer"), "{error}");
+        let surface = Arc::new(DeformedSurface { positions: vec![1234.5], ..DeformedSurface::default() });
+        assert!(!format!("{:?}", VertexReadback::pending(surface)).contains("1234"), "its vertices are not read");
     }
 
     #[test]

@@ -15,6 +15,8 @@
 //! The server uses this module. Programs that measure single kernels also use [`launch`], [`launchers`] and
 //! [`step_input`].
 
+#[cfg(test)]
+mod device_tests;
 mod executor;
 #[cfg(test)]
 mod kernel_tests;

@@ -17,7 +17,6 @@ pub(super) struct SurfaceLengths {
 }
 
 /// A surface whose large lists are page-locked. The lists keep their lengths, because a page lock covers a fixed range.
-#[derive(Debug)]
 pub(super) struct PinnedSurface {
     surface: Arc<DeformedSurface>,
     locks: Vec<PageLock>,
@@ -81,6 +80,13 @@ impl PinnedSurface {
     fn exclusive(surface: &mut Arc<DeformedSurface>) -> Result<&mut DeformedSurface> {
         let taken = || Error::Fault { stage: "fetch", reason: "the memory is in use".into() };
         Arc::get_mut(surface).ok_or_else(taken)
+    }
+}
+
+impl std::fmt::Debug for PinnedSurface {
+    /// Does not print the lists, because the device may write them.
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.debug_struct("PinnedSurface").field("locks", &self.locks).finish_non_exhaustive()
     }
 }
 

@@ -1,0 +1,97 @@
+//! Tests of the guards and of a lost device on a real device.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+use cudarc::driver::{LaunchConfig, result};
+
+use super::CudaDeformer;
+use super::launch::{Device, DeviceBuffer, LaunchOrder, capture, launch_kernel};
+use crate::testing::scene_and_state;
+use modalcast_model::deform::{Deformer as _, VertexAttributes};
+use modalcast_model::error::Error;
+
+/// Environment variable of the child process that loses its device.
+const LOSE_DEVICE: &str = "MODALCAST_TEST_LOSES_DEVICE";
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_other_scenes_run_after_a_panic_during_capture() {
+    let device = Device::open(0).expect("a CUDA device");
+    let (scene, state) = scene_and_state(&[(300, 5, 10)]);
+    let mut deformer = CudaDeformer::new(&device, &scene, None).expect("a deformer");
+    let before = deformer.deform(&state).expect("deforms").bounds;
+    let memory = DeviceBuffer::zeroed(&device, 64).expect("memory");
+    let submit = || {
+        // SAFETY: the buffer has 64 bytes, and the copy is captured in a graph that never runs.
+        unsafe { result::memset_d8_async(memory.address(), 1, 64, device.stream().cu_stream()) }.expect("is captured");
+        panic!("injected");
+    };
+    assert!(catch_unwind(AssertUnwindSafe(|| capture(&device, submit))).is_err());
+    assert_eq!(deformer.deform(&state).expect("the stream left the capture").bounds, before);
+    let mut bytes = [9_u8; 64];
+    memory.read(&device, 0, &mut bytes).expect("reads");
+    assert_eq!(bytes, [0; 64], "captured work does not run");
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_panics_restore_the_current_context() {
+    let device = Device::open(0).expect("a CUDA device");
+    // A new thread has no current context.
+    std::thread::scope(|scope| {
+        let check = || {
+            assert_eq!(result::ctx::get_current().expect("answers"), None);
+            let panicking = || {
+                let _current = device.enter().expect("enters");
+                assert_eq!(result::ctx::get_current().expect("answers"), Some(device.context().cu_ctx()));
+                panic!("injected");
+            };
+            assert!(catch_unwind(AssertUnwindSafe(panicking)).is_err());
+            assert_eq!(result::ctx::get_current().expect("answers"), None);
+        };
+        scope.spawn(check).join().expect("no failure");
+    });
+}
+
+/// The device is lost for the whole process, so a child process loses it.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_lost_device_is_an_error_of_every_call_and_no_panic() {
+    if std::env::var_os(LOSE_DEVICE).is_some() {
+        lose_device();
+        return;
+    }
+    let name = "gpu::device_tests::gpu_lost_device_is_an_error_of_every_call_and_no_panic";
+    let mut child = std::process::Command::new(std::env::current_exe().expect("a program"));
+    let output = child.args([name, "--exact", "--include-ignored"]).env(LOSE_DEVICE, "1").output().expect("starts");
+    let text = [output.stdout, output.stderr].map(|text| String::from_utf8_lossy(&text).into_owned()).concat();
+    assert!(output.status.success() && text.contains("1 passed"), "{text}");
+}
+
+fn lose_device() {
+    fn is_lost<T>(result: modalcast_model::error::Result<T>) -> bool {
+        result.is_err_and(|error| matches!(error, Error::DeviceLost { .. }))
+    }
+    let device = Device::open(0).expect("a CUDA device");
+    let (scene, state) = scene_and_state(&[(300, 5, 10)]);
+    let mut one = CudaDeformer::new(&device, &scene, None).expect("a deformer");
+    let mut other = CudaDeformer::new(&device, &scene, None).expect("a deformer");
+    one.deform(&state).expect("deforms");
+    other.deform(&state).expect("deforms");
+    let pending = other.readback(VertexAttributes::VERTICES).expect("begins");
+    let source = "extern \"C\" __global__ void trap(unsigned long long) { asm(\"trap;\"); }";
+    let function = device.function("trap", source, &[]).expect("compiles");
+    let config = LaunchConfig { grid_dim: (1, 1, 1), block_dim: (1, 1, 1), shared_mem_bytes: 0 };
+    // SAFETY: the kernel's only argument is a number; it accesses no memory.
+    unsafe { launch_kernel(&device, &function, config, LaunchOrder::Serial, &0_u64) }.expect("is submitted");
+    assert!(is_lost(device.synchronize("test")), "the kernel traps");
+    assert!(is_lost(one.surface().map(|_| ())));
+    assert!(is_lost(one.deform(&state)));
+    assert!(is_lost(one.deform(&state)), "again");
+    assert!(is_lost(other.wait_readback(&pending)));
+    assert!(is_lost(other.deform(&state)), "another scene");
+    assert!(is_lost(DeviceBuffer::upload(&device, &[1_u32])));
+    assert!(is_lost(CudaDeformer::new(&device, &scene, None).map(|_| ())));
+    drop((one, other, pending));
+    assert!(is_lost(device.synchronize("test")), "dropping hides nothing");
+}
