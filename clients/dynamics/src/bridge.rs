@@ -1,29 +1,29 @@
-//! A span under a pulsating load: reduced StVK forces, integrated by implicit Newmark.
+//! A bridge under a pulsating load: reduced StVK forces, integrated by implicit Newmark.
 //!
-//! The load acts on the middle of the span and is spread evenly over the samples there. Its strength is calibrated so
-//! that the deflection at equilibrium is a given share of the diagonal. The run starts at that equilibrium, and the
-//! load then pulsates as (1 + cos) / 2.
+//! The load acts on the middle of the bridge and is spread evenly over the samples there. Its strength is calibrated so
+//! that the deflection at equilibrium is a given fraction of the diagonal of the scene's rest bounds. The run starts at
+//! that equilibrium. The load then pulsates as (1 + cos) / 2.
 
 use std::f64::consts::TAU;
 
 use nalgebra::{DVector, Vector3};
 use serde_json::json;
 
-use crate::affine::Affine;
+use crate::affine::AffineTransform;
 use crate::cubic::ReducedForce;
-use crate::error::{Result, invalid};
+use crate::error::{Result, invalid_input};
 use crate::model::{DomainModel, Model};
 use crate::newmark::{LoadChange, NewmarkState, ReducedSystem};
-use crate::run::{Motion, Scenario, ScenarioReport};
+use crate::run::{Report, Scenario, StepValues};
 use crate::vega::VegaSettings;
 
-/// Settings of the load.
+/// Settings of the bridge scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Options {
+pub struct BridgeOptions {
     /// Seconds per step.
     pub dt: f64,
-    /// Deflection at equilibrium as a share of the diagonal.
-    pub deflection: f64,
+    /// Deflection at equilibrium as a fraction of the diagonal of the scene's rest bounds.
+    pub deflection_fraction: f64,
     /// Period of the load in seconds.
     pub period: f64,
     pub load_direction: LoadDirection,
@@ -32,208 +32,248 @@ pub struct Options {
 /// Direction of the load.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LoadDirection {
-    /// Like a wind: across the span, with an upward component of 0.3 times the horizontal one.
+    /// Like a wind: across the bridge, with an upward component of 0.3 times the horizontal one.
     Across,
-    /// Like a weight. A span close to the ground then moves below the ground plane of a picture.
+    /// Like a weight. A bridge close to the ground then moves below the ground plane of a rendered frame.
     Down,
     Up,
 }
 
 /// The bridge scenario.
-pub struct Bridge {
+pub struct BridgeScenario {
     model: Model,
     system: ReducedSystem,
-    options: Options,
-    /// Index of the deforming part.
-    part: usize,
-    /// The full reduced load.
-    load: DVector<f64>,
-    /// The state at step `next`, the step of the next motion.
-    motion: NewmarkState,
-    next: u64,
+    options: BridgeOptions,
+    /// Index of the deforming domain.
+    domain: usize,
+    /// Reduced load at the peak of the pulse.
+    peak_load: DVector<f64>,
+    /// The state at step `next_step`.
+    state: NewmarkState,
+    /// The step that the next call computes.
+    next_step: u64,
+    /// Force at the peak of the pulse, for unit reduced mass.
     strength: f64,
-    static_deflection: f64,
-    peak: f64,
+    /// Deflection at equilibrium as a fraction of the diagonal of the scene's rest bounds.
+    static_deflection_fraction: f64,
+    /// Largest displacement so far, in scene units.
+    peak_displacement: f64,
 }
 
-impl Bridge {
-    /// Calibrates the load for the span.
+/// An equilibrium and the strength of the load that causes it.
+struct LoadedEquilibrium {
+    strength: f64,
+    q: DVector<f64>,
+}
+
+impl BridgeScenario {
+    /// Calibrates the load of the bridge.
     ///
     /// # Errors
-    /// `Invalid` if no part has the rank of the forces, the stiffness is not positive definite, or the load cannot
-    /// deform the part.
-    pub fn new(model: Model, force: ReducedForce, settings: &VegaSettings, options: Options) -> Result<Self> {
+    /// `Invalid` if no domain has the rank of the forces, the stiffness is not positive definite, or the load cannot
+    /// deform the domain.
+    pub fn new(model: Model, force: ReducedForce, settings: &VegaSettings, options: BridgeOptions) -> Result<Self> {
         let rank = force.rank();
-        let part = model.parts.iter().position(|part| part.owns_q && part.rank == rank);
-        let ranks = || format!("{:?}", model.parts.iter().map(|part| part.rank).collect::<Vec<_>>());
-        let part = part.ok_or_else(|| invalid("scene", format!("a domain of rank {rank}"), ranks()))?;
+        let domain = model.domains.iter().position(|domain| domain.owns_q && domain.rank == rank);
+        let ranks =
+            || format!("domains of ranks {:?}", model.domains.iter().map(|domain| domain.rank).collect::<Vec<_>>());
+        let domain = domain.ok_or_else(|| invalid_input("scene", format!("a domain of rank {rank}"), ranks()))?;
         let system = ReducedSystem::new(force, settings)?;
-        let direction = pull(&model, &model.parts[part], options.load_direction)?;
-        let wanted = options.deflection * model.diagonal();
-        let (strength, q) = calibrate(&system, &model.parts[part], &direction, wanted)?;
-        let load = direction * strength;
-        let static_deflection = deflection(&model.parts[part], &q) / model.diagonal();
-        let motion = system.static_state(q);
-        Ok(Self { model, system, options, part, load, motion, next: 0, strength, static_deflection, peak: 0.0 })
+        let unit_load = compute_unit_load(&model, &model.domains[domain], options.load_direction)?;
+        let target_deflection = options.deflection_fraction * model.diagonal();
+        let equilibrium = calibrate_load(&system, &model.domains[domain], &unit_load, target_deflection)?;
+        let static_deflection = max_sample_displacement(&model.domains[domain], &equilibrium.q);
+        Ok(Self {
+            options,
+            domain,
+            peak_load: unit_load * equilibrium.strength,
+            state: system.static_state(equilibrium.q),
+            next_step: 0,
+            strength: equilibrium.strength,
+            static_deflection_fraction: static_deflection / model.diagonal(),
+            peak_displacement: 0.0,
+            system,
+            model,
+        })
     }
 
-    /// Integrates the state to the next step.
+    /// Integrates the state over one step.
     fn advance(&mut self) {
-        let (before, after) = (self.load(self.next), self.load(self.next + 1));
+        let (before, after) = (self.load_at(self.next_step), self.load_at(self.next_step + 1));
         let load = LoadChange { before: &before, after: &after };
-        self.motion = self.system.step(&self.motion, self.options.dt, load);
-        self.next += 1;
+        self.state = self.system.step(&self.state, self.options.dt, load);
+        self.next_step += 1;
     }
 
     /// The reduced load at a step.
-    fn load(&self, step: u64) -> DVector<f64> {
+    fn load_at(&self, step: u64) -> DVector<f64> {
         let time = step as f64 * self.options.dt;
-        &self.load * (0.5 + 0.5 * (TAU * time / self.options.period).cos())
+        &self.peak_load * (0.5 + 0.5 * (TAU * time / self.options.period).cos())
     }
 }
 
-impl Scenario for Bridge {
+impl Scenario for BridgeScenario {
     fn model(&self) -> &Model {
         &self.model
     }
 
-    fn next_motion(&mut self, motion: &mut Motion) -> Result<()> {
-        let part = &self.model.parts[self.part];
-        motion.q = vec![0.0; self.model.coordinates];
-        for (place, number) in motion.q[part.first..].iter_mut().zip(self.motion.q.iter()) {
-            *place = *number as f32;
+    fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()> {
+        let first_coordinate = self.model.domains[self.domain].first_coordinate;
+        values.q = vec![0.0; self.model.coordinate_count];
+        for (destination, coordinate) in values.q[first_coordinate..].iter_mut().zip(self.state.q.iter()) {
+            *destination = *coordinate as f32;
         }
-        motion.transforms = self.model.parts.iter().map(|part| part.placement.entries()).collect();
-        let q: Vec<f64> = motion.q.iter().map(|number| f64::from(*number)).collect();
-        let world: Vec<Affine> = motion.transforms.iter().map(Affine::from_entries).collect();
-        self.peak = self.peak.max(self.model.peak(&q, &world));
+        values.transforms = self.model.domains.iter().map(|domain| domain.placement.to_row_major()).collect();
+        let q: Vec<f64> = values.q.iter().map(|coordinate| f64::from(*coordinate)).collect();
+        let world_from_domain: Vec<AffineTransform> =
+            values.transforms.iter().map(AffineTransform::from_row_major).collect();
+        self.peak_displacement = self.peak_displacement.max(self.model.max_displacement(&q, &world_from_domain));
         self.advance();
         Ok(())
     }
 
-    fn report(&self) -> ScenarioReport {
-        let load = format!(
-            "a force of {:.4} (reduced mass 1) on the middle tenth of the span, {}, pulsating every {} s; it holds the \
-             span at {:.4} of the diagonal, where the run begins",
+    fn report(&self) -> Report {
+        let load_description = format!(
+            "a force of {:.4} (reduced mass 1) on the middle tenth of the bridge, {}, pulsating every {} s; the run starts \
+             at the equilibrium, with a deflection of {:.4} of the diagonal",
             self.strength,
-            self.options.load_direction.words(),
+            self.options.load_direction.description(),
             self.options.period,
-            self.static_deflection,
+            self.static_deflection_fraction,
         );
-        ScenarioReport::from_iter([
-            ("load".to_owned(), json!(load)),
-            ("deflection_of_diagonal".to_owned(), json!(self.static_deflection)),
-            ("peak_of_diagonal".to_owned(), json!(self.peak / self.model.diagonal())),
+        let peak_displacement_fraction = self.peak_displacement / self.model.diagonal();
+        Report::from_iter([
+            ("load".to_owned(), json!(load_description)),
+            ("deflection_of_diagonal".to_owned(), json!(self.static_deflection_fraction)),
+            ("peak_of_diagonal".to_owned(), json!(peak_displacement_fraction)),
             ("frequencies_hz".to_owned(), json!(self.system.frequencies())),
         ])
     }
 }
 
 impl LoadDirection {
-    const fn words(self) -> &'static str {
+    const fn description(self) -> &'static str {
         match self {
-            Self::Across => "across it with a lift of 0.3",
+            Self::Across => "sideways, with 0.3 of the force upwards",
             Self::Down => "downwards",
             Self::Up => "upwards",
         }
     }
 
-    fn direction(self, model: &Model) -> Vector3<f64> {
+    /// Unit vector of the load in world axes.
+    fn unit_vector(self, model: &Model) -> Vector3<f64> {
         match self {
-            Self::Across => (model.ground_axes().1 + 0.3 * model.up).normalize(),
+            Self::Across => (model.ground_axes().short + 0.3 * model.up).normalize(),
             Self::Down => -model.up,
             Self::Up => model.up,
         }
     }
 }
 
-/// U^T times a unit force, spread over the middle tenth of the longer horizontal axis, or over the whole part if the
-/// middle tenth cannot move.
-fn pull(model: &Model, part: &DomainModel, load_direction: LoadDirection) -> Result<DVector<f64>> {
-    let (axis, _) = model.ground_axes();
-    let along = |rest: &Vector3<f64>| part.placement.apply(rest).dot(&axis);
-    let places = || part.samples.iter().map(|sample| along(&sample.rest));
-    let (low, high) = places().fold((f64::MAX, f64::MIN), |(low, high), at| (low.min(at), high.max(at)));
-    let push = part.placement.linear.transpose() * load_direction.direction(model);
-    let of = |near: f64| {
-        let near = |at: f64| (at - 0.5 * (low + high)).abs() <= near * (high - low);
-        let chosen: Vec<_> = part.samples.iter().filter(|sample| near(along(&sample.rest))).collect();
-        let sum = |mode| chosen.iter().map(|sample| sample.column(mode, part.rank).dot(&push)).sum::<f64>();
-        DVector::from_fn(part.rank, |mode, _| sum(mode) / chosen.len().max(1) as f64)
+/// Computes U^T times a unit force that is spread over the middle tenth of the longer horizontal axis, or over the whole
+/// domain if the middle tenth cannot move.
+fn compute_unit_load(model: &Model, domain: &DomainModel, load_direction: LoadDirection) -> Result<DVector<f64>> {
+    let axis = model.ground_axes().long;
+    let axis_coordinate = |rest: &Vector3<f64>| domain.placement.apply(rest).dot(&axis);
+    let axis_coordinates = domain.samples.iter().map(|sample| axis_coordinate(&sample.rest));
+    let (min, max) = axis_coordinates.fold((f64::MAX, f64::MIN), |(min, max), x| (min.min(x), max.max(x)));
+    let local_direction = domain.placement.linear.transpose() * load_direction.unit_vector(model);
+    // `half_width` is a fraction of the bridge's length.
+    let unit_load_within = |half_width: f64| {
+        let is_within = |x: f64| (x - 0.5 * (min + max)).abs() <= half_width * (max - min);
+        let samples: Vec<_> = domain.samples.iter().filter(|sample| is_within(axis_coordinate(&sample.rest))).collect();
+        let sum =
+            |mode| samples.iter().map(|sample| sample.column(mode, domain.rank).dot(&local_direction)).sum::<f64>();
+        DVector::from_fn(domain.rank, |mode, _| sum(mode) / samples.len().max(1) as f64)
     };
-    let force = Some(of(0.05)).filter(|force| force.norm() > 0.0).unwrap_or_else(|| of(1.0));
-    if force.norm() > 0.0 { Ok(force) } else { Err(invalid("scene", "a part that a load can bend", &part.name)) }
-}
-
-/// The largest displacement of a part's samples, in scene units.
-fn deflection(part: &DomainModel, q: &DVector<f64>) -> f64 {
-    part.samples.iter().map(|sample| sample.displacement(q.as_slice()).norm()).fold(0.0, f64::max)
-}
-
-/// The strength of a load with the deflection `wanted` at equilibrium, and that equilibrium. The load is increased in
-/// steps, each solved from the previous equilibrium, and then bisected.
-fn calibrate(
-    system: &ReducedSystem,
-    part: &DomainModel,
-    direction: &DVector<f64>,
-    wanted: f64,
-) -> Result<(f64, DVector<f64>)> {
-    let rest = DVector::zeros(system.rank());
-    // The response to a tiny load is linear; extrapolate from it to a tenth of the wanted deflection.
-    let tiny = 1e-6 * direction.norm().recip();
-    let answer = deflection(part, &system.equilibrium(&(direction * tiny), &rest));
-    if !(answer > 0.0 && answer.is_finite()) {
-        return Err(invalid("load", "a deflection", answer));
+    let unit_load =
+        Some(unit_load_within(0.05)).filter(|load| load.norm() > 0.0).unwrap_or_else(|| unit_load_within(1.0));
+    if unit_load.norm() > 0.0 {
+        Ok(unit_load)
+    } else {
+        let given = format!("'{}', whose modes do not", domain.name);
+        Err(invalid_input("scene", "a domain whose modes respond to the load", given))
     }
-    let (mut low, mut high) = (0.0, 0.1 * wanted / answer * tiny);
-    let (mut below, mut above) = (rest.clone(), rest);
+}
+
+/// The largest displacement of a domain's samples, in scene units.
+fn max_sample_displacement(domain: &DomainModel, q: &DVector<f64>) -> f64 {
+    domain.samples.iter().map(|sample| sample.displacement(q.as_slice()).norm()).fold(0.0, f64::max)
+}
+
+/// Finds the strength of the load whose equilibrium has the target deflection (scene units). The load is increased in
+/// steps, each solved from the previous equilibrium, and then bisected.
+fn calibrate_load(
+    system: &ReducedSystem,
+    domain: &DomainModel,
+    unit_load: &DVector<f64>,
+    target_deflection: f64,
+) -> Result<LoadedEquilibrium> {
+    let solve =
+        |strength: f64, initial_guess: &DVector<f64>| system.solve_equilibrium(&(unit_load * strength), initial_guess);
+    let rest = DVector::zeros(system.rank());
+    // The response to a small load is linear. Extrapolate from it to a tenth of the target deflection.
+    let probe_strength = 1e-6 * unit_load.norm().recip();
+    let probe_deflection = max_sample_displacement(domain, &solve(probe_strength, &rest));
+    if !(probe_deflection > 0.0 && probe_deflection.is_finite()) {
+        let given = format!("a deflection of {probe_deflection}");
+        return Err(invalid_input("load", "a load that deflects the bridge", given));
+    }
+    let (mut low, mut high) = (0.0, 0.1 * target_deflection / probe_deflection * probe_strength);
+    let (mut q_low, mut q_high) = (rest.clone(), rest);
     for _ in 0..60 {
-        above = system.equilibrium(&(direction * high), &below);
-        if deflection(part, &above) >= wanted {
+        q_high = solve(high, &q_low);
+        if max_sample_displacement(domain, &q_high) >= target_deflection {
             break;
         }
-        (low, below) = (high, above.clone());
+        (low, q_low) = (high, q_high.clone());
         high *= 1.3;
     }
     for _ in 0..40 {
         let middle = 0.5 * (low + high);
-        let q = system.equilibrium(&(direction * middle), &below);
-        if deflection(part, &q) >= wanted { (high, above) = (middle, q) } else { (low, below) = (middle, q) }
+        let q = solve(middle, &q_low);
+        if max_sample_displacement(domain, &q) >= target_deflection {
+            (high, q_high) = (middle, q);
+        } else {
+            (low, q_low) = (middle, q);
+        }
     }
-    Ok((high, above))
+    Ok(LoadedEquilibrium { strength: high, q: q_high })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cubic::tests::chain;
-    use crate::hierarchy::tests::plant;
+    use crate::cubic::tests::spring_chain;
+    use crate::hierarchy::tests::four_domain_model;
 
-    /// A bridge with a part of two modes and a force of two coordinates.
-    fn span(options: Options) -> Bridge {
-        Bridge::new(plant(), chain(&[40.0, 90.0], 30.0, 4.0), &VegaSettings::default(), options).expect("valid")
+    const OPTIONS: BridgeOptions =
+        BridgeOptions { dt: 1.0 / 60.0, deflection_fraction: 0.03, period: 2.0, load_direction: LoadDirection::Across };
+
+    /// A bridge whose deforming domain has two modes, like the force.
+    fn two_mode_bridge() -> BridgeScenario {
+        let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);
+        BridgeScenario::new(four_domain_model(), force, &VegaSettings::default(), OPTIONS).expect("a valid scenario")
     }
-
-    const OPTIONS: Options =
-        Options { dt: 1.0 / 60.0, deflection: 0.03, period: 2.0, load_direction: LoadDirection::Across };
 
     #[test]
     fn run_starts_at_the_requested_deflection_and_moves() {
-        let mut bridge = span(OPTIONS);
-        assert!((bridge.static_deflection - 0.03).abs() <= 1e-6, "{}", bridge.static_deflection);
-        let (mut first, mut later) = (Motion::default(), Motion::default());
-        bridge.next_motion(&mut first).expect("moves");
-        assert!(bridge.peak / bridge.model.diagonal() >= 0.0299);
-        (0..40).for_each(|_| bridge.next_motion(&mut later).expect("moves"));
-        assert!(first.q != later.q && first.transforms == later.transforms);
-        assert!(bridge.peak / bridge.model.diagonal() < 0.2);
+        let mut bridge = two_mode_bridge();
+        let deflection = bridge.static_deflection_fraction;
+        assert!((deflection - 0.03).abs() <= 1e-6, "{deflection}");
+        let (mut first, mut last) = (StepValues::default(), StepValues::default());
+        bridge.compute_next_step(&mut first).expect("the first step");
+        assert!(bridge.peak_displacement / bridge.model.diagonal() >= 0.0299);
+        (0..40).for_each(|_| bridge.compute_next_step(&mut last).expect("the next step"));
+        assert!(first.q != last.q && first.transforms == last.transforms);
+        assert!(bridge.peak_displacement / bridge.model.diagonal() < 0.2);
     }
 
     #[test]
-    fn force_of_another_rank_is_refused_with_the_available_ranks() {
-        let force = chain(&[1.0, 2.0, 3.0], 0.0, 0.0);
-        let refusal =
-            Bridge::new(plant(), force, &VegaSettings::default(), OPTIONS).err().expect("refused").to_string();
-        assert!(refusal.contains("rank 3") && refusal.contains("[2, 2, 2, 0]"), "{refusal}");
+    fn force_of_another_rank_is_rejected_with_available_ranks() {
+        let force = spring_chain(&[1.0, 2.0, 3.0], 0.0, 0.0);
+        let result = BridgeScenario::new(four_domain_model(), force, &VegaSettings::default(), OPTIONS);
+        let error = result.err().expect("an error").to_string();
+        assert!(error.contains("rank 3") && error.contains("[2, 2, 2, 0]"), "{error}");
     }
 }

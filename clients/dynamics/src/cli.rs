@@ -13,9 +13,9 @@ Examples:
   modalcast-sim sweep --open MorphStressTest --scene morph --record out/record
   modalcast-sim auto --scene demo --files ../data/vega/simpleBridge --seconds 0 --realtime
 
-Exit codes: 0 done; 1 refused by the server (unknown scene, or a scene with another writer); 2 invalid command line;
-3 no connection, or connection lost; 4 error of a local file; 5 invalid content of a file, a scene or a reply; 6 done,
-but steps were rejected.";
+Exit codes: 0 done; 1 rejected by the server (unknown scene, or a scene with another writer); 2 invalid command line;
+3 connection failed or lost; 4 local file error; 5 invalid content of a file, a scene or a reply; 6 done, but the server
+rejected steps.";
 
 /// Drives a scene of a modalcast server: wind on trees, a load on a bridge, or a sweep through all coordinates.
 #[derive(Debug, Parser)]
@@ -27,7 +27,7 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Wind on a tree by modal superposition, exact for every mode. The scene must state eigenvalues.
+    /// Wind on a tree by modal superposition, with exact integration of every mode. The scene must have eigenvalues.
     #[command(after_help = EXAMPLES)]
     Tree {
         #[command(flatten)]
@@ -35,7 +35,7 @@ pub(crate) enum Command {
         #[command(flatten)]
         wind: WindOptions,
     },
-    /// A pulsating load on the middle of a span, by Vega's reduced cubic forces under implicit Newmark.
+    /// A pulsating load on the middle of a bridge, by Vega's reduced cubic forces and implicit Newmark integration.
     #[command(after_help = EXAMPLES)]
     Bridge {
         #[command(flatten)]
@@ -45,13 +45,13 @@ pub(crate) enum Command {
         #[command(flatten)]
         load: LoadOptions,
     },
-    /// Every coordinate in turn; a rigid scene rocks.
+    /// Moves one coordinate after another; rocks a rigid scene.
     #[command(after_help = EXAMPLES)]
     Sweep {
         #[command(flatten)]
         common: CommonOptions,
-        /// Largest displacement as a share of the diagonal.
-        #[arg(long, default_value_t = 0.06, value_parser = share)]
+        /// Largest displacement as a fraction of the diagonal.
+        #[arg(long, default_value_t = 0.06, value_parser = parse_fraction)]
         share: f64,
     },
     /// The bridge if cubic forces are available, else the tree if the scene has eigenvalues, else the sweep.
@@ -65,8 +65,8 @@ pub(crate) enum Command {
         load: LoadOptions,
         #[command(flatten)]
         wind: WindOptions,
-        /// Largest displacement of the sweep as a share of the diagonal.
-        #[arg(long, default_value_t = 0.06, value_parser = share)]
+        /// Largest displacement of the sweep as a fraction of the diagonal.
+        #[arg(long, default_value_t = 0.06, value_parser = parse_fraction)]
         share: f64,
     },
 }
@@ -77,27 +77,27 @@ pub(crate) struct CommonOptions {
     #[arg(long, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
     /// How long to retry until the server answers, in seconds.
-    #[arg(long, default_value_t = 0.0, value_parser = number)]
+    #[arg(long, default_value_t = 0.0, value_parser = parse_non_negative)]
     pub(crate) wait: f64,
     /// The scene's name on the server.
     #[arg(long, default_value = "tree")]
     pub(crate) scene: String,
-    /// First open this source of the server's repository under the name of --scene.
+    /// Source in the server's repository to open first, under the name of --scene.
     #[arg(long, value_name = "SOURCE")]
     pub(crate) open: Option<String>,
     /// Simulated time in seconds; 0 runs until interrupted.
-    #[arg(long, default_value_t = 10.0, value_parser = number)]
+    #[arg(long, default_value_t = 10.0, value_parser = parse_non_negative)]
     pub(crate) seconds: f64,
     /// Number of steps, in place of --seconds; 0 runs until interrupted.
     #[arg(long, conflicts_with = "seconds")]
     pub(crate) steps: Option<u64>,
     /// Seconds per step.
-    #[arg(long, default_value_t = 1.0 / 60.0, value_parser = positive)]
+    #[arg(long, default_value_t = 1.0 / 60.0, value_parser = parse_positive)]
     pub(crate) dt: f64,
-    /// Process every step (lossless), or only the newest (latest).
+    /// lossless: process every step; latest: skip to the newest step.
     #[arg(long, value_enum, default_value = "lossless")]
     pub(crate) policy: PolicyOption,
-    /// Most steps in flight; 0 selects the server's default.
+    /// Maximum number of steps in flight; 0 selects the server's default.
     #[arg(long, default_value_t = 0)]
     pub(crate) window: u32,
     /// Run in real time instead of as fast as possible.
@@ -129,14 +129,14 @@ impl From<PolicyOption> for Policy {
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct WindOptions {
     /// Strength of the wind; at 1 the crown sways by `--sway`.
-    #[arg(long, default_value_t = 1.0, value_parser = number)]
+    #[arg(long, default_value_t = 1.0, value_parser = parse_non_negative)]
     pub(crate) wind: f64,
-    /// Peak displacement of the crown at wind 1, as a share of the height.
-    #[arg(long, default_value_t = 0.05, value_parser = share)]
+    /// Peak displacement of the crown at wind 1, as a fraction of the height.
+    #[arg(long, default_value_t = 0.05, value_parser = parse_fraction)]
     pub(crate) sway: f64,
-    /// Direction that the wind blows to, in degrees about the up axis from the first horizontal axis; at 25 the default
+    /// Direction that the wind blows to, in degrees about the up axis from the first horizontal axis. At 25, the default
     /// camera sees the sway from the side.
-    #[arg(long, default_value_t = 25.0, value_parser = angle, allow_hyphen_values = true)]
+    #[arg(long, default_value_t = 25.0, value_parser = parse_degrees, allow_hyphen_values = true)]
     pub(crate) direction: f64,
     /// Random seed of the turbulence.
     #[arg(long, default_value_t = 7)]
@@ -148,23 +148,23 @@ pub(crate) struct ForceFileOptions {
     /// Vega's file of reduced cubic forces.
     #[arg(long, value_name = "FILE.cub")]
     pub(crate) cubic: Option<PathBuf>,
-    /// Vega's settings; default is the .config file next to the forces, if it exists.
+    /// Vega's settings; default: the .config file next to the file of cubic forces, if it exists.
     #[arg(long, value_name = "FILE.config")]
     pub(crate) config: Option<PathBuf>,
-    /// Folder to search for the cubic forces.
+    /// Folder to search for the file of cubic forces.
     #[arg(long, value_name = "DIR")]
     pub(crate) files: Option<PathBuf>,
 }
 
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct LoadOptions {
-    /// Deflection at equilibrium, as a share of the diagonal.
-    #[arg(long, default_value_t = 0.03, value_parser = share)]
+    /// Deflection at equilibrium, as a fraction of the diagonal.
+    #[arg(long, default_value_t = 0.03, value_parser = parse_fraction)]
     pub(crate) deflection: f64,
     /// Period of the load in seconds.
-    #[arg(long, default_value_t = 2.0, value_parser = positive)]
+    #[arg(long, default_value_t = 2.0, value_parser = parse_positive)]
     pub(crate) period: f64,
-    /// Direction of the load: across the span with some lift (a wind), down (a weight), or up.
+    /// Direction of the load: across the bridge and slightly upwards (a wind), down (a weight), or up.
     #[arg(long, value_enum, default_value = "across")]
     pub(crate) toward: LoadDirectionOption,
 }
@@ -206,22 +206,25 @@ impl Command {
     }
 }
 
-fn number(text: &str) -> Result<f64, String> {
-    let parsed = text.parse().ok().filter(|number| (0.0..=1e6).contains(number));
-    parsed.ok_or_else(|| "expected a number from 0 to 1000000".into())
+fn parse_non_negative(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok().filter(|number| (0.0..=1e6).contains(number));
+    number.ok_or_else(|| "expected a number from 0 to 1000000".into())
 }
 
-fn angle(text: &str) -> Result<f64, String> {
-    let parsed = text.parse().ok().filter(|number: &f64| number.abs() <= 360.0);
-    parsed.ok_or_else(|| "expected degrees, -360 to 360".into())
+fn parse_degrees(text: &str) -> Result<f64, String> {
+    let degrees = text.parse().ok().filter(|degrees: &f64| degrees.abs() <= 360.0);
+    degrees.ok_or_else(|| "expected degrees, -360 to 360".into())
 }
 
-fn positive(text: &str) -> Result<f64, String> {
-    number(text).and_then(|number| if number > 0.0 { Ok(number) } else { Err("expected a positive number".into()) })
+fn parse_positive(text: &str) -> Result<f64, String> {
+    let number = parse_non_negative(text)?;
+    if number > 0.0 { Ok(number) } else { Err("expected a positive number".into()) }
 }
 
-fn share(text: &str) -> Result<f64, String> {
-    number(text).and_then(|number| if number <= 0.5 { Ok(number) } else { Err("expected 0 to 0.5".into()) })
+/// Parses a fraction of a length of the scene, from 0 to 0.5.
+fn parse_fraction(text: &str) -> Result<f64, String> {
+    let number = parse_non_negative(text)?;
+    if number <= 0.5 { Ok(number) } else { Err("expected 0 to 0.5".into()) }
 }
 
 #[cfg(test)]
@@ -235,10 +238,10 @@ mod tests {
     }
 
     #[test]
-    fn invalid_numbers_are_refused() {
-        for wrong in ["nan", "-1", "inf", "x", ""] {
-            assert!(number(wrong).is_err(), "{wrong}");
+    fn invalid_numbers_are_rejected() {
+        for text in ["nan", "-1", "inf", "x", ""] {
+            assert!(parse_non_negative(text).is_err(), "{text}");
         }
-        assert!(positive("0").is_err() && share("0.6").is_err() && share("0.5").is_ok());
+        assert!(parse_positive("0").is_err() && parse_fraction("0.6").is_err() && parse_fraction("0.5").is_ok());
     }
 }

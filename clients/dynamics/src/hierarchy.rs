@@ -1,77 +1,91 @@
-//! Transforms of a hierarchy of parts that keep every joint closed. The transform T of a child is the product of its
-//! parent's T, the rigid motion that best fits the displacement U q of the parent's ring of attachment vertices, and
-//! the attachment frame at rest.
+//! Transforms of a hierarchy of domains that keep every joint closed. The transform T of a child is the product of its
+//! parent's T, the rigid transform that best fits the displacement U q of the parent's attachment vertices, and
+//! `parent_from_child` at rest.
 
 use nalgebra::Vector3;
 
-use crate::affine::{Affine, rigid_motion};
+use crate::affine::{AffineTransform, fit_rigid_transform};
 use crate::model::{DomainModel, Joint, Model};
 
-/// `world_from_domain` of every part at coordinates `q`. `local` moves a part within its own frame, for example a leaf
-/// that rotates about its stalk; parts without an entry do not move in their frame.
-pub fn transforms(model: &Model, q: &[f64], local: &[Option<Affine>]) -> Vec<Affine> {
-    let mut world: Vec<Affine> = Vec::with_capacity(model.parts.len());
-    for (index, part) in model.parts.iter().enumerate() {
-        let placed = match &part.joint {
-            None => part.placement,
-            Some(joint) => world[joint.parent].compose(&attachment_transform(&model.parts[joint.parent], joint, q)),
+/// Computes `world_from_domain` of every domain at the coordinates `q` of the scene. `local_transforms` move domains
+/// within their own frames, for example a leaf that rotates about its stalk. Domains without an entry do not move in
+/// their frames.
+pub fn compute_transforms(
+    model: &Model,
+    q: &[f64],
+    local_transforms: &[Option<AffineTransform>],
+) -> Vec<AffineTransform> {
+    let mut world_from_domain: Vec<AffineTransform> = Vec::with_capacity(model.domains.len());
+    for (index, domain) in model.domains.iter().enumerate() {
+        let attached = match &domain.joint {
+            None => domain.placement,
+            Some(joint) => {
+                let parent_from_child = deformed_attachment(&model.domains[joint.parent], joint, q);
+                world_from_domain[joint.parent].compose(&parent_from_child)
+            }
         };
-        let moved = local.get(index).and_then(Option::as_ref).map(|local| placed.compose(local));
-        world.push(moved.unwrap_or(placed));
+        let local = local_transforms.get(index).and_then(Option::as_ref);
+        world_from_domain.push(local.map_or(attached, |local| attached.compose(local)));
     }
-    world
+    world_from_domain
 }
 
-/// `parent_from_child` after the rigid motion of the parent's ring.
-fn attachment_transform(parent: &DomainModel, joint: &Joint, q: &[f64]) -> Affine {
-    if parent.rank == 0 || joint.ring.is_empty() {
-        return joint.frame;
+/// `parent_from_child` after the rigid transform that fits the displacement of the parent's attachment vertices.
+fn deformed_attachment(parent: &DomainModel, joint: &Joint, q: &[f64]) -> AffineTransform {
+    if parent.rank == 0 || joint.attachment_samples.is_empty() {
+        return joint.parent_from_child;
     }
     let q = parent.q(q);
-    let rest: Vec<_> = joint.ring.iter().map(|place| parent.samples[*place].rest).collect();
-    let now: Vec<_> = joint.ring.iter().map(|place| parent.samples[*place].deformed_position(q)).collect();
-    rigid_motion(&rest, &now).compose(&joint.frame)
+    let samples = || joint.attachment_samples.iter().map(|index| &parent.samples[*index]);
+    let rest: Vec<_> = samples().map(|sample| sample.rest).collect();
+    let current: Vec<_> = samples().map(|sample| sample.deformed_position(q)).collect();
+    fit_rigid_transform(&rest, &current).compose(&joint.parent_from_child)
 }
 
-/// Measures how far joints open: compares the distances between a child's base vertex and the vertices of its parent's
-/// ring with those at rest. The measurement is independent of how the transforms are computed.
+/// Measures how far joints open: compares the distances between a child's base vertex and the attachment vertices of its
+/// parent with those at rest. The measurement does not depend on how the transforms are computed.
 #[derive(Debug, Clone)]
 pub struct JointGapMeter {
-    rest: Vec<Vec<f64>>,
+    /// Distances at rest, per domain and attachment vertex.
+    rest_distances: Vec<Vec<f64>>,
 }
 
 impl JointGapMeter {
-    /// Computes the distances at rest, with the placement of each part.
+    /// Computes the distances at rest, with the placement of each domain.
     pub fn new(model: &Model) -> Self {
-        let world: Vec<_> = model.parts.iter().map(|part| part.placement).collect();
-        let q = vec![0.0; model.coordinates];
-        Self { rest: joint_distances(model, &q, &world) }
+        let placements: Vec<_> = model.domains.iter().map(|domain| domain.placement).collect();
+        let q = vec![0.0; model.coordinate_count];
+        Self { rest_distances: joint_distances(model, &q, &placements) }
     }
 
     /// The largest opening of a joint, in scene units.
-    pub fn gap(&self, model: &Model, q: &[f64], world: &[Affine]) -> f64 {
-        let now = joint_distances(model, q, world);
-        let pairs = now.iter().flatten().zip(self.rest.iter().flatten());
-        pairs.map(|(now, rest)| (now - rest).abs()).fold(0.0, f64::max)
+    pub fn max_gap(&self, model: &Model, q: &[f64], world_from_domain: &[AffineTransform]) -> f64 {
+        let distances = joint_distances(model, q, world_from_domain);
+        let pairs = distances.iter().flatten().zip(self.rest_distances.iter().flatten());
+        pairs.map(|(distance, rest)| (distance - rest).abs()).fold(0.0, f64::max)
     }
 }
 
-/// Per part: the distances between its base and its parent's ring. Without a ring: the distance between its base and
-/// the place given by its attachment frame.
-fn joint_distances(model: &Model, q: &[f64], world: &[Affine]) -> Vec<Vec<f64>> {
-    let of = |(part, pose): (&DomainModel, &Affine)| {
-        let Some(joint) = &part.joint else { return vec![] };
-        let (parent, above) = (&model.parts[joint.parent], &world[joint.parent]);
-        let still = part.base.map_or(Vector3::zeros(), |base| part.samples[base].rest);
-        let base = part.base.map_or(still, |base| part.samples[base].deformed_position(part.q(q)));
-        let base = pose.apply(&base);
-        if parent.rank == 0 || joint.ring.is_empty() {
-            return vec![(base - above.compose(&joint.frame).apply(&still)).norm()];
+/// Per domain: the distances between its base and the attachment vertices of its parent. Without attachment vertices:
+/// the distance between its base and the position that `parent_from_child` gives.
+fn joint_distances(model: &Model, q: &[f64], world_from_domain: &[AffineTransform]) -> Vec<Vec<f64>> {
+    let domain_distances = |(domain, transform): (&DomainModel, &AffineTransform)| {
+        let Some(joint) = &domain.joint else { return vec![] };
+        let (parent, world_from_parent) = (&model.domains[joint.parent], &world_from_domain[joint.parent]);
+        let base_sample = domain.base_sample.map(|index| &domain.samples[index]);
+        let rest_base = base_sample.map_or(Vector3::zeros(), |sample| sample.rest);
+        let base = transform.apply(&base_sample.map_or(rest_base, |sample| sample.deformed_position(domain.q(q))));
+        if parent.rank == 0 || joint.attachment_samples.is_empty() {
+            let expected_base = world_from_parent.compose(&joint.parent_from_child).apply(&rest_base);
+            return vec![(base - expected_base).norm()];
         }
-        let ring = joint.ring.iter().map(|place| above.apply(&parent.samples[*place].deformed_position(parent.q(q))));
-        ring.map(|place| (place - base).norm()).collect()
+        let distance = |index: &usize| {
+            let sample = &parent.samples[*index];
+            (world_from_parent.apply(&sample.deformed_position(parent.q(q))) - base).norm()
+        };
+        joint.attachment_samples.iter().map(distance).collect()
     };
-    model.parts.iter().zip(world).map(of).collect()
+    model.domains.iter().zip(world_from_domain).map(domain_distances).collect()
 }
 
 #[cfg(test)]
@@ -81,95 +95,103 @@ pub(crate) mod tests {
     use nalgebra::Matrix3;
     use std::collections::BTreeMap;
 
-    /// A part of length 1 along y with two modes: beam bending along x and z, with sections that rotate with the slope.
-    fn stem(radius: f64, joint: Option<Joint>, placement: Affine, first: usize) -> DomainModel {
+    /// A beam of length 1 along y with two modes: bending along x and z, with sections that rotate with the slope.
+    fn beam(radius: f64, joint: Option<Joint>, placement: AffineTransform, first_coordinate: usize) -> DomainModel {
         let mut samples = vec![];
-        for level in 0..5 {
-            let y = f64::from(level) / 4.0;
-            for corner in 0..6 {
-                let angle = f64::from(corner) * std::f64::consts::PI / 3.0;
+        for section in 0..5 {
+            let y = f64::from(section) / 4.0;
+            for vertex in 0..6 {
+                let angle = f64::from(vertex) * std::f64::consts::PI / 3.0;
                 let (x, z) = (radius * angle.cos(), radius * angle.sin());
-                // Tip displacement 1 per unit of q: y^2 sideways, with slope 2 y.
-                let rows = vec![y * y, 0.0, -2.0 * y * x, -2.0 * y * z, 0.0, y * y];
-                samples.push(Sample { rest: Vector3::new(x, y, z), rows });
+                // Displacement y^2 sideways per unit of q (1 at the tip), with slope 2 y.
+                let mode_rows = vec![y * y, 0.0, -2.0 * y * x, -2.0 * y * z, 0.0, y * y];
+                samples.push(Sample { rest: Vector3::new(x, y, z), mode_rows });
             }
         }
-        let (surface_samples, extent) = (samples.len(), 1.0);
-        samples.push(Sample { rest: Vector3::zeros(), rows: vec![0.0; 6] });
+        let surface_sample_count = samples.len();
+        samples.push(Sample { rest: Vector3::zeros(), mode_rows: vec![0.0; 6] });
         DomainModel {
-            name: "stem".into(),
+            name: "beam".into(),
             rank: 2,
-            first,
+            first_coordinate,
             owns_q: true,
             placement,
             joint,
             eigenvalues: vec![30.0, 35.0],
             notes: BTreeMap::new(),
             area: radius,
-            extent,
+            diagonal: 1.0,
             samples,
-            surface_samples,
-            base: Some(surface_samples),
+            surface_sample_count,
+            base_sample: Some(surface_sample_count),
         }
     }
 
-    /// A trunk, a tilted branch at its top ring, a twig at the branch's top ring, and a rigid leaf on the twig.
-    pub(crate) fn plant() -> Model {
-        let tilt = Affine::rotation_about(&Vector3::z(), -0.9, &Vector3::zeros());
-        let frame = Affine { translation: Vector3::y(), ..tilt };
-        let top = || (24..30).collect::<Vec<_>>();
-        let joint = |parent| Some(Joint { parent, frame, ring: top() });
-        let mut parts = vec![stem(0.05, None, Affine::identity(), 0)];
-        for above in 0..2 {
-            let placement = parts[above].placement.compose(&frame);
-            parts.push(stem(0.03, joint(above), placement, 2 * (above + 1)));
+    /// A trunk, a branch, a twig and a rigid leaf. Each is tilted and attached to the top section of the previous one.
+    /// The first three have two coordinates each.
+    pub(crate) fn four_domain_model() -> Model {
+        let tilt = AffineTransform::rotation_about(&Vector3::z(), -0.9, &Vector3::zeros());
+        let parent_from_child = AffineTransform { translation: Vector3::y(), ..tilt };
+        let joint = |parent| Some(Joint { parent, parent_from_child, attachment_samples: (24..30).collect() });
+        let mut domains = vec![beam(0.05, None, AffineTransform::identity(), 0)];
+        for parent in 0..2 {
+            let placement = domains[parent].placement.compose(&parent_from_child);
+            domains.push(beam(0.03, joint(parent), placement, 2 * (parent + 1)));
         }
-        let placement = parts[2].placement.compose(&frame);
-        let mut leaf = stem(0.01, joint(2), placement, 6);
+        let placement = domains[2].placement.compose(&parent_from_child);
+        let mut leaf = beam(0.01, joint(2), placement, 6);
         (leaf.rank, leaf.eigenvalues) = (0, vec![]);
-        leaf.samples.iter_mut().for_each(|sample| sample.rows.clear());
-        parts.push(leaf);
-        let (low, high) = (Vector3::new(-0.1, 0.0, -0.1), Vector3::new(2.5, 1.7, 0.1));
-        Model { scene: "plant".into(), parts, coordinates: 6, up: Vector3::y(), low, high }
+        leaf.samples.iter_mut().for_each(|sample| sample.mode_rows.clear());
+        domains.push(leaf);
+        Model {
+            scene: "four_domain_model".into(),
+            domains,
+            coordinate_count: 6,
+            up: Vector3::y(),
+            bounds_min: Vector3::new(-0.1, 0.0, -0.1),
+            bounds_max: Vector3::new(2.5, 1.7, 0.1),
+        }
     }
 
     #[test]
-    fn parts_at_rest_have_their_placement() {
-        let model = plant();
-        for (part, pose) in model.parts.iter().zip(transforms(&model, &[0.0; 6], &[])) {
-            assert!((pose.linear - part.placement.linear).abs().max() <= 1e-12);
-            assert!((pose.translation - part.placement.translation).norm() <= 1e-12);
+    fn domains_at_rest_have_their_placement() {
+        let model = four_domain_model();
+        for (domain, transform) in model.domains.iter().zip(compute_transforms(&model, &[0.0; 6], &[])) {
+            assert!((transform.linear - domain.placement.linear).abs().max() <= 1e-12);
+            assert!((transform.translation - domain.placement.translation).norm() <= 1e-12);
         }
     }
 
     #[test]
     fn children_follow_their_parents_and_joints_stay_closed() {
-        let model = plant();
-        let gauge = JointGapMeter::new(&model);
+        let model = four_domain_model();
+        let gap_meter = JointGapMeter::new(&model);
         for q in [[0.1, 0.05, -0.08, 0.1, 0.1, -0.1], [-0.12, 0.0, 0.1, 0.1, -0.05, 0.1]] {
-            let world = transforms(&model, &q, &[]);
-            let gap = gauge.gap(&model, &q, &world);
-            assert!(gap <= 1e-3 * model.diagonal(), "{gap} of {}", model.diagonal());
-            for pose in &world {
-                assert!((pose.linear.transpose() * pose.linear - Matrix3::identity()).abs().max() <= 1e-9);
+            let world_from_domain = compute_transforms(&model, &q, &[]);
+            let gap = gap_meter.max_gap(&model, &q, &world_from_domain);
+            assert!(gap <= 1e-3 * model.diagonal(), "gap {gap}, diagonal {}", model.diagonal());
+            for transform in &world_from_domain {
+                assert!((transform.linear.transpose() * transform.linear - Matrix3::identity()).abs().max() <= 1e-9);
             }
-            let tip = model.peak(&q, &world);
-            assert!(tip > 0.05, "the plant hardly moves: {tip}");
-            // Negative control: children that do not follow leave a gap that the gauge detects.
-            let still: Vec<_> = model.parts.iter().map(|part| part.placement).collect();
-            assert!(gauge.gap(&model, &q, &still) > 1e-2 * model.diagonal());
+            let displacement = model.max_displacement(&q, &world_from_domain);
+            assert!(displacement > 0.05, "expected a displacement above 0.05, got {displacement}");
+            // Negative control: children that do not follow their parents open the joints.
+            let placements: Vec<_> = model.domains.iter().map(|domain| domain.placement).collect();
+            assert!(gap_meter.max_gap(&model, &q, &placements) > 1e-2 * model.diagonal());
         }
     }
 
     #[test]
-    fn rigid_part_that_rotates_about_its_base_stays_attached() {
-        let model = plant();
-        let gauge = JointGapMeter::new(&model);
-        let turn = Affine::rotation_about(&Vector3::x(), 0.3, &Vector3::zeros());
-        let world = transforms(&model, &[0.05; 6], &[None, None, None, Some(turn)]);
-        assert!(gauge.gap(&model, &[0.05; 6], &world) <= 1e-3 * model.diagonal());
-        let away = Affine { translation: Vector3::new(0.0, 0.1, 0.0), ..turn };
-        let world = transforms(&model, &[0.05; 6], &[None, None, None, Some(away)]);
-        assert!(gauge.gap(&model, &[0.05; 6], &world) > 1e-3 * model.diagonal());
+    fn rigid_domain_that_rotates_about_its_base_stays_attached() {
+        let model = four_domain_model();
+        let gap_meter = JointGapMeter::new(&model);
+        let max_gap = |leaf_transform: AffineTransform| {
+            let world_from_domain = compute_transforms(&model, &[0.05; 6], &[None, None, None, Some(leaf_transform)]);
+            gap_meter.max_gap(&model, &[0.05; 6], &world_from_domain)
+        };
+        let rotation = AffineTransform::rotation_about(&Vector3::x(), 0.3, &Vector3::zeros());
+        assert!(max_gap(rotation) <= 1e-3 * model.diagonal());
+        let detached = AffineTransform { translation: Vector3::new(0.0, 0.1, 0.0), ..rotation };
+        assert!(max_gap(detached) > 1e-3 * model.diagonal());
     }
 }

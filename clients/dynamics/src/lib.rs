@@ -3,18 +3,18 @@
 //!
 //! | module | what it does |
 //! |---|---|
-//! | `model` | converts a scene description into parts: rank, joints, selected rows of U |
-//! | `affine` | affine transforms, and the rigid motion that best fits moved points |
+//! | `model` | converts a scene description into domain models: rank, joints, selected rows of U |
+//! | `affine` | affine transforms, and the rigid transform that best fits displaced points |
 //! | `hierarchy` | computes transforms that keep every joint closed, and measures the remaining gap |
 //! | `oscillator` | integrates one linear mode over a step, exactly |
-//! | `wind` | wind pressure by time and place |
+//! | `wind` | wind pressure by time and position |
 //! | `tree` | a tree in the wind, by modal superposition |
 //! | `cubic` | reduced StVK forces from a `.cub` file, with Jacobian and potential |
 //! | `vega` | base frequency and damping from a `.config` file |
-//! | `newmark` | implicit time integration of reduced forces under a load |
-//! | `bridge` | a span under a pulsating load |
-//! | `sweep` | motion for any scene: shows every coordinate in turn, or rocks a rigid scene |
-//! | `run` | sends a scenario as a step stream, with records and a summary |
+//! | `newmark` | implicit time integration of the reduced equations of motion |
+//! | `bridge` | a bridge under a pulsating load |
+//! | `sweep` | motion for any scene: moves one coordinate after another, or rocks a rigid scene |
+//! | `run` | sends a scenario as a step stream, optionally records it, and reports the results |
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 
@@ -32,4 +32,4 @@ pub mod tree;
 pub mod vega;
 pub mod wind;
 
-pub use error::{Error, Result, invalid};
+pub use error::{Error, Result, invalid_input};

@@ -9,31 +9,33 @@ use std::time::Duration;
 
 use clap::Parser as _;
 use modalcast_client::{Client, program};
-use modalcast_dynamics::bridge::{Bridge, Options as BridgeOptions};
+use modalcast_dynamics::bridge::{BridgeOptions, BridgeScenario};
 use modalcast_dynamics::cubic::ReducedForce;
 use modalcast_dynamics::model::Model;
-use modalcast_dynamics::run::{Options, Scenario, Summary, run};
-use modalcast_dynamics::sweep::{Options as SweepOptions, Sweep};
-use modalcast_dynamics::tree::{Options as TreeOptions, TreeScenario};
+use modalcast_dynamics::run::{Report, RunOptions, RunSummary, Scenario, drive_scene};
+use modalcast_dynamics::sweep::{SweepOptions, SweepScenario};
+use modalcast_dynamics::tree::{TreeOptions, TreeScenario};
 use modalcast_dynamics::vega::VegaSettings;
-use modalcast_dynamics::{Error, Result, invalid};
+use modalcast_dynamics::{Error, Result, invalid_input};
 use tokio::sync::watch;
 
 use cli::{Cli, Command, CommonOptions, ForceFileOptions};
 
-/// The most sampled vertices per part, of a tree and of other scenes.
-const TREE_SAMPLES: usize = 24;
+/// Maximum number of surface samples per domain of a tree.
+const MAX_TREE_SAMPLES: usize = 24;
+
+/// Maximum number of surface samples per domain of other scenes.
 const MAX_SAMPLES: usize = 1 << 16;
 
 /// The exit code of a complete run in which the server rejected steps.
-const REJECTED: u8 = 6;
+const STEPS_REJECTED: u8 = 6;
 
 fn main() -> ExitCode {
     let arguments = Cli::parse();
     let main = async {
-        let summary = drive(&arguments).await?;
-        print(&summary, arguments.command.common().json);
-        Ok(if summary.rejected > 0 { REJECTED } else { 0 })
+        let summary = run_scenario(&arguments).await?;
+        print_report(&summary.report, arguments.command.common().json);
+        Ok(if summary.rejected > 0 { STEPS_REJECTED } else { 0 })
     };
     program::run("modalcast-sim", main, exit_code)
 }
@@ -46,36 +48,36 @@ const fn exit_code(error: &Error) -> u8 {
     }
 }
 
-async fn drive(arguments: &Cli) -> Result<Summary> {
+async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
     let common = arguments.command.common();
     let client = Client::connect_with_retry(&common.server, Duration::from_secs_f64(common.wait)).await?;
     let scene = match &common.open {
         Some(source) => client.open_scene(source, &common.scene).await?.scene,
         None => common.scene.clone(),
     };
-    let mut scenario = scenario(&client, &scene, &arguments.command).await?;
-    let (stopper, stop) = watch::channel(false);
+    let mut scenario = create_scenario(&client, &scene, &arguments.command).await?;
+    let (stop_sender, stop) = watch::channel(false);
     tokio::spawn(async move {
-        shutdown_signal().await;
-        stopper.send_replace(true);
-        // The first signal ends the run in order. A later interrupt exits at once, also if the server has stalled.
+        wait_for_shutdown_signal().await;
+        stop_sender.send_replace(true);
+        // The first signal ends the run after the current step. A later Ctrl-C exits at once, even if the server stalls.
         if tokio::signal::ctrl_c().await.is_ok() {
             std::process::exit(130);
         }
     });
-    let options = Options {
-        steps: common.count(),
+    let options = RunOptions {
+        steps: common.step_count(),
         dt: common.dt,
         policy: common.policy.into(),
         window: common.window,
         realtime: common.realtime,
-        record: common.record.clone(),
+        record_folder: common.record.clone(),
     };
-    run(&client, scenario.as_mut(), &options, &stop).await
+    drive_scene(&client, scenario.as_mut(), &options, &stop).await
 }
 
 /// Waits for Ctrl-C or SIGTERM.
-async fn shutdown_signal() {
+async fn wait_for_shutdown_signal() {
     use tokio::signal::unix::{SignalKind, signal};
     let Ok(mut terminate) = signal(SignalKind::terminate()) else {
         tokio::signal::ctrl_c().await.ok(); // Without a SIGTERM handler, wait for Ctrl-C only.
@@ -87,12 +89,12 @@ async fn shutdown_signal() {
     }
 }
 
-async fn scenario(client: &Client, scene: &str, command: &Command) -> Result<Box<dyn Scenario>> {
+async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Result<Box<dyn Scenario>> {
     let common = command.common();
-    let (dt, steps) = (common.dt, common.count());
+    let (dt, steps) = (common.dt, common.step_count());
     match command {
         Command::Tree { wind, .. } => {
-            let model = Model::fetch(client, scene, TREE_SAMPLES).await?;
+            let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
             let (strength, direction) = (wind.wind, wind.direction.to_radians());
             let options = TreeOptions { dt, steps, sway: wind.sway, wind: strength, direction, seed: wind.seed };
             Ok(Box::new(TreeScenario::new(model, options)?))
@@ -101,72 +103,75 @@ async fn scenario(client: &Client, scene: &str, command: &Command) -> Result<Box
             let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
             let options = BridgeOptions {
                 dt,
-                deflection: load.deflection,
+                deflection_fraction: load.deflection,
                 period: load.period,
                 load_direction: load.toward.into(),
             };
-            bridge(model, files, options)
+            create_bridge_scenario(model, files, options)
         }
         Command::Sweep { share, .. } => {
             let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
-            Ok(Box::new(Sweep::new(model, SweepOptions { dt, steps, share: *share })))
+            let options = SweepOptions { dt, steps, displacement_fraction: *share };
+            Ok(Box::new(SweepScenario::new(model, options)))
         }
         Command::Auto { files, load, wind, share, .. } => {
             // A model with few samples is enough to choose the scenario.
-            let model = Model::fetch(client, scene, TREE_SAMPLES).await?;
-            let command = if cubic(&model, files).is_some() {
+            let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
+            let command = if find_force_file(&model, files).is_some() {
                 Command::Bridge { common: common.clone(), files: files.clone(), load: *load }
-            } else if model.parts.iter().any(|part| !part.eigenvalues.is_empty()) {
+            } else if model.domains.iter().any(|domain| !domain.eigenvalues.is_empty()) {
                 Command::Tree { common: common.clone(), wind: *wind }
             } else {
                 Command::Sweep { common: common.clone(), share: *share }
             };
             eprintln!("modalcast-sim: {scene}: scenario `{}`", command.name());
-            Box::pin(scenario(client, scene, &command)).await
+            Box::pin(create_scenario(client, scene, &command)).await
         }
     }
 }
 
-fn bridge(model: Model, files: &ForceFileOptions, options: BridgeOptions) -> Result<Box<dyn Scenario>> {
-    let missing = || invalid("cubic", "--cubic FILE.cub, or --files DIR with the file that the scene names", "none");
-    let cubic = cubic(&model, files).ok_or_else(missing)?;
-    let beside = cubic.with_extension("config");
-    let config = files.config.clone().or_else(|| beside.is_file().then_some(beside));
-    let settings = config.map_or_else(|| Ok(VegaSettings::default()), |path| VegaSettings::read(&path))?;
-    Ok(Box::new(Bridge::new(model, ReducedForce::read(&cubic)?, &settings, options)?))
+fn create_bridge_scenario(model: Model, files: &ForceFileOptions, options: BridgeOptions) -> Result<Box<dyn Scenario>> {
+    let force_path = find_force_file(&model, files).ok_or_else(|| {
+        let expected = "--cubic FILE.cub, or --files DIR with the file that the scene names";
+        invalid_input("cubic", expected, "no file, or several files in --files")
+    })?;
+    let default_config = force_path.with_extension("config");
+    let config_path = files.config.clone().or_else(|| default_config.is_file().then_some(default_config));
+    let settings = config_path.map_or_else(|| Ok(VegaSettings::default()), |path| VegaSettings::read(&path))?;
+    Ok(Box::new(BridgeScenario::new(model, ReducedForce::read(&force_path)?, &settings, options)?))
 }
 
-/// The file of cubic forces: the one of `--cubic`, or the one in `--files` that a note of the scene names, or the only
-/// one in `--files`.
-fn cubic(model: &Model, files: &ForceFileOptions) -> Option<PathBuf> {
+/// Finds the file of reduced forces: the one of `--cubic`, or the one in `--files` that a note of the scene names, or
+/// the only one in `--files`.
+fn find_force_file(model: &Model, files: &ForceFileOptions) -> Option<PathBuf> {
     if let Some(path) = &files.cubic {
         return Some(path.clone());
     }
     let folder = files.files.as_deref()?;
-    let named = model.parts.iter().filter_map(|part| part.notes.get("vega.cubic"));
-    let named = named.filter_map(|note| Path::new(note).file_name()).map(|name| folder.join(name));
-    let mut found: Vec<PathBuf> = named.filter(|path| path.is_file()).collect();
-    if found.is_empty() {
-        let items = folder.read_dir().ok()?.filter_map(|item| Some(item.ok()?.path()));
-        found = items.filter(|path| path.extension().is_some_and(|end| end == "cub")).collect();
+    let notes = model.domains.iter().filter_map(|domain| domain.notes.get("vega.cubic"));
+    let noted_paths = notes.filter_map(|note| Path::new(note).file_name()).map(|name| folder.join(name));
+    let mut candidates: Vec<PathBuf> = noted_paths.filter(|path| path.is_file()).collect();
+    if candidates.is_empty() {
+        let paths = folder.read_dir().ok()?.filter_map(|entry| Some(entry.ok()?.path()));
+        candidates = paths.filter(|path| path.extension().is_some_and(|extension| extension == "cub")).collect();
     }
-    if found.len() == 1 { found.pop() } else { None }
+    if candidates.len() == 1 { candidates.pop() } else { None }
 }
 
-/// Prints the summary as one line of JSON, or with one line per value.
-fn print(summary: &Summary, json: bool) {
-    if json {
-        println!("{}", summary.value);
+/// Prints the report as one line of JSON, or with one line per value.
+fn print_report(report: &Report, as_json: bool) {
+    if as_json {
+        println!("{}", serde_json::json!(report));
         return;
     }
-    for (name, value) in summary.value.as_object().into_iter().flatten() {
+    for (name, value) in report {
         println!("{name:24} {value}");
     }
 }
 
 impl CommonOptions {
     /// The number of steps; `None` for an unlimited run.
-    fn count(&self) -> Option<u64> {
+    fn step_count(&self) -> Option<u64> {
         match (self.steps, self.seconds) {
             (Some(0), _) => None,
             (Some(steps), _) => Some(steps),

@@ -1,311 +1,360 @@
-//! Model of a scene for the dynamics, built from the server's description: per part rank, joint, sampled vertices with
-//! their rows of U, and area.
+//! Model of a scene for the dynamics, built from the server's description. It has one `DomainModel` per domain: rank,
+//! joint, surface area, and sampled vertices with their rows of U.
 //!
-//! Points and rows are in the frame of their part, lengths in scene units. Parents precede their children.
+//! Points and rows of U are in the frame of their domain, lengths in scene units. Parents precede their children.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use modalcast_client::{Array, Client, Domain, ModeRows, SceneDescription};
 use nalgebra::Vector3;
 
-use crate::affine::Affine;
-use crate::error::{Result, invalid};
+use crate::affine::AffineTransform;
+use crate::error::{Result, invalid_input};
 
-/// The most numbers of U that are read, over all parts.
+/// Maximum number of entries of U that the surface samples of all domains have together.
 const MAX_MODE_ENTRIES: usize = 8 << 20;
+
+/// Minimum number of surface samples per domain (or all vertices of a smaller domain), whatever `MAX_MODE_ENTRIES` is.
+const MIN_SURFACE_SAMPLES: usize = 8;
 
 /// A vertex at which the dynamics measures displacements or applies loads.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
+    /// Rest position.
     pub rest: Vector3<f64>,
-    /// Three rows of r entries, row-major.
-    pub rows: Vec<f64>,
+    /// Rows of U at this vertex: 3 x r, row-major.
+    pub mode_rows: Vec<f64>,
 }
 
-/// The attachment of a part to its parent.
+/// The attachment of a domain to its parent.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Joint {
+    /// Index of the parent.
     pub parent: usize,
     /// `parent_from_child` at rest.
-    pub frame: Affine,
-    /// Indices of the parent's samples that carry the frame; empty for a rigid parent.
-    pub ring: Vec<usize>,
+    pub parent_from_child: AffineTransform,
+    /// Indices of the parent's samples whose displacement moves the joint; empty for a rigid parent.
+    pub attachment_samples: Vec<usize>,
 }
 
-/// One domain.
+/// One domain of the scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DomainModel {
     pub name: String,
     pub rank: usize,
-    /// Index of its first coordinate in the vector of all coordinates. Parts that share coordinates have the same
-    /// index.
-    pub first: usize,
-    /// Whether steps carry the coordinates of this part. False if the part shares those of an earlier part.
+    /// Index of the domain's first coordinate in the vector of all coordinates. Domains that share coordinates have the
+    /// same index.
+    pub first_coordinate: usize,
+    /// Whether steps carry the coordinates of this domain. False if it shares those of an earlier domain.
     pub owns_q: bool,
     /// `world_from_domain` at rest.
-    pub placement: Affine,
+    pub placement: AffineTransform,
     pub joint: Option<Joint>,
-    /// (rad/s)^2; empty when unknown.
+    /// (rad/s)^2 per mode; empty when unknown.
     pub eigenvalues: Vec<f64>,
+    /// Free-form metadata of the scene's author, by name.
     pub notes: BTreeMap<String, String>,
-    /// Surface area, and diagonal of the bounds; 0 if the mesh was not requested.
+    /// Surface area; 0 if the mesh was not requested.
     pub area: f64,
-    pub extent: f64,
-    /// The first `surface_samples` samples are spread evenly over the vertices; the other vertices of joint rings follow.
+    /// Diagonal of the bounds at rest; 0 if the positions were not requested.
+    pub diagonal: f64,
+    /// The first `surface_sample_count` samples are spread evenly over the vertices. The other vertices that joints
+    /// need follow.
     pub samples: Vec<Sample>,
-    pub surface_samples: usize,
-    /// Index of the sample nearest to the part's origin, where the part is attached to its parent.
-    pub base: Option<usize>,
+    pub surface_sample_count: usize,
+    /// Index of the sample nearest to the domain's origin, where the domain is attached to its parent.
+    pub base_sample: Option<usize>,
 }
 
 /// A scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Model {
     pub scene: String,
-    pub parts: Vec<DomainModel>,
-    /// Number of coordinates of all parts.
-    pub coordinates: usize,
+    pub domains: Vec<DomainModel>,
+    /// Number of coordinates of all domains.
+    pub coordinate_count: usize,
+    /// Unit vector of the up axis.
     pub up: Vector3<f64>,
-    pub low: Vector3<f64>,
-    pub high: Vector3<f64>,
+    /// Corners of the bounds at rest.
+    pub bounds_min: Vector3<f64>,
+    pub bounds_max: Vector3<f64>,
+}
+
+/// The horizontal axes of a scene. `long`, `short` and the up axis form a right-handed system.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GroundAxes {
+    /// The axis along which the bounds are longer.
+    pub long: Vector3<f64>,
+    pub short: Vector3<f64>,
 }
 
 impl Sample {
     /// U q at this vertex.
     pub fn displacement(&self, q: &[f64]) -> Vector3<f64> {
-        Vector3::from_fn(|row, _| self.row(row, q.len()).iter().zip(q).map(|(entry, q)| entry * q).sum())
+        Vector3::from_fn(|component, _| self.row(component, q.len()).iter().zip(q).map(|(entry, q)| entry * q).sum())
     }
 
     /// One row of U.
     pub fn row(&self, component: usize, rank: usize) -> &[f64] {
-        &self.rows[component * rank..][..rank]
+        &self.mode_rows[component * rank..][..rank]
     }
 
     /// One column of the three rows.
     pub fn column(&self, mode: usize, rank: usize) -> Vector3<f64> {
-        Vector3::from_fn(|component, _| self.rows[component * rank + mode])
+        Vector3::from_fn(|component, _| self.mode_rows[component * rank + mode])
     }
 
-    /// Displaced position of the vertex, in the frame of its part.
+    /// Displaced position of the vertex, in the frame of its domain.
     pub fn deformed_position(&self, q: &[f64]) -> Vector3<f64> {
         self.rest + self.displacement(q)
     }
 }
 
 impl DomainModel {
-    /// The coordinates of this part, from the vector of all coordinates.
-    pub fn q<'a>(&self, all: &'a [f64]) -> &'a [f64] {
-        &all[self.first..][..self.rank]
+    /// The coordinates of this domain, from the coordinates of the whole scene.
+    pub fn q<'a>(&self, scene_q: &'a [f64]) -> &'a [f64] {
+        &scene_q[self.first_coordinate..][..self.rank]
+    }
+
+    /// The samples that are spread evenly over the vertices.
+    pub fn surface_samples(&self) -> &[Sample] {
+        &self.samples[..self.surface_sample_count]
     }
 
     /// The value of a note, if it is a finite number.
-    pub fn note(&self, name: &str) -> Option<f64> {
+    pub fn numeric_note(&self, name: &str) -> Option<f64> {
         self.notes.get(name).and_then(|text| text.trim().parse().ok()).filter(|number: &f64| number.is_finite())
     }
 }
 
 impl Model {
-    /// Reads a scene from its server. `watched` is the most evenly spread samples per part; it is reduced, to no less
-    /// than 8, so that these samples of all parts together have at most 8 Mi numbers of U.
+    /// Reads a scene from its server. `max_surface_samples` limits the surface samples per domain. The limit is reduced,
+    /// to no less than 8, so that the surface samples of all domains have at most 8 Mi entries of U.
     ///
     /// # Errors
     /// `Client` as for the calls; `Invalid` if the description contradicts itself.
-    pub async fn fetch(client: &Client, scene: &str, watched: usize) -> Result<Self> {
-        let bare = client.describe(scene, &[]).await?;
-        let bends = bare.domains.iter().any(|domain| domain.rank > 0);
-        let swings = bare.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
-        let description = match (bends, swings) {
-            (false, _) => bare,
+    pub async fn fetch(client: &Client, scene: &str, max_surface_samples: usize) -> Result<Self> {
+        let without_arrays = client.describe(scene, &[]).await?;
+        let has_modes = without_arrays.domains.iter().any(|domain| domain.rank > 0);
+        let has_eigenvalues = without_arrays.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
+        let description = match (has_modes, has_eigenvalues) {
+            (false, _) => without_arrays,
             (true, false) => client.describe(scene, &[Array::RestPositions]).await?,
             (true, true) => {
                 client.describe(scene, &[Array::RestPositions, Array::Indices, Array::CornerVertices]).await?
             }
         };
-        let numbers: usize = description.domains.iter().map(|domain| 3 * domain.rank).sum();
-        let watched = watched.min(MAX_MODE_ENTRIES / numbers.max(1)).max(8);
-        let choices = choose(&description, watched)?;
+        let entries_per_sample: usize = description.domains.iter().map(|domain| 3 * domain.rank).sum();
+        let max_surface_samples =
+            max_surface_samples.min(MAX_MODE_ENTRIES / entries_per_sample.max(1)).max(MIN_SURFACE_SAMPLES);
+        let selections = select_vertices(&description, max_surface_samples)?;
         let mut modes = BTreeMap::new();
-        for (domain, choice) in description.domains.iter().zip(&choices) {
-            let key = (domain.shape, choice.vertices.clone());
+        for (domain, selection) in description.domains.iter().zip(&selections) {
+            let key = (domain.shape, selection.vertices.clone());
             if domain.rank > 0 && !modes.contains_key(&key) {
-                let rows = client.modes(scene, domain.index, &choice.vertices).await?;
+                let rows = client.modes(scene, domain.index, &selection.vertices).await?;
                 if rows.rank != domain.rank {
-                    return Err(invalid(format!("rank of '{}'", domain.name), domain.rank, rows.rank));
+                    return Err(invalid_input(format!("rank of '{}'", domain.name), domain.rank, rows.rank));
                 }
                 modes.insert(key, rows);
             }
         }
-        Self::assemble(&description, choices, |domain, vertices| modes.get(&(domain.shape, vertices.to_vec())))
+        Self::assemble(&description, selections, |domain, vertices| modes.get(&(domain.shape, vertices.to_vec())))
     }
 
     fn assemble<'a>(
         description: &SceneDescription,
-        choices: Vec<Choice>,
-        rows: impl Fn(&Domain, &[u32]) -> Option<&'a ModeRows>,
+        selections: Vec<SelectedVertices>,
+        mode_rows: impl Fn(&Domain, &[u32]) -> Option<&'a ModeRows>,
     ) -> Result<Self> {
-        let (mut parts, mut coordinates): (Vec<DomainModel>, _) = (vec![], 0);
-        for (domain, choice) in description.domains.iter().zip(&choices) {
-            let twin = domain.shares_q_with.map(|twin| parts.get(twin).map(|part| (part.first, part.rank)));
-            let first = match twin {
-                None => coordinates,
-                Some(Some((first, rank))) if rank == domain.rank => first,
-                Some(_) => return Err(invalid(format!("'{}' shares q", domain.name), "an earlier twin", "another")),
+        let mut domains: Vec<DomainModel> = vec![];
+        let mut coordinate_count = 0;
+        for (domain, selection) in description.domains.iter().zip(&selections) {
+            let first_coordinate = match domain.shares_q_with.map(|owner| domains.get(owner)) {
+                None => coordinate_count,
+                Some(Some(owner)) if owner.rank == domain.rank => owner.first_coordinate,
+                Some(_) => {
+                    let field = format!("domain whose q '{}' shares", domain.name);
+                    return Err(invalid_input(field, "an earlier domain of the same rank", "another domain"));
+                }
             };
-            coordinates += if twin.is_none() { domain.rank } else { 0 };
-            let read = rows(domain, &choice.vertices);
-            let mut part = part(domain, choice, read);
-            (part.first, part.owns_q) = (first, twin.is_none());
-            part.joint = joint(domain, &choices)?;
-            parts.push(part);
+            let owns_q = domain.shares_q_with.is_none();
+            coordinate_count += if owns_q { domain.rank } else { 0 };
+            let samples = create_samples(domain, selection, mode_rows(domain, &selection.vertices))?;
+            let mut domain_model = create_domain_model(domain, selection, samples);
+            (domain_model.first_coordinate, domain_model.owns_q) = (first_coordinate, owns_q);
+            domain_model.joint = create_joint(domain, &selections);
+            domains.push(domain_model);
         }
         let info = &description.info;
         let bounds = <[f64; 6]>::try_from(info.bounds.as_slice());
-        let bounds = bounds.map_err(|_| invalid("scene.bounds", "6 numbers", info.bounds.len()))?;
+        let bounds = bounds.map_err(|_| invalid_input("scene.bounds", "6 numbers", info.bounds.len()))?;
         let up = match info.up.as_str() {
             "x" => Vector3::x(),
             "z" => Vector3::z(),
             _ => Vector3::y(),
         };
-        let (low, high) = (Vector3::from_column_slice(&bounds[..3]), Vector3::from_column_slice(&bounds[3..]));
-        Ok(Self { scene: info.scene.clone(), parts, coordinates, up, low, high })
+        let bounds_min = Vector3::from_column_slice(&bounds[..3]);
+        let bounds_max = Vector3::from_column_slice(&bounds[3..]);
+        Ok(Self { scene: info.scene.clone(), domains, coordinate_count, up, bounds_min, bounds_max })
     }
 
     /// Diagonal of the bounds at rest, in scene units.
     pub fn diagonal(&self) -> f64 {
-        (self.high - self.low).norm().max(f64::MIN_POSITIVE)
+        (self.bounds_max - self.bounds_min).norm().max(f64::MIN_POSITIVE)
     }
 
     /// Extent along the up axis at rest, in scene units.
     pub fn height(&self) -> f64 {
-        (self.high - self.low).dot(&self.up).max(f64::MIN_POSITIVE)
+        (self.bounds_max - self.bounds_min).dot(&self.up).max(f64::MIN_POSITIVE)
     }
 
     /// The horizontal direction at an angle about the up axis, in radians, from the first horizontal axis (x, or y if x
     /// is up).
     pub fn horizontal_direction(&self, angle: f64) -> Vector3<f64> {
-        let first = if self.up.x > 0.5 { Vector3::y() } else { Vector3::x() };
-        first * angle.cos() + self.up.cross(&first) * angle.sin()
+        let first_axis = if self.up.x > 0.5 { Vector3::y() } else { Vector3::x() };
+        first_axis * angle.cos() + self.up.cross(&first_axis) * angle.sin()
     }
 
-    /// The longer horizontal axis and the other one. The two and the up axis form a right-handed system.
-    pub fn ground_axes(&self) -> (Vector3<f64>, Vector3<f64>) {
+    /// The horizontal axes, ordered by the size of the bounds at rest.
+    pub fn ground_axes(&self) -> GroundAxes {
         let (first, second) = (self.horizontal_direction(0.0), self.horizontal_direction(std::f64::consts::FRAC_PI_2));
-        let size = |axis: &Vector3<f64>| (self.high - self.low).dot(&axis.abs());
-        if size(&second) > size(&first) { (second, -first) } else { (first, second) }
+        let size = |axis: &Vector3<f64>| (self.bounds_max - self.bounds_min).dot(&axis.abs());
+        if size(&second) > size(&first) {
+            GroundAxes { long: second, short: -first }
+        } else {
+            GroundAxes { long: first, short: second }
+        }
     }
 
-    /// The largest displacement of a part's origin or of a sample from rest, in scene units. Considers evenly spread
-    /// samples only.
-    pub fn peak(&self, q: &[f64], world: &[Affine]) -> f64 {
-        let parts = self.parts.iter().zip(world);
-        let of = |(part, pose): (&DomainModel, &Affine)| {
-            let moved = |sample: &Sample| {
-                (pose.apply(&sample.deformed_position(part.q(q))) - part.placement.apply(&sample.rest)).norm()
+    /// The largest displacement from rest of a domain's origin or of a surface sample, in scene units.
+    /// `world_from_domain` has one transform per domain.
+    pub fn max_displacement(&self, q: &[f64], world_from_domain: &[AffineTransform]) -> f64 {
+        let domain_displacement = |(domain, transform): (&DomainModel, &AffineTransform)| {
+            let sample_displacement = |sample: &Sample| {
+                let current = transform.apply(&sample.deformed_position(domain.q(q)));
+                (current - domain.placement.apply(&sample.rest)).norm()
             };
-            let origin = (pose.translation - part.placement.translation).norm();
-            part.samples[..part.surface_samples].iter().map(moved).fold(origin, f64::max)
+            let origin_displacement = (transform.translation - domain.placement.translation).norm();
+            domain.surface_samples().iter().map(sample_displacement).fold(origin_displacement, f64::max)
         };
-        parts.map(of).fold(0.0, f64::max)
+        self.domains.iter().zip(world_from_domain).map(domain_displacement).fold(0.0, f64::max)
     }
 }
 
-/// The vertices of a domain to read: first `surface_samples` evenly spread ones, then the others that joints need.
-struct Choice {
+/// The vertices of a domain to read: first `surface_sample_count` evenly spread ones, then the others that joints need.
+struct SelectedVertices {
     vertices: Vec<u32>,
-    surface_samples: usize,
+    surface_sample_count: usize,
 }
 
-fn choose(description: &SceneDescription, watched: usize) -> Result<Vec<Choice>> {
+/// Selects the vertices of every domain; no vertices for domains without rest positions.
+fn select_vertices(description: &SceneDescription, max_surface_samples: usize) -> Result<Vec<SelectedVertices>> {
     let domains = &description.domains;
-    let mut rings: Vec<BTreeSet<u32>> = vec![BTreeSet::new(); domains.len()];
+    let mut attachment_vertices: Vec<BTreeSet<u32>> = vec![BTreeSet::new(); domains.len()];
     for (index, domain) in domains.iter().enumerate() {
         let Some(attachment) = &domain.attachment else { continue };
         if attachment.parent >= index {
             let field = format!("parent of '{}'", domain.name);
-            return Err(invalid(field, format!("an index below {index}"), attachment.parent));
+            return Err(invalid_input(field, format!("an index below {index}"), attachment.parent));
         }
         let limit = domains[attachment.parent].vertices;
-        if let Some(row) = attachment.rows.iter().find(|row| **row as usize >= limit) {
-            return Err(invalid(format!("ring of '{}'", domain.name), format!("vertices below {limit}"), row));
+        if let Some(vertex) = attachment.rows.iter().find(|vertex| **vertex as usize >= limit) {
+            let field = format!("attachment vertices of '{}'", domain.name);
+            return Err(invalid_input(field, format!("vertices below {limit}"), vertex));
         }
-        rings[attachment.parent].extend(&attachment.rows);
+        attachment_vertices[attachment.parent].extend(&attachment.rows);
     }
-    let choice = |(domain, ring): (&Domain, BTreeSet<u32>)| {
+    let select = |(domain, attachment_vertices): (&Domain, BTreeSet<u32>)| {
         if domain.rest_positions.is_empty() {
-            return Choice { vertices: vec![], surface_samples: 0 };
+            return SelectedVertices { vertices: vec![], surface_sample_count: 0 };
         }
-        let surface_samples = domain.vertices.min(watched);
-        let mut vertices: Vec<u32> =
-            (0..surface_samples).map(|at| (at * domain.vertices / surface_samples) as u32).collect();
-        let spread: BTreeSet<u32> = vertices.iter().copied().collect();
-        let others = ring.into_iter().chain([base(domain)]).collect::<BTreeSet<_>>();
-        vertices.extend(others.difference(&spread));
-        Choice { vertices, surface_samples }
+        let count = domain.vertices.min(max_surface_samples);
+        let mut vertices: Vec<u32> = (0..count).map(|ordinal| (ordinal * domain.vertices / count) as u32).collect();
+        let surface_vertices: BTreeSet<u32> = vertices.iter().copied().collect();
+        let joint_vertices = attachment_vertices.into_iter().chain([base_vertex(domain)]).collect::<BTreeSet<_>>();
+        vertices.extend(joint_vertices.difference(&surface_vertices));
+        SelectedVertices { vertices, surface_sample_count: count }
     };
-    Ok(domains.iter().zip(rings).map(choice).collect())
+    Ok(domains.iter().zip(attachment_vertices).map(select).collect())
 }
 
 /// Index of the vertex nearest to the domain's origin.
-fn base(domain: &Domain) -> u32 {
-    let size = |at: u32| domain.rest_positions[3 * at as usize..][..3].iter().map(|x| x * x).sum::<f32>();
-    (0..domain.vertices as u32).min_by(|a, b| size(*a).total_cmp(&size(*b))).unwrap_or(0)
+fn base_vertex(domain: &Domain) -> u32 {
+    let norm_squared =
+        |vertex: u32| domain.rest_positions[3 * vertex as usize..][..3].iter().map(|x| x * x).sum::<f32>();
+    (0..domain.vertices as u32).min_by(|a, b| norm_squared(*a).total_cmp(&norm_squared(*b))).unwrap_or(0)
 }
 
-fn point(domain: &Domain, vertex: u32) -> Vector3<f64> {
-    Vector3::from_fn(|row, _| f64::from(domain.rest_positions[3 * vertex as usize + row]))
+fn rest_position(domain: &Domain, vertex: u32) -> Vector3<f64> {
+    Vector3::from_fn(|component, _| f64::from(domain.rest_positions[3 * vertex as usize + component]))
 }
 
-fn part(domain: &Domain, choice: &Choice, read: Option<&ModeRows>) -> DomainModel {
-    let sample = |(place, vertex): (usize, &u32)| {
-        let rows = read.map_or(&[][..], |rows| rows.rows_of(place));
-        Sample { rest: point(domain, *vertex), rows: rows.iter().map(|entry| f64::from(*entry)).collect() }
+/// The samples of a domain's selected vertices; without rows of U if `mode_rows` is `None`.
+fn create_samples(domain: &Domain, selection: &SelectedVertices, mode_rows: Option<&ModeRows>) -> Result<Vec<Sample>> {
+    let sample = |(ordinal, vertex): (usize, &u32)| {
+        let rows = match mode_rows {
+            Some(mode_rows) => mode_rows.rows_of(ordinal).ok_or_else(|| {
+                let field = format!("rows of U of '{}'", domain.name);
+                invalid_input(field, format!("rows of {} vertices", selection.vertices.len()), ordinal)
+            })?,
+            None => &[],
+        };
+        let mode_rows = rows.iter().map(|entry| f64::from(*entry)).collect();
+        Ok(Sample { rest: rest_position(domain, *vertex), mode_rows })
     };
-    let samples: Vec<Sample> = choice.vertices.iter().enumerate().map(sample).collect();
-    let base = if samples.is_empty() { None } else { Some(base(domain)) };
+    selection.vertices.iter().enumerate().map(sample).collect()
+}
+
+/// Creates the model of a domain without a joint, as if its coordinates were the first of the scene.
+fn create_domain_model(domain: &Domain, selection: &SelectedVertices, samples: Vec<Sample>) -> DomainModel {
+    let base_vertex = if samples.is_empty() { None } else { Some(base_vertex(domain)) };
     DomainModel {
         name: domain.name.clone(),
         rank: domain.rank,
-        first: 0,
+        first_coordinate: 0,
         owns_q: true,
-        placement: Affine::from_entries(&domain.placement),
+        placement: AffineTransform::from_row_major(&domain.placement),
         joint: None,
         eigenvalues: domain.eigenvalues.clone(),
         notes: domain.notes.clone(),
-        area: area(domain),
-        extent: extent(domain),
-        base: base.and_then(|base| choice.vertices.iter().position(|vertex| *vertex == base)),
+        area: surface_area(domain),
+        diagonal: bounds_diagonal(domain),
+        base_sample: base_vertex.and_then(|base| selection.vertices.iter().position(|vertex| *vertex == base)),
         samples,
-        surface_samples: choice.surface_samples,
+        surface_sample_count: selection.surface_sample_count,
     }
 }
 
-fn joint(domain: &Domain, choices: &[Choice]) -> Result<Option<Joint>> {
-    let Some(attachment) = &domain.attachment else { return Ok(None) };
-    let places: BTreeMap<u32, usize> =
-        choices[attachment.parent].vertices.iter().enumerate().map(|(place, vertex)| (*vertex, place)).collect();
-    let ring = attachment.rows.iter().filter_map(|row| places.get(row).copied()).collect();
-    let frame = Affine::from_entries(&attachment.frame);
-    Ok(Some(Joint { parent: attachment.parent, frame, ring }))
+fn create_joint(domain: &Domain, selections: &[SelectedVertices]) -> Option<Joint> {
+    let attachment = domain.attachment.as_ref()?;
+    let parent_vertices = &selections[attachment.parent].vertices;
+    let sample_of_vertex: BTreeMap<u32, usize> =
+        parent_vertices.iter().enumerate().map(|(sample, vertex)| (*vertex, sample)).collect();
+    let attachment_samples =
+        attachment.rows.iter().filter_map(|vertex| sample_of_vertex.get(vertex).copied()).collect();
+    let parent_from_child = AffineTransform::from_row_major(&attachment.frame);
+    Some(Joint { parent: attachment.parent, parent_from_child, attachment_samples })
 }
 
-/// The surface area of a domain's mesh.
-fn area(domain: &Domain) -> f64 {
+/// The surface area of a domain's mesh; 0 without a mesh.
+fn surface_area(domain: &Domain) -> f64 {
     if domain.corner_vertices.is_empty() {
         return 0.0;
     }
-    let corner = |index: &u32| point(domain, domain.corner_vertices[*index as usize]);
-    let triangle = |three: &[u32]| {
-        let [a, b, c] = [corner(&three[0]), corner(&three[1]), corner(&three[2])];
+    let position = |corner: &u32| rest_position(domain, domain.corner_vertices[*corner as usize]);
+    let triangle_area = |corners: &[u32]| {
+        let [a, b, c] = [position(&corners[0]), position(&corners[1]), position(&corners[2])];
         0.5 * (b - a).cross(&(c - a)).norm()
     };
-    domain.indices.chunks_exact(3).map(triangle).sum()
+    domain.indices.chunks_exact(3).map(triangle_area).sum()
 }
 
-/// The diagonal of a domain's bounds.
-fn extent(domain: &Domain) -> f64 {
-    let points = (0..(domain.rest_positions.len() / 3) as u32).map(|vertex| point(domain, vertex));
+/// The diagonal of a domain's bounds at rest; 0 without rest positions.
+fn bounds_diagonal(domain: &Domain) -> f64 {
+    let points = (0..(domain.rest_positions.len() / 3) as u32).map(|vertex| rest_position(domain, vertex));
     let bounds = points.fold(None, |bounds: Option<(Vector3<f64>, Vector3<f64>)>, point| {
-        Some(bounds.map_or((point, point), |(low, high)| (low.inf(&point), high.sup(&point))))
+        Some(bounds.map_or((point, point), |(min, max)| (min.inf(&point), max.sup(&point))))
     });
-    bounds.map_or(0.0, |(low, high)| (high - low).norm())
+    bounds.map_or(0.0, |(min, max)| (max - min).norm())
 }

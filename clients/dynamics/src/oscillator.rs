@@ -6,13 +6,15 @@
 //! [[C, S], [-w^2 S, S']], the step response is G1 = integral of S, and the ramp response is G2 = integral of G1. The
 //! formula that gives full precision depends only on w and zeta.
 
-use crate::error::{Result, invalid};
+use crate::error::{Result, invalid_input};
 
 /// The coefficients of one step of one mode.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Oscillator {
+    /// h, in seconds.
     step: f64,
     response: Response,
+    /// w^2 = (omega h)^2.
     w_squared: f64,
 }
 
@@ -28,11 +30,13 @@ pub struct State {
 struct Response {
     /// C: displacement after a unit initial displacement.
     cosine: f64,
-    /// S and S': displacement and velocity after a unit impulse.
+    /// S: displacement after a unit impulse.
     impulse: f64,
+    /// S': velocity after a unit impulse.
     impulse_rate: f64,
-    /// G1 and G2: displacement under a unit force, and under a force that increases from 0 to 1.
+    /// G1: displacement under a unit force.
     constant: f64,
+    /// G2: displacement under a force that increases from 0 to 1.
     ramp: f64,
 }
 
@@ -44,16 +48,16 @@ impl Oscillator {
     /// positive.
     pub fn new(eigenvalue: f64, damping_ratio: f64, step: f64) -> Result<Self> {
         if !(eigenvalue.is_finite() && eigenvalue >= 0.0) {
-            return Err(invalid("eigenvalue", "a finite number >= 0", eigenvalue));
+            return Err(invalid_input("eigenvalue", "a finite number >= 0", eigenvalue));
         }
         if !(0.0..=1000.0).contains(&damping_ratio) {
-            return Err(invalid("damping_ratio", "0 to 1000", damping_ratio));
+            return Err(invalid_input("damping_ratio", "0 to 1000", damping_ratio));
         }
         if !(step.is_finite() && step > 0.0) {
-            return Err(invalid("dt", "a positive number of seconds", step));
+            return Err(invalid_input("dt", "a positive number of seconds", step));
         }
         let w = eigenvalue.sqrt() * step;
-        Ok(Self { step, response: Response::of(w, damping_ratio), w_squared: w * w })
+        Ok(Self { step, response: Response::compute(w, damping_ratio), w_squared: w * w })
     }
 
     /// A mode that never moves. Used for modes without stiffness, which would drift without bound under a steady force.
@@ -65,50 +69,54 @@ impl Oscillator {
     #[must_use]
     pub fn advance(&self, state: State, before: f64, after: f64) -> State {
         let (h, r) = (self.step, &self.response);
-        let (p, pull, growth) = (h * state.v, h * h * before, h * h * (after - before));
-        let q = r.cosine * state.q + r.impulse * p + r.constant * pull + r.ramp * growth;
-        let p = -self.w_squared * r.impulse * state.q + r.impulse_rate * p + r.impulse * pull + r.constant * growth;
+        let (p, force, force_change) = (h * state.v, h * h * before, h * h * (after - before));
+        let q = r.cosine * state.q + r.impulse * p + r.constant * force + r.ramp * force_change;
+        let p =
+            -self.w_squared * r.impulse * state.q + r.impulse_rate * p + r.impulse * force + r.constant * force_change;
         State { q, v: p / h }
     }
 }
 
 impl Response {
-    fn of(w: f64, zeta: f64) -> Self {
+    /// Selects the formula with full precision. w = omega h; zeta is the damping ratio.
+    fn compute(w: f64, zeta: f64) -> Self {
         let sigma = zeta * w;
         if w * w + 2.0 * sigma <= 1.0 {
-            return Self::series(w, sigma);
+            return Self::from_series(w, sigma);
         }
-        if zeta > 1.15 { Self::overdamped(w, sigma) } else { Self::underdamped(w, sigma) }
+        if zeta > 1.15 { Self::from_real_roots(w, sigma) } else { Self::from_complex_roots(w, sigma) }
     }
 
     /// The power series of S, for short steps, where the closed forms suffer from cancellation: s_0 = 0, s_1 = 1 and
     /// (k + 1)(k + 2) s_{k+2} = -2 sigma (k + 1) s_{k+1} - w^2 s_k.
-    fn series(w: f64, sigma: f64) -> Self {
+    fn from_series(w: f64, sigma: f64) -> Self {
         let mut sum = Self::default();
-        let (mut this, mut next) = (0.0, 1.0);
+        let (mut term, mut next_term) = (0.0, 1.0);
         for k in 0..40 {
             let order = f64::from(k);
-            sum.impulse += this;
-            sum.impulse_rate += order * this;
-            sum.constant += this / (order + 1.0);
-            sum.ramp += this / ((order + 1.0) * (order + 2.0));
-            let after = (-2.0 * sigma * (order + 1.0) * next - w * w * this) / ((order + 1.0) * (order + 2.0));
-            (this, next) = (next, after);
+            sum.impulse += term;
+            sum.impulse_rate += order * term;
+            sum.constant += term / (order + 1.0);
+            sum.ramp += term / ((order + 1.0) * (order + 2.0));
+            let numerator = -2.0 * sigma * (order + 1.0) * next_term - w * w * term;
+            (term, next_term) = (next_term, numerator / ((order + 1.0) * (order + 2.0)));
         }
         sum.cosine = 1.0 - w * w * sum.constant;
         sum
     }
 
-    /// Underdamped, critically damped and slightly overdamped modes: e^-sigma times cosine and sine, or cosh and sinh.
-    fn underdamped(w: f64, sigma: f64) -> Self {
-        let square = (w - sigma) * (w + sigma);
-        let d = square.abs().sqrt();
-        let fade = (-sigma).exp();
+    /// Underdamped, critically damped and slightly overdamped modes, whose roots are complex or close together: e^-sigma
+    /// times cosine and sine, or cosh and sinh.
+    fn from_complex_roots(w: f64, sigma: f64) -> Self {
+        let d_squared = (w - sigma) * (w + sigma);
+        let d = d_squared.abs().sqrt();
+        let decay = (-sigma).exp();
+        // e^-sigma cos(d) and e^-sigma sin(d)/d, or cosh and sinh for a negative d_squared.
         let (even, odd) = if d < 1e-4 {
-            // Taylor expansion of cos and sin(d)/d, or of cosh and sinh(d)/d; the error is of fourth order in d.
-            (fade * (1.0 - square / 2.0), fade * (1.0 - square / 6.0))
-        } else if square > 0.0 {
-            (fade * d.cos(), fade * d.sin() / d)
+            // Taylor expansion; the error is of fourth order in d.
+            (decay * (1.0 - d_squared / 2.0), decay * (1.0 - d_squared / 6.0))
+        } else if d_squared > 0.0 {
+            (decay * d.cos(), decay * d.sin() / d)
         } else {
             // cosh and sinh would overflow for large d, while these exponents stay negative.
             let (slow, fast) = ((d - sigma).exp(), (-d - sigma).exp());
@@ -120,29 +128,31 @@ impl Response {
         Self { cosine, impulse, impulse_rate: even - sigma * odd, constant, ramp }
     }
 
-    /// Two well separated real roots: the responses are divided differences of e^z, (e^z - 1)/z and (e^z - 1 - z)/z^2.
-    fn overdamped(w: f64, sigma: f64) -> Self {
-        let apart = ((sigma - w) * (sigma + w)).sqrt();
-        let fast = -(sigma + apart);
-        let slow = w / fast * w;
-        let between = |function: fn(f64) -> f64| (function(slow) - function(fast)) / (slow - fast);
+    /// Overdamped modes with two well separated real roots: the responses are divided differences of e^z, (e^z - 1)/z
+    /// and (e^z - 1 - z)/z^2.
+    fn from_real_roots(w: f64, sigma: f64) -> Self {
+        let half_distance = ((sigma - w) * (sigma + w)).sqrt();
+        let fast_root = -(sigma + half_distance);
+        let slow_root = w / fast_root * w;
+        let distance = slow_root - fast_root;
+        let divided_difference = |function: fn(f64) -> f64| (function(slow_root) - function(fast_root)) / distance;
         Self {
-            cosine: (slow * fast.exp() - fast * slow.exp()) / (slow - fast),
-            impulse: between(f64::exp),
-            impulse_rate: (slow * slow.exp() - fast * fast.exp()) / (slow - fast),
-            constant: between(first),
-            ramp: between(second),
+            cosine: (slow_root * fast_root.exp() - fast_root * slow_root.exp()) / distance,
+            impulse: divided_difference(f64::exp),
+            impulse_rate: (slow_root * slow_root.exp() - fast_root * fast_root.exp()) / distance,
+            constant: divided_difference(phi1),
+            ramp: divided_difference(phi2),
         }
     }
 }
 
 /// (e^z - 1) / z.
-fn first(z: f64) -> f64 {
+fn phi1(z: f64) -> f64 {
     if z == 0.0 { 1.0 } else { z.exp_m1() / z }
 }
 
 /// (e^z - 1 - z) / z^2.
-fn second(z: f64) -> f64 {
+fn phi2(z: f64) -> f64 {
     if z.abs() > 0.5 {
         return (z.exp_m1() - z) / (z * z);
     }
@@ -154,35 +164,37 @@ fn second(z: f64) -> f64 {
 mod tests {
     use super::*;
 
+    /// Damping ratios of all regimes and of their borders.
     const ZETAS: [f64; 9] = [0.0, 0.03, 0.7, 1.0 - 1e-9, 1.0, 1.0 + 1e-9, 1.2, 5.0, 80.0];
 
     fn omega(hertz: f64) -> f64 {
         2.0 * std::f64::consts::PI * hertz
     }
 
-    /// Frequencies from 0.1 Hz to 100 kHz, steps from 1 microsecond to 10 seconds, and all damping ratios.
-    fn extremes() -> impl Iterator<Item = (f64, f64, f64)> {
+    /// Frequencies from 0.1 Hz to 100 kHz, steps from 1 microsecond to 10 seconds, and all damping ratios, as
+    /// (hertz, h, zeta).
+    fn parameter_grid() -> impl Iterator<Item = (f64, f64, f64)> {
         let steps = [1e-6, 1e-4, 1.0 / 60.0, 0.3, 10.0];
         let hertz = [0.1, 1.0, 7.3, 440.0, 2e4, 1e5];
         hertz.into_iter().flat_map(move |f| steps.into_iter().flat_map(move |h| ZETAS.map(|zeta| (f, h, zeta))))
     }
 
     /// An independent solution: fourth-order Runge-Kutta in 20,000 small steps.
-    fn reference(w2: f64, damping: f64, start: State, before: f64, after: f64, h: f64) -> State {
+    fn integrate_runge_kutta(w2: f64, damping: f64, start: State, before: f64, after: f64, h: f64) -> State {
         let count = 20_000;
         let dt = h / f64::from(count);
         let rate = |time: f64, s: State| {
             let force = before + (after - before) * time / h;
             State { q: s.v, v: force - damping * s.v - w2 * s.q }
         };
-        let plus = |s: State, d: State, by: f64| State { q: s.q + by * d.q, v: s.v + by * d.v };
+        let add = |s: State, d: State, factor: f64| State { q: s.q + factor * d.q, v: s.v + factor * d.v };
         (0..count).fold(start, |s, index| {
             let t = f64::from(index) * dt;
             let a = rate(t, s);
-            let b = rate(t + dt / 2.0, plus(s, a, dt / 2.0));
-            let c = rate(t + dt / 2.0, plus(s, b, dt / 2.0));
-            let d = rate(t + dt, plus(s, c, dt));
-            [(a, 1.0), (b, 2.0), (c, 2.0), (d, 1.0)].iter().fold(s, |sum, (k, by)| plus(sum, *k, by * dt / 6.0))
+            let b = rate(t + dt / 2.0, add(s, a, dt / 2.0));
+            let c = rate(t + dt / 2.0, add(s, b, dt / 2.0));
+            let d = rate(t + dt, add(s, c, dt));
+            [(a, 1.0), (b, 2.0), (c, 2.0), (d, 1.0)].iter().fold(s, |sum, (k, weight)| add(sum, *k, weight * dt / 6.0))
         })
     }
 
@@ -196,41 +208,45 @@ mod tests {
                 if damping * h > 2000.0 {
                     continue;
                 }
-                let want = reference(eigenvalue, damping, start, 1.0, -2.5, h);
-                let got = Oscillator::new(eigenvalue, zeta, h).expect("valid").advance(start, 1.0, -2.5);
-                let close = (got.q - want.q).abs() <= 1e-9 && (got.v - want.v).abs() <= 1e-8;
-                assert!(close, "w {w} zeta {zeta}: {got:?} is not {want:?}");
+                let expected = integrate_runge_kutta(eigenvalue, damping, start, 1.0, -2.5, h);
+                let mode = Oscillator::new(eigenvalue, zeta, h).expect("valid parameters");
+                let state = mode.advance(start, 1.0, -2.5);
+                let is_close = (state.q - expected.q).abs() <= 1e-9 && (state.v - expected.v).abs() <= 1e-8;
+                assert!(is_close, "w {w} zeta {zeta}: expected {expected:?}, got {state:?}");
             }
         }
     }
 
     #[test]
     fn one_long_step_equals_many_short_steps() {
-        for (hertz, h, zeta) in extremes() {
-            let (eigenvalue, parts) = (omega(hertz).powi(2), 64_u32);
+        for (hertz, h, zeta) in parameter_grid() {
+            let (eigenvalue, count) = (omega(hertz).powi(2), 64_u32);
             let start = State { q: 1.0, v: 0.5 * omega(hertz) };
-            let force = |at: u32| eigenvalue * (0.5 - f64::from(at) / f64::from(parts));
-            let long = Oscillator::new(eigenvalue, zeta, h).expect("valid").advance(start, force(0), force(parts));
-            let short = Oscillator::new(eigenvalue, zeta, h / f64::from(parts)).expect("valid");
-            let many = (0..parts).fold(start, |state, at| short.advance(state, force(at), force(at + 1)));
+            let force = |step: u32| eigenvalue * (0.5 - f64::from(step) / f64::from(count));
+            let long_step = Oscillator::new(eigenvalue, zeta, h).expect("valid parameters");
+            let short_step = Oscillator::new(eigenvalue, zeta, h / f64::from(count)).expect("valid parameters");
+            let state = long_step.advance(start, force(0), force(count));
+            let expected =
+                (0..count).fold(start, |state, step| short_step.advance(state, force(step), force(step + 1)));
             // The rounding error of the phase is proportional to the phase angle of the step.
             let tolerance = 1e-9 + 1e-14 * omega(hertz) * h;
-            let close = (long.q - many.q).abs() <= tolerance && (long.v - many.v).abs() <= tolerance * omega(hertz);
-            assert!(close, "{hertz} Hz, {h} s, zeta {zeta}: {long:?} is not {many:?}");
+            let is_close =
+                (state.q - expected.q).abs() <= tolerance && (state.v - expected.v).abs() <= tolerance * omega(hertz);
+            assert!(is_close, "{hertz} Hz, {h} s, zeta {zeta}: expected {expected:?}, got {state:?}");
         }
     }
 
     #[test]
     fn free_motion_gains_no_energy_and_stays_bounded() {
-        for (hertz, h, zeta) in extremes() {
+        for (hertz, h, zeta) in parameter_grid() {
             let eigenvalue = omega(hertz).powi(2);
-            let mode = Oscillator::new(eigenvalue, zeta, h).expect("valid");
+            let mode = Oscillator::new(eigenvalue, zeta, h).expect("valid parameters");
             let energy = |state: State| 0.5 * (state.v * state.v + eigenvalue * state.q * state.q);
             let mut state = State { q: 1.0, v: omega(hertz) };
             for _ in 0..2000 {
                 let next = mode.advance(state, 0.0, 0.0);
-                let grown = energy(next) > energy(state) * (1.0 + 1e-12);
-                assert!(!grown && next.q.is_finite(), "{hertz} Hz, {h} s, zeta {zeta}: {state:?} to {next:?}");
+                let gains_energy = energy(next) > energy(state) * (1.0 + 1e-12);
+                assert!(!gains_energy && next.q.is_finite(), "{hertz} Hz, {h} s, zeta {zeta}: {state:?} to {next:?}");
                 state = next;
             }
         }
@@ -240,7 +256,7 @@ mod tests {
     fn undamped_mode_conserves_energy_over_a_million_steps() {
         for (hertz, h) in [(0.1, 1e-3), (1.7, 1.0 / 60.0), (300.0, 1.0 / 60.0), (1e5, 1.0)] {
             let eigenvalue = omega(hertz).powi(2);
-            let mode = Oscillator::new(eigenvalue, 0.0, h).expect("valid");
+            let mode = Oscillator::new(eigenvalue, 0.0, h).expect("valid parameters");
             let energy = |state: State| state.v * state.v + eigenvalue * state.q * state.q;
             let start = State { q: 1.0, v: 0.0 };
             let end = (0..1_000_000).fold(start, |state, _| mode.advance(state, 0.0, 0.0));
@@ -251,16 +267,20 @@ mod tests {
 
     #[test]
     fn steady_force_converges_to_the_static_solution() {
-        let mode = Oscillator::new(50.0, 0.3, 0.1).expect("valid");
+        let mode = Oscillator::new(50.0, 0.3, 0.1).expect("valid parameters");
         let end = (0..1000).fold(State::default(), |state, _| mode.advance(state, 2.0, 2.0));
         assert!((end.q - 2.0 / 50.0).abs() <= 1e-14 && end.v.abs() <= 1e-13, "{end:?}");
     }
 
     #[test]
-    fn invalid_parameters_are_refused_and_held_modes_stay() {
+    fn invalid_parameters_are_rejected() {
         for (eigenvalue, zeta, step) in [(-1.0, 0.0, 1.0), (f64::NAN, 0.0, 1.0), (1.0, -0.1, 1.0), (1.0, 0.1, 0.0)] {
             assert!(Oscillator::new(eigenvalue, zeta, step).is_err(), "{eigenvalue} {zeta} {step}");
         }
+    }
+
+    #[test]
+    fn fixed_mode_does_not_move() {
         assert_eq!(Oscillator::new_fixed().advance(State::default(), 5.0, 9.0), State::default());
     }
 }

@@ -1,11 +1,11 @@
-//! Drives a scene with a scenario: sends changed values as a step stream, optionally in real time and with records, and
-//! summarizes the run.
+//! Drives a scene with a scenario. Sends only the changed values of each step, optionally paces the steps in real time
+//! and records q and the transforms, and reports the results.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use modalcast_client::npy::Writer;
+use modalcast_client::npy::Writer as NpyWriter;
 use modalcast_client::{Client, Error as ClientError, Policy, StageSamples, Step, StepStream};
 use serde_json::{Value, json};
 use tokio::sync::watch;
@@ -14,114 +14,123 @@ use crate::error::{Error, Result};
 use crate::model::Model;
 
 /// Named results of a scenario or a run.
-pub type ScenarioReport = serde_json::Map<String, Value>;
+pub type Report = serde_json::Map<String, Value>;
 
-/// The most refusals that are kept for the summary.
+/// Maximum number of rejections in the report.
 const MAX_REJECTIONS: usize = 16;
 
-/// The state at one step: all coordinates, and `world_from_domain` of every part, row-major 3x4.
+/// The values of one step.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Motion {
+pub struct StepValues {
+    /// All coordinates of the scene.
     pub q: Vec<f32>,
+    /// `world_from_domain` of every domain, row-major 3x4.
     pub transforms: Vec<[f32; 12]>,
 }
 
-/// A source of motion for a scene. It counts the steps itself, so that they cannot be skipped or repeated.
+/// A source of step values for a scene. It counts the steps itself, so that they cannot be skipped or repeated.
 pub trait Scenario {
     /// The model of the scene.
     fn model(&self) -> &Model;
 
-    /// Computes the motion of the next step and overwrites `motion` with it. The first call computes step 0.
+    /// Computes the values of the next step and overwrites `values` with them. The first call computes step 0.
     ///
     /// # Errors
-    /// If the motion cannot be continued.
-    fn next_motion(&mut self, motion: &mut Motion) -> Result<()>;
+    /// `Invalid` if the values are not finite.
+    fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()>;
 
-    /// Load, peak displacements and joint gaps up to now.
-    fn report(&self) -> ScenarioReport;
+    /// Results so far. The keys depend on the scenario.
+    fn report(&self) -> Report;
 }
 
 /// Settings of a run.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Options {
+pub struct RunOptions {
     /// Number of steps; `None` runs until it is stopped.
     pub steps: Option<u64>,
     /// Seconds per step.
     pub dt: f64,
     pub policy: Policy,
-    /// The most steps in flight; 0 selects the server's default.
+    /// Maximum number of steps in flight; 0 selects the server's default.
     pub window: u32,
     /// Whether to run in real time.
     pub realtime: bool,
     /// Folder for q.npy (steps x coordinates) and transforms.npy (steps x domains x 12), f32.
-    pub record: Option<PathBuf>,
+    pub record_folder: Option<PathBuf>,
 }
 
 /// Results of a run.
 #[derive(Debug, Clone)]
-pub struct Summary {
+pub struct RunSummary {
+    /// Number of sent steps.
     pub sent: u64,
+    /// Number of rejected steps.
     pub rejected: u64,
-    pub value: Value,
+    pub report: Report,
 }
 
-/// Statistics of a run: acknowledgements, refusals and sent bytes.
+/// Statistics of a run: acknowledgements, rejections and sent bytes.
 #[derive(Default)]
 struct RunStats {
     stages: StageSamples,
     rejections: Vec<String>,
-    acks: u64,
-    bytes: u64,
+    acknowledgement_count: u64,
+    payload_bytes: u64,
 }
 
 /// Drives a scene until all steps are done or `stop` becomes true.
 ///
 /// # Errors
 /// `Client` if the scene has another writer, the stream ends, or a record cannot be written; errors of the scenario.
-pub async fn run(
+pub async fn drive_scene(
     client: &Client,
     scenario: &mut dyn Scenario,
-    options: &Options,
+    options: &RunOptions,
     stop: &watch::Receiver<bool>,
-) -> Result<Summary> {
+) -> Result<RunSummary> {
     let scene = scenario.model().scene.clone();
-    let mut drive = client.drive(&scene, options.policy, options.window).await?;
-    let mut record = options.record.as_deref().map(|folder| Recorder::create(folder, scenario.model())).transpose()?;
-    let (bar, start, mut tally) = (progress(options.steps), Instant::now(), RunStats::default());
-    let mut last: Option<Motion> = None;
-    let mut motion = Motion::default();
+    let mut step_stream = client.drive(&scene, options.policy, options.window).await?;
+    let create_recorder = |folder| Recorder::create(folder, scenario.model());
+    let mut recorder = options.record_folder.as_deref().map(create_recorder).transpose()?;
+    let progress_bar = create_progress_bar(options.steps);
+    let start = Instant::now();
+    let mut stats = RunStats::default();
+    // The values that the server has; `None` before the first step and after a rejection.
+    let mut accepted: Option<StepValues> = None;
+    let mut current = StepValues::default();
     let mut number = 0;
     while options.steps.is_none_or(|steps| number < steps) && !*stop.borrow() {
-        scenario.next_motion(&mut motion)?;
+        scenario.compute_next_step(&mut current)?;
+        let time = number as f64 * options.dt;
         if options.realtime {
-            let due = start + Duration::try_from_secs_f64(number as f64 * options.dt).unwrap_or(Duration::MAX / 4);
-            tokio::time::sleep_until(due.into()).await;
+            let due_time = start + Duration::try_from_secs_f64(time).unwrap_or(Duration::MAX / 4);
+            tokio::time::sleep_until(due_time.into()).await;
         }
-        let step = Step::new(number, number as f64 * options.dt);
-        let step = encode_changes(scenario.model(), step, last.as_ref(), &motion);
-        let rejected = tally.record_rejection(drive.step(&step).await)?;
-        tally.add(&drive, step.payload_bytes());
-        if let Some(record) = &mut record {
-            record.add(&motion)?;
+        let step = add_changes(scenario.model(), Step::new(number, time), accepted.as_ref(), &current);
+        let is_rejected = stats.record_rejection(step_stream.step(&step).await)?;
+        stats.payload_bytes += step.payload_bytes() as u64;
+        stats.record_acknowledgements(&step_stream);
+        if let Some(recorder) = &mut recorder {
+            recorder.write_row(&current)?;
         }
-        // After a refusal the server does not have the values of that step, so the next step sends everything.
-        last = if rejected { None } else { Some(std::mem::take(&mut motion)) };
+        // After a rejection the server does not have the values of that step, so the next step sends all values.
+        accepted = if is_rejected { None } else { Some(std::mem::take(&mut current)) };
         number += 1;
-        bar.inc(1);
+        progress_bar.inc(1);
     }
-    while tally.record_rejection(drive.flush().await)? {}
-    tally.add(&drive, 0);
-    let run = drive.run;
-    let window = drive.window;
-    let end = drive.finish().await?;
-    record.map(Recorder::finish).transpose()?;
-    bar.finish_and_clear();
+    // Each flush reports at most one rejection. Repeat until none is left.
+    while stats.record_rejection(step_stream.flush().await)? {}
+    stats.record_acknowledgements(&step_stream);
+    let (run_number, window) = (step_stream.run, step_stream.window);
+    let end = step_stream.finish().await?;
+    recorder.map(Recorder::finish).transpose()?;
+    progress_bar.finish_and_clear();
     let elapsed = start.elapsed().as_secs_f64();
-    let mut value = scenario.report();
-    value.extend(tally.report());
-    value.extend(ScenarioReport::from_iter([
+    let mut report = scenario.report();
+    report.extend(stats.report());
+    report.extend(Report::from_iter([
         ("scene".to_owned(), json!(scene)),
-        ("run".to_owned(), json!(run)),
+        ("run".to_owned(), json!(run_number)),
         ("window".to_owned(), json!(window)),
         ("dt_s".to_owned(), json!(options.dt)),
         ("steps_sent".to_owned(), json!(end.sent)),
@@ -131,33 +140,38 @@ pub async fn run(
         ("elapsed_s".to_owned(), json!(elapsed)),
         ("steps_per_second".to_owned(), json!(end.sent as f64 / elapsed.max(1e-9))),
     ]));
-    Ok(Summary { sent: end.sent, rejected: end.rejected, value: Value::Object(value) })
+    Ok(RunSummary { sent: end.sent, rejected: end.rejected, report })
 }
 
-/// Adds to a step the values whose bits differ from the last motion, or all values if there is none.
-fn encode_changes(model: &Model, mut step: Step, last: Option<&Motion>, now: &Motion) -> Step {
-    let same = |old: &[f32], new: &[f32]| old.iter().map(|x| x.to_bits()).eq(new.iter().map(|x| x.to_bits()));
-    for (index, part) in model.parts.iter().enumerate() {
-        let range = part.first..part.first + part.rank;
-        let moved = last.is_none_or(|last| !same(&last.q[range.clone()], &now.q[range.clone()]));
-        if part.owns_q && part.rank > 0 && moved {
-            step.set_q(index as u32, &now.q[range]);
+/// Adds to a step the values whose bits changed since the accepted values, or all values if there are none.
+fn add_changes(model: &Model, mut step: Step, accepted: Option<&StepValues>, current: &StepValues) -> Step {
+    let are_equal = |a: &[f32], b: &[f32]| a.iter().map(|x| x.to_bits()).eq(b.iter().map(|x| x.to_bits()));
+    for (index, domain) in model.domains.iter().enumerate() {
+        let range = domain.first_coordinate..domain.first_coordinate + domain.rank;
+        let q_changed =
+            accepted.is_none_or(|accepted| !are_equal(&accepted.q[range.clone()], &current.q[range.clone()]));
+        if domain.owns_q && domain.rank > 0 && q_changed {
+            step.set_q(index as u32, &current.q[range]);
         }
-        if last.is_none_or(|last| !same(&last.transforms[index], &now.transforms[index])) {
-            step.set_transform(index as u32, &now.transforms[index]);
+        let transform = &current.transforms[index];
+        if accepted.is_none_or(|accepted| !are_equal(&accepted.transforms[index], transform)) {
+            step.set_transform(index as u32, transform);
         }
     }
     step
 }
 
 impl RunStats {
-    /// Records a refusal and returns whether there was one. Any other error is returned.
-    fn record_rejection(&mut self, sent: modalcast_client::Result<()>) -> Result<bool> {
-        match sent {
+    /// Records a rejection and returns whether there was one.
+    ///
+    /// # Errors
+    /// `Client` for any other error of `result`.
+    fn record_rejection(&mut self, result: modalcast_client::Result<()>) -> Result<bool> {
+        match result {
             Ok(()) => Ok(false),
-            Err(ClientError::Rejected(refusal)) => {
+            Err(ClientError::Rejected(rejection)) => {
                 if self.rejections.len() < MAX_REJECTIONS {
-                    self.rejections.push(refusal.to_string());
+                    self.rejections.push(rejection.to_string());
                 }
                 Ok(true)
             }
@@ -165,26 +179,26 @@ impl RunStats {
         }
     }
 
-    fn add(&mut self, drive: &StepStream, bytes: usize) {
-        self.bytes += bytes as u64;
-        for ack in drive.take_acks() {
-            self.acks += 1;
-            self.stages.add(&ack.stages);
+    /// Records the acknowledgements that have arrived since the last call.
+    fn record_acknowledgements(&mut self, step_stream: &StepStream) {
+        for acknowledgement in step_stream.take_acks() {
+            self.acknowledgement_count += 1;
+            self.stages.add(&acknowledgement.stages);
         }
     }
 
-    fn report(self) -> ScenarioReport {
-        ScenarioReport::from_iter([
+    fn report(self) -> Report {
+        Report::from_iter([
             ("stages_ms".to_owned(), json!(self.stages.medians())),
-            ("acknowledgements".to_owned(), json!(self.acks)),
-            ("payload_bytes".to_owned(), json!(self.bytes)),
+            ("acknowledgements".to_owned(), json!(self.acknowledgement_count)),
+            ("payload_bytes".to_owned(), json!(self.payload_bytes)),
             ("rejections".to_owned(), json!(self.rejections)),
         ])
     }
 }
 
 /// A progress bar, or a counter for an unlimited run, on standard error; hidden unless standard error is a terminal.
-fn progress(steps: Option<u64>) -> ProgressBar {
+fn create_progress_bar(steps: Option<u64>) -> ProgressBar {
     let template = match steps {
         Some(_) => "steps [{bar:32}] {pos}/{len} {per_sec} eta {eta}",
         None => "{spinner} {pos} steps {per_sec}",
@@ -193,23 +207,23 @@ fn progress(steps: Option<u64>) -> ProgressBar {
     bar.with_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
-/// Records the coordinates and transforms of every step, so that results can be checked.
+/// Writes the coordinates and transforms of every step to files, so that results can be checked.
 struct Recorder {
-    q: Writer,
-    transforms: Writer,
+    q: NpyWriter,
+    transforms: NpyWriter,
 }
 
 impl Recorder {
     fn create(folder: &Path, model: &Model) -> Result<Self> {
-        std::fs::create_dir_all(folder).map_err(|fault| ClientError::file(folder, fault))?;
-        let q = Writer::create(&folder.join("q.npy"), &[model.coordinates])?;
-        let transforms = Writer::create(&folder.join("transforms.npy"), &[model.parts.len(), 12])?;
+        std::fs::create_dir_all(folder).map_err(|error| ClientError::file(folder, error))?;
+        let q = NpyWriter::create(&folder.join("q.npy"), &[model.coordinate_count])?;
+        let transforms = NpyWriter::create(&folder.join("transforms.npy"), &[model.domains.len(), 12])?;
         Ok(Self { q, transforms })
     }
 
-    fn add(&mut self, motion: &Motion) -> Result<()> {
-        self.q.row(&motion.q)?;
-        Ok(self.transforms.row(motion.transforms.as_flattened())?)
+    fn write_row(&mut self, values: &StepValues) -> Result<()> {
+        self.q.row(&values.q)?;
+        Ok(self.transforms.row(values.transforms.as_flattened())?)
     }
 
     fn finish(self) -> Result<()> {
@@ -222,21 +236,21 @@ impl Recorder {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hierarchy::tests::plant;
+    use crate::hierarchy::tests::four_domain_model;
 
     #[test]
-    fn first_step_sends_everything_and_later_ones_changes() {
-        let model = plant();
-        let still = Motion { q: vec![0.0; 6], transforms: vec![[0.0; 12]; 4] };
-        let wire = |last, now| encode_changes(&model, Step::new(3, 0.5), last, now).to_wire();
-        let first = wire(None, &still);
-        assert_eq!((first.q_domains, first.transform_domains), (vec![0, 1, 2], vec![0, 1, 2, 3]));
-        assert_eq!((first.q.len(), first.transforms.len()), (24, 192));
-        let mut moved = still.clone();
-        (moved.q[3], moved.transforms[3][7]) = (1.0, 2.0);
-        let second = wire(Some(&still), &moved);
-        assert_eq!((second.q_domains, second.transform_domains), (vec![1], vec![3]));
-        let third = wire(Some(&moved), &moved);
-        assert!(third.q.is_empty() && third.transforms.is_empty() && third.q_domains.is_empty());
+    fn first_step_sends_all_values_and_later_steps_changes() {
+        let model = four_domain_model();
+        let rest = StepValues { q: vec![0.0; 6], transforms: vec![[0.0; 12]; 4] };
+        let wire_step = |accepted, current| add_changes(&model, Step::new(3, 0.5), accepted, current).to_wire();
+        let all_values = wire_step(None, &rest);
+        assert_eq!((all_values.q_domains, all_values.transform_domains), (vec![0, 1, 2], vec![0, 1, 2, 3]));
+        assert_eq!((all_values.q.len(), all_values.transforms.len()), (24, 192));
+        let mut changed = rest.clone();
+        (changed.q[3], changed.transforms[3][7]) = (1.0, 2.0);
+        let changes = wire_step(Some(&rest), &changed);
+        assert_eq!((changes.q_domains, changes.transform_domains), (vec![1], vec![3]));
+        let no_changes = wire_step(Some(&changed), &changed);
+        assert!(no_changes.q.is_empty() && no_changes.transforms.is_empty() && no_changes.q_domains.is_empty());
     }
 }

@@ -1,163 +1,190 @@
-//! Kinematic motion for scenes without known physics. Each coordinate in turn follows a sine whose crest displaces a
-//! sample by a given share of the diagonal. A scene without coordinates rocks about the center of its base.
+//! Kinematic motion for scenes without known physics. The coordinates follow a sine one after another. The crest of each
+//! displaces a sample by a given fraction of the diagonal. A scene without coordinates rocks about the center of its base.
 
 use std::f64::consts::TAU;
 
 use nalgebra::Vector3;
 use serde_json::json;
 
-use crate::affine::Affine;
+use crate::affine::AffineTransform;
 use crate::error::Result;
 use crate::model::{DomainModel, Model};
-use crate::run::{Motion, Scenario, ScenarioReport};
+use crate::run::{Report, Scenario, StepValues};
 
-/// Amplitude, in radians, and period, in seconds, of a rocking scene.
+/// Amplitude of a rocking scene, in radians.
 const ROCKING_ANGLE: f64 = 0.05;
-const PERIOD: f64 = 2.0;
 
-/// Settings of the sweep.
+/// Period of a rocking scene, in seconds.
+const ROCKING_PERIOD: f64 = 2.0;
+
+/// Settings of the sweep scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Options {
+pub struct SweepOptions {
     /// Seconds per step.
     pub dt: f64,
     /// Number of steps; `None` for an unlimited run.
     pub steps: Option<u64>,
-    /// The largest displacement as a share of the diagonal.
-    pub share: f64,
+    /// The largest displacement as a fraction of the diagonal.
+    pub displacement_fraction: f64,
 }
 
 /// The sweep scenario.
-pub struct Sweep {
+pub struct SweepScenario {
     model: Model,
-    options: Options,
+    options: SweepOptions,
     /// Number of steps that each coordinate moves before the next one.
     steps_per_coordinate: u64,
-    /// Per coordinate: the value that displaces a sample by the requested share.
+    /// Per coordinate: the value that displaces a sample by the requested fraction of the diagonal.
     amplitudes: Vec<f64>,
-    /// The step of the next motion.
-    next: u64,
-    peak: f64,
+    /// The step that the next call computes.
+    next_step: u64,
+    /// Largest displacement so far, in scene units.
+    peak_displacement: f64,
 }
 
-impl Sweep {
+impl SweepScenario {
     /// Computes the amplitudes.
-    pub fn new(model: Model, options: Options) -> Self {
-        let wanted = options.share * model.diagonal();
-        let mut largest = vec![0.0_f64; model.coordinates];
-        for part in &model.parts {
-            for (mode, largest) in largest[part.first..][..part.rank].iter_mut().enumerate() {
-                *largest = largest.max(displacement_per_unit(part, mode));
+    pub fn new(model: Model, options: SweepOptions) -> Self {
+        let target_displacement = options.displacement_fraction * model.diagonal();
+        // Per coordinate: the largest value of all domains that share it.
+        let mut displacements_per_unit = vec![0.0_f64; model.coordinate_count];
+        for domain in &model.domains {
+            let coordinates = &mut displacements_per_unit[domain.first_coordinate..][..domain.rank];
+            for (mode, displacement) in coordinates.iter_mut().enumerate() {
+                *displacement = displacement.max(displacement_per_unit(domain, mode));
             }
         }
-        let amplitude =
-            |displacement_per_unit: f64| if displacement_per_unit > 0.0 { wanted / displacement_per_unit } else { 0.0 };
-        let amplitudes = largest.into_iter().map(amplitude).collect();
-        let turns = model.parts.iter().map(|part| part.rank as u64).max().unwrap_or(0).max(1);
-        let second = (1.0 / options.dt).clamp(1.0, 1e6) as u64;
-        let steps_per_coordinate = options.steps.map_or(second, |steps| steps / turns).clamp(1, second.max(1));
-        Self { model, options, steps_per_coordinate, amplitudes, next: 0, peak: 0.0 }
+        let amplitude = |displacement: f64| if displacement > 0.0 { target_displacement / displacement } else { 0.0 };
+        let amplitudes = displacements_per_unit.into_iter().map(amplitude).collect();
+        let max_rank = model.domains.iter().map(|domain| domain.rank as u64).max().unwrap_or(0).max(1);
+        let steps_per_second = (1.0 / options.dt).clamp(1.0, 1e6) as u64;
+        let steps_per_coordinate = options.steps.map_or(steps_per_second, |steps| steps / max_rank);
+        let steps_per_coordinate = steps_per_coordinate.clamp(1, steps_per_second.max(1));
+        Self { model, options, steps_per_coordinate, amplitudes, next_step: 0, peak_displacement: 0.0 }
     }
 
-    /// The sine at a step within a turn, scaled so that its largest value at a step is 1.
-    fn wave(&self, step: u64) -> f64 {
-        let at = |step: u64| (TAU * (step as f64 + 0.5) / self.steps_per_coordinate as f64).sin();
-        let crest = (0..self.steps_per_coordinate).map(at).fold(0.0, f64::max);
-        if crest > 1e-6 { at(step) / crest } else { 1.0 }
+    /// The sine at a step of one coordinate (0 to `steps_per_coordinate`), scaled so that its largest value at a step
+    /// is 1.
+    fn normalized_sine(&self, coordinate_step: u64) -> f64 {
+        let sine = |step: u64| (TAU * (step as f64 + 0.5) / self.steps_per_coordinate as f64).sin();
+        let crest = (0..self.steps_per_coordinate).map(sine).fold(0.0, f64::max);
+        if crest > 1e-6 { sine(coordinate_step) / crest } else { 1.0 }
     }
 
-    fn coordinates(&self, number: u64) -> Vec<f32> {
-        let (turn, wave) = (number / self.steps_per_coordinate, self.wave(number % self.steps_per_coordinate));
-        let mut q = vec![0.0; self.model.coordinates];
-        for part in self.model.parts.iter().filter(|part| part.owns_q && part.rank > 0) {
-            let at = part.first + (turn % part.rank as u64) as usize;
-            q[at] = (self.amplitudes[at] * wave) as f32;
+    fn compute_coordinates(&self, step: u64) -> Vec<f32> {
+        let mode = step / self.steps_per_coordinate;
+        let sine = self.normalized_sine(step % self.steps_per_coordinate);
+        let mut q = vec![0.0; self.model.coordinate_count];
+        for domain in self.model.domains.iter().filter(|domain| domain.owns_q && domain.rank > 0) {
+            let coordinate = domain.first_coordinate + (mode % domain.rank as u64) as usize;
+            q[coordinate] = (self.amplitudes[coordinate] * sine) as f32;
         }
         q
     }
 
-    /// The rigid motion of the whole scene; the identity if the scene has coordinates.
-    fn rocking(&self, time: f64) -> Affine {
-        if self.model.coordinates > 0 {
-            return Affine::identity();
+    /// The rigid transform of the whole scene; the identity if the scene has coordinates.
+    fn rocking_transform(&self, time: f64) -> AffineTransform {
+        if self.model.coordinate_count > 0 {
+            return AffineTransform::identity();
         }
-        let (model, (_, axis)) = (&self.model, self.model.ground_axes());
-        let middle = 0.5 * (model.low + model.high);
-        let base: Vector3<f64> = middle - model.up * (0.5 * model.height());
-        Affine::rotation_about(&axis, ROCKING_ANGLE * (TAU * time / PERIOD).sin(), &base)
+        let model = &self.model;
+        let center = 0.5 * (model.bounds_min + model.bounds_max);
+        let base: Vector3<f64> = center - model.up * (0.5 * model.height());
+        let angle = ROCKING_ANGLE * (TAU * time / ROCKING_PERIOD).sin();
+        AffineTransform::rotation_about(&model.ground_axes().short, angle, &base)
     }
 }
 
-impl Scenario for Sweep {
+impl Scenario for SweepScenario {
     fn model(&self) -> &Model {
         &self.model
     }
 
-    fn next_motion(&mut self, motion: &mut Motion) -> Result<()> {
-        let rocking = self.rocking(self.next as f64 * self.options.dt);
-        motion.q = self.coordinates(self.next);
-        motion.transforms = self.model.parts.iter().map(|part| rocking.compose(&part.placement).entries()).collect();
-        let q: Vec<f64> = motion.q.iter().map(|number| f64::from(*number)).collect();
-        let world: Vec<Affine> = motion.transforms.iter().map(Affine::from_entries).collect();
-        self.peak = self.peak.max(self.model.peak(&q, &world));
-        self.next += 1;
+    fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()> {
+        let rocking = self.rocking_transform(self.next_step as f64 * self.options.dt);
+        values.q = self.compute_coordinates(self.next_step);
+        let domains = self.model.domains.iter();
+        values.transforms = domains.map(|domain| rocking.compose(&domain.placement).to_row_major()).collect();
+        let q: Vec<f64> = values.q.iter().map(|coordinate| f64::from(*coordinate)).collect();
+        let world_from_domain: Vec<AffineTransform> =
+            values.transforms.iter().map(AffineTransform::from_row_major).collect();
+        self.peak_displacement = self.peak_displacement.max(self.model.max_displacement(&q, &world_from_domain));
+        self.next_step += 1;
         Ok(())
     }
 
-    fn report(&self) -> ScenarioReport {
-        let load = match self.model.coordinates {
-            0 => format!("no coordinates: the scene rocks by {ROCKING_ANGLE} rad about its base every {PERIOD} s"),
-            _ => format!("every coordinate in turn as a sine, {} of the diagonal at its crest", self.options.share),
+    fn report(&self) -> Report {
+        let load_description = match self.model.coordinate_count {
+            0 => format!(
+                "no coordinates: the scene rocks by {ROCKING_ANGLE} rad about its base every {ROCKING_PERIOD} s"
+            ),
+            _ => format!(
+                "one coordinate after another as a sine, {} of the diagonal at its crest",
+                self.options.displacement_fraction
+            ),
         };
-        let peak = self.peak / self.model.diagonal();
-        ScenarioReport::from_iter([("load".to_owned(), json!(load)), ("peak_of_diagonal".to_owned(), json!(peak))])
+        let peak_displacement_fraction = self.peak_displacement / self.model.diagonal();
+        Report::from_iter([
+            ("load".to_owned(), json!(load_description)),
+            ("peak_of_diagonal".to_owned(), json!(peak_displacement_fraction)),
+        ])
     }
 }
 
 /// The largest displacement of a sample per unit of a coordinate, in world axes.
-fn displacement_per_unit(part: &DomainModel, mode: usize) -> f64 {
-    let world = |column: Vector3<f64>| (part.placement.linear * column).norm();
-    part.samples.iter().map(|sample| world(sample.column(mode, part.rank))).fold(0.0, f64::max)
+fn displacement_per_unit(domain: &DomainModel, mode: usize) -> f64 {
+    let world_length = |column: Vector3<f64>| (domain.placement.linear * column).norm();
+    domain.samples.iter().map(|sample| world_length(sample.column(mode, domain.rank))).fold(0.0, f64::max)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hierarchy::tests::plant;
+    use crate::hierarchy::tests::four_domain_model;
 
-    #[test]
-    fn every_coordinate_reaches_its_amplitude_once_per_round() {
-        let options = Options { dt: 1.0 / 60.0, steps: Some(60), share: 0.06 };
-        let mut sweep = Sweep::new(plant(), options);
-        let mut shown = [0.0_f32; 6];
-        for _ in 0..60 {
-            let mut motion = Motion::default();
-            sweep.next_motion(&mut motion).expect("moves");
-            shown.iter_mut().zip(motion.q).for_each(|(most, now)| *most = most.max(now));
-        }
-        for (most, amplitude) in shown.iter().zip(&sweep.amplitudes) {
-            assert!((f64::from(*most) / amplitude - 1.0).abs() <= 1e-6, "{most} of {amplitude}");
-        }
-        assert!((sweep.peak / sweep.model.diagonal() - 0.06).abs() <= 1e-6, "{}", sweep.peak);
+    fn peak_displacement_fraction(sweep: &SweepScenario) -> f64 {
+        sweep.peak_displacement / sweep.model.diagonal()
     }
 
     #[test]
-    fn fewer_steps_than_coordinates_still_reach_the_full_share() {
-        let mut sweep = Sweep::new(plant(), Options { dt: 1.0, steps: Some(1), share: 0.06 });
-        sweep.next_motion(&mut Motion::default()).expect("moves");
-        assert!((sweep.peak / sweep.model.diagonal() - 0.06).abs() <= 1e-6, "{}", sweep.peak);
+    fn every_coordinate_reaches_its_amplitude() {
+        let options = SweepOptions { dt: 1.0 / 60.0, steps: Some(60), displacement_fraction: 0.06 };
+        let mut sweep = SweepScenario::new(four_domain_model(), options);
+        let mut peaks = [0.0_f32; 6];
+        for _ in 0..60 {
+            let mut values = StepValues::default();
+            sweep.compute_next_step(&mut values).expect("the next step");
+            peaks.iter_mut().zip(values.q).for_each(|(peak, coordinate)| *peak = peak.max(coordinate));
+        }
+        for (peak, amplitude) in peaks.iter().zip(&sweep.amplitudes) {
+            assert!((f64::from(*peak) / amplitude - 1.0).abs() <= 1e-6, "expected {amplitude}, got {peak}");
+        }
+        let fraction = peak_displacement_fraction(&sweep);
+        assert!((fraction - 0.06).abs() <= 1e-6, "{fraction}");
+    }
+
+    #[test]
+    fn single_step_reaches_the_full_displacement() {
+        let options = SweepOptions { dt: 1.0, steps: Some(1), displacement_fraction: 0.06 };
+        let mut sweep = SweepScenario::new(four_domain_model(), options);
+        sweep.compute_next_step(&mut StepValues::default()).expect("the first step");
+        let fraction = peak_displacement_fraction(&sweep);
+        assert!((fraction - 0.06).abs() <= 1e-6, "{fraction}");
     }
 
     #[test]
     fn rigid_scene_rocks_about_its_base() {
-        let mut model = plant();
-        model.parts.iter_mut().for_each(|part| (part.rank, part.first) = (0, 0));
-        model.coordinates = 0;
-        let mut sweep = Sweep::new(model, Options { dt: 0.5, steps: None, share: 0.06 });
-        let mut motion = Motion::default();
-        (0..2).for_each(|_| sweep.next_motion(&mut motion).expect("moves"));
-        let turned = Affine::from_entries(&motion.transforms[0]);
-        let base = 0.5 * (sweep.model.low + sweep.model.high) - sweep.model.up * (0.5 * sweep.model.height());
-        assert!((turned.apply(&base) - base).norm() <= 1e-6);
-        assert!(sweep.peak > 0.01 * sweep.model.diagonal());
+        let mut model = four_domain_model();
+        model.domains.iter_mut().for_each(|domain| (domain.rank, domain.first_coordinate) = (0, 0));
+        model.coordinate_count = 0;
+        let options = SweepOptions { dt: 0.5, steps: None, displacement_fraction: 0.06 };
+        let mut sweep = SweepScenario::new(model, options);
+        let mut values = StepValues::default();
+        (0..2).for_each(|_| sweep.compute_next_step(&mut values).expect("the next step"));
+        let trunk_transform = AffineTransform::from_row_major(&values.transforms[0]);
+        let model = &sweep.model;
+        let base = 0.5 * (model.bounds_min + model.bounds_max) - model.up * (0.5 * model.height());
+        assert!((trunk_transform.apply(&base) - base).norm() <= 1e-6);
+        assert!(peak_displacement_fraction(&sweep) > 0.01);
     }
 }

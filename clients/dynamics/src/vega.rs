@@ -4,9 +4,9 @@ use std::path::Path;
 
 use modalcast_client::Error as ClientError;
 
-use crate::error::{Result, invalid};
+use crate::error::{Result, invalid_input};
 
-/// Frequencies and Rayleigh damping of a reduced model.
+/// Frequency scale and Rayleigh damping of a reduced system.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VegaSettings {
     /// Factor of all frequencies: the internal force is scaled by its square.
@@ -29,7 +29,7 @@ impl VegaSettings {
     /// # Errors
     /// `Client` if it cannot be read; `Invalid` as for [`Self::parse`].
     pub fn read(path: &Path) -> Result<Self> {
-        Self::parse(&std::fs::read_to_string(path).map_err(|fault| ClientError::file(path, fault))?)
+        Self::parse(&std::fs::read_to_string(path).map_err(|error| ClientError::file(path, error))?)
     }
 
     /// Parses the text. Missing settings keep their defaults; unknown settings are ignored.
@@ -40,18 +40,18 @@ impl VegaSettings {
         let mut settings = Self::default();
         let mut lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
         while let Some(line) = lines.next() {
-            let place = match line.strip_prefix('*') {
+            let setting = match line.strip_prefix('*') {
                 Some("baseFrequency") => &mut settings.base_frequency,
                 Some("dampingMassCoef") => &mut settings.damping_mass,
                 Some("dampingStiffnessCoef") => &mut settings.damping_stiffness,
                 _ => continue,
             };
-            let given = lines.next().unwrap_or("nothing");
-            let number = given.parse().ok().filter(|number: &f64| number.is_finite() && *number >= 0.0);
-            *place = number.ok_or_else(|| invalid(&line[1..], "a finite number >= 0", given))?;
+            let text = lines.next().unwrap_or("nothing");
+            let value = text.parse().ok().filter(|value: &f64| value.is_finite() && *value >= 0.0);
+            *setting = value.ok_or_else(|| invalid_input(&line[1..], "a finite number >= 0", text))?;
         }
         if settings.base_frequency == 0.0 {
-            return Err(invalid("baseFrequency", "a positive number", 0));
+            return Err(invalid_input("baseFrequency", "a positive number", 0));
         }
         Ok(settings)
     }
@@ -62,18 +62,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn known_settings_are_read_and_the_rest_keep_defaults() {
+    fn missing_settings_keep_their_defaults() {
         let text = "*modesFilename\nx.URendering.float\n\n*baseFrequency\n0.25\n\n*dampingStiffnessCoef\n0.003\n";
         let settings = VegaSettings { base_frequency: 0.25, damping_mass: 0.0, damping_stiffness: 0.003 };
-        assert_eq!(VegaSettings::parse(text).expect("parses"), settings);
-        assert_eq!(VegaSettings::parse("").expect("parses"), VegaSettings::default());
+        assert_eq!(VegaSettings::parse(text).expect("valid settings"), settings);
+        assert_eq!(VegaSettings::parse("").expect("valid settings"), VegaSettings::default());
     }
 
     #[test]
-    fn invalid_values_are_refused_by_name() {
+    fn invalid_values_are_rejected_by_name() {
         for value in ["x", "nan", "-1", "inf", ""] {
-            let refusal = VegaSettings::parse(&format!("*dampingMassCoef\n{value}")).expect_err("refused").to_string();
-            assert!(refusal.starts_with("dampingMassCoef"), "{refusal}");
+            let error = VegaSettings::parse(&format!("*dampingMassCoef\n{value}")).expect_err("an invalid value");
+            assert!(error.to_string().starts_with("dampingMassCoef"), "{error}");
         }
         assert!(VegaSettings::parse("*baseFrequency\n0").is_err());
     }

@@ -70,9 +70,11 @@ pub struct ModeRows {
 }
 
 impl ModeRows {
-    /// The 3 x r rows of the `place`-th requested vertex, row-major.
-    pub fn rows_of(&self, place: usize) -> &[f32] {
-        &self.rows[3 * self.rank * place..][..3 * self.rank]
+    /// The 3 x r rows of the requested vertex with this ordinal, row-major; empty if r is 0. `None` if fewer vertices were
+    /// requested.
+    pub fn rows_of(&self, ordinal: usize) -> Option<&[f32]> {
+        let start = ordinal.checked_mul(3 * self.rank)?;
+        self.rows.get(start..)?.get(..3 * self.rank)
     }
 }
 

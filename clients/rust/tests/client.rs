@@ -40,7 +40,8 @@ async fn arrays_and_modes_above_4_mib_arrive_complete() {
     let rows = client.modes("toy", 0, &[]).await.expect("reads");
     assert_eq!((rows.rank, &rows.rows), (2, &world.domains[0].modes));
     let chosen = client.modes("toy", 0, &[7, 2]).await.expect("reads");
-    assert_eq!((chosen.rows_of(0), chosen.rows_of(1)), (&rows.rows[42..48], &rows.rows[12..18]));
+    assert_eq!((chosen.rows_of(0), chosen.rows_of(1)), (Some(&rows.rows[42..48]), Some(&rows.rows[12..18])));
+    assert_eq!(chosen.rows_of(2), None);
     let refusal = client.with_reply_limit(1000).modes("toy", 0, &[]).await.expect_err("too much").to_string();
     assert!(refusal.contains("modes.total") && refusal.contains("1000"), "{refusal}");
 }

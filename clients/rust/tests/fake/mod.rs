@@ -171,7 +171,7 @@ impl FakeServer {
         state.last = Some(id);
         drop(state);
         self.steps.lock().unwrap().push(step.clone());
-        self.shown.send(self.now()).ok();
+        self.shown.send(self.output()).ok();
         Ok(())
     }
 
@@ -180,7 +180,7 @@ impl FakeServer {
     }
 
     /// The state after the last step.
-    pub(crate) fn now(&self) -> StepOutput {
+    pub(crate) fn output(&self) -> StepOutput {
         let state = self.state.lock().unwrap();
         let q = |index: usize| {
             let owner = self.domains[index].wire.shares_q_with.map_or(index, |twin| twin as usize);

@@ -241,7 +241,7 @@ impl FrameService for FakeService {
     ) -> Result<Response<Self::RenderFrameStream>, Status> {
         let request = request.into_inner();
         self.known(&request.scene)?;
-        let chunks = frame(&self.0.now(), &request.picture.unwrap_or_default());
+        let chunks = frame(&self.0.output(), &request.picture.unwrap_or_default());
         Ok(replies(chunks.into_iter().map(|chunk| v1::RenderFrameResponse { chunk: Some(chunk) }).collect()))
     }
 
@@ -287,7 +287,7 @@ impl VertexService for FakeService {
         request: Request<v1::GetVerticesRequest>,
     ) -> Result<Response<Self::GetVerticesStream>, Status> {
         self.known(&request.into_inner().scene)?;
-        let chunks = self.vertices(&self.0.now());
+        let chunks = self.vertices(&self.0.output());
         Ok(replies(chunks.into_iter().map(|chunk| v1::GetVerticesResponse { chunk: Some(chunk) }).collect()))
     }
 
