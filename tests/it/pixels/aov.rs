@@ -5,13 +5,13 @@ use modalcast_model::scene::{Camera, Ground, Lens, View};
 use modalcast_render::{Aov, AovImage, FrameParams};
 use nalgebra::Vector3;
 
-use super::harness::{SceneBuilder, camera, facing, floor_mesh, open};
+use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer};
 
 /// Reads an AOV of a scene at rest in a square picture.
-fn survey(stage: SceneBuilder, camera: Camera, size: u32, field: Aov) -> AovImage {
-    let scene = stage.scene();
-    let mut renderer = open();
-    let mut buffers = renderer.load(&scene).expect("loads");
+fn survey(builder: SceneBuilder, camera: Camera, size: u32, field: Aov) -> AovImage {
+    let scene = builder.build();
+    let mut renderer = open_renderer();
+    let mut buffers = renderer.load(&scene).expect("expected the scene to load");
     let mut surface = modalcast_model::deform::DeformedSurface::default();
     for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
         let mesh = &scene.shapes[domain.shape].mesh;
@@ -19,15 +19,15 @@ fn survey(stage: SceneBuilder, camera: Camera, size: u32, field: Aov) -> AovImag
         surface.positions.extend(mesh.rest().as_flattened());
         surface.normals.extend(mesh.corners().normals.as_flattened());
     }
-    renderer.upload(&buffers, &surface).expect("uploads");
+    renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
     let shot = FrameParams { camera, width: size, height: size, bounds: scene.rest_bounds, light: None };
     if let Aov::Values { .. } = field {
         renderer.render_aov(&buffers, &shot, field).expect_err("no values yet");
         let values: Vec<f32> = surface.positions.chunks_exact(3).map(|point| point[0]).collect();
         renderer.upload_vertex_values(&mut buffers, &values[1..]).expect_err("too few");
-        renderer.upload_vertex_values(&mut buffers, &values).expect("uploads");
+        renderer.upload_vertex_values(&mut buffers, &values).expect("expected the upload to succeed");
     }
-    renderer.render_aov(&buffers, &shot, field).expect("surveys")
+    renderer.render_aov(&buffers, &shot, field).expect("expected AOVs")
 }
 
 fn floats(survey: &AovImage) -> Vec<f32> {
@@ -52,12 +52,12 @@ fn depth_of_floor(x: u32, y: u32) -> Option<f64> {
 #[test]
 fn depth_is_in_meters_along_the_view_axis() {
     for (ground, unit) in [(false, 1.0), (true, 0.5)] {
-        let mut stage = SceneBuilder::new();
-        stage.0.unit = unit;
-        stage.0.look.ground = ground.then(Ground::default);
+        let mut builder = SceneBuilder::new();
+        builder.parts.unit = unit;
+        builder.parts.look.ground = ground.then(Ground::default);
         // With a ground the square is small, so that most pixels show the ground.
         let half = if ground { 1.0 } else { 40.0 };
-        let depth = survey(stage.add(floor_mesh(half, 0.0), Material::default()), oblique(), 64, Aov::Depth);
+        let depth = survey(builder.add_domain(floor_mesh(half, 0.0), Material::default()), oblique(), 64, Aov::Depth);
         assert_eq!((depth.width, depth.height, depth.samples), (64, 64, 1));
         let (mut met, mut most) = (0, 0.0_f64);
         for (at, got) in floats(&depth).into_iter().enumerate() {
@@ -77,11 +77,11 @@ fn depth_is_in_meters_along_the_view_axis() {
 fn domain_indices_do_not_depend_on_the_drawing_order() {
     let leaf = Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() };
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.5, ..Material::default() };
-    let stage = SceneBuilder::new()
-        .add(facing(-3.0, -3.0, 3.0, 3.0, 2.0), glass)
-        .add(facing(-2.0, 0.0, -1.0, 1.0, 0.0), leaf)
-        .add(facing(1.0, 0.0, 2.0, 1.0, 0.0), Material::default());
-    let ids: Vec<u32> = bytemuck::pod_collect_to_vec(&survey(stage, camera(64), 64, Aov::Domains).bytes);
+    let builder = SceneBuilder::new()
+        .add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 2.0), glass)
+        .add_domain(facing_rectangle(-2.0, 0.0, -1.0, 1.0, 0.0), leaf)
+        .add_domain(facing_rectangle(1.0, 0.0, 2.0, 1.0, 0.0), Material::default());
+    let ids: Vec<u32> = bytemuck::pod_collect_to_vec(&survey(builder, front_camera(64), 64, Aov::Domains).bytes);
     assert_eq!([ids[64 * 26 + 17], ids[64 * 26 + 47], ids[64 * 26 + 32]], [1, 2, u32::MAX]);
     assert_eq!(ids.iter().filter(|id| **id == 1).count(), 100, "ten by ten pixels");
 }
@@ -89,14 +89,15 @@ fn domain_indices_do_not_depend_on_the_drawing_order() {
 #[test]
 fn normals_face_the_viewer_and_are_zero_elsewhere() {
     let double_sided = Material { double_sided: true, ..Material::default() };
-    let stage = SceneBuilder::new().add(facing(-2.0, -2.0, 0.0, 2.0, 0.0), double_sided);
+    let builder = SceneBuilder::new().add_domain(facing_rectangle(-2.0, -2.0, 0.0, 2.0, 0.0), double_sided);
     let behind = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
-    let normals = floats(&survey(stage, Camera { view: behind, ..camera(64) }, 64, Aov::Normals));
+    let normals = floats(&survey(builder, Camera { view: behind, ..front_camera(64) }, 64, Aov::Normals));
     let at = |x: usize, y: usize| &normals[3 * (64 * y + x)..][..3];
     assert_eq!((at(40, 30), at(20, 30)), (&[0.0, 0.0, -1.0][..], &[0.0; 3][..]));
-    let mut stage = SceneBuilder::new();
-    stage.0.look.ground = Some(Ground::default());
-    let normals = floats(&survey(stage.add(floor_mesh(1.0, 0.0), Material::default()), oblique(), 64, Aov::Normals));
+    let mut builder = SceneBuilder::new();
+    builder.parts.look.ground = Some(Ground::default());
+    let normals =
+        floats(&survey(builder.add_domain(floor_mesh(1.0, 0.0), Material::default()), oblique(), 64, Aov::Normals));
     assert_eq!(&normals[3 * (64 * 63 + 32)..][..3], [0.0; 3], "the ground");
 }
 
@@ -104,11 +105,11 @@ fn normals_face_the_viewer_and_are_zero_elsewhere() {
 fn values_are_interpolated_linearly_and_clamped() {
     // The value of each vertex is its x.
     for (samples, largest) in [(1, 2.0), (4, 1.0)] {
-        let mut stage = SceneBuilder::new();
-        stage.0.look.samples = samples;
+        let mut builder = SceneBuilder::new();
+        builder.parts.look.samples = samples;
         let shown = survey(
-            stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()),
-            camera(64),
+            builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()),
+            front_camera(64),
             64,
             Aov::Values { largest },
         );
@@ -129,9 +130,10 @@ fn values_are_interpolated_linearly_and_clamped() {
 
 #[test]
 fn aovs_allocate_on_demand_and_do_not_change_frames() {
-    let scene = SceneBuilder::new().add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()).scene();
-    let mut renderer = open();
-    let mut buffers = renderer.load(&scene).expect("loads");
+    let scene =
+        SceneBuilder::new().add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()).build();
+    let mut renderer = open_renderer();
+    let mut buffers = renderer.load(&scene).expect("expected the scene to load");
     let mesh = &scene.shapes[0].mesh;
     let surface = modalcast_model::deform::DeformedSurface {
         positions: mesh.rest().as_flattened().to_vec(),
@@ -139,15 +141,15 @@ fn aovs_allocate_on_demand_and_do_not_change_frames() {
         tangents: vec![],
         ..Default::default()
     };
-    renderer.upload(&buffers, &surface).expect("uploads");
-    let shot = FrameParams { camera: camera(64), width: 64, height: 64, bounds: scene.rest_bounds, light: None };
-    let before = renderer.draw(&buffers, &shot).expect("draws").rgba;
+    renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
+    let shot = FrameParams { camera: front_camera(64), width: 64, height: 64, bounds: scene.rest_bounds, light: None };
+    let before = renderer.draw(&buffers, &shot).expect("expected a frame").rgba;
     let (stats, planned) = (renderer.stats().clone(), buffers.allocations());
-    renderer.upload_vertex_values(&mut buffers, &[0.0, 1.0, 2.0, 3.0]).expect("uploads");
+    renderer.upload_vertex_values(&mut buffers, &[0.0, 1.0, 2.0, 3.0]).expect("expected the upload to succeed");
     assert_eq!(buffers.allocations().len(), planned.len() + 1, "the values, now that they were asked for");
     for field in [Aov::Depth, Aov::Domains, Aov::Normals, Aov::Values { largest: 3.0 }] {
-        renderer.render_aov(&buffers, &shot, field).expect("surveys");
-        assert_eq!(renderer.draw(&buffers, &shot).expect("draws").rgba, before);
+        renderer.render_aov(&buffers, &shot, field).expect("expected AOVs");
+        assert_eq!(renderer.draw(&buffers, &shot).expect("expected a frame").rgba, before);
         assert_eq!(renderer.stats(), &stats);
     }
     for [width, height] in [[0, 64], [64, u32::MAX]] {

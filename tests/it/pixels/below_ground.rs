@@ -9,21 +9,21 @@ use modalcast_model::scene::{Camera, Ground, PixelRect, Scene, SceneState, View}
 use modalcast_render::{Aov, FrameParams, PickHit};
 use nalgebra::{Matrix4, Vector3};
 
-use super::harness::{SceneBuilder, camera, facing, open};
+use super::harness::{SceneBuilder, facing_rectangle, front_camera, open_renderer};
 
 /// Side of the picture in pixels.
 const SIZE: u32 = 64;
 
 /// A wall of 40 x 30 pixels on the ground.
 fn wall(samples: u32, ground: Option<Ground>) -> Arc<Scene> {
-    let mut stage = SceneBuilder::new();
-    (stage.0.look.ground, stage.0.look.samples) = (ground, samples);
-    stage.add(facing(-2.0, 0.0, 2.0, 3.0, 0.0), Material::default()).scene()
+    let mut builder = SceneBuilder::new();
+    (builder.parts.look.ground, builder.parts.look.samples) = (ground, samples);
+    builder.add_domain(facing_rectangle(-2.0, 0.0, 2.0, 3.0, 0.0), Material::default()).build()
 }
 
 /// A camera slightly above the ground, so that the ground can hide the geometry below it.
 fn from_above() -> Camera {
-    Camera { view: View::LookAt { eye: [0.0, 3.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] }, ..camera(SIZE) }
+    Camera { view: View::LookAt { eye: [0.0, 3.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] }, ..front_camera(SIZE) }
 }
 
 /// Words of an AOV and the hits of all pixels, with the wall lowered by half of its height.
@@ -31,15 +31,16 @@ fn measure(scene: &Arc<Scene>, field: Aov) -> (Vec<u32>, Vec<PickHit>) {
     let mut state = SceneState::rest(scene);
     state.transforms[0] = Transform::from_matrix(&Matrix4::new_translation(&Vector3::new(0.0, -1.5, 0.0)));
     let mut deformer = ReferenceDeformer::new(scene);
-    let bounds = deformer.deform(&state).expect("deforms").bounds;
-    let mut renderer = open();
-    let mut buffers = renderer.load(scene).expect("loads");
-    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    renderer.upload_vertex_values(&mut buffers, &[0.25, 0.5, 0.75, 1.0]).expect("uploads");
+    let bounds = deformer.deform(&state).expect("expected the step to succeed").bounds;
+    let mut renderer = open_renderer();
+    let mut buffers = renderer.load(scene).expect("expected the scene to load");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
+    renderer.upload_vertex_values(&mut buffers, &[0.25, 0.5, 0.75, 1.0]).expect("expected the upload to succeed");
     let shot = FrameParams { camera: from_above(), width: SIZE, height: SIZE, bounds, light: None };
-    let words = bytemuck::pod_collect_to_vec(&renderer.render_aov(&buffers, &shot, field).expect("surveys").bytes);
+    let words =
+        bytemuck::pod_collect_to_vec(&renderer.render_aov(&buffers, &shot, field).expect("expected AOVs").bytes);
     let whole = PixelRect::within([SIZE; 2], [0; 2], [SIZE; 2]).expect("inside");
-    let pick = renderer.begin_pick(&buffers, &shot, whole).expect("begins");
+    let pick = renderer.begin_pick(&buffers, &shot, whole).expect("expected a readback to start");
     (words, renderer.finish_pick(pick).expect("ends"))
 }
 

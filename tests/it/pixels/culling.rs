@@ -8,9 +8,9 @@ use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{
     Camera, Culling, Ground, Lens, PixelRect, Scene, ShadowMethod, ShadowSettings, Transparency, View,
 };
-use modalcast_render::{Aov, FrameCullStats, FrameParams, FrameStats, Pass, Renderer, SceneBuffers, VisibilityId};
+use modalcast_render::{Aov, FrameCullStats, FrameParams, FrameStats, Renderer, SceneBuffers, VisibilityId};
 
-use super::harness::{SceneBuilder, camera, facing, open};
+use super::harness::{SceneBuilder, facing_rectangle, front_camera, open_renderer};
 
 const ALL: [Culling; 3] = [Culling::None, Culling::Triangles, Culling::Occlusion];
 const SIZE: u32 = 96;
@@ -36,10 +36,10 @@ struct CullHarness {
 }
 
 impl CullHarness {
-    fn new(mut stage: SceneBuilder, culling: Culling) -> Self {
-        stage.0.look.culling = culling;
-        let (scene, mut renderer) = (stage.scene(), open());
-        let buffers = renderer.load(&scene).expect("loads");
+    fn new(mut builder: SceneBuilder, culling: Culling) -> Self {
+        builder.parts.look.culling = culling;
+        let (scene, mut renderer) = (builder.build(), open_renderer());
+        let buffers = renderer.load(&scene).expect("expected the scene to load");
         let mut show = Self { renderer, buffers, scene };
         show.place(|point| point);
         show
@@ -53,12 +53,12 @@ impl CullHarness {
             surface.positions.extend(mesh.rest().iter().flat_map(|point| to(*point)));
             surface.normals.extend(mesh.corners().normals.as_flattened());
         }
-        self.renderer.upload(&self.buffers, &surface).expect("uploads");
+        self.renderer.upload(&self.buffers, &surface).expect("expected the upload to succeed");
     }
 
     fn frame(&mut self, camera: Camera, [width, height]: [u32; 2]) -> Frame {
         let shot = FrameParams { camera, width, height, bounds: self.scene.rest_bounds, light: None };
-        let rgba = self.renderer.draw(&self.buffers, &shot).expect("draws").rgba;
+        let rgba = self.renderer.draw(&self.buffers, &shot).expect("expected a frame").rgba;
         let stats = self.renderer.stats().clone();
         Frame { rgba, seen: self.renderer.read_visibility().expect("ids"), stats }
     }
@@ -100,16 +100,16 @@ fn material(alpha_mode: AlphaMode, double_sided: bool, color: [f32; 3]) -> Mater
 /// Whether the OpenGL driver is a software renderer.
 fn is_software() -> bool {
     static SOFTWARE: OnceLock<bool> = OnceLock::new();
-    *SOFTWARE.get_or_init(|| open().info().software)
+    *SOFTWARE.get_or_init(|| open_renderer().info().software)
 }
 
 /// Every kind of material, single-sided and double-sided. The opaque triangles exist twice, so depths tie.
 fn mixed(samples: u32, transparency: Transparency) -> SceneBuilder {
-    let mut stage = SceneBuilder::new();
-    (stage.0.look.samples, stage.0.look.transparency) = (samples, transparency);
-    stage.0.look.ground = Some(Ground::default());
-    stage.0.look.shadow = Some(ShadowSettings { size: 256, ..ShadowSettings::default() });
-    let leaf = stage.texture(8, 8, |x, y| [90, 200, 60, if (x / 2 + y / 2) % 2 == 0 { 255 } else { 10 }]);
+    let mut builder = SceneBuilder::new();
+    (builder.parts.look.samples, builder.parts.look.transparency) = (samples, transparency);
+    builder.parts.look.ground = Some(Ground::default());
+    builder.parts.look.shadow = Some(ShadowSettings { size: 256, ..ShadowSettings::default() });
+    let leaf = builder.add_texture(8, 8, |x, y| [90, 200, 60, if (x / 2 + y / 2) % 2 == 0 { 255 } else { 10 }]);
     let mask = AlphaMode::Mask { cutoff: 0.5 };
     for (seed, double_sided) in [(1, false), (2, true)] {
         // With several samples, a software renderer reads cut-out images at centroids that depend on hidden triangles;
@@ -117,19 +117,22 @@ fn mixed(samples: u32, transparency: Transparency) -> SceneBuilder {
         let image = (samples == 1 || !is_software()).then_some(leaf);
         let leaves = Material { color_texture: image, alpha: 0.75, ..material(mask, double_sided, [1.0; 3]) };
         let glass = Material { alpha: 0.5, ..material(AlphaMode::Blend, double_sided, [0.2, 0.4, 0.9]) };
-        stage = stage
-            .add(soup(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.8, 0.3, 0.2]))
-            .add(soup(seed + 2, 400, 3.0), leaves)
-            .add(soup(seed + 4, 60, 3.0), glass)
+        builder = builder
+            .add_domain(soup(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.8, 0.3, 0.2]))
+            .add_domain(soup(seed + 2, 400, 3.0), leaves)
+            .add_domain(soup(seed + 4, 60, 3.0), glass)
             // The same triangles again in another color: every depth exists twice.
-            .add(soup(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.2, 0.9, 0.3]));
+            .add_domain(soup(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.2, 0.9, 0.3]));
     }
-    stage
+    builder
 }
 
 /// Frames of all culling modes, which must be identical. Returns those with [`Culling::Occlusion`].
-fn assert_same_frames(stage: &dyn Fn() -> SceneBuilder, frames: &dyn Fn(&mut CullHarness) -> Vec<Frame>) -> Vec<Frame> {
-    let [none, triangles, depth] = ALL.map(|culling| frames(&mut CullHarness::new(stage(), culling)));
+fn assert_same_frames(
+    builder: &dyn Fn() -> SceneBuilder,
+    frames: &dyn Fn(&mut CullHarness) -> Vec<Frame>,
+) -> Vec<Frame> {
+    let [none, triangles, depth] = ALL.map(|culling| frames(&mut CullHarness::new(builder(), culling)));
     for (index, plain) in none.iter().enumerate() {
         assert!(plain.stats.culled.is_none(), "control: nothing is culled");
         for culled in [&triangles[index], &depth[index]] {
@@ -176,13 +179,13 @@ fn culled_frames_are_bit_identical_after_camera_moves() {
 #[test]
 fn long_triangle_lists_keep_their_order() {
     let field = || {
-        let mut stage = SceneBuilder::new();
-        stage.0.look.samples = 1;
+        let mut builder = SceneBuilder::new();
+        builder.parts.look.samples = 1;
         let mask = AlphaMode::Mask { cutoff: 0.5 };
-        stage
-            .add(soup(7, 45_000, 4.0), material(AlphaMode::Opaque, false, [0.8, 0.3, 0.2]))
-            .add(soup(7, 20_000, 4.0), material(AlphaMode::Opaque, true, [0.2, 0.3, 0.9]))
-            .add(soup(8, 17_000, 4.0), material(mask, true, [0.3, 0.8, 0.2]))
+        builder
+            .add_domain(soup(7, 45_000, 4.0), material(AlphaMode::Opaque, false, [0.8, 0.3, 0.2]))
+            .add_domain(soup(7, 20_000, 4.0), material(AlphaMode::Opaque, true, [0.2, 0.3, 0.9]))
+            .add_domain(soup(8, 17_000, 4.0), material(mask, true, [0.3, 0.8, 0.2]))
     };
     let frames = assert_same_frames(&field, &|show| {
         [0.0, 0.1, 0.2].map(|x| show.frame(at([x, 1.0, 14.0], [x, 0.0, 0.0]), [SIZE, SIZE])).into()
@@ -244,14 +247,15 @@ fn culling_keeps_huge_triangles_and_single_ones() {
         let wall = |z: f32| [[-1e5, -1e5, z], [1e5, -1e5, z], [0.0, 1e5, z]];
         let crossing = [[-3.0, -1.0, 20.0], [3.0, -1.0, 20.0], [0.0, -1.0, -20.0]];
         let mesh = loose(&[wall(-2.0), wall(-2.5), crossing, [[0.0, 0.0, 0.0], [1e9, 0.0, 0.0], [0.0, 1e9, 0.0]]]);
-        SceneBuilder::new().add(mesh, material(AlphaMode::Opaque, true, [0.7; 3]))
+        SceneBuilder::new().add_domain(mesh, material(AlphaMode::Opaque, true, [0.7; 3]))
     };
     let one = || {
-        SceneBuilder::new().add(loose(&[[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]]]), Material::default())
+        SceneBuilder::new()
+            .add_domain(loose(&[[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]]]), Material::default())
     };
-    for stage in [&huge as &dyn Fn() -> SceneBuilder, &one] {
-        let frames = assert_same_frames(stage, &|show| {
-            let camera = Camera { near: 0.01, far: 1e3, ..camera(64) };
+    for builder in [&huge as &dyn Fn() -> SceneBuilder, &one] {
+        let frames = assert_same_frames(builder, &|show| {
+            let camera = Camera { near: 0.01, far: 1e3, ..front_camera(64) };
             (0..3).map(|_| show.frame(camera, [64, 64])).collect()
         });
         assert!(frames[2].seen.iter().any(|seen| matches!(seen, VisibilityId::Triangle(_))));
@@ -265,19 +269,19 @@ fn curtain(culling: Culling) -> SceneBuilder {
         [[x + 0.02, y + 0.02, -1.0], [x + 0.22, y + 0.02, -1.0], [x + 0.02, y + 0.22, -1.0]]
     };
     let grid: Vec<_> = (0..32 * 32).map(small).collect();
-    let mut stage = SceneBuilder::new()
-        .add(loose(&grid), material(AlphaMode::Opaque, true, [0.9, 0.2, 0.1]))
-        .add(facing(-4.5, -4.5, 0.0, 4.5, 0.0), material(AlphaMode::Opaque, false, [0.1, 0.2, 0.9]));
-    (stage.0.look.samples, stage.0.look.culling) = (1, culling);
-    stage
+    let mut builder = SceneBuilder::new()
+        .add_domain(loose(&grid), material(AlphaMode::Opaque, true, [0.9, 0.2, 0.1]))
+        .add_domain(facing_rectangle(-4.5, -4.5, 0.0, 4.5, 0.0), material(AlphaMode::Opaque, false, [0.1, 0.2, 0.9]));
+    (builder.parts.look.samples, builder.parts.look.culling) = (1, culling);
+    builder
 }
 
 #[test]
 fn hidden_count_equals_triangles_behind_the_square() {
     let mut show = CullHarness::new(curtain(Culling::Occlusion), Culling::Occlusion);
-    let first = show.frame(camera(128), [128, 128]).culled().camera;
+    let first = show.frame(front_camera(128), [128, 128]).culled().camera;
     assert_eq!((first.occluded, first.visible), (0, 1024 + 2));
-    let second = show.frame(camera(128), [128, 128]).culled().camera;
+    let second = show.frame(front_camera(128), [128, 128]).culled().camera;
     // The grid is a tenth farther from the eye than the square, which hides everything left of x = 0. The column next
     // to its edge shares a pixel with visible triangles.
     assert_eq!((second.outside_view, second.back_facing, second.no_sample), (0, 0, 0));
@@ -297,9 +301,9 @@ fn triangles_without_a_sample_are_culled() {
     let dot = |x: f32, y: f32| [[x, y, 0.0], [x + 0.002, y, 0.0], [x, y + 0.002, 0.0]];
     // Ten pixels per unit: pixel centers lie at 0.05 + 0.1 i. The second triangle contains one, the first none.
     let mesh = loose(&[dot(0.0, 0.0), dot(0.0492, 0.0492)]);
-    let mut stage = SceneBuilder::new().add(mesh, Material::default());
-    stage.0.look.samples = 1;
-    let frame = CullHarness::new(stage, Culling::Triangles).frame(camera(64), [64, 64]);
+    let mut builder = SceneBuilder::new().add_domain(mesh, Material::default());
+    builder.parts.look.samples = 1;
+    let frame = CullHarness::new(builder, Culling::Triangles).frame(front_camera(64), [64, 64]);
     let camera = frame.culled().camera;
     assert_eq!((camera.no_sample, camera.visible), (1, 1), "{camera:?}");
     assert_eq!(frame.seen.iter().filter(|seen| **seen == VisibilityId::Triangle(1)).count(), 1, "control: it is seen");
@@ -308,13 +312,13 @@ fn triangles_without_a_sample_are_culled() {
 #[test]
 fn shadows_of_culled_casters_are_bit_identical() {
     for (method, splits) in [(ShadowMethod::Standard, 1), (ShadowMethod::Variance, 1), (ShadowMethod::Standard, 3)] {
-        let stage = || {
-            let mut stage = mixed(1, Transparency::OrderIndependent);
-            stage.0.look.sun = [0.3, 0.8, 0.4];
-            stage.0.look.shadow = Some(ShadowSettings { size: 128, method, splits, ..ShadowSettings::default() });
-            stage
+        let builder = || {
+            let mut builder = mixed(1, Transparency::OrderIndependent);
+            builder.parts.look.sun = [0.3, 0.8, 0.4];
+            builder.parts.look.shadow = Some(ShadowSettings { size: 128, method, splits, ..ShadowSettings::default() });
+            builder
         };
-        let frames = assert_same_frames(&stage, &|show| {
+        let frames = assert_same_frames(&builder, &|show| {
             (0..2).map(|_| show.frame(at([0.0, 4.0, 12.0], [0.0; 3]), [SIZE, SIZE])).collect()
         });
         let sun = frames[0].culled().shadow;
@@ -332,12 +336,15 @@ fn software_renderers_draw_hidden_multisampled_cut_outs() {
         (1, AlphaMode::Mask { cutoff: 0.5 }, false),
         (4, AlphaMode::Opaque, false),
     ] {
-        let mut stage = SceneBuilder::new();
-        stage.0.look.samples = samples;
-        let image = Some(stage.texture(1, 1, |_, _| [255; 4]));
+        let mut builder = SceneBuilder::new();
+        builder.parts.look.samples = samples;
+        let image = Some(builder.add_texture(1, 1, |_, _| [255; 4]));
         let paint = Material { color_texture: image, ..material(alpha_mode, true, [1.0; 3]) };
-        let mut show = CullHarness::new(stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), paint), Culling::Occlusion);
-        let hides = show.frame(camera(64), [64, 64]).stats.passes.contains(&Pass::Occluders);
+        let mut show = CullHarness::new(
+            builder.add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), paint),
+            Culling::Occlusion,
+        );
+        let hides = show.frame(front_camera(64), [64, 64]).stats.passes.contains(&"occluders");
         assert_eq!(hides, !(falls && show.renderer.info().software));
     }
 }
@@ -350,13 +357,15 @@ fn picks_aovs_and_rebased_frames_do_not_depend_on_culling() {
         let shot = FrameParams { camera, width: SIZE, height: SIZE, bounds: show.scene.rest_bounds, light: None };
         show.frame(camera, [SIZE, SIZE]);
         let rectangle = PixelRect::within([SIZE; 2], [40; 2], [8; 2]).expect("inside");
-        let pick = show.renderer.begin_pick(&show.buffers, &shot, rectangle).expect("picks");
+        let pick = show.renderer.begin_pick(&show.buffers, &shot, rectangle).expect("expected a pick");
         let hits = show.renderer.finish_pick(pick).expect("hits");
-        let depth = show.renderer.render_aov(&show.buffers, &shot, Aov::Depth).expect("surveys").bytes;
+        let depth = show.renderer.render_aov(&show.buffers, &shot, Aov::Depth).expect("expected AOVs").bytes;
         // Rebased positions: everything is shifted and has an origin of its own.
         let rest = show.scene.shapes.iter().flat_map(|shape| shape.mesh.rest());
         let aside: Vec<f32> = rest.flat_map(|[x, y, z]| [x + 0.75, *y, *z]).collect();
-        show.renderer.upload_rebased(&mut show.buffers, &aside, [0.25, 0.0, 0.0]).expect("uploads");
+        show.renderer
+            .upload_rebased(&mut show.buffers, &aside, [0.25, 0.0, 0.0])
+            .expect("expected the upload to succeed");
         let apart = [show.frame(camera, [SIZE, SIZE]), show.frame(camera, [SIZE, SIZE])].map(|frame| frame.rgba);
         (hits, depth, apart)
     });
@@ -372,13 +381,15 @@ fn culled_draw_calls_do_not_grow_with_domains() {
         plain.buffers.allocations().iter().all(|part| !part.name.contains("cull") && !part.name.contains("visible"))
     );
     let draw_calls = |domains: usize| {
-        let mut stage = SceneBuilder::new();
+        let mut builder = SceneBuilder::new();
         for index in 0..domains {
-            stage =
-                stage.add(facing(-1.0, -1.0, 1.0, 1.0, -(index as f32)), material(AlphaMode::Opaque, true, [0.5; 3]));
+            builder = builder.add_domain(
+                facing_rectangle(-1.0, -1.0, 1.0, 1.0, -(index as f32)),
+                material(AlphaMode::Opaque, true, [0.5; 3]),
+            );
         }
-        let mut show = CullHarness::new(stage, Culling::Occlusion);
-        let frame = show.frame(camera(64), [64, 64]);
+        let mut show = CullHarness::new(builder, Culling::Occlusion);
+        let frame = show.frame(front_camera(64), [64, 64]);
         assert_eq!(frame.stats.passes, show.buffers.plan().passes);
         assert_eq!(frame.stats.draw_calls, show.buffers.plan().draw_calls);
         frame.stats.draw_calls

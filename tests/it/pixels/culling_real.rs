@@ -10,25 +10,25 @@ use modalcast_model::scene::{
 };
 use modalcast_render::{FrameCullStats, FrameParams, FrameTimes, Renderer};
 
-use super::harness::open;
+use super::harness::open_renderer;
 
 const SIZE: [u32; 2] = [1920, 1080];
 const FRAMES: usize = 9;
 
 /// The same scene with another look.
 fn under(scene: &Scene, look: RenderSettings) -> Arc<Scene> {
-    Scene::new(SceneParts { look, ..scene.parts() }).expect("a good scene")
+    Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene")
 }
 
 /// The picture, the median times of some passes in milliseconds, and the culling statistics.
 fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'static str, f64)>, Option<FrameCullStats>) {
     let mut deformer = ReferenceDeformer::new(scene);
-    let bounds = deformer.deform(&SceneState::rest(scene)).expect("deforms").bounds;
-    let buffers = renderer.load(scene).expect("loads");
-    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    let bounds = deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed").bounds;
+    let buffers = renderer.load(scene).expect("expected the scene to load");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
     let camera = Camera::fit_to_scene(scene, SIZE[0], SIZE[1]);
     let shot = FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds, light: None };
-    let images: Vec<_> = (0..FRAMES).map(|_| renderer.draw(&buffers, &shot).expect("draws")).collect();
+    let images: Vec<_> = (0..FRAMES).map(|_| renderer.draw(&buffers, &shot).expect("expected a frame")).collect();
     assert!(images.iter().all(|image| image.rgba == images[0].rgba), "frames differ");
     let median = |name: &'static str| {
         let of = |times: &FrameTimes| times.iter().find(|(key, _)| key.name() == name).map_or(0.0, |(_, ms)| ms);
@@ -47,7 +47,7 @@ fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'stati
 fn real_almond_with_culling_is_the_same_picture() {
     let root = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
     let scene = modalcast_model::load::open(&root.join("plants/almond").to_string_lossy()).expect("the almond").scene;
-    let mut renderer = open();
+    let mut renderer = open_renderer();
     for transparency in [Transparency::OrderIndependent, Transparency::TwoPass] {
         let look = RenderSettings {
             transparency,

@@ -12,13 +12,13 @@ use modalcast_model::scene::{
 };
 use modalcast_render::FrameImage;
 
-use super::harness::{SceneBuilder, facing, floor_mesh};
+use super::harness::{SceneBuilder, facing_rectangle, floor_mesh};
 
 /// Far position: not on the grid of origin cells, and not representable in f32.
 const AWAY: [f64; 3] = [1e7 + 1.3, 0.0, -1e7 - 2.7];
 
 fn bench() -> DeviceContext {
-    DeviceContext::open(&Config { backend: BackendChoice::Cpu, ..Config::default() }).expect("a renderer")
+    DeviceContext::open(&Config { backend: BackendChoice::Cpu, ..Config::default() }).expect("expected a renderer")
 }
 
 /// The rest state with some domains moved by an f64 translation.
@@ -34,7 +34,7 @@ fn moved(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> SceneState {
         ..RawStepUpdate::default()
     };
     let mut state = SceneState::rest(scene);
-    state.apply(scene, &StepUpdate::parse(scene, &raw).expect("a good step"));
+    state.apply(scene, &StepUpdate::parse(scene, &raw).expect("expected a valid step"));
     state
 }
 
@@ -46,9 +46,9 @@ fn camera(at: [f64; 3]) -> Camera {
 }
 
 fn picture(bench: &mut DeviceContext, scene: &Arc<Scene>, state: &SceneState, camera: &Camera) -> FrameImage {
-    let mut staged = bench.load_scene(scene, BackendSettings::default()).expect("stages");
-    staged.deform(state).expect("deforms");
-    let image = bench.draw(&mut staged, camera, FrameSize::new(96, 96)).expect("draws");
+    let mut staged = bench.load_scene(scene, BackendSettings::default()).expect("expected the scene to load");
+    staged.deform(state).expect("expected the step to succeed");
+    let image = bench.draw(&mut staged, camera, FrameSize::new(96, 96)).expect("expected a frame");
     bench.unload_scene(staged);
     image
 }
@@ -62,9 +62,12 @@ fn difference(one: &FrameImage, other: &FrameImage) -> (u8, usize) {
 
 /// A table over the ground, with the default look and the given shadow.
 fn table(shadow: Option<ShadowSettings>) -> Arc<Scene> {
-    let mut stage = SceneBuilder::new();
-    stage.0.look = RenderSettings { shadow, ..RenderSettings::default() };
-    stage.add(floor_mesh(0.8, 0.5), Material::default()).add(floor_mesh(0.4, 0.0), Material::default()).scene()
+    let mut builder = SceneBuilder::new();
+    builder.parts.look = RenderSettings { shadow, ..RenderSettings::default() };
+    builder
+        .add_domain(floor_mesh(0.8, 0.5), Material::default())
+        .add_domain(floor_mesh(0.4, 0.0), Material::default())
+        .build()
 }
 
 /// With ground and every kind of shadow map.
@@ -106,19 +109,20 @@ fn far_scene_renders_like_the_scene_at_the_origin() {
 #[test]
 fn distant_domains_are_seen_by_nearby_cameras() {
     let mut bench = bench();
-    let square = |z: f32| facing(-0.7, -0.3, 0.6, 0.9, z);
+    let square = |z: f32| facing_rectangle(-0.7, -0.3, 0.6, 0.9, z);
     let red = Material { diffuse: [1.0, 0.1, 0.1], ambient: [1.0, 0.1, 0.1], ..Material::default() };
-    let scene = SceneBuilder::new().add(square(0.0), Material::default()).add(square(-0.1), red.clone()).scene();
-    let alone = |material: Material, z| SceneBuilder::new().add(square(z), material).scene();
+    let scene =
+        SceneBuilder::new().add_domain(square(0.0), Material::default()).add_domain(square(-0.1), red.clone()).build();
+    let alone = |material: Material, z| SceneBuilder::new().add_domain(square(z), material).build();
     let (gray, red) = (alone(Material::default(), 0.0), alone(red, -0.1));
     let mut at_rest = |scene: &Arc<Scene>| picture(&mut bench, scene, &SceneState::rest(scene), &camera([0.0; 3]));
     let (gray, red, both) = (at_rest(&gray), at_rest(&red), at_rest(&scene));
     let apart = moved(&scene, &[1], AWAY);
     assert!(apart.origins.as_ref().is_some_and(|origins| !origins.is_uniform()));
-    let mut staged = bench.load_scene(&scene, BackendSettings::default()).expect("stages");
+    let mut staged = bench.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
     let mut seen = |state: &SceneState, at| {
-        staged.deform(state).expect("deforms");
-        let image = bench.draw(&mut staged, &camera(at), FrameSize::new(96, 96)).expect("draws");
+        staged.deform(state).expect("expected the step to succeed");
+        let image = bench.draw(&mut staged, &camera(at), FrameSize::new(96, 96)).expect("expected a frame");
         [&gray, &red, &both].map(|want| difference(&image, want).0)
     };
     let is_only = |levels: [u8; 3], which: usize| (0..3).all(|at| (levels[at] <= 1) == (at == which));

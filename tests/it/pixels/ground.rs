@@ -9,27 +9,30 @@ use modalcast_model::scene::{
 };
 use modalcast_render::{FrameParams, Pass, Renderer, VisibilityId};
 
-use super::harness::{SceneBuilder, facing, floor_mesh, open};
+use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, open_renderer};
 
 const SIZE: u32 = 96;
 
 /// A wall and a pane that stand on the ground, a mat that lies on it, and a leaf with holes above.
-fn stage(look: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
-    let mut stage = SceneBuilder::new();
-    let base = &mut stage.0.look;
+fn test_scene(look: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
+    let mut builder = SceneBuilder::new();
+    let base = &mut builder.parts.look;
     (base.zenith, base.horizon) = ([0.1, 0.3, 0.8], [0.7, 0.8, 0.9]);
     base.sun = [2.0, 3.0, 1.0];
     base.ground = Some(Ground { color: [0.5, 0.4, 0.3] });
     look(base);
-    let holes = stage.texture(8, 8, |x, y| [200, 220, 90, if (x + y) % 2 == 0 { 255 } else { 0 }]);
+    let holes = builder.add_texture(8, 8, |x, y| [200, 220, 90, if (x + y) % 2 == 0 { 255 } else { 0 }]);
     let painted = |diffuse: [f32; 3]| Material { diffuse, double_sided: true, ..Material::default() };
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.4, ..painted([0.2, 0.9, 0.3]) };
     let leaf =
         Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, color_texture: Some(holes), ..painted([1.0; 3]) };
-    let stage = stage
-        .add(floor_mesh(1.5, 0.0), painted([0.9, 0.2, 0.2]))
-        .add(facing(-2.0, 0.0, -0.5, 1.5, -0.3), painted([0.4; 3]));
-    stage.add(facing(-1.0, 0.0, 2.5, 1.0, 0.8), glass).add(facing(0.5, 1.1, 1.5, 2.1, 0.0), leaf).scene()
+    let builder = builder
+        .add_domain(floor_mesh(1.5, 0.0), painted([0.9, 0.2, 0.2]))
+        .add_domain(facing_rectangle(-2.0, 0.0, -0.5, 1.5, -0.3), painted([0.4; 3]));
+    builder
+        .add_domain(facing_rectangle(-1.0, 0.0, 2.5, 1.0, 0.8), glass)
+        .add_domain(facing_rectangle(0.5, 1.1, 1.5, 2.1, 0.0), leaf)
+        .build()
 }
 
 fn from(eye: [f64; 3]) -> Camera {
@@ -46,7 +49,7 @@ struct Frame {
 impl Frame {
     /// Renders the scene at rest, lowered by `sunk`, with bounds whose lowest point is at `lowest`.
     fn new(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, (sunk, lowest): (f32, f64)) -> Self {
-        let buffers = renderer.load(scene).expect("loads");
+        let buffers = renderer.load(scene).expect("expected the scene to load");
         let of_all = |part: fn(&modalcast_model::domain::Mesh) -> &[[f32; 3]]| -> Vec<f32> {
             scene
                 .domains
@@ -59,11 +62,11 @@ impl Frame {
         positions.chunks_exact_mut(3).for_each(|vertex| vertex[1] -= sunk);
         renderer
             .upload(&buffers, &DeformedSurface { positions, normals, ..DeformedSurface::default() })
-            .expect("uploads");
+            .expect("expected the upload to succeed");
         let mut bounds = scene.rest_bounds;
         bounds.min[1] = lowest;
         let shot = FrameParams { camera, width: SIZE, height: SIZE, bounds, light: None };
-        let rgba = renderer.draw(&buffers, &shot).expect("draws").rgba;
+        let rgba = renderer.draw(&buffers, &shot).expect("expected a frame").rgba;
         let passes = renderer.stats().passes.clone();
         let seen = renderer.read_visibility().expect("reads");
         renderer.unload(buffers);
@@ -95,9 +98,9 @@ fn analytic_ground_equals_drawn_ground() {
         |look| look.culling = Culling::Occlusion,
         |look| look.bloom = Some(Bloom::default()),
     ];
-    let mut renderer = open();
+    let mut renderer = open_renderer();
     for (index, look) in looks.into_iter().enumerate() {
-        let scene = stage(look);
+        let scene = test_scene(look);
         for eye in [[0.5, 1.0, 7.0], [3.0, 4.0, 5.0], [-4.0, 0.05, 1.0], [0.0, 0.8, 60.0]] {
             let mut frame = |lowest: f64| Frame::new(&mut renderer, &scene, from(eye), (0.0, lowest));
             let (found, drawn) = (frame(0.0), frame(BELOW));
@@ -119,7 +122,7 @@ fn analytic_ground_equals_drawn_ground() {
 /// Bounds that overflowed need the ground pass, because they say nothing about geometry below the ground.
 #[test]
 fn ground_hides_geometry_below_and_is_one_sided() {
-    let (scene, mut renderer) = (stage(|_| {}), open());
+    let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
     let camera = from([0.5, 1.0, 7.0]);
     let mut frame = |eye: Camera, sunk: f32, lowest: f64| Frame::new(&mut renderer, &scene, eye, (sunk, lowest));
     let (right, wrong) = (frame(camera, 0.7, -0.7), frame(camera, 0.7, 0.0));
@@ -134,7 +137,7 @@ fn ground_hides_geometry_below_and_is_one_sided() {
 
 #[test]
 fn geometry_on_the_ground_is_visible_despite_rounding() {
-    let (scene, mut renderer) = (stage(|_| {}), open());
+    let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
     let camera = from([1.0, 5.0, 4.0]);
     let rounded = Bounds { min: [0.0, -4e-7, 0.0], ..scene.rest_bounds }.min[1];
     let frame = Frame::new(&mut renderer, &scene, camera, (4e-7, rounded));

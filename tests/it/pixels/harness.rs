@@ -6,13 +6,15 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformSummary, Deformer as _};
 use modalcast_model::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
 use modalcast_model::scene::{Camera, Lens, Scene, SceneParts, SceneState, View};
-use modalcast_render::{Allocation, DevicePreference, FrameImage, FrameParams, FrameStats, Pass, Renderer, plan};
+use modalcast_render::{Allocation, DevicePreference, FrameImage, FrameParams, FrameStats, Renderer, plan};
 
-/// A scene under construction: no shadow, no ground, a black sky, and the sun behind the camera.
-pub(super) struct SceneBuilder(pub(super) SceneParts);
+/// Builder for a scene without shadow and ground, with a black sky, and with the sun behind the camera.
+pub(super) struct SceneBuilder {
+    pub(super) parts: SceneParts,
+}
 
-/// A picture, the statistics of its frame and the allocations of its scene.
-pub(super) struct Picture {
+/// An image, the statistics of its frame and the allocations of its scene.
+pub(super) struct RenderedFrame {
     pub(super) image: FrameImage,
     pub(super) stats: FrameStats,
     pub(super) allocations: Vec<Allocation>,
@@ -28,22 +30,24 @@ impl SceneBuilder {
         parts.look.sun = [0.0, 0.0, 1.0];
         parts.look.sunlight = [0.5; 3];
         parts.look.skylight = [0.25; 3];
-        Self(parts)
+        Self { parts }
     }
 
-    pub(super) fn texture(&mut self, width: u32, height: u32, pixel: impl Fn(u32, u32) -> [u8; 4]) -> usize {
+    /// Adds a texture with the pixels `pixel(x, y)` and returns its index.
+    pub(super) fn add_texture(&mut self, width: u32, height: u32, pixel: impl Fn(u32, u32) -> [u8; 4]) -> usize {
         let rgba = (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).flat_map(|(x, y)| pixel(x, y)).collect();
-        self.0.textures.push(Texture::new("made", width, height, rgba).expect("fits"));
-        self.0.textures.len() - 1
+        self.parts.textures.push(Texture::new("test", width, height, rgba).expect("expected a valid texture"));
+        self.parts.textures.len() - 1
     }
 
-    pub(super) fn add(mut self, mesh: Mesh, material: Material) -> Self {
-        self.0.shapes.push(Shape::new(mesh, Modes::rigid()).expect("rigid"));
-        self.0.materials.push(material);
-        self.0.domains.push(Domain {
-            name: format!("domain {}", self.0.domains.len()),
-            shape: self.0.shapes.len() - 1,
-            material: self.0.materials.len() - 1,
+    /// Adds a rigid domain with a mesh and a material of its own.
+    pub(super) fn add_domain(mut self, mesh: Mesh, material: Material) -> Self {
+        self.parts.shapes.push(Shape::new(mesh, Modes::rigid()).expect("expected a valid shape"));
+        self.parts.materials.push(material);
+        self.parts.domains.push(Domain {
+            name: format!("domain {}", self.parts.domains.len()),
+            shape: self.parts.shapes.len() - 1,
+            material: self.parts.materials.len() - 1,
             material_ranges: vec![],
             placement: Transform::IDENTITY,
             attachment: None,
@@ -55,102 +59,114 @@ impl SceneBuilder {
         self
     }
 
-    pub(super) fn scene(self) -> Arc<Scene> {
-        Scene::new(self.0).expect("a good scene")
+    pub(super) fn build(self) -> Arc<Scene> {
+        Scene::new(self.parts).expect("expected a valid scene")
     }
 }
 
 /// A rectangle that faces +Z, from (left, bottom) to (right, top) at depth z.
-pub(super) fn facing(left: f32, bottom: f32, right: f32, top: f32, z: f32) -> Mesh {
+pub(super) fn facing_rectangle(left: f32, bottom: f32, right: f32, top: f32, z: f32) -> Mesh {
     let rest = vec![[left, bottom, z], [right, bottom, z], [right, top, z], [left, top, z]];
     rectangle(rest, [0.0, 0.0, 1.0])
 }
 
 /// A square that faces +Y at height y and extends `half` to each side of the origin.
-pub(super) fn floor_mesh(half: f32, y: f32) -> Mesh {
-    let rest = vec![[-half, y, half], [half, y, half], [half, y, -half], [-half, y, -half]];
+pub(super) fn floor_mesh(half_side: f32, y: f32) -> Mesh {
+    let rest = vec![
+        [-half_side, y, half_side],
+        [half_side, y, half_side],
+        [half_side, y, -half_side],
+        [-half_side, y, -half_side],
+    ];
     rectangle(rest, [0.0, 1.0, 0.0])
 }
 
 fn rectangle(rest: Vec<[f32; 3]>, normal: [f32; 3]) -> Mesh {
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
-    Mesh::from_indexed(rest, vec![normal; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a rectangle")
+    Mesh::from_indexed(rest, vec![normal; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("expected a valid mesh")
 }
 
-/// A camera with ten pixels per unit in the plane z = 0 and the origin at the center of the picture.
-pub(super) fn camera(size: u32) -> Camera {
-    let middle = f64::from(size) / 2.0;
+/// A camera at z = 10 with ten pixels per unit in the plane z = 0 and the origin at the center of the image.
+pub(super) fn front_camera(size: u32) -> Camera {
+    let center = f64::from(size) / 2.0;
     Camera {
         view: View::LookAt { eye: [0.0, 0.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] },
-        lens: Lens::Intrinsics { fx: 100.0, fy: 100.0, cx: middle, cy: middle },
+        lens: Lens::Intrinsics { fx: 100.0, fy: 100.0, cx: center, cy: center },
         near: 0.0,
         far: 0.0,
     }
 }
 
-pub(super) fn open() -> Renderer {
-    Renderer::open(DevicePreference::Any).expect("EGL and OpenGL 4.3 (libegl1, libegl-mesa0, libgl1-mesa-dri)")
+pub(super) fn open_renderer() -> Renderer {
+    Renderer::open(DevicePreference::Any)
+        .expect("expected EGL with OpenGL 4.3 (libegl1, libegl-mesa0, libgl1-mesa-dri)")
 }
 
-/// Renders the scene at rest in a square picture.
-pub(super) fn draw(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, size: u32) -> Picture {
-    draw_sized(renderer, scene, camera, [size, size])
+/// Renders the scene at rest to a square image.
+pub(super) fn render_square(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, size: u32) -> RenderedFrame {
+    render_sized(renderer, scene, camera, [size, size])
 }
 
-/// Renders the scene at rest.
-pub(super) fn draw_sized(
+/// Renders the scene at rest to an image of width x height pixels.
+pub(super) fn render_sized(
     renderer: &mut Renderer,
     scene: &Arc<Scene>,
     camera: Camera,
     [width, height]: [u32; 2],
-) -> Picture {
-    let mut deformer = ReferenceDeformer::new(scene).with_bounding_axes(scene.light_axes());
-    let DeformSummary { bounds, oriented_bounds: light, .. } =
-        deformer.deform(&SceneState::rest(scene)).expect("deforms");
-    let buffers = renderer.load(scene).expect("loads");
-    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    let shot = FrameParams { camera, width, height, bounds, light };
-    let image = renderer.draw(&buffers, &shot).expect("draws");
+) -> RenderedFrame {
+    let mut deformer = ReferenceDeformer::new(scene);
+    let DeformSummary { bounds, light, .. } =
+        deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed");
+    let buffers = renderer.load(scene).expect("expected the scene to load");
+    renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
+    let params = FrameParams { camera, width, height, bounds, light };
+    let image = renderer.draw(&buffers, &params).expect("expected a frame");
     let (stats, allocations) = (renderer.stats().clone(), buffers.allocations());
     renderer.unload(buffers);
-    Picture { image, stats, allocations }
+    RenderedFrame { image, stats, allocations }
 }
 
-/// Renders the scene at rest in a 64 x 64 picture of [`camera`].
-pub(super) fn picture(scene: &Arc<Scene>) -> Picture {
-    draw(&mut open(), scene, camera(64), 64)
+/// Renders the scene at rest to 64 x 64 pixels of [`front_camera`].
+pub(super) fn render(scene: &Arc<Scene>) -> RenderedFrame {
+    render_square(&mut open_renderer(), scene, front_camera(64), 64)
 }
 
-impl Picture {
+impl RenderedFrame {
     /// Red, green and blue of a pixel; (0, 0) is the top left.
-    pub(super) fn at(&self, x: u32, y: u32) -> [u8; 3] {
+    pub(super) fn pixel(&self, x: u32, y: u32) -> [u8; 3] {
         let first = 4 * (y * self.image.width + x) as usize;
         let [r, g, b, a] = [0, 1, 2, 3].map(|channel| self.image.rgba[first + channel]);
-        assert_eq!(a, 255, "every pixel is opaque");
+        assert_eq!(a, 255, "expected an opaque pixel");
         [r, g, b]
     }
 
     /// Number of pixels that satisfy a predicate.
-    pub(super) fn count(&self, claim: impl Fn([u8; 3]) -> bool) -> usize {
+    pub(super) fn count_pixels(&self, predicate: impl Fn([u8; 3]) -> bool) -> usize {
         (0..self.image.height)
             .flat_map(|y| (0..self.image.width).map(move |x| (x, y)))
-            .filter(|(x, y)| claim(self.at(*x, *y)))
+            .filter(|(x, y)| predicate(self.pixel(*x, *y)))
             .count()
     }
 }
 
-/// Planned passes of a scene with no geometry below its ground; the ground pass is skipped in this case.
-pub(super) fn planned_above(scene: &Scene) -> Vec<Pass> {
-    plan(scene).passes.into_iter().filter(|pass| *pass != Pass::Ground).collect()
+/// The planned passes of a scene without geometry below its ground, which skips the ground pass.
+pub(super) fn planned_passes_above_ground(scene: &Scene) -> Vec<&'static str> {
+    plan(scene).passes.into_iter().filter(|pass| *pass != "ground").collect()
 }
 
-/// sRGB value in 0 to 255 of a linear value.
-pub(super) fn srgb(linear: f64) -> f64 {
+/// The sRGB level, in 0 to 255, of a linear value.
+pub(super) fn encode_srgb(linear: f64) -> f64 {
     let linear = linear.clamp(0.0, 1.0);
     255.0 * if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 
-/// Whether a pixel is within `slack` levels of linear colors.
-pub(super) fn close(pixel: [u8; 3], linear: [f64; 3], slack: f64) -> bool {
-    pixel.iter().zip(linear).all(|(byte, value)| (f64::from(*byte) - srgb(value)).abs() <= slack)
+/// Linear value of an sRGB level.
+pub(super) fn decode_srgb(level: u8) -> f64 {
+    let encoded = f64::from(level) / 255.0;
+    if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
+}
+
+/// Whether a pixel is within `tolerance` levels of a linear color.
+pub(super) fn is_close(pixel: [u8; 3], linear: [f64; 3], tolerance: f64) -> bool {
+    pixel.iter().zip(linear).all(|(byte, value)| (f64::from(*byte) - encode_srgb(value)).abs() <= tolerance)
 }

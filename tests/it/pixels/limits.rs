@@ -6,18 +6,21 @@ use modalcast_model::domain::{AlphaMode, Material, Mesh, Transform};
 use modalcast_model::scene::{Bounds, Camera, RenderSettings, SceneState, View};
 use modalcast_render::{DevicePreference, FrameParams, Pass, Renderer, devices, plan};
 
-use super::harness::{SceneBuilder, camera, draw, facing, floor_mesh, open, picture, planned_above};
+use super::harness::{
+    SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer, planned_passes_above_ground, render,
+    render_square,
+};
 
 fn full() -> SceneBuilder {
-    let mut stage = SceneBuilder::new();
-    stage.0.look = RenderSettings::default();
-    stage
+    let mut builder = SceneBuilder::new();
+    builder.parts.look = RenderSettings::default();
+    builder
 }
 
 /// Allocated buffers and executed passes equal the plan of the scene.
 #[test]
 fn unused_features_allocate_and_run_nothing() {
-    let plain = picture(&full().add(floor_mesh(1.0, -0.5), Material::default()).scene());
+    let plain = render(&full().add_domain(floor_mesh(1.0, -0.5), Material::default()).build());
     let names = |list: &[modalcast_render::Allocation]| {
         list.iter().map(|allocation| allocation.name.clone()).collect::<Vec<_>>()
     };
@@ -29,16 +32,16 @@ fn unused_features_allocate_and_run_nothing() {
         [Pass::Shadow, Pass::Blur, Pass::Visibility, Pass::Background, Pass::Shade, Pass::Encode]
     );
 
-    let mut stage = full();
-    let image = stage.texture(1, 1, |_, _| [128, 128, 255, 255]);
+    let mut builder = full();
+    let image = builder.add_texture(1, 1, |_, _| [128, 128, 255, 255]);
     let mapped = Material { normal_texture: Some(image), ..Material::default() };
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.5, ..Material::default() };
-    let mut stage = stage.add(floor_mesh(1.0, -0.5), mapped).add(floor_mesh(1.0, -0.3), glass);
+    let mut builder = builder.add_domain(floor_mesh(1.0, -0.5), mapped).add_domain(floor_mesh(1.0, -0.3), glass);
     for index in 0..8 {
-        stage = stage.add(floor_mesh(0.1, -0.2 + 0.01 * index as f32), Material::default());
+        builder = builder.add_domain(floor_mesh(0.1, -0.2 + 0.01 * index as f32), Material::default());
     }
-    let scene = stage.scene();
-    let rich = picture(&scene);
+    let scene = builder.build();
+    let rich = render(&scene);
     for present in ["tangents", "uvs", "triangle materials"] {
         assert!(names(&rich.allocations).contains(&present.to_string()), "{present}");
     }
@@ -60,72 +63,78 @@ fn unused_features_allocate_and_run_nothing() {
     let mut planned = plan(&scene).buffers;
     planned.sort_by(|a, b| a.name.cmp(&b.name));
     assert_eq!(rich.allocations, planned, "what is planned is what is allocated");
-    assert_eq!(rich.stats.passes, planned_above(&scene), "what is planned is what runs");
+    assert_eq!(rich.stats.passes, planned_passes_above_ground(&scene), "what is planned is what runs");
 }
 
 #[test]
 fn draw_calls_do_not_grow_with_domains_and_materials() {
     let draw_calls = |domains: usize| {
-        let mut stage = SceneBuilder::new();
+        let mut builder = SceneBuilder::new();
         for index in 0..domains {
             let double_sided = index % 2 == 1;
-            stage = stage.add(
-                facing(-1.0, -1.0, 1.0, 1.0, index as f32 * -0.01),
+            builder = builder.add_domain(
+                facing_rectangle(-1.0, -1.0, 1.0, 1.0, index as f32 * -0.01),
                 Material { double_sided, ..Material::default() },
             );
         }
-        picture(&stage.scene()).stats.draw_calls
+        render(&builder.build()).stats.draw_calls
     };
     assert_eq!((draw_calls(1), draw_calls(2), draw_calls(9), draw_calls(60)), (1, 2, 2, 2));
 }
 
 #[test]
 fn empty_and_oversized_frames_are_refused() {
-    let scene = SceneBuilder::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).scene();
-    let mut renderer = open();
-    let buffers = renderer.load(&scene).expect("loads");
+    let scene =
+        SceneBuilder::new().add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).build();
+    let mut renderer = open_renderer();
+    let buffers = renderer.load(&scene).expect("expected the scene to load");
     let limit = renderer.info().max_side;
     for (width, height) in [(0, 0), (0, 5), (5, 0), (limit + 1, 1), (16384, 16384), (u32::MAX, u32::MAX)] {
-        let shot = FrameParams { camera: camera(64), width, height, bounds: scene.rest_bounds, light: None };
+        let shot = FrameParams { camera: front_camera(64), width, height, bounds: scene.rest_bounds, light: None };
         let refusal = renderer.draw(&buffers, &shot).expect_err("refused").to_string();
         let expected = format!("frame.size: expected 1 to {limit} pixels a side, got {width} x {height}");
         assert_eq!(refusal, expected);
     }
-    let shot = FrameParams { camera: camera(64), width: 1, height: 1, bounds: scene.rest_bounds, light: None };
+    let shot = FrameParams { camera: front_camera(64), width: 1, height: 1, bounds: scene.rest_bounds, light: None };
     assert_eq!(renderer.draw(&buffers, &shot).expect("one pixel is a frame").rgba.len(), 4);
 }
 
 /// Cut-outs stay cut out.
 #[test]
 fn frame_too_large_for_msaa_is_drawn_with_one_sample() {
-    let mut stage = SceneBuilder::new();
-    let image = stage.texture(2, 1, |x, _| [255, 255, 255, 255 * x as u8]);
+    let mut builder = SceneBuilder::new();
+    let image = builder.add_texture(2, 1, |x, _| [255, 255, 255, 255 * x as u8]);
     let alpha_mode = AlphaMode::Mask { cutoff: 0.5 };
     let leaf = Material { color_texture: Some(image), alpha_mode, ..Material::default() };
-    let scene = stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), leaf).scene();
-    let mut renderer = open();
+    let scene = builder.add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), leaf).build();
+    let mut renderer = open_renderer();
     let side = 3400;
-    let mut wide = camera(side);
+    let mut wide = front_camera(side);
     wide.lens = modalcast_model::scene::Lens::FieldOfView(12.0);
-    let shown = draw(&mut renderer, &scene, wide, side);
+    let shown = render_square(&mut renderer, &scene, wide, side);
     assert_eq!(shown.stats.samples, 1);
-    assert!(shown.at(side / 2 - 700, side / 2) == [0; 3] && shown.at(side / 2 + 700, side / 2) != [0; 3]);
+    assert!(shown.pixel(side / 2 - 700, side / 2) == [0; 3] && shown.pixel(side / 2 + 700, side / 2) != [0; 3]);
 }
 
 #[test]
 fn frames_are_deterministic() {
-    let scene =
-        full().add(floor_mesh(1.0, 0.5), Material::default()).add(floor_mesh(0.5, 1.0), Material::default()).scene();
-    let mut renderer = open();
-    let first = draw(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96);
-    assert!(first.image.rgba == draw(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96).image.rgba);
+    let scene = full()
+        .add_domain(floor_mesh(1.0, 0.5), Material::default())
+        .add_domain(floor_mesh(0.5, 1.0), Material::default())
+        .build();
+    let mut renderer = open_renderer();
+    let first = render_square(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96);
     assert!(
-        first.image.rgba == draw(&mut open(), &scene, Camera::fit_to_scene(&scene, 64, 64), 96).image.rgba,
+        first.image.rgba == render_square(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96).image.rgba
+    );
+    assert!(
+        first.image.rgba
+            == render_square(&mut open_renderer(), &scene, Camera::fit_to_scene(&scene, 64, 64), 96).image.rgba,
         "another context"
     );
     let mut moved = Camera::fit_to_scene(&scene, 64, 64);
     moved.lens = modalcast_model::scene::Lens::FieldOfView(33.0);
-    assert!(first.image.rgba != draw(&mut renderer, &scene, moved, 96).image.rgba, "control");
+    assert!(first.image.rgba != render_square(&mut renderer, &scene, moved, 96).image.rgba, "control");
 }
 
 /// Triangles without area, a sun straight above, and a camera inside the mesh.
@@ -134,31 +143,33 @@ fn degenerate_scenes_suns_and_cameras_are_drawn() {
     let line = vec![[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.0]];
     let triangles = vec![[0, 1, 2], [0, 0, 0], [0, 3, 1]];
     let flat = Mesh::from_indexed(line, vec![[0.0, 0.0, 1.0]; 4], vec![], triangles).expect("degenerate, yet a mesh");
-    let mut stage = full();
-    stage.0.look.sun = [0.0, 1.0, 0.0];
-    let scene = stage.add(flat, Material::default()).add(floor_mesh(2.0, 0.5), Material::default()).scene();
-    let shown = picture(&scene);
-    assert!(shown.count(|pixel| pixel != shown.at(0, 0)) > 100);
+    let mut builder = full();
+    builder.parts.look.sun = [0.0, 1.0, 0.0];
+    let scene =
+        builder.add_domain(flat, Material::default()).add_domain(floor_mesh(2.0, 0.5), Material::default()).build();
+    let shown = render(&scene);
+    assert!(shown.count_pixels(|pixel| pixel != shown.pixel(0, 0)) > 100);
     let view = View::LookAt { eye: [0.1, 0.3, 0.1], target: [1.0, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
-    let inside = draw(&mut open(), &scene, Camera { view, ..Camera::fit_to_scene(&scene, 64, 64) }, 64);
+    let inside =
+        render_square(&mut open_renderer(), &scene, Camera { view, ..Camera::fit_to_scene(&scene, 64, 64) }, 64);
     assert_eq!(inside.image.rgba.len(), 4 * 64 * 64);
 }
 
 #[test]
 fn overflowed_vertices_leave_no_black_pixels() {
-    let mut stage = full();
-    stage.0.look.horizon = [0.5; 3];
-    let scene = stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()).scene();
-    let mut renderer = open();
-    let buffers = renderer.load(&scene).expect("loads");
+    let mut builder = full();
+    builder.parts.look.horizon = [0.5; 3];
+    let scene = builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()).build();
+    let mut renderer = open_renderer();
+    let buffers = renderer.load(&scene).expect("expected the scene to load");
     for bad in [f32::NAN, f32::INFINITY, f32::MAX, -f32::MAX] {
         let mut positions: Vec<f32> = scene.shapes[0].mesh.rest().as_flattened().to_vec();
         positions[6..9].fill(bad);
         let surface = DeformedSurface { positions, normals: [0.0, 0.0, 1.0].repeat(4), ..DeformedSurface::default() };
-        renderer.upload(&buffers, &surface).expect("uploads");
+        renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
         let bounds = Bounds { min: [f64::NAN; 3], max: [f64::NAN; 3] };
-        let shot = FrameParams { camera: camera(64), width: 64, height: 64, bounds, light: None };
-        let image = renderer.draw(&buffers, &shot).expect("draws");
+        let shot = FrameParams { camera: front_camera(64), width: 64, height: 64, bounds, light: None };
+        let image = renderer.draw(&buffers, &shot).expect("expected a frame");
         assert!(image.rgba.chunks_exact(4).all(|pixel| pixel[..3] != [0; 3] && pixel[3] == 255), "{bad}");
     }
     let short = DeformedSurface { positions: vec![0.0; 3], ..DeformedSurface::default() };
@@ -168,44 +179,49 @@ fn overflowed_vertices_leave_no_black_pixels() {
 
 #[test]
 fn scene_far_from_the_origin_is_rendered() {
-    let mut parts =
-        full().add(floor_mesh(1.0, 1.0), Material::default()).add(floor_mesh(0.5, 0.0), Material::default()).0;
+    let mut parts = full()
+        .add_domain(floor_mesh(1.0, 1.0), Material::default())
+        .add_domain(floor_mesh(0.5, 0.0), Material::default())
+        .parts;
     for domain in &mut parts.domains {
         let mut place = Transform::IDENTITY;
         (place.0[3], place.0[7], place.0[11]) = (1e7, 1e7, -1e7);
         domain.placement = place;
     }
-    let scene = SceneBuilder(parts).scene();
-    let shown = draw(&mut open(), &scene, Camera::fit_to_scene(&scene, 64, 64), 64);
+    let scene = SceneBuilder { parts }.build();
+    let shown = render_square(&mut open_renderer(), &scene, Camera::fit_to_scene(&scene, 64, 64), 64);
     assert_eq!(shown.image.rgba.len(), 4 * 64 * 64);
 }
 
 #[test]
 fn renderers_work_on_many_threads_and_two_on_one() {
     let draw_one = || {
-        let scene = full().add(floor_mesh(1.0, 0.5), Material::default()).scene();
-        draw(&mut open(), &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba
+        let scene = full().add_domain(floor_mesh(1.0, 0.5), Material::default()).build();
+        render_square(&mut open_renderer(), &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba
     };
     let first = draw_one();
     let threads: Vec<_> = (0..4).map(|_| std::thread::spawn(move || [draw_one(), draw_one()])).collect();
     for thread in threads {
         assert!(thread.join().expect("lives").iter().all(|bytes| *bytes == first));
     }
-    let (mut left, mut right) = (open(), open());
-    let scene = full().add(floor_mesh(1.0, 0.5), Material::default()).scene();
-    let buffers = left.load(&scene).expect("loads");
-    assert!(draw(&mut right, &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba == first);
+    let (mut left, mut right) = (open_renderer(), open_renderer());
+    let scene = full().add_domain(floor_mesh(1.0, 0.5), Material::default()).build();
+    let buffers = left.load(&scene).expect("expected the scene to load");
+    assert!(render_square(&mut right, &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba == first);
     drop(right);
     let mut deformer = ReferenceDeformer::new(&scene);
-    let bounds = deformer.deform(&SceneState::rest(&scene)).expect("deforms").bounds;
-    left.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    let bounds = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed").bounds;
+    left.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
     let shot = FrameParams { camera: Camera::fit_to_scene(&scene, 64, 64), width: 32, height: 32, bounds, light: None };
-    assert!(left.draw(&buffers, &shot).expect("draws").rgba == first, "two contexts on one thread keep apart");
+    assert!(
+        left.draw(&buffers, &shot).expect("expected a frame").rgba == first,
+        "two contexts on one thread keep apart"
+    );
 }
 
 #[test]
 fn devices_are_listed_and_missing_ones_refused() {
-    let found = devices().expect("EGL");
+    let found = devices().expect("expected libEGL");
     assert!(found.iter().any(|device| device.renderer.is_some()), "{found:?}");
     for device in &found {
         assert_eq!(device.renderer.is_none(), device.problem.is_some(), "{device:?}");

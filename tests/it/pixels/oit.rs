@@ -6,7 +6,9 @@ use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Scene, Transparency};
 use modalcast_render::{OitStats, Pass};
 
-use super::harness::{Picture, SceneBuilder, camera, close, draw, facing, open, picture};
+use super::harness::{
+    RenderedFrame, SceneBuilder, facing_rectangle, front_camera, is_close, open_renderer, render, render_square,
+};
 
 /// A material lit by ambient light alone, so that colors appear unchanged.
 fn painted(ambient: [f32; 3]) -> Material {
@@ -17,18 +19,18 @@ fn glass(ambient: [f32; 3], alpha: f32) -> Material {
     Material { alpha, alpha_mode: AlphaMode::Blend, double_sided: true, ..painted(ambient) }
 }
 
-fn stage(transparency: Transparency, samples: u32) -> SceneBuilder {
-    let mut stage = SceneBuilder::new();
-    stage.0.look.skylight = [1.0; 3];
-    (stage.0.look.transparency, stage.0.look.samples) = (transparency, samples);
-    stage
+fn create_builder(transparency: Transparency, samples: u32) -> SceneBuilder {
+    let mut builder = SceneBuilder::new();
+    builder.parts.look.skylight = [1.0; 3];
+    (builder.parts.look.transparency, builder.parts.look.samples) = (transparency, samples);
+    builder
 }
 
 /// A pane of 40 x 40 pixels at depth z.
 fn pane(z: f32) -> Mesh {
     // Farther panes are larger, so that all cover the same pixels.
     let half = 2.0 * (10.0 - z) / 10.0;
-    facing(-half, -half, half, half, z)
+    facing_rectangle(-half, -half, half, half, z)
 }
 
 /// Blends layers from the farthest to the nearest over black.
@@ -40,7 +42,7 @@ fn over(layers: &[([f32; 3], f32)]) -> [f64; 3] {
     })
 }
 
-fn lists(shown: &Picture) -> OitStats {
+fn lists(shown: &RenderedFrame) -> OitStats {
     shown.stats.oit.expect("exact, with glass")
 }
 
@@ -58,15 +60,15 @@ fn two_layers_blend_exactly_in_either_order() {
             if near_first {
                 panes.reverse();
             }
-            let add = |stage: SceneBuilder, (mesh, material)| stage.add(mesh, material);
-            picture(&panes.into_iter().fold(stage(transparency, samples), add).scene()).at(30, 30)
+            let add = |builder: SceneBuilder, (mesh, material)| builder.add_domain(mesh, material);
+            render(&panes.into_iter().fold(create_builder(transparency, samples), add).build()).pixel(30, 30)
         };
         for near_first in [false, true] {
             let pixel = shown(Transparency::OrderIndependent, near_first);
-            assert!(close(pixel, expected, 1.0), "{samples}, {near_first}: {pixel:?}");
+            assert!(is_close(pixel, expected, 1.0), "{samples}, {near_first}: {pixel:?}");
         }
-        assert!(close(shown(Transparency::TwoPass, false), expected, 1.0), "two passes, farther first");
-        assert!(!close(shown(Transparency::TwoPass, true), expected, 8.0), "control: two passes hang on the order");
+        assert!(is_close(shown(Transparency::TwoPass, false), expected, 1.0), "two passes, farther first");
+        assert!(!is_close(shown(Transparency::TwoPass, true), expected, 8.0), "control: two passes hang on the order");
     }
 }
 
@@ -75,11 +77,13 @@ fn crossing(transparency: Transparency, order: [usize; 3]) -> Vec<u8> {
     let tilted = |x: f32, y: f32| {
         let corner = |[u, v]: [f32; 2]| [2.0 * u, 2.0 * v, x * u + y * v + 0.013 * x];
         let rest = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]].map(corner).to_vec();
-        Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a plane")
+        Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
+            .expect("expected a valid mesh")
     };
     let planes = [(tilted(0.9, 0.1), RED), (tilted(-0.7, 0.3), GREEN), (tilted(0.07, -0.8), BLUE)];
-    let add = |stage: SceneBuilder, index: usize| stage.add(planes[index].0.clone(), glass(planes[index].1, 0.6));
-    picture(&order.into_iter().fold(stage(transparency, 4), add).scene()).image.rgba
+    let add =
+        |builder: SceneBuilder, index: usize| builder.add_domain(planes[index].0.clone(), glass(planes[index].1, 0.6));
+    render(&order.into_iter().fold(create_builder(transparency, 4), add).build()).image.rgba
 }
 
 /// Control: with two passes the picture depends on the order.
@@ -98,83 +102,90 @@ fn crossing_layers_do_not_depend_on_the_order() {
 #[test]
 fn later_of_coplanar_layers_is_in_front() {
     for (first, second) in [(RED, BLUE), (BLUE, RED)] {
-        let scene = stage(Transparency::OrderIndependent, 4)
-            .add(pane(0.0), glass(first, 0.5))
-            .add(pane(0.0), glass(second, 0.5));
-        let pixel = picture(&scene.scene()).at(30, 25);
-        assert!(close(pixel, over(&[(first, 0.5), (second, 0.5)]), 1.0), "{pixel:?}");
+        let scene = create_builder(Transparency::OrderIndependent, 4)
+            .add_domain(pane(0.0), glass(first, 0.5))
+            .add_domain(pane(0.0), glass(second, 0.5));
+        let pixel = render(&scene.build()).pixel(30, 25);
+        assert!(is_close(pixel, over(&[(first, 0.5), (second, 0.5)]), 1.0), "{pixel:?}");
     }
 }
 
 #[test]
 fn opaque_hides_glass_behind_and_shows_through_in_front() {
     let shown = |z: f32| {
-        picture(
-            &stage(Transparency::OrderIndependent, 4)
-                .add(pane(0.0), painted(BLUE))
-                .add(pane(z), glass(RED, 0.5))
-                .scene(),
+        render(
+            &create_builder(Transparency::OrderIndependent, 4)
+                .add_domain(pane(0.0), painted(BLUE))
+                .add_domain(pane(z), glass(RED, 0.5))
+                .build(),
         )
     };
     let (behind, before) = (shown(-1.0), shown(1.0));
     assert_eq!((lists(&behind).fragments, lists(&behind).max_per_pixel), (0, 0), "nothing is left to blend");
-    assert!(close(behind.at(30, 30), BLUE.map(f64::from), 1.0), "{:?}", behind.at(30, 30));
+    assert!(is_close(behind.pixel(30, 30), BLUE.map(f64::from), 1.0), "{:?}", behind.pixel(30, 30));
     assert!(lists(&before).fragments >= 1600 && lists(&before).dropped() == 0);
-    assert!(close(before.at(30, 30), over(&[(BLUE, 1.0), (RED, 0.5)]), 1.0), "{:?}", before.at(30, 30));
+    assert!(is_close(before.pixel(30, 30), over(&[(BLUE, 1.0), (RED, 0.5)]), 1.0), "{:?}", before.pixel(30, 30));
 }
 
 #[test]
 fn cut_outs_and_glass_keep_their_depth_order() {
     for transparency in [Transparency::OrderIndependent, Transparency::TwoPass] {
         // The leaf is cut away on the left and solid on the right, with glass in front of it and behind it.
-        let mut stage = stage(transparency, 4);
-        let image = stage.texture(2, 1, |x, _| if x == 0 { [255, 255, 255, 0] } else { [255; 4] });
+        let mut builder = create_builder(transparency, 4);
+        let image = builder.add_texture(2, 1, |x, _| if x == 0 { [255, 255, 255, 0] } else { [255; 4] });
         let mask = AlphaMode::Mask { cutoff: 0.5 };
         let leaf = Material { alpha_mode: mask, color_texture: Some(image), ..painted(GREEN) };
-        let scene = stage.add(pane(-1.0), glass(BLUE, 0.5)).add(pane(0.0), leaf).add(pane(1.0), glass(RED, 0.25));
-        let shown = picture(&scene.scene());
+        let scene = builder
+            .add_domain(pane(-1.0), glass(BLUE, 0.5))
+            .add_domain(pane(0.0), leaf)
+            .add_domain(pane(1.0), glass(RED, 0.25));
+        let shown = render(&scene.build());
         let (hole, solid) = (over(&[(BLUE, 0.5), (RED, 0.25)]), over(&[(GREEN, 1.0), (RED, 0.25)]));
-        assert!(close(shown.at(18, 30), hole, 1.0), "{transparency:?}: {:?}", shown.at(18, 30));
-        assert!(close(shown.at(46, 30), solid, 1.0), "{transparency:?}: {:?}", shown.at(46, 30));
+        assert!(is_close(shown.pixel(18, 30), hole, 1.0), "{transparency:?}: {:?}", shown.pixel(18, 30));
+        assert!(is_close(shown.pixel(46, 30), solid, 1.0), "{transparency:?}: {:?}", shown.pixel(46, 30));
     }
 }
 
 #[test]
 fn edges_of_glass_and_opaque_surfaces_are_multisampled() {
     for (edge, share) in [(0.25_f32, 0.25), (0.5, 0.5), (0.75, 0.75)] {
-        let strip = || facing(-1.0, -1.0, 0.1 * edge, 1.0, 0.0);
-        let shown = |stage: SceneBuilder| picture(&stage.scene()).at(32, 30);
-        let alone = shown(stage(Transparency::OrderIndependent, 4).add(strip(), glass([1.0; 3], 0.5)));
-        assert!(close(alone, [0.5 * share; 3], 1.0), "{edge}: {alone:?}");
+        let strip = || facing_rectangle(-1.0, -1.0, 0.1 * edge, 1.0, 0.0);
+        let shown = |builder: SceneBuilder| render(&builder.build()).pixel(32, 30);
+        let alone = shown(create_builder(Transparency::OrderIndependent, 4).add_domain(strip(), glass([1.0; 3], 0.5)));
+        assert!(is_close(alone, [0.5 * share; 3], 1.0), "{edge}: {alone:?}");
         let hidden = shown(
-            stage(Transparency::OrderIndependent, 4).add(strip(), painted([1.0; 3])).add(pane(-1.0), glass(RED, 0.5)),
+            create_builder(Transparency::OrderIndependent, 4)
+                .add_domain(strip(), painted([1.0; 3]))
+                .add_domain(pane(-1.0), glass(RED, 0.5)),
         );
         let expected = RED.map(|channel| share + (1.0 - share) * 0.5 * f64::from(channel));
-        assert!(close(hidden, expected, 1.0), "{edge}: {hidden:?} instead of {expected:?}");
+        assert!(is_close(hidden, expected, 1.0), "{edge}: {hidden:?} instead of {expected:?}");
     }
-    let one = stage(Transparency::OrderIndependent, 1).add(facing(-1.0, -1.0, 0.025, 1.0, 0.0), glass([1.0; 3], 0.5));
-    assert_eq!(picture(&one.scene()).at(32, 30), [0; 3], "control: one sample sees no quarter");
+    let one = create_builder(Transparency::OrderIndependent, 1)
+        .add_domain(facing_rectangle(-1.0, -1.0, 0.025, 1.0, 0.0), glass([1.0; 3], 0.5));
+    assert_eq!(render(&one.build()).pixel(32, 30), [0; 3], "control: one sample sees no quarter");
 }
 
 #[test]
 fn triangles_of_one_pane_show_no_seam() {
-    let shown = picture(&stage(Transparency::OrderIndependent, 4).add(pane(0.0), glass([1.0; 3], 0.5)).scene());
-    assert_eq!(shown.count(|pixel| close(pixel, [0.5; 3], 1.0)), 1600);
-    assert_eq!(shown.count(|pixel| pixel == [0; 3]), 64 * 64 - 1600);
+    let shown =
+        render(&create_builder(Transparency::OrderIndependent, 4).add_domain(pane(0.0), glass([1.0; 3], 0.5)).build());
+    assert_eq!(shown.count_pixels(|pixel| is_close(pixel, [0.5; 3], 1.0)), 1600);
+    assert_eq!(shown.count_pixels(|pixel| pixel == [0; 3]), 64 * 64 - 1600);
     assert_eq!(lists(&shown).max_per_pixel, 2, "pixels on the diagonal see both triangles");
 }
 
 /// A stack of layers with different colors and opacities. `order` maps the position of a layer in the scene to its
 /// place in depth, counted from the farthest.
 fn stack(count: u32, order: impl Fn(u32) -> u32, set: impl Fn(&mut SceneBuilder)) -> Arc<Scene> {
-    let mut stage = stage(Transparency::OrderIndependent, 1);
-    set(&mut stage);
-    (0..count).fold(stage, |stage, index| layered(stage, order(index), count, 1.0)).scene()
+    let mut builder = create_builder(Transparency::OrderIndependent, 1);
+    set(&mut builder);
+    (0..count).fold(builder, |builder, index| layered(builder, order(index), count, 1.0)).build()
 }
 
-fn layered(stage: SceneBuilder, place: u32, count: u32, share: f32) -> SceneBuilder {
+fn layered(builder: SceneBuilder, place: u32, count: u32, share: f32) -> SceneBuilder {
     let (color, alpha) = layer(place, count);
-    stage.add(pane(-3.0 + 0.05 * place as f32), glass(color, share * alpha))
+    builder.add_domain(pane(-3.0 + 0.05 * place as f32), glass(color, share * alpha))
 }
 
 fn layer(place: u32, count: u32) -> ([f32; 3], f32) {
@@ -186,16 +197,18 @@ fn layer(place: u32, count: u32) -> ([f32; 3], f32) {
 fn nearest(count: u32, kept: u32) -> Arc<Scene> {
     let share = |place: u32| if place >= count - kept { 1.0 } else { 0.0 };
     (0..count)
-        .fold(stage(Transparency::OrderIndependent, 1), |stage, place| layered(stage, place, count, share(place)))
-        .scene()
+        .fold(create_builder(Transparency::OrderIndependent, 1), |builder, place| {
+            layered(builder, place, count, share(place))
+        })
+        .build()
 }
 
 #[test]
 fn long_fragment_lists_are_sorted() {
     for count in [31, 32, 33, 34, 61, 97] {
-        let sorted = picture(&stack(count, |index| index, |_| ()));
-        let mixed = picture(&stack(count, |index| index * 7 % count, |_| ()));
-        let backward = picture(&stack(count, |index| count - 1 - index, |_| ()));
+        let sorted = render(&stack(count, |index| index, |_| ()));
+        let mixed = render(&stack(count, |index| index * 7 % count, |_| ()));
+        let backward = render(&stack(count, |index| count - 1 - index, |_| ()));
         let fragments = 1600 * u64::from(count);
         assert_eq!(
             lists(&sorted),
@@ -203,7 +216,7 @@ fn long_fragment_lists_are_sorted() {
         );
         assert!(mixed.image.rgba == sorted.image.rgba && backward.image.rgba == sorted.image.rgba, "{count}");
         let layers: Vec<_> = (0..count).map(|place| layer(place, count)).collect();
-        assert!(close(sorted.at(20, 40), over(&layers), 1.0), "{count}: {:?}", sorted.at(20, 40));
+        assert!(is_close(sorted.pixel(20, 40), over(&layers), 1.0), "{count}: {:?}", sorted.pixel(20, 40));
     }
 }
 
@@ -211,7 +224,7 @@ fn long_fragment_lists_are_sorted() {
 #[test]
 fn fragments_over_budget_keep_the_nearest() {
     let limited = |budget: Option<u32>, order: fn(u32) -> u32| {
-        picture(&stack(10, order, |stage| stage.0.look.fragments = budget))
+        render(&stack(10, order, |builder| builder.parts.look.fragments = budget))
     };
     let whole = limited(None, |index| index);
     for (budget, per_pixel_limit) in [(8000, 5), (9599, 5), (9600, 6), (1600, 1), (1599, 0), (1, 0)] {
@@ -222,7 +235,7 @@ fn fragments_over_budget_keep_the_nearest() {
             OitStats { fragments: 16000, stored: kept, max_per_pixel: 10, per_pixel_limit: Some(per_pixel_limit) },
             "{budget}"
         );
-        let nearest = picture(&nearest(10, per_pixel_limit));
+        let nearest = render(&nearest(10, per_pixel_limit));
         assert!(shown.image.rgba == nearest.image.rgba, "{budget}");
         for order in [(|index| 9 - index) as fn(u32) -> u32, |index| index * 3 % 10] {
             let other = limited(Some(budget), order);
@@ -236,12 +249,12 @@ fn fragments_over_budget_keep_the_nearest() {
 #[test]
 fn latest_of_coplanar_layers_are_kept_over_budget() {
     let colors = [RED, GREEN, BLUE, RED, GREEN];
-    let mut stage = stage(Transparency::OrderIndependent, 1);
-    stage.0.look.fragments = Some(3200);
-    let add = |stage: SceneBuilder, color: [f32; 3]| stage.add(pane(0.0), glass(color, 0.5));
-    let shown = picture(&colors.into_iter().fold(stage, add).scene());
+    let mut builder = create_builder(Transparency::OrderIndependent, 1);
+    builder.parts.look.fragments = Some(3200);
+    let add = |builder: SceneBuilder, color: [f32; 3]| builder.add_domain(pane(0.0), glass(color, 0.5));
+    let shown = render(&colors.into_iter().fold(builder, add).build());
     assert_eq!((lists(&shown).stored, lists(&shown).per_pixel_limit), (3200, Some(2)));
-    assert!(close(shown.at(30, 40), over(&[(RED, 0.5), (GREEN, 0.5)]), 1.0), "{:?}", shown.at(30, 40));
+    assert!(is_close(shown.pixel(30, 40), over(&[(RED, 0.5), (GREEN, 0.5)]), 1.0), "{:?}", shown.pixel(30, 40));
 }
 
 #[test]
@@ -249,15 +262,15 @@ fn scene_over_budget_is_deterministic() {
     let scene = stack(
         40,
         |index| index * 7 % 40,
-        |stage| {
-            (stage.0.look.fragments, stage.0.look.samples) = (Some(20_000), 4);
+        |builder| {
+            (builder.parts.look.fragments, builder.parts.look.samples) = (Some(20_000), 4);
         },
     );
-    let mut renderer = open();
-    let first = draw(&mut renderer, &scene, camera(64), 64);
+    let mut renderer = open_renderer();
+    let first = render_square(&mut renderer, &scene, front_camera(64), 64);
     assert!(lists(&first).dropped() > 0);
     for _ in 0..5 {
-        let again = draw(&mut renderer, &scene, camera(64), 64);
+        let again = render_square(&mut renderer, &scene, front_camera(64), 64);
         assert!(again.image.rgba == first.image.rgba && again.stats == first.stats);
     }
 }
@@ -265,19 +278,19 @@ fn scene_over_budget_is_deterministic() {
 #[test]
 fn two_passes_draw_alpha_above_threshold_as_opaque() {
     let shown = |opaque_alpha: f32| {
-        let mut stage = stage(Transparency::TwoPass, 4);
-        stage.0.look.opaque_alpha = opaque_alpha;
-        let image = stage.texture(2, 1, |x, _| if x == 0 { [255, 255, 255, 128] } else { [255; 4] });
+        let mut builder = create_builder(Transparency::TwoPass, 4);
+        builder.parts.look.opaque_alpha = opaque_alpha;
+        let image = builder.add_texture(2, 1, |x, _| if x == 0 { [255, 255, 255, 128] } else { [255; 4] });
         let leaf = Material { color_texture: Some(image), ..glass(GREEN, 1.0) };
         // The farther pane comes later in the scene, so only the depth test keeps it behind.
-        picture(&stage.add(pane(0.0), leaf).add(pane(-1.0), glass(RED, 0.5)).scene())
+        render(&builder.add_domain(pane(0.0), leaf).add_domain(pane(-1.0), glass(RED, 0.5)).build())
     };
     let (parts, none) = (shown(0.95), shown(1.5));
-    assert!(close(parts.at(42, 30), GREEN.map(f64::from), 1.0), "{:?}", parts.at(42, 30));
-    assert!(close(none.at(42, 30), over(&[(GREEN, 1.0), (RED, 0.5)]), 2.0), "control: {:?}", none.at(42, 30));
+    assert!(is_close(parts.pixel(42, 30), GREEN.map(f64::from), 1.0), "{:?}", parts.pixel(42, 30));
+    assert!(is_close(none.pixel(42, 30), over(&[(GREEN, 1.0), (RED, 0.5)]), 2.0), "control: {:?}", none.pixel(42, 30));
     let wrong = over(&[(GREEN, 128.0 / 255.0), (RED, 0.5)]);
     // Near the center of the half-transparent texel; the other texel is opaque around its center.
-    assert!(close(parts.at(22, 30), wrong, 2.0), "blended in the order of the scene: {:?}", parts.at(22, 30));
+    assert!(is_close(parts.pixel(22, 30), wrong, 2.0), "blended in the order of the scene: {:?}", parts.pixel(22, 30));
     assert_eq!((parts.stats.draw_calls, none.stats.draw_calls), (2, 1));
     assert_eq!(none.stats.passes, [Pass::Blended, Pass::Background, Pass::Encode]);
     assert_eq!(parts.stats.passes, [Pass::Visibility, Pass::Blended, Pass::Background, Pass::Shade, Pass::Encode]);

@@ -4,19 +4,20 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Antialiasing, Bloom, Camera, Lens, RenderSettings, SceneState, ToneMapping};
-use modalcast_render::{FrameParams, Pass};
+use modalcast_render::FrameParams;
 
 use super::harness::{
-    Picture, SceneBuilder, camera, close, draw, draw_sized, facing, open, picture, planned_above, srgb,
+    RenderedFrame, SceneBuilder, encode_srgb, facing_rectangle, front_camera, is_close, open_renderer,
+    planned_passes_above_ground, render, render_sized, render_square,
 };
 
 /// A stage with one sample per pixel whose white surfaces emit this linear light.
 fn glowing(light: [f32; 3], change: impl FnOnce(RenderSettings) -> RenderSettings) -> SceneBuilder {
-    let mut stage = SceneBuilder::new();
-    stage.0.look.skylight = light;
-    stage.0.look.samples = 1;
-    stage.0.look = change(stage.0.look);
-    stage
+    let mut builder = SceneBuilder::new();
+    builder.parts.look.skylight = light;
+    builder.parts.look.samples = 1;
+    builder.parts.look = change(builder.parts.look);
+    builder
 }
 
 fn white() -> Material {
@@ -39,7 +40,8 @@ fn aces(light: f64) -> f64 {
 #[test]
 fn tone_curves_have_their_known_values() {
     let shown = |light: [f32; 3], look: &dyn Fn(RenderSettings) -> RenderSettings| {
-        picture(&glowing(light, look).add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), white()).scene()).at(32, 32)
+        render(&glowing(light, look).add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), white()).build())
+            .pixel(32, 32)
     };
     // A threshold that only the light of 1e30 exceeds. The bloom pass inverts the tone curve and applies it again.
     let idle = Some(Bloom { threshold: 1000.0, ..Bloom::default() });
@@ -53,22 +55,22 @@ fn tone_curves_have_their_known_values() {
             ] {
                 let want = want.map(|value| if value.is_finite() { value } else { 1.0 });
                 let got = shown(light, &|look| RenderSettings { tone, bloom, ..look });
-                assert!(close(got, want, 1.0), "{tone:?}, {bloom:?}, {light:?}: {got:?}");
+                assert!(is_close(got, want, 1.0), "{tone:?}, {bloom:?}, {light:?}: {got:?}");
             }
         }
     }
     let got = shown([0.09, 0.25, 1.0], &|look| RenderSettings { tone: ToneMapping::Aces, exposure: 2.0, ..look });
-    assert!(close(got, [0.18, 0.5, 2.0].map(aces), 1.0), "{got:?}");
-    assert!(!close(got, [0.09, 0.25, 1.0].map(aces), 10.0), "control: exposure is seen");
-    assert!(!close(got, [0.18, 0.5, 2.0].map(reinhard), 10.0), "control: the curves differ");
+    assert!(is_close(got, [0.18, 0.5, 2.0].map(aces), 1.0), "{got:?}");
+    assert!(!is_close(got, [0.09, 0.25, 1.0].map(aces), 10.0), "control: exposure is seen");
+    assert!(!is_close(got, [0.18, 0.5, 2.0].map(reinhard), 10.0), "control: the curves differ");
 }
 
 /// Sum and centroid of the red light; the centroid is in pixels from the top left.
-fn sum_and_centroid(shown: &Picture) -> (f64, [f64; 2]) {
+fn sum_and_centroid(shown: &RenderedFrame) -> (f64, [f64; 2]) {
     let (mut sum, mut moment) = (0.0, [0.0; 2]);
     for y in 0..shown.image.height {
         for x in 0..shown.image.width {
-            let light = linear(shown.at(x, y)[0]);
+            let light = linear(shown.pixel(x, y)[0]);
             sum += light;
             moment = [moment[0] + light * (f64::from(x) + 0.5), moment[1] + light * (f64::from(y) + 0.5)];
         }
@@ -80,9 +82,9 @@ fn sum_and_centroid(shown: &Picture) -> (f64, [f64; 2]) {
 fn bloom_of_one_pixel_keeps_its_light_and_centroid() {
     let shown = |light: f32, bloom: Option<Bloom>, size: [u32; 2]| {
         // One pixel, the second from the center: x = 33, and y = 30 from the top.
-        let pixel = facing(0.1, 0.1, 0.2, 0.2, 0.0);
-        let scene = glowing([light; 3], |look| RenderSettings { bloom, ..look }).add(pixel, white()).scene();
-        draw_sized(&mut open(), &scene, camera(64), size)
+        let pixel = facing_rectangle(0.1, 0.1, 0.2, 0.2, 0.0);
+        let scene = glowing([light; 3], |look| RenderSettings { bloom, ..look }).add_domain(pixel, white()).build();
+        render_sized(&mut open_renderer(), &scene, front_camera(64), size)
     };
     let all = |threshold: f32, levels: u32| Some(Bloom { threshold, strength: 1.0, levels });
     // The blurred pixels end below white, so that the picture contains all of their light.
@@ -97,31 +99,34 @@ fn bloom_of_one_pixel_keeps_its_light_and_centroid() {
     }
     let (sum, _) = sum_and_centroid(&shown(8.0, None, [64, 64]));
     assert!((sum - 1.0).abs() < 1e-9, "control: without glow a pixel is white and no more, {sum}");
-    let spread = |levels| shown(8.0, all(0.0, levels), [64, 64]).count(|pixel| pixel != [0; 3]);
+    let spread = |levels| shown(8.0, all(0.0, levels), [64, 64]).count_pixels(|pixel| pixel != [0; 3]);
     assert!(spread(1) == 36 && spread(3) > 200, "{} and {} pixels", spread(1), spread(3));
 }
 
 #[test]
 fn bloom_is_symmetric_and_respects_its_threshold() {
-    let four = facing(-0.1, -0.1, 0.1, 0.1, 0.0);
+    let four = facing_rectangle(-0.1, -0.1, 0.1, 0.1, 0.0);
     let bloom = |threshold| {
         RenderSettings { bloom: Some(Bloom { threshold, strength: 0.8, levels: 4 }), ..RenderSettings::default() }.bloom
     };
-    let stage = |threshold| glowing([30.0, 12.0, 5.0], |look| RenderSettings { bloom: bloom(threshold), ..look });
-    let shown = picture(&stage(1.0).add(four.clone(), white()).scene());
+    let builder = |threshold| glowing([30.0, 12.0, 5.0], |look| RenderSettings { bloom: bloom(threshold), ..look });
+    let shown = render(&builder(1.0).add_domain(four.clone(), white()).build());
     for (x, y) in (0..32).flat_map(|x| (0..32).map(move |y| (x, y))) {
-        let here = shown.at(x, y);
-        for other in [shown.at(63 - x, y), shown.at(x, 63 - y), shown.at(y, x)] {
+        let here = shown.pixel(x, y);
+        for other in [shown.pixel(63 - x, y), shown.pixel(x, 63 - y), shown.pixel(y, x)] {
             assert!(
                 (0..3).all(|channel| here[channel].abs_diff(other[channel]) <= 1),
                 "({x}, {y}): {here:?}, {other:?}"
             );
         }
     }
-    let [r, g, b] = shown.at(36, 32);
+    let [r, g, b] = shown.pixel(36, 32);
     assert!(r > g && g > b && b > 0, "a glow has the hue of its light: {r} {g} {b}");
-    let plain = picture(&glowing([30.0, 12.0, 5.0], |look| look).add(four.clone(), white()).scene());
-    assert!(picture(&stage(30.5).add(four, white()).scene()).image.rgba == plain.image.rgba, "nothing is above 30.5");
+    let plain = render(&glowing([30.0, 12.0, 5.0], |look| look).add_domain(four.clone(), white()).build());
+    assert!(
+        render(&builder(30.5).add_domain(four, white()).build()).image.rgba == plain.image.rgba,
+        "nothing is above 30.5"
+    );
     assert!(shown.image.rgba != plain.image.rgba, "control");
 }
 
@@ -130,41 +135,53 @@ fn bloom_is_symmetric_and_respects_its_threshold() {
 #[test]
 fn bright_edges_stay_antialiased_with_bloom() {
     let shown = |bloom: Option<Bloom>| {
-        let stage = glowing([50.0; 3], |look| RenderSettings { bloom, samples: 4, ..look });
+        let builder = glowing([50.0; 3], |look| RenderSettings { bloom, samples: 4, ..look });
         let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.25, ambient: [0.0; 3], ..white() };
         // The lamp covers the right half of the pixels of column 32. Its upper half is behind dark glass.
-        let scene = stage.add(facing(0.05, -2.0, 2.0, 2.0, 0.0), white()).add(facing(-2.0, 0.0, 2.0, 2.0, 0.1), glass);
-        picture(&scene.scene())
+        let scene = builder
+            .add_domain(facing_rectangle(0.05, -2.0, 2.0, 2.0, 0.0), white())
+            .add_domain(facing_rectangle(-2.0, 0.0, 2.0, 2.0, 0.1), glass);
+        render(&scene.build())
     };
     let plain = shown(None);
     let idle = shown(Some(Bloom { strength: 0.0, ..Bloom::default() }));
     assert_eq!(plain.stats.samples, 4);
     assert!(plain.image.rgba == idle.image.rgba, "a glow of no strength changes nothing");
     for y in [20, 40] {
-        assert!(close(plain.at(32, y), [0.5; 3], 1.0) && plain.at(33, y) == [255; 3], "{:?}", plain.at(32, y));
+        assert!(
+            is_close(plain.pixel(32, y), [0.5; 3], 1.0) && plain.pixel(33, y) == [255; 3],
+            "{:?}",
+            plain.pixel(32, y)
+        );
     }
     assert!(plain.image.rgba != shown(Some(Bloom::default())).image.rgba, "control");
 }
 
 /// A white rhombus with slanted edges on gray, `scale` times 64 pixels per side.
-fn slanted(antialias: Antialiasing, samples: u32, scale: u32) -> Picture {
+fn slanted(antialias: Antialiasing, samples: u32, scale: u32) -> RenderedFrame {
     let rest = vec![[-2.1, -1.37, 0.0], [1.63, -2.23, 0.0], [2.17, 1.41, 0.0], [-1.57, 2.29, 0.0]];
-    let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a rhomb");
-    let mut stage = glowing([0.9; 3], |look| RenderSettings { antialias, samples, ..look });
-    (stage.0.look.zenith, stage.0.look.horizon) = ([0.1; 3], [0.1; 3]);
+    let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
+        .expect("expected a valid mesh");
+    let mut builder = glowing([0.9; 3], |look| RenderSettings { antialias, samples, ..look });
+    (builder.parts.look.zenith, builder.parts.look.horizon) = ([0.1; 3], [0.1; 3]);
     let middle = f64::from(32 * scale);
     let focal = f64::from(100 * scale);
     let lens = Lens::Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle };
-    draw(&mut open(), &stage.add(mesh, white()).scene(), Camera { lens, ..camera(64) }, 64 * scale)
+    render_square(
+        &mut open_renderer(),
+        &builder.add_domain(mesh, white()).build(),
+        Camera { lens, ..front_camera(64) },
+        64 * scale,
+    )
 }
 
 /// Mean difference from the average light of 8 x 8 fine pixels, in levels.
-fn error(shown: &Picture, fine: &Picture) -> f64 {
+fn error(shown: &RenderedFrame, fine: &RenderedFrame) -> f64 {
     let exact = |x: u32, y: u32| {
-        let light = |i: u32| linear(fine.at(8 * x + i % 8, 8 * y + i / 8)[0]);
-        srgb((0..64).map(light).sum::<f64>() / 64.0)
+        let light = |i: u32| linear(fine.pixel(8 * x + i % 8, 8 * y + i / 8)[0]);
+        encode_srgb((0..64).map(light).sum::<f64>() / 64.0)
     };
-    let off = |(x, y): (u32, u32)| (f64::from(shown.at(x, y)[0]) - exact(x, y)).abs();
+    let off = |(x, y): (u32, u32)| (f64::from(shown.pixel(x, y)[0]) - exact(x, y)).abs();
     (0..64).flat_map(|y| (0..64).map(move |x| (x, y))).map(off).sum::<f64>() / 4096.0
 }
 
@@ -179,19 +196,19 @@ fn fxaa_smooths_slanted_edges_and_keeps_flat_areas() {
     assert!(slanted(Antialiasing::Msaa, 1, 1).image.rgba == none.image.rgba);
     let mut changed = 0;
     for (x, y) in (1..63).flat_map(|x| (1..63).map(move |y| (x, y))) {
-        let own = none.at(x, y);
-        let flat = (0..9).all(|i| none.at(x + i % 3 - 1, y + i / 3 - 1) == own);
-        assert!(!flat || fxaa.at(x, y) == own, "({x}, {y}) is flat");
-        changed += usize::from(fxaa.at(x, y) != own);
+        let own = none.pixel(x, y);
+        let flat = (0..9).all(|i| none.pixel(x + i % 3 - 1, y + i / 3 - 1) == own);
+        assert!(!flat || fxaa.pixel(x, y) == own, "({x}, {y}) is flat");
+        changed += usize::from(fxaa.pixel(x, y) != own);
     }
     assert!(changed > 100, "control: {changed} pixels were smoothed");
 }
 
 /// A sky whose values lie between two levels in each channel.
-fn sky(dither: bool) -> Picture {
-    let mut stage = glowing([0.0; 3], |look| RenderSettings { dither, ..look });
-    (stage.0.look.zenith, stage.0.look.horizon) = ([0.2985, 0.06, 0.41], [0.2988, 0.0601, 0.4103]);
-    picture(&stage.add(facing(-0.1, -3.2, 0.1, -3.1, 0.0), white()).scene())
+fn sky(dither: bool) -> RenderedFrame {
+    let mut builder = glowing([0.0; 3], |look| RenderSettings { dither, ..look });
+    (builder.parts.look.zenith, builder.parts.look.horizon) = ([0.2985, 0.06, 0.41], [0.2988, 0.0601, 0.4103]);
+    render(&builder.add_domain(facing_rectangle(-0.1, -3.2, 0.1, -3.1, 0.0), white()).build())
 }
 
 /// Exact level of a channel of that sky.
@@ -200,7 +217,7 @@ fn exact(x: u32, y: u32, channel: usize) -> f64 {
     let sine = away.y.max(0.0);
     let share = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
     let (low, high) = ([0.2988, 0.0601, 0.4103][channel], [0.2985, 0.06, 0.41][channel]);
-    srgb(low + share * (high - low))
+    encode_srgb(low + share * (high - low))
 }
 
 #[test]
@@ -208,15 +225,15 @@ fn dithering_stays_within_one_level_and_keeps_the_mean() {
     let (rounded, mixed) = (sky(false), sky(true));
     let pixels = || (0..64).flat_map(|y| (0..64).map(move |x| (x, y)));
     for (x, y) in pixels() {
-        let (one, other) = (rounded.at(x, y), mixed.at(x, y));
+        let (one, other) = (rounded.pixel(x, y), mixed.pixel(x, y));
         assert!((0..3).all(|channel| one[channel].abs_diff(other[channel]) <= 1), "({x}, {y})");
     }
     // Only the upper half, because the sky has one color below the horizon.
-    let bias = |shown: &Picture, channel: usize| {
+    let bias = |shown: &RenderedFrame, channel: usize| {
         let block = |corner: (u32, u32)| {
             let off = |i: u32| {
                 let (x, y) = (8 * corner.0 + i % 8, 8 * corner.1 + i / 8);
-                f64::from(shown.at(x, y)[channel]) - exact(x, y, channel)
+                f64::from(shown.pixel(x, y)[channel]) - exact(x, y, channel)
             };
             ((0..64).map(off).sum::<f64>() / 64.0).abs()
         };
@@ -227,8 +244,8 @@ fn dithering_stays_within_one_level_and_keeps_the_mean() {
         assert!(kept < 0.1 && lost > 0.2, "channel {channel}: {kept} levels with dithering, {lost} without");
     }
     let flat = |dither| {
-        let stage = glowing([1.0, 0.0, 2.0], |look| RenderSettings { dither, ..look });
-        picture(&stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), white()).scene()).image.rgba
+        let builder = glowing([1.0, 0.0, 2.0], |look| RenderSettings { dither, ..look });
+        render(&builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), white()).build()).image.rgba
     };
     assert!(flat(true) == flat(false), "what lies on a level stays");
 }
@@ -249,19 +266,25 @@ fn everything(look: RenderSettings) -> RenderSettings {
 #[test]
 fn post_processing_is_deterministic() {
     let scene = |look: RenderSettings| {
-        let mut stage = SceneBuilder::new();
-        stage.0.look = look;
-        stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.3), white()).add(facing(-2.0, 0.5, 2.0, 0.6, 0.5), white()).scene()
+        let mut builder = SceneBuilder::new();
+        builder.parts.look = look;
+        builder
+            .add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.3), white())
+            .add_domain(facing_rectangle(-2.0, 0.5, 2.0, 0.6, 0.5), white())
+            .build()
     };
     let rich = scene(everything(RenderSettings::default()));
-    let mut renderer = open();
-    let first = draw(&mut renderer, &rich, camera(96), 96);
-    assert_eq!(first.stats.passes, planned_above(&rich));
-    assert!(first.stats.passes.contains(&Pass::Bloom));
-    let plain = draw(&mut renderer, &scene(RenderSettings::default()), camera(96), 96);
-    assert!(!plain.stats.passes.contains(&Pass::Bloom));
-    assert!(draw(&mut renderer, &rich, camera(96), 96).image.rgba == first.image.rgba);
-    assert!(draw(&mut open(), &rich, camera(96), 96).image.rgba == first.image.rgba, "another context");
+    let mut renderer = open_renderer();
+    let first = render_square(&mut renderer, &rich, front_camera(96), 96);
+    assert_eq!(first.stats.passes, planned_passes_above_ground(&rich));
+    assert!(first.stats.passes.contains(&"bloom"));
+    let plain = render_square(&mut renderer, &scene(RenderSettings::default()), front_camera(96), 96);
+    assert!(!plain.stats.passes.contains(&"bloom"));
+    assert!(render_square(&mut renderer, &rich, front_camera(96), 96).image.rgba == first.image.rgba);
+    assert!(
+        render_square(&mut open_renderer(), &rich, front_camera(96), 96).image.rgba == first.image.rgba,
+        "another context"
+    );
     assert!(plain.image.rgba != first.image.rgba, "control");
 }
 
@@ -269,37 +292,37 @@ fn post_processing_is_deterministic() {
 fn nan_and_infinite_light_affect_no_other_pixel() {
     for tone in [ToneMapping::None, ToneMapping::Reinhard, ToneMapping::Aces] {
         for bloom in [None, Some(Bloom { threshold: 0.9, strength: 1.0, levels: 8 })] {
-            let mut stage = glowing([0.25; 3], |look| RenderSettings { tone, bloom, ..look });
-            stage.0.look.sunlight = [3e38; 3];
+            let mut builder = glowing([0.25; 3], |look| RenderSettings { tone, bloom, ..look });
+            builder.parts.look.sunlight = [3e38; 3];
             let lamp = Material { diffuse: [1.0; 3], specular: [1.0; 3], shininess: 1.0, ..white() };
-            let scene = stage
-                .add(facing(-3.0, -3.0, -2.0, -2.0, 0.0), lamp.clone())
-                .add(facing(-0.5, -0.5, 0.5, 0.5, 0.0), white())
-                .scene();
-            let mut renderer = open();
+            let scene = builder
+                .add_domain(facing_rectangle(-3.0, -3.0, -2.0, -2.0, 0.0), lamp.clone())
+                .add_domain(facing_rectangle(-0.5, -0.5, 0.5, 0.5, 0.0), white())
+                .build();
+            let mut renderer = open_renderer();
             let mut deformer = ReferenceDeformer::new(&scene);
-            let bounds = deformer.deform(&SceneState::rest(&scene)).expect("deforms").bounds;
+            let bounds = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed").bounds;
             let rest = deformer.surface().expect("there").clone();
             let shown = |normal: [f32; 3]| {
                 let mut surface = DeformedSurface { normals: rest.normals.clone(), ..rest.clone() };
                 surface.normals[..12].copy_from_slice(&normal.repeat(4));
-                let buffers = renderer.load(&scene).expect("loads");
-                renderer.upload(&buffers, &surface).expect("uploads");
-                let shot = FrameParams { camera: camera(64), width: 64, height: 64, bounds, light: None };
-                let image = renderer.draw(&buffers, &shot).expect("draws");
-                Picture { image, stats: renderer.stats().clone(), allocations: vec![] }
+                let buffers = renderer.load(&scene).expect("expected the scene to load");
+                renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
+                let shot = FrameParams { camera: front_camera(64), width: 64, height: 64, bounds, light: None };
+                let image = renderer.draw(&buffers, &shot).expect("expected a frame");
+                RenderedFrame { image, stats: renderer.stats().clone(), allocations: vec![] }
             };
             let mut shown = shown;
             let lit = shown([0.0, 0.0, 1.0]);
-            assert!(lit.at(7, 57).iter().all(|level| *level > 250), "{tone:?} {bloom:?}: {:?}", lit.at(7, 57));
+            assert!(lit.pixel(7, 57).iter().all(|level| *level > 250), "{tone:?} {bloom:?}: {:?}", lit.pixel(7, 57));
             let dark = shown([f32::NAN; 3]);
             let want = match tone {
                 ToneMapping::None => 0.25,
                 ToneMapping::Reinhard => reinhard(0.25),
                 ToneMapping::Aces => aces(0.25),
             };
-            assert!(close(dark.at(32, 32), [want; 3], 1.0), "{tone:?} {bloom:?}: {:?}", dark.at(32, 32));
-            assert_eq!(dark.at(60, 3), [0; 3], "{tone:?} {bloom:?}");
+            assert!(is_close(dark.pixel(32, 32), [want; 3], 1.0), "{tone:?} {bloom:?}: {:?}", dark.pixel(32, 32));
+            assert_eq!(dark.pixel(60, 3), [0; 3], "{tone:?} {bloom:?}");
         }
     }
 }

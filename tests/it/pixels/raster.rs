@@ -11,7 +11,7 @@ use modalcast_model::scene::{Camera, CullMode, Culling, DrawRange, Lens, Scene, 
 use modalcast_render::{FrameParams, VisibilityId};
 use nalgebra::Matrix4;
 
-use super::harness::{SceneBuilder, open};
+use super::harness::{SceneBuilder, open_renderer};
 use crate::common::exact_triangle::{ExactTriangle, compare_ids};
 use crate::scenes::Random;
 
@@ -33,26 +33,27 @@ fn scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
     let triangles: Vec<[u32; 3]> = (0..rest.len() as u32 / 3).map(|at| [3 * at, 3 * at + 1, 3 * at + 2]).collect();
     let count = rest.len();
     let normals = vec![[0.0, 0.0, 1.0]; count];
-    let mesh = Mesh::from_indexed(rest, normals, vec![[0.0; 2]; count], triangles.clone()).expect("a mesh");
-    let mut stage = SceneBuilder::new();
-    (stage.0.look.samples, stage.0.look.culling) = (1, Culling::None);
-    (stage.add(mesh, Material { double_sided: true, ..Material::default() }).scene(), triangles)
+    let mesh =
+        Mesh::from_indexed(rest, normals, vec![[0.0; 2]; count], triangles.clone()).expect("expected a valid mesh");
+    let mut builder = SceneBuilder::new();
+    (builder.parts.look.samples, builder.parts.look.culling) = (1, Culling::None);
+    (builder.add_domain(mesh, Material { double_sided: true, ..Material::default() }).build(), triangles)
 }
 
 #[test]
 fn ids_equal_opengl_except_on_edges_and_depth_ties() {
-    let mut renderer = open();
+    let mut renderer = open_renderer();
     for (seed, eye) in [(1, [0.0, 0.5, 9.0]), (2, [0.3, 0.2, 0.5]), (3, [-6.0, 4.0, 2.0])] {
         let (scene, triangles) = scene(seed);
         let view = View::LookAt { eye, target: [0.0; 3], up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, lens: Lens::FieldOfView(50.0), near: 0.1, far: 40.0 };
         let mut deformer = ReferenceDeformer::new(&scene);
-        let bounds = deformer.deform(&SceneState::rest(&scene)).expect("deforms").bounds;
+        let bounds = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed").bounds;
         let surface = deformer.surface().expect("there").clone();
-        let buffers = renderer.load(&scene).expect("loads");
-        renderer.upload(&buffers, &surface).expect("uploads");
+        let buffers = renderer.load(&scene).expect("expected the scene to load");
+        renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
         let [width, height] = SIZE;
-        renderer.draw(&buffers, &FrameParams { camera, width, height, bounds, light: None }).expect("draws");
+        renderer.draw(&buffers, &FrameParams { camera, width, height, bounds, light: None }).expect("expected a frame");
         assert_eq!(renderer.stats().samples, 1);
         let id = |seen: &VisibilityId| match seen {
             VisibilityId::Triangle(place) => buffers.source_triangle(*place).map(|(_, triangle)| triangle as u32),
@@ -66,7 +67,8 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
         let exact: Vec<ExactTriangle> =
             triangles.iter().map(|own| ExactTriangle::new(&clip, SIZE, own.map(corner))).collect();
         let ids = |clip: &Matrix4<f64>| {
-            let mut raster = VisibilityBuffer::new(Viewport::new(clip, width, height).expect("a window"));
+            let mut raster =
+                VisibilityBuffer::new(Viewport::new(clip, width, height).expect("expected a valid viewport"));
             let group = DrawRange { first: 0, triangles: triangles.len() as u32, faces: CullMode::None };
             raster.draw(&surface.positions, &triangles, group);
             raster.ids()

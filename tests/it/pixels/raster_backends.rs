@@ -12,12 +12,12 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::raster::{DrawTarget, GlBuffer, RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Camera, CullMode, DrawRange, Lens, Scene, SceneState, ShadowSettings, View, Viewport};
 use modalcast_render::{
-    BlurMethod, FrameImage, FrameParams, FrameStats, Pass, RasterBackend, RasterBackends, Renderer, SceneBuffers,
+    BlurMethod, FrameImage, FrameParams, FrameStats, RasterBackend, RasterBackends, Renderer, SceneBuffers,
     VisibilityId,
 };
 use nalgebra::{Matrix4, Vector3};
 
-use super::harness::{SceneBuilder, facing, floor_mesh, open};
+use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, open_renderer};
 
 /// The reference rasterizer, reading and writing buffers of the current OpenGL context.
 struct ReferenceRasterizer {
@@ -37,7 +37,8 @@ impl ReferenceRasterizer {
     fn new(mesh: RasterGeometry, aside: f64) -> Self {
         // SAFETY: loading runs the initializers of libEGL. They have run already, because the renderer of this test has
         // loaded the library.
-        let egl = unsafe { khronos_egl::DynamicInstance::<khronos_egl::EGL1_4>::load_required() }.expect("libEGL");
+        let egl =
+            unsafe { khronos_egl::DynamicInstance::<khronos_egl::EGL1_4>::load_required() }.expect("expected libEGL");
         let address = |name: &str| egl.get_proc_address(name).map_or(std::ptr::null(), |place| place as *const _);
         // SAFETY: a context is current on this thread while its scene is loaded, and `address` returns the functions of
         // that context.
@@ -60,7 +61,7 @@ impl ReferenceRasterizer {
         let [width, height] = window.size();
         let clip = Matrix4::from_row_slice(&window.clip().map(f64::from));
         let clip = Matrix4::new_translation(&Vector3::new(self.aside, 0.0, 0.0)) * clip;
-        let mut raster = VisibilityBuffer::new(Viewport::new(&clip, width, height).expect("a window"));
+        let mut raster = VisibilityBuffer::new(Viewport::new(&clip, width, height).expect("expected a valid viewport"));
         groups.iter().for_each(|group| raster.draw(&self.positions(), &self.mesh.triangles, *group));
         raster
     }
@@ -94,7 +95,7 @@ impl Rasterizer for ReferenceRasterizer {
 }
 
 fn named(name: u32) -> glow::Buffer {
-    glow::NativeBuffer(std::num::NonZeroU32::new(name).expect("a name"))
+    glow::NativeBuffer(std::num::NonZeroU32::new(name).expect("expected a name"))
 }
 
 /// Rasterizer that draws a scene.
@@ -115,17 +116,18 @@ struct DrawnFrame {
 const SIZE: [u32; 2] = [192, 128];
 
 fn show(scene: &Arc<Scene>, camera: Camera, by: Backend) -> DrawnFrame {
-    show_with(&mut open(), scene, camera, by)
+    show_with(&mut open_renderer(), scene, camera, by)
 }
 
 fn show_with(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, by: Backend) -> DrawnFrame {
     let mut deformer = ReferenceDeformer::new(scene);
-    let bounds = deformer.deform(&SceneState::rest(scene)).expect("deforms").bounds;
-    let mut buffers = renderer.load(scene).expect("loads");
-    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    let bounds = deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed").bounds;
+    let mut buffers = renderer.load(scene).expect("expected the scene to load");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
     attach(renderer, &mut buffers, by);
     let [width, height] = SIZE;
-    let image = renderer.draw(&buffers, &FrameParams { camera, width, height, bounds, light: None }).expect("draws");
+    let image =
+        renderer.draw(&buffers, &FrameParams { camera, width, height, bounds, light: None }).expect("expected a frame");
     let (seen, stats) = (renderer.read_visibility().expect("reads"), renderer.stats().clone());
     let allocations = buffers.allocations().into_iter().map(|part| part.name).collect();
     DrawnFrame { image, seen, stats, allocations }
@@ -140,13 +142,17 @@ fn attach(renderer: &mut Renderer, buffers: &mut SceneBuffers, by: Backend) {
 
 /// A wall, a lid above the ground and a square in the plane of the ground, lit by a slanting sun.
 fn yard(shadow: Option<ShadowSettings>, samples: u32) -> SceneBuilder {
-    let mut stage = SceneBuilder::new();
+    let mut builder = SceneBuilder::new();
     let defaults = modalcast_model::scene::RenderSettings::default();
-    (stage.0.look.ground, stage.0.look.horizon) = (defaults.ground, defaults.horizon);
-    (stage.0.look.sun, stage.0.look.shadow, stage.0.look.samples) = ([1.0, 3.0, 2.0], shadow, samples);
+    (builder.parts.look.ground, builder.parts.look.horizon) = (defaults.ground, defaults.horizon);
+    (builder.parts.look.sun, builder.parts.look.shadow, builder.parts.look.samples) =
+        ([1.0, 3.0, 2.0], shadow, samples);
     let plain = || Material { double_sided: true, ..Material::default() };
-    let wall = facing(-1.0, 0.0, 0.2, 1.1, -0.4);
-    stage.add(wall, plain()).add(floor_mesh(0.45, 0.7), Material::default()).add(floor_mesh(0.3, 0.0), plain())
+    let wall = facing_rectangle(-1.0, 0.0, 0.2, 1.1, -0.4);
+    builder
+        .add_domain(wall, plain())
+        .add_domain(floor_mesh(0.45, 0.7), Material::default())
+        .add_domain(floor_mesh(0.3, 0.0), plain())
 }
 
 fn from_above() -> Camera {
@@ -168,9 +174,9 @@ fn far_off(one: &FrameImage, other: &FrameImage) -> usize {
 fn compute_rasterized_frame_equals_opengl() {
     for blur_method in [BlurMethod::Tiles, BlurMethod::Rows, BlurMethod::Fragments] {
         let shadow = ShadowSettings { size: 256, ..ShadowSettings::default() };
-        let scene = yard(Some(shadow), 1).scene();
+        let scene = yard(Some(shadow), 1).build();
         let show = |by| {
-            let mut renderer = open();
+            let mut renderer = open_renderer();
             renderer.set_blur_method(blur_method);
             show_with(&mut renderer, &scene, from_above(), by)
         };
@@ -182,10 +188,9 @@ fn compute_rasterized_frame_equals_opengl() {
             want.stats.raster_backends,
             RasterBackends { shadow: Some(RasterBackend::OpenGl), visibility: Some(RasterBackend::OpenGl) }
         );
-        assert_eq!(got.stats.passes[..3], [Pass::RasterShadow, Pass::Blur, Pass::Unpack]);
+        assert_eq!(got.stats.passes[..3], ["raster shadow", "blur", "unpack"]);
         assert!(
-            !got.stats.passes.contains(&Pass::Ground)
-                && got.allocations.iter().any(|name| name == "raster shadow depths")
+            !got.stats.passes.contains(&"ground") && got.allocations.iter().any(|name| name == "raster shadow depths")
         );
         assert!(
             !want.allocations.iter().any(|name| name == "raster visibility keys" || name == "raster shadow depths"),
@@ -207,26 +212,26 @@ fn compute_rasterized_frame_equals_opengl() {
 /// Frames of both paths alternate on one render target, and each equals the frame of a fresh renderer.
 #[test]
 fn opengl_and_compute_frames_share_a_target() {
-    let mut stage = yard(None, 1);
-    stage.0.look.ground = None;
-    let scene = stage.scene();
+    let mut builder = yard(None, 1);
+    builder.parts.look.ground = None;
+    let scene = builder.build();
     let aside = |x: f64| {
         let view = View::LookAt { eye: [x, 6.0, 12.0], target: [x, 0.0, 0.0], up: [0.0, 1.0, 0.0] };
         Camera { view, ..from_above() }
     };
     let mut deformer = ReferenceDeformer::new(&scene);
-    let bounds = deformer.deform(&SceneState::rest(&scene)).expect("deforms").bounds;
-    let mut renderer = open();
+    let bounds = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed").bounds;
+    let mut renderer = open_renderer();
     let both = [Backend::OpenGl, Backend::Compute(0.0)].map(|by| {
-        let mut buffers = renderer.load(&scene).expect("loads");
-        renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+        let mut buffers = renderer.load(&scene).expect("expected the scene to load");
+        renderer.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
         attach(&mut renderer, &mut buffers, by);
         buffers
     });
     let [width, height] = SIZE;
     for (turn, x) in [-2.5, 2.5, 0.0, 1.0, -1.0].into_iter().enumerate() {
         let shot = FrameParams { camera: aside(x), width, height, bounds, light: None };
-        let image = renderer.draw(&both[turn % 2], &shot).expect("draws");
+        let image = renderer.draw(&both[turn % 2], &shot).expect("expected a frame");
         let alone = show(&scene, aside(x), if turn % 2 == 0 { Backend::OpenGl } else { Backend::Compute(0.0) });
         assert_eq!(image.raster_backends, alone.stats.raster_backends);
         assert!(image.rgba == alone.image.rgba, "turn {turn}");
@@ -237,21 +242,21 @@ fn opengl_and_compute_frames_share_a_target() {
 
 #[test]
 fn ground_hides_geometry_below_but_not_in_its_plane() {
-    let scene = yard(None, 1).scene();
+    let scene = yard(None, 1).build();
     let seen = |by: Backend, down: f32| {
-        let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene));
+        let (mut renderer, mut deformer) = (open_renderer(), ReferenceDeformer::new(&scene));
         let mut state = SceneState::rest(&scene);
         for domain in 0..2 {
             state.transforms[domain].0[7] -= down;
         }
-        let bounds = deformer.deform(&state).expect("deforms").bounds;
-        let mut buffers = renderer.load(&scene).expect("loads");
-        renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+        let bounds = deformer.deform(&state).expect("expected the step to succeed").bounds;
+        let mut buffers = renderer.load(&scene).expect("expected the scene to load");
+        renderer.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
         attach(&mut renderer, &mut buffers, by);
         let [width, height] = SIZE;
         renderer
             .draw(&buffers, &FrameParams { camera: from_above(), width, height, bounds, light: None })
-            .expect("draws");
+            .expect("expected a frame");
         let domain = |seen: &VisibilityId| match seen {
             VisibilityId::Triangle(place) => buffers.source_triangle(*place).map(|(domain, _)| domain),
             _ => None,
@@ -271,7 +276,7 @@ fn ground_hides_geometry_below_but_not_in_its_plane() {
 #[test]
 fn opengl_draws_what_the_compute_rasterizer_cannot() {
     let raster_backends =
-        |stage: SceneBuilder| show(&stage.scene(), from_above(), Backend::Compute(0.0)).stats.raster_backends;
+        |builder: SceneBuilder| show(&builder.build(), from_above(), Backend::Compute(0.0)).stats.raster_backends;
     let (opengl, cuda) = (Some(RasterBackend::OpenGl), Some(RasterBackend::Cuda));
     let base = ShadowSettings { size: 128, ..ShadowSettings::default() };
     assert_eq!(
@@ -285,7 +290,7 @@ fn opengl_draws_what_the_compute_rasterizer_cannot() {
     assert_eq!(raster_backends(yard(Some(standard), 1)), RasterBackends { shadow: opengl, visibility: cuda });
     assert_eq!(raster_backends(yard(None, 1)), RasterBackends { shadow: None, visibility: cuda });
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.4, ..Material::default() };
-    let blended = yard(None, 1).add(facing(0.0, 0.0, 0.5, 0.5, 0.5), glass);
+    let blended = yard(None, 1).add_domain(facing_rectangle(0.0, 0.0, 0.5, 0.5, 0.5), glass);
     assert_eq!(raster_backends(blended), RasterBackends { shadow: None, visibility: opengl });
     assert_eq!(
         raster_backends(yard(None, 4)),
@@ -297,41 +302,35 @@ fn opengl_draws_what_the_compute_rasterizer_cannot() {
 /// Cameras of one step share its shadow. OpenGL draws a rebased scene until the scene returns to the shared positions.
 #[test]
 fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
-    let scene = yard(Some(ShadowSettings { size: 256, ..ShadowSettings::default() }), 1).scene();
-    let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene).with_bounding_axes(scene.light_axes()));
-    let deformed = deformer.deform(&SceneState::rest(&scene)).expect("deforms");
-    let mut buffers = renderer.load(&scene).expect("loads");
-    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    let scene = yard(Some(ShadowSettings { size: 256, ..ShadowSettings::default() }), 1).build();
+    let (mut renderer, mut deformer) = (open_renderer(), ReferenceDeformer::new(&scene));
+    let deformed = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed");
+    let mut buffers = renderer.load(&scene).expect("expected the scene to load");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
     attach(&mut renderer, &mut buffers, Backend::Compute(0.0));
     let shot = |eye: [f64; 3]| {
         let view = View::LookAt { eye, target: [0.0, 0.2, 0.0], up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, ..from_above() };
-        FrameParams {
-            camera,
-            width: SIZE[0],
-            height: SIZE[1],
-            bounds: deformed.bounds,
-            light: deformed.oriented_bounds,
-        }
+        FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds: deformed.bounds, light: deformed.light }
     };
     let (one, other) = (shot([1.4, 1.9, 4.0]), shot([-2.0, 1.2, 3.0]));
-    let alone = renderer.draw(&buffers, &other).expect("draws");
+    let alone = renderer.draw(&buffers, &other).expect("expected a frame");
     buffers.set_step(7);
     let draw = |renderer: &mut Renderer, buffers: &SceneBuffers, shot: &FrameParams| {
-        let image = renderer.draw(buffers, shot).expect("draws");
+        let image = renderer.draw(buffers, shot).expect("expected a frame");
         (image, renderer.stats().passes[..2].to_vec())
     };
-    assert_eq!(draw(&mut renderer, &buffers, &one).1, [Pass::RasterShadow, Pass::Blur]);
+    assert_eq!(draw(&mut renderer, &buffers, &one).1, ["raster shadow", "blur"]);
     let (shared, passes) = draw(&mut renderer, &buffers, &other);
-    assert_eq!(passes, [Pass::RasterVisibility, Pass::Unpack], "the shadow is there");
+    assert_eq!(passes, ["raster visibility", "unpack"], "the shadow is there");
     assert_eq!(shared.raster_backends, RasterBackends { shadow: None, visibility: Some(RasterBackend::Cuda) });
     assert!(shared.rgba == alone.rgba, "the same picture");
     let positions = deformer.surface().expect("there").positions.clone();
-    renderer.upload_rebased(&mut buffers, &positions, [0.0; 3]).expect("uploads");
+    renderer.upload_rebased(&mut buffers, &positions, [0.0; 3]).expect("expected the upload to succeed");
     let (apart, passes) = draw(&mut renderer, &buffers, &other);
     assert_eq!(
         (passes[0], apart.raster_backends.visibility),
-        (Pass::Shadow, Some(RasterBackend::OpenGl)),
+        ("shadow", Some(RasterBackend::OpenGl)),
         "it knows the shared ones alone"
     );
     assert!(far_off(&apart, &alone) <= 60, "{}", far_off(&apart, &alone));
@@ -358,19 +357,19 @@ impl Rasterizer for FailingRasterizer {
 /// The frame of the failure and all later frames are drawn by OpenGL.
 #[test]
 fn failing_rasterizer_falls_back_to_opengl() {
-    let scene = yard(Some(ShadowSettings { size: 128, ..ShadowSettings::default() }), 1).scene();
+    let scene = yard(Some(ShadowSettings { size: 128, ..ShadowSettings::default() }), 1).build();
     let want = show(&scene, from_above(), Backend::OpenGl);
-    let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene));
-    let deformed = deformer.deform(&SceneState::rest(&scene)).expect("deforms");
-    let mut buffers = renderer.load(&scene).expect("loads");
-    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    let (mut renderer, mut deformer) = (open_renderer(), ReferenceDeformer::new(&scene));
+    let deformed = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed");
+    let mut buffers = renderer.load(&scene).expect("expected the scene to load");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
     renderer
         .attach_rasterizer(&mut buffers, |_| Ok(Box::new(FailingRasterizer) as Box<dyn Rasterizer>))
         .expect("given");
     let [width, height] = SIZE;
     let shot = FrameParams { camera: from_above(), width, height, bounds: deformed.bounds, light: None };
     for _ in 0..2 {
-        let image = renderer.draw(&buffers, &shot).expect("draws");
+        let image = renderer.draw(&buffers, &shot).expect("expected a frame");
         assert_eq!(image.raster_backends, want.stats.raster_backends);
         assert!(image.rgba == want.image.rgba);
     }
@@ -396,18 +395,18 @@ impl Rasterizer for UncompiledRasterizer {
 fn rasterizer_is_compiled_when_the_scene_is_loaded() {
     let shadow = Some(ShadowSettings { size: 128, ..ShadowSettings::default() });
     for (shadow, samples, want) in [(shadow, 1, [true; 2]), (shadow, 4, [true, false]), (None, 1, [false, true])] {
-        let scene = yard(shadow, samples).scene();
-        let (mut renderer, mut deformer) = (open(), ReferenceDeformer::new(&scene));
-        let deformed = deformer.deform(&SceneState::rest(&scene)).expect("deforms");
-        let mut buffers = renderer.load(&scene).expect("loads");
-        renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+        let scene = yard(shadow, samples).build();
+        let (mut renderer, mut deformer) = (open_renderer(), ReferenceDeformer::new(&scene));
+        let deformed = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed");
+        let mut buffers = renderer.load(&scene).expect("expected the scene to load");
+        renderer.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
         let asked = std::rc::Rc::default();
         let unready = UncompiledRasterizer(std::rc::Rc::clone(&asked));
         let refused = renderer.attach_rasterizer(&mut buffers, |_| Ok(Box::new(unready) as Box<dyn Rasterizer>));
         assert!(refused.is_err() && asked.get() == want, "{:?}", asked.get());
         let [width, height] = SIZE;
         let shot = FrameParams { camera: from_above(), width, height, bounds: deformed.bounds, light: None };
-        let raster_backends = renderer.draw(&buffers, &shot).expect("draws").raster_backends;
+        let raster_backends = renderer.draw(&buffers, &shot).expect("expected a frame").raster_backends;
         assert_eq!(raster_backends.visibility, Some(RasterBackend::OpenGl));
     }
 }

@@ -4,7 +4,7 @@ use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Lens, Transparency, View};
 use nalgebra::Vector3;
 
-use super::harness::{SceneBuilder, camera, close, draw, facing, open, picture};
+use super::harness::{SceneBuilder, facing_rectangle, front_camera, is_close, open_renderer, render, render_square};
 
 fn plain(diffuse: [f32; 3]) -> Material {
     Material { diffuse, ambient: diffuse, ..Material::default() }
@@ -12,50 +12,52 @@ fn plain(diffuse: [f32; 3]) -> Material {
 
 #[test]
 fn pixel_comparison_can_fail() {
-    assert!(close([188, 188, 188], [0.5; 3], 1.0));
-    assert!(!close([186, 188, 188], [0.5; 3], 1.0));
-    assert!(!close([0, 0, 0], [f64::NAN; 3], 1.0));
+    assert!(is_close([188, 188, 188], [0.5; 3], 1.0));
+    assert!(!is_close([186, 188, 188], [0.5; 3], 1.0));
+    assert!(!is_close([0, 0, 0], [f64::NAN; 3], 1.0));
 }
 
 #[test]
 fn square_covers_exactly_its_pixels() {
-    let shown = picture(&SceneBuilder::new().add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), plain([1.0; 3])).scene());
-    assert_eq!(shown.count(|pixel| pixel != [0; 3]), 400);
-    assert_eq!((shown.at(21, 32), shown.at(42, 32)), ([0; 3], [0; 3]));
+    let shown =
+        render(&SceneBuilder::new().add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), plain([1.0; 3])).build());
+    assert_eq!(shown.count_pixels(|pixel| pixel != [0; 3]), 400);
+    assert_eq!((shown.pixel(21, 32), shown.pixel(42, 32)), ([0; 3], [0; 3]));
     for corner in [(22, 22), (41, 22), (22, 41), (41, 41)] {
-        assert!(close(shown.at(corner.0, corner.1), [0.75; 3], 1.0), "{corner:?}");
+        assert!(is_close(shown.pixel(corner.0, corner.1), [0.75; 3], 1.0), "{corner:?}");
     }
     assert_eq!(shown.image.rgba.len(), 4 * 64 * 64);
 }
 
 #[test]
 fn top_row_comes_first_and_left_is_left() {
-    let red = facing(-3.2, 2.2, -2.2, 3.2, 0.0);
-    let green = facing(2.2, -3.2, 3.2, -2.2, 0.0);
-    let shown =
-        picture(&SceneBuilder::new().add(red, plain([1.0, 0.0, 0.0])).add(green, plain([0.0, 1.0, 0.0])).scene());
-    assert!(close(shown.at(2, 2), [0.75, 0.0, 0.0], 1.0));
-    assert!(close(shown.at(61, 61), [0.0, 0.75, 0.0], 1.0));
-    assert_eq!((shown.at(61, 2), shown.at(2, 61)), ([0; 3], [0; 3]));
+    let red = facing_rectangle(-3.2, 2.2, -2.2, 3.2, 0.0);
+    let green = facing_rectangle(2.2, -3.2, 3.2, -2.2, 0.0);
+    let shown = render(
+        &SceneBuilder::new().add_domain(red, plain([1.0, 0.0, 0.0])).add_domain(green, plain([0.0, 1.0, 0.0])).build(),
+    );
+    assert!(is_close(shown.pixel(2, 2), [0.75, 0.0, 0.0], 1.0));
+    assert!(is_close(shown.pixel(61, 61), [0.0, 0.75, 0.0], 1.0));
+    assert_eq!((shown.pixel(61, 2), shown.pixel(2, 61)), ([0; 3], [0; 3]));
 }
 
 #[test]
 fn first_image_row_is_the_top_of_the_surface() {
-    let mut stage = SceneBuilder::new();
-    let image = stage.texture(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 0, 255]);
+    let mut builder = SceneBuilder::new();
+    let image = builder.add_texture(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 0, 255]);
     let material = Material { color_texture: Some(image), ..Material::default() };
-    let shown = picture(&stage.add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), material).scene());
+    let shown = render(&builder.add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), material).build());
     // Half a texel from the edge of the image, each texel has its own color.
     for (x, y, color) in [(17, 17, [0.0, 0.0]), (46, 17, [1.0, 0.0]), (17, 46, [0.0, 1.0]), (46, 46, [1.0, 1.0])] {
-        let [r, g, b] = shown.at(x, y);
+        let [r, g, b] = shown.pixel(x, y);
         assert!(b == 0, "{x} {y}");
         assert!((f64::from(r) > 150.0) == (color[0] > 0.5) && (f64::from(g) > 150.0) == (color[1] > 0.5), "{x} {y}");
     }
 }
 
 /// Equation 3.12 in f64 with clamped dot products and unshadowed ambient light, for a surface that faces +Z.
-fn phong(stage: &SceneBuilder, material: &Material, point: Vector3<f64>, eye: Vector3<f64>) -> [f64; 3] {
-    let look = &stage.0.look;
+fn phong(builder: &SceneBuilder, material: &Material, point: Vector3<f64>, eye: Vector3<f64>) -> [f64; 3] {
+    let look = &builder.parts.look;
     let sun = Vector3::from(look.sun).cast::<f64>().normalize();
     let normal = Vector3::z();
     let to_eye = (eye - point).normalize();
@@ -79,20 +81,20 @@ fn phong_shading_equals_f64_arithmetic() {
         ..Material::default()
     };
     for (sun, lit) in [([0.3, -0.5, 0.8], true), ([-0.4, 0.1, 0.9], true), ([0.3, 0.5, -0.8], false)] {
-        let mut stage = SceneBuilder::new();
-        stage.0.look.sun = sun;
-        stage.0.look.sunlight = [0.6, 0.7, 0.8];
+        let mut builder = SceneBuilder::new();
+        builder.parts.look.sun = sun;
+        builder.parts.look.sunlight = [0.6, 0.7, 0.8];
         let mut probe = SceneBuilder::new();
-        probe.0.look = stage.0.look;
-        let shown = picture(&stage.add(facing(-3.0, -3.0, 3.0, 3.0, 0.0), material.clone()).scene());
+        probe.parts.look = builder.parts.look;
+        let shown = render(&builder.add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), material.clone()).build());
         let mut highlights = 0;
         for (x, y) in [(32, 32), (12, 20), (50, 45), (20, 50)] {
             let point = Vector3::new((f64::from(x) + 0.5 - 32.0) / 10.0, (32.0 - f64::from(y) - 0.5) / 10.0, 0.0);
             let expected = phong(&probe, &material, point, Vector3::new(0.0, 0.0, 10.0));
-            assert!(close(shown.at(x, y), expected, 1.0), "{sun:?} ({x}, {y}): {:?}", shown.at(x, y));
+            assert!(is_close(shown.pixel(x, y), expected, 1.0), "{sun:?} ({x}, {y}): {:?}", shown.pixel(x, y));
             let dull = Material { specular: [0.0; 3], ..material.clone() };
             let without = phong(&probe, &dull, point, Vector3::new(0.0, 0.0, 10.0));
-            highlights += usize::from(!close(shown.at(x, y), without, 1.0));
+            highlights += usize::from(!is_close(shown.pixel(x, y), without, 1.0));
         }
         assert_eq!(highlights > 0, lit, "{sun:?}: the highlight must be told from none, and none from behind");
     }
@@ -100,70 +102,74 @@ fn phong_shading_equals_f64_arithmetic() {
 
 #[test]
 fn sky_gradient_equals_its_formula() {
-    let mut stage = SceneBuilder::new();
-    stage.0.look.zenith = [0.1, 0.3, 0.8];
-    stage.0.look.horizon = [0.7, 0.8, 0.9];
-    let shown = picture(&stage.add(facing(-0.1, -0.1, 0.1, 0.1, 0.0), plain([0.0; 3])).scene());
+    let mut builder = SceneBuilder::new();
+    builder.parts.look.zenith = [0.1, 0.3, 0.8];
+    builder.parts.look.horizon = [0.7, 0.8, 0.9];
+    let shown = render(&builder.add_domain(facing_rectangle(-0.1, -0.1, 0.1, 0.1, 0.0), plain([0.0; 3])).build());
     for (x, y) in [(5, 3), (60, 20), (32, 60)] {
         let direction = Vector3::new((f64::from(x) - 31.5) / 100.0, (31.5 - f64::from(y)) / 100.0, -1.0).normalize();
         let sine = direction.y.max(0.0);
         let share = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
         let mix = |low: f64, high: f64| low + share * (high - low);
-        assert!(close(shown.at(x, y), [mix(0.7, 0.1), mix(0.8, 0.3), mix(0.9, 0.8)], 1.0), "{:?}", shown.at(x, y));
+        assert!(
+            is_close(shown.pixel(x, y), [mix(0.7, 0.1), mix(0.8, 0.3), mix(0.9, 0.8)], 1.0),
+            "{:?}",
+            shown.pixel(x, y)
+        );
     }
-    assert!(shown.at(32, 3) != shown.at(32, 60), "a gradient, not one colour");
+    assert!(shown.pixel(32, 3) != shown.pixel(32, 60), "a gradient, not one colour");
 }
 
 #[test]
 fn normal_map_changes_shading_and_a_flat_one_does_not() {
     let with = |pixel: Option<[u8; 4]>| {
-        let mut stage = SceneBuilder::new();
-        stage.0.look.sun = [0.6, 0.0, 0.8];
-        let image = pixel.map(|pixel| stage.texture(4, 4, |_, _| pixel));
+        let mut builder = SceneBuilder::new();
+        builder.parts.look.sun = [0.6, 0.0, 0.8];
+        let image = pixel.map(|pixel| builder.add_texture(4, 4, |_, _| pixel));
         let material = Material { normal_texture: image, ..plain([1.0; 3]) };
-        picture(&stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), material).scene())
+        render(&builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), material).build())
     };
     let lit = |facing: f64| [0.25 + 0.5 * facing; 3];
-    assert!(close(with(None).at(32, 32), lit(0.8), 1.0));
-    assert!(close(with(Some([128, 128, 255, 255])).at(32, 32), lit(0.8), 1.0), "a flat map is no map");
+    assert!(is_close(with(None).pixel(32, 32), lit(0.8), 1.0));
+    assert!(is_close(with(Some([128, 128, 255, 255])).pixel(32, 32), lit(0.8), 1.0), "a flat map is no map");
     // Tangent space: x along u, y against v, z along the normal. 0.6 and 0.8 are encoded in steps of 1/127.
-    assert!(close(with(Some([204, 128, 230, 255])).at(32, 32), lit(1.0), 1.0), "turned to the sun");
-    assert!(close(with(Some([52, 128, 230, 255])).at(32, 32), lit(0.28), 2.0), "turned away");
+    assert!(is_close(with(Some([204, 128, 230, 255])).pixel(32, 32), lit(1.0), 1.0), "turned to the sun");
+    assert!(is_close(with(Some([52, 128, 230, 255])).pixel(32, 32), lit(0.28), 2.0), "turned away");
     let up = with(Some([128, 204, 230, 255]));
-    assert!(close(up.at(32, 32), lit(0.64), 2.0), "+Y of the map is up and has no share of this sun");
+    assert!(is_close(up.pixel(32, 32), lit(0.64), 2.0), "+Y of the map is up and has no share of this sun");
 }
 
 #[test]
 fn plus_y_of_a_normal_map_points_up_the_image() {
     let with = |green: u8| {
-        let mut stage = SceneBuilder::new();
-        stage.0.look.sun = [0.0, 0.6, 0.8];
-        let image = stage.texture(1, 1, |_, _| [128, green, 230, 255]);
+        let mut builder = SceneBuilder::new();
+        builder.parts.look.sun = [0.0, 0.6, 0.8];
+        let image = builder.add_texture(1, 1, |_, _| [128, green, 230, 255]);
         let material = Material { normal_texture: Some(image), ..plain([1.0; 3]) };
-        picture(&stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), material).scene()).at(32, 32)
+        render(&builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), material).build()).pixel(32, 32)
     };
-    assert!(close(with(204), [0.75; 3], 1.0) && close(with(52), [0.25 + 0.5 * 0.28; 3], 2.0));
+    assert!(is_close(with(204), [0.75; 3], 1.0) && is_close(with(52), [0.25 + 0.5 * 0.28; 3], 2.0));
 }
 
 /// A red leaf in front of an empty background; the middle half of each of its axes is cut away.
-fn leaf(alpha_mode: AlphaMode) -> super::harness::Picture {
-    let mut stage = SceneBuilder::new();
+fn leaf(alpha_mode: AlphaMode) -> super::harness::RenderedFrame {
+    let mut builder = SceneBuilder::new();
     let hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
-    let image = stage.texture(64, 64, |x, y| [255, 0, 0, if hole(x, y) { 0 } else { 255 }]);
+    let image = builder.add_texture(64, 64, |x, y| [255, 0, 0, if hole(x, y) { 0 } else { 255 }]);
     let material = Material { color_texture: Some(image), alpha_mode, ..Material::default() };
-    picture(&stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), material).scene())
+    render(&builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), material).build())
 }
 
 #[test]
 fn cut_out_shows_the_background_and_opaque_does_not() {
     let cut = leaf(AlphaMode::Mask { cutoff: 0.5 });
-    assert_eq!(cut.at(32, 32), [0; 3]);
-    assert!(close(cut.at(15, 15), [0.75, 0.0, 0.0], 1.0));
-    let holes = cut.count(|pixel| pixel == [0; 3]) - (64 * 64 - 1600);
+    assert_eq!(cut.pixel(32, 32), [0; 3]);
+    assert!(is_close(cut.pixel(15, 15), [0.75, 0.0, 0.0], 1.0));
+    let holes = cut.count_pixels(|pixel| pixel == [0; 3]) - (64 * 64 - 1600);
     assert!((360..=440).contains(&holes), "20 x 20 pixels are cut away, {holes} seen");
     let opaque = leaf(AlphaMode::Opaque);
-    assert!(close(opaque.at(32, 32), [0.75, 0.0, 0.0], 1.0), "control: opaque fills the hole");
-    assert_eq!(opaque.count(|pixel| pixel == [0; 3]), 64 * 64 - 1600);
+    assert!(is_close(opaque.pixel(32, 32), [0.75, 0.0, 0.0], 1.0), "control: opaque fills the hole");
+    assert_eq!(opaque.count_pixels(|pixel| pixel == [0; 3]), 64 * 64 - 1600);
 }
 
 #[test]
@@ -172,11 +178,11 @@ fn two_blended_layers_equal_arithmetic() {
         let layer = |diffuse, alpha| Material { alpha, alpha_mode, ..plain(diffuse) };
         // Blended in the order of the scene, the farther layer first.
         let scene = SceneBuilder::new()
-            .add(facing(-3.0, -3.0, 3.0, 3.0, -2.0), plain([0.2, 0.2, 1.0]))
-            .add(facing(-2.0, -2.0, 2.0, 2.0, -1.0), layer([0.0, 1.0, 0.0], far))
-            .add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), layer([1.0, 0.0, 0.0], near))
-            .scene();
-        picture(&scene)
+            .add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, -2.0), plain([0.2, 0.2, 1.0]))
+            .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, -1.0), layer([0.0, 1.0, 0.0], far))
+            .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), layer([1.0, 0.0, 0.0], near))
+            .build();
+        render(&scene)
     };
     let expected = |near: f64, far: f64| {
         let under = [0.2, 0.2, 1.0].map(|channel| channel * (1.0 - far));
@@ -184,28 +190,31 @@ fn two_blended_layers_equal_arithmetic() {
         [middle[0] + near, middle[1], middle[2]].map(|channel| 0.75 * channel)
     };
     let shown = layers(0.25, 0.5, AlphaMode::Blend);
-    assert!(close(shown.at(32, 32), expected(0.25, 0.5), 1.0), "{:?}", shown.at(32, 32));
-    assert!(!close(shown.at(32, 32), expected(0.5, 0.25), 4.0), "control: the judge tells other alphas apart");
-    assert!(close(layers(0.5, 0.25, AlphaMode::Blend).at(32, 32), expected(0.5, 0.25), 1.0));
-    assert!(close(layers(0.25, 0.5, AlphaMode::Opaque).at(32, 32), [0.75, 0.0, 0.0], 1.0), "opaque ignores alpha");
+    assert!(is_close(shown.pixel(32, 32), expected(0.25, 0.5), 1.0), "{:?}", shown.pixel(32, 32));
+    assert!(!is_close(shown.pixel(32, 32), expected(0.5, 0.25), 4.0), "control: the judge tells other alphas apart");
+    assert!(is_close(layers(0.5, 0.25, AlphaMode::Blend).pixel(32, 32), expected(0.5, 0.25), 1.0));
+    assert!(
+        is_close(layers(0.25, 0.5, AlphaMode::Opaque).pixel(32, 32), [0.75, 0.0, 0.0], 1.0),
+        "opaque ignores alpha"
+    );
 }
 
 #[test]
 fn two_pass_blending_writes_no_depth() {
     let layer = |diffuse| Material { alpha: 0.5, alpha_mode: AlphaMode::Blend, ..plain(diffuse) };
     let shown = |second: f32| {
-        let first = facing(-2.0, -2.0, 2.0, 2.0, 0.0);
-        let mut stage = SceneBuilder::new();
-        stage.0.look.transparency = Transparency::TwoPass;
-        let scene = stage
-            .add(first, layer([1.0, 0.0, 0.0]))
-            .add(facing(-2.0, -2.0, 2.0, 2.0, second), layer([0.0, 1.0, 0.0]))
-            .scene();
-        picture(&scene).at(32, 32)
+        let first = facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0);
+        let mut builder = SceneBuilder::new();
+        builder.parts.look.transparency = Transparency::TwoPass;
+        let scene = builder
+            .add_domain(first, layer([1.0, 0.0, 0.0]))
+            .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, second), layer([0.0, 1.0, 0.0]))
+            .build();
+        render(&scene).pixel(32, 32)
     };
     // The pass writes no depth, so the later layer is blended over the earlier one at any distance.
     for second in [-1.0, 1.0] {
-        assert!(close(shown(second), [0.75 * 0.25, 0.75 * 0.5, 0.0], 1.0), "{second}: {:?}", shown(second));
+        assert!(is_close(shown(second), [0.75 * 0.25, 0.75 * 0.5, 0.0], 1.0), "{second}: {:?}", shown(second));
     }
 }
 
@@ -213,42 +222,44 @@ fn two_pass_blending_writes_no_depth() {
 #[test]
 fn only_double_sided_back_faces_are_drawn() {
     let from_behind = |double_sided: bool| {
-        let mut stage = SceneBuilder::new();
-        stage.0.look.sun = [0.0, 0.0, -1.0];
-        let scene = stage.add(facing(-2.0, -2.0, 2.0, 2.0, 0.0), Material { double_sided, ..plain([1.0; 3]) }).scene();
+        let mut builder = SceneBuilder::new();
+        builder.parts.look.sun = [0.0, 0.0, -1.0];
+        let scene = builder
+            .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), Material { double_sided, ..plain([1.0; 3]) })
+            .build();
         let view = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
-        draw(&mut open(), &scene, Camera { view, ..camera(64) }, 64).at(32, 32)
+        render_square(&mut open_renderer(), &scene, Camera { view, ..front_camera(64) }, 64).pixel(32, 32)
     };
-    assert!(close(from_behind(true), [0.75; 3], 1.0));
+    assert!(is_close(from_behind(true), [0.75; 3], 1.0));
     assert_eq!(from_behind(false), [0; 3]);
 }
 
 #[test]
 fn images_of_many_sizes_keep_their_materials() {
-    let mut stage = SceneBuilder::new();
+    let mut builder = SceneBuilder::new();
     let mut expected = Vec::new();
     for index in 0..9_u32 {
         let shade = 20 + 25 * index as u8;
-        let image = stage.texture(3 + 5 * index, 40 - 4 * index, |_, _| [shade, 255 - shade, 0, 255]);
+        let image = builder.add_texture(3 + 5 * index, 40 - 4 * index, |_, _| [shade, 255 - shade, 0, 255]);
         let material = Material { color_texture: Some(image), ..Material::default() };
         let left = -2.7 + 0.6 * index as f32;
-        stage = stage.add(facing(left, -1.0, left + 0.6, 1.0, 0.0), material);
+        builder = builder.add_domain(facing_rectangle(left, -1.0, left + 0.6, 1.0, 0.0), material);
         expected.push([shade, 255 - shade, 0]);
     }
-    let shown = draw(&mut open(), &stage.scene(), camera(64), 64);
+    let shown = render_square(&mut open_renderer(), &builder.build(), front_camera(64), 64);
     let linear = |byte: u8| ((f64::from(byte) / 255.0 + 0.055) / 1.055).powf(2.4);
     for (index, [r, g, _]) in expected.into_iter().enumerate() {
-        let seen = shown.at(5 + 6 * index as u32 + 3, 32);
-        assert!(close(seen, [0.75 * linear(r), 0.75 * linear(g), 0.0], 1.0), "image {index}: {seen:?}");
+        let seen = shown.pixel(5 + 6 * index as u32 + 3, 32);
+        assert!(is_close(seen, [0.75 * linear(r), 0.75 * linear(g), 0.0], 1.0), "image {index}: {seen:?}");
     }
 }
 
 #[test]
 fn intrinsics_set_principal_point_and_scale_per_axis() {
-    let scene = SceneBuilder::new().add(facing(0.0, 0.0, 1.0, 1.0, 0.0), plain([1.0; 3])).scene();
+    let scene = SceneBuilder::new().add_domain(facing_rectangle(0.0, 0.0, 1.0, 1.0, 0.0), plain([1.0; 3])).build();
     let lens = Lens::Intrinsics { fx: 200.0, fy: 100.0, cx: 10.0, cy: 50.0 };
-    let shown = draw(&mut open(), &scene, Camera { lens, ..camera(64) }, 64);
-    assert_eq!(shown.count(|pixel| pixel != [0; 3]), 200);
-    assert!(shown.at(10, 49) != [0; 3] && shown.at(29, 40) != [0; 3]);
-    assert!(shown.at(9, 49) == [0; 3] && shown.at(10, 50) == [0; 3] && shown.at(30, 40) == [0; 3]);
+    let shown = render_square(&mut open_renderer(), &scene, Camera { lens, ..front_camera(64) }, 64);
+    assert_eq!(shown.count_pixels(|pixel| pixel != [0; 3]), 200);
+    assert!(shown.pixel(10, 49) != [0; 3] && shown.pixel(29, 40) != [0; 3]);
+    assert!(shown.pixel(9, 49) == [0; 3] && shown.pixel(10, 50) == [0; 3] && shown.pixel(30, 40) == [0; 3]);
 }

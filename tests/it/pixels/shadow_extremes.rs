@@ -8,7 +8,7 @@ use modalcast_model::scene::{
 };
 use modalcast_render::{FrameImage, FrameParams};
 
-use super::harness::{SceneBuilder, floor_mesh, open};
+use super::harness::{SceneBuilder, floor_mesh, open_renderer};
 
 fn kinds() -> [ShadowSettings; 5] {
     let base = ShadowSettings { size: 128, ..ShadowSettings::default() };
@@ -22,28 +22,31 @@ fn kinds() -> [ShadowSettings; 5] {
 }
 
 fn triangle(corners: [[f32; 3]; 3]) -> Mesh {
-    Mesh::from_indexed(corners.to_vec(), vec![[0.0, 1.0, 0.0]; 3], vec![], vec![[0, 1, 2]]).expect("a triangle")
+    Mesh::from_indexed(corners.to_vec(), vec![[0.0, 1.0, 0.0]; 3], vec![], vec![[0, 1, 2]])
+        .expect("expected a valid mesh")
 }
 
 /// A picture of a scene with this sun and shadow map. The sky is bright and lights everything, so no valid pixel is
 /// black.
 fn picture(meshes: &[Mesh], sun: [f32; 3], shadow: ShadowSettings, camera: Option<(f64, f64)>) -> FrameImage {
-    let mut stage = SceneBuilder::new();
-    stage.0.look = RenderSettings { sun, shadow: Some(shadow), ..RenderSettings::default() };
+    let mut builder = SceneBuilder::new();
+    builder.parts.look = RenderSettings { sun, shadow: Some(shadow), ..RenderSettings::default() };
     for mesh in meshes {
-        stage = stage.add(mesh.clone(), Material { double_sided: true, ..Material::default() });
+        builder = builder.add_domain(mesh.clone(), Material { double_sided: true, ..Material::default() });
     }
-    let scene = stage.scene();
+    let scene = builder.build();
     let mut shown = Camera::fit_to_scene(&scene, 32, 32);
     if let Some((near, far)) = camera {
         (shown.near, shown.far) = (near, far);
     }
     let mut deformer = ReferenceDeformer::new(&scene);
-    let bounds = deformer.deform(&SceneState::rest(&scene)).expect("deforms").bounds;
-    let mut renderer = open();
-    let buffers = renderer.load(&scene).expect("loads");
-    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
-    renderer.draw(&buffers, &FrameParams { camera: shown, width: 32, height: 32, bounds, light: None }).expect("draws")
+    let bounds = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed").bounds;
+    let mut renderer = open_renderer();
+    let buffers = renderer.load(&scene).expect("expected the scene to load");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
+    renderer
+        .draw(&buffers, &FrameParams { camera: shown, width: 32, height: 32, bounds, light: None })
+        .expect("expected a frame")
 }
 
 fn black(image: &FrameImage) -> usize {
@@ -82,9 +85,12 @@ fn extreme_suns_cameras_and_scenes_have_no_nan_pixel() {
 #[test]
 fn static_shadow_does_not_flicker_while_bounds_grow() {
     let table = |shadow: ShadowSettings| {
-        let mut stage = SceneBuilder::new();
-        stage.0.look = RenderSettings { shadow: Some(shadow), ..RenderSettings::default() };
-        stage.add(floor_mesh(1.0, 0.7), Material::default()).add(floor_mesh(0.1, 0.0), Material::default()).scene()
+        let mut builder = SceneBuilder::new();
+        builder.parts.look = RenderSettings { shadow: Some(shadow), ..RenderSettings::default() };
+        builder
+            .add_domain(floor_mesh(1.0, 0.7), Material::default())
+            .add_domain(floor_mesh(0.1, 0.0), Material::default())
+            .build()
     };
     let base = ShadowSettings { size: 100, ..ShadowSettings::default() };
     for method in [ShadowMethod::Variance, ShadowMethod::Standard, ShadowMethod::PercentageCloser] {
@@ -105,10 +111,10 @@ fn static_shadow_does_not_flicker_while_bounds_grow() {
 /// Renders 60 frames of a scene at rest whose bounds grow. With `is_lit`, the shots contain light bounds too.
 fn frames(scene: &std::sync::Arc<Scene>, is_lit: bool) -> Vec<FrameImage> {
     let mut deformer = ReferenceDeformer::new(scene);
-    let rest = deformer.deform(&SceneState::rest(scene)).expect("deforms").bounds;
-    let mut renderer = open();
-    let buffers = renderer.load(scene).expect("loads");
-    renderer.upload(&buffers, deformer.surface().expect("there")).expect("uploads");
+    let rest = deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed").bounds;
+    let mut renderer = open_renderer();
+    let buffers = renderer.load(scene).expect("expected the scene to load");
+    renderer.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
     let view = View::LookAt { eye: [3.0, 4.0, 5.0], target: [-0.3, 0.0, -0.3], up: [0.0, 1.0, 0.0] };
     let camera = Camera { view, lens: Lens::FieldOfView(30.0), near: 1.0, far: 30.0 };
     let grown = |step: u32| {
@@ -121,7 +127,7 @@ fn frames(scene: &std::sync::Arc<Scene>, is_lit: bool) -> Vec<FrameImage> {
         // Slightly more than the box itself.
         let light = LightSpaceBox::enclosing(&axes, &bounds).expanded_by(0.02 * bounds.diagonal());
         let shot = FrameParams { camera, width: 96, height: 96, bounds, light: is_lit.then_some(light) };
-        renderer.draw(&buffers, &shot).expect("draws")
+        renderer.draw(&buffers, &shot).expect("expected a frame")
     };
     (0..60).map(&mut frame).collect()
 }

@@ -5,18 +5,18 @@ use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Lens, ShadowMethod, ShadowSettings, View};
 use modalcast_render::{BlurMethod, Renderer};
 
-use super::harness::{Picture, close, draw, facing, open};
-use super::shadow::{stage, with_square};
+use super::harness::{RenderedFrame, facing_rectangle, is_close, open_renderer, render_square};
+use super::shadow::{create_builder, with_square};
 
 /// The part of the ground that the map covers, seen from above, with the given shadow map or none.
-fn from_high_above(renderer: &mut Renderer, shadow: Option<ShadowSettings>, caster: bool) -> Picture {
-    let mut stage = stage();
-    stage.0.look.sun = [3.0, 4.0, 0.0];
-    stage.0.look.shadow = shadow;
-    let stage = if caster { with_square(stage, AlphaMode::Opaque, 1.0) } else { stage };
+fn from_high_above(renderer: &mut Renderer, shadow: Option<ShadowSettings>, caster: bool) -> RenderedFrame {
+    let mut builder = create_builder();
+    builder.parts.look.sun = [3.0, 4.0, 0.0];
+    builder.parts.look.shadow = shadow;
+    let builder = if caster { with_square(builder, AlphaMode::Opaque, 1.0) } else { builder };
     let view = View::LookAt { eye: [0.0, 20.0, 0.0], target: [0.0; 3], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 120.0, fy: 120.0, cx: 80.0, cy: 80.0 };
-    draw(renderer, &stage.scene(), Camera { view, lens, near: 0.0, far: 0.0 }, 160)
+    render_square(renderer, &builder.build(), Camera { view, lens, near: 0.0, far: 0.0 }, 160)
 }
 
 #[test]
@@ -29,36 +29,36 @@ fn ground_is_lit_at_the_border_of_the_map() {
         (BlurMethod::Auto, ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }),
         (BlurMethod::Auto, ShadowSettings { splits: 2, ..base }),
     ];
-    let bright = from_high_above(&mut open(), None, false);
-    let darker = |shown: &Picture| {
+    let bright = from_high_above(&mut open_renderer(), None, false);
+    let darker = |shown: &RenderedFrame| {
         let pairs = shown.image.rgba.iter().zip(&bright.image.rgba);
         pairs.filter(|(own, bright)| bright.abs_diff(**own) > 2).count()
     };
     for (method, shadow) in kinds {
-        let mut renderer = open();
+        let mut renderer = open_renderer();
         renderer.set_blur_method(method);
         assert_eq!(darker(&from_high_above(&mut renderer, Some(shadow), false)), 0, "{method:?}, {shadow:?}");
     }
-    assert!(darker(&from_high_above(&mut open(), Some(base), true)) > 300, "control: a caster is seen");
+    assert!(darker(&from_high_above(&mut open_renderer(), Some(base), true)) > 300, "control: a caster is seen");
 }
 
 /// Number of pixels of a wall on the ground that are not fully lit, and number that are not fully dark.
 fn on_the_wall(shadow: ShadowSettings, shaded: bool) -> [usize; 2] {
-    let mut stage = stage();
-    stage.0.look.sun = [0.0, 3.0, 4.0];
-    stage.0.look.shadow = Some(shadow);
-    let mut stage = stage.add(facing(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default());
+    let mut builder = create_builder();
+    builder.parts.look.sun = [0.0, 3.0, 4.0];
+    builder.parts.look.shadow = Some(shadow);
+    let mut builder = builder.add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default());
     if shaded {
         // Above the view of the camera. Its shadow on the wall extends from the ground to half a unit above the top of
         // the wall.
-        stage = stage.add(facing(-3.0, 1.8, 3.0, 4.5, 4.0), Material::default());
+        builder = builder.add_domain(facing_rectangle(-3.0, 1.8, 3.0, 4.5, 4.0), Material::default());
     }
     let lens = Lens::Intrinsics { fx: 100.0, fy: 100.0, cx: 32.0, cy: 32.0 };
     let view = View::LookAt { eye: [0.0, 0.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
-    let shown = draw(&mut open(), &stage.scene(), Camera { view, lens, near: 0.0, far: 0.0 }, 64);
+    let shown = render_square(&mut open_renderer(), &builder.build(), Camera { view, lens, near: 0.0, far: 0.0 }, 64);
     // The wall covers 20 x 20 pixels at the center; its rim is excluded.
     let wall = || (23..41).flat_map(|y| (23..41).map(move |x| (x, y)));
-    let differing = |light: f64| wall().filter(|(x, y)| !close(shown.at(*x, *y), [light; 3], 2.0)).count();
+    let differing = |light: f64| wall().filter(|(x, y)| !is_close(shown.pixel(*x, *y), [light; 3], 2.0)).count();
     [differing(0.25 + 0.5 * 0.8), differing(0.25)]
 }
 

@@ -4,8 +4,8 @@ use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Camera, Lens, MomentFormat, Scene, ShadowMethod, ShadowSettings, View};
 use modalcast_render::{BlurMethod, Pass, plan};
 
-use super::harness::{Picture, close, draw, floor_mesh, open, planned_above};
-use super::shadow::{stage, with_square};
+use super::harness::{RenderedFrame, floor_mesh, is_close, open_renderer, planned_passes_above_ground, render_square};
+use super::shadow::{create_builder, with_square};
 
 /// Pixels per unit of the ground in the picture of the edge.
 const SCALE: f64 = 100.0;
@@ -24,23 +24,23 @@ fn texel(shadow: &ShadowSettings) -> f64 {
 }
 
 fn scene(shadow: ShadowSettings) -> std::sync::Arc<Scene> {
-    let mut stage = stage();
-    stage.0.look.shadow = Some(shadow);
-    with_square(stage, AlphaMode::Opaque, 1.0).scene()
+    let mut builder = create_builder();
+    builder.parts.look.shadow = Some(shadow);
+    with_square(builder, AlphaMode::Opaque, 1.0).build()
 }
 
 /// Picture from straight above of the edge at z = 1 of the shadow of the square.
-fn edge(shadow: ShadowSettings) -> Picture {
+fn edge(shadow: ShadowSettings) -> RenderedFrame {
     edge_blurred_by(BlurMethod::Auto, shadow)
 }
 
 /// [`edge`] with this implementation of the blur.
-fn edge_blurred_by(method: BlurMethod, shadow: ShadowSettings) -> Picture {
-    let mut renderer = open();
+fn edge_blurred_by(method: BlurMethod, shadow: ShadowSettings) -> RenderedFrame {
+    let mut renderer = open_renderer();
     renderer.set_blur_method(method);
     let view = View::LookAt { eye: [0.0, 20.0, 1.0], target: [0.0, 0.0, 1.0], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 20.0 * SCALE, fy: 20.0 * SCALE, cx: 32.0, cy: 32.0 };
-    draw(&mut renderer, &scene(shadow), Camera { view, lens, near: 0.0, far: 0.0 }, 64)
+    render_square(&mut renderer, &scene(shadow), Camera { view, lens, near: 0.0, far: 0.0 }, 64)
 }
 
 /// z of the ground at the center of a row.
@@ -55,8 +55,8 @@ fn share([byte, ..]: [u8; 3]) -> f64 {
     (linear / 0.8 - 0.25) / (0.5 * 0.8)
 }
 
-fn profile(picture: &Picture, column: u32) -> Vec<f64> {
-    (0..64).map(|row| share(picture.at(column, row))).collect()
+fn profile(picture: &RenderedFrame, column: u32) -> Vec<f64> {
+    (0..64).map(|row| share(picture.pixel(column, row))).collect()
 }
 
 /// Expected fraction of sunlight at z: texels whose center the square covers are dark. The result is blurred with the
@@ -156,16 +156,16 @@ fn only_standard_maps_have_hard_edges() {
 /// Number of pixels of a lit square of six units per side that are darker than the sun makes them; the square casts and
 /// receives.
 fn self_shadowed(over: &[Mesh], shadow: ShadowSettings, sun: [f32; 3]) -> usize {
-    let mut stage = stage();
-    (stage.0.look.shadow, stage.0.look.sun) = (Some(shadow), sun);
-    let stage = over.iter().fold(stage, |stage, mesh| stage.add(mesh.clone(), Material::default()));
-    let scene = stage.add(floor_mesh(3.0, 2.0), Material::default()).scene();
+    let mut builder = create_builder();
+    (builder.parts.look.shadow, builder.parts.look.sun) = (Some(shadow), sun);
+    let builder = over.iter().fold(builder, |builder, mesh| builder.add_domain(mesh.clone(), Material::default()));
+    let scene = builder.add_domain(floor_mesh(3.0, 2.0), Material::default()).build();
     let view = View::LookAt { eye: [0.0, 20.0, 0.0], target: [0.0; 3], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 200.0, fy: 200.0, cx: 32.0, cy: 32.0 };
-    let shown = draw(&mut open(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 64);
+    let shown = render_square(&mut open_renderer(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 64);
     let facing = nalgebra::Vector3::from(sun).cast::<f64>().normalize().y;
     let inner = (8..56).flat_map(|y| (8..56).map(move |x| (x, y)));
-    inner.filter(|(x, y)| !close(shown.at(*x, *y), [0.25 + 0.5 * facing; 3], 2.0)).count()
+    inner.filter(|(x, y)| !is_close(shown.pixel(*x, *y), [0.25 + 0.5 * facing; 3], 2.0)).count()
 }
 
 #[test]
@@ -189,20 +189,20 @@ fn no_method_shadows_a_lit_surface() {
 
 /// Number of lit pixels in a strip of ground that is fully in the shadow of a square just above it.
 fn lit_in_the_umbra(moments: MomentFormat) -> usize {
-    let mut stage = stage();
-    stage.0.look.shadow = Some(ShadowSettings { size: 2048, blur: 0.5, moments, ..ShadowSettings::default() });
-    stage.0.look.sun = [3.0, 1.0, 0.0];
+    let mut builder = create_builder();
+    builder.parts.look.shadow = Some(ShadowSettings { size: 2048, blur: 0.5, moments, ..ShadowSettings::default() });
+    builder.parts.look.sun = [3.0, 1.0, 0.0];
     // Far from the center of the depth range, where f16 is coarse. The shadow extends 0.09 beyond the square.
     let mut rest = floor_mesh(1.0, 0.03).rest().to_vec();
     rest.iter_mut().for_each(|vertex| vertex[0] -= 2.5);
-    let mesh =
-        Mesh::from_indexed(rest, vec![[0.0, 1.0, 0.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
-    let scene = stage.add(mesh, Material { double_sided: true, ..Material::default() }).scene();
+    let mesh = Mesh::from_indexed(rest, vec![[0.0, 1.0, 0.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
+        .expect("expected a valid mesh");
+    let scene = builder.add_domain(mesh, Material { double_sided: true, ..Material::default() }).build();
     let view = View::LookAt { eye: [-3.545, 20.0, 0.0], target: [-3.545, 0.0, 0.0], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 2e4, fy: 2e4, cx: 32.0, cy: 32.0 };
-    let shown = draw(&mut open(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 64);
+    let shown = render_square(&mut open_renderer(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 64);
     let dark = [0.8 * 0.25; 3];
-    (0..64 * 64).filter(|pixel| !close(shown.at(pixel % 64, pixel / 64), dark, 3.0)).count()
+    (0..64 * 64).filter(|pixel| !is_close(shown.pixel(pixel % 64, pixel / 64), dark, 3.0)).count()
 }
 
 /// Moments in f32 leak none.
@@ -218,8 +218,8 @@ fn half_lit(splits: u32) -> usize {
     let view = View::LookAt { eye: [0.0, 2.0, 4.0], target: [0.0, 0.0, 1.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 400.0, fy: 400.0, cx: 64.0, cy: 64.0 };
     let scene = scene(ShadowSettings { size: 64, splits, ..variance() });
-    let shown = draw(&mut open(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 128);
-    let column: Vec<f64> = (0..128).map(|row| share(shown.at(64, row))).collect();
+    let shown = render_square(&mut open_renderer(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 128);
+    let column: Vec<f64> = (0..128).map(|row| share(shown.pixel(64, row))).collect();
     assert!(column[0] < 0.1 && column[127] > 0.9, "dark behind the edge and lit before it, {splits} maps: {column:?}");
     column.iter().filter(|share| (0.1..0.9).contains(*share)).count()
 }
@@ -235,7 +235,7 @@ fn unused_shadow_resources_are_not_allocated() {
     let made = |shadow: ShadowSettings| {
         let scene = scene(shadow);
         let (shown, plan) = (edge(shadow), plan(&scene));
-        assert_eq!(shown.stats.passes, planned_above(&scene), "what is planned is what runs");
+        assert_eq!(shown.stats.passes, planned_passes_above_ground(&scene), "what is planned is what runs");
         let textures: Vec<String> = plan.textures.iter().map(|part| part.name.clone()).collect();
         let maps: Vec<String> = textures.into_iter().filter(|name| name.starts_with("shadow")).collect();
         let splits = shown.allocations.iter().any(|part| part.name == "shadow cascades");

@@ -5,7 +5,7 @@ use modalcast_model::load;
 use modalcast_model::scene::{Camera, Lens, View};
 use modalcast_render::FrameImage;
 
-use super::harness::{draw_sized, open};
+use super::harness::{open_renderer, render_sized};
 
 /// Mean, 99th percentile and maximum of the per-pixel difference of two pictures, in levels. The difference of a pixel
 /// is that of its worst channel.
@@ -20,15 +20,16 @@ fn difference(one: &[u8], other: &[u8]) -> (f64, u8, u8) {
 
 /// The tree close to its trunk: normal map of the bark, cut-out leaves, shadow, ground and sky.
 fn tree(eye: [f64; 3]) -> FrameImage {
-    let scene = load::open("tree").expect("built in").scene;
+    let scene = load::open("tree").expect("expected the built-in scene").scene;
     let view = View::LookAt { eye, target: [0.0, 1.8, 0.0], up: [0.0, 1.0, 0.0] };
     let camera = Camera { view, lens: Lens::FieldOfView(45.0), near: 0.0, far: 0.0 };
-    draw_sized(&mut open(), &scene, camera, [104, 78]).image
+    render_sized(&mut open_renderer(), &scene, camera, [104, 78]).image
 }
 
 #[test]
 fn tree_matches_its_snapshot() {
-    let kept = image::load_from_memory(include_bytes!("../../snapshots/tree.png")).expect("a PNG").into_rgba8();
+    let kept =
+        image::load_from_memory(include_bytes!("../../snapshots/tree.png")).expect("expected a PNG file").into_rgba8();
     let (mean, high, most) = difference(&tree([1.5, 1.9, 2.5]).rgba, &kept);
     assert!(mean < MEAN && high < HIGH, "mean {mean}, 99 of 100 within {high}, at most {most} levels");
     let (mean, high, _) = difference(&tree([1.5, 2.1, 2.5]).rgba, &kept);
