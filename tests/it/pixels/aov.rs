@@ -7,8 +7,8 @@ use nalgebra::Vector3;
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer};
 
-/// Reads an AOV of a scene at rest in a square picture.
-fn survey(builder: SceneBuilder, camera: Camera, size: u32, field: Aov) -> AovImage {
+/// Reads an AOV of a scene at rest in a square image.
+fn read_aov(builder: SceneBuilder, camera: Camera, size: u32, aov: Aov) -> AovImage {
     let scene = builder.build();
     let mut renderer = open_renderer();
     let mut buffers = renderer.load(&scene).expect("expected the scene to load");
@@ -20,18 +20,18 @@ fn survey(builder: SceneBuilder, camera: Camera, size: u32, field: Aov) -> AovIm
         surface.normals.extend(mesh.corners().normals.as_flattened());
     }
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
-    let shot = FrameParams { camera, width: size, height: size, bounds: scene.rest_bounds, light: None };
-    if let Aov::Values { .. } = field {
-        renderer.render_aov(&buffers, &shot, field).expect_err("no values yet");
+    let params = FrameParams { camera, width: size, height: size, bounds: scene.rest_bounds, light: None };
+    if let Aov::Values { .. } = aov {
+        renderer.render_aov(&buffers, &params, aov).expect_err("expected an error without vertex values");
         let values: Vec<f32> = surface.positions.chunks_exact(3).map(|point| point[0]).collect();
-        renderer.upload_vertex_values(&mut buffers, &values[1..]).expect_err("too few");
+        renderer.upload_vertex_values(&mut buffers, &values[1..]).expect_err("expected an error for too few values");
         renderer.upload_vertex_values(&mut buffers, &values).expect("expected the upload to succeed");
     }
-    renderer.render_aov(&buffers, &shot, field).expect("expected AOVs")
+    renderer.render_aov(&buffers, &params, aov).expect("expected AOVs")
 }
 
-fn floats(survey: &AovImage) -> Vec<f32> {
-    bytemuck::pod_collect_to_vec(&survey.bytes)
+fn floats(image: &AovImage) -> Vec<f32> {
+    bytemuck::pod_collect_to_vec(&image.bytes)
 }
 
 fn oblique() -> Camera {
@@ -56,48 +56,49 @@ fn depth_is_in_meters_along_the_view_axis() {
         builder.parts.unit = unit;
         builder.parts.look.ground = ground.then(Ground::default);
         // With a ground the square is small, so that most pixels show the ground.
-        let half = if ground { 1.0 } else { 40.0 };
-        let depth = survey(builder.add_domain(floor_mesh(half, 0.0), Material::default()), oblique(), 64, Aov::Depth);
+        let half_side = if ground { 1.0 } else { 40.0 };
+        let depth =
+            read_aov(builder.add_domain(floor_mesh(half_side, 0.0), Material::default()), oblique(), 64, Aov::Depth);
         assert_eq!((depth.width, depth.height, depth.samples), (64, 64, 1));
-        let (mut met, mut most) = (0, 0.0_f64);
-        for (at, got) in floats(&depth).into_iter().enumerate() {
-            let want = depth_of_floor(at as u32 % 64, at as u32 / 64).map(|depth| depth * unit);
+        let (mut covered, mut max_error) = (0, 0.0_f64);
+        for (pixel, got) in floats(&depth).into_iter().enumerate() {
+            let want = depth_of_floor(pixel as u32 % 64, pixel as u32 / 64).map(|depth| depth * unit);
             if got.is_finite() {
-                met += 1;
-                let want = want.expect("only what lies below the horizon is met");
-                most = most.max((f64::from(got) / want - 1.0).abs());
+                covered += 1;
+                let want = want.expect("expected depth below the horizon only");
+                max_error = max_error.max((f64::from(got) / want - 1.0).abs());
             }
         }
-        assert!(met > 2000 && most < 1e-4, "{met} pixels, off by {most:e} of their depth");
+        assert!(covered > 2000 && max_error < 1e-4, "{covered} pixels, relative error {max_error:e}");
         assert!(floats(&depth)[0] == f32::INFINITY || ground, "the sky");
     }
 }
 
 #[test]
 fn domain_indices_do_not_depend_on_the_drawing_order() {
-    let leaf = Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() };
-    let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.5, ..Material::default() };
+    let cut_out_material = Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() };
+    let glass_material = Material { alpha_mode: AlphaMode::Blend, alpha: 0.5, ..Material::default() };
     let builder = SceneBuilder::new()
-        .add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 2.0), glass)
-        .add_domain(facing_rectangle(-2.0, 0.0, -1.0, 1.0, 0.0), leaf)
+        .add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 2.0), glass_material)
+        .add_domain(facing_rectangle(-2.0, 0.0, -1.0, 1.0, 0.0), cut_out_material)
         .add_domain(facing_rectangle(1.0, 0.0, 2.0, 1.0, 0.0), Material::default());
-    let ids: Vec<u32> = bytemuck::pod_collect_to_vec(&survey(builder, front_camera(64), 64, Aov::Domains).bytes);
+    let ids: Vec<u32> = bytemuck::pod_collect_to_vec(&read_aov(builder, front_camera(64), 64, Aov::Domains).bytes);
     assert_eq!([ids[64 * 26 + 17], ids[64 * 26 + 47], ids[64 * 26 + 32]], [1, 2, u32::MAX]);
-    assert_eq!(ids.iter().filter(|id| **id == 1).count(), 100, "ten by ten pixels");
+    assert_eq!(ids.iter().filter(|id| **id == 1).count(), 100, "expected 10 x 10 pixels");
 }
 
 #[test]
 fn normals_face_the_viewer_and_are_zero_elsewhere() {
     let double_sided = Material { double_sided: true, ..Material::default() };
     let builder = SceneBuilder::new().add_domain(facing_rectangle(-2.0, -2.0, 0.0, 2.0, 0.0), double_sided);
-    let behind = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
-    let normals = floats(&survey(builder, Camera { view: behind, ..front_camera(64) }, 64, Aov::Normals));
-    let at = |x: usize, y: usize| &normals[3 * (64 * y + x)..][..3];
-    assert_eq!((at(40, 30), at(20, 30)), (&[0.0, 0.0, -1.0][..], &[0.0; 3][..]));
+    let view_from_behind = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
+    let normals = floats(&read_aov(builder, Camera { view: view_from_behind, ..front_camera(64) }, 64, Aov::Normals));
+    let normal_at = |x: usize, y: usize| &normals[3 * (64 * y + x)..][..3];
+    assert_eq!((normal_at(40, 30), normal_at(20, 30)), (&[0.0, 0.0, -1.0][..], &[0.0; 3][..]));
     let mut builder = SceneBuilder::new();
     builder.parts.look.ground = Some(Ground::default());
     let normals =
-        floats(&survey(builder.add_domain(floor_mesh(1.0, 0.0), Material::default()), oblique(), 64, Aov::Normals));
+        floats(&read_aov(builder.add_domain(floor_mesh(1.0, 0.0), Material::default()), oblique(), 64, Aov::Normals));
     assert_eq!(&normals[3 * (64 * 63 + 32)..][..3], [0.0; 3], "the ground");
 }
 
@@ -107,24 +108,25 @@ fn values_are_interpolated_linearly_and_clamped() {
     for (samples, largest) in [(1, 2.0), (4, 1.0)] {
         let mut builder = SceneBuilder::new();
         builder.parts.look.samples = samples;
-        let shown = survey(
+        let frame = read_aov(
             builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()),
             front_camera(64),
             64,
             Aov::Values { largest },
         );
-        assert_eq!(shown.samples, samples);
-        let words: Vec<u32> = bytemuck::pod_collect_to_vec(&shown.bytes);
+        assert_eq!(frame.samples, samples);
+        let samples_of_image: Vec<u32> = bytemuck::pod_collect_to_vec(&frame.bytes);
         for x in 13..51_usize {
-            let of_pixel = &words[samples as usize * (64 * 30 + x)..][..samples as usize];
-            let mean = of_pixel.iter().map(|word| f64::from(word & 0xFFFF) / 65535.0).sum::<f64>() / f64::from(samples);
+            let pixel_samples = &samples_of_image[samples as usize * (64 * 30 + x)..][..samples as usize];
+            let mean = pixel_samples.iter().map(|sample| f64::from(sample & 0xFFFF) / 65535.0).sum::<f64>()
+                / f64::from(samples);
             let want = ((x as f64 + 0.5 - 32.0) / 10.0 / f64::from(largest)).clamp(0.0, 1.0);
             // Near the clamped ends, the samples of one pixel may mix clamped and linear values.
-            let slack = if (0.05..0.95).contains(&want) { 1e-4 } else { 0.1 };
-            assert!((mean - want).abs() < slack, "{x}: {mean} is not {want}");
-            assert!(of_pixel.iter().all(|word| word >> 16 > 60000), "seen from before");
+            let tolerance = if (0.05..0.95).contains(&want) { 1e-4 } else { 0.1 };
+            assert!((mean - want).abs() < tolerance, "{x}: expected {want}, got {mean}");
+            assert!(pixel_samples.iter().all(|sample| sample >> 16 > 60000), "expected full coverage");
         }
-        assert!(words[..samples as usize * 64 * 5].iter().all(|word| *word == 0));
+        assert!(samples_of_image[..samples as usize * 64 * 5].iter().all(|sample| *sample == 0));
     }
 }
 
@@ -142,17 +144,24 @@ fn aovs_allocate_on_demand_and_do_not_change_frames() {
         ..Default::default()
     };
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
-    let shot = FrameParams { camera: front_camera(64), width: 64, height: 64, bounds: scene.rest_bounds, light: None };
-    let before = renderer.draw(&buffers, &shot).expect("expected a frame").rgba;
-    let (stats, planned) = (renderer.stats().clone(), buffers.allocations());
+    let params =
+        FrameParams { camera: front_camera(64), width: 64, height: 64, bounds: scene.rest_bounds, light: None };
+    let before = renderer.draw(&buffers, &params).expect("expected a frame").rgba;
+    let (stats, initial_allocations) = (renderer.stats().clone(), buffers.allocations());
     renderer.upload_vertex_values(&mut buffers, &[0.0, 1.0, 2.0, 3.0]).expect("expected the upload to succeed");
-    assert_eq!(buffers.allocations().len(), planned.len() + 1, "the values, now that they were asked for");
-    for field in [Aov::Depth, Aov::Domains, Aov::Normals, Aov::Values { largest: 3.0 }] {
-        renderer.render_aov(&buffers, &shot, field).expect("expected AOVs");
-        assert_eq!(renderer.draw(&buffers, &shot).expect("expected a frame").rgba, before);
+    assert_eq!(
+        buffers.allocations().len(),
+        initial_allocations.len() + 1,
+        "expected one new allocation for the values"
+    );
+    for aov in [Aov::Depth, Aov::Domains, Aov::Normals, Aov::Values { largest: 3.0 }] {
+        renderer.render_aov(&buffers, &params, aov).expect("expected AOVs");
+        assert_eq!(renderer.draw(&buffers, &params).expect("expected a frame").rgba, before);
         assert_eq!(renderer.stats(), &stats);
     }
     for [width, height] in [[0, 64], [64, u32::MAX]] {
-        renderer.render_aov(&buffers, &FrameParams { width, height, ..shot }, Aov::Depth).expect_err("no such size");
+        renderer
+            .render_aov(&buffers, &FrameParams { width, height, ..params }, Aov::Depth)
+            .expect_err("expected an invalid-size error");
     }
 }

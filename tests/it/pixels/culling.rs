@@ -1,5 +1,5 @@
-//! Culled frames have the bits of frames without culling, whatever was drawn before, and the counts of culled triangles
-//! match arithmetic.
+//! Culled frames have the bits of frames without culling and do not depend on earlier frames. The counts of culled
+//! triangles equal computed ones.
 
 use std::sync::{Arc, OnceLock};
 
@@ -12,19 +12,19 @@ use modalcast_render::{Aov, FrameCullStats, FrameParams, FrameStats, Renderer, S
 
 use super::harness::{SceneBuilder, facing_rectangle, front_camera, open_renderer};
 
-const ALL: [Culling; 3] = [Culling::None, Culling::Triangles, Culling::Occlusion];
+const CULLING_MODES: [Culling; 3] = [Culling::None, Culling::Triangles, Culling::Occlusion];
 const SIZE: u32 = 96;
 
-/// One frame: its pixels, the visibility of its samples, and its statistics.
+/// One frame: its pixels, the ids of its samples, and its statistics.
 struct Frame {
     rgba: Vec<u8>,
-    seen: Vec<VisibilityId>,
+    ids: Vec<VisibilityId>,
     stats: FrameStats,
 }
 
 impl Frame {
     fn culled(&self) -> FrameCullStats {
-        self.stats.culled.expect("a culled frame")
+        self.stats.culled.expect("expected culling statistics")
     }
 }
 
@@ -40,57 +40,57 @@ impl CullHarness {
         builder.parts.look.culling = culling;
         let (scene, mut renderer) = (builder.build(), open_renderer());
         let buffers = renderer.load(&scene).expect("expected the scene to load");
-        let mut show = Self { renderer, buffers, scene };
-        show.place(|point| point);
-        show
+        let mut harness = Self { renderer, buffers, scene };
+        harness.move_vertices(|point| point);
+        harness
     }
 
     /// Moves every vertex to a function of its rest position.
-    fn place(&mut self, to: impl Fn([f32; 3]) -> [f32; 3]) {
+    fn move_vertices(&mut self, position: impl Fn([f32; 3]) -> [f32; 3]) {
         let mut surface = DeformedSurface::default();
         for domain in &self.scene.domains {
             let mesh = &self.scene.shapes[domain.shape].mesh;
-            surface.positions.extend(mesh.rest().iter().flat_map(|point| to(*point)));
+            surface.positions.extend(mesh.rest().iter().flat_map(|point| position(*point)));
             surface.normals.extend(mesh.corners().normals.as_flattened());
         }
         self.renderer.upload(&self.buffers, &surface).expect("expected the upload to succeed");
     }
 
-    fn frame(&mut self, camera: Camera, [width, height]: [u32; 2]) -> Frame {
-        let shot = FrameParams { camera, width, height, bounds: self.scene.rest_bounds, light: None };
-        let rgba = self.renderer.draw(&self.buffers, &shot).expect("expected a frame").rgba;
+    fn draw(&mut self, camera: Camera, [width, height]: [u32; 2]) -> Frame {
+        let params = FrameParams { camera, width, height, bounds: self.scene.rest_bounds, light: None };
+        let rgba = self.renderer.draw(&self.buffers, &params).expect("expected a frame").rgba;
         let stats = self.renderer.stats().clone();
-        Frame { rgba, seen: self.renderer.read_visibility().expect("ids"), stats }
+        Frame { rgba, ids: self.renderer.read_visibility().expect("expected visibility ids"), stats }
     }
 }
 
-fn at(eye: [f64; 3], target: [f64; 3]) -> Camera {
+fn camera_at(eye: [f64; 3], target: [f64; 3]) -> Camera {
     let view = View::LookAt { eye, target, up: [0.0, 1.0, 0.0] };
     Camera { view, lens: Lens::Intrinsics { fx: 60.0, fy: 60.0, cx: 48.0, cy: 48.0 }, near: 0.0, far: 0.0 }
 }
 
 /// A mesh of separate triangles that share no vertices.
-fn loose(triangles: &[[[f32; 3]; 3]]) -> Mesh {
+fn separate_triangles(triangles: &[[[f32; 3]; 3]]) -> Mesh {
     let rest = triangles.as_flattened().to_vec();
     let count = rest.len() as u32;
     let uvs = (0..count).map(|corner| [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]][corner as usize % 3]).collect();
     let indices = (0..count / 3).map(|first| [3 * first, 3 * first + 1, 3 * first + 2]).collect();
-    Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; count as usize], uvs, indices).expect("triangles")
+    Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; count as usize], uvs, indices).expect("expected a valid mesh")
 }
 
 /// Triangles of many sizes around the origin; some have no area.
-fn soup(seed: u64, count: usize, spread: f32) -> Mesh {
+fn random_triangles(seed: u64, count: usize, extent: f32) -> Mesh {
     let mut random = fastrand::Rng::with_seed(seed);
     let mut triangles = Vec::new();
     for _ in 0..count {
-        let mut number = |size: f32| size * (2.0 * random.f32() - 1.0);
-        let size = 10.0_f32.powf(number(1.5) - 1.0);
-        let middle: [f32; 3] = [number(spread), number(spread), number(spread)];
-        let mut corner = || [0, 1, 2].map(|axis| middle[axis] + number(size));
+        let mut symmetric_number = |triangle_size: f32| triangle_size * (2.0 * random.f32() - 1.0);
+        let triangle_size = 10.0_f32.powf(symmetric_number(1.5) - 1.0);
+        let center: [f32; 3] = [symmetric_number(extent), symmetric_number(extent), symmetric_number(extent)];
+        let mut corner = || [0, 1, 2].map(|axis| center[axis] + symmetric_number(triangle_size));
         let [a, b, c] = [corner(), corner(), corner()];
-        triangles.push(if number(1.0) > 0.95 { [a, b, b] } else { [a, b, c] });
+        triangles.push(if symmetric_number(1.0) > 0.95 { [a, b, b] } else { [a, b, c] });
     }
-    loose(&triangles)
+    separate_triangles(&triangles)
 }
 
 fn material(alpha_mode: AlphaMode, double_sided: bool, color: [f32; 3]) -> Material {
@@ -104,7 +104,7 @@ fn is_software() -> bool {
 }
 
 /// Every kind of material, single-sided and double-sided. The opaque triangles exist twice, so depths tie.
-fn mixed(samples: u32, transparency: Transparency) -> SceneBuilder {
+fn mixed_builder(samples: u32, transparency: Transparency) -> SceneBuilder {
     let mut builder = SceneBuilder::new();
     (builder.parts.look.samples, builder.parts.look.transparency) = (samples, transparency);
     builder.parts.look.ground = Some(Ground::default());
@@ -118,11 +118,11 @@ fn mixed(samples: u32, transparency: Transparency) -> SceneBuilder {
         let leaves = Material { color_texture: image, alpha: 0.75, ..material(mask, double_sided, [1.0; 3]) };
         let glass = Material { alpha: 0.5, ..material(AlphaMode::Blend, double_sided, [0.2, 0.4, 0.9]) };
         builder = builder
-            .add_domain(soup(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.8, 0.3, 0.2]))
-            .add_domain(soup(seed + 2, 400, 3.0), leaves)
-            .add_domain(soup(seed + 4, 60, 3.0), glass)
+            .add_domain(random_triangles(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.8, 0.3, 0.2]))
+            .add_domain(random_triangles(seed + 2, 400, 3.0), leaves)
+            .add_domain(random_triangles(seed + 4, 60, 3.0), glass)
             // The same triangles again in another color: every depth exists twice.
-            .add_domain(soup(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.2, 0.9, 0.3]));
+            .add_domain(random_triangles(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.2, 0.9, 0.3]));
     }
     builder
 }
@@ -132,63 +132,67 @@ fn assert_same_frames(
     builder: &dyn Fn() -> SceneBuilder,
     frames: &dyn Fn(&mut CullHarness) -> Vec<Frame>,
 ) -> Vec<Frame> {
-    let [none, triangles, depth] = ALL.map(|culling| frames(&mut CullHarness::new(builder(), culling)));
-    for (index, plain) in none.iter().enumerate() {
-        assert!(plain.stats.culled.is_none(), "control: nothing is culled");
-        for culled in [&triangles[index], &depth[index]] {
-            assert!(culled.seen == plain.seen, "frame {index}: other triangles are seen");
-            assert!(culled.rgba == plain.rgba, "frame {index}: other colours");
-            assert!(culled.stats.oit == plain.stats.oit, "frame {index}: other lists");
+    let [unculled, with_triangle_culling, with_occlusion] =
+        CULLING_MODES.map(|culling| frames(&mut CullHarness::new(builder(), culling)));
+    for (index, expected) in unculled.iter().enumerate() {
+        assert!(expected.stats.culled.is_none(), "negative control: expected a frame without culling");
+        for culled in [&with_triangle_culling[index], &with_occlusion[index]] {
+            assert!(culled.ids == expected.ids, "frame {index}: expected the same visible triangles");
+            assert!(culled.rgba == expected.rgba, "frame {index}: expected the same colors");
+            assert!(culled.stats.oit == expected.stats.oit, "frame {index}: expected the same fragment lists");
         }
     }
-    depth
+    with_occlusion
 }
 
 const CAMERAS: [([f64; 3], [f64; 3]); 5] = [
     ([0.0, 1.0, 9.0], [0.0; 3]),
     ([0.0, 1.2, 9.0], [0.1, 0.0, 0.0]),
-    // A jump to the other side, one into the middle of the scene, and one up close.
+    // From the opposite side, from inside of the scene, and close to a surface.
     ([-1.0, 2.0, -9.0], [0.0; 3]),
     ([0.1, 0.0, 0.2], [1.0, 0.2, -3.0]),
     ([2.0, 2.0, 2.0], [2.4, 2.0, 1.0]),
 ];
 
-/// Every triangle has exactly one verdict: listed, or culled for one reason.
+/// Every triangle is counted once: as visible, or as culled for one reason.
 #[test]
 fn culled_frames_are_bit_identical_after_camera_moves() {
     for (samples, transparency) in
         [(1, Transparency::OrderIndependent), (4, Transparency::OrderIndependent), (4, Transparency::TwoPass)]
     {
-        let frames = assert_same_frames(&|| mixed(samples, transparency), &|show| {
-            let there = CAMERAS.into_iter().chain([CAMERAS[0]]);
-            there.map(|(eye, target)| show.frame(at(eye, target), [SIZE, SIZE])).collect()
+        let frames = assert_same_frames(&|| mixed_builder(samples, transparency), &|harness| {
+            let cameras = CAMERAS.into_iter().chain([CAMERAS[0]]);
+            cameras.map(|(eye, target)| harness.draw(camera_at(eye, target), [SIZE, SIZE])).collect()
         });
-        let camera: Vec<_> = frames.iter().map(|frame| frame.culled().camera).collect();
-        assert_eq!(camera[0].occluded, 0, "nothing is remembered yet");
-        assert!(camera[1].occluded > 100, "{camera:?}");
-        assert!(camera.iter().all(|sifted| sifted.visible > 0 && sifted.no_sample > 50), "{camera:?}");
-        assert!(camera[0].back_facing > 100 && camera[3].outside_view > 500, "{camera:?}");
-        assert!(frames[0].rgba == frames[5].rgba, "the same camera again");
-        let all = camera[0].visible + camera[0].culled();
-        assert!(camera.iter().all(|sifted| sifted.visible + sifted.culled() == all), "each has one verdict");
-        assert_eq!(all as usize, 2 * (700 + 400 + 60 + 700));
+        let camera_stats: Vec<_> = frames.iter().map(|frame| frame.culled().camera).collect();
+        assert_eq!(camera_stats[0].occluded, 0, "expected no occlusion culling in the first frame");
+        assert!(camera_stats[1].occluded > 100, "{camera_stats:?}");
+        assert!(camera_stats.iter().all(|stats| stats.visible > 0 && stats.no_sample > 50), "{camera_stats:?}");
+        assert!(camera_stats[0].back_facing > 100 && camera_stats[3].outside_view > 500, "{camera_stats:?}");
+        assert!(frames[0].rgba == frames[5].rgba, "expected the same frame of the same camera");
+        let triangle_count = camera_stats[0].visible + camera_stats[0].culled();
+        assert!(
+            camera_stats.iter().all(|stats| stats.visible + stats.culled() == triangle_count),
+            "expected each triangle to be counted once"
+        );
+        assert_eq!(triangle_count as usize, 2 * (700 + 400 + 60 + 700));
     }
 }
 
 /// The lists span many blocks and super blocks of the prefix sum.
 #[test]
 fn long_triangle_lists_keep_their_order() {
-    let field = || {
+    let builder = || {
         let mut builder = SceneBuilder::new();
         builder.parts.look.samples = 1;
         let mask = AlphaMode::Mask { cutoff: 0.5 };
         builder
-            .add_domain(soup(7, 45_000, 4.0), material(AlphaMode::Opaque, false, [0.8, 0.3, 0.2]))
-            .add_domain(soup(7, 20_000, 4.0), material(AlphaMode::Opaque, true, [0.2, 0.3, 0.9]))
-            .add_domain(soup(8, 17_000, 4.0), material(mask, true, [0.3, 0.8, 0.2]))
+            .add_domain(random_triangles(7, 45_000, 4.0), material(AlphaMode::Opaque, false, [0.8, 0.3, 0.2]))
+            .add_domain(random_triangles(7, 20_000, 4.0), material(AlphaMode::Opaque, true, [0.2, 0.3, 0.9]))
+            .add_domain(random_triangles(8, 17_000, 4.0), material(mask, true, [0.3, 0.8, 0.2]))
     };
-    let frames = assert_same_frames(&field, &|show| {
-        [0.0, 0.1, 0.2].map(|x| show.frame(at([x, 1.0, 14.0], [x, 0.0, 0.0]), [SIZE, SIZE])).into()
+    let frames = assert_same_frames(&builder, &|harness| {
+        [0.0, 0.1, 0.2].map(|x| harness.draw(camera_at([x, 1.0, 14.0], [x, 0.0, 0.0]), [SIZE, SIZE])).into()
     });
     let camera = frames[2].culled().camera;
     assert_eq!(camera.visible + camera.culled(), 82_000);
@@ -197,17 +201,17 @@ fn long_triangle_lists_keep_their_order() {
 
 #[test]
 fn culled_frames_of_moving_scenes_are_bit_identical() {
-    let moved = |step: usize| {
+    let position_at = |step: usize| {
         move |[x, y, z]: [f32; 3]| {
             let (sin, cos) = (0.2 * step as f32).sin_cos();
             [x * cos - z * sin, y + 0.3 * (x + step as f32).sin(), x * sin + z * cos]
         }
     };
-    assert_same_frames(&|| mixed(4, Transparency::OrderIndependent), &|show| {
+    assert_same_frames(&|| mixed_builder(4, Transparency::OrderIndependent), &|harness| {
         let mut frames = Vec::new();
         for step in 0..5 {
-            show.place(moved(step));
-            frames.push(show.frame(at([0.0, 1.0, 9.0], [0.0; 3]), [SIZE, SIZE - 7]));
+            harness.move_vertices(position_at(step));
+            frames.push(harness.draw(camera_at([0.0, 1.0, 9.0], [0.0; 3]), [SIZE, SIZE - 7]));
         }
         frames
     });
@@ -215,15 +219,15 @@ fn culled_frames_of_moving_scenes_are_bit_identical() {
 
 #[test]
 fn culling_handles_non_finite_and_huge_positions() {
-    let spoil = |what: f32, every: u32| {
-        move |[x, y, z]: [f32; 3]| if (x.to_bits() / 8).is_multiple_of(every) { [x, what, z] } else { [x, y, z] }
+    let replace_y = |value: f32, interval: u32| {
+        move |[x, y, z]: [f32; 3]| if (x.to_bits() / 8).is_multiple_of(interval) { [x, value, z] } else { [x, y, z] }
     };
-    assert_same_frames(&|| mixed(4, Transparency::OrderIndependent), &|show| {
+    assert_same_frames(&|| mixed_builder(4, Transparency::OrderIndependent), &|harness| {
         let mut frames = Vec::new();
-        for what in [f32::NAN, f32::INFINITY, 3e38, -1e30, 1e19, 1e6] {
-            for every in [1, 3] {
-                show.place(spoil(what, every));
-                frames.push(show.frame(at([0.0, 1.0, 9.0], [0.0; 3]), [SIZE, SIZE]));
+        for value in [f32::NAN, f32::INFINITY, 3e38, -1e30, 1e19, 1e6] {
+            for interval in [1, 3] {
+                harness.move_vertices(replace_y(value, interval));
+                frames.push(harness.draw(camera_at([0.0, 1.0, 9.0], [0.0; 3]), [SIZE, SIZE]));
             }
         }
         frames
@@ -233,44 +237,51 @@ fn culling_handles_non_finite_and_huge_positions() {
 #[test]
 fn culling_handles_far_scenes_and_extreme_clip_planes() {
     for (shift, near, far) in [(1e4, 0.0, 0.0), (1e7, 0.0, 0.0), (0.0, 1e-6, 1e9), (0.0, 8.9, 9.1)] {
-        assert_same_frames(&|| mixed(4, Transparency::OrderIndependent), &|show| {
-            show.place(|[x, y, z]| [x + shift as f32, y, z]);
-            let camera = Camera { near, far, ..at([shift, 1.0, 9.0], [shift, 0.0, 0.0]) };
-            (0..3).map(|_| show.frame(camera, [SIZE, SIZE])).collect()
+        assert_same_frames(&|| mixed_builder(4, Transparency::OrderIndependent), &|harness| {
+            harness.move_vertices(|[x, y, z]| [x + shift as f32, y, z]);
+            let camera = Camera { near, far, ..camera_at([shift, 1.0, 9.0], [shift, 0.0, 0.0]) };
+            (0..3).map(|_| harness.draw(camera, [SIZE, SIZE])).collect()
         });
     }
 }
 
 #[test]
 fn culling_keeps_huge_triangles_and_single_ones() {
-    let huge = || {
+    let huge_builder = || {
         let wall = |z: f32| [[-1e5, -1e5, z], [1e5, -1e5, z], [0.0, 1e5, z]];
         let crossing = [[-3.0, -1.0, 20.0], [3.0, -1.0, 20.0], [0.0, -1.0, -20.0]];
-        let mesh = loose(&[wall(-2.0), wall(-2.5), crossing, [[0.0, 0.0, 0.0], [1e9, 0.0, 0.0], [0.0, 1e9, 0.0]]]);
+        let mesh = separate_triangles(&[
+            wall(-2.0),
+            wall(-2.5),
+            crossing,
+            [[0.0, 0.0, 0.0], [1e9, 0.0, 0.0], [0.0, 1e9, 0.0]],
+        ]);
         SceneBuilder::new().add_domain(mesh, material(AlphaMode::Opaque, true, [0.7; 3]))
     };
-    let one = || {
-        SceneBuilder::new()
-            .add_domain(loose(&[[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]]]), Material::default())
+    let single_builder = || {
+        SceneBuilder::new().add_domain(
+            separate_triangles(&[[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]]]),
+            Material::default(),
+        )
     };
-    for builder in [&huge as &dyn Fn() -> SceneBuilder, &one] {
-        let frames = assert_same_frames(builder, &|show| {
+    for builder in [&huge_builder as &dyn Fn() -> SceneBuilder, &single_builder] {
+        let frames = assert_same_frames(builder, &|harness| {
             let camera = Camera { near: 0.01, far: 1e3, ..front_camera(64) };
-            (0..3).map(|_| show.frame(camera, [64, 64])).collect()
+            (0..3).map(|_| harness.draw(camera, [64, 64])).collect()
         });
-        assert!(frames[2].seen.iter().any(|seen| matches!(seen, VisibilityId::Triangle(_))));
+        assert!(frames[2].ids.iter().any(|seen| matches!(seen, VisibilityId::Triangle(_))));
     }
 }
 
-/// A square in front of a grid of 32 x 32 small triangles; it hides half of them.
-fn curtain(culling: Culling) -> SceneBuilder {
-    let small = |index: usize| {
+/// A grid of 32 x 32 small triangles and a square in front of it that hides half of them.
+fn half_hidden_builder(culling: Culling) -> SceneBuilder {
+    let small_triangle = |index: usize| {
         let (x, y) = ((index % 32) as f32 * 0.25 - 4.0, (index / 32) as f32 * 0.25 - 4.0);
         [[x + 0.02, y + 0.02, -1.0], [x + 0.22, y + 0.02, -1.0], [x + 0.02, y + 0.22, -1.0]]
     };
-    let grid: Vec<_> = (0..32 * 32).map(small).collect();
+    let grid: Vec<_> = (0..32 * 32).map(small_triangle).collect();
     let mut builder = SceneBuilder::new()
-        .add_domain(loose(&grid), material(AlphaMode::Opaque, true, [0.9, 0.2, 0.1]))
+        .add_domain(separate_triangles(&grid), material(AlphaMode::Opaque, true, [0.9, 0.2, 0.1]))
         .add_domain(facing_rectangle(-4.5, -4.5, 0.0, 4.5, 0.0), material(AlphaMode::Opaque, false, [0.1, 0.2, 0.9]));
     (builder.parts.look.samples, builder.parts.look.culling) = (1, culling);
     builder
@@ -278,52 +289,59 @@ fn curtain(culling: Culling) -> SceneBuilder {
 
 #[test]
 fn hidden_count_equals_triangles_behind_the_square() {
-    let mut show = CullHarness::new(curtain(Culling::Occlusion), Culling::Occlusion);
-    let first = show.frame(front_camera(128), [128, 128]).culled().camera;
+    let mut harness = CullHarness::new(half_hidden_builder(Culling::Occlusion), Culling::Occlusion);
+    let first = harness.draw(front_camera(128), [128, 128]).culled().camera;
     assert_eq!((first.occluded, first.visible), (0, 1024 + 2));
-    let second = show.frame(front_camera(128), [128, 128]).culled().camera;
+    let second = harness.draw(front_camera(128), [128, 128]).culled().camera;
     // The grid is a tenth farther from the eye than the square, which hides everything left of x = 0. The column next
     // to its edge shares a pixel with visible triangles.
     assert_eq!((second.outside_view, second.back_facing, second.no_sample), (0, 0, 0));
     assert!((15 * 32..=16 * 32).contains(&second.occluded), "{second:?}");
     assert_eq!(second.visible + second.occluded, 1024 + 2);
     // From behind, nothing is hidden, and the square faces away.
-    let behind = show.frame(at([0.0, 0.0, -12.0], [0.0; 3]), [SIZE, SIZE]).culled().camera;
-    assert_eq!((behind.back_facing, behind.occluded), (2, 0));
+    let from_behind = harness.draw(camera_at([0.0, 0.0, -12.0], [0.0; 3]), [SIZE, SIZE]).culled().camera;
+    assert_eq!((from_behind.back_facing, from_behind.occluded), (2, 0));
     // A camera that looks away: everything is outside of the frustum.
-    let aside = show.frame(at([0.0, 0.0, 12.0], [0.0, 0.0, 30.0]), [SIZE, SIZE]).culled().camera;
-    assert_eq!((aside.outside_view, aside.visible), (1026, 0));
+    let looking_away = harness.draw(camera_at([0.0, 0.0, 12.0], [0.0, 0.0, 30.0]), [SIZE, SIZE]).culled().camera;
+    assert_eq!((looking_away.outside_view, looking_away.visible), (1026, 0));
 }
 
 /// A triangle between the samples is culled; a triangle of the same size that contains a sample is drawn.
 #[test]
 fn triangles_without_a_sample_are_culled() {
-    let dot = |x: f32, y: f32| [[x, y, 0.0], [x + 0.002, y, 0.0], [x, y + 0.002, 0.0]];
+    let small_triangle = |x: f32, y: f32| [[x, y, 0.0], [x + 0.002, y, 0.0], [x, y + 0.002, 0.0]];
     // Ten pixels per unit: pixel centers lie at 0.05 + 0.1 i. The second triangle contains one, the first none.
-    let mesh = loose(&[dot(0.0, 0.0), dot(0.0492, 0.0492)]);
+    let mesh = separate_triangles(&[small_triangle(0.0, 0.0), small_triangle(0.0492, 0.0492)]);
     let mut builder = SceneBuilder::new().add_domain(mesh, Material::default());
     builder.parts.look.samples = 1;
-    let frame = CullHarness::new(builder, Culling::Triangles).frame(front_camera(64), [64, 64]);
+    let frame = CullHarness::new(builder, Culling::Triangles).draw(front_camera(64), [64, 64]);
     let camera = frame.culled().camera;
     assert_eq!((camera.no_sample, camera.visible), (1, 1), "{camera:?}");
-    assert_eq!(frame.seen.iter().filter(|seen| **seen == VisibilityId::Triangle(1)).count(), 1, "control: it is seen");
+    assert_eq!(
+        frame.ids.iter().filter(|id| **id == VisibilityId::Triangle(1)).count(),
+        1,
+        "negative control: expected one visible sample"
+    );
 }
 
 #[test]
 fn shadows_of_culled_casters_are_bit_identical() {
     for (method, splits) in [(ShadowMethod::Standard, 1), (ShadowMethod::Variance, 1), (ShadowMethod::Standard, 3)] {
         let builder = || {
-            let mut builder = mixed(1, Transparency::OrderIndependent);
+            let mut builder = mixed_builder(1, Transparency::OrderIndependent);
             builder.parts.look.sun = [0.3, 0.8, 0.4];
             builder.parts.look.shadow = Some(ShadowSettings { size: 128, method, splits, ..ShadowSettings::default() });
             builder
         };
-        let frames = assert_same_frames(&builder, &|show| {
-            (0..2).map(|_| show.frame(at([0.0, 4.0, 12.0], [0.0; 3]), [SIZE, SIZE])).collect()
+        let frames = assert_same_frames(&builder, &|harness| {
+            (0..2).map(|_| harness.draw(camera_at([0.0, 4.0, 12.0], [0.0; 3]), [SIZE, SIZE])).collect()
         });
-        let sun = frames[0].culled().shadow;
-        assert!(sun.no_sample > 100 * splits && sun.back_facing == 0 && sun.occluded == 0, "{sun:?}");
-        assert_eq!(sun.visible + sun.culled(), splits * 2 * (700 + 400 + 60 + 700));
+        let shadow_stats = frames[0].culled().shadow;
+        assert!(
+            shadow_stats.no_sample > 100 * splits && shadow_stats.back_facing == 0 && shadow_stats.occluded == 0,
+            "{shadow_stats:?}"
+        );
+        assert_eq!(shadow_stats.visible + shadow_stats.culled(), splits * 2 * (700 + 400 + 60 + 700));
     }
 }
 
@@ -331,7 +349,7 @@ fn shadows_of_culled_casters_are_bit_identical() {
 /// Occlusion culling is off for such scenes.
 #[test]
 fn software_renderers_draw_hidden_multisampled_cut_outs() {
-    for (samples, alpha_mode, falls) in [
+    for (samples, alpha_mode, disables_occlusion_culling) in [
         (4, AlphaMode::Mask { cutoff: 0.5 }, true),
         (1, AlphaMode::Mask { cutoff: 0.5 }, false),
         (4, AlphaMode::Opaque, false),
@@ -339,46 +357,51 @@ fn software_renderers_draw_hidden_multisampled_cut_outs() {
         let mut builder = SceneBuilder::new();
         builder.parts.look.samples = samples;
         let image = Some(builder.add_texture(1, 1, |_, _| [255; 4]));
-        let paint = Material { color_texture: image, ..material(alpha_mode, true, [1.0; 3]) };
-        let mut show = CullHarness::new(
-            builder.add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), paint),
+        let material_with_image = Material { color_texture: image, ..material(alpha_mode, true, [1.0; 3]) };
+        let mut harness = CullHarness::new(
+            builder.add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), material_with_image),
             Culling::Occlusion,
         );
-        let hides = show.frame(front_camera(64), [64, 64]).stats.passes.contains(&"occluders");
-        assert_eq!(hides, !(falls && show.renderer.info().software));
+        let uses_occlusion_culling = harness.draw(front_camera(64), [64, 64]).stats.passes.contains(&"occluders");
+        assert_eq!(uses_occlusion_culling, !(disables_occlusion_culling && harness.renderer.info().software));
     }
 }
 
 #[test]
 fn picks_aovs_and_rebased_frames_do_not_depend_on_culling() {
-    let shown = ALL.map(|culling| {
-        let mut show = CullHarness::new(mixed(4, Transparency::OrderIndependent), culling);
-        let camera = at([0.0, 1.0, 9.0], [0.0; 3]);
-        let shot = FrameParams { camera, width: SIZE, height: SIZE, bounds: show.scene.rest_bounds, light: None };
-        show.frame(camera, [SIZE, SIZE]);
-        let rectangle = PixelRect::within([SIZE; 2], [40; 2], [8; 2]).expect("inside");
-        let pick = show.renderer.begin_pick(&show.buffers, &shot, rectangle).expect("expected a pick");
-        let hits = show.renderer.finish_pick(pick).expect("hits");
-        let depth = show.renderer.render_aov(&show.buffers, &shot, Aov::Depth).expect("expected AOVs").bytes;
-        // Rebased positions: everything is shifted and has an origin of its own.
-        let rest = show.scene.shapes.iter().flat_map(|shape| shape.mesh.rest());
-        let aside: Vec<f32> = rest.flat_map(|[x, y, z]| [x + 0.75, *y, *z]).collect();
-        show.renderer
-            .upload_rebased(&mut show.buffers, &aside, [0.25, 0.0, 0.0])
+    let results = CULLING_MODES.map(|culling| {
+        let mut harness = CullHarness::new(mixed_builder(4, Transparency::OrderIndependent), culling);
+        let camera = camera_at([0.0, 1.0, 9.0], [0.0; 3]);
+        let params = FrameParams { camera, width: SIZE, height: SIZE, bounds: harness.scene.rest_bounds, light: None };
+        harness.draw(camera, [SIZE, SIZE]);
+        let rectangle = PixelRect::within([SIZE; 2], [40; 2], [8; 2]).expect("expected a valid rectangle");
+        let pick = harness.renderer.begin_pick(&harness.buffers, &params, rectangle).expect("expected a pick to start");
+        let hits = harness.renderer.finish_pick(pick).expect("expected hits");
+        let depth = harness.renderer.render_aov(&harness.buffers, &params, Aov::Depth).expect("expected AOVs").bytes;
+        // Rebased positions: shifted, with another origin.
+        let rest = harness.scene.shapes.iter().flat_map(|shape| shape.mesh.rest());
+        let shifted: Vec<f32> = rest.flat_map(|[x, y, z]| [x + 0.75, *y, *z]).collect();
+        harness
+            .renderer
+            .upload_rebased(&mut harness.buffers, &shifted, [0.25, 0.0, 0.0])
             .expect("expected the upload to succeed");
-        let apart = [show.frame(camera, [SIZE, SIZE]), show.frame(camera, [SIZE, SIZE])].map(|frame| frame.rgba);
-        (hits, depth, apart)
+        let rebased = [harness.draw(camera, [SIZE, SIZE]), harness.draw(camera, [SIZE, SIZE])].map(|frame| frame.rgba);
+        (hits, depth, rebased)
     });
-    assert!(!shown[0].0.is_empty() && shown[0].2[0] == shown[0].2[1]);
-    assert!(shown[1] == shown[0] && shown[2] == shown[0]);
+    assert!(!results[0].0.is_empty() && results[0].2[0] == results[0].2[1]);
+    assert!(results[1] == results[0] && results[2] == results[0]);
 }
 
 /// A small scene with the default culling allocates no culling buffers.
 #[test]
 fn culled_draw_calls_do_not_grow_with_domains() {
-    let plain = CullHarness::new(curtain(Culling::Auto), Culling::Auto);
+    let default_culling = CullHarness::new(half_hidden_builder(Culling::Auto), Culling::Auto);
     assert!(
-        plain.buffers.allocations().iter().all(|part| !part.name.contains("cull") && !part.name.contains("visible"))
+        default_culling
+            .buffers
+            .allocations()
+            .iter()
+            .all(|allocation| !allocation.name.contains("cull") && !allocation.name.contains("visible"))
     );
     let draw_calls = |domains: usize| {
         let mut builder = SceneBuilder::new();
@@ -388,10 +411,10 @@ fn culled_draw_calls_do_not_grow_with_domains() {
                 material(AlphaMode::Opaque, true, [0.5; 3]),
             );
         }
-        let mut show = CullHarness::new(builder, Culling::Occlusion);
-        let frame = show.frame(front_camera(64), [64, 64]);
-        assert_eq!(frame.stats.passes, show.buffers.plan().passes);
-        assert_eq!(frame.stats.draw_calls, show.buffers.plan().draw_calls);
+        let mut harness = CullHarness::new(builder, Culling::Occlusion);
+        let frame = harness.draw(front_camera(64), [64, 64]);
+        assert_eq!(frame.stats.passes, harness.buffers.plan().passes);
+        assert_eq!(frame.stats.draw_calls, harness.buffers.plan().draw_calls);
         frame.stats.draw_calls
     };
     assert_eq!((draw_calls(1), draw_calls(40)), (2, 2));

@@ -1,4 +1,4 @@
-//! The almond tree with culling: the same picture, and the times of its passes.
+//! The almond tree has the same image with and without culling. Prints the times of its passes.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -8,7 +8,7 @@ use modalcast_model::deform::Deformer as _;
 use modalcast_model::scene::{
     Camera, Culling, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings, Transparency,
 };
-use modalcast_render::{FrameCullStats, FrameParams, FrameTimes, Renderer};
+use modalcast_render::{FrameCullStats, FrameParams, Renderer};
 
 use super::harness::open_renderer;
 
@@ -16,25 +16,29 @@ const SIZE: [u32; 2] = [1920, 1080];
 const FRAMES: usize = 9;
 
 /// The same scene with another look.
-fn under(scene: &Scene, look: RenderSettings) -> Arc<Scene> {
+fn with_look(scene: &Scene, look: RenderSettings) -> Arc<Scene> {
     Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene")
 }
 
-/// The picture, the median times of some passes in milliseconds, and the culling statistics.
-fn frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> (Vec<u8>, Vec<(&'static str, f64)>, Option<FrameCullStats>) {
+/// The image, the median times of some passes in milliseconds, and the culling statistics.
+fn draw_frames(
+    renderer: &mut Renderer,
+    scene: &Arc<Scene>,
+) -> (Vec<u8>, Vec<(&'static str, f64)>, Option<FrameCullStats>) {
     let mut deformer = ReferenceDeformer::new(scene);
     let bounds = deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed").bounds;
     let buffers = renderer.load(scene).expect("expected the scene to load");
-    renderer.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
+    renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
     let camera = Camera::fit_to_scene(scene, SIZE[0], SIZE[1]);
-    let shot = FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds, light: None };
-    let images: Vec<_> = (0..FRAMES).map(|_| renderer.draw(&buffers, &shot).expect("expected a frame")).collect();
-    assert!(images.iter().all(|image| image.rgba == images[0].rgba), "frames differ");
+    let params = FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds, light: None };
+    let images: Vec<_> = (0..FRAMES).map(|_| renderer.draw(&buffers, &params).expect("expected a frame")).collect();
+    assert!(images.iter().all(|image| image.rgba == images[0].rgba), "expected identical frames");
     let median = |name: &'static str| {
-        let of = |times: &FrameTimes| times.iter().find(|(key, _)| key.name() == name).map_or(0.0, |(_, ms)| ms);
-        let mut all: Vec<f64> = images[1..].iter().map(|image| of(&image.times)).collect();
-        all.sort_by(f64::total_cmp);
-        (name, all[all.len() / 2])
+        let pass_time =
+            |passes: &[(&'static str, f64)]| passes.iter().find(|pass| pass.0 == name).map_or(0.0, |pass| pass.1);
+        let mut times: Vec<f64> = images[1..].iter().map(|image| pass_time(&image.passes)).collect();
+        times.sort_by(f64::total_cmp);
+        (name, times[times.len() / 2])
     };
     let passes = ["shadow", "blur", "cull", "visibility", "blended", "draw"].map(median).to_vec();
     let culled = renderer.stats().culled;
@@ -54,11 +58,15 @@ fn real_almond_with_culling_is_the_same_picture() {
             shadow: Some(ShadowSettings { size: 2048, ..ShadowSettings::default() }),
             ..scene.look
         };
-        let mut plain = None;
+        let mut unculled_image = None;
         for culling in [Culling::None, Culling::Triangles, Culling::Occlusion] {
-            let (rgba, passes, culled) = frames(&mut renderer, &under(&scene, RenderSettings { culling, ..look }));
+            let (rgba, passes, culled) =
+                draw_frames(&mut renderer, &with_look(&scene, RenderSettings { culling, ..look }));
             println!("{transparency:?}, {culling:?}: {passes:.3?} {culled:?}");
-            assert!(plain.get_or_insert_with(|| rgba.clone()) == &rgba, "{culling:?} changes the picture");
+            assert!(
+                unculled_image.get_or_insert_with(|| rgba.clone()) == &rgba,
+                "{culling:?}: expected the image without culling"
+            );
             assert_eq!(culled.is_some_and(|culled| culled.camera.culled() > 0), culling != Culling::None);
         }
     }

@@ -1,4 +1,4 @@
-//! Pictures ten thousand kilometers from the scene origin equal those at the origin.
+//! Images ten thousand kilometers from the scene origin equal those at the origin.
 
 use std::sync::Arc;
 
@@ -15,21 +15,21 @@ use modalcast_render::FrameImage;
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh};
 
 /// Far position: not on the grid of origin cells, and not representable in f32.
-const AWAY: [f64; 3] = [1e7 + 1.3, 0.0, -1e7 - 2.7];
+const FAR_POSITION: [f64; 3] = [1e7 + 1.3, 0.0, -1e7 - 2.7];
 
-fn bench() -> DeviceContext {
+fn open_context() -> DeviceContext {
     DeviceContext::open(&Config { backend: BackendChoice::Cpu, ..Config::default() }).expect("expected a renderer")
 }
 
 /// The rest state with some domains moved by an f64 translation.
-fn moved(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> SceneState {
-    let one = || {
+fn move_domains(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> SceneState {
+    let transform_bytes = || {
         let rotation = [0.0, 0.0, 0.0, 1.0_f32].into_iter().flat_map(f32::to_le_bytes);
         rotation.chain([x, y, z].into_iter().flat_map(f64::to_le_bytes))
     };
     let raw = RawStepUpdate {
         transform_domains: domains.to_vec(),
-        transforms: domains.iter().flat_map(|_| one()).collect(),
+        transforms: domains.iter().flat_map(|_| transform_bytes()).collect(),
         transform_format: TransformFormat::RigidF64,
         ..RawStepUpdate::default()
     };
@@ -39,29 +39,29 @@ fn moved(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> SceneState {
 }
 
 /// A camera that looks obliquely from above at a square around `at`.
-fn camera(at: [f64; 3]) -> Camera {
-    let eye = [at[0] + 1.7, at[1] + 2.1, at[2] + 3.3];
-    let view = View::LookAt { eye, target: [at[0], at[1] + 0.2, at[2]], up: [0.0, 1.0, 0.0] };
+fn camera_at(target: [f64; 3]) -> Camera {
+    let eye = [target[0] + 1.7, target[1] + 2.1, target[2] + 3.3];
+    let view = View::LookAt { eye, target: [target[0], target[1] + 0.2, target[2]], up: [0.0, 1.0, 0.0] };
     Camera { view, lens: Lens::FieldOfView(40.0), near: 0.0, far: 0.0 }
 }
 
-fn picture(bench: &mut DeviceContext, scene: &Arc<Scene>, state: &SceneState, camera: &Camera) -> FrameImage {
-    let mut staged = bench.load_scene(scene, BackendSettings::default()).expect("expected the scene to load");
-    staged.deform(state).expect("expected the step to succeed");
-    let image = bench.draw(&mut staged, camera, FrameSize::new(96, 96)).expect("expected a frame");
-    bench.unload_scene(staged);
+fn draw_frame(context: &mut DeviceContext, scene: &Arc<Scene>, state: &SceneState, camera: &Camera) -> FrameImage {
+    let mut loaded_scene = context.load_scene(scene, BackendSettings::default()).expect("expected the scene to load");
+    loaded_scene.deform(state).expect("expected the step to succeed");
+    let image = context.draw(&mut loaded_scene, camera, FrameSize::new(96, 96)).expect("expected a frame");
+    context.unload_scene(loaded_scene);
     image
 }
 
-/// Largest difference of two pictures in levels, and number of pixels that differ by more than one level.
-fn difference(one: &FrameImage, other: &FrameImage) -> (u8, usize) {
-    let pairs = one.rgba.chunks_exact(4).zip(other.rgba.chunks_exact(4));
+/// Largest difference of two images in levels, and number of pixels that differ by more than one level.
+fn max_difference(left: &FrameImage, right: &FrameImage) -> (u8, usize) {
+    let pairs = left.rgba.chunks_exact(4).zip(right.rgba.chunks_exact(4));
     let levels = |(a, b): (&[u8], &[u8])| a.iter().zip(b).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
-    pairs.map(levels).fold((0, 0), |(most, count), levels| (most.max(levels), count + usize::from(levels > 1)))
+    pairs.map(levels).fold((0, 0), |(max, count), levels| (max.max(levels), count + usize::from(levels > 1)))
 }
 
 /// A table over the ground, with the default look and the given shadow.
-fn table(shadow: Option<ShadowSettings>) -> Arc<Scene> {
+fn table_scene(shadow: Option<ShadowSettings>) -> Arc<Scene> {
     let mut builder = SceneBuilder::new();
     builder.parts.look = RenderSettings { shadow, ..RenderSettings::default() };
     builder
@@ -70,66 +70,78 @@ fn table(shadow: Option<ShadowSettings>) -> Arc<Scene> {
         .build()
 }
 
-/// With ground and every kind of shadow map.
+/// The scene has a ground and every kind of shadow map.
 #[test]
 fn far_scene_renders_like_the_scene_at_the_origin() {
-    let mut bench = bench();
+    let mut context = open_context();
     // Texels of a shadow map are aligned to a grid, so the edge of a shadow looks the same only after a move by
     // multiples of the grid.
     let on_grid = [9766.0 * ORIGIN_GRID, 0.0, -9767.0 * ORIGIN_GRID];
     // Off the grid, positions round differently, by 1/500 pixel. A sample closer than that to an edge may change sides,
     // which affects at most one pixel in a thousand.
     let base = ShadowSettings::default();
-    let kinds = [
+    let cases = [
         (Some(base), on_grid, 0),
         (Some(ShadowSettings { method: ShadowMethod::Standard, ..base }), on_grid, 0),
         (Some(ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }), on_grid, 0),
         (Some(ShadowSettings { splits: 3, ..base }), on_grid, 0),
-        (None, AWAY, 9),
+        (None, FAR_POSITION, 9),
     ];
-    for (shadow, at, edges) in kinds {
-        let scene = table(shadow);
-        let home = picture(&mut bench, &scene, &SceneState::rest(&scene), &camera([0.0; 3]));
-        let away = moved(&scene, &[0, 1], at);
-        assert!(away.origins.as_ref().is_some_and(|origins| origins.is_uniform()));
-        let far = picture(&mut bench, &scene, &away, &camera(at));
-        let (most, count) = difference(&home, &far);
-        assert!(count <= edges, "{count} pixels at {at:?}, by {most} levels at most");
+    for (shadow, position, max_different) in cases {
+        let scene = table_scene(shadow);
+        let home_frame = draw_frame(&mut context, &scene, &SceneState::rest(&scene), &camera_at([0.0; 3]));
+        let far_state = move_domains(&scene, &[0, 1], position);
+        assert!(far_state.origins.as_ref().is_some_and(|origins| origins.is_uniform()));
+        let far_frame = draw_frame(&mut context, &scene, &far_state, &camera_at(position));
+        let (max, count) = max_difference(&home_frame, &far_frame);
+        assert!(count <= max_different, "{count} pixels at {position:?}, by {max} levels at most");
     }
-    let scene = table(None);
-    let home = picture(&mut bench, &scene, &SceneState::rest(&scene), &camera([0.0; 3]));
-    let away = moved(&scene, &[0, 1], AWAY);
-    // Controls: a camera position rounded to f32 gives another picture, and so does a camera moved by 0.1 units.
-    let rounded = AWAY.map(|number| f64::from(number as f32));
-    assert!(difference(&home, &picture(&mut bench, &scene, &away, &camera(rounded))).0 > 8);
-    assert!(difference(&home, &picture(&mut bench, &scene, &away, &camera([AWAY[0] + 0.1, 0.0, AWAY[2]]))).0 > 8);
+    let scene = table_scene(None);
+    let home_frame = draw_frame(&mut context, &scene, &SceneState::rest(&scene), &camera_at([0.0; 3]));
+    let far_state = move_domains(&scene, &[0, 1], FAR_POSITION);
+    // Negative controls: a camera position rounded to f32, and a camera moved by 0.1 units.
+    let rounded = FAR_POSITION.map(|number| f64::from(number as f32));
+    assert!(max_difference(&home_frame, &draw_frame(&mut context, &scene, &far_state, &camera_at(rounded))).0 > 8);
+    assert!(
+        max_difference(
+            &home_frame,
+            &draw_frame(&mut context, &scene, &far_state, &camera_at([FAR_POSITION[0] + 0.1, 0.0, FAR_POSITION[2]]))
+        )
+        .0 > 8
+    );
 }
 
-/// Two domains are far apart. A camera near either one sees that domain alone.
+/// A camera near one of two distant domains sees only that domain.
 #[test]
 fn distant_domains_are_seen_by_nearby_cameras() {
-    let mut bench = bench();
+    let mut context = open_context();
     let square = |z: f32| facing_rectangle(-0.7, -0.3, 0.6, 0.9, z);
     let red = Material { diffuse: [1.0, 0.1, 0.1], ambient: [1.0, 0.1, 0.1], ..Material::default() };
     let scene =
         SceneBuilder::new().add_domain(square(0.0), Material::default()).add_domain(square(-0.1), red.clone()).build();
-    let alone = |material: Material, z| SceneBuilder::new().add_domain(square(z), material).build();
-    let (gray, red) = (alone(Material::default(), 0.0), alone(red, -0.1));
-    let mut at_rest = |scene: &Arc<Scene>| picture(&mut bench, scene, &SceneState::rest(scene), &camera([0.0; 3]));
-    let (gray, red, both) = (at_rest(&gray), at_rest(&red), at_rest(&scene));
-    let apart = moved(&scene, &[1], AWAY);
-    assert!(apart.origins.as_ref().is_some_and(|origins| !origins.is_uniform()));
-    let mut staged = bench.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
-    let mut seen = |state: &SceneState, at| {
-        staged.deform(state).expect("expected the step to succeed");
-        let image = bench.draw(&mut staged, &camera(at), FrameSize::new(96, 96)).expect("expected a frame");
-        [&gray, &red, &both].map(|want| difference(&image, want).0)
+    let single_domain_scene = |material: Material, z| SceneBuilder::new().add_domain(square(z), material).build();
+    let (gray, red) = (single_domain_scene(Material::default(), 0.0), single_domain_scene(red, -0.1));
+    let mut draw_at_rest =
+        |scene: &Arc<Scene>| draw_frame(&mut context, scene, &SceneState::rest(scene), &camera_at([0.0; 3]));
+    let (gray, red, both_frame) = (draw_at_rest(&gray), draw_at_rest(&red), draw_at_rest(&scene));
+    let separated = move_domains(&scene, &[1], FAR_POSITION);
+    assert!(separated.origins.as_ref().is_some_and(|origins| !origins.is_uniform()));
+    let mut loaded_scene = context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
+    let mut compare_with_single = |state: &SceneState, index| {
+        loaded_scene.deform(state).expect("expected the step to succeed");
+        let image =
+            context.draw(&mut loaded_scene, &camera_at(index), FrameSize::new(96, 96)).expect("expected a frame");
+        [&gray, &red, &both_frame].map(|want| max_difference(&image, want).0)
     };
-    let is_only = |levels: [u8; 3], which: usize| (0..3).all(|at| (levels[at] <= 1) == (at == which));
-    // Twice, because no frame may contain remains of an earlier one.
+    let is_only = |levels: [u8; 3], expected: usize| (0..3).all(|index| (levels[index] <= 1) == (index == expected));
+    // Twice, because no frame may contain pixels of an earlier frame.
     for _ in 0..2 {
-        let levels = [seen(&apart, AWAY), seen(&apart, [0.0; 3]), seen(&SceneState::rest(&scene), [0.0; 3])];
+        let levels = [
+            compare_with_single(&separated, FAR_POSITION),
+            compare_with_single(&separated, [0.0; 3]),
+            compare_with_single(&SceneState::rest(&scene), [0.0; 3]),
+        ];
         assert!(is_only(levels[0], 1) && is_only(levels[1], 0) && is_only(levels[2], 2), "{levels:?}");
     }
-    bench.unload_scene(staged);
+    context.unload_scene(loaded_scene);
 }

@@ -1,17 +1,17 @@
-//! Unused features allocate and run nothing; extreme sizes, cameras and vertices; determinism.
+//! Unused features allocate and run nothing. Frames of extreme sizes, cameras and vertices are valid and deterministic.
 
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh, Transform};
 use modalcast_model::scene::{Bounds, Camera, RenderSettings, SceneState, View};
-use modalcast_render::{DevicePreference, FrameParams, Pass, Renderer, devices, plan};
+use modalcast_render::{DevicePreference, FrameParams, Renderer, devices, plan};
 
 use super::harness::{
     SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer, planned_passes_above_ground, render,
     render_square,
 };
 
-fn full() -> SceneBuilder {
+fn default_look_builder() -> SceneBuilder {
     let mut builder = SceneBuilder::new();
     builder.parts.look = RenderSettings::default();
     builder
@@ -20,50 +20,47 @@ fn full() -> SceneBuilder {
 /// Allocated buffers and executed passes equal the plan of the scene.
 #[test]
 fn unused_features_allocate_and_run_nothing() {
-    let plain = render(&full().add_domain(floor_mesh(1.0, -0.5), Material::default()).build());
-    let names = |list: &[modalcast_render::Allocation]| {
-        list.iter().map(|allocation| allocation.name.clone()).collect::<Vec<_>>()
+    let plain_frame = render(&default_look_builder().add_domain(floor_mesh(1.0, -0.5), Material::default()).build());
+    let names = |allocations: &[modalcast_render::Allocation]| {
+        allocations.iter().map(|allocation| allocation.name.clone()).collect::<Vec<_>>()
     };
-    for absent in ["tangents", "uvs", "triangle materials"] {
-        assert!(!names(&plain.allocations).contains(&absent.to_string()), "{absent}");
+    for name in ["tangents", "uvs", "triangle materials"] {
+        assert!(!names(&plain_frame.allocations).contains(&name.to_string()), "{name}");
     }
-    assert_eq!(
-        plain.stats.passes,
-        [Pass::Shadow, Pass::Blur, Pass::Visibility, Pass::Background, Pass::Shade, Pass::Encode]
-    );
+    assert_eq!(plain_frame.stats.passes, ["shadow", "blur", "visibility", "background", "shade", "encode"]);
 
-    let mut builder = full();
+    let mut builder = default_look_builder();
     let image = builder.add_texture(1, 1, |_, _| [128, 128, 255, 255]);
-    let mapped = Material { normal_texture: Some(image), ..Material::default() };
+    let normal_mapped = Material { normal_texture: Some(image), ..Material::default() };
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.5, ..Material::default() };
-    let mut builder = builder.add_domain(floor_mesh(1.0, -0.5), mapped).add_domain(floor_mesh(1.0, -0.3), glass);
+    let mut builder = builder.add_domain(floor_mesh(1.0, -0.5), normal_mapped).add_domain(floor_mesh(1.0, -0.3), glass);
     for index in 0..8 {
         builder = builder.add_domain(floor_mesh(0.1, -0.2 + 0.01 * index as f32), Material::default());
     }
     let scene = builder.build();
-    let rich = render(&scene);
-    for present in ["tangents", "uvs", "triangle materials"] {
-        assert!(names(&rich.allocations).contains(&present.to_string()), "{present}");
+    let full_frame = render(&scene);
+    for name in ["tangents", "uvs", "triangle materials"] {
+        assert!(names(&full_frame.allocations).contains(&name.to_string()), "{name}");
     }
     assert_eq!(
-        rich.stats.passes,
+        full_frame.stats.passes,
         [
-            Pass::Shadow,
-            Pass::Blur,
-            Pass::Visibility,
-            Pass::OitCount,
-            Pass::OitAllocate,
-            Pass::OitFill,
-            Pass::OitResolve,
-            Pass::Background,
-            Pass::Shade,
-            Pass::Encode
+            "shadow",
+            "blur",
+            "visibility",
+            "oit count",
+            "oit allocate",
+            "oit fill",
+            "oit resolve",
+            "background",
+            "shade",
+            "encode"
         ]
     );
     let mut planned = plan(&scene).buffers;
     planned.sort_by(|a, b| a.name.cmp(&b.name));
-    assert_eq!(rich.allocations, planned, "what is planned is what is allocated");
-    assert_eq!(rich.stats.passes, planned_passes_above_ground(&scene), "what is planned is what runs");
+    assert_eq!(full_frame.allocations, planned, "expected the planned allocations");
+    assert_eq!(full_frame.stats.passes, planned_passes_above_ground(&scene), "expected the planned passes");
 }
 
 #[test]
@@ -83,23 +80,23 @@ fn draw_calls_do_not_grow_with_domains_and_materials() {
 }
 
 #[test]
-fn empty_and_oversized_frames_are_refused() {
+fn empty_and_oversized_frames_are_rejected() {
     let scene =
         SceneBuilder::new().add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).build();
     let mut renderer = open_renderer();
     let buffers = renderer.load(&scene).expect("expected the scene to load");
     let limit = renderer.info().max_side;
     for (width, height) in [(0, 0), (0, 5), (5, 0), (limit + 1, 1), (16384, 16384), (u32::MAX, u32::MAX)] {
-        let shot = FrameParams { camera: front_camera(64), width, height, bounds: scene.rest_bounds, light: None };
-        let refusal = renderer.draw(&buffers, &shot).expect_err("refused").to_string();
+        let params = FrameParams { camera: front_camera(64), width, height, bounds: scene.rest_bounds, light: None };
+        let error = renderer.draw(&buffers, &params).expect_err("expected an invalid-size error").to_string();
         let expected = format!("frame.size: expected 1 to {limit} pixels a side, got {width} x {height}");
-        assert_eq!(refusal, expected);
+        assert_eq!(error, expected);
     }
-    let shot = FrameParams { camera: front_camera(64), width: 1, height: 1, bounds: scene.rest_bounds, light: None };
-    assert_eq!(renderer.draw(&buffers, &shot).expect("one pixel is a frame").rgba.len(), 4);
+    let params = FrameParams { camera: front_camera(64), width: 1, height: 1, bounds: scene.rest_bounds, light: None };
+    assert_eq!(renderer.draw(&buffers, &params).expect("expected a frame of one pixel").rgba.len(), 4);
 }
 
-/// Cut-outs stay cut out.
+/// A frame too large for multisampling is drawn with one sample per pixel, and cut-outs stay transparent.
 #[test]
 fn frame_too_large_for_msaa_is_drawn_with_one_sample() {
     let mut builder = SceneBuilder::new();
@@ -109,16 +106,16 @@ fn frame_too_large_for_msaa_is_drawn_with_one_sample() {
     let scene = builder.add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), leaf).build();
     let mut renderer = open_renderer();
     let side = 3400;
-    let mut wide = front_camera(side);
-    wide.lens = modalcast_model::scene::Lens::FieldOfView(12.0);
-    let shown = render_square(&mut renderer, &scene, wide, side);
-    assert_eq!(shown.stats.samples, 1);
-    assert!(shown.pixel(side / 2 - 700, side / 2) == [0; 3] && shown.pixel(side / 2 + 700, side / 2) != [0; 3]);
+    let mut camera = front_camera(side);
+    camera.lens = modalcast_model::scene::Lens::FieldOfView(12.0);
+    let frame = render_square(&mut renderer, &scene, camera, side);
+    assert_eq!(frame.stats.samples, 1);
+    assert!(frame.pixel(side / 2 - 700, side / 2) == [0; 3] && frame.pixel(side / 2 + 700, side / 2) != [0; 3]);
 }
 
 #[test]
 fn frames_are_deterministic() {
-    let scene = full()
+    let scene = default_look_builder()
         .add_domain(floor_mesh(1.0, 0.5), Material::default())
         .add_domain(floor_mesh(0.5, 1.0), Material::default())
         .build();
@@ -132,103 +129,110 @@ fn frames_are_deterministic() {
             == render_square(&mut open_renderer(), &scene, Camera::fit_to_scene(&scene, 64, 64), 96).image.rgba,
         "another context"
     );
-    let mut moved = Camera::fit_to_scene(&scene, 64, 64);
-    moved.lens = modalcast_model::scene::Lens::FieldOfView(33.0);
-    assert!(first.image.rgba != render_square(&mut renderer, &scene, moved, 96).image.rgba, "control");
+    let mut other_camera = Camera::fit_to_scene(&scene, 64, 64);
+    other_camera.lens = modalcast_model::scene::Lens::FieldOfView(33.0);
+    assert!(first.image.rgba != render_square(&mut renderer, &scene, other_camera, 96).image.rgba, "negative control");
 }
 
 /// Triangles without area, a sun straight above, and a camera inside the mesh.
 #[test]
 fn degenerate_scenes_suns_and_cameras_are_drawn() {
-    let line = vec![[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.0]];
+    let collinear = vec![[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.0]];
     let triangles = vec![[0, 1, 2], [0, 0, 0], [0, 3, 1]];
-    let flat = Mesh::from_indexed(line, vec![[0.0, 0.0, 1.0]; 4], vec![], triangles).expect("degenerate, yet a mesh");
-    let mut builder = full();
+    let degenerate_mesh =
+        Mesh::from_indexed(collinear, vec![[0.0, 0.0, 1.0]; 4], vec![], triangles).expect("expected a valid mesh");
+    let mut builder = default_look_builder();
     builder.parts.look.sun = [0.0, 1.0, 0.0];
-    let scene =
-        builder.add_domain(flat, Material::default()).add_domain(floor_mesh(2.0, 0.5), Material::default()).build();
-    let shown = render(&scene);
-    assert!(shown.count_pixels(|pixel| pixel != shown.pixel(0, 0)) > 100);
+    let scene = builder
+        .add_domain(degenerate_mesh, Material::default())
+        .add_domain(floor_mesh(2.0, 0.5), Material::default())
+        .build();
+    let frame = render(&scene);
+    assert!(frame.count_pixels(|pixel| pixel != frame.pixel(0, 0)) > 100);
     let view = View::LookAt { eye: [0.1, 0.3, 0.1], target: [1.0, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
-    let inside =
+    let frame_from_inside =
         render_square(&mut open_renderer(), &scene, Camera { view, ..Camera::fit_to_scene(&scene, 64, 64) }, 64);
-    assert_eq!(inside.image.rgba.len(), 4 * 64 * 64);
+    assert_eq!(frame_from_inside.image.rgba.len(), 4 * 64 * 64);
 }
 
 #[test]
 fn overflowed_vertices_leave_no_black_pixels() {
-    let mut builder = full();
+    let mut builder = default_look_builder();
     builder.parts.look.horizon = [0.5; 3];
     let scene = builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()).build();
     let mut renderer = open_renderer();
     let buffers = renderer.load(&scene).expect("expected the scene to load");
-    for bad in [f32::NAN, f32::INFINITY, f32::MAX, -f32::MAX] {
+    for value in [f32::NAN, f32::INFINITY, f32::MAX, -f32::MAX] {
         let mut positions: Vec<f32> = scene.shapes[0].mesh.rest().as_flattened().to_vec();
-        positions[6..9].fill(bad);
+        positions[6..9].fill(value);
         let surface = DeformedSurface { positions, normals: [0.0, 0.0, 1.0].repeat(4), ..DeformedSurface::default() };
         renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
         let bounds = Bounds { min: [f64::NAN; 3], max: [f64::NAN; 3] };
-        let shot = FrameParams { camera: front_camera(64), width: 64, height: 64, bounds, light: None };
-        let image = renderer.draw(&buffers, &shot).expect("expected a frame");
-        assert!(image.rgba.chunks_exact(4).all(|pixel| pixel[..3] != [0; 3] && pixel[3] == 255), "{bad}");
+        let params = FrameParams { camera: front_camera(64), width: 64, height: 64, bounds, light: None };
+        let image = renderer.draw(&buffers, &params).expect("expected a frame");
+        assert!(image.rgba.chunks_exact(4).all(|pixel| pixel[..3] != [0; 3] && pixel[3] == 255), "{value}");
     }
-    let short = DeformedSurface { positions: vec![0.0; 3], ..DeformedSurface::default() };
-    let refusal = renderer.upload(&buffers, &short).expect_err("three numbers of twelve").to_string();
-    assert!(refusal.contains("3 numbers of positions, 12 expected"), "{refusal}");
+    let short_surface = DeformedSurface { positions: vec![0.0; 3], ..DeformedSurface::default() };
+    let error =
+        renderer.upload(&buffers, &short_surface).expect_err("expected an error for 3 of 12 numbers").to_string();
+    assert!(error.contains("3 numbers of positions, 12 expected"), "{error}");
 }
 
 #[test]
 fn scene_far_from_the_origin_is_rendered() {
-    let mut parts = full()
+    let mut parts = default_look_builder()
         .add_domain(floor_mesh(1.0, 1.0), Material::default())
         .add_domain(floor_mesh(0.5, 0.0), Material::default())
         .parts;
     for domain in &mut parts.domains {
-        let mut place = Transform::IDENTITY;
-        (place.0[3], place.0[7], place.0[11]) = (1e7, 1e7, -1e7);
-        domain.placement = place;
+        let mut placement = Transform::IDENTITY;
+        (placement.0[3], placement.0[7], placement.0[11]) = (1e7, 1e7, -1e7);
+        domain.placement = placement;
     }
     let scene = SceneBuilder { parts }.build();
-    let shown = render_square(&mut open_renderer(), &scene, Camera::fit_to_scene(&scene, 64, 64), 64);
-    assert_eq!(shown.image.rgba.len(), 4 * 64 * 64);
+    let frame = render_square(&mut open_renderer(), &scene, Camera::fit_to_scene(&scene, 64, 64), 64);
+    assert_eq!(frame.image.rgba.len(), 4 * 64 * 64);
 }
 
 #[test]
 fn renderers_work_on_many_threads_and_two_on_one() {
     let draw_one = || {
-        let scene = full().add_domain(floor_mesh(1.0, 0.5), Material::default()).build();
+        let scene = default_look_builder().add_domain(floor_mesh(1.0, 0.5), Material::default()).build();
         render_square(&mut open_renderer(), &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba
     };
     let first = draw_one();
     let threads: Vec<_> = (0..4).map(|_| std::thread::spawn(move || [draw_one(), draw_one()])).collect();
     for thread in threads {
-        assert!(thread.join().expect("lives").iter().all(|bytes| *bytes == first));
+        assert!(thread.join().expect("expected the thread not to panic").iter().all(|bytes| *bytes == first));
     }
-    let (mut left, mut right) = (open_renderer(), open_renderer());
-    let scene = full().add_domain(floor_mesh(1.0, 0.5), Material::default()).build();
-    let buffers = left.load(&scene).expect("expected the scene to load");
-    assert!(render_square(&mut right, &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba == first);
-    drop(right);
+    let (mut first_renderer, mut second_renderer) = (open_renderer(), open_renderer());
+    let scene = default_look_builder().add_domain(floor_mesh(1.0, 0.5), Material::default()).build();
+    let buffers = first_renderer.load(&scene).expect("expected the scene to load");
+    assert!(render_square(&mut second_renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba == first);
+    drop(second_renderer);
     let mut deformer = ReferenceDeformer::new(&scene);
     let bounds = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed").bounds;
-    left.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
-    let shot = FrameParams { camera: Camera::fit_to_scene(&scene, 64, 64), width: 32, height: 32, bounds, light: None };
+    first_renderer
+        .upload(&buffers, deformer.surface().expect("expected a surface"))
+        .expect("expected the upload to succeed");
+    let params =
+        FrameParams { camera: Camera::fit_to_scene(&scene, 64, 64), width: 32, height: 32, bounds, light: None };
     assert!(
-        left.draw(&buffers, &shot).expect("expected a frame").rgba == first,
-        "two contexts on one thread keep apart"
+        first_renderer.draw(&buffers, &params).expect("expected a frame").rgba == first,
+        "expected independent contexts on one thread"
     );
 }
 
 #[test]
-fn devices_are_listed_and_missing_ones_refused() {
-    let found = devices().expect("expected libEGL");
-    assert!(found.iter().any(|device| device.renderer.is_some()), "{found:?}");
-    for device in &found {
+fn devices_are_listed_and_unknown_ones_rejected() {
+    let devices_found = devices().expect("expected libEGL");
+    assert!(devices_found.iter().any(|device| device.renderer.is_some()), "{devices_found:?}");
+    for device in &devices_found {
         assert_eq!(device.renderer.is_none(), device.problem.is_some(), "{device:?}");
     }
-    let refusal = Renderer::open(DevicePreference::Cuda(4711)).expect_err("no such device").to_string();
-    assert!(refusal.contains("CUDA device 4711") && refusal.contains("10_nvidia.json"), "{refusal}");
-    if found.iter().any(|device| device.software && device.renderer.is_some()) {
-        assert!(Renderer::open(DevicePreference::Software).expect("software").info().software);
+    let error = Renderer::open(DevicePreference::Cuda(4711)).expect_err("expected an unknown-device error").to_string();
+    assert!(error.contains("CUDA device 4711") && error.contains("10_nvidia.json"), "{error}");
+    if devices_found.iter().any(|device| device.software && device.renderer.is_some()) {
+        assert!(Renderer::open(DevicePreference::Software).expect("expected a software renderer").info().software);
     }
 }

@@ -11,9 +11,8 @@ use nalgebra::Vector3;
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer};
 
-/// Ids are those of the frame unless an edge passes a sample by less than the rasterizer's 1/256 pixel. The hit
-/// position is computed in f64 on the f32 triangle, so in these scenes it is correct to a millionth of a unit.
-const NEAR: f64 = 1e-6;
+/// Tolerance of hit positions in units. They are computed in f64 on the f32 triangle.
+const TOLERANCE: f64 = 1e-6;
 
 struct PickHarness {
     renderer: Renderer,
@@ -22,38 +21,40 @@ struct PickHarness {
 }
 
 impl PickHarness {
-    fn of(scene: &Arc<Scene>, state: &SceneState) -> Self {
+    fn with_state(scene: &Arc<Scene>, state: &SceneState) -> Self {
         let mut renderer = open_renderer();
         let mut deformer = ReferenceDeformer::new(scene);
         let bounds = deformer.deform(state).expect("expected the step to succeed").bounds;
         let buffers = renderer.load(scene).expect("expected the scene to load");
-        renderer.upload(&buffers, deformer.surface().expect("there")).expect("expected the upload to succeed");
+        renderer
+            .upload(&buffers, deformer.surface().expect("expected a surface"))
+            .expect("expected the upload to succeed");
         Self { renderer, buffers, bounds }
     }
 
-    fn rest(scene: &Arc<Scene>) -> Self {
-        Self::of(scene, &SceneState::rest(scene))
+    fn at_rest(scene: &Arc<Scene>) -> Self {
+        Self::with_state(scene, &SceneState::rest(scene))
     }
 
-    fn shot(&self, camera: Camera, size: u32) -> FrameParams {
+    fn frame_params(&self, camera: Camera, size: u32) -> FrameParams {
         FrameParams { camera, width: size, height: size, bounds: self.bounds, light: None }
     }
 
-    /// Hits of a rectangle of a square picture, given by its corner and size.
-    fn pick(&mut self, camera: Camera, picture: u32, corner: [u32; 2], size: [u32; 2]) -> Vec<PickHit> {
-        let rectangle = PixelRect::within([picture; 2], corner, size).expect("inside");
-        let shot = self.shot(camera, picture);
-        let pick = self.renderer.begin_pick(&self.buffers, &shot, rectangle).expect("expected a readback to start");
-        self.renderer.finish_pick(pick).expect("ends")
+    /// Hits in a rectangle of a square image, given by its corner and size.
+    fn pick(&mut self, camera: Camera, image_size: u32, corner: [u32; 2], size: [u32; 2]) -> Vec<PickHit> {
+        let rectangle = PixelRect::within([image_size; 2], corner, size).expect("expected a valid rectangle");
+        let frame_params = self.frame_params(camera, image_size);
+        let pick = self.renderer.begin_pick(&self.buffers, &frame_params, rectangle).expect("expected a pick to start");
+        self.renderer.finish_pick(pick).expect("expected hits")
     }
 }
 
-fn off(got: [f64; 3], want: [f64; 3]) -> f64 {
+fn max_difference(got: [f64; 3], want: [f64; 3]) -> f64 {
     (Vector3::from(got) - Vector3::from(want)).abs().max()
 }
 
 /// Intersection of the ray through the center of a pixel of [`front_camera`]`(64)` with the plane z = 0.
-fn at(x: u32, y: u32) -> [f64; 3] {
+fn plane_point(x: u32, y: u32) -> [f64; 3] {
     [(f64::from(x) + 0.5 - 32.0) / 10.0, (32.0 - f64::from(y) - 0.5) / 10.0, 0.0]
 }
 
@@ -61,15 +62,19 @@ fn at(x: u32, y: u32) -> [f64; 3] {
 fn pick_has_domain_triangle_position_normal_and_depth() {
     let builder = SceneBuilder::new().add_domain(facing_rectangle(-3.0, -3.0, -2.5, -2.5, 0.0), Material::default());
     let scene = builder.add_domain(facing_rectangle(-2.0, -1.0, 2.0, 1.0, 0.0), Material::default()).build();
-    let hits = PickHarness::rest(&scene).pick(front_camera(64), 64, [40, 30], [1, 1]);
+    let hits = PickHarness::at_rest(&scene).pick(front_camera(64), 64, [40, 30], [1, 1]);
     let [hit] = &hits[..] else { panic!("{hits:?}") };
-    let [x, y, _] = at(40, 30);
+    let [x, y, _] = plane_point(40, 30);
     assert_eq!((hit.pixel, hit.domain, hit.triangle, hit.vertices), ([40, 30], 1, 0, [0, 1, 2]));
-    assert!(off(hit.position, [x, y, 0.0]) < NEAR && off(hit.normal, [0.0, 0.0, 1.0]) < NEAR, "{hit:?}");
-    assert!((hit.depth - 10.0).abs() < NEAR);
+    assert!(
+        max_difference(hit.position, [x, y, 0.0]) < TOLERANCE
+            && max_difference(hit.normal, [0.0, 0.0, 1.0]) < TOLERANCE,
+        "{hit:?}"
+    );
+    assert!((hit.depth - 10.0).abs() < TOLERANCE);
     // Corners (-2, -1), (2, -1), (2, 1); the second barycentric coordinate is the remainder.
     let [first, third] = [(2.0 - x) / 4.0, (y + 1.0) / 2.0];
-    assert!(off(hit.barycentrics, [first, 1.0 - first - third, third]) < NEAR, "{hit:?}");
+    assert!(max_difference(hit.barycentrics, [first, 1.0 - first - third, third]) < TOLERANCE, "{hit:?}");
 }
 
 /// A hit on the back side has a flipped normal.
@@ -79,16 +84,19 @@ fn mirrored_domains_keep_vertex_order_in_picks() {
     let mut builder = SceneBuilder::new().add_domain(facing_rectangle(-2.0, -1.0, 2.0, 1.0, 0.0), double_sided);
     builder.parts.domains[0].placement.0[0] = -1.0;
     let scene = builder.build();
-    let mut board = PickHarness::rest(&scene);
-    let hit = board.pick(front_camera(64), 64, [24, 34], [1, 1]).remove(0);
+    let mut harness = PickHarness::at_rest(&scene);
+    let hit = harness.pick(front_camera(64), 64, [24, 34], [1, 1]).remove(0);
     // The point on the mesh is mirrored in x.
-    let [x, y, _] = at(24, 34);
+    let [x, y, _] = plane_point(24, 34);
     assert_eq!(hit.vertices, [0, 1, 2]);
-    assert!(off(hit.barycentrics, [(2.0 + x) / 4.0, 1.0 - (2.0 + x) / 4.0 - (y + 1.0) / 2.0, (y + 1.0) / 2.0]) < NEAR);
-    let behind = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
-    for (view, z) in [(front_camera(64).view, 1.0), (behind, -1.0)] {
-        let hit = board.pick(Camera { view, ..front_camera(64) }, 64, [30, 30], [1, 1]).remove(0);
-        assert!(off(hit.normal, [0.0, 0.0, z]) < NEAR, "{hit:?}");
+    assert!(
+        max_difference(hit.barycentrics, [(2.0 + x) / 4.0, 1.0 - (2.0 + x) / 4.0 - (y + 1.0) / 2.0, (y + 1.0) / 2.0])
+            < TOLERANCE
+    );
+    let view_from_behind = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
+    for (view, z) in [(front_camera(64).view, 1.0), (view_from_behind, -1.0)] {
+        let hit = harness.pick(Camera { view, ..front_camera(64) }, 64, [30, 30], [1, 1]).remove(0);
+        assert!(max_difference(hit.normal, [0.0, 0.0, z]) < TOLERANCE, "{hit:?}");
     }
 }
 
@@ -102,122 +110,141 @@ fn pick_follows_the_deformed_surface() {
     let mut state = SceneState::rest(&scene);
     for q in [0.0, 2.0, -3.0_f32] {
         state.q[0] = q;
-        let hit = PickHarness::of(&scene, &state).pick(front_camera(64), 64, [36, 27], [1, 1]).remove(0);
-        let (z, [x, y, _]) = (f64::from(q), at(36, 27));
+        let hit = PickHarness::with_state(&scene, &state).pick(front_camera(64), 64, [36, 27], [1, 1]).remove(0);
+        let (z, [x, y, _]) = (f64::from(q), plane_point(36, 27));
         // The ray from (0, 0, 10) meets the plane at this z instead of the plane z = 0.
         let want = [x * (10.0 - z) / 10.0, y * (10.0 - z) / 10.0, z];
-        assert!(off(hit.position, want) < NEAR && (hit.depth - 10.0 + z).abs() < NEAR, "{q}: {hit:?}");
+        assert!(
+            max_difference(hit.position, want) < TOLERANCE && (hit.depth - 10.0 + z).abs() < TOLERANCE,
+            "{q}: {hit:?}"
+        );
     }
 }
 
-/// For rectangles of the largest size and at the border of the picture.
+/// Rectangles of the largest size and at the border of the image.
 #[test]
 fn picks_agree_with_the_visibility_of_the_frame() {
     let mut builder = SceneBuilder::new();
     builder.parts.look.samples = 1;
     builder.parts.look.ground = Some(Ground::default());
     let image = builder.add_texture(8, 8, |x, y| [200, 200, 200, if (x + y) % 2 == 0 { 255 } else { 0 }]);
-    let leaf =
+    let cut_out_material =
         Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, color_texture: Some(image), ..Material::default() };
     let scene = builder
         .add_domain(floor_mesh(3.0, 0.0), Material::default())
-        .add_domain(facing_rectangle(-1.5, 0.3, 1.5, 2.5, 0.4), leaf)
+        .add_domain(facing_rectangle(-1.5, 0.3, 1.5, 2.5, 0.4), cut_out_material)
         .add_domain(facing_rectangle(-0.9, 0.2, 2.0, 1.1, -0.7), Material::default())
         .build();
-    let mut board = PickHarness::rest(&scene);
+    let mut harness = PickHarness::at_rest(&scene);
     let view = View::LookAt { eye: [3.0, 4.0, 9.0], target: [0.2, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
     for lens in [Lens::FieldOfView(40.0), Lens::Intrinsics { fx: 120.0, fy: 130.0, cx: 50.0, cy: 44.0 }] {
         let camera = Camera { view, lens, near: 0.0, far: 0.0 };
-        let shot = board.shot(camera, 100);
-        board.renderer.draw(&board.buffers, &shot).expect("expected a frame");
-        let frame = board.renderer.read_visibility().expect("reads");
-        let (mut differ, mut holes, mut seen) = (0, 0, [0; 3]);
+        let frame_params = harness.frame_params(camera, 100);
+        harness.renderer.draw(&harness.buffers, &frame_params).expect("expected a frame");
+        let frame_ids = harness.renderer.read_visibility().expect("expected visibility ids");
+        let (mut different, mut misses, mut hits_per_domain) = (0, 0, [0; 3]);
         for (corner, size) in [([0, 0], [64, 64]), ([64, 0], [36, 64]), ([0, 64], [64, 36]), ([64, 64], [36, 36])] {
-            let hits = board.pick(camera, 100, corner, size);
+            let hits = harness.pick(camera, 100, corner, size);
             for y in corner[1]..corner[1] + size[1] {
                 for x in corner[0]..corner[0] + size[0] {
-                    let want = match frame[(100 * y + x) as usize] {
-                        VisibilityId::Triangle(place) => board.buffers.source_triangle(place),
+                    let want = match frame_ids[(100 * y + x) as usize] {
+                        VisibilityId::Triangle(index) => harness.buffers.source_triangle(index),
                         _ => None,
                     };
                     let got = hits.iter().find(|hit| hit.pixel == [x, y]);
-                    differ += usize::from(got.map(|hit| (hit.domain, hit.triangle)) != want);
-                    holes += usize::from(got.is_none());
-                    got.into_iter().for_each(|hit| seen[hit.domain] += 1);
+                    different += usize::from(got.map(|hit| (hit.domain, hit.triangle)) != want);
+                    misses += usize::from(got.is_none());
+                    got.into_iter().for_each(|hit| hits_per_domain[hit.domain] += 1);
                 }
             }
         }
-        // An edge may pass a sample by less than the rasterizer's precision.
-        assert!(differ <= 5, "{differ} of 10000 pixels");
-        assert!(holes > 500 && seen.iter().all(|count| *count > 100), "control: {holes} {seen:?}");
+        // Ids may differ where an edge passes a sample within the rasterizer's precision of 1/256 pixel.
+        assert!(different <= 5, "{different} of 10000 pixels");
+        assert!(
+            misses > 500 && hits_per_domain.iter().all(|count| *count > 100),
+            "negative control: {misses} {hits_per_domain:?}"
+        );
     }
 }
 
-/// A surface behind a hole is hit.
+/// Holes of cut-outs, glass, sky and ground are not hit. A surface behind a hole is hit.
 #[test]
 fn holes_glass_sky_and_ground_are_not_hit() {
     let mut builder = SceneBuilder::new();
     let image = builder.add_texture(2, 1, |x, _| [200, 200, 200, if x == 0 { 255 } else { 0 }]);
-    let leaf =
+    let cut_out_material =
         Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, color_texture: Some(image), ..Material::default() };
-    let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.9, ..Material::default() };
+    let glass_material = Material { alpha_mode: AlphaMode::Blend, alpha: 0.9, ..Material::default() };
     // The leaf is solid on its left half and open on its right half. The glass covers the upper half, in front of it.
     let scene = builder
-        .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), leaf)
+        .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), cut_out_material)
         .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 0.0, -1.0), Material::default())
-        .add_domain(facing_rectangle(-2.0, 0.0, 2.0, 2.0, 1.0), glass)
+        .add_domain(facing_rectangle(-2.0, 0.0, 2.0, 2.0, 1.0), glass_material)
         .build();
-    let mut board = PickHarness::rest(&scene);
-    let mut at = |x: u32, y: u32| board.pick(front_camera(64), 64, [x, y], [1, 1]).first().map(|hit| hit.domain);
-    assert_eq!([at(22, 22), at(42, 22), at(42, 42), at(2, 2)], [Some(0), None, Some(1), None]);
-    let floor = Camera {
+    let mut harness = PickHarness::at_rest(&scene);
+    let mut picked_domain =
+        |x: u32, y: u32| harness.pick(front_camera(64), 64, [x, y], [1, 1]).first().map(|hit| hit.domain);
+    assert_eq!(
+        [picked_domain(22, 22), picked_domain(42, 22), picked_domain(42, 42), picked_domain(2, 2)],
+        [Some(0), None, Some(1), None]
+    );
+    let camera = Camera {
         view: View::LookAt { eye: [0.0, 2.0, 10.0], target: [0.0, -3.0, 0.0], up: [0.0, 1.0, 0.0] },
         ..front_camera(64)
     };
     let mut builder = SceneBuilder::new();
     builder.parts.look.ground = Some(Ground::default());
     let scene = builder.add_domain(facing_rectangle(-1.0, 0.0, 1.0, 1.0, 0.0), Material::default()).build();
-    assert!(PickHarness::rest(&scene).pick(floor, 64, [32, 60], [1, 1]).is_empty(), "the ground");
+    assert!(
+        PickHarness::at_rest(&scene).pick(camera, 64, [32, 60], [1, 1]).is_empty(),
+        "expected no hit on the ground"
+    );
 }
 
 #[test]
 fn concurrent_picks_finish_in_any_order() {
     let scene =
         SceneBuilder::new().add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), Material::default()).build();
-    let mut board = PickHarness::rest(&scene);
-    let shot = board.shot(front_camera(64), 64);
+    let mut harness = PickHarness::at_rest(&scene);
+    let frame_params = harness.frame_params(front_camera(64), 64);
     let picks: Vec<_> = (10..50)
         .map(|x| {
-            let rectangle = PixelRect::within([64; 2], [x, 20], [1, 1]).expect("inside");
-            (x, board.renderer.begin_pick(&board.buffers, &shot, rectangle).expect("expected a readback to start"))
+            let rectangle = PixelRect::within([64; 2], [x, 20], [1, 1]).expect("expected a valid rectangle");
+            (
+                x,
+                harness
+                    .renderer
+                    .begin_pick(&harness.buffers, &frame_params, rectangle)
+                    .expect("expected a pick to start"),
+            )
         })
         .collect();
-    board.renderer.draw(&board.buffers, &shot).expect("expected a frame");
+    harness.renderer.draw(&harness.buffers, &frame_params).expect("expected a frame");
     for (x, pick) in picks.into_iter().rev() {
-        let hits = board.renderer.finish_pick(pick).expect("ends");
-        assert!(off(hits[0].position, at(x, 20)) < NEAR, "{x}: {hits:?}");
+        let hits = harness.renderer.finish_pick(pick).expect("expected hits");
+        assert!(max_difference(hits[0].position, plane_point(x, 20)) < TOLERANCE, "{x}: {hits:?}");
     }
 }
 
-/// Normals that are zero or NaN give a zero normal.
+/// Picks of rebased scenes have world positions. Zero or NaN normals give a zero normal.
 #[test]
 fn picks_of_rebased_scenes_and_bad_normals_are_finite() {
     let scene =
         SceneBuilder::new().add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).build();
-    let mut board = PickHarness::rest(&scene);
-    let away = [1e7, 0.0, -1e7];
-    board.buffers.set_origin(away);
-    let view = View::LookAt { eye: [1e7, 0.0, 10.0 - 1e7], target: away, up: [0.0, 1.0, 0.0] };
-    let hit = board.pick(Camera { view, ..front_camera(64) }, 64, [36, 30], [1, 1]).remove(0);
-    let [x, y, _] = at(36, 30);
-    assert!(off(hit.position, [1e7 + x, y, -1e7]) < 2e-6, "{hit:?}");
-    board.buffers.set_origin([0.0; 3]);
+    let mut harness = PickHarness::at_rest(&scene);
+    let origin = [1e7, 0.0, -1e7];
+    harness.buffers.set_origin(origin);
+    let view = View::LookAt { eye: [1e7, 0.0, 10.0 - 1e7], target: origin, up: [0.0, 1.0, 0.0] };
+    let hit = harness.pick(Camera { view, ..front_camera(64) }, 64, [36, 30], [1, 1]).remove(0);
+    let [x, y, _] = plane_point(36, 30);
+    assert!(max_difference(hit.position, [1e7 + x, y, -1e7]) < 2e-6, "{hit:?}");
+    harness.buffers.set_origin([0.0; 3]);
     for normals in [[0.0_f32; 3], [f32::NAN; 3]] {
         let positions = scene.shapes[0].mesh.rest().as_flattened().to_vec();
         let surface =
             DeformedSurface { positions, normals: normals.repeat(4), tangents: vec![], ..DeformedSurface::default() };
-        board.renderer.upload(&board.buffers, &surface).expect("expected the upload to succeed");
-        let hit = board.pick(front_camera(64), 64, [30, 30], [1, 1]).remove(0);
+        harness.renderer.upload(&harness.buffers, &surface).expect("expected the upload to succeed");
+        let hit = harness.pick(front_camera(64), 64, [30, 30], [1, 1]).remove(0);
         assert_eq!(hit.normal.map(f64::abs), [0.0; 3]);
     }
 }
@@ -233,7 +260,7 @@ fn tiny_triangle_near_the_camera_is_picked() {
     let mut builder = SceneBuilder::new().add_domain(mesh.expect("expected a valid mesh"), Material::default());
     builder.parts.domains[0] = Domain { placement: Transform::IDENTITY, ..builder.parts.domains[0].clone() };
     let view = View::LookAt { eye: [2e-7, 2e-7, 2e-6], target: [2e-7, 2e-7, 0.0], up: [0.0, 1.0, 0.0] };
-    let near = Camera { view, near: 1e-6, far: 1e9, ..front_camera(64) };
-    let hit = PickHarness::rest(&builder.build()).pick(near, 64, [31, 31], [1, 1]).remove(0);
+    let camera = Camera { view, near: 1e-6, far: 1e9, ..front_camera(64) };
+    let hit = PickHarness::at_rest(&builder.build()).pick(camera, 64, [31, 31], [1, 1]).remove(0);
     assert!((hit.depth - 2e-6).abs() < 1e-12 && (hit.barycentrics.iter().sum::<f64>() - 1.0).abs() < 1e-12, "{hit:?}");
 }

@@ -1,5 +1,4 @@
-//! The definition of the compute rasterizer compared with OpenGL: ids differ only where depths tie or where a sample
-//! lies on an edge.
+//! The reference rasterizer compared with OpenGL: ids differ only where depths tie or where a sample lies on an edge.
 
 use std::sync::Arc;
 
@@ -16,21 +15,24 @@ use crate::common::exact_triangle::{ExactTriangle, compare_ids};
 use crate::scenes::Random;
 
 const SIZE: [u32; 2] = [320, 240];
-/// Depth precision: 24 bits of the depth range of the window, for each of the two rasterizers.
-const TIE: f64 = 2.0 / (1 << 24) as f64;
-/// Triangles of many sizes in one domain, around and behind the eye.
+/// Depths tie below this difference: each rasterizer has a depth precision of 24 bits.
+const DEPTH_TOLERANCE: f64 = 2.0 / (1 << 24) as f64;
+
+/// A scene of one domain with triangles of many sizes around and behind the eye, and its triangles.
 fn scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
     let mut random = Random(seed);
     let mut rest = Vec::new();
-    for at in 0..1500 {
-        let size = [0.02, 0.1, 0.5, 3.0][at % 4] * if at % 4 == 3 { f32::from(u8::from(at % 60 == 3)) } else { 1.0 };
-        let middle = random.next_triple().map(|number| 3.0 * number);
+    for index in 0..1500 {
+        let size =
+            [0.02, 0.1, 0.5, 3.0][index % 4] * if index % 4 == 3 { f32::from(u8::from(index % 60 == 3)) } else { 1.0 };
+        let center = random.next_triple().map(|number| 3.0 * number);
         for _ in 0..3 {
-            let aside = random.next_triple();
-            rest.push(std::array::from_fn(|axis| middle[axis] + size * aside[axis]));
+            let offset = random.next_triple();
+            rest.push(std::array::from_fn(|axis| center[axis] + size * offset[axis]));
         }
     }
-    let triangles: Vec<[u32; 3]> = (0..rest.len() as u32 / 3).map(|at| [3 * at, 3 * at + 1, 3 * at + 2]).collect();
+    let triangles: Vec<[u32; 3]> =
+        (0..rest.len() as u32 / 3).map(|index| [3 * index, 3 * index + 1, 3 * index + 2]).collect();
     let count = rest.len();
     let normals = vec![[0.0, 0.0, 1.0]; count];
     let mesh =
@@ -49,23 +51,24 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
         let camera = Camera { view, lens: Lens::FieldOfView(50.0), near: 0.1, far: 40.0 };
         let mut deformer = ReferenceDeformer::new(&scene);
         let bounds = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed").bounds;
-        let surface = deformer.surface().expect("there").clone();
+        let surface = deformer.surface().expect("expected a surface").clone();
         let buffers = renderer.load(&scene).expect("expected the scene to load");
         renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
         let [width, height] = SIZE;
         renderer.draw(&buffers, &FrameParams { camera, width, height, bounds, light: None }).expect("expected a frame");
         assert_eq!(renderer.stats().samples, 1);
-        let id = |seen: &VisibilityId| match seen {
-            VisibilityId::Triangle(place) => buffers.source_triangle(*place).map(|(_, triangle)| triangle as u32),
+        let source_triangle = |id: &VisibilityId| match id {
+            VisibilityId::Triangle(index) => buffers.source_triangle(*index).map(|(_, triangle)| triangle as u32),
             _ => None,
         };
-        let want: Vec<Option<u32>> = renderer.read_visibility().expect("reads").iter().map(id).collect();
+        let want: Vec<Option<u32>> =
+            renderer.read_visibility().expect("expected visibility ids").iter().map(source_triangle).collect();
         renderer.unload(buffers);
 
         let clip = camera.clip_from_camera(width, height, &bounds) * camera.camera_from_world();
         let corner = |vertex: u32| std::array::from_fn(|axis| surface.positions[3 * vertex as usize + axis]);
-        let exact: Vec<ExactTriangle> =
-            triangles.iter().map(|own| ExactTriangle::new(&clip, SIZE, own.map(corner))).collect();
+        let exact_triangles: Vec<ExactTriangle> =
+            triangles.iter().map(|triangle| ExactTriangle::new(&clip, SIZE, triangle.map(corner))).collect();
         let ids = |clip: &Matrix4<f64>| {
             let mut raster =
                 VisibilityBuffer::new(Viewport::new(clip, width, height).expect("expected a valid viewport"));
@@ -73,15 +76,15 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
             raster.draw(&surface.positions, &triangles, group);
             raster.ids()
         };
-        let found = compare_ids(&ids(&clip), &want, &exact, SIZE[0], TIE);
+        let differences = compare_ids(&ids(&clip), &want, &exact_triangles, SIZE[0], DEPTH_TOLERANCE);
         let covered = want.iter().flatten().count();
-        eprintln!("eye {eye:?}: {covered} samples see a triangle; {found:?}");
-        assert!(covered > 5000 && found.wrong == 0, "{covered} covered, {found:?}");
-        assert!(found.edges + found.ties < covered / 100, "{found:?}");
+        eprintln!("eye {eye:?}: {covered} samples see a triangle; {differences:?}");
+        assert!(covered > 5000 && differences.wrong == 0, "{covered} covered, {differences:?}");
+        assert!(differences.edges + differences.ties < covered / 100, "{differences:?}");
 
         let mut shifted = Matrix4::identity();
         shifted[(0, 3)] = 0.1 / f64::from(width);
-        let control = compare_ids(&ids(&(shifted * clip)), &want, &exact, SIZE[0], TIE);
-        assert!(control.wrong > 5, "control: a twentieth of a pixel aside is told: {control:?}");
+        let control = compare_ids(&ids(&(shifted * clip)), &want, &exact_triangles, SIZE[0], DEPTH_TOLERANCE);
+        assert!(control.wrong > 5, "negative control: shifted by 1/20 pixel: {control:?}");
     }
 }

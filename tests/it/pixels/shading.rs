@@ -6,12 +6,12 @@ use nalgebra::Vector3;
 
 use super::harness::{SceneBuilder, facing_rectangle, front_camera, is_close, open_renderer, render, render_square};
 
-fn plain(diffuse: [f32; 3]) -> Material {
+fn matte_material(diffuse: [f32; 3]) -> Material {
     Material { diffuse, ambient: diffuse, ..Material::default() }
 }
 
 #[test]
-fn pixel_comparison_can_fail() {
+fn is_close_rejects_other_colors_and_nan() {
     assert!(is_close([188, 188, 188], [0.5; 3], 1.0));
     assert!(!is_close([186, 188, 188], [0.5; 3], 1.0));
     assert!(!is_close([0, 0, 0], [f64::NAN; 3], 1.0));
@@ -19,26 +19,30 @@ fn pixel_comparison_can_fail() {
 
 #[test]
 fn square_covers_exactly_its_pixels() {
-    let shown =
-        render(&SceneBuilder::new().add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), plain([1.0; 3])).build());
-    assert_eq!(shown.count_pixels(|pixel| pixel != [0; 3]), 400);
-    assert_eq!((shown.pixel(21, 32), shown.pixel(42, 32)), ([0; 3], [0; 3]));
+    let frame = render(
+        &SceneBuilder::new().add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), matte_material([1.0; 3])).build(),
+    );
+    assert_eq!(frame.count_pixels(|pixel| pixel != [0; 3]), 400);
+    assert_eq!((frame.pixel(21, 32), frame.pixel(42, 32)), ([0; 3], [0; 3]));
     for corner in [(22, 22), (41, 22), (22, 41), (41, 41)] {
-        assert!(is_close(shown.pixel(corner.0, corner.1), [0.75; 3], 1.0), "{corner:?}");
+        assert!(is_close(frame.pixel(corner.0, corner.1), [0.75; 3], 1.0), "{corner:?}");
     }
-    assert_eq!(shown.image.rgba.len(), 4 * 64 * 64);
+    assert_eq!(frame.image.rgba.len(), 4 * 64 * 64);
 }
 
 #[test]
 fn top_row_comes_first_and_left_is_left() {
     let red = facing_rectangle(-3.2, 2.2, -2.2, 3.2, 0.0);
     let green = facing_rectangle(2.2, -3.2, 3.2, -2.2, 0.0);
-    let shown = render(
-        &SceneBuilder::new().add_domain(red, plain([1.0, 0.0, 0.0])).add_domain(green, plain([0.0, 1.0, 0.0])).build(),
+    let frame = render(
+        &SceneBuilder::new()
+            .add_domain(red, matte_material([1.0, 0.0, 0.0]))
+            .add_domain(green, matte_material([0.0, 1.0, 0.0]))
+            .build(),
     );
-    assert!(is_close(shown.pixel(2, 2), [0.75, 0.0, 0.0], 1.0));
-    assert!(is_close(shown.pixel(61, 61), [0.0, 0.75, 0.0], 1.0));
-    assert_eq!((shown.pixel(61, 2), shown.pixel(2, 61)), ([0; 3], [0; 3]));
+    assert!(is_close(frame.pixel(2, 2), [0.75, 0.0, 0.0], 1.0));
+    assert!(is_close(frame.pixel(61, 61), [0.0, 0.75, 0.0], 1.0));
+    assert_eq!((frame.pixel(61, 2), frame.pixel(2, 61)), ([0; 3], [0; 3]));
 }
 
 #[test]
@@ -46,28 +50,30 @@ fn first_image_row_is_the_top_of_the_surface() {
     let mut builder = SceneBuilder::new();
     let image = builder.add_texture(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 0, 255]);
     let material = Material { color_texture: Some(image), ..Material::default() };
-    let shown = render(&builder.add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), material).build());
+    let frame = render(&builder.add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), material).build());
     // Half a texel from the edge of the image, each texel has its own color.
     for (x, y, color) in [(17, 17, [0.0, 0.0]), (46, 17, [1.0, 0.0]), (17, 46, [0.0, 1.0]), (46, 46, [1.0, 1.0])] {
-        let [r, g, b] = shown.pixel(x, y);
+        let [r, g, b] = frame.pixel(x, y);
         assert!(b == 0, "{x} {y}");
         assert!((f64::from(r) > 150.0) == (color[0] > 0.5) && (f64::from(g) > 150.0) == (color[1] > 0.5), "{x} {y}");
     }
 }
 
 /// Equation 3.12 in f64 with clamped dot products and unshadowed ambient light, for a surface that faces +Z.
-fn phong(builder: &SceneBuilder, material: &Material, point: Vector3<f64>, eye: Vector3<f64>) -> [f64; 3] {
+fn expected_phong(builder: &SceneBuilder, material: &Material, point: Vector3<f64>, eye: Vector3<f64>) -> [f64; 3] {
     let look = &builder.parts.look;
     let sun = Vector3::from(look.sun).cast::<f64>().normalize();
     let normal = Vector3::z();
     let to_eye = (eye - point).normalize();
     let reflected = 2.0 * to_eye.dot(&normal) * normal - to_eye;
-    let facing = normal.dot(&sun).max(0.0);
-    let gleam = if facing > 0.0 { reflected.dot(&sun).max(0.0).powf(f64::from(material.shininess)) } else { 0.0 };
+    let cosine = normal.dot(&sun).max(0.0);
+    let specular_factor =
+        if cosine > 0.0 { reflected.dot(&sun).max(0.0).powf(f64::from(material.shininess)) } else { 0.0 };
     std::array::from_fn(|channel| {
-        let of = |color: [f32; 3]| f64::from(color[channel]);
-        of(look.skylight) * of(material.ambient)
-            + of(look.sunlight) * (facing * of(material.diffuse) + gleam * of(material.specular))
+        let component = |color: [f32; 3]| f64::from(color[channel]);
+        component(look.skylight) * component(material.ambient)
+            + component(look.sunlight)
+                * (cosine * component(material.diffuse) + specular_factor * component(material.specular))
     })
 }
 
@@ -80,23 +86,23 @@ fn phong_shading_equals_f64_arithmetic() {
         shininess: 12.0,
         ..Material::default()
     };
-    for (sun, lit) in [([0.3, -0.5, 0.8], true), ([-0.4, 0.1, 0.9], true), ([0.3, 0.5, -0.8], false)] {
+    for (sun, has_highlight) in [([0.3, -0.5, 0.8], true), ([-0.4, 0.1, 0.9], true), ([0.3, 0.5, -0.8], false)] {
         let mut builder = SceneBuilder::new();
         builder.parts.look.sun = sun;
         builder.parts.look.sunlight = [0.6, 0.7, 0.8];
-        let mut probe = SceneBuilder::new();
-        probe.parts.look = builder.parts.look;
-        let shown = render(&builder.add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), material.clone()).build());
+        let mut settings = SceneBuilder::new();
+        settings.parts.look = builder.parts.look;
+        let frame = render(&builder.add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), material.clone()).build());
         let mut highlights = 0;
         for (x, y) in [(32, 32), (12, 20), (50, 45), (20, 50)] {
             let point = Vector3::new((f64::from(x) + 0.5 - 32.0) / 10.0, (32.0 - f64::from(y) - 0.5) / 10.0, 0.0);
-            let expected = phong(&probe, &material, point, Vector3::new(0.0, 0.0, 10.0));
-            assert!(is_close(shown.pixel(x, y), expected, 1.0), "{sun:?} ({x}, {y}): {:?}", shown.pixel(x, y));
-            let dull = Material { specular: [0.0; 3], ..material.clone() };
-            let without = phong(&probe, &dull, point, Vector3::new(0.0, 0.0, 10.0));
-            highlights += usize::from(!is_close(shown.pixel(x, y), without, 1.0));
+            let expected = expected_phong(&settings, &material, point, Vector3::new(0.0, 0.0, 10.0));
+            assert!(is_close(frame.pixel(x, y), expected, 1.0), "{sun:?} ({x}, {y}): {:?}", frame.pixel(x, y));
+            let matte = Material { specular: [0.0; 3], ..material.clone() };
+            let without_highlight = expected_phong(&settings, &matte, point, Vector3::new(0.0, 0.0, 10.0));
+            highlights += usize::from(!is_close(frame.pixel(x, y), without_highlight, 1.0));
         }
-        assert_eq!(highlights > 0, lit, "{sun:?}: the highlight must be told from none, and none from behind");
+        assert_eq!(highlights > 0, has_highlight, "{sun:?}: {highlights} pixels with a highlight");
     }
 }
 
@@ -105,54 +111,67 @@ fn sky_gradient_equals_its_formula() {
     let mut builder = SceneBuilder::new();
     builder.parts.look.zenith = [0.1, 0.3, 0.8];
     builder.parts.look.horizon = [0.7, 0.8, 0.9];
-    let shown = render(&builder.add_domain(facing_rectangle(-0.1, -0.1, 0.1, 0.1, 0.0), plain([0.0; 3])).build());
+    let frame =
+        render(&builder.add_domain(facing_rectangle(-0.1, -0.1, 0.1, 0.1, 0.0), matte_material([0.0; 3])).build());
     for (x, y) in [(5, 3), (60, 20), (32, 60)] {
         let direction = Vector3::new((f64::from(x) - 31.5) / 100.0, (31.5 - f64::from(y)) / 100.0, -1.0).normalize();
         let sine = direction.y.max(0.0);
-        let share = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
-        let mix = |low: f64, high: f64| low + share * (high - low);
+        let weight = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
+        let mix = |low: f64, high: f64| low + weight * (high - low);
         assert!(
-            is_close(shown.pixel(x, y), [mix(0.7, 0.1), mix(0.8, 0.3), mix(0.9, 0.8)], 1.0),
+            is_close(frame.pixel(x, y), [mix(0.7, 0.1), mix(0.8, 0.3), mix(0.9, 0.8)], 1.0),
             "{:?}",
-            shown.pixel(x, y)
+            frame.pixel(x, y)
         );
     }
-    assert!(shown.pixel(32, 3) != shown.pixel(32, 60), "a gradient, not one colour");
+    assert!(frame.pixel(32, 3) != frame.pixel(32, 60), "expected a gradient");
 }
 
 #[test]
 fn normal_map_changes_shading_and_a_flat_one_does_not() {
-    let with = |pixel: Option<[u8; 4]>| {
+    let render_with = |pixel: Option<[u8; 4]>| {
         let mut builder = SceneBuilder::new();
         builder.parts.look.sun = [0.6, 0.0, 0.8];
         let image = pixel.map(|pixel| builder.add_texture(4, 4, |_, _| pixel));
-        let material = Material { normal_texture: image, ..plain([1.0; 3]) };
+        let material = Material { normal_texture: image, ..matte_material([1.0; 3]) };
         render(&builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), material).build())
     };
-    let lit = |facing: f64| [0.25 + 0.5 * facing; 3];
-    assert!(is_close(with(None).pixel(32, 32), lit(0.8), 1.0));
-    assert!(is_close(with(Some([128, 128, 255, 255])).pixel(32, 32), lit(0.8), 1.0), "a flat map is no map");
+    let expected = |facing: f64| [0.25 + 0.5 * facing; 3];
+    assert!(is_close(render_with(None).pixel(32, 32), expected(0.8), 1.0));
+    assert!(
+        is_close(render_with(Some([128, 128, 255, 255])).pixel(32, 32), expected(0.8), 1.0),
+        "expected no effect of a flat normal map"
+    );
     // Tangent space: x along u, y against v, z along the normal. 0.6 and 0.8 are encoded in steps of 1/127.
-    assert!(is_close(with(Some([204, 128, 230, 255])).pixel(32, 32), lit(1.0), 1.0), "turned to the sun");
-    assert!(is_close(with(Some([52, 128, 230, 255])).pixel(32, 32), lit(0.28), 2.0), "turned away");
-    let up = with(Some([128, 204, 230, 255]));
-    assert!(is_close(up.pixel(32, 32), lit(0.64), 2.0), "+Y of the map is up and has no share of this sun");
+    assert!(
+        is_close(render_with(Some([204, 128, 230, 255])).pixel(32, 32), expected(1.0), 1.0),
+        "normal tilted towards the sun"
+    );
+    assert!(
+        is_close(render_with(Some([52, 128, 230, 255])).pixel(32, 32), expected(0.28), 2.0),
+        "normal tilted away from the sun"
+    );
+    let tilted_up = render_with(Some([128, 204, 230, 255]));
+    assert!(
+        is_close(tilted_up.pixel(32, 32), expected(0.64), 2.0),
+        "normal tilted up, perpendicular to the sun's azimuth"
+    );
 }
 
 #[test]
 fn plus_y_of_a_normal_map_points_up_the_image() {
-    let with = |green: u8| {
+    let render_with = |green: u8| {
         let mut builder = SceneBuilder::new();
         builder.parts.look.sun = [0.0, 0.6, 0.8];
         let image = builder.add_texture(1, 1, |_, _| [128, green, 230, 255]);
-        let material = Material { normal_texture: Some(image), ..plain([1.0; 3]) };
+        let material = Material { normal_texture: Some(image), ..matte_material([1.0; 3]) };
         render(&builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), material).build()).pixel(32, 32)
     };
-    assert!(is_close(with(204), [0.75; 3], 1.0) && is_close(with(52), [0.25 + 0.5 * 0.28; 3], 2.0));
+    assert!(is_close(render_with(204), [0.75; 3], 1.0) && is_close(render_with(52), [0.25 + 0.5 * 0.28; 3], 2.0));
 }
 
 /// A red leaf in front of an empty background; the middle half of each of its axes is cut away.
-fn leaf(alpha_mode: AlphaMode) -> super::harness::RenderedFrame {
+fn render_leaf(alpha_mode: AlphaMode) -> super::harness::RenderedFrame {
     let mut builder = SceneBuilder::new();
     let hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
     let image = builder.add_texture(64, 64, |x, y| [255, 0, 0, if hole(x, y) { 0 } else { 255 }]);
@@ -162,76 +181,86 @@ fn leaf(alpha_mode: AlphaMode) -> super::harness::RenderedFrame {
 
 #[test]
 fn cut_out_shows_the_background_and_opaque_does_not() {
-    let cut = leaf(AlphaMode::Mask { cutoff: 0.5 });
-    assert_eq!(cut.pixel(32, 32), [0; 3]);
-    assert!(is_close(cut.pixel(15, 15), [0.75, 0.0, 0.0], 1.0));
-    let holes = cut.count_pixels(|pixel| pixel == [0; 3]) - (64 * 64 - 1600);
-    assert!((360..=440).contains(&holes), "20 x 20 pixels are cut away, {holes} seen");
-    let opaque = leaf(AlphaMode::Opaque);
-    assert!(is_close(opaque.pixel(32, 32), [0.75, 0.0, 0.0], 1.0), "control: opaque fills the hole");
+    let cut_out = render_leaf(AlphaMode::Mask { cutoff: 0.5 });
+    assert_eq!(cut_out.pixel(32, 32), [0; 3]);
+    assert!(is_close(cut_out.pixel(15, 15), [0.75, 0.0, 0.0], 1.0));
+    let hole_pixels = cut_out.count_pixels(|pixel| pixel == [0; 3]) - (64 * 64 - 1600);
+    assert!((360..=440).contains(&hole_pixels), "expected a hole of about 20 x 20 pixels, got {hole_pixels}");
+    let opaque = render_leaf(AlphaMode::Opaque);
+    assert!(is_close(opaque.pixel(32, 32), [0.75, 0.0, 0.0], 1.0), "negative control: opaque fills the hole");
     assert_eq!(opaque.count_pixels(|pixel| pixel == [0; 3]), 64 * 64 - 1600);
 }
 
 #[test]
 fn two_blended_layers_equal_arithmetic() {
     let layers = |near: f32, far: f32, alpha_mode: AlphaMode| {
-        let layer = |diffuse, alpha| Material { alpha, alpha_mode, ..plain(diffuse) };
+        let layer = |diffuse, alpha| Material { alpha, alpha_mode, ..matte_material(diffuse) };
         // Blended in the order of the scene, the farther layer first.
         let scene = SceneBuilder::new()
-            .add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, -2.0), plain([0.2, 0.2, 1.0]))
+            .add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, -2.0), matte_material([0.2, 0.2, 1.0]))
             .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, -1.0), layer([0.0, 1.0, 0.0], far))
             .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), layer([1.0, 0.0, 0.0], near))
             .build();
         render(&scene)
     };
     let expected = |near: f64, far: f64| {
-        let under = [0.2, 0.2, 1.0].map(|channel| channel * (1.0 - far));
-        let middle = [under[0], under[1] + far, under[2]].map(|channel| channel * (1.0 - near));
-        [middle[0] + near, middle[1], middle[2]].map(|channel| 0.75 * channel)
+        let background = [0.2, 0.2, 1.0].map(|channel| channel * (1.0 - far));
+        let behind_near = [background[0], background[1] + far, background[2]].map(|channel| channel * (1.0 - near));
+        [behind_near[0] + near, behind_near[1], behind_near[2]].map(|channel| 0.75 * channel)
     };
-    let shown = layers(0.25, 0.5, AlphaMode::Blend);
-    assert!(is_close(shown.pixel(32, 32), expected(0.25, 0.5), 1.0), "{:?}", shown.pixel(32, 32));
-    assert!(!is_close(shown.pixel(32, 32), expected(0.5, 0.25), 4.0), "control: the judge tells other alphas apart");
+    let frame = layers(0.25, 0.5, AlphaMode::Blend);
+    assert!(is_close(frame.pixel(32, 32), expected(0.25, 0.5), 1.0), "{:?}", frame.pixel(32, 32));
+    assert!(
+        !is_close(frame.pixel(32, 32), expected(0.5, 0.25), 4.0),
+        "negative control: expected other colors for other alphas"
+    );
     assert!(is_close(layers(0.5, 0.25, AlphaMode::Blend).pixel(32, 32), expected(0.5, 0.25), 1.0));
     assert!(
         is_close(layers(0.25, 0.5, AlphaMode::Opaque).pixel(32, 32), [0.75, 0.0, 0.0], 1.0),
-        "opaque ignores alpha"
+        "expected opaque materials to ignore alpha"
     );
 }
 
 #[test]
 fn two_pass_blending_writes_no_depth() {
-    let layer = |diffuse| Material { alpha: 0.5, alpha_mode: AlphaMode::Blend, ..plain(diffuse) };
-    let shown = |second: f32| {
+    let layer = |diffuse| Material { alpha: 0.5, alpha_mode: AlphaMode::Blend, ..matte_material(diffuse) };
+    let render_with = |second_z: f32| {
         let first = facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0);
         let mut builder = SceneBuilder::new();
         builder.parts.look.transparency = Transparency::TwoPass;
         let scene = builder
             .add_domain(first, layer([1.0, 0.0, 0.0]))
-            .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, second), layer([0.0, 1.0, 0.0]))
+            .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, second_z), layer([0.0, 1.0, 0.0]))
             .build();
         render(&scene).pixel(32, 32)
     };
     // The pass writes no depth, so the later layer is blended over the earlier one at any distance.
-    for second in [-1.0, 1.0] {
-        assert!(is_close(shown(second), [0.75 * 0.25, 0.75 * 0.5, 0.0], 1.0), "{second}: {:?}", shown(second));
+    for second_z in [-1.0, 1.0] {
+        assert!(
+            is_close(render_with(second_z), [0.75 * 0.25, 0.75 * 0.5, 0.0], 1.0),
+            "{second_z}: {:?}",
+            render_with(second_z)
+        );
     }
 }
 
 /// The normal of a back face points to the viewer.
 #[test]
 fn only_double_sided_back_faces_are_drawn() {
-    let from_behind = |double_sided: bool| {
+    let render_from_behind = |double_sided: bool| {
         let mut builder = SceneBuilder::new();
         builder.parts.look.sun = [0.0, 0.0, -1.0];
         let scene = builder
-            .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), Material { double_sided, ..plain([1.0; 3]) })
+            .add_domain(
+                facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0),
+                Material { double_sided, ..matte_material([1.0; 3]) },
+            )
             .build();
         let view = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
         render_square(&mut open_renderer(), &scene, Camera { view, ..front_camera(64) }, 64).pixel(32, 32)
     };
-    assert!(is_close(from_behind(true), [0.75; 3], 1.0));
-    assert_eq!(from_behind(false), [0; 3]);
+    assert!(is_close(render_from_behind(true), [0.75; 3], 1.0));
+    assert_eq!(render_from_behind(false), [0; 3]);
 }
 
 #[test]
@@ -246,20 +275,21 @@ fn images_of_many_sizes_keep_their_materials() {
         builder = builder.add_domain(facing_rectangle(left, -1.0, left + 0.6, 1.0, 0.0), material);
         expected.push([shade, 255 - shade, 0]);
     }
-    let shown = render_square(&mut open_renderer(), &builder.build(), front_camera(64), 64);
+    let frame = render_square(&mut open_renderer(), &builder.build(), front_camera(64), 64);
     let linear = |byte: u8| ((f64::from(byte) / 255.0 + 0.055) / 1.055).powf(2.4);
     for (index, [r, g, _]) in expected.into_iter().enumerate() {
-        let seen = shown.pixel(5 + 6 * index as u32 + 3, 32);
-        assert!(is_close(seen, [0.75 * linear(r), 0.75 * linear(g), 0.0], 1.0), "image {index}: {seen:?}");
+        let pixel = frame.pixel(5 + 6 * index as u32 + 3, 32);
+        assert!(is_close(pixel, [0.75 * linear(r), 0.75 * linear(g), 0.0], 1.0), "image {index}: {pixel:?}");
     }
 }
 
 #[test]
 fn intrinsics_set_principal_point_and_scale_per_axis() {
-    let scene = SceneBuilder::new().add_domain(facing_rectangle(0.0, 0.0, 1.0, 1.0, 0.0), plain([1.0; 3])).build();
+    let scene =
+        SceneBuilder::new().add_domain(facing_rectangle(0.0, 0.0, 1.0, 1.0, 0.0), matte_material([1.0; 3])).build();
     let lens = Lens::Intrinsics { fx: 200.0, fy: 100.0, cx: 10.0, cy: 50.0 };
-    let shown = render_square(&mut open_renderer(), &scene, Camera { lens, ..front_camera(64) }, 64);
-    assert_eq!(shown.count_pixels(|pixel| pixel != [0; 3]), 200);
-    assert!(shown.pixel(10, 49) != [0; 3] && shown.pixel(29, 40) != [0; 3]);
-    assert!(shown.pixel(9, 49) == [0; 3] && shown.pixel(10, 50) == [0; 3] && shown.pixel(30, 40) == [0; 3]);
+    let frame = render_square(&mut open_renderer(), &scene, Camera { lens, ..front_camera(64) }, 64);
+    assert_eq!(frame.count_pixels(|pixel| pixel != [0; 3]), 200);
+    assert!(frame.pixel(10, 49) != [0; 3] && frame.pixel(29, 40) != [0; 3]);
+    assert!(frame.pixel(9, 49) == [0; 3] && frame.pixel(10, 50) == [0; 3] && frame.pixel(30, 40) == [0; 3]);
 }
