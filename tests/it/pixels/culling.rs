@@ -8,7 +8,7 @@ use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{
     Camera, Culling, Ground, Lens, PixelRect, Scene, ShadowMethod, ShadowSettings, Transparency, View,
 };
-use modalcast_render::{Aov, FrameCullStats, FrameParams, FrameStats, Renderer, SceneBuffers, VisibilityId};
+use modalcast_render::{Aov, FrameCullStats, FrameParams, FrameStats, Pass, Renderer, SceneBuffers, VisibilityId};
 
 use super::harness::{SceneBuilder, facing_rectangle, front_camera, open_renderer};
 
@@ -362,7 +362,7 @@ fn software_renderers_draw_hidden_multisampled_cut_outs() {
             builder.add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), material_with_image),
             Culling::Occlusion,
         );
-        let uses_occlusion_culling = harness.draw(front_camera(64), [64, 64]).stats.passes.contains(&"occluders");
+        let uses_occlusion_culling = harness.draw(front_camera(64), [64, 64]).stats.passes.contains(&Pass::Occluders);
         assert_eq!(uses_occlusion_culling, !(disables_occlusion_culling && harness.renderer.info().software));
     }
 }

@@ -8,7 +8,7 @@ use modalcast_model::deform::Deformer as _;
 use modalcast_model::scene::{
     Camera, Culling, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings, Transparency,
 };
-use modalcast_render::{FrameCullStats, FrameParams, Renderer};
+use modalcast_render::{FrameCullStats, FrameParams, FrameTimes, Renderer};
 
 use super::harness::open_renderer;
 
@@ -34,9 +34,8 @@ fn draw_frames(
     let images: Vec<_> = (0..FRAMES).map(|_| renderer.draw(&buffers, &params).expect("expected a frame")).collect();
     assert!(images.iter().all(|image| image.rgba == images[0].rgba), "expected identical frames");
     let median = |name: &'static str| {
-        let pass_time =
-            |passes: &[(&'static str, f64)]| passes.iter().find(|pass| pass.0 == name).map_or(0.0, |pass| pass.1);
-        let mut times: Vec<f64> = images[1..].iter().map(|image| pass_time(&image.passes)).collect();
+        let pass_time = |times: &FrameTimes| times.iter().find(|(key, _)| key.name() == name).map_or(0.0, |(_, ms)| ms);
+        let mut times: Vec<f64> = images[1..].iter().map(|image| pass_time(&image.times)).collect();
         times.sort_by(f64::total_cmp);
         (name, times[times.len() / 2])
     };

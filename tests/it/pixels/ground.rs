@@ -7,7 +7,7 @@ use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{
     Bloom, Bounds, Camera, Culling, Ground, Lens, RenderSettings, Scene, ShadowSettings, Transparency, View,
 };
-use modalcast_render::{FrameParams, Renderer, VisibilityId};
+use modalcast_render::{FrameParams, Pass, Renderer, VisibilityId};
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, open_renderer};
 
@@ -46,7 +46,7 @@ fn camera_at(eye: [f64; 3]) -> Camera {
 struct Frame {
     rgba: Vec<u8>,
     ids: Vec<VisibilityId>,
-    passes: Vec<&'static str>,
+    passes: Vec<Pass>,
 }
 
 impl Frame {
@@ -78,7 +78,7 @@ impl Frame {
     }
 
     fn draws_ground(&self) -> bool {
-        self.passes.contains(&"ground")
+        self.passes.contains(&Pass::Ground)
     }
 
     /// Number of pixels whose colors differ by more than two levels, and number of samples whose ids differ.

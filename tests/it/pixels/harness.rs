@@ -6,7 +6,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformSummary, Deformer as _};
 use modalcast_model::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
 use modalcast_model::scene::{Camera, Lens, Scene, SceneParts, SceneState, View};
-use modalcast_render::{Allocation, DevicePreference, FrameImage, FrameParams, FrameStats, Renderer, plan};
+use modalcast_render::{Allocation, DevicePreference, FrameImage, FrameParams, FrameStats, Pass, Renderer, plan};
 
 /// Builder for a scene without shadow and ground, with a black sky, and with the sun behind the camera.
 pub(super) struct SceneBuilder {
@@ -114,8 +114,8 @@ pub(super) fn render_sized(
     camera: Camera,
     [width, height]: [u32; 2],
 ) -> RenderedFrame {
-    let mut deformer = ReferenceDeformer::new(scene);
-    let DeformSummary { bounds, light, .. } =
+    let mut deformer = ReferenceDeformer::new(scene).with_bounding_axes(scene.light_axes());
+    let DeformSummary { bounds, oriented_bounds: light, .. } =
         deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed");
     let buffers = renderer.load(scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
@@ -150,8 +150,8 @@ impl RenderedFrame {
 }
 
 /// The planned passes of a scene without geometry below its ground, which skips the ground pass.
-pub(super) fn planned_passes_above_ground(scene: &Scene) -> Vec<&'static str> {
-    plan(scene).passes.into_iter().filter(|pass| *pass != "ground").collect()
+pub(super) fn planned_passes_above_ground(scene: &Scene) -> Vec<Pass> {
+    plan(scene).passes.into_iter().filter(|pass| *pass != Pass::Ground).collect()
 }
 
 /// The sRGB level, in 0 to 255, of a linear value.

@@ -4,7 +4,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh, Transform};
 use modalcast_model::scene::{Bounds, Camera, RenderSettings, SceneState, View};
-use modalcast_render::{DevicePreference, FrameParams, Renderer, devices, plan};
+use modalcast_render::{DevicePreference, FrameParams, Pass, Renderer, devices, plan};
 
 use super::harness::{
     SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer, planned_passes_above_ground, render,
@@ -27,7 +27,10 @@ fn unused_features_allocate_and_run_nothing() {
     for name in ["tangents", "uvs", "triangle materials"] {
         assert!(!names(&plain_frame.allocations).contains(&name.to_string()), "{name}");
     }
-    assert_eq!(plain_frame.stats.passes, ["shadow", "blur", "visibility", "background", "shade", "encode"]);
+    assert_eq!(
+        plain_frame.stats.passes,
+        [Pass::Shadow, Pass::Blur, Pass::Visibility, Pass::Background, Pass::Shade, Pass::Encode]
+    );
 
     let mut builder = default_look_builder();
     let image = builder.add_texture(1, 1, |_, _| [128, 128, 255, 255]);
@@ -45,16 +48,16 @@ fn unused_features_allocate_and_run_nothing() {
     assert_eq!(
         full_frame.stats.passes,
         [
-            "shadow",
-            "blur",
-            "visibility",
-            "oit count",
-            "oit allocate",
-            "oit fill",
-            "oit resolve",
-            "background",
-            "shade",
-            "encode"
+            Pass::Shadow,
+            Pass::Blur,
+            Pass::Visibility,
+            Pass::OitCount,
+            Pass::OitAllocate,
+            Pass::OitFill,
+            Pass::OitResolve,
+            Pass::Background,
+            Pass::Shade,
+            Pass::Encode
         ]
     );
     let mut planned = plan(&scene).buffers;

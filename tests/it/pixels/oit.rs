@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Scene, Transparency};
-use modalcast_render::OitStats;
+use modalcast_render::{OitStats, Pass};
 
 use super::harness::{
     RenderedFrame, SceneBuilder, facing_rectangle, front_camera, is_close, open_renderer, render, render_square,
@@ -322,6 +322,6 @@ fn two_passes_draw_alpha_above_threshold_as_opaque() {
         split.pixel(22, 30)
     );
     assert_eq!((split.stats.draw_calls, unsplit.stats.draw_calls), (2, 1));
-    assert_eq!(unsplit.stats.passes, ["blended", "background", "encode"]);
-    assert_eq!(split.stats.passes, ["visibility", "blended", "background", "shade", "encode"]);
+    assert_eq!(unsplit.stats.passes, [Pass::Blended, Pass::Background, Pass::Encode]);
+    assert_eq!(split.stats.passes, [Pass::Visibility, Pass::Blended, Pass::Background, Pass::Shade, Pass::Encode]);
 }

@@ -4,7 +4,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Antialiasing, Bloom, Camera, Lens, RenderSettings, SceneState, ToneMapping};
-use modalcast_render::FrameParams;
+use modalcast_render::{FrameParams, Pass};
 
 use super::harness::{
     RenderedFrame, SceneBuilder, decode_srgb, encode_srgb, facing_rectangle, front_camera, is_close, open_renderer,
@@ -298,9 +298,9 @@ fn post_processing_is_deterministic() {
     let mut renderer = open_renderer();
     let first = render_square(&mut renderer, &all_effects, front_camera(96), 96);
     assert_eq!(first.stats.passes, planned_passes_above_ground(&all_effects));
-    assert!(first.stats.passes.contains(&"bloom"));
+    assert!(first.stats.passes.contains(&Pass::Bloom));
     let plain = render_square(&mut renderer, &scene(RenderSettings::default()), front_camera(96), 96);
-    assert!(!plain.stats.passes.contains(&"bloom"));
+    assert!(!plain.stats.passes.contains(&Pass::Bloom));
     assert!(render_square(&mut renderer, &all_effects, front_camera(96), 96).image.rgba == first.image.rgba);
     assert!(
         render_square(&mut open_renderer(), &all_effects, front_camera(96), 96).image.rgba == first.image.rgba,

@@ -12,7 +12,7 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::raster::{DrawTarget, GlBuffer, RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Camera, CullMode, DrawRange, Lens, Scene, SceneState, ShadowSettings, View, Viewport};
 use modalcast_render::{
-    BlurMethod, FrameImage, FrameParams, FrameStats, RasterBackend, RasterBackends, Renderer, SceneBuffers,
+    BlurMethod, FrameImage, FrameParams, FrameStats, Pass, RasterBackend, RasterBackends, Renderer, SceneBuffers,
     VisibilityId,
 };
 use nalgebra::{Matrix4, Vector3};
@@ -190,9 +190,10 @@ fn compute_rasterized_frame_equals_opengl() {
             want.stats.raster_backends,
             RasterBackends { shadow: Some(RasterBackend::OpenGl), visibility: Some(RasterBackend::OpenGl) }
         );
-        assert_eq!(got.stats.passes[..3], ["raster shadow", "blur", "unpack"]);
+        assert_eq!(got.stats.passes[..3], [Pass::RasterShadow, Pass::Blur, Pass::Unpack]);
         assert!(
-            !got.stats.passes.contains(&"ground") && got.allocations.iter().any(|name| name == "raster shadow depths")
+            !got.stats.passes.contains(&Pass::Ground)
+                && got.allocations.iter().any(|name| name == "raster shadow depths")
         );
         assert!(
             !want.allocations.iter().any(|name| name == "raster visibility keys" || name == "raster shadow depths"),
@@ -325,7 +326,8 @@ fn opengl_draws_what_the_compute_rasterizer_cannot() {
 #[test]
 fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     let scene = yard_builder(Some(ShadowSettings { size: 256, ..ShadowSettings::default() }), 1).build();
-    let (mut renderer, mut deformer) = (open_renderer(), ReferenceDeformer::new(&scene));
+    let (mut renderer, mut deformer) =
+        (open_renderer(), ReferenceDeformer::new(&scene).with_bounding_axes(scene.light_axes()));
     let summary = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed");
     let mut buffers = renderer.load(&scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
@@ -333,7 +335,7 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     let create_params = |eye: [f64; 3]| {
         let view = View::LookAt { eye, target: [0.0, 0.2, 0.0], up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, ..default_camera() };
-        FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds: summary.bounds, light: summary.light }
+        FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds: summary.bounds, light: summary.oriented_bounds }
     };
     let (first_params, second_params) = (create_params([1.4, 1.9, 4.0]), create_params([-2.0, 1.2, 3.0]));
     let unshared = renderer.draw(&buffers, &second_params).expect("expected a frame");
@@ -342,9 +344,9 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
         let image = renderer.draw(buffers, params).expect("expected a frame");
         (image, renderer.stats().passes[..2].to_vec())
     };
-    assert_eq!(draw(&mut renderer, &buffers, &first_params).1, ["raster shadow", "blur"]);
+    assert_eq!(draw(&mut renderer, &buffers, &first_params).1, [Pass::RasterShadow, Pass::Blur]);
     let (shared, passes) = draw(&mut renderer, &buffers, &second_params);
-    assert_eq!(passes, ["raster visibility", "unpack"], "expected no second shadow pass");
+    assert_eq!(passes, [Pass::RasterVisibility, Pass::Unpack], "expected no second shadow pass");
     assert_eq!(shared.raster_backends, RasterBackends { shadow: None, visibility: Some(RasterBackend::Cuda) });
     assert!(shared.rgba == unshared.rgba, "expected the same image with a shared shadow");
     let positions = deformer.surface().expect("expected a surface").positions.clone();
@@ -352,7 +354,7 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     let (rebased, passes) = draw(&mut renderer, &buffers, &second_params);
     assert_eq!(
         (passes[0], rebased.raster_backends.visibility),
-        ("shadow", Some(RasterBackend::OpenGl)),
+        (Pass::Shadow, Some(RasterBackend::OpenGl)),
         "expected OpenGL for rebased positions"
     );
     assert!(count_different_bytes(&rebased, &unshared) <= 60, "{}", count_different_bytes(&rebased, &unshared));

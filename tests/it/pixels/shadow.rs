@@ -3,6 +3,8 @@
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Ground, Lens, ShadowSettings, UpAxis, View};
 
+use modalcast_render::Pass;
+
 use super::harness::{
     RenderedFrame, SceneBuilder, facing_rectangle, floor_mesh, is_close, open_renderer, render_square,
 };
@@ -71,7 +73,7 @@ fn shadow_of_a_floating_square_has_only_ambient_light() {
     without_shadow.parts.look.shadow = None;
     let unshaded = render_square_shadow(without_shadow, AlphaMode::Opaque, 1.0);
     assert!(is_close(unshaded.pixel(32, 32), ground_color(1.0, 0.8), 2.0), "negative control: without a shadow map");
-    assert!(!unshaded.stats.passes.contains(&"shadow") && shaded.stats.passes.contains(&"shadow"));
+    assert!(!unshaded.stats.passes.contains(&Pass::Shadow) && shaded.stats.passes.contains(&Pass::Shadow));
     let mut without_caster = create_builder();
     without_caster.parts.look.sun = [3.0, 4.0, 0.0];
     assert!(

@@ -9,7 +9,7 @@ use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Bounds, Camera, FrameSize, Lens, LightSpaceBox, Scene, SceneState, ShadowSettings};
-use modalcast_render::{FrameParams, Renderer, SceneBuffers};
+use modalcast_render::{FrameParams, Pass, Renderer, SceneBuffers};
 
 use super::harness::open_renderer;
 use super::shadow::{create_builder, with_square};
@@ -42,7 +42,7 @@ fn frame_params(camera: Camera, bounds: Bounds) -> FrameParams {
 }
 
 fn count_shadow_passes(renderer: &Renderer) -> usize {
-    renderer.stats().passes.iter().filter(|pass| ["shadow", "blur"].contains(pass)).count()
+    renderer.stats().passes.iter().filter(|pass| [Pass::Shadow, Pass::Blur].contains(pass)).count()
 }
 
 /// The image of a new renderer.
@@ -143,7 +143,7 @@ fn frames_of_an_engine_step_share_its_shadow() {
         cameras(&cut_out_scene).map(|camera| {
             let rgba = context.draw(loaded_scene, &camera, FrameSize::new(64, 64)).expect("expected a frame").rgba;
             let stats = context.stats().expect("expected a frame").passes.clone();
-            (rgba, stats.iter().filter(|pass| **pass == "shadow").count())
+            (rgba, stats.iter().filter(|pass| **pass == Pass::Shadow).count())
         })
     };
     let mut state = SceneState::rest(&cut_out_scene);

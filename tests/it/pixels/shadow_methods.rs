@@ -2,7 +2,7 @@
 
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Camera, Lens, MomentFormat, Scene, ShadowMethod, ShadowSettings, View};
-use modalcast_render::{BlurMethod, plan};
+use modalcast_render::{BlurMethod, Pass, plan};
 
 use super::harness::{
     RenderedFrame, decode_srgb, floor_mesh, is_close, open_renderer, planned_passes_above_ground, render_square,
@@ -263,7 +263,7 @@ fn unused_shadow_resources_are_not_allocated() {
         let textures: Vec<String> = plan.textures.iter().map(|allocation| allocation.name.clone()).collect();
         let maps: Vec<String> = textures.into_iter().filter(|name| name.starts_with("shadow")).collect();
         let splits = frame.allocations.iter().any(|allocation| allocation.name == "shadow cascades");
-        (frame.stats.passes.contains(&"blur"), maps, splits)
+        (frame.stats.passes.contains(&Pass::Blur), maps, splits)
     };
     let base = ShadowSettings { size: 64, ..ShadowSettings::default() };
     let depth = vec!["shadow depth".to_string()];
