@@ -1,12 +1,11 @@
-// Kernels that measure the memory rates of the device, and helpers for timing. None of them deforms anything.
-//   fill     writes pseudo-random numbers                                                    `to`: [words] u32   (out)
-//   copy     copies `from` to `to`; one copy reads and writes the bytes of the buffer
-//   read     reads all of `from`; writes to `to` only if the AND of all words that a thread read is all ones, which
-//            never happens with these buffers, but the compiler cannot know
-//   hold     blocks the stream for a time
-//   nothing  does nothing
-// Launch of copy and read: BLOCK threads per block, LOADS words of 16 bytes per thread, one block per tile of BLOCK *
-// LOADS words; buffers are whole tiles.
+// Bandwidth kernels and helpers for timing.
+//   fill          writes pseudo-random words; one thread per word
+//   copy          copies `src` to `dst`: traffic is twice the size of a buffer
+//   read          reads all of `src`. A conditional store that never executes keeps the compiler from removing the loads.
+//   delay         blocks the stream for a time; one thread
+//   empty_kernel  does nothing; one thread
+// Launch of copy and read: BLOCK threads per block, LOADS vectors (uint4) per thread, one block per tile of BLOCK * LOADS
+// vectors; buffers are whole tiles. With STREAMING they use evict-first cache hints, otherwise the read-only cache.
 //
 // CPU twins: the tests of tests/bench/src/kernels/bandwidth.rs.
 #ifndef LOADS
@@ -15,59 +14,59 @@
 
 constexpr unsigned BLOCK = 256;
 
-__device__ uint4 load(const uint4* from) {
+__device__ uint4 load(const uint4* src) {
 #ifdef STREAMING
-    return __ldcs(from);
+    return __ldcs(src);
 #else
-    return __ldg(from);
+    return __ldg(src);
 #endif
 }
 
-__device__ void store(uint4* to, uint4 word) {
+__device__ void store(uint4* dst, uint4 vector) {
 #ifdef STREAMING
-    __stcs(to, word);
+    __stcs(dst, vector);
 #else
-    *to = word;
+    *dst = vector;
 #endif
 }
 
-// The first word of a thread; its other words follow at a distance of one block.
-__device__ size_t first_word() {
+// Index of the first vector of a thread. Its next vectors are BLOCK vectors apart, so that each load is coalesced.
+__device__ size_t first_vector() {
     return (size_t)blockIdx.x * (BLOCK * LOADS) + threadIdx.x;
 }
 
-extern "C" __global__ void __launch_bounds__(BLOCK) copy(const uint4* from, uint4* to) {
-    const size_t first = first_word();
-    uint4 words[LOADS];
+extern "C" __global__ void __launch_bounds__(BLOCK) copy(const uint4* src, uint4* dst) {
+    const size_t first = first_vector();
+    uint4 vectors[LOADS];
 #pragma unroll
     for (unsigned i = 0; i < LOADS; ++i) {
-        words[i] = load(from + first + i * BLOCK);
+        vectors[i] = load(src + first + i * BLOCK);
     }
 #pragma unroll
     for (unsigned i = 0; i < LOADS; ++i) {
-        store(to + first + i * BLOCK, words[i]);
+        store(dst + first + i * BLOCK, vectors[i]);
     }
 }
 
-extern "C" __global__ void __launch_bounds__(BLOCK) read(const uint4* from, uint4* to) {
-    const size_t first = first_word();
-    uint4 words[LOADS];
+extern "C" __global__ void __launch_bounds__(BLOCK) read(const uint4* src, uint4* dst) {
+    const size_t first = first_vector();
+    uint4 vectors[LOADS];
 #pragma unroll
     for (unsigned i = 0; i < LOADS; ++i) {
-        words[i] = load(from + first + i * BLOCK);
+        vectors[i] = load(src + first + i * BLOCK);
     }
-    unsigned all = 0xffffffffu;
+    unsigned and_of_words = 0xffffffffu;
 #pragma unroll
     for (unsigned i = 0; i < LOADS; ++i) {
-        all &= words[i].x & words[i].y & words[i].z & words[i].w;
+        and_of_words &= vectors[i].x & vectors[i].y & vectors[i].z & vectors[i].w;
     }
-    if (all == 0xffffffffu) {
-        to[first] = words[0];
+    if (and_of_words == 0xffffffffu) {
+        dst[first] = vectors[0];
     }
 }
 
-// The finalizer of MurmurHash3 with the top bit cleared, so that no word is all ones.
-extern "C" __global__ void __launch_bounds__(BLOCK) fill(unsigned* to, unsigned long long words) {
+// The finalizer of MurmurHash3 with the top bit cleared, so that no word is all ones and the store in `read` never executes.
+extern "C" __global__ void __launch_bounds__(BLOCK) fill(unsigned* dst, unsigned long long words) {
     const size_t index = (size_t)blockIdx.x * BLOCK + threadIdx.x;
     if (index < words) {
         unsigned key = (unsigned)index;
@@ -76,20 +75,20 @@ extern "C" __global__ void __launch_bounds__(BLOCK) fill(unsigned* to, unsigned 
         key ^= key >> 13;
         key *= 0xc2b2ae35u;
         key ^= key >> 16;
-        to[index] = key & 0x7fffffffu;
+        dst[index] = key & 0x7fffffffu;
     }
 }
 
-__device__ unsigned long long now() {
+__device__ unsigned long long globaltimer_ns() {
     unsigned long long nanoseconds;
     asm volatile("mov.u64 %0, %%globaltimer;" : "=l"(nanoseconds));
     return nanoseconds;
 }
 
-extern "C" __global__ void hold(unsigned long long nanoseconds) {
-    const unsigned long long begin = now();
-    while (now() - begin < nanoseconds) {
+extern "C" __global__ void delay(unsigned long long nanoseconds) {
+    const unsigned long long begin = globaltimer_ns();
+    while (globaltimer_ns() - begin < nanoseconds) {
     }
 }
 
-extern "C" __global__ void nothing() {}
+extern "C" __global__ void empty_kernel() {}

@@ -1,12 +1,12 @@
-// x = T_b (x0 + U q_b) for up to VECTORS domains b of one shape, by tensor cores. Only benchmarks use it.
-//   words      U in 16 bits per entry, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)        (in)
-//   rest       x0, [quads][12] f32: 4 x, 4 y, 4 z                                                       (in)
-//   transforms [VECTORS][3] float4: the rows of T; zeros where there is no domain                       (in)
-//   shrinks    [VECTORS] f32: powers of two that undo the scaling of q                                  (in)
-//   halves     q as two 16-bit numbers each, [steps][VECTORS / 8][32 lanes] words of 16 bytes: for
-//              vector lane / 4 the modes 2 (lane % 4) + {0, 1} and + {8, 9} of the step, first the
-//              rounded q, then the remainder, rounded likewise                                          (in)
-//   positions  [vertices][3] f32; domain b begins at vertex `first[b]`                                  (out)
+// x = T_b (x0 + U q_b) for up to BATCH_SIZE domains b of one shape, by tensor cores.
+//   words           U in 16 bits per entry, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)    (in)
+//   rest            x0, [quads][12] f32: 4 x, 4 y, 4 z                                                   (in)
+//   transforms      [BATCH_SIZE][3] float4: the rows of T; zeros where there is no domain                (in)
+//   inverse_scales  [BATCH_SIZE] f32: powers of two that undo the scaling of q                           (in)
+//   split_q         q as two 16-bit numbers each, [steps][BATCH_SIZE / 8][32 lanes] words of 16 bytes: for
+//                   vector lane / 4 the modes 2 (lane % 4) + {0, 1} and + {8, 9} of the step, first the
+//                   rounded q, then the rounded remainder                                                (in)
+//   positions       [vertices][3] f32; domain b begins at vertex `first_vertices[b]`                     (out)
 // Launch: one block of WARPS warps per tile (tests/bench/src/kernels/batch_mma.rs). CPU twin: the tests of that file.
 //
 // The result is not bit-identical to `deform`: q keeps 22 bits (f16) or 16 (bf16), and a tensor core sums the 16
@@ -18,7 +18,7 @@
 // assignment of rows and modes to these indices is free: a lane takes quad g and chunks t and t + 4, which are six
 // loads of 16 bytes in whole lines of 128, and has the fragments of six products after two byte permutations per
 // register. U does not pass through shared memory. The result is all 12 sums of quad g for a quarter of the domains, so
-// a lane places whole vertices. The sums of 16 vectors, two steps of U and q take 160 registers: 12 warps per
+// a lane computes the positions of whole vertices. The sums of 16 vectors, two steps of U and q take 160 registers: 12 warps per
 // multiprocessor, with 72 KB in flight.
 #if defined(STORE_BF16)
 #define OPERANDS "bf16.bf16"
@@ -36,32 +36,32 @@ constexpr unsigned MIN_BLOCKS_PER_SM = 2;
 constexpr unsigned BATCH_SIZE = 16;
 constexpr unsigned MIN_BLOCKS_PER_SM = 3;
 #endif
-constexpr unsigned MOST = 32;
-constexpr unsigned EIGHTS = BATCH_SIZE / 8;
+constexpr unsigned MAX_DOMAINS = 32;
+constexpr unsigned GROUPS = BATCH_SIZE / 8; // of 8 domains
 
-// A warp covers eight quads of a tile of 32; a step is eight chunks of two modes.
+// A warp covers group quads of a tile of 32; a step is group chunks of two modes.
 constexpr unsigned WARPS = 4;
 constexpr unsigned QUADS = 8;
 constexpr unsigned TILE = WARPS * QUADS;
 constexpr unsigned STEP_CHUNKS = 8;
-// Per domain: float4 words of its eight quads of x, and the stride between domains. The two extra words keep the lanes
+// float4 vectors per domain: those of its group quads of x, and the stride between domains. Two vectors of padding keep the lanes
 // of a quarter warp in different banks.
-constexpr unsigned FOURS = 3 * QUADS;
-constexpr unsigned STRIDE = FOURS + 2;
+constexpr unsigned DOMAIN_VECTORS = 3 * QUADS;
+constexpr unsigned STRIDE = DOMAIN_VECTORS + 2;
 
 // Twin: tests/bench/src/kernels/batch_mma.rs.
 struct BatchMmaArgs {
     const uint4* words;
     const float4* rest;
     const float4* transforms;
-    const float* shrinks;
-    const uint4* halves;
+    const float* inverse_scales;
+    const uint4* split_q;
     float* positions;
-    unsigned first[MOST]; // packed vertex of each domain
+    unsigned first_vertices[MAX_DOMAINS]; // packed vertex of each domain
     unsigned domains;
     unsigned vertices; // of the shape
     unsigned chunks;
-    unsigned aligned; // whether every domain's positions are 16-byte aligned
+    unsigned is_aligned; // whether every domain's positions are 16-byte aligned
 };
 static_assert(sizeof(BatchMmaArgs) == 192, "BatchMmaArgs differs from tests/bench/src/kernels/batch_mma.rs");
 
@@ -71,24 +71,24 @@ __device__ __forceinline__ unsigned lane_id() {
 }
 
 // The part of a tile that a warp covers.
-struct Part {
-    const uint4* words; // of the lane's quad
-    unsigned width;     // quads of the tile
-    unsigned rest;      // the lane's quad of the shape
-    unsigned first;     // the warp's first vertex in the shape
-    unsigned numbers;   // of the warp's vertices, three each; 0 without any
+struct WarpPart {
+    const uint4* words;    // words of the lane's quad
+    unsigned tile_quads;   // quads of the tile
+    unsigned rest_quad;    // the lane's quad of the shape
+    unsigned first_vertex; // the warp's first vertex in the shape
+    unsigned numbers;      // coordinates of the warp's vertices; 0 without vertices
 };
 
 // A lane beyond the last quad reads that quad again; its results are not stored.
-__device__ __forceinline__ Part part_of(const BatchMmaArgs& args) {
-    const unsigned tile = TILE * blockIdx.x, before = QUADS * (threadIdx.x / 32);
-    Part part;
-    part.width = min(TILE, (args.vertices + 3) / 4 - tile);
-    const unsigned quad = min(before + lane_id() / 4, part.width - 1);
+__device__ __forceinline__ WarpPart warp_part(const BatchMmaArgs& args) {
+    const unsigned tile = TILE * blockIdx.x, first_warp_quad = QUADS * (threadIdx.x / 32);
+    WarpPart part;
+    part.tile_quads = min(TILE, (args.vertices + 3) / 4 - tile);
+    const unsigned quad = min(first_warp_quad + lane_id() / 4, part.tile_quads - 1);
     part.words = args.words + 3 * (size_t)args.chunks * tile + quad;
-    part.rest = tile + quad;
-    part.first = 4 * (tile + before);
-    part.numbers = args.vertices > part.first ? 3 * min(4 * QUADS, args.vertices - part.first) : 0;
+    part.rest_quad = tile + quad;
+    part.first_vertex = 4 * (tile + first_warp_quad);
+    part.numbers = args.vertices > part.first_vertex ? 3 * min(4 * QUADS, args.vertices - part.first_vertex) : 0;
     return part;
 }
 
@@ -98,11 +98,11 @@ struct Chunk {
 };
 
 // Zeros beyond the last chunk, because NaN or infinity times a zero coordinate is not zero.
-__device__ __forceinline__ void load(Chunk& chunk, const BatchMmaArgs& args, const Part& part, unsigned index) {
+__device__ __forceinline__ void load_chunk(Chunk& chunk, const BatchMmaArgs& args, const WarpPart& part, unsigned index) {
 #pragma unroll
     for (unsigned plane = 0; plane < 3; ++plane) {
-        const uint4* from = part.words + (3 * (size_t)index + plane) * part.width;
-        const uint4 word = index < args.chunks ? __ldcs(from) : make_uint4(0, 0, 0, 0);
+        const uint4* src = part.words + (3 * (size_t)index + plane) * part.tile_quads;
+        const uint4 word = index < args.chunks ? __ldcs(src) : make_uint4(0, 0, 0, 0);
         chunk.words[4 * plane] = word.x;
         chunk.words[4 * plane + 1] = word.y;
         chunk.words[4 * plane + 2] = word.z;
@@ -115,14 +115,14 @@ struct Step {
     Chunk low, high;
 };
 
-__device__ __forceinline__ void load(Step& step, const BatchMmaArgs& args, const Part& part, unsigned index) {
+__device__ __forceinline__ void load_step(Step& step, const BatchMmaArgs& args, const WarpPart& part, unsigned index) {
     const unsigned chunk = STEP_CHUNKS * index + lane_id() % 4;
-    load(step.low, args, part, chunk);
-    load(step.high, args, part, chunk + 4);
+    load_chunk(step.low, args, part, chunk);
+    load_chunk(step.high, args, part, chunk + 4);
 }
 
-// [2 axis + pair of vertices][eight of domains][2 (vertex of the pair) + domain of the lane's two]
-typedef float Sums[6][EIGHTS][4];
+// [2 axis + pair of vertices][group of 8 domains][2 (vertex of the pair) + parity of the domain]
+typedef float Sums[6][GROUPS][4];
 
 __device__ __forceinline__ void multiply(float (&sum)[4], const unsigned (&u)[4], unsigned q0, unsigned q1) {
     asm("mma.sync.aligned.m16n8k16.row.col.f32." OPERANDS ".f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, "
@@ -132,11 +132,11 @@ __device__ __forceinline__ void multiply(float (&sum)[4], const unsigned (&u)[4]
 }
 
 // Adds the modes of a step. The rounding remainders of q come first, while the sums are small.
-__device__ __forceinline__ void add(Sums& sums, const Step& step, const uint4* halves) {
-    uint4 q[EIGHTS];
+__device__ __forceinline__ void add_step(Sums& sums, const Step& step, const uint4* split_q) {
+    uint4 q[GROUPS];
 #pragma unroll
-    for (unsigned eight = 0; eight < EIGHTS; ++eight) {
-        q[eight] = __ldg(halves + 32 * eight + lane_id());
+    for (unsigned group = 0; group < GROUPS; ++group) {
+        q[group] = __ldg(split_q + 32 * group + lane_id());
     }
 #pragma unroll
     for (unsigned row = 0; row < 6; ++row) {
@@ -148,29 +148,29 @@ __device__ __forceinline__ void add(Sums& sums, const Step& step, const uint4* h
             __byte_perm(high[row], high[6 + row], 0x7632),
         };
 #pragma unroll
-        for (unsigned eight = 0; eight < EIGHTS; ++eight) {
-            multiply(sums[row][eight], u, q[eight].z, q[eight].w);
-            multiply(sums[row][eight], u, q[eight].x, q[eight].y);
+        for (unsigned group = 0; group < GROUPS; ++group) {
+            multiply(sums[row][group], u, q[group].z, q[group].w);
+            multiply(sums[row][group], u, q[group].x, q[group].y);
         }
     }
 }
 
 // Sums all modes with the loads of two steps in flight.
-__device__ __forceinline__ void sum_modes(const BatchMmaArgs& args, const Part& part, Sums& sums) {
+__device__ __forceinline__ void sum_modes(const BatchMmaArgs& args, const WarpPart& part, Sums& sums) {
     const unsigned steps = (args.chunks + STEP_CHUNKS - 1) / STEP_CHUNKS;
-    const uint4* halves = args.halves;
+    const uint4* split_q = args.split_q;
     Step even, odd;
-    load(even, args, part, 0);
-    load(odd, args, part, 1);
+    load_step(even, args, part, 0);
+    load_step(odd, args, part, 1);
 #pragma unroll 1
     for (unsigned step = 0; step < steps; step += 2) {
-        add(sums, even, halves);
-        load(even, args, part, step + 2);
+        add_step(sums, even, split_q);
+        load_step(even, args, part, step + 2);
         if (step + 1 < steps) {
-            add(sums, odd, halves + 32 * EIGHTS);
-            load(odd, args, part, step + 3);
+            add_step(sums, odd, split_q + 32 * GROUPS);
+            load_step(odd, args, part, step + 3);
         }
-        halves += 2 * 32 * EIGHTS;
+        split_q += 2 * 32 * GROUPS;
     }
 }
 
@@ -179,18 +179,18 @@ __device__ __forceinline__ float transform_row(const float4& row, float x, float
 }
 
 // Computes x of the lane's quad for one domain and writes it to the staging buffer, 48 bytes.
-__device__ __forceinline__ void stage(const BatchMmaArgs& args, const float4 (&rest)[3], const float (&u)[3][4],
+__device__ __forceinline__ void stage_position(const BatchMmaArgs& args, const float4 (&rest)[3], const float (&u)[3][4],
                                       unsigned domain, float4* staged) {
     const float4 *rows = args.transforms + 3 * domain, a = __ldg(rows), b = __ldg(rows + 1), c = __ldg(rows + 2);
-    const float shrink = __ldg(args.shrinks + domain);
+    const float inverse_scale = __ldg(args.inverse_scales + domain);
     const float x0[3][4] = {{rest[0].x, rest[0].y, rest[0].z, rest[0].w},
                             {rest[1].x, rest[1].y, rest[1].z, rest[1].w},
                             {rest[2].x, rest[2].y, rest[2].z, rest[2].w}};
     float world[12];
 #pragma unroll
     for (unsigned vertex = 0; vertex < 4; ++vertex) {
-        const float x = x0[0][vertex] + u[0][vertex] * shrink, y = x0[1][vertex] + u[1][vertex] * shrink,
-                    z = x0[2][vertex] + u[2][vertex] * shrink;
+        const float x = x0[0][vertex] + u[0][vertex] * inverse_scale, y = x0[1][vertex] + u[1][vertex] * inverse_scale,
+                    z = x0[2][vertex] + u[2][vertex] * inverse_scale;
         world[3 * vertex] = transform_row(a, x, y, z);
         world[3 * vertex + 1] = transform_row(b, x, y, z);
         world[3 * vertex + 2] = transform_row(c, x, y, z);
@@ -201,54 +201,54 @@ __device__ __forceinline__ void stage(const BatchMmaArgs& args, const float4 (&r
     }
 }
 
-// Writes the staged positions of four domains, every second one from `domain` on: eight lanes per domain, coalesced
+// Writes the staged positions of four domains, every second one from `domain` on: group lanes per domain, coalesced
 // into 128 bytes.
-__device__ __forceinline__ void store(const BatchMmaArgs& args, const Part& part, unsigned domain,
+__device__ __forceinline__ void store_staged(const BatchMmaArgs& args, const WarpPart& part, unsigned domain,
                                       const float4* staged) {
-    const unsigned own = lane_id() / 8;
-    domain += 2 * own;
+    const unsigned slot = lane_id() / 8;
+    domain += 2 * slot;
     if (domain >= args.domains) {
         return;
     }
-    float* to = args.positions + 3 * ((size_t)args.first[domain] + part.first);
+    float* dst = args.positions + 3 * ((size_t)args.first_vertices[domain] + part.first_vertex);
 #pragma unroll
     for (unsigned i = 0; i < 3; ++i) {
-        const unsigned four = 8 * i + lane_id() % 8;
-        const float4 numbers = staged[STRIDE * own + four];
-        if (args.aligned && 4 * four + 4 <= part.numbers) {
-            __stcs((float4*)to + four, numbers);
+        const unsigned vector = 8 * i + lane_id() % 8;
+        const float4 numbers = staged[STRIDE * slot + vector];
+        if (args.is_aligned && 4 * vector + 4 <= part.numbers) {
+            __stcs((float4*)dst + vector, numbers);
         } else {
-            const float each[4] = {numbers.x, numbers.y, numbers.z, numbers.w};
+            const float components[4] = {numbers.x, numbers.y, numbers.z, numbers.w};
 #pragma unroll
             for (unsigned k = 0; k < 4; ++k) {
-                if (4 * four + k < part.numbers) {
-                    __stcs(to + 4 * four + k, each[k]);
+                if (4 * vector + k < part.numbers) {
+                    __stcs(dst + 4 * vector + k, components[k]);
                 }
             }
         }
     }
 }
 
-__device__ __forceinline__ void place(const BatchMmaArgs& args, const Part& part, const Sums& sums, float4* staged) {
+__device__ __forceinline__ void store_positions(const BatchMmaArgs& args, const WarpPart& part, const Sums& sums, float4* staged) {
     float4 rest[3];
 #pragma unroll
     for (unsigned axis = 0; axis < 3; ++axis) {
-        rest[axis] = __ldg(args.rest + 3 * (size_t)part.rest + axis);
+        rest[axis] = __ldg(args.rest + 3 * (size_t)part.rest_quad + axis);
     }
     const unsigned quad = lane_id() / 4, pair = lane_id() % 4;
 #pragma unroll
-    for (unsigned eight = 0; eight < EIGHTS; ++eight) {
+    for (unsigned group = 0; group < GROUPS; ++group) {
 #pragma unroll
-        for (unsigned of_pair = 0; of_pair < 2; ++of_pair) {
+        for (unsigned parity = 0; parity < 2; ++parity) {
             float u[3][4];
 #pragma unroll
             for (unsigned i = 0; i < 12; ++i) {
-                u[i / 4][i % 4] = sums[2 * (i / 4) + i % 4 / 2][eight][2 * (i % 2) + of_pair];
+                u[i / 4][i % 4] = sums[2 * (i / 4) + i % 4 / 2][group][2 * (i % 2) + parity];
             }
-            const unsigned domain = 8 * eight + of_pair;
-            stage(args, rest, u, domain + 2 * pair, staged + STRIDE * pair + 3 * quad);
+            const unsigned domain = 8 * group + parity;
+            stage_position(args, rest, u, domain + 2 * pair, staged + STRIDE * pair + 3 * quad);
             __syncwarp();
-            store(args, part, domain, staged);
+            store_staged(args, part, domain, staged);
             __syncwarp();
         }
     }
@@ -258,12 +258,12 @@ __device__ __forceinline__ void place(const BatchMmaArgs& args, const Part& part
 extern "C" __global__ void __launch_bounds__(32 * WARPS, MIN_BLOCKS_PER_SM) batch_mma(const __grid_constant__ BatchMmaArgs args) {
 #if __CUDA_ARCH__ >= 800
     __shared__ float4 staged[WARPS][4 * STRIDE];
-    const Part part = part_of(args);
+    const WarpPart part = warp_part(args);
     if (part.numbers == 0) {
         return;
     }
     Sums sums = {};
     sum_modes(args, part, sums);
-    place(args, part, sums, staged[threadIdx.x / 32]);
+    store_positions(args, part, sums, staged[threadIdx.x / 32]);
 #endif
 }

@@ -1,4 +1,4 @@
-// x = T (x0 + u) of every packed vertex, after a library computed u. Only benchmarks use it.
+// x = T (x0 + u) of every packed vertex, for a u that a library computed.
 //   slots       [domains] PlainSlot                                                                              (in)
 //   domains     [vertices] u32: the domain of each packed vertex; not read with SINGLE                           (in)
 //   rest        [vertices][3] f32                                                                                (in)
@@ -12,7 +12,7 @@ constexpr unsigned long long RIGID = 0xffffffffffffffffull;
 
 struct PlainSlot {
     unsigned long long first_u; // index into `u` in floats, or RIGID
-    unsigned first;             // packed vertex
+    unsigned first_vertex;      // packed
     unsigned reserved;
 };
 static_assert(sizeof(PlainSlot) == 16, "PlainSlot differs from tests/bench/src/kernels/plain_update.rs");
@@ -43,7 +43,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) plain_update(const PlainArgs
     const float* rest = args.rest + 3 * (size_t)vertex;
     float x = rest[0], y = rest[1], z = rest[2];
     if (slot.first_u != RIGID) {
-        const float* u = args.u + slot.first_u + 3 * (size_t)(vertex - slot.first);
+        const float* u = args.u + slot.first_u + 3 * (size_t)(vertex - slot.first_vertex);
         x += u[0];
         y += u[1];
         z += u[2];

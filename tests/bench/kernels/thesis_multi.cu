@@ -18,20 +18,20 @@ extern "C" __global__ void __launch_bounds__(WARPS * LANES)
     __shared__ float sub_sums[WARPS][LANES];
     const unsigned warp = threadIdx.x / LANES, lane = threadIdx.x % LANES;
     const size_t index = (size_t)blockIdx.x * (WARPS * LANES) + threadIdx.x;
-    const uint4 mine = meta[index];
-    const bool busy = mine.x != IDLE;
+    const uint4 lane_meta = meta[index];
+    const bool is_busy = lane_meta.x != IDLE;
     float sum = 0.0f;
-    if (busy) {
-        const float4 four = entries[index], part = q[mine.y];
-        sum = four.x * part.x + four.y * part.y + four.z * part.z + four.w * part.w;
+    if (is_busy) {
+        const float4 entry = entries[index], q_part = q[lane_meta.y];
+        sum = entry.x * q_part.x + entry.y * q_part.y + entry.z * q_part.z + entry.w * q_part.w;
     }
     sub_sums[warp][lane] = sum;
     __syncwarp();
-    if (busy && lane % WIDTH % mine.z == 0) {
+    if (is_busy && lane % WIDTH % lane_meta.z == 0) {
         float total = 0.0f;
-        for (unsigned k = 0; k < mine.z; ++k) {
+        for (unsigned k = 0; k < lane_meta.z; ++k) {
             total += sub_sums[warp][lane + k];
         }
-        u[mine.x] = total;
+        u[lane_meta.x] = total;
     }
 }

@@ -9,40 +9,40 @@
 // CPU twin: the tests of tests/bench/src/kernels/thesis/thesis_single.rs.
 constexpr unsigned LANES = 32;
 constexpr unsigned WARPS = 8;
-constexpr unsigned LARGEST_RANK = 512;
+constexpr unsigned MAX_RANK = 512;
 
 extern "C" __global__ void __launch_bounds__(WARPS * LANES)
     thesis_single(const float4* lines, const float* q, float* u, unsigned rank, unsigned rows) {
-    __shared__ float shared_q[LARGEST_RANK];
+    __shared__ float shared_q[MAX_RANK];
     __shared__ float sub_sums[WARPS][LANES];
-    const unsigned fours = (rank + 3) / 4;                      // n_vr
-    const unsigned width = min(fours, LANES);                   // lanes per row
-    const unsigned rows_of_line = LANES / width;                // n_g
-    const unsigned passes = (fours + LANES - 1) / LANES;
+    const unsigned n_vr = (rank + 3) / 4;                       // float4 per row
+    const unsigned width = min(n_vr, LANES);                   // lanes per row
+    const unsigned rows_per_line = LANES / width;                // n_g
+    const unsigned passes = (n_vr + LANES - 1) / LANES;
     // Thread (i, j) loads q[4 j + i] to the index of equation 3.3, which is i * 32 + j.
-    for (unsigned place = threadIdx.x; place < passes * 4 * LANES; place += WARPS * LANES) {
-        const unsigned mode = place / 128 * 128 + 4 * (place % LANES) + place / LANES % 4;
-        shared_q[place] = mode < rank ? q[mode] : 0.0f;
+    for (unsigned index = threadIdx.x; index < passes * 4 * LANES; index += WARPS * LANES) {
+        const unsigned mode = index / 128 * 128 + 4 * (index % LANES) + index / LANES % 4;
+        shared_q[index] = mode < rank ? q[mode] : 0.0f;
     }
     __syncthreads();
     const unsigned warp = threadIdx.x / LANES, lane = threadIdx.x % LANES;
     const unsigned line = blockIdx.x * WARPS + warp;
-    const unsigned row = line * rows_of_line + lane / width;
-    const bool busy = lane < rows_of_line * width && row < rows;
+    const unsigned row = line * rows_per_line + lane / width;
+    const bool is_busy = lane < rows_per_line * width && row < rows;
     float sum = 0.0f;
-    if (busy) {
+    if (is_busy) {
         for (unsigned pass = 0; pass < passes; ++pass) {
             const unsigned k = lane % width;
-            if (pass * LANES + k < fours) {
-                const float4 four = lines[((size_t)line * passes + pass) * LANES + lane];
-                const float* part = shared_q + pass * 4 * LANES + k;
-                sum += four.x * part[0] + four.y * part[LANES] + four.z * part[2 * LANES] + four.w * part[3 * LANES];
+            if (pass * LANES + k < n_vr) {
+                const float4 entry = lines[((size_t)line * passes + pass) * LANES + lane];
+                const float* q_part = shared_q + pass * 4 * LANES + k;
+                sum += entry.x * q_part[0] + entry.y * q_part[LANES] + entry.z * q_part[2 * LANES] + entry.w * q_part[3 * LANES];
             }
         }
     }
     sub_sums[warp][lane] = sum; // equation 3.4
     __syncwarp();
-    if (busy && lane % width == 0) {
+    if (is_busy && lane % width == 0) {
         float total = 0.0f;
         for (unsigned k = 0; k < width; ++k) {
             total += sub_sums[warp][lane + k];

@@ -30,7 +30,7 @@ struct UpdateArgs {
 };
 static_assert(sizeof(UpdateArgs) == 88, "UpdateArgs differs from tests/bench/src/kernels/thesis/thesis_update.rs");
 
-__device__ float product(const float* row, const float* rest) {
+__device__ float dot4(const float* row, const float* rest) {
     return row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3] * rest[3];
 }
 
@@ -44,29 +44,29 @@ extern "C" __global__ void __launch_bounds__(WARPS * LANES) thesis_update(const 
     const unsigned warp = threadIdx.x / LANES, lane = threadIdx.x % LANES;
     const unsigned local = threadIdx.x / 4, element = lane % 4;
     const unsigned vertex = blockIdx.x * VERTICES + local;
-    const size_t place = 4 * (size_t)vertex + element;
+    const size_t index = 4 * (size_t)vertex + element;
     const uint4 domains = args.warps[blockIdx.x * WARPS + warp];
     const unsigned domain = lane < 16 ? domains.x : domains.y;
     matrices[warp][lane / 16][lane % 16] = args.transforms[16 * (size_t)domain + lane % 16];
     if (vertex < args.vertices) {
-        float position = args.rest_positions[place];
+        float position = args.rest_positions[index];
         const unsigned source = args.sources[vertex];
         if (source != RIGID) {
             position += args.u[4 * (size_t)source + element];
         }
         rest_positions[local][element] = position;
-        rest_normals[local][element] = args.rest_normals[place];
+        rest_normals[local][element] = args.rest_normals[index];
 #ifdef TANGENTS
-        rest_tangents[local][element] = args.rest_tangents[place];
+        rest_tangents[local][element] = args.rest_tangents[index];
 #endif
     }
     __syncthreads();
     if (vertex < args.vertices) {
         const float* row = matrices[warp][lane / 4 < domains.z ? 0 : 1] + 4 * element;
-        args.positions[place] = product(row, rest_positions[local]);
-        args.normals[place] = product(row, rest_normals[local]);
+        args.positions[index] = dot4(row, rest_positions[local]);
+        args.normals[index] = dot4(row, rest_normals[local]);
 #ifdef TANGENTS
-        args.tangents[place] = product(row, rest_tangents[local]);
+        args.tangents[index] = dot4(row, rest_tangents[local]);
 #endif
     }
 }

@@ -109,7 +109,7 @@ impl BenchTarget for LocalMachine {
                 let label = VariantLabel { name: name.into(), backend, deformation };
                 make_candidate(wanted, label, |label| {
                     let scene = stock.scene(deformation)?;
-                    Ok(DeformerVariant::sharing(label, &scene, stock.ingredients(&scene), make(&scene)?))
+                    Ok(DeformerVariant::with_error_model(label, &scene, stock.error_model(&scene), make(&scene)?))
                 })
             };
         let cpu = |scene: &Arc<Scene>| -> Made { Ok(Box::new(CpuDeformer::new(scene))) };
@@ -131,18 +131,17 @@ impl BenchTarget for LocalMachine {
             if let Some(exact) = exact_normals(scene) {
                 offers.push(driven("cuda f32 step, exact normals", Backend::Cuda, exact, &cuda));
             }
-            for (name, short) in
-                shortcuts(scene).into_iter().filter(|(_, short)| cuda_variants::is_summed_otherwise(short))
+            for (name, short) in shortcuts(scene).into_iter().filter(|(_, short)| cuda_variants::needs_other_sum(short))
             {
                 offers.push(driven(&format!("cuda {name} step"), Backend::Cuda, short, &cuda));
-                offers.push(cuda_variants::positions(
+                offers.push(cuda_variants::positions_variant(
                     device,
                     &stock,
                     wanted,
                     (format!("cuda {name} positions"), short),
                 ));
             }
-            offers.extend(cuda_variants::trials(device, &stock, scene, wanted));
+            offers.extend(cuda_variants::kernel_variants(device, &stock, scene, wanted));
         }
         offers
     }
@@ -153,7 +152,8 @@ impl BenchTarget for LocalMachine {
 
     fn ingest(&self, load: &Workload, replays: usize) -> Option<UploadTiming> {
         let device = self.device.as_ref().ok()?;
-        let (bytes, timing) = kernels::ingest(device, &load.scene, &SceneState::rest(&load.scene), replays).ok()?;
+        let (bytes, timing) =
+            kernels::time_upload(device, &load.scene, &SceneState::rest(&load.scene), replays).ok()?;
         let expected = bytes as f64 / (1e3 * self.cuda.pinned_h2d_gbs?);
         Some(UploadTiming { bytes, median_us: timing.median_us, of_pinned: timing.median_us / expected })
     }

@@ -8,18 +8,18 @@ use super::timing::{CacheState, Timing};
 use super::variant::{Variant, VariantCandidate, VariantFilter, VariantLabel, make_candidate};
 use crate::kernels;
 use crate::kernels::{
-    BatchMmaBenchmark, CublasBenchmark, CublasMethod, DeformerBenchmark, KernelAttributes, KernelBenchmark,
-    KernelSplit, StepOutputs, ThesisBenchmark,
+    ArrayTraffic, BatchMmaBenchmark, CublasBenchmark, CublasMethod, DeformerBenchmark, KernelAttributes,
+    KernelBenchmark, KernelSplit, StepOutputs, ThesisBenchmark,
 };
 use modalcast_compute::gpu::Device;
 use modalcast_model::deform::{Backend, DeformedSurface};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{BatchPolicy, DeformationSettings, Scene, SceneState, StorageType};
 
-/// Creates a trial of a scene for the given states.
-type Make = Box<dyn Fn(&Device, &Arc<Scene>, &[SceneState]) -> Result<Box<dyn KernelBenchmark>>>;
+/// Creates a kernel benchmark of a scene for the given states.
+type BenchmarkFactory = Box<dyn Fn(&Device, &Arc<Scene>, &[SceneState]) -> Result<Box<dyn KernelBenchmark>>>;
 
-/// The parts of a step that competing kernels launch, and the suffixes of their names.
+/// The parts of a step that competing kernels launch, and the suffixes of the variants' names.
 const PARTS: [(kernels::Part, &str); 2] = [(kernels::Part::Uq, UQ), (kernels::Part::Whole, "")];
 
 /// Name suffixes of variants that compute only a part of a step; their times are not comparable with whole steps.
@@ -31,59 +31,60 @@ pub(super) fn is_partial(name: &str) -> bool {
     [UQ, CHANGED].iter().any(|ending| name.ends_with(ending))
 }
 
-/// A trial as a variant. It is created in [`Variant::prepare`], when the states are known.
+/// A kernel benchmark as a variant. [`Variant::prepare`] creates the benchmark, because it needs the states.
 struct BenchmarkVariant {
     label: VariantLabel,
     scene: Arc<Scene>,
-    ingredients: ErrorModel,
+    error_model: ErrorModel,
     device: Arc<Device>,
-    make: Make,
-    trial: Option<Box<dyn KernelBenchmark>>,
+    create_benchmark: BenchmarkFactory,
+    benchmark: Option<Box<dyn KernelBenchmark>>,
     surface: DeformedSurface,
 }
 
-/// All trials for a scene: our kernels in every storage type, and the competing kernels that support the scene.
-pub(super) fn trials(
+/// All kernel benchmarks of a scene as variants: our kernels in every storage type, and the competing kernels that
+/// support the scene.
+pub(super) fn kernel_variants(
     device: &Arc<Device>,
-    stock: &ErrorModelCache,
+    cache: &ErrorModelCache,
     scene: &Arc<Scene>,
-    wanted: VariantFilter<'_>,
+    is_selected: VariantFilter<'_>,
 ) -> Vec<VariantCandidate> {
-    let stored = |storage: StorageType, extent: StepOutputs| -> VariantCandidate {
+    let candidate_for = |storage: StorageType, outputs: StepOutputs| -> VariantCandidate {
         // The kernel that computes u alone does not support batches.
-        let batches = if extent == StepOutputs::Uq { BatchPolicy::Never } else { scene.deformation.batches };
+        let batches = if outputs == StepOutputs::Uq { BatchPolicy::Never } else { scene.deformation.batches };
         let deformation = DeformationSettings { storage, batches, ..scene.deformation };
-        let suffix = match extent {
+        let suffix = match outputs {
             StepOutputs::Uq => UQ,
             StepOutputs::Positions => " positions",
             StepOutputs::Whole => "",
         };
-        ours(device, stock, wanted, (format!("cuda {}{suffix}", storage.name()), deformation, extent))
+        deformer_variant(device, cache, is_selected, (format!("cuda {}{suffix}", storage.name()), deformation, outputs))
     };
     let storages: &[StorageType] = if scene.needs.modes { &StorageType::ALL } else { &[StorageType::F32] };
-    let mut offers: Vec<VariantCandidate> =
-        storages.iter().map(|storage| stored(*storage, StepOutputs::Positions)).collect();
+    let mut candidates: Vec<VariantCandidate> =
+        storages.iter().map(|storage| candidate_for(*storage, StepOutputs::Positions)).collect();
     if has_normals(scene) {
-        offers.extend(storages.iter().map(|storage| stored(*storage, StepOutputs::Whole)));
+        candidates.extend(storages.iter().map(|storage| candidate_for(*storage, StepOutputs::Whole)));
     }
-    for (name, kept) in readers(scene) {
-        let extent = if has_normals(scene) { StepOutputs::Whole } else { StepOutputs::Positions };
-        offers.push(ours(device, stock, wanted, (name, kept, extent)));
+    for (name, deformation) in with_extra_outputs(scene) {
+        let outputs = if has_normals(scene) { StepOutputs::Whole } else { StepOutputs::Positions };
+        candidates.push(deformer_variant(device, cache, is_selected, (name, deformation, outputs)));
     }
-    if scene.domains.len() >= MANY {
-        offers.push(changed(device, scene, wanted));
+    if scene.domains.len() >= MIN_CHANGED_DOMAINS {
+        candidates.push(one_percent_changed(device, scene, is_selected));
     }
     if scene.needs.modes {
-        offers.push(stored(StorageType::F32, StepOutputs::Uq));
-        offers.extend(batch(device, stock, scene, wanted));
-        offers.extend(thesis(device, scene, wanted));
-        offers.extend(cublas(device, scene, wanted));
+        candidates.push(candidate_for(StorageType::F32, StepOutputs::Uq));
+        candidates.extend(batch_variants(device, cache, scene, is_selected));
+        candidates.extend(thesis_variants(device, scene, is_selected));
+        candidates.extend(cublas_variants(device, scene, is_selected));
     }
-    offers
+    candidates
 }
 
-/// Deformations that keep additional outputs for readers, by name; empty when the scene already keeps one of them.
-fn readers(scene: &Scene) -> Vec<(String, DeformationSettings)> {
+/// Deformations with an additional output for clients, by name; empty when the scene already has one of them.
+fn with_extra_outputs(scene: &Scene) -> Vec<(String, DeformationSettings)> {
     let plain = scene.deformation;
     if plain.displacements || plain.boxes {
         return Vec::new();
@@ -93,123 +94,127 @@ fn readers(scene: &Scene) -> Vec<(String, DeformationSettings)> {
     vec![u, boxes]
 }
 
-/// Whether a deformation truncates modes or sums with compensation, so that its kernel needs rows of its own.
-pub(super) fn is_summed_otherwise(deformation: &DeformationSettings) -> bool {
+/// Whether a deformation truncates modes or sums with compensation, so that its kernel differs from the plain one.
+pub(super) fn needs_other_sum(deformation: &DeformationSettings) -> bool {
     deformation.truncation.is_some() || deformation.compensated
 }
 
-/// The positions kernel of a scene with this deformation. With truncation every state is decided independently, because
-/// trials have no history.
-pub(super) fn positions(
+/// The positions kernel of a scene with this deformation. Kernel benchmarks have no history, so with truncation the
+/// modes of every state are selected independently.
+pub(super) fn positions_variant(
     device: &Arc<Device>,
-    stock: &ErrorModelCache,
-    wanted: VariantFilter<'_>,
+    cache: &ErrorModelCache,
+    is_selected: VariantFilter<'_>,
     (name, deformation): (String, DeformationSettings),
 ) -> VariantCandidate {
-    ours(device, stock, wanted, (name, deformation, StepOutputs::Positions))
+    deformer_variant(device, cache, is_selected, (name, deformation, StepOutputs::Positions))
 }
 
-fn ours(
+/// A variant with the deformer's own kernels.
+fn deformer_variant(
     device: &Arc<Device>,
-    stock: &ErrorModelCache,
-    wanted: VariantFilter<'_>,
-    (name, deformation, extent): (String, DeformationSettings, StepOutputs),
+    cache: &ErrorModelCache,
+    is_selected: VariantFilter<'_>,
+    (name, deformation, outputs): (String, DeformationSettings, StepOutputs),
 ) -> VariantCandidate {
     let label = VariantLabel { name, backend: Backend::Cuda, deformation };
-    make_candidate(wanted, label, |label| {
-        let scene = stock.scene(deformation)?;
-        let make: Make =
-            Box::new(move |device, scene, states| Ok(Box::new(DeformerBenchmark::new(device, scene, states, extent)?)));
-        Ok(BenchmarkVariant::sharing(label, &scene, device, (stock.ingredients(&scene), make)))
+    make_candidate(is_selected, label, |label| {
+        let scene = cache.scene(deformation)?;
+        let create: BenchmarkFactory = Box::new(move |device, scene, states| {
+            Ok(Box::new(DeformerBenchmark::new(device, scene, states, outputs)?))
+        });
+        Ok(BenchmarkVariant::sharing(label, &scene, device, (cache.error_model(&scene), create)))
     })
 }
 
 /// Minimum of domains for which a step that changes one domain in a hundred is measured.
-const MANY: usize = 400;
+const MIN_CHANGED_DOMAINS: usize = 400;
 
 /// A step that changes one domain in a hundred, evenly distributed over the domains.
-fn changed(device: &Arc<Device>, scene: &Arc<Scene>, wanted: VariantFilter<'_>) -> VariantCandidate {
+fn one_percent_changed(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: VariantFilter<'_>) -> VariantCandidate {
     let list: Vec<u32> = (0..scene.domains.len() as u32).step_by(100).collect();
     let label = VariantLabel::new(format!("cuda f32 positions{CHANGED}"), Backend::Cuda, scene);
-    let make: Make = Box::new(move |device, scene, states| {
+    let create: BenchmarkFactory = Box::new(move |device, scene, states| {
         Ok(Box::new(DeformerBenchmark::of_changed(device, scene, states, (StepOutputs::Positions, Some(&list)))?))
     });
-    make_candidate(wanted, label, |label| Ok(BenchmarkVariant::new(label, scene, device, make)))
+    make_candidate(is_selected, label, |label| Ok(BenchmarkVariant::new(label, scene, device, create)))
 }
 
 /// Batched products of many q with one shape: in every storage type, in f32 without batches for comparison, and by
 /// tensor cores where U has 16 bits.
-fn batch(
+fn batch_variants(
     device: &Arc<Device>,
-    stock: &ErrorModelCache,
+    cache: &ErrorModelCache,
     scene: &Arc<Scene>,
-    wanted: VariantFilter<'_>,
+    is_selected: VariantFilter<'_>,
 ) -> Vec<VariantCandidate> {
     if scene.shapes.len() > 1 || scene.domains.len() < 2 {
         return Vec::new();
     }
     let count = scene.domains.len();
-    let of = |storage: StorageType, batches: BatchPolicy| DeformationSettings { storage, batches, ..scene.deformation };
-    let one = |storage: StorageType| {
+    let with_batches =
+        |storage: StorageType, batches: BatchPolicy| DeformationSettings { storage, batches, ..scene.deformation };
+    let batched = |storage: StorageType| {
         let name = format!("cuda batch of {count} {}", storage.name());
-        positions(device, stock, wanted, (name, of(storage, BatchPolicy::Always)))
+        positions_variant(device, cache, is_selected, (name, with_batches(storage, BatchPolicy::Always)))
     };
-    let apart = (format!("cuda {count} apart f32"), of(StorageType::F32, BatchPolicy::Never));
-    let products = |storage: StorageType| {
+    let unbatched = (format!("cuda {count} apart f32"), with_batches(StorageType::F32, BatchPolicy::Never));
+    let tensor_core = |storage: StorageType| {
         let deformation = DeformationSettings { storage, ..scene.deformation };
         // Summation order and rounding differ from the deformer's, so the name marks it.
         let name = format!("cuda batch of {count} {} mma", storage.name());
-        make_candidate(wanted, VariantLabel { name, backend: Backend::Cuda, deformation }, |label| {
-            let scene = stock.scene(deformation)?;
-            let make: Make =
+        make_candidate(is_selected, VariantLabel { name, backend: Backend::Cuda, deformation }, |label| {
+            let scene = cache.scene(deformation)?;
+            let create: BenchmarkFactory =
                 Box::new(|device, scene, states| Ok(Box::new(BatchMmaBenchmark::new(device, scene, states)?)));
-            Ok(BenchmarkVariant::sharing(label, &scene, device, (stock.ingredients(&scene).with_products(), make)))
+            Ok(BenchmarkVariant::sharing(label, &scene, device, (cache.error_model(&scene).with_products(), create)))
         })
     };
-    let ours = StorageType::ALL.into_iter().map(one).chain([positions(device, stock, wanted, apart)]);
-    ours.chain([StorageType::F16, StorageType::Bf16].map(products)).collect()
+    let deformer_variants =
+        StorageType::ALL.into_iter().map(batched).chain([positions_variant(device, cache, is_selected, unbatched)]);
+    deformer_variants.chain([StorageType::F16, StorageType::Bf16].map(tensor_core)).collect()
 }
 
 /// cuBLAS: each kind of product that fits the scene, alone and with a plain vertex update.
-fn cublas(device: &Arc<Device>, scene: &Arc<Scene>, wanted: VariantFilter<'_>) -> Vec<VariantCandidate> {
-    let shared = scene.domains.len() > 1 && scene.shapes.len() == 1;
-    let fits = |peer: &CublasMethod| match peer {
+fn cublas_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
+    let is_instanced = scene.domains.len() > 1 && scene.shapes.len() == 1;
+    let supports_scene = |method: &CublasMethod| match method {
         CublasMethod::SgemvColumns | CublasMethod::SgemvRows => scene.domains.len() == 1,
-        CublasMethod::Instances => shared,
+        CublasMethod::Instances => is_instanced,
         _ => scene.domains.len() > 1,
     };
-    let made = |peer: CublasMethod, (part, suffix): (kernels::Part, &str)| {
-        let label = VariantLabel::new(format!("{}{suffix}", peer.name().replace('_', " ")), Backend::Cuda, scene);
-        let make: Make = Box::new(move |device, scene, states| {
-            Ok(Box::new(CublasBenchmark::new(device, scene, states, (peer, part))?))
+    let candidate = |method: CublasMethod, (part, suffix): (kernels::Part, &str)| {
+        let label = VariantLabel::new(format!("{}{suffix}", method.name().replace('_', " ")), Backend::Cuda, scene);
+        let create: BenchmarkFactory = Box::new(move |device, scene, states| {
+            Ok(Box::new(CublasBenchmark::new(device, scene, states, (method, part))?))
         });
-        make_candidate(wanted, label, |label| Ok(BenchmarkVariant::new(label, scene, device, make)))
+        make_candidate(is_selected, label, |label| Ok(BenchmarkVariant::new(label, scene, device, create)))
     };
-    let both = |peer: CublasMethod| PARTS.map(|part| made(peer, part));
-    CublasMethod::ALL.into_iter().filter(fits).flat_map(both).collect()
+    let candidates_of = |method: CublasMethod| PARTS.map(|part| candidate(method, part));
+    CublasMethod::ALL.into_iter().filter(supports_scene).flat_map(candidates_of).collect()
 }
 
 /// The thesis's kernels: the single-domain kernel, or the grouped ones in all splits, which support up to 32 modes.
-fn thesis(device: &Arc<Device>, scene: &Arc<Scene>, wanted: VariantFilter<'_>) -> Vec<VariantCandidate> {
-    let made = |name: String, make: Make| {
+fn thesis_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
+    let candidate = |name: String, create: BenchmarkFactory| {
         let label = VariantLabel::new(name, Backend::Cuda, scene);
-        make_candidate(wanted, label, |label| Ok(BenchmarkVariant::new(label, scene, device, make)))
+        make_candidate(is_selected, label, |label| Ok(BenchmarkVariant::new(label, scene, device, create)))
     };
     let single = |(part, suffix): (kernels::Part, &str)| {
-        let make: Make =
+        let create: BenchmarkFactory =
             Box::new(move |device, scene, states| Ok(Box::new(ThesisBenchmark::single(device, scene, states, part)?)));
-        made(format!("thesis single{suffix}"), make)
+        candidate(format!("thesis single{suffix}"), create)
     };
     let multi = |split: KernelSplit, (part, suffix): (kernels::Part, &str)| {
-        let make: Make = Box::new(move |device, scene, states| {
+        let create: BenchmarkFactory = Box::new(move |device, scene, states| {
             Ok(Box::new(ThesisBenchmark::multi(device, scene, states, (split, part))?))
         });
-        made(format!("thesis {} kernels{suffix}", split.widths().len()), make)
+        candidate(format!("thesis {} kernels{suffix}", split.widths().len()), create)
     };
-    let largest = (0..scene.domains.len()).map(|domain| scene.rank_of(domain)).max().unwrap_or(0);
+    let max_rank = (0..scene.domains.len()).map(|domain| scene.rank_of(domain)).max().unwrap_or(0);
     // Unfolded triangles do not contain a vertex that no triangle refers to.
-    let parts = if names_all(scene) { &PARTS[..] } else { &PARTS[..1] };
-    match (scene.domains.len(), largest) {
+    let parts = if refers_to_all_vertices(scene) { &PARTS[..] } else { &PARTS[..1] };
+    match (scene.domains.len(), max_rank) {
         (1, _) => parts.iter().copied().map(single).collect(),
         (_, 0..=32) => KernelSplit::ALL
             .into_iter()
@@ -221,13 +226,13 @@ fn thesis(device: &Arc<Device>, scene: &Arc<Scene>, wanted: VariantFilter<'_>) -
 }
 
 /// Whether every vertex of every shape is a corner of some triangle.
-fn names_all(scene: &Scene) -> bool {
+fn refers_to_all_vertices(scene: &Scene) -> bool {
     scene.shapes.iter().all(|shape| {
-        let mut named = vec![false; shape.mesh.rest().len()];
+        let mut is_corner = vec![false; shape.mesh.rest().len()];
         for corner in shape.mesh.triangles().as_flattened() {
-            named[shape.mesh.corners().vertices[*corner as usize] as usize] = true;
+            is_corner[shape.mesh.corners().vertices[*corner as usize] as usize] = true;
         }
-        named.into_iter().all(|named| named)
+        is_corner.into_iter().all(|is_corner| is_corner)
     })
 }
 
@@ -236,9 +241,9 @@ pub(super) fn has_normals(scene: &Scene) -> bool {
     scene.shapes.iter().any(|shape| shape.mesh.corners().vertices.len() > 3)
 }
 
-/// The formula of a part of a trial's bytes, by the part's name.
-fn formula(name: &str) -> &'static str {
-    match name {
+/// The formula of the traffic of an array of a kernel benchmark.
+fn formula(array: &str) -> &'static str {
+    match array {
         "U" => "as packed: entries of all modes and vertices, filled up to tiles",
         "U kept" => "as packed: the share of modes that are kept, mean over the domains and states that are timed",
         "q" => "4 x sum r",
@@ -249,23 +254,32 @@ fn formula(name: &str) -> &'static str {
 }
 
 impl BenchmarkVariant {
-    fn new(label: VariantLabel, scene: &Arc<Scene>, device: &Arc<Device>, make: Make) -> Self {
-        Self::sharing(label, scene, device, (ErrorModel::of(scene), make))
+    fn new(label: VariantLabel, scene: &Arc<Scene>, device: &Arc<Device>, create: BenchmarkFactory) -> Self {
+        Self::sharing(label, scene, device, (ErrorModel::of(scene), create))
     }
 
     fn sharing(
         label: VariantLabel,
         scene: &Arc<Scene>,
         device: &Arc<Device>,
-        (ingredients, make): (ErrorModel, Make),
+        (error_model, create): (ErrorModel, BenchmarkFactory),
     ) -> Self {
         let (scene, device) = (Arc::clone(scene), Arc::clone(device));
-        Self { label, scene, ingredients, device, make, trial: None, surface: DeformedSurface::default() }
+        Self {
+            label,
+            scene,
+            error_model,
+            device,
+            create_benchmark: create,
+            benchmark: None,
+            surface: DeformedSurface::default(),
+        }
     }
 
-    fn trial(&self) -> Result<&dyn KernelBenchmark> {
-        let missing = || Error::Fault { stage: "trial", reason: format!("{} was not prepared", self.label.name) };
-        self.trial.as_deref().ok_or_else(missing)
+    fn benchmark(&self) -> Result<&dyn KernelBenchmark> {
+        let unprepared =
+            || Error::Fault { stage: "benchmark", reason: format!("{} was not prepared", self.label.name) };
+        self.benchmark.as_deref().ok_or_else(unprepared)
     }
 }
 
@@ -278,35 +292,40 @@ impl Variant for BenchmarkVariant {
         &self.scene
     }
 
-    fn ingredients(&self) -> &ErrorModel {
-        &self.ingredients
+    fn error_model(&self) -> &ErrorModel {
+        &self.error_model
     }
 
     fn traffic(&self) -> Vec<Operand> {
-        let parts = self.trial.as_ref().map_or_else(Vec::new, |trial| trial.bytes());
-        parts.into_iter().map(|(name, bytes)| Operand { name, formula: formula(name), bytes }).collect()
+        let traffic = self.benchmark.as_ref().map_or_else(Vec::new, |benchmark| benchmark.traffic());
+        let operand = |ArrayTraffic { array, bytes }| Operand { name: array, formula: formula(array), bytes };
+        traffic.into_iter().map(operand).collect()
     }
 
     fn prepare(&mut self, states: &[SceneState]) -> Result<()> {
-        self.trial = Some((self.make)(&self.device, &self.scene, states)?);
+        self.benchmark = Some((self.create_benchmark)(&self.device, &self.scene, states)?);
         Ok(())
     }
 
-    fn surface(&mut self, at: usize, state: &SceneState) -> Result<&DeformedSurface> {
-        self.ingredients.reset();
-        self.ingredients.follow(state);
-        let trial = self.trial()?;
-        trial.complete(&self.device, at)?;
-        trial.launch(&self.device, at)?;
-        self.surface.positions = trial.positions(&self.device)?;
+    fn surface(&mut self, state_index: usize, state: &SceneState) -> Result<&DeformedSurface> {
+        self.error_model.reset();
+        self.error_model.follow(state);
+        let benchmark = self.benchmark()?;
+        benchmark.compute_skipped_domains(&self.device, state_index)?;
+        benchmark.launch(&self.device, state_index)?;
+        self.surface.positions = benchmark.positions(&self.device)?;
         Ok(&self.surface)
     }
 
     fn time(&mut self, _states: &[SceneState], cache: CacheState, replays: usize) -> Result<Option<Timing>> {
-        kernels::time(&self.device, self.trial()?, cache, replays).map(Some)
+        kernels::time(&self.device, self.benchmark()?, cache, replays).map(Some)
     }
 
-    fn kernels(&self) -> (usize, Vec<KernelAttributes>) {
-        self.trial.as_ref().map_or((0, Vec::new()), |trial| (trial.launches(), trial.kernels()))
+    fn launches_per_step(&self) -> usize {
+        self.benchmark.as_ref().map_or(0, |benchmark| benchmark.launches_per_step())
+    }
+
+    fn kernel_attributes(&self) -> Vec<KernelAttributes> {
+        self.benchmark.as_ref().map_or_else(Vec::new, |benchmark| benchmark.kernel_attributes())
     }
 }

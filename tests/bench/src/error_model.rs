@@ -193,7 +193,7 @@ impl ErrorModelCache {
     }
 
     /// The error model of a deformer of one of these scenes.
-    pub fn ingredients(&self, scene: &Arc<Scene>) -> ErrorModel {
+    pub fn error_model(&self, scene: &Arc<Scene>) -> ErrorModel {
         let storage = scene.deformation.storage;
         let mut known = self.stored.lock().unwrap_or_else(PoisonError::into_inner);
         let own = known.iter().find(|(known, _)| *known == storage).map(|(_, stored)| Arc::clone(stored));
@@ -246,7 +246,7 @@ mod tests {
     use crate::motion::WorkloadMotion;
     use crate::workloads::{Size, WorkloadKind};
 
-    fn ingredients(deformation: DeformationSettings) -> (ErrorModel, SceneState) {
+    fn model_and_state(deformation: DeformationSettings) -> (ErrorModel, SceneState) {
         let load = WorkloadKind::Single { power: 8, rank: 20 }.build(Size::Full).expect("built");
         let scene = with_deformation(&load.scene, deformation).expect("restated");
         (ErrorModel::of(&scene), WorkloadMotion::new(&load, None).seed(0).state())
@@ -254,7 +254,7 @@ mod tests {
 
     #[test]
     fn default_deformation_replaces_nothing() {
-        let (exact, state) = ingredients(DeformationSettings::default());
+        let (exact, state) = model_and_state(DeformationSettings::default());
         assert!(exact.is_exact() && exact.tiles(0).is_none());
         let mut bounds = [1.0, 2.0];
         exact.bounds(0, &state).widen(0, bounds.iter_mut());
@@ -264,22 +264,22 @@ mod tests {
     #[test]
     fn variants_share_stored_u_by_storage_type() {
         let load = WorkloadKind::Single { power: 8, rank: 4 }.build(Size::Full).expect("built");
-        let stock = ErrorModelCache::new(&load.scene);
+        let cache = ErrorModelCache::new(&load.scene);
         let half = DeformationSettings { storage: StorageType::F16, ..DeformationSettings::default() };
-        let [one, two] = [half, half].map(|half| stock.scene(half).expect("restated"));
+        let [one, two] = [half, half].map(|half| cache.scene(half).expect("restated"));
         assert!(Arc::ptr_eq(&one, &two) && !Arc::ptr_eq(&one, &load.scene));
-        assert!(Arc::ptr_eq(&stock.scene(load.scene.deformation).expect("its own"), &load.scene));
-        let short = stock.scene(DeformationSettings { truncation: Some(0.01), ..half }).expect("restated");
-        let made = [&one, &short].map(|scene| stock.ingredients(scene));
+        assert!(Arc::ptr_eq(&cache.scene(load.scene.deformation).expect("its own"), &load.scene));
+        let short = cache.scene(DeformationSettings { truncation: Some(0.01), ..half }).expect("restated");
+        let made = [&one, &short].map(|scene| cache.error_model(scene));
         assert!(Arc::ptr_eq(&made[0].stored, &made[1].stored) && made[0].stores());
         assert!(made[1].truncates() && !made[0].truncates());
-        assert!(stock.ingredients(&load.scene).is_exact());
+        assert!(cache.error_model(&load.scene).is_exact());
     }
 
     #[test]
     fn coarser_storage_widens_bounds_more() {
         let widened = |storage| {
-            let (stored, state) = ingredients(DeformationSettings { storage, ..DeformationSettings::default() });
+            let (stored, state) = model_and_state(DeformationSettings { storage, ..DeformationSettings::default() });
             assert!(!stored.is_exact() && stored.tiles(0).is_some());
             let mut bounds = [1e-6; 256];
             stored.bounds(0, &state).widen(0, bounds.iter_mut());
@@ -292,10 +292,10 @@ mod tests {
     #[test]
     fn tensor_cores_widen_bounds_and_round_q_to_two_halves() {
         let (stored, state) =
-            ingredients(DeformationSettings { storage: StorageType::Bf16, ..DeformationSettings::default() });
-        let widened = |ingredients: &ErrorModel| {
+            model_and_state(DeformationSettings { storage: StorageType::Bf16, ..DeformationSettings::default() });
+        let widened = |error_model: &ErrorModel| {
             let mut bounds = [1e-6];
-            ingredients.bounds(0, &state).widen(0, bounds.iter_mut());
+            error_model.bounds(0, &state).widen(0, bounds.iter_mut());
             bounds[0]
         };
         let q: Vec<f64> = state.q.iter().map(|q| f64::from(*q)).collect();
@@ -316,10 +316,10 @@ mod tests {
     #[test]
     fn truncates_small_modes_within_budget_after_first_state() {
         let (mut truncated, state) =
-            ingredients(DeformationSettings { truncation: Some(0.01), ..DeformationSettings::default() });
-        let count = |ingredients: &ErrorModel| {
+            model_and_state(DeformationSettings { truncation: Some(0.01), ..DeformationSettings::default() });
+        let count = |error_model: &ErrorModel| {
             let mut q = state.q.clone();
-            ingredients.truncate(0, &mut q);
+            error_model.truncate(0, &mut q);
             q.iter().filter(|q| **q != 0.0).count()
         };
         assert_eq!(count(&truncated), 20);

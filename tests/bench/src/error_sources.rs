@@ -70,13 +70,13 @@ impl SharedErrorSources {
         Self { truth, given, exact, q, transform, plain, stored: Mutex::default() }
     }
 
-    fn stored(&self, scene: &Scene, ingredients: &ErrorModel) -> Arc<StorageError> {
+    fn stored(&self, scene: &Scene, error_model: &ErrorModel) -> Arc<StorageError> {
         let (storage, mut known) =
             (scene.deformation.storage, self.stored.lock().unwrap_or_else(PoisonError::into_inner));
         if let Some((_, stored)) = known.iter().find(|(known, _)| *known == storage) {
             return Arc::clone(stored);
         }
-        let take = ErrorModelTerms { storage: Some(ingredients), truncation: None };
+        let take = ErrorModelTerms { storage: Some(error_model), truncation: None };
         let alone = apart(&self.exact, &positions(scene, &self.truth, take));
         let stored = Arc::new(StorageError { alone, own: positions(scene, &self.given, take) });
         known.push((storage, Arc::clone(&stored)));
@@ -87,20 +87,20 @@ impl SharedErrorSources {
     pub(super) fn split(
         &self,
         scene: &Scene,
-        ingredients: &ErrorModel,
+        error_model: &ErrorModel,
         got: &[f32],
         split: &mut ErrorSourcesAccumulator,
     ) {
-        let storage = Some(ingredients).filter(|ingredients| ingredients.stores());
-        let truncation = Some(ingredients).filter(|ingredients| ingredients.truncates());
-        let stored = storage.map(|ingredients| self.stored(scene, ingredients));
+        let storage = Some(error_model).filter(|error_model| error_model.stores());
+        let truncation = Some(error_model).filter(|error_model| error_model.truncates());
+        let stored = storage.map(|error_model| self.stored(scene, error_model));
         // Every source counts all vertices, even if it moves none of them.
         let none = apart(&self.exact, &self.exact);
         let from_storage = stored.as_ref().map_or(none, |stored| stored.alone);
         // Truncation was decided from the rounded q; applying it to the unrounded q hardly changes the displacement.
         let cut = ErrorModelTerms { storage: None, truncation };
         let from_truncation = truncation.map_or(none, |_| apart(&self.exact, &positions(scene, &self.truth, cut)));
-        let halved = ingredients.halved(&self.given.q);
+        let halved = error_model.halved(&self.given.q);
         let with = |q: &[f64], transforms: &[[f64; 12]], take: ErrorModelTerms<'_>| {
             positions(scene, &ExactState { q: q.to_vec(), transforms: transforms.to_vec() }, take)
         };
@@ -148,15 +148,15 @@ mod tests {
 
     fn split(deformation: DeformationSettings, truth: &ExactState, got: Option<&[f32]>) -> ErrorSources {
         let (scene, state) = (with_deformation(&load().scene, deformation).expect("restated"), truth.state());
-        let mut ingredients = ErrorModel::of(&scene);
-        ingredients.follow(&state);
-        let all = ErrorModelTerms { storage: Some(&ingredients), truncation: Some(&ingredients) };
+        let mut error_model = ErrorModel::of(&scene);
+        error_model.follow(&state);
+        let all = ErrorModelTerms { storage: Some(&error_model), truncation: Some(&error_model) };
         let perfect = positions(&scene, &ExactState::of(&state), all);
         let perfect: Vec<f32> = perfect.as_flattened().iter().map(|number| *number as f32).collect();
         let mut split = ErrorSourcesAccumulator::default();
         SharedErrorSources::new(&scene, truth.clone(), &state).split(
             &scene,
-            &ingredients,
+            &error_model,
             got.unwrap_or(&perfect),
             &mut split,
         );

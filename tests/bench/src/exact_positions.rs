@@ -54,10 +54,10 @@ pub fn positions(scene: &Scene, truth: &ExactState, take: ErrorModelTerms<'_>) -
     each_tile(scene, [0.0; 3], |domain, vertices, out| {
         let shape = scene.domains[domain].shape;
         let mut q = own(scene, domain, truth).to_vec();
-        if let Some(ingredients) = take.truncation {
-            ingredients.truncate(domain, &mut q);
+        if let Some(error_model) = take.truncation {
+            error_model.truncate(domain, &mut q);
         }
-        let stored = take.storage.and_then(|ingredients| ingredients.tiles(shape));
+        let stored = take.storage.and_then(|error_model| error_model.tiles(shape));
         let entries = stored.map_or(Entries::Exact(&scene.shapes[shape].modes), Entries::Stored);
         let sums = sum(vertices.clone(), entries, &q);
         let (rest, transform) = (&scene.shapes[shape].mesh.rest()[vertices], truth.transform_of(scene, domain));
@@ -91,12 +91,12 @@ pub fn widen(
     scene: &Scene,
     state: &SceneState,
     judged: &[ReferenceVertex],
-    ingredients: &ErrorModel,
+    error_model: &ErrorModel,
 ) -> Vec<ReferenceVertex> {
     each_tile(scene, NOTHING, |domain, vertices, out| {
         let first = scene.layout.slots[domain].first_vertex + vertices.start;
         out.copy_from_slice(&judged[first..][..vertices.len()]);
-        ingredients.bounds(domain, state).widen(vertices.start, out.iter_mut().map(|judged| &mut judged.bound));
+        error_model.bounds(domain, state).widen(vertices.start, out.iter_mut().map(|judged| &mut judged.bound));
     })
 }
 

@@ -337,7 +337,7 @@ fn measure(
                 None
             });
             let (label, traffic) = (variant.label(), variant.traffic());
-            let (launches, kernels) = variant.kernels();
+            let (launches, kernels) = (variant.launches_per_step(), variant.kernel_attributes());
             let row = DeformRow::new(&load.name, label, found, traffic, (cache, timing));
             rows.push(DeformRow { launches, kernels, ..row.under(bench.roofs(label.backend)) });
         }

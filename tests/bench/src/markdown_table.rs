@@ -26,6 +26,6 @@ mod tests {
     fn writes_header_rule_and_escaped_cells() {
         let rows = [["1".to_owned(), "a|b".to_owned()], ["2".to_owned(), dash()]];
         assert_eq!(table(&["n", "text"], rows), "| n | text |\n|---|---|\n| 1 | a\\|b |\n| 2 | - |\n");
-        assert_eq!(table(&["n"], [[String::new(); 1]; 0]), "| n |\n|---|\n");
+        assert_eq!(table(&["n"], Vec::<[String; 1]>::new()), "| n |\n|---|\n");
     }
 }

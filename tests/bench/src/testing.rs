@@ -34,8 +34,8 @@ impl<V: Variant> Variant for Damaged<V> {
         self.inner.scene()
     }
 
-    fn ingredients(&self) -> &ErrorModel {
-        self.inner.ingredients()
+    fn error_model(&self) -> &ErrorModel {
+        self.inner.error_model()
     }
 
     fn traffic(&self) -> Vec<Operand> {
@@ -74,7 +74,7 @@ impl Variant for Emulated {
         &self.scene
     }
 
-    fn ingredients(&self) -> &ErrorModel {
+    fn error_model(&self) -> &ErrorModel {
         &self.says
     }
 

@@ -234,8 +234,8 @@ impl<'a> VariantCheck<'a> {
         self.tally.add(yardstick, &self.held.positions, &self.judged(look));
         self.orient(look);
         if let Some(origin) = &look.origin {
-            let (scene, ingredients) = (self.variant.scene(), self.variant.ingredients());
-            origin.split(scene, ingredients, &self.held.positions, &mut self.split);
+            let (scene, error_model) = (self.variant.scene(), self.variant.error_model());
+            origin.split(scene, error_model, &self.held.positions, &mut self.split);
         }
         if look.at == 0 {
             copy(&mut self.first, &self.held);
@@ -263,7 +263,7 @@ impl<'a> VariantCheck<'a> {
     /// Evaluates the first state again, after all others. Variants with truncation are exempt: their choice of modes
     /// may depend on earlier states.
     fn repeat(&mut self, states: &[SceneState]) {
-        if self.fault.is_none() && !self.variant.ingredients().truncates() {
+        if self.fault.is_none() && !self.variant.error_model().truncates() {
             let again = self.variant.surface(0, &states[0]);
             self.repeatable = again.is_ok_and(|again| bits(again).eq(bits(&self.first)));
         }
@@ -271,10 +271,10 @@ impl<'a> VariantCheck<'a> {
 
     /// The exact positions with this variant's own bounds.
     fn judged(&self, look: &StateSample<'_>) -> Arc<Vec<ReferenceVertex>> {
-        let ingredients = self.variant.ingredients();
-        match ingredients.is_exact() {
+        let error_model = self.variant.error_model();
+        match error_model.is_exact() {
             true => Arc::clone(&look.judged),
-            false => Arc::new(widen(self.variant.scene(), look.state, &look.judged, ingredients)),
+            false => Arc::new(widen(self.variant.scene(), look.state, &look.judged, error_model)),
         }
     }
 

@@ -26,7 +26,7 @@ impl VariantLabel {
     }
 }
 
-/// A way to deform one scene. It owns all data that it needs of the scene.
+/// A way to deform one scene. It owns all data of the scene that it needs.
 pub trait Variant {
     /// Name, backend and deformation.
     fn label(&self) -> &VariantLabel;
@@ -35,9 +35,9 @@ pub trait Variant {
     fn scene(&self) -> &Arc<Scene>;
 
     /// The error model: what the variant replaces in x = T (x0 + U q). It gives the a-priori bound.
-    fn ingredients(&self) -> &ErrorModel;
+    fn error_model(&self) -> &ErrorModel;
 
-    /// The minimum of bytes that a step moves, by part.
+    /// Minimum memory traffic of a step per operand.
     fn traffic(&self) -> Vec<Operand>;
 
     /// Receives all states that [`Self::surface`] will be called with.
@@ -49,12 +49,12 @@ pub trait Variant {
         Ok(())
     }
 
-    /// The surface at `state`, which is number `at` of the prepared states. Normals and tangents are empty when the
-    /// variant computes none.
+    /// Deforms to `state`, which is the prepared state of this index. Normals and tangents are empty when the variant
+    /// computes none.
     ///
     /// # Errors
     /// `Fault` when the device fails.
-    fn surface(&mut self, at: usize, state: &SceneState) -> Result<&DeformedSurface>;
+    fn surface(&mut self, state_index: usize, state: &SceneState) -> Result<&DeformedSurface>;
 
     /// Times steps over rotating states; `None` when the variant cannot be timed with this cache.
     ///
@@ -62,9 +62,14 @@ pub trait Variant {
     /// `Fault` when the device fails.
     fn time(&mut self, states: &[SceneState], cache: CacheState, replays: usize) -> Result<Option<Timing>>;
 
-    /// Kernel launches per step, and the driver's facts about each kernel; 0 and none on the CPU.
-    fn kernels(&self) -> (usize, Vec<KernelAttributes>) {
-        (0, Vec::new())
+    /// Kernel launches per step; 0 on the CPU.
+    fn launches_per_step(&self) -> usize {
+        0
+    }
+
+    /// The driver's attributes of each kernel; empty on the CPU.
+    fn kernel_attributes(&self) -> Vec<KernelAttributes> {
+        Vec::new()
     }
 }
 
@@ -72,24 +77,24 @@ pub trait Variant {
 pub struct DeformerVariant {
     label: VariantLabel,
     scene: Arc<Scene>,
-    ingredients: ErrorModel,
+    error_model: ErrorModel,
     deformer: Box<dyn Deformer>,
 }
 
 impl DeformerVariant {
     /// Wraps a deformer of this scene.
     pub fn new(label: VariantLabel, scene: &Arc<Scene>, deformer: Box<dyn Deformer>) -> Self {
-        Self::sharing(label, scene, ErrorModel::of(scene), deformer)
+        Self::with_error_model(label, scene, ErrorModel::of(scene), deformer)
     }
 
-    /// The same, with an existing error model.
-    pub fn sharing(
+    /// Wraps a deformer whose error model exists.
+    pub fn with_error_model(
         label: VariantLabel,
         scene: &Arc<Scene>,
-        ingredients: ErrorModel,
+        error_model: ErrorModel,
         deformer: Box<dyn Deformer>,
     ) -> Self {
-        Self { label, scene: Arc::clone(scene), ingredients, deformer }
+        Self { label, scene: Arc::clone(scene), error_model, deformer }
     }
 }
 
@@ -102,22 +107,22 @@ impl Variant for DeformerVariant {
         &self.scene
     }
 
-    fn ingredients(&self) -> &ErrorModel {
-        &self.ingredients
+    fn error_model(&self) -> &ErrorModel {
+        &self.error_model
     }
 
     fn traffic(&self) -> Vec<Operand> {
         memory_traffic::of_scene(&self.scene)
     }
 
-    fn surface(&mut self, _at: usize, state: &SceneState) -> Result<&DeformedSurface> {
-        self.ingredients.follow(state);
+    fn surface(&mut self, _state_index: usize, state: &SceneState) -> Result<&DeformedSurface> {
+        self.error_model.follow(state);
         self.deformer.deform(state)?;
         self.deformer.surface()
     }
 
     fn time(&mut self, states: &[SceneState], cache: CacheState, replays: usize) -> Result<Option<Timing>> {
-        // The cold sweep evicts the caches of the CPU, not those of a device.
+        // The cache flush evicts the caches of the CPU, not those of a device.
         if cache == CacheState::Cold && self.label.backend == Backend::Cuda {
             return Ok(None);
         }
@@ -126,21 +131,21 @@ impl Variant for DeformerVariant {
     }
 }
 
-/// Predicate: whether the request selects a variant of this name.
+/// Whether the report's options select a variant of this name.
 pub type VariantFilter<'a> = &'a dyn Fn(&str) -> bool;
 
 /// A variant, or the reason why it could not be created.
 pub type VariantCandidate = (VariantLabel, Result<Box<dyn Variant>>);
 
-/// Creates a variant if it is wanted; otherwise, and on failure, keeps the reason.
+/// Creates a variant if it is selected. The candidate holds the reason if it is not selected or cannot be created.
 pub fn make_candidate<V: Variant + 'static>(
-    wanted: VariantFilter<'_>,
+    is_selected: VariantFilter<'_>,
     label: VariantLabel,
-    make: impl FnOnce(VariantLabel) -> Result<V>,
+    create: impl FnOnce(VariantLabel) -> Result<V>,
 ) -> VariantCandidate {
-    if !wanted(&label.name) {
+    if !is_selected(&label.name) {
         let given = label.name.clone();
-        return (label, Err(Error::NotFound { what: "variant that is asked for", given }));
+        return (label, Err(Error::NotFound { what: "selected variant", given }));
     }
-    (label.clone(), make(label).map(|variant| Box::new(variant) as Box<dyn Variant>))
+    (label.clone(), create(label).map(|variant| Box::new(variant) as Box<dyn Variant>))
 }

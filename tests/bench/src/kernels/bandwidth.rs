@@ -1,4 +1,4 @@
-//! Launches `kernels/bandwidth.cu`: kernels that copy, read and fill device memory, and kernels that keep a stream busy.
+//! Launches `kernels/bandwidth.cu`: kernels that copy, read and fill device memory, and helpers for timing.
 
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg as _};
 
@@ -7,19 +7,20 @@ use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, fault_in};
 
-/// Threads per block, and bytes per word.
+/// Threads per block.
 const BLOCK: u64 = 256;
-const WORD: u64 = 16;
+/// Bytes of the vectors (`uint4`) that `copy` and `read` access.
+const VECTOR: u64 = 16;
 
 /// Macros of the `read` that evicts the L2. It must leave its lines in the cache, so it does not use streaming loads.
-pub(super) const SWEEP: &[&str] = &["LOADS=8"];
-pub(super) const SWEEP_LOADS: u64 = 8;
+pub(super) const L2_FLUSH_DEFINES: &[&str] = &["LOADS=8"];
+/// Loads per thread of that `read`.
+pub(super) const L2_FLUSH_LOADS: u64 = 8;
 
-/// The kernels.
-pub(super) const CODE: BenchmarkSource = BenchmarkSource {
-    source: include_str!("../../kernels/bandwidth.cu"),
-    functions: &["copy", "read", "fill", "hold", "nothing"],
-    variants: &[
+pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
+    text: include_str!("../../kernels/bandwidth.cu"),
+    functions: &["copy", "read", "fill", "delay", "empty_kernel"],
+    define_sets: &[
         &[],
         &["LOADS=1", "STREAMING"],
         &["LOADS=2", "STREAMING"],
@@ -34,15 +35,15 @@ pub(super) const CODE: BenchmarkSource = BenchmarkSource {
 };
 
 /// Bytes that one block of `copy` or `read` covers.
-pub(super) const fn tile(loads: u64) -> u64 {
-    BLOCK * loads * WORD
+pub(super) const fn tile_bytes(loads: u64) -> u64 {
+    BLOCK * loads * VECTOR
 }
 
 /// Launches `copy` or `read` on two addresses.
 pub(super) fn launch(device: &Device, function: &CudaFunction, blocks: u32, buffers: [u64; 2]) -> Result<()> {
     let mut launch = device.stream().launch_builder(function);
     // SAFETY: the kernel's arguments are two addresses; both callers pass buffers of `blocks` tiles.
-    unsafe { launch.arg(&buffers[0]).arg(&buffers[1]).launch(config(blocks)) }.map_err(fault_in("roof"))?;
+    unsafe { launch.arg(&buffers[0]).arg(&buffers[1]).launch(config(blocks)) }.map_err(fault_in("bandwidth"))?;
     Ok(())
 }
 
@@ -50,21 +51,21 @@ fn config(blocks: u32) -> LaunchConfig {
     LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK as u32, 1, 1), shared_mem_bytes: 0 }
 }
 
-/// Loads per thread and macros of all variants to try.
+/// Loads per thread and macros of all compiled variants of `copy` and `read`.
 pub(super) fn variants() -> impl Iterator<Item = (u64, &'static [&'static str])> {
-    let loads = |defines: &[&str]| defines.first()?.strip_prefix("LOADS=")?.parse().ok();
-    CODE.variants.iter().filter_map(move |defines| Some((loads(defines)?, *defines)))
+    let loads_per_thread = |defines: &[&str]| defines.first()?.strip_prefix("LOADS=")?.parse().ok();
+    SOURCE.define_sets.iter().filter_map(move |defines| Some((loads_per_thread(defines)?, *defines)))
 }
 
 /// A buffer of pseudo-random numbers, because memory that holds zeros may be faster than memory in use.
-pub(super) fn filled(device: &Device, bytes: u64) -> Result<DeviceBuffer> {
+pub(super) fn random_buffer(device: &Device, bytes: u64) -> Result<DeviceBuffer> {
     let buffer = DeviceBuffer::zeroed(device, bytes)?;
-    let function = device.function("fill", CODE.source, &[])?;
-    let (to, words) = (buffer.address(), bytes / 4);
+    let function = device.function("fill", SOURCE.text, &[])?;
+    let (dst, words) = (buffer.address(), bytes / 4);
     let mut launch = device.stream().launch_builder(&function);
     let config = config(words.div_ceil(BLOCK) as u32);
     // SAFETY: the kernel's arguments are the address of `buffer` and its number of words.
-    unsafe { launch.arg(&to).arg(&words).launch(config) }.map_err(fault_in("roof"))?;
+    unsafe { launch.arg(&dst).arg(&words).launch(config) }.map_err(fault_in("bandwidth"))?;
     Ok(buffer)
 }
 
@@ -73,14 +74,14 @@ mod tests {
     use super::super::kernel_benchmark::tests::compile_all;
     use super::*;
 
-    /// CPU twin of the addressing of `copy` and `read`: the words that they access.
-    fn twin_of_words(blocks: u64, loads: u64) -> Vec<u64> {
+    /// CPU twin of the addressing of `copy` and `read`: the indices of the vectors that they access.
+    fn accessed_vectors(blocks: u64, loads: u64) -> Vec<u64> {
         let threads = (0..blocks).flat_map(|block| (0..BLOCK).map(move |thread| block * BLOCK * loads + thread));
         threads.flat_map(|first| (0..loads).map(move |index| first + index * BLOCK)).collect()
     }
 
     /// CPU twin of `fill`, for one word.
-    fn twin_of_fill(index: u32) -> u32 {
+    fn fill_word(index: u32) -> u32 {
         let mut key = index ^ index >> 16;
         key = key.wrapping_mul(0x85eb_ca6b);
         key ^= key >> 13;
@@ -89,27 +90,27 @@ mod tests {
     }
 
     #[test]
-    fn copies_every_word_once_for_any_loads_per_thread() {
+    fn copies_every_vector_once_for_any_loads_per_thread() {
         let loads: Vec<u64> = variants().map(|(loads, _)| loads).collect();
         assert!(loads.len() >= 6, "{loads:?}");
         for loads in loads {
-            let bytes = 3 * tile(16);
-            let mut words = twin_of_words(bytes / tile(loads), loads);
-            words.sort_unstable();
-            assert!(words.iter().copied().eq(0..bytes / WORD), "{loads} loads");
+            let bytes = 3 * tile_bytes(16);
+            let mut vectors = accessed_vectors(bytes / tile_bytes(loads), loads);
+            vectors.sort_unstable();
+            assert!(vectors.iter().copied().eq(0..bytes / VECTOR), "{loads} loads");
         }
     }
 
     #[test]
     fn filled_words_differ_and_never_trigger_the_write_of_read() {
-        let words: std::collections::BTreeSet<u32> = (0..4096).map(twin_of_fill).collect();
+        let words: std::collections::BTreeSet<u32> = (0..4096).map(fill_word).collect();
         assert!(words.len() > 4090);
         assert!(words.iter().all(|word| *word != u32::MAX));
     }
 
     #[test]
     #[ignore = "needs NVRTC: deploy/check installs it"]
-    fn nvrtc_compiles_every_roof() {
-        compile_all(&CODE);
+    fn nvrtc_compiles_bandwidth() {
+        compile_all(&SOURCE);
     }
 }

@@ -1,11 +1,11 @@
-//! The deformer's own kernels as a trial: the same launchers and tables, on values that are uploaded beforehand.
+//! Benchmarks the deformer's own kernels: the same launchers and tables, on inputs that are uploaded in advance.
 
 use std::sync::Arc;
 
 use serde::Serialize;
 
 use super::input_sets::InputSets;
-use super::kernel_benchmark::{KernelAttributes, KernelBenchmark};
+use super::kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 use super::timer::MAX_GRAPHS;
 use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_compute::gpu::launchers::{
@@ -44,28 +44,28 @@ impl StepOutputs {
 #[derive(Debug)]
 pub struct DeformerBenchmark {
     name: String,
-    extent: StepOutputs,
+    step_outputs: StepOutputs,
     scene: Arc<Scene>,
     deform: DeformKernel,
     bounds: BoundsKernel,
     normals: Option<NormalsKernel>,
-    listed: bool,
+    /// Whether steps change only listed domains.
+    is_partial: bool,
     inputs: Vec<StepInputs>,
     outputs: DeviceBuffer,
-    turns: InputSets,
+    input_sets: InputSets,
     plan: DeformPlan,
-    /// Vertices and coordinates that a step computes, and the data that it reads.
-    counts: ComputedCounts,
+    counts: StepCounts,
 }
 
+/// Counts of a step, for its memory traffic.
 #[derive(Debug, Clone, Copy)]
-struct ComputedCounts {
+struct StepCounts {
     vertices: u64,
-    /// Bytes.
-    transforms: u64,
     coordinates: u64,
-    words: u64,
-    rest: u64,
+    transform_bytes: u64,
+    mode_bytes: u64,
+    rest_bytes: u64,
 }
 
 impl DeformerBenchmark {
@@ -74,12 +74,12 @@ impl DeformerBenchmark {
     /// # Errors
     /// `Invalid` when there is no state, or [`StepOutputs::Uq`] is requested for a scene with batches; `Unavailable` when
     /// NVRTC is missing; `Fault` when the device fails.
-    pub fn new(device: &Device, scene: &Arc<Scene>, states: &[SceneState], extent: StepOutputs) -> Result<Self> {
-        Self::of_changed(device, scene, states, (extent, None))
+    pub fn new(device: &Device, scene: &Arc<Scene>, states: &[SceneState], step_outputs: StepOutputs) -> Result<Self> {
+        Self::of_changed(device, scene, states, (step_outputs, None))
     }
 
     /// The same, for steps that change only the listed domains. The other domains keep the positions that
-    /// [`KernelBenchmark::complete`] computed.
+    /// [`KernelBenchmark::compute_skipped_domains`] computed.
     ///
     /// # Errors
     /// Those of [`Self::new`], and `Invalid` when the list of changes is too long for a partial step.
@@ -87,64 +87,64 @@ impl DeformerBenchmark {
         device: &Device,
         scene: &Arc<Scene>,
         states: &[SceneState],
-        (extent, changed): (StepOutputs, Option<&[u32]>),
+        (step_outputs, changed): (StepOutputs, Option<&[u32]>),
     ) -> Result<Self> {
         let tables = DeviceTables::new(scene, scene.light_axes());
         let plan = plan_from_tables(scene, &tables);
-        if extent == StepOutputs::Uq && plan.kernel(KernelKind::Batch).is_some() {
-            return Err(invalid("deform.batches", "never, where u alone is computed", "batches"));
+        if step_outputs == StepOutputs::Uq && plan.kernel(KernelKind::Batch).is_some() {
+            return Err(invalid("deform.batches", "never for u = U q alone", "batches"));
         }
-        let normals = plan.kernel(KernelKind::Normals).filter(|_| extent == StepOutputs::Whole);
+        let normals = plan.kernel(KernelKind::Normals).filter(|_| step_outputs == StepOutputs::Whole);
         let normals = normals.map(|kernel| NormalsKernel::new(device, scene, &tables, kernel)).transpose()?;
         let mut deform = plan.require_kernel(KernelKind::Deform)?.clone();
-        leave_out(&mut deform, extent);
+        remove_defines(&mut deform, step_outputs);
         let kernels = PositionKernels { deform: &deform, batch: plan.kernel(KernelKind::Batch) };
         let deform = DeformKernel::new(device, scene, kernels, tables)?;
-        let outputs = DeviceBuffer::zeroed(device, outputs_of(&plan).iter().sum())?;
-        let mut ours = Self {
-            name: format!("ours_{}{}", scene.deformation.storage.name(), extent.suffix()),
-            extent,
+        let outputs = DeviceBuffer::zeroed(device, output_bytes(&plan).iter().sum())?;
+        let mut benchmark = Self {
+            name: format!("ours_{}{}", scene.deformation.storage.name(), step_outputs.suffix()),
+            step_outputs,
             scene: Arc::clone(scene),
             bounds: BoundsKernel::new(device, plan.require_kernel(KernelKind::Bounds)?, scene.light_axes(), &deform)?,
             normals,
-            listed: changed.is_some(),
+            is_partial: changed.is_some(),
             inputs: Vec::new(),
             outputs,
-            turns: InputSets::new(device, scene, states, |_| [Vec::new(), Vec::new()])?,
-            counts: counts(scene, &plan, changed),
+            input_sets: InputSets::new(device, scene, states, |_| [Vec::new(), Vec::new()])?,
+            counts: count_step(scene, &plan, changed),
             deform,
             plan,
         };
         let mut staging = None;
         for state in states {
-            let header = Header { last_full_step: 1, step: 1, ..ours.header() };
-            let mut inputs = StepInputs::new(device, ours.deform.packing())?;
+            let header = Header { last_full_step: 1, step: 1, ..benchmark.header() };
+            let mut inputs = StepInputs::new(device, benchmark.deform.packing())?;
             let staging = match &mut staging {
                 Some(staging) => staging,
-                none => none.insert(inputs.staging(device)?),
+                empty => empty.insert(inputs.staging(device)?),
             };
-            send(device, (&mut inputs, staging), &header, state)?;
-            ours.inputs.push(inputs);
+            upload_step(device, (&mut inputs, staging), &header, state)?;
+            benchmark.inputs.push(inputs);
         }
-        changed.map_or(Ok(()), |changed| ours.apply(device, states, changed))?;
-        Ok(ours)
+        changed.map_or(Ok(()), |changed| benchmark.apply_changes(device, states, changed))?;
+        Ok(benchmark)
     }
 
-    /// Turns the inputs of each turn into those of a step that changed these domains.
-    fn apply(&mut self, device: &Device, states: &[SceneState], changed: &[u32]) -> Result<()> {
+    /// Replaces each input set by that of a step that changes only these domains.
+    fn apply_changes(&mut self, device: &Device, states: &[SceneState], changed: &[u32]) -> Result<()> {
         let allowed = "a quarter of the domains at most, no truncation, and less work than a whole step";
         let too_many = || invalid("changed", allowed, changed.len());
         let mut apply =
             ApplyKernel::new(device, self.deform.packing(), self.plan.kernel(KernelKind::Apply).ok_or_else(too_many)?)?;
         let mut list = apply.list(device)?;
-        let old = Header { last_full_step: 1, ..self.header() };
+        let full_step = Header { last_full_step: 1, ..self.header() };
         for (inputs, state) in self.inputs.iter_mut().zip(states) {
             let mut staging = inputs.staging(device)?;
             let lengths =
                 apply.write(&mut list, self.deform.packing(), state, ChangedDomains { changed, outdated: &[] })?;
             let ChangeListLengths { changed, dirty_tiles } = lengths.ok_or_else(too_many)?;
-            let header = Header { output_step: 1, step: 2, changed, dirty_tiles, ..old };
-            send(device, (inputs, &mut staging), &header, state)?;
+            let header = Header { output_step: 1, step: 2, changed, dirty_tiles, ..full_step };
+            upload_step(device, (inputs, &mut staging), &header, state)?;
             // SAFETY: the lists were written above for the packing of `deform` and of the inputs, and the next statement
             // waits for the kernel.
             unsafe { apply.launch(device, &list, inputs, &self.deform) }?;
@@ -154,60 +154,65 @@ impl DeformerBenchmark {
     }
 
     fn header(&self) -> Header {
-        let [positions, normals, tangents, _] = outputs_of(&self.plan);
-        let begin = self.outputs.address();
+        let [positions, normals, tangents, _] = output_bytes(&self.plan);
+        let base = self.outputs.address();
         debug_assert!(positions + normals + tangents > 0);
         Header {
-            positions: begin,
-            normals: begin + positions,
-            tangents: begin + positions + normals,
-            // With u alone, u takes the place of the positions.
-            displacements: if self.extent == StepOutputs::Uq { begin } else { begin + positions + normals + tangents },
+            positions: base,
+            normals: base + positions,
+            tangents: base + positions + normals,
+            // With `Uq`, u is written to the buffer of the positions.
+            displacements: if self.step_outputs == StepOutputs::Uq {
+                base
+            } else {
+                base + positions + normals + tangents
+            },
             ..Header::default()
         }
     }
 
-    /// Fraction of the chunks of modes that are summed, weighted by vertices, as a mean over the timed turns; `None`
+    /// Fraction of the chunks of modes that are summed, weighted by vertices, as a mean over the timed input sets; `None`
     /// without truncation.
-    fn kept(&self) -> Option<f64> {
+    fn retained_mode_share(&self) -> Option<f64> {
         let per_chunk = modes_per_chunk(self.scene.deformation.storage);
-        let weigh = |chunks: &dyn Fn(usize) -> usize| -> f64 {
+        let weighted_chunks = |chunks: &dyn Fn(usize) -> usize| -> f64 {
             let slots = self.scene.layout.slots.iter().enumerate();
             slots.map(|(domain, slot)| slot.vertices as f64 * chunks(domain) as f64).sum()
         };
-        let all = weigh(&|domain| self.scene.rank_of(domain).div_ceil(per_chunk));
+        let all_chunks = weighted_chunks(&|domain| self.scene.rank_of(domain).div_ceil(per_chunk));
         let shares = self.inputs.iter().take(MAX_GRAPHS).map(|inputs| {
-            let kept = inputs.retained_chunk_counts()?;
-            Some(weigh(&|domain| kept[domain] as usize) / all.max(1.0))
+            let retained = inputs.retained_chunk_counts()?;
+            Some(weighted_chunks(&|domain| retained[domain] as usize) / all_chunks.max(1.0))
         });
         let shares: Vec<f64> = shares.collect::<Option<_>>()?;
         Some(shares.iter().sum::<f64>() / shares.len().max(1) as f64)
     }
 
-    fn inputs(&self, turn: usize) -> &StepInputs {
-        &self.inputs[turn % self.inputs.len()]
+    fn inputs(&self, input_set: usize) -> &StepInputs {
+        &self.inputs[input_set % self.inputs.len()]
     }
 
     /// Computes the positions of all domains.
-    fn launch_all_positions(&self, device: &Device, turn: usize) -> Result<()> {
+    fn launch_all_positions(&self, device: &Device, input_set: usize) -> Result<()> {
         // SAFETY: the inputs are whole steps of this scene, whose header has the addresses of `outputs`. `self` owns the
         // inputs and the outputs, and device memory is released in the order of the stream.
-        unsafe { self.deform.launch(device, self.inputs(turn)) }
+        unsafe { self.deform.launch(device, self.inputs(input_set)) }
     }
 }
 
-/// Removes the macros of features that this part of a step does not compute.
-fn leave_out(kernel: &mut KernelDescriptor, extent: StepOutputs) {
-    if extent != StepOutputs::Whole {
+/// Removes the macros of outputs that this part of a step does not compute.
+fn remove_defines(kernel: &mut KernelDescriptor, step_outputs: StepOutputs) {
+    if step_outputs != StepOutputs::Whole {
         kernel.defines.retain(|define| !["RIGID_NORMALS", "CORNER_OFFSETS", "NORMAL_MAPS", "SHEAR"].contains(define));
     }
-    if extent == StepOutputs::Uq {
+    if step_outputs == StepOutputs::Uq {
         kernel.defines.retain(|define| *define != "DISPLACEMENTS");
         kernel.defines.extend(["DISPLACEMENTS", "DISPLACEMENTS_ONLY"]);
     }
 }
 
-fn send(
+/// Writes a step to its staging buffer, uploads it and waits for the copy.
+fn upload_step(
     device: &Device,
     (inputs, staging): (&mut StepInputs, &mut StagingBuffer),
     header: &Header,
@@ -220,35 +225,36 @@ fn send(
 }
 
 /// Bytes of positions, normals, tangents and displacements, each rounded up to the alignment of a float4.
-fn outputs_of(plan: &DeformPlan) -> [u64; 4] {
+fn output_bytes(plan: &DeformPlan) -> [u64; 4] {
     [BufferRole::Positions, BufferRole::Normals, BufferRole::Tangents, BufferRole::Displacements]
         .map(|role| plan.bytes(role).next_multiple_of(16))
 }
 
-fn counts(scene: &Scene, plan: &DeformPlan, changed: Option<&[u32]>) -> ComputedCounts {
+/// The counts of a step that changes these domains, or all of them.
+fn count_step(scene: &Scene, plan: &DeformPlan, changed: Option<&[u32]>) -> StepCounts {
     let slots = &scene.layout.slots;
-    // With followers every domain reads the index of its mover in addition to its own T or frame.
-    let transform = if scene.needs.followers { 56 } else { 48 };
+    // With followers every domain reads the index of its transform root in addition to its own T or frame.
+    let bytes_per_transform = if scene.needs.followers { 56 } else { 48 };
     match changed {
-        None => ComputedCounts {
+        None => StepCounts {
             vertices: scene.layout.vertices as u64,
-            transforms: transform * slots.len() as u64,
+            transform_bytes: bytes_per_transform * slots.len() as u64,
             coordinates: scene.layout.coordinates as u64,
-            words: plan.bytes(BufferRole::ModeWords),
-            rest: plan.bytes(BufferRole::RestPositions),
+            mode_bytes: plan.bytes(BufferRole::ModeWords),
+            rest_bytes: plan.bytes(BufferRole::RestPositions),
         },
         Some(list) => {
-            let chosen = || list.iter().map(|domain| slots[*domain as usize]);
-            let share = |slot: modalcast_model::scene::DomainLayout| (slot.vertices * slot.rank) as u64;
-            let all: u64 = slots.iter().map(|slot| share(*slot)).sum();
-            let own: u64 = chosen().map(share).sum();
-            let vertices: u64 = chosen().map(|slot| slot.vertices as u64).sum();
-            ComputedCounts {
+            let changed_slots = || list.iter().map(|domain| slots[*domain as usize]);
+            let mode_entries = |slot: modalcast_model::scene::DomainLayout| (slot.vertices * slot.rank) as u64;
+            let all_entries: u64 = slots.iter().map(|slot| mode_entries(*slot)).sum();
+            let changed_entries: u64 = changed_slots().map(mode_entries).sum();
+            let vertices: u64 = changed_slots().map(|slot| slot.vertices as u64).sum();
+            StepCounts {
                 vertices,
-                transforms: transform * list.len() as u64,
-                coordinates: chosen().map(|slot| slot.rank as u64).sum(),
-                words: plan.bytes(BufferRole::ModeWords) * own / all.max(1),
-                rest: 12 * vertices,
+                transform_bytes: bytes_per_transform * list.len() as u64,
+                coordinates: changed_slots().map(|slot| slot.rank as u64).sum(),
+                mode_bytes: plan.bytes(BufferRole::ModeWords) * changed_entries / all_entries.max(1),
+                rest_bytes: 12 * vertices,
             }
         }
     }
@@ -259,24 +265,24 @@ impl KernelBenchmark for DeformerBenchmark {
         self.name.clone()
     }
 
-    fn turns(&self) -> usize {
+    fn input_set_count(&self) -> usize {
         self.inputs.len()
     }
 
-    fn complete(&self, device: &Device, turn: usize) -> Result<()> {
-        if self.listed { self.launch_all_positions(device, turn) } else { Ok(()) }
+    fn compute_skipped_domains(&self, device: &Device, input_set: usize) -> Result<()> {
+        if self.is_partial { self.launch_all_positions(device, input_set) } else { Ok(()) }
     }
 
-    fn launch(&self, device: &Device, turn: usize) -> Result<()> {
-        let inputs = self.inputs(turn);
-        self.turns.start(turn);
-        if self.listed {
+    fn launch(&self, device: &Device, input_set: usize) -> Result<()> {
+        let inputs = self.inputs(input_set);
+        self.input_sets.select(input_set);
+        if self.is_partial {
             // SAFETY: as in `launch_all_positions`; `apply` has written the tile list.
             unsafe { self.deform.launch_tile_list(device, inputs) }?;
         } else {
-            self.launch_all_positions(device, turn)?;
+            self.launch_all_positions(device, input_set)?;
         }
-        if self.extent == StepOutputs::Whole {
+        if self.step_outputs == StepOutputs::Whole {
             // SAFETY: as in `launch_all_positions`.
             unsafe { self.bounds.launch(device, inputs, &self.deform) }?;
         }
@@ -287,42 +293,48 @@ impl KernelBenchmark for DeformerBenchmark {
     fn positions(&self, device: &Device) -> Result<Vec<f32>> {
         let mut numbers = vec![0.0_f32; (self.plan.bytes(BufferRole::Positions) / 4) as usize];
         self.outputs.read(device, 0, &mut numbers)?;
-        if self.extent != StepOutputs::Uq {
+        if self.step_outputs != StepOutputs::Uq {
             return Ok(numbers);
         }
         let slots = &self.scene.layout.slots;
-        Ok(self.turns.finish_on_host(|domain, vertex| {
-            let at = 3 * (slots[domain].first_vertex + vertex);
-            [numbers[at], numbers[at + 1], numbers[at + 2]]
+        Ok(self.input_sets.compute_positions_on_host(|domain, vertex| {
+            let first = 3 * (slots[domain].first_vertex + vertex);
+            [numbers[first], numbers[first + 1], numbers[first + 2]]
         }))
     }
 
-    fn bytes(&self) -> Vec<(&'static str, u64)> {
-        let ComputedCounts { vertices, transforms, coordinates, words, rest } = self.counts;
-        let words = self.kept().map_or(("U", words), |share| ("U kept", (share * words as f64) as u64));
-        let mut bytes = vec![words, ("scales", self.plan.bytes(BufferRole::Scales)), ("q", 4 * coordinates)];
-        bytes.push(("u or x", 12 * vertices));
-        if self.scene.needs.displacements && self.extent != StepOutputs::Uq {
-            bytes.push(("u kept", 12 * vertices));
+    fn traffic(&self) -> Vec<ArrayTraffic> {
+        let StepCounts { vertices, coordinates, transform_bytes, mode_bytes, rest_bytes } = self.counts;
+        let retained = |share: f64| ArrayTraffic::new("U kept", (share * mode_bytes as f64) as u64);
+        let modes = self.retained_mode_share().map_or(ArrayTraffic::new("U", mode_bytes), retained);
+        let mut traffic = vec![
+            modes,
+            ArrayTraffic::new("scales", self.plan.bytes(BufferRole::Scales)),
+            ArrayTraffic::new("q", 4 * coordinates),
+        ];
+        traffic.push(ArrayTraffic::new("u or x", 12 * vertices));
+        if self.scene.needs.displacements && self.step_outputs != StepOutputs::Uq {
+            traffic.push(ArrayTraffic::new("u kept", 12 * vertices));
         }
-        if self.extent != StepOutputs::Uq {
-            bytes.extend([("x0", rest), ("T", transforms)]);
+        if self.step_outputs != StepOutputs::Uq {
+            traffic.extend([ArrayTraffic::new("x0", rest_bytes), ArrayTraffic::new("T", transform_bytes)]);
         }
-        if self.extent == StepOutputs::Whole {
+        if self.step_outputs == StepOutputs::Whole {
             let roles = [BufferRole::RestNormals, BufferRole::Normals, BufferRole::RestTangents, BufferRole::Tangents];
-            bytes.push(("normals and tangents", roles.iter().map(|role| self.plan.bytes(*role)).sum()));
+            traffic
+                .push(ArrayTraffic::new("normals and tangents", roles.iter().map(|role| self.plan.bytes(*role)).sum()));
         }
-        bytes
+        traffic
     }
 
-    fn launches(&self) -> usize {
-        let more = [self.extent == StepOutputs::Whole, self.normals.is_some()].map(usize::from);
-        self.deform.kernels().len() + more[0] + more[1]
+    fn launches_per_step(&self) -> usize {
+        let other_launches = [self.step_outputs == StepOutputs::Whole, self.normals.is_some()].map(usize::from);
+        self.deform.kernels().len() + other_launches[0] + other_launches[1]
     }
 
-    fn kernels(&self) -> Vec<KernelAttributes> {
+    fn kernel_attributes(&self) -> Vec<KernelAttributes> {
         let functions = self.deform.kernels().into_iter().chain([("bounds", self.bounds.function())]);
         let functions = functions.chain(self.normals.iter().map(|normals| ("normals", normals.function())));
-        functions.filter_map(|(name, function)| KernelAttributes::of(name, function).ok()).collect()
+        functions.filter_map(|(name, function)| KernelAttributes::query(name, function).ok()).collect()
     }
 }

@@ -1,4 +1,4 @@
-//! Parts that the trials share: inputs of several steps on the device, and the rest of a deformation on the host.
+//! Input sets of kernel benchmarks: the inputs of several steps, on the device and on the host.
 
 use std::cell::Cell;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Scene, SceneState};
 
-/// The part of a step that a trial launches.
+/// The part of a step that a kernel benchmark launches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Part {
@@ -22,8 +22,8 @@ pub enum Part {
 }
 
 impl Part {
-    /// The name of a trial that launches this part.
-    pub(super) fn named(self, name: &str) -> String {
+    /// The name of a benchmark that launches this part.
+    pub(super) fn benchmark_name(self, name: &str) -> String {
         match self {
             Self::Uq => format!("{name}_uq"),
             Self::Whole => name.to_owned(),
@@ -31,26 +31,27 @@ impl Part {
     }
 }
 
-/// Minimum of vertices per parallel task on the host.
-const SHARE: usize = 4096;
+/// Minimum number of vertices per parallel task on the host.
+const MIN_TASK_VERTICES: usize = 4096;
 
-/// Device addresses of the inputs of one turn.
+/// Device addresses of one input set.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct InputAddresses {
     pub q: u64,
     pub transforms: u64,
 }
 
-/// The inputs of several steps (turns) of a scene, on the device and on the host.
+/// The inputs of several steps of a scene, on the device and on the host. An input set belongs to one step.
 #[derive(Debug)]
 pub(super) struct InputSets {
     scene: Arc<Scene>,
     states: Vec<SceneState>,
     q: DeviceBuffer,
     transforms: DeviceBuffer,
-    /// Bytes from one turn to the next, of q and of the transforms.
+    /// Bytes from one input set to the next, of q and of the transforms.
     strides: [u64; 2],
-    last: Cell<usize>,
+    /// Index of the input set that [`Self::select`] returned last.
+    selected: Cell<usize>,
 }
 
 impl InputSets {
@@ -67,58 +68,58 @@ impl InputSets {
         if states.is_empty() {
             return Err(invalid("states", "at least 1", 0));
         }
-        let fits = |state: &&SceneState| {
+        let is_mismatched = |state: &&SceneState| {
             state.q.len() != scene.layout.coordinates || state.transforms.len() != scene.movers.count()
         };
-        if let Some(wrong) = states.iter().find(fits) {
+        if let Some(mismatched) = states.iter().find(is_mismatched) {
             let expected = format!("{} coordinates, {} transforms", scene.layout.coordinates, scene.movers.count());
-            let given = format!("{} and {}", wrong.q.len(), wrong.transforms.len());
-            return Err(invalid("states", expected, given));
+            let lengths = format!("{} and {}", mismatched.q.len(), mismatched.transforms.len());
+            return Err(invalid("states", expected, lengths));
         }
         let [mut q, mut transforms] = [Vec::new(), Vec::new()];
         for state in states {
             let packed = pack(state);
-            for (all, one) in [&mut q, &mut transforms].into_iter().zip(packed) {
-                all.extend_from_slice(&one);
-                // Turns are aligned to float4.
-                all.resize(all.len().next_multiple_of(4), 0.0);
+            for (numbers, packed_numbers) in [&mut q, &mut transforms].into_iter().zip(packed) {
+                numbers.extend_from_slice(&packed_numbers);
+                // Each input set is aligned to float4.
+                numbers.resize(numbers.len().next_multiple_of(4), 0.0);
             }
         }
-        let strides = [&q, &transforms].map(|all| 4 * (all.len() / states.len()) as u64);
+        let strides = [&q, &transforms].map(|numbers| 4 * (numbers.len() / states.len()) as u64);
         let (q, transforms) = (DeviceBuffer::upload(device, &q)?, DeviceBuffer::upload(device, &transforms)?);
         let (scene, states) = (Arc::clone(scene), states.to_vec());
-        Ok(Self { scene, states, q, transforms, strides, last: Cell::new(0) })
+        Ok(Self { scene, states, q, transforms, strides, selected: Cell::new(0) })
     }
 
     pub(super) const fn count(&self) -> usize {
         self.states.len()
     }
 
-    /// The inputs of a turn. Records it as the last turn.
-    pub(super) fn start(&self, turn: usize) -> InputAddresses {
-        let turn = turn % self.states.len();
-        self.last.set(turn);
-        let [q, transforms] = self.strides.map(|stride| stride * turn as u64);
-        InputAddresses { q: self.q.address() + q, transforms: self.transforms.address() + transforms }
+    /// Selects an input set, modulo their number, for [`Self::compute_positions_on_host`] and returns its addresses.
+    pub(super) fn select(&self, input_set: usize) -> InputAddresses {
+        let input_set = input_set % self.states.len();
+        self.selected.set(input_set);
+        let [q_offset, transforms_offset] = self.strides.map(|stride| stride * input_set as u64);
+        InputAddresses { q: self.q.address() + q_offset, transforms: self.transforms.address() + transforms_offset }
     }
 
-    /// x = T (x0 + u) of the last turn, in f64 and rounded once, so that only the error of u remains. Three f32 per
-    /// vertex.
-    pub(super) fn finish_on_host(&self, u: impl Fn(usize, usize) -> [f32; 3] + Sync) -> Vec<f32> {
-        let state = &self.states[self.last.get()];
+    /// x = T (x0 + u) of the selected input set, three f32 per vertex. Computed in f64 and rounded once, so that only the
+    /// error of u remains. `u` returns the displacement of a vertex (second argument) of a domain (first argument).
+    pub(super) fn compute_positions_on_host(&self, u: impl Fn(usize, usize) -> [f32; 3] + Sync) -> Vec<f32> {
+        let state = &self.states[self.selected.get()];
         let mut positions = Vec::with_capacity(3 * self.scene.layout.vertices);
-        let mut placed: Vec<[f32; 3]> = Vec::new();
+        let mut domain_positions: Vec<[f32; 3]> = Vec::new();
         for domain in 0..self.scene.domains.len() {
             let t = state.composed_transform(&self.scene, domain).exact();
-            let place = |(vertex, rest): (usize, &[f32; 3])| {
+            let transform_vertex = |(vertex, rest): (usize, &[f32; 3])| {
                 let u = u(domain, vertex);
                 let [x, y, z] = [0, 1, 2].map(|axis| f64::from(rest[axis]) + f64::from(u[axis]));
                 let row = |row: usize| t[4 * row] * x + t[4 * row + 1] * y + t[4 * row + 2] * z + t[4 * row + 3];
                 [0, 1, 2].map(|axis| row(axis) as f32)
             };
             let rest = self.scene.shape_of(domain).mesh.rest().par_iter().enumerate();
-            rest.with_min_len(SHARE).map(place).collect_into_vec(&mut placed);
-            positions.extend_from_slice(placed.as_flattened());
+            rest.with_min_len(MIN_TASK_VERTICES).map(transform_vertex).collect_into_vec(&mut domain_positions);
+            positions.extend_from_slice(domain_positions.as_flattened());
         }
         positions
     }

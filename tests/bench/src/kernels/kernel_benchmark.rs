@@ -1,4 +1,4 @@
-//! The interface of benchmark kernels: a step consists of kernels alone, on inputs that are uploaded beforehand.
+//! The trait of benchmarked kernels. Inputs are uploaded in advance, so that only kernels are timed.
 
 use cudarc::driver::CudaFunction;
 use serde::Serialize;
@@ -6,30 +6,31 @@ use serde::Serialize;
 use modalcast_compute::gpu::Device;
 use modalcast_model::error::{Result, fault_in};
 
-/// One way to deform on the device, with the inputs of several turns uploaded.
+/// A sequence of kernels to time, with several uploaded input sets. An input set is the input of one step.
 pub trait KernelBenchmark {
     /// Name in reports.
     fn name(&self) -> String;
 
-    /// Number of prepared turns (different q), at least 1. [`Self::launch`] takes a turn modulo this number.
-    fn turns(&self) -> usize;
+    /// Number of uploaded input sets, at least 1. [`Self::launch`] takes an index modulo this number.
+    fn input_set_count(&self) -> usize;
 
-    /// Enqueues one step's kernels on the device's stream, without copies or waiting, so that a graph can capture it.
+    /// Enqueues the kernels of one step on the device's stream, without copies or waiting, so that a graph can capture
+    /// them.
     ///
     /// # Errors
     /// `Fault` when the device fails.
-    fn launch(&self, device: &Device, turn: usize) -> Result<()>;
+    fn launch(&self, device: &Device, input_set: usize) -> Result<()>;
 
-    /// Computes the domains that a launch of this turn skips. Validation calls it before the launch.
+    /// Computes the domains that a launch with this input set skips. Validation calls it before the launch.
     ///
     /// # Errors
     /// `Fault` when the device fails.
-    fn complete(&self, _device: &Device, _turn: usize) -> Result<()> {
+    fn compute_skipped_domains(&self, _device: &Device, _input_set: usize) -> Result<()> {
         Ok(())
     }
 
     /// World positions of the last launch for validation, three f32 per vertex, packed as in the scene's layout. Empty
-    /// when the trial does not deform.
+    /// if the kernels do not deform.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -37,21 +38,34 @@ pub trait KernelBenchmark {
         Ok(Vec::new())
     }
 
-    /// Bytes that one step must move, as (part, bytes). The sum is the numerator of a rate.
-    fn bytes(&self) -> Vec<(&'static str, u64)> {
+    /// Minimum memory traffic of one step per array. Its sum divided by the time is the reported bandwidth.
+    fn traffic(&self) -> Vec<ArrayTraffic> {
         Vec::new()
     }
 
     /// Kernel launches per step.
-    fn launches(&self) -> usize;
+    fn launches_per_step(&self) -> usize;
 
-    /// The driver's facts about each kernel; empty for a library's kernels.
-    fn kernels(&self) -> Vec<KernelAttributes> {
+    /// The driver's attributes of each kernel; empty for a library's kernels.
+    fn kernel_attributes(&self) -> Vec<KernelAttributes> {
         Vec::new()
     }
 }
 
-/// Facts about a loaded kernel from the driver (cuFuncGetAttribute).
+/// Bytes that a step reads from or writes to one array.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ArrayTraffic {
+    pub array: &'static str,
+    pub bytes: u64,
+}
+
+impl ArrayTraffic {
+    pub(super) const fn new(array: &'static str, bytes: u64) -> Self {
+        Self { array, bytes }
+    }
+}
+
+/// Attributes of a loaded kernel from the driver (cuFuncGetAttribute).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct KernelAttributes {
     /// The kernel's name and its macros.
@@ -59,7 +73,8 @@ pub struct KernelAttributes {
     /// Registers per thread.
     pub registers: u32,
     /// Bytes of local memory per thread: register spills, and arrays that are indexed at run time.
-    pub spilled_bytes: u32,
+    #[serde(rename = "spilled_bytes")]
+    pub local_bytes: u32,
     /// Static shared memory per block, bytes.
     pub shared_bytes: u32,
 }
@@ -69,14 +84,14 @@ impl KernelAttributes {
     ///
     /// # Errors
     /// `Fault` when the driver reports an error.
-    pub(super) fn of(name: &str, function: &CudaFunction) -> Result<Self> {
-        let fail = fault_in("kernel facts");
-        let number = |value: i32| u32::try_from(value).unwrap_or(0);
+    pub(super) fn query(name: &str, function: &CudaFunction) -> Result<Self> {
+        let to_fault = fault_in("kernel attributes");
+        let as_u32 = |value: i32| u32::try_from(value).unwrap_or(0);
         Ok(Self {
             name: name.to_owned(),
-            registers: number(function.num_regs().map_err(&fail)?),
-            spilled_bytes: number(function.local_size_bytes().map_err(&fail)?),
-            shared_bytes: number(function.shared_size_bytes().map_err(&fail)?),
+            registers: as_u32(function.num_regs().map_err(&to_fault)?),
+            local_bytes: as_u32(function.local_size_bytes().map_err(&to_fault)?),
+            shared_bytes: as_u32(function.shared_size_bytes().map_err(&to_fault)?),
         })
     }
 }
@@ -84,27 +99,27 @@ impl KernelAttributes {
 /// A kernel source file that only benchmarks use.
 #[derive(Debug)]
 pub(super) struct BenchmarkSource {
-    pub source: &'static str,
+    pub text: &'static str,
     /// Its functions; [`CompiledKernel`] compiles the first one.
     pub functions: &'static [&'static str],
-    /// All lists of macros that it is compiled with.
-    pub variants: &'static [&'static [&'static str]],
+    /// All sets of macros that it is compiled with.
+    pub define_sets: &'static [&'static [&'static str]],
 }
 
-/// A compiled function and its facts.
+/// A compiled function and its attributes.
 #[derive(Debug)]
 pub(super) struct CompiledKernel {
     pub function: CudaFunction,
-    pub facts: KernelAttributes,
+    pub attributes: KernelAttributes,
 }
 
 impl CompiledKernel {
-    /// Compiles the first function of a file with one list of macros.
-    pub(super) fn new(device: &Device, code: &BenchmarkSource, defines: &[&str]) -> Result<Self> {
-        let function = code.functions[0];
-        let compiled = device.function(function, code.source, defines)?;
+    /// Compiles the first function of a file with one set of macros.
+    pub(super) fn new(device: &Device, source: &BenchmarkSource, defines: &[&str]) -> Result<Self> {
+        let function = source.functions[0];
+        let compiled = device.function(function, source.text, defines)?;
         let name = std::iter::once(function).chain(defines.iter().copied()).collect::<Vec<_>>().join(" ");
-        Ok(Self { facts: KernelAttributes::of(&name, &compiled)?, function: compiled })
+        Ok(Self { attributes: KernelAttributes::query(&name, &compiled)?, function: compiled })
     }
 }
 
@@ -113,22 +128,22 @@ pub(super) mod tests {
     use super::*;
     use modalcast_compute::testing::assert_compiles;
 
-    /// Compiles every function with every list of macros; fails if a kernel spills registers.
-    pub(in super::super) fn compile_all(code: &BenchmarkSource) {
-        assert_compiles(code.source, code.functions, code.variants);
+    /// Compiles every function with every set of macros; panics if a kernel spills registers.
+    pub(in super::super) fn compile_all(source: &BenchmarkSource) {
+        assert_compiles(source.text, source.functions, source.define_sets);
     }
 
     #[test]
     #[ignore = "needs NVRTC: deploy/check installs it"]
-    fn nvrtc_broken_kernel_fails_the_check() {
+    fn nvrtc_compile_all_rejects_broken_kernels() {
         let broken = BenchmarkSource {
-            source: "extern \"C\" __global__ void f() { wrong; }",
+            text: "extern \"C\" __global__ void f() { wrong; }",
             functions: &["f"],
-            variants: &[&[]],
+            define_sets: &[&[]],
         };
         assert!(std::panic::catch_unwind(|| compile_all(&broken)).is_err());
         let misnamed =
-            BenchmarkSource { source: "extern \"C\" __global__ void g() {}", functions: &["f"], variants: &[&[]] };
+            BenchmarkSource { text: "extern \"C\" __global__ void g() {}", functions: &["f"], define_sets: &[&[]] };
         assert!(std::panic::catch_unwind(|| compile_all(&misnamed)).is_err());
     }
 }

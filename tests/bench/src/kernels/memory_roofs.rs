@@ -1,10 +1,10 @@
-//! Measures the best rates of device memory, and the transfer rates between host and device. The rate of a deformer is only
-//! meaningful relative to the best rate of the same run.
+//! Measures the peak bandwidth of device memory, and of transfers between host and device. The bandwidth of a deformer
+//! is compared with the peak of the same run.
 
 use cudarc::driver::{CudaFunction, result};
 use serde::Serialize;
 
-use super::bandwidth::{CODE, filled, launch, tile, variants};
+use super::bandwidth::{SOURCE, launch, random_buffer, tile_bytes, variants};
 use super::kernel_benchmark::KernelBenchmark;
 use super::timer::{EventPair, empty_replay, gigabytes_per_second, time};
 use crate::timing::{CacheState, Timing};
@@ -12,54 +12,58 @@ use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::{DeviceBuffer, PinnedBuffer, PinnedUse};
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 
-/// Largest buffer of `copy` and `read`, bytes.
-const LARGEST: u64 = 4 << 30;
+/// Maximum size of the buffers of `copy` and `read`, bytes.
+const MAX_BUFFER: u64 = 4 << 30;
 
-/// Bytes of a pinned copy, and the number of timed copies.
-const PINNED: usize = 64 << 20;
+/// Bytes of a copy between pinned host memory and the device.
+const PINNED_BYTES: usize = 64 << 20;
+/// Number of timed pinned copies.
 const PINNED_COPIES: usize = 15;
 
+/// Timed replays of each variant of `copy` and `read`, and of the empty kernel.
 const REPLAYS: usize = 20;
+const EMPTY_REPLAYS: usize = 200;
 
-/// Measured memory rates of the device.
+/// Measured peak bandwidths of the device.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Roofs {
     /// Best copy kernel, GB/s (1e9 bytes), read plus written.
     pub copy_gbs: f64,
     /// Best pure read, GB/s.
     pub read_gbs: f64,
-    /// A replay of a graph with one empty kernel, microseconds.
+    /// Median time of a replay of a graph with one empty kernel, microseconds.
     pub empty_us: f64,
     /// Copies from pinned host memory to the device, 64 MiB each, GB/s.
     pub pinned_h2d_gbs: f64,
+    /// Copies from the device to pinned host memory, 64 MiB each, GB/s.
     pub pinned_d2h_gbs: f64,
 }
 
-/// Measures the rates of a device. `copy` and `read` process 4 GiB, or an eighth of the free memory if that is less.
+/// Measures the bandwidths of a device. `copy` and `read` process 4 GiB, or an eighth of the free memory if that is less.
 ///
 /// # Errors
-/// `Unavailable` when NVRTC is missing; `Fault` when the device fails or a copy did not copy.
+/// `Unavailable` when NVRTC is missing; `Fault` when the device fails or `copy` does not copy.
 pub fn roofs(device: &Device) -> Result<Roofs> {
     let (free, _) = device.memory()?;
-    let unit = tile(16);
-    let bytes = (LARGEST.min(free as u64 / 8) / unit).max(1) * unit;
-    let from = filled(device, bytes)?;
-    let to = DeviceBuffer::zeroed(device, bytes)?;
-    let best = |function: &'static str, moved: u64| -> Result<f64> {
-        let mut best = 0.0_f64;
+    let max_tile_bytes = tile_bytes(16);
+    let bytes = (MAX_BUFFER.min(free as u64 / 8) / max_tile_bytes).max(1) * max_tile_bytes;
+    let src = random_buffer(device, bytes)?;
+    let dst = DeviceBuffer::zeroed(device, bytes)?;
+    let max_bandwidth = |function: &'static str, traffic: u64| -> Result<f64> {
+        let mut max_gbs = 0.0_f64;
         for (loads, defines) in variants() {
-            let stream = CopyBenchmark::new(device, function, defines, [&from, &to], bytes / tile(loads))?;
+            let benchmark = CopyBenchmark::new(device, function, defines, [&src, &dst], bytes / tile_bytes(loads))?;
             if function == "copy" {
-                stream.check(device, &from, &to)?;
+                benchmark.check_copy(device, &src, &dst)?;
             }
-            let timing = time(device, &stream, CacheState::Warm, REPLAYS)?;
-            best = best.max(gigabytes_per_second(moved, timing.median_us));
+            let timing = time(device, &benchmark, CacheState::Warm, REPLAYS)?;
+            max_gbs = max_gbs.max(gigabytes_per_second(traffic, timing.median_us));
         }
-        Ok(best)
+        Ok(max_gbs)
     };
-    let (copy_gbs, read_gbs) = (best("copy", 2 * bytes)?, best("read", bytes)?);
-    let empty_us = empty_replay(device, 200)?.median_us;
-    let (pinned_h2d_gbs, pinned_d2h_gbs) = pinned(device)?;
+    let (copy_gbs, read_gbs) = (max_bandwidth("copy", 2 * bytes)?, max_bandwidth("read", bytes)?);
+    let empty_us = empty_replay(device, EMPTY_REPLAYS)?.median_us;
+    let (pinned_h2d_gbs, pinned_d2h_gbs) = pinned_bandwidths(device)?;
     Ok(Roofs { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs })
 }
 
@@ -80,34 +84,34 @@ impl CopyBenchmark {
         blocks: u64,
     ) -> Result<Self> {
         Ok(Self {
-            function: device.function(function, CODE.source, defines)?,
+            function: device.function(function, SOURCE.text, defines)?,
             name: format!("{function} {}", defines.join(" ")),
             buffers: buffers.map(|buffer| buffer.address()),
             blocks: blocks as u32,
         })
     }
 
-    /// Copies once and compares both ends, because a copy that does nothing would be fast.
-    fn check(&self, device: &Device, from: &DeviceBuffer, to: &DeviceBuffer) -> Result<()> {
-        const END: usize = 4096;
-        let (last, fail) = (to.bytes() - END as u64, fault_in("roof"));
-        let ends = |buffer: &DeviceBuffer| -> Result<[Vec<u8>; 2]> {
-            let end = |first: u64| {
-                let mut bytes = vec![0_u8; END];
-                buffer.read(device, first, &mut bytes).map(|()| bytes)
+    /// Copies once and compares the first and last bytes, because a kernel that does nothing would seem fast.
+    fn check_copy(&self, device: &Device, src: &DeviceBuffer, dst: &DeviceBuffer) -> Result<()> {
+        const CHECKED_BYTES: usize = 4096;
+        let last_offset = dst.bytes() - CHECKED_BYTES as u64;
+        let read_ends = |buffer: &DeviceBuffer| -> Result<[Vec<u8>; 2]> {
+            let read_at = |offset: u64| {
+                let mut bytes = vec![0_u8; CHECKED_BYTES];
+                buffer.read(device, offset, &mut bytes).map(|()| bytes)
             };
-            Ok([end(0)?, end(last)?])
+            Ok([read_at(0)?, read_at(last_offset)?])
         };
-        for first in [0, last] {
-            // SAFETY: the buffer has at least one tile, which is more than END bytes, from both ends.
-            unsafe { result::memset_d8_async(to.address() + first, 0, END, device.stream().cu_stream()) }
-                .map_err(&fail)?;
+        for offset in [0, last_offset] {
+            // SAFETY: the buffer has at least one tile, which is more than `CHECKED_BYTES`, so both ranges are inside.
+            unsafe { result::memset_d8_async(dst.address() + offset, 0, CHECKED_BYTES, device.stream().cu_stream()) }
+                .map_err(fault_in("bandwidth"))?;
         }
         launch(device, &self.function, self.blocks, self.buffers)?;
-        if ends(from)? == ends(to)? {
+        if read_ends(src)? == read_ends(dst)? {
             return Ok(());
         }
-        Err(Error::Fault { stage: "roof", reason: format!("{} did not copy", self.name) })
+        Err(Error::Fault { stage: "bandwidth", reason: format!("{}: expected a copy, got other bytes", self.name) })
     }
 }
 
@@ -116,7 +120,7 @@ impl KernelBenchmark for CopyBenchmark {
         self.name.clone()
     }
 
-    fn turns(&self) -> usize {
+    fn input_set_count(&self) -> usize {
         1
     }
 
@@ -124,37 +128,39 @@ impl KernelBenchmark for CopyBenchmark {
         launch(device, &self.function, self.blocks, self.buffers)
     }
 
-    fn launches(&self) -> usize {
+    fn launches_per_step(&self) -> usize {
         1
     }
 }
 
-/// Rates of pinned copies to and from the device, GB/s.
-fn pinned(device: &Device) -> Result<(f64, f64)> {
-    let fail = fault_in("pinned copy");
-    let mut host = PinnedBuffer::<u8>::zeroed(device, PINNED, PinnedUse::FromDevice)?;
+/// Bandwidths of pinned copies to and from the device, GB/s.
+fn pinned_bandwidths(device: &Device) -> Result<(f64, f64)> {
+    let to_fault = fault_in("pinned copy");
+    let mut host = PinnedBuffer::<u8>::zeroed(device, PINNED_BYTES, PinnedUse::FromDevice)?;
     let host = host.as_mut_slice()?;
     host.fill(0x5a);
-    let buffer = DeviceBuffer::zeroed(device, PINNED as u64)?;
-    let (there, stream) = (buffer.address(), device.stream().cu_stream());
-    let mut rate = |copy: &mut dyn FnMut(&mut [u8]) -> Result<()>| -> Result<f64> {
+    let buffer = DeviceBuffer::zeroed(device, PINNED_BYTES as u64)?;
+    let (device_address, stream) = (buffer.address(), device.stream().cu_stream());
+    let mut measure_gbs = |copy: &mut dyn FnMut(&mut [u8]) -> Result<()>| -> Result<f64> {
         let mut times = Vec::with_capacity(PINNED_COPIES);
-        // The first copy is a warm-up and does not count.
-        for count in 0..=PINNED_COPIES {
-            let span = EventPair::new(device)?;
-            span.around(device, || copy(host))?;
-            let us = span.microseconds()?;
-            if count > 0 {
+        // The first copy is a warm-up and does not repetition.
+        for repetition in 0..=PINNED_COPIES {
+            let event_pair = EventPair::new(device)?;
+            event_pair.record_around(device, || copy(host))?;
+            let us = event_pair.microseconds()?;
+            if repetition > 0 {
                 times.push(us);
             }
         }
         let timing = Timing::of(times).ok_or_else(|| invalid("replays", "at least 1", 0))?;
-        Ok(gigabytes_per_second(PINNED as u64, timing.median_us))
+        Ok(gigabytes_per_second(PINNED_BYTES as u64, timing.median_us))
     };
-    // SAFETY: both sides have the bytes of `host`. Reading the span waits for each copy, before the next one and before
-    // either side is dropped.
-    let to = rate(&mut |host| unsafe { result::memcpy_htod_async(there, host, stream) }.map_err(&fail))?;
+    // SAFETY: `buffer` and `host` have equal sizes. `microseconds` waits for each copy, so the copy ends before the next
+    // one starts and before either buffer is dropped.
+    let to_device =
+        measure_gbs(&mut |host| unsafe { result::memcpy_htod_async(device_address, host, stream) }.map_err(&to_fault))?;
     // SAFETY: as above.
-    let from = rate(&mut |host| unsafe { result::memcpy_dtoh_async(host, there, stream) }.map_err(&fail))?;
-    Ok((to, from))
+    let from_device =
+        measure_gbs(&mut |host| unsafe { result::memcpy_dtoh_async(host, device_address, stream) }.map_err(&to_fault))?;
+    Ok((to_device, from_device))
 }

@@ -1,19 +1,19 @@
-//! Benchmark kernels and their launchers; the server uses none of them. A `KernelBenchmark` is one way to deform: its kernels are
-//! timed without copies, and its positions are validated.
+//! Benchmark kernels and their launchers; the server uses none of them. Each implements `KernelBenchmark`: its kernels
+//! are timed without copies, and its positions are validated.
 //!
 //! | file | contents |
 //! |---|---|
-//! | `kernel_benchmark` | the `KernelBenchmark` trait, and the driver's facts about kernels |
-//! | `turns` | inputs of several steps, uploaded before timing starts |
+//! | `kernel_benchmark` | the `KernelBenchmark` trait, and the driver's attributes of kernels |
+//! | `input_sets` | inputs of several steps, uploaded before timing starts |
 //! | `timer` | timing by CUDA graphs and events |
 //! | `bandwidth` | kernels that copy, read and fill device memory |
-//! | `memory_roofs` | the best memory rates of the device, for comparison |
-//! | `deformer_kernels` | the deformer's own kernels as a trial |
-//! | `batch_mma` | many vectors q of one U at once by tensor cores, with their own summation order and rounding |
-//! | `ingest` | host-to-device upload of a step's values |
+//! | `memory_roofs` | peak bandwidths of the device, for comparison |
+//! | `deformer_kernels` | the deformer's own kernels |
+//! | `batch_mma` | many vectors q of one U by tensor cores, with their own summation order and rounding |
+//! | `upload_time` | host-to-device upload of a step's values |
 //! | `overlap` | steps with readback by the host, serial and overlapped |
 //! | `cublas`, `plain_update` | products by cuBLAS, and the vertex update that follows them |
-//! | `raster` | the CUDA rasterizer on its own positions and samples |
+//! | `raster` | the CUDA rasterizer with its own positions and samples |
 //! | `thesis` | the kernels of the thesis |
 
 mod bandwidth;
@@ -34,10 +34,10 @@ pub use batch_mma::BatchMmaBenchmark;
 pub use cublas::{CublasBenchmark, CublasMethod, cublas_version};
 pub use deformer_kernels::{DeformerBenchmark, StepOutputs};
 pub use input_sets::Part;
-pub use kernel_benchmark::{KernelAttributes, KernelBenchmark};
+pub use kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 pub use memory_roofs::{Roofs, roofs};
 pub use overlap::{HostWrite, Overlap, host_writes, overlap};
 pub use raster::{RasterBenchmark, RasterCounts, RasterMesh};
 pub use thesis::{KernelSplit, LaneCounts, ThesisBenchmark, count_lanes, idle_lanes_per_warp};
 pub use timer::{empty_replay, gigabytes_per_second, time};
-pub use upload_time::ingest;
+pub use upload_time::time_upload;

@@ -45,13 +45,13 @@ pub struct Overlap {
     pub graph_us: f64,
     /// Readback of the vertices.
     pub copy_out_us: f64,
-    /// A whole step without readback of the vertices.
+    /// A complete step without readback of the vertices.
     pub step_us: f64,
-    /// Every step is read back before the next is written.
+    /// Time per step if every step is read back before the next is written.
     pub serial_us: f64,
-    /// The readback of every step is started at once and awaited after the next step, as the server does.
+    /// Time per step if every readback starts with its step and is awaited after the next step, as in the server.
     pub fetched_us: f64,
-    /// Two steps are in flight, so that the host also writes while the device works.
+    /// Time per step with two steps in flight, so that the host also writes while the device computes.
     pub overlapped_us: f64,
     /// `serial_us` divided by `overlapped_us`.
     pub gain: f64,
@@ -61,7 +61,7 @@ pub struct Overlap {
     pub differing: usize,
 }
 
-/// Measures a scene over rotating states.
+/// Measures `steps` steps of a scene per method and round. Steps rotate through `states`.
 ///
 /// # Errors
 /// `Invalid` without states or steps; errors of creating a deformer; `Fault` when the device fails.
@@ -70,23 +70,23 @@ pub fn overlap(device: &Arc<Device>, scene: &Arc<Scene>, states: &[SceneState], 
         return Err(invalid("states and steps", "at least 1", format!("{} and {steps}", states.len())));
     }
     let mut deformer = CudaDeformer::new(device, scene, None, scene.light_axes())?;
-    let differing = differing(&mut deformer, states, steps)?;
+    let differing = count_differing_steps(&mut deformer, states, steps)?;
     let mut times = [Vec::new(), Vec::new(), Vec::new()];
     for _ in 0..ROUNDS {
-        for (way, times) in [serial, pipelined, overlapped].iter().zip(&mut times) {
+        for (run_steps, times) in [run_serial, run_pipelined, run_overlapped].iter().zip(&mut times) {
             let begin = Instant::now();
-            way(&mut deformer, states, steps, &mut |_, surface| {
+            run_steps(&mut deformer, states, steps, &mut |_, surface| {
                 black_box(surface.positions.first());
             })?;
-            times.push(since(begin) / steps as f64);
+            times.push(elapsed_us(begin) / steps as f64);
         }
     }
     let [serial_us, fetched_us, overlapped_us] = times.map(median);
-    let [step_us, copy_out_us] = alone(&mut deformer, states, steps)?;
-    let (bytes_in, [write_one_core_us, write_us]) = writes(device, scene, states, steps)?;
-    let graph_us = graph(device, &deformer, steps)?;
-    let read = deformer.readback(VertexAttributes::VERTICES)?;
-    let surface = deformer.wait_readback(&read)?;
+    let [step_us, copy_out_us] = time_step_and_readback(&mut deformer, states, steps)?;
+    let (bytes_in, [write_one_core_us, write_us]) = time_input_writes(device, scene, states, steps)?;
+    let graph_us = time_graph(device, &deformer, steps)?;
+    let readback = deformer.readback(VertexAttributes::VERTICES)?;
+    let surface = deformer.wait_readback(&readback)?;
     Ok(Overlap {
         steps,
         cores: rayon::current_num_threads(),
@@ -106,123 +106,148 @@ pub fn overlap(device: &Arc<Device>, scene: &Arc<Scene>, states: &[SceneState], 
     })
 }
 
-type Read<'a> = &'a mut dyn FnMut(usize, &DeformedSurface);
+/// Receives the index and the surface of every step.
+type SurfaceCallback<'a> = &'a mut dyn FnMut(usize, &DeformedSurface);
 
-fn serial(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize, read: Read<'_>) -> Result<()> {
+/// Reads every step back before the next.
+fn run_serial(
+    deformer: &mut CudaDeformer,
+    states: &[SceneState],
+    steps: usize,
+    on_surface: SurfaceCallback<'_>,
+) -> Result<()> {
     for step in 0..steps {
         deformer.deform(&states[step % states.len()])?;
         let readback = deformer.readback(VertexAttributes::VERTICES)?;
-        read(step, &*deformer.wait_readback(&readback)?);
+        on_surface(step, &*deformer.wait_readback(&readback)?);
     }
     Ok(())
 }
 
-fn pipelined(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize, read: Read<'_>) -> Result<()> {
-    let mut before = None;
+/// Awaits the readback of every step after the next step.
+fn run_pipelined(
+    deformer: &mut CudaDeformer,
+    states: &[SceneState],
+    steps: usize,
+    on_surface: SurfaceCallback<'_>,
+) -> Result<()> {
+    let mut previous = None;
     for step in 0..=steps {
-        let next = match step < steps {
+        let current = match step < steps {
             true => {
                 deformer.deform(&states[step % states.len()])?;
                 Some(deformer.readback(VertexAttributes::VERTICES)?)
             }
             false => None,
         };
-        if let Some(readback) = std::mem::replace(&mut before, next) {
-            read(step - 1, &*deformer.wait_readback(&readback)?);
+        if let Some(readback) = std::mem::replace(&mut previous, current) {
+            on_surface(step - 1, &*deformer.wait_readback(&readback)?);
         }
     }
     Ok(())
 }
 
-fn overlapped(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize, read: Read<'_>) -> Result<()> {
+/// Keeps [`MAX_STEPS_IN_FLIGHT`] steps in flight.
+fn run_overlapped(
+    deformer: &mut CudaDeformer,
+    states: &[SceneState],
+    steps: usize,
+    on_surface: SurfaceCallback<'_>,
+) -> Result<()> {
     let mut readbacks = VecDeque::new();
     for step in 0..steps + MAX_STEPS_IN_FLIGHT {
-        let finished = step.checked_sub(MAX_STEPS_IN_FLIGHT);
-        if finished.is_some_and(|finished| finished < steps) {
+        let finished_step = step.checked_sub(MAX_STEPS_IN_FLIGHT);
+        if finished_step.is_some_and(|finished_step| finished_step < steps) {
             deformer.finish()?;
         }
         if step < steps {
             deformer.submit(&states[step % states.len()])?;
             readbacks.push_back(deformer.readback(VertexAttributes::VERTICES)?);
         }
-        if let (Some(finished), true) = (finished, readbacks.len() > MAX_STEPS_IN_FLIGHT || step >= steps)
+        if let (Some(finished_step), true) = (finished_step, readbacks.len() > MAX_STEPS_IN_FLIGHT || step >= steps)
             && let Some(readback) = readbacks.pop_front()
         {
-            read(finished, &*deformer.wait_readback(&readback)?);
+            on_surface(finished_step, &*deformer.wait_readback(&readback)?);
         }
     }
     Ok(())
 }
 
-/// Counts steps of the other two methods whose vertices differ from the serial ones.
-fn differing(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize) -> Result<usize> {
+/// Counts steps of the other two methods whose vertices differ from the serial ones, and missing steps.
+fn count_differing_steps(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize) -> Result<usize> {
     let mut want = Vec::new();
-    serial(deformer, states, states.len(), &mut |_, surface| want.push(surface.clone()))?;
+    run_serial(deformer, states, states.len(), &mut |_, surface| want.push(surface.clone()))?;
     let mut differing = 0;
-    for way in [pipelined, overlapped] {
-        let mut seen = 0;
-        way(deformer, states, steps, &mut |step, surface| {
-            seen += 1;
-            differing += usize::from(!same_bits(surface, &want[step % states.len()]));
+    for run_steps in [run_pipelined, run_overlapped] {
+        let mut received = 0;
+        run_steps(deformer, states, steps, &mut |step, surface| {
+            received += 1;
+            differing += usize::from(!have_equal_bits(surface, &want[step % states.len()]));
         })?;
-        differing += steps.abs_diff(seen);
+        differing += steps.abs_diff(received);
     }
     Ok(differing)
 }
 
-fn same_bits(one: &DeformedSurface, other: &DeformedSurface) -> bool {
-    let same =
+fn have_equal_bits(one: &DeformedSurface, other: &DeformedSurface) -> bool {
+    let are_equal =
         |one: &[f32], other: &[f32]| bytemuck::cast_slice::<f32, u32>(one) == bytemuck::cast_slice::<f32, u32>(other);
-    same(&one.positions, &other.positions) && same(&one.normals, &other.normals)
+    are_equal(&one.positions, &other.positions) && are_equal(&one.normals, &other.normals)
 }
 
 /// Median times of a step without readback, and of the readback alone.
-fn alone(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize) -> Result<[f64; 2]> {
-    let [mut whole, mut out] = [Vec::new(), Vec::new()];
+fn time_step_and_readback(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize) -> Result<[f64; 2]> {
+    let [mut step_times, mut readback_times] = [Vec::new(), Vec::new()];
     for step in 0..steps {
         let begin = Instant::now();
         deformer.deform(&states[step % states.len()])?;
-        whole.push(since(begin));
+        step_times.push(elapsed_us(begin));
         let begin = Instant::now();
         let readback = deformer.readback(VertexAttributes::VERTICES)?;
         deformer.wait_readback(&readback)?;
-        out.push(since(begin));
+        readback_times.push(elapsed_us(begin));
     }
-    Ok([whole, out].map(median))
+    Ok([step_times, readback_times].map(median))
 }
 
 /// Bytes of a step's values, and median times of writing them on one core and on all.
-fn writes(device: &Device, scene: &Arc<Scene>, states: &[SceneState], steps: usize) -> Result<(u64, [f64; 2])> {
+fn time_input_writes(
+    device: &Device,
+    scene: &Arc<Scene>,
+    states: &[SceneState],
+    steps: usize,
+) -> Result<(u64, [f64; 2])> {
     let packing = Arc::new(InputPacker::sizes_only(scene));
     let mut staging = StepInputs::new(device, &packing)?.staging(device)?;
     let words = staging.as_mut_slice()?;
     let mut writer = InputWriter::new(&packing);
     let bytes = size_of_val(words) as u64;
-    let mut run = move || {
-        let mut write = |step: usize| {
+    let mut measure = move || {
+        let mut time_write = |step: usize| {
             let begin = Instant::now();
             writer.write(words, &Header::default(), &states[step % states.len()]);
-            since(begin)
+            elapsed_us(begin)
         };
-        write(0);
-        median((0..steps).map(&mut write).collect())
+        // Warm-up.
+        time_write(0);
+        median((0..steps).map(&mut time_write).collect())
     };
-    let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().map_err(fault_in("write"))?;
-    Ok((bytes, [one.install(&mut run), run()]))
+    let single_thread = rayon::ThreadPoolBuilder::new().num_threads(1).build().map_err(fault_in("write"))?;
+    Ok((bytes, [single_thread.install(&mut measure), measure()]))
 }
 
 /// Median time of the last step's graph alone, between two events.
-fn graph(device: &Device, deformer: &CudaDeformer, steps: usize) -> Result<f64> {
+fn time_graph(device: &Device, deformer: &CudaDeformer, steps: usize) -> Result<f64> {
     let mut times = Vec::with_capacity(steps);
     for _ in 0..steps {
-        let span = EventPair::new(device)?;
-        span.around(device, || deformer.replay())?;
-        times.push(span.microseconds()?);
+        let event_pair = EventPair::new(device)?;
+        event_pair.record_around(device, || deformer.replay())?;
+        times.push(event_pair.microseconds()?);
     }
     Ok(median(times))
 }
 
-fn since(begin: Instant) -> f64 {
+fn elapsed_us(begin: Instant) -> f64 {
     begin.elapsed().as_secs_f64() * 1e6
 }
 
@@ -245,27 +270,27 @@ pub struct HostWrite {
 /// # Errors
 /// `Invalid` when `replays` is 0; `Fault` when the driver cannot allocate memory.
 pub fn host_writes(device: &Device, replays: usize) -> Result<Vec<HostWrite>> {
-    const LARGEST: usize = 64 << 20;
-    let mut staging = PinnedBuffer::<f32>::zeroed(device, LARGEST / 4, PinnedUse::ToDevice)?;
-    let to = staging.as_mut_slice()?;
-    let from = vec![1.0_f32; LARGEST / 4];
-    let mut row = |bytes: usize| {
-        let (to, from) = (&mut to[..bytes / 4], &from[..bytes / 4]);
-        let mut time = |copy: &dyn Fn(&mut [f32], &[f32])| {
-            let once = |_| {
+    const MAX_BYTES: usize = 64 << 20;
+    let mut staging = PinnedBuffer::<f32>::zeroed(device, MAX_BYTES / 4, PinnedUse::ToDevice)?;
+    let dst = staging.as_mut_slice()?;
+    let src = vec![1.0_f32; MAX_BYTES / 4];
+    let mut measure = |bytes: usize| {
+        let (dst, src) = (&mut dst[..bytes / 4], &src[..bytes / 4]);
+        let mut time_copy = |copy: &dyn Fn(&mut [f32], &[f32])| {
+            let time_once = |_| {
                 let begin = Instant::now();
-                copy(to, from);
-                since(begin)
+                copy(dst, src);
+                elapsed_us(begin)
             };
-            let timing = Timing::of((0..replays).map(once).collect());
+            let timing = Timing::of((0..replays).map(time_once).collect());
             timing.map(|timing| timing.median_us).ok_or_else(|| invalid("replays", "at least 1", 0))
         };
         Ok(HostWrite {
             bytes: bytes as u64,
-            one_core_us: time(&|to, from| to.copy_from_slice(from))?,
-            all_cores_us: time(&parallel_copy)?,
+            one_core_us: time_copy(&|dst, src| dst.copy_from_slice(src))?,
+            all_cores_us: time_copy(&parallel_copy)?,
             on_all_cores: bytes >= PARALLEL_THRESHOLD,
         })
     };
-    (16..=26).map(|power| row(1 << power)).collect()
+    (16..=26).map(|power| measure(1 << power)).collect()
 }

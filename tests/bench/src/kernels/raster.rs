@@ -1,7 +1,7 @@
-//! The CUDA rasterizer as a trial: it has its own positions and samples on the device, so that it can be timed without
-//! OpenGL and read back.
+//! Benchmarks the CUDA rasterizer. Positions and samples are device buffers of its own, so that it can be timed without
+//! OpenGL and its samples can be read back.
 
-use super::kernel_benchmark::{KernelAttributes, KernelBenchmark};
+use super::kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::RasterVariant;
 use modalcast_compute::gpu::launch::DeviceBuffer;
@@ -17,6 +17,7 @@ pub struct RasterMesh<'a> {
     pub positions: &'a [f32],
     /// Vertex indices; a triangle's id is its index here.
     pub triangles: &'a [[u32; 3]],
+    /// Ranges of triangles to draw, each with its visible faces.
     pub groups: &'a [DrawRange],
     pub cut_outs: Option<&'a CutOuts>,
 }
@@ -42,18 +43,18 @@ pub struct RasterCounts {
     pub missed: u32,
 }
 
-/// A mesh and a window on the device, and the kernels that draw the mesh into the window.
+/// A mesh and its render target on the device, and the kernels that draw the mesh.
 #[derive(Debug)]
 pub struct RasterBenchmark {
     variant: RasterVariant,
     functions: RasterFunctions,
-    facts: Vec<KernelAttributes>,
+    attributes: Vec<KernelAttributes>,
     groups: Vec<DrawRange>,
     positions: DeviceBuffer,
     target: DeviceBuffer,
-    core: RasterPipeline,
+    pipeline: RasterPipeline,
     window: Viewport,
-    bytes: Vec<(&'static str, u64)>,
+    traffic: Vec<ArrayTraffic>,
 }
 
 impl RasterBenchmark {
@@ -67,23 +68,27 @@ impl RasterBenchmark {
         if let Some(cut_outs) = mesh.cut_outs {
             check_cut_outs(mesh.triangles.len(), cut_outs)?;
         }
-        let core = RasterPipeline::new(device, mesh.triangles, mesh.cut_outs)?;
-        let functions = RasterFunctions::new(device, variant, core.has_cut_outs())?;
-        let facts = functions
+        let pipeline = RasterPipeline::new(device, mesh.triangles, mesh.cut_outs)?;
+        let functions = RasterFunctions::new(device, variant, pipeline.has_cut_outs())?;
+        let attributes = functions
             .with_names()
-            .map(|(name, function)| KernelAttributes::of(name, function))
+            .map(|(name, function)| KernelAttributes::query(name, function))
             .collect::<Result<_>>()?;
-        let (target, triangles) = (variant.bytes(&window), size_of_val(mesh.triangles) as u64);
+        let (target_bytes, triangle_bytes) = (variant.bytes(&window), size_of_val(mesh.triangles) as u64);
         Ok(Self {
             variant,
             functions,
-            facts,
+            attributes,
             groups: mesh.groups.to_vec(),
             positions: DeviceBuffer::upload(device, mesh.positions)?,
-            target: DeviceBuffer::zeroed(device, target)?,
-            core,
+            target: DeviceBuffer::zeroed(device, target_bytes)?,
+            pipeline,
             window,
-            bytes: vec![("samples", target), ("x", size_of_val(mesh.positions) as u64), ("triangles", triangles)],
+            traffic: vec![
+                ArrayTraffic::new("samples", target_bytes),
+                ArrayTraffic::new("x", size_of_val(mesh.positions) as u64),
+                ArrayTraffic::new("triangles", triangle_bytes),
+            ],
         })
     }
 
@@ -113,7 +118,7 @@ impl RasterBenchmark {
     /// # Errors
     /// `Fault` when the device fails.
     pub fn counts(&self, device: &Device) -> Result<RasterCounts> {
-        let [small, medium, large, not_finite, outside, flat, back, missed] = self.core.counts(device)?;
+        let [small, medium, large, not_finite, outside, flat, back, missed] = self.pipeline.counts(device)?;
         Ok(RasterCounts { small, medium, large, not_finite, outside, flat, back, missed })
     }
 }
@@ -124,7 +129,7 @@ impl KernelBenchmark for RasterBenchmark {
         format!("raster {} {width}x{height}", if self.variant.depth_only { "depth" } else { "ids" })
     }
 
-    fn turns(&self) -> usize {
+    fn input_set_count(&self) -> usize {
         1
     }
 
@@ -138,18 +143,18 @@ impl KernelBenchmark for RasterBenchmark {
         };
         // SAFETY: `new` checked mesh and groups; both buffers have the sizes of the pass, and device memory is
         // released in the order of the stream.
-        unsafe { self.core.draw(device, &pass) }
+        unsafe { self.pipeline.draw(device, &pass) }
     }
 
-    fn bytes(&self) -> Vec<(&'static str, u64)> {
-        self.bytes.clone()
+    fn traffic(&self) -> Vec<ArrayTraffic> {
+        self.traffic.clone()
     }
 
-    fn launches(&self) -> usize {
-        self.core.launches(&self.groups)
+    fn launches_per_step(&self) -> usize {
+        self.pipeline.launches(&self.groups)
     }
 
-    fn kernels(&self) -> Vec<KernelAttributes> {
-        self.facts.clone()
+    fn kernel_attributes(&self) -> Vec<KernelAttributes> {
+        self.attributes.clone()
     }
 }

@@ -12,43 +12,39 @@ use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::{DeviceBuffer, capture};
 use modalcast_model::error::{Result, fault_in, invalid};
 
-/// Replays that are enqueued together, behind a kernel that blocks the stream meanwhile, so that the host's launch
-/// overhead does not affect the times. The stream takes about a thousand entries before it blocks the host.
-const BATCH: usize = 25;
+/// Replays that are enqueued together behind a kernel that delays the stream, so that the host's launch overhead does
+/// not affect the times. A stream holds about a thousand entries before it blocks the host.
+const BATCH_REPLAYS: usize = 25;
 
-/// Microseconds for which the stream is blocked per replay of a batch: longer than the host needs for its calls.
-const HOLD_US: u64 = 40;
+/// Delay of the stream per replay of a batch, microseconds: longer than the host needs to enqueue a replay.
+const DELAY_US: u64 = 40;
 
-/// Upper limit of turns to rotate through: enough that no replay finds the q of the previous one in a cache.
+/// Maximum number of input sets to rotate through.
 pub(super) const MAX_GRAPHS: usize = 8;
 
 /// Warm-up time before timing, so that the device reaches its clock rates.
 const WARM_UP: Duration = Duration::from_millis(30);
 
-/// Size of the buffer that the cold sweep reads, in multiples of the L2 size.
-const SWEEPS: u64 = 4;
+/// Size of the buffer that evicts the L2, in multiples of the L2 size.
+const L2_FLUSH_FACTOR: u64 = 4;
 
-/// Times a trial's step: one CUDA graph per turn, replayed in rotation, each replay between two events.
+/// Times the steps of a benchmark: one CUDA graph per input set, replayed in rotation, each replay between two events.
 ///
 /// # Errors
 /// `Invalid` when `replays` is 0; `Unavailable` when NVRTC is missing; `Fault` when the device fails or a launch cannot
 /// be captured.
-pub fn time(
-    device: &Device,
-    kernel_benchmark: &dyn KernelBenchmark,
-    cache: CacheState,
-    replays: usize,
-) -> Result<Timing> {
+pub fn time(device: &Device, benchmark: &dyn KernelBenchmark, cache: CacheState, replays: usize) -> Result<Timing> {
     if replays == 0 {
         return Err(invalid("replays", "at least 1", 0));
     }
-    let hold = StreamDelay::new(device)?;
-    let sweep = matches!(cache, CacheState::Cold).then(|| L2Flush::new(device)).transpose()?;
+    let delay = StreamDelay::new(device)?;
+    let l2_flush = matches!(cache, CacheState::Cold).then(|| L2Flush::new(device)).transpose()?;
     // The first launch is outside of a graph: it loads code and allocates workspaces, neither of which a capture
     // allows.
-    kernel_benchmark.launch(device, 0)?;
-    let turns = kernel_benchmark.turns().min(MAX_GRAPHS);
-    let graphs = (0..turns).map(|turn| capture_turn(device, kernel_benchmark, turn)).collect::<Result<Vec<_>>>()?;
+    benchmark.launch(device, 0)?;
+    let graph_count = benchmark.input_set_count().min(MAX_GRAPHS);
+    let graphs =
+        (0..graph_count).map(|input_set| capture_graph(device, benchmark, input_set)).collect::<Result<Vec<_>>>()?;
     let begin = Instant::now();
     while begin.elapsed() < WARM_UP {
         graphs.iter().try_for_each(|graph| graph.launch().map_err(fault_in("replay")))?;
@@ -56,56 +52,61 @@ pub fn time(
     }
     let mut times = Vec::with_capacity(replays);
     while times.len() < replays {
-        let batch = BATCH.min(replays - times.len());
+        let batch_replays = BATCH_REPLAYS.min(replays - times.len());
         let first = times.len();
-        let spans: Vec<EventPair> = (0..batch).map(|_| EventPair::new(device)).collect::<Result<_>>()?;
-        hold.launch(device, HOLD_US * batch as u64)?;
-        for (index, span) in spans.iter().enumerate() {
-            sweep.as_ref().map_or(Ok(()), |sweep| sweep.launch(device))?;
-            span.around(device, || graphs[(first + index) % graphs.len()].launch().map_err(fault_in("replay")))?;
+        let event_pairs: Vec<EventPair> = (0..batch_replays).map(|_| EventPair::new(device)).collect::<Result<_>>()?;
+        delay.launch(device, DELAY_US * batch_replays as u64)?;
+        for (index, event_pair) in event_pairs.iter().enumerate() {
+            l2_flush.as_ref().map_or(Ok(()), |l2_flush| l2_flush.launch(device))?;
+            event_pair.record_around(device, || {
+                graphs[(first + index) % graphs.len()].launch().map_err(fault_in("replay"))
+            })?;
         }
         device.stream().synchronize().map_err(fault_in("replay"))?;
-        for span in &spans {
-            times.push(span.microseconds()?);
+        for event_pair in &event_pairs {
+            times.push(event_pair.microseconds()?);
         }
     }
     Timing::of(times).ok_or_else(|| invalid("replays", "at least 1", 0))
 }
 
 /// Times a graph with one empty kernel: the lower limit of any step's time.
+///
+/// # Errors
+/// Those of [`time`].
 pub fn empty_replay(device: &Device, replays: usize) -> Result<Timing> {
-    struct Nothing(CudaFunction);
-    impl KernelBenchmark for Nothing {
+    struct EmptyBenchmark(CudaFunction);
+    impl KernelBenchmark for EmptyBenchmark {
         fn name(&self) -> String {
             "empty".into()
         }
-        fn turns(&self) -> usize {
+        fn input_set_count(&self) -> usize {
             1
         }
         fn launch(&self, device: &Device, _: usize) -> Result<()> {
             let mut launch = device.stream().launch_builder(&self.0);
             // SAFETY: the kernel has no arguments and does nothing.
-            unsafe { launch.launch(SINGLE) }.map_err(fault_in("replay"))?;
+            unsafe { launch.launch(ONE_THREAD) }.map_err(fault_in("replay"))?;
             Ok(())
         }
-        fn launches(&self) -> usize {
+        fn launches_per_step(&self) -> usize {
             1
         }
     }
-    let nothing = Nothing(device.function("nothing", bandwidth::CODE.source, &[])?);
-    time(device, &nothing, CacheState::Warm, replays)
+    let benchmark = EmptyBenchmark(device.function("empty_kernel", bandwidth::SOURCE.text, &[])?);
+    time(device, &benchmark, CacheState::Warm, replays)
 }
 
-const SINGLE: LaunchConfig = LaunchConfig { grid_dim: (1, 1, 1), block_dim: (1, 1, 1), shared_mem_bytes: 0 };
+const ONE_THREAD: LaunchConfig = LaunchConfig { grid_dim: (1, 1, 1), block_dim: (1, 1, 1), shared_mem_bytes: 0 };
 
 /// Captures one step as a graph and uploads it.
-fn capture_turn(device: &Device, kernel_benchmark: &dyn KernelBenchmark, turn: usize) -> Result<CudaGraph> {
-    let graph = capture(device, || kernel_benchmark.launch(device, turn))?;
+fn capture_graph(device: &Device, benchmark: &dyn KernelBenchmark, input_set: usize) -> Result<CudaGraph> {
+    let graph = capture(device, || benchmark.launch(device, input_set))?;
     graph.upload().map_err(fault_in("capture"))?;
     Ok(graph)
 }
 
-/// Two events on the device's stream that enclose some work.
+/// Two events on the device's stream, recorded before and after some work.
 pub(super) struct EventPair {
     begin: CudaEvent,
     end: CudaEvent,
@@ -118,31 +119,31 @@ impl EventPair {
     }
 
     /// Records the events before and after the work that `work` enqueues.
-    pub(super) fn around(&self, device: &Device, work: impl FnOnce() -> Result<()>) -> Result<()> {
+    pub(super) fn record_around(&self, device: &Device, work: impl FnOnce() -> Result<()>) -> Result<()> {
         self.begin.record(device.stream()).map_err(fault_in("event"))?;
         work()?;
         self.end.record(device.stream()).map_err(fault_in("event"))
     }
 
-    /// Time between the two events, microseconds. Waits until both are complete.
+    /// Waits until both events are complete and returns the time between them, microseconds.
     pub(super) fn microseconds(&self) -> Result<f64> {
         self.begin.elapsed_ms(&self.end).map(|ms| 1e3 * f64::from(ms)).map_err(fault_in("event"))
     }
 }
 
-/// Blocks the stream for a given time.
+/// A kernel that delays the stream for a given time.
 struct StreamDelay(CudaFunction);
 
 impl StreamDelay {
     fn new(device: &Device) -> Result<Self> {
-        device.function("hold", bandwidth::CODE.source, &[]).map(Self)
+        device.function("delay", bandwidth::SOURCE.text, &[]).map(Self)
     }
 
     fn launch(&self, device: &Device, us: u64) -> Result<()> {
         let nanoseconds = 1000 * us;
         let mut launch = device.stream().launch_builder(&self.0);
         // SAFETY: the kernel's only argument is a number of nanoseconds; it touches no memory.
-        unsafe { launch.arg(&nanoseconds).launch(SINGLE) }.map_err(fault_in("replay"))?;
+        unsafe { launch.arg(&nanoseconds).launch(ONE_THREAD) }.map_err(fault_in("replay"))?;
         Ok(())
     }
 }
@@ -156,21 +157,20 @@ struct L2Flush {
 
 impl L2Flush {
     fn new(device: &Device) -> Result<Self> {
-        let l2 = device.context().attribute(CUdevice_attribute::CU_DEVICE_ATTRIBUTE_L2_CACHE_SIZE);
-        let l2 = u64::try_from(l2.map_err(fault_in("device"))?).unwrap_or(0);
-        let tiles = (SWEEPS * l2).div_ceil(bandwidth::tile(bandwidth::SWEEP_LOADS)).max(1);
+        let l2_size = device.context().attribute(CUdevice_attribute::CU_DEVICE_ATTRIBUTE_L2_CACHE_SIZE);
+        let l2_bytes = u64::try_from(l2_size.map_err(fault_in("device"))?).unwrap_or(0);
+        let tiles = (L2_FLUSH_FACTOR * l2_bytes).div_ceil(bandwidth::tile_bytes(bandwidth::L2_FLUSH_LOADS)).max(1);
         Ok(Self {
-            function: device.function("read", bandwidth::CODE.source, bandwidth::SWEEP)?,
-            buffer: DeviceBuffer::zeroed(device, tiles * bandwidth::tile(bandwidth::SWEEP_LOADS))?,
+            function: device.function("read", bandwidth::SOURCE.text, bandwidth::L2_FLUSH_DEFINES)?,
+            buffer: DeviceBuffer::zeroed(device, tiles * bandwidth::tile_bytes(bandwidth::L2_FLUSH_LOADS))?,
             blocks: tiles as u32,
         })
     }
 
     fn launch(&self, device: &Device) -> Result<()> {
-        // The kernel writes only if all bits that it read are ones. The buffer holds zeros, so input and output may be
-        // the same.
-        let from = self.buffer.address();
-        bandwidth::launch(device, &self.function, self.blocks, [from, from])
+        // `read` stores only if all bits that it read are ones. The buffer holds zeros, so it can be both input and output.
+        let buffer = self.buffer.address();
+        bandwidth::launch(device, &self.function, self.blocks, [buffer, buffer])
     }
 }
 

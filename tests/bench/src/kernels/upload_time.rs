@@ -10,7 +10,7 @@ use modalcast_compute::gpu::step_input::{Header, InputPacker, InputPart, Staging
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Scene, SceneState};
 
-/// The upload of whole steps as a trial.
+/// Uploads whole steps. It launches no kernel.
 struct UploadBenchmark {
     inputs: StepInputs,
     staging: StagingBuffer,
@@ -21,7 +21,7 @@ impl KernelBenchmark for UploadBenchmark {
         "ingest".into()
     }
 
-    fn turns(&self) -> usize {
+    fn input_set_count(&self) -> usize {
         1
     }
 
@@ -31,20 +31,20 @@ impl KernelBenchmark for UploadBenchmark {
         unsafe { self.inputs.send(device, &self.staging, InputPart::Whole) }
     }
 
-    fn launches(&self) -> usize {
+    fn launches_per_step(&self) -> usize {
         0
     }
 }
 
-/// Bytes of a whole step's values, and the time of their upload as a graph of its own.
+/// Bytes of a whole step's values, and the time of a graph that only uploads them.
 ///
 /// # Errors
 /// `Fault` when the device fails; `Invalid` when `replays` is 0.
-pub fn ingest(device: &Device, scene: &Arc<Scene>, state: &SceneState, replays: usize) -> Result<(u64, Timing)> {
+pub fn time_upload(device: &Device, scene: &Arc<Scene>, state: &SceneState, replays: usize) -> Result<(u64, Timing)> {
     let mut inputs = StepInputs::new(device, &Arc::new(InputPacker::sizes_only(scene)))?;
     let mut staging = inputs.staging(device)?;
     inputs.write(&mut staging, &Header::default(), state)?;
     let bytes = inputs.bytes();
-    let ingest = UploadBenchmark { inputs, staging };
-    Ok((bytes, time(device, &ingest, CacheState::Warm, replays)?))
+    let benchmark = UploadBenchmark { inputs, staging };
+    Ok((bytes, time(device, &benchmark, CacheState::Warm, replays)?))
 }

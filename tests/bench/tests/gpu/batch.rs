@@ -56,23 +56,23 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
         ] {
             let scene = build_scene(instanced_parts(vertices, rank, count, with_storage(storage)));
             let states = random_states(&scene);
-            let batch = BatchMmaBenchmark::new(&device, &scene, &states).expect("a trial");
+            let batch = BatchMmaBenchmark::new(&device, &scene, &states).expect("expected a benchmark");
             let name = format!("{} n {vertices} r {rank}", batch.name());
-            for (turn, state) in states.iter().enumerate() {
-                batch.launch(&device, turn).expect("launches");
+            for (input_set, state) in states.iter().enumerate() {
+                batch.launch(&device, input_set).expect("expected a launch");
                 let got = batch.positions(&device).expect("expected a surface");
                 let share = of_bound(&scene, state, &got);
-                assert!(share <= 1.0, "{name} turn {turn}: {share} of the bound");
-                let other = of_bound(&scene, &states[(turn + 1) % states.len()], &got);
+                assert!(share <= 1.0, "{name} input set {input_set}: {share} of the bound");
+                let other = of_bound(&scene, &states[(input_set + 1) % states.len()], &got);
                 assert!(other > 1.0, "{name}: the judge can fail");
-                batch.launch(&device, turn).expect("launches");
+                batch.launch(&device, input_set).expect("expected a launch");
                 assert!(
                     have_equal_bits(&got, &batch.positions(&device).expect("expected a surface")),
                     "{name}: run after run"
                 );
             }
-            for facts in batch.kernels() {
-                assert!(facts.spilled_bytes == 0, "{name}: {facts:?}");
+            for attributes in batch.kernel_attributes() {
+                assert!(attributes.local_bytes == 0, "{name}: {attributes:?}");
             }
         }
     }
@@ -94,28 +94,30 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
     let device = Device::open(0).expect("expected a CUDA device");
-    let measure = |trial: &dyn KernelBenchmark| {
-        let us = time(&device, trial, CacheState::Warm, 200).expect("times").median_us;
-        let bytes: u64 = trial.bytes().iter().map(|(_, bytes)| bytes).sum();
+    let measure = |benchmark: &dyn KernelBenchmark| {
+        let us = time(&device, benchmark, CacheState::Warm, 200).expect("times").median_us;
+        let bytes: u64 = benchmark.traffic().iter().map(|traffic| traffic.bytes).sum();
         let rate = gigabytes_per_second(bytes, us);
-        eprintln!("{}: {us:.1} us, {rate:.0} GB/s, {:?}", trial.name(), trial.kernels());
+        eprintln!("{}: {us:.1} us, {rate:.0} GB/s, {:?}", benchmark.name(), benchmark.kernel_attributes());
         us
     };
     for storage in StorageType::ALL {
         let batched = DeformationSettings { batches: BatchPolicy::Always, ..with_storage(storage) };
         let scene = build_scene(instanced_parts(1_500_000, 32, 1, batched));
         let state = scenes::random_state(&scene, 1);
-        let one = measure(&DeformerBenchmark::new(&device, &scene, &[state], StepOutputs::Positions).expect("a trial"));
+        let one = measure(
+            &DeformerBenchmark::new(&device, &scene, &[state], StepOutputs::Positions).expect("expected a benchmark"),
+        );
         let scene = build_scene(instanced_parts(1_500_000, 32, 16, batched));
         let state = scenes::random_state(&scene, 1);
         let sixteen = DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), StepOutputs::Positions)
-            .expect("a trial");
-        assert_eq!(sixteen.kernels()[0].name, "batch");
+            .expect("expected a benchmark");
+        assert_eq!(sixteen.kernel_attributes()[0].name, "batch");
         let sixteen = measure(&sixteen);
         eprintln!("{}: {:.2} times as long as one", storage.name(), sixteen / one);
         assert!(sixteen < 8.0 * one, "{storage:?} {one} {sixteen}");
         if matches!(storage, StorageType::F16 | StorageType::Bf16) {
-            let products = measure(&BatchMmaBenchmark::new(&device, &scene, &[state]).expect("a trial"));
+            let products = measure(&BatchMmaBenchmark::new(&device, &scene, &[state]).expect("expected a benchmark"));
             eprintln!("{} by tensor cores: {:.2} times as long as one", storage.name(), products / one);
             assert!(products < 8.0 * one, "{storage:?} {one} {products}");
         }
@@ -144,7 +146,7 @@ fn gpu_auto_mode_batches_where_it_is_faster() {
             let state = scenes::random_state(&together, 1);
             let measured = |scene: &Arc<Scene>| {
                 let ours = DeformerBenchmark::new(&device, scene, std::slice::from_ref(&state), StepOutputs::Positions)
-                    .expect("a trial");
+                    .expect("expected a benchmark");
                 time(&device, &ours, CacheState::Warm, 100).expect("times").median_us
             };
             let [batch, alone] = [&together, &apart].map(measured);

@@ -40,7 +40,7 @@ fn named(scene: &Scene) -> Vec<bool> {
     named
 }
 
-/// Largest error of a trial's positions, over the vertices that a triangle refers to, as a fraction of the diagonal.
+/// Largest error of a benchmark's positions, over the vertices that a triangle refers to, as a fraction of the diagonal.
 fn judge(scene: &Scene, state: &SceneState, positions: &[f32]) -> Result<f64, String> {
     let (named, want) = (named(scene), modalcast_compute::reference::deform(scene, state));
     if positions.len() != 3 * named.len() {
@@ -56,29 +56,34 @@ fn judge(scene: &Scene, state: &SceneState, positions: &[f32]) -> Result<f64, St
     max_error(&got, &want, MAX_POSITION_ERROR * diagonal).map(|error| error / diagonal)
 }
 
-/// Checks every turn of a trial, launched directly and replayed.
-fn check(device: &Device, scene: &Arc<Scene>, states: &[SceneState], trial: &dyn KernelBenchmark) {
-    let name = trial.name();
-    assert_eq!(trial.turns(), states.len(), "{name}");
-    for (turn, state) in states.iter().enumerate() {
-        trial.launch(device, turn).unwrap_or_else(|error| panic!("{name}: {error}"));
-        let positions = trial.positions(device).expect("expected a surface");
-        let error = judge(scene, state, &positions).unwrap_or_else(|error| panic!("{name} turn {turn}: {error}"));
-        assert!(judge(scene, &states[(turn + 1) % states.len()], &positions).is_err(), "{name}: the judge can fail");
-        eprintln!("{name} turn {turn}: {error:.2e} of the diagonal");
+/// Checks every input set of a benchmark, launched directly and replayed.
+fn check(device: &Device, scene: &Arc<Scene>, states: &[SceneState], benchmark: &dyn KernelBenchmark) {
+    let name = benchmark.name();
+    assert_eq!(benchmark.input_set_count(), states.len(), "{name}");
+    for (input_set, state) in states.iter().enumerate() {
+        benchmark.launch(device, input_set).unwrap_or_else(|error| panic!("{name}: {error}"));
+        let positions = benchmark.positions(device).expect("expected a surface");
+        let error =
+            judge(scene, state, &positions).unwrap_or_else(|error| panic!("{name} input set {input_set}: {error}"));
+        assert!(
+            judge(scene, &states[(input_set + 1) % states.len()], &positions).is_err(),
+            "{name}: the judge can fail"
+        );
+        eprintln!("{name} input set {input_set}: {error:.2e} of the diagonal");
     }
-    // The last replay runs the last turn.
+    // The last replay runs the last input set.
     for cache in [CacheState::Warm, CacheState::Cold] {
-        trial.launch(device, 0).expect("launches");
-        let timing = time(device, trial, cache, 10 * states.len()).unwrap_or_else(|error| panic!("{name}: {error}"));
-        let positions = trial.positions(device).expect("expected a surface");
+        benchmark.launch(device, 0).expect("expected a launch");
+        let timing =
+            time(device, benchmark, cache, 10 * states.len()).unwrap_or_else(|error| panic!("{name}: {error}"));
+        let positions = benchmark.positions(device).expect("expected a surface");
         let last = states.len() - 1;
         judge(scene, &states[last], &positions).unwrap_or_else(|error| panic!("{name} replayed: {error}"));
-        eprintln!("{name} {cache:?}: {timing:?}, {} launches", trial.launches());
+        eprintln!("{name} {cache:?}: {timing:?}, {} launches", benchmark.launches_per_step());
     }
-    assert!(trial.bytes().iter().map(|(_, bytes)| bytes).sum::<u64>() > 0, "{name}");
-    for facts in trial.kernels() {
-        assert!(facts.registers > 0 && facts.spilled_bytes == 0, "{name}: {facts:?}");
+    assert!(benchmark.traffic().iter().map(|traffic| traffic.bytes).sum::<u64>() > 0, "{name}");
+    for attributes in benchmark.kernel_attributes() {
+        assert!(attributes.registers > 0 && attributes.local_bytes == 0, "{name}: {attributes:?}");
     }
 }
 
@@ -104,8 +109,9 @@ fn single(ranks: &[usize]) {
         for (vertices, normal_maps) in [(1, false), (33, true), (5003, false)] {
             let scene = scenes::random_scene(&[(vertices, rank)], 1, normal_maps, false);
             for part in [Part::Uq, Part::Whole] {
-                let trial = ThesisBenchmark::single(&device, &scene, &states(&scene), part).expect("a trial");
-                check(&device, &scene, &states(&scene), &trial);
+                let benchmark =
+                    ThesisBenchmark::single(&device, &scene, &states(&scene), part).expect("expected a benchmark");
+                check(&device, &scene, &states(&scene), &benchmark);
             }
         }
     }
@@ -119,14 +125,15 @@ fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
     let scene = scenes::random_scene(&shapes, 2, true, false);
     for split in KernelSplit::ALL {
         for part in [Part::Uq, Part::Whole] {
-            let trial = ThesisBenchmark::multi(&device, &scene, &states(&scene), (split, part)).expect("a trial");
-            check(&device, &scene, &states(&scene), &trial);
-            assert_eq!(trial.launches(), split.widths().len() + usize::from(part == Part::Whole));
+            let benchmark =
+                ThesisBenchmark::multi(&device, &scene, &states(&scene), (split, part)).expect("expected a benchmark");
+            check(&device, &scene, &states(&scene), &benchmark);
+            assert_eq!(benchmark.launches_per_step(), split.widths().len() + usize::from(part == Part::Whole));
         }
     }
     let rigid = scenes::random_scene(&[(40, 0)], 3, false, true);
-    let update_alone =
-        ThesisBenchmark::multi(&device, &rigid, &states(&rigid), (KernelSplit::Two, Part::Whole)).expect("a trial");
+    let update_alone = ThesisBenchmark::multi(&device, &rigid, &states(&rigid), (KernelSplit::Two, Part::Whole))
+        .expect("expected a benchmark");
     check(&device, &rigid, &states(&rigid), &update_alone);
 }
 
@@ -146,7 +153,7 @@ fn gpu_cublas_matches_reference_with_every_product_kind() {
         };
         for part in [Part::Uq, Part::Whole] {
             match CublasBenchmark::new(&device, scene, &states(scene), (peer, part)) {
-                Ok(trial) => check(&device, scene, &states(scene), &trial),
+                Ok(benchmark) => check(&device, scene, &states(scene), &benchmark),
                 Err(Error::Unavailable { what: "cuBLAS", reason, .. }) => {
                     eprintln!("{} not judged: {reason}", peer.name())
                 }

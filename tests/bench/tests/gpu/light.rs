@@ -15,10 +15,13 @@ fn costs(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64
         parts.domains = vec![scenes::new_domain(0, 0); instances];
         parts.look.shadow = parts.look.shadow.filter(|_| is_lit);
         let scene = Scene::new(parts).expect("expected a valid scene");
-        let trial = DeformerBenchmark::new(&device, &scene, &[scenes::random_state(&scene, 1)], StepOutputs::Whole)
-            .expect("a trial");
-        trial.kernels().iter().for_each(|facts| eprintln!("{name}, shadow {is_lit}: {facts:?}"));
-        time(&device, &trial, CacheState::Warm, 300).expect("times").median_us
+        let benchmark = DeformerBenchmark::new(&device, &scene, &[scenes::random_state(&scene, 1)], StepOutputs::Whole)
+            .expect("expected a benchmark");
+        benchmark
+            .kernel_attributes()
+            .iter()
+            .for_each(|attributes| eprintln!("{name}, shadow {is_lit}: {attributes:?}"));
+        time(&device, &benchmark, CacheState::Warm, 300).expect("times").median_us
     });
     eprintln!("{name}: {:.2} us a step with light space, {:.2} us without", with[0], with[1]);
     with

@@ -1,11 +1,16 @@
 //! CPU twin of one warp of `kernels/batch_mma.cu` in lockstep: fragments, staging buffer and stores. Sums are f64.
 
-use super::{BatchMmaArgs, STEP, args, fragments, halves, placements, vectors_for};
+use super::{
+    BatchMmaArgs, STEP_MODES, args_without_addresses, pack_fragments, pack_transforms_and_scales, select_batch_size,
+    split_coordinates,
+};
 use modalcast_compute::storage::{PackedWord, TiledModes};
 use modalcast_compute::testing::transformed_axis;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
 
+/// Quads of vertices per warp.
 pub(super) const QUADS: usize = 8;
+/// float4 from one domain to the next in the staging buffer; two of them are padding.
 const STRIDE: usize = 3 * QUADS + 2;
 
 /// The kernel's inputs.
@@ -13,24 +18,26 @@ pub(super) struct KernelInputs {
     pub tiles: TiledModes,
     pub args: BatchMmaArgs,
     fragments: Vec<u32>,
-    placements: Vec<f32>,
-    pub vectors: usize,
+    /// Transforms, then inverse scales.
+    transforms_and_scales: Vec<f32>,
+    pub batch_size: usize,
 }
 
 impl KernelInputs {
-    pub(super) fn of(scene: &Scene, state: &SceneState) -> Self {
+    pub(super) fn pack(scene: &Scene, state: &SceneState) -> Self {
         let tiles = TiledModes::new(scene.shape_of(0), scene.deformation.storage);
-        let (vectors, halves) = (vectors_for(scene.domains.len()).0, halves(scene, state, &tiles));
+        let (batch_size, _) = select_batch_size(scene.domains.len());
+        let split_q = split_coordinates(scene, state, &tiles);
         Self {
-            args: args(scene, tiles.chunks()),
-            fragments: fragments(&halves, tiles.rank(), vectors),
-            placements: placements(state, &halves, vectors),
-            vectors,
+            args: args_without_addresses(scene, tiles.chunks()),
+            fragments: pack_fragments(&split_q, tiles.rank(), batch_size),
+            transforms_and_scales: pack_transforms_and_scales(state, &split_q, batch_size),
+            batch_size,
             tiles,
         }
     }
 
-    fn number(&self, bits: u32) -> f64 {
+    fn decode(&self, bits: u32) -> f64 {
         match self.tiles.storage() {
             StorageType::F16 => half::f16::from_bits(bits as u16).to_f64(),
             _ => half::bf16::from_bits(bits as u16).to_f64(),
@@ -38,59 +45,75 @@ impl KernelInputs {
     }
 }
 
-/// A product of fragments as the PTX instruction set defines m16n8k16: rows g and g + 8 of A and columns 2 t and 2 t +
+/// Adds a product of fragments as the PTX instruction set defines m16n8k16. Rows g and g + 8 of A and columns 2 t and 2 t +
 /// 1 of D belong to lane 4 g + t.
-fn multiply(tables: &KernelInputs, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &mut [[f64; 4]; 32]) {
-    let half = |word: u32, index: usize| tables.number(word >> (16 * (index % 2)) & 0xffff);
-    let at = |row: usize, k: usize| half(a[4 * (row % 8) + k % 8 / 2][row / 8 + 2 * (k / 8)], k);
-    let from = |k: usize, column: usize| half(b[4 * column + k % 8 / 2][k / 8], k);
+fn multiply(inputs: &KernelInputs, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &mut [[f64; 4]; 32]) {
+    let decode_half = |word: u32, index: usize| inputs.decode(word >> (16 * (index % 2)) & 0xffff);
+    let entry_of_a = |row: usize, k: usize| decode_half(a[4 * (row % 8) + k % 8 / 2][row / 8 + 2 * (k / 8)], k);
+    let entry_of_b = |k: usize, column: usize| decode_half(b[4 * column + k % 8 / 2][k / 8], k);
     for (lane, sums) in d.iter_mut().enumerate() {
         for (i, sum) in sums.iter_mut().enumerate() {
             let (row, column) = (lane / 4 + 8 * (i / 2), 2 * (lane % 4) + i % 2);
-            *sum += (0..16).map(|k| at(row, k) * from(k, column)).sum::<f64>();
+            *sum += (0..16).map(|k| entry_of_a(row, k) * entry_of_b(k, column)).sum::<f64>();
         }
     }
 }
 
+/// A quad of a tile, as a lane addresses it.
+#[derive(Clone, Copy)]
+struct TileQuad {
+    /// First packed word of the tile.
+    first_word: usize,
+    /// Quads of the tile.
+    tile_quads: usize,
+    /// Quad in the tile.
+    quad: usize,
+}
+
 /// The twelve words of a lane's chunk; zeros beyond the last chunk.
-fn load(tables: &KernelInputs, (first, width, quad): (usize, usize, usize), chunk: usize) -> [u32; 12] {
+fn load_chunk(inputs: &KernelInputs, at: TileQuad, chunk: usize) -> [u32; 12] {
     let mut words = [0; 12];
-    if chunk < tables.args.chunks as usize {
-        let plane =
-            |plane: usize| -> PackedWord { tables.tiles.packed_words()[first + (3 * chunk + plane) * width + quad] };
-        let bytes: Vec<u8> = (0..3).flat_map(|index| plane(index).0).collect();
+    if chunk < inputs.args.chunks as usize {
+        let plane_word = |plane: usize| -> PackedWord {
+            inputs.tiles.packed_words()[at.first_word + (3 * chunk + plane) * at.tile_quads + at.quad]
+        };
+        let bytes: Vec<u8> = (0..3).flat_map(|plane| plane_word(plane).0).collect();
         words = std::array::from_fn(|word| bytemuck::pod_read_unaligned(&bytes[4 * word..4 * word + 4]));
     }
     words
 }
 
-/// Accumulators: [row][eight of domains][lane][4].
+/// Accumulators: [row][group of 8 domains][lane][4].
 pub(super) type AccumulatorFragments = Vec<Vec<[[f64; 4]; 32]>>;
 
-pub(super) fn sums(tables: &KernelInputs, tile: usize, warp: usize) -> AccumulatorFragments {
-    let width = tables.tiles.tile(tile).quads;
-    let first = tables.tiles.tile(tile).first_packed_word;
-    let eights = tables.vectors / 8;
-    let mut sums: AccumulatorFragments = vec![vec![[[0.0; 4]; 32]; eights]; 6];
-    for step in 0..tables.tiles.rank().div_ceil(STEP) {
+/// The sums over all modes for the quads of one warp.
+pub(super) fn sum_modes(inputs: &KernelInputs, tile: usize, warp: usize) -> AccumulatorFragments {
+    let tile_quads = inputs.tiles.tile(tile).quads;
+    let first_word = inputs.tiles.tile(tile).first_packed_word;
+    let group_count = inputs.batch_size / 8;
+    let mut sums: AccumulatorFragments = vec![vec![[[0.0; 4]; 32]; group_count]; 6];
+    for step in 0..inputs.tiles.rank().div_ceil(STEP_MODES) {
         let chunks: Vec<[[u32; 12]; 2]> = (0..32)
             .map(|lane| {
-                let place = (first, width, (QUADS * warp + lane / 4).min(width - 1));
-                [0, 4].map(|more| load(tables, place, 8 * step + lane % 4 + more))
+                let quad = (QUADS * warp + lane / 4).min(tile_quads - 1);
+                let tile_quad = TileQuad { first_word, tile_quads, quad };
+                [0, 4].map(|offset| load_chunk(inputs, tile_quad, 8 * step + lane % 4 + offset))
             })
             .collect();
         for (row, sums) in sums.iter_mut().enumerate() {
-            let low = |words: &[u32; 12]| words[row] & 0xffff | words[6 + row] << 16;
-            let high = |words: &[u32; 12]| words[row] >> 16 | words[6 + row] & 0xffff_0000;
+            let low_halves = |words: &[u32; 12]| words[row] & 0xffff | words[6 + row] << 16;
+            let high_halves = |words: &[u32; 12]| words[row] >> 16 | words[6 + row] & 0xffff_0000;
             let a: [[u32; 4]; 32] = std::array::from_fn(|lane| {
-                let [near, far] = &chunks[lane];
-                [low(near), high(near), low(far), high(far)]
+                let [first, second] = &chunks[lane];
+                [low_halves(first), high_halves(first), low_halves(second), high_halves(second)]
             });
-            for (eight, sums) in sums.iter_mut().enumerate() {
-                let word = |lane: usize, at: usize| tables.fragments[4 * (32 * (eights * step + eight) + lane) + at];
+            for (group, sums) in sums.iter_mut().enumerate() {
+                let word = |lane: usize, index: usize| {
+                    inputs.fragments[4 * (32 * (group_count * step + group) + lane) + index]
+                };
                 for half in [2, 0] {
                     let b = std::array::from_fn(|lane| [word(lane, half), word(lane, half + 1)]);
-                    multiply(tables, &a, &b, sums);
+                    multiply(inputs, &a, &b, sums);
                 }
             }
         }
@@ -98,49 +121,58 @@ pub(super) fn sums(tables: &KernelInputs, tile: usize, warp: usize) -> Accumulat
     sums
 }
 
-pub(super) fn staged(
-    tables: &KernelInputs,
+/// The staging buffer of one warp after a pass. A pass stages the positions of four domains.
+pub(super) fn stage_positions(
+    inputs: &KernelInputs,
     sums: &AccumulatorFragments,
     (tile, warp): (usize, usize),
     pass: usize,
 ) -> Vec<[f32; 4]> {
     let mut staged = vec![[f32::NAN; 4]; 4 * STRIDE];
-    let place = tables.tiles.tile(tile);
+    let layout = inputs.tiles.tile(tile);
     for (quad, pair) in (0..QUADS).flat_map(|quad| (0..4).map(move |pair| (quad, pair))) {
-        let (lane, of_pair) = (4 * quad + pair, pass % 2);
-        let domain = 8 * (pass / 2) + of_pair + 2 * pair;
-        let rest = tables.tiles.rest()[place.first_quad + (QUADS * warp + quad).min(place.quads - 1)];
-        let rows = &tables.placements[12 * domain..][..12];
-        let shrink = tables.placements[12 * tables.vectors + domain];
+        let (lane, parity) = (4 * quad + pair, pass % 2);
+        let domain = 8 * (pass / 2) + parity + 2 * pair;
+        let rest = inputs.tiles.rest()[layout.first_quad + (QUADS * warp + quad).min(layout.quads - 1)];
+        let rows = &inputs.transforms_and_scales[12 * domain..][..12];
+        let inverse_scale = inputs.transforms_and_scales[12 * inputs.batch_size + domain];
         let world: Vec<f32> = (0..4)
             .flat_map(|vertex| {
                 let bent = [0, 1, 2].map(|axis| {
-                    let sum = sums[2 * axis + vertex / 2][pass / 2][lane][2 * (vertex % 2) + of_pair] as f32;
-                    rest[4 * axis + vertex] + sum * shrink
+                    let sum = sums[2 * axis + vertex / 2][pass / 2][lane][2 * (vertex % 2) + parity] as f32;
+                    rest[4 * axis + vertex] + sum * inverse_scale
                 });
                 [0, 1, 2].map(|row| transformed_axis(&rows[4 * row..], bent))
             })
             .collect();
-        for (i, four) in world.chunks_exact(4).enumerate() {
-            staged[STRIDE * pair + 3 * quad + i] = [four[0], four[1], four[2], four[3]];
+        for (i, components) in world.chunks_exact(4).enumerate() {
+            staged[STRIDE * pair + 3 * quad + i] = [components[0], components[1], components[2], components[3]];
         }
     }
     staged
 }
 
-pub(super) fn store(
-    tables: &KernelInputs,
-    staged: &[[f32; 4]],
-    (first, own, pass): (usize, usize, usize),
-    positions: &mut [f32],
-) {
+/// The part of the positions that a warp stores in one pass.
+#[derive(Clone, Copy)]
+pub(super) struct StoreRange {
+    /// First vertex of the warp in the shape.
+    pub first_vertex: usize,
+    /// Numbers of the warp's vertices, three each.
+    pub numbers: usize,
+    pub pass: usize,
+}
+
+/// Copies the staged positions of four domains to their packed vertices.
+pub(super) fn store_staged(inputs: &KernelInputs, staged: &[[f32; 4]], range: StoreRange, positions: &mut [f32]) {
     for (lane, i) in (0..32).flat_map(|lane| (0..3).map(move |i| (lane, i))) {
-        let domain = 8 * (pass / 2) + pass % 2 + 2 * (lane / 8);
-        let four = 8 * i + lane % 8;
-        for k in (0..4).filter(|k| domain < tables.args.domains as usize && 4 * four + k < own) {
-            let at = 3 * (tables.args.first[domain] as usize + first) + 4 * four + k;
-            assert!(positions[at].is_nan(), "number {at} is written once");
-            positions[at] = staged[STRIDE * (lane / 8) + four][k];
+        let domain = 8 * (range.pass / 2) + range.pass % 2 + 2 * (lane / 8);
+        let vector = 8 * i + lane % 8;
+        let is_stored = |k: &usize| domain < inputs.args.domains as usize && 4 * vector + k < range.numbers;
+        for k in (0..4).filter(is_stored) {
+            let first_vertex = inputs.args.first_vertices[domain] as usize + range.first_vertex;
+            let index = 3 * first_vertex + 4 * vector + k;
+            assert!(positions[index].is_nan(), "expected one write to number {index}, got two");
+            positions[index] = staged[STRIDE * (lane / 8) + vector][k];
         }
     }
 }

@@ -43,7 +43,7 @@ impl CublasMethod {
         Self::Instances,
     ];
 
-    /// Name of the trial.
+    /// Name in reports.
     pub const fn name(self) -> &'static str {
         match self {
             Self::SgemvColumns => "cublas_sgemv_columns",
@@ -57,14 +57,14 @@ impl CublasMethod {
         }
     }
 
-    /// Whether the product uses `sgemv` rather than `sgemm` with one column.
-    pub(super) const fn as_vectors(self) -> bool {
+    /// Whether strided products use `sgemv` instead of `sgemm` with one column.
+    pub(super) const fn uses_strided_gemv(self) -> bool {
         matches!(self, Self::PaddedGemv | Self::BucketedGemv)
     }
 
     /// Domains with equal keys share a batch. A bucket holds ranks up to the next multiple of 8 and sizes up to the
     /// next power of two.
-    const fn key(self, rows: usize, rank: usize) -> (usize, usize) {
+    const fn batch_key(self, rows: usize, rank: usize) -> (usize, usize) {
         match self {
             Self::Bucketed | Self::BucketedGemv => (rank.next_multiple_of(8), rows.next_power_of_two()),
             Self::Grouped => (rank, rows),
@@ -73,65 +73,75 @@ impl CublasMethod {
     }
 }
 
-/// Products of one kind and their domains.
+/// Index of an operand of u = U q in arrays of three.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Operand {
+    Matrix,
+    Q,
+    U,
+}
+
+/// Products of one size and their domains.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct GemmBatch {
-    pub product: GemmCall,
+    pub call: GemmCall,
     pub domains: Vec<usize>,
-    /// Offsets of U, q and u, in floats.
-    pub first: [u64; 3],
+    /// Offsets of the first U, q and u, in floats; indexed by [`Operand`].
+    pub offsets: [u64; 3],
 }
 
 /// All products of a step.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct GemmBatches {
     pub list: Vec<GemmBatch>,
-    /// Total floats of U, q and u.
+    /// Total floats of U, q and u; indexed by [`Operand`].
     pub floats: [u64; 3],
 }
 
 impl GemmBatches {
+    /// Plans the products of a scene.
+    ///
     /// # Errors
-    /// `Invalid` when `peer` does not support the scene, or the scene is too large for the library's 32-bit integers.
-    pub(super) fn of(scene: &Scene, peer: CublasMethod) -> Result<Self> {
-        check(scene, peer)?;
+    /// `Invalid` when `method` does not support the scene, or the scene is too large for the library's 32-bit integers.
+    pub(super) fn plan(scene: &Scene, method: CublasMethod) -> Result<Self> {
+        check_scene(scene, method)?;
         let mut groups: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
         for (domain, slot) in scene.layout.slots.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
-            groups.entry(peer.key(3 * slot.vertices, slot.rank)).or_default().push(domain);
+            groups.entry(method.batch_key(3 * slot.vertices, slot.rank)).or_default().push(domain);
         }
         let (mut list, mut floats) = (Vec::with_capacity(groups.len()), [0_u64; 3]);
         for domains in groups.into_values() {
-            let product = product(scene, peer, &domains)?;
-            let matrices = if peer == CublasMethod::Instances { 1 } else { domains.len() as u64 };
-            let sizes = [matrices, domains.len() as u64, domains.len() as u64];
-            let first = floats;
-            for ((total, stride), count) in floats.iter_mut().zip(product.strides).zip(sizes) {
+            let call = size_product(scene, method, &domains)?;
+            let matrices = if method == CublasMethod::Instances { 1 } else { domains.len() as u64 };
+            let counts = [matrices, domains.len() as u64, domains.len() as u64];
+            let offsets = floats;
+            for ((total, stride), count) in floats.iter_mut().zip(call.strides).zip(counts) {
                 // Batches are aligned to float4.
                 *total = (*total + stride.unsigned_abs() * count).next_multiple_of(4);
             }
-            list.push(GemmBatch { product, domains, first });
+            list.push(GemmBatch { call, domains, offsets });
         }
         Ok(Self { list, floats })
     }
 
-    /// First float of each domain's u; `None` for domains without modes.
-    pub(super) fn places_of_u(&self, domains: usize) -> Vec<Option<u64>> {
-        let mut places = vec![None; domains];
+    /// Offset of each domain's u, in floats; `None` for domains without modes.
+    pub(super) fn u_offsets(&self, domains: usize) -> Vec<Option<u64>> {
+        let mut offsets = vec![None; domains];
         for batch in &self.list {
             for (index, domain) in batch.domains.iter().enumerate() {
-                places[*domain] = Some(batch.place(index, 2));
+                offsets[*domain] = Some(batch.offset(index, Operand::U));
             }
         }
-        places
+        offsets
     }
 
     /// The coordinates of all domains, padded with zeros.
     pub(super) fn pack_q(&self, scene: &Scene, state: &SceneState) -> Vec<f32> {
-        let mut packed = vec![0.0; self.floats[1] as usize];
+        let mut packed = vec![0.0; self.floats[Operand::Q as usize] as usize];
         for batch in &self.list {
             for (index, domain) in batch.domains.iter().enumerate() {
                 let q = state.q_of(scene, *domain);
-                packed[batch.place(index, 1) as usize..][..q.len()].copy_from_slice(q);
+                packed[batch.offset(index, Operand::Q) as usize..][..q.len()].copy_from_slice(q);
             }
         }
         packed
@@ -139,20 +149,20 @@ impl GemmBatches {
 }
 
 impl GemmBatch {
-    /// Offset in floats of U (`of` 0), q (1) or u (2) of the domain at `index` of this batch.
-    pub(super) fn place(&self, index: usize, of: usize) -> u64 {
-        self.first[of] + self.product.strides[of].unsigned_abs() * index as u64
+    /// Offset in floats of an operand of the domain at `index` of this batch.
+    pub(super) fn offset(&self, index: usize, operand: Operand) -> u64 {
+        self.offsets[operand as usize] + self.call.strides[operand as usize].unsigned_abs() * index as u64
     }
 
     /// U of one domain in the product's layout, padded with zeros.
-    pub(super) fn matrix(&self, scene: &Scene, domain: usize, by_rows: bool) -> Vec<f32> {
+    pub(super) fn pack_matrix(&self, scene: &Scene, domain: usize, by_rows: bool) -> Vec<f32> {
         let modes = &scene.shape_of(domain).modes;
         let (rows, rank) = (3 * modes.vertices(), modes.rank());
         if by_rows {
             return (0..rows).flat_map(|row| (0..rank).map(move |mode| modes.at(row / 3, row % 3, mode))).collect();
         }
-        let lead = self.product.lead as usize;
-        let mut matrix = vec![0.0; lead * self.product.inner as usize];
+        let lead = self.call.lead as usize;
+        let mut matrix = vec![0.0; lead * self.call.inner as usize];
         for (mode, column) in matrix.chunks_exact_mut(lead).take(rank).enumerate() {
             column[..rows].copy_from_slice(modes.column(mode));
         }
@@ -161,35 +171,35 @@ impl GemmBatch {
 }
 
 /// The product of a batch, sized by its largest domain.
-fn product(scene: &Scene, peer: CublasMethod, domains: &[usize]) -> Result<GemmCall> {
-    let int = |number: usize| {
+fn size_product(scene: &Scene, method: CublasMethod, domains: &[usize]) -> Result<GemmCall> {
+    let to_i32 = |number: usize| {
         i32::try_from(number).map_err(|_| invalid("scene.size", format!("at most {} for cuBLAS", i32::MAX), number))
     };
     let slots = || domains.iter().map(|domain| scene.layout.slots[*domain]);
     let rows = slots().map(|slot| 3 * slot.vertices).max().unwrap_or(0);
     let rank = slots().map(|slot| slot.rank).max().unwrap_or(0);
     // The library is fastest with columns aligned to 16 bytes; row-major storage has no gaps.
-    let lead = if peer == CublasMethod::SgemvRows { rows } else { rows.next_multiple_of(4) };
-    let (columns, count) = if peer == CublasMethod::Instances { (domains.len(), 1) } else { (1, domains.len()) };
+    let lead = if method == CublasMethod::SgemvRows { rows } else { rows.next_multiple_of(4) };
+    let (columns, count) = if method == CublasMethod::Instances { (domains.len(), 1) } else { (1, domains.len()) };
     let strides = [lead as i64 * rank as i64, rank as i64, lead as i64];
     Ok(GemmCall {
-        rows: int(rows)?,
-        inner: int(rank)?,
-        columns: int(columns)?,
-        lead: int(lead)?,
-        count: int(count)?,
+        rows: to_i32(rows)?,
+        inner: to_i32(rank)?,
+        columns: to_i32(columns)?,
+        lead: to_i32(lead)?,
+        count: to_i32(count)?,
         strides,
     })
 }
 
-fn check(scene: &Scene, peer: CublasMethod) -> Result<()> {
+fn check_scene(scene: &Scene, method: CublasMethod) -> Result<()> {
     let domains = scene.domains.len();
     if !scene.needs.modes {
-        return Err(invalid("modes", format!("some, for {}", peer.name()), 0));
+        return Err(invalid("modes", format!("at least 1 for {}", method.name()), 0));
     }
-    match peer {
+    match method {
         CublasMethod::SgemvColumns | CublasMethod::SgemvRows if domains != 1 => {
-            Err(invalid("scene.domains", format!("1 for {}", peer.name()), domains))
+            Err(invalid("scene.domains", format!("1 for {}", method.name()), domains))
         }
         CublasMethod::Instances if scene.domains.iter().any(|domain| domain.shape != scene.domains[0].shape) => {
             Err(invalid("scene.domains", "instances of one shape for cublas_instances", "several shapes"))
@@ -205,10 +215,10 @@ mod tests {
 
     /// Emulates cuBLAS on a batch: C = A B for strided column-major matrices.
     fn multiply(batch: &GemmBatch, by_rows: bool, [a, b]: [&[f32]; 2], c: &mut [f32]) {
-        let GemmCall { rows, inner, columns, lead, count, strides } = batch.product;
-        let at = |first: u64, stride: i64, index: i32| first as usize + stride as usize * index as usize;
+        let GemmCall { rows, inner, columns, lead, count, strides } = batch.call;
+        let element = |first: u64, stride: i64, index: i32| first as usize + stride as usize * index as usize;
         for index in 0..count {
-            let [a0, b0, c0] = [0, 1, 2].map(|of| at(batch.first[of], strides[of], index));
+            let [a0, b0, c0] = [0, 1, 2].map(|operand| element(batch.offsets[operand], strides[operand], index));
             for (row, column) in
                 (0..rows as usize).flat_map(|row| (0..columns as usize).map(move |column| (row, column)))
             {
@@ -222,28 +232,28 @@ mod tests {
         }
     }
 
-    fn check_peer(scene: &Scene, state: &SceneState, peer: CublasMethod) -> GemmBatches {
-        let batches = GemmBatches::of(scene, peer).expect("batches");
-        let by_rows = peer == CublasMethod::SgemvRows;
-        let mut matrices = vec![0.0; batches.floats[0] as usize];
+    fn check_products(scene: &Scene, state: &SceneState, method: CublasMethod) -> GemmBatches {
+        let batches = GemmBatches::plan(scene, method).expect("a supported scene");
+        let by_rows = method == CublasMethod::SgemvRows;
+        let mut matrices = vec![0.0; batches.floats[Operand::Matrix as usize] as usize];
         for batch in &batches.list {
-            let stored = if peer == CublasMethod::Instances { 1 } else { batch.domains.len() };
-            for (index, domain) in batch.domains.iter().enumerate().take(stored) {
-                let matrix = batch.matrix(scene, *domain, by_rows);
-                matrices[batch.place(index, 0) as usize..][..matrix.len()].copy_from_slice(&matrix);
+            let matrix_count = if method == CublasMethod::Instances { 1 } else { batch.domains.len() };
+            for (index, domain) in batch.domains.iter().enumerate().take(matrix_count) {
+                let matrix = batch.pack_matrix(scene, *domain, by_rows);
+                matrices[batch.offset(index, Operand::Matrix) as usize..][..matrix.len()].copy_from_slice(&matrix);
             }
         }
-        let (q, mut u) = (batches.pack_q(scene, state), vec![f32::NAN; batches.floats[2] as usize]);
+        let (q, mut u) = (batches.pack_q(scene, state), vec![f32::NAN; batches.floats[Operand::U as usize] as usize]);
         for batch in &batches.list {
             multiply(batch, by_rows, [&matrices, &q], &mut u);
         }
-        for (domain, place) in batches.places_of_u(scene.domains.len()).iter().enumerate() {
-            assert_eq!(place.is_some(), scene.rank_of(domain) > 0);
-            let Some(place) = place else { continue };
+        for (domain, offset) in batches.u_offsets(scene.domains.len()).iter().enumerate() {
+            assert_eq!(offset.is_some(), scene.rank_of(domain) > 0);
+            let Some(offset) = offset else { continue };
             for vertex in 0..scene.layout.slots[domain].vertices {
                 for (axis, want) in displacement_of(scene, state, domain, vertex).iter().enumerate() {
-                    let got = f64::from(u[*place as usize + 3 * vertex + axis]);
-                    assert!((got - want).abs() < 1e-4, "{} domain {domain} vertex {vertex}", peer.name());
+                    let got = f64::from(u[*offset as usize + 3 * vertex + axis]);
+                    assert!((got - want).abs() < 1e-4, "{} domain {domain} vertex {vertex}", method.name());
                 }
             }
         }
@@ -251,21 +261,28 @@ mod tests {
     }
 
     #[test]
-    fn every_batching_gives_each_domain_its_own_u() {
+    fn every_method_gives_each_domain_its_u() {
         let shapes: Vec<_> = (0..30).map(|index| (1 + index * 11 % 40, index % 13, 1)).collect();
         let (many, state) = scene_and_state(&shapes);
         let deformable = shapes.iter().filter(|(_, rank, _)| *rank > 0);
-        let needed: u64 = deformable.clone().map(|(vertices, rank, _)| (3 * vertices * rank) as u64).sum();
-        let stored = |peer: CublasMethod| check_peer(&many, &state, peer).floats[0];
-        let (padded, bucketed, grouped) =
-            (stored(CublasMethod::Padded), stored(CublasMethod::Bucketed), stored(CublasMethod::Grouped));
-        assert!(needed <= grouped && grouped < bucketed && bucketed < padded, "{grouped} {bucketed} {padded}");
-        assert_eq!(check_peer(&many, &state, CublasMethod::Padded).list.len(), 1);
-        assert_eq!(check_peer(&many, &state, CublasMethod::Grouped).list.len(), deformable.count(), "all differ here");
+        let unpadded: u64 = deformable.clone().map(|(vertices, rank, _)| (3 * vertices * rank) as u64).sum();
+        let matrix_floats = |method: CublasMethod| check_products(&many, &state, method).floats[0];
+        let (padded, bucketed, grouped) = (
+            matrix_floats(CublasMethod::Padded),
+            matrix_floats(CublasMethod::Bucketed),
+            matrix_floats(CublasMethod::Grouped),
+        );
+        assert!(unpadded <= grouped && grouped < bucketed && bucketed < padded, "{grouped} {bucketed} {padded}");
+        assert_eq!(check_products(&many, &state, CublasMethod::Padded).list.len(), 1);
+        assert_eq!(
+            check_products(&many, &state, CublasMethod::Grouped).list.len(),
+            deformable.count(),
+            "expected a group per domain, because all sizes differ"
+        );
         let (one, state) = scene_and_state(&[(23, 10, 1)]);
-        for peer in CublasMethod::ALL {
-            let batches = check_peer(&one, &state, peer);
-            assert_eq!(batches.list.len(), 1, "{}", peer.name());
+        for method in CublasMethod::ALL {
+            let batches = check_products(&one, &state, method);
+            assert_eq!(batches.list.len(), 1, "{}", method.name());
         }
     }
 
@@ -277,24 +294,24 @@ mod tests {
         parts.shapes = one.shapes.clone();
         parts.materials = one.materials.clone();
         parts.domains = vec![one.domains[0].clone(); 16];
-        let instances = Scene::new(parts).expect("a scene");
+        let instances = Scene::new(parts).expect("a valid scene");
         let mut state = SceneState::rest(&instances);
         state.q.iter_mut().enumerate().for_each(|(index, q)| *q = (index as f32).sin());
-        let batches = check_peer(&instances, &state, CublasMethod::Instances);
+        let batches = check_products(&instances, &state, CublasMethod::Instances);
         assert_eq!(batches.floats, [72 * 10, 160, 72 * 16]);
-        assert_eq!((batches.list[0].product.columns, batches.list[0].product.count), (16, 1));
+        assert_eq!((batches.list[0].call.columns, batches.list[0].call.count), (16, 1));
     }
 
     #[test]
     fn rejects_unsupported_scenes_by_name() {
         let (two, _) = scene_and_state(&[(5, 2, 1), (5, 2, 1)]);
-        for peer in [CublasMethod::SgemvColumns, CublasMethod::SgemvRows, CublasMethod::Instances] {
-            let refusal = GemmBatches::of(&two, peer).expect_err("two shapes").to_string();
-            assert!(refusal.starts_with("scene.domains") && refusal.contains(peer.name()), "{refusal}");
+        for method in [CublasMethod::SgemvColumns, CublasMethod::SgemvRows, CublasMethod::Instances] {
+            let error = GemmBatches::plan(&two, method).expect_err("two shapes").to_string();
+            assert!(error.starts_with("scene.domains") && error.contains(method.name()), "{error}");
         }
         let (rigid, _) = scene_and_state(&[(5, 0, 1)]);
-        for peer in CublasMethod::ALL {
-            assert!(GemmBatches::of(&rigid, peer).expect_err("no modes").to_string().starts_with("modes"));
+        for method in CublasMethod::ALL {
+            assert!(GemmBatches::plan(&rigid, method).expect_err("no modes").to_string().starts_with("modes"));
         }
     }
 }

@@ -17,10 +17,10 @@ use modalcast_model::error::{Error, Result, fault_in};
 
 /// Remedy in the error message when cuBLAS is missing.
 const REMEDY: &str = "Install the PyPI wheel nvidia-cublas==13.* and set MODALCAST_CUBLAS to the path of its \
-                      libcublas.so.13, or leave its trials out";
+                      libcublas.so.13, or do not select its variants";
 
-/// Workspace of cuBLAS, bytes, as its manual recommends for Hopper. With it, calls can be captured in graphs.
-const WORKSPACE: u64 = 32 << 20;
+/// Workspace of cuBLAS, bytes, as its manual recommends for Hopper. With a workspace, graphs can capture calls.
+const WORKSPACE_BYTES: u64 = 32 << 20;
 
 const NO_TRANSPOSE: cublasOperation_t = cublasOperation_t::CUBLAS_OP_N;
 const TRANSPOSE: cublasOperation_t = cublasOperation_t::CUBLAS_OP_T;
@@ -28,13 +28,14 @@ const TRANSPOSE: cublasOperation_t = cublasOperation_t::CUBLAS_OP_T;
 /// cuBLAS, which stays loaded until the process ends.
 struct CublasLibrary {
     library: Library,
-    _dependency: Option<Library>,
+    /// cublasLt, loaded from the folder of a library off the search path.
+    _cublas_lt: Option<Library>,
 }
 
 /// The library of this process, loaded at the first call.
 fn library() -> Result<&'static CublasLibrary> {
-    static LOADED: OnceLock<Result<CublasLibrary>> = OnceLock::new();
-    LOADED.get_or_init(|| load(&candidates())).as_ref().map_err(Clone::clone)
+    static LIBRARY: OnceLock<Result<CublasLibrary>> = OnceLock::new();
+    LIBRARY.get_or_init(|| load(&candidates())).as_ref().map_err(Clone::clone)
 }
 
 /// Version of cuBLAS: major, minor, patch.
@@ -43,12 +44,12 @@ fn library() -> Result<&'static CublasLibrary> {
 /// `Unavailable` when there is no cuBLAS; it lists the paths that were tried.
 pub fn cublas_version() -> Result<[i32; 3]> {
     library()?;
-    let kinds =
+    let properties =
         [libraryPropertyType::MAJOR_VERSION, libraryPropertyType::MINOR_VERSION, libraryPropertyType::PATCH_LEVEL];
     let mut version = [0; 3];
-    for (kind, number) in kinds.into_iter().zip(&mut version) {
+    for (property, number) in properties.into_iter().zip(&mut version) {
         // SAFETY: `number` is a live integer.
-        unsafe { sys::cublasGetProperty(kind, number) }.result().map_err(fault_in("cublas"))?;
+        unsafe { sys::cublasGetProperty(property, number) }.result().map_err(fault_in("cublas"))?;
     }
     Ok(version)
 }
@@ -75,7 +76,7 @@ fn load(candidates: &[PathBuf]) -> Result<CublasLibrary> {
     let mut reasons = Vec::new();
     for candidate in candidates {
         match CublasLibrary::open(candidate) {
-            Ok(opened) if opened.is_used_by_cudarc() => return Ok(opened),
+            Ok(library) if library.is_used_by_cudarc() => return Ok(library),
             Ok(_) => reasons.push(format!("{}: cudarc finds another cuBLAS or none", candidate.display())),
             Err(error) => reasons.push(format!("{}: {error}", candidate.display())),
         }
@@ -85,48 +86,48 @@ fn load(candidates: &[PathBuf]) -> Result<CublasLibrary> {
 
 impl CublasLibrary {
     fn open(path: &Path) -> Result<Self, libloading::Error> {
-        // cuBLAS needs cublasLt. The loader does not find it off the search path unless it is loaded already.
-        let sibling = |name: &str| Some(path.parent()?.join(name.replace("libcublas.", "libcublasLt.")));
-        let dependency =
-            path.file_name().and_then(|name| sibling(&name.to_string_lossy())).filter(|file| file.is_file());
+        // cuBLAS needs cublasLt. Off the search path, the loader finds it only if it is loaded already.
+        let cublas_lt_path = |name: &str| Some(path.parent()?.join(name.replace("libcublas.", "libcublasLt.")));
+        let cublas_lt_file =
+            path.file_name().and_then(|name| cublas_lt_path(&name.to_string_lossy())).filter(|file| file.is_file());
         // SAFETY: the libraries' initializers only set them up; the operator chooses the name or path.
-        let (dependency, library) =
-            unsafe { (dependency.and_then(|file| Library::new(file).ok()), Library::new(path)?) };
-        Ok(Self { library, _dependency: dependency })
+        let (cublas_lt, library) =
+            unsafe { (cublas_lt_file.and_then(|file| Library::new(file).ok()), Library::new(path)?) };
+        Ok(Self { library, _cublas_lt: cublas_lt })
     }
 
-    /// Whether cudarc resolves its functions in this library. The system's loader identifies libraries by their name
-    /// (`SONAME`), so that it returns this one unless an earlier name of cudarc's list exists on the search path.
+    /// Whether cudarc resolves its functions in this library. The system's loader identifies a library by its `SONAME`.
+    /// It returns this library unless an earlier name of cudarc's list exists on the search path.
     fn is_used_by_cudarc(&self) -> bool {
         // SAFETY: as in `open`.
         if !unsafe { sys::is_culib_present() } {
             return false;
         }
         // SAFETY: a library is present, so `culib` does not panic; it runs the initializers of a cuBLAS.
-        let other = unsafe { sys::culib() };
-        let create = address_of(&self.library, CREATE);
-        create.is_some() && create == address_of(other, CREATE)
+        let cudarc_library = unsafe { sys::culib() };
+        let create = function_address(&self.library, CREATE);
+        create.is_some() && create == function_address(cudarc_library, CREATE)
     }
 
     /// Whether this version has a function. cudarc panics when it calls a missing one.
-    fn has(&self, function: &[u8]) -> bool {
-        address_of(&self.library, function).is_some()
+    fn has_function(&self, function: &[u8]) -> bool {
+        function_address(&self.library, function).is_some()
     }
 }
 
-/// Names of functions as the system's loader expects them.
+/// Names of functions, terminated by zero as the system's loader expects them.
 const CREATE: &[u8] = b"cublasCreate_v2\0";
 const SGEMV_STRIDED: &[u8] = b"cublasSgemvStridedBatched\0";
 const SGEMM_GROUPED: &[u8] = b"cublasSgemmGroupedBatched\0";
 
-fn address_of(library: &Library, function: &[u8]) -> Option<usize> {
+fn function_address(library: &Library, function: &[u8]) -> Option<usize> {
     // SAFETY: the symbol is not called; only its address is read.
     let symbol = unsafe { library.get::<unsafe extern "C" fn()>(function) };
     symbol.ok().map(|symbol| *symbol as usize)
 }
 
-/// C = A B for column-major matrices on the device: A is rows x inner, B inner x columns. `count` such products lie at
-/// regular strides.
+/// Sizes of C = A B for column-major matrices on the device: A is rows x inner, B inner x columns. There are `count`
+/// such products at regular strides.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct GemmCall {
     pub rows: i32,
@@ -134,8 +135,9 @@ pub(super) struct GemmCall {
     pub columns: i32,
     /// Leading dimension of A and C in floats. The columns of B are contiguous.
     pub lead: i32,
-    /// Number of products, and floats from one A, B and C to the next.
+    /// Number of products.
     pub count: i32,
+    /// Floats from one A, B and C to the next.
     pub strides: [i64; 3],
 }
 
@@ -147,14 +149,17 @@ pub(super) struct GroupedGemm<'a> {
     pub pointers: [u64; 3],
 }
 
-/// A cuBLAS handle on the device's stream.
-pub(super) struct CublasHandle {
-    library: &'static CublasLibrary,
+/// A cuBLAS handle on the device's stream, and the device memory `B` that its calls access.
+///
+/// The handle owns this memory because destroying the handle waits for its calls: `Drop::drop` runs before the fields
+/// are dropped, so the memory is released after the last call.
+pub(super) struct CublasHandle<B> {
     handle: cublasHandle_t,
-    _workspace: DeviceBuffer,
+    pub buffers: B,
+    workspace: DeviceBuffer,
 }
 
-impl std::fmt::Debug for CublasHandle {
+impl<B> std::fmt::Debug for CublasHandle<B> {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         formatter.debug_struct("CublasHandle").finish_non_exhaustive()
     }
@@ -163,49 +168,57 @@ impl std::fmt::Debug for CublasHandle {
 const ONE: f32 = 1.0;
 const ZERO: f32 = 0.0;
 
-impl CublasHandle {
+/// Loads cuBLAS and checks that this version has the grouped and strided functions, if they are needed.
+///
+/// # Errors
+/// `Unavailable` when cuBLAS or such a function is missing.
+pub(super) fn check_functions(needs_grouped: bool, needs_strided_gemv: bool) -> Result<()> {
+    let library = library()?;
+    let missing = |name: &str| Err(unavailable(format!("this version has no {name}")));
+    if needs_grouped && !library.has_function(SGEMM_GROUPED) {
+        return missing("cublasSgemmGroupedBatched");
+    }
+    if needs_strided_gemv && !library.has_function(SGEMV_STRIDED) {
+        return missing("cublasSgemvStridedBatched");
+    }
+    Ok(())
+}
+
+impl<B> CublasHandle<B> {
+    /// A handle whose calls access `buffers`.
+    ///
     /// # Errors
     /// `Unavailable` when cuBLAS is missing or does not start; `Fault` when the device fails.
-    pub(super) fn new(device: &Device) -> Result<Self> {
-        let library = library()?;
+    pub(super) fn new(device: &Device, buffers: B) -> Result<Self> {
+        library()?;
         device.context().bind_to_thread().map_err(fault_in("device"))?;
-        let workspace = DeviceBuffer::zeroed(device, WORKSPACE)?;
+        let workspace = DeviceBuffer::zeroed(device, WORKSPACE_BYTES)?;
         let handle = result::create_handle().map_err(|error| unavailable(error.to_string()))?;
-        let blas = Self { library, handle, _workspace: workspace };
-        let (stream, memory) = (device.stream().cu_stream().cast(), blas._workspace.address());
+        let cublas = Self { handle, buffers, workspace };
+        let (stream, workspace_address) = (device.stream().cu_stream().cast(), cublas.workspace.address());
         // SAFETY: handle and stream are live, and the workspace has the stated size. The stream is set first because
         // setting it resets the workspace.
         unsafe {
-            checked(result::set_stream(handle, stream))?;
-            checked(sys::cublasSetWorkspace_v2(handle, memory as *mut _, WORKSPACE as usize).result())?;
+            map_status(result::set_stream(handle, stream))?;
+            map_status(
+                sys::cublasSetWorkspace_v2(handle, workspace_address as *mut _, WORKSPACE_BYTES as usize).result(),
+            )?;
         }
-        Ok(blas)
-    }
-
-    /// Checks that this version has the grouped and strided functions, if required; otherwise `Unavailable`.
-    pub(super) fn check_has(&self, grouped: bool, vectors: bool) -> Result<()> {
-        let missing = |name: &str| Err(unavailable(format!("this version has no {name}")));
-        if grouped && !self.library.has(SGEMM_GROUPED) {
-            return missing("cublasSgemmGroupedBatched");
-        }
-        if vectors && !self.library.has(SGEMV_STRIDED) {
-            return missing("cublasSgemvStridedBatched");
-        }
-        Ok(())
+        Ok(cublas)
     }
 
     /// y = A x with `sgemv`, A column-major or, with `by_rows`, row-major.
     ///
     /// # Safety
-    /// The addresses are device addresses of matrices with the sizes in `of`; its `columns` and `count` are 1.
-    pub(super) unsafe fn gemv(&self, of: GemmCall, by_rows: bool, [a, x, y]: [u64; 3]) -> Result<()> {
+    /// The addresses are device addresses of matrices with the sizes in `call`; its `columns` and `count` are 1.
+    pub(super) unsafe fn gemv(&self, call: GemmCall, by_rows: bool, [a, x, y]: [u64; 3]) -> Result<()> {
         let (transpose, rows, columns, lead) = match by_rows {
             // A row-major matrix is the transpose of a column-major one.
-            true => (TRANSPOSE, of.inner, of.rows, of.inner),
-            false => (NO_TRANSPOSE, of.rows, of.inner, of.lead),
+            true => (TRANSPOSE, call.inner, call.rows, call.inner),
+            false => (NO_TRANSPOSE, call.rows, call.inner, call.lead),
         };
-        // SAFETY: the handle is live; the caller guarantees the matrices.
-        checked(unsafe {
+        // SAFETY: the handle is live, and the caller guarantees the matrices.
+        map_status(unsafe {
             let (a, x, y) = (a as *const f32, x as *const f32, y as *mut f32);
             result::sgemv(self.handle, transpose, rows, columns, &ONE, a, lead, x, 1, &ZERO, y, 1)
         })
@@ -214,39 +227,41 @@ impl CublasHandle {
     /// C = A B with `sgemm`.
     ///
     /// # Safety
-    /// The addresses are device addresses of matrices with the sizes in `of`; its `count` is 1.
-    pub(super) unsafe fn gemm(&self, of: GemmCall, [a, b, c]: [u64; 3]) -> Result<()> {
-        let GemmCall { rows, inner, columns, lead, .. } = of;
-        let (handle, no) = (self.handle, NO_TRANSPOSE);
-        // SAFETY: the handle is live; the caller guarantees the matrices.
-        checked(unsafe {
+    /// The addresses are device addresses of matrices with the sizes in `call`; its `count` is 1.
+    pub(super) unsafe fn gemm(&self, call: GemmCall, [a, b, c]: [u64; 3]) -> Result<()> {
+        let GemmCall { rows, inner, columns, lead, .. } = call;
+        let (handle, transpose) = (self.handle, NO_TRANSPOSE);
+        // SAFETY: the handle is live, and the caller guarantees the matrices.
+        map_status(unsafe {
             let (a, b, c) = (a as *const f32, b as *const f32, c as *mut f32);
-            result::sgemm(handle, no, no, rows, columns, inner, &ONE, a, lead, b, inner, &ZERO, c, lead)
+            result::sgemm(handle, transpose, transpose, rows, columns, inner, &ONE, a, lead, b, inner, &ZERO, c, lead)
         })
     }
 
-    /// Strided batched products: `sgemm`, or `sgemv` if `as_vectors`.
+    /// Strided batched products: `sgemm`, or `sgemv` if `use_gemv`.
     ///
     /// # Safety
-    /// The addresses are those of `count` matrices as `of` says; with `as_vectors`, its `columns` is 1.
-    pub(super) unsafe fn strided(&self, of: GemmCall, as_vectors: bool, [a, b, c]: [u64; 3]) -> Result<()> {
-        let GemmCall { rows, inner, columns, lead, count, strides: [to_a, to_b, to_c] } = of;
-        let (handle, no) = (self.handle, NO_TRANSPOSE);
+    /// The addresses are those of `count` matrices with the sizes and strides in `call`; with `use_gemv`, its `columns` is 1.
+    pub(super) unsafe fn multiply_strided(&self, call: GemmCall, use_gemv: bool, [a, b, c]: [u64; 3]) -> Result<()> {
+        let GemmCall { rows, inner, columns, lead, count, strides: [stride_a, stride_b, stride_c] } = call;
+        let (handle, transpose) = (self.handle, NO_TRANSPOSE);
         let (a, b, c) = (a as *const f32, b as *const f32, c as *mut f32);
-        if as_vectors {
-            self.check_has(false, true)?;
+        if use_gemv {
+            check_functions(false, true)?;
             // SAFETY: the handle is live and the function exists; the caller guarantees the matrices.
             let status = unsafe {
                 sys::cublasSgemvStridedBatched(
-                    handle, no, rows, inner, &ONE, a, lead, to_a, b, 1, to_b, &ZERO, c, 1, to_c, count,
+                    handle, transpose, rows, inner, &ONE, a, lead, stride_a, b, 1, stride_b, &ZERO, c, 1, stride_c,
+                    count,
                 )
             };
-            return checked(status.result());
+            return map_status(status.result());
         }
-        // SAFETY: the handle is live; the caller guarantees the matrices.
-        checked(unsafe {
+        // SAFETY: the handle is live, and the caller guarantees the matrices.
+        map_status(unsafe {
             result::sgemm_strided_batched(
-                handle, no, no, rows, columns, inner, &ONE, a, lead, to_a, b, inner, to_b, &ZERO, c, lead, to_c, count,
+                handle, transpose, transpose, rows, columns, inner, &ONE, a, lead, stride_a, b, inner, stride_b, &ZERO,
+                c, lead, stride_c, count,
             )
         })
     }
@@ -255,21 +270,22 @@ impl CublasHandle {
     ///
     /// # Safety
     /// The device arrays hold the device address of a matrix for each problem, in the order of the groups.
-    pub(super) unsafe fn grouped(&self, of: &GroupedGemm) -> Result<()> {
-        self.check_has(true, false)?;
-        let list = |of_group: fn(&GemmCall) -> i32| of.groups.iter().map(of_group).collect::<Vec<i32>>();
-        let (rows, columns, inner) = (list(|group| group.rows), list(|group| group.columns), list(|group| group.inner));
-        let (lead, counts, no) =
-            (list(|group| group.lead), list(|group| group.count), vec![NO_TRANSPOSE; of.groups.len()]);
-        let (ones, zeros) = (vec![ONE; of.groups.len()], vec![ZERO; of.groups.len()]);
-        let [a, b, c] = of.pointers;
+    pub(super) unsafe fn multiply_grouped(&self, call: &GroupedGemm) -> Result<()> {
+        check_functions(true, false)?;
+        let collect = |get_size: fn(&GemmCall) -> i32| call.groups.iter().map(get_size).collect::<Vec<i32>>();
+        let (rows, columns, inner) =
+            (collect(|group| group.rows), collect(|group| group.columns), collect(|group| group.inner));
+        let (lead, counts, transposes) =
+            (collect(|group| group.lead), collect(|group| group.count), vec![NO_TRANSPOSE; call.groups.len()]);
+        let (ones, zeros) = (vec![ONE; call.groups.len()], vec![ZERO; call.groups.len()]);
+        let [a, b, c] = call.pointers;
         // SAFETY: the handle is live, the function exists and every host array has an entry per group; the caller
         // guarantees the device arrays.
         let status = unsafe {
             sys::cublasSgemmGroupedBatched(
                 self.handle,
-                no.as_ptr(),
-                no.as_ptr(),
+                transposes.as_ptr(),
+                transposes.as_ptr(),
                 rows.as_ptr(),
                 columns.as_ptr(),
                 inner.as_ptr(),
@@ -281,23 +297,23 @@ impl CublasHandle {
                 zeros.as_ptr(),
                 c as *const *mut f32,
                 lead.as_ptr(),
-                of.groups.len() as i32,
+                call.groups.len() as i32,
                 counts.as_ptr(),
             )
         };
-        checked(status.result())
+        map_status(status.result())
     }
 }
 
-impl Drop for CublasHandle {
+impl<B> Drop for CublasHandle<B> {
     fn drop(&mut self) {
-        // SAFETY: the handle came from `create_handle` and is destroyed once; destroying waits for its work. A failure
-        // here cannot be handled, so its code is ignored.
+        // SAFETY: the handle came from `create_handle` and is destroyed once; destroying waits for its calls. A failure
+        // cannot be handled here, so its status is ignored.
         let _ = unsafe { result::destroy_handle(self.handle) };
     }
 }
 
-fn checked(result: Result<(), CublasError>) -> Result<()> {
+fn map_status(result: Result<(), CublasError>) -> Result<()> {
     result.map_err(fault_in("cublas"))
 }
 
@@ -311,19 +327,24 @@ mod tests {
         let broken = folder.path().join("libcublas.so.13");
         std::fs::write(&broken, b"no library").expect("a file");
         for path in [folder.path().join("nowhere.so"), broken] {
-            let refusal = load(std::slice::from_ref(&path)).err().expect("refused");
-            assert!(matches!(refusal, Error::Unavailable { what: "cuBLAS", .. }), "{refusal}");
-            let text = refusal.to_string();
+            let error = load(std::slice::from_ref(&path)).err().expect("expected an error");
+            assert!(matches!(error, Error::Unavailable { what: "cuBLAS", .. }), "{error}");
+            let text = error.to_string();
             assert!(text.contains(&path.display().to_string()) && text.contains("nvidia-cublas"), "{text}");
         }
     }
+
     /// No `gpu_` test, because the library can be loaded without a device.
     #[test]
     #[ignore = "needs cuBLAS"]
     fn cudarc_uses_the_library_of_the_variable() {
         let path = PathBuf::from(std::env::var_os("MODALCAST_CUBLAS").expect("MODALCAST_CUBLAS"));
-        let loaded = load(&[path]).map_err(|error| error.to_string()).expect("cuBLAS");
-        assert!(loaded.has(SGEMM_GROUPED) && loaded.has(SGEMV_STRIDED) && !loaded.has(b"cublasNothing\0"));
+        let library = load(&[path]).map_err(|error| error.to_string()).expect("cuBLAS");
+        assert!(
+            library.has_function(SGEMM_GROUPED)
+                && library.has_function(SGEMV_STRIDED)
+                && !library.has_function(b"cublasNothing\0")
+        );
         assert!(cublas_version().expect("a version")[0] >= 12);
     }
 }

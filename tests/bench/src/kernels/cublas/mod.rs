@@ -10,10 +10,10 @@ pub use library::cublas_version;
 use std::sync::Arc;
 
 use super::input_sets::{InputSets, Part};
-use super::kernel_benchmark::{KernelAttributes, KernelBenchmark};
+use super::kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 use super::plain_update::PlainUpdate;
-use batch::GemmBatches;
-use library::{CublasHandle, GemmCall, GroupedGemm};
+use batch::{GemmBatches, Operand};
+use library::{CublasHandle, GemmCall, GroupedGemm, check_functions};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Error, Result};
@@ -22,77 +22,85 @@ use modalcast_model::scene::{Scene, SceneState};
 /// cuBLAS for a scene, with the inputs of several steps.
 #[derive(Debug)]
 pub struct CublasBenchmark {
-    // Declared first and therefore dropped first: dropping it waits for its work on the buffers below.
-    blas: CublasHandle,
-    peer: CublasMethod,
+    cublas: CublasHandle<ProductBuffers>,
+    method: CublasMethod,
     part: Part,
     batches: GemmBatches,
-    u_matrices: DeviceBuffer,
-    u: DeviceBuffer,
     update: Option<PlainUpdate>,
-    /// First float of each domain's u; `None` for domains without modes.
-    places: Vec<Option<u64>>,
-    turns: InputSets,
+    /// Offset of each domain's u, in floats; `None` for domains without modes.
+    u_offsets: Vec<Option<u64>>,
+}
+
+/// Operands of the products on the device.
+#[derive(Debug)]
+struct ProductBuffers {
+    matrices: DeviceBuffer,
+    u: DeviceBuffer,
+    input_sets: InputSets,
+    /// Present for [`CublasMethod::Grouped`].
     pointers: Option<PointerArrays>,
 }
 
-/// Device arrays with one pointer per problem: to U, to u, and to q for each turn.
+/// Device arrays with one pointer per product: to U, to u, and to q for each input set.
 #[derive(Debug)]
 struct PointerArrays {
     matrices: DeviceBuffer,
-    outputs: DeviceBuffer,
+    u: DeviceBuffer,
     q: DeviceBuffer,
-    problems: u64,
+    product_count: u64,
 }
 
 impl CublasBenchmark {
-    /// Packs a scene for one kind of product.
+    /// Packs and uploads a scene for one method.
     ///
     /// # Errors
-    /// `Invalid` when `peer` does not support the scene, or there is no state; `Unavailable` when cuBLAS is missing or
+    /// `Invalid` when `method` does not support the scene, or there is no state; `Unavailable` when cuBLAS is missing or
     /// too old, or the device has too little memory; `Fault` when the device fails.
     pub fn new(
         device: &Device,
         scene: &Arc<Scene>,
         states: &[SceneState],
-        (peer, part): (CublasMethod, Part),
+        (method, part): (CublasMethod, Part),
     ) -> Result<Self> {
-        let batches = GemmBatches::of(scene, peer)?;
+        let batches = GemmBatches::plan(scene, method)?;
         check_memory(device, &batches)?;
-        let blas = CublasHandle::new(device)?;
-        blas.check_has(peer == CublasMethod::Grouped, peer.as_vectors())?;
-        let places = batches.places_of_u(scene.domains.len());
-        let u_matrices = upload_matrices(device, scene, &batches, peer)?;
-        let u = DeviceBuffer::zeroed(device, 4 * batches.floats[2])?;
+        let is_grouped = method == CublasMethod::Grouped;
+        check_functions(is_grouped, method.uses_strided_gemv())?;
+        let u_offsets = batches.u_offsets(scene.domains.len());
+        let matrices = upload_matrices(device, scene, &batches, method)?;
+        let u = DeviceBuffer::zeroed(device, 4 * batches.floats[Operand::U as usize])?;
         let transforms = |state: &SceneState| bytemuck::cast_slice(&state.world_transforms(scene)).to_vec();
-        let turns = InputSets::new(device, scene, states, |state| [batches.pack_q(scene, state), transforms(state)])?;
-        let pointers =
-            (peer == CublasMethod::Grouped).then(|| PointerArrays::new(device, &batches, [&u_matrices, &u], &turns));
-        let update = (part == Part::Whole).then(|| PlainUpdate::new(device, scene, &places)).transpose()?;
-        Ok(Self { blas, peer, part, pointers: pointers.transpose()?, batches, u_matrices, u, update, places, turns })
+        let input_sets =
+            InputSets::new(device, scene, states, |state| [batches.pack_q(scene, state), transforms(state)])?;
+        let pointers = is_grouped.then(|| PointerArrays::new(device, &batches, [&matrices, &u], &input_sets));
+        let buffers = ProductBuffers { matrices, u, pointers: pointers.transpose()?, input_sets };
+        let update = (part == Part::Whole).then(|| PlainUpdate::new(device, scene, &u_offsets)).transpose()?;
+        Ok(Self { cublas: CublasHandle::new(device, buffers)?, method, part, batches, update, u_offsets })
     }
 
-    fn multiply(&self, q: u64, turn: usize) -> Result<()> {
-        if let Some(pointers) = &self.pointers {
-            let groups: Vec<GemmCall> = self.batches.list.iter().map(|batch| batch.product).collect();
-            let q = pointers.q.address() + 8 * pointers.problems * (turn % self.turns.count()) as u64;
-            let pointers = [pointers.matrices.address(), q, pointers.outputs.address()];
-            // SAFETY: the arrays have a pointer for each problem, in the order of the groups, each to memory of the
+    /// Enqueues u = U q of all domains. `q` is the address of the coordinates of this input set.
+    fn multiply(&self, q: u64, input_set: usize) -> Result<()> {
+        let ProductBuffers { matrices, u, input_sets, pointers } = &self.cublas.buffers;
+        if let Some(pointers) = pointers {
+            let groups: Vec<GemmCall> = self.batches.list.iter().map(|batch| batch.call).collect();
+            let q = pointers.q.address() + 8 * pointers.product_count * (input_set % input_sets.count()) as u64;
+            let pointers = [pointers.matrices.address(), q, pointers.u.address()];
+            // SAFETY: the arrays have a pointer for each product, in the order of the groups, each to memory of the
             // size that `GemmBatches` planned.
-            return unsafe { self.blas.grouped(&GroupedGemm { groups: &groups, pointers }) };
+            return unsafe { self.cublas.multiply_grouped(&GroupedGemm { groups: &groups, pointers }) };
         }
-        let bases = [self.u_matrices.address(), q, self.u.address()];
+        let addresses = [matrices.address(), q, u.address()];
         for batch in &self.batches.list {
-            let at: [u64; 3] = std::array::from_fn(|of| bases[of] + 4 * batch.first[of]);
+            let operands: [u64; 3] = std::array::from_fn(|operand| addresses[operand] + 4 * batch.offsets[operand]);
             // SAFETY: the three buffers have the sizes that `GemmBatches` planned, and this batch lies inside them. The
-            // products of the first three kinds have a `count` of 1, and those of the first two have one column.
+            // products of the first three methods have a `count` of 1, and those of the first two have one column.
             unsafe {
-                match self.peer {
+                match self.method {
                     CublasMethod::SgemvColumns | CublasMethod::SgemvRows => {
-                        self.blas.gemv(batch.product, self.peer == CublasMethod::SgemvRows, at)?;
+                        self.cublas.gemv(batch.call, self.method == CublasMethod::SgemvRows, operands)?;
                     }
-                    CublasMethod::Instances => self.blas.gemm(batch.product, at)?,
-                    _ => self.blas.strided(batch.product, self.peer.as_vectors(), at)?,
+                    CublasMethod::Instances => self.cublas.gemm(batch.call, operands)?,
+                    _ => self.cublas.multiply_strided(batch.call, self.method.uses_strided_gemv(), operands)?,
                 }
             }
         }
@@ -102,51 +110,56 @@ impl CublasBenchmark {
 
 impl KernelBenchmark for CublasBenchmark {
     fn name(&self) -> String {
-        self.part.named(self.peer.name())
+        self.part.benchmark_name(self.method.name())
     }
 
-    fn turns(&self) -> usize {
-        self.turns.count()
+    fn input_set_count(&self) -> usize {
+        self.cublas.buffers.input_sets.count()
     }
 
-    fn launch(&self, device: &Device, turn: usize) -> Result<()> {
-        let values = self.turns.start(turn);
-        self.multiply(values.q, turn)?;
-        let u = self.u.address();
-        self.update.as_ref().map_or(Ok(()), |update| update.launch(device, values.transforms, u))
+    fn launch(&self, device: &Device, input_set: usize) -> Result<()> {
+        let inputs = self.cublas.buffers.input_sets.select(input_set);
+        self.multiply(inputs.q, input_set)?;
+        let u = self.cublas.buffers.u.address();
+        self.update.as_ref().map_or(Ok(()), |update| update.launch(device, inputs.transforms, u))
     }
 
     fn positions(&self, device: &Device) -> Result<Vec<f32>> {
         if let Some(update) = &self.update {
             return update.positions(device);
         }
-        let mut u = vec![0.0_f32; self.batches.floats[2] as usize];
-        self.u.read(device, 0, &mut u)?;
-        let places = &self.places;
-        Ok(self.turns.finish_on_host(|domain, vertex| {
-            let of = |first: u64| [0, 1, 2].map(|axis| u[first as usize + 3 * vertex + axis]);
-            places[domain].map_or([0.0; 3], of)
+        let mut u = vec![0.0_f32; self.batches.floats[Operand::U as usize] as usize];
+        self.cublas.buffers.u.read(device, 0, &mut u)?;
+        let u_offsets = &self.u_offsets;
+        Ok(self.cublas.buffers.input_sets.compute_positions_on_host(|domain, vertex| {
+            let displacement = |offset: u64| [0, 1, 2].map(|axis| u[offset as usize + 3 * vertex + axis]);
+            u_offsets[domain].map_or([0.0; 3], displacement)
         }))
     }
 
-    /// U counts as stored, padding included.
-    fn bytes(&self) -> Vec<(&'static str, u64)> {
+    /// Counts U as stored, padding included.
+    fn traffic(&self) -> Vec<ArrayTraffic> {
         let [matrices, q, u] = self.batches.floats.map(|floats| 4 * floats);
-        let mut bytes = vec![("U as stored", matrices), ("q", q), ("u written", u)];
-        bytes.extend(self.pointers.iter().map(|pointers| ("pointers", 24 * pointers.problems)));
-        bytes.extend(self.update.iter().flat_map(PlainUpdate::bytes));
-        bytes
+        let mut traffic = vec![
+            ArrayTraffic::new("U as stored", matrices),
+            ArrayTraffic::new("q", q),
+            ArrayTraffic::new("u written", u),
+        ];
+        let pointers = self.cublas.buffers.pointers.iter();
+        traffic.extend(pointers.map(|pointers| ArrayTraffic::new("pointers", 24 * pointers.product_count)));
+        traffic.extend(self.update.iter().flat_map(PlainUpdate::traffic));
+        traffic
     }
 
     /// Calls of the library, each of which may launch several kernels, plus the update.
-    fn launches(&self) -> usize {
-        let calls = if self.pointers.is_some() { 1 } else { self.batches.list.len() };
+    fn launches_per_step(&self) -> usize {
+        let calls = if self.cublas.buffers.pointers.is_some() { 1 } else { self.batches.list.len() };
         calls + usize::from(self.update.is_some())
     }
 
-    /// Facts about the update alone, because the library's kernels are not accessible.
-    fn kernels(&self) -> Vec<KernelAttributes> {
-        self.update.iter().map(|update| update.facts().clone()).collect()
+    /// Attributes of the update alone, because the library's kernels are not accessible.
+    fn kernel_attributes(&self) -> Vec<KernelAttributes> {
+        self.update.iter().map(|update| update.attributes().clone()).collect()
     }
 }
 
@@ -155,34 +168,42 @@ impl PointerArrays {
         device: &Device,
         batches: &GemmBatches,
         [matrices, u]: [&DeviceBuffer; 2],
-        turns: &InputSets,
+        input_sets: &InputSets,
     ) -> Result<Self> {
-        let problems =
+        let products =
             || batches.list.iter().flat_map(|batch| (0..batch.domains.len()).map(move |index| (batch, index)));
-        let list = |base: u64, of: usize| problems().map(move |(batch, index)| base + 4 * batch.place(index, of));
-        let of_turn = |turn: usize| list(turns.start(turn).q, 1);
+        let pointers =
+            |base: u64, operand: Operand| products().map(move |(batch, index)| base + 4 * batch.offset(index, operand));
+        let q_pointers = |input_set: usize| pointers(input_sets.select(input_set).q, Operand::Q);
+        let q: Vec<u64> = (0..input_sets.count()).flat_map(q_pointers).collect();
+        let matrices: Vec<u64> = pointers(matrices.address(), Operand::Matrix).collect();
         Ok(Self {
-            matrices: DeviceBuffer::upload(device, &list(matrices.address(), 0).collect::<Vec<u64>>())?,
-            outputs: DeviceBuffer::upload(device, &list(u.address(), 2).collect::<Vec<u64>>())?,
-            q: DeviceBuffer::upload(device, &(0..turns.count()).flat_map(of_turn).collect::<Vec<u64>>())?,
-            problems: problems().count() as u64,
+            matrices: DeviceBuffer::upload(device, &matrices)?,
+            u: DeviceBuffer::upload(device, &pointers(u.address(), Operand::U).collect::<Vec<u64>>())?,
+            q: DeviceBuffer::upload(device, &q)?,
+            product_count: products().count() as u64,
         })
     }
 }
 
-fn upload_matrices(device: &Device, scene: &Scene, batches: &GemmBatches, peer: CublasMethod) -> Result<DeviceBuffer> {
-    let mut buffer = DeviceBuffer::zeroed(device, 4 * batches.floats[0])?;
+fn upload_matrices(
+    device: &Device,
+    scene: &Scene,
+    batches: &GemmBatches,
+    method: CublasMethod,
+) -> Result<DeviceBuffer> {
+    let mut buffer = DeviceBuffer::zeroed(device, 4 * batches.floats[Operand::Matrix as usize])?;
     for batch in &batches.list {
-        let stored = if peer == CublasMethod::Instances { 1 } else { batch.domains.len() };
-        for (index, domain) in batch.domains.iter().enumerate().take(stored) {
-            let matrix = batch.matrix(scene, *domain, peer == CublasMethod::SgemvRows);
-            buffer.write(device, 4 * batch.place(index, 0), &matrix)?;
+        let matrix_count = if method == CublasMethod::Instances { 1 } else { batch.domains.len() };
+        for (index, domain) in batch.domains.iter().enumerate().take(matrix_count) {
+            let matrix = batch.pack_matrix(scene, *domain, method == CublasMethod::SgemvRows);
+            buffer.write(device, 4 * batch.offset(index, Operand::Matrix), &matrix)?;
         }
     }
     Ok(buffer)
 }
 
-/// Checks that the padded matrices fit into free device memory, before any of it is allocated.
+/// Checks that the padded operands fit into free device memory, before any of them is allocated.
 ///
 /// # Errors
 /// `Unavailable` when they do not fit.
@@ -193,5 +214,5 @@ fn check_memory(device: &Device, batches: &GemmBatches) -> Result<()> {
         return Ok(());
     }
     let reason = format!("the products need {bytes} bytes, {free} are free on {}", device.name());
-    Err(Error::Unavailable { what: "GPU memory", reason, remedy: "Leave this trial out for this scene".into() })
+    Err(Error::Unavailable { what: "GPU memory", reason, remedy: "Do not select this variant for this scene".into() })
 }

@@ -1,5 +1,4 @@
-//! BASELINE. The kernels of the thesis's chapter 3.2 as its text describes them, for comparison with ours. Only
-//! benchmarks use them.
+//! BASELINE. The kernels of the thesis's chapter 3.2 as its text describes them, for comparison with ours.
 //!
 //! | file | chapter | contents |
 //! |---|---|---|
@@ -19,15 +18,15 @@ pub use group::{KernelSplit, LaneCounts, count_lanes, idle_lanes_per_warp};
 use std::sync::Arc;
 
 use super::input_sets::{InputSets, Part};
-use super::kernel_benchmark::{KernelAttributes, KernelBenchmark};
-use group::{packed_q, places_of_u};
+use super::kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
+use group::{DisplacementLayout, pack_q};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Scene, SceneState};
 use thesis_multi::MultiDomainKernel;
 use thesis_single::SingleDomainKernel;
-use thesis_update::{UpdateKernel, matrices};
+use thesis_update::{UpdateKernel, transform_matrices};
 
 /// The kernels that compute u.
 #[derive(Debug)]
@@ -43,9 +42,8 @@ pub struct ThesisBenchmark {
     uq: UqKernel,
     update: Option<UpdateKernel>,
     u: DeviceBuffer,
-    /// First vertex of each domain's u (`None` without modes), and the number of vertices that have a u.
-    places: (Vec<Option<u32>>, usize),
-    turns: InputSets,
+    displacements: DisplacementLayout,
+    input_sets: InputSets,
     vertices: usize,
     /// Bytes of the packed q per step.
     q_bytes: u64,
@@ -59,13 +57,13 @@ impl ThesisBenchmark {
     /// missing; `Fault` when the device fails.
     pub fn single(device: &Device, scene: &Arc<Scene>, states: &[SceneState], part: Part) -> Result<Self> {
         let uq = UqKernel::Single(SingleDomainKernel::new(device, scene)?);
-        Self::new(device, scene, states, (part.named("thesis_single"), uq, part))
+        Self::new(device, scene, states, (part.benchmark_name("thesis_single"), uq, part))
     }
 
     /// The grouped kernels, followed by the vertex update for [`Part::Whole`].
     ///
     /// # Errors
-    /// `Invalid` when a domain has more than 32 modes, `Part::UqKernel` is requested and no domain has modes, or there is
+    /// `Invalid` when a domain has more than 32 modes, [`Part::Uq`] is requested and no domain has modes, or there is
     /// no state; `Unavailable` when NVRTC is missing; `Fault` when the device fails.
     pub fn multi(
         device: &Device,
@@ -74,10 +72,10 @@ impl ThesisBenchmark {
         (split, part): (KernelSplit, Part),
     ) -> Result<Self> {
         if part == Part::Uq && !scene.needs.modes {
-            return Err(invalid("modes", "some, for u = U q alone", 0));
+            return Err(invalid("modes", "at least 1 for u = U q alone", 0));
         }
         let uq = UqKernel::Multi(MultiDomainKernel::new(device, scene, split)?);
-        let name = part.named(&format!("thesis_multi_{}", split.widths().len()));
+        let name = part.benchmark_name(&format!("thesis_multi_{}", split.widths().len()));
         Self::new(device, scene, states, (name, uq, part))
     }
 
@@ -87,15 +85,17 @@ impl ThesisBenchmark {
         states: &[SceneState],
         (name, uq, part): (String, UqKernel, Part),
     ) -> Result<Self> {
-        let places = places_of_u(scene);
+        let displacements = DisplacementLayout::of(scene);
         let update = (part == Part::Whole).then(|| UpdateKernel::new(device, scene)).transpose()?;
         Ok(Self {
             name,
             uq,
             update,
-            u: DeviceBuffer::zeroed(device, 16 * places.1 as u64)?,
-            places,
-            turns: InputSets::new(device, scene, states, |state| [packed_q(scene, state), matrices(scene, state)])?,
+            u: DeviceBuffer::zeroed(device, 16 * displacements.vertex_count as u64)?,
+            displacements,
+            input_sets: InputSets::new(device, scene, states, |state| {
+                [pack_q(scene, state), transform_matrices(scene, state)]
+            })?,
             vertices: scene.layout.vertices,
             q_bytes: scene.layout.slots.iter().map(|slot| 4 * slot.rank.next_multiple_of(4) as u64).sum(),
         })
@@ -107,17 +107,17 @@ impl KernelBenchmark for ThesisBenchmark {
         self.name.clone()
     }
 
-    fn turns(&self) -> usize {
-        self.turns.count()
+    fn input_set_count(&self) -> usize {
+        self.input_sets.count()
     }
 
-    fn launch(&self, device: &Device, turn: usize) -> Result<()> {
-        let (values, u) = (self.turns.start(turn), self.u.address());
+    fn launch(&self, device: &Device, input_set: usize) -> Result<()> {
+        let (inputs, u) = (self.input_sets.select(input_set), self.u.address());
         match &self.uq {
-            UqKernel::Single(single) => single.launch(device, values.q, u)?,
-            UqKernel::Multi(multi) => multi.launch(device, values.q, u)?,
+            UqKernel::Single(single) => single.launch(device, inputs.q, u)?,
+            UqKernel::Multi(multi) => multi.launch(device, inputs.q, u)?,
         }
-        self.update.as_ref().map_or(Ok(()), |update| update.launch(device, values.transforms, u))
+        self.update.as_ref().map_or(Ok(()), |update| update.launch(device, inputs.transforms, u))
     }
 
     /// For [`Part::Whole`], a vertex that no triangle refers to is NaN, because unfolded triangles do not contain it.
@@ -125,38 +125,38 @@ impl KernelBenchmark for ThesisBenchmark {
         if let Some(update) = &self.update {
             return update.positions(device, self.vertices);
         }
-        let (places, count) = &self.places;
-        let mut u = vec![[0.0_f32; 4]; *count];
+        let DisplacementLayout { first_vertices, vertex_count } = &self.displacements;
+        let mut u = vec![[0.0_f32; 4]; *vertex_count];
         self.u.read(device, 0, &mut u)?;
-        Ok(self.turns.finish_on_host(|domain, vertex| {
-            let [x, y, z, _] = places[domain].map_or([0.0; 4], |first| u[first as usize + vertex]);
+        Ok(self.input_sets.compute_positions_on_host(|domain, vertex| {
+            let [x, y, z, _] = first_vertices[domain].map_or([0.0; 4], |first| u[first as usize + vertex]);
             [x, y, z]
         }))
     }
 
-    fn bytes(&self) -> Vec<(&'static str, u64)> {
-        let mut bytes = match &self.uq {
-            UqKernel::Single(single) => single.bytes(),
-            UqKernel::Multi(multi) => multi.bytes(self.q_bytes),
+    fn traffic(&self) -> Vec<ArrayTraffic> {
+        let mut traffic = match &self.uq {
+            UqKernel::Single(single) => single.traffic(),
+            UqKernel::Multi(multi) => multi.traffic(self.q_bytes),
         };
-        bytes.extend(self.update.iter().flat_map(UpdateKernel::bytes));
-        bytes
+        traffic.extend(self.update.iter().flat_map(UpdateKernel::traffic));
+        traffic
     }
 
-    fn launches(&self) -> usize {
-        let uq = match &self.uq {
+    fn launches_per_step(&self) -> usize {
+        let uq_launches = match &self.uq {
             UqKernel::Single(_) => 1,
-            UqKernel::Multi(multi) => multi.launches(),
+            UqKernel::Multi(multi) => multi.launches_per_step(),
         };
-        uq + usize::from(self.update.is_some())
+        uq_launches + usize::from(self.update.is_some())
     }
 
-    fn kernels(&self) -> Vec<KernelAttributes> {
-        let mut facts = match &self.uq {
-            UqKernel::Single(single) => vec![single.facts().clone()],
-            UqKernel::Multi(multi) => multi.facts(),
+    fn kernel_attributes(&self) -> Vec<KernelAttributes> {
+        let mut attributes = match &self.uq {
+            UqKernel::Single(single) => vec![single.attributes().clone()],
+            UqKernel::Multi(multi) => multi.attributes(),
         };
-        facts.extend(self.update.iter().map(|update| update.facts().clone()));
-        facts
+        attributes.extend(self.update.iter().map(|update| update.attributes().clone()));
+        attributes
     }
 }

@@ -4,17 +4,17 @@
 
 use cudarc::driver::{LaunchConfig, PushKernelArg as _};
 
-use super::super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes};
-use super::group::{BLOCK, KernelSplit, LARGEST_RANK, pack};
+use super::super::kernel_benchmark::{ArrayTraffic, BenchmarkSource, CompiledKernel, KernelAttributes};
+use super::group::{BLOCK, KernelSplit, MAX_RANK, pack_groups};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::Scene;
 
-pub(super) const CODE: BenchmarkSource = BenchmarkSource {
-    source: include_str!("../../../kernels/thesis_multi.cu"),
+pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
+    text: include_str!("../../../kernels/thesis_multi.cu"),
     functions: &["thesis_multi"],
-    variants: &[&["WIDTH=5"], &["WIDTH=6"], &["WIDTH=7"], &["WIDTH=8"]],
+    define_sets: &[&["WIDTH=5"], &["WIDTH=6"], &["WIDTH=7"], &["WIDTH=8"]],
 };
 
 /// The kernel of one group width and its inputs.
@@ -24,7 +24,7 @@ struct GroupKernel {
     entries: DeviceBuffer,
     meta: DeviceBuffer,
     lanes: usize,
-    busy: u64,
+    busy_lanes: u64,
 }
 
 /// The kernels of a split.
@@ -40,24 +40,24 @@ impl MultiDomainKernel {
     /// `Invalid` when a domain has more modes than a group holds.
     pub(super) fn new(device: &Device, scene: &Scene, split: KernelSplit) -> Result<Self> {
         let slots = &scene.layout.slots;
-        if let Some(domain) = slots.iter().position(|slot| slot.rank > LARGEST_RANK) {
+        if let Some(domain) = slots.iter().position(|slot| slot.rank > MAX_RANK) {
             let field = format!("domain {domain}: modes");
-            return Err(invalid(field, format!("at most {LARGEST_RANK} for groups"), slots[domain].rank));
+            return Err(invalid(field, format!("at most {MAX_RANK} for groups"), slots[domain].rank));
         }
         let rows = slots.iter().filter(|slot| slot.rank > 0).map(|slot| 3 * slot.vertices as u64).sum();
         let mut kernels = Vec::new();
         for width in split.widths() {
-            let packed = pack(scene, split, *width);
+            let packed = pack_groups(scene, split, *width);
             if packed.meta.is_empty() {
                 continue;
             }
             let define = format!("WIDTH={width}");
             kernels.push(GroupKernel {
-                compiled: CompiledKernel::new(device, &CODE, &[&define])?,
+                compiled: CompiledKernel::new(device, &SOURCE, &[&define])?,
                 entries: DeviceBuffer::upload(device, &packed.entries)?,
                 meta: DeviceBuffer::upload(device, &packed.meta)?,
                 lanes: packed.meta.len(),
-                busy: packed.busy(),
+                busy_lanes: packed.busy_lanes(),
             });
         }
         Ok(Self { kernels, rows })
@@ -72,55 +72,54 @@ impl MultiDomainKernel {
             let mut launch = device.stream().launch_builder(&kernel.compiled.function);
             launch.arg(&entries).arg(&meta).arg(&q).arg(&u);
             // SAFETY: these are the kernel's arguments. Entries and metadata have a float4 and a uint4 for each thread
-            // of the whole blocks. The indices in the metadata are inside of `u` and `q`, because `pack` made all of
+            // of the whole blocks. The indices in the metadata are inside of `u` and `q`, because `pack_groups` made all of
             // them from one scene.
             unsafe { launch.launch(config) }.map_err(fault_in("thesis_multi"))?;
         }
         Ok(())
     }
 
-    pub(super) fn launches(&self) -> usize {
+    pub(super) fn launches_per_step(&self) -> usize {
         self.kernels.len()
     }
 
-    /// Bytes of a step; `q`: bytes of the packed coordinates.
-    pub(super) fn bytes(&self, q: u64) -> Vec<(&'static str, u64)> {
-        let (busy, all) =
-            self.kernels.iter().fold((0, 0), |(busy, all), kernel| (busy + kernel.busy, all + kernel.lanes as u64));
+    pub(super) fn traffic(&self, q_bytes: u64) -> Vec<ArrayTraffic> {
+        let busy_lanes: u64 = self.kernels.iter().map(|kernel| kernel.busy_lanes).sum();
+        let lanes: u64 = self.kernels.iter().map(|kernel| kernel.lanes as u64).sum();
         vec![
-            ("U in fours of modes", 16 * busy),
-            ("meta data of lanes", 16 * all),
-            ("q", q),
-            ("u written", 4 * self.rows),
+            ArrayTraffic::new("U in fours of modes", 16 * busy_lanes),
+            ArrayTraffic::new("meta data of lanes", 16 * lanes),
+            ArrayTraffic::new("q", q_bytes),
+            ArrayTraffic::new("u written", 4 * self.rows),
         ]
     }
 
-    pub(super) fn facts(&self) -> Vec<KernelAttributes> {
-        self.kernels.iter().map(|kernel| kernel.compiled.facts.clone()).collect()
+    pub(super) fn attributes(&self) -> Vec<KernelAttributes> {
+        self.kernels.iter().map(|kernel| kernel.compiled.attributes.clone()).collect()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::super::super::kernel_benchmark::tests::compile_all;
-    use super::super::group::{IDLE, PackedGroups, WARP, packed_q, places_of_u};
+    use super::super::group::{DisplacementLayout, IDLE, PackedGroups, WARP, pack_q};
     use super::*;
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
     /// CPU twin of `thesis_multi`, thread by thread; counts the writes to each number of u.
-    fn twin_of_thesis_multi(packed: &PackedGroups, q: &[f32], u: &mut [f32], written: &mut [usize]) {
+    fn run_twin(packed: &PackedGroups, q: &[f32], u: &mut [f32], write_counts: &mut [usize]) {
         for first in (0..packed.meta.len()).step_by(WARP) {
-            let busy = |lane: &usize| packed.meta[first + lane][0] != IDLE;
+            let is_busy = |lane: &usize| packed.meta[first + lane][0] != IDLE;
             let mut sub_sums = [0.0_f32; WARP];
-            for lane in (0..WARP).filter(busy) {
+            for lane in (0..WARP).filter(is_busy) {
                 let q = &q[4 * packed.meta[first + lane][1] as usize..][..4];
                 sub_sums[lane] = packed.entries[first + lane].iter().zip(q).map(|(entry, q)| entry * q).sum();
             }
-            for lane in (0..WARP).filter(busy) {
-                let [place, _, fours, _] = packed.meta[first + lane].map(|number| number as usize);
-                if (lane % packed.width).is_multiple_of(fours) {
-                    u[place] = sub_sums[lane..lane + fours].iter().sum();
-                    written[place] += 1;
+            for lane in (0..WARP).filter(is_busy) {
+                let [output, _, n_vr, _] = packed.meta[first + lane].map(|number| number as usize);
+                if (lane % packed.width).is_multiple_of(n_vr) {
+                    u[output] = sub_sums[lane..lane + n_vr].iter().sum();
+                    write_counts[output] += 1;
                 }
             }
         }
@@ -130,30 +129,38 @@ mod tests {
     fn twin_writes_every_row_once_with_any_split() {
         let shapes: Vec<_> = (0..70).map(|index| (1 + index * 11 % 40, index % 33, 1)).collect();
         let (scene, state) = scene_and_state(&shapes);
-        let (places, vertices) = places_of_u(&scene);
-        let q = packed_q(&scene, &state);
+        let DisplacementLayout { first_vertices, vertex_count: vertices } = DisplacementLayout::of(&scene);
+        let q = pack_q(&scene, &state);
         for split in KernelSplit::ALL {
-            let (mut u, mut written) = (vec![f32::NAN; 4 * vertices], vec![0; 4 * vertices]);
+            let (mut u, mut write_counts) = (vec![f32::NAN; 4 * vertices], vec![0; 4 * vertices]);
             for width in split.widths() {
-                twin_of_thesis_multi(&pack(&scene, split, *width), &q, &mut u, &mut written);
+                run_twin(&pack_groups(&scene, split, *width), &q, &mut u, &mut write_counts);
             }
-            assert!(written.iter().enumerate().all(|(place, times)| *times == usize::from(place % 4 < 3)), "{split:?}");
-            let mut largest = 0.0_f64;
-            for (domain, first) in places.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?))) {
+            assert!(
+                write_counts.iter().enumerate().all(|(number, count)| *count == usize::from(number % 4 < 3)),
+                "{split:?}"
+            );
+            let mut max_error = 0.0_f64;
+            for (domain, first) in
+                first_vertices.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?)))
+            {
                 for vertex in 0..scene.layout.slots[domain].vertices {
                     let want = displacement_of(&scene, &state, domain, vertex);
                     let got = &u[4 * (first as usize + vertex)..][..3];
-                    largest =
-                        want.iter().zip(got).map(|(want, got)| (want - f64::from(*got)).abs()).fold(largest, f64::max);
+                    max_error = want
+                        .iter()
+                        .zip(got)
+                        .map(|(want, got)| (want - f64::from(*got)).abs())
+                        .fold(max_error, f64::max);
                 }
             }
-            assert!(largest > 0.0 && largest < 1e-5, "{split:?}: {largest}");
+            assert!(max_error > 0.0 && max_error < 1e-5, "{split:?}: {max_error}");
         }
     }
 
     #[test]
     #[ignore = "needs NVRTC: deploy/check installs it"]
     fn nvrtc_compiles_thesis_multi() {
-        compile_all(&CODE);
+        compile_all(&SOURCE);
     }
 }

@@ -2,17 +2,17 @@
 
 use cudarc::driver::{LaunchConfig, PushKernelArg as _};
 
-use super::super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes};
-use super::group::{BLOCK, WARP, entry, fours};
+use super::super::kernel_benchmark::{ArrayTraffic, BenchmarkSource, CompiledKernel, KernelAttributes};
+use super::group::{BLOCK, WARP, row_vector, vectors_per_row};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::Scene;
 
-pub(super) const CODE: BenchmarkSource = BenchmarkSource {
-    source: include_str!("../../../kernels/thesis_single.cu"),
+pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
+    text: include_str!("../../../kernels/thesis_single.cu"),
     functions: &["thesis_single"],
-    variants: &[&[]],
+    define_sets: &[&[]],
 };
 
 /// Layout of rows of U in lines of 32 float4 (figure 3.3).
@@ -30,20 +30,20 @@ struct RowLines {
 }
 
 impl RowLines {
-    fn of(vertices: usize, rank: usize) -> Self {
-        let (rows, width) = (3 * vertices, fours(rank).min(WARP));
-        Self { rows, rank, width, passes: fours(rank).div_ceil(WARP), lines: rows.div_ceil(WARP / width) }
+    fn new(vertices: usize, rank: usize) -> Self {
+        let (rows, width) = (3 * vertices, vectors_per_row(rank).min(WARP));
+        Self { rows, rank, width, passes: vectors_per_row(rank).div_ceil(WARP), lines: rows.div_ceil(WARP / width) }
     }
 
     /// The packed lines, in order.
     fn pack(self, scene: &Scene) -> Vec<[f32; 4]> {
-        let rows_of_line = WARP / self.width;
+        let rows_per_line = WARP / self.width;
         let mut lines = Vec::with_capacity(self.lines * self.passes * WARP);
         for line in 0..self.lines {
             for (pass, lane) in (0..self.passes).flat_map(|pass| (0..WARP).map(move |lane| (pass, lane))) {
-                let (row, k) = (line * rows_of_line + lane / self.width, pass * WARP + lane % self.width);
-                let busy = lane < rows_of_line * self.width && row < self.rows && k < fours(self.rank);
-                lines.push(if busy { entry(scene, 0, row, k) } else { [0.0; 4] });
+                let (row, k) = (line * rows_per_line + lane / self.width, pass * WARP + lane % self.width);
+                let is_busy = lane < rows_per_line * self.width && row < self.rows && k < vectors_per_row(self.rank);
+                lines.push(if is_busy { row_vector(scene, 0, row, k) } else { [0.0; 4] });
             }
         }
         lines
@@ -54,8 +54,8 @@ impl RowLines {
 #[derive(Debug)]
 pub(super) struct SingleDomainKernel {
     compiled: CompiledKernel,
-    buffer: DeviceBuffer,
-    lines: RowLines,
+    packed_lines: DeviceBuffer,
+    layout: RowLines,
 }
 
 impl SingleDomainKernel {
@@ -68,34 +68,34 @@ impl SingleDomainKernel {
         if slot.rank == 0 {
             return Err(invalid("modes", "at least 1 for the single-domain kernel", 0));
         }
-        let lines = RowLines::of(slot.vertices, slot.rank);
-        let compiled = CompiledKernel::new(device, &CODE, &[])?;
-        Ok(Self { compiled, buffer: DeviceBuffer::upload(device, &lines.pack(scene))?, lines })
+        let layout = RowLines::new(slot.vertices, slot.rank);
+        let compiled = CompiledKernel::new(device, &SOURCE, &[])?;
+        Ok(Self { compiled, packed_lines: DeviceBuffer::upload(device, &layout.pack(scene))?, layout })
     }
 
     pub(super) fn launch(&self, device: &Device, q: u64, u: u64) -> Result<()> {
-        let blocks = self.lines.lines.div_ceil(BLOCK / WARP) as u32;
+        let blocks = self.layout.lines.div_ceil(BLOCK / WARP) as u32;
         let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK as u32, 1, 1), shared_mem_bytes: 0 };
-        let (lines, rank, rows) = (self.buffer.address(), self.lines.rank as u32, self.lines.rows as u32);
+        let (lines, rank, rows) = (self.packed_lines.address(), self.layout.rank as u32, self.layout.rows as u32);
         let mut launch = device.stream().launch_builder(&self.compiled.function);
         launch.arg(&lines).arg(&q).arg(&u).arg(&rank).arg(&rows);
-        // SAFETY: these are the kernel's arguments. `buffer` has every line of `lines`, `q` as many floats as the rank
+        // SAFETY: these are the kernel's arguments. `packed_lines` has every line of `layout`, `q` as many floats as the rank
         // of the scene's only domain, and `u` a float4 per vertex; warps beyond the last row access none of them.
         unsafe { launch.launch(config) }.map_err(fault_in("thesis_single"))?;
         Ok(())
     }
 
-    pub(super) fn bytes(&self) -> Vec<(&'static str, u64)> {
-        let rows = self.lines.rows as u64;
+    pub(super) fn traffic(&self) -> Vec<ArrayTraffic> {
+        let rows = self.layout.rows as u64;
         vec![
-            ("U in fours of modes", 16 * rows * fours(self.lines.rank) as u64),
-            ("q", 4 * self.lines.rank as u64),
-            ("u written", 4 * rows),
+            ArrayTraffic::new("U in fours of modes", 16 * rows * vectors_per_row(self.layout.rank) as u64),
+            ArrayTraffic::new("q", 4 * self.layout.rank as u64),
+            ArrayTraffic::new("u written", 4 * rows),
         ]
     }
 
-    pub(super) fn facts(&self) -> &KernelAttributes {
-        &self.compiled.facts
+    pub(super) fn attributes(&self) -> &KernelAttributes {
+        &self.compiled.attributes
     }
 }
 
@@ -106,32 +106,32 @@ mod tests {
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
     /// Index of q_i in shared memory, in floats (equation 3.3).
-    const fn place_of_q(i: usize) -> usize {
+    const fn shared_index_of_q(i: usize) -> usize {
         i % 4 * 32 + i / 4
     }
 
     /// CPU twin of `thesis_single`, thread by thread.
-    fn twin_of_thesis_single(lines: &[[f32; 4]], q: &[f32], rows: usize) -> Vec<f32> {
-        let (rank, width) = (q.len(), fours(q.len()).min(WARP));
-        let (rows_of_line, passes) = (WARP / width, fours(rank).div_ceil(WARP));
+    fn run_twin(lines: &[[f32; 4]], q: &[f32], rows: usize) -> Vec<f32> {
+        let (rank, width) = (q.len(), vectors_per_row(q.len()).min(WARP));
+        let (rows_per_line, passes) = (WARP / width, vectors_per_row(rank).div_ceil(WARP));
         let mut shared_q = [f32::NAN; 512];
-        for (place, slot) in shared_q.iter_mut().enumerate().take(passes * 4 * WARP) {
-            let mode = place / 128 * 128 + 4 * (place % WARP) + place / WARP % 4;
-            *slot = q.get(mode).copied().unwrap_or(0.0);
+        for (index, shared) in shared_q.iter_mut().enumerate().take(passes * 4 * WARP) {
+            let mode = index / 128 * 128 + 4 * (index % WARP) + index / WARP % 4;
+            *shared = q.get(mode).copied().unwrap_or(0.0);
         }
         let mut u = vec![f32::NAN; 4 * rows.div_ceil(3)];
         for line in 0..lines.len() / (WARP * passes) {
             let mut sub_sums = [0.0_f32; WARP];
-            let busy = |lane: usize| lane < rows_of_line * width && line * rows_of_line + lane / width < rows;
-            for lane in (0..WARP).filter(|lane| busy(*lane)) {
-                for pass in (0..passes).filter(|pass| pass * WARP + lane % width < fours(rank)) {
-                    let four = lines[(line * passes + pass) * WARP + lane];
-                    let part = &shared_q[pass * 4 * WARP + lane % width..];
-                    sub_sums[lane] += (0..4).map(|index| four[index] * part[index * WARP]).sum::<f32>();
+            let is_busy = |lane: usize| lane < rows_per_line * width && line * rows_per_line + lane / width < rows;
+            for lane in (0..WARP).filter(|lane| is_busy(*lane)) {
+                for pass in (0..passes).filter(|pass| pass * WARP + lane % width < vectors_per_row(rank)) {
+                    let entries = lines[(line * passes + pass) * WARP + lane];
+                    let q = &shared_q[pass * 4 * WARP + lane % width..];
+                    sub_sums[lane] += (0..4).map(|index| entries[index] * q[index * WARP]).sum::<f32>();
                 }
             }
-            for lane in (0..WARP).filter(|lane| busy(*lane) && lane % width == 0) {
-                let row = line * rows_of_line + lane / width;
+            for lane in (0..WARP).filter(|lane| is_busy(*lane) && lane % width == 0) {
+                let row = line * rows_per_line + lane / width;
                 u[4 * (row / 3) + row % 3] = sub_sums[lane..lane + width].iter().sum();
             }
         }
@@ -142,9 +142,9 @@ mod tests {
     fn twin_sums_every_row_for_any_rank() {
         for rank in [1, 3, 4, 5, 9, 10, 20, 30, 31, 32, 33, 127, 128, 129, 300, 512] {
             let (scene, state) = scene_and_state(&[(23, rank, 1)]);
-            let lines = RowLines::of(23, rank).pack(&scene);
-            let largest = |q: &[f32]| {
-                let u = twin_of_thesis_single(&lines, q, 69);
+            let lines = RowLines::new(23, rank).pack(&scene);
+            let max_error = |q: &[f32]| {
+                let u = run_twin(&lines, q, 69);
                 let error = |row: usize| {
                     let want = displacement_of(&scene, &state, 0, row / 3)[row % 3];
                     let error = (f64::from(u[4 * (row / 3) + row % 3]) - want).abs();
@@ -152,39 +152,43 @@ mod tests {
                 };
                 (0..69).map(error).fold(0.0, f64::max)
             };
-            assert!(largest(&state.q) < 1e-4, "rank {rank}: {}", largest(&state.q));
-            let mut other = state.q.clone();
-            other[rank - 1] += 1.0;
-            assert!(largest(&other) > 1e-3, "rank {rank}: the judge can fail");
+            assert!(max_error(&state.q) < 1e-4, "rank {rank}: {}", max_error(&state.q));
+            // Negative control: another coordinate changes u.
+            let mut changed_q = state.q.clone();
+            changed_q[rank - 1] += 1.0;
+            assert!(max_error(&changed_q) > 1e-3, "rank {rank}");
         }
     }
 
     #[test]
     fn equation_3_3_avoids_bank_conflicts_up_to_rank_128() {
-        let places = |rank: usize| (0..rank).map(place_of_q).collect::<std::collections::BTreeSet<_>>().len();
-        assert_eq!(places(128), 128, "no two coordinates share a place");
-        assert!(places(129) < 129, "the 129th has the place of the second");
+        let distinct_indices =
+            |rank: usize| (0..rank).map(shared_index_of_q).collect::<std::collections::BTreeSet<_>>().len();
+        assert_eq!(distinct_indices(128), 128);
+        // The 129th coordinate has the index of the second.
+        assert!(distinct_indices(129) < 129);
         // In the kernel's loop, index i * 32 + j takes q[4 j + i]: the inverse of the same map.
-        assert!((0..128).all(|place| place_of_q(4 * (place % 32) + place / 32) == place));
-        for part in 0..4 {
-            let banks: std::collections::BTreeSet<usize> = (0..32).map(|k| place_of_q(4 * k + part) % 32).collect();
+        assert!((0..128).all(|index| shared_index_of_q(4 * (index % 32) + index / 32) == index));
+        for component in 0..4 {
+            let banks: std::collections::BTreeSet<usize> =
+                (0..32).map(|k| shared_index_of_q(4 * k + component) % 32).collect();
             assert_eq!(banks.len(), 32);
         }
     }
 
     #[test]
-    fn line_holds_whole_rows_and_is_128_byte_aligned() {
+    fn line_holds_complete_rows_and_is_128_byte_aligned() {
         // r = 30 of figure 3.2: eight lanes per row, four rows per warp.
-        let lines = RowLines::of(4, 30);
+        let lines = RowLines::new(4, 30);
         assert_eq!((lines.width, lines.passes, lines.lines), (8, 1, 3));
         assert_eq!(WARP * size_of::<[f32; 4]>() % 128, 0);
-        assert_eq!(RowLines::of(4, 10), RowLines { rows: 12, rank: 10, width: 3, passes: 1, lines: 2 });
-        assert_eq!(RowLines::of(1, 512), RowLines { rows: 3, rank: 512, width: 32, passes: 4, lines: 3 });
+        assert_eq!(RowLines::new(4, 10), RowLines { rows: 12, rank: 10, width: 3, passes: 1, lines: 2 });
+        assert_eq!(RowLines::new(1, 512), RowLines { rows: 3, rank: 512, width: 32, passes: 4, lines: 3 });
     }
 
     #[test]
     #[ignore = "needs NVRTC: deploy/check installs it"]
     fn nvrtc_compiles_thesis_single() {
-        compile_all(&CODE);
+        compile_all(&SOURCE);
     }
 }

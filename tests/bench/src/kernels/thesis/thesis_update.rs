@@ -3,29 +3,29 @@
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::{DeviceRepr, LaunchConfig, PushKernelArg as _};
 
-use super::super::kernel_benchmark::{BenchmarkSource, CompiledKernel, KernelAttributes};
-use super::group::{BLOCK, places_of_u};
+use super::super::kernel_benchmark::{ArrayTraffic, BenchmarkSource, CompiledKernel, KernelAttributes};
+use super::group::{BLOCK, DisplacementLayout};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Scene, SceneState};
 
-pub(super) const CODE: BenchmarkSource = BenchmarkSource {
-    source: include_str!("../../../kernels/thesis_update.cu"),
+pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
+    text: include_str!("../../../kernels/thesis_update.cu"),
     functions: &["thesis_update"],
-    variants: &[&[], &["TANGENTS"]],
+    define_sets: &[&[], &["TANGENTS"]],
 };
 
-/// Vertices per warp and per block.
-const OF_WARP: usize = 8;
-const OF_BLOCK: usize = 64;
+/// Vertices per warp and per block; four threads compute one vertex.
+const VERTICES_PER_WARP: usize = 8;
+const VERTICES_PER_BLOCK: usize = 64;
 
 /// Value of `sources` for a vertex without u.
 const RIGID: u32 = u32::MAX;
 
-/// The text assumes at least three triangles per domain, so that eight consecutive vertices belong to at most two
+/// Minimum number of triangles per domain that the text assumes, so that eight consecutive vertices belong to at most two
 /// domains.
-const FEWEST_TRIANGLES: usize = 3;
+const MIN_TRIANGLES: usize = 3;
 
 /// Arguments of `thesis_update`; pointers are device addresses.
 #[repr(C)]
@@ -53,6 +53,7 @@ unsafe impl DeviceRepr for UpdateArgs {}
 /// The vertices of unfolded triangles: three per triangle, without sharing.
 #[derive(Debug, Default)]
 struct UnfoldedTriangles {
+    /// Per warp: its two domains, the first vertex of the second one, and 0.
     warps: Vec<[u32; 4]>,
     /// Index of the vertex in u, or [`RIGID`].
     sources: Vec<u32>,
@@ -66,20 +67,20 @@ struct UnfoldedTriangles {
 impl UnfoldedTriangles {
     /// Unfolds all triangles. A domain with fewer than three triangles repeats its last one.
     fn of(scene: &Scene) -> Self {
-        let (places, _) = places_of_u(scene);
+        let displacements = DisplacementLayout::of(scene);
         let mut unfolded = Self::default();
         let mut domains = Vec::new();
         for (domain, slot) in scene.layout.slots.iter().enumerate() {
             let shape = scene.shape_of(domain);
             let (corners, triangles) = (shape.mesh.corners(), shape.mesh.triangles());
-            let fewest = triangles.len().max(FEWEST_TRIANGLES);
+            let triangle_count = triangles.len().max(MIN_TRIANGLES);
             let corner_of = |index: usize| triangles[(index / 3).min(triangles.len() - 1)][index % 3] as usize;
-            for corner in (0..3 * fewest).map(corner_of) {
+            for corner in (0..3 * triangle_count).map(corner_of) {
                 let vertex = corners.vertices[corner];
-                unfolded.sources.push(places[domain].map_or(RIGID, |first| first + vertex));
+                unfolded.sources.push(displacements.first_vertices[domain].map_or(RIGID, |first| first + vertex));
                 unfolded.targets.push(slot.first_vertex as u32 + vertex);
-                unfolded.positions.push(four(shape.mesh.rest()[vertex as usize], 1.0));
-                unfolded.normals.push(four(corners.normals[corner], 0.0));
+                unfolded.positions.push(float4(shape.mesh.rest()[vertex as usize], 1.0));
+                unfolded.normals.push(float4(corners.normals[corner], 0.0));
                 if scene.needs.normal_maps {
                     let [x, y, z, _] = shape.tangents().get(corner).copied().unwrap_or_default();
                     unfolded.tangents.push([x, y, z, 0.0]);
@@ -87,25 +88,28 @@ impl UnfoldedTriangles {
                 domains.push(domain as u32);
             }
         }
-        unfolded.warps = domains.chunks(OF_WARP).map(warp).collect();
-        unfolded.warps.resize(domains.len().div_ceil(OF_BLOCK) * OF_BLOCK / OF_WARP, [0, 0, OF_WARP as u32, 0]);
+        unfolded.warps = domains.chunks(VERTICES_PER_WARP).map(warp_domains).collect();
+        unfolded.warps.resize(
+            domains.len().div_ceil(VERTICES_PER_BLOCK) * VERTICES_PER_BLOCK / VERTICES_PER_WARP,
+            [0, 0, VERTICES_PER_WARP as u32, 0],
+        );
         unfolded
     }
 }
 
-/// The two domains of a warp and the first vertex of the second one.
-fn warp(domains: &[u32]) -> [u32; 4] {
+/// The two domains of a warp, the first vertex of the second one, and 0.
+fn warp_domains(domains: &[u32]) -> [u32; 4] {
     let first = domains[0];
-    let second = domains.iter().position(|domain| *domain != first);
-    second.map_or([first, first, OF_WARP as u32, 0], |at| [first, domains[at], at as u32, 0])
+    let boundary = domains.iter().position(|domain| *domain != first);
+    boundary.map_or([first, first, VERTICES_PER_WARP as u32, 0], |vertex| [first, domains[vertex], vertex as u32, 0])
 }
 
-const fn four([x, y, z]: [f32; 3], w: f32) -> [f32; 4] {
+const fn float4([x, y, z]: [f32; 3], w: f32) -> [f32; 4] {
     [x, y, z, w]
 }
 
 /// T of every domain as a 4x4 row-major matrix.
-pub(super) fn matrices(scene: &Scene, state: &SceneState) -> Vec<f32> {
+pub(super) fn transform_matrices(scene: &Scene, state: &SceneState) -> Vec<f32> {
     let transforms = state.world_transforms(scene);
     transforms.iter().flat_map(|transform| transform.0.into_iter().chain([0.0, 0.0, 0.0, 1.0])).collect()
 }
@@ -119,18 +123,18 @@ pub(super) struct UpdateKernel {
     /// Positions, normals and tangents.
     outputs: [DeviceBuffer; 3],
     targets: Vec<u32>,
-    tangents: bool,
-    /// Bytes of the transforms, and of u.
-    read: [u64; 2],
+    has_tangents: bool,
+    transform_bytes: u64,
+    u_bytes: u64,
 }
 
 impl UpdateKernel {
     pub(super) fn new(device: &Device, scene: &Scene) -> Result<Self> {
         let unfolded = UnfoldedTriangles::of(scene);
-        let (tangents, bytes) = (scene.needs.normal_maps, 16 * unfolded.targets.len() as u64);
-        let defines: &[&str] = if tangents { &["TANGENTS"] } else { &[] };
+        let (has_tangents, bytes) = (scene.needs.normal_maps, 16 * unfolded.targets.len() as u64);
+        let defines: &[&str] = if has_tangents { &["TANGENTS"] } else { &[] };
         Ok(Self {
-            compiled: CompiledKernel::new(device, &CODE, defines)?,
+            compiled: CompiledKernel::new(device, &SOURCE, defines)?,
             tables: [
                 DeviceBuffer::upload(device, &unfolded.warps)?,
                 DeviceBuffer::upload(device, &unfolded.sources)?,
@@ -141,11 +145,12 @@ impl UpdateKernel {
             outputs: [
                 DeviceBuffer::zeroed(device, bytes)?,
                 DeviceBuffer::zeroed(device, bytes)?,
-                DeviceBuffer::zeroed(device, if tangents { bytes } else { 0 })?,
+                DeviceBuffer::zeroed(device, if has_tangents { bytes } else { 0 })?,
             ],
             targets: unfolded.targets,
-            tangents,
-            read: [64 * scene.domains.len() as u64, 16 * places_of_u(scene).1 as u64],
+            has_tangents,
+            transform_bytes: 64 * scene.domains.len() as u64,
+            u_bytes: 16 * DisplacementLayout::of(scene).vertex_count as u64,
         })
     }
 
@@ -168,7 +173,7 @@ impl UpdateKernel {
             vertices: vertices as u32,
             reserved: 0,
         };
-        let blocks = vertices.div_ceil(OF_BLOCK) as u32;
+        let blocks = vertices.div_ceil(VERTICES_PER_BLOCK) as u32;
         let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK as u32, 1, 1), shared_mem_bytes: 0 };
         let mut launch = device.stream().launch_builder(&self.compiled.function);
         // SAFETY: `UpdateArgs` is the kernel's only argument. Its tables belong to one scene, as built by
@@ -186,23 +191,27 @@ impl UpdateKernel {
         Ok(fold(&unfolded, &self.targets, vertices))
     }
 
-    pub(super) fn bytes(&self) -> Vec<(&'static str, u64)> {
+    pub(super) fn traffic(&self) -> Vec<ArrayTraffic> {
         let vertices = self.targets.len() as u64;
-        let kinds = if self.tangents { 3 } else { 2 };
+        let attribute_count = if self.has_tangents { 3 } else { 2 };
         vec![
-            ("unfolded rest state", 16 * kinds * vertices),
-            ("sources and domains of vertices", 4 * vertices + 2 * vertices.next_multiple_of(OF_BLOCK as u64)),
-            ("T", self.read[0]),
-            ("u read", self.read[1]),
-            ("unfolded vertices written", 16 * kinds * vertices),
+            ArrayTraffic::new("unfolded rest state", 16 * attribute_count * vertices),
+            ArrayTraffic::new(
+                "sources and domains of vertices",
+                4 * vertices + 2 * vertices.next_multiple_of(VERTICES_PER_BLOCK as u64),
+            ),
+            ArrayTraffic::new("T", self.transform_bytes),
+            ArrayTraffic::new("u read", self.u_bytes),
+            ArrayTraffic::new("unfolded vertices written", 16 * attribute_count * vertices),
         ]
     }
 
-    pub(super) fn facts(&self) -> &KernelAttributes {
-        &self.compiled.facts
+    pub(super) fn attributes(&self) -> &KernelAttributes {
+        &self.compiled.attributes
     }
 }
 
+/// Copies unfolded positions to the packed vertices of `targets`; other vertices are NaN.
 fn fold(unfolded: &[[f32; 4]], targets: &[u32], vertices: usize) -> Vec<f32> {
     let mut positions = vec![f32::NAN; 3 * vertices];
     for (position, target) in unfolded.iter().zip(targets) {
@@ -218,10 +227,10 @@ mod tests {
     use modalcast_compute::testing::{displacement_of, position_of, scene_and_state};
 
     /// CPU twin of `thesis_update` for positions, thread by thread.
-    fn twin_of_thesis_update(unfolded: &UnfoldedTriangles, transforms: &[f32], u: &[[f32; 4]]) -> Vec<[f32; 4]> {
+    fn run_twin(unfolded: &UnfoldedTriangles, transforms: &[f32], u: &[[f32; 4]]) -> Vec<[f32; 4]> {
         let count = unfolded.targets.len();
         let mut positions = vec![[f32::NAN; 4]; count];
-        for thread in 0..count.div_ceil(OF_BLOCK) * BLOCK {
+        for thread in 0..count.div_ceil(VERTICES_PER_BLOCK) * BLOCK {
             let (vertex, element, warp) = (thread / 4, thread % 4, thread / 32);
             let [first, second, split, _] = unfolded.warps[warp];
             let domain = if (thread % 32 / 4) < split as usize { first } else { second };
@@ -245,28 +254,29 @@ mod tests {
         let (scene, state) = scene_and_state(&shapes);
         let unfolded = UnfoldedTriangles::of(&scene);
         assert_eq!(unfolded.targets.len(), 3 * (3 + 3 + 30 + 3 + 3 + 5));
-        let (places, vertices) = places_of_u(&scene);
-        let mut u = vec![[0.0_f32; 4]; vertices];
-        for (domain, first) in places.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?))) {
+        let DisplacementLayout { first_vertices, vertex_count } = DisplacementLayout::of(&scene);
+        let mut u = vec![[0.0_f32; 4]; vertex_count];
+        for (domain, first) in first_vertices.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?)))
+        {
             for vertex in 0..scene.layout.slots[domain].vertices {
                 u[first as usize + vertex] =
-                    four(displacement_of(&scene, &state, domain, vertex).map(|number| number as f32), 0.0);
+                    float4(displacement_of(&scene, &state, domain, vertex).map(|number| number as f32), 0.0);
             }
         }
-        let positions = twin_of_thesis_update(&unfolded, &matrices(&scene, &state), &u);
+        let positions = run_twin(&unfolded, &transform_matrices(&scene, &state), &u);
         let folded = fold(&positions, &unfolded.targets, scene.layout.vertices);
-        let mut left_out = 0;
+        let mut nan_count = 0;
         for (domain, slot) in scene.layout.slots.iter().enumerate() {
             for vertex in 0..slot.vertices {
                 let got = &folded[3 * (slot.first_vertex + vertex)..][..3];
-                left_out += usize::from(got[0].is_nan());
+                nan_count += usize::from(got[0].is_nan());
                 for (want, got) in position_of(&scene, &state, domain, vertex).iter().zip(got) {
-                    let named = vertex < 3 * shapes[domain].2;
-                    assert_eq!((want - f64::from(*got)).abs() < 1e-5, named, "domain {domain} vertex {vertex}");
+                    let is_corner = vertex < 3 * shapes[domain].2;
+                    assert_eq!((want - f64::from(*got)).abs() < 1e-5, is_corner, "domain {domain} vertex {vertex}");
                 }
             }
         }
-        assert_eq!(left_out, 2 + 3 + 1, "vertices that no triangle names");
+        assert_eq!(nan_count, 2 + 3 + 1, "vertices that no triangle refers to");
     }
 
     #[test]
@@ -274,18 +284,18 @@ mod tests {
         let (scene, _) = scene_and_state(&[(3, 0, 1); 50]);
         let unfolded = UnfoldedTriangles::of(&scene);
         let domain = |vertex: usize| unfolded.targets[vertex] / 3;
-        for (index, [first, second, split, _]) in unfolded.warps.iter().enumerate().take(450 / OF_WARP) {
-            for vertex in 0..OF_WARP {
+        for (index, [first, second, split, _]) in unfolded.warps.iter().enumerate().take(450 / VERTICES_PER_WARP) {
+            for vertex in 0..VERTICES_PER_WARP {
                 let expected = if vertex < *split as usize { first } else { second };
-                assert_eq!(domain(OF_WARP * index + vertex), *expected);
+                assert_eq!(domain(VERTICES_PER_WARP * index + vertex), *expected);
             }
         }
-        assert_eq!(unfolded.warps.len(), 450_usize.div_ceil(OF_BLOCK) * 8);
+        assert_eq!(unfolded.warps.len(), 450_usize.div_ceil(VERTICES_PER_BLOCK) * 8);
     }
 
     #[test]
     #[ignore = "needs NVRTC: deploy/check installs it"]
     fn nvrtc_compiles_thesis_update() {
-        compile_all(&CODE);
+        compile_all(&SOURCE);
     }
 }
