@@ -17,7 +17,7 @@ fn by_ray(viewport: &Viewport, triangle: [[f64; 3]; 3], uvs: [[f64; 2]; 3], [x, 
     let ray = Vector3::new((2.0 * x / width - 1.0) * width / height / focal, (1.0 - 2.0 * y / height) / focal, -1.0);
     let [a, b, c] = triangle.map(Vector3::from);
     // Solve a + s (b - a) + t (c - a) = r ray.
-    let solved = Matrix3::from_columns(&[b - a, c - a, -ray]).lu().solve(&-a).expect("a plane");
+    let solved = Matrix3::from_columns(&[b - a, c - a, -ray]).lu().solve(&-a).expect("expected a valid mesh");
     [0, 1].map(|axis| {
         uvs[0][axis] + solved[0] * (uvs[1][axis] - uvs[0][axis]) + solved[1] * (uvs[2][axis] - uvs[0][axis])
     })
@@ -66,7 +66,7 @@ fn texture_coordinates_match_ray_cast_behind_the_eye() {
     assert!(worst.0 < 1e-5 && worst.1 < 1e-4, "{worst:?}");
     let affine = by_ray(&viewport, tilted.map(|[x, y, z]| [-x / z, -y / z, -1.0]), uvs, [90.5, 60.5]);
     let right = by_ray(&viewport, tilted, uvs, [90.5, 60.5]);
-    assert!((affine[0] - right[0]).abs() > 0.05, "control: without perspective {affine:?} for {right:?}");
+    assert!((affine[0] - right[0]).abs() > 0.05, "negative control: without perspective {affine:?} for {right:?}");
 }
 
 #[test]
@@ -157,7 +157,7 @@ fn sheet_reproduces_its_image_at_levels_0_and_1() {
         assert!(seen == want, "level {level}");
     }
     let turned = own.levels[0].iter().rev().map(|texel| *texel == 255).collect::<Vec<_>>();
-    assert!(sheet_soup(64, own).rasterize().ids().iter().map(Option::is_some).ne(turned), "the judge can fail");
+    assert!(sheet_soup(64, own).rasterize().ids().iter().map(Option::is_some).ne(turned), "negative control");
 }
 
 #[test]
@@ -181,7 +181,7 @@ fn uniform_images_keep_all_or_nothing_of_a_triangle() {
         assert!(drawn.keys == kept.keys, "{}", soup.name);
         differing += drawn.keys.iter().zip(&soup.rasterize().keys).filter(|(cut, whole)| cut != whole).count();
     }
-    assert!(differing > 10_000, "control: {differing} samples see something else than without holes");
+    assert!(differing > 10_000, "negative control: {differing} samples see something else than without holes");
 }
 
 /// The floor is cut by its image, few of its samples are doubtful, and splitting it into smaller triangles changes few

@@ -27,11 +27,14 @@ pub(crate) fn strip(vertices: usize, rank: usize, noise: &mut TestRng) -> Shape 
     let corners = Corners { vertices: (0..vertices as u32).collect(), normals, uvs };
     let last = vertices as u32 - 1;
     let triangles = (0..vertices as u32).map(|at| [at, (at + 1).min(last), (at + 2).min(last)]).collect();
-    let mesh = Mesh::new(rest, corners, triangles).expect("a strip");
+    let mesh = Mesh::new(rest, corners, triangles).expect("expected a valid mesh");
     let entries = (0..3 * vertices * rank).map(|_| noise.next()).collect();
-    let modes =
-        if rank == 0 { Modes::rigid() } else { Modes::from_columns(3 * vertices, rank, entries).expect("modes") };
-    Shape::new(mesh, modes).expect("a shape")
+    let modes = if rank == 0 {
+        Modes::rigid()
+    } else {
+        Modes::from_columns(3 * vertices, rank, entries).expect("expected valid modes")
+    };
+    Shape::new(mesh, modes).expect("expected a valid shape")
 }
 
 pub(crate) fn domain(shape: usize, name: String) -> Domain {
@@ -53,13 +56,13 @@ pub(crate) fn domain(shape: usize, name: String) -> Domain {
 fn strips(sizes: &[(usize, usize)]) -> Arc<Scene> {
     let mut noise = TestRng(42);
     let mut parts = SceneParts::named("strips");
-    parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("a texture")];
+    parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("expected a valid texture")];
     parts.materials = vec![Material { normal_texture: Some(0), ..Material::default() }];
     for (at, (vertices, rank)) in sizes.iter().enumerate() {
         parts.shapes.push(strip(*vertices, *rank, &mut noise));
         parts.domains.push(domain(at, format!("strip {at}")));
     }
-    Scene::new(parts).expect("a scene")
+    Scene::new(parts).expect("expected a valid scene")
 }
 
 /// A state with random coordinates q and sheared or mirrored transforms.
@@ -81,9 +84,9 @@ fn cpu_equals_twin_for_all_sizes_ranks_shears_and_mirrors() {
     let scene = strips(&SIZES);
     let state = shaken(&scene);
     let mut cpu = CpuDeformer::new(&scene);
-    let told = cpu.deform(&state).expect("deforms");
+    let told = cpu.deform(&state).expect("expected the step to succeed");
     let want = reference::deform(&scene, &state);
-    let surface = cpu.surface().expect("a surface");
+    let surface = cpu.surface().expect("expected a surface");
     let diagonal = told.bounds.diagonal();
     let error = largest_error(&surface.positions, &want) / diagonal;
     assert!(error <= 1e-6, "positions are off by {error} of the diagonal");
@@ -109,8 +112,8 @@ fn wrong_q_transform_or_missing_mode_is_detected() {
     let mut spoil = |change: &dyn Fn(&mut SceneState)| {
         let mut wrong = state.clone();
         change(&mut wrong);
-        cpu.deform(&wrong).expect("deforms");
-        largest_error(&cpu.surface().expect("a surface").positions, &want)
+        cpu.deform(&wrong).expect("expected the step to succeed");
+        largest_error(&cpu.surface().expect("expected a surface").positions, &want)
     };
     assert!(spoil(&|state| state.q[30] += 0.01) > 1e-3);
     assert!(spoil(&|state| *state.q.last_mut().expect("some") = 0.0) > 1e-3);
@@ -144,17 +147,18 @@ fn twin_is_linear_in_q() {
 fn normals_stay_orthogonal_to_a_sheared_plane() {
     let mut parts = SceneParts::named("plane");
     let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
-    let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("a plane");
-    parts.shapes = vec![Shape::new(mesh, Modes::rigid()).expect("a shape")];
+    let mesh =
+        Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("expected a valid mesh");
+    parts.shapes = vec![Shape::new(mesh, Modes::rigid()).expect("expected a valid shape")];
     parts.materials = vec![Material::default()];
     parts.domains = vec![domain(0, "plane".into())];
-    let scene = Scene::new(parts).expect("a scene");
+    let scene = Scene::new(parts).expect("expected a valid scene");
     let mut state = SceneState::rest(&scene);
     // z += x tilts the plane about y. Transforming the normal by A itself would leave it upright.
     state.transforms[0].0[8] = 1.0;
     let mut cpu = CpuDeformer::new(&scene);
-    cpu.deform(&state).expect("deforms");
-    let surface = cpu.surface().expect("a surface");
+    cpu.deform(&state).expect("expected the step to succeed");
+    let surface = cpu.surface().expect("expected a surface");
     let edge = [surface.positions[3], surface.positions[4], surface.positions[5]];
     let dot = |normal: &[f32]| -> f32 { normal.iter().zip(edge).map(|(a, b)| a * b).sum() };
     assert!(dot(&surface.normals[..3]).abs() < 1e-6);
@@ -168,7 +172,7 @@ fn only_overflow_makes_bounds_non_finite() {
     let mut bounds = |amount: f32| {
         let mut state = SceneState::rest(&scene);
         state.q.fill(amount);
-        cpu.deform(&state).expect("deforms").bounds
+        cpu.deform(&state).expect("expected the step to succeed").bounds
     };
     assert!(bounds(1e30).is_finite());
     assert!(!bounds(3e38).is_finite());
@@ -185,15 +189,15 @@ fn runs_are_bit_identical_and_zero_rows_do_not_move() {
     for mode in 0..8 {
         columns[900 * mode..][..30].fill(0.0);
     }
-    shape.modes = Modes::from_columns(900, 8, columns).expect("modes");
+    shape.modes = Modes::from_columns(900, 8, columns).expect("expected valid modes");
     parts.shapes = vec![shape];
     parts.materials = vec![Material::default()];
     parts.domains = vec![domain(0, "clamped".into())];
-    let scene = Scene::new(parts).expect("a scene");
+    let scene = Scene::new(parts).expect("expected a valid scene");
     let mut cpu = CpuDeformer::new(&scene);
     let mut run = |state: &SceneState| {
-        cpu.deform(state).expect("deforms");
-        cpu.surface().expect("a surface").positions.clone()
+        cpu.deform(state).expect("expected the step to succeed");
+        cpu.surface().expect("expected a surface").positions.clone()
     };
     let still = run(&SceneState::rest(&scene));
     let mut state = shaken(&scene);

@@ -8,7 +8,8 @@ use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use v1::TransformFormat::{AffineF32, RigidF32, RigidF64, Unspecified};
 
 use crate::service_harness::{
-    ReceivedVertices, Server, config, expected, far_strips, get_vertices, rigid_step, state_after, step, strips,
+    ReceivedVertices, Server, config, far_strips, get_vertices, reference_vertices, rigid_step, state_after_steps,
+    step, strips,
 };
 
 /// Placement of one domain: quaternion x y z w and translation.
@@ -60,16 +61,16 @@ fn largest(got: &[Vector3<f64>], want: &[Vector3<f64>]) -> f64 {
 }
 
 async fn cpu() -> Server {
-    Server::with(|config| Config { backend: BackendChoice::Cpu, ..config }).await
+    Server::start_with(|config| Config { backend: BackendChoice::Cpu, ..config }).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn transform_formats_agree_at_any_byte_alignment() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
     let place = (turn(0.3, -0.8, 2.0), [1.5, -2.25, 1e3]);
-    let matrix = state_after(&strips(), &[rigid_step(0, RigidF32, &[(1, place.0, place.1)])]).transforms[1];
+    let matrix = state_after_steps(&strips(), &[rigid_step(0, RigidF32, &[(1, place.0, place.1)])]).transforms[1];
     let affine = |format: v1::TransformFormat| v1::Step {
         transform_domains: vec![1],
         transforms: bytemuck::cast_slice::<f32, u8>(&matrix.0).to_vec().into(),
@@ -82,7 +83,7 @@ async fn transform_formats_agree_at_any_byte_alignment() {
         rigid_step(0, RigidF32, &[(1, place.0, place.1)]),
         rigid_step(0, RigidF64, &[(1, place.0, place.1)]),
     ];
-    let want = expected(&strips(), &steps[..1]);
+    let want = reference_vertices(&strips(), &steps[..1]);
     for (number, mut step) in steps.into_iter().enumerate() {
         step.number = number as u64;
         // An odd number of bytes before the transforms changes their alignment within the message.
@@ -95,7 +96,7 @@ async fn transform_formats_agree_at_any_byte_alignment() {
     }
     // Control: another rotation gives other vertices.
     let other = rigid_step(9, RigidF32, &[(1, turn(0.3, -0.8, 2.1), place.1)]);
-    assert_ne!(expected(&strips(), &[other]).0, want.0);
+    assert_ne!(reference_vertices(&strips(), &[other]).0, want.0);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -135,7 +136,7 @@ async fn far_scene_and_far_domain_keep_millimeter_precision() {
 /// vertices.
 #[tokio::test(flavor = "multi_thread")]
 async fn origin_follows_a_moved_scene_and_survives_a_restart() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
     let settings = || Config { backend: BackendChoice::Cpu, ..config(folder.path()) };
     let server = Server::start(settings()).await;
     let scene = strips();
@@ -154,7 +155,7 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
     let error = largest(&told(&scene, &got), &want);
     assert!(error <= 1e-3, "{error} m");
     driver.finish().await;
-    server.stop().await.expect("a clean stop");
+    server.stop().await.expect("expected the server to stop without an error");
     let server = Server::start(settings()).await;
     let kept = get_vertices(&server, ask("strips", &[])).await.expect("vertices");
     assert_eq!((kept.step().number, &kept.positions, &kept.head.origin), (4, &got.positions, &got.head.origin));

@@ -2,7 +2,7 @@
 
 use modalcast_proto::v1;
 
-use crate::service_harness::{Server, expected, get_vertices, step, twig};
+use crate::service_harness::{Server, get_vertices, reference_vertices, step, twig};
 
 const BRANCH: u32 = 1;
 const LEAF: u32 = 2;
@@ -24,14 +24,14 @@ const SHIFT: [f32; 12] = [1.0, 0.0, 0.0, 7.0, 0.0, 1.0, 0.0, 8.0, 0.0, 0.0, 1.0,
 
 #[tokio::test(flavor = "multi_thread")]
 async fn moved_branch_moves_only_its_leaves() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("twig").await;
     let mut driver = server.drive("twig", v1::Policy::Lossless, 0).await;
     let at_rest = get_vertices(&server, ask(&[])).await.expect("vertices").positions;
     let step = moved(0, &[BRANCH], &[TURN]);
     driver.step_acknowledged(step.clone()).await;
     let got = get_vertices(&server, ask(&[])).await.expect("vertices").positions;
-    assert_eq!(got, expected(&twig(), &[step]).0);
+    assert_eq!(got, reference_vertices(&twig(), &[step]).0);
     assert_eq!(got[..12], at_rest[..12], "the other strip stays");
     // The first vertex of the leaf is the origin of the leaf's frame, which is at (0.5, 1, -0.25) in the branch's
     // frame. The leaflet applies the same frame again within the leaf's frame.
@@ -39,7 +39,7 @@ async fn moved_branch_moves_only_its_leaves() {
     let first = |domain: usize| [got[12 * domain], got[12 * domain + 1], got[12 * domain + 2]];
     assert_eq!(first(LEAF as usize), turned([0.5, 1.0, -0.25]));
     assert_eq!(first(LEAFLET as usize), turned([-0.5, 1.5, -0.5]));
-    assert!((1..4).all(|domain| got[12 * domain..][..12] != at_rest[12 * domain..][..12]), "the judge can fail");
+    assert!((1..4).all(|domain| got[12 * domain..][..12] != at_rest[12 * domain..][..12]), "negative control");
     driver.finish().await;
 }
 
@@ -47,14 +47,14 @@ async fn moved_branch_moves_only_its_leaves() {
 /// refused and none of it is applied.
 #[tokio::test(flavor = "multi_thread")]
 async fn transform_of_a_follower_is_refused_whole() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("twig").await;
     let mut driver = server.drive("twig", v1::Policy::Lossless, 0).await;
     // Transforms without a list of domains are those of both strips; the two followers have none.
     let all = moved(0, &[], &[SHIFT, TURN]);
     driver.step_acknowledged(all.clone()).await;
     let got = get_vertices(&server, ask(&[])).await.expect("vertices").positions;
-    assert_eq!(got, expected(&twig(), &[all]).0);
+    assert_eq!(got, reference_vertices(&twig(), &[all]).0);
     let wrong = v1::Step { q_domains: vec![0], q: vec![1; 8].into(), ..moved(1, &[BRANCH, LEAFLET], &[SHIFT, TURN]) };
     driver.step(wrong).await;
     let refusal = driver.rejection().await;

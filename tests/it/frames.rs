@@ -7,10 +7,10 @@ use prost::Message as _;
 use tonic::{Code, Status, Streaming};
 use v1::render_frame_request::Step as Which;
 
-use crate::service_harness::{Server, details, step, within};
+use crate::service_harness::{Server, rejection_details, step, with_timeout};
 
 async fn server() -> Server {
-    let server = Server::with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
+    let server = Server::start_with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
     server.open("strips").await;
     server
 }
@@ -30,17 +30,17 @@ struct Frame {
 }
 
 async fn render(server: &Server, request: v1::RenderFrameRequest) -> Result<Frame, Status> {
-    let mut stream = within(server.frames().await.render_frame(request)).await?.into_inner();
+    let mut stream = with_timeout(server.frames().await.render_frame(request)).await?.into_inner();
     let mut head = None;
     let mut bytes = Vec::new();
-    while let Some(response) = within(stream.message()).await? {
+    while let Some(response) = with_timeout(stream.message()).await? {
         assert!(response.encoded_len() <= (1 << 20) + 4096);
-        let chunk = response.chunk.expect("a chunk");
+        let chunk = response.chunk.expect("expected a chunk");
         assert_eq!(chunk.offset, bytes.len() as u64);
         head = head.or(chunk.head);
         bytes.extend_from_slice(&chunk.data);
     }
-    let head = head.expect("a head");
+    let head = head.expect("expected a head");
     assert_eq!(head.total, bytes.len() as u64);
     Ok(Frame { head, bytes })
 }
@@ -48,8 +48,8 @@ async fn render(server: &Server, request: v1::RenderFrameRequest) -> Result<Fram
 async fn next(stream: &mut Streaming<v1::StreamFramesResponse>) -> Option<v1::FrameHead> {
     let mut head: Option<v1::FrameHead> = None;
     let mut got = 0;
-    while let Some(response) = within(stream.message()).await.expect("goes on") {
-        let chunk = response.chunk.expect("a chunk");
+    while let Some(response) = with_timeout(stream.message()).await.expect("expected another message") {
+        let chunk = response.chunk.expect("expected a chunk");
         got += chunk.data.len() as u64;
         head = head.or(chunk.head);
         if head.as_ref().is_some_and(|head| head.total == got) {
@@ -67,13 +67,13 @@ async fn frame_names_its_step_and_png_equals_rgba() {
     assert_eq!(rest.head.step.map(|step| step.run), Some(0));
     driver.step_acknowledged(step(5, &[], &[0.9, 0.3, -0.9, 0.2])).await;
     let raw = render(&server, v1::RenderFrameRequest { step: Some(Which::ExactStep(5)), ..request() }).await;
-    let raw = raw.expect("a frame");
+    let raw = raw.expect("expected a frame");
     assert_eq!(raw.head.step, Some(v1::StepId { run: 1, number: 5, time: 2.5 }));
     assert_eq!((raw.head.width, raw.head.height, raw.bytes.len()), (64, 48, 64 * 48 * 4));
     assert_ne!(raw.bytes, rest.bytes, "the step is to be seen");
     let png = v1::RenderFrameRequest { picture: picture(64, 48, v1::Format::Png), ..request() };
-    let png = render(&server, png).await.expect("a frame");
-    let decoded = image::load_from_memory(&png.bytes).expect("a PNG").into_rgba8();
+    let png = render(&server, png).await.expect("expected a frame");
+    let decoded = image::load_from_memory(&png.bytes).expect("expected a PNG file").into_rgba8();
     assert_eq!(decoded.into_raw(), raw.bytes);
     let stages: Vec<&str> = png.head.stages.iter().map(|stage| stage.stage.as_str()).collect();
     for stage in ["deform", "draw", "read", "encode"] {
@@ -88,10 +88,10 @@ async fn frame_names_its_step_and_png_equals_rgba() {
 async fn large_frame_is_chunked_for_default_client_limits() {
     let server = server().await;
     let large = v1::RenderFrameRequest { picture: picture(1600, 1000, v1::Format::Rgba), ..request() };
-    let frame = render(&server, large).await.expect("a frame");
+    let frame = render(&server, large).await.expect("expected a frame");
     assert_eq!(frame.bytes.len(), 1600 * 1000 * 4);
     let unsized_picture = v1::RenderFrameRequest { picture: None, ..request() };
-    let frame = render(&server, unsized_picture).await.expect("a frame");
+    let frame = render(&server, unsized_picture).await.expect("expected a frame");
     assert_eq!((frame.head.width, frame.head.height, frame.head.format()), (1280, 720, v1::Format::Png));
 }
 
@@ -107,8 +107,8 @@ async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
         frames,
     };
     let mut client = server.frames().await;
-    let lossless = client.stream_frames(subscribe(v1::Delivery::Lossless, 12)).await.expect("subscribes");
-    let latest = client.stream_frames(subscribe(v1::Delivery::Latest, 0)).await.expect("subscribes");
+    let lossless = client.stream_frames(subscribe(v1::Delivery::Lossless, 12)).await.expect("expected a subscription");
+    let latest = client.stream_frames(subscribe(v1::Delivery::Latest, 0)).await.expect("expected a subscription");
     let (mut lossless, mut latest) = (lossless.into_inner(), latest.into_inner());
     let mut driver = server.drive("strips", v1::Policy::Lossless, 3).await;
     let write = async {
@@ -118,7 +118,7 @@ async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
     };
     let read = async {
         for number in 1..=12 {
-            let head = next(&mut lossless).await.expect("a frame");
+            let head = next(&mut lossless).await.expect("expected a frame");
             assert_eq!((head.step.map(|step| step.number), head.skipped), (Some(number), 0));
         }
         assert!(next(&mut lossless).await.is_none(), "it ends after its count");
@@ -127,8 +127,8 @@ async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
         let mut last = 0;
         let mut counted = 0;
         while last < 12 {
-            let head = next(&mut latest).await.expect("a frame");
-            let number = head.step.expect("a step").number;
+            let head = next(&mut latest).await.expect("expected a frame");
+            let number = head.step.expect("expected a valid step").number;
             assert!(number > last);
             counted += 1 + head.skipped;
             assert_eq!(counted, number, "every step is shown or counted");
@@ -169,13 +169,13 @@ async fn bad_pictures_are_refused_and_deadlines_hold() {
         bad.picture.as_mut().expect("a picture").camera = Some(camera);
         let status = render(&server, bad).await.err().expect(field);
         assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
-        assert!(details(&status).field.starts_with(field), "{:?} is not {field}", details(&status));
+        assert!(rejection_details(&status).field.starts_with(field), "{:?} is not {field}", rejection_details(&status));
     }
     for (width, height) in [(0, 48), (48, 0), (1_000_000, 48), (48, u32::MAX)] {
         let bad = v1::RenderFrameRequest { picture: picture(width, height, v1::Format::Png), ..request() };
         let status = render(&server, bad).await.err().expect("a size");
-        assert_eq!((status.code(), details(&status).field.as_str()), (Code::InvalidArgument, "picture.size"));
-        assert_eq!(details(&status).given, format!("{width} x {height}"));
+        assert_eq!((status.code(), rejection_details(&status).field.as_str()), (Code::InvalidArgument, "picture.size"));
+        assert_eq!(rejection_details(&status).given, format!("{width} x {height}"));
     }
     let late = v1::RenderFrameRequest { step: Some(Which::MinimumStep(1)), deadline_ms: 60, ..request() };
     assert_eq!(render(&server, late).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
@@ -185,5 +185,5 @@ async fn bad_pictures_are_refused_and_deadlines_hold() {
         let mut stream = server.frames().await.render_frame(hasty).await?.into_inner();
         stream.message().await
     };
-    assert_eq!(within(ended).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
+    assert_eq!(with_timeout(ended).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
 }

@@ -18,17 +18,23 @@ fn texel(scene: &Scene, deformed: &DeformSummary, is_lit: bool) -> [f64; 2] {
         bounds: deformed.bounds,
         light,
     };
-    shadow_texel_axes(scene, &shot).expect("the look has a shadow").map(|side| side.norm())
+    shadow_texel_axes(scene, &shot).expect("expected a scene with a shadow").map(|side| side.norm())
 }
 
 /// Texels fitted to the light-space boxes of tiles have less than half the area of texels fitted to the corners of the
 /// bounds, and less than 1.2 times the area of texels fitted to the exact vertices.
 #[test]
 fn fitted_shadow_texels_of_the_tree_have_half_the_area() {
-    let scene = load::open("tree").expect("built in").scene;
+    let scene = load::open("tree").expect("expected the built-in scene").scene;
     let state = SceneState::rest(&scene);
-    let exact = ReferenceDeformer::new(&scene).with_bounding_axes(scene.light_axes()).deform(&state).expect("deforms");
-    let tiled = CpuDeformer::new(&scene).with_bounding_axes(scene.light_axes()).deform(&state).expect("deforms");
+    let exact = ReferenceDeformer::new(&scene)
+        .with_bounding_axes(scene.light_axes())
+        .deform(&state)
+        .expect("expected the step to succeed");
+    let tiled = CpuDeformer::new(&scene)
+        .with_bounding_axes(scene.light_axes())
+        .deform(&state)
+        .expect("expected the step to succeed");
     let [corners, tiled, exact] =
         [texel(&scene, &exact, false), texel(&scene, &tiled, true), texel(&scene, &exact, true)];
     eprintln!("texel of the tree: {corners:?} by corners, {tiled:?} by boxes of tiles, {exact:?} by vertices");

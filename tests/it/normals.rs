@@ -1,14 +1,14 @@
 //! Exact normals and tangents: the reference is compared with algebra, and the CPU deformer with the reference.
 
-mod build;
 mod extremes;
-mod kept;
+mod fixtures;
+mod normal_reuse;
 
 use modalcast_compute::reference;
 use modalcast_model::scene::NormalMethod;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
-use build::{
+use fixtures::{
     bent, cube, degrees, exact, largest_angle, on_cpu, scene, scene_with, sheet, sphere, state, tube, with_mode,
 };
 
@@ -53,7 +53,7 @@ fn bent_strip_has_normals_and_tangents_of_its_parabola() {
     assert!(largest > 40.0, "rigid normals are off by {largest} degrees");
     assert!(largest_angle(&cpu.normals, &normals) < TOLERANCE);
     let rigid_scene = scene_with(scene.shapes.clone(), NormalMethod::Rigid);
-    assert!(largest_angle(&on_cpu(&rigid_scene, &state).normals, &normals) > 40.0, "the judge can fail");
+    assert!(largest_angle(&on_cpu(&rigid_scene, &state).normals, &normals) > 40.0, "negative control");
 }
 
 #[test]
@@ -107,7 +107,8 @@ fn exact_normals_equal_rigid_ones_at_zero_q() {
     let normals = corners.normals.iter().map(|_| [noise.next(), noise.next(), noise.next()]).collect();
     let rest = authored.rest().iter().map(|[x, y, _]| [*x, *y, 0.3 * noise.next()]).collect();
     let triangles = authored.triangles().to_vec();
-    authored = modalcast_model::domain::Mesh::from_indexed(rest, normals, corners.uvs, triangles).expect("a sheet");
+    authored = modalcast_model::domain::Mesh::from_indexed(rest, normals, corners.uvs, triangles)
+        .expect("expected a valid mesh");
     let scene = scene(vec![with_mode(authored, parabola), with_mode(cube(), parabola)]);
     for linear in linear_parts() {
         let mut state = state(&scene, 0.0, linear, [1.0, -2.0, 0.5]);
@@ -124,7 +125,7 @@ fn exact_normals_equal_rigid_ones_at_zero_q() {
         assert!(largest_angle(&cpu.normals, &rigid) < TOLERANCE);
         state.q.fill(1.0);
         let (bent, _) = exact(&scene, &state);
-        assert!(largest_angle(&cpu.normals, &bent) > 10.0, "the judge can fail");
+        assert!(largest_angle(&cpu.normals, &bent) > 10.0, "negative control");
     }
 }
 
@@ -156,7 +157,7 @@ fn rest_normals_opposite_to_the_winding_stay_opposite() {
     let down = vec![[0.0, 0.0, -1.0]; 81];
     let flipped =
         modalcast_model::domain::Mesh::from_indexed(mesh.rest().to_vec(), down, vec![], mesh.triangles().to_vec());
-    let scene = scene(vec![with_mode(mesh, parabola), with_mode(flipped.expect("a sheet"), parabola)]);
+    let scene = scene(vec![with_mode(mesh, parabola), with_mode(flipped.expect("expected a valid mesh"), parabola)]);
     let (normals, _) = exact(&scene, &bent(&scene, 0.5));
     for corner in 0..81 {
         assert!(degrees(normals[corner], normals[81 + corner]) > 180.0 - 1e-5);
@@ -190,12 +191,12 @@ fn transforms_act_on_bent_normals_by_their_cofactors() {
 fn tangents_are_unit_and_orthogonal_to_normals() {
     let bare = modalcast_model::domain::Mesh::from_indexed(
         sheet(5, 5).rest().to_vec(),
-        vec![build::UP; 25],
+        vec![fixtures::UP; 25],
         vec![],
         sheet(5, 5).triangles().to_vec(),
     );
     let wave = |[x, y, _]: [f32; 3]| [0.2 * y * y, 0.1 * x, (3.0 * x + y).sin()];
-    let scene = scene(vec![with_mode(bare.expect("a sheet"), wave), with_mode(sheet(17, 17), wave)]);
+    let scene = scene(vec![with_mode(bare.expect("expected a valid mesh"), wave), with_mode(sheet(17, 17), wave)]);
     for linear in linear_parts() {
         let state = state(&scene, 0.4, linear, [0.0; 3]);
         let cpu = on_cpu(&scene, &state);
@@ -216,8 +217,8 @@ fn tangents_are_unit_and_orthogonal_to_normals() {
 /// Smoothing groups exist only in scenes with exact normals, and there only for shapes with modes.
 #[test]
 fn only_deformable_shapes_have_smoothing_groups() {
-    let rigid =
-        modalcast_model::domain::Shape::new(sheet(3, 3), modalcast_model::domain::Modes::rigid()).expect("rigid");
+    let rigid = modalcast_model::domain::Shape::new(sheet(3, 3), modalcast_model::domain::Modes::rigid())
+        .expect("expected a valid shape");
     let shapes = || vec![with_mode(sheet(3, 3), parabola), rigid.clone()];
     let asks = scene(shapes());
     assert!(asks.needs.exact_normals);

@@ -9,15 +9,15 @@ use modalcast_model::scene::Scene;
 use modalcast_proto::v1;
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
-use crate::service_harness::{Server, far_strips, rigid_step, sheet, state_after, step, strips};
+use crate::service_harness::{Server, far_strips, rigid_step, sheet, state_after_steps, step, strips};
 
 /// Tolerance of picked positions against the reference's triangle, in scene units, for f32 vertices of a few units.
 const NEAR: f64 = 2e-6;
 
 async fn server(source: &str) -> (Server, Client) {
-    let server = Server::with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
+    let server = Server::start_with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
     server.open(source).await;
-    let client = Client::connect(&server.address).await.expect("connects");
+    let client = Client::connect(&server.address).await.expect("expected a connection");
     (server, client)
 }
 
@@ -56,7 +56,7 @@ fn whole_force(scene: &Scene, hit: &Hit, linear: Matrix3<f64>, force: Vector3<f6
 }
 
 fn position(scene: &Scene, steps: &[v1::Step], hit: &Hit) -> Vector3<f64> {
-    let deformed = reference::deform(scene, &state_after(scene, steps));
+    let deformed = reference::deform(scene, &state_after_steps(scene, steps));
     let first = scene.layout.slots[hit.domain as usize].first_vertex;
     let corners = hit.vertices.iter().map(|vertex| Vector3::from(deformed[first + *vertex as usize]));
     corners.zip(hit.barycentric).map(|(corner, share)| corner * share).sum()
@@ -79,9 +79,9 @@ async fn reduced_force_of_a_pick_equals_the_force_of_the_scene() {
         driver.step_acknowledged(step).await;
     }
     let request = PickRequest::new("strips", PickRectangle::pixel(picture(), 0, 0).size(64, 64)).exact_step(2);
-    let picks = client.pick(&request).await.expect("picks");
+    let picks = client.pick(&request).await.expect("expected a pick");
     assert_eq!(picks.step.number, 2);
-    let state = state_after(&scene, &steps);
+    let state = state_after_steps(&scene, &steps);
     let force = Vector3::new(0.3, -2.0, 1.1);
     let mut counts = [0; 2];
     for hit in &picks.hits {
@@ -92,11 +92,11 @@ async fn reduced_force_of_a_pick_equals_the_force_of_the_scene() {
         assert!((&got - &want).norm() < 1e-6 * force.norm(), "{got} is not {want}");
         assert!((Vector3::from(hit.position) - position(&scene, &steps, hit)).norm() < NEAR && on_ray(hit), "{hit:?}");
     }
-    assert!(counts.iter().all(|count| *count > 200), "control: both domains are seen, {counts:?}");
+    assert!(counts.iter().all(|count| *count > 200), "negative control: both domains are seen, {counts:?}");
     let turned = picks.hits.iter().find(|hit| hit.domain == 1).expect("counted");
     let without_turn = whole_force(&scene, turned, Matrix3::identity(), force);
     let got = DVector::from_vec(turned.reduced_force(force.into()));
-    assert!((got - without_turn).norm() > 0.1, "control: A matters");
+    assert!((got - without_turn).norm() > 0.1, "negative control: A matters");
     let now = client.pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 44, 37))).await.expect("now");
     assert!((Vector3::from(now.hits[0].position) - Vector3::from(before.hits[0].position)).norm() > 0.01, "it moved");
 }
@@ -112,7 +112,7 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
     let all = client
         .pick(&PickRequest::new("sheet", PickRectangle::pixel(picture, 100, 100).size(64, 64)))
         .await
-        .expect("picks");
+        .expect("expected a pick");
     assert_eq!(all.hits.len(), 64 * 64, "the sheet fills the view");
     let scene = sheet();
     for hit in all.hits.iter().step_by(97) {
@@ -126,7 +126,7 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
             PickRectangle { without_modes: true, ..PickRectangle::pixel(picture, 0, 0).size(2, 1) },
         ))
         .await
-        .expect("picks");
+        .expect("expected a pick");
     assert!(bare.hits.iter().all(|hit| hit.modes.is_empty() && hit.rank == 4));
 
     let (server, client) = server_of_far().await;
@@ -143,7 +143,7 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
     let hit = client
         .pick(&PickRequest::new("far", PickRectangle::pixel(picture, 32, 32)))
         .await
-        .expect("picks")
+        .expect("expected a pick")
         .hits
         .remove(0);
     let off = (Vector3::from(hit.position) - Vector3::from(near(0.4, 0.45, 0.0))).norm();
@@ -201,7 +201,7 @@ async fn bad_rectangles_outputs_and_steps_are_refused() {
     ] {
         let request = v1::RenderFrameRequest { scene: "strips".into(), picture: Some(picture), ..Default::default() };
         let status = server.frames().await.render_frame(request).await.expect_err(field);
-        assert_eq!(crate::service_harness::details(&status).field, field);
+        assert_eq!(crate::service_harness::rejection_details(&status).field, field);
     }
 }
 
@@ -212,7 +212,7 @@ async fn outputs_have_their_format_and_agree_with_picks() {
     driver.step_acknowledged(step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3])).await;
     let show = async |output| {
         let request = FrameRequest::new("strips", Picture { output, ..picture() });
-        client.frame(&request.minimum_step(1)).await.expect("a frame")
+        client.frame(&request.minimum_step(1)).await.expect("expected a frame")
     };
     let (depth, domains, normals) =
         (show(Output::Depth).await, show(Output::Domains).await, show(Output::Normals).await);
@@ -223,7 +223,7 @@ async fn outputs_have_their_format_and_agree_with_picks() {
     let picks = client
         .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 20, 10).size(64, 64)))
         .await
-        .expect("picks");
+        .expect("expected a pick");
     let word = |bytes: &[u8], at: usize| <[u8; 4]>::try_from(&bytes[4 * at..][..4]).expect("four bytes");
     let mut differ = 0;
     for hit in &picks.hits {
@@ -243,7 +243,10 @@ async fn outputs_have_their_format_and_agree_with_picks() {
         show(Output::ModeShape { mode: 1, largest: 0.0 }).await,
     ];
     for (at, map) in maps.iter().enumerate() {
-        assert_eq!((map.format, image::load_from_memory(&map.bytes).expect("a PNG").width()), (FrameFormat::Png, 96));
+        assert_eq!(
+            (map.format, image::load_from_memory(&map.bytes).expect("expected a PNG file").width()),
+            (FrameFormat::Png, 96)
+        );
         assert!(map.bytes != color && maps[..at].iter().all(|other| other.bytes != map.bytes), "{at}");
     }
 }
@@ -260,8 +263,11 @@ async fn distant_domains_are_picked_by_nearby_cameras() {
         let view = View::LookAt { eye: near(0.4, 0.45, 3.0), target: near(0.4, 0.45, 0.0), up: [0.0, 1.0, 0.0] };
         let camera = Some(Camera { view, lens: Lens::FieldOfView(40.0), clip: None });
         let picture = Picture { width: 65, height: 65, camera, ..Picture::default() };
-        let hits =
-            client.pick(&PickRequest::new("strips", PickRectangle::pixel(picture, 32, 32))).await.expect("picks").hits;
+        let hits = client
+            .pick(&PickRequest::new("strips", PickRectangle::pixel(picture, 32, 32)))
+            .await
+            .expect("expected a pick")
+            .hits;
         let off = (Vector3::from(hits[0].position) - Vector3::from(near(0.4, 0.45, 0.0))).norm();
         assert!(hits[0].domain == domain && off < 1e-3, "{off} units from {at:?}: {hits:?}");
     }

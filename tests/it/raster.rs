@@ -208,7 +208,7 @@ fn fan_covers_every_sample_once() {
     soup.positions.chunks_exact_mut(3).for_each(|position| position[2] = 0.0);
     assert!(takers(&soup, false).iter().all(|count| *count == 1));
     let twice = takers(&soup, true).iter().filter(|count| **count > 1).count();
-    assert!(twice > 100, "control: without the rule {twice} samples are taken twice or more");
+    assert!(twice > 100, "negative control: without the rule {twice} samples are taken twice or more");
 }
 
 #[test]

@@ -13,8 +13,8 @@ use v1::drive_scene_response::Kind as ResponseKind;
 
 use crate::common::attributes;
 use crate::service_harness::{
-    ReceivedVertices, Server, details, expected, get_vertices, next_vertices, state_after, step,
-    strips_with_attributes, within,
+    ReceivedVertices, Server, get_vertices, next_vertices, reference_vertices, rejection_details, state_after_steps,
+    step, strips_with_attributes, with_timeout,
 };
 
 fn ask(scene: &str, selection: v1::VertexSelection) -> v1::GetVerticesRequest {
@@ -32,7 +32,7 @@ fn alone(domains: &[u32]) -> v1::VertexSelection {
 /// Displacements u of the f64 reference after some steps.
 fn expected_u(steps: &[v1::Step]) -> Vec<f32> {
     let scene = strips_with_attributes();
-    let u = reference::displacements(&scene, &state_after(&scene, steps));
+    let u = reference::displacements(&scene, &state_after_steps(&scene, steps));
     u.into_flattened().into_iter().map(|number| number as f32).collect()
 }
 
@@ -60,13 +60,14 @@ fn turned() -> v1::Step {
 #[tokio::test(flavor = "multi_thread")]
 async fn displacements_and_boxes_come_with_or_without_vertices() {
     for backend in [BackendChoice::Reference, BackendChoice::Cpu] {
-        let server = Server::with(|config| Config { backend, ..config }).await;
+        let server = Server::start_with(|config| Config { backend, ..config }).await;
         server.open("kept").await;
         let mut driver = server.drive("kept", Policy::Lossless, 0).await;
         let steps = [step(1, &[1], &[0.5, -0.25]), turned()];
         for sent in 0..steps.len() {
             driver.step_acknowledged(steps[sent].clone()).await;
-            let (x, u) = (expected(&strips_with_attributes(), &steps[..=sent]).0, expected_u(&steps[..=sent]));
+            let (x, u) =
+                (reference_vertices(&strips_with_attributes(), &steps[..=sent]).0, expected_u(&steps[..=sent]));
             let check = |got: &ReceivedVertices, domains: std::ops::Range<usize>| {
                 let floats = 12 * domains.start..12 * domains.end;
                 assert!(largest_error(&got.displacements, &u[floats.clone()]) < 1e-6);
@@ -95,7 +96,7 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn box_stream_delivers_every_step() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("kept").await;
     let boxes = v1::VertexSelection { boxes: true, without_vertices: true, ..Default::default() };
     let request = v1::StreamVerticesRequest {
@@ -104,14 +105,15 @@ async fn box_stream_delivers_every_step() {
         delivery: v1::Delivery::Lossless.into(),
         steps: 2,
     };
-    let mut stream = server.vertices().await.stream_vertices(request).await.expect("subscribes").into_inner();
+    let mut stream =
+        server.vertices().await.stream_vertices(request).await.expect("expected a subscription").into_inner();
     let mut driver = server.drive("kept", Policy::Lossless, 0).await;
     let steps = [step(1, &[1], &[0.5, -0.25]), turned()];
     for sent in 0..steps.len() {
         driver.step_acknowledged(steps[sent].clone()).await;
-        let got = next_vertices(&mut stream).await.expect("goes on").expect("a step");
+        let got = next_vertices(&mut stream).await.expect("expected another message").expect("expected a valid step");
         assert_eq!(got.step().number, steps[sent].number);
-        assert_eq!(got.boxes, boxes_of(&expected(&strips_with_attributes(), &steps[..=sent]).0));
+        assert_eq!(got.boxes, boxes_of(&reference_vertices(&strips_with_attributes(), &steps[..=sent]).0));
         assert!(got.displacements.is_empty() && got.positions.is_empty());
     }
 }
@@ -125,7 +127,7 @@ fn parts_of(shown: &modalcast::engine::StepOutput) -> (usize, &DeformedSurface) 
 /// Feeds with different attributes receive every step while the next step is computed.
 #[tokio::test(flavor = "multi_thread")]
 async fn readers_of_different_parts_get_every_step() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("kept").await;
     let engine = server.engine.find("kept").expect("open");
     let nothing = VertexAttributes::default();
@@ -146,13 +148,13 @@ async fn readers_of_different_parts_get_every_step() {
         driver.step(step.clone()).await;
     }
     let want = |sent: usize| {
-        let ((x, n), u) = (expected(&strips_with_attributes(), &steps[..=sent]), expected_u(&steps[..=sent]));
+        let ((x, n), u) = (reference_vertices(&strips_with_attributes(), &steps[..=sent]), expected_u(&steps[..=sent]));
         (x, n, u)
     };
     let boxes = |surface: &DeformedSurface| -> Vec<f32> {
         surface.boxes.iter().flat_map(|side| [side.min, side.max].concat()).map(|number| number as f32).collect()
     };
-    let shown = within(late.next()).await.expect("the newest");
+    let shown = with_timeout(late.next()).await.expect("the newest");
     let (sent, surface) = parts_of(&shown);
     let (x, n, u) = want(sent);
     assert!(surface.positions == x && surface.normals == n && boxes(surface) == boxes_of(&x));
@@ -161,7 +163,7 @@ async fn readers_of_different_parts_get_every_step() {
     for sent in 0..40 {
         let (x, n, u) = want(sent);
         for (feed, wanted) in feeds.iter_mut().zip(wishes) {
-            let shown = within(feed.next()).await.expect("goes on");
+            let shown = with_timeout(feed.next()).await.expect("expected another message");
             let (number, surface) = parts_of(&shown);
             assert_eq!((number, shown.skipped), (sent, 0));
             assert!(!wanted.positions || surface.positions == x, "step {sent}");
@@ -181,7 +183,7 @@ async fn readers_of_different_parts_get_every_step() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn attributes_not_kept_are_refused_by_option_name() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     for (selection, field, option) in [
         (
@@ -197,7 +199,7 @@ async fn attributes_not_kept_are_refused_by_option_name() {
         ),
     ] {
         let refusal = get_vertices(&server, ask("strips", selection.clone())).await.expect_err("not kept");
-        let why = details(&refusal);
+        let why = rejection_details(&refusal);
         assert_eq!(
             (refusal.code(), why.field.as_str()),
             (Code::InvalidArgument, format!("selection.{field}").as_str())
@@ -209,14 +211,14 @@ async fn attributes_not_kept_are_refused_by_option_name() {
             ..v1::StreamVerticesRequest::default()
         };
         let refusal = server.vertices().await.stream_vertices(request).await.expect_err("not kept");
-        assert_eq!(details(&refusal), why);
+        assert_eq!(rejection_details(&refusal), why);
     }
 }
 
 /// The state before the refused step stays readable.
 #[tokio::test(flavor = "multi_thread")]
 async fn displacement_overflow_refuses_the_step() {
-    let server = Server::with(|config| Config { backend: BackendChoice::Cpu, ..config }).await;
+    let server = Server::start_with(|config| Config { backend: BackendChoice::Cpu, ..config }).await;
     server.open("kept").await;
     let mut driver = server.drive("kept", Policy::Lossless, 0).await;
     driver.step_acknowledged(step(1, &[1], &[0.5, -0.25])).await;

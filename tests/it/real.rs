@@ -13,7 +13,7 @@ use modalcast_model::scene::{Scene, SceneState};
 use modalcast_proto::v1;
 
 use crate::deformers::TestRng;
-use crate::service_harness::{Server, config, details, get_vertices};
+use crate::service_harness::{Server, config, get_vertices, rejection_details};
 use crate::tolerance::largest_error;
 
 /// Real inputs with modes.
@@ -47,13 +47,13 @@ fn bent(scene: &Scene, fraction: f64) -> SceneState {
 fn agrees(scene: &Arc<Scene>) {
     let state = bent(scene, 0.0501);
     let mut cpu = CpuDeformer::new(scene);
-    cpu.deform(&state).expect("deforms");
-    let bent = cpu.surface().expect("a surface").positions.clone();
+    cpu.deform(&state).expect("expected the step to succeed");
+    let bent = cpu.surface().expect("expected a surface").positions.clone();
     let error = largest_error(&bent, &reference::deform(scene, &state)) / scene.rest_bounds.diagonal();
     println!("{}: cpu is off by {error:.2e} of the diagonal", scene.name);
     assert!(error <= 1e-5, "{}: {error}", scene.name);
-    cpu.deform(&SceneState { q: vec![0.0; state.q.len()], ..state.clone() }).expect("deforms");
-    let still = cpu.surface().expect("a surface").positions.clone();
+    cpu.deform(&SceneState { q: vec![0.0; state.q.len()], ..state.clone() }).expect("expected the step to succeed");
+    let still = cpu.surface().expect("expected a surface").positions.clone();
     let (mut clamped, mut moved) = (0, 0);
     for (domain, slot) in scene.layout.slots.iter().enumerate() {
         let modes = &scene.shape_of(domain).modes;
@@ -73,7 +73,7 @@ fn agrees(scene: &Arc<Scene>) {
 
 #[test]
 fn tree_agrees_with_its_reference() {
-    agrees(&load::open("tree").expect("the tree").scene);
+    agrees(&load::open("tree").expect("expected the built-in scene").scene);
 }
 
 #[test]
@@ -89,7 +89,7 @@ fn real_modal_inputs_agree_with_their_reference() {
 /// Opens every modal input on a server with this backend, drives one step over gRPC and compares the streamed vertices
 /// with the reference.
 async fn streamed_agrees(backend: BackendChoice) {
-    let state = tempfile::tempdir().expect("a folder");
+    let state = tempfile::tempdir().expect("expected a temporary folder");
     let repository = Arc::new(load::SceneRepository::new(Some(Path::new(&data("")))).expect("the real inputs"));
     let server = Server::start_from(Config { backend, ..config(state.path()) }, repository).await;
     for source in MODAL.iter().chain(&["tree"]) {
@@ -128,14 +128,17 @@ async fn gpu_streamed_vertices_of_real_inputs_equal_the_reference() {
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 async fn real_malformed_modes_are_refused_and_the_server_continues() {
-    let (state, scenes) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
+    let (state, scenes) = (
+        tempfile::tempdir().expect("expected a temporary folder"),
+        tempfile::tempdir().expect("expected a temporary folder"),
+    );
     std::fs::copy(data("sofa/ball/modes.txt"), scenes.path().join("modes.txt")).expect("copied");
     std::fs::copy(data("sofa/hexaBeam/hexaBeam.derived.obj"), scenes.path().join("ball.obj")).expect("copied");
-    let repository = Arc::new(load::SceneRepository::new(Some(scenes.path())).expect("a repository"));
+    let repository = Arc::new(load::SceneRepository::new(Some(scenes.path())).expect("expected a repository"));
     let server = Server::start_from(config(state.path()), repository).await;
     let open = |source: &str| v1::OpenSceneRequest { source: source.into(), scene: String::new() };
     let refusal = server.scenes().await.open_scene(open("ball.obj")).await.expect_err("malformed");
-    let why = details(&refusal);
+    let why = rejection_details(&refusal);
     assert!(why.expected.contains("684 x 32") && why.given.contains("684 x 35"), "{why:?}");
     server.scenes().await.open_scene(open("tree")).await.expect("the server lives");
 }

@@ -7,7 +7,7 @@ use modalcast_proto::v1;
 use sha2::{Digest as _, Sha256};
 use v1::upload_scene_request::Part;
 
-use crate::service_harness::{Server, TIMEOUT, config, expected, get_vertices, step, strips};
+use crate::service_harness::{Server, TIMEOUT, config, get_vertices, reference_vertices, step, strips};
 
 fn ask(scene: &str) -> v1::GetVerticesRequest {
     v1::GetVerticesRequest { scene: scene.into(), ..v1::GetVerticesRequest::default() }
@@ -52,14 +52,14 @@ fn shown_by_the_next_server(state: &Path) -> (v1::StepId, Vec<f32>) {
 
 #[test]
 fn stopped_server_restores_scenes_and_last_steps() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
     let before = runtime().block_on(async {
         let server = Server::start(config(folder.path())).await;
         let before = play(&server).await;
-        server.stop().await.expect("a clean stop");
+        server.stop().await.expect("expected the server to stop without an error");
         before
     });
-    assert_eq!(before, expected(&strips(), &steps()).0);
+    assert_eq!(before, reference_vertices(&strips(), &steps()).0);
     let (step, after) = shown_by_the_next_server(folder.path());
     assert_eq!((step.run, step.number, step.time), (1, 9, 4.5));
     assert_eq!(after, before);
@@ -68,8 +68,8 @@ fn stopped_server_restores_scenes_and_last_steps() {
 /// The files are copied once the checkpoint of the last step is written; a server on the copy restores that step.
 #[test]
 fn killed_server_restores_the_last_checkpoint() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let copy = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    let copy = tempfile::tempdir().expect("expected a temporary folder");
     let doomed = runtime();
     let before = doomed.block_on(async {
         let server = Server::start(config(folder.path())).await;
@@ -81,9 +81,9 @@ fn killed_server_restores_the_last_checkpoint() {
             assert!(begin.elapsed() < TIMEOUT, "the step was never kept");
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
-        std::fs::create_dir(copy.path().join("steps")).expect("a folder");
+        std::fs::create_dir(copy.path().join("steps")).expect("expected a temporary folder");
         for file in ["scenes.json", "steps/strips.step"] {
-            std::fs::copy(folder.path().join(file), copy.path().join(file)).expect("copies");
+            std::fs::copy(folder.path().join(file), copy.path().join(file)).expect("expected a surface");
         }
         before
     });
@@ -97,11 +97,11 @@ fn killed_server_restores_the_last_checkpoint() {
 
 #[test]
 fn scene_with_a_damaged_checkpoint_starts_at_rest() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
     runtime().block_on(async {
         let server = Server::start(config(folder.path())).await;
         play(&server).await;
-        server.stop().await.expect("a clean stop");
+        server.stop().await.expect("expected the server to stop without an error");
     });
     let path = folder.path().join("steps/strips.step");
     let mut bytes = std::fs::read(&path).expect("it was kept");
@@ -109,13 +109,13 @@ fn scene_with_a_damaged_checkpoint_starts_at_rest() {
     std::fs::write(&path, bytes).expect("damages it");
     let (step, after) = shown_by_the_next_server(folder.path());
     assert_eq!(step.run, 0);
-    assert_eq!(after, expected(&strips(), &[]).0);
+    assert_eq!(after, reference_vertices(&strips(), &[]).0);
 }
 
 /// When the list of scenes cannot be written, opening and deleting fail, and the failed opening leaves its name free.
 #[test]
 fn catalog_write_failure_fails_the_call() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
     let open = |source: &str| v1::OpenSceneRequest { source: source.into(), scene: "name".into() };
     let delete = || v1::DeleteSceneRequest { scene: "name".into() };
     runtime().block_on(async {
@@ -140,7 +140,7 @@ fn catalog_write_failure_fails_the_call() {
 
 #[test]
 fn restart_restores_uploads_but_not_deleted_scenes() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
     runtime().block_on(async {
         let server = Server::start(config(folder.path())).await;
         play(&server).await;
@@ -154,10 +154,10 @@ fn restart_restores_uploads_but_not_deleted_scenes() {
         let parts =
             [Part::Header(header), Part::File(file), Part::Chunk(b"str"[..].into()), Part::Chunk(b"ips"[..].into())];
         let requests = parts.map(|part| v1::UploadSceneRequest { part: Some(part) });
-        server.scenes().await.upload_scene(tokio_stream::iter(requests)).await.expect("uploads");
+        server.scenes().await.upload_scene(tokio_stream::iter(requests)).await.expect("expected the upload to succeed");
         let delete = v1::DeleteSceneRequest { scene: "strips".into() };
-        server.scenes().await.delete_scene(delete).await.expect("deletes");
-        server.stop().await.expect("a clean stop");
+        server.scenes().await.delete_scene(delete).await.expect("expected the deletion to succeed");
+        server.stop().await.expect("expected the server to stop without an error");
     });
     runtime().block_on(async {
         let server = Server::start(config(folder.path())).await;

@@ -9,7 +9,9 @@ use tokio_stream::StreamExt as _;
 use v1::Array;
 use v1::describe_scene_response::Part;
 
-use crate::service_harness::{Server, details, expected, get_vertices, sheet, strips, within};
+use crate::service_harness::{
+    Server, get_vertices, reference_vertices, rejection_details, sheet, strips, with_timeout,
+};
 
 /// A source whose first opening fails on a signal, and whose later openings take 100 ms.
 struct FailsOnce {
@@ -39,7 +41,7 @@ impl SceneSource for FailsOnce {
 /// Two openings of one name overlap. The first fails, the second succeeds and stays registered.
 #[tokio::test(flavor = "multi_thread")]
 async fn opening_after_a_concurrent_failure_is_registered() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
     let (fail, told) = std::sync::mpsc::sync_channel(1);
     let source = std::sync::Arc::new(FailsOnce { opened: 0.into(), fail: told.into() });
     let server = Server::start_from(crate::service_harness::config(folder.path()), source.clone()).await;
@@ -54,10 +56,10 @@ async fn opening_after_a_concurrent_failure_is_registered() {
     let second = open();
     tokio::time::sleep(std::time::Duration::from_millis(50)).await;
     fail.send(()).expect("it listens");
-    assert!(within(first).await.expect("no panic").is_err());
-    within(second).await.expect("no panic").expect("opens");
+    assert!(with_timeout(first).await.expect("expected the task not to panic").is_err());
+    with_timeout(second).await.expect("expected the task not to panic").expect("opens");
     server.engine.find("strips").expect("what was opened is there");
-    server.engine.close("strips").await.expect("closes");
+    server.engine.close("strips").await.expect("expected the scene to close");
     server.engine.open("other", "strips").await.expect("its name is free for another source");
 }
 
@@ -70,7 +72,7 @@ async fn describe(server: &Server, scene: &str, arrays: &[Array]) -> (Vec<v1::Do
     let mut stream = server.scenes().await.describe_scene(request).await.expect("describes").into_inner();
     let mut domains = Vec::new();
     let mut contents: Vec<Vec<u8>> = Vec::new();
-    while let Some(response) = within(stream.message()).await.expect("goes on") {
+    while let Some(response) = with_timeout(stream.message()).await.expect("expected another message") {
         assert!(response.encoded_len() <= LARGEST);
         match response.part.expect("a part") {
             Part::Scene(info) => assert_eq!(info.scene, scene),
@@ -94,7 +96,7 @@ async fn modes(server: &Server, scene: &str, domain: u32, vertices: &[u32]) -> V
     let mut stream = server.scenes().await.read_modes(request).await.expect("reads").into_inner();
     let mut bytes = Vec::new();
     let mut total = 0;
-    while let Some(response) = within(stream.message()).await.expect("goes on") {
+    while let Some(response) = with_timeout(stream.message()).await.expect("expected another message") {
         assert!(response.encoded_len() <= LARGEST);
         assert_eq!(response.offset, bytes.len() as u64);
         bytes.extend_from_slice(&response.data);
@@ -106,7 +108,7 @@ async fn modes(server: &Server, scene: &str, domain: u32, vertices: &[u32]) -> V
 
 #[tokio::test(flavor = "multi_thread")]
 async fn client_can_read_the_whole_scene() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     let info = server.open("strips").await;
     assert_eq!((info.domains, info.vertices, info.corners, info.triangles, info.coordinates), (2, 8, 8, 4, 4));
     assert_eq!((info.up.as_str(), info.unit, info.last_step), ("y", 1.0, None));
@@ -137,7 +139,7 @@ async fn client_can_read_the_whole_scene() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn description_contains_follow_parents_and_frames() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("twig").await;
     let (domains, _) = describe(&server, "twig", &[]).await;
     assert_eq!(domains.iter().map(|domain| domain.follows).collect::<Vec<_>>(), [None, None, Some(1), Some(2)]);
@@ -148,7 +150,7 @@ async fn description_contains_follow_parents_and_frames() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn large_replies_are_chunked_for_default_client_limits() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("sheet").await;
     let scene = sheet();
     let (_, contents) = describe(&server, "sheet", &[Array::Indices, Array::RestPositions]).await;
@@ -162,47 +164,56 @@ async fn large_replies_are_chunked_for_default_client_limits() {
     let ask = v1::GetVerticesRequest { scene: "sheet".into(), ..v1::GetVerticesRequest::default() };
     let got = get_vertices(&server, ask).await.expect("vertices");
     assert_eq!(got.step().run, 0, "no step was made yet");
-    assert_eq!((got.positions, got.normals), expected(&scene, &[]));
+    assert_eq!((got.positions, got.normals), reference_vertices(&scene, &[]));
 }
 
 /// Deleting the scene ends the streams of all readers and writers with `NotFound`.
 #[tokio::test(flavor = "multi_thread")]
 async fn concurrent_openings_share_one_scene() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     let (a, b, c) = tokio::join!(server.open("strips"), server.open("strips"), server.open("strips"));
     assert!(a == b && b == c);
     let list = server.scenes().await.list_scenes(v1::ListScenesRequest {}).await.expect("lists").into_inner();
     assert_eq!(list.scenes.iter().map(|scene| scene.scene.as_str()).collect::<Vec<_>>(), ["strips"]);
     assert_eq!(list.sources, ["panic", "sheet", "strips"]);
     let request = v1::StreamVerticesRequest { scene: "strips".into(), ..v1::StreamVerticesRequest::default() };
-    let mut stream = server.vertices().await.stream_vertices(request).await.expect("subscribes").into_inner();
+    let mut stream =
+        server.vertices().await.stream_vertices(request).await.expect("expected a subscription").into_inner();
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
     let delete = v1::DeleteSceneRequest { scene: "strips".into() };
-    server.scenes().await.delete_scene(delete).await.expect("deletes");
-    let end = within(stream.message()).await.expect_err("the scene is gone");
-    assert_eq!((end.code(), details(&end).given.as_str()), (tonic::Code::NotFound, "'strips'"));
-    let end = within(driver.replies.message()).await.expect_err("the scene is gone");
+    server.scenes().await.delete_scene(delete).await.expect("expected the deletion to succeed");
+    let end = with_timeout(stream.message()).await.expect_err("the scene is gone");
+    assert_eq!((end.code(), rejection_details(&end).given.as_str()), (tonic::Code::NotFound, "'strips'"));
+    let end = with_timeout(driver.replies.message()).await.expect_err("the scene is gone");
     assert_eq!(end.code(), tonic::Code::NotFound);
     server.open("strips").await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn scene_limit_holds_and_a_deleted_scene_frees_a_slot() {
-    let server = Server::with(|config| modalcast::config::Config { open_scenes: 1, ..config }).await;
+    let server = Server::start_with(|config| modalcast::config::Config { open_scenes: 1, ..config }).await;
     server.open("strips").await;
     let more = v1::OpenSceneRequest { source: "sheet".into(), scene: String::new() };
     let status = server.scenes().await.open_scene(more).await.expect_err("full");
-    assert_eq!((status.code(), details(&status).expected.as_str()), (tonic::Code::ResourceExhausted, "at most 1"));
-    server.scenes().await.delete_scene(v1::DeleteSceneRequest { scene: "strips".into() }).await.expect("deletes");
+    assert_eq!(
+        (status.code(), rejection_details(&status).expected.as_str()),
+        (tonic::Code::ResourceExhausted, "at most 1")
+    );
+    server
+        .scenes()
+        .await
+        .delete_scene(v1::DeleteSceneRequest { scene: "strips".into() })
+        .await
+        .expect("expected the deletion to succeed");
     server.open("sheet").await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn server_without_renderer_refuses_only_frames() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let mut client = v1::server_service_client::ServerServiceClient::new(server.channel().await);
-    let info = client.get_server_info(v1::GetServerInfoRequest {}).await.expect("an info").into_inner();
+    let info = client.get_server_info(v1::GetServerInfoRequest {}).await.expect("expected the scene info").into_inner();
     assert_eq!((info.backend.as_str(), info.software), ("reference", false));
     assert!(info.renderer.contains("switched off"), "{}", info.renderer);
     let limits = info.limits.expect("limits");
@@ -210,7 +221,7 @@ async fn server_without_renderer_refuses_only_frames() {
     let request = v1::StreamFramesRequest { scene: "strips".into(), ..v1::StreamFramesRequest::default() };
     let status = server.frames().await.stream_frames(request).await.expect_err("no renderer");
     assert_eq!(status.code(), tonic::Code::Unavailable);
-    assert!(details(&status).given.contains("switched off"));
+    assert!(rejection_details(&status).given.contains("switched off"));
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -219,12 +230,12 @@ async fn health_and_reflection_answer_and_stop_ends_streams() {
     use tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient;
     use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;
     use tonic_reflection::pb::v1::server_reflection_response::MessageResponse;
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let mut health = tonic_health::pb::health_client::HealthClient::new(server.channel().await);
     for service in ["", "modalcast.v1.StepService"] {
         let request = tonic_health::pb::HealthCheckRequest { service: service.into() };
-        let status = health.check(request).await.expect("an answer").into_inner();
+        let status = health.check(request).await.expect("expected a reply").into_inner();
         assert_eq!(status.status(), tonic_health::pb::health_check_response::ServingStatus::Serving);
     }
     let ask = ServerReflectionRequest {
@@ -232,7 +243,8 @@ async fn health_and_reflection_answer_and_stop_ends_streams() {
         message_request: Some(MessageRequest::ListServices(String::new())),
     };
     let mut client = ServerReflectionClient::new(server.channel().await);
-    let mut answers = client.server_reflection_info(tokio_stream::iter([ask])).await.expect("an answer").into_inner();
+    let mut answers =
+        client.server_reflection_info(tokio_stream::iter([ask])).await.expect("expected a reply").into_inner();
     let answer = answers.next().await.expect("one").expect("fine").message_response;
     let Some(MessageResponse::ListServicesResponse(list)) = answer else { panic!("{answer:?}") };
     let names: Vec<_> = list.service.into_iter().map(|service| service.name).collect();
@@ -245,11 +257,11 @@ async fn health_and_reflection_answer_and_stop_ends_streams() {
     let mut watched = watched.expect("a watch").into_inner();
     assert_eq!(watched.message().await.expect("fine").expect("one").status, 1);
     let read = async {
-        assert_eq!(within(watched.message()).await.expect("fine").expect("one").status, 2, "not serving");
-        let end = within(driver.replies.message()).await.expect_err("the server stops");
+        assert_eq!(with_timeout(watched.message()).await.expect("fine").expect("one").status, 2, "not serving");
+        let end = with_timeout(driver.replies.message()).await.expect_err("the server stops");
         assert_eq!(end.code(), tonic::Code::Unavailable);
         drop((watched, driver, health, client, answers));
     };
     let (stopped, ()) = tokio::join!(server.stop(), read);
-    stopped.expect("a clean stop");
+    stopped.expect("expected the server to stop without an error");
 }

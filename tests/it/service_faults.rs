@@ -15,12 +15,12 @@ use v1::Policy;
 use v1::drive_scene_response::Kind as ResponseKind;
 use v1::upload_scene_request::Part;
 
-use crate::service_harness::{Driver, Server, TIMEOUT, step, within};
+use crate::service_harness::{Driver, Server, TIMEOUT, step, with_timeout};
 
 /// Another stream on the same connection continues.
 #[tokio::test(flavor = "multi_thread")]
 async fn flood_of_steps_is_merged_under_latest() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("sheet").await;
     server.open("strips").await;
     let channel = server.channel().await;
@@ -33,12 +33,17 @@ async fn flood_of_steps_is_merged_under_latest() {
     let send = async {
         for number in 1..=COUNT {
             let kind = Some(v1::drive_scene_request::Kind::Step(step(number, &[], &[])));
-            sender.send(v1::DriveSceneRequest { kind }).await.expect("the stream lives");
+            sender.send(v1::DriveSceneRequest { kind }).await.expect("expected an open stream");
         }
     };
     let read = async {
         loop {
-            match within(replies.message()).await.expect("goes on").expect("a reply").kind {
+            match with_timeout(replies.message())
+                .await
+                .expect("expected another message")
+                .expect("expected a reply")
+                .kind
+            {
                 Some(ResponseKind::Ack(ack)) if ack.step == COUNT => return ack.skipped,
                 Some(ResponseKind::Ack(_)) => {}
                 other => panic!("{other:?}"),
@@ -57,7 +62,7 @@ async fn flood_of_steps_is_merged_under_latest() {
 /// Only the stream ends; its connection stays usable.
 #[tokio::test(flavor = "multi_thread")]
 async fn writer_that_reads_no_refusals_is_disconnected() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let channel = server.channel().await;
     let mut driver = Driver::connect(channel.clone()).await;
@@ -82,11 +87,11 @@ async fn writer_that_reads_no_refusals_is_disconnected() {
             }
         }
     };
-    let mut next = within(next).await;
+    let mut next = with_timeout(next).await;
     next.step_acknowledged(step(0, &[0], &[0.1, 0.2])).await;
     let mut refusals = 0;
     let end = loop {
-        match within(replies.message()).await {
+        match with_timeout(replies.message()).await {
             Ok(Some(_)) => refusals += 1,
             Ok(None) => panic!("the stream ended as if nothing was wrong"),
             Err(status) => break status,
@@ -94,18 +99,18 @@ async fn writer_that_reads_no_refusals_is_disconnected() {
     };
     assert!(refusals < 20_000, "{refusals}");
     assert_eq!(end.code(), Code::ResourceExhausted, "{end:?}");
-    within(flood).await.expect("it ends with its stream");
+    with_timeout(flood).await.expect("it ends with its stream");
     next.step_acknowledged(step(1, &[0], &[0.1, 0.2])).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn silent_connection_is_closed_and_active_one_is_not() {
-    let server = Server::with(|config| Config { first_byte_timeout: Duration::from_millis(60), ..config }).await;
+    let server = Server::start_with(|config| Config { first_byte_timeout: Duration::from_millis(60), ..config }).await;
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
     let address = server.address.trim_start_matches("http://").to_owned();
-    let mut silent = TcpStream::connect(address).await.expect("connects");
-    let read = within(silent.read(&mut [0; 1])).await;
+    let mut silent = TcpStream::connect(address).await.expect("expected a connection");
+    let read = with_timeout(silent.read(&mut [0; 1])).await;
     assert!(matches!(read, Ok(0) | Err(_)), "{read:?}");
     driver.step_acknowledged(step(1, &[0], &[0.1, 0.2])).await;
 }
@@ -113,7 +118,7 @@ async fn silent_connection_is_closed_and_active_one_is_not() {
 #[tokio::test(flavor = "multi_thread")]
 async fn frozen_writer_loses_its_lease() {
     let (keepalive_interval, keepalive_timeout) = (Duration::from_millis(100), Duration::from_millis(100));
-    let server = Server::with(|config| Config { keepalive_interval, keepalive_timeout, ..config }).await;
+    let server = Server::start_with(|config| Config { keepalive_interval, keepalive_timeout, ..config }).await;
     server.open("strips").await;
     let proxy = Proxy::start(server.address.trim_start_matches("http://").to_owned()).await;
     let mut frozen = Driver::connect(proxy.channel().await).await;
@@ -129,54 +134,54 @@ async fn frozen_writer_loses_its_lease() {
             }
         }
     };
-    within(next).await;
+    with_timeout(next).await;
     assert!(begin.elapsed() < Duration::from_secs(10), "{:?}", begin.elapsed());
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn server_stops_in_time_despite_unread_streams() {
     let drain_timeout = Duration::from_millis(300);
-    let server = Server::with(|config| Config { drain_timeout, ..config }).await;
+    let server = Server::start_with(|config| Config { drain_timeout, ..config }).await;
     server.open("sheet").await;
     let subscribe =
         v1::StreamVerticesRequest { scene: "sheet".into(), delivery: 1, ..v1::StreamVerticesRequest::default() };
     // A subscriber that never reads, and a writer that never reads its replies.
-    let unread = server.vertices().await.stream_vertices(subscribe).await.expect("subscribes");
+    let unread = server.vertices().await.stream_vertices(subscribe).await.expect("expected a subscription");
     let driver = server.drive("sheet", Policy::Lossless, 8).await;
     for number in 1..=8 {
         driver.step(step(number, &[], &[])).await;
     }
     let begin = Instant::now();
-    server.stop().await.expect("a clean stop");
+    server.stop().await.expect("expected the server to stop without an error");
     assert!(begin.elapsed() < Duration::from_secs(5), "{:?}", begin.elapsed());
     drop((unread, driver));
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn silent_upload_times_out_and_leaves_no_files() {
-    let server = Server::with(|config| Config { stall_timeout: Duration::from_millis(60), ..config }).await;
+    let server = Server::start_with(|config| Config { stall_timeout: Duration::from_millis(60), ..config }).await;
     let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5 };
     let part = v1::UploadSceneRequest { part: Some(v1::upload_scene_request::Part::Header(header)) };
     let never = tokio_stream::StreamExt::chain(tokio_stream::iter([part]), tokio_stream::pending());
-    let status = within(server.scenes().await.upload_scene(never)).await.expect_err("it never ends");
+    let status = with_timeout(server.scenes().await.upload_scene(never)).await.expect_err("it never ends");
     assert_eq!(status.code(), Code::DeadlineExceeded);
     let uploads = server.engine.config().state.join("uploads");
-    assert_eq!(std::fs::read_dir(uploads).expect("a folder").count(), 0);
+    assert_eq!(std::fs::read_dir(uploads).expect("expected a temporary folder").count(), 0);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn slow_upload_times_out_despite_short_pauses() {
-    let server = Server::with(|config| Config { stall_timeout: Duration::from_millis(400), ..config }).await;
+    let server = Server::start_with(|config| Config { stall_timeout: Duration::from_millis(400), ..config }).await;
     let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5000 };
     let file = v1::UploadFile { path: "scene.txt".into(), bytes: 5000, sha256: vec![0; 32].into() };
     let parts = [Part::Header(header), Part::File(file)].into_iter();
     let parts = parts.chain(std::iter::repeat_with(|| Part::Chunk(b"x"[..].into())).take(5000));
     let requests = tokio_stream::iter(parts.map(|part| v1::UploadSceneRequest { part: Some(part) }));
     let trickle = tokio_stream::StreamExt::throttle(requests, Duration::from_millis(20));
-    let status = within(server.scenes().await.upload_scene(trickle)).await.expect_err("too slow");
+    let status = with_timeout(server.scenes().await.upload_scene(trickle)).await.expect_err("too slow");
     assert_eq!(status.code(), Code::DeadlineExceeded);
     let uploads = server.engine.config().state.join("uploads");
-    assert_eq!(std::fs::read_dir(uploads).expect("a folder").count(), 0);
+    assert_eq!(std::fs::read_dir(uploads).expect("expected a temporary folder").count(), 0);
 }
 
 /// Forwards connections until it is frozen. Then it keeps them open and forwards nothing.
@@ -187,8 +192,8 @@ struct Proxy {
 
 impl Proxy {
     async fn start(server: String) -> Self {
-        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
-        let address = format!("http://{}", listener.local_addr().expect("an address"));
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("expected a free port");
+        let address = format!("http://{}", listener.local_addr().expect("expected a socket address"));
         let frozen = Arc::new(watch::Sender::new(false));
         let freezing = Arc::clone(&frozen);
         tokio::spawn(async move {
@@ -209,7 +214,11 @@ impl Proxy {
     }
 
     async fn channel(&self) -> Channel {
-        Channel::from_shared(self.address.clone()).expect("an address").connect().await.expect("a connection")
+        Channel::from_shared(self.address.clone())
+            .expect("expected a socket address")
+            .connect()
+            .await
+            .expect("expected a connection")
     }
 
     fn freeze(&self) {

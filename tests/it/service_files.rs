@@ -10,7 +10,7 @@ use sha2::{Digest as _, Sha256};
 use tonic::{Code, Status};
 use v1::upload_scene_request::Part;
 
-use crate::service_harness::{Server, config, details, get_vertices, step};
+use crate::service_harness::{Server, config, get_vertices, rejection_details, step};
 
 const SQUARE: &str = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3 4/4\n";
 
@@ -32,13 +32,13 @@ fn lift() -> Vec<u8> {
 }
 
 async fn server(state: &Path, scenes: &Path) -> Server {
-    let repository = SceneRepository::new(Some(scenes)).expect("a repository");
+    let repository = SceneRepository::new(Some(scenes)).expect("expected a repository");
     Server::start_from(config(state), Arc::new(repository)).await
 }
 
 async fn open(server: &Server, source: &str) -> Result<v1::SceneInfo, Status> {
     let request = v1::OpenSceneRequest { source: source.into(), scene: String::new() };
-    Ok(server.scenes().await.open_scene(request).await?.into_inner().scene.expect("an info"))
+    Ok(server.scenes().await.open_scene(request).await?.into_inner().scene.expect("expected the scene info"))
 }
 
 async fn upload(server: &Server, entry: &str, files: &[(&str, &[u8])]) -> Result<v1::SceneInfo, Status> {
@@ -52,7 +52,7 @@ async fn upload(server: &Server, entry: &str, files: &[(&str, &[u8])]) -> Result
     }
     let requests = parts.into_iter().map(|part| v1::UploadSceneRequest { part: Some(part) }).collect::<Vec<_>>();
     let sent = server.scenes().await.upload_scene(tokio_stream::iter(requests)).await?;
-    Ok(sent.into_inner().scene.expect("an info"))
+    Ok(sent.into_inner().scene.expect("expected the scene info"))
 }
 
 /// Drives the single mode of a scene and returns the position of its last vertex.
@@ -66,9 +66,12 @@ async fn lifted(server: &Server, scene: &str) -> [f32; 3] {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn repository_paths_open_and_cannot_escape() {
-    let (state, outer) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
+    let (state, outer) = (
+        tempfile::tempdir().expect("expected a temporary folder"),
+        tempfile::tempdir().expect("expected a temporary folder"),
+    );
     let scenes = outer.path().join("scenes");
-    std::fs::create_dir_all(scenes.join("deep")).expect("a folder");
+    std::fs::create_dir_all(scenes.join("deep")).expect("expected a temporary folder");
     std::fs::write(scenes.join("deep/square.obj"), SQUARE).expect("written");
     std::fs::write(scenes.join("deep/square.npy"), lift()).expect("written");
     std::fs::write(outer.path().join("secret.obj"), SQUARE).expect("written");
@@ -81,26 +84,32 @@ async fn repository_paths_open_and_cannot_escape() {
     for path in ["../secret.obj", "deep/../../secret.obj", outside.as_str(), "link.obj"] {
         let status = open(&server, path).await.expect_err(path);
         assert_eq!(status.code(), Code::InvalidArgument, "{path}: {status:?}");
-        let why = details(&status);
+        let why = rejection_details(&status);
         assert!(!why.field.is_empty() && !why.expected.is_empty() && !why.given.is_empty(), "{path}: {why:?}");
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn upload_has_the_grammar_of_the_repository() {
-    let (state, scenes) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
+    let (state, scenes) = (
+        tempfile::tempdir().expect("expected a temporary folder"),
+        tempfile::tempdir().expect("expected a temporary folder"),
+    );
     let server = server(state.path(), scenes.path()).await;
     let manifest = b"model = \"parts/square.obj\"\nmodes = \"parts/u.npy\"\nup = \"z\"\n";
     let files: [(&str, &[u8]); 3] =
         [("scene.toml", manifest), ("parts/square.obj", SQUARE.as_bytes()), ("parts/u.npy", &lift())];
-    let info = upload(&server, "", &files).await.expect("uploads");
+    let info = upload(&server, "", &files).await.expect("expected the upload to succeed");
     assert_eq!((info.scene.as_str(), info.up.as_str(), info.coordinates), ("sent", "z", 1));
     assert_eq!(lifted(&server, "sent").await, [0.0, 1.0, 3.0]);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn bad_files_are_refused_and_leave_no_files() {
-    let (state, scenes) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
+    let (state, scenes) = (
+        tempfile::tempdir().expect("expected a temporary folder"),
+        tempfile::tempdir().expect("expected a temporary folder"),
+    );
     let server = server(state.path(), scenes.path()).await;
     let square = SQUARE.as_bytes();
     let short = &lift()[..150];
@@ -126,12 +135,16 @@ async fn bad_files_are_refused_and_leave_no_files() {
     for (name, files, words) in table {
         let status = upload(&server, "", &files).await.expect_err(name);
         assert!(matches!(status.code(), Code::InvalidArgument | Code::NotFound), "{name}: {status:?}");
-        let why = details(&status);
+        let why = rejection_details(&status);
         assert!(!why.field.is_empty() && !why.expected.is_empty() && !why.given.is_empty(), "{name}: {why:?}");
         for word in words {
             assert!(status.message().contains(word), "{name}: {status:?} lacks {word}");
         }
-        assert_eq!(std::fs::read_dir(state.path().join("uploads")).expect("a folder").count(), 0, "{name}");
+        assert_eq!(
+            std::fs::read_dir(state.path().join("uploads")).expect("expected a temporary folder").count(),
+            0,
+            "{name}"
+        );
     }
     assert!(server.engine.list().is_empty());
     upload(&server, "", &[("a.obj", square)]).await.expect("a good one under the same name");

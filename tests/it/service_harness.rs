@@ -93,7 +93,7 @@ pub(crate) fn far_strips() -> Arc<Scene> {
         origin: [1e7, -1e7, 1e7 + 0.25],
         ..SceneParts::named("far")
     };
-    Scene::new(parts).expect("a scene")
+    Scene::new(parts).expect("expected a valid scene")
 }
 
 /// [`strips`] with larger modes, displacements and boxes.
@@ -101,7 +101,8 @@ pub(crate) fn strips_with_attributes() -> Arc<Scene> {
     let (shape, domains) = two_strips(4.0);
     let deformation = DeformationSettings { displacements: true, boxes: true, ..DeformationSettings::default() };
     let (shapes, materials) = (vec![shape], vec![Material::default()]);
-    Scene::new(SceneParts { shapes, materials, domains, deformation, ..SceneParts::named("kept") }).expect("a scene")
+    Scene::new(SceneParts { shapes, materials, domains, deformation, ..SceneParts::named("kept") })
+        .expect("expected a valid scene")
 }
 
 fn two_strips(size: f32) -> (Shape, Vec<Domain>) {
@@ -129,7 +130,7 @@ fn grid(side: u32) -> Mesh {
     let cells = (0..(side - 1) * (side - 1)).map(|cell| cell % (side - 1) + cell / (side - 1) * side);
     let triangles = cells.flat_map(|at| [[at, at + 1, at + side], [at + 1, at + side + 1, at + side]]).collect();
     let normals = vec![[0.0, 0.0, 1.0]; rest.len()];
-    Mesh::from_indexed(rest, normals, uvs, triangles).expect("a grid")
+    Mesh::from_indexed(rest, normals, uvs, triangles).expect("expected a valid mesh")
 }
 
 fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
@@ -155,7 +156,7 @@ fn scene(name: &str, shape: Shape, domains: Vec<Domain>) -> Arc<Scene> {
     };
     let materials = vec![Material::default()];
     let parts = SceneParts { shapes: vec![shape], materials, domains, look, ..SceneParts::named(name) };
-    Scene::new(parts).expect("a scene")
+    Scene::new(parts).expect("expected a valid scene")
 }
 
 /// Settings of a test server: reference deformer, no renderer, any free port.
@@ -182,12 +183,12 @@ pub(crate) struct Server {
 
 impl Server {
     /// Starts a server with a fresh state folder.
-    pub(crate) async fn fresh() -> Self {
-        Self::with(|config| config).await
+    pub(crate) async fn start_default() -> Self {
+        Self::start_with(|config| config).await
     }
 
-    pub(crate) async fn with(change: impl FnOnce(Config) -> Config) -> Self {
-        let folder = tempfile::tempdir().expect("a folder");
+    pub(crate) async fn start_with(change: impl FnOnce(Config) -> Config) -> Self {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
         let mut server = Self::start(change(config(folder.path()))).await;
         server.folder = Some(folder);
         server
@@ -199,8 +200,8 @@ impl Server {
 
     pub(crate) async fn start_from(config: Config, source: Arc<dyn SceneSource>) -> Self {
         let config = config.validated().expect("settings");
-        let listener = service::bind(&config).await.expect("a port");
-        let address = format!("http://{}", listener.local_addr().expect("an address"));
+        let listener = service::bind(&config).await.expect("expected a free port");
+        let address = format!("http://{}", listener.local_addr().expect("expected a socket address"));
         let engine = Engine::start(config, source).await.expect("an engine");
         let (stop, stopped) = oneshot::channel();
         let shutdown = async {
@@ -211,7 +212,11 @@ impl Server {
     }
 
     pub(crate) async fn channel(&self) -> Channel {
-        Channel::from_shared(self.address.clone()).expect("an address").connect().await.expect("a connection")
+        Channel::from_shared(self.address.clone())
+            .expect("expected a socket address")
+            .connect()
+            .await
+            .expect("expected a connection")
     }
 
     pub(crate) async fn scenes(&self) -> SceneServiceClient<Channel> {
@@ -229,7 +234,14 @@ impl Server {
     /// Opens a source under its own name.
     pub(crate) async fn open(&self, source: &str) -> v1::SceneInfo {
         let request = v1::OpenSceneRequest { source: source.into(), scene: String::new() };
-        self.scenes().await.open_scene(request).await.expect("opens").into_inner().scene.expect("an info")
+        self.scenes()
+            .await
+            .open_scene(request)
+            .await
+            .expect("opens")
+            .into_inner()
+            .scene
+            .expect("expected the scene info")
     }
 
     /// Opens a step stream and expects success.
@@ -243,12 +255,12 @@ impl Server {
     /// Stops the server and waits for its end.
     pub(crate) async fn stop(mut self) -> Result<()> {
         self.stop.take().expect("not stopped yet").send(()).ok();
-        within(self.task).await.expect("no panic")
+        with_timeout(self.task).await.expect("expected the task not to panic")
     }
 }
 
 /// Awaits a future and panics after [`TIMEOUT`].
-pub(crate) async fn within<T>(work: impl Future<Output = T>) -> T {
+pub(crate) async fn with_timeout<T>(work: impl Future<Output = T>) -> T {
     tokio::time::timeout(TIMEOUT, work).await.expect("an answer in time")
 }
 
@@ -262,7 +274,10 @@ impl Driver {
     pub(crate) async fn connect(channel: Channel) -> Self {
         let (sender, requests) = mpsc::channel(1024);
         let mut client = StepServiceClient::new(channel);
-        let replies = within(client.drive_scene(ReceiverStream::new(requests))).await.expect("a stream").into_inner();
+        let replies = with_timeout(client.drive_scene(ReceiverStream::new(requests)))
+            .await
+            .expect("expected a stream")
+            .into_inner();
         Self { sender, replies }
     }
 
@@ -273,7 +288,7 @@ impl Driver {
     }
 
     pub(crate) async fn send(&self, kind: RequestKind) {
-        self.sender.send(v1::DriveSceneRequest { kind: Some(kind) }).await.expect("the stream lives");
+        self.sender.send(v1::DriveSceneRequest { kind: Some(kind) }).await.expect("expected an open stream");
     }
 
     pub(crate) async fn step(&self, step: v1::Step) {
@@ -281,7 +296,8 @@ impl Driver {
     }
 
     pub(crate) async fn reply(&mut self) -> ResponseKind {
-        let reply = within(self.replies.message()).await.expect("the stream goes on").expect("a reply");
+        let reply =
+            with_timeout(self.replies.message()).await.expect("expected another message").expect("expected a reply");
         reply.kind.expect("a kind")
     }
 
@@ -307,7 +323,7 @@ impl Driver {
     pub(crate) async fn finish(self) {
         let Self { sender, mut replies } = self;
         drop(sender);
-        while within(replies.message()).await.expect("a clean end").is_some() {}
+        while with_timeout(replies.message()).await.expect("a clean end").is_some() {}
     }
 
     /// Both directions, for concurrent use.
@@ -344,14 +360,14 @@ pub(crate) fn rigid_step(number: u64, format: v1::TransformFormat, places: &[(u3
 }
 
 /// Positions and normals of the reference after some steps.
-pub(crate) fn expected(scene: &Scene, steps: &[v1::Step]) -> (Vec<f32>, Vec<f32>) {
-    let state = state_after(scene, steps);
+pub(crate) fn reference_vertices(scene: &Scene, steps: &[v1::Step]) -> (Vec<f32>, Vec<f32>) {
+    let state = state_after_steps(scene, steps);
     let round = |list: Vec<[f64; 3]>| list.into_flattened().into_iter().map(|number| number as f32).collect();
     (round(reference::deform(scene, &state)), round(reference::rigid_normals(scene, &state)))
 }
 
 /// State of the scene after some steps.
-pub(crate) fn state_after(scene: &Scene, steps: &[v1::Step]) -> SceneState {
+pub(crate) fn state_after_steps(scene: &Scene, steps: &[v1::Step]) -> SceneState {
     use v1::TransformFormat as Wire;
     let mut state = SceneState::rest(scene);
     for step in steps.iter().cloned() {
@@ -369,7 +385,7 @@ pub(crate) fn state_after(scene: &Scene, steps: &[v1::Step]) -> SceneState {
             transforms: step.transforms,
             transform_format,
         };
-        state.apply(scene, &StepUpdate::parse(scene, &raw).expect("a good step"));
+        state.apply(scene, &StepUpdate::parse(scene, &raw).expect("expected a valid step"));
     }
     state
 }
@@ -389,7 +405,7 @@ pub(crate) struct ReceivedVertices {
 
 impl ReceivedVertices {
     pub(crate) fn step(&self) -> v1::StepId {
-        self.head.step.expect("a step")
+        self.head.step.expect("expected a valid step")
     }
 }
 
@@ -398,11 +414,11 @@ pub(crate) async fn get_vertices(
     server: &Server,
     request: v1::GetVerticesRequest,
 ) -> Result<ReceivedVertices, tonic::Status> {
-    let mut stream = within(server.vertices().await.get_vertices(request)).await?.into_inner();
+    let mut stream = with_timeout(server.vertices().await.get_vertices(request)).await?.into_inner();
     let mut chunks = Vec::new();
-    while let Some(response) = within(stream.message()).await? {
+    while let Some(response) = with_timeout(stream.message()).await? {
         assert!(response.encoded_len() <= (1 << 20) + 4096, "{} bytes", response.encoded_len());
-        chunks.push(response.chunk.expect("a chunk"));
+        chunks.push(response.chunk.expect("expected a chunk"));
     }
     Ok(join(chunks))
 }
@@ -412,9 +428,9 @@ pub(crate) async fn next_vertices(
     stream: &mut Streaming<v1::StreamVerticesResponse>,
 ) -> Result<Option<ReceivedVertices>, tonic::Status> {
     let mut chunks = Vec::<v1::VertexChunk>::new();
-    while let Some(response) = within(stream.message()).await? {
-        chunks.push(response.chunk.expect("a chunk"));
-        let total = chunks[0].head.as_ref().expect("a head first").total;
+    while let Some(response) = with_timeout(stream.message()).await? {
+        chunks.push(response.chunk.expect("expected a chunk"));
+        let total = chunks[0].head.as_ref().expect("expected a head as the first message").total;
         if chunks.iter().map(|chunk| chunk.data.len() as u64).sum::<u64>() == total {
             return Ok(Some(join(chunks)));
         }
@@ -424,7 +440,7 @@ pub(crate) async fn next_vertices(
 }
 
 fn join(mut chunks: Vec<v1::VertexChunk>) -> ReceivedVertices {
-    let head = chunks[0].head.take().expect("a head first");
+    let head = chunks[0].head.take().expect("expected a head as the first message");
     let mut bytes = Vec::new();
     for chunk in chunks {
         assert_eq!(chunk.offset, bytes.len() as u64);
@@ -443,6 +459,6 @@ fn join(mut chunks: Vec<v1::VertexChunk>) -> ReceivedVertices {
 }
 
 /// Decodes the refusal in the details of a status.
-pub(crate) fn details(status: &tonic::Status) -> v1::Rejection {
+pub(crate) fn rejection_details(status: &tonic::Status) -> v1::Rejection {
     v1::Rejection::decode(status.details()).expect("a rejection in the details")
 }

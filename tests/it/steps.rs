@@ -6,7 +6,9 @@ use modalcast_proto::v1;
 use v1::Policy;
 use v1::drive_scene_response::Kind as ResponseKind;
 
-use crate::service_harness::{Server, expected, get_vertices, next_vertices, sheet, step, strips, within};
+use crate::service_harness::{
+    Server, get_vertices, next_vertices, reference_vertices, sheet, step, strips, with_timeout,
+};
 
 fn vertices_of(scene: &str) -> v1::GetVerticesRequest {
     v1::GetVerticesRequest { scene: scene.into(), ..v1::GetVerticesRequest::default() }
@@ -14,7 +16,7 @@ fn vertices_of(scene: &str) -> v1::GetVerticesRequest {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn acknowledged_steps_have_vertices_of_the_reference() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
     let mut turned = step(1, &[1], &[0.5, -0.25]);
@@ -27,19 +29,19 @@ async fn acknowledged_steps_have_vertices_of_the_reference() {
         let stages: Vec<&str> = ack.stages.iter().map(|stage| stage.stage.as_str()).collect();
         assert_eq!(stages, ["parse", "queue", "deform"]);
         let got = get_vertices(&server, vertices_of("strips")).await.expect("vertices");
-        assert_eq!((got.positions.clone(), got.normals.clone()), expected(&strips(), &steps[..=sent]));
+        assert_eq!((got.positions.clone(), got.normals.clone()), reference_vertices(&strips(), &steps[..=sent]));
         let want = v1::StepId { run: 1, number: steps[sent].number, time: steps[sent].time };
         assert_eq!(got.step(), want);
     }
     // Control: other steps give other vertices.
-    assert_ne!(expected(&strips(), &steps[..2]), expected(&strips(), &steps));
+    assert_ne!(reference_vertices(&strips(), &steps[..2]), reference_vertices(&strips(), &steps));
     driver.finish().await;
 }
 
 /// The stream ends after the requested number of steps.
 #[tokio::test(flavor = "multi_thread")]
 async fn lossless_subscriber_gets_every_step_in_order() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let request = v1::StreamVerticesRequest {
         scene: "strips".into(),
@@ -48,14 +50,16 @@ async fn lossless_subscriber_gets_every_step_in_order() {
         steps: 30,
     };
     // Subscribing needs no step and no writer.
-    let mut stream = server.vertices().await.stream_vertices(request).await.expect("subscribes").into_inner();
+    let mut stream =
+        server.vertices().await.stream_vertices(request).await.expect("expected a subscription").into_inner();
     let mut driver = server.drive("strips", Policy::Lossless, 4).await;
     let steps: Vec<_> = (0..40).map(|number| step(number * 2, &[1], &[0.01 * number as f32, 1.0])).collect();
     let read = async {
         for sent in 0..30 {
-            let got = next_vertices(&mut stream).await.expect("goes on").expect("a step");
+            let got =
+                next_vertices(&mut stream).await.expect("expected another message").expect("expected a valid step");
             assert_eq!((got.step().number, got.head.skipped), (steps[sent].number, 0));
-            assert_eq!(got.positions, expected(&strips(), &steps[..=sent]).0[12..]);
+            assert_eq!(got.positions, reference_vertices(&strips(), &steps[..=sent]).0[12..]);
             assert!(got.normals.is_empty());
         }
         assert!(next_vertices(&mut stream).await.expect("a clean end").is_none());
@@ -71,7 +75,7 @@ async fn lossless_subscriber_gets_every_step_in_order() {
 /// Steps are computed while the vertices of earlier steps are still being sent.
 #[tokio::test(flavor = "multi_thread")]
 async fn overlapped_steps_keep_their_order_and_vertices() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let engine = server.engine.find("strips").expect("open");
     let mut feeds = Vec::new();
@@ -89,17 +93,17 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
         let sent = shown.step.number as usize;
         let stages: Vec<_> = shown.stages.iter().map(|(stage, _)| stage.name()).collect();
         assert_eq!(stages, ["parse", "queue", "deform", "copy"]);
-        assert_eq!(surface.positions, expected(&strips(), &steps[..=sent]).0, "step {sent}");
-        assert_ne!(surface.positions, expected(&strips(), &steps[..=(sent + 1) % 40]).0, "the judge can fail");
+        assert_eq!(surface.positions, reference_vertices(&strips(), &steps[..=sent]).0, "step {sent}");
+        assert_ne!(surface.positions, reference_vertices(&strips(), &steps[..=(sent + 1) % 40]).0, "negative control");
         sent
     };
     let mut latest = feeds.pop().expect("three");
-    let seen = judge(&within(latest.next()).await.expect("the newest"));
+    let seen = judge(&with_timeout(latest.next()).await.expect("the newest"));
     drop(latest);
     assert!(seen < 40);
     for sent in 0..40 {
         for feed in &mut feeds {
-            let shown = within(feed.next()).await.expect("goes on");
+            let shown = with_timeout(feed.next()).await.expect("expected another message");
             assert_eq!((judge(&shown), shown.skipped), (sent, 0));
         }
     }
@@ -112,7 +116,7 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
 /// A subscriber that does not read holds back the writer. A step beyond the window is refused.
 #[tokio::test(flavor = "multi_thread")]
 async fn unread_lossless_feed_applies_back_pressure() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let mut feed = server
         .engine
@@ -134,19 +138,19 @@ async fn unread_lossless_feed_applies_back_pressure() {
     assert_eq!(rejection.expected, "at most 2 steps without acknowledgement");
     // Reading releases the remaining steps. The refused step was not applied.
     for number in 1..=4 {
-        assert_eq!(within(feed.next()).await.expect("goes on").step.number, number);
+        assert_eq!(with_timeout(feed.next()).await.expect("expected another message").step.number, number);
     }
     for number in 3..=4 {
         assert!(matches!(driver.reply().await, ResponseKind::Ack(ack) if ack.step == number));
     }
     let got = get_vertices(&server, vertices_of("strips")).await.expect("vertices");
-    assert_eq!(got.positions, expected(&strips(), &[step(4, &[0], &[0.4, 0.0])]).0);
+    assert_eq!(got.positions, reference_vertices(&strips(), &[step(4, &[0], &[0.4, 0.0])]).0);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn stalled_subscriber_is_cut_off_and_the_writer_goes_on() {
     let stall_timeout = std::time::Duration::from_millis(50);
-    let server = Server::with(|config| modalcast::config::Config { stall_timeout, ..config }).await;
+    let server = Server::start_with(|config| modalcast::config::Config { stall_timeout, ..config }).await;
     server.open("strips").await;
     let mut feed = server
         .engine
@@ -159,17 +163,17 @@ async fn stalled_subscriber_is_cut_off_and_the_writer_goes_on() {
     for number in 1..=6 {
         driver.step_acknowledged(step(number, &[0], &[0.1, 0.0])).await;
     }
-    let cut = within(feed.disconnected()).await;
+    let cut = with_timeout(feed.disconnected()).await;
     assert!(matches!(cut, modalcast_model::error::Error::Busy { .. }), "{cut}");
-    within(feed.next()).await.expect("the first that it held");
-    within(feed.next()).await.expect("the second");
-    assert_eq!(within(feed.next()).await.expect_err("the end"), cut);
+    with_timeout(feed.next()).await.expect("the first that it held");
+    with_timeout(feed.next()).await.expect("the second");
+    assert_eq!(with_timeout(feed.next()).await.expect_err("the end"), cut);
 }
 
 /// The final state equals that after applying every step.
 #[tokio::test(flavor = "multi_thread")]
 async fn latest_policy_merges_steps_and_counts_skipped_ones() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("sheet").await;
     let mut driver = server.drive("sheet", Policy::Latest, 4).await;
     let transform = |offset: f32| -> Vec<u8> {
@@ -193,24 +197,24 @@ async fn latest_policy_merges_steps_and_counts_skipped_ones() {
     assert!(last.skipped > 0, "200 steps were sent at once and {acks} acknowledged before the last");
     assert!(last.skipped + acks < 200);
     let got = get_vertices(&server, vertices_of("sheet")).await.expect("vertices");
-    assert_eq!((got.positions, got.normals), expected(&sheet(), &steps));
+    assert_eq!((got.positions, got.normals), reference_vertices(&sheet(), &steps));
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn latest_subscriber_gets_current_step_and_skip_count() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
     driver.step_acknowledged(step(3, &[0], &[0.1, 0.0])).await;
     let host = server.engine.find("strips").expect("open");
     let mut feed =
         host.subscribe(OutputSpec::Vertices(VertexAttributes::VERTICES), Delivery::Latest).await.expect("a feed");
-    let first = within(feed.next()).await.expect("the current step");
+    let first = with_timeout(feed.next()).await.expect("the current step");
     assert_eq!((first.step.number, first.skipped), (3, 0));
     for number in 4..=8 {
         driver.step_acknowledged(step(number, &[0], &[0.1, 0.0])).await;
     }
-    let second = within(feed.next()).await.expect("the newest step");
+    let second = with_timeout(feed.next()).await.expect("the newest step");
     assert_eq!((second.step.number, second.skipped), (8, 4));
 }
 
@@ -218,7 +222,7 @@ async fn latest_subscriber_gets_current_step_and_skip_count() {
 /// the first writer has left.
 #[tokio::test(flavor = "multi_thread")]
 async fn second_writer_waits_for_the_first_to_leave() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let mut first = server.drive("strips", Policy::Lossless, 0).await;
     first.step_acknowledged(step(100, &[0], &[0.1, 0.0])).await;
@@ -242,12 +246,12 @@ async fn second_writer_waits_for_the_first_to_leave() {
             }
         }
     };
-    assert_eq!(within(third).await, 3);
+    assert_eq!(with_timeout(third).await, 3);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn requests_of_departed_clients_free_their_slots() {
-    let server = Server::with(|config| modalcast::config::Config { max_pending_requests: 4, ..config }).await;
+    let server = Server::start_with(|config| modalcast::config::Config { max_pending_requests: 4, ..config }).await;
     server.open("strips").await;
     let step = Some(v1::get_vertices_request::Step::MinimumStep(99));
     let never = v1::GetVerticesRequest { deadline_ms: 600_000, step, ..vertices_of("strips") };
@@ -255,27 +259,27 @@ async fn requests_of_departed_clients_free_their_slots() {
     // Eight requests wait for a step that never comes. Four of them are refused, and so is every later request.
     let mut waits = Vec::new();
     for _ in 0..8 {
-        waits.push(client.get_vertices(never.clone()).await.expect("a stream").into_inner());
+        waits.push(client.get_vertices(never.clone()).await.expect("expected a stream").into_inner());
     }
     let mut held = tokio::task::JoinSet::new();
     for mut stream in waits {
         held.spawn(async move { stream.message().await.expect_err("no step").code() });
     }
     for _ in 0..4 {
-        let code = within(held.join_next()).await.expect("one of eight").expect("no panic");
+        let code = with_timeout(held.join_next()).await.expect("one of eight").expect("expected the task not to panic");
         assert_eq!(code, tonic::Code::ResourceExhausted);
     }
     let busy = get_vertices(&server, vertices_of("strips")).await.expect_err("all places are taken");
     assert_eq!(busy.code(), tonic::Code::ResourceExhausted);
     held.shutdown().await;
     let served = async { while get_vertices(&server, vertices_of("strips")).await.is_err() {} };
-    within(served).await;
+    with_timeout(served).await;
 }
 
 /// A request for a step that has passed is refused with the number of the step.
 #[tokio::test(flavor = "multi_thread")]
 async fn requests_wait_for_exact_and_minimum_steps() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
     let host = server.engine.find("strips").expect("open");
@@ -290,14 +294,14 @@ async fn requests_wait_for_exact_and_minimum_steps() {
     }
     let mut shown = Vec::new();
     for request in waiting {
-        shown.push(within(request).await.expect("its step").step.number);
+        shown.push(with_timeout(request).await.expect("its step").step.number);
     }
     assert_eq!(shown, [2, 4, 5]);
     let ask = |step| v1::GetVerticesRequest { step: Some(step), ..vertices_of("strips") };
     use v1::get_vertices_request::Step::{ExactStep, MinimumStep};
     let gone = get_vertices(&server, ask(ExactStep(4))).await.expect_err("it has passed");
     assert_eq!(gone.code(), tonic::Code::FailedPrecondition);
-    let why = crate::service_harness::details(&gone);
+    let why = crate::service_harness::rejection_details(&gone);
     assert!(why.given == "4" && why.expected.starts_with('5'), "{why:?}");
     let begin = std::time::Instant::now();
     let late = v1::GetVerticesRequest { deadline_ms: 80, ..ask(MinimumStep(99)) };

@@ -30,7 +30,7 @@ fn scene_of(deformation: DeformationSettings) -> Arc<Scene> {
     let mut twin = domain(3, "instance of 3".into());
     twin.shares_q_with = Some(3);
     parts.domains.push(twin);
-    Scene::new(parts).expect("a scene")
+    Scene::new(parts).expect("expected a valid scene")
 }
 
 /// One domain with these columns of U and rest positions of zero.
@@ -42,15 +42,15 @@ fn columns_of(vertices: usize, columns: Vec<f32>, deformation: DeformationSettin
     let mesh =
         modalcast_model::domain::Mesh::new(vec![[0.0; 3]; vertices], flat.corners().clone(), flat.triangles().to_vec());
     let rank = columns.len() / (3 * vertices);
-    let modes = Modes::from_columns(3 * vertices, rank, columns).expect("modes");
-    parts.shapes = vec![Shape::new(mesh.expect("a mesh"), modes).expect("a shape")];
+    let modes = Modes::from_columns(3 * vertices, rank, columns).expect("expected valid modes");
+    parts.shapes = vec![Shape::new(mesh.expect("expected a valid mesh"), modes).expect("expected a valid shape")];
     parts.domains = vec![domain(0, "columns".into())];
-    Scene::new(parts).expect("a scene")
+    Scene::new(parts).expect("expected a valid scene")
 }
 
 fn run(deformer: &mut CpuDeformer, state: &SceneState) -> (DeformSummary, Vec<f32>) {
-    let told = deformer.deform(state).expect("deforms");
-    (told, deformer.surface().expect("a surface").positions.clone())
+    let told = deformer.deform(state).expect("expected the step to succeed");
+    (told, deformer.surface().expect("expected a surface").positions.clone())
 }
 
 /// Error bound of each tile of a domain, including the bound of the truncated modes.
@@ -227,7 +227,7 @@ fn truncation_budget_in_meters_holds_in_scene_units() {
         parts.materials = vec![Material::default()];
         parts.shapes = vec![strip(300, 24, &mut TestRng(2))];
         parts.domains = vec![domain(0, "strip".into())];
-        let scene = Scene::new(parts).expect("a scene");
+        let scene = Scene::new(parts).expect("expected a valid scene");
         let mut state = SceneState::rest(&scene);
         state.q.iter_mut().enumerate().for_each(|(mode, number)| *number = f32::exp2(-(mode as f32)));
         state.transforms[0] = Transform([2.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
@@ -253,5 +253,5 @@ fn columns_and_rest(scene: &Scene) -> Arc<Scene> {
     parts.materials = scene.materials.clone();
     parts.shapes = scene.shapes.clone();
     parts.domains = scene.domains.clone();
-    Scene::new(parts).expect("a scene")
+    Scene::new(parts).expect("expected a valid scene")
 }

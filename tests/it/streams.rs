@@ -11,7 +11,7 @@ use modalcast_proto::v1;
 use v1::Policy;
 use v1::drive_scene_response::Kind as ResponseKind;
 
-use crate::service_harness::{Server, state_after, step, strips_with_attributes, within};
+use crate::service_harness::{Server, state_after_steps, step, strips_with_attributes, with_timeout};
 
 const SIZE: FrameSize = FrameSize::new(48, 32);
 const STEPS: u64 = 30;
@@ -33,15 +33,15 @@ fn steps() -> Vec<v1::Step> {
 }
 
 /// Reference pictures of every valid step, rendered one by one.
-fn expected(cameras: &[Camera]) -> Vec<(u64, Vec<Vec<u8>>)> {
+fn reference_vertices(cameras: &[Camera]) -> Vec<(u64, Vec<Vec<u8>>)> {
     let (scene, steps) = (strips_with_attributes(), steps());
     let config = Config { backend: BackendChoice::Cpu, ..Config::default() };
     let mut bench = DeviceContext::open(&config).expect("opens");
-    let mut staged = bench.load_scene(&scene, BackendSettings::default()).expect("stages");
+    let mut staged = bench.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
     let mut pictures = Vec::new();
     for step in steps.iter().filter(|step| step.number != BAD) {
-        staged.deform(&state_after(&scene, std::slice::from_ref(step))).expect("deforms");
-        let mut draw = |camera: &Camera| bench.draw(&mut staged, camera, SIZE).expect("draws").rgba;
+        staged.deform(&state_after_steps(&scene, std::slice::from_ref(step))).expect("expected the step to succeed");
+        let mut draw = |camera: &Camera| bench.draw(&mut staged, camera, SIZE).expect("expected a frame").rgba;
         pictures.push((step.number, cameras.iter().map(&mut draw).collect()));
     }
     bench.unload_scene(staged);
@@ -55,7 +55,8 @@ fn pixels(shown: &StepOutput) -> &[u8] {
 
 async fn server() -> Server {
     let server =
-        Server::with(|config| Config { backend: BackendChoice::Cpu, renderer: RendererChoice::Auto, ..config }).await;
+        Server::start_with(|config| Config { backend: BackendChoice::Cpu, renderer: RendererChoice::Auto, ..config })
+            .await;
     server.open("kept").await;
     server
 }
@@ -78,20 +79,20 @@ async fn frames_of_many_cameras_show_their_own_step() {
     for step in steps() {
         driver.step(step).await;
     }
-    let want = expected(&cameras);
+    let want = reference_vertices(&cameras);
     for (number, pictures) in &want {
         if *number == 8 {
             leaver = None;
         }
         if let Some(feed) = &mut leaver {
-            assert_eq!(within(feed.next()).await.expect("goes on").step.number, *number);
+            assert_eq!(with_timeout(feed.next()).await.expect("expected another message").step.number, *number);
         }
         for (feed, picture) in feeds.iter_mut().zip(pictures) {
-            let shown = within(feed.next()).await.expect("goes on");
+            let shown = with_timeout(feed.next()).await.expect("expected another message");
             assert_eq!((shown.step.number, shown.skipped), (*number, 0));
             assert!(pixels(&shown) == picture, "step {number}");
         }
-        assert_eq!(within(vertices.next()).await.expect("goes on").step.number, *number);
+        assert_eq!(with_timeout(vertices.next()).await.expect("expected another message").step.number, *number);
     }
     for number in 0..STEPS {
         match driver.reply().await {
@@ -100,7 +101,7 @@ async fn frames_of_many_cameras_show_their_own_step() {
             other => panic!("{other:?}"),
         }
     }
-    assert!(want[0].1[0] != want[1].1[0] && want[0].1[0] != want[0].1[1], "control: steps and cameras differ");
+    assert!(want[0].1[0] != want[1].1[0] && want[0].1[0] != want[0].1[1], "negative control: steps and cameras differ");
     driver.finish().await;
 }
 
@@ -113,12 +114,12 @@ async fn closing_a_scene_delivers_frames_in_flight() {
     for step in steps().into_iter().take(12) {
         driver.step(step).await;
     }
-    let want = expected(&cameras);
-    let shown = within(feed.next()).await.expect("the first");
+    let want = reference_vertices(&cameras);
+    let shown = with_timeout(feed.next()).await.expect("the first");
     assert!(pixels(&shown) == want[0].1[0]);
-    within(server.engine.close("kept")).await.expect("closes");
+    with_timeout(server.engine.close("kept")).await.expect("expected the scene to close");
     let mut next = 1;
-    while let Ok(shown) = within(feed.next()).await {
+    while let Ok(shown) = with_timeout(feed.next()).await {
         assert_eq!(shown.step.number, next);
         assert!(pixels(&shown) == want[next as usize].1[0]);
         next += 1;

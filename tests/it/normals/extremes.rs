@@ -4,7 +4,7 @@ use modalcast_compute::reference;
 use modalcast_model::scene::Scene;
 use nalgebra::{Matrix3, Vector3};
 
-use super::build::{bent, degrees, exact, largest_angle, on_cpu, scene, sheet, state, tube, with_mode};
+use super::fixtures::{bent, degrees, exact, largest_angle, on_cpu, scene, sheet, state, tube, with_mode};
 use super::{TOLERANCE, linear_parts, parabola};
 
 /// Twice the bound for positions that are rounded once, because the CPU's own sum is rounded a few more times.
@@ -72,7 +72,7 @@ fn zero_area_triangles_do_not_change_normals() {
         let corners = corners.clone();
         let mesh =
             modalcast_model::domain::Mesh::from_indexed(mesh.rest().to_vec(), corners.normals, corners.uvs, triangles);
-        scene(vec![with_mode(mesh.expect("a sheet"), |[x, y, _]| [0.0, 0.0, x + 0.5 * y])])
+        scene(vec![with_mode(mesh.expect("expected a valid mesh"), |[x, y, _]| [0.0, 0.0, x + 0.5 * y])])
     };
     let (dirty, clean) = (of(triangles), of(clean));
     let state = bent(&dirty, 0.8);

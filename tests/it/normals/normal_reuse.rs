@@ -4,7 +4,7 @@ use modalcast_compute::cpu::CpuDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer};
 use modalcast_model::scene::{Scene, SceneState};
 
-use super::build::{cube, scene, sheet, sphere, state, tube, with_mode};
+use super::fixtures::{cube, scene, sheet, sphere, state, tube, with_mode};
 use super::linear_parts;
 use crate::deformers::TestRng;
 
@@ -56,11 +56,11 @@ fn unchanged_domains_keep_their_normals() {
     let scene = scene(meshes.map(|mesh| with_mode(mesh, wave)).into());
     let mut state = state(&scene, 0.4, linear_parts()[2], [1.0, 2.0, 3.0]);
     let mut kept = CpuDeformer::new(&scene);
-    kept.deform(&state).expect("deforms");
+    kept.deform(&state).expect("expected the step to succeed");
     let (mut noise, mut before) = (TestRng(3), kept.surface().expect("one").clone());
     for step in 0..5 {
         let changed = change(&scene, &mut state, step, &mut noise);
-        kept.deform(&state).expect("deforms");
+        kept.deform(&state).expect("expected the step to succeed");
         let now = kept.surface().expect("one").clone();
         for domain in 0..scene.domains.len() {
             let same = normals_of(&scene, &now, domain) == normals_of(&scene, &before, domain);
@@ -69,7 +69,7 @@ fn unchanged_domains_keep_their_normals() {
         for threads in [1, 2, 5] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
             let mut fresh = CpuDeformer::new(&scene);
-            pool.install(|| fresh.deform(&state)).expect("deforms");
+            pool.install(|| fresh.deform(&state)).expect("expected the step to succeed");
             assert!(all(fresh.surface().expect("one")) == all(&now), "step {step}, {threads} threads");
         }
         before = now;

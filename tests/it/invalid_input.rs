@@ -10,7 +10,9 @@ use v1::drive_scene_request::Kind as RequestKind;
 use v1::drive_scene_response::Kind as ResponseKind;
 use v1::upload_scene_request::Part;
 
-use crate::service_harness::{Driver, Server, details, expected, get_vertices, rigid_step, step, strips, within};
+use crate::service_harness::{
+    Driver, Server, get_vertices, reference_vertices, rejection_details, rigid_step, step, strips, with_timeout,
+};
 
 /// An invalid step: the name of the case, the step, and the prefixes of field, expected and given.
 type BadStep = (&'static str, v1::Step, [&'static str; 3]);
@@ -128,7 +130,7 @@ fn begins(rejection: &v1::Rejection, [field, expected, given]: [&str; 3]) -> boo
 /// client continue.
 #[tokio::test(flavor = "multi_thread")]
 async fn bad_steps_are_refused_and_the_stream_stays_open() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "other".into() };
     server.scenes().await.open_scene(request).await.expect("opens");
@@ -136,7 +138,7 @@ async fn bad_steps_are_refused_and_the_stream_stays_open() {
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
     let good = step(10, &[], &[0.1, 0.2, 0.3, 0.4]);
     driver.step_acknowledged(good.clone()).await;
-    let want = expected(&strips(), &[good]);
+    let want = reference_vertices(&strips(), &[good]);
     let ask = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
     // The server keeps the number of a step that it refused for overflow, so the numbers of the following steps
     // increase.
@@ -159,7 +161,7 @@ async fn bad_steps_are_refused_and_the_stream_stays_open() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn stream_opens_after_refused_openings() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let mut driver = Driver::connect(server.channel().await).await;
     driver.step(step(1, &[], &[])).await;
@@ -180,7 +182,7 @@ async fn stream_opens_after_refused_openings() {
 /// The scene keeps its last good step, and the other stream on the same connection continues.
 #[tokio::test(flavor = "multi_thread")]
 async fn oversized_message_ends_only_its_own_stream() {
-    let server = Server::with(|config| modalcast::config::Config { message_bytes: 64 << 10, ..config }).await;
+    let server = Server::start_with(|config| modalcast::config::Config { message_bytes: 64 << 10, ..config }).await;
     server.open("strips").await;
     // Both streams share one connection.
     let channel = server.channel().await;
@@ -193,12 +195,12 @@ async fn oversized_message_ends_only_its_own_stream() {
     let good = step(1, &[0], &[0.5, 0.25]);
     driver.step_acknowledged(good.clone()).await;
     driver.step(step(2, &[0], &vec![0.0; 20_000])).await;
-    let end = within(driver.replies.message()).await.expect_err("a fault of transport");
+    let end = with_timeout(driver.replies.message()).await.expect_err("a fault of transport");
     assert_eq!(end.code(), Code::ResourceExhausted);
-    assert_eq!(details(&end).expected, "at most 65536 bytes");
+    assert_eq!(rejection_details(&end).expected, "at most 65536 bytes");
     let ask = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
     let got = get_vertices(&server, ask).await.expect("vertices");
-    assert_eq!((got.step().number, got.positions), (1, expected(&strips(), &[good]).0));
+    assert_eq!((got.step().number, got.positions), (1, reference_vertices(&strips(), &[good]).0));
     other.step_acknowledged(step(1, &[0], &[0.5, 0.5])).await;
     let mut next = server.drive("strips", Policy::Lossless, 0).await;
     next.step_acknowledged(step(0, &[0], &[0.0, 0.0])).await;
@@ -206,31 +208,31 @@ async fn oversized_message_ends_only_its_own_stream() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn bad_requests_are_refused_with_code_and_details() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     server.open("strips").await;
     let mut scenes = server.scenes().await;
     let mut refuse = Vec::new();
     let selection = Some(v1::VertexSelection { domains: vec![0, 5], ..Default::default() });
     let ask = v1::GetVerticesRequest { scene: "strips".into(), selection, ..v1::GetVerticesRequest::default() };
-    let status = get_vertices(&server, ask).await.expect_err("no such domain");
+    let status = get_vertices(&server, ask).await.expect_err("expected an unknown-domain error");
     refuse.push((status, Code::InvalidArgument, ["selection.domains[1]", "an index below 2", "5"]));
     let ask = v1::GetVerticesRequest { scene: "nowhere".into(), ..v1::GetVerticesRequest::default() };
-    let status = get_vertices(&server, ask).await.expect_err("no such scene");
+    let status = get_vertices(&server, ask).await.expect_err("expected an unknown-scene error");
     refuse.push((status, Code::NotFound, ["scene", "a scene", "'nowhere'"]));
     let request = v1::ReadModesRequest { scene: "strips".into(), domain: 2, vertices: vec![] };
-    let status = scenes.read_modes(request).await.expect_err("no such domain");
+    let status = scenes.read_modes(request).await.expect_err("expected an unknown-domain error");
     refuse.push((status, Code::InvalidArgument, ["domain", "an index below 2", "2"]));
     let request = v1::ReadModesRequest { scene: "strips".into(), domain: 0, vertices: vec![0, 4] };
     let status = scenes.read_modes(request).await.expect_err("no such vertex");
     refuse.push((status, Code::InvalidArgument, ["vertices[1]", "an index below 4", "4"]));
     let request = v1::DescribeSceneRequest { scene: "strips".into(), domains: vec![7], arrays: vec![] };
-    let status = scenes.describe_scene(request).await.expect_err("no such domain");
+    let status = scenes.describe_scene(request).await.expect_err("expected an unknown-domain error");
     refuse.push((status, Code::InvalidArgument, ["domains[0]", "an index below 2", "7"]));
     let request = v1::DescribeSceneRequest { scene: "strips".into(), domains: vec![], arrays: vec![99] };
     let status = scenes.describe_scene(request).await.expect_err("no such array");
     refuse.push((status, Code::InvalidArgument, ["arrays", "arrays of this version", "99"]));
     let request = v1::OpenSceneRequest { source: "nothing".into(), scene: String::new() };
-    let status = scenes.open_scene(request).await.expect_err("no such source");
+    let status = scenes.open_scene(request).await.expect_err("expected an unknown-source error");
     refuse.push((status, Code::NotFound, ["scene", "a scene", "nothing"]));
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "../x".into() };
     let status = scenes.open_scene(request).await.expect_err("no such name");
@@ -239,11 +241,11 @@ async fn bad_requests_are_refused_with_code_and_details() {
     let status = scenes.open_scene(request).await.expect_err("another source");
     refuse.push((status, Code::AlreadyExists, ["the name of the scene", "nobody", "'strips' is strips"]));
     let request = v1::DeleteSceneRequest { scene: "nowhere".into() };
-    let status = scenes.delete_scene(request).await.expect_err("no such scene");
+    let status = scenes.delete_scene(request).await.expect_err("expected an unknown-scene error");
     refuse.push((status, Code::NotFound, ["scene", "a scene", "'nowhere'"]));
     for (status, code, refusal) in refuse {
         assert_eq!(status.code(), code, "{status:?}");
-        assert!(begins(&details(&status), refusal), "{:?} is not {refusal:?}", details(&status));
+        assert!(begins(&rejection_details(&status), refusal), "{:?} is not {refusal:?}", rejection_details(&status));
     }
     let request = v1::OpenSceneRequest { source: "panic".into(), scene: String::new() };
     let status = scenes.open_scene(request).await.expect_err("a loader that panics");
@@ -276,7 +278,7 @@ fn spoilt(change: impl FnOnce(&mut v1::UploadHeader, &mut v1::UploadFile)) -> Ve
 
 #[tokio::test(flavor = "multi_thread")]
 async fn bad_uploads_are_refused_and_leave_no_files() {
-    let server = Server::with(|config| modalcast::config::Config { upload_bytes: 1000, ..config }).await;
+    let server = Server::start_with(|config| modalcast::config::Config { upload_bytes: 1000, ..config }).await;
     let uploads = server.engine.config().state.join("uploads");
     let path = |path: &'static str| spoilt(move |_, file| file.path = path.into());
     let table: Vec<(&str, Vec<Part>, [&str; 3])> = vec![
@@ -310,24 +312,28 @@ async fn bad_uploads_are_refused_and_leave_no_files() {
     ];
     for (name, parts, refusal) in table {
         let status = send(&server, parts).await.expect_err(name);
-        assert!(begins(&details(&status), refusal), "{name}: {:?}", details(&status));
-        assert_eq!(std::fs::read_dir(&uploads).expect("a folder").count(), 0, "{name} left something");
+        assert!(begins(&rejection_details(&status), refusal), "{name}: {:?}", rejection_details(&status));
+        assert_eq!(
+            std::fs::read_dir(&uploads).expect("expected a temporary folder").count(),
+            0,
+            "{name} left something"
+        );
     }
     send(&server, upload(b"strips")).await.expect("a good one under the same name");
     let status = send(&server, upload(b"strips")).await.expect_err("the name is taken");
     assert_eq!(status.code(), Code::AlreadyExists);
     assert!(uploads.join("up/scene.txt").exists());
     let delete = v1::DeleteSceneRequest { scene: "up".into() };
-    server.scenes().await.delete_scene(delete).await.expect("deletes");
-    assert_eq!(std::fs::read_dir(&uploads).expect("a folder").count(), 0);
+    server.scenes().await.delete_scene(delete).await.expect("expected the deletion to succeed");
+    assert_eq!(std::fs::read_dir(&uploads).expect("expected a temporary folder").count(), 0);
 }
 
 /// Status details travel in an HTTP/2 header, so a refusal of a very long input is truncated.
 #[tokio::test(flavor = "multi_thread")]
 async fn refusal_details_fit_into_a_header() {
-    let server = Server::fresh().await;
+    let server = Server::start_default().await;
     let request = v1::OpenSceneRequest { source: "x".repeat(500_000), scene: "name".into() };
-    let status = server.scenes().await.open_scene(request).await.expect_err("no such source");
+    let status = server.scenes().await.open_scene(request).await.expect_err("expected an unknown-source error");
     assert_eq!(status.code(), Code::NotFound);
-    assert!(details(&status).encoded_len() < 4096);
+    assert!(rejection_details(&status).encoded_len() < 4096);
 }

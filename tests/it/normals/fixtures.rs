@@ -15,8 +15,8 @@ pub(crate) const UP: [f32; 3] = [0.0, 0.0, 1.0];
 /// A shape with one mode; the function gives the displacement at each rest position.
 pub(crate) fn with_mode(mesh: Mesh, displacement: impl Fn([f32; 3]) -> [f32; 3]) -> Shape {
     let column: Vec<f32> = mesh.rest().iter().flat_map(|rest| displacement(*rest)).collect();
-    let modes = Modes::from_columns(column.len(), 1, column).expect("modes");
-    Shape::new(mesh, modes).expect("a shape")
+    let modes = Modes::from_columns(column.len(), 1, column).expect("expected valid modes");
+    Shape::new(mesh, modes).expect("expected a valid shape")
 }
 
 /// A flat grid over -1..1 x -1..1 at z = 0 that faces +Z; u runs along x.
@@ -26,7 +26,7 @@ pub(crate) fn sheet(columns: u32, rows: u32) -> Mesh {
     let rest: Vec<_> = places.clone().map(|(x, y)| [x, y, 0.0]).collect();
     let uvs = places.map(|(x, y)| [0.5 * x + 0.5, 0.5 - 0.5 * y]).collect();
     let normals = vec![UP; rest.len()];
-    Mesh::from_indexed(rest, normals, uvs, quads(columns, rows)).expect("a sheet")
+    Mesh::from_indexed(rest, normals, uvs, quads(columns, rows)).expect("expected a valid mesh")
 }
 
 /// Two triangles per cell of a grid, all split along the same diagonal.
@@ -47,7 +47,7 @@ pub(crate) fn tube(around: u32, rows: u32, tilt: f32) -> Mesh {
         corners.normals.push([angle.cos(), 0.0, -angle.sin()]);
         corners.uvs.push([column as f32 / around as f32, 1.0 - row as f32]);
     }
-    Mesh::new(rest.collect(), corners, quads(around + 1, rows)).expect("a tube")
+    Mesh::new(rest.collect(), corners, quads(around + 1, rows)).expect("expected a valid mesh")
 }
 
 /// A unit cube of 8 vertices and 24 corners; every edge is hard.
@@ -64,7 +64,7 @@ pub(crate) fn cube() -> Mesh {
         let cut = if side == 1 { [[0, 1, 2], [0, 2, 3]] } else { [[0, 2, 1], [0, 3, 2]] };
         triangles.extend(cut.map(|triangle| triangle.map(|corner| first + corner)));
     }
-    Mesh::new(rest, corners, triangles).expect("a cube")
+    Mesh::new(rest, corners, triangles).expect("expected a valid mesh")
 }
 
 /// A unit sphere of 8 x 4^level triangles with area-weighted normals.
@@ -89,7 +89,7 @@ pub(crate) fn sphere(level: u32) -> Mesh {
     let triangles: Vec<_> = triangles.into_iter().map(|triangle| triangle.map(&mut number)).collect();
     let vertices: Vec<u32> = (0..rest.len() as u32).collect();
     let normals = smooth_normals(&rest, &vertices, &triangles);
-    Mesh::from_indexed(rest, normals, vec![], triangles).expect("a sphere")
+    Mesh::from_indexed(rest, normals, vec![], triangles).expect("expected a valid mesh")
 }
 
 fn octants() -> Vec<[Vector3<f64>; 3]> {
@@ -109,11 +109,11 @@ pub(crate) fn scene(shapes: Vec<Shape>) -> Arc<Scene> {
 pub(crate) fn scene_with(shapes: Vec<Shape>, normals: NormalMethod) -> Arc<Scene> {
     let mut parts = SceneParts::named("bent");
     parts.deformation.normals = normals;
-    parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("a texture")];
+    parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("expected a valid texture")];
     parts.materials = vec![Material { normal_texture: Some(0), ..Material::default() }];
     parts.domains = (0..shapes.len()).map(domain).collect();
     parts.shapes = shapes;
-    Scene::new(parts).expect("a scene")
+    Scene::new(parts).expect("expected a valid scene")
 }
 
 fn domain(shape: usize) -> Domain {
@@ -147,8 +147,8 @@ pub(crate) fn bent(scene: &Scene, q: f32) -> SceneState {
 /// The surface that the CPU deformer computes for a state.
 pub(crate) fn on_cpu(scene: &Arc<Scene>, state: &SceneState) -> DeformedSurface {
     let mut cpu = CpuDeformer::new(scene);
-    cpu.deform(state).expect("deforms");
-    cpu.surface().expect("a surface").clone()
+    cpu.deform(state).expect("expected the step to succeed");
+    cpu.surface().expect("expected a surface").clone()
 }
 
 /// Exact normals and tangents of the reference.
