@@ -1,5 +1,5 @@
-//! Invalid input: each case is refused with field, expected and given. The stream stays open, and other clients are not
-//! affected.
+//! Every invalid message is answered with a rejection that names the field, the expected and the received value. The
+//! stream stays open, and other clients are not affected.
 
 use modalcast_proto::v1;
 use prost::Message as _;
@@ -15,12 +15,12 @@ use crate::service_harness::{
 };
 
 /// An invalid step: the name of the case, the step, and the prefixes of field, expected and given.
-type BadStep = (&'static str, v1::Step, [&'static str; 3]);
+type InvalidStep = (&'static str, v1::Step, [&'static str; 3]);
 
 /// The identity rotation as a quaternion x y z w.
-const UPRIGHT: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
+const IDENTITY_QUATERNION: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
-fn bad_steps() -> Vec<BadStep> {
+fn invalid_steps() -> Vec<InvalidStep> {
     let transforms = |domains: &[u32], numbers: &[f32]| v1::Step {
         transform_domains: domains.to_vec(),
         transforms: numbers.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into(),
@@ -28,14 +28,14 @@ fn bad_steps() -> Vec<BadStep> {
     };
     let mut infinite = [1.0; 12];
     infinite[7] = f32::INFINITY;
-    let mut odd = step(11, &[0], &[0.0, 0.0]);
-    odd.q = odd.q.slice(..7);
-    let timeless = v1::Step { time: f64::NAN, ..step(11, &[0], &[0.0, 0.0]) };
+    let mut truncated_q = step(11, &[0], &[0.0, 0.0]);
+    truncated_q.q = truncated_q.q.slice(..7);
+    let nan_time = v1::Step { time: f64::NAN, ..step(11, &[0], &[0.0, 0.0]) };
     vec![
         ("q too short", step(11, &[1], &[0.5]), ["step.q of domain 'right'", "8 bytes (2 coordinates)", "4 bytes"]),
         ("q too long", step(11, &[0], &[0.5; 3]), ["step.q of domain 'left'", "8 bytes (2 coordinates)", "12 bytes"]),
-        ("q of all, too short", step(11, &[], &[0.5; 3]), ["step.q", "16 bytes (4 coordinates)", "12 bytes"]),
-        ("q cut within a number", odd, ["step.q of domain 'left'", "8 bytes", "7 bytes"]),
+        ("q of all domains is too short", step(11, &[], &[0.5; 3]), ["step.q", "16 bytes (4 coordinates)", "12 bytes"]),
+        ("q cut within a number", truncated_q, ["step.q of domain 'left'", "8 bytes", "7 bytes"]),
         ("NaN in q", step(11, &[0], &[0.0, f32::NAN]), ["step.q of domain 'left', mode 1", "a finite number", "NaN"]),
         (
             "infinity in q",
@@ -43,15 +43,19 @@ fn bad_steps() -> Vec<BadStep> {
             ["step.q of domain 'right', mode 0", "a finite", "inf"],
         ),
         (
-            "q that overflows",
+            "q moves a vertex out of range",
             step(11, &[1], &[f32::MAX, 0.0]),
             ["step.q of domain 'right'", "q and transform", "vertex"],
         ),
-        ("no such domain, q", step(11, &[0, 2], &[0.0; 4]), ["step.q_domains[1]", "an index below 2", "2"]),
-        ("no such domain, T", transforms(&[9], &[0.0; 12]), ["step.transform_domains[0]", "an index below 2", "9"]),
-        ("a domain twice, q", step(11, &[1, 1], &[0.0; 4]), ["step.q_domains[1]", "an index that was not named", "1"]),
+        ("unknown domain in q", step(11, &[0, 2], &[0.0; 4]), ["step.q_domains[1]", "an index below 2", "2"]),
+        ("unknown domain in T", transforms(&[9], &[0.0; 12]), ["step.transform_domains[0]", "an index below 2", "9"]),
         (
-            "a domain twice, T",
+            "repeated domain in q",
+            step(11, &[1, 1], &[0.0; 4]),
+            ["step.q_domains[1]", "an index that was not named", "1"],
+        ),
+        (
+            "repeated domain in T",
             transforms(&[0, 0], &[0.0; 24]),
             ["step.transform_domains[1]", "an index that was not named", "0"],
         ),
@@ -67,34 +71,46 @@ fn bad_steps() -> Vec<BadStep> {
             transforms(&[1], &infinite),
             ["step.transforms of domain 'right': transform[7]", "a finite", "inf"],
         ),
-        ("NaN time", timeless, ["step.time", "a finite number", "NaN"]),
-        ("a number that goes back", step(9, &[0], &[0.0; 2]), ["step.number", "a number above 10", "9"]),
-        ("a number that comes again", step(10, &[0], &[0.0; 2]), ["step.number", "a number above 10", "10"]),
+        ("NaN time", nan_time, ["step.time", "a finite number", "NaN"]),
+        ("decreasing step number", step(9, &[0], &[0.0; 2]), ["step.number", "a number above 10", "9"]),
+        ("repeated step number", step(10, &[0], &[0.0; 2]), ["step.number", "a number above 10", "10"]),
     ]
 }
 
 /// Invalid steps in the rigid transform formats, and steps with a format that does not match their bytes.
-fn bad_formats() -> Vec<BadStep> {
+fn invalid_formats() -> Vec<InvalidStep> {
     let bytes = |format: i32| v1::Step {
         transform_domains: vec![0],
         transforms: vec![0; 48].into(),
         transform_format: format,
         ..step(11, &[], &[])
     };
-    let misnamed = |format: v1::TransformFormat| bytes(format.into());
-    let overflow = rigid_step(11, v1::TransformFormat::RigidF64, &[(0, UPRIGHT, [1e7; 3]), (1, UPRIGHT, [1e7; 3])]);
+    let wrong_format = |format: v1::TransformFormat| bytes(format.into());
+    let overflow = rigid_step(
+        11,
+        v1::TransformFormat::RigidF64,
+        &[(0, IDENTITY_QUATERNION, [1e7; 3]), (1, IDENTITY_QUATERNION, [1e7; 3])],
+    );
     let overflow = v1::Step { q_domains: vec![1], q: step(11, &[1], &[f32::MAX, 0.0]).q, ..overflow };
     vec![
         ("a format of no version", bytes(9), ["step.transform_format", "a format of this version", "9"]),
-        ("48 bytes as 28", misnamed(v1::TransformFormat::RigidF32), ["step.transforms", "28 bytes (1 tr", "48 bytes"]),
-        ("48 bytes as 40", misnamed(v1::TransformFormat::RigidF64), ["step.transforms", "40 bytes (1 tr", "48 bytes"]),
         (
-            "no rotation",
+            "affine bytes in format RigidF32",
+            wrong_format(v1::TransformFormat::RigidF32),
+            ["step.transforms", "28 bytes (1 tr", "48 bytes"],
+        ),
+        (
+            "affine bytes in format RigidF64",
+            wrong_format(v1::TransformFormat::RigidF64),
+            ["step.transforms", "40 bytes (1 tr", "48 bytes"],
+        ),
+        (
+            "zero quaternion",
             rigid_step(11, v1::TransformFormat::RigidF32, &[(1, [0.0; 4], [0.0; 3])]),
             ["step.transforms of domain 'right': rotation", "a quaternion x y z w of norm 1", "norm 0"],
         ),
         (
-            "twice a rotation",
+            "quaternion of norm 2",
             rigid_step(11, v1::TransformFormat::RigidF64, &[(0, [0.0, 2.0, 0.0, 0.0], [0.0; 3])]),
             ["step.transforms of domain 'left': rotation", "a quaternion x y z w of norm 1", "norm 2"],
         ),
@@ -105,53 +121,57 @@ fn bad_formats() -> Vec<BadStep> {
         ),
         (
             "infinity in an f32 translation",
-            rigid_step(11, v1::TransformFormat::RigidF32, &[(0, UPRIGHT, [0.0, 1e300, 0.0])]),
+            rigid_step(11, v1::TransformFormat::RigidF32, &[(0, IDENTITY_QUATERNION, [0.0, 1e300, 0.0])]),
             ["step.transforms of domain 'left': translation[1]", "a finite", "inf"],
         ),
         (
             "infinity in an f64 translation",
-            rigid_step(11, v1::TransformFormat::RigidF64, &[(0, UPRIGHT, [0.0, 0.0, f64::NEG_INFINITY])]),
+            rigid_step(11, v1::TransformFormat::RigidF64, &[(0, IDENTITY_QUATERNION, [0.0, 0.0, f64::NEG_INFINITY])]),
             ["step.transforms of domain 'left': translation[2]", "a finite", "-inf"],
         ),
         (
-            "an f64 translation beyond all worlds",
-            rigid_step(11, v1::TransformFormat::RigidF64, &[(1, UPRIGHT, [-1e300, 0.0, 0.0])]),
+            "f64 translation above the limit",
+            rigid_step(11, v1::TransformFormat::RigidF64, &[(1, IDENTITY_QUATERNION, [-1e300, 0.0, 0.0])]),
             ["step.transforms of domain 'right': translation[0]", "at most 1.09", "-1000000000"],
         ),
-        ("q that overflows far away", overflow, ["step.q of domain 'right'", "q and transform", "vertex"]),
+        (
+            "q moves a vertex out of range at a far origin",
+            overflow,
+            ["step.q of domain 'right'", "q and transform", "vertex"],
+        ),
     ]
 }
 
-fn begins(rejection: &v1::Rejection, [field, expected, given]: [&str; 3]) -> bool {
+fn has_prefixes(rejection: &v1::Rejection, [field, expected, given]: [&str; 3]) -> bool {
     rejection.field.starts_with(field) && rejection.expected.starts_with(expected) && rejection.given.starts_with(given)
 }
 
-/// Every invalid step is refused by field and leaves the state unchanged. The same stream and the stream of another
-/// client continue.
+/// Every invalid step is rejected with its field and leaves the state unchanged. The same stream and the stream of
+/// another client continue.
 #[tokio::test(flavor = "multi_thread")]
-async fn bad_steps_are_refused_and_the_stream_stays_open() {
+async fn stream_stays_open_after_invalid_steps() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "other".into() };
     server.scenes().await.open_scene(request).await.expect("opens");
     let mut other = server.drive("other", Policy::Lossless, 0).await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
-    let good = step(10, &[], &[0.1, 0.2, 0.3, 0.4]);
-    driver.step_acknowledged(good.clone()).await;
-    let want = reference_vertices(&strips(), &[good]);
-    let ask = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
-    // The server keeps the number of a step that it refused for overflow, so the numbers of the following steps
-    // increase.
-    for (index, (name, mut bad, refusal)) in bad_steps().into_iter().chain(bad_formats()).enumerate() {
-        let goes_back = bad.number < 11;
-        bad.number += if goes_back { 0 } else { index as u64 };
-        let number = bad.number;
-        driver.step(bad).await;
+    let valid_step = step(10, &[], &[0.1, 0.2, 0.3, 0.4]);
+    driver.step_acknowledged(valid_step.clone()).await;
+    let want = reference_vertices(&strips(), &[valid_step]);
+    let request = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
+    // A step rejected for overflow still consumes its number, so each case needs a higher one.
+    for (index, (name, mut invalid_step, prefixes)) in invalid_steps().into_iter().chain(invalid_formats()).enumerate()
+    {
+        let is_decreasing = invalid_step.number < 11;
+        invalid_step.number += if is_decreasing { 0 } else { index as u64 };
+        let number = invalid_step.number;
+        driver.step(invalid_step).await;
         let rejection = driver.rejection().await;
-        let refusal = if goes_back { [refusal[0], "a number above", refusal[2]] } else { refusal };
-        assert!(begins(&rejection, refusal), "{name}: {rejection:?}");
+        let prefixes = if is_decreasing { [prefixes[0], "a number above", prefixes[2]] } else { prefixes };
+        assert!(has_prefixes(&rejection, prefixes), "{name}: {rejection:?}");
         assert_eq!(rejection.step, Some(number), "{name}");
-        let got = get_vertices(&server, ask.clone()).await.expect("vertices");
+        let got = get_vertices(&server, request.clone()).await.expect("vertices");
         assert_eq!((got.step().number, &got.positions, &got.normals), (10, &want.0, &want.1), "{name}");
         assert_eq!((got.head.origin.as_slice(), got.origins.len()), ([0.0; 3].as_slice(), 0), "{name}");
         other.step_acknowledged(step(index as u64, &[0], &[0.5, 0.5])).await;
@@ -160,22 +180,24 @@ async fn bad_steps_are_refused_and_the_stream_stays_open() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn stream_opens_after_refused_openings() {
+async fn stream_opens_after_rejected_openings() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let mut driver = Driver::connect(server.channel().await).await;
     driver.step(step(1, &[], &[])).await;
-    assert!(begins(&driver.rejection().await, ["kind", "open, before any step", "a step"]));
-    let ResponseKind::Rejection(unknown) = driver.open("nowhere", Policy::Lossless, 0).await else { panic!("opened") };
-    assert!(begins(&unknown, ["scene", "a scene that is there", "'nowhere'"]), "{unknown:?}");
+    assert!(has_prefixes(&driver.rejection().await, ["kind", "open, before any step", "a step"]));
+    let ResponseKind::Rejection(unknown_scene) = driver.open("nowhere", Policy::Lossless, 0).await else {
+        panic!("opened")
+    };
+    assert!(has_prefixes(&unknown_scene, ["scene", "a scene that is there", "'nowhere'"]), "{unknown_scene:?}");
     let open = v1::OpenDrive { scene: "strips".into(), policy: 77, window: 0 };
     driver.send(RequestKind::Open(open)).await;
-    assert!(begins(&driver.rejection().await, ["open.policy", "a policy of this version", "77"]));
+    assert!(has_prefixes(&driver.rejection().await, ["open.policy", "a policy of this version", "77"]));
     assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
-    let ResponseKind::Rejection(again) = driver.open("strips", Policy::Lossless, 0).await else {
+    let ResponseKind::Rejection(second_open) = driver.open("strips", Policy::Lossless, 0).await else {
         panic!("opened twice")
     };
-    assert!(begins(&again, ["open", "one open per stream", "a second"]), "{again:?}");
+    assert!(has_prefixes(&second_open, ["open", "one open per stream", "a second"]), "{second_open:?}");
     driver.step_acknowledged(step(0, &[0], &[0.0, 0.0])).await;
 }
 
@@ -192,63 +214,67 @@ async fn oversized_message_ends_only_its_own_stream() {
     assert!(matches!(other.open("other", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
     let mut driver = Driver::connect(channel).await;
     assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
-    let good = step(1, &[0], &[0.5, 0.25]);
-    driver.step_acknowledged(good.clone()).await;
+    let valid_step = step(1, &[0], &[0.5, 0.25]);
+    driver.step_acknowledged(valid_step.clone()).await;
     driver.step(step(2, &[0], &vec![0.0; 20_000])).await;
-    let end = with_timeout(driver.replies.message()).await.expect_err("a fault of transport");
+    let end = with_timeout(driver.replies.message()).await.expect_err("expected the stream to end with an error");
     assert_eq!(end.code(), Code::ResourceExhausted);
     assert_eq!(rejection_details(&end).expected, "at most 65536 bytes");
-    let ask = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
-    let got = get_vertices(&server, ask).await.expect("vertices");
-    assert_eq!((got.step().number, got.positions), (1, reference_vertices(&strips(), &[good]).0));
+    let request = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
+    let got = get_vertices(&server, request).await.expect("vertices");
+    assert_eq!((got.step().number, got.positions), (1, reference_vertices(&strips(), &[valid_step]).0));
     other.step_acknowledged(step(1, &[0], &[0.5, 0.5])).await;
-    let mut next = server.drive("strips", Policy::Lossless, 0).await;
-    next.step_acknowledged(step(0, &[0], &[0.0, 0.0])).await;
+    let mut second_writer = server.drive("strips", Policy::Lossless, 0).await;
+    second_writer.step_acknowledged(step(0, &[0], &[0.0, 0.0])).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn bad_requests_are_refused_with_code_and_details() {
+async fn invalid_requests_return_code_and_details() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let mut scenes = server.scenes().await;
-    let mut refuse = Vec::new();
+    let mut rejected_calls = Vec::new();
     let selection = Some(v1::VertexSelection { domains: vec![0, 5], ..Default::default() });
-    let ask = v1::GetVerticesRequest { scene: "strips".into(), selection, ..v1::GetVerticesRequest::default() };
-    let status = get_vertices(&server, ask).await.expect_err("expected an unknown-domain error");
-    refuse.push((status, Code::InvalidArgument, ["selection.domains[1]", "an index below 2", "5"]));
-    let ask = v1::GetVerticesRequest { scene: "nowhere".into(), ..v1::GetVerticesRequest::default() };
-    let status = get_vertices(&server, ask).await.expect_err("expected an unknown-scene error");
-    refuse.push((status, Code::NotFound, ["scene", "a scene", "'nowhere'"]));
+    let request = v1::GetVerticesRequest { scene: "strips".into(), selection, ..v1::GetVerticesRequest::default() };
+    let status = get_vertices(&server, request).await.expect_err("expected an unknown-domain error");
+    rejected_calls.push((status, Code::InvalidArgument, ["selection.domains[1]", "an index below 2", "5"]));
+    let request = v1::GetVerticesRequest { scene: "nowhere".into(), ..v1::GetVerticesRequest::default() };
+    let status = get_vertices(&server, request).await.expect_err("expected an unknown-scene error");
+    rejected_calls.push((status, Code::NotFound, ["scene", "a scene", "'nowhere'"]));
     let request = v1::ReadModesRequest { scene: "strips".into(), domain: 2, vertices: vec![] };
     let status = scenes.read_modes(request).await.expect_err("expected an unknown-domain error");
-    refuse.push((status, Code::InvalidArgument, ["domain", "an index below 2", "2"]));
+    rejected_calls.push((status, Code::InvalidArgument, ["domain", "an index below 2", "2"]));
     let request = v1::ReadModesRequest { scene: "strips".into(), domain: 0, vertices: vec![0, 4] };
-    let status = scenes.read_modes(request).await.expect_err("no such vertex");
-    refuse.push((status, Code::InvalidArgument, ["vertices[1]", "an index below 4", "4"]));
+    let status = scenes.read_modes(request).await.expect_err("expected an unknown-vertex error");
+    rejected_calls.push((status, Code::InvalidArgument, ["vertices[1]", "an index below 4", "4"]));
     let request = v1::DescribeSceneRequest { scene: "strips".into(), domains: vec![7], arrays: vec![] };
     let status = scenes.describe_scene(request).await.expect_err("expected an unknown-domain error");
-    refuse.push((status, Code::InvalidArgument, ["domains[0]", "an index below 2", "7"]));
+    rejected_calls.push((status, Code::InvalidArgument, ["domains[0]", "an index below 2", "7"]));
     let request = v1::DescribeSceneRequest { scene: "strips".into(), domains: vec![], arrays: vec![99] };
-    let status = scenes.describe_scene(request).await.expect_err("no such array");
-    refuse.push((status, Code::InvalidArgument, ["arrays", "arrays of this version", "99"]));
+    let status = scenes.describe_scene(request).await.expect_err("expected an unknown-array error");
+    rejected_calls.push((status, Code::InvalidArgument, ["arrays", "arrays of this version", "99"]));
     let request = v1::OpenSceneRequest { source: "nothing".into(), scene: String::new() };
     let status = scenes.open_scene(request).await.expect_err("expected an unknown-source error");
-    refuse.push((status, Code::NotFound, ["scene", "a scene", "nothing"]));
+    rejected_calls.push((status, Code::NotFound, ["scene", "a scene", "nothing"]));
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "../x".into() };
-    let status = scenes.open_scene(request).await.expect_err("no such name");
-    refuse.push((status, Code::InvalidArgument, ["scene", "1 to 64 of", "\"../x\""]));
+    let status = scenes.open_scene(request).await.expect_err("expected an invalid-name error");
+    rejected_calls.push((status, Code::InvalidArgument, ["scene", "1 to 64 of", "\"../x\""]));
     let request = v1::OpenSceneRequest { source: "sheet".into(), scene: "strips".into() };
-    let status = scenes.open_scene(request).await.expect_err("another source");
-    refuse.push((status, Code::AlreadyExists, ["the name of the scene", "nobody", "'strips' is strips"]));
+    let status = scenes.open_scene(request).await.expect_err("expected a name conflict");
+    rejected_calls.push((status, Code::AlreadyExists, ["the name of the scene", "nobody", "'strips' is strips"]));
     let request = v1::DeleteSceneRequest { scene: "nowhere".into() };
     let status = scenes.delete_scene(request).await.expect_err("expected an unknown-scene error");
-    refuse.push((status, Code::NotFound, ["scene", "a scene", "'nowhere'"]));
-    for (status, code, refusal) in refuse {
+    rejected_calls.push((status, Code::NotFound, ["scene", "a scene", "'nowhere'"]));
+    for (status, code, prefixes) in rejected_calls {
         assert_eq!(status.code(), code, "{status:?}");
-        assert!(begins(&rejection_details(&status), refusal), "{:?} is not {refusal:?}", rejection_details(&status));
+        assert!(
+            has_prefixes(&rejection_details(&status), prefixes),
+            "expected {prefixes:?}, got {:?}",
+            rejection_details(&status)
+        );
     }
     let request = v1::OpenSceneRequest { source: "panic".into(), scene: String::new() };
-    let status = scenes.open_scene(request).await.expect_err("a loader that panics");
+    let status = scenes.open_scene(request).await.expect_err("expected an internal error");
     assert_eq!(status.code(), Code::Internal);
     server.open("strips").await;
 }
@@ -264,63 +290,67 @@ fn upload(contents: &[u8]) -> Vec<Part> {
 
 async fn send(server: &Server, parts: Vec<Part>) -> Result<v1::UploadSceneResponse, tonic::Status> {
     let requests = parts.into_iter().map(|part| v1::UploadSceneRequest { part: Some(part) }).collect::<Vec<_>>();
-    let sent = server.scenes().await.upload_scene(tokio_stream::iter(requests)).await;
-    sent.map(tonic::Response::into_inner)
+    let response = server.scenes().await.upload_scene(tokio_stream::iter(requests)).await;
+    response.map(tonic::Response::into_inner)
 }
 
-fn spoilt(change: impl FnOnce(&mut v1::UploadHeader, &mut v1::UploadFile)) -> Vec<Part> {
+fn modified_upload(modify: impl FnOnce(&mut v1::UploadHeader, &mut v1::UploadFile)) -> Vec<Part> {
     let mut parts = upload(b"strips");
     if let [Part::Header(header), Part::File(file), _] = parts.as_mut_slice() {
-        change(header, file);
+        modify(header, file);
     }
     parts
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn bad_uploads_are_refused_and_leave_no_files() {
+async fn invalid_uploads_are_rejected_and_leave_no_files() {
     let server = Server::start_with(|config| modalcast::config::Config { upload_bytes: 1000, ..config }).await;
     let uploads = server.engine.config().state.join("uploads");
-    let path = |path: &'static str| spoilt(move |_, file| file.path = path.into());
-    let table: Vec<(&str, Vec<Part>, [&str; 3])> = vec![
-        ("nothing at all", vec![], ["part", "a header first", "nothing"]),
+    let path = |path: &'static str| modified_upload(move |_, file| file.path = path.into());
+    let cases: Vec<(&str, Vec<Part>, [&str; 3])> = vec![
+        ("empty stream", vec![], ["part", "a header first", "nothing"]),
         ("no header", upload(b"strips").split_off(1), ["part", "a header first", "a file or chunk"]),
         (
-            "a hash that differs",
-            spoilt(|_, file| file.sha256 = vec![7; 32].into()),
+            "other hash",
+            modified_upload(|_, file| file.sha256 = vec![7; 32].into()),
             ["file.sha256 of 'scene.txt'", "0707", ""],
         ),
-        ("no hash", spoilt(|_, file| file.sha256 = vec![7; 3].into()), ["file.sha256", "32 bytes", "3 bytes"]),
-        ("out of the folder", path("../scene.txt"), ["file.path", "a relative path", "\"../scene.txt\""]),
+        ("no hash", modified_upload(|_, file| file.sha256 = vec![7; 3].into()), ["file.sha256", "32 bytes", "3 bytes"]),
+        ("path outside of the folder", path("../scene.txt"), ["file.path", "a relative path", "\"../scene.txt\""]),
         ("absolute", path("/etc/scene.txt"), ["file.path", "a relative path", "\"/etc/scene.txt\""]),
         ("backslashes", path("..\\scene.txt"), ["file.path", "a relative path", ""]),
         ("truncated", upload(b"strips")[..2].to_vec(), ["file.bytes of 'scene.txt'", "6 bytes", "0 bytes"]),
-        ("too few bytes announced", spoilt(|header, _| header.total_bytes = 5), ["header.total_bytes", "5", "6"]),
+        (
+            "too few bytes announced",
+            modified_upload(|header, _| header.total_bytes = 5),
+            ["header.total_bytes", "5", "6"],
+        ),
         (
             "more than the limit",
-            spoilt(|header, _| header.total_bytes = 1001),
+            modified_upload(|header, _| header.total_bytes = 1001),
             ["header.total_bytes", "at most 1000", "1001"],
         ),
-        ("a file too few", spoilt(|header, _| header.files = 2), ["header.files", "2", "1"]),
-        ("a bad name", spoilt(|header, _| header.scene = "a/b".into()), ["scene", "1 to 64", "\"a/b\""]),
+        ("fewer files than announced", modified_upload(|header, _| header.files = 2), ["header.files", "2", "1"]),
+        ("invalid name", modified_upload(|header, _| header.scene = "a/b".into()), ["scene", "1 to 64", "\"a/b\""]),
         (
-            "a bad entry",
-            spoilt(|header, _| header.entry = "../x".into()),
+            "invalid entry",
+            modified_upload(|header, _| header.entry = "../x".into()),
             ["header.entry", "a relative path", "\"../x\""],
         ),
-        ("an entry that is not there", spoilt(|header, _| header.entry = "x".into()), ["entry", "a file", ""]),
-        ("no scene in it", upload(b"lunch"), ["scene", "a scene", "lunch"]),
+        ("missing entry", modified_upload(|header, _| header.entry = "x".into()), ["entry", "a file", ""]),
+        ("unknown source in the file", upload(b"lunch"), ["scene", "a scene", "lunch"]),
     ];
-    for (name, parts, refusal) in table {
+    for (name, parts, prefixes) in cases {
         let status = send(&server, parts).await.expect_err(name);
-        assert!(begins(&rejection_details(&status), refusal), "{name}: {:?}", rejection_details(&status));
+        assert!(has_prefixes(&rejection_details(&status), prefixes), "{name}: {:?}", rejection_details(&status));
         assert_eq!(
             std::fs::read_dir(&uploads).expect("expected a temporary folder").count(),
             0,
-            "{name} left something"
+            "{name}: expected no files"
         );
     }
-    send(&server, upload(b"strips")).await.expect("a good one under the same name");
-    let status = send(&server, upload(b"strips")).await.expect_err("the name is taken");
+    send(&server, upload(b"strips")).await.expect("expected the upload to succeed after rejected ones");
+    let status = send(&server, upload(b"strips")).await.expect_err("expected a name conflict");
     assert_eq!(status.code(), Code::AlreadyExists);
     assert!(uploads.join("up/scene.txt").exists());
     let delete = v1::DeleteSceneRequest { scene: "up".into() };
@@ -328,9 +358,9 @@ async fn bad_uploads_are_refused_and_leave_no_files() {
     assert_eq!(std::fs::read_dir(&uploads).expect("expected a temporary folder").count(), 0);
 }
 
-/// Status details travel in an HTTP/2 header, so a refusal of a very long input is truncated.
+/// Status details are sent in an HTTP/2 header, so a rejection of a very long input is truncated.
 #[tokio::test(flavor = "multi_thread")]
-async fn refusal_details_fit_into_a_header() {
+async fn rejection_details_fit_into_a_header() {
     let server = Server::start_default().await;
     let request = v1::OpenSceneRequest { source: "x".repeat(500_000), scene: "name".into() };
     let status = server.scenes().await.open_scene(request).await.expect_err("expected an unknown-source error");

@@ -182,7 +182,7 @@ pub(crate) struct Server {
 }
 
 impl Server {
-    /// Starts a server with a fresh state folder.
+    /// Starts a server with the settings of [`config`] and a new state folder.
     pub(crate) async fn start_default() -> Self {
         Self::start_with(|config| config).await
     }
@@ -199,13 +199,13 @@ impl Server {
     }
 
     pub(crate) async fn start_from(config: Config, source: Arc<dyn SceneSource>) -> Self {
-        let config = config.validated().expect("settings");
+        let config = config.validated().expect("expected valid settings");
         let listener = service::bind(&config).await.expect("expected a free port");
         let address = format!("http://{}", listener.local_addr().expect("expected a socket address"));
-        let engine = Engine::start(config, source).await.expect("an engine");
-        let (stop, stopped) = oneshot::channel();
+        let engine = Engine::start(config, source).await.expect("expected an engine");
+        let (stop, stop_receiver) = oneshot::channel();
         let shutdown = async {
-            stopped.await.ok();
+            stop_receiver.await.ok();
         };
         let task = tokio::spawn(service::serve(engine.clone(), listener, shutdown));
         Self { engine, address, stop: Some(stop), task, folder: None }
@@ -254,14 +254,14 @@ impl Server {
 
     /// Stops the server and waits for its end.
     pub(crate) async fn stop(mut self) -> Result<()> {
-        self.stop.take().expect("not stopped yet").send(()).ok();
+        self.stop.take().expect("expected a running server").send(()).ok();
         with_timeout(self.task).await.expect("expected the task not to panic")
     }
 }
 
 /// Awaits a future and panics after [`TIMEOUT`].
 pub(crate) async fn with_timeout<T>(work: impl Future<Output = T>) -> T {
-    tokio::time::timeout(TIMEOUT, work).await.expect("an answer in time")
+    tokio::time::timeout(TIMEOUT, work).await.expect("expected completion within the timeout")
 }
 
 /// Client end of a step stream, as a physics process uses it.
@@ -298,7 +298,7 @@ impl Driver {
     pub(crate) async fn reply(&mut self) -> ResponseKind {
         let reply =
             with_timeout(self.replies.message()).await.expect("expected another message").expect("expected a reply");
-        reply.kind.expect("a kind")
+        reply.kind.expect("expected a message kind")
     }
 
     /// Sends a step and expects its acknowledgement.
@@ -307,15 +307,15 @@ impl Driver {
         self.step(step).await;
         match self.reply().await {
             ResponseKind::Ack(ack) if ack.step == number => ack,
-            other => panic!("step {number} was answered with {other:?}"),
+            other => panic!("expected an acknowledgement of step {number}, got {other:?}"),
         }
     }
 
-    /// Expects a refusal.
+    /// Expects a rejection.
     pub(crate) async fn rejection(&mut self) -> v1::Rejection {
         match self.reply().await {
             ResponseKind::Rejection(rejection) => rejection,
-            other => panic!("expected a rejection, not {other:?}"),
+            other => panic!("expected a rejection, got {other:?}"),
         }
     }
 
@@ -323,7 +323,7 @@ impl Driver {
     pub(crate) async fn finish(self) {
         let Self { sender, mut replies } = self;
         drop(sender);
-        while with_timeout(replies.message()).await.expect("a clean end").is_some() {}
+        while with_timeout(replies.message()).await.expect("expected the stream to end without an error").is_some() {}
     }
 
     /// Both directions, for concurrent use.
@@ -342,9 +342,9 @@ pub(crate) fn step(number: u64, q_domains: &[u32], q: &[f32]) -> v1::Step {
 }
 
 /// A step that places domains by quaternions x y z w and translations, in one of the two rigid formats.
-pub(crate) fn rigid_step(number: u64, format: v1::TransformFormat, places: &[(u32, [f32; 4], [f64; 3])]) -> v1::Step {
+pub(crate) fn rigid_step(number: u64, format: v1::TransformFormat, poses: &[(u32, [f32; 4], [f64; 3])]) -> v1::Step {
     let mut bytes = Vec::new();
-    for (_, rotation, translation) in places {
+    for (_, rotation, translation) in poses {
         bytes.extend(rotation.iter().flat_map(|number| number.to_le_bytes()));
         match format {
             v1::TransformFormat::RigidF64 => bytes.extend(translation.iter().flat_map(|number| number.to_le_bytes())),
@@ -352,7 +352,7 @@ pub(crate) fn rigid_step(number: u64, format: v1::TransformFormat, places: &[(u3
         }
     }
     v1::Step {
-        transform_domains: places.iter().map(|(domain, ..)| *domain).collect(),
+        transform_domains: poses.iter().map(|(domain, ..)| *domain).collect(),
         transforms: bytes.into(),
         transform_format: format.into(),
         ..step(number, &[], &[])
@@ -435,7 +435,7 @@ pub(crate) async fn next_vertices(
             return Ok(Some(join(chunks)));
         }
     }
-    assert!(chunks.is_empty(), "the stream ended within a step");
+    assert!(chunks.is_empty(), "expected the stream to end after a complete step");
     Ok(None)
 }
 
@@ -444,7 +444,7 @@ fn join(mut chunks: Vec<v1::VertexChunk>) -> ReceivedVertices {
     let mut bytes = Vec::new();
     for chunk in chunks {
         assert_eq!(chunk.offset, bytes.len() as u64);
-        assert!(chunk.head.is_none(), "one head per reply");
+        assert!(chunk.head.is_none(), "expected one head per reply");
         bytes.extend_from_slice(&chunk.data);
     }
     assert_eq!(head.total, bytes.len() as u64);
@@ -458,7 +458,7 @@ fn join(mut chunks: Vec<v1::VertexChunk>) -> ReceivedVertices {
     ReceivedVertices { positions, normals, displacements, boxes, origins, head }
 }
 
-/// Decodes the refusal in the details of a status.
+/// Decodes the rejection in the details of a status.
 pub(crate) fn rejection_details(status: &tonic::Status) -> v1::Rejection {
-    v1::Rejection::decode(status.details()).expect("a rejection in the details")
+    v1::Rejection::decode(status.details()).expect("expected a rejection in the status details")
 }

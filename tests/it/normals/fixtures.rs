@@ -13,7 +13,7 @@ use nalgebra::{Matrix3, Vector3};
 pub(crate) const UP: [f32; 3] = [0.0, 0.0, 1.0];
 
 /// A shape with one mode; the function gives the displacement at each rest position.
-pub(crate) fn with_mode(mesh: Mesh, displacement: impl Fn([f32; 3]) -> [f32; 3]) -> Shape {
+pub(crate) fn shape_with_mode(mesh: Mesh, displacement: impl Fn([f32; 3]) -> [f32; 3]) -> Shape {
     let column: Vec<f32> = mesh.rest().iter().flat_map(|rest| displacement(*rest)).collect();
     let modes = Modes::from_columns(column.len(), 1, column).expect("expected valid modes");
     Shape::new(mesh, modes).expect("expected a valid shape")
@@ -21,10 +21,11 @@ pub(crate) fn with_mode(mesh: Mesh, displacement: impl Fn([f32; 3]) -> [f32; 3])
 
 /// A flat grid over -1..1 x -1..1 at z = 0 that faces +Z; u runs along x.
 pub(crate) fn sheet(columns: u32, rows: u32) -> Mesh {
-    let at = |index: u32, count: u32| 2.0 * index as f32 / (count - 1) as f32 - 1.0;
-    let places = (0..rows).flat_map(|row| (0..columns).map(move |column| (at(column, columns), at(row, rows))));
-    let rest: Vec<_> = places.clone().map(|(x, y)| [x, y, 0.0]).collect();
-    let uvs = places.map(|(x, y)| [0.5 * x + 0.5, 0.5 - 0.5 * y]).collect();
+    let coordinate = |index: u32, count: u32| 2.0 * index as f32 / (count - 1) as f32 - 1.0;
+    let grid =
+        (0..rows).flat_map(|row| (0..columns).map(move |column| (coordinate(column, columns), coordinate(row, rows))));
+    let rest: Vec<_> = grid.clone().map(|(x, y)| [x, y, 0.0]).collect();
+    let uvs = grid.map(|(x, y)| [0.5 * x + 0.5, 0.5 - 0.5 * y]).collect();
     let normals = vec![UP; rest.len()];
     Mesh::from_indexed(rest, normals, uvs, quads(columns, rows)).expect("expected a valid mesh")
 }
@@ -32,37 +33,43 @@ pub(crate) fn sheet(columns: u32, rows: u32) -> Mesh {
 /// Two triangles per cell of a grid, all split along the same diagonal.
 pub(crate) fn quads(columns: u32, rows: u32) -> Vec<[u32; 3]> {
     let cells = (0..rows - 1).flat_map(|row| (0..columns - 1).map(move |column| row * columns + column));
-    cells.flat_map(|at| [[at, at + 1, at + columns + 1], [at, at + columns + 1, at + columns]]).collect()
+    cells
+        .flat_map(|first| [[first, first + 1, first + columns + 1], [first, first + columns + 1, first + columns]])
+        .collect()
 }
 
 /// A tube about y. Its first and last columns of corners share one line of vertices, as at a seam of texture
 /// coordinates. The normals of the last column are rotated by `tilt` degrees.
-pub(crate) fn tube(around: u32, rows: u32, tilt: f32) -> Mesh {
-    let turn = |column: u32| column as f32 / around as f32 * std::f32::consts::TAU;
-    let rest = (0..rows).flat_map(|row| (0..around).map(move |at| [turn(at).cos(), row as f32, -turn(at).sin()]));
+pub(crate) fn tube(columns: u32, rows: u32, tilt: f32) -> Mesh {
+    let column_angle = |column: u32| column as f32 / columns as f32 * std::f32::consts::TAU;
+    let rest = (0..rows).flat_map(|row| {
+        (0..columns).map(move |column| [column_angle(column).cos(), row as f32, -column_angle(column).sin()])
+    });
     let mut corners = Corners::default();
-    for (row, column) in (0..rows).flat_map(|row| (0..=around).map(move |column| (row, column))) {
-        let angle = turn(column % around) + if column == around { tilt.to_radians() } else { 0.0 };
-        corners.vertices.push(row * around + column % around);
+    for (row, column) in (0..rows).flat_map(|row| (0..=columns).map(move |column| (row, column))) {
+        let angle = column_angle(column % columns) + if column == columns { tilt.to_radians() } else { 0.0 };
+        corners.vertices.push(row * columns + column % columns);
         corners.normals.push([angle.cos(), 0.0, -angle.sin()]);
-        corners.uvs.push([column as f32 / around as f32, 1.0 - row as f32]);
+        corners.uvs.push([column as f32 / columns as f32, 1.0 - row as f32]);
     }
-    Mesh::new(rest.collect(), corners, quads(around + 1, rows)).expect("expected a valid mesh")
+    Mesh::new(rest.collect(), corners, quads(columns + 1, rows)).expect("expected a valid mesh")
 }
 
 /// A unit cube of 8 vertices and 24 corners; every edge is hard.
 pub(crate) fn cube() -> Mesh {
-    let rest = (0..8_u8).map(|at| [0, 1, 2].map(|axis| f32::from(at >> axis & 1))).collect();
+    let rest = (0..8_u8).map(|vertex| [0, 1, 2].map(|axis| f32::from(vertex >> axis & 1))).collect();
     let (mut corners, mut triangles) = (Corners::default(), Vec::new());
     for (axis, side) in (0..3_usize).flat_map(|axis| [(axis, 0_u32), (axis, 1)]) {
-        let (next, last) = (1_u32 << ((axis + 1) % 3), 1_u32 << ((axis + 2) % 3));
+        let (second_axis, third_axis) = (1_u32 << ((axis + 1) % 3), 1_u32 << ((axis + 2) % 3));
         let first = corners.vertices.len() as u32;
-        corners.vertices.extend([0, next, next | last, last].map(|at| at | side << axis));
+        corners
+            .vertices
+            .extend([0, second_axis, second_axis | third_axis, third_axis].map(|vertex| vertex | side << axis));
         let mut normal = [0.0; 3];
         normal[axis] = if side == 1 { 1.0 } else { -1.0 };
         corners.normals.extend([normal; 4]);
-        let cut = if side == 1 { [[0, 1, 2], [0, 2, 3]] } else { [[0, 2, 1], [0, 3, 2]] };
-        triangles.extend(cut.map(|triangle| triangle.map(|corner| first + corner)));
+        let split = if side == 1 { [[0, 1, 2], [0, 2, 3]] } else { [[0, 2, 1], [0, 3, 2]] };
+        triangles.extend(split.map(|triangle| triangle.map(|corner| first + corner)));
     }
     Mesh::new(rest, corners, triangles).expect("expected a valid mesh")
 }
@@ -78,15 +85,15 @@ pub(crate) fn sphere(level: u32) -> Mesh {
         triangles = triangles.into_iter().flat_map(split).collect();
     }
     let mut rest: Vec<[f32; 3]> = Vec::new();
-    let mut number = |place: Vector3<f64>| {
-        let place: [f32; 3] = place.cast::<f32>().into();
-        let near = |other: &[f32; 3]| (0..3).all(|axis| (other[axis] - place[axis]).abs() < 1e-5);
-        rest.iter().position(near).unwrap_or_else(|| {
-            rest.push(place);
+    let mut vertex_index = |position: Vector3<f64>| {
+        let position: [f32; 3] = position.cast::<f32>().into();
+        let is_near = |other: &[f32; 3]| (0..3).all(|axis| (other[axis] - position[axis]).abs() < 1e-5);
+        rest.iter().position(is_near).unwrap_or_else(|| {
+            rest.push(position);
             rest.len() - 1
         }) as u32
     };
-    let triangles: Vec<_> = triangles.into_iter().map(|triangle| triangle.map(&mut number)).collect();
+    let triangles: Vec<_> = triangles.into_iter().map(|triangle| triangle.map(&mut vertex_index)).collect();
     let vertices: Vec<u32> = (0..rest.len() as u32).collect();
     let normals = smooth_normals(&rest, &vertices, &triangles);
     Mesh::from_indexed(rest, normals, vec![], triangles).expect("expected a valid mesh")
@@ -103,10 +110,11 @@ fn octants() -> Vec<[Vector3<f64>; 3]> {
 
 /// A scene of shapes with exact normals; shapes with texture coordinates have a normal map.
 pub(crate) fn scene(shapes: Vec<Shape>) -> Arc<Scene> {
-    scene_with(shapes, NormalMethod::Exact)
+    scene_with_normals(shapes, NormalMethod::Exact)
 }
 
-pub(crate) fn scene_with(shapes: Vec<Shape>, normals: NormalMethod) -> Arc<Scene> {
+/// A scene of shapes with rigid or exact normals; shapes with texture coordinates have a normal map.
+pub(crate) fn scene_with_normals(shapes: Vec<Shape>, normals: NormalMethod) -> Arc<Scene> {
     let mut parts = SceneParts::named("bent");
     parts.deformation.normals = normals;
     parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("expected a valid texture")];
@@ -140,37 +148,37 @@ pub(crate) fn state(scene: &Scene, q: f32, linear: Matrix3<f64>, translation: [f
 }
 
 /// The rest state with every coordinate set to q.
-pub(crate) fn bent(scene: &Scene, q: f32) -> SceneState {
+pub(crate) fn uniform_q_state(scene: &Scene, q: f32) -> SceneState {
     state(scene, q, Matrix3::identity(), [0.0; 3])
 }
 
 /// The surface that the CPU deformer computes for a state.
-pub(crate) fn on_cpu(scene: &Arc<Scene>, state: &SceneState) -> DeformedSurface {
+pub(crate) fn deform_on_cpu(scene: &Arc<Scene>, state: &SceneState) -> DeformedSurface {
     let mut cpu = CpuDeformer::new(scene);
     cpu.deform(state).expect("expected the step to succeed");
     cpu.surface().expect("expected a surface").clone()
 }
 
 /// Exact normals and tangents of the reference.
-pub(crate) fn exact(scene: &Scene, state: &SceneState) -> (Vec<[f64; 3]>, Vec<[f64; 4]>) {
+pub(crate) fn reference_normals_and_tangents(scene: &Scene, state: &SceneState) -> (Vec<[f64; 3]>, Vec<[f64; 4]>) {
     let positions = modalcast_compute::reference::deform(scene, state);
     let tangents = modalcast_compute::reference::exact_tangents(scene, state, &positions);
     (modalcast_compute::reference::exact_normals(scene, state, &positions), tangents)
 }
 
 /// Angle between two directions in degrees; NaN if a component is NaN.
-pub(crate) fn degrees(a: [f64; 3], b: [f64; 3]) -> f64 {
+pub(crate) fn angle_degrees(a: [f64; 3], b: [f64; 3]) -> f64 {
     let (a, b) = (Vector3::from(a), Vector3::from(b));
     a.cross(&b).norm().atan2(a.dot(&b)).to_degrees()
 }
 
 /// Largest angle in degrees between f32 triples and directions; infinite if a triple is NaN or not of unit length.
-pub(crate) fn largest_angle(got: &[f32], want: &[[f64; 3]]) -> f64 {
-    assert_eq!(got.len(), 3 * want.len(), "as many directions");
+pub(crate) fn max_angle_degrees(got: &[f32], want: &[[f64; 3]]) -> f64 {
+    assert_eq!(got.len(), 3 * want.len(), "expected three numbers per direction");
     let angle = |(got, want): (&[f32], &[f64; 3])| {
         let got: [f64; 3] = [0, 1, 2].map(|axis| f64::from(got[axis]));
         let is_unit = (Vector3::from(got).norm() - 1.0).abs() < 1e-6;
-        let angle = degrees(got, *want);
+        let angle = angle_degrees(got, *want);
         if is_unit && !angle.is_nan() { angle } else { f64::INFINITY }
     };
     got.chunks_exact(3).zip(want).map(angle).fold(0.0, f64::max)

@@ -4,11 +4,11 @@ use modalcast_compute::cpu::CpuDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer};
 use modalcast_model::scene::{Scene, SceneState};
 
-use super::fixtures::{cube, scene, sheet, sphere, state, tube, with_mode};
+use super::fixtures::{cube, scene, shape_with_mode, sheet, sphere, state, tube};
 use super::linear_parts;
 use crate::deformers::TestRng;
 
-/// A displacement that bends and shears.
+/// A nonlinear displacement.
 fn wave([x, y, z]: [f32; 3]) -> [f32; 3] {
     [0.3 * y * z, 0.2 * x * x, (2.0 * x + y).sin() + 0.4 * z]
 }
@@ -18,7 +18,7 @@ fn bits(numbers: &[f32]) -> Vec<u32> {
 }
 
 /// Positions, normals and tangents of a surface as bits.
-fn all(surface: &DeformedSurface) -> [Vec<u32>; 3] {
+fn surface_bits(surface: &DeformedSurface) -> [Vec<u32>; 3] {
     [&surface.positions, &surface.normals, &surface.tangents].map(|numbers| bits(numbers))
 }
 
@@ -29,7 +29,7 @@ fn normals_of(scene: &Scene, surface: &DeformedSurface, domain: usize) -> Vec<u3
 }
 
 /// Changes q of some domains, their transforms, or both, depending on the step. Returns the changed domains.
-fn change(scene: &Scene, state: &mut SceneState, step: usize, noise: &mut TestRng) -> Vec<usize> {
+fn change_domains(scene: &Scene, state: &mut SceneState, step: usize, random: &mut TestRng) -> Vec<usize> {
     let domains = match step {
         0 => vec![3],
         1 => vec![1],
@@ -40,38 +40,41 @@ fn change(scene: &Scene, state: &mut SceneState, step: usize, noise: &mut TestRn
     for domain in &domains {
         let slot = scene.layout.slots[*domain];
         if step != 1 {
-            state.q[slot.first_q..][..slot.rank].iter_mut().for_each(|number| *number += noise.next());
+            state.q[slot.first_q..][..slot.rank].iter_mut().for_each(|number| *number += random.next());
         }
         if step % 2 == 1 {
-            state.transforms[*domain].0.iter_mut().for_each(|number| *number += 0.3 * noise.next());
+            state.transforms[*domain].0.iter_mut().for_each(|number| *number += 0.3 * random.next());
         }
     }
     domains
 }
 
-/// After each step, all vertices and directions have the bits of a fresh deformer with any number of threads.
+/// After each step, positions, normals and tangents have the bits of a new deformer with any number of threads.
 #[test]
 fn unchanged_domains_keep_their_normals() {
     let meshes = [sheet(33, 30), cube(), tube(40, 20, 0.0), sphere(3), sheet(2, 2)];
-    let scene = scene(meshes.map(|mesh| with_mode(mesh, wave)).into());
+    let scene = scene(meshes.map(|mesh| shape_with_mode(mesh, wave)).into());
     let mut state = state(&scene, 0.4, linear_parts()[2], [1.0, 2.0, 3.0]);
-    let mut kept = CpuDeformer::new(&scene);
-    kept.deform(&state).expect("expected the step to succeed");
-    let (mut noise, mut before) = (TestRng(3), kept.surface().expect("one").clone());
+    let mut deformer = CpuDeformer::new(&scene);
+    deformer.deform(&state).expect("expected the step to succeed");
+    let (mut random, mut last) = (TestRng(3), deformer.surface().expect("one").clone());
     for step in 0..5 {
-        let changed = change(&scene, &mut state, step, &mut noise);
-        kept.deform(&state).expect("expected the step to succeed");
-        let now = kept.surface().expect("one").clone();
+        let changed = change_domains(&scene, &mut state, step, &mut random);
+        deformer.deform(&state).expect("expected the step to succeed");
+        let current = deformer.surface().expect("one").clone();
         for domain in 0..scene.domains.len() {
-            let same = normals_of(&scene, &now, domain) == normals_of(&scene, &before, domain);
-            assert_eq!(same, !changed.contains(&domain), "step {step}, domain {domain}");
+            let is_unchanged = normals_of(&scene, &current, domain) == normals_of(&scene, &last, domain);
+            assert_eq!(is_unchanged, !changed.contains(&domain), "step {step}, domain {domain}");
         }
         for threads in [1, 2, 5] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
-            let mut fresh = CpuDeformer::new(&scene);
-            pool.install(|| fresh.deform(&state)).expect("expected the step to succeed");
-            assert!(all(fresh.surface().expect("one")) == all(&now), "step {step}, {threads} threads");
+            let mut new_deformer = CpuDeformer::new(&scene);
+            pool.install(|| new_deformer.deform(&state)).expect("expected the step to succeed");
+            assert!(
+                surface_bits(new_deformer.surface().expect("one")) == surface_bits(&current),
+                "step {step}, {threads} threads"
+            );
         }
-        before = now;
+        last = current;
     }
 }
