@@ -39,6 +39,18 @@
 //! | `modalcast-compute::cpu` | the f32 deformer for machines without a GPU | `storage` |
 //! | `modalcast-compute::reference` | the f64 reference deformer, which the others are tested against | |
 //! | `modalcast-compute::storage` | tiled storage of U for CPU and GPU: storage types, a-priori bounds, mode truncation; pure functions | |
+//! | `modalcast-render::renderer` | the calls that load scenes and draw them; frames in flight, choice of rasterizers | `passes`, `resources`, `shaders`, `layout`, `uniforms`, `device`, `region`, `types`, `pass` |
+//! | `modalcast-render::passes` | the commands of each pass (culling, shadow, visibility, transparency, shading, post-processing, picking, AOV), its inputs, outputs and barriers | `resources`, `shaders`, `layout`, `scene_data`, `uniforms`, `device`, `region`, `types`, `pass` |
+//! | `modalcast-render::resources` | buffers, textures and programs of a scene, images of a frame | `shaders`, `plan`, `layout`, `scene_data`, `device`, `region`, `types` |
+//! | `modalcast-render::shaders` | shader sources, with the branches that a scene needs | `plan`, `layout`, `scene_data`, `device`, `types` |
+//! | `modalcast-render::plan` | buffers, passes and shader features of a scene; pure functions | `layout`, `scene_data`, `uniforms`, `device`, `types`, `pass` |
+//! | `modalcast-render::layout` | twins of GLSL blocks; texture units and bindings | `scene_data`, `types` |
+//! | `modalcast-render::scene_data` | draw groups, index lists and texture levels, computed on the host | |
+//! | `modalcast-render::uniforms` | uniforms of a frame: camera, shadow map, cascades | `types` |
+//! | `modalcast-render::device` | EGL and OpenGL: contexts, typed objects, readback ring; the only module that calls OpenGL | `region`, `types` |
+//! | `modalcast-render::region` | rectangles of a frame that are drawn or cleared | |
+//! | `modalcast-render::types` | parameters and results of the renderer | `pass` |
+//! | `modalcast-render::pass` | names of the passes and stages, and their times | |
 //! | `modalcast-model::load` | scene loaders: OBJ, glTF, Vega, NumPy, safetensors, SOFA, plants, `scene.toml`; the repository | `tree`, `backend_settings`, `scene`, `domain`, `error` |
 //! | `modalcast-model::tree` | the built-in scene: a tree of beams, their modes, and the skin they deform | `scene`, `domain`, `error` |
 //! | `modalcast-model::deform` | the trait of deformers | `scene`, `error` |
