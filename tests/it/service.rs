@@ -22,7 +22,7 @@ struct FailsOnce {
 impl SceneSource for FailsOnce {
     fn open(&self, source: &str) -> Result<OpenedScene> {
         if self.opened.fetch_add(1, std::sync::atomic::Ordering::SeqCst) == 0 {
-            self.fail.lock().expect("unpoisoned").recv().expect("a word");
+            self.fail.lock().expect("expected an unpoisoned mutex").recv().expect("expected a signal");
             return Err(modalcast_model::error::invalid("source", "a second try", source));
         }
         std::thread::sleep(std::time::Duration::from_millis(100));
@@ -42,8 +42,8 @@ impl SceneSource for FailsOnce {
 #[tokio::test(flavor = "multi_thread")]
 async fn opening_after_a_concurrent_failure_is_registered() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
-    let (fail, told) = std::sync::mpsc::sync_channel(1);
-    let source = std::sync::Arc::new(FailsOnce { opened: 0.into(), fail: told.into() });
+    let (fail, fail_receiver) = std::sync::mpsc::sync_channel(1);
+    let source = std::sync::Arc::new(FailsOnce { opened: 0.into(), fail: fail_receiver.into() });
     let server = Server::start_from(crate::service_harness::config(folder.path()), source.clone()).await;
     let open = || {
         let engine = server.engine.clone();
@@ -55,16 +55,16 @@ async fn opening_after_a_concurrent_failure_is_registered() {
     }
     let second = open();
     tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-    fail.send(()).expect("it listens");
+    fail.send(()).expect("expected a waiting source");
     assert!(with_timeout(first).await.expect("expected the task not to panic").is_err());
     with_timeout(second).await.expect("expected the task not to panic").expect("opens");
-    server.engine.find("strips").expect("what was opened is there");
+    server.engine.find("strips").expect("expected an open scene");
     server.engine.close("strips").await.expect("expected the scene to close");
-    server.engine.open("other", "strips").await.expect("its name is free for another source");
+    server.engine.open("other", "strips").await.expect("expected an unused name");
 }
 
 /// Size limit of one message in bytes: a chunk of 1 MiB and its envelope.
-const LARGEST: usize = (1 << 20) + 4096;
+const MAX_MESSAGE_BYTES: usize = (1 << 20) + 4096;
 
 async fn describe(server: &Server, scene: &str, arrays: &[Array]) -> (Vec<v1::DomainDescription>, Vec<Vec<u8>>) {
     let arrays = arrays.iter().map(|array| (*array).into()).collect();
@@ -73,7 +73,7 @@ async fn describe(server: &Server, scene: &str, arrays: &[Array]) -> (Vec<v1::Do
     let mut domains = Vec::new();
     let mut contents: Vec<Vec<u8>> = Vec::new();
     while let Some(response) = with_timeout(stream.message()).await.expect("expected another message") {
-        assert!(response.encoded_len() <= LARGEST);
+        assert!(response.encoded_len() <= MAX_MESSAGE_BYTES);
         match response.part.expect("a part") {
             Part::Scene(info) => assert_eq!(info.scene, scene),
             Part::Domains(part) => domains.extend(part.domains),
@@ -81,23 +81,23 @@ async fn describe(server: &Server, scene: &str, arrays: &[Array]) -> (Vec<v1::Do
                 if chunk.offset == 0 {
                     contents.push(Vec::new());
                 }
-                let whole = contents.last_mut().expect("begun");
-                assert_eq!(chunk.offset, whole.len() as u64);
-                whole.extend_from_slice(&chunk.data);
-                assert!(whole.len() as u64 <= chunk.total);
+                let array = contents.last_mut().expect("expected an array that starts at offset 0");
+                assert_eq!(chunk.offset, array.len() as u64);
+                array.extend_from_slice(&chunk.data);
+                assert!(array.len() as u64 <= chunk.total);
             }
         }
     }
     (domains, contents)
 }
 
-async fn modes(server: &Server, scene: &str, domain: u32, vertices: &[u32]) -> Vec<f32> {
+async fn read_modes(server: &Server, scene: &str, domain: u32, vertices: &[u32]) -> Vec<f32> {
     let request = v1::ReadModesRequest { scene: scene.into(), domain, vertices: vertices.to_vec() };
     let mut stream = server.scenes().await.read_modes(request).await.expect("reads").into_inner();
     let mut bytes = Vec::new();
     let mut total = 0;
     while let Some(response) = with_timeout(stream.message()).await.expect("expected another message") {
-        assert!(response.encoded_len() <= LARGEST);
+        assert!(response.encoded_len() <= MAX_MESSAGE_BYTES);
         assert_eq!(response.offset, bytes.len() as u64);
         bytes.extend_from_slice(&response.data);
         total = response.total;
@@ -134,7 +134,7 @@ async fn client_can_read_the_whole_scene() {
     assert_eq!((right.attachment_frame.len(), right.placement.len(), right.shape), (48, 48, 0));
     let columns = &scene.shapes[0].modes;
     let rows = |vertex: usize| (0..3).flat_map(move |part| (0..2).map(move |mode| columns.at(vertex, part, mode)));
-    assert_eq!(modes(&server, "strips", 1, &[3, 0]).await, rows(3).chain(rows(0)).collect::<Vec<_>>());
+    assert_eq!(read_modes(&server, "strips", 1, &[3, 0]).await, rows(3).chain(rows(0)).collect::<Vec<_>>());
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -144,8 +144,11 @@ async fn description_contains_follow_parents_and_frames() {
     let (domains, _) = describe(&server, "twig", &[]).await;
     assert_eq!(domains.iter().map(|domain| domain.follows).collect::<Vec<_>>(), [None, None, Some(1), Some(2)]);
     assert_eq!(domains.iter().map(|domain| domain.follow_frame.len()).collect::<Vec<_>>(), [0, 0, 48, 48]);
-    assert_eq!(domains[2].placement, domains[2].follow_frame, "on a branch that is where it was made");
-    assert_ne!(domains[3].placement, domains[3].follow_frame, "the placement is that in the world");
+    assert_eq!(
+        domains[2].placement, domains[2].follow_frame,
+        "expected the frame as placement on a branch at its rest pose"
+    );
+    assert_ne!(domains[3].placement, domains[3].follow_frame, "expected a world placement");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -157,13 +160,13 @@ async fn large_replies_are_chunked_for_default_client_limits() {
     let mesh = &scene.shapes[0].mesh;
     assert_eq!(contents[0], bytemuck::cast_slice::<_, u8>(mesh.triangles()));
     assert_eq!(contents[1], bytemuck::cast_slice::<_, u8>(mesh.rest()));
-    let rows = modes(&server, "sheet", 0, &[]).await;
+    let rows = read_modes(&server, "sheet", 0, &[]).await;
     let columns = &scene.shapes[0].modes;
     assert_eq!(rows.len(), columns.columns().len());
     assert!((0..90_000).all(|vertex| rows[12 * vertex + 7] == columns.at(vertex, 1, 3)));
-    let ask = v1::GetVerticesRequest { scene: "sheet".into(), ..v1::GetVerticesRequest::default() };
-    let got = get_vertices(&server, ask).await.expect("vertices");
-    assert_eq!(got.step().run, 0, "no step was made yet");
+    let request = v1::GetVerticesRequest { scene: "sheet".into(), ..v1::GetVerticesRequest::default() };
+    let got = get_vertices(&server, request).await.expect("expected vertices");
+    assert_eq!(got.step().run, 0, "expected run 0 before the first step");
     assert_eq!((got.positions, got.normals), reference_vertices(&scene, &[]));
 }
 
@@ -182,9 +185,9 @@ async fn concurrent_openings_share_one_scene() {
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
     let delete = v1::DeleteSceneRequest { scene: "strips".into() };
     server.scenes().await.delete_scene(delete).await.expect("expected the deletion to succeed");
-    let end = with_timeout(stream.message()).await.expect_err("the scene is gone");
+    let end = with_timeout(stream.message()).await.expect_err("expected a deleted-scene error");
     assert_eq!((end.code(), rejection_details(&end).given.as_str()), (tonic::Code::NotFound, "'strips'"));
-    let end = with_timeout(driver.replies.message()).await.expect_err("the scene is gone");
+    let end = with_timeout(driver.replies.message()).await.expect_err("expected a deleted-scene error");
     assert_eq!(end.code(), tonic::Code::NotFound);
     server.open("strips").await;
 }
@@ -193,8 +196,8 @@ async fn concurrent_openings_share_one_scene() {
 async fn scene_limit_holds_and_a_deleted_scene_frees_a_slot() {
     let server = Server::start_with(|config| modalcast::config::Config { open_scenes: 1, ..config }).await;
     server.open("strips").await;
-    let more = v1::OpenSceneRequest { source: "sheet".into(), scene: String::new() };
-    let status = server.scenes().await.open_scene(more).await.expect_err("full");
+    let second_scene = v1::OpenSceneRequest { source: "sheet".into(), scene: String::new() };
+    let status = server.scenes().await.open_scene(second_scene).await.expect_err("expected a scene-limit error");
     assert_eq!(
         (status.code(), rejection_details(&status).expected.as_str()),
         (tonic::Code::ResourceExhausted, "at most 1")
@@ -209,7 +212,7 @@ async fn scene_limit_holds_and_a_deleted_scene_frees_a_slot() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn server_without_renderer_refuses_only_frames() {
+async fn server_without_renderer_rejects_only_frames() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let mut client = v1::server_service_client::ServerServiceClient::new(server.channel().await);
@@ -219,7 +222,7 @@ async fn server_without_renderer_refuses_only_frames() {
     let limits = info.limits.expect("limits");
     assert_eq!((limits.message_bytes, limits.window, limits.scenes), (1 << 20, 256, 16));
     let request = v1::StreamFramesRequest { scene: "strips".into(), ..v1::StreamFramesRequest::default() };
-    let status = server.frames().await.stream_frames(request).await.expect_err("no renderer");
+    let status = server.frames().await.stream_frames(request).await.expect_err("expected an error without a renderer");
     assert_eq!(status.code(), tonic::Code::Unavailable);
     assert!(rejection_details(&status).given.contains("switched off"));
 }
@@ -238,30 +241,34 @@ async fn health_and_reflection_answer_and_stop_ends_streams() {
         let status = health.check(request).await.expect("expected a reply").into_inner();
         assert_eq!(status.status(), tonic_health::pb::health_check_response::ServingStatus::Serving);
     }
-    let ask = ServerReflectionRequest {
+    let request = ServerReflectionRequest {
         host: String::new(),
         message_request: Some(MessageRequest::ListServices(String::new())),
     };
     let mut client = ServerReflectionClient::new(server.channel().await);
-    let mut answers =
-        client.server_reflection_info(tokio_stream::iter([ask])).await.expect("expected a reply").into_inner();
-    let answer = answers.next().await.expect("one").expect("fine").message_response;
-    let Some(MessageResponse::ListServicesResponse(list)) = answer else { panic!("{answer:?}") };
+    let mut replies =
+        client.server_reflection_info(tokio_stream::iter([request])).await.expect("expected a reply").into_inner();
+    let reply = replies.next().await.expect("one").expect("fine").message_response;
+    let Some(MessageResponse::ListServicesResponse(list)) = reply else { panic!("{reply:?}") };
     let names: Vec<_> = list.service.into_iter().map(|service| service.name).collect();
     for service in ["modalcast.v1.SceneService", "modalcast.v1.FrameService", "grpc.health.v1.Health"] {
         assert!(names.iter().any(|name| name == service), "{service} is not in {names:?}");
     }
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
     driver.step_acknowledged(crate::service_harness::step(1, &[0], &[0.0, 0.0])).await;
-    let watched = health.watch(tonic_health::pb::HealthCheckRequest { service: String::new() }).await;
-    let mut watched = watched.expect("a watch").into_inner();
-    assert_eq!(watched.message().await.expect("fine").expect("one").status, 1);
-    let read = async {
-        assert_eq!(with_timeout(watched.message()).await.expect("fine").expect("one").status, 2, "not serving");
-        let end = with_timeout(driver.replies.message()).await.expect_err("the server stops");
+    let health_stream = health.watch(tonic_health::pb::HealthCheckRequest { service: String::new() }).await;
+    let mut health_stream = health_stream.expect("expected a health stream").into_inner();
+    assert_eq!(health_stream.message().await.expect("expected a reply").expect("expected a message").status, 1);
+    let read_until_stop = async {
+        assert_eq!(
+            with_timeout(health_stream.message()).await.expect("expected a reply").expect("expected a message").status,
+            2,
+            "expected NOT_SERVING"
+        );
+        let end = with_timeout(driver.replies.message()).await.expect_err("expected the stream to end");
         assert_eq!(end.code(), tonic::Code::Unavailable);
-        drop((watched, driver, health, client, answers));
+        drop((health_stream, driver, health, client, replies));
     };
-    let (stopped, ()) = tokio::join!(server.stop(), read);
-    stopped.expect("expected the server to stop without an error");
+    let (result, ()) = tokio::join!(server.stop(), read_until_stop);
+    result.expect("expected the server to stop without an error");
 }

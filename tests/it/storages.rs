@@ -10,37 +10,40 @@ use modalcast_model::deform::{DeformSummary, Deformer};
 use modalcast_model::domain::{Material, Modes, Shape, Transform};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState, StorageType};
 
-use crate::deformers::{TestRng, domain, shaken, strip};
+use crate::deformers::{TestRng, domain, random_state, random_strip};
 
 const SIZES: [(usize, usize); 9] =
     [(1, 1), (1, 0), (7, 3), (129, 31), (1500, 33), (7, 512), (129, 0), (128, 6), (1500, 1)];
 
 /// A scene of strips of [`SIZES`]. The last two domains are instances of the first and of the fourth shape; the last
-/// one also shares the coordinates of its twin.
+/// one also shares the coordinates of the fourth domain.
 fn scene_of(deformation: DeformationSettings) -> Arc<Scene> {
-    let mut noise = TestRng(42);
+    let mut random = TestRng(42);
     let mut parts = SceneParts::named("storages");
     parts.deformation = deformation;
     parts.materials = vec![Material::default()];
-    for (at, (vertices, rank)) in SIZES.iter().enumerate() {
-        parts.shapes.push(strip(*vertices, *rank, &mut noise));
-        parts.domains.push(domain(at, format!("strip {at}")));
+    for (index, (vertices, rank)) in SIZES.iter().enumerate() {
+        parts.shapes.push(random_strip(*vertices, *rank, &mut random));
+        parts.domains.push(domain(index, format!("strip {index}")));
     }
     parts.domains.push(domain(0, "instance of 0".into()));
-    let mut twin = domain(3, "instance of 3".into());
-    twin.shares_q_with = Some(3);
-    parts.domains.push(twin);
+    let mut sharing_domain = domain(3, "instance of 3".into());
+    sharing_domain.shares_q_with = Some(3);
+    parts.domains.push(sharing_domain);
     Scene::new(parts).expect("expected a valid scene")
 }
 
 /// One domain with these columns of U and rest positions of zero.
-fn columns_of(vertices: usize, columns: Vec<f32>, deformation: DeformationSettings) -> Arc<Scene> {
+fn scene_from_columns(vertices: usize, columns: Vec<f32>, deformation: DeformationSettings) -> Arc<Scene> {
     let mut parts = SceneParts::named("columns");
     parts.deformation = deformation;
     parts.materials = vec![Material::default()];
-    let flat = strip(vertices, 0, &mut TestRng(1)).mesh;
-    let mesh =
-        modalcast_model::domain::Mesh::new(vec![[0.0; 3]; vertices], flat.corners().clone(), flat.triangles().to_vec());
+    let template = random_strip(vertices, 0, &mut TestRng(1)).mesh;
+    let mesh = modalcast_model::domain::Mesh::new(
+        vec![[0.0; 3]; vertices],
+        template.corners().clone(),
+        template.triangles().to_vec(),
+    );
     let rank = columns.len() / (3 * vertices);
     let modes = Modes::from_columns(3 * vertices, rank, columns).expect("expected valid modes");
     parts.shapes = vec![Shape::new(mesh.expect("expected a valid mesh"), modes).expect("expected a valid shape")];
@@ -48,19 +51,19 @@ fn columns_of(vertices: usize, columns: Vec<f32>, deformation: DeformationSettin
     Scene::new(parts).expect("expected a valid scene")
 }
 
-fn run(deformer: &mut CpuDeformer, state: &SceneState) -> (DeformSummary, Vec<f32>) {
-    let told = deformer.deform(state).expect("expected the step to succeed");
-    (told, deformer.surface().expect("expected a surface").positions.clone())
+fn deform(deformer: &mut CpuDeformer, state: &SceneState) -> (DeformSummary, Vec<f32>) {
+    let summary = deformer.deform(state).expect("expected the step to succeed");
+    (summary, deformer.surface().expect("expected a surface").positions.clone())
 }
 
 /// Error bound of each tile of a domain, including the bound of the truncated modes.
-fn bounds_of(scene: &Scene, state: &SceneState, deformer: &CpuDeformer, domain: usize) -> Vec<f64> {
+fn tile_bounds(scene: &Scene, state: &SceneState, deformer: &CpuDeformer, domain: usize) -> Vec<f64> {
     let shape = scene.shape_of(domain);
     let tiles = TiledModes::new(shape, scene.deformation.storage);
     let mut q = state.q_of(scene, domain).to_vec();
-    let mut left_out = 0.0;
+    let mut truncation_bound = 0.0;
     if let Some(truncation) = deformer.truncation(domain) {
-        left_out = truncation.bound();
+        truncation_bound = truncation.bound();
         (0..q.len()).filter(|mode| !truncation.retained().contains(&(*mode as u16))).for_each(|mode| q[mode] = 0.0);
     }
     let step = ErrorBoundInput {
@@ -68,53 +71,53 @@ fn bounds_of(scene: &Scene, state: &SceneState, deformer: &CpuDeformer, domain: 
         transform: state.composed_transform(scene, domain),
         compensated: scene.deformation.compensated,
     };
-    let reaches = ShapeErrorModel::new(shape, &tiles);
-    (0..tiles.count()).map(|tile| reaches.tile(tile, &step).total() + left_out).collect()
+    let model = ShapeErrorModel::new(shape, &tiles);
+    (0..tiles.count()).map(|tile| model.tile(tile, &step).total() + truncation_bound).collect()
 }
 
 /// Largest error of each domain relative to the bound of its tile; infinite for NaN.
-fn parts_of_bound(scene: &Scene, state: &SceneState, positions: &[f32], deformer: &CpuDeformer) -> Vec<f64> {
+fn error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], deformer: &CpuDeformer) -> Vec<f64> {
     let want = reference::deform(scene, state);
-    let part = |domain: usize| {
+    let domain_ratio = |domain: usize| {
         let slot = scene.layout.slots[domain];
-        let bounds = bounds_of(scene, state, deformer, domain);
-        let part = |vertex: usize| {
+        let bounds = tile_bounds(scene, state, deformer, domain);
+        let vertex_ratio = |vertex: usize| {
             let packed = slot.first_vertex + vertex;
             let square = |axis: usize| (f64::from(positions[3 * packed + axis]) - want[packed][axis]).powi(2);
-            let part = (0..3).map(square).sum::<f64>().sqrt() / bounds[vertex / (QUAD * TILE_QUADS)];
-            if part.is_nan() { f64::INFINITY } else { part }
+            let ratio = (0..3).map(square).sum::<f64>().sqrt() / bounds[vertex / (QUAD * TILE_QUADS)];
+            if ratio.is_nan() { f64::INFINITY } else { ratio }
         };
-        (0..slot.vertices).map(part).fold(0.0, f64::max)
+        (0..slot.vertices).map(vertex_ratio).fold(0.0, f64::max)
     };
-    (0..scene.domains.len()).map(part).collect()
+    (0..scene.domains.len()).map(domain_ratio).collect()
 }
 
-/// Control: a state with the wrong sign exceeds the bound.
+/// Negative control: a state with the opposite sign exceeds the bound.
 #[test]
 fn errors_stay_within_bounds_in_every_storage() {
     for storage in StorageType::ALL {
         for (compensated, truncation) in [(false, None), (true, None), (false, Some(0.02)), (true, Some(0.02))] {
             let scene =
                 scene_of(DeformationSettings { storage, compensated, truncation, ..DeformationSettings::default() });
-            let mut state = shaken(&scene);
+            let mut state = random_state(&scene);
             // Decreasing amplitudes, so that some modes may be truncated.
             let count = state.q.len() as f32;
-            state.q.iter_mut().enumerate().for_each(|(at, number)| *number *= f32::exp2(-12.0 * at as f32 / count));
+            state.q.iter_mut().enumerate().for_each(|(mode, number)| *number *= f32::exp2(-12.0 * mode as f32 / count));
             let mut deformer = CpuDeformer::new(&scene);
-            let (_, positions) = run(&mut deformer, &state);
-            for (domain, part) in parts_of_bound(&scene, &state, &positions, &deformer).into_iter().enumerate() {
-                assert!(part <= 1.0, "{storage:?}, domain {domain}: {part} of the bound");
+            let (_, positions) = deform(&mut deformer, &state);
+            for (domain, ratio) in error_ratios(&scene, &state, &positions, &deformer).into_iter().enumerate() {
+                assert!(ratio <= 1.0, "{storage:?}, domain {domain}: {ratio} of the bound");
             }
-            let mut wrong = state.clone();
-            wrong.q.iter_mut().for_each(|number| *number = -*number);
-            let seen = parts_of_bound(&scene, &wrong, &positions, &deformer);
+            let mut negated_state = state.clone();
+            negated_state.q.iter_mut().for_each(|number| *number = -*number);
+            let ratios = error_ratios(&scene, &negated_state, &positions, &deformer);
             // Truncation may drop a mode within the budget, so its sign has no effect on the error.
-            let bends = |domain: usize| scene.rank_of(domain) > 0 && truncation.is_none();
-            for domain in (0..seen.len()).filter(|domain| bends(*domain)) {
+            let is_sensitive = |domain: usize| scene.rank_of(domain) > 0 && truncation.is_none();
+            for domain in (0..ratios.len()).filter(|domain| is_sensitive(*domain)) {
                 assert!(
-                    seen[domain] > 1.0,
+                    ratios[domain] > 1.0,
                     "{storage:?}, domain {domain}: a wrong sign is {} of the bound",
-                    seen[domain]
+                    ratios[domain]
                 );
             }
         }
@@ -125,28 +128,32 @@ fn errors_stay_within_bounds_in_every_storage() {
 fn positions_do_not_depend_on_threads_or_earlier_steps() {
     for storage in StorageType::ALL {
         let scene = scene_of(DeformationSettings { storage, ..DeformationSettings::default() });
-        let mut state = shaken(&scene);
+        let mut state = random_state(&scene);
         let mut retained = CpuDeformer::new(&scene);
-        run(&mut retained, &state);
-        let mut noise = TestRng(5);
+        deform(&mut retained, &state);
+        let mut random = TestRng(5);
         for step in 0..6 {
             // Each step changes q of one domain and the transform of another. The last step changes nothing, the one
             // before it all of q.
             let slot = scene.layout.slots[[0, 4, 8, 3, 0, 0][step]];
-            let moved = if step == 4 { 0..state.q.len() } else { slot.first_q..slot.first_q + slot.rank };
+            let changed_q = if step == 4 { 0..state.q.len() } else { slot.first_q..slot.first_q + slot.rank };
             if step < 5 {
-                state.q[moved].iter_mut().for_each(|number| *number = noise.next());
+                state.q[changed_q].iter_mut().for_each(|number| *number = random.next());
                 state.transforms[[1, 6, 10, 3, 5][step]].0[3] += 0.5;
             }
-            let (told, positions) = run(&mut retained, &state);
+            let (summary, positions) = deform(&mut retained, &state);
             for threads in [1, 2, 5] {
-                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
-                let mut fresh = CpuDeformer::new(&scene);
-                let (fresh_told, fresh_positions) = pool.install(|| run(&mut fresh, &state));
-                assert_eq!(bits(&positions), bits(&fresh_positions), "{storage:?}, step {step}, {threads} threads");
-                assert_eq!(told.bounds, fresh_told.bounds);
-                let (retained, fresh) = (retained.surface().expect("one"), fresh.surface().expect("one"));
-                assert_eq!(retained.normals, fresh.normals);
+                let pool =
+                    rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("expected a thread pool");
+                let mut new_deformer = CpuDeformer::new(&scene);
+                let (new_summary, new_positions) = pool.install(|| deform(&mut new_deformer, &state));
+                assert_eq!(bits(&positions), bits(&new_positions), "{storage:?}, step {step}, {threads} threads");
+                assert_eq!(summary.bounds, new_summary.bounds);
+                let (retained, new_deformer) = (
+                    retained.surface().expect("expected a surface"),
+                    new_deformer.surface().expect("expected a surface"),
+                );
+                assert_eq!(retained.normals, new_deformer.normals);
             }
         }
     }
@@ -160,15 +167,17 @@ fn bits(numbers: &[f32]) -> Vec<u32> {
 fn vertices_do_not_depend_on_the_tiling() {
     // The first 129 vertices of a shape of 1500 vertices, together with the others or alone, fall into tiles of
     // different sizes.
-    let mut noise = TestRng(8);
-    let columns: Vec<f32> = (0..4500 * 9).map(|_| noise.next()).collect();
-    let few: Vec<f32> = columns.chunks_exact(4500).flat_map(|column| column[..387].to_vec()).collect();
+    let mut random = TestRng(8);
+    let columns: Vec<f32> = (0..4500 * 9).map(|_| random.next()).collect();
+    let first_columns: Vec<f32> = columns.chunks_exact(4500).flat_map(|column| column[..387].to_vec()).collect();
     for storage in [StorageType::F32, StorageType::F16, StorageType::Bf16] {
         let deformation = DeformationSettings { storage, ..DeformationSettings::default() };
-        let (large, small) =
-            (columns_of(1500, columns.clone(), deformation), columns_of(129, few.clone(), deformation));
-        let state = shaken(&large);
-        let [large, small] = [&large, &small].map(|scene| run(&mut CpuDeformer::new(scene), &state).1);
+        let (large, small) = (
+            scene_from_columns(1500, columns.clone(), deformation),
+            scene_from_columns(129, first_columns.clone(), deformation),
+        );
+        let state = random_state(&large);
+        let [large, small] = [&large, &small].map(|scene| deform(&mut CpuDeformer::new(scene), &state).1);
         assert_eq!(bits(&large[..387]), bits(&small), "{storage:?}");
     }
 }
@@ -179,13 +188,13 @@ fn huge_tiny_and_denormal_q_stay_within_the_bound() {
         for compensated in [false, true] {
             let scene = scene_of(DeformationSettings { storage, compensated, ..DeformationSettings::default() });
             let mut deformer = CpuDeformer::new(&scene);
-            for amount in [1e30, 1e-38, 1e-42, 1e-45, 0.0] {
-                let mut state = shaken(&scene);
-                state.q.iter_mut().for_each(|number| *number *= amount);
-                let (told, positions) = run(&mut deformer, &state);
-                assert!(told.bounds.is_finite());
-                for (domain, part) in parts_of_bound(&scene, &state, &positions, &deformer).into_iter().enumerate() {
-                    assert!(part <= 1.0, "{storage:?}, {amount}, domain {domain}: {part} of the bound");
+            for scale in [1e30, 1e-38, 1e-42, 1e-45, 0.0] {
+                let mut state = random_state(&scene);
+                state.q.iter_mut().for_each(|number| *number *= scale);
+                let (summary, positions) = deform(&mut deformer, &state);
+                assert!(summary.bounds.is_finite());
+                for (domain, ratio) in error_ratios(&scene, &state, &positions, &deformer).into_iter().enumerate() {
+                    assert!(ratio <= 1.0, "{storage:?}, {scale}, domain {domain}: {ratio} of the bound");
                 }
             }
         }
@@ -200,20 +209,23 @@ fn finite_sums_survive_overflowing_terms() {
     for storage in StorageType::ALL {
         for compensated in [false, true] {
             let deformation = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
-            let scene = columns_of(5, columns.clone(), deformation);
+            let scene = scene_from_columns(5, columns.clone(), deformation);
             let mut deformer = CpuDeformer::new(&scene);
             let mut state = SceneState::rest(&scene);
             // Plain f32 summation gives infinity, and compensated summation gives infinity minus infinity.
             state.q = vec![3e38, -3e38, 0.75];
             assert!(2.0_f32.mul_add(state.q[1], 2.0_f32.mul_add(state.q[0], 0.0)).is_infinite());
-            let (told, positions) = run(&mut deformer, &state);
-            assert!(told.bounds.is_finite());
+            let (summary, positions) = deform(&mut deformer, &state);
+            assert!(summary.bounds.is_finite());
             // The third mode is rounded by its storage type. The first two modes are equal and cancel.
             assert!(positions.iter().all(|number| (number - 0.75).abs() <= 0.75 / 254.0), "{positions:?}");
             state.q = vec![3e38, 0.0, 1.0];
-            assert!(!run(&mut deformer, &state).0.bounds.is_finite());
+            assert!(!deform(&mut deformer, &state).0.bounds.is_finite());
             state.q = vec![1.0, 0.0, 1.0];
-            assert!(run(&mut deformer, &state).0.bounds.is_finite(), "and forgotten");
+            assert!(
+                deform(&mut deformer, &state).0.bounds.is_finite(),
+                "expected no effect of the overflow on the next step"
+            );
         }
     }
 }
@@ -225,30 +237,30 @@ fn truncation_budget_in_meters_holds_in_scene_units() {
         parts.unit = unit;
         parts.deformation.truncation = Some(1e-3);
         parts.materials = vec![Material::default()];
-        parts.shapes = vec![strip(300, 24, &mut TestRng(2))];
+        parts.shapes = vec![random_strip(300, 24, &mut TestRng(2))];
         parts.domains = vec![domain(0, "strip".into())];
         let scene = Scene::new(parts).expect("expected a valid scene");
         let mut state = SceneState::rest(&scene);
         state.q.iter_mut().enumerate().for_each(|(mode, number)| *number = f32::exp2(-(mode as f32)));
         state.transforms[0] = Transform([2.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
         let mut deformer = CpuDeformer::new(&scene);
-        let (_, positions) = run(&mut deformer, &state);
-        let truncation = deformer.truncation(0).expect("a budget");
+        let (_, positions) = deform(&mut deformer, &state);
+        let truncation = deformer.truncation(0).expect("expected a truncation");
         let retained = truncation.retained().to_vec();
         assert!(truncation.bound() > 0.0 && truncation.bound() <= 1e-3 / unit);
         assert!(retained.len() > 2 && retained.len() < 20, "{retained:?}");
-        assert!(parts_of_bound(&scene, &state, &positions, &deformer)[0] <= 1.0);
+        assert!(error_ratios(&scene, &state, &positions, &deformer)[0] <= 1.0);
         // Truncated modes contribute nothing: the result has the bits of a state with zeros for these modes.
         let mut zeroed = state.clone();
         (0..24).filter(|mode| !retained.contains(&(*mode as u16))).for_each(|mode| zeroed.q[mode] = 0.0);
-        let plain = columns_and_rest(&scene);
-        assert_eq!(bits(&run(&mut CpuDeformer::new(&plain), &zeroed).1), bits(&positions));
-        assert_ne!(bits(&run(&mut CpuDeformer::new(&plain), &state).1), bits(&positions));
+        let untruncated_scene = without_truncation(&scene);
+        assert_eq!(bits(&deform(&mut CpuDeformer::new(&untruncated_scene), &zeroed).1), bits(&positions));
+        assert_ne!(bits(&deform(&mut CpuDeformer::new(&untruncated_scene), &state).1), bits(&positions));
     }
 }
 
 /// The same scene without a truncation budget.
-fn columns_and_rest(scene: &Scene) -> Arc<Scene> {
+fn without_truncation(scene: &Scene) -> Arc<Scene> {
     let mut parts = SceneParts::named("plain");
     parts.materials = scene.materials.clone();
     parts.shapes = scene.shapes.clone();
