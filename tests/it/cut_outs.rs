@@ -11,15 +11,16 @@ use crate::common::soups::{clip_space_viewport, perspective_viewport};
 
 /// Texture coordinates at the point where the ray through a sample meets the plane of a triangle, in f64. The eye is
 /// that of [`perspective_viewport`], with a vertical field of view of 60 degrees.
-fn by_ray(viewport: &Viewport, triangle: [[f64; 3]; 3], uvs: [[f64; 2]; 3], [x, y]: [f64; 2]) -> [f64; 2] {
+fn ray_cast_uv(viewport: &Viewport, triangle: [[f64; 3]; 3], uvs: [[f64; 2]; 3], [x, y]: [f64; 2]) -> [f64; 2] {
     let [width, height] = viewport.size().map(f64::from);
     let focal = 1.0 / 30.0_f64.to_radians().tan();
     let ray = Vector3::new((2.0 * x / width - 1.0) * width / height / focal, (1.0 - 2.0 * y / height) / focal, -1.0);
     let [a, b, c] = triangle.map(Vector3::from);
     // Solve a + s (b - a) + t (c - a) = r ray.
-    let solved = Matrix3::from_columns(&[b - a, c - a, -ray]).lu().solve(&-a).expect("expected a valid mesh");
+    let solution =
+        Matrix3::from_columns(&[b - a, c - a, -ray]).lu().solve(&-a).expect("expected a triangle with an area");
     [0, 1].map(|axis| {
-        uvs[0][axis] + solved[0] * (uvs[1][axis] - uvs[0][axis]) + solved[1] * (uvs[2][axis] - uvs[0][axis])
+        uvs[0][axis] + solution[0] * (uvs[1][axis] - uvs[0][axis]) + solution[1] * (uvs[2][axis] - uvs[0][axis])
     })
 }
 
@@ -37,15 +38,17 @@ impl Case {
         let positions: Vec<f32> = self.triangle.as_flattened().iter().map(|number| *number as f32).collect();
         let corners = corners(&self.viewport, &positions, [0, 1, 2]);
         let got = footprint(&self.viewport, &corners, &self.uvs.map(|uv| uv.map(|number| number as f32)), self.pixel);
-        let middle = self.pixel.map(|at| f64::from(at) + 0.5);
-        let at = |x: f64, y: f64| by_ray(&self.viewport, self.triangle, self.uvs, [middle[0] + x, middle[1] + y]);
-        let worst = |got: [f32; 2], want: [f64; 2]| {
+        let center = self.pixel.map(|uv_at| f64::from(uv_at) + 0.5);
+        let uv_at =
+            |x: f64, y: f64| ray_cast_uv(&self.viewport, self.triangle, self.uvs, [center[0] + x, center[1] + y]);
+        let max_error = |got: [f32; 2], want: [f64; 2]| {
             (0..2).map(|axis| (f64::from(got[axis]) - want[axis]).abs()).fold(0.0, f64::max)
         };
-        let slope = |high: [f64; 2], low: [f64; 2]| [0, 1].map(|axis| (high[axis] - low[axis]) / 2e-3);
-        let across = worst(got.across, slope(at(1e-3, 0.0), at(-1e-3, 0.0)));
-        let down = worst(got.down, slope(at(0.0, 1e-3), at(0.0, -1e-3)));
-        (worst(got.uv, at(0.0, 0.0)), across.max(down))
+        let central_difference =
+            |upper: [f64; 2], lower: [f64; 2]| [0, 1].map(|axis| (upper[axis] - lower[axis]) / 2e-3);
+        let across = max_error(got.across, central_difference(uv_at(1e-3, 0.0), uv_at(-1e-3, 0.0)));
+        let down = max_error(got.down, central_difference(uv_at(0.0, 1e-3), uv_at(0.0, -1e-3)));
+        (max_error(got.uv, uv_at(0.0, 0.0)), across.max(down))
     }
 }
 
@@ -55,18 +58,23 @@ fn texture_coordinates_match_ray_cast_behind_the_eye() {
     let viewport = perspective_viewport(192, 128, 0.1, 100.0);
     let uvs = [[0.0, 0.0], [3.0, 0.0], [3.0, 5.0]];
     let tilted = [[-2.0, -2.0, -3.0], [2.5, -1.0, -5.0], [0.3, 3.0, -9.0]];
-    let through = [[-9.0, -1.0, 9.0], [9.0, -1.0, 9.0], [2.0, -1.0, -20.0]];
-    let mut worst = (0.0_f64, 0.0_f64);
-    for (triangle, pixels) in [(tilted, [[90, 60], [101, 70], [80, 66]]), (through, [[96, 80], [96, 120], [99, 100]])] {
+    let behind_eye = [[-9.0, -1.0, 9.0], [9.0, -1.0, 9.0], [2.0, -1.0, -20.0]];
+    let mut max_errors = (0.0_f64, 0.0_f64);
+    for (triangle, pixels) in
+        [(tilted, [[90, 60], [101, 70], [80, 66]]), (behind_eye, [[96, 80], [96, 120], [99, 100]])]
+    {
         for pixel in pixels {
-            let (of_uv, of_change) = Case { triangle, uvs, pixel, viewport }.errors();
-            worst = (worst.0.max(of_uv), worst.1.max(of_change));
+            let (uv_error, derivative_error) = Case { triangle, uvs, pixel, viewport }.errors();
+            max_errors = (max_errors.0.max(uv_error), max_errors.1.max(derivative_error));
         }
     }
-    assert!(worst.0 < 1e-5 && worst.1 < 1e-4, "{worst:?}");
-    let affine = by_ray(&viewport, tilted.map(|[x, y, z]| [-x / z, -y / z, -1.0]), uvs, [90.5, 60.5]);
-    let right = by_ray(&viewport, tilted, uvs, [90.5, 60.5]);
-    assert!((affine[0] - right[0]).abs() > 0.05, "negative control: without perspective {affine:?} for {right:?}");
+    assert!(max_errors.0 < 1e-5 && max_errors.1 < 1e-4, "{max_errors:?}");
+    let affine = ray_cast_uv(&viewport, tilted.map(|[x, y, z]| [-x / z, -y / z, -1.0]), uvs, [90.5, 60.5]);
+    let perspective = ray_cast_uv(&viewport, tilted, uvs, [90.5, 60.5]);
+    assert!(
+        (affine[0] - perspective[0]).abs() > 0.05,
+        "negative control: without perspective {affine:?}, with perspective {perspective:?}"
+    );
 }
 
 #[test]
@@ -74,11 +82,14 @@ fn small_triangles_at_window_border_keep_precision() {
     // The window is 16384 pixels wide. The triangle lies in the last column and is 1/50 pixel in size.
     let viewport = clip_space_viewport(16384, 64);
     let pixel = [16383, 1];
-    let middle = [1.0 - 0.5 / 8192.0, 1.0 - 1.5 / 32.0];
+    let center = [1.0 - 0.5 / 8192.0, 1.0 - 1.5 / 32.0];
     let size = [0.01 / 8192.0, 0.01 / 32.0];
-    let at = |x: f64, y: f64| [middle[0] + size[0] * x, middle[1] + size[1] * y, 0.0];
-    let positions: Vec<f32> =
-        [at(-1.0, -1.0), at(1.0, -1.0), at(0.0, 1.0)].as_flattened().iter().map(|number| *number as f32).collect();
+    let position = |x: f64, y: f64| [center[0] + size[0] * x, center[1] + size[1] * y, 0.0];
+    let positions: Vec<f32> = [position(-1.0, -1.0), position(1.0, -1.0), position(0.0, 1.0)]
+        .as_flattened()
+        .iter()
+        .map(|number| *number as f32)
+        .collect();
     let got =
         footprint(&viewport, &corners(&viewport, &positions, [0, 1, 2]), &[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]], pixel);
     // f32 resolves 1/16384^2 of the window here, which is a twentieth of this triangle.
@@ -86,10 +97,17 @@ fn small_triangles_at_window_border_keep_precision() {
     assert!((got.across[0] / 50.0 - 1.0).abs() < 0.1, "{got:?}");
     // The sample lies outside of the triangle by a rounding step. Its coordinates are those of the nearest point of the
     // triangle, not extrapolated ones.
-    let beside =
-        [at(0.2, -1.0), at(2.0, -1.0), at(1.2, 1.0)].as_flattened().iter().map(|n| *n as f32).collect::<Vec<_>>();
-    let got =
-        footprint(&viewport, &corners(&viewport, &beside, [0, 1, 2]), &[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]], pixel);
+    let positions_beside = [position(0.2, -1.0), position(2.0, -1.0), position(1.2, 1.0)]
+        .as_flattened()
+        .iter()
+        .map(|n| *n as f32)
+        .collect::<Vec<_>>();
+    let got = footprint(
+        &viewport,
+        &corners(&viewport, &positions_beside, [0, 1, 2]),
+        &[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]],
+        pixel,
+    );
     assert!((0.0..=1.0).contains(&got.uv[0]) && (0.0..=1.0).contains(&got.uv[1]), "{got:?}");
 }
 
@@ -98,17 +116,17 @@ fn small_triangles_at_window_border_keep_precision() {
 fn degenerate_footprints_are_zero() {
     let viewport = clip_space_viewport(8, 8);
     let uvs = [[0.5, 0.25], [1.0, 0.0], [0.0, 1.0]];
-    let of = |corners: [[f32; 4]; 3], uvs: [[f32; 2]; 3]| footprint(&viewport, &corners, &uvs, [3, 3]);
-    let good = [[-1.0, -1.0, 0.0, 1.0], [1.0, -1.0, 0.0, 1.0], [0.0, 1.0, 0.0, 1.0]];
-    assert!(of(good, uvs) != Footprint::default());
-    assert_eq!(of([good[0]; 3], uvs), Footprint::default());
-    assert_eq!(of(good.map(|corner| corner.map(|number| number * 1e30)), uvs), Footprint::default());
-    assert_eq!(of(good.map(|corner| corner.map(|number| number * 1e-30)), uvs), Footprint::default());
-    assert_eq!(of(good, [[f32::NAN; 2], uvs[1], uvs[2]]), Footprint::default());
-    assert_eq!(of(good, [[3e38, 0.0], [-3e38, 0.0], uvs[2]]), Footprint::default());
+    let footprint_of = |corners: [[f32; 4]; 3], uvs: [[f32; 2]; 3]| footprint(&viewport, &corners, &uvs, [3, 3]);
+    let valid = [[-1.0, -1.0, 0.0, 1.0], [1.0, -1.0, 0.0, 1.0], [0.0, 1.0, 0.0, 1.0]];
+    assert!(footprint_of(valid, uvs) != Footprint::default());
+    assert_eq!(footprint_of([valid[0]; 3], uvs), Footprint::default());
+    assert_eq!(footprint_of(valid.map(|corner| corner.map(|number| number * 1e30)), uvs), Footprint::default());
+    assert_eq!(footprint_of(valid.map(|corner| corner.map(|number| number * 1e-30)), uvs), Footprint::default());
+    assert_eq!(footprint_of(valid, [[f32::NAN; 2], uvs[1], uvs[2]]), Footprint::default());
+    assert_eq!(footprint_of(valid, [[3e38, 0.0], [-3e38, 0.0], uvs[2]]), Footprint::default());
 }
 
-fn of_image(image: AlphaImage) -> CutOuts {
+fn cut_outs_of_image(image: AlphaImage) -> CutOuts {
     let materials = vec![AlphaMaterial { alpha: 1.0, cutoff: 0.5, image: Some(0) }];
     CutOuts {
         first: 4,
@@ -124,80 +142,90 @@ fn of_image(image: AlphaImage) -> CutOuts {
 fn alpha_images_repeat_and_filter_trilinearly() {
     // Level 0 is a row of 4 texels with values 0, 51, 102 and 153. Level 1 is two texels of 255, and level 2 is one
     // texel of 0.
-    let cut_outs = of_image(alpha_image(4, 1, |level, column, _| [51 * column as u8, 255, 0][level as usize]));
-    let at = |u: f32, change: f32| {
-        let footprint = Footprint { uv: [u, 0.3], across: [change, 0.0], down: [0.0; 2] };
+    let cut_outs = cut_outs_of_image(alpha_image(4, 1, |level, column, _| [51 * column as u8, 255, 0][level as usize]));
+    let alpha_at = |u: f32, derivative: f32| {
+        let footprint = Footprint { uv: [u, 0.3], across: [derivative, 0.0], down: [0.0; 2] };
         alpha(&cut_outs, 4, &footprint)
     };
-    let is = |got: f32, want: f32| assert!((got - want).abs() < 1e-6, "{got} for {want}");
-    is(at(0.125, 0.0), 0.0);
-    is(at(0.375, 0.25), 0.2);
-    is(at(0.5, 0.1), 0.3);
+    let assert_close = |got: f32, want: f32| assert!((got - want).abs() < 1e-6, "expected {want}, got {got}");
+    assert_close(alpha_at(0.125, 0.0), 0.0);
+    assert_close(alpha_at(0.375, 0.25), 0.2);
+    assert_close(alpha_at(0.5, 0.1), 0.3);
     // Halfway between the last texel and the first.
-    is(at(0.0, 0.0), 0.3);
+    assert_close(alpha_at(0.0, 0.0), 0.3);
     for repeat in [-2.0, 1.0, 5.0] {
-        is(at(0.375 + repeat, 0.0), 0.2);
+        assert_close(alpha_at(0.375 + repeat, 0.0), 0.2);
     }
-    is(at(0.375, 0.5), 1.0);
-    is(at(0.375, 0.25 * 2.0_f32.sqrt()), 0.6);
-    is(at(0.375, 1.0), 0.0);
-    is(at(0.375, 1e30), 0.0);
-    is(at(0.375, f32::MIN_POSITIVE), 0.2);
+    assert_close(alpha_at(0.375, 0.5), 1.0);
+    assert_close(alpha_at(0.375, 0.25 * 2.0_f32.sqrt()), 0.6);
+    assert_close(alpha_at(0.375, 1.0), 0.0);
+    assert_close(alpha_at(0.375, 1e30), 0.0);
+    assert_close(alpha_at(0.375, f32::MIN_POSITIVE), 0.2);
 }
 
 /// A sheet with one sample per texel reproduces its image row by row; at half the size it reproduces level 1.
 #[test]
 fn sheet_reproduces_its_image_at_levels_0_and_1() {
     let mut random = crate::scenes::Random(3);
-    let own = alpha_image(64, 64, |_, _, _| if random.next_number() < 0.0 { 0 } else { 255 });
+    let image = alpha_image(64, 64, |_, _, _| if random.next_number() < 0.0 { 0 } else { 255 });
     for level in [0, 1] {
-        let keys = sheet_soup(64 >> level, own.clone()).rasterize();
-        let seen: Vec<bool> = keys.ids().iter().map(Option::is_some).collect();
-        let want: Vec<bool> = own.levels[level].iter().map(|texel| *texel == 255).collect();
-        assert!(seen == want, "level {level}");
+        let keys = sheet_soup(64 >> level, image.clone()).rasterize();
+        let got: Vec<bool> = keys.ids().iter().map(Option::is_some).collect();
+        let want: Vec<bool> = image.levels[level].iter().map(|texel| *texel == 255).collect();
+        assert!(got == want, "level {level}");
     }
-    let turned = own.levels[0].iter().rev().map(|texel| *texel == 255).collect::<Vec<_>>();
-    assert!(sheet_soup(64, own).rasterize().ids().iter().map(Option::is_some).ne(turned), "negative control");
+    let reversed = image.levels[0].iter().rev().map(|texel| *texel == 255).collect::<Vec<_>>();
+    assert!(sheet_soup(64, image).rasterize().ids().iter().map(Option::is_some).ne(reversed), "negative control");
 }
 
 #[test]
 fn uniform_images_keep_all_or_nothing_of_a_triangle() {
     let mut differing = 0;
-    for holes in uniform_cut_out_soups() {
-        let (soup, cut_outs) = (&holes.soup, &holes.cut_outs);
+    for cut_out_soup in uniform_cut_out_soups() {
+        let (soup, cut_outs) = (&cut_out_soup.soup, &cut_out_soup.cut_outs);
         // Whether each surface of the table keeps any sample.
-        let keeps = [false, true, false, true, true, false, false];
-        let mut kept = VisibilityBuffer::new(soup.viewport);
+        let is_material_opaque = [false, true, false, true, true, false, false];
+        let mut expected = VisibilityBuffer::new(soup.viewport);
         for group in &soup.groups {
             for triangle in group.first..group.first + group.triangles {
-                let own = triangle.checked_sub(cut_outs.first);
-                if own.is_none_or(|own| keeps[cut_outs.material_indices[own as usize] as usize]) {
-                    let one = modalcast_model::scene::DrawRange { first: triangle, triangles: 1, faces: group.faces };
-                    kept.draw(&soup.positions, &soup.triangles, one);
+                let cut_out = triangle.checked_sub(cut_outs.first);
+                if cut_out
+                    .is_none_or(|cut_out| is_material_opaque[cut_outs.material_indices[cut_out as usize] as usize])
+                {
+                    let range = modalcast_model::scene::DrawRange { first: triangle, triangles: 1, faces: group.faces };
+                    expected.draw(&soup.positions, &soup.triangles, range);
                 }
             }
         }
-        let drawn = holes.rasterize();
-        assert!(drawn.keys == kept.keys, "{}", soup.name);
-        differing += drawn.keys.iter().zip(&soup.rasterize().keys).filter(|(cut, whole)| cut != whole).count();
+        let rasterized = cut_out_soup.rasterize();
+        assert!(rasterized.keys == expected.keys, "{}", soup.name);
+        differing += rasterized
+            .keys
+            .iter()
+            .zip(&soup.rasterize().keys)
+            .filter(|(with_cut_outs, without)| with_cut_outs != without)
+            .count();
     }
-    assert!(differing > 10_000, "negative control: {differing} samples see something else than without holes");
+    assert!(differing > 10_000, "negative control: {differing} samples differ from those without cut-outs");
 }
 
-/// The floor is cut by its image, few of its samples are doubtful, and splitting it into smaller triangles changes few
-/// samples.
+/// The wall is visible through the cut-outs of the floor. Few samples are ambiguous, and splitting the floor into smaller
+/// triangles changes few samples.
 #[test]
 fn wall_shows_through_holes_of_the_floor() {
-    let holes = floor_soup(1);
-    let ids = holes.rasterize().ids();
-    let of = |wanted: fn(u32) -> bool| ids.iter().flatten().filter(|id| wanted(**id)).count();
-    let (wall, seen) = (of(|id| id < 2), of(|id| id >= 2));
-    let whole = holes.soup.rasterize().ids().iter().flatten().filter(|id| **id >= 2).count();
-    assert!(seen > whole / 5 && seen < whole * 4 / 5 && wall > 1000, "{seen} of {whole}, {wall}");
-    let doubtful = holes.ambiguous_samples(1.0 / 16.0).iter().filter(|doubt| **doubt).count();
-    assert!((100..whole / 4).contains(&doubtful), "{doubtful} of {whole}");
-    let pieces = floor_soup(40).rasterize().ids();
-    let same = |(a, b): (&Option<u32>, &Option<u32>)| a.is_some_and(|id| id >= 2) == b.is_some_and(|id| id >= 2);
-    let unlike = ids.iter().zip(&pieces).filter(|pair| !same(*pair)).count();
-    assert!(unlike < whole / 50, "in pieces {unlike} of {whole} samples differ");
+    let cut_out_soup = floor_soup(1);
+    let ids = cut_out_soup.rasterize().ids();
+    let count_ids = |predicate: fn(u32) -> bool| ids.iter().flatten().filter(|id| predicate(**id)).count();
+    let (wall_samples, floor_samples) = (count_ids(|id| id < 2), count_ids(|id| id >= 2));
+    let opaque_samples = cut_out_soup.soup.rasterize().ids().iter().flatten().filter(|id| **id >= 2).count();
+    assert!(
+        floor_samples > opaque_samples / 5 && floor_samples < opaque_samples * 4 / 5 && wall_samples > 1000,
+        "{floor_samples} of {opaque_samples}, {wall_samples}"
+    );
+    let ambiguous = cut_out_soup.ambiguous_samples(1.0 / 16.0).iter().filter(|is_ambiguous| **is_ambiguous).count();
+    assert!((100..opaque_samples / 4).contains(&ambiguous), "{ambiguous} of {opaque_samples}");
+    let split_ids = floor_soup(40).rasterize().ids();
+    let is_same = |(a, b): (&Option<u32>, &Option<u32>)| a.is_some_and(|id| id >= 2) == b.is_some_and(|id| id >= 2);
+    let different = ids.iter().zip(&split_ids).filter(|pair| !is_same(*pair)).count();
+    assert!(different < opaque_samples / 50, "split floor: {different} of {opaque_samples} samples differ");
 }

@@ -15,12 +15,12 @@ async fn server() -> Server {
     server
 }
 
-fn picture(width: u32, height: u32, format: v1::Format) -> Option<v1::Picture> {
+fn picture_of_size(width: u32, height: u32, format: v1::Format) -> Option<v1::Picture> {
     Some(v1::Picture { width, height, format: format.into(), ..v1::Picture::default() })
 }
 
 fn request() -> v1::RenderFrameRequest {
-    let picture = picture(64, 48, v1::Format::Rgba);
+    let picture = picture_of_size(64, 48, v1::Format::Rgba);
     v1::RenderFrameRequest { scene: "strips".into(), picture, ..v1::RenderFrameRequest::default() }
 }
 
@@ -63,21 +63,21 @@ async fn next(stream: &mut Streaming<v1::StreamFramesResponse>) -> Option<v1::Fr
 async fn frame_names_its_step_and_png_equals_rgba() {
     let server = server().await;
     let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
-    let rest = render(&server, request()).await.expect("the rest state can be drawn");
+    let rest = render(&server, request()).await.expect("expected a frame at rest");
     assert_eq!(rest.head.step.map(|step| step.run), Some(0));
     driver.step_acknowledged(step(5, &[], &[0.9, 0.3, -0.9, 0.2])).await;
     let raw = render(&server, v1::RenderFrameRequest { step: Some(Which::ExactStep(5)), ..request() }).await;
     let raw = raw.expect("expected a frame");
     assert_eq!(raw.head.step, Some(v1::StepId { run: 1, number: 5, time: 2.5 }));
     assert_eq!((raw.head.width, raw.head.height, raw.bytes.len()), (64, 48, 64 * 48 * 4));
-    assert_ne!(raw.bytes, rest.bytes, "the step is to be seen");
-    let png = v1::RenderFrameRequest { picture: picture(64, 48, v1::Format::Png), ..request() };
+    assert_ne!(raw.bytes, rest.bytes, "expected another image than at rest");
+    let png = v1::RenderFrameRequest { picture: picture_of_size(64, 48, v1::Format::Png), ..request() };
     let png = render(&server, png).await.expect("expected a frame");
     let decoded = image::load_from_memory(&png.bytes).expect("expected a PNG file").into_rgba8();
     assert_eq!(decoded.into_raw(), raw.bytes);
     let stages: Vec<&str> = png.head.stages.iter().map(|stage| stage.stage.as_str()).collect();
     for stage in ["deform", "draw", "read", "encode"] {
-        let times = stages.iter().filter(|own| **own == stage).count();
+        let times = stages.iter().filter(|other| **other == stage).count();
         assert_eq!(times, 1, "{stage} in {stages:?}");
     }
 }
@@ -87,7 +87,7 @@ async fn frame_names_its_step_and_png_equals_rgba() {
 #[tokio::test(flavor = "multi_thread")]
 async fn large_frame_is_chunked_for_default_client_limits() {
     let server = server().await;
-    let large = v1::RenderFrameRequest { picture: picture(1600, 1000, v1::Format::Rgba), ..request() };
+    let large = v1::RenderFrameRequest { picture: picture_of_size(1600, 1000, v1::Format::Rgba), ..request() };
     let frame = render(&server, large).await.expect("expected a frame");
     assert_eq!(frame.bytes.len(), 1600 * 1000 * 4);
     let unsized_picture = v1::RenderFrameRequest { picture: None, ..request() };
@@ -102,7 +102,7 @@ async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
     let server = server().await;
     let subscribe = |delivery: v1::Delivery, frames| v1::StreamFramesRequest {
         scene: "strips".into(),
-        picture: picture(32, 32, v1::Format::Png),
+        picture: picture_of_size(32, 32, v1::Format::Png),
         delivery: delivery.into(),
         frames,
     };
@@ -111,19 +111,19 @@ async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
     let latest = client.stream_frames(subscribe(v1::Delivery::Latest, 0)).await.expect("expected a subscription");
     let (mut lossless, mut latest) = (lossless.into_inner(), latest.into_inner());
     let mut driver = server.drive("strips", v1::Policy::Lossless, 3).await;
-    let write = async {
+    let send_steps = async {
         for number in 1..=12 {
             driver.step_acknowledged(step(number, &[0], &[0.1 * number as f32, 0.0])).await;
         }
     };
-    let read = async {
+    let read_lossless = async {
         for number in 1..=12 {
             let head = next(&mut lossless).await.expect("expected a frame");
             assert_eq!((head.step.map(|step| step.number), head.skipped), (Some(number), 0));
         }
-        assert!(next(&mut lossless).await.is_none(), "it ends after its count");
+        assert!(next(&mut lossless).await.is_none(), "expected the stream to end after 12 frames");
     };
-    let follow = async {
+    let read_latest = async {
         let mut last = 0;
         let mut counted = 0;
         while last < 12 {
@@ -131,29 +131,29 @@ async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
             let number = head.step.expect("expected a valid step").number;
             assert!(number > last);
             counted += 1 + head.skipped;
-            assert_eq!(counted, number, "every step is shown or counted");
+            assert_eq!(counted, number, "expected each step to be received or counted as skipped");
             last = number;
         }
     };
-    tokio::join!(write, read, follow);
+    tokio::join!(send_steps, read_lossless, read_latest);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn bad_pictures_are_refused_and_deadlines_hold() {
+async fn invalid_pictures_are_rejected_and_deadlines_hold() {
     let server = server().await;
-    let eye = |eye: Vec<f64>, up: Vec<f64>| v1::Camera {
+    let camera_at = |eye: Vec<f64>, up: Vec<f64>| v1::Camera {
         view: Some(v1::camera::View::LookAt(v1::LookAt { eye, target: vec![0.0; 3], up })),
         ..v1::Camera::default()
     };
-    let lens = |lens| v1::Camera { lens: Some(lens), ..v1::Camera::default() };
+    let camera_with_lens = |lens| v1::Camera { lens: Some(lens), ..v1::Camera::default() };
     let up = || vec![0.0, 1.0, 0.0];
     let cameras: Vec<(v1::Camera, &str)> = vec![
-        (eye(vec![0.0; 2], up()), "picture: camera.look_at.eye"),
-        (eye(vec![f64::NAN, 0.0, 1.0], up()), "picture: camera.look_at"),
-        (eye(vec![0.0; 3], up()), "picture: camera.look_at"),
-        (eye(vec![0.0, 2.0, 0.0], up()), "picture: camera.look_at"),
-        (lens(v1::camera::Lens::FieldOfView(180.0)), "picture: camera.field_of_view"),
-        (lens(v1::camera::Lens::Intrinsics(v1::Intrinsics::default())), "picture: camera.intrinsics"),
+        (camera_at(vec![0.0; 2], up()), "picture: camera.look_at.eye"),
+        (camera_at(vec![f64::NAN, 0.0, 1.0], up()), "picture: camera.look_at"),
+        (camera_at(vec![0.0; 3], up()), "picture: camera.look_at"),
+        (camera_at(vec![0.0, 2.0, 0.0], up()), "picture: camera.look_at"),
+        (camera_with_lens(v1::camera::Lens::FieldOfView(180.0)), "picture: camera.field_of_view"),
+        (camera_with_lens(v1::camera::Lens::Intrinsics(v1::Intrinsics::default())), "picture: camera.intrinsics"),
         (v1::Camera { near: 2.0, far: 1.0, ..v1::Camera::default() }, "picture: camera.near/far"),
         (v1::Camera { near: f64::NAN, ..v1::Camera::default() }, "picture: camera.near/far"),
         (
@@ -165,25 +165,27 @@ async fn bad_pictures_are_refused_and_deadlines_hold() {
         ),
     ];
     for (camera, field) in cameras {
-        let mut bad = request();
-        bad.picture.as_mut().expect("a picture").camera = Some(camera);
-        let status = render(&server, bad).await.err().expect(field);
+        let mut invalid_request = request();
+        invalid_request.picture.as_mut().expect("expected a picture").camera = Some(camera);
+        let status = render(&server, invalid_request).await.err().expect(field);
         assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
         assert!(rejection_details(&status).field.starts_with(field), "{:?} is not {field}", rejection_details(&status));
     }
     for (width, height) in [(0, 48), (48, 0), (1_000_000, 48), (48, u32::MAX)] {
-        let bad = v1::RenderFrameRequest { picture: picture(width, height, v1::Format::Png), ..request() };
-        let status = render(&server, bad).await.err().expect("a size");
+        let invalid_request =
+            v1::RenderFrameRequest { picture: picture_of_size(width, height, v1::Format::Png), ..request() };
+        let status = render(&server, invalid_request).await.err().expect("expected an invalid-size error");
         assert_eq!((status.code(), rejection_details(&status).field.as_str()), (Code::InvalidArgument, "picture.size"));
         assert_eq!(rejection_details(&status).given, format!("{width} x {height}"));
     }
-    let late = v1::RenderFrameRequest { step: Some(Which::MinimumStep(1)), deadline_ms: 60, ..request() };
-    assert_eq!(render(&server, late).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
-    let mut hasty = tonic::Request::new(v1::RenderFrameRequest { step: Some(Which::MinimumStep(1)), ..request() });
-    hasty.metadata_mut().insert("grpc-timeout", "60m".parse().expect("a header"));
-    let ended = async {
-        let mut stream = server.frames().await.render_frame(hasty).await?.into_inner();
+    let late_request = v1::RenderFrameRequest { step: Some(Which::MinimumStep(1)), deadline_ms: 60, ..request() };
+    assert_eq!(render(&server, late_request).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
+    let mut short_deadline =
+        tonic::Request::new(v1::RenderFrameRequest { step: Some(Which::MinimumStep(1)), ..request() });
+    short_deadline.metadata_mut().insert("grpc-timeout", "60m".parse().expect("a header"));
+    let result = async {
+        let mut stream = server.frames().await.render_frame(short_deadline).await?.into_inner();
         stream.message().await
     };
-    assert_eq!(with_timeout(ended).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
+    assert_eq!(with_timeout(result).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
 }

@@ -9,16 +9,16 @@ use modalcast_model::scene::{Camera, Scene, SceneState};
 use modalcast_render::{FrameParams, shadow_texel_axes};
 
 /// Side lengths of a shadow map texel in scene units, for a deformation.
-fn texel(scene: &Scene, deformed: &DeformSummary, is_lit: bool) -> [f64; 2] {
-    let light = deformed.oriented_bounds.filter(|_| is_lit);
-    let shot = FrameParams {
+fn texel_size(scene: &Scene, summary: &DeformSummary, uses_light_bounds: bool) -> [f64; 2] {
+    let light = summary.oriented_bounds.filter(|_| uses_light_bounds);
+    let params = FrameParams {
         camera: Camera::fit_to_scene(scene, 64, 64),
         width: 64,
         height: 64,
-        bounds: deformed.bounds,
+        bounds: summary.bounds,
         light,
     };
-    shadow_texel_axes(scene, &shot).expect("expected a scene with a shadow").map(|side| side.norm())
+    shadow_texel_axes(scene, &params).expect("expected a scene with a shadow").map(|side| side.norm())
 }
 
 /// Texels fitted to the light-space boxes of tiles have less than half the area of texels fitted to the corners of the
@@ -36,8 +36,8 @@ fn fitted_shadow_texels_of_the_tree_have_half_the_area() {
         .deform(&state)
         .expect("expected the step to succeed");
     let [corners, tiled, exact] =
-        [texel(&scene, &exact, false), texel(&scene, &tiled, true), texel(&scene, &exact, true)];
-    eprintln!("texel of the tree: {corners:?} by corners, {tiled:?} by boxes of tiles, {exact:?} by vertices");
+        [texel_size(&scene, &exact, false), texel_size(&scene, &tiled, true), texel_size(&scene, &exact, true)];
+    eprintln!("texel of the tree: {corners:?} fitted to corners, {tiled:?} to boxes of tiles, {exact:?} to vertices");
     let area = |[x, y]: [f64; 2]| x * y;
     assert!(area(tiled) < 0.5 * area(corners), "{tiled:?}, {corners:?}");
     assert!(area(exact) <= area(tiled) && area(tiled) < 1.2 * area(exact), "{tiled:?}, {exact:?}");

@@ -216,7 +216,8 @@ async fn server_without_renderer_rejects_only_frames() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let mut client = v1::server_service_client::ServerServiceClient::new(server.channel().await);
-    let info = client.get_server_info(v1::GetServerInfoRequest {}).await.expect("expected the scene info").into_inner();
+    let info =
+        client.get_server_info(v1::GetServerInfoRequest {}).await.expect("expected the server info").into_inner();
     assert_eq!((info.backend.as_str(), info.software), ("reference", false));
     assert!(info.renderer.contains("switched off"), "{}", info.renderer);
     let limits = info.limits.expect("limits");

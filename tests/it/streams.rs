@@ -15,89 +15,96 @@ use crate::service_harness::{Server, state_after_steps, step, strips_with_attrib
 
 const SIZE: FrameSize = FrameSize::new(48, 32);
 const STEPS: u64 = 30;
-/// Number of the step that is refused.
-const BAD: u64 = 13;
+/// Number of the step that is rejected because it overflows.
+const REJECTED_STEP: u64 = 13;
 
 fn cameras(count: usize) -> Vec<Camera> {
     let first = Camera::fit_to_scene(&strips_with_attributes(), SIZE.width, SIZE.height);
-    (0..count).map(|at| Camera { lens: Lens::FieldOfView(30.0 + 4.0 * at as f64), ..first }).collect()
+    (0..count).map(|index| Camera { lens: Lens::FieldOfView(30.0 + 4.0 * index as f64), ..first }).collect()
 }
 
-fn view(camera: Camera) -> OutputSpec {
+fn frame_of(camera: Camera) -> OutputSpec {
     OutputSpec::Frame { camera, size: SIZE, frame_output: FrameOutput::Color }
 }
 
 fn steps() -> Vec<v1::Step> {
-    let q = |number: u64| if number == BAD { 1e30 } else { 0.03 * number as f32 };
+    let q = |number: u64| if number == REJECTED_STEP { 1e30 } else { 0.03 * number as f32 };
     (0..STEPS).map(|number| step(number, &[1], &[q(number), 0.5])).collect()
 }
 
-/// Reference pictures of every valid step, rendered one by one.
-fn reference_vertices(cameras: &[Camera]) -> Vec<(u64, Vec<Vec<u8>>)> {
+/// Images of every valid step per camera, rendered one by one.
+fn reference_images(cameras: &[Camera]) -> Vec<(u64, Vec<Vec<u8>>)> {
     let (scene, steps) = (strips_with_attributes(), steps());
     let config = Config { backend: BackendChoice::Cpu, ..Config::default() };
-    let mut bench = DeviceContext::open(&config).expect("opens");
-    let mut staged = bench.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
-    let mut pictures = Vec::new();
-    for step in steps.iter().filter(|step| step.number != BAD) {
-        staged.deform(&state_after_steps(&scene, std::slice::from_ref(step))).expect("expected the step to succeed");
-        let mut draw = |camera: &Camera| bench.draw(&mut staged, camera, SIZE).expect("expected a frame").rgba;
-        pictures.push((step.number, cameras.iter().map(&mut draw).collect()));
+    let mut context = DeviceContext::open(&config).expect("expected a device context");
+    let mut loaded_scene = context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
+    let mut images = Vec::new();
+    for step in steps.iter().filter(|step| step.number != REJECTED_STEP) {
+        loaded_scene
+            .deform(&state_after_steps(&scene, std::slice::from_ref(step)))
+            .expect("expected the step to succeed");
+        let mut draw = |camera: &Camera| context.draw(&mut loaded_scene, camera, SIZE).expect("expected a frame").rgba;
+        images.push((step.number, cameras.iter().map(&mut draw).collect()));
     }
-    bench.unload_scene(staged);
-    pictures
+    context.unload_scene(loaded_scene);
+    images
 }
 
-fn pixels(shown: &StepOutput) -> &[u8] {
-    let OutputBody::Frame(image) = &shown.body else { panic!("no frame") };
+fn pixels(output: &StepOutput) -> &[u8] {
+    let OutputBody::Frame(image) = &output.body else { panic!("expected a frame") };
     &image.rgba
 }
 
-async fn server() -> Server {
-    let server =
+async fn start_server() -> Server {
+    let start_server =
         Server::start_with(|config| Config { backend: BackendChoice::Cpu, renderer: RendererChoice::Auto, ..config })
             .await;
-    server.open("kept").await;
-    server
+    start_server.open("kept").await;
+    start_server
 }
 
-/// More cameras than frames can be in flight: every frame is that of its step, and the steps are answered in order.
+/// With more cameras than frames can be in flight, every frame is that of its step, and steps are answered in order.
 #[tokio::test(flavor = "multi_thread")]
 async fn frames_of_many_cameras_show_their_own_step() {
-    let (server, cameras) = (server().await, cameras(5));
-    let host = server.engine.find("kept").expect("open");
-    let mut feeds = Vec::new();
+    let (start_server, cameras) = (start_server().await, cameras(5));
+    let host = start_server.engine.find("kept").expect("expected an open scene");
+    let mut subscriptions = Vec::new();
     for camera in &cameras {
-        feeds.push(host.subscribe(view(*camera), Delivery::Lossless).await.expect("a feed"));
+        subscriptions
+            .push(host.subscribe(frame_of(*camera), Delivery::Lossless).await.expect("expected a subscription"));
     }
     let positions = modalcast_model::deform::VertexAttributes { positions: true, ..Default::default() };
-    let mut vertices = host.subscribe(OutputSpec::Vertices(positions), Delivery::Lossless).await.expect("a feed");
-    // One feed is dropped halfway, and one is never read.
-    let mut leaver = Some(host.subscribe(view(cameras[0]), Delivery::Lossless).await.expect("a feed"));
-    let _idle = host.subscribe(view(cameras[0]), Delivery::Latest).await.expect("a feed");
-    let mut driver = server.drive("kept", Policy::Lossless, 40).await;
+    let mut vertices =
+        host.subscribe(OutputSpec::Vertices(positions), Delivery::Lossless).await.expect("expected a subscription");
+    // One subscription is dropped at step 8, and one is never read.
+    let mut dropped_subscription =
+        Some(host.subscribe(frame_of(cameras[0]), Delivery::Lossless).await.expect("expected a subscription"));
+    let _idle = host.subscribe(frame_of(cameras[0]), Delivery::Latest).await.expect("expected a subscription");
+    let mut driver = start_server.drive("kept", Policy::Lossless, 40).await;
     for step in steps() {
         driver.step(step).await;
     }
-    let want = reference_vertices(&cameras);
-    for (number, pictures) in &want {
+    let want = reference_images(&cameras);
+    for (number, images) in &want {
         if *number == 8 {
-            leaver = None;
+            dropped_subscription = None;
         }
-        if let Some(feed) = &mut leaver {
-            assert_eq!(with_timeout(feed.next()).await.expect("expected another message").step.number, *number);
+        if let Some(subscription) = &mut dropped_subscription {
+            assert_eq!(with_timeout(subscription.next()).await.expect("expected another message").step.number, *number);
         }
-        for (feed, picture) in feeds.iter_mut().zip(pictures) {
-            let shown = with_timeout(feed.next()).await.expect("expected another message");
-            assert_eq!((shown.step.number, shown.skipped), (*number, 0));
-            assert!(pixels(&shown) == picture, "step {number}");
+        for (subscription, image) in subscriptions.iter_mut().zip(images) {
+            let output = with_timeout(subscription.next()).await.expect("expected another message");
+            assert_eq!((output.step.number, output.skipped), (*number, 0));
+            assert!(pixels(&output) == image, "step {number}");
         }
         assert_eq!(with_timeout(vertices.next()).await.expect("expected another message").step.number, *number);
     }
     for number in 0..STEPS {
         match driver.reply().await {
-            ResponseKind::Ack(ack) => assert!(ack.step == number && number != BAD, "{ack:?}"),
-            ResponseKind::Rejection(_) => assert_eq!(number, BAD, "refused in its turn"),
+            ResponseKind::Ack(ack) => assert!(ack.step == number && number != REJECTED_STEP, "{ack:?}"),
+            ResponseKind::Rejection(_) => {
+                assert_eq!(number, REJECTED_STEP, "expected a rejection of step {REJECTED_STEP} only")
+            }
             other => panic!("{other:?}"),
         }
     }
@@ -107,23 +114,24 @@ async fn frames_of_many_cameras_show_their_own_step() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn closing_a_scene_delivers_frames_in_flight() {
-    let (server, cameras) = (server().await, cameras(2));
-    let host = Arc::clone(&server.engine.find("kept").expect("open"));
-    let mut feed = host.subscribe(view(cameras[0]), Delivery::Lossless).await.expect("a feed");
-    let driver = server.drive("kept", Policy::Lossless, 40).await;
+    let (start_server, cameras) = (start_server().await, cameras(2));
+    let host = Arc::clone(&start_server.engine.find("kept").expect("expected an open scene"));
+    let mut subscription =
+        host.subscribe(frame_of(cameras[0]), Delivery::Lossless).await.expect("expected a subscription");
+    let driver = start_server.drive("kept", Policy::Lossless, 40).await;
     for step in steps().into_iter().take(12) {
         driver.step(step).await;
     }
-    let want = reference_vertices(&cameras);
-    let shown = with_timeout(feed.next()).await.expect("the first");
-    assert!(pixels(&shown) == want[0].1[0]);
-    with_timeout(server.engine.close("kept")).await.expect("expected the scene to close");
-    let mut next = 1;
-    while let Ok(shown) = with_timeout(feed.next()).await {
-        assert_eq!(shown.step.number, next);
-        assert!(pixels(&shown) == want[next as usize].1[0]);
-        next += 1;
+    let want = reference_images(&cameras);
+    let output = with_timeout(subscription.next()).await.expect("expected a frame");
+    assert!(pixels(&output) == want[0].1[0]);
+    with_timeout(start_server.engine.close("kept")).await.expect("expected the scene to close");
+    let mut number = 1;
+    while let Ok(output) = with_timeout(subscription.next()).await {
+        assert_eq!(output.step.number, number);
+        assert!(pixels(&output) == want[number as usize].1[0]);
+        number += 1;
     }
-    assert!(next <= 12);
-    server.stop().await.expect("stops with nothing under way");
+    assert!(number <= 12);
+    start_server.stop().await.expect("expected the server to stop without an error");
 }
