@@ -6,11 +6,11 @@ use serde_json::{Value, json};
 
 use super::options::with_spinner;
 use super::{Outcome, print_line};
-use modalcast_compute::gpu::{self, DeformPlan};
-use modalcast_model::backend_settings::LookTable;
+use modalcast_compute::gpu::{self, CudaDeformerOptions, DeformPlan};
+use modalcast_model::backend_settings::{BackendSettings, DeformTable, LookTable};
 use modalcast_model::error::fault_in;
 use modalcast_model::load::{self, OpenedScene};
-use modalcast_model::scene::{DeformationSettings, Scene, SceneFeatures, UpAxis};
+use modalcast_model::scene::{Scene, SceneFeatures, UpAxis};
 use modalcast_render::{Pass, RenderPlan};
 
 /// Number of domains that the text table lists; `--json` lists all.
@@ -35,7 +35,7 @@ pub(super) fn run(args: &Args) -> Outcome {
         let report = serde_json::to_value(SceneReport::new(&opened)).map_err(fault_in("inspect"))?;
         print_line(serde_json::to_string_pretty(&report).map_err(fault_in("inspect"))?);
     } else {
-        lines(&opened.scene).into_iter().for_each(print_line);
+        lines(&opened).into_iter().for_each(print_line);
     }
     Ok(true)
 }
@@ -66,7 +66,7 @@ struct SceneReport<'a> {
     needs: SceneFeatures,
     look: LookTable,
     /// The settings in the `deform` table of `scene.toml`.
-    deformation: &'a DeformationSettings,
+    deformation: DeformTable,
     remarks: &'a [String],
     /// The plan of the deformer.
     deform: DeformPlan,
@@ -99,9 +99,9 @@ impl<'a> SceneReport<'a> {
             totals: totals(scene),
             needs: scene.needs,
             look: LookTable { settings: scene.look, raster: backends.raster },
-            deformation: &scene.deformation,
+            deformation: DeformTable { settings: scene.deformation, batches: backends.batches },
             remarks: &scene.remarks,
-            deform: gpu::plan(scene, scene.light_axes()),
+            deform: deform_plan(scene, backends),
             render: modalcast_render::plan(scene),
             domains: (0..scene.domains.len()).map(|index| DomainReport::new(scene, index)).collect(),
         }
@@ -145,7 +145,8 @@ fn totals(scene: &Scene) -> Value {
     })
 }
 
-fn lines(scene: &Scene) -> Vec<String> {
+fn lines(opened: &OpenedScene) -> Vec<String> {
+    let scene = &opened.scene;
     let mut lines = vec![format!("{:<28}{:>10}{:>6}{:>12}{:>14}", "domain", "vertices", "r", "triangles", "bytes")];
     for (index, domain) in scene.domains.iter().enumerate().take(MAX_LISTED_DOMAINS) {
         let slot = scene.layout.slots[index];
@@ -167,17 +168,22 @@ fn lines(scene: &Scene) -> Vec<String> {
     let flags = scene.needs.flags().into_iter();
     let needed: Vec<&str> = flags.filter_map(|(name, needed)| needed.then_some(name)).collect();
     lines.push(format!("needs: {}", needed.join(", ")));
-    lines.extend(plans(scene));
+    lines.extend(plans(opened));
     lines
 }
 
-/// The kernels, passes and memory that the deformer and the renderer plan for the scene, and the parts that they omit.
+/// The plan of the CUDA deformer that the server creates for the scene.
+fn deform_plan(scene: &Scene, backends: &BackendSettings) -> DeformPlan {
+    gpu::plan(scene, CudaDeformerOptions { batches: backends.batches, bounding_axes: scene.light_axes() })
+}
+
 fn pass_names(passes: &[Pass]) -> Vec<&str> {
     passes.iter().map(|pass| pass.name()).collect()
 }
 
-fn plans(scene: &Scene) -> Vec<String> {
-    let (deform, render) = (gpu::plan(scene, scene.light_axes()), modalcast_render::plan(scene));
+/// The kernels, passes and memory that the deformer and the renderer plan for the scene, and the parts that they omit.
+fn plans(OpenedScene { scene, backends }: &OpenedScene) -> Vec<String> {
+    let (deform, render) = (deform_plan(scene, backends), modalcast_render::plan(scene));
     let kernels: Vec<String> =
         deform.kernels.iter().map(|kernel| format!("{} [{}]", kernel.name, kernel.defines.join(" "))).collect();
     let mut lines = vec![
@@ -275,6 +281,7 @@ mod tests {
         assert!(serde_json::from_str::<UniqueKeys>(r#"[{"a": {"b": 1, "b": null}}]"#).is_err(), "control");
         let value: Value = serde_json::from_str(&text).expect("JSON");
         assert!(value["deformation"]["storage"].is_string(), "{}", value["deformation"]);
+        assert_eq!(value["deformation"]["batches"], "auto");
         assert!(value["deform"]["kernels"].is_array() && value["render"]["passes"].is_array(), "{text}");
     }
 }

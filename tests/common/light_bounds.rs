@@ -2,9 +2,10 @@
 
 use std::sync::Arc;
 
+use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::{Mesh, Modes, Shape};
-use modalcast_model::scene::{BatchPolicy, Bounds, DeformationSettings, LightSpaceBox, Scene, SceneState};
+use modalcast_model::scene::{Bounds, DeformationSettings, LightSpaceBox, Scene, SceneState};
 
 use super::{StepResult, run_step, scene_of_shapes};
 use crate::scenes::{self, Random};
@@ -90,16 +91,16 @@ fn bounds_of_corners(scene: &Scene, bounds: &Bounds) -> LightSpaceBox {
 
 /// Light bounds contain every vertex of scenes that are random, smooth, far from the origin or tiny, that have one
 /// vertex, or whose domains share tiles.
-pub(crate) fn check_containment<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
-    let batched = DeformationSettings { batches: BatchPolicy::Always, ..DeformationSettings::default() };
+pub(crate) fn check_containment<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>, BatchPolicy) -> D) {
+    let policy = BatchPolicy::default();
     let scenes = [
-        ("coils", coil_scene(DeformationSettings::default())),
-        ("batched coils", coil_scene(batched)),
-        ("one vertex", scenes::random_scene(&[(1, 1)], 1, false, true)),
-        ("small domains", scenes::random_scene(&[(7, 3), (40, 0), (300, 5)], 5, false, false)),
+        ("coils", policy, coil_scene(DeformationSettings::default())),
+        ("batched coils", BatchPolicy::Always, coil_scene(DeformationSettings::default())),
+        ("one vertex", policy, scenes::random_scene(&[(1, 1)], 1, false, true)),
+        ("small domains", policy, scenes::random_scene(&[(7, 3), (40, 0), (300, 5)], 5, false, false)),
     ];
-    for (name, scene) in scenes {
-        let mut deformer = create_deformer(&scene);
+    for (name, batches, scene) in scenes {
+        let mut deformer = create_deformer(&scene, batches);
         for seed in 0..3 {
             let mut state = scenes::random_state(&scene, seed);
             checked_light_bounds(name, &scene, &run_step(&mut deformer, &state));

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::gpu::{KernelKind, plan};
+use modalcast_compute::gpu::{CudaDeformerOptions, KernelKind, plan};
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::{Domain, Shape};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType};
@@ -76,7 +76,7 @@ fn bits_of(result: &StepResult, scene: &Scene, domain: usize) -> [Vec<u32>; 3] {
 
 /// Whether the GPU plan has so few tiles that each lane computes one vertex instead of four.
 pub(crate) fn has_one_item_per_lane(scene: &Scene) -> bool {
-    plan(scene, None)
+    plan(scene, CudaDeformerOptions::default())
         .kernel(KernelKind::Deform)
         .expect("expected a deform kernel")
         .defines

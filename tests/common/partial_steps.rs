@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
+use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::{Domain, Shape};
 use modalcast_model::scene::{
-    BatchPolicy, DeformationSettings, DirtyDomains, NormalMethod, RawStepUpdate, Scene, SceneState, StepUpdate,
-    StorageType,
+    DeformationSettings, DirtyDomains, NormalMethod, RawStepUpdate, Scene, SceneState, StepUpdate, StorageType,
 };
 
 use super::attributes::{find_wrong_box, with_displacements_and_boxes};
@@ -208,12 +208,11 @@ fn compare_scripted_steps<D: Deformer>(name: &str, scene: &Arc<Scene>, create_de
     eprintln!("{name}: {} states, {changed_steps} of them after changes, have equal bits", deformers.states);
 }
 
-/// Runs the scripted steps for every storage type and every deformation feature.
-pub(crate) fn check_partial_steps<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+/// Runs the scripted steps for every storage type and every deformation feature, and with batches.
+pub(crate) fn check_partial_steps<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>, BatchPolicy) -> D) {
     let stored = |storage| DeformationSettings { storage, ..DeformationSettings::default() };
     let exact = |storage| DeformationSettings { normals: NormalMethod::Exact, ..stored(storage) };
     let compensated = |deformation| DeformationSettings { compensated: true, ..deformation };
-    let batched = |deformation| DeformationSettings { batches: BatchPolicy::Always, ..deformation };
     let truncated = |storage| DeformationSettings { truncation: Some(0.2), ..stored(storage) };
     for (deformation, normal_maps) in [
         (stored(StorageType::F32), true),
@@ -228,12 +227,19 @@ pub(crate) fn check_partial_steps<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
         (with_displacements_and_boxes(stored(StorageType::F32)), true),
         (with_displacements_and_boxes(truncated(StorageType::F16)), false),
         (with_displacements_and_boxes(compensated(exact(StorageType::Int8))), false),
-        (batched(stored(StorageType::F32)), true),
-        (batched(exact(StorageType::F16)), true),
-        (DeformationSettings { boxes: true, ..batched(stored(StorageType::Int8)) }, true),
     ] {
         let name = format!("{deformation:?}, normal maps {normal_maps}");
+        let create_deformer = |scene: &Arc<Scene>| create_deformer(scene, BatchPolicy::default());
         compare_scripted_steps(&name, &mixed_scene(deformation, normal_maps), &create_deformer);
+    }
+    for deformation in [
+        stored(StorageType::F32),
+        exact(StorageType::F16),
+        DeformationSettings { boxes: true, ..stored(StorageType::Int8) },
+    ] {
+        let name = format!("batched {deformation:?}");
+        let create_deformer = |scene: &Arc<Scene>| create_deformer(scene, BatchPolicy::Always);
+        compare_scripted_steps(&name, &mixed_scene(deformation, true), &create_deformer);
     }
 }
 

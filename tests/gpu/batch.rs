@@ -2,39 +2,40 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::gpu::KernelKind;
+use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, KernelKind};
 use modalcast_compute::storage::{QUAD, TILE_QUADS};
+use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::domain::Transform;
-use modalcast_model::scene::{BatchPolicy, DeformationSettings, NormalMethod, Scene, SceneParts, StorageType};
+use modalcast_model::scene::{DeformationSettings, NormalMethod, Scene, SceneParts, StorageType};
 
 use crate::common::attributes::find_wrong_box;
 use crate::common::followers::follower_scene_parts;
 use crate::common::{assert_within_bound, run_step, scene_of_shapes, strip_shape};
 use crate::ensembles::{instanced_parts, random_states, with_storage};
-use crate::reference_comparison::cuda_deformer;
+use crate::reference_comparison::cuda_deformer_with_batches;
 use crate::scenes::{self, Random};
 
-/// The same scene with batches and without.
-fn batched_and_separate(mut create_parts: impl FnMut() -> SceneParts) -> [Arc<Scene>; 2] {
-    [BatchPolicy::Always, BatchPolicy::Never].map(|batches| {
-        let mut parts = create_parts();
-        parts.deformation.batches = batches;
-        Scene::new(parts).expect("expected a valid scene")
-    })
+/// Deformers of a scene, with batches and without.
+fn batched_and_separate(scene: &Arc<Scene>) -> [CudaDeformer; 2] {
+    [BatchPolicy::Always, BatchPolicy::Never].map(|batches| cuda_deformer_with_batches(scene, batches))
+}
+
+fn build_scene(parts: SceneParts) -> Arc<Scene> {
+    Scene::new(parts).expect("expected a valid scene")
 }
 
 /// Deforms states of a scene with batches and without, and returns the number of states with a differing bit.
-fn count_differing_states(name: &str, [batched_scene, separate_scene]: &[Arc<Scene>; 2]) -> usize {
-    let (mut batched_deformer, mut separate_deformer) = (cuda_deformer(batched_scene), cuda_deformer(separate_scene));
+fn count_differing_states(name: &str, scene: &Arc<Scene>) -> usize {
+    let [mut batched_deformer, mut separate_deformer] = batched_and_separate(scene);
     assert!(batched_deformer.plan().kernel(KernelKind::Batch).is_some(), "{name}: expected a batch kernel");
     assert!(separate_deformer.plan().kernel(KernelKind::Batch).is_none(), "{name}: expected no batch kernel");
     assert!(batched_deformer.plan().launches() <= 4, "{name}");
-    let states = random_states(batched_scene);
+    let states = random_states(scene);
     let count = states.iter().filter(|state| {
         let (result, want) = (run_step(&mut batched_deformer, state), run_step(&mut separate_deformer, state));
         if result.bounds.is_finite() {
-            assert_within_bound(name, batched_scene, state, &result.surface.positions, 0.0);
-            assert!(result.surface.boxes.is_empty() || find_wrong_box(batched_scene, &result).is_none(), "{name}");
+            assert_within_bound(name, scene, state, &result.surface.positions, 0.0);
+            assert!(result.surface.boxes.is_empty() || find_wrong_box(scene, &result).is_none(), "{name}");
         }
         let difference = result.difference(&want);
         difference.iter().for_each(|difference| eprintln!("{name}: {difference}"));
@@ -63,8 +64,8 @@ fn gpu_batches_have_the_bits_of_separate_domains() {
         ] {
             let deformation = DeformationSettings { boxes: true, ..with_storage(storage) };
             let name = format!("{} n {vertices}, r {rank}, {domains} domains", storage.name());
-            let scenes = batched_and_separate(|| instanced_parts(vertices, rank, domains, deformation));
-            assert_eq!(count_differing_states(&name, &scenes), 0, "{name}");
+            let scene = build_scene(instanced_parts(vertices, rank, domains, deformation));
+            assert_eq!(count_differing_states(&name, &scene), 0, "{name}");
         }
     }
 }
@@ -77,15 +78,15 @@ fn gpu_multi_tile_blocks_have_the_bits_of_separate_domains() {
         [(StorageType::F32, 1_100_007), (StorageType::Int8, 1_100_007), (StorageType::F16, 1_600_001)]
     {
         let name = format!("{} n {vertices}", storage.name());
-        let scenes = batched_and_separate(|| {
-            instanced_parts(vertices, 5, 3, DeformationSettings { boxes: true, ..with_storage(storage) })
-        });
-        let blocks = modalcast_compute::gpu::plan(&scenes[0], None)
+        let deformation = DeformationSettings { boxes: true, ..with_storage(storage) };
+        let scene = build_scene(instanced_parts(vertices, 5, 3, deformation));
+        let options = CudaDeformerOptions { batches: BatchPolicy::Always, ..CudaDeformerOptions::default() };
+        let blocks = modalcast_compute::gpu::plan(&scene, options)
             .kernel(KernelKind::Batch)
             .expect("expected a batch kernel")
             .blocks as usize;
         assert!(2 * blocks <= vertices.div_ceil(QUAD * TILE_QUADS) + 1, "{name}: {blocks} blocks");
-        assert_eq!(count_differing_states(&name, &scenes), 0, "{name}");
+        assert_eq!(count_differing_states(&name, &scene), 0, "{name}");
     }
 }
 
@@ -117,17 +118,10 @@ fn gpu_batches_agree_with_every_feature_of_a_scene() {
         (DeformationSettings { boxes: true, ..with_storage(StorageType::Bf16) }, true),
     ] {
         let name = format!("{deformation:?}, normal maps {normal_maps}");
-        assert_eq!(
-            count_differing_states(&name, &batched_and_separate(|| mixed_parts(deformation, normal_maps))),
-            0,
-            "{name}"
-        );
+        assert_eq!(count_differing_states(&name, &build_scene(mixed_parts(deformation, normal_maps))), 0, "{name}");
         let name = format!("followers, {name}");
         assert_eq!(
-            count_differing_states(
-                &name,
-                &batched_and_separate(|| follower_scene_parts(90, deformation, !normal_maps))
-            ),
+            count_differing_states(&name, &build_scene(follower_scene_parts(90, deformation, !normal_maps))),
             0,
             "{name}"
         );
@@ -138,12 +132,10 @@ fn gpu_batches_agree_with_every_feature_of_a_scene() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_batches_repair_intermediate_overflow() {
     for vertices in [300, 512] {
-        let [batched_scene, separate_scene] = batched_and_separate(|| {
-            instanced_parts(vertices, 5, 6, DeformationSettings { boxes: true, ..DeformationSettings::default() })
-        });
-        let (mut batched_deformer, mut separate_deformer) =
-            (cuda_deformer(&batched_scene), cuda_deformer(&separate_scene));
-        let mut state = scenes::random_state(&batched_scene, 4);
+        let deformation = DeformationSettings { boxes: true, ..DeformationSettings::default() };
+        let scene = build_scene(instanced_parts(vertices, 5, 6, deformation));
+        let [mut batched_deformer, mut separate_deformer] = batched_and_separate(&scene);
+        let mut state = scenes::random_state(&scene, 4);
         // The sum of domain 1 overflows. The products of domain 3 overflow in f32, although their sum may be finite.
         state.q[5..10].fill(f32::MAX);
         state.transforms[3] = Transform([2e38, 2e38, -2e38, 0.0, 3e38, -3e38, 3e38, 0.0, 1e38, 1e38, 1e38, 0.0]);

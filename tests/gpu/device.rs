@@ -1,6 +1,8 @@
 //! The CUDA device: struct layouts equal those of the host, unknown ordinals are rejected, and memory is released.
 
-use modalcast_compute::gpu::{CudaDeformer, Device, device_layout_values, layout_constants, probe};
+use modalcast_compute::gpu::{
+    CudaDeformer, CudaDeformerOptions, Device, device_layout_values, layout_constants, probe,
+};
 use modalcast_model::deform::Deformer;
 use modalcast_model::error::Error;
 
@@ -44,7 +46,8 @@ fn gpu_dropped_deformers_release_their_memory() {
     let state = scenes::random_state(&scene, 1);
     let deform_once = || {
         let mut deformer =
-            CudaDeformer::new(&device, &scene, None, scene.light_axes()).expect("expected a CUDA deformer");
+            CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))
+                .expect("expected a CUDA deformer");
         deformer.deform(&state).expect("expected the step to succeed");
         deformer.surface().expect("expected a surface");
         deformer.plan().total_bytes()

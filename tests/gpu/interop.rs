@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::gpu::{CudaDeformer, Device};
+use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, Device};
 use modalcast_model::deform::{Deformer, VertexAttributes};
 use modalcast_model::raster::{GlBuffer, GlVertexBuffers};
 use modalcast_model::scene::{Camera, Scene};
@@ -26,10 +26,16 @@ fn open_renderer() -> (Renderer, Arc<Device>, Arc<Scene>) {
 fn gpu_shared_buffers_have_the_bits_of_copied_buffers() {
     let (mut renderer, device, scene) = open_renderer();
     let buffers = renderer.load(&scene).expect("expected the scene to load");
-    let mut sharing_deformer = CudaDeformer::new(&device, &scene, Some(shared_buffers(&buffers)), scene.light_axes())
-        .expect("expected a CUDA deformer");
+    let mut sharing_deformer = CudaDeformer::new(
+        &device,
+        &scene,
+        Some(shared_buffers(&buffers)),
+        CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
+    )
+    .expect("expected a CUDA deformer");
     let mut copying_deformer =
-        CudaDeformer::new(&device, &scene, None, scene.light_axes()).expect("expected a CUDA deformer");
+        CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))
+            .expect("expected a CUDA deformer");
     assert!(sharing_deformer.shares_buffers(), "expected shared buffers");
     assert!(!copying_deformer.shares_buffers());
     for seed in 0..3 {
@@ -54,10 +60,16 @@ fn gpu_shared_buffers_have_the_bits_of_copied_buffers() {
 fn gpu_shared_buffers_are_read_back_during_the_next_step() {
     let (mut renderer, device, scene) = open_renderer();
     let buffers = renderer.load(&scene).expect("expected the scene to load");
-    let mut sharing_deformer = CudaDeformer::new(&device, &scene, Some(shared_buffers(&buffers)), scene.light_axes())
-        .expect("expected a CUDA deformer");
+    let mut sharing_deformer = CudaDeformer::new(
+        &device,
+        &scene,
+        Some(shared_buffers(&buffers)),
+        CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
+    )
+    .expect("expected a CUDA deformer");
     let mut copying_deformer =
-        CudaDeformer::new(&device, &scene, None, scene.light_axes()).expect("expected a CUDA deformer");
+        CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))
+            .expect("expected a CUDA deformer");
     assert!(sharing_deformer.shares_buffers(), "expected shared buffers");
     let mut pending = None;
     for seed in 0..50 {
@@ -92,9 +104,13 @@ fn gpu_frames_of_shared_and_uploaded_buffers_are_equal() {
         renderer.load(&scene).expect("expected the scene to load"),
         renderer.load(&scene).expect("expected the scene to load"),
     );
-    let mut sharing_deformer =
-        CudaDeformer::new(&device, &scene, Some(shared_buffers(&shared_scene)), scene.light_axes())
-            .expect("expected a CUDA deformer");
+    let mut sharing_deformer = CudaDeformer::new(
+        &device,
+        &scene,
+        Some(shared_buffers(&shared_scene)),
+        CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
+    )
+    .expect("expected a CUDA deformer");
     let bounds = sharing_deformer.deform(&state).expect("expected the step to succeed").bounds;
     let params =
         FrameParams { camera: Camera::fit_to_scene(&scene, 64, 64), width: 320, height: 240, bounds, light: None };
@@ -123,11 +139,16 @@ fn gpu_frames_in_flight_keep_the_vertices_of_their_step() {
         renderer.load(&scene).expect("expected the scene to load"),
         renderer.load(&scene).expect("expected the scene to load"),
     );
-    let mut sharing_deformer =
-        CudaDeformer::new(&device, &scene, Some(shared_buffers(&shared_scene)), scene.light_axes())
-            .expect("expected a CUDA deformer");
+    let mut sharing_deformer = CudaDeformer::new(
+        &device,
+        &scene,
+        Some(shared_buffers(&shared_scene)),
+        CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
+    )
+    .expect("expected a CUDA deformer");
     let mut copying_deformer =
-        CudaDeformer::new(&device, &scene, None, scene.light_axes()).expect("expected a CUDA deformer");
+        CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))
+            .expect("expected a CUDA deformer");
     assert!(sharing_deformer.shares_buffers(), "expected shared buffers");
     // A large image, so that a frame takes longer than a step.
     let params = |bounds| FrameParams {
@@ -182,13 +203,23 @@ fn gpu_unknown_or_small_buffers_fall_back_to_copies() {
     };
     let without_tangents = GlVertexBuffers { tangents: None, ..shared_buffers(&good) };
     for buffers in [shared_buffers(&small), unknown, without_tangents] {
-        let mut deformer = CudaDeformer::new(&device, &scene, Some(buffers.clone()), scene.light_axes())
-            .expect("expected a CUDA deformer");
+        let mut deformer = CudaDeformer::new(
+            &device,
+            &scene,
+            Some(buffers.clone()),
+            CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
+        )
+        .expect("expected a CUDA deformer");
         assert!(!deformer.shares_buffers(), "{buffers:?}");
         assert_equals_reference("copied buffers", &scene, &scenes::random_state(&scene, 3), &mut deformer);
     }
-    let mut sharing_deformer = CudaDeformer::new(&device, &scene, Some(shared_buffers(&good)), scene.light_axes())
-        .expect("expected a CUDA deformer");
+    let mut sharing_deformer = CudaDeformer::new(
+        &device,
+        &scene,
+        Some(shared_buffers(&good)),
+        CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
+    )
+    .expect("expected a CUDA deformer");
     assert!(sharing_deformer.shares_buffers(), "expected shared buffers after rejected ones");
     assert_equals_reference("after rejected buffers", &scene, &scenes::random_state(&scene, 3), &mut sharing_deformer);
 }

@@ -7,13 +7,13 @@ use crate::common::light_bounds::{
     self, TILE_VERTICES, bounds_in_light_space, coil_shape, coordinate_magnitude, max_excess,
 };
 use crate::common::scene_of_shapes;
-use crate::reference_comparison::cuda_deformer;
+use crate::reference_comparison::{cuda_deformer, cuda_deformer_with_batches};
 use crate::scenes;
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_light_bounds_contain_every_vertex() {
-    light_bounds::check_containment(cuda_deformer);
+    light_bounds::check_containment(cuda_deformer_with_batches);
 }
 
 #[test]

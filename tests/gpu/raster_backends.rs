@@ -43,7 +43,9 @@ fn with_one_sample(scene: &Scene) -> Arc<Scene> {
 fn draw_states(scene: &Scene, raster: RasterPolicy, states: &[SceneState]) -> Vec<FrameImage> {
     let (mut context, scene) = (open_device(), with_one_sample(scene));
     let camera = Camera::fit_to_scene(&scene, SIZE[0], SIZE[1]);
-    let mut loaded_scene = context.load_scene(&scene, BackendSettings { raster }).expect("expected the scene to load");
+    let mut loaded_scene = context
+        .load_scene(&scene, BackendSettings { raster, ..BackendSettings::default() })
+        .expect("expected the scene to load");
     let draw_state = |state: &SceneState| {
         loaded_scene.deform(state).expect("expected the step to succeed");
         context.draw(&mut loaded_scene, &camera, FrameSize::new(SIZE[0], SIZE[1])).expect("expected a frame")
@@ -206,7 +208,7 @@ fn gpu_cuda_frames_in_flight_keep_their_step() {
     let (mut context, cuda_scene) = (open_device(), with_one_sample(&scene));
     let camera = Camera::fit_to_scene(&cuda_scene, SIZE[0], SIZE[1]);
     let mut loaded_scene = context
-        .load_scene(&cuda_scene, BackendSettings { raster: RasterPolicy::Cuda })
+        .load_scene(&cuda_scene, BackendSettings { raster: RasterPolicy::Cuda, ..BackendSettings::default() })
         .expect("expected the scene to load");
     let mut images = Vec::new();
     let mut in_flight = std::collections::VecDeque::new();
@@ -261,13 +263,14 @@ fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
             image.rgba
         };
     let mut context = open_device();
-    let mut loaded_scene =
-        context.load_scene(&scene, BackendSettings { raster: RasterPolicy::Cuda }).expect("expected the scene to load");
+    let mut loaded_scene = context
+        .load_scene(&scene, BackendSettings { raster: RasterPolicy::Cuda, ..BackendSettings::default() })
+        .expect("expected the scene to load");
     for size in [[64, 48], [1920, 1080], [1, 1], [333, 77], [64, 48]] {
         let got = draw(&mut context, &mut loaded_scene, size);
         let mut new_context = open_device();
         let mut new_scene = new_context
-            .load_scene(&scene, BackendSettings { raster: RasterPolicy::Cuda })
+            .load_scene(&scene, BackendSettings { raster: RasterPolicy::Cuda, ..BackendSettings::default() })
             .expect("expected the scene to load");
         assert!(got == draw(&mut new_context, &mut new_scene, size), "{size:?}");
         new_context.unload_scene(new_scene);
@@ -282,7 +285,7 @@ fn gpu_fastest_path_draws_frames_of_every_size() {
     let scene = with_one_sample(&scenes::random_scene(&[(3000, 12), (700, 3)], 3, false, false));
     let mut context = open_device();
     let mut loaded_scene = context
-        .load_scene(&scene, BackendSettings { raster: RasterPolicy::Fastest })
+        .load_scene(&scene, BackendSettings { raster: RasterPolicy::Fastest, ..BackendSettings::default() })
         .expect("expected the scene to load");
     for [width, height] in [[64, 48], [1920, 1080], [1, 1], [333, 77]] {
         let camera = Camera::fit_to_scene(&scene, width, height);

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::gpu::{CudaDeformer, CudaRasterizer, Device};
+use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, CudaRasterizer, Device};
 use modalcast_compute::reference::raster::VisibilityBuffer;
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::raster::{CutOuts, GlBuffer, RasterGeometry, Rasterizer};
@@ -207,8 +207,13 @@ fn gpu_positions_shared_with_a_deformer_are_drawn() {
     let buffers = context.gl.renderer.load(&scene).expect("expected the scene to load");
     let shared = buffers.vertex_buffers();
     let positions = shared.positions.clone();
-    let mut deformer =
-        CudaDeformer::new(&context.device, &scene, Some(shared), scene.light_axes()).expect("expected a CUDA deformer");
+    let mut deformer = CudaDeformer::new(
+        &context.device,
+        &scene,
+        Some(shared),
+        CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
+    )
+    .expect("expected a CUDA deformer");
     assert!(deformer.shares_buffers(), "expected shared buffers");
     let triangles = scene.triangle_vertices();
     let all = DrawRange { first: 0, triangles: triangles.len() as u32, faces: CullMode::None };

@@ -2,7 +2,8 @@
 
 use std::sync::Arc;
 
-use modalcast_compute::gpu::{CudaDeformer, Device};
+use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, Device};
+use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::deform::Deformer;
 use modalcast_model::scene::{Scene, SceneState};
 
@@ -10,8 +11,13 @@ use crate::accuracy::{assert_equals_reference, have_equal_bits};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 
 pub(crate) fn cuda_deformer(scene: &Arc<Scene>) -> CudaDeformer {
+    cuda_deformer_with_batches(scene, BatchPolicy::default())
+}
+
+pub(crate) fn cuda_deformer_with_batches(scene: &Arc<Scene>, batches: BatchPolicy) -> CudaDeformer {
     let device = Device::open(0).expect("expected a CUDA device");
-    CudaDeformer::new(&device, scene, None, scene.light_axes()).expect("expected a CUDA deformer")
+    let options = CudaDeformerOptions { batches, bounding_axes: scene.light_axes() };
+    CudaDeformer::new(&device, scene, None, options).expect("expected a CUDA deformer")
 }
 
 #[test]

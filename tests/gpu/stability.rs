@@ -8,7 +8,7 @@ use modalcast_model::scene::{DeformationSettings, Scene};
 use crate::common::{
     self, attributes, extreme_values, followers, neighbors, overflow, partial_steps, surfaces, truncation,
 };
-use crate::reference_comparison::cuda_deformer;
+use crate::reference_comparison::{cuda_deformer, cuda_deformer_with_batches};
 use crate::scenes::{self, Random};
 
 fn truncation_bound(deformer: &CudaDeformer, _: &Scene) -> f64 {
@@ -90,7 +90,7 @@ fn gpu_mode_near_the_truncation_limit_does_not_flicker() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_partial_steps_have_the_bits_of_full_steps() {
-    partial_steps::check_partial_steps(cuda_deformer);
+    partial_steps::check_partial_steps(cuda_deformer_with_batches);
 }
 
 /// Negative control of the test above: a step depends on its list of dirty domains.

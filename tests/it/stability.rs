@@ -83,7 +83,7 @@ fn mode_near_the_truncation_limit_does_not_flicker() {
 
 #[test]
 fn partial_steps_have_the_bits_of_full_steps() {
-    partial_steps::check_partial_steps(cpu_deformer);
+    partial_steps::check_partial_steps(|scene, _| cpu_deformer(scene));
     assert!(!partial_steps::relies_on_dirty_list(cpu_deformer), "expected the CPU deformer to compare values");
 }
 
@@ -140,7 +140,7 @@ fn overflowing_frame_products_keep_finite_vertices() {
 
 #[test]
 fn light_bounds_contain_every_vertex() {
-    light_bounds::check_containment(cpu_deformer);
+    light_bounds::check_containment(|scene, _| cpu_deformer(scene));
 }
 
 #[test]

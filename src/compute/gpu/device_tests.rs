@@ -4,8 +4,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use cudarc::driver::{LaunchConfig, result};
 
-use super::CudaDeformer;
 use super::launch::{Device, DeviceBuffer, LaunchOrder, capture, launch_kernel};
+use super::{CudaDeformer, CudaDeformerOptions};
 use crate::testing::scene_and_state;
 use modalcast_model::deform::{Deformer as _, VertexAttributes};
 use modalcast_model::error::Error;
@@ -18,7 +18,7 @@ const LOSE_DEVICE: &str = "MODALCAST_TEST_LOSES_DEVICE";
 fn gpu_other_scenes_run_after_a_panic_during_capture() {
     let device = Device::open(0).expect("a CUDA device");
     let (scene, state) = scene_and_state(&[(300, 5, 10)]);
-    let mut deformer = CudaDeformer::new(&device, &scene, None).expect("a deformer");
+    let mut deformer = CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).expect("a deformer");
     let before = deformer.deform(&state).expect("deforms").bounds;
     let memory = DeviceBuffer::zeroed(&device, 64).expect("memory");
     let submit = || {
@@ -74,8 +74,8 @@ fn lose_device() {
     }
     let device = Device::open(0).expect("a CUDA device");
     let (scene, state) = scene_and_state(&[(300, 5, 10)]);
-    let mut one = CudaDeformer::new(&device, &scene, None).expect("a deformer");
-    let mut other = CudaDeformer::new(&device, &scene, None).expect("a deformer");
+    let mut one = CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).expect("a deformer");
+    let mut other = CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).expect("a deformer");
     one.deform(&state).expect("deforms");
     other.deform(&state).expect("deforms");
     let pending = other.readback(VertexAttributes::VERTICES).expect("begins");
@@ -91,7 +91,7 @@ fn lose_device() {
     assert!(is_lost(other.wait_readback(&pending)));
     assert!(is_lost(other.deform(&state)), "another scene");
     assert!(is_lost(DeviceBuffer::upload(&device, &[1_u32])));
-    assert!(is_lost(CudaDeformer::new(&device, &scene, None).map(|_| ())));
+    assert!(is_lost(CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).map(|_| ())));
     drop((one, other, pending));
     assert!(is_lost(device.synchronize("test")), "dropping hides nothing");
 }

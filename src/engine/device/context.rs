@@ -9,9 +9,9 @@ use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use crate::telemetry::ms_since;
 use modalcast_compute::cpu::CpuDeformer;
-use modalcast_compute::gpu::{self, CudaDeformer, CudaRasterizer};
+use modalcast_compute::gpu::{self, CudaDeformer, CudaDeformerOptions, CudaRasterizer};
 use modalcast_compute::reference::ReferenceDeformer;
-use modalcast_model::backend_settings::{BackendSettings, RasterPolicy};
+use modalcast_model::backend_settings::{BackendSettings, BatchPolicy, RasterPolicy};
 use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
@@ -112,7 +112,7 @@ impl DeviceContext {
     /// # Errors
     /// `Fault` of the device; `Invalid` when the rest state overflows.
     pub fn load_scene(&mut self, scene: &Arc<Scene>, backends: BackendSettings) -> Result<LoadedScene> {
-        let (deformer, buffers) = self.create_deformer(scene)?;
+        let (deformer, buffers) = self.create_deformer(scene, backends.batches)?;
         let mut loaded_scene = LoadedScene::new(scene, deformer, buffers);
         let ready = loaded_scene.rest().and_then(|()| self.attach_rasterizer(&mut loaded_scene, backends.raster));
         match ready {
@@ -125,7 +125,11 @@ impl DeviceContext {
     }
 
     /// Creates the deformer of a scene, and the OpenGL buffers that it writes to, if it writes to any.
-    fn create_deformer(&mut self, scene: &Arc<Scene>) -> Result<(Box<dyn Deformer>, Option<SceneBuffers>)> {
+    fn create_deformer(
+        &mut self,
+        scene: &Arc<Scene>,
+        batches: BatchPolicy,
+    ) -> Result<(Box<dyn Deformer>, Option<SceneBuffers>)> {
         #[cfg(test)]
         if let Some(create) = self.test_deformer {
             return Ok((create(scene), None));
@@ -138,8 +142,8 @@ impl DeviceContext {
             _ => return Ok((Box::new(CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())), None)),
         };
         let buffers = self.shareable_buffers(scene)?;
-        match CudaDeformer::new(&device, scene, buffers.as_ref().map(SceneBuffers::vertex_buffers), scene.light_axes())
-        {
+        let options = CudaDeformerOptions { batches, bounding_axes: scene.light_axes() };
+        match CudaDeformer::new(&device, scene, buffers.as_ref().map(SceneBuffers::vertex_buffers), options) {
             Ok(deformer) => Ok((Box::new(deformer), buffers)),
             Err(error) => {
                 self.unload(buffers);

@@ -44,23 +44,8 @@ pub enum NormalMethod {
     Exact,
 }
 
-/// Whether domains that share a shape are deformed in a batch, so that U is read once for all of them. The results are
-/// bit-identical.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum BatchPolicy {
-    /// Batches where they are known to be faster.
-    #[default]
-    Auto,
-    /// No batches.
-    Never,
-    /// Batches of all domains that share a shape with modes.
-    Always,
-}
-
 /// Options that trade accuracy for time, and additional outputs. The default is exact.
-#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
 pub struct DeformationSettings {
     pub storage: StorageType,
     pub normals: NormalMethod,
@@ -72,8 +57,6 @@ pub struct DeformationSettings {
     pub displacements: bool,
     /// Store an axis-aligned bounding box of each domain's deformed positions.
     pub boxes: bool,
-    /// Batching in the CUDA deformer. Not available with truncation, compensated sums or stored displacements.
-    pub batches: BatchPolicy,
 }
 
 impl DeformationSettings {

@@ -21,7 +21,7 @@ mod transform_format;
 mod transform_roots;
 
 pub use camera::{Bounds, Camera, Lens, View};
-pub use deformation::{BatchPolicy, DeformationSettings, NormalMethod, StorageType};
+pub use deformation::{DeformationSettings, NormalMethod, StorageType};
 pub use features::SceneFeatures;
 pub use floating_origin::{FloatingOrigins, ORIGIN_GRID, ORIGIN_REACH, snap_to_origin_grid};
 pub use frame_size::FrameSize;

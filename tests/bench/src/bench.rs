@@ -5,13 +5,13 @@ use std::sync::Arc;
 use serde::Serialize;
 
 use super::UploadTiming;
-use super::cuda_variants;
+use super::cuda_variants::{self, StepVariant};
 use super::error_model::ErrorModelCache;
 use super::variant::{DeformerVariant, VariantCandidate, VariantFilter, VariantLabel, make_candidate};
 use super::workloads::Workload;
-use crate::kernels;
+use crate::kernels::{self, StepOutputs};
 use modalcast_compute::cpu::{CpuDeformer, read_bandwidth};
-use modalcast_compute::gpu::{CudaDeformer, Device};
+use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, Device};
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result};
@@ -125,7 +125,8 @@ impl BenchTarget for LocalMachine {
         if let Ok(device) = &self.device {
             // A whole step as the server runs it: upload of q and T, kernels, readback of the bounds.
             let cuda = |scene: &Arc<Scene>| -> Made {
-                Ok(Box::new(CudaDeformer::new(device, scene, None, scene.light_axes())?))
+                let options = CudaDeformerOptions { batches: load.batches, bounding_axes: scene.light_axes() };
+                Ok(Box::new(CudaDeformer::new(device, scene, None, options)?))
             };
             offers.push(driven("cuda f32 step", Backend::Cuda, plain, &cuda));
             if let Some(exact) = exact_normals(scene) {
@@ -134,14 +135,15 @@ impl BenchTarget for LocalMachine {
             for (name, short) in shortcuts(scene).into_iter().filter(|(_, short)| cuda_variants::needs_other_sum(short))
             {
                 offers.push(driven(&format!("cuda {name} step"), Backend::Cuda, short, &cuda));
-                offers.push(cuda_variants::positions_variant(
-                    device,
-                    &stock,
-                    wanted,
-                    (format!("cuda {name} positions"), short),
-                ));
+                let variant = StepVariant {
+                    name: format!("cuda {name} positions"),
+                    deformation: short,
+                    batches: load.batches,
+                    outputs: StepOutputs::Positions,
+                };
+                offers.push(variant.candidate(device, &stock, wanted));
             }
-            offers.extend(cuda_variants::kernel_variants(device, &stock, scene, wanted));
+            offers.extend(cuda_variants::kernel_variants(device, &stock, load, wanted));
         }
         offers
     }
@@ -159,7 +161,7 @@ impl BenchTarget for LocalMachine {
     }
 
     fn overlap(&self, load: &Workload, states: &[SceneState], steps: usize) -> Option<Result<kernels::Overlap>> {
-        Some(kernels::overlap(self.device.as_ref().ok()?, &load.scene, states, steps))
+        Some(kernels::overlap(self.device.as_ref().ok()?, load, states, steps))
     }
 
     fn host_writes(&self, replays: usize) -> Vec<kernels::HostWrite> {

@@ -8,13 +8,15 @@ use super::timing::{CacheState, Timing};
 use super::variant::{Variant, VariantCandidate, VariantFilter, VariantLabel, make_candidate};
 use crate::kernels;
 use crate::kernels::{
-    ArrayTraffic, BatchMmaBenchmark, CublasBenchmark, CublasMethod, DeformerBenchmark, KernelAttributes,
+    ArrayTraffic, BatchMmaBenchmark, BenchmarkStep, CublasBenchmark, CublasMethod, DeformerBenchmark, KernelAttributes,
     KernelBenchmark, KernelSplit, StepOutputs, ThesisBenchmark,
 };
+use crate::workloads::Workload;
 use modalcast_compute::gpu::Device;
+use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::deform::{Backend, DeformedSurface};
 use modalcast_model::error::{Error, Result};
-use modalcast_model::scene::{BatchPolicy, DeformationSettings, Scene, SceneState, StorageType};
+use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType};
 
 /// Creates a kernel benchmark of a scene for the given states.
 type BenchmarkFactory = Box<dyn Fn(&Device, &Arc<Scene>, &[SceneState]) -> Result<Box<dyn KernelBenchmark>>>;
@@ -47,19 +49,21 @@ struct BenchmarkVariant {
 pub(super) fn kernel_variants(
     device: &Arc<Device>,
     cache: &ErrorModelCache,
-    scene: &Arc<Scene>,
+    load: &Workload,
     is_selected: VariantFilter<'_>,
 ) -> Vec<VariantCandidate> {
+    let scene = &load.scene;
     let candidate_for = |storage: StorageType, outputs: StepOutputs| -> VariantCandidate {
         // The kernel that computes u alone does not support batches.
-        let batches = if outputs == StepOutputs::Uq { BatchPolicy::Never } else { scene.deformation.batches };
-        let deformation = DeformationSettings { storage, batches, ..scene.deformation };
+        let batches = if outputs == StepOutputs::Uq { BatchPolicy::Never } else { load.batches };
         let suffix = match outputs {
             StepOutputs::Uq => UQ,
             StepOutputs::Positions => " positions",
             StepOutputs::Whole => "",
         };
-        deformer_variant(device, cache, is_selected, (format!("cuda {}{suffix}", storage.name()), deformation, outputs))
+        let name = format!("cuda {}{suffix}", storage.name());
+        let deformation = DeformationSettings { storage, ..scene.deformation };
+        StepVariant { name, deformation, batches, outputs }.candidate(device, cache, is_selected)
     };
     let storages: &[StorageType] = if scene.needs.modes { &StorageType::ALL } else { &[StorageType::F32] };
     let mut candidates: Vec<VariantCandidate> =
@@ -69,10 +73,11 @@ pub(super) fn kernel_variants(
     }
     for (name, deformation) in with_extra_outputs(scene) {
         let outputs = if has_normals(scene) { StepOutputs::Whole } else { StepOutputs::Positions };
-        candidates.push(deformer_variant(device, cache, is_selected, (name, deformation, outputs)));
+        let variant = StepVariant { name, deformation, batches: load.batches, outputs };
+        candidates.push(variant.candidate(device, cache, is_selected));
     }
     if scene.domains.len() >= MIN_CHANGED_DOMAINS {
-        candidates.push(one_percent_changed(device, scene, is_selected));
+        candidates.push(one_percent_changed(device, load, is_selected));
     }
     if scene.needs.modes {
         candidates.push(candidate_for(StorageType::F32, StepOutputs::Uq));
@@ -99,43 +104,45 @@ pub(super) fn needs_other_sum(deformation: &DeformationSettings) -> bool {
     deformation.truncation.is_some() || deformation.compensated
 }
 
-/// The positions kernel of a scene with this deformation. Kernel benchmarks have no history, so with truncation the
-/// modes of every state are selected independently.
-pub(super) fn positions_variant(
-    device: &Arc<Device>,
-    cache: &ErrorModelCache,
-    is_selected: VariantFilter<'_>,
-    (name, deformation): (String, DeformationSettings),
-) -> VariantCandidate {
-    deformer_variant(device, cache, is_selected, (name, deformation, StepOutputs::Positions))
+/// A full step of the deformer's own kernels. Kernel benchmarks have no history, so with truncation the modes of every
+/// state are selected independently.
+pub(super) struct StepVariant {
+    pub name: String,
+    pub deformation: DeformationSettings,
+    pub batches: BatchPolicy,
+    pub outputs: StepOutputs,
 }
 
-/// A variant with the deformer's own kernels.
-fn deformer_variant(
-    device: &Arc<Device>,
-    cache: &ErrorModelCache,
-    is_selected: VariantFilter<'_>,
-    (name, deformation, outputs): (String, DeformationSettings, StepOutputs),
-) -> VariantCandidate {
-    let label = VariantLabel { name, backend: Backend::Cuda, deformation };
-    make_candidate(is_selected, label, |label| {
-        let scene = cache.scene(deformation)?;
-        let create: BenchmarkFactory = Box::new(move |device, scene, states| {
-            Ok(Box::new(DeformerBenchmark::new(device, scene, states, outputs)?))
-        });
-        Ok(BenchmarkVariant::sharing(label, &scene, device, (cache.error_model(&scene), create)))
-    })
+impl StepVariant {
+    pub(super) fn candidate(
+        self,
+        device: &Arc<Device>,
+        cache: &ErrorModelCache,
+        is_selected: VariantFilter<'_>,
+    ) -> VariantCandidate {
+        let Self { name, deformation, batches, outputs } = self;
+        make_candidate(is_selected, VariantLabel { name, backend: Backend::Cuda, deformation }, |label| {
+            let scene = cache.scene(deformation)?;
+            let step = BenchmarkStep { outputs, batches, changed: None };
+            let create: BenchmarkFactory = Box::new(move |device, scene, states| {
+                Ok(Box::new(DeformerBenchmark::new(device, scene, states, step)?))
+            });
+            Ok(BenchmarkVariant::sharing(label, &scene, device, (cache.error_model(&scene), create)))
+        })
+    }
 }
 
 /// Minimum of domains for which a step that changes one domain in a hundred is measured.
 const MIN_CHANGED_DOMAINS: usize = 400;
 
 /// A step that changes one domain in a hundred, evenly distributed over the domains.
-fn one_percent_changed(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: VariantFilter<'_>) -> VariantCandidate {
+fn one_percent_changed(device: &Arc<Device>, load: &Workload, is_selected: VariantFilter<'_>) -> VariantCandidate {
+    let (scene, batches) = (&load.scene, load.batches);
     let list: Vec<u32> = (0..scene.domains.len() as u32).step_by(100).collect();
     let label = VariantLabel::new(format!("cuda f32 positions{CHANGED}"), Backend::Cuda, scene);
     let create: BenchmarkFactory = Box::new(move |device, scene, states| {
-        Ok(Box::new(DeformerBenchmark::of_changed(device, scene, states, (StepOutputs::Positions, Some(&list)))?))
+        let step = BenchmarkStep { outputs: StepOutputs::Positions, batches, changed: Some(&list) };
+        Ok(Box::new(DeformerBenchmark::new(device, scene, states, step)?))
     });
     make_candidate(is_selected, label, |label| Ok(BenchmarkVariant::new(label, scene, device, create)))
 }
@@ -152,13 +159,18 @@ fn batch_variants(
         return Vec::new();
     }
     let count = scene.domains.len();
-    let with_batches =
-        |storage: StorageType, batches: BatchPolicy| DeformationSettings { storage, batches, ..scene.deformation };
-    let batched = |storage: StorageType| {
-        let name = format!("cuda batch of {count} {}", storage.name());
-        positions_variant(device, cache, is_selected, (name, with_batches(storage, BatchPolicy::Always)))
+    let positions = |name: String, storage: StorageType, batches: BatchPolicy| {
+        let deformation = DeformationSettings { storage, ..scene.deformation };
+        StepVariant { name, deformation, batches, outputs: StepOutputs::Positions }.candidate(
+            device,
+            cache,
+            is_selected,
+        )
     };
-    let unbatched = (format!("cuda {count} apart f32"), with_batches(StorageType::F32, BatchPolicy::Never));
+    let batched = |storage: StorageType| {
+        positions(format!("cuda batch of {count} {}", storage.name()), storage, BatchPolicy::Always)
+    };
+    let unbatched = positions(format!("cuda {count} apart f32"), StorageType::F32, BatchPolicy::Never);
     let tensor_core = |storage: StorageType| {
         let deformation = DeformationSettings { storage, ..scene.deformation };
         // Summation order and rounding differ from the deformer's, so the name marks it.
@@ -170,8 +182,7 @@ fn batch_variants(
             Ok(BenchmarkVariant::sharing(label, &scene, device, (cache.error_model(&scene).with_products(), create)))
         })
     };
-    let deformer_variants =
-        StorageType::ALL.into_iter().map(batched).chain([positions_variant(device, cache, is_selected, unbatched)]);
+    let deformer_variants = StorageType::ALL.into_iter().map(batched).chain([unbatched]);
     deformer_variants.chain([StorageType::F16, StorageType::Bf16].map(tensor_core)).collect()
 }
 

@@ -48,7 +48,7 @@ use crate::kernels::{HostWrite, Overlap};
 use bench::{BenchTarget, MemoryBandwidth};
 use modalcast_model::deform::Backend;
 use modalcast_model::error::{Result, fault_in};
-use modalcast_model::load;
+use modalcast_model::load::{self, OpenedScene};
 use motion::WorkloadMotion;
 use provenance::Provenance;
 use recorded_trajectory::RecordedTrajectory;
@@ -275,13 +275,14 @@ fn open(source: &WorkloadSource, size: Size) -> Result<(Workload, WorkloadMotion
             Ok((load, motion))
         }
         WorkloadSource::Scene { source, record } => {
-            let scene = load::open(source)?.scene;
+            let OpenedScene { scene, backends } = load::open(source)?;
             let record = match record {
                 Some(path) => Some(RecordedTrajectory::read(path, &scene)?),
                 None => RecordedTrajectory::beside(source, &scene)?,
             };
             let remarks = scene.remarks.clone();
-            let load = Workload { name: scene.name.clone(), scene, paired: false, species: None, remarks };
+            let batches = backends.batches;
+            let load = Workload { batches, remarks, ..Workload::new(scene.name.clone(), scene) };
             let motion = WorkloadMotion::new(&load, record);
             Ok((load, motion))
         }

@@ -23,12 +23,10 @@ use crate::gpu::launch::cleanup::WaitForStream;
 use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, DeviceBuffer, KernelKind};
 use crate::gpu::tables::change_list::{ChangeListLengths, ChangedDomains, max_changed_domains};
-use crate::gpu::tables::device_tables::DeviceTables;
+use crate::gpu::tables::device_tables::{CudaDeformerOptions, DeviceTables};
 use crate::gpu::tables::layout::Header;
 use crate::gpu::tables::plan::{BufferRole, DeformPlan, plan_from_tables};
-use modalcast_model::deform::{
-    Backend, BoundingAxes, DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback,
-};
+use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::raster::GlVertexBuffers;
 use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
@@ -63,8 +61,7 @@ pub struct CudaDeformer {
 }
 
 impl CudaDeformer {
-    /// Packs a scene onto the device. With `gl`, steps write directly into those buffers when the driver allows it. With
-    /// `bounding_axes`, every step also bounds the positions along them.
+    /// Packs a scene onto the device. With `gl`, steps write directly into those buffers when the driver allows it.
     ///
     /// # Errors
     /// `Fault` when the device refuses; `Unavailable` when NVRTC is missing or the device's memory is too small.
@@ -72,9 +69,9 @@ impl CudaDeformer {
         device: &Arc<Device>,
         scene: &Arc<Scene>,
         gl: Option<GlVertexBuffers>,
-        bounding_axes: Option<BoundingAxes>,
+        options: CudaDeformerOptions,
     ) -> Result<Self> {
-        let tables = DeviceTables::new(scene, bounding_axes);
+        let tables = DeviceTables::new(scene, options);
         let plan = plan_from_tables(scene, &tables);
         let _current = device.enter()?;
         check_memory(device, &plan)?;
@@ -85,7 +82,12 @@ impl CudaDeformer {
         let deform = DeformKernel::new(device, scene, kernels, tables)?;
         let apply = plan.kernel(KernelKind::Apply);
         let kernels = StepKernels {
-            bounds: BoundsKernel::new(device, plan.require_kernel(KernelKind::Bounds)?, bounding_axes, &deform)?,
+            bounds: BoundsKernel::new(
+                device,
+                plan.require_kernel(KernelKind::Bounds)?,
+                options.bounding_axes,
+                &deform,
+            )?,
             normals,
             apply: apply.map(|apply| ApplyKernel::new(device, deform.packing(), apply)).transpose()?,
             deform,

@@ -57,6 +57,7 @@ mod tests {
     use super::super::test_scenes::{scene, used_once};
     use super::super::work::CoordinateLayout;
     use super::*;
+    use modalcast_model::backend_settings::BatchPolicy;
 
     /// How many pieces contain each vertex of a domain.
     fn seen(scene: &Scene, work: &WorkList, domain: usize) -> Vec<u32> {
@@ -83,7 +84,7 @@ mod tests {
     fn every_vertex_lies_in_one_piece_of_its_domain_whatever_its_tiles() {
         let sizes = [(7, 2), (64, 0), (65, 3), (128, 1), (129, 0), (9_000, 4), (1, 1)];
         for scene in [scene(&sizes, false, false), used_once(&sizes)] {
-            let work = WorkList::new(&scene, &CoordinateLayout::new(&scene));
+            let work = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::default());
             let list = segments(&scene, &work);
             assert!(list.iter().any(|piece| piece.from_vertices == 1) && list.len() > scene.domains.len());
             assert!(list.is_sorted_by_key(|piece| piece.domain));

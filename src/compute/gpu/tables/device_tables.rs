@@ -7,8 +7,25 @@ use super::layout::{BoxSegment, NormalSlot, TransformLink};
 use super::normal_tables;
 use super::rings::{self, RingTables};
 use super::work::{CoordinateLayout, WorkList, rest_directions, rest_positions};
+use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::deform::BoundingAxes;
 use modalcast_model::scene::Scene;
+
+/// Settings of a CUDA deformer that its scene does not contain. The default is automatic batching and no bounding axes.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct CudaDeformerOptions {
+    /// Whether domains that share a shape are deformed in batches.
+    pub batches: BatchPolicy,
+    /// Axes along which every step bounds the positions, in addition to the world's axes.
+    pub bounding_axes: Option<BoundingAxes>,
+}
+
+impl CudaDeformerOptions {
+    /// Default options with these bounding axes.
+    pub fn with_bounding_axes(bounding_axes: Option<BoundingAxes>) -> Self {
+        Self { bounding_axes, ..Self::default() }
+    }
+}
 
 /// The constant tables of a scene, built once for the plan and the upload. U itself is packed during its upload, because
 /// it is large.
@@ -36,12 +53,12 @@ pub struct DeviceTables {
 
 impl DeviceTables {
     /// Builds the tables of a scene.
-    pub fn new(scene: &Scene, bounding_axes: Option<BoundingAxes>) -> Self {
+    pub fn new(scene: &Scene, options: CudaDeformerOptions) -> Self {
         let coordinates = CoordinateLayout::new(scene);
-        let work = WorkList::new(scene, &coordinates);
+        let work = WorkList::new(scene, &coordinates, options.batches);
         let [rest_normals, rest_tangents] = rest_directions(scene, &work);
         Self {
-            bounding_axes,
+            bounding_axes: options.bounding_axes,
             segments: box_segments::segments(scene, &work),
             rest: rest_positions(scene, &work),
             rest_normals,

@@ -4,14 +4,13 @@ use serde::Serialize;
 
 use super::box_segments::box_bytes;
 use super::change_list::{ChangeListLayout, max_change_entries};
-use super::device_tables::{DeviceTables, NormalTables};
+use super::device_tables::{CudaDeformerOptions, DeviceTables, NormalTables};
 use super::kernels::kernels;
 use super::layout::NormalSlot;
 use super::normal_tables;
 use super::rings::possible_corner_group_bytes;
 use super::work::batches::BatchTables;
 use crate::gpu::launch::{KernelDescriptor, KernelKind};
-use modalcast_model::deform::BoundingAxes;
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::Scene;
 
@@ -94,9 +93,9 @@ pub struct DeformPlan {
     pub omitted: Vec<OmittedFeature>,
 }
 
-/// The plan of a scene, for a deformer that also bounds the positions along `bounding_axes`.
-pub fn plan(scene: &Scene, bounding_axes: Option<BoundingAxes>) -> DeformPlan {
-    plan_from_tables(scene, &DeviceTables::new(scene, bounding_axes))
+/// The plan of a scene, for a deformer with these options.
+pub fn plan(scene: &Scene, options: CudaDeformerOptions) -> DeformPlan {
+    plan_from_tables(scene, &DeviceTables::new(scene, options))
 }
 
 /// The plan of a scene from existing tables.

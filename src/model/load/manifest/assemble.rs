@@ -50,7 +50,7 @@ pub(super) fn assemble(
     parts.unit = manifest.unit.unwrap_or(parts.unit);
     parts.origin = manifest.origin;
     parts.look = manifest.look.as_ref().map_or(parts.look, LookKeys::render_settings);
-    parts.deformation = manifest.deform;
+    parts.deformation = manifest.deform.deformation_settings();
     match manifest.shadows {
         Some(false) => parts.look.shadow = None,
         Some(true) => parts.look.shadow = Some(parts.look.shadow.unwrap_or_default()),
@@ -63,8 +63,10 @@ pub(super) fn assemble(
     }
     parts.rigid_transforms = manifest.transforms == TransformKind::Rigid;
     drop_unused(&mut parts);
-    let backends =
-        BackendSettings { raster: manifest.look.as_ref().map_or_else(RasterPolicy::default, |look| look.raster) };
+    let backends = BackendSettings {
+        raster: manifest.look.as_ref().map_or_else(RasterPolicy::default, |look| look.raster),
+        batches: manifest.deform.batches,
+    };
     Ok(SceneDescription { parts, backends })
 }
 

@@ -67,12 +67,12 @@ use std::collections::BTreeMap;
 
 use patch::MaterialPatch;
 use placement::Placement;
-use settings::LookKeys;
+use settings::{DeformKeys, LookKeys};
 
 use super::SceneDescription;
 use super::asset_dir::AssetDir;
 use crate::error::{Result, invalid};
-use crate::scene::{DeformationSettings, UpAxis};
+use crate::scene::UpAxis;
 
 /// The file name that makes a folder a scene.
 pub(super) const MANIFEST_FILE: &str = "scene.toml";
@@ -93,7 +93,7 @@ struct Manifest {
     shadows: Option<bool>,
     ground: Option<bool>,
     #[serde(default)]
-    deform: DeformationSettings,
+    deform: DeformKeys,
     #[serde(default)]
     material: BTreeMap<String, MaterialPatch>,
     model: Option<String>,

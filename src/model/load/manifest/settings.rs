@@ -1,8 +1,11 @@
 //! The tables `look` and `deform` of `scene.toml`. Some of their keys are settings of the scene, the others are settings
 //! of the backends.
 
-use crate::backend_settings::RasterPolicy;
-use crate::scene::{Antialiasing, Bloom, Culling, Ground, RenderSettings, ShadowSettings, ToneMapping, Transparency};
+use crate::backend_settings::{BatchPolicy, RasterPolicy};
+use crate::scene::{
+    Antialiasing, Bloom, Culling, DeformationSettings, Ground, NormalMethod, RenderSettings, ShadowSettings,
+    StorageType, ToneMapping, Transparency,
+};
 
 /// The table `look`. Missing keys have the default of [`RenderSettings`].
 #[derive(Debug, serde::Deserialize)]
@@ -52,6 +55,34 @@ impl LookKeys {
             opaque_alpha: self.opaque_alpha.unwrap_or(default.opaque_alpha),
             fragments: self.fragments.or(default.fragments),
             culling: self.culling.unwrap_or(default.culling),
+        }
+    }
+}
+
+/// The table `deform`. Missing keys have the default of [`DeformationSettings`].
+#[derive(Debug, Default, serde::Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct DeformKeys {
+    storage: StorageType,
+    normals: NormalMethod,
+    truncation: Option<f64>,
+    compensated: bool,
+    displacements: bool,
+    boxes: bool,
+    /// A setting of the backends.
+    pub(super) batches: BatchPolicy,
+}
+
+impl DeformKeys {
+    /// The settings of the scene.
+    pub(super) fn deformation_settings(&self) -> DeformationSettings {
+        DeformationSettings {
+            storage: self.storage,
+            normals: self.normals,
+            truncation: self.truncation,
+            compensated: self.compensated,
+            displacements: self.displacements,
+            boxes: self.boxes,
         }
     }
 }

@@ -3,11 +3,11 @@
 use std::path::Path;
 
 use super::*;
-use crate::backend_settings::{BackendSettings, RasterPolicy};
+use crate::backend_settings::{BackendSettings, BatchPolicy, RasterPolicy};
 use crate::domain::{AlphaMode, Transform};
 use crate::scene::{
-    Antialiasing, BatchPolicy, Bloom, Culling, DeformationSettings, MomentFormat, NormalMethod, RenderSettings,
-    SceneParts, ShadowMethod, ShadowSettings, StorageType, ToneMapping,
+    Antialiasing, Bloom, Culling, DeformationSettings, MomentFormat, NormalMethod, RenderSettings, SceneParts,
+    ShadowMethod, ShadowSettings, StorageType, ToneMapping,
 };
 
 const TRIANGLE: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
@@ -45,7 +45,7 @@ fn one_model_with_everything_said_about_the_scene() {
     assert_eq!((parts.name.as_str(), parts.up, parts.unit), ("n", UpAxis::Z, 0.01));
     assert_eq!((parts.origin, parts.rigid_transforms), ([1.5, 0.0, 0.0], true));
     assert!(parts.look.shadow.is_none() && parts.look.ground.is_some());
-    assert_eq!(backends, BackendSettings { raster: RasterPolicy::Fastest });
+    assert_eq!(backends, BackendSettings { raster: RasterPolicy::Fastest, batches: BatchPolicy::Never });
     assert_eq!(parts.look.sunlight, [2.0; 3]);
     assert_eq!(parts.look.bloom, Some(Bloom { strength: 0.25, ..Bloom::default() }));
     assert_eq!((parts.look.antialias, parts.look.tone), (Antialiasing::Fxaa, ToneMapping::Aces));
@@ -54,9 +54,9 @@ fn one_model_with_everything_said_about_the_scene() {
         storage: StorageType::Int8,
         normals: NormalMethod::Exact,
         truncation: Some(1e-4),
+        displacements: true,
         ..DeformationSettings::default()
     };
-    let deformation = DeformationSettings { displacements: true, batches: BatchPolicy::Never, ..deformation };
     assert_eq!(parts.deformation, deformation);
     assert_eq!(parts.shapes[0].modes.rank(), 2);
     assert_eq!(parts.domains[0].placement.translation(), nalgebra::Vector3::new(1.0, 2.0, 3.0));

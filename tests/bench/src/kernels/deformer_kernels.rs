@@ -13,8 +13,9 @@ use modalcast_compute::gpu::launchers::{
     PositionKernels, plan_from_tables,
 };
 use modalcast_compute::gpu::step_input::{Header, InputPart, StagingBuffer, StepInputs};
-use modalcast_compute::gpu::{BufferRole, DeformPlan, Device, KernelDescriptor, KernelKind};
+use modalcast_compute::gpu::{BufferRole, CudaDeformerOptions, DeformPlan, Device, KernelDescriptor, KernelKind};
 use modalcast_compute::storage::modes_per_chunk;
+use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::{Scene, SceneState};
 
@@ -58,6 +59,23 @@ pub struct DeformerBenchmark {
     counts: StepCounts,
 }
 
+/// The step that a [`DeformerBenchmark`] measures.
+#[derive(Debug, Clone, Copy)]
+pub struct BenchmarkStep<'a> {
+    pub outputs: StepOutputs,
+    pub batches: BatchPolicy,
+    /// The domains that a partial step changes; the other domains keep the positions that
+    /// [`KernelBenchmark::compute_skipped_domains`] computed. `None` measures full steps.
+    pub changed: Option<&'a [u32]>,
+}
+
+impl BenchmarkStep<'_> {
+    /// A full step with the default batching.
+    pub fn full(outputs: StepOutputs) -> Self {
+        Self { outputs, batches: BatchPolicy::default(), changed: None }
+    }
+}
+
 /// Counts of a step, for its memory traffic.
 #[derive(Debug, Clone, Copy)]
 struct StepCounts {
@@ -72,24 +90,12 @@ impl DeformerBenchmark {
     /// Packs and uploads the scene and the values of each state.
     ///
     /// # Errors
-    /// `Invalid` when there is no state, or [`StepOutputs::Uq`] is requested for a scene with batches; `Unavailable` when
-    /// NVRTC is missing; `Fault` when the device fails.
-    pub fn new(device: &Device, scene: &Arc<Scene>, states: &[SceneState], step_outputs: StepOutputs) -> Result<Self> {
-        Self::of_changed(device, scene, states, (step_outputs, None))
-    }
-
-    /// The same, for steps that change only the listed domains. The other domains keep the positions that
-    /// [`KernelBenchmark::compute_skipped_domains`] computed.
-    ///
-    /// # Errors
-    /// Those of [`Self::new`], and `Invalid` when the list of changes is too long for a partial step.
-    pub fn of_changed(
-        device: &Device,
-        scene: &Arc<Scene>,
-        states: &[SceneState],
-        (step_outputs, changed): (StepOutputs, Option<&[u32]>),
-    ) -> Result<Self> {
-        let tables = DeviceTables::new(scene, scene.light_axes());
+    /// `Invalid` when there is no state, [`StepOutputs::Uq`] is requested for a scene with batches, or the list of changes
+    /// is too long for a partial step; `Unavailable` when NVRTC is missing; `Fault` when the device fails.
+    pub fn new(device: &Device, scene: &Arc<Scene>, states: &[SceneState], step: BenchmarkStep<'_>) -> Result<Self> {
+        let BenchmarkStep { outputs: step_outputs, batches, changed } = step;
+        let options = CudaDeformerOptions { batches, bounding_axes: scene.light_axes() };
+        let tables = DeviceTables::new(scene, options);
         let plan = plan_from_tables(scene, &tables);
         if step_outputs == StepOutputs::Uq && plan.kernel(KernelKind::Batch).is_some() {
             return Err(invalid("deform.batches", "never for u = U q alone", "batches"));
@@ -105,7 +111,12 @@ impl DeformerBenchmark {
             name: format!("ours_{}{}", scene.deformation.storage.name(), step_outputs.suffix()),
             step_outputs,
             scene: Arc::clone(scene),
-            bounds: BoundsKernel::new(device, plan.require_kernel(KernelKind::Bounds)?, scene.light_axes(), &deform)?,
+            bounds: BoundsKernel::new(
+                device,
+                plan.require_kernel(KernelKind::Bounds)?,
+                options.bounding_axes,
+                &deform,
+            )?,
             normals,
             is_partial: changed.is_some(),
             inputs: Vec::new(),

@@ -32,7 +32,7 @@ mod upload_time;
 
 pub use batch_mma::BatchMmaBenchmark;
 pub use cublas::{CublasBenchmark, CublasMethod, cublas_version};
-pub use deformer_kernels::{DeformerBenchmark, StepOutputs};
+pub use deformer_kernels::{BenchmarkStep, DeformerBenchmark, StepOutputs};
 pub use input_sets::Part;
 pub use kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 pub use memory_roofs::{Roofs, roofs};

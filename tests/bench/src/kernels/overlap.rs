@@ -14,12 +14,13 @@ use serde::Serialize;
 
 use super::timer::EventPair;
 use crate::timing::{Timing, quantile};
+use crate::workloads::Workload;
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::{PinnedBuffer, PinnedUse};
 use modalcast_compute::gpu::step_input::{
     Header, InputPacker, InputWriter, PARALLEL_THRESHOLD, StepInputs, parallel_copy,
 };
-use modalcast_compute::gpu::{CudaDeformer, MAX_STEPS_IN_FLIGHT};
+use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, MAX_STEPS_IN_FLIGHT};
 use modalcast_model::deform::{DeformedSurface, Deformer as _, VertexAttributes};
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::{Scene, SceneState};
@@ -61,15 +62,17 @@ pub struct Overlap {
     pub differing: usize,
 }
 
-/// Measures `steps` steps of a scene per method and round. Steps rotate through `states`.
+/// Measures `steps` steps of a workload per method and round. Steps rotate through `states`.
 ///
 /// # Errors
 /// `Invalid` without states or steps; errors of creating a deformer; `Fault` when the device fails.
-pub fn overlap(device: &Arc<Device>, scene: &Arc<Scene>, states: &[SceneState], steps: usize) -> Result<Overlap> {
+pub fn overlap(device: &Arc<Device>, load: &Workload, states: &[SceneState], steps: usize) -> Result<Overlap> {
     if states.is_empty() || steps == 0 {
         return Err(invalid("states and steps", "at least 1", format!("{} and {steps}", states.len())));
     }
-    let mut deformer = CudaDeformer::new(device, scene, None, scene.light_axes())?;
+    let scene = &load.scene;
+    let options = CudaDeformerOptions { batches: load.batches, bounding_axes: scene.light_axes() };
+    let mut deformer = CudaDeformer::new(device, scene, None, options)?;
     let differing = count_differing_steps(&mut deformer, states, steps)?;
     let mut times = [Vec::new(), Vec::new(), Vec::new()];
     for _ in 0..ROUNDS {

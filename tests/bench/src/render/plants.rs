@@ -19,7 +19,7 @@ use crate::thesis::{PLANTS, ThesisPlant};
 use crate::timing::{MIN_REPETITIONS, Timing};
 use crate::workloads::{Size as Scale, Workload, WorkloadKind};
 use modalcast_compute::cpu::CpuDeformer;
-use modalcast_compute::gpu::{self, BufferRole, CudaDeformer, Device};
+use modalcast_compute::gpu::{self, BufferRole, CudaDeformer, CudaDeformerOptions, Device};
 use modalcast_model::deform::{Backend, DeformSummary, Deformer, VertexAttributes};
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Camera, RenderSettings, Scene, SceneState, ShadowSettings};
@@ -130,7 +130,7 @@ fn rig(studio: &mut RenderHarness, device: Option<&Arc<Device>>, scene: &Arc<Sce
     let draws = studio.renderer.info().cuda_device.map(|ordinal| usize::try_from(ordinal).ok());
     let is_shared = draws == Some(Some(device.ordinal()));
     let gl = if is_shared { Some(buffers.vertex_buffers()) } else { None };
-    let deformer = CudaDeformer::new(device, scene, gl, scene.light_axes())?;
+    let deformer = CudaDeformer::new(device, scene, gl, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))?;
     Ok(PlantSetup { bytes: beside(deformer.plan(), deformer.shares_buffers()), deformer: Box::new(deformer), buffers })
 }
 
@@ -220,7 +220,7 @@ mod tests {
     #[test]
     fn shared_output_buffers_count_once() {
         let scene = WorkloadKind::Plant(0).build(Scale::Quick).expect("built").scene;
-        let plan = gpu::plan(&scene, scene.light_axes());
+        let plan = gpu::plan(&scene, CudaDeformerOptions::with_bounding_axes(scene.light_axes()));
         let outputs = 12 * (scene.layout.vertices + scene.layout.corners) as u64;
         assert_eq!(beside(&plan, false) - beside(&plan, true), outputs);
     }

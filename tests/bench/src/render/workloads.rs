@@ -120,7 +120,7 @@ impl RenderWorkload {
 
 impl AnimatedScene {
     fn new(kind: RenderWorkload, scene: Arc<Scene>, slides: Option<usize>) -> Self {
-        let load = Workload { name: kind.name(), scene, paired: false, species: None, remarks: Vec::new() };
+        let load = Workload::new(kind.name(), scene);
         let motion = WorkloadMotion::new(&load, None);
         Self { name: load.name, kind, scene: load.scene, motion, slides }
     }
@@ -162,8 +162,7 @@ impl AnimatedScene {
 
 /// State of a scene in a light wind.
 pub(super) fn swaying(scene: &Arc<Scene>) -> SceneState {
-    let load =
-        Workload { name: scene.name.clone(), scene: Arc::clone(scene), paired: false, species: None, remarks: vec![] };
+    let load = Workload::new(scene.name.clone(), Arc::clone(scene));
     let mut state = SceneState::rest(scene);
     for (own, swing) in state.q.iter_mut().zip(WorkloadMotion::new(&load, None).step(10).q) {
         *own += (SWAY * swing) as f32;

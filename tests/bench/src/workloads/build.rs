@@ -37,13 +37,8 @@ pub(super) fn build(kind: WorkloadKind, size: Size) -> Result<Workload> {
     let paired = kind == WorkloadKind::Cancelling;
     let shapes = patches.par_iter().map(|patch| shape(patch, paired)).collect::<Result<Vec<_>>>()?;
     let instances = if kind == WorkloadKind::Batch { 16 } else { shapes.len() };
-    Ok(Workload {
-        scene: scene(kind.name(), shapes, instances, dressed)?,
-        name: kind.name(),
-        paired,
-        species: None,
-        remarks,
-    })
+    let scene = scene(kind.name(), shapes, instances, dressed)?;
+    Ok(Workload { paired, remarks, ..Workload::new(kind.name(), scene) })
 }
 
 fn many(kind: WorkloadKind, count: usize, size_of: impl Fn(&mut Rng) -> (usize, usize)) -> Vec<PatchSpec> {

@@ -22,6 +22,7 @@ mod plant;
 use std::sync::Arc;
 
 use super::thesis::{PLANTS, POWERS, RANKS};
+use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts};
 
@@ -59,12 +60,21 @@ pub enum WorkloadKind {
 pub struct Workload {
     pub name: String,
     pub scene: Arc<Scene>,
+    /// Batching in the CUDA deformer.
+    pub batches: BatchPolicy,
     /// Whether modes 2k and 2k + 1 are nearly equal, so that opposite coordinates nearly cancel.
     pub paired: bool,
     /// Index of the thesis's plant, if it is one.
     pub species: Option<usize>,
     /// Deviations from the size that the name states.
     pub remarks: Vec<String>,
+}
+
+impl Workload {
+    /// A workload with the default batching, without paired modes and remarks.
+    pub fn new(name: String, scene: Arc<Scene>) -> Self {
+        Self { name, scene, batches: BatchPolicy::default(), paired: false, species: None, remarks: Vec::new() }
+    }
 }
 
 impl WorkloadKind {

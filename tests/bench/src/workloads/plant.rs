@@ -25,7 +25,7 @@ pub(super) fn build_plant(index: usize, size: Size) -> Result<Workload> {
     let shapes = patches.par_iter().map(|patch| shape(patch, false)).collect::<Result<Vec<_>>>()?;
     let name = format!("plant-{}", index + 1);
     let scene = scene(name.clone(), shapes, counts.domains, false)?;
-    Ok(Workload { name, scene, paired: false, species: Some(index), remarks: remarks(&printed, &counts) })
+    Ok(Workload { species: Some(index), remarks: remarks(&printed, &counts), ..Workload::new(name, scene) })
 }
 
 /// The same plant with its leaves distributed over its branches. Each leaf follows its branch by the frame that keeps

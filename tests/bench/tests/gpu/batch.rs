@@ -3,13 +3,14 @@
 use std::sync::Arc;
 
 use modalcast_bench::kernels::{
-    BatchMmaBenchmark, DeformerBenchmark, KernelBenchmark, StepOutputs, gigabytes_per_second, time,
+    BatchMmaBenchmark, BenchmarkStep, DeformerBenchmark, KernelBenchmark, StepOutputs, gigabytes_per_second, time,
 };
 use modalcast_bench::timing::CacheState;
-use modalcast_compute::gpu::{Device, KernelKind};
+use modalcast_compute::gpu::{CudaDeformerOptions, Device, KernelKind};
 use modalcast_compute::storage::bound::{ErrorBoundInput, ShapeErrorModel};
 use modalcast_compute::storage::{QUAD, TILE_QUADS, TensorCoreError, TiledModes};
-use modalcast_model::scene::{BatchPolicy, DeformationSettings, Scene, SceneState, StorageType};
+use modalcast_model::backend_settings::BatchPolicy;
+use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType};
 
 use crate::accuracy::have_equal_bits;
 use crate::ensembles::{build_scene, instanced_parts, random_states, with_storage};
@@ -102,16 +103,14 @@ fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
         us
     };
     for storage in StorageType::ALL {
-        let batched = DeformationSettings { batches: BatchPolicy::Always, ..with_storage(storage) };
-        let scene = build_scene(instanced_parts(1_500_000, 32, 1, batched));
+        let step = BenchmarkStep { batches: BatchPolicy::Always, ..BenchmarkStep::full(StepOutputs::Positions) };
+        let scene = build_scene(instanced_parts(1_500_000, 32, 1, with_storage(storage)));
         let state = scenes::random_state(&scene, 1);
-        let one = measure(
-            &DeformerBenchmark::new(&device, &scene, &[state], StepOutputs::Positions).expect("expected a benchmark"),
-        );
-        let scene = build_scene(instanced_parts(1_500_000, 32, 16, batched));
+        let one = measure(&DeformerBenchmark::new(&device, &scene, &[state], step).expect("expected a benchmark"));
+        let scene = build_scene(instanced_parts(1_500_000, 32, 16, with_storage(storage)));
         let state = scenes::random_state(&scene, 1);
-        let sixteen = DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), StepOutputs::Positions)
-            .expect("expected a benchmark");
+        let sixteen =
+            DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), step).expect("expected a benchmark");
         assert_eq!(sixteen.kernel_attributes()[0].name, "batch");
         let sixteen = measure(&sixteen);
         eprintln!("{}: {:.2} times as long as one", storage.name(), sixteen / one);
@@ -134,23 +133,18 @@ fn gpu_auto_mode_batches_where_it_is_faster() {
             if vertices * count * rank > 1 << 29 {
                 continue;
             }
-            let of = |batches| {
-                build_scene(instanced_parts(
-                    vertices,
-                    rank,
-                    count,
-                    DeformationSettings { batches, ..DeformationSettings::default() },
-                ))
-            };
-            let [together, apart, chosen] = [BatchPolicy::Always, BatchPolicy::Never, BatchPolicy::Auto].map(of);
-            let state = scenes::random_state(&together, 1);
-            let measured = |scene: &Arc<Scene>| {
-                let ours = DeformerBenchmark::new(&device, scene, std::slice::from_ref(&state), StepOutputs::Positions)
+            let scene = build_scene(instanced_parts(vertices, rank, count, DeformationSettings::default()));
+            let state = scenes::random_state(&scene, 1);
+            let measured = |batches: BatchPolicy| {
+                let step = BenchmarkStep { batches, ..BenchmarkStep::full(StepOutputs::Positions) };
+                let ours = DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), step)
                     .expect("expected a benchmark");
                 time(&device, &ours, CacheState::Warm, 100).expect("times").median_us
             };
-            let [batch, alone] = [&together, &apart].map(measured);
-            let chooses = modalcast_compute::gpu::plan(&chosen, None).kernel(KernelKind::Batch).is_some();
+            let [batch, alone] = [BatchPolicy::Always, BatchPolicy::Never].map(measured);
+            let chooses = modalcast_compute::gpu::plan(&scene, CudaDeformerOptions::default())
+                .kernel(KernelKind::Batch)
+                .is_some();
             eprintln!("n {vertices} r {rank} x {count}: {batch:.1} us batched, {alone:.1} apart, chosen {chooses}");
             let (own, other) = if chooses { (batch, alone) } else { (alone, batch) };
             if own > 1.5 * other + 2.0 {

@@ -1,6 +1,6 @@
 //! Cost of computing light-space bounds in a step.
 
-use modalcast_bench::kernels::{DeformerBenchmark, KernelBenchmark, StepOutputs, time};
+use modalcast_bench::kernels::{BenchmarkStep, DeformerBenchmark, KernelBenchmark, StepOutputs, time};
 use modalcast_bench::timing::CacheState;
 use modalcast_compute::gpu::Device;
 use modalcast_model::scene::Scene;
@@ -15,8 +15,13 @@ fn costs(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64
         parts.domains = vec![scenes::new_domain(0, 0); instances];
         parts.look.shadow = parts.look.shadow.filter(|_| is_lit);
         let scene = Scene::new(parts).expect("expected a valid scene");
-        let benchmark = DeformerBenchmark::new(&device, &scene, &[scenes::random_state(&scene, 1)], StepOutputs::Whole)
-            .expect("expected a benchmark");
+        let benchmark = DeformerBenchmark::new(
+            &device,
+            &scene,
+            &[scenes::random_state(&scene, 1)],
+            BenchmarkStep::full(StepOutputs::Whole),
+        )
+        .expect("expected a benchmark");
         benchmark
             .kernel_attributes()
             .iter()

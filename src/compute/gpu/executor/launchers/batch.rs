@@ -93,19 +93,20 @@ mod tests {
 
     use super::warp::{Tables, Warp};
     use crate::gpu::launch::KernelKind;
+    use crate::gpu::tables::device_tables::CudaDeformerOptions;
     use crate::gpu::tables::plan::{BufferRole, plan};
     use crate::gpu::tables::test_scenes::corners_match;
     use crate::gpu::tables::work::{CoordinateLayout, WorkList};
     use crate::testing::{TestRng, scene_and_state, transformed_axis};
-    use modalcast_model::scene::{BatchPolicy, DeformationSettings, Scene, SceneParts, SceneState, StorageType};
+    use modalcast_model::backend_settings::BatchPolicy;
+    use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState, StorageType};
 
     /// A scene with shapes of so many vertices and modes, each used by `instances` domains, and a random state of it.
     fn ensemble(storage: StorageType, shapes: &[(usize, usize)], instances: usize) -> (Arc<Scene>, SceneState) {
         let one = scene_and_state(&shapes.iter().map(|(vertices, rank)| (*vertices, *rank, 1)).collect::<Vec<_>>()).0;
         let mut parts = SceneParts::named("ensemble");
         (parts.shapes, parts.materials) = (one.shapes.clone(), one.materials.clone());
-        parts.deformation =
-            DeformationSettings { storage, batches: BatchPolicy::Always, ..DeformationSettings::default() };
+        parts.deformation = DeformationSettings { storage, ..DeformationSettings::default() };
         parts.domains = (0..instances * shapes.len()).map(|at| one.domains[at % shapes.len()].clone()).collect();
         let scene = Scene::new(parts).expect("a scene");
         let (mut random, mut state) = (TestRng(instances as u64), SceneState::rest(&scene));
@@ -194,7 +195,7 @@ mod tests {
     #[test]
     fn groups_are_as_large_as_each_other_and_side_by_side_in_each_tile() {
         let (scene, _) = ensemble(StorageType::F32, &[(261, 12)], 40);
-        let work = WorkList::new(&scene, &CoordinateLayout::new(&scene));
+        let work = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::Always);
         let sizes: Vec<u32> = work.batched.groups.iter().map(|group| group.members).collect();
         assert_eq!(sizes, [14, 14, 12]);
         let blocks: Vec<(u32, u32)> = work.batched.blocks.iter().map(|block| (block.tile, block.group)).collect();
@@ -211,7 +212,7 @@ mod tests {
     #[test]
     fn blocks_of_large_scenes_have_runs_of_tiles_that_cover_each_shape_once() {
         let (scene, _) = ensemble(StorageType::F32, &[(128 * 6001, 1), (128 * 3000, 1)], 2);
-        let batched = WorkList::new(&scene, &CoordinateLayout::new(&scene)).batched;
+        let batched = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::Always).batched;
         assert!(batched.blocks.iter().all(|block| (1..=2).contains(&(block.end - block.tile))), "9001 tiles");
         for (group, tiles) in [6001, 3000].into_iter().enumerate() {
             let own = batched.blocks.iter().filter(|block| block.group == group as u32);
@@ -223,14 +224,15 @@ mod tests {
     #[test]
     fn a_scene_compiles_batches_when_it_has_any_and_for_as_many_vectors_as_it_needs() {
         let defines = |instances: usize| {
-            let plan = plan(&ensemble(StorageType::F16, &[(261, 12)], instances).0, None);
+            let options = CudaDeformerOptions { batches: BatchPolicy::Always, ..CudaDeformerOptions::default() };
+            let plan = plan(&ensemble(StorageType::F16, &[(261, 12)], instances).0, options);
             let kernel = plan.kernel(KernelKind::Batch).expect("a batch").clone();
             (kernel.defines.join(" "), kernel.blocks)
         };
         assert_eq!(defines(2), ("STORE_F16 BATCH_4".into(), 3));
         assert_eq!(defines(8), ("STORE_F16 BATCH_8".into(), 3));
         assert_eq!(defines(17), ("STORE_F16".into(), 6));
-        let none = plan(&corners_match(&[(261, 12)]), None);
+        let none = plan(&corners_match(&[(261, 12)]), CudaDeformerOptions::default());
         assert!(none.kernel(KernelKind::Batch).is_none(), "too few to pay");
         assert_eq!(none.bytes(BufferRole::Batches), 0);
     }

@@ -5,11 +5,12 @@ use super::super::rings::RingTables;
 use super::super::test_scenes::{deformed, exact, kept, on_the_first, scene, stored, unlit};
 use super::super::work::{CoordinateLayout, WorkList};
 use super::*;
+use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::scene::{DeformationSettings, StorageType};
 
 /// The plan for a deformer that bounds the positions along the axes of the scene's shadow, if it has one.
 fn plan(scene: &Scene) -> DeformPlan {
-    super::plan(scene, scene.light_axes())
+    super::plan(scene, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))
 }
 
 fn defines(plan: &DeformPlan) -> Vec<(&str, Vec<&str>)> {
@@ -88,7 +89,7 @@ fn exact_normals_come_behind_the_positions_and_their_tables_are_planned() {
         assert_eq!(plan.bytes(role), bytes as u64, "{role:?}");
     }
     assert_eq!(plan.bytes(BufferRole::CornerGroups), 4 * (9 + 515), "the shape without modes has no groups");
-    let rigid = super::plan(&stored(&[(7, 2), (300, 0), (513, 4)], StorageType::F32), None);
+    let rigid = super::plan(&stored(&[(7, 2), (300, 0), (513, 4)], StorageType::F32), CudaDeformerOptions::default());
     assert_eq!(
         rigid.bytes(BufferRole::CornerGroups)
             + rigid.bytes(BufferRole::RingTables)
@@ -156,7 +157,7 @@ fn a_scene_whose_steps_are_always_whole_plans_nothing_for_lists() {
 fn planned_bytes_are_those_of_the_tables() {
     let scene = scene(&[(7, 2), (300, 0), (513, 4)], true, false);
     let plan = plan(&scene);
-    let work = WorkList::new(&scene, &CoordinateLayout::new(&scene));
+    let work = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::default());
     for (role, bytes) in [
         (BufferRole::WarpTiles, size_of_val(work.tiles.as_slice()) + 4 * work.tiles.len()),
         (BufferRole::MixedQuads, size_of_val(work.mixed_quads.as_slice())),

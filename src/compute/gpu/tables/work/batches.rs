@@ -3,7 +3,8 @@
 use super::super::layout::{BatchBlock, BatchGroup, BatchMember};
 use super::{CoordinateLayout, WorkList, chunks_of, quads_of};
 use crate::storage::TILE_QUADS;
-use modalcast_model::scene::{BatchPolicy, Scene};
+use modalcast_model::backend_settings::BatchPolicy;
+use modalcast_model::scene::Scene;
 
 /// Maximum number of domains of a group.
 pub(crate) const MAX_BATCH_SIZE: usize = 16;
@@ -34,7 +35,7 @@ pub(crate) struct BatchTables {
 }
 
 /// Per shape, whether its domains are deformed in batches.
-pub(crate) fn shapes(scene: &Scene) -> Vec<bool> {
+pub(crate) fn shapes(scene: &Scene, policy: BatchPolicy) -> Vec<bool> {
     let needs = scene.needs;
     // `batch` neither truncates nor compensates its sums, and writes no displacements.
     let never = needs.truncation || needs.compensated || needs.displacements;
@@ -44,7 +45,7 @@ pub(crate) fn shapes(scene: &Scene) -> Vec<bool> {
         let of = &scene.shapes[shape];
         let bytes = (48 * quads_of(of) * chunks_of(scene, of)) as u64;
         let pays = bytes >= MIN_SHAPE_BYTES || users as u64 * bytes >= MIN_READ_BYTES;
-        match scene.deformation.batches {
+        match policy {
             BatchPolicy::Never => false,
             BatchPolicy::Auto => users > 1 && pays,
             BatchPolicy::Always => users > 1,

@@ -20,6 +20,7 @@ pub(crate) use quads::{Quads, rest_directions, rest_positions};
 
 use super::layout::{MixedQuad, TILE_CORNERS, TILE_VERTICES, WarpTile};
 use crate::storage::{PackedWord, TILE_QUADS, TiledModes, modes_per_chunk};
+use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::domain::Shape;
 use modalcast_model::scene::{Scene, StorageType};
 
@@ -92,8 +93,8 @@ enum PendingTile {
 }
 
 impl WorkList {
-    pub(crate) fn new(scene: &Scene, coordinates: &CoordinateLayout) -> Self {
-        let batched = batches::shapes(scene);
+    pub(crate) fn new(scene: &Scene, coordinates: &CoordinateLayout, policy: BatchPolicy) -> Self {
+        let batched = batches::shapes(scene, policy);
         let corners_match = scene
             .shapes
             .iter()

@@ -81,7 +81,7 @@ fn check_corners(scene: &Scene, work: &WorkList) {
 /// Walks the work list as the kernel does and checks that every vertex finds its x0, its entries and its q.
 fn check(scene: &Arc<Scene>) -> WorkList {
     let coordinates = CoordinateLayout::new(scene);
-    let work = WorkList::new(scene, &coordinates);
+    let work = WorkList::new(scene, &coordinates, BatchPolicy::default());
     let loaded = load(scene, &work);
     assert_eq!(loaded.words.len() as u64, work.words);
     let per_chunk = modes_per_chunk(scene.deformation.storage);

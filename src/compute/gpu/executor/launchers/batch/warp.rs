@@ -10,6 +10,7 @@ use crate::gpu::tables::work::batches::MAX_BATCH_SIZE;
 use crate::gpu::tables::work::tests::{Loaded, load};
 use crate::gpu::tables::work::{CoordinateLayout, WorkList};
 use crate::storage::{PackedWord, TILE_QUADS, modes_per_chunk};
+use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
 
 /// Quads and vertices of a warp, 16-byte words of a stage, and stages of its ring.
@@ -32,7 +33,7 @@ pub(super) struct Tables {
 impl Tables {
     pub(super) fn of(scene: &Arc<Scene>, state: &SceneState) -> Self {
         let coordinates = CoordinateLayout::new(scene);
-        let work = WorkList::new(scene, &coordinates);
+        let work = WorkList::new(scene, &coordinates, BatchPolicy::Always);
         let loaded = load(scene, &work);
         let mut q = vec![f32::NAN; coordinates.total];
         let packing = InputPacker { factors: loaded.factors.clone(), ..InputPacker::sizes_only(scene) };
