@@ -21,11 +21,11 @@ struct Cli {
     #[arg(long)]
     build: bool,
     #[command(subcommand)]
-    what: Option<What>,
+    report: Option<ReportCommand>,
 }
 
 #[derive(Debug, Subcommand)]
-enum What {
+enum ReportCommand {
     Deform(DeformArgs),
     Render(render::Args),
 }
@@ -95,9 +95,9 @@ pub fn run() -> u8 {
         return 0;
     }
     modalcast::telemetry::init_logging();
-    finish(match &cli.what {
-        Some(What::Deform(args)) => run_deform(args),
-        Some(What::Render(args)) => render::run(args),
+    finish(match &cli.report {
+        Some(ReportCommand::Deform(args)) => run_deform(args),
+        Some(ReportCommand::Render(args)) => render::run(args),
         None => {
             Cli::command().print_help().ok(); // A closed stdout is no error.
             return 2;
@@ -106,21 +106,21 @@ pub fn run() -> u8 {
 }
 
 fn run_deform(args: &DeformArgs) -> Outcome {
-    let request = request(args)?;
-    let hear = |told: Progress<'_>| match told {
+    let options = report_options(args)?;
+    let on_progress = |progress: Progress<'_>| match progress {
         Progress::Started(what) => {
             tracing::info!(load = what, "measuring");
             Ok(())
         }
         Progress::Measured(report) => report.write(&args.out),
     };
-    let report = with_spinner("measuring", || deform(&request, &LocalMachine::open(), hear))?;
-    lines(&report).into_iter().for_each(print_line);
+    let report = with_spinner("measuring", || deform(&options, &LocalMachine::open(), on_progress))?;
+    format_rows(&report).into_iter().for_each(print_line);
     print_line(format!("written to {}", args.out.display()));
     Ok(report.passed())
 }
 
-fn request(args: &DeformArgs) -> Result<DeformReportOptions> {
+fn report_options(args: &DeformArgs) -> Result<DeformReportOptions> {
     let mut sources = Vec::new();
     if let Some(source) = &args.scene {
         sources.push(WorkloadSource::Scene { source: source.clone(), record: args.trajectory.clone() });
@@ -132,7 +132,7 @@ fn request(args: &DeformArgs) -> Result<DeformReportOptions> {
         sources.extend(WorkloadKind::all().into_iter().map(WorkloadSource::Synthetic));
     }
     let (seeds, replays, size) = if args.quick { (10, 20, Size::Quick) } else { (100, 100, Size::Full) };
-    let number = |given: Option<u32>, usual: usize| given.map_or(usual, |given| given as usize);
+    let number = |option: Option<u32>, default: usize| option.map_or(default, |number| number as usize);
     Ok(DeformReportOptions {
         sources,
         seeds: number(args.seeds, seeds),
@@ -143,26 +143,26 @@ fn request(args: &DeformArgs) -> Result<DeformReportOptions> {
     })
 }
 
-fn lines(report: &DeformReport) -> Vec<String> {
+fn format_rows(report: &DeformReport) -> Vec<String> {
     let mut lines = report.remarks.clone();
     lines.push(format!(
         "{:<16}{:<24}{:<6}{:>14}{:>10}{:>16}{:>12}{:>10}",
         "load", "variant", "cache", "median us", "GB/s", "largest m", "of bound", "passed"
     ));
     for row in &report.rows {
-        let show =
+        let format_number =
             |number: Option<f64>, digits: usize| number.map_or("-".into(), |number| format!("{number:.digits$}"));
-        let errors = row.found.as_ref().map(|found| found.errors);
+        let errors = row.validation.as_ref().map(|validation| validation.errors);
         lines.push(format!(
             "{:<16}{:<24}{:<6}{:>14}{:>10}{:>16}{:>12}{:>10}",
             row.load,
             row.name,
             row.cache.name(),
-            show(row.timing.map(|timing| timing.median_us), 2),
-            show(row.gbs, 2),
+            format_number(row.timing.map(|timing| timing.median_us), 2),
+            format_number(row.gbs, 2),
             errors.map_or("-".into(), |errors| format!("{:.3e}", errors.meters.largest)),
-            show(errors.map(|errors| errors.of_bound), 4),
-            match (row.passed, row.left_out) {
+            format_number(errors.map(|errors| errors.of_bound), 4),
+            match (row.passed, row.is_skipped) {
                 (true, _) => "yes",
                 (false, true) => "left out",
                 (false, false) => "NO",
@@ -194,20 +194,20 @@ mod tests {
 
     #[test]
     fn defaults_to_all_loads_and_quick_to_fewer_states() {
-        let all = request(&args()).expect("fits");
+        let all = report_options(&args()).expect("valid arguments");
         assert_eq!(
             (all.sources.len(), all.seeds, all.replays, all.size),
             (WorkloadKind::all().len(), 100, 100, Size::Full)
         );
-        let quick = request(&DeformArgs { quick: true, seeds: Some(3), ..args() }).expect("fits");
+        let quick = report_options(&DeformArgs { quick: true, seeds: Some(3), ..args() }).expect("valid arguments");
         assert_eq!((quick.seeds, quick.replays, quick.size), (3, 20, Size::Quick));
     }
 
     #[test]
     fn combines_scene_and_loads_and_rejects_unknown_load() {
         let both = DeformArgs { scene: Some("tree".into()), loads: vec!["plants".into(), "c".into()], ..args() };
-        assert_eq!(request(&both).expect("fits").sources.len(), 14);
-        let wrong = request(&DeformArgs { loads: vec!["d".into()], ..args() }).expect_err("no such load");
+        assert_eq!(report_options(&both).expect("valid arguments").sources.len(), 14);
+        let wrong = report_options(&DeformArgs { loads: vec!["d".into()], ..args() }).expect_err("no such load");
         assert!(wrong.to_string().starts_with("load: expected single-P-R"), "{wrong}");
     }
 }

@@ -179,7 +179,12 @@ fn batch_variants(
             let scene = cache.scene(deformation)?;
             let create: BenchmarkFactory =
                 Box::new(|device, scene, states| Ok(Box::new(BatchMmaBenchmark::new(device, scene, states)?)));
-            Ok(BenchmarkVariant::sharing(label, &scene, device, (cache.error_model(&scene).with_products(), create)))
+            Ok(BenchmarkVariant::sharing(
+                label,
+                &scene,
+                device,
+                (cache.error_model(&scene).with_tensor_cores(), create),
+            ))
         })
     };
     let deformer_variants = StorageType::ALL.into_iter().map(batched).chain([unbatched]);

@@ -20,20 +20,24 @@ const TILE: usize = QUAD * TILE_QUADS;
 #[derive(Debug)]
 pub struct ErrorModel {
     scene: Arc<Scene>,
-    /// Stored U per shape; empty when U is stored in f32.
-    stored: Arc<Vec<Stored>>,
+    /// StoredShape U per shape; empty when U is stored in f32.
+    stored: Arc<Vec<StoredShape>>,
     truncation: Option<TruncationState>,
     /// Whether tensor cores multiply, in which case each coordinate is split into two 16-bit numbers.
-    halves: bool,
+    uses_tensor_cores: bool,
 }
 
-/// Stored U of one shape, and the data that its error bounds need.
-type Stored = (TiledModes, ShapeErrorModel);
+/// StoredShape U of one shape, and the data that its error bounds need.
+#[derive(Debug)]
+struct StoredShape {
+    tiles: TiledModes,
+    error_model: ShapeErrorModel,
+}
 
 #[derive(Debug)]
 struct TruncationState {
     /// Error budget, scene units.
-    most: f64,
+    budget: f64,
     /// Per shape and mode: the farthest that a unit coordinate moves a vertex.
     max_row_norms: Vec<Vec<f64>>,
     /// Truncation state per domain.
@@ -43,22 +47,22 @@ struct TruncationState {
 impl ErrorModel {
     /// The error model of a deformer that follows this scene's deformation.
     pub fn of(scene: &Arc<Scene>) -> Self {
-        Self::with(scene, Arc::new(store(scene)))
+        Self::with(scene, Arc::new(store_shapes(scene)))
     }
 
-    fn with(scene: &Arc<Scene>, stored: Arc<Vec<Stored>>) -> Self {
+    fn with(scene: &Arc<Scene>, stored: Arc<Vec<StoredShape>>) -> Self {
         let truncation =
             scene.deformation.truncation.filter(|_| scene.needs.truncation).map(|meters| TruncationState {
-                most: meters / scene.unit,
+                budget: meters / scene.unit,
                 max_row_norms: scene.shapes.par_iter().map(|shape| max_row_norms(&shape.modes)).collect(),
                 domains: (0..scene.domains.len()).map(|domain| Truncation::new(scene.rank_of(domain))).collect(),
             });
-        Self { scene: Arc::clone(scene), stored, truncation, halves: false }
+        Self { scene: Arc::clone(scene), stored, truncation, uses_tensor_cores: false }
     }
 
     /// The same for sums by tensor cores. U must be stored in 16 bits.
-    pub fn with_products(self) -> Self {
-        Self { halves: true, ..self }
+    pub fn with_tensor_cores(self) -> Self {
+        Self { uses_tensor_cores: true, ..self }
     }
 
     /// Whether nothing is replaced. All such deformers share their bounds.
@@ -86,18 +90,18 @@ impl ErrorModel {
     /// Advances truncation to a state: decides which modes are left out, given the previous states, as a deformer does.
     pub fn follow(&mut self, state: &SceneState) {
         let Self { scene, truncation, .. } = self;
-        if let Some(TruncationState { most, max_row_norms, domains }) = truncation {
+        if let Some(TruncationState { budget, max_row_norms, domains }) = truncation {
             domains.par_iter_mut().enumerate().with_min_len(64).for_each(|(domain, truncation)| {
                 let max_row_norms = &max_row_norms[scene.domains[domain].shape];
                 let norm = norm(&state.composed_transform(scene, domain));
-                truncation.update(TruncationInput { q: state.q_of(scene, domain), max_row_norms, norm }, *most);
+                truncation.update(TruncationInput { q: state.q_of(scene, domain), max_row_norms, norm }, *budget);
             });
         }
     }
 
-    /// Stored U of a shape; `None` when it is stored in f32.
+    /// StoredShape U of a shape; `None` when it is stored in f32.
     pub(super) fn tiles(&self, shape: usize) -> Option<&TiledModes> {
-        self.stored.get(shape).map(|(tiles, _)| tiles)
+        self.stored.get(shape).map(|stored| &stored.tiles)
     }
 
     /// Zeroes the coordinates of a domain's truncated modes.
@@ -114,7 +118,7 @@ impl ErrorModel {
         let mut q = state.q_of(&self.scene, domain).to_vec();
         self.truncate(domain, &mut q);
         let truncation = self.truncation.as_ref().map_or(0.0, |budget| budget.domains[domain].bound());
-        let error_model = self.stored.get(self.scene.domains[domain].shape).map(|(_, error_model)| error_model);
+        let error_model = self.stored.get(self.scene.domains[domain].shape).map(|stored| &stored.error_model);
         DomainErrorBounds {
             error_model,
             q,
@@ -122,43 +126,43 @@ impl ErrorModel {
             compensated: self.scene.deformation.compensated,
             truncation,
             products: self
-                .halves
+                .uses_tensor_cores
                 .then(|| TensorCoreError::of(self.scene.deformation.storage, self.scene.rank_of(domain))),
         }
     }
 
     /// The packed coordinates as tensor cores read them, rounded to a pair of 16-bit numbers each; `None` when they are
     /// read in f32.
-    pub(super) fn halved(&self, q: &[f64]) -> Option<Vec<f64>> {
-        let own = |(domain, slot): (usize, &DomainLayout)| -> Vec<f64> {
-            let factors = self.stored[self.scene.domains[domain].shape].0.factors();
-            let amounts = q[slot.first_q..][..slot.rank].iter().zip(factors).map(|(q, factor)| *q as f32 * factor);
-            let halves = SplitCoordinates::new(&amounts.collect::<Vec<_>>(), self.scene.deformation.storage);
+    pub(super) fn split_q(&self, q: &[f64]) -> Option<Vec<f64>> {
+        let split_domain = |(domain, slot): (usize, &DomainLayout)| -> Vec<f64> {
+            let factors = self.stored[self.scene.domains[domain].shape].tiles.factors();
+            let scaled_q = q[slot.first_q..][..slot.rank].iter().zip(factors).map(|(q, factor)| *q as f32 * factor);
+            let split = SplitCoordinates::new(&scaled_q.collect::<Vec<_>>(), self.scene.deformation.storage);
             factors
                 .iter()
                 .enumerate()
-                .map(|(mode, factor)| halves.decode_coordinate(mode) / f64::from(*factor))
+                .map(|(mode, factor)| split.decode_coordinate(mode) / f64::from(*factor))
                 .collect()
         };
-        let mut halved = q.to_vec();
-        for (domain, slot) in self.scene.layout.slots.iter().enumerate().filter(|_| self.halves) {
-            halved[slot.first_q..][..slot.rank].copy_from_slice(&own((domain, slot)));
+        let mut rounded_q = q.to_vec();
+        for (domain, slot) in self.scene.layout.slots.iter().enumerate().filter(|_| self.uses_tensor_cores) {
+            rounded_q[slot.first_q..][..slot.rank].copy_from_slice(&split_domain((domain, slot)));
         }
-        self.halves.then_some(halved)
+        self.uses_tensor_cores.then_some(rounded_q)
     }
 }
 
 /// The shapes of a scene in its storage type; empty for f32.
-fn store(scene: &Scene) -> Vec<Stored> {
+fn store_shapes(scene: &Scene) -> Vec<StoredShape> {
     let storage = scene.deformation.storage;
-    let one = |shape| {
+    let store_shape = |shape| {
         let tiles = TiledModes::new(shape, storage);
         let error_model = ShapeErrorModel::new(shape, &tiles);
-        (tiles, error_model)
+        StoredShape { tiles, error_model }
     };
     match storage {
         StorageType::F32 => Vec::new(),
-        _ => scene.shapes.par_iter().map(one).collect(),
+        _ => scene.shapes.par_iter().map(store_shape).collect(),
     }
 }
 
@@ -168,7 +172,7 @@ fn store(scene: &Scene) -> Vec<Stored> {
 pub struct ErrorModelCache {
     scene: Arc<Scene>,
     scenes: Mutex<Vec<(DeformationSettings, Arc<Scene>)>>,
-    stored: Mutex<Vec<(StorageType, Arc<Vec<Stored>>)>>,
+    stored: Mutex<Vec<(StorageType, Arc<Vec<StoredShape>>)>>,
 }
 
 impl ErrorModelCache {
@@ -184,23 +188,23 @@ impl ErrorModelCache {
     /// `Invalid` when the deformation's options contradict each other.
     pub fn scene(&self, deformation: DeformationSettings) -> Result<Arc<Scene>> {
         let mut scenes = self.scenes.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, known)) = scenes.iter().find(|(known, _)| *known == deformation) {
-            return Ok(Arc::clone(known));
+        if let Some((_, scene)) = scenes.iter().find(|(cached, _)| *cached == deformation) {
+            return Ok(Arc::clone(scene));
         }
-        let made = with_deformation(&self.scene, deformation)?;
-        scenes.push((deformation, Arc::clone(&made)));
-        Ok(made)
+        let scene = with_deformation(&self.scene, deformation)?;
+        scenes.push((deformation, Arc::clone(&scene)));
+        Ok(scene)
     }
 
     /// The error model of a deformer of one of these scenes.
     pub fn error_model(&self, scene: &Arc<Scene>) -> ErrorModel {
         let storage = scene.deformation.storage;
-        let mut known = self.stored.lock().unwrap_or_else(PoisonError::into_inner);
-        let own = known.iter().find(|(known, _)| *known == storage).map(|(_, stored)| Arc::clone(stored));
-        let stored = own.unwrap_or_else(|| {
-            let made = Arc::new(store(scene));
-            known.push((storage, Arc::clone(&made)));
-            made
+        let mut cached = self.stored.lock().unwrap_or_else(PoisonError::into_inner);
+        let found = cached.iter().find(|(cached, _)| *cached == storage).map(|(_, stored)| Arc::clone(stored));
+        let stored = found.unwrap_or_else(|| {
+            let stored = Arc::new(store_shapes(scene));
+            cached.push((storage, Arc::clone(&stored)));
+            stored
         });
         ErrorModel::with(scene, stored)
     }
@@ -217,23 +221,25 @@ pub(super) struct DomainErrorBounds<'a> {
 }
 
 impl DomainErrorBounds<'_> {
-    /// Widens the bounds of consecutive vertices, from vertex `first` of the shape. On entry they hold `arithmetic`,
-    /// the bound of a sum of all modes in f32.
-    pub(super) fn widen<'b>(&self, first: usize, arithmetic: impl Iterator<Item = &'b mut f64>) {
+    /// Widens the bounds of consecutive vertices, from vertex `first` of the shape. On entry, `arithmetic` holds the
+    /// bounds of a sum of all modes in f32.
+    pub(super) fn widen_bounds<'b>(&self, first: usize, arithmetic: impl Iterator<Item = &'b mut f64>) {
         let step = ErrorBoundInput { q: &self.q, transform: self.transform, compensated: self.compensated };
-        let mut known: Option<(usize, ErrorBound, f64)> = None;
+        // Tile, its bounds, and the bound of its tensor core products.
+        let mut cached: Option<(usize, ErrorBound, f64)> = None;
         for (vertex, bound) in arithmetic.enumerate() {
             if let Some(error_model) = self.error_model {
                 let tile = (first + vertex) / TILE;
-                let look = || {
+                let evaluate_tile = || {
                     let products = self.products.map_or(0.0, |products| error_model.products(tile, &step, products));
                     (tile, error_model.tile(tile, &step), products)
                 };
-                let (_, own, products) = known.filter(|(at, ..)| *at == tile).unwrap_or_else(look);
-                known = Some((tile, own, products));
-                // Stored entries differ from U, so sums of them may be larger and round correspondingly more.
-                let stored = (own.storage + own.coordinates) * (1.0 + 1e-4);
-                *bound = (*bound + stored).min(own.total()) + products;
+                let (_, tile_bound, products) =
+                    cached.filter(|(cached_tile, ..)| *cached_tile == tile).unwrap_or_else(evaluate_tile);
+                cached = Some((tile, tile_bound, products));
+                // StoredShape entries differ from U, so sums of them may be larger and round correspondingly more.
+                let stored = (tile_bound.storage + tile_bound.coordinates) * (1.0 + 1e-4);
+                *bound = (*bound + stored).min(tile_bound.total()) + products;
             }
             *bound += self.truncation;
         }
@@ -247,8 +253,8 @@ mod tests {
     use crate::workloads::{Size, WorkloadKind};
 
     fn model_and_state(deformation: DeformationSettings) -> (ErrorModel, SceneState) {
-        let load = WorkloadKind::Single { power: 8, rank: 20 }.build(Size::Full).expect("built");
-        let scene = with_deformation(&load.scene, deformation).expect("restated");
+        let load = WorkloadKind::Single { power: 8, rank: 20 }.build(Size::Full).expect("expected a load");
+        let scene = with_deformation(&load.scene, deformation).expect("expected a scene");
         (ErrorModel::of(&scene), WorkloadMotion::new(&load, None).seed(0).state())
     }
 
@@ -257,19 +263,19 @@ mod tests {
         let (exact, state) = model_and_state(DeformationSettings::default());
         assert!(exact.is_exact() && exact.tiles(0).is_none());
         let mut bounds = [1.0, 2.0];
-        exact.bounds(0, &state).widen(0, bounds.iter_mut());
+        exact.bounds(0, &state).widen_bounds(0, bounds.iter_mut());
         assert_eq!(bounds, [1.0, 2.0]);
     }
 
     #[test]
     fn variants_share_stored_u_by_storage_type() {
-        let load = WorkloadKind::Single { power: 8, rank: 4 }.build(Size::Full).expect("built");
+        let load = WorkloadKind::Single { power: 8, rank: 4 }.build(Size::Full).expect("expected a load");
         let cache = ErrorModelCache::new(&load.scene);
         let half = DeformationSettings { storage: StorageType::F16, ..DeformationSettings::default() };
-        let [one, two] = [half, half].map(|half| cache.scene(half).expect("restated"));
+        let [one, two] = [half, half].map(|half| cache.scene(half).expect("expected a scene"));
         assert!(Arc::ptr_eq(&one, &two) && !Arc::ptr_eq(&one, &load.scene));
-        assert!(Arc::ptr_eq(&cache.scene(load.scene.deformation).expect("its own"), &load.scene));
-        let short = cache.scene(DeformationSettings { truncation: Some(0.01), ..half }).expect("restated");
+        assert!(Arc::ptr_eq(&cache.scene(load.scene.deformation).expect("expected the cached scene"), &load.scene));
+        let short = cache.scene(DeformationSettings { truncation: Some(0.01), ..half }).expect("expected a scene");
         let made = [&one, &short].map(|scene| cache.error_model(scene));
         assert!(Arc::ptr_eq(&made[0].stored, &made[1].stored) && made[0].stores());
         assert!(made[1].truncates() && !made[0].truncates());
@@ -282,7 +288,7 @@ mod tests {
             let (stored, state) = model_and_state(DeformationSettings { storage, ..DeformationSettings::default() });
             assert!(!stored.is_exact() && stored.tiles(0).is_some());
             let mut bounds = [1e-6; 256];
-            stored.bounds(0, &state).widen(0, bounds.iter_mut());
+            stored.bounds(0, &state).widen_bounds(0, bounds.iter_mut());
             bounds[200]
         };
         let [half, brain, eighth] = [StorageType::F16, StorageType::Bf16, StorageType::Int8].map(widened);
@@ -295,22 +301,22 @@ mod tests {
             model_and_state(DeformationSettings { storage: StorageType::Bf16, ..DeformationSettings::default() });
         let widened = |error_model: &ErrorModel| {
             let mut bounds = [1e-6];
-            error_model.bounds(0, &state).widen(0, bounds.iter_mut());
+            error_model.bounds(0, &state).widen_bounds(0, bounds.iter_mut());
             bounds[0]
         };
         let q: Vec<f64> = state.q.iter().map(|q| f64::from(*q)).collect();
         let before = widened(&stored);
-        assert_eq!(stored.halved(&q), None);
-        let products = stored.with_products();
+        assert_eq!(stored.split_q(&q), None);
+        let products = stored.with_tensor_cores();
         let after = widened(&products);
         assert!(before < after && after < 1.1 * before, "{before} {after}");
-        let halved = products.halved(&q).expect("halves");
+        let rounded_q = products.split_q(&q).expect("expected rounded coordinates");
         let largest = q.iter().fold(0.0, |largest: f64, q| largest.max(q.abs()));
         let off = |of_own: f64| {
             let off = |(half, q): (&f64, &f64)| (half - q).abs() <= of_own * q.abs() + 1e-9 * largest;
-            halved.iter().zip(&q).all(off)
+            rounded_q.iter().zip(&q).all(off)
         };
-        assert!(off(2f64.powi(-16)) && !off(2f64.powi(-24)), "{halved:?} {q:?}");
+        assert!(off(2f64.powi(-16)) && !off(2f64.powi(-24)), "{rounded_q:?} {q:?}");
     }
 
     #[test]
@@ -326,7 +332,7 @@ mod tests {
         truncated.follow(&state);
         assert!((1..20).contains(&count(&truncated)), "{}", count(&truncated));
         let mut bounds = [0.0];
-        truncated.bounds(0, &state).widen(0, bounds.iter_mut());
+        truncated.bounds(0, &state).widen_bounds(0, bounds.iter_mut());
         assert!(bounds[0] > 0.0 && bounds[0] <= 0.01, "{bounds:?}");
     }
 }

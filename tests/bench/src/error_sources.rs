@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::error_model::ErrorModel;
-use super::errors::{ErrorNorms, NormAccumulator, in_pieces};
+use super::errors::{ErrorNorms, NormAccumulator, reduce_parallel};
 use super::exact_positions::{ErrorModelTerms, positions};
 use super::exact_state::ExactState;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
@@ -38,12 +38,14 @@ pub(super) struct ErrorSourcesAccumulator([NormAccumulator; 6]);
 #[derive(Debug)]
 pub(super) struct SharedErrorSources {
     truth: ExactState,
-    given: ExactState,
+    /// The truth rounded to f32.
+    rounded: ExactState,
+    /// Positions of the truth.
     exact: Vec<[f64; 3]>,
     q: NormAccumulator,
     transform: NormAccumulator,
     /// Positions with q and T rounded to f32, U exact and all modes.
-    plain: Vec<[f64; 3]>,
+    rounded_positions: Vec<[f64; 3]>,
     /// Per storage type that a variant has requested so far.
     stored: Mutex<Vec<(StorageType, Arc<StorageError>)>>,
 }
@@ -51,70 +53,82 @@ pub(super) struct SharedErrorSources {
 /// Positions that variants of one storage type without truncation share.
 #[derive(Debug)]
 struct StorageError {
-    alone: NormAccumulator,
-    /// Positions with q and T rounded to f32.
-    own: Vec<[f64; 3]>,
+    /// Error of the storage alone.
+    norms: NormAccumulator,
+    /// Positions with q and T rounded to f32 and U as stored.
+    positions: Vec<[f64; 3]>,
 }
 
 impl SharedErrorSources {
     /// Evaluates a truth and its rounding to f32 in f64.
     pub(super) fn new(scene: &Scene, truth: ExactState, state: &SceneState) -> Self {
-        let given = ExactState::of(state);
-        let at = |q: &[f64], transforms: &[[f64; 12]]| {
+        let rounded = ExactState::of(state);
+        let positions_of = |q: &[f64], transforms: &[[f64; 12]]| {
             positions(scene, &ExactState { q: q.to_vec(), transforms: transforms.to_vec() }, ErrorModelTerms::default())
         };
-        let exact = at(&truth.q, &truth.transforms);
-        let q = apart(&exact, &at(&given.q, &truth.transforms));
-        let transform = apart(&exact, &at(&truth.q, &given.transforms));
-        let plain = at(&given.q, &given.transforms);
-        Self { truth, given, exact, q, transform, plain, stored: Mutex::default() }
+        let exact = positions_of(&truth.q, &truth.transforms);
+        let q = distances(&exact, &positions_of(&rounded.q, &truth.transforms));
+        let transform = distances(&exact, &positions_of(&truth.q, &rounded.transforms));
+        let rounded_positions = positions_of(&rounded.q, &rounded.transforms);
+        Self { truth, rounded, exact, q, transform, rounded_positions, stored: Mutex::default() }
     }
 
-    fn stored(&self, scene: &Scene, error_model: &ErrorModel) -> Arc<StorageError> {
-        let (storage, mut known) =
+    fn storage_error(&self, scene: &Scene, error_model: &ErrorModel) -> Arc<StorageError> {
+        let (storage, mut cached) =
             (scene.deformation.storage, self.stored.lock().unwrap_or_else(PoisonError::into_inner));
-        if let Some((_, stored)) = known.iter().find(|(known, _)| *known == storage) {
+        if let Some((_, stored)) = cached.iter().find(|(cached, _)| *cached == storage) {
             return Arc::clone(stored);
         }
-        let take = ErrorModelTerms { storage: Some(error_model), truncation: None };
-        let alone = apart(&self.exact, &positions(scene, &self.truth, take));
-        let stored = Arc::new(StorageError { alone, own: positions(scene, &self.given, take) });
-        known.push((storage, Arc::clone(&stored)));
+        let terms = ErrorModelTerms { storage: Some(error_model), truncation: None };
+        let norms = distances(&self.exact, &positions(scene, &self.truth, terms));
+        let stored = Arc::new(StorageError { norms, positions: positions(scene, &self.rounded, terms) });
+        cached.push((storage, Arc::clone(&stored)));
         stored
     }
 
     /// Adds the sources of a variant's error at this truth. `got`: its positions, three f32 per vertex.
-    pub(super) fn split(
+    pub(super) fn add_sources(
         &self,
         scene: &Scene,
         error_model: &ErrorModel,
         got: &[f32],
-        split: &mut ErrorSourcesAccumulator,
+        accumulator: &mut ErrorSourcesAccumulator,
     ) {
         let storage = Some(error_model).filter(|error_model| error_model.stores());
         let truncation = Some(error_model).filter(|error_model| error_model.truncates());
-        let stored = storage.map(|error_model| self.stored(scene, error_model));
+        let stored = storage.map(|error_model| self.storage_error(scene, error_model));
         // Every source counts all vertices, even if it moves none of them.
-        let none = apart(&self.exact, &self.exact);
-        let from_storage = stored.as_ref().map_or(none, |stored| stored.alone);
+        let zero = distances(&self.exact, &self.exact);
+        let from_storage = stored.as_ref().map_or(zero, |stored| stored.norms);
         // Truncation was decided from the rounded q; applying it to the unrounded q hardly changes the displacement.
-        let cut = ErrorModelTerms { storage: None, truncation };
-        let from_truncation = truncation.map_or(none, |_| apart(&self.exact, &positions(scene, &self.truth, cut)));
-        let halved = error_model.halved(&self.given.q);
-        let with = |q: &[f64], transforms: &[[f64; 12]], take: ErrorModelTerms<'_>| {
-            positions(scene, &ExactState { q: q.to_vec(), transforms: transforms.to_vec() }, take)
+        let truncated = ErrorModelTerms { storage: None, truncation };
+        let from_truncation =
+            truncation.map_or(zero, |_| distances(&self.exact, &positions(scene, &self.truth, truncated)));
+        let split_q = error_model.split_q(&self.rounded.q);
+        let positions_of = |q: &[f64], transforms: &[[f64; 12]], terms: ErrorModelTerms<'_>| {
+            positions(scene, &ExactState { q: q.to_vec(), transforms: transforms.to_vec() }, terms)
         };
-        let exact_but = |q: &Vec<f64>| apart(&self.exact, &with(q, &self.truth.transforms, ErrorModelTerms::default()));
-        let from_q = halved.as_ref().map_or(self.q, exact_but);
-        let q = halved.as_ref().unwrap_or(&self.given.q);
-        let otherwise = truncation.is_some() || halved.is_some();
-        let other = otherwise.then(|| with(q, &self.given.transforms, ErrorModelTerms { storage, truncation }));
-        let own = other.as_ref().or(stored.as_ref().map(|stored| &stored.own)).unwrap_or(&self.plain);
-        let rounded: Vec<[f64; 3]> = own.par_iter().map(|at| at.map(|number| f64::from(number as f32))).collect();
-        let got: Vec<[f64; 3]> = got.as_chunks::<3>().0.par_iter().map(|at| at.map(f64::from)).collect();
-        let parts =
-            [from_storage, from_q, apart(&rounded, &got), self.transform, apart(own, &rounded), from_truncation];
-        split.0.iter_mut().zip(parts).for_each(|(sum, part)| *sum = sum.join(part));
+        let error_from_q =
+            |q: &Vec<f64>| distances(&self.exact, &positions_of(q, &self.truth.transforms, ErrorModelTerms::default()));
+        let from_q = split_q.as_ref().map_or(self.q, error_from_q);
+        let q = split_q.as_ref().unwrap_or(&self.rounded.q);
+        let differs = truncation.is_some() || split_q.is_some();
+        let replaced =
+            differs.then(|| positions_of(q, &self.rounded.transforms, ErrorModelTerms { storage, truncation }));
+        let emulated =
+            replaced.as_ref().or(stored.as_ref().map(|stored| &stored.positions)).unwrap_or(&self.rounded_positions);
+        let rounded: Vec<[f64; 3]> =
+            emulated.par_iter().map(|position| position.map(|number| f64::from(number as f32))).collect();
+        let got: Vec<[f64; 3]> = got.as_chunks::<3>().0.par_iter().map(|position| position.map(f64::from)).collect();
+        let norms = [
+            from_storage,
+            from_q,
+            distances(&rounded, &got),
+            self.transform,
+            distances(emulated, &rounded),
+            from_truncation,
+        ];
+        accumulator.0.iter_mut().zip(norms).for_each(|(sum, norms)| *sum = sum.join(norms));
     }
 }
 
@@ -122,17 +136,22 @@ impl ErrorSourcesAccumulator {
     /// The accumulated sources in meters; `unit` is meters per scene unit.
     pub(super) fn sources(&self, unit: f64) -> ErrorSources {
         let [storage, q, accumulation, transform, origin, truncation] =
-            self.0.map(|collect| collect.spread(unit).unwrap_or_default());
+            self.0.map(|norms| norms.norms(unit).unwrap_or_default());
         ErrorSources { storage, q, accumulation, transform, origin, truncation }
     }
 }
 
-fn apart(one: &[[f64; 3]], other: &[[f64; 3]]) -> NormAccumulator {
-    let length = |at: usize| {
-        let square: f64 = one[at].iter().zip(other[at]).map(|(one, other)| (one - other).powi(2)).sum();
+/// Norms of the distances between corresponding positions.
+fn distances(one: &[[f64; 3]], other: &[[f64; 3]]) -> NormAccumulator {
+    let distance = |vertex: usize| {
+        let square: f64 = one[vertex].iter().zip(other[vertex]).map(|(one, other)| (one - other).powi(2)).sum();
         square.sqrt()
     };
-    in_pieces(one.len().min(other.len()), |at, sum: &mut NormAccumulator| sum.add(length(at)), NormAccumulator::join)
+    reduce_parallel(
+        one.len().min(other.len()),
+        |vertex, norms: &mut NormAccumulator| norms.add(distance(vertex)),
+        NormAccumulator::join,
+    )
 }
 
 #[cfg(test)]
@@ -143,28 +162,28 @@ mod tests {
     use modalcast_model::scene::{DeformationSettings, StorageType};
 
     fn load() -> Workload {
-        WorkloadKind::Single { power: 8, rank: 2 }.build(Size::Full).expect("built")
+        WorkloadKind::Single { power: 8, rank: 2 }.build(Size::Full).expect("expected a load")
     }
 
-    fn split(deformation: DeformationSettings, truth: &ExactState, got: Option<&[f32]>) -> ErrorSources {
-        let (scene, state) = (with_deformation(&load().scene, deformation).expect("restated"), truth.state());
+    fn measure(deformation: DeformationSettings, truth: &ExactState, got: Option<&[f32]>) -> ErrorSources {
+        let (scene, state) = (with_deformation(&load().scene, deformation).expect("expected a scene"), truth.state());
         let mut error_model = ErrorModel::of(&scene);
         error_model.follow(&state);
-        let all = ErrorModelTerms { storage: Some(&error_model), truncation: Some(&error_model) };
-        let perfect = positions(&scene, &ExactState::of(&state), all);
-        let perfect: Vec<f32> = perfect.as_flattened().iter().map(|number| *number as f32).collect();
-        let mut split = ErrorSourcesAccumulator::default();
-        SharedErrorSources::new(&scene, truth.clone(), &state).split(
+        let terms = ErrorModelTerms { storage: Some(&error_model), truncation: Some(&error_model) };
+        let emulated = positions(&scene, &ExactState::of(&state), terms);
+        let emulated: Vec<f32> = emulated.as_flattened().iter().map(|number| *number as f32).collect();
+        let mut accumulator = ErrorSourcesAccumulator::default();
+        SharedErrorSources::new(&scene, truth.clone(), &state).add_sources(
             &scene,
             &error_model,
-            got.unwrap_or(&perfect),
-            &mut split,
+            got.unwrap_or(&emulated),
+            &mut accumulator,
         );
-        split.sources(1.0)
+        accumulator.sources(1.0)
     }
 
     /// A truth whose numbers f32 represents exactly, so that rounding moves nothing.
-    fn even() -> ExactState {
+    fn representable() -> ExactState {
         let identity = modalcast_model::domain::Transform::IDENTITY.0.map(f64::from);
         ExactState { q: vec![1.0, 0.5], transforms: vec![identity] }
     }
@@ -172,22 +191,23 @@ mod tests {
     #[test]
     fn measures_each_source_alone() {
         let plain = DeformationSettings::default;
-        let none = split(plain(), &even(), None);
+        let none = measure(plain(), &representable(), None);
         assert!(
             [none.storage, none.q, none.accumulation, none.transform, none.truncation] == [ErrorNorms::default(); 5]
         );
         assert!(none.origin.largest > 0.0 && none.origin.largest < 1e-6);
-        let found = split(plain(), &ExactState { q: vec![1.0 + 2f64.powi(-30), 0.5], ..even() }, None);
+        let found = measure(plain(), &ExactState { q: vec![1.0 + 2f64.powi(-30), 0.5], ..representable() }, None);
         assert!(found.q.largest > 1e-10 && found.q.largest < 2e-9 && found.transform.largest == 0.0, "{found:?}");
-        let turned = ExactState { transforms: WorkloadMotion::new(&load(), None).seed(0).transforms, ..even() };
-        let found = split(plain(), &turned, None);
+        let rotated =
+            ExactState { transforms: WorkloadMotion::new(&load(), None).seed(0).transforms, ..representable() };
+        let found = measure(plain(), &rotated, None);
         assert!(found.transform.largest > 1e-9 && found.q.largest == 0.0, "{found:?}");
-        let found = split(DeformationSettings { storage: StorageType::Int8, ..plain() }, &even(), None);
+        let found = measure(DeformationSettings { storage: StorageType::Int8, ..plain() }, &representable(), None);
         // Half a step of 1/127 on each axis for coordinates of 1.5 together, at most.
         assert!(found.storage.largest > 1e-3 && found.storage.largest < 0.5 / 127.0 * 1.5 * 1.74, "{found:?}");
         assert_eq!([found.accumulation, found.truncation], [ErrorNorms::default(); 2]);
         // Mode 1 moves vertices by up to 0.5 sqrt(3). A mode is truncated if it moves no vertex by half the budget.
-        let found = split(DeformationSettings { truncation: Some(1.75), ..plain() }, &even(), None);
+        let found = measure(DeformationSettings { truncation: Some(1.75), ..plain() }, &representable(), None);
         assert!(found.truncation.largest > 0.5 && found.truncation.largest <= 0.87, "{found:?}");
         assert_eq!([found.accumulation, found.storage], [ErrorNorms::default(); 2]);
     }
@@ -195,7 +215,7 @@ mod tests {
     #[test]
     fn counts_unexplained_error_as_accumulation() {
         let got = vec![1e3_f32; 3 * 256];
-        let found = split(DeformationSettings::default(), &WorkloadMotion::new(&load(), None).seed(0), Some(&got));
+        let found = measure(DeformationSettings::default(), &WorkloadMotion::new(&load(), None).seed(0), Some(&got));
         assert!(found.accumulation.largest > 1e3, "{found:?}");
         assert!(found.origin.largest < 1e-6);
     }

@@ -20,7 +20,7 @@ use modalcast_model::scene::{Scene, SceneState};
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ReferenceVertex {
     /// Exact position, scene units.
-    pub at: [f64; 3],
+    pub position: [f64; 3],
     /// A-priori bound on the error of an f32 sum in any order, scene units.
     pub bound: f64,
     /// Condition number sum |U q| / |u|: infinite where only u vanishes, 0 where every term does.
@@ -28,19 +28,19 @@ pub struct ReferenceVertex {
 }
 
 /// Initial value of vertices that are not evaluated yet.
-const NOTHING: ReferenceVertex = ReferenceVertex { at: [0.0; 3], bound: 0.0, condition: 0.0 };
+const UNSET: ReferenceVertex = ReferenceVertex { position: [0.0; 3], bound: 0.0, condition: 0.0 };
 /// Roundings of an f32 sum beyond one per mode: adding x0, and separate products and sums in other orders.
-const EXTRA: usize = 3;
+const EXTRA_ROUNDINGS: usize = 3;
 /// Vertices per tile.
 const TILE: usize = 512;
 /// Condition number above which an f64 sum is repeated in double-double.
-const CANCELS: f64 = 1e6;
+const CANCELLING_CONDITION: f64 = 1e6;
 /// Unit roundoff of f32.
-const ROUND: f64 = 1.0 / (1 << 24) as f64;
+const UNIT_ROUNDOFF: f64 = 1.0 / (1 << 24) as f64;
 /// Largest absolute error of one operation with a subnormal f32 result: half the smallest f32.
-const TINY: f64 = 7.1e-46;
+const MAX_UNDERFLOW_ERROR: f64 = 7.1e-46;
 
-/// Selects the replacements of a deformer to apply.
+/// Selects which replacements of a deformer to apply.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ErrorModelTerms<'a> {
     /// Use U as this model stores it.
@@ -49,21 +49,21 @@ pub struct ErrorModelTerms<'a> {
     pub truncation: Option<&'a ErrorModel>,
 }
 
-/// World positions of a truth in f64, three per vertex, scene units. Only the replacements in `take` are applied.
-pub fn positions(scene: &Scene, truth: &ExactState, take: ErrorModelTerms<'_>) -> Vec<[f64; 3]> {
-    each_tile(scene, [0.0; 3], |domain, vertices, out| {
+/// World positions of a truth in f64, three per vertex, scene units. Only the replacements in `terms` are applied.
+pub fn positions(scene: &Scene, truth: &ExactState, terms: ErrorModelTerms<'_>) -> Vec<[f64; 3]> {
+    map_tiles(scene, [0.0; 3], |domain, vertices, out| {
         let shape = scene.domains[domain].shape;
-        let mut q = own(scene, domain, truth).to_vec();
-        if let Some(error_model) = take.truncation {
+        let mut q = coordinates_of(scene, domain, truth).to_vec();
+        if let Some(error_model) = terms.truncation {
             error_model.truncate(domain, &mut q);
         }
-        let stored = take.storage.and_then(|error_model| error_model.tiles(shape));
+        let stored = terms.storage.and_then(|error_model| error_model.tiles(shape));
         let entries = stored.map_or(Entries::Exact(&scene.shapes[shape].modes), Entries::Stored);
-        let sums = sum(vertices.clone(), entries, &q);
+        let sums = sum_modes(vertices.clone(), entries, &q);
         let (rest, transform) = (&scene.shapes[shape].mesh.rest()[vertices], truth.transform_of(scene, domain));
         for ((rest, sum), out) in rest.iter().zip(&sums).zip(out) {
-            let bent = std::array::from_fn(|axis| f64::from(rest[axis]) + sum.u[axis]);
-            *out = placed(&transform, bent);
+            let deformed = std::array::from_fn(|axis| f64::from(rest[axis]) + sum.u[axis]);
+            *out = transform_point(&transform, deformed);
         }
     })
 }
@@ -71,32 +71,34 @@ pub fn positions(scene: &Scene, truth: &ExactState, take: ErrorModelTerms<'_>) -
 /// Exact positions at a state, with the bounds of a deformer that replaces nothing.
 pub fn reference_vertices(scene: &Scene, state: &SceneState) -> Vec<ReferenceVertex> {
     let truth = ExactState::of(state);
-    each_tile(scene, NOTHING, |domain, vertices, out| {
+    map_tiles(scene, UNSET, |domain, vertices, out| {
         let shape = &scene.shapes[scene.domains[domain].shape];
-        let q = own(scene, domain, &truth);
-        let sums = sum(vertices.clone(), Entries::Exact(&shape.modes), q);
-        let (transform, size) = (truth.transform_of(scene, domain), truth.size_of(scene, domain));
-        let (roundings, follows) = (q.len() + EXTRA, scene.movers.frame_of(domain).is_some());
+        let q = coordinates_of(scene, domain, &truth);
+        let sums = sum_modes(vertices.clone(), Entries::Exact(&shape.modes), q);
+        let (transform, size) = (truth.transform_of(scene, domain), truth.absolute_transform_of(scene, domain));
+        let (roundings, is_follower) = (q.len() + EXTRA_ROUNDINGS, scene.movers.frame_of(domain).is_some());
         let rest = shape.mesh.rest()[vertices].iter().map(|rest| rest.map(f64::from));
         for ((rest, sum), out) in rest.zip(&sums).zip(out) {
-            let at = placed(&transform, std::array::from_fn(|axis| rest[axis] + sum.u[axis]));
-            let bound = bound((&size, follows), &rest, sum, roundings);
-            *out = ReferenceVertex { at, bound, condition: condition(sum) };
+            let position = transform_point(&transform, std::array::from_fn(|axis| rest[axis] + sum.u[axis]));
+            let bound = bound((&size, is_follower), &rest, sum, roundings);
+            *out = ReferenceVertex { position, bound, condition: condition(sum) };
         }
     })
 }
 
-/// The results of [`reference_vertices`] with the bounds widened for a deformer with this error model. No sum is computed again.
-pub fn widen(
+/// Results of [`reference_vertices`] with bounds widened for a deformer with this error model. Reuses their sums.
+pub fn widen_bounds(
     scene: &Scene,
     state: &SceneState,
-    judged: &[ReferenceVertex],
+    references: &[ReferenceVertex],
     error_model: &ErrorModel,
 ) -> Vec<ReferenceVertex> {
-    each_tile(scene, NOTHING, |domain, vertices, out| {
+    map_tiles(scene, UNSET, |domain, vertices, out| {
         let first = scene.layout.slots[domain].first_vertex + vertices.start;
-        out.copy_from_slice(&judged[first..][..vertices.len()]);
-        error_model.bounds(domain, state).widen(vertices.start, out.iter_mut().map(|judged| &mut judged.bound));
+        out.copy_from_slice(&references[first..][..vertices.len()]);
+        error_model
+            .bounds(domain, state)
+            .widen_bounds(vertices.start, out.iter_mut().map(|reference| &mut reference.bound));
     })
 }
 
@@ -146,18 +148,19 @@ impl Entries<'_> {
 }
 
 /// Modal coordinates of a domain.
-fn own<'a>(scene: &Scene, domain: usize, truth: &'a ExactState) -> &'a [f64] {
+fn coordinates_of<'a>(scene: &Scene, domain: usize, truth: &'a ExactState) -> &'a [f64] {
     let slot = scene.layout.slots[domain];
     &truth.q[slot.first_q..][..slot.rank]
 }
 
-fn sum(vertices: Range<usize>, entries: Entries<'_>, q: &[f64]) -> Vec<Sum> {
+/// u and sum |U q| of consecutive vertices. Rows that cancel are summed in double-double.
+fn sum_modes(vertices: Range<usize>, entries: Entries<'_>, q: &[f64]) -> Vec<Sum> {
     let mut rows = vec![(0.0_f64, 0.0_f64); 3 * vertices.len()];
     for (mode, q) in q.iter().enumerate().filter(|(_, q)| **q != 0.0) {
         entries.add(&vertices, (mode, *q), &mut rows);
     }
     for (row, (u, magnitude)) in rows.iter_mut().enumerate() {
-        if *magnitude > CANCELS * u.abs() {
+        if *magnitude > CANCELLING_CONDITION * u.abs() {
             let mut double_double = DoubleDouble::default();
             let (vertex, axis) = (vertices.start + row / 3, row % 3);
             q.iter().enumerate().for_each(|(mode, q)| double_double.add(entries.at(vertex, axis, mode), *q));
@@ -168,34 +171,38 @@ fn sum(vertices: Range<usize>, entries: Entries<'_>, q: &[f64]) -> Vec<Sum> {
     rows.as_chunks().0.iter().map(vertex).collect()
 }
 
-fn placed(transform: &[f64; 12], bent: [f64; 3]) -> [f64; 3] {
+fn transform_point(transform: &[f64; 12], [px, py, pz]: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|row| {
         let [x, y, z, offset] = std::array::from_fn(|column| transform[4 * row + column]);
-        x * bent[0] + y * bent[1] + z * bent[2] + offset
+        x * px + y * py + z * pz + offset
     })
 }
 
 /// The standard bound on sums in any order: after k roundings a sum of terms t errs by at most
 /// k e / (1 - k e) sum |t| (Higham, "Accuracy and Stability of Numerical Algorithms", chapters 3 and 4).
 fn gamma(roundings: usize) -> f64 {
-    let sum = roundings as f64 * ROUND;
-    sum / (1.0 - sum)
+    let relative_error = roundings as f64 * UNIT_ROUNDOFF;
+    relative_error / (1.0 - relative_error)
 }
 
 /// Error bound of T (x0 + u), scene units. `size` holds the absolute values of T; for a follower, T itself is a product
 /// of two transforms, which adds three roundings per entry.
-fn bound((size, follows): (&[f64; 12], bool), rest: &[f64; 3], sum: &Sum, roundings: usize) -> f64 {
-    let of_t = if follows { 3 } else { 0 };
-    let bent: [f64; 3] = std::array::from_fn(|axis| rest[axis].abs() + sum.magnitude[axis]);
-    let off = bent.map(|bent| gamma(roundings) * bent + roundings as f64 * TINY);
-    let row = |row: usize| {
-        let entry = |axis: usize| size[4 * row + axis] * (1.0 + gamma(of_t));
-        let carried: f64 = (0..3).map(|axis| entry(axis) * off[axis]).sum();
-        let whole: f64 = (0..3).map(|axis| entry(axis) * (bent[axis] + off[axis])).sum();
-        let tiny: f64 = bent.iter().map(|bent| of_t as f64 * TINY * (1.0 + bent)).sum();
-        carried + gamma(4 + of_t) * (whole + size[4 * row + 3]) + 4.0 * TINY + tiny
+fn bound((size, is_follower): (&[f64; 12], bool), rest: &[f64; 3], sum: &Sum, roundings: usize) -> f64 {
+    let roundings_of_t = if is_follower { 3 } else { 0 };
+    let magnitude: [f64; 3] = std::array::from_fn(|axis| rest[axis].abs() + sum.magnitude[axis]);
+    let sum_error = magnitude.map(|magnitude| gamma(roundings) * magnitude + roundings as f64 * MAX_UNDERFLOW_ERROR);
+    let row_bound = |row: usize| {
+        let entry = |axis: usize| size[4 * row + axis] * (1.0 + gamma(roundings_of_t));
+        let propagated: f64 = (0..3).map(|axis| entry(axis) * sum_error[axis]).sum();
+        let row_magnitude: f64 = (0..3).map(|axis| entry(axis) * (magnitude[axis] + sum_error[axis])).sum();
+        let underflow: f64 =
+            magnitude.iter().map(|magnitude| roundings_of_t as f64 * MAX_UNDERFLOW_ERROR * (1.0 + magnitude)).sum();
+        propagated
+            + gamma(4 + roundings_of_t) * (row_magnitude + size[4 * row + 3])
+            + 4.0 * MAX_UNDERFLOW_ERROR
+            + underflow
     };
-    (0..3).map(|axis| row(axis).powi(2)).sum::<f64>().sqrt()
+    (0..3).map(|row| row_bound(row).powi(2)).sum::<f64>().sqrt()
 }
 
 fn condition(sum: &Sum) -> f64 {
@@ -206,29 +213,34 @@ fn condition(sum: &Sum) -> f64 {
     }
 }
 
-/// One tile of vertices: its domain, its vertices in that domain, and the output slice.
-type Tile<'a, T> = (usize, Range<usize>, &'a mut [T]);
+/// A tile of vertices of one domain, and its part of the output.
+struct Tile<'a, T> {
+    domain: usize,
+    vertices: Range<usize>,
+    out: &'a mut [T],
+}
 
-/// Values of all vertices in packed order, computed tile by tile on all cores. `nothing` is the initial value.
-fn each_tile<T: Copy + Send + Sync>(
+/// Values of all vertices in packed order, computed tile by tile on all cores. `initial` is the value before.
+/// `compute` receives a domain, its vertices in the tile, and their values.
+fn map_tiles<T: Copy + Send + Sync>(
     scene: &Scene,
-    nothing: T,
-    work: impl Fn(usize, Range<usize>, &mut [T]) + Sync,
+    initial: T,
+    compute: impl Fn(usize, Range<usize>, &mut [T]) + Sync,
 ) -> Vec<T> {
-    let mut all: Vec<T> = rayon::iter::repeat_n(nothing, scene.layout.vertices).collect();
-    let (mut tiles, mut left): (Vec<Tile<'_, T>>, _) = (Vec::new(), all.as_mut_slice());
+    let mut values: Vec<T> = rayon::iter::repeat_n(initial, scene.layout.vertices).collect();
+    let (mut tiles, mut remaining): (Vec<Tile<'_, T>>, _) = (Vec::new(), values.as_mut_slice());
     for (domain, slot) in scene.layout.slots.iter().enumerate() {
         for first in (0..slot.vertices).step_by(TILE) {
             let vertices = first..slot.vertices.min(first + TILE);
-            let (own, rest) = std::mem::take(&mut left).split_at_mut(vertices.len());
-            tiles.push((domain, vertices, own));
-            left = rest;
+            let (out, rest) = std::mem::take(&mut remaining).split_at_mut(vertices.len());
+            tiles.push(Tile { domain, vertices, out });
+            remaining = rest;
         }
     }
     // Several tiles share a task, because scheduling a task per small domain would cost more than its vertices.
-    let each = |(domain, vertices, own): &mut Tile<'_, T>| work(*domain, vertices.clone(), own);
-    tiles.par_chunks_mut(32).for_each(|tiles| tiles.iter_mut().for_each(each));
-    all
+    let compute_tile = |tile: &mut Tile<'_, T>| compute(tile.domain, tile.vertices.clone(), tile.out);
+    tiles.par_chunks_mut(32).for_each(|tiles| tiles.iter_mut().for_each(compute_tile));
+    values
 }
 
 #[cfg(test)]
@@ -250,9 +262,9 @@ mod tests {
             let state = WorkloadMotion::new(&load, None).seed(0).state();
             let want = modalcast_compute::reference::deform(&load.scene, &state);
             let got = positions(&load.scene, &ExactState::of(&state), ErrorModelTerms::default());
-            let apart = want.as_flattened().iter().zip(got.as_flattened()).map(|(a, b)| (a - b).abs());
+            let differences = want.as_flattened().iter().zip(got.as_flattened()).map(|(a, b)| (a - b).abs());
             assert_eq!(want.len(), got.len());
-            assert!(apart.fold(0.0, f64::max) <= 1e-14 * load.scene.rest_bounds.diagonal(), "{}", load.name);
+            assert!(differences.fold(0.0, f64::max) <= 1e-14 * load.scene.rest_bounds.diagonal(), "{}", load.name);
         }
     }
 
@@ -261,17 +273,18 @@ mod tests {
         for load in loads() {
             let motion = WorkloadMotion::new(&load, None);
             let mut cpu = modalcast_compute::cpu::CpuDeformer::new(&load.scene);
-            let mut tightest = 0.0_f64;
+            let mut max_share = 0.0_f64;
             for seed in 0..4 {
                 let state = motion.seed(seed).state();
-                cpu.deform(&state).expect("deforms");
-                let surface = &cpu.surface().expect("a surface").positions;
+                cpu.deform(&state).expect("expected a deformation");
+                let surface = &cpu.surface().expect("expected a surface").positions;
                 for (got, want) in surface.as_chunks::<3>().0.iter().zip(reference_vertices(&load.scene, &state)) {
-                    let square: f64 = got.iter().zip(want.at).map(|(got, want)| (f64::from(*got) - want).powi(2)).sum();
-                    tightest = tightest.max(square.sqrt() / want.bound);
+                    let square: f64 =
+                        got.iter().zip(want.position).map(|(got, want)| (f64::from(*got) - want).powi(2)).sum();
+                    max_share = max_share.max(square.sqrt() / want.bound);
                 }
             }
-            assert!((0.01..=1.0).contains(&tightest), "{}: {tightest}", load.name);
+            assert!((0.01..=1.0).contains(&max_share), "{}: {max_share}", load.name);
         }
     }
 
@@ -280,8 +293,8 @@ mod tests {
         let load = WorkloadKind::Cancelling.build(Size::Quick).expect("built");
         let motion = WorkloadMotion::new(&load, None);
         let median = |seed: usize| {
-            let judged = reference_vertices(&load.scene, &motion.seed(seed).state());
-            let mut conditions: Vec<f64> = judged.iter().map(|judged| judged.condition).collect();
+            let references = reference_vertices(&load.scene, &motion.seed(seed).state());
+            let mut conditions: Vec<f64> = references.iter().map(|reference| reference.condition).collect();
             conditions.sort_by(f64::total_cmp);
             conditions[conditions.len() / 2]
         };
@@ -293,9 +306,9 @@ mod tests {
     #[test]
     fn repeats_cancelling_sum_in_double_double() {
         let columns = vec![1.0, 1.0, 1.0, 2f32.powi(-30), 0.0, 0.0, -1.0, -1.0, -1.0];
-        let modes = Modes::from_columns(3, 3, columns).expect("modes");
+        let modes = Modes::from_columns(3, 3, columns).expect("valid modes");
         // 1e10 + 2^-30 - 1e10: f64 has 53 bits, and 2^-30 is 63 binary places below 1e10.
-        let sums = sum(0..1, Entries::Exact(&modes), &[1e10, 1.0, 1e10]);
+        let sums = sum_modes(0..1, Entries::Exact(&modes), &[1e10, 1.0, 1e10]);
         assert_eq!(sums[0].u, [2f64.powi(-30), 0.0, 0.0]);
     }
 }

@@ -1,5 +1,5 @@
-//! A state in f64. A physics process computes in f64 and sends f32, so the truth of an error is f64, and the state that a
-//! deformer receives is its rounding.
+//! A state in f64. A physics process computes in f64 and sends f32. Errors are therefore measured against the f64 state,
+//! and a deformer receives its rounding.
 
 use modalcast_model::domain::Transform;
 use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
@@ -30,7 +30,8 @@ impl ExactState {
         }
     }
 
-    /// `world_from_domain` of a domain; for a follower the product of its mover's transform and its frame.
+    /// `world_from_domain` of a domain. For a follower, this is the product of its transform root's transform and its
+    /// frame.
     pub fn transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
         let mover = &self.transforms[scene.movers.of(domain)];
         match scene.movers.frame_of(domain) {
@@ -39,8 +40,8 @@ impl ExactState {
         }
     }
 
-    /// The same with absolute values. Entries of the exact product do not exceed it in magnitude.
-    pub(super) fn size_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
+    /// The product of the absolute values. No entry of the exact product exceeds it in magnitude.
+    pub(super) fn absolute_transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
         let mover = self.transforms[scene.movers.of(domain)].map(f64::abs);
         match scene.movers.frame_of(domain) {
             None => mover,
@@ -51,8 +52,8 @@ impl ExactState {
 
 /// The product of two affine transforms, 3x4 row-major.
 fn product(t: &[f64; 12], f: &[f64; 12]) -> [f64; 12] {
-    std::array::from_fn(|at| {
-        let (row, column) = (&t[at / 4 * 4..][..4], at % 4);
+    std::array::from_fn(|entry| {
+        let (row, column) = (&t[entry / 4 * 4..][..4], entry % 4);
         let sum = row[0] * f[column] + row[1] * f[4 + column] + row[2] * f[8 + column];
         if column == 3 { sum + row[3] } else { sum }
     })

@@ -4,8 +4,8 @@
 //! Validation comes before timing: a variant whose error exceeds its a-priori bound at any vertex of any state is not
 //! timed. The report names the variant and fails.
 //!
-//! - [`workloads`] and [`motion`]: seeded synthetic scenes, modal coordinates and transforms; [`recorded_trajectory`]: recorded
-//!   trajectories.
+//! - [`workloads`] and [`motion`]: seeded synthetic scenes, modal coordinates and transforms;
+//!   [`recorded_trajectory`]: recorded trajectories.
 //! - [`exact_positions`], [`error_model`] and `double_double`: reference positions in f64 with single terms of the error model
 //!   exchanged, and a-priori bounds. [`errors`] and [`error_sources`] measure variants against them.
 //! - [`variant`] and [`mod@bench`]: the variants to measure. A new variant implements [`variant::Variant`], and a
@@ -64,7 +64,7 @@ use workloads::{Size, Workload, WorkloadKind};
 const OVERLAP: &str = "cuda overlap";
 
 /// Number of states that timed steps rotate through.
-const ROTATING: usize = 8;
+const ROTATING_STATES: usize = 8;
 
 /// Settings of a report: scenes, sample counts and variants.
 #[derive(Debug, Clone)]
@@ -82,15 +82,16 @@ pub struct DeformReportOptions {
 }
 
 impl DeformReportOptions {
-    fn wants(&self, name: &str) -> bool {
-        wants(&self.variants, name)
+    fn selects(&self, name: &str) -> bool {
+        is_selected(&self.variants, name)
     }
 }
 
 /// Whether `name` is selected by a list of full names and prefixes that end in `*`; an empty list selects everything.
-fn wants(list: &[String], name: &str) -> bool {
-    let fits = |wanted: &String| wanted.strip_suffix('*').map_or(name == wanted, |begin| name.starts_with(begin));
-    list.is_empty() || list.iter().any(fits)
+fn is_selected(list: &[String], name: &str) -> bool {
+    let matches =
+        |pattern: &String| pattern.strip_suffix('*').map_or(name == pattern, |prefix| name.starts_with(prefix));
+    list.is_empty() || list.iter().any(matches)
 }
 
 /// Source of a scene.
@@ -151,7 +152,8 @@ pub struct UploadTiming {
 /// All results of one run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct DeformReport {
-    pub made: Provenance,
+    #[serde(rename = "made")]
+    pub provenance: Provenance,
     /// Missing capabilities and the reasons, for the reader.
     pub remarks: Vec<String>,
     pub seeds: usize,
@@ -185,22 +187,22 @@ pub fn deform(
     bench: &dyn BenchTarget,
     mut progress: impl FnMut(Progress<'_>) -> Result<()>,
 ) -> Result<DeformReport> {
-    let mut made = Measurements::default();
-    if request.wants(OVERLAP) {
-        made.host_writes = bench.host_writes(request.replays);
+    let mut measurements = Measurements::default();
+    if request.selects(OVERLAP) {
+        measurements.host_writes = bench.host_writes(request.replays);
     }
-    let mut report = gathered(request, bench, &made);
+    let mut report = assemble_report(request, bench, &measurements);
     for source in &request.sources {
-        let (load, motion) = open(source, request.size)?;
+        let (load, motion) = open_workload(source, request.size)?;
         let (vertices, domains) = (load.scene.layout.vertices, load.scene.domains.len());
         progress(Progress::Started(&format!("{}: {vertices} vertices, {domains} domains", load.name)))?;
-        let (condition, measured) = measure(request, bench, &load, &motion);
-        made.rows.extend(measured);
+        let (condition, rows) = measure_variants(request, bench, &load, &motion);
+        measurements.rows.extend(rows);
         let full = request.size == Size::Full && matches!(source, WorkloadSource::Synthetic(_));
-        let entry = entry(&load, &motion, condition, full);
-        let overlap = overlap(request, bench, &load, &motion, &mut made.failed);
-        made.loads.push(WorkloadSummary { ingest: bench.ingest(&load, request.replays), overlap, ..entry });
-        report = gathered(request, bench, &made);
+        let summary = summarize(&load, &motion, condition, full);
+        let overlap = measure_overlap(request, bench, &load, &motion, &mut measurements.failed);
+        measurements.loads.push(WorkloadSummary { ingest: bench.ingest(&load, request.replays), overlap, ..summary });
+        report = assemble_report(request, bench, &measurements);
         progress(Progress::Measured(&report))?;
     }
     Ok(report)
@@ -217,22 +219,26 @@ struct Measurements {
 }
 
 /// Assembles the report from the loads measured so far. They are the first ones of `request.sources`.
-fn gathered(request: &DeformReportOptions, bench: &dyn BenchTarget, made: &Measurements) -> DeformReport {
-    let Measurements { loads, rows, .. } = made;
-    let full = |name: &str| loads.iter().any(|load: &WorkloadSummary| load.name == name && load.full);
-    let thesis = ThesisComparison::of(rows, full);
-    let name = |row: &DeformRow| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
-    let mut failed = made.failed.clone();
-    failed.extend(rows.iter().filter(|row| !row.passed && !row.left_out).map(name));
+fn assemble_report(
+    request: &DeformReportOptions,
+    bench: &dyn BenchTarget,
+    measurements: &Measurements,
+) -> DeformReport {
+    let Measurements { loads, rows, .. } = measurements;
+    let is_full_size = |name: &str| loads.iter().any(|load: &WorkloadSummary| load.name == name && load.full);
+    let thesis = ThesisComparison::of(rows, is_full_size);
+    let describe = |row: &DeformRow| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
+    let mut failed = measurements.failed.clone();
+    failed.extend(rows.iter().filter(|row| !row.passed && !row.is_skipped).map(describe));
     // The rows for warm and cold caches repeat the same failure of one variant.
     failed.dedup();
     let roofs = [Backend::Cpu, Backend::Cuda].map(|backend| (backend, bench.roofs(backend))).into();
     DeformReport {
-        made: Provenance::here(),
+        provenance: Provenance::here(),
         remarks: bench.remarks(),
         seeds: request.seeds,
         roofs,
-        host_writes: made.host_writes.clone(),
+        host_writes: measurements.host_writes.clone(),
         loads: loads.clone(),
         missing: request.sources[loads.len()..].iter().map(WorkloadSource::name).collect(),
         rows: rows.clone(),
@@ -242,22 +248,22 @@ fn gathered(request: &DeformReportOptions, bench: &dyn BenchTarget, made: &Measu
 }
 
 /// Runs the overlap benchmark if it is requested. The report fails if its vertices differ from those of serial steps.
-fn overlap(
+fn measure_overlap(
     request: &DeformReportOptions,
     bench: &dyn BenchTarget,
     load: &Workload,
     motion: &WorkloadMotion,
     failed: &mut Vec<String>,
 ) -> Option<Overlap> {
-    if !request.wants(OVERLAP) {
+    if !request.selects(OVERLAP) {
         return None;
     }
-    let states: Vec<_> = (0..ROTATING).map(|seed| motion.seed(seed).state()).collect();
+    let states: Vec<_> = (0..ROTATING_STATES).map(|seed| motion.seed(seed).state()).collect();
     match bench.overlap(load, &states, request.replays)? {
         Ok(overlap) => {
             let differing = overlap.differing;
-            let wrong = (differing > 0).then(|| format!("{}: {OVERLAP}: {differing} steps differ", load.name));
-            failed.extend(wrong);
+            let failure = (differing > 0).then(|| format!("{}: {OVERLAP}: {differing} steps differ", load.name));
+            failed.extend(failure);
             Some(overlap)
         }
         Err(error) => {
@@ -267,7 +273,7 @@ fn overlap(
     }
 }
 
-fn open(source: &WorkloadSource, size: Size) -> Result<(Workload, WorkloadMotion)> {
+fn open_workload(source: &WorkloadSource, size: Size) -> Result<(Workload, WorkloadMotion)> {
     match source {
         WorkloadSource::Synthetic(kind) => {
             let load = kind.build(size)?;
@@ -278,7 +284,7 @@ fn open(source: &WorkloadSource, size: Size) -> Result<(Workload, WorkloadMotion
             let OpenedScene { scene, backends } = load::open(source)?;
             let record = match record {
                 Some(path) => Some(RecordedTrajectory::read(path, &scene)?),
-                None => RecordedTrajectory::beside(source, &scene)?,
+                None => RecordedTrajectory::find_next_to(source, &scene)?,
             };
             let remarks = scene.remarks.clone();
             let batches = backends.batches;
@@ -289,7 +295,7 @@ fn open(source: &WorkloadSource, size: Size) -> Result<(Workload, WorkloadMotion
     }
 }
 
-fn entry(load: &Workload, motion: &WorkloadMotion, condition: ConditionNumbers, full: bool) -> WorkloadSummary {
+fn summarize(load: &Workload, motion: &WorkloadMotion, condition: ConditionNumbers, full: bool) -> WorkloadSummary {
     let (scene, layout) = (&load.scene, &load.scene.layout);
     WorkloadSummary {
         name: load.name.clone(),
@@ -310,37 +316,39 @@ fn entry(load: &Workload, motion: &WorkloadMotion, condition: ConditionNumbers, 
 }
 
 /// Validates all variants of a load together, then times the passing ones one after the other.
-fn measure(
+fn measure_variants(
     request: &DeformReportOptions,
     bench: &dyn BenchTarget,
     load: &Workload,
     motion: &WorkloadMotion,
 ) -> (ConditionNumbers, Vec<DeformRow>) {
     let (mut variants, mut rows): (Vec<Box<dyn Variant>>, Vec<DeformRow>) = (Vec::new(), Vec::new());
-    let wanted = |name: &str| request.wants(name);
-    for (label, made) in bench.variants(load, &wanted).into_iter().filter(|(label, _)| wanted(&label.name)) {
-        match made {
+    let is_selected = |name: &str| request.selects(name);
+    for (label, candidate) in
+        bench.variants(load, &is_selected).into_iter().filter(|(label, _)| is_selected(&label.name))
+    {
+        match candidate {
             Ok(variant) => variants.push(variant),
-            Err(error) => rows.push(DeformRow::unmade(&load.name, &label, &error)),
+            Err(error) => rows.push(DeformRow::not_created(&load.name, &label, &error)),
         }
     }
-    let (found, condition) = validate::validate(load, motion, &mut variants, (request.seeds, request.steps));
-    let states: Vec<_> = (0..ROTATING).map(|seed| motion.seed(seed).state()).collect();
-    for (variant, found) in variants.iter_mut().zip(found) {
+    let (results, condition) = validate::validate(load, motion, &mut variants, (request.seeds, request.steps));
+    let states: Vec<_> = (0..ROTATING_STATES).map(|seed| motion.seed(seed).state()).collect();
+    for (variant, result) in variants.iter_mut().zip(results) {
         for cache in [CacheState::Warm, CacheState::Cold] {
-            let mut found = found.clone();
-            let timing = match found.passed() {
+            let mut result = result.clone();
+            let timing = match result.passed() {
                 true => variant.time(&states, cache, request.replays),
                 false => Ok(None),
             };
             let timing = timing.unwrap_or_else(|error| {
-                found.faults.push(error.to_string());
+                result.faults.push(error.to_string());
                 None
             });
             let (label, traffic) = (variant.label(), variant.traffic());
             let (launches, kernels) = (variant.launches_per_step(), variant.kernel_attributes());
-            let row = DeformRow::new(&load.name, label, found, traffic, (cache, timing));
-            rows.push(DeformRow { launches, kernels, ..row.under(bench.roofs(label.backend)) });
+            let row = DeformRow::new(&load.name, label, result, traffic, (cache, timing));
+            rows.push(DeformRow { launches, kernels, ..row.relative_to(bench.roofs(label.backend)) });
         }
     }
     (condition, rows)
@@ -366,9 +374,9 @@ impl DeformReport {
             ("report.svg", svg.into_bytes()),
         ];
         for (name, bytes) in files {
-            let (place, beside) = (folder.join(name), folder.join(format!("{name}.part")));
-            std::fs::write(&beside, bytes)
-                .and_then(|()| std::fs::rename(&beside, place))
+            let (path, temporary_path) = (folder.join(name), folder.join(format!("{name}.part")));
+            std::fs::write(&temporary_path, bytes)
+                .and_then(|()| std::fs::rename(&temporary_path, path))
                 .map_err(fault_in("report"))?;
         }
         Ok(())

@@ -5,10 +5,10 @@ use super::table::DeformRow;
 use super::{DeformReport, WorkloadSummary};
 use crate::kernels::Overlap;
 
-/// The whole page.
+/// The complete report.
 pub(super) fn markdown(report: &DeformReport) -> String {
-    let mut text = format!("# Error against run time\n\n{}\n", report.made.line());
-    let commit = report.made.commit.as_deref().unwrap_or("unknown");
+    let mut text = format!("# Error against run time\n\n{}\n", report.provenance.line());
+    let commit = report.provenance.commit.as_deref().unwrap_or("unknown");
     text.push_str(&format!("\nCommit {commit}; {} random states per load.\n", report.seeds));
     for remark in &report.remarks {
         text.push_str(&format!("\n{remark}\n"));
@@ -16,13 +16,13 @@ pub(super) fn markdown(report: &DeformReport) -> String {
     if !report.missing.is_empty() {
         text.push_str(&format!("\nNot measured yet: {}.\n", report.missing.join(", ")));
     }
-    let verdict = match report.failed.is_empty() {
+    let failures = match report.failed.is_empty() {
         true => "\nEvery variant stays within its a-priori bound.\n".to_owned(),
         false => format!("\nFailed:\n\n- {}\n", report.failed.join("\n- ")),
     };
-    text.push_str(&verdict);
+    text.push_str(&failures);
     for load in &report.loads {
-        text.push_str(&section(load, report.rows.iter().filter(|row| row.load == load.name)));
+        text.push_str(&load_section(load, report.rows.iter().filter(|row| row.load == load.name)));
     }
     text.push('\n');
     text.push_str(&report.thesis.markdown());
@@ -45,7 +45,7 @@ const HEAD: [&str; 13] = [
     "passed",
 ];
 
-fn section<'a>(load: &WorkloadSummary, rows: impl Iterator<Item = &'a DeformRow>) -> String {
+fn load_section<'a>(load: &WorkloadSummary, rows: impl Iterator<Item = &'a DeformRow>) -> String {
     let WorkloadSummary {
         name, vertices, corners, triangles, domains, coordinates, condition, steps, recorded, ..
     } = load;
@@ -68,13 +68,13 @@ fn section<'a>(load: &WorkloadSummary, rows: impl Iterator<Item = &'a DeformRow>
 
 /// The time per step if the host reads every step back, serially and overlapped.
 fn overlap_paragraph(overlap: &Overlap) -> String {
-    let Overlap { write_one_core_us: one, write_us: all, cores, graph_us, copy_out_us, step_us, .. } = overlap;
+    let Overlap { write_one_core_us, write_us, cores, graph_us, copy_out_us, step_us, .. } = overlap;
     let Overlap { serial_us, fetched_us, overlapped_us, gain, ideal_us, differing, .. } = overlap;
     format!(
-        "\nThe host reads every step, microseconds a step: {serial_us:.1} one after the other, {fetched_us:.1} with the \
-         way out beside the next step, {overlapped_us:.1} with two steps under way, {gain:.2} times as fast; \
-         {ideal_us:.1} would be the longest part alone. Parts: writing {all:.1} on {cores} cores ({one:.1} on one), copy \
-         in and kernels {graph_us:.1}, way out {copy_out_us:.1}; a step that nobody reads {step_us:.1}. Steps that \
+        "\nThe host reads every step. Microseconds per step: {serial_us:.1} serially, {fetched_us:.1} with the readback during \
+         the next step, {overlapped_us:.1} with two steps in flight ({gain:.2} times as fast as serially). The lower \
+         limit is {ideal_us:.1}, the longest part alone. Parts: host write {write_us:.1} on {cores} cores ({write_one_core_us:.1} on one), \
+         upload and kernels {graph_us:.1}, readback {copy_out_us:.1}; a step without readback {step_us:.1}. Steps that \
          differ in a bit: {differing}.\n"
     )
 }
@@ -82,7 +82,7 @@ fn overlap_paragraph(overlap: &Overlap) -> String {
 fn cells(row: &DeformRow) -> [String; 13] {
     let number = |value: Option<f64>| value.map_or_else(dash, |value| format!("{value:.3}"));
     let small = |value: Option<f64>| value.map_or_else(dash, |value| format!("{value:.2e}"));
-    let errors = row.found.as_ref().map(|found| found.errors);
+    let errors = row.validation.as_ref().map(|validation| validation.errors);
     [
         row.name.clone(),
         row.cache.name().into(),
@@ -96,7 +96,7 @@ fn cells(row: &DeformRow) -> [String; 13] {
         small(errors.map(|errors| errors.of_diagonal.largest)),
         small(errors.and_then(|errors| Some(errors.pixels?.largest))),
         number(errors.map(|errors| errors.of_bound)),
-        match (row.passed, row.left_out) {
+        match (row.passed, row.is_skipped) {
             (true, _) => "yes".into(),
             (false, true) => format!("left out: {}", row.faults.join("; ")),
             (false, false) => format!("no: {}", row.faults.join("; ")),

@@ -19,7 +19,7 @@ pub struct RecordedTrajectory {
 impl RecordedTrajectory {
     /// Reads a `.csv` file with a header and the columns time, q0, q1, ..., or a folder with `q.npy` (steps x
     /// coordinates) and, if the domains move, `transforms.npy` (steps x movers x 12), as `modalcast-sim` writes it.
-    /// Movers are the domains with a transform of their own.
+    /// Movers are the domains that have a transform.
     ///
     /// # Errors
     /// `NotFound`, or `Invalid` when the numbers do not fit the scene.
@@ -27,15 +27,15 @@ impl RecordedTrajectory {
         let name = path.display().to_string();
         let record = match path.is_dir() {
             true => Self {
-                q: table(&path.join("q.npy"))?,
+                q: read_npy_rows(&path.join("q.npy"))?,
                 transforms: match path.join("transforms.npy") {
-                    file if file.exists() => table(&file)?,
+                    file if file.exists() => read_npy_rows(&file)?,
                     _ => Vec::new(),
                 },
             },
-            false => Self { q: columns(path)?, transforms: Vec::new() },
+            false => Self { q: read_csv_rows(path)?, transforms: Vec::new() },
         };
-        record.validated(scene).map_err(|error| error.prefix_field(&name))
+        record.validate(scene).map_err(|error| error.prefix_field(&name))
     }
 
     /// The recording next to a scene: the only file in its folder that ends in `.q.csv`. `None` when there is no such
@@ -43,7 +43,7 @@ impl RecordedTrajectory {
     ///
     /// # Errors
     /// As [`Self::read`].
-    pub fn beside(source: &str, scene: &Scene) -> Result<Option<Self>> {
+    pub fn find_next_to(source: &str, scene: &Scene) -> Result<Option<Self>> {
         let path = Path::new(source);
         let folder = if path.is_dir() { path } else { path.parent().unwrap_or(path) };
         let Ok(entries) = std::fs::read_dir(folder) else { return Ok(None) };
@@ -55,17 +55,19 @@ impl RecordedTrajectory {
         }
     }
 
-    fn validated(self, scene: &Scene) -> Result<Self> {
-        let fits = |field: &str, list: &[Vec<f64>], length: usize| match list.iter().position(|row| row.len() != length)
+    fn validate(self, scene: &Scene) -> Result<Self> {
+        let check_lengths = |field: &str, list: &[Vec<f64>], length: usize| match list
+            .iter()
+            .position(|row| row.len() != length)
         {
             None => Ok(()),
-            Some(at) => Err(invalid(format!("{field}[{at}]"), format!("{length} numbers"), list[at].len())),
+            Some(index) => Err(invalid(format!("{field}[{index}]"), format!("{length} numbers"), list[index].len())),
         };
         if self.q.is_empty() {
             return Err(invalid("steps", "at least one", 0));
         }
-        fits("q", &self.q, scene.layout.coordinates)?;
-        fits("transforms", &self.transforms, 12 * scene.movers.count())?;
+        check_lengths("q", &self.q, scene.layout.coordinates)?;
+        check_lengths("transforms", &self.transforms, 12 * scene.movers.count())?;
         if !self.transforms.is_empty() && self.transforms.len() != self.q.len() {
             return Err(invalid("transforms", format!("{} steps", self.q.len()), self.transforms.len()));
         }
@@ -81,17 +83,20 @@ impl RecordedTrajectory {
 
     pub(super) fn step(&self, scene: &Scene, step: usize) -> ExactState {
         let placement = |domain: u32| scene.domains[domain as usize].placement.0.map(f64::from);
-        let still = || scene.movers.domains().map(placement).collect();
-        let moved = |row: &Vec<f64>| row.as_chunks().0.to_vec();
-        ExactState { q: self.q[step].clone(), transforms: self.transforms.get(step).map_or_else(still, moved) }
+        let rest_transforms = || scene.movers.domains().map(placement).collect();
+        let recorded_transforms = |row: &Vec<f64>| row.as_chunks().0.to_vec();
+        ExactState {
+            q: self.q[step].clone(),
+            transforms: self.transforms.get(step).map_or_else(rest_transforms, recorded_transforms),
+        }
     }
 }
 
 /// The rows of a `.npy` array of at least two dimensions; all but the first dimension are flattened.
-fn table(path: &Path) -> Result<Vec<Vec<f64>>> {
-    let missing =
+fn read_npy_rows(path: &Path) -> Result<Vec<Vec<f64>>> {
+    let not_found =
         |error: std::io::Error| Error::NotFound { what: "record", given: format!("{}: {error}", path.display()) };
-    let array = parse_numpy(&std::fs::read(path).map_err(missing)?)?;
+    let array = parse_numpy(&std::fs::read(path).map_err(not_found)?)?;
     if array.shape.len() < 2 || array.fortran_order {
         let given = format!("{:?}, fortran {}", array.shape, array.fortran_order);
         return Err(invalid(path.display().to_string(), "steps x numbers in C order", given));
@@ -102,13 +107,13 @@ fn table(path: &Path) -> Result<Vec<Vec<f64>>> {
 }
 
 /// All columns except the first of a CSV file with a header.
-fn columns(path: &Path) -> Result<Vec<Vec<f64>>> {
-    let refuse = |error: csv::Error| match error.is_io_error() {
+fn read_csv_rows(path: &Path) -> Result<Vec<Vec<f64>>> {
+    let to_error = |error: csv::Error| match error.is_io_error() {
         true => Error::NotFound { what: "record", given: format!("{}: {error}", path.display()) },
         false => invalid(path.display().to_string(), "rows of time,q0,q1,...", error),
     };
-    let mut reader = csv::Reader::from_path(path).map_err(refuse)?;
-    let row = |row: Result<Vec<f64>, csv::Error>| row.map(|row| row[1.min(row.len())..].to_vec()).map_err(refuse);
+    let mut reader = csv::Reader::from_path(path).map_err(to_error)?;
+    let row = |row: Result<Vec<f64>, csv::Error>| row.map(|row| row[1.min(row.len())..].to_vec()).map_err(to_error);
     reader.deserialize().map(row).collect()
 }
 
@@ -122,18 +127,18 @@ mod tests {
     }
 
     fn read(text: &str) -> Result<RecordedTrajectory> {
-        let folder = tempfile::tempdir().expect("a folder");
+        let folder = tempfile::tempdir().expect("expected a folder");
         let path = folder.path().join("x.q.csv");
         std::fs::write(&path, text).expect("written");
-        let beside = RecordedTrajectory::beside(folder.path().to_str().expect("UTF-8"), &scene());
+        let found = RecordedTrajectory::find_next_to(folder.path().to_str().expect("UTF-8"), &scene());
         let read = RecordedTrajectory::read(&path, &scene());
-        assert_eq!(beside, read.clone().map(Some));
+        assert_eq!(found, read.clone().map(Some));
         read
     }
 
     #[test]
     fn columns_after_time_are_coordinates() {
-        let record = read("time,q0,q1\n0,1.5,-2\n1,3,4\n").expect("a record");
+        let record = read("time,q0,q1\n0,1.5,-2\n1,3,4\n").expect("a valid record");
         assert_eq!(record.steps(), 2);
         assert_eq!(record.step(&scene(), 1).q, [3.0, 4.0]);
         assert_eq!(record.step(&scene(), 1).transforms[0][0], 1.0, "at its placement");
@@ -147,16 +152,16 @@ mod tests {
             ("time,q0,q1\n0,1,x\n", "expected rows of time,q0,q1"),
             ("time,q0,q1\n0,1,inf\n", "expected finite numbers"),
         ] {
-            let refusal = read(text).expect_err(part).to_string();
-            assert!(refusal.contains(part), "{refusal}");
+            let error = read(text).expect_err(part).to_string();
+            assert!(error.contains(part), "{error}");
         }
         assert!(matches!(RecordedTrajectory::read(Path::new("absent.csv"), &scene()), Err(Error::NotFound { .. })));
-        assert_eq!(RecordedTrajectory::beside("tree", &scene()), Ok(None));
+        assert_eq!(RecordedTrajectory::find_next_to("tree", &scene()), Ok(None));
     }
 
     #[test]
     fn reads_transforms_from_a_folder_of_arrays() {
-        let folder = tempfile::tempdir().expect("a folder");
+        let folder = tempfile::tempdir().expect("expected a folder");
         let write = |name: &str, shape: &str, numbers: &[f32]| {
             let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
             header.push_str(&" ".repeat(63 - (header.len() + 10) % 64));
@@ -170,7 +175,7 @@ mod tests {
         write("q.npy", "(2, 2)", &[1.0, 2.0, 3.0, 4.0]);
         let numbers: Vec<f32> = (0..24).map(|number| number as f32).collect();
         write("transforms.npy", "(2, 1, 12)", &numbers);
-        let record = RecordedTrajectory::read(folder.path(), &scene()).expect("a record");
+        let record = RecordedTrajectory::read(folder.path(), &scene()).expect("a valid record");
         let step = record.step(&scene(), 1);
         assert_eq!((step.q, step.transforms[0][0]), (vec![3.0, 4.0], 12.0));
     }

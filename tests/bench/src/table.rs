@@ -31,7 +31,8 @@ pub struct DeformRow {
     pub faults: Vec<String>,
     /// Whether the variant was skipped because something that it needs is unavailable. It then does not count as
     /// failed.
-    pub left_out: bool,
+    #[serde(rename = "left_out")]
+    pub is_skipped: bool,
     /// `None` when it failed, or cannot be timed with this cache.
     pub timing: Option<Timing>,
     pub bytes: u64,
@@ -44,10 +45,11 @@ pub struct DeformRow {
     pub of_read: Option<f64>,
     /// Kernel launches per step; 0 on the CPU.
     pub launches: usize,
-    /// The driver's facts about each kernel; empty on the CPU.
+    /// The driver's attributes of each kernel; empty on the CPU.
     pub kernels: Vec<KernelAttributes>,
     /// `None` when the variant could not be created.
-    pub found: Option<ValidationResult>,
+    #[serde(rename = "found")]
+    pub validation: Option<ValidationResult>,
 }
 
 impl DeformRow {
@@ -55,33 +57,32 @@ impl DeformRow {
     pub fn new(
         load: &str,
         label: &VariantLabel,
-        found: ValidationResult,
+        validation: ValidationResult,
         traffic: Vec<Operand>,
-        time: (CacheState, Option<Timing>),
+        (cache, timing): (CacheState, Option<Timing>),
     ) -> Self {
-        let (cache, timing) = time;
         let bytes = memory_traffic::total(&traffic);
         Self {
             cache,
-            passed: found.passed(),
-            faults: found.faults.clone(),
-            left_out: found.left_out,
+            passed: validation.passed(),
+            faults: validation.faults.clone(),
+            is_skipped: validation.is_skipped,
             timing,
             bytes,
             traffic,
             gbs: timing.map(|timing| bytes as f64 / timing.median_us / 1e3),
-            found: Some(found),
-            ..Self::blank(load, label)
+            validation: Some(validation),
+            ..Self::empty(load, label)
         }
     }
 
     /// The row of a variant that could not be created.
-    pub fn unmade(load: &str, label: &VariantLabel, error: &Error) -> Self {
-        let left_out = matches!(error, Error::Unavailable { .. });
-        Self { faults: vec![error.to_string()], left_out, ..Self::blank(load, label) }
+    pub fn not_created(load: &str, label: &VariantLabel, error: &Error) -> Self {
+        let is_skipped = matches!(error, Error::Unavailable { .. });
+        Self { faults: vec![error.to_string()], is_skipped, ..Self::empty(load, label) }
     }
 
-    fn blank(load: &str, label: &VariantLabel) -> Self {
+    fn empty(load: &str, label: &VariantLabel) -> Self {
         Self {
             load: load.into(),
             name: label.name.clone(),
@@ -93,7 +94,7 @@ impl DeformRow {
             cache: CacheState::Warm,
             passed: false,
             faults: Vec::new(),
-            left_out: false,
+            is_skipped: false,
             timing: None,
             bytes: 0,
             traffic: Vec::new(),
@@ -102,12 +103,12 @@ impl DeformRow {
             of_read: None,
             launches: 0,
             kernels: Vec::new(),
-            found: None,
+            validation: None,
         }
     }
 
-    /// The row with its rate divided by the rates of the machine.
-    pub fn under(mut self, roofs: MemoryBandwidth) -> Self {
+    /// The row with its bandwidth divided by the peak bandwidths of the machine.
+    pub fn relative_to(mut self, roofs: MemoryBandwidth) -> Self {
         let share = |roof: Option<f64>| Some(self.gbs? / roof.filter(|roof| *roof > 0.0)?);
         (self.of_copy, self.of_read) = (share(roofs.copy_gbs), share(roofs.read_gbs));
         self
@@ -116,8 +117,8 @@ impl DeformRow {
     /// Median time in microseconds and largest error as a fraction of the diagonal; `None` when the variant failed or
     /// was not timed.
     pub fn point(&self) -> Option<(f64, f64)> {
-        let found = self.found.as_ref().filter(|_| self.passed)?;
-        Some((self.timing?.median_us, found.errors.of_diagonal.largest))
+        let validation = self.validation.as_ref().filter(|_| self.passed)?;
+        Some((self.timing?.median_us, validation.errors.of_diagonal.largest))
     }
 }
 
@@ -190,7 +191,7 @@ pub fn csv(rows: &[DeformRow]) -> Result<Vec<u8>> {
     writer.write_record(COLUMNS.map(|(name, _)| name)).map_err(fault_in("report"))?;
     for row in rows {
         let value = serde_json::to_value(row).map_err(fault_in("report"))?;
-        let cell = |(name, place): (&str, &str)| match (name, value.pointer(place)) {
+        let cell = |(name, pointer): (&str, &str)| match (name, value.pointer(pointer)) {
             ("bytes_by_formula", _) => memory_traffic::line(&row.traffic),
             ("faults", _) => row.faults.join("; "),
             (_, None | Some(Value::Null)) => String::new(),
@@ -206,13 +207,13 @@ pub fn csv(rows: &[DeformRow]) -> Result<Vec<u8>> {
 pub fn pareto(points: &[(f64, f64)]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.sort_by(|a, b| points[*a].0.total_cmp(&points[*b].0).then(points[*a].1.total_cmp(&points[*b].1)));
-    let mut least = f64::INFINITY;
-    let mut best = |index: &usize| {
-        let better = points[*index].1 < least;
-        least = least.min(points[*index].1);
-        better
+    let mut min_second = f64::INFINITY;
+    let mut is_on_front = |index: &usize| {
+        let is_smaller = points[*index].1 < min_second;
+        min_second = min_second.min(points[*index].1);
+        is_smaller
     };
-    order.retain(|index| best(index));
+    order.retain(|index| is_on_front(index));
     order
 }
 
@@ -225,10 +226,10 @@ pub(super) mod tests {
     /// A row with these numbers; everything else is zero or empty.
     pub(crate) fn row(load: &str, name: &str, cache: CacheState, (us, error): (f64, f64)) -> DeformRow {
         let label = VariantLabel { name: name.into(), backend: Backend::Cpu, deformation: Default::default() };
-        let spread = ErrorNorms { largest: error, rms: error / 2.0 };
+        let norms = ErrorNorms { largest: error, rms: error / 2.0 };
         let errors = PositionErrors {
-            meters: spread,
-            of_diagonal: spread,
+            meters: norms,
+            of_diagonal: norms,
             pixels: None,
             bias_meters: [0.5, -0.5, 0.0],
             bound_meters: 1.0,
@@ -236,49 +237,49 @@ pub(super) mod tests {
             not_finite: 0,
             states: 1,
         };
-        let found = ValidationResult {
+        let validation = ValidationResult {
             errors,
-            step_meters: spread,
+            step_meters: norms,
             sources: ErrorSources::default(),
             orientation: OrientationErrors::default(),
             repeatable: true,
             faults: Vec::new(),
-            left_out: false,
+            is_skipped: false,
         };
         let timing = Timing { median_us: us, q1_us: us, q3_us: us, replays: 20 };
         let traffic = vec![Operand { name: "U", formula: "4 x sum 3 n r", bytes: 2_000 }];
-        DeformRow::new(load, &label, found, traffic, (cache, Some(timing)))
+        DeformRow::new(load, &label, validation, traffic, (cache, Some(timing)))
     }
 
     #[test]
-    fn front_contains_exactly_the_undominated_points() {
+    fn front_contains_exactly_the_pareto_optimal_points() {
         let points = [(1.0, 5.0), (2.0, 6.0), (3.0, 1.0), (3.0, 0.5), (4.0, 0.5), (0.5, 9.0)];
         assert_eq!(pareto(&points), [5, 0, 3]);
         assert_eq!(pareto(&[]), [0; 0]);
-        assert_eq!(pareto(&[(1.0, 1.0), (1.0, 1.0)]).len(), 1, "twins count once");
+        assert_eq!(pareto(&[(1.0, 1.0), (1.0, 1.0)]).len(), 1, "expected one of two equal points");
     }
 
     #[test]
-    fn rates_are_bytes_per_time_and_fractions_of_roofs() {
+    fn bandwidth_is_bytes_per_time_and_relative_to_the_peak() {
         let row = row("a", "x", CacheState::Warm, (2.0, 0.1));
         assert_eq!((row.gbs, row.of_copy), (Some(1.0), None));
-        let under = row.under(MemoryBandwidth { copy_gbs: Some(4.0), ..MemoryBandwidth::default() });
-        assert_eq!((under.of_copy, under.of_read), (Some(0.25), None));
+        let relative = row.relative_to(MemoryBandwidth { copy_gbs: Some(4.0), ..MemoryBandwidth::default() });
+        assert_eq!((relative.of_copy, relative.of_read), (Some(0.25), None));
     }
 
     #[test]
     fn csv_reads_back_all_columns_and_quoted_text() {
-        let mut odd = row("a", "odd, \"name\"", CacheState::Cold, (3.0, 1e-9));
-        odd.faults = vec!["one".into(), "two, three".into()];
-        let rows = [row("a", "x", CacheState::Warm, (2.0, 0.125)), odd];
+        let mut quoted = row("a", "odd, \"name\"", CacheState::Cold, (3.0, 1e-9));
+        quoted.faults = vec!["one".into(), "two, three".into()];
+        let rows = [row("a", "x", CacheState::Warm, (2.0, 0.125)), quoted];
         let bytes = csv(&rows).expect("written");
         let mut reader = csv::Reader::from_reader(bytes.as_slice());
         let header = reader.headers().expect("a header").clone();
         assert_eq!(header.len(), COLUMNS.len());
         let records: Vec<csv::StringRecord> = reader.records().map(|record| record.expect("a record")).collect();
         let cell = |row: usize, name: &str| {
-            let at = header.iter().position(|column| column == name).expect("a column");
-            records[row][at].to_owned()
+            let index = header.iter().position(|column| column == name).expect("a column");
+            records[row][index].to_owned()
         };
         assert_eq!(
             (cell(0, "largest_m"), cell(0, "median_us"), cell(0, "cache")),
@@ -291,25 +292,25 @@ pub(super) mod tests {
 
     #[test]
     fn every_column_pointer_resolves_in_a_full_row() {
-        let mut full = row("a", "x", CacheState::Warm, (2.0, 0.125)).under(MemoryBandwidth {
+        let mut full = row("a", "x", CacheState::Warm, (2.0, 0.125)).relative_to(MemoryBandwidth {
             copy_gbs: Some(1.0),
             read_gbs: Some(1.0),
             ..MemoryBandwidth::default()
         });
         full.truncation_meters = Some(1e-3);
-        let found = full.found.as_mut().expect("found");
-        let spread = Some(ErrorNorms::default());
-        found.errors.pixels = spread;
-        found.orientation = OrientationErrors {
-            normals_degrees: spread,
-            normals_to_surface_degrees: spread,
-            tangents_degrees: spread,
-            normal_dot_tangent: spread,
+        let validation = full.validation.as_mut().expect("expected a validation result");
+        let norms = Some(ErrorNorms::default());
+        validation.errors.pixels = norms;
+        validation.orientation = OrientationErrors {
+            normals_degrees: norms,
+            normals_to_surface_degrees: norms,
+            tangents_degrees: norms,
+            normal_dot_tangent: norms,
             broken: 0,
         };
         let value = serde_json::to_value(&full).expect("JSON");
-        for (name, place) in COLUMNS.iter().filter(|(_, place)| !place.is_empty()) {
-            assert!(value.pointer(place).is_some_and(|value| !value.is_null()), "{name}");
+        for (name, pointer) in COLUMNS.iter().filter(|(_, pointer)| !pointer.is_empty()) {
+            assert!(value.pointer(pointer).is_some_and(|value| !value.is_null()), "{name}");
         }
     }
 }

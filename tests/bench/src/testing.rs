@@ -13,19 +13,19 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::{Scene, SceneState};
 
 /// Wraps another variant and adds an error to its last coordinate.
-pub(super) struct Damaged<V> {
+pub(super) struct InaccurateVariant<V> {
     inner: V,
-    damage: f32,
+    error: f32,
     surface: DeformedSurface,
 }
 
-impl<V: Variant> Damaged<V> {
-    pub(super) fn new(inner: V, damage: f32) -> Self {
-        Self { inner, damage, surface: DeformedSurface::default() }
+impl<V: Variant> InaccurateVariant<V> {
+    pub(super) fn new(inner: V, error: f32) -> Self {
+        Self { inner, error, surface: DeformedSurface::default() }
     }
 }
 
-impl<V: Variant> Variant for Damaged<V> {
+impl<V: Variant> Variant for InaccurateVariant<V> {
     fn label(&self) -> &VariantLabel {
         self.inner.label()
     }
@@ -42,10 +42,10 @@ impl<V: Variant> Variant for Damaged<V> {
         self.inner.traffic()
     }
 
-    fn surface(&mut self, at: usize, state: &SceneState) -> Result<&DeformedSurface> {
-        self.surface = self.inner.surface(at, state)?.clone();
-        let last = self.surface.positions.last_mut().expect("a vertex");
-        *last += self.damage;
+    fn surface(&mut self, state_index: usize, state: &SceneState) -> Result<&DeformedSurface> {
+        self.surface = self.inner.surface(state_index, state)?.clone();
+        let last = self.surface.positions.last_mut().expect("at least one vertex");
+        *last += self.error;
         Ok(&self.surface)
     }
 
@@ -55,17 +55,17 @@ impl<V: Variant> Variant for Damaged<V> {
 }
 
 /// Emulates storage and truncation in f64 and rounds only the positions.
-pub(super) struct Emulated {
+pub(super) struct EmulatedVariant {
     pub(super) label: VariantLabel,
     pub(super) scene: Arc<Scene>,
     /// Error model that it applies.
-    pub(super) does: ErrorModel,
+    pub(super) applied: ErrorModel,
     /// Error model that it declares, which gives its bounds.
-    pub(super) says: ErrorModel,
+    pub(super) declared: ErrorModel,
     pub(super) surface: DeformedSurface,
 }
 
-impl Variant for Emulated {
+impl Variant for EmulatedVariant {
     fn label(&self) -> &VariantLabel {
         &self.label
     }
@@ -75,18 +75,18 @@ impl Variant for Emulated {
     }
 
     fn error_model(&self) -> &ErrorModel {
-        &self.says
+        &self.declared
     }
 
     fn traffic(&self) -> Vec<Operand> {
         Vec::new()
     }
 
-    fn surface(&mut self, _at: usize, state: &SceneState) -> Result<&DeformedSurface> {
-        self.does.follow(state);
-        self.says.follow(state);
-        let take = ErrorModelTerms { storage: Some(&self.does), truncation: Some(&self.does) };
-        let positions = positions(&self.scene, &ExactState::of(state), take);
+    fn surface(&mut self, _state_index: usize, state: &SceneState) -> Result<&DeformedSurface> {
+        self.applied.follow(state);
+        self.declared.follow(state);
+        let terms = ErrorModelTerms { storage: Some(&self.applied), truncation: Some(&self.applied) };
+        let positions = positions(&self.scene, &ExactState::of(state), terms);
         self.surface.positions = positions.as_flattened().iter().map(|number| *number as f32).collect();
         Ok(&self.surface)
     }

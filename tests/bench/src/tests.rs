@@ -1,22 +1,25 @@
 use super::*;
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_model::error::invalid;
-use testing::Damaged;
+use testing::InaccurateVariant;
 use variant::{DeformerVariant, VariantLabel};
 use variant::{VariantCandidate, VariantFilter, make_candidate};
 
-/// A bench with the CPU deformer, intact and damaged, and a variant that cannot be created.
-struct Mixed {
-    damage: f32,
+/// A target with the CPU deformer, and with the same deformer plus a position error.
+struct CpuTarget {
+    error: f32,
 }
 
-impl BenchTarget for Mixed {
-    fn variants(&self, load: &Workload, wanted: VariantFilter<'_>) -> Vec<VariantCandidate> {
+impl BenchTarget for CpuTarget {
+    fn variants(&self, load: &Workload, is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
         let label = |name: &str| VariantLabel::new(name, Backend::Cpu, &load.scene);
         let cpu =
             |label: VariantLabel| DeformerVariant::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
-        let bad = |label: VariantLabel| Ok(Damaged::new(cpu(label), self.damage));
-        vec![make_candidate(wanted, label("good"), |label| Ok(cpu(label))), make_candidate(wanted, label("bad"), bad)]
+        let inaccurate = |label: VariantLabel| Ok(InaccurateVariant::new(cpu(label), self.error));
+        vec![
+            make_candidate(is_selected, label("accurate"), |label| Ok(cpu(label))),
+            make_candidate(is_selected, label("inaccurate"), inaccurate),
+        ]
     }
 
     fn roofs(&self, _backend: Backend) -> MemoryBandwidth {
@@ -28,35 +31,35 @@ fn request(sources: Vec<WorkloadSource>) -> DeformReportOptions {
     DeformReportOptions { sources, seeds: 3, replays: 20, steps: usize::MAX, variants: vec![], size: Size::Quick }
 }
 
-fn report(damage: f32) -> DeformReport {
+fn report(error: f32) -> DeformReport {
     let sources = vec![
         WorkloadSource::Synthetic(WorkloadKind::Plant(1)),
         WorkloadSource::Synthetic(WorkloadKind::Single { power: 14, rank: 10 }),
     ];
-    let mut heard = Vec::new();
-    let hear = |told: Progress<'_>| {
-        heard.push(match told {
+    let mut events = Vec::new();
+    let on_progress = |progress: Progress<'_>| {
+        events.push(match progress {
             Progress::Started(what) => what.to_owned(),
             Progress::Measured(report) => format!("{} {:?}", report.rows.len(), report.missing),
         });
         Ok(())
     };
-    let report = deform(&request(sources), &Mixed { damage }, hear).expect("a report");
-    assert!(heard[0].starts_with("plant-2: ") && heard[2].starts_with("single-14-10: "), "{heard:?}");
-    assert_eq!([&heard[1], &heard[3]], ["4 [\"single-14-10\"]", "8 []"]);
+    let report = deform(&request(sources), &CpuTarget { error }, on_progress).expect("expected a report");
+    assert!(events[0].starts_with("plant-2: ") && events[2].starts_with("single-14-10: "), "{events:?}");
+    assert_eq!([&events[1], &events[3]], ["4 [\"single-14-10\"]", "8 []"]);
     report
 }
 
 #[test]
 fn interrupted_run_keeps_results_and_names_missing_loads() {
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("expected a folder");
     let absent = WorkloadSource::Scene { source: "absent".into(), record: None };
     let request = request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains), absent]);
-    let keep = |told: Progress<'_>| match told {
+    let write_report = |progress: Progress<'_>| match progress {
         Progress::Measured(report) => report.write(folder.path()),
         Progress::Started(_) => Ok(()),
     };
-    deform(&request, &Mixed { damage: 0.0 }, keep).expect_err("no such scene");
+    deform(&request, &CpuTarget { error: 0.0 }, write_report).expect_err("no such scene");
     let json = std::fs::read(folder.path().join("report.json")).expect("written");
     let json: serde_json::Value = serde_json::from_slice(&json).expect("JSON");
     assert_eq!((&json["missing"][0], json["rows"].as_array().map(Vec::len)), (&"absent".into(), Some(4)));
@@ -72,7 +75,7 @@ fn interrupted_run_keeps_results_and_names_missing_loads() {
 fn writes_all_report_files_and_reads_them_back() {
     let report = report(0.0);
     assert!(report.passed(), "{:?}", report.failed);
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("expected a folder");
     let out = folder.path().join("new");
     report.write(&out).expect("written");
     let read = |name: &str| std::fs::read(out.join(name)).expect(name);
@@ -91,52 +94,56 @@ fn writes_all_report_files_and_reads_them_back() {
 }
 
 #[test]
-fn damaged_variant_fails_report_and_is_not_timed() {
+fn inaccurate_variant_fails_report_and_is_not_timed() {
     let report = report(0.01);
     assert!(!report.passed());
     assert_eq!(report.failed.len(), 2);
-    assert!(report.failed[0].starts_with("plant-2: bad: "), "{:?}", report.failed);
+    assert!(report.failed[0].starts_with("plant-2: inaccurate: "), "{:?}", report.failed);
     for row in &report.rows {
-        assert_eq!((row.passed, row.timing.is_some()), (row.name == "good", row.name == "good"));
+        assert_eq!((row.passed, row.timing.is_some()), (row.name == "accurate", row.name == "accurate"));
     }
 }
 
 #[test]
 fn variant_that_cannot_be_created_fails_report() {
-    struct Broken;
-    impl BenchTarget for Broken {
-        fn variants(&self, load: &Workload, _wanted: VariantFilter<'_>) -> Vec<VariantCandidate> {
+    struct BrokenTarget;
+    impl BenchTarget for BrokenTarget {
+        fn variants(&self, load: &Workload, _is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
             let label = VariantLabel::new("lost", Backend::Cuda, &load.scene);
             vec![(label, Err(invalid("kernel", "one that compiles", "none")))]
         }
     }
-    let report = deform(&request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &Broken, |_| Ok(()))
-        .expect("a report");
+    let report =
+        deform(&request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &BrokenTarget, |_| Ok(()))
+            .expect("expected a report");
     assert_eq!(report.failed, ["c: lost: kernel: expected one that compiles, got none"]);
     assert!(plot::png(&plot::svg(&report)).is_ok(), "an empty plot is still a plot");
 }
 
 #[test]
 fn unavailable_variant_is_skipped_without_failing_report() {
-    struct Lacking;
-    impl BenchTarget for Lacking {
-        fn variants(&self, load: &Workload, _wanted: VariantFilter<'_>) -> Vec<VariantCandidate> {
+    struct UnavailableTarget;
+    impl BenchTarget for UnavailableTarget {
+        fn variants(&self, load: &Workload, _is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
             let label = VariantLabel::new("peer", Backend::Cuda, &load.scene);
             let (reason, remedy) = ("not found".into(), "install it".into());
             vec![(label, Err(modalcast_model::error::Error::Unavailable { what: "a library", reason, remedy }))]
         }
     }
-    let report = deform(&request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &Lacking, |_| Ok(()))
-        .expect("a report");
-    assert!(report.passed() && report.rows[0].left_out && !report.rows[0].passed);
+    let report =
+        deform(&request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &UnavailableTarget, |_| Ok(()))
+            .expect("expected a report");
+    assert!(report.passed() && report.rows[0].is_skipped && !report.rows[0].passed);
     assert!(report.rows[0].faults[0].contains("not found"), "{:?}", report.rows[0].faults);
 }
 
 #[test]
 fn overlap_fails_report_only_when_vertices_differ() {
-    struct Beside(usize);
-    impl BenchTarget for Beside {
-        fn variants(&self, _load: &Workload, _wanted: VariantFilter<'_>) -> Vec<VariantCandidate> {
+    struct OverlapTarget {
+        differing: usize,
+    }
+    impl BenchTarget for OverlapTarget {
+        fn variants(&self, _load: &Workload, _is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
             Vec::new()
         }
 
@@ -146,12 +153,12 @@ fn overlap_fails_report_only_when_vertices_differ() {
             states: &[modalcast_model::scene::SceneState],
             steps: usize,
         ) -> Option<Result<Overlap>> {
-            assert_eq!(states.len(), ROTATING);
+            assert_eq!(states.len(), ROTATING_STATES);
             let us = 12.5;
             let (cores, [bytes_in, bytes_out]) = (2, [1, 2]);
             let [write_one_core_us, write_us, graph_us, copy_out_us, step_us, ideal_us] = [us; 6];
             let [serial_us, fetched_us, overlapped_us, gain] = [4.0 * us, 3.0 * us, 2.0 * us, 2.0];
-            let differing = self.0;
+            let differing = self.differing;
             Some(Ok(Overlap {
                 steps,
                 cores,
@@ -171,29 +178,29 @@ fn overlap_fails_report_only_when_vertices_differ() {
             }))
         }
     }
-    let made = |differing, variants: &[&str]| {
+    let report_with = |differing, variants: &[&str]| {
         let variants = variants.iter().map(|name| (*name).to_owned()).collect();
         let request =
             DeformReportOptions { variants, ..request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]) };
-        deform(&request, &Beside(differing), |_| Ok(())).expect("a report")
+        deform(&request, &OverlapTarget { differing }, |_| Ok(())).expect("expected a report")
     };
-    assert_eq!(made(3, &[]).failed, ["c: cuda overlap: 3 steps differ"]);
-    let good = made(0, &["cuda overlap"]);
+    assert_eq!(report_with(3, &[]).failed, ["c: cuda overlap: 3 steps differ"]);
+    let good = report_with(0, &["cuda overlap"]);
     assert!(good.passed());
-    assert!(markdown::markdown(&good).contains("50.0 one after the other, 37.5"));
-    assert_eq!(made(3, &["cpu*"]).loads[0].overlap, None, "not asked for");
+    assert!(markdown::markdown(&good).contains("50.0 serially, 37.5"));
+    assert_eq!(report_with(3, &["cpu*"]).loads[0].overlap, None, "the overlap is not selected");
 }
 
 #[test]
 fn user_scene_is_measured_under_its_own_name() {
     let source = WorkloadSource::Scene { source: "tree".into(), record: None };
-    let report = deform(&request(vec![source]), &Mixed { damage: 0.0 }, |_| Ok(())).expect("a report");
+    let report = deform(&request(vec![source]), &CpuTarget { error: 0.0 }, |_| Ok(())).expect("expected a report");
     assert!(report.passed(), "{:?}", report.failed);
     assert_eq!((report.loads[0].name.as_str(), report.loads[0].recorded), ("tree", false));
     assert!(
         deform(
             &request(vec![WorkloadSource::Scene { source: "absent".into(), record: None }]),
-            &Mixed { damage: 0.0 },
+            &CpuTarget { error: 0.0 },
             |_| Ok(())
         )
         .is_err()

@@ -12,7 +12,7 @@ use super::errors::{
     ErrorNorms, ErrorScale, IMAGE_SIZE, NormAccumulator, OrientationErrorAccumulator, OrientationErrors,
     PositionErrorAccumulator, PositionErrors, step_errors,
 };
-use super::exact_positions::{ReferenceVertex, reference_vertices, widen};
+use super::exact_positions::{ReferenceVertex, reference_vertices, widen_bounds};
 use super::motion::WorkloadMotion;
 use super::timing::quantile;
 use super::variant::Variant;
@@ -22,8 +22,8 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::Error;
 use modalcast_model::scene::{Camera, DeformationSettings, NormalMethod, Scene, SceneState};
 
-/// Number of seeds for which the error is split into its sources. Each split costs five evaluations in f64.
-const SPLIT: usize = 4;
+/// Number of seeds for which the error is split into its sources. Each split takes five evaluations in f64.
+const SPLIT_SEEDS: usize = 4;
 
 /// Condition numbers of the modal sums of a load: sum |U q| / |u| per vertex.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
@@ -50,7 +50,8 @@ pub struct ValidationResult {
     /// Reasons why the variant failed; empty when it passed.
     pub faults: Vec<String>,
     /// Whether the variant was skipped because something that it needs is unavailable on this machine.
-    pub left_out: bool,
+    #[serde(rename = "left_out")]
+    pub is_skipped: bool,
 }
 
 impl ValidationResult {
@@ -63,32 +64,35 @@ impl ValidationResult {
 /// Accumulator for the [`ValidationResult`] of one variant.
 struct VariantCheck<'a> {
     variant: &'a mut dyn Variant,
-    tally: PositionErrorAccumulator,
-    turned: OrientationErrorAccumulator,
-    split: ErrorSourcesAccumulator,
+    positions: PositionErrorAccumulator,
+    orientation: OrientationErrorAccumulator,
+    sources: ErrorSourcesAccumulator,
     steps: NormAccumulator,
-    before: Option<(Vec<f32>, Arc<Vec<ReferenceVertex>>)>,
+    /// The variant's positions and the references at the previous step of the trajectory.
+    previous: Option<(Vec<f32>, Arc<Vec<ReferenceVertex>>)>,
     /// The variant's most recent surface. The buffers are reused.
-    held: DeformedSurface,
-    first: DeformedSurface,
-    repeatable: bool,
+    surface: DeformedSurface,
+    /// The surface at the first state.
+    first_surface: DeformedSurface,
+    is_repeatable: bool,
     fault: Option<String>,
-    left_out: bool,
+    is_skipped: bool,
 }
 
 /// One state to validate, with the reference values that all variants share.
 struct StateSample<'a> {
-    at: usize,
-    scenes: &'a Scenes<'a>,
+    index: usize,
+    scenes: &'a NormalScenes<'a>,
     state: &'a SceneState,
     /// Exact positions, with the bounds of a deformer that stores U exactly and sums all modes.
-    judged: Arc<Vec<ReferenceVertex>>,
-    partial: StateCondition,
+    references: Arc<Vec<ReferenceVertex>>,
+    condition: StateCondition,
     /// Present for the states whose error is split into its sources.
-    origin: Option<SharedErrorSources>,
+    error_sources: Option<SharedErrorSources>,
     rigid: OnceLock<Directions>,
     exact: OnceLock<Directions>,
-    along: bool,
+    /// Whether the state is a step of the trajectory.
+    is_trajectory_step: bool,
 }
 
 /// Reference normals and tangents in f64.
@@ -98,26 +102,36 @@ struct Directions {
 }
 
 /// The scenes that define the correct directions.
-struct Scenes<'a> {
+struct NormalScenes<'a> {
     rigid: &'a Scene,
     /// The same scene with exact normals of the deformed surface; `None` when it has no modes or no normals.
-    bent: Option<Arc<Scene>>,
+    exact: Option<Arc<Scene>>,
 }
 
-impl<'a> Scenes<'a> {
+impl<'a> NormalScenes<'a> {
     fn new(load: &'a Workload) -> Self {
         let exact_normals = DeformationSettings { normals: NormalMethod::Exact, ..load.scene.deformation };
-        let bends = load.scene.needs.modes && has_normals(&load.scene);
-        let bent = bends.then(|| with_deformation(&load.scene, exact_normals)).and_then(Result::ok);
-        Self { rigid: &load.scene, bent }
+        let has_exact_normals = load.scene.needs.modes && has_normals(&load.scene);
+        let exact = has_exact_normals.then(|| with_deformation(&load.scene, exact_normals)).and_then(Result::ok);
+        Self { rigid: &load.scene, exact }
     }
 }
 
 impl<'a> StateSample<'a> {
-    fn new(scenes: &'a Scenes<'a>, at: usize, state: &'a SceneState, along: bool) -> Self {
-        let judged = Arc::new(reference_vertices(scenes.rigid, state));
+    fn new(scenes: &'a NormalScenes<'a>, index: usize, state: &'a SceneState, is_trajectory_step: bool) -> Self {
+        let references = Arc::new(reference_vertices(scenes.rigid, state));
         let (rigid, exact) = (OnceLock::new(), OnceLock::new());
-        Self { at, scenes, state, partial: StateCondition::of(&judged), judged, origin: None, rigid, exact, along }
+        Self {
+            index,
+            scenes,
+            state,
+            condition: StateCondition::of(&references),
+            references,
+            error_sources: None,
+            rigid,
+            exact,
+            is_trajectory_step,
+        }
     }
 
     /// Reference directions: by T alone, or, if `exact`, of the deformed surface. Computed at the first call and
@@ -125,9 +139,10 @@ impl<'a> StateSample<'a> {
     fn directions(&self, exact: bool) -> &Directions {
         match exact {
             true => self.exact.get_or_init(|| {
-                let (scene, places) = (self.scenes.bent.as_deref().unwrap_or(self.scenes.rigid), places(&self.judged));
-                let normals = || reference::exact_normals(scene, self.state, &places);
-                let tangents = || reference::exact_tangents(scene, self.state, &places);
+                let (scene, positions) =
+                    (self.scenes.exact.as_deref().unwrap_or(self.scenes.rigid), positions_of(&self.references));
+                let normals = || reference::exact_normals(scene, self.state, &positions);
+                let tangents = || reference::exact_tangents(scene, self.state, &positions);
                 let (normals, tangents) = rayon::join(normals, tangents);
                 Directions { normals, tangents }
             }),
@@ -141,9 +156,9 @@ impl<'a> StateSample<'a> {
     }
 }
 
-/// Upper limit of the vertices plus corners of the states that are evaluated together: 40 bytes per vertex and up to
-/// 112 per corner.
-const AT_ONCE: usize = 1 << 24;
+/// Maximum number of vertices plus corners of the states that are evaluated together. A vertex takes 40 bytes and a
+/// corner up to 112.
+const MAX_GROUP_ITEMS: usize = 1 << 24;
 
 /// Validates the variants at `seeds` random states and at no more than `steps` states of the trajectory, at every
 /// vertex and corner. The reference values are computed once for all variants, in parallel over several states.
@@ -154,177 +169,182 @@ pub fn validate(
     (seeds, steps): (usize, usize),
 ) -> (Vec<ValidationResult>, ConditionNumbers) {
     let camera = Camera::fit_to_scene(&load.scene, IMAGE_SIZE.0, IMAGE_SIZE.1);
-    let yardstick = ErrorScale::new(&load.scene, &camera);
-    let truth = |at: usize| if at < seeds { motion.seed(at) } else { motion.step(at - seeds) };
+    let error_scale = ErrorScale::new(&load.scene, &camera);
+    let truth = |index: usize| if index < seeds { motion.seed(index) } else { motion.step(index - seeds) };
     let count = seeds + motion.steps().min(steps);
-    let states: Vec<SceneState> = (0..count).into_par_iter().map(|at| truth(at).state()).collect();
-    let mut cases: Vec<VariantCheck<'_>> =
+    let states: Vec<SceneState> = (0..count).into_par_iter().map(|index| truth(index).state()).collect();
+    let mut checks: Vec<VariantCheck<'_>> =
         variants.iter_mut().map(|variant| VariantCheck::new(variant.as_mut(), &states)).collect();
-    let (scenes, mut conditions) = (Scenes::new(load), ConditionAccumulator::default());
+    let (scenes, mut conditions) = (NormalScenes::new(load), ConditionAccumulator::default());
     // Which directions the variants needed at the first state. For the other states these are computed beforehand, in
     // parallel.
-    let mut asked = [false; 2];
+    let mut is_needed = [false; 2];
     for group in groups(count, load.scene.layout.vertices + load.scene.layout.corners) {
-        let look = |at: usize| {
-            let look = StateSample::new(&scenes, at, &states[at], at >= seeds);
-            for exact in [false, true].into_iter().filter(|exact| asked[usize::from(*exact)]) {
-                look.directions(exact);
+        let evaluate = |index: usize| {
+            let sample = StateSample::new(&scenes, index, &states[index], index >= seeds);
+            for exact in [false, true].into_iter().filter(|exact| is_needed[usize::from(*exact)]) {
+                sample.directions(exact);
             }
-            let split = at < SPLIT.min(seeds);
-            StateSample { origin: split.then(|| SharedErrorSources::new(&load.scene, truth(at), &states[at])), ..look }
+            let is_split = index < SPLIT_SEEDS.min(seeds);
+            let error_sources = is_split.then(|| SharedErrorSources::new(&load.scene, truth(index), &states[index]));
+            StateSample { error_sources, ..sample }
         };
-        let looks: Vec<StateSample<'_>> = group.into_par_iter().map(look).collect();
-        for look in looks {
-            conditions.add(&look.partial);
-            cases.iter_mut().for_each(|case| case.look(&yardstick, &look));
-            if look.at == 0 {
-                let exact = cases.iter().any(|case| case.is_held_to_surface());
-                asked = [look.rigid.get().is_some(), exact];
+        let samples: Vec<StateSample<'_>> = group.into_par_iter().map(evaluate).collect();
+        for sample in samples {
+            conditions.add(&sample.condition);
+            checks.iter_mut().for_each(|check| check.add_sample(&error_scale, &sample));
+            if sample.index == 0 {
+                let exact = checks.iter().any(|check| check.has_exact_normals());
+                is_needed = [sample.rigid.get().is_some(), exact];
             }
         }
     }
-    cases.iter_mut().for_each(|case| case.repeat(&states));
-    (cases.into_iter().map(|case| case.found(&yardstick)).collect(), conditions.condition())
+    checks.iter_mut().for_each(|check| check.repeat_first_state(&states));
+    (checks.into_iter().map(|check| check.result(&error_scale)).collect(), conditions.finish())
 }
 
 /// Splits states 0 to `count` into groups that are evaluated together. The first state is its own group, because it
 /// shows which directions the others need.
 fn groups(count: usize, items: usize) -> impl Iterator<Item = Range<usize>> {
-    let together = (AT_ONCE / items.max(1)).clamp(1, rayon::current_num_threads());
-    let rest = (1..count).step_by(together).map(move |first| first..count.min(first + together));
+    let group_size = (MAX_GROUP_ITEMS / items.max(1)).clamp(1, rayon::current_num_threads());
+    let rest = (1..count).step_by(group_size).map(move |first| first..count.min(first + group_size));
     std::iter::once(0..count.min(1)).chain(rest)
 }
 
 impl<'a> VariantCheck<'a> {
     fn new(variant: &'a mut dyn Variant, states: &[SceneState]) -> Self {
         let fault = variant.prepare(states).err();
-        let left_out = matches!(fault, Some(Error::Unavailable { .. }));
+        let is_skipped = matches!(fault, Some(Error::Unavailable { .. }));
         let fault = fault.map(|error| error.to_string());
         Self {
             variant,
-            tally: PositionErrorAccumulator::default(),
-            turned: OrientationErrorAccumulator::default(),
-            split: ErrorSourcesAccumulator::default(),
+            positions: PositionErrorAccumulator::default(),
+            orientation: OrientationErrorAccumulator::default(),
+            sources: ErrorSourcesAccumulator::default(),
             steps: NormAccumulator::default(),
-            before: None,
-            held: DeformedSurface::default(),
-            first: DeformedSurface::default(),
-            repeatable: true,
+            previous: None,
+            surface: DeformedSurface::default(),
+            first_surface: DeformedSurface::default(),
+            is_repeatable: true,
             fault,
-            left_out,
+            is_skipped,
         }
     }
 
-    fn look(&mut self, yardstick: &ErrorScale, look: &StateSample<'_>) {
+    fn add_sample(&mut self, error_scale: &ErrorScale, sample: &StateSample<'_>) {
         if self.fault.is_some() {
             return;
         }
-        match self.variant.surface(look.at, look.state) {
-            Ok(surface) => copy(&mut self.held, surface),
+        match self.variant.surface(sample.index, sample.state) {
+            Ok(surface) => copy_surface(&mut self.surface, surface),
             Err(error) => {
                 self.fault = Some(error.to_string());
                 return;
             }
         }
-        if self.held.positions.len() != 3 * look.judged.len() {
-            let (given, wanted) = (self.held.positions.len(), look.judged.len());
-            self.fault = Some(format!("{given} coordinates for {wanted} vertices"));
+        if self.surface.positions.len() != 3 * sample.references.len() {
+            let (expected, given) = (3 * sample.references.len(), self.surface.positions.len());
+            self.fault = Some(format!("positions: expected {expected} coordinates, got {given}"));
             return;
         }
-        self.tally.add(yardstick, &self.held.positions, &self.judged(look));
-        self.orient(look);
-        if let Some(origin) = &look.origin {
+        self.positions.add(error_scale, &self.surface.positions, &self.bounded_references(sample));
+        self.add_orientation(sample);
+        if let Some(error_sources) = &sample.error_sources {
             let (scene, error_model) = (self.variant.scene(), self.variant.error_model());
-            origin.split(scene, error_model, &self.held.positions, &mut self.split);
+            error_sources.add_sources(scene, error_model, &self.surface.positions, &mut self.sources);
         }
-        if look.at == 0 {
-            copy(&mut self.first, &self.held);
+        if sample.index == 0 {
+            copy_surface(&mut self.first_surface, &self.surface);
         }
-        if look.along {
-            self.step(look);
+        if sample.is_trajectory_step {
+            self.add_step(sample);
         }
     }
 
-    /// Error of the step from the previous state.
-    fn step(&mut self, look: &StateSample<'_>) {
-        if let Some((positions, before)) = &self.before {
-            self.steps = self.steps.join(step_errors([positions, &self.held.positions], [before, &look.judged]));
+    /// Adds the error of the step from the previous state.
+    fn add_step(&mut self, sample: &StateSample<'_>) {
+        if let Some((positions, references)) = &self.previous {
+            self.steps =
+                self.steps.join(step_errors([positions, &self.surface.positions], [references, &sample.references]));
         }
-        let (mut positions, _) = self.before.take().unwrap_or_default();
-        std::mem::swap(&mut positions, &mut self.held.positions);
-        self.before = Some((positions, Arc::clone(&look.judged)));
+        let (mut positions, _) = self.previous.take().unwrap_or_default();
+        std::mem::swap(&mut positions, &mut self.surface.positions);
+        self.previous = Some((positions, Arc::clone(&sample.references)));
     }
 
     /// Whether the variant outputs normals that must follow the deformed surface.
-    fn is_held_to_surface(&self) -> bool {
-        !self.held.normals.is_empty() && self.variant.scene().needs.exact_normals
+    fn has_exact_normals(&self) -> bool {
+        !self.surface.normals.is_empty() && self.variant.scene().needs.exact_normals
     }
 
     /// Evaluates the first state again, after all others. Variants with truncation are exempt: their choice of modes
     /// may depend on earlier states.
-    fn repeat(&mut self, states: &[SceneState]) {
+    fn repeat_first_state(&mut self, states: &[SceneState]) {
         if self.fault.is_none() && !self.variant.error_model().truncates() {
-            let again = self.variant.surface(0, &states[0]);
-            self.repeatable = again.is_ok_and(|again| bits(again).eq(bits(&self.first)));
+            let surface = self.variant.surface(0, &states[0]);
+            self.is_repeatable =
+                surface.is_ok_and(|surface| surface_bits(surface).eq(surface_bits(&self.first_surface)));
         }
     }
 
     /// The exact positions with this variant's own bounds.
-    fn judged(&self, look: &StateSample<'_>) -> Arc<Vec<ReferenceVertex>> {
+    fn bounded_references(&self, sample: &StateSample<'_>) -> Arc<Vec<ReferenceVertex>> {
         let error_model = self.variant.error_model();
         match error_model.is_exact() {
-            true => Arc::clone(&look.judged),
-            false => Arc::new(widen(self.variant.scene(), look.state, &look.judged, error_model)),
+            true => Arc::clone(&sample.references),
+            false => Arc::new(widen_bounds(self.variant.scene(), sample.state, &sample.references, error_model)),
         }
     }
 
-    fn orient(&mut self, look: &StateSample<'_>) {
-        let DeformedSurface { normals, tangents, .. } = &self.held;
+    /// Adds the errors of normals and tangents.
+    fn add_orientation(&mut self, sample: &StateSample<'_>) {
+        let DeformedSurface { normals, tangents, .. } = &self.surface;
         if normals.is_empty() {
             return;
         }
-        let want = look.directions(self.variant.scene().needs.exact_normals);
-        self.turned.add_normals(normals, &want.normals);
-        if look.origin.is_some() && look.scenes.bent.is_some() {
-            self.turned.add_to_surface(normals, &look.directions(true).normals);
+        let want = sample.directions(self.variant.scene().needs.exact_normals);
+        self.orientation.add_normals(normals, &want.normals);
+        if sample.error_sources.is_some() && sample.scenes.exact.is_some() {
+            self.orientation.add_to_surface(normals, &sample.directions(true).normals);
         }
-        self.turned.add_tangents(tangents, &want.tangents, normals);
+        self.orientation.add_tangents(tangents, &want.tangents, normals);
     }
 
-    fn found(self, yardstick: &ErrorScale) -> ValidationResult {
-        let (errors, orientation) = (self.tally.errors(yardstick), self.turned.orientation());
+    fn result(self, error_scale: &ErrorScale) -> ValidationResult {
+        let (errors, orientation) = (self.positions.errors(error_scale), self.orientation.orientation());
         let mut faults: Vec<String> = self.fault.into_iter().collect();
         if !errors.passed() {
             let PositionErrors { of_bound, not_finite, .. } = errors;
-            faults.push(format!("{of_bound:.3} times its a-priori bound, {not_finite} coordinates not finite"));
+            faults
+                .push(format!("error of {of_bound:.3} times its a-priori bound, {not_finite} coordinates not finite"));
         }
         if orientation.broken > 0 {
-            faults.push(format!("{} normals or tangents are no directions", orientation.broken));
+            faults.push(format!("{} normals or tangents are not unit vectors", orientation.broken));
         }
         ValidationResult {
             errors,
-            step_meters: self.steps.spread(yardstick.unit()).unwrap_or_default(),
-            sources: self.split.sources(yardstick.unit()),
+            step_meters: self.steps.norms(error_scale.unit()).unwrap_or_default(),
+            sources: self.sources.sources(error_scale.unit()),
             orientation,
-            repeatable: self.repeatable,
+            repeatable: self.is_repeatable,
             faults,
-            left_out: self.left_out,
+            is_skipped: self.is_skipped,
         }
     }
 }
 
 /// Copies a surface into the buffers of another.
-fn copy(to: &mut DeformedSurface, from: &DeformedSurface) {
-    to.positions.clone_from(&from.positions);
-    to.normals.clone_from(&from.normals);
-    to.tangents.clone_from(&from.tangents);
+fn copy_surface(dst: &mut DeformedSurface, src: &DeformedSurface) {
+    dst.positions.clone_from(&src.positions);
+    dst.normals.clone_from(&src.normals);
+    dst.tangents.clone_from(&src.tangents);
 }
 
-fn places(judged: &[ReferenceVertex]) -> Vec<[f64; 3]> {
-    judged.par_iter().map(|judged| judged.at).collect()
+fn positions_of(references: &[ReferenceVertex]) -> Vec<[f64; 3]> {
+    references.par_iter().map(|reference| reference.position).collect()
 }
 
-fn bits(surface: &DeformedSurface) -> impl Iterator<Item = u32> + '_ {
+fn surface_bits(surface: &DeformedSurface) -> impl Iterator<Item = u32> + '_ {
     let lists = [&surface.positions, &surface.normals, &surface.tangents];
     lists.into_iter().flatten().map(|number| number.to_bits())
 }
@@ -338,13 +358,13 @@ struct StateCondition {
 }
 
 impl StateCondition {
-    fn of(judged: &[ReferenceVertex]) -> Self {
-        let all = judged.iter().map(|judged| judged.condition).filter(|condition| *condition > 0.0);
-        let mut all: Vec<f64> = all.collect();
-        let count = all.len();
-        all.retain(|condition| condition.is_finite());
-        let largest = all.iter().copied().fold(0.0, f64::max);
-        Self { largest, infinite: (count - all.len()) as u64, median: quantile(&mut all, 0.5) }
+    fn of(references: &[ReferenceVertex]) -> Self {
+        let positive = references.iter().map(|reference| reference.condition).filter(|condition| *condition > 0.0);
+        let mut conditions: Vec<f64> = positive.collect();
+        let count = conditions.len();
+        conditions.retain(|condition| condition.is_finite());
+        let largest = conditions.iter().copied().fold(0.0, f64::max);
+        Self { largest, infinite: (count - conditions.len()) as u64, median: quantile(&mut conditions, 0.5) }
     }
 }
 
@@ -363,7 +383,7 @@ impl ConditionAccumulator {
         self.medians.extend(state.median);
     }
 
-    fn condition(mut self) -> ConditionNumbers {
+    fn finish(mut self) -> ConditionNumbers {
         let median = quantile(&mut self.medians, 0.5).unwrap_or(0.0);
         ConditionNumbers { largest: self.largest, median, infinite: self.infinite }
     }
@@ -373,36 +393,36 @@ impl ConditionAccumulator {
 mod tests {
     use super::*;
     use crate::error_model::ErrorModel;
-    use crate::testing::{Damaged, Emulated};
+    use crate::testing::{EmulatedVariant, InaccurateVariant};
     use crate::variant::{DeformerVariant, VariantLabel};
     use crate::workloads::{Size, WorkloadKind};
     use modalcast_compute::cpu::CpuDeformer;
     use modalcast_model::deform::Backend;
     use modalcast_model::scene::StorageType;
 
-    fn find(kind: WorkloadKind, damage: f32) -> (ValidationResult, ConditionNumbers) {
-        let load = kind.build(Size::Quick).expect("built");
+    fn validate_cpu(kind: WorkloadKind, error: f32) -> (ValidationResult, ConditionNumbers) {
+        let load = kind.build(Size::Quick).expect("expected a load");
         let label = VariantLabel::new("cpu", Backend::Cpu, &load.scene);
         let cpu = DeformerVariant::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
-        let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(Damaged::new(cpu, damage))];
+        let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(InaccurateVariant::new(cpu, error))];
         let motion = WorkloadMotion::new(&load, None);
         let (mut found, condition) = validate(&load, &motion, &mut variants, (4, usize::MAX));
         (found.remove(0), condition)
     }
 
     #[test]
-    fn cpu_passes_all_loads_and_fills_all_figures() {
-        let (found, condition) = find(WorkloadKind::OneDomain { dressed: true }, 0.0);
+    fn cpu_passes_all_loads_and_fills_all_results() {
+        let (found, condition) = validate_cpu(WorkloadKind::OneDomain { dressed: true }, 0.0);
         assert!(found.passed() && found.repeatable, "{:?}", found.faults);
         assert_eq!(found.errors.states, 4 + 24);
         assert!(found.errors.meters.largest > 0.0 && found.errors.of_diagonal.largest < 1e-6, "{found:?}");
         assert!(found.step_meters.largest > 0.0 && found.step_meters.largest < 2e-6, "{found:?}");
-        let normals = found.orientation.normals_degrees.expect("normals");
-        let tangents = found.orientation.tangents_degrees.expect("tangents");
-        let to_surface = found.orientation.normals_to_surface_degrees.expect("normals");
+        let normals = found.orientation.normals_degrees.expect("expected normals");
+        let tangents = found.orientation.tangents_degrees.expect("expected tangents");
+        let to_surface = found.orientation.normals_to_surface_degrees.expect("expected normals");
         assert!(to_surface.largest > 0.1, "rigid normals do not follow the surface: {found:?}");
         assert!(normals.largest < 1e-4 && tangents.largest < 1e-4, "{found:?}");
-        assert!(found.orientation.normal_dot_tangent.expect("dots").largest < 1e-6, "{found:?}");
+        assert!(found.orientation.normal_dot_tangent.expect("expected dot products").largest < 1e-6, "{found:?}");
         let ErrorSources { storage, q, accumulation, transform, origin, truncation } = found.sources;
         assert_eq!([storage, truncation], [ErrorNorms::default(); 2]);
         assert!([q, accumulation, transform, origin].iter().all(|part| part.largest > 0.0), "{:?}", found.sources);
@@ -410,28 +430,28 @@ mod tests {
         for kind in
             [WorkloadKind::ManyDomains, WorkloadKind::TinyDomains, WorkloadKind::Cancelling, WorkloadKind::Plant(1)]
         {
-            let (found, _) = find(kind, 0.0);
+            let (found, _) = validate_cpu(kind, 0.0);
             assert!(found.passed(), "{kind:?}: {:?}", found.faults);
         }
     }
 
     #[test]
-    fn damaged_variant_fails_with_a_reason() {
-        let (found, _) = find(WorkloadKind::ManyDomains, 1e-3);
+    fn inaccurate_variant_fails_with_a_reason() {
+        let (found, _) = validate_cpu(WorkloadKind::ManyDomains, 1e-3);
         assert!(!found.passed() && found.faults[0].contains("times its a-priori bound"), "{:?}", found.faults);
-        let (found, _) = find(WorkloadKind::ManyDomains, f32::NAN);
+        let (found, _) = validate_cpu(WorkloadKind::ManyDomains, f32::NAN);
         assert!(found.faults[0].contains("not finite"), "{:?}", found.faults);
     }
 
-    /// Validates an emulated deformer that computes by the deformation `does` but declares `says`, which gives its
-    /// bounds.
-    fn emulate(does: DeformationSettings, says: DeformationSettings) -> ValidationResult {
-        let load = WorkloadKind::ManyDomains.build(Size::Quick).expect("built");
-        let [done, said] =
-            [does, says].map(|deformation| with_deformation(&load.scene, deformation).expect("restated"));
-        let label = VariantLabel::new("emulated", Backend::Cpu, &said);
-        let (does, says) = (ErrorModel::of(&done), ErrorModel::of(&said));
-        let emulated = Emulated { label, scene: said, does, says, surface: DeformedSurface::default() };
+    /// Validates an emulated deformer that applies one deformation and declares another, which gives its bounds.
+    fn emulate(applied: DeformationSettings, declared: DeformationSettings) -> ValidationResult {
+        let load = WorkloadKind::ManyDomains.build(Size::Quick).expect("expected a load");
+        let [applied_scene, declared_scene] = [applied, declared]
+            .map(|deformation| with_deformation(&load.scene, deformation).expect("expected a scene"));
+        let label = VariantLabel::new("emulated", Backend::Cpu, &declared_scene);
+        let (applied, declared) = (ErrorModel::of(&applied_scene), ErrorModel::of(&declared_scene));
+        let emulated =
+            EmulatedVariant { label, scene: declared_scene, applied, declared, surface: DeformedSurface::default() };
         let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(emulated)];
         validate(&load, &WorkloadMotion::new(&load, None), &mut variants, (3, usize::MAX)).0.remove(0)
     }
@@ -439,17 +459,17 @@ mod tests {
     #[test]
     fn approximate_deformers_meet_only_their_own_bounds() {
         let storage = |storage| DeformationSettings { storage, ..DeformationSettings::default() };
-        let [half, brain, eighth] = [StorageType::F16, StorageType::Bf16, StorageType::Int8].map(storage);
-        let short = DeformationSettings { truncation: Some(1e-4), ..DeformationSettings::default() };
-        for deformation in [half, brain, eighth, short, DeformationSettings { truncation: Some(1e-4), ..eighth }] {
+        let [f16, bf16, int8] = [StorageType::F16, StorageType::Bf16, StorageType::Int8].map(storage);
+        let truncated = DeformationSettings { truncation: Some(1e-4), ..DeformationSettings::default() };
+        for deformation in [f16, bf16, int8, truncated, DeformationSettings { truncation: Some(1e-4), ..int8 }] {
             let found = emulate(deformation, deformation);
             assert!(found.passed(), "{deformation:?}: {:?}", found.faults);
-            assert!(found.errors.of_bound > 0.05, "{deformation:?} is judged by a bound of its size: {found:?}");
+            assert!(found.errors.of_bound > 0.05, "{deformation:?}: expected a tight bound, got {found:?}");
             assert_eq!(found.sources.accumulation, ErrorNorms::default(), "{deformation:?}");
             assert_eq!(found.sources.storage.largest > 0.0, deformation.storage != StorageType::F32);
             assert_eq!(found.sources.truncation.largest > 0.0, deformation.truncation.is_some());
             assert!(!emulate(deformation, DeformationSettings::default()).passed(), "{deformation:?} is not exact");
         }
-        assert!(!emulate(eighth, half).passed() && !emulate(brain, half).passed(), "coarser than it says");
+        assert!(!emulate(int8, f16).passed() && !emulate(bf16, f16).passed(), "coarser than declared");
     }
 }

@@ -57,7 +57,7 @@ pub fn svg(report: &DeformReport) -> String {
         "font-size=\"20\" font-weight=\"bold\" fill=\"#222222\"",
         "Error against run time",
     );
-    text(&mut out, (MARGIN + 8.0, MARGIN + 40.0), "font-size=\"12\" fill=\"#555555\"", &report.made.line());
+    text(&mut out, (MARGIN + 8.0, MARGIN + 40.0), "font-size=\"12\" fill=\"#555555\"", &report.provenance.line());
     let marks = [
         "filled: warm, hollow: cold; ringed: Pareto front (partial work aside)",
         "circle: CPU, square and triangle: CUDA, diamond: reference",

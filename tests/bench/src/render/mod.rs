@@ -69,8 +69,8 @@ pub use self::raster_report::{RasterReport, rasters};
 pub use self::readback::ReadbackRates;
 use self::variants::RenderVariant;
 use self::workloads::RenderWorkload;
+use super::is_selected;
 use super::provenance::Provenance;
-use super::wants;
 use modalcast_model::error::Result;
 use modalcast_model::scene::Scene;
 use modalcast_render::{FrameParams, RendererInfo, shadow_texel_axes};
@@ -96,7 +96,7 @@ impl RenderReportOptions {
         let (few, mut all) = (variants::all(self.quick), variants::all(false));
         all.retain(|variant| {
             let is_named = self.variants.contains(&variant.name);
-            is_named || wants(&self.variants, &variant.name) && few.iter().any(|own| own.name == variant.name)
+            is_named || is_selected(&self.variants, &variant.name) && few.iter().any(|own| own.name == variant.name)
         });
         all
     }
