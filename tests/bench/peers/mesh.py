@@ -1,6 +1,6 @@
 """The scene that both programs draw: a field of hills, a knot above it, one image; OBJ, MTL, PNG and two scene files.
 
-Both programs read what this writes, so that both draw the same triangles in the same order.
+Both programs read these files, so that both draw the same triangles in the same order.
 """
 
 import struct
@@ -32,9 +32,9 @@ SHADOWS = {
 
 def grid(points, rows, columns):
     """Two triangles for each cell of a grid of points, and normals by area."""
-    at = lambda row, column: row * (columns + 1) + column
+    index = lambda row, column: row * (columns + 1) + column
     row, column = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
-    a, b, c, d = at(row, column), at(row, column + 1), at(row + 1, column + 1), at(row + 1, column)
+    a, b, c, d = index(row, column), index(row, column + 1), index(row + 1, column + 1), index(row + 1, column)
     triangles = np.stack([a, d, c, a, c, b], axis=-1).reshape(-1, 3)
     corners = points[triangles]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -45,7 +45,7 @@ def grid(points, rows, columns):
     return triangles, normals
 
 
-def field():
+def hills():
     v, u = np.meshgrid(np.linspace(0, 1, FIELD + 1), np.linspace(0, 1, FIELD + 1), indexing="ij")
     x, z = 6 * (u - 0.5), 6 * (v - 0.5)
     y = 0.16 * np.sin(2.1 * x + 1.3 * z) + 0.11 * np.sin(3.1 * z - 1.7 * x) + 0.02 * np.sin(9 * x + 7 * z)
@@ -55,35 +55,35 @@ def field():
 
 
 def knot():
-    along, around = KNOT
-    t = np.linspace(0, 2 * np.pi, along + 1)
-    line = lambda t: np.stack(
+    segments, sides = KNOT
+    t = np.linspace(0, 2 * np.pi, segments + 1)
+    curve = lambda t: np.stack(
         [(1 + 0.42 * np.cos(3 * t)) * np.cos(2 * t), 1.35 + 0.5 * np.sin(3 * t), (1 + 0.42 * np.cos(3 * t)) * np.sin(2 * t)],
         axis=-1,
     )
-    ahead = line(t + 1e-4) - line(t - 1e-4)
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    side = np.cross(ahead, [0.0, 1.0, 0.0])
+    tangent = curve(t + 1e-4) - curve(t - 1e-4)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    side = np.cross(tangent, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side, axis=1, keepdims=True)
-    above = np.cross(side, ahead)
-    angle = np.linspace(0, 2 * np.pi, around + 1)
-    circle = np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * above[:, None]
-    points = (line(t)[:, None] + 0.16 * circle).reshape(-1, 3)
-    u, v = np.meshgrid(np.linspace(0, 30, along + 1), np.linspace(0, 2, around + 1), indexing="ij")
-    triangles, _ = grid(points, along, around)
-    # The two ends of the tube lie in one place: normals come from its own roundness.
+    up = np.cross(side, tangent)
+    angle = np.linspace(0, 2 * np.pi, sides + 1)
+    circle = np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * up[:, None]
+    points = (curve(t)[:, None] + 0.16 * circle).reshape(-1, 3)
+    u, v = np.meshgrid(np.linspace(0, 30, segments + 1), np.linspace(0, 2, sides + 1), indexing="ij")
+    triangles, _ = grid(points, segments, sides)
+    # The two ends of the tube coincide, so its normals are those of the circle, not those of the triangles.
     return points, circle.reshape(-1, 3), np.stack([u, v], axis=-1).reshape(-1, 2), triangles
 
 
 def image():
     v, u = np.meshgrid((np.arange(IMAGE) + 0.5) / IMAGE, (np.arange(IMAGE) + 0.5) / IMAGE, indexing="ij")
-    wave = lambda place: 0.5 + 0.5 * np.sin(2 * np.pi * place)
+    wave = lambda periods: 0.5 + 0.5 * np.sin(2 * np.pi * periods)
     light = 0.45 + 0.4 * wave(4 * u + wave(2 * v)) * wave(4 * v + wave(2 * u)) + 0.15 * wave(32 * u) * wave(32 * v)
     colour = np.stack([0.86 - 0.2 * wave(v), 0.70 + 0.2 * wave(u + v), 0.52 + 0.2 * wave(2 * v - u)], axis=-1)
     return (255 * np.clip(colour * light[..., None], 0, 1)).astype(np.uint8)
 
 
-def png(path, rgb):
+def write_png(path, rgb):
     height, width, _ = rgb.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), rgb.reshape(height, -1)], axis=1).tobytes()
     chunk = lambda kind, data: struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -92,29 +92,29 @@ def png(path, rgb):
     Path(path).write_bytes(b"\x89PNG\r\n\x1a\n" + body)
 
 
-def mesh():
+def build_mesh():
     """Positions, normals, texture coordinates (v downwards) and triangles of the whole scene."""
-    parts, first = [field(), knot()], 0
+    parts, first = [hills(), knot()], 0
     joined = [[], [], [], []]
     for points, normals, uvs, triangles in parts:
-        for into, own in zip(joined, (points, normals, uvs, triangles + first)):
-            into.append(own)
+        for arrays, array in zip(joined, (points, normals, uvs, triangles + first)):
+            arrays.append(array)
         first += len(points)
-    return tuple(np.concatenate(own) for own in joined)
+    return tuple(np.concatenate(arrays) for arrays in joined)
 
 
 def write(folder):
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    points, normals, uvs, triangles = mesh()
+    points, normals, uvs, triangles = build_mesh()
     lines = ["mtllib mesh.mtl", "o mesh", "usemtl cloth"]
     lines += ["v %.7g %.7g %.7g" % tuple(point) for point in points]
     lines += ["vt %.7g %.7g" % (u, 1 - v) for u, v in uvs]
     lines += ["vn %.7g %.7g %.7g" % tuple(normal) for normal in normals]
-    lines += ["f %d/%d/%d %d/%d/%d %d/%d/%d" % tuple(np.repeat(own + 1, 3)) for own in triangles]
+    lines += ["f %d/%d/%d %d/%d/%d %d/%d/%d" % tuple(np.repeat(triangle + 1, 3)) for triangle in triangles]
     (folder / "mesh.obj").write_text("\n".join(lines) + "\n")
     (folder / "mesh.mtl").write_text("newmtl cloth\nKa 1 1 1\nKd 1 1 1\nKs 0.2 0.2 0.2\nNs 24\nmap_Kd cloth.png\n")
-    png(folder / "cloth.png", image())
+    write_png(folder / "cloth.png", image())
     for name, shadow in SHADOWS.items():
         (folder / f"{name}.toml").write_text(LOOK.format(shadow=shadow))
 
