@@ -1,8 +1,8 @@
 // Reduces the boxes that `deform` stored per tile to the bounds of all positions, including the tiles that this step
-// did not compute. With LIGHT_BOUNDS, also the bounds along the axes of light space, from the same boxes. With DOMAIN_BOXES, also a
+// did not compute. With ORIENTED_BOUNDS, also the bounds along `bounding_axes`, from the same boxes. With DOMAIN_BOXES, also a
 // box of each domain, from its boxes, or from its positions if it shares a tile with other domains.
 //   boxes      [count][6] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z; four per tile             (in)
-//   light      with LIGHT_BOUNDS: the axes of light space                                            (in)
+//   bounding_axes  with ORIENTED_BOUNDS: three orthogonal unit vectors                               (in)
 //   bounds     in the header: the maxima of all; zeros before the launch                      (in, out)
 //   pieces     with DOMAIN_BOXES: the parts of domains that are reduced to one box each              (in)
 //   stamps     with DOMAIN_BOXES: per domain, the step that last changed it                          (in)
@@ -68,21 +68,21 @@ __device__ __forceinline__ void compute_segment_boxes(const BoundsArgs& args) {
 }
 #endif
 
-#ifdef LIGHT_BOUNDS
+#ifdef ORIENTED_BOUNDS
 constexpr unsigned KEY_COUNT = 12;
 #else
 constexpr unsigned KEY_COUNT = 6;
 #endif
 
-#ifdef LIGHT_BOUNDS
+#ifdef ORIENTED_BOUNDS
 // The maxima of -a x and of a x along an axis a, for one of the four lanes that hold a tile's boxes. Lane 3 duplicates
 // the axis of lane 2.
-struct LightExtent {
+struct OrientedExtent {
     float axis[3];
     unsigned ends[2];
 
     __device__ __forceinline__ void begin(const BoundsArgs& args) {
-        const float* from = args.light + 3 * min(threadIdx.x % 4, 2u);
+        const float* from = args.bounding_axes + 3 * min(threadIdx.x % 4, 2u);
         axis[0] = from[0];
         axis[1] = from[1];
         axis[2] = from[2];
@@ -144,8 +144,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK) bounds(const __grid_constant
     }
     __syncthreads();
     unsigned keys[6] = {0, 0, 0, 0, 0, 0};
-#ifdef LIGHT_BOUNDS
-    LightExtent along;
+#ifdef ORIENTED_BOUNDS
+    OrientedExtent along;
     along.begin(args);
 #endif
     for (unsigned box = blockIdx.x * BLOCK + threadIdx.x; box < args.count; box += gridDim.x * BLOCK) {
@@ -161,7 +161,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) bounds(const __grid_constant
         for (unsigned side = 0; side < 6; ++side) {
             keys[side] = max(keys[side], own[side]);
         }
-#ifdef LIGHT_BOUNDS
+#ifdef ORIENTED_BOUNDS
         along.add(own);
 #endif
     }
@@ -172,7 +172,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) bounds(const __grid_constant
             atomicMax(&most[side], key);
         }
     }
-#ifdef LIGHT_BOUNDS
+#ifdef ORIENTED_BOUNDS
     along.reduce_into(most + 6);
 #endif
     __syncthreads();

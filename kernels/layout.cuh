@@ -28,7 +28,7 @@ struct Header {
     unsigned changed;    // number of entries in the list of `apply`
     unsigned dirty_tiles;      // number of tiles in the tile list
     unsigned reserved[3];
-    unsigned bounds[12]; // `float_to_ordered` maxima of -x, -y, -z, x, y, z; with LIGHT_BOUNDS also in light space; sent as zeros
+    unsigned bounds[12]; // `float_to_ordered` maxima of -x, -y, -z, x, y, z; with ORIENTED_BOUNDS also along `BoundsArgs::bounding_axes`; sent as zeros
 };
 static_assert(sizeof(Header) == 112, "Header differs from src/compute/gpu/tables/layout.rs");
 
@@ -175,7 +175,7 @@ struct BoundsArgs {
     unsigned* segment_boxes;
     unsigned count;
     unsigned segment_count;
-    float light[9]; // with LIGHT_BOUNDS: the three axes of light space
+    float bounding_axes[9]; // with ORIENTED_BOUNDS: three orthogonal unit vectors
     unsigned reserved;
 };
 static_assert(sizeof(BoundsArgs) == 88, "BoundsArgs differs from src/compute/gpu/tables/layout.rs");

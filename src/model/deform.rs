@@ -10,7 +10,7 @@
 use std::sync::Arc;
 
 use crate::error::{Result, fault_in};
-use crate::scene::{Bounds, LightSpaceBox, SceneState};
+use crate::scene::{Bounds, OrientedBounds, SceneState};
 
 /// Deformed vertices of a whole scene, packed as in [`Layout`](crate::scene::Layout).
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -156,7 +156,7 @@ pub struct DeformSummary {
     /// it was constructed without axes. The bounds contain every vertex. `reference` returns the tight bounds. The other backends bound boxes of up to 128 vertices
     /// each: they exceed the tight bounds by less than the diagonal of such a box, and never extend beyond the corners
     /// of `bounds` by more than rounding.
-    pub oriented_bounds: Option<LightSpaceBox>,
+    pub oriented_bounds: Option<OrientedBounds>,
     /// Milliseconds from the call until the vertices were complete. If they are written to the renderer's own buffers,
     /// the wait for frames that still read these buffers is not included.
     pub ms: f64,

@@ -1,7 +1,7 @@
 //! Values that the renderer takes and returns. They refer to no device.
 
 use crate::pass::{FrameTimes, Pass};
-use modalcast_model::scene::{Bounds, Camera, LightSpaceBox};
+use modalcast_model::scene::{Bounds, Camera, OrientedBounds};
 
 /// Preference for the EGL device that draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -40,7 +40,7 @@ pub struct FrameParams {
     pub bounds: Bounds,
     /// Bounds of the same vertices in light space, to which the shadow map is fitted. Without them, the map is fitted
     /// to the corners of `bounds`.
-    pub light: Option<LightSpaceBox>,
+    pub light: Option<OrientedBounds>,
 }
 
 /// RGBA8 sRGB pixels of a frame, top row first.

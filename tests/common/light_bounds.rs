@@ -5,7 +5,7 @@ use std::sync::Arc;
 use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::{Mesh, Modes, Shape};
-use modalcast_model::scene::{Bounds, DeformationSettings, LightSpaceBox, Scene, SceneState};
+use modalcast_model::scene::{Bounds, DeformationSettings, OrientedBounds, Scene, SceneState};
 
 use super::{StepResult, run_step, scene_of_shapes};
 use crate::scenes::{self, Random};
@@ -39,14 +39,14 @@ pub(crate) fn coil_scene(deformation: DeformationSettings) -> Arc<Scene> {
 }
 
 /// The smallest light-space box that contains the bounding boxes of all tiles of `tile_vertices` packed positions.
-pub(crate) fn bounds_in_light_space(scene: &Scene, positions: &[f32], tile_vertices: usize) -> LightSpaceBox {
+pub(crate) fn bounds_in_light_space(scene: &Scene, positions: &[f32], tile_vertices: usize) -> OrientedBounds {
     let axes = scene.light_axes().expect("expected a scene with a shadow");
-    let tile_box = |positions: &[f32]| LightSpaceBox::enclosing(&axes, &Bounds::from_positions(positions));
-    positions.chunks(3 * tile_vertices).map(tile_box).fold(LightSpaceBox::EMPTY, LightSpaceBox::union)
+    let tile_box = |positions: &[f32]| OrientedBounds::enclosing(&axes, &Bounds::from_positions(positions));
+    positions.chunks(3 * tile_vertices).map(tile_box).fold(OrientedBounds::EMPTY, OrientedBounds::union)
 }
 
 /// Distance by which `inner` exceeds `outer`, or NaN if either contains a NaN.
-pub(crate) fn max_excess(outer: &LightSpaceBox, inner: &LightSpaceBox) -> f64 {
+pub(crate) fn max_excess(outer: &OrientedBounds, inner: &OrientedBounds) -> f64 {
     let excesses =
         (0..3).flat_map(|axis| [outer.0.min[axis] - inner.0.min[axis], inner.0.max[axis] - outer.0.max[axis]]);
     excesses.fold(0.0, |max: f64, excess| if excess.is_nan() || max.is_nan() { f64::NAN } else { max.max(excess) })
@@ -64,7 +64,7 @@ fn max_tile_diagonal(positions: &[f32]) -> f64 {
 
 /// The light-space bounds of a step. Asserts that they contain every vertex, and that they exceed the light-space box of
 /// the scene bounds only by rounding.
-fn checked_light_bounds(name: &str, scene: &Scene, result: &StepResult) -> LightSpaceBox {
+fn checked_light_bounds(name: &str, scene: &Scene, result: &StepResult) -> OrientedBounds {
     let light_box = result.light.expect("expected a scene with a shadow");
     let (vertex_box, corner_box) =
         (bounds_in_light_space(scene, &result.surface.positions, 1), bounds_of_corners(scene, &result.bounds));
@@ -85,8 +85,8 @@ fn checked_light_bounds(name: &str, scene: &Scene, result: &StepResult) -> Light
     light_box
 }
 
-fn bounds_of_corners(scene: &Scene, bounds: &Bounds) -> LightSpaceBox {
-    LightSpaceBox::enclosing(&scene.light_axes().expect("expected a scene with a shadow"), bounds)
+fn bounds_of_corners(scene: &Scene, bounds: &Bounds) -> OrientedBounds {
+    OrientedBounds::enclosing(&scene.light_axes().expect("expected a scene with a shadow"), bounds)
 }
 
 /// Light bounds contain every vertex of scenes that are random, smooth, far from the origin or tiny, that have one
@@ -125,8 +125,9 @@ pub(crate) fn check_tightness<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>)
         max_excess(&vertex_box, &light_box) < tile_diagonal,
         "{light_box:?} beyond {vertex_box:?}, tiles of {tile_diagonal}"
     );
-    let volume =
-        |LightSpaceBox(bounds): &LightSpaceBox| (0..3).map(|axis| bounds.max[axis] - bounds.min[axis]).product::<f64>();
+    let volume = |OrientedBounds(bounds): &OrientedBounds| {
+        (0..3).map(|axis| bounds.max[axis] - bounds.min[axis]).product::<f64>()
+    };
     let [light_box, vertex_box, corner_box] = [light_box, vertex_box, corner_box].map(|bounds| volume(&bounds));
     eprintln!(
         "coil, volume relative to the box of the scene bounds: light bounds {:.3}, vertices {:.3}",

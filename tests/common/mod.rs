@@ -21,7 +21,7 @@ use std::sync::Arc;
 
 use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::domain::{Domain, Mesh, Shape};
-use modalcast_model::scene::{Bounds, DeformationSettings, LightSpaceBox, Scene, SceneState};
+use modalcast_model::scene::{Bounds, DeformationSettings, OrientedBounds, Scene, SceneState};
 
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 pub(crate) use error_bounds::{
@@ -32,7 +32,7 @@ pub(crate) use error_bounds::{
 #[derive(Debug, Clone)]
 pub(crate) struct StepResult {
     pub(crate) bounds: Bounds,
-    pub(crate) light: Option<LightSpaceBox>,
+    pub(crate) light: Option<OrientedBounds>,
     pub(crate) surface: DeformedSurface,
 }
 

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use modalcast_model::scene::{Bounds, LightSpaceBox};
+use modalcast_model::scene::{Bounds, OrientedBounds};
 
 /// Bounds of f32 positions: all NaN if a position is not finite, `min > max` if there are none.
 #[derive(Debug, Clone, Copy)]
@@ -67,10 +67,10 @@ impl TileBounds {
         extents.par_iter().with_min_len(4096).copied().reduce(|| Self::EMPTY, Self::union).to_bounds()
     }
 
-    /// Bounds of all tiles along these axes of light space, from the corners of their boxes.
-    pub(super) fn along(extents: &[Self], axes: &[Vector3<f64>; 3]) -> LightSpaceBox {
-        let one = |tile_bounds: &Self| LightSpaceBox::enclosing(axes, &tile_bounds.to_bounds());
-        extents.par_iter().with_min_len(4096).map(one).reduce(|| LightSpaceBox::EMPTY, LightSpaceBox::union)
+    /// Bounds of all tiles along these axes, from the corners of their boxes.
+    pub(super) fn along(extents: &[Self], axes: &[Vector3<f64>; 3]) -> OrientedBounds {
+        let one = |tile_bounds: &Self| OrientedBounds::enclosing(axes, &tile_bounds.to_bounds());
+        extents.par_iter().with_min_len(4096).map(one).reduce(|| OrientedBounds::EMPTY, OrientedBounds::union)
     }
 
     /// Bounds of the tiles of one domain.

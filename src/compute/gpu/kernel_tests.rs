@@ -126,7 +126,7 @@ const ADDED_CODE: [(&str, &str, &[&str]); 14] = [
     ("deform", "MODES", &[]),
     ("deform", "COMPENSATED_SUM", &["MODES"]),
     ("deform", "DISPLACEMENTS", &["MODES"]),
-    ("bounds", "LIGHT_BOUNDS", &[]),
+    ("bounds", "ORIENTED_BOUNDS", &[]),
     ("bounds", "DOMAIN_BOXES", &[]),
     ("deform", "RIGID_NORMALS", &[]),
     ("deform", "CORNER_OFFSETS", &["RIGID_NORMALS"]),

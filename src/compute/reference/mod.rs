@@ -14,7 +14,7 @@ pub use rigid_normals::{rigid_normals, rigid_tangents};
 
 use modalcast_model::deform::{Backend, BoundingAxes, DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Bounds, DomainLayout, LightSpaceBox, Scene, SceneState};
+use modalcast_model::scene::{Bounds, DomainLayout, OrientedBounds, Scene, SceneState};
 
 /// The deformer of the `reference` backend: computes in f64 and rounds once.
 #[derive(Debug)]
@@ -64,8 +64,9 @@ impl Deformer for ReferenceDeformer {
         let begin = Instant::now();
         let positions = deform(&self.scene, state);
         let oriented_bounds = self.bounding_axes.map(|axes| {
-            let one = |position: &[f64; 3]| LightSpaceBox::enclosing(&axes, &Bounds { min: *position, max: *position });
-            positions.iter().map(one).fold(LightSpaceBox::EMPTY, LightSpaceBox::union)
+            let one =
+                |position: &[f64; 3]| OrientedBounds::enclosing(&axes, &Bounds { min: *position, max: *position });
+            positions.iter().map(one).fold(OrientedBounds::EMPTY, OrientedBounds::union)
         });
         let (normals, tangents) = if self.scene.needs.exact_normals {
             (exact_normals(&self.scene, state, &positions), exact_tangents(&self.scene, state, &positions))

@@ -10,7 +10,7 @@ use crate::frame::Legend;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{Bounds, Camera, FrameSize, LightSpaceBox, Scene, SceneState, snap_to_origin_grid};
+use modalcast_model::scene::{Bounds, Camera, FrameSize, OrientedBounds, Scene, SceneState, snap_to_origin_grid};
 use modalcast_render::{FrameParams, Renderer, SceneBuffers};
 
 /// Positions beyond this bound (scene units) are rejected like infinite ones, because their squares overflow f32 in the
@@ -25,7 +25,7 @@ const BENCHMARK_SIZE: FrameSize = FrameSize::new(1920, 1080);
 pub(in crate::engine) struct BufferContents {
     bounds: Bounds,
     /// `None` in a camera-relative frame, because the deformer computed them in the frames of the domains' cells.
-    light: Option<LightSpaceBox>,
+    light: Option<OrientedBounds>,
     /// Whether vertices were uploaded.
     pub(in crate::engine) uploaded: bool,
 }
@@ -47,7 +47,7 @@ pub struct LoadedScene {
     filled: bool,
     bounds: Bounds,
     /// Bounds of the same vertices in light space; only if the scene has a shadow.
-    light: Option<LightSpaceBox>,
+    light: Option<OrientedBounds>,
     /// The state that the deformer's output shows.
     current_state: Arc<SceneState>,
     /// Number of deformations, including rejected states and the deformations that undo them, since each one changes

@@ -29,15 +29,15 @@ impl Scene {
     }
 }
 
-/// A bounding box along the axes of light space, in scene units and relative to the same origin as the bounded
-/// positions. Empty if `min > max`.
+/// A bounding box along three orthogonal axes, such as those of light space, in scene units and relative to the same
+/// origin as the bounded positions. Empty if `min > max`.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LightSpaceBox(pub Bounds);
+pub struct OrientedBounds(pub Bounds);
 
-impl LightSpaceBox {
+impl OrientedBounds {
     pub const EMPTY: Self = Self(Bounds::EMPTY);
 
-    /// The smallest light-space box that contains a world-space box: along each axis, a corner of the box is the
+    /// The smallest box along these axes that contains a world-space box: along each axis, a corner of the box is the
     /// farthest point. NaN and infinite coordinates yield NaN or infinite bounds; an empty box yields an empty one.
     pub fn enclosing(axes: &[Vector3<f64>; 3], world: &Bounds) -> Self {
         if world.min[0] > world.max[0] {
@@ -101,7 +101,7 @@ mod tests {
             for corner in world.corners() {
                 want.include(axes.map(|axis| axis.dot(&corner.coords)));
             }
-            let LightSpaceBox(got) = LightSpaceBox::enclosing(&axes, &world);
+            let OrientedBounds(got) = OrientedBounds::enclosing(&axes, &world);
             for axis in 0..3 {
                 assert!(
                     (got.min[axis] - want.min[axis]).abs() < 1e-12 && (got.max[axis] - want.max[axis]).abs() < 1e-12
@@ -113,11 +113,11 @@ mod tests {
     #[test]
     fn nothing_is_empty_and_what_is_not_finite_is_told() {
         let axes = light_axes(suns()[0], UpAxis::Y);
-        let of = |min, max| LightSpaceBox::enclosing(&axes, &Bounds { min, max });
+        let of = |min, max| OrientedBounds::enclosing(&axes, &Bounds { min, max });
         let good = of([0.0; 3], [1.0; 3]);
-        assert!(good.is_valid() && !LightSpaceBox::EMPTY.is_valid());
-        assert_eq!(LightSpaceBox::enclosing(&axes, &Bounds::EMPTY), LightSpaceBox::EMPTY);
-        assert_eq!(good.union(LightSpaceBox::EMPTY), good);
+        assert!(good.is_valid() && !OrientedBounds::EMPTY.is_valid());
+        assert_eq!(OrientedBounds::enclosing(&axes, &Bounds::EMPTY), OrientedBounds::EMPTY);
+        assert_eq!(good.union(OrientedBounds::EMPTY), good);
         for bad in [f64::NAN, f64::INFINITY] {
             assert!(!of([0.0; 3], [1.0, bad, 1.0]).is_valid());
             assert!(!good.union(of([0.0; 3], [1.0, bad, 1.0])).is_valid());

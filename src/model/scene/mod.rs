@@ -26,7 +26,7 @@ pub use features::SceneFeatures;
 pub use floating_origin::{FloatingOrigins, ORIGIN_GRID, ORIGIN_REACH, snap_to_origin_grid};
 pub use frame_size::FrameSize;
 pub use layout::{DomainLayout, Layout};
-pub use light_space::{LightSpaceBox, light_axes};
+pub use light_space::{OrientedBounds, light_axes};
 pub use pixel_rect::PixelRect;
 pub use post_processing::{Antialiasing, Bloom, ToneMapping};
 pub use raster_input::{CullMode, DrawRange, MAX_VIEWPORT_SIDE, Viewport};

@@ -5,7 +5,7 @@ use std::cell::Cell;
 
 use crate::types::FrameParams;
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Bounds, LightSpaceBox};
+use modalcast_model::scene::{Bounds, OrientedBounds};
 
 /// Identity of the current vertices, and what the map was last drawn from.
 #[derive(Debug, Default)]
@@ -20,7 +20,7 @@ pub(crate) struct ShadowCache {
 pub(crate) struct ShadowKey {
     step: u64,
     bounds: Bounds,
-    light: Option<LightSpaceBox>,
+    light: Option<OrientedBounds>,
     origin: [f64; 3],
 }
 

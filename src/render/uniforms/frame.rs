@@ -6,7 +6,7 @@ use nalgebra::{Matrix4, Vector3};
 use super::light_box::{LightBox, LightBoxParams};
 use crate::types::FrameParams;
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::scene::{Bounds, LightSpaceBox, Scene};
+use modalcast_model::scene::{Bounds, OrientedBounds, Scene};
 
 /// Uniform block of a frame; matrices are column-major. Twin of `FrameBlock` in `shaders/shared/frame.glsl`.
 #[repr(C)]
@@ -127,7 +127,7 @@ fn finite_bounds(scene: &Scene, shot: &FrameParams) -> Bounds {
 }
 
 /// Light-space bounds of a shot; none when they or the world-space bounds overflowed.
-fn finite_light_bounds(shot: &FrameParams) -> Option<LightSpaceBox> {
+fn finite_light_bounds(shot: &FrameParams) -> Option<OrientedBounds> {
     shot.light.filter(|light| light.is_valid() && shot.bounds.is_finite())
 }
 
@@ -296,11 +296,11 @@ mod tests {
             let replaced = FrameUniforms::new(&scene, &FrameParams { bounds, ..shot }, [0.0; 3]).expect("replaced");
             assert_eq!(replaced, FrameUniforms { to_sun: [x, y, z, 1.0], ..good }, "what overflowed may be below it");
         }
-        let measured = LightSpaceBox(Bounds { min: [-0.25; 3], max: [0.25; 3] });
+        let measured = OrientedBounds(Bounds { min: [-0.25; 3], max: [0.25; 3] });
         let with =
             |light| FrameUniforms::new(&scene, &FrameParams { light: Some(light), ..shot }, [0.0; 3]).expect("good");
         assert_ne!(with(measured), good, "control: what was measured decides");
-        for lost in [LightSpaceBox::EMPTY, measured.expanded_by(f64::NAN), measured.expanded_by(f64::INFINITY)] {
+        for lost in [OrientedBounds::EMPTY, measured.expanded_by(f64::NAN), measured.expanded_by(f64::INFINITY)] {
             assert_eq!(with(lost), good, "{lost:?}");
         }
         shot.camera.view = View::LookAt { eye: [1e300, 0.0, 0.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };

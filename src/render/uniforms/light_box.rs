@@ -10,7 +10,7 @@
 
 use nalgebra::{Matrix4, Vector3};
 
-use modalcast_model::scene::{Bounds, LightSpaceBox, UpAxis, light_axes};
+use modalcast_model::scene::{Bounds, OrientedBounds, UpAxis, light_axes};
 
 /// Maximum distance by which the ground may push the far plane below the box, in diagonals of the bounds. A grazing sun
 /// would push it to infinity. Receivers beyond the far plane are still shaded correctly.
@@ -37,7 +37,7 @@ pub(crate) struct LightBoxParams {
     pub(crate) up: UpAxis,
     pub(crate) bounds: Bounds,
     /// Light-space bounds of the same vertices; without them, the corners of `bounds` are used.
-    pub(crate) light: Option<LightSpaceBox>,
+    pub(crate) light: Option<OrientedBounds>,
     /// Height of the ground along the up axis.
     pub(crate) ground: Option<f64>,
     /// Side of the map and the empty rim that the blur needs, both in texels.
@@ -72,7 +72,7 @@ fn next_length_step(length: f64) -> f64 {
 impl LightBox {
     pub(crate) fn fit(fit: &LightBoxParams) -> Self {
         let axes = light_axes(fit.to_sun, fit.up);
-        let LightSpaceBox(held) = fit.light.unwrap_or_else(|| LightSpaceBox::enclosing(&axes, &fit.bounds));
+        let OrientedBounds(held) = fit.light.unwrap_or_else(|| OrientedBounds::enclosing(&axes, &fit.bounds));
         let diagonal = diagonal(fit);
         let sides = [0, 1].map(|axis: usize| {
             let (center, reach) = (0.5 * (held.min[axis] + held.max[axis]), 0.5 * (held.max[axis] - held.min[axis]));
@@ -181,12 +181,12 @@ mod tests {
         (0..=500).map(point).collect()
     }
 
-    fn held(fit: &LightBoxParams, points: &[Point3<f64>]) -> Option<LightSpaceBox> {
+    fn held(fit: &LightBoxParams, points: &[Point3<f64>]) -> Option<OrientedBounds> {
         let axes = light_axes(fit.to_sun, fit.up);
         let one = |point: &Point3<f64>| {
-            LightSpaceBox::enclosing(&axes, &Bounds { min: (*point).into(), max: (*point).into() })
+            OrientedBounds::enclosing(&axes, &Bounds { min: (*point).into(), max: (*point).into() })
         };
-        Some(points.iter().map(one).fold(LightSpaceBox::EMPTY, LightSpaceBox::union))
+        Some(points.iter().map(one).fold(OrientedBounds::EMPTY, OrientedBounds::union))
     }
 
     #[test]

@@ -8,7 +8,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::scene::{Bounds, Camera, FrameSize, Lens, LightSpaceBox, Scene, SceneState, ShadowSettings};
+use modalcast_model::scene::{Bounds, Camera, FrameSize, Lens, OrientedBounds, Scene, SceneState, ShadowSettings};
 use modalcast_render::{FrameParams, Pass, Renderer, SceneBuffers};
 
 use super::harness::open_renderer;
@@ -121,7 +121,7 @@ fn upload_bounds_or_origin_invalidate_the_shadow() {
     );
     let light_bounds_passes = [0.0, 0.0, 0.5, 0.5].map(|expansion| {
         let axes = cut_out_scene.light_axes().expect("expected a scene with a shadow");
-        let light = Some(LightSpaceBox::enclosing(&axes, &bounds).expanded_by(expansion));
+        let light = Some(OrientedBounds::enclosing(&axes, &bounds).expanded_by(expansion));
         renderer.draw(&buffers, &FrameParams { light, ..frame_params(camera, bounds) }).expect("expected a frame");
         count_shadow_passes(&renderer)
     });

@@ -4,7 +4,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::domain::{Material, Mesh};
 use modalcast_model::scene::{
-    Bounds, Camera, Lens, LightSpaceBox, RenderSettings, Scene, SceneState, ShadowMethod, ShadowSettings, View,
+    Bounds, Camera, Lens, OrientedBounds, RenderSettings, Scene, SceneState, ShadowMethod, ShadowSettings, View,
 };
 use modalcast_render::{FrameImage, FrameParams};
 
@@ -134,7 +134,7 @@ fn render_growing_bounds(scene: &std::sync::Arc<Scene>, has_light_bounds: bool) 
     let mut draw_frame = |step: u32| {
         let bounds = bounds_of_step(step);
         // Light bounds slightly larger than the box of the scene bounds.
-        let light = LightSpaceBox::enclosing(&axes, &bounds).expanded_by(0.02 * bounds.diagonal());
+        let light = OrientedBounds::enclosing(&axes, &bounds).expanded_by(0.02 * bounds.diagonal());
         let params = FrameParams { camera, width: 96, height: 96, bounds, light: has_light_bounds.then_some(light) };
         renderer.draw(&buffers, &params).expect("expected a frame")
     };

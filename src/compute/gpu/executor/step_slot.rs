@@ -12,10 +12,10 @@ use super::launchers::deform::DeformKernel;
 use super::launchers::normals::NormalsKernel;
 use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, PinnedBuffer, PinnedUse, capture};
-use crate::gpu::tables::box_keys::{bounds_from_keys, light_bounds_from_keys};
+use crate::gpu::tables::box_keys::{bounds_from_keys, oriented_bounds_from_keys};
 use crate::gpu::tables::layout::Header;
 use modalcast_model::error::{Error, Result};
-use modalcast_model::scene::{Bounds, LightSpaceBox};
+use modalcast_model::scene::{Bounds, OrientedBounds};
 
 /// The kernels of a scene.
 #[derive(Debug)]
@@ -89,11 +89,11 @@ impl StepSlot {
         graph.ok_or_else(missing)?.launch().map_err(cuda_error("deform"))
     }
 
-    /// Waits for the end of the step. Returns its bounds, and its bounds in light space if the scene has a shadow.
-    pub(super) fn wait(&self) -> Result<(Bounds, Option<LightSpaceBox>)> {
+    /// Waits for the end of the step. Returns its bounds, and those along the bounding axes of the deformer if it has any.
+    pub(super) fn wait(&self) -> Result<(Bounds, Option<OrientedBounds>)> {
         self.done.synchronize().map_err(cuda_error("deform"))?;
         let keys = self.bounds_keys.as_slice()?;
-        Ok((bounds_from_keys(keys), light_bounds_from_keys(keys)))
+        Ok((bounds_from_keys(keys), oriented_bounds_from_keys(keys)))
     }
 }
 

@@ -2,24 +2,24 @@
 
 use nalgebra::Vector3;
 
-use modalcast_model::scene::{Bounds, LightSpaceBox};
+use modalcast_model::scene::{Bounds, OrientedBounds};
 
-/// The axes of light space as arguments of `bounds`; zeros without a shadow.
+/// The bounding axes as arguments of `bounds`; zeros without any.
 pub(crate) fn axes_to_f32(axes: Option<[Vector3<f64>; 3]>) -> [f32; 9] {
     let axes = axes.unwrap_or_default();
     std::array::from_fn(|at| axes[at / 3][at % 3] as f32)
 }
 
-/// The bounds in light space, from the last six of twelve keys; `None` when there are only six keys.
+/// The bounds along the bounding axes, from the last six of twelve keys; `None` when there are only six keys.
 ///
 /// The kernel rounds its sums outward, but its axes are f32. A component of a unit vector in f32 has an error of at
 /// most 2^-25, so an end of the bounds has an error of at most 2^-25 times the sum of the largest coordinates. This
 /// function widens the bounds by twice that.
-pub(crate) fn light_bounds_from_keys(keys: &[u32]) -> Option<LightSpaceBox> {
-    let (world, light) = keys.split_at_checked(6).filter(|(_, light)| light.len() == 6)?;
+pub(crate) fn oriented_bounds_from_keys(keys: &[u32]) -> Option<OrientedBounds> {
+    let (world, oriented) = keys.split_at_checked(6).filter(|(_, oriented)| oriented.len() == 6)?;
     let world = bounds_from_keys(world);
     let farthest: f64 = world.min.iter().zip(&world.max).map(|(min, max)| min.abs().max(max.abs())).sum();
-    Some(LightSpaceBox(bounds_from_keys(light)).expanded_by(farthest * f64::from(f32::EPSILON) / 2.0))
+    Some(OrientedBounds(bounds_from_keys(oriented)).expanded_by(farthest * f64::from(f32::EPSILON) / 2.0))
 }
 
 /// The bounds that six keys encode.
@@ -52,21 +52,24 @@ mod tests {
     }
 
     #[test]
-    fn light_bounds_are_the_last_six_keys_and_hold_what_the_axes_lost_in_f32() {
+    fn oriented_bounds_are_the_last_six_keys_and_hold_what_the_axes_lost_in_f32() {
         let world = [1000.0_f32, 10.0, 1.0, 2000.0, 10.0, -0.5].map(float_to_ordered);
-        let light = [1.0_f32, -2.0, 0.0, 4.0, 5.0, 6.0].map(float_to_ordered);
-        assert_eq!(light_bounds_from_keys(&world), None, "without a shadow there are six");
-        let LightSpaceBox(got) = light_bounds_from_keys(&[world, light].concat()).expect("twelve");
+        let oriented = [1.0_f32, -2.0, 0.0, 4.0, 5.0, 6.0].map(float_to_ordered);
+        assert_eq!(oriented_bounds_from_keys(&world), None, "without axes there are six");
+        let OrientedBounds(got) = oriented_bounds_from_keys(&[world, oriented].concat()).expect("twelve");
         let margin = (2000.0 + 10.0 + 1.0) * 2.0_f64.powi(-24);
         for (end, want) in [(got.min, [-1.0, 2.0, 0.0]), (got.max, [4.0, 5.0, 6.0])] {
             let out = |axis: usize| if want[axis] == end[axis] { 0.0 } else { (want[axis] - end[axis]).abs() };
             assert!((0..3).all(|axis| (out(axis) - margin).abs() < 1e-12), "{end:?}");
         }
         assert!(got.min[0] < -1.0 && got.max[2] > 6.0, "outwards");
-        let mut lost = light;
+        let mut lost = oriented;
         lost[4] = float_to_ordered(f32::NAN);
-        assert!(!light_bounds_from_keys(&[world, lost].concat()).is_some_and(|light| light.is_valid()));
-        assert!(!light_bounds_from_keys(&[0; 12]).is_some_and(|light| light.is_valid()), "nothing was measured");
+        assert!(!oriented_bounds_from_keys(&[world, lost].concat()).is_some_and(|oriented| oriented.is_valid()));
+        assert!(
+            !oriented_bounds_from_keys(&[0; 12]).is_some_and(|oriented| oriented.is_valid()),
+            "nothing was measured"
+        );
     }
 
     #[test]

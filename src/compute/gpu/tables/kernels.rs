@@ -35,7 +35,7 @@ pub(crate) const KERNELS: [KernelSource; 5] = [
     KernelSource {
         name: "bounds",
         source: include_str!("../../../../kernels/bounds.cu"),
-        features: &["LIGHT_BOUNDS", "DOMAIN_BOXES"],
+        features: &["ORIENTED_BOUNDS", "DOMAIN_BOXES"],
     },
     KernelSource { name: "apply", source: include_str!("../../../../kernels/apply.cu"), features: &["FOLLOWERS"] },
     KernelSource {
@@ -103,7 +103,7 @@ pub(crate) fn kernels(scene: &Scene, tables: &DeviceTables) -> Vec<KernelDescrip
             ("NORMAL_MAPS", needs.normal_maps),
             ("SHEAR", needs.shear),
             ("FOLLOWERS", needs.followers),
-            ("LIGHT_BOUNDS", tables.bounding_axes.is_some()),
+            ("ORIENTED_BOUNDS", tables.bounding_axes.is_some()),
             ("DOMAIN_BOXES", needs.boxes),
         ];
         let on = defines.iter().filter(|(name, on)| *on && kernel.features.contains(name));

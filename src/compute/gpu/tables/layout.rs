@@ -183,7 +183,7 @@ pub(crate) struct BoundsArgs {
     pub segment_boxes: u64,
     pub count: u32,
     pub segment_count: u32,
-    pub light: [f32; 9],
+    pub bounding_axes: [f32; 9],
     pub reserved: u32,
 }
 
@@ -295,7 +295,7 @@ pub fn layout_constants() -> Vec<LayoutConstant> {
             header, blocks, groups, members, words, rest, scales, transforms, transform_links, frames, q, boxes
         }
         BoxSegment { first, count, domain, from_vertices }
-        BoundsArgs { header, boxes, segments, change_steps, segment_boxes, count, segment_count, light, reserved }
+        BoundsArgs { header, boxes, segments, change_steps, segment_boxes, count, segment_count, bounding_axes, reserved }
         ApplyArgs { header, changes, new_transforms, new_q, dirty_tiles, transform_links, transforms, q, change_steps, list }
         NormalSlot { first, first_normal, first_tangent, first_vertex, first_member }
         NormalsArgs {

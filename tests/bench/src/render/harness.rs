@@ -12,7 +12,7 @@ use modalcast_model::backend_settings::RasterPolicy;
 use modalcast_model::deform::{DeformedSurface, Deformer};
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{Bounds, Camera, LightSpaceBox, Scene, SceneState};
+use modalcast_model::scene::{Bounds, Camera, OrientedBounds, Scene, SceneState};
 use modalcast_render::{DevicePreference, FrameImage, FrameParams, Renderer, SceneBuffers};
 
 /// The first CUDA device with a working compiler, if there is one.
@@ -48,7 +48,7 @@ pub(super) struct HarnessScene {
     pub(super) buffers: SceneBuffers,
     deformer: CpuDeformer,
     bounds: Bounds,
-    light: Option<LightSpaceBox>,
+    light: Option<OrientedBounds>,
 }
 
 impl RenderHarness {
@@ -156,7 +156,7 @@ impl HarnessScene {
     }
 
     /// Bounds of the last posed vertices, in world and in light space.
-    pub(super) const fn extents(&self) -> (Bounds, Option<LightSpaceBox>) {
+    pub(super) const fn extents(&self) -> (Bounds, Option<OrientedBounds>) {
         (self.bounds, self.light)
     }
 

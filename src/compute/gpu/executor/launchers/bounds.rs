@@ -1,5 +1,5 @@
 //! Launches `kernels/bounds.cu`, which reduces the boxes of `deform` to the bounds of all positions. It also computes
-//! the bounds in light space if the scene has a shadow, and the box of each domain if the scene keeps boxes.
+//! the bounds along the bounding axes of the deformer if it has any, and the box of each domain if the scene keeps boxes.
 
 use cudarc::driver::{CudaFunction, LaunchConfig};
 
@@ -71,7 +71,7 @@ impl BoundsKernel {
             segment_boxes: domains.boxes,
             count: warp_boxes.count,
             segment_count: domains.count,
-            light: axes_to_f32(self.axes),
+            bounding_axes: axes_to_f32(self.axes),
             reserved: 0,
         };
         // SAFETY: the kernel's only argument is a `BoundsArgs`; `boxes` has six words for each of `count`, as

@@ -24,7 +24,7 @@ fn a_scene_without_modes_normal_maps_and_shear_compiles_none_of_their_branches()
         defines(&bare),
         [
             ("deform", vec!["ONE_ITEM_PER_LANE", "RIGID_NORMALS", "CORNER_OFFSETS"]),
-            ("bounds", vec!["LIGHT_BOUNDS"]),
+            ("bounds", vec!["ORIENTED_BOUNDS"]),
             ("apply", vec![])
         ]
     );
@@ -126,7 +126,7 @@ fn light_space_is_measured_by_a_macro_of_a_kernel_that_is_there_and_only_for_a_s
     let sizes = [(7, 2), (300, 0)];
     let (lit, dark) = (plan(&stored(&sizes, StorageType::F32)), plan(&unlit(&sizes)));
     let defines = |plan: &DeformPlan| plan.kernel(KernelKind::Bounds).expect("always").defines.clone();
-    assert_eq!((defines(&lit), defines(&dark)), (vec!["LIGHT_BOUNDS"], vec![]));
+    assert_eq!((defines(&lit), defines(&dark)), (vec!["ORIENTED_BOUNDS"], vec![]));
     assert_eq!((lit.bytes_out, dark.bytes_out), (48, 24));
     assert_eq!((lit.launches(), lit.total_bytes()), (dark.launches(), dark.total_bytes()));
     let omitted = |plan: &DeformPlan| plan.omitted.iter().any(|part| part.feature == "shadows");
