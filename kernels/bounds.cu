@@ -8,7 +8,7 @@
 //   stamps     with DOMAIN_BOXES: per domain, the step that last changed it                          (in)
 //   positions  with DOMAIN_BOXES: address in the header                                              (in)
 //   piece_boxes  with DOMAIN_BOXES: [pieces][6] u32, like `boxes`; only those of stale domains are written (out)
-// Launch: BLOCK threads per block, any number of blocks. CPU twin: Bounds::union.
+// Launch: BLOCK threads per block, any number of blocks. CPU twin: BoundingBox::union.
 //
 // Light space: the farthest corner of a tile's box along an axis follows from the signs of the axis, so an end takes
 // three multiply-adds. They round outward, so that the bounds along the f32 axes contain every vertex. The box of a

@@ -10,7 +10,7 @@
 use std::sync::Arc;
 
 use crate::error::{Result, fault_in};
-use crate::scene::{Bounds, OrientedBounds, SceneState};
+use crate::scene::{BoundingBox, OrientedBounds, SceneState};
 
 /// Deformed vertices of a whole scene, packed as in [`Layout`](crate::scene::Layout).
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -27,7 +27,7 @@ pub struct DeformedSurface {
     pub displacements: Vec<f32>,
     /// The axis-aligned bounding box of each domain's `positions`, relative to the same cell. Empty unless the scene
     /// enables `deform.boxes`.
-    pub boxes: Vec<Bounds>,
+    pub boxes: Vec<BoundingBox>,
 }
 
 impl DeformedSurface {
@@ -151,7 +151,7 @@ pub type BoundingAxes = [nalgebra::Vector3<f64>; 3];
 pub struct DeformSummary {
     /// Bounds of all deformed positions in the coordinates of [`DeformedSurface::positions`]. Not finite if f32 overflowed in a
     /// position or in a stored displacement.
-    pub bounds: Bounds,
+    pub bounds: BoundingBox,
     /// Bounds of the same positions along the [`BoundingAxes`] of the deformer, relative to the same origin. `None` if
     /// it was constructed without axes. The bounds contain every vertex. `reference` returns the tight bounds. The other backends bound boxes of up to 128 vertices
     /// each: they exceed the tight bounds by less than the diagonal of such a box, and never extend beyond the corners
@@ -236,7 +236,7 @@ mod tests {
         }
 
         fn deform(&mut self, _: &SceneState) -> Result<DeformSummary> {
-            Ok(DeformSummary { bounds: Bounds::EMPTY, oriented_bounds: None, ms: 0.0 })
+            Ok(DeformSummary { bounds: BoundingBox::EMPTY, oriented_bounds: None, ms: 0.0 })
         }
 
         fn surface(&mut self) -> Result<&DeformedSurface> {
@@ -263,7 +263,7 @@ mod tests {
             normals: vec![2.0],
             tangents: vec![3.0],
             displacements: vec![4.0],
-            boxes: vec![Bounds::EMPTY],
+            boxes: vec![BoundingBox::EMPTY],
         };
         assert_eq!(whole.select(VertexAttributes::ALL), DeformedSurface { tangents: vec![], ..whole.clone() });
         assert_eq!(whole.select(VertexAttributes::default()), DeformedSurface::default());

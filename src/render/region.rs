@@ -5,7 +5,7 @@ use std::cell::Cell;
 
 use nalgebra::{Matrix4, Vector4};
 
-use modalcast_model::scene::Bounds;
+use modalcast_model::scene::BoundingBox;
 
 /// A rectangle of a frame's pixels; (0, 0) is the bottom left pixel. It may be empty.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -36,7 +36,7 @@ impl Region {
 
     /// Region of the frame that can show points in `bounds` when `clip` transforms positions in f32. The whole frame if
     /// the bounds reach behind the eye or overflow.
-    pub(crate) fn project(clip: &Matrix4<f64>, bounds: &Bounds, frame: [u32; 2]) -> Self {
+    pub(crate) fn project(clip: &Matrix4<f64>, bounds: &BoundingBox, frame: [u32; 2]) -> Self {
         let corners = bounds.corners().map(|corner| corner.to_homogeneous());
         let magnitudes = corners.iter().map(|corner| clip.abs() * corner.abs());
         let rounded = magnitudes.fold(Vector4::zeros(), |most: Vector4<f64>, one| most.sup(&one)) * CLIP_RELATIVE_ERROR;
@@ -96,7 +96,7 @@ mod tests {
 
     const FRAME: [u32; 2] = [640, 400];
 
-    fn clip(eye: [f64; 3], target: [f64; 3], bounds: &Bounds) -> Matrix4<f64> {
+    fn clip(eye: [f64; 3], target: [f64; 3], bounds: &BoundingBox) -> Matrix4<f64> {
         let view = View::LookAt { eye, target, up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, lens: Lens::FieldOfView(40.0), near: 0.0, far: 0.0 };
         camera.clip_from_camera(FRAME[0], FRAME[1], bounds) * camera.camera_from_world()
@@ -110,8 +110,8 @@ mod tests {
     }
 
     /// A cube with this half side, and points in steps of a fifth of it from the center to its corners.
-    fn filled(center: [f64; 3], half: f64) -> (Bounds, Vec<[f32; 3]>) {
-        let (mut bounds, mut points) = (Bounds::EMPTY, Vec::new());
+    fn filled(center: [f64; 3], half: f64) -> (BoundingBox, Vec<[f32; 3]>) {
+        let (mut bounds, mut points) = (BoundingBox::EMPTY, Vec::new());
         for index in 0..216 {
             let step = [index % 6, index / 6 % 6, index / 36].map(|step| f64::from(step) / 2.5 - 1.0);
             let point: [f32; 3] = std::array::from_fn(|axis| (center[axis] + half * step[axis]) as f32);
@@ -187,7 +187,7 @@ mod tests {
             }
             assert_eq!(Region::project(&(seen * bad), &bounds, FRAME), whole);
         }
-        assert_eq!(Region::project(&seen, &Bounds::EMPTY, FRAME), whole);
+        assert_eq!(Region::project(&seen, &BoundingBox::EMPTY, FRAME), whole);
         // So far along x that f32 rounding may place it at any column.
         let (bounds, _) = filled([1e9, 0.0, 0.0], 0.5);
         let [_, y, width, height] =

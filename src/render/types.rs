@@ -1,7 +1,7 @@
 //! Values that the renderer takes and returns. They refer to no device.
 
 use crate::pass::{FrameTimes, Pass};
-use modalcast_model::scene::{Bounds, Camera, OrientedBounds};
+use modalcast_model::scene::{BoundingBox, Camera, OrientedBounds};
 
 /// Preference for the EGL device that draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,7 +37,7 @@ pub struct FrameParams {
     pub height: u32,
     /// Bounds of all deformed vertices, in scene units. The frame draws nothing outside them; bounds that are not
     /// finite are ignored.
-    pub bounds: Bounds,
+    pub bounds: BoundingBox,
     /// Bounds of the same vertices in light space, to which the shadow map is fitted. Without them, the map is fitted
     /// to the corners of `bounds`.
     pub light: Option<OrientedBounds>,

@@ -7,7 +7,7 @@ use modalcast::engine::DeviceContext;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{Deformer, VertexAttributes};
 use modalcast_model::domain::{Domain, Transform};
-use modalcast_model::scene::{Bounds, DeformationSettings, Scene, SceneState, StorageType};
+use modalcast_model::scene::{BoundingBox, DeformationSettings, Scene, SceneState, StorageType};
 
 use super::extreme_values::scene_from_columns;
 use super::neighbors::has_one_item_per_lane;
@@ -28,7 +28,7 @@ pub(crate) fn find_wrong_box(scene: &Scene, result: &StepResult) -> Option<usize
     assert_eq!(result.surface.boxes.len(), slots.len(), "expected a box per domain");
     let position_bounds = |domain: usize| {
         let positions = &result.surface.positions[3 * slots[domain].first_vertex..][..3 * slots[domain].vertices];
-        Bounds::from_positions(positions)
+        BoundingBox::from_positions(positions)
     };
     (0..slots.len()).find(|domain| result.surface.boxes[*domain] != position_bounds(*domain))
 }

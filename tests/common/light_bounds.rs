@@ -5,7 +5,7 @@ use std::sync::Arc;
 use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::deform::Deformer;
 use modalcast_model::domain::{Mesh, Modes, Shape};
-use modalcast_model::scene::{Bounds, DeformationSettings, OrientedBounds, Scene, SceneState};
+use modalcast_model::scene::{BoundingBox, DeformationSettings, OrientedBounds, Scene, SceneState};
 
 use super::{StepResult, run_step, scene_of_shapes};
 use crate::scenes::{self, Random};
@@ -41,7 +41,7 @@ pub(crate) fn coil_scene(deformation: DeformationSettings) -> Arc<Scene> {
 /// The smallest light-space box that contains the bounding boxes of all tiles of `tile_vertices` packed positions.
 pub(crate) fn bounds_in_light_space(scene: &Scene, positions: &[f32], tile_vertices: usize) -> OrientedBounds {
     let axes = scene.light_axes().expect("expected a scene with a shadow");
-    let tile_box = |positions: &[f32]| OrientedBounds::enclosing(&axes, &Bounds::from_positions(positions));
+    let tile_box = |positions: &[f32]| OrientedBounds::enclosing(&axes, &BoundingBox::from_positions(positions));
     positions.chunks(3 * tile_vertices).map(tile_box).fold(OrientedBounds::EMPTY, OrientedBounds::union)
 }
 
@@ -53,13 +53,13 @@ pub(crate) fn max_excess(outer: &OrientedBounds, inner: &OrientedBounds) -> f64 
 }
 
 /// Sum of the largest absolute coordinates; the rounding error of f32 is proportional to it.
-pub(crate) fn coordinate_magnitude(bounds: &Bounds) -> f64 {
+pub(crate) fn coordinate_magnitude(bounds: &BoundingBox) -> f64 {
     bounds.min.iter().zip(&bounds.max).map(|(min, max)| min.abs().max(max.abs())).sum()
 }
 
 /// Largest diagonal of the box of a tile.
 fn max_tile_diagonal(positions: &[f32]) -> f64 {
-    positions.chunks(3 * TILE_VERTICES).map(|tile| Bounds::from_positions(tile).diagonal()).fold(0.0, f64::max)
+    positions.chunks(3 * TILE_VERTICES).map(|tile| BoundingBox::from_positions(tile).diagonal()).fold(0.0, f64::max)
 }
 
 /// The light-space bounds of a step. Asserts that they contain every vertex, and that they exceed the light-space box of
@@ -85,7 +85,7 @@ fn checked_light_bounds(name: &str, scene: &Scene, result: &StepResult) -> Orien
     light_box
 }
 
-fn bounds_of_corners(scene: &Scene, bounds: &Bounds) -> OrientedBounds {
+fn bounds_of_corners(scene: &Scene, bounds: &BoundingBox) -> OrientedBounds {
     OrientedBounds::enclosing(&scene.light_axes().expect("expected a scene with a shadow"), bounds)
 }
 

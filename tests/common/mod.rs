@@ -21,7 +21,7 @@ use std::sync::Arc;
 
 use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::domain::{Domain, Mesh, Shape};
-use modalcast_model::scene::{Bounds, DeformationSettings, OrientedBounds, Scene, SceneState};
+use modalcast_model::scene::{BoundingBox, DeformationSettings, OrientedBounds, Scene, SceneState};
 
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 pub(crate) use error_bounds::{
@@ -31,7 +31,7 @@ pub(crate) use error_bounds::{
 /// Results of a step.
 #[derive(Debug, Clone)]
 pub(crate) struct StepResult {
-    pub(crate) bounds: Bounds,
+    pub(crate) bounds: BoundingBox,
     pub(crate) light: Option<OrientedBounds>,
     pub(crate) surface: DeformedSurface,
 }
@@ -96,7 +96,7 @@ pub(crate) fn scene_of_shapes(
 #[test]
 fn difference_detects_bits_lengths_and_bounds() {
     let surface = DeformedSurface { positions: vec![0.0; 3], normals: vec![1.0; 3], ..DeformedSurface::default() };
-    let result = StepResult { bounds: Bounds { min: [0.0; 3], max: [0.0; 3] }, light: None, surface };
+    let result = StepResult { bounds: BoundingBox { min: [0.0; 3], max: [0.0; 3] }, light: None, surface };
     assert_eq!(result.difference(&result), None);
     let difference_after = |modify: &dyn Fn(&mut StepResult)| {
         let mut other = result.clone();
@@ -107,6 +107,6 @@ fn difference_detects_bits_lengths_and_bounds() {
     assert!(difference_after(&|other| other.surface.normals[2] = 1.000_000_1).is_some());
     assert!(difference_after(&|other| other.surface.tangents.push(0.0)).is_some());
     assert!(difference_after(&|other| other.surface.displacements.push(0.0)).is_some());
-    assert!(difference_after(&|other| other.surface.boxes.push(Bounds::EMPTY)).is_some());
+    assert!(difference_after(&|other| other.surface.boxes.push(BoundingBox::EMPTY)).is_some());
     assert!(difference_after(&|other| other.bounds.max[0] = f64::NAN).is_some());
 }

@@ -3,7 +3,7 @@
 use modalcast_compute::gpu::CudaDeformer;
 use modalcast_compute::reference::{rigid_normals, rigid_tangents};
 use modalcast_model::deform::{DeformSummary, Deformer};
-use modalcast_model::scene::{Bounds, Scene, SceneState};
+use modalcast_model::scene::{BoundingBox, Scene, SceneState};
 
 /// Largest accepted error of a position, relative to the scene's diagonal.
 pub(crate) const MAX_POSITION_ERROR: f64 = 1e-5;
@@ -39,7 +39,7 @@ pub(crate) fn assert_equals_reference(
     let summary = deformer.deform(state).expect("expected the step to succeed");
     let surface = deformer.surface().expect("expected a surface");
     let reference_positions = modalcast_compute::reference::deform(scene, state);
-    let mut bounds = Bounds::EMPTY;
+    let mut bounds = BoundingBox::EMPTY;
     reference_positions.iter().for_each(|position_error| bounds.include(*position_error));
     let diagonal = bounds.diagonal().max(f64::from(f32::MIN_POSITIVE));
     let position_error = max_error(&surface.positions, &reference_positions, MAX_POSITION_ERROR * diagonal)
@@ -56,8 +56,8 @@ pub(crate) fn assert_equals_reference(
     summary
 }
 
-fn bounds_of(positions: &[f32]) -> Bounds {
-    let mut bounds = Bounds::EMPTY;
+fn bounds_of(positions: &[f32]) -> BoundingBox {
+    let mut bounds = BoundingBox::EMPTY;
     for position in positions.chunks_exact(3) {
         bounds.include([0, 1, 2].map(|axis| f64::from(position[axis])));
     }

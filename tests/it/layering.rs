@@ -225,7 +225,7 @@ fn is_walked_in_tests(name: &str) -> bool {
 /// Kernels whose CPU twin is a method of a model or reference type, instead of a file with the name of the kernel.
 const TWINS_ELSEWHERE: [(&str, Twin); 3] = [
     ("apply", Twin { file: "src/model/scene/state.rs", of: "SceneState", method: "apply" }),
-    ("bounds", Twin { file: "src/model/scene/camera.rs", of: "Bounds", method: "union" }),
+    ("bounds", Twin { file: "src/model/scene/camera.rs", of: "BoundingBox", method: "union" }),
     ("raster", Twin { file: "src/compute/reference/raster.rs", of: "VisibilityBuffer", method: "draw" }),
 ];
 

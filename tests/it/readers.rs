@@ -5,7 +5,7 @@ use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::{Delivery, OutputSpec};
 use modalcast_compute::reference::{self, ReferenceDeformer};
 use modalcast_model::deform::{DeformedSurface, Deformer, VertexAttributes};
-use modalcast_model::scene::Bounds;
+use modalcast_model::scene::BoundingBox;
 use modalcast_proto::v1;
 use tonic::Code;
 use v1::Policy;
@@ -39,7 +39,7 @@ fn reference_displacements(steps: &[v1::Step]) -> Vec<f32> {
 /// Bounding boxes of packed domains with four vertices each.
 fn boxes_of(positions: &[f32]) -> Vec<f32> {
     let sides = |positions| {
-        let Bounds { min, max } = Bounds::from_positions(positions);
+        let BoundingBox { min, max } = BoundingBox::from_positions(positions);
         [min, max].concat().into_iter().map(|number| number as f32)
     };
     positions.chunks_exact(12).flat_map(sides).collect()

@@ -34,7 +34,7 @@ use changes::ChangeTracker;
 use deform::{DeformInputs, MAX_TILE_VERTICES};
 use modalcast_model::deform::{Backend, BoundingAxes, DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Bounds, Scene, SceneState};
+use modalcast_model::scene::{BoundingBox, Scene, SceneState};
 use retained_modes::RetainedModes;
 use tile::{PackedOutput, PerTileOutput, WorkList};
 use tile_bounds::TileBounds;
@@ -83,7 +83,7 @@ impl CpuDeformer {
                 normals: vec![0.0; 3 * layout.corners],
                 tangents: vec![0.0; tangents],
                 displacements: vec![0.0; if scene.needs.displacements { 3 * layout.vertices } else { 0 }],
-                boxes: vec![Bounds::EMPTY; if scene.needs.boxes { layout.slots.len() } else { 0 }],
+                boxes: vec![BoundingBox::EMPTY; if scene.needs.boxes { layout.slots.len() } else { 0 }],
             },
         }
     }

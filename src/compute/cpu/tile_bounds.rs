@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use modalcast_model::scene::{Bounds, OrientedBounds};
+use modalcast_model::scene::{BoundingBox, OrientedBounds};
 
 /// Bounds of f32 positions: all NaN if a position is not finite, `min > max` if there are none.
 #[derive(Debug, Clone, Copy)]
@@ -63,7 +63,7 @@ impl TileBounds {
     }
 
     /// Bounds of all tiles.
-    pub(super) fn all(extents: &[Self]) -> Bounds {
+    pub(super) fn all(extents: &[Self]) -> BoundingBox {
         extents.par_iter().with_min_len(4096).copied().reduce(|| Self::EMPTY, Self::union).to_bounds()
     }
 
@@ -74,12 +74,12 @@ impl TileBounds {
     }
 
     /// Bounds of the tiles of one domain.
-    pub(super) fn of_domain(extents: &[Self]) -> Bounds {
+    pub(super) fn of_domain(extents: &[Self]) -> BoundingBox {
         extents.iter().copied().fold(Self::EMPTY, Self::union).to_bounds()
     }
 
-    fn to_bounds(self) -> Bounds {
-        Bounds { min: self.min.map(f64::from), max: self.max.map(f64::from) }
+    fn to_bounds(self) -> BoundingBox {
+        BoundingBox { min: self.min.map(f64::from), max: self.max.map(f64::from) }
     }
 
     /// The extent, made NaN if `number` is not finite.

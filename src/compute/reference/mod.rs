@@ -14,7 +14,7 @@ pub use rigid_normals::{rigid_normals, rigid_tangents};
 
 use modalcast_model::deform::{Backend, BoundingAxes, DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Bounds, DomainLayout, OrientedBounds, Scene, SceneState};
+use modalcast_model::scene::{BoundingBox, DomainLayout, OrientedBounds, Scene, SceneState};
 
 /// The deformer of the `reference` backend: computes in f64 and rounds once.
 #[derive(Debug)]
@@ -38,7 +38,7 @@ impl ReferenceDeformer {
 
     /// Computes displacements and boxes if the scene keeps them. A displacement that overflows f32 makes the bounds
     /// NaN.
-    fn compute_attributes(&mut self, state: &SceneState, bounds: &mut Bounds) {
+    fn compute_attributes(&mut self, state: &SceneState, bounds: &mut BoundingBox) {
         let (scene, surface) = (&self.scene, &mut self.surface);
         if scene.needs.displacements {
             surface.displacements = round(displacements(scene, state));
@@ -48,7 +48,7 @@ impl ReferenceDeformer {
         }
         if scene.needs.boxes {
             let box_of = |slot: &DomainLayout| {
-                Bounds::from_positions(&surface.positions[3 * slot.first_vertex..][..3 * slot.vertices])
+                BoundingBox::from_positions(&surface.positions[3 * slot.first_vertex..][..3 * slot.vertices])
             };
             surface.boxes = scene.layout.slots.iter().map(box_of).collect();
         }
@@ -65,7 +65,7 @@ impl Deformer for ReferenceDeformer {
         let positions = deform(&self.scene, state);
         let oriented_bounds = self.bounding_axes.map(|axes| {
             let one =
-                |position: &[f64; 3]| OrientedBounds::enclosing(&axes, &Bounds { min: *position, max: *position });
+                |position: &[f64; 3]| OrientedBounds::enclosing(&axes, &BoundingBox { min: *position, max: *position });
             positions.iter().map(one).fold(OrientedBounds::EMPTY, OrientedBounds::union)
         });
         let (normals, tangents) = if self.scene.needs.exact_normals {
@@ -76,7 +76,7 @@ impl Deformer for ReferenceDeformer {
         self.surface.positions = round(positions);
         self.surface.normals = round(normals);
         self.surface.tangents = round(tangents);
-        let mut bounds = Bounds::from_positions(&self.surface.positions);
+        let mut bounds = BoundingBox::from_positions(&self.surface.positions);
         self.compute_attributes(state, &mut bounds);
         Ok(DeformSummary { bounds, oriented_bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
     }

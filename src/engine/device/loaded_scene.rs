@@ -10,7 +10,7 @@ use crate::frame::Legend;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{Bounds, Camera, FrameSize, OrientedBounds, Scene, SceneState, snap_to_origin_grid};
+use modalcast_model::scene::{BoundingBox, Camera, FrameSize, OrientedBounds, Scene, SceneState, snap_to_origin_grid};
 use modalcast_render::{FrameParams, Renderer, SceneBuffers};
 
 /// Positions beyond this bound (scene units) are rejected like infinite ones, because their squares overflow f32 in the
@@ -23,7 +23,7 @@ const BENCHMARK_SIZE: FrameSize = FrameSize::new(1920, 1080);
 /// Description of the content of the buffers, in the coordinate frame that the camera needs.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::engine) struct BufferContents {
-    bounds: Bounds,
+    bounds: BoundingBox,
     /// `None` in a camera-relative frame, because the deformer computed them in the frames of the domains' cells.
     light: Option<OrientedBounds>,
     /// Whether vertices were uploaded.
@@ -45,7 +45,7 @@ pub struct LoadedScene {
     buffers: Option<SceneBuffers>,
     /// Whether the buffers hold the vertices of the last deformation.
     filled: bool,
-    bounds: Bounds,
+    bounds: BoundingBox,
     /// Bounds of the same vertices in light space; only if the scene has a shadow.
     light: Option<OrientedBounds>,
     /// The state that the deformer's output shows.
@@ -94,7 +94,7 @@ impl LoadedScene {
     }
 
     /// Bounds of the last deformation in scene units, each domain relative to its cell. Always finite.
-    pub const fn bounds(&self) -> Bounds {
+    pub const fn bounds(&self) -> BoundingBox {
         self.bounds
     }
 
@@ -275,7 +275,7 @@ fn no_buffers() -> Error {
     fault_in("draw")("the scene has no buffers")
 }
 
-fn is_in_range(bounds: &Bounds) -> bool {
+fn is_in_range(bounds: &BoundingBox) -> bool {
     bounds.min.iter().chain(&bounds.max).all(|number| number.abs() <= MAX_COORDINATE)
 }
 

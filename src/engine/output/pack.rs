@@ -9,7 +9,7 @@ use crate::engine::blocking::run_blocking;
 use crate::telemetry::{Stage, ms_since};
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Result, fault_in, invalid};
-use modalcast_model::scene::{Bounds, DomainLayout, FloatingOrigins, Layout, Scene};
+use modalcast_model::scene::{BoundingBox, DomainLayout, FloatingOrigins, Layout, Scene};
 use modalcast_render::RasterBackends;
 
 // Vertices are copied in memory order, and the wire format is little-endian.
@@ -178,7 +178,7 @@ fn pack(surface: &DeformedSurface, selection: &VertexSelection) -> Vec<u8> {
     put(wanted.normals, &surface.normals, &corners);
     put(wanted.displacements, &surface.displacements, &vertices);
     for domain in selection.domains.iter().filter(|_| wanted.boxes) {
-        let Bounds { min, max } = surface.boxes[*domain as usize];
+        let BoundingBox { min, max } = surface.boxes[*domain as usize];
         // The bounds are f32 values stored as f64, so the conversion is exact.
         let sides = [min, max].map(|corner| corner.map(|number| number as f32));
         bytes.extend_from_slice(bytemuck::cast_slice(&sides));
@@ -220,7 +220,7 @@ mod tests {
     fn displacements_and_boxes_follow_the_normals_and_are_refused_where_the_scene_keeps_none() {
         let (bare, kept) = (testing::two_strips(), testing::strips_with_attributes());
         let count = |from: f32, len: usize| (0..len).map(|at| from + at as f32).collect::<Vec<_>>();
-        let side = |from: f64| Bounds { min: [from; 3], max: [from + 1.0, from + 2.0, from + 3.0] };
+        let side = |from: f64| BoundingBox { min: [from; 3], max: [from + 1.0, from + 2.0, from + 3.0] };
         let surface = DeformedSurface {
             displacements: count(50.0, 24),
             boxes: vec![side(7.0), side(-3.5)],

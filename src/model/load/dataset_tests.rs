@@ -130,7 +130,7 @@ fn real_plants_lie_where_their_file_says_and_petioles_reach_their_leaves() {
         let scene = open(&format!("plants/{name}"));
         assert_eq!((scene.domains.len(), scene.layout.triangles), (domains, triangles), "{name}");
         let text = std::fs::read_to_string(data(&format!("plants/{name}/{name}.obj"))).expect("read");
-        let mut bounds = crate::scene::Bounds::EMPTY;
+        let mut bounds = crate::scene::BoundingBox::EMPTY;
         for line in text.lines().filter_map(|line| line.strip_prefix("v ")) {
             let numbers: Vec<f64> = line.split_whitespace().map(|word| word.parse().expect("a number")).collect();
             bounds.include([numbers[0], numbers[1], numbers[2]]);

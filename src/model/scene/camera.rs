@@ -7,12 +7,12 @@ use crate::error::{Result, invalid};
 
 /// An axis-aligned bounding box in scene units. Empty if `min > max`.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Bounds {
+pub struct BoundingBox {
     pub min: [f64; 3],
     pub max: [f64; 3],
 }
 
-impl Bounds {
+impl BoundingBox {
     pub const EMPTY: Self = Self { min: [f64::INFINITY; 3], max: [f64::NEG_INFINITY; 3] };
 
     /// The bounding box of packed positions, three numbers each.
@@ -221,7 +221,7 @@ impl Camera {
     }
 
     /// `clip_from_camera` for an image of `width` x `height` pixels. Fitted near and far planes enclose `bounds`.
-    pub fn clip_from_camera(&self, width: u32, height: u32, bounds: &Bounds) -> Matrix4<f64> {
+    pub fn clip_from_camera(&self, width: u32, height: u32, bounds: &BoundingBox) -> Matrix4<f64> {
         let (near, far) = self.depth_range(bounds);
         let [fx, fy, cx, cy] = self.intrinsics([width, height]);
         let (width, height) = (f64::from(width), f64::from(height));
@@ -237,7 +237,7 @@ impl Camera {
     }
 
     /// Near and far distances: as given, or fitted to `bounds` and the ground around them.
-    fn depth_range(&self, bounds: &Bounds) -> (f64, f64) {
+    fn depth_range(&self, bounds: &BoundingBox) -> (f64, f64) {
         if self.far > 0.0 {
             return (self.near, self.far);
         }
@@ -264,13 +264,13 @@ mod tests {
 
     #[test]
     fn bounds_never_forget_a_nan() {
-        let mut bounds = Bounds::EMPTY;
+        let mut bounds = BoundingBox::EMPTY;
         bounds.include([0.0; 3]);
         assert!(bounds.is_finite());
         bounds.include([0.0, f64::NAN, 0.0]);
         bounds.include([1.0; 3]);
         assert!(!bounds.is_finite());
-        let other = Bounds { min: [0.0; 3], max: [1.0; 3] };
+        let other = BoundingBox { min: [0.0; 3], max: [1.0; 3] };
         assert!(!other.union(bounds).is_finite() && !bounds.union(other).is_finite());
     }
 

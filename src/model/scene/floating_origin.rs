@@ -19,7 +19,7 @@
 //! Cells exist only after the first step with f64 translations. Until then, the scene's origin is the cell of all
 //! domains.
 
-use super::{Bounds, Scene};
+use super::{BoundingBox, Scene};
 use crate::domain::Transform;
 use crate::error::{Result, invalid};
 
@@ -142,14 +142,14 @@ impl FloatingOrigins {
     /// in f64, rounded to f32 once. `positions` has three numbers per vertex in layout order. Also returns the bounds
     /// of the domains that are near `view` compared with the nearest one; bounds of much more distant domains would say
     /// nothing about the visible ones.
-    pub fn rebase_positions(&self, view: [f64; 3], scene: &Scene, positions: &[f32]) -> (Vec<f32>, Bounds) {
+    pub fn rebase_positions(&self, view: [f64; 3], scene: &Scene, positions: &[f32]) -> (Vec<f32>, BoundingBox) {
         let slots = &scene.layout.slots;
         let offset = |domain| difference(self.origin_of(scene.movers.of(domain)), view);
         let offsets: Vec<[f64; 3]> = (0..slots.len()).map(offset).collect();
         let distance = |offset: &[f64; 3]| offset.iter().fold(0.0, |most: f64, along| most.max(along.abs()));
         let nearest = offsets.iter().map(distance).fold(f64::INFINITY, f64::min);
         let mut seen = Vec::with_capacity(positions.len());
-        let mut bounds = Bounds::EMPTY;
+        let mut bounds = BoundingBox::EMPTY;
         for (slot, offset) in slots.iter().zip(&offsets) {
             let is_near = distance(offset) <= ORIGIN_REACH + 4.0 * nearest;
             let own = &positions[3 * slot.first_vertex..][..3 * slot.vertices];

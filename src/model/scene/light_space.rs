@@ -7,7 +7,7 @@
 use nalgebra::Vector3;
 
 use super::shadow::ShadowFit;
-use super::{Bounds, Scene, UpAxis};
+use super::{BoundingBox, Scene, UpAxis};
 
 /// The x, y and z axes of light space as unit vectors in the world. z is v_l, the direction to the sun, and y points
 /// up. If the sun is at the zenith, "up" does not determine y, and y is chosen arbitrarily.
@@ -32,14 +32,14 @@ impl Scene {
 /// A bounding box along three orthogonal axes, such as those of light space, in scene units and relative to the same
 /// origin as the bounded positions. Empty if `min > max`.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct OrientedBounds(pub Bounds);
+pub struct OrientedBounds(pub BoundingBox);
 
 impl OrientedBounds {
-    pub const EMPTY: Self = Self(Bounds::EMPTY);
+    pub const EMPTY: Self = Self(BoundingBox::EMPTY);
 
     /// The smallest box along these axes that contains a world-space box: along each axis, a corner of the box is the
     /// farthest point. NaN and infinite coordinates yield NaN or infinite bounds; an empty box yields an empty one.
-    pub fn enclosing(axes: &[Vector3<f64>; 3], world: &Bounds) -> Self {
+    pub fn enclosing(axes: &[Vector3<f64>; 3], world: &BoundingBox) -> Self {
         if world.min[0] > world.max[0] {
             return Self::EMPTY;
         }
@@ -50,7 +50,7 @@ impl OrientedBounds {
             };
             farthest(0) + farthest(1) + farthest(2)
         };
-        Self(Bounds {
+        Self(BoundingBox {
             min: std::array::from_fn(|axis| end(axis, false)),
             max: std::array::from_fn(|axis| end(axis, true)),
         })
@@ -65,7 +65,7 @@ impl OrientedBounds {
     /// The box, extended by `margin` at all sides.
     #[must_use]
     pub fn expanded_by(self, margin: f64) -> Self {
-        Self(Bounds { min: self.0.min.map(|end| end - margin), max: self.0.max.map(|end| end + margin) })
+        Self(BoundingBox { min: self.0.min.map(|end| end - margin), max: self.0.max.map(|end| end + margin) })
     }
 
     /// Whether a shadow map can be fitted to the box: it is finite and not empty.
@@ -94,10 +94,10 @@ mod tests {
 
     #[test]
     fn a_box_in_light_space_reaches_to_the_farthest_corners_and_no_farther() {
-        let world = Bounds { min: [-1.0, 0.5, -2.0], max: [1.5, 3.0, 2.0] };
+        let world = BoundingBox { min: [-1.0, 0.5, -2.0], max: [1.5, 3.0, 2.0] };
         for sun in suns() {
             let axes = light_axes(sun, UpAxis::Y);
-            let mut want = Bounds::EMPTY;
+            let mut want = BoundingBox::EMPTY;
             for corner in world.corners() {
                 want.include(axes.map(|axis| axis.dot(&corner.coords)));
             }
@@ -113,10 +113,10 @@ mod tests {
     #[test]
     fn nothing_is_empty_and_what_is_not_finite_is_told() {
         let axes = light_axes(suns()[0], UpAxis::Y);
-        let of = |min, max| OrientedBounds::enclosing(&axes, &Bounds { min, max });
+        let of = |min, max| OrientedBounds::enclosing(&axes, &BoundingBox { min, max });
         let good = of([0.0; 3], [1.0; 3]);
         assert!(good.is_valid() && !OrientedBounds::EMPTY.is_valid());
-        assert_eq!(OrientedBounds::enclosing(&axes, &Bounds::EMPTY), OrientedBounds::EMPTY);
+        assert_eq!(OrientedBounds::enclosing(&axes, &BoundingBox::EMPTY), OrientedBounds::EMPTY);
         assert_eq!(good.union(OrientedBounds::EMPTY), good);
         for bad in [f64::NAN, f64::INFINITY] {
             assert!(!of([0.0; 3], [1.0, bad, 1.0]).is_valid());

@@ -20,7 +20,7 @@ mod step_update;
 mod transform_format;
 mod transform_roots;
 
-pub use camera::{Bounds, Camera, Lens, View};
+pub use camera::{BoundingBox, Camera, Lens, View};
 pub use deformation::{DeformationSettings, NormalMethod, StorageType};
 pub use features::SceneFeatures;
 pub use floating_origin::{FloatingOrigins, ORIGIN_GRID, ORIGIN_REACH, snap_to_origin_grid};
@@ -94,7 +94,7 @@ pub struct Scene {
     pub movers: TransformRoots,
     pub needs: SceneFeatures,
     /// Bounds of the rest state in scene units.
-    pub rest_bounds: Bounds,
+    pub rest_bounds: BoundingBox,
 }
 
 impl Scene {
@@ -161,7 +161,7 @@ impl Scene {
             layout,
             movers,
             needs,
-            rest_bounds: Bounds::EMPTY,
+            rest_bounds: BoundingBox::EMPTY,
         };
         scene.rest_bounds = scene.bounds_at_rest();
         Ok(Arc::new(scene))
@@ -192,8 +192,8 @@ impl Scene {
         self.domains.iter().position(|domain| domain.name == name)
     }
 
-    fn bounds_at_rest(&self) -> Bounds {
-        let mut bounds = Bounds::EMPTY;
+    fn bounds_at_rest(&self) -> BoundingBox {
+        let mut bounds = BoundingBox::EMPTY;
         for domain in &self.domains {
             let place = domain.placement.to_matrix();
             for position in self.shapes[domain.shape].mesh.rest() {

@@ -8,7 +8,7 @@ use crate::scene_data::geometry::tests::squares;
 use crate::{DevicePreference, FrameParams};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::scene::{Bounds, Camera, Scene, Transparency};
+use modalcast_model::scene::{BoundingBox, Camera, Scene, Transparency};
 
 /// Draws a glass square in front of an opaque square and another behind it, 64 pixels wide; returns the pixels and
 /// the renderer.
@@ -27,7 +27,7 @@ fn drawn(transparency: Transparency, alpha_mode: AlphaMode, post_depth_coverage:
         .into_iter()
         .flat_map(|(z, angle)| square.map(|at| corner(z, angle, at)))
         .collect();
-    let mut bounds = Bounds::EMPTY;
+    let mut bounds = BoundingBox::EMPTY;
     positions.iter().for_each(|position| bounds.include(position.map(f64::from)));
     let surface = DeformedSurface {
         positions: positions.as_flattened().to_vec(),

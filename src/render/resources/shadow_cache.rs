@@ -5,7 +5,7 @@ use std::cell::Cell;
 
 use crate::types::FrameParams;
 use modalcast_model::error::Result;
-use modalcast_model::scene::{Bounds, OrientedBounds};
+use modalcast_model::scene::{BoundingBox, OrientedBounds};
 
 /// Identity of the current vertices, and what the map was last drawn from.
 #[derive(Debug, Default)]
@@ -19,7 +19,7 @@ pub(crate) struct ShadowCache {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ShadowKey {
     step: u64,
-    bounds: Bounds,
+    bounds: BoundingBox,
     light: Option<OrientedBounds>,
     origin: [f64; 3],
 }

@@ -108,10 +108,10 @@ fn cascade_transform(whole: &[TexelSpan; 2], part: &[TexelSpan; 2]) -> [f32; 4] 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use modalcast_model::scene::{Bounds, Lens, UpAxis, View};
+    use modalcast_model::scene::{BoundingBox, Lens, UpAxis, View};
 
     fn fit() -> LightBoxParams {
-        let bounds = Bounds { min: [-50.0, 0.0, -50.0], max: [50.0, 5.0, 50.0] };
+        let bounds = BoundingBox { min: [-50.0, 0.0, -50.0], max: [50.0, 5.0, 50.0] };
         let to_sun = Vector3::new(0.4, 0.8, 0.5).normalize();
         LightBoxParams { to_sun, up: UpAxis::Y, bounds, light: None, ground: Some(0.0), size: 512.0, rim: 6.0 }
     }
@@ -168,7 +168,7 @@ mod tests {
             let view = View::LookAt { eye, target: [eye[0], eye[1], eye[2] - 1.0], up: [0.0, 1.0, 0.0] };
             FrameParams { camera: Camera { view, lens: Lens::FieldOfView(100.0), near, far }, ..shot(0.0) }
         };
-        let point = Bounds { min: [5.0; 3], max: [5.0; 3] };
+        let point = BoundingBox { min: [5.0; 3], max: [5.0; 3] };
         for shot in [turned(1e-6, 1e9, [0.0; 3]), turned(0.0, 0.0, [0.0, 0.0, -900.0]), turned(0.0, 0.0, [1e9; 3])] {
             for bounds in [fit().bounds, point] {
                 let splits = ShadowCascades::new(&scene(4), &shot, &LightBoxParams { bounds, ..fit() }, [0.0; 3]);

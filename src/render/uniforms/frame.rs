@@ -6,7 +6,7 @@ use nalgebra::{Matrix4, Vector3};
 use super::light_box::{LightBox, LightBoxParams};
 use crate::types::FrameParams;
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::scene::{Bounds, OrientedBounds, Scene};
+use modalcast_model::scene::{BoundingBox, OrientedBounds, Scene};
 
 /// Uniform block of a frame; matrices are column-major. Twin of `FrameBlock` in `shaders/shared/frame.glsl`.
 #[repr(C)]
@@ -121,7 +121,7 @@ pub(crate) fn shadow_clip_from_positions(scene: &Scene, shot: &FrameParams, orig
 
 /// The bounds of a shot, or the rest bounds when those overflowed: overflowed bounds fit no shadow map and no depth
 /// range.
-fn finite_bounds(scene: &Scene, shot: &FrameParams) -> Bounds {
+fn finite_bounds(scene: &Scene, shot: &FrameParams) -> BoundingBox {
     let finite_bounds = shot.bounds.is_finite() && shot.bounds.min[0] <= shot.bounds.max[0];
     if finite_bounds { shot.bounds } else { scene.rest_bounds }
 }
@@ -183,7 +183,7 @@ pub(crate) fn ground_is_behind_scene(scene: &Scene, shot: &FrameParams, origin: 
 
 /// The rest bounds in the coordinates of the positions. When positions have another origin than the scene, because the
 /// scene moved far from its origin, the rest bounds move along to the current center; the ground keeps its height.
-fn rebased_rest_bounds(scene: &Scene, bounds: Bounds, origin: [f64; 3]) -> Bounds {
+fn rebased_rest_bounds(scene: &Scene, bounds: BoundingBox, origin: [f64; 3]) -> BoundingBox {
     let rest = scene.rest_bounds;
     if origin == [0.0; 3] {
         return rest;
@@ -191,11 +191,11 @@ fn rebased_rest_bounds(scene: &Scene, bounds: Bounds, origin: [f64; 3]) -> Bound
     let mut shift = bounds.center() - rest.center();
     shift[scene.up.index()] = -origin[scene.up.index()];
     let moved = |corner: [f64; 3]| std::array::from_fn(|axis| corner[axis] + shift[axis]);
-    Bounds { min: moved(rest.min), max: moved(rest.max) }
+    BoundingBox { min: moved(rest.min), max: moved(rest.max) }
 }
 
 /// Center of the ground below the scene, and the distance D over which it fades.
-fn ground_disc(up: usize, rebased_rest_bounds: Bounds, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
+fn ground_disc(up: usize, rebased_rest_bounds: BoundingBox, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
     let mut center = rebased_rest_bounds.center().coords;
     center[up] = rebased_rest_bounds.min[up];
     let mut aside = eye - center;
@@ -235,7 +235,7 @@ mod tests {
         let view = View::LookAt { eye: [1.0, 2.0, 3.0], target: [0.2, 0.1, -0.4], up: [0.0, 1.0, 0.0] };
         let lens = Lens::Intrinsics { fx: 300.0, fy: 250.0, cx: 100.0, cy: 130.0 };
         let camera = Camera { view, lens, near: 0.1, far: 100.0 };
-        let (clip, from_world) = (camera.clip_from_camera(320, 200, &Bounds::EMPTY), camera.camera_from_world());
+        let (clip, from_world) = (camera.clip_from_camera(320, 200, &BoundingBox::EMPTY), camera.camera_from_world());
         let point = nalgebra::Point3::new(0.3, -0.2, 0.7);
         let image = (clip * from_world * point.to_homogeneous()).scale(1.0);
         let image = Vector3::new(image.x / image.w, image.y / image.w, 1.0);
@@ -249,11 +249,11 @@ mod tests {
         let scene = Scene::new(squares(vec![Material::default()])).expect("good");
         let rest = scene.rest_bounds;
         let moved = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] + 5.0, corner[2] - 7.0];
-        let bounds = Bounds { min: moved(rest.min), max: moved(rest.max) };
+        let bounds = BoundingBox { min: moved(rest.min), max: moved(rest.max) };
         assert_eq!(rebased_rest_bounds(&scene, bounds, [0.0; 3]), rest, "a scene at its origin rests where it rested");
         let rebased_rest_bounds = rebased_rest_bounds(&scene, bounds, [1024.0, 2048.0, 0.0]);
         let want = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] - 2048.0, corner[2] - 7.0];
-        assert_eq!(rebased_rest_bounds, Bounds { min: want(rest.min), max: want(rest.max) });
+        assert_eq!(rebased_rest_bounds, BoundingBox { min: want(rest.min), max: want(rest.max) });
     }
 
     #[test]
@@ -292,11 +292,11 @@ mod tests {
         let good = FrameUniforms::new(&scene, &shot, [0.0; 3]).expect("good");
         let [x, y, z, may_hide] = good.to_sun;
         assert!(may_hide == 0.0 && good.eye[3] > 0.0, "nothing is below the ground");
-        for bounds in [Bounds::EMPTY, Bounds { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
+        for bounds in [BoundingBox::EMPTY, BoundingBox { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
             let replaced = FrameUniforms::new(&scene, &FrameParams { bounds, ..shot }, [0.0; 3]).expect("replaced");
             assert_eq!(replaced, FrameUniforms { to_sun: [x, y, z, 1.0], ..good }, "what overflowed may be below it");
         }
-        let measured = OrientedBounds(Bounds { min: [-0.25; 3], max: [0.25; 3] });
+        let measured = OrientedBounds(BoundingBox { min: [-0.25; 3], max: [0.25; 3] });
         let with =
             |light| FrameUniforms::new(&scene, &FrameParams { light: Some(light), ..shot }, [0.0; 3]).expect("good");
         assert_ne!(with(measured), good, "control: what was measured decides");

@@ -10,7 +10,7 @@
 
 use nalgebra::{Matrix4, Vector3};
 
-use modalcast_model::scene::{Bounds, OrientedBounds, UpAxis, light_axes};
+use modalcast_model::scene::{BoundingBox, OrientedBounds, UpAxis, light_axes};
 
 /// Maximum distance by which the ground may push the far plane below the box, in diagonals of the bounds. A grazing sun
 /// would push it to infinity. Receivers beyond the far plane are still shaded correctly.
@@ -35,7 +35,7 @@ pub(crate) struct LightBox {
 pub(crate) struct LightBoxParams {
     pub(crate) to_sun: Vector3<f64>,
     pub(crate) up: UpAxis,
-    pub(crate) bounds: Bounds,
+    pub(crate) bounds: BoundingBox,
     /// Light-space bounds of the same vertices; without them, the corners of `bounds` are used.
     pub(crate) light: Option<OrientedBounds>,
     /// Height of the ground along the up axis.
@@ -140,7 +140,7 @@ mod tests {
     use super::*;
 
     fn fit(to_sun: Vector3<f64>, ground: Option<f64>) -> LightBoxParams {
-        let bounds = Bounds { min: [-1.0, 0.0, -2.0], max: [1.0, 3.0, 2.0] };
+        let bounds = BoundingBox { min: [-1.0, 0.0, -2.0], max: [1.0, 3.0, 2.0] };
         LightBoxParams {
             to_sun: to_sun.normalize(),
             up: UpAxis::Y,
@@ -184,7 +184,7 @@ mod tests {
     fn held(fit: &LightBoxParams, points: &[Point3<f64>]) -> Option<OrientedBounds> {
         let axes = light_axes(fit.to_sun, fit.up);
         let one = |point: &Point3<f64>| {
-            OrientedBounds::enclosing(&axes, &Bounds { min: (*point).into(), max: (*point).into() })
+            OrientedBounds::enclosing(&axes, &BoundingBox { min: (*point).into(), max: (*point).into() })
         };
         Some(points.iter().map(one).fold(OrientedBounds::EMPTY, OrientedBounds::union))
     }
@@ -220,7 +220,7 @@ mod tests {
             let light = LightBox::fit(&fit(sun, ground));
             assert!(light.shadow_from_world.iter().chain(&light.ground).all(|number| number.is_finite()), "{sun}");
         }
-        let point = Bounds { min: [5.0; 3], max: [5.0; 3] };
+        let point = BoundingBox { min: [5.0; 3], max: [5.0; 3] };
         let light = LightBox::fit(&LightBoxParams { bounds: point, ..fit(Vector3::y(), Some(5.0)) });
         let center = light.shadow_from_world.transform_point(&Point3::new(5.0, 5.0, 5.0));
         assert!(center.iter().all(|number| (0.0..=1.0).contains(number)), "{center}");

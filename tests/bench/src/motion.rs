@@ -135,7 +135,7 @@ fn spread_of(scene: &Scene, domain: usize) -> Vec<(f64, f64)> {
 
 /// Diagonal of a domain at rest, in scene units.
 fn diagonal(scene: &Scene, domain: usize) -> f64 {
-    let mut bounds = modalcast_model::scene::Bounds::EMPTY;
+    let mut bounds = modalcast_model::scene::BoundingBox::EMPTY;
     scene.shape_of(domain).mesh.rest().iter().for_each(|position| bounds.include(position.map(f64::from)));
     bounds.diagonal()
 }

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::scene::{Bounds, Camera, Culling, RenderSettings, Scene, Transparency};
+use modalcast_model::scene::{BoundingBox, Camera, Culling, RenderSettings, Scene, Transparency};
 use modalcast_render::{FrameParams, Renderer, SceneBuffers, VisibilityId};
 
 use super::harness::{SceneBuilder, facing_rectangle, front_camera, open_renderer};
@@ -54,7 +54,7 @@ fn shifted_camera([x, y]: [f64; 2]) -> Camera {
 
 type Frame = (Vec<u8>, Vec<VisibilityId>);
 
-fn draw_frame(renderer: &mut Renderer, buffers: &SceneBuffers, camera: Camera, bounds: Bounds) -> Frame {
+fn draw_frame(renderer: &mut Renderer, buffers: &SceneBuffers, camera: Camera, bounds: BoundingBox) -> Frame {
     let params = FrameParams { camera, width: SIZE, height: SIZE, bounds, light: None };
     let rgba = renderer.draw(buffers, &params).expect("expected a frame").rgba;
     (rgba, renderer.read_visibility().expect("expected visibility ids"))
@@ -125,7 +125,7 @@ fn geometry_outside_the_bounds_leaves_no_remains() {
         let mut renderer = open_renderer();
         let buffers = load_at_rest(&mut renderer, &scene);
         // Bounds smaller than the scene. They cut it on all sides, inside a quad of pixels or at the border of a quad.
-        let small_bounds = Bounds { min: [-0.3, -0.3, -0.5], max: [0.1, 0.2, -0.4] };
+        let small_bounds = BoundingBox { min: [-0.3, -0.3, -0.5], max: [0.1, 0.2, -0.4] };
         let mut draw = |shift: [f64; 2]| draw_frame(&mut renderer, &buffers, shifted_camera(shift), small_bounds);
         for shift in [[0.0; 2], [1.0; 2]] {
             let first = draw(shift);
@@ -139,12 +139,12 @@ fn geometry_outside_the_bounds_leaves_no_remains() {
 fn nothing_is_drawn_outside_the_given_bounds() {
     let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
     let buffers = load_at_rest(&mut renderer, &scene);
-    let mut count_triangle_pixels = |bounds: Bounds| {
+    let mut count_triangle_pixels = |bounds: BoundingBox| {
         let (_, ids) = draw_frame(&mut renderer, &buffers, front_camera(SIZE), bounds);
         ids.iter().filter(|ids| matches!(ids, VisibilityId::Triangle(_))).count()
     };
     let full = count_triangle_pixels(scene.rest_bounds);
-    let half_bounds = count_triangle_pixels(Bounds { max: [0.0, 1.0, 0.5], ..scene.rest_bounds });
-    let nan_bounds = count_triangle_pixels(Bounds { max: [f64::NAN; 3], ..scene.rest_bounds });
+    let half_bounds = count_triangle_pixels(BoundingBox { max: [0.0, 1.0, 0.5], ..scene.rest_bounds });
+    let nan_bounds = count_triangle_pixels(BoundingBox { max: [f64::NAN; 3], ..scene.rest_bounds });
     assert!(half_bounds < full * 3 / 4 && full == nan_bounds, "{half_bounds} and {nan_bounds} of {full} pixels");
 }

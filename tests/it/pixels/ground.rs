@@ -5,7 +5,7 @@ use std::sync::Arc;
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{
-    Bloom, Bounds, Camera, Culling, Ground, Lens, RenderSettings, Scene, ShadowSettings, Transparency, View,
+    Bloom, BoundingBox, Camera, Culling, Ground, Lens, RenderSettings, Scene, ShadowSettings, Transparency, View,
 };
 use modalcast_render::{FrameParams, Pass, Renderer, VisibilityId};
 
@@ -146,7 +146,7 @@ fn ground_hides_geometry_below_and_is_one_sided() {
 fn geometry_on_the_ground_is_visible_despite_rounding() {
     let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
     let camera = camera_at([1.0, 5.0, 4.0]);
-    let rounded = Bounds { min: [0.0, -4e-7, 0.0], ..scene.rest_bounds }.min[1];
+    let rounded = BoundingBox { min: [0.0, -4e-7, 0.0], ..scene.rest_bounds }.min[1];
     let frame = Frame::new(&mut renderer, &scene, camera, (4e-7, rounded));
     assert!(!frame.draws_ground());
     let with_pass = Frame::new(&mut renderer, &scene, camera, (4e-7, BELOW_GROUND));

@@ -3,7 +3,7 @@
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh, Transform};
-use modalcast_model::scene::{Bounds, Camera, RenderSettings, SceneState, View};
+use modalcast_model::scene::{BoundingBox, Camera, RenderSettings, SceneState, View};
 use modalcast_render::{DevicePreference, FrameParams, Pass, Renderer, devices, plan};
 
 use super::harness::{
@@ -170,7 +170,7 @@ fn overflowed_vertices_leave_no_black_pixels() {
         positions[6..9].fill(value);
         let surface = DeformedSurface { positions, normals: [0.0, 0.0, 1.0].repeat(4), ..DeformedSurface::default() };
         renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
-        let bounds = Bounds { min: [f64::NAN; 3], max: [f64::NAN; 3] };
+        let bounds = BoundingBox { min: [f64::NAN; 3], max: [f64::NAN; 3] };
         let params = FrameParams { camera: front_camera(64), width: 64, height: 64, bounds, light: None };
         let image = renderer.draw(&buffers, &params).expect("expected a frame");
         assert!(image.rgba.chunks_exact(4).all(|pixel| pixel[..3] != [0; 3] && pixel[3] == 255), "{value}");

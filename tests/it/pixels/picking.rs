@@ -5,7 +5,7 @@ use std::sync::Arc;
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Domain, Material, Mesh, Modes, Shape, Transform};
-use modalcast_model::scene::{Bounds, Camera, Ground, Lens, PixelRect, Scene, SceneState, View};
+use modalcast_model::scene::{BoundingBox, Camera, Ground, Lens, PixelRect, Scene, SceneState, View};
 use modalcast_render::{FrameParams, PickHit, Renderer, SceneBuffers, VisibilityId};
 use nalgebra::Vector3;
 
@@ -17,7 +17,7 @@ const TOLERANCE: f64 = 1e-6;
 struct PickHarness {
     renderer: Renderer,
     buffers: SceneBuffers,
-    bounds: Bounds,
+    bounds: BoundingBox,
 }
 
 impl PickHarness {

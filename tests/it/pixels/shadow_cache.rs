@@ -8,7 +8,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::scene::{Bounds, Camera, FrameSize, Lens, OrientedBounds, Scene, SceneState, ShadowSettings};
+use modalcast_model::scene::{BoundingBox, Camera, FrameSize, Lens, OrientedBounds, Scene, SceneState, ShadowSettings};
 use modalcast_render::{FrameParams, Pass, Renderer, SceneBuffers};
 
 use super::harness::open_renderer;
@@ -22,7 +22,7 @@ fn cut_out_scene(splits: u32) -> Arc<Scene> {
 }
 
 /// The surface and the bounds at rest, shifted along x.
-fn shifted_surface(cut_out_scene: &Arc<Scene>, shift: f32) -> (DeformedSurface, Bounds) {
+fn shifted_surface(cut_out_scene: &Arc<Scene>, shift: f32) -> (DeformedSurface, BoundingBox) {
     let mut deformer = ReferenceDeformer::new(cut_out_scene);
     let mut bounds = deformer.deform(&SceneState::rest(cut_out_scene)).expect("expected the step to succeed").bounds;
     let mut shifted_surface = deformer.surface().expect("expected a surface").clone();
@@ -37,7 +37,7 @@ fn cameras(cut_out_scene: &Scene) -> [Camera; 2] {
     [first, Camera { lens: Lens::FieldOfView(25.0), ..first }]
 }
 
-fn frame_params(camera: Camera, bounds: Bounds) -> FrameParams {
+fn frame_params(camera: Camera, bounds: BoundingBox) -> FrameParams {
     FrameParams { camera, width: 64, height: 64, bounds, light: None }
 }
 
@@ -109,11 +109,11 @@ fn upload_bounds_or_origin_invalidate_the_shadow() {
         renderer.draw(buffers, &frame_params(camera, bounds)).expect("expected a frame");
         count_shadow_passes(renderer)
     };
-    let wider_bounds = Bounds { min: bounds.min.map(|side| side - 1.0), ..bounds };
+    let wider_bounds = BoundingBox { min: bounds.min.map(|side| side - 1.0), ..bounds };
     let shadow_passes =
         [bounds, bounds, wider_bounds, wider_bounds, bounds].map(|bounds| draw(&mut renderer, &buffers, bounds));
     assert_eq!(shadow_passes, [2, 0, 2, 0, 2]);
-    let nan_bounds = Bounds { min: [f64::NAN; 3], max: [f64::NAN; 3] };
+    let nan_bounds = BoundingBox { min: [f64::NAN; 3], max: [f64::NAN; 3] };
     assert_eq!(
         [nan_bounds, nan_bounds].map(|bounds| draw(&mut renderer, &buffers, bounds)),
         [2, 2],

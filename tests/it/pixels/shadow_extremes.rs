@@ -4,7 +4,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::domain::{Material, Mesh};
 use modalcast_model::scene::{
-    Bounds, Camera, Lens, OrientedBounds, RenderSettings, Scene, SceneState, ShadowMethod, ShadowSettings, View,
+    BoundingBox, Camera, Lens, OrientedBounds, RenderSettings, Scene, SceneState, ShadowMethod, ShadowSettings, View,
 };
 use modalcast_render::{FrameImage, FrameParams};
 
@@ -128,7 +128,10 @@ fn render_growing_bounds(scene: &std::sync::Arc<Scene>, has_light_bounds: bool) 
     let camera = Camera { view, lens: Lens::FieldOfView(30.0), near: 1.0, far: 30.0 };
     let bounds_of_step = |step: u32| {
         let growth = 0.125 * f64::from(step) / 59.0;
-        Bounds { min: rest.min, max: [rest.max[0] * (1.0 + 2.0 * growth), rest.max[1], rest.max[2] * (1.0 + growth)] }
+        BoundingBox {
+            min: rest.min,
+            max: [rest.max[0] * (1.0 + 2.0 * growth), rest.max[1], rest.max[2] * (1.0 + growth)],
+        }
     };
     let axes = scene.light_axes().expect("expected a scene with a shadow");
     let mut draw_frame = |step: u32| {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::gpu::launch::{Device, PageLock};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::{Error, Result};
-use modalcast_model::scene::Bounds;
+use modalcast_model::scene::BoundingBox;
 
 /// Lengths of the lists of a surface, in f32; 0 for a list that is not wanted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -29,7 +29,7 @@ pub(super) struct SurfaceLists<'a> {
     pub normals: &'a mut [f32],
     pub tangents: &'a mut [f32],
     pub displacements: &'a mut [f32],
-    pub boxes: &'a mut Vec<Bounds>,
+    pub boxes: &'a mut Vec<BoundingBox>,
 }
 
 impl PinnedSurface {

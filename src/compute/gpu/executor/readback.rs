@@ -23,7 +23,7 @@ use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, DeviceBuffer};
 use modalcast_model::deform::{DeformedSurface, VertexReadback};
 use modalcast_model::error::{Error, Result};
-use modalcast_model::scene::Bounds;
+use modalcast_model::scene::BoundingBox;
 
 const STAGE: &str = "fetch";
 
@@ -83,7 +83,7 @@ pub(super) struct ReadbackRequest<'a> {
 pub(super) struct SynchronousLists<'a> {
     /// Empty unless displacements are wanted.
     pub displacements: &'a mut [f32],
-    pub boxes: &'a mut Vec<Bounds>,
+    pub boxes: &'a mut Vec<BoundingBox>,
 }
 
 /// Where a readback of an output set reads.

@@ -15,7 +15,7 @@ use crate::gpu::launch::{Device, PinnedBuffer, PinnedUse, capture};
 use crate::gpu::tables::box_keys::{bounds_from_keys, oriented_bounds_from_keys};
 use crate::gpu::tables::layout::Header;
 use modalcast_model::error::{Error, Result};
-use modalcast_model::scene::{Bounds, OrientedBounds};
+use modalcast_model::scene::{BoundingBox, OrientedBounds};
 
 /// The kernels of a scene.
 #[derive(Debug)]
@@ -90,7 +90,7 @@ impl StepSlot {
     }
 
     /// Waits for the end of the step. Returns its bounds, and those along the bounding axes of the deformer if it has any.
-    pub(super) fn wait(&self) -> Result<(Bounds, Option<OrientedBounds>)> {
+    pub(super) fn wait(&self) -> Result<(BoundingBox, Option<OrientedBounds>)> {
         self.done.synchronize().map_err(cuda_error("deform"))?;
         let keys = self.bounds_keys.as_slice()?;
         Ok((bounds_from_keys(keys), oriented_bounds_from_keys(keys)))

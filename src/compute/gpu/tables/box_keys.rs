@@ -2,7 +2,7 @@
 
 use nalgebra::Vector3;
 
-use modalcast_model::scene::{Bounds, OrientedBounds};
+use modalcast_model::scene::{BoundingBox, OrientedBounds};
 
 /// The bounding axes as arguments of `bounds`; zeros without any.
 pub(crate) fn axes_to_f32(axes: Option<[Vector3<f64>; 3]>) -> [f32; 9] {
@@ -23,8 +23,8 @@ pub(crate) fn oriented_bounds_from_keys(keys: &[u32]) -> Option<OrientedBounds> 
 }
 
 /// The bounds that six keys encode.
-pub(crate) fn bounds_from_keys(keys: &[u32]) -> Bounds {
-    let mut bounds = Bounds::EMPTY;
+pub(crate) fn bounds_from_keys(keys: &[u32]) -> BoundingBox {
+    let mut bounds = BoundingBox::EMPTY;
     for axis in 0..3 {
         bounds.min[axis] = -f64::from(ordered_to_float(keys[axis]));
         bounds.max[axis] = f64::from(ordered_to_float(keys[3 + axis]));
@@ -100,7 +100,7 @@ mod tests {
         assert!(ordered_to_float(float_to_ordered(f32::NAN)).is_nan());
         assert!(ordered_to_float(0).is_nan());
         let good = [-1.0_f32, -2.0, -3.0, 4.0, 5.0, 6.0].map(float_to_ordered);
-        assert_eq!(bounds_from_keys(&good), Bounds { min: [1.0, 2.0, 3.0], max: [4.0, 5.0, 6.0] });
+        assert_eq!(bounds_from_keys(&good), BoundingBox { min: [1.0, 2.0, 3.0], max: [4.0, 5.0, 6.0] });
         for bad in [f32::NAN, f32::INFINITY] {
             let mut keys = good;
             keys[4] = float_to_ordered(bad);

@@ -7,7 +7,7 @@
 use super::box_keys::bounds_from_keys;
 use super::layout::{BoxSegment, TILE_LAST};
 use super::work::WorkList;
-use modalcast_model::scene::{Bounds, Scene};
+use modalcast_model::scene::{BoundingBox, Scene};
 
 /// Maximum number of tiles of a piece; each tile has four boxes.
 const MAX_SEGMENT_TILES: u32 = 32;
@@ -40,7 +40,7 @@ pub(crate) const fn box_bytes(segments: usize) -> u64 {
 }
 
 /// One box for each domain, from the keys of its pieces.
-pub(crate) fn union_per_domain(domains: &[u32], keys: &[u32], to: &mut Vec<Bounds>) {
+pub(crate) fn union_per_domain(domains: &[u32], keys: &[u32], to: &mut Vec<BoundingBox>) {
     to.clear();
     for (domain, keys) in domains.iter().zip(keys.chunks_exact(BOX_KEYS)) {
         let piece = bounds_from_keys(keys);
@@ -101,9 +101,9 @@ mod tests {
         let key = |x: f32| if x.is_sign_negative() { !x.to_bits() } else { x.to_bits() | 1 << 31 };
         let cube = |low: f32, high: f32| [[key(-low); 3], [key(high); 3]].concat();
         let keys = [cube(-1.0, 2.0), cube(0.5, 0.75), cube(-3.0, 0.25)].concat();
-        let mut boxes = vec![Bounds::EMPTY; 7];
+        let mut boxes = vec![BoundingBox::EMPTY; 7];
         union_per_domain(&[0, 1, 1], &keys, &mut boxes);
-        let want = |low: f64, high: f64| Bounds { min: [low; 3], max: [high; 3] };
+        let want = |low: f64, high: f64| BoundingBox { min: [low; 3], max: [high; 3] };
         assert_eq!(boxes, [want(-1.0, 2.0), want(-3.0, 0.75)]);
         let spoilt = [&keys[..17], &[u32::MAX]].concat();
         union_per_domain(&[0, 1, 1], &spoilt, &mut boxes);

@@ -12,7 +12,7 @@ use modalcast_model::backend_settings::RasterPolicy;
 use modalcast_model::deform::{DeformedSurface, Deformer};
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{Bounds, Camera, OrientedBounds, Scene, SceneState};
+use modalcast_model::scene::{BoundingBox, Camera, OrientedBounds, Scene, SceneState};
 use modalcast_render::{DevicePreference, FrameImage, FrameParams, Renderer, SceneBuffers};
 
 /// The first CUDA device with a working compiler, if there is one.
@@ -47,7 +47,7 @@ pub(super) struct HarnessScene {
     scene: Arc<Scene>,
     pub(super) buffers: SceneBuffers,
     deformer: CpuDeformer,
-    bounds: Bounds,
+    bounds: BoundingBox,
     light: Option<OrientedBounds>,
 }
 
@@ -60,7 +60,7 @@ impl RenderHarness {
     pub(super) fn set(&mut self, scene: &Arc<Scene>) -> Result<HarnessScene> {
         let (buffers, deformer) =
             (self.renderer.load(scene)?, CpuDeformer::new(scene).with_bounding_axes(scene.light_axes()));
-        Ok(HarnessScene { scene: Arc::clone(scene), buffers, deformer, bounds: Bounds::EMPTY, light: None })
+        Ok(HarnessScene { scene: Arc::clone(scene), buffers, deformer, bounds: BoundingBox::EMPTY, light: None })
     }
 
     /// Lets the CUDA rasterizer draw the passes of a scene that it supports.
@@ -156,7 +156,7 @@ impl HarnessScene {
     }
 
     /// Bounds of the last posed vertices, in world and in light space.
-    pub(super) const fn extents(&self) -> (Bounds, Option<OrientedBounds>) {
+    pub(super) const fn extents(&self) -> (BoundingBox, Option<OrientedBounds>) {
         (self.bounds, self.light)
     }
 

@@ -15,7 +15,7 @@ use rayon::prelude::*;
 use super::reference_material::{AlphaKind, ReferenceMaterial};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::Mesh;
-use modalcast_model::scene::{Bounds, Scene};
+use modalcast_model::scene::{BoundingBox, Scene};
 
 /// Padding of boxes as a fraction of the scene's radius.
 const PADDING: f64 = 2e-6;
@@ -288,12 +288,12 @@ impl RayScene {
 
 /// Center and radius of a bounding sphere.
 fn ball(triangles: &[Triangle]) -> (Vector3<f64>, f64) {
-    let held = |mut bounds: Bounds, triangle: &Triangle| {
+    let held = |mut bounds: BoundingBox, triangle: &Triangle| {
         triangle.points().iter().for_each(|point| bounds.include((*point).into()));
         bounds
     };
-    let each = triangles.par_iter().with_min_len(LEAST).fold(|| Bounds::EMPTY, held);
-    let bounds = each.reduce(|| Bounds::EMPTY, Bounds::union);
+    let each = triangles.par_iter().with_min_len(LEAST).fold(|| BoundingBox::EMPTY, held);
+    let bounds = each.reduce(|| BoundingBox::EMPTY, BoundingBox::union);
     match triangles.is_empty() {
         true => (Vector3::zeros(), 1.0),
         false => (bounds.center().coords, (0.5 * bounds.diagonal()).max(1e-9)),

@@ -18,7 +18,7 @@ use super::{RenderReportOptions, render};
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh, Texture};
-use modalcast_model::scene::{Bounds, Camera, Ground, Lens, Scene, SceneParts, SceneState, View as Eye};
+use modalcast_model::scene::{BoundingBox, Camera, Ground, Lens, Scene, SceneParts, SceneState, View as Eye};
 use modalcast_render::FrameParams;
 
 /// An empty scene without sky and ground, with the sun behind the camera.
@@ -34,7 +34,7 @@ fn facing([left, bottom, right, top]: [f32; 4], z: f32) -> Mesh {
     quad([[left, bottom, z], [right, bottom, z], [right, top, z], [left, top, z]], [0.0, 0.0, 1.0]).expect("a square")
 }
 
-fn surface(scene: &Arc<Scene>) -> (DeformedSurface, Bounds) {
+fn surface(scene: &Arc<Scene>) -> (DeformedSurface, BoundingBox) {
     let mut deformer = ReferenceDeformer::new(scene);
     let bounds = deformer.deform(&SceneState::rest(scene)).expect("deforms").bounds;
     (deformer.surface().expect("there").clone(), bounds)
@@ -42,7 +42,7 @@ fn surface(scene: &Arc<Scene>) -> (DeformedSurface, Bounds) {
 
 /// A shot with ten pixels per unit in the plane z = 0, or y = 0 when seen from above; the origin is in the center of
 /// `side` pixels.
-fn shot(bounds: Bounds, side: u32, above: bool) -> FrameParams {
+fn shot(bounds: BoundingBox, side: u32, above: bool) -> FrameParams {
     let middle = f64::from(side) / 2.0;
     let (eye, up) = if above { ([0.0, 10.0, 0.0], [0.0, 0.0, -1.0]) } else { ([0.0, 0.0, 10.0], [0.0, 1.0, 0.0]) };
     let camera = Camera {

@@ -8,7 +8,7 @@ use modalcast_bench::kernels::{
 use modalcast_bench::timing::CacheState;
 use modalcast_compute::gpu::Device;
 use modalcast_model::error::Error;
-use modalcast_model::scene::{Bounds, Scene, SceneState};
+use modalcast_model::scene::{BoundingBox, Scene, SceneState};
 
 use crate::accuracy::{MAX_POSITION_ERROR, max_error};
 use crate::scenes;
@@ -46,7 +46,7 @@ fn judge(scene: &Scene, state: &SceneState, positions: &[f32]) -> Result<f64, St
     if positions.len() != 3 * named.len() {
         return Err(format!("{} numbers for {} vertices", positions.len(), named.len()));
     }
-    let mut bounds = Bounds::EMPTY;
+    let mut bounds = BoundingBox::EMPTY;
     want.iter().for_each(|position| bounds.include(*position));
     // One vertex has no diagonal; shapes fit into a cube of side 2.
     let diagonal = bounds.diagonal().max(1.0);

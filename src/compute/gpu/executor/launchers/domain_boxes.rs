@@ -4,7 +4,7 @@ use crate::gpu::launch::{Device, DeviceBuffer, PinnedBuffer, PinnedUse};
 use crate::gpu::tables::box_segments::{BOX_KEYS, box_bytes, union_per_domain};
 use crate::gpu::tables::layout::BoxSegment;
 use modalcast_model::error::Result;
-use modalcast_model::scene::Bounds;
+use modalcast_model::scene::BoundingBox;
 
 /// Pieces of domains and their boxes on the device.
 #[derive(Debug)]
@@ -44,7 +44,7 @@ impl DomainBoxes {
     }
 
     /// Copies the boxes of all domains, and waits for the copy.
-    pub(crate) fn read(&mut self, device: &Device, to: &mut Vec<Bounds>) -> Result<()> {
+    pub(crate) fn read(&mut self, device: &Device, to: &mut Vec<BoundingBox>) -> Result<()> {
         let keys = match &mut self.keys {
             Some(keys) => keys,
             none => {
