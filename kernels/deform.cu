@@ -7,7 +7,7 @@
 //   rest_normals  rest normals in the same layout; with RIGID_NORMALS                                              (in)
 //   rest_tangents rest tangents likewise: x, y, z and the sign of the bitangent; with RIGID_NORMALS, NORMAL_MAPS   (in)
 //   corner_shifts with CORNER_OFFSETS: per domain, offset from a vertex to its corner                              (in)
-//   transforms    [movers][3] float4: the rows of world_from_domain, relative to the state's origin         (in)
+//   transforms    [roots][3] float4: the rows of world_from_domain, relative to the state's origin         (in)
 //   following     with FOLLOWERS: per domain its transform root, and the index of its frame                 (in)
 //   frames        [followers][3] float4: the rows of mover_from_domain, with FOLLOWERS; without, every domain is a
 //                 transform root                                                                            (in)

@@ -1,7 +1,7 @@
 // Unit normals and tangents that follow the deformed triangles, for every corner of every domain, in one launch.
 //   rest_normals   [3][rest_corners] f32, one plane per axis                                            (in)
 //   rest_tangents  [..] float4: unit tangent, sign of the bitangent; read only with NORMAL_MAPS         (in)
-//   transforms     [movers][3] float4: the rows of world_from_domain; A is their first three columns   (in)
+//   transforms     [roots][3] float4: the rows of world_from_domain; A is their first three columns   (in)
 //   following, frames  with FOLLOWERS, as for `deform`                                                  (in)
 //   members        [..] u32: the smoothing group of each corner of a shape that has groups              (in)
 //   begins, rings  [groups + 1] u32 offsets into the rings: src/model/domain/smoothing_groups.rs               (in)

@@ -10,7 +10,7 @@ struct Affine {
 
 // Tables from which T is composed.
 struct Transforms {
-    const float4* rows; // [movers][3]
+    const float4* rows; // [roots][3]
 #ifdef FOLLOWERS
     const TransformLink* transform_links;
     const float4* frames; // [followers][3]

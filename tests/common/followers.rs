@@ -85,7 +85,7 @@ pub(crate) fn check_frames<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) ->
         let parts =
             || follower_scene_parts(45, DeformationSettings { storage, ..DeformationSettings::default() }, rigid);
         let scene = Scene::new(parts()).expect("expected a valid scene");
-        assert_eq!((scene.movers.count(), scene.needs.shear), (15, !rigid));
+        assert_eq!((scene.transform_roots.count(), scene.needs.shear), (15, !rigid));
         let state = scenes::random_state(&scene, 61);
         let result = run_step(&mut create_deformer(&scene), &state);
         assert_within_bound(&name, &scene, &state, &result.surface.positions, 0.0);
@@ -101,7 +101,7 @@ pub(crate) fn check_frames<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) ->
         );
         // Negative control: without their frames all followers have other positions and normals.
         let (root_scene, unframed_state) =
-            without_followers(parts(), &state, |domain| state.transforms[scene.movers.of(domain)]);
+            without_followers(parts(), &state, |domain| state.transforms[scene.transform_roots.of(domain)]);
         let followers: Vec<usize> = (0..45).filter(|domain| domain % 3 != 0).collect();
         assert_eq!(
             domains_beyond_bound(&root_scene, &unframed_state, &result.surface.positions, 0.0),
@@ -145,7 +145,7 @@ pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn
         let (mut state, mut random) = (scenes::random_state(&scene, 63), Random(62));
         let mut last = run_step(&mut partial_deformer, &state);
         run_step(&mut full_deformer, &state);
-        let roots: Vec<u32> = scene.movers.domains().collect();
+        let roots: Vec<u32> = scene.transform_roots.domains().collect();
         let mut partial_steps = 0;
         for step in 0..12 {
             let two_roots = [roots[(step * 5 + 20) % 40], roots[(step * 11 + 39) % 40]];
@@ -204,9 +204,9 @@ pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     let mut state = SceneState::rest(&scene);
     let translation = [1e7 + 0.3, -1e7 - 0.7, 12.25];
     state.apply(&scene, &StepUpdate::parse(&scene, &far_step(0, translation)).expect("expected a valid step"));
-    assert_eq!((scene.movers.of(1), state.transforms.len()), (0, 2));
+    assert_eq!((scene.transform_roots.of(1), state.transforms.len()), (0, 2));
     let result = run_step(&mut create_deformer(&scene), &state);
-    let (slot, cell) = (scene.layout.slots[1], state.origin_of(scene.movers.of(1)));
+    let (slot, cell) = (scene.layout.slots[1], state.origin_of(scene.transform_roots.of(1)));
     let [mut error, mut f32_error] = [0.0_f64; 2];
     for (vertex, rest) in scene.shape_of(1).mesh.rest().iter().enumerate() {
         let inside = frame.to_matrix().transform_point(&nalgebra::Point3::from(*rest).cast());

@@ -91,7 +91,7 @@ pub struct Scene {
     pub rigid_transforms: bool,
     pub remarks: Vec<String>,
     pub layout: Layout,
-    pub movers: TransformRoots,
+    pub transform_roots: TransformRoots,
     pub needs: SceneFeatures,
     /// Bounds of the rest state in scene units.
     pub rest_bounds: BoundingBox,
@@ -135,7 +135,7 @@ impl Scene {
         for index in 0..parts.domains.len() {
             check_domain(&parts, index).map_err(|error| error.prefix_field(&format!("domain {index}")))?;
         }
-        let movers = TransformRoots::new(&mut parts.domains)?;
+        let transform_roots = TransformRoots::new(&mut parts.domains)?;
         parts.look.check()?;
         parts.deformation.check()?;
         drop_textures_without_uvs(&mut parts);
@@ -159,7 +159,7 @@ impl Scene {
             rigid_transforms: parts.rigid_transforms,
             remarks: parts.remarks,
             layout,
-            movers,
+            transform_roots,
             needs,
             rest_bounds: BoundingBox::EMPTY,
         };

@@ -60,7 +60,8 @@ impl SceneState {
         for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
             q[slot.first_q..][..domain.rest_q.len()].copy_from_slice(&domain.rest_q);
         }
-        let transforms = scene.movers.domains().map(|domain| scene.domains[domain as usize].placement).collect();
+        let transforms =
+            scene.transform_roots.domains().map(|domain| scene.domains[domain as usize].placement).collect();
         Self { run: 0, step: 0, time: 0.0, q, transforms, origins: None, serial: 0, changed: DirtyDomains::All }
     }
 
@@ -82,16 +83,16 @@ impl SceneState {
         }
         for (domain, _) in &update.transforms {
             changed.push(*domain);
-            changed.extend_from_slice(scene.movers.followers_of(*domain as usize));
+            changed.extend_from_slice(scene.transform_roots.followers_of(*domain as usize));
         }
         changed.sort_unstable();
         changed.dedup();
-        let anew = self.apply_transforms(&scene.movers, update);
+        let anew = self.apply_transforms(&scene.transform_roots, update);
         self.changed = if anew { DirtyDomains::All } else { DirtyDomains::Some(changed) };
     }
 
     /// Sets the named transforms. Returns true if transforms of other domains were rebased to a new cell.
-    fn apply_transforms(&mut self, movers: &TransformRoots, update: &StepUpdate) -> bool {
+    fn apply_transforms(&mut self, transform_roots: &TransformRoots, update: &StepUpdate) -> bool {
         let begins = self.origins.is_none() && update.has_f64_translations();
         if begins {
             self.origins = Some(Arc::new(FloatingOrigins::of(&self.transforms)));
@@ -101,13 +102,13 @@ impl SceneState {
         }
         let Some(origins) = self.origins.as_mut().map(Arc::make_mut) else {
             for (domain, transform) in &update.transforms {
-                self.transforms[movers.of(*domain as usize)] = *transform;
+                self.transforms[transform_roots.of(*domain as usize)] = *transform;
             }
             return false;
         };
         let anew = begins && !origins.is_uniform();
         for (domain, transform, translation) in update.transform_updates() {
-            let root = movers.of(domain);
+            let root = transform_roots.of(domain);
             origins.set(root, translation);
             self.transforms[root] = origins.rebase_transform(root, transform);
         }
@@ -128,7 +129,10 @@ impl SceneState {
 
     /// The transform of a domain's root and, for a follower, its constant frame; relative to the cell of the root.
     pub fn composed_transform(&self, scene: &Scene, domain: usize) -> ComposedTransform {
-        ComposedTransform { root: self.transforms[scene.movers.of(domain)], frame: scene.movers.frame_of(domain) }
+        ComposedTransform {
+            root: self.transforms[scene.transform_roots.of(domain)],
+            frame: scene.transform_roots.frame_of(domain),
+        }
     }
 
     /// `world_from_domain` of a domain in f32, as deformers use it ([`ComposedTransform::to_f32`]).

@@ -146,10 +146,10 @@ type ParsedTransforms = (Vec<(u32, Transform)>, Vec<(u32, [f64; 3])>);
 fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransforms> {
     let everyone = raw.transform_domains.is_empty() && !raw.transforms.is_empty();
     let domains = match everyone {
-        true => scene.movers.domains().collect(),
+        true => scene.transform_roots.domains().collect(),
         false => parse_domain_list(scene, "step.transform_domains", &raw.transform_domains)?,
     };
-    check_transform_targets(&scene.movers, &scene.domains, ("step.transform_domains", &domains))?;
+    check_transform_targets(&scene.transform_roots, &scene.domains, ("step.transform_domains", &domains))?;
     let size = raw.transform_format.bytes();
     if raw.transforms.len() != size * domains.len() {
         let wanted = format!("{} bytes ({} transforms of {size})", size * domains.len(), domains.len());

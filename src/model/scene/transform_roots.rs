@@ -138,18 +138,18 @@ impl FollowTable {
 
 /// Rejects a step that sets the transform of a follower.
 pub(super) fn check_transform_targets(
-    movers: &TransformRoots,
+    transform_roots: &TransformRoots,
     domains: &[Domain],
     (field, list): (&str, &[u32]),
 ) -> Result<()> {
-    if movers.table.is_none() {
+    if transform_roots.table.is_none() {
         return Ok(());
     }
     match list.iter().position(|domain| domains[*domain as usize].follows.is_some()) {
         None => Ok(()),
         Some(at) => {
             let name = |domain: u32| &domains[domain as usize].name;
-            let root = movers.domain(movers.of(list[at] as usize));
+            let root = transform_roots.domain(transform_roots.of(list[at] as usize));
             let given = format!("{} ('{}'), which follows '{}'", list[at], name(list[at]), name(root));
             Err(invalid(format!("{field}[{at}]"), "a domain with a transform of its own", given))
         }
@@ -202,13 +202,13 @@ mod tests {
         let mut parts = following(&[(1, 0), (2, 1), (4, 3)]);
         parts.domains[0].placement = moved(10.0);
         let scene = Scene::new(parts).expect("a scene");
-        let movers = &scene.movers;
-        assert_eq!((movers.count(), movers.domains().collect::<Vec<_>>()), (2, vec![0, 3]));
-        assert_eq!([0, 1, 2, 3, 4].map(|domain| movers.of(domain)), [0, 0, 0, 1, 1]);
-        let frames = [0, 1, 2, 3, 4].map(|domain| movers.frame_of(domain));
+        let transform_roots = &scene.transform_roots;
+        assert_eq!((transform_roots.count(), transform_roots.domains().collect::<Vec<_>>()), (2, vec![0, 3]));
+        assert_eq!([0, 1, 2, 3, 4].map(|domain| transform_roots.of(domain)), [0, 0, 0, 1, 1]);
+        let frames = [0, 1, 2, 3, 4].map(|domain| transform_roots.frame_of(domain));
         assert_eq!(frames, [None, Some(moved(1.0)), Some(moved(3.0)), None, Some(moved(3.0))]);
         assert_eq!(
-            [0, 1, 2, 3, 4].map(|domain| movers.followers_of(domain).to_vec()),
+            [0, 1, 2, 3, 4].map(|domain| transform_roots.followers_of(domain).to_vec()),
             [vec![1, 2], vec![], vec![], vec![4], vec![]]
         );
         assert_eq!((scene.domains[1].placement, scene.domains[2].placement), (moved(11.0), moved(13.0)));
@@ -224,15 +224,18 @@ mod tests {
         }
         let scene = Scene::new(parts).expect("a scene");
         let once = (f64::from(1.0_f32 / 3.0) * f64::from(1.0_f32 / 3.0)) as f32;
-        assert_eq!(scene.movers.frame_of(2).expect("follows").0[0], once);
+        assert_eq!(scene.transform_roots.frame_of(2).expect("follows").0[0], once);
     }
 
     #[test]
     fn where_nobody_follows_there_is_no_table() {
         let scene = Scene::new(following(&[])).expect("a scene");
-        assert_eq!((scene.movers.table.as_ref(), scene.movers.count()), (None, 5));
-        assert_eq!((scene.movers.of(3), scene.movers.frame_of(3), scene.movers.domain(3)), (3, None, 3));
-        assert!(scene.movers.followers_of(3).is_empty() && !scene.needs.followers);
+        assert_eq!((scene.transform_roots.table.as_ref(), scene.transform_roots.count()), (None, 5));
+        assert_eq!(
+            (scene.transform_roots.of(3), scene.transform_roots.frame_of(3), scene.transform_roots.domain(3)),
+            (3, None, 3)
+        );
+        assert!(scene.transform_roots.followers_of(3).is_empty() && !scene.needs.followers);
     }
 
     #[test]

@@ -76,7 +76,7 @@ pub fn reference_vertices(scene: &Scene, state: &SceneState) -> Vec<ReferenceVer
         let q = coordinates_of(scene, domain, &truth);
         let sums = sum_modes(vertices.clone(), Entries::Exact(&shape.modes), q);
         let (transform, size) = (truth.transform_of(scene, domain), truth.absolute_transform_of(scene, domain));
-        let (roundings, is_follower) = (q.len() + EXTRA_ROUNDINGS, scene.movers.frame_of(domain).is_some());
+        let (roundings, is_follower) = (q.len() + EXTRA_ROUNDINGS, scene.transform_roots.frame_of(domain).is_some());
         let rest = shape.mesh.rest()[vertices].iter().map(|rest| rest.map(f64::from));
         for ((rest, sum), out) in rest.zip(&sums).zip(out) {
             let position = transform_point(&transform, std::array::from_fn(|axis| rest[axis] + sum.u[axis]));

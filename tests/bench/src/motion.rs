@@ -56,8 +56,8 @@ impl WorkloadMotion {
         if seed % 2 == 1 {
             self.cancel(&mut q, &mut rng);
         }
-        let movers = self.scene.movers.domains();
-        let transforms = movers.map(|domain| self.moved(domain as usize, &mut rng)).collect();
+        let transform_roots = self.scene.transform_roots.domains();
+        let transforms = transform_roots.map(|domain| self.moved(domain as usize, &mut rng)).collect();
         ExactState { q, transforms }
     }
 
@@ -88,7 +88,7 @@ impl WorkloadMotion {
             let axis = Vector3::new(phase.sin(), 1.0, phase.cos()) * (TURN * (TAU * SLOWEST * time + phase).sin());
             place(&self.scene, domain, &Rotation3::new(axis * 0.5).into_inner(), &Vector3::zeros())
         };
-        ExactState { q, transforms: self.scene.movers.domains().map(turn).collect() }
+        ExactState { q, transforms: self.scene.transform_roots.domains().map(turn).collect() }
     }
 
     fn moved(&self, domain: usize, rng: &mut Rng) -> [f64; 12] {

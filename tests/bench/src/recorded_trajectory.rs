@@ -18,7 +18,7 @@ pub struct RecordedTrajectory {
 
 impl RecordedTrajectory {
     /// Reads a `.csv` file with a header and the columns time, q0, q1, ..., or a folder with `q.npy` (steps x
-    /// coordinates) and, if the domains move, `transforms.npy` (steps x movers x 12), as `modalcast-sim` writes it.
+    /// coordinates) and, if the domains move, `transforms.npy` (steps x transform roots x 12), as `modalcast-sim` writes it.
     /// Movers are the domains that have a transform.
     ///
     /// # Errors
@@ -67,7 +67,7 @@ impl RecordedTrajectory {
             return Err(invalid("steps", "at least one", 0));
         }
         check_lengths("q", &self.q, scene.layout.coordinates)?;
-        check_lengths("transforms", &self.transforms, 12 * scene.movers.count())?;
+        check_lengths("transforms", &self.transforms, 12 * scene.transform_roots.count())?;
         if !self.transforms.is_empty() && self.transforms.len() != self.q.len() {
             return Err(invalid("transforms", format!("{} steps", self.q.len()), self.transforms.len()));
         }
@@ -83,7 +83,7 @@ impl RecordedTrajectory {
 
     pub(super) fn step(&self, scene: &Scene, step: usize) -> ExactState {
         let placement = |domain: u32| scene.domains[domain as usize].placement.0.map(f64::from);
-        let rest_transforms = || scene.movers.domains().map(placement).collect();
+        let rest_transforms = || scene.transform_roots.domains().map(placement).collect();
         let recorded_transforms = |row: &Vec<f64>| row.as_chunks().0.to_vec();
         ExactState {
             q: self.q[step].clone(),

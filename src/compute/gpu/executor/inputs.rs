@@ -63,7 +63,7 @@ impl StepInputs {
             buffer: DeviceBuffer::zeroed(device, sizes.total())?,
             change_steps: DeviceBuffer::zeroed(device, 4 * scene.domains.len() as u64)?,
             transform_links: DeviceBuffer::upload(device, &transform_links(scene))?,
-            frames: DeviceBuffer::upload(device, scene.movers.frames())?,
+            frames: DeviceBuffer::upload(device, scene.transform_roots.frames())?,
             sizes,
         })
     }

@@ -44,7 +44,7 @@ fn needs_no_entry(scene: &Scene, domain: usize) -> bool {
     needs.followers
         && !(needs.exact_normals || needs.boxes)
         && scene.layout.slots[domain].rank == 0
-        && scene.movers.frame_of(domain).is_some()
+        && scene.transform_roots.frame_of(domain).is_some()
 }
 
 /// Where each list begins in the memory of a partial step, in words, and the number of all words.
@@ -120,7 +120,7 @@ impl ChangeListWriter {
         for (index, domain) in entries.enumerate() {
             let (at, first) = (*domain as usize, source);
             // The kernel does not read the transform of a follower.
-            let transform: [u32; TRANSFORM_WORDS] = bytemuck::cast(state.transforms[scene.movers.of(at)].0);
+            let transform: [u32; TRANSFORM_WORDS] = bytemuck::cast(state.transforms[scene.transform_roots.of(at)].0);
             transforms[TRANSFORM_WORDS * index..][..TRANSFORM_WORDS].copy_from_slice(&transform);
             let own = state.q_of(scene, at);
             if source + own.len().next_multiple_of(4) > q.len() {

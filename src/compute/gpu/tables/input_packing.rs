@@ -53,7 +53,7 @@ impl InputSizes {
         let domains = scene.domains.len() as u64;
         let (truncation, per_chunk) = (scene.needs.truncation, modes_per_chunk(scene.deformation.storage));
         Self {
-            transforms: 48 * scene.movers.count() as u64,
+            transforms: 48 * scene.transform_roots.count() as u64,
             q: 4 * coordinates.total as u64,
             retained_counts: if truncation { 4 * domains.next_multiple_of(4) } else { 0 },
             retained: if truncation { 2 * (coordinates.total / per_chunk).next_multiple_of(8) as u64 } else { 0 },
@@ -105,7 +105,7 @@ impl InputWriter {
 
 /// Transform root and frame of each domain; empty in a scene without followers.
 pub(crate) fn transform_links(scene: &Scene) -> Vec<TransformLink> {
-    scene.movers.following().iter().map(|[root, frame]| TransformLink { root: *root, frame: *frame }).collect()
+    scene.transform_roots.following().iter().map(|[root, frame]| TransformLink { root: *root, frame: *frame }).collect()
 }
 
 impl InputPacker {

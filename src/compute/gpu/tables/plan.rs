@@ -164,7 +164,7 @@ fn buffers(scene: &Scene, tables: &DeviceTables) -> Vec<BufferDescriptor> {
         buffers.push((BufferRole::GroupNormals, bytes_of(&rings.normals)));
     }
     if needs.followers {
-        let frames = bytes_of(scene.movers.frames()) + bytes_of(&tables.transform_links);
+        let frames = bytes_of(scene.transform_roots.frames()) + bytes_of(&tables.transform_links);
         buffers.push((BufferRole::FollowerFrames, frames));
     }
     buffers.into_iter().map(|(role, bytes)| BufferDescriptor { role, bytes }).collect()

@@ -128,7 +128,7 @@ fn an_entry_may_follow_what_it_hangs_on_and_says_so_by_how_names_begin() {
     assert_eq!((follow.parent, Some(follow.frame)), (0, attachment.map(|attachment| attachment.frame)));
     let before = parts.domains[1].placement;
     let scene = crate::scene::Scene::new(parts).expect("a scene");
-    assert_eq!(scene.movers.count(), 1);
+    assert_eq!(scene.transform_roots.count(), 1);
     let apart = scene.domains[1].placement.0.iter().zip(before.0).map(|(new, old)| (new - old).abs());
     assert!(apart.fold(0.0, f32::max) < 1e-5, "it stays where it was");
     let refusal = child("follows = 'nobody'\n").map(drop).expect_err("no such name").to_string();

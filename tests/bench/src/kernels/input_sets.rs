@@ -69,10 +69,11 @@ impl InputSets {
             return Err(invalid("states", "at least 1", 0));
         }
         let is_mismatched = |state: &&SceneState| {
-            state.q.len() != scene.layout.coordinates || state.transforms.len() != scene.movers.count()
+            state.q.len() != scene.layout.coordinates || state.transforms.len() != scene.transform_roots.count()
         };
         if let Some(mismatched) = states.iter().find(is_mismatched) {
-            let expected = format!("{} coordinates, {} transforms", scene.layout.coordinates, scene.movers.count());
+            let expected =
+                format!("{} coordinates, {} transforms", scene.layout.coordinates, scene.transform_roots.count());
             let lengths = format!("{} and {}", mismatched.q.len(), mismatched.transforms.len());
             return Err(invalid("states", expected, lengths));
         }

@@ -169,7 +169,7 @@ mod tests {
             let (own, follows) = (own.expect("grown"), follows.expect("grown"));
             assert_eq!(census(&own), census(&follows), "{}", plant.name);
             let [_, _, domains, branches, ..] = census(&own);
-            assert_eq!((own.scene.movers.count(), follows.scene.movers.count()), (domains, branches));
+            assert_eq!((own.scene.transform_roots.count(), follows.scene.transform_roots.count()), (domains, branches));
             for (own, follows) in own.scene.domains.iter().zip(&follows.scene.domains) {
                 let apart = own.placement.0.iter().zip(follows.placement.0).map(|(own, other)| (own - other).abs());
                 assert!(apart.fold(0.0, f32::max) < 1e-5, "{}", own.name);
