@@ -110,7 +110,7 @@ impl<'a> SceneReport<'a> {
 
 impl<'a> DomainReport<'a> {
     fn new(scene: &'a Scene, index: usize) -> Self {
-        let (domain, slot) = (&scene.domains[index], scene.layout.slots[index]);
+        let (domain, slot) = (&scene.domains[index], scene.layout.domains[index]);
         Self {
             name: &domain.name,
             vertices: slot.vertices,
@@ -149,7 +149,7 @@ fn lines(opened: &OpenedScene) -> Vec<String> {
     let scene = &opened.scene;
     let mut lines = vec![format!("{:<28}{:>10}{:>6}{:>12}{:>14}", "domain", "vertices", "r", "triangles", "bytes")];
     for (index, domain) in scene.domains.iter().enumerate().take(MAX_LISTED_DOMAINS) {
-        let slot = scene.layout.slots[index];
+        let slot = scene.layout.domains[index];
         let bytes = bytes_of(scene, index);
         lines.push(format!(
             "{:<28}{:>10}{:>6}{:>12}{:>14}",

@@ -367,7 +367,7 @@ impl Engine {
             return Err(error);
         }
         let layout = &scene_handle.scene.layout;
-        tracing::info!(scene = name, domains = layout.slots.len(), vertices = layout.vertices, "opened");
+        tracing::info!(scene = name, domains = layout.domains.len(), vertices = layout.vertices, "opened");
         Ok(scene_handle)
     }
 

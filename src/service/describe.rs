@@ -120,7 +120,7 @@ async fn send_descriptions(
 
 fn describe(scene: &Scene, index: u32) -> v1::DomainDescription {
     let domain = &scene.domains[index as usize];
-    let slot = scene.layout.slots[index as usize];
+    let slot = scene.layout.domains[index as usize];
     let numbers = |transform: &modalcast_model::domain::Transform| -> Bytes {
         transform.0.into_iter().flat_map(f32::to_le_bytes).collect::<Vec<u8>>().into()
     };

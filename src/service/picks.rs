@@ -69,7 +69,7 @@ fn hit(picked: &ModalHit, scene: &Scene) -> v1::Hit {
         normal: hit.normal.to_vec(),
         depth: scene.unit * hit.depth,
         linear: picked.linear.to_vec(),
-        rank: scene.layout.slots[hit.domain].rank as u32,
+        rank: scene.layout.domains[hit.domain].rank as u32,
         modes: picked.modes.iter().flat_map(|entry| entry.to_le_bytes()).collect::<Bytes>(),
     }
 }

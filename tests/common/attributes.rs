@@ -24,7 +24,7 @@ pub(crate) fn with_displacements_and_boxes(deformation: DeformationSettings) -> 
 
 /// The first domain whose box differs from the bounds of its positions.
 pub(crate) fn find_wrong_box(scene: &Scene, result: &StepResult) -> Option<usize> {
-    let slots = &scene.layout.slots;
+    let slots = &scene.layout.domains;
     assert_eq!(result.surface.boxes.len(), slots.len(), "expected a box per domain");
     let position_bounds = |domain: usize| {
         let positions = &result.surface.positions[3 * slots[domain].first_vertex..][..3 * slots[domain].vertices];
@@ -93,7 +93,7 @@ pub(crate) fn check_displacements_and_boxes<D: Deformer>(create_deformer: impl F
             "{name}"
         );
         let mut modified = result.clone();
-        modified.surface.positions[3 * scene.layout.slots[3].first_vertex] += 100.0;
+        modified.surface.positions[3 * scene.layout.domains[3].first_vertex] += 100.0;
         assert_eq!(find_wrong_box(&scene, &modified), Some(3), "{name}");
     }
 }
@@ -268,7 +268,7 @@ pub(crate) fn check_displacement_overflow_rejection(backend: BackendChoice) {
             &[domain as u32],
         );
         overflowing_state.transforms[domain] = Transform(TINY_SCALE.0.map(|number| number * 1e-18));
-        let slot = scene.layout.slots[domain];
+        let slot = scene.layout.domains[domain];
         overflowing_state.q[slot.first_q..][..slot.rank].fill(f32::MAX);
         let error = loaded_scene.deform(&overflowing_state).expect_err("expected an overflow error").to_string();
         eprintln!("{error}");

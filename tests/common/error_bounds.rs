@@ -52,7 +52,7 @@ fn error_ratios(
     let model = |shape| ShapeErrorModel::new(shape, &TiledModes::new(shape, storage));
     let models: Vec<ShapeErrorModel> = scene.shapes.iter().map(model).collect();
     let domain_ratio = |domain: usize| {
-        let (slot, compensated) = (scene.layout.slots[domain], scene.deformation.compensated);
+        let (slot, compensated) = (scene.layout.domains[domain], scene.deformation.compensated);
         let step = ErrorBoundInput {
             q: state.q_of(scene, domain),
             transform: state.composed_transform(scene, domain),

@@ -175,7 +175,7 @@ pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn
 
 /// Whether the positions of a domain differ between two steps.
 fn has_moved(scene: &Scene, domain: u32, [before, after]: [&StepResult; 2]) -> bool {
-    let slot = scene.layout.slots[domain as usize];
+    let slot = scene.layout.domains[domain as usize];
     let positions = |result: &StepResult| bits(&result.surface.positions[3 * slot.first_vertex..][..3 * slot.vertices]);
     positions(before) != positions(after)
 }
@@ -206,7 +206,7 @@ pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     state.apply(&scene, &StepUpdate::parse(&scene, &far_step(0, translation)).expect("expected a valid step"));
     assert_eq!((scene.transform_roots.of(1), state.transforms.len()), (0, 2));
     let result = run_step(&mut create_deformer(&scene), &state);
-    let (slot, cell) = (scene.layout.slots[1], state.origin_of(scene.transform_roots.of(1)));
+    let (slot, cell) = (scene.layout.domains[1], state.origin_of(scene.transform_roots.of(1)));
     let [mut error, mut f32_error] = [0.0_f64; 2];
     for (vertex, rest) in scene.shape_of(1).mesh.rest().iter().enumerate() {
         let inside = frame.to_matrix().transform_point(&nalgebra::Point3::from(*rest).cast());

@@ -54,7 +54,7 @@ fn state_of(scene: &Scene, first: usize, tested_state: &SceneState) -> SceneStat
     let mut q = tested_state.q.iter();
     for domain in 0..tested_state.transforms.len() {
         state.transforms[first + domain] = tested_state.transforms[domain];
-        let slot = scene.layout.slots[first + domain];
+        let slot = scene.layout.domains[first + domain];
         state.q[slot.first_q..][..slot.rank]
             .iter_mut()
             .zip(q.by_ref())
@@ -65,7 +65,7 @@ fn state_of(scene: &Scene, first: usize, tested_state: &SceneState) -> SceneStat
 
 /// Positions, normals and tangents of a domain, as bits.
 fn bits_of(result: &StepResult, scene: &Scene, domain: usize) -> [Vec<u32>; 3] {
-    let (slot, surface) = (scene.layout.slots[domain], &result.surface);
+    let (slot, surface) = (scene.layout.domains[domain], &result.surface);
     [
         &surface.positions[3 * slot.first_vertex..][..3 * slot.vertices],
         &surface.normals[3 * slot.first_corner..][..3 * slot.corners],

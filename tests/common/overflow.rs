@@ -38,7 +38,7 @@ pub(crate) fn check_overflow_affects_one_step<D: Deformer>(create_deformer: impl
         for coordinate in [f32::MAX, -f32::MAX] {
             let mut overflowing_state = valid_state.clone();
             partial_steps::apply_random_step(&scene, &mut overflowing_state, &mut random, &[1], &[1]);
-            let first_q = scene.layout.slots[1].first_q;
+            let first_q = scene.layout.domains[1].first_q;
             overflowing_state.q[first_q..first_q + 2].fill(coordinate);
             overflowing_state.transforms[1] = LARGE_SHEAR;
             assert!(
@@ -74,7 +74,7 @@ pub(crate) fn check_overflow_rejection(backend: BackendChoice) {
     for (domain, coordinate) in [(5, f32::MAX), (2, -f32::MAX), (5, 1e30)] {
         let mut overflowing_state = valid_state.clone();
         partial_steps::apply_random_step(&scene, &mut overflowing_state, &mut random, &[domain], &[]);
-        overflowing_state.q[scene.layout.slots[domain as usize].first_q] = coordinate;
+        overflowing_state.q[scene.layout.domains[domain as usize].first_q] = coordinate;
         let error = loaded_scene.deform(&overflowing_state).expect_err("expected an overflow error").to_string();
         eprintln!("{error}");
         assert!(error.starts_with(&format!("step.q of domain 'domain {domain}'")), "{error}");

@@ -255,7 +255,7 @@ pub(crate) fn relies_on_dirty_list<D: Deformer>(create_deformer: impl Fn(&Arc<Sc
     state.changed = DirtyDomains::Some(vec![3]);
     let after = run_step(&mut deformer, &state).surface.positions;
     let is_unchanged = |domain: u32| {
-        let slot = scene.layout.slots[domain as usize];
+        let slot = scene.layout.domains[domain as usize];
         let range = 3 * slot.first_vertex..3 * (slot.first_vertex + slot.vertices);
         before[range.clone()] == after[range]
     };

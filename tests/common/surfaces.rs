@@ -105,7 +105,7 @@ pub(crate) fn check_zero_area_and_missing_uvs<D: Deformer>(create_deformer: impl
             let result = run_step(&mut deformer, &state);
             assert!(result.bounds.is_finite());
             assert!(are_unit(&result.surface.normals, 3), "{normals:?}, q of {scale:e}");
-            for (domain, slot) in scene.layout.slots.iter().enumerate() {
+            for (domain, slot) in scene.layout.domains.iter().enumerate() {
                 let tangents = &result.surface.tangents[4 * slot.first_corner..][..4 * slot.corners];
                 let is_valid = if scene.shape_of(domain).tangents().is_empty() {
                     tangents.iter().all(|number| *number == 0.0)

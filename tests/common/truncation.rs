@@ -38,7 +38,7 @@ pub(crate) fn check_error_budget<D: Deformer>(
             partial_steps::apply_random_step(&scene, &mut state, &mut random, &domains, &domains);
             // Amplitudes decrease with the mode, as for a vibrating body.
             for domain in domains {
-                let slot = scene.layout.slots[domain as usize];
+                let slot = scene.layout.domains[domain as usize];
                 let q = &mut state.q[slot.first_q..][..slot.rank];
                 q.iter_mut().enumerate().for_each(|(mode, amplitude)| *amplitude *= f32::exp2(-(mode as f32)));
             }

@@ -163,7 +163,7 @@ fn gpu_exact_normals_equal_rigid_ones_without_deformation() {
     let comparison = compare_normals(&scene, &state, &mut deformer);
     // Rounded positions rotate a normal by about the rounding error divided by the size of a triangle.
     let assert_equal = |domain: usize, got: &[f32], want: &[f64], components: usize, limit: f64| {
-        let slot = scene.layout.slots[domain];
+        let slot = scene.layout.domains[domain];
         let (first, count) = (components * slot.first_corner, components * slot.corners);
         let want: Vec<[f64; 1]> = want[first..][..count].iter().map(|number| [*number]).collect();
         max_error(&got[first..][..count], &want, limit).unwrap_or_else(|error| panic!("domain {domain}: {error}"));
@@ -196,7 +196,7 @@ fn gpu_exact_normals_are_unit_and_deterministic() {
     let q = state.q_of(&scene, 1).to_vec();
     for domain in [3, 5] {
         state.transforms[domain] = state.transforms[1];
-        state.q[scene.layout.slots[domain].first_q..][..5].copy_from_slice(&q);
+        state.q[scene.layout.domains[domain].first_q..][..5].copy_from_slice(&q);
     }
     let mut deformer = cuda_deformer(&scene);
     let mut deform = |state: &SceneState| {
@@ -215,7 +215,7 @@ fn gpu_exact_normals_are_unit_and_deterministic() {
         }
     }
     let normals_of = |domain: usize| {
-        let slot = scene.layout.slots[domain];
+        let slot = scene.layout.domains[domain];
         &first.normals[3 * slot.first_corner..][..3 * slot.corners]
     };
     assert!(

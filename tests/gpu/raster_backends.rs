@@ -92,7 +92,7 @@ fn draw_still(scene: &Arc<Scene>, state: &SceneState, uses_cuda: bool) -> StillI
     let triangles = scene.triangle_vertices();
     let exact_triangle = |index: usize| {
         let (domain, triangle) = buffers.source_triangle(index).expect("expected a source triangle");
-        let corners = triangles[scene.layout.slots[domain].first_triangle + triangle]
+        let corners = triangles[scene.layout.domains[domain].first_triangle + triangle]
             .map(|vertex| std::array::from_fn(|axis| positions[3 * vertex as usize + axis]));
         ExactTriangle::new(&clip, SIZE, corners)
     };

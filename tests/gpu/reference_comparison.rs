@@ -101,7 +101,8 @@ fn gpu_domains_with_shared_coordinates_move_alike() {
     let mut deformer = cuda_deformer(&scene);
     assert_equals_reference("shared q", &scene, &state, &mut deformer);
     let positions = &deformer.surface().expect("expected a surface").positions;
-    let [first, second] = [1, 3].map(|domain: usize| &positions[3 * scene.layout.slots[domain].first_vertex..][..900]);
+    let [first, second] =
+        [1, 3].map(|domain: usize| &positions[3 * scene.layout.domains[domain].first_vertex..][..900]);
     assert!(have_equal_bits(first, second));
 }
 
@@ -115,7 +116,7 @@ fn gpu_bits_do_not_depend_on_history_or_packing() {
     let q = state.q_of(&scene, 0).to_vec();
     for domain in [2, 4, 6] {
         state.transforms[domain] = state.transforms[0];
-        state.q[scene.layout.slots[domain].first_q..][..37].copy_from_slice(&q);
+        state.q[scene.layout.domains[domain].first_q..][..37].copy_from_slice(&q);
     }
     let mut deformer = cuda_deformer(&scene);
     deformer.deform(&state).expect("expected the step to succeed");
@@ -133,7 +134,7 @@ fn gpu_bits_do_not_depend_on_history_or_packing() {
         assert!(have_equal_bits(&first.normals, &surface.normals));
         assert!(have_equal_bits(&first.tangents, &surface.tangents));
     }
-    let positions = |domain: usize| &first.positions[3 * scene.layout.slots[domain].first_vertex..][..3000];
+    let positions = |domain: usize| &first.positions[3 * scene.layout.domains[domain].first_vertex..][..3000];
     for domain in [2, 4, 6] {
         assert!(have_equal_bits(positions(0), positions(domain)), "instance {domain}");
     }

@@ -175,7 +175,7 @@ fn gpu_two_hundred_thousand_domains_take_three_launches() {
     dirty_state.mark_all_dirty();
     assert_eq!(after.difference(&common::run_step(&mut deformer, &dirty_state)), None);
     let has_moved = |domain: usize| {
-        let first = 3 * scene.layout.slots[domain].first_vertex;
+        let first = 3 * scene.layout.domains[domain].first_vertex;
         result.surface.positions[first..first + 21] != after.surface.positions[first..first + 21]
     };
     let moved_domains = (0..scene.domains.len()).filter(|domain| has_moved(*domain)).count();
@@ -246,7 +246,7 @@ fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
     dirty_state.mark_all_dirty();
     assert_eq!(after.difference(&common::run_step(&mut deformer, &dirty_state)), None);
     let has_moved = |domain: usize| {
-        let slot = scene.layout.slots[domain];
+        let slot = scene.layout.domains[domain];
         let range = 3 * slot.first_vertex..3 * (slot.first_vertex + slot.vertices);
         before.surface.positions[range.clone()] != after.surface.positions[range]
     };

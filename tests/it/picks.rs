@@ -57,7 +57,7 @@ fn full_reduced_force(scene: &Scene, hit: &Hit, linear: Matrix3<f64>, force: Vec
 
 fn reference_position(scene: &Scene, steps: &[v1::Step], hit: &Hit) -> Vector3<f64> {
     let deformed = reference::deform(scene, &state_after_steps(scene, steps));
-    let first = scene.layout.slots[hit.domain as usize].first_vertex;
+    let first = scene.layout.domains[hit.domain as usize].first_vertex;
     let corners = hit.vertices.iter().map(|vertex| Vector3::from(deformed[first + *vertex as usize]));
     corners.zip(hit.barycentric).map(|(corner, weight)| corner * weight).sum()
 }

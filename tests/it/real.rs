@@ -55,7 +55,7 @@ fn assert_cpu_equals_reference(scene: &Arc<Scene>) {
     cpu.deform(&SceneState { q: vec![0.0; state.q.len()], ..state.clone() }).expect("expected the step to succeed");
     let rest = cpu.surface().expect("expected a surface").positions.clone();
     let (mut zero_row_vertices, mut moved) = (0, 0);
-    for (domain, slot) in scene.layout.slots.iter().enumerate() {
+    for (domain, slot) in scene.layout.domains.iter().enumerate() {
         let modes = &scene.shape_of(domain).modes;
         for vertex in 0..slot.vertices {
             let range = 3 * (slot.first_vertex + vertex)..3 * (slot.first_vertex + vertex) + 3;

@@ -79,7 +79,7 @@ fn tile_bounds(scene: &Scene, state: &SceneState, deformer: &CpuDeformer, domain
 fn error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], deformer: &CpuDeformer) -> Vec<f64> {
     let want = reference::deform(scene, state);
     let domain_ratio = |domain: usize| {
-        let slot = scene.layout.slots[domain];
+        let slot = scene.layout.domains[domain];
         let bounds = tile_bounds(scene, state, deformer, domain);
         let vertex_ratio = |vertex: usize| {
             let packed = slot.first_vertex + vertex;
@@ -135,7 +135,7 @@ fn positions_do_not_depend_on_threads_or_earlier_steps() {
         for step in 0..6 {
             // Each step changes q of one domain and the transform of another. The last step changes nothing, the one
             // before it all of q.
-            let slot = scene.layout.slots[[0, 4, 8, 3, 0, 0][step]];
+            let slot = scene.layout.domains[[0, 4, 8, 3, 0, 0][step]];
             let changed_q = if step == 4 { 0..state.q.len() } else { slot.first_q..slot.first_q + slot.rank };
             if step < 5 {
                 state.q[changed_q].iter_mut().for_each(|number| *number = random.next());

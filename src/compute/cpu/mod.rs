@@ -67,7 +67,7 @@ impl CpuDeformer {
         let storage = scene.deformation.storage;
         let shapes: Vec<TiledModes> = scene.shapes.par_iter().map(|shape| TiledModes::new(shape, storage)).collect();
         let most_chunks = shapes.iter().map(TiledModes::chunks).max().unwrap_or(0);
-        let vertex_work = WorkList::new(layout.slots.iter().map(|slot| slot.vertices), MAX_TILE_VERTICES);
+        let vertex_work = WorkList::new(layout.domains.iter().map(|slot| slot.vertices), MAX_TILE_VERTICES);
         Self {
             scene: Arc::clone(scene),
             bounding_axes: None,
@@ -77,13 +77,13 @@ impl CpuDeformer {
             extents: vec![TileBounds::EMPTY; vertex_work.len()],
             shapes,
             vertex_work,
-            corner_work: WorkList::new(layout.slots.iter().map(|slot| slot.corners), CORNER_TILE),
+            corner_work: WorkList::new(layout.domains.iter().map(|slot| slot.corners), CORNER_TILE),
             surface: DeformedSurface {
                 positions: vec![0.0; 3 * layout.vertices],
                 normals: vec![0.0; 3 * layout.corners],
                 tangents: vec![0.0; tangents],
                 displacements: vec![0.0; if scene.needs.displacements { 3 * layout.vertices } else { 0 }],
-                boxes: vec![BoundingBox::EMPTY; if scene.needs.boxes { layout.slots.len() } else { 0 }],
+                boxes: vec![BoundingBox::EMPTY; if scene.needs.boxes { layout.domains.len() } else { 0 }],
             },
         }
     }

@@ -69,7 +69,7 @@ struct DeformedDomain<'a> {
 
 impl<'a> DeformedDomain<'a> {
     fn new(scene: &'a Scene, state: &SceneState, domain: usize, positions: &'a [f32]) -> Self {
-        let slot = scene.layout.slots[domain];
+        let slot = scene.layout.domains[domain];
         Self {
             smoothing: scene.shape_of(domain).smoothing(),
             positions: &positions[3 * slot.first_vertex..][..3 * slot.vertices],

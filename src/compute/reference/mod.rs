@@ -50,7 +50,7 @@ impl ReferenceDeformer {
             let box_of = |slot: &DomainLayout| {
                 BoundingBox::from_positions(&surface.positions[3 * slot.first_vertex..][..3 * slot.vertices])
             };
-            surface.boxes = scene.layout.slots.iter().map(box_of).collect();
+            surface.boxes = scene.layout.domains.iter().map(box_of).collect();
         }
     }
 }

@@ -106,7 +106,7 @@ fn for_each_rotated_corner(
     positions: &[[f64; 3]],
     mut act: impl FnMut(usize, &ShortestArc),
 ) {
-    for (domain, slot) in scene.layout.slots.iter().enumerate() {
+    for (domain, slot) in scene.layout.domains.iter().enumerate() {
         let shape = scene.shape_of(domain);
         let Some(smoothing) = shape.smoothing() else { continue };
         let rest = areas(&shape.mesh, smoothing.members(), |vertex| shape.mesh.rest()[vertex].map(f64::from));

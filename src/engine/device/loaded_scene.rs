@@ -263,7 +263,7 @@ impl LoadedScene {
         let far = surface.positions.iter().position(is_far);
         // A displacement may be out of range although its position is not.
         let at = far.or_else(|| surface.displacements.iter().position(|number| !number.is_finite())).unwrap_or(0);
-        let domain = scene.layout.slots.partition_point(|slot| slot.first_vertex <= at / 3).saturating_sub(1);
+        let domain = scene.layout.domains.partition_point(|slot| slot.first_vertex <= at / 3).saturating_sub(1);
         let largest = state.q_of(&scene, domain).iter().fold(0.0_f32, |most, amount| most.max(amount.abs()));
         let given = format!("vertex {} out of range, largest |q| {largest:e}", at / 3);
         let field = format!("step.q of domain '{}'", scene.domains[domain].name);
@@ -303,7 +303,7 @@ mod tests {
         let before = loaded_scene.surface().expect("vertices").clone();
         let light = loaded_scene.light;
         assert!(light.is_some_and(|light| light.is_valid()));
-        let last = scene.layout.slots[1].first_q;
+        let last = scene.layout.domains[1].first_q;
         for amount in [f32::MAX, 1e30] {
             let mut bad = good.clone();
             bad.q[last] = amount;

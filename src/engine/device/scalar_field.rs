@@ -18,7 +18,7 @@ const MIN_DISPLACEMENT_SCALE: f64 = 1e-5;
 /// # Errors
 /// `Invalid` when every domain has fewer modes.
 pub fn validate_mode(scene: &Scene, mode: u32) -> Result<u32> {
-    let most = scene.layout.slots.iter().map(|slot| slot.rank).max().unwrap_or(0);
+    let most = scene.layout.domains.iter().map(|slot| slot.rank).max().unwrap_or(0);
     match (mode as usize) < most {
         true => Ok(mode),
         false => Err(invalid("picture.mode", format!("an index below {most}"), mode)),
@@ -35,7 +35,7 @@ pub(in crate::engine) fn displacement_magnitudes(
     state: &SceneState,
     surface: &DeformedSurface,
 ) -> Vec<f32> {
-    let domains = scene.domains.par_iter().zip(&scene.layout.slots).enumerate();
+    let domains = scene.domains.par_iter().zip(&scene.layout.domains).enumerate();
     let of_domain = domains.flat_map_iter(|(index, (domain, slot))| {
         let placed = state.composed_transform(scene, index);
         let (linear, entries) = (placed.linear(), placed.exact());
@@ -53,7 +53,7 @@ pub(in crate::engine) fn displacement_magnitudes(
 /// The norm of every vertex's three entries of one column of U, times the scene's unit: the displacement in meters per
 /// unit of the coordinate, before T. Zero in domains without the mode.
 pub(in crate::engine) fn mode_shape_magnitudes(scene: &Scene, mode: usize) -> Vec<f32> {
-    let of_domain = scene.domains.par_iter().zip(&scene.layout.slots).flat_map_iter(|(domain, slot)| {
+    let of_domain = scene.domains.par_iter().zip(&scene.layout.domains).flat_map_iter(|(domain, slot)| {
         let modes = &scene.shapes[domain.shape].modes;
         let column = if mode < modes.rank() { modes.column(mode) } else { &[] };
         let length = |row: &[f32]| Vector3::from_column_slice(row).cast::<f64>().norm();
@@ -93,7 +93,7 @@ mod tests {
         let turn = nalgebra::Rotation3::from_euler_angles(0.4, 1.0, -0.3).into_inner();
         state.transforms[1] =
             modalcast_model::domain::Transform::from_parts(&(2.0 * turn), &Vector3::new(5.0, -3.0, 1.0));
-        state.q[scene.layout.slots[1].first_q] = 0.75;
+        state.q[scene.layout.domains[1].first_q] = 0.75;
         let positions = reference::deform(&scene, &state).into_flattened();
         let surface =
             DeformedSurface { positions: positions.iter().map(|x| *x as f32).collect(), ..DeformedSurface::default() };

@@ -77,13 +77,13 @@ impl VertexSelection {
 
     /// Vertex count of each selected domain.
     pub fn vertices(&self) -> impl Iterator<Item = u32> {
-        let slots = &self.scene.layout.slots;
+        let slots = &self.scene.layout.domains;
         self.domains.iter().map(|domain| slots[*domain as usize].vertices as u32)
     }
 
     /// Corner count of each selected domain.
     pub fn corners(&self) -> impl Iterator<Item = u32> {
-        let slots = &self.scene.layout.slots;
+        let slots = &self.scene.layout.domains;
         self.domains.iter().map(|domain| slots[*domain as usize].corners as u32)
     }
 }
@@ -166,7 +166,7 @@ fn pack(surface: &DeformedSurface, selection: &VertexSelection) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(12 * corners + others as usize);
     let mut put = |wanted: bool, numbers: &[f32], range: &dyn Fn(&DomainLayout) -> (usize, usize)| {
         for domain in selection.domains.iter().filter(|_| wanted) {
-            let (first, count) = range(&layout.slots[*domain as usize]);
+            let (first, count) = range(&layout.domains[*domain as usize]);
             bytes.extend_from_slice(bytemuck::cast_slice(&numbers[3 * first..][..3 * count]));
         }
     };

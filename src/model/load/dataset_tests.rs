@@ -32,7 +32,7 @@ fn fixed_rows(scene: &Scene) -> usize {
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 fn real_simple_bridge_keeps_the_numbering_of_its_file() {
     let scene = open("vega/simpleBridge");
-    let slot = scene.layout.slots[0];
+    let slot = scene.layout.domains[0];
     assert_eq!((slot.vertices, slot.corners, slot.triangles, slot.rank), (16085, 61612, 32014, 20));
     assert_eq!(fixed_rows(&scene), 59);
     assert_eq!(scene.domains.len(), 1);
@@ -58,7 +58,7 @@ fn real_simple_bridge_keeps_the_numbering_of_its_file() {
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 fn real_a_has_vertices_that_no_face_uses() {
     let scene = open("vega/A");
-    let slot = scene.layout.slots[0];
+    let slot = scene.layout.domains[0];
     assert_eq!((slot.vertices, slot.triangles, slot.rank), (575, 834, 20));
     let mut used: Vec<u32> = scene.shapes[0].mesh.corners().vertices.clone();
     used.sort_unstable();
@@ -73,7 +73,7 @@ fn real_sofa_models_open_with_their_binary_modes_which_the_text_confirms() {
         [("hexaBeam", 320, 492, 8), ("finger", 158, 306, 3), ("diamond", 1628, 3268, 32)]
     {
         let scene = open(&format!("sofa/{name}"));
-        let slot = scene.layout.slots[0];
+        let slot = scene.layout.domains[0];
         assert_eq!((slot.vertices, slot.triangles, slot.rank), (vertices, triangles, rank), "{name}");
         let (model, modes) =
             (data(&format!("sofa/{name}/{name}.derived.obj")), data(&format!("sofa/{name}/modes.txt")));

@@ -25,7 +25,7 @@ pub struct DomainLayout {
 /// The packed ranges of all domains and the totals.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Layout {
-    pub slots: Vec<DomainLayout>,
+    pub domains: Vec<DomainLayout>,
     pub vertices: usize,
     pub corners: usize,
     pub triangles: usize,
@@ -38,7 +38,7 @@ pub struct Layout {
 impl Layout {
     pub(super) fn new(shapes: &[Shape], domains: &[Domain]) -> Result<Self> {
         let mut layout = Self {
-            slots: Vec::with_capacity(domains.len()),
+            domains: Vec::with_capacity(domains.len()),
             vertices: 0,
             corners: 0,
             triangles: 0,
@@ -48,7 +48,7 @@ impl Layout {
         for (index, domain) in domains.iter().enumerate() {
             let shape = &shapes[domain.shape];
             let rank = shape.modes.rank();
-            let shared = domain.shares_q_with.map(|twin| layout.slots[twin].first_q);
+            let shared = domain.shares_q_with.map(|twin| layout.domains[twin].first_q);
             let slot = DomainLayout {
                 first_vertex: layout.vertices,
                 vertices: shape.mesh.rest().len(),
@@ -67,7 +67,7 @@ impl Layout {
                 // Only the owner of the coordinates inserts itself: a twin of a twin finds an existing list.
                 layout.domains_sharing_q.entry(slot.first_q).or_insert_with(|| vec![twin as u32]).push(index as u32);
             }
-            layout.slots.push(slot);
+            layout.domains.push(slot);
         }
         // Device indices have 32 bits and address three numbers per vertex and corner.
         let largest = layout.vertices.max(layout.corners).max(layout.triangles);

@@ -170,7 +170,7 @@ impl Scene {
     /// The packed vertex indices of each triangle, in layout order.
     pub fn triangle_vertices(&self) -> Vec<[u32; 3]> {
         let of_domain = |domain: usize| {
-            let (mesh, first) = (&self.shape_of(domain).mesh, self.layout.slots[domain].first_vertex as u32);
+            let (mesh, first) = (&self.shape_of(domain).mesh, self.layout.domains[domain].first_vertex as u32);
             let vertices = &mesh.corners().vertices;
             mesh.triangles().iter().map(move |corners| corners.map(|corner| first + vertices[corner as usize]))
         };

@@ -57,7 +57,7 @@ impl SceneState {
     /// The state before any step.
     pub fn rest(scene: &Scene) -> Self {
         let mut q = vec![0.0; scene.layout.coordinates];
-        for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
+        for (domain, slot) in scene.domains.iter().zip(&scene.layout.domains) {
             q[slot.first_q..][..domain.rest_q.len()].copy_from_slice(&domain.rest_q);
         }
         let transforms =
@@ -74,7 +74,7 @@ impl SceneState {
         self.serial += 1;
         let mut changed = Vec::new();
         for (domain, q) in update.coordinates() {
-            let slot = scene.layout.slots[domain];
+            let slot = scene.layout.domains[domain];
             self.q[slot.first_q..][..slot.rank].copy_from_slice(q);
             match scene.layout.domains_sharing_q.get(&slot.first_q) {
                 Some(domains_sharing_q) if slot.rank > 0 => changed.extend_from_slice(domains_sharing_q),
@@ -157,7 +157,7 @@ impl SceneState {
 
     /// The coordinates of one domain.
     pub fn q_of<'a>(&'a self, scene: &Scene, domain: usize) -> &'a [f32] {
-        let slot = scene.layout.slots[domain];
+        let slot = scene.layout.domains[domain];
         &self.q[slot.first_q..][..slot.rank]
     }
 }

@@ -118,7 +118,7 @@ fn parse_q(scene: &Scene, raw: &RawStepUpdate) -> Result<(Vec<CoordinateSpan>, V
     let mut expected = 0;
     let mut places = Vec::with_capacity(domains.len());
     for domain in domains {
-        let rank = scene.layout.slots[domain as usize].rank;
+        let rank = scene.layout.domains[domain as usize].rank;
         places.push((domain, expected, rank));
         expected += rank;
     }

@@ -194,7 +194,7 @@ fn hit(pick: &PendingPick, rays: &PixelRays, words: &[u32], at: [u32; 2]) -> Opt
     let (domain, triangle) = locate_triangle(&pick.spans, place)?;
     let mesh = &pick.scene.shapes[pick.scene.domains[domain].shape].mesh;
     let corners = *mesh.triangles().get(triangle)?;
-    let first = pick.scene.layout.slots[domain].first_corner as u32;
+    let first = pick.scene.layout.domains[domain].first_corner as u32;
     // The renderer reverses the winding of some triangles; the result uses the order of the mesh.
     let drawn: [u32; 3] = [words[1], words[2], words[3]];
     let order = corners.map(|corner| drawn.iter().position(|own| *own == corner + first).unwrap_or(0));

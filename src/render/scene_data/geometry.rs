@@ -80,7 +80,7 @@ pub(crate) fn groups(scene: &Scene) -> (Vec<DrawGroup>, Vec<usize>) {
         }
         of_material[material] = groups.len() - 1;
     }
-    for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
+    for (domain, slot) in scene.domains.iter().zip(&scene.layout.domains) {
         for (material, triangles) in spans(domain, slot) {
             groups[of_material[material]].triangles += triangles.len();
         }
@@ -133,7 +133,7 @@ impl Geometry {
         }
         let mut next: Vec<usize> = geometry.groups.iter().map(|group| group.first_triangle).collect();
         for (index, domain) in scene.domains.iter().enumerate() {
-            geometry.add_corners(scene, domain, &scene.layout.slots[index], textured);
+            geometry.add_corners(scene, domain, &scene.layout.domains[index], textured);
             geometry.add_triangles(scene, index, &rank, &mut next);
         }
         let vertex = |corner: u32| geometry.vertices[corner as usize];
@@ -153,7 +153,7 @@ impl Geometry {
     }
 
     fn add_triangles(&mut self, scene: &Scene, index: usize, rank: &[u32], next: &mut [usize]) {
-        let (domain, slot) = (&scene.domains[index], &scene.layout.slots[index]);
+        let (domain, slot) = (&scene.domains[index], &scene.layout.domains[index]);
         let mesh = &scene.shapes[domain.shape].mesh;
         // A mirroring placement reverses the winding of all triangles.
         let mirrored = domain.placement.linear().determinant() < 0.0;

@@ -205,7 +205,7 @@ fn exact_normals(scene: &Scene) -> Option<DeformationSettings> {
 }
 
 fn entries(scene: &Scene) -> usize {
-    scene.layout.slots.iter().map(|slot| 3 * slot.vertices * (1 + slot.rank)).sum()
+    scene.layout.domains.iter().map(|slot| 3 * slot.vertices * (1 + slot.rank)).sum()
 }
 
 #[cfg(test)]

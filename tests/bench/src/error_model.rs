@@ -145,7 +145,7 @@ impl ErrorModel {
                 .collect()
         };
         let mut rounded_q = q.to_vec();
-        for (domain, slot) in self.scene.layout.slots.iter().enumerate().filter(|_| self.uses_tensor_cores) {
+        for (domain, slot) in self.scene.layout.domains.iter().enumerate().filter(|_| self.uses_tensor_cores) {
             rounded_q[slot.first_q..][..slot.rank].copy_from_slice(&split_domain((domain, slot)));
         }
         self.uses_tensor_cores.then_some(rounded_q)

@@ -94,7 +94,7 @@ pub fn widen_bounds(
     error_model: &ErrorModel,
 ) -> Vec<ReferenceVertex> {
     map_tiles(scene, UNSET, |domain, vertices, out| {
-        let first = scene.layout.slots[domain].first_vertex + vertices.start;
+        let first = scene.layout.domains[domain].first_vertex + vertices.start;
         out.copy_from_slice(&references[first..][..vertices.len()]);
         error_model
             .bounds(domain, state)
@@ -149,7 +149,7 @@ impl Entries<'_> {
 
 /// Modal coordinates of a domain.
 fn coordinates_of<'a>(scene: &Scene, domain: usize, truth: &'a ExactState) -> &'a [f64] {
-    let slot = scene.layout.slots[domain];
+    let slot = scene.layout.domains[domain];
     &truth.q[slot.first_q..][..slot.rank]
 }
 
@@ -229,7 +229,7 @@ fn map_tiles<T: Copy + Send + Sync>(
 ) -> Vec<T> {
     let mut values: Vec<T> = rayon::iter::repeat_n(initial, scene.layout.vertices).collect();
     let (mut tiles, mut remaining): (Vec<Tile<'_, T>>, _) = (Vec::new(), values.as_mut_slice());
-    for (domain, slot) in scene.layout.slots.iter().enumerate() {
+    for (domain, slot) in scene.layout.domains.iter().enumerate() {
         for first in (0..slot.vertices).step_by(TILE) {
             let vertices = first..slot.vertices.min(first + TILE);
             let (out, rest) = std::mem::take(&mut remaining).split_at_mut(vertices.len());

@@ -44,7 +44,7 @@ pub fn of_scene(scene: &Scene) -> Vec<Operand> {
         part("scales", "4 x sum C K tiles", only(storage == StorageType::Int8, scales)),
         part("x0", "12 x sum n", 12 * vertices),
         part("q", "4 x sum r", 4 * layout.coordinates),
-        part("T", "48 x d", 48 * layout.slots.len()),
+        part("T", "48 x d", 48 * layout.domains.len()),
         part("x", "12 x sum n", 12 * layout.vertices),
         part("x in", "12 x sum n", only(exact, 12 * layout.vertices)),
         part("triangles", "12 x sum f + 4 x sum c", only(exact, 12 * triangles + 4 * corners)),

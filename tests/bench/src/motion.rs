@@ -41,7 +41,7 @@ impl WorkloadMotion {
         let scene = &load.scene;
         let mut spread = vec![(0.0, 1.0); scene.layout.coordinates];
         let parts: Vec<_> = (0..scene.domains.len()).into_par_iter().map(|domain| spread_of(scene, domain)).collect();
-        for (slot, part) in scene.layout.slots.iter().zip(parts) {
+        for (slot, part) in scene.layout.domains.iter().zip(parts) {
             spread[slot.first_q..][..part.len()].copy_from_slice(&part);
         }
         Self { scene: Arc::clone(scene), paired: load.paired, spread, record }
@@ -98,7 +98,7 @@ impl WorkloadMotion {
     }
 
     fn cancel(&self, q: &mut [f64], rng: &mut Rng) {
-        for (domain, slot) in self.scene.layout.slots.iter().enumerate() {
+        for (domain, slot) in self.scene.layout.domains.iter().enumerate() {
             let own = &mut q[slot.first_q..][..slot.rank];
             if self.paired {
                 own.chunks_exact_mut(2).for_each(|pair| pair[1] = -pair[0]);

@@ -24,7 +24,7 @@ fn surface_bits(surface: &DeformedSurface) -> [Vec<u32>; 3] {
 
 /// Normals of one domain as bits.
 fn normals_of(scene: &Scene, surface: &DeformedSurface, domain: usize) -> Vec<u32> {
-    let slot = scene.layout.slots[domain];
+    let slot = scene.layout.domains[domain];
     bits(&surface.normals[3 * slot.first_corner..][..3 * slot.corners])
 }
 
@@ -38,7 +38,7 @@ fn change_domains(scene: &Scene, state: &mut SceneState, step: usize, random: &m
         _ => vec![0, 2],
     };
     for domain in &domains {
-        let slot = scene.layout.slots[*domain];
+        let slot = scene.layout.domains[*domain];
         if step != 1 {
             state.q[slot.first_q..][..slot.rank].iter_mut().for_each(|number| *number += random.next());
         }

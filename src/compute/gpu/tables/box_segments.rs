@@ -18,7 +18,7 @@ pub(crate) const BOX_KEYS: usize = 6;
 /// The pieces of all domains, in the order of the domains.
 pub(crate) fn segments(scene: &Scene, work: &WorkList) -> Vec<BoxSegment> {
     let mut segments = Vec::with_capacity(scene.domains.len());
-    for (index, ([(first, count), _], slot)) in work.spans.iter().zip(&scene.layout.slots).enumerate() {
+    for (index, ([(first, count), _], slot)) in work.spans.iter().zip(&scene.layout.domains).enumerate() {
         let domain = index as u32;
         if work.tiles[*first as usize].kind & TILE_LAST == 0 {
             let (first, count) = (slot.first_vertex as u32, slot.vertices as u32);
@@ -61,7 +61,7 @@ mod tests {
 
     /// How many pieces contain each vertex of a domain.
     fn seen(scene: &Scene, work: &WorkList, domain: usize) -> Vec<u32> {
-        let slot = scene.layout.slots[domain];
+        let slot = scene.layout.domains[domain];
         let mut seen = vec![0; slot.vertices];
         for piece in segments(scene, work).iter().filter(|piece| piece.domain as usize == domain) {
             let range = piece.first as usize..(piece.first + piece.count) as usize;
@@ -89,7 +89,7 @@ mod tests {
             assert!(list.iter().any(|piece| piece.from_vertices == 1) && list.len() > scene.domains.len());
             assert!(list.is_sorted_by_key(|piece| piece.domain));
             assert!(list.iter().all(|piece| piece.from_vertices == 1 || piece.count <= 4 * MAX_SEGMENT_TILES));
-            for (domain, slot) in scene.layout.slots.iter().enumerate() {
+            for (domain, slot) in scene.layout.domains.iter().enumerate() {
                 assert_eq!(seen(&scene, &work, domain), vec![1; slot.vertices], "domain {domain}");
             }
         }

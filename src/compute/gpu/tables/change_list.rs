@@ -43,7 +43,7 @@ fn needs_no_entry(scene: &Scene, domain: usize) -> bool {
     let needs = scene.needs;
     needs.followers
         && !(needs.exact_normals || needs.boxes)
-        && scene.layout.slots[domain].rank == 0
+        && scene.layout.domains[domain].rank == 0
         && scene.transform_roots.frame_of(domain).is_some()
 }
 

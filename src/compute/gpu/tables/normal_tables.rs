@@ -24,7 +24,7 @@ pub(crate) fn corner_slots(scene: &Scene) -> Vec<CornerSlot> {
         let (first_normal, first_tangent) = places[domain.shape];
         CornerSlot { first: slot.first_corner as u32, first_normal, first_tangent }
     };
-    scene.domains.iter().zip(&scene.layout.slots).map(slot).collect()
+    scene.domains.iter().zip(&scene.layout.domains).map(slot).collect()
 }
 
 /// The domain of the first item of each block, followed by the last domain. `firsts`: the first items of all domains in

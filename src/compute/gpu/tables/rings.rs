@@ -63,7 +63,7 @@ pub(crate) fn slots(scene: &Scene) -> Vec<NormalSlot> {
         first_vertex: slot.first_vertex as u32,
         first_member: first_members[domain.shape],
     };
-    let domains = scene.domains.iter().zip(&scene.layout.slots);
+    let domains = scene.domains.iter().zip(&scene.layout.domains);
     normal_tables::corner_slots(scene).into_iter().zip(domains).map(slot).collect()
 }
 
@@ -81,7 +81,7 @@ mod tests {
         assert_eq!(slots[2].first_member, NO_GROUPS);
         assert_eq!(slots[4].first_member, slots[5].first_member, "instances share");
         for (domain, slot) in slots.iter().enumerate() {
-            assert_eq!(slot.first_vertex as usize, scene.layout.slots[domain].first_vertex);
+            assert_eq!(slot.first_vertex as usize, scene.layout.domains[domain].first_vertex);
             let Some(smoothing) = scene.shape_of(domain).smoothing() else { continue };
             for (corner, member) in smoothing.members().iter().enumerate() {
                 let group = rings.members[slot.first_member as usize + corner] as usize;

@@ -93,7 +93,7 @@ fn instances_share_mesh_and_modes_but_not_coordinates_or_names() {
     let names: Vec<_> = parts.domains.iter().map(|domain| domain.name.as_str()).collect();
     assert_eq!(names, ["a", "a 2", "b"]);
     let scene = crate::scene::Scene::new(parts).expect("a scene");
-    assert_eq!((scene.layout.coordinates, scene.layout.slots[1].first_q), (4, 2));
+    assert_eq!((scene.layout.coordinates, scene.layout.domains[1].first_q), (4, 2));
 }
 
 #[test]

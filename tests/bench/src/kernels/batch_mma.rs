@@ -251,7 +251,7 @@ fn pack_transforms_and_scales(state: &SceneState, split_q: &[SplitCoordinates], 
 
 /// The arguments with null addresses.
 fn args_without_addresses(scene: &Scene, chunks: usize) -> BatchMmaArgs {
-    let slots = &scene.layout.slots;
+    let slots = &scene.layout.domains;
     let mut args = BatchMmaArgs {
         domains: slots.len() as u32,
         vertices: slots[0].vertices as u32,

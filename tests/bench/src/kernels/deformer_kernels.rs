@@ -187,7 +187,7 @@ impl DeformerBenchmark {
     fn retained_mode_share(&self) -> Option<f64> {
         let per_chunk = modes_per_chunk(self.scene.deformation.storage);
         let weighted_chunks = |chunks: &dyn Fn(usize) -> usize| -> f64 {
-            let slots = self.scene.layout.slots.iter().enumerate();
+            let slots = self.scene.layout.domains.iter().enumerate();
             slots.map(|(domain, slot)| slot.vertices as f64 * chunks(domain) as f64).sum()
         };
         let all_chunks = weighted_chunks(&|domain| self.scene.rank_of(domain).div_ceil(per_chunk));
@@ -243,7 +243,7 @@ fn output_bytes(plan: &DeformPlan) -> [u64; 4] {
 
 /// The counts of a step that changes these domains, or all of them.
 fn count_step(scene: &Scene, plan: &DeformPlan, changed: Option<&[u32]>) -> StepCounts {
-    let slots = &scene.layout.slots;
+    let slots = &scene.layout.domains;
     // With followers every domain reads the index of its transform root in addition to its own T or frame.
     let bytes_per_transform = if scene.needs.followers { 56 } else { 48 };
     match changed {
@@ -307,7 +307,7 @@ impl KernelBenchmark for DeformerBenchmark {
         if self.step_outputs != StepOutputs::Uq {
             return Ok(numbers);
         }
-        let slots = &self.scene.layout.slots;
+        let slots = &self.scene.layout.domains;
         Ok(self.input_sets.compute_positions_on_host(|domain, vertex| {
             let first = 3 * (slots[domain].first_vertex + vertex);
             [numbers[first], numbers[first + 1], numbers[first + 2]]

@@ -69,7 +69,7 @@ impl PlainUpdate {
     pub(super) fn new(device: &Device, scene: &Scene, first_u: &[Option<u64>]) -> Result<Self> {
         let (is_single, vertices) = (scene.domains.len() == 1, scene.layout.vertices);
         let defines: &[&str] = if is_single { &["SINGLE"] } else { &[] };
-        let slots = scene.layout.slots.iter();
+        let slots = scene.layout.domains.iter();
         let u_bytes = slots.filter(|slot| slot.rank > 0).map(|slot| 12 * slot.vertices as u64).sum();
         Ok(Self {
             compiled: CompiledKernel::new(device, &SOURCE, defines)?,
@@ -132,12 +132,12 @@ fn pack_slots(scene: &Scene, first_u: &[Option<u64>]) -> Vec<PlainSlot> {
         first_vertex: slot.first_vertex as u32,
         reserved: 0,
     };
-    scene.layout.slots.iter().zip(first_u).map(pack_slot).collect()
+    scene.layout.domains.iter().zip(first_u).map(pack_slot).collect()
 }
 
 /// The domain of each packed vertex.
 fn domain_of_vertices(scene: &Scene) -> Vec<u32> {
-    let slots = scene.layout.slots.iter().enumerate();
+    let slots = scene.layout.domains.iter().enumerate();
     slots.flat_map(|(domain, slot)| std::iter::repeat_n(domain as u32, slot.vertices)).collect()
 }
 
@@ -181,7 +181,7 @@ mod tests {
         let first_u = [Some(200), None, Some(3)];
         let mut u = vec![f32::NAN; 215];
         for (domain, first) in first_u.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?))) {
-            for vertex in 0..scene.layout.slots[domain].vertices {
+            for vertex in 0..scene.layout.domains[domain].vertices {
                 let displacement = displacement_of(&scene, &state, domain, vertex).map(|number| number as f32);
                 u[first as usize + 3 * vertex..][..3].copy_from_slice(&displacement);
             }
@@ -192,7 +192,7 @@ mod tests {
             rest: packed_rest(&scene),
         };
         let transforms: &[f32] = bytemuck::cast_slice(&state.transforms);
-        for (domain, slot) in scene.layout.slots.iter().enumerate() {
+        for (domain, slot) in scene.layout.domains.iter().enumerate() {
             for vertex in 0..slot.vertices {
                 let packed = slot.first_vertex + vertex;
                 let got = update_vertex(&tables, transforms, &u, packed);

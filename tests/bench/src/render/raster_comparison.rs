@@ -214,7 +214,7 @@ impl RasterSetup {
 
     /// Ids that OpenGL drew, as indices of packed triangles; all ones where it drew none.
     fn ids(&self, seen: &[VisibilityId], set: &HarnessScene) -> Vec<u32> {
-        let slots = &self.scene.layout.slots;
+        let slots = &self.scene.layout.domains;
         let id = |seen: &VisibilityId| match seen {
             VisibilityId::Triangle(place) => set.buffers.source_triangle(*place),
             _ => None,

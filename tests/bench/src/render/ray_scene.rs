@@ -312,7 +312,7 @@ fn tangents(surface: &DeformedSurface) -> Vec<[f64; 4]> {
 /// Texture coordinates per corner; (0, 0) where a mesh has none.
 fn uvs(scene: &Scene) -> Vec<[f64; 2]> {
     let mut uvs = Vec::with_capacity(scene.layout.corners);
-    for (domain, slot) in scene.domains.iter().zip(&scene.layout.slots) {
+    for (domain, slot) in scene.domains.iter().zip(&scene.layout.domains) {
         let own = &scene.shapes[domain.shape].mesh.corners().uvs;
         uvs.extend(own.iter().map(|uv| uv.map(f64::from)));
         uvs.resize(slot.first_corner + slot.corners, [0.0; 2]);
@@ -322,7 +322,7 @@ fn uvs(scene: &Scene) -> Vec<[f64; 2]> {
 
 fn triangles(scene: &Scene, surface: &DeformedSurface) -> Vec<Triangle> {
     let of_domain = |index: usize| {
-        let (domain, slot) = (&scene.domains[index], scene.layout.slots[index]);
+        let (domain, slot) = (&scene.domains[index], scene.layout.domains[index]);
         let mesh = &scene.shape_of(index).mesh;
         let mirrored = domain.placement.linear().determinant() < 0.0;
         let vertices = &mesh.corners().vertices;

@@ -145,9 +145,9 @@ mod tests {
     /// v, f, d, d', r and u of a scene, counted.
     fn census(load: &Workload) -> [usize; 6] {
         let layout = &load.scene.layout;
-        let bent: Vec<_> = layout.slots.iter().filter(|slot| slot.rank > 0).collect();
+        let bent: Vec<_> = layout.domains.iter().filter(|slot| slot.rank > 0).collect();
         let rows = bent.iter().map(|slot| 3 * slot.vertices).sum();
-        [layout.corners, layout.triangles, layout.slots.len(), bent.len(), layout.coordinates, rows]
+        [layout.corners, layout.triangles, layout.domains.len(), bent.len(), layout.coordinates, rows]
     }
 
     #[test]

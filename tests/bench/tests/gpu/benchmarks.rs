@@ -31,7 +31,7 @@ fn gpu_memory_rates_are_plausible_and_empty_replay_takes_time() {
 /// Per packed vertex, whether a triangle refers to it. Other vertices are not computed from unfolded triangles.
 fn named(scene: &Scene) -> Vec<bool> {
     let mut named = vec![false; scene.layout.vertices];
-    for (domain, slot) in scene.layout.slots.iter().enumerate() {
+    for (domain, slot) in scene.layout.domains.iter().enumerate() {
         let mesh = &scene.shape_of(domain).mesh;
         for corner in mesh.triangles().as_flattened() {
             named[slot.first_vertex + mesh.corners().vertices[*corner as usize] as usize] = true;

@@ -158,7 +158,7 @@ mod tests {
         for (shapes, instances) in LOADS {
             let (scene, state) = ensemble(StorageType::F32, shapes, instances);
             let got = twin_of_batch(&Tables::of(&scene, &state));
-            for (domain, slot) in scene.layout.slots.iter().enumerate() {
+            for (domain, slot) in scene.layout.domains.iter().enumerate() {
                 for vertex in 0..slot.vertices {
                     let got = &got[3 * (slot.first_vertex + vertex)..][..3];
                     if slot.rank == 0 {
@@ -180,7 +180,7 @@ mod tests {
             for (shapes, instances) in LOADS {
                 let (scene, state) = ensemble(storage, shapes, instances);
                 let got = twin_of_batch(&Tables::of(&scene, &state));
-                for (domain, slot) in scene.layout.slots.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
+                for (domain, slot) in scene.layout.domains.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
                     for vertex in 0..slot.vertices {
                         let (got, want) =
                             (&got[3 * (slot.first_vertex + vertex)..][..3], x_of(&scene, &state, domain, vertex));

@@ -92,7 +92,7 @@ impl BatchTables {
                     members: list.len() as u32,
                 });
                 all.members.extend(list.iter().map(|domain| BatchMember {
-                    first: scene.layout.slots[*domain].first_vertex as u32,
+                    first: scene.layout.domains[*domain].first_vertex as u32,
                     first_q: coordinates.first[*domain],
                     domain: *domain as u32,
                     first_tile: work.spans[*domain][0].0,

@@ -20,7 +20,7 @@ impl CoordinateLayout {
         // Factors belong to a shape and lists of kept modes to a domain, so domains that share coordinates cannot share
         // these.
         if storage == StorageType::F32 && !scene.needs.truncation {
-            let first = scene.layout.slots.iter().map(|slot| slot.first_q as u32).collect();
+            let first = scene.layout.domains.iter().map(|slot| slot.first_q as u32).collect();
             return Self { first, total: scene.layout.coordinates.next_multiple_of(4), is_scene_order: true };
         }
         let mut total = 0;
@@ -29,7 +29,7 @@ impl CoordinateLayout {
             total += slot.rank.next_multiple_of(modes_per_chunk(storage));
             first as u32
         };
-        let first = scene.layout.slots.iter().map(place).collect();
+        let first = scene.layout.domains.iter().map(place).collect();
         Self { first, total: total.next_multiple_of(4), is_scene_order: false }
     }
 }

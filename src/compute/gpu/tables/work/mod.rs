@@ -257,7 +257,7 @@ impl WorkList {
 
     /// Items of a domain: its vertices, or its corners in a tile of corners alone.
     fn place(&self, scene: &Scene, class: TileClass, domain: usize) -> ItemRange {
-        let (slot, shape) = (scene.layout.slots[domain], scene.domains[domain].shape);
+        let (slot, shape) = (scene.layout.domains[domain], scene.domains[domain].shape);
         if class.flags & TILE_VERTICES > 0 {
             ItemRange { items: slot.vertices, first: slot.first_vertex as u32, rest: self.quads.vertices[shape] }
         } else {
@@ -309,7 +309,7 @@ fn items(scene: &Scene, corners_match: &[bool]) -> Vec<(TileClass, PendingTile)>
         *filled += quads;
     };
     for (index, domain) in scene.domains.iter().enumerate() {
-        let (shape, slot) = (&scene.shapes[domain.shape], scene.layout.slots[index]);
+        let (shape, slot) = (&scene.shapes[domain.shape], scene.layout.domains[index]);
         let chunks = chunks_of(scene, shape);
         let both = has_rigid_normals(scene) && corners_match[domain.shape];
         let flags = TILE_VERTICES | if both { TILE_CORNERS } else { 0 };
@@ -326,7 +326,7 @@ fn items(scene: &Scene, corners_match: &[bool]) -> Vec<(TileClass, PendingTile)>
 fn corner_offsets(scene: &Scene) -> Vec<u32> {
     let shift =
         |slot: &modalcast_model::scene::DomainLayout| (slot.first_corner as u32).wrapping_sub(slot.first_vertex as u32);
-    let shifts: Vec<u32> = scene.layout.slots.iter().map(shift).collect();
+    let shifts: Vec<u32> = scene.layout.domains.iter().map(shift).collect();
     if has_rigid_normals(scene) && shifts.iter().any(|shift| *shift != 0) { shifts } else { Vec::new() }
 }
 

@@ -63,7 +63,7 @@ fn check_corners(scene: &Scene, work: &WorkList) {
             let (domain, item, count, rest, ..) = lane(work, tile, in_tile);
             let both = tile.kind & TILE_VERTICES > 0;
             let shift = if both { shifts.get(domain).copied().unwrap_or(0) } else { 0 };
-            let slot = scene.layout.slots[domain];
+            let slot = scene.layout.domains[domain];
             for within in 0..count {
                 let corner = item.wrapping_add(shift) as usize + within;
                 seen[corner] += 1;
@@ -99,7 +99,7 @@ fn check(scene: &Arc<Scene>) -> WorkList {
             for within in 0..count {
                 let packed = first as usize + within;
                 seen[packed] += 1;
-                let vertex = packed - scene.layout.slots[domain].first_vertex;
+                let vertex = packed - scene.layout.domains[domain].first_vertex;
                 for axis in 0..3 {
                     let own = usize::from(tile.kind & TILE_LAST) > 0;
                     let (step, lane) = if own { (usize::from(tile.width), quad) } else { (1, 0) };

@@ -106,7 +106,7 @@ impl GemmBatches {
     pub(super) fn plan(scene: &Scene, method: CublasMethod) -> Result<Self> {
         check_scene(scene, method)?;
         let mut groups: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
-        for (domain, slot) in scene.layout.slots.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
+        for (domain, slot) in scene.layout.domains.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
             groups.entry(method.batch_key(3 * slot.vertices, slot.rank)).or_default().push(domain);
         }
         let (mut list, mut floats) = (Vec::with_capacity(groups.len()), [0_u64; 3]);
@@ -175,7 +175,7 @@ fn size_product(scene: &Scene, method: CublasMethod, domains: &[usize]) -> Resul
     let to_i32 = |number: usize| {
         i32::try_from(number).map_err(|_| invalid("scene.size", format!("at most {} for cuBLAS", i32::MAX), number))
     };
-    let slots = || domains.iter().map(|domain| scene.layout.slots[*domain]);
+    let slots = || domains.iter().map(|domain| scene.layout.domains[*domain]);
     let rows = slots().map(|slot| 3 * slot.vertices).max().unwrap_or(0);
     let rank = slots().map(|slot| slot.rank).max().unwrap_or(0);
     // The library is fastest with columns aligned to 16 bytes; row-major storage has no gaps.
@@ -250,7 +250,7 @@ mod tests {
         for (domain, offset) in batches.u_offsets(scene.domains.len()).iter().enumerate() {
             assert_eq!(offset.is_some(), scene.rank_of(domain) > 0);
             let Some(offset) = offset else { continue };
-            for vertex in 0..scene.layout.slots[domain].vertices {
+            for vertex in 0..scene.layout.domains[domain].vertices {
                 for (axis, want) in displacement_of(scene, state, domain, vertex).iter().enumerate() {
                     let got = f64::from(u[*offset as usize + 3 * vertex + axis]);
                     assert!((got - want).abs() < 1e-4, "{} domain {domain} vertex {vertex}", method.name());

@@ -93,7 +93,7 @@ pub struct LaneCounts {
 pub fn count_lanes(scene: &Scene, split: KernelSplit) -> Vec<LaneCounts> {
     let count_for_width = |width: &usize| {
         let (mut groups, mut busy_lanes) = (0, 0);
-        for slot in scene.layout.slots.iter().filter(|slot| is_of_width(split, *width, slot.rank)) {
+        for slot in scene.layout.domains.iter().filter(|slot| is_of_width(split, *width, slot.rank)) {
             groups += reshaped_rows(3 * slot.vertices, *width, vectors_per_row(slot.rank));
             busy_lanes += (3 * slot.vertices * vectors_per_row(slot.rank)) as u64;
         }
@@ -124,7 +124,7 @@ impl DisplacementLayout {
             vertex_count += if slot.rank > 0 { slot.vertices } else { 0 };
             (slot.rank > 0).then_some(first as u32)
         };
-        let first_vertices = scene.layout.slots.iter().map(&mut append_domain).collect();
+        let first_vertices = scene.layout.domains.iter().map(&mut append_domain).collect();
         Self { first_vertices, vertex_count }
     }
 }
@@ -169,7 +169,7 @@ pub(super) fn pack_groups(scene: &Scene, split: KernelSplit, width: usize) -> Pa
     let mut packed = PackedGroups { width, entries: Vec::new(), meta: Vec::new() };
     // Index of the domain's first float4 of q.
     let mut first_q = 0;
-    for (domain, slot) in scene.layout.slots.iter().enumerate() {
+    for (domain, slot) in scene.layout.domains.iter().enumerate() {
         let n_vr = vectors_per_row(slot.rank);
         let first_u = displacements.first_vertices[domain].filter(|_| is_of_width(split, width, slot.rank));
         if let Some(first_u) = first_u {

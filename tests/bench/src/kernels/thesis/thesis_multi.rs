@@ -39,7 +39,7 @@ impl MultiDomainKernel {
     /// # Errors
     /// `Invalid` when a domain has more modes than a group holds.
     pub(super) fn new(device: &Device, scene: &Scene, split: KernelSplit) -> Result<Self> {
-        let slots = &scene.layout.slots;
+        let slots = &scene.layout.domains;
         if let Some(domain) = slots.iter().position(|slot| slot.rank > MAX_RANK) {
             let field = format!("domain {domain}: modes");
             return Err(invalid(field, format!("at most {MAX_RANK} for groups"), slots[domain].rank));
@@ -144,7 +144,7 @@ mod tests {
             for (domain, first) in
                 first_vertices.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?)))
             {
-                for vertex in 0..scene.layout.slots[domain].vertices {
+                for vertex in 0..scene.layout.domains[domain].vertices {
                     let want = displacement_of(&scene, &state, domain, vertex);
                     let got = &u[4 * (first as usize + vertex)..][..3];
                     max_error = want

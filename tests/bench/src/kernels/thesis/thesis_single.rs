@@ -62,7 +62,7 @@ impl SingleDomainKernel {
     /// # Errors
     /// `Invalid` when the scene is not one domain with modes.
     pub(super) fn new(device: &Device, scene: &Scene) -> Result<Self> {
-        let [slot] = scene.layout.slots[..] else {
+        let [slot] = scene.layout.domains[..] else {
             return Err(invalid("scene.domains", "1 for the single-domain kernel", scene.domains.len()));
         };
         if slot.rank == 0 {

@@ -70,7 +70,7 @@ impl UnfoldedTriangles {
         let displacements = DisplacementLayout::of(scene);
         let mut unfolded = Self::default();
         let mut domains = Vec::new();
-        for (domain, slot) in scene.layout.slots.iter().enumerate() {
+        for (domain, slot) in scene.layout.domains.iter().enumerate() {
             let shape = scene.shape_of(domain);
             let (corners, triangles) = (shape.mesh.corners(), shape.mesh.triangles());
             let triangle_count = triangles.len().max(MIN_TRIANGLES);
@@ -258,7 +258,7 @@ mod tests {
         let mut u = vec![[0.0_f32; 4]; vertex_count];
         for (domain, first) in first_vertices.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?)))
         {
-            for vertex in 0..scene.layout.slots[domain].vertices {
+            for vertex in 0..scene.layout.domains[domain].vertices {
                 u[first as usize + vertex] =
                     float4(displacement_of(&scene, &state, domain, vertex).map(|number| number as f32), 0.0);
             }
@@ -266,7 +266,7 @@ mod tests {
         let positions = run_twin(&unfolded, &transform_matrices(&scene, &state), &u);
         let folded = fold(&positions, &unfolded.targets, scene.layout.vertices);
         let mut nan_count = 0;
-        for (domain, slot) in scene.layout.slots.iter().enumerate() {
+        for (domain, slot) in scene.layout.domains.iter().enumerate() {
             for vertex in 0..slot.vertices {
                 let got = &folded[3 * (slot.first_vertex + vertex)..][..3];
                 nan_count += usize::from(got[0].is_nan());
