@@ -65,7 +65,7 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
                 let share = of_bound(&scene, state, &got);
                 assert!(share <= 1.0, "{name} input set {input_set}: {share} of the bound");
                 let other = of_bound(&scene, &states[(input_set + 1) % states.len()], &got);
-                assert!(other > 1.0, "{name}: the judge can fail");
+                assert!(other > 1.0, "{name}: expected the next state to exceed the bound, got {other} of it");
                 batch.launch(&device, input_set).expect("expected a launch");
                 assert!(
                     have_equal_bits(&got, &batch.positions(&device).expect("expected a surface")),

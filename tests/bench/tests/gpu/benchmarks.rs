@@ -29,7 +29,7 @@ fn gpu_memory_rates_are_plausible_and_empty_replay_takes_time() {
 }
 
 /// Per packed vertex, whether a triangle refers to it. Other vertices are not computed from unfolded triangles.
-fn named(scene: &Scene) -> Vec<bool> {
+fn is_corner_of_triangle(scene: &Scene) -> Vec<bool> {
     let mut named = vec![false; scene.layout.vertices];
     for (domain, slot) in scene.layout.domains.iter().enumerate() {
         let mesh = &scene.shape_of(domain).mesh;
@@ -41,8 +41,8 @@ fn named(scene: &Scene) -> Vec<bool> {
 }
 
 /// Largest error of a benchmark's positions, over the vertices that a triangle refers to, as a fraction of the diagonal.
-fn judge(scene: &Scene, state: &SceneState, positions: &[f32]) -> Result<f64, String> {
-    let (named, want) = (named(scene), modalcast_compute::reference::deform(scene, state));
+fn relative_error(scene: &Scene, state: &SceneState, positions: &[f32]) -> Result<f64, String> {
+    let (named, want) = (is_corner_of_triangle(scene), modalcast_compute::reference::deform(scene, state));
     if positions.len() != 3 * named.len() {
         return Err(format!("{} numbers for {} vertices", positions.len(), named.len()));
     }
@@ -63,11 +63,11 @@ fn check(device: &Device, scene: &Arc<Scene>, states: &[SceneState], benchmark: 
     for (input_set, state) in states.iter().enumerate() {
         benchmark.launch(device, input_set).unwrap_or_else(|error| panic!("{name}: {error}"));
         let positions = benchmark.positions(device).expect("expected a surface");
-        let error =
-            judge(scene, state, &positions).unwrap_or_else(|error| panic!("{name} input set {input_set}: {error}"));
+        let error = relative_error(scene, state, &positions)
+            .unwrap_or_else(|error| panic!("{name} input set {input_set}: {error}"));
         assert!(
-            judge(scene, &states[(input_set + 1) % states.len()], &positions).is_err(),
-            "{name}: the judge can fail"
+            relative_error(scene, &states[(input_set + 1) % states.len()], &positions).is_err(),
+            "{name}: expected the next state to exceed the tolerance"
         );
         eprintln!("{name} input set {input_set}: {error:.2e} of the diagonal");
     }
@@ -78,7 +78,7 @@ fn check(device: &Device, scene: &Arc<Scene>, states: &[SceneState], benchmark: 
             time(device, benchmark, cache, 10 * states.len()).unwrap_or_else(|error| panic!("{name}: {error}"));
         let positions = benchmark.positions(device).expect("expected a surface");
         let last = states.len() - 1;
-        judge(scene, &states[last], &positions).unwrap_or_else(|error| panic!("{name} replayed: {error}"));
+        relative_error(scene, &states[last], &positions).unwrap_or_else(|error| panic!("{name} replayed: {error}"));
         eprintln!("{name} {cache:?}: {timing:?}, {} launches", benchmark.launches_per_step());
     }
     assert!(benchmark.traffic().iter().map(|traffic| traffic.bytes).sum::<u64>() > 0, "{name}");
@@ -155,7 +155,7 @@ fn gpu_cublas_matches_reference_with_every_product_kind() {
             match CublasBenchmark::new(&device, scene, &states(scene), (peer, part)) {
                 Ok(benchmark) => check(&device, scene, &states(scene), &benchmark),
                 Err(Error::Unavailable { what: "cuBLAS", reason, .. }) => {
-                    eprintln!("{} not judged: {reason}", peer.name())
+                    eprintln!("{} skipped: {reason}", peer.name())
                 }
                 Err(error) => panic!("{}: {error}", peer.name()),
             }
@@ -165,7 +165,7 @@ fn gpu_cublas_matches_reference_with_every_product_kind() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_trials_reject_unsupported_scenes() {
+fn gpu_thesis_kernels_reject_unsupported_scenes() {
     let device = Device::open(0).expect("expected a CUDA device");
     let (large, two) =
         (scenes::random_scene(&[(40, 33)], 1, false, false), scenes::random_scene(&[(40, 3)], 2, false, false));
