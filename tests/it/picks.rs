@@ -135,7 +135,7 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
     let without_modes = client
         .pick(&PickRequest::new(
             "sheet",
-            PickRectangle { without_modes: true, ..PickRectangle::pixel(picture, 0, 0).size(2, 1) },
+            PickRectangle { omit_modes: true, ..PickRectangle::pixel(picture, 0, 0).size(2, 1) },
         ))
         .await
         .expect("expected a pick");
@@ -226,7 +226,7 @@ async fn outputs_have_their_format_and_agree_with_picks() {
     driver.step_acknowledged(step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3])).await;
     let render = async |output| {
         let request = FrameRequest::new("strips", Picture { output, ..picture() });
-        client.frame(&request.minimum_step(1)).await.expect("expected a frame")
+        client.render_frame(&request.minimum_step(1)).await.expect("expected a frame")
     };
     let (depth, domains, normals) =
         (render(Output::Depth).await, render(Output::Domains).await, render(Output::Normals).await);
@@ -251,10 +251,10 @@ async fn outputs_have_their_format_and_agree_with_picks() {
     assert!(picks.hits.len() > 1000 && different <= 3, "{different} of {} pixels", picks.hits.len());
     let color = render(Output::Color).await.bytes;
     let maps = [
-        render(Output::Displacement { largest: 0.0 }).await,
-        render(Output::Displacement { largest: 9.0 }).await,
-        render(Output::ModeShape { mode: 0, largest: 0.0 }).await,
-        render(Output::ModeShape { mode: 1, largest: 0.0 }).await,
+        render(Output::Displacement { scale_max: 0.0 }).await,
+        render(Output::Displacement { scale_max: 9.0 }).await,
+        render(Output::ModeShape { mode: 0, scale_max: 0.0 }).await,
+        render(Output::ModeShape { mode: 1, scale_max: 0.0 }).await,
     ];
     for (index, map) in maps.iter().enumerate() {
         assert_eq!(

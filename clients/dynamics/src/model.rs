@@ -5,7 +5,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use modalcast_client::{Array, Client, Domain, ModeRows, SceneDescription};
+use modalcast_client::{Client, Domain, DomainArray, ModeRows, SceneDescription};
 use nalgebra::Vector3;
 
 use crate::affine::AffineTransform;
@@ -139,9 +139,11 @@ impl Model {
         let has_eigenvalues = without_arrays.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
         let description = match (has_modes, has_eigenvalues) {
             (false, _) => without_arrays,
-            (true, false) => client.describe(scene, &[Array::RestPositions]).await?,
+            (true, false) => client.describe(scene, &[DomainArray::RestPositions]).await?,
             (true, true) => {
-                client.describe(scene, &[Array::RestPositions, Array::Indices, Array::CornerVertices]).await?
+                client
+                    .describe(scene, &[DomainArray::RestPositions, DomainArray::Indices, DomainArray::CornerVertices])
+                    .await?
             }
         };
         let entries_per_sample: usize = description.domains.iter().map(|domain| 3 * domain.rank).sum();
@@ -152,7 +154,7 @@ impl Model {
         for (domain, selection) in description.domains.iter().zip(&selections) {
             let key = (domain.shape, selection.vertices.clone());
             if domain.rank > 0 && !modes.contains_key(&key) {
-                let rows = client.modes(scene, domain.index, &selection.vertices).await?;
+                let rows = client.read_modes(scene, domain.index, &selection.vertices).await?;
                 if rows.rank != domain.rank {
                     return Err(invalid_input(format!("rank of '{}'", domain.name), domain.rank, rows.rank));
                 }
@@ -258,19 +260,19 @@ fn select_vertices(description: &SceneDescription, max_surface_samples: usize) -
             let field = format!("parent of '{}'", domain.name);
             return Err(invalid_input(field, format!("an index below {index}"), attachment.parent));
         }
-        let limit = domains[attachment.parent].vertices;
-        if let Some(vertex) = attachment.rows.iter().find(|vertex| **vertex as usize >= limit) {
+        let limit = domains[attachment.parent].vertex_count;
+        if let Some(vertex) = attachment.parent_vertices.iter().find(|vertex| **vertex as usize >= limit) {
             let field = format!("attachment vertices of '{}'", domain.name);
             return Err(invalid_input(field, format!("vertices below {limit}"), vertex));
         }
-        attachment_vertices[attachment.parent].extend(&attachment.rows);
+        attachment_vertices[attachment.parent].extend(&attachment.parent_vertices);
     }
     let select = |(domain, attachment_vertices): (&Domain, BTreeSet<u32>)| {
         if domain.rest_positions.is_empty() {
             return SelectedVertices { vertices: vec![], surface_sample_count: 0 };
         }
-        let count = domain.vertices.min(max_surface_samples);
-        let mut vertices: Vec<u32> = (0..count).map(|ordinal| (ordinal * domain.vertices / count) as u32).collect();
+        let count = domain.vertex_count.min(max_surface_samples);
+        let mut vertices: Vec<u32> = (0..count).map(|ordinal| (ordinal * domain.vertex_count / count) as u32).collect();
         let surface_vertices: BTreeSet<u32> = vertices.iter().copied().collect();
         let joint_vertices = attachment_vertices.into_iter().chain([base_vertex(domain)]).collect::<BTreeSet<_>>();
         vertices.extend(joint_vertices.difference(&surface_vertices));
@@ -283,7 +285,7 @@ fn select_vertices(description: &SceneDescription, max_surface_samples: usize) -
 fn base_vertex(domain: &Domain) -> u32 {
     let norm_squared =
         |vertex: u32| domain.rest_positions[3 * vertex as usize..][..3].iter().map(|x| x * x).sum::<f32>();
-    (0..domain.vertices as u32).min_by(|a, b| norm_squared(*a).total_cmp(&norm_squared(*b))).unwrap_or(0)
+    (0..domain.vertex_count as u32).min_by(|a, b| norm_squared(*a).total_cmp(&norm_squared(*b))).unwrap_or(0)
 }
 
 fn rest_position(domain: &Domain, vertex: u32) -> Vector3<f64> {
@@ -332,8 +334,8 @@ fn create_joint(domain: &Domain, selections: &[SelectedVertices]) -> Option<Join
     let sample_of_vertex: BTreeMap<u32, usize> =
         parent_vertices.iter().enumerate().map(|(sample, vertex)| (*vertex, sample)).collect();
     let attachment_samples =
-        attachment.rows.iter().filter_map(|vertex| sample_of_vertex.get(vertex).copied()).collect();
-    let parent_from_child = AffineTransform::from_row_major(&attachment.frame);
+        attachment.parent_vertices.iter().filter_map(|vertex| sample_of_vertex.get(vertex).copied()).collect();
+    let parent_from_child = AffineTransform::from_row_major(&attachment.parent_from_child);
     Some(Joint { parent: attachment.parent, parent_from_child, attachment_samples })
 }
 

@@ -222,8 +222,8 @@ impl Recorder {
     }
 
     fn write_row(&mut self, values: &StepValues) -> Result<()> {
-        self.q.row(&values.q)?;
-        Ok(self.transforms.row(values.transforms.as_flattened())?)
+        self.q.write_row(&values.q)?;
+        Ok(self.transforms.write_row(values.transforms.as_flattened())?)
     }
 
     fn finish(self) -> Result<()> {

@@ -1,5 +1,5 @@
-//! Assembles chunks into complete replies. A reply states its total size and a chunk its offset; both are checked, and
-//! the total is bounded before any byte is stored.
+//! Assembles chunks into complete replies. A reply states its total size, and a chunk its offset. Both are checked. A
+//! total above the limit is an error before any byte is stored.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -60,6 +60,7 @@ pub(crate) struct Chunk<H> {
 pub(crate) trait WireChunk: Sized {
     type Head;
     type Reply;
+    /// Name of the reply in errors.
     const NAME: &'static str;
     fn into_chunk(self) -> Chunk<Self::Head>;
     fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<Self::Reply>;
@@ -67,42 +68,47 @@ pub(crate) trait WireChunk: Sized {
 
 /// Collects the chunks of consecutive replies.
 pub(crate) struct Assembler<H> {
+    /// Name of the reply in errors.
     name: &'static str,
+    /// Maximum size of a reply in bytes.
     limit: u64,
-    open: Option<(H, u64)>,
+    /// Head and total size in bytes of the reply whose last chunk has not been added.
+    open_reply: Option<(H, u64)>,
     bytes: Vec<u8>,
 }
 
 impl<H> Assembler<H> {
     pub(crate) const fn new(name: &'static str, limit: u64) -> Self {
-        Self { name, limit, open: None, bytes: Vec::new() }
+        Self { name, limit, open_reply: None, bytes: Vec::new() }
     }
 
     /// Whether a reply has begun and not ended.
     pub(crate) const fn is_open(&self) -> bool {
-        self.open.is_some()
+        self.open_reply.is_some()
     }
 
     /// Adds a chunk. Returns the complete reply after its last chunk.
     pub(crate) fn push(&mut self, chunk: Chunk<H>) -> Result<Option<(H, Bytes)>> {
         let field = |name: &str| format!("{}.{name}", self.name);
-        match (chunk.head, self.open.is_some()) {
+        match (chunk.head, self.open_reply.is_some()) {
             (Some((_, total)), false) if total > self.limit => {
                 return Err(malformed_reply(field("total"), format!("at most {} bytes", self.limit), total));
             }
-            (Some(head), false) => self.open = Some(head),
+            (Some(head), false) => self.open_reply = Some(head),
             (None, true) => {}
-            (Some(_), true) => return Err(malformed_reply(field("head"), "the rest of the last reply", "a new head")),
+            (Some(_), true) => {
+                return Err(malformed_reply(field("head"), "the next chunk of the open reply", "a new head"));
+            }
             (None, false) => return Err(malformed_reply(field("head"), "a head on the first chunk", "none")),
         }
-        let Some((_, total)) = &self.open else { return Ok(None) };
+        let Some((_, total)) = &self.open_reply else { return Ok(None) };
         let (total, received) = (*total, self.bytes.len() as u64);
         if chunk.offset != received {
             return Err(malformed_reply(field("offset"), received, chunk.offset));
         }
         let end = received.saturating_add(chunk.data.len() as u64);
         if end > total {
-            return Err(malformed_reply(field("data"), format!("{total} bytes in all"), end));
+            return Err(malformed_reply(field("data"), format!("at most {total} bytes"), end));
         }
         if end < total {
             if self.bytes.capacity() == 0 {
@@ -111,23 +117,23 @@ impl<H> Assembler<H> {
             self.bytes.extend_from_slice(&chunk.data);
             return Ok(None);
         }
-        Ok(self.close(chunk.data))
+        Ok(self.complete(chunk.data))
     }
 
     /// Reserves memory for the whole reply. A total that this machine cannot hold is an error, not an abort.
     fn reserve(&mut self, total: u64) -> Result<()> {
-        let reserved = usize::try_from(total).ok().and_then(|total| self.bytes.try_reserve_exact(total).ok());
-        reserved.ok_or_else(|| malformed_reply(format!("{}.total", self.name), "a size that fits in memory", total))
+        let reservation = usize::try_from(total).ok().and_then(|total| self.bytes.try_reserve_exact(total).ok());
+        reservation.ok_or_else(|| malformed_reply(format!("{}.total", self.name), "a size that fits in memory", total))
     }
 
     /// Completes the reply. A reply of a single chunk is returned without a copy.
-    fn close(&mut self, last: Bytes) -> Option<(H, Bytes)> {
-        let (head, _) = self.open.take()?;
+    fn complete(&mut self, last_data: Bytes) -> Option<(H, Bytes)> {
+        let (head, _) = self.open_reply.take()?;
         if self.bytes.is_empty() {
-            return Some((head, last));
+            return Some((head, last_data));
         }
         let mut bytes = std::mem::take(&mut self.bytes);
-        bytes.extend_from_slice(&last);
+        bytes.extend_from_slice(&last_data);
         Some((head, bytes.into()))
     }
 }
@@ -135,29 +141,30 @@ impl<H> Assembler<H> {
 /// Turns a server stream of messages `M` with chunks `C` into a stream of complete replies. An error ends the stream.
 pub(crate) struct ChunkedReplies<M, C: WireChunk> {
     messages: Replies<M>,
+    /// Extracts the chunk of a message.
     chunk_of: fn(M) -> Option<C>,
     assembler: Assembler<C::Head>,
-    ended: bool,
+    has_ended: bool,
 }
 
 impl<M, C: WireChunk> ChunkedReplies<M, C> {
     pub(crate) const fn new(messages: Replies<M>, chunk_of: fn(M) -> Option<C>, limit: u64) -> Self {
-        Self { messages, chunk_of, assembler: Assembler::new(C::NAME, limit), ended: false }
+        Self { messages, chunk_of, assembler: Assembler::new(C::NAME, limit), has_ended: false }
     }
 
     /// Polls for the next complete reply.
     pub(crate) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<C::Reply>>> {
-        while !self.ended {
+        while !self.has_ended {
             let reply = match ready!(self.messages.poll(context)) {
-                Some(Ok(message)) => self.accept(message),
+                Some(Ok(message)) => self.add_message(message),
                 Some(Err(error)) => Err(error),
                 None if self.assembler.is_open() => Err(Error::StreamEnded { what: "the last chunk of a reply" }),
                 None => {
-                    self.ended = true;
+                    self.has_ended = true;
                     return Poll::Ready(None);
                 }
             };
-            self.ended = reply.is_err();
+            self.has_ended = reply.is_err();
             if let Some(reply) = reply.transpose() {
                 return Poll::Ready(Some(reply));
             }
@@ -170,9 +177,10 @@ impl<M, C: WireChunk> ChunkedReplies<M, C> {
         std::future::poll_fn(|context| self.poll(context)).await
     }
 
-    fn accept(&mut self, message: M) -> Result<Option<C::Reply>> {
-        let missing = || malformed_reply(format!("{}.chunk", C::NAME), "a chunk", "none");
-        let chunk = (self.chunk_of)(message).ok_or_else(missing)?;
+    /// Adds the chunk of a message. Returns the complete reply after its last chunk.
+    fn add_message(&mut self, message: M) -> Result<Option<C::Reply>> {
+        let missing_chunk = || malformed_reply(format!("{}.chunk", C::NAME), "a chunk", "none");
+        let chunk = (self.chunk_of)(message).ok_or_else(missing_chunk)?;
         match self.assembler.push(chunk.into_chunk())? {
             Some((head, bytes)) => C::decode_reply(head, bytes).map(Some),
             None => Ok(None),
@@ -206,21 +214,21 @@ mod tests {
             chunk(Some(0), 0, b""),
             chunk(Some(2), 0, b"fg"),
         ]);
-        assert_eq!(replies.expect("fits"), [&b"abcde"[..], b"", b"fg"]);
+        assert_eq!(replies.expect("valid chunks"), [&b"abcde"[..], b"", b"fg"]);
     }
 
     #[test]
     fn first_chunk_reserves_the_announced_total() {
         let mut assembler = Assembler::new("frame", 1 << 20);
-        assert!(assembler.push(chunk(Some(1 << 20), 0, b"ab")).expect("fits").is_none());
+        assert!(assembler.push(chunk(Some(1 << 20), 0, b"ab")).expect("a valid chunk").is_none());
         let (start, capacity) = (assembler.bytes.as_ptr(), assembler.bytes.capacity());
         assert!(capacity >= 1 << 20, "{capacity}");
-        assembler.push(Chunk { head: None, offset: 2, data: vec![0; 1 << 19].into() }).expect("fits");
+        assembler.push(Chunk { head: None, offset: 2, data: vec![0; 1 << 19].into() }).expect("a valid chunk");
         assert_eq!((assembler.bytes.as_ptr(), assembler.bytes.capacity()), (start, capacity));
     }
 
     #[test]
-    fn wrong_chunks_are_refused_by_field() {
+    fn malformed_chunks_report_their_field() {
         for (chunks, field) in [
             (vec![chunk(Some(9), 0, b"")], "frame.total"),
             (vec![chunk(Some(u64::MAX), 0, b"")], "frame.total"),
@@ -231,16 +239,16 @@ mod tests {
             (vec![chunk(Some(4), 0, b"ab"), chunk(Some(4), 0, b"ab")], "frame.head"),
             (vec![chunk(Some(4), 0, b"ab")], "the stream ended"),
         ] {
-            let refusal = assemble(chunks).expect_err("wrong").to_string();
-            assert!(refusal.contains(field), "{refusal} does not name {field}");
+            let error = assemble(chunks).expect_err("malformed chunks").to_string();
+            assert!(error.contains(field), "expected an error of {field}, got: {error}");
         }
     }
 
     #[test]
-    fn total_beyond_the_memory_is_refused() {
+    fn total_beyond_the_memory_is_an_error() {
         let mut assembler = Assembler::new("frame", u64::MAX);
-        let refusal = assembler.push(chunk(Some(u64::MAX), 0, b"ab")).expect_err("too much").to_string();
-        assert!(refusal.contains("frame.total"), "{refusal}");
+        let error = assembler.push(chunk(Some(u64::MAX), 0, b"ab")).expect_err("too many bytes").to_string();
+        assert!(error.contains("frame.total"), "{error}");
     }
 
     #[test]
@@ -248,10 +256,10 @@ mod tests {
         let mut bytes = vec![0];
         bytes.extend(1.5_f32.to_le_bytes());
         bytes.extend((-2.0_f32).to_le_bytes());
-        assert_eq!(decode::<f32>("q", &bytes[1..]).expect("whole"), [1.5, -2.0]);
-        assert_eq!(decode::<[f32; 2]>("q", &bytes[1..]).expect("whole"), [[1.5, -2.0]]);
-        assert_eq!(decode::<u32>("q", &7_u32.to_le_bytes()).expect("whole"), [7]);
-        let refusal = decode::<f32>("q", &bytes).expect_err("nine bytes").to_string();
-        assert!(refusal.contains("a multiple of 4 bytes"), "{refusal}");
+        assert_eq!(decode::<f32>("q", &bytes[1..]).expect("whole numbers"), [1.5, -2.0]);
+        assert_eq!(decode::<[f32; 2]>("q", &bytes[1..]).expect("whole numbers"), [[1.5, -2.0]]);
+        assert_eq!(decode::<u32>("q", &7_u32.to_le_bytes()).expect("whole numbers"), [7]);
+        let error = decode::<f32>("q", &bytes).expect_err("nine bytes").to_string();
+        assert!(error.contains("a multiple of 4 bytes"), "{error}");
     }
 }

@@ -1,4 +1,5 @@
-//! The connection to a server. Unary calls return values, streams return handles; clones share the connection.
+//! The connection to a server. Unary calls return values, and streaming calls return handles of streams. Clones of a
+//! `Client` share the connection.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -10,23 +11,35 @@ use tonic::{Response, Status, Streaming};
 use crate::assemble::Replies;
 use crate::error::{Error, Result, describe_causes, malformed_reply};
 
-/// The default limit of one reply assembled from chunks, in bytes.
+/// The default limit of one reply that is assembled from chunks, in bytes.
 pub const REPLY_LIMIT: u64 = 1 << 30;
 
-/// HTTP/2 flow-control windows in bytes. A stream that is not read fills its own window. Sixteen such streams fill the
-/// window of the connection, and every other call then waits.
+/// HTTP/2 flow-control window of a stream, in bytes. A stream that is not read fills its own window only.
 const STREAM_WINDOW: u32 = 4 << 20;
+
+/// HTTP/2 flow-control window of the connection, in bytes. Sixteen streams that are not read fill it, and every other
+/// call then waits.
 const CONNECTION_WINDOW: u32 = 16 * STREAM_WINDOW;
+
 /// The largest HTTP/2 frame that the server may send, in bytes: one chunk of a reply. The default of 16 KiB halves the
 /// rate of large replies.
-const FRAME_SIZE: u32 = 1 << 20;
+const MAX_FRAME_SIZE: u32 = 1 << 20;
+
+/// Time limit of a connection attempt.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Interval of HTTP/2 pings, and the time after which a ping without an answer closes the connection.
+const KEEP_ALIVE: Duration = Duration::from_secs(20);
+
+/// Pause between two connection attempts.
+const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
 /// A connection to a modalcast server.
 #[derive(Debug, Clone)]
 pub struct Client {
     pub(crate) channel: Channel,
     pub(crate) reply_limit: u64,
-    /// The URL of the server, as the caller wrote it; errors name it.
+    /// The URL of the server, as the caller passed it. Errors contain it.
     server: Arc<str>,
 }
 
@@ -40,9 +53,17 @@ pub struct ServerInfo {
     pub device: String,
     /// The name that the OpenGL renderer reports.
     pub renderer: String,
-    /// Whether that renderer runs on the CPU.
-    pub software: bool,
+    /// Whether the OpenGL renderer runs on the CPU.
+    pub is_software_renderer: bool,
     pub limits: v1::Limits,
+}
+
+/// The open scenes and the available sources of a server.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SceneList {
+    pub scenes: Vec<v1::SceneInfo>,
+    /// Sources that [`Client::open_scene`] accepts.
+    pub sources: Vec<String>,
 }
 
 impl Client {
@@ -51,18 +72,18 @@ impl Client {
     /// # Errors
     /// `Connect` if the URL is invalid or no server answers.
     pub async fn connect(url: &str) -> Result<Self> {
-        let refused =
-            |fault: tonic::transport::Error| Error::Connect { url: url.to_owned(), reason: describe_causes(&fault) };
-        let whole = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
-        let endpoint = Endpoint::from_shared(whole)
-            .map_err(refused)?
-            .connect_timeout(Duration::from_secs(5))
+        let connect_error =
+            |error: tonic::transport::Error| Error::Connect { url: url.to_owned(), reason: describe_causes(&error) };
+        let url_with_scheme = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
+        let endpoint = Endpoint::from_shared(url_with_scheme)
+            .map_err(connect_error)?
+            .connect_timeout(CONNECT_TIMEOUT)
             .initial_stream_window_size(STREAM_WINDOW)
             .initial_connection_window_size(CONNECTION_WINDOW)
-            .max_frame_size(FRAME_SIZE)
-            .http2_keep_alive_interval(Duration::from_secs(20))
-            .keep_alive_timeout(Duration::from_secs(20));
-        let channel = endpoint.connect().await.map_err(refused)?;
+            .max_frame_size(MAX_FRAME_SIZE)
+            .http2_keep_alive_interval(KEEP_ALIVE)
+            .keep_alive_timeout(KEEP_ALIVE);
+        let channel = endpoint.connect().await.map_err(connect_error)?;
         Ok(Self { channel, reply_limit: REPLY_LIMIT, server: url.into() })
     }
 
@@ -74,8 +95,8 @@ impl Client {
         let start = Instant::now();
         loop {
             match Self::connect(url).await {
-                Err(_) if start.elapsed() < timeout => tokio::time::sleep(Duration::from_millis(100)).await,
-                answer => return answer,
+                Err(_) if start.elapsed() < timeout => tokio::time::sleep(RETRY_INTERVAL).await,
+                result => return result,
             }
         }
     }
@@ -87,10 +108,10 @@ impl Client {
         self
     }
 
-    /// Backend, renderer and limits of the server.
+    /// Gets backend, renderer and limits of the server.
     ///
     /// # Errors
-    /// `Status`, `Connect` or `Malformed`, as for every call.
+    /// `Status` if the server rejects the call; `Connect` if the connection is lost.
     pub async fn server_info(&self) -> Result<ServerInfo> {
         let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
         let wire = self.reply(service.get_server_info(v1::GetServerInfoRequest {}).await)?;
@@ -99,7 +120,7 @@ impl Client {
             backend: wire.backend,
             device: wire.device,
             renderer: wire.renderer,
-            software: wire.software,
+            is_software_renderer: wire.software,
             limits: wire.limits.unwrap_or_default(),
         })
     }
@@ -108,26 +129,26 @@ impl Client {
     /// empty `name`, the scene has the name of its source.
     ///
     /// # Errors
-    /// `Status` if the source does not exist; `Connect`; `Malformed`.
+    /// `Status` if the source does not exist; `Connect` if the connection is lost; `Malformed` if the reply has no scene.
     pub async fn open_scene(&self, source: &str, name: &str) -> Result<v1::SceneInfo> {
         let request = v1::OpenSceneRequest { source: source.to_owned(), scene: name.to_owned() };
         let reply = self.reply(self.scenes().open_scene(request).await)?;
         reply.scene.ok_or_else(|| malformed_reply("open_scene.scene", "a scene", "none"))
     }
 
-    /// The open scenes, and the sources that [`Self::open_scene`] accepts.
+    /// Lists the open scenes, and the sources that [`Self::open_scene`] accepts.
     ///
     /// # Errors
-    /// `Status` or `Connect`.
-    pub async fn list_scenes(&self) -> Result<(Vec<v1::SceneInfo>, Vec<String>)> {
+    /// `Status` if the server rejects the call; `Connect` if the connection is lost.
+    pub async fn list_scenes(&self) -> Result<SceneList> {
         let reply = self.reply(self.scenes().list_scenes(v1::ListScenesRequest {}).await)?;
-        Ok((reply.scenes, reply.sources))
+        Ok(SceneList { scenes: reply.scenes, sources: reply.sources })
     }
 
     /// Closes a scene. The server deletes the files of an uploaded scene.
     ///
     /// # Errors
-    /// `Status` if the scene does not exist; `Connect`.
+    /// `Status` if the scene does not exist; `Connect` if the connection is lost.
     pub async fn delete_scene(&self, scene: &str) -> Result<()> {
         let request = v1::DeleteSceneRequest { scene: scene.to_owned() };
         self.reply(self.scenes().delete_scene(request).await).map(drop)

@@ -1,5 +1,4 @@
-//! Errors of the client, by who can act on them. A refusal of the server names the field, what the server expected and
-//! what it got.
+//! Errors of the client. A rejection by the server names the field, what the server expected and what it got.
 
 use modalcast_proto::v1;
 use prost::Message as _;
@@ -7,10 +6,10 @@ use prost::Message as _;
 /// The result type of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// Why the server refused a request or a step.
+/// Why the server rejected a request or a step.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Rejection {
-    /// The number of the refused step; `None` for other requests.
+    /// The number of the rejected step; `None` for other requests.
     pub step: Option<u64>,
     pub field: String,
     pub expected: String,
@@ -38,13 +37,13 @@ pub enum Error {
     /// No connection, or the connection was lost.
     #[error("{url}: no connection: {reason}")]
     Connect { url: String, reason: String },
-    /// The server refused a call. `rejection` is present if the server sent details.
-    #[error("refused ({code:?}): {message}")]
+    /// The server rejected a call. `rejection` is present if the server sent details.
+    #[error("rejected ({code:?}): {message}")]
     Status { code: tonic::Code, message: String, rejection: Option<Box<Rejection>> },
-    /// The server refused a step, or the opening of a step stream; a refused step does not end its stream.
+    /// The server rejected a step, or the opening of a step stream. A rejected step does not end its stream.
     #[error("rejected: {0}")]
     Rejected(Box<Rejection>),
-    /// The reply of the server contradicts itself or the contract.
+    /// The reply of the server contradicts itself or the wire contract.
     #[error("malformed reply: {field}: expected {expected}, got {given}")]
     Malformed { field: String, expected: String, given: String },
     /// A stream ended too early.
@@ -53,7 +52,7 @@ pub enum Error {
     /// A reply did not arrive in time.
     #[error("{what} did not arrive within {ms} ms")]
     Deadline { what: &'static str, ms: u64 },
-    /// A step that cannot be encoded as one message; nothing was sent.
+    /// A step cannot be encoded as one message, so it was not sent.
     #[error("step {step} cannot be sent: {reason}")]
     Step { step: u64, reason: &'static str },
     /// A local file could not be read or written.
@@ -63,11 +62,11 @@ pub enum Error {
 
 impl Error {
     /// An error of a local file.
-    pub fn file(path: impl AsRef<std::path::Path>, fault: impl std::fmt::Display) -> Self {
-        Self::File { path: path.as_ref().display().to_string(), reason: fault.to_string() }
+    pub fn file(path: impl AsRef<std::path::Path>, error: impl std::fmt::Display) -> Self {
+        Self::File { path: path.as_ref().display().to_string(), reason: error.to_string() }
     }
 
-    /// The refusal of the server, if it sent details.
+    /// The rejection by the server, if it sent details.
     pub fn rejection(&self) -> Option<&Rejection> {
         match self {
             Self::Rejected(rejection) => Some(rejection),
@@ -77,7 +76,7 @@ impl Error {
     }
 }
 
-/// A reply that violates the contract.
+/// Creates a `Malformed` error: `field` of a reply holds `given` instead of `expected`.
 pub(crate) fn malformed_reply(field: impl Into<String>, expected: impl ToString, given: impl ToString) -> Error {
     Error::Malformed { field: field.into(), expected: expected.to_string(), given: given.to_string() }
 }
@@ -88,23 +87,24 @@ impl Error {
         if is_connection_lost(&status) {
             return Self::Connect { url: server.to_owned(), reason: describe_causes(&status) };
         }
-        let decoded = (!status.details().is_empty()).then(|| v1::Rejection::decode(status.details()).ok()).flatten();
+        let has_details = !status.details().is_empty();
+        let rejection = has_details.then(|| v1::Rejection::decode(status.details()).ok()).flatten();
         Self::Status {
             code: status.code(),
             message: status.message().to_owned(),
-            rejection: decoded.map(|wire| Box::new(wire.into())),
+            rejection: rejection.map(|wire| Box::new(wire.into())),
         }
     }
 }
 
 /// Whether the connection failed. The transport reports a broken connection as `Unknown` or `Unavailable` with a cause;
 /// a status that the server sent has no cause. A proxy answers `Unavailable` without details for a server that it cannot
-/// reach; a refusal of the server with that code has details.
+/// reach; a rejection by the server with that code has details.
 fn is_connection_lost(status: &tonic::Status) -> bool {
-    let local = std::error::Error::source(status).is_some();
+    let has_cause = std::error::Error::source(status).is_some();
     match status.code() {
-        tonic::Code::Unknown => local,
-        tonic::Code::Unavailable => local || status.details().is_empty(),
+        tonic::Code::Unknown => has_cause,
+        tonic::Code::Unavailable => has_cause || status.details().is_empty(),
         _ => false,
     }
 }
@@ -120,12 +120,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_valid_status_details_become_a_refusal() {
+    fn only_valid_status_details_become_a_rejection() {
         let wire = v1::Rejection { step: Some(4), field: "q".into(), expected: "80".into(), given: "79".into() };
-        let with = |details: Vec<u8>| tonic::Status::with_details(tonic::Code::InvalidArgument, "no", details.into());
-        let error = Error::from_status(with(wire.encode_to_vec()), "server:1");
+        let status = |details: Vec<u8>| tonic::Status::with_details(tonic::Code::InvalidArgument, "no", details.into());
+        let error = Error::from_status(status(wire.encode_to_vec()), "server:1");
         assert_eq!(error.rejection().map(ToString::to_string).as_deref(), Some("step 4: q: expected 80, got 79"));
-        assert_eq!(Error::from_status(with(vec![0xff, 0xff, 0xff]), "server:1").rejection(), None);
+        assert_eq!(Error::from_status(status(vec![0xff, 0xff, 0xff]), "server:1").rejection(), None);
         assert_eq!(Error::from_status(tonic::Status::not_found("scene"), "server:1").rejection(), None);
     }
 }

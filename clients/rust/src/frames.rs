@@ -19,13 +19,14 @@ pub type FrameRequest = StepRequest<Picture>;
 /// A subscription to one frame per step.
 pub type FrameStreamRequest = Subscription<Picture>;
 
-/// Encoding of the bytes of a frame, top row first: 8-bit sRGB, or numbers.
+/// Encoding of the bytes of a frame, top row first: 8-bit sRGB (`Png`, `Rgba`), or numbers.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum FrameFormat {
     #[default]
     Png,
     Rgba,
-    /// Little-endian f32, one per pixel: depth in meters. A request need not name this format; the frame states it.
+    /// Little-endian f32, one per pixel: depth in meters. The server chooses this and the other number formats by the
+    /// output.
     F32,
     /// Little-endian u32, one per pixel: domain indices.
     U32,
@@ -44,10 +45,11 @@ pub enum Output {
     Domains,
     /// Unit normals; zeros in the background.
     Normals,
-    /// |u| as a color map with a legend. `largest` is the value at the bright end in meters; 0 fits it to each frame.
-    Displacement { largest: f64 },
-    /// One column of U as a color map with a legend.
-    ModeShape { mode: u32, largest: f64 },
+    /// |u| as a color map with a legend. `scale_max` is the value at the bright end in meters; 0 selects the maximum of
+    /// each frame.
+    Displacement { scale_max: f64 },
+    /// The length of one column of U as a color map with a legend. `scale_max` is as for `Displacement`.
+    ModeShape { mode: u32, scale_max: f64 },
 }
 
 /// The pose of the camera.
@@ -118,9 +120,10 @@ pub struct Frame {
     /// Number of steps skipped since the previous frame of the stream.
     pub skipped: u64,
     pub stages: StageTimes,
-    /// For color frames: the rasterizer of the shadow map (`None` if the map is shared with another frame of the step)
-    /// and of the visible triangles.
+    /// The rasterizer of the shadow map. `None` for other outputs than color, and if the map is shared with another frame
+    /// of the step.
     pub shadow_drawn_by: Option<DrawnBy>,
+    /// The rasterizer of the visible triangles. `None` for other outputs than color.
     pub visibility_drawn_by: Option<DrawnBy>,
 }
 
@@ -135,8 +138,9 @@ impl Client {
     /// Renders one frame.
     ///
     /// # Errors
-    /// `Status` if the scene or the step does not exist or the deadline passed; `Malformed`; `Connect`.
-    pub async fn frame(&self, request: &FrameRequest) -> Result<Frame> {
+    /// `Status` if the scene or the step does not exist or the deadline passed; `Malformed` if the reply contradicts
+    /// itself; `Connect` if the connection is lost.
+    pub async fn render_frame(&self, request: &FrameRequest) -> Result<Frame> {
         use v1::render_frame_request::Step;
         let wire = v1::RenderFrameRequest {
             scene: request.scene.clone(),
@@ -146,14 +150,14 @@ impl Client {
         };
         let messages = self.replies(FrameServiceClient::new(self.channel.clone()).render_frame(wire).await)?;
         let frame = ChunkedReplies::new(messages, |message| message.chunk, self.reply_limit).next().await;
-        frame.unwrap_or(Err(Error::StreamEnded { what: "the frame" }))
+        frame.unwrap_or(Err(Error::StreamEnded { what: "the first frame" }))
     }
 
     /// Subscribes to frames. When this returns, the server has accepted the subscription, so that no later step is
     /// missed.
     ///
     /// # Errors
-    /// `Status` if the scene does not exist; `Connect`.
+    /// `Status` if the scene does not exist; `Connect` if the connection is lost.
     pub async fn stream_frames(&self, request: &FrameStreamRequest) -> Result<FrameStream> {
         let wire = v1::StreamFramesRequest {
             scene: request.scene.clone(),
@@ -198,7 +202,7 @@ impl WireChunk for v1::FrameChunk {
     }
 
     fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<Frame> {
-        let (format, size) = match head.format() {
+        let (format, pixel_bytes) = match head.format() {
             v1::Format::Png => (FrameFormat::Png, None),
             v1::Format::Rgba => (FrameFormat::Rgba, Some(4)),
             v1::Format::F32 => (FrameFormat::F32, Some(4)),
@@ -208,9 +212,10 @@ impl WireChunk for v1::FrameChunk {
                 return Err(malformed_reply("frame.format", "a known format", head.format));
             }
         };
-        let pixels = u64::from(head.width) * u64::from(head.height);
-        if let Some(total) = size.map(|size: u64| size * pixels).filter(|total| *total != bytes.len() as u64) {
-            return Err(malformed_reply("frame.total", format!("{total} bytes"), bytes.len()));
+        let pixel_count = u64::from(head.width) * u64::from(head.height);
+        let expected_bytes = pixel_bytes.map(|pixel_bytes: u64| pixel_bytes * pixel_count);
+        if let Some(expected_bytes) = expected_bytes.filter(|expected_bytes| *expected_bytes != bytes.len() as u64) {
+            return Err(malformed_reply("frame.total", format!("{expected_bytes} bytes"), bytes.len()));
         }
         let step = head.step.ok_or_else(|| malformed_reply("frame.step", "a step", "none"))?;
         Ok(Frame {
@@ -220,14 +225,14 @@ impl WireChunk for v1::FrameChunk {
             format,
             bytes,
             skipped: head.skipped,
-            shadow_drawn_by: drawn_by(head.shadow_drawn_by()),
-            visibility_drawn_by: drawn_by(head.visibility_drawn_by()),
+            shadow_drawn_by: decode_drawn_by(head.shadow_drawn_by()),
+            visibility_drawn_by: decode_drawn_by(head.visibility_drawn_by()),
             stages: stages::from_wire(head.stages),
         })
     }
 }
 
-const fn drawn_by(wire: v1::DrawnBy) -> Option<DrawnBy> {
+const fn decode_drawn_by(wire: v1::DrawnBy) -> Option<DrawnBy> {
     match wire {
         v1::DrawnBy::Unspecified => None,
         v1::DrawnBy::Opengl => Some(DrawnBy::OpenGl),
@@ -237,13 +242,13 @@ const fn drawn_by(wire: v1::DrawnBy) -> Option<DrawnBy> {
 
 impl From<Picture> for v1::Picture {
     fn from(picture: Picture) -> Self {
-        let (output, mode, largest) = match picture.output {
+        let (output, mode, scale_max) = match picture.output {
             Output::Color => (v1::Output::Colour, 0, 0.0),
             Output::Depth => (v1::Output::Depth, 0, 0.0),
             Output::Domains => (v1::Output::Domains, 0, 0.0),
             Output::Normals => (v1::Output::Normals, 0, 0.0),
-            Output::Displacement { largest } => (v1::Output::Displacement, 0, largest),
-            Output::ModeShape { mode, largest } => (v1::Output::ModeShape, mode, largest),
+            Output::Displacement { scale_max } => (v1::Output::Displacement, 0, scale_max),
+            Output::ModeShape { mode, scale_max } => (v1::Output::ModeShape, mode, scale_max),
         };
         // Depth, domains and normals have a single format each, which the server chooses.
         let format = match (picture.output, picture.format) {
@@ -255,7 +260,7 @@ impl From<Picture> for v1::Picture {
         };
         let camera = picture.camera.map(Into::into);
         let (width, height) = (picture.width, picture.height);
-        Self { width, height, format: format.into(), camera, output: output.into(), mode, largest }
+        Self { width, height, format: format.into(), camera, output: output.into(), mode, largest: scale_max }
     }
 }
 

@@ -16,7 +16,7 @@ mod step_stream;
 mod upload;
 mod vertices;
 
-pub use client::{Client, REPLY_LIMIT, ServerInfo};
+pub use client::{Client, REPLY_LIMIT, SceneList, ServerInfo};
 pub use error::{Error, Rejection, Result};
 pub use frames::{
     Camera, DrawnBy, Frame, FrameFormat, FrameRequest, FrameStream, FrameStreamRequest, Lens, Output, Picture, View,
@@ -25,7 +25,7 @@ pub use modalcast_proto::v1;
 pub use modalcast_proto::v1::{SceneInfo, StepId};
 pub use pick::{Hit, PickRectangle, PickRequest, PickResult};
 pub use request::{Delivery, StepRequest, StepSelector, Subscription};
-pub use scene::{Array, Attachment, Domain, ModeRows, SceneDescription};
+pub use scene::{Attachment, Domain, DomainArray, ModeRows, SceneDescription};
 pub use stages::{StageSamples, StageTimes};
 pub use step::{DomainTransform, Step};
 pub use step_stream::{Ack, Policy, StepStream, StreamSummary};

@@ -1,5 +1,5 @@
-//! Writes NumPy files of f32 rows incrementally. The header reserves space for the largest number of rows and is
-//! rewritten when the number is known.
+//! Writes NumPy files of f32 rows incrementally. The header has space for the largest number of rows. `finish` rewrites
+//! it with the final number.
 
 use std::fs::File;
 use std::io::{BufWriter, Seek as _, SeekFrom, Write as _};
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
 
-/// The start of a file of format version 1.0, which stores the length of the rest of the header as u16.
+/// The start of a file of format version 1.0. The length of the rest of the header follows as u16.
 const MAGIC: &[u8] = b"\x93NUMPY\x01\x00";
 
 /// The format pads the header with spaces and a newline, so that the data starts at a multiple of 64 bytes.
@@ -17,9 +17,11 @@ const ALIGNMENT: usize = 64;
 pub struct Writer {
     path: PathBuf,
     file: BufWriter<File>,
+    /// Shape of one row.
     shape: Vec<usize>,
+    /// Size of the whole header.
     header_bytes: usize,
-    rows: u64,
+    row_count: u64,
 }
 
 impl Writer {
@@ -28,85 +30,88 @@ impl Writer {
     /// # Errors
     /// `File` if it cannot be written, or if the shape has so many axes that it exceeds the header of version 1.0.
     pub fn create(path: &Path, shape: &[usize]) -> Result<Self> {
-        let header_bytes = header_bytes(shape);
+        let header_bytes = compute_header_bytes(shape);
         if header_bytes - MAGIC.len() - 2 > usize::from(u16::MAX) {
             let reason = format!("expected a shape that fits a NumPy 1.0 header, got {} axes", shape.len());
             return Err(Error::file(path, reason));
         }
-        let file = File::create(path).map_err(|fault| Error::file(path, fault))?;
+        let file = File::create(path).map_err(|error| Error::file(path, error))?;
         let (path, file) = (path.to_owned(), BufWriter::new(file));
-        let mut writer = Self { path, file, shape: shape.to_vec(), header_bytes, rows: 0 };
-        writer.put_header()?;
+        let mut writer = Self { path, file, shape: shape.to_vec(), header_bytes, row_count: 0 };
+        writer.write_header()?;
         Ok(writer)
     }
 
-    /// Adds one row.
+    /// Writes one row.
     ///
     /// # Errors
     /// `File` if its length does not match the shape, or if it cannot be written.
-    pub fn row(&mut self, numbers: &[f32]) -> Result<()> {
+    pub fn write_row(&mut self, numbers: &[f32]) -> Result<()> {
         let expected: usize = self.shape.iter().product();
         if numbers.len() != expected {
             let reason = format!("expected rows of {expected} numbers, got {}", numbers.len());
             return Err(Error::file(&self.path, reason));
         }
-        self.rows += 1;
-        self.put(bytemuck::cast_slice(numbers))
+        self.row_count += 1;
+        self.write_bytes(bytemuck::cast_slice(numbers))
     }
 
-    /// Writes the number of rows into the header and closes the file.
+    /// Writes the number of rows into the header, closes the file and returns the number.
     ///
     /// # Errors
     /// `File` if it cannot be written.
     pub fn finish(mut self) -> Result<u64> {
-        self.file.seek(SeekFrom::Start(0)).map_err(|fault| Error::file(&self.path, fault))?;
-        self.put_header()?;
-        self.file.flush().map_err(|fault| Error::file(&self.path, fault))?;
-        Ok(self.rows)
+        self.file.seek(SeekFrom::Start(0)).map_err(|error| Error::file(&self.path, error))?;
+        self.write_header()?;
+        self.file.flush().map_err(|error| Error::file(&self.path, error))?;
+        Ok(self.row_count)
     }
 
-    /// Writes magic, version, length, dictionary, padding and newline: `header_bytes` bytes for every number of rows.
-    fn put_header(&mut self) -> Result<()> {
+    /// Writes magic, version, length, dictionary, padding and newline. The size is `header_bytes` for every number of
+    /// rows.
+    fn write_header(&mut self) -> Result<()> {
         let length = self.header_bytes - MAGIC.len() - 2;
         let mut header = MAGIC.to_vec();
         header.extend((length as u16).to_le_bytes());
-        header.extend(dictionary(self.rows, &self.shape).into_bytes());
+        header.extend(format_dictionary(self.row_count, &self.shape).into_bytes());
         header.resize(self.header_bytes - 1, b' ');
         header.push(b'\n');
-        self.put(&header)
+        self.write_bytes(&header)
     }
 
-    fn put(&mut self, bytes: &[u8]) -> Result<()> {
-        self.file.write_all(bytes).map_err(|fault| Error::file(&self.path, fault))
+    fn write_bytes(&mut self, bytes: &[u8]) -> Result<()> {
+        self.file.write_all(bytes).map_err(|error| Error::file(&self.path, error))
     }
 }
 
 /// Size of the header with the largest number of rows; at least 128 bytes.
-fn header_bytes(shape: &[usize]) -> usize {
-    let bytes = MAGIC.len() + 2 + dictionary(u64::MAX, shape).len() + 1;
+fn compute_header_bytes(shape: &[usize]) -> usize {
+    let bytes = MAGIC.len() + 2 + format_dictionary(u64::MAX, shape).len() + 1;
     bytes.next_multiple_of(ALIGNMENT).max(2 * ALIGNMENT)
 }
 
-fn dictionary(rows: u64, shape: &[usize]) -> String {
+/// The Python dictionary in the header.
+fn format_dictionary(row_count: u64, shape: &[usize]) -> String {
     let shape: String = shape.iter().map(|size| format!(" {size},")).collect();
-    format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({rows},{shape}), }}")
+    format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({row_count},{shape}), }}")
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn written(shape: &[usize], rows: &[&[f32]]) -> Vec<u8> {
-        let folder = tempfile::tempdir().expect("folder");
+    /// Writes a file and returns its bytes.
+    fn write_file(shape: &[usize], rows: &[&[f32]]) -> Vec<u8> {
+        let folder = tempfile::tempdir().expect("a temporary folder");
         let path = folder.path().join("rows.npy");
-        let mut writer = Writer::create(&path, shape).expect("creates");
-        rows.iter().for_each(|row| writer.row(row).expect("fits"));
-        assert_eq!(writer.finish().expect("closes"), rows.len() as u64);
-        std::fs::read(&path).expect("reads")
+        let mut writer = Writer::create(&path, shape).expect("a new file");
+        rows.iter().for_each(|row| writer.write_row(row).expect("a row of the right length"));
+        assert_eq!(writer.finish().expect("a complete file"), rows.len() as u64);
+        std::fs::read(&path).expect("a readable file")
     }
 
     /// Splits a file into the text of its header and its data by the length that the header states.
-    fn parsed(file: &[u8]) -> (&str, &[u8]) {
+    fn split_file(file: &[u8]) -> (&str, &[u8]) {
         let length = usize::from(u16::from_le_bytes([file[8], file[9]]));
         let (header, data) = file.split_at(10 + length);
         assert_eq!((&header[..8], header.len() % ALIGNMENT, header.last()), (MAGIC, 0, Some(&b'\n')));
@@ -116,8 +121,8 @@ mod tests {
     #[test]
     fn file_has_row_count_and_numbers() {
         let row = [1.0, 2.0, 3.0, 4.0, 5.0, -6.0];
-        let file = written(&[2, 3], &[&row, &row]);
-        let (text, data) = parsed(&file);
+        let file = write_file(&[2, 3], &[&row, &row]);
+        let (text, data) = split_file(&file);
         assert_eq!((file.len(), data), (128 + 48, bytemuck::cast_slice(&[row, row].concat())));
         assert!(text.contains("'shape': (2, 2, 3,)") && text.contains("'<f4'"), "{text}");
     }
@@ -125,22 +130,22 @@ mod tests {
     #[test]
     fn long_header_does_not_overwrite_the_data() {
         let shape = [vec![1; 30], vec![2]].concat();
-        let file = written(&shape, &[&[1.5, -2.5]]);
-        let (text, data) = parsed(&file);
-        assert!(text.trim_end().len() > 117, "the header is short: {text}");
+        let file = write_file(&shape, &[&[1.5, -2.5]]);
+        let (text, data) = split_file(&file);
+        assert!(text.trim_end().len() > 117, "expected a header of more than 128 bytes, got: {text}");
         assert_eq!(data, bytemuck::cast_slice(&[1.5_f32, -2.5]));
-        assert!(text.starts_with(&dictionary(1, &shape)), "{text}");
-        for rows in [0, 9, 10, u64::MAX] {
-            assert!(10 + dictionary(rows, &shape).len() < header_bytes(&shape));
+        assert!(text.starts_with(&format_dictionary(1, &shape)), "{text}");
+        for row_count in [0, 9, 10, u64::MAX] {
+            assert!(10 + format_dictionary(row_count, &shape).len() < compute_header_bytes(&shape));
         }
     }
 
     #[test]
-    fn row_of_another_length_and_too_many_axes_are_refused() {
-        let folder = tempfile::tempdir().expect("folder");
+    fn row_of_another_length_and_too_many_axes_are_rejected() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
         let path = folder.path().join("rows.npy");
-        assert!(Writer::create(&path, &[2, 3]).expect("creates").row(&[0.0; 5]).is_err());
-        let refusal = Writer::create(&path, &[1; 30_000]).err().expect("refused").to_string();
-        assert!(refusal.contains("30000 axes"), "{refusal}");
+        assert!(Writer::create(&path, &[2, 3]).expect("a new file").write_row(&[0.0; 5]).is_err());
+        let error = Writer::create(&path, &[1; 30_000]).err().expect("an error").to_string();
+        assert!(error.contains("30000 axes"), "{error}");
     }
 }

@@ -1,4 +1,5 @@
-//! Picking: the surface point at a pixel of a picture, and the rows of U that map a force at that point to the modes.
+//! Picking: the surface point at a pixel of a picture, and U interpolated at that point, which projects a force there
+//! onto the modes.
 
 use modalcast_proto::v1;
 use v1::frame_service_client::FrameServiceClient;
@@ -10,6 +11,9 @@ use crate::frames::Picture;
 use crate::request::StepRequest;
 use crate::stages::{self, StageTimes};
 
+/// Maximum number of hits of a reply: the server accepts at most 64 x 64 pixels. It bounds memory if a stream never ends.
+const MAX_HITS: usize = 64 * 64;
+
 /// A request for the surface points in a small rectangle of a picture.
 pub type PickRequest = StepRequest<PickRectangle>;
 
@@ -18,19 +22,22 @@ pub type PickRequest = StepRequest<PickRectangle>;
 pub struct PickRectangle {
     /// Size and camera of the picture to which the pixel coordinates refer.
     pub picture: Picture,
-    /// The top left pixel; (0, 0) is the top left pixel of the picture.
+    /// Column of the top left pixel of the rectangle, from the left of the picture.
     pub x: u32,
+    /// Row of the top left pixel of the rectangle, from the top of the picture.
     pub y: u32,
+    /// In pixels.
     pub width: u32,
+    /// In pixels.
     pub height: u32,
-    /// Omits [`Hit::modes`].
-    pub without_modes: bool,
+    /// Whether the reply omits [`Hit::modes`].
+    pub omit_modes: bool,
 }
 
 impl PickRectangle {
     /// One pixel of a picture, with [`Hit::modes`].
     pub const fn pixel(picture: Picture, x: u32, y: u32) -> Self {
-        Self { picture, x, y, width: 1, height: 1, without_modes: false }
+        Self { picture, x, y, width: 1, height: 1, omit_modes: false }
     }
 
     /// Sets the size in pixels.
@@ -52,8 +59,10 @@ pub struct PickResult {
 /// The surface at the center of a pixel; `frames.proto` documents each field.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hit {
+    /// Column and row in the picture.
     pub pixel: [u32; 2],
     pub domain: u32,
+    /// Index of the triangle in its domain.
     pub triangle: u32,
     /// Vertex indices; vertex v has the rows 3v, 3v + 1 and 3v + 2 of U.
     pub vertices: [u32; 3],
@@ -75,11 +84,13 @@ pub struct Hit {
 impl Hit {
     /// The reduced force f_q = U^T A^T f of a force f at the point, in world axes. Empty without modes.
     pub fn reduced_force(&self, force: [f64; 3]) -> Vec<f64> {
-        let turned: [f64; 3] =
+        let local_force: [f64; 3] =
             std::array::from_fn(|row| (0..3).map(|axis| f64::from(self.linear[3 * axis + row]) * force[axis]).sum());
-        let rank = self.modes.len() / 3;
-        let entry = |mode: usize| (0..3).map(|row| f64::from(self.modes[row * rank + mode]) * turned[row]).sum();
-        (0..rank).map(entry).collect()
+        // `modes` is a public field, so take the number of columns from its length rather than from `rank`.
+        let column_count = self.modes.len() / 3;
+        let component =
+            |mode: usize| (0..3).map(|row| f64::from(self.modes[row * column_count + mode]) * local_force[row]).sum();
+        (0..column_count).map(component).collect()
     }
 }
 
@@ -88,10 +99,10 @@ impl Client {
     ///
     /// # Errors
     /// `Status` if the scene or the step does not exist, the rectangle is outside the picture, or the deadline passed;
-    /// `Malformed`; `Connect`.
+    /// `Malformed` if the reply contradicts itself; `Connect` if the connection is lost.
     pub async fn pick(&self, request: &PickRequest) -> Result<PickResult> {
         use v1::pick_request::Step;
-        let PickRectangle { picture, x, y, width, height, without_modes } = request.query;
+        let PickRectangle { picture, x, y, width, height, omit_modes } = request.query;
         let wire = v1::PickRequest {
             scene: request.scene.clone(),
             picture: Some(picture.into()),
@@ -101,7 +112,7 @@ impl Client {
             y,
             width,
             height,
-            without_modes,
+            without_modes: omit_modes,
         };
         let mut messages = self.replies(FrameServiceClient::new(self.channel.clone()).pick(wire).await)?;
         let mut head = None;
@@ -109,11 +120,10 @@ impl Client {
         while let Some(response) = messages.next().await? {
             head = head.or(response.head);
             for wire in response.hits {
-                hits.push(hit(wire)?);
+                hits.push(decode_hit(wire)?);
             }
-            // The server's limit. It bounds memory if a stream never ends.
-            if hits.len() > 64 * 64 {
-                return Err(malformed_reply("pick.hits", "at most 4096", hits.len()));
+            if hits.len() > MAX_HITS {
+                return Err(malformed_reply("pick.hits", format!("at most {MAX_HITS}"), hits.len()));
             }
         }
         let head = head.ok_or_else(|| malformed_reply("pick.head", "a head", "none"))?;
@@ -125,27 +135,27 @@ impl Client {
     }
 }
 
-fn hit(wire: v1::Hit) -> Result<Hit> {
-    let whole = 12 * wire.rank as usize;
-    if !wire.modes.is_empty() && wire.modes.len() != whole {
-        return Err(malformed_reply("hit.modes", format!("none or {whole} bytes"), wire.modes.len()));
+fn decode_hit(wire: v1::Hit) -> Result<Hit> {
+    let mode_bytes = 12 * wire.rank as usize;
+    if !wire.modes.is_empty() && wire.modes.len() != mode_bytes {
+        return Err(malformed_reply("hit.modes", format!("none or {mode_bytes} bytes"), wire.modes.len()));
     }
     Ok(Hit {
         pixel: [wire.x, wire.y],
         domain: wire.domain,
         triangle: wire.triangle,
-        vertices: exactly("hit.vertices", wire.vertices)?,
-        barycentric: exactly("hit.barycentric", wire.barycentric)?,
-        position: exactly("hit.position", wire.position)?,
-        normal: exactly("hit.normal", wire.normal)?,
+        vertices: to_array("hit.vertices", wire.vertices)?,
+        barycentric: to_array("hit.barycentric", wire.barycentric)?,
+        position: to_array("hit.position", wire.position)?,
+        normal: to_array("hit.normal", wire.normal)?,
         depth: wire.depth,
-        linear: exactly("hit.linear", wire.linear)?,
+        linear: to_array("hit.linear", wire.linear)?,
         rank: wire.rank as usize,
         modes: decode("hit.modes", &wire.modes)?,
     })
 }
 
-fn exactly<T, const N: usize>(field: &str, list: Vec<T>) -> Result<[T; N]> {
+fn to_array<T, const N: usize>(field: &str, list: Vec<T>) -> Result<[T; N]> {
     list.try_into().map_err(|list: Vec<T>| malformed_reply(field, format!("{N} numbers"), list.len()))
 }
 
@@ -153,7 +163,7 @@ fn exactly<T, const N: usize>(field: &str, list: Vec<T>) -> Result<[T; N]> {
 mod tests {
     use super::*;
 
-    fn wire() -> v1::Hit {
+    fn wire_hit() -> v1::Hit {
         v1::Hit {
             vertices: vec![1, 2, 3],
             barycentric: vec![0.5, 0.25, 0.25],
@@ -168,23 +178,27 @@ mod tests {
 
     #[test]
     fn reduced_force_is_projected_onto_the_modes() {
-        let hit = hit(wire()).expect("fits");
+        let hit = decode_hit(wire_hit()).expect("a valid hit");
         // A^T f = (2 f_y, -2 f_x, f_z), and the columns of U are (1, 3, 5) and (2, 4, 6).
         assert_eq!(hit.reduced_force([1.0, 0.0, 0.0]), [-6.0, -8.0]);
         assert_eq!(hit.reduced_force([0.0, 1.0, 10.0]), [52.0, 64.0]);
-        let bare = super::hit(v1::Hit { modes: bytes::Bytes::new(), ..wire() }).expect("fits");
-        assert!(bare.reduced_force([1.0; 3]).is_empty());
     }
 
     #[test]
-    fn malformed_hits_are_refused_by_field() {
-        for (wrong, field) in [
-            (v1::Hit { rank: 3, ..wire() }, "hit.modes"),
-            (v1::Hit { vertices: vec![1], ..wire() }, "hit.vertices"),
-            (v1::Hit { linear: vec![1.0; 8], ..wire() }, "hit.linear"),
+    fn reduced_force_is_empty_without_modes() {
+        let hit = decode_hit(v1::Hit { modes: bytes::Bytes::new(), ..wire_hit() }).expect("a valid hit");
+        assert!(hit.reduced_force([1.0; 3]).is_empty());
+    }
+
+    #[test]
+    fn malformed_hits_report_their_field() {
+        for (wire, field) in [
+            (v1::Hit { rank: 3, ..wire_hit() }, "hit.modes"),
+            (v1::Hit { vertices: vec![1], ..wire_hit() }, "hit.vertices"),
+            (v1::Hit { linear: vec![1.0; 8], ..wire_hit() }, "hit.linear"),
         ] {
-            let refusal = hit(wrong).expect_err(field).to_string();
-            assert!(refusal.contains(field), "{refusal}");
+            let error = decode_hit(wire).expect_err(field).to_string();
+            assert!(error.contains(field), "{error}");
         }
     }
 }

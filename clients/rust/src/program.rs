@@ -1,4 +1,4 @@
-//! Shared parts of the programs `modalcast-fetch` and `modalcast-sim`: the start and the exit codes.
+//! Entry point and exit codes that the programs `modalcast-fetch` and `modalcast-sim` share.
 
 use std::fmt::Display;
 use std::process::ExitCode;
@@ -17,8 +17,8 @@ pub fn run<E: Display>(
 ) -> ExitCode {
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,
-        Err(fault) => {
-            eprintln!("{name}: no runtime: {fault}");
+        Err(error) => {
+            eprintln!("{name}: cannot start the async runtime: {error}");
             return ExitCode::from(LOCAL_ERROR);
         }
     };
@@ -29,8 +29,8 @@ pub fn run<E: Display>(
     ExitCode::from(code)
 }
 
-/// The exit code of an error of the client, as the help texts document it: 1 refused by the server, 3 no connection, 4
-/// local file, 5 malformed, incomplete or late reply.
+/// The exit code of an error of the client, as the help texts document it: 1 rejected by the server, 3 connection failed
+/// or lost, 4 local file error, 5 malformed, truncated or late reply.
 pub const fn exit_code(error: &Error) -> u8 {
     match error {
         Error::Connect { .. } | Error::Status { code: tonic::Code::Unavailable, .. } => 3,

@@ -1,5 +1,5 @@
-//! Requests for one step of a scene and subscriptions to all of them. [`StepRequest`] is the one builder of frame,
-//! vertex and pick requests.
+//! Requests for one step of a scene, and subscriptions to all steps. [`StepRequest`] builds the frame, vertex and pick
+//! requests.
 
 use modalcast_proto::v1;
 
@@ -9,7 +9,7 @@ pub enum StepSelector {
     /// The newest state; the rest state before the first step.
     #[default]
     Current,
-    /// Exactly this step of the current run. The server refuses a step that it no longer has.
+    /// Exactly this step of the current run. The server rejects a step that it no longer has.
     Exact(u64),
     /// This step of the current run or a later one.
     Minimum(u64),
@@ -43,9 +43,9 @@ impl<Q> StepRequest<Q> {
         Self { scene: scene.to_owned(), query, step: StepSelector::Current, deadline_ms: 0 }
     }
 
-    /// Selects the step.
+    /// Sets [`Self::step`].
     #[must_use]
-    pub fn at(mut self, step: StepSelector) -> Self {
+    pub fn step(mut self, step: StepSelector) -> Self {
         self.step = step;
         self
     }
@@ -53,13 +53,13 @@ impl<Q> StepRequest<Q> {
     /// Selects [`StepSelector::Exact`].
     #[must_use]
     pub fn exact_step(self, step: u64) -> Self {
-        self.at(StepSelector::Exact(step))
+        self.step(StepSelector::Exact(step))
     }
 
     /// Selects [`StepSelector::Minimum`].
     #[must_use]
     pub fn minimum_step(self, step: u64) -> Self {
-        self.at(StepSelector::Minimum(step))
+        self.step(StepSelector::Minimum(step))
     }
 
     /// Sets [`Self::deadline_ms`].
@@ -107,7 +107,7 @@ pub enum Delivery {
     /// Every step, in order; back-pressure from a slow reader slows the writer.
     #[default]
     Lossless,
-    /// The newest step; skipped steps are counted.
+    /// The newest step. Each reply states the number of skipped steps.
     Latest,
 }
 
@@ -125,17 +125,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn selected_step_becomes_the_variant_of_each_message() {
+    fn step_selector_converts_to_the_variants_of_each_message() {
         use v1::{get_vertices_request, render_frame_request};
         let request = StepRequest::new("toy", ()).minimum_step(3).exact_step(7).deadline_ms(20);
         assert_eq!((request.step, request.deadline_ms), (StepSelector::Exact(7), 20));
-        let frame = |step: StepSelector| {
+        let frame_step = |step: StepSelector| {
             step.to_wire(render_frame_request::Step::ExactStep, render_frame_request::Step::MinimumStep)
         };
-        assert_eq!(frame(request.step), Some(render_frame_request::Step::ExactStep(7)));
-        assert_eq!(frame(StepSelector::Current), None);
-        let minimum = StepSelector::Minimum(4);
-        let vertices = minimum.to_wire(get_vertices_request::Step::ExactStep, get_vertices_request::Step::MinimumStep);
-        assert_eq!(vertices, Some(get_vertices_request::Step::MinimumStep(4)));
+        assert_eq!(frame_step(request.step), Some(render_frame_request::Step::ExactStep(7)));
+        assert_eq!(frame_step(StepSelector::Current), None);
+        let selector = StepSelector::Minimum(4);
+        let step = selector.to_wire(get_vertices_request::Step::ExactStep, get_vertices_request::Step::MinimumStep);
+        assert_eq!(step, Some(get_vertices_request::Step::MinimumStep(4)));
     }
 }

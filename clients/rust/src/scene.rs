@@ -9,17 +9,17 @@ use crate::assemble::{Assembler, Chunk, decode};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed_reply};
 
-/// The arrays that [`Client::describe`] can fetch.
-pub use modalcast_proto::v1::Array;
+/// The arrays of a domain that [`Client::describe`] can fetch.
+pub use modalcast_proto::v1::Array as DomainArray;
 
 /// The attachment of a domain to its parent.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Attachment {
     pub parent: usize,
     /// `parent_from_child` at rest, row-major 3x4.
-    pub frame: [f32; 12],
-    /// Vertices of the parent that carry the frame; empty on a rigid parent.
-    pub rows: Vec<u32>,
+    pub parent_from_child: [f32; 12],
+    /// Vertices of the parent whose displacement moves the child; empty on a rigid parent.
+    pub parent_vertices: Vec<u32>,
 }
 
 /// One domain: n vertices, r modes, and the requested arrays (the others are empty).
@@ -27,12 +27,12 @@ pub struct Attachment {
 pub struct Domain {
     pub index: usize,
     pub name: String,
-    /// n: U has 3n rows.
-    pub vertices: usize,
-    /// r: U has r columns.
+    /// n, the number of vertices: U has 3n rows.
+    pub vertex_count: usize,
+    /// r, the number of modes: U has r columns.
     pub rank: usize,
-    pub corners: usize,
-    pub triangles: usize,
+    pub corner_count: usize,
+    pub triangle_count: usize,
     pub attachment: Option<Attachment>,
     /// `world_from_domain` at rest, row-major 3x4.
     pub placement: [f32; 12],
@@ -42,16 +42,17 @@ pub struct Domain {
     pub shape: usize,
     /// (rad/s)^2, one per mode; empty when unknown.
     pub eigenvalues: Vec<f64>,
+    /// Free-form metadata of the scene's author, by name.
     pub notes: BTreeMap<String, String>,
     /// Corner indices, three per triangle.
     pub indices: Vec<u32>,
-    /// Vertex of each corner: rows 3v, 3v + 1, 3v + 2 of U.
+    /// Vertex of each corner. Vertex v has the rows 3v, 3v + 1 and 3v + 2 of U.
     pub corner_vertices: Vec<u32>,
-    /// Three per vertex.
+    /// Three numbers per vertex, in the frame of the domain.
     pub rest_positions: Vec<f32>,
-    /// Two per corner.
+    /// Texture coordinates, two per corner.
     pub uvs: Vec<f32>,
-    /// Three per corner.
+    /// Three numbers per corner, in the frame of the domain.
     pub rest_normals: Vec<f32>,
 }
 
@@ -66,6 +67,7 @@ pub struct SceneDescription {
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModeRows {
     pub rank: usize,
+    /// 3 x r entries per requested vertex, row-major.
     pub rows: Vec<f32>,
 }
 
@@ -79,11 +81,11 @@ impl ModeRows {
 }
 
 impl Client {
-    /// Describes all domains of a scene, with the requested arrays.
+    /// Gets the description of all domains of a scene, with the requested arrays.
     ///
     /// # Errors
     /// `Status` if the scene does not exist; `Malformed` if lengths and counts contradict each other.
-    pub async fn describe(&self, scene: &str, arrays: &[Array]) -> Result<SceneDescription> {
+    pub async fn describe(&self, scene: &str, arrays: &[DomainArray]) -> Result<SceneDescription> {
         self.describe_domains(scene, &[], arrays).await
     }
 
@@ -91,131 +93,164 @@ impl Client {
     ///
     /// # Errors
     /// As [`Self::describe`].
-    pub async fn describe_domains(&self, scene: &str, domains: &[u32], arrays: &[Array]) -> Result<SceneDescription> {
+    pub async fn describe_domains(
+        &self,
+        scene: &str,
+        domains: &[u32],
+        arrays: &[DomainArray],
+    ) -> Result<SceneDescription> {
         let request = v1::DescribeSceneRequest {
             scene: scene.to_owned(),
             domains: domains.to_vec(),
             arrays: arrays.iter().map(|array| *array as i32).collect(),
         };
         let mut messages = self.replies(self.scenes().describe_scene(request).await)?;
-        let mut collected = DescriptionBuilder::new(self.reply_limit);
+        let mut builder = DescriptionBuilder::new(self.reply_limit);
         while let Some(message) = messages.next().await? {
-            collected.add(message)?;
+            builder.add_message(message)?;
         }
-        collected.finish(arrays)
+        builder.finish(arrays)
     }
 
-    /// The rows of U of selected vertices of a domain; an empty list selects all.
+    /// Gets the rows of U of selected vertices of a domain; an empty list selects all.
     ///
     /// # Errors
     /// `Status` if the scene, the domain or a vertex does not exist; `Malformed` if the reply does not have 3 r
     /// numbers per vertex.
-    pub async fn modes(&self, scene: &str, domain: usize, vertices: &[u32]) -> Result<ModeRows> {
-        let domain = u32::try_from(domain).map_err(|_| malformed_reply("modes.domain", "a 32-bit index", domain))?;
+    pub async fn read_modes(&self, scene: &str, domain: usize, vertices: &[u32]) -> Result<ModeRows> {
+        // No server has a domain with the index u32::MAX, so that it answers with a `Status`.
+        let domain = u32::try_from(domain).unwrap_or(u32::MAX);
         let request = v1::ReadModesRequest { scene: scene.to_owned(), domain, vertices: vertices.to_vec() };
         let mut messages = self.replies(self.scenes().read_modes(request).await)?;
         let mut assembler = Assembler::new("modes", self.reply_limit);
-        let mut whole = None;
+        let mut complete_reply = None;
         while let Some(message) = messages.next().await? {
             let head = (!assembler.is_open()).then_some((message.rank, message.total));
-            let done = assembler.push(Chunk { head, offset: message.offset, data: message.data })?;
-            whole = done.or(whole);
+            let reply = assembler.push(Chunk { head, offset: message.offset, data: message.data })?;
+            complete_reply = reply.or(complete_reply);
         }
         if assembler.is_open() {
             return Err(Error::StreamEnded { what: "the last chunk of the modes" });
         }
         // A rigid domain has no rows; a server may answer without any message.
-        let (rank, bytes) = whole.unwrap_or((0, Bytes::new()));
-        let per_vertex = 12 * u64::from(rank);
-        let expected = per_vertex.saturating_mul(vertices.len() as u64);
-        if !vertices.is_empty() && bytes.len() as u64 != expected {
-            return Err(malformed_reply("modes.total", format!("{expected} bytes"), bytes.len()));
+        let (rank, bytes) = complete_reply.unwrap_or((0, Bytes::new()));
+        let vertex_bytes = 12 * u64::from(rank);
+        let expected_bytes = vertex_bytes.saturating_mul(vertices.len() as u64);
+        if !vertices.is_empty() && bytes.len() as u64 != expected_bytes {
+            return Err(malformed_reply("modes.total", format!("{expected_bytes} bytes"), bytes.len()));
         }
-        if !(bytes.len() as u64).is_multiple_of(per_vertex) {
-            return Err(malformed_reply("modes.total", format!("a multiple of {per_vertex} bytes"), bytes.len()));
+        if !(bytes.len() as u64).is_multiple_of(vertex_bytes) {
+            return Err(malformed_reply("modes.total", format!("a multiple of {vertex_bytes} bytes"), bytes.len()));
         }
         Ok(ModeRows { rank: rank as usize, rows: decode("modes.data", &bytes)? })
     }
 }
 
-/// The parts of a description received so far.
+/// Identifies an array of a description.
+#[derive(Clone, Copy, PartialEq)]
+struct ArrayKey {
+    domain: u32,
+    /// A value of [`DomainArray`], or an unknown number.
+    array: i32,
+}
+
+impl std::fmt::Display for ArrayKey {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match DomainArray::try_from(self.array) {
+            Ok(array) => write!(out, "{} of domain {}", array.as_str_name(), self.domain),
+            Err(_) => write!(out, "array {} of domain {}", self.array, self.domain),
+        }
+    }
+}
+
+/// An array whose last chunk has not been received.
+struct PartialArray {
+    key: ArrayKey,
+    assembler: Assembler<()>,
+}
+
+/// Assembles a description from its messages.
 struct DescriptionBuilder {
+    /// Maximum size of all arrays together, in bytes.
     limit: u64,
-    kept: u64,
+    received_bytes: u64,
     info: Option<v1::SceneInfo>,
     domains: Vec<Domain>,
-    places: BTreeMap<u32, usize>,
-    open: Option<((u32, i32), Assembler<()>)>,
+    /// From a domain's index in the scene to its index in `domains`.
+    domain_positions: BTreeMap<u32, usize>,
+    partial_array: Option<PartialArray>,
 }
 
 impl DescriptionBuilder {
     const fn new(limit: u64) -> Self {
-        Self { limit, kept: 0, info: None, domains: vec![], places: BTreeMap::new(), open: None }
+        let domain_positions = BTreeMap::new();
+        Self { limit, received_bytes: 0, info: None, domains: vec![], domain_positions, partial_array: None }
     }
 
-    fn add(&mut self, message: v1::DescribeSceneResponse) -> Result<()> {
+    fn add_message(&mut self, message: v1::DescribeSceneResponse) -> Result<()> {
         use v1::describe_scene_response::Part;
         match message.part {
             Some(Part::Scene(info)) => self.info = Some(info),
             Some(Part::Domains(list)) => {
                 for wire in list.domains {
-                    self.places.insert(wire.domain, self.domains.len());
-                    self.domains.push(domain(wire)?);
+                    self.domain_positions.insert(wire.domain, self.domains.len());
+                    self.domains.push(decode_domain(wire)?);
                 }
             }
-            Some(Part::Chunk(chunk)) => self.chunk(chunk)?,
+            Some(Part::Chunk(chunk)) => self.add_chunk(chunk)?,
             None => return Err(malformed_reply("describe.part", "a part", "none")),
         }
         Ok(())
     }
 
     /// Adds a chunk of an array. The chunks of one array are consecutive.
-    fn chunk(&mut self, chunk: v1::ArrayChunk) -> Result<()> {
-        let key = (chunk.domain, chunk.array);
-        let mut assembler = match self.open.take() {
-            Some((open, assembler)) if open == key => assembler,
-            Some((open, _)) => {
-                return Err(malformed_reply("describe.chunk", format!("the rest of {open:?}"), format!("{key:?}")));
+    fn add_chunk(&mut self, chunk: v1::ArrayChunk) -> Result<()> {
+        let key = ArrayKey { domain: chunk.domain, array: chunk.array };
+        let mut assembler = match self.partial_array.take() {
+            Some(partial) if partial.key == key => partial.assembler,
+            Some(partial) => {
+                return Err(malformed_reply("describe.chunk", format!("the next chunk of {}", partial.key), key));
             }
             None => Assembler::new("describe.chunk", self.limit),
         };
         let head = (!assembler.is_open()).then_some(((), chunk.total));
         match assembler.push(Chunk { head, offset: chunk.offset, data: chunk.data })? {
-            None => self.open = Some((key, assembler)),
-            Some(((), bytes)) => self.store(key, &bytes)?,
+            None => self.partial_array = Some(PartialArray { key, assembler }),
+            Some(((), bytes)) => self.store_array(key, &bytes)?,
         }
         Ok(())
     }
 
-    fn store(&mut self, (index, array): (u32, i32), bytes: &[u8]) -> Result<()> {
+    fn store_array(&mut self, key: ArrayKey, bytes: &[u8]) -> Result<()> {
         const FIELD: &str = "describe.chunk.data";
-        self.kept = self.kept.saturating_add(bytes.len() as u64);
-        if self.kept > self.limit {
-            return Err(malformed_reply("describe.chunk", format!("at most {} bytes in all", self.limit), self.kept));
+        self.received_bytes = self.received_bytes.saturating_add(bytes.len() as u64);
+        if self.received_bytes > self.limit {
+            let expected = format!("at most {} bytes of arrays", self.limit);
+            return Err(malformed_reply("describe.chunk", expected, self.received_bytes));
         }
-        let place = self.places.get(&index).and_then(|place| self.domains.get_mut(*place));
-        let Some(domain) = place else {
-            return Err(malformed_reply("describe.chunk.domain", "a domain described before", index));
+        let position = self.domain_positions.get(&key.domain);
+        let Some(domain) = position.and_then(|position| self.domains.get_mut(*position)) else {
+            return Err(malformed_reply("describe.chunk.domain", "a domain described before", key.domain));
         };
-        match Array::try_from(array) {
-            Ok(Array::Indices) => domain.indices = decode(FIELD, bytes)?,
-            Ok(Array::CornerVertices) => domain.corner_vertices = decode(FIELD, bytes)?,
-            Ok(Array::RestPositions) => domain.rest_positions = decode(FIELD, bytes)?,
-            Ok(Array::Uvs) => domain.uvs = decode(FIELD, bytes)?,
-            Ok(Array::RestNormals) => domain.rest_normals = decode(FIELD, bytes)?,
-            _ => return Err(malformed_reply("describe.chunk.array", "a known array", array)),
+        match DomainArray::try_from(key.array) {
+            Ok(DomainArray::Indices) => domain.indices = decode(FIELD, bytes)?,
+            Ok(DomainArray::CornerVertices) => domain.corner_vertices = decode(FIELD, bytes)?,
+            Ok(DomainArray::RestPositions) => domain.rest_positions = decode(FIELD, bytes)?,
+            Ok(DomainArray::Uvs) => domain.uvs = decode(FIELD, bytes)?,
+            Ok(DomainArray::RestNormals) => domain.rest_normals = decode(FIELD, bytes)?,
+            _ => return Err(malformed_reply("describe.chunk.array", "a known array", key.array)),
         }
         Ok(())
     }
 
-    fn finish(self, arrays: &[Array]) -> Result<SceneDescription> {
-        if self.open.is_some() {
+    fn finish(self, arrays: &[DomainArray]) -> Result<SceneDescription> {
+        if self.partial_array.is_some() {
             return Err(Error::StreamEnded { what: "the last chunk of an array" });
         }
         let info = self.info.ok_or_else(|| malformed_reply("describe.scene", "a scene", "none"))?;
         for domain in &self.domains {
             for array in arrays {
-                domain.check(*array)?;
+                domain.check_array(*array)?;
             }
         }
         Ok(SceneDescription { info, domains: self.domains })
@@ -224,44 +259,45 @@ impl DescriptionBuilder {
 
 impl Domain {
     /// Checks that a requested array has the length given by the counts, and that its indices are within range.
-    fn check(&self, array: Array) -> Result<()> {
-        let (got, wanted) = match array {
-            Array::Indices => (self.indices.len(), 3 * self.triangles),
-            Array::CornerVertices => (self.corner_vertices.len(), self.corners),
-            Array::RestPositions => (self.rest_positions.len(), 3 * self.vertices),
-            Array::RestNormals => (self.rest_normals.len(), 3 * self.corners),
+    fn check_array(&self, array: DomainArray) -> Result<()> {
+        let (length, expected_length) = match array {
+            DomainArray::Indices => (self.indices.len(), 3 * self.triangle_count),
+            DomainArray::CornerVertices => (self.corner_vertices.len(), self.corner_count),
+            DomainArray::RestPositions => (self.rest_positions.len(), 3 * self.vertex_count),
+            DomainArray::RestNormals => (self.rest_normals.len(), 3 * self.corner_count),
             // Texture coordinates are optional.
-            Array::Uvs if self.uvs.is_empty() => (0, 0),
-            Array::Uvs => (self.uvs.len(), 2 * self.corners),
-            Array::Unspecified => (0, 0),
+            DomainArray::Uvs if self.uvs.is_empty() => (0, 0),
+            DomainArray::Uvs => (self.uvs.len(), 2 * self.corner_count),
+            DomainArray::Unspecified => (0, 0),
         };
-        let field = |what: &str| format!("domain '{}': {what}", self.name);
-        if got != wanted {
-            return Err(malformed_reply(field(array.as_str_name()), format!("{wanted} numbers"), got));
+        let field = |name: &str| format!("domain '{}': {name}", self.name);
+        if length != expected_length {
+            return Err(malformed_reply(field(array.as_str_name()), format!("{expected_length} numbers"), length));
         }
-        let below = |list: &[u32], limit: usize| list.iter().all(|index| (*index as usize) < limit);
-        if !below(&self.indices, self.corners) {
-            return Err(malformed_reply(field("indices"), format!("below {}", self.corners), "a larger one"));
-        }
-        if !below(&self.corner_vertices, self.vertices) {
-            return Err(malformed_reply(field("corner_vertices"), format!("below {}", self.vertices), "a larger one"));
+        for (name, indices, limit) in [
+            ("indices", &self.indices, self.corner_count),
+            ("corner_vertices", &self.corner_vertices, self.vertex_count),
+        ] {
+            if let Some(index) = indices.iter().find(|index| **index as usize >= limit) {
+                return Err(malformed_reply(field(name), format!("indices below {limit}"), index));
+            }
         }
         Ok(())
     }
 }
 
 /// Converts a domain from its wire format.
-fn domain(wire: v1::DomainDescription) -> Result<Domain> {
-    let place = |field: &str, bytes: &[u8]| {
-        let refusal = |_| malformed_reply(format!("domain '{}': {field}", wire.name), "48 bytes", bytes.len());
-        bytemuck::try_pod_read_unaligned::<[f32; 12]>(bytes).map_err(refusal)
+fn decode_domain(wire: v1::DomainDescription) -> Result<Domain> {
+    let decode_transform = |field: &str, bytes: &[u8]| {
+        let error = |_| malformed_reply(format!("domain '{}': {field}", wire.name), "48 bytes", bytes.len());
+        bytemuck::try_pod_read_unaligned::<[f32; 12]>(bytes).map_err(error)
     };
     let attachment = match wire.parent {
         None => None,
         Some(parent) => Some(Attachment {
             parent: parent as usize,
-            frame: place("attachment_frame", &wire.attachment_frame)?,
-            rows: wire.attachment_rows.clone(),
+            parent_from_child: decode_transform("attachment_frame", &wire.attachment_frame)?,
+            parent_vertices: wire.attachment_rows.clone(),
         }),
     };
     if !wire.eigenvalues.is_empty() && wire.eigenvalues.len() != wire.rank as usize {
@@ -270,13 +306,13 @@ fn domain(wire: v1::DomainDescription) -> Result<Domain> {
     }
     Ok(Domain {
         index: wire.domain as usize,
-        placement: place("placement", &wire.placement)?,
+        placement: decode_transform("placement", &wire.placement)?,
         attachment,
-        vertices: wire.vertices as usize,
+        vertex_count: wire.vertices as usize,
         rank: wire.rank as usize,
-        corners: wire.corners as usize,
-        triangles: wire.triangles as usize,
-        shares_q_with: wire.shares_q_with.map(|twin| twin as usize),
+        corner_count: wire.corners as usize,
+        triangle_count: wire.triangles as usize,
+        shares_q_with: wire.shares_q_with.map(|owner| owner as usize),
         shape: wire.shape as usize,
         name: wire.name,
         eigenvalues: wire.eigenvalues,

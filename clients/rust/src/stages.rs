@@ -7,14 +7,14 @@ use modalcast_proto::v1;
 /// Milliseconds per processing stage, under the server's stage names and in its order.
 pub type StageTimes = Vec<(String, f32)>;
 
-/// The most times per stage that [`StageSamples`] keeps, so that its memory is bounded.
+/// Maximum number of times per stage in a [`StageSamples`], so that its memory is bounded.
 const MAX_SAMPLES: usize = 1 << 16;
 
 pub(crate) fn from_wire(wire: Vec<v1::StageTime>) -> StageTimes {
     wire.into_iter().map(|time| (time.stage, time.milliseconds)).collect()
 }
 
-/// The times of each stage over many replies. Only the first 65536 times of a stage are kept.
+/// The times of each stage over many replies. Only the first 65536 times of a stage are stored.
 #[derive(Debug, Clone, Default)]
 pub struct StageSamples(BTreeMap<String, Vec<f32>>);
 

@@ -9,7 +9,7 @@ use crate::error::{Error, Result};
 /// part) with a norm of 1 within 0.001; the server normalizes it in f64.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum DomainTransform {
-    /// 48 bytes: row-major 3x4, with a translation relative to the scene's origin. May shear and scale if the scene
+    /// 48 bytes: row-major 3x4, with a translation relative to the scene's origin. It may shear and scale if the scene
     /// allows it.
     Affine([f32; 12]),
     /// 28 bytes: a translation relative to the scene's origin.
@@ -29,27 +29,27 @@ impl DomainTransform {
         }
     }
 
-    fn put(&self, bytes: &mut BytesMut) {
+    fn append_to(&self, bytes: &mut BytesMut) {
         match self {
-            Self::Affine(entries) => put_array(bytes, entries),
+            Self::Affine(entries) => append_numbers(bytes, entries),
             Self::RigidF32 { rotation, translation } => {
-                put_array(bytes, rotation);
-                put_array(bytes, translation);
+                append_numbers(bytes, rotation);
+                append_numbers(bytes, translation);
             }
             Self::RigidF64 { rotation, translation } => {
-                put_array(bytes, rotation);
-                put_array(bytes, translation);
+                append_numbers(bytes, rotation);
+                append_numbers(bytes, translation);
             }
         }
     }
 }
 
 /// Appends the bytes of numbers; `assemble` checks at compile time that the host is little-endian.
-fn put_array<T: bytemuck::NoUninit>(bytes: &mut BytesMut, numbers: &[T]) {
+fn append_numbers<T: bytemuck::NoUninit>(bytes: &mut BytesMut, numbers: &[T]) {
     bytes.extend_from_slice(bytemuck::cast_slice(numbers));
 }
 
-/// Builds a step. Values that are not set keep their value on the server.
+/// The coordinates and transforms of one step. Values that are not set do not change on the server.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Step {
     number: u64,
@@ -61,7 +61,7 @@ pub struct Step {
     /// The format of the first transform.
     format: v1::TransformFormat,
     /// Whether a later transform has another format.
-    mixed: bool,
+    has_mixed_formats: bool,
 }
 
 impl Step {
@@ -87,38 +87,38 @@ impl Step {
     /// Sets the transform of a domain, in any of the three formats. All transforms of one step must have the same
     /// format.
     #[must_use]
-    pub fn place(mut self, domain: u32, place: &DomainTransform) -> Self {
-        self.set_place(domain, place);
+    pub fn domain_transform(mut self, domain: u32, transform: &DomainTransform) -> Self {
+        self.set_domain_transform(domain, transform);
         self
     }
 
     /// As [`Self::q`], in place.
     pub fn set_q(&mut self, domain: u32, coordinates: &[f32]) {
         self.q_domains.push(domain);
-        put_array(&mut self.q, coordinates);
+        append_numbers(&mut self.q, coordinates);
     }
 
     /// As [`Self::transform`], in place.
     pub fn set_transform(&mut self, domain: u32, world_from_domain: &[f32; 12]) {
-        self.set_place(domain, &DomainTransform::Affine(*world_from_domain));
+        self.set_domain_transform(domain, &DomainTransform::Affine(*world_from_domain));
     }
 
-    /// As [`Self::place`], in place.
-    pub fn set_place(&mut self, domain: u32, place: &DomainTransform) {
+    /// As [`Self::domain_transform`], in place.
+    pub fn set_domain_transform(&mut self, domain: u32, transform: &DomainTransform) {
         if self.transform_domains.is_empty() {
-            self.format = place.format();
+            self.format = transform.format();
         }
-        self.mixed |= self.format != place.format();
+        self.has_mixed_formats |= self.format != transform.format();
         self.transform_domains.push(domain);
-        place.put(&mut self.transforms);
+        transform.append_to(&mut self.transforms);
     }
 
-    /// Refuses a step with transforms of several formats, because one message has one format.
-    pub(crate) fn check(&self) -> Result<()> {
-        match self.mixed {
-            false => Ok(()),
-            true => Err(Error::Step { step: self.number, reason: "its transforms are of several formats" }),
+    /// Checks that all transforms have the same format, because one message has one format.
+    pub(crate) fn check_formats(&self) -> Result<()> {
+        if self.has_mixed_formats {
+            return Err(Error::Step { step: self.number, reason: "its transforms are of several formats" });
         }
+        Ok(())
     }
 
     /// The step's number.
@@ -151,8 +151,8 @@ mod tests {
 
     #[test]
     fn numbers_are_packed_little_endian_in_domain_order() {
-        let pose = [1.0, 0.0, 0.0, 5.0, 0.0, 1.0, 0.0, 6.0, 0.0, 0.0, 1.0, 7.0];
-        let wire = Step::new(3, 0.5).q(2, &[1.0, -2.0]).q(0, &[0.25]).transform(1, &pose).to_wire();
+        let transform = [1.0, 0.0, 0.0, 5.0, 0.0, 1.0, 0.0, 6.0, 0.0, 0.0, 1.0, 7.0];
+        let wire = Step::new(3, 0.5).q(2, &[1.0, -2.0]).q(0, &[0.25]).transform(1, &transform).to_wire();
         assert_eq!((wire.number, wire.time), (3, 0.5));
         assert_eq!(wire.q_domains, [2, 0]);
         let bytes: Vec<u8> = [1.0_f32, -2.0, 0.25].iter().flat_map(|number| number.to_le_bytes()).collect();
@@ -163,12 +163,12 @@ mod tests {
     }
 
     #[test]
-    fn rigid_transforms_put_rotation_first_and_formats_do_not_mix() {
+    fn rigid_transforms_start_with_rotation_and_do_not_mix() {
         let rotation = [0.0, 0.6, 0.0, 0.8];
-        let narrow = DomainTransform::RigidF32 { rotation, translation: [1.0, 2.0, 3.0] };
-        let wide = DomainTransform::RigidF64 { rotation, translation: [1e7, 2.0, 3.25] };
-        let step = Step::new(0, 0.0).place(4, &narrow).place(2, &narrow);
-        assert_eq!((step.check().is_ok(), step.payload_bytes()), (true, 56));
+        let rigid_f32 = DomainTransform::RigidF32 { rotation, translation: [1.0, 2.0, 3.0] };
+        let rigid_f64 = DomainTransform::RigidF64 { rotation, translation: [1e7, 2.0, 3.25] };
+        let step = Step::new(0, 0.0).domain_transform(4, &rigid_f32).domain_transform(2, &rigid_f32);
+        assert_eq!((step.check_formats().is_ok(), step.payload_bytes()), (true, 56));
         let wire = step.clone().to_wire();
         assert_eq!(
             (wire.transform_domains.as_slice(), wire.transform_format()),
@@ -178,15 +178,15 @@ mod tests {
             (&wire.transforms[4..8], &wire.transforms[24..28]),
             (&0.6_f32.to_le_bytes()[..], &3.0_f32.to_le_bytes()[..])
         );
-        let wire = Step::new(0, 0.0).place(1, &wide).to_wire();
+        let wire = Step::new(0, 0.0).domain_transform(1, &rigid_f64).to_wire();
         assert_eq!((wire.transforms.len(), wire.transform_format()), (40, v1::TransformFormat::RigidF64));
         assert_eq!(
             (&wire.transforms[12..16], &wire.transforms[16..24]),
             (&0.8_f32.to_le_bytes()[..], &1e7_f64.to_le_bytes()[..])
         );
-        for mixed in [step.clone().place(1, &wide), step.transform(1, &[0.0; 12])] {
-            let refusal = mixed.check().expect_err("mixed").to_string();
-            assert_eq!(refusal, "step 0 cannot be sent: its transforms are of several formats");
+        for step in [step.clone().domain_transform(1, &rigid_f64), step.transform(1, &[0.0; 12])] {
+            let error = step.check_formats().expect_err("mixed formats").to_string();
+            assert_eq!(error, "step 0 cannot be sent: its transforms are of several formats");
         }
     }
 }

@@ -1,6 +1,7 @@
-//! A step stream: sends steps, receives acknowledgements and refusals, and limits the steps in flight to the window.
+//! A step stream: sends steps, receives acknowledgements and rejections, and limits the steps in flight to the window.
 //!
-//! A separate task always reads the replies, because a stalled reader of many small messages would lose its connection.
+//! A separate task reads the replies all the time, because the server closes the connection of a client that does not
+//! read many small messages.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -18,9 +19,9 @@ use crate::error::{Error, Rejection, Result, malformed_reply};
 use crate::stages::{self, StageTimes};
 use crate::step::Step;
 
-/// The most acknowledgements, and the most refusals, that are kept until the caller takes them. Older ones are dropped;
-/// [`StreamSummary::rejected`] counts all refusals.
-const MAX_RETAINED: usize = 1024;
+/// Maximum number of acknowledgements, and of rejections, that are stored until the caller takes them. Older ones are
+/// dropped; [`StreamSummary::rejected`] counts all rejections.
+const MAX_STORED: usize = 1024;
 
 /// How the server handles steps that arrive faster than it processes them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,8 +46,9 @@ pub struct Ack {
 pub struct StreamSummary {
     /// The last acknowledged step.
     pub acknowledged: Option<u64>,
-    /// Number of steps sent, and how many of them the server refused.
+    /// Number of sent steps.
     pub sent: u64,
+    /// Number of sent steps that the server rejected.
     pub rejected: u64,
     /// Number of steps merged into a newer one.
     pub skipped: u64,
@@ -55,33 +57,39 @@ pub struct StreamSummary {
 /// State shared between the reading task and the [`StepStream`].
 #[derive(Default)]
 struct Progress {
-    outstanding: VecDeque<u64>,
+    /// Numbers of the steps in flight, oldest first.
+    in_flight: VecDeque<u64>,
+    /// The last acknowledged step.
     acknowledged: Option<u64>,
     skipped: u64,
     rejected: u64,
+    /// Acknowledgements that the caller has not taken.
     acks: VecDeque<Ack>,
+    /// Rejections that have not been reported to the caller.
     rejections: VecDeque<Rejection>,
-    ended: Option<Option<Error>>,
+    /// Whether the stream has ended, and its error if the server did not close it.
+    end: Option<Option<Error>>,
 }
 
 /// A step stream to one scene. Dropping it ends the stream and releases the scene.
 pub struct StepStream {
     /// The number of this run; every new writer of the scene increments it.
     pub run: u64,
-    /// The most steps in flight: sent and not yet acknowledged.
+    /// Maximum number of steps in flight: sent and not yet acknowledged.
     pub window: usize,
     /// The scene at the time the stream opened.
     pub scene: v1::SceneInfo,
     requests: Option<mpsc::Sender<v1::DriveSceneRequest>>,
     progress: Arc<Mutex<Progress>>,
-    changed: watch::Receiver<()>,
+    /// Notifies of changes of `progress`; closed when the reading task ends.
+    progress_changes: watch::Receiver<()>,
     reader: tokio::task::JoinHandle<()>,
     sent: u64,
 }
 
 impl Client {
-    /// Becomes the writer of a scene. A `window` of 0 selects the server's default; [`StepStream::window`] is the granted
-    /// window.
+    /// Opens a step stream and makes this client the writer of the scene. A `window` of 0 selects the server's default;
+    /// [`StepStream::window`] is the granted window.
     ///
     /// # Errors
     /// `Rejected` or `Status` if the scene does not exist or has another writer.
@@ -92,8 +100,8 @@ impl Client {
         };
         let (requests, queue) = mpsc::channel(64);
         let open = v1::OpenDrive { scene: scene.to_owned(), policy: policy.into(), window };
-        let opening = v1::DriveSceneRequest { kind: Some(RequestKind::Open(open)) };
-        requests.send(opening).await.map_err(|_| Error::StreamEnded { what: "the stream opened" })?;
+        let open_request = v1::DriveSceneRequest { kind: Some(RequestKind::Open(open)) };
+        requests.send(open_request).await.map_err(|_| Error::StreamEnded { what: "the stream opened" })?;
         let mut service = v1::step_service_client::StepServiceClient::new(self.channel.clone());
         let mut replies = self.replies(service.drive_scene(ReceiverStream::new(queue)).await)?;
         let opened = match replies.next().await?.and_then(|reply| reply.kind) {
@@ -105,15 +113,15 @@ impl Client {
             None => return Err(Error::StreamEnded { what: "the stream opened" }),
         };
         let progress = Arc::new(Mutex::new(Progress::default()));
-        let (change, changed) = watch::channel(());
-        let reader = tokio::spawn(read(replies, Arc::clone(&progress), change));
+        let (change_sender, progress_changes) = watch::channel(());
+        let reader = tokio::spawn(read_replies(replies, Arc::clone(&progress), change_sender));
         Ok(StepStream {
             run: opened.run,
             window: (opened.window as usize).max(1),
             scene: opened.scene.unwrap_or_default(),
             requests: Some(requests),
             progress,
-            changed,
+            progress_changes,
             reader,
             sent: 0,
         })
@@ -124,51 +132,53 @@ impl StepStream {
     /// Sends a step as soon as the window has capacity.
     ///
     /// # Errors
-    /// `Rejected` reports the oldest unreported refusal. It names the refused step, usually an earlier one; the step
+    /// `Rejected` reports the oldest unreported rejection. It names the rejected step, usually an earlier one; the step
     /// passed to this call has been sent and the stream stays open. `Step` means that the step passed to this call was
     /// not sent; the stream stays open. Every other error ends the stream.
     pub async fn step(&mut self, step: &Step) -> Result<()> {
-        step.check()?;
-        self.wait(|progress, window| progress.outstanding.len() < window).await?;
-        lock(&self.progress).outstanding.push_back(step.number());
+        step.check_formats()?;
+        self.wait_until(|progress, window| progress.in_flight.len() < window).await?;
+        lock(&self.progress).in_flight.push_back(step.number());
         let message = v1::DriveSceneRequest { kind: Some(RequestKind::Step(step.to_wire())) };
         let requests = self.requests.as_ref().ok_or(Error::StreamEnded { what: "this step" })?;
         if requests.send(message).await.is_err() {
             // The stream has ended; the reading task receives the reason.
-            self.wait(|_, _| false).await?;
+            self.wait_until(|_, _| false).await?;
         }
         self.sent += 1;
-        match lock(&self.progress).rejections.pop_front() {
-            Some(rejection) => Err(Error::Rejected(Box::new(rejection))),
-            None => Ok(()),
-        }
+        self.report_rejection()
     }
 
-    /// Waits until every step sent so far is acknowledged or refused.
+    /// Waits until every step sent so far is acknowledged or rejected. Each call reports at most one rejection.
     ///
     /// # Errors
-    /// `Rejected` with the oldest unreported refusal; every other error ends the stream.
+    /// `Rejected` with the oldest unreported rejection; every other error ends the stream.
     pub async fn flush(&mut self) -> Result<()> {
-        self.wait(|progress, _| progress.outstanding.is_empty()).await?;
+        self.wait_until(|progress, _| progress.in_flight.is_empty()).await?;
+        self.report_rejection()
+    }
+
+    /// Takes the oldest unreported rejection and returns it as an error.
+    fn report_rejection(&self) -> Result<()> {
         match lock(&self.progress).rejections.pop_front() {
             Some(rejection) => Err(Error::Rejected(Box::new(rejection))),
             None => Ok(()),
         }
     }
 
-    /// Takes the acknowledgements received since the last call, oldest first; at most 1024 are kept.
+    /// Takes the acknowledgements received since the last call, oldest first; at most 1024 are stored.
     pub fn take_acks(&self) -> Vec<Ack> {
         lock(&self.progress).acks.drain(..).collect()
     }
 
-    /// Takes the unreported refusals, oldest first; at most 1024 are kept.
+    /// Takes the unreported rejections, oldest first; at most 1024 are stored.
     pub fn take_rejections(&self) -> Vec<Rejection> {
         lock(&self.progress).rejections.drain(..).collect()
     }
 
     /// Number of steps in flight.
-    pub fn outstanding(&self) -> usize {
-        lock(&self.progress).outstanding.len()
+    pub fn in_flight_count(&self) -> usize {
+        lock(&self.progress).in_flight.len()
     }
 
     /// Totals of the stream up to now.
@@ -182,34 +192,34 @@ impl StepStream {
         }
     }
 
-    /// Waits for all acknowledgements, then ends the stream. Refusals are counted and are not errors.
+    /// Waits for all acknowledgements, then ends the stream. Rejections are counted and are not errors.
     ///
     /// # Errors
     /// The error that ended the stream before all steps were acknowledged.
     pub async fn finish(mut self) -> Result<StreamSummary> {
-        self.wait(|progress, _| progress.outstanding.is_empty()).await?;
+        self.wait_until(|progress, _| progress.in_flight.is_empty()).await?;
         self.requests = None;
         // The server closes its side after it has released the scene. The timeout covers a server that does not.
-        let closing = async { while self.changed.changed().await.is_ok() {} };
-        tokio::time::timeout(Duration::from_secs(5), closing).await.ok();
+        let reader_end = async { while self.progress_changes.changed().await.is_ok() {} };
+        tokio::time::timeout(Duration::from_secs(5), reader_end).await.ok();
         Ok(self.summary())
     }
 
-    /// Waits until `enough` holds, or the stream has ended.
-    async fn wait(&mut self, enough: impl Fn(&Progress, usize) -> bool) -> Result<()> {
+    /// Waits until `condition` holds for the progress and the window. Fails if the stream has ended.
+    async fn wait_until(&mut self, condition: impl Fn(&Progress, usize) -> bool) -> Result<()> {
         loop {
             // Mark the value as seen before reading it, so that a change in between wakes the wait below.
-            self.changed.borrow_and_update();
+            self.progress_changes.borrow_and_update();
             {
                 let progress = lock(&self.progress);
-                if let Some(end) = &progress.ended {
+                if let Some(end) = &progress.end {
                     return Err(end.clone().unwrap_or(Error::StreamEnded { what: "the acknowledgement" }));
                 }
-                if enough(&progress, self.window) {
+                if condition(&progress, self.window) {
                     return Ok(());
                 }
             }
-            if self.changed.changed().await.is_err() && lock(&self.progress).ended.is_none() {
+            if self.progress_changes.changed().await.is_err() && lock(&self.progress).end.is_none() {
                 return Err(Error::StreamEnded { what: "the acknowledgement" });
             }
         }
@@ -223,21 +233,25 @@ impl Drop for StepStream {
 }
 
 /// Reads replies until the stream ends.
-async fn read(mut replies: Replies<v1::DriveSceneResponse>, progress: Arc<Mutex<Progress>>, change: watch::Sender<()>) {
+async fn read_replies(
+    mut replies: Replies<v1::DriveSceneResponse>,
+    progress: Arc<Mutex<Progress>>,
+    change_sender: watch::Sender<()>,
+) {
     loop {
         let reply = replies.next().await;
         let mut progress = lock(&progress);
         match reply {
             Ok(Some(reply)) => match reply.kind {
                 Some(ResponseKind::Ack(ack)) => progress.acknowledge(ack),
-                Some(ResponseKind::Rejection(rejection)) => progress.refuse(rejection.into()),
+                Some(ResponseKind::Rejection(rejection)) => progress.reject(rejection.into()),
                 Some(ResponseKind::Opened(_)) | None => {}
             },
-            Ok(None) => progress.ended = Some(None),
-            Err(error) => progress.ended = Some(Some(error)),
+            Ok(None) => progress.end = Some(None),
+            Err(error) => progress.end = Some(Some(error)),
         }
-        change.send_replace(());
-        if progress.ended.is_some() {
+        change_sender.send_replace(());
+        if progress.end.is_some() {
             return;
         }
     }
@@ -245,7 +259,7 @@ async fn read(mut replies: Replies<v1::DriveSceneResponse>, progress: Arc<Mutex<
 
 impl Progress {
     fn acknowledge(&mut self, ack: v1::Acknowledgement) {
-        self.outstanding.retain(|step| *step > ack.step);
+        self.in_flight.retain(|step| *step > ack.step);
         self.acknowledged = self.acknowledged.max(Some(ack.step));
         self.skipped = ack.skipped;
         push_bounded(
@@ -254,10 +268,10 @@ impl Progress {
         );
     }
 
-    /// Removes the refused step from the steps in flight. If several have its number, the oldest one is meant.
-    fn refuse(&mut self, rejection: Rejection) {
-        if let Some(at) = self.outstanding.iter().position(|step| Some(*step) == rejection.step) {
-            self.outstanding.remove(at);
+    /// Removes the rejected step from the steps in flight. If several have its number, it is the oldest one.
+    fn reject(&mut self, rejection: Rejection) {
+        if let Some(index) = self.in_flight.iter().position(|step| Some(*step) == rejection.step) {
+            self.in_flight.remove(index);
         }
         self.rejected += 1;
         push_bounded(&mut self.rejections, rejection);
@@ -266,13 +280,13 @@ impl Progress {
 
 /// Appends to a bounded list and drops the oldest item of a full one.
 fn push_bounded<T>(list: &mut VecDeque<T>, item: T) {
-    if list.len() == MAX_RETAINED {
+    if list.len() == MAX_STORED {
         list.pop_front();
     }
     list.push_back(item);
 }
 
-/// Locks the progress. No holder panics; if one did, the last written state would still be usable.
+/// Locks the progress, also after a panic of another holder. Each field stays valid if a panic interrupts an update.
 fn lock(progress: &Mutex<Progress>) -> MutexGuard<'_, Progress> {
     progress.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -286,23 +300,23 @@ mod tests {
     }
 
     #[test]
-    fn an_ack_covers_all_earlier_steps_and_a_refusal_covers_one() {
-        let mut progress = Progress { outstanding: (0..6).collect(), ..Progress::default() };
-        progress.refuse(rejection(4));
-        assert_eq!(progress.outstanding, [0, 1, 2, 3, 5]);
+    fn ack_removes_all_earlier_steps_and_rejection_removes_one() {
+        let mut progress = Progress { in_flight: (0..6).collect(), ..Progress::default() };
+        progress.reject(rejection(4));
+        assert_eq!(progress.in_flight, [0, 1, 2, 3, 5]);
         progress.acknowledge(v1::Acknowledgement { step: 3, skipped: 2, stages: vec![] });
-        assert_eq!((progress.outstanding.make_contiguous(), progress.skipped), (&mut [5][..], 2));
-        progress.refuse(rejection(9));
-        assert_eq!((progress.outstanding.len(), progress.rejected), (1, 2));
+        assert_eq!((progress.in_flight.make_contiguous(), progress.skipped), (&mut [5][..], 2));
+        progress.reject(rejection(9));
+        assert_eq!((progress.in_flight.len(), progress.rejected), (1, 2));
     }
 
     #[test]
-    fn untaken_refusals_are_bounded() {
+    fn number_of_stored_rejections_is_bounded() {
         let mut progress = Progress::default();
-        for step in 0..2 * MAX_RETAINED as u64 {
-            progress.refuse(rejection(step));
+        for step in 0..2 * MAX_STORED as u64 {
+            progress.reject(rejection(step));
         }
-        assert_eq!((progress.rejections.len(), progress.rejected), (MAX_RETAINED, 2 * MAX_RETAINED as u64));
-        assert_eq!(progress.rejections[0].step, Some(MAX_RETAINED as u64));
+        assert_eq!((progress.rejections.len(), progress.rejected), (MAX_STORED, 2 * MAX_STORED as u64));
+        assert_eq!(progress.rejections[0].step, Some(MAX_STORED as u64));
     }
 }

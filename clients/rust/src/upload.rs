@@ -16,15 +16,16 @@ use crate::client::Client;
 use crate::error::{Error, Result, malformed_reply};
 
 /// Bytes per message: far below 4 MiB, the default limit of gRPC.
-const CHUNK: usize = 512 << 10;
+const CHUNK_BYTES: usize = 512 << 10;
 
-/// The most nested folders. Deeper ones are an error, so that a cyclic link ends.
-const DEPTH: usize = 16;
+/// Maximum depth of nested folders. Deeper ones are an error, so that a cyclic link does not cause an endless recursion.
+const MAX_FOLDER_DEPTH: usize = 16;
 
 /// One file to upload.
-struct Entry {
-    disk: PathBuf,
-    file: v1::UploadFile,
+struct LocalFile {
+    local_path: PathBuf,
+    /// Path relative to the uploaded folder, size and hash.
+    header: v1::UploadFile,
 }
 
 impl Client {
@@ -32,53 +33,51 @@ impl Client {
     /// it is empty, the folder itself or the single file is opened.
     ///
     /// # Errors
-    /// `File` if a file cannot be read; `Status` if the server refuses the upload or cannot open the scene.
+    /// `File` if a file cannot be read; `Status` if the server rejects the upload or cannot open the scene.
     pub async fn upload_scene(&self, path: &Path, scene: &str, entry: &str) -> Result<v1::SceneInfo> {
-        let (root, listing) = (
-            path.to_owned(),
-            tokio::task::spawn_blocking({
-                let root = path.to_owned();
-                move || list(&root)
-            }),
-        );
-        let entries = listing.await.map_err(|fault| Error::file(&root, fault))??;
-        let single = if root.is_file() { entries.first().map(|only| only.file.path.clone()) } else { None };
+        let root = path.to_owned();
+        let list_task = tokio::task::spawn_blocking(move || list_files(&root));
+        let files = list_task.await.map_err(|error| Error::file(path, error))??;
+        let single_file = if path.is_file() { files.first().map(|file| file.header.path.clone()) } else { None };
         let header = v1::UploadHeader {
             scene: scene.to_owned(),
-            entry: if entry.is_empty() { single.unwrap_or_default() } else { entry.to_owned() },
-            files: u32::try_from(entries.len()).map_err(|_| Error::file(&root, "more than 2^32 files"))?,
-            total_bytes: entries.iter().map(|entry| entry.file.bytes).sum(),
+            entry: if entry.is_empty() { single_file.unwrap_or_default() } else { entry.to_owned() },
+            files: u32::try_from(files.len())
+                .map_err(|_| Error::file(path, format!("expected fewer than 2^32 files, got {}", files.len())))?,
+            total_bytes: files.iter().map(|file| file.header.bytes).sum(),
         };
         let (sender, queue) = mpsc::channel(4);
-        let reading = tokio::task::spawn_blocking(move || send_all(&sender, header, &entries));
+        let send_task = tokio::task::spawn_blocking(move || send_files(&sender, header, &files));
         let reply = self.reply(self.scenes().upload_scene(ReceiverStream::new(queue)).await);
-        // A read error truncates the upload, and the server refuses it. Report the read error, which is the cause.
-        reading.await.map_err(|fault| Error::file(&root, fault))??;
+        // A read error truncates the upload, and the server rejects it. Report the read error, which is the cause.
+        send_task.await.map_err(|error| Error::file(path, error))??;
         reply?.scene.ok_or_else(|| malformed_reply("upload.scene", "a scene", "none"))
     }
 }
 
-/// All files below a folder, sorted by path, with size and hash.
-fn list(root: &Path) -> Result<Vec<Entry>> {
+/// Lists all files below a folder, or the single file `root`, sorted by path.
+fn list_files(root: &Path) -> Result<Vec<LocalFile>> {
     let mut paths = vec![];
     if root.is_file() {
         paths.push(root.to_owned());
     } else {
-        walk(root, 0, &mut paths)?;
+        collect_paths(root, 0, &mut paths)?;
     }
     paths.sort();
     let base = if root.is_file() { root.parent().unwrap_or(root) } else { root };
-    paths.into_iter().map(|disk| describe(base, disk)).collect()
+    paths.into_iter().map(|path| read_header(base, path)).collect()
 }
 
-fn walk(folder: &Path, depth: usize, paths: &mut Vec<PathBuf>) -> Result<()> {
-    if depth > DEPTH {
-        return Err(Error::file(folder, format!("more than {DEPTH} folders deep")));
+/// Appends the paths of all files below a folder.
+fn collect_paths(folder: &Path, depth: usize, paths: &mut Vec<PathBuf>) -> Result<()> {
+    if depth > MAX_FOLDER_DEPTH {
+        let reason = format!("expected at most {MAX_FOLDER_DEPTH} nested folders, got more");
+        return Err(Error::file(folder, reason));
     }
-    for item in folder.read_dir().map_err(|fault| Error::file(folder, fault))? {
-        let path = item.map_err(|fault| Error::file(folder, fault))?.path();
+    for entry in folder.read_dir().map_err(|error| Error::file(folder, error))? {
+        let path = entry.map_err(|error| Error::file(folder, error))?.path();
         if path.is_dir() {
-            walk(&path, depth + 1, paths)?;
+            collect_paths(&path, depth + 1, paths)?;
         } else {
             paths.push(path);
         }
@@ -86,46 +85,52 @@ fn walk(folder: &Path, depth: usize, paths: &mut Vec<PathBuf>) -> Result<()> {
     Ok(())
 }
 
-fn describe(base: &Path, disk: PathBuf) -> Result<Entry> {
-    let relative = disk.strip_prefix(base).map_err(|fault| Error::file(&disk, fault))?;
-    let names = relative.components().map(|part| part.as_os_str().to_str());
-    let names = names.collect::<Option<Vec<_>>>().ok_or_else(|| Error::file(&disk, "the name is not UTF-8"))?;
-    let path = names.join("/");
+/// Computes the path relative to `base`, the size and the hash of a file.
+fn read_header(base: &Path, local_path: PathBuf) -> Result<LocalFile> {
+    let relative_path = local_path.strip_prefix(base).map_err(|error| Error::file(&local_path, error))?;
+    let names = relative_path.components().map(|component| component.as_os_str().to_str());
+    let names = names.collect::<Option<Vec<_>>>();
+    let path = names.ok_or_else(|| Error::file(&local_path, "the name is not UTF-8"))?.join("/");
     let mut hash = Sha256::new();
     let mut bytes = 0;
-    read(&disk, |chunk| {
+    read_chunks(&local_path, |chunk| {
         hash.update(chunk);
         bytes += chunk.len() as u64;
         true
     })?;
-    Ok(Entry { disk, file: v1::UploadFile { path, bytes, sha256: hash.finalize().to_vec().into() } })
+    let header = v1::UploadFile { path, bytes, sha256: hash.finalize().to_vec().into() };
+    Ok(LocalFile { local_path, header })
 }
 
 /// Sends the header, then each file and its chunks. Stops without error if the server has closed the stream.
-fn send_all(sender: &mpsc::Sender<v1::UploadSceneRequest>, header: v1::UploadHeader, entries: &[Entry]) -> Result<()> {
+fn send_files(
+    sender: &mpsc::Sender<v1::UploadSceneRequest>,
+    header: v1::UploadHeader,
+    files: &[LocalFile],
+) -> Result<()> {
     let send = |part| sender.blocking_send(v1::UploadSceneRequest { part: Some(part) }).is_ok();
-    let mut listening = send(Part::Header(header));
-    for entry in entries {
-        listening = listening && send(Part::File(entry.file.clone()));
-        if !listening {
+    let mut is_open = send(Part::Header(header));
+    for file in files {
+        is_open = is_open && send(Part::File(file.header.clone()));
+        if !is_open {
             return Ok(());
         }
-        read(&entry.disk, |chunk| {
-            listening = send(Part::Chunk(Bytes::copy_from_slice(chunk)));
-            listening
+        read_chunks(&file.local_path, |chunk| {
+            is_open = send(Part::Chunk(Bytes::copy_from_slice(chunk)));
+            is_open
         })?;
     }
     Ok(())
 }
 
-/// Reads a file chunk by chunk while `more` returns true.
-fn read(path: &Path, mut more: impl FnMut(&[u8]) -> bool) -> Result<()> {
-    let fail = |fault: std::io::Error| Error::file(path, fault);
-    let mut file = File::open(path).map_err(fail)?;
-    let mut buffer = vec![0; CHUNK];
+/// Reads a file chunk by chunk until its end, or until `process_chunk` returns false.
+fn read_chunks(path: &Path, mut process_chunk: impl FnMut(&[u8]) -> bool) -> Result<()> {
+    let file_error = |error: std::io::Error| Error::file(path, error);
+    let mut file = File::open(path).map_err(file_error)?;
+    let mut buffer = vec![0; CHUNK_BYTES];
     loop {
-        let got = file.read(&mut buffer).map_err(fail)?;
-        if got == 0 || !more(&buffer[..got]) {
+        let length = file.read(&mut buffer).map_err(file_error)?;
+        if length == 0 || !process_chunk(&buffer[..length]) {
             return Ok(());
         }
     }

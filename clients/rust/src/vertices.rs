@@ -1,5 +1,5 @@
-//! Deformed vertices of a step: positions per vertex and normals per corner in world axes, relative to an origin that
-//! the set states. On request also displacements and bounding boxes.
+//! Deformed vertices of a step: positions per vertex and normals per corner, in world axes, relative to
+//! [`VertexSet::origin`]. Displacements and bounding boxes are optional.
 
 use std::ops::Range;
 use std::pin::Pin;
@@ -15,8 +15,8 @@ use crate::error::{Error, Result, malformed_reply};
 use crate::request::{StepRequest, Subscription};
 use crate::stages::{self, StageTimes};
 
-/// The domains and attributes to return. The default is positions and normals of all domains. The server refuses
-/// attributes that the scene does not keep.
+/// The domains and attributes to return. The default is positions and normals of all domains. The server rejects
+/// attributes that `deform` in scene.toml does not enable.
 pub use modalcast_proto::v1::VertexSelection;
 
 /// A request for the vertices of one step.
@@ -29,55 +29,59 @@ pub type VertexStreamRequest = Subscription<VertexSelection>;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct VertexSetDomain {
     pub index: u32,
-    pub vertices: u32,
-    pub corners: u32,
+    pub vertex_count: u32,
+    pub corner_count: u32,
 }
 
 /// The vertices of one step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VertexSet {
     pub step: v1::StepId,
-    /// World position of the origin of all positions, in meters. This is the scene's origin unless steps with f64
-    /// translations move domains far from it; it may change from step to step.
+    /// World position of the common origin of all positions, in meters. It equals the scene's origin until f64
+    /// translations move domains far from there. Then it follows the domains and may differ per step.
     pub origin: Vec<f64>,
-    /// The origin of each selected domain if the origins differ; otherwise empty.
-    pub origins: Vec<[f64; 3]>,
+    /// The origin of each selected domain in meters, if the origins differ; otherwise empty.
+    pub domain_origins: Vec<[f64; 3]>,
     /// The selected domains, in the order of all arrays.
     pub domains: Vec<VertexSetDomain>,
-    /// Three per vertex, selected domains concatenated; empty if omitted.
+    /// Three numbers per vertex in scene units, selected domains concatenated; empty if omitted.
     pub positions: Vec<f32>,
-    /// Three per corner; empty if omitted.
+    /// Three numbers per corner; empty if omitted.
     pub normals: Vec<f32>,
-    /// u = U q, three per vertex in the frame of its domain; empty unless requested.
+    /// u = U q, three numbers per vertex in the frame of its domain; empty unless requested.
     pub displacements: Vec<f32>,
     /// Per selected domain the minimum and the maximum x, y, z of its positions; empty unless requested.
     pub boxes: Vec<[[f32; 3]; 2]>,
+    /// Number of steps skipped since the previous set of the stream.
     pub skipped: u64,
     pub stages: StageTimes,
 }
 
 impl VertexSet {
-    /// The range of the `place`-th selected domain in `positions` and in `displacements`.
-    pub fn range(&self, place: usize) -> Range<usize> {
-        let before: usize = self.domains[..place].iter().map(|domain| 3 * domain.vertices as usize).sum();
-        before..before + 3 * self.domains[place].vertices as usize
+    /// The range of a selected domain in `positions` and in `displacements`. `ordinal` is its index in `domains`;
+    /// `None` if it is out of range.
+    pub fn float_range(&self, ordinal: usize) -> Option<Range<usize>> {
+        let float_count = |domain: &VertexSetDomain| 3 * domain.vertex_count as usize;
+        let domain = self.domains.get(ordinal)?;
+        let start: usize = self.domains.iter().take(ordinal).map(float_count).sum();
+        Some(start..start + float_count(domain))
     }
 
-    /// World position of the origin of the `place`-th selected domain, in meters. A vertex is at
-    /// `origin_of(place) + unit * position`, with the unit of the scene's info.
-    pub fn origin_of(&self, place: usize) -> [f64; 3] {
-        let all = || std::array::from_fn(|axis| self.origin.get(axis).copied().unwrap_or(0.0));
-        self.origins.get(place).copied().unwrap_or_else(all)
+    /// World position of the origin of a selected domain, in meters. `ordinal` is its index in `domains`. A vertex is at
+    /// `domain_origin(ordinal) + unit * position`, where `unit` is [`v1::SceneInfo::unit`].
+    pub fn domain_origin(&self, ordinal: usize) -> [f64; 3] {
+        let common_origin = || std::array::from_fn(|axis| self.origin.get(axis).copied().unwrap_or(0.0));
+        self.domain_origins.get(ordinal).copied().unwrap_or_else(common_origin)
     }
 }
 
 impl Client {
-    /// The vertices of one step.
+    /// Gets the vertices of one step.
     ///
     /// # Errors
-    /// `Status` if the scene, a domain or the step does not exist, the scene does not keep a requested attribute, or
-    /// the deadline passed; `Malformed`; `Connect`.
-    pub async fn vertices(&self, request: &VertexRequest) -> Result<VertexSet> {
+    /// `Status` if the scene, a domain or the step does not exist, the scene does not enable a requested attribute, or
+    /// the deadline passed; `Malformed` if the reply contradicts itself; `Connect` if the connection is lost.
+    pub async fn get_vertices(&self, request: &VertexRequest) -> Result<VertexSet> {
         use v1::get_vertices_request::Step;
         let wire = v1::GetVerticesRequest {
             scene: request.scene.clone(),
@@ -87,13 +91,14 @@ impl Client {
         };
         let messages = self.replies(VertexServiceClient::new(self.channel.clone()).get_vertices(wire).await)?;
         let set = ChunkedReplies::new(messages, |message| message.chunk, self.reply_limit).next().await;
-        set.unwrap_or(Err(Error::StreamEnded { what: "the vertices" }))
+        set.unwrap_or(Err(Error::StreamEnded { what: "the first reply of vertices" }))
     }
 
     /// Subscribes to vertices. When this returns, the server has accepted the subscription.
     ///
     /// # Errors
-    /// `Status` if the scene or a domain does not exist, or the scene does not keep a requested attribute; `Connect`.
+    /// `Status` if the scene or a domain does not exist, or the scene does not enable a requested attribute; `Connect`
+    /// if the connection is lost.
     pub async fn stream_vertices(&self, request: &VertexStreamRequest) -> Result<VertexStream> {
         let wire = v1::StreamVerticesRequest {
             scene: request.scene.clone(),
@@ -138,43 +143,43 @@ impl WireChunk for v1::VertexChunk {
     }
 
     fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<VertexSet> {
-        set(head, &bytes)
+        decode_vertex_set(head, &bytes)
     }
 }
 
-fn set(head: v1::VertexHead, bytes: &[u8]) -> Result<VertexSet> {
-    let counts = (head.domains.len(), head.vertices.len(), head.corners.len());
-    if counts.0 != counts.1 || counts.0 != counts.2 {
+fn decode_vertex_set(head: v1::VertexHead, bytes: &[u8]) -> Result<VertexSet> {
+    let domain_count = head.domains.len();
+    if head.vertices.len() != domain_count || head.corners.len() != domain_count {
         return Err(malformed_reply(
             "vertices.domains",
-            "one count of vertices and corners each",
-            format!("{counts:?}"),
+            format!("{domain_count} vertex counts and {domain_count} corner counts"),
+            format!("{} and {}", head.vertices.len(), head.corners.len()),
         ));
     }
-    let parts = parts(&head, bytes)?;
+    let sections = split_reply(&head, bytes)?;
     let counts = head.vertices.iter().zip(&head.corners);
     let domains = head.domains.iter().zip(counts);
-    let domain = |(index, (vertices, corners)): (&u32, (&u32, &u32))| VertexSetDomain {
+    let domain = |(index, (vertex_count, corner_count)): (&u32, (&u32, &u32))| VertexSetDomain {
         index: *index,
-        vertices: *vertices,
-        corners: *corners,
+        vertex_count: *vertex_count,
+        corner_count: *corner_count,
     };
     Ok(VertexSet {
         step: head.step.ok_or_else(|| malformed_reply("vertices.step", "a step", "none"))?,
         origin: head.origin,
-        origins: decode("vertices.origins", parts.origins)?,
+        domain_origins: decode("vertices.origins", sections.origins)?,
         domains: domains.map(domain).collect(),
-        positions: decode("vertices.positions", parts.positions)?,
-        normals: decode("vertices.normals", parts.normals)?,
-        displacements: decode("vertices.displacements", parts.displacements)?,
-        boxes: decode("vertices.boxes", parts.boxes)?,
+        positions: decode("vertices.positions", sections.positions)?,
+        normals: decode("vertices.normals", sections.normals)?,
+        displacements: decode("vertices.displacements", sections.displacements)?,
+        boxes: decode("vertices.boxes", sections.boxes)?,
         skipped: head.skipped,
         stages: stages::from_wire(head.stages),
     })
 }
 
 /// The bytes of a reply, split by the sizes in its head.
-struct Parts<'a> {
+struct ReplySections<'a> {
     positions: &'a [u8],
     normals: &'a [u8],
     displacements: &'a [u8],
@@ -182,37 +187,43 @@ struct Parts<'a> {
     origins: &'a [u8],
 }
 
-fn parts<'a>(head: &v1::VertexHead, bytes: &'a [u8]) -> Result<Parts<'a>> {
-    let sum = |list: &[u32]| 12 * list.iter().map(|count| u64::from(*count)).sum::<u64>();
-    let (vertices, domains) = (sum(&head.vertices), 24 * head.domains.len() as u64);
-    for (field, given, whole) in [
-        ("vertices.position_bytes", head.position_bytes, vertices),
-        ("vertices.displacement_bytes", head.displacement_bytes, vertices),
-        ("vertices.box_bytes", head.box_bytes, domains),
-        ("vertices.origin_bytes", head.origin_bytes, domains),
+fn split_reply<'a>(head: &v1::VertexHead, bytes: &'a [u8]) -> Result<ReplySections<'a>> {
+    // Size of three f32 per item.
+    let float3_bytes = |counts: &[u32]| 12 * counts.iter().map(|count| u64::from(*count)).sum::<u64>();
+    let vertex_bytes = float3_bytes(&head.vertices);
+    let normal_bytes = float3_bytes(&head.corners);
+    // A box has six f32, an origin three f64.
+    let domain_bytes = 24 * head.domains.len() as u64;
+    for (field, section_bytes, complete_bytes) in [
+        ("vertices.position_bytes", head.position_bytes, vertex_bytes),
+        ("vertices.displacement_bytes", head.displacement_bytes, vertex_bytes),
+        ("vertices.box_bytes", head.box_bytes, domain_bytes),
+        ("vertices.origin_bytes", head.origin_bytes, domain_bytes),
     ] {
-        if given != 0 && given != whole {
-            return Err(malformed_reply(field, format!("0 or {whole}"), given));
+        if section_bytes != 0 && section_bytes != complete_bytes {
+            return Err(malformed_reply(field, format!("0 or {complete_bytes}"), section_bytes));
         }
     }
     let total = bytes.len() as u64;
-    let bare = head.position_bytes + head.displacement_bytes + head.box_bytes + head.origin_bytes;
-    if total != bare && total != bare + sum(&head.corners) {
-        let expected = format!("{bare} or {}", bare + sum(&head.corners));
+    let bytes_without_normals = head.position_bytes + head.displacement_bytes + head.box_bytes + head.origin_bytes;
+    let bytes_with_normals = bytes_without_normals + normal_bytes;
+    if total != bytes_without_normals && total != bytes_with_normals {
+        let expected = format!("{bytes_without_normals} or {bytes_with_normals}");
         return Err(malformed_reply("vertices.total", expected, total));
     }
     let (positions, rest) = bytes.split_at(head.position_bytes as usize);
-    let (normals, rest) = rest.split_at((total - bare) as usize);
+    let (normals, rest) = rest.split_at((total - bytes_without_normals) as usize);
     let (displacements, rest) = rest.split_at(head.displacement_bytes as usize);
     let (boxes, origins) = rest.split_at(head.box_bytes as usize);
-    Ok(Parts { positions, normals, displacements, boxes, origins })
+    Ok(ReplySections { positions, normals, displacements, boxes, origins })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn head(origin_bytes: u64) -> v1::VertexHead {
+    /// The head of a reply with two domains: one vertex and no corner, and no vertex and one corner.
+    fn two_domain_head(origin_bytes: u64) -> v1::VertexHead {
         v1::VertexHead {
             step: Some(v1::StepId::default()),
             origin: vec![1.0, 2.0, 3.0],
@@ -226,57 +237,65 @@ mod tests {
     }
 
     #[test]
-    fn a_set_reports_the_origin_of_each_domain() {
-        let floats = [1.5_f32, 2.5, 3.5, 0.0, 0.0, 1.0].into_iter().flat_map(f32::to_le_bytes);
+    fn vertex_set_reports_the_origin_of_each_domain() {
+        let vertex_and_normal = [1.5_f32, 2.5, 3.5, 0.0, 0.0, 1.0].into_iter().flat_map(f32::to_le_bytes);
         let origins = [1e7_f64, 0.0, -1.0, 8.0, 9.0, 1e300].into_iter().flat_map(f64::to_le_bytes);
-        let whole: Vec<u8> = floats.clone().chain(origins).collect();
-        let with_own = set(head(48), &whole).expect("fits");
-        assert_eq!((with_own.positions.as_slice(), with_own.normals.len()), ([1.5, 2.5, 3.5].as_slice(), 3));
-        assert_eq!([with_own.origin_of(0), with_own.origin_of(1)], [[1e7, 0.0, -1.0], [8.0, 9.0, 1e300]]);
-        let bare = set(head(48), &[&whole[..12], &whole[24..]].concat()).expect("without normals");
-        assert_eq!((bare.normals.len(), bare.origin_of(1)), (0, [8.0, 9.0, 1e300]));
-        let plain = set(head(0), &floats.collect::<Vec<u8>>()).expect("fits");
-        assert_eq!((plain.origins.len(), plain.origin_of(1)), (0, [1.0, 2.0, 3.0]));
+        let reply: Vec<u8> = vertex_and_normal.clone().chain(origins).collect();
+        let set = decode_vertex_set(two_domain_head(48), &reply).expect("a valid reply");
+        assert_eq!((set.positions.as_slice(), set.normals.len()), ([1.5, 2.5, 3.5].as_slice(), 3));
+        assert_eq!([set.domain_origin(0), set.domain_origin(1)], [[1e7, 0.0, -1.0], [8.0, 9.0, 1e300]]);
+        assert_eq!([set.float_range(0), set.float_range(1), set.float_range(2)], [Some(0..3), Some(3..3), None]);
+        let reply_without_normals = [&reply[..12], &reply[24..]].concat();
+        let set = decode_vertex_set(two_domain_head(48), &reply_without_normals).expect("a valid reply");
+        assert_eq!((set.normals.len(), set.domain_origin(1)), (0, [8.0, 9.0, 1e300]));
+        let reply_without_origins: Vec<u8> = vertex_and_normal.collect();
+        let set = decode_vertex_set(two_domain_head(0), &reply_without_origins).expect("a valid reply");
+        assert_eq!((set.domain_origins.len(), set.domain_origin(1)), (0, [1.0, 2.0, 3.0]));
     }
 
     #[test]
-    fn malformed_origins_are_refused_by_field() {
+    fn malformed_origins_report_their_field() {
         for (origin_bytes, length, field) in
             [(24, 48, "origin_bytes"), (u64::MAX, 72, "origin_bytes"), (48, 24, "total"), (0, 72, "total")]
         {
-            let refusal = set(head(origin_bytes), &vec![0; length]).expect_err(field).to_string();
-            assert!(refusal.contains(field), "{refusal}");
+            let error =
+                decode_vertex_set(two_domain_head(origin_bytes), &vec![0; length]).expect_err(field).to_string();
+            assert!(error.contains(field), "{error}");
         }
     }
 
     #[test]
     fn displacements_and_boxes_follow_optional_vertices() {
-        let bytes = |from: u16, count: u16| (from..from + count).flat_map(|at| f32::from(at).to_le_bytes());
-        let readback = |positions: bool| v1::VertexHead {
-            position_bytes: if positions { 12 } else { 0 },
+        let float_bytes = |first: u16, count: u16| (first..first + count).flat_map(|x| f32::from(x).to_le_bytes());
+        let head = |position_bytes| v1::VertexHead {
+            position_bytes,
             displacement_bytes: 12,
             box_bytes: 48,
-            ..head(0)
+            ..two_domain_head(0)
         };
-        let with_all: Vec<u8> = bytes(0, 3).chain(bytes(10, 3)).chain(bytes(20, 3)).chain(bytes(30, 12)).collect();
-        let all = set(readback(true), &with_all).expect("fits");
-        assert_eq!((all.positions.as_slice(), all.normals.as_slice()), (&[0.0, 1.0, 2.0][..], &[10.0, 11.0, 12.0][..]));
-        assert_eq!(all.displacements, [20.0, 21.0, 22.0]);
-        let want = [[[30.0, 31.0, 32.0], [33.0, 34.0, 35.0]], [[36.0, 37.0, 38.0], [39.0, 40.0, 41.0]]];
-        assert_eq!(all.boxes, want);
-        let alone = set(readback(false), &with_all[24..]).expect("fits");
-        assert_eq!((alone.displacements, alone.boxes), (all.displacements, all.boxes));
-        assert!(alone.positions.is_empty() && alone.normals.is_empty());
-        for (spoil, field) in [
-            ((0, 12, 24), "box_bytes"),
-            ((0, 24, 48), "displacement_bytes"),
-            ((24, 12, 48), "position_bytes"),
-            ((12, 0, 0), "total"),
+        let positions_and_normals = float_bytes(0, 3).chain(float_bytes(10, 3));
+        let reply: Vec<u8> = positions_and_normals.chain(float_bytes(20, 3)).chain(float_bytes(30, 12)).collect();
+        let set = decode_vertex_set(head(12), &reply).expect("a valid reply");
+        assert_eq!((set.positions.as_slice(), set.normals.as_slice()), (&[0.0, 1.0, 2.0][..], &[10.0, 11.0, 12.0][..]));
+        assert_eq!(set.displacements, [20.0, 21.0, 22.0]);
+        let boxes = [[[30.0, 31.0, 32.0], [33.0, 34.0, 35.0]], [[36.0, 37.0, 38.0], [39.0, 40.0, 41.0]]];
+        assert_eq!(set.boxes, boxes);
+        let set_without_vertices = decode_vertex_set(head(0), &reply[24..]).expect("a valid reply");
+        assert_eq!((set_without_vertices.displacements, set_without_vertices.boxes), (set.displacements, set.boxes));
+        assert!(set_without_vertices.positions.is_empty() && set_without_vertices.normals.is_empty());
+    }
+
+    #[test]
+    fn malformed_sizes_report_their_field() {
+        for (position_bytes, displacement_bytes, box_bytes, field) in [
+            (0, 12, 24, "box_bytes"),
+            (0, 24, 48, "displacement_bytes"),
+            (24, 12, 48, "position_bytes"),
+            (12, 0, 0, "total"),
         ] {
-            let (position_bytes, displacement_bytes, box_bytes) = spoil;
-            let head = v1::VertexHead { position_bytes, displacement_bytes, box_bytes, ..head(0) };
-            let refusal = set(head, &with_all).expect_err(field).to_string();
-            assert!(refusal.contains(field), "{refusal}");
+            let head = v1::VertexHead { position_bytes, displacement_bytes, box_bytes, ..two_domain_head(0) };
+            let error = decode_vertex_set(head, &[0; 84]).expect_err(field).to_string();
+            assert!(error.contains(field), "{error}");
         }
     }
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use fake::{FakeDomain, FakeServer, serve};
 use modalcast_client::{
-    Array, Client, DrawnBy, Error, FrameFormat, FrameRequest, FrameStreamRequest, Picture, Policy, Step,
+    Client, DomainArray, DrawnBy, Error, FrameFormat, FrameRequest, FrameStreamRequest, Picture, Policy, Step,
 };
 use modalcast_client::{VertexRequest, VertexSelection, VertexStreamRequest};
 use tokio::sync::Semaphore;
@@ -32,17 +32,19 @@ async fn connected(world: FakeServer) -> (Arc<FakeServer>, Client) {
 #[tokio::test]
 async fn arrays_and_modes_above_4_mib_arrive_complete() {
     let (world, client) = connected(world(300_000)).await;
-    let described =
-        client.describe("toy", &[Array::RestPositions, Array::Indices, Array::Uvs]).await.expect("describes");
+    let described = client
+        .describe("toy", &[DomainArray::RestPositions, DomainArray::Indices, DomainArray::Uvs])
+        .await
+        .expect("describes");
     assert_eq!(described.domains[0].rest_positions, world.domains[0].rest);
-    assert_eq!(described.domains[0].indices.len(), 3 * described.domains[0].triangles);
+    assert_eq!(described.domains[0].indices.len(), 3 * described.domains[0].triangle_count);
     assert!(described.domains[0].uvs.is_empty());
-    let rows = client.modes("toy", 0, &[]).await.expect("reads");
+    let rows = client.read_modes("toy", 0, &[]).await.expect("reads");
     assert_eq!((rows.rank, &rows.rows), (2, &world.domains[0].modes));
-    let chosen = client.modes("toy", 0, &[7, 2]).await.expect("reads");
+    let chosen = client.read_modes("toy", 0, &[7, 2]).await.expect("reads");
     assert_eq!((chosen.rows_of(0), chosen.rows_of(1)), (Some(&rows.rows[42..48]), Some(&rows.rows[12..18])));
     assert_eq!(chosen.rows_of(2), None);
-    let refusal = client.with_reply_limit(1000).modes("toy", 0, &[]).await.expect_err("too much").to_string();
+    let refusal = client.with_reply_limit(1000).read_modes("toy", 0, &[]).await.expect_err("too much").to_string();
     assert!(refusal.contains("modes.total") && refusal.contains("1000"), "{refusal}");
 }
 
@@ -53,7 +55,7 @@ async fn frame_above_4_mib_arrives_complete_and_names_its_step() {
     drive.step(&Step::new(5, 0.1).q(0, &[1.0, 2.0])).await.expect("sent");
     drive.flush().await.expect("acknowledged");
     let request = FrameRequest::new("toy", picture(1920, 1080)).minimum_step(5);
-    let frame = client.frame(&request).await.expect("comes");
+    let frame = client.render_frame(&request).await.expect("comes");
     assert_eq!((frame.step.number, frame.width, frame.bytes.len()), (5, 1920, 1920 * 1080 * 4));
     assert!(frame.bytes.iter().all(|byte| *byte == 5));
     assert_eq!(frame.stages, [("draw".to_owned(), 2.0)]);
@@ -78,7 +80,7 @@ async fn subscription_before_the_first_step_receives_every_step() {
     for number in 0..20 {
         assert_eq!(frames.next().await.expect("a frame").expect("whole").step.number, number);
         let set = sets.next().await.expect("a set").expect("whole");
-        assert_eq!((set.step.number, set.range(0)), (number, 0..12));
+        assert_eq!((set.step.number, set.float_range(0)), (number, Some(0..12)));
         assert_eq!(set.positions[3], 3.0 + 6.0 * number as f32);
     }
     assert!(frames.next().await.is_none() && sets.next().await.is_none());
@@ -136,9 +138,9 @@ async fn refused_calls_report_the_details_of_the_server() {
     let (_, client) = connected(world(4)).await;
     for error in [
         client.describe("none", &[]).await.expect_err("unknown"),
-        client.modes("none", 0, &[]).await.expect_err("unknown"),
-        client.frame(&FrameRequest::new("none", Picture::default())).await.expect_err("unknown"),
-        client.vertices(&VertexRequest::new("none", VertexSelection::default())).await.expect_err("unknown"),
+        client.read_modes("none", 0, &[]).await.expect_err("unknown"),
+        client.render_frame(&FrameRequest::new("none", Picture::default())).await.expect_err("unknown"),
+        client.get_vertices(&VertexRequest::new("none", VertexSelection::default())).await.expect_err("unknown"),
         client.open_scene("none", "").await.expect_err("unknown"),
     ] {
         let Error::Status { code, .. } = &error else { panic!("{error}") };

@@ -65,7 +65,7 @@ mod tests {
         let path = folder.path().join("rows.npy");
         let mut writer = modalcast_client::npy::Writer::create(&path, &[2, 2]).expect("created");
         for row in [[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]] {
-            writer.row(&row).expect("written");
+            writer.write_row(&row).expect("written");
         }
         writer.finish().expect("closed");
         let records = StepRecords::read(&path).expect("read");

@@ -15,8 +15,8 @@ Examples:
 `frames`, and `vertices` with --count, print the line `ready` on standard output when the server has accepted the
 subscription. A physics process that starts after that line loses no step.
 
-Exit codes: 0 done; 1 refused by the server; 2 invalid command line; 3 no connection, or connection lost; 4 error of a
-local file; 5 the reply was malformed, ended early or did not arrive in time.";
+Exit codes: 0 done; 1 rejected by the server; 2 invalid command line; 3 connection failed or lost; 4 local file error;
+5 malformed, truncated or late reply.";
 
 /// Saves frames or vertices of a modalcast server.
 #[derive(Debug, Parser)]
@@ -26,7 +26,7 @@ pub(crate) struct Cli {
     #[arg(long, global = true, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
     /// How long to retry until the server answers, in seconds.
-    #[arg(long, global = true, default_value_t = 0.0, value_parser = seconds)]
+    #[arg(long, global = true, default_value_t = 0.0, value_parser = parse_seconds)]
     pub(crate) wait: f64,
     /// Print a machine-readable summary on standard output.
     #[arg(long, global = true)]
@@ -64,7 +64,7 @@ pub(crate) struct SceneOptions {
     /// The scene's name on the server.
     #[arg(long)]
     pub(crate) scene: String,
-    /// First open this source of the server's repository under the name of --scene.
+    /// Source in the server's repository to open first, under the name of --scene.
     #[arg(long, value_name = "SOURCE")]
     pub(crate) open: Option<String>,
 }
@@ -73,28 +73,28 @@ pub(crate) struct SceneOptions {
 #[derive(Debug, Args)]
 pub(crate) struct PictureOptions {
     /// Image size in pixels.
-    #[arg(long, default_value = "1280x720", value_name = "WxH", value_parser = size)]
+    #[arg(long, default_value = "1280x720", value_name = "WxH", value_parser = parse_size)]
     size: (u32, u32),
-    /// What the picture shows: color, depth (f32 meters), domains (u32), normals (3 f32), or a color map with legend.
+    /// Content of the picture: color, depth (f32 meters), domains (u32), normals (3 f32), or a color map with a legend.
     #[arg(long, value_enum, default_value = "color")]
     output: OutputOption,
     /// Index of the column of U for `--output mode-shape`, from 0.
     #[arg(long, requires = "output", default_value_t = 0)]
     mode: u32,
-    /// Value at the bright end of the color map; 0 fits it to each frame.
-    #[arg(long, requires = "output", default_value_t = 0.0)]
-    largest: f64,
+    /// Value at the bright end of the color map; 0 selects the maximum of each frame.
+    #[arg(long = "largest", value_name = "VALUE", requires = "output", default_value_t = 0.0)]
+    scale_max: f64,
     /// Encoding of color pictures: PNG, or raw RGBA8 (top row first, sRGB).
     #[arg(long, value_enum, default_value = "png")]
     pub(crate) format: FormatOption,
     /// Position of the camera in scene units. Default: a camera that frames the scene.
-    #[arg(long, value_name = "X,Y,Z", value_parser = point, requires = "target", allow_hyphen_values = true)]
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_vector, requires = "target", allow_hyphen_values = true)]
     eye: Option<[f64; 3]>,
     /// Point that the camera looks at, in scene units.
-    #[arg(long, value_name = "X,Y,Z", value_parser = point, requires = "eye", allow_hyphen_values = true)]
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_vector, requires = "eye", allow_hyphen_values = true)]
     target: Option<[f64; 3]>,
     /// Up direction of the camera.
-    #[arg(long, value_name = "X,Y,Z", value_parser = point, default_value = "0,1,0", allow_hyphen_values = true)]
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_vector, default_value = "0,1,0", allow_hyphen_values = true)]
     up: [f64; 3],
     /// Vertical field of view in degrees. Default: 35.
     #[arg(long, requires = "eye", value_name = "DEGREES")]
@@ -126,14 +126,14 @@ impl PictureOptions {
             FormatOption::Png => FrameFormat::Png,
             FormatOption::Raw => FrameFormat::Rgba,
         };
-        let (mode, largest) = (self.mode, self.largest);
+        let (mode, scale_max) = (self.mode, self.scale_max);
         let output = match self.output {
             OutputOption::Color => Output::Color,
             OutputOption::Depth => Output::Depth,
             OutputOption::Domains => Output::Domains,
             OutputOption::Normals => Output::Normals,
-            OutputOption::Displacement => Output::Displacement { largest },
-            OutputOption::ModeShape => Output::ModeShape { mode, largest },
+            OutputOption::Displacement => Output::Displacement { scale_max },
+            OutputOption::ModeShape => Output::ModeShape { mode, scale_max },
         };
         Picture { width: self.size.0, height: self.size.1, format, camera, output }
     }
@@ -166,21 +166,21 @@ pub(crate) struct FramesOptions {
     /// Folder for frame_00000.png and so on; created if it does not exist.
     #[arg(long, value_name = "DIR")]
     pub(crate) out: PathBuf,
-    /// Receive every step, or the newest.
+    /// lossless: receive every step; latest: skip to the newest step.
     #[arg(long, value_enum, default_value = "lossless")]
     pub(crate) delivery: DeliveryOption,
     /// How long to wait for the next frame, in seconds.
-    #[arg(long, default_value_t = 120.0, value_parser = seconds)]
+    #[arg(long, default_value_t = 120.0, value_parser = parse_seconds)]
     pub(crate) timeout: f64,
 }
 
 /// Options that select the step.
 #[derive(Debug, Args)]
 pub(crate) struct StepOptions {
-    /// Exactly this step of the current run.
+    /// Number of the step in the current run.
     #[arg(long, conflicts_with = "min_step")]
     pub(crate) step: Option<u64>,
-    /// This step of the current run or a later one.
+    /// Smallest accepted step number in the current run: the reply has this step or a later one.
     #[arg(long)]
     pub(crate) min_step: Option<u64>,
     /// How long the server may wait for the step, in milliseconds; 0 selects the server's default.
@@ -220,44 +220,43 @@ pub(crate) struct VerticesOptions {
     /// NumPy file for normals, float32, steps x corners x 3.
     #[arg(long, value_name = "FILE.npy")]
     pub(crate) normals: Option<PathBuf>,
-    /// NumPy file for u = U q, float32, steps x vertices x 3; for scenes that keep displacements.
+    /// NumPy file for u = U q, float32, steps x vertices x 3. Requires deform.displacements in scene.toml.
     #[arg(long, value_name = "FILE.npy")]
     pub(crate) displacements: Option<PathBuf>,
-    /// NumPy file for bounding boxes, float32, steps x domains x 2 x 3; for scenes that keep boxes.
+    /// NumPy file for bounding boxes, float32, steps x domains x 2 x 3. Requires deform.boxes in scene.toml.
     #[arg(long, value_name = "FILE.npy")]
     pub(crate) boxes: Option<PathBuf>,
-    /// Domain indices, separated by commas; default all.
+    /// Domain indices, separated by commas. Default: all domains.
     #[arg(long, value_delimiter = ',')]
     pub(crate) domains: Vec<u32>,
-    /// Subscribe, and save this number of steps.
+    /// Number of steps to receive by a subscription. Default: one step, without a subscription.
     #[arg(long, conflicts_with_all = ["step", "min_step"], value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) count: Option<u64>,
-    /// Receive every step, or the newest.
+    /// lossless: receive every step; latest: skip to the newest step.
     #[arg(long, value_enum, default_value = "lossless")]
     pub(crate) delivery: DeliveryOption,
     /// How long to wait for the next step, in seconds.
-    #[arg(long, default_value_t = 120.0, value_parser = seconds)]
+    #[arg(long, default_value_t = 120.0, value_parser = parse_seconds)]
     pub(crate) timeout: f64,
 }
 
-fn size(text: &str) -> Result<(u32, u32), String> {
-    let parsed = text.split_once('x').and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
-    parsed
-        .filter(|(width, height)| *width > 0 && *height > 0)
-        .ok_or_else(|| "expected WIDTHxHEIGHT, such as 1280x720".into())
+fn parse_size(text: &str) -> Result<(u32, u32), String> {
+    let size = text.split_once('x').and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
+    size.filter(|(width, height)| *width > 0 && *height > 0)
+        .ok_or_else(|| "expected WIDTHxHEIGHT with positive integers, such as 1280x720".into())
 }
 
-fn point(text: &str) -> Result<[f64; 3], String> {
+fn parse_vector(text: &str) -> Result<[f64; 3], String> {
     let numbers: Option<Vec<f64>> = text.split(',').map(|number| number.trim().parse().ok()).collect();
-    let point = numbers.and_then(|numbers| <[f64; 3]>::try_from(numbers).ok());
-    point
-        .filter(|numbers| numbers.iter().all(|number| number.is_finite()))
+    let vector = numbers.and_then(|numbers| <[f64; 3]>::try_from(numbers).ok());
+    vector
+        .filter(|vector| vector.iter().all(|component| component.is_finite()))
         .ok_or_else(|| "expected three finite numbers X,Y,Z".into())
 }
 
-fn seconds(text: &str) -> Result<f64, String> {
-    let parsed = text.parse().ok().filter(|number| (0.0..=1e6).contains(number));
-    parsed.ok_or_else(|| "expected seconds, 0 to 1000000".into())
+fn parse_seconds(text: &str) -> Result<f64, String> {
+    let seconds = text.parse().ok().filter(|seconds| (0.0..=1e6).contains(seconds));
+    seconds.ok_or_else(|| "expected seconds, 0 to 1000000".into())
 }
 
 #[cfg(test)]
@@ -271,15 +270,19 @@ mod tests {
     }
 
     #[test]
-    fn sizes_and_points_are_parsed_and_invalid_ones_refused() {
-        assert_eq!(size("1280x720"), Ok((1280, 720)));
-        assert_eq!(point("1, -2,.5"), Ok([1.0, -2.0, 0.5]));
-        for wrong in ["", "1280", "0x5", "-1x5", "axb", "5x5x5"] {
-            assert!(size(wrong).is_err(), "{wrong}");
+    fn valid_sizes_and_vectors_are_parsed() {
+        assert_eq!(parse_size("1280x720"), Ok((1280, 720)));
+        assert_eq!(parse_vector("1, -2,.5"), Ok([1.0, -2.0, 0.5]));
+    }
+
+    #[test]
+    fn invalid_sizes_vectors_and_seconds_are_rejected() {
+        for text in ["", "1280", "0x5", "-1x5", "axb", "5x5x5"] {
+            assert!(parse_size(text).is_err(), "{text}");
         }
-        for wrong in ["", "1,2", "1,2,3,4", "1,2,nan", "inf,0,0"] {
-            assert!(point(wrong).is_err(), "{wrong}");
+        for text in ["", "1,2", "1,2,3,4", "1,2,nan", "inf,0,0"] {
+            assert!(parse_vector(text).is_err(), "{text}");
         }
-        assert!(seconds("-1").is_err() && seconds("nan").is_err());
+        assert!(parse_seconds("-1").is_err() && parse_seconds("nan").is_err());
     }
 }

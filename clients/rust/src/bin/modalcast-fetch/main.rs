@@ -16,18 +16,18 @@ use cli::{Cli, Command};
 
 fn main() -> ExitCode {
     let arguments = Cli::parse();
-    program::run("modalcast-fetch", async { run(&arguments).await.map(|()| 0) }, program::exit_code)
+    program::run("modalcast-fetch", async { run_command(&arguments).await.map(|()| 0) }, program::exit_code)
 }
 
-async fn run(arguments: &Cli) -> Result<()> {
+async fn run_command(arguments: &Cli) -> Result<()> {
     let client = Client::connect_with_retry(&arguments.server, Duration::from_secs_f64(arguments.wait)).await?;
     let json = arguments.json;
     match &arguments.command {
-        Command::Frames(options) => frames::stream(&client, options, json).await,
-        Command::Frame(options) => frames::single(&client, options, json).await,
+        Command::Frames(options) => frames::fetch_stream(&client, options, json).await,
+        Command::Frame(options) => frames::fetch_single(&client, options, json).await,
         Command::Vertices(options) => vertices::fetch(&client, options, json).await,
-        Command::Info => output::info(&client, json).await,
-        Command::List => output::list(&client, json).await,
+        Command::Info => output::print_info(&client, json).await,
+        Command::List => output::print_list(&client, json).await,
         Command::Close { scene } => client.delete_scene(scene).await,
     }
 }

@@ -3,12 +3,12 @@
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use modalcast_client::{Client, Result, SceneInfo, StageSamples, StageTimes, StepId};
+use modalcast_client::{Client, Result, SceneInfo, SceneList, StageSamples, StageTimes, StepId};
 use serde_json::{Value, json};
 
 use crate::cli::SceneOptions;
 
-/// A received reply, as the summary counts it.
+/// Step, size and times of a received reply.
 pub(crate) struct ReceivedStep<'a> {
     pub(crate) step: StepId,
     pub(crate) bytes: u64,
@@ -16,11 +16,17 @@ pub(crate) struct ReceivedStep<'a> {
     pub(crate) stages: &'a StageTimes,
 }
 
+#[derive(Clone, Copy)]
+struct ReplyTimes {
+    first: Instant,
+    newest: Instant,
+}
+
 /// Totals of the received frames or vertices.
 pub(crate) struct Summary {
     start: Instant,
-    /// The times at which the first and the newest reply were complete.
-    replies: Option<(Instant, Instant)>,
+    /// When the first and the newest reply were complete.
+    reply_times: Option<ReplyTimes>,
     steps: Vec<u64>,
     runs: Vec<u64>,
     bytes: u64,
@@ -32,7 +38,7 @@ impl Summary {
     pub(crate) fn new() -> Self {
         Self {
             start: Instant::now(),
-            replies: None,
+            reply_times: None,
             steps: vec![],
             runs: vec![],
             bytes: 0,
@@ -44,7 +50,7 @@ impl Summary {
     /// Counts one reply.
     pub(crate) fn add(&mut self, reply: &ReceivedStep<'_>) {
         let now = Instant::now();
-        self.replies = Some((self.replies.map_or(now, |(first, _)| first), now));
+        self.reply_times = Some(ReplyTimes { first: self.reply_times.map_or(now, |times| times.first), newest: now });
         self.runs.push(reply.step.run);
         self.steps.push(reply.step.number);
         self.bytes += reply.bytes;
@@ -52,21 +58,23 @@ impl Summary {
         self.stages.add(reply.stages);
     }
 
-    /// Replies per second from the first to the last, which excludes the wait for the first; 0 for fewer than two.
-    fn rate(&self) -> f64 {
-        let seconds = self.replies.map_or(0.0, |(first, last)| (last - first).as_secs_f64());
+    /// Replies per second from the first to the newest reply, without the wait for the first; 0 for fewer than two
+    /// replies.
+    fn replies_per_second(&self) -> f64 {
+        let seconds = self.reply_times.map_or(0.0, |times| (times.newest - times.first).as_secs_f64());
         if seconds > 0.0 { (self.steps.len() - 1) as f64 / seconds } else { 0.0 }
     }
 
-    /// Prints the number of `what` (frames, steps), the output path, and the origin of vertices in meters.
-    pub(crate) fn print(self, what: &str, out: &std::path::Path, origin: Option<Vec<f64>>, json: bool) {
-        let rate = self.rate();
+    /// Prints the number of replies under the name `unit` (frames, steps), the output path, and the origin of vertices in
+    /// meters.
+    pub(crate) fn print(self, unit: &str, out: &std::path::Path, origin: Option<Vec<f64>>, json: bool) {
+        let rate = self.replies_per_second();
         let medians = self.stages.medians();
         let elapsed = self.start.elapsed().as_secs_f64();
         let count = self.steps.len();
         if json {
             let mut summary = json!({
-                what: count, "out": out.display().to_string(), "steps": self.steps, "runs": self.runs,
+                unit: count, "out": out.display().to_string(), "steps": self.steps, "runs": self.runs,
                 "bytes": self.bytes, "skipped": self.skipped, "elapsed_s": elapsed,
                 "per_second": rate, "stages_ms": medians,
             });
@@ -77,7 +85,7 @@ impl Summary {
             return;
         }
         let (bytes, skipped) = (self.bytes, self.skipped);
-        println!("{count} {what}, {bytes} bytes, {elapsed:.2} s ({rate:.1}/s), {skipped} skipped: {}", out.display());
+        println!("{count} {unit}, {bytes} bytes, {elapsed:.2} s ({rate:.1}/s), {skipped} skipped: {}", out.display());
         for (stage, milliseconds) in medians {
             println!("  {stage:8} {milliseconds:8.3} ms (median)");
         }
@@ -85,20 +93,21 @@ impl Summary {
 }
 
 /// A progress bar on standard error; hidden unless standard error is a terminal.
-pub(crate) fn bar(count: u64, what: &'static str) -> ProgressBar {
+pub(crate) fn create_progress_bar(count: u64, unit: &'static str) -> ProgressBar {
     let style = ProgressStyle::with_template("{msg} [{bar:32}] {pos}/{len} {per_sec} eta {eta}");
-    ProgressBar::new(count).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())).with_message(what)
+    ProgressBar::new(count).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())).with_message(unit)
 }
 
-/// With `--open`, opens the scene first. Returns the name for other calls.
-pub(crate) async fn scene(client: &Client, options: &SceneOptions) -> Result<String> {
+/// Opens the scene if `--open` is given. Returns its name on the server.
+pub(crate) async fn open_scene(client: &Client, options: &SceneOptions) -> Result<String> {
     match &options.open {
         None => Ok(options.scene.clone()),
         Some(source) => Ok(client.open_scene(source, &options.scene).await?.scene),
     }
 }
 
-pub(crate) async fn info(client: &Client, json: bool) -> Result<()> {
+/// Prints backend, renderer and limits of the server.
+pub(crate) async fn print_info(client: &Client, json: bool) -> Result<()> {
     let info = client.server_info().await?;
     let limits = &info.limits;
     if json {
@@ -106,39 +115,40 @@ pub(crate) async fn info(client: &Client, json: bool) -> Result<()> {
             "message_bytes": limits.message_bytes, "frame_side": limits.frame_side, "scenes": limits.scenes,
             "window": limits.window, "upload_bytes": limits.upload_bytes, "deadline_ms": limits.deadline_ms,
         });
-        let value = json!({
+        let summary = json!({
             "version": info.version, "backend": info.backend, "device": info.device, "renderer": info.renderer,
-            "software": info.software, "limits": limits,
+            "software": info.is_software_renderer, "limits": limits,
         });
-        println!("{value}");
+        println!("{summary}");
         return Ok(());
     }
-    let how = if info.software { "software" } else { "hardware" };
+    let renderer_kind = if info.is_software_renderer { "software" } else { "hardware" };
     println!("modalcast {}\nbackend   {} ({})", info.version, info.backend, info.device);
-    println!("renderer  {} ({how})", info.renderer);
+    println!("renderer  {} ({renderer_kind})", info.renderer);
     println!("message   at most {} bytes", limits.message_bytes);
     println!("frame     at most {} pixels a side", limits.frame_side);
     println!("scenes    at most {}", limits.scenes);
     println!("window    at most {} steps", limits.window);
     println!("upload    at most {} bytes", limits.upload_bytes);
-    println!("deadline  {} ms unless a request says otherwise", limits.deadline_ms);
+    println!("deadline  {} ms by default", limits.deadline_ms);
     Ok(())
 }
 
-pub(crate) async fn list(client: &Client, json: bool) -> Result<()> {
-    let (scenes, sources) = client.list_scenes().await?;
+/// Prints the open scenes and the available sources.
+pub(crate) async fn print_list(client: &Client, json: bool) -> Result<()> {
+    let SceneList { scenes, sources } = client.list_scenes().await?;
     if json {
         let scenes: Vec<_> = scenes.iter().map(scene_json).collect();
         println!("{}", json!({ "scenes": scenes, "sources": sources }));
         return Ok(());
     }
     for scene in scenes {
-        let last =
+        let last_step =
             scene.last_step.map_or("no step yet".into(), |step| format!("step {} of run {}", step.number, step.run));
-        let counts = (scene.domains, scene.vertices, scene.triangles, scene.coordinates);
+        let SceneInfo { scene: name, source, domains, vertices, triangles, coordinates, .. } = scene;
         println!(
-            "{} ({}): {} domains, {} vertices, {} triangles, {} coordinates, {last}",
-            scene.scene, scene.source, counts.0, counts.1, counts.2, counts.3
+            "{name} ({source}): {domains} domains, {vertices} vertices, {triangles} triangles, {coordinates} \
+             coordinates, {last_step}"
         );
     }
     for source in sources {
@@ -148,11 +158,11 @@ pub(crate) async fn list(client: &Client, json: bool) -> Result<()> {
 }
 
 fn scene_json(scene: &SceneInfo) -> Value {
-    let last = scene.last_step.map(|step| json!({ "run": step.run, "number": step.number, "time": step.time }));
+    let last_step = scene.last_step.map(|step| json!({ "run": step.run, "number": step.number, "time": step.time }));
     json!({
         "scene": scene.scene, "source": scene.source, "domains": scene.domains, "vertices": scene.vertices,
         "corners": scene.corners, "triangles": scene.triangles, "coordinates": scene.coordinates, "up": scene.up,
-        "unit": scene.unit, "origin": scene.origin, "bounds": scene.bounds, "last_step": last,
+        "unit": scene.unit, "origin": scene.origin, "bounds": scene.bounds, "last_step": last_step,
         "remarks": scene.remarks,
     })
 }
@@ -162,16 +172,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_rate_counts_from_the_first_reply_to_the_last() {
+    fn rate_counts_from_the_first_reply_to_the_newest() {
         let mut summary = Summary::new();
-        assert_eq!(summary.rate(), 0.0);
+        assert_eq!(summary.replies_per_second(), 0.0);
         for step in 0..3 {
             let step = StepId { run: 1, number: step, time: 0.0 };
             summary.add(&ReceivedStep { step, bytes: 8, skipped: 0, stages: &vec![] });
         }
         let start = summary.start;
-        let after = |seconds| start + std::time::Duration::from_secs(seconds);
-        summary.replies = Some((after(60), after(64)));
-        assert_eq!(summary.rate(), 0.5);
+        let time = |seconds| start + std::time::Duration::from_secs(seconds);
+        summary.reply_times = Some(ReplyTimes { first: time(60), newest: time(64) });
+        assert_eq!(summary.replies_per_second(), 0.5);
     }
 }

@@ -1,49 +1,49 @@
-//! Saves vertices as NumPy files, with one row of vertices x 3 per step.
+//! Saves vertices as NumPy files. Each step adds one row to every file, for positions of shape vertices x 3.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use modalcast_client::npy::Writer;
+use modalcast_client::npy::Writer as NpyWriter;
 use modalcast_client::{Client, Error, Result, VertexRequest, VertexSelection, VertexSet, VertexStreamRequest};
 
 use crate::cli::VerticesOptions;
-use crate::output::{ReceivedStep, Summary, bar, scene};
+use crate::output::{ReceivedStep, Summary, create_progress_bar, open_scene};
 
 pub(crate) async fn fetch(client: &Client, options: &VerticesOptions, json: bool) -> Result<()> {
-    let name = scene(client, &options.scene).await?;
-    let mut files = Files { options, open: Vec::new(), origin: vec![], summary: Summary::new() };
+    let scene = open_scene(client, &options.scene).await?;
+    let mut files = OutputFiles { options, writers: Vec::new(), origin: vec![], summary: Summary::new() };
     match options.count {
-        None => files.add(&single(client, options, &name).await?)?,
-        Some(count) => stream(client, &name, count, &mut files).await?,
+        None => files.write_set(&fetch_single(client, options, &scene).await?)?,
+        Some(count) => fetch_stream(client, &scene, count, &mut files).await?,
     }
     files.finish(json)
 }
 
-async fn single(client: &Client, options: &VerticesOptions, scene: &str) -> Result<VertexSet> {
-    let request = VertexRequest::new(scene, selection(options));
-    let request = request.at(options.step.selector()).deadline_ms(options.step.deadline_ms);
-    client.vertices(&request).await
+async fn fetch_single(client: &Client, options: &VerticesOptions, scene: &str) -> Result<VertexSet> {
+    let request = VertexRequest::new(scene, vertex_selection(options));
+    let request = request.step(options.step.selector()).deadline_ms(options.step.deadline_ms);
+    client.get_vertices(&request).await
 }
 
-async fn stream(client: &Client, scene: &str, count: u64, files: &mut Files<'_>) -> Result<()> {
+async fn fetch_stream(client: &Client, scene: &str, count: u64, files: &mut OutputFiles<'_>) -> Result<()> {
     let options = files.options;
-    let request = VertexStreamRequest::new(scene, selection(options));
+    let request = VertexStreamRequest::new(scene, vertex_selection(options));
     let request = request.delivery(options.delivery.into()).replies(count);
-    let mut sets = client.stream_vertices(&request).await?;
+    let mut vertex_stream = client.stream_vertices(&request).await?;
     println!("ready");
     let timeout = Duration::from_secs_f64(options.timeout);
-    let bar = bar(count, "steps");
+    let progress_bar = create_progress_bar(count, "steps");
     for _ in 0..count {
-        let late = Error::Deadline { what: "the next step", ms: timeout.as_millis() as u64 };
-        let next = tokio::time::timeout(timeout, sets.next()).await.map_err(|_| late)?;
-        files.add(&next.unwrap_or(Err(Error::StreamEnded { what: "the last step" }))?)?;
-        bar.inc(1);
+        let deadline_error = Error::Deadline { what: "the next step", ms: timeout.as_millis() as u64 };
+        let result = tokio::time::timeout(timeout, vertex_stream.next()).await.map_err(|_| deadline_error)?;
+        files.write_set(&result.unwrap_or(Err(Error::StreamEnded { what: "the last step" }))?)?;
+        progress_bar.inc(1);
     }
-    bar.finish_and_clear();
+    progress_bar.finish_and_clear();
     Ok(())
 }
 
-fn selection(options: &VerticesOptions) -> VertexSelection {
+fn vertex_selection(options: &VerticesOptions) -> VertexSelection {
     VertexSelection {
         domains: options.domains.clone(),
         positions_only: options.normals.is_none(),
@@ -53,56 +53,58 @@ fn selection(options: &VerticesOptions) -> VertexSelection {
     }
 }
 
-/// One step of an array that is saved.
+/// The values of one step of an array.
 struct ArrayRow<'a> {
-    file: &'a Path,
+    path: &'a Path,
     shape: Vec<usize>,
     numbers: &'a [f32],
 }
 
+/// The rows of all arrays that the options select.
 fn array_rows<'a>(options: &'a VerticesOptions, set: &'a VertexSet) -> Vec<ArrayRow<'a>> {
     let boxes = set.boxes.as_flattened().as_flattened();
-    let triples = |file: Option<&'a PathBuf>, numbers: &'a [f32]| {
-        file.map(|file| ArrayRow { file, shape: vec![numbers.len() / 3, 3], numbers })
+    let vector_row = |path: Option<&'a PathBuf>, numbers: &'a [f32]| {
+        path.map(|path| ArrayRow { path, shape: vec![numbers.len() / 3, 3], numbers })
     };
-    let all = [
-        triples(Some(&options.out), &set.positions),
-        triples(options.normals.as_ref(), &set.normals),
-        triples(options.displacements.as_ref(), &set.displacements),
-        options.boxes.as_ref().map(|file| ArrayRow { file, shape: vec![boxes.len() / 6, 2, 3], numbers: boxes }),
+    let rows = [
+        vector_row(Some(&options.out), &set.positions),
+        vector_row(options.normals.as_ref(), &set.normals),
+        vector_row(options.displacements.as_ref(), &set.displacements),
+        options.boxes.as_ref().map(|path| ArrayRow { path, shape: vec![boxes.len() / 6, 2, 3], numbers: boxes }),
     ];
-    all.into_iter().flatten().collect()
+    rows.into_iter().flatten().collect()
 }
 
-/// The output files. They are created with the first step, which has the number of vertices.
-struct Files<'a> {
+/// The output files. They are created at the first step, when the number of vertices is known.
+struct OutputFiles<'a> {
     options: &'a VerticesOptions,
-    open: Vec<Writer>,
+    /// One per array, in the order of [`array_rows`]; empty before the first step.
+    writers: Vec<NpyWriter>,
     /// The origin of the first step. All rows of one array must have the same origin.
     origin: Vec<f64>,
     summary: Summary,
 }
 
-impl Files<'_> {
-    fn add(&mut self, set: &VertexSet) -> Result<()> {
+impl OutputFiles<'_> {
+    fn write_set(&mut self, set: &VertexSet) -> Result<()> {
         let rows = array_rows(self.options, set);
-        if self.open.is_empty() {
-            self.open = rows.iter().map(|row| Writer::create(row.file, &row.shape)).collect::<Result<_>>()?;
+        if self.writers.is_empty() {
+            self.writers = rows.iter().map(|row| NpyWriter::create(row.path, &row.shape)).collect::<Result<_>>()?;
             self.origin = set.origin.clone();
         }
-        if set.origin != self.origin || !set.origins.is_empty() {
+        if set.origin != self.origin || !set.domain_origins.is_empty() {
             let step = set.step.number;
-            let fault = format!("step {step}: expected the origin of the rows before, got another one or several");
-            return Err(Error::file(&self.options.out, fault));
+            let reason = format!("step {step}: expected the origin of the previous steps, got another one or several");
+            return Err(Error::file(&self.options.out, reason));
         }
-        self.open.iter_mut().zip(&rows).try_for_each(|(file, row)| file.row(row.numbers))?;
+        self.writers.iter_mut().zip(&rows).try_for_each(|(writer, row)| writer.write_row(row.numbers))?;
         let bytes = rows.iter().map(|row| size_of_val(row.numbers) as u64).sum();
         self.summary.add(&ReceivedStep { step: set.step, bytes, skipped: set.skipped, stages: &set.stages });
         Ok(())
     }
 
     fn finish(self, json: bool) -> Result<()> {
-        self.open.into_iter().try_for_each(|file| file.finish().map(drop))?;
+        self.writers.into_iter().try_for_each(|writer| writer.finish().map(drop))?;
         self.summary.print("steps", &self.options.out, Some(self.origin), json);
         Ok(())
     }
