@@ -94,6 +94,19 @@ impl Engine {
         Self::start_with_device(config, source, move || DeviceContext::open(&device_config)).await
     }
 
+    /// An engine with the open scene "strips", whose device is lost as soon as the returned step is driven.
+    #[cfg(test)]
+    pub(crate) async fn with_losable_device(
+        config: ValidatedConfig,
+    ) -> Result<(Self, modalcast_model::scene::RawStepUpdate)> {
+        let open = || DeviceContext::with_deformer(testing::FaultyDeformer::boxed);
+        let engine = Self::start_with_device(Arc::new(config), Arc::new(testing::StripsSource), open).await?;
+        engine.open("strips", "strips").await?;
+        let q = bytes::Bytes::copy_from_slice(bytemuck::cast_slice(&[testing::InjectedFault::DeviceLost.q(), 0.0]));
+        let step = modalcast_model::scene::RawStepUpdate { number: 1, q_domains: vec![0], q, ..Default::default() };
+        Ok((engine, step))
+    }
+
     /// [`Self::start`] with the function that opens the devices on the device thread.
     async fn start_with_device(
         config: Arc<ValidatedConfig>,

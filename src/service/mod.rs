@@ -145,3 +145,50 @@ fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
         .with(limited!(FrameServiceServer::new(frames::FrameServiceImpl(engine.clone()))))
         .with(limited!(VertexServiceServer::new(vertices::VertexServiceImpl(engine.clone())))))
 }
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use tonic::transport::Channel;
+    use tonic_health::ServingStatus;
+    use tonic_health::pb::HealthCheckRequest;
+    use tonic_health::pb::health_client::HealthClient;
+
+    use super::*;
+    use crate::engine::Policy;
+
+    async fn health(client: &mut HealthClient<Channel>) -> i32 {
+        let request = HealthCheckRequest { service: String::new() };
+        client.check(request).await.expect("an answer").into_inner().status
+    }
+
+    #[tokio::test]
+    async fn lost_device_turns_health_to_not_serving() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let config =
+            Config { listen: ([127, 0, 0, 1], 0).into(), state: folder.path().to_owned(), ..Config::default() };
+        let config = config.validated().expect("a good configuration");
+        let listener = bind(&config).await.expect("a port");
+        let address = format!("http://{}", listener.local_addr().expect("an address"));
+        let (engine, step) = Engine::with_losable_device(config).await.expect("starts");
+        let (stop, stopped) = oneshot::channel::<()>();
+        let server = tokio::spawn(serve(engine.clone(), listener, async {
+            stopped.await.ok();
+        }));
+        let mut client =
+            HealthClient::new(Channel::from_shared(address).expect("a URL").connect().await.expect("connects"));
+        assert_eq!(health(&mut client).await, ServingStatus::Serving as i32);
+        let scene = engine.find("strips").expect("is open");
+        let mut writer = scene.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
+        writer.step(&step).expect("is queued");
+        let turned = async {
+            while health(&mut client).await != ServingStatus::NotServing as i32 {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+        };
+        tokio::time::timeout(Duration::from_secs(60), turned).await.expect("health turns");
+        stop.send(()).expect("the server goes on until it is stopped");
+        server.await.expect("no panic").expect("a clean stop");
+    }
+}
