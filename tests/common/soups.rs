@@ -115,53 +115,21 @@ pub(crate) fn all_soups() -> Vec<Soup> {
         scattered(random, 300, 3.0, [2.0; 3]).into_iter().map(|number| number + 1e7).collect();
     let positions_behind = scattered(random, 100, 1.0, [0.5; 3]);
     let positions_behind = positions_behind.chunks_exact(3).flat_map(|p| [p[0], p[1], p[2] + 5.0]).collect();
+    let mut scattered_soup = |name, count, extent, size, viewport| {
+        Soup::with_separate_triangles(name, scattered(random, count, extent, size), viewport)
+    };
+    let nan_viewport = Viewport::new(&Matrix4::from_element(f64::NAN), 8, 8).expect("expected a valid viewport");
     vec![
-        Soup::with_separate_triangles(
-            "smaller than a pixel",
-            scattered(random, 6000, 1.1, [0.004; 3]),
-            clip_space_viewport(200, 120),
-        ),
-        Soup::with_separate_triangles(
-            "a few pixels",
-            scattered(random, 2000, 1.1, [0.04; 3]),
-            clip_space_viewport(301, 177),
-        ),
-        Soup::with_separate_triangles(
-            "slivers",
-            scattered(random, 400, 1.0, [0.9, 0.001, 0.3]),
-            clip_space_viewport(311, 97),
-        ),
-        Soup::with_separate_triangles(
-            "vertical slivers",
-            scattered(random, 400, 1.0, [0.0005, 1.9, 0.3]),
-            clip_space_viewport(311, 97),
-        ),
-        Soup::with_separate_triangles(
-            "large",
-            scattered(random, 60, 1.0, [3.0, 3.0, 0.9]),
-            clip_space_viewport(257, 255),
-        ),
-        Soup::with_separate_triangles(
-            "huge",
-            scattered(random, 60, 1.0, [1e4, 1e4, 0.9]),
-            clip_space_viewport(129, 65),
-        ),
-        Soup::with_separate_triangles(
-            "through the near plane",
-            scattered(random, 300, 1.0, [2.0; 3]),
-            perspective_viewport(160, 120, 0.1, 10.0),
-        ),
-        Soup::with_separate_triangles(
-            "near 1e-6, far 1e9",
-            scattered(random, 100, 1.0, [9.0; 3]),
-            perspective_viewport(160, 120, 1e-6, 1e9),
-        ),
+        scattered_soup("smaller than a pixel", 6000, 1.1, [0.004; 3], clip_space_viewport(200, 120)),
+        scattered_soup("a few pixels", 2000, 1.1, [0.04; 3], clip_space_viewport(301, 177)),
+        scattered_soup("slivers", 400, 1.0, [0.9, 0.001, 0.3], clip_space_viewport(311, 97)),
+        scattered_soup("vertical slivers", 400, 1.0, [0.0005, 1.9, 0.3], clip_space_viewport(311, 97)),
+        scattered_soup("large", 60, 1.0, [3.0, 3.0, 0.9], clip_space_viewport(257, 255)),
+        scattered_soup("huge", 60, 1.0, [1e4, 1e4, 0.9], clip_space_viewport(129, 65)),
+        scattered_soup("through the near plane", 300, 1.0, [2.0; 3], perspective_viewport(160, 120, 0.1, 10.0)),
+        scattered_soup("near 1e-6, far 1e9", 100, 1.0, [9.0; 3], perspective_viewport(160, 120, 1e-6, 1e9)),
         Soup::with_separate_triangles("behind the eye", positions_behind, perspective_viewport(64, 64, 0.1, 10.0)),
-        Soup::with_separate_triangles(
-            "beyond the far plane",
-            scattered(random, 200, 6.0, [4.0; 3]),
-            perspective_viewport(90, 90, 0.1, 4.0),
-        ),
+        scattered_soup("beyond the far plane", 200, 6.0, [4.0; 3], perspective_viewport(90, 90, 0.1, 4.0)),
         Soup::with_separate_triangles("non-finite positions", non_finite, clip_space_viewport(97, 101)),
         Soup::with_separate_triangles("coincident", coincident, clip_space_viewport(64, 64)),
         Soup::with_separate_triangles(
@@ -169,24 +137,10 @@ pub(crate) fn all_soups() -> Vec<Soup> {
             far_positions,
             Viewport::new(&far_projection, 150, 100).expect("expected a valid viewport"),
         ),
-        Soup::with_separate_triangles(
-            "one-pixel viewport",
-            scattered(random, 200, 1.0, [2.0; 3]),
-            clip_space_viewport(1, 1),
-        ),
-        Soup::with_separate_triangles(
-            "wide viewport",
-            scattered(random, 40, 1.0, [1.0; 3]),
-            clip_space_viewport(16384, 2),
-        ),
-        Soup::with_separate_triangles(
-            "tall viewport",
-            scattered(random, 40, 1.0, [1.0; 3]),
-            clip_space_viewport(2, 16384),
-        ),
-        Soup::with_separate_triangles("NaN viewport", scattered(random, 9, 1.0, [1.0; 3]), {
-            Viewport::new(&Matrix4::from_element(f64::NAN), 8, 8).expect("expected a valid viewport")
-        }),
+        scattered_soup("one-pixel viewport", 200, 1.0, [2.0; 3], clip_space_viewport(1, 1)),
+        scattered_soup("wide viewport", 40, 1.0, [1.0; 3], clip_space_viewport(16384, 2)),
+        scattered_soup("tall viewport", 40, 1.0, [1.0; 3], clip_space_viewport(2, 16384)),
+        scattered_soup("NaN viewport", 9, 1.0, [1.0; 3], nan_viewport),
         Soup::with_separate_triangles("no triangles", Vec::new(), clip_space_viewport(8, 8)),
         degenerate(),
         fan_soup(clip_space_viewport(128, 128)),
