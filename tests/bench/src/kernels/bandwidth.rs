@@ -75,13 +75,13 @@ mod tests {
     use super::*;
 
     /// CPU twin of the addressing of `copy` and `read`: the indices of the vectors that they access.
-    fn accessed_vectors(blocks: u64, loads: u64) -> Vec<u64> {
+    fn twin_of_copy(blocks: u64, loads: u64) -> Vec<u64> {
         let threads = (0..blocks).flat_map(|block| (0..BLOCK).map(move |thread| block * BLOCK * loads + thread));
         threads.flat_map(|first| (0..loads).map(move |index| first + index * BLOCK)).collect()
     }
 
     /// CPU twin of `fill`, for one word.
-    fn fill_word(index: u32) -> u32 {
+    fn twin_of_fill(index: u32) -> u32 {
         let mut key = index ^ index >> 16;
         key = key.wrapping_mul(0x85eb_ca6b);
         key ^= key >> 13;
@@ -95,7 +95,7 @@ mod tests {
         assert!(loads.len() >= 6, "{loads:?}");
         for loads in loads {
             let bytes = 3 * tile_bytes(16);
-            let mut vectors = accessed_vectors(bytes / tile_bytes(loads), loads);
+            let mut vectors = twin_of_copy(bytes / tile_bytes(loads), loads);
             vectors.sort_unstable();
             assert!(vectors.iter().copied().eq(0..bytes / VECTOR), "{loads} loads");
         }
@@ -103,7 +103,7 @@ mod tests {
 
     #[test]
     fn filled_words_differ_and_never_trigger_the_write_of_read() {
-        let words: std::collections::BTreeSet<u32> = (0..4096).map(fill_word).collect();
+        let words: std::collections::BTreeSet<u32> = (0..4096).map(twin_of_fill).collect();
         assert!(words.len() > 4090);
         assert!(words.iter().all(|word| *word != u32::MAX));
     }

@@ -318,7 +318,7 @@ mod tests {
     ];
 
     /// CPU twin of `batch_mma`, warp by warp, with fragments, staging buffer and stores; sums in f64.
-    fn run_twin(inputs: &KernelInputs, numbers: usize) -> Vec<f32> {
+    fn twin_of_batch_mma(inputs: &KernelInputs, numbers: usize) -> Vec<f32> {
         let mut positions = vec![f32::NAN; numbers];
         let vertices = inputs.args.vertices as usize;
         for (tile, warp) in (0..inputs.tiles.count()).flat_map(|tile| (0..WARPS).map(move |warp| (tile, warp))) {
@@ -341,7 +341,7 @@ mod tests {
             for (vertices, rank, domains) in SIZES.into_iter().chain([(70, 31, 32), (33, 40, 17)]) {
                 let (scene, state) = instanced_scene(vertices, rank, domains, storage);
                 let inputs = KernelInputs::pack(&scene, &state);
-                let positions = run_twin(&inputs, 3 * scene.layout.vertices);
+                let positions = twin_of_batch_mma(&inputs, 3 * scene.layout.vertices);
                 for (packed, got) in positions.chunks_exact(3).enumerate() {
                     let (domain, vertex) = (packed / vertices, packed % vertices);
                     // Compare with the result for stored U; only the rounding of q and f32 remains.

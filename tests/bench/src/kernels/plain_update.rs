@@ -161,7 +161,7 @@ mod tests {
     }
 
     /// CPU twin of `plain_update`, for one vertex.
-    fn update_vertex(tables: &Tables, t: &[f32], u: &[f32], vertex: usize) -> [f32; 3] {
+    fn twin_of_plain_update(tables: &Tables, t: &[f32], u: &[f32], vertex: usize) -> [f32; 3] {
         let domain = tables.domains[vertex] as usize;
         let slot = tables.slots[domain];
         let mut deformed: [f32; 3] = std::array::from_fn(|axis| tables.rest[3 * vertex + axis]);
@@ -195,13 +195,13 @@ mod tests {
         for (domain, slot) in scene.layout.domains.iter().enumerate() {
             for vertex in 0..slot.vertices {
                 let packed = slot.first_vertex + vertex;
-                let got = update_vertex(&tables, transforms, &u, packed);
+                let got = twin_of_plain_update(&tables, transforms, &u, packed);
                 let want = position_of(&scene, &state, domain, vertex);
                 for (want, got) in want.iter().zip(got) {
                     assert!((want - f64::from(got)).abs() < 1e-5, "domain {domain} vertex {vertex}: {got} not {want}");
                 }
                 // Negative control: the next vertex has another position.
-                let next = update_vertex(&tables, transforms, &u, (packed + 1) % 54);
+                let next = twin_of_plain_update(&tables, transforms, &u, (packed + 1) % 54);
                 assert_ne!(next, want.map(|number| number as f32));
             }
         }

@@ -107,7 +107,7 @@ mod tests {
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
     /// CPU twin of `thesis_multi`, thread by thread; counts the writes to each number of u.
-    fn run_twin(packed: &PackedGroups, q: &[f32], u: &mut [f32], write_counts: &mut [usize]) {
+    fn twin_of_thesis_multi(packed: &PackedGroups, q: &[f32], u: &mut [f32], write_counts: &mut [usize]) {
         for first in (0..packed.meta.len()).step_by(WARP) {
             let is_busy = |lane: &usize| packed.meta[first + lane][0] != IDLE;
             let mut sub_sums = [0.0_f32; WARP];
@@ -134,7 +134,7 @@ mod tests {
         for split in KernelSplit::ALL {
             let (mut u, mut write_counts) = (vec![f32::NAN; 4 * vertices], vec![0; 4 * vertices]);
             for width in split.widths() {
-                run_twin(&pack_groups(&scene, split, *width), &q, &mut u, &mut write_counts);
+                twin_of_thesis_multi(&pack_groups(&scene, split, *width), &q, &mut u, &mut write_counts);
             }
             assert!(
                 write_counts.iter().enumerate().all(|(number, count)| *count == usize::from(number % 4 < 3)),

@@ -111,7 +111,7 @@ mod tests {
     }
 
     /// CPU twin of `thesis_single`, thread by thread.
-    fn run_twin(lines: &[[f32; 4]], q: &[f32], rows: usize) -> Vec<f32> {
+    fn twin_of_thesis_single(lines: &[[f32; 4]], q: &[f32], rows: usize) -> Vec<f32> {
         let (rank, width) = (q.len(), vectors_per_row(q.len()).min(WARP));
         let (rows_per_line, passes) = (WARP / width, vectors_per_row(rank).div_ceil(WARP));
         let mut shared_q = [f32::NAN; 512];
@@ -144,7 +144,7 @@ mod tests {
             let (scene, state) = scene_and_state(&[(23, rank, 1)]);
             let lines = RowLines::new(23, rank).pack(&scene);
             let max_error = |q: &[f32]| {
-                let u = run_twin(&lines, q, 69);
+                let u = twin_of_thesis_single(&lines, q, 69);
                 let error = |row: usize| {
                     let want = displacement_of(&scene, &state, 0, row / 3)[row % 3];
                     let error = (f64::from(u[4 * (row / 3) + row % 3]) - want).abs();

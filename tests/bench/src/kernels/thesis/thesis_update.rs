@@ -227,7 +227,7 @@ mod tests {
     use modalcast_compute::testing::{displacement_of, position_of, scene_and_state};
 
     /// CPU twin of `thesis_update` for positions, thread by thread.
-    fn run_twin(unfolded: &UnfoldedTriangles, transforms: &[f32], u: &[[f32; 4]]) -> Vec<[f32; 4]> {
+    fn twin_of_thesis_update(unfolded: &UnfoldedTriangles, transforms: &[f32], u: &[[f32; 4]]) -> Vec<[f32; 4]> {
         let count = unfolded.targets.len();
         let mut positions = vec![[f32::NAN; 4]; count];
         for thread in 0..count.div_ceil(VERTICES_PER_BLOCK) * BLOCK {
@@ -263,7 +263,7 @@ mod tests {
                     float4(displacement_of(&scene, &state, domain, vertex).map(|number| number as f32), 0.0);
             }
         }
-        let positions = run_twin(&unfolded, &transform_matrices(&scene, &state), &u);
+        let positions = twin_of_thesis_update(&unfolded, &transform_matrices(&scene, &state), &u);
         let folded = fold(&positions, &unfolded.targets, scene.layout.vertices);
         let mut nan_count = 0;
         for (domain, slot) in scene.layout.domains.iter().enumerate() {
