@@ -42,7 +42,7 @@ struct ImportCollector<'a> {
 
 impl ImportCollector<'_> {
     /// The path from the crate root of a path that begins with `crate`, `self` or `super`.
-    fn from_root(&self, segments: &[String]) -> Option<ModulePath> {
+    fn absolute_path(&self, segments: &[String]) -> Option<ModulePath> {
         let mut base = match segments.first()?.as_str() {
             "crate" => Vec::new(),
             "self" | "super" => self.module.clone(),
@@ -65,7 +65,7 @@ impl ImportCollector<'_> {
             syn::UseTree::Rename(rename) => (extended(&rename.ident), rename.rename.to_string()),
             syn::UseTree::Glob(_) => (prefix.to_vec(), "*".to_owned()),
         };
-        let Some(path) = self.from_root(&path) else { return };
+        let Some(path) = self.absolute_path(&path) else { return };
         if is_public {
             self.found.reexports.insert(name, path.clone());
         }
@@ -91,7 +91,7 @@ impl<'ast> Visit<'ast> for ImportCollector<'_> {
 
     fn visit_path(&mut self, path: &'ast syn::Path) {
         let segments: Vec<String> = path.segments.iter().map(|segment| segment.ident.to_string()).collect();
-        self.found.imports.extend(self.from_root(&segments).filter(|_| segments.len() > 1));
+        self.found.imports.extend(self.absolute_path(&segments).filter(|_| segments.len() > 1));
         syn::visit::visit_path(self, path);
     }
 

@@ -250,7 +250,7 @@ fn fragments_over_budget_keep_the_nearest() {
         let stored = 1600 * u64::from(per_pixel_limit);
         assert_eq!(
             oit_stats(&frame),
-            OitStats { fragments: 16000, stored: stored, max_per_pixel: 10, per_pixel_limit: Some(per_pixel_limit) },
+            OitStats { fragments: 16000, stored, max_per_pixel: 10, per_pixel_limit: Some(per_pixel_limit) },
             "{budget}"
         );
         let nearest_layers = render(&nearest_layers(10, per_pixel_limit));
