@@ -1,14 +1,15 @@
-// Writes the transforms and coordinates of the changed domains into the device state and stamps the domains with the
-// step.
-//   header          number of changes, and the step                      (in)
-//   changes         [changed]                                            (in)
-//   new_transforms  [changed][3] float4                                  (in)
-//   new_q           the coordinates of the changed domains, packed       (in)
-//   following       with FOLLOWERS: per domain its transform root, and its frame, if any    (in)
-//   transforms, q   of all transform roots, and of all domains           (out)
-//   stale           [stale] u32: the tiles that contain a changed domain (in)
-//   stamps          [domains] u32: the step that last changed a domain   (out)
-//   list            [stale] u32: copy of `dirty_tiles` in device memory        (out)
+// Writes the transforms and coordinates of the changed domains into the device state and records the step in which they
+// changed.
+//   header           number of changes, number of dirty tiles, and the step                             (in)
+//   changes          [changed]                                                                          (in)
+//   new_transforms   [changed][3] float4                                                                (in)
+//   new_q            the coordinates of the changed domains, packed                                     (in)
+//   dirty_tiles      [dirty_tiles] u32: the tiles that contain a changed domain                         (in)
+//   transform_links  with FOLLOWERS: per domain its transform root and the index of its frame           (in)
+//   transforms       [transform roots][3] float4                                                        (out)
+//   q                packed coordinates of all domains                                                  (out)
+//   change_steps     [domains] u32: the step that last changed a domain                                 (out)
+//   tile_list        [dirty_tiles] u32: copy of `dirty_tiles` in device memory                          (out)
 // Launch: BLOCK threads per block, a warp per changed domain, any number of blocks. CPU twin: SceneState::apply.
 #include "layout.cuh"
 
@@ -18,15 +19,15 @@ extern "C" __global__ void __launch_bounds__(BLOCK) apply(const __grid_constant_
     for (unsigned index = blockIdx.x * (BLOCK / 32) + threadIdx.x / 32; index < changed; index += warps) {
         const Change change = args.changes[index];
 #ifdef FOLLOWERS
-        // A follower is in the list only for its coordinates or its stamp.
-        const TransformLink own = args.transform_links[change.domain];
-        const unsigned root = own.root;
-        const bool moves = own.frame == NO_FRAME;
+        // A follower has no transform of its own; its entry only changes its coordinates or its change step.
+        const TransformLink link = args.transform_links[change.domain];
+        const unsigned root = link.root;
+        const bool has_transform = link.frame == NO_FRAME;
 #else
         const unsigned root = change.domain;
-        const bool moves = true;
+        const bool has_transform = true;
 #endif
-        if (moves && lane < 3) {
+        if (has_transform && lane < 3) {
             args.transforms[3 * (size_t)root + lane] = args.new_transforms[3 * (size_t)index + lane];
         }
         if (lane == 3) {
@@ -38,6 +39,6 @@ extern "C" __global__ void __launch_bounds__(BLOCK) apply(const __grid_constant_
     }
     const unsigned dirty_tiles = args.header->dirty_tiles;
     for (unsigned i = blockIdx.x * BLOCK + threadIdx.x; i < dirty_tiles; i += gridDim.x * BLOCK) {
-        args.list[i] = args.dirty_tiles[i];
+        args.tile_list[i] = args.dirty_tiles[i];
     }
 }

@@ -5,7 +5,7 @@
 //   words      U, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)                             (in)
 //   rest       x0, per tile [3][width][4] f32                                                           (in)
 //   scales     with STORE_INT8: per tile of U and mode                                                  (in)
-//   transforms, following, frames, q   as for `deform`                                                  (in)
+//   transforms, transform_links, frames, q   as for `deform`                                                  (in)
 //   positions  [vertices][3] f32, address in the header                                                 (out)
 //   boxes      [tiles of deform][4][6] u32, as `deform` writes them; the boxes of half a tile without
 //              vertices keep the zeros of their allocation                                              (out)

@@ -1,39 +1,40 @@
-// Reduces the boxes that `deform` stored per tile to the bounds of all positions, including the tiles that this step
-// did not compute. With ORIENTED_BOUNDS, also the bounds along `bounding_axes`, from the same boxes. With DOMAIN_BOXES, also a
-// box of each domain, from its boxes, or from its positions if it shares a tile with other domains.
-//   boxes      [count][6] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z; four per tile             (in)
-//   bounding_axes  with ORIENTED_BOUNDS: three orthogonal unit vectors                               (in)
-//   bounds     in the header: the maxima of all; zeros before the launch                      (in, out)
-//   pieces     with DOMAIN_BOXES: the parts of domains that are reduced to one box each              (in)
-//   stamps     with DOMAIN_BOXES: per domain, the step that last changed it                          (in)
-//   positions  with DOMAIN_BOXES: address in the header                                              (in)
-//   piece_boxes  with DOMAIN_BOXES: [pieces][6] u32, like `boxes`; only those of stale domains are written (out)
-// Launch: BLOCK threads per block, any number of blocks. CPU twin: BoundingBox::union.
+// Reduces the per-tile boxes that `deform` wrote to one bounding box of all positions. Tiles that this step skips keep the
+// boxes of an earlier step. With ORIENTED_BOUNDS, also computes the bounds along `bounding_axes` from the same boxes. With
+// DOMAIN_BOXES, also computes one box per segment of a domain: from tile boxes, or from vertices if the domain shares a tile
+// with others.
+//   boxes          [count][6] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z; four per tile            (in)
+//   bounding_axes  with ORIENTED_BOUNDS: three orthogonal unit vectors                                        (in)
+//   bounds         in the header: the maxima over all boxes; zeros before the launch                          (in, out)
+//   segments       with DOMAIN_BOXES: parts of domains; each is reduced to one box                            (in)
+//   change_steps   with DOMAIN_BOXES: per domain, the step that last changed it                               (in)
+//   positions      with DOMAIN_BOXES: address in the header                                                   (in)
+//   segment_boxes  with DOMAIN_BOXES: [segments][6] u32, like `boxes`; only those of dirty domains are written (out)
+// Launch: BLOCK threads per block, any number of blocks. CPU twin: BoundingBox::union (joins two boxes in f64).
 //
-// Light space: the farthest corner of a tile's box along an axis follows from the signs of the axis, so an end takes
-// three multiply-adds. They round outward, so that the bounds along the f32 axes contain every vertex. The box of a
-// tile of 128 vertices exceeds its vertices by less than its diagonal. Six dot products per vertex in `deform` would be
-// tight, but `deform` has no registers left.
+// Oriented bounds: the signs of an axis select the farthest corner of a tile's box along the axis, so each extreme costs
+// three multiply-adds. These round outward, so that the bounds along the f32 axes contain every vertex. The bounds of a
+// tile exceed the extent of its vertices by less than the diagonal of its box. Projecting every vertex in `deform` would
+// give tight bounds, but `deform` has no spare registers.
 #include "dependent_launch.cuh"
 #include "layout.cuh"
 #include "ordered_float.cuh"
 
 #ifdef DOMAIN_BOXES
-// Threads that reduce one piece together.
+// Threads that reduce one segment together.
 constexpr unsigned THREADS_PER_SEGMENT = 8;
 
-// Adds one box or vertex of a piece to the keys.
-__device__ __forceinline__ void add_item(const BoundsArgs& args, const BoxSegment& piece, unsigned item, unsigned (&keys)[6]) {
-    if (piece.from_vertices) {
-        const float* at = args.header->positions + 3 * (size_t)(piece.first + item);
+// Merges one tile box or vertex of a segment into the running maxima.
+__device__ __forceinline__ void merge_item(const BoundsArgs& args, const BoxSegment& segment, unsigned item, unsigned (&keys)[6]) {
+    if (segment.from_vertices) {
+        const float* position = args.header->positions + 3 * (size_t)(segment.first + item);
 #pragma unroll
         for (unsigned axis = 0; axis < 3; ++axis) {
-            const float number = at[axis];
-            keys[axis] = max(keys[axis], float_to_ordered(-number));
-            keys[3 + axis] = max(keys[3 + axis], float_to_ordered(number));
+            const float coordinate = position[axis];
+            keys[axis] = max(keys[axis], float_to_ordered(-coordinate));
+            keys[3 + axis] = max(keys[3 + axis], float_to_ordered(coordinate));
         }
     } else {
-        const unsigned* box = args.boxes + 6 * (size_t)(piece.first + item);
+        const unsigned* box = args.boxes + 6 * (size_t)(segment.first + item);
 #pragma unroll
         for (unsigned side = 0; side < 6; ++side) {
             keys[side] = max(keys[side], box[side]);
@@ -41,26 +42,26 @@ __device__ __forceinline__ void add_item(const BoundsArgs& args, const BoxSegmen
     }
 }
 
-// All threads of a team have the same piece, so they stay converged in the loop.
+// All threads of a group share one segment, so they stay converged in the loop.
 __device__ __forceinline__ void compute_segment_boxes(const BoundsArgs& args) {
-    const unsigned member = threadIdx.x % THREADS_PER_SEGMENT;
-    const unsigned team = 0xffu << threadIdx.x % 32 / THREADS_PER_SEGMENT * THREADS_PER_SEGMENT;
-    const unsigned teams = gridDim.x * (BLOCK / THREADS_PER_SEGMENT);
-    for (unsigned i = (blockIdx.x * BLOCK + threadIdx.x) / THREADS_PER_SEGMENT; i < args.segment_count; i += teams) {
-        const BoxSegment piece = args.segments[i];
-        if (!is_dirty(args.header, args.change_steps, piece.domain)) {
+    const unsigned group_rank = threadIdx.x % THREADS_PER_SEGMENT;
+    const unsigned group_mask = 0xffu << threadIdx.x % 32 / THREADS_PER_SEGMENT * THREADS_PER_SEGMENT;
+    const unsigned group_count = gridDim.x * (BLOCK / THREADS_PER_SEGMENT);
+    for (unsigned i = (blockIdx.x * BLOCK + threadIdx.x) / THREADS_PER_SEGMENT; i < args.segment_count; i += group_count) {
+        const BoxSegment segment = args.segments[i];
+        if (!is_dirty(args.header, args.change_steps, segment.domain)) {
             continue;
         }
         unsigned keys[6] = {0, 0, 0, 0, 0, 0};
-        for (unsigned item = member; item < piece.count; item += THREADS_PER_SEGMENT) {
-            add_item(args, piece, item, keys);
+        for (unsigned item = group_rank; item < segment.count; item += THREADS_PER_SEGMENT) {
+            merge_item(args, segment, item, keys);
         }
 #pragma unroll
         for (unsigned side = 0; side < 6; ++side) {
-            for (unsigned lanes = THREADS_PER_SEGMENT / 2; lanes > 0; lanes /= 2) {
-                keys[side] = max(keys[side], __shfl_xor_sync(team, keys[side], lanes));
+            for (unsigned offset = THREADS_PER_SEGMENT / 2; offset > 0; offset /= 2) {
+                keys[side] = max(keys[side], __shfl_xor_sync(group_mask, keys[side], offset));
             }
-            if (member == side) {
+            if (group_rank == side) {
                 args.segment_boxes[6 * (size_t)i + side] = keys[side];
             }
         }
@@ -79,52 +80,53 @@ constexpr unsigned KEY_COUNT = 6;
 // the axis of lane 2.
 struct OrientedExtent {
     float axis[3];
-    unsigned ends[2];
+    unsigned extent_keys[2];
 
     __device__ __forceinline__ void begin(const BoundsArgs& args) {
-        const float* from = args.bounding_axes + 3 * min(threadIdx.x % 4, 2u);
-        axis[0] = from[0];
-        axis[1] = from[1];
-        axis[2] = from[2];
-        ends[0] = ends[1] = 0;
+        const float* bounding_axis = args.bounding_axes + 3 * min(threadIdx.x % 4, 2u);
+        axis[0] = bounding_axis[0];
+        axis[1] = bounding_axis[1];
+        axis[2] = bounding_axis[2];
+        extent_keys[0] = extent_keys[1] = 0;
     }
 
-    // The kernel that wrote the four boxes decides whether each covers the whole tile or a part of it, but their union
-    // is always the same. The result therefore does not depend on which domains a step changed. All four lanes must
-    // call this.
-    __device__ __forceinline__ void add(unsigned (&box)[6]) {
-        const unsigned four = 0xfu << threadIdx.x % 32 / 4 * 4;
+    // Merges a tile's boxes; all four lanes must call this. The tile's box may be stored four times or as four partial
+    // boxes, so only the union of the four is defined. Reducing the four boxes first makes the result independent of
+    // which domains a step changed.
+    __device__ __forceinline__ void merge_tile(unsigned (&box)[6]) {
+        const unsigned quad_mask = 0xfu << threadIdx.x % 32 / 4 * 4;
 #pragma unroll
         for (unsigned side = 0; side < 6; ++side) {
-            box[side] = max(box[side], __shfl_xor_sync(four, box[side], 1));
-            box[side] = max(box[side], __shfl_xor_sync(four, box[side], 2));
+            box[side] = max(box[side], __shfl_xor_sync(quad_mask, box[side], 1));
+            box[side] = max(box[side], __shfl_xor_sync(quad_mask, box[side], 2));
         }
-        // A tile of corners alone has no box.
+        // A tile without TILE_VERTICES computes no positions; its box keys are 0.
         if (box[0] == 0) {
             return;
         }
-        float lower = 0.0f, upper = 0.0f;
+        float negated_min = 0.0f, max_extent = 0.0f;
 #pragma unroll
         for (unsigned i = 0; i < 3; ++i) {
-            const float below = ordered_to_float(box[i]), above = ordered_to_float(box[3 + i]);
-            const bool is_along = axis[i] >= 0.0f;
-            lower = __fmaf_ru(fabsf(axis[i]), is_along ? below : above, lower);
-            upper = __fmaf_ru(fabsf(axis[i]), is_along ? above : below, upper);
+            const float box_negated_min = ordered_to_float(box[i]), box_max = ordered_to_float(box[3 + i]);
+            const bool is_nonnegative = axis[i] >= 0.0f;
+            negated_min = __fmaf_ru(fabsf(axis[i]), is_nonnegative ? box_negated_min : box_max, negated_min);
+            max_extent = __fmaf_ru(fabsf(axis[i]), is_nonnegative ? box_max : box_negated_min, max_extent);
         }
-        ends[0] = max(ends[0], float_to_ordered(lower));
-        ends[1] = max(ends[1], float_to_ordered(upper));
+        extent_keys[0] = max(extent_keys[0], float_to_ordered(negated_min));
+        extent_keys[1] = max(extent_keys[1], float_to_ordered(max_extent));
     }
 
-    // Reduces over the warp; all lanes must call this.
-    __device__ __forceinline__ void reduce_into(unsigned* most) {
+    // Reduces over the lanes of a warp with the same axis (lane % 4); lanes 0 to 2 then hold x, y and z. All lanes must
+    // call this.
+    __device__ __forceinline__ void reduce_into(unsigned* block_maxima) {
 #pragma unroll
-        for (unsigned end = 0; end < 2; ++end) {
+        for (unsigned extreme = 0; extreme < 2; ++extreme) {
 #pragma unroll
-            for (unsigned lanes = 16; lanes > 2; lanes /= 2) {
-                ends[end] = max(ends[end], __shfl_xor_sync(0xffffffffu, ends[end], lanes));
+            for (unsigned offset = 16; offset > 2; offset /= 2) {
+                extent_keys[extreme] = max(extent_keys[extreme], __shfl_xor_sync(0xffffffffu, extent_keys[extreme], offset));
             }
             if (threadIdx.x % 32 < 3) {
-                atomicMax(&most[3 * end + threadIdx.x % 32], ends[end]);
+                atomicMax(&block_maxima[3 * extreme + threadIdx.x % 32], extent_keys[extreme]);
             }
         }
     }
@@ -132,53 +134,53 @@ struct OrientedExtent {
 #endif
 
 extern "C" __global__ void __launch_bounds__(BLOCK) bounds(const __grid_constant__ BoundsArgs args) {
-    wait_on_dependent_grids();
+    wait_for_prerequisite_grids();
     launch_dependent_grids();
 #ifdef DOMAIN_BOXES
     compute_segment_boxes(args);
     __syncwarp();
 #endif
-    __shared__ unsigned most[KEY_COUNT];
+    __shared__ unsigned block_maxima[KEY_COUNT];
     if (threadIdx.x < KEY_COUNT) {
-        most[threadIdx.x] = 0;
+        block_maxima[threadIdx.x] = 0;
     }
     __syncthreads();
     unsigned keys[6] = {0, 0, 0, 0, 0, 0};
 #ifdef ORIENTED_BOUNDS
-    OrientedExtent along;
-    along.begin(args);
+    OrientedExtent oriented_extent;
+    oriented_extent.begin(args);
 #endif
     for (unsigned box = blockIdx.x * BLOCK + threadIdx.x; box < args.count; box += gridDim.x * BLOCK) {
         const uint2* sides = (const uint2*)(args.boxes + 6 * (size_t)box);
-        unsigned own[6];
+        unsigned box_keys[6];
 #pragma unroll
         for (unsigned pair = 0; pair < 3; ++pair) {
-            const uint2 two = sides[pair];
-            own[2 * pair] = two.x;
-            own[2 * pair + 1] = two.y;
+            const uint2 key_pair = sides[pair];
+            box_keys[2 * pair] = key_pair.x;
+            box_keys[2 * pair + 1] = key_pair.y;
         }
 #pragma unroll
         for (unsigned side = 0; side < 6; ++side) {
-            keys[side] = max(keys[side], own[side]);
+            keys[side] = max(keys[side], box_keys[side]);
         }
 #ifdef ORIENTED_BOUNDS
-        along.add(own);
+        oriented_extent.merge_tile(box_keys);
 #endif
     }
 #pragma unroll
     for (unsigned side = 0; side < 6; ++side) {
         const unsigned key = warp_max(keys[side]);
         if (threadIdx.x % 32 == side) {
-            atomicMax(&most[side], key);
+            atomicMax(&block_maxima[side], key);
         }
     }
 #ifdef ORIENTED_BOUNDS
-    along.reduce_into(most + 6);
+    oriented_extent.reduce_into(block_maxima + 6);
 #endif
     __syncthreads();
-    // Read before the atomic: few blocks exceed what others have reported, so most atomics to the same addresses are
-    // avoided. The value read may be stale, but it only grows, so no maximum is lost.
-    if (threadIdx.x < KEY_COUNT && most[threadIdx.x] > *(volatile unsigned*)(args.header->bounds + threadIdx.x)) {
-        atomicMax(args.header->bounds + threadIdx.x, most[threadIdx.x]);
+    // Compare before the atomic: the stored maximum already exceeds that of most blocks, so most contended atomics are
+    // skipped. The value read may be stale, but it only grows, so no maximum is lost.
+    if (threadIdx.x < KEY_COUNT && block_maxima[threadIdx.x] > *(volatile unsigned*)(args.header->bounds + threadIdx.x)) {
+        atomicMax(args.header->bounds + threadIdx.x, block_maxima[threadIdx.x]);
     }
 }

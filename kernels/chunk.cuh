@@ -11,7 +11,7 @@ constexpr unsigned CHUNK_MODES = 1;
 #endif
 constexpr unsigned ENTRY_BYTES = 4 / CHUNK_MODES;
 
-// Decodes the lowest bits of `bits`, without the factor or scale of the mode.
+// Decodes the entry in the lowest bits of `bits`, without the factor or scale of its mode.
 __device__ __forceinline__ float decode_bits(unsigned bits) {
 #if defined(STORE_F16)
     float number;
@@ -20,7 +20,7 @@ __device__ __forceinline__ float decode_bits(unsigned bits) {
 #elif defined(STORE_BF16)
     return __uint_as_float(bits << 16);
 #elif defined(STORE_INT8)
-    // A byte in the mantissa of 2^23 adds its value; the code is the byte minus 128. Both steps are exact.
+    // The byte is placed in the mantissa of 2^23, which gives 2^23 + byte; the entry is byte - 128. Both steps are exact.
     return __uint_as_float(__byte_perm(bits, 0x4b000000u, 0x7650u)) - 8388736.0f;
 #else
     return __uint_as_float(bits);

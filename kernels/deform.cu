@@ -1,20 +1,20 @@
 // The main kernel of a step: x = T (x0 + U q) for every vertex of every domain of a scene, and with RIGID_NORMALS also the
 // rigid normals and tangents of every corner. One launch covers all domains by a flat list of tiles. Also computes a
 // bounding box of each warp's x.
-//   tiles, lanes  the work of each warp (layout.cuh)                                                        (in)
+//   tiles, mixed_quads the work of each warp (layout.cuh)                                                        (in)
 //   words         U, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)                              (in)
 //   rest          x0, per tile of one domain [3][width][4] f32, per quad of a mixed tile [3][4]             (in)
 //   rest_normals  rest normals in the same layout; with RIGID_NORMALS                                              (in)
 //   rest_tangents rest tangents likewise: x, y, z and the sign of the bitangent; with RIGID_NORMALS, NORMAL_MAPS   (in)
-//   corner_shifts with CORNER_OFFSETS: per domain, offset from a vertex to its corner                              (in)
+//   corner_offsets with CORNER_OFFSETS: per domain, offset from a vertex to its corner                              (in)
 //   transforms    [roots][3] float4: the rows of world_from_domain, relative to the state's origin         (in)
-//   following     with FOLLOWERS: per domain its transform root, and the index of its frame                 (in)
+//   transform_links with FOLLOWERS: per domain its transform root, and the index of its frame                 (in)
 //   frames        [followers][3] float4: the rows of mover_from_domain, with FOLLOWERS; without, every domain is a
 //                 transform root                                                                            (in)
 //   q             packed coordinates; with STORE_F16 and STORE_BF16 multiplied by the factor of their mode  (in)
 //   scales        with STORE_INT8: per tile of U and mode                                                   (in)
-//   kept          with MODE_TRUNCATION: per domain the chunks to sum, ascending                                   (in)
-//   list          with TILE_LIST: the tiles to compute, their number is in the header; without, all tiles      (in)
+//   retained      with MODE_TRUNCATION: per domain the chunks to sum, ascending                                   (in)
+//   tile_list     with TILE_LIST: the tiles to compute, their number is in the header; without, all tiles      (in)
 //   positions     [vertices][3] f32, address in the header                                                  (out)
 //   normals       [corners][3] f32, address in the header                                                   (out)
 //   tangents      [corners] float4, address in the header                                                   (out)
@@ -423,7 +423,7 @@ extern "C" __global__ void __launch_bounds__(32 * WARPS, MIN_BLOCKS_PER_SM) defo
 #ifdef TILE_LIST
     const unsigned warps = WARPS_PER_TILE * __ldg(&args.header->dirty_tiles);
     for (unsigned i = warp; i < warps; i += gridDim.x * WARPS) {
-        compute_tile(args, shared[threadIdx.x / 32], __ldg(args.list + i / WARPS_PER_TILE), i % WARPS_PER_TILE);
+        compute_tile(args, shared[threadIdx.x / 32], __ldg(args.tile_list + i / WARPS_PER_TILE), i % WARPS_PER_TILE);
     }
 #else
     if (warp < WARPS_PER_TILE * args.count) {

@@ -1,17 +1,17 @@
-// Programmatic dependent launch (compute capability 9.0 and later; src/compute/gpu/launch/kernel.rs): a kernel may be scheduled
-// while the last blocks of the previous kernel on its stream still run. It accesses no memory before `wait_on_dependent_grids`,
-// and calls `launch_dependent_grids` only after that. The third kernel of a chain therefore finds the results of the first
-// complete.
+// Programmatic dependent launch (compute capability 9.0 and later; src/compute/gpu/launch/kernel.rs): a kernel may start
+// while the last blocks of the previous kernel on its stream still run. It must not access memory before
+// `wait_for_prerequisite_grids`, and must call `launch_dependent_grids` only after that. The third kernel of a chain
+// therefore starts after the first is complete.
 #pragma once
 
-// Returns when all writes of the previous kernel are visible.
-__device__ __forceinline__ void wait_on_dependent_grids() {
+// Returns when the previous kernel is complete and its writes are visible.
+__device__ __forceinline__ void wait_for_prerequisite_grids() {
 #if __CUDA_ARCH__ >= 900
     asm volatile("griddepcontrol.wait;" ::: "memory");
 #endif
 }
 
-// Allows the next kernel to start once every block has called this or has ended.
+// The next kernel may start when every block has called this or has exited.
 __device__ __forceinline__ void launch_dependent_grids() {
 #if __CUDA_ARCH__ >= 900
     asm volatile("griddepcontrol.launch_dependents;" ::: "memory");

@@ -1,5 +1,5 @@
-// Structs and constants that host and kernels share. Twin: src/compute/gpu/tables/layout.rs; tests compare the size and the
-// offset of every field.
+// Structs and constants that host and kernels share. Twin: src/compute/gpu/tables/layout.rs; tests compare the size of every
+// struct and the offset of every field.
 #pragma once
 
 // Threads per block of every kernel but `deform`, and packed corners per block of `normals`.
@@ -16,25 +16,25 @@ constexpr unsigned RING_START = 0x80000000u;
 // `frame` of a domain that follows no other domain.
 constexpr unsigned NO_FRAME = 0xffffffffu;
 
-// The start of a step's inputs, uploaded with them: output addresses, and which domains to compute again.
+// Start of the upload of a step: output addresses, and what to compute.
 struct Header {
     float* positions;
     float* normals;
     float4* tangents;
     float* displacements;
-    unsigned output_step;      // this output contains all changes up to this step
+    unsigned output_step;    // the output buffers contain all changes up to this step
     unsigned last_full_step; // the last step that changed all domains
-    unsigned step;       // this step; counts from 1
-    unsigned changed;    // number of entries in the list of `apply`
-    unsigned dirty_tiles;      // number of tiles in the tile list
+    unsigned step;           // number of this step, from 1
+    unsigned changed;        // number of `Change` entries for `apply`
+    unsigned dirty_tiles;    // number of tiles in the tile list
     unsigned reserved[3];
     unsigned bounds[12]; // `float_to_ordered` maxima of -x, -y, -z, x, y, z; with ORIENTED_BOUNDS also along `BoundsArgs::bounding_axes`; sent as zeros
 };
 static_assert(sizeof(Header) == 112, "Header differs from src/compute/gpu/tables/layout.rs");
 
-// Bit fields of a tile's `kind`: the number of items of its last quad (0 in a mixed tile); whether it computes
-// positions; whether it computes normals and tangents. A tile of both computes corner i of a shape together with vertex
-// i.
+// Bit fields of a tile's `kind`: the number of items of its last quad (0 in a mixed tile), whether the tile computes
+// positions, and whether it computes normals and tangents. A tile with both flags computes corner i of a shape together
+// with vertex i.
 constexpr unsigned TILE_LAST = 7;
 constexpr unsigned TILE_VERTICES = 8;
 constexpr unsigned TILE_CORNERS = 16;
@@ -42,7 +42,7 @@ constexpr unsigned TILE_CORNERS = 16;
 // The work of one warp: up to 32 quads and their part of U, [chunk][3][width] words of 16 bytes.
 struct WarpTile {
     unsigned long long first_word; // of its U
-    unsigned first;                // first packed vertex or corner; of a mixed tile, first entry of `mixed_quads`
+    unsigned first;                // first packed vertex or corner; in a mixed tile, first entry of `mixed_quads`
     unsigned rest;                 // first quad of x0, normals and tangents
     unsigned domain;
     unsigned first_q;
@@ -62,7 +62,7 @@ struct MixedQuad {
 };
 static_assert(sizeof(MixedQuad) == 16, "MixedQuad differs from src/compute/gpu/tables/layout.rs");
 
-// Offsets of a domain for `normals`. Instances share all but `first` and `first_vertex`.
+// Offsets of a domain for `normals`. Domains of the same shape share all fields except `first` and `first_vertex`.
 struct NormalSlot {
     unsigned first; // packed corner
     unsigned first_normal;
@@ -103,16 +103,16 @@ struct DeformArgs {
     const TransformLink* transform_links;
     const float4* frames;
     const float* q;
-    const unsigned* list;
+    const unsigned* tile_list;
     const unsigned* retained_counts;
     const unsigned short* retained;
     unsigned* boxes;
-    unsigned count; // of tiles
+    unsigned count; // number of tiles
     unsigned reserved;
 };
 static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/compute/gpu/tables/layout.rs");
 
-// Domains of one shape, for which `batch` reads U once.
+// A group of domains of one shape, for which `batch` reads U once.
 struct BatchGroup {
     unsigned long long first_word;
     unsigned rest; // first quad of x0
@@ -120,7 +120,7 @@ struct BatchGroup {
     unsigned vertices; // of the shape
     unsigned first_member;
     unsigned chunks;
-    unsigned members;
+    unsigned members; // number of domains in the group
 };
 static_assert(sizeof(BatchGroup) == 32, "BatchGroup differs from src/compute/gpu/tables/layout.rs");
 
@@ -190,7 +190,7 @@ struct ApplyArgs {
     float4* transforms;
     float* q;
     unsigned* change_steps;
-    unsigned* list;
+    unsigned* tile_list;
 };
 static_assert(sizeof(ApplyArgs) == 80, "ApplyArgs differs from src/compute/gpu/tables/layout.rs");
 
@@ -215,7 +215,7 @@ struct NormalsArgs {
 };
 static_assert(sizeof(NormalsArgs) == 120, "NormalsArgs differs from src/compute/gpu/tables/layout.rs");
 
-// Whether a domain changed after this output was last written.
+// Whether a domain changed after the output buffers were last written.
 __device__ inline bool is_dirty(const Header* header, const unsigned* change_steps, unsigned domain) {
     return max(__ldg(&header->last_full_step), __ldg(change_steps + domain)) > __ldg(&header->output_step);
 }
@@ -227,18 +227,18 @@ __device__ inline unsigned domain_of(const Slot* slots, const unsigned* first_do
     unsigned low = first_domains[blockIdx.x];
     unsigned high = first_domains[blockIdx.x + 1];
     while (low < high) {
-        const unsigned middle = (low + high + 1) / 2;
-        if (slots[middle].first <= item) {
-            low = middle;
+        const unsigned mid = (low + high + 1) / 2;
+        if (slots[mid].first <= item) {
+            low = mid;
         } else {
-            high = middle - 1;
+            high = mid - 1;
         }
     }
     return low;
 }
 
-// Writes three floats per item as one contiguous run of the block, so that a warp fills whole sectors. The caller has a
-// barrier between writing `staged` and this call.
+// Writes three floats per item of the block as one contiguous run, so that warps write whole sectors. The caller must
+// synchronize the block between writing `staged` and this call.
 __device__ inline void store_triples(float* packed, const float* staged, unsigned items) {
     const unsigned begin = blockIdx.x * BLOCK;
     const unsigned floats = 3 * min(BLOCK, items - begin);

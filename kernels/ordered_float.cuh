@@ -1,41 +1,42 @@
 // Order-preserving integer keys of floats, so that integer maxima give float maxima. Twin: src/compute/gpu/tables/box_keys.rs.
 #pragma once
 
-// The key of a number: increases with x and is never 0. x must not be NaN.
+// The key of a number. Keys increase with x and are never 0. x must not be NaN.
 __device__ inline unsigned non_nan_to_ordered(float x) {
     const unsigned bits = __float_as_uint(x);
     return bits ^ (unsigned)((int)bits >> 31 | (int)0x80000000u);
 }
 
-// The key of any x. A NaN has the largest key, so it wins every maximum.
+// The key of any x. A NaN has the largest key, so a maximum with a NaN is NaN.
 __device__ inline unsigned float_to_ordered(float x) {
     return x != x ? 0xffffffffu : non_nan_to_ordered(x);
 }
 
-// The number of a key. The key 0, which no number has, and the key of NaN give a NaN.
+// The number of a key. Key 0, which no number has, and the key of NaN give NaN.
 __device__ inline float ordered_to_float(unsigned key) {
     return __uint_as_float(key >> 31 ? key & 0x7fffffffu : ~key);
 }
 
+// The maximum of a key over the warp.
 __device__ inline unsigned warp_max(unsigned key) {
 #if __CUDA_ARCH__ >= 800
     return __reduce_max_sync(0xffffffffu, key);
 #else
-    for (int lanes = 16; lanes > 0; lanes /= 2) {
-        key = max(key, __shfl_xor_sync(0xffffffffu, key, lanes));
+    for (int offset = 16; offset > 0; offset /= 2) {
+        key = max(key, __shfl_xor_sync(0xffffffffu, key, offset));
     }
     return key;
 #endif
 }
 
-// The maxima of six keys each over a warp; lane i returns that of key i % 6.
+// Reduces each of six keys to its maximum over the warp. Lane i returns the maximum of key i % 6.
 __device__ inline unsigned warp_box(const unsigned (&keys)[6]) {
     const unsigned side = threadIdx.x % 32 % 6;
-    unsigned own = 0;
+    unsigned lane_key = 0;
 #pragma unroll
     for (unsigned i = 0; i < 6; ++i) {
         const unsigned key = warp_max(keys[i]);
-        own = side == i ? key : own;
+        lane_key = side == i ? key : lane_key;
     }
-    return own;
+    return lane_key;
 }

@@ -1,5 +1,5 @@
-// T of a domain: its own or, with FOLLOWERS, that of its transform root times a constant frame. CPU twin:
-// src/model/domain/composed_transform.rs, bit by bit: it defines the order of operations.
+// The transform T of a domain: its own or, with FOLLOWERS, that of its transform root times a constant frame. CPU twin:
+// src/model/domain/composed_transform.rs, which defines the order of operations; results are bit-identical.
 #pragma once
 #include "layout.cuh"
 
@@ -26,18 +26,18 @@ __device__ __forceinline__ Transforms transforms_of(const Args& args) {
 #endif
 }
 
-__device__ __forceinline__ Affine load_affine(const float4* list, unsigned index) {
-    const float4* rows = list + 3 * (size_t)index;
+__device__ __forceinline__ Affine load_affine(const float4* table, unsigned index) {
+    const float4* rows = table + 3 * (size_t)index;
     return {__ldg(rows), __ldg(rows + 1), __ldg(rows + 2)};
 }
 
 #ifdef FOLLOWERS
 __device__ __forceinline__ TransformLink load_transform_link(const Transforms& transforms, unsigned domain) {
-    const uint2 own = __ldg((const uint2*)(transforms.transform_links + domain));
-    return {own.x, own.y};
+    const uint2 link = __ldg((const uint2*)(transforms.transform_links + domain));
+    return {link.x, link.y};
 }
 
-// A row of T times a column of F.
+// A row of T times a column (x, y, z) of the frame F.
 __device__ __forceinline__ float dot_row_column(const float4& t, float x, float y, float z) {
     return fmaf(t.x, x, fmaf(t.y, y, __fmul_rn(t.z, z)));
 }
@@ -50,12 +50,12 @@ __device__ __forceinline__ float4 compose_row(const float4& t, const Affine& f) 
 
 __device__ __forceinline__ Affine load_transform(const Transforms& transforms, unsigned domain) {
 #ifdef FOLLOWERS
-    const TransformLink own = load_transform_link(transforms, domain);
-    const Affine t = load_affine(transforms.rows, own.root);
-    if (own.frame == NO_FRAME) {
+    const TransformLink link = load_transform_link(transforms, domain);
+    const Affine t = load_affine(transforms.rows, link.root);
+    if (link.frame == NO_FRAME) {
         return t;
     }
-    const Affine f = load_affine(transforms.frames, own.frame);
+    const Affine f = load_affine(transforms.frames, link.frame);
     return {compose_row(t.a, f), compose_row(t.b, f), compose_row(t.c, f)};
 #else
     return load_affine(transforms.rows, domain);
@@ -74,19 +74,19 @@ __device__ __forceinline__ void transform_point_f64(const float4* rows, const do
     }
 }
 
-// T of a domain times a point in f64, rounded once.
+// T of a domain times a point, computed in f64 and rounded once. Overwrites `point`.
 __device__ __forceinline__ float3 transform_domain_point_f64(const Transforms& transforms, unsigned domain, double (&point)[3]) {
     double world[3];
 #ifdef FOLLOWERS
     // Apply both transforms in sequence: their product may overflow f32.
-    const TransformLink own = load_transform_link(transforms, domain);
-    if (own.frame != NO_FRAME) {
-        transform_point_f64(transforms.frames + 3 * (size_t)own.frame, point, world);
+    const TransformLink link = load_transform_link(transforms, domain);
+    if (link.frame != NO_FRAME) {
+        transform_point_f64(transforms.frames + 3 * (size_t)link.frame, point, world);
         point[0] = world[0];
         point[1] = world[1];
         point[2] = world[2];
     }
-    transform_point_f64(transforms.rows + 3 * (size_t)own.root, point, world);
+    transform_point_f64(transforms.rows + 3 * (size_t)link.root, point, world);
 #else
     transform_point_f64(transforms.rows + 3 * (size_t)domain, point, world);
 #endif

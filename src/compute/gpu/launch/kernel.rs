@@ -80,7 +80,7 @@ pub enum LaunchOrder {
     Serial,
     /// Programmatic dependent launch (`kernels/dependent_launch.cuh`): the kernel may be scheduled while the previous
     /// one ends, which hides its launch latency. The kernel itself waits for the previous one by
-    /// `wait_on_dependent_grids`. Devices below capability 9.0 launch serially.
+    /// `wait_for_prerequisite_grids`. Devices below capability 9.0 launch serially.
     Dependent,
 }
 
@@ -89,7 +89,7 @@ pub enum LaunchOrder {
 /// # Safety
 /// The kernel has one argument, a struct with the layout of `T`. The addresses in it are those of device memory, or of
 /// pinned memory, that has the sizes which the kernel accesses, and that lives until the kernel has run. A kernel that
-/// is launched with [`LaunchOrder::Dependent`] calls `wait_on_dependent_grids` before it accesses memory.
+/// is launched with [`LaunchOrder::Dependent`] calls `wait_for_prerequisite_grids` before it accesses memory.
 ///
 /// # Errors
 /// `Fault` when the driver refuses the launch.

@@ -103,7 +103,7 @@ pub(crate) struct DeformArgs {
     pub transform_links: u64,
     pub frames: u64,
     pub q: u64,
-    pub list: u64,
+    pub tile_list: u64,
     pub retained_counts: u64,
     pub retained: u64,
     pub boxes: u64,
@@ -200,7 +200,7 @@ pub(crate) struct ApplyArgs {
     pub transforms: u64,
     pub q: u64,
     pub change_steps: u64,
-    pub list: u64,
+    pub tile_list: u64,
 }
 
 /// Offsets of the corners of one domain, and of the vertices that `normals` gathers around them.
@@ -286,7 +286,7 @@ pub fn layout_constants() -> Vec<LayoutConstant> {
         TransformLink { root, frame }
         DeformArgs {
             header, tiles, mixed_quads, words, rest, rest_normals, rest_tangents, corner_offsets, scales, mixed_quad_scales,
-            transforms, transform_links, frames, q, list, retained_counts, retained, boxes, count, reserved
+            transforms, transform_links, frames, q, tile_list, retained_counts, retained, boxes, count, reserved
         }
         BatchGroup { first_word, rest, first_scale, vertices, first_member, chunks, members }
         BatchMember { first, first_q, domain, first_tile }
@@ -296,7 +296,7 @@ pub fn layout_constants() -> Vec<LayoutConstant> {
         }
         BoxSegment { first, count, domain, from_vertices }
         BoundsArgs { header, boxes, segments, change_steps, segment_boxes, count, segment_count, bounding_axes, reserved }
-        ApplyArgs { header, changes, new_transforms, new_q, dirty_tiles, transform_links, transforms, q, change_steps, list }
+        ApplyArgs { header, changes, new_transforms, new_q, dirty_tiles, transform_links, transforms, q, change_steps, tile_list }
         NormalSlot { first, first_normal, first_tangent, first_vertex, first_member }
         NormalsArgs {
             header, slots, first_domains, rest_normals, rest_tangents, transforms, transform_links, frames, change_steps, members,

@@ -84,7 +84,7 @@ impl ApplyKernel {
             transforms: values.transforms,
             q: values.q,
             change_steps: values.change_steps,
-            list: deform.tile_list(),
+            tile_list: deform.tile_list(),
         };
         // SAFETY: the kernel's only argument is an `ApplyArgs`. Pinned memory has the same address on host and device
         // (unified addressing). The lists refer to domains and coordinates of the scene that the buffers were made for,

@@ -76,7 +76,7 @@ impl BoundsKernel {
         };
         // SAFETY: the kernel's only argument is a `BoundsArgs`; `boxes` has six words for each of `count`, as
         // `DeformKernel` allocated them, and `segment_boxes` has six for each piece. Pieces refer to boxes, vertices and
-        // domains of the same scene. The kernel calls `wait_on_dependent_grids` before it accesses memory.
+        // domains of the same scene. The kernel calls `wait_for_prerequisite_grids` before it accesses memory.
         unsafe { launch_kernel(device, &self.function, self.config, LaunchOrder::Dependent, &args) }
     }
 }

@@ -217,7 +217,7 @@ impl DeformKernel {
             transform_links: values.transform_links,
             frames: values.frames,
             q: values.q,
-            list: self.list.address(),
+            tile_list: self.list.address(),
             retained_counts: values.retained_counts,
             retained: values.retained,
             boxes: self.boxes.address(),

@@ -89,7 +89,7 @@ impl NormalsKernel {
             groups: self.groups,
             reserved: 0,
         };
-        // SAFETY: the kernel's only argument is a `NormalsArgs`, and the kernel calls `wait_on_dependent_grids` before it
+        // SAFETY: the kernel's only argument is a `NormalsArgs`, and the kernel calls `wait_for_prerequisite_grids` before it
         // accesses memory. The tables come from `NormalTables`: members refer to groups, rings refer to vertices of
         // their shape, and slots lie inside the rest normals, tangents, positions and transforms of the same scene.
         // Tangents are read and written only by a kernel that was compiled for a scene with normal maps. The caller
