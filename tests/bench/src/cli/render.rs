@@ -104,12 +104,12 @@ fn rasters(args: &Args, request: &RenderReportOptions) -> Outcome {
 }
 
 fn figures(args: &Args) -> Outcome {
-    let request = render::figures::Request { size: size(args, USUAL[1])?, scenes: args.scenes.clone() };
+    let request = render::figures::FigureOptions { size: size(args, USUAL[1])?, scenes: args.scenes.clone() };
     let hear = |what: &str| tracing::info!(what, "drawing");
-    let figures = with_spinner("drawing", || render::figures::figures(&request, hear))?;
+    let figures = with_spinner("drawing", || render::figures::draw_figures(&request, hear))?;
     figures.write(&args.out)?;
     for figure in &figures.figures {
-        print_line(format!("{:<6}{:<36}{}", figure.name, figure.file, figure.shows.join("; ")));
+        print_line(format!("{:<6}{:<36}{}", figure.name, figure.file, figure.captions.join("; ")));
     }
     print_line(format!("written to {}", args.out.display()));
     Ok(true)
@@ -117,15 +117,17 @@ fn figures(args: &Args) -> Outcome {
 
 fn timed(args: &Args) -> Outcome {
     let replays = args.replays.map_or(100, |replays| replays as usize);
-    let request = render::frame_times::Request { scenes: args.scenes.clone(), size: size(args, USUAL[0])?, replays };
-    let timed =
-        with_spinner("measuring", || render::frame_times::timed(&request, |what| tracing::info!(what, "timing")))?;
+    let request =
+        render::frame_times::FrameTimeOptions { scenes: args.scenes.clone(), size: size(args, USUAL[0])?, replays };
+    let timed = with_spinner("measuring", || {
+        render::frame_times::time_scenes(&request, |what| tracing::info!(what, "timing"))
+    })?;
     timed.write(&args.out)?;
     for scene in &timed.scenes {
         let frame = scene.passes.iter().find(|pass| pass.name == "frame").map_or(0.0, |pass| pass.timing.median_us);
         print_line(format!(
             "{:<24}frame {frame:>12.1} us, with its pixels {:>12.1} us",
-            scene.name, scene.whole.median_us
+            scene.name, scene.wall_clock.median_us
         ));
     }
     print_line(format!("written to {}", args.out.display()));
@@ -163,7 +165,7 @@ fn request(args: &Args) -> Result<RenderReportOptions> {
         quick: args.quick,
         replays: args.replays.map_or(if args.quick { 20 } else { 100 }, |replays| replays as usize),
     };
-    match request.wanted().is_empty() {
+    match request.selected_variants().is_empty() {
         false => Ok(request),
         true => {
             let names: Vec<String> = variants::all(false).into_iter().map(|variant| variant.name).collect();
@@ -197,7 +199,7 @@ fn lines(report: &RenderReport) -> Vec<String> {
             show(row.flicker.map(|flicker| flicker.mean), 3),
             match (row.passed, row.to_fail) {
                 (true, _) => "yes".into(),
-                (false, true) => "as stated".into(),
+                (false, true) => "as expected".into(),
                 (false, false) => "NO".into(),
             },
         ];
@@ -218,13 +220,13 @@ fn lines(report: &RenderReport) -> Vec<String> {
             100.0 * plant.occupation
         ));
     }
-    for bare in &report.bare {
-        let (depth, visibility) = (bare.depth.median_us, bare.visibility.median_us);
+    for minimal in &report.minimal_passes {
+        let (depth, visibility) = (minimal.depth.median_us, minimal.visibility.median_us);
         lines.push(format!(
             "{:<18}map {}: bare depth {depth:.1} us, bare visibility {visibility:.1} us",
-            bare.load, bare.map
+            minimal.load, minimal.map
         ));
-        lines.extend([&bare.unculled, &bare.usual].map(|frame| {
+        lines.extend([&minimal.unculled, &minimal.default_culling].map(|frame| {
             format!("{:<18}{} takes {:.1} us, {:.1} us beyond both", "", frame.name, frame.frame_us, frame.beyond_us)
         }));
     }
@@ -263,10 +265,10 @@ mod tests {
         assert_eq!(request(&named).expect("fits").loads, [RenderWorkload::Square, RenderWorkload::Triangles(10)]);
         // A quick run also includes the frame that the bare passes are compared with, if it is named.
         let variants = ["variance 4096, blur 1.5", "culling*"].map(String::from).to_vec();
-        let named = request(&Args { variants, ..args() }).expect("fits").wanted();
+        let named = request(&Args { variants, ..args() }).expect("fits").selected_variants();
         let names: Vec<&str> = named.iter().map(|variant| variant.name.as_str()).collect();
         assert_eq!(names, ["variance 4096, blur 1.5", "culling none", "culling triangles", "culling depth"]);
-        assert_eq!(request(&args()).expect("fits").wanted().len(), variants::all(true).len());
+        assert_eq!(request(&args()).expect("fits").selected_variants().len(), variants::all(true).len());
         for wrong in [
             Args { loads: vec!["cube".into()], ..args() },
             Args { loads: vec!["plant-13".into()], ..args() },

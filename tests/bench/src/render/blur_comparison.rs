@@ -15,32 +15,34 @@ pub struct BlurComparison {
     pub size: u32,
     /// Taps of the blur per direction.
     pub taps: u32,
-    /// Medians, microseconds: the fastest compute method, and fragments.
+    /// Median of the fastest compute method, microseconds.
     pub compute_us: f64,
+    /// Median of the fragment shaders, microseconds.
     pub fragments_us: f64,
+    /// Speedup of compute over fragments.
     pub ratio: f64,
 }
 
-/// Required speedup of compute over fragments at 4096 texels per side on an H200, and the time limit of compute in
-/// microseconds.
-pub(super) const TIMES_AS_FAST: f64 = 40.0;
-pub(super) const MOST_US: f64 = 200.0;
+/// Required speedup of compute over fragments at 4096 texels per side on an H200.
+pub(super) const MIN_SPEEDUP: f64 = 40.0;
+/// Time limit of compute for the same map, microseconds.
+pub(super) const MAX_COMPUTE_US: f64 = 200.0;
 
 impl BlurComparison {
     /// Every map that was timed with both methods.
-    pub(super) fn of(rows: &[RenderRow]) -> Vec<Self> {
+    pub(super) fn pair_rows(rows: &[RenderRow]) -> Vec<Self> {
         let is_by_fragments = |row: &RenderRow| row.blur_method == BlurMethod::Fragments;
         let fragments = rows.iter().filter(|row| is_by_fragments(row)).filter_map(|row| Some((row, row.shadow?)));
-        let comparison_tables = |(row, shadow): (&RenderRow, ShadowSettings)| {
-            let same =
+        let compare = |(row, shadow): (&RenderRow, ShadowSettings)| {
+            let is_same_map =
                 |other: &&RenderRow| other.load == row.load && other.shadow == Some(shadow) && !is_by_fragments(other);
-            let compute_us = rows.iter().filter(same).filter_map(blur_us).min_by(f64::total_cmp)?;
+            let compute_us = rows.iter().filter(is_same_map).filter_map(blur_us).min_by(f64::total_cmp)?;
             let fragments_us = blur_us(row)?;
             let ratio = fragments_us / compute_us;
             let taps = 2 * shadow.reach() + 1;
             Some(Self { load: row.load.clone(), size: shadow.size, taps, compute_us, fragments_us, ratio })
         };
-        fragments.filter_map(comparison_tables).collect()
+        fragments.filter_map(compare).collect()
     }
 }
 
@@ -58,7 +60,7 @@ mod tests {
     use modalcast_model::scene::Culling;
 
     fn row(load: &str, (size, blur_method): (u32, BlurMethod), us: f64) -> RenderRow {
-        let timing = Timing::of(vec![us]).expect("one");
+        let timing = Timing::of(vec![us]).expect("a timing");
         RenderRow {
             load: load.into(),
             name: String::new(),
@@ -97,8 +99,8 @@ mod tests {
             row("b", (4096, BlurMethod::Tiles), 1.0),
             row("b", (1024, BlurMethod::Fragments), 50.0),
         ];
-        let [only] = &BlurComparison::of(&rows)[..] else { panic!("one map was made both ways") };
-        assert_eq!((only.load.as_str(), only.size, only.taps), ("a", 4096, 15));
-        assert_eq!((only.compute_us, only.fragments_us, only.ratio), (200.0, 9000.0, 45.0));
+        let [comparison] = &BlurComparison::pair_rows(&rows)[..] else { panic!("expected one map with both methods") };
+        assert_eq!((comparison.load.as_str(), comparison.size, comparison.taps), ("a", 4096, 15));
+        assert_eq!((comparison.compute_us, comparison.fragments_us, comparison.ratio), (200.0, 9000.0, 45.0));
     }
 }

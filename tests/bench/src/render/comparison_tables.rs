@@ -1,19 +1,24 @@
-//! Sections of `report.md` that do not belong to one load: bare passes, rasterizers, blurs, and the plants of the
-//! thesis.
+//! Sections of `report.md` that cover all loads: minimal passes, rasterizers, blurs, and the plants of the thesis.
 
 use super::RenderReport;
-use super::blur_comparison::{BlurComparison, MOST_US, TIMES_AS_FAST};
-use super::minimal_passes::{BEYOND_US, MinimalPasses};
+use super::blur_comparison::{BlurComparison, MAX_COMPUTE_US, MIN_SPEEDUP};
+use super::minimal_passes::{MAX_EXCESS_US, MinimalPasses};
 use super::plants::PlantResult;
-use super::raster_comparison::{MOST_DIFFERING, RasterComparison, TimingPair, TriangleCounts};
+use super::raster_comparison::{MAX_DIFFERING, RasterComparison, TimingPair, TriangleCounts};
 use crate::markdown_table::{dash, table};
 
 /// All sections for which the report has data.
 pub(super) fn markdown(report: &RenderReport) -> String {
-    [bare(&report.bare), raster(&report.raster), blurs(&report.blurs), plants(&report.plants)].concat()
+    [
+        minimal_passes_section(&report.minimal_passes),
+        raster_section(&report.raster),
+        blur_section(&report.blurs),
+        plant_section(&report.plants),
+    ]
+    .concat()
 }
 
-fn bare(list: &[MinimalPasses]) -> String {
+fn minimal_passes_section(list: &[MinimalPasses]) -> String {
     if list.is_empty() {
         return String::new();
     }
@@ -33,22 +38,22 @@ fn bare(list: &[MinimalPasses]) -> String {
         "\n## Bare passes\n\nThe same scene in the same run, stripped to one opaque material: all triangles in one draw into \
          the depth of the map, and in one draw into ids and depth of the frame; no culling, no images, no holes. Beside them \
          frames with a variance map of the same side. What the frame without culling takes beyond both passes is to be \
-         {BEYOND_US} us at most for 3,000,000 triangles and a map of 4096 on an H200 at 1920 x 1080; the other has fewer \
+         {MAX_EXCESS_US} us at most for 3,000,000 triangles and a map of 4096 on an H200 at 1920 x 1080; the other has fewer \
          triangles to draw than the passes have.\n\n"
     );
-    let row = |own: &MinimalPasses| {
+    let row = |passes: &MinimalPasses| {
         let us = |us: f64| format!("{us:.1}");
         [
-            own.load.clone(),
-            own.triangles.to_string(),
-            us(own.depth.median_us),
-            own.map.to_string(),
-            us(own.visibility.median_us),
-            own.samples.to_string(),
-            us(own.unculled.frame_us),
-            us(own.unculled.beyond_us),
-            us(own.usual.frame_us),
-            us(own.usual.beyond_us),
+            passes.load.clone(),
+            passes.triangles.to_string(),
+            us(passes.depth.median_us),
+            passes.map.to_string(),
+            us(passes.visibility.median_us),
+            passes.samples.to_string(),
+            us(passes.unculled.frame_us),
+            us(passes.unculled.beyond_us),
+            us(passes.default_culling.frame_us),
+            us(passes.default_culling.beyond_us),
         ]
     };
     text.push_str(&table(&head, list.iter().map(row)));
@@ -56,67 +61,75 @@ fn bare(list: &[MinimalPasses]) -> String {
 }
 
 /// The section that compares the CUDA rasterizer with OpenGL.
-pub(super) fn raster(list: &[RasterComparison]) -> String {
+pub(super) fn raster_section(list: &[RasterComparison]) -> String {
     if list.is_empty() {
         return String::new();
     }
     let head = [
         "load",
         "triangles",
-        "ids that differ",
+        "differing ids",
         "depth us: OpenGL",
         "CUDA",
-        "times as fast",
+        "speedup",
         "of",
         "ids us: OpenGL",
         "CUDA",
-        "times as fast",
+        "speedup",
         "in the map",
         "in the frame",
     ];
     let mut text = format!(
-        "\n## Raster\n\nThe bare passes at one sample a pixel, by OpenGL and by CUDA's own kernels, in the same run. Where \
+        "\n## Raster\n\nThe bare passes at one sample a pixel, by OpenGL and by our CUDA kernels, in the same run. Where \
          more than {} % of the ids differ nothing is timed. Triangles: drawn by a thread + a warp + tile by tile; between \
          the samples; dropped for another reason.\n\n",
-        100.0 * MOST_DIFFERING
+        100.0 * MAX_DIFFERING
     );
-    let row = |own: &RasterComparison| {
-        let count = |own: TriangleCounts| {
-            format!("{} + {} + {}; {}; {}", own.small, own.medium, own.large, own.missed, own.dropped)
+    let row = |raster: &RasterComparison| {
+        let triangle_counts = |counts: TriangleCounts| {
+            let TriangleCounts { small, medium, large, missed, dropped } = counts;
+            format!("{small} + {medium} + {large}; {missed}; {dropped}")
         };
-        let pair = |pair: Option<TimingPair>| match pair {
-            Some(pair) => [pair.opengl.median_us, pair.cuda.median_us, pair.ratio()].map(|own| format!("{own:.1}")),
+        let pair_cells = |pair: Option<TimingPair>| match pair {
+            Some(pair) => {
+                [pair.opengl.median_us, pair.cuda.median_us, pair.ratio()].map(|number| format!("{number:.1}"))
+            }
             None => [(); 3].map(|()| dash()),
         };
-        let first = [own.load.clone(), own.triangles.to_string(), format!("{} of {}", own.differing, own.samples)];
-        let cells = first.into_iter().chain(pair(own.passes.map(|passes| passes.depth))).chain([own.map.to_string()]);
-        let cells = cells.chain(pair(own.passes.map(|passes| passes.visibility)));
-        cells.chain([count(own.in_map), count(own.in_frame)])
+        let sizes =
+            [raster.load.clone(), raster.triangles.to_string(), format!("{} of {}", raster.differing, raster.samples)];
+        let cells = sizes
+            .into_iter()
+            .chain(pair_cells(raster.passes.map(|passes| passes.depth)))
+            .chain([raster.map.to_string()]);
+        let cells = cells.chain(pair_cells(raster.passes.map(|passes| passes.visibility)));
+        cells.chain([triangle_counts(raster.in_map), triangle_counts(raster.in_frame)])
     };
     text.push_str(&table(&head, list.iter().map(row)));
     text
 }
 
-fn blurs(list: &[BlurComparison]) -> String {
+fn blur_section(list: &[BlurComparison]) -> String {
     if list.is_empty() {
         return String::new();
     }
-    let head = ["load", "map", "taps", "compute us", "fragments us", "times as fast"];
+    let head = ["load", "map", "taps", "compute us", "fragments us", "speedup"];
     let mut text = format!(
         "\n## Moments and blur\n\nThe same map from the same depth, by compute shaders (the fastest of ours) and by two \
-         passes of fragments. At 4096 on an H200 compute is to take {MOST_US} us at most and to be {TIMES_AS_FAST} times as \
+         passes of fragments. At 4096 on an H200 compute is to take {MAX_COMPUTE_US} us at most and to be {MIN_SPEEDUP} times as \
          fast.\n\n"
     );
-    let row = |own: &BlurComparison| {
-        let [compute, fragments, ratio] = [own.compute_us, own.fragments_us, own.ratio].map(|us| format!("{us:.1}"));
-        let [size, taps] = [own.size, own.taps].map(|number| number.to_string());
-        [own.load.clone(), size, taps, compute, fragments, ratio]
+    let row = |blur: &BlurComparison| {
+        let [compute, fragments, ratio] =
+            [blur.compute_us, blur.fragments_us, blur.ratio].map(|number| format!("{number:.1}"));
+        let [size, taps] = [blur.size, blur.taps].map(|number| number.to_string());
+        [blur.load.clone(), size, taps, compute, fragments, ratio]
     };
     text.push_str(&table(&head, list.iter().map(row)));
     text
 }
 
-fn plants(list: &[PlantResult]) -> String {
+fn plant_section(list: &[PlantResult]) -> String {
     let Some(first) = list.first() else { return String::new() };
     let head = [
         "species",
@@ -148,28 +161,28 @@ fn plants(list: &[PlantResult]) -> String {
             " These plants are smaller than the thesis's: its figures are not to be compared."
         }
     );
-    text.push_str(&table(&head, list.iter().map(plant)));
+    text.push_str(&table(&head, list.iter().map(plant_cells)));
     text
 }
 
-fn plant(own: &PlantResult) -> [String; 14] {
+fn plant_cells(plant: &PlantResult) -> [String; 14] {
     let ms = |us: f64| format!("{:.3}", us / 1e3);
     let percent = |share: f64| format!("{:.2} %", 100.0 * share);
-    let printed = own.thesis.drawn;
+    let thesis = plant.thesis.drawn;
     [
-        own.thesis.name.into(),
-        own.triangles.to_string(),
-        own.domains.to_string(),
-        ms(own.deform.median_us),
-        if own.shared { dash() } else { ms(own.upload.median_us) },
-        ms(own.render.median_us),
-        ms(own.vbr.median_us),
-        printed.gpu_vbr_ms.to_string(),
-        format!("{:.1}", own.fps),
-        printed.gpu_fps.to_string(),
-        format!("{:.1}", own.bytes as f64 / 1e6),
-        printed.gpu_mb.to_string(),
-        percent(own.occupation),
-        percent(printed.gpu_vbr_occupation),
+        plant.thesis.name.into(),
+        plant.triangles.to_string(),
+        plant.domains.to_string(),
+        ms(plant.deform.median_us),
+        if plant.shared { dash() } else { ms(plant.upload.median_us) },
+        ms(plant.render.median_us),
+        ms(plant.vbr.median_us),
+        thesis.gpu_vbr_ms.to_string(),
+        format!("{:.1}", plant.fps),
+        thesis.gpu_fps.to_string(),
+        format!("{:.1}", plant.bytes as f64 / 1e6),
+        thesis.gpu_mb.to_string(),
+        percent(plant.occupation),
+        percent(thesis.gpu_vbr_occupation),
     ]
 }

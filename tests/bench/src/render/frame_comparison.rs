@@ -1,15 +1,15 @@
-//! Compares whole frames of OpenGL's and the CUDA rasterizer in one run: the same scene with its materials, a variance
-//! map and one sample per pixel with FXAA. Ids and colors are compared before anything is timed.
+//! Compares whole frames with the OpenGL and the CUDA rasterizer in one run. Both draw the scene with its materials, a
+//! variance shadow map and one sample per pixel with FXAA. Ids and colors are compared before the frames are timed.
 
 use std::sync::Arc;
 
 use serde::Serialize;
 
-use super::harness::{HarnessScene, PassTime, RenderHarness, Size};
-use super::light_meter::relit;
+use super::harness::{LoadedScene, PassTime, RenderHarness, Size};
+use super::light_meter::with_settings;
 use super::measure::STILL;
-use super::metrics::{ErrorDistribution, colors};
-use super::raster_comparison::{MAPS, MOST_DIFFERING};
+use super::metrics::{ErrorDistribution, compare_colors};
+use super::raster_comparison::{MAPS, MAX_DIFFERING};
 use super::rigid_domain::add_rigid_domain;
 use super::workloads::{room, screen};
 use super::{RenderReportOptions, harness};
@@ -18,7 +18,7 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::{
     Antialiasing, Camera, Culling, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings,
 };
-use modalcast_render::{FrameCullStats, RasterBackends, VisibilityId};
+use modalcast_render::{FrameCullStats, FrameImage, RasterBackends, VisibilityId};
 
 /// Results of one load with both rasterizers.
 #[derive(Debug, Clone, Serialize)]
@@ -27,7 +27,7 @@ pub struct FrameComparison {
     pub triangles: usize,
     /// Side of the shadow map, texels.
     pub map: u32,
-    /// Taps of its blur per direction.
+    /// Taps of the map's blur per direction.
     pub taps: u32,
     /// Rasterizer of each pass when CUDA is available.
     #[serde(rename = "paths")]
@@ -35,10 +35,10 @@ pub struct FrameComparison {
     /// Pixels whose id differs from OpenGL's.
     pub differing: usize,
     pub pixels: usize,
-    /// Color differences from OpenGL's picture, of 255.
+    /// Color differences from OpenGL's image, of 255.
     #[serde(rename = "colours")]
     pub colors: ErrorDistribution,
-    /// Times of OpenGL with the load's culling; "frame" is the sum without readback.
+    /// Times of OpenGL with automatic culling; "frame" is the sum without readback.
     pub opengl: Vec<PassTime>,
     pub culled: Option<FrameCullStats>,
     /// Times with CUDA; `None` where too many ids differ.
@@ -48,22 +48,22 @@ pub struct FrameComparison {
 impl FrameComparison {
     /// Speedup of the frame by CUDA.
     pub fn ratio(&self) -> Option<f64> {
-        let frame =
+        let frame_us =
             |passes: &[PassTime]| passes.iter().find(|pass| pass.name == "frame").map(|pass| pass.timing.median_us);
-        Some(frame(&self.opengl)? / frame(self.cuda.as_deref()?)?)
+        Some(frame_us(&self.opengl)? / frame_us(self.cuda.as_deref()?)?)
     }
 
     /// The results as one line of text.
     pub fn line(&self) -> String {
-        let us = |passes: &[PassTime]| {
-            let one = |pass: &PassTime| format!("{} {:.1}", pass.name, pass.timing.median_us);
-            passes.iter().map(one).collect::<Vec<_>>().join(", ")
+        let pass_times = |passes: &[PassTime]| {
+            let pass_time = |pass: &PassTime| format!("{} {:.1}", pass.name, pass.timing.median_us);
+            passes.iter().map(pass_time).collect::<Vec<_>>().join(", ")
         };
         format!(
             "{:<18}opengl: {}; cuda: {}; {:.1} times as fast; {} of {} ids differ, pixels by {:.3} of 255 on average, {} at most",
             self.load,
-            us(&self.opengl),
-            self.cuda.as_deref().map_or("not timed".into(), us),
+            pass_times(&self.opengl),
+            self.cuda.as_deref().map_or("not timed".into(), pass_times),
             self.ratio().unwrap_or(f64::NAN),
             self.differing,
             self.pixels,
@@ -73,7 +73,7 @@ impl FrameComparison {
     }
 }
 
-/// A scene with the look of this benchmark, its state and camera.
+/// A scene with the render settings of this benchmark, its state and camera.
 struct FrameSetup {
     name: String,
     scene: Arc<Scene>,
@@ -86,18 +86,18 @@ struct FrameSetup {
 /// # Errors
 /// Errors of drawing and of the device.
 pub(super) fn measure(
-    studio: &mut RenderHarness,
+    harness: &mut RenderHarness,
     device: &Arc<Device>,
     request: &RenderReportOptions,
     progress: &mut dyn FnMut(&str),
 ) -> Result<Vec<FrameComparison>> {
-    let mut jobs = Vec::new();
-    for kind in &request.loads {
-        let stage = kind.stage()?;
-        jobs.push(FrameSetup::new(
-            &stage.name,
-            &stage.scene,
-            (stage.state(STILL), stage.camera(request.size)),
+    let mut setups = Vec::new();
+    for workload in &request.loads {
+        let animation = workload.build()?;
+        setups.push(FrameSetup::new(
+            &animation.name,
+            &animation.scene,
+            (animation.state(STILL), animation.camera(request.size)),
             request,
         )?);
     }
@@ -105,17 +105,17 @@ pub(super) fn measure(
         let mut parts = SceneParts::named(name);
         add_rigid_domain(&mut parts, name, mesh, modalcast_model::domain::Material::default())?;
         let scene = Scene::new(parts)?;
-        jobs.push(FrameSetup::new(name, &scene, (SceneState::rest(&scene), camera), request)?);
+        setups.push(FrameSetup::new(name, &scene, (SceneState::rest(&scene), camera), request)?);
     }
-    let mut list = Vec::new();
-    for job in jobs {
-        progress(&format!("{}: frames by OpenGL and by CUDA", job.name));
-        let mut set = studio.set(&job.scene)?;
-        let measured = job.measure(studio, &mut set, device, request);
-        studio.unload(set);
-        list.push(measured?);
+    let mut comparisons = Vec::new();
+    for setup in setups {
+        progress(&format!("{}: frames by OpenGL and by CUDA", setup.name));
+        let mut loaded_scene = harness.load(&setup.scene)?;
+        let measured = setup.measure(harness, &mut loaded_scene, device, request);
+        harness.unload(loaded_scene);
+        comparisons.push(measured?);
     }
-    Ok(list)
+    Ok(comparisons)
 }
 
 impl FrameSetup {
@@ -128,29 +128,29 @@ impl FrameSetup {
         let size = if request.quick { MAPS.1 } else { MAPS.0 };
         let shadow = Some(ShadowSettings { size, ..ShadowSettings::default() });
         let look = RenderSettings { shadow, antialias: Antialiasing::Fxaa, culling: Culling::Auto, ..scene.look };
-        Ok(Self { name: name.into(), scene: relit(scene, look)?, state, camera })
+        Ok(Self { name: name.into(), scene: with_settings(scene, look)?, state, camera })
     }
 
     fn measure(
         &self,
-        studio: &mut RenderHarness,
-        set: &mut HarnessScene,
+        harness: &mut RenderHarness,
+        loaded_scene: &mut LoadedScene,
         device: &Arc<Device>,
         request: &RenderReportOptions,
     ) -> Result<FrameComparison> {
         let (size, replays) = (request.size, request.replays);
-        studio.pose(set, &self.state)?;
-        let want = self.shown(studio, set, size)?;
-        let opengl = studio.time(set, self.camera, size, replays)?;
-        let culled = studio.renderer.stats().culled;
-        studio.attach_rasterizer(set, device)?;
-        let got = self.shown(studio, set, size)?;
-        let raster_backends = studio.renderer.stats().raster_backends;
-        let differing = got.1.iter().zip(&want.1).filter(|(got, want)| got != want).count();
-        let agrees = differing as f64 <= MOST_DIFFERING * want.1.len() as f64;
-        let cuda = if agrees { Some(studio.time(set, self.camera, size, replays)?) } else { None };
+        harness.deform(loaded_scene, &self.state)?;
+        let (opengl_image, opengl_ids) = self.draw_with_ids(harness, loaded_scene, size)?;
+        let opengl = harness.time(loaded_scene, self.camera, size, replays)?;
+        let culled = harness.renderer.stats().culled;
+        harness.attach_rasterizer(loaded_scene, device)?;
+        let (cuda_image, cuda_ids) = self.draw_with_ids(harness, loaded_scene, size)?;
+        let raster_backends = harness.renderer.stats().raster_backends;
+        let differing = cuda_ids.iter().zip(&opengl_ids).filter(|(cuda, opengl)| cuda != opengl).count();
+        let agrees = differing as f64 <= MAX_DIFFERING * opengl_ids.len() as f64;
+        let cuda = if agrees { Some(harness.time(loaded_scene, self.camera, size, replays)?) } else { None };
         let reference: Vec<[f32; 3]> =
-            want.0.chunks_exact(4).map(|pixel| [0, 1, 2].map(|channel| f32::from(pixel[channel]))).collect();
+            opengl_image.rgba.chunks_exact(4).map(|pixel| [0, 1, 2].map(|channel| f32::from(pixel[channel]))).collect();
         let shadow = self.scene.look.shadow.unwrap_or_default();
         Ok(FrameComparison {
             load: self.name.clone(),
@@ -159,36 +159,38 @@ impl FrameSetup {
             taps: 2 * shadow.reach() + 1,
             raster_backends,
             differing,
-            pixels: want.1.len(),
-            colors: colors(&got.0, &reference),
+            pixels: opengl_ids.len(),
+            colors: compare_colors(&cuda_image.rgba, &reference),
             opengl,
             culled,
             cuda,
         })
     }
 
-    /// The picture, and the id at each of its pixels.
-    fn shown(
+    /// Draws the frame and reads the id at each of its pixels.
+    fn draw_with_ids(
         &self,
-        studio: &mut RenderHarness,
-        set: &HarnessScene,
+        harness: &mut RenderHarness,
+        loaded_scene: &LoadedScene,
         size: Size,
-    ) -> Result<(Vec<u8>, Vec<VisibilityId>)> {
-        let image = studio.draw(set, self.camera, size)?;
-        Ok((image.rgba, studio.renderer.read_visibility()?))
+    ) -> Result<(FrameImage, Vec<VisibilityId>)> {
+        let image = harness.draw(loaded_scene, self.camera, size)?;
+        Ok((image, harness.renderer.read_visibility()?))
     }
 }
 
-/// Descriptions of the frames that were not timed.
-pub(super) fn faults(list: &[FrameComparison]) -> Vec<String> {
-    let untimed = list.iter().filter(|own| own.cuda.is_none());
+/// Reasons why frames were not timed.
+pub(super) fn faults(comparisons: &[FrameComparison]) -> Vec<String> {
+    let untimed = comparisons.iter().filter(|comparison| comparison.cuda.is_none());
     untimed
-        .map(|own| format!("{}: {} of {} pixels see another triangle", own.load, own.differing, own.pixels))
+        .map(|frame| {
+            format!("{}: expected equal ids, {} of {} pixels differ", frame.load, frame.differing, frame.pixels)
+        })
         .collect()
 }
 
 /// The section of whole frames in `raster.md`.
-pub(super) fn markdown(list: &[FrameComparison]) -> String {
+pub(super) fn markdown(comparisons: &[FrameComparison]) -> String {
     use crate::markdown_table::{dash, table};
     let head = [
         "load",
@@ -198,47 +200,47 @@ pub(super) fn markdown(list: &[FrameComparison]) -> String {
         "drawn by CUDA",
         "frame us: OpenGL",
         "CUDA",
-        "times as fast",
+        "speedup",
         "raster",
         "shadow",
         "blur",
         "visibility",
         "shade",
         "encode",
-        "ids that differ",
+        "differing ids",
         "colours: mean",
         "p99",
         "largest",
     ];
     let mut text = format!(
-        "\n## Whole frames\n\nOne sample a pixel, edges smoothed after, by OpenGL as the load is culled there and with CUDA's \
-         rasteriser where it may draw, in the same run. A pass with two numbers: OpenGL / CUDA, us; \"raster\" is by \
-         CUDA and counted to \"shadow\", as is the blur. Where more than {} % of the ids differ nothing is timed.\n\n",
-        100.0 * MOST_DIFFERING
+        "\n## Whole frames\n\nOne sample per pixel with FXAA, by OpenGL with automatic culling and by the CUDA \
+         rasterizer where it supports the pass, in the same run. Times of passes: OpenGL / CUDA, us; \"raster\" is \
+         CUDA time within \"shadow\", as is \"blur\". A load is not timed if more than {} % of its ids differ.\n\n",
+        100.0 * MAX_DIFFERING
     );
-    let row = |own: &FrameComparison| {
-        let of = |passes: &[harness::PassTime], name: &str| {
+    let row = |frame: &FrameComparison| {
+        let median = |passes: &[harness::PassTime], name: &str| {
             passes
                 .iter()
                 .find(|pass| pass.name == name)
                 .map_or_else(dash, |pass| format!("{:.1}", pass.timing.median_us))
         };
-        let cuda = own.cuda.as_deref().unwrap_or_default();
-        let both = |name: &str| format!("{} / {}", of(&own.opengl, name), of(cuda, name));
+        let cuda = frame.cuda.as_deref().unwrap_or_default();
+        let both_times = |name: &str| format!("{} / {}", median(&frame.opengl, name), median(cuda, name));
         let by_cuda: Vec<&str> =
-            [("shadow", own.raster_backends.shadow), ("visibility", own.raster_backends.visibility)]
+            [("shadow", frame.raster_backends.shadow), ("visibility", frame.raster_backends.visibility)]
                 .into_iter()
-                .filter(|(_, path)| *path == Some(modalcast_render::RasterBackend::Cuda))
+                .filter(|(_, backend)| *backend == Some(modalcast_render::RasterBackend::Cuda))
                 .map(|(name, _)| name)
                 .collect();
-        let first = [own.load.clone(), own.triangles.to_string(), own.map.to_string(), own.taps.to_string()];
-        let frames = [by_cuda.join(", "), of(&own.opengl, "frame"), of(cuda, "frame")];
-        let ratio = own.ratio().map_or_else(dash, |ratio| format!("{ratio:.1}"));
-        let passes = ["raster", "shadow", "blur", "visibility", "shade", "encode"].map(both);
-        let ids = format!("{} of {}", own.differing, own.pixels);
-        let colors = [own.colors.mean, own.colors.p99, own.colors.largest].map(|own| format!("{own:.3}"));
-        first.into_iter().chain(frames).chain([ratio]).chain(passes).chain([ids]).chain(colors)
+        let sizes = [frame.load.clone(), frame.triangles.to_string(), frame.map.to_string(), frame.taps.to_string()];
+        let frame_times = [by_cuda.join(", "), median(&frame.opengl, "frame"), median(cuda, "frame")];
+        let ratio = frame.ratio().map_or_else(dash, |ratio| format!("{ratio:.1}"));
+        let passes = ["raster", "shadow", "blur", "visibility", "shade", "encode"].map(both_times);
+        let ids = format!("{} of {}", frame.differing, frame.pixels);
+        let colors = [frame.colors.mean, frame.colors.p99, frame.colors.largest].map(|error| format!("{error:.3}"));
+        sizes.into_iter().chain(frame_times).chain([ratio]).chain(passes).chain([ids]).chain(colors)
     };
-    text.push_str(&table(&head, list.iter().map(row)));
+    text.push_str(&table(&head, comparisons.iter().map(row)));
     text
 }

@@ -1,5 +1,5 @@
-//! Frame times of scenes of the user, without references or variants, and all data that another program needs to draw
-//! the same view.
+//! Measures frame times of user-supplied scenes, without references and variants. The results contain all data that
+//! another program needs to draw the same view.
 
 use std::path::Path;
 use std::time::Instant;
@@ -18,7 +18,7 @@ use modalcast_render::{RasterBackends, RendererInfo};
 
 /// Settings of the timing.
 #[derive(Debug, Clone)]
-pub struct Request {
+pub struct FrameTimeOptions {
     /// Scenes as the command line names them.
     pub scenes: Vec<String>,
     pub size: Size,
@@ -44,15 +44,18 @@ pub struct SceneFrameTimes {
     pub to_sun: [f64; 3],
     /// Times per pass; "frame" is the sum without readback.
     pub passes: Vec<PassTime>,
-    /// Wall-clock time of a whole frame, including readback.
-    pub whole: Timing,
+    /// Wall-clock time of a frame, including readback.
+    #[serde(rename = "whole")]
+    pub wall_clock: Timing,
+    /// Name of the image file.
     pub picture: String,
 }
 
 /// Results of all scenes.
 #[derive(Debug, Clone, Serialize)]
 pub struct FrameTimeReport {
-    pub made: Provenance,
+    #[serde(rename = "made")]
+    pub provenance: Provenance,
     pub renderer: RendererInfo,
     pub size: Size,
     pub scenes: Vec<SceneFrameTimes>,
@@ -60,60 +63,64 @@ pub struct FrameTimeReport {
     files: Vec<ImageFile>,
 }
 
-/// Times scenes; `progress` receives the name of each.
+/// Times all scenes; `progress` receives the name of each.
 ///
 /// # Errors
 /// `Unavailable` without OpenGL; errors of loading and drawing a scene.
-pub fn timed(request: &Request, mut progress: impl FnMut(&str)) -> Result<FrameTimeReport> {
-    let mut studio = RenderHarness::open()?;
+pub fn time_scenes(request: &FrameTimeOptions, mut progress: impl FnMut(&str)) -> Result<FrameTimeReport> {
+    let mut harness = RenderHarness::open()?;
     let (mut scenes, mut files) = (Vec::new(), Vec::new());
     for source in &request.scenes {
         progress(source);
-        let (sample, file) = sample(&mut studio, request, source)?;
-        scenes.push(sample);
+        let (entry, file) = time_scene(&mut harness, request, source)?;
+        scenes.push(entry);
         files.push(file);
     }
-    let renderer = studio.renderer.info().clone();
-    Ok(FrameTimeReport { made: Provenance::here(), renderer, size: request.size, scenes, files })
+    let renderer = harness.renderer.info().clone();
+    Ok(FrameTimeReport { provenance: Provenance::here(), renderer, size: request.size, scenes, files })
 }
 
-fn sample(studio: &mut RenderHarness, request: &Request, source: &str) -> Result<(SceneFrameTimes, ImageFile)> {
+fn time_scene(
+    harness: &mut RenderHarness,
+    request: &FrameTimeOptions,
+    source: &str,
+) -> Result<(SceneFrameTimes, ImageFile)> {
     let (OpenedScene { scene, backends }, size) = (load::open(source)?, request.size);
     let name = Path::new(source).file_stem().map_or_else(|| "scene".into(), |stem| stem.to_string_lossy());
-    let mut set = studio.set(&scene)?;
-    studio.pose(&mut set, &SceneState::rest(&scene))?;
+    let mut loaded_scene = harness.load(&scene)?;
+    harness.deform(&mut loaded_scene, &SceneState::rest(&scene))?;
     let camera = Camera::fit_to_scene(&scene, size.width, size.height);
-    studio.select_rasterizer(&mut set, backends.raster, camera, size)?;
-    let passes = studio.time(&set, camera, size, request.replays)?;
+    harness.select_rasterizer(&mut loaded_scene, backends.raster, camera, size)?;
+    let passes = harness.time(&loaded_scene, camera, size, request.replays)?;
     let mut times = Vec::new();
     for _ in 0..request.replays.max(MIN_REPETITIONS) {
         let begin = Instant::now();
-        studio.draw(&set, camera, size)?;
+        harness.draw(&loaded_scene, camera, size)?;
         times.push(begin.elapsed().as_secs_f64() * 1e6);
     }
-    let (image, shot) = (studio.draw(&set, camera, size)?, set.shot(camera, size));
-    let file = image_files::sheet(&name, size, 1, &[image.rgba])?;
-    let clip = camera.clip_from_camera(size.width, size.height, &shot.bounds) * camera.camera_from_world();
-    let sample = SceneFrameTimes {
+    let (image, frame_params) = (harness.draw(&loaded_scene, camera, size)?, loaded_scene.frame_params(camera, size));
+    let file = image_files::encode_grid(&name, size, 1, &[image.rgba])?;
+    let clip = camera.clip_from_camera(size.width, size.height, &frame_params.bounds) * camera.camera_from_world();
+    let entry = SceneFrameTimes {
         name: name.into_owned(),
         vertices: scene.layout.vertices,
         triangles: scene.layout.triangles,
         look: LookTable { settings: scene.look, raster: backends.raster },
-        samples: studio.renderer.stats().samples,
-        raster_backends: studio.renderer.stats().raster_backends,
+        samples: harness.renderer.stats().samples,
+        raster_backends: harness.renderer.stats().raster_backends,
         clip_from_world: clip.iter().copied().collect(),
         eye: camera.eye().into(),
         to_sun: scene.look.to_sun(scene.up).into(),
         passes,
-        whole: Timing::of(times).ok_or_else(|| fault_in("time")("no frame was drawn"))?,
+        wall_clock: Timing::of(times).ok_or_else(|| fault_in("time")("expected at least one frame, got none"))?,
         picture: file.name.clone(),
     };
-    studio.unload(set);
-    Ok((sample, file))
+    harness.unload(loaded_scene);
+    Ok((entry, file))
 }
 
 impl FrameTimeReport {
-    /// Writes the pictures and `times.json` into a folder, which is created.
+    /// Writes the images and `times.json` into a folder, which is created.
     ///
     /// # Errors
     /// `Fault` when a file cannot be written.
@@ -130,18 +137,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn times_a_scene_and_its_matrix_centers_it() {
-        let request = Request { scenes: vec!["tree".into()], size: Size { width: 32, height: 24 }, replays: 1 };
-        let timed = timed(&request, |_| {}).expect("timed");
-        let sample = &timed.scenes[0];
-        assert!(sample.whole.median_us > 0.0 && sample.whole.replays == MIN_REPETITIONS);
-        assert!(sample.passes.iter().any(|pass| pass.name == "frame"));
-        let scene = load::open("tree").expect("built").scene;
-        let clip = nalgebra::Matrix4::from_column_slice(&sample.clip_from_world);
-        let middle = clip.transform_point(&scene.rest_bounds.center());
-        assert!(middle.x.abs() < 1e-9 && middle.y.abs() < 1e-9, "{middle}");
+    fn times_a_scene_and_records_a_centering_matrix() {
+        let request =
+            FrameTimeOptions { scenes: vec!["tree".into()], size: Size { width: 32, height: 24 }, replays: 1 };
+        let report = time_scenes(&request, |_| {}).expect("a report");
+        let entry = &report.scenes[0];
+        assert!(entry.wall_clock.median_us > 0.0 && entry.wall_clock.replays == MIN_REPETITIONS);
+        assert!(entry.passes.iter().any(|pass| pass.name == "frame"));
+        let scene = load::open("tree").expect("a scene").scene;
+        let clip = nalgebra::Matrix4::from_column_slice(&entry.clip_from_world);
+        let center = clip.transform_point(&scene.rest_bounds.center());
+        assert!(center.x.abs() < 1e-9 && center.y.abs() < 1e-9, "{center}");
         let folder = tempfile::tempdir().expect("a folder");
-        timed.write(folder.path()).expect("written");
+        report.write(folder.path()).expect("report files");
         assert!(folder.path().join("times.json").exists() && folder.path().join("tree.png").exists());
     }
 }

@@ -27,7 +27,7 @@ pub struct Size {
     pub height: u32,
 }
 
-/// Time of one pass, by the name of its stage.
+/// Time of one render pass.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PassTime {
     pub name: &'static str,
@@ -37,18 +37,18 @@ pub struct PassTime {
 /// Warm-up time before timing starts.
 pub(super) const WARM_UP: Duration = Duration::from_millis(500);
 
-/// Owns the renderer and draws scenes with it.
+/// Owns the renderer and draws scenes.
 pub(super) struct RenderHarness {
     pub(super) renderer: Renderer,
 }
 
 /// A scene that is loaded on the device, with its deformer.
-pub(super) struct HarnessScene {
+pub(super) struct LoadedScene {
     scene: Arc<Scene>,
     pub(super) buffers: SceneBuffers,
     deformer: CpuDeformer,
     bounds: BoundingBox,
-    light: Option<OrientedBounds>,
+    light_box: Option<OrientedBounds>,
 }
 
 impl RenderHarness {
@@ -57,114 +57,114 @@ impl RenderHarness {
     }
 
     /// Loads a scene.
-    pub(super) fn set(&mut self, scene: &Arc<Scene>) -> Result<HarnessScene> {
+    pub(super) fn load(&mut self, scene: &Arc<Scene>) -> Result<LoadedScene> {
         let (buffers, deformer) =
             (self.renderer.load(scene)?, CpuDeformer::new(scene).with_bounding_axes(scene.light_axes()));
-        Ok(HarnessScene { scene: Arc::clone(scene), buffers, deformer, bounds: BoundingBox::EMPTY, light: None })
+        Ok(LoadedScene { scene: Arc::clone(scene), buffers, deformer, bounds: BoundingBox::EMPTY, light_box: None })
     }
 
     /// Lets the CUDA rasterizer draw the passes of a scene that it supports.
     ///
     /// # Errors
     /// Errors of the device.
-    pub(super) fn attach_rasterizer(&mut self, set: &mut HarnessScene, device: &Arc<Device>) -> Result<()> {
-        let make = |mesh: RasterGeometry| Ok(Box::new(CudaRasterizer::new(device, mesh)?) as Box<dyn Rasterizer>);
-        self.renderer.attach_rasterizer(&mut set.buffers, make)
+    pub(super) fn attach_rasterizer(&mut self, loaded_scene: &mut LoadedScene, device: &Arc<Device>) -> Result<()> {
+        let create = |mesh: RasterGeometry| Ok(Box::new(CudaRasterizer::new(device, mesh)?) as Box<dyn Rasterizer>);
+        self.renderer.attach_rasterizer(&mut loaded_scene.buffers, create)
     }
 
-    /// Selects the rasterizers of a posed scene by `policy`, as far as they are available.
+    /// Selects the rasterizers of a deformed scene by `policy`. Without a CUDA device OpenGL draws all passes.
     ///
     /// # Errors
     /// Errors of the device and of drawing.
     pub(super) fn select_rasterizer(
         &mut self,
-        set: &mut HarnessScene,
+        loaded_scene: &mut LoadedScene,
         policy: RasterPolicy,
         camera: Camera,
         size: Size,
     ) -> Result<()> {
         let Some(device) = cuda_device().filter(|_| policy != RasterPolicy::OpenGl) else { return Ok(()) };
-        self.attach_rasterizer(set, &device)?;
+        self.attach_rasterizer(loaded_scene, &device)?;
         if policy == RasterPolicy::Fastest {
-            let shot = set.shot(camera, size);
-            self.renderer.select_raster_backends(&mut set.buffers, &shot)?;
+            let frame_params = loaded_scene.frame_params(camera, size);
+            self.renderer.select_raster_backends(&mut loaded_scene.buffers, &frame_params)?;
         }
         Ok(())
     }
 
     /// Deforms the scene to a state and uploads the vertices.
-    pub(super) fn pose(&mut self, set: &mut HarnessScene, state: &SceneState) -> Result<()> {
-        let deformed = set.deformer.deform(state)?;
-        (set.bounds, set.light) = (deformed.bounds, deformed.oriented_bounds);
-        self.renderer.upload(&set.buffers, set.deformer.surface()?)
+    pub(super) fn deform(&mut self, loaded_scene: &mut LoadedScene, state: &SceneState) -> Result<()> {
+        let deformed = loaded_scene.deformer.deform(state)?;
+        (loaded_scene.bounds, loaded_scene.light_box) = (deformed.bounds, deformed.oriented_bounds);
+        self.renderer.upload(&loaded_scene.buffers, loaded_scene.deformer.surface()?)
     }
 
-    pub(super) fn draw(&mut self, set: &HarnessScene, camera: Camera, size: Size) -> Result<FrameImage> {
-        self.renderer.draw(&set.buffers, &set.shot(camera, size))
+    pub(super) fn draw(&mut self, loaded_scene: &LoadedScene, camera: Camera, size: Size) -> Result<FrameImage> {
+        self.renderer.draw(&loaded_scene.buffers, &loaded_scene.frame_params(camera, size))
     }
 
     /// Draws the same frame repeatedly and returns the times per pass; "frame" is the sum of all passes except the
     /// readback.
     pub(super) fn time(
         &mut self,
-        set: &HarnessScene,
+        loaded_scene: &LoadedScene,
         camera: Camera,
         size: Size,
         replays: usize,
     ) -> Result<Vec<PassTime>> {
         let mut times: Vec<(&'static str, Vec<f64>)> = vec![("frame", Vec::new())];
-        self.warm_up(set, camera, size)?;
+        self.warm_up(loaded_scene, camera, size)?;
         for _ in 0..replays.max(MIN_REPETITIONS) {
-            let image = self.draw(set, camera, size)?;
+            let image = self.draw(loaded_scene, camera, size)?;
             times[0].1.push(1e3 * image.times.drawing_ms());
             for (key, ms) in image.times.iter() {
                 let name = key.name();
-                match times.iter_mut().find(|(own, _)| *own == name) {
-                    Some((_, list)) => list.push(1e3 * ms),
+                match times.iter_mut().find(|(known, _)| *known == name) {
+                    Some((_, values)) => values.push(1e3 * ms),
                     None => times.push((name, vec![1e3 * ms])),
                 }
             }
         }
-        let pass = |(name, list): (&'static str, Vec<f64>)| {
-            Timing::of(list)
+        let pass_time = |(name, values): (&'static str, Vec<f64>)| {
+            Timing::of(values)
                 .map(|timing| PassTime { name, timing })
-                .ok_or_else(|| fault_in("time")("no frame was drawn"))
+                .ok_or_else(|| fault_in("time")("expected at least one frame, got none"))
         };
-        times.into_iter().map(pass).collect()
+        times.into_iter().map(pass_time).collect()
     }
 
-    /// Draws until times are stable. The first frame of a size compiles and allocates, and the clock rate of an idle
-    /// device rises for a while: the same pass took six times as long on an H200 at first.
-    pub(super) fn warm_up(&mut self, set: &HarnessScene, camera: Camera, size: Size) -> Result<()> {
+    /// Draws until times are stable. The first frame of a size compiles shaders and allocates textures, and the clock
+    /// rate of an idle device rises slowly: on an idle H200 a pass took six times as long at first.
+    pub(super) fn warm_up(&mut self, loaded_scene: &LoadedScene, camera: Camera, size: Size) -> Result<()> {
         let begin = Instant::now();
         loop {
-            self.draw(set, camera, size)?;
+            self.draw(loaded_scene, camera, size)?;
             if self.renderer.info().software || begin.elapsed() >= WARM_UP {
                 return Ok(());
             }
         }
     }
 
-    pub(super) fn unload(&mut self, set: HarnessScene) {
-        self.renderer.unload(set.buffers);
+    pub(super) fn unload(&mut self, loaded_scene: LoadedScene) {
+        self.renderer.unload(loaded_scene.buffers);
     }
 }
 
-impl HarnessScene {
-    pub(super) fn shot(&self, camera: Camera, size: Size) -> FrameParams {
-        FrameParams { camera, width: size.width, height: size.height, bounds: self.bounds, light: self.light }
+impl LoadedScene {
+    pub(super) fn frame_params(&self, camera: Camera, size: Size) -> FrameParams {
+        FrameParams { camera, width: size.width, height: size.height, bounds: self.bounds, light: self.light_box }
     }
 
-    /// Bounds of the last posed vertices, in world and in light space.
+    /// Bounds of the last deformed vertices, in world and in light space.
     pub(super) const fn extents(&self) -> (BoundingBox, Option<OrientedBounds>) {
-        (self.bounds, self.light)
+        (self.bounds, self.light_box)
     }
 
     pub(super) fn scene(&self) -> &Arc<Scene> {
         &self.scene
     }
 
-    /// The last posed vertices.
+    /// The last deformed vertices.
     pub(super) fn surface(&mut self) -> Result<&DeformedSurface> {
         self.deformer.surface()
     }

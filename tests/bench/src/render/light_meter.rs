@@ -1,28 +1,28 @@
-//! Light meter: the scene with white matte surfaces of the same shapes and holes, so that the ratio of a frame with
-//! shadows and one without is the sun visibility.
+//! Measures the sun visibility of rendered frames. All surfaces of the scene become white and matte; the ratio of a frame
+//! with shadows to one without is the sun visibility.
 
 use std::sync::Arc;
 
-use super::reference_image::LEAST_LIGHT;
+use super::reference_image::MIN_SUNLIGHT;
 use super::reference_texture::linear_from_srgb;
 use modalcast_model::domain::{Material, Texture};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Ground, RenderSettings, Scene, SceneParts};
 
-/// The scene with another look.
+/// The scene with other render settings.
 ///
 /// # Errors
-/// `Invalid` when the look's options contradict each other.
-pub(super) fn relit(scene: &Scene, look: RenderSettings) -> Result<Arc<Scene>> {
+/// `Invalid` when the settings contradict each other.
+pub(super) fn with_settings(scene: &Scene, look: RenderSettings) -> Result<Arc<Scene>> {
     Scene::new(SceneParts { look, ..scene.parts() })
 }
 
-/// The light meter of a scene. Blended surfaces keep their alpha and cut-outs their holes; the sunlight is 1, the
-/// maximum of the display.
+/// The scene with white, matte surfaces. Blended surfaces keep their alpha and cut-outs their holes. The sunlight is 1,
+/// the maximum of the display.
 ///
 /// # Errors
 /// Only those that the scene itself would cause.
-pub(super) fn meter(scene: &Scene) -> Result<Arc<Scene>> {
+pub(super) fn meter_scene(scene: &Scene) -> Result<Arc<Scene>> {
     let look = RenderSettings {
         sunlight: [1.0; 3],
         skylight: [0.0; 3],
@@ -35,12 +35,12 @@ pub(super) fn meter(scene: &Scene) -> Result<Arc<Scene>> {
     for material in &mut parts.materials {
         *material = Material { ambient: [0.0; 3], diffuse: [1.0; 3], specular: [0.0; 3], ..material.clone() };
     }
-    let colors: std::collections::BTreeSet<usize> =
+    let color_textures: std::collections::BTreeSet<usize> =
         parts.materials.iter().filter_map(|material| material.color_texture).collect();
-    for index in colors {
+    for index in color_textures {
         let texture = &parts.textures[index];
-        let white = texture.rgba().chunks_exact(4).flat_map(|texel| [255, 255, 255, texel[3]]).collect();
-        let white = Texture::new(texture.name.clone(), texture.width(), texture.height(), white)?;
+        let white_rgba = texture.rgba().chunks_exact(4).flat_map(|texel| [255, 255, 255, texel[3]]).collect();
+        let white = Texture::new(texture.name.clone(), texture.width(), texture.height(), white_rgba)?;
         // An image may be used for colors and for normals; the normals keep the original.
         parts.textures.push(white);
         let last = parts.textures.len() - 1;
@@ -51,14 +51,14 @@ pub(super) fn meter(scene: &Scene) -> Result<Arc<Scene>> {
     Scene::new(parts)
 }
 
-/// Sun visibility per pixel from light-meter frames with and without shadows, both RGBA. Bytes resolve it to one part
-/// in a hundred at [`LEAST_LIGHT`], and better in brighter places.
-pub(super) fn read(shadowed: &[u8], unshadowed: &[u8]) -> Vec<Option<f32>> {
-    let linear = |pixel: &[u8]| linear_from_srgb(f64::from(pixel[1]) / 255.0);
+/// Sun visibility per pixel from frames of [`meter_scene`] with and without shadows, both RGBA. The resolution of 8-bit
+/// sRGB is one part in a hundred at [`MIN_SUNLIGHT`], and better where it is brighter.
+pub(super) fn read_sun_visibility(shadowed: &[u8], unshadowed: &[u8]) -> Vec<Option<f32>> {
+    let sunlight = |pixel: &[u8]| linear_from_srgb(f64::from(pixel[1]) / 255.0);
     let pairs = shadowed.chunks_exact(4).zip(unshadowed.chunks_exact(4));
     pairs
-        .map(|(some, all)| (linear(some), linear(all)))
-        .map(|(some, all)| (all >= LEAST_LIGHT).then(|| (some / all) as f32))
+        .map(|(shadowed, unshadowed)| (sunlight(shadowed), sunlight(unshadowed)))
+        .map(|(shadowed, unshadowed)| (unshadowed >= MIN_SUNLIGHT).then(|| (shadowed / unshadowed) as f32))
         .collect()
 }
 
@@ -68,13 +68,13 @@ mod tests {
     use crate::render::reference_texture::srgb_from_linear;
 
     #[test]
-    fn reads_visibility_only_where_enough_light_falls() {
+    fn reads_visibility_only_above_the_minimum_sunlight() {
         let byte = |linear: f64| (255.0 * srgb_from_linear(linear)).round() as u8;
         let pixel = |linear: f64| [byte(linear); 4];
-        for (all, share) in [(1.0, 0.5), (0.5, 0.25), (0.11, 1.0), (0.8, 0.0)] {
-            let read = read(&pixel(all * share), &pixel(all))[0].expect("enough light");
-            assert!((f64::from(read) - share).abs() < 0.01, "{all} {share}: {read}");
+        for (sunlight, visibility) in [(1.0, 0.5), (0.5, 0.25), (0.11, 1.0), (0.8, 0.0)] {
+            let found = read_sun_visibility(&pixel(sunlight * visibility), &pixel(sunlight))[0].expect("a visibility");
+            assert!((f64::from(found) - visibility).abs() < 0.01, "expected {visibility}, got {found}");
         }
-        assert_eq!(read(&pixel(0.05), &pixel(0.05)), [None]);
+        assert_eq!(read_sun_visibility(&pixel(0.05), &pixel(0.05)), [None]);
     }
 }

@@ -6,11 +6,11 @@ use std::time::Instant;
 use nalgebra::Vector3;
 use serde::Serialize;
 
-use super::harness::{HarnessScene, PassTime, RenderHarness, Size};
+use super::harness::{LoadedScene, PassTime, RenderHarness, Size};
 use super::image_files::{self, ImageFile};
 use super::metrics::{self, ErrorDistribution, Flicker, LightErrors};
 use super::minimal_passes::{self, FrameBaseline, MinimalPasses};
-use super::packing::{Packing, packed};
+use super::packing::{Packing, pack_images};
 use super::ray_scene::RayScene;
 use super::reference_image::{ReferenceImage, SampleCounts, SunTerm, trace};
 use super::reference_view::View;
@@ -22,12 +22,12 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::{Camera, Culling, RenderSettings, Scene, ShadowSettings};
 use modalcast_render::{BlurMethod, FrameCullStats, FrameImage, shadow_texel_axes};
 
-/// Step of the motion that still pictures show.
+/// Step of the motion that the still images show.
 pub(super) const STILL: usize = 10;
 /// Steps over which flicker is measured.
-const STEPS: usize = 60;
-/// Factor per side by which pictures of moving scenes are smaller.
-const SMALLER: u32 = 4;
+const FLICKER_STEPS: usize = 60;
+/// Factor per side by which images of moving scenes are smaller than still images.
+const MOVING_SIZE_DIVISOR: u32 = 4;
 
 /// Results of one variant on one load.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -41,13 +41,13 @@ pub struct RenderRow {
     pub blur_method: BlurMethod,
     /// Packing of images in arrays, for variants that compare it.
     pub packing: Option<Packing>,
-    /// Culling of the variant's look.
+    /// Culling of the variant's settings.
     pub culling: Culling,
     /// Bounds on the error against the intended result.
     pub bounds: ErrorLimits,
     /// Whether the variant is within its bounds.
     pub passed: bool,
-    /// Whether the variant is included to show a failure. The report fails if it passes.
+    /// Whether the variant is expected to fail. The report fails if it passes.
     pub to_fail: bool,
     /// Reasons why it failed.
     pub faults: Vec<String>,
@@ -69,9 +69,9 @@ pub struct RenderRow {
     pub passes: Vec<PassTime>,
     /// Device memory of the scene.
     pub bytes: u64,
-    /// Part of `bytes` that the shadow takes.
+    /// Part of `bytes` for the textures of the shadow map.
     pub shadow_bytes: u64,
-    /// Part of `bytes` that the images take, with all mip levels.
+    /// Part of `bytes` for color and normal images, with all mip levels.
     pub image_bytes: u64,
     pub samples: u32,
     pub draws: usize,
@@ -80,8 +80,8 @@ pub struct RenderRow {
 }
 
 impl RenderRow {
-    /// Whether it passed or failed as stated.
-    pub const fn as_stated(&self) -> bool {
+    /// Whether the variant passed or failed as expected.
+    pub const fn is_as_expected(&self) -> bool {
         self.passed != self.to_fail
     }
 
@@ -91,23 +91,23 @@ impl RenderRow {
     }
 }
 
-/// References of a load's still picture.
+/// References of a load's still image.
 struct References {
     hard: ReferenceImage,
     /// The intended result of each variant.
-    aims: Vec<ReferenceImage>,
-    texels: Option<ShadowTexelSize>,
+    intended: Vec<ReferenceImage>,
+    texel_size: Option<ShadowTexelSize>,
 }
 
 /// Data that all variants of a load share.
 struct WorkloadContext<'a> {
     request: &'a RenderReportOptions,
-    stage: AnimatedScene,
+    animation: AnimatedScene,
     camera: Camera,
     variants: Vec<RenderVariant>,
     references: References,
-    /// Light-meter image of the still picture without shadows.
-    bright: FrameImage,
+    /// Light-meter frame of the still scene without shadows.
+    unshadowed: FrameImage,
     moving: MovingReferences,
 }
 
@@ -116,280 +116,297 @@ type MovingReferences = std::result::Result<Vec<[ReferenceImage; 2]>, String>;
 
 /// All results of one load.
 pub(super) struct WorkloadResult {
-    pub(super) entry: RenderWorkloadSummary,
+    pub(super) summary: RenderWorkloadSummary,
     pub(super) rows: Vec<RenderRow>,
-    /// `None` when there is no row to compare it with.
-    pub(super) bare: Option<MinimalPasses>,
+    /// `None` when no row was timed with a default variance map.
+    pub(super) minimal_passes: Option<MinimalPasses>,
     pub(super) files: Vec<ImageFile>,
 }
 
 /// Measures every requested variant on one load.
-pub(super) fn load(
-    studio: &mut RenderHarness,
+pub(super) fn measure_workload(
+    harness: &mut RenderHarness,
     request: &RenderReportOptions,
-    kind: RenderWorkload,
+    workload: RenderWorkload,
     progress: &mut dyn FnMut(&str),
 ) -> Result<WorkloadResult> {
-    let stage = kind.stage()?;
-    let camera = stage.camera(request.size);
-    let mut variants = request.wanted();
-    variants.retain(|variant| variant.suits(kind));
-    progress(&format!("{}: tracing the references", stage.name));
+    let animation = workload.build()?;
+    let camera = animation.camera(request.size);
+    let mut variants = request.selected_variants();
+    variants.retain(|variant| variant.is_applicable(workload));
+    progress(&format!("{}: tracing the references of the still image", animation.name));
     let begin = Instant::now();
-    let references = references(studio, request, &stage, camera, &variants)?;
+    let references = trace_references(harness, request, &animation, camera, &variants)?;
     let reference_ms = begin.elapsed().as_secs_f64() * 1e3;
-    progress(&format!("{}: tracing the moving scene", stage.name));
-    let moving = moving(studio, request, &stage)?;
-    let unlit = light_meter::relit(&stage.scene, RenderSettings { shadow: None, ..stage.scene.look })?;
-    let bright = frame(studio, &light_meter::meter(&unlit)?, &stage, request)?;
-    let job = WorkloadContext { request, stage, camera, variants, references, bright, moving };
-    let mut files = vec![job.reference_file("hard", &job.references.hard)?];
-    files.push(job.light_file()?);
+    progress(&format!("{}: tracing the references of the moving scene", animation.name));
+    let moving = trace_moving_references(harness, request, &animation)?;
+    let without_shadow =
+        light_meter::with_settings(&animation.scene, RenderSettings { shadow: None, ..animation.scene.look })?;
+    let unshadowed = draw_still(harness, &light_meter::meter_scene(&without_shadow)?, &animation, request)?;
+    let context = WorkloadContext { request, animation, camera, variants, references, unshadowed, moving };
+    let mut files = vec![context.reference_file("hard", &context.references.hard)?];
+    files.push(context.light_file()?);
     let mut rows = Vec::new();
-    for at in 0..job.variants.len() {
-        progress(&format!("{}: {}", job.stage.name, job.variants[at].name));
-        studio.renderer.set_blur_method(job.variants[at].blur_method);
-        let (row, file) = job.measure(studio, at)?;
+    for index in 0..context.variants.len() {
+        progress(&format!("{}: {}", context.animation.name, context.variants[index].name));
+        harness.renderer.set_blur_method(context.variants[index].blur_method);
+        let (row, strip) = context.measure(harness, index)?;
         rows.push(row);
-        files.push(file);
+        files.push(strip);
     }
-    studio.renderer.set_blur_method(BlurMethod::Auto);
-    progress(&format!("{}: bare passes", job.stage.name));
-    let bare = job.bare(studio, &rows)?;
-    Ok(WorkloadResult { entry: job.entry(reference_ms), rows, bare, files })
+    harness.renderer.set_blur_method(BlurMethod::Auto);
+    progress(&format!("{}: timing the minimal passes", context.animation.name));
+    let minimal_passes = context.time_minimal_passes(harness, &rows)?;
+    Ok(WorkloadResult { summary: context.summarize(reference_ms), rows, minimal_passes, files })
 }
 
-fn detail(request: &RenderReportOptions) -> SampleCounts {
+fn sample_counts(request: &RenderReportOptions) -> SampleCounts {
     if request.quick { SampleCounts::QUICK } else { SampleCounts::FULL }
 }
 
-fn references(
-    studio: &mut RenderHarness,
+fn trace_references(
+    harness: &mut RenderHarness,
     request: &RenderReportOptions,
-    stage: &AnimatedScene,
+    animation: &AnimatedScene,
     camera: Camera,
     variants: &[RenderVariant],
 ) -> Result<References> {
-    let mut set = studio.set(&stage.scene)?;
-    studio.pose(&mut set, &stage.state(STILL))?;
-    let shot = set.shot(camera, request.size);
-    let ray_scene = RayScene::new(&stage.scene, set.surface()?);
-    let view = View::new(set.scene(), &shot);
+    let mut loaded_scene = harness.load(&animation.scene)?;
+    harness.deform(&mut loaded_scene, &animation.state(STILL))?;
+    let frame_params = loaded_scene.frame_params(camera, request.size);
+    let ray_scene = RayScene::new(&animation.scene, loaded_scene.surface()?);
+    let view = View::new(loaded_scene.scene(), &frame_params);
     let mut terms = vec![SunTerm::Hard];
     for variant in variants {
-        let scene = light_meter::relit(&stage.scene, variant.look(stage.scene.look))?;
-        terms.push(term(variant, shadow_texel_axes(&scene, &shot)));
+        let scene = light_meter::with_settings(&animation.scene, variant.settings(animation.scene.look))?;
+        terms.push(intended_sun_term(variant, shadow_texel_axes(&scene, &frame_params)));
     }
-    let mut pictures = trace(&ray_scene, &view, &terms, detail(request));
-    studio.unload(set);
-    let aims = pictures.split_off(1);
-    Ok(References { hard: pictures.pop().unwrap_or_default(), aims, texels: ShadowTexelSize::of(&stage.scene, &shot) })
+    let mut images = trace(&ray_scene, &view, &terms, sample_counts(request));
+    harness.unload(loaded_scene);
+    let intended = images.split_off(1);
+    Ok(References {
+        hard: images.pop().unwrap_or_default(),
+        intended,
+        texel_size: ShadowTexelSize::measure(&animation.scene, &frame_params),
+    })
 }
 
-fn term(variant: &RenderVariant, texel: Option<[Vector3<f64>; 2]>) -> SunTerm {
-    match (variant.aim, texel) {
+fn intended_sun_term(variant: &RenderVariant, texel_axes: Option<[Vector3<f64>; 2]>) -> SunTerm {
+    match (variant.intended, texel_axes) {
         (ReferenceKind::Hard, _) => SunTerm::Hard,
-        (ReferenceKind::Filtered { texels }, Some(texel)) => SunTerm::Filtered(texel.map(|side| side * texels)),
+        (ReferenceKind::Filtered { texels }, Some(axes)) => SunTerm::Filtered(axes.map(|axis| axis * texels)),
         _ => SunTerm::Unshadowed,
     }
 }
 
-/// Size of the pictures of the moving scene.
-fn small(size: Size) -> Size {
-    Size { width: (size.width / SMALLER).max(1), height: (size.height / SMALLER).max(1) }
+/// Size of the images of the moving scene.
+fn moving_size(size: Size) -> Size {
+    Size { width: (size.width / MOVING_SIZE_DIVISOR).max(1), height: (size.height / MOVING_SIZE_DIVISOR).max(1) }
 }
 
-/// Traces the references of every step, with a quarter of a still picture's samples.
-fn moving(
-    studio: &mut RenderHarness,
+/// Traces the references of every step, with a quarter of the samples of a still image.
+fn trace_moving_references(
+    harness: &mut RenderHarness,
     request: &RenderReportOptions,
-    stage: &AnimatedScene,
+    animation: &AnimatedScene,
 ) -> Result<MovingReferences> {
-    let size = small(request.size);
-    let camera = stage.camera(size);
-    let mut set = studio.set(&stage.scene)?;
-    let (mut all, mut ray_scene, mut too_long) = (Vec::new(), None::<RayScene>, None);
-    let mut time_budget = TimeBudget::new(STEP_TIME_BUDGET, STEPS);
-    for step in 0..STEPS {
-        studio.pose(&mut set, &stage.state(step))?;
-        let view = View::new(set.scene(), &set.shot(camera, size));
-        let own = match ray_scene.take() {
-            Some(ray_scene) => ray_scene.moved(&stage.scene, set.surface()?),
-            None => RayScene::new(&stage.scene, set.surface()?),
+    let size = moving_size(request.size);
+    let camera = animation.camera(size);
+    let mut loaded_scene = harness.load(&animation.scene)?;
+    let (mut images, mut previous, mut stop_reason) = (Vec::new(), None::<RayScene>, None);
+    let mut time_budget = TimeBudget::new(STEP_TIME_BUDGET, FLICKER_STEPS);
+    for step in 0..FLICKER_STEPS {
+        harness.deform(&mut loaded_scene, &animation.state(step))?;
+        let view = View::new(loaded_scene.scene(), &loaded_scene.frame_params(camera, size));
+        let ray_scene = match previous.take() {
+            Some(ray_scene) => ray_scene.refit(&animation.scene, loaded_scene.surface()?),
+            None => RayScene::new(&animation.scene, loaded_scene.surface()?),
         };
-        let detail = SampleCounts { taps: 1, ..SampleCounts::QUICK };
-        if let Ok(pair) = trace(&own, &view, &[SunTerm::Unshadowed, SunTerm::Hard], detail).try_into() {
-            all.push(pair);
+        let counts = SampleCounts { taps: 1, ..SampleCounts::QUICK };
+        if let Ok(pair) = trace(&ray_scene, &view, &[SunTerm::Unshadowed, SunTerm::Hard], counts).try_into() {
+            images.push(pair);
         }
-        ray_scene = Some(own);
-        too_long = time_budget.tick("references");
-        if too_long.is_some() {
+        previous = Some(ray_scene);
+        stop_reason = time_budget.finish_step("references");
+        if stop_reason.is_some() {
             break;
         }
     }
-    studio.unload(set);
-    Ok(too_long.map_or(Ok(all), Err))
+    harness.unload(loaded_scene);
+    Ok(stop_reason.map_or(Ok(images), Err))
 }
 
-/// Draws the still picture of a scene.
-fn frame(
-    studio: &mut RenderHarness,
+/// Draws the still image of a scene.
+fn draw_still(
+    harness: &mut RenderHarness,
     scene: &Arc<Scene>,
-    stage: &AnimatedScene,
+    animation: &AnimatedScene,
     request: &RenderReportOptions,
 ) -> Result<FrameImage> {
-    let mut set = studio.set(scene)?;
-    studio.pose(&mut set, &stage.state(STILL))?;
-    let image = studio.draw(&set, stage.camera(request.size), request.size);
-    studio.unload(set);
+    let mut loaded_scene = harness.load(scene)?;
+    harness.deform(&mut loaded_scene, &animation.state(STILL))?;
+    let image = harness.draw(&loaded_scene, animation.camera(request.size), request.size);
+    harness.unload(loaded_scene);
     image
 }
 
 impl WorkloadContext<'_> {
-    fn entry(&self, reference_ms: f64) -> RenderWorkloadSummary {
-        let (layout, detail) = (&self.stage.scene.layout, detail(self.request));
+    fn summarize(&self, reference_ms: f64) -> RenderWorkloadSummary {
+        let (layout, counts) = (&self.animation.scene.layout, sample_counts(self.request));
         RenderWorkloadSummary {
-            name: self.stage.name.clone(),
+            name: self.animation.name.clone(),
             vertices: layout.vertices,
             triangles: layout.triangles,
-            domains: self.stage.scene.domains.len(),
-            samples: detail.side * detail.side,
-            taps: detail.taps,
+            domains: self.animation.scene.domains.len(),
+            samples: counts.side * counts.side,
+            taps: counts.taps,
             reference_ms,
-            texels: self.references.texels,
+            texels: self.references.texel_size,
             steps: self.moving.as_ref().map_or(0, Vec::len),
             no_flicker: self.moving.as_ref().err().cloned(),
-            steps_size: small(self.request.size),
+            steps_size: moving_size(self.request.size),
         }
     }
 
-    /// Compares one variant's still picture and sun visibility with the references; if it passes, measures its times
-    /// and flicker.
-    fn measure(&self, studio: &mut RenderHarness, at: usize) -> Result<(RenderRow, ImageFile)> {
-        let (variant, aim) = (&self.variants[at], &self.references.aims[at]);
-        let mut scene = light_meter::relit(&self.stage.scene, variant.look(self.stage.scene.look))?;
+    /// Compares the still image and sun visibility of variant `index` with the references; if it passes, measures its
+    /// times and flicker.
+    fn measure(&self, harness: &mut RenderHarness, index: usize) -> Result<(RenderRow, ImageFile)> {
+        let (variant, reference) = (&self.variants[index], &self.references.intended[index]);
+        let mut scene = light_meter::with_settings(&self.animation.scene, variant.settings(self.animation.scene.look))?;
         if let Some(packing) = variant.packing {
-            scene = packed(&scene, packing)?;
+            scene = pack_images(&scene, packing)?;
         }
-        let dark = frame(studio, &light_meter::meter(&scene)?, &self.stage, self.request)?;
-        let lit = light_meter::read(&dark.rgba, &self.bright.rgba);
-        let mut set = studio.set(&scene)?;
-        studio.pose(&mut set, &self.stage.state(STILL))?;
-        let image = studio.draw(&set, self.camera, self.request.size)?;
-        let stats = studio.renderer.stats().clone();
-        let mut row = self.compared(variant, (&image, &lit), aim);
+        let shadowed = draw_still(harness, &light_meter::meter_scene(&scene)?, &self.animation, self.request)?;
+        let sun_visibility = light_meter::read_sun_visibility(&shadowed.rgba, &self.unshadowed.rgba);
+        let mut loaded_scene = harness.load(&scene)?;
+        harness.deform(&mut loaded_scene, &self.animation.state(STILL))?;
+        let image = harness.draw(&loaded_scene, self.camera, self.request.size)?;
+        let stats = harness.renderer.stats().clone();
+        let mut row = self.compare(variant, (&image, &sun_visibility), reference);
         (row.samples, row.draws) = (stats.samples, stats.draw_calls);
-        let plan = set.buffers.plan();
+        let plan = loaded_scene.buffers.plan();
         row.bytes = plan.bytes();
-        let of = |begins: &[&str]| -> u64 {
-            let own = plan.textures.iter().filter(|texture| begins.iter().any(|begin| texture.name.starts_with(begin)));
-            own.map(|texture| texture.bytes).sum()
+        let texture_bytes = |prefixes: &[&str]| -> u64 {
+            let has_prefix = |name: &str| prefixes.iter().any(|prefix| name.starts_with(prefix));
+            let textures = plan.textures.iter().filter(|texture| has_prefix(texture.name.as_ref()));
+            textures.map(|texture| texture.bytes).sum()
         };
-        (row.shadow_bytes, row.image_bytes) = (of(&["shadow"]), of(&["color", "normal"]));
+        (row.shadow_bytes, row.image_bytes) = (texture_bytes(&["shadow"]), texture_bytes(&["color", "normal"]));
         if row.passed {
-            row.passes = studio.time(&set, self.camera, self.request.size, self.request.replays)?;
-            row.culled = studio.renderer.stats().culled;
-            match self.flicker(studio, &mut set, variant)? {
+            row.passes = harness.time(&loaded_scene, self.camera, self.request.size, self.request.replays)?;
+            row.culled = harness.renderer.stats().culled;
+            match self.measure_flicker(harness, &mut loaded_scene, variant)? {
                 Ok(flicker) => row.flicker = Some(flicker),
-                Err(why) => row.no_flicker = Some(why),
+                Err(reason) => row.no_flicker = Some(reason),
             }
         }
-        studio.unload(set);
-        let file = image_files::strip(&self.file_name(&variant.name), self.request.size, (&image.rgba, &aim.colors))?;
+        harness.unload(loaded_scene);
+        let file = image_files::encode_strip(
+            &self.file_name(&variant.name),
+            self.request.size,
+            (&image.rgba, &reference.colors),
+        )?;
         Ok((row, file))
     }
 
-    /// Times the passes of the stripped scene, for comparison with frames that use the largest timed variance map with
-    /// default settings.
-    fn bare(&self, studio: &mut RenderHarness, rows: &[RenderRow]) -> Result<Option<MinimalPasses>> {
-        let usual = |row: &RenderRow| {
-            let own = row.shadow.filter(|own| ShadowSettings { size: own.size, ..ShadowSettings::default() } == *own);
-            own.filter(|_| row.median_us().is_some())
+    /// Times the passes of the scene stripped to its mesh. Frames with the largest timed variance map of default settings
+    /// are the baseline.
+    fn time_minimal_passes(&self, harness: &mut RenderHarness, rows: &[RenderRow]) -> Result<Option<MinimalPasses>> {
+        let timed_default_shadow = |row: &RenderRow| {
+            let is_default =
+                |shadow: &ShadowSettings| *shadow == ShadowSettings { size: shadow.size, ..ShadowSettings::default() };
+            row.shadow.filter(is_default).filter(|_| row.median_us().is_some())
         };
-        let Some(shadow) = rows.iter().filter_map(usual).max_by_key(|own| own.size) else { return Ok(None) };
-        let scene = minimal_passes::stripped(&self.stage.scene, shadow.size)?;
-        let passes = self.timed(studio, &scene)?;
-        let stats = studio.renderer.stats().clone();
+        let Some(shadow) = rows.iter().filter_map(timed_default_shadow).max_by_key(|shadow| shadow.size) else {
+            return Ok(None);
+        };
+        let scene = minimal_passes::strip_to_mesh(&self.animation.scene, shadow.size)?;
+        let passes = self.time_passes(harness, &scene)?;
+        let stats = harness.renderer.stats().clone();
         let timing = |name: &str| passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
         let Some((depth, visibility)) = timing("shadow").zip(timing("visibility")) else { return Ok(None) };
-        if !minimal_passes::is_bare(&stats) {
-            tracing::warn!(load = self.stage.name, "the stripped scene was not one draw a pass: no bare passes");
+        if !minimal_passes::is_minimal(&stats) {
+            tracing::warn!(
+                load = self.animation.name,
+                "expected one draw per pass of the stripped scene, got more; minimal passes are not reported"
+            );
             return Ok(None);
         }
-        let own = MinimalPasses {
-            load: self.stage.name.clone(),
+        let passes = MinimalPasses {
+            load: self.animation.name.clone(),
             triangles: scene.layout.triangles,
             map: shadow.size,
             samples: stats.samples,
             depth,
             visibility,
-            unculled: self.beside(studio, rows, (shadow, Culling::None))?,
-            usual: self.beside(studio, rows, (shadow, self.stage.scene.look.culling))?,
+            unculled: self.frame_baseline(harness, rows, (shadow, Culling::None))?,
+            default_culling: self.frame_baseline(harness, rows, (shadow, self.animation.scene.look.culling))?,
         };
-        Ok(Some(own.compared()))
+        Ok(Some(passes.with_frame_differences()))
     }
 
     /// Time of a frame with this shadow map and culling: that of an existing row, or a new measurement.
-    fn beside(
+    fn frame_baseline(
         &self,
-        studio: &mut RenderHarness,
+        harness: &mut RenderHarness,
         rows: &[RenderRow],
         (shadow, culling): (ShadowSettings, Culling),
     ) -> Result<FrameBaseline> {
-        // A row with the load's own look may not have culled anything.
-        let is = |row: &&RenderRow| {
-            let culls_so = row.culling == culling || culling == Culling::None && row.culled.is_none();
-            row.shadow == Some(shadow) && culls_so
+        // A row with automatic culling counts as not culled if no triangles were culled.
+        let matches = |row: &&RenderRow| {
+            let has_culling = row.culling == culling || culling == Culling::None && row.culled.is_none();
+            row.shadow == Some(shadow) && has_culling
         };
-        let found = rows.iter().filter(is).find_map(|row| Some((row.name.clone(), row.median_us()?)));
+        let found = rows.iter().filter(matches).find_map(|row| Some((row.name.clone(), row.median_us()?)));
         let (name, frame_us) = match found {
             Some(found) => found,
             None => {
-                let look = RenderSettings { shadow: Some(shadow), culling, ..self.stage.scene.look };
-                let passes = self.timed(studio, &light_meter::relit(&self.stage.scene, look)?)?;
+                let look = RenderSettings { shadow: Some(shadow), culling, ..self.animation.scene.look };
+                let passes = self.time_passes(harness, &light_meter::with_settings(&self.animation.scene, look)?)?;
                 let frame = passes.iter().find(|pass| pass.name == "frame").map_or(0.0, |pass| pass.timing.median_us);
                 (format!("variance {}, blur {}", shadow.size, shadow.blur), frame)
             }
         };
-        let way = if culling == Culling::None { "without culling" } else { "as the load culls" };
-        Ok(FrameBaseline { name: format!("{name}: {way}"), frame_us, beyond_us: 0.0 })
+        let culling_name = if culling == Culling::None { "without culling" } else { "as the load culls" };
+        Ok(FrameBaseline { name: format!("{name}: {culling_name}"), frame_us, beyond_us: 0.0 })
     }
 
-    /// Times the passes of the still picture of a scene.
-    fn timed(&self, studio: &mut RenderHarness, scene: &Arc<Scene>) -> Result<Vec<PassTime>> {
-        let mut set = studio.set(scene)?;
-        studio.pose(&mut set, &self.stage.state(STILL))?;
-        let passes = studio.time(&set, self.camera, self.request.size, self.request.replays);
-        studio.unload(set);
+    /// Times the passes of the still image of a scene.
+    fn time_passes(&self, harness: &mut RenderHarness, scene: &Arc<Scene>) -> Result<Vec<PassTime>> {
+        let mut loaded_scene = harness.load(scene)?;
+        harness.deform(&mut loaded_scene, &self.animation.state(STILL))?;
+        let passes = harness.time(&loaded_scene, self.camera, self.request.size, self.request.replays);
+        harness.unload(loaded_scene);
         passes
     }
 
-    fn compared(
+    /// The row of a variant without times and flicker.
+    fn compare(
         &self,
         variant: &RenderVariant,
-        (image, lit): (&FrameImage, &[Option<f32>]),
-        aim: &ReferenceImage,
+        (image, sun_visibility): (&FrameImage, &[Option<f32>]),
+        reference: &ReferenceImage,
     ) -> RenderRow {
         let hard = &self.references.hard;
-        let color_of_reference = metrics::colors(&image.rgba, &aim.colors);
-        let light_of_aim = metrics::light(lit, &aim.light);
-        let bounds = variant.bounds(self.stage.kind);
-        let faults = faults(&color_of_reference, &light_of_aim, &bounds);
+        let color_of_reference = metrics::compare_colors(&image.rgba, &reference.colors);
+        let light_of_aim = metrics::compare_light(sun_visibility, &reference.light);
+        let bounds = variant.bounds(self.animation.workload);
+        let faults = exceeded_bounds(&color_of_reference, &light_of_aim, &bounds);
         RenderRow {
-            load: self.stage.name.clone(),
+            load: self.animation.name.clone(),
             name: variant.name.clone(),
             method: variant.method,
             shadow: variant.shadow,
             blur_method: variant.blur_method,
             packing: variant.packing,
-            culling: variant.look(self.stage.scene.look).culling,
+            culling: variant.settings(self.animation.scene.look).culling,
             bounds,
             passed: faults.is_empty(),
-            to_fail: variant.is_to_fail(self.stage.kind),
+            to_fail: variant.is_expected_to_fail(self.animation.workload),
             faults,
-            color: metrics::colors(&image.rgba, &hard.colors),
+            color: metrics::compare_colors(&image.rgba, &hard.colors),
             color_of_reference,
-            light: metrics::light(lit, &hard.light),
+            light: metrics::compare_light(sun_visibility, &hard.light),
             light_of_aim,
             flicker: None,
             no_flicker: None,
@@ -404,61 +421,61 @@ impl WorkloadContext<'_> {
     }
 
     /// The flicker of a variant, or the reason why it was skipped.
-    fn flicker(
+    fn measure_flicker(
         &self,
-        studio: &mut RenderHarness,
-        set: &mut HarnessScene,
+        harness: &mut RenderHarness,
+        loaded_scene: &mut LoadedScene,
         variant: &RenderVariant,
     ) -> Result<std::result::Result<ErrorDistribution, String>> {
         let moving = match &self.moving {
             Ok(moving) => moving,
-            Err(why) => return Ok(Err(why.clone())),
+            Err(reason) => return Ok(Err(reason.clone())),
         };
-        let size = small(self.request.size);
-        let camera = self.stage.camera(size);
+        let size = moving_size(self.request.size);
+        let camera = self.animation.camera(size);
         let mut flicker = Flicker::default();
-        let mut time_budget = TimeBudget::new(STEP_TIME_BUDGET, STEPS);
+        let mut time_budget = TimeBudget::new(STEP_TIME_BUDGET, FLICKER_STEPS);
         for (step, [unshadowed, hard]) in moving.iter().enumerate() {
-            studio.pose(set, &self.stage.state(step))?;
-            let image = studio.draw(set, camera, size)?;
-            let reference = if variant.aim == ReferenceKind::Unshadowed { unshadowed } else { hard };
+            harness.deform(loaded_scene, &self.animation.state(step))?;
+            let image = harness.draw(loaded_scene, camera, size)?;
+            let reference = if variant.intended == ReferenceKind::Unshadowed { unshadowed } else { hard };
             flicker.push(&image.rgba, &reference.colors);
-            if let Some(why) = time_budget.tick("frames") {
-                return Ok(Err(why));
+            if let Some(reason) = time_budget.finish_step("frames") {
+                return Ok(Err(reason));
             }
         }
-        Ok(Ok(flicker.spread()))
+        Ok(Ok(flicker.into_distribution()))
     }
 
-    fn file_name(&self, what: &str) -> String {
-        format!("{}-{}", self.stage.name, what.replace(", ", "-").replace(' ', "-"))
+    fn file_name(&self, image_name: &str) -> String {
+        format!("{}-{}", self.animation.name, image_name.replace(", ", "-").replace(' ', "-"))
     }
 
-    fn reference_file(&self, what: &str, picture: &ReferenceImage) -> Result<ImageFile> {
-        image_files::picture(&self.file_name(what), self.request.size, &picture.colors)
+    fn reference_file(&self, name: &str, image: &ReferenceImage) -> Result<ImageFile> {
+        image_files::encode_reference(&self.file_name(name), self.request.size, &image.colors)
     }
 
     /// Sun visibility of the hard reference as a gray image; blue where it is undefined.
     fn light_file(&self) -> Result<ImageFile> {
         let shade = |light: &Option<f32>| light.map_or([60.0, 70.0, 110.0], |light| [255.0 * light; 3]);
         let colors: Vec<[f32; 3]> = self.references.hard.light.iter().map(shade).collect();
-        image_files::picture(&self.file_name("hard light"), self.request.size, &colors)
+        image_files::encode_reference(&self.file_name("hard light"), self.request.size, &colors)
     }
 }
 
-/// Descriptions of the exceeded bounds.
-fn faults(color: &ErrorDistribution, light: &LightErrors, bounds: &ErrorLimits) -> Vec<String> {
-    let found = [
-        ("mean error of colour", Some(color.mean), bounds.mean_color),
-        ("mean error of light", Some(light.all.mean), bounds.mean_light),
-        ("mean light in the umbra", light.in_umbra, bounds.bleeding),
-        ("mean light lost outside of shadows", light.lost, bounds.lost),
+/// Messages about exceeded bounds.
+fn exceeded_bounds(color: &ErrorDistribution, light: &LightErrors, bounds: &ErrorLimits) -> Vec<String> {
+    let errors = [
+        ("mean color error", Some(color.mean), bounds.mean_color),
+        ("mean sun visibility error", Some(light.all.mean), bounds.mean_light),
+        ("mean sun visibility in the umbra", light.in_umbra, bounds.bleeding),
+        ("mean sun visibility lost outside of shadows", light.lost, bounds.lost),
     ];
-    let over = |(what, found, bound): (&str, Option<f64>, f64)| {
-        let found = found.filter(|found| found.is_nan() || *found > bound)?;
-        Some(format!("{what} {found:.3}, bound {bound}"))
+    let message = |(quantity, error, bound): (&str, Option<f64>, f64)| {
+        let error = error.filter(|error| error.is_nan() || *error > bound)?;
+        Some(format!("{quantity}: expected at most {bound}, got {error:.3}"))
     };
-    found.into_iter().filter_map(over).collect()
+    errors.into_iter().filter_map(message).collect()
 }
 
 #[cfg(test)]
@@ -469,18 +486,30 @@ mod tests {
     #[test]
     fn detects_missing_dark_or_displaced_small_shadows() {
         let shadow = |first: usize| -> Vec<Option<f32>> {
-            (0..1000).map(|at| Some(if (first..first + 10).contains(&at) { 0.0 } else { 1.0 })).collect()
+            (0..1000).map(|pixel| Some(if (first..first + 10).contains(&pixel) { 0.0 } else { 1.0 })).collect()
         };
-        let judged = |own: &[Option<f32>]| {
-            faults(&ErrorDistribution::default(), &metrics::light(own, &shadow(100)), &ERROR_LIMITS)
+        let check = |visibility: &[Option<f32>]| {
+            exceeded_bounds(
+                &ErrorDistribution::default(),
+                &metrics::compare_light(visibility, &shadow(100)),
+                &ERROR_LIMITS,
+            )
         };
-        assert_eq!(judged(&shadow(100)), Vec::<String>::new(), "control: the right one");
-        assert_eq!(judged(&shadow(102)), Vec::<String>::new(), "a fifth of it beside its place is within the bound");
+        assert_eq!(check(&shadow(100)), Vec::<String>::new(), "control: equal to the reference");
+        assert_eq!(
+            check(&shadow(102)),
+            Vec::<String>::new(),
+            "a displacement by a fifth of the shadow's width is within the bound"
+        );
         for wrong in [shadow(200), vec![Some(1.0); 1000], shadow(105)] {
-            assert!(judged(&wrong)[0].starts_with("mean light in the umbra"), "{:?}", judged(&wrong));
+            assert!(check(&wrong)[0].starts_with("mean sun visibility in the umbra"), "{:?}", check(&wrong));
         }
-        assert!(judged(&vec![Some(0.5); 1000]).iter().any(|fault| fault.starts_with("mean light lost")));
-        let loud = ErrorDistribution { mean: f64::NAN, ..ErrorDistribution::default() };
-        assert_eq!(faults(&loud, &LightErrors::default(), &ERROR_LIMITS).len(), 1, "what is no number is a fault");
+        assert!(check(&vec![Some(0.5); 1000]).iter().any(|message| message.starts_with("mean sun visibility lost")));
+        let undefined = ErrorDistribution { mean: f64::NAN, ..ErrorDistribution::default() };
+        assert_eq!(
+            exceeded_bounds(&undefined, &LightErrors::default(), &ERROR_LIMITS).len(),
+            1,
+            "NaN exceeds every bound"
+        );
     }
 }

@@ -1,6 +1,6 @@
-//! Error metrics of a picture against its reference. Colors are compared as displayed: sRGB, 0 to 255, the largest
-//! difference of the three channels. Light is compared as sun visibility, the fraction of the unshadowed sunlight that
-//! arrives.
+//! Error metrics of an image against its reference. Colors are compared as displayed: sRGB, 0 to 255, the largest
+//! difference of the three channels. Shadows are compared as sun visibility, the fraction of the unshadowed sunlight
+//! that reaches the surface.
 
 use serde::Serialize;
 
@@ -19,58 +19,59 @@ pub struct ErrorDistribution {
 }
 
 impl ErrorDistribution {
-    fn of(mut values: Vec<f32>) -> Self {
+    fn from_values(mut values: Vec<f32>) -> Self {
         values.sort_by(f32::total_cmp);
         let count = values.len();
         let Some(last) = values.last() else { return Self::default() };
         let mean = values.iter().map(|value| f64::from(*value)).sum::<f64>() / count as f64;
-        // Nearest-rank percentile: the smallest number that at least 99 % do not exceed.
+        // Nearest-rank percentile: the smallest number that at least 99 % of the numbers do not exceed.
         let rank = (99 * count).div_ceil(100).clamp(1, count);
         Self { mean, p99: f64::from(values[rank - 1]), largest: f64::from(*last), count }
     }
 }
 
 /// Color errors over all pixels, of 255. `rendered` is RGBA, `reference` sRGB of 255.
-pub fn colors(rendered: &[u8], reference: &[[f32; 3]]) -> ErrorDistribution {
-    ErrorDistribution::of(differences(rendered, reference).collect())
+pub fn compare_colors(rendered: &[u8], reference: &[[f32; 3]]) -> ErrorDistribution {
+    ErrorDistribution::from_values(differences(rendered, reference).collect())
 }
 
 /// The largest difference of the three channels, per pixel.
 pub fn differences<'a>(rendered: &'a [u8], reference: &'a [[f32; 3]]) -> impl Iterator<Item = f32> + 'a {
-    let largest = |(pixel, wanted): (&[u8], &[f32; 3])| {
-        pixel.iter().zip(wanted).map(|(byte, value)| (f32::from(*byte) - value).abs()).fold(0.0, f32::max)
+    let largest_difference = |(pixel, expected): (&[u8], &[f32; 3])| {
+        pixel.iter().zip(expected).map(|(byte, value)| (f32::from(*byte) - value).abs()).fold(0.0, f32::max)
     };
-    rendered.chunks_exact(4).zip(reference).map(largest)
+    rendered.chunks_exact(4).zip(reference).map(largest_difference)
 }
 
-/// Errors of the sun visibility over the pixels where both pictures define it.
+/// Errors of the sun visibility over the pixels where both images define it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct LightErrors {
     pub all: ErrorDistribution,
-    /// Over the pixels in the reference's penumbra alone.
+    /// Over the pixels in the reference's penumbra only.
     pub penumbra: ErrorDistribution,
     /// Light bleeding: mean sun visibility in the reference's umbra. `None` without such pixels.
     pub in_umbra: Option<f64>,
     pub umbra_pixels: usize,
     /// Mean missing sun visibility where the reference is fully lit. `None` without such pixels.
     pub lost: Option<f64>,
-    /// Mean of rendered minus reference; positive when the picture is too bright.
+    /// Mean of rendered minus reference; positive when the image is too bright.
     pub bias: f64,
 }
 
 /// Compares the sun visibility pixel by pixel; pixels where either is undefined are skipped.
-pub fn light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> LightErrors {
-    let pairs: Vec<(f32, f32)> = rendered.iter().zip(reference).filter_map(|(own, wanted)| own.zip(*wanted)).collect();
-    let error = |(own, wanted): &(f32, f32)| (own - wanted).abs();
-    let soft = |(_, wanted): &&(f32, f32)| (PENUMBRA..=1.0 - PENUMBRA).contains(wanted);
+pub fn compare_light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> LightErrors {
+    let pairs: Vec<(f32, f32)> =
+        rendered.iter().zip(reference).filter_map(|(rendered, reference)| rendered.zip(*reference)).collect();
+    let error = |(rendered, reference): &(f32, f32)| (rendered - reference).abs();
+    let is_penumbra = |(_, reference): &&(f32, f32)| (PENUMBRA..=1.0 - PENUMBRA).contains(reference);
     let umbra: Vec<f64> = pairs.iter().filter(|pair| pair.1 <= UMBRA).map(|pair| f64::from(pair.0)).collect();
-    let whole = pairs.iter().filter(|pair| pair.1 >= 1.0 - UMBRA);
-    let lost: Vec<f64> = whole.map(|pair| f64::from(pair.1 - pair.0)).collect();
+    let fully_lit = pairs.iter().filter(|pair| pair.1 >= 1.0 - UMBRA);
+    let lost: Vec<f64> = fully_lit.map(|pair| f64::from(pair.1 - pair.0)).collect();
     let mean = |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
-    let bias = pairs.iter().map(|(own, wanted)| f64::from(own - wanted)).sum::<f64>();
+    let bias = pairs.iter().map(|(rendered, reference)| f64::from(rendered - reference)).sum::<f64>();
     LightErrors {
-        all: ErrorDistribution::of(pairs.iter().map(error).collect()),
-        penumbra: ErrorDistribution::of(pairs.iter().filter(soft).map(error).collect()),
+        all: ErrorDistribution::from_values(pairs.iter().map(error).collect()),
+        penumbra: ErrorDistribution::from_values(pairs.iter().filter(is_penumbra).map(error).collect()),
         in_umbra: mean(&umbra),
         umbra_pixels: umbra.len(),
         lost: mean(&lost),
@@ -82,27 +83,29 @@ pub fn light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> LightErrors
 /// 255. A constant error does not flicker.
 #[derive(Debug, Default)]
 pub struct Flicker {
-    before: Vec<[f32; 3]>,
+    /// Signed error of each pixel of the last frame.
+    last_errors: Vec<[f32; 3]>,
+    /// Absolute changes of the errors of all pixels and frames.
     changes: Vec<f32>,
 }
 
 impl Flicker {
     /// Adds the next frame and its reference.
     pub fn push(&mut self, rendered: &[u8], reference: &[[f32; 3]]) {
-        let error = |(pixel, wanted): (&[u8], &[f32; 3])| {
-            std::array::from_fn(|channel| f32::from(pixel[channel]) - wanted[channel])
+        let error = |(pixel, expected): (&[u8], &[f32; 3])| {
+            std::array::from_fn(|channel| f32::from(pixel[channel]) - expected[channel])
         };
-        let now: Vec<[f32; 3]> = rendered.chunks_exact(4).zip(reference).map(error).collect();
-        let change = |(now, before): (&[f32; 3], &[f32; 3])| {
-            now.iter().zip(before).map(|(now, before)| (now - before).abs()).fold(0.0, f32::max)
+        let errors: Vec<[f32; 3]> = rendered.chunks_exact(4).zip(reference).map(error).collect();
+        let change = |(current, last): (&[f32; 3], &[f32; 3])| {
+            current.iter().zip(last).map(|(current, last)| (current - last).abs()).fold(0.0, f32::max)
         };
-        self.changes.extend(now.iter().zip(&self.before).map(change));
-        self.before = now;
+        self.changes.extend(errors.iter().zip(&self.last_errors).map(change));
+        self.last_errors = errors;
     }
 
-    /// The result over all pixels of all pairs of consecutive frames.
-    pub fn spread(self) -> ErrorDistribution {
-        ErrorDistribution::of(self.changes)
+    /// The distribution over all pixels of all pairs of consecutive frames.
+    pub fn into_distribution(self) -> ErrorDistribution {
+        ErrorDistribution::from_values(self.changes)
     }
 }
 
@@ -117,62 +120,74 @@ mod tests {
     #[test]
     fn one_wrong_pixel_in_a_hundred_gives_known_errors() {
         let reference = vec![[100.0; 3]; 100];
-        assert_eq!(colors(&gray([100; 100]), &reference).largest, 0.0, "control: equal pictures");
-        let one = gray((0..100).map(|at| if at == 7 { 150 } else { 100 }));
-        let found = colors(&one, &reference);
+        assert_eq!(compare_colors(&gray([100; 100]), &reference).largest, 0.0, "control: equal images");
+        let one_wrong = gray((0..100).map(|pixel| if pixel == 7 { 150 } else { 100 }));
+        let found = compare_colors(&one_wrong, &reference);
         assert_eq!((found.mean, found.p99, found.largest, found.count), (0.5, 0.0, 50.0, 100));
-        let two = gray((0..100).map(|at| if at < 2 { 150 } else { 100 }));
-        assert_eq!(colors(&two, &reference).p99, 50.0, "two in a hundred reach the percentile");
+        let two_wrong = gray((0..100).map(|pixel| if pixel < 2 { 150 } else { 100 }));
+        assert_eq!(
+            compare_colors(&two_wrong, &reference).p99,
+            50.0,
+            "two wrong pixels in a hundred reach the 99th percentile"
+        );
         let mut tinted = gray([100; 100]);
         tinted[1] = 90;
-        assert_eq!(colors(&tinted, &reference).largest, 10.0, "one channel counts");
-        assert_eq!(colors(&[], &[]), ErrorDistribution::default());
+        assert_eq!(compare_colors(&tinted, &reference).largest, 10.0, "an error in one channel is counted");
+        assert_eq!(compare_colors(&[], &[]), ErrorDistribution::default());
     }
 
     #[test]
     fn shifted_ramp_errs_by_its_slope_only_on_the_ramp() {
         let ramp = |shift: i32| -> Vec<Option<f32>> {
-            (0..100).map(|at| Some(((at - 40 - shift) as f32 / 20.0).clamp(0.0, 1.0))).collect()
+            (0..100).map(|pixel| Some(((pixel - 40 - shift) as f32 / 20.0).clamp(0.0, 1.0))).collect()
         };
-        let still = light(&ramp(0), &ramp(0));
+        let still = compare_light(&ramp(0), &ramp(0));
         assert_eq!((still.all.largest, still.penumbra.count, still.bias), (0.0, 19, 0.0), "control: the same ramp");
-        let moved = light(&ramp(2), &ramp(0));
+        let moved = compare_light(&ramp(2), &ramp(0));
         assert!((moved.penumbra.largest - 0.1).abs() < 1e-6 && moved.penumbra.mean > 0.09, "{moved:?}");
         assert!((moved.all.mean - 0.02).abs() < 1e-6 && (moved.bias + 0.02).abs() < 1e-6, "{moved:?}");
-        assert_eq!(moved.in_umbra, Some(0.0), "a shadow that is too large lets nothing in");
+        assert_eq!(moved.in_umbra, Some(0.0), "a displaced shadow does not bleed");
     }
 
     #[test]
     fn only_light_in_the_umbra_counts_as_bleeding() {
-        let reference: Vec<Option<f32>> = (0..10).map(|at| Some(if at < 4 { 0.0 } else { 1.0 })).collect();
+        let reference: Vec<Option<f32>> = (0..10).map(|pixel| Some(if pixel < 4 { 0.0 } else { 1.0 })).collect();
         let mut leaking = reference.clone();
         leaking[1] = Some(0.2);
-        let found = light(&leaking, &reference);
-        assert!((found.in_umbra.expect("an umbra") - 0.05).abs() < 1e-7 && found.umbra_pixels == 4);
+        let found = compare_light(&leaking, &reference);
+        assert!((found.in_umbra.expect("umbra pixels") - 0.05).abs() < 1e-7 && found.umbra_pixels == 4);
         let mut dark = reference.clone();
         dark[9] = Some(0.5);
-        let found = light(&dark, &reference);
+        let found = compare_light(&dark, &reference);
         assert_eq!(found.in_umbra, Some(0.0), "control: an error in the light");
-        assert!((found.lost.expect("a lit part") - 0.5 / 6.0).abs() < 1e-7, "{found:?}");
-        assert_eq!(light(&leaking, &reference).lost, Some(0.0), "control: an error in the umbra");
-        assert_eq!(light(&[Some(0.5)], &[Some(1.0)]).in_umbra, None, "no umbra, no bleeding");
-        assert_eq!(light(&[None, Some(1.0)], &[Some(0.0), None]).all.count, 0, "what neither tells is left out");
+        assert!((found.lost.expect("fully lit pixels") - 0.5 / 6.0).abs() < 1e-7, "{found:?}");
+        assert_eq!(compare_light(&leaking, &reference).lost, Some(0.0), "control: an error in the umbra");
+        assert_eq!(
+            compare_light(&[Some(0.5)], &[Some(1.0)]).in_umbra,
+            None,
+            "bleeding is undefined without umbra pixels"
+        );
+        assert_eq!(
+            compare_light(&[None, Some(1.0)], &[Some(0.0), None]).all.count,
+            0,
+            "pixels that either image leaves undefined are skipped"
+        );
     }
 
     #[test]
-    fn only_changes_without_the_reference_flicker() {
+    fn only_changes_of_the_error_are_flicker() {
         let flicker = |rendered: &dyn Fn(usize) -> u8, reference: &dyn Fn(usize) -> f32| {
             let mut flicker = Flicker::default();
             (0..60).for_each(|step| flicker.push(&gray([rendered(step); 4]), &[[reference(step); 3]; 4]));
-            flicker.spread()
+            flicker.into_distribution()
         };
         let still = flicker(&|_| 90, &|_| 100.0);
-        assert_eq!((still.largest, still.count), (0.0, 59 * 4), "a still error does not flicker");
+        assert_eq!((still.largest, still.count), (0.0, 59 * 4), "a constant error does not flicker");
         let moving = flicker(&|step| 3 * step as u8, &|step| 3.0 * step as f32);
-        assert_eq!(moving.largest, 0.0, "a picture that moves with its reference does not");
+        assert_eq!(moving.largest, 0.0, "an image that follows its reference does not flicker");
         let blinking = flicker(&|step| 100 + 10 * (step % 2) as u8, &|_| 100.0);
         assert_eq!((blinking.mean, blinking.largest), (10.0, 10.0));
         let frozen = flicker(&|_| 100, &|step| 100.0 + 10.0 * (step % 2) as f32);
-        assert_eq!(frozen.mean, 10.0, "a picture that misses a change of the reference does");
+        assert_eq!(frozen.mean, 10.0, "an image that misses a change of the reference flickers");
     }
 }

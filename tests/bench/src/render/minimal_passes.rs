@@ -1,6 +1,8 @@
-//! Lower limit of the cost of drawing a mesh: the scene stripped to one opaque two-sided white material, so that the
-//! depth of the map is one draw without a fragment shader, and ids and depth of the frame are one more draw. No
-//! culling, images, holes, moments or ground: the commands of a minimal program, issued by the renderer.
+//! Times the minimal passes of a scene, a lower limit of the cost of drawing its mesh: one draw of the depth of the
+//! shadow map without a fragment shader, and one draw of the ids and depth of the frame.
+//!
+//! The scene is stripped to one opaque, two-sided, white material. Culling, images, cut-outs, shadow moments and the
+//! ground are off.
 
 use std::sync::Arc;
 
@@ -23,10 +25,11 @@ pub struct MinimalPasses {
     pub samples: u32,
     pub depth: Timing,
     pub visibility: Timing,
-    /// A frame without culling, like both passes. Its excess over both passes is the overhead of the renderer.
+    /// A frame without culling. Its excess over both passes is the overhead of the renderer.
     pub unculled: FrameBaseline,
-    /// A frame with the culling of the load's own look.
-    pub usual: FrameBaseline,
+    /// A frame with the culling of the load's own settings.
+    #[serde(rename = "usual")]
+    pub default_culling: FrameBaseline,
 }
 
 /// A frame of the renderer with the same map, for comparison with both passes.
@@ -36,16 +39,16 @@ pub struct FrameBaseline {
     pub name: String,
     /// Time of the frame, microseconds.
     pub frame_us: f64,
-    /// Time in excess of both bare passes, microseconds.
+    /// Time in excess of both minimal passes, microseconds.
     pub beyond_us: f64,
 }
 
 impl MinimalPasses {
     /// Fills in each frame's excess over both passes.
-    pub(super) fn compared(mut self) -> Self {
-        let both = self.depth.median_us + self.visibility.median_us;
-        for frame in [&mut self.unculled, &mut self.usual] {
-            frame.beyond_us = frame.frame_us - both;
+    pub(super) fn with_frame_differences(mut self) -> Self {
+        let sum_us = self.depth.median_us + self.visibility.median_us;
+        for frame in [&mut self.unculled, &mut self.default_culling] {
+            frame.beyond_us = frame.frame_us - sum_us;
         }
         self
     }
@@ -53,13 +56,13 @@ impl MinimalPasses {
 
 /// Limit of the excess over both passes, microseconds, for a frame of three million triangles without culling on an
 /// H200.
-pub(super) const BEYOND_US: f64 = 600.0;
+pub(super) const MAX_EXCESS_US: f64 = 600.0;
 
 /// The scene with one material and a standard shadow map of this size.
 ///
 /// # Errors
 /// Only those that the scene itself would cause.
-pub(super) fn stripped(scene: &Scene, map: u32) -> Result<Arc<Scene>> {
+pub(super) fn strip_to_mesh(scene: &Scene, map: u32) -> Result<Arc<Scene>> {
     let shadow = ShadowSettings { method: ShadowMethod::Standard, size: map, ..ShadowSettings::default() };
     let look = RenderSettings { shadow: Some(shadow), ground: None, bloom: None, culling: Culling::None, ..scene.look };
     let materials = vec![Material { double_sided: true, ..Material::default() }];
@@ -71,8 +74,8 @@ pub(super) fn stripped(scene: &Scene, map: u32) -> Result<Arc<Scene>> {
     Scene::new(parts)
 }
 
-/// Whether a frame consisted of one draw of ids and one of depth, without a pass that uses the depth.
-pub(super) fn is_bare(stats: &FrameStats) -> bool {
+/// Whether a frame consisted of one draw of depth and one of ids, without a shadow pass that processes the depth.
+pub(super) fn is_minimal(stats: &FrameStats) -> bool {
     stats.draw_calls == 1 && stats.passes.starts_with(&[Pass::Shadow, Pass::Visibility])
 }
 
@@ -83,21 +86,21 @@ mod tests {
     use crate::render::workloads::RenderWorkload;
 
     #[test]
-    fn stripped_scene_is_one_draw_and_the_tree_is_not() {
-        let mut studio = RenderHarness::open().expect("OpenGL");
-        let stage = RenderWorkload::Tree.stage().expect("built");
-        let bare = stripped(&stage.scene, 64).expect("stripped");
-        assert_eq!(bare.layout.triangles, stage.scene.layout.triangles);
-        assert!(!bare.needs.textures && !bare.needs.mask && !bare.needs.normal_maps);
+    fn stripped_scene_needs_one_draw_and_the_tree_several() {
+        let mut harness = RenderHarness::open().expect("OpenGL");
+        let animation = RenderWorkload::Tree.build().expect("a workload");
+        let stripped_scene = strip_to_mesh(&animation.scene, 64).expect("a stripped scene");
+        assert_eq!(stripped_scene.layout.triangles, animation.scene.layout.triangles);
+        assert!(!stripped_scene.needs.textures && !stripped_scene.needs.mask && !stripped_scene.needs.normal_maps);
         let size = Size { width: 32, height: 24 };
         let mut stats = |scene: &Arc<Scene>| {
-            let mut set = studio.set(scene).expect("loaded");
-            studio.pose(&mut set, &stage.state(0)).expect("posed");
-            studio.draw(&set, stage.camera(size), size).expect("drawn");
-            studio.unload(set);
-            studio.renderer.stats().clone()
+            let mut loaded_scene = harness.load(scene).expect("a loaded scene");
+            harness.deform(&mut loaded_scene, &animation.state(0)).expect("deformed vertices");
+            harness.draw(&loaded_scene, animation.camera(size), size).expect("a frame");
+            harness.unload(loaded_scene);
+            harness.renderer.stats().clone()
         };
-        assert!(is_bare(&stats(&bare)));
-        assert!(!is_bare(&stats(&stage.scene)), "control: leaves and bark are drawn apart");
+        assert!(is_minimal(&stats(&stripped_scene)));
+        assert!(!is_minimal(&stats(&animation.scene)), "control: leaves and bark need separate draws");
     }
 }

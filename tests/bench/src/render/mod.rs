@@ -1,25 +1,26 @@
-//! Benchmarks of error against run time for the renderer: pictures by every variant against brute-force ray-cast
-//! references.
+//! Benchmarks of error against run time for the renderer: compares the images of every variant with brute-force
+//! ray-cast references.
 //!
-//! Validation comes before timing: a variant whose error against its intended result exceeds a stated bound is not
-//! timed. The report names it and fails. Some variants are included to show a failure; the report also fails if such a
+//! Each variant is validated before it is timed: if its error against its intended result exceeds a stated bound, it is
+//! not timed, and the report names it and fails. Some variants are expected to fail; the report also fails if such a
 //! variant passes.
 //!
 //! - [`workloads`], [`variants`]: the scenes, and the ways to draw them.
-//! - `ray_scene`, `paint`, `texels`, `view`, `shade`, `sample_pattern`, `picture`: the references. 64 samples per pixel, in f64
-//!   except for the boxes of the BVH. Opaque surfaces and cut-outs by their nearest point, transparent ones sorted by
-//!   depth along every sample. Shadows by one ray per sample to the sun, or by rays distributed over the blur's
-//!   footprint.
-//! - `studio`, `meter`: frames of the renderer, and their sun visibility.
+//! - `ray_scene`, `reference_material`, `reference_texture`, `reference_view`, `shade`, `sample_pattern`,
+//!   `reference_image`: the references, with 64 samples per pixel, in f64 except for the boxes of the BVH. Each sample
+//!   sees its nearest opaque or cut-out surface and the transparent surfaces in front of it, sorted by depth. Shadows
+//!   are cast by one ray per sample to the sun, or by rays that are distributed over the footprint of the blur.
+//! - `harness`, `light_meter`: frames of the renderer, and their sun visibility.
 //! - `readback`: frames per second when each frame is read back.
 //! - [`metrics`]: errors, light bleeding, flicker.
-//! - `bare`: the passes of the scene stripped to its mesh, timed in the same run; `blurs`: moments and blur by compute
-//!   and by fragment shaders.
-//! - `raster`: the bare passes by the CUDA rasterizer and by OpenGL; `frame_comparison`: whole frames with either.
-//! - [`packing`]: images in one array as in equation 3.13, against arrays by size.
+//! - `minimal_passes`: times of the depth and visibility passes of the scene stripped to its mesh.
+//! - `blur_comparison`: moments and blur by compute shaders and by fragment shaders.
+//! - `raster_comparison`: the minimal passes by the CUDA rasterizer and by OpenGL; `frame_comparison`: whole frames by
+//!   both.
+//! - [`packing`]: all images in one array as in equation 3.13, and in arrays by size.
 //! - [`plants`]: the plants of table 4.5, deformed and drawn.
-//! - [`frame_times`]: frame times of a scene of the user, for comparison with other programs.
-//! - [`figures`]: figures like those of the thesis, for viewing.
+//! - [`frame_times`]: frame times of user-supplied scenes, for comparison with other programs.
+//! - [`figures`]: reproduces figures of the thesis.
 
 mod blur_comparison;
 mod comparison_tables;
@@ -84,7 +85,7 @@ pub struct RenderReportOptions {
     /// Variants to measure: full names, or prefixes that end in `*`. An empty list selects all.
     pub variants: Vec<String>,
     pub size: Size,
-    /// Fewer variants, samples and steps, for machines with few cores.
+    /// Uses fewer variants, samples and steps, for machines with few cores.
     pub quick: bool,
     /// Frames per median.
     pub replays: usize,
@@ -92,17 +93,19 @@ pub struct RenderReportOptions {
 
 impl RenderReportOptions {
     /// The variants to measure. A quick run has fewer, but includes every variant that is named in full.
-    pub fn wanted(&self) -> Vec<RenderVariant> {
-        let (few, mut all) = (variants::all(self.quick), variants::all(false));
-        all.retain(|variant| {
+    pub fn selected_variants(&self) -> Vec<RenderVariant> {
+        let (quick_variants, mut selected) = (variants::all(self.quick), variants::all(false));
+        selected.retain(|variant| {
             let is_named = self.variants.contains(&variant.name);
-            is_named || is_selected(&self.variants, &variant.name) && few.iter().any(|own| own.name == variant.name)
+            is_named
+                || is_selected(&self.variants, &variant.name)
+                    && quick_variants.iter().any(|quick| quick.name == variant.name)
         });
-        all
+        selected
     }
 }
 
-/// Facts of one load in a report.
+/// Sizes, sample counts and reference times of one load in a report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RenderWorkloadSummary {
     pub name: String,
@@ -111,35 +114,38 @@ pub struct RenderWorkloadSummary {
     pub domains: usize,
     /// Samples per pixel of the references.
     pub samples: usize,
-    /// Rays to the sun per sample, where the light is filtered.
+    /// Rays to the sun per sample of a filtered shadow.
     pub taps: usize,
-    /// Time to trace all references of the still picture.
+    /// Time to trace all references of the still image.
     pub reference_ms: f64,
-    /// Texels of the shadow map of the load's own look; `None` without one.
+    /// Texel size of the shadow map of the load's own settings; `None` without shadows.
     pub texels: Option<ShadowTexelSize>,
     /// Steps over which flicker was measured.
     pub steps: usize,
-    /// Size of the pictures of the moving scene.
+    /// Size of the images of the moving scene.
     pub steps_size: Size,
     /// Reason why flicker was not measured.
     pub no_flicker: Option<String>,
 }
 
-/// Longer side of a texel of a shadow map of `size` texels per side, in scene units. `side`: of the map that is drawn,
-/// which is fitted to the vertices' extent in light space; `by_corners`: of a map that is fitted to the corners of
-/// their bounds.
+/// Longer side of a texel of a shadow map, in scene units.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ShadowTexelSize {
+    /// Texels per side of the map.
     pub size: u32,
+    /// For a map that is fitted to the extent of the vertices in light space, as the renderer does.
     pub side: f64,
+    /// For a map that is fitted to the corners of the bounding box.
     pub by_corners: f64,
 }
 
 impl ShadowTexelSize {
-    fn of(scene: &Scene, shot: &FrameParams) -> Option<Self> {
-        let longer =
-            |shot: &FrameParams| shadow_texel_axes(scene, shot).map(|sides| sides[0].norm().max(sides[1].norm()));
-        let (side, by_corners) = (longer(shot)?, longer(&FrameParams { light: None, ..*shot })?);
+    fn measure(scene: &Scene, frame_params: &FrameParams) -> Option<Self> {
+        let longer_side = |frame_params: &FrameParams| {
+            shadow_texel_axes(scene, frame_params).map(|axes| axes[0].norm().max(axes[1].norm()))
+        };
+        let (side, by_corners) =
+            (longer_side(frame_params)?, longer_side(&FrameParams { light: None, ..*frame_params })?);
         scene.look.shadow.map(|shadow| Self { size: shadow.size, side, by_corners })
     }
 }
@@ -147,7 +153,8 @@ impl ShadowTexelSize {
 /// All results of one run.
 #[derive(Debug, Clone, Serialize)]
 pub struct RenderReport {
-    pub made: Provenance,
+    #[serde(rename = "made")]
+    pub provenance: Provenance,
     pub renderer: RendererInfo,
     pub size: Size,
     /// Error bounds against the intended result, for rows without tighter ones.
@@ -156,18 +163,19 @@ pub struct RenderReport {
     pub rows: Vec<RenderRow>,
     /// One entry per load.
     pub readback: Vec<ReadbackRates>,
-    /// Times of the bare passes on each load.
-    pub bare: Vec<MinimalPasses>,
-    /// The same passes by CUDA and by OpenGL, where there is a CUDA device.
+    /// Times of the minimal passes on each load.
+    #[serde(rename = "bare")]
+    pub minimal_passes: Vec<MinimalPasses>,
+    /// Times of the minimal passes by CUDA and by OpenGL; empty without a CUDA device.
     pub raster: Vec<RasterComparison>,
-    /// Times of the passes that compute the same moment map by compute and by fragment shaders.
+    /// Times to compute the same moment map by compute shaders and by fragment shaders.
     pub blurs: Vec<BlurComparison>,
     /// Plants of table 4.5, deformed and drawn.
     pub plants: Vec<PlantResult>,
-    /// Unexpected results, as `load: variant: reason`: variants that failed, and variants that passed although they are
-    /// stated to fail.
+    /// Unexpected results, as `load: variant: reason`: variants that failed unexpectedly, and variants that passed
+    /// although they were expected to fail.
     pub failed: Vec<String>,
-    /// Pictures for viewing.
+    /// Reference images and comparison strips.
     #[serde(skip)]
     pub pictures: Vec<ImageFile>,
 }
@@ -177,43 +185,43 @@ pub struct RenderReport {
 /// # Errors
 /// `Unavailable` without OpenGL; errors of loading and drawing a scene.
 pub fn render(request: &RenderReportOptions, mut progress: impl FnMut(&str)) -> Result<RenderReport> {
-    let mut studio = RenderHarness::open()?;
-    let (mut loads, mut rows, mut bare, mut pictures) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let mut harness = RenderHarness::open()?;
+    let (mut loads, mut rows, mut minimal_passes, mut pictures) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     let mut readback = Vec::new();
-    for kind in &request.loads {
-        progress(&format!("{}: building", kind.name()));
-        let measured = measure::load(&mut studio, request, *kind, &mut progress)?;
-        loads.push(measured.entry);
+    for workload in &request.loads {
+        progress(&format!("{}: building", workload.name()));
+        let measured = measure::measure_workload(&mut harness, request, *workload, &mut progress)?;
+        loads.push(measured.summary);
         rows.extend(measured.rows);
-        bare.extend(measured.bare);
+        minimal_passes.extend(measured.minimal_passes);
         pictures.extend(measured.files);
-        progress(&format!("{}: reading back", kind.name()));
-        readback.push(readback::measure(&mut studio, request, *kind)?);
+        progress(&format!("{}: measuring readback", workload.name()));
+        readback.push(readback::measure(&mut harness, request, *workload)?);
     }
     let device = harness::cuda_device();
     let raster = match &device {
-        Some(device) => raster_comparison::measure(&mut studio, device, request, &mut progress)?,
+        Some(device) => raster_comparison::measure(&mut harness, device, request, &mut progress)?,
         None => Vec::new(),
     };
     let mut plants = Vec::new();
     for index in &request.plants {
         progress(&format!("plant-{}", index + 1));
-        plants.push(plants::measure(&mut studio, device.as_ref(), request, *index)?);
+        plants.push(plants::measure(&mut harness, device.as_ref(), request, *index)?);
     }
-    let failed = rows.iter().filter(|row: &&RenderRow| !row.as_stated()).map(why);
+    let failed = rows.iter().filter(|row: &&RenderRow| !row.is_as_expected()).map(describe_failure);
     let failed = failed.chain(raster.iter().filter_map(RasterComparison::fault)).collect();
-    let (made, renderer, bounds) = (Provenance::here(), studio.renderer.info().clone(), variants::ERROR_LIMITS);
-    let blurs = BlurComparison::of(&rows);
+    let (provenance, renderer, bounds) = (Provenance::here(), harness.renderer.info().clone(), variants::ERROR_LIMITS);
+    let blurs = BlurComparison::pair_rows(&rows);
     let size = request.size;
     Ok(RenderReport {
-        made,
+        provenance,
         renderer,
         size,
         bounds,
         loads,
         rows,
         readback,
-        bare,
+        minimal_passes,
         raster,
         blurs,
         plants,
@@ -222,13 +230,14 @@ pub fn render(request: &RenderReportOptions, mut progress: impl FnMut(&str)) -> 
     })
 }
 
-fn why(row: &RenderRow) -> String {
-    let why = if row.passed { "keeps bounds that it is stated to exceed".into() } else { row.faults.join("; ") };
-    format!("{}: {}: {why}", row.load, row.name)
+fn describe_failure(row: &RenderRow) -> String {
+    let reason =
+        if row.passed { "expected to exceed its bounds, but is within them".into() } else { row.faults.join("; ") };
+    format!("{}: {}: {reason}", row.load, row.name)
 }
 
 impl RenderReport {
-    /// Whether every variant passed or failed as stated.
+    /// Whether every variant passed or failed as expected.
     pub fn passed(&self) -> bool {
         self.failed.is_empty()
     }

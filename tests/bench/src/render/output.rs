@@ -1,4 +1,4 @@
-//! Output files of a report: JSON, CSV, Markdown, the plot as SVG and PNG, and the pictures.
+//! Output files of a report: JSON, CSV, Markdown, the plot as SVG and PNG, and the images.
 
 use std::path::Path;
 
@@ -10,8 +10,8 @@ use crate::plot::png;
 use crate::timing::Timing;
 use modalcast_model::error::{Result, fault_in};
 
-/// Columns of `report.csv`: name, and JSON pointer of the value in a row of `report.json`, or for times the name of the
-/// pass.
+/// Columns of `report.csv`: name, and the JSON pointer of the value in a row of `report.json`. Columns of times have the
+/// name of the pass instead of a pointer.
 const COLUMNS: [(&str, &str); 55] = [
     ("load", "/load"),
     ("variant", "/name"),
@@ -71,7 +71,7 @@ const COLUMNS: [(&str, &str); 55] = [
 ];
 
 impl RenderReport {
-    /// Writes `report.json`, `report.csv`, `passes.csv` (bare passes; rasterizer and blur, both methods each),
+    /// Writes `report.json`, `report.csv`, `passes.csv` (minimal passes, rasterizers and blurs),
     /// `plants.csv`, `report.md`, `report.svg`, `report.png` and `pictures/` into a folder, which is created.
     ///
     /// # Errors
@@ -82,7 +82,7 @@ impl RenderReport {
         let svg = plot::svg(self);
         let files = [
             ("report.json", serde_json::to_vec_pretty(self).map_err(fault_in("report"))?),
-            ("report.csv", csv(&self.rows)?),
+            ("report.csv", rows_csv(&self.rows)?),
             ("passes.csv", passes_csv(self)?),
             ("plants.csv", plants_csv(&self.plants)?),
             ("report.md", markdown::markdown(self).into_bytes()),
@@ -99,61 +99,74 @@ impl RenderReport {
     }
 }
 
-fn csv(rows: &[RenderRow]) -> Result<Vec<u8>> {
+fn rows_csv(rows: &[RenderRow]) -> Result<Vec<u8>> {
     let mut lines = Vec::new();
     for row in rows {
         let value = serde_json::to_value(row).map_err(fault_in("report"))?;
-        lines.push(COLUMNS.map(|column| cell(row, &value, column)));
+        lines.push(COLUMNS.map(|column| cell_text(row, &value, column)));
     }
-    table(COLUMNS.map(|(name, _)| name.to_owned()), lines)
+    encode_csv(COLUMNS.map(|(name, _)| name.to_owned()), lines)
 }
 
-/// The CSV of bare passes, rasterizers and blurs: one line each, with the row that it is compared with.
+/// The CSV of minimal passes, rasterizers and blurs. Each line has a time, and after `beside` the time that it is
+/// compared with.
 fn passes_csv(report: &RenderReport) -> Result<Vec<u8>> {
     let head =
         ["load", "what", "size", "samples_or_taps", "median_us", "beside", "beside_us", "difference_us", "ratio"];
     let mut lines = Vec::new();
-    for bare in &report.bare {
-        let passes =
-            [("bare depth pass", bare.map, bare.depth), ("bare visibility pass", bare.samples, bare.visibility)];
-        for (what, number, timing) in passes {
-            let [size, many] = if what == "bare depth pass" {
+    for minimal in &report.minimal_passes {
+        let passes = [
+            ("bare depth pass", minimal.map, minimal.depth),
+            ("bare visibility pass", minimal.samples, minimal.visibility),
+        ];
+        for (pass_name, number, timing) in passes {
+            let [size, sample_count] = if pass_name == "bare depth pass" {
                 [number.to_string(), "1".into()]
             } else {
                 [format!("{}x{}", report.size.width, report.size.height), number.to_string()]
             };
             let median = timing.median_us.to_string();
-            lines.push([&bare.load, what, &size, &many, &median, "", "", "", ""].map(String::from));
+            lines.push([&minimal.load, pass_name, &size, &sample_count, &median, "", "", "", ""].map(String::from));
         }
-        let both = (bare.depth.median_us + bare.visibility.median_us).to_string();
-        for frame in [&bare.unculled, &bare.usual] {
-            let [own, beyond, size] = [frame.frame_us.to_string(), frame.beyond_us.to_string(), bare.map.to_string()];
-            let what = "both bare passes";
-            lines.push([&bare.load, what, &size, "", &both, &frame.name, &own, &beyond, ""].map(String::from));
+        let sum_us = (minimal.depth.median_us + minimal.visibility.median_us).to_string();
+        for frame in [&minimal.unculled, &minimal.default_culling] {
+            let [frame_us, beyond_us, size] =
+                [frame.frame_us, frame.beyond_us, f64::from(minimal.map)].map(|number| number.to_string());
+            let pass_name = "both bare passes";
+            lines.push(
+                [&minimal.load, pass_name, &size, "", &sum_us, &frame.name, &frame_us, &beyond_us, ""]
+                    .map(String::from),
+            );
         }
     }
-    for (own, passes) in report.raster.iter().filter_map(|own| own.passes.map(|passes| (own, passes))) {
+    for (comparison, passes) in report.raster.iter().filter_map(|entry| entry.passes.map(|passes| (entry, passes))) {
         let frame = format!("{}x{}", report.size.width, report.size.height);
-        let both = [
-            ("raster depth in CUDA", own.map.to_string(), passes.depth),
+        let pairs = [
+            ("raster depth in CUDA", comparison.map.to_string(), passes.depth),
             ("raster ids in CUDA", frame, passes.visibility),
         ];
-        for (what, size, pair) in both {
+        for (pass_name, size, pair) in pairs {
             let [cuda, opengl, ratio] =
                 [pair.cuda.median_us, pair.opengl.median_us, pair.ratio()].map(|us| us.to_string());
-            lines.push([&own.load, what, &size, "1", &cuda, "in OpenGL", &opengl, "", &ratio].map(String::from));
+            lines.push(
+                [&comparison.load, pass_name, &size, "1", &cuda, "in OpenGL", &opengl, "", &ratio].map(String::from),
+            );
         }
     }
     for blurs in &report.blurs {
         let [size, taps] = [blurs.size, blurs.taps].map(|number| number.to_string());
-        let [own, other, ratio] = [blurs.compute_us, blurs.fragments_us, blurs.ratio].map(|number| number.to_string());
-        let what = "moments and blur in compute";
-        lines.push([&blurs.load, what, &size, &taps, &own, "in fragments", &other, "", &ratio].map(String::from));
+        let [compute_us, fragments_us, ratio] =
+            [blurs.compute_us, blurs.fragments_us, blurs.ratio].map(|number| number.to_string());
+        let pass_name = "moments and blur in compute";
+        lines.push(
+            [&blurs.load, pass_name, &size, &taps, &compute_us, "in fragments", &fragments_us, "", &ratio]
+                .map(String::from),
+        );
     }
-    table(head.map(String::from), lines)
+    encode_csv(head.map(String::from), lines)
 }
 
-/// The CSV of plants, one per line: our figures and those of the thesis.
+/// The CSV of plants, one per line: our measurements and those of the thesis.
 fn plants_csv(plants: &[PlantResult]) -> Result<Vec<u8>> {
     let head =
         ["load", "species", "full", "backend", "shared", "triangles", "domains", "map_size", "deform_ms", "upload_ms"];
@@ -161,20 +174,21 @@ fn plants_csv(plants: &[PlantResult]) -> Result<Vec<u8>> {
     let head = head.chain(["thesis_t_vbr_ms", "thesis_fps", "thesis_memory_mb", "thesis_o_vbr"]);
     let line = |plant: &PlantResult| {
         let ms = |timing: Timing| (timing.median_us / 1e3).to_string();
-        let printed = plant.thesis.drawn;
+        let thesis = plant.thesis.drawn;
         let (backend, shared, full) = (plant.backend.name(), plant.shared, plant.full);
-        let own = [plant.load.clone(), plant.thesis.name.into(), full.to_string(), backend.into(), shared.to_string()];
+        let texts =
+            [plant.load.clone(), plant.thesis.name.into(), full.to_string(), backend.into(), shared.to_string()];
         let sizes = [plant.triangles, plant.domains, plant.map as usize].map(|number| number.to_string());
         let times = [plant.deform, plant.upload, plant.render, plant.vbr, plant.frame].map(ms);
-        let rest = [plant.fps, plant.bytes as f64 / 1e6, plant.occupation];
-        let thesis = [printed.gpu_vbr_ms, printed.gpu_fps, printed.gpu_mb, printed.gpu_vbr_occupation];
-        let numbers = rest.iter().chain(&thesis).map(|number| number.to_string());
-        own.into_iter().chain(sizes).chain(times).chain(numbers).collect::<Vec<String>>()
+        let rates = [plant.fps, plant.bytes as f64 / 1e6, plant.occupation];
+        let thesis = [thesis.gpu_vbr_ms, thesis.gpu_fps, thesis.gpu_mb, thesis.gpu_vbr_occupation];
+        let numbers = rates.iter().chain(&thesis).map(|number| number.to_string());
+        texts.into_iter().chain(sizes).chain(times).chain(numbers).collect::<Vec<String>>()
     };
-    table(head.map(String::from), plants.iter().map(line))
+    encode_csv(head.map(String::from), plants.iter().map(line))
 }
 
-fn table<L: IntoIterator<Item = String>>(
+fn encode_csv<L: IntoIterator<Item = String>>(
     head: impl IntoIterator<Item = String>,
     lines: impl IntoIterator<Item = L>,
 ) -> Result<Vec<u8>> {
@@ -186,12 +200,13 @@ fn table<L: IntoIterator<Item = String>>(
     writer.into_inner().map_err(fault_in("report"))
 }
 
-fn cell(row: &RenderRow, value: &Value, (name, place): (&str, &str)) -> String {
+/// The text of a column in a row; `value` is the row as JSON.
+fn cell_text(row: &RenderRow, value: &Value, (name, source): (&str, &str)) -> String {
     if name == "faults" {
         return row.faults.join("; ");
     }
-    if !place.starts_with('/') {
-        let timing = row.passes.iter().find(|pass| pass.name == place).map(|pass| pass.timing);
+    if !source.starts_with('/') {
+        let timing = row.passes.iter().find(|pass| pass.name == source).map(|pass| pass.timing);
         let us = timing.map(|timing| match name {
             "frame_q1_us" => timing.q1_us,
             "frame_q3_us" => timing.q3_us,
@@ -199,10 +214,10 @@ fn cell(row: &RenderRow, value: &Value, (name, place): (&str, &str)) -> String {
         });
         return us.map_or_else(String::new, |us| us.to_string());
     }
-    match value.pointer(place) {
+    match value.pointer(source) {
         None | Some(Value::Null) => String::new(),
         Some(Value::String(text)) => text.clone(),
-        Some(other) => other.to_string(),
+        Some(scalar) => scalar.to_string(),
     }
 }
 
@@ -210,27 +225,29 @@ fn cell(row: &RenderRow, value: &Value, (name, place): (&str, &str)) -> String {
 mod tests {
     use super::*;
     use crate::render::harness::{RenderHarness, Size};
-    use crate::render::light_meter::relit;
+    use crate::render::light_meter::with_settings;
     use crate::render::workloads::RenderWorkload;
     use modalcast_model::scene::{Bloom, Culling, RenderSettings};
 
     #[test]
-    fn every_pass_has_a_column_and_parts_add_up_to_draw() {
-        let stage = RenderWorkload::Triangles(2_000).stage().expect("built");
-        let look = RenderSettings { culling: Culling::Occlusion, bloom: Some(Bloom::default()), ..stage.scene.look };
-        let mut studio = RenderHarness::open().expect("OpenGL");
-        let mut set = studio.set(&relit(&stage.scene, look).expect("fits")).expect("loads");
-        studio.pose(&mut set, &stage.state(0)).expect("poses");
+    fn every_pass_has_a_column_and_draw_is_their_sum() {
+        let animation = RenderWorkload::Triangles(2_000).build().expect("a workload");
+        let look =
+            RenderSettings { culling: Culling::Occlusion, bloom: Some(Bloom::default()), ..animation.scene.look };
+        let mut harness = RenderHarness::open().expect("OpenGL");
+        let mut loaded_scene =
+            harness.load(&with_settings(&animation.scene, look).expect("valid settings")).expect("a loaded scene");
+        harness.deform(&mut loaded_scene, &animation.state(0)).expect("deformed vertices");
         let size = Size { width: 64, height: 36 };
-        let times = studio.draw(&set, stage.camera(size), size).expect("draws").times;
+        let times = harness.draw(&loaded_scene, animation.camera(size), size).expect("a frame").times;
         let passes: Vec<(&str, f64)> = times.iter().map(|(key, ms)| (key.name(), ms)).collect();
         for (name, _) in &passes {
-            assert!(COLUMNS.iter().any(|(_, place)| place == name), "{name}");
+            assert!(COLUMNS.iter().any(|(_, source)| source == name), "expected a column for pass {name}");
         }
         let sum =
             |names: &[&str]| -> f64 { passes.iter().filter(|pass| names.contains(&pass.0)).map(|pass| pass.1).sum() };
         let (draw, parts) = (sum(&["draw"]), ["cull", "visibility", "blended", "shade", "bloom", "encode"]);
         assert!((draw - sum(&parts)).abs() < 1e-9 * draw, "{passes:?}");
-        assert!(sum(&parts[1..]) < draw && sum(&["bloom"]) > 0.0, "control: culling takes time");
+        assert!(sum(&parts[1..]) < draw && sum(&["bloom"]) > 0.0, "expected non-zero times of culling and bloom");
     }
 }

@@ -1,15 +1,16 @@
-//! Packs images into arrays as in the thesis (equation 3.13, figure 3.12): all in one array of the largest width and
-//! height, smaller ones repeated until they fill their layer, texture coordinates wrapped and scaled:
+//! Packs images into arrays as in the thesis (equation 3.13, figure 3.12): all images are in one array of the largest
+//! width and height. Smaller images are repeated until they fill their layer, and texture coordinates are wrapped and
+//! scaled:
 //!
 //!   uv' = (uv - floor uv) s,  s = ((w - 1) / (w_t - 1), (h - 1) / (h_t - 1))
 //!
-//! The renderer itself uses an array per size class, without a scale. To compare both, a scene is rebuilt so that the
-//! renderer reproduces the thesis's method: every image is filled by repetition, and the corners of every triangle have
-//! the coordinates of the equation. The equation wraps every fragment; wrapping whole triangles is equivalent where
-//! none crosses the edge of its image.
+//! The renderer uses an array per size class, without a scale. For the comparison, a scene is rebuilt so that the
+//! renderer reproduces the thesis's method: images are repeated to the common size, and the corners of every triangle
+//! have the coordinates of the equation. The equation wraps each fragment. Wrapping whole triangles is equivalent if no
+//! triangle crosses the edge of its image.
 //!
-//! On the `images` load the corrected scale is slightly nearer to the reference than arrays by size: 3.93 against 4.24
-//! of 255 in software at 640 x 360. The load has seven sizes and the renderer six arrays, so the two smallest, 16 x 16
+//! On the `images` load the corrected scale has a slightly smaller error than arrays by size: 3.93 against 4.24 of 255,
+//! measured in software at 640 x 360. The load has seven sizes and the renderer six arrays, so the two smallest, 16 x 16
 //! and 25 x 15, share an array of 25 x 16 and are stretched to it. Arrays by size lose on their panels, which are seen
 //! with several pixels per texel, by up to 7 of 255. On the floor arrays by size are nearer, by up to half a level.
 
@@ -29,52 +30,52 @@ pub enum Packing {
     Classes,
     /// Equation 3.13 as printed: it does not reach the last column and row of an image.
     Repeated,
-    /// The same with s = (w / w_t, h / h_t), which covers the whole image.
+    /// Equation 3.13 with s = (w / w_t, h / h_t), which covers the whole image.
     RepeatedWhole,
 }
 
-/// A scene with its images packed by this method. It must be rigid, and all its images must be colors.
+/// Packs the images of a scene by this method. The scene must be rigid, and all its images must be colors.
 ///
 /// # Errors
 /// `Invalid` when a triangle crosses the edge of its image.
-pub(super) fn packed(scene: &Scene, packing: Packing) -> Result<Arc<Scene>> {
+pub(super) fn pack_images(scene: &Scene, packing: Packing) -> Result<Arc<Scene>> {
     let mut parts = scene.parts();
     if packing != Packing::Classes {
-        repeat(&mut parts, packing)?;
+        repeat_images(&mut parts, packing)?;
     }
     Scene::new(parts)
 }
 
-fn repeat(parts: &mut SceneParts, packing: Packing) -> Result<()> {
+fn repeat_images(parts: &mut SceneParts, packing: Packing) -> Result<()> {
     let largest = |side: fn(&Texture) -> u32| parts.textures.iter().map(side).max().unwrap_or(1);
     let size = [largest(Texture::width), largest(Texture::height)];
     let mut shapes = Vec::new();
     for domain in &mut parts.domains {
         let image = parts.materials[domain.material].color_texture.map(|image| &parts.textures[image]);
-        let scale = image.map_or([1.0; 2], |image| scale(image, size, packing));
-        shapes.push(Shape::new(wrapped(&parts.shapes[domain.shape].mesh, scale)?, Modes::rigid())?);
+        let scale = image.map_or([1.0; 2], |image| uv_scale(image, size, packing));
+        shapes.push(Shape::new(wrap_uvs(&parts.shapes[domain.shape].mesh, scale)?, Modes::rigid())?);
         domain.shape = shapes.len() - 1;
     }
     parts.shapes = shapes;
-    parts.textures = parts.textures.iter().map(|image| filled(image, size)).collect::<Result<_>>()?;
+    parts.textures = parts.textures.iter().map(|image| fill_by_repetition(image, size)).collect::<Result<_>>()?;
     Ok(())
 }
 
 /// s of equation 3.13 per axis.
-fn scale(image: &Texture, size: [u32; 2], packing: Packing) -> [f32; 2] {
-    let own = [image.width(), image.height()];
+fn uv_scale(image: &Texture, size: [u32; 2], packing: Packing) -> [f32; 2] {
+    let image_size = [image.width(), image.height()];
     std::array::from_fn(|axis| match packing {
-        Packing::Repeated => f64::from(own[axis] - 1) / f64::from((size[axis] - 1).max(1)),
-        Packing::Classes | Packing::RepeatedWhole => f64::from(own[axis]) / f64::from(size[axis]),
+        Packing::Repeated => f64::from(image_size[axis] - 1) / f64::from((size[axis] - 1).max(1)),
+        Packing::Classes | Packing::RepeatedWhole => f64::from(image_size[axis]) / f64::from(size[axis]),
     } as f32)
 }
 
 /// The image repeated until it fills this size.
-fn filled(image: &Texture, [width, height]: [u32; 2]) -> Result<Texture> {
-    let (own, rows) = (image.width() as usize, image.height() as usize);
-    let pixel = |at: usize| {
-        let (x, y) = (at % width as usize % own, at / width as usize % rows);
-        let first = 4 * (y * own + x);
+fn fill_by_repetition(image: &Texture, [width, height]: [u32; 2]) -> Result<Texture> {
+    let (columns, rows) = (image.width() as usize, image.height() as usize);
+    let pixel = |index: usize| {
+        let (x, y) = (index % width as usize % columns, index / width as usize % rows);
+        let first = 4 * (y * columns + x);
         image.rgba()[first..first + 4].iter().copied()
     };
     let rgba = (0..width as usize * height as usize).flat_map(pixel).collect();
@@ -82,28 +83,32 @@ fn filled(image: &Texture, [width, height]: [u32; 2]) -> Result<Texture> {
 }
 
 /// A mesh with separate corners per triangle and wrapped, scaled texture coordinates.
-fn wrapped(mesh: &Mesh, scale: [f32; 2]) -> Result<Mesh> {
-    let own = mesh.corners();
+fn wrap_uvs(mesh: &Mesh, scale: [f32; 2]) -> Result<Mesh> {
+    let mesh_corners = mesh.corners();
     let mut corners = Corners { vertices: Vec::new(), normals: Vec::new(), uvs: Vec::new() };
     for triangle in mesh.triangles() {
-        let uvs = triangle.map(|corner| own.uvs[corner as usize]);
-        let least = [0, 1].map(|axis| uvs.iter().map(|uv| uv[axis]).fold(f32::MAX, f32::min).floor());
+        let uvs = triangle.map(|corner| mesh_corners.uvs[corner as usize]);
+        let min_uv = [0, 1].map(|axis| uvs.iter().map(|uv| uv[axis]).fold(f32::MAX, f32::min).floor());
         for (corner, uv) in triangle.iter().zip(uvs) {
-            let inside = [0, 1].map(|axis| uv[axis] - least[axis]);
-            if inside.iter().any(|place| *place > 1.0) {
+            let wrapped = [0, 1].map(|axis| uv[axis] - min_uv[axis]);
+            if wrapped.iter().any(|coordinate| *coordinate > 1.0) {
                 return Err(invalid(
                     "packing",
                     "triangles that stay within one repetition of their image",
                     format!("{uv:?}"),
                 ));
             }
-            corners.vertices.push(own.vertices[*corner as usize]);
-            corners.normals.push(own.normals[*corner as usize]);
-            corners.uvs.push([0, 1].map(|axis| inside[axis] * scale[axis]));
+            corners.vertices.push(mesh_corners.vertices[*corner as usize]);
+            corners.normals.push(mesh_corners.normals[*corner as usize]);
+            corners.uvs.push([0, 1].map(|axis| wrapped[axis] * scale[axis]));
         }
     }
     let count = corners.vertices.len() as u32 / 3;
-    Mesh::new(mesh.rest().to_vec(), corners, (0..count).map(|at| [3 * at, 3 * at + 1, 3 * at + 2]).collect())
+    Mesh::new(
+        mesh.rest().to_vec(),
+        corners,
+        (0..count).map(|triangle| [3 * triangle, 3 * triangle + 1, 3 * triangle + 2]).collect(),
+    )
 }
 
 #[cfg(test)]
@@ -113,36 +118,45 @@ mod tests {
 
     #[test]
     fn repeats_small_images_and_scales_uvs_by_equation_3_13() {
-        let scene = RenderWorkload::Images.stage().expect("built").scene;
-        let [printed, whole] =
-            [Packing::Repeated, Packing::RepeatedWhole].map(|packing| packed(&scene, packing).expect("packed"));
-        let small = scene.textures.iter().position(|image| (image.width(), image.height()) == (25, 15)).expect("there");
-        let (image, filled) = (&scene.textures[small], &printed.textures[small]);
+        let scene = RenderWorkload::Images.build().expect("built").scene;
+        let [as_printed, corrected] = [Packing::Repeated, Packing::RepeatedWhole]
+            .map(|packing| pack_images(&scene, packing).expect("a packed scene"));
+        let small = scene
+            .textures
+            .iter()
+            .position(|image| (image.width(), image.height()) == (25, 15))
+            .expect("an image of 25 x 15");
+        let (image, filled) = (&scene.textures[small], &as_printed.textures[small]);
         assert_eq!((filled.width(), filled.height()), (128, 128));
-        let at = |image: &Texture, x: u32, y: u32| image.rgba()[4 * (y * image.width() + x) as usize];
+        let red = |image: &Texture, x: u32, y: u32| image.rgba()[4 * (y * image.width() + x) as usize];
         for (x, y) in [(0, 0), (24, 14), (25, 15), (127, 127), (63, 40)] {
-            assert_eq!(at(filled, x, y), at(image, x % 25, y % 15), "({x}, {y})");
+            assert_eq!(red(filled, x, y), red(image, x % 25, y % 15), "({x}, {y})");
         }
-        let largest = |scene: &Scene| {
+        let max_uv = |scene: &Scene| {
             let domain =
                 scene.domains.iter().find(|domain| scene.materials[domain.material].color_texture == Some(small));
-            let uvs = &scene.shapes[domain.expect("drawn").shape].mesh.corners().uvs;
-            uvs.iter().fold([0.0_f32; 2], |most, uv| [most[0].max(uv[0]), most[1].max(uv[1])])
+            let uvs = &scene.shapes[domain.expect("a domain with the image").shape].mesh.corners().uvs;
+            uvs.iter().fold([0.0_f32; 2], |max, uv| [max[0].max(uv[0]), max[1].max(uv[1])])
         };
-        let near = |own: [f32; 2], want: [f32; 2]| own.iter().zip(want).all(|(own, want)| (own - want).abs() < 1e-6);
-        assert!(near(largest(&printed), [24.0 / 127.0, 14.0 / 127.0]), "{:?}", largest(&printed));
-        assert!(near(largest(&whole), [25.0 / 128.0, 15.0 / 128.0]), "{:?}", largest(&whole));
-        assert!(largest(&scene)[0] > 1.5, "control: the panel repeats its image");
+        let is_near = |uv: [f32; 2], expected: [f32; 2]| {
+            uv.iter().zip(expected).all(|(uv, expected)| (uv - expected).abs() < 1e-6)
+        };
+        assert!(is_near(max_uv(&as_printed), [24.0 / 127.0, 14.0 / 127.0]), "{:?}", max_uv(&as_printed));
+        assert!(is_near(max_uv(&corrected), [25.0 / 128.0, 15.0 / 128.0]), "{:?}", max_uv(&corrected));
+        assert!(max_uv(&scene)[0] > 1.5, "control: the panel repeats its image");
     }
 
     #[test]
     fn rejects_triangle_that_crosses_its_image_edge() {
-        let mesh = |last: f32| {
+        let mesh = |max_u: f32| {
             let rest = vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
-            let uvs = vec![[1.0, 0.0], [last, 0.0], [1.0, 1.0]];
+            let uvs = vec![[1.0, 0.0], [max_u, 0.0], [1.0, 1.0]];
             Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 3], uvs, vec![[0, 1, 2]]).expect("a mesh")
         };
-        assert_eq!(wrapped(&mesh(2.0), [0.5; 2]).expect("stays inside").corners().uvs[1], [0.5, 0.0]);
-        assert!(wrapped(&mesh(2.25), [0.5; 2]).is_err());
+        assert_eq!(
+            wrap_uvs(&mesh(2.0), [0.5; 2]).expect("a triangle inside of its image").corners().uvs[1],
+            [0.5, 0.0]
+        );
+        assert!(wrap_uvs(&mesh(2.25), [0.5; 2]).is_err());
     }
 }

@@ -1,5 +1,5 @@
-//! The plants of table 4.5, deformed and drawn: the rendering columns of tables 4.6 and 4.7 next to those that the
-//! thesis printed.
+//! Deforms and draws the plants of table 4.5 and compares the results with the rendering columns of tables 4.6 and 4.7 of
+//! the thesis.
 //!
 //! Definitions of the thesis: `t_vbr` is the time to update the vertices and render, `O_vbr` its fraction of the whole
 //! frame, FPS are whole frames per second, s is device memory. Our `t_vbr` is a step of the deformer (upload of q and
@@ -25,12 +25,12 @@ use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Camera, RenderSettings, Scene, SceneState, ShadowSettings};
 use modalcast_render::{FrameParams, SceneBuffers};
 
-/// Results of one plant, with the figures of the thesis.
+/// Results of one plant, with the numbers of the thesis.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PlantResult {
     pub load: String,
     pub thesis: ThesisPlant,
-    /// Whether the plant has the size of its row in table 4.5; only then are the figures comparable.
+    /// Whether the plant has the size of its row in table 4.5. The results are comparable only if it has.
     pub full: bool,
     pub remarks: Vec<String>,
     pub backend: Backend,
@@ -52,13 +52,13 @@ pub struct PlantResult {
     pub fps: f64,
     /// `O_vbr`: the fraction of the frame that is `t_vbr`.
     pub occupation: f64,
-    /// s: device bytes of the renderer and of a deformer on the device; shared buffers count once.
+    /// s: device memory of the renderer and the deformer, bytes; shared buffers count once.
     pub bytes: u64,
 }
 
-/// Number of states that frames rotate through.
+/// Number of states, which the frames use in turn.
 const STATES: usize = 8;
-/// Sides of the shadow map in a full and in a quick run.
+/// Sides of the shadow map in a full and in a quick run, texels.
 const MAPS: (u32, u32) = (4096, 1024);
 
 /// A plant's deformer and renderer buffers. The deformer is dropped first, because it may write the buffers.
@@ -71,7 +71,7 @@ struct PlantSetup {
 
 /// Measures plant `index`.
 pub(super) fn measure(
-    studio: &mut RenderHarness,
+    harness: &mut RenderHarness,
     device: Option<&Arc<Device>>,
     request: &RenderReportOptions,
     index: usize,
@@ -80,15 +80,15 @@ pub(super) fn measure(
     let load = WorkloadKind::Plant(index).build(scale)?;
     let map = if request.quick { MAPS.1 } else { MAPS.0 };
     let shadow = Some(ShadowSettings { size: map, ..ShadowSettings::default() });
-    let scene = light_meter::relit(&load.scene, RenderSettings { shadow, ..load.scene.look })?;
-    let states = states(&Workload { scene: Arc::clone(&scene), ..load.clone() });
-    let mut rig = rig(studio, device, &scene)?;
-    let times = times(studio, &mut rig, &scene, (request.size, request.replays), &states)?;
-    let PlantSetup { deformer, bytes, buffers } = rig;
+    let scene = light_meter::with_settings(&load.scene, RenderSettings { shadow, ..load.scene.look })?;
+    let states = motion_states(&Workload { scene: Arc::clone(&scene), ..load.clone() });
+    let mut setup = create_setup(harness, device, &scene)?;
+    let times = time_frames(harness, &mut setup, &scene, (request.size, request.replays), &states)?;
+    let PlantSetup { deformer, bytes, buffers } = setup;
     let (backend, shared) = (deformer.backend(), deformer.shares_buffers());
     let bytes = bytes + buffers.plan().bytes();
     drop(deformer);
-    studio.renderer.unload(buffers);
+    harness.renderer.unload(buffers);
     let [deform, upload, render, vbr, frame] = times;
     Ok(PlantResult {
         load: load.name,
@@ -111,15 +111,15 @@ pub(super) fn measure(
     })
 }
 
-fn states(load: &Workload) -> Vec<SceneState> {
+fn motion_states(load: &Workload) -> Vec<SceneState> {
     let motion = WorkloadMotion::new(load, None);
     let state =
         |step: usize| SceneState { step: step as u64 + 1, serial: step as u64 + 1, ..motion.step(step).state() };
     (0..STATES).map(state).collect()
 }
 
-fn rig(studio: &mut RenderHarness, device: Option<&Arc<Device>>, scene: &Arc<Scene>) -> Result<PlantSetup> {
-    let buffers = studio.renderer.load(scene)?;
+fn create_setup(harness: &mut RenderHarness, device: Option<&Arc<Device>>, scene: &Arc<Scene>) -> Result<PlantSetup> {
+    let buffers = harness.renderer.load(scene)?;
     let Some(device) = device else {
         return Ok(PlantSetup {
             deformer: Box::new(CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())),
@@ -127,65 +127,71 @@ fn rig(studio: &mut RenderHarness, device: Option<&Arc<Device>>, scene: &Arc<Sce
             buffers,
         });
     };
-    let draws = studio.renderer.info().cuda_device.map(|ordinal| usize::try_from(ordinal).ok());
-    let is_shared = draws == Some(Some(device.ordinal()));
+    let renderer_device = harness.renderer.info().cuda_device.map(|ordinal| usize::try_from(ordinal).ok());
+    let is_shared = renderer_device == Some(Some(device.ordinal()));
     let gl = if is_shared { Some(buffers.vertex_buffers()) } else { None };
     let deformer = CudaDeformer::new(device, scene, gl, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))?;
-    Ok(PlantSetup { bytes: beside(deformer.plan(), deformer.shares_buffers()), deformer: Box::new(deformer), buffers })
+    Ok(PlantSetup {
+        bytes: unshared_bytes(deformer.plan(), deformer.shares_buffers()),
+        deformer: Box::new(deformer),
+        buffers,
+    })
 }
 
-/// Bytes of a deformer's plan, without outputs in shared buffers.
-fn beside(plan: &gpu::DeformPlan, shared: bool) -> u64 {
+/// Device bytes of a deformer, without outputs that it shares with the renderer.
+fn unshared_bytes(plan: &gpu::DeformPlan, shared: bool) -> u64 {
     let outputs = [BufferRole::Positions, BufferRole::Normals, BufferRole::Tangents].map(|role| plan.bytes(role));
     plan.total_bytes() - if shared { outputs.iter().sum() } else { 0 }
 }
 
 /// Times of deforming, uploading, rendering, their sum, and the whole frame.
-fn times(
-    studio: &mut RenderHarness,
-    rig: &mut PlantSetup,
+fn time_frames(
+    harness: &mut RenderHarness,
+    setup: &mut PlantSetup,
     scene: &Arc<Scene>,
     (size, replays): (Size, usize),
     states: &[SceneState],
 ) -> Result<[Timing; 5]> {
     let camera = Camera::fit_to_scene(scene, size.width, size.height);
     let begin = Instant::now();
-    let mut warm = 0;
-    // Warm-up: the first frames compile and allocate, and clock rates rise.
-    while warm < 2 || (!studio.renderer.info().software && begin.elapsed() < super::harness::WARM_UP) {
-        frame(studio, rig, (camera, size), &states[warm % states.len()])?;
-        warm += 1;
+    let mut warm_up_frames = 0;
+    // The first frames compile shaders and allocate textures, and the clock rates rise.
+    while warm_up_frames < 2 || (!harness.renderer.info().software && begin.elapsed() < super::harness::WARM_UP) {
+        time_frame(harness, setup, (camera, size), &states[warm_up_frames % states.len()])?;
+        warm_up_frames += 1;
     }
-    let mut lists: [Vec<f64>; 5] = Default::default();
+    let mut samples: [Vec<f64>; 5] = Default::default();
     for replay in 0..replays.max(MIN_REPETITIONS) {
-        let times = frame(studio, rig, (camera, size), &states[replay % states.len()])?;
-        lists.iter_mut().zip(times).for_each(|(list, time)| list.push(time));
+        let times = time_frame(harness, setup, (camera, size), &states[replay % states.len()])?;
+        samples.iter_mut().zip(times).for_each(|(values, time)| values.push(time));
     }
-    let timing = |list: Vec<f64>| Timing::of(list).ok_or_else(|| fault_in("plants")("no frame was drawn"));
-    let [deform, upload, render, vbr, frame] = lists;
+    let timing = |values: Vec<f64>| {
+        Timing::of(values).ok_or_else(|| fault_in("plants")("expected at least one frame, got none"))
+    };
+    let [deform, upload, render, vbr, frame] = samples;
     Ok([timing(deform)?, timing(upload)?, timing(render)?, timing(vbr)?, timing(frame)?])
 }
 
-/// One frame, microseconds, in the order of [`times`].
-fn frame(
-    studio: &mut RenderHarness,
-    rig: &mut PlantSetup,
+/// One frame, microseconds, in the order of [`time_frames`].
+fn time_frame(
+    harness: &mut RenderHarness,
+    setup: &mut PlantSetup,
     (camera, size): (Camera, Size),
     state: &SceneState,
 ) -> Result<[f64; 5]> {
-    let us = |begin: Instant| begin.elapsed().as_secs_f64() * 1e6;
-    let whole = Instant::now();
-    let DeformSummary { bounds, oriented_bounds: light, .. } = rig.deformer.deform(state)?;
-    let deform = us(whole);
+    let elapsed_us = |begin: Instant| begin.elapsed().as_secs_f64() * 1e6;
+    let frame_begin = Instant::now();
+    let DeformSummary { bounds, oriented_bounds: light, .. } = setup.deformer.deform(state)?;
+    let deform = elapsed_us(frame_begin);
     let begin = Instant::now();
     let mut upload = 0.0;
-    if !rig.deformer.shares_buffers() {
-        studio.renderer.upload(&rig.buffers, rig.deformer.read(VertexAttributes::VERTICES)?)?;
-        upload = us(begin);
+    if !setup.deformer.shares_buffers() {
+        harness.renderer.upload(&setup.buffers, setup.deformer.read(VertexAttributes::VERTICES)?)?;
+        upload = elapsed_us(begin);
     }
-    let shot = FrameParams { camera, width: size.width, height: size.height, bounds, light };
-    let image = studio.renderer.draw(&rig.buffers, &shot)?;
-    let frame = us(whole);
+    let frame_params = FrameParams { camera, width: size.width, height: size.height, bounds, light };
+    let image = harness.renderer.draw(&setup.buffers, &frame_params)?;
+    let frame = elapsed_us(frame_begin);
     let render = 1e3 * image.times.drawing_ms();
     Ok([deform, upload, render, deform + upload + render, frame])
 }
@@ -196,7 +202,7 @@ mod tests {
 
     #[test]
     fn deforms_and_draws_a_plant_with_consistent_times() {
-        let mut studio = RenderHarness::open().expect("OpenGL");
+        let mut harness = RenderHarness::open().expect("a renderer");
         let request = RenderReportOptions {
             loads: vec![],
             plants: vec![1],
@@ -205,7 +211,7 @@ mod tests {
             quick: true,
             replays: 1,
         };
-        let plant = measure(&mut studio, None, &request, 1).expect("measured");
+        let plant = measure(&mut harness, None, &request, 1).expect("a result");
         assert_eq!(
             (plant.thesis.name, plant.full, plant.backend, plant.shared),
             ("Conifer", false, Backend::Cpu, false)
@@ -219,9 +225,9 @@ mod tests {
 
     #[test]
     fn shared_output_buffers_count_once() {
-        let scene = WorkloadKind::Plant(0).build(Scale::Quick).expect("built").scene;
+        let scene = WorkloadKind::Plant(0).build(Scale::Quick).expect("a workload").scene;
         let plan = gpu::plan(&scene, CudaDeformerOptions::with_bounding_axes(scene.light_axes()));
         let outputs = 12 * (scene.layout.vertices + scene.layout.corners) as u64;
-        assert_eq!(beside(&plan, false) - beside(&plan, true), outputs);
+        assert_eq!(unshared_bytes(&plan, false) - unshared_bytes(&plan, true), outputs);
     }
 }

@@ -1,4 +1,4 @@
-//! Plots error against frame time: one panel per load, with the Pareto front marked.
+//! Plots error against frame time in one panel per load, and marks the Pareto front.
 
 use std::fmt::Write as _;
 
@@ -28,48 +28,48 @@ pub(super) fn svg(report: &RenderReport) -> String {
          viewBox=\"0 0 {width} {height}\" font-family=\"'DejaVu Sans', Verdana, sans-serif\">\n\
          <rect width=\"{width}\" height=\"{height}\" fill=\"#ffffff\"/>\n"
     );
-    head(&mut out, report);
+    draw_head(&mut out, report);
     out.push_str(&legend);
-    let words = ["median time of a frame without reading it back", "mean error of a pixel, of 255"];
+    let axis_labels = ["median frame time without readback", "mean error of a pixel, of 255"];
     for (index, load) in report.loads.iter().enumerate() {
         let corner = (MARGIN + (index % columns) as f64 * PANEL.0, top + (index / columns) as f64 * PANEL.1);
-        let points = report.rows.iter().filter(|row| row.load == load.name).filter_map(point).collect();
-        Panel::new(corner, &load.name, words, points).draw(&mut out, |name| look(&names, name));
+        let points = report.rows.iter().filter(|row| row.load == load.name).filter_map(row_point).collect();
+        Panel::new(corner, &load.name, axis_labels, points).draw(&mut out, |name| marker_style(&names, name));
     }
     out.push_str("</svg>\n");
     out
 }
 
-fn head(out: &mut String, report: &RenderReport) {
-    let title = "font-size=\"20\" font-weight=\"bold\" fill=\"#222222\"";
-    let small = "font-size=\"12\" fill=\"#555555\"";
-    text(out, (MARGIN + 8.0, MARGIN + 18.0), title, "Rendering: error against run time");
+fn draw_head(out: &mut String, report: &RenderReport) {
+    let title_style = "font-size=\"20\" font-weight=\"bold\" fill=\"#222222\"";
+    let text_style = "font-size=\"12\" fill=\"#555555\"";
+    text(out, (MARGIN + 8.0, MARGIN + 18.0), title_style, "Rendering: error against run time");
     let size = format!("{} x {}", report.size.width, report.size.height);
     let lines = [
-        report.made.line(),
+        report.provenance.line(),
         format!(
             "{}, {size} pixels; error against hard shadow rays, {} samples a pixel",
             report.renderer.renderer,
-            samples(report)
+            min_samples(report)
         ),
         "ringed: Pareto front".into(),
     ];
     for (line, words) in lines.iter().enumerate() {
-        text(out, (MARGIN + 8.0, MARGIN + 40.0 + 16.0 * line as f64), small, words);
+        text(out, (MARGIN + 8.0, MARGIN + 40.0 + 16.0 * line as f64), text_style, words);
     }
 }
 
-fn samples(report: &RenderReport) -> usize {
+fn min_samples(report: &RenderReport) -> usize {
     report.loads.iter().map(|load| load.samples).min().unwrap_or(0)
 }
 
-fn point(row: &RenderRow) -> Option<Point<'_>> {
+fn row_point(row: &RenderRow) -> Option<Point<'_>> {
     Some(Point { name: &row.name, at: (row.median_us()?, row.color.mean), filled: true, rival: true })
 }
 
-fn look(names: &[&str], name: &str) -> MarkerStyle {
-    let index = names.iter().position(|own| *own == name).unwrap_or(0);
-    // Circles first, then squares and triangles.
+fn marker_style(names: &[&str], name: &str) -> MarkerStyle {
+    let index = names.iter().position(|known| *known == name).unwrap_or(0);
+    // The CPU's marker is a circle, CUDA's markers are squares and triangles.
     let (backend, round) = match index / COLORS.len() {
         0 => (Backend::Cpu, 0),
         round => (Backend::Cuda, round - 1),
@@ -81,16 +81,16 @@ fn look(names: &[&str], name: &str) -> MarkerStyle {
 fn legend(names: &[&str], width: f64) -> (String, usize) {
     let (mut out, mut x, mut line) = (String::new(), MARGIN + 8.0, 0);
     for name in names {
-        let wide = 30.0 + width_of(name, 13.0);
-        if x + wide > width - MARGIN && x > MARGIN + 8.0 {
+        let entry_width = 30.0 + width_of(name, 13.0);
+        if x + entry_width > width - MARGIN && x > MARGIN + 8.0 {
             (x, line) = (MARGIN + 8.0, line + 1);
         }
-        let (y, look) = (MARGIN + HEAD + line as f64 * LEGEND, look(names, name));
-        mark(&mut out, (x + 6.0, y - 4.0), look, &filled(look.color));
+        let (y, style) = (MARGIN + HEAD + line as f64 * LEGEND, marker_style(names, name));
+        mark(&mut out, (x + 6.0, y - 4.0), style, &filled(style.color));
         // Writing into a string cannot fail.
         let _ = writeln!(out);
         text(&mut out, (x + 17.0, y), "font-size=\"13\" fill=\"#222222\"", name);
-        x += wide + 10.0;
+        x += entry_width + 10.0;
     }
     (out, line + 1)
 }

@@ -1,12 +1,12 @@
-//! Compares the CUDA rasterizer with OpenGL on two passes, ids with depth and depth alone: the scene stripped to its
-//! mesh, one sample per pixel, both in one run. Ids are compared before anything is timed.
+//! Compares the CUDA rasterizer with OpenGL in one run on two passes: ids with depth, and depth alone. The scene is
+//! stripped to its mesh and has one sample per pixel. Ids are compared before the passes are timed.
 
 use std::sync::Arc;
 
 use nalgebra::Matrix4;
 use serde::Serialize;
 
-use super::harness::{HarnessScene, RenderHarness, Size};
+use super::harness::{LoadedScene, RenderHarness, Size};
 use super::measure::STILL;
 use super::rigid_domain::add_rigid_domain;
 use super::workloads::{RenderWorkload, room, screen};
@@ -19,12 +19,12 @@ use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Camera, CullMode, DrawRange, RenderSettings, Scene, SceneParts, SceneState, Viewport};
 use modalcast_render::{FrameParams, VisibilityId, shadow_clip_from_world};
 
-/// Side of the depth map: in a full and in a quick run.
+/// Sides of the depth map in a full and in a quick run, texels.
 pub(super) const MAPS: (u32, u32) = (4096, 1024);
 
-/// Largest fraction of samples whose ids may differ from OpenGL's, because of edges and depth ties. Above it nothing is
-/// timed.
-pub(super) const MOST_DIFFERING: f64 = 0.01;
+/// Largest fraction of samples whose ids may differ from OpenGL's because of edges and depth ties. If more differ, the
+/// passes are not timed.
+pub(super) const MAX_DIFFERING: f64 = 0.01;
 
 /// Both passes by both rasterizers on one load.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -38,8 +38,9 @@ pub struct RasterComparison {
     pub samples: usize,
     /// `None` where too many ids differ.
     pub passes: Option<PassPairs>,
-    /// Triangle counts in the frame, and below in the map.
+    /// Triangle counts of the frame.
     pub in_frame: TriangleCounts,
+    /// Triangle counts of the depth map.
     pub in_map: TriangleCounts,
 }
 
@@ -64,20 +65,24 @@ impl TimingPair {
     }
 }
 
-/// Triangle counts by outcome.
+/// Numbers of triangles by the way they were drawn or dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct TriangleCounts {
+    /// Drawn by one thread each.
     pub small: u32,
+    /// Drawn by one warp each.
     pub medium: u32,
+    /// Drawn tile by tile.
     pub large: u32,
+    /// Between the samples.
     pub missed: u32,
     /// Not finite, outside of the view, without area, or back-facing.
     pub dropped: u32,
 }
 
 impl From<RasterCounts> for TriangleCounts {
-    fn from(own: RasterCounts) -> Self {
-        let RasterCounts { small, medium, large, not_finite, outside, flat, back, missed } = own;
+    fn from(counts: RasterCounts) -> Self {
+        let RasterCounts { small, medium, large, not_finite, outside, flat, back, missed } = counts;
         Self { small, medium, large, missed, dropped: not_finite + outside + flat + back }
     }
 }
@@ -86,7 +91,7 @@ impl RasterComparison {
     /// Reason why the passes are not timed.
     pub(super) fn fault(&self) -> Option<String> {
         let Self { load, differing, samples, passes, .. } = self;
-        passes.is_none().then(|| format!("{load}: raster: {differing} of {samples} samples see another triangle"))
+        passes.is_none().then(|| format!("{load}: raster: expected equal ids, {differing} of {samples} samples differ"))
     }
 }
 
@@ -124,15 +129,15 @@ struct RasterSetup {
 /// # Errors
 /// Errors of drawing and of the device.
 pub(super) fn measure(
-    studio: &mut RenderHarness,
+    harness: &mut RenderHarness,
     device: &Device,
     request: &RenderReportOptions,
     progress: &mut dyn FnMut(&str),
 ) -> Result<Vec<RasterComparison>> {
     let mut list = Vec::new();
-    for kind in &request.loads {
-        progress(&format!("{}: raster", kind.name()));
-        list.push(measure_load(studio, device, request, *kind)?);
+    for workload in &request.loads {
+        progress(&format!("{}: raster", workload.name()));
+        list.push(measure_load(harness, device, request, *workload)?);
     }
     for (name, (mesh, camera)) in [("room", room()?), ("screen", screen()?)] {
         progress(&format!("{name}: raster"));
@@ -140,20 +145,20 @@ pub(super) fn measure(
         add_rigid_domain(&mut parts, name, mesh, modalcast_model::domain::Material::default())?;
         let scene = Scene::new(parts)?;
         let state = SceneState::rest(&scene);
-        list.push(RasterSetup::new(name, &scene, (state, camera), request)?.measure(studio, device)?);
+        list.push(RasterSetup::new(name, &scene, (state, camera), request)?.measure(harness, device)?);
     }
     Ok(list)
 }
 
 fn measure_load(
-    studio: &mut RenderHarness,
+    harness: &mut RenderHarness,
     device: &Device,
     request: &RenderReportOptions,
-    kind: RenderWorkload,
+    workload: RenderWorkload,
 ) -> Result<RasterComparison> {
-    let stage = kind.stage()?;
-    let view = (stage.state(STILL), stage.camera(request.size));
-    RasterSetup::new(&stage.name, &stage.scene, view, request)?.measure(studio, device)
+    let animation = workload.build()?;
+    let view = (animation.state(STILL), animation.camera(request.size));
+    RasterSetup::new(&animation.name, &animation.scene, view, request)?.measure(harness, device)
 }
 
 impl RasterSetup {
@@ -164,42 +169,55 @@ impl RasterSetup {
         request: &RenderReportOptions,
     ) -> Result<Self> {
         let map = if request.quick { MAPS.1 } else { MAPS.0 };
-        let one = Scene::new(SceneParts { look: RenderSettings { samples: 1, ..scene.look }, ..scene.parts() })?;
+        let single_sample =
+            Scene::new(SceneParts { look: RenderSettings { samples: 1, ..scene.look }, ..scene.parts() })?;
         let (size, replays) = (request.size, request.replays.max(MIN_REPETITIONS));
-        Ok(Self { name: name.into(), scene: minimal_passes::stripped(&one, map)?, state, camera, size, map, replays })
+        Ok(Self {
+            name: name.into(),
+            scene: minimal_passes::strip_to_mesh(&single_sample, map)?,
+            state,
+            camera,
+            size,
+            map,
+            replays,
+        })
     }
 
-    fn measure(&self, studio: &mut RenderHarness, device: &Device) -> Result<RasterComparison> {
-        let mut set = studio.set(&self.scene)?;
-        let measured = self.measure_set(studio, &mut set, device);
-        studio.unload(set);
+    fn measure(&self, harness: &mut RenderHarness, device: &Device) -> Result<RasterComparison> {
+        let mut loaded_scene = harness.load(&self.scene)?;
+        let measured = self.measure_loaded(harness, &mut loaded_scene, device);
+        harness.unload(loaded_scene);
         measured
     }
 
-    fn measure_set(
+    fn measure_loaded(
         &self,
-        studio: &mut RenderHarness,
-        set: &mut HarnessScene,
+        harness: &mut RenderHarness,
+        loaded_scene: &mut LoadedScene,
         device: &Device,
     ) -> Result<RasterComparison> {
-        studio.pose(set, &self.state)?;
-        studio.draw(set, self.camera, self.size)?;
-        let ids = self.ids(&studio.renderer.read_visibility()?, set);
-        let shot = set.shot(self.camera, self.size);
+        harness.deform(loaded_scene, &self.state)?;
+        harness.draw(loaded_scene, self.camera, self.size)?;
+        let ids = self.packed_ids(&harness.renderer.read_visibility()?, loaded_scene);
+        let frame_params = loaded_scene.frame_params(self.camera, self.size);
         let triangles = self.scene.triangle_vertices();
-        let positions = set.surface()?.positions.clone();
+        let positions = loaded_scene.surface()?.positions.clone();
         let group = [DrawRange { first: 0, triangles: triangles.len() as u32, faces: CullMode::None }];
         let mesh = RasterMesh { positions: &positions, triangles: &triangles, groups: &group, cut_outs: None };
-        let (frame, map) = (self.frame(&shot)?, self.map(&shot)?);
-        let [of_frame, of_map] = [(frame, false), (map, true)].map(|(window, depth_only)| {
-            RasterBenchmark::new(device, mesh, window, RasterVariant { depth_only, ..RasterVariant::default() })
+        let (frame, map) = (self.frame_viewport(&frame_params)?, self.map_viewport(&frame_params)?);
+        let [frame_raster, map_raster] = [(frame, false), (map, true)].map(|(viewport, depth_only)| {
+            RasterBenchmark::new(device, mesh, viewport, RasterVariant { depth_only, ..RasterVariant::default() })
         });
-        let (of_frame, of_map) = (of_frame?, of_map?);
-        of_frame.launch(device, 0)?;
-        let keys = of_frame.keys(device)?;
+        let (frame_raster, map_raster) = (frame_raster?, map_raster?);
+        frame_raster.launch(device, 0)?;
+        let keys = frame_raster.keys(device)?;
         let differing = keys.iter().zip(&ids).filter(|(key, id)| **key as u32 != **id).count();
-        let agrees = differing as f64 <= MOST_DIFFERING * ids.len() as f64;
-        let passes = if agrees { Some(self.passes(studio, set, device, [&of_map, &of_frame])?) } else { None };
+        let agrees = differing as f64 <= MAX_DIFFERING * ids.len() as f64;
+        let passes = if agrees {
+            Some(self.time_passes(harness, loaded_scene, device, [&map_raster, &frame_raster])?)
+        } else {
+            None
+        };
         Ok(RasterComparison {
             load: self.name.clone(),
             triangles: triangles.len(),
@@ -207,25 +225,25 @@ impl RasterSetup {
             differing,
             samples: ids.len(),
             passes,
-            in_frame: counts(device, mesh, frame, false)?,
-            in_map: counts(device, mesh, map, true)?,
+            in_frame: count_triangles(device, mesh, frame, false)?,
+            in_map: count_triangles(device, mesh, map, true)?,
         })
     }
 
-    /// Ids that OpenGL drew, as indices of packed triangles; all ones where it drew none.
-    fn ids(&self, seen: &[VisibilityId], set: &HarnessScene) -> Vec<u32> {
+    /// Ids that OpenGL drew, as indices of packed triangles; `u32::MAX` where it drew no triangle.
+    fn packed_ids(&self, visibility: &[VisibilityId], loaded_scene: &LoadedScene) -> Vec<u32> {
         let slots = &self.scene.layout.domains;
-        let id = |seen: &VisibilityId| match seen {
-            VisibilityId::Triangle(place) => set.buffers.source_triangle(*place),
+        let source_triangle = |id: &VisibilityId| match id {
+            VisibilityId::Triangle(triangle) => loaded_scene.buffers.source_triangle(*triangle),
             _ => None,
         };
-        let packed = |(domain, triangle): (usize, usize)| (slots[domain].first_triangle + triangle) as u32;
-        seen.iter().map(|seen| id(seen).map_or(u32::MAX, packed)).collect()
+        let packed_index = |(domain, triangle): (usize, usize)| (slots[domain].first_triangle + triangle) as u32;
+        visibility.iter().map(|id| source_triangle(id).map_or(u32::MAX, packed_index)).collect()
     }
 
-    fn frame(&self, shot: &FrameParams) -> Result<Viewport> {
+    fn frame_viewport(&self, frame_params: &FrameParams) -> Result<Viewport> {
         let Size { width, height } = self.size;
-        let bounds = shot.bounds.union(self.scene.rest_bounds);
+        let bounds = frame_params.bounds.union(self.scene.rest_bounds);
         Viewport::new(
             &(self.camera.clip_from_camera(width, height, &bounds) * self.camera.camera_from_world()),
             width,
@@ -233,36 +251,41 @@ impl RasterSetup {
         )
     }
 
-    fn map(&self, shot: &FrameParams) -> Result<Viewport> {
-        let clip: Matrix4<f64> =
-            shadow_clip_from_world(&self.scene, shot).ok_or_else(|| fault_in("raster")("no shadow"))?;
+    fn map_viewport(&self, frame_params: &FrameParams) -> Result<Viewport> {
+        let clip: Matrix4<f64> = shadow_clip_from_world(&self.scene, frame_params)
+            .ok_or_else(|| fault_in("raster")("expected a scene with a shadow map"))?;
         Viewport::new(&clip, self.map, self.map)
     }
 
-    fn passes(
+    fn time_passes(
         &self,
-        studio: &mut RenderHarness,
-        set: &HarnessScene,
+        harness: &mut RenderHarness,
+        loaded_scene: &LoadedScene,
         device: &Device,
-        ours: [&RasterBenchmark; 2],
+        cuda_rasters: [&RasterBenchmark; 2],
     ) -> Result<PassPairs> {
-        let passes = studio.time(set, self.camera, self.size, self.replays)?;
+        let passes = harness.time(loaded_scene, self.camera, self.size, self.replays)?;
         let pair = |name: &str, raster: &RasterBenchmark| {
             let opengl = passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
-            let opengl = opengl.ok_or_else(|| fault_in("raster")(format!("no pass {name}")))?;
+            let opengl = opengl.ok_or_else(|| fault_in("raster")(format!("expected a pass named {name}")))?;
             let cuda = kernels::time(device, raster, CacheState::Warm, self.replays)?;
             Ok(TimingPair { opengl, cuda })
         };
-        Ok(PassPairs { depth: pair("shadow", ours[0])?, visibility: pair("visibility", ours[1])? })
+        Ok(PassPairs { depth: pair("shadow", cuda_rasters[0])?, visibility: pair("visibility", cuda_rasters[1])? })
     }
 }
 
-/// Counts by a separate launch, because the timed kernels do not count.
-fn counts(device: &Device, mesh: RasterMesh<'_>, window: Viewport, depth_only: bool) -> Result<TriangleCounts> {
+/// Counts triangles in a separate launch, because the timed kernels do not count.
+fn count_triangles(
+    device: &Device,
+    mesh: RasterMesh<'_>,
+    viewport: Viewport,
+    depth_only: bool,
+) -> Result<TriangleCounts> {
     let raster = RasterBenchmark::new(
         device,
         mesh,
-        window,
+        viewport,
         RasterVariant { depth_only, count_triangles: true, ..RasterVariant::default() },
     )?;
     raster.launch(device, 0)?;
@@ -274,13 +297,13 @@ mod tests {
     use super::*;
     use modalcast_render::Renderer;
 
-    /// The bounding box of the triangle that OpenGL drew at a sample contains the sample.
+    /// Checks that the bounding box of the triangle that OpenGL drew at a sample contains the sample.
     #[test]
-    fn windows_and_triangles_match_the_opengl_frame() {
-        let mut studio = RenderHarness::open().expect("OpenGL");
+    fn viewports_and_triangles_match_the_opengl_frame() {
+        let mut harness = RenderHarness::open().expect("OpenGL");
         let (mesh, camera) = room().expect("a room");
         let mut parts = SceneParts::named("room");
-        add_rigid_domain(&mut parts, "room", mesh, modalcast_model::domain::Material::default()).expect("added");
+        add_rigid_domain(&mut parts, "room", mesh, modalcast_model::domain::Material::default()).expect("a domain");
         let scene = Scene::new(parts).expect("a scene");
         let request = RenderReportOptions {
             loads: vec![],
@@ -290,52 +313,56 @@ mod tests {
             quick: true,
             replays: 1,
         };
-        let job = RasterSetup::new("room", &scene, (SceneState::rest(&scene), camera), &request).expect("a job");
-        assert!((9_000..11_000).contains(&job.scene.layout.triangles));
-        let mut set = studio.set(&job.scene).expect("set");
-        studio.pose(&mut set, &job.state).expect("posed");
-        studio.draw(&set, camera, job.size).expect("drawn");
-        assert_eq!(Renderer::stats(&studio.renderer).samples, 1);
-        let ids = job.ids(&studio.renderer.read_visibility().expect("seen"), &set);
-        assert!(ids.iter().all(|id| *id != u32::MAX), "a room is all around");
-        let shot = set.shot(camera, job.size);
-        let (window, positions) =
-            (job.frame(&shot).expect("a window"), set.surface().expect("there").positions.clone());
-        let list = job.scene.triangle_vertices();
-        let clip = window.clip();
-        let row =
-            |row: usize, p: [f32; 3]| (0..3).map(|at| clip[4 * row + at] * p[at]).sum::<f32>() + clip[4 * row + 3];
-        // Visible triangles in front of the eye surround their samples: each bounding box contains its sample, up to
-        // half a pixel.
-        let mut held = 0;
-        for (at, id) in ids.iter().enumerate() {
-            let corners = list[*id as usize].map(|vertex| [0, 1, 2].map(|axis| positions[3 * vertex as usize + axis]));
-            let [x, y] = [0, 1].map(|axis| corners.map(|p| row(axis, p) / row(3, p)));
-            let sample = [(at % 160) as f32 + 0.5, (at / 160) as f32 + 0.5];
-            let within = |list: [f32; 3], at: f32, pixel: f32| {
-                list.iter().any(|own| *own <= at + pixel) && list.iter().any(|own| *own >= at - pixel)
+        let setup = RasterSetup::new("room", &scene, (SceneState::rest(&scene), camera), &request).expect("a setup");
+        assert!((9_000..11_000).contains(&setup.scene.layout.triangles));
+        let mut loaded_scene = harness.load(&setup.scene).expect("a loaded scene");
+        harness.deform(&mut loaded_scene, &setup.state).expect("deformed vertices");
+        harness.draw(&loaded_scene, camera, setup.size).expect("a frame");
+        assert_eq!(Renderer::stats(&harness.renderer).samples, 1);
+        let ids = setup.packed_ids(&harness.renderer.read_visibility().expect("visibility ids"), &loaded_scene);
+        assert!(ids.iter().all(|id| *id != u32::MAX), "expected a triangle at every sample");
+        let frame_params = loaded_scene.frame_params(camera, setup.size);
+        let (viewport, positions) = (
+            setup.frame_viewport(&frame_params).expect("a viewport"),
+            loaded_scene.surface().expect("a surface").positions.clone(),
+        );
+        let triangles = setup.scene.triangle_vertices();
+        let clip = viewport.clip();
+        let clip_coordinate = |row: usize, p: [f32; 3]| {
+            (0..3).map(|axis| clip[4 * row + axis] * p[axis]).sum::<f32>() + clip[4 * row + 3]
+        };
+        // Each bounding box contains its sample within half a pixel.
+        let mut contained_samples = 0;
+        for (pixel, id) in ids.iter().enumerate() {
+            let corners =
+                triangles[*id as usize].map(|vertex| [0, 1, 2].map(|axis| positions[3 * vertex as usize + axis]));
+            let [x, y] = [0, 1].map(|axis| corners.map(|p| clip_coordinate(axis, p) / clip_coordinate(3, p)));
+            let sample = [(pixel % 160) as f32 + 0.5, (pixel / 160) as f32 + 0.5];
+            let contains = |corners: [f32; 3], center: f32, tolerance: f32| {
+                corners.iter().any(|corner| *corner <= center + tolerance)
+                    && corners.iter().any(|corner| *corner >= center - tolerance)
             };
             let inside =
-                within(x, sample[0] / 80.0 - 1.0, 1.0 / 160.0) && within(y, 1.0 - sample[1] / 45.0, 1.0 / 90.0);
-            held += usize::from(inside);
+                contains(x, sample[0] / 80.0 - 1.0, 1.0 / 160.0) && contains(y, 1.0 - sample[1] / 45.0, 1.0 / 90.0);
+            contained_samples += usize::from(inside);
         }
-        assert_eq!(held, ids.len());
-        let map = job.map(&shot).expect("a map");
+        assert_eq!(contained_samples, ids.len());
+        let map = setup.map_viewport(&frame_params).expect("a viewport of the map");
         assert_eq!(map.size(), [1024; 2]);
         let inside = |p: &[f32]| {
             (0..3).all(|axis| {
                 let clip = map.clip();
-                let at: f32 = (0..3).map(|k| clip[4 * axis + k] * p[k]).sum::<f32>() + clip[4 * axis + 3];
-                at.abs() <= 1.0
+                let coordinate: f32 = (0..3).map(|k| clip[4 * axis + k] * p[k]).sum::<f32>() + clip[4 * axis + 3];
+                coordinate.abs() <= 1.0
             })
         };
-        assert!(positions.chunks_exact(3).all(inside), "the map holds the whole room");
-        studio.unload(set);
+        assert!(positions.chunks_exact(3).all(inside), "expected all vertices inside the map");
+        harness.unload(loaded_scene);
     }
 
     #[test]
     fn ratio_exceeds_one_where_cuda_is_faster() {
-        let of = |us: f64| Timing::of(vec![us]).expect("one");
-        assert_eq!(TimingPair { opengl: of(10.0), cuda: of(2.0) }.ratio(), 5.0);
+        let timing = |us: f64| Timing::of(vec![us]).expect("a timing");
+        assert_eq!(TimingPair { opengl: timing(10.0), cuda: timing(2.0) }.ratio(), 5.0);
     }
 }

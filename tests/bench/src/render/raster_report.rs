@@ -17,7 +17,8 @@ use modalcast_render::RendererInfo;
 /// Results of all loads.
 #[derive(Debug, Clone, Serialize)]
 pub struct RasterReport {
-    pub made: Provenance,
+    #[serde(rename = "made")]
+    pub provenance: Provenance,
     pub renderer: RendererInfo,
     pub size: Size,
     pub rows: Vec<RasterComparison>,
@@ -35,11 +36,11 @@ impl RasterReport {
         let json = serde_json::to_vec_pretty(self).map_err(fault_in("report"))?;
         let markdown = format!(
             "{}\n\n{}; {} x {} pixels.\n{}{}",
-            self.made.line(),
+            self.provenance.line(),
             self.renderer.renderer,
             self.size.width,
             self.size.height,
-            comparison_tables::raster(&self.rows),
+            comparison_tables::raster_section(&self.rows),
             frame_comparison::markdown(&self.frames)
         );
         for (name, bytes) in [("raster.json", json), ("raster.md", markdown.into_bytes())] {
@@ -48,22 +49,22 @@ impl RasterReport {
         Ok(())
     }
 
-    /// Whether everything was timed.
+    /// Whether all passes and frames were timed.
     pub fn passed(&self) -> bool {
         self.rows.iter().all(|row| row.passes.is_some()) && frame_comparison::faults(&self.frames).is_empty()
     }
 }
 
-/// Measures these passes and nothing else; `progress` receives a description of each stage.
+/// Compares the rasterizers on all loads; `progress` receives a description of each stage.
 ///
 /// # Errors
 /// `Unavailable` without OpenGL, a CUDA device or NVRTC; errors of loading and drawing a scene.
 pub fn rasters(request: &RenderReportOptions, mut progress: impl FnMut(&str)) -> Result<RasterReport> {
     let device = Device::open(0)?;
     device.check_compiler()?;
-    let mut studio = RenderHarness::open()?;
-    let rows = measure(&mut studio, &device, request, &mut progress)?;
-    let frames = frame_comparison::measure(&mut studio, &device, request, &mut progress)?;
-    let renderer = studio.renderer.info().clone();
-    Ok(RasterReport { made: Provenance::here(), renderer, size: request.size, rows, frames })
+    let mut harness = RenderHarness::open()?;
+    let rows = measure(&mut harness, &device, request, &mut progress)?;
+    let frames = frame_comparison::measure(&mut harness, &device, request, &mut progress)?;
+    let renderer = harness.renderer.info().clone();
+    Ok(RasterReport { provenance: Provenance::here(), renderer, size: request.size, rows, frames })
 }

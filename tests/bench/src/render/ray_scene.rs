@@ -1,8 +1,8 @@
 //! The ray-cast scene of the references: deformed triangles in a bounding volume hierarchy (BVH), and ray queries.
 //!
-//! Boxes are f32 and padded, triangle tests are f64, so a box may give false positives but no false negatives.
-//! Positions in the BVH are relative to the center of the scene and rays begin near it, so that the padding of two
-//! millionths of the scene's radius covers all rounding.
+//! Triangle tests are f64. Boxes are f32 and padded, so a box test may give false positives but no false negatives:
+//! positions in the BVH are relative to the center of the scene and rays begin near it, so that rounding errors stay
+//! below the padding.
 
 use nalgebra::Vector3;
 use obvhs::aabb::Aabb;
@@ -20,19 +20,19 @@ use modalcast_model::scene::{BoundingBox, Scene};
 /// Padding of boxes as a fraction of the scene's radius.
 const PADDING: f64 = 2e-6;
 
-/// Minimum of triangles per parallel task.
-const LEAST: usize = 4096;
+/// Minimum number of triangles per parallel task.
+const MIN_TASK_TRIANGLES: usize = 4096;
 
-/// Points `from + t along`.
+/// The points `origin + t direction`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Ray {
-    pub(super) from: Vector3<f64>,
-    pub(super) along: Vector3<f64>,
+    pub(super) origin: Vector3<f64>,
+    pub(super) direction: Vector3<f64>,
 }
 
 impl Ray {
-    pub(super) fn at(&self, t: f64) -> Vector3<f64> {
-        self.from + self.along * t
+    pub(super) fn point_at(&self, t: f64) -> Vector3<f64> {
+        self.origin + self.direction * t
     }
 }
 
@@ -41,11 +41,12 @@ impl Ray {
 pub(super) struct Triangle {
     pub(super) corner: Vector3<f64>,
     pub(super) edges: [Vector3<f64>; 2],
-    /// Indices of its corners in the packed normals, in winding order.
+    /// Indices of the corners in the packed normals, in winding order.
     pub(super) corners: [u32; 3],
-    /// Its index in the packed triangles, which breaks depth ties.
-    pub(super) number: u32,
-    pub(super) paint: u32,
+    /// Index in the packed triangles, which breaks depth ties.
+    pub(super) packed_index: u32,
+    /// Index into [`RayScene::materials`].
+    pub(super) material: u32,
 }
 
 /// Intersection of a ray and a triangle; the barycentric weights of the corners are 1 - u - v, u and v.
@@ -63,7 +64,7 @@ pub(super) struct Hit {
 /// The ray-cast scene.
 pub(super) struct RayScene {
     pub(super) triangles: Vec<Triangle>,
-    pub(super) paints: Vec<ReferenceMaterial>,
+    pub(super) materials: Vec<ReferenceMaterial>,
     pub(super) normals: Vec<Vector3<f64>>,
     pub(super) tangents: Vec<[f64; 4]>,
     pub(super) uvs: Vec<[f64; 2]>,
@@ -71,18 +72,23 @@ pub(super) struct RayScene {
     pub(super) radius: f64,
     /// Whether any triangle is blended.
     pub(super) has_blended: bool,
-    boxes: Bvh2,
+    bvh: Bvh2,
 }
 
-struct Padded<'a>(&'a Triangle, &'a Vector3<f64>, f64);
+/// A triangle whose box is relative to `center` and padded by `padding` on each side.
+struct PaddedTriangle<'a> {
+    triangle: &'a Triangle,
+    center: &'a Vector3<f64>,
+    padding: f64,
+}
 
-impl Boundable for Padded<'_> {
+impl Boundable for PaddedTriangle<'_> {
     fn aabb(&self) -> Aabb {
-        let Self(triangle, center, padding) = self;
+        let Self { triangle, center, padding } = self;
         let [a, b, c] = triangle.points().map(|point| point - *center);
         let (low, high) = (a.inf(&b).inf(&c).add_scalar(-padding), a.sup(&b).sup(&c).add_scalar(*padding));
-        let wide = |v: Vector3<f64>| glam::Vec3A::new(v.x as f32, v.y as f32, v.z as f32);
-        Aabb::new(wide(low), wide(high))
+        let narrow = |v: Vector3<f64>| glam::Vec3A::new(v.x as f32, v.y as f32, v.z as f32);
+        Aabb::new(narrow(low), narrow(high))
     }
 }
 
@@ -92,28 +98,28 @@ impl Triangle {
     }
 
     /// Geometric normal of the counter-clockwise side; zero for triangles without area.
-    pub(super) fn facet(&self) -> Vector3<f64> {
+    pub(super) fn geometric_normal(&self) -> Vector3<f64> {
         self.edges[0].cross(&self.edges[1]).try_normalize(0.0).unwrap_or_default()
     }
 
-    /// Möller and Trumbore's intersection test: (t, u, v, front). Edges count as inside.
-    fn meet(&self, ray: &Ray) -> Option<(f64, f64, f64, bool)> {
-        let across = ray.along.cross(&self.edges[1]);
-        let volume = self.edges[0].dot(&across);
-        if volume == 0.0 {
+    /// Intersection test by Möller and Trumbore: (t, u, v, front). Points on an edge are inside.
+    fn intersect(&self, ray: &Ray) -> Option<(f64, f64, f64, bool)> {
+        let direction_cross_edge = ray.direction.cross(&self.edges[1]);
+        let determinant = self.edges[0].dot(&direction_cross_edge);
+        if determinant == 0.0 {
             return None;
         }
-        let away = ray.from - self.corner;
-        let u = away.dot(&across) / volume;
+        let from_corner = ray.origin - self.corner;
+        let u = from_corner.dot(&direction_cross_edge) / determinant;
         if !(0.0..=1.0).contains(&u) {
             return None;
         }
-        let beside = away.cross(&self.edges[0]);
-        let v = ray.along.dot(&beside) / volume;
+        let corner_cross_edge = from_corner.cross(&self.edges[0]);
+        let v = ray.direction.dot(&corner_cross_edge) / determinant;
         if v < 0.0 || u + v > 1.0 {
             return None;
         }
-        Some((self.edges[1].dot(&beside) / volume, u, v, volume > 0.0))
+        Some((self.edges[1].dot(&corner_cross_edge) / determinant, u, v, determinant > 0.0))
     }
 }
 
@@ -121,71 +127,84 @@ impl RayScene {
     /// Builds the BVH of a surface. Triangles with a corner that is not finite are skipped, because they are not
     /// visible.
     pub(super) fn new(scene: &Scene, surface: &DeformedSurface) -> Self {
-        let paints = ReferenceMaterial::all(scene);
+        let materials = ReferenceMaterial::from_scene(scene);
         let triangles = triangles(scene, surface);
-        let (center, radius) = ball(&triangles);
-        let padded: Vec<Padded<'_>> =
-            triangles.iter().map(|triangle| Padded(triangle, &center, PADDING * radius)).collect();
-        let boxes = build_bvh2(&padded, BvhBuildParams::medium_build(), &mut std::time::Duration::default());
-        // In BVH order, so that the triangles of a leaf are contiguous.
-        let ordered = boxes.primitive_indices.iter().map(|index| triangles[*index as usize]).collect();
+        let (center, radius) = bounding_sphere(&triangles);
+        let padded: Vec<PaddedTriangle<'_>> = triangles
+            .iter()
+            .map(|triangle| PaddedTriangle { triangle, center: &center, padding: PADDING * radius })
+            .collect();
+        let bvh = build_bvh2(&padded, BvhBuildParams::medium_build(), &mut std::time::Duration::default());
+        // Triangles are stored in BVH order, so that those of a leaf are contiguous.
+        let ordered = bvh.primitive_indices.iter().map(|index| triangles[*index as usize]).collect();
         Self {
             triangles: ordered,
             normals: normals(surface),
             tangents: tangents(surface),
             uvs: uvs(scene),
-            has_blended: triangles.iter().any(|triangle| paints[triangle.paint as usize].kind == AlphaKind::Blend),
-            paints,
+            has_blended: triangles
+                .iter()
+                .any(|triangle| materials[triangle.material as usize].kind == AlphaKind::Blend),
+            materials,
             center,
             radius,
-            boxes,
+            bvh,
         }
     }
 
-    /// Updates the scene to another step by refitting the BVH; its topology, images and texture coordinates remain.
+    /// Updates the scene to the vertices of another step by refitting the BVH. The topology of the BVH, images and
+    /// texture coordinates remain.
     /// Queries give the same results as with a rebuilt BVH, but are slower where triangles moved far.
-    pub(super) fn moved(self, scene: &Scene, surface: &DeformedSurface) -> Self {
+    pub(super) fn refit(self, scene: &Scene, surface: &DeformedSurface) -> Self {
         let triangles = triangles(scene, surface);
         // The set of finite triangles changed, so the BVH must be rebuilt.
         if triangles.len() != self.triangles.len() {
             return Self::new(scene, surface);
         }
-        let (center, radius) = ball(&triangles);
-        let mut boxes = self.boxes;
-        let ordered: Vec<Triangle> =
-            boxes.primitive_indices.par_iter().map(|index| triangles[*index as usize]).collect();
-        boxes.nodes.par_iter_mut().filter(|node| node.is_leaf()).for_each(|leaf| {
-            let own = &ordered[leaf.first_index as usize..][..leaf.prim_count as usize];
-            let each = own.iter().map(|triangle| Padded(triangle, &center, PADDING * radius).aabb());
-            leaf.set_aabb(each.fold(Aabb::empty(), |whole, own| whole.union(&own)));
+        let (center, radius) = bounding_sphere(&triangles);
+        let mut bvh = self.bvh;
+        let ordered: Vec<Triangle> = bvh.primitive_indices.par_iter().map(|index| triangles[*index as usize]).collect();
+        bvh.nodes.par_iter_mut().filter(|node| node.is_leaf()).for_each(|leaf| {
+            let leaf_triangles = &ordered[leaf.first_index as usize..][..leaf.prim_count as usize];
+            let boxes = leaf_triangles
+                .iter()
+                .map(|triangle| PaddedTriangle { triangle, center: &center, padding: PADDING * radius }.aabb());
+            leaf.set_aabb(boxes.fold(Aabb::empty(), |union, triangle_box| union.union(&triangle_box)));
         });
-        boxes.refit_all();
+        bvh.refit_all();
         let (normals, tangents) = (normals(surface), tangents(surface));
-        Self { triangles: ordered, normals, tangents, center, radius, boxes, ..self }
+        Self { triangles: ordered, normals, tangents, center, radius, bvh, ..self }
     }
 
-    /// The ray relative to the BVH's center in f32, and the parameter t where it begins.
-    fn boxed(&self, ray: &Ray, least: f64, most: f64) -> (BoxRay, f64) {
-        let squared = ray.along.norm_squared();
-        let nearest = ray.along.dot(&(self.center - ray.from)) / squared;
-        let begin = (nearest - 1.5 * self.radius / squared.sqrt()).max(least);
-        let from = (ray.at(begin) - self.center).cast::<f32>();
-        let (from, along) = (<[f32; 3]>::from(from), <[f32; 3]>::from(ray.along.cast::<f32>()));
-        (BoxRay::new(from.into(), along.into(), 0.0, (most - begin).max(0.0) as f32), begin)
+    /// The ray relative to the BVH's center in f32, and the parameter t at its start.
+    fn box_ray(&self, ray: &Ray, min_t: f64, max_t: f64) -> (BoxRay, f64) {
+        let length_squared = ray.direction.norm_squared();
+        let closest_t = ray.direction.dot(&(self.center - ray.origin)) / length_squared;
+        let begin = (closest_t - 1.5 * self.radius / length_squared.sqrt()).max(min_t);
+        let origin = (ray.point_at(begin) - self.center).cast::<f32>();
+        let (origin, direction) = (<[f32; 3]>::from(origin), <[f32; 3]>::from(ray.direction.cast::<f32>()));
+        (BoxRay::new(origin.into(), direction.into(), 0.0, (max_t - begin).max(0.0) as f32), begin)
     }
 
-    /// The nearest hit with t between `least` and `most` that `sees` accepts.
-    pub(super) fn nearest(&self, ray: &Ray, (least, most): (f64, f64), sees: impl Fn(&Hit) -> bool) -> Option<Hit> {
-        let (boxed, begin) = self.boxed(ray, least, most);
+    /// The nearest hit with t between `min_t` and `max_t` that `accepts` accepts.
+    pub(super) fn nearest_hit(
+        &self,
+        ray: &Ray,
+        (min_t, max_t): (f64, f64),
+        accepts: impl Fn(&Hit) -> bool,
+    ) -> Option<Hit> {
+        let (box_ray, begin) = self.box_ray(ray, min_t, max_t);
         let mut best: Option<Hit> = None;
-        self.boxes.ray_traverse(boxed, &mut RayHit::none(), |_, index| {
-            let nearer = |t: f64| t >= least && t <= most && best.is_none_or(|best| t <= best.t);
-            let Some((t, u, v, front)) = self.triangles[index].meet(ray).filter(|meets| nearer(meets.0)) else {
+        self.bvh.ray_traverse(box_ray, &mut RayHit::none(), |_, index| {
+            let is_nearer = |t: f64| t >= min_t && t <= max_t && best.is_none_or(|best| t <= best.t);
+            let Some((t, u, v, front)) =
+                self.triangles[index].intersect(ray).filter(|intersection| is_nearer(intersection.0))
+            else {
                 return f32::INFINITY;
             };
             let hit = Hit { t, u, v, triangle: index, front };
-            let earlier = |best: Hit| t < best.t || self.number(&hit) < self.number(&best);
-            if !best.is_none_or(earlier) || !sees(&hit) {
+            let precedes = |best: Hit| t < best.t || self.packed_index(&hit) < self.packed_index(&best);
+            if !best.is_none_or(precedes) || !accepts(&hit) {
                 return f32::INFINITY;
             }
             best = Some(hit);
@@ -195,89 +214,91 @@ impl RayScene {
         best
     }
 
-    /// All hits in between that `sees` accepts, farthest first; ties by descending number. A ray through a shared edge
-    /// of two triangles counts one hit.
-    pub(super) fn every(&self, ray: &Ray, (least, most): (f64, f64), sees: impl Fn(&Hit) -> bool) -> Vec<Hit> {
-        let (boxed, _) = self.boxed(ray, least, most);
+    /// All hits with t from `min_t` to below `max_t` that `accepts` accepts, farthest first; with equal t by descending
+    /// packed index. A ray through a shared edge of two triangles counts as one hit.
+    pub(super) fn all_hits(&self, ray: &Ray, (min_t, max_t): (f64, f64), accepts: impl Fn(&Hit) -> bool) -> Vec<Hit> {
+        let (box_ray, _) = self.box_ray(ray, min_t, max_t);
         let mut hits = Vec::new();
-        self.boxes.ray_traverse_anyhit(boxed, |_, index| {
-            if let Some((t, u, v, front)) =
-                self.triangles[index].meet(ray).filter(|meets| meets.0 >= least && meets.0 < most)
+        self.bvh.ray_traverse_anyhit(box_ray, |_, index| {
+            if let Some((t, u, v, front)) = self.triangles[index]
+                .intersect(ray)
+                .filter(|intersection| intersection.0 >= min_t && intersection.0 < max_t)
             {
                 hits.push(Hit { t, u, v, triangle: index, front });
             }
         });
-        hits.retain(sees);
-        hits.sort_by(|a, b| b.t.total_cmp(&a.t).then(self.number(b).cmp(&self.number(a))));
-        hits.dedup_by(|one, other| self.are_one(one, other));
+        hits.retain(accepts);
+        hits.sort_by(|a, b| b.t.total_cmp(&a.t).then(self.packed_index(b).cmp(&self.packed_index(a))));
+        hits.dedup_by(|one, other| self.are_same_hit(one, other));
         hits
     }
 
     /// Whether two hits lie on a shared edge of their triangles.
-    fn are_one(&self, one: &Hit, other: &Hit) -> bool {
-        let on_rim = |hit: &Hit| hit.u.min(hit.v).min(1.0 - hit.u - hit.v) < 1e-9;
-        if (one.t - other.t).abs() > 1e-9 * one.t.abs() || !on_rim(one) || !on_rim(other) {
+    fn are_same_hit(&self, one: &Hit, other: &Hit) -> bool {
+        let is_on_edge = |hit: &Hit| hit.u.min(hit.v).min(1.0 - hit.u - hit.v) < 1e-9;
+        if (one.t - other.t).abs() > 1e-9 * one.t.abs() || !is_on_edge(one) || !is_on_edge(other) {
             return false;
         }
-        let [own, theirs] = [one, other].map(|hit| self.triangles[hit.triangle].points());
-        let near = |a: &Vector3<f64>, b: &Vector3<f64>| (a - b).norm() <= 1e-9 * self.radius;
-        own.iter().filter(|point| theirs.iter().any(|other| near(point, other))).count() >= 2
+        let [points, other_points] = [one, other].map(|hit| self.triangles[hit.triangle].points());
+        let is_equal = |a: &Vector3<f64>, b: &Vector3<f64>| (a - b).norm() <= 1e-9 * self.radius;
+        points.iter().filter(|point| other_points.iter().any(|other| is_equal(point, other))).count() >= 2
     }
 
-    /// Whether any shadow caster other than triangle `own` lies beyond `least`.
-    pub(super) fn is_dark(&self, ray: &Ray, least: f64, own: Option<usize>) -> bool {
-        let (boxed, _) = self.boxed(ray, least, f64::MAX);
-        let boxed = BoxRay { tmax: f32::MAX, ..boxed };
+    /// Whether a shadow caster other than triangle `receiver` intersects the ray beyond `min_t`.
+    pub(super) fn is_occluded(&self, ray: &Ray, min_t: f64, receiver: Option<usize>) -> bool {
+        let (box_ray, _) = self.box_ray(ray, min_t, f64::MAX);
+        let box_ray = BoxRay { tmax: f32::MAX, ..box_ray };
         let blocks = |index: usize| {
-            let (t, u, v, front) = self.triangles[index].meet(ray).filter(|meets| meets.0 > least)?;
-            let casts = own != Some(index) && self.casts(&Hit { t, u, v, triangle: index, front });
-            casts.then_some(())
+            let (t, u, v, front) =
+                self.triangles[index].intersect(ray).filter(|intersection| intersection.0 > min_t)?;
+            let is_caster = receiver != Some(index) && self.casts_shadow(&Hit { t, u, v, triangle: index, front });
+            is_caster.then_some(())
         };
-        !self.boxes.ray_traverse_miss(boxed, |_, index| blocks(index).map_or(f32::INFINITY, |()| 0.0))
+        !self.bvh.ray_traverse_miss(box_ray, |_, index| blocks(index).map_or(f32::INFINITY, |()| 0.0))
     }
 
     /// Intersection of a ray with one triangle.
     #[cfg(test)]
-    pub(super) fn meet(&self, triangle: usize, ray: &Ray) -> Option<Hit> {
-        let (t, u, v, front) = self.triangles[triangle].meet(ray).filter(|meets| meets.0 >= 0.0)?;
+    pub(super) fn intersect(&self, triangle: usize, ray: &Ray) -> Option<Hit> {
+        let (t, u, v, front) = self.triangles[triangle].intersect(ray).filter(|intersection| intersection.0 >= 0.0)?;
         Some(Hit { t, u, v, triangle, front })
     }
 
-    pub(super) fn number(&self, hit: &Hit) -> u32 {
-        self.triangles[hit.triangle].number
+    pub(super) fn packed_index(&self, hit: &Hit) -> u32 {
+        self.triangles[hit.triangle].packed_index
     }
 
-    pub(super) fn paint(&self, hit: &Hit) -> &ReferenceMaterial {
-        &self.paints[self.triangles[hit.triangle].paint as usize]
+    pub(super) fn material(&self, hit: &Hit) -> &ReferenceMaterial {
+        &self.materials[self.triangles[hit.triangle].material as usize]
     }
 
     /// Whether a hit is opaque: not a culled back face, not cut out, not blended.
-    pub(super) fn is_solid(&self, hit: &Hit) -> bool {
-        let paint = self.paint(hit);
-        let faces = hit.front || paint.double_sided;
-        faces
-            && match paint.kind {
+    pub(super) fn is_opaque(&self, hit: &Hit) -> bool {
+        let material = self.material(hit);
+        let is_visible_side = hit.front || material.double_sided;
+        is_visible_side
+            && match material.kind {
                 AlphaKind::Opaque => true,
-                AlphaKind::Mask => self.alpha(hit) >= paint.cutoff,
+                AlphaKind::Mask => self.alpha(hit) >= material.alpha_cutoff,
                 AlphaKind::Blend => false,
             }
     }
 
     /// Whether a hit is blended over the surfaces behind it.
     pub(super) fn is_blended(&self, hit: &Hit) -> bool {
-        let paint = self.paint(hit);
-        paint.kind == AlphaKind::Blend && (hit.front || paint.double_sided)
+        let material = self.material(hit);
+        material.kind == AlphaKind::Blend && (hit.front || material.double_sided)
     }
 
     /// Whether a hit casts a shadow: both sides do, except where alpha is below the caster threshold.
-    fn casts(&self, hit: &Hit) -> bool {
-        let paint = self.paint(hit);
-        paint.kind == AlphaKind::Opaque || self.alpha(hit) >= paint.caster
+    fn casts_shadow(&self, hit: &Hit) -> bool {
+        let material = self.material(hit);
+        material.kind == AlphaKind::Opaque || self.alpha(hit) >= material.shadow_alpha_cutoff
     }
 
     pub(super) fn alpha(&self, hit: &Hit) -> f64 {
-        let paint = self.paint(hit);
-        paint.alpha * paint.color.as_ref().map_or(1.0, |image| image.alpha(self.uv(hit)))
+        let material = self.material(hit);
+        material.alpha * material.color.as_ref().map_or(1.0, |image| image.sample_alpha(self.uv(hit)))
     }
 
     pub(super) fn uv(&self, hit: &Hit) -> [f64; 2] {
@@ -287,13 +308,13 @@ impl RayScene {
 }
 
 /// Center and radius of a bounding sphere.
-fn ball(triangles: &[Triangle]) -> (Vector3<f64>, f64) {
-    let held = |mut bounds: BoundingBox, triangle: &Triangle| {
+fn bounding_sphere(triangles: &[Triangle]) -> (Vector3<f64>, f64) {
+    let include = |mut bounds: BoundingBox, triangle: &Triangle| {
         triangle.points().iter().for_each(|point| bounds.include((*point).into()));
         bounds
     };
-    let each = triangles.par_iter().with_min_len(LEAST).fold(|| BoundingBox::EMPTY, held);
-    let bounds = each.reduce(|| BoundingBox::EMPTY, BoundingBox::union);
+    let partial_bounds = triangles.par_iter().with_min_len(MIN_TASK_TRIANGLES).fold(|| BoundingBox::EMPTY, include);
+    let bounds = partial_bounds.reduce(|| BoundingBox::EMPTY, BoundingBox::union);
     match triangles.is_empty() {
         true => (Vector3::zeros(), 1.0),
         false => (bounds.center().coords, (0.5 * bounds.diagonal()).max(1e-9)),
@@ -301,61 +322,64 @@ fn ball(triangles: &[Triangle]) -> (Vector3<f64>, f64) {
 }
 
 fn normals(surface: &DeformedSurface) -> Vec<Vector3<f64>> {
-    let vector = |three: &[f32]| Vector3::new(three[0], three[1], three[2]).cast::<f64>();
+    let vector = |components: &[f32]| Vector3::new(components[0], components[1], components[2]).cast::<f64>();
     surface.normals.par_chunks_exact(3).map(vector).collect()
 }
 
 fn tangents(surface: &DeformedSurface) -> Vec<[f64; 4]> {
-    surface.tangents.par_chunks_exact(4).map(|four| [0, 1, 2, 3].map(|at| f64::from(four[at]))).collect()
+    surface.tangents.par_chunks_exact(4).map(|tangent| [0, 1, 2, 3].map(|axis| f64::from(tangent[axis]))).collect()
 }
 
 /// Texture coordinates per corner; (0, 0) where a mesh has none.
 fn uvs(scene: &Scene) -> Vec<[f64; 2]> {
     let mut uvs = Vec::with_capacity(scene.layout.corners);
     for (domain, slot) in scene.domains.iter().zip(&scene.layout.domains) {
-        let own = &scene.shapes[domain.shape].mesh.corners().uvs;
-        uvs.extend(own.iter().map(|uv| uv.map(f64::from)));
+        let mesh_uvs = &scene.shapes[domain.shape].mesh.corners().uvs;
+        uvs.extend(mesh_uvs.iter().map(|uv| uv.map(f64::from)));
         uvs.resize(slot.first_corner + slot.corners, [0.0; 2]);
     }
     uvs
 }
 
 fn triangles(scene: &Scene, surface: &DeformedSurface) -> Vec<Triangle> {
-    let of_domain = |index: usize| {
+    let domain_triangles = |index: usize| {
         let (domain, slot) = (&scene.domains[index], scene.layout.domains[index]);
         let mesh = &scene.shape_of(index).mesh;
-        let mirrored = domain.placement.linear().determinant() < 0.0;
+        let is_mirrored = domain.placement.linear().determinant() < 0.0;
         let vertices = &mesh.corners().vertices;
-        mesh.triangles().par_iter().with_min_len(LEAST).enumerate().filter_map(move |(at, corners)| {
-            let run = domain.material_ranges.iter().rev().find(|run| run.first_triangle <= at);
-            let material = run.map_or(domain.material, |run| run.material);
-            // The front side of a double-sided triangle is the one that its rest normals point to.
-            let turned = scene.materials[material].double_sided && disagrees(mesh, *corners);
-            let [a, b, c] = *corners;
-            let corners = if mirrored == turned { [a, b, c] } else { [a, c, b] };
-            let point = |corner: u32| {
-                let first = 3 * (slot.first_vertex + vertices[corner as usize] as usize);
-                let three = &surface.positions[first..first + 3];
-                Vector3::new(three[0], three[1], three[2]).cast::<f64>()
-            };
-            let [a, b, c] = corners.map(point);
-            let sound = [a, b, c].iter().all(|point| point.iter().all(|number| number.is_finite()));
-            sound.then(|| Triangle {
-                corner: a,
-                edges: [b - a, c - a],
-                corners: corners.map(|corner| corner + slot.first_corner as u32),
-                number: (slot.first_triangle + at) as u32,
-                paint: material as u32,
-            })
-        })
+        mesh.triangles().par_iter().with_min_len(MIN_TASK_TRIANGLES).enumerate().filter_map(
+            move |(triangle, corners)| {
+                let run = domain.material_ranges.iter().rev().find(|run| run.first_triangle <= triangle);
+                let material = run.map_or(domain.material, |run| run.material);
+                // The front side of a double-sided triangle is the side that its rest normals point to.
+                let is_reversed = scene.materials[material].double_sided && is_winding_reversed(mesh, *corners);
+                let [a, b, c] = *corners;
+                let corners = if is_mirrored == is_reversed { [a, b, c] } else { [a, c, b] };
+                let point = |corner: u32| {
+                    let first = 3 * (slot.first_vertex + vertices[corner as usize] as usize);
+                    let position = &surface.positions[first..first + 3];
+                    Vector3::new(position[0], position[1], position[2]).cast::<f64>()
+                };
+                let [a, b, c] = corners.map(point);
+                let is_finite = [a, b, c].iter().all(|point| point.iter().all(|coordinate| coordinate.is_finite()));
+                is_finite.then(|| Triangle {
+                    corner: a,
+                    edges: [b - a, c - a],
+                    corners: corners.map(|corner| corner + slot.first_corner as u32),
+                    packed_index: (slot.first_triangle + triangle) as u32,
+                    material: material as u32,
+                })
+            },
+        )
     };
-    (0..scene.domains.len()).into_par_iter().flat_map(of_domain).collect()
+    (0..scene.domains.len()).into_par_iter().flat_map(domain_triangles).collect()
 }
 
-fn disagrees(mesh: &Mesh, [a, b, c]: [u32; 3]) -> bool {
+/// Whether the rest normals point to the clockwise side of a triangle.
+fn is_winding_reversed(mesh: &Mesh, [a, b, c]: [u32; 3]) -> bool {
     let corners = mesh.corners();
-    let at = |corner: u32| Vector3::from(mesh.rest()[corners.vertices[corner as usize] as usize]).cast::<f64>();
-    let mean: Vector3<f64> =
+    let position = |corner: u32| Vector3::from(mesh.rest()[corners.vertices[corner as usize] as usize]).cast::<f64>();
+    let normal_sum: Vector3<f64> =
         [a, b, c].iter().map(|corner| Vector3::from(corners.normals[*corner as usize]).cast::<f64>()).sum();
-    (at(b) - at(a)).cross(&(at(c) - at(a))).dot(&mean) < 0.0
+    (position(b) - position(a)).cross(&(position(c) - position(a))).dot(&normal_sum) < 0.0
 }

@@ -1,13 +1,13 @@
-//! Cost of reading every frame back: frames per second without readback, with a blocking readback after each frame, and
-//! with readbacks through the ring while the next frames are drawn.
+//! Measures the cost of reading every frame back: frames per second without readback, with a blocking readback after
+//! each frame, and with asynchronous readbacks through the ring while the next frames are drawn.
 //!
 //! All three methods keep at most as many frames in flight as the ring has slots, so that they differ only in the
 //! readback. Rounds of the three methods alternate, and the medians over the rounds are compared. Two more methods,
 //! without readback and through the ring, upload the vertices of another step before every frame, as a moving scene
 //! does.
 //!
-//! Validation comes first: frames of two alternating cameras come back through the ring and must equal, in order, the
-//! frames that were drawn one by one, with steps between them and without.
+//! Frames are validated before they are timed: frames of two alternating cameras are read through the ring and must
+//! equal, in order, the frames of blocking readbacks, with and without uploads between them.
 
 use std::collections::VecDeque;
 use std::sync::mpsc::{self, SyncSender};
@@ -16,7 +16,7 @@ use std::time::Instant;
 use serde::Serialize;
 
 use super::RenderReportOptions;
-use super::harness::{HarnessScene, RenderHarness, Size};
+use super::harness::{LoadedScene, RenderHarness, Size};
 use super::measure::STILL;
 use super::workloads::{AnimatedScene, RenderWorkload};
 use crate::markdown_table::table;
@@ -39,65 +39,69 @@ pub struct ReadbackRates {
     pub unread_fps: f64,
     pub at_once_fps: f64,
     pub ring_fps: f64,
-    /// Percentage of frames per second that is lost to the readback.
+    /// Loss of frames per second by the readback, percent.
     pub at_once_loss: f64,
     pub ring_loss: f64,
-    /// The same with the vertices of another step uploaded before every frame.
+    /// Rates and loss with an upload of the vertices of another step before every frame.
     pub stepped_unread_fps: f64,
     pub stepped_ring_fps: f64,
     pub stepped_ring_loss: f64,
 }
 
-/// The frames to draw: even and odd frame numbers alternate between two shots.
+/// The frames to draw. Even and odd frames have different parameters and vertices.
 struct FrameSource {
-    shots: [FrameParams; 2],
+    frame_params: [FrameParams; 2],
     /// Vertices to upload before even and odd frames, if any.
     steps: Option<[DeformedSurface; 2]>,
 }
 
 /// Distance in steps between the two uploaded states.
-const APART: usize = 7;
+const STEP_DISTANCE: usize = 7;
 
 /// Readback method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ReadbackMode {
+    /// Frames are not read back.
     Unread,
-    AtOnce,
+    /// A blocking readback follows each frame.
+    Blocking,
+    /// Asynchronous readbacks through the ring.
     Ring,
 }
 
-/// Measures one load with its own look.
+/// Measures one load with its own render settings.
 ///
 /// # Errors
-/// Errors of drawing; `Fault` when a frame that was read through the ring differs from the frame drawn alone.
+/// Errors of drawing; `Fault` when a frame that was read through the ring differs from its blocking readback.
 pub(super) fn measure(
-    studio: &mut RenderHarness,
+    harness: &mut RenderHarness,
     request: &RenderReportOptions,
-    kind: RenderWorkload,
+    workload: RenderWorkload,
 ) -> Result<ReadbackRates> {
-    let stage = kind.stage()?;
-    let camera = stage.camera(request.size);
-    let mut set = studio.set(&stage.scene)?;
-    let stepped = FrameSource::stepped(studio, &mut set, &stage, request.size)?;
-    let still = FrameSource { shots: stepped.shots, steps: None };
-    [&still, &stepped].into_iter().try_for_each(|feed| validate(studio, &set, feed))?;
-    // One camera, so that all rounds draw the same.
-    let [still, stepped] = [still, stepped].map(|feed| FrameSource { shots: [feed.shots[0]; 2], ..feed });
-    studio.warm_up(&set, camera, request.size)?;
-    // A software renderer takes as long for one frame as a GPU for a thousand.
-    let frames = if studio.renderer.info().software { MIN_REPETITIONS } else { request.replays.max(MIN_REPETITIONS) };
-    let ways = [ReadbackMode::Unread, ReadbackMode::AtOnce, ReadbackMode::Ring].map(|way| (way, &still));
-    let ways = ways.into_iter().chain([ReadbackMode::Unread, ReadbackMode::Ring].map(|way| (way, &stepped)));
+    let animation = workload.build()?;
+    let camera = animation.camera(request.size);
+    let mut loaded_scene = harness.load(&animation.scene)?;
+    let stepped = FrameSource::stepped(harness, &mut loaded_scene, &animation, request.size)?;
+    let still = FrameSource { frame_params: stepped.frame_params, steps: None };
+    [&still, &stepped].into_iter().try_for_each(|source| validate(harness, &loaded_scene, source))?;
+    // Use one camera, so that all rounds draw the same image.
+    let [still, stepped] =
+        [still, stepped].map(|source| FrameSource { frame_params: [source.frame_params[0]; 2], ..source });
+    harness.warm_up(&loaded_scene, camera, request.size)?;
+    // A software renderer is about a thousand times slower than a GPU, so it draws the minimum number of frames.
+    let frames = if harness.renderer.info().software { MIN_REPETITIONS } else { request.replays.max(MIN_REPETITIONS) };
+    let modes = [ReadbackMode::Unread, ReadbackMode::Blocking, ReadbackMode::Ring].map(|mode| (mode, &still));
+    let modes = modes.into_iter().chain([ReadbackMode::Unread, ReadbackMode::Ring].map(|mode| (mode, &stepped)));
     let mut fps = [const { Vec::new() }; 5];
     for _ in 0..ROUNDS {
-        for ((way, feed), list) in ways.clone().zip(&mut fps) {
-            list.push(round(studio, &set, feed, (way, frames))?);
+        for ((mode, source), rates) in modes.clone().zip(&mut fps) {
+            rates.push(measure_round(harness, &loaded_scene, source, (mode, frames))?);
         }
     }
-    studio.unload(set);
+    harness.unload(loaded_scene);
     let [unread, at_once, ring, stepped_unread, stepped_ring] = fps.map(median);
     Ok(ReadbackRates {
-        load: stage.name,
+        load: animation.name,
         size: request.size,
         frames,
         unread_fps: unread,
@@ -113,21 +117,30 @@ pub(super) fn measure(
 
 impl FrameSource {
     /// Two cameras and the vertices of two steps; the shadow's bounds cover both.
-    fn stepped(studio: &mut RenderHarness, set: &mut HarnessScene, stage: &AnimatedScene, size: Size) -> Result<Self> {
-        let mut pose = |step: usize| -> Result<_> {
-            studio.pose(set, &stage.state(step))?;
-            Ok((set.surface()?.clone(), set.extents()))
+    fn stepped(
+        harness: &mut RenderHarness,
+        loaded_scene: &mut LoadedScene,
+        animation: &AnimatedScene,
+        size: Size,
+    ) -> Result<Self> {
+        let mut deform = |step: usize| -> Result<_> {
+            harness.deform(loaded_scene, &animation.state(step))?;
+            Ok((loaded_scene.surface()?.clone(), loaded_scene.extents()))
         };
-        let ((later, far), (first, near)) = (pose(STILL + APART)?, pose(STILL)?);
-        let camera = stage.camera(size);
-        let light = near.1.zip(far.1).map(|(near, far)| near.union(far));
-        let shot = |camera: Camera| FrameParams { bounds: near.0.union(far.0), light, ..set.shot(camera, size) };
-        Ok(Self { shots: [camera, farther(camera)].map(shot), steps: Some([first, later]) })
+        let ((second, second_extents), (first, first_extents)) = (deform(STILL + STEP_DISTANCE)?, deform(STILL)?);
+        let camera = animation.camera(size);
+        let light = first_extents.1.zip(second_extents.1).map(|(first, second)| first.union(second));
+        let frame_params = |camera: Camera| FrameParams {
+            bounds: first_extents.0.union(second_extents.0),
+            light,
+            ..loaded_scene.frame_params(camera, size)
+        };
+        Ok(Self { frame_params: [camera, farther(camera)].map(frame_params), steps: Some([first, second]) })
     }
 
-    /// Uploads the vertices of the frame with this number, if the feed has steps.
-    fn step(&self, studio: &mut RenderHarness, set: &HarnessScene, frame: usize) -> Result<()> {
-        self.steps.as_ref().map_or(Ok(()), |steps| studio.renderer.upload(&set.buffers, &steps[frame % 2]))
+    /// Uploads the vertices of a frame, if the source has steps.
+    fn upload_step(&self, harness: &mut RenderHarness, loaded_scene: &LoadedScene, frame: usize) -> Result<()> {
+        self.steps.as_ref().map_or(Ok(()), |steps| harness.renderer.upload(&loaded_scene.buffers, &steps[frame % 2]))
     }
 }
 
@@ -138,99 +151,102 @@ fn farther(camera: Camera) -> Camera {
     Camera { view: View::LookAt { eye, target, up }, ..camera }
 }
 
-/// Percentage of `all` that is missing in `left`.
-fn loss(all: f64, left: f64) -> f64 {
-    100.0 * (1.0 - left / all)
+/// Loss of the rate `fps` compared with `baseline_fps`, percent.
+fn loss(baseline_fps: f64, fps: f64) -> f64 {
+    100.0 * (1.0 - fps / baseline_fps)
 }
 
-fn median(mut list: Vec<f64>) -> f64 {
-    quantile(&mut list, 0.5).unwrap_or(f64::NAN)
+fn median(mut rates: Vec<f64>) -> f64 {
+    quantile(&mut rates, 0.5).unwrap_or(f64::NAN)
 }
 
-/// Checks that frames through the full ring equal those that are drawn one by one, in order.
-fn validate(studio: &mut RenderHarness, set: &HarnessScene, feed: &FrameSource) -> Result<()> {
-    let mut alone = |frame: usize| {
-        feed.step(studio, set, frame)?;
-        studio.renderer.draw(&set.buffers, &feed.shots[frame])
+/// Checks that frames that are read through the ring equal those of blocking readbacks, in order.
+fn validate(harness: &mut RenderHarness, loaded_scene: &LoadedScene, source: &FrameSource) -> Result<()> {
+    let mut draw_blocking = |frame: usize| {
+        source.upload_step(harness, loaded_scene, frame)?;
+        harness.renderer.draw(&loaded_scene.buffers, &source.frame_params[frame])
     };
-    let alone = [alone(0)?, alone(1)?];
+    let expected = [draw_blocking(0)?, draw_blocking(1)?];
     let frames = 2 * MAX_FRAMES_IN_FLIGHT + 1;
-    let (texture_panels, taken) = mpsc::sync_channel(frames);
-    under_way(studio, set, feed, (frames, Some(texture_panels)))?;
-    check(&alone, &taken.iter().collect::<Vec<_>>(), frames)
+    let (frame_sender, receiver) = mpsc::sync_channel(frames);
+    draw_pipelined(harness, loaded_scene, source, (frames, Some(frame_sender)))?;
+    check_frames(&expected, &receiver.iter().collect::<Vec<_>>(), frames)
 }
 
-/// Checks that all frames came back, with even frames equal to the first one drawn alone and odd frames equal to the
-/// second.
-fn check(alone: &[FrameImage; 2], taken: &[(usize, FrameImage)], frames: usize) -> Result<()> {
-    if alone[0].rgba == alone[1].rgba {
-        return Err(fault_in("readback")("two cameras show the same: frames that are mixed up would not be noticed"));
+/// Checks that all frames were received. Even frames must equal the first expected image and odd frames the second.
+fn check_frames(expected: &[FrameImage; 2], received: &[(usize, FrameImage)], frames: usize) -> Result<()> {
+    if expected[0].rgba == expected[1].rgba {
+        return Err(fault_in("readback")(
+            "expected two cameras with different images, got equal ones: swapped frames would not be detected",
+        ));
     }
-    let numbers: std::collections::BTreeSet<usize> = taken.iter().map(|(frame, _)| *frame).collect();
-    let wrong = taken.iter().filter(|(frame, image)| image.rgba != alone[frame % 2].rgba).count();
-    match (numbers.len() == frames && taken.len() == frames, wrong) {
+    let numbers: std::collections::BTreeSet<usize> = received.iter().map(|(frame, _)| *frame).collect();
+    let wrong = received.iter().filter(|(frame, image)| image.rgba != expected[frame % 2].rgba).count();
+    match (numbers.len() == frames && received.len() == frames, wrong) {
         (true, 0) => Ok(()),
-        (false, _) => Err(fault_in("readback")(format!("{} of {frames} frames came back", numbers.len()))),
-        _ => Err(fault_in("readback")(format!("{wrong} frames through the ring differ from those drawn alone"))),
+        (false, _) => Err(fault_in("readback")(format!("expected {frames} frames, got {}", numbers.len()))),
+        _ => Err(fault_in("readback")(format!("expected frames equal to blocking readbacks, {wrong} differ"))),
     }
 }
 
 /// Frames per second of one round. The images are dropped on a separate thread.
-fn round(
-    studio: &mut RenderHarness,
-    set: &HarnessScene,
-    feed: &FrameSource,
-    (way, frames): (ReadbackMode, usize),
+fn measure_round(
+    harness: &mut RenderHarness,
+    loaded_scene: &LoadedScene,
+    source: &FrameSource,
+    (mode, frames): (ReadbackMode, usize),
 ) -> Result<f64> {
-    // Capacity for all frames, so that the copying threads do not wait.
-    let (texture_panels, taken) = mpsc::sync_channel::<(usize, FrameImage)>(frames);
+    // The channel has capacity for all frames, so that the copying threads do not wait.
+    let (frame_sender, receiver) = mpsc::sync_channel::<(usize, FrameImage)>(frames);
     let begin = Instant::now();
-    let taker = std::thread::spawn(move || taken.iter().filter(|(_, image)| !image.rgba.is_empty()).count());
-    match way {
-        ReadbackMode::AtOnce => {
+    let counter = std::thread::spawn(move || receiver.iter().filter(|(_, image)| !image.rgba.is_empty()).count());
+    match mode {
+        ReadbackMode::Blocking => {
             for frame in 0..frames {
-                feed.step(studio, set, frame)?;
-                let image = studio.renderer.draw(&set.buffers, &feed.shots[frame % 2])?;
-                texture_panels.send((frame, image)).map_err(fault_in("readback"))?;
+                source.upload_step(harness, loaded_scene, frame)?;
+                let image = harness.renderer.draw(&loaded_scene.buffers, &source.frame_params[frame % 2])?;
+                frame_sender.send((frame, image)).map_err(fault_in("readback"))?;
             }
-            drop(texture_panels);
+            drop(frame_sender);
         }
-        ReadbackMode::Unread => under_way(studio, set, feed, (frames, None)).map(|()| drop(texture_panels))?,
-        ReadbackMode::Ring => under_way(studio, set, feed, (frames, Some(texture_panels)))?,
+        ReadbackMode::Unread => {
+            draw_pipelined(harness, loaded_scene, source, (frames, None)).map(|()| drop(frame_sender))?
+        }
+        ReadbackMode::Ring => draw_pipelined(harness, loaded_scene, source, (frames, Some(frame_sender)))?,
     }
-    let taken = taker.join().map_err(|_| fault_in("readback")("the taker of frames panicked"))?;
+    let received = counter.join().map_err(|_| fault_in("readback")("the receiving thread panicked"))?;
     let seconds = begin.elapsed().as_secs_f64();
-    match taken == if way == ReadbackMode::Unread { 0 } else { frames } {
+    match received == if mode == ReadbackMode::Unread { 0 } else { frames } {
         true => Ok(frames as f64 / seconds),
-        false => Err(fault_in("readback")(format!("{taken} of {frames} frames came back"))),
+        false => Err(fault_in("readback")(format!("expected {frames} frames, got {received}"))),
     }
 }
 
-/// Draws with as many frames in flight as the ring has slots. `to` receives each frame's number and pixels, which are
-/// copied on other threads.
-fn under_way(
-    studio: &mut RenderHarness,
-    set: &HarnessScene,
-    feed: &FrameSource,
-    (frames, to): (usize, Option<SyncSender<(usize, FrameImage)>>),
+/// Draws with as many frames in flight as the ring has slots. `sender` receives each frame's number and pixels, which
+/// are copied on other threads.
+fn draw_pipelined(
+    harness: &mut RenderHarness,
+    loaded_scene: &LoadedScene,
+    source: &FrameSource,
+    (frames, sender): (usize, Option<SyncSender<(usize, FrameImage)>>),
 ) -> Result<()> {
     let mut tickets = VecDeque::new();
     for frame in 0..frames + MAX_FRAMES_IN_FLIGHT {
         if let Some(ticket) = if frame < MAX_FRAMES_IN_FLIGHT { None } else { tickets.pop_front() } {
-            let pixels = studio.renderer.map_pixels(ticket)?;
-            if let Some(to) = to.clone() {
+            let pixels = harness.renderer.map_pixels(ticket)?;
+            if let Some(sender) = sender.clone() {
                 rayon::spawn(move || {
                     // The receiver counts the images, so a failed send is noticed there.
-                    to.send((frame - MAX_FRAMES_IN_FLIGHT, pixels.into_image())).ok();
+                    sender.send((frame - MAX_FRAMES_IN_FLIGHT, pixels.into_image())).ok();
                 });
             }
         }
         if frame < frames {
-            feed.step(studio, set, frame)?;
-            let shot = &feed.shots[frame % 2];
-            tickets.push_back(match &to {
-                Some(_) => studio.renderer.submit(&set.buffers, shot)?,
-                None => studio.renderer.submit_without_readback(&set.buffers, shot)?,
+            source.upload_step(harness, loaded_scene, frame)?;
+            let frame_params = &source.frame_params[frame % 2];
+            tickets.push_back(match &sender {
+                Some(_) => harness.renderer.submit(&loaded_scene.buffers, frame_params)?,
+                None => harness.renderer.submit_without_readback(&loaded_scene.buffers, frame_params)?,
             });
         }
     }
@@ -238,11 +254,11 @@ fn under_way(
 }
 
 /// The Markdown section of the report.
-pub(super) fn section(list: &[ReadbackRates]) -> String {
-    let head = ["load", "frames/s, none read", "each read at once", "loss", "each read through the ring", "loss"];
-    let head = [&head[..], &["a step before each, none read", "a step before each, through the ring", "loss"]].concat();
+pub(super) fn readback_section(list: &[ReadbackRates]) -> String {
+    let head = ["load", "frames/s, no readback", "blocking readback", "loss", "readback through the ring", "loss"];
+    let head = [&head[..], &["with uploads, no readback", "with uploads, through the ring", "loss"]].concat();
     let mut text = String::from(
-        "\n## Reading every frame back\n\nThe same vertices again and again; and with those of another step uploaded from host \
+        "\n## Reading every frame back\n\nWithout uploads, and with the vertices of another step uploaded from host \
          memory before every frame.\n\n",
     );
     let cells = |row: &ReadbackRates| {
@@ -277,44 +293,45 @@ mod tests {
             quick: true,
             replays: 20,
         };
-        let mut studio = RenderHarness::open().expect("EGL");
-        let row = measure(&mut studio, &request, RenderWorkload::Square).expect("measured");
+        let mut harness = RenderHarness::open().expect("a renderer");
+        let row = measure(&mut harness, &request, RenderWorkload::Square).expect("rates");
         assert!(row.unread_fps > 0.0 && row.at_once_fps > 0.0 && row.ring_fps > 0.0, "{row:?}");
         assert!(row.stepped_unread_fps > 0.0 && row.stepped_ring_fps > 0.0 && row.stepped_ring_loss < 100.0);
         assert!(row.ring_loss < 100.0 && row.at_once_loss < 100.0 && row.frames >= 20);
-        let markdown = section(std::slice::from_ref(&row));
+        let markdown = readback_section(std::slice::from_ref(&row));
         assert!(markdown.lines().any(|line| line.contains("square") && line.contains('%')), "{markdown}");
         assert_eq!((loss(200.0, 190.0), median(vec![3.0, 1.0, 2.0])), (5.000000000000004, 2.0));
     }
 
     #[test]
     fn detects_wrong_swapped_and_missing_frames() {
-        let stage = RenderWorkload::Square.stage().expect("a load");
+        let animation = RenderWorkload::Square.build().expect("a workload");
         let size = Size { width: 64, height: 36 };
-        let mut studio = RenderHarness::open().expect("EGL");
-        let mut set = studio.set(&stage.scene).expect("loads");
-        let mut feed = FrameSource::stepped(&mut studio, &mut set, &stage, size).expect("poses");
-        validate(&mut studio, &set, &feed).expect("control: with steps");
-        let alone = [0, 1].map(|frame| {
-            feed.step(&mut studio, &set, frame).expect("uploads");
-            studio.renderer.draw(&set.buffers, &feed.shots[frame]).expect("draws")
+        let mut harness = RenderHarness::open().expect("a renderer");
+        let mut loaded_scene = harness.load(&animation.scene).expect("a loaded scene");
+        let mut source = FrameSource::stepped(&mut harness, &mut loaded_scene, &animation, size).expect("two steps");
+        validate(&mut harness, &loaded_scene, &source).expect("equal frames with uploads between them");
+        let expected = [0, 1].map(|frame| {
+            source.upload_step(&mut harness, &loaded_scene, frame).expect("uploaded vertices");
+            harness.renderer.draw(&loaded_scene.buffers, &source.frame_params[frame]).expect("a frame")
         });
-        let (texture_panels, taken) = mpsc::sync_channel(6);
-        under_way(&mut studio, &set, &feed, (6, Some(texture_panels))).expect("draws");
-        // Several threads copy, so the frames arrive in any order; the swap below needs two that differ.
-        let mut frames: Vec<(usize, FrameImage)> = taken.iter().collect();
+        let (frame_sender, receiver) = mpsc::sync_channel(6);
+        draw_pipelined(&mut harness, &loaded_scene, &source, (6, Some(frame_sender))).expect("a frame");
+        // Several threads copy, so frames are received in any order. The swap below needs an even and an odd frame.
+        let mut frames: Vec<(usize, FrameImage)> = receiver.iter().collect();
         frames.sort_by_key(|(number, _)| *number);
-        check(&alone, &frames, 6).expect("control: all are right");
-        let why = |frames: &[(usize, FrameImage)]| check(&alone, frames, 6).expect_err("noticed").to_string();
-        assert!(why(&frames[1..]).contains("5 of 6"));
+        check_frames(&expected, &frames, 6).expect("control: equal frames");
+        let error =
+            |frames: &[(usize, FrameImage)]| check_frames(&expected, frames, 6).expect_err("a rejection").to_string();
+        assert!(error(&frames[1..]).contains("expected 6 frames, got 5"));
         (frames[2].0, frames[3].0) = (frames[3].0, frames[2].0);
-        assert!(why(&frames).contains("2 frames"), "two that are swapped");
+        assert!(error(&frames).contains("2 differ"), "two swapped frames");
         (frames[2].0, frames[3].0) = (frames[3].0, frames[2].0);
         frames[4].1.rgba[100] ^= 1;
-        assert!(why(&frames).contains("1 frames"), "one byte is wrong");
-        feed.shots[1] = feed.shots[0];
-        feed.steps = None;
-        let same = validate(&mut studio, &set, &feed).expect_err("nothing could be told apart");
-        assert!(same.to_string().contains("two cameras show the same"), "{same}");
+        assert!(error(&frames).contains("1 differ"), "one wrong byte");
+        source.frame_params[1] = source.frame_params[0];
+        source.steps = None;
+        let error = validate(&mut harness, &loaded_scene, &source).expect_err("equal images");
+        assert!(error.to_string().contains("two cameras with different images"), "{error}");
     }
 }

@@ -25,48 +25,49 @@ pub(super) struct ReferenceMaterial {
     pub(super) ambient: Vector3<f64>,
     pub(super) diffuse: Vector3<f64>,
     pub(super) specular: Vector3<f64>,
+    /// Exponent of the specular highlight.
     pub(super) exponent: f64,
     pub(super) alpha: f64,
-    /// A masked surface is visible where alpha is at least this.
-    pub(super) cutoff: f64,
-    /// A surface that is not opaque casts a shadow where alpha is at least this.
-    pub(super) caster: f64,
+    /// Alpha from which a masked surface is visible.
+    pub(super) alpha_cutoff: f64,
+    /// Alpha from which a surface that is not opaque casts a shadow.
+    pub(super) shadow_alpha_cutoff: f64,
     pub(super) color: Option<Arc<ReferenceTexture>>,
     pub(super) normal: Option<Arc<ReferenceTexture>>,
 }
 
 impl ReferenceMaterial {
-    /// The materials of a scene, in order. Each image is decoded once per use.
-    pub(super) fn all(scene: &Scene) -> Vec<Self> {
-        let mut decoded: BTreeMap<(usize, bool), Arc<ReferenceTexture>> = BTreeMap::new();
-        let mut image = |texture: Option<usize>, purpose: TextureRole| {
+    /// Converts the materials of a scene. Each image is decoded once per role.
+    pub(super) fn from_scene(scene: &Scene) -> Vec<Self> {
+        let mut textures: BTreeMap<(usize, bool), Arc<ReferenceTexture>> = BTreeMap::new();
+        let mut image = |texture: Option<usize>, role: TextureRole| {
             texture.map(|index| {
-                let slot = decoded.entry((index, purpose == TextureRole::Color));
-                Arc::clone(slot.or_insert_with(|| Arc::new(ReferenceTexture::new(&scene.textures[index], purpose))))
+                let entry = textures.entry((index, role == TextureRole::Color));
+                Arc::clone(entry.or_insert_with(|| Arc::new(ReferenceTexture::new(&scene.textures[index], role))))
             })
         };
-        let threshold = scene.look.shadow.unwrap_or_default().alpha_threshold;
-        let wide = |color: [f32; 3]| Vector3::from(color).cast::<f64>();
-        let paint = |material: &modalcast_model::domain::Material| {
-            let (kind, cutoff, caster) = match material.alpha_mode {
+        let shadow_threshold = scene.look.shadow.unwrap_or_default().alpha_threshold;
+        let to_f64 = |color: [f32; 3]| Vector3::from(color).cast::<f64>();
+        let convert = |material: &modalcast_model::domain::Material| {
+            let (kind, alpha_cutoff, shadow_alpha_cutoff) = match material.alpha_mode {
                 AlphaMode::Opaque => (AlphaKind::Opaque, 0.0, 0.0),
                 AlphaMode::Mask { cutoff } => (AlphaKind::Mask, cutoff, cutoff),
-                AlphaMode::Blend => (AlphaKind::Blend, 0.0, threshold),
+                AlphaMode::Blend => (AlphaKind::Blend, 0.0, shadow_threshold),
             };
             Self {
                 kind,
                 double_sided: material.double_sided,
-                ambient: wide(material.ambient),
-                diffuse: wide(material.diffuse),
-                specular: wide(material.specular),
+                ambient: to_f64(material.ambient),
+                diffuse: to_f64(material.diffuse),
+                specular: to_f64(material.specular),
                 exponent: f64::from(material.shininess),
                 alpha: f64::from(material.alpha),
-                cutoff: f64::from(cutoff),
-                caster: f64::from(caster),
+                alpha_cutoff: f64::from(alpha_cutoff),
+                shadow_alpha_cutoff: f64::from(shadow_alpha_cutoff),
                 color: image(material.color_texture, TextureRole::Color),
                 normal: image(material.normal_texture, TextureRole::Normal),
             }
         };
-        scene.materials.iter().map(paint).collect()
+        scene.materials.iter().map(convert).collect()
     }
 }

@@ -1,4 +1,4 @@
-//! Image sampling of the references: mip level 0, bilinear, repeating, in f32 after decoding.
+//! Samples images for the references: bilinear, repeating, without mip levels. Decoded texels are f32.
 
 use modalcast_model::domain::Texture;
 
@@ -16,58 +16,59 @@ pub(super) enum TextureRole {
 pub(super) struct ReferenceTexture {
     width: usize,
     height: usize,
-    purpose: TextureRole,
+    role: TextureRole,
     rgba: Vec<[f32; 4]>,
 }
 
 impl ReferenceTexture {
-    pub(super) fn new(texture: &Texture, purpose: TextureRole) -> Self {
-        let decode: [f32; 256] = std::array::from_fn(|byte| match purpose {
+    pub(super) fn new(texture: &Texture, role: TextureRole) -> Self {
+        let decode: [f32; 256] = std::array::from_fn(|byte| match role {
             TextureRole::Color => linear_from_srgb(byte as f64 / 255.0) as f32,
             TextureRole::Normal => byte as f32 / 255.0,
         });
-        let texel = |four: &[u8]| {
-            let [r, g, b] = [0, 1, 2].map(|channel| decode[usize::from(four[channel])]);
-            [r, g, b, f32::from(four[3]) / 255.0]
+        let texel = |bytes: &[u8]| {
+            let [r, g, b] = [0, 1, 2].map(|channel| decode[usize::from(bytes[channel])]);
+            [r, g, b, f32::from(bytes[3]) / 255.0]
         };
         let rgba = texture.rgba().chunks_exact(4).map(texel).collect();
-        Self { width: texture.width() as usize, height: texture.height() as usize, purpose, rgba }
+        Self { width: texture.width() as usize, height: texture.height() as usize, role, rgba }
     }
 
     /// The four texels around a point and their weights.
-    fn around(&self, uv: [f64; 2]) -> [([f32; 4], f64); 4] {
-        let along = |coordinate: f64, count: usize| {
-            // Wrap first, so that large coordinates keep their fraction.
-            let place = coordinate.rem_euclid(1.0) * count as f64 - 0.5;
-            let low = place.floor();
+    fn bilinear_footprint(&self, uv: [f64; 2]) -> [([f32; 4], f64); 4] {
+        let neighbors = |coordinate: f64, count: usize| {
+            // Wrap before scaling, so that large coordinates keep the precision of their fraction.
+            let position = coordinate.rem_euclid(1.0) * count as f64 - 0.5;
+            let lower = position.floor();
             let wrap = |index: f64| (index as i64).rem_euclid(count as i64) as usize;
-            (wrap(low), wrap(low + 1.0), place - low)
+            (wrap(lower), wrap(lower + 1.0), position - lower)
         };
-        let ((left, right, u), (top, bottom, v)) = (along(uv[0], self.width), along(uv[1], self.height));
-        let at = |x: usize, y: usize| self.rgba[y * self.width + x];
+        let ((left, right, u), (top, bottom, v)) = (neighbors(uv[0], self.width), neighbors(uv[1], self.height));
+        let texel = |x: usize, y: usize| self.rgba[y * self.width + x];
         [
-            (at(left, top), (1.0 - u) * (1.0 - v)),
-            (at(right, top), u * (1.0 - v)),
-            (at(left, bottom), (1.0 - u) * v),
-            (at(right, bottom), u * v),
+            (texel(left, top), (1.0 - u) * (1.0 - v)),
+            (texel(right, top), u * (1.0 - v)),
+            (texel(left, bottom), (1.0 - u) * v),
+            (texel(right, bottom), u * v),
         ]
     }
 
-    /// Alpha alone.
-    pub(super) fn alpha(&self, uv: [f64; 2]) -> f64 {
-        self.around(uv).iter().map(|(texel, weight)| f64::from(texel[3]) * weight).sum()
+    /// Samples alpha.
+    pub(super) fn sample_alpha(&self, uv: [f64; 2]) -> f64 {
+        self.bilinear_footprint(uv).iter().map(|(texel, weight)| f64::from(texel[3]) * weight).sum()
     }
 
-    /// All four channels. Fully transparent texels have no color, so the color weights of the others are renormalized.
-    pub(super) fn at(&self, uv: [f64; 2]) -> [f64; 4] {
-        let four = self.around(uv);
-        let counts = |texel: &[f32; 4]| self.purpose == TextureRole::Normal || texel[3] > 0.0;
-        let whole: f64 = four.iter().filter(|(texel, _)| counts(texel)).map(|(_, weight)| weight).sum();
+    /// Samples all four channels. Fully transparent texels have no color, so the color weights of the other texels are
+    /// renormalized.
+    pub(super) fn sample(&self, uv: [f64; 2]) -> [f64; 4] {
+        let footprint = self.bilinear_footprint(uv);
+        let has_color = |texel: &[f32; 4]| self.role == TextureRole::Normal || texel[3] > 0.0;
+        let color_weight: f64 = footprint.iter().filter(|(texel, _)| has_color(texel)).map(|(_, weight)| weight).sum();
         let mut sum = [0.0; 4];
-        for (texel, weight) in &four {
+        for (texel, weight) in &footprint {
             sum[3] += f64::from(texel[3]) * weight;
-            if counts(texel) && whole > 0.0 {
-                (0..3).for_each(|channel| sum[channel] += f64::from(texel[channel]) * weight / whole);
+            if has_color(texel) && color_weight > 0.0 {
+                (0..3).for_each(|channel| sum[channel] += f64::from(texel[channel]) * weight / color_weight);
             }
         }
         sum
@@ -88,27 +89,27 @@ pub(super) fn srgb_from_linear(linear: f64) -> f64 {
 mod tests {
     use super::*;
 
-    fn pair(purpose: TextureRole) -> ReferenceTexture {
-        ReferenceTexture::new(&Texture::new("two", 2, 1, vec![255, 0, 0, 255, 0, 255, 0, 0]).expect("fits"), purpose)
+    fn two_texels(role: TextureRole) -> ReferenceTexture {
+        ReferenceTexture::new(&Texture::new("two", 2, 1, vec![255, 0, 0, 255, 0, 255, 0, 0]).expect("a texture"), role)
     }
 
     #[test]
     fn texel_centers_are_exact_and_images_repeat() {
-        let texels = pair(TextureRole::Normal);
-        for turn in [-3.0, 0.0, 1e6] {
-            assert_eq!(texels.at([0.25 + turn, 0.5]), [1.0, 0.0, 0.0, 1.0]);
-            assert_eq!(texels.at([0.75 + turn, 7.5]), [0.0, 1.0, 0.0, 0.0]);
+        let texels = two_texels(TextureRole::Normal);
+        for offset in [-3.0, 0.0, 1e6] {
+            assert_eq!(texels.sample([0.25 + offset, 0.5]), [1.0, 0.0, 0.0, 1.0]);
+            assert_eq!(texels.sample([0.75 + offset, 7.5]), [0.0, 1.0, 0.0, 0.0]);
         }
-        assert_eq!(texels.at([0.5, 0.5]), [0.5, 0.5, 0.0, 0.5]);
-        assert_eq!(texels.at([0.0, 0.5]), [0.5, 0.5, 0.0, 0.5], "the rim blends with the other side");
+        assert_eq!(texels.sample([0.5, 0.5]), [0.5, 0.5, 0.0, 0.5]);
+        assert_eq!(texels.sample([0.0, 0.5]), [0.5, 0.5, 0.0, 0.5], "the edge is interpolated with the opposite edge");
     }
 
     #[test]
     fn transparent_texels_do_not_affect_color() {
-        let texels = pair(TextureRole::Color);
-        assert_eq!(texels.at([0.5, 0.5]), [1.0, 0.0, 0.0, 0.5]);
-        assert_eq!(texels.alpha([0.5, 0.5]), 0.5);
-        assert_eq!(texels.at([0.75, 0.5]), [0.0; 4]);
+        let texels = two_texels(TextureRole::Color);
+        assert_eq!(texels.sample([0.5, 0.5]), [1.0, 0.0, 0.0, 0.5]);
+        assert_eq!(texels.sample_alpha([0.5, 0.5]), 0.5);
+        assert_eq!(texels.sample([0.75, 0.5]), [0.0; 4]);
     }
 
     #[test]

@@ -1,31 +1,34 @@
-//! Sample patterns: in a pixel, and under the Gaussian of a blur.
+//! Sample patterns: in a pixel, and of a Gaussian filter.
 
 use std::f64::consts::TAU;
 
-/// Samples of one pixel in `side` x `side` cells. Each sample is shifted inside of its cell by its index in the other
-/// direction, so that all samples have different x and different y: (i + (j + 1/2) / side) / side, and likewise for y.
-pub(super) fn pixel(side: usize) -> Vec<[f64; 2]> {
+/// Samples of one pixel in `side` x `side` cells. The offset of a sample within its cell is given by its index in the
+/// other direction, x = (i + (j + 1/2) / side) / side and likewise y, so that all x and all y are different.
+pub(super) fn pixel_samples(side: usize) -> Vec<[f64; 2]> {
     let count = side as f64;
-    let place = |own: usize, other: usize| (own as f64 + (other as f64 + 0.5) / count) / count;
-    (0..side * side).map(|at| (at % side, at / side)).map(|(i, j)| [place(i, j), place(j, i)]).collect()
+    let coordinate = |cell: usize, other: usize| (cell as f64 + (other as f64 + 0.5) / count) / count;
+    (0..side * side)
+        .map(|index| (index % side, index / side))
+        .map(|(i, j)| [coordinate(i, j), coordinate(j, i)])
+        .collect()
 }
 
-/// Points of a two-dimensional normal distribution with standard deviation 1, by Box and Muller from Hammersley's
-/// points. `turn` (each 0 to 1) shifts all points, so that neighboring pixels do not repeat each other's error.
-pub(super) fn gaussian_samples(count: usize, turn: [f64; 2]) -> Vec<[f64; 2]> {
-    let point = |at: usize| {
-        let radical = f64::from((at as u32).reverse_bits()) / 4_294_967_296.0;
-        let share = ((at as f64 + 0.5) / count as f64 + turn[0]).fract();
-        let angle = TAU * (radical + turn[1]);
-        // Limits the radius of the outermost point.
-        let radius = (-2.0 * (1.0 - share).max(0.25 / count as f64).ln()).sqrt();
+/// Points of a two-dimensional normal distribution with standard deviation 1: Hammersley points, transformed by Box and
+/// Muller. `shift` (both 0 to 1) shifts all points, so that the errors of neighboring pixels are uncorrelated.
+pub(super) fn gaussian_samples(count: usize, shift: [f64; 2]) -> Vec<[f64; 2]> {
+    let point = |index: usize| {
+        let radical_inverse = f64::from((index as u32).reverse_bits()) / 4_294_967_296.0;
+        let quantile = ((index as f64 + 0.5) / count as f64 + shift[0]).fract();
+        let angle = TAU * (radical_inverse + shift[1]);
+        // The lower bound limits the radius of the outermost point.
+        let radius = (-2.0 * (1.0 - quantile).max(0.25 / count as f64).ln()).sqrt();
         [radius * angle.cos(), radius * angle.sin()]
     };
     (0..count).map(point).collect()
 }
 
 /// Two pseudo-random numbers in [0, 1) per pixel.
-pub(super) fn scatter(x: u32, y: u32) -> [f64; 2] {
+pub(super) fn pixel_shift(x: u32, y: u32) -> [f64; 2] {
     let mix = |mut word: u64| {
         word = (word ^ (word >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
         word = (word ^ (word >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
@@ -41,32 +44,40 @@ mod tests {
 
     #[test]
     fn samples_have_distinct_evenly_spaced_coordinates() {
-        let samples = pixel(8);
+        let samples = pixel_samples(8);
         assert_eq!(samples.len(), 64);
         for axis in 0..2 {
-            let mut along: Vec<f64> = samples.iter().map(|sample| sample[axis]).collect();
-            along.sort_by(f64::total_cmp);
-            assert!(along.iter().enumerate().all(|(at, place)| (place * 64.0 - at as f64 - 0.5).abs() < 1e-9));
+            let mut coordinates: Vec<f64> = samples.iter().map(|sample| sample[axis]).collect();
+            coordinates.sort_by(f64::total_cmp);
+            assert!(
+                coordinates
+                    .iter()
+                    .enumerate()
+                    .all(|(index, coordinate)| (coordinate * 64.0 - index as f64 - 0.5).abs() < 1e-9)
+            );
         }
     }
 
     #[test]
     fn gaussian_has_mean_0_and_deviation_1_for_any_shift() {
-        for turn in [[0.0, 0.0], [0.3, 0.9], [0.999, 0.5]] {
-            let points = gaussian_samples(256, turn);
+        for shift in [[0.0, 0.0], [0.3, 0.9], [0.999, 0.5]] {
+            let points = gaussian_samples(256, shift);
             for axis in 0..2 {
                 let mean = points.iter().map(|point| point[axis]).sum::<f64>() / 256.0;
-                let square = points.iter().map(|point| point[axis] * point[axis]).sum::<f64>() / 256.0;
-                assert!(mean.abs() < 0.03 && (square - 1.0).abs() < 0.04, "{turn:?}: {mean} {square}");
+                let variance = points.iter().map(|point| point[axis] * point[axis]).sum::<f64>() / 256.0;
+                assert!(
+                    mean.abs() < 0.03 && (variance - 1.0).abs() < 0.04,
+                    "{shift:?}: mean {mean}, variance {variance}"
+                );
             }
         }
     }
 
     #[test]
-    fn neighboring_pixels_get_different_offsets() {
-        let all: Vec<[f64; 2]> = (0..100).map(|at| scatter(at % 10, at / 10)).collect();
-        assert!(all.iter().flatten().all(|number| (0.0..1.0).contains(number)));
-        let mean = all.iter().map(|pair| pair[0]).sum::<f64>() / 100.0;
-        assert!((mean - 0.5).abs() < 0.1 && all[0] != all[1], "{mean}");
+    fn neighboring_pixels_get_different_shifts() {
+        let shifts: Vec<[f64; 2]> = (0..100).map(|index| pixel_shift(index % 10, index / 10)).collect();
+        assert!(shifts.iter().flatten().all(|number| (0.0..1.0).contains(number)));
+        let mean = shifts.iter().map(|pair| pair[0]).sum::<f64>() / 100.0;
+        assert!((mean - 0.5).abs() < 0.1 && shifts[0] != shifts[1], "{mean}");
     }
 }

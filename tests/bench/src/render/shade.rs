@@ -1,5 +1,5 @@
-//! Phong shading by equation 3.12, as in the shaders but in f64. The light of a point towards the eye is split into the
-//! part without the sun and the part from the sun.
+//! Phong shading by equation 3.12, as in the shaders but in f64. The radiance towards the eye is split into an ambient
+//! part and a part from the sun.
 //!
 //!   C = skylight Ca + s_f sunlight ((n . v_l) Cd + (v_e' . v_l)^k Cs),  v_e' = 2 (v_e . n) n - v_e
 
@@ -13,100 +13,102 @@ use super::reference_view::View;
 pub(super) struct ShadedPoint {
     pub(super) point: Vector3<f64>,
     /// Geometric normal, on the sun's side.
-    pub(super) facet: Vector3<f64>,
+    pub(super) geometric_normal: Vector3<f64>,
     /// The triangle; `None` for ground and sky.
     pub(super) triangle: Option<usize>,
-    /// Linear light without the sun; below it the contribution of the unshadowed sun.
+    /// Linear radiance without the sun.
     pub(super) ambient: Vector3<f64>,
+    /// Linear radiance from the unshadowed sun.
     pub(super) sun: Vector3<f64>,
-    /// Fraction of the sunlight that the point would receive: the cosine, or 0 when it faces away.
-    pub(super) facing: f64,
+    /// Cosine between normal and sun direction; 0 when the point faces away. On the ground, it is reduced by the haze.
+    pub(super) cosine: f64,
     pub(super) alpha: f64,
 }
 
-/// A point of the sky, without sunlight.
-pub(super) fn sky(view: &View, ray: &Ray) -> ShadedPoint {
-    let (point, zero) = (ray.from, Vector3::zeros());
+/// Shades the sky.
+pub(super) fn shade_sky(view: &View, ray: &Ray) -> ShadedPoint {
+    let (point, zero) = (ray.origin, Vector3::zeros());
     ShadedPoint {
         point,
-        facet: zero,
+        geometric_normal: zero,
         triangle: None,
-        ambient: view.sky(&ray.along),
+        ambient: view.sky_color(&ray.direction),
         sun: zero,
-        facing: 0.0,
+        cosine: 0.0,
         alpha: 1.0,
     }
 }
 
-/// A point of the ground at `t`: Lambertian, with haze.
-pub(super) fn ground(view: &View, ray: &Ray, t: f64) -> ShadedPoint {
-    let point = ray.at(t);
+/// Shades the Lambertian ground, with haze, at ray parameter `t`.
+pub(super) fn shade_ground(view: &View, ray: &Ray, t: f64) -> ShadedPoint {
+    let point = ray.point_at(t);
     let (color, haze) = view.ground_colors();
-    let clear = view.clear(&point);
-    let facing = view.up.dot(&view.to_sun).max(0.0);
+    let visibility = view.ground_visibility(&point);
+    let cosine = view.up.dot(&view.to_sun).max(0.0);
     ShadedPoint {
         point,
-        facet: view.up,
+        geometric_normal: view.up,
         triangle: None,
-        ambient: haze.lerp(&color.component_mul(&view.skylight), clear),
-        sun: color.component_mul(&view.sunlight) * (clear * facing),
-        facing: clear * facing,
+        ambient: haze.lerp(&color.component_mul(&view.skylight), visibility),
+        sun: color.component_mul(&view.sunlight) * (visibility * cosine),
+        cosine: visibility * cosine,
         alpha: 1.0,
     }
 }
 
-/// A point of a triangle.
-pub(super) fn surface(ray_scene: &RayScene, view: &View, ray: &Ray, hit: &Hit) -> ShadedPoint {
-    let paint = ray_scene.paint(hit);
-    let point = ray.at(hit.t);
-    let [r, g, b, a] = paint.color.as_ref().map_or([1.0; 4], |image| image.at(ray_scene.uv(hit)));
+/// Shades a point of a triangle.
+pub(super) fn shade_triangle(ray_scene: &RayScene, view: &View, ray: &Ray, hit: &Hit) -> ShadedPoint {
+    let material = ray_scene.material(hit);
+    let point = ray.point_at(hit.t);
+    let [r, g, b, a] = material.color.as_ref().map_or([1.0; 4], |image| image.sample(ray_scene.uv(hit)));
     let tint = Vector3::new(r, g, b);
-    let normal = normal(ray_scene, hit);
+    let normal = shading_normal(ray_scene, hit);
     let cosine = normal.dot(&view.to_sun);
     let mut sun = Vector3::zeros();
     if cosine > 0.0 {
-        let to_eye = unit(view.eye - point);
+        let to_eye = normalize(view.eye - point);
         let reflected = 2.0 * to_eye.dot(&normal) * normal - to_eye;
-        let gleam = reflected.dot(&view.to_sun);
-        let highlight = if gleam > 0.0 { gleam.powf(paint.exponent) } else { 0.0 };
-        let answer = cosine * paint.diffuse.component_mul(&tint) + highlight * paint.specular;
-        sun = answer.component_mul(&view.sunlight);
+        let specular_cosine = reflected.dot(&view.to_sun);
+        let highlight = if specular_cosine > 0.0 { specular_cosine.powf(material.exponent) } else { 0.0 };
+        let reflectance = cosine * material.diffuse.component_mul(&tint) + highlight * material.specular;
+        sun = reflectance.component_mul(&view.sunlight);
     }
-    let flat = ray_scene.triangles[hit.triangle].facet();
+    let geometric_normal = ray_scene.triangles[hit.triangle].geometric_normal();
     ShadedPoint {
         point,
-        facet: if flat.dot(&view.to_sun) < 0.0 { -flat } else { flat },
+        geometric_normal: if geometric_normal.dot(&view.to_sun) < 0.0 { -geometric_normal } else { geometric_normal },
         triangle: Some(hit.triangle),
-        ambient: view.skylight.component_mul(&paint.ambient).component_mul(&tint),
+        ambient: view.skylight.component_mul(&material.ambient).component_mul(&tint),
         sun,
-        facing: cosine.max(0.0),
-        alpha: if ray_scene.is_blended(hit) { paint.alpha * a } else { 1.0 },
+        cosine: cosine.max(0.0),
+        alpha: if ray_scene.is_blended(hit) { material.alpha * a } else { 1.0 },
     }
 }
 
 /// The interpolated normal, perturbed by the normal map and flipped to the visible side.
-fn normal(ray_scene: &RayScene, hit: &Hit) -> Vector3<f64> {
+fn shading_normal(ray_scene: &RayScene, hit: &Hit) -> Vector3<f64> {
     let corners = ray_scene.triangles[hit.triangle].corners.map(|corner| corner as usize);
     let weights = [1.0 - hit.u - hit.v, hit.u, hit.v];
     let mut normal: Vector3<f64> =
-        corners.iter().zip(weights).map(|(at, weight)| ray_scene.normals[*at] * weight).sum();
-    normal = unit(normal);
-    if let Some(image) = ray_scene.paint(hit).normal.as_ref().filter(|_| !ray_scene.tangents.is_empty()) {
-        let tangent =
-            |axis: usize| corners.iter().zip(weights).map(|(at, weight)| ray_scene.tangents[*at][axis] * weight).sum();
-        let [x, y, z, sign]: [f64; 4] = [0, 1, 2, 3].map(tangent);
-        let along = Vector3::new(x, y, z);
-        if along.norm_squared() > 0.0 {
+        corners.iter().zip(weights).map(|(corner, weight)| ray_scene.normals[*corner] * weight).sum();
+    normal = normalize(normal);
+    if let Some(image) = ray_scene.material(hit).normal.as_ref().filter(|_| !ray_scene.tangents.is_empty()) {
+        let tangent_component = |axis: usize| {
+            corners.iter().zip(weights).map(|(corner, weight)| ray_scene.tangents[*corner][axis] * weight).sum()
+        };
+        let [x, y, z, sign]: [f64; 4] = [0, 1, 2, 3].map(tangent_component);
+        let tangent = Vector3::new(x, y, z);
+        if tangent.norm_squared() > 0.0 {
             let [r, g, b] =
-                std::array::from_fn(|channel| (image.at(ray_scene.uv(hit))[channel] * 255.0 - 128.0) / 127.0);
-            let along = unit(along - normal * normal.dot(&along));
-            let across = normal.cross(&along) * if sign < 0.0 { -1.0 } else { 1.0 };
-            normal = unit(along * r + across * g + normal * b);
+                std::array::from_fn(|channel| (image.sample(ray_scene.uv(hit))[channel] * 255.0 - 128.0) / 127.0);
+            let tangent = normalize(tangent - normal * normal.dot(&tangent));
+            let bitangent = normal.cross(&tangent) * if sign < 0.0 { -1.0 } else { 1.0 };
+            normal = normalize(tangent * r + bitangent * g + normal * b);
         }
     }
     if hit.front { normal } else { -normal }
 }
 
-fn unit(vector: Vector3<f64>) -> Vector3<f64> {
+fn normalize(vector: Vector3<f64>) -> Vector3<f64> {
     vector / vector.norm_squared().max(1e-30).sqrt()
 }

@@ -1,4 +1,4 @@
-//! The `images` scene: upright panels with images of many sizes, and a long floor; each repeats its image.
+//! The `images` scene: upright panels with images of different sizes, and a long floor. Each repeats its image.
 
 use std::f32::consts::TAU;
 
@@ -7,46 +7,49 @@ use modalcast_model::domain::{Material, Mesh, Texture};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{RenderSettings, SceneParts};
 
-/// Image sizes of the upright panels, from left to right, lower row first. In a picture of default size their texels
-/// are between four pixels and half a pixel wide.
+/// Image sizes of the upright panels, from left to right, lower row first. In a frame of default size the texels of the
+/// smallest are four pixels wide, those of the largest half a pixel.
 const SIZES: [[u32; 2]; 6] = [[16, 16], [25, 15], [32, 32], [64, 64], [75, 50], [128, 128]];
-/// Repetitions along each side of an upright panel, and of the floor.
-const TURNS: (usize, usize) = (2, 24);
+/// Repetitions of the image along each side of an upright panel.
+const PANEL_REPETITIONS: usize = 2;
+/// Repetitions of the image along each side of the floor.
+const FLOOR_REPETITIONS: usize = 24;
 /// Size of the floor's image.
-const FLOOR: [u32; 2] = [24, 24];
+const FLOOR_IMAGE_SIZE: [u32; 2] = [24, 24];
 
 /// Builds the scene.
 ///
 /// # Errors
 /// None in practice: its sizes are constants.
-pub(super) fn panels() -> Result<SceneParts> {
+pub(super) fn build_panels() -> Result<SceneParts> {
     let mut parts = SceneParts::named("images");
-    for (at, size) in SIZES.iter().enumerate() {
-        let (column, row) = (at % 3, at / 3);
+    for (index, size) in SIZES.iter().enumerate() {
+        let (column, row) = (index % 3, index / 3);
         let corner = [1.1 * column as f32 - 1.6, 0.1 + 1.1 * row as f32, 0.0];
-        let mesh = tiled(corner, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], TURNS.0)?;
-        hang(&mut parts, &format!("panel {} x {}", size[0], size[1]), mesh, *size)?;
+        let mesh = repeated_quads(corner, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], PANEL_REPETITIONS)?;
+        add_panel(&mut parts, &format!("panel {} x {}", size[0], size[1]), mesh, *size)?;
     }
-    let floor = tiled([-4.0, 0.0, 5.0], [[8.0, 0.0, 0.0], [0.0, 0.0, -8.0]], TURNS.1)?;
-    hang(&mut parts, "floor", floor, FLOOR)?;
+    let floor = repeated_quads([-4.0, 0.0, 5.0], [[8.0, 0.0, 0.0], [0.0, 0.0, -8.0]], FLOOR_REPETITIONS)?;
+    add_panel(&mut parts, "floor", floor, FLOOR_IMAGE_SIZE)?;
     parts.look = RenderSettings { sun: [0.35, 0.6, 0.7], shadow: None, ground: None, ..RenderSettings::default() };
     Ok(parts)
 }
 
-fn hang(parts: &mut SceneParts, name: &str, mesh: Mesh, [width, height]: [u32; 2]) -> Result<()> {
-    parts.textures.push(weave(name, width, height)?);
+/// Adds a panel with a new image of this size.
+fn add_panel(parts: &mut SceneParts, name: &str, mesh: Mesh, [width, height]: [u32; 2]) -> Result<()> {
+    parts.textures.push(test_image(name, width, height)?);
     let color_texture = Some(parts.textures.len() - 1);
     add_rigid_domain(parts, name, mesh, Material { color_texture, double_sided: true, ..Material::default() })
 }
 
-/// A parallelogram of `turns` x `turns` cells. Each cell shows the image once and has its own corners.
-fn tiled(corner: [f32; 3], sides: [[f32; 3]; 2], turns: usize) -> Result<Mesh> {
+/// A parallelogram of `repetitions` x `repetitions` cells. Each cell shows the image once and has its own corners.
+fn repeated_quads(corner: [f32; 3], sides: [[f32; 3]; 2], repetitions: usize) -> Result<Mesh> {
     let point = |u: usize, v: usize| {
-        let [u, v] = [u, v].map(|turn| turn as f32 / turns as f32);
+        let [u, v] = [u, v].map(|index| index as f32 / repetitions as f32);
         std::array::from_fn(|axis| corner[axis] + u * sides[0][axis] + v * sides[1][axis])
     };
     let (mut rest, mut uvs, mut triangles): (Vec<[f32; 3]>, _, Vec<[u32; 3]>) = (Vec::new(), Vec::new(), Vec::new());
-    for (column, row) in (0..turns * turns).map(|cell| (cell % turns, cell / turns)) {
+    for (column, row) in (0..repetitions * repetitions).map(|cell| (cell % repetitions, cell / repetitions)) {
         let first = rest.len() as u32;
         for (u, v) in [(0, 0), (1, 0), (1, 1), (0, 1)] {
             rest.push(point(column + u, row + v));
@@ -60,15 +63,15 @@ fn tiled(corner: [f32; 3], sides: [[f32; 3]; 2], turns: usize) -> Result<Mesh> {
 }
 
 /// A seamless image: waves of whole periods in three colors, with a thin dark border that marks its edges.
-fn weave(name: &str, width: u32, height: u32) -> Result<Texture> {
-    let wave = |place: f32| 0.5 + 0.5 * (TAU * place).sin();
-    let pixel = |at: u32| {
-        let (x, y) = (at % width, at / width);
+fn test_image(name: &str, width: u32, height: u32) -> Result<Texture> {
+    let wave = |phase: f32| 0.5 + 0.5 * (TAU * phase).sin();
+    let pixel = |index: u32| {
+        let (x, y) = (index % width, index / width);
         let (u, v) = ((x as f32 + 0.5) / width as f32, (y as f32 + 0.5) / height as f32);
-        let rim = x < width.div_ceil(32) || y < height.div_ceil(32);
-        let light = if rim { 0.15 } else { 0.35 + 0.65 * wave(3.0 * u + 2.0 * wave(v)) };
+        let is_border = x < width.div_ceil(32) || y < height.div_ceil(32);
+        let brightness = if is_border { 0.15 } else { 0.35 + 0.65 * wave(3.0 * u + 2.0 * wave(v)) };
         let color = [0.9 - 0.4 * wave(v), 0.45 + 0.4 * wave(u + v), 0.35 + 0.5 * wave(2.0 * v - u)];
-        let [r, g, b] = color.map(|channel| (255.0 * channel * light) as u8);
+        let [r, g, b] = color.map(|channel| (255.0 * channel * brightness) as u8);
         [r, g, b, 255]
     };
     Texture::new(name, width, height, (0..width * height).flat_map(pixel).collect())

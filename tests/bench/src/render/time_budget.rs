@@ -11,27 +11,28 @@ pub(super) struct TimeBudget {
     steps: usize,
     begin: Instant,
     /// Time of the first step, which includes preparations that the other steps reuse.
-    first: Option<Duration>,
-    done: usize,
+    first_step: Option<Duration>,
+    finished_steps: usize,
 }
 
 impl TimeBudget {
     /// Starts the timer.
     pub(super) fn new(budget: Duration, steps: usize) -> Self {
-        Self { budget, steps, begin: Instant::now(), first: None, done: 0 }
+        Self { budget, steps, begin: Instant::now(), first_step: None, finished_steps: 0 }
     }
 
-    /// Counts a finished step. After the second one, returns a reason to stop if all steps would exceed the budget.
-    pub(super) fn tick(&mut self, what: &str) -> Option<String> {
+    /// Counts a finished step. After the second step, returns a reason to stop if all steps would exceed the budget.
+    /// `work` names the timed work in the message.
+    pub(super) fn finish_step(&mut self, work: &str) -> Option<String> {
         let elapsed = self.begin.elapsed();
-        self.done += 1;
-        let first = *self.first.get_or_insert(elapsed);
-        let rest = self.steps.saturating_sub(1) as u32;
-        // Decide only once, so that work that continues runs to its end.
-        let all = (self.done == 2).then(|| first + (elapsed - first) * rest)?;
-        (all > self.budget).then(|| {
-            let (all, budget) = (all.as_secs_f64(), self.budget.as_secs_f64());
-            format!("{what} of {} steps would take {all:.0} s, more than the {budget:.0} s that they may", self.steps)
+        self.finished_steps += 1;
+        let first_step = *self.first_step.get_or_insert(elapsed);
+        let remaining_steps = self.steps.saturating_sub(1) as u32;
+        // Decide only once, so that a sequence that continues is not cut short.
+        let total = (self.finished_steps == 2).then(|| first_step + (elapsed - first_step) * remaining_steps)?;
+        (total > self.budget).then(|| {
+            let (total, budget) = (total.as_secs_f64(), self.budget.as_secs_f64());
+            format!("expected {work} of {} steps in at most {budget:.0} s, would take {total:.0} s", self.steps)
         })
     }
 }
@@ -43,11 +44,11 @@ mod tests {
     #[test]
     fn stops_after_two_steps_if_budget_would_be_exceeded() {
         let mut long = TimeBudget::new(Duration::from_secs(1000), 60);
-        assert!((0..60).all(|_| long.tick("frames").is_none()));
+        assert!((0..60).all(|_| long.finish_step("frames").is_none()));
         let mut short = TimeBudget::new(Duration::from_millis(50), 60);
-        assert_eq!(short.tick("frames"), None, "one step says too little");
+        assert_eq!(short.finish_step("frames"), None, "the first step does not decide");
         std::thread::sleep(Duration::from_millis(5));
-        let why = short.tick("frames").expect("59 times 5 ms are more than 50");
-        assert!(why.starts_with("frames of 60 steps would take"), "{why}");
+        let reason = short.finish_step("frames").expect("a reason to stop: 59 steps of 5 ms exceed 50 ms");
+        assert!(reason.starts_with("expected frames of 60 steps in at most"), "{reason}");
     }
 }

@@ -1,6 +1,6 @@
-//! The rendering variants: ways to draw the same scene, each a change of its look.
+//! The rendering variants: ways to draw the same scene, each with changed render settings.
 //!
-//! To add a variant, add it to [`all`]: its name, method, change of the look, and intended result.
+//! To add a variant, add it to [`all`]: its name, method, changed settings, and intended result.
 
 use serde::Serialize;
 
@@ -57,43 +57,44 @@ pub struct RenderVariant {
     pub name: String,
     pub method: ShadowVariant,
     pub shadow: Option<ShadowSettings>,
-    /// Transparency method, for variants that compare it; otherwise that of the load's look.
+    /// Transparency method, for variants that compare it; `None` uses that of the load's settings.
     pub transparency: Option<Transparency>,
     /// Packing of images in arrays, for variants that compare it.
     pub packing: Option<Packing>,
-    /// Culling, for variants that compare it. It does not change the picture.
+    /// Culling, for variants that compare it. It does not change the image.
     pub culling: Option<Culling>,
-    /// Implementation of the shadow blur. It does not change the picture beyond rounding.
+    /// Implementation of the shadow blur. It changes the image only by rounding.
     pub blur_method: BlurMethod,
-    pub aim: ReferenceKind,
+    pub intended: ReferenceKind,
 }
 
-/// Twice the errors of small pictures with many leaves, where each leaf covers a pixel or two; all other errors are far
-/// below. A missing or displaced shadow exceeds the last two bounds, however small its part of the picture is.
+/// Twice the errors of small images with many leaves, where each leaf covers a pixel or two; all other errors are far
+/// smaller. A missing or displaced shadow exceeds `bleeding` or `lost` even if it covers a small part of the image.
 pub(super) const ERROR_LIMITS: ErrorLimits =
     ErrorLimits { mean_color: 16.0, mean_light: 0.2, bleeding: 0.25, lost: 0.25 };
 /// Bound on light bleeding of a filtered map where no two casters overlap: Chebyshev's bound is exact there, and only
 /// rounding remains.
-const EXACT: f64 = 0.01;
-/// Bound on the mean light error of the shelf. Its shadow fills half of the picture and is narrower than the widest
-/// blur. The depths of the ground itself then vary as much as the shelf's height above it, and most of the sunlight
+const EXACT_BLEEDING_LIMIT: f64 = 0.01;
+/// Bound on the mean light error of the shelf. Its shadow fills half of the image and is narrower than the widest blur.
+/// The depths of the ground itself then vary as much as the shelf's height above it, and most of the sunlight
 /// leaks through.
-const NARROW: f64 = 0.4;
+const SHELF_MEAN_LIGHT_LIMIT: f64 = 0.4;
 
-/// Sides of shadow maps, and standard deviations of their blur in texels.
+/// Sides of shadow maps, texels.
 const SIZES: [u32; 4] = [512, 1024, 2048, 4096];
+/// Standard deviations of the blur, texels.
 const BLURS: [f32; 3] = [0.0, 1.5, 4.0];
 
 impl RenderVariant {
-    /// The look of a scene as this variant draws it.
-    pub fn look(&self, look: RenderSettings) -> RenderSettings {
+    /// The render settings of a scene as this variant draws it.
+    pub fn settings(&self, look: RenderSettings) -> RenderSettings {
         let (transparency, culling) =
             (self.transparency.unwrap_or(look.transparency), self.culling.unwrap_or(look.culling));
         RenderSettings { shadow: self.shadow, transparency, culling, ..look }
     }
 
     /// Whether a load has the features that the variant compares.
-    pub fn suits(&self, load: RenderWorkload) -> bool {
+    pub fn is_applicable(&self, load: RenderWorkload) -> bool {
         let is_large = matches!(load, RenderWorkload::Tree | RenderWorkload::Grove | RenderWorkload::Triangles(_));
         let has_images = self.packing.is_some() == (load == RenderWorkload::Images);
         has_images
@@ -103,17 +104,17 @@ impl RenderVariant {
 
     /// Error bounds on a load.
     pub fn bounds(&self, load: RenderWorkload) -> ErrorLimits {
-        let bleeding = match (self.aim, load) {
-            (ReferenceKind::Filtered { .. }, RenderWorkload::Square | RenderWorkload::Shelf) => EXACT,
+        let bleeding = match (self.intended, load) {
+            (ReferenceKind::Filtered { .. }, RenderWorkload::Square | RenderWorkload::Shelf) => EXACT_BLEEDING_LIMIT,
             _ => ERROR_LIMITS.bleeding,
         };
-        let mean_light = if load == RenderWorkload::Shelf { NARROW } else { ERROR_LIMITS.mean_light };
+        let mean_light = if load == RenderWorkload::Shelf { SHELF_MEAN_LIGHT_LIMIT } else { ERROR_LIMITS.mean_light };
         ErrorLimits { bleeding, mean_light, ..ERROR_LIMITS }
     }
 
-    /// Whether the variant is stated to exceed its bounds on a load: f16 second moments let light into a shadow near
-    /// its caster.
-    pub fn is_to_fail(&self, load: RenderWorkload) -> bool {
+    /// Whether the variant is expected to exceed its bounds on a load: with f16 second moments, light bleeds into a
+    /// shadow near its caster.
+    pub fn is_expected_to_fail(&self, load: RenderWorkload) -> bool {
         load == RenderWorkload::Shelf && self.shadow.is_some_and(|shadow| shadow.moments == MomentFormat::F16)
     }
 
@@ -126,7 +127,7 @@ impl RenderVariant {
             packing: None,
             culling: None,
             blur_method: BlurMethod::Auto,
-            aim: ReferenceKind::Unshadowed,
+            intended: ReferenceKind::Unshadowed,
         }
     }
 
@@ -141,48 +142,49 @@ impl RenderVariant {
             packing: None,
             culling: None,
             blur_method: BlurMethod::Auto,
-            aim: ReferenceKind::Hard,
+            intended: ReferenceKind::Hard,
         }
     }
 
     /// A map whose comparisons are weighted by a Gaussian of `blur` texels around the shaded point (PCF).
     fn filtered(size: u32, blur: f32) -> Self {
         let shadow = ShadowSettings { method: ShadowMethod::PercentageCloser, size, blur, ..ShadowSettings::default() };
-        Self::soft(format!("filtered {size}, blur {blur}"), ShadowVariant::Filtered, shadow)
+        Self::with_soft_shadow(format!("filtered {size}, blur {blur}"), ShadowVariant::Filtered, shadow)
     }
 
     /// A variance map whose moments are blurred by a Gaussian of `blur` texels and then interpolated.
     fn variance(size: u32, blur: f32) -> Self {
         let shadow = ShadowSettings { size, blur, ..ShadowSettings::default() };
-        Self::soft(format!("variance {size}, blur {blur}"), ShadowVariant::Variance, shadow)
+        Self::with_soft_shadow(format!("variance {size}, blur {blur}"), ShadowVariant::Variance, shadow)
     }
 
-    fn f16(size: u32) -> Self {
+    /// A variance map with f16 moments.
+    fn with_f16_moments(size: u32) -> Self {
         let shadow = ShadowSettings { size, moments: MomentFormat::F16, ..ShadowSettings::default() };
-        Self::soft(format!("variance {size}, f16"), ShadowVariant::Variance, shadow)
+        Self::with_soft_shadow(format!("variance {size}, f16"), ShadowVariant::Variance, shadow)
     }
 
     /// A variance map without light-bleeding reduction.
-    fn uncut(size: u32, blur: f32) -> Self {
+    fn without_bleeding_reduction(size: u32, blur: f32) -> Self {
         let shadow = ShadowSettings { size, blur, bleeding: 0.0, ..ShadowSettings::default() };
-        Self::soft(format!("variance {size}, blur {blur}, bleeding uncut"), ShadowVariant::Variance, shadow)
+        Self::with_soft_shadow(format!("variance {size}, blur {blur}, bleeding uncut"), ShadowVariant::Variance, shadow)
     }
 
     /// A map that is fitted to the corners of the bounding box, as in the thesis.
-    fn cornered(size: u32) -> Self {
+    fn fitted_to_corners(size: u32) -> Self {
         let shadow = ShadowSettings { size, fit: ShadowFit::Corners, ..ShadowSettings::default() };
-        Self::soft(format!("variance {size}, fitted to corners"), ShadowVariant::Variance, shadow)
+        Self::with_soft_shadow(format!("variance {size}, fitted to corners"), ShadowVariant::Variance, shadow)
     }
 
-    /// The same picture with the blur in other passes: a baseline for times.
-    fn blurred((size, blur): (u32, f32), (name, blur_method): (&str, BlurMethod)) -> Self {
+    /// A variance map with this implementation of the blur: a baseline for times.
+    fn with_blur_method((size, blur): (u32, f32), (name, blur_method): (&str, BlurMethod)) -> Self {
         let shadow = ShadowSettings { size, blur, ..ShadowSettings::default() };
         let name = format!("variance {size}, blur {blur}, {name}");
-        Self { blur_method, ..Self::soft(name, ShadowVariant::Variance, shadow) }
+        Self { blur_method, ..Self::with_soft_shadow(name, ShadowVariant::Variance, shadow) }
     }
 
     /// Cascaded maps, sharper near the camera. The intended result is the hard shadow.
-    fn split(size: u32, splits: u32) -> Self {
+    fn with_splits(size: u32, splits: u32) -> Self {
         let shadow = ShadowSettings { size, splits, ..ShadowSettings::default() };
         let name = format!("variance {size}, {splits} splits");
         Self {
@@ -193,27 +195,28 @@ impl RenderVariant {
             packing: None,
             culling: None,
             blur_method: BlurMethod::Auto,
-            aim: ReferenceKind::Hard,
+            intended: ReferenceKind::Hard,
         }
     }
 
     /// Panes with this transparency method, without shadows.
-    fn blended(name: &str, transparency: Transparency) -> Self {
+    fn with_transparency(name: &str, transparency: Transparency) -> Self {
         Self { name: name.into(), transparency: Some(transparency), ..Self::unshadowed() }
     }
 
     /// Images with this packing, without shadows.
-    fn packed(name: &str, packing: Packing) -> Self {
+    fn with_packing(name: &str, packing: Packing) -> Self {
         Self { name: name.into(), packing: Some(packing), ..Self::unshadowed() }
     }
 
-    /// The same picture from fewer triangles.
-    fn culled((name, culling): (&str, Culling)) -> Self {
+    /// The same image with this culling.
+    fn with_culling((name, culling): (&str, Culling)) -> Self {
         Self { name: format!("culling {name}"), culling: Some(culling), ..Self::variance(2048, BLURS[1]) }
     }
 
-    fn soft(name: String, method: ShadowVariant, shadow: ShadowSettings) -> Self {
-        let aim = ReferenceKind::Filtered { texels: shadow.filter_deviation() };
+    /// A variant whose intended result is the filtered shadow.
+    fn with_soft_shadow(name: String, method: ShadowVariant, shadow: ShadowSettings) -> Self {
+        let intended = ReferenceKind::Filtered { texels: shadow.filter_deviation() };
         Self {
             name,
             method,
@@ -222,15 +225,15 @@ impl RenderVariant {
             packing: None,
             culling: None,
             blur_method: BlurMethod::Auto,
-            aim,
+            intended,
         }
     }
 }
 
-/// All variants, or the few of a quick run.
+/// All variants, or a selection for a quick run.
 pub fn all(quick: bool) -> Vec<RenderVariant> {
     if quick {
-        return few();
+        return quick_variants();
     }
     let mut all = vec![RenderVariant::unshadowed()];
     for size in SIZES {
@@ -238,17 +241,17 @@ pub fn all(quick: bool) -> Vec<RenderVariant> {
         all.extend(BLURS[1..].iter().map(|blur| RenderVariant::filtered(size, *blur)));
         all.extend(BLURS.iter().map(|blur| RenderVariant::variance(size, *blur)));
     }
-    all.extend([2048, 4096].map(RenderVariant::f16));
-    all.extend(BLURS[1..].iter().map(|blur| RenderVariant::uncut(1024, *blur)));
-    all.extend((2..=4).map(|splits| RenderVariant::split(1024, splits)));
-    all.push(RenderVariant::cornered(2048));
+    all.extend([2048, 4096].map(RenderVariant::with_f16_moments));
+    all.extend(BLURS[1..].iter().map(|blur| RenderVariant::without_bleeding_reduction(1024, *blur)));
+    all.extend((2..=4).map(|splits| RenderVariant::with_splits(1024, splits)));
+    all.push(RenderVariant::fitted_to_corners(2048));
     let passes = [("tiles", BlurMethod::Tiles), ("rows", BlurMethod::Rows), ("fragments", BlurMethod::Fragments)];
     // Blurs of 25 taps per direction, and of 15.
     for map in [(1024, 4.0), (4096, 4.0), (4096, 2.3)] {
-        all.extend(passes.map(|pass| RenderVariant::blurred(map, pass)));
+        all.extend(passes.map(|pass| RenderVariant::with_blur_method(map, pass)));
     }
-    all.push(RenderVariant::blended("exact transparency", Transparency::OrderIndependent));
-    all.push(RenderVariant::blended("two-pass transparency", Transparency::TwoPass));
+    all.push(RenderVariant::with_transparency("exact transparency", Transparency::OrderIndependent));
+    all.push(RenderVariant::with_transparency("two-pass transparency", Transparency::TwoPass));
     all.extend(packings());
     all.extend(cullings());
     all
@@ -256,34 +259,34 @@ pub fn all(quick: bool) -> Vec<RenderVariant> {
 
 fn packings() -> [RenderVariant; 3] {
     [
-        RenderVariant::packed("images by size", Packing::Classes),
-        RenderVariant::packed("images repeat-filled", Packing::Repeated),
-        RenderVariant::packed("images repeat-filled, whole", Packing::RepeatedWhole),
+        RenderVariant::with_packing("images by size", Packing::Classes),
+        RenderVariant::with_packing("images repeat-filled", Packing::Repeated),
+        RenderVariant::with_packing("images repeat-filled, whole", Packing::RepeatedWhole),
     ]
 }
 
 fn cullings() -> [RenderVariant; 3] {
     [("none", Culling::None), ("triangles", Culling::Triangles), ("depth", Culling::Occlusion)]
-        .map(RenderVariant::culled)
+        .map(RenderVariant::with_culling)
 }
 
-fn few() -> Vec<RenderVariant> {
-    let mut few = vec![
+fn quick_variants() -> Vec<RenderVariant> {
+    let mut quick = vec![
         RenderVariant::unshadowed(),
         RenderVariant::variance(512, BLURS[1]),
         RenderVariant::variance(512, BLURS[2]),
         RenderVariant::variance(2048, BLURS[1]),
         RenderVariant::standard(1024),
         RenderVariant::filtered(1024, BLURS[1]),
-        RenderVariant::f16(2048),
-        RenderVariant::split(1024, 3),
-        RenderVariant::cornered(2048),
-        RenderVariant::blended("exact transparency", Transparency::OrderIndependent),
-        RenderVariant::blended("two-pass transparency", Transparency::TwoPass),
+        RenderVariant::with_f16_moments(2048),
+        RenderVariant::with_splits(1024, 3),
+        RenderVariant::fitted_to_corners(2048),
+        RenderVariant::with_transparency("exact transparency", Transparency::OrderIndependent),
+        RenderVariant::with_transparency("two-pass transparency", Transparency::TwoPass),
     ];
-    few.extend(packings());
-    few.extend(cullings());
-    few
+    quick.extend(packings());
+    quick.extend(cullings());
+    quick
 }
 
 #[cfg(test)]
@@ -297,35 +300,41 @@ mod tests {
             let names: std::collections::BTreeSet<&str> = all.iter().map(|variant| variant.name.as_str()).collect();
             assert_eq!((names.len(), all.len()), if quick { (17, 17) } else { (50, 50) });
             for variant in &all {
-                let look = variant.look(RenderSettings::default());
+                let look = variant.settings(RenderSettings::default());
                 let transparency = variant.transparency.unwrap_or_default();
                 let culling = variant.culling.unwrap_or_default();
-                let plain = RenderSettings { shadow: None, transparency, culling, ..RenderSettings::default() };
-                assert_eq!(RenderSettings { shadow: None, ..look }, plain);
-                let (blends, packs) = (variant.transparency.is_some(), variant.packing.is_some());
-                let suits = [RenderWorkload::Panes, RenderWorkload::Tree, RenderWorkload::Images]
-                    .map(|load| variant.suits(load));
-                let culls = variant.culling.is_some();
-                assert_eq!(suits, [!packs && !culls, !packs && !blends, packs], "{}", variant.name);
-                assert_eq!(look.shadow.is_none(), variant.aim == ReferenceKind::Unshadowed);
+                let expected = RenderSettings { shadow: None, transparency, culling, ..RenderSettings::default() };
+                assert_eq!(RenderSettings { shadow: None, ..look }, expected);
+                let (has_transparency, has_packing) = (variant.transparency.is_some(), variant.packing.is_some());
+                let is_applicable = [RenderWorkload::Panes, RenderWorkload::Tree, RenderWorkload::Images]
+                    .map(|load| variant.is_applicable(load));
+                let has_culling = variant.culling.is_some();
+                assert_eq!(
+                    is_applicable,
+                    [!has_packing && !has_culling, !has_packing && !has_transparency, has_packing],
+                    "{}",
+                    variant.name
+                );
+                assert_eq!(look.shadow.is_none(), variant.intended == ReferenceKind::Unshadowed);
             }
         }
     }
     #[test]
-    fn only_f16_on_the_shelf_is_stated_to_fail() {
+    fn only_f16_on_the_shelf_is_expected_to_fail() {
         for variant in all(false) {
             let loads: Vec<RenderWorkload> =
-                RenderWorkload::all(false).into_iter().filter(|load| variant.is_to_fail(*load)).collect();
-            let wanted: &[RenderWorkload] = if variant.name.contains("f16") { &[RenderWorkload::Shelf] } else { &[] };
-            assert_eq!(loads, wanted, "{}", variant.name);
+                RenderWorkload::all(false).into_iter().filter(|load| variant.is_expected_to_fail(*load)).collect();
+            let expected: &[RenderWorkload] = if variant.name.contains("f16") { &[RenderWorkload::Shelf] } else { &[] };
+            assert_eq!(loads, expected, "{}", variant.name);
         }
     }
 
     #[test]
     fn only_filtered_maps_get_the_exact_bleeding_bound() {
-        let soft = RenderVariant::variance(512, 1.5);
+        let filtered = RenderVariant::variance(512, 1.5);
         assert!(
-            soft.bounds(RenderWorkload::Square).bleeding < 0.02 && soft.bounds(RenderWorkload::Tree) == ERROR_LIMITS
+            filtered.bounds(RenderWorkload::Square).bleeding < 0.02
+                && filtered.bounds(RenderWorkload::Tree) == ERROR_LIMITS
         );
         assert_eq!(RenderVariant::standard(512).bounds(RenderWorkload::Square), ERROR_LIMITS);
     }

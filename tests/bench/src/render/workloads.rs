@@ -3,10 +3,10 @@
 //!
 //! | name | contents |
 //! |---|---|
-//! | `square` | a square that floats above the ground: umbra and penumbra are known |
-//! | `shelf` | the narrow shadow of a square just above the ground, from nearby and far from the middle of all depths |
-//! | `panes` | three translucent panes in front of each other and an opaque one behind, listed in the wrong order |
-//! | `texture_panels` | panels with images of many sizes, each repeated |
+//! | `square` | a square that floats above the ground; its umbra and penumbra are known |
+//! | `shelf` | the narrow shadow of a square just above the ground, at one end of the depth range |
+//! | `panes` | three translucent panes in front of an opaque wall, listed from nearest to farthest |
+//! | `images` | panels with images of many sizes, each repeated |
 //! | `tree` | the built-in tree |
 //! | `grove` | four built-in trees |
 //! | `triangles-N` | a rolling field of about N triangles with poles on it |
@@ -26,7 +26,7 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::load;
 use modalcast_model::scene::{Camera, Lens, RenderSettings, Scene, SceneParts, SceneState, View};
 
-/// Identifies a scene.
+/// Identifies a load: a scene of the benchmark.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RenderWorkload {
     Square,
@@ -39,30 +39,32 @@ pub enum RenderWorkload {
     Triangles(usize),
 }
 
-/// Default triangle count of the field: in a full and in a quick run.
-const FIELD: (usize, usize) = (1_000_000, 50_000);
-/// Upper limit of triangles that a name may request.
-const MOST: usize = 8_000_000;
+/// Default triangle counts of the field in a full and in a quick run.
+const FIELD_TRIANGLES: (usize, usize) = (1_000_000, 50_000);
+/// Largest triangle count that a name may request.
+const MAX_TRIANGLES: usize = 8_000_000;
 
 /// A scene and its motion.
 pub(super) struct AnimatedScene {
     pub(super) name: String,
-    pub(super) kind: RenderWorkload,
+    pub(super) workload: RenderWorkload,
     pub(super) scene: Arc<Scene>,
     motion: WorkloadMotion,
-    /// The domain that moves on a circle; `None` when only modes move.
-    slides: Option<usize>,
+    /// The domain that moves on a circle; `None` if only modes are animated.
+    sliding_domain: Option<usize>,
 }
 
-/// Seconds between steps, radius of the circle as a fraction of the diagonal, and scale of the modal amplitudes.
+/// Seconds between steps.
 const DT: f64 = 1.0 / 60.0;
-const SLIDE: f64 = 0.02;
-const SWAY: f64 = 0.2;
+/// Radius of the sliding domain's circle as a fraction of the scene's diagonal.
+const SLIDE_RADIUS: f64 = 0.02;
+/// Factor of the modal amplitudes.
+const SWAY_AMPLITUDE: f64 = 0.2;
 
 impl RenderWorkload {
     /// Every load, in the order of the report.
     pub fn all(quick: bool) -> Vec<Self> {
-        let field = Self::Triangles(if quick { FIELD.1 } else { FIELD.0 });
+        let field = Self::Triangles(if quick { FIELD_TRIANGLES.1 } else { FIELD_TRIANGLES.0 });
         vec![Self::Square, Self::Shelf, Self::Panes, Self::Images, Self::Tree, Self::Grove, field]
     }
 
@@ -71,7 +73,7 @@ impl RenderWorkload {
     /// # Errors
     /// `Invalid` when there is none.
     pub fn named(name: &str) -> Result<Self> {
-        let found = match name {
+        let workload = match name {
             "square" => Some(Self::Square),
             "shelf" => Some(Self::Shelf),
             "panes" => Some(Self::Panes),
@@ -80,11 +82,11 @@ impl RenderWorkload {
             "grove" => Some(Self::Grove),
             _ => {
                 let count = name.strip_prefix("triangles-").and_then(|count| count.parse().ok());
-                count.filter(|count| (2..=MOST).contains(count)).map(Self::Triangles)
+                count.filter(|count| (2..=MAX_TRIANGLES).contains(count)).map(Self::Triangles)
             }
         };
-        let expected = format!("square, shelf, panes, images, tree, grove, or triangles-N (2 to {MOST})");
-        found.ok_or_else(|| invalid("load", expected, name))
+        let expected = format!("square, shelf, panes, images, tree, grove, or triangles-N (2 to {MAX_TRIANGLES})");
+        workload.ok_or_else(|| invalid("load", expected, name))
     }
 
     /// The name that [`Self::named`] takes.
@@ -104,32 +106,33 @@ impl RenderWorkload {
     ///
     /// # Errors
     /// Errors of [`Scene::new`] and of generating the tree.
-    pub(super) fn stage(self) -> Result<AnimatedScene> {
-        let (scene, slides) = match self {
+    pub(super) fn build(self) -> Result<AnimatedScene> {
+        let (scene, sliding_domain) = match self {
             Self::Square => (Scene::new(square()?)?, Some(1)),
             Self::Shelf => (Scene::new(shelf()?)?, None),
             Self::Panes => (Scene::new(panes()?)?, Some(1)),
-            Self::Images => (Scene::new(texture_panels::panels()?)?, Some(0)),
+            Self::Images => (Scene::new(texture_panels::build_panels()?)?, Some(0)),
             Self::Tree => (load::open("tree")?.scene, None),
             Self::Grove => (Scene::new(grove(load::open("tree")?.scene.as_ref()))?, None),
             Self::Triangles(count) => (Scene::new(field(count)?)?, Some(1)),
         };
-        Ok(AnimatedScene::new(self, scene, slides))
+        Ok(AnimatedScene::new(self, scene, sliding_domain))
     }
 }
 
 impl AnimatedScene {
-    fn new(kind: RenderWorkload, scene: Arc<Scene>, slides: Option<usize>) -> Self {
-        let load = Workload::new(kind.name(), scene);
+    fn new(workload: RenderWorkload, scene: Arc<Scene>, sliding_domain: Option<usize>) -> Self {
+        let load = Workload::new(workload.name(), scene);
         let motion = WorkloadMotion::new(&load, None);
-        Self { name: load.name, kind, scene: load.scene, motion, slides }
+        Self { name: load.name, workload, scene: load.scene, motion, sliding_domain }
     }
 
-    /// The camera of its pictures. It frames the whole scene, except for `shelf` (the shadow alone) and `texture_panels`.
+    /// The camera of the load's images. It frames the whole scene, except for `shelf` (only the shadow) and
+    /// `images`.
     pub(super) fn camera(&self, size: Size) -> Camera {
-        match self.kind {
+        match self.workload {
             RenderWorkload::Shelf => {}
-            // The panels fill the picture, and the floor extends beyond it.
+            // The panels fill the image; the floor extends beyond it.
             RenderWorkload::Images => {
                 let view = View::LookAt { eye: [0.5, 1.5, 4.6], target: [0.0, 1.05, 0.0], up: [0.0, 1.0, 0.0] };
                 return Camera { view, lens: Lens::FieldOfView(34.0), near: 0.0, far: 0.0 };
@@ -145,15 +148,15 @@ impl AnimatedScene {
     /// sliding domain, that domain moves on a small circle.
     pub(super) fn state(&self, step: usize) -> SceneState {
         let mut state = SceneState::rest(&self.scene);
-        for (own, swing) in state.q.iter_mut().zip(self.motion.step(step).q) {
-            *own += (SWAY * swing) as f32;
+        for (q, displacement) in state.q.iter_mut().zip(self.motion.step(step).q) {
+            *q += (SWAY_AMPLITUDE * displacement) as f32;
         }
-        if let Some(domain) = self.slides {
-            let (reach, angle) = (SLIDE * self.scene.rest_bounds.diagonal(), TAU * 0.5 * step as f64 * DT);
-            let turn = self.scene.up.rotation_from_y_up();
-            let aside = turn * Vector3::new(reach * angle.sin(), 0.0, reach * (1.0 - angle.cos()));
-            let place = self.scene.domains[domain].placement.to_matrix();
-            state.transforms[domain] = Transform::from_matrix(&(Matrix4::new_translation(&aside) * place));
+        if let Some(domain) = self.sliding_domain {
+            let (radius, angle) = (SLIDE_RADIUS * self.scene.rest_bounds.diagonal(), TAU * 0.5 * step as f64 * DT);
+            let from_y_up = self.scene.up.rotation_from_y_up();
+            let offset = from_y_up * Vector3::new(radius * angle.sin(), 0.0, radius * (1.0 - angle.cos()));
+            let placement = self.scene.domains[domain].placement.to_matrix();
+            state.transforms[domain] = Transform::from_matrix(&(Matrix4::new_translation(&offset) * placement));
         }
         state.mark_all_dirty();
         state
@@ -161,11 +164,11 @@ impl AnimatedScene {
 }
 
 /// State of a scene in a light wind.
-pub(super) fn swaying(scene: &Arc<Scene>) -> SceneState {
+pub(super) fn swaying_state(scene: &Arc<Scene>) -> SceneState {
     let load = Workload::new(scene.name.clone(), Arc::clone(scene));
     let mut state = SceneState::rest(scene);
-    for (own, swing) in state.q.iter_mut().zip(WorkloadMotion::new(&load, None).step(10).q) {
-        *own += (SWAY * swing) as f32;
+    for (q, displacement) in state.q.iter_mut().zip(WorkloadMotion::new(&load, None).step(10).q) {
+        *q += (SWAY_AMPLITUDE * displacement) as f32;
     }
     state.mark_all_dirty();
     state
@@ -176,24 +179,24 @@ pub(super) fn quad(corners: [[f32; 3]; 4], normal: [f32; 3]) -> Result<Mesh> {
     Mesh::from_indexed(corners.to_vec(), vec![normal; 4], Vec::new(), vec![[0, 1, 2], [0, 2, 3]])
 }
 
-/// A square of side `2 * half` that faces up at this height.
-pub(super) fn lying(half: f32, height: f32) -> Result<Mesh> {
-    let at = |x: f32, z: f32| [x * half, height, z * half];
-    quad([at(-1.0, 1.0), at(1.0, 1.0), at(1.0, -1.0), at(-1.0, -1.0)], [0.0, 1.0, 0.0])
+/// A square of side `2 * half_side` that faces up at this height.
+pub(super) fn horizontal_square(half_side: f32, height: f32) -> Result<Mesh> {
+    let point = |x: f32, z: f32| [x * half_side, height, z * half_side];
+    quad([point(-1.0, 1.0), point(1.0, 1.0), point(1.0, -1.0), point(-1.0, -1.0)], [0.0, 1.0, 0.0])
 }
 
-/// A room of about 10,000 triangles seen from inside: not a load of its own, but a mesh that fills the frame.
+/// A room of about 10,000 triangles seen from inside. It fills the frame and is used by the rasterizer benchmarks only.
 pub(super) fn room() -> Result<(Mesh, Camera)> {
     const CELLS: u32 = 29;
     let (mut rest, mut normals, mut triangles) = (Vec::new(), Vec::new(), Vec::new());
     for (axis, side) in (0..3).flat_map(|axis| [(axis, -1.0_f32), (axis, 1.0)]) {
         let first = rest.len() as u32;
         for (row, column) in (0..=CELLS).flat_map(|row| (0..=CELLS).map(move |column| (row, column))) {
-            let at = |cell: u32| 2.0 * cell as f32 / CELLS as f32 - 1.0;
+            let coordinate = |cell: u32| 2.0 * cell as f32 / CELLS as f32 - 1.0;
             let mut point = [0.0; 3];
-            (point[axis], point[(axis + 1) % 3], point[(axis + 2) % 3]) = (side, at(column), at(row));
+            (point[axis], point[(axis + 1) % 3], point[(axis + 2) % 3]) = (side, coordinate(column), coordinate(row));
             rest.push([3.0 * point[0], 1.5 * point[1], 3.0 * point[2]]);
-            normals.push(std::array::from_fn(|own| if own == axis { -side } else { 0.0 }));
+            normals.push(std::array::from_fn(|component| if component == axis { -side } else { 0.0 }));
         }
         for (row, column) in (0..CELLS).flat_map(|row| (0..CELLS).map(move |column| (row, column))) {
             let a = first + row * (CELLS + 1) + column;
@@ -213,7 +216,7 @@ pub(super) fn screen() -> Result<(Mesh, Camera)> {
     Ok((mesh, Camera { view, lens: Lens::FieldOfView(50.0), near: 0.1, far: 10.0 }))
 }
 
-fn paint(diffuse: [f32; 3]) -> Material {
+fn two_sided_material(diffuse: [f32; 3]) -> Material {
     Material {
         ambient: diffuse,
         diffuse,
@@ -224,11 +227,11 @@ fn paint(diffuse: [f32; 3]) -> Material {
     }
 }
 
-/// A square of 1.4 units at height 1, and a slab that keeps the ground at height 0.
+/// A square of 1.4 units at height 1. A slab keeps the ground, which is at the lowest vertex, at height 0.
 fn square() -> Result<SceneParts> {
     let mut parts = SceneParts::named("square");
-    add_rigid_domain(&mut parts, "slab", lying(1.6, 0.0)?, paint([0.75, 0.72, 0.68]))?;
-    add_rigid_domain(&mut parts, "square", lying(0.7, 1.0)?, paint([0.80, 0.35, 0.25]))?;
+    add_rigid_domain(&mut parts, "slab", horizontal_square(1.6, 0.0)?, two_sided_material([0.75, 0.72, 0.68]))?;
+    add_rigid_domain(&mut parts, "square", horizontal_square(0.7, 1.0)?, two_sided_material([0.80, 0.35, 0.25]))?;
     parts.look = RenderSettings { sun: [0.45, 0.8, 0.3], ..RenderSettings::default() };
     Ok(parts)
 }
@@ -236,17 +239,22 @@ fn square() -> Result<SceneParts> {
 /// x of the shelf's edge, where the visible part of its shadow begins.
 const SHELF_EDGE: f32 = -3.5;
 
-/// A square of two units, 0.03 above the ground, with a shadow 0.09 long. Two slabs keep the ground at height 0 and
-/// widen the scene, so that the shadow lies near the end of the depth range.
+/// A square of two units, 0.03 above the ground; its shadow extends 0.09 beyond it. Two slabs keep the ground at height 0
+/// and widen the scene, so that the shadow lies near the end of the depth range.
 fn shelf() -> Result<SceneParts> {
     let mut parts = SceneParts::named("shelf");
-    let moved = |half: f32, height: f32, x: f32, z: f32| {
-        let at = |dx: f32, dz: f32| [x + dx * half, height, z + dz * half];
-        quad([at(-1.0, 1.0), at(1.0, 1.0), at(1.0, -1.0), at(-1.0, -1.0)], [0.0, 1.0, 0.0])
+    let square_at = |half_side: f32, height: f32, x: f32, z: f32| {
+        let point = |dx: f32, dz: f32| [x + dx * half_side, height, z + dz * half_side];
+        quad([point(-1.0, 1.0), point(1.0, 1.0), point(1.0, -1.0), point(-1.0, -1.0)], [0.0, 1.0, 0.0])
     };
-    add_rigid_domain(&mut parts, "near slab", moved(0.1, 0.0, 5.0, 5.0)?, paint([0.75, 0.72, 0.68]))?;
-    add_rigid_domain(&mut parts, "far slab", moved(0.1, 0.0, -5.0, -5.0)?, paint([0.75, 0.72, 0.68]))?;
-    add_rigid_domain(&mut parts, "shelf", moved(1.0, 0.03, SHELF_EDGE + 1.0, 0.0)?, paint([0.80, 0.35, 0.25]))?;
+    add_rigid_domain(&mut parts, "near slab", square_at(0.1, 0.0, 5.0, 5.0)?, two_sided_material([0.75, 0.72, 0.68]))?;
+    add_rigid_domain(&mut parts, "far slab", square_at(0.1, 0.0, -5.0, -5.0)?, two_sided_material([0.75, 0.72, 0.68]))?;
+    add_rigid_domain(
+        &mut parts,
+        "shelf",
+        square_at(1.0, 0.03, SHELF_EDGE + 1.0, 0.0)?,
+        two_sided_material([0.80, 0.35, 0.25]),
+    )?;
     parts.look = RenderSettings { sun: [3.0, 1.0, 0.0], ..RenderSettings::default() };
     Ok(parts)
 }
@@ -254,14 +262,35 @@ fn shelf() -> Result<SceneParts> {
 /// Three panes of red, green and blue glass, listed from nearest to farthest, in front of a pale wall.
 fn panes() -> Result<SceneParts> {
     let mut parts = SceneParts::named("panes");
-    let upright = |[left, bottom, right, top]: [f32; 4], z: f32| {
+    let upright_rectangle = |[left, bottom, right, top]: [f32; 4], z: f32| {
         quad([[left, bottom, z], [right, bottom, z], [right, top, z], [left, top, z]], [0.0, 0.0, 1.0])
     };
-    add_rigid_domain(&mut parts, "wall", upright([-1.4, 0.0, 1.4, 1.9], -0.8)?, paint([0.85, 0.84, 0.80]))?;
-    let glass = |color: [f32; 3], alpha: f32| Material { alpha, alpha_mode: AlphaMode::Blend, ..paint(color) };
-    add_rigid_domain(&mut parts, "red", upright([-1.1, 0.3, 0.3, 1.3], 0.6)?, glass([0.85, 0.12, 0.10], 0.6))?;
-    add_rigid_domain(&mut parts, "green", upright([-0.6, 0.5, 0.8, 1.6], 0.2)?, glass([0.10, 0.70, 0.20], 0.45))?;
-    add_rigid_domain(&mut parts, "blue", upright([-0.2, 0.2, 1.2, 1.2], -0.2)?, glass([0.12, 0.25, 0.85], 0.7))?;
+    add_rigid_domain(
+        &mut parts,
+        "wall",
+        upright_rectangle([-1.4, 0.0, 1.4, 1.9], -0.8)?,
+        two_sided_material([0.85, 0.84, 0.80]),
+    )?;
+    let glass =
+        |color: [f32; 3], alpha: f32| Material { alpha, alpha_mode: AlphaMode::Blend, ..two_sided_material(color) };
+    add_rigid_domain(
+        &mut parts,
+        "red",
+        upright_rectangle([-1.1, 0.3, 0.3, 1.3], 0.6)?,
+        glass([0.85, 0.12, 0.10], 0.6),
+    )?;
+    add_rigid_domain(
+        &mut parts,
+        "green",
+        upright_rectangle([-0.6, 0.5, 0.8, 1.6], 0.2)?,
+        glass([0.10, 0.70, 0.20], 0.45),
+    )?;
+    add_rigid_domain(
+        &mut parts,
+        "blue",
+        upright_rectangle([-0.2, 0.2, 1.2, 1.2], -0.2)?,
+        glass([0.12, 0.25, 0.85], 0.7),
+    )?;
     parts.look = RenderSettings { sun: [0.35, 0.6, 0.7], ..RenderSettings::default() };
     Ok(parts)
 }
@@ -273,22 +302,22 @@ fn grove(tree: &Scene) -> SceneParts {
     parts.materials.clone_from(&tree.materials);
     parts.textures.clone_from(&tree.textures);
     (parts.look, parts.up, parts.unit, parts.rigid_transforms) = (tree.look, tree.up, tree.unit, tree.rigid_transforms);
-    let apart = 0.42 * tree.rest_bounds.diagonal();
-    for (index, [across, behind]) in [[-1.5, 0.1], [-0.5, -0.5], [0.5, 0.3], [1.5, -0.3]].into_iter().enumerate() {
-        let turn = tree.up.rotation_from_y_up();
-        let aside = turn * Vector3::new(across * apart, 0.0, behind * apart);
-        let turned = Rotation3::new(tree.up.vector() * (1.3 * index as f64));
-        let place = Matrix4::new_translation(&aside) * turned.to_homogeneous();
-        let first = parts.domains.len();
+    let spacing = 0.42 * tree.rest_bounds.diagonal();
+    for (index, [column, row]) in [[-1.5, 0.1], [-0.5, -0.5], [0.5, 0.3], [1.5, -0.3]].into_iter().enumerate() {
+        let from_y_up = tree.up.rotation_from_y_up();
+        let offset = from_y_up * Vector3::new(column * spacing, 0.0, row * spacing);
+        let rotation = Rotation3::new(tree.up.vector() * (1.3 * index as f64));
+        let placement = Matrix4::new_translation(&offset) * rotation.to_homogeneous();
+        let first_domain = parts.domains.len();
         for domain in &tree.domains {
-            let mut own = domain.clone();
-            own.name = format!("{} of tree {index}", domain.name);
-            own.placement = Transform::from_matrix(&(place * domain.placement.to_matrix()));
-            if let Some(attachment) = &mut own.attachment {
-                attachment.parent += first;
+            let mut copy = domain.clone();
+            copy.name = format!("{} of tree {index}", domain.name);
+            copy.placement = Transform::from_matrix(&(placement * domain.placement.to_matrix()));
+            if let Some(attachment) = &mut copy.attachment {
+                attachment.parent += first_domain;
             }
-            own.shares_q_with = own.shares_q_with.map(|twin| twin + first);
-            parts.domains.push(own);
+            copy.shares_q_with = copy.shares_q_with.map(|source| source + first_domain);
+            parts.domains.push(copy);
         }
     }
     parts
@@ -298,31 +327,37 @@ fn grove(tree: &Scene) -> SceneParts {
 fn field(count: usize) -> Result<SceneParts> {
     let mut parts = SceneParts::named("field");
     let side = ((count as f64 / 2.0).sqrt().round() as usize).max(1);
-    let at = |column: usize, row: usize| {
+    let point = |column: usize, row: usize| {
         let [x, z] = [column, row].map(|index| 4.0 * (index as f64 / side as f64 - 0.5));
         let wave = |fx: f64, fz: f64, phase: f64| (fx * x + fz * z + phase).sin();
         let height = 0.16 * wave(2.1, 1.3, 0.4) + 0.11 * wave(-1.7, 3.1, 1.9) + 0.03 * wave(9.0, 7.0, 0.7);
         [x as f32, (0.4 + height) as f32, z as f32]
     };
-    let rest: Vec<[f32; 3]> = (0..=side).flat_map(|row| (0..=side).map(move |column| at(column, row))).collect();
+    let rest: Vec<[f32; 3]> = (0..=side).flat_map(|row| (0..=side).map(move |column| point(column, row))).collect();
     let corner = |column: usize, row: usize| (row * (side + 1) + column) as u32;
-    let cell = |at: usize| {
-        let (column, row) = (at % side, at / side);
+    let cell_triangles = |cell: usize| {
+        let (column, row) = (cell % side, cell / side);
         let [a, b] = [corner(column, row), corner(column + 1, row)];
         let [c, d] = [corner(column + 1, row + 1), corner(column, row + 1)];
         [[a, d, c], [a, c, b]]
     };
-    let triangles: Vec<[u32; 3]> = (0..side * side).flat_map(cell).collect();
+    let triangles: Vec<[u32; 3]> = (0..side * side).flat_map(cell_triangles).collect();
     let corners: Vec<u32> = (0..rest.len() as u32).collect();
     let normals = smooth_normals(&rest, &corners, &triangles);
     let mesh = Mesh::from_indexed(rest, normals, Vec::new(), triangles)?;
-    add_rigid_domain(&mut parts, "field", mesh, Material { double_sided: false, ..paint([0.52, 0.60, 0.34]) })?;
+    add_rigid_domain(
+        &mut parts,
+        "field",
+        mesh,
+        Material { double_sided: false, ..two_sided_material([0.52, 0.60, 0.34]) },
+    )?;
     let pole = |x: f32, z: f32| [[x - 0.05, 0.2, z], [x + 0.05, 0.2, z], [x + 0.05, 1.5, z], [x - 0.05, 1.5, z]];
-    let places = [[-0.9, 0.0], [0.9, 0.2], [0.0, -0.9], [0.1, 0.8]];
-    let rest: Vec<[f32; 3]> = places.iter().flat_map(|[x, z]| pole(*x, *z)).collect();
-    let triangles = (0..4).flat_map(|pole| [[0, 1, 2], [0, 2, 3]].map(|three: [u32; 3]| three.map(|at| at + 4 * pole)));
+    let positions = [[-0.9, 0.0], [0.9, 0.2], [0.0, -0.9], [0.1, 0.8]];
+    let rest: Vec<[f32; 3]> = positions.iter().flat_map(|[x, z]| pole(*x, *z)).collect();
+    let triangles =
+        (0..4).flat_map(|pole| [[0, 1, 2], [0, 2, 3]].map(|corners: [u32; 3]| corners.map(|corner| corner + 4 * pole)));
     let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 16], Vec::new(), triangles.collect())?;
-    add_rigid_domain(&mut parts, "poles", mesh, paint([0.70, 0.30, 0.22]))?;
+    add_rigid_domain(&mut parts, "poles", mesh, two_sided_material([0.70, 0.30, 0.22]))?;
     parts.look = RenderSettings { sun: [0.55, 0.5, 0.45], ..RenderSettings::default() };
     Ok(parts)
 }
@@ -333,30 +368,30 @@ mod tests {
 
     #[test]
     fn finds_every_load_by_name_and_rejects_others() {
-        for kind in RenderWorkload::all(false).into_iter().chain(RenderWorkload::all(true)) {
-            assert_eq!(RenderWorkload::named(&kind.name()), Ok(kind));
+        for workload in RenderWorkload::all(false).into_iter().chain(RenderWorkload::all(true)) {
+            assert_eq!(RenderWorkload::named(&workload.name()), Ok(workload));
         }
-        for wrong in ["", "triangles", "triangles-", "triangles-1", "triangles-9000000", "Tree", "a"] {
-            assert!(RenderWorkload::named(wrong).is_err(), "{wrong}");
+        for name in ["", "triangles", "triangles-", "triangles-1", "triangles-9000000", "Tree", "a"] {
+            assert!(RenderWorkload::named(name).is_err(), "{name}");
         }
     }
 
     #[test]
     fn field_has_about_the_requested_triangles_facing_up() {
-        let stage = RenderWorkload::Triangles(5_000).stage().expect("built");
-        let own = &stage.scene.shapes[0].mesh;
-        assert!((4_900..=5_100).contains(&own.triangles().len()), "{}", own.triangles().len());
-        assert!(own.corners().normals.iter().all(|normal| normal[1] > 0.5));
+        let animation = RenderWorkload::Triangles(5_000).build().expect("a workload");
+        let mesh = &animation.scene.shapes[0].mesh;
+        assert!((4_900..=5_100).contains(&mesh.triangles().len()), "{}", mesh.triangles().len());
+        assert!(mesh.corners().normals.iter().all(|normal| normal[1] > 0.5));
     }
 
     #[test]
     fn only_the_sliding_domain_moves() {
-        let stage = RenderWorkload::Square.stage().expect("built");
-        let (rest, moved) = (SceneState::rest(&stage.scene), stage.state(30));
-        assert_eq!(stage.state(0).transforms, rest.transforms);
+        let animation = RenderWorkload::Square.build().expect("a workload");
+        let (rest, moved) = (SceneState::rest(&animation.scene), animation.state(30));
+        assert_eq!(animation.state(0).transforms, rest.transforms);
         assert_eq!(moved.transforms[0], rest.transforms[0]);
         let shift = (moved.transforms[1].translation() - rest.transforms[1].translation()).norm();
-        let reach = SLIDE * stage.scene.rest_bounds.diagonal();
-        assert!((shift - reach * 2f64.sqrt()).abs() < 1e-6, "{shift} of {reach}");
+        let radius = SLIDE_RADIUS * animation.scene.rest_bounds.diagonal();
+        assert!((shift - radius * 2f64.sqrt()).abs() < 1e-6, "expected a shift of sqrt(2) x {radius}, got {shift}");
     }
 }

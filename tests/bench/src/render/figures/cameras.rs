@@ -6,66 +6,68 @@ use crate::render::harness::Size;
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Camera, Lens, Scene, View};
 
-/// Fraction of the half image that a scene may fill; the rest is for shadows.
-const MARGIN: f64 = 0.86;
-const DEGREES: f64 = 28.0;
+/// Fraction of the image that a scene may fill; the rest is for shadows.
+const FILL_FRACTION: f64 = 0.86;
+/// Vertical field of view of [`frame_scene`], degrees.
+const FIELD_OF_VIEW: f64 = 28.0;
 
-fn looking(eye: Vector3<f64>, target: Vector3<f64>, degrees: f64) -> Camera {
+fn look_at(eye: Vector3<f64>, target: Vector3<f64>, degrees: f64) -> Camera {
     let view = View::LookAt { eye: eye.into(), target: target.into(), up: [0.0, 1.0, 0.0] };
     Camera { view, lens: Lens::FieldOfView(degrees), near: 0.0, far: 0.0 }
 }
 
-/// Frames a whole scene, from slightly to the right and from above by a slope of `elevation`.
-pub(super) fn whole(scene: &Scene, size: Size, elevation: f64) -> Camera {
-    let aside = Vector3::new(0.30, elevation, 0.95).normalize();
-    let right = Vector3::y().cross(&aside).normalize();
-    let above = aside.cross(&right);
-    let slope = MARGIN * (0.5 * DEGREES).to_radians().tan();
+/// Frames a scene from slightly to the right and above; `elevation` is the y component of the unnormalized view
+/// direction.
+pub(super) fn frame_scene(scene: &Scene, size: Size, elevation: f64) -> Camera {
+    let to_eye = Vector3::new(0.30, elevation, 0.95).normalize();
+    let right = Vector3::y().cross(&to_eye).normalize();
+    let view_up = to_eye.cross(&right);
+    let slope = FILL_FRACTION * (0.5 * FIELD_OF_VIEW).to_radians().tan();
     let aspect = f64::from(size.width) / f64::from(size.height);
     let center = scene.rest_bounds.center().coords;
-    // Use vertices rather than the corners of their bounding box, where a tree has no leaves.
+    // Use vertices, because a tree has no leaves at the corners of its bounding box.
     let distance = |point: Vector3<f64>| {
         let offset = point - center;
-        let wide = (offset.dot(&right) / (slope * aspect)).abs();
-        offset.dot(&aside) + wide.max((offset.dot(&above) / slope).abs())
+        let horizontal = (offset.dot(&right) / (slope * aspect)).abs();
+        offset.dot(&to_eye) + horizontal.max((offset.dot(&view_up) / slope).abs())
     };
-    let distance = points(scene).map(distance).fold(0.0, f64::max);
-    looking(center + aside * distance, center, DEGREES)
+    let distance = rest_positions(scene).map(distance).fold(0.0, f64::max);
+    look_at(center + to_eye * distance, center, FIELD_OF_VIEW)
 }
 
 /// Rest positions of all vertices.
-fn points(scene: &Scene) -> impl Iterator<Item = Vector3<f64>> + '_ {
+fn rest_positions(scene: &Scene) -> impl Iterator<Item = Vector3<f64>> + '_ {
     scene.domains.iter().flat_map(|domain| {
-        let place = domain.placement.to_matrix();
+        let placement = domain.placement.to_matrix();
         let rest = scene.shapes[domain.shape].mesh.rest();
-        rest.iter().map(move |point| place.transform_point(&nalgebra::Point3::from(point.map(f64::from))).coords)
+        rest.iter().map(move |point| placement.transform_point(&nalgebra::Point3::from(point.map(f64::from))).coords)
     })
 }
 
-/// A trunk at the origin, from nearby.
+/// A close-up of a trunk at the origin.
 pub(super) fn trunk() -> Camera {
-    looking(Vector3::new(0.25, 1.0, 0.72), Vector3::new(0.0, 0.92, 0.0), 34.0)
+    look_at(Vector3::new(0.25, 1.0, 0.72), Vector3::new(0.0, 0.92, 0.0), 34.0)
 }
 
-/// The shadow of a tree at the origin, and the foot of its trunk.
+/// Frames the shadow of a tree at the origin and the base of its trunk.
 pub(super) fn shadow(scene: &Scene) -> Camera {
     let to_sun = scene.look.to_sun(scene.up);
     let height = scene.rest_bounds.max[1];
     // The shadow of the center of the crown on the ground.
-    let middle = Vector3::new(-to_sun.x, 0.0, -to_sun.z) * (0.55 * height / to_sun.y);
-    looking(middle + Vector3::new(1.2, 4.2, 6.4), middle + Vector3::new(0.3, 0.0, 0.4), 38.0)
+    let crown_shadow = Vector3::new(-to_sun.x, 0.0, -to_sun.z) * (0.55 * height / to_sun.y);
+    look_at(crown_shadow + Vector3::new(1.2, 4.2, 6.4), crown_shadow + Vector3::new(0.3, 0.0, 0.4), 38.0)
 }
 
-/// The leaves nearest to the viewer, from a distance of about 1.4 m.
+/// A close-up of the leaf nearest to the viewer, from a distance of about 1.4 m.
 ///
 /// # Errors
 /// `Fault` when the scene has no leaves.
-pub(super) fn bough(scene: &Scene) -> Result<Camera> {
-    let towards = Vector3::new(0.30, -0.15, 0.95).normalize();
-    let places = scene.domains.iter().filter(|domain| domain.name.starts_with("leaf"));
-    let nearest = places
+pub(super) fn leaf_closeup(scene: &Scene) -> Result<Camera> {
+    let to_viewer = Vector3::new(0.30, -0.15, 0.95).normalize();
+    let leaves = scene.domains.iter().filter(|domain| domain.name.starts_with("leaf"));
+    let nearest = leaves
         .map(|domain| domain.placement.translation())
-        .max_by(|a, b| a.dot(&towards).total_cmp(&b.dot(&towards)))
-        .ok_or_else(|| fault_in("figures")("the tree has no leaves"))?;
-    Ok(looking(nearest + Vector3::new(0.25, 0.25, 1.35), nearest, 36.0))
+        .max_by(|a, b| a.dot(&to_viewer).total_cmp(&b.dot(&to_viewer)))
+        .ok_or_else(|| fault_in("figures")("expected a tree with leaves"))?;
+    Ok(look_at(nearest + Vector3::new(0.25, 0.25, 1.35), nearest, 36.0))
 }

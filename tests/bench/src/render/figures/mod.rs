@@ -1,8 +1,8 @@
-//! Reproduces the figures of the thesis's chapter 4.2 with our own scenes: single trees (4.1), groups of four and
-//! twenty (4.2), bump mapping (4.3), shadow maps of 4096 and 512 texels per side (4.4, 4.5), transparency (4.6); also
-//! draws scenes of the user.
+//! Reproduces the figures of chapter 4.2 of the thesis with our own scenes: single trees (4.1), groups of four and
+//! twenty trees (4.2), bump mapping (4.3), shadow maps of 4096 and 512 texels per side (4.4, 4.5), and transparency
+//! (4.6). Also draws user-supplied scenes.
 //!
-//! The trees are the built-in one, the same in blossom, and generated conifers. Trees with modes bend as in a light
+//! The models are the built-in tree, its blossoming variant, and procedural conifers. Trees with modes bend as in a light
 //! wind.
 
 mod cameras;
@@ -28,10 +28,10 @@ use modalcast_render::RendererInfo;
 
 /// Settings of the figures.
 #[derive(Debug, Clone)]
-pub struct Request {
-    /// Size of a single picture. Most figures consist of several pictures.
+pub struct FigureOptions {
+    /// Size of a single image. Most figures consist of several images.
     pub size: Size,
-    /// Scenes of the user, as given on the command line; each becomes a figure.
+    /// User-supplied scenes, as given on the command line; each becomes a figure.
     pub scenes: Vec<String>,
 }
 
@@ -40,61 +40,64 @@ pub struct Request {
 pub struct Figure {
     /// Number in the thesis, or the name of the user's scene.
     pub name: String,
-    /// Descriptions of the pictures, from left to right and top to bottom.
-    pub shows: Vec<String>,
+    /// Captions of the images, from left to right and top to bottom.
+    #[serde(rename = "shows")]
+    pub captions: Vec<String>,
+    /// Name of the image file.
     pub file: String,
-    /// Triangles of all pictures together.
+    /// Triangles of all images together.
     pub triangles: usize,
 }
 
 /// All figures.
 #[derive(Debug, Clone, Serialize)]
 pub struct Figures {
-    pub made: Provenance,
+    #[serde(rename = "made")]
+    pub provenance: Provenance,
     pub renderer: RendererInfo,
-    /// Size of a single picture.
+    /// Size of a single image.
     pub size: Size,
     pub figures: Vec<Figure>,
     #[serde(skip)]
     files: Vec<ImageFile>,
 }
 
-/// Draws all figures; `progress` receives the name of each.
+/// Draws all figures; `progress` receives a line per stage.
 ///
 /// # Errors
 /// `Unavailable` without OpenGL; errors of loading and drawing a scene.
-pub fn figures(request: &Request, mut progress: impl FnMut(&str)) -> Result<Figures> {
-    let mut atelier =
-        FigureRenderer { studio: RenderHarness::open()?, size: request.size, figures: Vec::new(), files: Vec::new() };
-    progress("growing");
-    let species = FigurePlants::grow()?;
+pub fn draw_figures(options: &FigureOptions, mut progress: impl FnMut(&str)) -> Result<Figures> {
+    let mut renderer =
+        FigureRenderer { harness: RenderHarness::open()?, size: options.size, figures: Vec::new(), files: Vec::new() };
+    progress("building plant models");
+    let plants = FigurePlants::build()?;
     for (name, draw) in [
-        ("4.1", singles as fn(&mut FigureRenderer, &FigurePlants) -> Result<()>),
-        ("4.2", groups),
-        ("4.3", bumps),
-        ("4.4 and 4.5", shadows),
-        ("4.6", leaves),
+        ("4.1", draw_single_trees as fn(&mut FigureRenderer, &FigurePlants) -> Result<()>),
+        ("4.2", draw_groups),
+        ("4.3", draw_bump_mapping),
+        ("4.4 and 4.5", draw_shadow_maps),
+        ("4.6", draw_transparency),
     ] {
         progress(&format!("figure {name}"));
-        draw(&mut atelier, &species)?;
+        draw(&mut renderer, &plants)?;
     }
-    for source in &request.scenes {
+    for source in &options.scenes {
         progress(source);
-        own(&mut atelier, source)?;
+        draw_user_scene(&mut renderer, source)?;
     }
-    let FigureRenderer { studio, size, figures, files } = atelier;
-    Ok(Figures { made: Provenance::here(), renderer: studio.renderer.info().clone(), size, figures, files })
+    let FigureRenderer { harness, size, figures, files } = renderer;
+    Ok(Figures { provenance: Provenance::here(), renderer: harness.renderer.info().clone(), size, figures, files })
 }
 
 /// The renderer and the figures drawn so far.
 struct FigureRenderer {
-    studio: RenderHarness,
+    harness: RenderHarness,
     size: Size,
     figures: Vec<Figure>,
     files: Vec<ImageFile>,
 }
 
-/// The species of all figures.
+/// One plant of each species.
 struct FigurePlants {
     tree: SceneParts,
     peach: SceneParts,
@@ -104,189 +107,207 @@ struct FigurePlants {
 }
 
 impl FigurePlants {
-    fn grow() -> Result<Self> {
+    fn build() -> Result<Self> {
         let tree = load::open("tree")?.scene.parts();
-        let bark = bark(&tree)?;
-        let conifer = |habit: &conifer::ConiferParameters| conifer::grow(habit, bark);
-        let (fir, hemlock, spruce) = (conifer(&conifer::FIR)?, conifer(&conifer::HEMLOCK)?, conifer(&conifer::SPRUCE)?);
-        Ok(Self { peach: forest::in_blossom(&tree)?, fir, hemlock, spruce, tree })
+        let bark = bark_textures(&tree)?;
+        let build_conifer = |parameters: &conifer::ConiferParameters| conifer::build(parameters, bark);
+        let (fir, hemlock, spruce) =
+            (build_conifer(&conifer::FIR)?, build_conifer(&conifer::HEMLOCK)?, build_conifer(&conifer::SPRUCE)?);
+        Ok(Self { peach: forest::build_blossoming_tree(&tree)?, fir, hemlock, spruce, tree })
     }
 }
 
 /// Color and normal images of the tree's bark, which the conifers share.
-fn bark(tree: &SceneParts) -> Result<[&Texture; 2]> {
+fn bark_textures(tree: &SceneParts) -> Result<[&Texture; 2]> {
     let images = tree.materials.iter().find_map(|material| material.color_texture.zip(material.normal_texture));
-    let (color, normal) = images.ok_or_else(|| fault_in("figures")("the tree has no bark"))?;
+    let (color, normal) = images.ok_or_else(|| {
+        fault_in("figures")("expected a material with color and normal textures in the built-in tree")
+    })?;
     Ok([&tree.textures[color], &tree.textures[normal]])
 }
 
-/// A look with a shadow map that is sharp enough for single leaves.
-fn fine(look: RenderSettings) -> RenderSettings {
+/// Settings with a shadow map that resolves single leaves.
+fn with_large_shadow_map(look: RenderSettings) -> RenderSettings {
     RenderSettings { shadow: Some(ShadowSettings { size: 4096, ..ShadowSettings::default() }), ..look }
 }
 
-/// One picture to draw.
+/// One image to draw.
 struct FigureView<'a> {
-    shows: String,
+    caption: String,
     scene: &'a Arc<Scene>,
     camera: Camera,
     size: Size,
 }
 
 impl FigureRenderer {
-    fn draw(&mut self, piece: &FigureView<'_>) -> Result<Vec<u8>> {
-        let mut set = self.studio.set(piece.scene)?;
-        self.studio.pose(&mut set, &workloads::swaying(piece.scene))?;
-        let image = self.studio.draw(&set, piece.camera, piece.size);
-        self.studio.unload(set);
+    fn draw(&mut self, view: &FigureView<'_>) -> Result<Vec<u8>> {
+        let mut loaded_scene = self.harness.load(view.scene)?;
+        self.harness.deform(&mut loaded_scene, &workloads::swaying_state(view.scene))?;
+        let image = self.harness.draw(&loaded_scene, view.camera, view.size);
+        self.harness.unload(loaded_scene);
         image.map(|image| image.rgba)
     }
 
-    /// Draws a figure of equally sized pictures in rows of `columns`.
-    fn figure(&mut self, name: &str, title: &str, columns: usize, pieces: &[FigureView<'_>]) -> Result<()> {
-        let drawn = pieces.iter().map(|piece| self.draw(piece)).collect::<Result<Vec<_>>>()?;
-        let size = pieces.first().map_or(self.size, |piece| piece.size);
-        let file = image_files::sheet(&format!("figure-{name}-{title}"), size, columns, &drawn)?;
+    /// Draws a figure of equally sized images in rows of `columns`.
+    fn draw_figure(&mut self, name: &str, title: &str, columns: usize, views: &[FigureView<'_>]) -> Result<()> {
+        let images = views.iter().map(|view| self.draw(view)).collect::<Result<Vec<_>>>()?;
+        let size = views.first().map_or(self.size, |view| view.size);
+        let file = image_files::encode_grid(&format!("figure-{name}-{title}"), size, columns, &images)?;
         self.figures.push(Figure {
             name: name.into(),
-            shows: pieces.iter().map(|piece| piece.shows.clone()).collect(),
+            captions: views.iter().map(|view| view.caption.clone()).collect(),
             file: file.name.clone(),
-            triangles: pieces.iter().map(|piece| piece.scene.layout.triangles).sum(),
+            triangles: views.iter().map(|view| view.scene.layout.triangles).sum(),
         });
         self.files.push(file);
         Ok(())
     }
 
-    fn piece<'a>(&self, shows: &str, scene: &'a Arc<Scene>, camera: Camera) -> FigureView<'a> {
-        FigureView { shows: shows.into(), scene, camera, size: self.size }
+    fn view<'a>(&self, caption: &str, scene: &'a Arc<Scene>, camera: Camera) -> FigureView<'a> {
+        FigureView { caption: caption.into(), scene, camera, size: self.size }
     }
 }
 
-/// One plant at the origin.
-fn alone(turn: f64) -> [PlantInstance; 1] {
-    [PlantInstance { species: 0, right: 0.0, near: 0.0, turn, scale: 1.0 }]
+/// One plant at the origin, rotated about its trunk.
+fn single_instance(rotation: f64) -> [PlantInstance; 1] {
+    [PlantInstance { species: 0, x: 0.0, z: 0.0, rotation, scale: 1.0 }]
 }
 
 /// Figure 4.1: single trees.
-fn singles(atelier: &mut FigureRenderer, species: &FigurePlants) -> Result<()> {
-    let alone = |(plant, turn): (&SceneParts, f64)| {
-        Scene::new(forest::plant("single", &[plant], &alone(turn), fine(species.tree.look)))
+fn draw_single_trees(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Result<()> {
+    let build_scene = |(plant, rotation): (&SceneParts, f64)| {
+        Scene::new(forest::combine_plants(
+            "single",
+            &[plant],
+            &single_instance(rotation),
+            with_large_shadow_map(plants.tree.look),
+        ))
     };
-    let plants = [(&species.tree, 0.6), (&species.peach, 2.9), (&species.fir, 0.0), (&species.hemlock, 0.0)];
-    let scenes = plants.map(alone);
+    let rotated_plants = [(&plants.tree, 0.6), (&plants.peach, 2.9), (&plants.fir, 0.0), (&plants.hemlock, 0.0)];
+    let scenes = rotated_plants.map(build_scene);
     let names = ["broad-leaved tree", "peach tree", "fir", "eastern hemlock"];
-    let mut pieces = Vec::new();
+    let mut views = Vec::new();
     for (name, scene) in names.iter().zip(&scenes) {
         let scene = scene.as_ref().map_err(Clone::clone)?;
-        pieces.push(atelier.piece(name, scene, cameras::whole(scene, atelier.size, 0.14)));
+        views.push(renderer.view(name, scene, cameras::frame_scene(scene, renderer.size, 0.14)));
     }
-    atelier.figure("4.1", "single-trees", 2, &pieces)
+    renderer.draw_figure("4.1", "single-trees", 2, &views)
 }
 
 /// Figure 4.2: four firs; three species and twenty trees.
-fn groups(atelier: &mut FigureRenderer, species: &FigurePlants) -> Result<()> {
-    let look = fine(species.tree.look);
-    let firs: Vec<PlantInstance> =
-        [[-4.2, 0.4], [-1.3, -0.9], [1.5, 0.7], [4.3, -0.3]].iter().enumerate().map(four).collect();
-    let firs = Scene::new(forest::plant("four firs", &[&species.fir], &firs, look))?;
-    let kinds = [&species.tree, &species.peach, &species.hemlock];
-    let stands: Vec<PlantInstance> = (0..20).map(twenty).collect();
-    let twenty = Scene::new(forest::plant("twenty trees", &kinds, &stands, look))?;
-    let size = Size { width: atelier.size.width * 2, ..atelier.size };
-    let piece = |shows: &str, scene, elevation| FigureView {
-        shows: String::from(shows),
+fn draw_groups(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Result<()> {
+    let look = with_large_shadow_map(plants.tree.look);
+    let firs: Vec<PlantInstance> = [[-4.2, 0.4], [-1.3, -0.9], [1.5, 0.7], [4.3, -0.3]]
+        .iter()
+        .enumerate()
+        .map(|(index, position)| fir_instance(index, *position))
+        .collect();
+    let firs = Scene::new(forest::combine_plants("four firs", &[&plants.fir], &firs, look))?;
+    let species = [&plants.tree, &plants.peach, &plants.hemlock];
+    let instances: Vec<PlantInstance> = (0..20).map(mixed_instance).collect();
+    let twenty_trees = Scene::new(forest::combine_plants("twenty trees", &species, &instances, look))?;
+    let size = Size { width: renderer.size.width * 2, ..renderer.size };
+    let view = |caption: &str, scene, elevation| FigureView {
+        caption: String::from(caption),
         scene,
-        camera: cameras::whole(scene, size, elevation),
+        camera: cameras::frame_scene(scene, size, elevation),
         size,
     };
-    let pieces = [piece("four firs", &firs, 0.16), piece("twenty trees of three species", &twenty, 0.50)];
-    atelier.figure("4.2", "multiple-trees", 1, &pieces)
+    let views = [view("four firs", &firs, 0.16), view("twenty trees of three species", &twenty_trees, 0.50)];
+    renderer.draw_figure("4.2", "multiple-trees", 1, &views)
 }
 
-fn four((index, [right, near]): (usize, &[f64; 2])) -> PlantInstance {
+/// A fir at [x, z].
+fn fir_instance(index: usize, [x, z]: [f64; 2]) -> PlantInstance {
     let scale = [1.0, 1.12, 0.94, 1.05][index % 4];
-    PlantInstance { species: 0, right: *right, near: *near, turn: 1.7 * index as f64, scale }
+    PlantInstance { species: 0, x, z, rotation: 1.7 * index as f64, scale }
 }
 
 /// Four rows of five plants with irregular offsets.
-fn twenty(index: usize) -> PlantInstance {
+fn mixed_instance(index: usize) -> PlantInstance {
     let (row, column) = (index / 5, index % 5);
-    let (wave, other) = ((2.3 * index as f64).sin(), (4.1 * index as f64).cos());
+    let (x_jitter, z_jitter) = ((2.3 * index as f64).sin(), (4.1 * index as f64).cos());
     PlantInstance {
         species: (index + 2 * row) % 3,
-        right: 6.2 * (column as f64 - 2.0) + 3.1 * (row % 2) as f64 + 0.6 * wave,
-        near: 8.5 * (1.5 - row as f64) + other,
-        turn: 1.9 * index as f64,
-        scale: 0.88 + 0.14 * wave * other + 0.1 * (index % 2) as f64,
+        x: 6.2 * (column as f64 - 2.0) + 3.1 * (row % 2) as f64 + 0.6 * x_jitter,
+        z: 8.5 * (1.5 - row as f64) + z_jitter,
+        rotation: 1.9 * index as f64,
+        scale: 0.88 + 0.14 * x_jitter * z_jitter + 0.1 * (index % 2) as f64,
     }
 }
 
 /// Figure 4.3: trunks with and without bump mapping.
-fn bumps(atelier: &mut FigureRenderer, species: &FigurePlants) -> Result<()> {
+fn draw_bump_mapping(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Result<()> {
     let mut scenes = Vec::new();
-    for (name, plant) in [("peach tree", &species.peach), ("blue spruce", &species.spruce)] {
-        let look = RenderSettings { sun: [0.95, 0.28, 0.22], ..fine(species.tree.look) };
-        let bumpy = forest::plant(name, &[plant], &alone(0.3), look);
-        let mut flat = forest::plant(name, &[plant], &alone(0.3), look);
-        flat.materials.iter_mut().for_each(|material| material.normal_texture = None);
-        scenes.push((format!("{name} trunk with bump mapping"), Scene::new(bumpy)?));
-        scenes.push((format!("{name} trunk without"), Scene::new(flat)?));
+    for (name, plant) in [("peach tree", &plants.peach), ("blue spruce", &plants.spruce)] {
+        let look = RenderSettings { sun: [0.95, 0.28, 0.22], ..with_large_shadow_map(plants.tree.look) };
+        let with_normal_map = forest::combine_plants(name, &[plant], &single_instance(0.3), look);
+        let mut without_normal_map = forest::combine_plants(name, &[plant], &single_instance(0.3), look);
+        without_normal_map.materials.iter_mut().for_each(|material| material.normal_texture = None);
+        scenes.push((format!("{name} trunk with bump mapping"), Scene::new(with_normal_map)?));
+        scenes.push((format!("{name} trunk without bump mapping"), Scene::new(without_normal_map)?));
     }
-    let pieces: Vec<FigureView<'_>> =
-        scenes.iter().map(|(shows, scene)| atelier.piece(shows, scene, cameras::trunk())).collect();
-    atelier.figure("4.3", "bump-mapping", 2, &pieces)
+    let views: Vec<FigureView<'_>> =
+        scenes.iter().map(|(caption, scene)| renderer.view(caption, scene, cameras::trunk())).collect();
+    renderer.draw_figure("4.3", "bump-mapping", 2, &views)
 }
 
 /// Figures 4.4 and 4.5: standard and variance shadow maps of two sizes.
-fn shadows(atelier: &mut FigureRenderer, species: &FigurePlants) -> Result<()> {
-    let tree = Scene::new(forest::plant("shadows", &[&species.tree], &alone(0.6), species.tree.look))?;
+fn draw_shadow_maps(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Result<()> {
+    let tree = Scene::new(forest::combine_plants("shadows", &[&plants.tree], &single_instance(0.6), plants.tree.look))?;
     for (name, size) in [("4.4", 4096), ("4.5", 512)] {
         let standard = ShadowSettings { method: ShadowMethod::Standard, size, ..ShadowSettings::default() };
         let variance = ShadowSettings { size, ..ShadowSettings::default() };
-        let lit = |shadow| light_meter::relit(&tree, RenderSettings { shadow: Some(shadow), ..tree.look });
-        let (standard, variance) = (lit(standard)?, lit(variance)?);
+        let with_shadow =
+            |shadow| light_meter::with_settings(&tree, RenderSettings { shadow: Some(shadow), ..tree.look });
+        let (standard, variance) = (with_shadow(standard)?, with_shadow(variance)?);
         let camera = cameras::shadow(&tree);
-        let pieces = [
-            atelier.piece(&format!("standard shadow map, {size} x {size}"), &standard, camera),
-            atelier.piece(&format!("variance shadow map, {size} x {size}"), &variance, camera),
+        let views = [
+            renderer.view(&format!("standard shadow map, {size} x {size}"), &standard, camera),
+            renderer.view(&format!("variance shadow map, {size} x {size}"), &variance, camera),
         ];
-        atelier.figure(name, &format!("shadow-maps-{size}"), 2, &pieces)?;
+        renderer.draw_figure(name, &format!("shadow-maps-{size}"), 2, &views)?;
     }
     Ok(())
 }
 
-/// Figure 4.6: leaves with transparency, and their opaque cards.
-fn leaves(atelier: &mut FigureRenderer, species: &FigurePlants) -> Result<()> {
-    let drawn = |mode: AlphaMode| {
-        let mut parts = forest::plant("leaves", &[&species.tree], &alone(0.6), fine(species.tree.look));
+/// Figure 4.6: leaves with transparency, and as opaque cards.
+fn draw_transparency(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Result<()> {
+    let build_scene = |mode: AlphaMode| {
+        let mut parts = forest::combine_plants(
+            "leaves",
+            &[&plants.tree],
+            &single_instance(0.6),
+            with_large_shadow_map(plants.tree.look),
+        );
         let leaves = parts.materials.iter_mut().filter(|material| material.alpha_mode != AlphaMode::Opaque);
         leaves.for_each(|leaf| leaf.alpha_mode = mode);
         Scene::new(parts)
     };
-    let (with, without) = (drawn(AlphaMode::Blend)?, drawn(AlphaMode::Opaque)?);
-    let camera = cameras::bough(&with)?;
-    let pieces =
-        [atelier.piece("with transparency", &with, camera), atelier.piece("without transparency", &without, camera)];
-    atelier.figure("4.6", "transparency", 2, &pieces)
+    let (blended, opaque) = (build_scene(AlphaMode::Blend)?, build_scene(AlphaMode::Opaque)?);
+    let camera = cameras::leaf_closeup(&blended)?;
+    let views =
+        [renderer.view("with transparency", &blended, camera), renderer.view("without transparency", &opaque, camera)];
+    renderer.draw_figure("4.6", "transparency", 2, &views)
 }
 
-/// A scene of the user with its own look, and default shadows if it has none.
-fn own(atelier: &mut FigureRenderer, source: &str) -> Result<()> {
+/// A user-supplied scene with its own settings, and with default shadows if it has none.
+fn draw_user_scene(renderer: &mut FigureRenderer, source: &str) -> Result<()> {
     let scene = load::open(source)?.scene;
-    let scene = light_meter::relit(
+    let scene = light_meter::with_settings(
         &scene,
         RenderSettings { shadow: scene.look.shadow.or(Some(ShadowSettings::default())), ..scene.look },
     )?;
     let name = Path::new(source).file_stem().map_or_else(|| "scene".into(), |stem| stem.to_string_lossy());
-    if atelier.figures.iter().any(|figure| figure.name == name) {
-        return Err(invalid("scene", "scenes of different names", source));
+    if renderer.figures.iter().any(|figure| figure.name == name) {
+        return Err(invalid("scene", "distinct file names", format!("'{name}' twice")));
     }
-    let pieces = [atelier.piece(&name, &scene, Camera::fit_to_scene(&scene, atelier.size.width, atelier.size.height))];
-    atelier.figure(&name, "own", 1, &pieces)
+    let views = [renderer.view(&name, &scene, Camera::fit_to_scene(&scene, renderer.size.width, renderer.size.height))];
+    renderer.draw_figure(&name, "user", 1, &views)
 }
 
 impl Figures {
-    /// Writes the pictures, `figures.json` and `figures.md` into a folder, which is created.
+    /// Writes the images, `figures.json` and `figures.md` into a folder, which is created.
     ///
     /// # Errors
     /// `Fault` when a file cannot be written.
@@ -301,14 +322,14 @@ impl Figures {
     fn markdown(&self) -> String {
         let Size { width, height } = self.size;
         let mut text = format!(
-            "# The thesis's figures, remade\n\n{}\n\n{}; each picture {width} x {height} pixels.\n",
-            self.made.line(),
+            "# Reproduced figures of the thesis\n\n{}\n\n{}; each image {width} x {height} pixels.\n",
+            self.provenance.line(),
             self.renderer.renderer
         );
         for figure in &self.figures {
-            let Figure { name, shows, file, triangles } = figure;
-            let shows = shows.join("; ");
-            text.push_str(&format!("\n## {name}\n\n{shows}. {triangles} triangles.\n\n![{shows}]({file})\n"));
+            let Figure { name, captions, file, triangles } = figure;
+            let captions = captions.join("; ");
+            text.push_str(&format!("\n## {name}\n\n{captions}. {triangles} triangles.\n\n![{captions}]({file})\n"));
         }
         text
     }
