@@ -9,7 +9,7 @@
 //   change_steps   with DOMAIN_BOXES: per domain, the step that last changed it                               (in)
 //   positions      with DOMAIN_BOXES: address in the header                                                   (in)
 //   segment_boxes  with DOMAIN_BOXES: [segments][6] u32, like `boxes`; only those of dirty domains are written (out)
-// Launch: BLOCK threads per block, any number of blocks. CPU twin: BoundingBox::union (joins two boxes in f64).
+// Launch: BLOCK threads per block, any number of blocks. CPU twin: BoundingBox::union.
 //
 // Oriented bounds: the signs of an axis select the farthest corner of a tile's box along the axis, so each extreme costs
 // three multiply-adds. These round outward, so that the bounds along the f32 axes contain every vertex. The bounds of a
