@@ -63,7 +63,8 @@ struct SceneReport<'a> {
     unit: f64,
     origin: [f64; 3],
     totals: Value,
-    needs: SceneFeatures,
+    #[serde(rename = "needs")]
+    features: SceneFeatures,
     look: LookTable,
     /// The settings in the `deform` table of `scene.toml`.
     deformation: DeformTable,
@@ -97,7 +98,7 @@ impl<'a> SceneReport<'a> {
             unit: scene.unit,
             origin: scene.origin,
             totals: totals(scene),
-            needs: scene.needs,
+            features: scene.features,
             look: LookTable { settings: scene.look, raster: backends.raster },
             deformation: DeformTable { settings: scene.deformation, batches: backends.batches },
             remarks: &scene.remarks,
@@ -165,7 +166,7 @@ fn lines(opened: &OpenedScene) -> Vec<String> {
     let extent = scene.rest_bounds.diagonal();
     lines.push(format!("up {:?}, unit {} m, diagonal {extent:.4}, origin {:?}", scene.up, scene.unit, scene.origin));
     lines.extend(scene.remarks.iter().map(|remark| format!("remark: {remark}")));
-    let flags = scene.needs.flags().into_iter();
+    let flags = scene.features.flags().into_iter();
     let needed: Vec<&str> = flags.filter_map(|(name, needed)| needed.then_some(name)).collect();
     lines.push(format!("needs: {}", needed.join(", ")));
     lines.extend(plans(opened));

@@ -33,7 +33,7 @@ pub(super) fn scene_info(scene_handle: &SceneHandle, with_remarks: bool) -> v1::
         unit: scene.unit,
         origin: scene.origin.to_vec(),
         bounds: [bounds.min, bounds.max].concat(),
-        affine: scene.needs.shear,
+        affine: scene.features.shear,
         last_step: scene_handle.last_step().map(step_id),
         remarks: if with_remarks { remarks(scene) } else { Vec::new() },
     }

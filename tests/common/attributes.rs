@@ -103,7 +103,7 @@ pub(crate) fn check_scene_without_modes<D: Deformer>(create_deformer: impl Fn(&A
     let mut random = Random(103);
     let shapes = vec![strip_shape(&mut random, 7, 0), scenes::random_shape(&mut random, 300, 0)];
     let scene = scene_of_shapes(shapes, 2, with_displacements_and_boxes(DeformationSettings::default()), false);
-    assert!(!scene.needs.modes && scene.needs.displacements);
+    assert!(!scene.features.modes && scene.features.displacements);
     let result = run_step(&mut create_deformer(&scene), &scenes::random_state(&scene, 104));
     assert_eq!(result.surface.displacements, vec![0.0; 3 * scene.layout.vertices]);
     assert_eq!(find_wrong_box(&scene, &result), None);

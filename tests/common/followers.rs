@@ -85,7 +85,7 @@ pub(crate) fn check_frames<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) ->
         let parts =
             || follower_scene_parts(45, DeformationSettings { storage, ..DeformationSettings::default() }, rigid);
         let scene = Scene::new(parts()).expect("expected a valid scene");
-        assert_eq!((scene.transform_roots.count(), scene.needs.shear), (15, !rigid));
+        assert_eq!((scene.transform_roots.count(), scene.features.shear), (15, !rigid));
         let state = scenes::random_state(&scene, 61);
         let result = run_step(&mut create_deformer(&scene), &state);
         assert_within_bound(&name, &scene, &state, &result.surface.positions, 0.0);
@@ -164,7 +164,7 @@ pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn
                 |domain: &u32| transform_domains.contains(&(transform_root(&scene, *domain as usize) as u32));
             assert!(moved.iter().all(|domain| expected.contains(domain)));
             assert!(expected.iter().filter(|domain| has_new_transform(domain)).all(|domain| moved.contains(domain)));
-            assert!(!scene.needs.boxes || find_wrong_box(&scene, &result).is_none(), "step {step}");
+            assert!(!scene.features.boxes || find_wrong_box(&scene, &result).is_none(), "step {step}");
             // A partial step changes at most a quarter of the domains.
             partial_steps += usize::from(!expected.is_empty() && expected.len() <= 30);
             last = result;

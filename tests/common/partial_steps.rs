@@ -19,7 +19,7 @@ fn random_step(scene: &Scene, random: &mut Random, q_domains: &[u32], transform_
     let q: Vec<f32> = (0..coordinates).map(|_| random.next_number()).collect();
     let transform = |domain: &u32| match domain % 3 {
         0 => random.next_similarity(true).0,
-        1 if scene.needs.shear => random.next_shear().0,
+        1 if scene.features.shear => random.next_shear().0,
         _ => random.next_similarity(false).0,
     };
     let transforms: Vec<f32> = transform_domains.iter().flat_map(transform).collect();
@@ -201,7 +201,7 @@ fn compare_scripted_steps<D: Deformer>(name: &str, scene: &Arc<Scene>, create_de
     }
     assert_eq!(deformers.deform(&state, name).difference(&last), None, "{name}: the same state again");
     // Without truncation the result does not depend on earlier steps.
-    if !scene.needs.truncation {
+    if !scene.features.truncation {
         let new_result = run_step(&mut create_deformer(scene), &state);
         assert_eq!(new_result.difference(&last), None, "{name}: a new deformer");
     }

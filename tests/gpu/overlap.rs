@@ -59,7 +59,7 @@ fn states(scene: &Scene) -> Vec<SceneState> {
     let next_state = |step: usize| {
         let (q_domains, mut transform_domains) =
             (random_domains(scene, &mut random), random_domains(scene, &mut random));
-        if scene.needs.followers {
+        if scene.features.followers {
             // A root also moves its followers, so two roots already change many domains.
             transform_domains.retain(|domain| *domain < 20);
             transform_domains.truncate(2);
@@ -176,7 +176,7 @@ fn gpu_overlapped_reads_equal_blocking_reads() {
                 &want[STEPS - 1]
             ));
         }
-        let (deformation, followers) = (scene.deformation, scene.needs.followers);
+        let (deformation, followers) = (scene.deformation, scene.features.followers);
         eprintln!(
             "{deformation:?}, followers {followers}: {STEPS} steps have equal bits with up to five readbacks in flight"
         );
@@ -215,7 +215,7 @@ fn gpu_two_steps_in_flight_keep_their_own_results() {
         }
         reader.compare(&mut deformer, 0);
         assert_eq!(reader.compared, STEPS);
-        if scene.deformation == DeformationSettings::default() && !scene.needs.followers {
+        if scene.deformation == DeformationSettings::default() && !scene.features.followers {
             assert_equals_reference("after overlapped steps", &scene, &scenes::random_state(&scene, 5), &mut deformer);
         }
     }

@@ -31,7 +31,7 @@ fn deformed_state(scene: &Scene) -> SceneState {
 }
 
 fn assert_scene_equals_reference(name: &str, scene: &Arc<Scene>) {
-    assert!(scene.needs.modes, "{name}: expected a scene with modes");
+    assert!(scene.features.modes, "{name}: expected a scene with modes");
     let mut deformer = cuda_deformer(scene);
     let state = deformed_state(scene);
     assert_equals_reference(name, scene, &state, &mut deformer);

@@ -43,7 +43,10 @@ fn gpu_every_feature_combination_equals_its_twin() {
     for (modes, normal_maps, rigid) in (0..8).map(|set| (set & 1 != 0, set & 2 != 0, set & 4 != 0)) {
         let rank = if modes { 5 } else { 0 };
         let scene = scenes::random_scene(&[(300, rank), (40, 0), (7, rank)], 4, normal_maps, rigid);
-        assert_eq!((scene.needs.modes, scene.needs.normal_maps, scene.needs.shear), (modes, normal_maps, !rigid));
+        assert_eq!(
+            (scene.features.modes, scene.features.normal_maps, scene.features.shear),
+            (modes, normal_maps, !rigid)
+        );
         let mut deformer = cuda_deformer(&scene);
         assert!(deformer.plan().launches() <= 4);
         let name = format!("modes {modes} normal maps {normal_maps} rigid {rigid}");

@@ -110,7 +110,7 @@ pub(crate) fn random_state(scene: &Scene, seed: u64) -> SceneState {
     for (index, transform) in state.transforms.iter_mut().enumerate() {
         *transform = match index % 3 {
             0 => random.next_similarity(false),
-            1 if scene.needs.shear => random.next_shear(),
+            1 if scene.features.shear => random.next_shear(),
             _ => random.next_similarity(true),
         };
     }

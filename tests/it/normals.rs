@@ -239,7 +239,7 @@ fn only_deformable_shapes_have_smoothing_groups() {
         .expect("expected a valid shape");
     let shapes = || vec![shape_with_mode(sheet(3, 3), parabola), rigid_shape.clone()];
     let exact_scene = scene(shapes());
-    assert!(exact_scene.needs.exact_normals);
+    assert!(exact_scene.features.exact_normals);
     assert!(exact_scene.shapes[0].smoothing().is_some() && exact_scene.shapes[1].smoothing().is_none());
     let state = state(&exact_scene, 0.5, linear_parts()[2], [0.0; 3]);
     let cpu = deform_on_cpu(&exact_scene, &state);
@@ -249,5 +249,5 @@ fn only_deformable_shapes_have_smoothing_groups() {
         "expected rigid normals of the rigid shape"
     );
     let rigid_scene = scene_with_normals(shapes(), NormalMethod::Rigid);
-    assert!(!rigid_scene.needs.exact_normals && rigid_scene.shapes.iter().all(|shape| shape.smoothing().is_none()));
+    assert!(!rigid_scene.features.exact_normals && rigid_scene.shapes.iter().all(|shape| shape.smoothing().is_none()));
 }

@@ -81,7 +81,7 @@ fn tree_agrees_with_its_reference() {
 fn real_modal_inputs_agree_with_their_reference() {
     for path in MODAL_INPUTS {
         let scene = load::open(&input_path(path)).unwrap_or_else(|error| panic!("{path}: {error}")).scene;
-        assert!(scene.needs.modes, "{path}: expected a scene with modes");
+        assert!(scene.features.modes, "{path}: expected a scene with modes");
         assert_cpu_equals_reference(&scene);
     }
 }

@@ -175,8 +175,8 @@ impl MinimumMotion {
     /// 2 % of the diagonal for a scene with modes, 0.01 % for a rigid one. A scene with modes and attached domains must
     /// also sway by 3 % of its height.
     fn of(scene: &Scene) -> Self {
-        let jointed = scene.needs.modes && scene.domains.iter().any(|domain| domain.attachment.is_some());
-        Self { displacement: if scene.needs.modes { 0.02 } else { 1e-4 }, sway: if jointed { 0.03 } else { 0.0 } }
+        let jointed = scene.features.modes && scene.domains.iter().any(|domain| domain.attachment.is_some());
+        Self { displacement: if scene.features.modes { 0.02 } else { 1e-4 }, sway: if jointed { 0.03 } else { 0.0 } }
     }
 }
 

@@ -32,7 +32,7 @@ pub(super) type TileOutputs<'a> = (PackedOutput<'a>, PerTileOutput<'a, TileBound
 /// Writes positions, extents and displacements of these tiles. A tile's extent is not finite if one of its positions,
 /// or one of the displacements that the scene keeps, is not.
 pub(super) fn deform(inputs: DeformInputs, tiles: &[DomainTile], outputs: TileOutputs) {
-    if inputs.scene.needs.compensated {
+    if inputs.scene.features.compensated {
         tile::run_parallel(tiles, outputs, &|tiles, outputs| {
             run_vectorized(DeformTask::<true> { inputs, tiles, outputs })
         });

@@ -63,7 +63,7 @@ impl CpuDeformer {
     /// Encodes U in the scene's storage type and allocates work lists and outputs.
     pub fn new(scene: &Arc<Scene>) -> Self {
         let layout = &scene.layout;
-        let tangents = if scene.needs.normal_maps { 4 * layout.corners } else { 0 };
+        let tangents = if scene.features.normal_maps { 4 * layout.corners } else { 0 };
         let storage = scene.deformation.storage;
         let shapes: Vec<TiledModes> = scene.shapes.par_iter().map(|shape| TiledModes::new(shape, storage)).collect();
         let most_chunks = shapes.iter().map(TiledModes::chunks).max().unwrap_or(0);
@@ -82,8 +82,8 @@ impl CpuDeformer {
                 positions: vec![0.0; 3 * layout.vertices],
                 normals: vec![0.0; 3 * layout.corners],
                 tangents: vec![0.0; tangents],
-                displacements: vec![0.0; if scene.needs.displacements { 3 * layout.vertices } else { 0 }],
-                boxes: vec![BoundingBox::EMPTY; if scene.needs.boxes { layout.domains.len() } else { 0 }],
+                displacements: vec![0.0; if scene.features.displacements { 3 * layout.vertices } else { 0 }],
+                boxes: vec![BoundingBox::EMPTY; if scene.features.boxes { layout.domains.len() } else { 0 }],
             },
         }
     }
@@ -113,7 +113,7 @@ impl CpuDeformer {
             all_chunks: &self.all_chunks,
         };
         let DeformedSurface { positions, displacements, .. } = &mut self.surface;
-        let displacements = self.scene.needs.displacements.then(|| PackedOutput::new(3, displacements));
+        let displacements = self.scene.features.displacements.then(|| PackedOutput::new(3, displacements));
         let outputs = (PackedOutput::new(3, positions), PerTileOutput::new(&mut self.extents), displacements);
         deform::deform(inputs, self.vertex_work.of(&self.changes), outputs);
     }
@@ -145,7 +145,7 @@ impl Deformer for CpuDeformer {
         self.update_boxes();
         // Both kinds of normals depend only on the domain's own positions and T.
         let corners = self.corner_work.of(&self.changes);
-        if self.scene.needs.exact_normals {
+        if self.scene.features.exact_normals {
             normals::normals(&self.scene, state, corners, &mut self.surface);
         } else {
             rigid_normals::rigid_normals(&self.scene, state, corners, &mut self.surface);

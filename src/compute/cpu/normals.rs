@@ -24,7 +24,7 @@ pub(super) fn normals(scene: &Scene, state: &SceneState, tiles: &[DomainTile], s
     let DeformedSurface { positions, normals, tangents, .. } = surface;
     let positions = positions.as_slice();
     // In a scene without tangents, a tile has zero numbers of them.
-    let tangents = PackedOutput::new(if scene.needs.normal_maps { 4 } else { 0 }, tangents);
+    let tangents = PackedOutput::new(if scene.features.normal_maps { 4 } else { 0 }, tangents);
     tile::run_parallel(tiles, (PackedOutput::new(3, normals), tangents), &|tiles, (mut normals, mut tangents)| {
         for tile in tiles {
             let (normals, tangents) = (normals.of(tile), tangents.of(tile));

@@ -27,7 +27,7 @@ struct DomainModes {
 impl RetainedModes {
     /// Starts without truncated modes. `None` for a scene without a budget.
     pub(super) fn new(scene: &Scene) -> Option<Self> {
-        let meters = scene.deformation.truncation.filter(|_| scene.needs.truncation)?;
+        let meters = scene.deformation.truncation.filter(|_| scene.features.truncation)?;
         let list = |domain| {
             let rank = scene.rank_of(domain);
             DomainModes { truncation: Truncation::new(rank), q: vec![0.0; rank], chunks: Vec::with_capacity(rank) }

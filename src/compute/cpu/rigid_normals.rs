@@ -11,7 +11,7 @@ pub(super) fn rigid_normals(scene: &Scene, state: &SceneState, tiles: &[DomainTi
     tile::run_parallel(tiles, PackedOutput::new(3, &mut surface.normals), &|tiles, mut out| {
         tiles.iter().for_each(|tile| write_rigid_normals(scene, state, tile, out.of(tile)));
     });
-    if scene.needs.normal_maps {
+    if scene.features.normal_maps {
         tile::run_parallel(tiles, PackedOutput::new(4, &mut surface.tangents), &|tiles, mut out| {
             tiles.iter().for_each(|tile| write_rigid_tangents(scene, state, tile, out.of(tile)));
         });
@@ -22,7 +22,7 @@ pub(super) fn rigid_normals(scene: &Scene, state: &SceneState, tiles: &[DomainTi
 pub(super) fn write_rigid_normals(scene: &Scene, state: &SceneState, tile: &DomainTile, out: &mut [f32]) {
     let linear = state.composed_transform(scene, tile.domain()).linear();
     // Without shear A itself transforms normals, up to the sign of a reflection, which the cofactors include.
-    let turn = if scene.needs.shear { cofactors(&linear) * linear.determinant().signum() } else { linear };
+    let turn = if scene.features.shear { cofactors(&linear) * linear.determinant().signum() } else { linear };
     let turn = scaled(turn);
     let normals = &scene.shape_of(tile.domain()).mesh.corners().normals[tile.first()..][..tile.count()];
     for (normal, out) in normals.iter().zip(out.chunks_exact_mut(3)) {

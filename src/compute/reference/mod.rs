@@ -40,13 +40,13 @@ impl ReferenceDeformer {
     /// NaN.
     fn compute_attributes(&mut self, state: &SceneState, bounds: &mut BoundingBox) {
         let (scene, surface) = (&self.scene, &mut self.surface);
-        if scene.needs.displacements {
+        if scene.features.displacements {
             surface.displacements = round(displacements(scene, state));
             if !surface.displacements.iter().all(|number| number.is_finite()) {
                 bounds.include([f64::NAN; 3]);
             }
         }
-        if scene.needs.boxes {
+        if scene.features.boxes {
             let box_of = |slot: &DomainLayout| {
                 BoundingBox::from_positions(&surface.positions[3 * slot.first_vertex..][..3 * slot.vertices])
             };
@@ -68,7 +68,7 @@ impl Deformer for ReferenceDeformer {
                 |position: &[f64; 3]| OrientedBounds::enclosing(&axes, &BoundingBox { min: *position, max: *position });
             positions.iter().map(one).fold(OrientedBounds::EMPTY, OrientedBounds::union)
         });
-        let (normals, tangents) = if self.scene.needs.exact_normals {
+        let (normals, tangents) = if self.scene.features.exact_normals {
             (exact_normals(&self.scene, state, &positions), exact_tangents(&self.scene, state, &positions))
         } else {
             (rigid_normals(&self.scene, state), rigid_tangents(&self.scene, state))

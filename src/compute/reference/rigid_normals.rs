@@ -23,7 +23,7 @@ pub fn rigid_normals(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
 /// World unit tangents and bitangent signs, one per corner; empty when the scene has no normal map. A shape without
 /// tangents gives zeros. A mirroring A flips the sign.
 pub fn rigid_tangents(scene: &Scene, state: &SceneState) -> Vec<[f64; 4]> {
-    if !scene.needs.normal_maps {
+    if !scene.features.normal_maps {
         return Vec::new();
     }
     let mut tangents = Vec::with_capacity(scene.layout.corners);

@@ -94,8 +94,8 @@ fn check_available(scene: &Scene, wanted: VertexAttributes) -> Result<()> {
         return Err(invalid("selection.without_vertices", "displacements or boxes instead", "neither"));
     }
     let options = [
-        ("displacements", wanted.displacements, scene.needs.displacements),
-        ("boxes", wanted.boxes, scene.needs.boxes),
+        ("displacements", wanted.displacements, scene.features.displacements),
+        ("boxes", wanted.boxes, scene.features.boxes),
     ];
     match options.into_iter().find(|(_, wanted, kept)| *wanted && !kept) {
         None => Ok(()),

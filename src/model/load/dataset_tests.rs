@@ -111,7 +111,7 @@ fn real_almond_is_1447_domains_upright_and_no_face_is_lost() {
     assert_eq!(scene.up, UpAxis::Z);
     let height = scene.rest_bounds.max[2] - scene.rest_bounds.min[2];
     assert!((height - 2.6745).abs() < 1e-3, "{height}");
-    assert!(scene.needs.mask && !scene.needs.modes && !scene.needs.normal_maps);
+    assert!(scene.features.mask && !scene.features.modes && !scene.features.normal_maps);
     assert_eq!(open("plants/almond/almond.obj").domains.len(), 1447, "the file alone is the same plant");
     let leaf = scene.domains.iter().find(|domain| domain.name.starts_with("leaf ")).expect("a leaf");
     let materials: Vec<_> = leaf.materials().map(|material| &scene.materials[material]).collect();

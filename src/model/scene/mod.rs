@@ -92,7 +92,8 @@ pub struct Scene {
     pub remarks: Vec<String>,
     pub layout: Layout,
     pub transform_roots: TransformRoots,
-    pub needs: SceneFeatures,
+    /// The optional features that the scene uses.
+    pub features: SceneFeatures,
     /// Bounds of the rest state in scene units.
     pub rest_bounds: BoundingBox,
 }
@@ -141,8 +142,8 @@ impl Scene {
         drop_textures_without_uvs(&mut parts);
         add_tangents(&mut parts);
         let layout = Layout::new(&parts.shapes, &parts.domains)?;
-        let needs = SceneFeatures::from_parts(&parts);
-        if needs.exact_normals {
+        let features = SceneFeatures::from_parts(&parts);
+        if features.exact_normals {
             add_smoothing(&mut parts)?;
         }
         let mut scene = Self {
@@ -160,7 +161,7 @@ impl Scene {
             remarks: parts.remarks,
             layout,
             transform_roots,
-            needs,
+            features,
             rest_bounds: BoundingBox::EMPTY,
         };
         scene.rest_bounds = scene.bounds_at_rest();
@@ -402,7 +403,7 @@ mod tests {
         let scene = Scene::new(textured()).expect("a scene");
         let shown = &scene.materials[scene.domains[0].material];
         assert_eq!((shown.color_texture, shown.alpha_mode), (None, AlphaMode::Opaque));
-        assert!(!scene.needs.textures && !scene.needs.mask);
+        assert!(!scene.features.textures && !scene.features.mask);
         assert!(scene.remarks[0].contains("no texture coordinates"), "{:?}", scene.remarks);
         let mut placed = textured();
         let mesh = &placed.shapes[0].mesh;
@@ -411,7 +412,7 @@ mod tests {
         let mesh = Mesh::from_indexed(mesh.rest().to_vec(), corners.normals, uvs, mesh.triangles().to_vec());
         placed.shapes[0] = Shape::new(mesh.expect("a square"), Modes::rigid()).expect("rigid");
         let scene = Scene::new(placed).expect("a scene");
-        assert!(scene.needs.textures && scene.needs.mask && scene.remarks.is_empty());
+        assert!(scene.features.textures && scene.features.mask && scene.remarks.is_empty());
     }
 
     fn run(first_triangle: usize, material: usize) -> MaterialRange {
@@ -420,8 +421,8 @@ mod tests {
 
     #[test]
     fn a_material_of_any_run_counts_for_what_the_scene_needs() {
-        assert!(Scene::new(square(vec![run(0, 0), run(1, 1)])).expect("good").needs.blend);
-        assert!(!Scene::new(square(vec![])).expect("good").needs.blend, "the second material is unused");
+        assert!(Scene::new(square(vec![run(0, 0), run(1, 1)])).expect("good").features.blend);
+        assert!(!Scene::new(square(vec![])).expect("good").features.blend, "the second material is unused");
     }
 
     #[test]

@@ -142,7 +142,7 @@ impl SceneState {
 
     /// `world_from_domain` of every domain. Borrows `transforms` if the scene has no followers.
     pub fn world_transforms(&self, scene: &Scene) -> Cow<'_, [Transform]> {
-        match scene.needs.followers {
+        match scene.features.followers {
             false => Cow::Borrowed(&self.transforms),
             true => (0..scene.domains.len()).map(|domain| self.transform_of(scene, domain)).collect(),
         }

@@ -174,7 +174,7 @@ fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransfor
 /// Parses the only format that can contain shear.
 fn parse_affine(scene: &Scene, bytes: &[u8]) -> Result<ParsedTransform> {
     let (transform, kept) = transform_format::parse_affine(bytes)?;
-    if !scene.needs.shear && !transform.is_similarity() {
+    if !scene.features.shear && !transform.is_similarity() {
         let expected = "no shear and one scale (the scene declares rigid transforms)";
         return Err(invalid("linear", expected, format!("{:?}", transform.0)));
     }

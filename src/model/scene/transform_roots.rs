@@ -212,7 +212,7 @@ mod tests {
             [vec![1, 2], vec![], vec![], vec![4], vec![]]
         );
         assert_eq!((scene.domains[1].placement, scene.domains[2].placement), (moved(11.0), moved(13.0)));
-        assert!(scene.needs.followers);
+        assert!(scene.features.followers);
     }
 
     #[test]
@@ -235,7 +235,7 @@ mod tests {
             (scene.transform_roots.of(3), scene.transform_roots.frame_of(3), scene.transform_roots.domain(3)),
             (3, None, 3)
         );
-        assert!(scene.transform_roots.followers_of(3).is_empty() && !scene.needs.followers);
+        assert!(scene.transform_roots.followers_of(3).is_empty() && !scene.features.followers);
     }
 
     #[test]
@@ -265,7 +265,7 @@ mod tests {
         };
         let (mut sheared, mut mirrored) = (Transform::IDENTITY, Transform::IDENTITY);
         (sheared.0[1], mirrored.0[0]) = (0.5, -1.0);
-        assert!(scene(sheared).needs.shear);
-        assert!(!scene(mirrored).needs.shear);
+        assert!(scene(sheared).features.shear);
+        assert!(!scene(mirrored).features.shear);
     }
 }

@@ -224,9 +224,9 @@ mod tests {
             assert_eq!(count("trunk"), 1);
             assert!(count("branch") >= 60 && count("leaf") >= 200);
             assert_eq!(count("trunk") + count("branch") + count("leaf"), scene.domains.len());
-            let needs = scene.needs;
-            assert!(needs.modes && needs.textures && needs.normal_maps && needs.mask && needs.shadows);
-            assert!(!needs.blend && !needs.shear);
+            let features = scene.features;
+            assert!(features.modes && features.textures && features.normal_maps && features.mask && features.shadows);
+            assert!(!features.blend && !features.shear);
             let height = scene.rest_bounds.max[1];
             assert!((7.0..9.5).contains(&height), "{height} m high");
             assert!(scene.rest_bounds.min[1].abs() < 1e-6, "the tree stands on {}", scene.rest_bounds.min[1]);

@@ -39,7 +39,7 @@ pub(crate) fn select_culling(scene: &Scene, limits: &Limits) -> Culling {
 /// the samples that also pass the depth test. Hidden triangles drawn earlier thus move the centroid, and about one
 /// pixel in a million differs when they are culled.
 fn interpolates_at_centroid(scene: &Scene) -> bool {
-    scene.look.samples_per_pixel() > 1 && scene.needs.mask && scene.needs.textures
+    scene.look.samples_per_pixel() > 1 && scene.features.mask && scene.features.textures
 }
 
 /// The passes of the camera's lists, in execution order.

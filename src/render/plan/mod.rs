@@ -166,18 +166,18 @@ fn draw_calls(scene: &Scene, groups: &[DrawGroup]) -> usize {
 }
 
 fn buffer_sizes(scene: &Scene, culling: Culling) -> SceneBufferSet<u64> {
-    let (layout, needs) = (&scene.layout, scene.needs);
+    let (layout, features) = (&scene.layout, scene.features);
     let [vertices, corners, triangles] = [layout.vertices, layout.corners, layout.triangles].map(|count| count as u64);
     let cascades = scene.look.shadow.filter(|shadow| shadow.splits > 1);
     SceneBufferSet {
         geometry: GeometryBuffers {
             positions: 12 * vertices,
             normals: 12 * corners,
-            tangents: needs.normal_maps.then_some(16 * corners),
-            uvs: (needs.textures || needs.normal_maps).then_some(8 * corners),
+            tangents: features.normal_maps.then_some(16 * corners),
+            uvs: (features.textures || features.normal_maps).then_some(8 * corners),
             triangles: 12 * triangles,
             triangle_vertices: 12 * triangles,
-            corner_vertices: (needs.mask || needs.blend).then_some(4 * corners),
+            corner_vertices: (features.mask || features.blend).then_some(4 * corners),
         },
         materials: MaterialBuffers {
             materials: (MATERIAL_BYTES * used_materials(scene).len()) as u64,
@@ -214,14 +214,14 @@ fn shadow_allocations(shadow: &ShadowSettings, blur_method: BlurMethod) -> impl 
 }
 
 fn features(scene: &Scene, blur_method: BlurMethod, culling: Culling) -> ShaderFeatures {
-    let (needs, look) = (scene.needs, &scene.look);
+    let (features, look) = (scene.features, &scene.look);
     ShaderFeatures {
-        textures: needs.textures,
-        normal_maps: needs.normal_maps,
+        textures: features.textures,
+        normal_maps: features.normal_maps,
         material_table: uses_material_table(scene),
         ground: look.ground.is_some(),
-        blend_layers: needs.blend,
-        oit: needs.blend && look.transparency == Transparency::OrderIndependent,
+        blend_layers: features.blend,
+        oit: features.blend && look.transparency == Transparency::OrderIndependent,
         opaque_parts: opaque_parts(scene),
         shadow: look.shadow,
         blur_method,
@@ -230,16 +230,16 @@ fn features(scene: &Scene, blur_method: BlurMethod, culling: Culling) -> ShaderF
 }
 
 fn omitted(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
-    let (needs, layout, look) = (scene.needs, &scene.layout, &scene.look);
+    let (features, layout, look) = (scene.features, &scene.layout, &scene.look);
     let map: u64 = shadow_allocations(&look.shadow.unwrap_or_default(), BlurMethod::Auto).map(|part| part.bytes).sum();
     let per_corner = |bytes: usize| (bytes * layout.corners) as u64;
-    let uvs = if needs.textures || needs.normal_maps { 0 } else { per_corner(8) };
+    let uvs = if features.textures || features.normal_maps { 0 } else { per_corner(8) };
     let all: [(bool, &str, u64, &[Pass], &str); 12] = [
-        (needs.normal_maps, "normal maps", per_corner(16), &[], "no tangent frame, no normal map lookup"),
-        (needs.textures, "textures", uvs, &[], "no colour lookup"),
-        (needs.mask, "mask", 0, &[], "no discard, no sample mask; depth needs no fragment shader"),
-        (needs.blend, "blend", 0, blend_passes(scene), "no layers in the shading, 8 bytes a sample less"),
-        (needs.shadows, "shadows", map, &[Pass::Shadow, Pass::Blur], "no shadow lookup"),
+        (features.normal_maps, "normal maps", per_corner(16), &[], "no tangent frame, no normal map lookup"),
+        (features.textures, "textures", uvs, &[], "no colour lookup"),
+        (features.mask, "mask", 0, &[], "no discard, no sample mask; depth needs no fragment shader"),
+        (features.blend, "blend", 0, blend_passes(scene), "no layers in the shading, 8 bytes a sample less"),
+        (features.shadows, "shadows", map, &[Pass::Shadow, Pass::Blur], "no shadow lookup"),
         (uses_material_table(scene), "many materials", 4 * layout.triangles as u64, &[], "no lookup per triangle"),
         (look.ground.is_some(), "ground", 0, &[Pass::Ground], "no ground program"),
         (look.bloom.is_some(), "bloom", 0, &[Pass::Bloom], "what glows is not kept, 10.7 bytes a pixel less"),

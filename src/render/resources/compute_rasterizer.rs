@@ -67,7 +67,7 @@ impl RasterPasses {
         let triangles = scene.layout.triangles > 0;
         Self {
             shadow: triangles && shadow,
-            visibility: triangles && look.samples_per_pixel() == 1 && !scene.needs.blend,
+            visibility: triangles && look.samples_per_pixel() == 1 && !scene.features.blend,
         }
     }
 

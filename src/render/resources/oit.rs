@@ -83,7 +83,7 @@ impl OitTarget {
 /// How a frame of this look draws blended triangles.
 pub(crate) fn blend_storage(gl: &Gl, scene: &Scene, size: [u32; 2]) -> Result<BlendStorage> {
     match scene.look.transparency {
-        _ if !scene.needs.blend => Ok(BlendStorage::None),
+        _ if !scene.features.blend => Ok(BlendStorage::None),
         Transparency::TwoPass => Ok(BlendStorage::SingleLayer),
         Transparency::OrderIndependent => budget(&gl.limits, &scene.look, size).map(BlendStorage::FragmentLists),
     }

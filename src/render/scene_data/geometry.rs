@@ -116,7 +116,7 @@ impl Geometry {
     pub(crate) fn new(scene: &Scene) -> Self {
         let (groups, group_of) = groups(scene);
         let layout = &scene.layout;
-        let textured = scene.needs.textures || scene.needs.normal_maps;
+        let textured = scene.features.textures || scene.features.normal_maps;
         let mut geometry = Self {
             vertices: Vec::with_capacity(layout.corners),
             uvs: Vec::with_capacity(if textured { layout.corners } else { 0 }),

@@ -56,8 +56,8 @@ impl TextureArray {
 /// The arrays that a scene needs for one use; empty when no used material has such an image.
 pub(crate) fn arrays(scene: &Scene, purpose: TextureRole) -> Vec<TextureArray> {
     let wanted = match purpose {
-        TextureRole::Color => scene.needs.textures,
-        TextureRole::Normal => scene.needs.normal_maps,
+        TextureRole::Color => scene.features.textures,
+        TextureRole::Normal => scene.features.normal_maps,
     };
     if !wanted {
         return Vec::new();

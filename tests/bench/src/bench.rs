@@ -182,7 +182,7 @@ const BUDGETS: [(&str, f64); 3] = [("1e-6", 1e-6), ("1e-5", 1e-5), ("1e-4", 1e-4
 /// already chooses.
 fn shortcuts(scene: &Scene) -> Vec<(String, DeformationSettings)> {
     let plain = scene.deformation;
-    if !scene.needs.modes || plain != DeformationSettings::default() {
+    if !scene.features.modes || plain != DeformationSettings::default() {
         return Vec::new();
     }
     let diagonal = scene.unit * scene.rest_bounds.diagonal();
@@ -200,7 +200,7 @@ fn shortcuts(scene: &Scene) -> Vec<(String, DeformationSettings)> {
 /// normals.
 fn exact_normals(scene: &Scene) -> Option<DeformationSettings> {
     let rigid =
-        scene.needs.modes && cuda_variants::has_normals(scene) && scene.deformation.normals == NormalMethod::Rigid;
+        scene.features.modes && cuda_variants::has_normals(scene) && scene.deformation.normals == NormalMethod::Rigid;
     rigid.then_some(DeformationSettings { normals: NormalMethod::Exact, ..scene.deformation })
 }
 

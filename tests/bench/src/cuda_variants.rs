@@ -65,7 +65,7 @@ pub(super) fn kernel_variants(
         let deformation = DeformationSettings { storage, ..scene.deformation };
         StepVariant { name, deformation, batches, outputs }.candidate(device, cache, is_selected)
     };
-    let storages: &[StorageType] = if scene.needs.modes { &StorageType::ALL } else { &[StorageType::F32] };
+    let storages: &[StorageType] = if scene.features.modes { &StorageType::ALL } else { &[StorageType::F32] };
     let mut candidates: Vec<VariantCandidate> =
         storages.iter().map(|storage| candidate_for(*storage, StepOutputs::Positions)).collect();
     if has_normals(scene) {
@@ -79,7 +79,7 @@ pub(super) fn kernel_variants(
     if scene.domains.len() >= MIN_CHANGED_DOMAINS {
         candidates.push(one_percent_changed(device, load, is_selected));
     }
-    if scene.needs.modes {
+    if scene.features.modes {
         candidates.push(candidate_for(StorageType::F32, StepOutputs::Uq));
         candidates.extend(batch_variants(device, cache, scene, is_selected));
         candidates.extend(thesis_variants(device, scene, is_selected));

@@ -52,7 +52,7 @@ impl ErrorModel {
 
     fn with(scene: &Arc<Scene>, stored: Arc<Vec<StoredShape>>) -> Self {
         let truncation =
-            scene.deformation.truncation.filter(|_| scene.needs.truncation).map(|meters| TruncationState {
+            scene.deformation.truncation.filter(|_| scene.features.truncation).map(|meters| TruncationState {
                 budget: meters / scene.unit,
                 max_row_norms: scene.shapes.par_iter().map(|shape| max_row_norms(&shape.modes)).collect(),
                 domains: (0..scene.domains.len()).map(|domain| Truncation::new(scene.rank_of(domain))).collect(),

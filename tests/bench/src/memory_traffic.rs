@@ -34,8 +34,8 @@ pub fn of_scene(scene: &Scene) -> Vec<Operand> {
         triangles += shape.mesh.triangles().len();
         tangents += shape.tangents().len();
     }
-    let mapped = if scene.needs.normal_maps { layout.corners } else { 0 };
-    let (exact, storage) = (scene.needs.exact_normals, scene.deformation.storage);
+    let mapped = if scene.features.normal_maps { layout.corners } else { 0 };
+    let (exact, storage) = (scene.features.exact_normals, scene.deformation.storage);
     let only = |wanted: bool, bytes: usize| if wanted { bytes } else { 0 };
     let part = |name, formula, bytes: usize| Operand { name, formula, bytes: bytes as u64 };
     let parts = [

@@ -111,7 +111,7 @@ struct NormalScenes<'a> {
 impl<'a> NormalScenes<'a> {
     fn new(load: &'a Workload) -> Self {
         let exact_normals = DeformationSettings { normals: NormalMethod::Exact, ..load.scene.deformation };
-        let has_exact_normals = load.scene.needs.modes && has_normals(&load.scene);
+        let has_exact_normals = load.scene.features.modes && has_normals(&load.scene);
         let exact = has_exact_normals.then(|| with_deformation(&load.scene, exact_normals)).and_then(Result::ok);
         Self { rigid: &load.scene, exact }
     }
@@ -274,7 +274,7 @@ impl<'a> VariantCheck<'a> {
 
     /// Whether the variant outputs normals that must follow the deformed surface.
     fn has_exact_normals(&self) -> bool {
-        !self.surface.normals.is_empty() && self.variant.scene().needs.exact_normals
+        !self.surface.normals.is_empty() && self.variant.scene().features.exact_normals
     }
 
     /// Evaluates the first state again, after all others. Variants with truncation are exempt: their choice of modes
@@ -302,7 +302,7 @@ impl<'a> VariantCheck<'a> {
         if normals.is_empty() {
             return;
         }
-        let want = sample.directions(self.variant.scene().needs.exact_normals);
+        let want = sample.directions(self.variant.scene().features.exact_normals);
         self.orientation.add_normals(normals, &want.normals);
         if sample.error_sources.is_some() && sample.scenes.exact.is_some() {
             self.orientation.add_to_surface(normals, &sample.directions(true).normals);

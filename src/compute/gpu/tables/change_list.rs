@@ -27,7 +27,7 @@ const TRANSFORM_WORDS: usize = 12;
 /// domains, or when it truncates modes. The set of truncated modes depends on q and is uploaded only with the whole
 /// state.
 pub(crate) const fn max_changed_domains(scene: &Scene) -> usize {
-    if scene.needs.truncation { 0 } else { scene.domains.len() / MAX_CHANGED_DIVISOR }
+    if scene.features.truncation { 0 } else { scene.domains.len() / MAX_CHANGED_DIVISOR }
 }
 
 /// Maximum number of entries of such a list: silent domains have none.
@@ -40,9 +40,9 @@ pub(crate) fn max_change_entries(scene: &Scene) -> usize {
 /// coordinates, and the scene keeps neither exact normals nor boxes, which read the step of its last change. Its tiles
 /// are recomputed nevertheless.
 fn needs_no_entry(scene: &Scene, domain: usize) -> bool {
-    let needs = scene.needs;
-    needs.followers
-        && !(needs.exact_normals || needs.boxes)
+    let features = scene.features;
+    features.followers
+        && !(features.exact_normals || features.boxes)
         && scene.layout.domains[domain].rank == 0
         && scene.transform_roots.frame_of(domain).is_some()
 }

@@ -63,7 +63,7 @@ impl DeviceTables {
             rest: rest_positions(scene, &work),
             rest_normals,
             rest_tangents,
-            normals: scene.needs.exact_normals.then(|| NormalTables::new(scene)),
+            normals: scene.features.exact_normals.then(|| NormalTables::new(scene)),
             transform_links: transform_links(scene),
             inputs: InputSizes::of(scene, &coordinates),
             listed_tiles: if max_change_entries(scene) > 0 { work.tiles.len() } else { 0 },
@@ -92,7 +92,7 @@ impl NormalTables {
         Self {
             first_domains: normal_tables::first_domains(slots.iter().map(|slot| slot.first), scene.layout.corners),
             rest_normals: normal_tables::rest_normals(scene),
-            rest_tangents: if scene.needs.normal_maps { normal_tables::rest_tangents(scene) } else { Vec::new() },
+            rest_tangents: if scene.features.normal_maps { normal_tables::rest_tangents(scene) } else { Vec::new() },
             rings: RingTables::new(scene),
             slots,
         }

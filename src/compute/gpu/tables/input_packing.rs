@@ -51,7 +51,7 @@ pub(crate) struct InputSizes {
 impl InputSizes {
     pub(crate) fn of(scene: &Scene, coordinates: &CoordinateLayout) -> Self {
         let domains = scene.domains.len() as u64;
-        let (truncation, per_chunk) = (scene.needs.truncation, modes_per_chunk(scene.deformation.storage));
+        let (truncation, per_chunk) = (scene.features.truncation, modes_per_chunk(scene.deformation.storage));
         Self {
             transforms: 48 * scene.transform_roots.count() as u64,
             q: 4 * coordinates.total as u64,
@@ -75,7 +75,7 @@ pub struct InputWriter {
 impl InputWriter {
     /// A writer of steps in the layout of `packing`.
     pub fn new(packing: &Arc<InputPacker>) -> Self {
-        let truncation = packing.scene.needs.truncation.then(|| ChunkSelection::new(&packing.scene));
+        let truncation = packing.scene.features.truncation.then(|| ChunkSelection::new(&packing.scene));
         Self { packing: Arc::clone(packing), truncation }
     }
 

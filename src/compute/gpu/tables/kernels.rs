@@ -90,7 +90,7 @@ pub(crate) fn deform_blocks(kernel: &KernelDescriptor, tiles: usize) -> u32 {
 
 /// The kernels of a scene in launch order, except `apply`, which is last.
 pub(crate) fn kernels(scene: &Scene, tables: &DeviceTables) -> Vec<KernelDescriptor> {
-    let (needs, work, segments) = (scene.needs, &tables.work, &tables.segments);
+    let (features, work, segments) = (scene.features, &tables.work, &tables.segments);
     let [deform, batch, bounds, apply, normals] = KERNELS;
     let defines = deform_defines(scene, work);
     let threads = block_threads(&defines);
@@ -100,11 +100,11 @@ pub(crate) fn kernels(scene: &Scene, tables: &DeviceTables) -> Vec<KernelDescrip
     deform.blocks = deform_blocks(&deform, work.full_step_tiles);
     let walk = |kind, kernel: &KernelSource, blocks: usize| {
         let defines = [
-            ("NORMAL_MAPS", needs.normal_maps),
-            ("SHEAR", needs.shear),
-            ("FOLLOWERS", needs.followers),
+            ("NORMAL_MAPS", features.normal_maps),
+            ("SHEAR", features.shear),
+            ("FOLLOWERS", features.followers),
             ("ORIENTED_BOUNDS", tables.bounding_axes.is_some()),
-            ("DOMAIN_BOXES", needs.boxes),
+            ("DOMAIN_BOXES", features.boxes),
         ];
         let on = defines.iter().filter(|(name, on)| *on && kernel.features.contains(name));
         let (defines, blocks) = (on.map(|(name, _)| *name).collect(), blocks as u32);
@@ -113,11 +113,11 @@ pub(crate) fn kernels(scene: &Scene, tables: &DeviceTables) -> Vec<KernelDescrip
     let few = (4 * work.tiles.len()).div_ceil(BLOCK as usize).min(MAX_GRID_BLOCKS / 4);
     // Eight threads reduce one piece of a domain and mostly wait for memory, so more blocks hide the latency.
     let many = segments.len().div_ceil(BLOCK as usize / 8).min(4 * MAX_GRID_BLOCKS);
-    let boxes = if needs.boxes { few.max(many) } else { few };
+    let boxes = if features.boxes { few.max(many) } else { few };
     let batch = (!work.batched.blocks.is_empty()).then(|| batch_kernel(scene, &work.batched, batch));
     let mut kernels: Vec<KernelDescriptor> = batch.into_iter().chain([deform]).collect();
     kernels.push(walk(KernelKind::Bounds, &bounds, boxes));
-    if needs.exact_normals {
+    if features.exact_normals {
         kernels.push(walk(KernelKind::Normals, &normals, scene.layout.corners.div_ceil(BLOCK as usize)));
     }
     let changes = max_change_entries(scene);
@@ -129,21 +129,21 @@ pub(crate) fn kernels(scene: &Scene, tables: &DeviceTables) -> Vec<KernelDescrip
 
 /// The macros of `deform`.
 fn deform_defines(scene: &Scene, work: &WorkList) -> Vec<&'static str> {
-    let (needs, has_rigid_normals) = (scene.needs, has_rigid_normals(scene));
+    let (features, has_rigid_normals) = (scene.features, has_rigid_normals(scene));
     let flags = [
-        ("MODES", needs.modes),
+        ("MODES", features.modes),
         ("ONE_ITEM_PER_LANE", has_one_item_per_lane(work)),
-        ("MODE_TRUNCATION", needs.truncation),
-        ("COMPENSATED_SUM", needs.compensated),
-        ("DISPLACEMENTS", needs.displacements),
+        ("MODE_TRUNCATION", features.truncation),
+        ("COMPENSATED_SUM", features.compensated),
+        ("DISPLACEMENTS", features.displacements),
         ("RIGID_NORMALS", has_rigid_normals),
         ("CORNER_OFFSETS", !work.corner_offsets.is_empty()),
-        ("NORMAL_MAPS", has_rigid_normals && needs.normal_maps),
-        ("SHEAR", has_rigid_normals && needs.shear),
-        ("FOLLOWERS", needs.followers),
+        ("NORMAL_MAPS", has_rigid_normals && features.normal_maps),
+        ("SHEAR", has_rigid_normals && features.shear),
+        ("FOLLOWERS", features.followers),
     ];
     let on = flags.iter().filter(|(_, on)| *on).map(|(name, _)| *name);
-    on.chain(storage_define(scene.deformation.storage).filter(|_| needs.modes)).collect()
+    on.chain(storage_define(scene.deformation.storage).filter(|_| features.modes)).collect()
 }
 
 /// Maximum number of blocks of the kernels that loop over lists: two per multiprocessor of a large device.
@@ -152,7 +152,7 @@ const MAX_GRID_BLOCKS: usize = 264;
 /// The kernel of a scene with batches.
 fn batch_kernel(scene: &Scene, batched: &BatchTables, source: KernelSource) -> KernelDescriptor {
     let vectors = SMALLER_BATCHES.iter().find(|(vectors, _)| batched.max_members <= *vectors).map(|(_, name)| *name);
-    let follows = scene.needs.followers.then_some("FOLLOWERS");
+    let follows = scene.features.followers.then_some("FOLLOWERS");
     KernelDescriptor {
         kind: KernelKind::Batch,
         name: source.name,

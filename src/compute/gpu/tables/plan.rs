@@ -120,7 +120,7 @@ fn bytes_of<T>(table: &[T]) -> u64 {
 
 /// The buffers of a scene with the bytes of their tables.
 fn buffers(scene: &Scene, tables: &DeviceTables) -> Vec<BufferDescriptor> {
-    let (needs, layout, work) = (scene.needs, &scene.layout, &tables.work);
+    let (features, layout, work) = (scene.features, &scene.layout, &tables.work);
     let normals = tables.normals.as_ref();
     let (vertices, corners) = (layout.vertices as u64, layout.corners as u64);
     let mut buffers = vec![
@@ -140,19 +140,19 @@ fn buffers(scene: &Scene, tables: &DeviceTables) -> Vec<BufferDescriptor> {
         (BufferRole::Positions, 12 * vertices),
         (BufferRole::Normals, 12 * corners),
     ];
-    if needs.normal_maps {
+    if features.normal_maps {
         let bytes = normals.map_or(bytes_of(&tables.rest_tangents), |normals| bytes_of(&normals.rest_tangents));
         buffers.push((BufferRole::RestTangents, bytes));
         buffers.push((BufferRole::Tangents, 16 * corners));
     }
-    if needs.displacements {
+    if features.displacements {
         buffers.push((BufferRole::Displacements, 12 * vertices));
     }
     if !work.batched.blocks.is_empty() {
         let BatchTables { groups, members, blocks, .. } = &work.batched;
         buffers.push((BufferRole::Batches, bytes_of(groups) + bytes_of(members) + bytes_of(blocks)));
     }
-    if needs.boxes {
+    if features.boxes {
         let boxes = (BufferRole::DomainBoxes, box_bytes(tables.segments.len()));
         buffers.extend([(BufferRole::BoxSegments, bytes_of(&tables.segments)), boxes]);
     }
@@ -163,7 +163,7 @@ fn buffers(scene: &Scene, tables: &DeviceTables) -> Vec<BufferDescriptor> {
         buffers.push((BufferRole::RingTables, bytes_of(&rings.ring_offsets) + bytes_of(&rings.rings)));
         buffers.push((BufferRole::GroupNormals, bytes_of(&rings.normals)));
     }
-    if needs.followers {
+    if features.followers {
         let frames = bytes_of(scene.transform_roots.frames()) + bytes_of(&tables.transform_links);
         buffers.push((BufferRole::FollowerFrames, frames));
     }
@@ -171,30 +171,30 @@ fn buffers(scene: &Scene, tables: &DeviceTables) -> Vec<BufferDescriptor> {
 }
 
 fn omitted(scene: &Scene, tables: &DeviceTables) -> Vec<OmittedFeature> {
-    let (needs, layout) = (scene.needs, &scene.layout);
+    let (features, layout) = (scene.features, &scene.layout);
     let is_batched = !tables.work.batched.blocks.is_empty();
     let slots = size_of::<NormalSlot>() * scene.domains.len();
     let tangents = 16 * (normal_tables::rest_corners(scene) + layout.corners) as u64;
     let boxes = bytes_of(&tables.segments) + box_bytes(tables.segments.len());
     let feature = |feature, what, bytes| OmittedFeature { feature, what, bytes };
     let all = [
-        (needs.modes, feature("modes", "the sum U q in `deform`", 0)),
-        (needs.normal_maps, feature("normal_maps", "tangents and their two buffers", tangents)),
-        (needs.shear, feature("shear", "the inverse transpose", 0)),
-        (needs.truncation, feature("truncation", "lists of modes in `deform`", 0)),
+        (features.modes, feature("modes", "the sum U q in `deform`", 0)),
+        (features.normal_maps, feature("normal_maps", "tangents and their two buffers", tangents)),
+        (features.shear, feature("shear", "the inverse transpose", 0)),
+        (features.truncation, feature("truncation", "lists of modes in `deform`", 0)),
         (
-            needs.exact_normals,
+            features.exact_normals,
             feature(
                 "exact_normals",
                 "`normals` behind `deform`, and its rings",
                 possible_corner_group_bytes(scene) + slots as u64,
             ),
         ),
-        (needs.compensated, feature("compensated", "the compensation in `deform`", 0)),
-        (needs.followers, feature("followers", "frames, and products of transforms", 0)),
-        (needs.displacements, feature("displacements", "u as an output of `deform`", 12 * layout.vertices as u64)),
+        (features.compensated, feature("compensated", "the compensation in `deform`", 0)),
+        (features.followers, feature("followers", "frames, and products of transforms", 0)),
+        (features.displacements, feature("displacements", "u as an output of `deform`", 12 * layout.vertices as u64)),
         (tables.bounding_axes.is_some(), feature("shadows", "bounds in light space", 0)),
-        (needs.boxes, feature("boxes", "a box of each domain in `bounds`", boxes)),
+        (features.boxes, feature("boxes", "a box of each domain in `bounds`", boxes)),
         (is_batched, feature("batches", "`batch`, and groups of domains", 0)),
     ];
     all.into_iter().filter(|(is_used, _)| !is_used).map(|(_, omitted)| omitted).collect()

@@ -187,7 +187,7 @@ fn check_scene(scene: &Scene) -> Result<()> {
     if scene.deformation.compensated {
         return Err(invalid("deform.compensated", "false for tensor cores", true));
     }
-    if scene.needs.followers {
+    if scene.features.followers {
         return Err(invalid("follows", "no followers for tensor cores", true));
     }
     Ok(())

@@ -245,7 +245,7 @@ fn output_bytes(plan: &DeformPlan) -> [u64; 4] {
 fn count_step(scene: &Scene, plan: &DeformPlan, changed: Option<&[u32]>) -> StepCounts {
     let slots = &scene.layout.domains;
     // With followers every domain reads the index of its transform root in addition to its own T or frame.
-    let bytes_per_transform = if scene.needs.followers { 56 } else { 48 };
+    let bytes_per_transform = if scene.features.followers { 56 } else { 48 };
     match changed {
         None => StepCounts {
             vertices: scene.layout.vertices as u64,
@@ -324,7 +324,7 @@ impl KernelBenchmark for DeformerBenchmark {
             ArrayTraffic::new("q", 4 * coordinates),
         ];
         traffic.push(ArrayTraffic::new("u or x", 12 * vertices));
-        if self.scene.needs.displacements && self.step_outputs != StepOutputs::Uq {
+        if self.scene.features.displacements && self.step_outputs != StepOutputs::Uq {
             traffic.push(ArrayTraffic::new("u kept", 12 * vertices));
         }
         if self.step_outputs != StepOutputs::Uq {

@@ -91,7 +91,9 @@ mod tests {
         let animation = RenderWorkload::Tree.build().expect("a workload");
         let stripped_scene = strip_to_mesh(&animation.scene, 64).expect("a stripped scene");
         assert_eq!(stripped_scene.layout.triangles, animation.scene.layout.triangles);
-        assert!(!stripped_scene.needs.textures && !stripped_scene.needs.mask && !stripped_scene.needs.normal_maps);
+        assert!(
+            !stripped_scene.features.textures && !stripped_scene.features.mask && !stripped_scene.features.normal_maps
+        );
         let size = Size { width: 32, height: 24 };
         let mut stats = |scene: &Arc<Scene>| {
             let mut loaded_scene = harness.load(scene).expect("a loaded scene");

@@ -85,10 +85,10 @@ mod tests {
     fn only_dressed_load_a_has_normals_and_tangents() {
         let of = |kind: WorkloadKind| kind.build(Size::Quick).expect("built").scene;
         let dressed = of(WorkloadKind::OneDomain { dressed: true });
-        assert!(dressed.needs.normal_maps && dressed.layout.corners == 30_000 && dressed.layout.vertices == 30_000);
+        assert!(dressed.features.normal_maps && dressed.layout.corners == 30_000 && dressed.layout.vertices == 30_000);
         assert!(dressed.layout.triangles > 59_000, "two for each cell");
         let plain = of(WorkloadKind::OneDomain { dressed: false });
-        assert!(!plain.needs.normal_maps && plain.layout.corners == 3 && plain.layout.vertices == 30_000);
+        assert!(!plain.features.normal_maps && plain.layout.corners == 3 && plain.layout.vertices == 30_000);
         let single = of(WorkloadKind::Single { power: 14, rank: 20 });
         assert_eq!((single.layout.vertices, single.rank_of(0)), ((1_usize << 14).div_ceil(QUICK), 20));
     }

@@ -174,7 +174,7 @@ mod tests {
                 let apart = own.placement.0.iter().zip(follows.placement.0).map(|(own, other)| (own - other).abs());
                 assert!(apart.fold(0.0, f32::max) < 1e-5, "{}", own.name);
             }
-            assert!(!follows.scene.needs.shear && follows.species.is_none());
+            assert!(!follows.scene.features.shear && follows.species.is_none());
         }
     }
 

@@ -112,7 +112,7 @@ impl DeformKernel {
             count: work.tiles.len() as u32,
             full_step_tiles: full_step_tiles as u32,
             first_with_normals: work.quads.first_with_normals,
-            segments: scene.needs.boxes.then_some(segments),
+            segments: scene.features.boxes.then_some(segments),
             packing: Arc::new(InputPacker {
                 scene: Arc::clone(scene),
                 coordinates,

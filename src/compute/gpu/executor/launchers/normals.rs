@@ -44,7 +44,7 @@ impl NormalsKernel {
             slots: DeviceBuffer::upload(device, slots)?,
             first_domains: DeviceBuffer::upload(device, first_domains)?,
             rest_normals: DeviceBuffer::upload(device, rest_normals)?,
-            rest_tangents: scene.needs.normal_maps.then(tangents).transpose()?,
+            rest_tangents: scene.features.normal_maps.then(tangents).transpose()?,
             members: DeviceBuffer::upload(device, &rings.members)?,
             ring_offsets: DeviceBuffer::upload(device, &rings.ring_offsets)?,
             rings: DeviceBuffer::upload(device, &rings.rings)?,

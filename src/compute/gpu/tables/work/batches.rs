@@ -36,9 +36,9 @@ pub(crate) struct BatchTables {
 
 /// Per shape, whether its domains are deformed in batches.
 pub(crate) fn shapes(scene: &Scene, policy: BatchPolicy) -> Vec<bool> {
-    let needs = scene.needs;
+    let features = scene.features;
     // `batch` neither truncates nor compensates its sums, and writes no displacements.
-    let never = needs.truncation || needs.compensated || needs.displacements;
+    let never = features.truncation || features.compensated || features.displacements;
     let mut users = vec![0_usize; scene.shapes.len()];
     scene.domains.iter().for_each(|domain| users[domain.shape] += 1);
     let chosen = |(shape, users): (usize, usize)| {

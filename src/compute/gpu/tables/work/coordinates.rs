@@ -19,7 +19,7 @@ impl CoordinateLayout {
         let storage = scene.deformation.storage;
         // Factors belong to a shape and lists of kept modes to a domain, so domains that share coordinates cannot share
         // these.
-        if storage == StorageType::F32 && !scene.needs.truncation {
+        if storage == StorageType::F32 && !scene.features.truncation {
             let first = scene.layout.domains.iter().map(|slot| slot.first_q as u32).collect();
             return Self { first, total: scene.layout.coordinates.next_multiple_of(4), is_scene_order: true };
         }

@@ -75,7 +75,7 @@ fn corners_match_vertices(shape: &Shape) -> bool {
 
 /// Whether `deform` rotates the rest normals. Otherwise `normals` computes them from the deformed surface.
 pub(crate) fn has_rigid_normals(scene: &Scene) -> bool {
-    !scene.needs.exact_normals
+    !scene.features.exact_normals
 }
 
 /// What a domain's tile computes.

@@ -68,7 +68,7 @@ pub(crate) fn rest_directions(scene: &Scene, work: &WorkList) -> [Vec<[f32; 4]>;
     }
     let count = (work.quads.end - work.quads.first_with_normals) as usize;
     let mut normals = vec![[0.0; 4]; 3 * count];
-    let mut tangents = vec![[0.0; 4]; if scene.needs.normal_maps { 4 * count } else { 0 }];
+    let mut tangents = vec![[0.0; 4]; if scene.features.normal_maps { 4 * count } else { 0 }];
     let vertices = shapes_with_own_tiles(scene);
     for (index, shape) in scene.shapes.iter().enumerate() {
         let corners = &shape.mesh.corners().normals;

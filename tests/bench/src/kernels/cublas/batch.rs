@@ -194,7 +194,7 @@ fn size_product(scene: &Scene, method: CublasMethod, domains: &[usize]) -> Resul
 
 fn check_scene(scene: &Scene, method: CublasMethod) -> Result<()> {
     let domains = scene.domains.len();
-    if !scene.needs.modes {
+    if !scene.features.modes {
         return Err(invalid("modes", format!("at least 1 for {}", method.name()), 0));
     }
     match method {

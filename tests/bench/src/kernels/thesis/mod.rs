@@ -71,7 +71,7 @@ impl ThesisBenchmark {
         states: &[SceneState],
         (split, part): (KernelSplit, Part),
     ) -> Result<Self> {
-        if part == Part::Uq && !scene.needs.modes {
+        if part == Part::Uq && !scene.features.modes {
             return Err(invalid("modes", "at least 1 for u = U q alone", 0));
         }
         let uq = UqKernel::Multi(MultiDomainKernel::new(device, scene, split)?);

@@ -81,7 +81,7 @@ impl UnfoldedTriangles {
                 unfolded.targets.push(slot.first_vertex as u32 + vertex);
                 unfolded.positions.push(float4(shape.mesh.rest()[vertex as usize], 1.0));
                 unfolded.normals.push(float4(corners.normals[corner], 0.0));
-                if scene.needs.normal_maps {
+                if scene.features.normal_maps {
                     let [x, y, z, _] = shape.tangents().get(corner).copied().unwrap_or_default();
                     unfolded.tangents.push([x, y, z, 0.0]);
                 }
@@ -131,7 +131,7 @@ pub(super) struct UpdateKernel {
 impl UpdateKernel {
     pub(super) fn new(device: &Device, scene: &Scene) -> Result<Self> {
         let unfolded = UnfoldedTriangles::of(scene);
-        let (has_tangents, bytes) = (scene.needs.normal_maps, 16 * unfolded.targets.len() as u64);
+        let (has_tangents, bytes) = (scene.features.normal_maps, 16 * unfolded.targets.len() as u64);
         let defines: &[&str] = if has_tangents { &["TANGENTS"] } else { &[] };
         Ok(Self {
             compiled: CompiledKernel::new(device, &SOURCE, defines)?,
