@@ -47,7 +47,7 @@ fn bytes_of(scene: &Scene, domain: usize) -> usize {
     let corners = shape.mesh.corners();
     let per_corner =
         4 + 12 + if corners.uvs.is_empty() { 0 } else { 8 } + if shape.tangents().is_empty() { 0 } else { 16 };
-    12 * shape.mesh.rest().len()
+    12 * shape.mesh.rest_positions().len()
         + per_corner * corners.vertices.len()
         + 12 * shape.mesh.triangles().len()
         + 4 * shape.modes.columns().len()

@@ -100,13 +100,15 @@ fn shape_with_corners(noise: &mut TestRng, vertices: usize, rank: usize, triangl
 pub fn displacement_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usize) -> [f64; 3] {
     let modes = &scene.shape_of(domain).modes;
     let q = state.q_of(scene, domain);
-    [0, 1, 2]
-        .map(|axis| q.iter().enumerate().map(|(mode, q)| f64::from(modes.at(vertex, axis, mode)) * f64::from(*q)).sum())
+    [0, 1, 2].map(|axis| {
+        q.iter().enumerate().map(|(mode, q)| f64::from(modes.entry(vertex, axis, mode)) * f64::from(*q)).sum()
+    })
 }
 
 /// x = T (x0 + u) of a vertex, in f64.
 pub fn position_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usize) -> [f64; 3] {
-    let (u, rest) = (displacement_of(scene, state, domain, vertex), scene.shape_of(domain).mesh.rest()[vertex]);
+    let (u, rest) =
+        (displacement_of(scene, state, domain, vertex), scene.shape_of(domain).mesh.rest_positions()[vertex]);
     let (linear, offset) = (state.transforms[domain].linear(), state.transforms[domain].translation());
     let bent = nalgebra::Vector3::from([0, 1, 2].map(|axis| f64::from(rest[axis]) + u[axis]));
     (linear * bent + offset).into()

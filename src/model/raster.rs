@@ -108,7 +108,7 @@ pub trait Rasterizer: std::fmt::Debug {
     ///
     /// Depths are one f32 per sample from 0 to 1, and 1 where no triangle is; triangles are drawn two-sided. Ids are
     /// one u64 per sample: the bits of the nearest depth in the upper half and the triangle in the lower half, and all
-    /// ones where no triangle is. Each group says which of its faces are drawn.
+    /// ones where no triangle is. Each group has its own cull mode.
     ///
     /// # Errors
     /// `Fault` if the device fails, or if a buffer is unknown or smaller than its window.

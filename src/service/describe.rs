@@ -57,7 +57,7 @@ pub(super) fn modes(
         return Err(invalid("domain", format!("an index below {count}"), request.domain));
     }
     let shape = scene_handle.scene.shape_of(request.domain as usize);
-    let (vertices, rank) = (shape.mesh.rest().len(), shape.modes.rank());
+    let (vertices, rank) = (shape.mesh.rest_positions().len(), shape.modes.rank());
     let chosen = match request.vertices {
         all if all.is_empty() => (0..vertices as u32).collect(),
         some => some,
@@ -152,7 +152,7 @@ fn array_bytes(scene: &Scene, domain: usize, array: v1::Array) -> &[u8] {
         v1::Array::Unspecified => &[],
         v1::Array::Indices => bytemuck::cast_slice(mesh.triangles()),
         v1::Array::CornerVertices => bytemuck::cast_slice(&corners.vertices),
-        v1::Array::RestPositions => bytemuck::cast_slice(mesh.rest()),
+        v1::Array::RestPositions => bytemuck::cast_slice(mesh.rest_positions()),
         v1::Array::Uvs => bytemuck::cast_slice(&corners.uvs),
         v1::Array::RestNormals => bytemuck::cast_slice(&corners.normals),
     }

@@ -27,14 +27,12 @@ impl CutOutSoup {
     pub(crate) fn ambiguous_samples(&self, tolerance: f32) -> Vec<bool> {
         let (soup, cut_outs) = (&self.soup, &self.cut_outs);
         let mut is_ambiguous = vec![false; soup.viewport.pixel_count()];
-        for (triangle, faces) in soup
-            .groups
-            .iter()
-            .flat_map(|group| (group.first..group.first + group.triangles).map(move |triangle| (triangle, group.faces)))
-        {
+        for (triangle, cull_mode) in soup.groups.iter().flat_map(|group| {
+            (group.first..group.first + group.triangles).map(move |triangle| (triangle, group.cull_mode))
+        }) {
             let Some(cut_out) = triangle.checked_sub(cut_outs.first) else { continue };
             let vertices = soup.triangles[triangle as usize];
-            let Ok(clipped_polygon) = clipped_polygon(&soup.viewport, &soup.positions, vertices, faces) else {
+            let Ok(clipped_polygon) = clipped_polygon(&soup.viewport, &soup.positions, vertices, cull_mode) else {
                 continue;
             };
             let (corners, uvs) = (corners(&soup.viewport, &soup.positions, vertices), &cut_outs.uvs[cut_out as usize]);
@@ -104,7 +102,7 @@ pub(crate) fn sheet_soup(side: u32, image: AlphaImage) -> CutOutSoup {
         images: vec![image],
         anisotropy: 1.0,
     };
-    let groups = vec![DrawRange { first: 0, triangles: 2, faces: CullMode::Back }];
+    let groups = vec![DrawRange { first: 0, triangles: 2, cull_mode: CullMode::Back }];
     CutOutSoup {
         soup: Soup { name: "sheet", positions, triangles, groups, viewport: clip_space_viewport(side, side) },
         cut_outs,
@@ -139,8 +137,8 @@ pub(crate) fn floor_soup(cuts: u32) -> CutOutSoup {
     };
     let viewport: Viewport = perspective_viewport(192, 128, 0.1, 100.0);
     let groups = vec![
-        DrawRange { first: 0, triangles: 2, faces: CullMode::Back },
-        DrawRange { first: 2, triangles: triangles.len() as u32 - 2, faces: CullMode::None },
+        DrawRange { first: 0, triangles: 2, cull_mode: CullMode::Back },
+        DrawRange { first: 2, triangles: triangles.len() as u32 - 2, cull_mode: CullMode::None },
     ];
     CutOutSoup { soup: Soup { name: "floor", positions, triangles, groups, viewport }, cut_outs }
 }

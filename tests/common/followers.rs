@@ -101,7 +101,7 @@ pub(crate) fn check_frames<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) ->
         );
         // Negative control: without their frames all followers have other positions and normals.
         let (root_scene, unframed_state) =
-            without_followers(parts(), &state, |domain| state.transforms[scene.transform_roots.of(domain)]);
+            without_followers(parts(), &state, |domain| state.transforms[scene.transform_roots.root_of(domain)]);
         let followers: Vec<usize> = (0..45).filter(|domain| domain % 3 != 0).collect();
         assert_eq!(
             domains_beyond_bound(&root_scene, &unframed_state, &result.surface.positions, 0.0),
@@ -204,11 +204,11 @@ pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     let mut state = SceneState::rest(&scene);
     let translation = [1e7 + 0.3, -1e7 - 0.7, 12.25];
     state.apply(&scene, &StepUpdate::parse(&scene, &far_step(0, translation)).expect("expected a valid step"));
-    assert_eq!((scene.transform_roots.of(1), state.transforms.len()), (0, 2));
+    assert_eq!((scene.transform_roots.root_of(1), state.transforms.len()), (0, 2));
     let result = run_step(&mut create_deformer(&scene), &state);
-    let (slot, cell) = (scene.layout.domains[1], state.origin_of(scene.transform_roots.of(1)));
+    let (slot, cell) = (scene.layout.domains[1], state.origin_of(scene.transform_roots.root_of(1)));
     let [mut error, mut f32_error] = [0.0_f64; 2];
-    for (vertex, rest) in scene.shape_of(1).mesh.rest().iter().enumerate() {
+    for (vertex, rest) in scene.shape_of(1).mesh.rest_positions().iter().enumerate() {
         let inside = frame.to_matrix().transform_point(&nalgebra::Point3::from(*rest).cast());
         for axis in 0..3 {
             let want = translation[axis] + inside[axis];

@@ -72,7 +72,7 @@ pub(crate) fn strip_shape(random: &mut Random, vertices: usize, rank: usize) -> 
     let last = vertices as u32 - 1;
     let triangles = (0..=last).map(|index| [index, (index + 1).min(last), (index + 2).min(last)]).collect();
     let uvs = shape.mesh.corners().uvs[..vertices].to_vec();
-    let mesh = Mesh::from_indexed(shape.mesh.rest().to_vec(), normals, uvs, triangles).expect("a valid mesh");
+    let mesh = Mesh::from_indexed(shape.mesh.rest_positions().to_vec(), normals, uvs, triangles).expect("a valid mesh");
     Shape::new(mesh, shape.modes).expect("a valid shape")
 }
 

@@ -192,7 +192,8 @@ fn uniform_images_keep_all_or_nothing_of_a_triangle() {
                 if cut_out
                     .is_none_or(|cut_out| is_material_opaque[cut_outs.material_indices[cut_out as usize] as usize])
                 {
-                    let range = modalcast_model::scene::DrawRange { first: triangle, triangles: 1, faces: group.faces };
+                    let range =
+                        modalcast_model::scene::DrawRange { first: triangle, triangles: 1, cull_mode: group.cull_mode };
                     expected.draw(&soup.positions, &soup.triangles, range);
                 }
             }

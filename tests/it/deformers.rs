@@ -128,7 +128,7 @@ fn wrong_q_transform_or_missing_mode_is_detected() {
 fn reference_is_linear_in_q() {
     let scene = strips_scene(&[(50, 6)]);
     let modes = &scene.shape_of(0).modes;
-    let rest = scene.shape_of(0).mesh.rest();
+    let rest = scene.shape_of(0).mesh.rest_positions();
     let mut state = SceneState::rest(&scene);
     let rest_positions = reference::deform(&scene, &state);
     state.q[4] = 1.0;
@@ -138,7 +138,7 @@ fn reference_is_linear_in_q() {
     for vertex in 0..50 {
         for axis in 0..3 {
             assert_eq!(rest_positions[vertex][axis], f64::from(rest[vertex][axis]));
-            let column = f64::from(modes.at(vertex, axis, 4));
+            let column = f64::from(modes.entry(vertex, axis, 4));
             assert!((unit_positions[vertex][axis] - rest_positions[vertex][axis] - column).abs() < 1e-12);
             assert!((scaled_positions[vertex][axis] - rest_positions[vertex][axis] + 2.5 * column).abs() < 1e-12);
         }

@@ -34,12 +34,12 @@ fn expected_positions(scene: &Scene, domain: usize, q: &[f32], (rotation, transl
         let deformed = Vector3::from_fn(|axis, _| {
             let modes = q.iter().enumerate();
             let displacement: f64 =
-                modes.map(|(mode, q)| f64::from(shape.modes.at(vertex, axis, mode)) * f64::from(*q)).sum();
+                modes.map(|(mode, q)| f64::from(shape.modes.entry(vertex, axis, mode)) * f64::from(*q)).sum();
             f64::from(rest[axis]) + displacement
         });
         scene.unit * (rotation * deformed + Vector3::from(translation))
     };
-    shape.mesh.rest().iter().enumerate().map(world_position).collect()
+    shape.mesh.rest_positions().iter().enumerate().map(world_position).collect()
 }
 
 /// World positions in meters, decoded from the reply.

@@ -44,7 +44,7 @@ fn bent_strip_has_normals_and_tangents_of_its_parabola() {
     let rigid = reference::rigid_normals(&scene, &state);
     let mut max_rigid_error = 0.0_f64;
     let is_interior = |(_, rest): &(usize, &[f32; 3])| rest[0].abs() < 0.99 && rest[1].abs() < 0.99;
-    for (corner, [x, ..]) in scene.shapes[0].mesh.rest().iter().enumerate().filter(is_interior) {
+    for (corner, [x, ..]) in scene.shapes[0].mesh.rest_positions().iter().enumerate().filter(is_interior) {
         // The slope of a parabola equals that of the chord over both neighbors.
         let slope = f64::from(*x);
         assert!(angle_degrees(normals[corner], [-slope, 0.0, 1.0]) < 1e-5, "corner {corner}: {:?}", normals[corner]);
@@ -95,7 +95,7 @@ fn stretched_sphere_has_normals_of_the_ellipsoid() {
         }
         assert!(max_angle_degrees(&deform_on_cpu(&scene, &state).normals, &normals) < MAX_ANGLE_DEGREES);
         let analytic_normals: Vec<_> =
-            mesh.rest().iter().map(|rest| transform_normal(stretch, rest.map(f64::from))).collect();
+            mesh.rest_positions().iter().map(|rest| transform_normal(stretch, rest.map(f64::from))).collect();
         let rigid = reference::rigid_normals(&scene, &state);
         let angle = |(normal, analytic_normals): (&[f64; 3], &[f64; 3])| angle_degrees(*normal, *analytic_normals);
         assert!(
@@ -115,7 +115,7 @@ fn exact_normals_equal_rigid_ones_at_zero_q() {
     let corners = authored.corners().clone();
     let mut random = crate::deformers::TestRng(5);
     let normals = corners.normals.iter().map(|_| [random.next(), random.next(), random.next()]).collect();
-    let rest = authored.rest().iter().map(|[x, y, _]| [*x, *y, 0.3 * random.next()]).collect();
+    let rest = authored.rest_positions().iter().map(|[x, y, _]| [*x, *y, 0.3 * random.next()]).collect();
     let triangles = authored.triangles().to_vec();
     authored = modalcast_model::domain::Mesh::from_indexed(rest, normals, corners.uvs, triangles)
         .expect("expected a valid mesh");
@@ -166,8 +166,12 @@ fn both_sides_of_a_uv_seam_share_one_normal() {
 fn rest_normals_opposite_to_the_winding_stay_opposite() {
     let mesh = sheet(9, 9);
     let down = vec![[0.0, 0.0, -1.0]; 81];
-    let flipped =
-        modalcast_model::domain::Mesh::from_indexed(mesh.rest().to_vec(), down, vec![], mesh.triangles().to_vec());
+    let flipped = modalcast_model::domain::Mesh::from_indexed(
+        mesh.rest_positions().to_vec(),
+        down,
+        vec![],
+        mesh.triangles().to_vec(),
+    );
     let scene = scene(vec![
         shape_with_mode(mesh, parabola),
         shape_with_mode(flipped.expect("expected a valid mesh"), parabola),
@@ -205,7 +209,7 @@ fn transform_applies_inverse_transpose_to_normals() {
 #[test]
 fn tangents_are_unit_and_orthogonal_to_normals() {
     let mesh_without_uvs = modalcast_model::domain::Mesh::from_indexed(
-        sheet(5, 5).rest().to_vec(),
+        sheet(5, 5).rest_positions().to_vec(),
         vec![fixtures::UP; 25],
         vec![],
         sheet(5, 5).triangles().to_vec(),

@@ -40,7 +40,7 @@ fn is_on_ray(hit: &Hit) -> bool {
 /// U of a domain, 3n x r, from the scene itself.
 fn mode_matrix(scene: &Scene, domain: u32) -> DMatrix<f64> {
     let shape = &scene.shapes[scene.domains[domain as usize].shape];
-    let (rows, rank) = (3 * shape.mesh.rest().len(), shape.modes.rank());
+    let (rows, rank) = (3 * shape.mesh.rest_positions().len(), shape.modes.rank());
     DMatrix::from_iterator(rows, rank, shape.modes.columns().iter().map(|entry| f64::from(*entry)))
 }
 

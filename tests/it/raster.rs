@@ -34,13 +34,13 @@ impl Walk<'_> {
         self.keys[at] = self.keys[at].min(u64::from(depth.to_bits()) << 32 | u64::from(triangle));
     }
 
-    fn clipped_polygon(&self, triangle: u32, faces: CullMode) -> Result<ClippedPolygon, CullReason> {
-        clipped_polygon(&self.soup.viewport, &self.soup.positions, self.soup.triangles[triangle as usize], faces)
+    fn clipped_polygon(&self, triangle: u32, cull_mode: CullMode) -> Result<ClippedPolygon, CullReason> {
+        clipped_polygon(&self.soup.viewport, &self.soup.positions, self.soup.triangles[triangle as usize], cull_mode)
     }
 
     /// `raster`: the narrow tests of `setup_unclipped`, and the entries that each path pushes.
-    fn aim(&mut self, triangle: u32, faces: CullMode) {
-        let Ok(clipped_polygon) = self.clipped_polygon(triangle, faces) else { return };
+    fn aim(&mut self, triangle: u32, cull_mode: CullMode) {
+        let Ok(clipped_polygon) = self.clipped_polygon(triangle, cull_mode) else { return };
         let extent = |of: fn(&SnappedVertex) -> i32| {
             let all = || clipped_polygon.corners.iter().map(of);
             all().max().expect("corners") - all().min().expect("corners")
@@ -143,7 +143,7 @@ fn twin_of_raster(soup: &Soup, strip_splits: u32) -> (Vec<u64>, [usize; 3]) {
     let keys = vec![EMPTY_KEY; soup.viewport.pixel_count()];
     let mut walk = Walk { soup, keys, medium: vec![], large: vec![], tally: 0, paths: [0; 3] };
     for group in &soup.groups {
-        (group.first..group.first + group.triangles).rev().for_each(|triangle| walk.aim(triangle, group.faces));
+        (group.first..group.first + group.triangles).rev().for_each(|triangle| walk.aim(triangle, group.cull_mode));
     }
     for triangle in std::mem::take(&mut walk.medium) {
         let clipped_polygon = walk.clipped_polygon(triangle, CullMode::None).expect("queued");
@@ -234,7 +234,7 @@ fn depth_ties_go_to_the_lower_id() {
     let positions = [square(0.5), square(0.5), square(0.25), square(0.25)].concat();
     let drawn = |triangles: &[[u32; 3]]| {
         let mut raster = VisibilityBuffer::new(clip_space_viewport(4, 4));
-        let group = DrawRange { first: 0, triangles: triangles.len() as u32, faces: CullMode::None };
+        let group = DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None };
         raster.draw(&positions, triangles, group);
         (raster.ids(), raster.depths())
     };
@@ -247,8 +247,9 @@ fn depth_ties_go_to_the_lower_id() {
 #[test]
 fn dropped_triangles_report_the_reason() {
     let viewport = clip_space_viewport(10, 10);
-    let why =
-        |corners: [[f32; 3]; 3], faces: CullMode| clipped_polygon(&viewport, &corners.concat(), [0, 1, 2], faces).err();
+    let why = |corners: [[f32; 3]; 3], cull_mode: CullMode| {
+        clipped_polygon(&viewport, &corners.concat(), [0, 1, 2], cull_mode).err()
+    };
     let front = [[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.5, 0.0]];
     let back = [front[1], front[0], front[2]];
     assert_eq!(why(front, CullMode::Back), None);
@@ -268,7 +269,7 @@ fn plane_depth_and_rectangle_coverage_are_exact() {
     let corners = [[-2.0, -2.0, -4.0], [2.0, -2.0, -9.0], [-1.0, 3.0, -20.0]];
     let mut raster = VisibilityBuffer::new(viewport);
     let positions = corners.map(|corner| corner.map(|number: f64| number as f32)).concat();
-    raster.draw(&positions, &[[0, 1, 2]], DrawRange { first: 0, triangles: 1, faces: CullMode::None });
+    raster.draw(&positions, &[[0, 1, 2]], DrawRange { first: 0, triangles: 1, cull_mode: CullMode::None });
     let [a, b, c] = corners.map(nalgebra::Vector3::from);
     let normal = (b - a).cross(&(c - a));
     let focal = 1.0 / 30.0_f64.to_radians().tan();
@@ -287,6 +288,6 @@ fn plane_depth_and_rectangle_coverage_are_exact() {
 
     let mut raster = VisibilityBuffer::new(clip_space_viewport(100, 100));
     let square = [[-0.6, -0.4, 0.0], [0.2, -0.4, 0.0], [0.2, 0.8, 0.0], [-0.6, 0.8, 0.0]].concat();
-    raster.draw(&square, &[[0, 1, 2], [0, 2, 3]], DrawRange { first: 0, triangles: 2, faces: CullMode::Back });
+    raster.draw(&square, &[[0, 1, 2], [0, 2, 3]], DrawRange { first: 0, triangles: 2, cull_mode: CullMode::Back });
     assert_eq!(raster.ids().iter().flatten().count(), 40 * 60);
 }

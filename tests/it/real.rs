@@ -59,7 +59,7 @@ fn assert_cpu_equals_reference(scene: &Arc<Scene>) {
         let modes = &scene.shape_of(domain).modes;
         for vertex in 0..slot.vertices {
             let range = 3 * (slot.first_vertex + vertex)..3 * (slot.first_vertex + vertex) + 3;
-            let has_zero_rows = (0..3).all(|axis| (0..slot.rank).all(|mode| modes.at(vertex, axis, mode) == 0.0));
+            let has_zero_rows = (0..3).all(|axis| (0..slot.rank).all(|mode| modes.entry(vertex, axis, mode) == 0.0));
             match has_zero_rows {
                 true => assert_eq!(deformed[range.clone()], rest[range], "vertex {vertex} of domain {domain}"),
                 false => moved += usize::from(deformed[range.clone()] != rest[range]),

@@ -119,7 +119,7 @@ async fn client_can_read_the_whole_scene() {
     let want: [Vec<u8>; 5] = [
         bytemuck::cast_slice(mesh.triangles()).to_vec(),
         bytemuck::cast_slice(&mesh.corners().vertices).to_vec(),
-        bytemuck::cast_slice(mesh.rest()).to_vec(),
+        bytemuck::cast_slice(mesh.rest_positions()).to_vec(),
         bytemuck::cast_slice(&mesh.corners().uvs).to_vec(),
         bytemuck::cast_slice(&mesh.corners().normals).to_vec(),
     ];
@@ -133,7 +133,7 @@ async fn client_can_read_the_whole_scene() {
     );
     assert_eq!((right.attachment_frame.len(), right.placement.len(), right.shape), (48, 48, 0));
     let columns = &scene.shapes[0].modes;
-    let rows = |vertex: usize| (0..3).flat_map(move |part| (0..2).map(move |mode| columns.at(vertex, part, mode)));
+    let rows = |vertex: usize| (0..3).flat_map(move |part| (0..2).map(move |mode| columns.entry(vertex, part, mode)));
     assert_eq!(read_modes(&server, "strips", 1, &[3, 0]).await, rows(3).chain(rows(0)).collect::<Vec<_>>());
 }
 
@@ -159,11 +159,11 @@ async fn large_replies_are_chunked_for_default_client_limits() {
     let (_, contents) = describe(&server, "sheet", &[Array::Indices, Array::RestPositions]).await;
     let mesh = &scene.shapes[0].mesh;
     assert_eq!(contents[0], bytemuck::cast_slice::<_, u8>(mesh.triangles()));
-    assert_eq!(contents[1], bytemuck::cast_slice::<_, u8>(mesh.rest()));
+    assert_eq!(contents[1], bytemuck::cast_slice::<_, u8>(mesh.rest_positions()));
     let rows = read_modes(&server, "sheet", 0, &[]).await;
     let columns = &scene.shapes[0].modes;
     assert_eq!(rows.len(), columns.columns().len());
-    assert!((0..90_000).all(|vertex| rows[12 * vertex + 7] == columns.at(vertex, 1, 3)));
+    assert!((0..90_000).all(|vertex| rows[12 * vertex + 7] == columns.entry(vertex, 1, 3)));
     let request = v1::GetVerticesRequest { scene: "sheet".into(), ..v1::GetVerticesRequest::default() };
     let got = get_vertices(&server, request).await.expect("expected vertices");
     assert_eq!(got.step().run, 0, "expected run 0 before the first step");

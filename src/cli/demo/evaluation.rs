@@ -195,7 +195,7 @@ impl Joint {
         let diagonal = scene.rest_bounds.diagonal();
         let joint = |(child, domain): (usize, &modalcast_model::domain::Domain)| {
             let attachment = domain.attachment.as_ref().filter(|attachment| !attachment.rows.is_empty())?;
-            let root = scene.transform_roots.frame_of(child).is_none().then(|| scene.transform_roots.of(child))?;
+            let root = scene.transform_roots.frame_of(child).is_none().then(|| scene.transform_roots.root_of(child))?;
             let first = scene.layout.domains[attachment.parent].first_vertex;
             let joint = Self { root, ring: attachment.rows.iter().map(|row| first + *row as usize).collect() };
             let center = center(joint.ring.iter().map(|vertex| rest[*vertex]));

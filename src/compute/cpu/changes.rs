@@ -32,7 +32,7 @@ impl ChangeTracker {
         self.flags.par_iter_mut().with_min_len(4096).enumerate().for_each(|(domain, flag)| {
             let slot = &scene.layout.domains[domain];
             let range = slot.first_q..slot.first_q + slot.rank;
-            let mover = scene.transform_roots.of(domain);
+            let mover = scene.transform_roots.root_of(domain);
             *flag = bits(&last_transforms[mover].0) != bits(&state.transforms[mover].0)
                 || bits(&last_q[range.clone()]) != bits(&state.q[range]);
         });

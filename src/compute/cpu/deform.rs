@@ -183,7 +183,7 @@ fn store_positions(transform: &Transform, bent: &mut TileVertices, width: usize,
 #[inline(never)]
 fn repair_non_finite(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32]) -> TileBounds {
     let tiles = inputs.tiles_of(tile);
-    let transform = inputs.state.composed_transform(inputs.scene, tile.domain()).exact();
+    let transform = inputs.state.composed_transform(inputs.scene, tile.domain()).to_f64();
     let q = inputs.q_of(tile);
     let mut tile_bounds = TileBounds::EMPTY;
     for (at, out) in out.chunks_exact_mut(3).enumerate() {

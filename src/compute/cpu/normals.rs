@@ -46,7 +46,7 @@ pub(super) fn normals(scene: &Scene, state: &SceneState, tiles: &[DomainTile], s
 fn rotate_to_surface(bent: &DeformedDomain, first: usize, normals: &mut [f32], tangents: &mut [f32]) {
     let Some(smoothing) = bent.smoothing else { return };
     let mut tangents = tangents.chunks_exact_mut(4);
-    for (group, normal) in smoothing.members()[first..].iter().zip(normals.chunks_exact_mut(3)) {
+    for (group, normal) in smoothing.corner_groups()[first..].iter().zip(normals.chunks_exact_mut(3)) {
         let tangent = tangents.next();
         let Some(surface_rotation) = bent.surface_rotation(smoothing, *group as usize) else { continue };
         let carried = surface_rotation.rotate(vector(normal)).try_normalize(0.0).unwrap_or(surface_rotation.to);

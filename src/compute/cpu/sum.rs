@@ -270,7 +270,7 @@ mod tests {
     /// The expected sums of one tile of f32.
     fn plain(shape: &Shape, tile: &TileLayout, q: &[f32]) -> Vec<f32> {
         let chain = |vertex: usize, axis: usize| {
-            (0..q.len()).fold(0.0_f32, |sum, mode| shape.modes.at(vertex, axis, mode).mul_add(q[mode], sum))
+            (0..q.len()).fold(0.0_f32, |sum, mode| shape.modes.entry(vertex, axis, mode).mul_add(q[mode], sum))
         };
         let vertices = || tile.first_vertex..tile.first_vertex + tile.vertices;
         (0..3).flat_map(|axis| vertices().map(move |vertex| chain(vertex, axis))).collect()

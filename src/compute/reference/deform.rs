@@ -9,8 +9,8 @@ pub fn deform(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
     for domain in 0..scene.domains.len() {
         let shape = scene.shape_of(domain);
         let q = state.q_of(scene, domain);
-        let world_from_domain = state.composed_transform(scene, domain).exact();
-        for (vertex, rest) in shape.mesh.rest().iter().enumerate() {
+        let world_from_domain = state.composed_transform(scene, domain).to_f64();
+        for (vertex, rest) in shape.mesh.rest_positions().iter().enumerate() {
             let mut bent = rest.map(f64::from);
             add_modes(shape, q, vertex, &mut bent);
             positions.push(std::array::from_fn(|row| {
@@ -27,7 +27,7 @@ pub fn displacements(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
     let mut displacements = Vec::with_capacity(scene.layout.vertices);
     for domain in 0..scene.domains.len() {
         let (shape, q) = (scene.shape_of(domain), state.q_of(scene, domain));
-        for vertex in 0..shape.mesh.rest().len() {
+        for vertex in 0..shape.mesh.rest_positions().len() {
             let mut moved = [0.0; 3];
             add_modes(shape, q, vertex, &mut moved);
             displacements.push(moved);
@@ -40,7 +40,7 @@ pub fn displacements(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
 fn add_modes(shape: &Shape, q: &[f32], vertex: usize, coordinates: &mut [f64; 3]) {
     for (component, coordinate) in coordinates.iter_mut().enumerate() {
         for (mode, amount) in q.iter().enumerate() {
-            *coordinate += f64::from(shape.modes.at(vertex, component, mode)) * f64::from(*amount);
+            *coordinate += f64::from(shape.modes.entry(vertex, component, mode)) * f64::from(*amount);
         }
     }
 }

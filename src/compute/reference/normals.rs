@@ -109,10 +109,11 @@ fn for_each_rotated_corner(
     for (domain, slot) in scene.layout.domains.iter().enumerate() {
         let shape = scene.shape_of(domain);
         let Some(smoothing) = shape.smoothing() else { continue };
-        let rest = areas(&shape.mesh, smoothing.members(), |vertex| shape.mesh.rest()[vertex].map(f64::from));
-        let now = areas(&shape.mesh, smoothing.members(), |vertex| positions[slot.first_vertex + vertex]);
+        let rest =
+            areas(&shape.mesh, smoothing.corner_groups(), |vertex| shape.mesh.rest_positions()[vertex].map(f64::from));
+        let now = areas(&shape.mesh, smoothing.corner_groups(), |vertex| positions[slot.first_vertex + vertex]);
         let area_transform = cofactors(&state.composed_transform(scene, domain).linear());
-        for (corner, group) in smoothing.members().iter().enumerate() {
+        for (corner, group) in smoothing.corner_groups().iter().enumerate() {
             let group = *group as usize;
             let has_normal = smoothing.normals()[group] != [0.0; 3];
             let resolved = now[group].sum.norm() > RESOLUTION * now[group].rounding;

@@ -93,7 +93,7 @@ impl VisibilityBuffer {
     ) {
         for triangle in group.first..group.first + group.triangles {
             if let Ok(clipped_polygon) =
-                clipped_polygon(&self.window, positions, triangles[triangle as usize], group.faces)
+                clipped_polygon(&self.window, positions, triangles[triangle as usize], group.cull_mode)
             {
                 self.fill(&clipped_polygon, triangle, |pixel| passes_alpha_test(triangle, pixel));
             }
@@ -133,7 +133,7 @@ pub fn clipped_polygon(
     window: &Viewport,
     positions: &[f32],
     triangle: [u32; 3],
-    faces: CullMode,
+    cull_mode: CullMode,
 ) -> Result<ClippedPolygon, CullReason> {
     let corners = corners(window, positions, triangle);
     if !corners.as_flattened().iter().all(|number| number.is_finite()) {
@@ -155,7 +155,7 @@ pub fn clipped_polygon(
     if area == 0 {
         return Err(CullReason::Degenerate);
     }
-    if faces == CullMode::Back && area > 0 {
+    if cull_mode == CullMode::Back && area > 0 {
         return Err(CullReason::BackFacing);
     }
     if samples[0] > samples[2] || samples[1] > samples[3] {
@@ -256,7 +256,7 @@ fn clip_edge(inner: &[f32; 4], outer: &[f32; 4], of_inner: f32, of_outer: f32) -
 }
 
 fn snap(window: &Viewport, [x, y, z, w]: &[f32; 4]) -> SnappedVertex {
-    let [half_width, half_height] = window.half();
+    let [half_width, half_height] = window.half_size();
     let inverse = 1.0 / w;
     let across = x * inverse * half_width + half_width;
     let down = -(y * inverse) * half_height + half_height;

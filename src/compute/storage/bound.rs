@@ -100,7 +100,7 @@ impl ShapeErrorModel {
         let modes = |tile: usize| (0..tiles.rank()).map(move |mode| reach(shape, tiles, tile, mode));
         let rest = |tile: usize| {
             let place = tiles.tile(tile);
-            let rest = &shape.mesh.rest()[place.first_vertex..][..place.vertices];
+            let rest = &shape.mesh.rest_positions()[place.first_vertex..][..place.vertices];
             rest.iter().map(|vertex| length(vertex.map(f64::from))).fold(0.0, f64::max) * ROUND_UP
         };
         Self {
@@ -181,7 +181,7 @@ fn rounding(transform: &ComposedTransform) -> [f64; 2] {
         root: Transform(transform.root.0.map(f32::abs)),
         frame: Some(Transform(frame.0.map(f32::abs))),
     };
-    let entries = sizes.exact();
+    let entries = sizes.to_f64();
     let length = |of: &mut dyn Iterator<Item = f64>| {
         of.map(|entry| (gamma(3.0) * entry + 3.0 * UNDERFLOW).powi(2)).sum::<f64>().sqrt() * ROUND_UP
     };

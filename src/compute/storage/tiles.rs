@@ -46,7 +46,7 @@ impl TiledModes {
     /// `F16` and `Bf16` divide each mode by a power of two first, so that its largest entry lies in [2^14, 2^15) or in
     /// [1, 2). `Int8` divides each mode of each tile by 1/127 of its largest entry, rounded up.
     pub fn new(shape: &Shape, storage: StorageType) -> Self {
-        let rest = shape.mesh.rest();
+        let rest = shape.mesh.rest_positions();
         let rank = shape.modes.rank();
         let mut tiles = Self {
             storage,
@@ -211,7 +211,7 @@ mod tests {
                 for vertex in 0..vertices {
                     let tile = tiles.tile(vertex / QUAD / TILE_QUADS);
                     for (axis, mode) in (0..3).flat_map(|axis| (0..rank).map(move |mode| (axis, mode))) {
-                        let entry = f64::from(shape.modes.at(vertex, axis, mode));
+                        let entry = f64::from(shape.modes.entry(vertex, axis, mode));
                         let error = (tiles.decode_entry(vertex, axis, mode) - entry).abs();
                         let allowed = half_step(&tiles, tile, mode, entry);
                         assert!(error <= allowed, "{storage:?} {vertices} {rank}: {error} of {entry} over {allowed}");
@@ -261,18 +261,18 @@ mod tests {
         let tiles = TiledModes::new(&shape, StorageType::F32);
         let float = |at: usize| f32::from_ne_bytes(tiles.bytes()[at..at + 4].try_into().expect("four bytes"));
         // Three quads: mode 2, axis 1, vertex 6 is in quad 1 at position 2.
-        assert_eq!(float(((2 * 3 + 1) * 3 + 1) * 16 + 2 * 4), shape.modes.at(6, 1, 2));
-        assert_eq!(tiles.rest()[1][4 + 2], shape.mesh.rest()[6][1]);
+        assert_eq!(float(((2 * 3 + 1) * 3 + 1) * 16 + 2 * 4), shape.modes.entry(6, 1, 2));
+        assert_eq!(tiles.rest()[1][4 + 2], shape.mesh.rest_positions()[6][1]);
         assert_eq!(tiles.rest()[2][1], 0.0);
         let tiles = TiledModes::new(&shape, StorageType::Int8);
         // Chunk 0, mode 2 is group 7 of 4 vertices: plane 1, bytes 12 to 15.
         let code = tiles.packed_words()[3 + 1].0[12 + 2];
-        let want = (shape.modes.at(6, 1, 2) / tiles.scales()[2]).round() + 128.0;
+        let want = (shape.modes.entry(6, 1, 2) / tiles.scales()[2]).round() + 128.0;
         assert_eq!(f32::from(code), want);
         let tiles = TiledModes::new(&shape, StorageType::F16);
         // Mode 3 is the second mode of chunk 1: its group 4 is plane 2, bytes 0 to 7.
         let bytes = &tiles.packed_words()[9 + 2 * 3 + 1].0[4..6];
         let stored = f16::from_ne_bytes([bytes[0], bytes[1]]).to_f32();
-        assert_eq!(f16::from_f32(shape.modes.at(6, 1, 3) / tiles.factors()[3]).to_f32(), stored);
+        assert_eq!(f16::from_f32(shape.modes.entry(6, 1, 3) / tiles.factors()[3]).to_f32(), stored);
     }
 }

@@ -121,7 +121,7 @@ mod tests {
     fn farthest(shape: &Shape, q: &[f32], retained: &[u16]) -> f64 {
         let dropped = || (0..q.len()).filter(|mode| !retained.contains(&(*mode as u16)));
         let part = |vertex: usize, axis: usize| -> f64 {
-            dropped().map(|mode| f64::from(q[mode]) * f64::from(shape.modes.at(vertex, axis, mode))).sum()
+            dropped().map(|mode| f64::from(q[mode]) * f64::from(shape.modes.entry(vertex, axis, mode))).sum()
         };
         let length = |vertex| (0..3).map(|axis| part(vertex, axis).powi(2)).sum::<f64>().sqrt();
         (0..shape.modes.vertices()).map(length).fold(0.0, f64::max)

@@ -38,10 +38,10 @@ pub(in crate::engine) fn displacement_magnitudes(
     let domains = scene.domains.par_iter().zip(&scene.layout.domains).enumerate();
     let of_domain = domains.flat_map_iter(|(index, (domain, slot))| {
         let placed = state.composed_transform(scene, index);
-        let (linear, entries) = (placed.linear(), placed.exact());
+        let (linear, entries) = (placed.linear(), placed.to_f64());
         let translation = Vector3::new(entries[3], entries[7], entries[11]);
         let deformed = surface.positions[3 * slot.first_vertex..][..3 * slot.vertices].chunks_exact(3);
-        scene.shapes[domain.shape].mesh.rest().iter().zip(deformed).map(move |(rest, deformed)| {
+        scene.shapes[domain.shape].mesh.rest_positions().iter().zip(deformed).map(move |(rest, deformed)| {
             let deformed = Vector3::from_fn(|axis, _| f64::from(deformed[axis]));
             let moved = deformed - linear * Vector3::from(*rest).cast::<f64>() - translation;
             (scene.unit * moved.norm()) as f32
@@ -101,7 +101,7 @@ mod tests {
         let modes = &scene.shapes[0].modes;
         let mut largest = 0.0_f32;
         for vertex in 0..4 {
-            let row = Vector3::from_fn(|axis, _| modes.at(vertex, axis, 0));
+            let row = Vector3::from_fn(|axis, _| modes.entry(vertex, axis, 0));
             assert!((shape[vertex] - row.norm()).abs() < 1e-6 && shape[4 + vertex] == shape[vertex]);
             assert!(moved[vertex] < 1e-6, "the first strip rests: {moved:?}");
             assert!((moved[4 + vertex] - 2.0 * 0.75 * row.norm()).abs() < 2e-6, "{moved:?}");

@@ -152,7 +152,8 @@ fn push_origins(selection: &VertexSelection, origins: Option<&FloatingOrigins>, 
     let scene = &selection.scene;
     let meters = |cell: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * cell[axis]);
     let Some(origins) = origins else { return scene.origin };
-    let own = || selection.domains.iter().map(|domain| origins.origin_of(scene.transform_roots.of(*domain as usize)));
+    let own =
+        || selection.domains.iter().map(|domain| origins.origin_of(scene.transform_roots.root_of(*domain as usize)));
     if own().any(|cell| cell != origins.shared()) {
         bytes.extend(own().map(meters).flat_map(|origin: [f64; 3]| origin.map(f64::to_le_bytes)).flatten());
     }

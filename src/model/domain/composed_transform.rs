@@ -38,7 +38,7 @@ impl ComposedTransform {
 
     /// The product in f64, 3x4 row-major. Products of two f32 are exact in f64 and cannot overflow. Sums are evaluated
     /// from left to right as on the device, so that an entry that cancels to 0 here also does so there.
-    pub fn exact(&self) -> [f64; 12] {
+    pub fn to_f64(&self) -> [f64; 12] {
         let t = self.root.0.map(f64::from);
         let Some(frame) = self.frame else { return t };
         let f = frame.0.map(f64::from);
@@ -49,9 +49,9 @@ impl ComposedTransform {
         })
     }
 
-    /// The linear part A of [`Self::exact`], which transforms normals and tangents.
+    /// The linear part A of [`Self::to_f64`], which transforms normals and tangents.
     pub fn linear(&self) -> Matrix3<f64> {
-        let entries = self.exact();
+        let entries = self.to_f64();
         Matrix3::from_fn(|row, column| entries[4 * row + column])
     }
 }
@@ -68,7 +68,7 @@ mod tests {
         let composed_transform = ComposedTransform { root: T, frame: Some(F) };
         // Small whole numbers and halves: every product and sum is exact in f32.
         assert_eq!(composed_transform.to_f32(), T.compose(F));
-        assert_eq!(composed_transform.exact(), T.compose(F).0.map(f64::from));
+        assert_eq!(composed_transform.to_f64(), T.compose(F).0.map(f64::from));
         assert_eq!(composed_transform.linear(), T.linear() * F.linear());
         assert_ne!(composed_transform.to_f32(), F.compose(T), "the judge can fail");
         let own = ComposedTransform::from(T);
@@ -80,7 +80,7 @@ mod tests {
         let scaled = |scale: f32| Transform(Transform::IDENTITY.0.map(|entry| entry * scale));
         let huge = ComposedTransform { root: scaled(1e30), frame: Some(scaled(1e30)) };
         assert_eq!(huge.to_f32().0[0], f32::INFINITY);
-        assert!((huge.exact()[0] / 1e60 - 1.0).abs() < 1e-6);
+        assert!((huge.to_f64()[0] / 1e60 - 1.0).abs() < 1e-6);
         let tiny = ComposedTransform { root: scaled(1e-30), frame: Some(scaled(1e-30)) };
         assert_eq!(tiny.to_f32().0[0], 0.0);
         assert!(tiny.linear().determinant() > 0.0);
@@ -88,6 +88,6 @@ mod tests {
         (flat.0[0], flat.0[1]) = (0.1, -0.1);
         let mut ones = Transform::IDENTITY;
         (ones.0[0], ones.0[4]) = (1.0, 1.0);
-        assert_eq!(ComposedTransform { root: flat, frame: Some(ones) }.exact()[0], 0.0);
+        assert_eq!(ComposedTransform { root: flat, frame: Some(ones) }.to_f64()[0], 0.0);
     }
 }

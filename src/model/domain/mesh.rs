@@ -70,7 +70,7 @@ impl Mesh {
     }
 
     /// Rest positions, one per vertex.
-    pub fn rest(&self) -> &[[f32; 3]] {
+    pub fn rest_positions(&self) -> &[[f32; 3]] {
         &self.rest
     }
 

@@ -40,10 +40,10 @@ impl Shape {
     /// # Errors
     /// `Invalid` if the modes do not have three rows per vertex of the mesh.
     pub fn new(mesh: Mesh, modes: Modes) -> crate::error::Result<Self> {
-        if modes.rank() > 0 && modes.vertices() != mesh.rest().len() {
+        if modes.rank() > 0 && modes.vertices() != mesh.rest_positions().len() {
             return Err(crate::error::invalid(
                 "modes.rows",
-                format!("{} (3 x {} vertices)", 3 * mesh.rest().len(), mesh.rest().len()),
+                format!("{} (3 x {} vertices)", 3 * mesh.rest_positions().len(), mesh.rest_positions().len()),
                 3 * modes.vertices(),
             ));
         }

@@ -80,7 +80,7 @@ impl Modes {
     }
 
     /// The entry of vertex `vertex`, component `component`, mode `mode`.
-    pub fn at(&self, vertex: usize, component: usize, mode: usize) -> f32 {
+    pub fn entry(&self, vertex: usize, component: usize, mode: usize) -> f32 {
         self.columns[3 * self.vertices * mode + 3 * vertex + component]
     }
 
@@ -89,7 +89,7 @@ impl Modes {
     pub fn block_at_point(&self, vertices: [u32; 3], shares: [f64; 3]) -> Vec<f32> {
         let entry = |component: usize, mode: usize| {
             let of_vertex =
-                |(vertex, share): (&u32, f64)| share * f64::from(self.at(*vertex as usize, component, mode));
+                |(vertex, share): (&u32, f64)| share * f64::from(self.entry(*vertex as usize, component, mode));
             vertices.iter().zip(shares).map(of_vertex).sum::<f64>() as f32
         };
         (0..3)
@@ -113,7 +113,7 @@ mod tests {
         let rows = Modes::from_rows(3, 2, &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).expect("fits");
         let columns = Modes::from_columns(3, 2, vec![1.0, 3.0, 5.0, 2.0, 4.0, 6.0]).expect("fits");
         assert_eq!(rows, columns);
-        assert_eq!(rows.at(0, 2, 1), 6.0);
+        assert_eq!(rows.entry(0, 2, 1), 6.0);
         assert_eq!(rows.column(1), [2.0, 4.0, 6.0]);
     }
 

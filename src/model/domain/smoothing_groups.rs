@@ -69,7 +69,7 @@ impl SmoothingGroups {
     }
 
     /// The group of each corner. Groups are numbered in the order of their first corners.
-    pub fn members(&self) -> &[u32] {
+    pub fn corner_groups(&self) -> &[u32] {
         &self.members
     }
 
@@ -180,7 +180,7 @@ fn pairs_of_groups(mesh: &Mesh, members: &[u32], groups: usize) -> (Vec<usize>, 
 }
 
 fn geometric_normal(mesh: &Mesh, own: u32, pairs: &[OppositeEdge]) -> [f32; 3] {
-    let at = |vertex: u32| Vector3::from(mesh.rest()[vertex as usize]).cast::<f64>();
+    let at = |vertex: u32| Vector3::from(mesh.rest_positions()[vertex as usize]).cast::<f64>();
     let (mut sum, mut lengths) = (Vector3::zeros(), 0.0);
     for (from, to) in pairs {
         let area = (at(*from) - at(own)).cross(&(at(*to) - at(own)));
@@ -265,10 +265,10 @@ mod tests {
         let degrees = |angle: f32| [angle.to_radians().sin(), 0.0, angle.to_radians().cos()];
         let corners = [(3, SIDE), (5, UP), (3, degrees(0.09)), (3, UP), (3, degrees(0.3)), (5, UP), (4, UP)];
         let groups = SmoothingGroups::of(&mesh(&corners, vec![[0, 1, 6]]));
-        assert_eq!(groups.members(), [0, 1, 2, 2, 3, 1, 4]);
+        assert_eq!(groups.corner_groups(), [0, 1, 2, 2, 3, 1, 4]);
         let mut turned = corners;
         turned.reverse();
-        assert_eq!(SmoothingGroups::of(&mesh(&turned, vec![[0, 1, 6]])).members(), [0, 1, 2, 3, 3, 1, 4]);
+        assert_eq!(SmoothingGroups::of(&mesh(&turned, vec![[0, 1, 6]])).corner_groups(), [0, 1, 2, 3, 3, 1, 4]);
     }
 
     #[test]
@@ -288,7 +288,8 @@ mod tests {
                 let mut want = Vec::new();
                 for (at, triangle) in triangles.iter().flat_map(|triangle| (0..3).map(move |at| (at, triangle))) {
                     let [a, b, c] = [0, 1, 2].map(|step| vertex(triangle[(at + step) % 3]));
-                    if smoothing.members()[triangle[at] as usize] as usize == group && a != b && b != c && c != a {
+                    if smoothing.corner_groups()[triangle[at] as usize] as usize == group && a != b && b != c && c != a
+                    {
                         assert_eq!(a, smoothing.ring(group)[0]);
                         want.push((b, c));
                     }

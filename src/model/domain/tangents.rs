@@ -32,7 +32,8 @@ pub(super) fn lengyel_tangents(mesh: &Mesh) -> Vec<[f32; 4]> {
 /// Derivatives of the position along u and along v over one triangle. v points up here, as in normal maps.
 fn gradients(mesh: &Mesh, triangle: [u32; 3]) -> Option<(Vector3<f64>, Vector3<f64>)> {
     let corners = mesh.corners();
-    let position = |corner: u32| Vector3::from(mesh.rest()[corners.vertices[corner as usize] as usize]).cast::<f64>();
+    let position =
+        |corner: u32| Vector3::from(mesh.rest_positions()[corners.vertices[corner as usize] as usize]).cast::<f64>();
     let uv = |corner: u32| corners.uvs[corner as usize].map(f64::from);
     let [a, b, c] = triangle;
     let (edge1, edge2) = (position(b) - position(a), position(c) - position(a));

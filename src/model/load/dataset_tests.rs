@@ -24,7 +24,7 @@ fn manifest(text: &str) -> crate::error::Result<Arc<Scene>> {
 
 fn fixed_rows(scene: &Scene) -> usize {
     let modes = &scene.shapes[0].modes;
-    let is_zero = |vertex: &usize| (0..3 * modes.rank()).all(|at| modes.at(*vertex, at % 3, at / 3) == 0.0);
+    let is_zero = |vertex: &usize| (0..3 * modes.rank()).all(|at| modes.entry(*vertex, at % 3, at / 3) == 0.0);
     (0..modes.vertices()).filter(is_zero).count()
 }
 
@@ -45,7 +45,7 @@ fn real_simple_bridge_keeps_the_numbering_of_its_file() {
     assert!(moved > 15_000, "{moved}");
     let text = std::fs::read_to_string(data("vega/simpleBridge/simpleBridge.obj")).expect("read");
     let lines = text.lines().filter_map(|line| line.strip_prefix("v "));
-    for (line, rest) in lines.zip(scene.shapes[0].mesh.rest()) {
+    for (line, rest) in lines.zip(scene.shapes[0].mesh.rest_positions()) {
         let numbers: Vec<f32> = line.split_whitespace().map(|word| word.parse().expect("a number")).collect();
         assert_eq!(numbers, rest);
     }
@@ -143,7 +143,7 @@ fn real_plants_lie_where_their_file_says_and_petioles_reach_their_leaves() {
         let reach = if name == "almond" { 0.2 } else { 0.4 };
         for (index, domain) in scene.domains.iter().enumerate().filter(|(_, domain)| domain.name.starts_with("leaf ")) {
             let far = |rest: &[f32; 3]| nalgebra::Vector3::from(*rest).norm();
-            let farthest = scene.shape_of(index).mesh.rest().iter().map(far).fold(0.0, f32::max);
+            let farthest = scene.shape_of(index).mesh.rest_positions().iter().map(far).fold(0.0, f32::max);
             assert!(farthest < reach, "{name}: {}: {farthest}", domain.name);
         }
     }

@@ -144,7 +144,7 @@ impl FloatingOrigins {
     /// nothing about the visible ones.
     pub fn rebase_positions(&self, view: [f64; 3], scene: &Scene, positions: &[f32]) -> (Vec<f32>, BoundingBox) {
         let slots = &scene.layout.domains;
-        let offset = |domain| difference(self.origin_of(scene.transform_roots.of(domain)), view);
+        let offset = |domain| difference(self.origin_of(scene.transform_roots.root_of(domain)), view);
         let offsets: Vec<[f64; 3]> = (0..slots.len()).map(offset).collect();
         let distance = |offset: &[f64; 3]| offset.iter().fold(0.0, |most: f64, along| most.max(along.abs()));
         let nearest = offsets.iter().map(distance).fold(f64::INFINITY, f64::min);

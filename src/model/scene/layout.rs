@@ -51,7 +51,7 @@ impl Layout {
             let shared = domain.shares_q_with.map(|twin| layout.domains[twin].first_q);
             let slot = DomainLayout {
                 first_vertex: layout.vertices,
-                vertices: shape.mesh.rest().len(),
+                vertices: shape.mesh.rest_positions().len(),
                 first_corner: layout.corners,
                 corners: shape.mesh.corners().vertices.len(),
                 first_triangle: layout.triangles,

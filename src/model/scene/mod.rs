@@ -197,7 +197,7 @@ impl Scene {
         let mut bounds = BoundingBox::EMPTY;
         for domain in &self.domains {
             let place = domain.placement.to_matrix();
-            for position in self.shapes[domain.shape].mesh.rest() {
+            for position in self.shapes[domain.shape].mesh.rest_positions() {
                 let world = place.transform_point(&nalgebra::Point3::from(*position).cast());
                 bounds.include(world.coords.into());
             }
@@ -250,7 +250,7 @@ fn check_domain(parts: &SceneParts, index: usize) -> Result<()> {
     if let Some(attachment) = &domain.attachment {
         // A parent must precede its children: the hierarchy then has no cycle, and one pass in order composes it.
         below("parent", attachment.parent, index)?;
-        let vertices = parts.shapes[parts.domains[attachment.parent].shape].mesh.rest().len();
+        let vertices = parts.shapes[parts.domains[attachment.parent].shape].mesh.rest_positions().len();
         if attachment.rows.len() > MAX_ATTACHMENT_ROWS {
             let expected = format!("at most {MAX_ATTACHMENT_ROWS} vertices");
             return Err(invalid("attachment.rows", expected, attachment.rows.len()));
@@ -409,7 +409,7 @@ mod tests {
         let mesh = &placed.shapes[0].mesh;
         let corners = mesh.corners().clone();
         let uvs = vec![[0.0, 0.0]; 4];
-        let mesh = Mesh::from_indexed(mesh.rest().to_vec(), corners.normals, uvs, mesh.triangles().to_vec());
+        let mesh = Mesh::from_indexed(mesh.rest_positions().to_vec(), corners.normals, uvs, mesh.triangles().to_vec());
         placed.shapes[0] = Shape::new(mesh.expect("a square"), Modes::rigid()).expect("rigid");
         let scene = Scene::new(placed).expect("a scene");
         assert!(scene.features.textures && scene.features.mask && scene.remarks.is_empty());

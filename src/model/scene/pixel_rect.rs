@@ -2,7 +2,7 @@
 
 use crate::error::{Result, invalid};
 
-/// A rectangle inside an image, at most [`Self::LARGEST`] pixels per side. (0, 0) is the top left pixel.
+/// A rectangle inside an image, at most [`Self::MAX_SIDE`] pixels per side. (0, 0) is the top left pixel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PixelRect {
     x: u32,
@@ -13,16 +13,16 @@ pub struct PixelRect {
 
 impl PixelRect {
     /// The largest width and height in pixels.
-    pub const LARGEST: u32 = 64;
+    pub const MAX_SIDE: u32 = 64;
 
     /// The rectangle with the top left pixel `corner` in an image of the size `picture` (width, height).
     ///
     /// # Errors
-    /// `Invalid` if a side is 0 or above [`Self::LARGEST`], or if the rectangle exceeds the image.
+    /// `Invalid` if a side is 0 or above [`Self::MAX_SIDE`], or if the rectangle exceeds the image.
     pub fn within(picture: [u32; 2], corner: [u32; 2], size: [u32; 2]) -> Result<Self> {
         let ([x, y], [width, height]) = (corner, size);
-        if !size.iter().all(|side| (1..=Self::LARGEST).contains(side)) {
-            let expected = format!("1 to {} pixels a side", Self::LARGEST);
+        if !size.iter().all(|side| (1..=Self::MAX_SIDE).contains(side)) {
+            let expected = format!("1 to {} pixels a side", Self::MAX_SIDE);
             return Err(invalid("rectangle.size", expected, format!("{width} x {height}")));
         }
         let ends = |axis: usize| u64::from(corner[axis]) + u64::from(size[axis]);

@@ -47,14 +47,14 @@ impl Viewport {
     }
 
     /// Half the width and height in pixels.
-    pub fn half(&self) -> [f32; 2] {
+    pub fn half_size(&self) -> [f32; 2] {
         self.size().map(|side| 0.5 * side as f32)
     }
 
     /// The guard band: |x| and |y| in normalized device coordinates beyond which triangles are clipped. It ends 16384
     /// pixels from the center, where f32 still resolves more than 1/256 pixel.
     pub fn guard(&self) -> [f32; 2] {
-        self.half().map(|half| MAX_VIEWPORT_SIDE as f32 / half)
+        self.half_size().map(|half| MAX_VIEWPORT_SIDE as f32 / half)
     }
 }
 
@@ -72,7 +72,7 @@ pub enum CullMode {
 pub struct DrawRange {
     pub first: u32,
     pub triangles: u32,
-    pub faces: CullMode,
+    pub cull_mode: CullMode,
 }
 
 #[cfg(test)]
@@ -84,6 +84,6 @@ mod tests {
         let of = |width, height| Viewport::new(&Matrix4::identity(), width, height);
         assert!(of(0, 1).is_err() && of(1, 0).is_err() && of(MAX_VIEWPORT_SIDE + 1, 1).is_err());
         let largest = of(MAX_VIEWPORT_SIDE, 1).expect("a window");
-        assert_eq!((largest.guard()[0], largest.half()), (2.0, [8192.0, 0.5]));
+        assert_eq!((largest.guard()[0], largest.half_size()), (2.0, [8192.0, 0.5]));
     }
 }

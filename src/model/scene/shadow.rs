@@ -56,7 +56,7 @@ pub struct ShadowSettings {
     /// Standard deviation of the Gaussian in texels, 0 (no blur) to 16. [`ShadowMethod::Standard`] ignores it.
     pub blur: f32,
     /// Lower bound of the variance, as a fraction of the squared depth range. The effective bound is at least
-    /// [`Self::floor`], the variance that rounding alone produces.
+    /// [`Self::variance_floor`], the variance that rounding alone produces.
     pub least_variance: f32,
     /// Light-bleeding reduction: Chebyshev values below this count as full shadow, 0 to 0.99. It moves the edge of a
     /// shadow outwards, at 0.2 by a quarter of the standard deviation.
@@ -97,7 +97,7 @@ impl ShadowSettings {
     }
 
     /// Radius of the blur kernel in texels: three standard deviations.
-    pub fn reach(&self) -> u32 {
+    pub fn blur_radius(&self) -> u32 {
         match self.method {
             ShadowMethod::Standard => 0,
             _ => (3.0 * f64::from(self.blur)).ceil() as u32,
@@ -114,8 +114,8 @@ impl ShadowSettings {
     /// and in y. With u = 2^-24, the products, sums and weights of two passes and the bilinear lookup change M2 <= 1/4
     /// by at most (2 N + 6) u / 4 and M1 by at most (2 N + 5) u / 2, hence M1^2 by (N + 3) u. In total, the
     /// variance is below (1.5 N + 5) u.
-    pub fn floor(&self) -> f32 {
-        let taps = 2 * self.reach() + 1;
+    pub fn variance_floor(&self) -> f32 {
+        let taps = 2 * self.blur_radius() + 1;
         (1.5 * taps as f32 + 5.0) * (0.5 * f32::EPSILON)
     }
 
@@ -165,7 +165,7 @@ mod tests {
 
     /// Blurs moments of equal depths m twice in f32, as the shaders do. Returns the largest |M2 - M1^2|.
     fn spurious(shadow: &ShadowSettings) -> f32 {
-        let reach = shadow.reach() as i32;
+        let reach = shadow.blur_radius() as i32;
         let bell = |step: i32| (-0.5 * (f64::from(step) / f64::from(shadow.blur)).powi(2)).exp();
         let sum: f64 = (-reach..=reach).map(bell).sum();
         let weights: Vec<f32> = (-reach..=reach).map(|step| (bell(step) / sum) as f32).collect();
@@ -181,10 +181,10 @@ mod tests {
     fn the_floor_holds_what_rounding_makes_of_no_variance_and_not_a_hundred_times_more() {
         for blur in [0.5, 1.5, 4.0, 16.0] {
             let shadow = ShadowSettings { blur, ..ShadowSettings::default() };
-            let (worst, floor) = (spurious(&shadow), shadow.floor());
+            let (worst, floor) = (spurious(&shadow), shadow.variance_floor());
             assert!(worst <= floor && floor < 100.0 * worst, "blur {blur}: {worst} of {floor}");
         }
         let default = ShadowSettings::default();
-        assert!(default.floor() < default.least_variance, "the default least variance is above its floor");
+        assert!(default.variance_floor() < default.least_variance, "the default least variance is above its floor");
     }
 }

@@ -102,13 +102,13 @@ impl SceneState {
         }
         let Some(origins) = self.origins.as_mut().map(Arc::make_mut) else {
             for (domain, transform) in &update.transforms {
-                self.transforms[transform_roots.of(*domain as usize)] = *transform;
+                self.transforms[transform_roots.root_of(*domain as usize)] = *transform;
             }
             return false;
         };
         let anew = begins && !origins.is_uniform();
         for (domain, transform, translation) in update.transform_updates() {
-            let root = transform_roots.of(domain);
+            let root = transform_roots.root_of(domain);
             origins.set(root, translation);
             self.transforms[root] = origins.rebase_transform(root, transform);
         }
@@ -130,7 +130,7 @@ impl SceneState {
     /// The transform of a domain's root and, for a follower, its constant frame; relative to the cell of the root.
     pub fn composed_transform(&self, scene: &Scene, domain: usize) -> ComposedTransform {
         ComposedTransform {
-            root: self.transforms[scene.transform_roots.of(domain)],
+            root: self.transforms[scene.transform_roots.root_of(domain)],
             frame: scene.transform_roots.frame_of(domain),
         }
     }

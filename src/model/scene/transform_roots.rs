@@ -75,7 +75,7 @@ impl TransformRoots {
 
     /// The index in [`super::SceneState::transforms`] of the transform of a domain's root. A domain that follows no other is
     /// its own root.
-    pub fn of(&self, domain: usize) -> usize {
+    pub fn root_of(&self, domain: usize) -> usize {
         self.table.as_ref().map_or(domain, |table| table.following[domain][0] as usize)
     }
 
@@ -149,7 +149,7 @@ pub(super) fn check_transform_targets(
         None => Ok(()),
         Some(at) => {
             let name = |domain: u32| &domains[domain as usize].name;
-            let root = transform_roots.domain(transform_roots.of(list[at] as usize));
+            let root = transform_roots.domain(transform_roots.root_of(list[at] as usize));
             let given = format!("{} ('{}'), which follows '{}'", list[at], name(list[at]), name(root));
             Err(invalid(format!("{field}[{at}]"), "a domain with a transform of its own", given))
         }
@@ -204,7 +204,7 @@ mod tests {
         let scene = Scene::new(parts).expect("a scene");
         let transform_roots = &scene.transform_roots;
         assert_eq!((transform_roots.count(), transform_roots.domains().collect::<Vec<_>>()), (2, vec![0, 3]));
-        assert_eq!([0, 1, 2, 3, 4].map(|domain| transform_roots.of(domain)), [0, 0, 0, 1, 1]);
+        assert_eq!([0, 1, 2, 3, 4].map(|domain| transform_roots.root_of(domain)), [0, 0, 0, 1, 1]);
         let frames = [0, 1, 2, 3, 4].map(|domain| transform_roots.frame_of(domain));
         assert_eq!(frames, [None, Some(moved(1.0)), Some(moved(3.0)), None, Some(moved(3.0))]);
         assert_eq!(
@@ -232,7 +232,7 @@ mod tests {
         let scene = Scene::new(following(&[])).expect("a scene");
         assert_eq!((scene.transform_roots.table.as_ref(), scene.transform_roots.count()), (None, 5));
         assert_eq!(
-            (scene.transform_roots.of(3), scene.transform_roots.frame_of(3), scene.transform_roots.domain(3)),
+            (scene.transform_roots.root_of(3), scene.transform_roots.frame_of(3), scene.transform_roots.domain(3)),
             (3, None, 3)
         );
         assert!(scene.transform_roots.followers_of(3).is_empty() && !scene.features.followers);

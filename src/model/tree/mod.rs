@@ -198,8 +198,9 @@ mod tests {
     #[test]
     fn a_seed_grows_the_same_tree_twice_and_another_seed_another_tree() {
         let (one, two, other) = (grown(7), grown(7), grown(8));
-        let rest =
-            |parts: &SceneParts| parts.shapes.iter().flat_map(|shape| shape.mesh.rest().to_vec()).collect::<Vec<_>>();
+        let rest = |parts: &SceneParts| {
+            parts.shapes.iter().flat_map(|shape| shape.mesh.rest_positions().to_vec()).collect::<Vec<_>>()
+        };
         let modes = |parts: &SceneParts| {
             parts.shapes.iter().flat_map(|shape| shape.modes.columns().to_vec()).collect::<Vec<_>>()
         };
@@ -252,7 +253,7 @@ mod tests {
         for domain in &parts.domains[1..] {
             let attachment = domain.attachment.as_ref().expect("all but the trunk hang on something");
             let parent = &parts.domains[attachment.parent];
-            let rest = parts.shapes[parent.shape].mesh.rest();
+            let rest = parts.shapes[parent.shape].mesh.rest_positions();
             let mean = |rows: &[u32]| {
                 let sum: Vector3<f64> = rows.iter().map(|row| Vector3::from(rest[*row as usize]).cast::<f64>()).sum();
                 let center = parent.placement.to_matrix().transform_point(&(sum / rows.len() as f64).into());
@@ -304,8 +305,8 @@ mod tests {
     fn the_first_mode_sways_the_top_more_than_the_stem_below_it() {
         let parts = grown(7);
         let shape = &parts.shapes[parts.domains[0].shape];
-        let sway = |vertex: usize| Vector3::from_fn(|axis, _| shape.modes.at(vertex, axis, 0)).norm();
-        let count = shape.mesh.rest().len();
+        let sway = |vertex: usize| Vector3::from_fn(|axis, _| shape.modes.entry(vertex, axis, 0)).norm();
+        let count = shape.mesh.rest_positions().len();
         let largest = (0..count).map(sway).fold(0.0, f32::max);
         assert!(sway(count - 1) > 0.95 * largest);
         assert!(sway(count / 4) < 0.3 * largest);

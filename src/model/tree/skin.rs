@@ -217,15 +217,16 @@ mod tests {
         let tube = Tube { centerline: &centerline, radii: &radii, sides: 9, wrap: UvMapping::Bark { repeats: 2 } };
         sheet.add_tube(&tube, |_, angle| 1.0 + 0.3 * angle.cos());
         let mesh = sheet.mesh().expect("finite");
-        assert_eq!(mesh.rest().len(), 13 * 9 + 1);
+        assert_eq!(mesh.rest_positions().len(), 13 * 9 + 1);
         assert_eq!(mesh.triangles().len(), 12 * 9 * 2 + 9);
         for ring in 0..13 {
-            let places = mesh.rest()[9 * ring..][..9].iter().map(|place| Vector3::from(*place).cast::<f64>());
+            let places = mesh.rest_positions()[9 * ring..][..9].iter().map(|place| Vector3::from(*place).cast::<f64>());
             let mean = places.sum::<Vector3<f64>>() / 9.0;
             assert!((mean - centerline.points[ring]).norm() < 1e-6);
         }
         for (corner, normal) in mesh.corners().vertices.iter().zip(&mesh.corners().normals) {
-            let (place, ring) = (Vector3::from(mesh.rest()[*corner as usize]).cast::<f64>(), *corner as usize / 9);
+            let (place, ring) =
+                (Vector3::from(mesh.rest_positions()[*corner as usize]).cast::<f64>(), *corner as usize / 9);
             let center = if ring > 12 { centerline.points[12] } else { centerline.points[ring] };
             let outwards = (place - center).normalize().dot(&Vector3::from(*normal).cast());
             assert!(outwards > 0.3, "normal {normal:?} looks inwards: {outwards}");
@@ -284,7 +285,7 @@ mod tests {
         let mesh = sheet.mesh().expect("finite");
         for corner in corners as usize..mesh.corners().vertices.len() {
             assert!(mesh.corners().normals[corner][2] > 0.5);
-            assert!(mesh.rest()[mesh.corners().vertices[corner] as usize][0] > 0.9);
+            assert!(mesh.rest_positions()[mesh.corners().vertices[corner] as usize][0] > 0.9);
         }
     }
 }

@@ -145,8 +145,8 @@ mod tests {
             let arm = Vector3::from(rest[1]).cast::<f64>() - beam.nodes[node];
             let want: Vector3<f64> = part(0) + part(3).cross(&arm);
             for axis in 0..3 {
-                assert_eq!(skin.at(0, axis, mode).to_bits(), 0, "the clamp moves");
-                let got = f64::from(skin.at(1, axis, mode));
+                assert_eq!(skin.entry(0, axis, mode).to_bits(), 0, "the clamp moves");
+                let got = f64::from(skin.entry(1, axis, mode));
                 assert!((got - want[axis]).abs() <= 1e-6 * want.norm(), "mode {mode}: {got} is not {}", want[axis]);
             }
             // Counterexample: without the rotational part, the skin's displacement would differ.

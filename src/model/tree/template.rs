@@ -175,12 +175,13 @@ mod tests {
             let mean = |ring: usize, mode: usize| {
                 let rows = mold.ring_rows(ring);
                 let count = rows.len() as f64;
-                let row = |row: u32| Vector3::from_fn(|axis, _| f64::from(shape.modes.at(row as usize, axis, mode)));
+                let row = |row: u32| Vector3::from_fn(|axis, _| f64::from(shape.modes.entry(row as usize, axis, mode)));
                 rows.into_iter().map(row).sum::<Vector3<f64>>() / count
             };
             for mode in 0..mold.rank {
                 let base = mold.ring_rows(0);
-                let at_rest = |row: &u32| (0..3).all(|axis| shape.modes.at(*row as usize, axis, mode).to_bits() == 0);
+                let at_rest =
+                    |row: &u32| (0..3).all(|axis| shape.modes.entry(*row as usize, axis, mode).to_bits() == 0);
                 assert!(base.iter().all(at_rest), "the base moves");
                 let dofs: Vec<f64> = solved.mode_shapes.column(mode).iter().copied().collect();
                 let largest = solved.mode_shapes.column(mode).amax();
@@ -202,7 +203,7 @@ mod tests {
             let mesh = mold.sheet.mesh().expect("finite");
             let last = mold.centerline.points.len() - 1;
             for (vertex, normal) in mesh.corners().vertices.iter().zip(&mesh.corners().normals) {
-                let place = Vector3::from(mesh.rest()[*vertex as usize]).cast::<f64>();
+                let place = Vector3::from(mesh.rest_positions()[*vertex as usize]).cast::<f64>();
                 let center = mold.centerline.points[(*vertex as usize / mold.sides).min(last)];
                 let outwards = (place - center).normalize().dot(&Vector3::from(*normal).cast());
                 assert!(outwards > 0.2, "level {:?}: {outwards}", mold.level);

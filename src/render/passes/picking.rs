@@ -33,7 +33,7 @@ use modalcast_model::scene::{Camera, PixelRect, Scene};
 
 /// 32-bit words per pixel that `shaders/pick.comp` writes.
 const WORDS_PER_PIXEL: usize = 22;
-const MAX_SIDE: u32 = PixelRect::LARGEST;
+const MAX_SIDE: u32 = PixelRect::MAX_SIDE;
 const MAX_BYTES: u64 = 4 * WORDS_PER_PIXEL as u64 * MAX_SIDE as u64 * MAX_SIDE as u64;
 
 /// The surface point at the center of a pixel.

@@ -51,7 +51,7 @@ fn picture(scene: &Arc<Scene>, (just, greedy): (&str, &str)) -> Vec<u8> {
     let buffers = SceneBuffers::new(&gl, scene, &places, BlurMethod::Auto, compile).expect("loads");
     assert!(found, "the shader says no '{just}'");
     let corners = scene.shapes[0].mesh.corners();
-    let (positions, normals) = (scene.shapes[0].mesh.rest().as_flattened(), corners.normals.as_flattened());
+    let (positions, normals) = (scene.shapes[0].mesh.rest_positions().as_flattened(), corners.normals.as_flattened());
     let surface =
         DeformedSurface { positions: positions.to_vec(), normals: normals.to_vec(), ..DeformedSurface::default() };
     renderer.upload(&buffers, &surface).expect("uploads");

@@ -12,7 +12,7 @@ pub(super) fn raster_geometry(scene: &Scene, positions: GlBuffer, anisotropy: f3
     let groups = geometry.groups.iter().map(|group| DrawRange {
         first: group.first_triangle as u32,
         triangles: group.triangles as u32,
-        faces: if group.double_sided { CullMode::None } else { CullMode::Back },
+        cull_mode: if group.double_sided { CullMode::None } else { CullMode::Back },
     });
     RasterGeometry {
         positions,

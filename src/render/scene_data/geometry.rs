@@ -188,7 +188,8 @@ fn spans<'a>(domain: &'a Domain, slot: &DomainLayout) -> impl Iterator<Item = (u
 /// visible, so it must agree with the normals; not all files guarantee that.
 fn winding_disagrees(mesh: &modalcast_model::domain::Mesh, triangle: [u32; 3]) -> bool {
     let corners = mesh.corners();
-    let at = |corner: u32| Vector3::from(mesh.rest()[corners.vertices[corner as usize] as usize]).cast::<f64>();
+    let at =
+        |corner: u32| Vector3::from(mesh.rest_positions()[corners.vertices[corner as usize] as usize]).cast::<f64>();
     let normal = |corner: u32| Vector3::from(corners.normals[corner as usize]).cast::<f64>();
     let [a, b, c] = triangle;
     let area = (at(b) - at(a)).cross(&(at(c) - at(a)));
@@ -284,7 +285,7 @@ pub(crate) mod tests {
     fn a_double_sided_triangle_wound_against_its_normals_is_turned_and_a_single_sided_one_is_kept() {
         for (double_sided, expected) in [(true, [0, 2, 1]), (false, [0, 1, 2])] {
             let mut parts = squares(vec![of(AlphaMode::Opaque, double_sided)]);
-            let rest = parts.shapes[0].mesh.rest().to_vec();
+            let rest = parts.shapes[0].mesh.rest_positions().to_vec();
             let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, -1.0]; 4], vec![], vec![[0, 1, 2]]).expect("good");
             parts.shapes[0] = Shape::new(mesh, Modes::rigid()).expect("rigid");
             let geometry = Geometry::new(&Scene::new(parts).expect("good"));

@@ -29,7 +29,7 @@ impl BlurStrip {
     /// None if the kernel is too wide. Each strip also processes 2 `reach` rows that it does not store, so tall strips
     /// cost less; a small map needs many strips to occupy the device.
     pub(crate) fn of(shadow: &ShadowSettings) -> Option<Self> {
-        let reach = shadow.reach();
+        let reach = shadow.blur_radius();
         let (wide, rows_per_step) = STRIP_SHAPES[usize::from(reach > NARROW_RADIUS)];
         let rows = (shadow.size / 32).clamp(16, 128) + 2 * reach;
         let tall = rows.next_multiple_of(rows_per_step) - 2 * reach;

@@ -42,7 +42,7 @@ struct BlurTile {
 impl BlurTile {
     /// The first of these sizes that fits into shared memory; a wider blur kernel needs smaller tiles.
     fn of(shadow: &ShadowSettings) -> Self {
-        let reach = shadow.reach();
+        let reach = shadow.blur_radius();
         let sizes = [(32, 64, 256), (32, 48, 256), (32, 32, 256), (32, 32, 32), (16, 64, 32), (16, 64, 16)];
         // All rows at once if they fit: a second band would leave most lanes idle.
         let tiles = sizes.map(|(wide, tall, band)| Self { wide, tall, band: (tall + 2 * reach).min(band), reach });
@@ -217,7 +217,7 @@ mod tests {
             assert!((sum - 1.0).abs() < 1e-5, "{filter_deviation}: {sum}");
             assert!(weights.is_sorted_by(|near, far| near >= far));
             let shadow = ShadowSettings { blur: filter_deviation, ..ShadowSettings::default() };
-            assert_eq!(shadow.reach() as usize, weights.len() - 1);
+            assert_eq!(shadow.blur_radius() as usize, weights.len() - 1);
         }
         assert_eq!(gaussian_weights(0.0), [1.0]);
     }

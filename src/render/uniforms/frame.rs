@@ -72,7 +72,7 @@ impl FrameUniforms {
             ground: color(look.ground.unwrap_or_default().color, fade),
             ground_center: vec4_of(center, GROUND_EXTENT * fade),
             shadow: [
-                shadow.least_variance.max(shadow.floor()),
+                shadow.least_variance.max(shadow.variance_floor()),
                 shadow.bleeding,
                 shadow.alpha_threshold,
                 shadow.size as f32,
@@ -143,7 +143,7 @@ pub(crate) fn light_box_params(scene: &Scene, shot: &FrameParams, origin: [f64; 
         light: finite_light_bounds(shot),
         ground: scene.look.ground.map(|_| height),
         size: f64::from(shadow.size),
-        rim: f64::from(shadow.reach()) + 1.0,
+        rim: f64::from(shadow.blur_radius()) + 1.0,
     }
 }
 

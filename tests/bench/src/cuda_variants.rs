@@ -244,7 +244,7 @@ fn thesis_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: Varian
 /// Whether every vertex of every shape is a corner of some triangle.
 fn refers_to_all_vertices(scene: &Scene) -> bool {
     scene.shapes.iter().all(|shape| {
-        let mut is_corner = vec![false; shape.mesh.rest().len()];
+        let mut is_corner = vec![false; shape.mesh.rest_positions().len()];
         for corner in shape.mesh.triangles().as_flattened() {
             is_corner[shape.mesh.corners().vertices[*corner as usize] as usize] = true;
         }

@@ -60,7 +60,8 @@ pub fn positions(scene: &Scene, truth: &ExactState, terms: ErrorModelTerms<'_>) 
         let stored = terms.storage.and_then(|error_model| error_model.tiles(shape));
         let entries = stored.map_or(Entries::Exact(&scene.shapes[shape].modes), Entries::Stored);
         let sums = sum_modes(vertices.clone(), entries, &q);
-        let (rest, transform) = (&scene.shapes[shape].mesh.rest()[vertices], truth.transform_of(scene, domain));
+        let (rest, transform) =
+            (&scene.shapes[shape].mesh.rest_positions()[vertices], truth.transform_of(scene, domain));
         for ((rest, sum), out) in rest.iter().zip(&sums).zip(out) {
             let deformed = std::array::from_fn(|axis| f64::from(rest[axis]) + sum.u[axis]);
             *out = transform_point(&transform, deformed);
@@ -77,7 +78,7 @@ pub fn reference_vertices(scene: &Scene, state: &SceneState) -> Vec<ReferenceVer
         let sums = sum_modes(vertices.clone(), Entries::Exact(&shape.modes), q);
         let (transform, size) = (truth.transform_of(scene, domain), truth.absolute_transform_of(scene, domain));
         let (roundings, is_follower) = (q.len() + EXTRA_ROUNDINGS, scene.transform_roots.frame_of(domain).is_some());
-        let rest = shape.mesh.rest()[vertices].iter().map(|rest| rest.map(f64::from));
+        let rest = shape.mesh.rest_positions()[vertices].iter().map(|rest| rest.map(f64::from));
         for ((rest, sum), out) in rest.zip(&sums).zip(out) {
             let position = transform_point(&transform, std::array::from_fn(|axis| rest[axis] + sum.u[axis]));
             let bound = bound((&size, is_follower), &rest, sum, roundings);
@@ -119,7 +120,7 @@ enum Entries<'a> {
 impl Entries<'_> {
     fn at(&self, vertex: usize, axis: usize, mode: usize) -> f64 {
         match self {
-            Self::Exact(modes) => f64::from(modes.at(vertex, axis, mode)),
+            Self::Exact(modes) => f64::from(modes.entry(vertex, axis, mode)),
             Self::Stored(tiles) => tiles.decode_entry(vertex, axis, mode),
         }
     }

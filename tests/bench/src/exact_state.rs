@@ -33,7 +33,7 @@ impl ExactState {
     /// `world_from_domain` of a domain. For a follower, this is the product of its transform root's transform and its
     /// frame.
     pub fn transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
-        let mover = &self.transforms[scene.transform_roots.of(domain)];
+        let mover = &self.transforms[scene.transform_roots.root_of(domain)];
         match scene.transform_roots.frame_of(domain) {
             None => *mover,
             Some(frame) => product(mover, &frame.0.map(f64::from)),
@@ -42,7 +42,7 @@ impl ExactState {
 
     /// The product of the absolute values. No entry of the exact product exceeds it in magnitude.
     pub(super) fn absolute_transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
-        let mover = self.transforms[scene.transform_roots.of(domain)].map(f64::abs);
+        let mover = self.transforms[scene.transform_roots.root_of(domain)].map(f64::abs);
         match scene.transform_roots.frame_of(domain) {
             None => mover,
             Some(frame) => product(&mover, &frame.0.map(|entry| f64::from(entry.abs()))),

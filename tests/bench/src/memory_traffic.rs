@@ -25,7 +25,7 @@ pub fn of_scene(scene: &Scene) -> Vec<Operand> {
             continue;
         }
         let (shape, per_chunk) = (&scene.shapes[domain.shape], modes_per_chunk(scene.deformation.storage));
-        let (rest, chunks) = (shape.mesh.rest().len(), shape.modes.rank().div_ceil(per_chunk));
+        let (rest, chunks) = (shape.mesh.rest_positions().len(), shape.modes.rank().div_ceil(per_chunk));
         entries += shape.modes.columns().len();
         stored += 48 * chunks * rest.div_ceil(QUAD);
         scales += 4 * chunks * per_chunk * rest.div_ceil(QUAD * TILE_QUADS);

@@ -105,7 +105,7 @@ impl WorkloadMotion {
             } else if slot.rank > 1 {
                 let modes = &self.scene.shape_of(domain).modes;
                 let row = rng.usize(0..3 * slot.vertices);
-                let entry = |mode: usize| f64::from(modes.at(row / 3, row % 3, mode));
+                let entry = |mode: usize| f64::from(modes.entry(row / 3, row % 3, mode));
                 let largest = (0..slot.rank).max_by(|a, b| entry(*a).abs().total_cmp(&entry(*b).abs())).unwrap_or(0);
                 let others: f64 =
                     (0..slot.rank).filter(|mode| *mode != largest).map(|mode| entry(mode) * own[mode]).sum();
@@ -136,7 +136,7 @@ fn spread_of(scene: &Scene, domain: usize) -> Vec<(f64, f64)> {
 /// Diagonal of a domain at rest, in scene units.
 fn diagonal(scene: &Scene, domain: usize) -> f64 {
     let mut bounds = modalcast_model::scene::BoundingBox::EMPTY;
-    scene.shape_of(domain).mesh.rest().iter().for_each(|position| bounds.include(position.map(f64::from)));
+    scene.shape_of(domain).mesh.rest_positions().iter().for_each(|position| bounds.include(position.map(f64::from)));
     bounds.diagonal()
 }
 
@@ -190,7 +190,7 @@ mod tests {
         let condition = |seed: usize| {
             let q = motion.seed(seed).q;
             let row = |row: usize| {
-                let terms = (0..10).map(|mode| f64::from(modes.at(row / 3, row % 3, mode)) * q[mode]);
+                let terms = (0..10).map(|mode| f64::from(modes.entry(row / 3, row % 3, mode)) * q[mode]);
                 terms.clone().map(f64::abs).sum::<f64>() / terms.sum::<f64>().abs()
             };
             (0..3 * modes.vertices()).map(row).fold(0.0, f64::max)

@@ -73,8 +73,12 @@ fn zero_area_triangles_do_not_change_normals() {
     triangles.retain(|triangle| !triangle.contains(&24));
     let scene_of_triangles = |triangles: Vec<[u32; 3]>| {
         let corners = corners.clone();
-        let mesh =
-            modalcast_model::domain::Mesh::from_indexed(mesh.rest().to_vec(), corners.normals, corners.uvs, triangles);
+        let mesh = modalcast_model::domain::Mesh::from_indexed(
+            mesh.rest_positions().to_vec(),
+            corners.normals,
+            corners.uvs,
+            triangles,
+        );
         scene(vec![shape_with_mode(mesh.expect("expected a valid mesh"), |[x, y, _]| [0.0, 0.0, x + 0.5 * y])])
     };
     let (degenerate, clean) = (scene_of_triangles(triangles), scene_of_triangles(clean));

@@ -14,7 +14,7 @@ pub(crate) const UP: [f32; 3] = [0.0, 0.0, 1.0];
 
 /// A shape with one mode; the function gives the displacement at each rest position.
 pub(crate) fn shape_with_mode(mesh: Mesh, displacement: impl Fn([f32; 3]) -> [f32; 3]) -> Shape {
-    let column: Vec<f32> = mesh.rest().iter().flat_map(|rest| displacement(*rest)).collect();
+    let column: Vec<f32> = mesh.rest_positions().iter().flat_map(|rest| displacement(*rest)).collect();
     let modes = Modes::from_columns(column.len(), 1, column).expect("expected valid modes");
     Shape::new(mesh, modes).expect("expected a valid shape")
 }

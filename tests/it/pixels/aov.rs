@@ -16,7 +16,7 @@ fn read_aov(builder: SceneBuilder, camera: Camera, size: u32, aov: Aov) -> AovIm
     for (domain, slot) in scene.domains.iter().zip(&scene.layout.domains) {
         let mesh = &scene.shapes[domain.shape].mesh;
         assert_eq!(slot.first_vertex, surface.positions.len() / 3);
-        surface.positions.extend(mesh.rest().as_flattened());
+        surface.positions.extend(mesh.rest_positions().as_flattened());
         surface.normals.extend(mesh.corners().normals.as_flattened());
     }
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
@@ -138,7 +138,7 @@ fn aovs_allocate_on_demand_and_do_not_change_frames() {
     let mut buffers = renderer.load(&scene).expect("expected the scene to load");
     let mesh = &scene.shapes[0].mesh;
     let surface = modalcast_model::deform::DeformedSurface {
-        positions: mesh.rest().as_flattened().to_vec(),
+        positions: mesh.rest_positions().as_flattened().to_vec(),
         normals: mesh.corners().normals.as_flattened().to_vec(),
         tangents: vec![],
         ..Default::default()

@@ -50,7 +50,7 @@ impl CullHarness {
         let mut surface = DeformedSurface::default();
         for domain in &self.scene.domains {
             let mesh = &self.scene.shapes[domain.shape].mesh;
-            surface.positions.extend(mesh.rest().iter().flat_map(|point| position(*point)));
+            surface.positions.extend(mesh.rest_positions().iter().flat_map(|point| position(*point)));
             surface.normals.extend(mesh.corners().normals.as_flattened());
         }
         self.renderer.upload(&self.buffers, &surface).expect("expected the upload to succeed");
@@ -379,7 +379,7 @@ fn picks_aovs_and_rebased_frames_do_not_depend_on_culling() {
         let hits = harness.renderer.finish_pick(pick).expect("expected hits");
         let depth = harness.renderer.render_aov(&harness.buffers, &params, Aov::Depth).expect("expected AOVs").bytes;
         // Rebased positions: shifted, with another origin.
-        let rest = harness.scene.shapes.iter().flat_map(|shape| shape.mesh.rest());
+        let rest = harness.scene.shapes.iter().flat_map(|shape| shape.mesh.rest_positions());
         let shifted: Vec<f32> = rest.flat_map(|[x, y, z]| [x + 0.75, *y, *z]).collect();
         harness
             .renderer

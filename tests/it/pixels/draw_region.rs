@@ -36,7 +36,7 @@ fn load_at_rest(renderer: &mut Renderer, scene: &Arc<Scene>) -> SceneBuffers {
     let mut surface = modalcast_model::deform::DeformedSurface::default();
     for domain in &scene.domains {
         let mesh = &scene.shapes[domain.shape].mesh;
-        surface.positions.extend(mesh.rest().as_flattened());
+        surface.positions.extend(mesh.rest_positions().as_flattened());
         surface.normals.extend(mesh.corners().normals.as_flattened());
     }
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");

@@ -62,7 +62,7 @@ impl Frame {
                 .collect()
         };
         let (mut positions, normals) =
-            (collect_from_meshes(|mesh| mesh.rest()), collect_from_meshes(|mesh| &mesh.corners().normals));
+            (collect_from_meshes(|mesh| mesh.rest_positions()), collect_from_meshes(|mesh| &mesh.corners().normals));
         positions.chunks_exact_mut(3).for_each(|vertex| vertex[1] -= lowering);
         renderer
             .upload(&buffers, &DeformedSurface { positions, normals, ..DeformedSurface::default() })

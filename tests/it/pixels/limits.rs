@@ -166,7 +166,7 @@ fn overflowed_vertices_leave_no_black_pixels() {
     let mut renderer = open_renderer();
     let buffers = renderer.load(&scene).expect("expected the scene to load");
     for value in [f32::NAN, f32::INFINITY, f32::MAX, -f32::MAX] {
-        let mut positions: Vec<f32> = scene.shapes[0].mesh.rest().as_flattened().to_vec();
+        let mut positions: Vec<f32> = scene.shapes[0].mesh.rest_positions().as_flattened().to_vec();
         positions[6..9].fill(value);
         let surface = DeformedSurface { positions, normals: [0.0, 0.0, 1.0].repeat(4), ..DeformedSurface::default() };
         renderer.upload(&buffers, &surface).expect("expected the upload to succeed");

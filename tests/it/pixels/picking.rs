@@ -240,7 +240,7 @@ fn picks_of_rebased_scenes_and_bad_normals_are_finite() {
     assert!(max_difference(hit.position, [1e7 + x, y, -1e7]) < 2e-6, "{hit:?}");
     harness.buffers.set_origin([0.0; 3]);
     for normals in [[0.0_f32; 3], [f32::NAN; 3]] {
-        let positions = scene.shapes[0].mesh.rest().as_flattened().to_vec();
+        let positions = scene.shapes[0].mesh.rest_positions().as_flattened().to_vec();
         let surface =
             DeformedSurface { positions, normals: normals.repeat(4), tangents: vec![], ..DeformedSurface::default() };
         harness.renderer.upload(&harness.buffers, &surface).expect("expected the upload to succeed");

@@ -72,7 +72,7 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
         let ids = |clip: &Matrix4<f64>| {
             let mut raster =
                 VisibilityBuffer::new(Viewport::new(clip, width, height).expect("expected a valid viewport"));
-            let group = DrawRange { first: 0, triangles: triangles.len() as u32, faces: CullMode::None };
+            let group = DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None };
             raster.draw(&surface.positions, &triangles, group);
             raster.ids()
         };

@@ -86,7 +86,7 @@ impl Rasterizer for ReferenceRasterizer {
 
     fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
         if let Some((viewport, target)) = depth {
-            let all = DrawRange { first: 0, triangles: self.mesh.triangles.len() as u32, faces: CullMode::None };
+            let all = DrawRange { first: 0, triangles: self.mesh.triangles.len() as u32, cull_mode: CullMode::None };
             self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &[all]).depths()))?;
         }
         let Some((viewport, target)) = ids else { return Ok(()) };

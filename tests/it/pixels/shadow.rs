@@ -45,7 +45,7 @@ pub(super) fn with_square(mut builder: SceneBuilder, alpha_mode: AlphaMode, alph
     let image = builder.add_texture(64, 64, |x, y| [255, 255, 255, if hole(x, y) { 0 } else { 255 }]);
     let material =
         Material { alpha_mode, alpha, color_texture: Some(image), double_sided: true, ..Material::default() };
-    let mut square = floor_mesh(1.0, 4.0).rest().to_vec();
+    let mut square = floor_mesh(1.0, 4.0).rest_positions().to_vec();
     square.iter_mut().for_each(|vertex| vertex[0] += 3.0);
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
     let mesh =
@@ -243,7 +243,8 @@ fn every_up_axis_gives_the_same_picture() {
         let mesh = floor_mesh(1.0, 1.0);
         let rotate =
             |vector: &[f32; 3]| (rotation * nalgebra::Vector3::from(*vector).cast::<f64>()).cast::<f32>().into();
-        let rest: Vec<[f32; 3]> = mesh.rest().iter().chain(floor_mesh(0.4, 0.0).rest()).map(rotate).collect();
+        let rest: Vec<[f32; 3]> =
+            mesh.rest_positions().iter().chain(floor_mesh(0.4, 0.0).rest_positions()).map(rotate).collect();
         let normals = vec![rotate(&[0.0, 1.0, 0.0]); 8];
         let triangles = vec![[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]];
         let mesh = modalcast_model::domain::Mesh::from_indexed(rest, normals, vec![], triangles)

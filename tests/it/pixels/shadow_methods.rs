@@ -21,7 +21,7 @@ fn variance_settings() -> ShadowSettings {
 
 /// Side of a shadow map texel across the edge, in units. `empty_border` texels at each border contain no caster.
 fn texel_size(shadow: &ShadowSettings) -> f64 {
-    let empty_border = f64::from(shadow.reach()) + 1.0;
+    let empty_border = f64::from(shadow.blur_radius()) + 1.0;
     2.0 * LIGHT_BOX_HALF_EXTENT / (f64::from(shadow.size) - 2.0 * empty_border)
 }
 
@@ -62,7 +62,7 @@ fn visibility_profile(frame: &RenderedFrame, column: u32) -> Vec<f64> {
 /// Expected fraction of sunlight at z: texels whose center the square covers are dark. The result is blurred with the
 /// Gaussian and interpolated linearly between texels.
 fn expected_visibility(shadow: &ShadowSettings, z: f64) -> f64 {
-    let (texel_size, radius) = (texel_size(shadow), shadow.reach() as i64);
+    let (texel_size, radius) = (texel_size(shadow), shadow.blur_radius() as i64);
     let gaussian =
         |step: i64| if step == 0 { 1.0 } else { (-0.5 * (step as f64 / f64::from(shadow.blur)).powi(2)).exp() };
     let sum: f64 = (-radius..=radius).map(gaussian).sum();
@@ -214,7 +214,7 @@ fn count_lit_in_umbra(moments: MomentFormat) -> usize {
     builder.parts.look.shadow = Some(ShadowSettings { size: 2048, blur: 0.5, moments, ..ShadowSettings::default() });
     builder.parts.look.sun = [3.0, 1.0, 0.0];
     // Far from the center of the depth range, where f16 is coarse. The shadow extends 0.09 beyond the square.
-    let mut rest = floor_mesh(1.0, 0.03).rest().to_vec();
+    let mut rest = floor_mesh(1.0, 0.03).rest_positions().to_vec();
     rest.iter_mut().for_each(|vertex| vertex[0] -= 2.5);
     let mesh = Mesh::from_indexed(rest, vec![[0.0, 1.0, 0.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
         .expect("expected a valid mesh");

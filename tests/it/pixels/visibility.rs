@@ -85,7 +85,7 @@ fn cut_out_edge_is_resolved_per_sample() {
 fn render_stripes(size: u32, max_uv: f32) -> RenderedFrame {
     let mut builder = create_builder();
     let image = builder.add_texture(size, size, |x, _| if x % 4 < 2 { [255; 4] } else { [0, 0, 0, 255] });
-    let rest = facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0).rest().to_vec();
+    let rest = facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0).rest_positions().to_vec();
     let uvs = vec![[0.0, max_uv], [max_uv, max_uv], [max_uv, 0.0], [0.0, 0.0]];
     let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]])
         .expect("expected a valid mesh");
@@ -260,7 +260,7 @@ fn five_hundred_and_twelve_images_are_drawn_in_one_call() {
 fn render_with_normals(scene: &Arc<Scene>, normals: [f32; 3], tangents: [f32; 4], is_flattened: bool) -> Vec<u8> {
     let mut renderer = open_renderer();
     let buffers = renderer.load(scene).expect("expected the scene to load");
-    let mut positions = scene.shapes[0].mesh.rest().as_flattened().to_vec();
+    let mut positions = scene.shapes[0].mesh.rest_positions().as_flattened().to_vec();
     if is_flattened {
         // Shrunk along x below the resolution of f32, so that the square has no area on the screen.
         positions.chunks_exact_mut(3).for_each(|vertex| vertex[0] *= 1e-30);

@@ -186,7 +186,7 @@ impl RasterPipeline {
             let (whole, cut) = self.split(*group);
             for (function, own) in [(Some(&functions.raster), whole), (functions.raster_cut_outs.as_ref(), cut)] {
                 if let Some(function) = function.filter(|_| own.triangles > 0) {
-                    let faces = u32::from(own.faces == CullMode::Back);
+                    let faces = u32::from(own.cull_mode == CullMode::Back);
                     let args = RasterArgs { first: own.first, count: own.triangles, faces, ..args };
                     start(function, own.triangles.div_ceil(BLOCK), args)?;
                 }
@@ -234,7 +234,7 @@ impl RasterPipeline {
             large: self.large.address(),
             counters: self.counters.address(),
             clip: *pass.window.clip(),
-            half: pass.window.half(),
+            half: pass.window.half_size(),
             guard: pass.window.guard(),
             size: pass.window.size(),
             uvs: addresses.uvs,

@@ -120,7 +120,8 @@ impl ChangeListWriter {
         for (index, domain) in entries.enumerate() {
             let (at, first) = (*domain as usize, source);
             // The kernel does not read the transform of a follower.
-            let transform: [u32; TRANSFORM_WORDS] = bytemuck::cast(state.transforms[scene.transform_roots.of(at)].0);
+            let transform: [u32; TRANSFORM_WORDS] =
+                bytemuck::cast(state.transforms[scene.transform_roots.root_of(at)].0);
             transforms[TRANSFORM_WORDS * index..][..TRANSFORM_WORDS].copy_from_slice(&transform);
             let own = state.q_of(scene, at);
             if source + own.len().next_multiple_of(4) > q.len() {

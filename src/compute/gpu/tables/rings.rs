@@ -34,7 +34,7 @@ impl RingTables {
         for smoothing in smoothings(scene) {
             // Every index fits: a scene has at most `MAX_RING_TRIANGLES` triangles in rings.
             let (group, ring) = (all.ring_offsets.len() as u32, all.rings.len() as u32);
-            all.members.extend(smoothing.members().iter().map(|member| member + group));
+            all.members.extend(smoothing.corner_groups().iter().map(|member| member + group));
             all.ring_offsets.extend(smoothing.ring_offsets()[..smoothing.groups()].iter().map(|begin| begin + ring));
             all.rings.extend_from_slice(smoothing.rings());
         }
@@ -51,7 +51,7 @@ pub(crate) fn slots(scene: &Scene) -> Vec<NormalSlot> {
     let first_member = |shape: &Shape| {
         shape.smoothing().map_or(NO_GROUPS, |smoothing| {
             let first = members;
-            members += smoothing.members().len() as u32;
+            members += smoothing.corner_groups().len() as u32;
             first
         })
     };
@@ -83,7 +83,7 @@ mod tests {
         for (domain, slot) in slots.iter().enumerate() {
             assert_eq!(slot.first_vertex as usize, scene.layout.domains[domain].first_vertex);
             let Some(smoothing) = scene.shape_of(domain).smoothing() else { continue };
-            for (corner, member) in smoothing.members().iter().enumerate() {
+            for (corner, member) in smoothing.corner_groups().iter().enumerate() {
                 let group = rings.members[slot.first_member as usize + corner] as usize;
                 let ring = &rings.rings[rings.ring_offsets[group] as usize..rings.ring_offsets[group + 1] as usize];
                 assert_eq!(ring, smoothing.ring(*member as usize));

@@ -93,7 +93,7 @@ pub(crate) fn unlit(shapes: &[(usize, usize)]) -> Arc<Scene> {
 pub(crate) fn corners_match(shapes: &[(usize, usize)]) -> Arc<Scene> {
     let mut parts = parts(shapes, false, false);
     for shape in &mut parts.shapes {
-        let (rest, corners) = (shape.mesh.rest().to_vec(), shape.mesh.corners().clone());
+        let (rest, corners) = (shape.mesh.rest_positions().to_vec(), shape.mesh.corners().clone());
         let (normals, uvs) = (corners.normals[..rest.len()].to_vec(), corners.uvs[..rest.len()].to_vec());
         let mesh = Mesh::from_indexed(rest, normals, uvs, vec![[0, 1, 2]]).expect("a mesh");
         *shape = Shape::new(mesh, shape.modes.clone()).expect("a shape");

@@ -26,7 +26,7 @@ pub fn footprint(
     uvs: &[[f32; 2]; 3],
     [column, row]: [i32; 2],
 ) -> Footprint {
-    let step = window.half().map(|half| 1.0 / half);
+    let step = window.half_size().map(|half| 1.0 / half);
     let sample = [(column as f32 + 0.5) * step[0] - 1.0, 1.0 - (row as f32 + 0.5) * step[1]];
     let x = corners.map(|[x, _, _, w]| x - sample[0] * w);
     let y = corners.map(|[_, y, _, w]| y - sample[1] * w);

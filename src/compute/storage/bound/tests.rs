@@ -20,7 +20,7 @@ fn chained(shape: &Shape, tiles: &TiledModes, step: &ErrorBoundInput, turn: usiz
                     sum = (stored as f32).mul_add(q * factor, sum);
                 }
             }
-            sum + shape.mesh.rest()[vertex][axis]
+            sum + shape.mesh.rest_positions()[vertex][axis]
         });
         std::array::from_fn(|row| {
             let [x, y, z, offset] = [0, 1, 2, 3].map(|column| t[4 * row + column]);
@@ -31,15 +31,15 @@ fn chained(shape: &Shape, tiles: &TiledModes, step: &ErrorBoundInput, turn: usiz
 }
 
 fn exact(shape: &Shape, step: &ErrorBoundInput) -> Vec<[f64; 3]> {
-    let t = step.transform.exact();
+    let t = step.transform.to_f64();
     let position = |vertex: usize| {
         let bent = [0, 1, 2].map(|axis| {
-            let part = |(mode, q): (usize, &f32)| f64::from(*q) * f64::from(shape.modes.at(vertex, axis, mode));
-            f64::from(shape.mesh.rest()[vertex][axis]) + step.q.iter().enumerate().map(part).sum::<f64>()
+            let part = |(mode, q): (usize, &f32)| f64::from(*q) * f64::from(shape.modes.entry(vertex, axis, mode));
+            f64::from(shape.mesh.rest_positions()[vertex][axis]) + step.q.iter().enumerate().map(part).sum::<f64>()
         });
         [0, 4, 8].map(|row| t[row] * bent[0] + t[row + 1] * bent[1] + t[row + 2] * bent[2] + t[row + 3])
     };
-    (0..shape.mesh.rest().len()).map(position).collect()
+    (0..shape.mesh.rest_positions().len()).map(position).collect()
 }
 
 /// The largest error relative to the bound of its tile; infinite for a NaN.
@@ -116,7 +116,7 @@ fn rounding_the_product_of_a_frame_is_within_its_part_of_the_bound_and_the_norm_
         let scale = f32::exp2(40.0 * noise.next());
         let root = Transform(transform(&mut noise).root.0.map(|entry| entry * scale));
         let follows = ComposedTransform { root, frame: Some(transform(&mut noise).root) };
-        let (got, want, [turned, moved]) = (follows.to_f32(), follows.exact(), rounding(&follows));
+        let (got, want, [turned, moved]) = (follows.to_f32(), follows.to_f64(), rounding(&follows));
         let error = |linear: bool| {
             let entries = (0..12).filter(|at| (at % 4 != 3) == linear);
             entries.map(|at| (f64::from(got.0[at]) - want[at]).powi(2)).sum::<f64>().sqrt()

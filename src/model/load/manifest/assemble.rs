@@ -339,7 +339,7 @@ fn nearest_vertices(shape: &Shape, frame: Transform) -> Vec<u32> {
         return Vec::new();
     }
     let origin = frame.translation();
-    let rest = shape.mesh.rest();
+    let rest = shape.mesh.rest_positions();
     let distance = |vertex: u32| (nalgebra::Vector3::from(rest[vertex as usize]).cast::<f64>() - origin).norm_squared();
     let mut vertices: Vec<u32> = (0..rest.len() as u32).collect();
     vertices.sort_by(|a, b| distance(*a).total_cmp(&distance(*b)));

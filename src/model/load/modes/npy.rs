@@ -116,7 +116,7 @@ mod tests {
             .iter()
             .map(|bytes| super::super::parse_npy(bytes).expect("good"))
             .collect();
-        assert_eq!(modes[0].at(0, 2, 1), 5.0);
+        assert_eq!(modes[0].entry(0, 2, 1), 5.0);
         assert!(parse(&written(&fortran_order)).expect("good").fortran_order, "the writer kept the order");
         assert_eq!(modes[0], modes[1]);
         assert_eq!(modes[0], modes[2]);

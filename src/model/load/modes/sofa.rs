@@ -63,7 +63,7 @@ mod tests {
     fn rows_stand_one_per_line_or_wrapped() {
         for text in ["3 2\n1 2\n3 4\n5 6\n", "3. 2.\n1 2 3 4\n5 6\n", "\n3 2\n\n  1e0 2 3 4 5 6"] {
             let modes = parse(text.as_bytes()).expect(text);
-            assert_eq!((modes.at(0, 2, 0), modes.at(0, 2, 1)), (5.0, 6.0));
+            assert_eq!((modes.entry(0, 2, 0), modes.entry(0, 2, 1)), (5.0, 6.0));
         }
     }
 

@@ -146,7 +146,7 @@ mod tests {
     fn rows_follow_the_v_lines_with_unreferenced_and_coincident_vertices_kept() {
         let obj = parsed();
         let mesh = build_all_faces(&obj).expect("good").mesh;
-        assert_eq!(mesh.rest(), obj.positions);
+        assert_eq!(mesh.rest_positions(), obj.positions);
         assert_eq!(mesh.corners().vertices, [1, 2, 3, 4, 1, 2, 3, 5, 6, 7, 8], "v/1 and v/2 are corners of one vertex");
         assert_eq!(mesh.corners().uvs[4], [1.0, 0.0]);
         assert_eq!(mesh.corners().uvs[7], [0.0, 0.0], "a corner without vt among others with");
@@ -171,7 +171,7 @@ mod tests {
     fn a_part_has_its_own_vertices_relative_to_its_base() {
         let piece = build_faces(&parsed(), &[1], [1.0, 0.0, 0.5]).expect("good");
         let rest = [[0.0, 0.0, -0.5], [1.0, 0.0, -0.5], [1.0, 1.0, -0.5], [0.0, 1.0, -0.5]];
-        assert_eq!(piece.mesh.rest(), rest);
+        assert_eq!(piece.mesh.rest_positions(), rest);
         assert!(piece.mesh.corners().uvs.is_empty());
     }
 

@@ -150,7 +150,7 @@ mod tests {
         assert_eq!(parts.materials.iter().map(|material| material.name.as_str()).collect::<Vec<_>>(), ["red", "blue"]);
         assert_eq!(parts.domains.len(), 1);
         assert_eq!(parts.domains[0].material_ranges.len(), 2);
-        assert_eq!(parts.shapes[0].modes.at(2, 2, 0), 2.0);
+        assert_eq!(parts.shapes[0].modes.entry(2, 2, 0), 2.0);
         let rigid = read(&AssetDir::unrestricted(folder.path()), "a.obj", ModesSource::None).expect("good");
         assert_eq!(rigid.shapes[0].modes.rank(), 0);
     }

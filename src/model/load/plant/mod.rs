@@ -177,7 +177,7 @@ mod tests {
         );
         let world: Vec<_> = parts.shapes[leaf.shape]
             .mesh
-            .rest()
+            .rest_positions()
             .iter()
             .map(|point| leaf.placement.translation() + nalgebra::Vector3::from(*point).cast::<f64>())
             .collect();

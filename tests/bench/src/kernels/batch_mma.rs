@@ -366,7 +366,7 @@ mod tests {
         tiles: &TiledModes,
         (domain, vertex): (usize, usize),
     ) -> [f64; 3] {
-        let (rest, q) = (scene.shape_of(domain).mesh.rest()[vertex], state.q_of(scene, domain));
+        let (rest, q) = (scene.shape_of(domain).mesh.rest_positions()[vertex], state.q_of(scene, domain));
         let deformed = [0, 1, 2].map(|axis| {
             let terms = q.iter().enumerate().map(|(mode, q)| tiles.decode_entry(vertex, axis, mode) * f64::from(*q));
             f64::from(rest[axis]) + terms.sum::<f64>()

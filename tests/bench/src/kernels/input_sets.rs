@@ -111,14 +111,14 @@ impl InputSets {
         let mut positions = Vec::with_capacity(3 * self.scene.layout.vertices);
         let mut domain_positions: Vec<[f32; 3]> = Vec::new();
         for domain in 0..self.scene.domains.len() {
-            let t = state.composed_transform(&self.scene, domain).exact();
+            let t = state.composed_transform(&self.scene, domain).to_f64();
             let transform_vertex = |(vertex, rest): (usize, &[f32; 3])| {
                 let u = u(domain, vertex);
                 let [x, y, z] = [0, 1, 2].map(|axis| f64::from(rest[axis]) + f64::from(u[axis]));
                 let row = |row: usize| t[4 * row] * x + t[4 * row + 1] * y + t[4 * row + 2] * z + t[4 * row + 3];
                 [0, 1, 2].map(|axis| row(axis) as f32)
             };
-            let rest = self.scene.shape_of(domain).mesh.rest().par_iter().enumerate();
+            let rest = self.scene.shape_of(domain).mesh.rest_positions().par_iter().enumerate();
             rest.with_min_len(MIN_TASK_VERTICES).map(transform_vertex).collect_into_vec(&mut domain_positions);
             positions.extend_from_slice(domain_positions.as_flattened());
         }

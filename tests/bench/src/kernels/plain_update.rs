@@ -144,7 +144,7 @@ fn domain_of_vertices(scene: &Scene) -> Vec<u32> {
 /// Rest positions of all domains in packed order.
 fn packed_rest(scene: &Scene) -> Vec<f32> {
     let shapes = (0..scene.domains.len()).map(|domain| scene.shape_of(domain));
-    shapes.flat_map(|shape| shape.mesh.rest().as_flattened()).copied().collect()
+    shapes.flat_map(|shape| shape.mesh.rest_positions().as_flattened()).copied().collect()
 }
 
 #[cfg(test)]

@@ -17,7 +17,7 @@ pub struct RasterMesh<'a> {
     pub positions: &'a [f32],
     /// Vertex indices; a triangle's id is its index here.
     pub triangles: &'a [[u32; 3]],
-    /// Ranges of triangles to draw, each with its visible faces.
+    /// Ranges of triangles to draw, each with its cull mode.
     pub groups: &'a [DrawRange],
     pub cut_outs: Option<&'a CutOuts>,
 }

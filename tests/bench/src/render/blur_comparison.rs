@@ -39,7 +39,7 @@ impl BlurComparison {
             let compute_us = rows.iter().filter(is_same_map).filter_map(blur_us).min_by(f64::total_cmp)?;
             let fragments_us = blur_us(row)?;
             let ratio = fragments_us / compute_us;
-            let taps = 2 * shadow.reach() + 1;
+            let taps = 2 * shadow.blur_radius() + 1;
             Some(Self { load: row.load.clone(), size: shadow.size, taps, compute_us, fragments_us, ratio })
         };
         fragments.filter_map(compare).collect()

@@ -156,7 +156,7 @@ impl FrameSetup {
             load: self.name.clone(),
             triangles: self.scene.layout.triangles,
             map: shadow.size,
-            taps: 2 * shadow.reach() + 1,
+            taps: 2 * shadow.blur_radius() + 1,
             raster_backends,
             differing,
             pixels: opengl_ids.len(),

@@ -105,7 +105,7 @@ fn wrap_uvs(mesh: &Mesh, scale: [f32; 2]) -> Result<Mesh> {
     }
     let count = corners.vertices.len() as u32 / 3;
     Mesh::new(
-        mesh.rest().to_vec(),
+        mesh.rest_positions().to_vec(),
         corners,
         (0..count).map(|triangle| [3 * triangle, 3 * triangle + 1, 3 * triangle + 2]).collect(),
     )

@@ -202,7 +202,7 @@ impl RasterSetup {
         let frame_params = loaded_scene.frame_params(self.camera, self.size);
         let triangles = self.scene.triangle_vertices();
         let positions = loaded_scene.surface()?.positions.clone();
-        let group = [DrawRange { first: 0, triangles: triangles.len() as u32, faces: CullMode::None }];
+        let group = [DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None }];
         let mesh = RasterMesh { positions: &positions, triangles: &triangles, groups: &group, cut_outs: None };
         let (frame, map) = (self.frame_viewport(&frame_params)?, self.map_viewport(&frame_params)?);
         let [frame_raster, map_raster] = [(frame, false), (map, true)].map(|(viewport, depth_only)| {

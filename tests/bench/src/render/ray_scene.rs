@@ -378,7 +378,8 @@ fn triangles(scene: &Scene, surface: &DeformedSurface) -> Vec<Triangle> {
 /// Whether the rest normals point to the clockwise side of a triangle.
 fn is_winding_reversed(mesh: &Mesh, [a, b, c]: [u32; 3]) -> bool {
     let corners = mesh.corners();
-    let position = |corner: u32| Vector3::from(mesh.rest()[corners.vertices[corner as usize] as usize]).cast::<f64>();
+    let position =
+        |corner: u32| Vector3::from(mesh.rest_positions()[corners.vertices[corner as usize] as usize]).cast::<f64>();
     let normal_sum: Vector3<f64> =
         [a, b, c].iter().map(|corner| Vector3::from(corners.normals[*corner as usize]).cast::<f64>()).sum();
     (position(b) - position(a)).cross(&(position(c) - position(a))).dot(&normal_sum) < 0.0

@@ -22,7 +22,7 @@ fn of_bound(scene: &Scene, state: &SceneState, positions: &[f32]) -> f64 {
     let (shape, storage) = (scene.shape_of(0), scene.deformation.storage);
     let tiles = TiledModes::new(shape, storage);
     let (reaches, products) = (ShapeErrorModel::new(shape, &tiles), TensorCoreError::of(storage, tiles.rank()));
-    let vertices = shape.mesh.rest().len();
+    let vertices = shape.mesh.rest_positions().len();
     let want = modalcast_compute::reference::deform(scene, state);
     let share = |(packed, got): (usize, &[f32; 3])| {
         let (domain, tile) = (packed / vertices, packed % vertices / (QUAD * TILE_QUADS));

@@ -22,7 +22,7 @@ fn dropped(soup: &Soup) -> ([u32; 5], u32) {
     let (mut counts, mut drawn) = ([0; 5], 0);
     for group in &soup.groups {
         for triangle in &soup.triangles[group.first as usize..][..group.triangles as usize] {
-            match clipped_polygon(&soup.viewport, &soup.positions, *triangle, group.faces) {
+            match clipped_polygon(&soup.viewport, &soup.positions, *triangle, group.cull_mode) {
                 Ok(_) => drawn += 1,
                 Err(CullReason::NotFinite) => counts[0] += 1,
                 Err(CullReason::OutsideFrustum) => counts[1] += 1,

@@ -135,9 +135,9 @@ mod tests {
     /// x of a vertex by the same arithmetic, directly from the U of the shape.
     fn x_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usize) -> [f32; 3] {
         let (shape, q) = (scene.shape_of(domain), state.q_of(scene, domain));
-        let rest = shape.mesh.rest()[vertex];
+        let rest = shape.mesh.rest_positions()[vertex];
         let bent = [0, 1, 2].map(|axis| {
-            let entry = |(mode, q): (usize, &f32)| (shape.modes.at(vertex, axis, mode), *q);
+            let entry = |(mode, q): (usize, &f32)| (shape.modes.entry(vertex, axis, mode), *q);
             rest[axis] + q.iter().enumerate().map(entry).fold(0.0_f32, |sum, (entry, q)| entry.mul_add(q, sum))
         });
         [0, 1, 2].map(|row| transformed_axis(&state.transforms[domain].0[4 * row..], bent))

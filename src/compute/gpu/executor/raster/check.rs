@@ -113,7 +113,7 @@ mod tests {
 
     #[test]
     fn meshes_that_would_be_read_out_of_bounds_are_refused() {
-        let group = |first, triangles| DrawRange { first, triangles, faces: CullMode::None };
+        let group = |first, triangles| DrawRange { first, triangles, cull_mode: CullMode::None };
         let of = |triangles: &[[u32; 3]], groups: &[DrawRange]| check(3, triangles, groups).is_ok();
         let two = [[0, 1, 2], [2, 1, 0]];
         assert!(of(&two, &[group(0, 1), group(1, 1)]) && of(&[], &[]));

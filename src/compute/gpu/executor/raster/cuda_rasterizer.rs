@@ -93,7 +93,7 @@ impl CudaRasterizer {
         }
         let _current = device.enter()?;
         let sharing = GlInterop::open(device, &mesh.positions)?;
-        let all = DrawRange { first: 0, triangles: mesh.triangles.len() as u32, faces: CullMode::None };
+        let all = DrawRange { first: 0, triangles: mesh.triangles.len() as u32, cull_mode: CullMode::None };
         Ok(Self {
             positions: sharing.register(device, mesh.positions)?,
             depth: PassState::new(true, vec![all]),

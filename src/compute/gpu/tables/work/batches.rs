@@ -86,7 +86,7 @@ impl BatchTables {
                     first_word: first_words[shape].unwrap_or(0),
                     rest: work.quads.vertices[shape],
                     first_scale: work.first_scale[shape],
-                    vertices: of.mesh.rest().len() as u32,
+                    vertices: of.mesh.rest_positions().len() as u32,
                     first_member: all.members.len() as u32,
                     chunks: chunks_of(scene, of) as u32,
                     members: list.len() as u32,

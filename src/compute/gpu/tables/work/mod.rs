@@ -70,7 +70,8 @@ pub(crate) struct WorkList {
 /// Whether corner i of a shape is its vertex i, so that one lane can compute both.
 fn corners_match_vertices(shape: &Shape) -> bool {
     let corners = &shape.mesh.corners().vertices;
-    corners.len() == shape.mesh.rest().len() && corners.iter().enumerate().all(|(at, vertex)| at as u32 == *vertex)
+    corners.len() == shape.mesh.rest_positions().len()
+        && corners.iter().enumerate().all(|(at, vertex)| at as u32 == *vertex)
 }
 
 /// Whether `deform` rotates the rest normals. Otherwise `normals` computes them from the deformed surface.
@@ -283,7 +284,7 @@ fn shapes_with_own_tiles(scene: &Scene) -> Vec<bool> {
     let mut users = vec![0_usize; scene.shapes.len()];
     scene.domains.iter().for_each(|domain| users[domain.shape] += 1);
     let own = |(shape, users): (&Shape, usize)| {
-        has_own_tiles(shape.mesh.rest().len()) || (shape.modes.rank() > 0 && users > 1)
+        has_own_tiles(shape.mesh.rest_positions().len()) || (shape.modes.rank() > 0 && users > 1)
     };
     scene.shapes.iter().zip(users).map(own).collect()
 }
@@ -331,7 +332,7 @@ fn corner_offsets(scene: &Scene) -> Vec<u32> {
 }
 
 fn quads_of(shape: &Shape) -> usize {
-    shape.mesh.rest().len().div_ceil(QUAD)
+    shape.mesh.rest_positions().len().div_ceil(QUAD)
 }
 
 fn chunks_of(scene: &Scene, shape: &Shape) -> usize {

@@ -32,7 +32,7 @@ impl Quads {
             };
             scene.shapes.iter().zip(corners_match).map(place).collect()
         };
-        let vertices = |shape: &Shape| shape.mesh.rest().len();
+        let vertices = |shape: &Shape| shape.mesh.rest_positions().len();
         let mut next = 0;
         let before = places(&|shape, corners_match| (!corners_match).then(|| vertices(shape)), &mut next);
         let first_with_normals = next;
@@ -54,7 +54,7 @@ pub(crate) fn rest_positions(scene: &Scene, work: &WorkList) -> Vec<[f32; 4]> {
     let mut all = vec![[0.0; 4]; 3 * work.quads.rest as usize];
     let own = shapes_with_own_tiles(scene);
     for (index, shape) in scene.shapes.iter().enumerate() {
-        let fours = arrange_for_tiles(&quads_of_items(shape.mesh.rest()), own[index]);
+        let fours = arrange_for_tiles(&quads_of_items(shape.mesh.rest_positions()), own[index]);
         all[3 * work.quads.vertices[index] as usize..][..fours.len()].copy_from_slice(&fours);
     }
     all

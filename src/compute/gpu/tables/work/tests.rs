@@ -104,7 +104,7 @@ fn check(scene: &Arc<Scene>) -> WorkList {
                     let own = usize::from(tile.kind & TILE_LAST) > 0;
                     let (step, lane) = if own { (usize::from(tile.width), quad) } else { (1, 0) };
                     let at = 3 * rest as usize + axis * step + lane;
-                    assert_eq!(loaded.rest[at][within], shape.mesh.rest()[vertex][axis]);
+                    assert_eq!(loaded.rest[at][within], shape.mesh.rest_positions()[vertex][axis]);
                     for mode in 0..shape.modes.rank() {
                         let size = 4 / per_chunk;
                         let byte = ((mode % per_chunk * 3 + axis) * 4 + within) * size;
@@ -120,7 +120,7 @@ fn check(scene: &Arc<Scene>) -> WorkList {
                                 (f32::from(bytes[0]) - 128.0) * loaded.scales[first_scale as usize + mode]
                             }
                         };
-                        let (got, want) = (got * factor.unwrap_or(1.0), shape.modes.at(vertex, axis, mode));
+                        let (got, want) = (got * factor.unwrap_or(1.0), shape.modes.entry(vertex, axis, mode));
                         assert!((got - want).abs() <= want.abs() / 100.0 + 1.0, "{got} is not {want}");
                     }
                 }

@@ -265,7 +265,7 @@ fn interleaved_vertices_and_normalised_coordinates_are_read_and_missing_normals_
     ]);
     model.primitive()["attributes"] = json!({"POSITION": 0, "TEXCOORD_0": 1});
     let parts = model.parts();
-    assert_eq!(parts.shapes[0].mesh.rest(), [[0.0, 0.0, 0.0], [4.0, 16.0, 0.0], [8.0, 64.0, 0.0]]);
+    assert_eq!(parts.shapes[0].mesh.rest_positions(), [[0.0, 0.0, 0.0], [4.0, 16.0, 0.0], [8.0, 64.0, 0.0]]);
     assert_eq!(parts.shapes[0].mesh.corners().uvs, [[0.0, 1.0], [1.0, 0.0], [0.2, 0.8]]);
 }
 

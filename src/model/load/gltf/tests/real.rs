@@ -19,7 +19,8 @@ fn real_morph_stress_test_has_a_rigid_plate_and_a_block_of_eight_modes() {
     assert_eq!(parts.name, "MorphStressTest");
     let names: Vec<&str> = parts.domains.iter().map(|domain| domain.name.as_str()).collect();
     assert_eq!(names, ["Main.0", "Main.1"]);
-    let sizes: Vec<_> = parts.shapes.iter().map(|shape| (shape.mesh.rest().len(), shape.modes.rank())).collect();
+    let sizes: Vec<_> =
+        parts.shapes.iter().map(|shape| (shape.mesh.rest_positions().len(), shape.modes.rank())).collect();
     assert_eq!(sizes, [(24, 0), (1504, 8)]);
     assert_eq!(parts.shapes[1].mesh.triangles().len(), 2400);
     assert_eq!(parts.domains[1].rest_q, [0.0; 8]);
@@ -47,7 +48,7 @@ fn real_ferns_are_four_masked_plants_with_a_normal_map() {
         .domains
         .iter()
         .map(|domain| &parts.shapes[domain.shape].mesh)
-        .map(|mesh| (mesh.rest().len(), mesh.triangles().len()))
+        .map(|mesh| (mesh.rest_positions().len(), mesh.triangles().len()))
         .collect();
     assert_eq!(sizes, [(1660, 2384), (1568, 2248), (544, 784), (565, 816)]);
     let names: Vec<&str> = parts.domains.iter().map(|domain| domain.name.as_str()).collect();

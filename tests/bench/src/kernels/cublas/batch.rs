@@ -159,7 +159,7 @@ impl GemmBatch {
         let modes = &scene.shape_of(domain).modes;
         let (rows, rank) = (3 * modes.vertices(), modes.rank());
         if by_rows {
-            return (0..rows).flat_map(|row| (0..rank).map(move |mode| modes.at(row / 3, row % 3, mode))).collect();
+            return (0..rows).flat_map(|row| (0..rank).map(move |mode| modes.entry(row / 3, row % 3, mode))).collect();
         }
         let lead = self.call.lead as usize;
         let mut matrix = vec![0.0; lead * self.call.inner as usize];

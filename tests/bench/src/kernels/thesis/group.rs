@@ -143,7 +143,7 @@ pub(super) fn pack_q(scene: &Scene, state: &SceneState) -> Vec<f32> {
 pub(super) fn row_vector(scene: &Scene, domain: usize, row: usize, k: usize) -> [f32; 4] {
     let modes = &scene.shape_of(domain).modes;
     [0, 1, 2, 3].map(|component| match 4 * k + component {
-        mode if mode < modes.rank() => modes.at(row / 3, row % 3, mode),
+        mode if mode < modes.rank() => modes.entry(row / 3, row % 3, mode),
         _ => 0.0,
     })
 }

@@ -79,7 +79,7 @@ impl UnfoldedTriangles {
                 let vertex = corners.vertices[corner];
                 unfolded.sources.push(displacements.first_vertices[domain].map_or(RIGID, |first| first + vertex));
                 unfolded.targets.push(slot.first_vertex as u32 + vertex);
-                unfolded.positions.push(float4(shape.mesh.rest()[vertex as usize], 1.0));
+                unfolded.positions.push(float4(shape.mesh.rest_positions()[vertex as usize], 1.0));
                 unfolded.normals.push(float4(corners.normals[corner], 0.0));
                 if scene.features.normal_maps {
                     let [x, y, z, _] = shape.tangents().get(corner).copied().unwrap_or_default();

@@ -39,7 +39,7 @@ pub(super) fn frame_scene(scene: &Scene, size: Size, elevation: f64) -> Camera {
 fn rest_positions(scene: &Scene) -> impl Iterator<Item = Vector3<f64>> + '_ {
     scene.domains.iter().flat_map(|domain| {
         let placement = domain.placement.to_matrix();
-        let rest = scene.shapes[domain.shape].mesh.rest();
+        let rest = scene.shapes[domain.shape].mesh.rest_positions();
         rest.iter().map(move |point| placement.transform_point(&nalgebra::Point3::from(point.map(f64::from))).coords)
     })
 }
