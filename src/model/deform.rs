@@ -15,7 +15,7 @@ use crate::scene::{BoundingBox, OrientedBounds, SceneState};
 /// Deformed vertices of a whole scene, packed as in [`Layout`](crate::scene::Layout).
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct DeformedSurface {
-    /// World positions, three numbers per vertex, relative to the cell of their domain ([`SceneState::origin_of`]). The cell
+    /// World positions, three numbers per vertex, relative to the floating origin of their domain ([`SceneState::origin_of`]). It
     /// is the scene's origin unless a step with f64 translations moved the domain far from it.
     pub positions: Vec<f32>,
     /// World-space unit normals, three numbers per corner.
@@ -25,7 +25,7 @@ pub struct DeformedSurface {
     /// Displacements u = U q in the domain's own frame, three numbers per vertex, in scene units. Empty unless the
     /// scene enables `deform.displacements`.
     pub displacements: Vec<f32>,
-    /// The axis-aligned bounding box of each domain's `positions`, relative to the same cell. Empty unless the scene
+    /// The axis-aligned bounding box of each domain's `positions`, relative to the same origin. Empty unless the scene
     /// enables `deform.boxes`.
     pub boxes: Vec<BoundingBox>,
 }

@@ -192,7 +192,7 @@ fn far_step(domain: u32, translation: [f64; 3]) -> RawStepUpdate {
     }
 }
 
-/// A follower uses the origin cell of its root, so a far follower is as precise as one near the origin.
+/// A follower uses the floating origin of its root, so a far follower is as precise as one near the origin.
 pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(64);
     let mut parts = scenes::parts_of_shapes(vec![strip_shape(&mut random, 50, 0)]);
@@ -206,13 +206,13 @@ pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     state.apply(&scene, &StepUpdate::parse(&scene, &far_step(0, translation)).expect("expected a valid step"));
     assert_eq!((scene.transform_roots.root_of(1), state.transforms.len()), (0, 2));
     let result = run_step(&mut create_deformer(&scene), &state);
-    let (slot, cell) = (scene.layout.domains[1], state.origin_of(scene.transform_roots.root_of(1)));
+    let (slot, origin) = (scene.layout.domains[1], state.origin_of(scene.transform_roots.root_of(1)));
     let [mut error, mut f32_error] = [0.0_f64; 2];
     for (vertex, rest) in scene.shape_of(1).mesh.rest_positions().iter().enumerate() {
         let inside = frame.to_matrix().transform_point(&nalgebra::Point3::from(*rest).cast());
         for axis in 0..3 {
             let want = translation[axis] + inside[axis];
-            let got = cell[axis] + f64::from(result.surface.positions[3 * (slot.first_vertex + vertex) + axis]);
+            let got = origin[axis] + f64::from(result.surface.positions[3 * (slot.first_vertex + vertex) + axis]);
             error = error.max((got - want).abs());
             f32_error = f32_error.max((f64::from(want as f32) - want).abs());
         }

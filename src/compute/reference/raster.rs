@@ -209,7 +209,7 @@ fn area(piece: &[SnappedVertex; 3]) -> i64 {
 }
 
 fn to_clip(window: &Viewport, position: &[f32]) -> [f32; 4] {
-    let m = window.clip();
+    let m = window.clip_from_positions();
     std::array::from_fn(|row| {
         let row = &m[4 * row..][..4];
         row[0] * position[0] + row[1] * position[1] + row[2] * position[2] + row[3]
@@ -223,7 +223,7 @@ fn is_outside(corners: &[[f32; 4]; 3]) -> bool {
 
 /// Signed distance to a plane, not negative on the inner side: the near plane, then the sides of the guard band.
 fn plane_distance(window: &Viewport, [x, y, z, w]: &[f32; 4], plane: usize) -> f32 {
-    let [guard_x, guard_y] = window.guard().map(|guard| guard * w);
+    let [guard_x, guard_y] = window.guard_band().map(|guard| guard * w);
     [z + w, guard_x - x, guard_x + x, guard_y - y, guard_y + y][plane]
 }
 

@@ -24,7 +24,7 @@ const BENCHMARK_SIZE: FrameSize = FrameSize::new(1920, 1080);
 #[derive(Debug, Clone, Copy)]
 pub(in crate::engine) struct BufferContents {
     bounds: BoundingBox,
-    /// `None` in a camera-relative frame, because the deformer computed them in the frames of the domains' cells.
+    /// `None` in a camera-relative frame, because the deformer computed them relative to the floating origins of the domains.
     light: Option<OrientedBounds>,
     /// Whether vertices were uploaded.
     pub(in crate::engine) uploaded: bool,
@@ -93,7 +93,7 @@ impl LoadedScene {
         &self.scene
     }
 
-    /// Bounds of the last deformation in scene units, each domain relative to its cell. Always finite.
+    /// Bounds of the last deformation in scene units, each domain relative to its floating origin. Always finite.
     pub const fn bounds(&self) -> BoundingBox {
         self.bounds
     }
@@ -139,8 +139,8 @@ impl LoadedScene {
         self.deformer.surface()
     }
 
-    /// Creates the buffers on first use and fills them with the last deformation. If the domains have different cells,
-    /// the positions are rebased to the cell nearest the camera.
+    /// Creates the buffers on first use and fills them with the last deformation. If the domains have different floating origins,
+    /// the positions are rebased to the floating origin nearest the camera.
     pub(in crate::engine) fn fill_buffers(
         &mut self,
         renderer: &mut Renderer,
@@ -152,7 +152,7 @@ impl LoadedScene {
             Some(origins) if !origins.is_uniform() => Arc::clone(origins),
             // All domains share one origin, so the deformer's output is drawn unchanged.
             origins => {
-                buffers.set_origin(origins.as_ref().map_or([0.0; 3], |origins| origins.shared()));
+                buffers.set_origin(origins.as_ref().map_or([0.0; 3], |origins| origins.shared_origin()));
                 buffers.set_step(self.generation);
                 return Ok(BufferContents { bounds: self.bounds, light: self.light, uploaded });
             }

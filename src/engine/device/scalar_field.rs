@@ -28,7 +28,7 @@ pub fn validate_mode(scene: &Scene, mode: u32) -> Result<u32> {
 /// |u| of every vertex in meters: the distance of its deformed position from T x0, its position in the rigid domain.
 ///
 /// The error is that of the deformer's positions, because T x0 and the difference are computed in f64. The positions
-/// are f32 relative to the domain's cell, so a vertex one kilometer from the cell's origin has an error of up to 0.1
+/// are f32 relative to the domain's floating origin, so a vertex one kilometer from it has an error of up to 0.1
 /// mm.
 pub(in crate::engine) fn displacement_magnitudes(
     scene: &Scene,

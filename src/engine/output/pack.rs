@@ -150,14 +150,14 @@ pub async fn pack_vertices(output: StepOutput, selection: &Arc<VertexSelection>)
 /// Returns the origin of the reply in meters; appends per-domain origins to `bytes` if any differs from it.
 fn push_origins(selection: &VertexSelection, origins: Option<&FloatingOrigins>, bytes: &mut Vec<u8>) -> [f64; 3] {
     let scene = &selection.scene;
-    let meters = |cell: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * cell[axis]);
+    let meters = |origin: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * origin[axis]);
     let Some(origins) = origins else { return scene.origin };
     let own =
         || selection.domains.iter().map(|domain| origins.origin_of(scene.transform_roots.root_of(*domain as usize)));
-    if own().any(|cell| cell != origins.shared()) {
+    if own().any(|origin| origin != origins.shared_origin()) {
         bytes.extend(own().map(meters).flat_map(|origin: [f64; 3]| origin.map(f64::to_le_bytes)).flatten());
     }
-    meters(origins.shared())
+    meters(origins.shared_origin())
 }
 
 fn pack(surface: &DeformedSurface, selection: &VertexSelection) -> Vec<u8> {

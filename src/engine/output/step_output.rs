@@ -79,7 +79,7 @@ pub struct StepOutput {
     /// Steps that this subscriber skipped since its last result.
     pub skipped: u64,
     pub stages: StageTimes,
-    /// The cells that the vertices are relative to; `None` if all are relative to the scene's origin.
+    /// The floating origins that the vertices are relative to. `None` if all are relative to the scene's origin.
     pub origins: Option<Arc<FloatingOrigins>>,
     pub body: OutputBody,
 }

@@ -25,9 +25,9 @@ const WRITE_INTERVAL: Duration = Duration::from_millis(100);
 /// counts of coordinates and of transforms (u64), q (f32), the transforms (12 f32 each), and the SHA-256 of all bytes
 /// before the hash. Little-endian.
 const MAGIC: &[u8; 8] = b"MCSTEP01";
-/// Magic number of a checkpoint with cells: as above, plus the shared cell (3 f64) and one translation (3 f64) per
+/// Magic number of a checkpoint with floating origins: as above, plus the shared origin (3 f64) and one translation (3 f64) per
 /// transform after the transforms.
-const MAGIC_CELLS: &[u8; 8] = b"MCSTEP02";
+const MAGIC_ORIGINS: &[u8; 8] = b"MCSTEP02";
 const HEADER_BYTES: usize = 8 + 5 * 8;
 const HASH_BYTES: usize = 32;
 
@@ -163,7 +163,7 @@ fn path_of(folder: &Path, name: &str) -> PathBuf {
 
 fn encode(state: &SceneState) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(HEADER_BYTES + 4 * state.q.len() + 48 * state.transforms.len() + HASH_BYTES);
-    bytes.extend_from_slice(if state.origins.is_some() { MAGIC_CELLS } else { MAGIC });
+    bytes.extend_from_slice(if state.origins.is_some() { MAGIC_ORIGINS } else { MAGIC });
     bytes.extend_from_slice(&state.run.to_le_bytes());
     bytes.extend_from_slice(&state.step.to_le_bytes());
     bytes.extend_from_slice(&state.time.to_le_bytes());
@@ -172,7 +172,7 @@ fn encode(state: &SceneState) -> Vec<u8> {
     let transforms = state.transforms.iter().flat_map(|transform| transform.0);
     bytes.extend(state.q.iter().copied().chain(transforms).flat_map(f32::to_le_bytes));
     if let Some(origins) = &state.origins {
-        let shared = origins.shared();
+        let shared = origins.shared_origin();
         let translations = origins.translations().as_flattened();
         bytes.extend(shared.iter().chain(translations).flat_map(|number| number.to_le_bytes()));
     }
@@ -183,7 +183,7 @@ fn encode(state: &SceneState) -> Vec<u8> {
 
 fn decode(bytes: &[u8], scene: &Scene) -> Result<SceneState> {
     let rest = SceneState::rest(scene);
-    let has_cells = bytes.starts_with(MAGIC_CELLS);
+    let has_cells = bytes.starts_with(MAGIC_ORIGINS);
     let extra = if has_cells { 24 * (1 + rest.transforms.len()) } else { 0 };
     let size = HEADER_BYTES + 4 * rest.q.len() + 48 * rest.transforms.len() + extra + HASH_BYTES;
     if bytes.len() != size {
@@ -213,13 +213,13 @@ fn decode(bytes: &[u8], scene: &Scene) -> Result<SceneState> {
         time: f64::from_le_bytes(word(3)),
         q: q.chunks_exact(4).map(number).collect(),
         transforms: transforms.chunks_exact(48).map(transform).collect(),
-        origins: if has_cells { Some(Arc::new(decode_cells(origins)?)) } else { None },
+        origins: if has_cells { Some(Arc::new(decode_origins(origins)?)) } else { None },
         ..rest
     })
 }
 
-/// Decodes the shared cell (24 bytes), then the translations (24 bytes each).
-fn decode_cells(bytes: &[u8]) -> Result<FloatingOrigins> {
+/// Decodes the shared origin (24 bytes), then the translations (24 bytes each).
+fn decode_origins(bytes: &[u8]) -> Result<FloatingOrigins> {
     let point = |bytes: &[u8]| {
         std::array::from_fn(|axis| {
             let mut word = [0; 8];
@@ -275,7 +275,7 @@ mod tests {
         let bytes = encode(&state);
         let kept = decode(&bytes, &scene).expect("whole");
         assert_eq!((&kept, kept.origin_of(1)), (&state, [9766.0 * 1024.0, 0.0, 0.0]));
-        assert_ne!(SceneState { origins: None, ..kept }, state, "the cells count");
+        assert_ne!(SceneState { origins: None, ..kept }, state, "expected a comparison of floating origins");
         assert!(decode(&bytes[..bytes.len() - 24], &scene).is_err());
     }
 

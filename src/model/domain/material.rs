@@ -57,16 +57,16 @@ impl Material {
     /// # Errors
     /// `Invalid` with the material and the field.
     pub fn validated(self) -> Result<Self> {
-        let unit = |field: &str, value: f32| match value {
+        let check_unit_interval = |field: &str, value: f32| match value {
             0.0..=1.0 => Ok(()),
             _ => Err(invalid(format!("material '{}': {field}", self.name), "0 to 1", value)),
         };
         for (field, color) in [("ambient", self.ambient), ("diffuse", self.diffuse), ("specular", self.specular)] {
-            color.into_iter().try_for_each(|channel| unit(field, channel))?;
+            color.into_iter().try_for_each(|channel| check_unit_interval(field, channel))?;
         }
-        unit("alpha", self.alpha)?;
+        check_unit_interval("alpha", self.alpha)?;
         if let AlphaMode::Mask { cutoff } = self.alpha_mode {
-            unit("cutoff", cutoff)?;
+            check_unit_interval("cutoff", cutoff)?;
         }
         if !(0.0..=1e6).contains(&self.shininess) {
             return Err(invalid(format!("material '{}': shininess", self.name), "0 to 1e6", self.shininess));
@@ -80,11 +80,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_alpha_of_seven_is_refused_with_field_expected_and_given() {
-        let refusal = Material { alpha: 7.0, ..Material::default() }.validated().expect_err("7 is no alpha");
-        assert_eq!(refusal.to_string(), "material 'white': alpha: expected 0 to 1, got 7");
-        let nan = Material { diffuse: [0.0, f32::NAN, 0.0], ..Material::default() };
-        assert!(nan.validated().is_err());
+    fn out_of_range_alpha_is_rejected_with_its_field() {
+        let error = Material { alpha: 7.0, ..Material::default() }.validated().expect_err("an alpha out of range");
+        assert_eq!(error.to_string(), "material 'white': alpha: expected 0 to 1, got 7");
+        let nan_material = Material { diffuse: [0.0, f32::NAN, 0.0], ..Material::default() };
+        assert!(nan_material.validated().is_err());
         assert!(Material::default().validated().is_ok());
     }
 }

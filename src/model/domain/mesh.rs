@@ -1,9 +1,9 @@
-//! A triangle mesh on two levels: vertices, each with three rows of U, and corners, one per rendered combination of
-//! OBJ's v, vt and vn.
+//! A triangle mesh. A vertex is a deformed point with three rows of U. A corner is a vertex with a normal and texture
+//! coordinates, as the renderer draws it: several corners can share one vertex. Triangles index corners.
 
 use crate::error::{Result, invalid};
 
-/// The rendered corners as arrays of equal length.
+/// The attributes of all corners, one array per attribute. The arrays have equal lengths, but `uvs` may be empty.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Corners {
     /// The vertex of each corner.
@@ -17,42 +17,45 @@ pub struct Corners {
 /// Vertices, corners and triangles of a shape at rest.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mesh {
-    rest: Vec<[f32; 3]>,
+    rest_positions: Vec<[f32; 3]>,
     corners: Corners,
     triangles: Vec<[u32; 3]>,
 }
 
 impl Mesh {
-    /// A mesh whose triangles index `corners` and whose corners index `rest`. Normals are normalized.
+    /// A mesh whose triangles index `corners` and whose corners index `rest_positions`. Normals are normalized.
     ///
     /// Unreferenced vertices are kept, because the rows of U include them.
     ///
     /// # Errors
-    /// `Invalid` if a list is empty, an index is out of range, lengths differ or a number is not finite.
-    pub fn new(rest: Vec<[f32; 3]>, mut corners: Corners, triangles: Vec<[u32; 3]>) -> Result<Self> {
-        let count = corners.vertices.len();
-        if rest.is_empty() || triangles.is_empty() {
+    /// `Invalid` if there is no vertex or no triangle, an index is out of range, the number of normals or texture
+    /// coordinates is wrong, or a number is not finite.
+    pub fn new(rest_positions: Vec<[f32; 3]>, mut corners: Corners, triangles: Vec<[u32; 3]>) -> Result<Self> {
+        let corner_count = corners.vertices.len();
+        if rest_positions.is_empty() || triangles.is_empty() {
             return Err(invalid(
                 "mesh",
                 "at least one vertex and one triangle",
-                format!("{} vertices, {} triangles", rest.len(), triangles.len()),
+                format!("{} vertices, {} triangles", rest_positions.len(), triangles.len()),
             ));
         }
-        if corners.normals.len() != count {
-            return Err(invalid("mesh.normals", format!("{count}, one per corner"), corners.normals.len()));
+        if corners.normals.len() != corner_count {
+            let expected = format!("one normal per corner ({corner_count})");
+            return Err(invalid("mesh.normals", expected, corners.normals.len()));
         }
-        if !corners.uvs.is_empty() && corners.uvs.len() != count {
-            return Err(invalid("mesh.uvs", format!("none or {count}, one per corner"), corners.uvs.len()));
+        if !corners.uvs.is_empty() && corners.uvs.len() != corner_count {
+            let expected = format!("none or one per corner ({corner_count})");
+            return Err(invalid("mesh.uvs", expected, corners.uvs.len()));
         }
-        finite("mesh.positions", &rest)?;
-        finite("mesh.normals", &corners.normals)?;
-        finite("mesh.uvs", &corners.uvs)?;
-        in_range("mesh.corners", &corners.vertices, rest.len())?;
-        in_range("mesh.indices", triangles.as_flattened(), count)?;
+        check_finite("mesh.positions", &rest_positions)?;
+        check_finite("mesh.normals", &corners.normals)?;
+        check_finite("mesh.uvs", &corners.uvs)?;
+        check_indices("mesh.corners", &corners.vertices, rest_positions.len())?;
+        check_indices("mesh.indices", triangles.as_flattened(), corner_count)?;
         for normal in &mut corners.normals {
-            *normal = unit(*normal);
+            *normal = normalize_or_z(*normal);
         }
-        Ok(Self { rest, corners, triangles })
+        Ok(Self { rest_positions, corners, triangles })
     }
 
     /// A mesh with one corner per vertex.
@@ -60,21 +63,21 @@ impl Mesh {
     /// # Errors
     /// As for [`Self::new`].
     pub fn from_indexed(
-        rest: Vec<[f32; 3]>,
+        rest_positions: Vec<[f32; 3]>,
         normals: Vec<[f32; 3]>,
         uvs: Vec<[f32; 2]>,
         triangles: Vec<[u32; 3]>,
     ) -> Result<Self> {
-        let vertices = (0..rest.len() as u32).collect();
-        Self::new(rest, Corners { vertices, normals, uvs }, triangles)
+        let vertices = (0..rest_positions.len() as u32).collect();
+        Self::new(rest_positions, Corners { vertices, normals, uvs }, triangles)
     }
 
     /// Rest positions, one per vertex.
     pub fn rest_positions(&self) -> &[[f32; 3]] {
-        &self.rest
+        &self.rest_positions
     }
 
-    /// The corners.
+    /// The attributes of all corners.
     pub const fn corners(&self) -> &Corners {
         &self.corners
     }
@@ -86,40 +89,45 @@ impl Mesh {
 }
 
 /// Area-weighted vertex normals, one per corner, for corners without normals. Triangles index corners, and all corners
-/// of a vertex share its normal. A vertex without adjacent area gets +Z.
-pub fn smooth_normals(rest: &[[f32; 3]], corner_vertices: &[u32], triangles: &[[u32; 3]]) -> Vec<[f32; 3]> {
-    let mut sums = vec![nalgebra::Vector3::<f64>::zeros(); rest.len()];
-    let position = |vertex: u32| nalgebra::Vector3::from(rest[vertex as usize]).cast::<f64>();
+/// of a vertex share its normal. The normal is +Z if all triangles at the vertex are degenerate.
+pub fn smooth_normals(rest_positions: &[[f32; 3]], corner_vertices: &[u32], triangles: &[[u32; 3]]) -> Vec<[f32; 3]> {
+    let mut normal_sums = vec![nalgebra::Vector3::<f64>::zeros(); rest_positions.len()];
+    let position = |vertex: u32| nalgebra::Vector3::from(rest_positions[vertex as usize]).cast::<f64>();
     for triangle in triangles {
         let [a, b, c] = triangle.map(|corner| corner_vertices[corner as usize]);
-        let area = (position(b) - position(a)).cross(&(position(c) - position(a)));
+        let area_vector = (position(b) - position(a)).cross(&(position(c) - position(a)));
         for vertex in [a, b, c] {
-            sums[vertex as usize] += area;
+            normal_sums[vertex as usize] += area_vector;
         }
     }
     let normal = |vertex: &u32| {
-        let sum = sums[*vertex as usize].try_normalize(f64::MIN_POSITIVE);
-        sum.map_or([0.0, 0.0, 1.0], |sum| sum.cast::<f32>().into())
+        let unit_normal = normal_sums[*vertex as usize].try_normalize(f64::MIN_POSITIVE);
+        unit_normal.map_or([0.0, 0.0, 1.0], |normal| normal.cast::<f32>().into())
     };
     corner_vertices.iter().map(normal).collect()
 }
 
-fn unit(normal: [f32; 3]) -> [f32; 3] {
-    let long = nalgebra::Vector3::from(normal).cast::<f64>();
-    long.try_normalize(1e-30).map_or([0.0, 0.0, 1.0], |unit| unit.cast::<f32>().into())
+/// Normalizes in f64. A zero vector becomes +Z.
+fn normalize_or_z(normal: [f32; 3]) -> [f32; 3] {
+    let normal_f64 = nalgebra::Vector3::from(normal).cast::<f64>();
+    normal_f64.try_normalize(1e-30).map_or([0.0, 0.0, 1.0], |unit| unit.cast::<f32>().into())
 }
 
-fn finite<const N: usize>(field: &str, list: &[[f32; N]]) -> Result<()> {
+fn check_finite<const N: usize>(field: &str, list: &[[f32; N]]) -> Result<()> {
     match list.as_flattened().iter().position(|number| !number.is_finite()) {
         None => Ok(()),
-        Some(at) => Err(invalid(format!("{field}[{}]", at / N), "finite numbers", format!("{:?}", list[at / N]))),
+        Some(index) => {
+            Err(invalid(format!("{field}[{}]", index / N), "finite numbers", format!("{:?}", list[index / N])))
+        }
     }
 }
 
-fn in_range(field: &str, indices: &[u32], limit: usize) -> Result<()> {
+fn check_indices(field: &str, indices: &[u32], limit: usize) -> Result<()> {
     match indices.iter().position(|index| *index as usize >= limit) {
         None => Ok(()),
-        Some(at) => Err(invalid(format!("{field}[{at}]"), format!("an index below {limit}"), indices[at])),
+        Some(position) => {
+            Err(invalid(format!("{field}[{position}]"), format!("an index below {limit}"), indices[position]))
+        }
     }
 }
 
@@ -130,28 +138,32 @@ mod tests {
     const SQUARE: [[f32; 3]; 4] = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
 
     #[test]
-    fn smooth_normals_of_a_flat_square_point_up_and_a_collapsed_vertex_stays_finite() {
+    fn smooth_normals_of_a_flat_square_point_up() {
         let normals = smooth_normals(&SQUARE, &[0, 1, 2, 3], &[[0, 1, 2], [0, 2, 3]]);
         assert_eq!(normals, [[0.0, 0.0, 1.0]; 4]);
-        let collapsed = smooth_normals(&SQUARE, &[0, 0, 0], &[[0, 1, 2]]);
-        assert_eq!(collapsed, [[0.0, 0.0, 1.0]; 3]);
     }
 
     #[test]
-    fn bad_meshes_are_refused_by_name() {
+    fn smooth_normal_of_a_degenerate_triangle_is_z() {
+        let normals = smooth_normals(&SQUARE, &[0, 0, 0], &[[0, 1, 2]]);
+        assert_eq!(normals, [[0.0, 0.0, 1.0]; 3]);
+    }
+
+    #[test]
+    fn invalid_mesh_is_rejected_with_its_field() {
         let corners = || Corners { vertices: vec![0, 1, 2], normals: vec![[0.0, 0.0, 2.0]; 3], uvs: vec![] };
-        let good = Mesh::new(SQUARE.to_vec(), corners(), vec![[0, 1, 2]]).expect("good");
-        assert_eq!(good.corners().normals[0], [0.0, 0.0, 1.0]);
-        let refusals = [
+        let valid_mesh = Mesh::new(SQUARE.to_vec(), corners(), vec![[0, 1, 2]]).expect("a valid mesh");
+        assert_eq!(valid_mesh.corners().normals[0], [0.0, 0.0, 1.0]);
+        let rejections = [
             (Mesh::new(vec![], corners(), vec![[0, 1, 2]]), "mesh:"),
             (Mesh::new(SQUARE.to_vec(), corners(), vec![[0, 1, 3]]), "mesh.indices[2]"),
             (Mesh::new(SQUARE[..2].to_vec(), corners(), vec![[0, 1, 2]]), "mesh.corners[2]"),
             (Mesh::new(vec![[f32::NAN; 3]; 3], corners(), vec![[0, 1, 2]]), "mesh.positions[0]"),
             (Mesh::new(SQUARE.to_vec(), Corners { uvs: vec![[0.0; 2]], ..corners() }, vec![[0, 1, 2]]), "mesh.uvs"),
         ];
-        for (refusal, field) in refusals {
-            let text = refusal.expect_err(field).to_string();
-            assert!(text.starts_with(field), "{text}");
+        for (result, field) in rejections {
+            let message = result.expect_err(field).to_string();
+            assert!(message.starts_with(field), "expected an error about {field}, got {message}");
         }
     }
 }

@@ -1,8 +1,7 @@
-//! A domain: one deformable or rigid object of a scene, with its mesh, modes, materials and textures. Objects are
-//! validated once and are immutable afterwards.
+//! A domain: one deformable or rigid object of a scene, with its mesh, modes, materials and textures.
 //!
-//! Positions are in scene units. The constructors of this module check lengths, indices and numbers; code that uses the
-//! constructed values does not check them again.
+//! The constructors of this module check lengths, indices and numbers. The constructed values are immutable, so that
+//! other code does not check them again. Positions are in scene units.
 
 mod composed_transform;
 mod material;
@@ -23,14 +22,14 @@ pub use transform::Transform;
 
 use std::collections::BTreeMap;
 
-/// A mesh with its modes. Instances of an object share one shape.
+/// A mesh with its modes. Domains that are instances of one object share a shape.
 #[derive(Debug, Clone)]
 pub struct Shape {
     pub mesh: Mesh,
     pub modes: Modes,
     /// Per corner, the unit tangent and the sign of the bitangent. Empty unless a normal map needs them.
     pub(crate) tangents: Vec<[f32; 4]>,
-    /// `None` unless normals are computed from the deformed triangles.
+    /// Present if normals are computed from the deformed triangles.
     smoothing: Option<SmoothingGroups>,
 }
 
@@ -62,14 +61,14 @@ impl Shape {
         }
     }
 
-    /// Smoothing groups and the triangles around them; `None` if normals only rotate with the domain.
+    /// The smoothing groups of the mesh. `None` if the rest normals are transformed by T alone.
     pub const fn smoothing(&self) -> Option<&SmoothingGroups> {
         self.smoothing.as_ref()
     }
 
     /// Computes the smoothing groups unless they already exist.
     pub(crate) fn add_smoothing(&mut self) {
-        self.smoothing.get_or_insert_with(|| SmoothingGroups::of(&self.mesh));
+        self.smoothing.get_or_insert_with(|| SmoothingGroups::from_mesh(&self.mesh));
     }
 }
 
@@ -87,14 +86,14 @@ pub struct Metadata {
 pub struct Attachment {
     /// Index of the parent domain.
     pub parent: usize,
-    /// Rest pose of the child's frame in the parent's frame, `parent_from_child`.
+    /// `parent_from_child` at rest.
     pub frame: Transform,
-    /// Vertices of the parent (rows of its U divided by three) from whose displaced positions the motion of the frame
-    /// can be determined. Empty for a rigid parent.
+    /// Vertices of the parent near the joint. Clients fit the motion of the joint to their displaced positions. Empty
+    /// for a rigid parent.
     pub rows: Vec<u32>,
 }
 
-/// A constant frame on another domain, T = T_parent F. The modes of the parent do not affect it.
+/// Attaches a domain to another one by a constant transform: T = T_parent F. The modes of the parent do not affect T.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FollowConstraint {
     /// Index of the followed domain, smaller than that of the follower. The followed domain may be a follower itself.
@@ -103,7 +102,7 @@ pub struct FollowConstraint {
     pub frame: Transform,
 }
 
-/// The first triangle of a material within a domain. The run ends at the next one.
+/// The triangles of a domain that have one material. A range ends where the next range begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MaterialRange {
     pub first_triangle: usize,
@@ -119,15 +118,15 @@ pub struct Domain {
     pub shape: usize,
     /// Index into the scene's materials.
     pub material: usize,
-    /// Runs of triangles with different materials, ascending, the first at triangle 0. Empty if all triangles have
-    /// `material`.
+    /// Ranges of triangles with different materials, ascending. The first range begins at triangle 0. Empty if all
+    /// triangles have `material`.
     pub material_ranges: Vec<MaterialRange>,
-    /// `world_from_domain` at rest. For a follower it is computed from the frame, and the given value is ignored.
+    /// `world_from_domain` at rest. [`crate::scene::Scene::new`] ignores the placement of a follower and computes it from the frame.
     pub placement: Transform,
     pub attachment: Option<Attachment>,
-    /// For a domain that moves with another one; steps cannot set the transform of such a domain.
+    /// Present if the domain moves with another one. Steps cannot set the transform of such a domain.
     pub follows: Option<FollowConstraint>,
-    /// The coordinates at rest. The length is the rank, or 0 for all zeros.
+    /// q at rest. The length is the rank. Empty if all coordinates are 0.
     pub rest_q: Vec<f32>,
     /// A domain with a smaller index and the same rank whose coordinates this domain shares (glTF node weights).
     pub shares_q_with: Option<usize>,
@@ -135,9 +134,9 @@ pub struct Domain {
 }
 
 impl Domain {
-    /// Indices of the materials of its triangles, one per run.
+    /// Indices of the materials of the domain's triangles, one per range.
     pub fn materials(&self) -> impl Iterator<Item = usize> + '_ {
-        let only = self.material_ranges.is_empty().then_some(self.material);
-        only.into_iter().chain(self.material_ranges.iter().map(|run| run.material))
+        let single_material = self.material_ranges.is_empty().then_some(self.material);
+        single_material.into_iter().chain(self.material_ranges.iter().map(|range| range.material))
     }
 }

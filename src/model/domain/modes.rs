@@ -37,9 +37,9 @@ impl Modes {
         if rows.checked_mul(rank) != Some(columns.len()) {
             return Err(invalid("modes.entries", format!("{rows} x {rank}"), columns.len()));
         }
-        if let Some(at) = columns.iter().position(|entry| !entry.is_finite()) {
-            let place = format!("modes[{}, {}]", at % rows, at / rows);
-            return Err(invalid(place, "a finite number", columns[at]));
+        if let Some(index) = columns.iter().position(|entry| !entry.is_finite()) {
+            let field = format!("modes[{}, {}]", index % rows, index / rows);
+            return Err(invalid(field, "a finite number", columns[index]));
         }
         if rank == 0 {
             return Ok(Self::rigid());
@@ -85,20 +85,20 @@ impl Modes {
     }
 
     /// The 3 x r block of U at a point of a triangle, row-major: the rows of the three vertices, weighted by the
-    /// barycentric coordinates `shares` in f64 and rounded once.
-    pub fn block_at_point(&self, vertices: [u32; 3], shares: [f64; 3]) -> Vec<f32> {
+    /// barycentric coordinates `weights` in f64 and rounded once.
+    pub fn block_at_point(&self, vertices: [u32; 3], weights: [f64; 3]) -> Vec<f32> {
         let entry = |component: usize, mode: usize| {
-            let of_vertex =
-                |(vertex, share): (&u32, f64)| share * f64::from(self.entry(*vertex as usize, component, mode));
-            vertices.iter().zip(shares).map(of_vertex).sum::<f64>() as f32
+            let weighted_entry =
+                |(vertex, weight): (&u32, f64)| weight * f64::from(self.entry(*vertex as usize, component, mode));
+            vertices.iter().zip(weights).map(weighted_entry).sum::<f64>() as f32
         };
         (0..3)
             .flat_map(|component| (0..self.rank).map(move |mode| (component, mode)))
-            .map(|(c, m)| entry(c, m))
+            .map(|(component, mode)| entry(component, mode))
             .collect()
     }
 
-    /// Replaces a matrix whose entries are all zero by no modes.
+    /// Replaces U by [`Self::rigid`] if all entries are zero.
     pub fn without_zero_matrix(self) -> Self {
         if self.columns.iter().all(|entry| *entry == 0.0) { Self::rigid() } else { self }
     }
@@ -110,24 +110,24 @@ mod tests {
 
     #[test]
     fn row_major_and_column_major_give_the_same_matrix() {
-        let rows = Modes::from_rows(3, 2, &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).expect("fits");
-        let columns = Modes::from_columns(3, 2, vec![1.0, 3.0, 5.0, 2.0, 4.0, 6.0]).expect("fits");
+        let rows = Modes::from_rows(3, 2, &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).expect("valid modes");
+        let columns = Modes::from_columns(3, 2, vec![1.0, 3.0, 5.0, 2.0, 4.0, 6.0]).expect("valid modes");
         assert_eq!(rows, columns);
         assert_eq!(rows.entry(0, 2, 1), 6.0);
         assert_eq!(rows.column(1), [2.0, 4.0, 6.0]);
     }
 
     #[test]
-    fn the_block_at_a_point_is_the_mean_of_its_corners_and_at_a_corner_its_rows() {
-        let modes = Modes::from_columns(9, 2, (0..18).map(|entry| entry as f32).collect()).expect("fits");
+    fn block_at_point_interpolates_the_rows_of_the_vertices() {
+        let modes = Modes::from_columns(9, 2, (0..18).map(|entry| entry as f32).collect()).expect("valid modes");
         assert_eq!(modes.block_at_point([2, 0, 1], [0.0, 1.0, 0.0]), [0.0, 9.0, 1.0, 10.0, 2.0, 11.0]);
-        let third = [1.0 / 3.0; 3];
-        assert_eq!(modes.block_at_point([0, 1, 2], third), [3.0, 12.0, 4.0, 13.0, 5.0, 14.0]);
-        assert!(Modes::rigid().block_at_point([0, 1, 2], third).is_empty());
+        let center = [1.0 / 3.0; 3];
+        assert_eq!(modes.block_at_point([0, 1, 2], center), [3.0, 12.0, 4.0, 13.0, 5.0, 14.0]);
+        assert!(Modes::rigid().block_at_point([0, 1, 2], center).is_empty());
     }
 
     #[test]
-    fn wrong_shapes_and_non_finite_entries_are_refused_by_name() {
+    fn invalid_modes_are_rejected_with_their_field() {
         for (rows, rank, entries, field) in [
             (4, 1, vec![0.0; 4], "modes.rows"),
             (0, 0, vec![], "modes.rows"),
@@ -135,8 +135,8 @@ mod tests {
             (3, 2, vec![0.0; 5], "modes.entries"),
             (3, 1, vec![0.0, f32::NAN, 0.0], "modes[1, 0]"),
         ] {
-            let refusal = Modes::from_columns(rows, rank, entries).expect_err("wrong").to_string();
-            assert!(refusal.starts_with(field), "{refusal}");
+            let message = Modes::from_columns(rows, rank, entries).expect_err(field).to_string();
+            assert!(message.starts_with(field), "expected an error about {field}, got {message}");
         }
     }
 }

@@ -6,31 +6,31 @@ use super::Mesh;
 
 /// Per corner, the unit tangent, orthogonal to the normal, and the sign of the bitangent.
 ///
-/// Each triangle adds its uv gradients to its three corners; the sum is orthogonalized against the normal. A corner
-/// without a usable gradient (no uv, zero area) gets an arbitrary unit vector orthogonal to its normal and a positive
-/// sign.
+/// Each triangle adds the derivatives of its position along u and v to its three corners. The sum along u is
+/// orthogonalized against the normal. A corner without usable derivatives (no texture coordinates, or no area) has an
+/// arbitrary unit tangent orthogonal to its normal, and a positive sign.
 pub(super) fn lengyel_tangents(mesh: &Mesh) -> Vec<[f32; 4]> {
     let corners = mesh.corners();
-    let mut along_u = vec![Vector3::<f64>::zeros(); corners.vertices.len()];
-    let mut along_v = along_u.clone();
+    let mut tangent_sums = vec![Vector3::<f64>::zeros(); corners.vertices.len()];
+    let mut bitangent_sums = tangent_sums.clone();
     if !corners.uvs.is_empty() {
         for triangle in mesh.triangles() {
-            if let Some((tangent, bitangent)) = gradients(mesh, *triangle) {
+            if let Some((tangent, bitangent)) = uv_gradients(mesh, *triangle) {
                 for corner in triangle {
-                    along_u[*corner as usize] += tangent;
-                    along_v[*corner as usize] += bitangent;
+                    tangent_sums[*corner as usize] += tangent;
+                    bitangent_sums[*corner as usize] += bitangent;
                 }
             }
         }
     }
-    let frame = |((normal, tangent), bitangent): ((&[f32; 3], &Vector3<f64>), &Vector3<f64>)| {
-        orthogonal(Vector3::from(*normal).cast(), *tangent, *bitangent)
+    let tangent_of = |((normal, tangent), bitangent): ((&[f32; 3], &Vector3<f64>), &Vector3<f64>)| {
+        orthogonalize(Vector3::from(*normal).cast(), *tangent, *bitangent)
     };
-    corners.normals.iter().zip(&along_u).zip(&along_v).map(frame).collect()
+    corners.normals.iter().zip(&tangent_sums).zip(&bitangent_sums).map(tangent_of).collect()
 }
 
-/// Derivatives of the position along u and along v over one triangle. v points up here, as in normal maps.
-fn gradients(mesh: &Mesh, triangle: [u32; 3]) -> Option<(Vector3<f64>, Vector3<f64>)> {
+/// Derivatives of the position along u and along v over one triangle. `None` if the triangle has no area in (u, v).
+fn uv_gradients(mesh: &Mesh, triangle: [u32; 3]) -> Option<(Vector3<f64>, Vector3<f64>)> {
     let corners = mesh.corners();
     let position =
         |corner: u32| Vector3::from(mesh.rest_positions()[corners.vertices[corner as usize] as usize]).cast::<f64>();
@@ -40,19 +40,21 @@ fn gradients(mesh: &Mesh, triangle: [u32; 3]) -> Option<(Vector3<f64>, Vector3<f
     // Corners store v downwards from the top of the image; the tangent frame of a normal map has v upwards.
     let (s1, t1) = (uv(b)[0] - uv(a)[0], uv(a)[1] - uv(b)[1]);
     let (s2, t2) = (uv(c)[0] - uv(a)[0], uv(a)[1] - uv(c)[1]);
-    let area = s1 * t2 - s2 * t1;
-    let inverse = 1.0 / area;
-    inverse.is_finite().then(|| ((edge1 * t2 - edge2 * t1) * inverse, (edge2 * s1 - edge1 * s2) * inverse))
+    let uv_area = s1 * t2 - s2 * t1;
+    let inverse_area = 1.0 / uv_area;
+    inverse_area
+        .is_finite()
+        .then(|| ((edge1 * t2 - edge2 * t1) * inverse_area, (edge2 * s1 - edge1 * s2) * inverse_area))
 }
 
-fn orthogonal(normal: Vector3<f64>, tangent: Vector3<f64>, bitangent: Vector3<f64>) -> [f32; 4] {
-    let flat = (tangent - normal * normal.dot(&tangent)).try_normalize(1e-20);
-    let (unit, sign) = match flat {
-        Some(unit) if normal.cross(&unit).dot(&bitangent) < 0.0 => (unit, -1.0),
-        Some(unit) => (unit, 1.0),
+fn orthogonalize(normal: Vector3<f64>, tangent: Vector3<f64>, bitangent: Vector3<f64>) -> [f32; 4] {
+    let projected = (tangent - normal * normal.dot(&tangent)).try_normalize(1e-20);
+    let (unit_tangent, sign) = match projected {
+        Some(unit_tangent) if normal.cross(&unit_tangent).dot(&bitangent) < 0.0 => (unit_tangent, -1.0),
+        Some(unit_tangent) => (unit_tangent, 1.0),
         None => (any_orthogonal(normal), 1.0),
     };
-    [unit.x as f32, unit.y as f32, unit.z as f32, sign]
+    [unit_tangent.x as f32, unit_tangent.y as f32, unit_tangent.z as f32, sign]
 }
 
 fn any_orthogonal(normal: Vector3<f64>) -> Vector3<f64> {
@@ -70,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn the_tangent_of_an_upright_image_is_plus_x_and_a_mirrored_image_flips_the_sign() {
+    fn mirrored_texture_coordinates_flip_tangent_and_sign() {
         let upright = square(vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]]);
         assert_eq!(lengyel_tangents(&upright), [[1.0, 0.0, 0.0, 1.0]; 4]);
         let mirrored = square(vec![[1.0, 1.0], [0.0, 1.0], [0.0, 0.0], [1.0, 0.0]]);
@@ -78,12 +80,12 @@ mod tests {
     }
 
     #[test]
-    fn missing_and_degenerate_uvs_give_finite_unit_tangents() {
+    fn missing_and_degenerate_uvs_give_unit_tangents() {
         for mesh in [square(vec![]), square(vec![[0.5, 0.5]; 4])] {
             for [x, y, z, sign] in lengyel_tangents(&mesh) {
                 let length = (x * x + y * y + z * z).sqrt();
                 assert!((length - 1.0).abs() < 1e-6, "length {length}");
-                assert!((z.abs() < 1e-6) && (sign == 1.0));
+                assert!((z.abs() < 1e-6) && (sign == 1.0), "expected z = 0 and sign 1, got z = {z} and sign {sign}");
             }
         }
     }

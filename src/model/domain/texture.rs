@@ -25,7 +25,7 @@ impl Texture {
             let field = format!("texture '{name}': size");
             return Err(invalid(
                 field,
-                format!("1 to {MAX_TEXTURE_SIDE} pixels a side"),
+                format!("1 to {MAX_TEXTURE_SIDE} pixels per side"),
                 format!("{width} x {height}"),
             ));
         }
@@ -38,17 +38,18 @@ impl Texture {
     /// Decodes PNG or JPEG bytes.
     ///
     /// # Errors
-    /// `Invalid` if the bytes are not such an image, or the image exceeds the limits.
+    /// `Invalid` if the bytes are neither a PNG nor a JPEG image, or a side exceeds 8192 pixels.
     pub fn decode(name: impl Into<String>, bytes: &[u8]) -> Result<Self> {
         let name = name.into();
-        let refuse = |error: &dyn std::fmt::Display| invalid(format!("texture '{name}'"), "a PNG or JPEG image", error);
+        let decode_error =
+            |error: &dyn std::fmt::Display| invalid(format!("texture '{name}'"), "a PNG or JPEG image", error);
         let mut reader = image::ImageReader::new(std::io::Cursor::new(bytes));
         let mut limits = image::Limits::default();
         limits.max_image_width = Some(MAX_TEXTURE_SIDE);
         limits.max_image_height = Some(MAX_TEXTURE_SIDE);
         reader.limits(limits);
-        let reader = reader.with_guessed_format().map_err(|error| refuse(&error))?;
-        let image = reader.decode().map_err(|error| refuse(&error))?.into_rgba8();
+        let reader = reader.with_guessed_format().map_err(|error| decode_error(&error))?;
+        let image = reader.decode().map_err(|error| decode_error(&error))?.into_rgba8();
         let (width, height) = image.dimensions();
         Self::new(name, width, height, image.into_raw())
     }

@@ -1,4 +1,5 @@
-//! Affine transforms between frames, 3x4 row-major. Names state target and source: `world_from_domain`.
+//! Affine transforms between coordinate frames. The name of a transform states its target and its source:
+//! `world_from_domain` maps coordinates of a domain to the world.
 
 use nalgebra::{Matrix3, Matrix4, Vector3};
 
@@ -28,7 +29,7 @@ impl Transform {
     pub fn new(entries: [f32; 12]) -> Result<Self> {
         match entries.iter().position(|entry| !entry.is_finite()) {
             None => Ok(Self(entries)),
-            Some(at) => Err(invalid(format!("transform[{at}]"), "a finite number", entries[at])),
+            Some(index) => Err(invalid(format!("transform[{index}]"), "a finite number", entries[index])),
         }
     }
 
@@ -65,7 +66,7 @@ impl Transform {
         self.to_matrix().fixed_view::<3, 3>(0, 0).into_owned()
     }
 
-    /// The translation.
+    /// The last column, in scene units.
     pub fn translation(self) -> Vector3<f64> {
         self.to_matrix().fixed_view::<3, 1>(0, 3).into_owned()
     }
@@ -96,17 +97,17 @@ mod tests {
 
     #[test]
     fn a_transform_times_its_inverse_is_the_identity() {
-        let turn = nalgebra::Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
-        let transform = Transform::from_parts(&(turn * 2.0), &Vector3::new(1.0, -2.0, 3.0));
-        let unit = transform.compose(transform.inverse().expect("regular"));
-        for (got, want) in unit.0.iter().zip(Transform::IDENTITY.0) {
-            assert!((got - want).abs() <= 1e-6, "{got} is not {want}");
+        let rotation = nalgebra::Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
+        let transform = Transform::from_parts(&(rotation * 2.0), &Vector3::new(1.0, -2.0, 3.0));
+        let product = transform.compose(transform.inverse().expect("an invertible transform"));
+        for (got, want) in product.0.iter().zip(Transform::IDENTITY.0) {
+            assert!((got - want).abs() <= 1e-6, "expected {want}, got {got}");
         }
         assert!(transform.is_similarity());
     }
 
     #[test]
-    fn shear_is_no_similarity_and_a_singular_transform_has_no_inverse() {
+    fn shear_is_no_similarity_and_singular_has_no_inverse() {
         let mut entries = Transform::IDENTITY.0;
         entries[1] = 0.1;
         assert!(!Transform(entries).is_similarity());
@@ -114,10 +115,10 @@ mod tests {
     }
 
     #[test]
-    fn an_infinite_entry_is_named() {
+    fn infinite_entry_is_rejected_with_its_index() {
         let mut entries = Transform::IDENTITY.0;
         entries[7] = f32::INFINITY;
-        let refusal = Transform::new(entries).expect_err("infinite").to_string();
-        assert!(refusal.starts_with("transform[7]"), "{refusal}");
+        let message = Transform::new(entries).expect_err("an infinite entry").to_string();
+        assert!(message.starts_with("transform[7]"), "expected an error about transform[7], got {message}");
     }
 }

@@ -1,4 +1,4 @@
-//! Cameras and bounding boxes. All computations are in f64; matrices are rounded to f32 last, by their users.
+//! Cameras and bounding boxes. All computations are in f64. Only the users of a matrix round it to f32.
 
 use nalgebra::{Matrix3x4, Matrix4, Point3, Vector3};
 
@@ -23,21 +23,21 @@ impl BoundingBox {
         bounds
     }
 
-    /// Extends the box to contain a point. NaN coordinates propagate, so that the bounds do not appear finite.
+    /// Extends the box to contain a point. NaN coordinates propagate, so that [`Self::is_finite`] detects them.
     pub fn include(&mut self, point: [f64; 3]) {
         *self = self.union(Self { min: point, max: point });
     }
 
     /// The smallest box that contains both. NaN in either propagates.
     pub fn union(self, other: Self) -> Self {
-        let pick = |a: f64, b: f64, least: bool| match (a.is_nan() || b.is_nan(), least) {
+        let select = |a: f64, b: f64, is_min: bool| match (a.is_nan() || b.is_nan(), is_min) {
             (true, _) => f64::NAN,
             (false, true) => a.min(b),
             (false, false) => a.max(b),
         };
         Self {
-            min: std::array::from_fn(|axis| pick(self.min[axis], other.min[axis], true)),
-            max: std::array::from_fn(|axis| pick(self.max[axis], other.max[axis], false)),
+            min: std::array::from_fn(|axis| select(self.min[axis], other.min[axis], true)),
+            max: std::array::from_fn(|axis| select(self.max[axis], other.max[axis], false)),
         }
     }
 
@@ -87,8 +87,8 @@ pub enum Lens {
     Intrinsics { fx: f64, fy: f64, cx: f64, cy: f64 },
 }
 
-/// The fraction of the half image that a framed scene may fill.
-const FRAMING_MARGIN: f64 = 0.94;
+/// The fraction of the image that the scene fills in [`Camera::fit_to_scene`], in the tighter of both directions.
+const IMAGE_FILL: f64 = 0.94;
 
 /// A camera. `near` and `far` are distances in scene units; if both are 0, they are fitted to the scene.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -101,26 +101,26 @@ pub struct Camera {
 
 impl Camera {
     /// A camera that views the scene's rest bounds from the front, slightly from above and from the side. The bounds
-    /// fill an image of this size up to a margin.
+    /// fill an image of `width` x `height` pixels up to a margin.
     pub fn fit_to_scene(scene: &Scene, width: u32, height: u32) -> Self {
         let up = scene.up.vector();
-        let aside = scene.up.rotation_from_y_up() * Vector3::new(0.42, 0.14, 0.90).normalize();
-        let (bounds, degrees) = (scene.rest_bounds, 28.0_f64);
-        let slope = FRAMING_MARGIN * (degrees / 2.0).to_radians().tan();
+        let to_camera = scene.up.rotation_from_y_up() * Vector3::new(0.42, 0.14, 0.90).normalize();
+        let (bounds, field_of_view) = (scene.rest_bounds, 28.0_f64);
+        let slope = IMAGE_FILL * (field_of_view / 2.0).to_radians().tan();
         let aspect = f64::from(width.max(1)) / f64::from(height.max(1));
-        let right = up.cross(&aside).normalize();
-        let above = aside.cross(&right);
-        // A corner that is nearer by `depth` must stay inside the view frustum, so it requires that much more distance.
+        let right = up.cross(&to_camera).normalize();
+        let camera_up = to_camera.cross(&right);
+        // A corner is inside the view frustum if its depth is at least its larger lateral offset, divided by the slope.
         let distance = |corner: &Point3<f64>| {
             let offset = corner - bounds.center();
-            let wide = offset.dot(&right).abs() / (slope * aspect);
-            offset.dot(&aside) + wide.max(offset.dot(&above).abs() / slope)
+            let horizontal = offset.dot(&right).abs() / (slope * aspect);
+            offset.dot(&to_camera) + horizontal.max(offset.dot(&camera_up).abs() / slope)
         };
         let distance = bounds.corners().iter().map(distance).fold(0.0, f64::max);
         let distance = if distance > 0.0 { distance } else { 1.0 };
-        let eye = bounds.center() + aside * distance;
+        let eye = bounds.center() + to_camera * distance;
         let view = View::LookAt { eye: eye.coords.into(), target: bounds.center().coords.into(), up: up.into() };
-        Self { view, lens: Lens::FieldOfView(degrees), near: 0.0, far: 0.0 }
+        Self { view, lens: Lens::FieldOfView(field_of_view), near: 0.0, far: 0.0 }
     }
 
     /// Validates all fields.
@@ -129,15 +129,19 @@ impl Camera {
     /// `Invalid` with the field.
     pub fn validated(self) -> Result<Self> {
         if let View::LookAt { eye, target, up } = self.view {
-            let ahead = Vector3::from(target) - Vector3::from(eye);
-            let aside = ahead.cross(&Vector3::from(up)).norm();
-            let given = || format!("eye {eye:?}, target {target:?}, up {up:?}");
-            if !(aside.is_finite() && aside > 1e-12 * ahead.norm() * Vector3::from(up).norm()) {
-                return Err(invalid("camera.look_at", "finite eye and target apart, and up not along them", given()));
+            let forward = Vector3::from(target) - Vector3::from(eye);
+            let cross_norm = forward.cross(&Vector3::from(up)).norm();
+            let look_at_text = || format!("eye {eye:?}, target {target:?}, up {up:?}");
+            if !(cross_norm.is_finite() && cross_norm > 1e-12 * forward.norm() * Vector3::from(up).norm()) {
+                return Err(invalid(
+                    "camera.look_at",
+                    "finite eye and target at different points, and up not parallel to the view",
+                    look_at_text(),
+                ));
             }
         }
         if let View::Pose(pose) = self.view
-            && !(pose.iter().all(|number| number.is_finite()) && inverse(pose).is_some())
+            && !(pose.iter().all(|number| number.is_finite()) && invert_pose(pose).is_some())
         {
             return Err(invalid("camera.pose", "a finite, regular transform", format!("{pose:?}")));
         }
@@ -156,9 +160,9 @@ impl Camera {
             }
             _ => {}
         }
-        let fitted = self.near == 0.0 && self.far == 0.0;
-        let ordered = self.near > 0.0 && self.far > self.near && self.far.is_finite();
-        if !(fitted || ordered) {
+        let is_fitted = self.near == 0.0 && self.far == 0.0;
+        let is_ordered = self.near > 0.0 && self.far > self.near && self.far.is_finite();
+        if !(is_fitted || is_ordered) {
             return Err(invalid(
                 "camera.near/far",
                 "0 < near < far, or both 0",
@@ -174,7 +178,7 @@ impl Camera {
             View::LookAt { eye, target, up } => {
                 Matrix4::look_at_rh(&Point3::from(eye), &Point3::from(target), &Vector3::from(up))
             }
-            View::Pose(pose) => inverse(pose).unwrap_or_else(Matrix4::identity),
+            View::Pose(pose) => invert_pose(pose).unwrap_or_else(Matrix4::identity),
         }
     }
 
@@ -186,13 +190,13 @@ impl Camera {
         }
     }
 
-    /// The same camera relative to the point `origin`. Computed in f64, so that a camera close to a domain far from the
-    /// scene's origin keeps its relative pose with f32 accuracy.
+    /// The same camera relative to the point `origin`. Computed in f64, so that a camera near a distant `origin` can be
+    /// rounded to f32 afterwards.
     #[must_use]
     pub fn relative_to(self, origin: [f64; 3]) -> Self {
-        let moved = |point: [f64; 3]| std::array::from_fn(|axis| point[axis] - origin[axis]);
+        let shifted = |point: [f64; 3]| std::array::from_fn(|axis| point[axis] - origin[axis]);
         let view = match self.view {
-            View::LookAt { eye, target, up } => View::LookAt { eye: moved(eye), target: moved(target), up },
+            View::LookAt { eye, target, up } => View::LookAt { eye: shifted(eye), target: shifted(target), up },
             View::Pose(mut pose) => {
                 (0..3).for_each(|axis| pose[4 * axis + 3] -= origin[axis]);
                 View::Pose(pose)
@@ -201,21 +205,21 @@ impl Camera {
         Self { view, ..self }
     }
 
-    /// fx, fy, cx and cy in pixels for an image of this width and height; (0, 0) is its top left corner.
+    /// fx, fy, cx and cy in pixels for an image of this width and height. (0, 0) is its top left corner.
     pub fn intrinsics(&self, [width, height]: [u32; 2]) -> [f64; 4] {
         match self.lens {
             Lens::FieldOfView(degrees) => {
-                let focal = 0.5 * f64::from(height) / (degrees.to_radians() / 2.0).tan();
-                [focal, focal, 0.5 * f64::from(width), 0.5 * f64::from(height)]
+                let focal_length = 0.5 * f64::from(height) / (degrees.to_radians() / 2.0).tan();
+                [focal_length, focal_length, 0.5 * f64::from(width), 0.5 * f64::from(height)]
             }
             Lens::Intrinsics { fx, fy, cx, cy } => [fx, fy, cx, cy],
         }
     }
 
-    /// The camera whose image is, pixel for pixel, the rectangle `pixel_rect` of this camera's image of size `picture`.
+    /// The camera whose image equals the rectangle `pixel_rect` of this camera's image. `image` is (width, height).
     #[must_use]
-    pub fn cropped_to(self, picture: [u32; 2], pixel_rect: PixelRect) -> Self {
-        let [fx, fy, cx, cy] = self.intrinsics(picture);
+    pub fn cropped_to(self, image: [u32; 2], pixel_rect: PixelRect) -> Self {
+        let [fx, fy, cx, cy] = self.intrinsics(image);
         let (cx, cy) = (cx - f64::from(pixel_rect.x()), cy - f64::from(pixel_rect.y()));
         Self { lens: Lens::Intrinsics { fx, fy, cx, cy }, ..self }
     }
@@ -225,15 +229,15 @@ impl Camera {
         let (near, far) = self.depth_range(bounds);
         let [fx, fy, cx, cy] = self.intrinsics([width, height]);
         let (width, height) = (f64::from(width), f64::from(height));
-        let mut clip = Matrix4::zeros();
-        clip[(0, 0)] = 2.0 * fx / width;
-        clip[(0, 2)] = 1.0 - 2.0 * cx / width;
-        clip[(1, 1)] = 2.0 * fy / height;
-        clip[(1, 2)] = 2.0 * cy / height - 1.0;
-        clip[(2, 2)] = -(far + near) / (far - near);
-        clip[(2, 3)] = -2.0 * far * near / (far - near);
-        clip[(3, 2)] = -1.0;
-        clip
+        let mut matrix = Matrix4::zeros();
+        matrix[(0, 0)] = 2.0 * fx / width;
+        matrix[(0, 2)] = 1.0 - 2.0 * cx / width;
+        matrix[(1, 1)] = 2.0 * fy / height;
+        matrix[(1, 2)] = 2.0 * cy / height - 1.0;
+        matrix[(2, 2)] = -(far + near) / (far - near);
+        matrix[(2, 3)] = -2.0 * far * near / (far - near);
+        matrix[(3, 2)] = -1.0;
+        matrix
     }
 
     /// Near and far distances: as given, or fitted to `bounds` and the ground around them.
@@ -252,7 +256,7 @@ impl Camera {
 }
 
 /// The inverse of a 3x4 row-major transform, if it exists and is finite.
-fn inverse(pose: [f64; 12]) -> Option<Matrix4<f64>> {
+fn invert_pose(pose: [f64; 12]) -> Option<Matrix4<f64>> {
     let mut matrix = Matrix4::identity();
     matrix.fixed_view_mut::<3, 4>(0, 0).copy_from(&Matrix3x4::from_row_slice(&pose));
     matrix.try_inverse().filter(|inverse| inverse.iter().all(|number| number.is_finite()))
@@ -263,52 +267,54 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bounds_never_forget_a_nan() {
+    fn bounds_with_a_nan_are_never_finite() {
         let mut bounds = BoundingBox::EMPTY;
         bounds.include([0.0; 3]);
         assert!(bounds.is_finite());
         bounds.include([0.0, f64::NAN, 0.0]);
         bounds.include([1.0; 3]);
         assert!(!bounds.is_finite());
-        let other = BoundingBox { min: [0.0; 3], max: [1.0; 3] };
-        assert!(!other.union(bounds).is_finite() && !bounds.union(other).is_finite());
+        let finite_bounds = BoundingBox { min: [0.0; 3], max: [1.0; 3] };
+        assert!(!finite_bounds.union(bounds).is_finite() && !bounds.union(finite_bounds).is_finite());
     }
 
     #[test]
-    fn a_framed_scene_fills_the_image_up_to_the_margin_whatever_its_shape() {
+    fn fitted_camera_fills_the_image_up_to_the_margin() {
         for (size, width, height) in [([1.0, 8.0, 1.0], 1280, 720), ([9.0, 1.0, 2.0], 1280, 720), ([1.0; 3], 200, 900)]
         {
             let scene = block(size);
             let camera = Camera::fit_to_scene(&scene, width, height);
             let clip = camera.clip_from_camera(width, height, &scene.rest_bounds) * camera.camera_from_world();
-            let reach = scene.rest_bounds.corners().map(|corner| {
+            let extent = scene.rest_bounds.corners().map(|corner| {
                 let point = clip.transform_point(&corner);
                 point.x.abs().max(point.y.abs())
             });
-            let reach = reach.into_iter().fold(0.0, f64::max);
-            assert!((reach - FRAMING_MARGIN).abs() < 1e-6, "{size:?} reaches {reach}");
+            let extent = extent.into_iter().fold(0.0, f64::max);
+            assert!((extent - IMAGE_FILL).abs() < 1e-6, "{size:?}: expected {IMAGE_FILL}, got {extent}");
         }
     }
 
     #[test]
-    fn a_camera_far_away_keeps_its_view_in_a_frame_beside_it_and_loses_it_in_f32() {
+    fn relative_camera_keeps_its_precision_far_from_the_origin() {
         let (eye, target, up) = ([1e7 + 0.125, 2.0, -1e7 + 3.0], [1e7, 2.25, -1e7], [0.0, 1.0, 0.0]);
         let lens = Lens::FieldOfView(30.0);
-        let look = Camera { view: View::LookAt { eye, target, up }, lens, near: 0.0, far: 0.0 };
-        let inverse = look.camera_from_world().try_inverse().expect("regular");
-        let pose = std::array::from_fn(|entry| inverse[(entry / 4, entry % 4)]);
+        let camera = Camera { view: View::LookAt { eye, target, up }, lens, near: 0.0, far: 0.0 };
+        let world_from_camera = camera.camera_from_world().try_inverse().expect("an invertible transform");
+        let pose = std::array::from_fn(|entry| world_from_camera[(entry / 4, entry % 4)]);
         let origin = [1e7, 0.0, -1e7];
-        let beside = View::LookAt { eye: [0.125, 2.0, 3.0], target: [0.0, 2.25, 0.0], up };
-        let want = Camera { view: beside, ..look }.camera_from_world();
-        let error = |camera: Camera| (camera.validated().expect("good").camera_from_world() - want).abs().max();
-        assert!(error(look.relative_to(origin)) < 1e-12);
-        assert!(error(Camera { view: View::Pose(pose), ..look }.relative_to(origin)) < 1e-7);
-        let rounded = View::Pose(pose.map(|number| f64::from(number as f32)));
-        assert!(error(Camera { view: rounded, ..look }.relative_to(origin)) > 0.05);
-        for bad in [f64::NAN, f64::INFINITY] {
+        let relative_view = View::LookAt { eye: [0.125, 2.0, 3.0], target: [0.0, 2.25, 0.0], up };
+        let expected = Camera { view: relative_view, ..camera }.camera_from_world();
+        let error = |candidate: Camera| {
+            (candidate.validated().expect("a valid camera").camera_from_world() - expected).abs().max()
+        };
+        assert!(error(camera.relative_to(origin)) < 1e-12);
+        assert!(error(Camera { view: View::Pose(pose), ..camera }.relative_to(origin)) < 1e-7);
+        let rounded_pose = View::Pose(pose.map(|number| f64::from(number as f32)));
+        assert!(error(Camera { view: rounded_pose, ..camera }.relative_to(origin)) > 0.05);
+        for entry in [f64::NAN, f64::INFINITY] {
             let mut pose = pose;
-            pose[7] = bad;
-            assert!(Camera { view: View::Pose(pose), ..look }.validated().is_err());
+            pose[7] = entry;
+            assert!(Camera { view: View::Pose(pose), ..camera }.validated().is_err());
         }
     }
 

@@ -1,5 +1,5 @@
-//! How a scene's modes are stored and its deformation computed: exact by default, with cheaper approximations on
-//! request.
+//! Settings of the deformation: how modes are stored, and which approximations and additional outputs are computed. The
+//! default has no approximations.
 
 use crate::error::{Result, invalid};
 
@@ -44,12 +44,12 @@ pub enum NormalMethod {
     Exact,
 }
 
-/// Options that trade accuracy for time, and additional outputs. The default is exact.
+/// Options that trade accuracy for time, and additional outputs.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
 pub struct DeformationSettings {
     pub storage: StorageType,
     pub normals: NormalMethod,
-    /// Error bound in meters: modes that together move no vertex by more than this distance are skipped.
+    /// Error bound in meters: the modes skipped in a step would together move no vertex by more than this distance.
     pub truncation: Option<f64>,
     /// Sum modes with error compensation. Useful for modes that nearly cancel.
     pub compensated: bool,
@@ -62,8 +62,8 @@ pub struct DeformationSettings {
 impl DeformationSettings {
     pub(super) fn check(&self) -> Result<()> {
         match self.truncation {
-            Some(budget) if !(budget.is_finite() && budget > 0.0) => {
-                Err(invalid("deform.truncation", "a positive number of metres", budget))
+            Some(meters) if !(meters.is_finite() && meters > 0.0) => {
+                Err(invalid("deform.truncation", "a positive number of meters", meters))
             }
             _ => Ok(()),
         }

@@ -1,5 +1,5 @@
-//! The features that a scene uses, computed once at load time. Kernels, shaders, passes and buffers are selected by
-//! these flags alone.
+//! The optional features that a scene uses, computed once at load time. These flags alone select kernels, shaders,
+//! passes and buffers.
 
 use super::{NormalMethod, SceneParts};
 use crate::domain::Domain;
@@ -7,7 +7,7 @@ use crate::domain::Domain;
 /// Feature flags of a scene. A feature is compiled, allocated and run only if its flag is set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 pub struct SceneFeatures {
-    /// Some domain has modes; without, u = U q is not computed.
+    /// Some domain has modes; requires u = U q.
     pub modes: bool,
     /// Some material has a color texture.
     pub textures: bool,
@@ -25,11 +25,11 @@ pub struct SceneFeatures {
     pub exact_normals: bool,
     /// Modes that are negligible at a step's q are skipped; requires lists of modes.
     pub truncation: bool,
-    /// Sums of modes are compensated (their rounding errors are accumulated).
+    /// Sums over modes are compensated: their rounding errors are accumulated and added.
     pub compensated: bool,
     /// Some domain follows another one by a constant frame; requires products of transforms.
     pub followers: bool,
-    /// Displacements are stored for every domain. Those of domains without modes are 0.
+    /// Displacements of all vertices are stored. Those of domains without modes are 0.
     pub displacements: bool,
     /// A bounding box of each domain is stored.
     pub boxes: bool,
@@ -37,19 +37,19 @@ pub struct SceneFeatures {
 
 impl SceneFeatures {
     pub(super) fn from_parts(parts: &SceneParts) -> Self {
-        // Options for modes cost nothing in a scene without modes.
+        // Without modes, all options that concern modes are off.
         let modes = parts.domains.iter().any(|domain| parts.shapes[domain.shape].modes.rank() > 0);
         Self {
             modes,
-            textures: parts.any_material(|material| material.color_texture.is_some()),
+            textures: parts.has_used_material(|material| material.color_texture.is_some()),
             normal_maps: parts.domains.iter().any(|domain| {
                 domain.materials().any(|material| parts.materials[material].normal_texture.is_some())
                     && !parts.shapes[domain.shape].tangents().is_empty()
             }),
-            mask: parts.any_mask(),
-            blend: parts.any_material(|material| material.alpha_mode == crate::domain::AlphaMode::Blend),
+            mask: parts.has_masked_material(),
+            blend: parts.has_used_material(|material| material.alpha_mode == crate::domain::AlphaMode::Blend),
             shadows: parts.look.shadow.is_some(),
-            shear: !parts.rigid_transforms || !parts.domains.iter().all(is_similar),
+            shear: !parts.rigid_transforms || !parts.domains.iter().all(has_similar_transforms),
             exact_normals: modes && parts.deformation.normals == NormalMethod::Exact,
             truncation: modes && parts.deformation.truncation.is_some(),
             compensated: modes && parts.deformation.compensated,
@@ -80,6 +80,6 @@ impl SceneFeatures {
 }
 
 /// Whether the placement of a domain and, for a follower, its frame are similarities (without shear).
-fn is_similar(domain: &Domain) -> bool {
+fn has_similar_transforms(domain: &Domain) -> bool {
     domain.placement.is_similarity() && domain.follows.is_none_or(|follow| follow.frame.is_similarity())
 }

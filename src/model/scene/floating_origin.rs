@@ -2,83 +2,90 @@
 //! away from the scene's origin.
 //!
 //! A domain's f32 transform, and every f32 position that a deformer computes with it, is relative to the domain's
-//! *cell*: a point at whole multiples of [`ORIGIN_GRID`] from the scene's origin. All domains within [`ORIGIN_REACH`] of the shared
-//! cell use the shared cell, so that one coordinate frame suffices to draw them. A domain outside has a cell of its
-//! own. When more than half of the domains are outside, the shared cell moves to them, and all transforms are rebased
-//! from the stored f64 translations.
+//! *floating origin*: a point at whole multiples of [`ORIGIN_GRID`] from the scene's origin. All domains within
+//! [`ORIGIN_REACH`] of the *shared origin* use it, so that one coordinate frame suffices to draw them. A domain outside
+//! (an *outlier*) has a floating origin of its own. When more than half of the domains are outliers, the shared origin
+//! moves to them, and all transforms are rebased from the stored f64 translations.
 //!
-//! Error bound per axis: rounding a translation contributes at most 2^-13 units at `ORIGIN_REACH`, and each of the three fused
-//! multiply-adds of x = A p + t at most 2^-12 units while the vertex is within 8192 units of its cell. In a scene of
-//! meters that is 0.86 mm. In a cell of its own, a translation is at most 512 units long, and the error of a vertex
-//! within 1024 units is at most 0.11 mm. The f32 rounding of A and p adds to this bound, independent of the domain's
-//! position.
+//! Error bound per axis: rounding a translation contributes at most 2^-13 units at `ORIGIN_REACH`. Each of the three
+//! fused multiply-adds of x = A p + t contributes at most 2^-12 units while the vertex is within 8192 units of its
+//! floating origin. In a scene of meters that is 0.86 mm. The translation of an outlier is at most 512 units per axis,
+//! and the error of its vertices within 1024 units is at most 0.11 mm. The f32 rounding of A and p adds to this bound,
+//! independent of the domain's position.
 //!
-//! A follower has no translation of its own: it uses the cell of its transform root. Where this module says "domain",
-//! it means a transform root; translations have the order of the roots' transforms.
+//! A follower has no translation of its own: it uses the floating origin of its transform root. Where this module says
+//! "domain", it means a transform root. Translations have the order of the roots' transforms.
 //!
-//! Cells exist only after the first step with f64 translations. Until then, the scene's origin is the cell of all
-//! domains.
+//! Floating origins exist only after the first step with f64 translations. Until then, all transforms are relative to
+//! the scene's origin.
 
 use super::{BoundingBox, Scene};
 use crate::domain::Transform;
 use crate::error::{Result, invalid};
 
-/// Spacing of cells in scene units. A power of two, so that their coordinates are exact in f64 and often in f32.
+/// Spacing of floating origins in scene units. A power of two, so that their coordinates are exact in f64 and often in
+/// f32.
 pub const ORIGIN_GRID: f64 = 1024.0;
 
-/// The largest distance, per axis and in scene units, between the shared cell and the translation of a domain that uses
-/// it. Beyond, the domain has a cell of its own.
+/// The largest distance, per axis and in scene units, between the shared origin and the translation of a domain that
+/// uses it.
 pub const ORIGIN_REACH: f64 = 4096.0;
 
-/// The cells of all transform roots of one state.
+/// The floating origins of all transform roots of one state.
 #[derive(Debug, Clone)]
 pub struct FloatingOrigins {
     /// Translation of each root in scene units from the scene's origin.
     translations: Vec<[f64; 3]>,
-    shared: [f64; 3],
-    /// Number of roots that have a cell of their own.
-    outliers: usize,
-    /// Number of translations set since the last search for a shared cell. A search is a pass over all domains; it is
+    shared_origin: [f64; 3],
+    /// Number of roots that have a floating origin of their own.
+    outlier_count: usize,
+    /// Number of translations set since the last search for a shared origin. A search is a pass over all domains. It is
     /// repeated only after as many translations as there are domains, so that its cost per translation is constant.
-    set: usize,
+    set_translation_count: usize,
 }
 
-/// Equality ignores the counters: equal cells and translations are enough.
+/// Equality ignores the counters.
 impl PartialEq for FloatingOrigins {
     fn eq(&self, other: &Self) -> bool {
-        self.shared == other.shared && self.translations == other.translations
+        self.shared_origin == other.shared_origin && self.translations == other.translations
     }
 }
 
 impl FloatingOrigins {
-    /// Cells of transforms that are relative to the scene's origin. [`Self::rebase_transform`] converts the transforms to their
-    /// cells.
-    pub(super) fn of(transforms: &[Transform]) -> Self {
+    /// Floating origins for transforms that are relative to the scene's origin. [`Self::rebase_transform`] makes the
+    /// transforms relative to these floating origins.
+    pub(super) fn from_transforms(transforms: &[Transform]) -> Self {
         Self::with_shared_origin([0.0; 3], transforms.iter().map(|transform| transform.translation().into()).collect())
     }
 
-    fn with_shared_origin(shared: [f64; 3], translations: Vec<[f64; 3]>) -> Self {
-        let outliers = translations.iter().filter(|translation| is_out_of_reach(shared, **translation)).count();
-        Self { shared, outliers, set: translations.len(), translations }
+    fn with_shared_origin(shared_origin: [f64; 3], translations: Vec<[f64; 3]>) -> Self {
+        let outlier_count =
+            translations.iter().filter(|translation| is_beyond_reach(shared_origin, **translation)).count();
+        Self { shared_origin, outlier_count, set_translation_count: translations.len(), translations }
     }
 
-    /// Restores cells from the stored values of [`Self::shared`] and [`Self::translations`].
+    /// Restores floating origins from the stored values of [`Self::shared_origin`] and [`Self::translations`].
     ///
     /// # Errors
-    /// `Invalid` if the shared cell is not on the grid or a translation is not finite.
-    pub fn restore(shared: [f64; 3], translations: Vec<[f64; 3]>) -> Result<Self> {
-        if shared != snap_to_origin_grid(shared) || !shared.iter().all(|number| number.is_finite()) {
-            return Err(invalid("cells.shared", format!("multiples of {ORIGIN_GRID}"), format!("{shared:?}")));
+    /// `Invalid` if the shared origin is not on the grid or a translation is not finite.
+    pub fn restore(shared_origin: [f64; 3], translations: Vec<[f64; 3]>) -> Result<Self> {
+        if shared_origin != snap_to_origin_grid(shared_origin) || !shared_origin.iter().all(|number| number.is_finite())
+        {
+            return Err(invalid("origins.shared", format!("multiples of {ORIGIN_GRID}"), format!("{shared_origin:?}")));
         }
         match translations.iter().position(|translation| !translation.iter().all(|number| number.is_finite())) {
-            None => Ok(Self::with_shared_origin(shared, translations)),
-            Some(at) => Err(invalid(format!("cells.translations[{at}]"), "finite numbers", "others")),
+            None => Ok(Self::with_shared_origin(shared_origin, translations)),
+            Some(index) => Err(invalid(
+                format!("origins.translations[{index}]"),
+                "finite numbers",
+                format!("{:?}", translations[index]),
+            )),
         }
     }
 
-    /// The cell of all domains without a cell of their own, in scene units from the scene's origin.
-    pub const fn shared(&self) -> [f64; 3] {
-        self.shared
+    /// The floating origin of all domains that are not outliers, in scene units from the scene's origin.
+    pub const fn shared_origin(&self) -> [f64; 3] {
+        self.shared_origin
     }
 
     /// Translation of each root in scene units from the scene's origin.
@@ -86,94 +93,101 @@ impl FloatingOrigins {
         &self.translations
     }
 
-    /// Whether all domains use the shared cell.
+    /// Whether all domains use the shared origin.
     pub const fn is_uniform(&self) -> bool {
-        self.outliers == 0
+        self.outlier_count == 0
     }
 
-    /// The cell of a root and its followers, in scene units from the scene's origin.
-    pub fn origin_of(&self, mover: usize) -> [f64; 3] {
-        let translation = self.translations[mover];
-        if is_out_of_reach(self.shared, translation) { snap_to_origin_grid(translation) } else { self.shared }
+    /// The floating origin of a root and its followers, in scene units from the scene's origin.
+    pub fn origin_of(&self, root: usize) -> [f64; 3] {
+        let translation = self.translations[root];
+        if is_beyond_reach(self.shared_origin, translation) {
+            snap_to_origin_grid(translation)
+        } else {
+            self.shared_origin
+        }
     }
 
-    /// Replaces the translation of `transform` by the root's translation relative to its cell, rounded once.
-    pub(super) fn rebase_transform(&self, mover: usize, mut transform: Transform) -> Transform {
-        let own = difference(self.translations[mover], self.origin_of(mover));
-        for (row, along) in transform.0.chunks_exact_mut(4).zip(own) {
-            row[3] = along as f32;
+    /// Replaces the translation of `transform` by the root's translation relative to its floating origin, rounded once.
+    pub(super) fn rebase_transform(&self, root: usize, mut transform: Transform) -> Transform {
+        let relative_translation = subtract(self.translations[root], self.origin_of(root));
+        for (row, coordinate) in transform.0.chunks_exact_mut(4).zip(relative_translation) {
+            row[3] = coordinate as f32;
         }
         transform
     }
 
     /// Sets the translation of a root, in scene units from the scene's origin.
-    pub(super) fn set(&mut self, mover: usize, translation: [f64; 3]) {
-        let (shared, kept) = (self.shared, &mut self.translations[mover]);
-        self.outliers -= usize::from(is_out_of_reach(shared, *kept));
-        *kept = translation;
-        self.outliers += usize::from(is_out_of_reach(shared, translation));
-        self.set = self.set.saturating_add(1);
+    pub(super) fn set_translation(&mut self, root: usize, translation: [f64; 3]) {
+        let (shared_origin, stored) = (self.shared_origin, &mut self.translations[root]);
+        self.outlier_count -= usize::from(is_beyond_reach(shared_origin, *stored));
+        *stored = translation;
+        self.outlier_count += usize::from(is_beyond_reach(shared_origin, translation));
+        self.set_translation_count = self.set_translation_count.saturating_add(1);
     }
 
-    /// Moves the shared cell if more than half of the domains are outside its reach, as many translations were set
-    /// since the last attempt as there are domains, and the move leaves fewer domains outside. If this returns true,
-    /// the caller must rebase every transform by [`Self::rebase_transform`]. The new cell is the one nearest to the per-axis
-    /// median, which, unlike the centroid, is robust to a few very distant domains.
+    /// Moves the shared origin under three conditions: more than half of the domains are outliers, at least as many
+    /// translations were set since the last search as there are domains, and the move reduces the number of outliers.
+    /// The new shared origin is the grid point nearest to the per-axis median, which is robust to a few very distant
+    /// domains. If this function returns true, the caller must call [`Self::rebase_transform`] for every transform.
     pub(super) fn update_shared_origin(&mut self) -> bool {
         let count = self.translations.len();
-        if 2 * self.outliers <= count || self.set < count {
+        if 2 * self.outlier_count <= count || self.set_translation_count < count {
             return false;
         }
-        self.set = 0;
-        let median = |axis: usize| {
-            let mut along: Vec<f64> = self.translations.iter().map(|translation| translation[axis]).collect();
-            *along.select_nth_unstable_by(count / 2, f64::total_cmp).1
+        self.set_translation_count = 0;
+        let median_along = |axis: usize| {
+            let mut coordinates: Vec<f64> = self.translations.iter().map(|translation| translation[axis]).collect();
+            *coordinates.select_nth_unstable_by(count / 2, f64::total_cmp).1
         };
-        let shared = snap_to_origin_grid([0, 1, 2].map(median));
-        let outliers = self.translations.iter().filter(|translation| is_out_of_reach(shared, **translation)).count();
-        let nearer = outliers < self.outliers;
-        if nearer {
-            (self.shared, self.outliers) = (shared, outliers);
+        let shared_origin = snap_to_origin_grid([0, 1, 2].map(median_along));
+        let outlier_count =
+            self.translations.iter().filter(|translation| is_beyond_reach(shared_origin, **translation)).count();
+        let is_improvement = outlier_count < self.outlier_count;
+        if is_improvement {
+            (self.shared_origin, self.outlier_count) = (shared_origin, outlier_count);
         }
-        nearer
+        is_improvement
     }
 
-    /// Rebases positions from their domains' cells to `view`, a point in scene units from the scene's origin: computed
-    /// in f64, rounded to f32 once. `positions` has three numbers per vertex in layout order. Also returns the bounds
-    /// of the domains that are near `view` compared with the nearest one; bounds of much more distant domains would say
-    /// nothing about the visible ones.
+    /// Rebases positions from the floating origins of their domains to `view`, a point in scene units from the scene's
+    /// origin. The result is computed in f64 and rounded to f32 once. `positions` has three numbers per vertex in
+    /// layout order. Also returns the bounds of the domains that are not much farther from `view` than the nearest one.
+    /// Much more distant domains are excluded, because they would make the bounds too large to fit a camera or shadow
+    /// map to.
     pub fn rebase_positions(&self, view: [f64; 3], scene: &Scene, positions: &[f32]) -> (Vec<f32>, BoundingBox) {
-        let slots = &scene.layout.domains;
-        let offset = |domain| difference(self.origin_of(scene.transform_roots.root_of(domain)), view);
-        let offsets: Vec<[f64; 3]> = (0..slots.len()).map(offset).collect();
-        let distance = |offset: &[f64; 3]| offset.iter().fold(0.0, |most: f64, along| most.max(along.abs()));
+        let layouts = &scene.layout.domains;
+        let offset = |domain| subtract(self.origin_of(scene.transform_roots.root_of(domain)), view);
+        let offsets: Vec<[f64; 3]> = (0..layouts.len()).map(offset).collect();
+        let distance =
+            |offset: &[f64; 3]| offset.iter().fold(0.0, |largest: f64, coordinate| largest.max(coordinate.abs()));
         let nearest = offsets.iter().map(distance).fold(f64::INFINITY, f64::min);
-        let mut seen = Vec::with_capacity(positions.len());
+        let mut rebased = Vec::with_capacity(positions.len());
         let mut bounds = BoundingBox::EMPTY;
-        for (slot, offset) in slots.iter().zip(&offsets) {
+        for (layout, offset) in layouts.iter().zip(&offsets) {
             let is_near = distance(offset) <= ORIGIN_REACH + 4.0 * nearest;
-            let own = &positions[3 * slot.first_vertex..][..3 * slot.vertices];
-            for point in own.chunks_exact(3) {
+            let domain_positions = &positions[3 * layout.first_vertex..][..3 * layout.vertices];
+            for point in domain_positions.chunks_exact(3) {
                 let point: [f64; 3] = std::array::from_fn(|axis| f64::from(point[axis]) + offset[axis]);
-                seen.extend(point.map(|number| number as f32));
+                rebased.extend(point.map(|number| number as f32));
                 if is_near {
                     bounds.include(point);
                 }
             }
         }
-        (seen, bounds)
+        (rebased, bounds)
     }
 }
 
-/// The cell nearest to a point.
+/// The possible floating origin nearest to a point.
 pub fn snap_to_origin_grid(point: [f64; 3]) -> [f64; 3] {
-    point.map(|along| (along / ORIGIN_GRID).round() * ORIGIN_GRID)
+    point.map(|coordinate| (coordinate / ORIGIN_GRID).round() * ORIGIN_GRID)
 }
 
-fn difference(to: [f64; 3], from: [f64; 3]) -> [f64; 3] {
-    std::array::from_fn(|axis| to[axis] - from[axis])
+fn subtract(minuend: [f64; 3], subtrahend: [f64; 3]) -> [f64; 3] {
+    std::array::from_fn(|axis| minuend[axis] - subtrahend[axis])
 }
 
-fn is_out_of_reach(shared: [f64; 3], translation: [f64; 3]) -> bool {
-    difference(translation, shared).iter().any(|along| along.abs() > ORIGIN_REACH)
+fn is_beyond_reach(shared_origin: [f64; 3], translation: [f64; 3]) -> bool {
+    subtract(translation, shared_origin).iter().any(|coordinate| coordinate.abs() > ORIGIN_REACH)
 }

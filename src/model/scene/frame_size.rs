@@ -1,11 +1,11 @@
-//! The size of a frame in pixels.
+//! The size of a frame, and its text format.
 
 use std::fmt;
 use std::str::FromStr;
 
 use crate::error::{Error, Result, invalid};
 
-/// Width and height of a frame in pixels. Each renderer checks its own limits.
+/// Width and height of a frame in pixels. Any value is valid here, because each renderer has its own limits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FrameSize {
     pub width: u32,
@@ -48,11 +48,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sizes_are_two_numbers_and_an_x() {
+    fn parses_two_numbers_separated_by_an_x() {
         assert_eq!("1280x720".parse::<FrameSize>(), Ok(FrameSize::new(1280, 720)));
         assert_eq!(FrameSize::new(1280, 720).to_string(), "1280x720");
-        for wrong in ["1280", "1280x", "x720", "1280x-1", "1280 x 720", "1x2x3"] {
-            assert!(wrong.parse::<FrameSize>().is_err(), "{wrong}");
+        for text in ["1280", "1280x", "x720", "1280x-1", "1280 x 720", "1x2x3"] {
+            assert!(text.parse::<FrameSize>().is_err(), "expected {text} to be rejected");
         }
     }
 }

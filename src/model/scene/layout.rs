@@ -1,4 +1,5 @@
-//! The layout of a scene's packed buffers: where the vertices, corners, triangles and coordinates of each domain begin.
+//! The layout of a scene's packed buffers: the ranges of the vertices, corners, triangles and coordinates of each
+//! domain.
 
 use std::collections::BTreeMap;
 
@@ -48,34 +49,38 @@ impl Layout {
         for (index, domain) in domains.iter().enumerate() {
             let shape = &shapes[domain.shape];
             let rank = shape.modes.rank();
-            let shared = domain.shares_q_with.map(|twin| layout.domains[twin].first_q);
-            let slot = DomainLayout {
+            let shared_first_q = domain.shares_q_with.map(|twin| layout.domains[twin].first_q);
+            let domain_layout = DomainLayout {
                 first_vertex: layout.vertices,
                 vertices: shape.mesh.rest_positions().len(),
                 first_corner: layout.corners,
                 corners: shape.mesh.corners().vertices.len(),
                 first_triangle: layout.triangles,
                 triangles: shape.mesh.triangles().len(),
-                first_q: shared.unwrap_or(layout.coordinates),
+                first_q: shared_first_q.unwrap_or(layout.coordinates),
                 rank,
             };
-            layout.vertices += slot.vertices;
-            layout.corners += slot.corners;
-            layout.triangles += slot.triangles;
-            layout.coordinates += if shared.is_some() { 0 } else { rank };
+            layout.vertices += domain_layout.vertices;
+            layout.corners += domain_layout.corners;
+            layout.triangles += domain_layout.triangles;
+            layout.coordinates += if shared_first_q.is_some() { 0 } else { rank };
             if let Some(twin) = domain.shares_q_with.filter(|_| rank > 0) {
-                // Only the owner of the coordinates inserts itself: a twin of a twin finds an existing list.
-                layout.domains_sharing_q.entry(slot.first_q).or_insert_with(|| vec![twin as u32]).push(index as u32);
+                // The list begins with the domain that owns the coordinates. If `twin` shares them too, the list exists.
+                layout
+                    .domains_sharing_q
+                    .entry(domain_layout.first_q)
+                    .or_insert_with(|| vec![twin as u32])
+                    .push(index as u32);
             }
-            layout.domains.push(slot);
+            layout.domains.push(domain_layout);
         }
-        // Device indices have 32 bits and address three numbers per vertex and corner.
-        let largest = layout.vertices.max(layout.corners).max(layout.triangles);
-        if largest > (u32::MAX / 4) as usize {
+        // Device indices have 32 bits and address up to four numbers per vertex and corner.
+        let largest_count = layout.vertices.max(layout.corners).max(layout.triangles);
+        if largest_count > (u32::MAX / 4) as usize {
             return Err(invalid(
                 "scene.size",
                 format!("at most {} vertices, corners and triangles", u32::MAX / 4),
-                largest,
+                largest_count,
             ));
         }
         Ok(layout)

@@ -1,7 +1,7 @@
-//! A scene: an immutable set of domains that one simulation drives, and the state that its steps change.
+//! A scene: an immutable set of domains that one simulation drives. [`SceneState`] is the part that steps change.
 //!
-//! All domains share packed buffers. [`Layout`] stores where the vertices, corners, triangles and coordinates of each
-//! domain begin; every deformer and the renderer use it.
+//! The data of all domains is packed into shared buffers. [`Layout`] stores where the vertices, corners, triangles and
+//! coordinates of each domain begin.
 
 mod camera;
 mod deformation;
@@ -46,9 +46,11 @@ use crate::error::{Result, invalid};
 /// The largest number of domains in a scene.
 pub const MAX_DOMAINS: usize = 1 << 20;
 
-/// The most bytes of a domain's name, and of all its notes together. The limits keep the description of a domain within
-/// one message.
+/// The largest size of a domain's name. With [`MAX_NOTES_BYTES`] and [`MAX_ATTACHMENT_ROWS`], it keeps the description
+/// of a domain within one gRPC message.
 const MAX_NAME_BYTES: usize = 4 << 10;
+
+/// The largest size of all notes of a domain together, names included.
 const MAX_NOTES_BYTES: usize = 64 << 10;
 
 /// The largest number of parent vertices that define an attachment frame.
@@ -65,7 +67,7 @@ pub struct SceneParts {
     pub up: UpAxis,
     /// Meters per scene unit.
     pub unit: f64,
-    /// World position, in meters, of the frame in which all transforms are given.
+    /// World position of the scene's origin in meters. Transforms are relative to the scene's origin.
     pub origin: [f64; 3],
     pub look: RenderSettings,
     pub deformation: DeformationSettings,
@@ -75,7 +77,7 @@ pub struct SceneParts {
     pub remarks: Vec<String>,
 }
 
-/// A validated scene. Immutable, and shared through `Arc`.
+/// A validated, immutable scene. Fields without a comment are those of [`SceneParts`].
 #[derive(Debug)]
 pub struct Scene {
     pub name: String,
@@ -99,7 +101,7 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// The parts of which this scene was built, for building a modified scene.
+    /// Copies the parts of this scene, for building a modified scene.
     pub fn parts(&self) -> SceneParts {
         SceneParts {
             name: self.name.clone(),
@@ -117,16 +119,17 @@ impl Scene {
         }
     }
 
-    /// Validates all references between the parts, and computes the layout, feature flags, tangents and rest bounds.
+    /// Builds a scene: validates all references between the parts, and computes the layout, features, tangents and rest
+    /// bounds.
     ///
     /// # Errors
-    /// `Invalid` with the domain and the field.
+    /// `Invalid` with the field and, for a field of a domain, the index of the domain.
     pub fn new(mut parts: SceneParts) -> Result<Arc<Self>> {
         if parts.domains.is_empty() || parts.domains.len() > MAX_DOMAINS {
             return Err(invalid("scene.domains", format!("1 to {MAX_DOMAINS}"), parts.domains.len()));
         }
         if !(parts.unit.is_finite() && parts.unit > 0.0) {
-            return Err(invalid("scene.unit", "a positive number of metres", parts.unit));
+            return Err(invalid("scene.unit", "a positive number of meters", parts.unit));
         }
         if !parts.origin.iter().all(|number| number.is_finite()) {
             return Err(invalid("scene.origin", "finite numbers", format!("{:?}", parts.origin)));
@@ -164,18 +167,18 @@ impl Scene {
             features,
             rest_bounds: BoundingBox::EMPTY,
         };
-        scene.rest_bounds = scene.bounds_at_rest();
+        scene.rest_bounds = scene.compute_rest_bounds();
         Ok(Arc::new(scene))
     }
 
     /// The packed vertex indices of each triangle, in layout order.
     pub fn triangle_vertices(&self) -> Vec<[u32; 3]> {
-        let of_domain = |domain: usize| {
-            let (mesh, first) = (&self.shape_of(domain).mesh, self.layout.domains[domain].first_vertex as u32);
+        let vertices_of_domain = |domain: usize| {
+            let (mesh, first_vertex) = (&self.shape_of(domain).mesh, self.layout.domains[domain].first_vertex as u32);
             let vertices = &mesh.corners().vertices;
-            mesh.triangles().iter().map(move |corners| corners.map(|corner| first + vertices[corner as usize]))
+            mesh.triangles().iter().map(move |corners| corners.map(|corner| first_vertex + vertices[corner as usize]))
         };
-        (0..self.domains.len()).flat_map(of_domain).collect()
+        (0..self.domains.len()).flat_map(vertices_of_domain).collect()
     }
 
     /// The shape of a domain.
@@ -193,13 +196,13 @@ impl Scene {
         self.domains.iter().position(|domain| domain.name == name)
     }
 
-    fn bounds_at_rest(&self) -> BoundingBox {
+    fn compute_rest_bounds(&self) -> BoundingBox {
         let mut bounds = BoundingBox::EMPTY;
         for domain in &self.domains {
-            let place = domain.placement.to_matrix();
+            let world_from_domain = domain.placement.to_matrix();
             for position in self.shapes[domain.shape].mesh.rest_positions() {
-                let world = place.transform_point(&nalgebra::Point3::from(*position).cast());
-                bounds.include(world.coords.into());
+                let world_position = world_from_domain.transform_point(&nalgebra::Point3::from(*position).cast());
+                bounds.include(world_position.coords.into());
             }
         }
         bounds
@@ -220,17 +223,17 @@ fn check_textures(parts: &SceneParts) -> Result<()> {
 
 fn check_domain(parts: &SceneParts, index: usize) -> Result<()> {
     let domain = &parts.domains[index];
-    let below = |field: &str, given: usize, limit: usize| match given < limit {
+    let check_index = |field: &str, given: usize, limit: usize| match given < limit {
         true => Ok(()),
         false => Err(invalid(field, format!("an index below {limit}"), given)),
     };
-    below("shape", domain.shape, parts.shapes.len())?;
-    below("material", domain.material, parts.materials.len())?;
-    check_runs(parts, domain)?;
-    check_texts(domain)?;
-    if let Some(follow) = &domain.follows {
-        below("follows.parent", follow.parent, index)?;
-        crate::domain::Transform::new(follow.frame.0).map_err(|error| error.prefix_field("follows.frame"))?;
+    check_index("shape", domain.shape, parts.shapes.len())?;
+    check_index("material", domain.material, parts.materials.len())?;
+    check_material_ranges(parts, domain)?;
+    check_text_sizes(domain)?;
+    if let Some(constraint) = &domain.follows {
+        check_index("follows.parent", constraint.parent, index)?;
+        crate::domain::Transform::new(constraint.frame.0).map_err(|error| error.prefix_field("follows.frame"))?;
     }
     let rank = parts.shapes[domain.shape].modes.rank();
     crate::domain::Transform::new(domain.placement.0).map_err(|error| error.prefix_field("placement"))?;
@@ -241,28 +244,28 @@ fn check_domain(parts: &SceneParts, index: usize) -> Result<()> {
         return Err(invalid("rest_q", "finite numbers", format!("{:?}", domain.rest_q)));
     }
     if let Some(twin) = domain.shares_q_with {
-        below("shares_q_with", twin, index)?;
-        let theirs = parts.shapes[parts.domains[twin].shape].modes.rank();
-        if theirs != rank {
-            return Err(invalid("shares_q_with", format!("a domain of rank {rank}"), theirs));
+        check_index("shares_q_with", twin, index)?;
+        let twin_rank = parts.shapes[parts.domains[twin].shape].modes.rank();
+        if twin_rank != rank {
+            return Err(invalid("shares_q_with", format!("a domain of rank {rank}"), twin_rank));
         }
     }
     if let Some(attachment) = &domain.attachment {
-        // A parent must precede its children: the hierarchy then has no cycle, and one pass in order composes it.
-        below("parent", attachment.parent, index)?;
+        // A parent precedes its children, so that the hierarchy has no cycles and one pass in order can compose it.
+        check_index("parent", attachment.parent, index)?;
         let vertices = parts.shapes[parts.domains[attachment.parent].shape].mesh.rest_positions().len();
         if attachment.rows.len() > MAX_ATTACHMENT_ROWS {
             let expected = format!("at most {MAX_ATTACHMENT_ROWS} vertices");
             return Err(invalid("attachment.rows", expected, attachment.rows.len()));
         }
         for row in &attachment.rows {
-            below("attachment.rows", *row as usize, vertices)?;
+            check_index("attachment.rows", *row as usize, vertices)?;
         }
     }
     Ok(())
 }
 
-fn check_texts(domain: &Domain) -> Result<()> {
+fn check_text_sizes(domain: &Domain) -> Result<()> {
     if domain.name.len() > MAX_NAME_BYTES {
         return Err(invalid("name", format!("at most {MAX_NAME_BYTES} bytes"), domain.name.len()));
     }
@@ -273,72 +276,72 @@ fn check_texts(domain: &Domain) -> Result<()> {
     Ok(())
 }
 
-fn check_runs(parts: &SceneParts, domain: &Domain) -> Result<()> {
-    let triangles = parts.shapes[domain.shape].mesh.triangles().len();
-    for (index, run) in domain.material_ranges.iter().enumerate() {
-        let before = index.checked_sub(1).map(|before| domain.material_ranges[before].first_triangle);
-        let in_order = before.map_or(run.first_triangle == 0, |before| run.first_triangle > before);
-        if !in_order || run.first_triangle >= triangles {
-            let expected = format!("0 for the first, then ascending, below {triangles}");
-            return Err(invalid(format!("runs[{index}].first_triangle"), expected, run.first_triangle));
+fn check_material_ranges(parts: &SceneParts, domain: &Domain) -> Result<()> {
+    let triangle_count = parts.shapes[domain.shape].mesh.triangles().len();
+    for (index, range) in domain.material_ranges.iter().enumerate() {
+        let previous_start = index.checked_sub(1).map(|previous| domain.material_ranges[previous].first_triangle);
+        let is_ascending = previous_start.map_or(range.first_triangle == 0, |start| range.first_triangle > start);
+        if !is_ascending || range.first_triangle >= triangle_count {
+            let expected = format!("0 for the first range, then ascending, below {triangle_count}");
+            return Err(invalid(format!("material_ranges[{index}].first_triangle"), expected, range.first_triangle));
         }
-        if run.material >= parts.materials.len() {
+        if range.material >= parts.materials.len() {
             let expected = format!("an index below {}", parts.materials.len());
-            return Err(invalid(format!("runs[{index}].material"), expected, run.material));
+            return Err(invalid(format!("material_ranges[{index}].material"), expected, range.material));
         }
     }
     Ok(())
 }
 
-/// Removes textures from shapes without texture coordinates, where they would show one texel everywhere. Affected
-/// domains get an untextured copy of their material, and a remark is recorded.
+/// Replaces the materials of domains without texture coordinates by untextured copies, because a texture would show the
+/// same texel everywhere. Each replaced material adds a remark.
 fn drop_textures_without_uvs(parts: &mut SceneParts) {
-    let mut copies: BTreeMap<usize, usize> = BTreeMap::new();
+    let mut untextured_materials: BTreeMap<usize, usize> = BTreeMap::new();
     let SceneParts { shapes, materials, domains, remarks, .. } = parts;
     for domain in domains.iter_mut().filter(|domain| shapes[domain.shape].mesh.corners().uvs.is_empty()) {
-        let material_ranges = domain.material_ranges.iter_mut().map(|run| &mut run.material);
-        for material in std::iter::once(&mut domain.material).chain(material_ranges) {
-            let textured = &materials[*material];
-            if textured.color_texture.is_none() && textured.normal_texture.is_none() {
+        let material_ranges = domain.material_ranges.iter_mut().map(|range| &mut range.material);
+        for material_index in std::iter::once(&mut domain.material).chain(material_ranges) {
+            let material = &materials[*material_index];
+            if material.color_texture.is_none() && material.normal_texture.is_none() {
                 continue;
             }
-            let textured = textured.clone();
-            *material = *copies.entry(*material).or_insert_with(|| {
-                let name = &textured.name;
+            let material = material.clone();
+            *material_index = *untextured_materials.entry(*material_index).or_insert_with(|| {
+                let name = &material.name;
                 remarks.push(format!("textures of material '{name}' left out where there are no texture coordinates"));
-                let alpha_mode = match textured.alpha_mode {
-                    AlphaMode::Mask { cutoff } if textured.alpha >= cutoff => AlphaMode::Opaque,
-                    kept => kept,
+                let alpha_mode = match material.alpha_mode {
+                    AlphaMode::Mask { cutoff } if material.alpha >= cutoff => AlphaMode::Opaque,
+                    alpha_mode => alpha_mode,
                 };
-                let plain = Material { color_texture: None, normal_texture: None, alpha_mode, ..textured };
-                materials.push(plain);
+                let untextured = Material { color_texture: None, normal_texture: None, alpha_mode, ..material };
+                materials.push(untextured);
                 materials.len() - 1
             });
         }
     }
 }
 
-/// Computes tangents of shapes that are used with a normal map.
+/// Computes the tangents of shapes that have texture coordinates and are used with a normal map.
 fn add_tangents(parts: &mut SceneParts) {
     for domain in &parts.domains {
         let shape = &mut parts.shapes[domain.shape];
-        let mapped = domain.materials().any(|material| parts.materials[material].normal_texture.is_some());
-        if mapped && !shape.mesh.corners().uvs.is_empty() {
+        let has_normal_map = domain.materials().any(|material| parts.materials[material].normal_texture.is_some());
+        if has_normal_map && !shape.mesh.corners().uvs.is_empty() {
             shape.add_tangents();
         }
     }
 }
 
-/// Computes smoothing groups of shapes with modes. Normals of rigid shapes only rotate with their domain.
+/// Computes the smoothing groups of shapes with modes. Rest normals suffice for shapes without modes.
 fn add_smoothing(parts: &mut SceneParts) -> Result<()> {
-    let mut triangles = 0;
+    let mut triangle_count = 0;
     for domain in &parts.domains {
         let shape = &mut parts.shapes[domain.shape];
         if shape.modes.rank() > 0 && shape.smoothing().is_none() {
-            triangles += shape.mesh.triangles().len();
-            if triangles > MAX_RING_TRIANGLES {
+            triangle_count += shape.mesh.triangles().len();
+            if triangle_count > MAX_RING_TRIANGLES {
                 let expected = format!("at most {MAX_RING_TRIANGLES} triangles of shapes with modes");
-                return Err(invalid("deform.normals", expected, triangles));
+                return Err(invalid("deform.normals", expected, triangle_count));
             }
             shape.add_smoothing();
         }
@@ -347,18 +350,18 @@ fn add_smoothing(parts: &mut SceneParts) -> Result<()> {
 }
 
 impl SceneParts {
-    /// Empty parts with default conventions: meters, origin at zero, default look.
+    /// Parts without domains, with meters as unit and default settings.
     pub fn named(name: impl Into<String>) -> Self {
         Self { name: name.into(), unit: 1.0, ..Self::default() }
     }
 
-    /// Whether `has` holds for a material of any domain.
-    pub(crate) fn any_material(&self, has: impl Fn(&Material) -> bool) -> bool {
-        self.domains.iter().flat_map(Domain::materials).any(|material| has(&self.materials[material]))
+    /// Whether the predicate holds for a material of any domain.
+    pub(crate) fn has_used_material(&self, predicate: impl Fn(&Material) -> bool) -> bool {
+        self.domains.iter().flat_map(Domain::materials).any(|material| predicate(&self.materials[material]))
     }
 
-    pub(crate) fn any_mask(&self) -> bool {
-        self.any_material(|material| matches!(material.alpha_mode, AlphaMode::Mask { .. }))
+    pub(crate) fn has_masked_material(&self) -> bool {
+        self.has_used_material(|material| matches!(material.alpha_mode, AlphaMode::Mask { .. }))
     }
 }
 
@@ -369,9 +372,9 @@ mod tests {
 
     /// One domain of two triangles, with an opaque and a blended material.
     fn square(material_ranges: Vec<MaterialRange>) -> SceneParts {
-        let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
-        let mesh =
-            Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
+        let rest_positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+        let mesh = Mesh::from_indexed(rest_positions, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
+            .expect("a square");
         let domain = Domain {
             name: "square".into(),
             shape: 0,
@@ -392,67 +395,73 @@ mod tests {
     }
 
     #[test]
-    fn a_texture_that_has_no_place_is_left_out_with_a_remark_and_one_that_has_stays() {
-        let textured = || {
+    fn textures_without_uvs_are_dropped_with_a_remark() {
+        let textured_parts = || {
             let mut parts = square(vec![]);
             parts.textures = vec![Texture::new("leaf", 1, 1, vec![0; 4]).expect("a texture")];
             parts.materials[0].color_texture = Some(0);
             parts.materials[0].alpha_mode = AlphaMode::Mask { cutoff: 0.5 };
             parts
         };
-        let scene = Scene::new(textured()).expect("a scene");
-        let shown = &scene.materials[scene.domains[0].material];
-        assert_eq!((shown.color_texture, shown.alpha_mode), (None, AlphaMode::Opaque));
+        let scene = Scene::new(textured_parts()).expect("a scene");
+        let material = &scene.materials[scene.domains[0].material];
+        assert_eq!((material.color_texture, material.alpha_mode), (None, AlphaMode::Opaque));
         assert!(!scene.features.textures && !scene.features.mask);
         assert!(scene.remarks[0].contains("no texture coordinates"), "{:?}", scene.remarks);
-        let mut placed = textured();
-        let mesh = &placed.shapes[0].mesh;
+        let mut parts_with_uvs = textured_parts();
+        let mesh = &parts_with_uvs.shapes[0].mesh;
         let corners = mesh.corners().clone();
         let uvs = vec![[0.0, 0.0]; 4];
         let mesh = Mesh::from_indexed(mesh.rest_positions().to_vec(), corners.normals, uvs, mesh.triangles().to_vec());
-        placed.shapes[0] = Shape::new(mesh.expect("a square"), Modes::rigid()).expect("rigid");
-        let scene = Scene::new(placed).expect("a scene");
+        parts_with_uvs.shapes[0] = Shape::new(mesh.expect("a square"), Modes::rigid()).expect("rigid");
+        let scene = Scene::new(parts_with_uvs).expect("a scene");
         assert!(scene.features.textures && scene.features.mask && scene.remarks.is_empty());
     }
 
-    fn run(first_triangle: usize, material: usize) -> MaterialRange {
+    fn material_range(first_triangle: usize, material: usize) -> MaterialRange {
         MaterialRange { first_triangle, material }
     }
 
     #[test]
-    fn a_material_of_any_run_counts_for_what_the_scene_needs() {
-        assert!(Scene::new(square(vec![run(0, 0), run(1, 1)])).expect("good").features.blend);
-        assert!(!Scene::new(square(vec![])).expect("good").features.blend, "the second material is unused");
+    fn features_include_materials_of_all_ranges() {
+        assert!(
+            Scene::new(square(vec![material_range(0, 0), material_range(1, 1)])).expect("a valid scene").features.blend
+        );
+        assert!(
+            !Scene::new(square(vec![])).expect("a valid scene").features.blend,
+            "expected an unused material to be ignored"
+        );
     }
 
     #[test]
-    fn names_notes_and_attachments_that_no_description_could_carry_are_refused_by_name() {
-        let with = |name: usize, note: usize, rows: usize| {
+    fn oversized_names_notes_and_attachments_are_rejected() {
+        let build_scene = |name_bytes: usize, notes_bytes: usize, row_count: usize| {
             let mut parts = square(vec![]);
-            let mut second = parts.domains[0].clone();
-            second.name = "x".repeat(name);
-            second.metadata.notes = [("a".into(), "x".repeat(note - 3)), ("b".into(), "y".into())].into();
-            second.attachment = Some(Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![3; rows] });
-            parts.domains.push(second);
+            let mut domain = parts.domains[0].clone();
+            domain.name = "x".repeat(name_bytes);
+            domain.metadata.notes = [("a".into(), "x".repeat(notes_bytes - 3)), ("b".into(), "y".into())].into();
+            domain.attachment = Some(Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![3; row_count] });
+            parts.domains.push(domain);
             Scene::new(parts).map(drop).map_err(|error| error.to_string())
         };
-        assert_eq!(with(4096, 65536, 4096), Ok(()));
-        let refusal = |field, most, given| Err(format!("domain 1: {field}: expected at most {most}, got {given}"));
-        assert_eq!(with(4097, 65536, 4096), refusal("name", "4096 bytes", 4097));
-        assert_eq!(with(4096, 65537, 4096), refusal("notes", "65536 bytes in all", 65537));
-        assert_eq!(with(4096, 65536, 4097), refusal("attachment.rows", "4096 vertices", 4097));
+        assert_eq!(build_scene(4096, 65536, 4096), Ok(()));
+        let rejection =
+            |field, limit, actual| Err(format!("domain 1: {field}: expected at most {limit}, got {actual}"));
+        assert_eq!(build_scene(4097, 65536, 4096), rejection("name", "4096 bytes", 4097));
+        assert_eq!(build_scene(4096, 65537, 4096), rejection("notes", "65536 bytes in all", 65537));
+        assert_eq!(build_scene(4096, 65536, 4097), rejection("attachment.rows", "4096 vertices", 4097));
     }
 
     #[test]
-    fn runs_out_of_order_or_out_of_range_are_refused_by_name() {
+    fn invalid_material_ranges_are_rejected_with_their_field() {
         for (material_ranges, field) in [
-            (vec![run(1, 0)], "domain 0: runs[0].first_triangle"),
-            (vec![run(0, 0), run(0, 1)], "domain 0: runs[1].first_triangle"),
-            (vec![run(0, 0), run(2, 1)], "domain 0: runs[1].first_triangle"),
-            (vec![run(0, 2)], "domain 0: runs[0].material"),
+            (vec![material_range(1, 0)], "domain 0: material_ranges[0].first_triangle"),
+            (vec![material_range(0, 0), material_range(0, 1)], "domain 0: material_ranges[1].first_triangle"),
+            (vec![material_range(0, 0), material_range(2, 1)], "domain 0: material_ranges[1].first_triangle"),
+            (vec![material_range(0, 2)], "domain 0: material_ranges[0].material"),
         ] {
-            let refusal = Scene::new(square(material_ranges)).expect_err(field).to_string();
-            assert!(refusal.starts_with(field), "{refusal}");
+            let message = Scene::new(square(material_ranges)).expect_err(field).to_string();
+            assert!(message.starts_with(field), "expected an error about {field}, got {message}");
         }
     }
 }

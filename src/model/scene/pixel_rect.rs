@@ -1,8 +1,8 @@
-//! A small rectangle of an image's pixels.
+//! A small rectangle of pixels inside an image.
 
 use crate::error::{Result, invalid};
 
-/// A rectangle inside an image, at most [`Self::MAX_SIDE`] pixels per side. (0, 0) is the top left pixel.
+/// A rectangle of pixels inside an image, at most [`Self::MAX_SIDE`] pixels per side. (0, 0) is the top left pixel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PixelRect {
     x: u32,
@@ -15,20 +15,20 @@ impl PixelRect {
     /// The largest width and height in pixels.
     pub const MAX_SIDE: u32 = 64;
 
-    /// The rectangle with the top left pixel `corner` in an image of the size `picture` (width, height).
+    /// The rectangle of `size` whose top left pixel is `corner`. `image` and `size` are (width, height) in pixels.
     ///
     /// # Errors
     /// `Invalid` if a side is 0 or above [`Self::MAX_SIDE`], or if the rectangle exceeds the image.
-    pub fn within(picture: [u32; 2], corner: [u32; 2], size: [u32; 2]) -> Result<Self> {
+    pub fn within(image: [u32; 2], corner: [u32; 2], size: [u32; 2]) -> Result<Self> {
         let ([x, y], [width, height]) = (corner, size);
         if !size.iter().all(|side| (1..=Self::MAX_SIDE).contains(side)) {
             let expected = format!("1 to {} pixels a side", Self::MAX_SIDE);
             return Err(invalid("rectangle.size", expected, format!("{width} x {height}")));
         }
-        let ends = |axis: usize| u64::from(corner[axis]) + u64::from(size[axis]);
-        if (0..2).any(|axis| ends(axis) > u64::from(picture[axis])) {
-            let expected = format!("pixels inside the picture of {} x {}", picture[0], picture[1]);
-            return Err(invalid("rectangle", expected, format!("{width} x {height} from ({x}, {y}) on")));
+        let end = |axis: usize| u64::from(corner[axis]) + u64::from(size[axis]);
+        if (0..2).any(|axis| end(axis) > u64::from(image[axis])) {
+            let expected = format!("pixels inside the image of {} x {}", image[0], image[1]);
+            return Err(invalid("rectangle", expected, format!("{width} x {height} pixels at ({x}, {y})")));
         }
         Ok(Self { x, y, width, height })
     }
@@ -54,10 +54,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_rectangle_up_to_the_border_is_taken_and_one_beyond_it_empty_or_too_large_is_refused() {
-        let of = |corner, size| PixelRect::within([100, 80], corner, size).map_err(|error| error.to_string());
+    fn rectangle_must_be_inside_the_image_and_at_most_64_pixels() {
+        let create = |corner, size| PixelRect::within([100, 80], corner, size).map_err(|error| error.to_string());
         for (corner, size) in [([0, 0], [1, 1]), ([99, 79], [1, 1]), ([36, 16], [64, 64])] {
-            assert_eq!(of(corner, size).map(|taken| taken.size()), Ok(size));
+            assert_eq!(create(corner, size).map(|rect| rect.size()), Ok(size));
         }
         for (corner, size, field) in [
             ([99, 79], [2, 1], "rectangle:"),
@@ -66,8 +66,8 @@ mod tests {
             ([0, 0], [0, 1], "rectangle.size:"),
             ([0, 0], [1, 65], "rectangle.size:"),
         ] {
-            let refusal = of(corner, size).expect_err(field);
-            assert!(refusal.starts_with(field), "{refusal}");
+            let message = create(corner, size).expect_err(field);
+            assert!(message.starts_with(field), "expected an error about {field}, got {message}");
         }
     }
 }

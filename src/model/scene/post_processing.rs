@@ -41,8 +41,8 @@ pub struct Bloom {
     pub threshold: f32,
     /// The fraction of the light above the threshold that is spread, 0 to 1.
     pub strength: f32,
-    /// Number of successive halvings of the image, 1 to 8. With n levels, the widest glow extends about 2^n pixels to
-    /// each side, and every other one half as far as the next. All levels have equal energy.
+    /// Number of successive halvings of the image, 1 to 8. The glow of level n extends about 2^n pixels to each side.
+    /// All levels have equal energy.
     pub levels: u32,
 }
 
@@ -52,7 +52,7 @@ impl Default for Bloom {
     }
 }
 
-/// The largest exposure; the limit keeps light from overflowing.
+/// The largest exposure. The limit prevents overflow of the radiance.
 const MAX_EXPOSURE: f32 = 1024.0;
 
 impl Bloom {
@@ -61,7 +61,7 @@ impl Bloom {
             return Err(invalid("look.bloom.threshold", "0 to 1000", self.threshold));
         }
         if !(0.0..=1.0).contains(&self.strength) {
-            return Err(invalid("look.bloom.strength", "a share of 0 to 1", self.strength));
+            return Err(invalid("look.bloom.strength", "a fraction of 0 to 1", self.strength));
         }
         if !(1..=8).contains(&self.levels) {
             return Err(invalid("look.bloom.levels", "1 to 8 halvings", self.levels));
@@ -71,7 +71,7 @@ impl Bloom {
 }
 
 impl super::RenderSettings {
-    /// Number of samples per pixel of the image.
+    /// Number of samples per pixel. It is 1 unless the antialiasing method is [`Antialiasing::Msaa`].
     pub fn samples_per_pixel(&self) -> u32 {
         if self.antialias == Antialiasing::Msaa { self.samples } else { 1 }
     }
@@ -90,34 +90,34 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_out_of_range_and_nan_are_refused_with_the_field() {
-        let look =
+    fn out_of_range_numbers_are_rejected_with_their_field() {
+        let settings =
             |bloom: Bloom, exposure: f32| RenderSettings { bloom: Some(bloom), exposure, ..RenderSettings::default() };
-        let base = Bloom::default();
+        let default_bloom = Bloom::default();
         for (bloom, exposure) in [
-            (base, 1.0),
+            (default_bloom, 1.0),
             (Bloom { threshold: 0.0, strength: 0.0, levels: 1 }, 1e-6),
             (Bloom { threshold: 1000.0, strength: 1.0, levels: 8 }, 1024.0),
         ] {
-            look(bloom, exposure).check_post().expect("good");
+            settings(bloom, exposure).check_post().expect("valid settings");
         }
         for (bloom, exposure, field) in [
-            (Bloom { threshold: f32::NAN, ..base }, 1.0, "look.bloom.threshold"),
-            (Bloom { threshold: -0.1, ..base }, 1.0, "look.bloom.threshold"),
-            (Bloom { strength: 1.1, ..base }, 1.0, "look.bloom.strength"),
-            (Bloom { levels: 0, ..base }, 1.0, "look.bloom.levels"),
-            (Bloom { levels: 9, ..base }, 1.0, "look.bloom.levels"),
-            (base, 0.0, "look.exposure"),
-            (base, f32::NAN, "look.exposure"),
-            (base, f32::INFINITY, "look.exposure"),
+            (Bloom { threshold: f32::NAN, ..default_bloom }, 1.0, "look.bloom.threshold"),
+            (Bloom { threshold: -0.1, ..default_bloom }, 1.0, "look.bloom.threshold"),
+            (Bloom { strength: 1.1, ..default_bloom }, 1.0, "look.bloom.strength"),
+            (Bloom { levels: 0, ..default_bloom }, 1.0, "look.bloom.levels"),
+            (Bloom { levels: 9, ..default_bloom }, 1.0, "look.bloom.levels"),
+            (default_bloom, 0.0, "look.exposure"),
+            (default_bloom, f32::NAN, "look.exposure"),
+            (default_bloom, f32::INFINITY, "look.exposure"),
         ] {
-            let refusal = look(bloom, exposure).check_post().expect_err("refused").to_string();
-            assert!(refusal.starts_with(&format!("{field}:")), "{refusal}");
+            let message = settings(bloom, exposure).check_post().expect_err(field).to_string();
+            assert!(message.starts_with(&format!("{field}:")), "expected an error about {field}, got {message}");
         }
     }
 
     #[test]
-    fn only_antialiasing_by_samples_asks_for_more_than_one() {
+    fn only_msaa_has_more_than_one_sample_per_pixel() {
         let samples =
             |antialias| RenderSettings { antialias, samples: 4, ..RenderSettings::default() }.samples_per_pixel();
         assert_eq!([Antialiasing::Msaa, Antialiasing::Fxaa, Antialiasing::None].map(samples), [4, 1, 1]);

@@ -1,23 +1,23 @@
-//! Inputs of a rasterizer besides the mesh: the window and groups of triangles.
+//! Inputs of a rasterizer besides the mesh: the viewport and ranges of triangles.
 
 use nalgebra::Matrix4;
 
 use crate::error::{Result, invalid};
 
-/// The largest width and height of a window in pixels.
+/// The largest width and height of a viewport in pixels.
 pub const MAX_VIEWPORT_SIDE: u32 = 16384;
 
 /// An image size and the projection of positions into it. Rows are counted from the top.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Viewport {
-    clip: [f32; 16],
+    clip_from_positions: [f32; 16],
     width: u32,
     height: u32,
 }
 
 impl Viewport {
-    /// A window of `width` x `height` pixels. `clip_from_positions` maps positions to OpenGL's clip space and is
-    /// rounded to f32. A triangle with a vertex that is not finite in clip space is dropped.
+    /// A viewport of `width` x `height` pixels. `clip_from_positions` maps positions to OpenGL's clip space and is
+    /// rounded to f32. Rasterizers drop triangles with a vertex that is not finite in clip space.
     ///
     /// # Errors
     /// `Invalid` if a side is not 1 to [`MAX_VIEWPORT_SIDE`] pixels.
@@ -27,13 +27,13 @@ impl Viewport {
                 return Err(invalid(name, format!("1 to {MAX_VIEWPORT_SIDE} pixels"), side));
             }
         }
-        let clip = std::array::from_fn(|at| clip_from_positions[(at / 4, at % 4)] as f32);
-        Ok(Self { clip, width, height })
+        let clip_from_positions = std::array::from_fn(|entry| clip_from_positions[(entry / 4, entry % 4)] as f32);
+        Ok(Self { clip_from_positions, width, height })
     }
 
     /// `clip_from_positions`, row-major.
-    pub const fn clip(&self) -> &[f32; 16] {
-        &self.clip
+    pub const fn clip_from_positions(&self) -> &[f32; 16] {
+        &self.clip_from_positions
     }
 
     /// Width and height in pixels.
@@ -51,23 +51,23 @@ impl Viewport {
         self.size().map(|side| 0.5 * side as f32)
     }
 
-    /// The guard band: |x| and |y| in normalized device coordinates beyond which triangles are clipped. It ends 16384
-    /// pixels from the center, where f32 still resolves more than 1/256 pixel.
-    pub fn guard(&self) -> [f32; 2] {
+    /// The guard band: |x| and |y| in normalized device coordinates beyond which triangles are clipped. It ends
+    /// [`MAX_VIEWPORT_SIDE`] pixels from the center, where f32 still resolves 1/256 pixel.
+    pub fn guard_band(&self) -> [f32; 2] {
         self.half_size().map(|half| MAX_VIEWPORT_SIDE as f32 / half)
     }
 }
 
-/// Which faces of triangles are drawn.
+/// Which faces of triangles are culled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum CullMode {
     #[default]
     None,
-    /// Front faces: triangles whose corners appear counterclockwise.
+    /// Back faces are culled: only triangles whose corners appear counterclockwise are drawn.
     Back,
 }
 
-/// A contiguous range of triangles that are drawn alike.
+/// A contiguous range of triangles with one cull mode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DrawRange {
     pub first: u32,
@@ -80,10 +80,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn windows_have_pixels_and_not_too_many() {
-        let of = |width, height| Viewport::new(&Matrix4::identity(), width, height);
-        assert!(of(0, 1).is_err() && of(1, 0).is_err() && of(MAX_VIEWPORT_SIDE + 1, 1).is_err());
-        let largest = of(MAX_VIEWPORT_SIDE, 1).expect("a window");
-        assert_eq!((largest.guard()[0], largest.half_size()), (2.0, [8192.0, 0.5]));
+    fn viewport_side_is_limited() {
+        let viewport = |width, height| Viewport::new(&Matrix4::identity(), width, height);
+        assert!(viewport(0, 1).is_err() && viewport(1, 0).is_err() && viewport(MAX_VIEWPORT_SIDE + 1, 1).is_err());
+        let largest_viewport = viewport(MAX_VIEWPORT_SIDE, 1).expect("a valid viewport");
+        assert_eq!((largest_viewport.guard_band()[0], largest_viewport.half_size()), (2.0, [8192.0, 0.5]));
     }
 }

@@ -1,5 +1,5 @@
-//! The look of a scene: one directional light (the sun) and its shadow, ground, sky, and how triangles are rasterized
-//! and blended.
+//! Render settings of a scene: one directional light (the sun) and its shadow, the ground, the sky, and how triangles
+//! are rasterized and blended.
 
 use nalgebra::Vector3;
 
@@ -49,20 +49,21 @@ impl Default for Ground {
     }
 }
 
-/// The largest number of blended fragments per frame. They share one buffer, 8 bytes per fragment, and a buffer must
-/// stay below 2 GiB.
+/// The largest number of blended fragments per frame. They share one buffer with 8 bytes per fragment, which must be
+/// smaller than 2 GiB.
 pub const MAX_FRAGMENTS: u32 = (1 << 28) - 1;
 
 /// How blended triangles are composited over opaque ones and over each other.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Transparency {
-    /// The two-pass method of the thesis (chapter 3.3). The first pass draws fragments whose alpha reaches
-    /// [`RenderSettings::opaque_alpha`], with depth writes; the second blends the others over them without depth writes. Blended
-    /// triangles are drawn in index-buffer order: one-sided before two-sided, then by domain, then by triangle.
+    /// The two-pass method of the thesis (chapter 3.3). The first pass draws fragments whose alpha is at least
+    /// [`RenderSettings::opaque_alpha`], with depth writes. The second pass blends the others over them without depth
+    /// writes. Blended triangles are drawn in index-buffer order: one-sided before two-sided, then by domain, then by
+    /// triangle.
     TwoPass,
     /// Order-independent transparency: per pixel, a list of all blended fragments, sorted by depth. Depths are compared
-    /// at the pixel center; of equal depths, the later triangle in the index buffer is in front.
+    /// at the pixel center. At equal depths, the later triangle in the index buffer is in front.
     #[default]
     #[serde(rename = "exact")]
     OrderIndependent,
@@ -81,9 +82,9 @@ pub enum Culling {
     /// Triangles outside the view, back faces of one-sided materials, and triangles that cover no sample. Applies to
     /// shadow maps too.
     Triangles,
-    /// As `Triangles`, plus triangles that are occluded by the triangles visible in the last frame. On software OpenGL
-    /// implementations, hidden triangles are kept if cut-outs have textures and the frame is multisampled, because
-    /// there their absence would change where textures are sampled.
+    /// As `Triangles`, plus triangles that are occluded by the triangles visible in the last frame. Software OpenGL
+    /// implementations draw hidden triangles of multisampled frames with textured cut-outs, because culling them would
+    /// change where textures are sampled.
     #[serde(rename = "depth")]
     Occlusion,
 }
@@ -110,17 +111,17 @@ pub struct RenderSettings {
     pub tone: ToneMapping,
     /// Multiplier of all light before bloom and tone mapping, above 0.
     pub exposure: f32,
-    /// Whether 8-bit output is dithered with a fixed pattern of 8 x 8 pixels against banding in slow gradients. A pixel
-    /// changes by at most one level, and a value exactly on a level does not change.
+    /// Whether 8-bit output is dithered with a fixed pattern of 8 x 8 pixels against banding. A pixel changes by at
+    /// most one level, and a value exactly on a level does not change.
     pub dither: bool,
     /// How blended triangles are composited.
     pub transparency: Transparency,
-    /// [`Transparency::TwoPass`] only: the alpha from which a blended fragment counts as opaque, above 0. Above 1, none
-    /// does.
+    /// [`Transparency::TwoPass`] only: the smallest alpha of a fragment that is drawn as opaque, above 0. If it exceeds
+    /// 1, all fragments are blended.
     pub opaque_alpha: f32,
-    /// [`Transparency::OrderIndependent`] only: capacity of the fragment buffer, 1 to 2^28 - 1. By default eight fragments per
-    /// pixel and at least 2^20, limited by the largest buffer of the device. If a frame has more fragments, every pixel
-    /// keeps the same number of nearest ones, the largest that fits.
+    /// [`Transparency::OrderIndependent`] only: capacity of the fragment buffer, 1 to 2^28 - 1. The default is eight
+    /// fragments per pixel and at least 2^20, limited by the largest buffer of the device. If a frame has more
+    /// fragments, every pixel keeps only its n nearest ones, with the largest n that fits into the buffer.
     pub fragments: Option<u32>,
     /// Which triangles are culled.
     pub culling: Culling,
@@ -130,7 +131,7 @@ impl Default for RenderSettings {
     fn default() -> Self {
         Self {
             sun: [0.45, 0.80, 0.55],
-            // Ambient and sun together stay about at 1, so that white surfaces keep some shape.
+            // Sunlight and skylight add up to about 1, so that white surfaces are not clipped to uniform white.
             sunlight: [0.82, 0.77, 0.69],
             skylight: [0.25, 0.28, 0.33],
             zenith: [0.16, 0.36, 0.72],
@@ -159,12 +160,12 @@ impl RenderSettings {
     }
 
     pub(super) fn check(&self) -> Result<()> {
-        let colors = [self.sun, self.sunlight, self.skylight, self.zenith, self.horizon];
-        if !colors.as_flattened().iter().all(|number| number.is_finite()) {
+        let vectors = [self.sun, self.sunlight, self.skylight, self.zenith, self.horizon];
+        if !vectors.as_flattened().iter().all(|number| number.is_finite()) {
             return Err(invalid("look", "finite numbers", format!("{self:?}")));
         }
         if ![1, 4].contains(&self.samples) {
-            return Err(invalid("look.samples", "1 or 4 a pixel", self.samples));
+            return Err(invalid("look.samples", "1 or 4 per pixel", self.samples));
         }
         if !(self.opaque_alpha > 0.0 && self.opaque_alpha.is_finite()) {
             return Err(invalid("look.opaque_alpha", "a number above 0", self.opaque_alpha));
@@ -182,29 +183,37 @@ mod tests {
     use super::*;
 
     #[test]
-    fn samples_that_are_neither_one_nor_four_are_refused() {
+    fn samples_other_than_one_and_four_are_rejected() {
         for samples in [1, 4] {
-            RenderSettings { samples, ..RenderSettings::default() }.check().expect("good");
+            RenderSettings { samples, ..RenderSettings::default() }.check().expect("valid settings");
         }
         for samples in [0, 2, 8, u32::MAX] {
-            let refusal =
-                RenderSettings { samples, ..RenderSettings::default() }.check().expect_err("refused").to_string();
-            assert_eq!(refusal, format!("look.samples: expected 1 or 4 a pixel, got {samples}"));
+            let message = RenderSettings { samples, ..RenderSettings::default() }
+                .check()
+                .expect_err("invalid settings")
+                .to_string();
+            assert_eq!(message, format!("look.samples: expected 1 or 4 per pixel, got {samples}"));
         }
     }
 
     #[test]
-    fn a_threshold_of_nothing_and_a_budget_of_nothing_or_beyond_a_buffer_are_refused() {
+    fn invalid_opaque_alpha_and_fragments_are_rejected() {
         for opaque_alpha in [0.0, -1.0, f32::NAN, f32::INFINITY] {
-            let refusal =
-                RenderSettings { opaque_alpha, ..RenderSettings::default() }.check().expect_err("refused").to_string();
-            assert_eq!(refusal, format!("look.opaque_alpha: expected a number above 0, got {opaque_alpha}"));
+            let message = RenderSettings { opaque_alpha, ..RenderSettings::default() }
+                .check()
+                .expect_err("invalid settings")
+                .to_string();
+            assert_eq!(message, format!("look.opaque_alpha: expected a number above 0, got {opaque_alpha}"));
         }
         for fragments in [0, MAX_FRAGMENTS + 1, u32::MAX] {
-            RenderSettings { fragments: Some(fragments), ..RenderSettings::default() }.check().expect_err("refused");
+            RenderSettings { fragments: Some(fragments), ..RenderSettings::default() }
+                .check()
+                .expect_err("invalid settings");
         }
         for fragments in [None, Some(1), Some(MAX_FRAGMENTS)] {
-            RenderSettings { fragments, opaque_alpha: 2.0, ..RenderSettings::default() }.check().expect("good");
+            RenderSettings { fragments, opaque_alpha: 2.0, ..RenderSettings::default() }
+                .check()
+                .expect("valid settings");
         }
     }
 }

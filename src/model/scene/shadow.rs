@@ -7,8 +7,8 @@ use crate::error::{Result, invalid};
 #[serde(rename_all = "lowercase")]
 pub enum ShadowMethod {
     /// Variance shadow map (equation 3.10): Chebyshev's bound on blurred moments of depth. Soft edges, one lookup per
-    /// pixel. For a receiver with a single occluder the bound is exact, and, apart from `bleeding`, the half-dark
-    /// contour is within half a texel of the true edge. Where occluders overlap, light bleeds through.
+    /// pixel. For a receiver with a single occluder the bound is exact: with `bleeding` 0, the half-dark contour is
+    /// within half a texel of the true edge. Where occluders overlap, light bleeds through.
     #[default]
     Variance,
     /// Standard shadow map with one depth per texel. Hard edges, within half a texel of the true edge in the plane of
@@ -27,9 +27,8 @@ pub enum ShadowMethod {
 pub enum MomentFormat {
     #[default]
     F32,
-    /// Half the memory, but insufficient precision: the second moment is rounded by up to 2^-14, thirty times the
-    /// default `least_variance`, so that shadows near their occluder are speckled with light. Intended for measurements
-    /// only.
+    /// Half the memory, but insufficient precision: the second moment is rounded by up to 2^-14, which is thirty times
+    /// the default `least_variance`. Shadows near their occluder are speckled with light. Intended for measurements only.
     F16,
 }
 
@@ -37,12 +36,11 @@ pub enum MomentFormat {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ShadowFit {
-    /// Bounds of the vertices in light space. Compared with `Corners`, the texels of a tree have a third of the area,
-    /// and its leaves cover three times as many of them.
+    /// Bounds of the vertices in light space. Texels are smaller than with `Corners`: for a tree, a third of the area.
     #[default]
     Vertices,
-    /// The corners of the vertices' bounding box in the world, as in the thesis (section 3.3.1). Needs no extra
-    /// measurement by the deformers.
+    /// The corners of the world-space bounding box of the vertices, as in the thesis (section 3.3.1). Deformers need
+    /// not compute bounds in light space.
     Corners,
 }
 
@@ -104,8 +102,8 @@ impl ShadowSettings {
         }
     }
 
-    /// Standard deviation, in texels, of the filter that a soft map applies to depths: the blur and the bilinear
-    /// lookup, a tent of variance 1/6.
+    /// Standard deviation, in texels, of the filter of a soft shadow map: the blur, and the bilinear lookup, which is a
+    /// tent filter of variance 1/6.
     pub fn filter_deviation(&self) -> f64 {
         (f64::from(self.blur).powi(2) + 1.0 / 6.0).sqrt()
     }
@@ -134,8 +132,12 @@ impl ShadowSettings {
         }
         let texels = u64::from(self.size) * u64::from(self.size) * u64::from(self.splits);
         if !(1..=4).contains(&self.splits) || texels > MAX_TEXELS {
-            let expected = format!("1 to 4 maps of together {MAX_TEXELS} texels at most");
-            return Err(invalid("look.shadow.splits", expected, format!("{} of {} a side", self.splits, self.size)));
+            let expected = format!("1 to 4 maps of at most {MAX_TEXELS} texels together");
+            return Err(invalid(
+                "look.shadow.splits",
+                expected,
+                format!("{} maps of {} x {} texels", self.splits, self.size, self.size),
+            ));
         }
         Ok(())
     }
@@ -146,45 +148,51 @@ mod tests {
     use super::*;
 
     #[test]
-    fn maps_out_of_range_are_refused_by_field() {
-        let good = ShadowSettings::default();
-        good.check().expect("good");
-        let bad = [
-            (ShadowSettings { size: 15, ..good }, "size"),
-            (ShadowSettings { blur: f32::NAN, ..good }, "blur"),
-            (ShadowSettings { bleeding: 1.0, ..good }, "bleeding"),
-            (ShadowSettings { splits: 0, ..good }, "splits"),
-            (ShadowSettings { splits: 5, ..good }, "splits"),
-            (ShadowSettings { splits: 2, size: 16384, ..good }, "splits"),
+    fn out_of_range_settings_are_rejected_with_their_field() {
+        let valid_shadow = ShadowSettings::default();
+        valid_shadow.check().expect("valid settings");
+        let invalid_shadows = [
+            (ShadowSettings { size: 15, ..valid_shadow }, "size"),
+            (ShadowSettings { blur: f32::NAN, ..valid_shadow }, "blur"),
+            (ShadowSettings { bleeding: 1.0, ..valid_shadow }, "bleeding"),
+            (ShadowSettings { splits: 0, ..valid_shadow }, "splits"),
+            (ShadowSettings { splits: 5, ..valid_shadow }, "splits"),
+            (ShadowSettings { splits: 2, size: 16384, ..valid_shadow }, "splits"),
         ];
-        for (shadow, field) in bad {
-            let refusal = shadow.check().expect_err(field).to_string();
-            assert!(refusal.starts_with(&format!("look.shadow.{field}:")), "{refusal}");
+        for (shadow, field) in invalid_shadows {
+            let message = shadow.check().expect_err(field).to_string();
+            assert!(
+                message.starts_with(&format!("look.shadow.{field}:")),
+                "expected an error about {field}, got {message}"
+            );
         }
     }
 
     /// Blurs moments of equal depths m twice in f32, as the shaders do. Returns the largest |M2 - M1^2|.
-    fn spurious(shadow: &ShadowSettings) -> f32 {
-        let reach = shadow.blur_radius() as i32;
-        let bell = |step: i32| (-0.5 * (f64::from(step) / f64::from(shadow.blur)).powi(2)).exp();
-        let sum: f64 = (-reach..=reach).map(bell).sum();
-        let weights: Vec<f32> = (-reach..=reach).map(|step| (bell(step) / sum) as f32).collect();
-        let blurred = |value: f32| weights.iter().fold(0.0_f32, |sum, weight| sum + weight * value);
+    fn largest_rounding_variance(shadow: &ShadowSettings) -> f32 {
+        let radius = shadow.blur_radius() as i32;
+        let gaussian = |step: i32| (-0.5 * (f64::from(step) / f64::from(shadow.blur)).powi(2)).exp();
+        let weight_sum: f64 = (-radius..=radius).map(gaussian).sum();
+        let weights: Vec<f32> = (-radius..=radius).map(|step| (gaussian(step) / weight_sum) as f32).collect();
+        let blur = |value: f32| weights.iter().fold(0.0_f32, |sum, weight| sum + weight * value);
         let depths = (0..=20_000).map(|step| step as f32 / 20_000.0 - 0.5);
         depths
-            .map(|m| (blurred(blurred(m)), blurred(blurred(m * m))))
-            .map(|(first, second)| (second - first * first).abs())
+            .map(|m| (blur(blur(m)), blur(blur(m * m))))
+            .map(|(mean, second_moment)| (second_moment - mean * mean).abs())
             .fold(0.0, f32::max)
     }
 
     #[test]
-    fn the_floor_holds_what_rounding_makes_of_no_variance_and_not_a_hundred_times_more() {
+    fn variance_floor_bounds_the_rounding_variance() {
         for blur in [0.5, 1.5, 4.0, 16.0] {
             let shadow = ShadowSettings { blur, ..ShadowSettings::default() };
-            let (worst, floor) = (spurious(&shadow), shadow.variance_floor());
-            assert!(worst <= floor && floor < 100.0 * worst, "blur {blur}: {worst} of {floor}");
+            let (rounding_variance, floor) = (largest_rounding_variance(&shadow), shadow.variance_floor());
+            assert!(
+                rounding_variance <= floor && floor < 100.0 * rounding_variance,
+                "blur {blur}: expected at most {floor}, got {rounding_variance}"
+            );
         }
         let default = ShadowSettings::default();
-        assert!(default.variance_floor() < default.least_variance, "the default least variance is above its floor");
+        assert!(default.variance_floor() < default.least_variance, "expected a default above the floor");
     }
 }

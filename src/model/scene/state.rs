@@ -1,5 +1,5 @@
-//! The state of a scene after a step: packed coordinates q, and the transform of each transform root (a domain that
-//! follows no other domain).
+//! The state of a scene after a step: the packed coordinates q, and the transform of each transform root. A transform
+//! root is a domain that follows no other domain.
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -21,7 +21,8 @@ pub enum DirtyDomains {
 /// The complete state after a step.
 #[derive(Debug, Clone)]
 pub struct SceneState {
-    /// Number of the run: each new writer starts a run, and step numbers belong to one run. 0 before the first.
+    /// Number of the run. Each new writer starts a run, and step numbers are unique only within a run. 0 before the
+    /// first step.
     pub run: u64,
     /// The step number that the writer assigned.
     pub step: u64,
@@ -29,21 +30,21 @@ pub struct SceneState {
     pub time: f64,
     /// All coordinates, packed as in [`super::Layout`].
     pub q: Vec<f32>,
-    /// `world_from_domain` of each transform root ([`super::TransformRoots`]); without followers, every domain is one. Relative
-    /// to the domain's cell ([`Self::origin_of`]), which is the scene's origin unless a step with f64 translations moved
-    /// the domain far from it.
+    /// `world_from_domain` of each transform root ([`super::TransformRoots`]), relative to its floating origin
+    /// ([`Self::origin_of`]). The floating origin is the scene's origin unless a step with f64 translations moved the
+    /// domain far from it.
     pub transforms: Vec<Transform>,
-    /// f64 translations and cells; present after the first step with f64 translations.
+    /// The f64 translations and floating origins. Present after the first step with f64 translations.
     pub origins: Option<Arc<FloatingOrigins>>,
-    /// Number of updates of this state; 0 at rest. A deformer that computed serial s and receives s + 1 needs to
-    /// compute only the domains in `changed`. For any other pair of serials, including equal ones, and after an error
-    /// of its own, it must compute all domains.
+    /// Number of updates of this state; 0 at rest. If a deformer computed the state with serial s and receives the one
+    /// with serial s + 1, it may compute only the domains in `changed`. It must compute all domains for any other pair
+    /// of serials, including equal ones, and after a failed step.
     pub serial: u64,
     /// The domains that the last update changed.
     pub changed: DirtyDomains,
 }
 
-/// Equality ignores how the state came about (`serial`, `changed`).
+/// Equality ignores `serial` and `changed`.
 impl PartialEq for SceneState {
     fn eq(&self, other: &Self) -> bool {
         (self.run, self.step, self.time) == (other.run, other.step, other.time)
@@ -57,27 +58,27 @@ impl SceneState {
     /// The state before any step.
     pub fn rest(scene: &Scene) -> Self {
         let mut q = vec![0.0; scene.layout.coordinates];
-        for (domain, slot) in scene.domains.iter().zip(&scene.layout.domains) {
-            q[slot.first_q..][..domain.rest_q.len()].copy_from_slice(&domain.rest_q);
+        for (domain, layout) in scene.domains.iter().zip(&scene.layout.domains) {
+            q[layout.first_q..][..domain.rest_q.len()].copy_from_slice(&domain.rest_q);
         }
         let transforms =
             scene.transform_roots.domains().map(|domain| scene.domains[domain as usize].placement).collect();
         Self { run: 0, step: 0, time: 0.0, q, transforms, origins: None, serial: 0, changed: DirtyDomains::All }
     }
 
-    /// Applies a whole step. Domains that the step does not name keep their values. The cost is proportional to the
-    /// number of named domains, their followers, and the domains that share their q. Exceptions are the first step with
-    /// f64 translations and the rare steps that search a new shared cell: they make a pass over all transform roots.
+    /// Applies a step. Domains that the step does not contain keep their values. The cost is proportional to the number
+    /// of domains in the step, their followers, and the domains that share their q. The first step with f64
+    /// translations, and the rare steps that search for a new shared origin, also visit all transform roots.
     pub fn apply(&mut self, scene: &Scene, update: &StepUpdate) {
         self.step = update.number;
         self.time = update.time;
         self.serial += 1;
         let mut changed = Vec::new();
         for (domain, q) in update.coordinates() {
-            let slot = scene.layout.domains[domain];
-            self.q[slot.first_q..][..slot.rank].copy_from_slice(q);
-            match scene.layout.domains_sharing_q.get(&slot.first_q) {
-                Some(domains_sharing_q) if slot.rank > 0 => changed.extend_from_slice(domains_sharing_q),
+            let layout = scene.layout.domains[domain];
+            self.q[layout.first_q..][..layout.rank].copy_from_slice(q);
+            match scene.layout.domains_sharing_q.get(&layout.first_q) {
+                Some(domains_sharing_q) if layout.rank > 0 => changed.extend_from_slice(domains_sharing_q),
                 _ => changed.push(domain as u32),
             }
         }
@@ -87,15 +88,15 @@ impl SceneState {
         }
         changed.sort_unstable();
         changed.dedup();
-        let anew = self.apply_transforms(&scene.transform_roots, update);
-        self.changed = if anew { DirtyDomains::All } else { DirtyDomains::Some(changed) };
+        let is_rebased = self.apply_transforms(&scene.transform_roots, update);
+        self.changed = if is_rebased { DirtyDomains::All } else { DirtyDomains::Some(changed) };
     }
 
-    /// Sets the named transforms. Returns true if transforms of other domains were rebased to a new cell.
+    /// Sets the transforms of a step. Returns true if transforms of other domains were rebased to a new floating origin.
     fn apply_transforms(&mut self, transform_roots: &TransformRoots, update: &StepUpdate) -> bool {
-        let begins = self.origins.is_none() && update.has_f64_translations();
-        if begins {
-            self.origins = Some(Arc::new(FloatingOrigins::of(&self.transforms)));
+        let is_first_f64 = self.origins.is_none() && update.has_f64_translations();
+        if is_first_f64 {
+            self.origins = Some(Arc::new(FloatingOrigins::from_transforms(&self.transforms)));
         }
         if update.transforms.is_empty() {
             return false;
@@ -106,28 +107,28 @@ impl SceneState {
             }
             return false;
         };
-        let anew = begins && !origins.is_uniform();
+        let is_rebased = is_first_f64 && !origins.is_uniform();
         for (domain, transform, translation) in update.transform_updates() {
             let root = transform_roots.root_of(domain);
-            origins.set(root, translation);
+            origins.set_translation(root, translation);
             self.transforms[root] = origins.rebase_transform(root, transform);
         }
-        let anew = origins.update_shared_origin() || anew;
-        if anew {
+        let is_rebased = origins.update_shared_origin() || is_rebased;
+        if is_rebased {
             for (root, transform) in self.transforms.iter_mut().enumerate() {
                 *transform = origins.rebase_transform(root, *transform);
             }
         }
-        anew
+        is_rebased
     }
 
-    /// The f64 reference point of a transform root: its transform, its vertices and those of its followers are relative
-    /// to this point, which is in scene units from the scene's origin. `root` is an index into `transforms`.
+    /// The floating origin of a transform root, in scene units from the scene's origin. The root's transform, its
+    /// vertices and those of its followers are relative to this point. `root` is an index into `transforms`.
     pub fn origin_of(&self, root: usize) -> [f64; 3] {
         self.origins.as_ref().map_or([0.0; 3], |origins| origins.origin_of(root))
     }
 
-    /// The transform of a domain's root and, for a follower, its constant frame; relative to the cell of the root.
+    /// The transform of a domain's root, relative to the root's floating origin, and the frame of a follower.
     pub fn composed_transform(&self, scene: &Scene, domain: usize) -> ComposedTransform {
         ComposedTransform {
             root: self.transforms[scene.transform_roots.root_of(domain)],
@@ -157,8 +158,8 @@ impl SceneState {
 
     /// The coordinates of one domain.
     pub fn q_of<'a>(&'a self, scene: &Scene, domain: usize) -> &'a [f32] {
-        let slot = scene.layout.domains[domain];
-        &self.q[slot.first_q..][..slot.rank]
+        let layout = scene.layout.domains[domain];
+        &self.q[layout.first_q..][..layout.rank]
     }
 }
 

@@ -13,14 +13,14 @@ use crate::error::{Error, Result, invalid};
 pub struct RawStepUpdate {
     pub number: u64,
     pub time: f64,
-    /// Domains whose coordinates are in `q`. If empty while `q` is not, all domains in order.
+    /// Domains whose coordinates are in `q`. If this is empty and `q` is not, `q` contains all domains in order.
     pub q_domains: Vec<u32>,
-    /// r little-endian f32 per named domain, concatenated, at any alignment.
+    /// r little-endian f32 per domain of `q_domains`, concatenated. The bytes need no alignment.
     pub q: bytes::Bytes,
-    /// Domains whose transforms are in `transforms`. If empty while `transforms` is not, all transform roots in order
-    /// (domains that follow no other).
+    /// Domains whose transforms are in `transforms`. If this is empty and `transforms` is not, `transforms` contains
+    /// all transform roots in order.
     pub transform_domains: Vec<u32>,
-    /// One transform per named domain in `transform_format`, little-endian, concatenated, at any alignment.
+    /// One little-endian transform per domain of `transform_domains`, concatenated. The bytes need no alignment.
     pub transforms: bytes::Bytes,
     pub transform_format: TransformFormat,
 }
@@ -33,12 +33,12 @@ type CoordinateSpan = (u32, usize, usize);
 pub struct StepUpdate {
     pub number: u64,
     pub time: f64,
-    q: Vec<CoordinateSpan>,
+    spans: Vec<CoordinateSpan>,
     values: Vec<f32>,
-    /// The transform of each named domain relative to the scene's origin, rounded to f32.
+    /// The transforms of the step, relative to the scene's origin and rounded to f32.
     pub transforms: Vec<(u32, Transform)>,
-    /// For the domains of `transforms` with an f64 translation, in the same order: the unrounded translation relative
-    /// to the scene's origin.
+    /// The unrounded translations, relative to the scene's origin, of those domains of `transforms` that were given in
+    /// f64. They have the order of `transforms`.
     translations: Vec<(u32, [f64; 3])>,
 }
 
@@ -51,9 +51,9 @@ impl StepUpdate {
         if !raw.time.is_finite() {
             return Err(invalid("step.time", "a finite number", raw.time));
         }
-        let (q, values) = parse_q(scene, raw)?;
+        let (spans, values) = parse_coordinates(scene, raw)?;
         let (transforms, translations) = parse_transforms(scene, raw)?;
-        Ok(Self { number: raw.number, time: raw.time, q, values, transforms, translations })
+        Ok(Self { number: raw.number, time: raw.time, spans, values, transforms, translations })
     }
 
     /// Whether any translation was given in f64.
@@ -64,27 +64,28 @@ impl StepUpdate {
     /// Each domain with a new transform, and its translation relative to the scene's origin in the precision in which
     /// it was given.
     pub fn transform_updates(&self) -> impl Iterator<Item = (usize, Transform, [f64; 3])> {
-        let mut exact = self.translations.iter().peekable();
+        let mut f64_translations = self.translations.iter().peekable();
         self.transforms.iter().map(move |(domain, transform)| {
-            let given = exact.next_if(|(parse_domain_list, _)| parse_domain_list == domain);
-            let translation = given.map_or_else(|| transform.translation().into(), |(_, translation)| *translation);
+            let f64_translation = f64_translations.next_if(|(other_domain, _)| other_domain == domain);
+            let translation =
+                f64_translation.map_or_else(|| transform.translation().into(), |(_, translation)| *translation);
             (*domain as usize, *transform, translation)
         })
     }
 
     /// Each domain with new coordinates, and its r numbers.
     pub fn coordinates(&self) -> impl Iterator<Item = (usize, &[f32])> {
-        self.q.iter().map(|(domain, first, count)| (*domain as usize, &self.values[*first..][..*count]))
+        self.spans.iter().map(|(domain, first, count)| (*domain as usize, &self.values[*first..][..*count]))
     }
 
     /// Merges this step with an older one. Applying the result equals applying both in order.
     pub fn merged_after(self, older: &Self) -> Self {
-        let mut q: BTreeMap<u32, &[f32]> = BTreeMap::new();
+        let mut coordinates: BTreeMap<u32, &[f32]> = BTreeMap::new();
         let mut transforms = BTreeMap::new();
         // A newer f32 translation of a domain replaces an older f64 translation.
         let mut translations = BTreeMap::new();
         for step in [older, &self] {
-            q.extend(step.coordinates().map(|(domain, values)| (domain as u32, values)));
+            coordinates.extend(step.coordinates().map(|(domain, values)| (domain as u32, values)));
             transforms.extend(step.transforms.iter().copied());
             if !translations.is_empty() {
                 for (domain, _) in &step.transforms {
@@ -96,64 +97,64 @@ impl StepUpdate {
         let mut merged = Self {
             number: self.number,
             time: self.time,
-            q: vec![],
+            spans: vec![],
             values: vec![],
             transforms: transforms.into_iter().collect(),
             translations: translations.into_iter().collect(),
         };
-        for (domain, values) in q {
-            merged.q.push((domain, merged.values.len(), values.len()));
+        for (domain, values) in coordinates {
+            merged.spans.push((domain, merged.values.len(), values.len()));
             merged.values.extend_from_slice(values);
         }
         merged
     }
 }
 
-fn parse_q(scene: &Scene, raw: &RawStepUpdate) -> Result<(Vec<CoordinateSpan>, Vec<f32>)> {
-    let everyone = raw.q_domains.is_empty() && !raw.q.is_empty();
-    let domains = match everyone {
+fn parse_coordinates(scene: &Scene, raw: &RawStepUpdate) -> Result<(Vec<CoordinateSpan>, Vec<f32>)> {
+    let is_for_all_domains = raw.q_domains.is_empty() && !raw.q.is_empty();
+    let domains = match is_for_all_domains {
         true => (0..scene.domains.len() as u32).collect(),
         false => parse_domain_list(scene, "step.q_domains", &raw.q_domains)?,
     };
-    let mut expected = 0;
-    let mut places = Vec::with_capacity(domains.len());
+    let mut coordinate_count = 0;
+    let mut spans = Vec::with_capacity(domains.len());
     for domain in domains {
         let rank = scene.layout.domains[domain as usize].rank;
-        places.push((domain, expected, rank));
-        expected += rank;
+        spans.push((domain, coordinate_count, rank));
+        coordinate_count += rank;
     }
-    if raw.q.len() != 4 * expected {
-        let field = match places.as_slice() {
+    if raw.q.len() != 4 * coordinate_count {
+        let field = match spans.as_slice() {
             [(domain, ..)] => format!("step.q of domain '{}'", scene.domains[*domain as usize].name),
             _ => "step.q".into(),
         };
-        let wanted = format!("{} bytes ({expected} coordinates)", 4 * expected);
-        return Err(invalid(field, wanted, format!("{} bytes", raw.q.len())));
+        let expected_bytes = format!("{} bytes ({coordinate_count} coordinates)", 4 * coordinate_count);
+        return Err(invalid(field, expected_bytes, format!("{} bytes", raw.q.len())));
     }
     let values = floats(&raw.q);
-    for (domain, first, rank) in &places {
+    for (domain, first, rank) in &spans {
         if let Some(mode) = values[*first..][..*rank].iter().position(|number| !number.is_finite()) {
             let field = format!("step.q of domain '{}', mode {mode}", scene.domains[*domain as usize].name);
             return Err(invalid(field, "a finite number", values[first + mode]));
         }
     }
-    Ok((places, values))
+    Ok((spans, values))
 }
 
-/// Transforms of the named domains, and the f64 translations among them.
+/// The transforms of a step, and the translations that were given in f64. Both are with their domains.
 type ParsedTransforms = (Vec<(u32, Transform)>, Vec<(u32, [f64; 3])>);
 
 fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransforms> {
-    let everyone = raw.transform_domains.is_empty() && !raw.transforms.is_empty();
-    let domains = match everyone {
+    let is_for_all_domains = raw.transform_domains.is_empty() && !raw.transforms.is_empty();
+    let domains = match is_for_all_domains {
         true => scene.transform_roots.domains().collect(),
         false => parse_domain_list(scene, "step.transform_domains", &raw.transform_domains)?,
     };
     check_transform_targets(&scene.transform_roots, &scene.domains, ("step.transform_domains", &domains))?;
     let size = raw.transform_format.bytes();
     if raw.transforms.len() != size * domains.len() {
-        let wanted = format!("{} bytes ({} transforms of {size})", size * domains.len(), domains.len());
-        return Err(invalid("step.transforms", wanted, format!("{} bytes", raw.transforms.len())));
+        let expected = format!("{} bytes ({} transforms of {size})", size * domains.len(), domains.len());
+        return Err(invalid("step.transforms", expected, format!("{} bytes", raw.transforms.len())));
     }
     let origin = scene.origin.map(|meters| meters / scene.unit);
     let (mut transforms, mut translations) = (Vec::with_capacity(domains.len()), Vec::new());
@@ -171,14 +172,14 @@ fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransfor
     Ok((transforms, translations))
 }
 
-/// Parses the only format that can contain shear.
+/// Parses [`TransformFormat::Affine`], the only format that can contain shear, and rejects shear in rigid scenes.
 fn parse_affine(scene: &Scene, bytes: &[u8]) -> Result<ParsedTransform> {
-    let (transform, kept) = transform_format::parse_affine(bytes)?;
+    let (transform, translation) = transform_format::parse_affine(bytes)?;
     if !scene.features.shear && !transform.is_similarity() {
-        let expected = "no shear and one scale (the scene declares rigid transforms)";
+        let expected = "no shear and a uniform scale (the scene declares rigid transforms)";
         return Err(invalid("linear", expected, format!("{:?}", transform.0)));
     }
-    Ok((transform, kept))
+    Ok((transform, translation))
 }
 
 /// Validates a list of domain indices: in range and without duplicates.
@@ -187,18 +188,18 @@ fn parse_domain_list(scene: &Scene, field: &str, list: &[u32]) -> Result<Vec<u32
     if list.len() > count {
         return Err(invalid(field, format!("at most {count} indices"), list.len()));
     }
-    // A bit set keeps the cost per index independent of the length of the list.
-    let mut seen = vec![0_u64; count.div_ceil(64)];
-    for (at, domain) in list.iter().enumerate() {
+    // A bit set of all domains, because searching the list for duplicates would take quadratic time.
+    let mut seen_bits = vec![0_u64; count.div_ceil(64)];
+    for (position, domain) in list.iter().enumerate() {
         let index = *domain as usize;
         if index >= count {
-            return Err(invalid(format!("{field}[{at}]"), format!("an index below {count}"), domain));
+            return Err(invalid(format!("{field}[{position}]"), format!("an index below {count}"), domain));
         }
         let (word, bit) = (index / 64, 1 << (index % 64));
-        if seen[word] & bit != 0 {
-            return Err(invalid(format!("{field}[{at}]"), "an index that was not named before", domain));
+        if seen_bits[word] & bit != 0 {
+            return Err(invalid(format!("{field}[{position}]"), "an index that was not named before", domain));
         }
-        seen[word] |= bit;
+        seen_bits[word] |= bit;
     }
     Ok(list.to_vec())
 }

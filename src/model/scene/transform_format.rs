@@ -5,11 +5,11 @@ use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 use crate::domain::Transform;
 use crate::error::{Result, invalid};
 
-/// The largest accepted deviation of a quaternion's norm from 1. Rounding to f32 causes a ten-thousandth of it; a
-/// larger deviation is an error of the sender.
+/// The largest accepted deviation of a quaternion's norm from 1. Rounding to f32 causes deviations of about 1e-7, so
+/// that a larger deviation is an error of the sender.
 const NORM_TOLERANCE: f64 = 1e-3;
 
-/// The largest f64 translation per axis, in scene units. At this distance, f64 rounds by up to 1.2e-4 units.
+/// The largest f64 translation per axis, in scene units. Up to this distance, f64 rounds by at most 1.2e-4 units.
 pub(super) const MAX_TRANSLATION: f64 = (1_u64 << 40) as f64;
 
 /// The encoding of the transforms of a step.
@@ -35,41 +35,42 @@ impl TransformFormat {
     }
 }
 
-/// A parsed transform relative to the scene's origin and, if it was given in f64, the unrounded translation.
+/// A parsed transform relative to the scene's origin and, if its translation was given in f64, the unrounded
+/// translation.
 pub(super) type ParsedTransform = (Transform, Option<[f64; 3]>);
 
 /// Parses [`TransformFormat::Affine`].
 pub(super) fn parse_affine(bytes: &[u8]) -> Result<ParsedTransform> {
-    Ok((Transform::new(floats(bytes))?, None))
+    Ok((Transform::new(decode_f32_array(bytes))?, None))
 }
 
 /// Parses [`TransformFormat::RigidF32`].
 pub(super) fn parse_rigid_f32(bytes: &[u8]) -> Result<ParsedTransform> {
     let (rotation, translation) = bytes.split_at(16);
-    let translation: [f32; 3] = floats(translation);
-    finite("translation", &translation.map(f64::from))?;
-    let linear = rotation_matrix(floats(rotation))?;
+    let translation: [f32; 3] = decode_f32_array(translation);
+    check_finite("translation", &translation.map(f64::from))?;
+    let linear = rotation_matrix(decode_f32_array(rotation))?;
     Ok((Transform::from_parts(&linear, &Vector3::from(translation).cast()), None))
 }
 
 /// Parses [`TransformFormat::RigidF64`]. `origin` is the scene's origin in scene units.
 pub(super) fn parse_rigid_f64(bytes: &[u8], origin: [f64; 3]) -> Result<ParsedTransform> {
     let (rotation, translation) = bytes.split_at(16);
-    let given: [f64; 3] = numbers(translation, f64::from_le_bytes);
-    finite("translation", &given)?;
-    let relative: [f64; 3] = std::array::from_fn(|axis| given[axis] - origin[axis]);
-    for (what, list) in [("", given), (" relative to the scene's origin", relative)] {
-        if let Some(axis) = list.iter().position(|along| along.abs() > MAX_TRANSLATION) {
-            let expected = format!("at most {MAX_TRANSLATION:e} scene units{what}");
-            return Err(invalid(format!("translation[{axis}]"), expected, list[axis]));
+    let absolute: [f64; 3] = decode_array(translation, f64::from_le_bytes);
+    check_finite("translation", &absolute)?;
+    let relative: [f64; 3] = std::array::from_fn(|axis| absolute[axis] - origin[axis]);
+    for (suffix, translation) in [("", absolute), (" relative to the scene's origin", relative)] {
+        if let Some(axis) = translation.iter().position(|coordinate| coordinate.abs() > MAX_TRANSLATION) {
+            let expected = format!("at most {MAX_TRANSLATION:e} scene units{suffix}");
+            return Err(invalid(format!("translation[{axis}]"), expected, translation[axis]));
         }
     }
-    let linear = rotation_matrix(floats(rotation))?;
+    let linear = rotation_matrix(decode_f32_array(rotation))?;
     Ok((Transform::from_parts(&linear, &Vector3::from(relative)), Some(relative)))
 }
 
 fn rotation_matrix([x, y, z, w]: [f32; 4]) -> Result<Matrix3<f64>> {
-    finite("rotation", &[x, y, z, w].map(f64::from))?;
+    check_finite("rotation", &[x, y, z, w].map(f64::from))?;
     let quaternion = Quaternion::new(w, x, y, z).cast::<f64>();
     let norm = quaternion.norm();
     if (norm - 1.0).abs() > NORM_TOLERANCE {
@@ -79,22 +80,22 @@ fn rotation_matrix([x, y, z, w]: [f32; 4]) -> Result<Matrix3<f64>> {
     Ok(UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix().into_inner())
 }
 
-fn finite(field: &str, list: &[f64]) -> Result<()> {
+fn check_finite(field: &str, list: &[f64]) -> Result<()> {
     match list.iter().position(|number| !number.is_finite()) {
         None => Ok(()),
-        Some(at) => Err(invalid(format!("{field}[{at}]"), "a finite number", list[at])),
+        Some(index) => Err(invalid(format!("{field}[{index}]"), "a finite number", list[index])),
     }
 }
 
-fn floats<const N: usize>(bytes: &[u8]) -> [f32; N] {
-    numbers(bytes, f32::from_le_bytes)
+fn decode_f32_array<const N: usize>(bytes: &[u8]) -> [f32; N] {
+    decode_array(bytes, f32::from_le_bytes)
 }
 
 /// Decodes N little-endian numbers of S bytes each, at any alignment. `bytes` has at least N * S bytes.
-fn numbers<T, const N: usize, const S: usize>(bytes: &[u8], read: fn([u8; S]) -> T) -> [T; N] {
-    std::array::from_fn(|at| {
+fn decode_array<T, const N: usize, const S: usize>(bytes: &[u8], read: fn([u8; S]) -> T) -> [T; N] {
+    std::array::from_fn(|index| {
         let mut word = [0; S];
-        word.copy_from_slice(&bytes[S * at..][..S]);
+        word.copy_from_slice(&bytes[S * index..][..S]);
         read(word)
     })
 }
@@ -112,56 +113,63 @@ mod tests {
     }
 
     #[test]
-    fn a_quaternion_turns_as_its_axis_and_angle_say_and_both_precisions_agree() {
-        let turn = UnitQuaternion::from_euler_angles(0.4, -1.3, 2.2);
-        let rotation = [turn.i, turn.j, turn.k, turn.w].map(|number| number as f32);
-        let narrow = pack(rotation, [1.5_f32, -2.0, 0.25].map(|number| number.to_le_bytes().to_vec()));
-        let wide = pack(rotation, [1.5_f64, -2.0, 0.25].map(|number| number.to_le_bytes().to_vec()));
-        let (narrow, none) = parse_rigid_f32(&narrow[1..]).expect("good");
-        let (wide, kept) = parse_rigid_f64(&wide[1..], [0.0; 3]).expect("good");
-        assert_eq!((narrow, none, kept), (wide, None, Some([1.5, -2.0, 0.25])));
-        let error = (narrow.linear() - turn.to_rotation_matrix().into_inner()).abs().max();
+    fn f32_and_f64_formats_give_the_same_rotation() {
+        let expected_rotation = UnitQuaternion::from_euler_angles(0.4, -1.3, 2.2);
+        let rotation = [expected_rotation.i, expected_rotation.j, expected_rotation.k, expected_rotation.w]
+            .map(|number| number as f32);
+        let f32_transform = pack(rotation, [1.5_f32, -2.0, 0.25].map(|number| number.to_le_bytes().to_vec()));
+        let f64_transform = pack(rotation, [1.5_f64, -2.0, 0.25].map(|number| number.to_le_bytes().to_vec()));
+        let (f32_transform, no_translation) = parse_rigid_f32(&f32_transform[1..]).expect("a valid transform");
+        let (f64_transform, f64_translation) =
+            parse_rigid_f64(&f64_transform[1..], [0.0; 3]).expect("a valid transform");
+        assert_eq!((f32_transform, no_translation, f64_translation), (f64_transform, None, Some([1.5, -2.0, 0.25])));
+        let error = (f32_transform.linear() - expected_rotation.to_rotation_matrix().into_inner()).abs().max();
         assert!(error <= 2e-7, "{error}");
-        assert!(narrow.is_similarity());
-        let control = (narrow.linear() - turn.inverse().to_rotation_matrix().into_inner()).abs().max();
-        assert!(control > 0.1, "the inverse is another rotation");
+        assert!(f32_transform.is_similarity());
+        let inverse_error =
+            (f32_transform.linear() - expected_rotation.inverse().to_rotation_matrix().into_inner()).abs().max();
+        assert!(inverse_error > 0.1, "expected the inverse rotation to differ");
     }
 
     #[test]
-    fn a_norm_is_put_right_within_the_slack_and_refused_with_its_value_beyond() {
-        let with = |w: f32| parse_rigid_f32(&pack([0.0, 0.0, 0.0, w], [vec![0; 12]])[1..]);
-        assert_eq!(with(1.0009).expect("near enough").0, Transform::IDENTITY);
-        assert_eq!(with(-0.9991).expect("near enough").0, Transform::IDENTITY);
-        for (w, given) in [(1.002, "norm 1.00199"), (0.998, "norm 0.99800"), (0.0, "norm 0"), (3e38, "norm 300000")] {
-            let refusal = with(w).expect_err(given).to_string();
-            assert!(refusal.starts_with("rotation: expected a quaternion x y z w of norm 1 within 0.001"), "{refusal}");
-            assert!(refusal.contains(given), "{refusal}");
+    fn quaternion_is_normalized_within_the_tolerance() {
+        let parse_with_w = |w: f32| parse_rigid_f32(&pack([0.0, 0.0, 0.0, w], [vec![0; 12]])[1..]);
+        assert_eq!(parse_with_w(1.0009).expect("a norm within the tolerance").0, Transform::IDENTITY);
+        assert_eq!(parse_with_w(-0.9991).expect("a norm within the tolerance").0, Transform::IDENTITY);
+        for (w, norm_text) in [(1.002, "norm 1.00199"), (0.998, "norm 0.99800"), (0.0, "norm 0"), (3e38, "norm 300000")]
+        {
+            let message = parse_with_w(w).expect_err(norm_text).to_string();
+            assert!(message.starts_with("rotation: expected a quaternion x y z w of norm 1 within 0.001"), "{message}");
+            assert!(message.contains(norm_text), "{message}");
         }
-        let refusal = with(f32::NAN).expect_err("NaN").to_string();
-        assert!(refusal.starts_with("rotation[3]: expected a finite number"), "{refusal}");
+        let message = parse_with_w(f32::NAN).expect_err("NaN").to_string();
+        assert!(message.starts_with("rotation[3]: expected a finite number"), "{message}");
     }
 
     #[test]
-    fn an_f64_translation_loses_the_scenes_origin_before_it_is_rounded() {
-        let at = [1e7 + 0.001, -1e7, 12.5];
-        let bytes = pack([0.0, 0.0, 0.0, 1.0], at.map(|number: f64| number.to_le_bytes().to_vec()));
-        let (transform, kept) = parse_rigid_f64(&bytes[1..], [1e7, -1e7, 0.0]).expect("good");
+    fn scene_origin_is_subtracted_before_rounding() {
+        let position = [1e7 + 0.001, -1e7, 12.5];
+        let bytes = pack([0.0, 0.0, 0.0, 1.0], position.map(|number: f64| number.to_le_bytes().to_vec()));
+        let (transform, f64_translation) = parse_rigid_f64(&bytes[1..], [1e7, -1e7, 0.0]).expect("a valid transform");
         assert!((transform.0[3] - 0.001).abs() < 2e-9, "{}", transform.0[3]);
-        assert_eq!((transform.0[7], transform.0[11], kept.map(|kept| kept[2])), (0.0, 12.5, Some(12.5)));
+        assert_eq!(
+            (transform.0[7], transform.0[11], f64_translation.map(|translation| translation[2])),
+            (0.0, 12.5, Some(12.5))
+        );
         // Counterexample: rounding before the subtraction loses the millimeter.
-        assert_eq!(at[0] as f32 - 1e7_f32, 0.0);
+        assert_eq!(position[0] as f32 - 1e7_f32, 0.0);
     }
 
     #[test]
-    fn translations_that_f64_cannot_keep_to_the_millimetre_are_refused() {
-        let with = |x: f64, origin: f64| {
+    fn too_distant_translations_are_rejected() {
+        let parse_at = |x: f64, origin: f64| {
             let translation = [x, 0.0, 0.0].map(|number| number.to_le_bytes().to_vec());
             parse_rigid_f64(&pack([0.0, 0.0, 0.0, 1.0], translation)[1..], [origin, 0.0, 0.0]).map(drop)
         };
-        assert_eq!(with(MAX_TRANSLATION, 0.0), Ok(()));
+        assert_eq!(parse_at(MAX_TRANSLATION, 0.0), Ok(()));
         for (x, origin) in [(2e12, 0.0), (2e12, 2e12), (1e12, -1e12), (f64::INFINITY, 0.0), (f64::NAN, 0.0)] {
-            let refusal = with(x, origin).expect_err("too far").to_string();
-            assert!(refusal.starts_with("translation[0]"), "{refusal}");
+            let message = parse_at(x, origin).expect_err("too far").to_string();
+            assert!(message.starts_with("translation[0]"), "{message}");
         }
     }
 }

@@ -14,7 +14,7 @@ use modalcast_render::FrameImage;
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh};
 
-/// Far position: not on the grid of origin cells, and not representable in f32.
+/// Far position: not on the grid of floating origins, and not representable in f32.
 const FAR_POSITION: [f64; 3] = [1e7 + 1.3, 0.0, -1e7 - 2.7];
 
 fn open_context() -> DeviceContext {

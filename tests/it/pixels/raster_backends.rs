@@ -59,7 +59,7 @@ impl ReferenceRasterizer {
 
     fn rasterize(&self, viewport: &Viewport, groups: &[DrawRange]) -> VisibilityBuffer {
         let [width, height] = viewport.size();
-        let clip = Matrix4::from_row_slice(&viewport.clip().map(f64::from));
+        let clip = Matrix4::from_row_slice(&viewport.clip_from_positions().map(f64::from));
         let clip = Matrix4::new_translation(&Vector3::new(self.x_offset, 0.0, 0.0)) * clip;
         let mut buffer = VisibilityBuffer::new(Viewport::new(&clip, width, height).expect("expected a valid viewport"));
         groups.iter().for_each(|group| buffer.draw(&self.positions(), &self.mesh.triangles, *group));

@@ -105,7 +105,12 @@ impl InputWriter {
 
 /// Transform root and frame of each domain; empty in a scene without followers.
 pub(crate) fn transform_links(scene: &Scene) -> Vec<TransformLink> {
-    scene.transform_roots.following().iter().map(|[root, frame]| TransformLink { root: *root, frame: *frame }).collect()
+    scene
+        .transform_roots
+        .root_and_frame_indices()
+        .iter()
+        .map(|[root, frame]| TransformLink { root: *root, frame: *frame })
+        .collect()
 }
 
 impl InputPacker {

@@ -10,7 +10,8 @@ fn scene(count: usize) -> Arc<Scene> {
         || Mesh::from_indexed(vec![[0.5, 0.25, 1.0]], vec![[0.0, 0.0, 1.0]], vec![], vec![[0, 0, 0]]).expect("a point");
     let modes = Modes::from_columns(3, 2, vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0]).expect("3 x 2");
     let mut parts = SceneParts::named("points");
-    parts.shapes = vec![Shape::new(mesh(), modes).expect("fits"), Shape::new(mesh(), Modes::rigid()).expect("rigid")];
+    parts.shapes =
+        vec![Shape::new(mesh(), modes).expect("a valid shape"), Shape::new(mesh(), Modes::rigid()).expect("rigid")];
     parts.materials = vec![Material::default()];
     let domain = |index: usize| Domain {
         name: format!("point {index}"),
@@ -21,179 +22,191 @@ fn scene(count: usize) -> Arc<Scene> {
         attachment: None,
         follows: None,
         rest_q: vec![],
-        shares_q_with: [(2, 1), (4, 2)].into_iter().find(|(own, _)| *own == index).map(|(_, twin)| twin),
+        shares_q_with: [(2, 1), (4, 2)].into_iter().find(|(domain, _)| *domain == index).map(|(_, twin)| twin),
         metadata: Metadata::default(),
     };
     parts.domains = (0..count).map(domain).collect();
     Scene::new(parts).expect("a scene")
 }
 
-fn q(domains: &[u32], values: &[f32]) -> RawStepUpdate {
+fn coordinates_step(domains: &[u32], values: &[f32]) -> RawStepUpdate {
     let q = values.iter().flat_map(|number| number.to_le_bytes()).collect();
     RawStepUpdate { q_domains: domains.to_vec(), q, ..RawStepUpdate::default() }
 }
 
-/// A step with f64 translations without rotation.
-fn far(domains: &[u32], translations: &[[f64; 3]]) -> RawStepUpdate {
-    let one = |translation: &[f64; 3]| {
+/// A step with f64 translations and no rotation.
+fn f64_step(domains: &[u32], translations: &[[f64; 3]]) -> RawStepUpdate {
+    let encode = |translation: &[f64; 3]| {
         let rotation = [0.0, 0.0, 0.0, 1.0_f32].into_iter().flat_map(f32::to_le_bytes);
         rotation.chain(translation.iter().flat_map(|number| number.to_le_bytes())).collect::<Vec<u8>>()
     };
     RawStepUpdate {
         transform_domains: domains.to_vec(),
-        transforms: translations.iter().flat_map(one).collect(),
+        transforms: translations.iter().flat_map(encode).collect(),
         transform_format: TransformFormat::RigidF64,
         ..RawStepUpdate::default()
     }
 }
 
-/// A step with an f32 translation without rotation.
-fn near(domain: u32, [x, y, z]: [f32; 3]) -> RawStepUpdate {
+/// A step with an f32 translation and no rotation.
+fn f32_step(domain: u32, [x, y, z]: [f32; 3]) -> RawStepUpdate {
     let entries = [1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z];
     let transforms = entries.iter().flat_map(|number: &f32| number.to_le_bytes()).collect();
     RawStepUpdate { transform_domains: vec![domain], transforms, ..RawStepUpdate::default() }
 }
 
-fn parse(scene: &Scene, raw: &RawStepUpdate) -> StepUpdate {
-    StepUpdate::parse(scene, raw).expect("a good step")
+fn parse_step(scene: &Scene, raw: &RawStepUpdate) -> StepUpdate {
+    StepUpdate::parse(scene, raw).expect("a valid step")
 }
 
-fn after(scene: &Scene, steps: &[RawStepUpdate]) -> SceneState {
+fn state_after(scene: &Scene, steps: &[RawStepUpdate]) -> SceneState {
     let mut state = SceneState::rest(scene);
-    steps.iter().for_each(|raw| state.apply(scene, &parse(scene, raw)));
+    steps.iter().for_each(|raw| state.apply(scene, &parse_step(scene, raw)));
     state
 }
 
-/// The f64 position of a domain as stored in the state.
-fn place(state: &SceneState, domain: usize) -> [f64; 3] {
-    let (cell, own) = (state.origin_of(domain), state.transforms[domain].translation());
-    std::array::from_fn(|axis| cell[axis] + own[axis])
+/// The position of a domain's origin in f64, relative to the scene's origin.
+fn world_position(state: &SceneState, domain: usize) -> [f64; 3] {
+    let (origin, translation) = (state.origin_of(domain), state.transforms[domain].translation());
+    std::array::from_fn(|axis| origin[axis] + translation[axis])
 }
 
 #[test]
-fn a_step_lists_the_domains_that_it_names_and_those_that_share_their_coordinates() {
+fn changed_domains_include_those_that_share_coordinates() {
     let scene = scene(7);
     let rest = SceneState::rest(&scene);
     assert_eq!((rest.serial, &rest.changed), (0, &DirtyDomains::All));
     let mut state = rest;
-    for (serial, (raw, listed)) in [
-        (q(&[3, 0], &[0.0; 4]), vec![0, 3]),
-        (q(&[1], &[1.0, 2.0]), vec![1, 2, 4]),
-        (q(&[4], &[1.0, 2.0]), vec![1, 2, 4]),
-        (q(&[2, 6], &[0.0; 4]), vec![1, 2, 4, 6]),
+    for (serial, (raw, changed)) in [
+        (coordinates_step(&[3, 0], &[0.0; 4]), vec![0, 3]),
+        (coordinates_step(&[1], &[1.0, 2.0]), vec![1, 2, 4]),
+        (coordinates_step(&[4], &[1.0, 2.0]), vec![1, 2, 4]),
+        (coordinates_step(&[2, 6], &[0.0; 4]), vec![1, 2, 4, 6]),
         // A domain without modes has the same `first_q` as the next one but shares no coordinates with it.
-        (q(&[5], &[]), vec![5]),
-        (near(6, [1.0; 3]), vec![6]),
-        (RawStepUpdate { q_domains: vec![4], q: vec![0; 8].into(), ..near(2, [1.0; 3]) }, vec![1, 2, 4]),
+        (coordinates_step(&[5], &[]), vec![5]),
+        (f32_step(6, [1.0; 3]), vec![6]),
+        (RawStepUpdate { q_domains: vec![4], q: vec![0; 8].into(), ..f32_step(2, [1.0; 3]) }, vec![1, 2, 4]),
         (RawStepUpdate::default(), vec![]),
     ]
     .into_iter()
     .enumerate()
     {
-        state.apply(&scene, &parse(&scene, &raw));
-        assert_eq!((state.serial, &state.changed), (serial as u64 + 1, &DirtyDomains::Some(listed)));
+        state.apply(&scene, &parse_step(&scene, &raw));
+        assert_eq!((state.serial, &state.changed), (serial as u64 + 1, &DirtyDomains::Some(changed)));
     }
     state.mark_all_dirty();
     assert_eq!((state.serial, &state.changed), (9, &DirtyDomains::All));
 }
 
+/// Recomputing only the domains in `changed` must suffice, and no entry of the list may be superfluous.
 #[test]
-fn vertices_kept_from_the_last_state_are_right_with_the_list_and_wrong_without_an_entry_of_it() {
+fn changed_domains_are_complete_and_minimal() {
     let scene = scene(7);
-    let vertices = |state: &SceneState, kept: &[f64], list: &[u32]| {
-        let whole = fingerprints(&scene, state);
-        let mut mixed = kept.to_vec();
-        list.iter().for_each(|domain| mixed[*domain as usize] = whole[*domain as usize]);
-        (mixed, whole)
+    let updated_fingerprints = |state: &SceneState, previous: &[f64], changed: &[u32]| {
+        let expected = fingerprints(&scene, state);
+        let mut updated = previous.to_vec();
+        changed.iter().for_each(|domain| updated[*domain as usize] = expected[*domain as usize]);
+        (updated, expected)
     };
     let mut state = SceneState::rest(&scene);
-    let mut kept = fingerprints(&scene, &state);
-    for raw in [q(&[1], &[0.5, 2.0]), near(3, [1.0, 2.0, 3.0]), q(&[4, 0], &[1.0, -1.0, 3.0, 4.0])] {
-        state.apply(&scene, &parse(&scene, &raw));
-        let DirtyDomains::Some(list) = &state.changed else { panic!("a list") };
-        let (mixed, whole) = vertices(&state, &kept, list);
-        assert_eq!(mixed, whole);
-        for left_out in 0..list.len() {
-            let mut short = list.clone();
-            short.remove(left_out);
-            assert_ne!(vertices(&state, &kept, &short).0, whole, "{left_out} of {list:?}");
+    let mut previous = fingerprints(&scene, &state);
+    for raw in [
+        coordinates_step(&[1], &[0.5, 2.0]),
+        f32_step(3, [1.0, 2.0, 3.0]),
+        coordinates_step(&[4, 0], &[1.0, -1.0, 3.0, 4.0]),
+    ] {
+        state.apply(&scene, &parse_step(&scene, &raw));
+        let DirtyDomains::Some(changed) = &state.changed else { panic!("expected a list of domains") };
+        let (updated, expected) = updated_fingerprints(&state, &previous, changed);
+        assert_eq!(updated, expected);
+        for removed in 0..changed.len() {
+            let mut incomplete_list = changed.clone();
+            incomplete_list.remove(removed);
+            assert_ne!(
+                updated_fingerprints(&state, &previous, &incomplete_list).0,
+                expected,
+                "{removed} of {changed:?}"
+            );
         }
-        kept = whole;
+        previous = expected;
     }
 }
 
 /// One number per domain that depends on all of its q and T.
 fn fingerprints(scene: &Scene, state: &SceneState) -> Vec<f64> {
-    let of = |domain: usize| {
+    let fingerprint = |domain: usize| {
         let q: f64 = state.q_of(scene, domain).iter().zip([1.0, 10.0]).map(|(q, weight)| f64::from(*q) * weight).sum();
         let t: f64 =
             state.transforms[domain].0.iter().zip(1..).map(|(t, weight)| f64::from(*t) * f64::from(weight)).sum();
         q + 1000.0 * t
     };
-    (0..scene.domains.len()).map(of).collect()
+    (0..scene.domains.len()).map(fingerprint).collect()
 }
 
 #[test]
-fn a_scene_that_never_sees_f64_has_no_cells_and_one_that_stays_near_keeps_its_origin() {
+fn near_translations_keep_the_scene_origin() {
     let scene = scene(3);
-    let state = after(&scene, &[near(1, [1e6, 0.0, 0.0])]);
+    let state = state_after(&scene, &[f32_step(1, [1e6, 0.0, 0.0])]);
     assert_eq!((state.origins.as_ref(), state.transforms[1].0[3]), (None, 1e6));
-    let state = after(&scene, &[far(&[0, 1], &[[4096.0, -4096.0, 0.1], [1.0, 2.0, 3.0]])]);
+    let state = state_after(&scene, &[f64_step(&[0, 1], &[[4096.0, -4096.0, 0.1], [1.0, 2.0, 3.0]])]);
     assert_eq!((state.origin_of(0), state.transforms[0].0[11]), ([0.0; 3], 0.1));
     assert_eq!(state.changed, DirtyDomains::Some(vec![0, 1]));
     assert!(state.origins.is_some_and(|origins| origins.is_uniform()));
 }
 
 #[test]
-fn a_domain_ten_thousand_kilometres_away_has_a_cell_of_its_own_and_the_others_stay() {
+fn distant_domain_has_its_own_floating_origin() {
     let scene = scene(3);
-    let at = [1e7 + 0.001, -1e7 - 0.002, 3.0];
-    let mut state = after(&scene, &[far(&[2], &[at])]);
+    let position = [1e7 + 0.001, -1e7 - 0.002, 3.0];
+    let mut state = state_after(&scene, &[f64_step(&[2], &[position])]);
     assert_eq!(state.changed, DirtyDomains::Some(vec![2]));
     assert_eq!(
         (state.origin_of(0), state.origin_of(2)),
         ([0.0; 3], [9766.0 * ORIGIN_GRID, -9766.0 * ORIGIN_GRID, 0.0])
     );
-    let error = (0..3).map(|axis| (place(&state, 2)[axis] - at[axis]).abs()).fold(0.0, f64::max);
+    let error = (0..3).map(|axis| (world_position(&state, 2)[axis] - position[axis]).abs()).fold(0.0, f64::max);
     assert!(error <= 2e-5, "{error} units");
-    assert!((f64::from(at[0] as f32) - at[0]).abs() > 5e-4, "the control: f32 alone loses the millimetre");
-    // An f32 translation also moves the domain, exactly, and it may return.
-    state.apply(&scene, &parse(&scene, &near(2, [1e6 + 1.0, 0.0, 0.0])));
-    assert_eq!((place(&state, 2), state.origin_of(2)), ([1e6 + 1.0, 0.0, 0.0], [977.0 * ORIGIN_GRID, 0.0, 0.0]));
-    state.apply(&scene, &parse(&scene, &near(2, [5.0, 6.0, 7.0])));
+    assert!((f64::from(position[0] as f32) - position[0]).abs() > 5e-4, "expected f32 to lose a millimeter");
+    // f32 translations also change the floating origin, and move the domain back to the scene's origin.
+    state.apply(&scene, &parse_step(&scene, &f32_step(2, [1e6 + 1.0, 0.0, 0.0])));
+    assert_eq!(
+        (world_position(&state, 2), state.origin_of(2)),
+        ([1e6 + 1.0, 0.0, 0.0], [977.0 * ORIGIN_GRID, 0.0, 0.0])
+    );
+    state.apply(&scene, &parse_step(&scene, &f32_step(2, [5.0, 6.0, 7.0])));
     assert_eq!((state.transforms[2].0[3], state.origin_of(2)), (5.0, [0.0; 3]));
 }
 
 #[test]
-fn a_scene_that_leaves_as_a_whole_takes_its_origin_along_but_for_those_who_stay_behind() {
+fn shared_origin_follows_the_majority_of_the_domains() {
     let scene = scene(5);
-    let off = |shift: f64| [0.0, 1.0, 2.0, 3.0].map(|at| [shift + at, 0.25, -shift]);
-    // The first two of five domains leave alone; after the third, most have left.
-    let steps = [far(&[0, 1], &off(1e7)[..2]), far(&[2, 3], &off(1e7)[2..])];
-    let state = after(&scene, &steps[..1]);
+    let distant_positions = |shift: f64| [0.0, 1.0, 2.0, 3.0].map(|offset| [shift + offset, 0.25, -shift]);
+    // Two of five distant domains are outliers. Four of five move the shared origin.
+    let steps = [f64_step(&[0, 1], &distant_positions(1e7)[..2]), f64_step(&[2, 3], &distant_positions(1e7)[2..])];
+    let state = state_after(&scene, &steps[..1]);
     assert_eq!(
         (state.origin_of(1), state.origin_of(4)),
         ([9766.0 * ORIGIN_GRID, 0.0, -9766.0 * ORIGIN_GRID], [0.0; 3])
     );
-    assert_eq!(state.origins.as_ref().map(|origins| origins.shared()), Some([0.0; 3]));
-    let mut state = after(&scene, &steps);
-    assert_eq!((state.serial, &state.changed), (2, &DirtyDomains::All), "every transform was expressed anew");
+    assert_eq!(state.origins.as_ref().map(|origins| origins.shared_origin()), Some([0.0; 3]));
+    let mut state = state_after(&scene, &steps);
+    assert_eq!((state.serial, &state.changed), (2, &DirtyDomains::All), "expected all transforms to be rebased");
     assert_eq!(
-        state.origins.as_ref().map(|origins| (origins.shared(), origins.is_uniform())),
+        state.origins.as_ref().map(|origins| (origins.shared_origin(), origins.is_uniform())),
         Some((state.origin_of(0), false))
     );
-    assert_eq!((state.origin_of(4), place(&state, 4)), ([0.0; 3], [0.0; 3]));
-    for (domain, want) in off(1e7).iter().enumerate() {
+    assert_eq!((state.origin_of(4), world_position(&state, 4)), ([0.0; 3], [0.0; 3]));
+    for (domain, expected) in distant_positions(1e7).iter().enumerate() {
         assert_eq!(state.origin_of(domain), [9766.0 * ORIGIN_GRID, 0.0, -9766.0 * ORIGIN_GRID]);
-        assert_eq!(place(&state, domain), *want);
+        assert_eq!(world_position(&state, domain), *expected);
     }
-    // Within reach of the origin, the shared cell stays; beyond, it moves.
-    state.apply(&scene, &parse(&scene, &far(&[0, 1, 2, 3], &off(1e7 + 4000.0))));
+    // Within reach, the shared origin remains. Beyond, it moves.
+    state.apply(&scene, &parse_step(&scene, &f64_step(&[0, 1, 2, 3], &distant_positions(1e7 + 4000.0))));
     assert_eq!(
         (state.origin_of(0), &state.changed),
         ([9766.0 * ORIGIN_GRID, 0.0, -9766.0 * ORIGIN_GRID], &DirtyDomains::Some(vec![0, 1, 2, 3]))
     );
-    state.apply(&scene, &parse(&scene, &far(&[0, 1, 2, 3], &off(1e7 + 9000.0))));
+    state.apply(&scene, &parse_step(&scene, &f64_step(&[0, 1, 2, 3], &distant_positions(1e7 + 9000.0))));
     assert_eq!(
         (state.origin_of(0), &state.changed),
         ([9774.0 * ORIGIN_GRID, 0.0, -9774.0 * ORIGIN_GRID], &DirtyDomains::All)
@@ -201,48 +214,51 @@ fn a_scene_that_leaves_as_a_whole_takes_its_origin_along_but_for_those_who_stay_
 }
 
 #[test]
-fn f64_that_begins_in_a_scene_with_far_f32_transforms_expresses_those_anew() {
+fn first_f64_step_rebases_distant_f32_transforms() {
     let scene = scene(5);
-    let mut state = after(&scene, &[near(3, [1e6, 2.0, 0.0])]);
-    state.apply(&scene, &parse(&scene, &far(&[0], &[[1.0, 0.0, 0.0]])));
-    assert_eq!((state.origin_of(3), place(&state, 3)), ([977.0 * ORIGIN_GRID, 0.0, 0.0], [1e6, 2.0, 0.0]));
+    let mut state = state_after(&scene, &[f32_step(3, [1e6, 2.0, 0.0])]);
+    state.apply(&scene, &parse_step(&scene, &f64_step(&[0], &[[1.0, 0.0, 0.0]])));
+    assert_eq!((state.origin_of(3), world_position(&state, 3)), ([977.0 * ORIGIN_GRID, 0.0, 0.0], [1e6, 2.0, 0.0]));
     assert_eq!(state.changed, DirtyDomains::All);
 }
 
 #[test]
-fn a_scattered_scene_is_not_searched_for_a_shared_cell_at_every_step() {
+fn scattered_scene_is_not_searched_in_every_step() {
     let scene = scene(4);
-    let scattered = [0.0, 1e5, 2e5, 3e5].map(|x| [x, x, x]);
-    let mut state = after(&scene, &[far(&[0, 1, 2, 3], &scattered)]);
-    let shared = state.origins.as_ref().map(|origins| origins.shared());
+    let positions = [0.0, 1e5, 2e5, 3e5].map(|x| [x, x, x]);
+    let mut state = state_after(&scene, &[f64_step(&[0, 1, 2, 3], &positions)]);
+    let shared_origin = state.origins.as_ref().map(|origins| origins.shared_origin());
     for _ in 0..3 {
-        state.apply(&scene, &parse(&scene, &far(&[3], &[scattered[3]])));
+        state.apply(&scene, &parse_step(&scene, &f64_step(&[3], &[positions[3]])));
         assert_eq!(state.changed, DirtyDomains::Some(vec![3]));
-        assert_eq!(state.origins.as_ref().map(|origins| origins.shared()), shared);
+        assert_eq!(state.origins.as_ref().map(|origins| origins.shared_origin()), shared_origin);
     }
-    for (domain, want) in scattered.iter().enumerate() {
-        assert_eq!(place(&state, domain), *want);
+    for (domain, expected) in positions.iter().enumerate() {
+        assert_eq!(world_position(&state, domain), *expected);
     }
 }
 
 #[test]
-fn merged_steps_leave_the_state_of_all_in_whatever_formats_they_came() {
+fn merged_step_gives_the_state_of_all_its_steps() {
     let scene = scene(4);
     let steps = [
-        far(&[0, 1], &[[1e7, 0.0, 0.0], [5.0, 0.5, 0.0]]),
-        RawStepUpdate { q_domains: vec![1], q: vec![1; 8].into(), ..near(0, [1.0, 2.0, 3.0]) },
-        far(&[3], &[[-1e7 - 0.125, 0.0, 0.0]]),
-        near(2, [9.0, 9.0, 9.0]),
+        f64_step(&[0, 1], &[[1e7, 0.0, 0.0], [5.0, 0.5, 0.0]]),
+        RawStepUpdate { q_domains: vec![1], q: vec![1; 8].into(), ..f32_step(0, [1.0, 2.0, 3.0]) },
+        f64_step(&[3], &[[-1e7 - 0.125, 0.0, 0.0]]),
+        f32_step(2, [9.0, 9.0, 9.0]),
     ];
-    let merged =
-        steps.iter().map(|raw| parse(&scene, raw)).reduce(|older, newer| newer.merged_after(&older)).expect("some");
-    let mut at_once = SceneState::rest(&scene);
-    at_once.apply(&scene, &merged);
-    let one_by_one = after(&scene, &steps);
-    assert_eq!(at_once, one_by_one);
-    assert_eq!((at_once.serial, one_by_one.serial), (1, 4));
-    assert_eq!(at_once.changed, DirtyDomains::Some(vec![0, 1, 2, 3]));
-    assert_eq!(place(&at_once, 3), [-1e7 - 0.125, 0.0, 0.0]);
-    // An implementation that ignores the newer f32 translation of domain 0 would fail here.
-    assert_ne!(after(&scene, &[steps[0].clone(), steps[2].clone(), steps[3].clone()]), one_by_one);
+    let merged = steps
+        .iter()
+        .map(|raw| parse_step(&scene, raw))
+        .reduce(|older, newer| newer.merged_after(&older))
+        .expect("at least one step");
+    let mut merged_state = SceneState::rest(&scene);
+    merged_state.apply(&scene, &merged);
+    let sequential_state = state_after(&scene, &steps);
+    assert_eq!(merged_state, sequential_state);
+    assert_eq!((merged_state.serial, sequential_state.serial), (1, 4));
+    assert_eq!(merged_state.changed, DirtyDomains::Some(vec![0, 1, 2, 3]));
+    assert_eq!(world_position(&merged_state, 3), [-1e7 - 0.125, 0.0, 0.0]);
+    // The f32 translation of domain 0 in the second step changes the result.
+    assert_ne!(state_after(&scene, &[steps[0].clone(), steps[2].clone(), steps[3].clone()]), sequential_state);
 }

@@ -327,7 +327,7 @@ mod tests {
             loaded_scene.surface().expect("a surface").positions.clone(),
         );
         let triangles = setup.scene.triangle_vertices();
-        let clip = viewport.clip();
+        let clip = viewport.clip_from_positions();
         let clip_coordinate = |row: usize, p: [f32; 3]| {
             (0..3).map(|axis| clip[4 * row + axis] * p[axis]).sum::<f32>() + clip[4 * row + 3]
         };
@@ -351,7 +351,7 @@ mod tests {
         assert_eq!(map.size(), [1024; 2]);
         let inside = |p: &[f32]| {
             (0..3).all(|axis| {
-                let clip = map.clip();
+                let clip = map.clip_from_positions();
                 let coordinate: f32 = (0..3).map(|k| clip[4 * axis + k] * p[k]).sum::<f32>() + clip[4 * axis + 3];
                 coordinate.abs() <= 1.0
             })
