@@ -13,7 +13,7 @@ const SIDE: usize = 512;
 /// Height of the ridges above the furrows, in tile widths.
 const RELIEF: f32 = 0.020;
 
-/// sRGB colors, 0 to 255: furrow bottoms, ridges, weathered crests, and lichen.
+// sRGB colors, 0 to 255.
 const FURROW: [f32; 3] = [70.0, 57.0, 47.0];
 const RIDGE: [f32; 3] = [126.0, 109.0, 92.0];
 const CREST: [f32; 3] = [166.0, 152.0, 135.0];
@@ -25,7 +25,7 @@ const LICHEN: [f32; 3] = [126.0, 126.0, 92.0];
 /// None in practice, because the sizes are constants.
 pub(super) fn textures(random: &mut SplitMix64) -> Result<[Texture; 2]> {
     let layers = BarkLayers::new(random);
-    let rows = |row: usize| (0..SIDE).map(move |column| (column, row));
+    let pixels_of_row = |row: usize| (0..SIDE).map(move |column| (column, row));
     let heights: Vec<f32> = (0..SIDE * SIDE)
         .into_par_iter()
         .with_min_len(SIDE)
@@ -33,7 +33,7 @@ pub(super) fn textures(random: &mut SplitMix64) -> Result<[Texture; 2]> {
         .collect();
     let mut colors = Vec::with_capacity(4 * SIDE * SIDE);
     let mut normals = Vec::with_capacity(4 * SIDE * SIDE);
-    for (column, row) in (0..SIDE).flat_map(rows) {
+    for (column, row) in (0..SIDE).flat_map(pixels_of_row) {
         let (u, v) = (column as f32 / SIDE as f32, row as f32 / SIDE as f32);
         let color = layers.color(u, v, heights[row * SIDE + column]);
         colors.extend(color.map(|channel| channel.clamp(0.0, 255.0) as u8));
@@ -45,6 +45,7 @@ pub(super) fn textures(random: &mut SplitMix64) -> Result<[Texture; 2]> {
     Ok([Texture::new("bark", side, side, colors)?, Texture::new("bark normals", side, side, normals)?])
 }
 
+/// The noise layers of the bark.
 struct BarkLayers {
     warps: [GradientNoise; 2],
     furrows: [GradientNoise; 2],
@@ -55,7 +56,7 @@ struct BarkLayers {
 
 impl BarkLayers {
     fn new(random: &mut SplitMix64) -> Self {
-        let mut noise = |across, along| GradientNoise { cells: [across, along], seed: random.bits() };
+        let mut noise = |across, along| GradientNoise { cells: [across, along], seed: random.next_bits() };
         Self {
             warps: [noise(4, 3), noise(9, 7)],
             furrows: [noise(15, 3), noise(27, 5)],
@@ -65,37 +66,37 @@ impl BarkLayers {
         }
     }
 
-    /// 0 in the furrows to about 1 on the crests.
+    /// The height at a position, from 0 in the furrows to about 1 on the crests.
     fn height(&self, u: f32, v: f32) -> f32 {
-        let bent = u + 0.035 * self.warps[0].at(u, v) + 0.012 * self.warps[1].at(u, v);
-        // The zero crossings of the noise form long, wavering furrows; the finer ones are shallow.
-        let deep = smoothstep(0.0, 0.34, self.furrows[0].at(bent, v).abs());
-        let fine = smoothstep(0.0, 0.36, self.furrows[1].at(bent, v).abs());
-        let crack = smoothstep(0.0, 0.16, self.cracks.at(bent, v + 0.02 * self.warps[1].at(v, u)).abs());
-        let grain = 0.6 * self.grain[0].at(bent, v) + 0.4 * self.grain[1].at(u, v);
+        let warped_u = u + 0.035 * self.warps[0].sample(u, v) + 0.012 * self.warps[1].sample(u, v);
+        // The zero crossings of the noise form long, wavering furrows. Those of the finer noise are shallow.
+        let deep = smoothstep(0.0, 0.34, self.furrows[0].sample(warped_u, v).abs());
+        let fine = smoothstep(0.0, 0.36, self.furrows[1].sample(warped_u, v).abs());
+        let crack = smoothstep(0.0, 0.16, self.cracks.sample(warped_u, v + 0.02 * self.warps[1].sample(v, u)).abs());
+        let grain = 0.6 * self.grain[0].sample(warped_u, v) + 0.4 * self.grain[1].sample(u, v);
         let plate = deep.powf(0.7) * (0.58 + 0.42 * fine) * (0.80 + 0.20 * crack);
         plate * (0.93 + 0.07 * grain) + 0.045 * grain
     }
 
     /// sRGB color at a position of the given height.
     fn color(&self, u: f32, v: f32, height: f32) -> [f32; 3] {
-        let grain = self.grain[0].at(u, v);
-        let tint = self.tint.at(u, v);
-        let body = lerp_color(FURROW, RIDGE, smoothstep(0.02, 0.6, height));
-        let crest = lerp_color(body, CREST, 0.75 * smoothstep(0.55, 1.0, height + 0.12 * grain));
-        let mossy = 0.45 * smoothstep(0.05, 0.6, tint) * smoothstep(0.3, 0.9, height);
-        let lichen = lerp_color(crest, LICHEN, mossy);
-        lichen.map(|channel| channel * (1.0 + 0.07 * grain + 0.05 * tint))
+        let grain = self.grain[0].sample(u, v);
+        let tint = self.tint.sample(u, v);
+        let base_color = lerp_color(FURROW, RIDGE, smoothstep(0.02, 0.6, height));
+        let crest_color = lerp_color(base_color, CREST, 0.75 * smoothstep(0.55, 1.0, height + 0.12 * grain));
+        let lichen_weight = 0.45 * smoothstep(0.05, 0.6, tint) * smoothstep(0.3, 0.9, height);
+        let lichen_color = lerp_color(crest_color, LICHEN, lichen_weight);
+        lichen_color.map(|channel| channel * (1.0 + 0.07 * grain + 0.05 * tint))
     }
 }
 
 /// The unit normal by central differences, periodic at the tile's edges; x points right and y up in the image.
 fn normal(heights: &[f32], column: usize, row: usize) -> [f32; 3] {
-    let at = |column: usize, row: usize| heights[row % SIDE * SIDE + column % SIDE];
-    let right = at(column + 1, row) - at(column + SIDE - 1, row);
-    let up = at(column, row + SIDE - 1) - at(column, row + 1);
+    let height = |column: usize, row: usize| heights[row % SIDE * SIDE + column % SIDE];
+    let height_step_right = height(column + 1, row) - height(column + SIDE - 1, row);
+    let height_step_up = height(column, row + SIDE - 1) - height(column, row + 1);
     let slope = 0.5 * SIDE as f32 * RELIEF;
-    nalgebra::Vector3::new(-slope * right, -slope * up, 1.0).normalize().into()
+    nalgebra::Vector3::new(-slope * height_step_right, -slope * height_step_up, 1.0).normalize().into()
 }
 
 #[cfg(test)]
@@ -110,30 +111,32 @@ mod tests {
     }
 
     #[test]
-    fn the_normal_map_looks_up_on_average_and_the_colour_is_a_warm_brown() {
-        let [color, normals] = textures(&mut SplitMix64::new(1)).expect("made");
+    fn mean_normal_is_z_and_mean_color_is_brown() {
+        let [color, normals] = textures(&mut SplitMix64::new(1)).expect("valid textures");
         let [x, y, z] = mean(&normals);
         assert!((x - 127.5).abs() < 2.0 && (y - 127.5).abs() < 2.0 && z > 215.0, "{x} {y} {z}");
         let [red, green, blue] = mean(&color);
         assert!(red > green && green > blue && (70.0..160.0).contains(&red), "{red} {green} {blue}");
         // The map is not flat.
-        let tilted = normals.rgba().chunks_exact(4).filter(|pixel| pixel[2] < 240).count();
-        assert!(tilted > SIDE * SIDE / 10, "{tilted} tilted pixels");
+        let tilted_count = normals.rgba().chunks_exact(4).filter(|pixel| pixel[2] < 240).count();
+        assert!(tilted_count > SIDE * SIDE / 10, "{tilted_count} tilted pixels");
     }
 
     #[test]
-    fn the_images_tile_edges_differ_no_more_than_neighbours_within() {
-        let [color, _] = textures(&mut SplitMix64::new(2)).expect("made");
+    fn images_are_continuous_across_the_tile_edges() {
+        let [color, _] = textures(&mut SplitMix64::new(2)).expect("valid textures");
         let red = |column: usize, row: usize| f64::from(color.rgba()[4 * (row * SIDE + column)]);
-        let step = |a: usize, b: usize| (0..SIDE).map(|row| (red(a, row) - red(b, row)).abs()).sum::<f64>();
-        let drop = |a: usize, b: usize| (0..SIDE).map(|column| (red(column, a) - red(column, b)).abs()).sum::<f64>();
-        assert!(step(SIDE - 1, 0) < 3.0 * step(100, 101) + 1.0);
-        assert!(drop(SIDE - 1, 0) < 3.0 * drop(100, 101) + 1.0);
-        assert!(step(0, 101) > 3.0 * step(100, 101));
+        let column_difference =
+            |a: usize, b: usize| (0..SIDE).map(|row| (red(a, row) - red(b, row)).abs()).sum::<f64>();
+        let row_difference =
+            |a: usize, b: usize| (0..SIDE).map(|column| (red(column, a) - red(column, b)).abs()).sum::<f64>();
+        assert!(column_difference(SIDE - 1, 0) < 3.0 * column_difference(100, 101) + 1.0);
+        assert!(row_difference(SIDE - 1, 0) < 3.0 * row_difference(100, 101) + 1.0);
+        assert!(column_difference(0, 101) > 3.0 * column_difference(100, 101));
     }
 
     #[test]
-    fn a_bump_tilts_the_normals_away_from_its_top() {
+    fn normals_around_a_bump_point_away_from_it() {
         let mut heights = vec![0.0; SIDE * SIDE];
         heights[100 * SIDE + 100] = 0.2;
         assert!(normal(&heights, 101, 100)[0] > 0.1);

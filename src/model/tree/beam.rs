@@ -28,30 +28,30 @@ pub(super) struct BeamModes {
 }
 
 impl Beam {
-    /// Mass of the wood alone in kg.
-    pub(super) fn own_mass(&self) -> f64 {
+    /// Mass of the beam in kg, without carried masses.
+    pub(super) fn wood_mass(&self) -> f64 {
         let lengths = self.nodes.windows(2).map(|ends| (ends[1] - ends[0]).norm());
         lengths.zip(&self.sections).map(|(length, section)| self.elastic.density * section.area * length).sum()
     }
 
     /// K and M of the 6 N free degrees of freedom.
     pub(super) fn assemble(&self) -> (DMatrix<f64>, DMatrix<f64>) {
-        let free = 6 * self.sections.len();
-        let (mut stiffness, mut mass) = (DMatrix::zeros(free, free), DMatrix::zeros(free, free));
+        let free_dofs = 6 * self.sections.len();
+        let (mut stiffness, mut mass) = (DMatrix::zeros(free_dofs, free_dofs), DMatrix::zeros(free_dofs, free_dofs));
         for (element, section) in self.sections.iter().enumerate() {
             let (k, m) = element_matrices(&self.nodes[element], &self.nodes[element + 1], section, &self.elastic);
-            // The first node is clamped: of the first element, only the second node's block is free.
-            let (first, count) = if element == 0 { (6, 6) } else { (0, 12) };
-            let to = 6 * element + first - 6;
-            let mut block = stiffness.view_mut((to, to), (count, count));
-            block += k.view((first, first), (count, count));
-            let mut block = mass.view_mut((to, to), (count, count));
-            block += m.view((first, first), (count, count));
+            // The first node is clamped, so only the second node's block of the first element is free.
+            let (first_free, count) = if element == 0 { (6, 6) } else { (0, 12) };
+            let first_row = 6 * element + first_free - 6;
+            let mut block = stiffness.view_mut((first_row, first_row), (count, count));
+            block += k.view((first_free, first_free), (count, count));
+            let mut block = mass.view_mut((first_row, first_row), (count, count));
+            block += m.view((first_free, first_free), (count, count));
         }
-        for (station, load) in &self.point_masses {
-            for (node, share) in [(station.element, 1.0 - station.fraction), (station.element + 1, station.fraction)] {
+        for (station, carried_mass) in &self.point_masses {
+            for (node, weight) in [(station.element, 1.0 - station.fraction), (station.element + 1, station.fraction)] {
                 for axis in 0..if node == 0 { 0 } else { 3 } {
-                    mass[(6 * (node - 1) + axis, 6 * (node - 1) + axis)] += share * load;
+                    mass[(6 * (node - 1) + axis, 6 * (node - 1) + axis)] += weight * carried_mass;
                 }
             }
         }
@@ -60,32 +60,33 @@ impl Beam {
 
     /// The `count` lowest modes.
     ///
-    /// K is factored instead of M. Axial stiffness is up to 10^10 times the lowest bending stiffness, so that in L^-1 K
-    /// L^-T with M = L L^T the lowest eigenvalues would be lost in the rounding errors of the highest. With K = L L^T
-    /// they are the largest ones of L^-1 M L^-T, mu = 1 / lambda, and accurate to full precision; phi = L^-T y /
-    /// sqrt(mu).
+    /// K is factored instead of M. Axial stiffness is up to 10^10 times the lowest bending stiffness. With M = L L^T,
+    /// the lowest eigenvalues of L^-1 K L^-T would be smaller than the rounding errors of the highest. With K = L L^T,
+    /// the lowest modes have the largest eigenvalues mu = 1 / lambda of L^-1 M L^-T, which are accurate to full
+    /// precision. For an eigenvector y, phi = L^-T y / sqrt(mu).
     ///
     /// # Errors
-    /// `Fault` if K is not positive definite (a node without stiffness) or the iteration does not converge.
-    pub(super) fn modes(&self, count: usize) -> Result<BeamModes> {
+    /// `Fault` if K is not positive definite (the beam has no stiffness) or the iteration does not converge.
+    pub(super) fn solve_modes(&self, count: usize) -> Result<BeamModes> {
         let fault = fault_in::<&str>("tree.beam");
         let (stiffness, mass) = self.assemble();
         let factor = Cholesky::new(stiffness).ok_or_else(|| fault("the stiffness is not positive definite"))?.unpack();
-        let singular = || fault("the factor of the stiffness is singular");
-        let half = factor.solve_lower_triangular(&mass).ok_or_else(singular)?;
-        let flexibility = factor.solve_lower_triangular(&half.transpose()).ok_or_else(singular)?;
+        let singular_factor = || fault("the factor of the stiffness is singular");
+        let half_transformed = factor.solve_lower_triangular(&mass).ok_or_else(singular_factor)?;
+        let flexibility = factor.solve_lower_triangular(&half_transformed.transpose()).ok_or_else(singular_factor)?;
         let flexibility = (&flexibility + flexibility.transpose()) * 0.5;
         let eigen = SymmetricEigen::try_new(flexibility, f64::EPSILON, 10_000)
             .ok_or_else(|| fault("the eigenvalue iteration did not converge"))?;
-        let mut order: Vec<usize> = (0..eigen.eigenvalues.len()).collect();
-        order.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
-        order.truncate(count);
-        let mut mode_shapes = DMatrix::zeros(6 * self.nodes.len(), order.len());
-        let mut eigenvalues = Vec::with_capacity(order.len());
-        for (column, index) in order.into_iter().enumerate() {
+        let mut sorted_indices: Vec<usize> = (0..eigen.eigenvalues.len()).collect();
+        sorted_indices.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
+        sorted_indices.truncate(count);
+        let mut mode_shapes = DMatrix::zeros(6 * self.nodes.len(), sorted_indices.len());
+        let mut eigenvalues = Vec::with_capacity(sorted_indices.len());
+        for (column, index) in sorted_indices.into_iter().enumerate() {
             let mu = eigen.eigenvalues[index];
-            let shape = factor.tr_solve_lower_triangular(&eigen.eigenvectors.column(index)).ok_or_else(singular)?;
-            // The largest entry is positive, so that the sign does not depend on the solver.
+            let shape =
+                factor.tr_solve_lower_triangular(&eigen.eigenvectors.column(index)).ok_or_else(singular_factor)?;
+            // Make the largest entry positive, so that the sign does not depend on the solver.
             let scale = shape[shape.icamax()].signum() / mu.sqrt();
             mode_shapes.view_mut((6, column), (shape.len(), 1)).copy_from(&(shape * scale));
             eigenvalues.push(1.0 / mu);
@@ -104,18 +105,18 @@ pub(super) mod tests {
     /// A beam of length 1 with different radii at its ends, bent by `bend` radians over its length, in an oblique
     /// direction.
     pub(in super::super) fn curved_beam(elements: usize, radii: [f64; 2], bend: f64) -> Beam {
-        let oblique = nalgebra::Rotation3::from_euler_angles(0.4, 0.9, -1.3);
-        let place = |index: usize| {
+        let orientation = nalgebra::Rotation3::from_euler_angles(0.4, 0.9, -1.3);
+        let node_position = |index: usize| {
             let s = index as f64 / elements as f64;
-            let flat = match bend == 0.0 {
+            let in_plane = match bend == 0.0 {
                 true => Vector3::new(0.0, s, 0.0),
                 false => Vector3::new((1.0 - (bend * s).cos()) / bend, (bend * s).sin() / bend, 0.1 * s * s),
             };
-            oblique * flat
+            orientation * in_plane
         };
         let radius = |index: usize| radii[0] + (radii[1] - radii[0]) * index as f64 / elements as f64;
         Beam {
-            nodes: (0..=elements).map(place).collect(),
+            nodes: (0..=elements).map(node_position).collect(),
             sections: (0..elements).map(|index| Section::of_cone(radius(index), radius(index + 1))).collect(),
             elastic: WOOD,
             point_masses: vec![],
@@ -136,79 +137,84 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn kept_modes_solve_the_eigenproblem_and_are_mass_orthonormal_at_every_slenderness() {
+    fn modes_solve_the_eigenproblem_at_every_slenderness() {
         for slenderness in [10.0, 60.0, 2000.0] {
             for (bend, taper) in [(0.0, 1.0), (0.0, 0.1), (1.2, 1.0), (1.2, 0.1)] {
                 let radius = 0.5 / slenderness;
                 let mut beam = curved_beam(14, [radius, radius * taper], bend);
-                beam.point_masses.push((Station { element: 7, fraction: 0.25 }, 0.3 * beam.own_mass()));
-                let modes = beam.modes(12).expect("converges");
-                let (residual, skew) = eigen_residuals(&beam, &modes);
-                let case = format!("1:{slenderness}, bend {bend}, taper {taper}: residual {residual}, skew {skew}");
+                beam.point_masses.push((Station { element: 7, fraction: 0.25 }, 0.3 * beam.wood_mass()));
+                let modes = beam.solve_modes(12).expect("a converged solution");
+                let (residual, gram_error) = eigen_residuals(&beam, &modes);
+                let case = format!(
+                    "1:{slenderness}, bend {bend}, taper {taper}: residual {residual}, Gram error {gram_error}"
+                );
                 assert!(residual <= 1e-6, "{case}");
-                assert!(skew <= 1e-6, "{case}");
+                assert!(gram_error <= 1e-6, "{case}");
                 assert!(modes.eigenvalues.windows(2).all(|pair| pair[0] <= pair[1] && pair[0] > 0.0), "{case}");
             }
         }
     }
 
     #[test]
-    fn a_wrong_eigenvalue_or_shape_fails_the_residual_test() {
+    fn residuals_detect_a_wrong_eigenvalue_or_shape() {
         let beam = curved_beam(10, [0.02, 0.01], 0.6);
-        let mut modes = beam.modes(4).expect("converges");
+        let mut modes = beam.solve_modes(4).expect("a converged solution");
         modes.eigenvalues[2] *= 1.0 + 1e-4;
         assert!(eigen_residuals(&beam, &modes).0 > 1e-5);
-        modes = beam.modes(4).expect("converges");
+        modes = beam.solve_modes(4).expect("a converged solution");
         modes.mode_shapes[(20, 1)] *= 1.001;
-        let (residual, skew) = eigen_residuals(&beam, &modes);
-        assert!(residual > 1e-6 && skew > 1e-9, "{residual} {skew}");
+        let (residual, gram_error) = eigen_residuals(&beam, &modes);
+        assert!(residual > 1e-6 && gram_error > 1e-9, "{residual} {gram_error}");
     }
 
     #[test]
-    fn a_uniform_cantilever_has_the_frequencies_of_euler_and_bernoulli() {
+    fn uniform_cantilever_has_its_analytic_frequencies() {
         for radius in [0.02, 0.00025] {
             // An unrealistically high shear modulus keeps torsion above the first bending modes.
             let elastic = ElasticConstants { shear_modulus: 1e12, ..WOOD };
             let beam = Beam { elastic, ..curved_beam(14, [radius; 2], 0.0) };
-            let modes = beam.modes(6).expect("converges");
+            let modes = beam.solve_modes(6).expect("a converged solution");
             let Section { area, moment } = beam.sections[0];
-            let base = (elastic.youngs_modulus * moment / (elastic.density * area)).sqrt();
+            let base_frequency = (elastic.youngs_modulus * moment / (elastic.density * area)).sqrt();
             // Roots of cos x cosh x = -1. Each bending mode occurs twice, once per plane.
             let roots = [1.875_104, 1.875_104, 4.694_091, 4.694_091, 7.854_757, 7.854_757];
-            for (value, root) in modes.eigenvalues.iter().zip(roots) {
-                let want = root * root * base;
-                let omega = value.sqrt();
-                assert!((omega / want - 1.0).abs() <= 1e-3, "radius {radius}: {omega} rad/s is not {want}");
+            for (eigenvalue, root) in modes.eigenvalues.iter().zip(roots) {
+                let expected = root * root * base_frequency;
+                let omega = eigenvalue.sqrt();
+                assert!(
+                    (omega / expected - 1.0).abs() <= 1e-3,
+                    "radius {radius}: expected {expected} rad/s, got {omega}"
+                );
             }
         }
     }
 
     #[test]
     fn torsion_of_a_shaft_has_its_analytic_frequency() {
-        let soft = ElasticConstants { shear_modulus: 1e3, ..WOOD };
-        let beam = Beam { elastic: soft, ..curved_beam(14, [0.05; 2], 0.0) };
-        let omega = beam.modes(1).expect("converges").eigenvalues[0].sqrt();
-        let want = std::f64::consts::FRAC_PI_2 * (soft.shear_modulus / soft.density).sqrt();
-        assert!((omega / want - 1.0).abs() <= 1e-3, "{omega} is not {want}");
+        let soft_constants = ElasticConstants { shear_modulus: 1e3, ..WOOD };
+        let beam = Beam { elastic: soft_constants, ..curved_beam(14, [0.05; 2], 0.0) };
+        let omega = beam.solve_modes(1).expect("a converged solution").eigenvalues[0].sqrt();
+        let expected = std::f64::consts::FRAC_PI_2 * (soft_constants.shear_modulus / soft_constants.density).sqrt();
+        assert!((omega / expected - 1.0).abs() <= 1e-3, "expected {expected} rad/s, got {omega}");
     }
 
     #[test]
-    fn a_heavy_tip_turns_the_beam_into_a_spring() {
+    fn beam_with_a_heavy_tip_behaves_like_a_spring() {
         let mut beam = curved_beam(12, [0.02; 2], 0.0);
-        let load = 1000.0 * beam.own_mass();
-        beam.point_masses.push((Station { element: 11, fraction: 1.0 }, load));
-        let spring = 3.0 * WOOD.youngs_modulus * beam.sections[0].moment;
-        let got = beam.modes(1).expect("converges").eigenvalues[0];
-        assert!((got * load / spring - 1.0).abs() < 1e-3, "{got}");
+        let tip_mass = 1000.0 * beam.wood_mass();
+        beam.point_masses.push((Station { element: 11, fraction: 1.0 }, tip_mass));
+        let expected_stiffness = 3.0 * WOOD.youngs_modulus * beam.sections[0].moment;
+        let eigenvalue = beam.solve_modes(1).expect("a converged solution").eigenvalues[0];
+        assert!((eigenvalue * tip_mass / expected_stiffness - 1.0).abs() < 1e-3, "{eigenvalue}");
     }
 
     #[test]
-    fn a_beam_without_stiffness_is_a_fault_and_no_panic() {
+    fn beam_without_stiffness_is_a_fault() {
         let mut beam = curved_beam(4, [0.02; 2], 0.0);
         beam.elastic.youngs_modulus = 0.0;
-        let fault = beam.modes(2).expect_err("nothing holds it").to_string();
-        assert!(fault.contains("positive definite"), "{fault}");
+        let message = beam.solve_modes(2).expect_err("a beam without stiffness").to_string();
+        assert!(message.contains("positive definite"), "{message}");
         beam.elastic.youngs_modulus = f64::NAN;
-        assert!(beam.modes(2).is_err());
+        assert!(beam.solve_modes(2).is_err());
     }
 }

@@ -1,12 +1,12 @@
-//! The centerline of a branch: generated from a start direction and bends, sampled as points, tangents and arc lengths
-//! in meters.
+//! The centerline of a branch: a curve that is generated from a start direction and bends, and sampled once per ring of
+//! the skin.
 
 use nalgebra::{Rotation3, Vector3};
 
 use super::random::SplitMix64;
 
 /// Integration steps between two rings.
-const STEPS: usize = 8;
+const STEPS_PER_RING: usize = 8;
 
 /// Growth parameters of a branch. Angles are in radians, lengths in meters.
 #[derive(Debug, Clone)]
@@ -30,7 +30,8 @@ pub(super) struct GrowthParameters {
     pub(super) wander: f64,
 }
 
-/// A sampled curve: one sample per ring of the skin; every `rings`-th sample is a node of the beam.
+/// A sampled curve with one sample per ring of the skin. Every `rings`-th sample is a node of the beam. Points and arc
+/// lengths are in meters.
 #[derive(Debug, Clone)]
 pub(super) struct Centerline {
     pub(super) points: Vec<Vector3<f64>>,
@@ -47,25 +48,25 @@ pub(super) struct Centerline {
 impl Centerline {
     /// Generates a curve from the origin.
     pub(super) fn grow(growth: &GrowthParameters, random: &mut SplitMix64) -> Self {
-        let wander = RandomBends::new(growth, random);
+        let random_bends = RandomBends::new(growth, random);
         let arc_lengths = ring_arc_lengths(growth);
         let (mut point, mut tangent) = (Vector3::zeros(), growth.start);
-        let mut line =
+        let mut centerline =
             Self { points: vec![point], tangents: vec![tangent], sides: vec![], arc_lengths, rings: growth.rings };
-        for ring in 1..line.arc_lengths.len() {
-            let step = (line.arc_lengths[ring] - line.arc_lengths[ring - 1]) / STEPS as f64;
-            for sub in 0..STEPS {
-                let along = (line.arc_lengths[ring - 1] + (sub as f64 + 0.5) * step) / growth.length;
-                let bend = bend(growth, &tangent, along) + wander.at(along);
-                let turned = (tangent + bend * (step / growth.length)).normalize();
-                point += (tangent + turned).normalize() * step;
-                tangent = turned;
+        for ring in 1..centerline.arc_lengths.len() {
+            let step = (centerline.arc_lengths[ring] - centerline.arc_lengths[ring - 1]) / STEPS_PER_RING as f64;
+            for substep in 0..STEPS_PER_RING {
+                let fraction = (centerline.arc_lengths[ring - 1] + (substep as f64 + 0.5) * step) / growth.length;
+                let relative_bend = gravity_and_light_bend(growth, &tangent, fraction) + random_bends.sample(fraction);
+                let next_tangent = (tangent + relative_bend * (step / growth.length)).normalize();
+                point += (tangent + next_tangent).normalize() * step;
+                tangent = next_tangent;
             }
-            line.points.push(point);
-            line.tangents.push(tangent);
+            centerline.points.push(point);
+            centerline.tangents.push(tangent);
         }
-        line.sides = parallel_transport(&line.tangents);
-        line
+        centerline.sides = parallel_transport(&centerline.tangents);
+        centerline
     }
 
     pub(super) fn length(&self) -> f64 {
@@ -74,9 +75,16 @@ impl Centerline {
 
     /// The ring nearest to a fraction of the length.
     pub(super) fn ring_at(&self, fraction: f64) -> usize {
-        let arc = fraction * self.length();
-        let after = self.arc_lengths.partition_point(|at| *at < arc).clamp(1, self.arc_lengths.len() - 1);
-        if arc - self.arc_lengths[after - 1] < self.arc_lengths[after] - arc { after - 1 } else { after }
+        let arc_length = fraction * self.length();
+        let next_ring = self
+            .arc_lengths
+            .partition_point(|ring_arc_length| *ring_arc_length < arc_length)
+            .clamp(1, self.arc_lengths.len() - 1);
+        if arc_length - self.arc_lengths[next_ring - 1] < self.arc_lengths[next_ring] - arc_length {
+            next_ring - 1
+        } else {
+            next_ring
+        }
     }
 
     /// The arc length of a ring as a fraction of the length.
@@ -89,79 +97,93 @@ impl Centerline {
         self.points.iter().copied().step_by(self.rings).collect()
     }
 
-    /// A unit vector at ring `ring`, at `angle` from the tangent towards the direction `across`.
-    pub(super) fn branch_direction(&self, ring: usize, angle: f64, across: &Vector3<f64>) -> Vector3<f64> {
+    /// The unit direction of a branch at ring `ring`: the tangent, rotated by `angle` towards the direction `side`.
+    pub(super) fn branch_direction(&self, ring: usize, angle: f64, side: &Vector3<f64>) -> Vector3<f64> {
         let tangent = self.tangents[ring];
-        let flat = (across - tangent * tangent.dot(across)).try_normalize(1e-9).unwrap_or(self.sides[ring]);
-        tangent * angle.cos() + flat * angle.sin()
+        let perpendicular = (side - tangent * tangent.dot(side)).try_normalize(1e-9).unwrap_or(self.sides[ring]);
+        tangent * angle.cos() + perpendicular * angle.sin()
     }
 }
 
-/// The frame of a part: +Y along `along`, +Z as close to `up` as possible.
-pub(super) fn frame(along: &Vector3<f64>, up: &Vector3<f64>) -> Rotation3<f64> {
-    let flat = up - along * along.dot(up);
-    let z = flat.try_normalize(1e-6).unwrap_or_else(|| {
-        let other = if along.x.abs() < 0.9 { Vector3::x() } else { Vector3::z() };
-        (other - along * along.dot(&other)).normalize()
+/// The orientation of a part: +Y along the unit vector `y`, +Z as close to `up` as possible.
+pub(super) fn part_orientation(y: &Vector3<f64>, up: &Vector3<f64>) -> Rotation3<f64> {
+    let projected_up = up - y * y.dot(up);
+    let z = projected_up.try_normalize(1e-6).unwrap_or_else(|| {
+        let fallback = if y.x.abs() < 0.9 { Vector3::x() } else { Vector3::z() };
+        (fallback - y * y.dot(&fallback)).normalize()
     });
-    Rotation3::from_basis_unchecked(&[along.cross(&z), *along, z])
+    Rotation3::from_basis_unchecked(&[y.cross(&z), *y, z])
 }
 
+/// The arc length of each ring. Rings are equidistant within a beam element.
 fn ring_arc_lengths(growth: &GrowthParameters) -> Vec<f64> {
-    let node = |index: usize| growth.length * (index as f64 / growth.elements as f64).powf(growth.grading);
-    let within = |element: usize, ring: usize| {
+    let node_arc_length = |index: usize| growth.length * (index as f64 / growth.elements as f64).powf(growth.grading);
+    let ring_arc_length = |element: usize, ring: usize| {
         let fraction = ring as f64 / growth.rings as f64;
-        node(element) * (1.0 - fraction) + node(element + 1) * fraction
+        node_arc_length(element) * (1.0 - fraction) + node_arc_length(element + 1) * fraction
     };
-    let mut arc_lengths: Vec<f64> =
-        (0..growth.elements).flat_map(|e| (0..growth.rings).map(move |r| (e, r))).map(|(e, r)| within(e, r)).collect();
+    let mut arc_lengths: Vec<f64> = (0..growth.elements)
+        .flat_map(|element| (0..growth.rings).map(move |ring| (element, ring)))
+        .map(|(element, ring)| ring_arc_length(element, ring))
+        .collect();
     arc_lengths.push(growth.length);
     arc_lengths
 }
 
-/// Change of the tangent, per unit of relative length, by weight and light.
-fn bend(growth: &GrowthParameters, tangent: &Vector3<f64>, along: f64) -> Vector3<f64> {
-    let across = growth.up - tangent * tangent.dot(&growth.up);
-    across * (2.0 * growth.rise * along - 2.0 * growth.sag * (1.0 - along))
+/// Change of the tangent by weight and light, per unit of relative length, at a fraction of the length.
+fn gravity_and_light_bend(growth: &GrowthParameters, tangent: &Vector3<f64>, fraction: f64) -> Vector3<f64> {
+    let perpendicular_up = growth.up - tangent * tangent.dot(&growth.up);
+    perpendicular_up * (2.0 * growth.rise * fraction - 2.0 * growth.sag * (1.0 - fraction))
 }
 
 /// Smooth random bends: three waves about each of two axes perpendicular to the start.
 struct RandomBends {
     axes: [Vector3<f64>; 2],
-    /// Amplitude, number of waves along the branch, and phase of each wave.
-    waves: [[(f64, f64, f64); 3]; 2],
+    /// Three waves per axis.
+    waves: [[BendWave; 3]; 2],
+}
+
+/// One cosine wave of the bend along a branch.
+struct BendWave {
+    amplitude: f64,
+    /// Number of periods along the branch.
+    periods: f64,
+    /// Phase at the root in radians.
+    phase: f64,
 }
 
 impl RandomBends {
     fn new(growth: &GrowthParameters, random: &mut SplitMix64) -> Self {
-        let basis = frame(&growth.start, &growth.up);
-        let mut wave = |number: usize| {
-            let waves = number as f64 + random.between(0.6, 1.3);
-            (
-                growth.wander * std::f64::consts::TAU * waves * 0.5 / (1.0 + number as f64),
-                waves,
-                random.between(0.0, std::f64::consts::TAU),
-            )
+        let basis = part_orientation(&growth.start, &growth.up);
+        let mut wave = |index: usize| {
+            let periods = index as f64 + random.uniform(0.6, 1.3);
+            BendWave {
+                amplitude: growth.wander * std::f64::consts::TAU * periods * 0.5 / (1.0 + index as f64),
+                periods,
+                phase: random.uniform(0.0, std::f64::consts::TAU),
+            }
         };
         let waves = std::array::from_fn(|_| std::array::from_fn(&mut wave));
         Self { axes: [basis * Vector3::x(), basis * Vector3::z()], waves }
     }
 
-    fn at(&self, along: f64) -> Vector3<f64> {
-        let sum = |waves: &[(f64, f64, f64); 3]| -> f64 {
-            waves.iter().map(|(size, waves, phase)| size * (std::f64::consts::TAU * waves * along + phase).cos()).sum()
-        };
+    /// The random bend at a fraction of the length.
+    fn sample(&self, fraction: f64) -> Vector3<f64> {
+        let value =
+            |wave: &BendWave| wave.amplitude * (std::f64::consts::TAU * wave.periods * fraction + wave.phase).cos();
+        let sum = |waves: &[BendWave; 3]| -> f64 { waves.iter().map(value).sum() };
         self.axes[0] * sum(&self.waves[0]) + self.axes[1] * sum(&self.waves[1])
     }
 }
 
+/// Unit vectors perpendicular to the tangents, transported without twist.
 fn parallel_transport(tangents: &[Vector3<f64>]) -> Vec<Vector3<f64>> {
-    let mut side = frame(&tangents[0], &Vector3::z()) * Vector3::x();
-    let carry = |tangent: &Vector3<f64>| {
+    let mut side = part_orientation(&tangents[0], &Vector3::z()) * Vector3::x();
+    let transport = |tangent: &Vector3<f64>| {
         side = (side - tangent * tangent.dot(&side)).normalize();
         side
     };
-    tangents.iter().map(carry).collect()
+    tangents.iter().map(transport).collect()
 }
 
 #[cfg(test)]
@@ -174,43 +196,43 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_branch_without_bends_is_straight_and_as_long_as_asked() {
-        let line = Centerline::grow(&straight_growth(3.0, 6, 2), &mut SplitMix64::new(1));
-        assert_eq!(line.points.len(), 13);
-        assert!((line.points[12] - Vector3::new(0.0, 3.0, 0.0)).norm() < 1e-12);
-        assert_eq!(line.nodes().len(), 7);
-        assert_eq!(line.ring_at(0.5), 6);
-        assert_eq!((line.ring_at(0.0), line.ring_at(1.0)), (0, 12));
+    fn branch_without_bends_is_straight() {
+        let centerline = Centerline::grow(&straight_growth(3.0, 6, 2), &mut SplitMix64::new(1));
+        assert_eq!(centerline.points.len(), 13);
+        assert!((centerline.points[12] - Vector3::new(0.0, 3.0, 0.0)).norm() < 1e-12);
+        assert_eq!(centerline.nodes().len(), 7);
+        assert_eq!(centerline.ring_at(0.5), 6);
+        assert_eq!((centerline.ring_at(0.0), centerline.ring_at(1.0)), (0, 12));
     }
 
     #[test]
-    fn light_bends_a_branch_up_and_weight_bends_it_down() {
-        let tip = |sag, rise| {
+    fn rise_bends_a_branch_up_and_sag_bends_it_down() {
+        let tip_height = |sag, rise| {
             let growth = GrowthParameters { sag, rise, ..straight_growth(1.0, 8, 2) };
             Centerline::grow(&growth, &mut SplitMix64::new(1)).points[16].z
         };
-        assert!(tip(0.0, 0.5) > 0.05);
-        assert!(tip(0.5, 0.0) < -0.05);
+        assert!(tip_height(0.0, 0.5) > 0.05);
+        assert!(tip_height(0.5, 0.0) < -0.05);
     }
 
     #[test]
-    fn frames_along_a_winding_branch_stay_orthonormal() {
+    fn tangents_and_sides_are_orthonormal() {
         let growth = GrowthParameters { wander: 0.4, rise: 0.9, grading: 1.4, ..straight_growth(2.0, 10, 3) };
-        let line = Centerline::grow(&growth, &mut SplitMix64::new(5));
-        for (tangent, side) in line.tangents.iter().zip(&line.sides) {
+        let centerline = Centerline::grow(&growth, &mut SplitMix64::new(5));
+        for (tangent, side) in centerline.tangents.iter().zip(&centerline.sides) {
             assert!((tangent.norm() - 1.0).abs() < 1e-12);
             assert!((side.norm() - 1.0).abs() < 1e-12);
             assert!(tangent.dot(side).abs() < 1e-12);
         }
-        assert!(line.arc_lengths.windows(2).all(|pair| pair[1] > pair[0]));
+        assert!(centerline.arc_lengths.windows(2).all(|pair| pair[1] > pair[0]));
     }
 
     #[test]
-    fn a_frame_has_its_y_along_the_part_even_straight_up() {
-        for along in [Vector3::y(), Vector3::new(1.0, 2.0, -0.5).normalize(), Vector3::z(), -Vector3::z()] {
-            let turn = frame(&along, &Vector3::z());
-            assert!((turn * Vector3::y() - along).norm() < 1e-12);
-            assert!((turn.matrix().determinant() - 1.0).abs() < 1e-12);
+    fn part_orientation_is_a_rotation_even_straight_up() {
+        for y in [Vector3::y(), Vector3::new(1.0, 2.0, -0.5).normalize(), Vector3::z(), -Vector3::z()] {
+            let orientation = part_orientation(&y, &Vector3::z());
+            assert!((orientation * Vector3::y() - y).norm() < 1e-12);
+            assert!((orientation.matrix().determinant() - 1.0).abs() < 1e-12);
         }
     }
 }

@@ -6,7 +6,7 @@ use super::centerline::{Centerline, GrowthParameters};
 use super::element::ElasticConstants;
 use super::leaf_image::{LEAF_SPAN, STEM_U};
 use super::random::SplitMix64;
-use super::skin::{Blade, SkinBuilder, UvMapping, between};
+use super::skin::{Blade, SkinBuilder, UvMapping, sample_at};
 use super::template::{PartKind, PartTemplate};
 
 /// Green shoots are softer than wood.
@@ -21,26 +21,45 @@ const LEAF_COVERAGE: f64 = 0.55;
 /// Ratio of width to length of a leaf's card.
 const LEAF_ASPECT: f64 = 0.62;
 
-/// The clusters: whether it bends, length of the shoot (m), number of leaves, length of a leaf (m).
-const CLUSTERS: [(bool, f64, usize, f64); 8] = [
-    (true, 0.50, 13, 0.235),
-    (true, 0.46, 12, 0.240),
-    (true, 0.42, 12, 0.225),
-    (true, 0.38, 11, 0.235),
-    (true, 0.34, 10, 0.225),
-    (false, 0.28, 11, 0.230),
-    (false, 0.24, 10, 0.220),
-    (false, 0.26, 10, 0.225),
+/// Parameters of a leaf cluster. Lengths are in meters.
+#[derive(Clone, Copy)]
+struct ClusterParameters {
+    /// Whether the shoot bends with two modes (a spray) or is rigid (a rosette).
+    is_flexible: bool,
+    shoot_length: f64,
+    leaf_count: usize,
+    leaf_length: f64,
+}
+
+const fn spray(shoot_length: f64, leaf_count: usize, leaf_length: f64) -> ClusterParameters {
+    ClusterParameters { is_flexible: true, shoot_length, leaf_count, leaf_length }
+}
+
+const fn rosette(shoot_length: f64, leaf_count: usize, leaf_length: f64) -> ClusterParameters {
+    ClusterParameters { is_flexible: false, shoot_length, leaf_count, leaf_length }
+}
+
+/// Parameters of all cluster templates.
+const CLUSTERS: [ClusterParameters; 8] = [
+    spray(0.50, 13, 0.235),
+    spray(0.46, 12, 0.240),
+    spray(0.42, 12, 0.225),
+    spray(0.38, 11, 0.235),
+    spray(0.34, 10, 0.225),
+    rosette(0.28, 11, 0.230),
+    rosette(0.24, 10, 0.220),
+    rosette(0.26, 10, 0.225),
 ];
 
 /// The templates of all clusters.
 pub(super) fn leaf_clusters(random: &mut SplitMix64) -> Vec<PartTemplate> {
-    CLUSTERS.iter().map(|cluster| grow(*cluster, &mut random.fork())).collect()
+    CLUSTERS.iter().map(|parameters| grow_cluster(*parameters, &mut random.fork())).collect()
 }
 
-fn grow((bends, length, leaves, size): (bool, f64, usize, f64), random: &mut SplitMix64) -> PartTemplate {
+fn grow_cluster(parameters: ClusterParameters, random: &mut SplitMix64) -> PartTemplate {
+    let ClusterParameters { is_flexible, shoot_length, leaf_count, leaf_length } = parameters;
     let growth = GrowthParameters {
-        length,
+        length: shoot_length,
         elements: 4,
         rings: 1,
         grading: 1.0,
@@ -51,63 +70,64 @@ fn grow((bends, length, leaves, size): (bool, f64, usize, f64), random: &mut Spl
         wander: 0.12,
     };
     let centerline = Centerline::grow(&growth, random);
-    let count = centerline.points.len();
-    let radii = (0..count).map(|ring| 0.0036 - 0.0022 * centerline.fraction(ring)).collect();
-    let mut mold = PartTemplate {
+    let radii = (0..centerline.points.len()).map(|ring| 0.0036 - 0.0022 * centerline.fraction(ring)).collect();
+    let mut template = PartTemplate {
         kind: PartKind::Leaf,
         level: None,
         centerline,
         radii,
         sides: 3,
-        sheet: SkinBuilder::default(),
+        skin: SkinBuilder::default(),
         elastic: SHOOT,
         damping: 0.12,
         point_masses: vec![],
         children: vec![],
-        rank: if bends { 2 } else { 0 },
+        rank: if is_flexible { 2 } else { 0 },
         leaf_area: 0.0,
     };
-    mold.add_skin(UvMapping::Strip { u: STEM_U }, |_, _| 1.0);
-    for leaf in 0..leaves {
-        let along = if leaf + 1 == leaves {
+    template.add_skin(UvMapping::Strip { u: STEM_U }, |_, _| 1.0);
+    for leaf in 0..leaf_count {
+        let fraction = if leaf + 1 == leaf_count {
             1.0
         } else {
-            0.16 + 0.84 * (leaf as f64 + random.next_unit() * 0.6) / leaves as f64
+            0.16 + 0.84 * (leaf as f64 + random.next_unit() * 0.6) / leaf_count as f64
         };
-        let azimuth = if bends { std::f64::consts::PI * leaf as f64 } else { 2.4 * leaf as f64 };
-        add_leaf(&mut mold, along, azimuth + random.spread(0.7), size * random.between(0.78, 1.12), random);
+        // Leaves of a spray alternate between two sides. Leaves of a rosette follow the golden angle.
+        let azimuth = if is_flexible { std::f64::consts::PI * leaf as f64 } else { 2.4 * leaf as f64 };
+        let azimuth = azimuth + random.uniform_symmetric(0.7);
+        add_leaf(&mut template, fraction, azimuth, leaf_length * random.uniform(0.78, 1.12), random);
     }
-    mold
+    template
 }
 
-/// Adds a leaf at a fraction of the shoot. Azimuth 0 is to the right of the shoot; light comes from +Z.
-fn add_leaf(mold: &mut PartTemplate, along: f64, azimuth: f64, length: f64, random: &mut SplitMix64) {
-    let (station, base, tangent) = between(&mold.centerline, along);
+/// Adds a leaf at a fraction of the shoot. Azimuth 0 is to the right of the shoot. Light comes from +Z.
+fn add_leaf(template: &mut PartTemplate, fraction: f64, azimuth: f64, length: f64, random: &mut SplitMix64) {
+    let (station, base, tangent) = sample_at(&template.centerline, fraction);
     let right = tangent.cross(&Vector3::z()).normalize();
-    let over = right.cross(&tangent);
-    // Leaves point sideways rather than up or down; the last leaf continues the shoot.
-    let across = right * azimuth.cos() + over * (0.60 * azimuth.sin() + 0.15);
-    let angle = if along >= 1.0 { random.between(0.05, 0.25) } else { random.between(0.70, 1.20) };
-    let droop = random.between(0.05, 0.50);
-    let forward = (tangent * angle.cos() + across * angle.sin() - Vector3::z() * droop).normalize();
+    let upward = right.cross(&tangent);
+    // Leaves point sideways rather than up or down. The last leaf continues the shoot.
+    let side = right * azimuth.cos() + upward * (0.60 * azimuth.sin() + 0.15);
+    let angle = if fraction >= 1.0 { random.uniform(0.05, 0.25) } else { random.uniform(0.70, 1.20) };
+    let droop = random.uniform(0.05, 0.50);
+    let forward = (tangent * angle.cos() + side * angle.sin() - Vector3::z() * droop).normalize();
     // The blade turns its face towards the light, but not completely.
-    let face = (over + Vector3::z() + forward.cross(&Vector3::z()) * random.spread(0.55)).normalize();
+    let face = (upward + Vector3::z() + forward.cross(&Vector3::z()) * random.uniform_symmetric(0.55)).normalize();
     let normal = (face - forward * forward.dot(&face)).normalize();
-    let twist = Rotation3::from_axis_angle(&Unit::new_unchecked(forward), random.spread(0.35));
+    let twist = Rotation3::from_axis_angle(&Unit::new_unchecked(forward), random.uniform_symmetric(0.35));
     let blade = Blade {
         base,
         forward,
         normal: twist * normal,
         length,
-        width: length * LEAF_ASPECT * random.between(0.92, 1.08),
-        curl: random.between(0.25, 0.95),
-        fold: random.between(0.12, 0.42),
-        span: LEAF_SPAN,
+        width: length * LEAF_ASPECT * random.uniform(0.92, 1.08),
+        curl: random.uniform(0.25, 0.95),
+        fold: random.uniform(0.12, 0.42),
+        u_range: LEAF_SPAN,
     };
     let area = LEAF_COVERAGE * blade.length * blade.width;
-    mold.sheet.add_blade(&blade, station);
-    mold.point_masses.push((station, LEAF_MASS * area));
-    mold.leaf_area += area;
+    template.skin.add_blade(&blade, station);
+    template.point_masses.push((station, LEAF_MASS * area));
+    template.leaf_area += area;
 }
 
 #[cfg(test)]
@@ -115,29 +135,31 @@ mod tests {
     use super::*;
 
     #[test]
-    fn some_clusters_bend_with_two_modes_and_some_are_rigid() {
-        let molds = leaf_clusters(&mut SplitMix64::new(2));
-        let ranks: Vec<usize> = molds.iter().map(|mold| mold.cast().expect("solved").0.modes.rank()).collect();
+    fn clusters_have_zero_or_two_modes() {
+        let templates = leaf_clusters(&mut SplitMix64::new(2));
+        let ranks: Vec<usize> =
+            templates.iter().map(|template| template.build_shape().expect("a valid shape").0.modes.rank()).collect();
         assert!(ranks.contains(&2) && ranks.contains(&0), "{ranks:?}");
     }
 
     #[test]
-    fn shoots_flutter_at_a_few_hertz_and_carry_their_leaves() {
-        for mold in leaf_clusters(&mut SplitMix64::new(2)).into_iter().filter(|mold| mold.rank > 0) {
-            let (_, metadata) = mold.cast().expect("solved");
+    fn lowest_frequency_of_a_spray_is_a_few_hertz() {
+        for template in leaf_clusters(&mut SplitMix64::new(2)).into_iter().filter(|template| template.rank > 0) {
+            let (_, metadata) = template.build_shape().expect("a valid shape");
             let hertz = metadata.eigenvalues[0].sqrt() / std::f64::consts::TAU;
             assert!((1.5..12.0).contains(&hertz), "{hertz} Hz");
-            assert!(mold.mass() > mold.beam().own_mass() * 1.2);
+            assert!(template.mass() > template.beam().wood_mass() * 1.2);
         }
     }
 
     #[test]
-    fn upper_faces_look_to_the_light_on_the_whole() {
-        for mold in leaf_clusters(&mut SplitMix64::new(9)) {
-            let mesh = mold.sheet.mesh().expect("finite");
-            let blades = &mesh.corners().normals[5 * 4 + 3..];
-            let mean = blades.iter().map(|normal| normal[2]).sum::<f32>() / blades.len() as f32;
-            assert!(mean > 0.5, "{mean}");
+    fn mean_leaf_normal_points_to_the_light() {
+        for template in leaf_clusters(&mut SplitMix64::new(9)) {
+            let mesh = template.skin.build_mesh().expect("a valid mesh");
+            // The shoot's corners come first: five rings of four, and three at the tip.
+            let leaf_normals = &mesh.corners().normals[5 * 4 + 3..];
+            let mean_z = leaf_normals.iter().map(|normal| normal[2]).sum::<f32>() / leaf_normals.len() as f32;
+            assert!(mean_z > 0.5, "{mean_z}");
         }
     }
 }

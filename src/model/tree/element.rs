@@ -1,8 +1,9 @@
 //! The 12 x 12 stiffness and consistent mass matrices of one Euler-Bernoulli frame element.
 //!
-//! Degrees of freedom per node: displacement x, y, z (m), rotation about x, y, z (rad). Local x points along the
-//! element. Bending is cubic, stretch and twist are linear in the element (Przemieniecki, "Theory of Matrix Structural
-//! Analysis", sections 5.6 and 11.3). Rotary inertia of bending is neglected, as in Euler-Bernoulli theory.
+//! Degrees of freedom per node: displacement along x, y, z (m), rotation about x, y, z (rad). Local x points along the
+//! element. Within the element, bending is cubic, and stretch and twist are linear (Przemieniecki, "Theory of Matrix
+//! Structural Analysis", sections 5.6 and 11.3). The rotary inertia of bending is neglected, as in Euler-Bernoulli
+//! theory.
 
 use nalgebra::{Matrix3, Matrix4, SMatrix, Vector3};
 
@@ -25,23 +26,28 @@ pub(super) struct Section {
 
 impl Section {
     /// Mean area and second moment over a truncated cone between two radii.
-    pub(super) fn of_cone(a: f64, b: f64) -> Self {
+    pub(super) fn of_cone(radius_a: f64, radius_b: f64) -> Self {
         use std::f64::consts::{FRAC_PI_4, PI};
-        let squares = (a * a + a * b + b * b) / 3.0;
-        let fourths = (a.powi(4) + a.powi(3) * b + (a * b).powi(2) + a * b.powi(3) + b.powi(4)) / 5.0;
-        Self { area: PI * squares, moment: FRAC_PI_4 * fourths }
+        let mean_square = (radius_a * radius_a + radius_a * radius_b + radius_b * radius_b) / 3.0;
+        let mean_fourth_power = (radius_a.powi(4)
+            + radius_a.powi(3) * radius_b
+            + (radius_a * radius_b).powi(2)
+            + radius_a * radius_b.powi(3)
+            + radius_b.powi(4))
+            / 5.0;
+        Self { area: PI * mean_square, moment: FRAC_PI_4 * mean_fourth_power }
     }
 }
 
 /// The local axes of an element between two nodes, as rows.
 pub(super) fn element_axes(from: &Vector3<f64>, to: &Vector3<f64>) -> Matrix3<f64> {
     let x = (to - from).normalize();
-    let helper = if x.x.abs() < 0.7 { Vector3::x() } else { Vector3::z() };
-    let z = x.cross(&helper).normalize();
+    let reference = if x.x.abs() < 0.7 { Vector3::x() } else { Vector3::z() };
+    let z = x.cross(&reference).normalize();
     Matrix3::from_rows(&[x.transpose(), z.cross(&x).transpose(), z.transpose()])
 }
 
-/// Stiffness and consistent mass in the frame of the nodes.
+/// Stiffness and consistent mass in the coordinate frame of the nodes.
 pub(super) fn element_matrices(
     from: &Vector3<f64>,
     to: &Vector3<f64>,
@@ -49,19 +55,22 @@ pub(super) fn element_matrices(
     wood: &ElasticConstants,
 ) -> (Matrix12, Matrix12) {
     let length = (to - from).norm();
-    let mut turn = Matrix12::zeros();
+    let mut local_from_global = Matrix12::zeros();
     for block in 0..4 {
-        turn.fixed_view_mut::<3, 3>(3 * block, 3 * block).copy_from(&element_axes(from, to));
+        local_from_global.fixed_view_mut::<3, 3>(3 * block, 3 * block).copy_from(&element_axes(from, to));
     }
     let (stiffness, mass) = (local_stiffness(length, section, wood), local_mass(length, section, wood));
-    (turn.transpose() * stiffness * turn, turn.transpose() * mass * turn)
+    (
+        local_from_global.transpose() * stiffness * local_from_global,
+        local_from_global.transpose() * mass * local_from_global,
+    )
 }
 
 fn local_stiffness(l: f64, section: &Section, wood: &ElasticConstants) -> Matrix12 {
     let mut matrix = Matrix12::zeros();
-    let ends = [1.0, -1.0, -1.0, 1.0];
-    add_linear(&mut matrix, 0, ends.map(|end| end * wood.youngs_modulus * section.area / l));
-    add_linear(&mut matrix, 3, ends.map(|end| end * wood.shear_modulus * 2.0 * section.moment / l));
+    let block = [1.0, -1.0, -1.0, 1.0];
+    add_linear(&mut matrix, 0, block.map(|entry| entry * wood.youngs_modulus * section.area / l));
+    add_linear(&mut matrix, 3, block.map(|entry| entry * wood.shear_modulus * 2.0 * section.moment / l));
     #[rustfmt::skip]
     let bending = Matrix4::new(
         12.0,    6.0 * l,     -12.0,   6.0 * l,
@@ -75,9 +84,9 @@ fn local_stiffness(l: f64, section: &Section, wood: &ElasticConstants) -> Matrix
 
 fn local_mass(l: f64, section: &Section, wood: &ElasticConstants) -> Matrix12 {
     let mut matrix = Matrix12::zeros();
-    let ends = [2.0, 1.0, 1.0, 2.0];
-    add_linear(&mut matrix, 0, ends.map(|end| end * wood.density * section.area * l / 6.0));
-    add_linear(&mut matrix, 3, ends.map(|end| end * wood.density * 2.0 * section.moment * l / 6.0));
+    let block = [2.0, 1.0, 1.0, 2.0];
+    add_linear(&mut matrix, 0, block.map(|entry| entry * wood.density * section.area * l / 6.0));
+    add_linear(&mut matrix, 3, block.map(|entry| entry * wood.density * 2.0 * section.moment * l / 6.0));
     #[rustfmt::skip]
     let bending = Matrix4::new(
         156.0,     22.0 * l,     54.0,      -13.0 * l,
@@ -89,20 +98,21 @@ fn local_mass(l: f64, section: &Section, wood: &ElasticConstants) -> Matrix12 {
     matrix
 }
 
-/// Adds a 2 x 2 block that couples degree of freedom `dof` of both nodes.
+/// Adds a row-major 2 x 2 block that couples degree of freedom `dof` of both nodes.
 fn add_linear(matrix: &mut Matrix12, dof: usize, block: [f64; 4]) {
-    for (at, value) in block.into_iter().enumerate() {
-        matrix[(dof + 6 * (at / 2), dof + 6 * (at % 2))] += value;
+    for (index, value) in block.into_iter().enumerate() {
+        matrix[(dof + 6 * (index / 2), dof + 6 * (index % 2))] += value;
     }
 }
 
-/// Adds bending in both planes. The sign accounts for rotations about y, which decrease the slope dw/dx.
+/// Adds bending in both planes. The sign of the second plane is negative, because a rotation about y decreases the slope
+/// dz/dx.
 fn add_bending(matrix: &mut Matrix12, block: &Matrix4<f64>) {
-    for (places, sign) in [([1, 5, 7, 11], 1.0), ([2, 4, 8, 10], -1.0)] {
+    for (dofs, sign) in [([1, 5, 7, 11], 1.0), ([2, 4, 8, 10], -1.0)] {
         for row in 0..4 {
             for column in 0..4 {
-                let flips = if (row + column) % 2 == 1 { sign } else { 1.0 };
-                matrix[(places[row], places[column])] += flips * block[(row, column)];
+                let factor = if (row + column) % 2 == 1 { sign } else { 1.0 };
+                matrix[(dofs[row], dofs[column])] += factor * block[(row, column)];
             }
         }
     }
@@ -114,37 +124,37 @@ mod tests {
 
     const WOOD: ElasticConstants = ElasticConstants { youngs_modulus: 8e9, shear_modulus: 5e8, density: 800.0 };
 
-    fn oblique() -> (Vector3<f64>, Vector3<f64>) {
+    fn oblique_nodes() -> (Vector3<f64>, Vector3<f64>) {
         (Vector3::new(0.2, -0.1, 0.4), Vector3::new(0.5, 0.3, 0.1))
     }
 
     #[test]
-    fn rigid_motions_cost_no_energy_and_translations_weigh_the_mass() {
-        let (from, to) = oblique();
+    fn rigid_motions_have_no_elastic_energy() {
+        let (from, to) = oblique_nodes();
         let section = Section::of_cone(0.03, 0.02);
         let (stiffness, mass) = element_matrices(&from, &to, &section, &WOOD);
-        let weight = WOOD.density * section.area * (to - from).norm();
+        let element_mass = WOOD.density * section.area * (to - from).norm();
         for axis in 0..3 {
-            let turn = Vector3::ith(axis, 1.0);
-            let mut shift = nalgebra::SVector::<f64, 12>::zeros();
-            let mut spin = shift;
-            for (node, place) in [from, to].iter().enumerate() {
-                shift.fixed_rows_mut::<3>(6 * node).copy_from(&turn);
-                spin.fixed_rows_mut::<3>(6 * node).copy_from(&turn.cross(place));
-                spin.fixed_rows_mut::<3>(6 * node + 3).copy_from(&turn);
+            let direction = Vector3::ith(axis, 1.0);
+            let mut translation = nalgebra::SVector::<f64, 12>::zeros();
+            let mut rotation = translation;
+            for (node, position) in [from, to].iter().enumerate() {
+                translation.fixed_rows_mut::<3>(6 * node).copy_from(&direction);
+                rotation.fixed_rows_mut::<3>(6 * node).copy_from(&direction.cross(position));
+                rotation.fixed_rows_mut::<3>(6 * node + 3).copy_from(&direction);
             }
-            assert!((stiffness * shift).norm() <= 1e-9 * stiffness.norm());
-            assert!((stiffness * spin).norm() <= 1e-9 * stiffness.norm());
-            assert!((shift.dot(&(mass * shift)) / weight - 1.0).abs() < 1e-12);
+            assert!((stiffness * translation).norm() <= 1e-9 * stiffness.norm());
+            assert!((stiffness * rotation).norm() <= 1e-9 * stiffness.norm());
+            assert!((translation.dot(&(mass * translation)) / element_mass - 1.0).abs() < 1e-12);
             // Counterexample: moving only one end requires energy.
-            shift.fixed_rows_mut::<3>(0).fill(0.0);
-            assert!((stiffness * shift).norm() > 1e-6 * stiffness.norm());
+            translation.fixed_rows_mut::<3>(0).fill(0.0);
+            assert!((stiffness * translation).norm() > 1e-6 * stiffness.norm());
         }
     }
 
     #[test]
     fn matrices_are_symmetric_and_the_mass_is_positive() {
-        let (from, to) = oblique();
+        let (from, to) = oblique_nodes();
         let (stiffness, mass) = element_matrices(&from, &to, &Section::of_cone(0.01, 0.01), &WOOD);
         assert!((stiffness - stiffness.transpose()).norm() <= 1e-12 * stiffness.norm());
         assert!((mass - mass.transpose()).norm() <= 1e-12 * mass.norm());
@@ -152,11 +162,12 @@ mod tests {
     }
 
     #[test]
-    fn a_cone_has_its_means_between_those_of_its_ends() {
-        let (thick, thin, cone) = (Section::of_cone(2.0, 2.0), Section::of_cone(1.0, 1.0), Section::of_cone(2.0, 1.0));
-        assert!((thin.area - std::f64::consts::PI).abs() < 1e-12);
-        assert!((thin.moment - std::f64::consts::FRAC_PI_4).abs() < 1e-12);
-        assert!(cone.area < thick.area && cone.area > thin.area);
-        assert!((cone.area - std::f64::consts::PI * 7.0 / 3.0).abs() < 1e-12);
+    fn cone_section_is_between_those_of_its_ends() {
+        let (thick_section, thin_section, cone_section) =
+            (Section::of_cone(2.0, 2.0), Section::of_cone(1.0, 1.0), Section::of_cone(2.0, 1.0));
+        assert!((thin_section.area - std::f64::consts::PI).abs() < 1e-12);
+        assert!((thin_section.moment - std::f64::consts::FRAC_PI_4).abs() < 1e-12);
+        assert!(cone_section.area < thick_section.area && cone_section.area > thin_section.area);
+        assert!((cone_section.area - std::f64::consts::PI * 7.0 / 3.0).abs() < 1e-12);
     }
 }

@@ -1,30 +1,32 @@
-//! Procedural leaf texture from a seed: a 256 x 256 sRGB image. Alpha is the outline of the leaf with its tip at the
-//! top; at the right edge is an opaque strip for stems.
+//! Procedural leaf texture from a seed: a 256 x 256 sRGB image with alpha. It shows one leaf with its tip at the top, and
+//! an opaque strip at the right edge, which is the texture of stems.
 
 use super::noise::{GradientNoise, lerp_color, smoothstep};
 use super::random::SplitMix64;
 use crate::domain::Texture;
 use crate::error::Result;
 
+/// Side of the image in pixels.
 const SIDE: usize = 256;
 
-/// The horizontal range of the leaf. It keeps a margin on the left, where filtering with wrap mode "repeat" would blend
-/// in the strip at the right edge.
+/// The range of u that the leaf covers. The margin on the left separates it from the strip at the right edge, which
+/// filtering with wrap mode "repeat" blends into the left edge.
 pub(super) const LEAF_SPAN: [f32; 2] = [0.03, 0.90];
 
 /// The center of the strip for stems.
 pub(super) const STEM_U: f32 = 0.965;
 
 /// Left edge of the strip.
-const STRIP: f32 = 0.93;
+const STRIP_LEFT: f32 = 0.93;
 
-/// The fraction of the height that the petiole takes, at the bottom.
-const PETIOLE: f32 = 0.13;
+/// Length of the petiole at the bottom of the image, as a fraction of the height.
+const PETIOLE_LENGTH: f32 = 0.13;
 
-/// Largest half-width of the blade, as a fraction of the leaf's range.
-const HALF_WIDTH: f32 = 0.46;
+/// Largest half-width of the blade, as a fraction of [`LEAF_SPAN`].
+const MAX_HALF_WIDTH: f32 = 0.46;
 
-const TEETH: f32 = 19.0;
+/// Number of teeth per side of the outline.
+const TOOTH_COUNT: f32 = 19.0;
 
 /// sRGB colors, 0 to 255.
 #[derive(Debug, Clone, Copy)]
@@ -40,59 +42,65 @@ pub(super) struct LeafColors {
 /// # Errors
 /// None in practice, because the sizes are constants.
 pub(super) fn texture(name: &str, palette: &LeafColors, random: &mut SplitMix64) -> Result<Texture> {
-    let mottle =
-        [GradientNoise { cells: [7, 9], seed: random.bits() }, GradientNoise { cells: [31, 37], seed: random.bits() }];
+    let mottle_noise = [
+        GradientNoise { cells: [7, 9], seed: random.next_bits() },
+        GradientNoise { cells: [31, 37], seed: random.next_bits() },
+    ];
     let mut rgba = Vec::with_capacity(4 * SIDE * SIDE);
     for pixel in 0..SIDE * SIDE {
         let u = ((pixel % SIDE) as f32 + 0.5) / SIDE as f32;
         let v = ((pixel / SIDE) as f32 + 0.5) / SIDE as f32;
-        let shade = 1.0 + 0.08 * mottle[0].at(u, v) + 0.05 * mottle[1].at(u, v);
-        let across = (u - LEAF_SPAN[0]) / (LEAF_SPAN[1] - LEAF_SPAN[0]) - 0.5;
-        let (color, cover) = if u >= STRIP { (palette.stem, 1.0) } else { leaf(palette, across, 1.0 - v) };
-        rgba.extend(color.map(|channel| (shade * channel).clamp(0.0, 255.0) as u8));
-        rgba.push((255.0 * cover).round() as u8);
+        let brightness = 1.0 + 0.08 * mottle_noise[0].sample(u, v) + 0.05 * mottle_noise[1].sample(u, v);
+        let x = (u - LEAF_SPAN[0]) / (LEAF_SPAN[1] - LEAF_SPAN[0]) - 0.5;
+        let (color, coverage) = if u >= STRIP_LEFT { (palette.stem, 1.0) } else { shade_leaf(palette, x, 1.0 - v) };
+        rgba.extend(color.map(|channel| (brightness * channel).clamp(0.0, 255.0) as u8));
+        rgba.push((255.0 * coverage).round() as u8);
     }
     Texture::new(name, SIDE as u32, SIDE as u32, rgba)
 }
 
-/// Color and coverage at distance `x` from the midrib and `y` above the base of the petiole.
-fn leaf(palette: &LeafColors, x: f32, y: f32) -> ([f32; 3], f32) {
-    let along = (y - PETIOLE) / (0.985 - PETIOLE);
-    let off = x.abs();
-    let pixel = 1.2 / SIDE as f32;
-    let stalk = 0.016 * (1.0 - 0.85 * along.max(0.0));
-    let on_stalk = if along < 0.9 { ((stalk - off) / pixel + 0.5).clamp(0.0, 1.0) } else { 0.0 };
-    if along <= 0.0 {
-        return (palette.stem, on_stalk);
+/// Color and coverage at the signed distance `x` from the midrib and the height `y` above the base of the petiole.
+fn shade_leaf(palette: &LeafColors, x: f32, y: f32) -> ([f32; 3], f32) {
+    let blade_fraction = (y - PETIOLE_LENGTH) / (0.985 - PETIOLE_LENGTH);
+    let distance = x.abs();
+    let pixel_width = 1.2 / SIDE as f32;
+    let stalk_half_width = 0.016 * (1.0 - 0.85 * blade_fraction.max(0.0));
+    let stalk_coverage =
+        if blade_fraction < 0.9 { ((stalk_half_width - distance) / pixel_width + 0.5).clamp(0.0, 1.0) } else { 0.0 };
+    if blade_fraction <= 0.0 {
+        return (palette.stem, stalk_coverage);
     }
-    let half = half_width(along);
-    let cover = ((half - off) / (1.6 * pixel) + 0.5).clamp(0.0, 1.0).max(on_stalk);
-    let across = (off / half.max(1e-3)).min(1.2);
-    let body = lerp_color(palette.blade, palette.edge, smoothstep(0.35, 1.1, across));
+    let blade_half_width = half_width(blade_fraction);
+    let coverage = ((blade_half_width - distance) / (1.6 * pixel_width) + 0.5).clamp(0.0, 1.0).max(stalk_coverage);
+    let relative_distance = (distance / blade_half_width.max(1e-3)).min(1.2);
+    let base_color = lerp_color(palette.blade, palette.edge, smoothstep(0.35, 1.1, relative_distance));
     // Between two side veins the blade bulges and appears lighter.
-    let (vein, bulge) = side_vein(along, off, across);
-    let bulged = body.map(|channel| channel * (0.93 + 0.14 * bulge));
-    let veined = lerp_color(bulged, palette.vein, 0.75 * vein);
-    (lerp_color(veined, palette.vein, smoothstep(1.9 * stalk, 0.6 * stalk, off)), cover)
+    let (vein_intensity, bulge) = side_vein(blade_fraction, distance, relative_distance);
+    let bulged_color = base_color.map(|channel| channel * (0.93 + 0.14 * bulge));
+    let veined_color = lerp_color(bulged_color, palette.vein, 0.75 * vein_intensity);
+    (
+        lerp_color(veined_color, palette.vein, smoothstep(1.9 * stalk_half_width, 0.6 * stalk_half_width, distance)),
+        coverage,
+    )
 }
 
 /// Half-width of the blade: egg-shaped with an elongated tip and forward-pointing teeth.
-fn half_width(along: f32) -> f32 {
-    let t = along.clamp(0.0, 1.0);
+fn half_width(blade_fraction: f32) -> f32 {
+    let t = blade_fraction.clamp(0.0, 1.0);
     let egg = (std::f32::consts::PI * t.powf(0.74)).sin().max(0.0).powf(0.72);
     let tip = 1.0 - 0.42 * smoothstep(0.70, 0.96, t);
-    let tooth = (t * TEETH).fract();
-    HALF_WIDTH * egg * tip * (0.93 + 0.07 * tooth * tooth.sqrt())
+    let tooth = (t * TOOTH_COUNT).fract();
+    MAX_HALF_WIDTH * egg * tip * (0.93 + 0.07 * tooth * tooth.sqrt())
 }
 
-/// Intensity of the side veins, and relative distance from the nearest one (1 halfway between two).
-fn side_vein(along: f32, off: f32, across: f32) -> (f32, f32) {
+/// Intensity of the side veins, and smoothed distance from the nearest one: 0 on the vein, 1 halfway between two.
+fn side_vein(blade_fraction: f32, distance: f32, relative_distance: f32) -> (f32, f32) {
     // Veins leave the midrib at equal intervals and bend towards the tip.
-    let phase = (along - 0.62 * off - 0.35 * off * off) * 8.5;
-    let from_vein = (phase - phase.round()).abs();
-    let width = 0.10 * (1.0 - 0.75 * across.min(1.0));
-    let vein = smoothstep(width, 0.35 * width, from_vein) * smoothstep(1.05, 0.75, across);
-    (vein, smoothstep(0.0, 0.5, from_vein))
+    let phase = (blade_fraction - 0.62 * distance - 0.35 * distance * distance) * 8.5;
+    let vein_distance = (phase - phase.round()).abs();
+    let width = 0.10 * (1.0 - 0.75 * relative_distance.min(1.0));
+    let intensity = smoothstep(width, 0.35 * width, vein_distance) * smoothstep(1.05, 0.75, relative_distance);
+    (intensity, smoothstep(0.0, 0.5, vein_distance))
 }
 
 #[cfg(test)]
@@ -107,30 +115,32 @@ mod tests {
     };
 
     #[test]
-    fn the_outline_covers_a_part_of_the_image_and_the_stem_strip_all_of_its_own() {
-        let image = texture("leaf", &PALETTE, &mut SplitMix64::new(1)).expect("made");
-        let opaque = |pixel: usize| image.rgba()[4 * pixel + 3] >= 128;
-        let share = (0..SIDE * SIDE).filter(|pixel| opaque(*pixel)).count() as f64 / (SIDE * SIDE) as f64;
-        assert!((0.2..0.8).contains(&share), "{share} of the image is leaf");
-        let strip = (STEM_U * SIDE as f32) as usize;
-        assert!((0..SIDE).all(|row| opaque(row * SIDE + strip)));
-        assert!(!opaque(0) && opaque(SIDE / 2 * SIDE + (0.45 * SIDE as f32) as usize));
+    fn leaf_covers_part_of_the_image_and_the_strip_is_opaque() {
+        let image = texture("leaf", &PALETTE, &mut SplitMix64::new(1)).expect("a valid texture");
+        let is_opaque = |pixel: usize| image.rgba()[4 * pixel + 3] >= 128;
+        let leaf_fraction = (0..SIDE * SIDE).filter(|pixel| is_opaque(*pixel)).count() as f64 / (SIDE * SIDE) as f64;
+        assert!((0.2..0.8).contains(&leaf_fraction), "{leaf_fraction} of the image is leaf");
+        let strip_column = (STEM_U * SIDE as f32) as usize;
+        assert!((0..SIDE).all(|row| is_opaque(row * SIDE + strip_column)));
+        assert!(!is_opaque(0) && is_opaque(SIDE / 2 * SIDE + (0.45 * SIDE as f32) as usize));
     }
 
     #[test]
-    fn the_outline_is_serrated_and_the_petiole_reaches_the_foot() {
+    fn outline_is_serrated_and_petiole_reaches_the_bottom() {
         let widths: Vec<f32> = (20..80).map(|step| half_width(step as f32 / 100.0)).collect();
-        let turns = widths.windows(3).filter(|w| (w[1] - w[0]) * (w[2] - w[1]) < 0.0).count();
-        assert!(turns >= 12, "{turns} turns of the outline");
-        assert_eq!(leaf(&PALETTE, 0.0, 0.01).1, 1.0);
-        assert_eq!(leaf(&PALETTE, 0.1, 0.01).1, 0.0);
+        let turning_points =
+            widths.windows(3).filter(|widths| (widths[1] - widths[0]) * (widths[2] - widths[1]) < 0.0).count();
+        assert!(turning_points >= 12, "expected at least 12 turning points, got {turning_points}");
+        assert_eq!(shade_leaf(&PALETTE, 0.0, 0.01).1, 1.0);
+        assert_eq!(shade_leaf(&PALETTE, 0.1, 0.01).1, 0.0);
     }
 
+    /// Dark transparent pixels would darken the outline in smaller mip levels.
     #[test]
-    fn transparent_pixels_are_green_too_so_that_smaller_copies_get_no_dark_rim() {
-        let image = texture("leaf", &PALETTE, &mut SplitMix64::new(1)).expect("made");
-        let hidden = image.rgba().chunks_exact(4).filter(|pixel| pixel[3] == 0);
-        assert!(hidden.clone().count() > 1000);
-        assert!(hidden.into_iter().all(|pixel| pixel[1] > 70));
+    fn transparent_pixels_are_green() {
+        let image = texture("leaf", &PALETTE, &mut SplitMix64::new(1)).expect("a valid texture");
+        let transparent_pixels = image.rgba().chunks_exact(4).filter(|pixel| pixel[3] == 0);
+        assert!(transparent_pixels.clone().count() > 1000);
+        assert!(transparent_pixels.into_iter().all(|pixel| pixel[1] > 70));
     }
 }

@@ -1,12 +1,12 @@
-//! The built-in scene `tree`, generated from a seed: beams, their modes, and the modes of the skin.
+//! The built-in scene `tree`, generated from a seed.
 //!
 //! A trunk of 6.8 m carries boughs and twigs, boughs carry twigs, and boughs and twigs carry leaf clusters. Every
 //! wooden part is a clamped Euler-Bernoulli beam along its centerline, loaded with the masses of its children at their
-//! joints; its modes are lifted to the skin. Modes are mass-orthonormal in kg, so that modal forces are U^T f with f in
-//! newtons.
+//! joints. The modes of the beam are lifted to the part's skin. Modes are mass-orthonormal in kg, so that modal forces
+//! are U^T f with f in newtons.
 //!
-//! The frame of a part has its origin at the center of the base, +Y along the start of the centerline, and +Z as close
-//! to up as possible.
+//! The coordinate frame of a part has its origin at the center of the part's base, +Y along the start of the
+//! centerline, and +Z as close to the world's up direction as possible.
 
 mod bark;
 mod beam;
@@ -42,7 +42,7 @@ impl Default for TreeParameters {
     }
 }
 
-/// Index of the bark material; the leaf materials follow.
+/// Index of the bark material. The leaf materials follow it.
 const BARK: usize = 0;
 
 /// The two leaf materials: shaded and sunlit leaves.
@@ -71,8 +71,8 @@ const LEAVES: [(&str, leaf_image::LeafColors); 2] = [
 ///
 /// # Errors
 /// `Fault` if the eigenproblem of a beam does not converge.
-pub fn generate(recipe: &TreeParameters) -> Result<SceneParts> {
-    let mut random = SplitMix64::new(recipe.seed);
+pub fn generate(parameters: &TreeParameters) -> Result<SceneParts> {
+    let mut random = SplitMix64::new(parameters.seed);
     let mut parts = SceneParts::named("tree");
     parts.rigid_transforms = true;
     // Leaves and bark are dark, so strong sunlight does not overexpose them.
@@ -83,13 +83,13 @@ pub fn generate(recipe: &TreeParameters) -> Result<SceneParts> {
         ..RenderSettings::default()
     };
     add_materials(&mut parts, &mut random.fork())?;
-    let templates = species::plan(&mut random.fork());
-    let cast = templates.par_iter().map(PartTemplate::cast).collect::<Result<Vec<_>>>()?;
-    let (shapes, metadata): (Vec<_>, Vec<_>) = cast.into_iter().unzip();
+    let templates = species::grow_templates(&mut random.fork());
+    let shapes_and_metadata = templates.par_iter().map(PartTemplate::build_shape).collect::<Result<Vec<_>>>()?;
+    let (shapes, metadata): (Vec<_>, Vec<_>) = shapes_and_metadata.into_iter().unzip();
     parts.shapes = shapes;
-    let mut planter = PartPlacer { templates: &templates, metadata: &metadata, domains: vec![], random: random.fork() };
-    planter.place_trunk();
-    parts.domains = planter.domains;
+    let mut placer = PartPlacer { templates: &templates, metadata: &metadata, domains: vec![], random: random.fork() };
+    placer.place_trunk();
+    parts.domains = placer.domains;
     Ok(parts)
 }
 
@@ -127,41 +127,49 @@ struct PartPlacer<'a> {
 }
 
 impl PartPlacer<'_> {
-    /// Places the trunk, which is the last template, and everything attached to it.
+    /// Places the trunk, which is the last template, and all parts that it carries.
     fn place_trunk(&mut self) {
         let trunk = self.templates.len() - 1;
-        self.domains.push(self.domain("trunk".into(), trunk, BARK, Transform::IDENTITY));
+        self.domains.push(self.create_domain("trunk".into(), trunk, BARK, Transform::IDENTITY));
         self.place_children(0, trunk, &Isometry3::identity());
     }
 
-    /// Places the children of a domain, recursively.
-    fn place_children(&mut self, parent: usize, mold: usize, world_from_parent: &Isometry3<f64>) {
+    /// Places the children of a domain, and recursively their children.
+    fn place_children(&mut self, parent: usize, template_index: usize, world_from_parent: &Isometry3<f64>) {
         let templates = self.templates;
-        for (number, bud) in templates[mold].children.iter().enumerate() {
-            let parent_from_child = joint(&templates[mold], bud, world_from_parent);
+        for (index, child_joint) in templates[template_index].children.iter().enumerate() {
+            let parent_from_child = joint_transform(&templates[template_index], child_joint, world_from_parent);
             let world_from_child = world_from_parent * parent_from_child;
-            let child = &templates[bud.mold];
-            let path = self.domains[parent].name.split_once(' ').map_or(String::new(), |(_, path)| format!("{path}."));
+            let child = &templates[child_joint.template_index];
+            let parent_path = self.domains[parent]
+                .name
+                .split_once(' ')
+                .map_or(String::new(), |(_, parent_path)| format!("{parent_path}."));
             let (kind, material) = match child.kind {
                 PartKind::Leaf => ("leaf", BARK + 1 + usize::from(self.random.next_unit() < 0.35)),
                 PartKind::Trunk | PartKind::Branch => ("branch", BARK),
             };
             let placement = Transform::from_matrix(&world_from_child.to_homogeneous());
-            let mut domain = self.domain(format!("{kind} {path}{}", number + 1), bud.mold, material, placement);
+            let mut domain = self.create_domain(
+                format!("{kind} {parent_path}{}", index + 1),
+                child_joint.template_index,
+                material,
+                placement,
+            );
             domain.attachment = Some(Attachment {
                 parent,
                 frame: Transform::from_matrix(&parent_from_child.to_homogeneous()),
-                rows: templates[mold].ring_rows(bud.ring),
+                rows: templates[template_index].ring_rows(child_joint.ring),
             });
             self.domains.push(domain);
-            self.place_children(self.domains.len() - 1, bud.mold, &world_from_child);
+            self.place_children(self.domains.len() - 1, child_joint.template_index, &world_from_child);
         }
     }
 
-    fn domain(&self, name: String, mold: usize, material: usize, placement: Transform) -> Domain {
+    fn create_domain(&self, name: String, template_index: usize, material: usize, placement: Transform) -> Domain {
         Domain {
             name,
-            shape: mold,
+            shape: template_index,
             material,
             placement,
             attachment: None,
@@ -169,17 +177,24 @@ impl PartPlacer<'_> {
             material_ranges: vec![],
             rest_q: vec![],
             shares_q_with: None,
-            metadata: self.metadata[mold].clone(),
+            metadata: self.metadata[template_index].clone(),
         }
     }
 }
 
-/// `parent_from_child`: the origin is the ring's center, +Y the bud's direction, and +Z points towards the sky.
-fn joint(parent: &PartTemplate, bud: &ChildJoint, world_from_parent: &Isometry3<f64>) -> Isometry3<f64> {
-    let turn = world_from_parent.rotation;
-    let child = centerline::frame(&(turn * bud.direction), &Vector3::y());
-    let rotation = turn.inverse() * UnitQuaternion::from_rotation_matrix(&child);
-    Isometry3::from_parts(Translation3::from(parent.centerline.points[bud.ring]), rotation)
+/// `parent_from_child`. The child's origin is the ring's center, +Y the direction of the joint, and +Z is as close to
+/// the world's up direction as possible.
+fn joint_transform(
+    parent: &PartTemplate,
+    child_joint: &ChildJoint,
+    world_from_parent: &Isometry3<f64>,
+) -> Isometry3<f64> {
+    let world_from_parent_rotation = world_from_parent.rotation;
+    let world_from_child_rotation =
+        centerline::part_orientation(&(world_from_parent_rotation * child_joint.direction), &Vector3::y());
+    let rotation =
+        world_from_parent_rotation.inverse() * UnitQuaternion::from_rotation_matrix(&world_from_child_rotation);
+    Isometry3::from_parts(Translation3::from(parent.centerline.points[child_joint.ring]), rotation)
 }
 
 #[cfg(test)]
@@ -187,8 +202,8 @@ mod tests {
     use super::*;
     use crate::scene::Scene;
 
-    fn grown(seed: u64) -> SceneParts {
-        generate(&TreeParameters { seed }).expect("every beam is solved")
+    fn generate_tree(seed: u64) -> SceneParts {
+        generate(&TreeParameters { seed }).expect("a valid tree")
     }
 
     fn note<'a>(domain: &'a Domain, name: &str) -> &'a str {
@@ -196,30 +211,34 @@ mod tests {
     }
 
     #[test]
-    fn a_seed_grows_the_same_tree_twice_and_another_seed_another_tree() {
-        let (one, two, other) = (grown(7), grown(7), grown(8));
-        let rest = |parts: &SceneParts| {
+    fn equal_seeds_give_equal_trees() {
+        let (tree, same_tree, other_tree) = (generate_tree(7), generate_tree(7), generate_tree(8));
+        let rest_positions = |parts: &SceneParts| {
             parts.shapes.iter().flat_map(|shape| shape.mesh.rest_positions().to_vec()).collect::<Vec<_>>()
         };
         let modes = |parts: &SceneParts| {
             parts.shapes.iter().flat_map(|shape| shape.modes.columns().to_vec()).collect::<Vec<_>>()
         };
-        let frames = |parts: &SceneParts| parts.domains.iter().map(|domain| domain.placement).collect::<Vec<_>>();
-        assert_eq!(rest(&one), rest(&two));
-        assert_eq!(modes(&one), modes(&two));
-        assert_eq!(frames(&one), frames(&two));
-        assert_eq!(one.textures, two.textures);
-        assert!(rest(&one) != rest(&other) && modes(&one) != modes(&other) && frames(&one) != frames(&other));
-        assert_ne!(one.textures, other.textures);
+        let placements = |parts: &SceneParts| parts.domains.iter().map(|domain| domain.placement).collect::<Vec<_>>();
+        assert_eq!(rest_positions(&tree), rest_positions(&same_tree));
+        assert_eq!(modes(&tree), modes(&same_tree));
+        assert_eq!(placements(&tree), placements(&same_tree));
+        assert_eq!(tree.textures, same_tree.textures);
+        assert!(
+            rest_positions(&tree) != rest_positions(&other_tree)
+                && modes(&tree) != modes(&other_tree)
+                && placements(&tree) != placements(&other_tree)
+        );
+        assert_ne!(tree.textures, other_tree.textures);
     }
 
     #[test]
-    fn every_seed_gives_a_scene_of_the_promised_size_that_needs_what_it_should() {
+    fn every_seed_gives_a_valid_scene_of_the_documented_size() {
         for seed in [0, 7, u64::MAX] {
-            let scene = Scene::new(grown(seed)).expect("a valid scene");
+            let scene = Scene::new(generate_tree(seed)).expect("a valid scene");
             let count = |kind: &str| scene.domains.iter().filter(|domain| note(domain, "kind") == kind).count();
-            let corners = |domain: &Domain| scene.shapes[domain.shape].mesh.triangles().len();
-            let triangles: usize = scene.domains.iter().map(corners).sum();
+            let triangle_count = |domain: &Domain| scene.shapes[domain.shape].mesh.triangles().len();
+            let triangles: usize = scene.domains.iter().map(triangle_count).sum();
             assert!(scene.domains.len() >= 300, "{} domains", scene.domains.len());
             assert!((50_000..=130_000).contains(&triangles), "{triangles} triangles");
             assert_eq!(count("trunk"), 1);
@@ -230,13 +249,13 @@ mod tests {
             assert!(!features.blend && !features.shear);
             let height = scene.rest_bounds.max[1];
             assert!((7.0..9.5).contains(&height), "{height} m high");
-            assert!(scene.rest_bounds.min[1].abs() < 1e-6, "the tree stands on {}", scene.rest_bounds.min[1]);
+            assert!(scene.rest_bounds.min[1].abs() < 1e-6, "expected the base at 0, got {}", scene.rest_bounds.min[1]);
         }
     }
 
     #[test]
-    fn some_leaves_are_rigid_and_some_bend_with_two_modes() {
-        let parts = grown(7);
+    fn leaf_clusters_have_zero_or_two_modes() {
+        let parts = generate_tree(7);
         let rank = |domain: &Domain| parts.shapes[domain.shape].modes.rank();
         let leaves = parts.domains.iter().filter(|domain| note(domain, "kind") == "leaf");
         let ranks: std::collections::BTreeSet<usize> = leaves.map(rank).collect();
@@ -248,50 +267,55 @@ mod tests {
     }
 
     #[test]
-    fn every_joint_is_the_centre_of_the_ring_that_carries_it() {
-        let parts = grown(7);
+    fn every_joint_is_at_the_center_of_its_ring() {
+        let parts = generate_tree(7);
         for domain in &parts.domains[1..] {
-            let attachment = domain.attachment.as_ref().expect("all but the trunk hang on something");
+            let attachment = domain.attachment.as_ref().expect("a parent for every part but the trunk");
             let parent = &parts.domains[attachment.parent];
-            let rest = parts.shapes[parent.shape].mesh.rest_positions();
-            let mean = |rows: &[u32]| {
-                let sum: Vector3<f64> = rows.iter().map(|row| Vector3::from(rest[*row as usize]).cast::<f64>()).sum();
+            let rest_positions = parts.shapes[parent.shape].mesh.rest_positions();
+            let joint_gap = |rows: &[u32]| {
+                let sum: Vector3<f64> =
+                    rows.iter().map(|row| Vector3::from(rest_positions[*row as usize]).cast::<f64>()).sum();
                 let center = parent.placement.to_matrix().transform_point(&(sum / rows.len() as f64).into());
                 (center.coords - domain.placement.translation()).norm()
             };
-            assert!(mean(&attachment.rows) <= 1e-5, "{}: a gap of {}", domain.name, mean(&attachment.rows));
+            assert!(joint_gap(&attachment.rows) <= 1e-5, "{}: a gap of {}", domain.name, joint_gap(&attachment.rows));
             // Counterexample: the center of the ring below differs.
-            let count = attachment.rows.len() as u32;
-            let below: Vec<u32> = attachment.rows.iter().map(|row| row.saturating_sub(count)).collect();
-            assert!(mean(&below) > 1e-3, "{}", domain.name);
+            let row_count = attachment.rows.len() as u32;
+            let lower_ring: Vec<u32> = attachment.rows.iter().map(|row| row.saturating_sub(row_count)).collect();
+            assert!(joint_gap(&lower_ring) > 1e-3, "{}", domain.name);
         }
         assert!(parts.domains[0].attachment.is_none());
     }
 
     #[test]
-    fn frames_compose_to_placements_and_are_rotations() {
-        let parts = grown(7);
+    fn attachment_frames_compose_to_placements() {
+        let parts = generate_tree(7);
         for domain in &parts.domains {
             let linear = domain.placement.linear();
             assert!((linear.transpose() * linear - nalgebra::Matrix3::identity()).abs().max() < 1e-5);
             assert!((linear.determinant() - 1.0).abs() < 1e-5);
             let Some(attachment) = &domain.attachment else { continue };
             let composed = parts.domains[attachment.parent].placement.compose(attachment.frame);
-            for (got, want) in composed.0.iter().zip(domain.placement.0) {
-                assert!((got - want).abs() <= 1e-5, "{}: {got} is not {want}", domain.name);
+            for (actual, expected) in composed.0.iter().zip(domain.placement.0) {
+                assert!((actual - expected).abs() <= 1e-5, "{}: expected {expected}, got {actual}", domain.name);
             }
         }
     }
 
     #[test]
-    fn frequencies_are_those_of_a_living_tree() {
-        for domain in &grown(7).domains {
-            let hertz: Vec<f64> =
-                domain.metadata.eigenvalues.iter().map(|value| value.sqrt() / std::f64::consts::TAU).collect();
+    fn lowest_frequencies_are_in_the_range_of_real_trees() {
+        for domain in &generate_tree(7).domains {
+            let hertz: Vec<f64> = domain
+                .metadata
+                .eigenvalues
+                .iter()
+                .map(|eigenvalue| eigenvalue.sqrt() / std::f64::consts::TAU)
+                .collect();
             assert!(hertz.windows(2).all(|pair| pair[0] <= pair[1]));
             let Some(lowest) = hertz.first() else { continue };
             let level = domain.metadata.notes.get("level").map(String::as_str);
-            assert_eq!(level.is_none(), note(domain, "kind") == "leaf", "only leaves have no level");
+            assert_eq!(level.is_none(), note(domain, "kind") == "leaf", "expected a level unless the part is a leaf");
             let range = match level {
                 Some("0") => 0.4..1.5,
                 Some("1") => 0.6..6.0,
@@ -302,13 +326,13 @@ mod tests {
     }
 
     #[test]
-    fn the_first_mode_sways_the_top_more_than_the_stem_below_it() {
-        let parts = grown(7);
+    fn first_mode_of_the_trunk_is_largest_at_the_top() {
+        let parts = generate_tree(7);
         let shape = &parts.shapes[parts.domains[0].shape];
-        let sway = |vertex: usize| Vector3::from_fn(|axis, _| shape.modes.entry(vertex, axis, 0)).norm();
-        let count = shape.mesh.rest_positions().len();
-        let largest = (0..count).map(sway).fold(0.0, f32::max);
-        assert!(sway(count - 1) > 0.95 * largest);
-        assert!(sway(count / 4) < 0.3 * largest);
+        let amplitude = |vertex: usize| Vector3::from_fn(|axis, _| shape.modes.entry(vertex, axis, 0)).norm();
+        let vertex_count = shape.mesh.rest_positions().len();
+        let largest = (0..vertex_count).map(amplitude).fold(0.0, f32::max);
+        assert!(amplitude(vertex_count - 1) > 0.95 * largest);
+        assert!(amplitude(vertex_count / 4) < 0.3 * largest);
     }
 }

@@ -10,33 +10,36 @@ pub(super) struct GradientNoise {
 }
 
 impl GradientNoise {
-    /// Noise of about -1 to 1, with period 1 in both `u` and `v` and a mean of about 0.
-    pub(super) fn at(&self, u: f32, v: f32) -> f32 {
+    /// The noise at (u, v): about -1 to 1 with a mean of about 0, and with period 1 in both directions.
+    pub(super) fn sample(&self, u: f32, v: f32) -> f32 {
         let (x, y) = (u * self.cells[0] as f32, v * self.cells[1] as f32);
         let (column, row) = (x.floor(), y.floor());
         let (dx, dy) = (x - column, y - row);
-        let corner = |right: i32, down: i32| {
-            let (gx, gy) = self.gradient(column as i32 + right, row as i32 + down);
-            gx * (dx - right as f32) + gy * (dy - down as f32)
+        let corner_value = |column_offset: i32, row_offset: i32| {
+            let (gx, gy) = self.gradient(column as i32 + column_offset, row as i32 + row_offset);
+            gx * (dx - column_offset as f32) + gy * (dy - row_offset as f32)
         };
         let (sx, sy) = (fade(dx), fade(dy));
-        let top = corner(0, 0) * (1.0 - sx) + corner(1, 0) * sx;
-        let bottom = corner(0, 1) * (1.0 - sx) + corner(1, 1) * sx;
-        1.4 * (top * (1.0 - sy) + bottom * sy)
+        let top_value = corner_value(0, 0) * (1.0 - sx) + corner_value(1, 0) * sx;
+        let bottom_value = corner_value(0, 1) * (1.0 - sx) + corner_value(1, 1) * sx;
+        1.4 * (top_value * (1.0 - sy) + bottom_value * sy)
     }
 
+    /// The pseudo-random gradient at a grid point, of about unit length.
     fn gradient(&self, column: i32, row: i32) -> (f32, f32) {
-        let place = column.rem_euclid(self.cells[0]) as u64 | (row.rem_euclid(self.cells[1]) as u64) << 32;
-        let turn = (mix64(place ^ self.seed) >> 40) as f32 / (1_u32 << 24) as f32;
-        // Approximate cosine and sine of the gradient's angle by parabolas, which is cheaper.
-        let wave = |turn: f32| {
-            let x = 2.0 * turn.fract() - 1.0;
+        let cell_key = column.rem_euclid(self.cells[0]) as u64 | (row.rem_euclid(self.cells[1]) as u64) << 32;
+        let angle_fraction = (mix64(cell_key ^ self.seed) >> 40) as f32 / (1_u32 << 24) as f32;
+        // Parabolas approximate the sine and cosine of the gradient's angle, because they are cheaper. The argument is
+        // the angle as a fraction of a full turn.
+        let parabolic_sine = |angle_fraction: f32| {
+            let x = 2.0 * angle_fraction.fract() - 1.0;
             4.0 * x * (1.0 - x.abs())
         };
-        (wave(turn + 0.25), wave(turn))
+        (parabolic_sine(angle_fraction + 0.25), parabolic_sine(angle_fraction))
     }
 }
 
+/// Perlin's quintic interpolation weight.
 fn fade(t: f32) -> f32 {
     t * t * t * (t * (t * 6.0 - 15.0) + 10.0)
 }
@@ -57,18 +60,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn noise_is_periodic_bounded_and_not_constant() {
+    fn noise_is_periodic_and_bounded() {
         let noise = GradientNoise { cells: [5, 3], seed: 11 };
         let mut sum = 0.0;
         let mut peak = 0.0_f32;
         for step in 0..400 {
             let (u, v) = (step as f32 / 400.0, (step as f32 * 0.377).fract());
-            let here = noise.at(u, v);
-            assert!((here - noise.at(u + 1.0, v)).abs() < 1e-4);
-            assert!((here - noise.at(u, v - 1.0)).abs() < 1e-4);
-            assert!(here.abs() <= 1.5);
-            sum += here;
-            peak = peak.max(here.abs());
+            let value = noise.sample(u, v);
+            assert!((value - noise.sample(u + 1.0, v)).abs() < 1e-4);
+            assert!((value - noise.sample(u, v - 1.0)).abs() < 1e-4);
+            assert!(value.abs() <= 1.5);
+            sum += value;
+            peak = peak.max(value.abs());
         }
         assert!(peak > 0.3);
         assert!((sum / 400.0_f32).abs() < 0.15);

@@ -10,29 +10,29 @@ impl SplitMix64 {
     }
 
     /// The next 64 bits.
-    pub(super) const fn bits(&mut self) -> u64 {
+    pub(super) const fn next_bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         mix64(self.0)
     }
 
     /// Uniform in `[0, 1)`.
     pub(super) fn next_unit(&mut self) -> f64 {
-        (self.bits() >> 11) as f64 / (1_u64 << 53) as f64
+        (self.next_bits() >> 11) as f64 / (1_u64 << 53) as f64
     }
 
     /// Uniform in `[low, high)`.
-    pub(super) fn between(&mut self, low: f64, high: f64) -> f64 {
+    pub(super) fn uniform(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.next_unit()
     }
 
-    /// Uniform in `[-spread, spread)`.
-    pub(super) fn spread(&mut self, spread: f64) -> f64 {
-        self.between(-spread, spread)
+    /// Uniform in `[-limit, limit)`.
+    pub(super) fn uniform_symmetric(&mut self, limit: f64) -> f64 {
+        self.uniform(-limit, limit)
     }
 
-    /// An independent stream, so that a part that draws more numbers does not change its siblings.
+    /// An independent generator. With one generator per part, a part that draws more numbers does not change others.
     pub(super) const fn fork(&mut self) -> Self {
-        Self(self.bits())
+        Self(self.next_bits())
     }
 }
 
@@ -48,17 +48,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_seed_repeats_its_numbers_and_another_seed_differs() {
-        let draw =
-            |seed| (0..4).map(|_| 0).scan(SplitMix64::new(seed), |random, _| Some(random.bits())).collect::<Vec<_>>();
+    fn equal_seeds_give_equal_numbers() {
+        let draw = |seed| {
+            (0..4).map(|_| 0).scan(SplitMix64::new(seed), |random, _| Some(random.next_bits())).collect::<Vec<_>>()
+        };
         assert_eq!(draw(1), draw(1));
         assert_ne!(draw(1), draw(2));
         // The published first output for seed 0.
-        assert_eq!(SplitMix64::new(0).bits(), 0xE220_A839_7B1D_CDAF);
+        assert_eq!(SplitMix64::new(0).next_bits(), 0xE220_A839_7B1D_CDAF);
     }
 
     #[test]
-    fn units_fill_their_interval_evenly() {
+    fn unit_numbers_are_in_range_with_a_mean_of_one_half() {
         let mut random = SplitMix64::new(3);
         let draws: Vec<f64> = (0..4000).map(|_| random.next_unit()).collect();
         assert!(draws.iter().all(|draw| (0.0..1.0).contains(draw)));

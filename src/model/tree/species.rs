@@ -1,11 +1,10 @@
-//! The species: the templates of all parts, generated from a seed; children before parents, the trunk last. Lengths are
-//! in meters.
+//! The species of the tree: parameters and growth of the templates of all parts. Lengths are in meters.
 
 use std::f64::consts::TAU;
 
 use nalgebra::{Rotation3, Unit, Vector3};
 
-use super::centerline::{Centerline, GrowthParameters, frame};
+use super::centerline::{Centerline, GrowthParameters, part_orientation};
 use super::cluster::leaf_clusters;
 use super::element::ElasticConstants;
 use super::random::SplitMix64;
@@ -18,43 +17,51 @@ const WOOD: ElasticConstants = ElasticConstants { youngs_modulus: 4.5e9, shear_m
 /// Angle in radians between successive boughs around the trunk.
 const GOLDEN_ANGLE: f64 = 2.399_963;
 
-/// Number of boughs on the trunk, and the fractions of the trunk where the crown begins and ends.
-const BOUGHS: usize = 24;
-const CROWN: [f64; 2] = [0.24, 0.96];
+/// Number of boughs on the trunk.
+const BOUGH_COUNT: usize = 24;
+
+/// The fractions of the trunk's length where the crown begins and ends.
+const CROWN_RANGE: [f64; 2] = [0.24, 0.96];
 
 /// Lengths of the twigs, one template each.
-const TWIGS: [f64; 12] = [0.45, 0.50, 0.56, 0.66, 0.72, 0.78, 0.90, 0.97, 1.04, 1.18, 1.26, 1.34];
+const TWIG_LENGTHS: [f64; 12] = [0.45, 0.50, 0.56, 0.66, 0.72, 0.78, 0.90, 0.97, 1.04, 1.18, 1.26, 1.34];
 
-/// The templates of a tree.
-pub(super) fn plan(random: &mut SplitMix64) -> Vec<PartTemplate> {
-    let mut molds = leaf_clusters(&mut random.fork());
-    let leaves = 0..molds.len();
-    for length in TWIGS {
-        let twig = twig(length, &molds[leaves.clone()], &mut random.fork());
-        molds.push(twig);
+/// Generates the templates of a tree: children before parents, the trunk last.
+pub(super) fn grow_templates(random: &mut SplitMix64) -> Vec<PartTemplate> {
+    let mut templates = leaf_clusters(&mut random.fork());
+    let leaf_range = 0..templates.len();
+    for length in TWIG_LENGTHS {
+        let twig = grow_twig(length, &templates[leaf_range.clone()], &mut random.fork());
+        templates.push(twig);
     }
-    let twigs = leaves.end..molds.len();
-    let mut trunk = trunk(&mut random.fork());
-    for number in 0..BOUGHS {
+    let twig_range = leaf_range.end..templates.len();
+    let mut trunk = grow_trunk(&mut random.fork());
+    for index in 0..BOUGH_COUNT {
         let mut random = random.fork();
-        let (ring, direction, length) = place_bough(&trunk, number, &mut random);
-        let thickest = 0.60 * trunk.radii[ring];
-        let bough = bough(&direction, [length, thickest], &molds, &[leaves.clone(), twigs.clone()], &mut random);
-        trunk.attach_child(ChildJoint { ring, direction, mold: molds.len() }, bough.mass());
-        molds.push(bough);
+        let (ring, direction, length) = choose_bough_joint(&trunk, index, &mut random);
+        let max_radius = 0.60 * trunk.radii[ring];
+        let bough = grow_bough(
+            &direction,
+            [length, max_radius],
+            &templates,
+            &[leaf_range.clone(), twig_range.clone()],
+            &mut random,
+        );
+        trunk.attach_child(ChildJoint { ring, direction, template_index: templates.len() }, bough.mass());
+        templates.push(bough);
     }
-    let last = trunk.centerline.points.len() - 1;
-    for (ring, lean) in [(last, 0.10), (last - 2, 0.55), (last - 4, 0.65), (last - 6, 0.7)] {
-        let across = around(&trunk.centerline, ring, GOLDEN_ANGLE * (ring + BOUGHS) as f64);
-        let direction = trunk.centerline.branch_direction(ring, lean, &across);
-        let mold = twigs.start + 4 + ring % 5;
-        trunk.attach_child(ChildJoint { ring, direction, mold }, molds[mold].mass());
+    let last_ring = trunk.centerline.points.len() - 1;
+    for (ring, angle) in [(last_ring, 0.10), (last_ring - 2, 0.55), (last_ring - 4, 0.65), (last_ring - 6, 0.7)] {
+        let side = perpendicular_at(&trunk.centerline, ring, GOLDEN_ANGLE * (ring + BOUGH_COUNT) as f64);
+        let direction = trunk.centerline.branch_direction(ring, angle, &side);
+        let template_index = twig_range.start + 4 + ring % 5;
+        trunk.attach_child(ChildJoint { ring, direction, template_index }, templates[template_index].mass());
     }
-    molds.push(trunk);
-    molds
+    templates.push(trunk);
+    templates
 }
 
-fn trunk(random: &mut SplitMix64) -> PartTemplate {
+fn grow_trunk(random: &mut SplitMix64) -> PartTemplate {
     let growth = GrowthParameters {
         length: 6.8,
         elements: 16,
@@ -68,76 +75,83 @@ fn trunk(random: &mut SplitMix64) -> PartTemplate {
     };
     let centerline = Centerline::grow(&growth, random);
     let radius = |ring: usize| {
-        let along = centerline.fraction(ring);
-        0.010 + 0.086 * (1.0 - along).powf(0.92) + 0.075 * (-centerline.arc_lengths[ring] / 0.22).exp()
+        let fraction = centerline.fraction(ring);
+        0.010 + 0.086 * (1.0 - fraction).powf(0.92) + 0.075 * (-centerline.arc_lengths[ring] / 0.22).exp()
     };
     let radii = (0..centerline.points.len()).map(radius).collect();
-    let mut mold = wooden(PartKind::Trunk, centerline, radii, [24, 10]);
-    mold.damping = 0.05;
-    let phases = [random.between(0.0, TAU), random.between(0.0, TAU), random.between(0.0, TAU)];
-    mold.add_skin(UvMapping::Bark { repeats: 2 }, |arc, angle| {
-        // Roots extend outwards at the ground; further up, the trunk is slightly uneven.
-        let root = 0.20 * (5.0 * angle + phases[0]).cos() + 0.10 * (3.0 * angle + phases[1]).cos();
-        let uneven = 0.025 * (2.0 * angle + phases[2] + 1.7 * arc).cos() + 0.018 * (4.0 * angle - 2.3 * arc).cos();
-        1.0 + root * (-arc / 0.30).exp() + uneven
+    let mut template = wooden_part(PartKind::Trunk, centerline, radii, [24, 10]);
+    template.damping = 0.05;
+    let phases = [random.uniform(0.0, TAU), random.uniform(0.0, TAU), random.uniform(0.0, TAU)];
+    template.add_skin(UvMapping::Bark { repeats: 2 }, |arc, angle| {
+        // Roots extend outwards at the ground. Above them, the trunk is slightly uneven.
+        let root_swelling = 0.20 * (5.0 * angle + phases[0]).cos() + 0.10 * (3.0 * angle + phases[1]).cos();
+        let unevenness = 0.025 * (2.0 * angle + phases[2] + 1.7 * arc).cos() + 0.018 * (4.0 * angle - 2.3 * arc).cos();
+        1.0 + root_swelling * (-arc / 0.30).exp() + unevenness
     });
-    mold
+    template
 }
 
-/// Ring, direction and length of a bough: long and level at the bottom, short and steep at the top.
-fn place_bough(trunk: &PartTemplate, number: usize, random: &mut SplitMix64) -> (usize, Vector3<f64>, f64) {
-    let height = (number as f64 + random.spread(0.25)) / (BOUGHS - 1) as f64;
-    let ring = trunk.centerline.ring_at(CROWN[0] + (CROWN[1] - CROWN[0]) * height.clamp(0.0, 1.0).powf(1.06));
-    let across = around(&trunk.centerline, ring, GOLDEN_ANGLE * (number as f64 + 0.8) + random.spread(0.3));
-    let angle = 1.22 - 0.74 * height + random.spread(0.12);
-    let crown = (1.0 - ((height - 0.28) / 0.75).powi(2)).max(0.0).sqrt();
-    (ring, trunk.centerline.branch_direction(ring, angle, &across), (0.40 + 2.32 * crown) * random.between(0.92, 1.08))
+/// Ring, direction and length of a bough. Boughs are long and level at the bottom, short and steep at the top.
+fn choose_bough_joint(trunk: &PartTemplate, index: usize, random: &mut SplitMix64) -> (usize, Vector3<f64>, f64) {
+    let height = (index as f64 + random.uniform_symmetric(0.25)) / (BOUGH_COUNT - 1) as f64;
+    let ring = trunk
+        .centerline
+        .ring_at(CROWN_RANGE[0] + (CROWN_RANGE[1] - CROWN_RANGE[0]) * height.clamp(0.0, 1.0).powf(1.06));
+    let side =
+        perpendicular_at(&trunk.centerline, ring, GOLDEN_ANGLE * (index as f64 + 0.8) + random.uniform_symmetric(0.3));
+    let angle = 1.22 - 0.74 * height + random.uniform_symmetric(0.12);
+    let crown_profile = (1.0 - ((height - 0.28) / 0.75).powi(2)).max(0.0).sqrt();
+    (
+        ring,
+        trunk.centerline.branch_direction(ring, angle, &side),
+        (0.40 + 2.32 * crown_profile) * random.uniform(0.92, 1.08),
+    )
 }
 
-/// A bough that starts along `direction` (in the world), with its twigs and leaves. `size` is length and largest
-/// radius.
-fn bough(
+/// Grows a bough that starts along `direction` (in the world), with its twigs and leaves. `size` is its length and its
+/// largest radius.
+fn grow_bough(
     direction: &Vector3<f64>,
     size: [f64; 2],
-    molds: &[PartTemplate],
-    [leaves, twigs]: &[std::ops::Range<usize>; 2],
+    templates: &[PartTemplate],
+    [leaf_range, twig_range]: &[std::ops::Range<usize>; 2],
     random: &mut SplitMix64,
 ) -> PartTemplate {
-    let [length, thickest] = size;
+    let [length, max_radius] = size;
     let growth = GrowthParameters {
         length,
         elements: 12,
         rings: 2,
         grading: 1.1,
         start: Vector3::y(),
-        up: frame(direction, &Vector3::y()).inverse() * Vector3::y(),
+        up: part_orientation(direction, &Vector3::y()).inverse() * Vector3::y(),
         sag: 0.10 + 0.06 * length,
         rise: 0.55,
         wander: 0.20,
     };
     let centerline = Centerline::grow(&growth, random);
-    let base = (0.008 + 0.0105 * length).min(thickest);
-    let radii = tapering(&centerline, base, 0.0045);
-    let mut mold = wooden(PartKind::Branch, centerline, radii, [10, 6]);
-    mold.level = Some(1);
-    mold.damping = 0.07;
-    mold.add_skin(UvMapping::Bark { repeats: 1 }, |_, _| 1.0);
-    let count = (length / 0.42).round().max(3.0) as usize;
-    for number in 0..count {
-        let along = 0.26 + 0.68 * (number as f64 + random.spread(0.25)) / (count as f64 - 1.0);
-        let ring = mold.centerline.ring_at(along.min(0.95));
-        let wanted = (0.38 + 0.34 * length) * (1.12 - 0.62 * along) * random.between(0.85, 1.15);
-        let across = beside(&mold.centerline, ring, &growth.up, number, random);
-        let direction = mold.centerline.branch_direction(ring, random.between(0.70, 1.0) - 0.2 * along, &across);
-        let child = nearest(wanted, twigs, random);
-        mold.attach_child(ChildJoint { ring, direction, mold: child }, molds[child].mass());
+    let base_radius = (0.008 + 0.0105 * length).min(max_radius);
+    let radii = tapered_radii(&centerline, base_radius, 0.0045);
+    let mut template = wooden_part(PartKind::Branch, centerline, radii, [10, 6]);
+    template.level = Some(1);
+    template.damping = 0.07;
+    template.add_skin(UvMapping::Bark { repeats: 1 }, |_, _| 1.0);
+    let twig_count = (length / 0.42).round().max(3.0) as usize;
+    for index in 0..twig_count {
+        let fraction = 0.26 + 0.68 * (index as f64 + random.uniform_symmetric(0.25)) / (twig_count as f64 - 1.0);
+        let ring = template.centerline.ring_at(fraction.min(0.95));
+        let twig_length = (0.38 + 0.34 * length) * (1.12 - 0.62 * fraction) * random.uniform(0.85, 1.15);
+        let side = side_direction(&template.centerline, ring, &growth.up, index, random);
+        let direction = template.centerline.branch_direction(ring, random.uniform(0.70, 1.0) - 0.2 * fraction, &side);
+        let template_index = choose_twig(twig_length, twig_range, random);
+        template.attach_child(ChildJoint { ring, direction, template_index }, templates[template_index].mass());
     }
-    hang_leaves(&mut mold, &[0.50, 0.66, 0.82, 1.0], &molds[leaves.clone()], &growth.up, random);
-    mold
+    attach_leaf_clusters(&mut template, &[0.50, 0.66, 0.82, 1.0], &templates[leaf_range.clone()], &growth.up, random);
+    template
 }
 
-/// A twig with its leaf clusters.
-fn twig(length: f64, leaves: &[PartTemplate], random: &mut SplitMix64) -> PartTemplate {
+/// Grows a twig with its leaf clusters.
+fn grow_twig(length: f64, leaves: &[PartTemplate], random: &mut SplitMix64) -> PartTemplate {
     let growth = GrowthParameters {
         length,
         elements: 10,
@@ -150,44 +164,45 @@ fn twig(length: f64, leaves: &[PartTemplate], random: &mut SplitMix64) -> PartTe
         wander: 0.24,
     };
     let centerline = Centerline::grow(&growth, random);
-    let radii = tapering(&centerline, 0.0040 + 0.0055 * length, 0.0028);
-    let mut mold = wooden(PartKind::Branch, centerline, radii, [5, 4]);
-    mold.level = Some(2);
-    mold.damping = 0.09;
-    mold.add_skin(UvMapping::Bark { repeats: 1 }, |_, _| 1.0);
-    let count = (0.6 + length / 0.33).round() as usize;
-    let along: Vec<f64> = (0..=count).map(|number| 0.24 + 0.76 * number as f64 / count as f64).collect();
-    hang_leaves(&mut mold, &along, leaves, &growth.up, random);
-    mold
+    let radii = tapered_radii(&centerline, 0.0040 + 0.0055 * length, 0.0028);
+    let mut template = wooden_part(PartKind::Branch, centerline, radii, [5, 4]);
+    template.level = Some(2);
+    template.damping = 0.09;
+    template.add_skin(UvMapping::Bark { repeats: 1 }, |_, _| 1.0);
+    let interval_count = (0.6 + length / 0.33).round() as usize;
+    let fractions: Vec<f64> =
+        (0..=interval_count).map(|index| 0.24 + 0.76 * index as f64 / interval_count as f64).collect();
+    attach_leaf_clusters(&mut template, &fractions, leaves, &growth.up, random);
+    template
 }
 
-/// Attaches leaf clusters at fractions of the length. A cluster at the very end continues the branch.
-fn hang_leaves(
-    mold: &mut PartTemplate,
-    along: &[f64],
+/// Attaches leaf clusters at fractions of the length. A cluster at the tip continues the branch.
+fn attach_leaf_clusters(
+    template: &mut PartTemplate,
+    fractions: &[f64],
     leaves: &[PartTemplate],
     up: &Vector3<f64>,
     random: &mut SplitMix64,
 ) {
-    for (number, along) in along.iter().enumerate() {
-        let ring = mold.centerline.ring_at(*along);
-        let end = ring + 1 == mold.centerline.points.len();
-        let across = beside(&mold.centerline, ring, up, number, random);
-        let angle = if end { random.between(0.0, 0.2) } else { random.between(0.65, 1.05) };
-        let direction = mold.centerline.branch_direction(ring, angle, &across);
-        let child = (random.next_unit() * leaves.len() as f64) as usize;
-        mold.attach_child(ChildJoint { ring, direction, mold: child }, leaves[child].mass());
+    for (index, fraction) in fractions.iter().enumerate() {
+        let ring = template.centerline.ring_at(*fraction);
+        let is_tip = ring + 1 == template.centerline.points.len();
+        let side = side_direction(&template.centerline, ring, up, index, random);
+        let angle = if is_tip { random.uniform(0.0, 0.2) } else { random.uniform(0.65, 1.05) };
+        let direction = template.centerline.branch_direction(ring, angle, &side);
+        let template_index = (random.next_unit() * leaves.len() as f64) as usize;
+        template.attach_child(ChildJoint { ring, direction, template_index }, leaves[template_index].mass());
     }
 }
 
-fn wooden(kind: PartKind, centerline: Centerline, radii: Vec<f64>, [sides, rank]: [usize; 2]) -> PartTemplate {
+fn wooden_part(kind: PartKind, centerline: Centerline, radii: Vec<f64>, [sides, rank]: [usize; 2]) -> PartTemplate {
     PartTemplate {
         kind,
         level: Some(0),
         centerline,
         radii,
         sides,
-        sheet: SkinBuilder::default(),
+        skin: SkinBuilder::default(),
         elastic: WOOD,
         damping: 0.0,
         point_masses: vec![],
@@ -198,37 +213,37 @@ fn wooden(kind: PartKind, centerline: Centerline, radii: Vec<f64>, [sides, rank]
 }
 
 /// Radii from the base to the tip, with a branch collar at the base.
-fn tapering(centerline: &Centerline, base: f64, tip: f64) -> Vec<f64> {
+fn tapered_radii(centerline: &Centerline, base_radius: f64, tip_radius: f64) -> Vec<f64> {
     let radius = |ring: usize| {
-        let along = centerline.fraction(ring);
-        (tip + (base - tip) * (1.0 - along).powf(0.9))
-            * (1.0 + 0.45 * (-centerline.arc_lengths[ring] / (2.6 * base)).exp())
+        let fraction = centerline.fraction(ring);
+        (tip_radius + (base_radius - tip_radius) * (1.0 - fraction).powf(0.9))
+            * (1.0 + 0.45 * (-centerline.arc_lengths[ring] / (2.6 * base_radius)).exp())
     };
     (0..centerline.points.len()).map(radius).collect()
 }
 
-/// A unit vector perpendicular to the line, at `azimuth` around it.
-fn around(centerline: &Centerline, ring: usize, azimuth: f64) -> Vector3<f64> {
+/// A unit vector perpendicular to the centerline, at the angle `azimuth`.
+fn perpendicular_at(centerline: &Centerline, ring: usize, azimuth: f64) -> Vector3<f64> {
     Rotation3::from_axis_angle(&Unit::new_unchecked(centerline.tangents[ring]), azimuth) * centerline.sides[ring]
 }
 
-/// A unit vector perpendicular to the line, alternately left and right, more often tilted up than down.
-fn beside(
+/// A unit vector perpendicular to the centerline: alternately left and right, and more often tilted up than down.
+fn side_direction(
     centerline: &Centerline,
     ring: usize,
     up: &Vector3<f64>,
-    number: usize,
+    index: usize,
     random: &mut SplitMix64,
 ) -> Vector3<f64> {
-    let basis = frame(&centerline.tangents[ring], up);
-    let tilt = random.between(-0.6, 0.8);
-    let side = if number.is_multiple_of(2) { 1.0 } else { -1.0 };
+    let basis = part_orientation(&centerline.tangents[ring], up);
+    let tilt = random.uniform(-0.6, 0.8);
+    let side = if index.is_multiple_of(2) { 1.0 } else { -1.0 };
     basis * Vector3::new(side * tilt.cos(), 0.0, tilt.sin())
 }
 
-/// The twig template nearest to the wanted length, which is varied randomly by up to 7 %.
-fn nearest(wanted: f64, twigs: &std::ops::Range<usize>, random: &mut SplitMix64) -> usize {
-    let wanted = wanted * random.between(0.93, 1.07);
-    let gap = |twig: &usize| (TWIGS[twig - twigs.start] - wanted).abs();
-    twigs.clone().min_by(|a, b| gap(a).total_cmp(&gap(b))).unwrap_or(twigs.start)
+/// The index of the twig template with the nearest length. `length` is varied randomly by up to 7 %.
+fn choose_twig(length: f64, twig_range: &std::ops::Range<usize>, random: &mut SplitMix64) -> usize {
+    let length = length * random.uniform(0.93, 1.07);
+    let difference = |twig: &usize| (TWIG_LENGTHS[twig - twig_range.start] - length).abs();
+    twig_range.clone().min_by(|a, b| difference(a).total_cmp(&difference(b))).unwrap_or(twig_range.start)
 }

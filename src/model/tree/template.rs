@@ -1,5 +1,5 @@
-//! Templates of tree parts. A template has a centerline, radii, a skin, carried masses and joints, and is converted to
-//! a shape with modes. Parts that look alike are instances of one template.
+//! Templates of tree parts. A template has a centerline, radii, a skin, carried masses and joints. It is converted to a
+//! shape with modes. Several parts of a tree can be instances of one template.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,7 @@ use super::beam::Beam;
 use super::centerline::Centerline;
 use super::element::{ElasticConstants, Section};
 use super::skin::{SkinBuilder, Tube, UvMapping, station};
-use super::skin_modes::{Station, lift};
+use super::skin_modes::{Station, lift_to_skin};
 use crate::domain::{Metadata, Modes, Shape};
 use crate::error::Result;
 
@@ -29,10 +29,10 @@ pub(super) struct ChildJoint {
     /// Unit direction of the child in this part's frame.
     pub(super) direction: Vector3<f64>,
     /// Index of the child's template.
-    pub(super) mold: usize,
+    pub(super) template_index: usize,
 }
 
-/// A template: a part that can be placed any number of times.
+/// A template of a part.
 #[derive(Debug, Clone)]
 pub(super) struct PartTemplate {
     pub(super) kind: PartKind,
@@ -43,7 +43,7 @@ pub(super) struct PartTemplate {
     /// One radius per ring, meters.
     pub(super) radii: Vec<f64>,
     pub(super) sides: usize,
-    pub(super) sheet: SkinBuilder,
+    pub(super) skin: SkinBuilder,
     pub(super) elastic: ElasticConstants,
     /// Damping ratio (fraction of critical damping), for clients.
     pub(super) damping: f64,
@@ -58,46 +58,46 @@ pub(super) struct PartTemplate {
 
 impl PartTemplate {
     /// Attaches a part of `mass` kg at a ring.
-    pub(super) fn attach_child(&mut self, bud: ChildJoint, mass: f64) {
-        self.point_masses.push((station(&self.centerline, bud.ring), mass));
-        self.children.push(bud);
+    pub(super) fn attach_child(&mut self, child_joint: ChildJoint, mass: f64) {
+        self.point_masses.push((station(&self.centerline, child_joint.ring), mass));
+        self.children.push(child_joint);
     }
 
     /// Own and carried mass in kg.
     pub(super) fn mass(&self) -> f64 {
-        self.beam().own_mass() + self.carried_mass()
+        self.beam().wood_mass() + self.carried_mass()
     }
 
-    /// The vertices of a ring of the tube. The tube must be the first geometry of its sheet.
+    /// The vertices of a ring of the tube. The tube must be the first geometry of the skin.
     pub(super) fn ring_rows(&self, ring: usize) -> Vec<u32> {
         (ring * self.sides..(ring + 1) * self.sides).map(|row| row as u32).collect()
     }
 
     /// Adds a tube around the centerline.
-    pub(super) fn add_skin(&mut self, wrap: UvMapping, swell: impl Fn(f64, f64) -> f64) {
-        let tube = Tube { centerline: &self.centerline, radii: &self.radii, sides: self.sides, wrap };
-        self.sheet.add_tube(&tube, swell);
+    pub(super) fn add_skin(&mut self, uv_mapping: UvMapping, radius_factor: impl Fn(f64, f64) -> f64) {
+        let tube = Tube { centerline: &self.centerline, radii: &self.radii, sides: self.sides, uv_mapping };
+        self.skin.add_tube(&tube, radius_factor);
     }
 
     /// Converts to a shape with modes and metadata for clients.
     ///
     /// # Errors
     /// `Fault` if the beam's eigenproblem fails.
-    pub(super) fn cast(&self) -> Result<(Shape, Metadata)> {
+    pub(super) fn build_shape(&self) -> Result<(Shape, Metadata)> {
         let beam = self.beam();
         let mut metadata = Metadata { notes: self.notes(&beam), eigenvalues: vec![] };
         let mut modes = Modes::rigid();
         if self.rank > 0 {
-            let solved = beam.modes(self.rank)?;
-            modes = lift(&beam.nodes, &solved.mode_shapes, &self.sheet.rest, &self.sheet.stations)?;
-            metadata.eigenvalues = solved.eigenvalues;
+            let beam_modes = beam.solve_modes(self.rank)?;
+            modes = lift_to_skin(&beam.nodes, &beam_modes.mode_shapes, &self.skin.rest_positions, &self.skin.stations)?;
+            metadata.eigenvalues = beam_modes.eigenvalues;
         }
-        Ok((Shape::new(self.sheet.mesh()?, modes)?, metadata))
+        Ok((Shape::new(self.skin.build_mesh()?, modes)?, metadata))
     }
 
     pub(super) fn beam(&self) -> Beam {
-        let element = |first: usize| {
-            let cones = self.radii[first..=first + self.centerline.rings]
+        let section_of_element = |first_ring: usize| {
+            let cones = self.radii[first_ring..=first_ring + self.centerline.rings]
                 .windows(2)
                 .map(|ends| Section::of_cone(ends[0], ends[1]));
             let count = self.centerline.rings as f64;
@@ -106,7 +106,7 @@ impl PartTemplate {
                 moment: sum.moment + cone.moment / count,
             })
         };
-        let sections = (0..self.radii.len() - 1).step_by(self.centerline.rings).map(element).collect();
+        let sections = (0..self.radii.len() - 1).step_by(self.centerline.rings).map(section_of_element).collect();
         Beam {
             nodes: self.centerline.nodes(),
             sections,
@@ -128,7 +128,7 @@ impl PartTemplate {
         let mut notes = BTreeMap::from([
             ("kind".into(), kind.into()),
             ("length".into(), format!("{:.4}", self.centerline.length())),
-            ("mass".into(), format!("{:.5}", beam.own_mass())),
+            ("mass".into(), format!("{:.5}", beam.wood_mass())),
             ("carried_mass".into(), format!("{:.5}", self.carried_mass())),
             ("damping_ratio".into(), self.damping.to_string()),
             ("youngs_modulus".into(), self.elastic.youngs_modulus.to_string()),
@@ -152,61 +152,66 @@ mod tests {
     use super::super::beam::tests::eigen_residuals;
     use super::super::random::SplitMix64;
     use super::super::skin_modes::section_motion;
-    use super::super::species::plan;
+    use super::super::species::grow_templates;
     use super::*;
 
     #[test]
-    fn the_modes_of_every_part_solve_its_eigenproblem() {
-        for mold in plan(&mut SplitMix64::new(7)).iter().filter(|mold| mold.rank > 0) {
-            let beam = mold.beam();
-            let modes = beam.modes(mold.rank).expect("converges");
-            let (residual, skew) = eigen_residuals(&beam, &modes);
-            assert!(residual <= 1e-6, "level {:?}: residual {residual}", mold.level);
-            assert!(skew <= 1e-6, "level {:?}: departure from mass-orthonormality {skew}", mold.level);
+    fn modes_of_every_template_solve_its_eigenproblem() {
+        for template in grow_templates(&mut SplitMix64::new(7)).iter().filter(|template| template.rank > 0) {
+            let beam = template.beam();
+            let modes = beam.solve_modes(template.rank).expect("a converged solution");
+            let (residual, gram_error) = eigen_residuals(&beam, &modes);
+            assert!(residual <= 1e-6, "level {:?}: residual {residual}", template.level);
+            assert!(gram_error <= 1e-6, "level {:?}: Gram error {gram_error}", template.level);
         }
     }
 
     #[test]
-    fn the_base_rests_and_the_mean_of_a_ring_moves_as_its_section_does() {
-        for mold in plan(&mut SplitMix64::new(7)).iter().filter(|mold| mold.rank > 0) {
-            let (shape, _) = mold.cast().expect("solved");
-            let beam = mold.beam();
-            let solved = beam.modes(mold.rank).expect("converges");
-            let mean = |ring: usize, mode: usize| {
-                let rows = mold.ring_rows(ring);
+    fn mean_of_a_ring_moves_with_its_section() {
+        for template in grow_templates(&mut SplitMix64::new(7)).iter().filter(|template| template.rank > 0) {
+            let (shape, _) = template.build_shape().expect("a valid shape");
+            let beam = template.beam();
+            let beam_modes = beam.solve_modes(template.rank).expect("a converged solution");
+            let ring_mean = |ring: usize, mode: usize| {
+                let rows = template.ring_rows(ring);
                 let count = rows.len() as f64;
-                let row = |row: u32| Vector3::from_fn(|axis, _| f64::from(shape.modes.entry(row as usize, axis, mode)));
-                rows.into_iter().map(row).sum::<Vector3<f64>>() / count
+                let row_vector = |row_vector: u32| {
+                    Vector3::from_fn(|axis, _| f64::from(shape.modes.entry(row_vector as usize, axis, mode)))
+                };
+                rows.into_iter().map(row_vector).sum::<Vector3<f64>>() / count
             };
-            for mode in 0..mold.rank {
-                let base = mold.ring_rows(0);
-                let at_rest =
-                    |row: &u32| (0..3).all(|axis| shape.modes.entry(*row as usize, axis, mode).to_bits() == 0);
-                assert!(base.iter().all(at_rest), "the base moves");
-                let dofs: Vec<f64> = solved.mode_shapes.column(mode).iter().copied().collect();
-                let largest = solved.mode_shapes.column(mode).amax();
-                for ring in 1..mold.centerline.points.len() {
-                    let section = section_motion(&beam.nodes, &dofs, station(&mold.centerline, ring));
-                    let want = section.displacement_of(&mold.centerline.points[ring]);
-                    assert!((mean(ring, mode) - want).norm() <= 1e-6 * largest, "ring {ring}");
+            for mode in 0..template.rank {
+                let base_rows = template.ring_rows(0);
+                let is_zero = |row_vector: &u32| {
+                    (0..3).all(|axis| shape.modes.entry(*row_vector as usize, axis, mode).to_bits() == 0)
+                };
+                assert!(base_rows.iter().all(is_zero), "expected a clamped base");
+                let dofs: Vec<f64> = beam_modes.mode_shapes.column(mode).iter().copied().collect();
+                let max_entry = beam_modes.mode_shapes.column(mode).amax();
+                for ring in 1..template.centerline.points.len() {
+                    let section = section_motion(&beam.nodes, &dofs, station(&template.centerline, ring));
+                    let expected = section.displacement_of(&template.centerline.points[ring]);
+                    assert!((ring_mean(ring, mode) - expected).norm() <= 1e-6 * max_entry, "ring {ring}");
                 }
                 // Counterexample: neighboring rings move differently.
-                let last = mold.centerline.points.len() - 1;
-                assert!((mean(last, mode) - mean(last - 1, mode)).norm() > 1e-4 * largest);
+                let last_ring = template.centerline.points.len() - 1;
+                assert!((ring_mean(last_ring, mode) - ring_mean(last_ring - 1, mode)).norm() > 1e-4 * max_entry);
             }
         }
     }
 
     #[test]
-    fn all_bark_looks_outwards() {
-        for mold in plan(&mut SplitMix64::new(7)).iter().filter(|mold| mold.kind != PartKind::Leaf) {
-            let mesh = mold.sheet.mesh().expect("finite");
-            let last = mold.centerline.points.len() - 1;
+    fn bark_normals_point_outwards() {
+        for template in
+            grow_templates(&mut SplitMix64::new(7)).iter().filter(|template| template.kind != PartKind::Leaf)
+        {
+            let mesh = template.skin.build_mesh().expect("a valid mesh");
+            let last_ring = template.centerline.points.len() - 1;
             for (vertex, normal) in mesh.corners().vertices.iter().zip(&mesh.corners().normals) {
-                let place = Vector3::from(mesh.rest_positions()[*vertex as usize]).cast::<f64>();
-                let center = mold.centerline.points[(*vertex as usize / mold.sides).min(last)];
-                let outwards = (place - center).normalize().dot(&Vector3::from(*normal).cast());
-                assert!(outwards > 0.2, "level {:?}: {outwards}", mold.level);
+                let position = Vector3::from(mesh.rest_positions()[*vertex as usize]).cast::<f64>();
+                let center = template.centerline.points[(*vertex as usize / template.sides).min(last_ring)];
+                let outward_component = (position - center).normalize().dot(&Vector3::from(*normal).cast());
+                assert!(outward_component > 0.2, "level {:?}: {outward_component}", template.level);
                 assert!((Vector3::from(*normal).norm() - 1.0).abs() < 1e-5);
             }
             assert!(mesh.corners().uvs.as_flattened().iter().all(|number| number.is_finite()));
@@ -214,13 +219,14 @@ mod tests {
     }
 
     #[test]
-    fn masses_add_up_from_the_leaves_to_the_trunk() {
-        let molds = plan(&mut SplitMix64::new(7));
-        for mold in molds.iter().filter(|mold| mold.kind != PartKind::Leaf) {
-            let children: f64 = mold.children.iter().map(|bud| molds[bud.mold].mass()).sum();
-            assert!((mold.mass() - mold.beam().own_mass() - children).abs() <= 1e-9 * mold.mass());
+    fn carried_mass_is_the_sum_of_the_child_masses() {
+        let templates = grow_templates(&mut SplitMix64::new(7));
+        for template in templates.iter().filter(|template| template.kind != PartKind::Leaf) {
+            let child_mass: f64 =
+                template.children.iter().map(|child_joint| templates[child_joint.template_index].mass()).sum();
+            assert!((template.mass() - template.beam().wood_mass() - child_mass).abs() <= 1e-9 * template.mass());
         }
-        let whole = molds.last().expect("a trunk").mass();
-        assert!((80.0..400.0).contains(&whole), "the tree weighs {whole} kg");
+        let tree_mass = templates.last().expect("a trunk").mass();
+        assert!((80.0..400.0).contains(&tree_mass), "expected 80 to 400 kg, got {tree_mass}");
     }
 }
