@@ -365,12 +365,12 @@ impl DeformReport {
     /// files.
     pub fn write(&self, folder: &Path) -> Result<()> {
         std::fs::create_dir_all(folder).map_err(fault_in("report"))?;
-        let svg = plot::svg(self);
+        let svg = plot::draw_svg(self);
         let files = [
             ("report.json", serde_json::to_vec_pretty(self).map_err(fault_in("report"))?),
             ("report.csv", table::csv(&self.rows)?),
             ("report.md", markdown::markdown(self).into_bytes()),
-            ("report.png", plot::png(&svg)?),
+            ("report.png", plot::render_png(&svg)?),
             ("report.svg", svg.into_bytes()),
         ];
         for (name, bytes) in files {

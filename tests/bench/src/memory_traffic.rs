@@ -75,11 +75,11 @@ mod tests {
 
     #[test]
     fn bytes_of_load_a_match_the_formulas() {
-        let scene = WorkloadKind::OneDomain { dressed: true }.build(Size::Quick).expect("built").scene;
+        let scene = WorkloadKind::OneDomain { has_normal_map: true }.build(Size::Quick).expect("built").scene;
         let (n, r) = (30_000, 32);
         let want = 4 * 3 * n * r + 12 * n + 4 * r + 48 + 12 * n + 2 * 12 * n + 2 * 16 * n;
         assert_eq!(total(&of_scene(&scene)), want);
-        let bare = WorkloadKind::OneDomain { dressed: false }.build(Size::Quick).expect("built").scene;
+        let bare = WorkloadKind::OneDomain { has_normal_map: false }.build(Size::Quick).expect("built").scene;
         assert_eq!(total(&of_scene(&bare)), 4 * 3 * n * r + 24 * n + 4 * r + 48 + 2 * 12 * 3);
         let stored = |storage| {
             let scene = with_deformation(&bare, DeformationSettings { storage, ..DeformationSettings::default() })

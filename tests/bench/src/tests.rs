@@ -117,7 +117,7 @@ fn variant_that_cannot_be_created_fails_report() {
         deform(&request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &BrokenTarget, |_| Ok(()))
             .expect("expected a report");
     assert_eq!(report.failed, ["c: lost: kernel: expected one that compiles, got none"]);
-    assert!(plot::png(&plot::svg(&report)).is_ok(), "an empty plot is still a plot");
+    assert!(plot::render_png(&plot::draw_svg(&report)).is_ok(), "an empty plot is still a plot");
 }
 
 #[test]

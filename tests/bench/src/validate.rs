@@ -412,7 +412,7 @@ mod tests {
 
     #[test]
     fn cpu_passes_all_loads_and_fills_all_results() {
-        let (found, condition) = validate_cpu(WorkloadKind::OneDomain { dressed: true }, 0.0);
+        let (found, condition) = validate_cpu(WorkloadKind::OneDomain { has_normal_map: true }, 0.0);
         assert!(found.passed() && found.repeatable, "{:?}", found.faults);
         assert_eq!(found.errors.states, 4 + 24);
         assert!(found.errors.meters.largest > 0.0 && found.errors.of_diagonal.largest < 1e-6, "{found:?}");

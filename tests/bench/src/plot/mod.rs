@@ -1,4 +1,4 @@
-//! Plots error against time: one log-log panel per load, with the Pareto front marked.
+//! Plots error against time: one log-log panel per workload, with the Pareto front marked.
 //!
 //! The SVG is generated here. The PNG is rendered from it with an embedded font, so that both are independent of the
 //! machine.
@@ -18,77 +18,84 @@ use panel::{MarkerStyle, Panel, Point};
 
 /// Pixels of the PNG per unit of the SVG.
 const SCALE: f32 = 2.0;
-/// Size of a panel, and the outer margin.
-pub(super) const PANEL: (f64, f64) = (440.0, 320.0);
+/// Width and height of a panel.
+pub(super) const PANEL_SIZE: (f64, f64) = (440.0, 320.0);
+/// Outer margin of the plot.
 pub(super) const MARGIN: f64 = 24.0;
-/// Height of title, subtitle and the explanation of the marks.
-pub(super) const HEAD: f64 = 94.0;
+/// Height of the title, the subtitle and the explanation of the markers.
+pub(super) const HEADER_HEIGHT: f64 = 94.0;
 /// Height of a line of the legend.
-pub(super) const LEGEND: f64 = 22.0;
+pub(super) const LEGEND_LINE_HEIGHT: f64 = 22.0;
 
-/// Colors that color-blind readers can distinguish, followed by a few more (Okabe and Ito; Tableau).
+/// Eight colors that color-blind readers can distinguish (Okabe and Ito; Tableau), and four more.
 pub(super) const COLORS: [&str; 12] = [
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6a3d9a", "#8c564b", "#7f7f7f", "#a6a800",
     "#17becf", "#b2182b",
 ];
 
 /// Draws the plot as SVG.
-pub fn svg(report: &DeformReport) -> String {
-    let names = names(&report.rows);
-    let loads: Vec<&str> = report.loads.iter().map(|load| load.name.as_str()).collect();
-    let columns = match loads.len() {
-        0..=3 => loads.len().max(1),
+pub fn draw_svg(report: &DeformReport) -> String {
+    let variants = list_variants(&report.rows);
+    let workloads: Vec<&str> = report.loads.iter().map(|load| load.name.as_str()).collect();
+    let columns = match workloads.len() {
+        0..=3 => workloads.len().max(1),
         4 => 2,
         5..=12 => 3,
         _ => 4,
     };
-    let width = 2.0 * MARGIN + columns as f64 * PANEL.0;
-    let (legend, lines) = legend(&names, width);
-    let top = MARGIN + HEAD + lines as f64 * LEGEND;
-    let height = top + loads.len().div_ceil(columns) as f64 * PANEL.1 + MARGIN;
-    let mut out = format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
-         viewBox=\"0 0 {width} {height}\" font-family=\"'DejaVu Sans', Verdana, sans-serif\">\n\
-         <rect width=\"{width}\" height=\"{height}\" fill=\"#ffffff\"/>\n"
-    );
-    text(
-        &mut out,
+    let width = 2.0 * MARGIN + columns as f64 * PANEL_SIZE.0;
+    let (legend, lines) = draw_legend(variants.iter().map(|(name, _)| (*name, marker_style(&variants, name))), width);
+    let panels_top = MARGIN + HEADER_HEIGHT + lines as f64 * LEGEND_LINE_HEIGHT;
+    let height = panels_top + workloads.len().div_ceil(columns) as f64 * PANEL_SIZE.1 + MARGIN;
+    let mut svg = begin_svg(width, height);
+    write_text(
+        &mut svg,
         (MARGIN + 8.0, MARGIN + 18.0),
         "font-size=\"20\" font-weight=\"bold\" fill=\"#222222\"",
         "Error against run time",
     );
-    text(&mut out, (MARGIN + 8.0, MARGIN + 40.0), "font-size=\"12\" fill=\"#555555\"", &report.provenance.line());
-    let marks = [
-        "filled: warm, hollow: cold; ringed: Pareto front (partial work aside)",
+    let text_style = "font-size=\"12\" fill=\"#555555\"";
+    write_text(&mut svg, (MARGIN + 8.0, MARGIN + 40.0), text_style, &report.provenance.line());
+    let explanations = [
+        "filled: warm, hollow: cold; ringed: Pareto front (without variants that compute only a part)",
         "circle: CPU, square and triangle: CUDA, diamond: reference",
     ];
-    for (line, mark) in marks.into_iter().enumerate() {
-        let at = (MARGIN + 8.0, MARGIN + 57.0 + 15.0 * line as f64);
-        text(&mut out, at, "font-size=\"12\" fill=\"#555555\"", mark);
+    for (line, explanation) in explanations.into_iter().enumerate() {
+        write_text(&mut svg, (MARGIN + 8.0, MARGIN + 57.0 + 15.0 * line as f64), text_style, explanation);
     }
-    out.push_str(&legend);
-    for (index, load) in loads.iter().enumerate() {
-        let corner = (MARGIN + (index % columns) as f64 * PANEL.0, top + (index / columns) as f64 * PANEL.1);
-        let points = report.rows.iter().filter(|row| row.load == *load).filter_map(point).collect();
-        let words = ["median time of a step", "largest error / diagonal"];
-        Panel::new(corner, load, words, points).draw(&mut out, |name| look(&names, name));
+    svg.push_str(&legend);
+    let axis_labels = ["median time of a step", "largest error / diagonal"];
+    for (index, workload) in workloads.iter().enumerate() {
+        let corner =
+            (MARGIN + (index % columns) as f64 * PANEL_SIZE.0, panels_top + (index / columns) as f64 * PANEL_SIZE.1);
+        let points = report.rows.iter().filter(|row| row.load == *workload).filter_map(row_point).collect();
+        Panel::new(corner, workload, axis_labels, points).draw(&mut svg, |name| marker_style(&variants, name));
     }
-    out.push_str("</svg>\n");
-    out
+    svg.push_str("</svg>\n");
+    svg
+}
+
+/// The opening tag and the white background of an SVG.
+pub(super) fn begin_svg(width: f64, height: f64) -> String {
+    format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
+         viewBox=\"0 0 {width} {height}\" font-family=\"'DejaVu Sans', Verdana, sans-serif\">\n\
+         <rect width=\"{width}\" height=\"{height}\" fill=\"#ffffff\"/>\n"
+    )
 }
 
 /// Renders an SVG as PNG.
 ///
 /// # Errors
 /// `Fault` when the SVG is invalid, or too large for memory.
-pub fn png(svg: &str) -> Result<Vec<u8>> {
+pub fn render_png(svg: &str) -> Result<Vec<u8>> {
     let mut options = resvg::usvg::Options::default();
     let fonts = options.fontdb_mut();
     fonts.load_font_data(dejavu::sans::regular().to_vec());
     fonts.load_font_data(dejavu::sans::bold().to_vec());
     let tree = resvg::usvg::Tree::from_str(svg, &options).map_err(fault_in("plot"))?;
     let [width, height] = [tree.size().width(), tree.size().height()].map(|side| (side * SCALE).ceil() as u32);
-    let too_large = || fault_in("plot")(format!("{width} x {height} pixels are too many"));
+    let too_large = || fault_in("plot")(format!("{width} x {height} pixels exceed the available memory"));
     let mut pixels = resvg::tiny_skia::Pixmap::new(width, height).ok_or_else(too_large)?;
     resvg::render(&tree, resvg::tiny_skia::Transform::from_scale(SCALE, SCALE), &mut pixels.as_mut());
     // The background is opaque, so premultiplied colors equal straight ones.
@@ -101,50 +108,55 @@ pub fn png(svg: &str) -> Result<Vec<u8>> {
     Ok(bytes.into_inner())
 }
 
-/// Warm rows are filled. Variants that compute only a part of a step are excluded from the Pareto front.
-fn point(row: &DeformRow) -> Option<Point<'_>> {
-    let warm = row.cache == CacheState::Warm;
-    Some(Point { name: &row.name, at: row.point()?, filled: warm, rival: warm && !is_partial(&row.name) })
+/// The point of a row. Warm rows are filled. Variants that compute only a part of a step are excluded from the Pareto
+/// front.
+fn row_point(row: &DeformRow) -> Option<Point<'_>> {
+    let is_filled = row.cache == CacheState::Warm;
+    let (time_us, error) = row.point()?;
+    Some(Point { name: &row.name, time_us, error, is_filled, is_candidate: is_filled && !is_partial(&row.name) })
 }
 
 /// Each variant once with its backend, in the order of the rows.
-fn names(rows: &[DeformRow]) -> Vec<(&str, Backend)> {
-    let mut names: Vec<(&str, Backend)> = Vec::new();
+fn list_variants(rows: &[DeformRow]) -> Vec<(&str, Backend)> {
+    let mut variants: Vec<(&str, Backend)> = Vec::new();
     for row in rows {
-        if !names.iter().any(|(name, _)| *name == row.name) {
-            names.push((&row.name, row.backend));
+        if !variants.iter().any(|(name, _)| *name == row.name) {
+            variants.push((&row.name, row.backend));
         }
     }
-    names
+    variants
 }
 
-fn look(names: &[(&str, Backend)], name: &str) -> MarkerStyle {
-    let index = names.iter().position(|(own, _)| *own == name).unwrap_or(0);
-    let backend = names.get(index).map_or(Backend::Cpu, |(_, backend)| *backend);
-    MarkerStyle { color: COLORS[index % COLORS.len()], backend, round: index / COLORS.len() }
+fn marker_style(variants: &[(&str, Backend)], name: &str) -> MarkerStyle {
+    let index = variants.iter().position(|(variant, _)| *variant == name).unwrap_or(0);
+    let backend = variants.get(index).map_or(Backend::Cpu, |(_, backend)| *backend);
+    MarkerStyle { color: COLORS[index % COLORS.len()], backend, color_reuse: index / COLORS.len() }
 }
 
-/// The legend's SVG and its number of lines.
-fn legend(names: &[(&str, Backend)], width: f64) -> (String, usize) {
-    let (mut out, mut x, mut line) = (String::new(), MARGIN + 8.0, 0);
-    for (name, _) in names {
-        let look = look(names, name);
-        let wide = 30.0 + panel::width_of(name, 13.0);
-        if x + wide > width - MARGIN && x > MARGIN + 8.0 {
+/// Draws the legend of a plot of this width. Returns its SVG and its number of lines.
+pub(super) fn draw_legend<'a>(
+    entries: impl Iterator<Item = (&'a str, MarkerStyle)>,
+    plot_width: f64,
+) -> (String, usize) {
+    let (mut svg, mut x, mut line) = (String::new(), MARGIN + 8.0, 0);
+    for (name, style) in entries {
+        let entry_width = 30.0 + panel::text_width(name, 13.0);
+        if x + entry_width > plot_width - MARGIN && x > MARGIN + 8.0 {
             (x, line) = (MARGIN + 8.0, line + 1);
         }
-        let y = MARGIN + HEAD + line as f64 * LEGEND;
-        panel::mark(&mut out, (x + 6.0, y - 4.0), look, &panel::filled(look.color));
-        text(&mut out, (x + 17.0, y), "font-size=\"13\" fill=\"#222222\"", name);
-        x += wide + 10.0;
+        let y = MARGIN + HEADER_HEIGHT + line as f64 * LEGEND_LINE_HEIGHT;
+        panel::draw_marker(&mut svg, (x + 6.0, y - 4.0), style, &panel::filled_attributes(style.color));
+        write_text(&mut svg, (x + 17.0, y), "font-size=\"13\" fill=\"#222222\"", name);
+        x += entry_width + 10.0;
     }
-    (out, line + 1)
+    (svg, line + 1)
 }
 
-pub(super) fn text(out: &mut String, (x, y): (f64, f64), style: &str, words: &str) {
-    let words = words.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
+/// Writes escaped text whose baseline starts at (x, y). `style` is a list of SVG attributes.
+pub(super) fn write_text(svg: &mut String, (x, y): (f64, f64), style: &str, text: &str) {
+    let text = text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
     // Writing into a string cannot fail.
-    let _ = writeln!(out, "<text x=\"{x:.1}\" y=\"{y:.1}\" {style}>{words}</text>");
+    let _ = writeln!(svg, "<text x=\"{x:.1}\" y=\"{y:.1}\" {style}>{text}</text>");
 }
 
 #[cfg(test)]
@@ -154,40 +166,37 @@ mod tests {
 
     #[test]
     fn escapes_text_and_renders_with_the_embedded_font() {
-        let mut out = String::from(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"80\" height=\"20\" font-family=\"DejaVu Sans\">",
-        );
-        out.push_str("<rect width=\"80\" height=\"20\" fill=\"#ffffff\"/>");
-        let blank = png(&format!("{out}</svg>")).expect("a PNG");
-        text(&mut out, (4.0, 14.0), "font-size=\"12\"", "a < b & c");
-        out.push_str("</svg>");
-        assert!(out.contains("a &lt; b &amp; c"));
-        let dark = |bytes: &[u8]| {
+        let mut svg = begin_svg(80.0, 20.0);
+        let blank = render_png(&format!("{svg}</svg>")).expect("a PNG");
+        write_text(&mut svg, (4.0, 14.0), "font-size=\"12\"", "a < b & c");
+        svg.push_str("</svg>");
+        assert!(svg.contains("a &lt; b &amp; c"));
+        let count_dark_pixels = |bytes: &[u8]| {
             let image = image::load_from_memory(bytes).expect("a PNG").to_luma8();
             image.pixels().filter(|pixel| pixel.0[0] < 100).count()
         };
-        assert_eq!(dark(&blank), 0);
-        assert!(dark(&png(&out).expect("a PNG")) > 50, "letters are drawn");
-        assert!(png("no svg").is_err());
+        assert_eq!(count_dark_pixels(&blank), 0);
+        assert!(count_dark_pixels(&render_png(&svg).expect("a PNG")) > 50, "expected dark pixels of the letters");
+        assert!(render_png("no svg").is_err());
     }
 
     #[test]
-    fn variant_has_the_same_color_in_every_panel() {
+    fn variants_have_one_style_in_every_panel() {
         let rows = [
             row("a", "x", CacheState::Warm, (1.0, 1.0)),
             row("b", "y", CacheState::Warm, (1.0, 1.0)),
             row("b", "x", CacheState::Cold, (1.0, 1.0)),
         ];
-        let names = names(&rows);
-        assert_eq!(names, [("x", Backend::Cpu), ("y", Backend::Cpu)]);
-        assert_ne!(look(&names, "x").color, look(&names, "y").color);
+        let variants = list_variants(&rows);
+        assert_eq!(variants, [("x", Backend::Cpu), ("y", Backend::Cpu)]);
+        assert_ne!(marker_style(&variants, "x").color, marker_style(&variants, "y").color);
     }
 
     #[test]
-    fn thirty_six_device_variants_have_distinct_marks() {
+    fn thirty_six_cuda_variants_have_distinct_markers() {
         let names: Vec<String> = (0..36).map(|index| index.to_string()).collect();
-        let list: Vec<(&str, Backend)> = names.iter().map(|name| (name.as_str(), Backend::Cuda)).collect();
-        let looks: Vec<MarkerStyle> = names.iter().map(|name| look(&list, name)).collect();
-        assert!((0..36).all(|one| (0..one).all(|other| looks[one] != looks[other])));
+        let variants: Vec<(&str, Backend)> = names.iter().map(|name| (name.as_str(), Backend::Cuda)).collect();
+        let styles: Vec<MarkerStyle> = names.iter().map(|name| marker_style(&variants, name)).collect();
+        assert!((0..36).all(|first| (0..first).all(|second| styles[first] != styles[second])));
     }
 }

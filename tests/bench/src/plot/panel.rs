@@ -3,215 +3,265 @@
 use std::fmt::Write as _;
 
 use super::axis::{self, Axis};
-use super::{PANEL, text};
+use super::{PANEL_SIZE, write_text};
 use crate::table::pareto;
 use modalcast_model::deform::Backend;
 
-/// Space for labels left, right, above and below the plotted area.
-const LEFT: f64 = 66.0;
-const RIGHT: f64 = 18.0;
-const ABOVE: f64 = 34.0;
-const BELOW: f64 = 52.0;
-/// Height of the letters of labels.
-const LETTERS: f64 = 11.0;
+/// Margins of the plotted area for axis labels and the title.
+const LEFT_MARGIN: f64 = 66.0;
+const RIGHT_MARGIN: f64 = 18.0;
+const TOP_MARGIN: f64 = 34.0;
+const BOTTOM_MARGIN: f64 = 52.0;
+/// Font size of point labels.
+const LABEL_SIZE: f64 = 11.0;
 
-/// x, y, width and height.
-type Area = (f64, f64, f64, f64);
+/// A rectangle in pixels, with y downwards.
+#[derive(Debug, Clone, Copy)]
+struct Rectangle {
+    x: f64,
+    y: f64,
+    width: f64,
+    height: f64,
+}
 
-/// A point of a panel.
+impl Rectangle {
+    fn overlaps(&self, other: &Self) -> bool {
+        self.x < other.x + other.width
+            && other.x < self.x + self.width
+            && self.y < other.y + other.height
+            && other.y < self.y + self.height
+    }
+
+    fn contains(&self, other: &Self) -> bool {
+        other.x >= self.x
+            && other.x + other.width <= self.x + self.width
+            && other.y >= self.y
+            && other.y + other.height <= self.y + self.height
+    }
+}
+
+/// One measurement in a panel.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Point<'a> {
     pub(crate) name: &'a str,
-    /// Median time in microseconds, and error.
-    pub(crate) at: (f64, f64),
-    /// Whether its mark is filled; filled marks are drawn on top.
-    pub(crate) filled: bool,
+    /// Median time, microseconds.
+    pub(crate) time_us: f64,
+    pub(crate) error: f64,
+    /// Whether its marker is filled; filled markers are drawn on top.
+    pub(crate) is_filled: bool,
     /// Whether it is a candidate for the Pareto front.
-    pub(crate) rival: bool,
+    pub(crate) is_candidate: bool,
 }
 
-/// A panel of one load.
+/// The panel of one workload.
 pub(crate) struct Panel<'a> {
+    /// Top left corner.
     corner: (f64, f64),
     title: &'a str,
     /// Labels of the x and y axes.
-    words: [&'a str; 2],
+    axis_labels: [&'a str; 2],
     points: Vec<Point<'a>>,
-    time: Axis,
-    error: Axis,
+    time_axis: Axis,
+    error_axis: Axis,
 }
 
 impl<'a> Panel<'a> {
-    pub(crate) fn new(corner: (f64, f64), title: &'a str, words: [&'a str; 2], points: Vec<Point<'a>>) -> Self {
-        let across = (corner.0 + LEFT, corner.0 + PANEL.0 - RIGHT);
-        let upwards = (corner.1 + PANEL.1 - BELOW, corner.1 + ABOVE);
-        let time = Axis::around(points.iter().map(|point| point.at.0), (1.0, 1e3), across);
-        let error = Axis::around(points.iter().map(|point| point.at.1), (1e-8, 1e-6), upwards);
-        Self { corner, title, words, points, time, error }
+    pub(crate) fn new(corner: (f64, f64), title: &'a str, axis_labels: [&'a str; 2], points: Vec<Point<'a>>) -> Self {
+        let x_range = (corner.0 + LEFT_MARGIN, corner.0 + PANEL_SIZE.0 - RIGHT_MARGIN);
+        // The smallest error is at the bottom.
+        let y_range = (corner.1 + PANEL_SIZE.1 - BOTTOM_MARGIN, corner.1 + TOP_MARGIN);
+        let time_axis = Axis::new(points.iter().map(|point| point.time_us), (1.0, 1e3), x_range);
+        let error_axis = Axis::new(points.iter().map(|point| point.error), (1e-8, 1e-6), y_range);
+        Self { corner, title, axis_labels, points, time_axis, error_axis }
     }
 
-    pub(crate) fn draw(&self, out: &mut String, look: impl Fn(&str) -> MarkerStyle) {
-        self.frame(out);
-        let places: Vec<(f64, f64)> = self.points.iter().map(|point| self.place(point.at.0, point.at.1)).collect();
-        let front = self.front();
-        let steps: Vec<String> =
-            front.iter().map(|index| format!("{:.1},{:.1}", places[*index].0, places[*index].1)).collect();
-        if steps.len() > 1 {
+    /// Appends the panel to an SVG. `marker_style` gives the style of a variant by its name.
+    pub(crate) fn draw(&self, svg: &mut String, marker_style: impl Fn(&str) -> MarkerStyle) {
+        self.draw_axes(svg);
+        let positions: Vec<(f64, f64)> = self
+            .points
+            .iter()
+            .map(|point| (self.time_axis.pixel(point.time_us), self.error_axis.pixel(point.error)))
+            .collect();
+        let front = self.pareto_front();
+        let vertices: Vec<String> =
+            front.iter().map(|index| format!("{:.1},{:.1}", positions[*index].0, positions[*index].1)).collect();
+        if vertices.len() > 1 {
+            // Writing into a string cannot fail.
             let _ = writeln!(
-                out,
+                svg,
                 "<polyline points=\"{}\" fill=\"none\" stroke=\"#999999\" stroke-width=\"1.5\" stroke-dasharray=\"5 3\"/>",
-                steps.join(" ")
+                vertices.join(" ")
             );
         }
         for index in &front {
-            let (x, y) = places[*index];
+            let (x, y) = positions[*index];
             let _ = writeln!(
-                out,
+                svg,
                 "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"9\" fill=\"none\" stroke=\"#444444\" stroke-width=\"1.2\"/>"
             );
         }
-        // Hollow marks first, so that none covers a filled one.
-        for full in [false, true] {
-            for (point, place) in self.points.iter().zip(&places).filter(|(point, _)| point.filled == full) {
-                let look = look(point.name);
-                let style = if full { filled(look.color) } else { hollow(look.color) };
-                mark(out, *place, look, &style);
+        // Hollow markers are drawn first, so that they do not cover filled ones.
+        for is_filled in [false, true] {
+            for (point, position) in
+                self.points.iter().zip(&positions).filter(|(point, _)| point.is_filled == is_filled)
+            {
+                let style = marker_style(point.name);
+                let attributes =
+                    if is_filled { filled_attributes(style.color) } else { hollow_attributes(style.color) };
+                draw_marker(svg, *position, style, &attributes);
             }
         }
-        self.labels(out, &places, &front, &look);
+        self.draw_point_labels(svg, &positions, &front, &marker_style);
         if self.points.is_empty() {
-            let middle = (self.corner.0 + PANEL.0 / 2.0, self.corner.1 + PANEL.1 / 2.0);
-            text(out, middle, "font-size=\"13\" fill=\"#b2182b\" text-anchor=\"middle\"", "nothing passed");
+            let center = (self.corner.0 + PANEL_SIZE.0 / 2.0, self.corner.1 + PANEL_SIZE.1 / 2.0);
+            write_text(svg, center, "font-size=\"13\" fill=\"#b2182b\" text-anchor=\"middle\"", "no variant passed");
         }
-    }
-
-    fn place(&self, us: f64, error: f64) -> (f64, f64) {
-        (self.time.place(us), self.error.place(error))
     }
 
     /// Indices of the points on the Pareto front of the candidates.
-    fn front(&self) -> Vec<usize> {
-        let rivals: Vec<usize> = (0..self.points.len()).filter(|at| self.points[*at].rival).collect();
-        let points: Vec<(f64, f64)> = rivals.iter().map(|at| self.points[*at].at).collect();
-        pareto(&points).into_iter().map(|at| rivals[at]).collect()
+    fn pareto_front(&self) -> Vec<usize> {
+        let candidates: Vec<usize> = (0..self.points.len()).filter(|index| self.points[*index].is_candidate).collect();
+        let points: Vec<(f64, f64)> =
+            candidates.iter().map(|index| (self.points[*index].time_us, self.points[*index].error)).collect();
+        pareto(&points).into_iter().map(|index| candidates[index]).collect()
     }
 
-    fn frame(&self, out: &mut String) {
-        let (left, right) = (self.corner.0 + LEFT, self.corner.0 + PANEL.0 - RIGHT);
-        let (top, bottom) = (self.corner.1 + ABOVE, self.corner.1 + PANEL.1 - BELOW);
+    /// The plotted area within the margins.
+    fn plot_area(&self) -> Rectangle {
+        Rectangle {
+            x: self.corner.0 + LEFT_MARGIN,
+            y: self.corner.1 + TOP_MARGIN,
+            width: PANEL_SIZE.0 - LEFT_MARGIN - RIGHT_MARGIN,
+            height: PANEL_SIZE.1 - TOP_MARGIN - BOTTOM_MARGIN,
+        }
+    }
+
+    /// Draws the frame, the grid, the title and the labels of the axes.
+    fn draw_axes(&self, svg: &mut String) {
+        let Rectangle { x: left, y: top, width, height } = self.plot_area();
+        let (right, bottom) = (left + width, top + height);
         let _ = writeln!(
-            out,
-            "<rect x=\"{left}\" y=\"{top}\" width=\"{}\" height=\"{}\" fill=\"#fafafa\" stroke=\"#888888\"/>",
-            right - left,
-            bottom - top
+            svg,
+            "<rect x=\"{left}\" y=\"{top}\" width=\"{width}\" height=\"{height}\" fill=\"#fafafa\" stroke=\"#888888\"/>"
         );
-        for tick in self.time.ticks() {
-            let x = self.time.place(tick);
+        for tick in self.time_axis.ticks() {
+            let x = self.time_axis.pixel(tick);
             let _ =
-                writeln!(out, "<line x1=\"{x:.1}\" y1=\"{top}\" x2=\"{x:.1}\" y2=\"{bottom}\" stroke=\"#e2e2e2\"/>");
-            text(
-                out,
+                writeln!(svg, "<line x1=\"{x:.1}\" y1=\"{top}\" x2=\"{x:.1}\" y2=\"{bottom}\" stroke=\"#e2e2e2\"/>");
+            write_text(
+                svg,
                 (x, bottom + 15.0),
                 "font-size=\"11\" fill=\"#444444\" text-anchor=\"middle\"",
-                &axis::time(tick),
+                &axis::format_time(tick),
             );
         }
-        for tick in self.error.ticks() {
-            let y = self.error.place(tick);
+        for tick in self.error_axis.ticks() {
+            let y = self.error_axis.pixel(tick);
             let _ =
-                writeln!(out, "<line x1=\"{left}\" y1=\"{y:.1}\" x2=\"{right}\" y2=\"{y:.1}\" stroke=\"#e2e2e2\"/>");
-            text(
-                out,
+                writeln!(svg, "<line x1=\"{left}\" y1=\"{y:.1}\" x2=\"{right}\" y2=\"{y:.1}\" stroke=\"#e2e2e2\"/>");
+            write_text(
+                svg,
                 (left - 6.0, y + 4.0),
                 "font-size=\"11\" fill=\"#444444\" text-anchor=\"end\"",
-                &axis::power(tick),
+                &axis::format_power(tick),
             );
         }
-        text(out, (left, top - 9.0), "font-size=\"14\" font-weight=\"bold\" fill=\"#222222\"", self.title);
-        let middle = (left + right) / 2.0;
-        let label = "font-size=\"11\" fill=\"#444444\" text-anchor=\"middle\"";
-        text(out, (middle, bottom + 33.0), label, self.words[0]);
+        write_text(svg, (left, top - 9.0), "font-size=\"14\" font-weight=\"bold\" fill=\"#222222\"", self.title);
+        let center = (left + right) / 2.0;
+        let label_style = "font-size=\"11\" fill=\"#444444\" text-anchor=\"middle\"";
+        write_text(svg, (center, bottom + 33.0), label_style, self.axis_labels[0]);
         let (x, y) = (self.corner.0 + 14.0, (top + bottom) / 2.0);
-        text(out, (x, y), &format!("{label} transform=\"rotate(-90 {x:.1} {y:.1})\""), self.words[1]);
+        let rotated_style = format!("{label_style} transform=\"rotate(-90 {x:.1} {y:.1})\"");
+        write_text(svg, (x, y), &rotated_style, self.axis_labels[1]);
     }
 
-    /// Labels the points of the front, and all filled points when there are few.
-    fn labels(&self, out: &mut String, places: &[(f64, f64)], front: &[usize], look: &impl Fn(&str) -> MarkerStyle) {
-        let mut taken: Vec<Area> = places.iter().map(|(x, y)| (x - 7.0, y - 7.0, 14.0, 14.0)).collect();
-        let few = self.points.len() <= 8;
-        let named = |at: &usize| front.contains(at) || (few && self.points[*at].filled);
-        for at in (0..self.points.len()).filter(named) {
-            let name = self.points[at].name;
-            // A label without free space is omitted; the legend names its point too.
-            if let Some(area) = self.room(places[at], width_of(name, LETTERS), &taken) {
-                let fill = look(name).color;
+    /// Labels the points of the front, and all filled points if the panel has few points.
+    fn draw_point_labels(
+        &self,
+        svg: &mut String,
+        positions: &[(f64, f64)],
+        front: &[usize],
+        marker_style: &impl Fn(&str) -> MarkerStyle,
+    ) {
+        let mut occupied: Vec<Rectangle> =
+            positions.iter().map(|(x, y)| Rectangle { x: x - 7.0, y: y - 7.0, width: 14.0, height: 14.0 }).collect();
+        let has_few_points = self.points.len() <= 8;
+        let has_label = |index: &usize| front.contains(index) || (has_few_points && self.points[*index].is_filled);
+        for index in (0..self.points.len()).filter(has_label) {
+            let name = self.points[index].name;
+            // A label without free space is omitted; the legend also names its point.
+            if let Some(area) = self.find_label_area(positions[index], text_width(name, LABEL_SIZE), &occupied) {
+                let color = marker_style(name).color;
                 let style = format!(
-                    "font-size=\"{LETTERS}\" fill=\"{fill}\" stroke=\"#fafafa\" stroke-width=\"3\" paint-order=\"stroke\""
+                    "font-size=\"{LABEL_SIZE}\" fill=\"{color}\" stroke=\"#fafafa\" stroke-width=\"3\" paint-order=\"stroke\""
                 );
-                text(out, (area.0, area.1 + LETTERS), &style, name);
-                taken.push(area);
+                write_text(svg, (area.x, area.y + LABEL_SIZE), &style, name);
+                occupied.push(area);
             }
         }
     }
 
-    /// Finds free space for a label of this width around a point.
-    fn room(&self, (x, y): (f64, f64), width: f64, taken: &[Area]) -> Option<Area> {
-        let height = LETTERS + 3.0;
-        let beside = [(x + 12.0, y - height / 2.0), (x - 12.0 - width, y - height / 2.0)];
-        let above = [14.0, 28.0, 42.0].into_iter().flat_map(|away| {
-            let rows = [y - away - height / 2.0 - 4.0, y + away - height / 2.0 + 4.0];
-            rows.into_iter().flat_map(move |row| [(x - width / 2.0, row), (x + 4.0, row), (x - 4.0 - width, row)])
+    /// Finds free space for a label of this width near a point: to its right or left, else above or below it.
+    fn find_label_area(&self, (x, y): (f64, f64), width: f64, occupied: &[Rectangle]) -> Option<Rectangle> {
+        let height = LABEL_SIZE + 3.0;
+        let side_corners = [(x + 12.0, y - height / 2.0), (x - 12.0 - width, y - height / 2.0)];
+        let vertical_corners = [14.0, 28.0, 42.0].into_iter().flat_map(|distance| {
+            let tops = [y - distance - height / 2.0 - 4.0, y + distance - height / 2.0 + 4.0];
+            tops.into_iter().flat_map(move |top| [(x - width / 2.0, top), (x + 4.0, top), (x - 4.0 - width, top)])
         });
-        let (left, right) = (self.corner.0 + LEFT + 2.0, self.corner.0 + PANEL.0 - RIGHT - 2.0);
-        let (top, bottom) = (self.corner.1 + ABOVE + 2.0, self.corner.1 + PANEL.1 - BELOW - 2.0);
-        let fits = |(x, y): &(f64, f64)| {
-            let inside = *x >= left && x + width <= right && *y >= top && y + height <= bottom;
-            inside && !taken.iter().any(|area| overlap(*area, (*x, *y, width, height)))
+        let plot_area = self.plot_area();
+        let label_bounds = Rectangle {
+            x: plot_area.x + 2.0,
+            y: plot_area.y + 2.0,
+            width: plot_area.width - 4.0,
+            height: plot_area.height - 4.0,
         };
-        beside.into_iter().chain(above).find(fits).map(|(x, y)| (x, y, width, height))
+        side_corners
+            .into_iter()
+            .chain(vertical_corners)
+            .map(|(x, y)| Rectangle { x, y, width, height })
+            .find(|label| label_bounds.contains(label) && !occupied.iter().any(|area| area.overlaps(label)))
     }
 }
 
-fn overlap(one: Area, other: Area) -> bool {
-    let apart = |a: f64, wide: f64, b: f64, broad: f64| a + wide <= b || b + broad <= a;
-    !apart(one.0, one.2, other.0, other.2) && !apart(one.1, one.3, other.1, other.3)
-}
-
 /// Approximate width of a text in `DejaVu Sans`.
-pub(crate) fn width_of(words: &str, size: f64) -> f64 {
-    0.61 * size * words.chars().count() as f64
+pub(crate) fn text_width(text: &str, font_size: f64) -> f64 {
+    0.61 * font_size * text.chars().count() as f64
 }
 
-pub(crate) fn filled(color: &str) -> String {
+/// SVG attributes of a filled marker.
+pub(crate) fn filled_attributes(color: &str) -> String {
     format!("fill=\"{color}\" stroke=\"#ffffff\" stroke-width=\"0.8\"")
 }
 
-fn hollow(color: &str) -> String {
+/// SVG attributes of a hollow marker.
+fn hollow_attributes(color: &str) -> String {
     format!("fill=\"#fafafa\" stroke=\"{color}\" stroke-width=\"1.8\"")
 }
 
-/// Color and shape of a mark, unique per variant of a report.
+/// Color and shape of a marker, unique per variant of a report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct MarkerStyle {
     pub(crate) color: &'static str,
     pub(crate) backend: Backend,
-    /// Number of times that all colors were used before.
-    pub(crate) round: usize,
+    /// Number of variants before this one that have the same color. CUDA markers have a different shape for each.
+    pub(crate) color_reuse: usize,
 }
 
-/// Draws the mark of a variant at a point.
-pub(crate) fn mark(out: &mut String, (x, y): (f64, f64), look: MarkerStyle, style: &str) {
-    let shape = match (look.backend, look.round % 3) {
-        (Backend::Cpu, _) => format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"5\" {style}/>"),
-        (Backend::Reference, _) => format!("<path d=\"M{x:.1} {:.1}l6 6l-6 6l-6 -6z\" {style}/>", y - 6.0),
+/// Draws the marker of a variant at a point.
+pub(crate) fn draw_marker(svg: &mut String, (x, y): (f64, f64), style: MarkerStyle, attributes: &str) {
+    let shape = match (style.backend, style.color_reuse % 3) {
+        (Backend::Cpu, _) => format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"5\" {attributes}/>"),
+        (Backend::Reference, _) => format!("<path d=\"M{x:.1} {:.1}l6 6l-6 6l-6 -6z\" {attributes}/>", y - 6.0),
         (Backend::Cuda, 0) => {
-            format!("<rect x=\"{:.1}\" y=\"{:.1}\" width=\"9\" height=\"9\" {style}/>", x - 4.5, y - 4.5)
+            format!("<rect x=\"{:.1}\" y=\"{:.1}\" width=\"9\" height=\"9\" {attributes}/>", x - 4.5, y - 4.5)
         }
-        (Backend::Cuda, 1) => format!("<path d=\"M{x:.1} {:.1}l6 10h-12z\" {style}/>", y - 6.0),
-        (Backend::Cuda, _) => format!("<path d=\"M{x:.1} {:.1}l6 -10h-12z\" {style}/>", y + 6.0),
+        (Backend::Cuda, 1) => format!("<path d=\"M{x:.1} {:.1}l6 10h-12z\" {attributes}/>", y - 6.0),
+        (Backend::Cuda, _) => format!("<path d=\"M{x:.1} {:.1}l6 -10h-12z\" {attributes}/>", y + 6.0),
     };
-    out.push_str(&shape);
-    out.push('\n');
+    svg.push_str(&shape);
+    svg.push('\n');
 }
 
 #[cfg(test)]
@@ -219,29 +269,31 @@ mod tests {
     use super::*;
 
     #[test]
-    fn front_contains_only_rivals_and_labels_do_not_overlap() {
-        let point = |name, filled, rival, at| Point { name, at, filled, rival };
+    fn front_has_only_candidates_and_labels_do_not_overlap() {
+        let point =
+            |name, is_filled, is_candidate, time_us, error| Point { name, time_us, error, is_filled, is_candidate };
         let points = vec![
-            point("cold and best", false, false, (0.1, 1e-9)),
-            point("first", true, true, (1.0, 1e-6)),
-            point("second", true, true, (1.05, 9e-7)),
-            point("beaten", true, true, (2.0, 1e-5)),
-            point("does less", true, false, (0.5, 1e-8)),
+            point("cold and best", false, false, 0.1, 1e-9),
+            point("first", true, true, 1.0, 1e-6),
+            point("second", true, true, 1.05, 9e-7),
+            point("dominated", true, true, 2.0, 1e-5),
+            point("partial", true, false, 0.5, 1e-8),
         ];
         let panel = Panel::new((0.0, 0.0), "a", ["time", "error"], points);
-        assert_eq!(panel.front(), [1, 2]);
-        let mut out = String::new();
-        panel.draw(&mut out, |_| MarkerStyle { color: "#0072b2", backend: Backend::Cpu, round: 0 });
-        for name in ["first", "second", "beaten"] {
-            assert!(out.contains(&format!(">{name}</text>")), "{name}");
+        assert_eq!(panel.pareto_front(), [1, 2]);
+        let mut svg = String::new();
+        panel.draw(&mut svg, |_| MarkerStyle { color: "#0072b2", backend: Backend::Cpu, color_reuse: 0 });
+        for name in ["first", "second", "dominated"] {
+            assert!(svg.contains(&format!(">{name}</text>")), "expected a label for '{name}'");
         }
-        assert!(!out.contains("cold and best"));
+        assert!(!svg.contains("cold and best"), "expected no label for a hollow point off the front");
     }
 
     #[test]
-    fn areas_overlap_only_if_both_axes_do() {
-        assert!(overlap((0.0, 0.0, 2.0, 2.0), (1.0, 1.0, 2.0, 2.0)));
-        assert!(!overlap((0.0, 0.0, 2.0, 2.0), (2.0, 0.0, 2.0, 2.0)));
-        assert!(!overlap((0.0, 0.0, 2.0, 2.0), (1.0, 3.0, 2.0, 2.0)));
+    fn rectangles_overlap_only_if_both_axes_do() {
+        let square = |x: f64, y: f64| Rectangle { x, y, width: 2.0, height: 2.0 };
+        assert!(square(0.0, 0.0).overlaps(&square(1.0, 1.0)));
+        assert!(!square(0.0, 0.0).overlaps(&square(2.0, 0.0)));
+        assert!(!square(0.0, 0.0).overlaps(&square(1.0, 3.0)));
     }
 }

@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use super::plants::PlantResult;
 use super::{RenderReport, RenderRow, markdown, plot};
-use crate::plot::png;
+use crate::plot::render_png;
 use crate::timing::Timing;
 use modalcast_model::error::{Result, fault_in};
 
@@ -79,14 +79,14 @@ impl RenderReport {
     pub fn write(&self, folder: &Path) -> Result<()> {
         let pictures = folder.join("pictures");
         std::fs::create_dir_all(&pictures).map_err(fault_in("report"))?;
-        let svg = plot::svg(self);
+        let svg = plot::draw_svg(self);
         let files = [
             ("report.json", serde_json::to_vec_pretty(self).map_err(fault_in("report"))?),
             ("report.csv", rows_csv(&self.rows)?),
             ("passes.csv", passes_csv(self)?),
             ("plants.csv", plants_csv(&self.plants)?),
             ("report.md", markdown::markdown(self).into_bytes()),
-            ("report.png", png(&svg)?),
+            ("report.png", render_png(&svg)?),
             ("report.svg", svg.into_bytes()),
         ];
         for (name, bytes) in files {

@@ -1,96 +1,76 @@
-//! Plots error against frame time in one panel per load, and marks the Pareto front.
-
-use std::fmt::Write as _;
+//! Plots error against frame time in one panel per workload, and marks the Pareto front.
 
 use super::{RenderReport, RenderRow};
-use crate::plot::panel::{MarkerStyle, Panel, Point, filled, mark, width_of};
-use crate::plot::{COLORS, HEAD, LEGEND, MARGIN, PANEL, text};
+use crate::plot::panel::{MarkerStyle, Panel, Point};
+use crate::plot::{COLORS, HEADER_HEIGHT, LEGEND_LINE_HEIGHT, MARGIN, PANEL_SIZE, begin_svg, draw_legend, write_text};
 use modalcast_model::deform::Backend;
 
 /// Panels per row.
 const COLUMNS: usize = 3;
 
 /// Draws the plot as SVG.
-pub(super) fn svg(report: &RenderReport) -> String {
-    let mut names: Vec<&str> = Vec::new();
+pub(super) fn draw_svg(report: &RenderReport) -> String {
+    let mut variants: Vec<&str> = Vec::new();
     for row in &report.rows {
-        if !names.contains(&row.name.as_str()) {
-            names.push(&row.name);
+        if !variants.contains(&row.name.as_str()) {
+            variants.push(&row.name);
         }
     }
     let columns = report.loads.len().clamp(1, COLUMNS);
-    let width = 2.0 * MARGIN + columns as f64 * PANEL.0;
-    let (legend, lines) = legend(&names, width);
-    let top = MARGIN + HEAD + lines as f64 * LEGEND;
-    let height = top + report.loads.len().div_ceil(columns) as f64 * PANEL.1 + MARGIN;
-    let mut out = format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
-         viewBox=\"0 0 {width} {height}\" font-family=\"'DejaVu Sans', Verdana, sans-serif\">\n\
-         <rect width=\"{width}\" height=\"{height}\" fill=\"#ffffff\"/>\n"
-    );
-    draw_head(&mut out, report);
-    out.push_str(&legend);
+    let width = 2.0 * MARGIN + columns as f64 * PANEL_SIZE.0;
+    let (legend, lines) = draw_legend(variants.iter().map(|name| (*name, marker_style(&variants, name))), width);
+    let panels_top = MARGIN + HEADER_HEIGHT + lines as f64 * LEGEND_LINE_HEIGHT;
+    let height = panels_top + report.loads.len().div_ceil(columns) as f64 * PANEL_SIZE.1 + MARGIN;
+    let mut svg = begin_svg(width, height);
+    draw_header(&mut svg, report);
+    svg.push_str(&legend);
     let axis_labels = ["median frame time without readback", "mean error of a pixel, of 255"];
-    for (index, load) in report.loads.iter().enumerate() {
-        let corner = (MARGIN + (index % columns) as f64 * PANEL.0, top + (index / columns) as f64 * PANEL.1);
-        let points = report.rows.iter().filter(|row| row.load == load.name).filter_map(row_point).collect();
-        Panel::new(corner, &load.name, axis_labels, points).draw(&mut out, |name| marker_style(&names, name));
+    for (index, workload) in report.loads.iter().enumerate() {
+        let corner =
+            (MARGIN + (index % columns) as f64 * PANEL_SIZE.0, panels_top + (index / columns) as f64 * PANEL_SIZE.1);
+        let points = report.rows.iter().filter(|row| row.load == workload.name).filter_map(row_point).collect();
+        Panel::new(corner, &workload.name, axis_labels, points).draw(&mut svg, |name| marker_style(&variants, name));
     }
-    out.push_str("</svg>\n");
-    out
+    svg.push_str("</svg>\n");
+    svg
 }
 
-fn draw_head(out: &mut String, report: &RenderReport) {
+fn draw_header(svg: &mut String, report: &RenderReport) {
     let title_style = "font-size=\"20\" font-weight=\"bold\" fill=\"#222222\"";
     let text_style = "font-size=\"12\" fill=\"#555555\"";
-    text(out, (MARGIN + 8.0, MARGIN + 18.0), title_style, "Rendering: error against run time");
+    write_text(svg, (MARGIN + 8.0, MARGIN + 18.0), title_style, "Rendering: error against run time");
     let size = format!("{} x {}", report.size.width, report.size.height);
     let lines = [
         report.provenance.line(),
         format!(
-            "{}, {size} pixels; error against hard shadow rays, {} samples a pixel",
+            "{}, {size} pixels; error against hard shadow rays, {} samples per pixel",
             report.renderer.renderer,
             min_samples(report)
         ),
         "ringed: Pareto front".into(),
     ];
-    for (line, words) in lines.iter().enumerate() {
-        text(out, (MARGIN + 8.0, MARGIN + 40.0 + 16.0 * line as f64), text_style, words);
+    for (index, line) in lines.iter().enumerate() {
+        write_text(svg, (MARGIN + 8.0, MARGIN + 40.0 + 16.0 * index as f64), text_style, line);
     }
 }
 
+/// Minimum number of samples per pixel of the references.
 fn min_samples(report: &RenderReport) -> usize {
-    report.loads.iter().map(|load| load.samples).min().unwrap_or(0)
+    report.loads.iter().map(|workload| workload.samples).min().unwrap_or(0)
 }
 
 fn row_point(row: &RenderRow) -> Option<Point<'_>> {
-    Some(Point { name: &row.name, at: (row.median_us()?, row.color.mean), filled: true, rival: true })
+    let (time_us, error) = (row.median_us()?, row.color.mean);
+    Some(Point { name: &row.name, time_us, error, is_filled: true, is_candidate: true })
 }
 
-fn marker_style(names: &[&str], name: &str) -> MarkerStyle {
-    let index = names.iter().position(|known| *known == name).unwrap_or(0);
-    // The CPU's marker is a circle, CUDA's markers are squares and triangles.
-    let (backend, round) = match index / COLORS.len() {
+/// Color and shape of a variant's marker: circles for the first colors, then squares and triangles. The backend only
+/// selects the shape here.
+fn marker_style(variants: &[&str], name: &str) -> MarkerStyle {
+    let index = variants.iter().position(|variant| *variant == name).unwrap_or(0);
+    let (backend, color_reuse) = match index / COLORS.len() {
         0 => (Backend::Cpu, 0),
-        round => (Backend::Cuda, round - 1),
+        reuse => (Backend::Cuda, reuse - 1),
     };
-    MarkerStyle { color: COLORS[index % COLORS.len()], backend, round }
-}
-
-/// The legend's SVG and its number of lines.
-fn legend(names: &[&str], width: f64) -> (String, usize) {
-    let (mut out, mut x, mut line) = (String::new(), MARGIN + 8.0, 0);
-    for name in names {
-        let entry_width = 30.0 + width_of(name, 13.0);
-        if x + entry_width > width - MARGIN && x > MARGIN + 8.0 {
-            (x, line) = (MARGIN + 8.0, line + 1);
-        }
-        let (y, style) = (MARGIN + HEAD + line as f64 * LEGEND, marker_style(names, name));
-        mark(&mut out, (x + 6.0, y - 4.0), style, &filled(style.color));
-        // Writing into a string cannot fail.
-        let _ = writeln!(out);
-        text(&mut out, (x + 17.0, y), "font-size=\"13\" fill=\"#222222\"", name);
-        x += entry_width + 10.0;
-    }
-    (out, line + 1)
+    MarkerStyle { color: COLORS[index % COLORS.len()], backend, color_reuse }
 }

@@ -1,19 +1,19 @@
-//! Synthetic scenes of known sizes, identical on every machine: seeded, and fast to build even with millions of
-//! vertices.
+//! Synthetic scenes of known sizes, the workloads of the deformation benchmark. They are seeded, so they are identical
+//! on every machine.
 //!
 //! | name | contents |
 //! |---|---|
 //! | `single-P-R` | one domain of 2^P vertices and R modes, positions only (table 4.4 of the thesis) |
 //! | `a`, `a-positions` | one domain of 1.5 M vertices, r = 32, with normals and tangents, or without |
-//! | `b` | 1,000 domains of 1,500 vertices, r mixed 0 to 64, about 17 on average |
+//! | `b` | 1,000 domains of 1,500 vertices, r random from 0 to 64, about 17 on average |
 //! | `c` | 200,000 domains of 7 vertices, 95 % of them rigid |
 //! | `cancel` | one domain of 2^16 vertices whose modes nearly cancel in pairs |
 //! | `batch` | 16 instances of one domain of 2^18 vertices, r = 32: sixteen q per U; compare `single-18-32` |
 //! | `plant-1` to `plant-12` | the plants of table 4.5 |
-//! | `plant-1-follows` to `plant-12-follows` | the same, leaves follow branches: T for branches alone |
+//! | `plant-1-follows` to `plant-12-follows` | the same plants; leaves follow branches, so only branches have a T |
 //!
-//! `single`, `plants` and `follows` name whole groups. `all` names everything except that of the last group it includes
-//! only the plant with the most domains.
+//! `single`, `plants` and `follows` select all workloads of a group. `all` selects all workloads, but of `follows` only the
+//! plant with the most domains.
 
 mod build;
 mod patch;
@@ -26,11 +26,11 @@ use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts};
 
-/// Size of a load.
+/// Size of a workload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Size {
     Full,
-    /// A fraction of the vertices or domains, for machines without a GPU; the load's remarks state it.
+    /// A fraction of the vertices or domains, for machines without a GPU. The workload's remarks state the fraction.
     Quick,
 }
 
@@ -42,17 +42,20 @@ pub enum WorkloadKind {
         power: u32,
         rank: usize,
     },
+    /// One large domain; with normals and tangents if it has a normal map.
     OneDomain {
-        dressed: bool,
+        has_normal_map: bool,
     },
     ManyDomains,
     TinyDomains,
+    /// One domain whose modes nearly cancel in pairs.
     Cancelling,
+    /// Instances of one shape.
     Batch,
     /// Index into the thesis's plants.
     Plant(usize),
     /// The same plant with leaves that follow its branches.
-    Follows(usize),
+    FollowingPlant(usize),
 }
 
 /// A scene to measure.
@@ -63,8 +66,8 @@ pub struct Workload {
     /// Batching in the CUDA deformer.
     pub batches: BatchPolicy,
     /// Whether modes 2k and 2k + 1 are nearly equal, so that opposite coordinates nearly cancel.
-    pub paired: bool,
-    /// Index of the thesis's plant, if it is one.
+    pub is_paired: bool,
+    /// Index into the thesis's plants, if the scene is one of them.
     pub species: Option<usize>,
     /// Deviations from the size that the name states.
     pub remarks: Vec<String>,
@@ -73,25 +76,25 @@ pub struct Workload {
 impl Workload {
     /// A workload with the default batching, without paired modes and remarks.
     pub fn new(name: String, scene: Arc<Scene>) -> Self {
-        Self { name, scene, batches: BatchPolicy::default(), paired: false, species: None, remarks: Vec::new() }
+        Self { name, scene, batches: BatchPolicy::default(), is_paired: false, species: None, remarks: Vec::new() }
     }
 }
 
 impl WorkloadKind {
-    /// Every load, in the order of the report.
+    /// Every workload, in the order of the report.
     pub fn all() -> Vec<Self> {
         let mut kinds = Self::singles();
         kinds.extend([
-            Self::OneDomain { dressed: false },
-            Self::OneDomain { dressed: true },
+            Self::OneDomain { has_normal_map: false },
+            Self::OneDomain { has_normal_map: true },
             Self::ManyDomains,
             Self::TinyDomains,
             Self::Cancelling,
             Self::Batch,
         ]);
         kinds.extend((0..PLANTS.len()).map(Self::Plant));
-        let largest = (0..PLANTS.len()).max_by_key(|index| PLANTS[*index].domains);
-        kinds.extend(largest.map(Self::Follows));
+        let largest_plant = (0..PLANTS.len()).max_by_key(|index| PLANTS[*index].domains);
+        kinds.extend(largest_plant.map(Self::FollowingPlant));
         kinds
     }
 
@@ -99,51 +102,52 @@ impl WorkloadKind {
         RANKS.iter().flat_map(|rank| POWERS.map(|power| Self::Single { power, rank: *rank })).collect()
     }
 
-    /// The loads that a name on the command line selects.
+    /// The workloads that a name on the command line selects.
     ///
     /// # Errors
-    /// `Invalid` when there is no such load.
+    /// `Invalid` when there is no such workload.
     pub fn parse(name: &str) -> Result<Vec<Self>> {
-        let number = |text: &str| text.parse::<usize>().ok();
-        let plant =
-            |index: &str| number(index).filter(|index| (1..=PLANTS.len()).contains(index)).map(|index| index - 1);
-        let found = match name.split('-').collect::<Vec<_>>()[..] {
+        let parse_number = |text: &str| text.parse::<usize>().ok();
+        let parse_plant = |number: &str| {
+            parse_number(number).filter(|number| (1..=PLANTS.len()).contains(number)).map(|number| number - 1)
+        };
+        let kinds = match name.split('-').collect::<Vec<_>>()[..] {
             ["all"] => Some(Self::all()),
             ["single"] => Some(Self::singles()),
             ["single", power, rank] => {
-                let power = number(power).filter(|power| (2..=22).contains(power));
-                let rank = number(rank).filter(|rank| (0..=modalcast_model::domain::MAX_RANK).contains(rank));
+                let power = parse_number(power).filter(|power| (2..=22).contains(power));
+                let rank = parse_number(rank).filter(|rank| (0..=modalcast_model::domain::MAX_RANK).contains(rank));
                 power.zip(rank).map(|(power, rank)| vec![Self::Single { power: power as u32, rank }])
             }
-            ["a"] => Some(vec![Self::OneDomain { dressed: true }]),
-            ["a", "positions"] => Some(vec![Self::OneDomain { dressed: false }]),
+            ["a"] => Some(vec![Self::OneDomain { has_normal_map: true }]),
+            ["a", "positions"] => Some(vec![Self::OneDomain { has_normal_map: false }]),
             ["b"] => Some(vec![Self::ManyDomains]),
             ["c"] => Some(vec![Self::TinyDomains]),
             ["cancel"] => Some(vec![Self::Cancelling]),
             ["batch"] => Some(vec![Self::Batch]),
             ["plants"] => Some((0..PLANTS.len()).map(Self::Plant).collect()),
-            ["follows"] => Some((0..PLANTS.len()).map(Self::Follows).collect()),
-            ["plant", index] => plant(index).map(|index| vec![Self::Plant(index)]),
-            ["plant", index, "follows"] => plant(index).map(|index| vec![Self::Follows(index)]),
+            ["follows"] => Some((0..PLANTS.len()).map(Self::FollowingPlant).collect()),
+            ["plant", number] => parse_plant(number).map(|index| vec![Self::Plant(index)]),
+            ["plant", number, "follows"] => parse_plant(number).map(|index| vec![Self::FollowingPlant(index)]),
             _ => None,
         };
         let expected = "single-P-R (2^P vertices, P 2 to 22, R modes), a, a-positions, b, c, cancel, batch, plant-1 to \
                         plant-12, each also with -follows, or one of the groups single, plants, follows, all";
-        found.ok_or_else(|| invalid("load", expected, name))
+        kinds.ok_or_else(|| invalid("load", expected, name))
     }
 
     /// The name that [`Self::parse`] takes.
     pub fn name(self) -> String {
         match self {
             Self::Single { power, rank } => format!("single-{power}-{rank}"),
-            Self::OneDomain { dressed: true } => "a".into(),
-            Self::OneDomain { dressed: false } => "a-positions".into(),
+            Self::OneDomain { has_normal_map: true } => "a".into(),
+            Self::OneDomain { has_normal_map: false } => "a-positions".into(),
             Self::ManyDomains => "b".into(),
             Self::TinyDomains => "c".into(),
             Self::Cancelling => "cancel".into(),
             Self::Batch => "batch".into(),
             Self::Plant(index) => format!("plant-{}", index + 1),
-            Self::Follows(index) => format!("plant-{}-follows", index + 1),
+            Self::FollowingPlant(index) => format!("plant-{}-follows", index + 1),
         }
     }
 
@@ -156,10 +160,10 @@ impl WorkloadKind {
     }
 }
 
-/// The scene with another deformation.
+/// The scene with other deformation settings.
 ///
 /// # Errors
-/// `Invalid` when the deformation's options contradict each other.
+/// `Invalid` when the settings contradict each other.
 pub fn with_deformation(scene: &Scene, deformation: DeformationSettings) -> Result<Arc<Scene>> {
     Scene::new(SceneParts { deformation, ..scene.parts() })
 }
@@ -170,14 +174,14 @@ mod tests {
     use modalcast_model::scene::StorageType;
 
     #[test]
-    fn finds_every_load_by_name_and_rejects_others() {
+    fn finds_every_workload_by_name_and_rejects_others() {
         for kind in WorkloadKind::all() {
             assert_eq!(WorkloadKind::parse(&kind.name()), Ok(vec![kind]));
         }
         assert_eq!(WorkloadKind::parse("plants").map(|list| list.len()), Ok(12));
         assert_eq!(WorkloadKind::parse("follows").map(|list| list.len()), Ok(12));
         assert_eq!(WorkloadKind::parse("single").map(|list| list.len()), Ok(15));
-        for wrong in [
+        for name in [
             "",
             "d",
             "plant-0",
@@ -191,27 +195,28 @@ mod tests {
             "plant-1-",
             "b-follows",
         ] {
-            assert!(WorkloadKind::parse(wrong).is_err(), "{wrong}");
+            assert!(WorkloadKind::parse(name).is_err(), "{name}");
         }
     }
 
     #[test]
-    fn building_a_load_is_deterministic() {
-        let [one, two] = [0, 1].map(|_| WorkloadKind::ManyDomains.build(Size::Quick).expect("built").scene);
-        assert_eq!(one.shapes[7].modes, two.shapes[7].modes);
-        assert_eq!(one.shapes[7].mesh, two.shapes[7].mesh);
-        assert_ne!(one.shapes[7].mesh, one.shapes[8].mesh);
+    fn building_a_workload_is_deterministic() {
+        let [first_scene, second_scene] =
+            [0, 1].map(|_| WorkloadKind::ManyDomains.build(Size::Quick).expect("a workload").scene);
+        assert_eq!(first_scene.shapes[7].modes, second_scene.shapes[7].modes);
+        assert_eq!(first_scene.shapes[7].mesh, second_scene.shapes[7].mesh);
+        assert_ne!(first_scene.shapes[7].mesh, first_scene.shapes[8].mesh);
     }
 
     #[test]
-    fn restates_a_scene_with_another_storage_type() {
-        let scene = WorkloadKind::OneDomain { dressed: true }.build(Size::Quick).expect("built").scene;
-        let other = with_deformation(
+    fn changes_only_deformation_settings_of_a_scene() {
+        let scene = WorkloadKind::OneDomain { has_normal_map: true }.build(Size::Quick).expect("a workload").scene;
+        let int8_scene = with_deformation(
             &scene,
             DeformationSettings { storage: StorageType::Int8, ..DeformationSettings::default() },
         )
-        .expect("fits");
-        assert_eq!((other.deformation.storage, &other.layout), (StorageType::Int8, &scene.layout));
+        .expect("a valid scene");
+        assert_eq!((int8_scene.deformation.storage, &int8_scene.layout), (StorageType::Int8, &scene.layout));
         assert!(
             with_deformation(&scene, DeformationSettings { truncation: Some(-1.0), ..DeformationSettings::default() })
                 .is_err()

@@ -1,4 +1,5 @@
-//! Rectangular patches of vertices with random modes, and scenes of them: what all synthetic loads consist of.
+//! Rectangular patches of vertices with random modes, and scenes that consist of them. All synthetic workloads are such
+//! scenes.
 
 use fastrand::Rng;
 use nalgebra::{Rotation3, Vector3};
@@ -10,8 +11,8 @@ use modalcast_model::domain::{
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Scene, SceneParts};
 
-/// Divisor of the vertices (of one domain) or of the domains (of many) in a quick run.
-pub(super) const QUICK: usize = 50;
+/// Divisor of sizes in a quick run: of the vertices of a workload with one domain, else of the domains.
+pub(super) const QUICK_DIVISOR: usize = 50;
 
 /// Parameters of one domain.
 #[derive(Debug, Clone, Copy)]
@@ -22,7 +23,7 @@ pub(super) struct PatchSpec {
     /// Render vertices; each refers to one of `vertices`.
     pub(super) corners: usize,
     pub(super) triangles: PatchTopology,
-    /// Edge length of the sheet, scene units.
+    /// Edge length of the patch, scene units.
     pub(super) size: f32,
     pub(super) seed: u64,
 }
@@ -30,108 +31,129 @@ pub(super) struct PatchSpec {
 /// Triangles of a patch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum PatchTopology {
-    /// The minimum of a mesh: one triangle with three corners.
+    /// One triangle with three corners, the minimum of a mesh.
     One,
-    /// Two per cell of the sheet; one corner per vertex.
+    /// Two triangles per grid cell; one corner per vertex.
     Cells,
-    /// A strip with this number of triangles, over all corners and again from the start.
+    /// A strip with this number of triangles. It starts again at the first corner when it reaches the last one.
     Strip(usize),
 }
 
-/// A seed for part `index` of the load with this name (FNV-1a, then fastrand's mixing).
-pub(super) fn seed_of(name: &str, index: usize) -> u64 {
-    let word = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3);
-    let hash = name.bytes().chain(index.to_le_bytes()).fold(0xCBF2_9CE4_8422_2325, word);
+/// A seed for part `index` of the workload with this name: an FNV-1a hash, mixed by fastrand.
+pub(super) fn part_seed(name: &str, index: usize) -> u64 {
+    let hash_byte = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3);
+    let hash = name.bytes().chain(index.to_le_bytes()).fold(0xCBF2_9CE4_8422_2325, hash_byte);
     Rng::with_seed(hash).u64(..)
 }
 
-/// The mesh and the modes of a patch.
-pub(super) fn shape(patch: &PatchSpec, paired: bool) -> Result<Shape> {
+/// Builds the mesh and the modes of a patch.
+pub(super) fn build_shape(patch: &PatchSpec, is_paired: bool) -> Result<Shape> {
     let mut rng = Rng::with_seed(patch.seed);
     let columns = (patch.vertices as f64).sqrt().ceil().max(1.0) as usize;
-    let step = patch.size / columns as f32;
-    let rest: Vec<[f32; 3]> = (0..patch.vertices)
-        .map(|at| {
-            let relief = 0.1 * patch.size * (rng.f32() - 0.5);
-            [(at % columns) as f32 * step, (at / columns) as f32 * step, relief]
+    let spacing = patch.size / columns as f32;
+    let positions: Vec<[f32; 3]> = (0..patch.vertices)
+        .map(|vertex| {
+            let height = 0.1 * patch.size * (rng.f32() - 0.5);
+            [(vertex % columns) as f32 * spacing, (vertex / columns) as f32 * spacing, height]
         })
         .collect();
     // Corners are distributed evenly over the vertices.
-    let row = |corner: usize| (corner * patch.vertices / patch.corners.max(1)).min(patch.vertices - 1) as u32;
-    let vertices: Vec<u32> = (0..patch.corners).map(row).collect();
-    let triangles = triangles(patch, columns);
+    let vertex_of_corner =
+        |corner: usize| (corner * patch.vertices / patch.corners.max(1)).min(patch.vertices - 1) as u32;
+    let vertices: Vec<u32> = (0..patch.corners).map(vertex_of_corner).collect();
+    let triangles = patch_triangles(patch, columns);
     let (normals, uvs) = match patch.triangles {
         PatchTopology::One => (vec![[0.0, 0.0, 1.0]; patch.corners], Vec::new()),
         _ => {
-            let uv = |vertex: &u32| [rest[*vertex as usize][0] / patch.size, rest[*vertex as usize][1] / patch.size];
-            (smooth_normals(&rest, &vertices, &triangles), vertices.iter().map(uv).collect())
+            let uv = |vertex: &u32| {
+                [positions[*vertex as usize][0] / patch.size, positions[*vertex as usize][1] / patch.size]
+            };
+            (smooth_normals(&positions, &vertices, &triangles), vertices.iter().map(uv).collect())
         }
     };
-    let mesh = Mesh::new(rest, Corners { vertices, normals, uvs }, triangles)?;
-    Shape::new(mesh, modes(patch, paired)?)
+    let mesh = Mesh::new(positions, Corners { vertices, normals, uvs }, triangles)?;
+    Shape::new(mesh, random_modes(patch, is_paired)?)
 }
 
-fn triangles(patch: &PatchSpec, columns: usize) -> Vec<[u32; 3]> {
-    let count = patch.corners as u32;
+/// Triangles as indices of corners. `columns`: vertices per row of the grid.
+fn patch_triangles(patch: &PatchSpec, columns: usize) -> Vec<[u32; 3]> {
+    let corners = patch.corners as u32;
     match patch.triangles {
-        PatchTopology::One => vec![[0, 1 % count, 2 % count]],
-        PatchTopology::Cells if patch.vertices < 3 || columns < 2 => vec![[0, 1 % count, 2 % count]],
+        PatchTopology::One => vec![[0, 1 % corners, 2 % corners]],
+        PatchTopology::Cells if patch.vertices < 3 || columns < 2 => vec![[0, 1 % corners, 2 % corners]],
         PatchTopology::Cells => {
             let width = columns as u32;
-            let cell = |at: u32| {
-                let inside = at % width != width - 1;
-                let lower = (inside && at + width < count).then_some([at, at + 1, at + width]);
-                let upper = (inside && at + width + 1 < count).then_some([at + 1, at + width + 1, at + width]);
-                lower.into_iter().chain(upper)
+            let cell_triangles = |corner: u32| {
+                let is_inside = corner % width != width - 1;
+                let lower_triangle =
+                    (is_inside && corner + width < corners).then_some([corner, corner + 1, corner + width]);
+                let upper_triangle = (is_inside && corner + width + 1 < corners).then_some([
+                    corner + 1,
+                    corner + width + 1,
+                    corner + width,
+                ]);
+                lower_triangle.into_iter().chain(upper_triangle)
             };
-            (0..count).flat_map(cell).collect()
+            (0..corners).flat_map(cell_triangles).collect()
         }
-        PatchTopology::Strip(wanted) => {
-            let wound = |at: u32| if at.is_multiple_of(2) { [at, at + 1, at + 2] } else { [at + 1, at, at + 2] };
-            (0..wanted as u32).map(|at| wound(at % count).map(|corner| corner % count)).collect()
+        PatchTopology::Strip(triangle_count) => {
+            let strip_triangle = |corner: u32| {
+                if corner.is_multiple_of(2) {
+                    [corner, corner + 1, corner + 2]
+                } else {
+                    [corner + 1, corner, corner + 2]
+                }
+            };
+            (0..triangle_count as u32)
+                .map(|corner| strip_triangle(corner % corners).map(|corner| corner % corners))
+                .collect()
         }
     }
 }
 
-/// Entries uniform in [-1, 1). With `paired`, each odd column equals its left neighbor up to a relative difference of
-/// at most 5e-5.
-fn modes(patch: &PatchSpec, paired: bool) -> Result<Modes> {
+/// Modes with entries uniform in [-1, 1). If `is_paired`, each odd column equals its left neighbor up to a relative
+/// difference of at most 5e-5.
+fn random_modes(patch: &PatchSpec, is_paired: bool) -> Result<Modes> {
     let rows = 3 * patch.vertices;
     if patch.rank == 0 {
         return Ok(Modes::rigid());
     }
     let mut entries = vec![0.0_f32; rows * patch.rank];
     entries.par_chunks_mut(rows).enumerate().for_each(|(column, entries)| {
-        let own = Rng::with_seed(patch.seed ^ (1 + column as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
-        let mut rng = own;
+        let mut rng = Rng::with_seed(patch.seed ^ (1 + column as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
         entries.iter_mut().for_each(|entry| *entry = 2.0 * rng.f32() - 1.0);
     });
-    if paired {
+    if is_paired {
         entries.par_chunks_mut(2 * rows).for_each(|pair| {
             let mut rng = Rng::with_seed(patch.seed);
             let (left, right) = pair.split_at_mut(rows);
-            let twin = |(right, left): (&mut f32, &f32)| *right = left * (1.0 + 1e-4 * (rng.f32() - 0.5));
-            right.iter_mut().zip(left.iter()).for_each(twin);
+            let copy_with_noise = |(right, left): (&mut f32, &f32)| *right = left * (1.0 + 1e-4 * (rng.f32() - 0.5));
+            right.iter_mut().zip(left.iter()).for_each(copy_with_noise);
         });
     }
     Modes::from_columns(rows, patch.rank, entries)
 }
 
-/// A scene of `count` domains that cycle through the shapes, each randomly rotated on a cubic lattice; with a normal
-/// map if `dressed`.
-pub(super) fn scene(name: String, shapes: Vec<Shape>, count: usize, dressed: bool) -> Result<std::sync::Arc<Scene>> {
-    let mut rng = Rng::with_seed(seed_of(&name, usize::MAX));
+/// Builds a scene of `count` domains, which use the shapes cyclically. Domains are on a cubic lattice with random
+/// rotations.
+pub(super) fn build_patch_scene(
+    name: String,
+    shapes: Vec<Shape>,
+    count: usize,
+    has_normal_map: bool,
+) -> Result<std::sync::Arc<Scene>> {
+    let mut rng = Rng::with_seed(part_seed(&name, usize::MAX));
     let side = (count as f64).cbrt().ceil() as usize;
     let spacing = if count > 1 { 0.15 } else { 0.0 };
     let domain = |index: usize| {
-        let place = [index % side, index / side % side, index / side / side].map(|cell| cell as f64 * spacing);
-        let turn = if count > 1 { any_turn(&mut rng) } else { Rotation3::identity() };
+        let position = [index % side, index / side % side, index / side / side].map(|cell| cell as f64 * spacing);
+        let rotation = if count > 1 { random_rotation(&mut rng) } else { Rotation3::identity() };
         Domain {
             name: index.to_string(),
             shape: index % shapes.len(),
             material: 0,
             material_ranges: Vec::new(),
-            placement: Transform::from_parts(&turn.into_inner(), &Vector3::from(place)),
+            placement: Transform::from_parts(&rotation.into_inner(), &Vector3::from(position)),
             attachment: None,
             follows: None,
             rest_q: Vec::new(),
@@ -141,14 +163,14 @@ pub(super) fn scene(name: String, shapes: Vec<Shape>, count: usize, dressed: boo
     };
     let domains = (0..count).map(domain).collect();
     let mut parts = SceneParts::named(name);
-    if dressed {
+    if has_normal_map {
         parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255])?];
     }
-    parts.materials = vec![Material { normal_texture: dressed.then_some(0), ..Material::default() }];
+    parts.materials = vec![Material { normal_texture: has_normal_map.then_some(0), ..Material::default() }];
     Scene::new(SceneParts { shapes, domains, rigid_transforms: true, ..parts })
 }
 
-fn any_turn(rng: &mut Rng) -> Rotation3<f64> {
+fn random_rotation(rng: &mut Rng) -> Rotation3<f64> {
     let angle = |rng: &mut Rng| std::f64::consts::TAU * rng.f64();
     Rotation3::from_euler_angles(angle(rng), angle(rng), angle(rng))
 }
@@ -159,15 +181,15 @@ mod tests {
 
     #[test]
     fn only_paired_modes_are_nearly_equal() {
-        let near = |paired: bool| {
-            let modes = modes(
+        let max_difference = |is_paired: bool| {
+            let modes = random_modes(
                 &PatchSpec { vertices: 50, rank: 3, corners: 3, triangles: PatchTopology::One, size: 1.0, seed: 5 },
-                paired,
+                is_paired,
             );
             let modes = modes.expect("modes");
             modes.column(0).iter().zip(modes.column(1)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
         };
-        assert!(near(true) <= 1e-4 && near(true) > 0.0);
-        assert!(near(false) > 0.1);
+        assert!(max_difference(true) <= 1e-4 && max_difference(true) > 0.0);
+        assert!(max_difference(false) > 0.1);
     }
 }

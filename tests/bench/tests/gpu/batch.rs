@@ -16,33 +16,34 @@ use crate::accuracy::have_equal_bits;
 use crate::ensembles::{build_scene, instanced_parts, random_states, with_storage};
 use crate::scenes;
 
-/// Largest quotient of a vertex's error and the bound of its tile. The bound covers U in 16 bits, q as pairs of 16-bit
-/// numbers, and the tensor cores' own sums.
-fn of_bound(scene: &Scene, state: &SceneState, positions: &[f32]) -> f64 {
+/// Largest ratio of a vertex's error to the bound of its tile. The bound covers U in 16 bits, q as pairs of 16-bit
+/// numbers, and the rounding of the tensor cores' sums.
+fn max_error_over_bound(scene: &Scene, state: &SceneState, positions: &[f32]) -> f64 {
     let (shape, storage) = (scene.shape_of(0), scene.deformation.storage);
     let tiles = TiledModes::new(shape, storage);
-    let (reaches, products) = (ShapeErrorModel::new(shape, &tiles), TensorCoreError::of(storage, tiles.rank()));
+    let error_model = ShapeErrorModel::new(shape, &tiles);
+    let tensor_core_error = TensorCoreError::of(storage, tiles.rank());
     let vertices = shape.mesh.rest_positions().len();
-    let want = modalcast_compute::reference::deform(scene, state);
-    let share = |(packed, got): (usize, &[f32; 3])| {
+    let reference_positions = modalcast_compute::reference::deform(scene, state);
+    let error_over_bound = |(packed, position): (usize, &[f32; 3])| {
         let (domain, tile) = (packed / vertices, packed % vertices / (QUAD * TILE_QUADS));
         let step = ErrorBoundInput {
             q: state.q_of(scene, domain),
             transform: state.composed_transform(scene, domain),
             compensated: false,
         };
-        let bound = reaches.tile(tile, &step).total() + reaches.products(tile, &step, products);
-        let square = |axis: usize| (f64::from(got[axis]) - want[packed][axis]).powi(2);
-        let error = (0..3).map(square).sum::<f64>().sqrt();
+        let bound = error_model.tile(tile, &step).total() + error_model.products(tile, &step, tensor_core_error);
+        let squared_difference = |axis: usize| (f64::from(position[axis]) - reference_positions[packed][axis]).powi(2);
+        let error = (0..3).map(squared_difference).sum::<f64>().sqrt();
         if error.is_nan() { f64::INFINITY } else { error / bound }
     };
-    positions.as_chunks::<3>().0.iter().enumerate().map(share).fold(0.0, f64::max)
+    positions.as_chunks::<3>().0.iter().enumerate().map(error_over_bound).fold(0.0, f64::max)
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_tensor_core_batches_stay_within_their_bound() {
-    let device = Device::open(0).expect("expected a CUDA device");
+    let device = Device::open(0).expect("a CUDA device");
     for storage in [StorageType::F16, StorageType::Bf16] {
         for (vertices, rank, count) in [
             (1, 3, 1),
@@ -57,19 +58,26 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
         ] {
             let scene = build_scene(instanced_parts(vertices, rank, count, with_storage(storage)));
             let states = random_states(&scene);
-            let batch = BatchMmaBenchmark::new(&device, &scene, &states).expect("expected a benchmark");
+            let batch = BatchMmaBenchmark::new(&device, &scene, &states).expect("a benchmark");
             let name = format!("{} n {vertices} r {rank}", batch.name());
             for (input_set, state) in states.iter().enumerate() {
-                batch.launch(&device, input_set).expect("expected a launch");
-                let got = batch.positions(&device).expect("expected a surface");
-                let share = of_bound(&scene, state, &got);
-                assert!(share <= 1.0, "{name} input set {input_set}: {share} of the bound");
-                let other = of_bound(&scene, &states[(input_set + 1) % states.len()], &got);
-                assert!(other > 1.0, "{name}: expected the next state to exceed the bound, got {other} of it");
-                batch.launch(&device, input_set).expect("expected a launch");
+                batch.launch(&device, input_set).expect("a launch");
+                let positions = batch.positions(&device).expect("positions");
+                let error_over_bound = max_error_over_bound(&scene, state, &positions);
                 assert!(
-                    have_equal_bits(&got, &batch.positions(&device).expect("expected a surface")),
-                    "{name}: run after run"
+                    error_over_bound <= 1.0,
+                    "{name} input set {input_set}: expected an error within the bound, got {error_over_bound} times it"
+                );
+                let next_error_over_bound =
+                    max_error_over_bound(&scene, &states[(input_set + 1) % states.len()], &positions);
+                assert!(
+                    next_error_over_bound > 1.0,
+                    "{name}: expected the next state to exceed the bound, got {next_error_over_bound} times it"
+                );
+                batch.launch(&device, input_set).expect("a launch");
+                assert!(
+                    have_equal_bits(&positions, &batch.positions(&device).expect("positions")),
+                    "{name}: expected bit-identical positions of two launches"
                 );
             }
             for attributes in batch.kernel_attributes() {
@@ -77,15 +85,15 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
             }
         }
     }
-    let refused =
-        |scene: &Arc<Scene>| BatchMmaBenchmark::new(&device, scene, &random_states(scene)).expect_err("refused");
+    let rejection =
+        |scene: &Arc<Scene>| BatchMmaBenchmark::new(&device, scene, &random_states(scene)).expect_err("a rejection");
     assert!(
-        refused(&build_scene(instanced_parts(9, 2, 2, with_storage(StorageType::F32))))
+        rejection(&build_scene(instanced_parts(9, 2, 2, with_storage(StorageType::F32))))
             .to_string()
             .contains("f16 or bf16")
     );
     assert!(
-        refused(&build_scene(instanced_parts(9, 2, 33, with_storage(StorageType::F16))))
+        rejection(&build_scene(instanced_parts(9, 2, 33, with_storage(StorageType::F16))))
             .to_string()
             .contains("at most 32")
     );
@@ -94,31 +102,37 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
-    let device = Device::open(0).expect("expected a CUDA device");
+    let device = Device::open(0).expect("a CUDA device");
     let measure = |benchmark: &dyn KernelBenchmark| {
-        let us = time(&device, benchmark, CacheState::Warm, 200).expect("times").median_us;
+        let us = time(&device, benchmark, CacheState::Warm, 200).expect("a timing").median_us;
         let bytes: u64 = benchmark.traffic().iter().map(|traffic| traffic.bytes).sum();
-        let rate = gigabytes_per_second(bytes, us);
-        eprintln!("{}: {us:.1} us, {rate:.0} GB/s, {:?}", benchmark.name(), benchmark.kernel_attributes());
+        let bandwidth = gigabytes_per_second(bytes, us);
+        eprintln!("{}: {us:.1} us, {bandwidth:.0} GB/s, {:?}", benchmark.name(), benchmark.kernel_attributes());
         us
     };
     for storage in StorageType::ALL {
         let step = BenchmarkStep { batches: BatchPolicy::Always, ..BenchmarkStep::full(StepOutputs::Positions) };
         let scene = build_scene(instanced_parts(1_500_000, 32, 1, with_storage(storage)));
         let state = scenes::random_state(&scene, 1);
-        let one = measure(&DeformerBenchmark::new(&device, &scene, &[state], step).expect("expected a benchmark"));
+        let single_us = measure(&DeformerBenchmark::new(&device, &scene, &[state], step).expect("a benchmark"));
         let scene = build_scene(instanced_parts(1_500_000, 32, 16, with_storage(storage)));
         let state = scenes::random_state(&scene, 1);
-        let sixteen =
-            DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), step).expect("expected a benchmark");
-        assert_eq!(sixteen.kernel_attributes()[0].name, "batch");
-        let sixteen = measure(&sixteen);
-        eprintln!("{}: {:.2} times as long as one", storage.name(), sixteen / one);
-        assert!(sixteen < 8.0 * one, "{storage:?} {one} {sixteen}");
+        let batch = DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), step).expect("a benchmark");
+        assert_eq!(batch.kernel_attributes()[0].name, "batch");
+        let batch_us = measure(&batch);
+        eprintln!("{}: {:.2} times as long as one vector", storage.name(), batch_us / single_us);
+        assert!(batch_us < 8.0 * single_us, "{storage:?}: expected less than 8 x {single_us} us, got {batch_us} us");
         if matches!(storage, StorageType::F16 | StorageType::Bf16) {
-            let products = measure(&BatchMmaBenchmark::new(&device, &scene, &[state]).expect("expected a benchmark"));
-            eprintln!("{} by tensor cores: {:.2} times as long as one", storage.name(), products / one);
-            assert!(products < 8.0 * one, "{storage:?} {one} {products}");
+            let tensor_core_us = measure(&BatchMmaBenchmark::new(&device, &scene, &[state]).expect("a benchmark"));
+            eprintln!(
+                "{} by tensor cores: {:.2} times as long as one vector",
+                storage.name(),
+                tensor_core_us / single_us
+            );
+            assert!(
+                tensor_core_us < 8.0 * single_us,
+                "{storage:?} by tensor cores: expected less than 8 x {single_us} us, got {tensor_core_us} us"
+            );
         }
     }
 }
@@ -126,8 +140,8 @@ fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_auto_mode_batches_where_it_is_faster() {
-    let device = Device::open(0).expect("expected a CUDA device");
-    let mut slow = Vec::new();
+    let device = Device::open(0).expect("a CUDA device");
+    let mut slow_choices = Vec::new();
     for (vertices, rank) in [(1000, 32), (4000, 32), (16_000, 8), (16_000, 32), (64_000, 32), (500_000, 32)] {
         for count in [2, 3, 4, 8, 16, 64] {
             if vertices * count * rank > 1 << 29 {
@@ -135,22 +149,27 @@ fn gpu_auto_mode_batches_where_it_is_faster() {
             }
             let scene = build_scene(instanced_parts(vertices, rank, count, DeformationSettings::default()));
             let state = scenes::random_state(&scene, 1);
-            let measured = |batches: BatchPolicy| {
+            let measure = |batches: BatchPolicy| {
                 let step = BenchmarkStep { batches, ..BenchmarkStep::full(StepOutputs::Positions) };
-                let ours = DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), step)
-                    .expect("expected a benchmark");
-                time(&device, &ours, CacheState::Warm, 100).expect("times").median_us
+                let benchmark =
+                    DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), step).expect("a benchmark");
+                time(&device, &benchmark, CacheState::Warm, 100).expect("a timing").median_us
             };
-            let [batch, alone] = [BatchPolicy::Always, BatchPolicy::Never].map(measured);
-            let chooses = modalcast_compute::gpu::plan(&scene, CudaDeformerOptions::default())
+            let [batch_us, separate_us] = [BatchPolicy::Always, BatchPolicy::Never].map(measure);
+            let is_batch_chosen = modalcast_compute::gpu::plan(&scene, CudaDeformerOptions::default())
                 .kernel(KernelKind::Batch)
                 .is_some();
-            eprintln!("n {vertices} r {rank} x {count}: {batch:.1} us batched, {alone:.1} apart, chosen {chooses}");
-            let (own, other) = if chooses { (batch, alone) } else { (alone, batch) };
-            if own > 1.5 * other + 2.0 {
-                slow.push((vertices, rank, count, own, other));
+            eprintln!(
+                "n {vertices} r {rank} x {count}: {batch_us:.1} us batched, {separate_us:.1} us separate, \
+                 batched by auto: {is_batch_chosen}"
+            );
+            let (chosen_us, rejected_us) =
+                if is_batch_chosen { (batch_us, separate_us) } else { (separate_us, batch_us) };
+            if chosen_us > 1.5 * rejected_us + 2.0 {
+                slow_choices.push((vertices, rank, count, chosen_us, rejected_us));
             }
         }
     }
-    assert!(slow.is_empty(), "chosen and slower: {slow:?}");
+    // Entries are (vertices, rank, vectors, us of the choice, us of the alternative).
+    assert!(slow_choices.is_empty(), "expected no slow choice, got {slow_choices:?}");
 }

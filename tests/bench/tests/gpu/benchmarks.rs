@@ -1,4 +1,4 @@
-//! Device memory rates and benchmark kernels; every kernel's positions are compared with the f64 reference.
+//! Tests device memory bandwidths and benchmark kernels. Every kernel's positions are compared with the f64 reference.
 
 use std::sync::Arc;
 
@@ -17,47 +17,62 @@ use crate::scenes;
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_memory_rates_are_plausible_and_empty_replay_takes_time() {
     let device = Device::open(0).expect("expected a CUDA device");
-    let roofs = roofs(&device).expect("roofs");
-    eprintln!("{}: {roofs:?}", device.name());
-    assert!(roofs.copy_gbs > 20.0 && roofs.pinned_h2d_gbs > 1.0 && roofs.pinned_d2h_gbs > 1.0, "{roofs:?}");
-    assert!((0.8..1.6).contains(&(roofs.read_gbs / roofs.copy_gbs)), "reading is about as fast as copying: {roofs:?}");
-    assert!(roofs.pinned_h2d_gbs < roofs.copy_gbs, "{roofs:?}");
-    let empty = empty_replay(&device, 100).expect("replays");
-    assert!(empty.replays == 100 && empty.q1_us <= empty.median_us && empty.median_us <= empty.q3_us, "{empty:?}");
-    assert!((0.1..100.0).contains(&empty.median_us), "{empty:?}");
+    let bandwidths = roofs(&device).expect("memory bandwidths");
+    eprintln!("{}: {bandwidths:?}", device.name());
+    assert!(
+        bandwidths.copy_gbs > 20.0 && bandwidths.pinned_h2d_gbs > 1.0 && bandwidths.pinned_d2h_gbs > 1.0,
+        "{bandwidths:?}"
+    );
+    assert!(
+        (0.8..1.6).contains(&(bandwidths.read_gbs / bandwidths.copy_gbs)),
+        "expected reads about as fast as copies, got {bandwidths:?}"
+    );
+    assert!(bandwidths.pinned_h2d_gbs < bandwidths.copy_gbs, "{bandwidths:?}");
+    let replay_timing = empty_replay(&device, 100).expect("a timing");
+    assert!(
+        replay_timing.replays == 100
+            && replay_timing.q1_us <= replay_timing.median_us
+            && replay_timing.median_us <= replay_timing.q3_us,
+        "{replay_timing:?}"
+    );
+    assert!((0.1..100.0).contains(&replay_timing.median_us), "{replay_timing:?}");
     assert!(empty_replay(&device, 0).is_err());
 }
 
-/// Per packed vertex, whether a triangle refers to it. Other vertices are not computed from unfolded triangles.
+/// Per packed vertex, whether a triangle refers to it. The thesis's kernels compute the corners of unfolded triangles,
+/// so they do not compute other vertices.
 fn is_corner_of_triangle(scene: &Scene) -> Vec<bool> {
-    let mut named = vec![false; scene.layout.vertices];
+    let mut is_referenced = vec![false; scene.layout.vertices];
     for (domain, slot) in scene.layout.domains.iter().enumerate() {
         let mesh = &scene.shape_of(domain).mesh;
         for corner in mesh.triangles().as_flattened() {
-            named[slot.first_vertex + mesh.corners().vertices[*corner as usize] as usize] = true;
+            is_referenced[slot.first_vertex + mesh.corners().vertices[*corner as usize] as usize] = true;
         }
     }
-    named
+    is_referenced
 }
 
 /// Largest error of a benchmark's positions, over the vertices that a triangle refers to, as a fraction of the diagonal.
 fn relative_error(scene: &Scene, state: &SceneState, positions: &[f32]) -> Result<f64, String> {
-    let (named, want) = (is_corner_of_triangle(scene), modalcast_compute::reference::deform(scene, state));
-    if positions.len() != 3 * named.len() {
-        return Err(format!("{} numbers for {} vertices", positions.len(), named.len()));
+    let (is_referenced, reference_positions) =
+        (is_corner_of_triangle(scene), modalcast_compute::reference::deform(scene, state));
+    if positions.len() != 3 * is_referenced.len() {
+        return Err(format!("expected {} vertices, got {} numbers", is_referenced.len(), positions.len()));
     }
     let mut bounds = BoundingBox::EMPTY;
-    want.iter().for_each(|position| bounds.include(*position));
-    // One vertex has no diagonal; shapes fit into a cube of side 2.
+    reference_positions.iter().for_each(|position| bounds.include(*position));
+    // A single vertex has diagonal 0, so the diagonal is at least 1. Shapes fit into a cube of side 2.
     let diagonal = bounds.diagonal().max(1.0);
-    let kept = |vertex: &usize| named[*vertex];
-    let got: Vec<f32> = (0..named.len()).filter(kept).flat_map(|at| positions[3 * at..][..3].to_vec()).collect();
-    let want: Vec<[f64; 3]> = (0..named.len()).filter(kept).map(|vertex| want[vertex]).collect();
-    max_error(&got, &want, MAX_POSITION_ERROR * diagonal).map(|error| error / diagonal)
+    let is_compared = |vertex: &usize| is_referenced[*vertex];
+    let compared_positions: Vec<f32> =
+        (0..is_referenced.len()).filter(is_compared).flat_map(|vertex| positions[3 * vertex..][..3].to_vec()).collect();
+    let reference_positions: Vec<[f64; 3]> =
+        (0..is_referenced.len()).filter(is_compared).map(|vertex| reference_positions[vertex]).collect();
+    max_error(&compared_positions, &reference_positions, MAX_POSITION_ERROR * diagonal).map(|error| error / diagonal)
 }
 
 /// Checks every input set of a benchmark, launched directly and replayed.
-fn check(device: &Device, scene: &Arc<Scene>, states: &[SceneState], benchmark: &dyn KernelBenchmark) {
+fn check_benchmark(device: &Device, scene: &Arc<Scene>, states: &[SceneState], benchmark: &dyn KernelBenchmark) {
     let name = benchmark.name();
     assert_eq!(benchmark.input_set_count(), states.len(), "{name}");
     for (input_set, state) in states.iter().enumerate() {
@@ -87,31 +102,31 @@ fn check(device: &Device, scene: &Arc<Scene>, states: &[SceneState], benchmark: 
     }
 }
 
-fn states(scene: &Scene) -> Vec<SceneState> {
+fn random_states(scene: &Scene) -> Vec<SceneState> {
     (1..=3).map(|seed| scenes::random_state(scene, seed)).collect()
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_thesis_single_matches_reference_at_a_few_ranks() {
-    single(&[1, 10, 33]);
+    check_single_kernel(&[1, 10, 33]);
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_thesis_single_matches_reference_up_to_rank_512() {
-    single(&[3, 20, 30, 32, 129, 512]);
+    check_single_kernel(&[3, 20, 30, 32, 129, 512]);
 }
 
-fn single(ranks: &[usize]) {
+fn check_single_kernel(ranks: &[usize]) {
     let device = Device::open(0).expect("expected a CUDA device");
     for rank in ranks.iter().copied() {
         for (vertices, normal_maps) in [(1, false), (33, true), (5003, false)] {
             let scene = scenes::random_scene(&[(vertices, rank)], 1, normal_maps, false);
             for part in [Part::Uq, Part::Whole] {
-                let benchmark =
-                    ThesisBenchmark::single(&device, &scene, &states(&scene), part).expect("expected a benchmark");
-                check(&device, &scene, &states(&scene), &benchmark);
+                let benchmark = ThesisBenchmark::single(&device, &scene, &random_states(&scene), part)
+                    .expect("expected a benchmark");
+                check_benchmark(&device, &scene, &random_states(&scene), &benchmark);
             }
         }
     }
@@ -125,16 +140,17 @@ fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
     let scene = scenes::random_scene(&shapes, 2, true, false);
     for split in KernelSplit::ALL {
         for part in [Part::Uq, Part::Whole] {
-            let benchmark =
-                ThesisBenchmark::multi(&device, &scene, &states(&scene), (split, part)).expect("expected a benchmark");
-            check(&device, &scene, &states(&scene), &benchmark);
+            let benchmark = ThesisBenchmark::multi(&device, &scene, &random_states(&scene), (split, part))
+                .expect("expected a benchmark");
+            check_benchmark(&device, &scene, &random_states(&scene), &benchmark);
             assert_eq!(benchmark.launches_per_step(), split.widths().len() + usize::from(part == Part::Whole));
         }
     }
-    let rigid = scenes::random_scene(&[(40, 0)], 3, false, true);
-    let update_alone = ThesisBenchmark::multi(&device, &rigid, &states(&rigid), (KernelSplit::Two, Part::Whole))
-        .expect("expected a benchmark");
-    check(&device, &rigid, &states(&rigid), &update_alone);
+    let rigid_scene = scenes::random_scene(&[(40, 0)], 3, false, true);
+    let update_benchmark =
+        ThesisBenchmark::multi(&device, &rigid_scene, &random_states(&rigid_scene), (KernelSplit::Two, Part::Whole))
+            .expect("expected a benchmark");
+    check_benchmark(&device, &rigid_scene, &random_states(&rigid_scene), &update_benchmark);
 }
 
 #[test]
@@ -142,22 +158,22 @@ fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
 fn gpu_cublas_matches_reference_with_every_product_kind() {
     let device = Device::open(0).expect("expected a CUDA device");
     let shapes: Vec<_> = (0..40).map(|index| (1 + index * 29 % 611, index * 7 % 65)).collect();
-    let many = scenes::random_scene(&shapes, 2, false, false);
-    let (one, instances) =
+    let mixed_scene = scenes::random_scene(&shapes, 2, false, false);
+    let (single_scene, instanced_scene) =
         (scenes::random_scene(&[(5003, 30)], 1, false, false), scenes::random_scene(&[(5003, 32)], 16, false, false));
-    for peer in CublasMethod::ALL {
-        let scene = match peer {
-            CublasMethod::SgemvColumns | CublasMethod::SgemvRows => &one,
-            CublasMethod::Instances => &instances,
-            _ => &many,
+    for method in CublasMethod::ALL {
+        let scene = match method {
+            CublasMethod::SgemvColumns | CublasMethod::SgemvRows => &single_scene,
+            CublasMethod::Instances => &instanced_scene,
+            _ => &mixed_scene,
         };
         for part in [Part::Uq, Part::Whole] {
-            match CublasBenchmark::new(&device, scene, &states(scene), (peer, part)) {
-                Ok(benchmark) => check(&device, scene, &states(scene), &benchmark),
+            match CublasBenchmark::new(&device, scene, &random_states(scene), (method, part)) {
+                Ok(benchmark) => check_benchmark(&device, scene, &random_states(scene), &benchmark),
                 Err(Error::Unavailable { what: "cuBLAS", reason, .. }) => {
-                    eprintln!("{} skipped: {reason}", peer.name())
+                    eprintln!("{} skipped: {reason}", method.name())
                 }
-                Err(error) => panic!("{}: {error}", peer.name()),
+                Err(error) => panic!("{}: {error}", method.name()),
             }
         }
     }
@@ -167,17 +183,28 @@ fn gpu_cublas_matches_reference_with_every_product_kind() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_thesis_kernels_reject_unsupported_scenes() {
     let device = Device::open(0).expect("expected a CUDA device");
-    let (large, two) =
+    let (large_scene, two_domain_scene) =
         (scenes::random_scene(&[(40, 33)], 1, false, false), scenes::random_scene(&[(40, 3)], 2, false, false));
-    let field = |refusal: Result<ThesisBenchmark, Error>| match refusal {
+    let invalid_field = |result: Result<ThesisBenchmark, Error>| match result {
         Err(Error::Invalid { field, .. }) => field,
-        other => panic!("{other:?}"),
+        other => panic!("expected an invalid field, got {other:?}"),
     };
     assert_eq!(
-        field(ThesisBenchmark::multi(&device, &large, &states(&large), (KernelSplit::Two, Part::Uq))),
+        invalid_field(ThesisBenchmark::multi(
+            &device,
+            &large_scene,
+            &random_states(&large_scene),
+            (KernelSplit::Two, Part::Uq)
+        )),
         "domain 0: modes"
     );
-    assert_eq!(field(ThesisBenchmark::single(&device, &two, &states(&two), Part::Uq)), "scene.domains");
-    assert_eq!(field(ThesisBenchmark::single(&device, &large, &[], Part::Uq)), "states");
-    assert_eq!(field(ThesisBenchmark::single(&device, &large, &states(&two), Part::Uq)), "states");
+    assert_eq!(
+        invalid_field(ThesisBenchmark::single(&device, &two_domain_scene, &random_states(&two_domain_scene), Part::Uq)),
+        "scene.domains"
+    );
+    assert_eq!(invalid_field(ThesisBenchmark::single(&device, &large_scene, &[], Part::Uq)), "states");
+    assert_eq!(
+        invalid_field(ThesisBenchmark::single(&device, &large_scene, &random_states(&two_domain_scene), Part::Uq)),
+        "states"
+    );
 }

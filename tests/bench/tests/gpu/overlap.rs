@@ -13,16 +13,27 @@ fn gpu_overlapped_steps_are_faster_with_identical_vertices() {
     let device = Device::open(0).expect("expected a CUDA device");
     let scene = scenes::random_scene(&[(200_000, 8), (7, 0), (40, 3)], 4, false, false);
     let states: Vec<SceneState> = (0..4).map(|seed| scenes::random_state(&scene, seed)).collect();
-    let load = Workload::new("overlap".to_owned(), scene);
-    let found = overlap(&device, &load, &states, 50).expect("measures");
-    eprintln!("{found:#?}");
-    assert_eq!(found.differing, 0);
-    let times = [found.serial_us, found.fetched_us, found.overlapped_us, found.graph_us, found.copy_out_us];
-    assert!(times.iter().chain([&found.write_us, &found.step_us]).all(|time| time.is_finite() && *time > 0.0));
-    assert!(found.overlapped_us < found.serial_us, "what runs side by side takes less time");
-    assert!(found.overlapped_us > 0.5 * found.ideal_us, "and no less than its longest part");
-    assert!(overlap(&device, &load, &[], 5).is_err() && overlap(&device, &load, &states, 0).is_err());
-    for write in host_writes(&device, 20).expect("writes") {
+    let workload = Workload::new("overlap".to_owned(), scene);
+    let measurement = overlap(&device, &workload, &states, 50).expect("a measurement");
+    eprintln!("{measurement:#?}");
+    assert_eq!(measurement.differing, 0);
+    let times = [
+        measurement.serial_us,
+        measurement.fetched_us,
+        measurement.overlapped_us,
+        measurement.graph_us,
+        measurement.copy_out_us,
+    ];
+    assert!(
+        times.iter().chain([&measurement.write_us, &measurement.step_us]).all(|time| time.is_finite() && *time > 0.0)
+    );
+    assert!(
+        measurement.overlapped_us < measurement.serial_us,
+        "expected overlapped steps to be faster than serial ones"
+    );
+    assert!(measurement.overlapped_us > 0.5 * measurement.ideal_us, "expected at least half of the ideal time");
+    assert!(overlap(&device, &workload, &[], 5).is_err() && overlap(&device, &workload, &states, 0).is_err());
+    for write in host_writes(&device, 20).expect("measured writes") {
         eprintln!("{write:?}");
     }
 }

@@ -1,4 +1,4 @@
-//! The CUDA rasterizer against its definition: bit-identical samples on every path.
+//! Compares the CUDA rasterizer with its CPU definition: samples are bit-identical with every granularity.
 
 use modalcast_bench::kernels::{KernelBenchmark as _, RasterBenchmark, RasterCounts, RasterMesh};
 use modalcast_bench::render::workloads::RenderWorkload;
@@ -8,31 +8,31 @@ use modalcast_compute::reference::raster::{CullReason, clipped_polygon};
 
 use crate::soups::{Soup, all_soups};
 
-fn launched(device: &Device, soup: &Soup, form: RasterVariant) -> RasterBenchmark {
+fn launch_raster(device: &Device, soup: &Soup, variant: RasterVariant) -> RasterBenchmark {
     let mesh =
         RasterMesh { positions: &soup.positions, triangles: &soup.triangles, groups: &soup.groups, cut_outs: None };
-    let raster = RasterBenchmark::new(device, mesh, soup.viewport, form).expect("expected a rasterizer");
-    // Twice, to check that queues and samples of the first launch are cleared.
-    (0..2).for_each(|_| raster.launch(device, 0).expect("launches"));
+    let raster = RasterBenchmark::new(device, mesh, soup.viewport, variant).expect("expected a rasterizer");
+    // Launch twice, to check that queues and samples of the first launch are cleared.
+    (0..2).for_each(|_| raster.launch(device, 0).expect("a launch"));
     raster
 }
 
-/// Triangles that the definition drops, by reason, and the number that it draws.
-fn dropped(soup: &Soup) -> ([u32; 5], u32) {
-    let (mut counts, mut drawn) = ([0; 5], 0);
+/// Numbers of triangles that the definition drops, by reason, and the number that it draws.
+fn count_triangles(soup: &Soup) -> ([u32; 5], u32) {
+    let (mut counts_by_reason, mut drawn) = ([0; 5], 0);
     for group in &soup.groups {
         for triangle in &soup.triangles[group.first as usize..][..group.triangles as usize] {
             match clipped_polygon(&soup.viewport, &soup.positions, *triangle, group.cull_mode) {
                 Ok(_) => drawn += 1,
-                Err(CullReason::NotFinite) => counts[0] += 1,
-                Err(CullReason::OutsideFrustum) => counts[1] += 1,
-                Err(CullReason::Degenerate) => counts[2] += 1,
-                Err(CullReason::BackFacing) => counts[3] += 1,
-                Err(CullReason::NoSample) => counts[4] += 1,
+                Err(CullReason::NotFinite) => counts_by_reason[0] += 1,
+                Err(CullReason::OutsideFrustum) => counts_by_reason[1] += 1,
+                Err(CullReason::Degenerate) => counts_by_reason[2] += 1,
+                Err(CullReason::BackFacing) => counts_by_reason[3] += 1,
+                Err(CullReason::NoSample) => counts_by_reason[4] += 1,
             }
         }
     }
-    (counts, drawn)
+    (counts_by_reason, drawn)
 }
 
 #[test]
@@ -40,19 +40,23 @@ fn dropped(soup: &Soup) -> ([u32; 5], u32) {
 fn gpu_samples_match_the_definition_bitwise_on_every_path() {
     let device = Device::open(0).expect("expected a CUDA device");
     for soup in all_soups() {
-        let want = soup.rasterize();
+        let definition = soup.rasterize();
         for granularity in [RasterGranularity::BySize, RasterGranularity::Warps, RasterGranularity::Tiles] {
             for count_triangles in [false, true] {
-                let form = RasterVariant { granularity, count_triangles, ..RasterVariant::default() };
-                let keys = launched(&device, &soup, form).keys(&device).expect("expected the id keys");
-                let wrong = keys.iter().zip(&want.keys).filter(|(got, want)| got != want).count();
-                assert_eq!(wrong, 0, "{} by {form:?}: of {} samples", soup.name, keys.len());
+                let variant = RasterVariant { granularity, count_triangles, ..RasterVariant::default() };
+                let keys = launch_raster(&device, &soup, variant).keys(&device).expect("expected the id keys");
+                let differing = keys.iter().zip(&definition.keys).filter(|(key, expected)| key != expected).count();
+                assert_eq!(differing, 0, "{} with {variant:?}: expected {} equal samples", soup.name, keys.len());
             }
         }
-        let form = RasterVariant { depth_only: true, ..RasterVariant::default() };
-        let bits = |depths: Vec<f32>| depths.into_iter().map(f32::to_bits).collect::<Vec<_>>();
-        let depths = launched(&device, &soup, form).depths(&device).expect("depths");
-        assert!(bits(depths) == bits(want.depths()), "{}: depth alone", soup.name);
+        let variant = RasterVariant { depth_only: true, ..RasterVariant::default() };
+        let to_bits = |depths: Vec<f32>| depths.into_iter().map(f32::to_bits).collect::<Vec<_>>();
+        let depths = launch_raster(&device, &soup, variant).depths(&device).expect("depths");
+        assert!(
+            to_bits(depths) == to_bits(definition.depths()),
+            "{}: expected equal depths if only depth is drawn",
+            soup.name
+        );
     }
 }
 
@@ -60,31 +64,36 @@ fn gpu_samples_match_the_definition_bitwise_on_every_path() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_counts_every_triangle_once_and_takes_every_path() {
     let device = Device::open(0).expect("expected a CUDA device");
-    let mut all = [0; 3];
+    let mut total_by_path = [0; 3];
     for soup in all_soups() {
         for granularity in [RasterGranularity::BySize, RasterGranularity::Warps, RasterGranularity::Tiles] {
-            let form = RasterVariant { count_triangles: true, granularity, ..RasterVariant::default() };
-            let counts = launched(&device, &soup, form).counts(&device).expect("counts");
+            let variant = RasterVariant { count_triangles: true, granularity, ..RasterVariant::default() };
+            let counts = launch_raster(&device, &soup, variant).counts(&device).expect("counts");
             let RasterCounts { small, medium, large, not_finite, outside, flat, back, missed } = counts;
-            let (want, drawn) = dropped(&soup);
-            assert_eq!([not_finite, outside, flat, back, missed], want, "{}", soup.name);
-            assert_eq!(small + medium + large, drawn, "{}", soup.name);
+            let (expected_dropped, expected_drawn) = count_triangles(&soup);
+            assert_eq!([not_finite, outside, flat, back, missed], expected_dropped, "{}", soup.name);
+            assert_eq!(small + medium + large, expected_drawn, "{}", soup.name);
             match granularity {
-                RasterGranularity::BySize => all = [all[0] + small, all[1] + medium, all[2] + large],
+                RasterGranularity::BySize => {
+                    total_by_path = [total_by_path[0] + small, total_by_path[1] + medium, total_by_path[2] + large]
+                }
                 RasterGranularity::Warps => assert_eq!(small, 0),
                 RasterGranularity::Tiles => assert_eq!(small + medium, 0),
             }
         }
     }
-    assert!(all.iter().all(|path| *path > 10), "{all:?}");
-    let quiet = launched(&device, &all_soups()[1], RasterVariant::default()).counts(&device).expect("counts");
-    assert_eq!(quiet, RasterCounts::default(), "nothing is counted unasked");
+    assert!(
+        total_by_path.iter().all(|triangles| *triangles > 10),
+        "expected more than 10 triangles on every path, got {total_by_path:?}"
+    );
+    let counts = launch_raster(&device, &all_soups()[1], RasterVariant::default()).counts(&device).expect("counts");
+    assert_eq!(counts, RasterCounts::default(), "expected zeros without `count_triangles`");
 }
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_ids_of_scenes_match_opengl_and_both_are_timed() {
-    let request = RenderReportOptions {
+    let options = RenderReportOptions {
         loads: vec![RenderWorkload::Square, RenderWorkload::Triangles(50_000)],
         plants: vec![],
         variants: vec![],
@@ -92,15 +101,19 @@ fn gpu_ids_of_scenes_match_opengl_and_both_are_timed() {
         quick: true,
         replays: 20,
     };
-    let report = rasters(&request, |_| {}).expect("expected a report");
+    let report = rasters(&options, |_| {}).expect("expected a report");
     report.rows.iter().for_each(|row| eprintln!("{}", row.line()));
     assert_eq!(report.rows.len(), 4);
     for row in &report.rows {
-        let passes = row.passes.unwrap_or_else(|| panic!("not timed: {row:?}"));
+        let passes = row.passes.unwrap_or_else(|| panic!("expected a timed row, got {row:?}"));
         assert!(passes.depth.ratio() > 0.0 && passes.visibility.ratio() > 0.0);
         assert!(row.in_frame.small + row.in_frame.medium + row.in_frame.large > 0, "{row:?}");
     }
-    let named = |name: &str| report.rows.iter().find(|row| row.load == name).expect("there").in_frame;
-    assert!(named("room").dropped > 1000, "much of the room lies behind the eye: {:?}", named("room"));
-    assert_eq!(named("screen").large, 2);
+    let triangle_counts = |name: &str| report.rows.iter().find(|row| row.load == name).expect("a row").in_frame;
+    assert!(
+        triangle_counts("room").dropped > 1000,
+        "expected many dropped triangles behind the eye, got {:?}",
+        triangle_counts("room")
+    );
+    assert_eq!(triangle_counts("screen").large, 2);
 }
