@@ -1,5 +1,5 @@
-//! Affine transforms in f64, and the rigid transform that best fits displaced points. Transforms are row-major 3x4 on
-//! the wire. Their names state the target and the source frame (`world_from_domain`).
+//! Affine transforms in f64, and the rigid transform that best fits displaced points. The name of a transform states
+//! its target and its source: `world_from_domain` maps coordinates of a domain to the world.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -49,7 +49,8 @@ impl AffineTransform {
 }
 
 /// The proper rotation and translation that map `rest` to `current` with the least squared error (Kabsch 1976). Fewer
-/// than three points, or collinear points, do not determine the rotation: then the result is the translation of the mean.
+/// than three points, or collinear points, do not determine the rotation. In this case, the result is the translation
+/// of the mean.
 pub fn fit_rigid_transform(rest: &[Vector3<f64>], current: &[Vector3<f64>]) -> AffineTransform {
     let count = rest.len().min(current.len());
     if count == 0 {

@@ -1,8 +1,8 @@
 //! A bridge under a pulsating load: reduced StVK forces, integrated by implicit Newmark.
 //!
-//! The load acts on the middle of the bridge and is spread evenly over the samples there. Its strength is calibrated so
-//! that the deflection at equilibrium is a given fraction of the diagonal of the scene's rest bounds. The run starts at
-//! that equilibrium. The load then pulsates as (1 + cos) / 2.
+//! The load acts on the middle of the bridge, spread evenly over the samples there. Its strength is calibrated so that
+//! the deflection at equilibrium is a given fraction of the diagonal of the scene's rest bounds. The run starts at
+//! this equilibrium. The load then pulsates as (1 + cos) / 2.
 
 use std::f64::consts::TAU;
 
@@ -32,7 +32,7 @@ pub struct BridgeOptions {
 /// Direction of the load.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LoadDirection {
-    /// Like a wind: across the bridge, with an upward component of 0.3 times the horizontal one.
+    /// Like wind: across the bridge, with an upward component of 0.3 times the horizontal one.
     Across,
     /// Like a weight. A bridge close to the ground then moves below the ground plane of a rendered frame.
     Down,
@@ -99,14 +99,14 @@ impl BridgeScenario {
 
     /// Integrates the state over one step.
     fn advance(&mut self) {
-        let (before, after) = (self.load_at(self.next_step), self.load_at(self.next_step + 1));
-        let load = LoadChange { before: &before, after: &after };
-        self.state = self.system.step(&self.state, self.options.dt, load);
+        let (start_load, end_load) = (self.compute_load(self.next_step), self.compute_load(self.next_step + 1));
+        let load = LoadChange { start: &start_load, end: &end_load };
+        self.state = self.system.advance(&self.state, self.options.dt, load);
         self.next_step += 1;
     }
 
     /// The reduced load at a step.
-    fn load_at(&self, step: u64) -> DVector<f64> {
+    fn compute_load(&self, step: u64) -> DVector<f64> {
         let time = step as f64 * self.options.dt;
         &self.peak_load * (0.5 + 0.5 * (TAU * time / self.options.period).cos())
     }
@@ -163,7 +163,7 @@ impl LoadDirection {
     /// Unit vector of the load in world axes.
     fn unit_vector(self, model: &Model) -> Vector3<f64> {
         match self {
-            Self::Across => (model.ground_axes().short + 0.3 * model.up).normalize(),
+            Self::Across => (model.ground_axes().short_axis + 0.3 * model.up).normalize(),
             Self::Down => -model.up,
             Self::Up => model.up,
         }
@@ -173,15 +173,17 @@ impl LoadDirection {
 /// Computes U^T times a unit force that is spread over the middle tenth of the longer horizontal axis, or over the whole
 /// domain if the middle tenth cannot move.
 fn compute_unit_load(model: &Model, domain: &DomainModel, load_direction: LoadDirection) -> Result<DVector<f64>> {
-    let axis = model.ground_axes().long;
-    let axis_coordinate = |rest: &Vector3<f64>| domain.placement.apply(rest).dot(&axis);
-    let axis_coordinates = domain.samples.iter().map(|sample| axis_coordinate(&sample.rest));
-    let (min, max) = axis_coordinates.fold((f64::MAX, f64::MIN), |(min, max), x| (min.min(x), max.max(x)));
+    let axis = model.ground_axes().long_axis;
+    let axis_coordinate = |rest_position: &Vector3<f64>| domain.placement.apply(rest_position).dot(&axis);
+    let axis_coordinates = domain.samples.iter().map(|sample| axis_coordinate(&sample.rest_position));
+    let (min, max) = axis_coordinates
+        .fold((f64::MAX, f64::MIN), |(min, max), coordinate| (min.min(coordinate), max.max(coordinate)));
     let local_direction = domain.placement.linear.transpose() * load_direction.unit_vector(model);
     // `half_width` is a fraction of the bridge's length.
     let unit_load_within = |half_width: f64| {
-        let is_within = |x: f64| (x - 0.5 * (min + max)).abs() <= half_width * (max - min);
-        let samples: Vec<_> = domain.samples.iter().filter(|sample| is_within(axis_coordinate(&sample.rest))).collect();
+        let is_within = |coordinate: f64| (coordinate - 0.5 * (min + max)).abs() <= half_width * (max - min);
+        let samples: Vec<_> =
+            domain.samples.iter().filter(|sample| is_within(axis_coordinate(&sample.rest_position))).collect();
         let sum =
             |mode| samples.iter().map(|sample| sample.column(mode, domain.rank).dot(&local_direction)).sum::<f64>();
         DVector::from_fn(domain.rank, |mode, _| sum(mode) / samples.len().max(1) as f64)
@@ -191,7 +193,7 @@ fn compute_unit_load(model: &Model, domain: &DomainModel, load_direction: LoadDi
     if unit_load.norm() > 0.0 {
         Ok(unit_load)
     } else {
-        let given = format!("'{}', whose modes do not", domain.name);
+        let given = format!("'{}' with a reduced load of 0", domain.name);
         Err(invalid_input("scene", "a domain whose modes respond to the load", given))
     }
 }
@@ -211,34 +213,34 @@ fn calibrate_load(
 ) -> Result<LoadedEquilibrium> {
     let solve =
         |strength: f64, initial_guess: &DVector<f64>| system.solve_equilibrium(&(unit_load * strength), initial_guess);
-    let rest = DVector::zeros(system.rank());
+    let rest_q = DVector::zeros(system.rank());
     // The response to a small load is linear. Extrapolate from it to a tenth of the target deflection.
     let probe_strength = 1e-6 * unit_load.norm().recip();
-    let probe_deflection = max_sample_displacement(domain, &solve(probe_strength, &rest));
+    let probe_deflection = max_sample_displacement(domain, &solve(probe_strength, &rest_q));
     if !(probe_deflection > 0.0 && probe_deflection.is_finite()) {
         let given = format!("a deflection of {probe_deflection}");
         return Err(invalid_input("load", "a load that deflects the bridge", given));
     }
-    let (mut low, mut high) = (0.0, 0.1 * target_deflection / probe_deflection * probe_strength);
-    let (mut q_low, mut q_high) = (rest.clone(), rest);
+    let (mut low_strength, mut high_strength) = (0.0, 0.1 * target_deflection / probe_deflection * probe_strength);
+    let (mut q_low, mut q_high) = (rest_q.clone(), rest_q);
     for _ in 0..60 {
-        q_high = solve(high, &q_low);
+        q_high = solve(high_strength, &q_low);
         if max_sample_displacement(domain, &q_high) >= target_deflection {
             break;
         }
-        (low, q_low) = (high, q_high.clone());
-        high *= 1.3;
+        (low_strength, q_low) = (high_strength, q_high.clone());
+        high_strength *= 1.3;
     }
     for _ in 0..40 {
-        let middle = 0.5 * (low + high);
-        let q = solve(middle, &q_low);
+        let middle_strength = 0.5 * (low_strength + high_strength);
+        let q = solve(middle_strength, &q_low);
         if max_sample_displacement(domain, &q) >= target_deflection {
-            (high, q_high) = (middle, q);
+            (high_strength, q_high) = (middle_strength, q);
         } else {
-            (low, q_low) = (middle, q);
+            (low_strength, q_low) = (middle_strength, q);
         }
     }
-    Ok(LoadedEquilibrium { strength: high, q: q_high })
+    Ok(LoadedEquilibrium { strength: high_strength, q: q_high })
 }
 
 #[cfg(test)]
@@ -260,12 +262,12 @@ mod tests {
     fn run_starts_at_the_requested_deflection_and_moves() {
         let mut bridge = two_mode_bridge();
         let deflection = bridge.static_deflection_fraction;
-        assert!((deflection - 0.03).abs() <= 1e-6, "{deflection}");
-        let (mut first, mut last) = (StepValues::default(), StepValues::default());
-        bridge.compute_next_step(&mut first).expect("the first step");
+        assert!((deflection - 0.03).abs() <= 1e-6, "expected 0.03, got {deflection}");
+        let (mut first_values, mut last_values) = (StepValues::default(), StepValues::default());
+        bridge.compute_next_step(&mut first_values).expect("the first step");
         assert!(bridge.peak_displacement / bridge.model.diagonal() >= 0.0299);
-        (0..40).for_each(|_| bridge.compute_next_step(&mut last).expect("the next step"));
-        assert!(first.q != last.q && first.transforms == last.transforms);
+        (0..40).for_each(|_| bridge.compute_next_step(&mut last_values).expect("the next step"));
+        assert!(first_values.q != last_values.q && first_values.transforms == last_values.transforms);
         assert!(bridge.peak_displacement / bridge.model.diagonal() < 0.2);
     }
 

@@ -50,11 +50,12 @@ pub(crate) enum Command {
     Sweep {
         #[command(flatten)]
         common: CommonOptions,
-        /// Largest displacement as a fraction of the diagonal.
-        #[arg(long, default_value_t = 0.06, value_parser = parse_fraction)]
-        share: f64,
+        /// Largest displacement as a fraction of the diagonal of the scene's bounds.
+        #[arg(long = "share", value_name = "SHARE", default_value_t = 0.06, value_parser = parse_fraction)]
+        displacement_fraction: f64,
     },
-    /// The bridge if cubic forces are available, else the tree if the scene has eigenvalues, else the sweep.
+    /// Selects the scenario: the bridge if cubic forces are available, else the tree if the scene has eigenvalues, else
+    /// the sweep.
     #[command(after_help = EXAMPLES)]
     Auto {
         #[command(flatten)]
@@ -65,9 +66,9 @@ pub(crate) enum Command {
         load: LoadOptions,
         #[command(flatten)]
         wind: WindOptions,
-        /// Largest displacement of the sweep as a fraction of the diagonal.
-        #[arg(long, default_value_t = 0.06, value_parser = parse_fraction)]
-        share: f64,
+        /// Largest displacement of the sweep as a fraction of the diagonal of the scene's bounds.
+        #[arg(long = "share", value_name = "SHARE", default_value_t = 0.06, value_parser = parse_fraction)]
+        displacement_fraction: f64,
     },
 }
 
@@ -76,13 +77,13 @@ pub(crate) struct CommonOptions {
     /// URL of the server.
     #[arg(long, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
-    /// How long to retry until the server answers, in seconds.
+    /// Maximum time to retry until the server answers, in seconds.
     #[arg(long, default_value_t = 0.0, value_parser = parse_non_negative)]
     pub(crate) wait: f64,
     /// The scene's name on the server.
     #[arg(long, default_value = "tree")]
     pub(crate) scene: String,
-    /// Source in the server's repository to open first, under the name of --scene.
+    /// Source of a scene to open first, in the server's scene repository. The scene gets the name of --scene.
     #[arg(long, value_name = "SOURCE")]
     pub(crate) open: Option<String>,
     /// Simulated time in seconds; 0 runs until interrupted.
@@ -128,16 +129,22 @@ impl From<PolicyOption> for Policy {
 
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct WindOptions {
-    /// Strength of the wind; at 1 the crown sways by `--sway`.
-    #[arg(long, default_value_t = 1.0, value_parser = parse_non_negative)]
-    pub(crate) wind: f64,
-    /// Peak displacement of the crown at wind 1, as a fraction of the height.
-    #[arg(long, default_value_t = 0.05, value_parser = parse_fraction)]
-    pub(crate) sway: f64,
+    /// Strength of the wind. At 1, the crown sways by `--sway`.
+    #[arg(long = "wind", value_name = "WIND", default_value_t = 1.0, value_parser = parse_non_negative)]
+    pub(crate) strength: f64,
+    /// Peak displacement of the crown at wind 1, as a fraction of the scene's height.
+    #[arg(long = "sway", value_name = "SWAY", default_value_t = 0.05, value_parser = parse_fraction)]
+    pub(crate) sway_fraction: f64,
     /// Direction that the wind blows to, in degrees about the up axis from the first horizontal axis. At 25, the default
     /// camera sees the sway from the side.
-    #[arg(long, default_value_t = 25.0, value_parser = parse_degrees, allow_hyphen_values = true)]
-    pub(crate) direction: f64,
+    #[arg(
+        long = "direction",
+        value_name = "DIRECTION",
+        default_value_t = 25.0,
+        value_parser = parse_degrees,
+        allow_hyphen_values = true
+    )]
+    pub(crate) direction_degrees: f64,
     /// Random seed of the turbulence.
     #[arg(long, default_value_t = 7)]
     pub(crate) seed: u64,
@@ -148,25 +155,25 @@ pub(crate) struct ForceFileOptions {
     /// Vega's file of reduced cubic forces.
     #[arg(long, value_name = "FILE.cub")]
     pub(crate) cubic: Option<PathBuf>,
-    /// Vega's settings; default: the .config file next to the file of cubic forces, if it exists.
+    /// Vega's settings. Default: the .config file next to the file of cubic forces, if it exists.
     #[arg(long, value_name = "FILE.config")]
     pub(crate) config: Option<PathBuf>,
     /// Folder to search for the file of cubic forces.
-    #[arg(long, value_name = "DIR")]
-    pub(crate) files: Option<PathBuf>,
+    #[arg(long = "files", value_name = "DIR")]
+    pub(crate) folder: Option<PathBuf>,
 }
 
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct LoadOptions {
-    /// Deflection at equilibrium, as a fraction of the diagonal.
-    #[arg(long, default_value_t = 0.03, value_parser = parse_fraction)]
-    pub(crate) deflection: f64,
+    /// Deflection at equilibrium, as a fraction of the diagonal of the scene's bounds.
+    #[arg(long = "deflection", value_name = "DEFLECTION", default_value_t = 0.03, value_parser = parse_fraction)]
+    pub(crate) deflection_fraction: f64,
     /// Period of the load in seconds.
     #[arg(long, default_value_t = 2.0, value_parser = parse_positive)]
     pub(crate) period: f64,
     /// Direction of the load: across the bridge and slightly upwards (a wind), down (a weight), or up.
-    #[arg(long, value_enum, default_value = "across")]
-    pub(crate) toward: LoadDirectionOption,
+    #[arg(long = "toward", value_name = "TOWARD", value_enum, default_value = "across")]
+    pub(crate) direction: LoadDirectionOption,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]

@@ -1,5 +1,5 @@
-//! Reduced StVK forces of r coordinates, read from a `.cub` file: f(q) = L q + quadratic + cubic monomials, with
-//! Jacobian and potential.
+//! Reduced StVK (Saint Venant-Kirchhoff) forces of r coordinates, read from a `.cub` file. The force f(q) is a
+//! polynomial of degree three without a constant term. This module also computes its Jacobian and potential.
 //!
 //! File format: four little-endian i32 (r, then the numbers of monomials of degree one, two and three: r, r(r+1)/2 and
 //! r(r+1)(r+2)/6), followed by one f64 block per degree, row-major per force component. The monomials q_i q_j (i <= j)
@@ -19,11 +19,12 @@ const HEADER_BYTES: usize = 16;
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReducedForce {
     rank: usize,
-    linear: DMatrix<f64>,
+    /// r x r: the stiffness at rest.
+    linear_block: DMatrix<f64>,
     /// Row-major: one row per force component, one column per monomial of degree two.
-    quadratic: Vec<f64>,
+    quadratic_block: Vec<f64>,
     /// Row-major: one row per force component, one column per monomial of degree three.
-    cubic: Vec<f64>,
+    cubic_block: Vec<f64>,
 }
 
 impl ReducedForce {
@@ -47,7 +48,8 @@ impl ReducedForce {
                 return Err(invalid_input(format!("{field}[{index}]"), "a finite number", block[index]));
             }
         }
-        Ok(Self { rank, linear: DMatrix::from_row_slice(rank, rank, linear), quadratic, cubic })
+        let linear_block = DMatrix::from_row_slice(rank, rank, linear);
+        Ok(Self { rank, linear_block, quadratic_block: quadratic, cubic_block: cubic })
     }
 
     /// Reads a file.
@@ -78,7 +80,7 @@ impl ReducedForce {
                 return Err(invalid_input(field, format!("{count} monomials for r = {rank}"), word));
             }
         }
-        // Cannot overflow: with r at most 512 the size is below 2^37 bytes.
+        // With r at most 512, the size is below 2^37 bytes and cannot overflow.
         let body_bytes = 8 * rank * counts.iter().sum::<usize>();
         if body.len() != body_bytes {
             return Err(invalid_input("cub.size", format!("{} bytes", HEADER_BYTES + body_bytes), bytes.len()));
@@ -95,32 +97,32 @@ impl ReducedForce {
     }
 
     /// The stiffness at rest, r x r.
-    pub const fn linear(&self) -> &DMatrix<f64> {
-        &self.linear
+    pub const fn rest_stiffness(&self) -> &DMatrix<f64> {
+        &self.linear_block
     }
 
     /// The force f(q), r entries.
     pub fn force(&self, q: &DVector<f64>) -> DVector<f64> {
-        let [linear, quadratic, cubic] = self.force_terms(q);
-        linear + quadratic + cubic
+        let [linear_term, quadratic_term, cubic_term] = self.force_terms(q);
+        linear_term + quadratic_term + cubic_term
     }
 
-    /// The potential V(q), whose gradient is f. The term f_d of degree d has the potential q . f_d / (d + 1) (Euler's
-    /// theorem on homogeneous functions).
+    /// The potential V(q), whose gradient is f. By Euler's theorem on homogeneous functions, the term f_d of degree d
+    /// has the potential q . f_d / (d + 1).
     pub fn potential(&self, q: &DVector<f64>) -> f64 {
-        let [linear, quadratic, cubic] = self.force_terms(q);
-        q.dot(&linear) / 2.0 + q.dot(&quadratic) / 3.0 + q.dot(&cubic) / 4.0
+        let [linear_term, quadratic_term, cubic_term] = self.force_terms(q);
+        q.dot(&linear_term) / 2.0 + q.dot(&quadratic_term) / 3.0 + q.dot(&cubic_term) / 4.0
     }
 
     /// The Jacobian df/dq, r x r.
     pub fn jacobian(&self, q: &DVector<f64>) -> DMatrix<f64> {
-        let mut matrix = self.linear.clone();
+        let mut matrix = self.linear_block.clone();
         let [_, quadratic_count, cubic_count] = monomial_counts(self.rank).unwrap_or_default();
         for row in 0..self.rank {
-            let mut quadratic = self.quadratic[row * quadratic_count..][..quadratic_count].iter();
-            let mut cubic = self.cubic[row * cubic_count..][..cubic_count].iter();
+            let mut quadratic_entries = self.quadratic_block[row * quadratic_count..][..quadratic_count].iter();
+            let mut cubic_entries = self.cubic_block[row * cubic_count..][..cubic_count].iter();
             for i in 0..self.rank {
-                for (j, entry) in (i..self.rank).zip(&mut quadratic) {
+                for (j, entry) in (i..self.rank).zip(&mut quadratic_entries) {
                     matrix[(row, i)] += entry * q[j];
                     matrix[(row, j)] += entry * q[i];
                 }
@@ -128,7 +130,7 @@ impl ReducedForce {
             for i in 0..self.rank {
                 for j in i..self.rank {
                     let product = q[i] * q[j];
-                    for (k, entry) in (j..self.rank).zip(&mut cubic) {
+                    for (k, entry) in (j..self.rank).zip(&mut cubic_entries) {
                         matrix[(row, i)] += entry * q[j] * q[k];
                         matrix[(row, j)] += entry * q[i] * q[k];
                         matrix[(row, k)] += entry * product;
@@ -150,14 +152,14 @@ impl ReducedForce {
                 cubic_monomials.extend((j..self.rank).map(|k| product * q[k]));
             }
         }
-        let multiply = |block: &[f64], monomials: &[f64]| {
+        let multiply_block = |block: &[f64], monomials: &[f64]| {
             let rows = block.chunks_exact(monomials.len().max(1));
             let dot = |row: &[f64]| row.iter().zip(monomials).map(|(a, b)| a * b).sum::<f64>();
             DVector::from_iterator(self.rank, rows.map(dot))
         };
-        let quadratic = multiply(&self.quadratic, &quadratic_monomials);
-        let cubic = multiply(&self.cubic, &cubic_monomials);
-        [&self.linear * q, quadratic, cubic]
+        let quadratic_term = multiply_block(&self.quadratic_block, &quadratic_monomials);
+        let cubic_term = multiply_block(&self.cubic_block, &cubic_monomials);
+        [&self.linear_block * q, quadratic_term, cubic_term]
     }
 }
 
@@ -221,8 +223,8 @@ pub(crate) mod tests {
         for count in [force.rank, linear_count, quadratic_count, cubic_count] {
             bytes.extend((count as i32).to_le_bytes());
         }
-        let linear = force.linear.transpose();
-        let blocks = linear.as_slice().iter().chain(&force.quadratic).chain(&force.cubic);
+        let linear = force.linear_block.transpose();
+        let blocks = linear.as_slice().iter().chain(&force.quadratic_block).chain(&force.cubic_block);
         blocks.for_each(|number| bytes.extend(number.to_le_bytes()));
         bytes
     }
@@ -257,13 +259,13 @@ pub(crate) mod tests {
         for seed in 0..8 {
             let q = random_vector(seed, 4);
             let JacobianErrors { difference, asymmetry } = jacobian_errors(&force, &q);
-            assert!(difference <= 1e-8 && asymmetry <= 1e-14, "{difference} {asymmetry}");
+            assert!(difference <= 1e-8 && asymmetry <= 1e-14, "difference {difference}, asymmetry {asymmetry}");
             let slope = (force.potential(&(&q * (1.0 + 1e-6))) - force.potential(&(&q * (1.0 - 1e-6)))) / 2e-6;
             assert!((slope - q.dot(&force.force(&q))).abs() <= 1e-6 * slope.abs().max(1.0), "{slope}");
         }
         assert_eq!(force.force(&DVector::zeros(4)), DVector::zeros(4));
         let mut non_gradient = force;
-        non_gradient.cubic[1] += 50.0;
+        non_gradient.cubic_block[1] += 50.0;
         let asymmetry = jacobian_errors(&non_gradient, &random_vector(1, 4)).asymmetry;
         assert!(asymmetry > 1e-4, "expected an asymmetric Jacobian, got the asymmetry {asymmetry}");
     }
@@ -321,8 +323,8 @@ pub(crate) mod tests {
     fn simple_bridge_has_a_lowest_frequency_of_one_hertz() {
         let path = data_folder().join("vega/simpleBridge/simpleBridge.cub");
         let force = ReducedForce::read(&path).expect("a valid file");
-        let lowest = force.linear().clone().symmetric_eigenvalues().min();
-        let hertz = lowest.sqrt() / (2.0 * std::f64::consts::PI);
+        let lowest_eigenvalue = force.rest_stiffness().clone().symmetric_eigenvalues().min();
+        let hertz = lowest_eigenvalue.sqrt() / (2.0 * std::f64::consts::PI);
         assert!((hertz - 1.0).abs() <= 1e-3, "{hertz} Hz");
     }
 }

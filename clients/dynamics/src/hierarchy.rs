@@ -1,15 +1,15 @@
-//! Transforms of a hierarchy of domains that keep every joint closed. The transform T of a child is the product of its
-//! parent's T, the rigid transform that best fits the displacement U q of the parent's attachment vertices, and
-//! `parent_from_child` at rest.
+//! Transforms of a hierarchy of domains that keep every joint closed. The transform T of a child is the product of
+//! three transforms: its parent's T, the rigid transform that best fits the displacement U q of the parent's attachment
+//! vertices, and `parent_from_child` at rest.
 
 use nalgebra::Vector3;
 
 use crate::affine::{AffineTransform, fit_rigid_transform};
 use crate::model::{DomainModel, Joint, Model};
 
-/// Computes `world_from_domain` of every domain at the coordinates `q` of the scene. `local_transforms` move domains
-/// within their own frames, for example a leaf that rotates about its stalk. Domains without an entry do not move in
-/// their frames.
+/// Computes `world_from_domain` of every domain at the coordinates `q` of the scene. `local_transforms` has an optional
+/// motion of each domain within its own frame, for example the rotation of a leaf about its stalk. The list may be
+/// shorter than the list of domains.
 pub fn compute_transforms(
     model: &Model,
     q: &[f64],
@@ -17,33 +17,33 @@ pub fn compute_transforms(
 ) -> Vec<AffineTransform> {
     let mut world_from_domain: Vec<AffineTransform> = Vec::with_capacity(model.domains.len());
     for (index, domain) in model.domains.iter().enumerate() {
-        let attached = match &domain.joint {
+        let world_from_attached = match &domain.joint {
             None => domain.placement,
             Some(joint) => {
                 let parent_from_child = deformed_attachment(&model.domains[joint.parent], joint, q);
                 world_from_domain[joint.parent].compose(&parent_from_child)
             }
         };
-        let local = local_transforms.get(index).and_then(Option::as_ref);
-        world_from_domain.push(local.map_or(attached, |local| attached.compose(local)));
+        let local_transform = local_transforms.get(index).and_then(Option::as_ref);
+        world_from_domain.push(local_transform.map_or(world_from_attached, |local| world_from_attached.compose(local)));
     }
     world_from_domain
 }
 
-/// `parent_from_child` after the rigid transform that fits the displacement of the parent's attachment vertices.
+/// `parent_from_child`, moved by the rigid transform that fits the displacement of the parent's attachment vertices.
 fn deformed_attachment(parent: &DomainModel, joint: &Joint, q: &[f64]) -> AffineTransform {
     if parent.rank == 0 || joint.attachment_samples.is_empty() {
         return joint.parent_from_child;
     }
     let q = parent.q(q);
     let samples = || joint.attachment_samples.iter().map(|index| &parent.samples[*index]);
-    let rest: Vec<_> = samples().map(|sample| sample.rest).collect();
+    let rest: Vec<_> = samples().map(|sample| sample.rest_position).collect();
     let current: Vec<_> = samples().map(|sample| sample.deformed_position(q)).collect();
     fit_rigid_transform(&rest, &current).compose(&joint.parent_from_child)
 }
 
-/// Measures how far joints open: compares the distances between a child's base vertex and the attachment vertices of its
-/// parent with those at rest. The measurement does not depend on how the transforms are computed.
+/// Measures how far joints open. It compares the distances between a child's base vertex and the attachment vertices of
+/// its parent with the same distances at rest.
 #[derive(Debug, Clone)]
 pub struct JointGapMeter {
     /// Distances at rest, per domain and attachment vertex.
@@ -62,7 +62,7 @@ impl JointGapMeter {
     pub fn max_gap(&self, model: &Model, q: &[f64], world_from_domain: &[AffineTransform]) -> f64 {
         let distances = joint_distances(model, q, world_from_domain);
         let pairs = distances.iter().flatten().zip(self.rest_distances.iter().flatten());
-        pairs.map(|(distance, rest)| (distance - rest).abs()).fold(0.0, f64::max)
+        pairs.map(|(distance, rest_distance)| (distance - rest_distance).abs()).fold(0.0, f64::max)
     }
 }
 
@@ -73,15 +73,16 @@ fn joint_distances(model: &Model, q: &[f64], world_from_domain: &[AffineTransfor
         let Some(joint) = &domain.joint else { return vec![] };
         let (parent, world_from_parent) = (&model.domains[joint.parent], &world_from_domain[joint.parent]);
         let base_sample = domain.base_sample.map(|index| &domain.samples[index]);
-        let rest_base = base_sample.map_or(Vector3::zeros(), |sample| sample.rest);
-        let base = transform.apply(&base_sample.map_or(rest_base, |sample| sample.deformed_position(domain.q(q))));
+        let rest_base_position = base_sample.map_or(Vector3::zeros(), |sample| sample.rest_position);
+        let base_position =
+            transform.apply(&base_sample.map_or(rest_base_position, |sample| sample.deformed_position(domain.q(q))));
         if parent.rank == 0 || joint.attachment_samples.is_empty() {
-            let expected_base = world_from_parent.compose(&joint.parent_from_child).apply(&rest_base);
-            return vec![(base - expected_base).norm()];
+            let attached_base_position = world_from_parent.compose(&joint.parent_from_child).apply(&rest_base_position);
+            return vec![(base_position - attached_base_position).norm()];
         }
         let distance = |index: &usize| {
             let sample = &parent.samples[*index];
-            (world_from_parent.apply(&sample.deformed_position(parent.q(q))) - base).norm()
+            (world_from_parent.apply(&sample.deformed_position(parent.q(q))) - base_position).norm()
         };
         joint.attachment_samples.iter().map(distance).collect()
     };
@@ -103,13 +104,13 @@ pub(crate) mod tests {
             for vertex in 0..6 {
                 let angle = f64::from(vertex) * std::f64::consts::PI / 3.0;
                 let (x, z) = (radius * angle.cos(), radius * angle.sin());
-                // Displacement y^2 sideways per unit of q (1 at the tip), with slope 2 y.
+                // Per unit of q, the displacement is y^2 sideways, so that it is 1 at the tip. Its slope is 2 y.
                 let mode_rows = vec![y * y, 0.0, -2.0 * y * x, -2.0 * y * z, 0.0, y * y];
-                samples.push(Sample { rest: Vector3::new(x, y, z), mode_rows });
+                samples.push(Sample { rest_position: Vector3::new(x, y, z), mode_rows });
             }
         }
         let surface_sample_count = samples.len();
-        samples.push(Sample { rest: Vector3::zeros(), mode_rows: vec![0.0; 6] });
+        samples.push(Sample { rest_position: Vector3::zeros(), mode_rows: vec![0.0; 6] });
         DomainModel {
             name: "beam".into(),
             rank: 2,

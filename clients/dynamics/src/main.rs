@@ -28,19 +28,19 @@ const MAX_TREE_SAMPLES: usize = 24;
 const MAX_SAMPLES: usize = 1 << 16;
 
 /// The exit code of a complete run in which the server rejected steps.
-const STEPS_REJECTED: u8 = 6;
+const EXIT_STEPS_REJECTED: u8 = 6;
 
 fn main() -> ExitCode {
     let arguments = Cli::parse();
     let main = async {
         let summary = run_scenario(&arguments).await?;
         print_report(&summary.report, arguments.command.common().json);
-        Ok(if summary.rejected > 0 { STEPS_REJECTED } else { 0 })
+        Ok(if summary.rejected_steps > 0 { EXIT_STEPS_REJECTED } else { 0 })
     };
     program::run("modalcast-sim", main, exit_code)
 }
 
-/// The documented exit code of an error.
+/// The exit code of an error. The help text in `cli.rs` lists the codes.
 const fn exit_code(error: &Error) -> u8 {
     match error {
         Error::Client(error) => program::exit_code(error),
@@ -56,7 +56,7 @@ async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
         None => common.scene.clone(),
     };
     let mut scenario = create_scenario(&client, &scene, &arguments.command).await?;
-    let (stop_sender, stop) = watch::channel(false);
+    let (stop_sender, stop_receiver) = watch::channel(false);
     tokio::spawn(async move {
         wait_for_shutdown_signal().await;
         stop_sender.send_replace(true);
@@ -73,7 +73,7 @@ async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
         realtime: common.realtime,
         record_folder: common.record.clone(),
     };
-    drive_scene(&client, scenario.as_mut(), &options, &stop).await
+    drive_scene(&client, scenario.as_mut(), &options, &stop_receiver).await
 }
 
 /// Waits for Ctrl-C or SIGTERM.
@@ -95,26 +95,32 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
     match command {
         Command::Tree { wind, .. } => {
             let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
-            let (strength, direction) = (wind.wind, wind.direction.to_radians());
-            let options = TreeOptions { dt, steps, sway: wind.sway, wind: strength, direction, seed: wind.seed };
+            let options = TreeOptions {
+                dt,
+                steps,
+                sway_fraction: wind.sway_fraction,
+                wind_strength: wind.strength,
+                direction_radians: wind.direction_degrees.to_radians(),
+                seed: wind.seed,
+            };
             Ok(Box::new(TreeScenario::new(model, options)?))
         }
         Command::Bridge { files, load, .. } => {
             let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
             let options = BridgeOptions {
                 dt,
-                deflection_fraction: load.deflection,
+                deflection_fraction: load.deflection_fraction,
                 period: load.period,
-                load_direction: load.toward.into(),
+                load_direction: load.direction.into(),
             };
             create_bridge_scenario(model, files, options)
         }
-        Command::Sweep { share, .. } => {
+        Command::Sweep { displacement_fraction, .. } => {
             let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
-            let options = SweepOptions { dt, steps, displacement_fraction: *share };
+            let options = SweepOptions { dt, steps, displacement_fraction: *displacement_fraction };
             Ok(Box::new(SweepScenario::new(model, options)))
         }
-        Command::Auto { files, load, wind, share, .. } => {
+        Command::Auto { files, load, wind, displacement_fraction, .. } => {
             // A model with few samples is enough to choose the scenario.
             let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
             let command = if find_force_file(&model, files).is_some() {
@@ -122,7 +128,7 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
             } else if model.domains.iter().any(|domain| !domain.eigenvalues.is_empty()) {
                 Command::Tree { common: common.clone(), wind: *wind }
             } else {
-                Command::Sweep { common: common.clone(), share: *share }
+                Command::Sweep { common: common.clone(), displacement_fraction: *displacement_fraction }
             };
             eprintln!("modalcast-sim: {scene}: scenario `{}`", command.name());
             Box::pin(create_scenario(client, scene, &command)).await
@@ -141,16 +147,16 @@ fn create_bridge_scenario(model: Model, files: &ForceFileOptions, options: Bridg
     Ok(Box::new(BridgeScenario::new(model, ReducedForce::read(&force_path)?, &settings, options)?))
 }
 
-/// Finds the file of reduced forces: the one of `--cubic`, or the one in `--files` that a note of the scene names, or
-/// the only one in `--files`.
+/// Finds the file of reduced forces. It is the first of these that is given: `--cubic`, the file in `--files` that the
+/// note `vega.cubic` of a domain names, and the only .cub file in `--files`.
 fn find_force_file(model: &Model, files: &ForceFileOptions) -> Option<PathBuf> {
     if let Some(path) = &files.cubic {
         return Some(path.clone());
     }
-    let folder = files.files.as_deref()?;
+    let folder = files.folder.as_deref()?;
     let notes = model.domains.iter().filter_map(|domain| domain.notes.get("vega.cubic"));
-    let noted_paths = notes.filter_map(|note| Path::new(note).file_name()).map(|name| folder.join(name));
-    let mut candidates: Vec<PathBuf> = noted_paths.filter(|path| path.is_file()).collect();
+    let paths_in_notes = notes.filter_map(|note| Path::new(note).file_name()).map(|name| folder.join(name));
+    let mut candidates: Vec<PathBuf> = paths_in_notes.filter(|path| path.is_file()).collect();
     if candidates.is_empty() {
         let paths = folder.read_dir().ok()?.filter_map(|entry| Some(entry.ok()?.path()));
         candidates = paths.filter(|path| path.extension().is_some_and(|extension| extension == "cub")).collect();

@@ -14,14 +14,13 @@ use crate::error::{Result, invalid_input};
 /// Maximum number of entries of U that the surface samples of all domains have together.
 const MAX_MODE_ENTRIES: usize = 8 << 20;
 
-/// Minimum number of surface samples per domain (or all vertices of a smaller domain), whatever `MAX_MODE_ENTRIES` is.
+/// Number of surface samples per domain that `MAX_MODE_ENTRIES` does not reduce. A smaller domain has all its vertices.
 const MIN_SURFACE_SAMPLES: usize = 8;
 
 /// A vertex at which the dynamics measures displacements or applies loads.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
-    /// Rest position.
-    pub rest: Vector3<f64>,
+    pub rest_position: Vector3<f64>,
     /// Rows of U at this vertex: 3 x r, row-major.
     pub mode_rows: Vec<f64>,
 }
@@ -33,7 +32,7 @@ pub struct Joint {
     pub parent: usize,
     /// `parent_from_child` at rest.
     pub parent_from_child: AffineTransform,
-    /// Indices of the parent's samples whose displacement moves the joint; empty for a rigid parent.
+    /// Indices of the parent's samples whose displacement moves the joint. Empty for a rigid parent.
     pub attachment_samples: Vec<usize>,
 }
 
@@ -80,12 +79,12 @@ pub struct Model {
     pub bounds_max: Vector3<f64>,
 }
 
-/// The horizontal axes of a scene. `long`, `short` and the up axis form a right-handed system.
+/// The horizontal axes of a scene. `long_axis`, `short_axis` and the up axis form a right-handed system.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GroundAxes {
     /// The axis along which the bounds are longer.
-    pub long: Vector3<f64>,
-    pub short: Vector3<f64>,
+    pub long_axis: Vector3<f64>,
+    pub short_axis: Vector3<f64>,
 }
 
 impl Sample {
@@ -99,14 +98,14 @@ impl Sample {
         &self.mode_rows[component * rank..][..rank]
     }
 
-    /// One column of the three rows.
+    /// One column of the three rows of U.
     pub fn column(&self, mode: usize, rank: usize) -> Vector3<f64> {
         Vector3::from_fn(|component, _| self.mode_rows[component * rank + mode])
     }
 
     /// Displaced position of the vertex, in the frame of its domain.
     pub fn deformed_position(&self, q: &[f64]) -> Vector3<f64> {
-        self.rest + self.displacement(q)
+        self.rest_position + self.displacement(q)
     }
 }
 
@@ -134,11 +133,11 @@ impl Model {
     /// # Errors
     /// `Client` as for the calls; `Invalid` if the description contradicts itself.
     pub async fn fetch(client: &Client, scene: &str, max_surface_samples: usize) -> Result<Self> {
-        let without_arrays = client.describe(scene, &[]).await?;
-        let has_modes = without_arrays.domains.iter().any(|domain| domain.rank > 0);
-        let has_eigenvalues = without_arrays.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
+        let description_without_arrays = client.describe(scene, &[]).await?;
+        let has_modes = description_without_arrays.domains.iter().any(|domain| domain.rank > 0);
+        let has_eigenvalues = description_without_arrays.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
         let description = match (has_modes, has_eigenvalues) {
-            (false, _) => without_arrays,
+            (false, _) => description_without_arrays,
             (true, false) => client.describe(scene, &[DomainArray::RestPositions]).await?,
             (true, true) => {
                 client
@@ -150,18 +149,20 @@ impl Model {
         let max_surface_samples =
             max_surface_samples.min(MAX_MODE_ENTRIES / entries_per_sample.max(1)).max(MIN_SURFACE_SAMPLES);
         let selections = select_vertices(&description, max_surface_samples)?;
-        let mut modes = BTreeMap::new();
+        let mut mode_rows_by_vertices = BTreeMap::new();
         for (domain, selection) in description.domains.iter().zip(&selections) {
             let key = (domain.shape, selection.vertices.clone());
-            if domain.rank > 0 && !modes.contains_key(&key) {
-                let rows = client.read_modes(scene, domain.index, &selection.vertices).await?;
-                if rows.rank != domain.rank {
-                    return Err(invalid_input(format!("rank of '{}'", domain.name), domain.rank, rows.rank));
+            if domain.rank > 0 && !mode_rows_by_vertices.contains_key(&key) {
+                let mode_rows = client.read_modes(scene, domain.index, &selection.vertices).await?;
+                if mode_rows.rank != domain.rank {
+                    return Err(invalid_input(format!("rank of '{}'", domain.name), domain.rank, mode_rows.rank));
                 }
-                modes.insert(key, rows);
+                mode_rows_by_vertices.insert(key, mode_rows);
             }
         }
-        Self::assemble(&description, selections, |domain, vertices| modes.get(&(domain.shape, vertices.to_vec())))
+        Self::assemble(&description, selections, |domain, vertices| {
+            mode_rows_by_vertices.get(&(domain.shape, vertices.to_vec()))
+        })
     }
 
     fn assemble<'a>(
@@ -172,12 +173,14 @@ impl Model {
         let mut domains: Vec<DomainModel> = vec![];
         let mut coordinate_count = 0;
         for (domain, selection) in description.domains.iter().zip(&selections) {
-            let first_coordinate = match domain.shares_q_with.map(|owner| domains.get(owner)) {
+            let first_coordinate = match domain.shares_q_with {
                 None => coordinate_count,
-                Some(Some(owner)) if owner.rank == domain.rank => owner.first_coordinate,
-                Some(_) => {
-                    let field = format!("domain whose q '{}' shares", domain.name);
-                    return Err(invalid_input(field, "an earlier domain of the same rank", "another domain"));
+                Some(owner) => {
+                    let owner_model = domains.get(owner).filter(|owner_model| owner_model.rank == domain.rank);
+                    owner_model.map(|owner_model| owner_model.first_coordinate).ok_or_else(|| {
+                        let field = format!("domain whose q '{}' shares", domain.name);
+                        invalid_input(field, "an earlier domain of the same rank", format!("domain {owner}"))
+                    })?
                 }
             };
             let owns_q = domain.shares_q_with.is_none();
@@ -220,12 +223,13 @@ impl Model {
 
     /// The horizontal axes, ordered by the size of the bounds at rest.
     pub fn ground_axes(&self) -> GroundAxes {
-        let (first, second) = (self.horizontal_direction(0.0), self.horizontal_direction(std::f64::consts::FRAC_PI_2));
-        let size = |axis: &Vector3<f64>| (self.bounds_max - self.bounds_min).dot(&axis.abs());
-        if size(&second) > size(&first) {
-            GroundAxes { long: second, short: -first }
+        let (first_axis, second_axis) =
+            (self.horizontal_direction(0.0), self.horizontal_direction(std::f64::consts::FRAC_PI_2));
+        let extent = |axis: &Vector3<f64>| (self.bounds_max - self.bounds_min).dot(&axis.abs());
+        if extent(&second_axis) > extent(&first_axis) {
+            GroundAxes { long_axis: second_axis, short_axis: -first_axis }
         } else {
-            GroundAxes { long: first, short: second }
+            GroundAxes { long_axis: first_axis, short_axis: second_axis }
         }
     }
 
@@ -235,7 +239,7 @@ impl Model {
         let domain_displacement = |(domain, transform): (&DomainModel, &AffineTransform)| {
             let sample_displacement = |sample: &Sample| {
                 let current = transform.apply(&sample.deformed_position(domain.q(q)));
-                (current - domain.placement.apply(&sample.rest)).norm()
+                (current - domain.placement.apply(&sample.rest_position)).norm()
             };
             let origin_displacement = (transform.translation - domain.placement.translation).norm();
             domain.surface_samples().iter().map(sample_displacement).fold(origin_displacement, f64::max)
@@ -244,13 +248,14 @@ impl Model {
     }
 }
 
-/// The vertices of a domain to read: first `surface_sample_count` evenly spread ones, then the others that joints need.
+/// The vertices of a domain to read: first `surface_sample_count` evenly spread vertices, then further vertices that
+/// joints need.
 struct SelectedVertices {
     vertices: Vec<u32>,
     surface_sample_count: usize,
 }
 
-/// Selects the vertices of every domain; no vertices for domains without rest positions.
+/// Selects the vertices of every domain. Domains without rest positions have none.
 fn select_vertices(description: &SceneDescription, max_surface_samples: usize) -> Result<Vec<SelectedVertices>> {
     let domains = &description.domains;
     let mut attachment_vertices: Vec<BTreeSet<u32>> = vec![BTreeSet::new(); domains.len()];
@@ -267,18 +272,19 @@ fn select_vertices(description: &SceneDescription, max_surface_samples: usize) -
         }
         attachment_vertices[attachment.parent].extend(&attachment.parent_vertices);
     }
-    let select = |(domain, attachment_vertices): (&Domain, BTreeSet<u32>)| {
+    let select_for_domain = |(domain, attachment_vertices): (&Domain, BTreeSet<u32>)| {
         if domain.rest_positions.is_empty() {
             return SelectedVertices { vertices: vec![], surface_sample_count: 0 };
         }
-        let count = domain.vertex_count.min(max_surface_samples);
-        let mut vertices: Vec<u32> = (0..count).map(|ordinal| (ordinal * domain.vertex_count / count) as u32).collect();
+        let surface_sample_count = domain.vertex_count.min(max_surface_samples);
+        let spread_vertex = |ordinal: usize| (ordinal * domain.vertex_count / surface_sample_count) as u32;
+        let mut vertices: Vec<u32> = (0..surface_sample_count).map(spread_vertex).collect();
         let surface_vertices: BTreeSet<u32> = vertices.iter().copied().collect();
         let joint_vertices = attachment_vertices.into_iter().chain([base_vertex(domain)]).collect::<BTreeSet<_>>();
         vertices.extend(joint_vertices.difference(&surface_vertices));
-        SelectedVertices { vertices, surface_sample_count: count }
+        SelectedVertices { vertices, surface_sample_count }
     };
-    Ok(domains.iter().zip(attachment_vertices).map(select).collect())
+    Ok(domains.iter().zip(attachment_vertices).map(select_for_domain).collect())
 }
 
 /// Index of the vertex nearest to the domain's origin.
@@ -292,18 +298,19 @@ fn rest_position(domain: &Domain, vertex: u32) -> Vector3<f64> {
     Vector3::from_fn(|component, _| f64::from(domain.rest_positions[3 * vertex as usize + component]))
 }
 
-/// The samples of a domain's selected vertices; without rows of U if `mode_rows` is `None`.
+/// The samples of a domain's selected vertices. They have no rows of U if `mode_rows` is `None`.
 fn create_samples(domain: &Domain, selection: &SelectedVertices, mode_rows: Option<&ModeRows>) -> Result<Vec<Sample>> {
     let sample = |(ordinal, vertex): (usize, &u32)| {
         let rows = match mode_rows {
             Some(mode_rows) => mode_rows.rows_of(ordinal).ok_or_else(|| {
                 let field = format!("rows of U of '{}'", domain.name);
-                invalid_input(field, format!("rows of {} vertices", selection.vertices.len()), ordinal)
+                let expected = format!("rows of {} vertices", selection.vertices.len());
+                invalid_input(field, expected, format!("rows of {ordinal}"))
             })?,
             None => &[],
         };
         let mode_rows = rows.iter().map(|entry| f64::from(*entry)).collect();
-        Ok(Sample { rest: rest_position(domain, *vertex), mode_rows })
+        Ok(Sample { rest_position: rest_position(domain, *vertex), mode_rows })
     };
     selection.vertices.iter().enumerate().map(sample).collect()
 }
@@ -322,7 +329,8 @@ fn create_domain_model(domain: &Domain, selection: &SelectedVertices, samples: V
         notes: domain.notes.clone(),
         area: surface_area(domain),
         diagonal: bounds_diagonal(domain),
-        base_sample: base_vertex.and_then(|base| selection.vertices.iter().position(|vertex| *vertex == base)),
+        base_sample: base_vertex
+            .and_then(|base_vertex_index| selection.vertices.iter().position(|vertex| *vertex == base_vertex_index)),
         samples,
         surface_sample_count: selection.surface_sample_count,
     }

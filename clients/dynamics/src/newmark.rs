@@ -13,10 +13,10 @@
 //! diverge.
 //!
 //! Average acceleration conserves the energy of a linear system exactly and that of a nonlinear system approximately.
-//! The energy error, which is the spurious gain accumulated over the steps, may not exceed `ENERGY_TOLERANCE` times the
-//! highest energy so far. A step that would exceed it is repeated with backward Euler. The velocity of that step is
-//! scaled down if its kinetic energy exceeds what the previous energy and the work of the load allow. The solution
-//! therefore stays bounded at any step size.
+//! The energy error is the spurious gain accumulated over the steps. It may not exceed `ENERGY_TOLERANCE` times the
+//! highest energy so far. A step that would exceed this bound is repeated with backward Euler. The velocity of that step
+//! is scaled down if its energy exceeds the previous energy plus the work of the load. The solution therefore stays
+//! bounded at any step size.
 
 use nalgebra::{Cholesky, DMatrix, DVector};
 
@@ -46,8 +46,8 @@ pub struct ReducedSystem {
 /// The load at the start and at the end of a step. It changes linearly in between.
 #[derive(Debug, Clone, Copy)]
 pub struct LoadChange<'a> {
-    pub before: &'a DVector<f64>,
-    pub after: &'a DVector<f64>,
+    pub start: &'a DVector<f64>,
+    pub end: &'a DVector<f64>,
 }
 
 /// Coordinates, velocities and accelerations at one time.
@@ -65,9 +65,9 @@ pub struct NewmarkState {
 /// The constants of the objective in the module documentation.
 struct StepObjective<'a> {
     /// c, in 1/s^2.
-    inertia: f64,
+    inertia_coefficient: f64,
     /// d, in 1/s.
-    rate: f64,
+    velocity_coefficient: f64,
     /// q_p.
     predicted_q: DVector<f64>,
     /// v_p.
@@ -82,7 +82,7 @@ impl ReducedSystem {
     /// `Invalid` if the stiffness at rest is not positive definite.
     pub fn new(force: ReducedForce, settings: &VegaSettings) -> Result<Self> {
         let scale = settings.base_frequency * settings.base_frequency;
-        let stiffness = (force.linear() + force.linear().transpose()) * (0.5 * scale);
+        let stiffness = (force.rest_stiffness() + force.rest_stiffness().transpose()) * (0.5 * scale);
         if Cholesky::new(stiffness.clone()).is_none() {
             let eigenvalue = stiffness.symmetric_eigenvalues().min();
             let given = format!("one with the eigenvalue {eigenvalue}");
@@ -100,9 +100,9 @@ impl ReducedSystem {
 
     /// Natural frequencies at rest in hertz, lowest first.
     pub fn frequencies(&self) -> Vec<f64> {
-        let eigenvalues = (self.force.linear() * self.scale).symmetric_eigenvalues();
+        let eigenvalues = (self.force.rest_stiffness() * self.scale).symmetric_eigenvalues();
         let mut hertz: Vec<f64> =
-            eigenvalues.iter().map(|value| value.max(0.0).sqrt() / (2.0 * std::f64::consts::PI)).collect();
+            eigenvalues.iter().map(|eigenvalue| eigenvalue.max(0.0).sqrt() / (2.0 * std::f64::consts::PI)).collect();
         hertz.sort_by(f64::total_cmp);
         hertz
     }
@@ -112,7 +112,8 @@ impl ReducedSystem {
         self.static_state(DVector::zeros(self.rank()))
     }
 
-    /// The state at `q` with zero velocity and acceleration, in equilibrium with a load.
+    /// The state at `q` with zero velocity and acceleration. The caller must apply a load under which
+    /// `q` is in equilibrium.
     pub fn static_state(&self, q: DVector<f64>) -> NewmarkState {
         let zero = DVector::zeros(self.rank());
         let max_energy = self.scale * self.force.potential(&q);
@@ -128,69 +129,77 @@ impl ReducedSystem {
     pub fn solve_equilibrium(&self, load: &DVector<f64>, initial_guess: &DVector<f64>) -> DVector<f64> {
         let predicted_v = DVector::zeros(self.rank());
         let predicted_q = initial_guess.clone();
-        let objective = StepObjective { inertia: 0.0, rate: 0.0, predicted_q, predicted_v, load };
+        let objective =
+            StepObjective { inertia_coefficient: 0.0, velocity_coefficient: 0.0, predicted_q, predicted_v, load };
         self.minimize(&objective, initial_guess)
     }
 
     /// Computes the state `dt` seconds later, under a changing load.
     #[must_use]
-    pub fn step(&self, state: &NewmarkState, dt: f64, load: LoadChange<'_>) -> NewmarkState {
-        let LoadChange { before, after } = load;
-        let next = self.step_average_acceleration(state, dt, after);
-        // The energy after the step by the balance of work and dissipation.
-        let balanced_energy = |next: &NewmarkState| {
-            let displacement = &next.q - &state.q;
-            let work = 0.5 * (before + after).dot(&displacement);
+    pub fn advance(&self, state: &NewmarkState, dt: f64, load: LoadChange<'_>) -> NewmarkState {
+        let LoadChange { start: start_load, end: end_load } = load;
+        let next_state = self.step_average_acceleration(state, dt, end_load);
+        // The expected energy after the step: the previous energy plus the work of the load minus the dissipation.
+        let balanced_energy = |next_state: &NewmarkState| {
+            let displacement = &next_state.q - &state.q;
+            let work = 0.5 * (start_load + end_load).dot(&displacement);
             let dissipated = (&self.damping * &displacement).dot(&displacement) / dt;
             self.energy(state) + work - dissipated
         };
-        let energy_error = state.energy_error + self.energy(&next) - balanced_energy(&next);
-        // A spurious gain must not raise the highest energy, which the tolerance refers to.
-        let max_energy = state.max_energy.max(self.energy(&next).min(balanced_energy(&next)));
+        let energy_error = state.energy_error + self.energy(&next_state) - balanced_energy(&next_state);
+        // The tolerance is relative to `max_energy`, so a spurious gain must not raise it.
+        let max_energy = state.max_energy.max(self.energy(&next_state).min(balanced_energy(&next_state)));
         if energy_error <= ENERGY_TOLERANCE * max_energy {
-            // Bound the credit of steps that lose energy.
+            // Limit the negative error of steps that lose energy, so that it cannot offset later gains.
             let energy_error = energy_error.max(-ENERGY_TOLERANCE * max_energy);
-            return NewmarkState { energy_error, max_energy, ..next };
+            return NewmarkState { energy_error, max_energy, ..next_state };
         }
-        let mut next = self.step_backward_euler(state, dt, after);
-        // Backward Euler damps fast modes. Its kinetic energy must not exceed the available energy.
-        let available_energy = (self.energy(state) + after.dot(&(&next.q - &state.q))).max(0.0);
-        let kinetic_energy = available_energy - self.scale * self.force.potential(&next.q);
-        let speed = next.v.norm();
+        let mut next_state = self.step_backward_euler(state, dt, end_load);
+        // Backward Euler damps fast modes, but it can gain energy where the potential is not convex (buckling). Limit the
+        // velocity so that the energy does not exceed the previous energy plus the work of the load.
+        let available_energy = (self.energy(state) + end_load.dot(&(&next_state.q - &state.q))).max(0.0);
+        let max_kinetic_energy = available_energy - self.scale * self.force.potential(&next_state.q);
+        let speed = next_state.v.norm();
         if speed > 0.0 {
-            next.v *= ((2.0 * kinetic_energy.max(0.0)).sqrt() / speed).min(1.0);
+            next_state.v *= ((2.0 * max_kinetic_energy.max(0.0)).sqrt() / speed).min(1.0);
         }
-        next.a = after - &self.damping * &next.v - self.force.force(&next.q) * self.scale;
-        let max_energy = state.max_energy.max(self.energy(&next));
-        NewmarkState { energy_error: state.energy_error.min(0.0), max_energy, ..next }
+        next_state.a = end_load - &self.damping * &next_state.v - self.force.force(&next_state.q) * self.scale;
+        let max_energy = state.max_energy.max(self.energy(&next_state));
+        NewmarkState { energy_error: state.energy_error.min(0.0), max_energy, ..next_state }
     }
 
     fn step_average_acceleration(&self, state: &NewmarkState, dt: f64, load: &DVector<f64>) -> NewmarkState {
-        let (inertia, rate) = (4.0 / (dt * dt), 2.0 / dt);
+        let (inertia_coefficient, velocity_coefficient) = (4.0 / (dt * dt), 2.0 / dt);
         let predicted_q = &state.q + &state.v * dt + &state.a * (0.25 * dt * dt);
         let predicted_v = &state.v + &state.a * (0.5 * dt);
-        let objective = StepObjective { inertia, rate, predicted_q, predicted_v, load };
+        let objective = StepObjective { inertia_coefficient, velocity_coefficient, predicted_q, predicted_v, load };
         let q = self.minimize(&objective, &state.q);
         let correction = &q - objective.predicted_q;
-        let v = objective.predicted_v + &correction * rate;
-        NewmarkState { q, v, a: correction * inertia, ..*state }
+        let v = objective.predicted_v + &correction * velocity_coefficient;
+        NewmarkState { q, v, a: correction * inertia_coefficient, ..*state }
     }
 
-    /// Keeps the acceleration of `state`; the caller computes the new one.
+    /// Returns the new state with the acceleration of `state`. The caller computes the new acceleration.
     fn step_backward_euler(&self, state: &NewmarkState, dt: f64, load: &DVector<f64>) -> NewmarkState {
         let predicted_q = &state.q + &state.v * dt;
         let predicted_v = state.v.clone();
-        let objective = StepObjective { inertia: 1.0 / (dt * dt), rate: 1.0 / dt, predicted_q, predicted_v, load };
+        let objective = StepObjective {
+            inertia_coefficient: 1.0 / (dt * dt),
+            velocity_coefficient: 1.0 / dt,
+            predicted_q,
+            predicted_v,
+            load,
+        };
         let q = self.minimize(&objective, &state.q);
         let v = (&q - &state.q) / dt;
         NewmarkState { q, v, ..state.clone() }
     }
 
-    /// Newton's method with a line search on the objective. Returns the last accepted point, which is no worse than the
-    /// start up to rounding.
-    fn minimize(&self, objective: &StepObjective<'_>, start: &DVector<f64>) -> DVector<f64> {
-        let mut q = start.clone();
-        let mut value = self.objective_value(objective, &q);
+    /// Minimizes the objective by Newton's method with a line search. Returns the last accepted point. Up to rounding,
+    /// its objective does not exceed that of `initial_guess`.
+    fn minimize(&self, objective: &StepObjective<'_>, initial_guess: &DVector<f64>) -> DVector<f64> {
+        let mut q = initial_guess.clone();
+        let mut objective_value = self.objective_value(objective, &q);
         for _ in 0..MAX_NEWTON_STEPS {
             let gradient = self.objective_gradient(objective, &q);
             let direction = self.newton_direction(objective, &q, &gradient);
@@ -199,22 +208,22 @@ impl ReducedSystem {
             if !is_descent {
                 return q;
             }
-            // Near the minimum the decrease is below the rounding error; there the norm of the gradient decides.
-            let inertial_scale = objective.inertia * (&q - &objective.predicted_q).norm_squared();
-            let rounding_error = 1e-13 * (value.abs() + inertial_scale);
+            // Near the minimum, rounding hides the decrease, so a point with a smaller gradient is also accepted.
+            let inertial_scale = objective.inertia_coefficient * (&q - &objective.predicted_q).norm_squared();
+            let rounding_error = 1e-13 * (objective_value.abs() + inertial_scale);
             let mut step_length = 1.0;
-            let accepted = (0..MAX_LINE_SEARCH_STEPS).find_map(|_| {
+            let accepted_point = (0..MAX_LINE_SEARCH_STEPS).find_map(|_| {
                 let next_q = &q + &direction * step_length;
-                let next_value = self.objective_value(objective, &next_q);
-                let satisfies_armijo = next_value <= value + 1e-4 * step_length * slope;
-                let reduces_gradient = next_value <= value + rounding_error
+                let next_objective_value = self.objective_value(objective, &next_q);
+                let satisfies_armijo = next_objective_value <= objective_value + 1e-4 * step_length * slope;
+                let reduces_gradient = next_objective_value <= objective_value + rounding_error
                     && self.objective_gradient(objective, &next_q).norm() < gradient.norm();
                 step_length *= 0.5;
-                (satisfies_armijo || reduces_gradient).then_some((next_q, next_value))
+                (satisfies_armijo || reduces_gradient).then_some((next_q, next_objective_value))
             });
-            let Some((next_q, next_value)) = accepted else { return q };
+            let Some((next_q, next_objective_value)) = accepted_point else { return q };
             let has_converged = (&next_q - &q).norm() <= 1e-13 * next_q.norm().max(f64::MIN_POSITIVE);
-            (q, value) = (next_q, next_value);
+            (q, objective_value) = (next_q, next_objective_value);
             if has_converged {
                 return q;
             }
@@ -223,20 +232,22 @@ impl ReducedSystem {
     }
 
     fn objective_value(&self, objective: &StepObjective<'_>, q: &DVector<f64>) -> f64 {
-        let StepObjective { inertia, rate, .. } = *objective;
+        let StepObjective { inertia_coefficient, velocity_coefficient, .. } = *objective;
         let correction = q - &objective.predicted_q;
         let static_term = self.scale * self.force.potential(q) - objective.load.dot(q);
-        let v = &objective.predicted_v + &correction * rate;
-        let damping_term = if rate > 0.0 { (&self.damping * &v).dot(&v) / (2.0 * rate) } else { 0.0 };
-        0.5 * inertia * correction.norm_squared() + damping_term + static_term
+        let v = &objective.predicted_v + &correction * velocity_coefficient;
+        let damping_term =
+            if velocity_coefficient > 0.0 { (&self.damping * &v).dot(&v) / (2.0 * velocity_coefficient) } else { 0.0 };
+        0.5 * inertia_coefficient * correction.norm_squared() + damping_term + static_term
     }
 
     fn objective_gradient(&self, objective: &StepObjective<'_>, q: &DVector<f64>) -> DVector<f64> {
-        let StepObjective { inertia, rate, .. } = *objective;
+        let StepObjective { inertia_coefficient, velocity_coefficient, .. } = *objective;
         let correction = q - &objective.predicted_q;
         let static_term = self.force.force(q) * self.scale - objective.load;
-        let damping_term = &self.damping * (&objective.predicted_v + &correction * rate);
-        correction * inertia + if rate > 0.0 { damping_term + static_term } else { static_term }
+        let damping_term = &self.damping * (&objective.predicted_v + &correction * velocity_coefficient);
+        correction * inertia_coefficient
+            + if velocity_coefficient > 0.0 { damping_term + static_term } else { static_term }
     }
 
     /// Newton's direction. The Hessian of a buckling system can be indefinite. A growing diagonal shift makes it
@@ -250,7 +261,8 @@ impl ReducedSystem {
         let identity = DMatrix::<f64>::identity(self.rank(), self.rank());
         let jacobian = self.force.jacobian(q);
         let stiffness = (&jacobian + jacobian.transpose()) * (0.5 * self.scale);
-        let hessian = &identity * objective.inertia + &self.damping * objective.rate + stiffness;
+        let hessian =
+            &identity * objective.inertia_coefficient + &self.damping * objective.velocity_coefficient + stiffness;
         let mut shift = 0.0;
         for _ in 0..40 {
             if let Some(cholesky) = Cholesky::new(&hessian + &identity * shift) {
@@ -273,7 +285,7 @@ mod tests {
     }
 
     fn constant_load(load: &DVector<f64>) -> LoadChange<'_> {
-        LoadChange { before: load, after: load }
+        LoadChange { start: load, end: load }
     }
 
     fn undamped_system(force: ReducedForce) -> ReducedSystem {
@@ -287,10 +299,11 @@ mod tests {
         let no_load = DVector::zeros(2);
         let dt = 1.0 / f64::from(steps_per_second);
         let mut state = system.static_state(DVector::from_column_slice(&[0.8, -0.3]));
-        // Without the load of this equilibrium, the initial acceleration is not 0.
+        // The load of this equilibrium is released, so the initial acceleration is -f(q).
         state.a = -system.force.force(&state.q);
-        let end = (0..steps_per_second).fold(state, |state, _| system.step(&state, dt, constant_load(&no_load)));
-        (system, end)
+        let final_state =
+            (0..steps_per_second).fold(state, |state, _| system.advance(&state, dt, constant_load(&no_load)));
+        (system, final_state)
     }
 
     #[test]
@@ -305,20 +318,24 @@ mod tests {
 
     #[test]
     fn damping_alone_dissipates_energy() {
-        let (system, end) = simulate_release(1000);
+        let (system, final_state) = simulate_release(1000);
         let initial_energy = system.scale * system.force.potential(&DVector::from_column_slice(&[0.8, -0.3]));
-        assert!((system.energy(&end) / initial_energy - 1.0).abs() <= 1e-3, "{}", system.energy(&end) / initial_energy);
+        assert!(
+            (system.energy(&final_state) / initial_energy - 1.0).abs() <= 1e-3,
+            "{}",
+            system.energy(&final_state) / initial_energy
+        );
         let settings = VegaSettings { damping_mass: 0.5, damping_stiffness: 0.01, ..VegaSettings::default() };
-        let damped = ReducedSystem::new(spring_chain(&[40.0, 90.0], 30.0, 4.0), &settings)
+        let damped_system = ReducedSystem::new(spring_chain(&[40.0, 90.0], 30.0, 4.0), &settings)
             .expect("a positive definite stiffness");
         let no_load = DVector::zeros(2);
-        let mut state = damped.static_state(DVector::from_column_slice(&[0.8, -0.3]));
+        let mut state = damped_system.static_state(DVector::from_column_slice(&[0.8, -0.3]));
         for _ in 0..2000 {
-            let next = damped.step(&state, 0.01, constant_load(&no_load));
-            assert!(damped.energy(&next) <= damped.energy(&state) * (1.0 + 1e-3) + 1e-12);
+            let next = damped_system.advance(&state, 0.01, constant_load(&no_load));
+            assert!(damped_system.energy(&next) <= damped_system.energy(&state) * (1.0 + 1e-3) + 1e-12);
             state = next;
         }
-        assert!(damped.energy(&state) < 1e-3 * initial_energy);
+        assert!(damped_system.energy(&state) < 1e-3 * initial_energy);
     }
 
     #[test]
@@ -331,7 +348,7 @@ mod tests {
         assert!((system.force.force(&equilibrium) - &load).norm() <= 1e-9);
         let mut state = system.rest_state();
         for _ in 0..4000 {
-            state = system.step(&state, 0.02, constant_load(&load));
+            state = system.advance(&state, 0.02, constant_load(&load));
         }
         assert!((state.q - equilibrium).norm() <= 1e-6);
     }
@@ -349,13 +366,13 @@ mod tests {
             let load = |step: u32| random_vector(u64::from(step), 5) * 0.5;
             let (mut state, mut work) = (system.rest_state(), 0.0_f64);
             for step in 0..3000 {
-                let (before, after) = (load(step), load(step + 1));
-                let next = system.step(&state, dt, LoadChange { before: &before, after: &after });
-                work += (before + after).dot(&(&next.q - &state.q)).abs();
+                let (start_load, end_load) = (load(step), load(step + 1));
+                let next = system.advance(&state, dt, LoadChange { start: &start_load, end: &end_load });
+                work += (start_load + end_load).dot(&(&next.q - &state.q)).abs();
                 let energy = system.energy(&next);
                 assert!(
                     energy.is_finite() && energy <= 2.0 * work + 1e-6,
-                    "dt {dt}, step {step}: {energy}, work {work}"
+                    "dt {dt}, step {step}: expected an energy of at most twice the work {work}, got {energy}"
                 );
                 state = next;
             }
@@ -373,7 +390,7 @@ mod tests {
                 state.v = random_vector(seed, 3) * 20.0;
                 let limit = 1.1 * system.energy(&state);
                 for step in 0..1500 {
-                    state = system.step(&state, dt, constant_load(&no_load));
+                    state = system.advance(&state, dt, constant_load(&no_load));
                     let energy = system.energy(&state);
                     assert!(
                         energy <= limit,
@@ -402,7 +419,7 @@ mod tests {
             let mut state = system.rest_state();
             for step in 0..400 {
                 let step_load = &peak_load * (f64::from(step) * 0.37).sin();
-                state = system.step(&state, dt, constant_load(&step_load));
+                state = system.advance(&state, dt, constant_load(&step_load));
                 assert!(state.q.norm() <= 1e4, "dt {dt}, step {step}: {}", state.q.norm());
             }
         }

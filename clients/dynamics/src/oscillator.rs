@@ -1,10 +1,10 @@
 //! Exact time integration of one mode, q'' + 2 zeta omega q' + omega^2 q = f, with a force that is linear within a
 //! step.
 //!
-//! With time in units of the step h and p = h q', the mode is the 2 x 2 system y' = M y + h^2 e2 f with w = omega h and
-//! M = [[0, 1], [-w^2, -2 zeta w]]. All coefficients follow from the impulse response S(t): the free motion is exp(M) =
-//! [[C, S], [-w^2 S, S']], the step response is G1 = integral of S, and the ramp response is G2 = integral of G1. The
-//! formula that gives full precision depends only on w and zeta.
+//! With time in units of the step h and y = (q, p), p = h q', the mode is the 2 x 2 system y' = M y + h^2 e2 f with
+//! w = omega h and M = [[0, 1], [-w^2, -2 zeta w]]. All coefficients follow from the impulse response S(t): the free
+//! motion is exp(M) = [[C, S], [-w^2 S, S']], the step response is G1 = integral of S, and the ramp response is G2 =
+//! integral of G1. There are three formulas for S. The one with full precision is selected by w and zeta.
 
 use crate::error::{Result, invalid_input};
 
@@ -20,7 +20,7 @@ pub struct Oscillator {
 
 /// Displacement and velocity of one mode.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct State {
+pub struct ModeState {
     pub q: f64,
     pub v: f64,
 }
@@ -60,20 +60,27 @@ impl Oscillator {
         Ok(Self { step, response: Response::compute(w, damping_ratio), w_squared: w * w })
     }
 
-    /// A mode that never moves. Used for modes without stiffness, which would drift without bound under a steady force.
+    /// A mode that never moves, in place of a mode without stiffness, which would drift without bound under a steady
+    /// force.
     pub fn new_fixed() -> Self {
         Self { step: 1.0, response: Response::default(), w_squared: 0.0 }
     }
 
-    /// The state one step later, under a force that changes linearly from `before` to `after`.
+    /// The state one step later, under a force that changes linearly from `start_force` to `end_force`.
     #[must_use]
-    pub fn advance(&self, state: State, before: f64, after: f64) -> State {
-        let (h, r) = (self.step, &self.response);
-        let (p, force, force_change) = (h * state.v, h * h * before, h * h * (after - before));
-        let q = r.cosine * state.q + r.impulse * p + r.constant * force + r.ramp * force_change;
-        let p =
-            -self.w_squared * r.impulse * state.q + r.impulse_rate * p + r.impulse * force + r.constant * force_change;
-        State { q, v: p / h }
+    pub fn advance(&self, state: ModeState, start_force: f64, end_force: f64) -> ModeState {
+        let (h, response) = (self.step, &self.response);
+        let (p, scaled_force, scaled_force_change) =
+            (h * state.v, h * h * start_force, h * h * (end_force - start_force));
+        let q = response.cosine * state.q
+            + response.impulse * p
+            + response.constant * scaled_force
+            + response.ramp * scaled_force_change;
+        let p = -self.w_squared * response.impulse * state.q
+            + response.impulse_rate * p
+            + response.impulse * scaled_force
+            + response.constant * scaled_force_change;
+        ModeState { q, v: p / h }
     }
 }
 
@@ -87,8 +94,8 @@ impl Response {
         if zeta > 1.15 { Self::from_real_roots(w, sigma) } else { Self::from_complex_roots(w, sigma) }
     }
 
-    /// The power series of S, for short steps, where the closed forms suffer from cancellation: s_0 = 0, s_1 = 1 and
-    /// (k + 1)(k + 2) s_{k+2} = -2 sigma (k + 1) s_{k+1} - w^2 s_k.
+    /// The power series of S for short steps, because the closed forms suffer from cancellation there. Its coefficients
+    /// are s_0 = 0, s_1 = 1 and (k + 1)(k + 2) s_{k+2} = -2 sigma (k + 1) s_{k+1} - w^2 s_k.
     fn from_series(w: f64, sigma: f64) -> Self {
         let mut sum = Self::default();
         let (mut term, mut next_term) = (0.0, 1.0);
@@ -112,20 +119,20 @@ impl Response {
         let d = d_squared.abs().sqrt();
         let decay = (-sigma).exp();
         // e^-sigma cos(d) and e^-sigma sin(d)/d, or cosh and sinh for a negative d_squared.
-        let (even, odd) = if d < 1e-4 {
+        let (cosine_term, sine_term) = if d < 1e-4 {
             // Taylor expansion; the error is of fourth order in d.
             (decay * (1.0 - d_squared / 2.0), decay * (1.0 - d_squared / 6.0))
         } else if d_squared > 0.0 {
             (decay * d.cos(), decay * d.sin() / d)
         } else {
             // cosh and sinh would overflow for large d, while these exponents stay negative.
-            let (slow, fast) = ((d - sigma).exp(), (-d - sigma).exp());
-            (0.5 * (slow + fast), 0.5 * (slow - fast) / d)
+            let (slow_decay, fast_decay) = ((d - sigma).exp(), (-d - sigma).exp());
+            (0.5 * (slow_decay + fast_decay), 0.5 * (slow_decay - fast_decay) / d)
         };
-        let (impulse, cosine) = (odd, even + sigma * odd);
+        let (impulse, cosine) = (sine_term, cosine_term + sigma * sine_term);
         let constant = (1.0 - cosine) / (w * w);
         let ramp = (1.0 - 2.0 * sigma * constant - impulse) / (w * w);
-        Self { cosine, impulse, impulse_rate: even - sigma * odd, constant, ramp }
+        Self { cosine, impulse, impulse_rate: cosine_term - sigma * sine_term, constant, ramp }
     }
 
     /// Overdamped modes with two well separated real roots: the responses are divided differences of e^z, (e^z - 1)/z
@@ -180,27 +187,39 @@ mod tests {
     }
 
     /// An independent solution: fourth-order Runge-Kutta in 20,000 small steps.
-    fn integrate_runge_kutta(w2: f64, damping: f64, start: State, before: f64, after: f64, h: f64) -> State {
+    fn integrate_runge_kutta(
+        w2: f64,
+        damping: f64,
+        start: ModeState,
+        start_force: f64,
+        end_force: f64,
+        h: f64,
+    ) -> ModeState {
         let count = 20_000;
         let dt = h / f64::from(count);
-        let rate = |time: f64, s: State| {
-            let force = before + (after - before) * time / h;
-            State { q: s.v, v: force - damping * s.v - w2 * s.q }
+        let derivative = |time: f64, state: ModeState| {
+            let force = start_force + (end_force - start_force) * time / h;
+            ModeState { q: state.v, v: force - damping * state.v - w2 * state.q }
         };
-        let add = |s: State, d: State, factor: f64| State { q: s.q + factor * d.q, v: s.v + factor * d.v };
-        (0..count).fold(start, |s, index| {
+        let add_scaled = |state: ModeState, d: ModeState, factor: f64| ModeState {
+            q: state.q + factor * d.q,
+            v: state.v + factor * d.v,
+        };
+        (0..count).fold(start, |state, index| {
             let t = f64::from(index) * dt;
-            let a = rate(t, s);
-            let b = rate(t + dt / 2.0, add(s, a, dt / 2.0));
-            let c = rate(t + dt / 2.0, add(s, b, dt / 2.0));
-            let d = rate(t + dt, add(s, c, dt));
-            [(a, 1.0), (b, 2.0), (c, 2.0), (d, 1.0)].iter().fold(s, |sum, (k, weight)| add(sum, *k, weight * dt / 6.0))
+            let a = derivative(t, state);
+            let b = derivative(t + dt / 2.0, add_scaled(state, a, dt / 2.0));
+            let c = derivative(t + dt / 2.0, add_scaled(state, b, dt / 2.0));
+            let d = derivative(t + dt, add_scaled(state, c, dt));
+            [(a, 1.0), (b, 2.0), (c, 2.0), (d, 1.0)]
+                .iter()
+                .fold(state, |sum, (k, weight)| add_scaled(sum, *k, weight * dt / 6.0))
         })
     }
 
     #[test]
     fn step_agrees_with_fine_runge_kutta_integration() {
-        let start = State { q: 0.3, v: -0.2 };
+        let start = ModeState { q: 0.3, v: -0.2 };
         for w in [1e-4, 0.02, 0.5, 0.9, 1.1, 3.0, 20.0] {
             for zeta in ZETAS {
                 let (h, eigenvalue) = (0.25, (w / 0.25) * (w / 0.25));
@@ -220,14 +239,14 @@ mod tests {
     #[test]
     fn one_long_step_equals_many_short_steps() {
         for (hertz, h, zeta) in parameter_grid() {
-            let (eigenvalue, count) = (omega(hertz).powi(2), 64_u32);
-            let start = State { q: 1.0, v: 0.5 * omega(hertz) };
-            let force = |step: u32| eigenvalue * (0.5 - f64::from(step) / f64::from(count));
+            let (eigenvalue, step_count) = (omega(hertz).powi(2), 64_u32);
+            let start = ModeState { q: 1.0, v: 0.5 * omega(hertz) };
+            let force = |step: u32| eigenvalue * (0.5 - f64::from(step) / f64::from(step_count));
             let long_step = Oscillator::new(eigenvalue, zeta, h).expect("valid parameters");
-            let short_step = Oscillator::new(eigenvalue, zeta, h / f64::from(count)).expect("valid parameters");
-            let state = long_step.advance(start, force(0), force(count));
+            let short_step = Oscillator::new(eigenvalue, zeta, h / f64::from(step_count)).expect("valid parameters");
+            let state = long_step.advance(start, force(0), force(step_count));
             let expected =
-                (0..count).fold(start, |state, step| short_step.advance(state, force(step), force(step + 1)));
+                (0..step_count).fold(start, |state, step| short_step.advance(state, force(step), force(step + 1)));
             // The rounding error of the phase is proportional to the phase angle of the step.
             let tolerance = 1e-9 + 1e-14 * omega(hertz) * h;
             let is_close =
@@ -241,8 +260,8 @@ mod tests {
         for (hertz, h, zeta) in parameter_grid() {
             let eigenvalue = omega(hertz).powi(2);
             let mode = Oscillator::new(eigenvalue, zeta, h).expect("valid parameters");
-            let energy = |state: State| 0.5 * (state.v * state.v + eigenvalue * state.q * state.q);
-            let mut state = State { q: 1.0, v: omega(hertz) };
+            let energy = |state: ModeState| 0.5 * (state.v * state.v + eigenvalue * state.q * state.q);
+            let mut state = ModeState { q: 1.0, v: omega(hertz) };
             for _ in 0..2000 {
                 let next = mode.advance(state, 0.0, 0.0);
                 let gains_energy = energy(next) > energy(state) * (1.0 + 1e-12);
@@ -257,8 +276,8 @@ mod tests {
         for (hertz, h) in [(0.1, 1e-3), (1.7, 1.0 / 60.0), (300.0, 1.0 / 60.0), (1e5, 1.0)] {
             let eigenvalue = omega(hertz).powi(2);
             let mode = Oscillator::new(eigenvalue, 0.0, h).expect("valid parameters");
-            let energy = |state: State| state.v * state.v + eigenvalue * state.q * state.q;
-            let start = State { q: 1.0, v: 0.0 };
+            let energy = |state: ModeState| state.v * state.v + eigenvalue * state.q * state.q;
+            let start = ModeState { q: 1.0, v: 0.0 };
             let end = (0..1_000_000).fold(start, |state, _| mode.advance(state, 0.0, 0.0));
             let drift = energy(end) / energy(start) - 1.0;
             assert!(drift.abs() <= 1e-9, "{hertz} Hz, {h} s: energy drifts by {drift}");
@@ -268,7 +287,7 @@ mod tests {
     #[test]
     fn steady_force_converges_to_the_static_solution() {
         let mode = Oscillator::new(50.0, 0.3, 0.1).expect("valid parameters");
-        let end = (0..1000).fold(State::default(), |state, _| mode.advance(state, 2.0, 2.0));
+        let end = (0..1000).fold(ModeState::default(), |state, _| mode.advance(state, 2.0, 2.0));
         assert!((end.q - 2.0 / 50.0).abs() <= 1e-14 && end.v.abs() <= 1e-13, "{end:?}");
     }
 
@@ -281,6 +300,6 @@ mod tests {
 
     #[test]
     fn fixed_mode_does_not_move() {
-        assert_eq!(Oscillator::new_fixed().advance(State::default(), 5.0, 9.0), State::default());
+        assert_eq!(Oscillator::new_fixed().advance(ModeState::default(), 5.0, 9.0), ModeState::default());
     }
 }

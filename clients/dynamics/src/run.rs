@@ -1,5 +1,5 @@
-//! Drives a scene with a scenario. Sends only the changed values of each step, optionally paces the steps in real time
-//! and records q and the transforms, and reports the results.
+//! Drives a scene with a scenario: sends the changed values of each step, and reports the results. Optionally paces the
+//! steps in real time, and records q and the transforms.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -28,12 +28,12 @@ pub struct StepValues {
     pub transforms: Vec<[f32; 12]>,
 }
 
-/// A source of step values for a scene. It counts the steps itself, so that they cannot be skipped or repeated.
+/// Computes the values of all steps of a scene, one step after another.
 pub trait Scenario {
     /// The model of the scene.
     fn model(&self) -> &Model;
 
-    /// Computes the values of the next step and overwrites `values` with them. The first call computes step 0.
+    /// Overwrites `values` with the values of the next step. The first call computes step 0.
     ///
     /// # Errors
     /// `Invalid` if the values are not finite.
@@ -46,12 +46,12 @@ pub trait Scenario {
 /// Settings of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunOptions {
-    /// Number of steps; `None` runs until it is stopped.
+    /// Number of steps. `None` runs until the caller stops the run.
     pub steps: Option<u64>,
     /// Seconds per step.
     pub dt: f64,
     pub policy: Policy,
-    /// Maximum number of steps in flight; 0 selects the server's default.
+    /// Maximum number of steps in flight. 0 selects the server's default.
     pub window: u32,
     /// Whether to run in real time.
     pub realtime: bool,
@@ -63,30 +63,30 @@ pub struct RunOptions {
 #[derive(Debug, Clone)]
 pub struct RunSummary {
     /// Number of sent steps.
-    pub sent: u64,
+    pub sent_steps: u64,
     /// Number of rejected steps.
-    pub rejected: u64,
+    pub rejected_steps: u64,
     pub report: Report,
 }
 
 /// Statistics of a run: acknowledgements, rejections and sent bytes.
 #[derive(Default)]
 struct RunStats {
-    stages: StageSamples,
+    stage_samples: StageSamples,
     rejections: Vec<String>,
     acknowledgement_count: u64,
     payload_bytes: u64,
 }
 
-/// Drives a scene until all steps are done or `stop` becomes true.
+/// Drives a scene until all steps are done or `stop_receiver` receives true.
 ///
 /// # Errors
-/// `Client` if the scene has another writer, the stream ends, or a record cannot be written; errors of the scenario.
+/// `Client` if the scene has another writer, the stream ends, or a record cannot be written. Errors of the scenario.
 pub async fn drive_scene(
     client: &Client,
     scenario: &mut dyn Scenario,
     options: &RunOptions,
-    stop: &watch::Receiver<bool>,
+    stop_receiver: &watch::Receiver<bool>,
 ) -> Result<RunSummary> {
     let scene = scenario.model().scene.clone();
     let mut step_stream = client.drive(&scene, options.policy, options.window).await?;
@@ -95,34 +95,35 @@ pub async fn drive_scene(
     let progress_bar = create_progress_bar(options.steps);
     let start = Instant::now();
     let mut stats = RunStats::default();
-    // The values that the server has; `None` before the first step and after a rejection.
-    let mut accepted: Option<StepValues> = None;
-    let mut current = StepValues::default();
-    let mut number = 0;
-    while options.steps.is_none_or(|steps| number < steps) && !*stop.borrow() {
-        scenario.compute_next_step(&mut current)?;
-        let time = number as f64 * options.dt;
+    // The values that the server has. `None` before the first step and after a rejection.
+    let mut accepted_values: Option<StepValues> = None;
+    let mut current_values = StepValues::default();
+    let mut step_number = 0;
+    while options.steps.is_none_or(|steps| step_number < steps) && !*stop_receiver.borrow() {
+        scenario.compute_next_step(&mut current_values)?;
+        let time = step_number as f64 * options.dt;
         if options.realtime {
             let due_time = start + Duration::try_from_secs_f64(time).unwrap_or(Duration::MAX / 4);
             tokio::time::sleep_until(due_time.into()).await;
         }
-        let step = add_changes(scenario.model(), Step::new(number, time), accepted.as_ref(), &current);
+        let step =
+            add_changes(scenario.model(), Step::new(step_number, time), accepted_values.as_ref(), &current_values);
         let is_rejected = stats.record_rejection(step_stream.step(&step).await)?;
         stats.payload_bytes += step.payload_bytes() as u64;
         stats.record_acknowledgements(&step_stream);
         if let Some(recorder) = &mut recorder {
-            recorder.write_row(&current)?;
+            recorder.write_row(&current_values)?;
         }
         // After a rejection the server does not have the values of that step, so the next step sends all values.
-        accepted = if is_rejected { None } else { Some(std::mem::take(&mut current)) };
-        number += 1;
+        accepted_values = if is_rejected { None } else { Some(std::mem::take(&mut current_values)) };
+        step_number += 1;
         progress_bar.inc(1);
     }
     // Each flush reports at most one rejection. Repeat until none is left.
     while stats.record_rejection(step_stream.flush().await)? {}
     stats.record_acknowledgements(&step_stream);
     let (run_number, window) = (step_stream.run, step_stream.window);
-    let end = step_stream.finish().await?;
+    let stream_summary = step_stream.finish().await?;
     recorder.map(Recorder::finish).transpose()?;
     progress_bar.finish_and_clear();
     let elapsed = start.elapsed().as_secs_f64();
@@ -133,28 +134,34 @@ pub async fn drive_scene(
         ("run".to_owned(), json!(run_number)),
         ("window".to_owned(), json!(window)),
         ("dt_s".to_owned(), json!(options.dt)),
-        ("steps_sent".to_owned(), json!(end.sent)),
-        ("last_acknowledged".to_owned(), json!(end.acknowledged)),
-        ("rejected".to_owned(), json!(end.rejected)),
-        ("skipped".to_owned(), json!(end.skipped)),
+        ("steps_sent".to_owned(), json!(stream_summary.sent)),
+        ("last_acknowledged".to_owned(), json!(stream_summary.acknowledged)),
+        ("rejected".to_owned(), json!(stream_summary.rejected)),
+        ("skipped".to_owned(), json!(stream_summary.skipped)),
         ("elapsed_s".to_owned(), json!(elapsed)),
-        ("steps_per_second".to_owned(), json!(end.sent as f64 / elapsed.max(1e-9))),
+        ("steps_per_second".to_owned(), json!(stream_summary.sent as f64 / elapsed.max(1e-9))),
     ]));
-    Ok(RunSummary { sent: end.sent, rejected: end.rejected, report })
+    Ok(RunSummary { sent_steps: stream_summary.sent, rejected_steps: stream_summary.rejected, report })
 }
 
 /// Adds to a step the values whose bits changed since the accepted values, or all values if there are none.
-fn add_changes(model: &Model, mut step: Step, accepted: Option<&StepValues>, current: &StepValues) -> Step {
+fn add_changes(
+    model: &Model,
+    mut step: Step,
+    accepted_values: Option<&StepValues>,
+    current_values: &StepValues,
+) -> Step {
     let are_equal = |a: &[f32], b: &[f32]| a.iter().map(|x| x.to_bits()).eq(b.iter().map(|x| x.to_bits()));
     for (index, domain) in model.domains.iter().enumerate() {
         let range = domain.first_coordinate..domain.first_coordinate + domain.rank;
-        let q_changed =
-            accepted.is_none_or(|accepted| !are_equal(&accepted.q[range.clone()], &current.q[range.clone()]));
+        let q_changed = accepted_values.is_none_or(|accepted_values| {
+            !are_equal(&accepted_values.q[range.clone()], &current_values.q[range.clone()])
+        });
         if domain.owns_q && domain.rank > 0 && q_changed {
-            step.set_q(index as u32, &current.q[range]);
+            step.set_q(index as u32, &current_values.q[range]);
         }
-        let transform = &current.transforms[index];
-        if accepted.is_none_or(|accepted| !are_equal(&accepted.transforms[index], transform)) {
+        let transform = &current_values.transforms[index];
+        if accepted_values.is_none_or(|accepted_values| !are_equal(&accepted_values.transforms[index], transform)) {
             step.set_transform(index as u32, transform);
         }
     }
@@ -183,13 +190,13 @@ impl RunStats {
     fn record_acknowledgements(&mut self, step_stream: &StepStream) {
         for acknowledgement in step_stream.take_acks() {
             self.acknowledgement_count += 1;
-            self.stages.add(&acknowledgement.stages);
+            self.stage_samples.add(&acknowledgement.stages);
         }
     }
 
     fn report(self) -> Report {
         Report::from_iter([
-            ("stages_ms".to_owned(), json!(self.stages.medians())),
+            ("stages_ms".to_owned(), json!(self.stage_samples.medians())),
             ("acknowledgements".to_owned(), json!(self.acknowledgement_count)),
             ("payload_bytes".to_owned(), json!(self.payload_bytes)),
             ("rejections".to_owned(), json!(self.rejections)),
@@ -197,7 +204,8 @@ impl RunStats {
     }
 }
 
-/// A progress bar, or a counter for an unlimited run, on standard error; hidden unless standard error is a terminal.
+/// A progress bar on standard error, or a counter for an unlimited run. It is hidden unless standard error is a
+/// terminal.
 fn create_progress_bar(steps: Option<u64>) -> ProgressBar {
     let template = match steps {
         Some(_) => "steps [{bar:32}] {pos}/{len} {per_sec} eta {eta}",
@@ -207,7 +215,7 @@ fn create_progress_bar(steps: Option<u64>) -> ProgressBar {
     bar.with_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
-/// Writes the coordinates and transforms of every step to files, so that results can be checked.
+/// Writes the coordinates and transforms of every step to files.
 struct Recorder {
     q: NpyWriter,
     transforms: NpyWriter,
@@ -241,16 +249,18 @@ mod tests {
     #[test]
     fn first_step_sends_all_values_and_later_steps_changes() {
         let model = four_domain_model();
-        let rest = StepValues { q: vec![0.0; 6], transforms: vec![[0.0; 12]; 4] };
-        let wire_step = |accepted, current| add_changes(&model, Step::new(3, 0.5), accepted, current).to_wire();
-        let all_values = wire_step(None, &rest);
+        let rest_values = StepValues { q: vec![0.0; 6], transforms: vec![[0.0; 12]; 4] };
+        let encode_step = |accepted_values, current_values| {
+            add_changes(&model, Step::new(3, 0.5), accepted_values, current_values).to_wire()
+        };
+        let all_values = encode_step(None, &rest_values);
         assert_eq!((all_values.q_domains, all_values.transform_domains), (vec![0, 1, 2], vec![0, 1, 2, 3]));
         assert_eq!((all_values.q.len(), all_values.transforms.len()), (24, 192));
-        let mut changed = rest.clone();
-        (changed.q[3], changed.transforms[3][7]) = (1.0, 2.0);
-        let changes = wire_step(Some(&rest), &changed);
+        let mut changed_values = rest_values.clone();
+        (changed_values.q[3], changed_values.transforms[3][7]) = (1.0, 2.0);
+        let changes = encode_step(Some(&rest_values), &changed_values);
         assert_eq!((changes.q_domains, changes.transform_domains), (vec![1], vec![3]));
-        let no_changes = wire_step(Some(&changed), &changed);
+        let no_changes = encode_step(Some(&changed_values), &changed_values);
         assert!(no_changes.q.is_empty() && no_changes.transforms.is_empty() && no_changes.q_domains.is_empty());
     }
 }

@@ -1,5 +1,6 @@
-//! Kinematic motion for scenes without known physics. The coordinates follow a sine one after another. The crest of each
-//! displaces a sample by a given fraction of the diagonal. A scene without coordinates rocks about the center of its base.
+//! Kinematic motion for scenes without known physics. Each coordinate in turn performs one period of a sine. At its
+//! peak, the most displaced sample moves by a given fraction of the diagonal of the scene's rest bounds. A scene without
+//! coordinates rocks about the center of its base.
 
 use std::f64::consts::TAU;
 
@@ -24,7 +25,7 @@ pub struct SweepOptions {
     pub dt: f64,
     /// Number of steps; `None` for an unlimited run.
     pub steps: Option<u64>,
-    /// The largest displacement as a fraction of the diagonal.
+    /// The largest displacement as a fraction of the diagonal of the scene's rest bounds.
     pub displacement_fraction: f64,
 }
 
@@ -32,9 +33,9 @@ pub struct SweepOptions {
 pub struct SweepScenario {
     model: Model,
     options: SweepOptions,
-    /// Number of steps that each coordinate moves before the next one.
+    /// Duration of the sine of each coordinate, in steps.
     steps_per_coordinate: u64,
-    /// Per coordinate: the value that displaces a sample by the requested fraction of the diagonal.
+    /// Per coordinate: the value at which the largest displacement is `displacement_fraction`.
     amplitudes: Vec<f64>,
     /// The step that the next call computes.
     next_step: u64,
@@ -46,11 +47,11 @@ impl SweepScenario {
     /// Computes the amplitudes.
     pub fn new(model: Model, options: SweepOptions) -> Self {
         let target_displacement = options.displacement_fraction * model.diagonal();
-        // Per coordinate: the largest value of all domains that share it.
+        // Per coordinate: the maximum over all domains that share the coordinate.
         let mut displacements_per_unit = vec![0.0_f64; model.coordinate_count];
         for domain in &model.domains {
-            let coordinates = &mut displacements_per_unit[domain.first_coordinate..][..domain.rank];
-            for (mode, displacement) in coordinates.iter_mut().enumerate() {
+            let displacements = &mut displacements_per_unit[domain.first_coordinate..][..domain.rank];
+            for (mode, displacement) in displacements.iter_mut().enumerate() {
                 *displacement = displacement.max(displacement_per_unit(domain, mode));
             }
         }
@@ -63,14 +64,15 @@ impl SweepScenario {
         Self { model, options, steps_per_coordinate, amplitudes, next_step: 0, peak_displacement: 0.0 }
     }
 
-    /// The sine at a step of one coordinate (0 to `steps_per_coordinate`), scaled so that its largest value at a step
-    /// is 1.
+    /// The sine of a coordinate at `coordinate_step` (0 to `steps_per_coordinate` - 1), divided by the largest value
+    /// that it has at any step.
     fn normalized_sine(&self, coordinate_step: u64) -> f64 {
-        let sine = |step: u64| (TAU * (step as f64 + 0.5) / self.steps_per_coordinate as f64).sin();
-        let crest = (0..self.steps_per_coordinate).map(sine).fold(0.0, f64::max);
-        if crest > 1e-6 { sine(coordinate_step) / crest } else { 1.0 }
+        let sine_at = |step: u64| (TAU * (step as f64 + 0.5) / self.steps_per_coordinate as f64).sin();
+        let max_sine = (0..self.steps_per_coordinate).map(sine_at).fold(0.0, f64::max);
+        if max_sine > 1e-6 { sine_at(coordinate_step) / max_sine } else { 1.0 }
     }
 
+    /// The coordinates of the scene at a step. All domains move the same mode at the same time.
     fn compute_coordinates(&self, step: u64) -> Vec<f32> {
         let mode = step / self.steps_per_coordinate;
         let sine = self.normalized_sine(step % self.steps_per_coordinate);
@@ -82,7 +84,7 @@ impl SweepScenario {
         q
     }
 
-    /// The rigid transform of the whole scene; the identity if the scene has coordinates.
+    /// The rigid transform of the whole scene. It is the identity if the scene has coordinates.
     fn rocking_transform(&self, time: f64) -> AffineTransform {
         if self.model.coordinate_count > 0 {
             return AffineTransform::identity();
@@ -91,7 +93,7 @@ impl SweepScenario {
         let center = 0.5 * (model.bounds_min + model.bounds_max);
         let base: Vector3<f64> = center - model.up * (0.5 * model.height());
         let angle = ROCKING_ANGLE * (TAU * time / ROCKING_PERIOD).sin();
-        AffineTransform::rotation_about(&model.ground_axes().short, angle, &base)
+        AffineTransform::rotation_about(&model.ground_axes().short_axis, angle, &base)
     }
 }
 
@@ -133,8 +135,8 @@ impl Scenario for SweepScenario {
 
 /// The largest displacement of a sample per unit of a coordinate, in world axes.
 fn displacement_per_unit(domain: &DomainModel, mode: usize) -> f64 {
-    let world_length = |column: Vector3<f64>| (domain.placement.linear * column).norm();
-    domain.samples.iter().map(|sample| world_length(sample.column(mode, domain.rank))).fold(0.0, f64::max)
+    let world_displacement = |column: Vector3<f64>| (domain.placement.linear * column).norm();
+    domain.samples.iter().map(|sample| world_displacement(sample.column(mode, domain.rank))).fold(0.0, f64::max)
 }
 
 #[cfg(test)]
@@ -181,10 +183,10 @@ mod tests {
         let mut sweep = SweepScenario::new(model, options);
         let mut values = StepValues::default();
         (0..2).for_each(|_| sweep.compute_next_step(&mut values).expect("the next step"));
-        let trunk_transform = AffineTransform::from_row_major(&values.transforms[0]);
+        let first_transform = AffineTransform::from_row_major(&values.transforms[0]);
         let model = &sweep.model;
         let base = 0.5 * (model.bounds_min + model.bounds_max) - model.up * (0.5 * model.height());
-        assert!((trunk_transform.apply(&base) - base).norm() <= 1e-6);
+        assert!((first_transform.apply(&base) - base).norm() <= 1e-6);
         assert!(peak_displacement_fraction(&sweep) > 0.01);
     }
 }

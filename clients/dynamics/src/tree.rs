@@ -13,17 +13,17 @@ use crate::affine::AffineTransform;
 use crate::error::{Result, invalid_input};
 use crate::hierarchy::{JointGapMeter, compute_transforms};
 use crate::model::{DomainModel, Model};
-use crate::oscillator::{Oscillator, State};
+use crate::oscillator::{ModeState, Oscillator};
 use crate::run::{Report, Scenario, StepValues};
 use crate::wind::{Wind, WindPressure};
 
-/// Maximum bending of a branch as a fraction of its diagonal, at wind 1.
+/// Maximum bending of a branch as a fraction of its diagonal, at wind strength 1.
 const MAX_BRANCH_BENDING: f64 = 0.05;
 
-/// Maximum bending of the trunk as a fraction of its diagonal, at wind 1.
+/// Maximum bending of the trunk as a fraction of its diagonal, at wind strength 1.
 const MAX_TRUNK_BENDING: f64 = 0.2;
 
-/// Maximum scale of the bending limits, because linear modes do not represent larger bending.
+/// Maximum factor by which the wind strength scales the bending limits.
 const MAX_BENDING_SCALE: f64 = 2.5;
 
 /// Scale of the rotation of a rigid leaf about its base, in radians.
@@ -32,7 +32,7 @@ const FLUTTER_ANGLE: f64 = 0.15;
 /// Damping ratio of domains without a note `damping_ratio`.
 const DEFAULT_DAMPING_RATIO: f64 = 0.03;
 
-/// Number of states of the calibration run with the largest trunk displacements. The sway is evaluated at these.
+/// Number of states at which the calibration evaluates the sway. They are those with the largest trunk displacements.
 const CALIBRATION_STATES: usize = 24;
 
 /// Maximum size of all stored states of the calibration run, in bytes.
@@ -45,24 +45,25 @@ pub struct TreeOptions {
     pub dt: f64,
     /// Number of steps; `None` for an unlimited run.
     pub steps: Option<u64>,
-    /// Peak displacement of the crown at wind 1, as a fraction of the height.
-    pub sway: f64,
+    /// Peak displacement of the crown at wind strength 1, as a fraction of the height.
+    pub sway_fraction: f64,
     /// Strength of the wind.
-    pub wind: f64,
+    pub wind_strength: f64,
     /// Direction that the wind blows to, in radians about the up axis from the first horizontal axis (x, or y if x is
     /// up).
-    pub direction: f64,
+    pub direction_radians: f64,
     /// Seed of the turbulence.
     pub seed: u64,
 }
 
-/// Reduced loads of one domain, per unit of wind pressure and of force of its children.
+/// Reduced loads of one domain per unit of wind pressure, and of its parent per unit of force at the joint.
 struct WindLoad {
     /// Per mode: U^T times a unit pressure downwind.
     downwind: Vec<f64>,
     /// Per mode: U^T times a unit pressure crosswind.
     crosswind: Vec<f64>,
-    /// 3 x r of the parent: the mean rows of the parent's U at the joint, in world axes; empty without a parent.
+    /// The mean of the parent's U over the attachment samples of the joint: 3 x r of the parent, in world axes. Empty
+    /// without a parent.
     joint_modes: Vec<f64>,
     /// Downwind distance of the domain, in scene units.
     distance: f64,
@@ -87,13 +88,13 @@ pub struct TreeScenario {
     /// Per domain: factor from the response at unit strength to the coordinates.
     gains: Vec<f64>,
     /// Per coordinate: state at step `next_step`, at unit strength.
-    states: Vec<State>,
+    states: Vec<ModeState>,
     /// Per coordinate: force at step `next_step`, at unit strength.
     forces: Vec<f64>,
     /// The step that the next call computes.
     next_step: u64,
-    /// The highest sample of each domain that reaches the crown.
-    crown: Vec<SampleIndex>,
+    /// The highest sample of each domain that reaches into the crown.
+    crown_samples: Vec<SampleIndex>,
     gap_meter: JointGapMeter,
     /// Sway that the calibration predicts, as a fraction of the height.
     calibrated_sway: f64,
@@ -105,7 +106,7 @@ pub struct TreeScenario {
     max_gap: f64,
 }
 
-/// What the calibration run at unit strength records.
+/// The response to the wind at unit strength, recorded by the calibration run.
 struct UnitResponse {
     /// Per domain: largest elastic displacement of its surface samples, in scene units.
     bending: Vec<f64>,
@@ -116,7 +117,7 @@ struct UnitResponse {
 /// The gain of each domain, and the sway that it causes as a fraction of the height.
 struct Calibration {
     gains: Vec<f64>,
-    sway: f64,
+    sway_fraction: f64,
 }
 
 impl TreeScenario {
@@ -126,10 +127,10 @@ impl TreeScenario {
     /// `Invalid` if the scene has no eigenvalues, or an eigenvalue, a damping ratio or the step is out of range.
     pub fn new(model: Model, options: TreeOptions) -> Result<Self> {
         if model.domains.iter().all(|domain| domain.eigenvalues.is_empty()) {
-            let given = format!("{} domains without any; try the sweep", model.domains.len());
+            let given = format!("{} domains without eigenvalues (the sweep needs none)", model.domains.len());
             return Err(invalid_input("scene.eigenvalues", "a domain whose modes have eigenvalues", given));
         }
-        let downwind = model.horizontal_direction(options.direction);
+        let downwind = model.horizontal_direction(options.direction_radians);
         let crosswind = model.up.cross(&downwind);
         let wind = Wind { seed: options.seed, downwind, crosswind, delay_per_length: 0.25 / model.height() };
         let mut tree = Self {
@@ -138,10 +139,10 @@ impl TreeScenario {
             oscillators: create_oscillators(&model, options.dt)?,
             loads: model.domains.iter().map(|domain| compute_wind_load(&model, domain, &wind)).collect(),
             gains: vec![1.0; model.domains.len()],
-            states: vec![State::default(); model.coordinate_count],
+            states: vec![ModeState::default(); model.coordinate_count],
             forces: vec![0.0; model.coordinate_count],
             next_step: 0,
-            crown: select_crown(&model),
+            crown_samples: select_crown(&model),
             gap_meter: JointGapMeter::new(&model),
             calibrated_sway: 0.0,
             peak_sway: 0.0,
@@ -151,7 +152,7 @@ impl TreeScenario {
         };
         let response = tree.record_unit_response();
         let calibration = tree.find_gains(&response);
-        (tree.gains, tree.calibrated_sway) = (calibration.gains, calibration.sway);
+        (tree.gains, tree.calibrated_sway) = (calibration.gains, calibration.sway_fraction);
         Ok(tree)
     }
 
@@ -191,7 +192,7 @@ impl TreeScenario {
         forces
     }
 
-    /// Scales the response to unit wind by the gain of each domain, and rounds it to f32.
+    /// Scales the response at unit strength by the gain of each domain, and rounds it to f32.
     fn scale_response(&self, unit_q: &[f64], gains: &[f64]) -> Vec<f64> {
         let mut q = vec![0.0; self.model.coordinate_count];
         for (domain, gain) in self.model.domains.iter().zip(gains) {
@@ -205,18 +206,19 @@ impl TreeScenario {
     /// Runs at unit strength, records the response, and resets the state.
     fn record_unit_response(&mut self) -> UnitResponse {
         let max_steps = (20.0 / self.options.dt).clamp(60.0, 1200.0) as u64;
-        let steps = self.options.steps.map_or(max_steps, |steps| steps.saturating_sub(1).clamp(1, max_steps));
-        let stride = (steps * self.model.coordinate_count as u64 * 8).div_ceil(MAX_CALIBRATION_BYTES).max(1);
+        let step_count =
+            self.options.steps.map_or(max_steps, |step_count| step_count.saturating_sub(1).clamp(1, max_steps));
+        let stride = (step_count * self.model.coordinate_count as u64 * 8).div_ceil(MAX_CALIBRATION_BYTES).max(1);
         let mut bending = vec![0.0_f64; self.model.domains.len()];
         let mut recorded_states = vec![];
-        for step in 0..steps {
+        for step in 0..step_count {
             self.advance();
             let q: Vec<f64> = self.states.iter().map(|state| state.q).collect();
             let domains = &self.model.domains;
             let displacements: Vec<f64> =
                 domains.iter().map(|domain| elastic_displacement(domain, domain.q(&q))).collect();
-            let roots = domains.iter().zip(&displacements).filter(|(domain, _)| domain.joint.is_none());
-            let trunk_displacement: f64 = roots.map(|(_, displacement)| displacement).sum();
+            let root_displacements = domains.iter().zip(&displacements).filter(|(domain, _)| domain.joint.is_none());
+            let trunk_displacement: f64 = root_displacements.map(|(_, displacement)| displacement).sum();
             for (bending, displacement) in bending.iter_mut().zip(displacements) {
                 *bending = bending.max(displacement);
             }
@@ -226,55 +228,60 @@ impl TreeScenario {
         }
         recorded_states.sort_by(|a, b| b.0.total_cmp(&a.0));
         recorded_states.truncate(CALIBRATION_STATES);
-        self.states.fill(State::default());
+        self.states.fill(ModeState::default());
         self.forces.fill(0.0);
         self.next_step = 0;
         UnitResponse { bending, coordinates: recorded_states.into_iter().map(|(_, q)| q).collect() }
     }
 
-    /// Finds the gains with which the crown peaks at the requested fraction of the height, or the largest gains that the
-    /// bending limits allow.
+    /// Finds the gains at which the peak displacement of the crown is the requested fraction of the height. If the
+    /// bending limits do not allow it, returns the largest gains that they allow.
     fn find_gains(&self, response: &UnitResponse) -> Calibration {
-        let calibration = |strength: f64| {
-            let gains = self.limit_gains(strength, &response.bending);
+        let calibrate = |strength: f64| {
+            let gains = self.compute_gains(strength, &response.bending);
             let sway = |unit_q: &Vec<f64>| {
                 let q = self.scale_response(unit_q, &gains);
                 self.crown_sway(&q, &compute_transforms(&self.model, &q, &[]))
             };
-            let sway = response.coordinates.iter().map(sway).fold(0.0, f64::max);
-            Calibration { gains, sway }
+            let sway_fraction = response.coordinates.iter().map(sway).fold(0.0, f64::max);
+            Calibration { gains, sway_fraction }
         };
-        let target_sway = self.options.sway * self.options.wind;
-        let mut high = self.max_strength(&response.bending);
-        let can_sway = target_sway > 0.0 && high > 0.0;
+        let target_sway = self.options.sway_fraction * self.options.wind_strength;
+        let mut high_strength = self.max_strength(&response.bending);
+        let can_sway = target_sway > 0.0 && high_strength > 0.0;
         if !can_sway {
-            return Calibration { gains: vec![0.0; response.bending.len()], sway: 0.0 };
+            return Calibration { gains: vec![0.0; response.bending.len()], sway_fraction: 0.0 };
         }
-        if calibration(high).sway > target_sway {
-            let mut low = 0.0;
+        if calibrate(high_strength).sway_fraction > target_sway {
+            let mut low_strength = 0.0;
             for _ in 0..24 {
-                let middle = 0.5 * (low + high);
-                if calibration(middle).sway > target_sway { high = middle } else { low = middle }
+                let middle_strength = 0.5 * (low_strength + high_strength);
+                if calibrate(middle_strength).sway_fraction > target_sway {
+                    high_strength = middle_strength
+                } else {
+                    low_strength = middle_strength
+                }
             }
         }
-        calibration(high)
+        calibrate(high_strength)
     }
 
     /// The gain of each domain: `strength`, reduced for branches that would exceed their bending limit.
-    fn limit_gains(&self, strength: f64, bending: &[f64]) -> Vec<f64> {
+    fn compute_gains(&self, strength: f64, bending: &[f64]) -> Vec<f64> {
         let gain = |(domain, bending): (&DomainModel, &f64)| match (&domain.joint, *bending > 0.0) {
-            (Some(_), true) => strength.min(self.bending_limit(MAX_BRANCH_BENDING) * domain.diagonal / bending),
+            (Some(_), true) => strength.min(self.scale_bending_limit(MAX_BRANCH_BENDING) * domain.diagonal / bending),
             _ => strength,
         };
         self.model.domains.iter().zip(bending).map(gain).collect()
     }
 
-    /// The strength at which the trunk reaches its bending limit. Without a deforming trunk: the strength at which all
-    /// branches have reached theirs.
+    /// The strength at which the trunk reaches its bending limit. If no trunk deforms, the strength at which all branches
+    /// have reached their limits.
     fn max_strength(&self, bending: &[f64]) -> f64 {
         let bending_domains = || self.model.domains.iter().zip(bending).filter(|(_, bending)| **bending > 0.0);
-        let strength_at =
-            |limit: f64, domain: &DomainModel, bending: f64| self.bending_limit(limit) * domain.diagonal / bending;
+        let strength_at = |limit: f64, domain: &DomainModel, bending: f64| {
+            self.scale_bending_limit(limit) * domain.diagonal / bending
+        };
         let roots = bending_domains().filter(|(domain, _)| domain.joint.is_none());
         let trunk_strength =
             roots.map(|(domain, bending)| strength_at(MAX_TRUNK_BENDING, domain, *bending)).fold(f64::MAX, f64::min);
@@ -284,31 +291,31 @@ impl TreeScenario {
         bending_domains().map(|(domain, bending)| strength_at(MAX_BRANCH_BENDING, domain, *bending)).fold(0.0, f64::max)
     }
 
-    /// A bending limit at wind 1, scaled by the wind.
-    fn bending_limit(&self, limit: f64) -> f64 {
-        limit * self.options.wind.clamp(0.0, MAX_BENDING_SCALE)
+    /// Scales a bending limit at wind strength 1 to the wind strength of the options.
+    fn scale_bending_limit(&self, limit: f64) -> f64 {
+        limit * self.options.wind_strength.clamp(0.0, MAX_BENDING_SCALE)
     }
 
-    /// The mean displacement of the crown as a fraction of the height.
+    /// The length of the mean displacement of the crown samples, as a fraction of the height.
     fn crown_sway(&self, q: &[f64], world_from_domain: &[AffineTransform]) -> f64 {
         let displacement = |index: &SampleIndex| {
             let domain = &self.model.domains[index.domain];
             let sample = &domain.samples[index.sample];
             let current = world_from_domain[index.domain].apply(&sample.deformed_position(domain.q(q)));
-            current - domain.placement.apply(&sample.rest)
+            current - domain.placement.apply(&sample.rest_position)
         };
-        let sum: Vector3<f64> = self.crown.iter().map(displacement).sum();
-        sum.norm() / (self.crown.len().max(1) as f64 * self.model.height())
+        let displacement_sum: Vector3<f64> = self.crown_samples.iter().map(displacement).sum();
+        displacement_sum.norm() / (self.crown_samples.len().max(1) as f64 * self.model.height())
     }
 
-    /// Small rotations of rigid leaves about their bases, at a time in seconds; `None` for the other domains.
+    /// Small rotations of rigid leaves about their bases, at a time in seconds. `None` for the other domains.
     fn leaf_rotations(&self, time: f64) -> Vec<Option<AffineTransform>> {
         let mut has_children = vec![false; self.model.domains.len()];
         for joint in self.model.domains.iter().filter_map(|domain| domain.joint.as_ref()) {
             has_children[joint.parent] = true;
         }
-        let max_angle = FLUTTER_ANGLE * self.options.wind.clamp(0.0, 2.0);
-        let rotation = |(index, domain): (usize, &DomainModel)| {
+        let max_angle = FLUTTER_ANGLE * self.options.wind_strength.clamp(0.0, 2.0);
+        let leaf_rotation = |(index, domain): (usize, &DomainModel)| {
             let is_leaf = domain.rank == 0 && domain.joint.is_some() && !has_children[index];
             (is_leaf && max_angle > 0.0).then(|| {
                 let pressure = self.wind.pressure(time, index, self.loads[index].distance).downwind;
@@ -318,7 +325,7 @@ impl TreeScenario {
                 AffineTransform::rotation_about(&axis, angle, &Vector3::zeros())
             })
         };
-        self.model.domains.iter().enumerate().map(rotation).collect()
+        self.model.domains.iter().enumerate().map(leaf_rotation).collect()
     }
 }
 
@@ -337,7 +344,7 @@ impl Scenario for TreeScenario {
         }
         values.q = q.iter().map(|coordinate| *coordinate as f32).collect();
         values.transforms = world_from_domain.iter().map(|transform| transform.to_row_major()).collect();
-        // Measure the reported values with the transforms that are sent, which are rounded to f32.
+        // The report refers to the transforms that the server receives, which are rounded to f32.
         let sent_transforms: Vec<AffineTransform> =
             values.transforms.iter().map(AffineTransform::from_row_major).collect();
         self.peak_sway = self.peak_sway.max(self.crown_sway(&q, &sent_transforms));
@@ -351,9 +358,9 @@ impl Scenario for TreeScenario {
         let load_description = format!(
             "wind {} on all surfaces, calibrated to a crown sway of {:.3} of the height; branches bend by at most {:.3} of \
              their diagonal",
-            self.options.wind,
+            self.options.wind_strength,
             self.calibrated_sway,
-            self.bending_limit(MAX_BRANCH_BENDING),
+            self.scale_bending_limit(MAX_BRANCH_BENDING),
         );
         Report::from_iter([
             ("load".to_owned(), json!(load_description)),
@@ -383,21 +390,21 @@ fn compute_wind_load(model: &Model, domain: &DomainModel, wind: &Wind) -> WindLo
     let sample_area = domain.area / samples.len().max(1) as f64;
     let reduced_load = |direction: &Vector3<f64>| {
         let local_direction = domain.placement.linear.transpose() * direction;
-        let load = |mode| {
+        let modal_load = |mode| {
             samples.iter().map(|sample| sample.column(mode, domain.rank).dot(&local_direction)).sum::<f64>()
                 * sample_area
         };
-        (0..domain.rank).map(load).collect::<Vec<f64>>()
+        (0..domain.rank).map(modal_load).collect::<Vec<f64>>()
     };
-    let center = samples.iter().map(|sample| sample.rest).sum::<Vector3<f64>>() / samples.len().max(1) as f64;
+    let center = samples.iter().map(|sample| sample.rest_position).sum::<Vector3<f64>>() / samples.len().max(1) as f64;
     let distance = (domain.placement.apply(&center) - model.bounds_min).dot(&wind.downwind);
     let joint_modes = domain.joint.as_ref().map_or(vec![], |joint| {
         let parent = &model.domains[joint.parent];
         let attachment_samples = joint.attachment_samples.iter().map(|index| &parent.samples[*index]);
-        let count = joint.attachment_samples.len().max(1) as f64;
+        let sample_count = joint.attachment_samples.len().max(1) as f64;
         let mean_column = |mode: usize| {
             let columns = attachment_samples.clone().map(|sample| sample.column(mode, parent.rank));
-            columns.sum::<Vector3<f64>>() / count
+            columns.sum::<Vector3<f64>>() / sample_count
         };
         let columns: Vec<Vector3<f64>> =
             (0..parent.rank).map(|mode| parent.placement.linear * mean_column(mode)).collect();
@@ -412,11 +419,11 @@ fn elastic_displacement(domain: &DomainModel, q: &[f64]) -> f64 {
     domain.surface_samples().iter().map(|sample| sample.displacement(q).norm()).fold(0.0, f64::max)
 }
 
-/// Selects per domain the highest of its surface samples, if it is in the top quarter of the scene.
+/// Selects the highest surface sample of each domain, if this sample is in the top quarter of the scene.
 fn select_crown(model: &Model) -> Vec<SampleIndex> {
     let min_height = model.bounds_min.dot(&model.up) + 0.75 * model.height();
     let highest_sample = |(index, domain): (usize, &DomainModel)| {
-        let height = |sample: &usize| domain.placement.apply(&domain.samples[*sample].rest).dot(&model.up);
+        let height = |sample: &usize| domain.placement.apply(&domain.samples[*sample].rest_position).dot(&model.up);
         let sample = (0..domain.surface_sample_count).max_by(|a, b| height(a).total_cmp(&height(b)))?;
         (height(&sample) >= min_height).then_some(SampleIndex { domain: index, sample })
     };
@@ -428,8 +435,14 @@ mod tests {
     use super::*;
     use crate::hierarchy::tests::four_domain_model;
 
-    const OPTIONS: TreeOptions =
-        TreeOptions { dt: 1.0 / 60.0, steps: Some(60), sway: 0.05, wind: 1.0, direction: 0.4, seed: 7 };
+    const OPTIONS: TreeOptions = TreeOptions {
+        dt: 1.0 / 60.0,
+        steps: Some(60),
+        sway_fraction: 0.05,
+        wind_strength: 1.0,
+        direction_radians: 0.4,
+        seed: 7,
+    };
 
     /// Runs the scenario of the four-domain model. Returns it with the values of every step.
     fn run_tree(options: TreeOptions) -> (TreeScenario, Vec<StepValues>) {
@@ -456,11 +469,11 @@ mod tests {
 
     #[test]
     fn sway_increases_with_the_wind() {
-        let (calm_tree, _) = run_tree(TreeOptions { wind: 0.0, ..OPTIONS });
+        let (calm_tree, _) = run_tree(TreeOptions { wind_strength: 0.0, ..OPTIONS });
         assert!(calm_tree.peak_displacement <= 1e-6, "{}", calm_tree.peak_displacement);
-        let half_sway = run_tree(TreeOptions { wind: 0.5, ..OPTIONS }).0.peak_sway;
+        let half_sway = run_tree(TreeOptions { wind_strength: 0.5, ..OPTIONS }).0.peak_sway;
         let full_sway = run_tree(OPTIONS).0.peak_sway;
-        assert!(half_sway < 0.7 * full_sway && half_sway > 0.01, "{half_sway} {full_sway}");
+        assert!(half_sway < 0.7 * full_sway && half_sway > 0.01, "half {half_sway}, full {full_sway}");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Settings from Vega's `.config` text: a line `*name`, then a line with its value.
+//! Settings from Vega's `.config` files. A setting is a line `*name`, followed by a line with its value.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use crate::error::{Result, invalid_input};
 /// Frequency scale and Rayleigh damping of a reduced system.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VegaSettings {
-    /// Factor of all frequencies: the internal force is scaled by its square.
+    /// Factor of all frequencies. The internal force is scaled by its square.
     pub base_frequency: f64,
     /// Mass coefficient of Rayleigh damping, 1/s.
     pub damping_mass: f64,
@@ -46,9 +46,9 @@ impl VegaSettings {
                 Some("dampingStiffnessCoef") => &mut settings.damping_stiffness,
                 _ => continue,
             };
-            let text = lines.next().unwrap_or("nothing");
-            let value = text.parse().ok().filter(|value: &f64| value.is_finite() && *value >= 0.0);
-            *setting = value.ok_or_else(|| invalid_input(&line[1..], "a finite number >= 0", text))?;
+            let value_text = lines.next().unwrap_or("nothing");
+            let value = value_text.parse().ok().filter(|value: &f64| value.is_finite() && *value >= 0.0);
+            *setting = value.ok_or_else(|| invalid_input(&line[1..], "a finite number >= 0", value_text))?;
         }
         if settings.base_frequency == 0.0 {
             return Err(invalid_input("baseFrequency", "a positive number", 0));
@@ -70,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn invalid_values_are_rejected_by_name() {
+    fn invalid_values_are_rejected_with_their_name() {
         for value in ["x", "nan", "-1", "inf", ""] {
             let error = VegaSettings::parse(&format!("*dampingMassCoef\n{value}")).expect_err("an invalid value");
             assert!(error.to_string().starts_with("dampingMassCoef"), "{error}");

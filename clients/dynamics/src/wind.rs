@@ -1,5 +1,6 @@
 //! Wind pressure by time and position: a steady component, gusts that travel downwind, and turbulence per domain.
-//! Pressures are relative: the tree scales them. The same seed gives the same wind.
+//! Pressures are dimensionless: the tree scenario multiplies them by a calibrated strength. The same seed gives the same
+//! wind.
 
 use std::f64::consts::TAU;
 
@@ -13,7 +14,7 @@ struct Gust {
     amplitude: f64,
 }
 
-/// The ratios between the periods are not simple, so that the sum repeats only after a long time.
+/// The gusts. Their periods have no simple ratios, so that the sum repeats only after a long time.
 const GUSTS: [Gust; 5] = [
     Gust { period: 0.83, amplitude: 0.30 },
     Gust { period: 1.31, amplitude: 0.30 },
@@ -25,7 +26,7 @@ const GUSTS: [Gust; 5] = [
 /// Time at which all gusts peak together at distance 0, in seconds.
 const PEAK_TIME: f64 = 0.55;
 
-/// Time in which the wind rises from zero, in seconds.
+/// Time in which the wind rises from 0 to its full pressure, in seconds.
 const RISE_TIME: f64 = 0.35;
 
 /// A wind that blows in one horizontal direction.
@@ -41,7 +42,7 @@ pub struct Wind {
     pub delay_per_length: f64,
 }
 
-/// Relative pressure in the two horizontal directions of a wind.
+/// Components of the dimensionless pressure along the two horizontal directions of a wind.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WindPressure {
     pub downwind: f64,
@@ -49,37 +50,38 @@ pub struct WindPressure {
 }
 
 impl Wind {
-    /// The pressure at `time` (seconds) on a domain at the downwind distance `distance` (scene units). It is 0 at time 0.
-    pub fn pressure(&self, time: f64, domain: usize, distance: f64) -> WindPressure {
-        let rise = smoothstep(time / RISE_TIME);
-        let gust_time = time - PEAK_TIME - self.delay_per_length * distance;
-        let gusts: f64 = GUSTS.iter().map(|gust| gust.amplitude * (TAU * gust_time / gust.period).cos()).sum();
+    /// The pressure at `time` (seconds) on a domain. `downwind_position` is the domain's position along the wind, in
+    /// scene units. The pressure is 0 at time 0.
+    pub fn pressure(&self, time: f64, domain: usize, downwind_position: f64) -> WindPressure {
+        let onset_factor = smoothstep(time / RISE_TIME);
+        let gust_time = time - PEAK_TIME - self.delay_per_length * downwind_position;
+        let gust_sum: f64 = GUSTS.iter().map(|gust| gust.amplitude * (TAU * gust_time / gust.period).cos()).sum();
         WindPressure {
-            downwind: rise * (0.55 + 0.45 * gusts + 0.15 * self.turbulence(time, domain, 0)),
-            crosswind: rise * 0.25 * self.turbulence(time, domain, 1),
+            downwind: onset_factor * (0.55 + 0.45 * gust_sum + 0.15 * self.turbulence(time, domain, 0)),
+            crosswind: onset_factor * 0.25 * self.turbulence(time, domain, 1),
         }
     }
 
-    /// The mean of three sines with random frequencies (0.3 to 2 Hz) and phases per domain and channel, between -1 and 1.
-    /// Channel 0 is downwind, channel 1 crosswind.
+    /// Turbulence from -1 to 1: the mean of three sines. Their frequencies (0.3 to 2 Hz) and phases are random per domain
+    /// and channel. Channel 0 is downwind, channel 1 crosswind.
     pub fn turbulence(&self, time: f64, domain: usize, channel: u64) -> f64 {
         let sine = |index: u64| {
             let counter = (domain as u64) * 16 + channel * 8 + 2 * index;
-            let hertz = 0.3 + 1.7 * random(self.seed, counter);
-            (TAU * (hertz * time + random(self.seed, counter + 1))).sin()
+            let hertz = 0.3 + 1.7 * hash_to_unit(self.seed, counter);
+            (TAU * (hertz * time + hash_to_unit(self.seed, counter + 1))).sin()
         };
         (0..3).map(sine).sum::<f64>() / 3.0
     }
 }
 
-/// Smoothstep: 0 below 0, 1 above 1.
+/// A smooth step: 0 if x is below 0, 1 if x is above 1.
 fn smoothstep(x: f64) -> f64 {
     let x = x.clamp(0.0, 1.0);
     x * x * (3.0 - 2.0 * x)
 }
 
-/// A pseudorandom number in [0, 1) for a seed and a counter (the finalizer of splitmix64).
-pub fn random(seed: u64, counter: u64) -> f64 {
+/// Hashes a seed and a counter to a pseudorandom number in [0, 1), with the finalizer of splitmix64.
+fn hash_to_unit(seed: u64, counter: u64) -> f64 {
     let mut x = seed.wrapping_add(counter.wrapping_mul(0x9e37_79b9_7f4a_7c15)).wrapping_add(0x9e37_79b9_7f4a_7c15);
     x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
@@ -104,16 +106,16 @@ mod tests {
             assert_ne!(pressure, other_wind.pressure(time, 3, 0.5), "seeds 1 and 2 at {time} s");
             max_pressure = max_pressure.max(pressure.downwind.abs()).max(pressure.crosswind.abs());
         }
-        assert!(max_pressure <= 1.2, "{max_pressure}");
+        assert!(max_pressure <= 1.2, "expected at most 1.2, got {max_pressure}");
     }
 
     #[test]
     fn gust_arrives_later_downwind() {
         let wind = Wind { seed: 1, downwind: Vector3::x(), crosswind: Vector3::z(), delay_per_length: 0.2 };
-        let peak_step = |distance: f64| {
+        let peak_step = |downwind_position: f64| {
             let gust_pressure = |step: &i32| {
                 let time = f64::from(*step) * 0.01;
-                wind.pressure(time, 0, distance).downwind - 0.15 * wind.turbulence(time, 0, 0)
+                wind.pressure(time, 0, downwind_position).downwind - 0.15 * wind.turbulence(time, 0, 0)
             };
             (40..300).max_by(|a, b| gust_pressure(a).total_cmp(&gust_pressure(b))).unwrap_or(0)
         };

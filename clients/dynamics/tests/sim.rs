@@ -1,5 +1,5 @@
-//! Tests of the physics process against a fake server: its model matches the server's description, and subscribers of
-//! the server receive the motion that it computes.
+//! Tests of the physics process against a fake server. Subscribers of the server receive the motion that the process
+//! computes.
 
 #[path = "../../rust/tests/fake/mod.rs"]
 #[allow(dead_code, reason = "shared with the tests of the client")]
@@ -13,17 +13,17 @@ use modalcast_client::{Client, VertexSelection, VertexStreamRequest};
 
 /// A beam of length 1 along y with two bending modes: nine sections of six vertices, 54 vertices in all.
 fn beam(index: u32, radius: f32) -> FakeDomain {
-    let (mut rest, mut modes) = (vec![], vec![]);
+    let (mut rest_positions, mut modes) = (vec![], vec![]);
     for section in 0..9 {
         let y = section as f32 / 8.0;
         for vertex in 0..6 {
             let angle = vertex as f32 * std::f32::consts::PI / 3.0;
             let (x, z) = (radius * angle.cos(), radius * angle.sin());
-            rest.extend([x, y, z]);
+            rest_positions.extend([x, y, z]);
             modes.extend([y * y, 0.0, -2.0 * y * x, -2.0 * y * z, 0.0, y * y]);
         }
     }
-    FakeDomain::new(index, rest, 2, modes)
+    FakeDomain::new(index, rest_positions, 2, modes)
 }
 
 /// A server with a trunk, two generations of branches and a rigid leaf. Each is tilted and attached to the last section
@@ -109,14 +109,14 @@ async fn tree_sways_and_subscribers_receive_closed_joints() {
     let server = Arc::new(tree_server());
     let url = serve(Arc::clone(&server)).await;
     let client = Client::connect(&url).await.expect("a connection");
-    let rest = server.output().positions;
+    let rest_positions = server.output().positions;
     let request = VertexStreamRequest::new("toy", VertexSelection::default()).replies(90);
     let mut vertex_stream = client.stream_vertices(&request).await.expect("a stream");
     let folder = tempfile::tempdir().expect("a temporary folder");
     let record = folder.path().display().to_string();
-    let sim = run_sim(&url, &["tree", "--scene", "toy", "--steps", "90", "--json", "--record", &record]).await;
-    assert_eq!(sim.exit_code, 0, "{}", sim.stderr);
-    let report = sim.report();
+    let sim_output = run_sim(&url, &["tree", "--scene", "toy", "--steps", "90", "--json", "--record", &record]).await;
+    assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
+    let report = sim_output.report();
     assert_eq!((report["steps_sent"].as_u64(), report["rejected"].as_u64()), (Some(90), Some(0)));
     let sway = report["crown_sway_of_height"].as_f64().expect("a number");
     assert!((0.03..0.1).contains(&sway), "{sway}");
@@ -128,43 +128,46 @@ async fn tree_sways_and_subscribers_receive_closed_joints() {
     let diagonal = (0..3).map(|axis| (bounds[axis + 3] - bounds[axis]).powi(2)).sum::<f64>().sqrt();
     let (mut max_gap, mut peak_displacement) = (0.0_f64, 0.0_f64);
     for step in 0..90 {
-        let set = vertex_stream.next().await.expect("a set of vertices").expect("a valid set");
-        assert_eq!(set.step.number, step);
+        let vertex_set = vertex_stream.next().await.expect("a set of vertices").expect("a valid set");
+        assert_eq!(vertex_set.step.number, step);
         // The first section of a child is at the last section of its parent.
         for child in 1..4 {
             for vertex in 0..6 {
                 let (parent_vertex, child_vertex) = (54 * (child - 1) + 48 + vertex, 54 * child);
-                let rest_distance = distance(&rest, parent_vertex, child_vertex);
-                max_gap = max_gap.max((distance(&set.positions, parent_vertex, child_vertex) - rest_distance).abs());
+                let rest_distance = distance(&rest_positions, parent_vertex, child_vertex);
+                max_gap =
+                    max_gap.max((distance(&vertex_set.positions, parent_vertex, child_vertex) - rest_distance).abs());
             }
         }
-        let displacements = set.positions.iter().zip(&rest).map(|(current, rest)| f64::from((current - rest).abs()));
+        let displacements =
+            vertex_set.positions.iter().zip(&rest_positions).map(|(current, rest)| f64::from((current - rest).abs()));
         peak_displacement = peak_displacement.max(displacements.fold(0.0, f64::max));
     }
     assert!(max_gap <= 1e-3 * diagonal, "joint gap {max_gap}, diagonal {diagonal}");
     assert!(peak_displacement >= 0.03 * diagonal, "displacement {peak_displacement}, diagonal {diagonal}");
     let steps = server.steps.lock().expect("lock");
     assert_eq!(steps[0].transform_domains, [0, 1, 2, 3]);
-    let sends_trunk = steps[5..].iter().any(|step| step.transform_domains.contains(&0));
-    assert!(!sends_trunk, "expected no transform of the trunk, which does not change");
+    let sends_trunk_transform = steps[5..].iter().any(|step| step.transform_domains.contains(&0));
+    assert!(!sends_trunk_transform, "expected no transform of the trunk, which does not change");
     assert_eq!(fake::floats(&steps[40].q), q[40 * 6..41 * 6]);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn auto_selects_tree_or_sweep_by_scene() {
-    let mut without_eigenvalues = tree_server();
-    without_eigenvalues.domains.iter_mut().for_each(|domain| domain.wire.eigenvalues.clear());
+    let mut server_without_eigenvalues = tree_server();
+    server_without_eigenvalues.domains.iter_mut().for_each(|domain| domain.wire.eigenvalues.clear());
     let triangle = vec![-1.0, 0.0, -1.0, 1.0, 2.0, 1.0, 0.0, 1.0, 0.0];
-    let rigid = FakeServer::new(vec![FakeDomain::new(0, triangle, 0, vec![])]);
-    for (server, scenario) in [(tree_server(), "tree"), (without_eigenvalues, "sweep"), (rigid, "sweep")] {
+    let rigid_server = FakeServer::new(vec![FakeDomain::new(0, triangle, 0, vec![])]);
+    for (server, scenario) in [(tree_server(), "tree"), (server_without_eigenvalues, "sweep"), (rigid_server, "sweep")]
+    {
         let server = Arc::new(server);
-        let rest = server.output().positions;
+        let rest_positions = server.output().positions;
         let url = serve(Arc::clone(&server)).await;
         let arguments = ["auto", "--scene", "toy", "--open", "toy", "--steps", "25", "--policy", "latest", "--json"];
-        let sim = run_sim(&url, &arguments).await;
-        assert!(sim.exit_code == 0 && sim.stderr.contains(scenario), "{}", sim.stderr);
-        assert_eq!(sim.report()["steps_sent"].as_u64(), Some(25));
-        assert_ne!(server.output().positions, rest, "expected positions of {scenario} to change");
+        let sim_output = run_sim(&url, &arguments).await;
+        assert!(sim_output.exit_code == 0 && sim_output.stderr.contains(scenario), "{}", sim_output.stderr);
+        assert_eq!(sim_output.report()["steps_sent"].as_u64(), Some(25));
+        assert_ne!(server.output().positions, rest_positions, "expected positions of {scenario} to change");
     }
 }
 
@@ -175,8 +178,8 @@ async fn errors_exit_with_documented_codes() {
     assert_eq!(run_sim(&url, &["tree", "--dt", "0"]).await.exit_code, 2);
     assert_eq!(run_sim("http://127.0.0.1:1", &["tree"]).await.exit_code, 3);
     assert_eq!(run_sim(&url, &["bridge", "--scene", "toy", "--cubic", "/nowhere.cub"]).await.exit_code, 4);
-    let sim = run_sim(&url, &["bridge", "--scene", "toy"]).await;
-    assert!(sim.exit_code == 5 && sim.stderr.contains("--cubic"), "{}", sim.stderr);
+    let sim_output = run_sim(&url, &["bridge", "--scene", "toy"]).await;
+    assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("--cubic"), "{}", sim_output.stderr);
 }
 
 /// The folder of a Vega model.
@@ -190,15 +193,21 @@ fn vega_folder(name: &str) -> PathBuf {
 fn vega_domain(name: &str) -> FakeDomain {
     let text = std::fs::read_to_string(vega_folder(name).join(format!("{name}.obj"))).expect("an OBJ file");
     let positions = text.lines().filter_map(|line| line.strip_prefix("v "));
-    let rest: Vec<f32> = positions
+    let rest_positions: Vec<f32> = positions
         .flat_map(|line| line.split_whitespace().take(3).map(|number| number.parse().expect("a number")))
         .collect();
     let file = std::fs::read(vega_folder(name).join(format!("{name}.URendering.float"))).expect("a file of U");
-    let size = |offset: usize| i32::from_le_bytes(file[offset..offset + 4].try_into().expect("four bytes")) as usize;
-    let (rows, columns, entries) = (size(0), size(4), fake::floats(&file[8..]));
-    assert_eq!(rows, rest.len());
+    let read_size =
+        |offset: usize| i32::from_le_bytes(file[offset..offset + 4].try_into().expect("four bytes")) as usize;
+    let (rows, columns, entries) = (read_size(0), read_size(4), fake::floats(&file[8..]));
+    assert_eq!(rows, rest_positions.len());
     let modes = (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column)));
-    FakeDomain::new(0, rest, columns as u32, modes.map(|(row, column)| entries[column * rows + row]).collect())
+    FakeDomain::new(
+        0,
+        rest_positions,
+        columns as u32,
+        modes.map(|(row, column)| entries[column * rows + row]).collect(),
+    )
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -209,9 +218,9 @@ async fn vega_models_deflect_as_requested_and_stay_bounded() {
         let files = vega_folder(name).display().to_string();
         for dt in ["0.0166667", "1"] {
             let arguments = ["auto", "--scene", "toy", "--files", &files, "--steps", "60", "--dt", dt, "--json"];
-            let sim = run_sim(&url, &arguments).await;
-            assert!(sim.exit_code == 0 && sim.stderr.contains("bridge"), "{}", sim.stderr);
-            let report = sim.report();
+            let sim_output = run_sim(&url, &arguments).await;
+            assert!(sim_output.exit_code == 0 && sim_output.stderr.contains("bridge"), "{}", sim_output.stderr);
+            let report = sim_output.report();
             let number = |field: &str| report[field].as_f64().expect("a number");
             assert!((number("deflection_of_diagonal") - 0.03).abs() <= 1e-4, "{report}");
             assert!((0.02..0.3).contains(&number("peak_of_diagonal")), "{report}");
