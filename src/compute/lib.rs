@@ -1,5 +1,5 @@
-//! Deformers: three implementations of x = T (x0 + U q), the deformation of every vertex of a scene. They run on CUDA,
-//! on all cores of the CPU, and as a plain f64 reference against which the tests compare the other two.
+//! Deformers: three implementations of x = T (x0 + U q), the deformation of every vertex of a scene. The first runs on
+//! CUDA, the second on all cores of the CPU. The third is a plain f64 reference, with which tests compare the others.
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 

@@ -1,5 +1,5 @@
-//! Input and judges for tests of this crate and of crates that add kernels: seeded scenes, exact results, and what the
-//! compiler reports of a kernel. Compiled for tests and with the feature `testing` only.
+//! Support for tests of this crate and of crates that add kernels: seeded random scenes, exact results, and the resource
+//! usage of compiled kernels. Compiled for tests and with the feature `testing` only.
 
 #![allow(clippy::expect_used, clippy::panic, missing_docs, reason = "a test may fail")]
 
@@ -10,45 +10,45 @@ pub use crate::gpu::{CompiledVariant, assert_compiles};
 use modalcast_model::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState};
 
-/// Deterministic numbers in -1 to 1.
+/// Deterministic random numbers from -1 to 1.
 #[derive(Debug)]
 pub struct TestRng(pub u64);
 
 impl TestRng {
-    /// The next number. Not an iterator: it never ends.
-    #[expect(clippy::should_implement_trait, reason = "an iterator would need an adapter at every use")]
+    /// The next number.
+    #[expect(clippy::should_implement_trait, reason = "an iterator would wrap every number in an option")]
     pub fn next(&mut self) -> f32 {
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (self.0 >> 40) as f32 / (1_u64 << 23) as f32 - 1.0
     }
 }
 
-/// Vertices in the unit cube with modes of noise.
-pub fn shape(vertices: usize, rank: usize, noise: &mut TestRng) -> Shape {
-    let columns = (0..3 * vertices * rank).map(|_| noise.next()).collect();
-    with_columns(vertices, rank, columns, noise)
+/// A shape with random vertices and modes; all numbers are from -1 to 1.
+pub fn shape(vertices: usize, rank: usize, rng: &mut TestRng) -> Shape {
+    let columns = (0..3 * vertices * rank).map(|_| rng.next()).collect();
+    with_columns(vertices, rank, columns, rng)
 }
 
-/// Vertices in the unit cube with these columns.
-pub fn with_columns(vertices: usize, rank: usize, columns: Vec<f32>, noise: &mut TestRng) -> Shape {
-    let rest: Vec<[f32; 3]> = (0..vertices).map(|_| [noise.next(), noise.next(), noise.next()]).collect();
+/// A shape with random vertices and these columns of U.
+pub fn with_columns(vertices: usize, rank: usize, columns: Vec<f32>, rng: &mut TestRng) -> Shape {
+    let rest_positions: Vec<[f32; 3]> = (0..vertices).map(|_| [rng.next(), rng.next(), rng.next()]).collect();
     let normals = vec![[0.0, 0.0, 1.0]; vertices];
-    let mesh = Mesh::from_indexed(rest, normals, vec![], vec![[0; 3]]).expect("a mesh");
+    let mesh = Mesh::from_indexed(rest_positions, normals, vec![], vec![[0; 3]]).expect("a valid mesh");
     let modes =
-        if rank == 0 { Modes::rigid() } else { Modes::from_columns(3 * vertices, rank, columns).expect("modes") };
-    Shape::new(mesh, modes).expect("a shape")
+        if rank == 0 { Modes::rigid() } else { Modes::from_columns(3 * vertices, rank, columns).expect("valid modes") };
+    Shape::new(mesh, modes).expect("a valid shape")
 }
 
-/// A scene of shapes of noise, one domain each per (n, r).
-pub fn scene(sizes: &[(usize, usize)], deformation: DeformationSettings, noise: &mut TestRng) -> Arc<Scene> {
+/// A scene with one random shape and one domain for each (vertices, rank).
+pub fn scene(sizes: &[(usize, usize)], deformation: DeformationSettings, rng: &mut TestRng) -> Arc<Scene> {
     let mut parts = SceneParts::named("noise");
     parts.deformation = deformation;
     parts.materials = vec![Material::default()];
-    for (at, (vertices, rank)) in sizes.iter().enumerate() {
-        parts.shapes.push(shape(*vertices, *rank, noise));
-        parts.domains.push(domain(at));
+    for (index, (vertices, rank)) in sizes.iter().enumerate() {
+        parts.shapes.push(shape(*vertices, *rank, rng));
+        parts.domains.push(domain(index));
     }
-    Scene::new(parts).expect("a scene")
+    Scene::new(parts).expect("a valid scene")
 }
 
 fn domain(shape: usize) -> Domain {
@@ -68,32 +68,32 @@ fn domain(shape: usize) -> Domain {
 
 /// One domain for each (vertices, rank, triangles), with random corner normals, and a random state.
 pub fn scene_and_state(shapes: &[(usize, usize, usize)]) -> (Arc<Scene>, SceneState) {
-    let mut noise = TestRng(shapes.len() as u64);
+    let mut rng = TestRng(shapes.len() as u64);
     let mut parts = SceneParts::named("noise");
     parts.materials = vec![Material::default()];
-    for (at, (vertices, rank, triangles)) in shapes.iter().enumerate() {
-        parts.shapes.push(shape_with_corners(&mut noise, *vertices, *rank, *triangles));
-        parts.domains.push(domain(at));
+    for (shape, (vertices, rank, triangles)) in shapes.iter().enumerate() {
+        parts.shapes.push(shape_with_corners(&mut rng, *vertices, *rank, *triangles));
+        parts.domains.push(domain(shape));
     }
-    let scene = Scene::new(parts).expect("a scene");
+    let scene = Scene::new(parts).expect("a valid scene");
     let mut state = SceneState::rest(&scene);
-    state.q.iter_mut().for_each(|coordinate| *coordinate = noise.next());
-    state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| noise.next()));
+    state.q.iter_mut().for_each(|coordinate| *coordinate = rng.next());
+    state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| rng.next()));
     (scene, state)
 }
 
-fn shape_with_corners(noise: &mut TestRng, vertices: usize, rank: usize, triangles: usize) -> Shape {
-    let rest = (0..vertices).map(|_| [0; 3].map(|_| noise.next())).collect();
+fn shape_with_corners(rng: &mut TestRng, vertices: usize, rank: usize, triangles: usize) -> Shape {
+    let rest_positions = (0..vertices).map(|_| [0; 3].map(|_| rng.next())).collect();
     let corners = Corners {
         vertices: (0..vertices as u32).collect(),
-        normals: (0..vertices).map(|_| [0; 3].map(|_| noise.next())).collect(),
+        normals: (0..vertices).map(|_| [0; 3].map(|_| rng.next())).collect(),
         uvs: Vec::new(),
     };
-    let corner = |index: usize| (index % vertices) as u32;
-    let triangles = (0..triangles).map(|first| [3 * first, 3 * first + 1, 3 * first + 2].map(corner)).collect();
-    let entries = (0..3 * vertices * rank).map(|_| noise.next()).collect();
-    let modes = Modes::from_columns(3 * vertices, rank, entries).expect("modes");
-    Shape::new(Mesh::new(rest, corners, triangles).expect("a mesh"), modes).expect("a shape")
+    let wrapped_corner = |index: usize| (index % vertices) as u32;
+    let triangles = (0..triangles).map(|first| [3 * first, 3 * first + 1, 3 * first + 2].map(wrapped_corner)).collect();
+    let columns = (0..3 * vertices * rank).map(|_| rng.next()).collect();
+    let modes = Modes::from_columns(3 * vertices, rank, columns).expect("valid modes");
+    Shape::new(Mesh::new(rest_positions, corners, triangles).expect("a valid mesh"), modes).expect("a valid shape")
 }
 
 /// u = U q of a vertex, in f64.
@@ -110,11 +110,11 @@ pub fn position_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usi
     let (u, rest) =
         (displacement_of(scene, state, domain, vertex), scene.shape_of(domain).mesh.rest_positions()[vertex]);
     let (linear, offset) = (state.transforms[domain].linear(), state.transforms[domain].translation());
-    let bent = nalgebra::Vector3::from([0, 1, 2].map(|axis| f64::from(rest[axis]) + u[axis]));
-    (linear * bent + offset).into()
+    let deformed = nalgebra::Vector3::from([0, 1, 2].map(|axis| f64::from(rest[axis]) + u[axis]));
+    (linear * deformed + offset).into()
 }
 
-/// One row of T (x, y, z, 1) with fused multiply-adds, in the order of the kernels that batch.
+/// One row of T (x, y, z, 1) with fused multiply-adds, in the order of the batch kernels.
 pub fn transformed_axis(row: &[f32], [x, y, z]: [f32; 3]) -> f32 {
     row[0].mul_add(x, row[1].mul_add(y, row[2].mul_add(z, row[3])))
 }

@@ -40,7 +40,7 @@ pub(crate) fn assert_equals_reference(
     let surface = deformer.surface().expect("expected a surface");
     let reference_positions = modalcast_compute::reference::deform(scene, state);
     let mut bounds = BoundingBox::EMPTY;
-    reference_positions.iter().for_each(|position_error| bounds.include(*position_error));
+    reference_positions.iter().for_each(|position| bounds.include(*position));
     let diagonal = bounds.diagonal().max(f64::from(f32::MIN_POSITIVE));
     let position_error = max_error(&surface.positions, &reference_positions, MAX_POSITION_ERROR * diagonal)
         .unwrap_or_else(|error| panic!("{name}: {error}"));
@@ -73,9 +73,9 @@ pub(crate) fn have_equal_bits(got: &[f32], want: &[f32]) -> bool {
 fn max_error_rejects_wrong_missing_and_non_finite_numbers() {
     let want = [[1.0, 2.0], [3.0, 4.0]];
     assert_eq!(max_error(&[1.0, 2.0, 3.0, 4.0], &want, 1e-5), Ok(0.0));
-    let slightly_off = max_error(&[1.0, 2.0, 3.0, 4.000_005], &want, 1e-5).expect("within the limit");
-    assert!(slightly_off > 1e-6);
-    let wrong: [&[f32]; 7] = [
+    let small_error = max_error(&[1.0, 2.0, 3.0, 4.000_005], &want, 1e-5).expect("an error within the limit");
+    assert!(small_error > 1e-6);
+    let wrong_lists: [&[f32]; 7] = [
         &[1.0, 2.0, 3.0, 4.1],
         &[1.0, 2.0, 4.0, 3.0],
         &[1.0, 2.0, 3.0, f32::NAN],
@@ -84,8 +84,8 @@ fn max_error_rejects_wrong_missing_and_non_finite_numbers() {
         &[1.0, 2.0, 3.0, 4.0, 5.0],
         &[],
     ];
-    for got in wrong {
-        assert!(max_error(got, &want, 1e-5).is_err(), "{got:?} passed");
+    for got in wrong_lists {
+        assert!(max_error(got, &want, 1e-5).is_err(), "expected an error for {got:?}");
     }
     assert!(max_error(&[1.0], &[[f64::NAN]], 1e-5).is_err(), "expected a NaN in the reference to fail");
     assert!(have_equal_bits(&[0.0], &[0.0]));

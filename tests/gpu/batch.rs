@@ -31,7 +31,7 @@ fn count_differing_states(name: &str, scene: &Arc<Scene>) -> usize {
     assert!(separate_deformer.plan().kernel(KernelKind::Batch).is_none(), "{name}: expected no batch kernel");
     assert!(batched_deformer.plan().launches() <= 4, "{name}");
     let states = random_states(scene);
-    let count = states.iter().filter(|state| {
+    let differing_states = states.iter().filter(|state| {
         let (result, want) = (run_step(&mut batched_deformer, state), run_step(&mut separate_deformer, state));
         if result.bounds.is_finite() {
             assert_within_bound(name, scene, state, &result.surface.positions, 0.0);
@@ -39,11 +39,11 @@ fn count_differing_states(name: &str, scene: &Arc<Scene>) -> usize {
         }
         let difference = result.difference(&want);
         difference.iter().for_each(|difference| eprintln!("{name}: {difference}"));
-        let moved = run_step(&mut separate_deformer, &states[0]).difference(&result).is_some();
-        assert!(moved || state.q == states[0].q, "{name}: expected the state to change vertices");
+        let changes_vertices = run_step(&mut separate_deformer, &states[0]).difference(&result).is_some();
+        assert!(changes_vertices || state.q == states[0].q, "{name}: expected the state to change vertices");
         difference.is_some()
     });
-    count.count()
+    differing_states.count()
 }
 
 /// Shapes of several sizes and ranks, with several numbers of instances, for every storage type.

@@ -53,10 +53,13 @@ fn gpu_dropped_deformers_release_their_memory() {
         deformer.plan().total_bytes()
     };
     let bytes = deform_once();
-    let (before, _) = device.memory().expect("expected the free memory");
+    let (free_before, _) = device.memory().expect("expected the free memory");
     for _ in 0..200 {
         deform_once();
     }
-    let (after, _) = device.memory().expect("expected the free memory");
-    assert!((before as u64) < after as u64 + 8 * bytes, "{before} bytes free before, {after} after 200 scenes");
+    let (free_after, _) = device.memory().expect("expected the free memory");
+    assert!(
+        (free_before as u64) < free_after as u64 + 8 * bytes,
+        "expected about {free_before} free bytes after 200 scenes, got {free_after}"
+    );
 }

@@ -55,7 +55,7 @@ fn gpu_bounds_show_axis_and_sign_of_an_overflow() {
     let scene = Scene::new(parts).expect("expected a valid scene");
     let mut state = SceneState::rest(&scene);
     state.q[0] = f32::MAX;
-    // Infinity minus infinity in the first row, which is finite in f64. The other rows overflow in f32.
+    // The first row is infinity minus infinity in f32, and finite in f64. The other rows overflow in f32.
     state.transforms[0] = Transform([1.0, -1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0, 1.0, 5.0]);
     let bounds = cuda_deformer(&scene).deform(&state).expect("expected the step to succeed").bounds;
     assert!(bounds.min[0].is_finite() && bounds.max[0].is_finite(), "{bounds:?}");
@@ -89,8 +89,8 @@ fn gpu_directions_of_singular_transforms_equal_the_reference() {
     }
     let mut deformer = cuda_deformer(&scene);
     assert_equals_reference("edge transforms", &scene, &state, &mut deformer);
-    // Negative control: the reference of other transforms differs.
+    // Negative control: the normals at rest differ.
     let normals = &deformer.surface().expect("expected a surface").normals;
-    let other = rigid_normals(&scene, &SceneState::rest(&scene));
-    assert!(max_error(normals, &other, MAX_DIRECTION_ERROR).is_err(), "negative control");
+    let rest_normals = rigid_normals(&scene, &SceneState::rest(&scene));
+    assert!(max_error(normals, &rest_normals, MAX_DIRECTION_ERROR).is_err(), "negative control");
 }

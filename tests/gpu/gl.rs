@@ -47,9 +47,10 @@ impl GlContext {
         // SAFETY: loading runs the initializers of libEGL. They have already run, because the renderer loaded libEGL.
         let egl =
             unsafe { khronos_egl::DynamicInstance::<khronos_egl::EGL1_4>::load_required() }.expect("expected libEGL");
-        let address = |name: &str| egl.get_proc_address(name).map_or(std::ptr::null(), |function| function as *const _);
+        let load_address =
+            |name: &str| egl.get_proc_address(name).map_or(std::ptr::null(), |function| function as *const _);
         // SAFETY: the renderer's context is current on this thread and outlives `api`.
-        let api = unsafe { glow::Context::from_loader_function(address) };
+        let api = unsafe { glow::Context::from_loader_function(load_address) };
         Self { renderer, api: Rc::new(api) }
     }
 

@@ -43,13 +43,11 @@ fn gpu_shared_buffers_have_the_bits_of_copied_buffers() {
         let summary = assert_equals_reference("shared buffers", &scene, &state, &mut sharing_deformer);
         let bounds = copying_deformer.deform(&state).expect("expected the step to succeed").bounds;
         assert_eq!(summary.bounds, bounds);
-        let (sharing_deformer, copying_deformer) = (
-            sharing_deformer.surface().expect("expected a surface"),
-            copying_deformer.surface().expect("expected a surface"),
-        );
-        assert!(have_equal_bits(&sharing_deformer.positions, &copying_deformer.positions));
-        assert!(have_equal_bits(&sharing_deformer.normals, &copying_deformer.normals));
-        assert!(have_equal_bits(&sharing_deformer.tangents, &copying_deformer.tangents));
+        let shared_surface = sharing_deformer.surface().expect("expected a surface");
+        let copied_surface = copying_deformer.surface().expect("expected a surface");
+        assert!(have_equal_bits(&shared_surface.positions, &copied_surface.positions));
+        assert!(have_equal_bits(&shared_surface.normals, &copied_surface.normals));
+        assert!(have_equal_bits(&shared_surface.tangents, &copied_surface.tangents));
     }
     drop(sharing_deformer);
     renderer.unload(buffers);
@@ -99,7 +97,7 @@ fn gpu_shared_buffers_are_read_back_during_the_next_step() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_frames_of_shared_and_uploaded_buffers_are_equal() {
     let (mut renderer, device, scene) = open_renderer();
-    let (state, other) = (scenes::random_state(&scene, 1), scenes::random_state(&scene, 2));
+    let (state, other_state) = (scenes::random_state(&scene, 1), scenes::random_state(&scene, 2));
     let (shared_scene, uploaded_scene) = (
         renderer.load(&scene).expect("expected the scene to load"),
         renderer.load(&scene).expect("expected the scene to load"),
@@ -122,7 +120,7 @@ fn gpu_frames_of_shared_and_uploaded_buffers_are_equal() {
     assert_eq!(frame.rgba, uploaded_frame.rgba, "expected the same image of uploaded vertices");
     let repeated_frame = renderer.draw(&shared_scene, &params).expect("expected a frame");
     assert_eq!(frame.rgba, repeated_frame.rgba, "expected the same image after reading the surface");
-    sharing_deformer.deform(&other).expect("expected the step to succeed");
+    sharing_deformer.deform(&other_state).expect("expected the step to succeed");
     let moved_frame = renderer.draw(&shared_scene, &params).expect("expected a frame");
     assert_ne!(frame.rgba, moved_frame.rgba, "expected another image of another state");
     drop(sharing_deformer);
@@ -193,16 +191,17 @@ fn gpu_frames_in_flight_keep_the_vertices_of_their_step() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_unknown_or_small_buffers_fall_back_to_copies() {
     let (mut renderer, device, scene) = open_renderer();
-    let small = renderer.load(&scenes::random_scene(&[(4, 0)], 1, true, false)).expect("expected the scene to load");
-    let good = renderer.load(&scene).expect("expected the scene to load");
-    let GlVertexBuffers { positions, normals, .. } = shared_buffers(&good);
-    let unknown = GlVertexBuffers {
+    let small_scene =
+        renderer.load(&scenes::random_scene(&[(4, 0)], 1, true, false)).expect("expected the scene to load");
+    let loaded_scene = renderer.load(&scene).expect("expected the scene to load");
+    let GlVertexBuffers { positions, normals, .. } = shared_buffers(&loaded_scene);
+    let unknown_buffers = GlVertexBuffers {
         positions: GlBuffer { name: 999_999, ..positions.clone() },
         normals: GlBuffer { name: 999_998, ..normals },
         tangents: Some(GlBuffer { name: 999_997, ..positions }),
     };
-    let without_tangents = GlVertexBuffers { tangents: None, ..shared_buffers(&good) };
-    for buffers in [shared_buffers(&small), unknown, without_tangents] {
+    let without_tangents = GlVertexBuffers { tangents: None, ..shared_buffers(&loaded_scene) };
+    for buffers in [shared_buffers(&small_scene), unknown_buffers, without_tangents] {
         let mut deformer = CudaDeformer::new(
             &device,
             &scene,
@@ -216,7 +215,7 @@ fn gpu_unknown_or_small_buffers_fall_back_to_copies() {
     let mut sharing_deformer = CudaDeformer::new(
         &device,
         &scene,
-        Some(shared_buffers(&good)),
+        Some(shared_buffers(&loaded_scene)),
         CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
     )
     .expect("expected a CUDA deformer");

@@ -41,16 +41,16 @@ fn tube(random: &mut Random, columns: u32, rows: u32, rank: usize) -> Shape {
         [[lower_corner, lower_corner + 1, upper_corner + 1], [lower_corner, upper_corner + 1, upper_corner]]
     };
     let triangles = (0..rows - 1).flat_map(|row| (0..columns).flat_map(move |column| triangle(row, column))).collect();
-    let mut column = Vec::with_capacity(3 * rest.len() * rank);
+    let mut entries = Vec::with_capacity(3 * rest.len() * rank);
     for _ in 0..rank {
         let (wave_vector, amplitudes) = (random.next_triple(), random.next_triple());
         let phase = |position: &[f32; 3]| (0..3).map(|axis| 2.0 * wave_vector[axis] * position[axis]).sum::<f32>();
         let scale = 0.3 / (rank as f32).sqrt();
-        column.extend(
+        entries.extend(
             rest.iter().flat_map(|position| amplitudes.map(|amplitude| scale * amplitude * phase(position).sin())),
         );
     }
-    let modes = Modes::from_columns(3 * rest.len(), rank, column).expect("expected valid modes");
+    let modes = Modes::from_columns(3 * rest.len(), rank, entries).expect("expected valid modes");
     Shape::new(Mesh::new(rest, corners, triangles).expect("expected a valid mesh"), modes)
         .expect("expected a valid shape")
 }
@@ -78,7 +78,7 @@ fn compare_normals(scene: &Scene, state: &SceneState, deformer: &mut CudaDeforme
     deformer.deform(state).expect("expected the step to succeed");
     let surface = deformer.surface().expect("expected a surface");
     let positions: Vec<[f64; 3]> =
-        surface.positions.chunks_exact(3).map(|place| [0, 1, 2].map(|axis| f64::from(place[axis]))).collect();
+        surface.positions.chunks_exact(3).map(|position| [0, 1, 2].map(|axis| f64::from(position[axis]))).collect();
     NormalComparison {
         normals: surface.normals.clone(),
         tangents: surface.tangents.clone(),
@@ -105,7 +105,7 @@ fn assert_equals_reference(name: &str, scene: &Scene, state: &SceneState, deform
     let tangent_error = max_error(&comparison.tangents, &comparison.want_tangents, MAX_DIRECTION_ERROR);
     let tangent_error = tangent_error.unwrap_or_else(|error| panic!("{name}: tangent {error}"));
     let rigid_angle = max_angle_degrees(&comparison.normals, &rigid_normals(scene, state));
-    assert!(rigid_angle > 5.0, "{name}: rigid normals are only {rigid_angle} degrees off");
+    assert!(rigid_angle > 5.0, "{name}: expected rigid normals to differ by more than 5 degrees, got {rigid_angle}");
     let angle = max_angle_degrees(&comparison.normals, &comparison.want_normals);
     eprintln!(
         "{name}: error of normals {normal_error:.2e} ({angle:.1e} degrees), of tangents {tangent_error:.2e}; rigid {rigid_angle:.1} degrees"
@@ -116,8 +116,8 @@ fn assert_equals_reference(name: &str, scene: &Scene, state: &SceneState, deform
 /// Near 180 degrees, f32 cannot determine the axis of a rotation.
 #[test]
 fn test_scenes_bend_but_do_not_fold() {
-    for (seed, around, rows, rank) in [(1, 16, 9, 3), (4, 24, 12, 3), (5, 16, 6, 2), (6, 70, 72, 8)] {
-        let scene = scene_with_exact_normals(vec![tube(&mut Random(seed), around, rows, rank)], 3, true, false);
+    for (seed, columns, rows, rank) in [(1, 16, 9, 3), (4, 24, 12, 3), (5, 16, 6, 2), (6, 70, 72, 8)] {
+        let scene = scene_with_exact_normals(vec![tube(&mut Random(seed), columns, rows, rank)], 3, true, false);
         for seed in 5..11 {
             let state = scenes::random_state(&scene, seed);
             let mut cpu = modalcast_compute::cpu::CpuDeformer::new(&scene);
@@ -138,7 +138,7 @@ fn test_scenes_bend_but_do_not_fold() {
 fn gpu_exact_normals_equal_the_reference() {
     let mut random = Random(1);
     let shapes = [(16, 9, 3), (5, 2, 1), (40, 31, 12)];
-    let shapes: Vec<_> = shapes.map(|(around, rows, rank)| tube(&mut random, around, rows, rank)).into();
+    let shapes: Vec<_> = shapes.map(|(columns, rows, rank)| tube(&mut random, columns, rows, rank)).into();
     for (normal_maps, rigid) in [(false, false), (false, true), (true, false), (true, true)] {
         let scene = scene_with_exact_normals(shapes.clone(), 4, normal_maps, rigid);
         let mut deformer = cuda_deformer(&scene);
@@ -192,7 +192,7 @@ fn gpu_exact_normals_are_unit_and_deterministic() {
         true,
         false,
     );
-    let (mut state, other) = (scenes::random_state(&scene, 7), scenes::random_state(&scene, 8));
+    let (mut state, other_state) = (scenes::random_state(&scene, 7), scenes::random_state(&scene, 8));
     let q = state.q_of(&scene, 1).to_vec();
     for domain in [3, 5] {
         state.transforms[domain] = state.transforms[1];
@@ -203,7 +203,7 @@ fn gpu_exact_normals_are_unit_and_deterministic() {
         deformer.deform(state).expect("expected the step to succeed");
         deformer.surface().expect("expected a surface").clone()
     };
-    let (first, other_surface, repeated) = (deform(&state), deform(&other), deform(&state));
+    let (first, other_surface, repeated) = (deform(&state), deform(&other_state), deform(&state));
     assert!(!have_equal_bits(&first.normals, &other_surface.normals), "expected states with different normals");
     assert!(have_equal_bits(&first.normals, &repeated.normals) && have_equal_bits(&first.tangents, &repeated.tangents));
     for surface in [&first, &other_surface] {
@@ -220,7 +220,7 @@ fn gpu_exact_normals_are_unit_and_deterministic() {
     };
     assert!(
         have_equal_bits(normals_of(1), normals_of(3)) && have_equal_bits(normals_of(1), normals_of(5)),
-        "instances"
+        "expected equal normals of all instances"
     );
 }
 
@@ -234,7 +234,7 @@ fn gpu_seams_share_a_normal_and_hard_edges_stay_hard() {
     let normals = &deformer.surface().expect("expected a surface").normals;
     let normal_at = |corner_row: usize, column: usize| &normals[3 * (25 * corner_row + column)..][..3];
     for corner_row in 1..23 {
-        assert!(have_equal_bits(normal_at(corner_row, 0), normal_at(corner_row, 24)), "line {corner_row}");
+        assert!(have_equal_bits(normal_at(corner_row, 0), normal_at(corner_row, 24)), "corner row {corner_row}");
     }
     let squared_distance = |corner_row: usize| {
         (0..3).map(|axis| (normal_at(corner_row, 5)[axis] - normal_at(corner_row + 1, 5)[axis]).powi(2)).sum::<f32>()

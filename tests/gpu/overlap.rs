@@ -110,7 +110,7 @@ impl Reader<'_> {
             let Some((step, readback)) = self.pending.pop_front() else { break };
             let surface = deformer.wait_readback(&readback).expect("expected the readback to complete");
             assert!(equals_ignoring_tangents(&surface, &self.want[step]), "step {step}");
-            // A second read returns the same memory.
+            // A second wait returns the same memory.
             assert!(Arc::ptr_eq(
                 &surface,
                 &deformer.wait_readback(&readback).expect("expected the completed readback")
@@ -233,7 +233,7 @@ fn gpu_steps_after_a_fault_are_computed_in_full() {
         deformer.submit(&states[step]).expect("expected the step to start");
         let readback = deformer.readback(VertexAttributes::ALL).expect("expected a readback to start");
         if step % 5 == 4 {
-            // A failed step calls this too: no result counts as complete.
+            // A failed step also calls `invalidate`.
             deformer.invalidate();
             assert!(
                 matches!(deformer.readback(VertexAttributes::ALL), Err(Error::Fault { .. })),
@@ -268,7 +268,7 @@ fn gpu_invalid_call_sequences_return_errors() {
     deformer.submit(&states[0]).expect("expected the step to start");
     deformer.submit(&states[1]).expect("expected the step to start");
     assert!(matches!(deformer.submit(&states[2]), Err(Error::Busy { limit: MAX_STEPS_IN_FLIGHT, .. })));
-    // A blocking step waits for the steps before it.
+    // `deform` waits for the steps in flight.
     deformer.deform(&states[2]).expect("expected the step to succeed");
     other_deformer.deform(&states[0]).expect("expected the step to succeed");
     let foreign_readback = other_deformer.readback(VertexAttributes::VERTICES).expect("expected a readback to start");

@@ -1,5 +1,5 @@
-//! Frames that the server rasterizes with CUDA. They equal OpenGL frames except on edges and at depth ties, do not depend
-//! on steps computed while they are in flight, and are deterministic.
+//! Frames that the server rasterizes with CUDA. They equal OpenGL frames except on edges and at depth ties. Steps that are
+//! computed while a frame is in flight do not change it. Frames are deterministic.
 
 use std::sync::Arc;
 
@@ -21,8 +21,8 @@ use crate::common::exact_triangle::{ExactTriangle, compare_ids};
 use crate::scenes;
 
 const SIZE: [u32; 2] = [960, 540];
-/// Depths tie below this difference. Hardware interpolates the depth of triangles that are hundreds of pixels wide with
-/// an error of up to 3e-7 of the depth range.
+/// Depths that differ by less than this are a depth tie. Hardware interpolates the depth of triangles that are hundreds of
+/// pixels wide with an error of up to 3e-7 of the depth range.
 const DEPTH_TOLERANCE: f64 = 4e-7;
 const CUDA_BACKENDS: RasterBackends =
     RasterBackends { shadow: Some(RasterBackend::Cuda), visibility: Some(RasterBackend::Cuda) };
@@ -130,10 +130,10 @@ fn gpu_ids_equal_opengl_except_on_edges_and_depth_ties() {
         // At the border of a cut-out, the filtered alpha crosses its threshold. Hardware uses 8-bit filter weights.
         let max_wrong = if name == "tree" { SIZE[0] * SIZE[1] / 500 } else { 0 };
         assert!(differences.wrong <= max_wrong as usize, "{name}: {differences:?}");
-        let other_image =
+        let other_state_image =
             draw_still(&scene, &SceneState { q: state.q.iter().map(|q| q + 0.3).collect(), ..state.clone() }, true);
         let control = compare_ids(
-            &other_image.visible_triangles,
+            &other_state_image.visible_triangles,
             &want.visible_triangles,
             &want.exact_triangles,
             SIZE[0],
@@ -163,7 +163,8 @@ fn gpu_shading_of_equal_ids_equals_opengl() {
                 "{name}, {:?}: {different} pixels with equal ids have different colors",
                 shadow.map(|shadow| shadow.size)
             );
-            assert!(different <= got.visible_triangles.len() / 500, "{name}: {different}");
+            let limit = got.visible_triangles.len() / 500;
+            assert!(different <= limit, "{name}: expected at most {limit} different pixels, got {different}");
         }
     }
     let [(_, soup, state), _] = scenes_and_states();
@@ -243,11 +244,18 @@ fn gpu_ground_hides_geometry_below_on_both_paths() {
     let look = RenderSettings { shadow: None, antialias: Antialiasing::None, ..scene.look };
     let scene = Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene");
     let [want, got] = [false, true].map(|uses_cuda| draw_still(&scene, &state, uses_cuda));
-    let count_hidden =
+    let count_uncovered =
         |image: &StillImage| image.visible_triangles.iter().filter(|triangle| triangle.is_none()).count();
     let different = got.visible_triangles.iter().zip(&want.visible_triangles).filter(|(got, want)| got != want).count();
-    eprintln!("{different} differ, {} and {} see ground or sky", count_hidden(&got), count_hidden(&want));
-    assert!(count_hidden(&want) > 20_000 && different < got.visible_triangles.len() / 2000, "{different}");
+    eprintln!(
+        "{different} pixels differ, {} and {} pixels show ground or sky",
+        count_uncovered(&got),
+        count_uncovered(&want)
+    );
+    let uncovered = count_uncovered(&want);
+    assert!(uncovered > 20_000, "expected more than 20,000 pixels of ground or sky, got {uncovered}");
+    let limit = got.visible_triangles.len() / 2000;
+    assert!(different < limit, "expected fewer than {limit} different pixels, got {different}");
 }
 
 #[test]

@@ -50,10 +50,10 @@ fn soup_geometry(positions: GlBuffer, soup: &Soup, cut_outs: Option<CutOuts>) ->
 /// The bits of the reference depths of all triangles with both faces, as in a depth-only pass.
 fn two_sided_depths(soup: &Soup, cut_outs: Option<&CutOuts>) -> Vec<u32> {
     let mut rasterizer = VisibilityBuffer::new(soup.viewport);
-    let all = DrawRange { first: 0, triangles: soup.triangles.len() as u32, cull_mode: CullMode::None };
+    let all_triangles = DrawRange { first: 0, triangles: soup.triangles.len() as u32, cull_mode: CullMode::None };
     match cut_outs {
-        Some(cut_outs) => rasterizer.draw_cut_out(&soup.positions, &soup.triangles, all, cut_outs),
-        None => rasterizer.draw(&soup.positions, &soup.triangles, all),
+        Some(cut_outs) => rasterizer.draw_cut_out(&soup.positions, &soup.triangles, all_triangles, cut_outs),
+        None => rasterizer.draw(&soup.positions, &soup.triangles, all_triangles),
     }
     rasterizer.depths().into_iter().map(f32::to_bits).collect()
 }
@@ -66,7 +66,7 @@ fn count_differences<T: PartialEq>(got: &[T], want: &[T]) -> usize {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_samples_have_the_bits_of_the_definition() {
+fn gpu_samples_have_the_bits_of_the_reference() {
     let context = GpuContext::open();
     let mut back_faces = 0;
     for soup in all_soups() {
@@ -84,13 +84,13 @@ fn gpu_samples_have_the_bits_of_the_definition() {
         drop(rasterizer);
         drop((positions, keys, depths));
     }
-    assert!(back_faces > 1000, "control: {back_faces} samples see a back in depth alone");
+    assert!(back_faces > 1000, "control: expected more than 1000 samples of back faces, got {back_faces}");
 }
 
 /// Compares the id pass and the depth pass.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_uniform_cut_outs_have_the_bits_of_the_definition() {
+fn gpu_uniform_cut_outs_have_the_bits_of_the_reference() {
     let context = GpuContext::open();
     for cut_out_soup in uniform_cut_out_soups() {
         let soup = &cut_out_soup.soup;
@@ -115,17 +115,17 @@ fn gpu_positions_written_by_opengl_need_no_wait() {
     let mut soup = all_soups().into_iter().find(|soup| soup.name == "a few pixels").expect("expected the named soup");
     let (mut rasterizer, positions) = context.create_rasterizer(&soup, None);
     let keys = context.gl.create_buffer(8 * soup.viewport.pixel_count() as u64);
-    let mut before = Vec::new();
+    let mut previous_keys = Vec::new();
     for step in 0..20 {
         soup.positions
             .iter_mut()
             .enumerate()
-            .for_each(|(at, number)| *number += 0.01 * ((at + step) % 7) as f32 - 0.03);
+            .for_each(|(index, number)| *number += 0.01 * ((index + step) % 7) as f32 - 0.03);
         context.gl.write(&positions, &soup.positions);
         let got = context.draw_ids(&mut rasterizer, &soup.viewport, &keys);
         assert_eq!(count_differences(&got, &soup.rasterize().keys), 0, "step {step}");
-        assert!(got != before, "step {step}: expected other samples than before");
-        before = got;
+        assert!(got != previous_keys, "step {step}: expected other samples than before");
+        previous_keys = got;
     }
 }
 
@@ -149,7 +149,8 @@ fn gpu_targets_may_be_resized_and_reuse_buffer_names() {
         }
     }
     // Two registered targets that alternate; one is larger than needed.
-    let buffers = [0, 100].map(|more| context.gl.create_buffer(8 * soup.viewport.pixel_count() as u64 + more));
+    let buffers =
+        [0, 100].map(|extra_bytes| context.gl.create_buffer(8 * soup.viewport.pixel_count() as u64 + extra_bytes));
     for keys in [&buffers[0], &buffers[1], &buffers[0], &buffers[1]] {
         context.gl.write(keys, &vec![0_u64; soup.viewport.pixel_count()]);
         assert_eq!(
@@ -216,8 +217,9 @@ fn gpu_positions_shared_with_a_deformer_are_drawn() {
     .expect("expected a CUDA deformer");
     assert!(deformer.shares_buffers(), "expected shared buffers");
     let triangles = scene.triangle_vertices();
-    let all = DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None };
-    let geometry = RasterGeometry { positions, triangles: triangles.clone(), groups: vec![all], cut_outs: None };
+    let all_triangles = DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None };
+    let geometry =
+        RasterGeometry { positions, triangles: triangles.clone(), groups: vec![all_triangles], cut_outs: None };
     let mut rasterizer = CudaRasterizer::new(&context.device, geometry)
         .expect("expected a rasterizer on a buffer that the deformer registered");
     let viewport = clip_space_viewport(300, 200);
@@ -226,7 +228,7 @@ fn gpu_positions_shared_with_a_deformer_are_drawn() {
         deformer.deform(&scenes::random_state(&scene, seed)).expect("expected the step to succeed");
         let got = context.draw_ids(&mut rasterizer, &viewport, &keys);
         let mut want = VisibilityBuffer::new(viewport);
-        want.draw(&deformer.surface().expect("expected a surface").positions, &triangles, all);
+        want.draw(&deformer.surface().expect("expected a surface").positions, &triangles, all_triangles);
         assert_eq!(count_differences(&got, &want.keys), 0, "step {seed}");
         assert!(got.iter().any(|key| *key != u64::MAX), "expected visible triangles");
     }

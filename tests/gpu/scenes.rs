@@ -23,38 +23,39 @@ impl Random {
         std::array::from_fn(|_| self.next_number())
     }
 
-    fn vector(&mut self) -> Vector3<f64> {
+    fn next_vector(&mut self) -> Vector3<f64> {
         Vector3::from(self.next_triple()).cast()
     }
 
-    /// A rotation times a scale, optionally mirrored.
-    pub(crate) fn next_similarity(&mut self, mirror: bool) -> Transform {
-        let turn = Rotation3::from_scaled_axis(self.vector() * 3.0).into_inner();
-        let scale = f64::from(1.0 + 0.5 * self.next_number()) * if mirror { -1.0 } else { 1.0 };
-        Transform::from_parts(&(turn * scale), &(self.vector() * 2.0))
+    /// A random rotation, scale and translation, optionally with a reflection.
+    pub(crate) fn next_similarity(&mut self, is_mirrored: bool) -> Transform {
+        let rotation = Rotation3::from_scaled_axis(self.next_vector() * 3.0).into_inner();
+        let scale = f64::from(1.0 + 0.5 * self.next_number()) * if is_mirrored { -1.0 } else { 1.0 };
+        Transform::from_parts(&(rotation * scale), &(self.next_vector() * 2.0))
     }
 
-    /// A transform with a general linear part.
+    /// A random transform with shear.
     pub(crate) fn next_shear(&mut self) -> Transform {
-        let linear = Matrix3::from_columns(&[self.vector(), self.vector(), self.vector()]) + Matrix3::identity();
-        Transform::from_parts(&linear, &(self.vector() * 2.0))
+        let linear =
+            Matrix3::from_columns(&[self.next_vector(), self.next_vector(), self.next_vector()]) + Matrix3::identity();
+        Transform::from_parts(&linear, &(self.next_vector() * 2.0))
     }
 }
 
 /// A shape with coordinates in -1 to 1 whose modes displace it by about its own size at q = 1. It has more corners than
 /// vertices.
 pub(crate) fn random_shape(random: &mut Random, vertices: usize, rank: usize) -> Shape {
-    let rest = (0..vertices).map(|_| random.next_triple()).collect();
-    let count = vertices + 3;
+    let rest_positions = (0..vertices).map(|_| random.next_triple()).collect();
+    let corner_count = vertices + 3;
     let corners = Corners {
-        vertices: (0..count).map(|corner| (corner * 7 % vertices) as u32).collect(),
-        normals: (0..count).map(|_| random.next_triple()).collect(),
-        uvs: (0..count).map(|_| [random.next_number(), random.next_number()]).collect(),
+        vertices: (0..corner_count).map(|corner| (corner * 7 % vertices) as u32).collect(),
+        normals: (0..corner_count).map(|_| random.next_triple()).collect(),
+        uvs: (0..corner_count).map(|_| [random.next_number(), random.next_number()]).collect(),
     };
-    let triangles = (0..count as u32 - 2).map(|first| [first, first + 1, first + 2]).collect();
-    let mesh = Mesh::new(rest, corners, triangles).expect("expected a valid mesh");
-    let size = 1.0 / (rank.max(1) as f32).sqrt();
-    let entries = (0..3 * vertices * rank).map(|_| size * random.next_number()).collect();
+    let triangles = (0..corner_count as u32 - 2).map(|first| [first, first + 1, first + 2]).collect();
+    let mesh = Mesh::new(rest_positions, corners, triangles).expect("expected a valid mesh");
+    let amplitude = 1.0 / (rank.max(1) as f32).sqrt();
+    let entries = (0..3 * vertices * rank).map(|_| amplitude * random.next_number()).collect();
     Shape::new(mesh, Modes::from_columns(3 * vertices, rank, entries).expect("expected valid modes"))
         .expect("expected a valid shape")
 }
@@ -74,15 +75,15 @@ pub(crate) fn new_domain(shape: usize, material: usize) -> Domain {
     }
 }
 
-/// Index of the material of [`parts_of_shapes`] with a normal map; material 0 has none.
+/// Index of the material with a normal map in [`parts_of_shapes`]. Material 0 has no normal map.
 pub(crate) const NORMAL_MAPPED: usize = 1;
 
 /// Scene parts with these shapes, two materials and no domains.
 pub(crate) fn parts_of_shapes(shapes: Vec<Shape>) -> SceneParts {
     let mut parts = SceneParts::named("random");
     parts.shapes = shapes;
-    let mapped = Material { normal_texture: Some(0), ..Material::default() };
-    parts.materials = vec![Material::default(), mapped];
+    let normal_mapped = Material { normal_texture: Some(0), ..Material::default() };
+    parts.materials = vec![Material::default(), normal_mapped];
     parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("expected a valid texture")];
     parts
 }
@@ -95,8 +96,8 @@ pub(crate) fn random_scene(shapes: &[(usize, usize)], instances: usize, normal_m
     parts.rigid_transforms = rigid;
     for _ in 0..instances {
         for index in 0..shapes.len() {
-            let mapped = normal_maps && index % 2 == 0;
-            parts.domains.push(new_domain(index, if mapped { NORMAL_MAPPED } else { 0 }));
+            let has_normal_map = normal_maps && index % 2 == 0;
+            parts.domains.push(new_domain(index, if has_normal_map { NORMAL_MAPPED } else { 0 }));
         }
     }
     Scene::new(parts).expect("expected a valid scene")

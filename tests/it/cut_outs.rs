@@ -46,8 +46,8 @@ impl Case {
         };
         let central_difference =
             |upper: [f64; 2], lower: [f64; 2]| [0, 1].map(|axis| (upper[axis] - lower[axis]) / 2e-3);
-        let across = max_error(got.across, central_difference(uv_at(1e-3, 0.0), uv_at(-1e-3, 0.0)));
-        let down = max_error(got.down, central_difference(uv_at(0.0, 1e-3), uv_at(0.0, -1e-3)));
+        let across = max_error(got.duv_dx, central_difference(uv_at(1e-3, 0.0), uv_at(-1e-3, 0.0)));
+        let down = max_error(got.duv_dy, central_difference(uv_at(0.0, 1e-3), uv_at(0.0, -1e-3)));
         (max_error(got.uv, uv_at(0.0, 0.0)), across.max(down))
     }
 }
@@ -94,7 +94,7 @@ fn small_triangles_at_window_border_keep_precision() {
         footprint(&viewport, &corners(&viewport, &positions, [0, 1, 2]), &[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]], pixel);
     // f32 resolves 1/16384^2 of the window here, which is a twentieth of this triangle.
     assert!((got.uv[0] - 0.5).abs() < 0.06 && (got.uv[1] - 0.5).abs() < 0.06, "{got:?}");
-    assert!((got.across[0] / 50.0 - 1.0).abs() < 0.1, "{got:?}");
+    assert!((got.duv_dx[0] / 50.0 - 1.0).abs() < 0.1, "{got:?}");
     // The sample lies outside of the triangle by a rounding step. Its coordinates are those of the nearest point of the
     // triangle, not extrapolated ones.
     let positions_beside = [position(0.2, -1.0), position(2.0, -1.0), position(1.2, 1.0)]
@@ -144,7 +144,7 @@ fn alpha_images_repeat_and_filter_trilinearly() {
     // texel of 0.
     let cut_outs = cut_outs_of_image(alpha_image(4, 1, |level, column, _| [51 * column as u8, 255, 0][level as usize]));
     let alpha_at = |u: f32, derivative: f32| {
-        let footprint = Footprint { uv: [u, 0.3], across: [derivative, 0.0], down: [0.0; 2] };
+        let footprint = Footprint { uv: [u, 0.3], duv_dx: [derivative, 0.0], duv_dy: [0.0; 2] };
         alpha(&cut_outs, 4, &footprint)
     };
     let assert_close = |got: f32, want: f32| assert!((got - want).abs() < 1e-6, "expected {want}, got {got}");

@@ -46,7 +46,7 @@ impl Walk<'_> {
             all().max().expect("corners") - all().min().expect("corners")
         };
         let [x0, y0, x1, y1] = clipped_polygon.samples;
-        let narrow = !clipped_polygon.clipped
+        let narrow = !clipped_polygon.is_clipped
             && extent(|corner| corner.x) <= MAX_WARP_EXTENT
             && extent(|corner| corner.y) <= MAX_WARP_EXTENT;
         if narrow && (x1 - x0 + 1) * (y1 - y0 + 1) <= MAX_THREAD_SAMPLES {

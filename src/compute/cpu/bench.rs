@@ -1,4 +1,4 @@
-//! Benchmark: the fraction of the memory's read bandwidth that the deformer reaches. Run with
+//! Benchmark: the deformer's fraction of the memory read bandwidth. Run with
 //! `cargo test --release -p modalcast-compute cpu::bench -- --ignored --nocapture`.
 
 use std::time::Instant;
@@ -9,15 +9,15 @@ use modalcast_model::scene::{DeformationSettings, StorageType};
 
 /// The median time of a step in seconds, over 15 steps with different coordinates.
 fn median_step(scene: &Arc<Scene>, deformer: &mut CpuDeformer) -> f64 {
-    let mut noise = TestRng(3);
+    let mut rng = TestRng(3);
     let mut state = SceneState::rest(scene);
     let mut times: Vec<f64> = (0..20)
         .map(|_| {
-            state.q.iter_mut().for_each(|number| *number = noise.next());
+            state.q.iter_mut().for_each(|number| *number = rng.next());
             deformer.changes.update(scene, &state);
-            let begin = Instant::now();
+            let start = Instant::now();
             deformer.deform_positions(&state);
-            begin.elapsed().as_secs_f64()
+            start.elapsed().as_secs_f64()
         })
         .skip(5)
         .collect();
@@ -27,7 +27,7 @@ fn median_step(scene: &Arc<Scene>, deformer: &mut CpuDeformer) -> f64 {
 
 #[test]
 #[ignore = "a measurement"]
-fn part_of_the_read_rate() {
+fn prints_fraction_of_read_bandwidth() {
     // The first size fits the caches: it shows the time of the computation alone.
     for (vertices, rank) in [(1 << 11, 32), (1 << 20, 10), (1 << 20, 32)] {
         for storage in StorageType::ALL {
@@ -36,14 +36,14 @@ fn part_of_the_read_rate() {
                 let scene = scene(&[(vertices, rank)], deformation, &mut TestRng(1));
                 let mut deformer = CpuDeformer::new(&scene);
                 let bytes = deformer.stored_bytes() + 12 * vertices;
-                let rate = bytes as f64 / median_step(&scene, &mut deformer) / 1e9;
-                let roof = read_bandwidth(bytes, 10);
+                let bandwidth = bytes as f64 / median_step(&scene, &mut deformer) / 1e9;
+                let read_limit = read_bandwidth(bytes, 10);
                 let name = storage.name();
                 println!(
-                    "n {vertices} r {rank} {name} compensated {compensated}: {rate:.1} of {roof:.1} GB/s, {:.2}",
-                    rate / roof
+                    "n {vertices} r {rank} {name} compensated {compensated}: {bandwidth:.1} of {read_limit:.1} GB/s, {:.2}",
+                    bandwidth / read_limit
                 );
-                assert!(rate > 0.0 && roof > 0.0);
+                assert!(bandwidth > 0.0 && read_limit > 0.0);
             }
         }
     }

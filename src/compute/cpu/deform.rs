@@ -4,8 +4,8 @@ use pulp::NullaryFnOnce;
 
 use super::retained_modes::RetainedModes;
 use super::simd::run_vectorized;
-use super::sum::{ModeSelection, Scratch, TileVertices, sum};
-use super::tile::{self, DomainTile, PackedOutput, PerTileOutput};
+use super::sum::{ModeSelection, Scratch, TileVertices, sum_modes};
+use super::tile::{self, DomainTile, PackedOutput, PerTileOutput, SplitOutput};
 use super::tile_bounds::TileBounds;
 use crate::storage::{QUAD, TILE_QUADS, TiledModes};
 use modalcast_model::domain::Transform;
@@ -26,12 +26,30 @@ pub(super) struct DeformInputs<'a> {
     pub(super) all_chunks: &'a [u16],
 }
 
-/// Three f32 per vertex; the extent of each tile; and three more f32 per vertex if the scene keeps displacements.
-pub(super) type TileOutputs<'a> = (PackedOutput<'a>, PerTileOutput<'a, TileBounds>, Option<PackedOutput<'a>>);
+/// The outputs of a step.
+pub(super) struct DeformOutputs<'a> {
+    /// Three f32 per vertex.
+    pub(super) positions: PackedOutput<'a>,
+    /// Per tile. Not finite if a position or a displacement of the tile is not finite.
+    pub(super) bounds: PerTileOutput<'a, TileBounds>,
+    /// Three f32 per vertex; `None` if the scene does not keep displacements.
+    pub(super) displacements: Option<PackedOutput<'a>>,
+}
 
-/// Writes positions, extents and displacements of these tiles. A tile's extent is not finite if one of its positions,
-/// or one of the displacements that the scene keeps, is not.
-pub(super) fn deform(inputs: DeformInputs, tiles: &[DomainTile], outputs: TileOutputs) {
+impl SplitOutput for DeformOutputs<'_> {
+    fn split_at_tile(self, tile: &DomainTile) -> (Self, Self) {
+        let (left_positions, right_positions) = self.positions.split_at_tile(tile);
+        let (left_bounds, right_bounds) = self.bounds.split_at_tile(tile);
+        let (left_displacements, right_displacements) = self.displacements.split_at_tile(tile);
+        (
+            Self { positions: left_positions, bounds: left_bounds, displacements: left_displacements },
+            Self { positions: right_positions, bounds: right_bounds, displacements: right_displacements },
+        )
+    }
+}
+
+/// Writes positions, bounds and displacements of these tiles.
+pub(super) fn deform(inputs: DeformInputs, tiles: &[DomainTile], outputs: DeformOutputs) {
     if inputs.scene.features.compensated {
         tile::run_parallel(tiles, outputs, &|tiles, outputs| {
             run_vectorized(DeformTask::<true> { inputs, tiles, outputs })
@@ -43,11 +61,11 @@ pub(super) fn deform(inputs: DeformInputs, tiles: &[DomainTile], outputs: TileOu
     }
 }
 
-/// A run of neighboring tiles on one core.
+/// A run of consecutive tiles that one core computes.
 struct DeformTask<'a, const COMPENSATED: bool> {
     inputs: DeformInputs<'a>,
     tiles: &'a [DomainTile],
-    outputs: TileOutputs<'a>,
+    outputs: DeformOutputs<'a>,
 }
 
 impl<const COMPENSATED: bool> NullaryFnOnce for DeformTask<'_, COMPENSATED> {
@@ -56,18 +74,18 @@ impl<const COMPENSATED: bool> NullaryFnOnce for DeformTask<'_, COMPENSATED> {
     #[inline(always)]
     fn call(mut self) {
         let mut scratch = Scratch::new();
+        let DeformOutputs { positions, bounds, displacements } = &mut self.outputs;
         for tile in self.tiles {
-            let (positions, extents, displacements) = &mut self.outputs;
             let out = TileOutput {
-                positions: positions.of(tile),
-                displacements: displacements.as_mut().map(|all| all.of(tile)),
+                positions: positions.numbers_of(tile),
+                displacements: displacements.as_mut().map(|displacements| displacements.numbers_of(tile)),
             };
-            *extents.of(tile) = deform_tile::<COMPENSATED>(&self.inputs, tile, &mut scratch, out);
+            *bounds.value_of(tile) = deform_tile::<COMPENSATED>(&self.inputs, tile, &mut scratch, out);
         }
     }
 }
 
-/// A tile's part of the outputs.
+/// The part of one tile in the outputs.
 struct TileOutput<'a> {
     positions: &'a mut [f32],
     displacements: Option<&'a mut [f32]>,
@@ -81,48 +99,50 @@ fn deform_tile<const COMPENSATED: bool>(
     out: TileOutput,
 ) -> TileBounds {
     let tiles = inputs.tiles_of(tile);
-    let place = tiles.tile(tile.first() / MAX_TILE_VERTICES);
+    let layout = tiles.tile(tile.first() / MAX_TILE_VERTICES);
     if tiles.rank() > 0 {
-        sum::<COMPENSATED>(tiles, &place, inputs.mode_selection(tile), scratch);
+        sum_modes::<COMPENSATED>(tiles, &layout, inputs.mode_selection(tile), scratch);
     } else {
-        scratch.sums[..12 * place.quads].fill(0.0);
+        scratch.sums[..12 * layout.quads].fill(0.0);
     }
-    let spoil =
+    let poison =
         out.displacements.map_or(0.0, |displacements| store_displacements(inputs, tile, &scratch.sums, displacements));
-    add_rest(&tiles.rest()[place.first_quad..][..place.quads], &mut scratch.sums);
+    add_rest(&tiles.rest()[layout.first_quad..][..layout.quads], &mut scratch.sums);
     let transform = inputs.state.transform_of(inputs.scene, tile.domain());
-    let tile_bounds = store_positions(&transform, &mut scratch.sums, 4 * place.quads, out.positions);
+    let tile_bounds = store_positions(&transform, &mut scratch.sums, 4 * layout.quads, out.positions);
     let tile_bounds =
         if tile_bounds.is_finite() { tile_bounds } else { repair_non_finite(inputs, tile, out.positions) };
-    tile_bounds.poison_with(spoil)
+    tile_bounds.poison_with(poison)
 }
 
 /// Copies the sums of a tile, `[axis][vertex]`, to the displacements of its vertices. Displacements that are not finite
-/// are summed again in f64, so that only values that f32 cannot hold are lost. Returns 0, or NaN if any is lost.
+/// are repaired. Returns the result of [`repair_displacements`], else 0.
 #[inline(always)]
 fn store_displacements(inputs: &DeformInputs, tile: &DomainTile, sums: &TileVertices, out: &mut [f32]) -> f32 {
     let width = tile.count().next_multiple_of(QUAD);
-    let mut spoil = 0.0;
+    let mut poison = 0.0;
     for (vertex, out) in out.chunks_exact_mut(3).enumerate() {
         out.copy_from_slice(&[sums[vertex], sums[width + vertex], sums[2 * width + vertex]]);
-        spoil += (out[0] + out[1] + out[2]) * 0.0;
+        poison += (out[0] + out[1] + out[2]) * 0.0;
     }
-    if spoil == 0.0 { spoil } else { repair_displacements(inputs, tile, out) }
+    if poison == 0.0 { poison } else { repair_displacements(inputs, tile, out) }
 }
 
+/// Sums the displacements that are not finite again in f64. Returns NaN if one of them still is not finite in f32, else
+/// 0.
 #[cold]
 #[inline(never)]
 fn repair_displacements(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32]) -> f32 {
     let (tiles, q) = (inputs.tiles_of(tile), inputs.q_of(tile));
-    let mut spoil = 0.0;
-    for (at, out) in out.chunks_exact_mut(3).enumerate() {
+    let mut poison = 0.0;
+    for (vertex, out) in out.chunks_exact_mut(3).enumerate() {
         if !out.iter().all(|number| number.is_finite()) {
-            let exact = displacement_f64(tiles, q, tile.first() + at).map(|number| number as f32);
-            out.copy_from_slice(&exact);
+            let displacement = displacement_f64(tiles, q, tile.first() + vertex).map(|number| number as f32);
+            out.copy_from_slice(&displacement);
         }
-        out.iter().for_each(|number| spoil += number * 0.0);
+        out.iter().for_each(|number| poison += number * 0.0);
     }
-    spoil
+    poison
 }
 
 impl<'a> DeformInputs<'a> {
@@ -135,17 +155,18 @@ impl<'a> DeformInputs<'a> {
     fn mode_selection(&self, tile: &DomainTile) -> ModeSelection<'a> {
         let chunks = self.tiles_of(tile).chunks();
         match self.retained_modes {
-            Some(retained_modes) => retained_modes.of(tile.domain()),
+            Some(retained_modes) => retained_modes.selection_of(tile.domain()),
             None => ModeSelection { q: self.state.q_of(self.scene, tile.domain()), chunks: &self.all_chunks[..chunks] },
         }
     }
 
-    /// The coordinates that a tile's domain sums.
+    /// The coordinates of a tile's domain; empty without modes.
     fn q_of(&self, tile: &DomainTile) -> &'a [f32] {
         if self.tiles_of(tile).rank() > 0 { self.mode_selection(tile).q } else { &[] }
     }
 }
 
+/// Adds x0 to the sums of a tile, `[axis][vertex]`.
 #[inline(always)]
 fn add_rest(rest: &[[f32; 12]], sums: &mut TileVertices) {
     let width = QUAD * rest.len();
@@ -158,11 +179,12 @@ fn add_rest(rest: &[[f32; 12]], sums: &mut TileVertices) {
     }
 }
 
-/// World positions of a tile from `[axis][vertex]`, `width` vertices per axis. Overwrites `bent`.
+/// Writes the world positions of a tile. `deformed` is x0 + u as `[axis][vertex]` with `width` vertices per axis, and is
+/// overwritten.
 #[inline(always)]
-fn store_positions(transform: &Transform, bent: &mut TileVertices, width: usize, out: &mut [f32]) -> TileBounds {
+fn store_positions(transform: &Transform, deformed: &mut TileVertices, width: usize, out: &mut [f32]) -> TileBounds {
     let t = transform.0;
-    let (x, yz) = bent[..3 * width].split_at_mut(width);
+    let (x, yz) = deformed[..3 * width].split_at_mut(width);
     let (y, z) = yz.split_at_mut(width);
     for ((x, y), z) in x.iter_mut().zip(y.iter_mut()).zip(z.iter_mut()) {
         // No closure here: it would be compiled without fused multiply-adds.
@@ -175,10 +197,11 @@ fn store_positions(transform: &Transform, bent: &mut TileVertices, width: usize,
     for (((out, x), y), z) in out.chunks_exact_mut(3).zip(&*x).zip(&*y).zip(&*z) {
         out.copy_from_slice(&[*x, *y, *z]);
     }
-    TileBounds::of([&x[..count], &y[..count], &z[..count]])
+    TileBounds::of_axes([&x[..count], &y[..count], &z[..count]])
 }
 
-/// Recomputes in f64 the vertices that are not finite: an f32 intermediate of a finite result may have overflowed.
+/// Recomputes in f64 the positions that are not finite, because only an intermediate f32 may have overflowed. Returns the
+/// bounds of all positions.
 #[cold]
 #[inline(never)]
 fn repair_non_finite(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32]) -> TileBounds {
@@ -186,27 +209,29 @@ fn repair_non_finite(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32]) 
     let transform = inputs.state.composed_transform(inputs.scene, tile.domain()).to_f64();
     let q = inputs.q_of(tile);
     let mut tile_bounds = TileBounds::EMPTY;
-    for (at, out) in out.chunks_exact_mut(3).enumerate() {
+    for (vertex, out) in out.chunks_exact_mut(3).enumerate() {
         if !out.iter().all(|number| number.is_finite()) {
-            let bent = deformed_rest_f64(tiles, q, tile.first() + at);
+            let deformed = deformed_position_f64(tiles, q, tile.first() + vertex);
             for (row, out) in out.iter_mut().enumerate() {
                 let [x, y, z, offset] = [0, 1, 2, 3].map(|column| transform[4 * row + column]);
-                *out = (x * bent[0] + y * bent[1] + z * bent[2] + offset) as f32;
+                *out = (x * deformed[0] + y * deformed[1] + z * deformed[2] + offset) as f32;
             }
         }
-        tile_bounds = tile_bounds.union(TileBounds::of([&out[..1], &out[1..2], &out[2..]]));
+        tile_bounds = tile_bounds.union(TileBounds::of_axes([&out[..1], &out[1..2], &out[2..]]));
     }
     tile_bounds
 }
 
-fn deformed_rest_f64(tiles: &TiledModes, q: &[f32], vertex: usize) -> [f64; 3] {
-    let moved = displacement_f64(tiles, q, vertex);
-    [0, 1, 2].map(|axis| moved[axis] + f64::from(tiles.rest()[vertex / QUAD][QUAD * axis + vertex % QUAD]))
+/// x0 + u of a vertex.
+fn deformed_position_f64(tiles: &TiledModes, q: &[f32], vertex: usize) -> [f64; 3] {
+    let displacement = displacement_f64(tiles, q, vertex);
+    [0, 1, 2].map(|axis| displacement[axis] + f64::from(tiles.rest()[vertex / QUAD][QUAD * axis + vertex % QUAD]))
 }
 
+/// u of a vertex.
 fn displacement_f64(tiles: &TiledModes, q: &[f32], vertex: usize) -> [f64; 3] {
     [0, 1, 2].map(|axis| {
-        let part = |(mode, q): (usize, &f32)| tiles.decode_entry(vertex, axis, mode) * f64::from(*q);
-        q.iter().enumerate().map(part).sum::<f64>()
+        let mode_term = |(mode, q): (usize, &f32)| tiles.decode_entry(vertex, axis, mode) * f64::from(*q);
+        q.iter().enumerate().map(mode_term).sum::<f64>()
     })
 }

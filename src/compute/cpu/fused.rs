@@ -1,5 +1,5 @@
-//! Fused decoding and summation of packed entries in vector registers, two quads at a time. The results are
-//! bit-identical to those of [`super::sum`] by decoded columns, and much faster. Only for uncompensated sums on x86.
+//! Decodes and sums packed entries in vector registers, two quads at a time. This is much faster than the decoded
+//! columns of [`super::sum`] and gives bit-identical results. Only for uncompensated sums on x86.
 
 use std::arch::x86_64::{__m256, __m256i};
 
@@ -9,20 +9,20 @@ use pulp::x86::V3;
 use super::decode::SMALLEST_NORMAL_HALF;
 use crate::storage::{PackedWord, QUAD};
 
-/// Decoder of a storage type. The entries of two neighboring quads, the 32 bytes of two planes, decode to `GROUPS`
-/// vectors of one mode and axis each.
+/// Decoder of a storage type. It decodes 32 bytes, one plane of two neighboring quads, to `GROUPS` vectors. Each vector
+/// has the entries of eight vertices for one mode and axis.
 pub(super) trait Decode<const GROUPS: usize> {
     fn decode(simd: V3, packed_words: __m256i) -> [__m256; GROUPS];
 }
 
-/// f16.
+/// Decoder of f16.
 pub(super) struct DecodeF16;
-/// bf16.
+/// Decoder of bf16.
 pub(super) struct DecodeBf16;
-/// int8.
+/// Decoder of int8.
 pub(super) struct DecodeInt8;
 
-// No closure may call an intrinsic here: it would be compiled without the features that intrinsics need to be inlined.
+// Closures are compiled without the CPU features that intrinsics need to be inlined, so no closure here calls intrinsics.
 
 impl Decode<2> for DecodeF16 {
     #[inline(always)]
@@ -30,14 +30,14 @@ impl Decode<2> for DecodeF16 {
         let mut groups = [simd.avx._mm256_set1_ps(0.0); 2];
         for (group, target) in groups.iter_mut().enumerate() {
             let bits = simd.avx2._mm256_shuffle_epi8(packed_words, cast(F16_SHUFFLE[group]));
-            // The algorithm of `decode::half`.
-            let kept = simd.avx._mm256_set1_epi32(0x0fff_e000);
-            let magnitude = simd.avx2._mm256_and_si256(simd.avx2._mm256_srli_epi32::<3>(bits), kept);
+            // The algorithm of `decode::decode_f16`.
+            let mantissa_mask = simd.avx._mm256_set1_epi32(0x0fff_e000);
+            let magnitude = simd.avx2._mm256_and_si256(simd.avx2._mm256_srli_epi32::<3>(bits), mantissa_mask);
             let x = cast(simd.avx2._mm256_add_epi32(magnitude, simd.avx._mm256_set1_epi32(112 << 23)));
-            let (two, less) = (simd.avx._mm256_set1_ps(2.0), simd.avx._mm256_set1_ps(SMALLEST_NORMAL_HALF));
-            let fixed = simd.fma._mm256_fmsub_ps(two, x, less);
+            let (two, offset) = (simd.avx._mm256_set1_ps(2.0), simd.avx._mm256_set1_ps(SMALLEST_NORMAL_HALF));
+            let corrected = simd.fma._mm256_fmsub_ps(two, x, offset);
             let sign = simd.avx._mm256_and_ps(cast(bits), simd.avx._mm256_set1_ps(-0.0));
-            *target = simd.avx._mm256_or_ps(sign, simd.avx._mm256_min_ps(x, fixed));
+            *target = simd.avx._mm256_or_ps(sign, simd.avx._mm256_min_ps(x, corrected));
         }
         groups
     }
@@ -56,20 +56,20 @@ impl Decode<2> for DecodeBf16 {
 impl Decode<4> for DecodeInt8 {
     #[inline(always)]
     fn decode(simd: V3, packed_words: __m256i) -> [__m256; 4] {
-        // A byte in the mantissa of 2^23 is 2^23 + byte: the subtraction also removes the bias of 128, exactly.
-        let above = simd.avx._mm256_set1_epi32(0x4b00_0000);
-        let zero = simd.avx._mm256_set1_ps(8_388_608.0 + 128.0);
-        let mut groups = [zero; 4];
+        // A byte in the mantissa of 2^23 gives 2^23 + byte. One exact subtraction removes 2^23 and the code of zero.
+        let exponent_bits = simd.avx._mm256_set1_epi32(0x4b00_0000);
+        let bias = simd.avx._mm256_set1_ps(8_388_608.0 + 128.0);
+        let mut groups = [bias; 4];
         for (group, target) in groups.iter_mut().enumerate() {
             let bytes = simd.avx2._mm256_shuffle_epi8(packed_words, cast(INT8_SHUFFLE[group]));
-            *target = simd.avx._mm256_sub_ps(cast(simd.avx2._mm256_or_si256(bytes, above)), zero);
+            *target = simd.avx._mm256_sub_ps(cast(simd.avx2._mm256_or_si256(bytes, exponent_bits)), bias);
         }
         groups
     }
 }
 
-/// Shuffle masks that move each half of a group to the upper bits of a word: indices into the 16 bytes of a quad, 0x80
-/// for zero.
+/// Shuffle masks that move each 16-bit entry of a group to the upper bits of a word. A mask has indices into the 16 bytes
+/// of a quad, and 0x80 for zero bytes.
 const F16_SHUFFLE: [[u8; 32]; 2] = [shuffle_mask(2, 0), shuffle_mask(2, 1)];
 
 /// Shuffle masks that move each byte of a group to the lower bits of a word.
@@ -82,9 +82,9 @@ const fn shuffle_mask(size: u8, group: u8) -> [u8; 32] {
         let mut byte = 0;
         while byte < size {
             // Halves go to bytes 2 and 3 of a word, codes to byte 0.
-            let target = (4 * vertex + if size == 2 { 2 } else { 0 } + byte) as usize;
-            shuffle_mask[target] = size * (4 * group + vertex) + byte;
-            shuffle_mask[target + 16] = shuffle_mask[target];
+            let target_byte = (4 * vertex + if size == 2 { 2 } else { 0 } + byte) as usize;
+            shuffle_mask[target_byte] = size * (4 * group + vertex) + byte;
+            shuffle_mask[target_byte + 16] = shuffle_mask[target_byte];
             byte += 1;
         }
         vertex += 1;
@@ -92,8 +92,8 @@ const fn shuffle_mask(size: u8, group: u8) -> [u8; 32] {
     shuffle_mask
 }
 
-/// Adds chunks of a tile to its sums, `[axis][vertex]`. A chunk is three planes per quad and `MODES` amounts; a group
-/// of a plane has four vertices.
+/// Adds chunks of a tile to its sums, `[axis][vertex]`. A chunk has three planes and `MODES` scaled coordinates. A group
+/// has the entries of four vertices for one mode and axis.
 #[inline(always)]
 pub(super) fn add<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CHUNKS: usize>(
     simd: V3,
@@ -103,24 +103,25 @@ pub(super) fn add<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, co
     let quads = sums.len() / (3 * QUAD);
     let (x, yz) = sums.split_at_mut(QUAD * quads);
     let (y, z) = yz.split_at_mut(QUAD * quads);
-    let ((x, x_rest), (y, y_rest), (z, z_rest)) = (x.as_chunks_mut(), y.as_chunks_mut(), z.as_chunks_mut());
+    let ((x, x_tail), (y, y_tail), (z, z_tail)) = (x.as_chunks_mut(), y.as_chunks_mut(), z.as_chunks_mut());
     for (pair, ((x, y), z)) in x.iter_mut().zip(y).zip(z).enumerate() {
         add_pair::<D, GROUPS, MODES, CHUNKS>(simd, &chunks, [2 * pair, 2 * pair + 1], [x, y, z]);
     }
     if quads % 2 == 1 {
         // Process the last quad twice and drop the second result.
-        let mut room = [[0.0; 2 * QUAD]; 3];
-        let [a, b, c] = &mut room;
-        a[..QUAD].copy_from_slice(x_rest);
-        b[..QUAD].copy_from_slice(y_rest);
-        c[..QUAD].copy_from_slice(z_rest);
+        let mut padded = [[0.0; 2 * QUAD]; 3];
+        let [a, b, c] = &mut padded;
+        a[..QUAD].copy_from_slice(x_tail);
+        b[..QUAD].copy_from_slice(y_tail);
+        c[..QUAD].copy_from_slice(z_tail);
         add_pair::<D, GROUPS, MODES, CHUNKS>(simd, &chunks, [quads - 1; 2], [a, b, c]);
-        x_rest.copy_from_slice(&a[..QUAD]);
-        y_rest.copy_from_slice(&b[..QUAD]);
-        z_rest.copy_from_slice(&c[..QUAD]);
+        x_tail.copy_from_slice(&a[..QUAD]);
+        y_tail.copy_from_slice(&b[..QUAD]);
+        z_tail.copy_from_slice(&c[..QUAD]);
     }
 }
 
+/// Adds chunks to the sums of two quads, x, y and z of eight vertices.
 #[inline(always)]
 fn add_pair<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CHUNKS: usize>(
     simd: V3,
@@ -130,16 +131,16 @@ fn add_pair<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CH
 ) {
     let [x, y, z] = sums;
     let mut axes: [__m256; 3] = [cast(*x), cast(*y), cast(*z)];
-    for (packed_words, amounts) in chunks {
+    for (packed_words, scaled_q) in chunks {
         let count = packed_words.len() / 3;
         // Groups are ordered by mode, then axis, so this is the order of the sum.
         for plane in 0..3 {
-            let two = [packed_words[plane * count + quads[0]], packed_words[plane * count + quads[1]]];
-            let groups = D::decode(simd, cast(two));
-            for (group, vector) in groups.iter().enumerate() {
-                let at = GROUPS * plane + group;
-                let amount = simd.avx._mm256_set1_ps(amounts[at / 3]);
-                axes[at % 3] = simd.fma._mm256_fmadd_ps(*vector, amount, axes[at % 3]);
+            let words = [packed_words[plane * count + quads[0]], packed_words[plane * count + quads[1]]];
+            let groups = D::decode(simd, cast(words));
+            for (group, entries) in groups.iter().enumerate() {
+                let column = GROUPS * plane + group;
+                let coordinate = simd.avx._mm256_set1_ps(scaled_q[column / 3]);
+                axes[column % 3] = simd.fma._mm256_fmadd_ps(*entries, coordinate, axes[column % 3]);
             }
         }
     }

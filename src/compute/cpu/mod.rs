@@ -1,10 +1,10 @@
-//! The CPU deformer in f32, for machines without a GPU: rayon over a flat list of tiles of all domains, SIMD inside a
-//! tile.
+//! The CPU deformer in f32, for machines without a GPU. All cores share the tiles of all domains, and SIMD instructions
+//! compute the vertices of a tile.
 //!
-//! Each vertex sums its modes in order by fused multiply-adds, independent of its tile and of the domains that changed,
-//! so equal inputs give bit-identical outputs on any number of cores. Domains whose q and T equal those of the previous
-//! step keep their vertices and normals. With a truncation budget, the result also depends on earlier steps, because
-//! the choice of truncated modes has hysteresis.
+//! Equal inputs give bit-identical outputs on any number of cores: the modes of a vertex are summed in order by fused
+//! multiply-adds, independent of its tile and of the domains that changed. Domains whose q and T equal those of the
+//! previous step keep their vertices and normals. With a truncation budget, the result also depends on earlier steps,
+//! because the choice of truncated modes has hysteresis.
 
 mod bandwidth;
 #[cfg(test)]
@@ -31,7 +31,7 @@ pub use bandwidth::read_bandwidth;
 
 use crate::storage::{TiledModes, Truncation};
 use changes::ChangeTracker;
-use deform::{DeformInputs, MAX_TILE_VERTICES};
+use deform::{DeformInputs, DeformOutputs, MAX_TILE_VERTICES};
 use modalcast_model::deform::{Backend, BoundingAxes, DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{BoundingBox, Scene, SceneState};
@@ -40,22 +40,23 @@ use tile::{PackedOutput, PerTileOutput, WorkList};
 use tile_bounds::TileBounds;
 
 /// Maximum number of corners of a tile.
-const CORNER_TILE: usize = 256;
+const MAX_TILE_CORNERS: usize = 256;
 
-/// The deformer of the `cpu` backend, of one scene.
+/// The deformer of the `cpu` backend for one scene.
 #[derive(Debug)]
 pub struct CpuDeformer {
     scene: Arc<Scene>,
     bounding_axes: Option<BoundingAxes>,
     /// Per shape.
     shapes: Vec<TiledModes>,
+    /// 0, 1, 2 and so on: the chunk indices of the shape with the most chunks.
     all_chunks: Vec<u16>,
     retained_modes: Option<RetainedModes>,
     changes: ChangeTracker,
     vertex_work: WorkList,
     corner_work: WorkList,
     /// Per tile of vertices.
-    extents: Vec<TileBounds>,
+    tile_bounds: Vec<TileBounds>,
     surface: DeformedSurface,
 }
 
@@ -63,25 +64,25 @@ impl CpuDeformer {
     /// Encodes U in the scene's storage type and allocates work lists and outputs.
     pub fn new(scene: &Arc<Scene>) -> Self {
         let layout = &scene.layout;
-        let tangents = if scene.features.normal_maps { 4 * layout.corners } else { 0 };
+        let tangent_numbers = if scene.features.normal_maps { 4 * layout.corners } else { 0 };
         let storage = scene.deformation.storage;
         let shapes: Vec<TiledModes> = scene.shapes.par_iter().map(|shape| TiledModes::new(shape, storage)).collect();
-        let most_chunks = shapes.iter().map(TiledModes::chunks).max().unwrap_or(0);
+        let max_chunks = shapes.iter().map(TiledModes::chunks).max().unwrap_or(0);
         let vertex_work = WorkList::new(layout.domains.iter().map(|slot| slot.vertices), MAX_TILE_VERTICES);
         Self {
             scene: Arc::clone(scene),
             bounding_axes: None,
-            all_chunks: (0..most_chunks as u16).collect(),
+            all_chunks: (0..max_chunks as u16).collect(),
             retained_modes: RetainedModes::new(scene),
             changes: ChangeTracker::default(),
-            extents: vec![TileBounds::EMPTY; vertex_work.len()],
+            tile_bounds: vec![TileBounds::EMPTY; vertex_work.len()],
             shapes,
             vertex_work,
-            corner_work: WorkList::new(layout.domains.iter().map(|slot| slot.corners), CORNER_TILE),
+            corner_work: WorkList::new(layout.domains.iter().map(|slot| slot.corners), MAX_TILE_CORNERS),
             surface: DeformedSurface {
                 positions: vec![0.0; 3 * layout.vertices],
                 normals: vec![0.0; 3 * layout.corners],
-                tangents: vec![0.0; tangents],
+                tangents: vec![0.0; tangent_numbers],
                 displacements: vec![0.0; if scene.features.displacements { 3 * layout.vertices } else { 0 }],
                 boxes: vec![BoundingBox::EMPTY; if scene.features.boxes { layout.domains.len() } else { 0 }],
             },
@@ -94,7 +95,7 @@ impl CpuDeformer {
         Self { bounding_axes: axes, ..self }
     }
 
-    /// Bytes of stored U and x0: what a step of all domains reads if no two domains share a shape.
+    /// Bytes of stored U and x0. A full step reads so many bytes if no two domains share a shape.
     pub fn stored_bytes(&self) -> usize {
         self.shapes.iter().map(|tiles| tiles.bytes().len() + size_of_val(tiles.rest())).sum()
     }
@@ -114,17 +115,20 @@ impl CpuDeformer {
         };
         let DeformedSurface { positions, displacements, .. } = &mut self.surface;
         let displacements = self.scene.features.displacements.then(|| PackedOutput::new(3, displacements));
-        let outputs = (PackedOutput::new(3, positions), PerTileOutput::new(&mut self.extents), displacements);
-        deform::deform(inputs, self.vertex_work.of(&self.changes), outputs);
+        let outputs = DeformOutputs {
+            positions: PackedOutput::new(3, positions),
+            bounds: PerTileOutput::new(&mut self.tile_bounds),
+            displacements,
+        };
+        deform::deform(inputs, self.vertex_work.select_changed(&self.changes), outputs);
     }
 
-    /// Updates the boxes of the domains that changed, from those of their tiles; does nothing if the scene keeps no
-    /// boxes.
+    /// Updates the boxes of the changed domains from the bounds of their tiles, if the scene keeps boxes.
     fn update_boxes(&mut self) {
-        let (changes, work, extents) = (&self.changes, &self.vertex_work, &self.extents);
-        self.surface.boxes.par_iter_mut().with_min_len(1024).enumerate().for_each(|(domain, all)| {
+        let (changes, vertex_work, tile_bounds) = (&self.changes, &self.vertex_work, &self.tile_bounds);
+        self.surface.boxes.par_iter_mut().with_min_len(1024).enumerate().for_each(|(domain, bounding_box)| {
             if changes.is_changed(domain) {
-                *all = TileBounds::of_domain(&extents[work.tiles_of(domain)]);
+                *bounding_box = TileBounds::of_domain(&tile_bounds[vertex_work.tiles_of(domain)]);
             }
         });
     }
@@ -136,23 +140,23 @@ impl Deformer for CpuDeformer {
     }
 
     fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
-        let begin = Instant::now();
+        let start = Instant::now();
         self.changes.update(&self.scene, state);
         if let Some(retained_modes) = &mut self.retained_modes {
             retained_modes.update(&self.scene, state, &self.changes);
         }
         self.deform_positions(state);
         self.update_boxes();
-        // Both kinds of normals depend only on the domain's own positions and T.
-        let corners = self.corner_work.of(&self.changes);
+        // Exact and rigid normals depend only on the positions and T of their domain.
+        let corner_tiles = self.corner_work.select_changed(&self.changes);
         if self.scene.features.exact_normals {
-            normals::normals(&self.scene, state, corners, &mut self.surface);
+            normals::compute_normals(&self.scene, state, corner_tiles, &mut self.surface);
         } else {
-            rigid_normals::rigid_normals(&self.scene, state, corners, &mut self.surface);
+            rigid_normals::compute_rigid_normals(&self.scene, state, corner_tiles, &mut self.surface);
         }
-        let oriented_bounds = self.bounding_axes.map(|axes| TileBounds::along(&self.extents, &axes));
-        let bounds = TileBounds::all(&self.extents);
-        Ok(DeformSummary { bounds, oriented_bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
+        let oriented_bounds = self.bounding_axes.map(|axes| TileBounds::of_scene_along(&self.tile_bounds, &axes));
+        let bounds = TileBounds::of_scene(&self.tile_bounds);
+        Ok(DeformSummary { bounds, oriented_bounds, ms: start.elapsed().as_secs_f64() * 1e3 })
     }
 
     fn surface(&mut self) -> Result<&DeformedSurface> {

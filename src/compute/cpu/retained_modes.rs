@@ -7,35 +7,38 @@ use super::sum::ModeSelection;
 use crate::storage::{Truncation, TruncationInput, bound, max_row_norms, modes_per_chunk};
 use modalcast_model::scene::{Scene, SceneState};
 
-/// The kept modes of all domains.
+/// The retained modes of all domains.
 #[derive(Debug)]
 pub(super) struct RetainedModes {
-    /// Error budget, scene units.
+    /// Maximum error of a vertex by truncation, in scene units.
     budget: f64,
     /// Per shape.
     max_row_norms: Vec<Vec<f64>>,
     domains: Vec<DomainModes>,
 }
 
+/// The retained modes of a domain.
 #[derive(Debug)]
 struct DomainModes {
     truncation: Truncation,
+    /// Zero for truncated modes.
     q: Vec<f32>,
+    /// Chunks with at least one retained mode, ascending.
     chunks: Vec<u16>,
 }
 
 impl RetainedModes {
     /// Starts without truncated modes. `None` for a scene without a budget.
     pub(super) fn new(scene: &Scene) -> Option<Self> {
-        let meters = scene.deformation.truncation.filter(|_| scene.features.truncation)?;
-        let list = |domain| {
+        let budget_meters = scene.deformation.truncation.filter(|_| scene.features.truncation)?;
+        let create_domain_modes = |domain| {
             let rank = scene.rank_of(domain);
             DomainModes { truncation: Truncation::new(rank), q: vec![0.0; rank], chunks: Vec::with_capacity(rank) }
         };
         Some(Self {
-            budget: meters / scene.unit,
+            budget: budget_meters / scene.unit,
             max_row_norms: scene.shapes.par_iter().map(|shape| max_row_norms(&shape.modes)).collect(),
-            domains: (0..scene.domains.len()).map(list).collect(),
+            domains: (0..scene.domains.len()).map(create_domain_modes).collect(),
         })
     }
 
@@ -43,32 +46,32 @@ impl RetainedModes {
     pub(super) fn update(&mut self, scene: &Scene, state: &SceneState, changes: &ChangeTracker) {
         let per_chunk = modes_per_chunk(scene.deformation.storage) as u16;
         let Self { budget, max_row_norms, domains } = self;
-        let decide = |(domain, list): (usize, &mut DomainModes)| {
-            if list.q.is_empty() || !changes.is_changed(domain) {
+        let update_domain = |(domain, modes): (usize, &mut DomainModes)| {
+            if modes.q.is_empty() || !changes.is_changed(domain) {
                 return;
             }
             let q = state.q_of(scene, domain);
             let max_row_norms = &max_row_norms[scene.domains[domain].shape];
-            list.truncation.update(
+            modes.truncation.update(
                 TruncationInput { q, max_row_norms, norm: bound::norm(&state.composed_transform(scene, domain)) },
                 *budget,
             );
-            list.q.fill(0.0);
-            list.chunks.clear();
-            for mode in list.truncation.retained() {
-                list.q[usize::from(*mode)] = q[usize::from(*mode)];
-                if list.chunks.last() != Some(&(mode / per_chunk)) {
-                    list.chunks.push(mode / per_chunk);
+            modes.q.fill(0.0);
+            modes.chunks.clear();
+            for mode in modes.truncation.retained() {
+                modes.q[usize::from(*mode)] = q[usize::from(*mode)];
+                if modes.chunks.last() != Some(&(mode / per_chunk)) {
+                    modes.chunks.push(mode / per_chunk);
                 }
             }
         };
-        domains.par_iter_mut().enumerate().with_min_len(64).for_each(decide);
+        domains.par_iter_mut().enumerate().with_min_len(64).for_each(update_domain);
     }
 
     /// The modes that a domain sums.
-    pub(super) fn of(&self, domain: usize) -> ModeSelection<'_> {
-        let list = &self.domains[domain];
-        ModeSelection { q: &list.q, chunks: &list.chunks }
+    pub(super) fn selection_of(&self, domain: usize) -> ModeSelection<'_> {
+        let modes = &self.domains[domain];
+        ModeSelection { q: &modes.q, chunks: &modes.chunks }
     }
 
     /// The truncation of a domain.

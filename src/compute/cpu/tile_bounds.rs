@@ -1,4 +1,4 @@
-//! The bounds of one tile, cached so that tiles that did not change still count in the bounds of the scene.
+//! Bounds of one tile. The deformer stores them between steps, because the bounds of a scene include unchanged tiles.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -12,48 +12,49 @@ pub(super) struct TileBounds {
     max: [f32; 3],
 }
 
+/// Number of independent minima and maxima: one per lane of a 256-bit vector of f32.
 const LANES: usize = 8;
 
 impl TileBounds {
     pub(super) const EMPTY: Self = Self { min: [f32::INFINITY; 3], max: [f32::NEG_INFINITY; 3] };
 
-    /// Bounds of positions given by axis.
+    /// Bounds of positions; `axes` are their x, y and z.
     #[inline(always)]
-    pub(super) fn of(axes: [&[f32]; 3]) -> Self {
+    pub(super) fn of_axes(axes: [&[f32]; 3]) -> Self {
         let mut tile_bounds = Self::EMPTY;
         let mut poison = 0.0;
         for (axis, numbers) in axes.into_iter().enumerate() {
             let (mut min, mut max, mut sums) = ([f32::INFINITY; LANES], [f32::NEG_INFINITY; LANES], [0.0_f32; LANES]);
-            let mut eights = numbers.chunks_exact(LANES);
-            for eight in eights.by_ref() {
+            let mut blocks = numbers.chunks_exact(LANES);
+            for block in blocks.by_ref() {
                 for lane in 0..LANES {
-                    let number = eight[lane];
+                    let number = block[lane];
                     min[lane] = if number < min[lane] { number } else { min[lane] };
                     max[lane] = if number > max[lane] { number } else { max[lane] };
-                    // Infinity times zero is NaN, and NaN propagates: the sum shows whether all numbers are finite.
+                    // The sum stays 0 if all numbers are finite: infinity times zero is NaN, and NaN propagates.
                     sums[lane] += number * 0.0;
                 }
             }
-            for number in eights.remainder() {
+            for number in blocks.remainder() {
                 (min[0], max[0], sums[0]) = (min[0].min(*number), max[0].max(*number), sums[0] + number * 0.0);
             }
             tile_bounds.min[axis] = min.into_iter().fold(f32::INFINITY, f32::min);
             tile_bounds.max[axis] = max.into_iter().fold(f32::NEG_INFINITY, f32::max);
             poison += sums.iter().sum::<f32>();
         }
-        tile_bounds.poisoned(poison)
+        tile_bounds.add_poison(poison)
     }
 
-    /// The smallest extent that contains both.
+    /// The smallest bounds that contain both.
     #[inline(always)]
     pub(super) fn union(self, other: Self) -> Self {
-        // An empty extent is infinite but not NaN, and must not make the union NaN.
+        // Empty bounds are infinite but not NaN, and must not make the union NaN.
         let poison = if self.min[0].is_nan() || other.min[0].is_nan() { f32::NAN } else { 0.0 };
         Self {
             min: std::array::from_fn(|axis| self.min[axis].min(other.min[axis])),
             max: std::array::from_fn(|axis| self.max[axis].max(other.max[axis])),
         }
-        .poisoned(poison)
+        .add_poison(poison)
     }
 
     /// Whether all positions are finite, and there is at least one.
@@ -62,35 +63,39 @@ impl TileBounds {
         self.min[0].is_finite()
     }
 
-    /// Bounds of all tiles.
-    pub(super) fn all(extents: &[Self]) -> BoundingBox {
-        extents.par_iter().with_min_len(4096).copied().reduce(|| Self::EMPTY, Self::union).to_bounds()
+    /// Bounds of all tiles of a scene.
+    pub(super) fn of_scene(tile_bounds: &[Self]) -> BoundingBox {
+        tile_bounds.par_iter().with_min_len(4096).copied().reduce(|| Self::EMPTY, Self::union).to_bounds()
     }
 
-    /// Bounds of all tiles along these axes, from the corners of their boxes.
-    pub(super) fn along(extents: &[Self], axes: &[Vector3<f64>; 3]) -> OrientedBounds {
-        let one = |tile_bounds: &Self| OrientedBounds::enclosing(axes, &tile_bounds.to_bounds());
-        extents.par_iter().with_min_len(4096).map(one).reduce(|| OrientedBounds::EMPTY, OrientedBounds::union)
+    /// Bounds of a scene along these axes. They enclose the boxes of its tiles.
+    pub(super) fn of_scene_along(tile_bounds: &[Self], axes: &[Vector3<f64>; 3]) -> OrientedBounds {
+        let bounds_of_tile = |tile_bounds: &Self| OrientedBounds::enclosing(axes, &tile_bounds.to_bounds());
+        tile_bounds
+            .par_iter()
+            .with_min_len(4096)
+            .map(bounds_of_tile)
+            .reduce(|| OrientedBounds::EMPTY, OrientedBounds::union)
     }
 
     /// Bounds of the tiles of one domain.
-    pub(super) fn of_domain(extents: &[Self]) -> BoundingBox {
-        extents.iter().copied().fold(Self::EMPTY, Self::union).to_bounds()
+    pub(super) fn of_domain(tile_bounds: &[Self]) -> BoundingBox {
+        tile_bounds.iter().copied().fold(Self::EMPTY, Self::union).to_bounds()
     }
 
     fn to_bounds(self) -> BoundingBox {
         BoundingBox { min: self.min.map(f64::from), max: self.max.map(f64::from) }
     }
 
-    /// The extent, made NaN if `number` is not finite.
+    /// Makes the bounds NaN if `number` is not finite.
     #[inline(always)]
     pub(super) fn poison_with(self, number: f32) -> Self {
-        self.poisoned(number * 0.0)
+        self.add_poison(number * 0.0)
     }
 
-    /// The extent, unchanged if `poison` is 0, all NaN if it is NaN.
+    /// Adds 0, which changes nothing, or NaN, which makes all bounds NaN.
     #[inline(always)]
-    fn poisoned(self, poison: f32) -> Self {
+    fn add_poison(self, poison: f32) -> Self {
         Self { min: self.min.map(|number| number + poison), max: self.max.map(|number| number + poison) }
     }
 }
@@ -100,21 +105,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_extent_holds_every_position_and_any_that_is_not_finite_spoils_it() {
-        let axes: [Vec<f32>; 3] = [0, 1, 2].map(|axis| (0..21).map(|at| (at * 8 % 21 + axis) as f32).collect());
-        let of = |axes: &[Vec<f32>; 3]| TileBounds::of([&axes[0], &axes[1], &axes[2]]);
-        let tile_bounds = of(&axes);
+    fn bounds_contain_all_positions_and_non_finite_ones_make_them_nan() {
+        let axes: [Vec<f32>; 3] = [0, 1, 2].map(|axis| (0..21).map(|index| (index * 8 % 21 + axis) as f32).collect());
+        let bounds_of = |axes: &[Vec<f32>; 3]| TileBounds::of_axes([&axes[0], &axes[1], &axes[2]]);
+        let tile_bounds = bounds_of(&axes);
         assert_eq!((tile_bounds.min, tile_bounds.max), ([0.0, 1.0, 2.0], [20.0, 21.0, 22.0]));
-        for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-            for place in 0..63 {
-                let mut spoiled = axes.clone();
-                spoiled[place % 3][place / 3] = bad;
-                assert!(!of(&spoiled).is_finite());
-                assert!(!TileBounds::all(&[tile_bounds, of(&spoiled), tile_bounds]).is_finite());
+        for non_finite in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            for index in 0..63 {
+                let mut poisoned_axes = axes.clone();
+                poisoned_axes[index % 3][index / 3] = non_finite;
+                let poisoned = bounds_of(&poisoned_axes);
+                assert!(!poisoned.is_finite());
+                assert!(!TileBounds::of_scene(&[tile_bounds, poisoned, tile_bounds]).is_finite());
             }
         }
-        let other = TileBounds::of([&[30.0], &[-5.0], &[3.0]]);
-        let both = TileBounds::all(&[tile_bounds, other, TileBounds::EMPTY]);
-        assert_eq!((both.min, both.max), ([0.0, -5.0, 2.0], [30.0, 21.0, 22.0]));
+        let point_bounds = TileBounds::of_axes([&[30.0], &[-5.0], &[3.0]]);
+        let union = TileBounds::of_scene(&[tile_bounds, point_bounds, TileBounds::EMPTY]);
+        assert_eq!((union.min, union.max), ([0.0, -5.0, 2.0], [30.0, 21.0, 22.0]));
     }
 }

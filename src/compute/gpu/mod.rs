@@ -39,7 +39,7 @@ pub mod launchers {
     pub use super::executor::launchers::bounds::BoundsKernel;
     pub use super::executor::launchers::deform::{DeformKernel, PositionKernels};
     pub use super::executor::launchers::normals::NormalsKernel;
-    pub use super::executor::raster::{RasterFunctions, RasterPass, RasterPipeline, check, check_cut_outs};
+    pub use super::executor::raster::{RasterFunctions, RasterPass, RasterPipeline, check_cut_outs, check_mesh};
     pub use super::tables::change_list::{ChangeListLengths, ChangedDomains};
     pub use super::tables::device_tables::DeviceTables;
     pub use super::tables::kernels::storage_define;

@@ -11,11 +11,11 @@ pub fn deform(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
         let q = state.q_of(scene, domain);
         let world_from_domain = state.composed_transform(scene, domain).to_f64();
         for (vertex, rest) in shape.mesh.rest_positions().iter().enumerate() {
-            let mut bent = rest.map(f64::from);
-            add_modes(shape, q, vertex, &mut bent);
+            let mut deformed = rest.map(f64::from);
+            add_modes(shape, q, vertex, &mut deformed);
             positions.push(std::array::from_fn(|row| {
                 let [x, y, z, offset] = std::array::from_fn(|column| world_from_domain[4 * row + column]);
-                x * bent[0] + y * bent[1] + z * bent[2] + offset
+                x * deformed[0] + y * deformed[1] + z * deformed[2] + offset
             }));
         }
     }
@@ -28,19 +28,19 @@ pub fn displacements(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
     for domain in 0..scene.domains.len() {
         let (shape, q) = (scene.shape_of(domain), state.q_of(scene, domain));
         for vertex in 0..shape.mesh.rest_positions().len() {
-            let mut moved = [0.0; 3];
-            add_modes(shape, q, vertex, &mut moved);
-            displacements.push(moved);
+            let mut displacement = [0.0; 3];
+            add_modes(shape, q, vertex, &mut displacement);
+            displacements.push(displacement);
         }
     }
     displacements
 }
 
-/// Adds the three rows of U q of a vertex.
-fn add_modes(shape: &Shape, q: &[f32], vertex: usize, coordinates: &mut [f64; 3]) {
-    for (component, coordinate) in coordinates.iter_mut().enumerate() {
-        for (mode, amount) in q.iter().enumerate() {
-            *coordinate += f64::from(shape.modes.entry(vertex, component, mode)) * f64::from(*amount);
+/// Adds the three rows of U q of a vertex to `sum`.
+fn add_modes(shape: &Shape, q: &[f32], vertex: usize, sum: &mut [f64; 3]) {
+    for (axis, sum) in sum.iter_mut().enumerate() {
+        for (mode, coordinate) in q.iter().enumerate() {
+            *sum += f64::from(shape.modes.entry(vertex, axis, mode)) * f64::from(*coordinate);
         }
     }
 }

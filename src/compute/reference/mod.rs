@@ -1,4 +1,4 @@
-//! The reference deformer, which defines the results in plain f64 loops. Shares no code with the other deformers.
+//! The reference deformer: plain f64 loops that define the results. It shares no code with the other deformers.
 
 mod deform;
 mod normals;
@@ -36,12 +36,11 @@ impl ReferenceDeformer {
         Self { bounding_axes: axes, ..self }
     }
 
-    /// Computes displacements and boxes if the scene keeps them. A displacement that overflows f32 makes the bounds
-    /// NaN.
+    /// Computes displacements and boxes if the scene keeps them. Displacements that overflow f32 make the bounds NaN.
     fn compute_attributes(&mut self, state: &SceneState, bounds: &mut BoundingBox) {
         let (scene, surface) = (&self.scene, &mut self.surface);
         if scene.features.displacements {
-            surface.displacements = round(displacements(scene, state));
+            surface.displacements = round_to_f32(displacements(scene, state));
             if !surface.displacements.iter().all(|number| number.is_finite()) {
                 bounds.include([f64::NAN; 3]);
             }
@@ -61,24 +60,24 @@ impl Deformer for ReferenceDeformer {
     }
 
     fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
-        let begin = Instant::now();
+        let start = Instant::now();
         let positions = deform(&self.scene, state);
         let oriented_bounds = self.bounding_axes.map(|axes| {
-            let one =
+            let bounds_of =
                 |position: &[f64; 3]| OrientedBounds::enclosing(&axes, &BoundingBox { min: *position, max: *position });
-            positions.iter().map(one).fold(OrientedBounds::EMPTY, OrientedBounds::union)
+            positions.iter().map(bounds_of).fold(OrientedBounds::EMPTY, OrientedBounds::union)
         });
         let (normals, tangents) = if self.scene.features.exact_normals {
             (exact_normals(&self.scene, state, &positions), exact_tangents(&self.scene, state, &positions))
         } else {
             (rigid_normals(&self.scene, state), rigid_tangents(&self.scene, state))
         };
-        self.surface.positions = round(positions);
-        self.surface.normals = round(normals);
-        self.surface.tangents = round(tangents);
+        self.surface.positions = round_to_f32(positions);
+        self.surface.normals = round_to_f32(normals);
+        self.surface.tangents = round_to_f32(tangents);
         let mut bounds = BoundingBox::from_positions(&self.surface.positions);
         self.compute_attributes(state, &mut bounds);
-        Ok(DeformSummary { bounds, oriented_bounds, ms: begin.elapsed().as_secs_f64() * 1e3 })
+        Ok(DeformSummary { bounds, oriented_bounds, ms: start.elapsed().as_secs_f64() * 1e3 })
     }
 
     fn surface(&mut self) -> Result<&DeformedSurface> {
@@ -86,6 +85,6 @@ impl Deformer for ReferenceDeformer {
     }
 }
 
-fn round<const N: usize>(list: Vec<[f64; N]>) -> Vec<f32> {
-    list.into_flattened().into_iter().map(|number| number as f32).collect()
+fn round_to_f32<const N: usize>(vectors: Vec<[f64; N]>) -> Vec<f32> {
+    vectors.into_flattened().into_iter().map(|number| number as f32).collect()
 }

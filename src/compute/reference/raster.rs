@@ -1,25 +1,28 @@
-//! The reference rasterizer, sample by sample: defines the result of `kernels/raster.cu`, in plain loops.
+//! The reference rasterizer: plain loops over samples that define the result of `kernels/raster.cu`.
 //!
-//! Corners are transformed to clip space in f32, with each sum and product rounded separately, clipped by the near
-//! plane and a guard band around the window (Sutherland and Hodgman, "Reentrant polygon clipping", 1974), and snapped
-//! to 1/256 pixel. From there on coverage is exact, in integers: a triangle covers the samples on the inner side of all
-//! its edges. A sample on an edge belongs to the triangle for which it is a top or left edge, so triangles that share
-//! an edge cover each sample exactly once. Depth is z/w, linear in the window, in f32 from the exact edge values.
-//! Cut-outs keep the samples whose alpha is large enough ([`cut_out`]).
+//! Corners are transformed to clip space in f32; each sum and product is rounded separately. Triangles are clipped by the
+//! near plane and a guard band around the window (Sutherland and Hodgman, "Reentrant polygon clipping", 1974), and their
+//! corners are snapped to 1/256 pixel.
+//!
+//! Coverage is then exact, in integers: a triangle covers the samples on the inner side of all its edges. A sample on an
+//! edge belongs to the triangle for which it is a top or left edge, so triangles that share an edge cover each sample
+//! exactly once. Depth is z/w, linear in the window, in f32 from the exact edge values. Cut-outs cover only samples whose
+//! alpha is large enough ([`cut_out`]).
 
 pub mod cut_out;
 
 use modalcast_model::raster::CutOuts;
 use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
-/// Subpixel steps per pixel, and the smallest w of a divisor.
+/// Subpixel steps per pixel.
 const SUBPIXEL_STEPS: i32 = 256;
+/// The smallest w by which clip coordinates are divided.
 const MIN_W: f32 = f32::from_bits((127 - 100) << 23);
 
-/// Clear value of a sample.
+/// Key of a sample that no triangle covers.
 pub const EMPTY_KEY: u64 = u64::MAX;
 
-/// A corner in the window: 1/256 pixel with y down, and depth.
+/// A corner in the window: x and y in 1/256 pixel with y down, z is the depth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SnappedVertex {
     pub x: i32,
@@ -32,50 +35,52 @@ pub struct SnappedVertex {
 pub enum CullReason {
     /// A corner is not finite in clip space.
     NotFinite,
-    /// Outside one plane of the view frustum, or nothing remains after clipping.
+    /// All corners are outside of one plane of the view frustum, or nothing remains after clipping.
     OutsideFrustum,
     /// No area after snapping.
     Degenerate,
     BackFacing,
-    /// The box of its corners contains no sample.
+    /// The bounding box of its corners contains no sample.
     NoSample,
 }
 
-/// The samples of a box, both ends included: least x and y, largest x and y.
+/// A range of samples with both ends included: minimum x and y, maximum x and y.
 pub type PixelRect = [i32; 4];
 
 /// A triangle after clipping.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ClippedPolygon {
-    /// 3 to 8 corners of a convex polygon, in the triangle's own orientation.
+    /// 3 to 8 corners of a convex polygon, in the orientation of the triangle.
     pub corners: Vec<SnappedVertex>,
-    /// Twice its area in (1/256 pixel)^2, positive where the corners are clockwise on the screen.
-    pub area: i64,
+    /// Twice the signed area in (1/256 pixel)^2, positive if the corners are clockwise on the screen.
+    pub doubled_area: i64,
+    /// The samples in the bounding box of the corners, inside of the window.
     pub samples: PixelRect,
-    /// Whether a plane clipped it.
-    pub clipped: bool,
+    /// Whether the near plane or the guard band clipped the triangle.
+    pub is_clipped: bool,
 }
 
-/// Samples of a window: the least depth of each and its triangle.
+/// Samples of a window: the smallest depth of each sample, and its triangle.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VisibilityBuffer {
     window: Viewport,
-    /// Row by row from the top: the bits of depth, then the triangle; [`EMPTY_KEY`] where there is none.
+    /// Row by row from the top. The upper 32 bits are the bits of the depth, the lower 32 bits the triangle.
+    /// [`EMPTY_KEY`] where no triangle covers the sample.
     pub keys: Vec<u64>,
 }
 
 impl VisibilityBuffer {
-    /// An empty window.
+    /// Creates an empty buffer for a window.
     pub fn new(window: Viewport) -> Self {
         Self { window, keys: vec![EMPTY_KEY; window.pixel_count()] }
     }
 
-    /// Draws the triangles of a group; positions are three numbers per vertex.
+    /// Draws a range of triangles. Positions are three numbers per vertex.
     pub fn draw(&mut self, positions: &[f32], triangles: &[[u32; 3]], group: DrawRange) {
         self.draw_filtered(positions, triangles, group, |_, _| true);
     }
 
-    /// Draws the triangles of a group of a mesh with cut-outs.
+    /// Draws a range of triangles of a mesh with cut-outs.
     pub fn draw_cut_out(&mut self, positions: &[f32], triangles: &[[u32; 3]], group: DrawRange, cut_outs: &CutOuts) {
         let window = self.window;
         self.draw_filtered(positions, triangles, group, |triangle, pixel| {
@@ -102,21 +107,24 @@ impl VisibilityBuffer {
 
     /// Depths; 1 where nothing was drawn.
     pub fn depths(&self) -> Vec<f32> {
-        let depth = |key: &u64| if *key == EMPTY_KEY { 1.0 } else { f32::from_bits((key >> 32) as u32) };
-        self.keys.iter().map(depth).collect()
+        let depth_of = |key: &u64| if *key == EMPTY_KEY { 1.0 } else { f32::from_bits((key >> 32) as u32) };
+        self.keys.iter().map(depth_of).collect()
     }
 
-    /// The triangle of each sample.
+    /// The triangle of each sample; `None` where nothing was drawn.
     pub fn ids(&self) -> Vec<Option<u32>> {
         self.keys.iter().map(|key| (*key != EMPTY_KEY).then_some(*key as u32)).collect()
     }
 
+    /// Draws the samples of a clipped triangle.
     fn fill(&mut self, clipped_polygon: &ClippedPolygon, triangle: u32, passes_alpha_test: impl Fn([i32; 2]) -> bool) {
         let [x0, y0, x1, y1] = clipped_polygon.samples;
         let width = self.window.size()[0] as usize;
-        for piece in fan_triangles(clipped_polygon) {
+        for triangle_corners in fan_triangles(clipped_polygon) {
             for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
-                if let Some(depth) = depth_at(&piece, column, row).filter(|_| passes_alpha_test([column, row])) {
+                if let Some(depth) =
+                    depth_at(&triangle_corners, column, row).filter(|_| passes_alpha_test([column, row]))
+                {
                     let key = &mut self.keys[row as usize * width + column as usize];
                     *key = (*key).min(u64::from(depth.to_bits()) << 32 | u64::from(triangle));
                 }
@@ -142,73 +150,75 @@ pub fn clipped_polygon(
     if is_outside(&corners) {
         return Err(CullReason::OutsideFrustum);
     }
-    let whole =
+    let is_unclipped =
         |corner: &[f32; 4]| (0..5).all(|plane| plane_distance(window, corner, plane) >= 0.0) && corner[3] >= MIN_W;
-    let clipped = !corners.iter().all(whole);
-    let kept = if clipped { clip(window, &corners) } else { corners.to_vec() };
-    if kept.len() < 3 || !kept.iter().all(|corner| corner[3] >= MIN_W) {
+    let is_clipped = !corners.iter().all(is_unclipped);
+    let clipped_corners = if is_clipped { clip(window, &corners) } else { corners.to_vec() };
+    if clipped_corners.len() < 3 || !clipped_corners.iter().all(|corner| corner[3] >= MIN_W) {
         return Err(CullReason::OutsideFrustum);
     }
-    let corners: Vec<SnappedVertex> = kept.iter().map(|corner| snap(window, corner)).collect();
-    let area = (1..corners.len() - 1).map(|at| area(&[corners[0], corners[at], corners[at + 1]])).sum();
+    let corners: Vec<SnappedVertex> = clipped_corners.iter().map(|corner| snap(window, corner)).collect();
+    let doubled_area =
+        (1..corners.len() - 1).map(|index| doubled_area(&[corners[0], corners[index], corners[index + 1]])).sum();
     let samples = samples(window, &corners);
-    if area == 0 {
+    if doubled_area == 0 {
         return Err(CullReason::Degenerate);
     }
-    if cull_mode == CullMode::Back && area > 0 {
+    if cull_mode == CullMode::Back && doubled_area > 0 {
         return Err(CullReason::BackFacing);
     }
     if samples[0] > samples[2] || samples[1] > samples[3] {
         return Err(CullReason::NoSample);
     }
-    Ok(ClippedPolygon { corners, area, samples, clipped })
+    Ok(ClippedPolygon { corners, doubled_area, samples, is_clipped })
 }
 
 /// A triangle's corners in clip space.
 pub fn corners(window: &Viewport, positions: &[f32], triangle: [u32; 3]) -> [[f32; 4]; 3] {
-    triangle.map(|vertex| to_clip(window, &positions[3 * vertex as usize..][..3]))
+    triangle.map(|vertex| transform_to_clip(window, &positions[3 * vertex as usize..][..3]))
 }
 
-/// A triangle fan over the outline, each triangle oriented so that its corners are clockwise on the screen.
+/// Divides the polygon into a triangle fan. The corners of each triangle are clockwise on the screen.
 pub fn fan_triangles(clipped_polygon: &ClippedPolygon) -> Vec<[SnappedVertex; 3]> {
     let corners = &clipped_polygon.corners;
-    let turned = |at: usize| {
-        let (b, c) = if clipped_polygon.area < 0 { (at + 1, at) } else { (at, at + 1) };
-        [corners[0], corners[b], corners[c]]
+    let oriented_triangle = |index: usize| {
+        let (second, third) = if clipped_polygon.doubled_area < 0 { (index + 1, index) } else { (index, index + 1) };
+        [corners[0], corners[second], corners[third]]
     };
-    (1..corners.len() - 1).map(turned).filter(|piece| area(piece) > 0).collect()
+    (1..corners.len() - 1).map(oriented_triangle).filter(|triangle| doubled_area(triangle) > 0).collect()
 }
 
-/// Depth of a piece at a pixel's sample, if the sample lies inside and not behind the far plane.
-pub fn depth_at(piece: &[SnappedVertex; 3], column: i32, row: i32) -> Option<f32> {
+/// Depth of a triangle at a pixel's sample, if the sample lies inside and not behind the far plane.
+pub fn depth_at(triangle: &[SnappedVertex; 3], column: i32, row: i32) -> Option<f32> {
     let (x, y) = (SUBPIXEL_STEPS * column + SUBPIXEL_STEPS / 2, SUBPIXEL_STEPS * row + SUBPIXEL_STEPS / 2);
-    let [a, b, c] = piece;
-    let edges = [(b, c), (c, a), (a, b)].map(|(from, to)| (edge(from, to, x, y), top_left_bias(from, to)));
-    if edges.iter().any(|(value, top_left_bias)| value < top_left_bias) {
+    let [a, b, c] = triangle;
+    let edge_values = [(b, c), (c, a), (a, b)].map(|(from, to)| (edge(from, to, x, y), top_left_bias(from, to)));
+    if edge_values.iter().any(|(value, top_left_bias)| value < top_left_bias) {
         return None;
     }
-    let inverse = 1.0 / area(piece) as f32;
-    let [share_b, share_c] = [1, 2].map(|at| edges[at].0 as f32 * inverse);
-    let z = a.z + (share_b * (b.z - a.z) + share_c * (c.z - a.z));
+    let inverse_area = 1.0 / doubled_area(triangle) as f32;
+    let [weight_b, weight_c] = [1, 2].map(|corner| edge_values[corner].0 as f32 * inverse_area);
+    let z = a.z + (weight_b * (b.z - a.z) + weight_c * (c.z - a.z));
     (z <= 1.0).then_some(if z > 0.0 { z } else { 0.0 })
 }
 
 /// The edge function at a point: positive on the right of the edge, with y down.
 pub fn edge(from: &SnappedVertex, to: &SnappedVertex, x: i32, y: i32) -> i64 {
-    let [across, down] = [to.x - from.x, to.y - from.y].map(i64::from);
-    across * i64::from(y - from.y) - down * i64::from(x - from.x)
+    let [dx, dy] = [to.x - from.x, to.y - from.y].map(i64::from);
+    dx * i64::from(y - from.y) - dy * i64::from(x - from.x)
 }
 
-/// Least covered value of an edge function: samples on top and left edges are covered.
+/// Smallest value of an edge function at covered samples: 0 for top and left edges, 1 for other edges.
 fn top_left_bias(from: &SnappedVertex, to: &SnappedVertex) -> i64 {
     i64::from(!(to.y < from.y || (to.y == from.y && to.x > from.x)))
 }
 
-fn area(piece: &[SnappedVertex; 3]) -> i64 {
-    edge(&piece[0], &piece[1], piece[2].x, piece[2].y)
+/// Twice the signed area in (1/256 pixel)^2, positive if the corners are clockwise on the screen.
+fn doubled_area(triangle: &[SnappedVertex; 3]) -> i64 {
+    edge(&triangle[0], &triangle[1], triangle[2].x, triangle[2].y)
 }
 
-fn to_clip(window: &Viewport, position: &[f32]) -> [f32; 4] {
+fn transform_to_clip(window: &Viewport, position: &[f32]) -> [f32; 4] {
     let m = window.clip_from_positions();
     std::array::from_fn(|row| {
         let row = &m[4 * row..][..4];
@@ -217,61 +227,66 @@ fn to_clip(window: &Viewport, position: &[f32]) -> [f32; 4] {
 }
 
 fn is_outside(corners: &[[f32; 4]; 3]) -> bool {
-    let beyond = |axis: usize, side: f32| corners.iter().all(|corner| side * corner[axis] > corner[3]);
-    (0..3).any(|axis| beyond(axis, 1.0) || beyond(axis, -1.0))
+    let is_beyond = |axis: usize, sign: f32| corners.iter().all(|corner| sign * corner[axis] > corner[3]);
+    (0..3).any(|axis| is_beyond(axis, 1.0) || is_beyond(axis, -1.0))
 }
 
-/// Signed distance to a plane, not negative on the inner side: the near plane, then the sides of the guard band.
+/// Signed distance to a plane, not negative on the inner side. Plane 0 is the near plane, the others are the sides of the
+/// guard band.
 fn plane_distance(window: &Viewport, [x, y, z, w]: &[f32; 4], plane: usize) -> f32 {
     let [guard_x, guard_y] = window.guard_band().map(|guard| guard * w);
     [z + w, guard_x - x, guard_x + x, guard_y - y, guard_y + y][plane]
 }
 
 fn clip(window: &Viewport, corners: &[[f32; 4]; 3]) -> Vec<[f32; 4]> {
-    let mut list = corners.to_vec();
+    let mut polygon = corners.to_vec();
     for plane in 0..5 {
-        let mut kept = Vec::with_capacity(8);
-        for (at, a) in list.iter().enumerate() {
-            let b = &list[(at + 1) % list.len()];
-            let [of_a, of_b] = [a, b].map(|corner| plane_distance(window, corner, plane));
-            if of_a >= 0.0 {
-                kept.push(*a);
+        let mut clipped_polygon = Vec::with_capacity(8);
+        for (index, start) in polygon.iter().enumerate() {
+            let end = &polygon[(index + 1) % polygon.len()];
+            let [start_distance, end_distance] = [start, end].map(|corner| plane_distance(window, corner, plane));
+            if start_distance >= 0.0 {
+                clipped_polygon.push(*start);
             }
-            if (of_a >= 0.0) != (of_b >= 0.0) {
-                kept.push(if of_a >= 0.0 { clip_edge(a, b, of_a, of_b) } else { clip_edge(b, a, of_b, of_a) });
+            if (start_distance >= 0.0) != (end_distance >= 0.0) {
+                clipped_polygon.push(if start_distance >= 0.0 {
+                    clip_edge(start, end, start_distance, end_distance)
+                } else {
+                    clip_edge(end, start, end_distance, start_distance)
+                });
             }
         }
         // Rounding may make a polygon slightly concave; a plane adds at most one corner to a convex polygon.
-        kept.truncate(8);
-        list = kept;
+        clipped_polygon.truncate(8);
+        polygon = clipped_polygon;
     }
-    list
+    polygon
 }
 
-/// Intersection of an edge with a plane, always computed from the inner end, so that both triangles of an edge get the
-/// same result.
-fn clip_edge(inner: &[f32; 4], outer: &[f32; 4], of_inner: f32, of_outer: f32) -> [f32; 4] {
-    let t = of_inner / (of_inner - of_outer);
+/// Intersection of an edge with a plane. Both triangles of an edge get the same result, because it is always computed
+/// from the inner end.
+fn clip_edge(inner: &[f32; 4], outer: &[f32; 4], inner_distance: f32, outer_distance: f32) -> [f32; 4] {
+    let t = inner_distance / (inner_distance - outer_distance);
     std::array::from_fn(|axis| inner[axis] + t * (outer[axis] - inner[axis]))
 }
 
 fn snap(window: &Viewport, [x, y, z, w]: &[f32; 4]) -> SnappedVertex {
     let [half_width, half_height] = window.half_size();
-    let inverse = 1.0 / w;
-    let across = x * inverse * half_width + half_width;
-    let down = -(y * inverse) * half_height + half_height;
-    let snapped = |pixel_count: f32| (pixel_count * SUBPIXEL_STEPS as f32).round_ties_even() as i32;
-    SnappedVertex { x: snapped(across), y: snapped(down), z: z * inverse * 0.5 + 0.5 }
+    let inverse_w = 1.0 / w;
+    let window_x = x * inverse_w * half_width + half_width;
+    let window_y = -(y * inverse_w) * half_height + half_height;
+    let to_subpixels = |pixels: f32| (pixels * SUBPIXEL_STEPS as f32).round_ties_even() as i32;
+    SnappedVertex { x: to_subpixels(window_x), y: to_subpixels(window_y), z: z * inverse_w * 0.5 + 0.5 }
 }
 
-/// The samples in the box of the corners, clipped to the window.
+/// The samples in the bounding box of the corners, clipped to the window.
 fn samples(window: &Viewport, corners: &[SnappedVertex]) -> PixelRect {
-    let ends = |of: fn(&SnappedVertex) -> i32, side: u32| {
-        let all = || corners.iter().map(of);
-        let (low, high) = (all().min().unwrap_or(0), all().max().unwrap_or(0));
-        (((low + SUBPIXEL_STEPS / 2 - 1) >> 8).max(0), ((high - SUBPIXEL_STEPS / 2) >> 8).min(side as i32 - 1))
+    let sample_range = |coordinate_of: fn(&SnappedVertex) -> i32, window_side: u32| {
+        let coordinates = || corners.iter().map(coordinate_of);
+        let (min, max) = (coordinates().min().unwrap_or(0), coordinates().max().unwrap_or(0));
+        (((min + SUBPIXEL_STEPS / 2 - 1) >> 8).max(0), ((max - SUBPIXEL_STEPS / 2) >> 8).min(window_side as i32 - 1))
     };
     let [width, height] = window.size();
-    let ((x0, x1), (y0, y1)) = (ends(|corner| corner.x, width), ends(|corner| corner.y, height));
+    let ((x0, x1), (y0, y1)) = (sample_range(|corner| corner.x, width), sample_range(|corner| corner.y, height));
     [x0, y0, x1, y1]
 }

@@ -1,4 +1,5 @@
-//! Rigid normals by the inverse transpose of A, tangents by A, both of unit length. Twin of `kernels/rigid_normals.cuh`.
+//! Rigid normals, transformed by the inverse transpose of A, and tangents, transformed by A. Both have unit length. Twin
+//! of `kernels/rigid_normals.cuh`.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -12,9 +13,9 @@ pub fn rigid_normals(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
         let linear = state.composed_transform(scene, domain).linear();
         // The inverse transpose is the cofactor matrix over the determinant; only the determinant's sign survives
         // normalization.
-        let turn = cofactors(&linear) * linear.determinant().signum();
+        let normal_transform = cofactors(&linear) * linear.determinant().signum();
         for normal in &scene.shape_of(domain).mesh.corners().normals {
-            normals.push(unit(turn * Vector3::from(*normal).cast::<f64>()).into());
+            normals.push(normalize_or_z(normal_transform * Vector3::from(*normal).cast::<f64>()).into());
         }
     }
     normals
@@ -30,14 +31,14 @@ pub fn rigid_tangents(scene: &Scene, state: &SceneState) -> Vec<[f64; 4]> {
     for domain in 0..scene.domains.len() {
         let shape = scene.shape_of(domain);
         let linear = state.composed_transform(scene, domain).linear();
-        let hand = linear.determinant().signum();
+        let determinant_sign = linear.determinant().signum();
         for corner in 0..shape.mesh.corners().vertices.len() {
             let Some([x, y, z, sign]) = shape.tangents().get(corner) else {
                 tangents.push([0.0; 4]);
                 continue;
             };
-            let tangent = unit(linear * Vector3::new(*x, *y, *z).cast::<f64>());
-            tangents.push([tangent.x, tangent.y, tangent.z, f64::from(*sign) * hand]);
+            let tangent = normalize_or_z(linear * Vector3::new(*x, *y, *z).cast::<f64>());
+            tangents.push([tangent.x, tangent.y, tangent.z, f64::from(*sign) * determinant_sign]);
         }
     }
     tangents
@@ -48,6 +49,6 @@ pub(super) fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
     Matrix3::from_rows(&[b.cross(&c).transpose(), c.cross(&a).transpose(), a.cross(&b).transpose()])
 }
 
-fn unit(vector: Vector3<f64>) -> Vector3<f64> {
+fn normalize_or_z(vector: Vector3<f64>) -> Vector3<f64> {
     vector.try_normalize(1e-300).unwrap_or_else(Vector3::z)
 }

@@ -1,14 +1,13 @@
-//! Storage of U in tiles, as the CPU and GPU deformers read it; error bounds of each storage type; and modal
-//! truncation. Pure functions of a scene's values.
+//! U in tiles, as the CPU and GPU deformers read it, error bounds of each storage type, and modal truncation.
 //!
 //! # Layout
-//! Four consecutive vertices form a quad, up to [`TILE_QUADS`] consecutive quads of a shape form a tile.
-//! [`modes_per_chunk`] modes form a chunk, which takes 48 bytes per quad for every storage type: three planes of 16
-//! bytes. A tile of W quads is `[chunk][plane][quad]` of those 16 bytes. A warp thus makes coalesced reads of 16 bytes
-//! per lane, and a core reads a shape sequentially from its first byte to its last.
+//! Four consecutive vertices form a quad. Up to [`TILE_QUADS`] consecutive quads of a shape form a tile.
+//! [`modes_per_chunk`] modes form a chunk. For every storage type, a chunk has 48 bytes per quad: three planes of 16
+//! bytes. A tile of W quads is the array `[chunk][plane][quad]` of these packed words of 16 bytes. A warp thus makes
+//! coalesced reads of 16 bytes per lane, and a core reads a shape sequentially.
 //!
-//! Element e of the 48 bytes is that of mode e / 12 of the chunk, axis e / 4 % 3, vertex e % 4 of the quad. The padding
-//! of quads and chunks is zero. Numbers have the machine's byte order.
+//! Element e of the 48 bytes belongs to mode e / 12 of the chunk, axis e / 4 % 3, and vertex e % 4 of the quad. Padding
+//! vertices and modes are zero. Numbers have the machine's byte order.
 
 pub mod bound;
 mod quantize;

@@ -1,4 +1,4 @@
-//! Encodes columns of U as planes: scales, factors, rounding. Parallel over tiles.
+//! Encodes columns of U as planes of a storage type, in parallel over tiles.
 
 use half::{bf16, f16};
 use rayon::prelude::*;
@@ -7,47 +7,47 @@ use super::{PackedWord, QUAD, TILE_QUADS, TileLayout, modes_per_chunk};
 use modalcast_model::domain::Modes;
 use modalcast_model::scene::StorageType;
 
-/// x0 of up to four vertices, element `4 axis + vertex`.
+/// Packs x0 of up to four vertices; element `4 axis + vertex`.
 pub(super) fn rest_quad(vertices: &[[f32; 3]]) -> [f32; 12] {
     let mut quad = [0.0; 12];
-    for (at, vertex) in vertices.iter().enumerate() {
-        (0..3).for_each(|axis| quad[QUAD * axis + at] = vertex[axis]);
+    for (vertex, position) in vertices.iter().enumerate() {
+        (0..3).for_each(|axis| quad[QUAD * axis + vertex] = position[axis]);
     }
     quad
 }
 
 /// Factors 2^s per mode such that the largest stored entry lies in [2^14, 2^15) for `F16`, in [1, 2) for `Bf16`; 1 for
-/// a mode of zeros. s is at least -149, where 2^s is the smallest f32: columns below 2^-135 are stored smaller, without
-/// loss of precision.
+/// a mode of zeros. s is at least -149, where 2^s is the smallest f32. Columns below 2^-135 therefore have smaller stored
+/// entries, without loss of precision.
 pub(super) fn factors(modes: &Modes, storage: StorageType) -> Vec<f32> {
-    let top = match storage {
+    let stored_exponent = match storage {
         StorageType::F16 => 14,
         StorageType::Bf16 => 0,
         StorageType::F32 | StorageType::Int8 => return Vec::new(),
     };
-    let factor = |mode: usize| match largest(modes.column(mode)) {
+    let factor = |mode: usize| match max_magnitude(modes.column(mode)) {
         0.0 => 1.0,
-        largest => power_of_two((exponent(largest) - top).max(-149)) as f32,
+        magnitude => power_of_two((floor_log2(magnitude) - stored_exponent).max(-149)) as f32,
     };
     (0..modes.rank()).into_par_iter().map(factor).collect()
 }
 
-/// Writes the planes of `F32`, `F16` or `Bf16`; they must be zero.
+/// Writes the planes of `F32`, `F16` or `Bf16`, which must be zero before.
 pub(super) fn encode_floats(
     modes: &Modes,
     tiles: &[TileLayout],
-    storage: (StorageType, &[f32]),
+    storage: StorageType,
+    factors: &[f32],
     packed_words: &mut [PackedWord],
 ) {
-    let (storage, factors) = storage;
     let inverse = |mode: usize| 1.0 / f64::from(factors[mode]);
-    each_tile(modes, storage, tiles, packed_words).for_each(|(tile, packed_words)| match storage {
-        StorageType::F32 => write(modes, tile, storage, packed_words, |_, entry| entry.to_ne_bytes()),
+    par_tiles(modes, storage, tiles, packed_words).for_each(|(tile, packed_words)| match storage {
+        StorageType::F32 => write_planes(modes, tile, storage, packed_words, |_, entry| entry.to_ne_bytes()),
         // The quotient is exact in f64, and in f32 unless it is far below the range of the storage type.
-        StorageType::F16 => write(modes, tile, storage, packed_words, |mode, entry| {
+        StorageType::F16 => write_planes(modes, tile, storage, packed_words, |mode, entry| {
             f16::from_f32((f64::from(entry) * inverse(mode)) as f32).to_ne_bytes()
         }),
-        StorageType::Bf16 => write(modes, tile, storage, packed_words, |mode, entry| {
+        StorageType::Bf16 => write_planes(modes, tile, storage, packed_words, |mode, entry| {
             bf16::from_f32((f64::from(entry) * inverse(mode)) as f32).to_ne_bytes()
         }),
         StorageType::Int8 => {}
@@ -56,17 +56,18 @@ pub(super) fn encode_floats(
 
 /// Writes the planes and scales of `Int8`.
 pub(super) fn encode_int8(modes: &Modes, tiles: &[TileLayout], packed_words: &mut [PackedWord], scales: &mut [f32]) {
-    let per_tile = modes.rank().next_multiple_of(modes_per_chunk(StorageType::Int8));
-    let parts = each_tile(modes, StorageType::Int8, tiles, packed_words).zip(scales.par_chunks_mut(per_tile));
-    parts.for_each(|((tile, packed_words), scales)| {
+    let tile_scales = modes.rank().next_multiple_of(modes_per_chunk(StorageType::Int8));
+    let encoded_tiles =
+        par_tiles(modes, StorageType::Int8, tiles, packed_words).zip(scales.par_chunks_mut(tile_scales));
+    encoded_tiles.for_each(|((tile, packed_words), scales)| {
         packed_words.fill(PackedWord([ZERO_CODE; 16]));
         for (mode, scale) in scales.iter_mut().take(modes.rank()).enumerate() {
-            *scale = quantization_step(largest(rows(modes, tile, mode)));
+            *scale = quantization_step(max_magnitude(tile_entries(modes, tile, mode)));
         }
         let scales = &*scales;
-        write(modes, tile, StorageType::Int8, packed_words, |mode, entry| match scales[mode] {
+        write_planes(modes, tile, StorageType::Int8, packed_words, |mode, entry| match scales[mode] {
             0.0 => [ZERO_CODE],
-            // At most 127 away from zero, because the scale was rounded up.
+            // The code is at most 127 away from that of zero, because the scale was rounded up.
             scale => [((f64::from(entry) / f64::from(scale)).round() + f64::from(ZERO_CODE)) as u8],
         });
     });
@@ -75,8 +76,8 @@ pub(super) fn encode_int8(modes: &Modes, tiles: &[TileLayout], packed_words: &mu
 /// The code of zero.
 const ZERO_CODE: u8 = 128;
 
-/// Each tile with its planes. Only the last tile of a shape is shorter.
-fn each_tile<'a>(
+/// Iterates in parallel over tiles and their planes. Only the last tile of a shape may be shorter.
+fn par_tiles<'a>(
     modes: &Modes,
     storage: StorageType,
     tiles: &'a [TileLayout],
@@ -87,12 +88,12 @@ fn each_tile<'a>(
 }
 
 /// The entries of a tile's vertices in one mode, three per vertex.
-fn rows<'a>(modes: &'a Modes, tile: &TileLayout, mode: usize) -> &'a [f32] {
+fn tile_entries<'a>(modes: &'a Modes, tile: &TileLayout, mode: usize) -> &'a [f32] {
     &modes.column(mode)[3 * tile.first_vertex..][..3 * tile.vertices]
 }
 
-/// Writes every entry of a tile to its byte offset.
-fn write<const SIZE: usize>(
+/// Encodes every entry of a tile into its planes. `encode` gets the mode and the entry.
+fn write_planes<const SIZE: usize>(
     modes: &Modes,
     tile: &TileLayout,
     storage: StorageType,
@@ -101,30 +102,31 @@ fn write<const SIZE: usize>(
 ) {
     let per_chunk = modes_per_chunk(storage);
     for mode in 0..modes.rank() {
-        let chunk = 3 * (mode / per_chunk) * tile.quads;
-        for (vertex, entries) in rows(modes, tile, mode).chunks_exact(3).enumerate() {
+        let first_word = 3 * (mode / per_chunk) * tile.quads;
+        for (vertex, entries) in tile_entries(modes, tile, mode).chunks_exact(3).enumerate() {
             for (axis, entry) in entries.iter().enumerate() {
                 let byte = SIZE * ((mode % per_chunk * 3 + axis) * QUAD + vertex % QUAD);
-                let plane = &mut packed_words[chunk + byte / 16 * tile.quads + vertex / QUAD];
-                plane.0[byte % 16..][..SIZE].copy_from_slice(&encode(mode, *entry));
+                let word = &mut packed_words[first_word + byte / 16 * tile.quads + vertex / QUAD];
+                word.0[byte % 16..][..SIZE].copy_from_slice(&encode(mode, *entry));
             }
         }
     }
 }
 
-/// 1/127 of the largest entry, rounded up, so that 127 steps reach it. A tile of zeros has step 0.
-fn quantization_step(largest: f32) -> f32 {
-    let exact = f64::from(largest) / 127.0;
-    let near = exact as f32;
-    if f64::from(near) < exact { near.next_up() } else { near }
+/// 1/127 of the largest magnitude, rounded up, so that 127 steps reach it. A tile of zeros has step 0.
+fn quantization_step(max_magnitude: f32) -> f32 {
+    let exact = f64::from(max_magnitude) / 127.0;
+    let nearest = exact as f32;
+    if f64::from(nearest) < exact { nearest.next_up() } else { nearest }
 }
 
-fn largest(entries: &[f32]) -> f32 {
+/// The largest magnitude of these entries.
+fn max_magnitude(entries: &[f32]) -> f32 {
     entries.iter().fold(0.0, |largest, entry| entry.abs().max(largest))
 }
 
 /// The floor of the binary logarithm of a positive number.
-pub(super) fn exponent(number: f32) -> i32 {
+pub(super) fn floor_log2(number: f32) -> i32 {
     // Every f32 is a normal number in f64.
     ((f64::from(number).to_bits() >> 52) & 0x7ff) as i32 - 1023
 }

@@ -1,9 +1,9 @@
-//! Coordinates for tensor cores with U in 16 bits: each coordinate is split into two numbers of U's type.
+//! Splits each coordinate into two numbers of U's type, for tensor cores with U in 16 bits.
 //!
 //! A number x becomes h = round(x) and l = round(x - h). For a type with p significant bits, |x - h| <= 2^-p |x|.
-//! Unless l is denormal, |x - h - l| <= 2^-2p |x|: 2^-22 with f16, 2^-16 with bf16. All coordinates of a domain are
-//! first multiplied by one power of two, so that the largest lies in [2^13, 2^14). Then nothing overflows f16, and the
-//! loss in its denormals is at most 2^-25, 2^-38 of the largest.
+//! Unless l is denormal, |x - h - l| <= 2^-2p |x|: 2^-22 |x| with f16, 2^-16 |x| with bf16. All coordinates of a domain
+//! are first multiplied by one power of two, so that the largest lies in [2^13, 2^14). Then nothing overflows f16. If l
+//! is denormal, the error is at most 2^-25, which is 2^-38 of the largest coordinate.
 
 use half::{bf16, f16};
 
@@ -18,40 +18,41 @@ const MIN_EXPONENT: i32 = -113;
 #[derive(Debug, Clone, PartialEq)]
 pub struct SplitCoordinates {
     storage: StorageType,
+    /// Per mode, the bits of h and l.
     pairs: Vec<[u16; 2]>,
     /// Exponent of the inverse scaling: sums are multiplied by 2 to this power.
     exponent: i32,
 }
 
 impl SplitCoordinates {
-    /// Splits finite coordinates, already multiplied by the factors of their modes, for U in `F16`; for any other
-    /// storage, in `Bf16`.
-    pub fn new(amounts: &[f32], storage: StorageType) -> Self {
-        let largest = amounts.iter().fold(0.0, |largest: f32, amount| largest.max(amount.abs()));
-        let exponent = exponent_of(largest).max(MIN_EXPONENT) - TOP_EXPONENT;
-        let grow = f64::from(-exponent).exp2();
-        let pair = |amount: &f32| {
-            let scaled = f64::from(*amount) * grow;
-            let high = rounded(scaled, storage);
-            [high, rounded(scaled - value(high, storage), storage)]
+    /// Splits finite coordinates, which are already multiplied by the factors of their modes. They become pairs of f16
+    /// for U in `F16`, and pairs of bf16 for any other storage.
+    pub fn new(scaled_q: &[f32], storage: StorageType) -> Self {
+        let largest = scaled_q.iter().fold(0.0, |largest: f32, coordinate| largest.max(coordinate.abs()));
+        let exponent = floor_log2(largest).max(MIN_EXPONENT) - TOP_EXPONENT;
+        let scale = f64::from(-exponent).exp2();
+        let split = |coordinate: &f32| {
+            let scaled = f64::from(*coordinate) * scale;
+            let high = encode(scaled, storage);
+            [high, encode(scaled - decode(high, storage), storage)]
         };
-        Self { storage, pairs: amounts.iter().map(pair).collect(), exponent }
+        Self { storage, pairs: scaled_q.iter().map(split).collect(), exponent }
     }
 
-    /// Bits of both numbers of a mode, the larger one first.
+    /// Bits of h and l of a mode.
     pub fn pair(&self, mode: usize) -> [u16; 2] {
         self.pairs[mode]
     }
 
-    /// Factor of the inverse scaling, by which sums are multiplied: a power of two that f32 can represent.
+    /// Factor by which sums are multiplied to undo the scaling: a power of two that f32 can represent.
     pub fn inverse_scale(&self) -> f32 {
         f64::from(self.exponent).exp2() as f32
     }
 
-    /// The value that both numbers of a mode represent.
+    /// The coordinate of a mode that its pair represents.
     pub fn decode_coordinate(&self, mode: usize) -> f64 {
         let [high, low] = self.pairs[mode];
-        (value(high, self.storage) + value(low, self.storage)) * f64::from(self.exponent).exp2()
+        (decode(high, self.storage) + decode(low, self.storage)) * f64::from(self.exponent).exp2()
     }
 }
 
@@ -68,10 +69,10 @@ pub struct TensorCoreError {
 
 /// 2^-23: the relative loss of truncating an addend that is aligned to the exponent of the largest.
 const TRUNCATION_ERROR: f64 = 1.0 / (1 << 23) as f64;
-/// Modes per product.
+/// Number of modes per matrix product.
 const MMA_MODES: usize = 16;
-/// Truncations of a product of 16 terms, computed at once or in two halves: of each term and of the previous sum, and
-/// of the result.
+/// Upper bound of the number of truncations in a product of 16 terms, computed at once or in two halves. Each term, the
+/// previous sum and the result are truncated.
 const TRUNCATIONS: f64 = 20.0;
 
 impl TensorCoreError {
@@ -80,7 +81,7 @@ impl TensorCoreError {
     /// A tensor core multiplies exactly, aligns all terms and the previous sum to the largest of them, and truncates
     /// (Fasi, Higham, Mikaitis, Pranesh, Numerical behavior of NVIDIA tensor cores, PeerJ Computer Science 7:e330,
     /// 2021). A product therefore loses at most `TRUNCATIONS` units of the sum of all magnitudes, and there are two
-    /// products for every 16 modes.
+    /// products for every 16 modes, one per number of the split.
     pub fn of(storage: StorageType, rank: usize) -> Self {
         let coordinate = f64::from(if storage == StorageType::F16 { -22_i8 } else { -16 }).exp2();
         let sum = 2.0 * rank.div_ceil(MMA_MODES) as f64 * TRUNCATIONS * TRUNCATION_ERROR;
@@ -89,22 +90,24 @@ impl TensorCoreError {
     }
 
     /// Lower limit of the largest coordinate in the `floor` bound.
-    pub(super) fn least() -> f64 {
+    pub(super) fn min_largest_coordinate() -> f64 {
         f64::from(MIN_EXPONENT).exp2()
     }
 }
 
 /// Exponent of the power of two at or below a number; for zero, that of the smallest f32.
-fn exponent_of(number: f32) -> i32 {
+fn floor_log2(number: f32) -> i32 {
     let bits = f64::from(number).to_bits();
     if number == 0.0 { -149 } else { (bits >> 52) as i32 - 1023 }
 }
 
-fn rounded(number: f64, storage: StorageType) -> u16 {
+/// Rounds a number to the bits of f16 or bf16.
+fn encode(number: f64, storage: StorageType) -> u16 {
     if storage == StorageType::F16 { f16::from_f64(number).to_bits() } else { bf16::from_f64(number).to_bits() }
 }
 
-fn value(bits: u16, storage: StorageType) -> f64 {
+/// The number with these bits of f16 or bf16.
+fn decode(bits: u16, storage: StorageType) -> f64 {
     if storage == StorageType::F16 { f16::from_bits(bits).to_f64() } else { bf16::from_bits(bits).to_f64() }
 }
 
@@ -114,32 +117,38 @@ mod tests {
     use crate::testing::TestRng;
 
     #[test]
-    fn two_halves_keep_what_they_promise_at_every_size_and_one_half_does_not() {
-        let mut noise = TestRng(3);
+    fn split_error_stays_within_its_bound_and_one_half_exceeds_it() {
+        let mut rng = TestRng(3);
         for storage in [StorageType::F16, StorageType::Bf16] {
-            let TensorCoreError { coordinate, floor, .. } = TensorCoreError::of(storage, 32);
-            for power in [-149, -126, -60, -14, 0, 30, 127] {
-                let scale = f64::from(power).exp2();
-                let spread = |at: i32| (f64::from(noise.next()) * scale * f64::from(-at).exp2()) as f32;
-                let amounts: Vec<f32> = (0..32).map(spread).collect();
-                let halves = SplitCoordinates::new(&amounts, storage);
-                let largest = amounts.iter().fold(0.0, |most: f32, amount| most.max(amount.abs()));
-                let most = f64::from(largest).max(TensorCoreError::least());
-                let mut one_half = false;
-                for (mode, amount) in amounts.iter().map(|amount| f64::from(*amount)).enumerate() {
-                    let allowed = coordinate * amount.abs() + floor * most;
-                    assert!((halves.decode_coordinate(mode) - amount).abs() <= allowed, "{storage:?} {power} {mode}");
-                    let high = value(halves.pair(mode)[0], storage) * f64::from(halves.inverse_scale());
-                    one_half |= (high - amount).abs() > allowed;
+            let error_bound = TensorCoreError::of(storage, 32);
+            for exponent in [-149, -126, -60, -14, 0, 30, 127] {
+                let scale = f64::from(exponent).exp2();
+                let random_coordinate = |index: i32| (f64::from(rng.next()) * scale * f64::from(-index).exp2()) as f32;
+                let scaled_q: Vec<f32> = (0..32).map(random_coordinate).collect();
+                let split = SplitCoordinates::new(&scaled_q, storage);
+                let largest = scaled_q.iter().fold(0.0, |largest: f32, coordinate| largest.max(coordinate.abs()));
+                let limited_largest = f64::from(largest).max(TensorCoreError::min_largest_coordinate());
+                let mut one_half_fails = false;
+                for (mode, coordinate) in scaled_q.iter().map(|coordinate| f64::from(*coordinate)).enumerate() {
+                    let max_error = error_bound.coordinate * coordinate.abs() + error_bound.floor * limited_largest;
+                    assert!(
+                        (split.decode_coordinate(mode) - coordinate).abs() <= max_error,
+                        "{storage:?} {exponent} {mode}"
+                    );
+                    let high = decode(split.pair(mode)[0], storage) * f64::from(split.inverse_scale());
+                    one_half_fails |= (high - coordinate).abs() > max_error;
                 }
-                assert!(one_half || power < -120, "{storage:?} {power}: the judge can fail");
-                assert!(halves.inverse_scale() > 0.0 && halves.inverse_scale().is_finite());
+                assert!(
+                    one_half_fails || exponent < -120,
+                    "{storage:?} 2^{exponent}: expected one half to exceed the bound"
+                );
+                assert!(split.inverse_scale() > 0.0 && split.inverse_scale().is_finite());
             }
         }
     }
 
     #[test]
-    fn zeros_and_the_extremes_of_f32_stay_finite_and_keep_their_signs() {
+    fn zeros_and_extremes_of_f32_stay_finite_and_keep_their_signs() {
         let zeros = SplitCoordinates::new(&[0.0, -0.0], StorageType::F16);
         assert_eq!((zeros.decode_coordinate(0), zeros.decode_coordinate(1)), (0.0, 0.0));
         let wide = SplitCoordinates::new(&[f32::MAX, -f32::MAX, f32::MIN_POSITIVE, 1e-45], StorageType::F16);
@@ -150,7 +159,7 @@ mod tests {
         assert_eq!(
             (wide.decode_coordinate(2), wide.decode_coordinate(3)),
             (0.0, 0.0),
-            "2^-253 of the largest is nothing"
+            "expected values of 2^-253 of the largest to become 0"
         );
         assert_eq!(SplitCoordinates::new(&[3.0], StorageType::F16).decode_coordinate(0), 3.0);
     }

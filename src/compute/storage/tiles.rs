@@ -8,23 +8,25 @@ use super::{QUAD, TILE_QUADS, modes_per_chunk, quantize};
 use modalcast_model::domain::Shape;
 use modalcast_model::scene::StorageType;
 
-/// 16 bytes of a quad's chunk: the unit that one lane loads at once.
+/// 16 bytes of one quad and chunk, in one plane: one lane loads them at once.
 #[repr(C, align(16))]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct PackedWord(pub [u8; 16]);
 
-/// Offsets and sizes of one tile.
+/// Offsets and sizes of one tile. C is the number of chunks, K the number of modes per chunk, W the number of quads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TileLayout {
-    /// The first quad in the shape, and the number W of quads.
+    /// Index of the first quad in the shape.
     pub first_quad: usize,
+    /// W, the number of quads.
     pub quads: usize,
-    /// The first vertex in the shape, and the number of vertices without padding.
+    /// Index of the first vertex in the shape.
     pub first_vertex: usize,
+    /// Number of vertices without padding.
     pub vertices: usize,
-    /// The first of its `3 C W` planes.
+    /// Index of the first of the tile's `3 C W` packed words.
     pub first_packed_word: usize,
-    /// The first of its `C K` scales, if the storage has scales.
+    /// Index of the first of the tile's `C K` scales, if the storage has scales.
     pub first_scale: usize,
 }
 
@@ -61,12 +63,12 @@ impl TiledModes {
         if rank == 0 {
             return tiles;
         }
-        let places: Vec<TileLayout> = (0..tiles.count()).map(|tile| tiles.tile(tile)).collect();
+        let layouts: Vec<TileLayout> = (0..tiles.count()).map(|tile| tiles.tile(tile)).collect();
         if storage == StorageType::Int8 {
             tiles.scales = vec![0.0; tiles.count() * tiles.chunks() * modes_per_chunk(storage)];
-            quantize::encode_int8(&shape.modes, &places, &mut tiles.packed_words, &mut tiles.scales);
+            quantize::encode_int8(&shape.modes, &layouts, &mut tiles.packed_words, &mut tiles.scales);
         } else {
-            quantize::encode_floats(&shape.modes, &places, (storage, &tiles.factors), &mut tiles.packed_words);
+            quantize::encode_floats(&shape.modes, &layouts, storage, &tiles.factors, &mut tiles.packed_words);
         }
         tiles
     }
@@ -101,7 +103,7 @@ impl TiledModes {
         self.quads().div_ceil(TILE_QUADS)
     }
 
-    /// Offsets of tile `tile`.
+    /// Offsets and sizes of tile `tile`.
     pub fn tile(&self, tile: usize) -> TileLayout {
         let first_quad = TILE_QUADS * tile;
         let quads = TILE_QUADS.min(self.quads() - first_quad);
@@ -116,7 +118,7 @@ impl TiledModes {
         }
     }
 
-    /// All planes, tile after tile without gaps: `48 C Q` bytes.
+    /// The planes of all tiles without gaps: `48 C Q` bytes.
     pub fn packed_words(&self) -> &[PackedWord] {
         &self.packed_words
     }
@@ -128,17 +130,17 @@ impl TiledModes {
 
     /// The range of tile `tile` in [`Self::bytes`].
     pub fn byte_range(&self, tile: usize) -> Range<usize> {
-        let place = self.tile(tile);
-        let first = 16 * place.first_packed_word;
-        first..first + 48 * self.chunks() * place.quads
+        let layout = self.tile(tile);
+        let first = 16 * layout.first_packed_word;
+        first..first + 48 * self.chunks() * layout.quads
     }
 
-    /// `Int8`: the step between codes per tile and mode, `[tile][C K]`, zero for padding modes. Else empty.
+    /// `Int8`: the value of one code step per tile and mode, `[tile][C K]`, zero for padding modes. Else empty.
     pub fn scales(&self) -> &[f32] {
         &self.scales
     }
 
-    /// `F16` and `Bf16`: per mode the power of two by which its stored entries are multiplied. Else empty.
+    /// `F16` and `Bf16`: per mode, the power of two by which decoding multiplies its stored entries. Else empty.
     pub fn factors(&self) -> &[f32] {
         &self.factors
     }
@@ -150,19 +152,20 @@ impl TiledModes {
 
     /// The stored entry of vertex `vertex`, axis `axis`, mode `mode`: exact in f64.
     pub fn decode_entry(&self, vertex: usize, axis: usize, mode: usize) -> f64 {
-        let per_chunk = modes_per_chunk(self.storage);
+        let chunk_modes = modes_per_chunk(self.storage);
         let (quad, tile) = (vertex / QUAD, vertex / QUAD / TILE_QUADS);
-        let place = self.tile(tile);
-        let element = (mode % per_chunk * 3 + axis) * QUAD + vertex % QUAD;
-        let size = 4 / per_chunk;
-        let (plane, within) = (element * size / 16, element * size % 16);
-        let at = place.first_packed_word + (mode / per_chunk * 3 + plane) * place.quads + quad - place.first_quad;
-        let bytes = &self.packed_words[at].0[within..within + size];
+        let layout = self.tile(tile);
+        let element = (mode % chunk_modes * 3 + axis) * QUAD + vertex % QUAD;
+        let size = 4 / chunk_modes;
+        let (plane, byte) = (element * size / 16, element * size % 16);
+        let word =
+            layout.first_packed_word + (mode / chunk_modes * 3 + plane) * layout.quads + quad - layout.first_quad;
+        let bytes = &self.packed_words[word].0[byte..byte + size];
         match self.storage {
             StorageType::F32 => f64::from(bytemuck::pod_read_unaligned::<f32>(bytes)),
             StorageType::F16 => f16::from_ne_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),
             StorageType::Bf16 => bf16::from_ne_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),
-            StorageType::Int8 => (f64::from(bytes[0]) - 128.0) * f64::from(self.scales[place.first_scale + mode]),
+            StorageType::Int8 => (f64::from(bytes[0]) - 128.0) * f64::from(self.scales[layout.first_scale + mode]),
         }
     }
 }
@@ -202,10 +205,10 @@ mod tests {
     }
 
     #[test]
-    fn every_entry_is_the_nearest_that_its_storage_can_hold() {
-        let mut noise = TestRng(1);
+    fn entries_are_rounded_to_the_nearest_stored_value() {
+        let mut rng = TestRng(1);
         for (vertices, rank) in SIZES {
-            let shape = shape(vertices, rank, &mut noise);
+            let shape = shape(vertices, rank, &mut rng);
             for storage in StorageType::ALL {
                 let tiles = TiledModes::new(&shape, storage);
                 for vertex in 0..vertices {
@@ -213,8 +216,11 @@ mod tests {
                     for (axis, mode) in (0..3).flat_map(|axis| (0..rank).map(move |mode| (axis, mode))) {
                         let entry = f64::from(shape.modes.entry(vertex, axis, mode));
                         let error = (tiles.decode_entry(vertex, axis, mode) - entry).abs();
-                        let allowed = half_step(&tiles, tile, mode, entry);
-                        assert!(error <= allowed, "{storage:?} {vertices} {rank}: {error} of {entry} over {allowed}");
+                        let max_error = half_step(&tiles, tile, mode, entry);
+                        assert!(
+                            error <= max_error,
+                            "{storage:?}, {vertices} x {rank}, entry {entry}: expected at most {max_error}, got {error}"
+                        );
                     }
                 }
             }
@@ -222,32 +228,32 @@ mod tests {
     }
 
     #[test]
-    fn tiles_follow_each_other_without_gaps_and_what_fills_up_is_zero() {
-        let mut noise = TestRng(2);
+    fn tiles_have_no_gaps_and_padding_is_zero() {
+        let mut rng = TestRng(2);
         for (vertices, rank) in SIZES {
-            let shape = shape(vertices, rank, &mut noise);
+            let shape = shape(vertices, rank, &mut rng);
             for storage in StorageType::ALL {
                 let tiles = TiledModes::new(&shape, storage);
                 assert_eq!(tiles.bytes().len(), 48 * tiles.chunks() * tiles.quads());
-                let ends = (0..tiles.count()).fold((0, 0, 0), |(byte, quad, vertex), tile| {
-                    let place = tiles.tile(tile);
+                let end = (0..tiles.count()).fold((0, 0, 0), |(byte, quad, vertex), tile| {
+                    let layout = tiles.tile(tile);
                     let range = tiles.byte_range(tile);
-                    assert_eq!((range.start, place.first_quad, place.first_vertex), (byte, quad, vertex));
-                    (range.end, quad + place.quads, vertex + place.vertices)
+                    assert_eq!((range.start, layout.first_quad, layout.first_vertex), (byte, quad, vertex));
+                    (range.end, quad + layout.quads, vertex + layout.vertices)
                 });
-                assert_eq!(ends, (tiles.bytes().len(), tiles.quads(), vertices));
-                let filled = tiles.chunks() * modes_per_chunk(storage);
+                assert_eq!(end, (tiles.bytes().len(), tiles.quads(), vertices));
+                let padded_rank = tiles.chunks() * modes_per_chunk(storage);
                 for vertex in vertices..QUAD * tiles.quads() {
                     for (axis, mode) in (0..3).flat_map(|axis| (0..rank).map(move |mode| (axis, mode))) {
                         assert_eq!(tiles.decode_entry(vertex, axis, mode), 0.0);
                     }
                 }
-                if storage == StorageType::Int8 && filled > rank {
-                    let place = tiles.tile(0);
-                    assert!(tiles.scales()[rank..filled].iter().all(|scale| *scale == 0.0));
+                if storage == StorageType::Int8 && padded_rank > rank {
+                    let layout = tiles.tile(0);
+                    assert!(tiles.scales()[rank..padded_rank].iter().all(|scale| *scale == 0.0));
                     // The last byte of the last chunk is vertex 3, axis 2 of a padding mode.
                     assert_eq!(
-                        tiles.packed_words()[place.first_packed_word + (3 * tiles.chunks() - 1) * place.quads].0[15],
+                        tiles.packed_words()[layout.first_packed_word + (3 * tiles.chunks() - 1) * layout.quads].0[15],
                         128
                     );
                 }
@@ -256,10 +262,11 @@ mod tests {
     }
 
     #[test]
-    fn bytes_lie_where_the_page_says() {
+    fn entries_have_the_documented_byte_offsets() {
         let shape = shape(9, 5, &mut TestRng(3));
         let tiles = TiledModes::new(&shape, StorageType::F32);
-        let float = |at: usize| f32::from_ne_bytes(tiles.bytes()[at..at + 4].try_into().expect("four bytes"));
+        let float =
+            |offset: usize| f32::from_ne_bytes(tiles.bytes()[offset..offset + 4].try_into().expect("four bytes"));
         // Three quads: mode 2, axis 1, vertex 6 is in quad 1 at position 2.
         assert_eq!(float(((2 * 3 + 1) * 3 + 1) * 16 + 2 * 4), shape.modes.entry(6, 1, 2));
         assert_eq!(tiles.rest()[1][4 + 2], shape.mesh.rest_positions()[6][1]);
@@ -267,8 +274,8 @@ mod tests {
         let tiles = TiledModes::new(&shape, StorageType::Int8);
         // Chunk 0, mode 2 is group 7 of 4 vertices: plane 1, bytes 12 to 15.
         let code = tiles.packed_words()[3 + 1].0[12 + 2];
-        let want = (shape.modes.entry(6, 1, 2) / tiles.scales()[2]).round() + 128.0;
-        assert_eq!(f32::from(code), want);
+        let expected = (shape.modes.entry(6, 1, 2) / tiles.scales()[2]).round() + 128.0;
+        assert_eq!(f32::from(code), expected);
         let tiles = TiledModes::new(&shape, StorageType::F16);
         // Mode 3 is the second mode of chunk 1: its group 4 is plane 2, bytes 0 to 7.
         let bytes = &tiles.packed_words()[9 + 2 * 3 + 1].0[4..6];

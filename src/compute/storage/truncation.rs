@@ -1,21 +1,22 @@
-//! Modal truncation: which modes can be left out at a step's q, and a bound of the resulting error.
+//! Modal truncation: the modes that can be left out at a step's q, and a bound of the resulting error.
 //!
 //! Leaving out the modes D moves no vertex by more than `||A||_2 sum_{j in D} |q_j| max_i ||U_ij||_2`, by the triangle
-//! inequality and the norm of A. Hysteresis prevents a mode whose q oscillates around a limit from popping: a mode is
-//! left out only when all truncated modes together stay within half the budget, and returns when the whole budget is
-//! exceeded.
+//! inequality and the norm of A. Hysteresis prevents popping of a mode whose q oscillates around a limit. A mode is
+//! truncated only while all truncated modes together stay within half the budget. It is restored when they exceed the
+//! whole budget.
 
 use modalcast_model::domain::Modes;
 
-/// Safety factor, slightly more than the rounding error of 513 additions and three products in f64.
+/// Safety factor: more than the rounding error of 513 additions and three products in f64.
 const ROUND_UP: f64 = 1.0 + 1e-12;
 
-/// `max_i ||U_ij||_2` per mode, rounded up, scene units per unit of q: the largest displacement of a vertex by the
-/// mode.
+/// `max_i ||U_ij||_2` per mode j, rounded up: the largest displacement of a vertex by the mode, in scene units per unit
+/// of q.
 pub fn max_row_norms(modes: &Modes) -> Vec<f64> {
-    let square = |row: &[f32]| row.iter().map(|entry| f64::from(*entry).powi(2)).sum::<f64>();
-    let reach = |mode: usize| modes.column(mode).chunks_exact(3).map(square).fold(0.0, f64::max).sqrt() * ROUND_UP;
-    (0..modes.rank()).map(reach).collect()
+    let norm_squared = |row: &[f32]| row.iter().map(|entry| f64::from(*entry).powi(2)).sum::<f64>();
+    let max_row_norm =
+        |mode: usize| modes.column(mode).chunks_exact(3).map(norm_squared).fold(0.0, f64::max).sqrt() * ROUND_UP;
+    (0..modes.rank()).map(max_row_norm).collect()
 }
 
 /// Inputs of the truncation of a domain in one step.
@@ -32,29 +33,40 @@ pub struct TruncationInput<'a> {
 /// The truncated modes of one domain, updated step by step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Truncation {
-    out: Vec<bool>,
+    /// Per mode.
+    is_truncated: Vec<bool>,
+    /// Per mode: maximum displacement of a vertex by the mode in this step, in scene units.
     costs: Vec<f64>,
+    /// All modes by ascending cost.
     ascending: Vec<u16>,
+    /// Modes that are not truncated, ascending.
     retained: Vec<u16>,
+    /// Sum of the costs of truncated modes, rounded up.
     bound: f64,
 }
 
 impl Truncation {
-    /// A domain with `rank` modes, none truncated.
+    /// Creates the state of a domain with `rank` modes, none truncated.
     pub fn new(rank: usize) -> Self {
-        let all: Vec<u16> = (0..rank as u16).collect();
-        Self { out: vec![false; rank], costs: vec![0.0; rank], ascending: all.clone(), retained: all, bound: 0.0 }
+        let all_modes: Vec<u16> = (0..rank as u16).collect();
+        Self {
+            is_truncated: vec![false; rank],
+            costs: vec![0.0; rank],
+            ascending: all_modes.clone(),
+            retained: all_modes,
+            bound: 0.0,
+        }
     }
 
     /// Resets to the initial state: keeps all modes until the next update.
     pub fn reset(&mut self) {
-        *self = Self::new(self.out.len());
+        *self = Self::new(self.is_truncated.len());
     }
 
     /// Updates the truncation for a step. `budget` is the maximum error of a vertex, in scene units.
-    pub fn update(&mut self, amounts: TruncationInput, budget: f64) {
-        for (cost, (q, reach)) in self.costs.iter_mut().zip(amounts.q.iter().zip(amounts.max_row_norms)) {
-            *cost = amounts.norm * (f64::from(q.abs()) * reach);
+    pub fn update(&mut self, input: TruncationInput, budget: f64) {
+        for (cost, (q, max_row_norm)) in self.costs.iter_mut().zip(input.q.iter().zip(input.max_row_norms)) {
+            *cost = input.norm * (f64::from(q.abs()) * max_row_norm);
         }
         let costs = &self.costs;
         self.ascending.sort_unstable_by(|a, b| {
@@ -64,7 +76,7 @@ impl Truncation {
         let total = self.restore_modes(budget);
         self.bound = self.drop_modes(total, budget / 2.0) * ROUND_UP;
         self.retained.clear();
-        self.retained.extend((0..self.out.len() as u16).filter(|mode| !self.out[usize::from(*mode)]));
+        self.retained.extend((0..self.is_truncated.len() as u16).filter(|mode| !self.is_truncated[usize::from(*mode)]));
     }
 
     /// The modes to sum, ascending.
@@ -77,14 +89,14 @@ impl Truncation {
         self.bound
     }
 
-    /// Restores the costliest truncated modes until the rest fits the budget. Returns the cost of the rest.
+    /// Restores the costliest truncated modes until the other truncated modes fit the budget. Returns their total cost.
     fn restore_modes(&mut self, budget: f64) -> f64 {
         let mut total = 0.0;
         for mode in self.ascending.iter().map(|mode| usize::from(*mode)) {
-            if self.out[mode] {
-                let with = total + self.costs[mode];
-                self.out[mode] = with * ROUND_UP <= budget;
-                total = if self.out[mode] { with } else { total };
+            if self.is_truncated[mode] {
+                let new_total = total + self.costs[mode];
+                self.is_truncated[mode] = new_total * ROUND_UP <= budget;
+                total = if self.is_truncated[mode] { new_total } else { total };
             }
         }
         total
@@ -93,15 +105,15 @@ impl Truncation {
     /// Truncates the cheapest modes while the total cost fits the budget. Returns the total cost.
     fn drop_modes(&mut self, mut total: f64, budget: f64) -> f64 {
         for mode in self.ascending.iter().map(|mode| usize::from(*mode)) {
-            if self.out[mode] {
+            if self.is_truncated[mode] {
                 continue;
             }
-            let with = total + self.costs[mode];
-            if with * ROUND_UP > budget {
+            let new_total = total + self.costs[mode];
+            if new_total * ROUND_UP > budget {
                 break;
             }
-            self.out[mode] = true;
-            total = with;
+            self.is_truncated[mode] = true;
+            total = new_total;
         }
         total
     }
@@ -113,44 +125,47 @@ mod tests {
     use crate::testing::{TestRng, shape};
     use modalcast_model::domain::Shape;
 
-    fn decide(truncation: &mut Truncation, q: &[f32], max_row_norms: &[f64], budget: f64) {
+    fn update(truncation: &mut Truncation, q: &[f32], max_row_norms: &[f64], budget: f64) {
         truncation.update(TruncationInput { q, max_row_norms, norm: 1.0 }, budget);
     }
 
     /// The largest displacement of a vertex by all modes but `retained`.
-    fn farthest(shape: &Shape, q: &[f32], retained: &[u16]) -> f64 {
-        let dropped = || (0..q.len()).filter(|mode| !retained.contains(&(*mode as u16)));
-        let part = |vertex: usize, axis: usize| -> f64 {
-            dropped().map(|mode| f64::from(q[mode]) * f64::from(shape.modes.entry(vertex, axis, mode))).sum()
+    fn max_truncated_displacement(shape: &Shape, q: &[f32], retained: &[u16]) -> f64 {
+        let truncated_modes = || (0..q.len()).filter(|mode| !retained.contains(&(*mode as u16)));
+        let coordinate_sum = |vertex: usize, axis: usize| -> f64 {
+            truncated_modes().map(|mode| f64::from(q[mode]) * f64::from(shape.modes.entry(vertex, axis, mode))).sum()
         };
-        let length = |vertex| (0..3).map(|axis| part(vertex, axis).powi(2)).sum::<f64>().sqrt();
+        let length = |vertex| (0..3).map(|axis| coordinate_sum(vertex, axis).powi(2)).sum::<f64>().sqrt();
         (0..shape.modes.vertices()).map(length).fold(0.0, f64::max)
     }
 
     #[test]
-    fn no_vertex_is_off_by_more_than_the_bound_and_the_bound_stays_within_the_budget() {
-        let (mut left_out, mut seen) = (0, 0);
+    fn truncation_error_stays_within_bound_and_bound_within_budget() {
+        let (mut truncated_count, mut exceeded_count) = (0, 0);
         for seed in 0..120 {
-            let mut noise = TestRng(seed);
+            let mut rng = TestRng(seed);
             let rank = 1 + seed as usize % 40;
-            let shape = shape(30, rank, &mut noise);
+            let shape = shape(30, rank, &mut rng);
             let max_row_norms = max_row_norms(&shape.modes);
             let mut truncation = Truncation::new(rank);
             for step in 0..4 {
-                let q: Vec<f32> = (0..rank).map(|mode| noise.next() * f32::exp2(-(mode as f32))).collect();
+                let q: Vec<f32> = (0..rank).map(|mode| rng.next() * f32::exp2(-(mode as f32))).collect();
                 let budget = 0.4 / f64::from(1 << (4 * step));
-                decide(&mut truncation, &q, &max_row_norms, budget);
-                let error = farthest(&shape, &q, truncation.retained());
+                update(&mut truncation, &q, &max_row_norms, budget);
+                let error = max_truncated_displacement(&shape, &q, truncation.retained());
                 assert!(error <= truncation.bound() && truncation.bound() <= budget, "seed {seed}: {error}");
                 assert!(truncation.retained().is_sorted());
-                left_out += rank - truncation.retained().len();
+                truncated_count += rank - truncation.retained().len();
                 // With one more truncated mode than reported, the error often exceeds the bound, so this test can fail.
-                let one_less = truncation.retained().split_first().map_or(&[][..], |(_, rest)| rest);
-                seen += usize::from(farthest(&shape, &q, one_less) > truncation.bound());
+                let fewer_modes = truncation.retained().split_first().map_or(&[][..], |(_, others)| others);
+                exceeded_count += usize::from(max_truncated_displacement(&shape, &q, fewer_modes) > truncation.bound());
             }
         }
-        assert!(left_out > 1000, "{left_out} modes were left out");
-        assert!(seen > 300, "one mode more was seen {seen} times");
+        assert!(truncated_count > 1000, "expected more than 1000 truncated modes, got {truncated_count}");
+        assert!(
+            exceeded_count > 300,
+            "expected one more truncated mode to exceed the bound, got {exceeded_count} cases"
+        );
     }
 
     #[test]
@@ -158,54 +173,54 @@ mod tests {
         let shape = shape(1, 1, &mut TestRng(5));
         let max_row_norms = max_row_norms(&shape.modes);
         let mut truncation = Truncation::new(1);
-        decide(&mut truncation, &[0.25], &max_row_norms, 10.0);
-        let error = farthest(&shape, &[0.25], &[]);
+        update(&mut truncation, &[0.25], &max_row_norms, 10.0);
+        let error = max_truncated_displacement(&shape, &[0.25], &[]);
         assert!(truncation.retained().is_empty());
         assert!(error <= truncation.bound() && truncation.bound() <= error * (1.0 + 1e-11));
     }
 
     #[test]
-    fn a_mode_that_swings_about_a_limit_does_not_flicker_and_would_without_the_half_budget() {
-        let swing = |step: i32| (0.5 + 0.1 * f64::from(step).sin()) as f32;
+    fn hysteresis_prevents_flicker_of_a_mode_near_the_limit() {
+        let oscillation = |step: i32| (0.5 + 0.1 * f64::from(step).sin()) as f32;
         let mut truncation = Truncation::new(2);
         let (mut changes, mut naive_changes) = (0, 0);
-        let mut before = truncation.retained().to_vec();
-        let mut naive_before = before.len();
+        let mut previous_modes = truncation.retained().to_vec();
+        let mut naive_previous_count = previous_modes.len();
         for step in 0..200 {
-            let q = [1.0, swing(step)];
-            decide(&mut truncation, &q, &[1.0, 1.0], 1.0);
-            changes += usize::from(truncation.retained() != before);
-            before = truncation.retained().to_vec();
+            let q = [1.0, oscillation(step)];
+            update(&mut truncation, &q, &[1.0, 1.0], 1.0);
+            changes += usize::from(truncation.retained() != previous_modes);
+            previous_modes = truncation.retained().to_vec();
             // Without hysteresis, every mode that fits half the budget is truncated.
             let mut naive = Truncation::new(2);
-            decide(&mut naive, &q, &[1.0, 1.0], 1.0);
-            naive_changes += usize::from(naive.retained().len() != naive_before);
-            naive_before = naive.retained().len();
+            update(&mut naive, &q, &[1.0, 1.0], 1.0);
+            naive_changes += usize::from(naive.retained().len() != naive_previous_count);
+            naive_previous_count = naive.retained().len();
         }
-        assert_eq!(changes, 1, "it goes once and stays away");
-        assert!(naive_changes > 50, "{naive_changes} changes without memory");
+        assert_eq!(changes, 1, "expected the mode to be truncated once");
+        assert!(naive_changes > 50, "expected more than 50 changes without hysteresis, got {naive_changes}");
     }
 
     #[test]
-    fn a_mode_that_grows_returns_once_the_whole_budget_is_exceeded_and_goes_below_half_of_it() {
+    fn mode_is_truncated_below_half_and_restored_above_full_budget() {
         let mut truncation = Truncation::new(1);
         let mut retained = |q: f32| {
-            decide(&mut truncation, &[q], &[1.0], 1.0);
+            update(&mut truncation, &[q], &[1.0], 1.0);
             truncation.retained().len()
         };
         assert_eq!([0.6, 0.51, 0.49, 0.9, 0.99, 1.01, 0.8, 0.51, 0.4].map(&mut retained), [1, 1, 0, 0, 0, 1, 1, 1, 0]);
     }
 
     #[test]
-    fn huge_tiny_and_zero_amounts_are_decided_without_overflow() {
+    fn huge_tiny_and_zero_coordinates_do_not_overflow() {
         let huge = [f32::MAX, 1e-45, 0.0, -f32::MAX];
         let max_row_norms = [f64::from(f32::MAX); 4];
         let mut truncation = Truncation::new(4);
         truncation.update(TruncationInput { q: &huge, max_row_norms: &max_row_norms, norm: 1e39 }, 1e-6);
         assert_eq!(truncation.retained(), [0, 1, 3]);
         assert_eq!(truncation.bound(), 0.0);
-        let mut none = Truncation::new(0);
-        decide(&mut none, &[], &[], 1.0);
-        assert!(none.retained().is_empty());
+        let mut rigid = Truncation::new(0);
+        update(&mut rigid, &[], &[], 1.0);
+        assert!(rigid.retained().is_empty());
     }
 }

@@ -231,7 +231,8 @@ impl DomainErrorBounds<'_> {
             if let Some(error_model) = self.error_model {
                 let tile = (first + vertex) / TILE;
                 let evaluate_tile = || {
-                    let products = self.products.map_or(0.0, |products| error_model.products(tile, &step, products));
+                    let products =
+                        self.products.map_or(0.0, |products| error_model.tensor_core_bound(tile, &step, products));
                     (tile, error_model.tile(tile, &step), products)
                 };
                 let (_, tile_bound, products) =

@@ -209,8 +209,7 @@ mod tests {
         let max_condition = |seed: usize| {
             let q = motion.seed(seed).q;
             let row_condition = |row: usize| {
-                let terms =
-                    (0..10).map(|mode| f64::from(modes.entry(row / 3, row % 3, mode)) * q[mode]);
+                let terms = (0..10).map(|mode| f64::from(modes.entry(row / 3, row % 3, mode)) * q[mode]);
                 terms.clone().map(f64::abs).sum::<f64>() / terms.sum::<f64>().abs()
             };
             (0..3 * modes.vertices()).map(row_condition).fold(0.0, f64::max)

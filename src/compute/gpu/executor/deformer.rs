@@ -34,6 +34,14 @@ use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
 /// Maximum number of steps in flight.
 pub const MAX_STEPS_IN_FLIGHT: usize = 2;
 
+/// A submitted step.
+#[derive(Debug, Clone, Copy)]
+struct StepInFlight {
+    /// Index of its ring slot.
+    slot: usize,
+    submitted: Instant,
+}
+
 /// The CUDA deformer of one scene. It stays on the thread that created it, which owns the OpenGL context.
 ///
 /// Dropping it waits for all steps and copies before any memory that they use is released.
@@ -44,31 +52,31 @@ pub struct CudaDeformer {
     kernels: StepKernels,
     inputs: StepInputs,
     output: OutputBuffers,
-    /// u, if the scene keeps displacements. All output sets share this buffer, and also the boxes, because both are
-    /// read before the next step is submitted.
+    /// u, if the scene keeps displacements. One buffer is sufficient for all output sets, because displacements are read
+    /// before the next step is submitted. The same holds for boxes.
     displacements: Option<DeviceBuffer>,
     output_ring: OutputRing,
-    /// Steps in flight, oldest first: ring slot and time of submission.
-    in_flight: VecDeque<(usize, Instant)>,
+    /// Steps in flight, oldest first.
+    in_flight: VecDeque<StepInFlight>,
     /// Ring slot of the last step.
-    last: usize,
+    last_slot: usize,
     readbacks: ReadbackPool,
-    /// The last step's fetch and the attributes it copies; `None` after the next step is submitted.
+    /// The readback of the last step and the attributes it copies; `None` after the next step is submitted.
     readback: Option<(VertexAttributes, VertexReadback)>,
     surface: PinnedSurface,
-    /// Attributes of `surface` that are up to date with the device.
+    /// Attributes of `surface` that show the last step.
     host_attributes: VertexAttributes,
 }
 
 impl CudaDeformer {
-    /// Packs a scene onto the device. With `gl`, steps write directly into those buffers when the driver allows it.
+    /// Uploads a scene to the device. Steps write directly into `gl_buffers` if the driver can register them.
     ///
     /// # Errors
-    /// `Fault` when the device refuses; `Unavailable` when NVRTC is missing or the device's memory is too small.
+    /// `Fault` when the device fails; `Unavailable` when NVRTC is missing or the device's memory is too small.
     pub fn new(
         device: &Arc<Device>,
         scene: &Arc<Scene>,
-        gl: Option<GlVertexBuffers>,
+        gl_buffers: Option<GlVertexBuffers>,
         options: CudaDeformerOptions,
     ) -> Result<Self> {
         let tables = DeviceTables::new(scene, options);
@@ -92,7 +100,7 @@ impl CudaDeformer {
             apply: apply.map(|apply| ApplyKernel::new(device, deform.packing(), apply)).transpose()?,
             deform,
         };
-        let output = OutputBuffers::new(device, &plan, gl)?;
+        let output = OutputBuffers::new(device, &plan, gl_buffers)?;
         let inputs = StepInputs::new(device, kernels.deform.packing())?;
         Ok(Self {
             step_slots: vec![StepSlot::new(device, &kernels, &inputs, output.is_shared())?],
@@ -105,7 +113,7 @@ impl CudaDeformer {
                 bytes => Some(DeviceBuffer::zeroed(device, bytes)?),
             },
             in_flight: VecDeque::new(),
-            last: 0,
+            last_slot: 0,
             readbacks: ReadbackPool::default(),
             readback: None,
             surface: PinnedSurface::empty(),
@@ -115,40 +123,39 @@ impl CudaDeformer {
         })
     }
 
-    /// The compiled kernels and allocated buffers. The plan does not count the second output set, which is allocated
-    /// when vertices are fetched concurrently with a step, nor the second ring slot of pinned memory, which is
-    /// allocated when a step is submitted while another is in flight.
+    /// The compiled kernels and allocated buffers. The plan excludes memory that is allocated on demand: the second output
+    /// set (vertices are fetched concurrently with a step), and the second ring slot (two steps are in flight).
     pub const fn plan(&self) -> &DeformPlan {
         &self.plan
     }
 
-    /// Number of output sets: two after vertices were fetched concurrently with a step.
+    /// Number of allocated output sets: two after vertices were fetched concurrently with a step, else one.
     pub fn outputs(&self) -> usize {
         self.output.count()
     }
 
-    /// Bound of the displacement that the truncated modes cause at any vertex in the last step, scene units.
+    /// Upper bound of any vertex's displacement by the truncated modes in the last step, in scene units.
     pub fn truncation_bound(&self) -> f64 {
         self.inputs.truncation_bound()
     }
 
-    /// Starts a step without waiting for the steps in flight, of which there may be [`MAX_STEPS_IN_FLIGHT`] with this one.
-    /// [`Self::finish`] waits for the oldest.
+    /// Starts a step without waiting for the steps in flight. [`Self::finish`] waits for the oldest step.
     ///
     /// # Errors
-    /// `Busy` when [`MAX_STEPS_IN_FLIGHT`] steps are in flight; `Fault` of the device, after which no step is in flight.
+    /// `Busy` when [`MAX_STEPS_IN_FLIGHT`] steps are already in flight; `Fault` of the device, after which no step is in
+    /// flight.
     pub fn submit(&mut self, state: &SceneState) -> Result<()> {
         if self.in_flight.len() == MAX_STEPS_IN_FLIGHT {
-            return Err(Error::Busy { queue: "steps under way", limit: MAX_STEPS_IN_FLIGHT });
+            return Err(Error::Busy { queue: "steps in flight", limit: MAX_STEPS_IN_FLIGHT });
         }
         self.host_attributes = VertexAttributes::default();
         self.readback = None;
-        let begin = Instant::now();
+        let submitted = Instant::now();
         // If a panic unwinds from `start`, the step may run although it is not in `in_flight`: wait for it.
         let guard = WaitForStream::new(self.device.stream());
-        let started = self.start(state, begin).inspect_err(|_| self.invalidate())?;
-        self.in_flight.push_back((started, begin));
-        self.last = started;
+        let slot = self.start(state, submitted).inspect_err(|_| self.invalidate())?;
+        self.in_flight.push_back(StepInFlight { slot, submitted });
+        self.last_slot = slot;
         guard.disarm();
         Ok(())
     }
@@ -156,31 +163,31 @@ impl CudaDeformer {
     /// Waits for the oldest step in flight.
     ///
     /// # Errors
-    /// `Fault` of the device, after which no step is in flight. Also `Fault` when no step was in flight.
+    /// `Fault` when no step is in flight, or of the device. Afterwards no step is in flight.
     pub fn finish(&mut self) -> Result<DeformSummary> {
-        let none = || Error::Fault { stage: "deform", reason: "no step is under way".into() };
-        let (step_slot, begin) = self.in_flight.pop_front().ok_or_else(none)?;
-        let (bounds, oriented_bounds) = self.step_slots[step_slot].wait().inspect_err(|_| self.invalidate())?;
-        let whole = begin.elapsed().as_secs_f64() * 1e3;
-        let own = self.step_slots[step_slot].device_ms().inspect_err(|_| self.invalidate())?;
-        Ok(DeformSummary { bounds, oriented_bounds, ms: own.unwrap_or(whole) })
+        let missing_step = || Error::Fault { stage: "deform", reason: "expected a step in flight, got none".into() };
+        let StepInFlight { slot, submitted } = self.in_flight.pop_front().ok_or_else(missing_step)?;
+        let (bounds, oriented_bounds) = self.step_slots[slot].wait().inspect_err(|_| self.invalidate())?;
+        let elapsed_ms = submitted.elapsed().as_secs_f64() * 1e3;
+        let device_ms = self.step_slots[slot].device_ms().inspect_err(|_| self.invalidate())?;
+        Ok(DeformSummary { bounds, oriented_bounds, ms: device_ms.unwrap_or(elapsed_ms) })
     }
 
-    /// Starts the graph of the last full step again, to measure the graph alone.
+    /// Starts the graph of the last full step again, to measure its time.
     ///
     /// # Errors
-    /// `Fault` when the outputs are OpenGL's buffers, which are not mapped here, when no step was deformed, or when the
+    /// `Fault` when the outputs are OpenGL's buffers, which this does not map; when no step was deformed; or when the
     /// device fails.
     pub fn replay(&self) -> Result<()> {
-        if self.output.is_shared() || self.output_ring.shown().is_none() {
+        if self.output.is_shared() || self.output_ring.shown_output().is_none() {
             let reason = "expected a deformed step in buffers of the deformer".into();
             return Err(Error::Fault { stage: "replay", reason });
         }
-        self.step_slots[self.last].launch(StepKind::Full)
+        self.step_slots[self.last_slot].launch(StepKind::Full)
     }
 
-    /// Writes the values of a step and starts its graph. Returns the ring slot. `begin`: time of submission.
-    fn start(&mut self, state: &SceneState, begin: Instant) -> Result<usize> {
+    /// Writes the values of a step and starts its graph. Returns the ring slot.
+    fn start(&mut self, state: &SceneState, submitted: Instant) -> Result<usize> {
         let _current = self.device.enter()?;
         let set = self.output_ring.next_output();
         match self.output.ensure_set(&self.device, &self.plan, set) {
@@ -191,56 +198,62 @@ impl CudaDeformer {
                 self.output_ring.forbid_more_outputs();
             }
         }
-        let at = self.acquire_step_slot()?;
-        let turn = self.output_ring.begin(state);
+        let slot_index = self.acquire_step_slot()?;
+        let target = self.output_ring.begin_step(state);
         let Self { step_slots, kernels, inputs, .. } = self;
-        let step_slot = &mut step_slots[at];
-        let some = match (&turn.dirty_domains, &state.changed, &mut step_slot.list, &mut kernels.apply) {
+        let step_slot = &mut step_slots[slot_index];
+        let list_lengths = match (&target.dirty_domains, &state.changed, &mut step_slot.change_list, &mut kernels.apply)
+        {
             (Some(outdated), DirtyDomains::Some(changed), Some(list), Some(apply)) => {
                 apply.write(list, kernels.deform.packing(), state, ChangedDomains { changed, outdated })?
             }
             _ => None,
         };
-        let header = header(&turn, some, self.output_ring.last_full_step(some.is_none()));
-        // Shared OpenGL buffers are copied to the back buffer on this same stream, so the step is already ordered after
-        // it.
-        if turn.is_being_read && !self.output.is_shared() {
-            self.readbacks.wait_for_reads(&self.device, turn.output)?;
+        let last_full_step = self.output_ring.update_last_full_step(list_lengths.is_none());
+        let header = header(&target, list_lengths, last_full_step);
+        // Shared OpenGL buffers are copied to the back buffer on this stream, so the copy already precedes the step.
+        if target.is_being_read && !self.output.is_shared() {
+            self.readbacks.wait_for_reads(&self.device, target.output)?;
         }
-        // `normals` and the boxes read the positions again, so the driver must not discard them.
-        let keep = some.is_some() || kernels.normals.is_some() || kernels.bounds.boxes.is_some();
+        // A partial step keeps the other vertices, and the kernels of normals and boxes read the positions.
+        let keeps_contents = list_lengths.is_some() || kernels.normals.is_some() || kernels.bounds.boxes.is_some();
         let displacements = self.displacements.as_ref().map_or(0, DeviceBuffer::address);
         let header = Header { displacements, ..header };
-        let access = if keep { MapAccess::ReadWrite } else { MapAccess::WriteDiscard };
-        step_slot.host_ms = begin.elapsed().as_secs_f64() * 1e3;
-        self.output.with_addresses(&self.device, OutputAccess { set: turn.output, access }, |to| {
+        let access = if keeps_contents { MapAccess::ReadWrite } else { MapAccess::WriteDiscard };
+        step_slot.host_ms = submitted.elapsed().as_secs_f64() * 1e3;
+        self.output.with_addresses(&self.device, OutputAccess { set: target.output, access }, |addresses| {
             step_slot.record_mapped(&self.device)?;
-            let header = Header { positions: to.positions, normals: to.normals, tangents: to.tangents, ..header };
-            match some {
+            let header = Header {
+                positions: addresses.positions,
+                normals: addresses.normals,
+                tangents: addresses.tangents,
+                ..header
+            };
+            match list_lengths {
                 Some(_) => StepInputs::write_header(&mut step_slot.values, &header)?,
                 None => inputs.write(&mut step_slot.values, &header, state)?,
             }
-            step_slot.launch(if some.is_some() { StepKind::Partial } else { StepKind::Full })
+            step_slot.launch(if list_lengths.is_some() { StepKind::Partial } else { StepKind::Full })
         })?;
         step_slot.done.record(self.device.stream()).map_err(cuda_error("deform"))?;
-        self.output_ring.end(state);
-        Ok(at)
+        self.output_ring.end_step(state);
+        Ok(slot_index)
     }
 
-    /// A ring slot whose step has ended; allocates one if all are in flight.
+    /// Returns a ring slot whose step has ended; allocates one if all are in flight.
     fn acquire_step_slot(&mut self) -> Result<usize> {
-        let is_free = |at: &usize| self.in_flight.iter().all(|(step_slot, _)| step_slot != at);
-        if let Some(at) = (0..self.step_slots.len()).find(is_free) {
-            return Ok(at);
+        let is_free = |slot: &usize| self.in_flight.iter().all(|step| step.slot != *slot);
+        if let Some(slot) = (0..self.step_slots.len()).find(is_free) {
+            return Ok(slot);
         }
         self.step_slots.push(StepSlot::new(&self.device, &self.kernels, &self.inputs, self.output.is_shared())?);
         Ok(self.step_slots.len() - 1)
     }
 
-    /// Waits for all steps in flight, whose inputs the next step would overwrite, and marks all outputs and the values
-    /// on the device as invalid. Every failed step does the same.
+    /// Waits for all steps in flight, and marks all outputs and the values on the device as invalid. A failed step does
+    /// this, too.
     pub fn invalidate(&mut self) {
-        // The step has already failed, so a second error adds nothing.
+        // The error of the failed step is already reported.
         self.device.stream().synchronize().ok();
         self.readbacks.synchronize();
         self.in_flight.clear();
@@ -248,44 +261,46 @@ impl CudaDeformer {
         self.output_ring.invalidate();
     }
 
-    fn request(&mut self, wanted: VertexAttributes) -> Result<VertexReadback> {
-        let nothing = || Error::Fault { stage: "fetch", reason: "no step was deformed".into() };
-        let set = self.output_ring.shown().ok_or_else(nothing)?;
-        let length = |wanted: bool, role: BufferRole| if wanted { self.plan.bytes(role) as usize / 4 } else { 0 };
+    /// Starts a readback of the last step.
+    fn start_readback(&mut self, attributes: VertexAttributes) -> Result<VertexReadback> {
+        let missing_step = || Error::Fault { stage: "fetch", reason: "expected a deformed step, got none".into() };
+        let set = self.output_ring.shown_output().ok_or_else(missing_step)?;
+        let length =
+            |is_requested: bool, role: BufferRole| if is_requested { self.plan.bytes(role) as usize / 4 } else { 0 };
         let lengths = SurfaceLengths {
-            positions: length(wanted.positions, BufferRole::Positions),
-            normals: length(wanted.normals, BufferRole::Normals),
+            positions: length(attributes.positions, BufferRole::Positions),
+            normals: length(attributes.normals, BufferRole::Normals),
             tangents: 0,
-            displacements: length(wanted.displacements, BufferRole::Displacements),
+            displacements: length(attributes.displacements, BufferRole::Displacements),
         };
-        // Other attributes do not need the output set, which remains free for the next step.
+        // Displacements and boxes are not in the output set, so the next step may write it.
         let reads_output = lengths.positions + lengths.normals > 0;
         let read_id = reads_output.then(|| self.output_ring.begin_read());
-        let request = ReadbackRequest { set, lengths, read_id, after: &self.step_slots[self.last].done };
+        let request = ReadbackRequest { set, lengths, read_id, step_done: &self.step_slots[self.last_slot].done };
         let Self { device, kernels, displacements, readbacks, output, .. } = self;
         readbacks.start(device, output, request, |lists: SynchronousLists<'_>| {
             if let Some(buffer) = displacements.as_ref() {
                 buffer.read(device, 0, lists.displacements)?;
             }
             match &mut kernels.bounds.boxes {
-                Some(boxes) if wanted.boxes => boxes.read(device, lists.boxes),
+                Some(boxes) if attributes.boxes => boxes.read(device, lists.boxes),
                 _ => Ok(()),
             }
         })
     }
 
-    /// Copies the wanted attributes that are not yet up to date in `surface`.
-    fn download_attributes(&mut self, wanted: VertexAttributes) -> Result<()> {
+    /// Copies the attributes that `surface` does not yet have of the last step.
+    fn download_attributes(&mut self, attributes: VertexAttributes) -> Result<()> {
         let host_attributes = self.host_attributes;
-        if (wanted.positions || wanted.normals) && !host_attributes.contains(VertexAttributes::VERTICES) {
+        if (attributes.positions || attributes.normals) && !host_attributes.contains(VertexAttributes::VERTICES) {
             self.download_vertices()?;
             self.host_attributes = self.host_attributes.union(VertexAttributes::VERTICES);
         }
-        if wanted.displacements && !host_attributes.displacements {
+        if attributes.displacements && !host_attributes.displacements {
             self.download_displacements()?;
             self.host_attributes.displacements = true;
         }
-        if wanted.boxes && !host_attributes.boxes {
+        if attributes.boxes && !host_attributes.boxes {
             if let Some(boxes) = &mut self.kernels.bounds.boxes {
                 boxes.read(&self.device, self.surface.lists()?.boxes)?;
             }
@@ -302,8 +317,8 @@ impl CudaDeformer {
     }
 
     fn download_vertices(&mut self) -> Result<()> {
-        let nothing = || Error::Fault { stage: "download", reason: "no step was deformed".into() };
-        let set = self.output_ring.shown().ok_or_else(nothing)?;
+        let missing_step = || Error::Fault { stage: "download", reason: "expected a deformed step, got none".into() };
+        let set = self.output_ring.shown_output().ok_or_else(missing_step)?;
         let [positions, normals, tangents] = output_sizes(&self.plan).map(|bytes| bytes as usize / 4);
         let lengths = SurfaceLengths { positions, normals, tangents, displacements: 0 };
         self.surface.allocate(&self.device, lengths)?;
@@ -312,12 +327,12 @@ impl CudaDeformer {
 }
 
 /// The header of a step, without the addresses of its outputs.
-fn header(turn: &StepTarget, some: Option<ChangeListLengths>, last_full_step: u32) -> Header {
-    let lengths = some.unwrap_or_default();
+fn header(target: &StepTarget, list_lengths: Option<ChangeListLengths>, last_full_step: u32) -> Header {
+    let lengths = list_lengths.unwrap_or_default();
     Header {
-        output_step: if some.is_some() { turn.shown } else { 0 },
+        output_step: if list_lengths.is_some() { target.shown_step } else { 0 },
         last_full_step,
-        step: turn.step,
+        step: target.step,
         changed: lengths.changed,
         dirty_tiles: lengths.dirty_tiles,
         ..Header::default()
@@ -329,16 +344,16 @@ impl Deformer for CudaDeformer {
         Backend::Cuda
     }
 
-    /// Also waits for the steps that were submitted before.
+    /// Also waits for all steps that are in flight.
     fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
         while self.in_flight.len() == MAX_STEPS_IN_FLIGHT {
             self.finish()?;
         }
         self.submit(state)?;
         loop {
-            let deformed = self.finish()?;
+            let summary = self.finish()?;
             if self.in_flight.is_empty() {
-                return Ok(deformed);
+                return Ok(summary);
             }
         }
     }
@@ -351,26 +366,26 @@ impl Deformer for CudaDeformer {
         self.read(VertexAttributes::ALL)
     }
 
-    fn read(&mut self, wanted: VertexAttributes) -> Result<&DeformedSurface> {
-        self.download_attributes(wanted)?;
+    fn read(&mut self, attributes: VertexAttributes) -> Result<&DeformedSurface> {
+        self.download_attributes(attributes)?;
         Ok(self.surface.surface())
     }
 
-    /// Positions and normals are copied concurrently with the next step. Displacements and boxes exist once on the
-    /// device, so their copy is complete when this returns.
-    fn readback(&mut self, wanted: VertexAttributes) -> Result<VertexReadback> {
-        if let Some((_, readback)) = self.readback.as_ref().filter(|(there, _)| there.contains(wanted)) {
+    /// Copies positions and normals concurrently with the next step. The copies of displacements and boxes, of which the
+    /// device has only one buffer each, are complete when this returns.
+    fn readback(&mut self, attributes: VertexAttributes) -> Result<VertexReadback> {
+        if let Some((_, readback)) = self.readback.as_ref().filter(|(copied, _)| copied.contains(attributes)) {
             return Ok(readback.clone());
         }
-        let readback = self.request(wanted)?;
-        self.readback = Some((wanted, readback.clone()));
+        let readback = self.start_readback(attributes)?;
+        self.readback = Some((attributes, readback.clone()));
         Ok(readback)
     }
 
     fn wait_readback(&mut self, readback: &VertexReadback) -> Result<Arc<DeformedSurface>> {
-        let (surface, number) = self.readbacks.wait(readback)?;
-        if let Some(number) = number {
-            self.output_ring.end_read(number);
+        let (surface, read_id) = self.readbacks.wait(readback)?;
+        if let Some(read_id) = read_id {
+            self.output_ring.end_read(read_id);
         }
         Ok(surface)
     }
@@ -378,13 +393,13 @@ impl Deformer for CudaDeformer {
 
 impl Drop for CudaDeformer {
     fn drop(&mut self) {
-        // The device must not use memory that is about to be freed. After a fault the call fails, and no kernel runs.
+        // Wait, because the device uses memory that is freed next. After a fault the call fails, but then no kernel runs.
         self.device.stream().synchronize().ok();
         self.readbacks.synchronize();
     }
 }
 
-/// Refuses a scene that cannot fit before any part of it is uploaded.
+/// Rejects a scene that does not fit into the device's free memory.
 fn check_memory(device: &Device, plan: &DeformPlan) -> Result<()> {
     // Frees are stream-ordered: synchronize, so that memory freed by other scenes counts as free.
     device.synchronize("device")?;
@@ -392,6 +407,6 @@ fn check_memory(device: &Device, plan: &DeformPlan) -> Result<()> {
     if plan.total_bytes() <= free as u64 {
         return Ok(());
     }
-    let reason = format!("the scene needs {} bytes, {free} are free on {}", plan.total_bytes(), device.name());
+    let reason = format!("expected {} free bytes on {}, got {free}", plan.total_bytes(), device.name());
     Err(Error::Unavailable { what: "GPU memory", reason, remedy: "Close other scenes or other programs".into() })
 }

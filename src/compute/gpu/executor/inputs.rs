@@ -17,14 +17,16 @@ use modalcast_model::scene::SceneState;
 pub(crate) struct InputAddresses {
     pub header: u64,
     pub transforms: u64,
-    /// Constant: each follower's transform root and frame. Only in scenes with followers.
+    /// Per domain, its transform root and frame. Constant; only in scenes with followers.
     pub transform_links: u64,
+    /// Transforms of followers relative to their roots. Constant.
     pub frames: u64,
     pub q: u64,
     /// Per domain, the step that last changed it.
     pub change_steps: u64,
-    /// 0 without truncation.
+    /// Per domain, the number of chunks that it sums; 0 without truncation.
     pub retained_counts: u64,
+    /// The chunks that domains sum; 0 without truncation.
     pub retained: u64,
 }
 
@@ -45,10 +47,10 @@ pub type StagingBuffer = PinnedBuffer<f32>;
 /// The part of the staging buffer to copy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InputPart {
-    /// The header alone, for a partial step: `apply` reads the other values from pinned memory.
+    /// Only the header, for a partial step: `apply` reads the other values from pinned memory.
     Header,
     /// All values.
-    Whole,
+    All,
 }
 
 impl StepInputs {
@@ -93,42 +95,42 @@ impl StepInputs {
         }
     }
 
-    /// Writes a full step. The caller has waited for the last copy from this memory, so nothing reads it.
+    /// Writes the values of a full step. The caller has waited for the last copy from this memory.
     ///
     /// # Errors
     /// `Fault` when the device fails.
-    pub fn write(&mut self, to: &mut StagingBuffer, header: &Header, state: &SceneState) -> Result<()> {
-        self.writer.write(to.as_mut_slice()?, header, state);
+    pub fn write(&mut self, staging: &mut StagingBuffer, header: &Header, state: &SceneState) -> Result<()> {
+        self.writer.write(staging.as_mut_slice()?, header, state);
         Ok(())
     }
 
     /// Writes only the header.
-    pub(crate) fn write_header(to: &mut StagingBuffer, header: &Header) -> Result<()> {
-        SliceWriter::new(to.as_mut_slice()?).put(std::slice::from_ref(header));
+    pub(crate) fn write_header(staging: &mut StagingBuffer, header: &Header) -> Result<()> {
+        SliceWriter::new(staging.as_mut_slice()?).put(std::slice::from_ref(header));
         Ok(())
     }
 
-    /// Starts the copy of a part of `from` to the device, on the device's stream, so that a graph can capture it.
+    /// Starts the copy of a part of `staging` to the device, on the device's stream, so that a graph can capture it.
     ///
     /// # Safety
-    /// `from` is neither written nor dropped before the copy has ended. If the copy is captured in a graph, this holds
-    /// for each launch of the graph, and `self` exists until the last one has ended.
+    /// `staging` is neither written nor dropped before the copy has ended. If the copy is captured in a graph, this holds
+    /// for each launch of the graph, and `self` exists until the last launch has ended.
     ///
     /// # Errors
-    /// `Fault` when `from` is not a staging buffer of these inputs, or when the device fails.
-    pub unsafe fn send(&self, device: &Device, from: &StagingBuffer, part: InputPart) -> Result<()> {
-        let host: &[u8] = bytemuck::cast_slice(from.as_slice()?);
-        if host.len() as u64 != self.buffer.bytes() {
-            let reason = format!("expected a staging buffer of {} bytes, got {}", self.buffer.bytes(), host.len());
+    /// `Fault` when `staging` is not a staging buffer of these inputs, or when the device fails.
+    pub unsafe fn send(&self, device: &Device, staging: &StagingBuffer, part: InputPart) -> Result<()> {
+        let bytes: &[u8] = bytemuck::cast_slice(staging.as_slice()?);
+        if bytes.len() as u64 != self.buffer.bytes() {
+            let reason = format!("expected a staging buffer of {} bytes, got {}", self.buffer.bytes(), bytes.len());
             return Err(Error::Fault { stage: "upload", reason });
         }
-        let host = match part {
-            InputPart::Header => &host[..size_of::<Header>()],
-            InputPart::Whole => host,
+        let bytes = match part {
+            InputPart::Header => &bytes[..size_of::<Header>()],
+            InputPart::All => bytes,
         };
         let _current = device.enter()?;
-        // SAFETY: both buffers have the bytes of `host`, as checked above; the caller keeps them.
-        unsafe { result::memcpy_htod_async(self.buffer.address(), host, device.stream().cu_stream()) }
+        // SAFETY: both buffers have at least the size of `bytes`, as checked above. The caller keeps them alive.
+        unsafe { result::memcpy_htod_async(self.buffer.address(), bytes, device.stream().cu_stream()) }
             .map_err(cuda_error("upload"))
     }
 
@@ -142,7 +144,7 @@ impl StepInputs {
         self.writer.retained_chunk_counts()
     }
 
-    /// Bound of the displacement that the truncated modes cause at any vertex in the last step, scene units.
+    /// Upper bound of any vertex's displacement by the truncated modes in the last step, in scene units.
     pub(crate) fn truncation_bound(&self) -> f64 {
         self.writer.truncation_bound()
     }

@@ -5,7 +5,7 @@
 //! complete before CUDA work that is submitted to the stream after it. CUDA work submitted before an unmap completes
 //! before OpenGL commands that are issued after it. A frame may therefore be in flight when the next step is submitted:
 //! the step waits on the device until the frame is drawn and its pixels are read back. A step never runs concurrently
-//! with a frame that uses its buffers, and this wait is not part of the step's time (`step_slot`).
+//! with a frame that uses its buffers. The reported time of a step excludes this wait (`step_slot`).
 
 use std::cell::Cell;
 use std::ffi::{c_int, c_uint};
@@ -50,38 +50,38 @@ impl GlInterop {
     /// Checks that the OpenGL context of `buffer` draws on this device.
     ///
     /// # Errors
-    /// `Fault` with the reason why nothing can be shared.
+    /// `Fault` with the reason why buffers cannot be shared.
     pub(super) fn open(device: &Device, buffer: &GlBuffer) -> Result<Self> {
-        let fail = fault_in(STAGE);
+        let to_fault = fault_in(STAGE);
         let _gl = buffer.owner.make_current()?;
         // SAFETY: the driver library is already loaded, so this only increments its reference count and runs no
         // initializer.
-        let library = unsafe { Library::new("libcuda.so.1") }.map_err(|error| fail(error.to_string()))?;
+        let library = unsafe { Library::new("libcuda.so.1") }.map_err(|error| to_fault(error.to_string()))?;
         check_device(&library, device)?;
         // SAFETY: the type matches the declaration in cudaGL.h.
         let register = unsafe { library.get::<RegisterBuffer>(b"cuGraphicsGLRegisterBuffer\0") };
-        let register = *register.map_err(|error| fail(error.to_string()))?;
+        let register = *register.map_err(|error| to_fault(error.to_string()))?;
         Ok(Self { register, _library: library })
     }
 
     /// Registers a buffer. Each mapping checks that the buffer has at least `buffer.bytes` bytes.
     ///
     /// # Errors
-    /// `Fault` with the name of the buffer that the driver refused.
+    /// `Fault` with the name of the buffer that the driver rejects.
     pub(super) fn register(&self, device: &Device, buffer: GlBuffer) -> Result<RegisteredBuffer> {
         let _current = device.enter()?;
         let _gl = buffer.owner.make_current()?;
         let mut resource = std::ptr::null_mut();
-        // SAFETY: `resource` is a live pointer; the driver refuses an unknown buffer name.
-        let registered = unsafe { (self.register)(&mut resource, buffer.name, 0) };
-        registered.result().map_err(|error| match cuda_error(STAGE)(error) {
+        // SAFETY: `resource` is a live pointer; the driver rejects an unknown buffer name.
+        let result = unsafe { (self.register)(&mut resource, buffer.name, 0) };
+        result.result().map_err(|error| match cuda_error(STAGE)(error) {
             Error::Fault { stage, reason } => {
                 Error::Fault { stage, reason: format!("buffer {}: {reason}", buffer.name) }
             }
             lost => lost,
         })?;
         let context = Arc::clone(device.context());
-        Ok(RegisteredBuffer { resource, buffer, announced: None, is_mapped: Cell::new(false), context })
+        Ok(RegisteredBuffer { resource, buffer, map_flags: None, is_mapped: Cell::new(false), context })
     }
 }
 
@@ -91,8 +91,8 @@ impl GlInterop {
 pub(super) struct RegisteredBuffer {
     resource: CUgraphicsResource,
     buffer: GlBuffer,
-    /// The access that the driver was told last.
-    announced: Option<MapAccess>,
+    /// The access that was last announced to the driver; `None` before the first mapping and after a failure.
+    map_flags: Option<MapAccess>,
     /// Whether the buffer is mapped; outside of [`with_mapped`] only if the last unmap failed.
     is_mapped: Cell<bool>,
     context: Arc<CudaContext>,
@@ -110,7 +110,7 @@ impl RegisteredBuffer {
             let reason = format!("buffer {} is still mapped: its last unmap failed", self.buffer.name);
             return Err(Error::Fault { stage: STAGE, reason });
         }
-        if self.announced == Some(access) {
+        if self.map_flags == Some(access) {
             return Ok(());
         }
         let flags = match access {
@@ -118,12 +118,12 @@ impl RegisteredBuffer {
             MapAccess::ReadWrite => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_NONE,
             MapAccess::Read => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_READ_ONLY,
         };
-        self.announced = None;
+        self.map_flags = None;
         // SAFETY: the resource is registered, and `is_mapped` shows that it is unmapped.
         unsafe { sys::cuGraphicsResourceSetMapFlags_v2(self.resource, flags as c_uint) }
             .result()
             .map_err(cuda_error(STAGE))?;
-        self.announced = Some(access);
+        self.map_flags = Some(access);
         Ok(())
     }
 
@@ -133,15 +133,15 @@ impl RegisteredBuffer {
     /// `Fault` when the buffer is smaller than expected.
     fn address(&self) -> Result<u64> {
         let GlBuffer { name, bytes: expected, .. } = self.buffer;
-        let (mut place, mut bytes) = (0, 0);
-        // SAFETY: both pointers are live; the driver refuses a resource that is not mapped.
-        unsafe { sys::cuGraphicsResourceGetMappedPointer_v2(&mut place, &mut bytes, self.resource) }
+        let (mut address, mut bytes) = (0, 0);
+        // SAFETY: both pointers are live; the driver rejects a resource that is not mapped.
+        unsafe { sys::cuGraphicsResourceGetMappedPointer_v2(&mut address, &mut bytes, self.resource) }
             .result()
             .map_err(cuda_error(STAGE))?;
         if (bytes as u64) < expected {
             return Err(fault_in(STAGE)(format!("buffer {name}: expected {expected} bytes, got {bytes}")));
         }
-        Ok(place)
+        Ok(address)
     }
 }
 
@@ -155,18 +155,18 @@ impl Drop for RegisteredBuffer {
     }
 }
 
-/// A buffer to map, and for what.
+/// A buffer to map, and the purpose of the mapping.
 #[derive(Debug)]
 pub(super) struct Mapping<'a> {
     pub buffer: &'a mut RegisteredBuffer,
     pub access: MapAccess,
 }
 
-/// Maps distinct buffers by one call, runs `work` with their addresses in the same order, and unmaps them when `work`
-/// returns, also with an error, and when it panics. `work` submits to the device's stream.
+/// Maps distinct buffers by one call, runs `work` with their addresses in the same order, and unmaps them, also when
+/// `work` fails or panics. `work` submits to the device's stream.
 ///
 /// # Errors
-/// The error of `work`, or a `Fault` of mapping. A buffer whose unmap fails is refused by the next mapping.
+/// The error of `work`, or a `Fault` of mapping. A buffer whose unmap fails is rejected by the next mapping.
 pub(super) fn with_mapped(
     device: &Device,
     mappings: &mut [Mapping<'_>],
@@ -191,7 +191,8 @@ pub(super) fn with_mapped(
         || work(&addresses()?),
         || {
             let count = resources.len() as c_uint;
-            // SAFETY: they were mapped above; the work that `work` submitted completes before OpenGL uses the buffers.
+            // SAFETY: the resources were mapped above. The device work that `work` submitted completes before OpenGL uses
+            // the buffers.
             unsafe { sys::cuGraphicsUnmapResources(count, resources.as_mut_ptr(), device.stream().cu_stream()) }
                 .result()
                 .map_err(cuda_error(STAGE))
@@ -199,35 +200,35 @@ pub(super) fn with_mapped(
     )
 }
 
-/// Runs `work` on buffers that have just been mapped, then `unmap`, also when `work` panics. `states` say afterwards
-/// which buffers are still mapped: all of them when `unmap` fails, otherwise none.
+/// Runs `work` on mapped buffers, then `unmap`, also when `work` panics. Afterwards each of `states` is true if `unmap`
+/// failed and the buffers are still mapped, otherwise false.
 fn run_mapped(
     states: &[&Cell<bool>],
     work: impl FnOnce() -> Result<()>,
     unmap: impl FnOnce() -> Result<()>,
 ) -> Result<()> {
-    let set = |is_mapped| states.iter().for_each(|state| state.set(is_mapped));
-    set(true);
-    let (worked, unmapped) = with_cleanup(work, || unmap().inspect(|()| set(false)));
-    worked.and(unmapped)
+    let set_states = |is_mapped| states.iter().for_each(|state| state.set(is_mapped));
+    set_states(true);
+    let (work_result, unmap_result) = with_cleanup(work, || unmap().inspect(|()| set_states(false)));
+    work_result.and(unmap_result)
 }
 
 /// Checks that OpenGL draws on this CUDA device. Registration cannot work with another device or with Mesa's software
 /// rasterizer.
 fn check_device(library: &Library, device: &Device) -> Result<()> {
-    let refused = |reason: String| Error::Fault { stage: STAGE, reason };
+    let fault = |reason: String| Error::Fault { stage: STAGE, reason };
     // SAFETY: the type matches the declaration in cudaGL.h.
-    let get = unsafe { library.get::<GetDevices>(b"cuGLGetDevices_v2\0") };
-    let get = get.map_err(|error| refused(error.to_string()))?;
+    let get_devices = unsafe { library.get::<GetDevices>(b"cuGLGetDevices_v2\0") };
+    let get_devices = get_devices.map_err(|error| fault(error.to_string()))?;
     let (mut count, mut devices) = (0, [0; 16]);
     // SAFETY: `devices` has as many elements as the call receives in its third argument.
-    let answer = unsafe { get(&mut count, devices.as_mut_ptr(), devices.len() as c_uint, GL_DEVICE_LIST_ALL) };
-    answer.result().map_err(|error| refused(format!("no current OpenGL context of a CUDA device: {error}")))?;
-    let drawing = &devices[..devices.len().min(count as usize)];
-    if drawing.contains(&device.context().cu_device()) {
+    let query = unsafe { get_devices(&mut count, devices.as_mut_ptr(), devices.len() as c_uint, GL_DEVICE_LIST_ALL) };
+    query.result().map_err(|error| fault(format!("no current OpenGL context of a CUDA device: {error}")))?;
+    let gl_devices = &devices[..devices.len().min(count as usize)];
+    if gl_devices.contains(&device.context().cu_device()) {
         return Ok(());
     }
-    Err(refused(format!("OpenGL draws on CUDA devices {drawing:?}, vertices are computed on {}", device.ordinal())))
+    Err(fault(format!("OpenGL draws on CUDA devices {gl_devices:?}, vertices are computed on {}", device.ordinal())))
 }
 
 #[cfg(test)]
@@ -237,21 +238,22 @@ mod tests {
 
     #[test]
     fn buffers_are_unmapped_after_errors_and_panics() {
-        let (one, other, unmaps) = (Cell::new(false), Cell::new(false), Cell::new(0));
-        let run = |work: &dyn Fn() -> Result<()>, unmapped: Result<()>| {
+        let (first, second, unmaps) = (Cell::new(false), Cell::new(false), Cell::new(0));
+        let run = |work: &dyn Fn() -> Result<()>, unmap_result: Result<()>| {
             let unmap = || {
                 unmaps.set(unmaps.get() + 1);
-                unmapped.clone()
+                unmap_result.clone()
             };
-            let ran = catch_unwind(AssertUnwindSafe(|| run_mapped(&[&one, &other], work, unmap)));
-            (ran, one.get(), other.get())
+            let result = catch_unwind(AssertUnwindSafe(|| run_mapped(&[&first, &second], work, unmap)));
+            (result, first.get(), second.get())
         };
-        let is_mapped = || if one.get() && other.get() { Ok(()) } else { Err(fault_in("work")("not mapped")) };
-        assert!(matches!(run(&is_mapped, Ok(())), (Ok(Ok(())), false, false)));
+        let check_mapped = || if first.get() && second.get() { Ok(()) } else { Err(fault_in("work")("not mapped")) };
+        assert!(matches!(run(&check_mapped, Ok(())), (Ok(Ok(())), false, false)));
         assert!(matches!(run(&|| Err(fault_in("work")("wrong")), Ok(())), (Ok(Err(_)), false, false)));
         assert!(matches!(run(&|| panic!("injected"), Ok(())), (Err(_), false, false)));
-        let failed = Err(fault_in(STAGE)("unmap"));
-        assert!(matches!(run(&|| Ok(()), failed), (Ok(Err(_)), true, true)), "the buffers are still mapped");
+        let unmap_error = Err(fault_in(STAGE)("unmap"));
+        let result = run(&|| Ok(()), unmap_error);
+        assert!(matches!(result, (Ok(Err(_)), true, true)), "expected mapped buffers after a failed unmap");
         assert_eq!(unmaps.get(), 4);
     }
 }

@@ -1,4 +1,4 @@
-//! Reads every size and offset that host and device share from the device itself, to compare them with the host's.
+//! Reads the device's values of all sizes and offsets that host and device share, to compare them with the host's.
 
 use cudarc::driver::LaunchConfig;
 

@@ -6,9 +6,9 @@
 //! | `launchers` | one launcher per kernel of a step |
 //! | `inputs` | the input values of a step on the device |
 //! | `output`, `interop` | the output buffers |
-//! | `output_ring` | double buffering of the outputs: which one a step writes and which domains it lacks; pure |
+//! | `output_ring` | double buffering of the outputs: the output that a step writes, and its outdated domains |
 //! | `readback`, `pinned_surface` | asynchronous readback of vertices, concurrent with the next step |
-//! | `raster` | compute rasterizer: triangles to samples in OpenGL's buffers, next to OpenGL's own rasterizer |
+//! | `raster` | compute rasterizer, which draws into OpenGL's buffers |
 //! | `layout_check` | check that host and device agree on struct layouts |
 
 mod deformer;

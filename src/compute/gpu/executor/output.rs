@@ -1,4 +1,4 @@
-//! Output buffers of positions, normals and tangents: OpenGL's buffers when the driver shares them, else owned ones.
+//! Output buffers of positions, normals and tangents: OpenGL's buffers if CUDA can register them, else own buffers.
 
 use super::interop::{GlInterop, MapAccess, Mapping, RegisteredBuffer, with_mapped};
 use super::pinned_surface::SurfaceLists;
@@ -7,7 +7,7 @@ use crate::gpu::tables::plan::{BufferRole, DeformPlan};
 use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::raster::{GlBuffer, GlVertexBuffers};
 
-/// Device addresses of the outputs, valid while the outputs are mapped; `tangents` is 0 when the scene has none.
+/// Device addresses of the outputs, valid while the outputs are mapped. `tangents` is 0 if the scene has no tangents.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct OutputAddresses {
     pub positions: u64,
@@ -15,12 +15,12 @@ pub(super) struct OutputAddresses {
     pub tangents: u64,
 }
 
-/// The three output buffers; each has at least the bytes of the plan.
+/// The output sets. Each buffer of a set has at least the bytes of the plan.
 #[derive(Debug)]
 pub(super) enum OutputBuffers {
-    /// One set, or two after a step was submitted while the host reads the other set.
+    /// One set. A second set is added when a step is submitted while the host reads the first.
     Owned(Vec<OutputSet>),
-    /// Buffers that OpenGL draws from, so there is one set.
+    /// One set: the buffers that OpenGL draws from.
     Shared(RegisteredOutputs),
 }
 
@@ -72,21 +72,21 @@ pub(super) struct RegisteredOutputs {
 }
 
 impl RegisteredOutputs {
-    /// Registers the buffers. `sizes`: bytes of positions, normals and tangents; 0 bytes of tangents means no tangents.
+    /// Registers the buffers. `sizes` are the bytes of positions, normals and tangents, 0 without tangents.
     ///
     /// # Errors
-    /// `Fault` with the refused resource; nothing remains registered.
+    /// `Fault` with the buffer that cannot be registered. No buffer remains registered.
     fn register(device: &Device, buffers: GlVertexBuffers, sizes: [u64; 3]) -> Result<Self> {
-        let missing = || fault_in("interop")("the renderer gave no buffer for tangents");
+        let missing_tangents = || fault_in("interop")("expected an OpenGL buffer for tangents, got none");
         let [positions, normals, tangents] = sizes;
         let interop = GlInterop::open(device, &buffers.positions)?;
-        let register = |buffer, bytes| interop.register(device, GlBuffer { bytes, ..buffer });
+        let register_buffer = |buffer, bytes| interop.register(device, GlBuffer { bytes, ..buffer });
         let mut outputs = Self {
-            positions: register(buffers.positions, positions)?,
-            normals: register(buffers.normals, normals)?,
+            positions: register_buffer(buffers.positions, positions)?,
+            normals: register_buffer(buffers.normals, normals)?,
             tangents: match tangents {
                 0 => None,
-                bytes => Some(register(buffers.tangents.ok_or_else(missing)?, bytes)?),
+                bytes => Some(register_buffer(buffers.tangents.ok_or_else(missing_tangents)?, bytes)?),
             },
         };
         outputs.with_addresses(device, MapAccess::Read, |_| Ok(()))?;
@@ -111,13 +111,13 @@ impl RegisteredOutputs {
 }
 
 impl OutputBuffers {
-    /// Uses OpenGL's buffers if they are given and the driver registers them. A refusal is logged, not returned.
+    /// Registers OpenGL's buffers if they are given. If this fails, logs the error and allocates own buffers.
     ///
     /// # Errors
     /// `Fault` when the device has not enough memory; `DeviceLost`.
-    pub(super) fn new(device: &Device, plan: &DeformPlan, gl: Option<GlVertexBuffers>) -> Result<Self> {
-        match gl.map(|buffers| RegisteredOutputs::register(device, buffers, output_sizes(plan))) {
-            Some(Ok(interop)) => return Ok(Self::Shared(interop)),
+    pub(super) fn new(device: &Device, plan: &DeformPlan, gl_buffers: Option<GlVertexBuffers>) -> Result<Self> {
+        match gl_buffers.map(|buffers| RegisteredOutputs::register(device, buffers, output_sizes(plan))) {
+            Some(Ok(outputs)) => return Ok(Self::Shared(outputs)),
             Some(Err(lost @ Error::DeviceLost { .. })) => return Err(lost),
             Some(Err(error)) => tracing::warn!(%error, "vertices are copied: CUDA cannot write into OpenGL's buffers"),
             None => {}
@@ -156,28 +156,28 @@ impl OutputBuffers {
         }
     }
 
-    /// Copies a set into `lists`, which have the lengths of the plan or are empty, and waits for the copies.
-    pub(super) fn read(&mut self, device: &Device, set: usize, lists: SurfaceLists<'_>) -> Result<()> {
-        let SurfaceLists { positions, normals, tangents, .. } = lists;
+    /// Copies a set into `surface_lists` and waits for the copies. Each list has the length of the plan or is empty.
+    pub(super) fn read(&mut self, device: &Device, set: usize, surface_lists: SurfaceLists<'_>) -> Result<()> {
+        let SurfaceLists { positions, normals, tangents, .. } = surface_lists;
         if let Self::Owned(sets) = self {
-            let of = &sets[set];
-            of.positions.read(device, 0, positions)?;
-            of.normals.read(device, 0, normals)?;
-            return of.tangents.as_ref().map_or(Ok(()), |buffer| buffer.read(device, 0, tangents));
+            let buffers = &sets[set];
+            buffers.positions.read(device, 0, positions)?;
+            buffers.normals.read(device, 0, normals)?;
+            return buffers.tangents.as_ref().map_or(Ok(()), |buffer| buffer.read(device, 0, tangents));
         }
-        self.with_addresses(device, OutputAccess { set, access: MapAccess::Read }, |from| {
-            // SAFETY: each mapping checks that the outputs have the bytes of the plan, from which the lists have their
-            // lengths.
+        self.with_addresses(device, OutputAccess { set, access: MapAccess::Read }, |addresses| {
+            // SAFETY: each mapping checks that the outputs have the bytes of the plan. The lists have these sizes or are
+            // empty.
             unsafe {
-                download(device, from.positions, positions)?;
-                download(device, from.normals, normals)?;
-                download(device, from.tangents, tangents)
+                download(device, addresses.positions, positions)?;
+                download(device, addresses.normals, normals)?;
+                download(device, addresses.tangents, tangents)
             }
         })
     }
 
-    /// Runs `work` with the addresses of an existing set, mapped if it is shared. `work` submits to the device's stream.
-    /// The addresses of a shared set are not valid after `work`.
+    /// Runs `work` with the addresses of an existing set. A shared set is mapped meanwhile, and its addresses are not
+    /// valid after `work`. `work` submits to the device's stream.
     pub(super) fn with_addresses(
         &mut self,
         device: &Device,
@@ -190,14 +190,14 @@ impl OutputBuffers {
         }
     }
 
-    /// The addresses of an existing set that is not shared, for a copy that runs while the set exists.
+    /// The addresses of an existing set that is not shared. They are valid while the set exists.
     ///
     /// # Errors
     /// `Fault` when the outputs are OpenGL's buffers, which have addresses only while they are mapped.
     pub(super) fn owned_addresses(&self, set: usize) -> Result<OutputAddresses> {
         match self {
             Self::Owned(sets) => Ok(sets[set].addresses()),
-            Self::Shared(_) => Err(fault_in("fetch")("the outputs are OpenGL's buffers, which are not mapped")),
+            Self::Shared(_) => Err(fault_in("fetch")("expected buffers of the deformer, got OpenGL's buffers")),
         }
     }
 }

@@ -7,7 +7,7 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::BoundingBox;
 
-/// Lengths of the lists of a surface, in f32; 0 for a list that is not wanted.
+/// Lengths of the lists of a surface, in f32; 0 for a list that is not requested.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct SurfaceLengths {
     pub positions: usize,
@@ -22,7 +22,7 @@ pub(super) struct PinnedSurface {
     locks: Vec<PageLock>,
 }
 
-/// The lists of a surface, to write. The lengths are fixed, except that of the boxes, which are never page-locked.
+/// Mutable lists of a surface. Their lengths are fixed, except that of `boxes`, which is never page-locked.
 #[derive(Debug)]
 pub(super) struct SurfaceLists<'a> {
     pub positions: &'a mut [f32],
@@ -38,15 +38,20 @@ impl PinnedSurface {
         Self { surface: Arc::new(DeformedSurface::default()), locks: Vec::new() }
     }
 
-    /// Allocates lists of these lengths and page-locks them. Lists that exist already remain as they are.
+    /// Allocates lists of these lengths and page-locks them. Lists that are not empty remain unchanged.
     ///
     /// # Errors
     /// `Fault` when a reader has a reference to the surface.
     pub(super) fn allocate(&mut self, device: &Device, lengths: SurfaceLengths) -> Result<()> {
         let surface = Self::exclusive(&mut self.surface)?;
         let DeformedSurface { positions, normals, tangents, displacements, .. } = surface;
-        let SurfaceLengths { positions: first, normals: second, tangents: third, displacements: fourth } = lengths;
-        for (list, length) in [(positions, first), (normals, second), (tangents, third), (displacements, fourth)] {
+        let lists_and_lengths = [
+            (positions, lengths.positions),
+            (normals, lengths.normals),
+            (tangents, lengths.tangents),
+            (displacements, lengths.displacements),
+        ];
+        for (list, length) in lists_and_lengths {
             if list.is_empty() && length > 0 {
                 list.resize(length, 0.0);
                 // SAFETY: nothing else changes the length of the list, so it is not moved. `drop` drops the lock before
@@ -57,7 +62,7 @@ impl PinnedSurface {
         Ok(())
     }
 
-    /// The lists, to write. The caller has waited for the last copy into them.
+    /// The lists to write. The caller has waited for the last copy into them.
     ///
     /// # Errors
     /// `Fault` when a reader has a reference to the surface.
@@ -78,8 +83,8 @@ impl PinnedSurface {
     }
 
     fn exclusive(surface: &mut Arc<DeformedSurface>) -> Result<&mut DeformedSurface> {
-        let taken = || Error::Fault { stage: "fetch", reason: "the memory is in use".into() };
-        Arc::get_mut(surface).ok_or_else(taken)
+        let in_use = || Error::Fault { stage: "fetch", reason: "expected no reader of the surface".into() };
+        Arc::get_mut(surface).ok_or_else(in_use)
     }
 }
 

@@ -1,16 +1,16 @@
 //! The compute rasterizer: launches `kernels/raster.cu`. For each sample of a window it computes the visible triangle
 //! and its depth, or depth alone, by atomic minima.
 //!
-//! A thread draws a triangle that is near few samples, a warp draws one of up to 64 x 64 pixels. A larger or clipped
-//! triangle is cut into tiles, which warps draw. The queues between the kernels have capacity for every triangle, so
-//! they cannot overflow, and their lengths stay on the device. Samples of cut-outs are tested for alpha before the
-//! atomic minimum. Meshes without cut-outs compile none of that code.
+//! A thread draws a triangle whose bounding box has few samples. A warp draws a triangle of up to 64 x 64 pixels. A
+//! larger or clipped triangle is divided into tiles, which warps draw. The queues between the kernels have capacity for
+//! every triangle, so they cannot overflow, and their lengths stay on the device. Samples of cut-outs are tested for
+//! alpha before the atomic minimum. The kernels for meshes without cut-outs are compiled without this code.
 //!
 //! | file | content |
 //! |---|---|
 //! | `variant` | the variants of the kernels |
-//! | [`check`] | validation of meshes |
-//! | `cut_out` | texture coordinates, surfaces and images of cut-outs |
+//! | `check` | validation of meshes |
+//! | `cut_out` | texture coordinates, materials and images of cut-outs |
 //! | `cuda_rasterizer` | positions and samples in OpenGL's buffers |
 
 mod check;
@@ -22,7 +22,7 @@ use bytemuck::{Pod, Zeroable};
 use cudarc::driver::sys::{self, CUdevice_attribute};
 use cudarc::driver::{CudaFunction, LaunchConfig};
 
-pub use self::check::{check, check_cut_outs};
+pub use self::check::{check_cut_outs, check_mesh};
 pub use self::cuda_rasterizer::CudaRasterizer;
 use self::cut_out::CutOutBuffers;
 use self::variant::{FUNCTIONS, OPAQUE_FUNCTIONS, SOURCE};
@@ -33,11 +33,12 @@ use modalcast_model::error::{Result, fault_in};
 use modalcast_model::raster::CutOuts;
 use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
-/// Threads per block, and resident blocks per multiprocessor for kernels that loop over a queue.
-const BLOCK: u32 = 128;
+/// Threads per block.
+const BLOCK_THREADS: u32 = 128;
+/// Blocks per multiprocessor of the kernels that loop over a queue: as many as are resident.
 const BLOCKS_PER_SM: u32 = 16;
 
-/// Clear value of a sample.
+/// Each 32-bit word of a sample that no triangle covers.
 const EMPTY_SAMPLE: u32 = u32::MAX;
 
 /// Arguments of all kernels; pointers are device addresses.
@@ -65,7 +66,7 @@ struct RasterArgs {
 
 const _: () = assert!(size_of::<RasterArgs>() == 176, "RasterArgs differs from kernels/raster.cuh");
 
-/// Lengths of the queues, and triangle counts by path.
+/// Lengths of the queues, and numbers of triangles by `TriangleBin` of the kernels.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct RasterCounters {
@@ -80,7 +81,7 @@ const _: () = assert!(size_of::<RasterCounters>() == 48, "RasterCounters differs
 /// Bytes per entry of the large queue.
 const LARGE_ENTRY_BYTES: u64 = 16;
 
-/// The compiled kernels of one form.
+/// The compiled kernels of one variant.
 #[derive(Debug)]
 pub struct RasterFunctions {
     variant: RasterVariant,
@@ -92,18 +93,18 @@ pub struct RasterFunctions {
 }
 
 impl RasterFunctions {
-    /// Compiles the kernels of a form, or takes them from the cache.
+    /// Compiles the kernels of a variant, or takes them from the cache.
     ///
     /// # Errors
     /// `Unavailable` when NVRTC is missing; `Fault` when compiling fails.
-    pub fn new(device: &Device, variant: RasterVariant, cut: bool) -> Result<Self> {
-        let names: &[&str] = if cut { &FUNCTIONS } else { &OPAQUE_FUNCTIONS };
-        let mut list = device.functions(names, SOURCE, &variant.defines(cut))?.into_iter();
-        let mut next = || list.next().ok_or_else(|| fault_in("load kernel")("a function is missing"));
+    pub fn new(device: &Device, variant: RasterVariant, has_cut_outs: bool) -> Result<Self> {
+        let names: &[&str] = if has_cut_outs { &FUNCTIONS } else { &OPAQUE_FUNCTIONS };
+        let mut functions = device.functions(names, SOURCE, &variant.defines(has_cut_outs))?.into_iter();
+        let mut next = || functions.next().ok_or_else(|| fault_in("load kernel")("expected another function"));
         Ok(Self {
             variant,
             raster: next()?,
-            raster_cut_outs: if cut { Some(next()?) } else { None },
+            raster_cut_outs: if has_cut_outs { Some(next()?) } else { None },
             raster_warps: next()?,
             raster_tiles: next()?,
         })
@@ -111,13 +112,13 @@ impl RasterFunctions {
 
     /// The functions with their names.
     pub fn with_names(&self) -> impl Iterator<Item = (&'static str, &CudaFunction)> {
-        let list =
+        let functions =
             [Some(&self.raster), self.raster_cut_outs.as_ref(), Some(&self.raster_warps), Some(&self.raster_tiles)];
-        FUNCTIONS.into_iter().zip(list).filter_map(|(name, function)| function.map(|function| (name, function)))
+        FUNCTIONS.into_iter().zip(functions).filter_map(|(name, function)| function.map(|function| (name, function)))
     }
 }
 
-/// The inputs of one pass.
+/// The inputs and the target of one pass.
 #[derive(Debug, Clone, Copy)]
 pub struct RasterPass<'a> {
     pub functions: &'a RasterFunctions,
@@ -136,59 +137,64 @@ pub struct RasterPipeline {
     medium: DeviceBuffer,
     large: DeviceBuffer,
     counters: DeviceBuffer,
-    cut: Option<CutOutBuffers>,
-    /// Blocks of the kernels that loop over a queue.
+    cut_outs: Option<CutOutBuffers>,
+    /// Number of blocks of the kernels that loop over a queue.
     blocks: u32,
 }
 
 impl RasterPipeline {
-    /// Uploads triangles and cut-outs, which [`check`] and [`check_cut_outs`] must have accepted.
+    /// Uploads triangles and cut-outs, which [`check_mesh`] and [`check_cut_outs`] must have accepted.
     ///
     /// # Errors
-    /// `Fault` when the device refuses.
+    /// `Fault` when the device fails.
     pub fn new(device: &Device, triangles: &[[u32; 3]], cut_outs: Option<&CutOuts>) -> Result<Self> {
-        let units = device.context().attribute(CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT);
-        let units = u32::try_from(units.map_err(cuda_error("device"))?).unwrap_or(1);
+        let multiprocessors = device
+            .context()
+            .attribute(CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)
+            .map_err(cuda_error("device"))?;
+        let multiprocessors = u32::try_from(multiprocessors).unwrap_or(1);
         let count = triangles.len() as u64;
         Ok(Self {
             triangles: DeviceBuffer::upload(device, triangles.as_flattened())?,
             medium: DeviceBuffer::zeroed(device, 4 * count)?,
             large: DeviceBuffer::zeroed(device, LARGE_ENTRY_BYTES * count)?,
             counters: DeviceBuffer::zeroed(device, size_of::<RasterCounters>() as u64)?,
-            cut: cut_outs.map(|cut_outs| CutOutBuffers::new(device, cut_outs)).transpose()?,
-            blocks: BLOCKS_PER_SM * units,
+            cut_outs: cut_outs.map(|cut_outs| CutOutBuffers::new(device, cut_outs)).transpose()?,
+            blocks: BLOCKS_PER_SM * multiprocessors,
         })
     }
 
-    /// Whether its passes need the functions for cut-outs.
+    /// Whether passes need the functions for cut-outs.
     pub const fn has_cut_outs(&self) -> bool {
-        self.cut.is_some()
+        self.cut_outs.is_some()
     }
 
     /// Clears the target and draws into it, on the device's stream.
     ///
     /// # Safety
-    /// [`check`] accepted this mesh and the groups of the pass for the number of vertices at `positions`. `positions` and
-    /// `target` are addresses of device memory with the sizes that [`RasterPass`] states, which exists until the pass has
-    /// ended.
+    /// [`check_mesh`] accepted this mesh and the groups of the pass for the number of vertices at `positions`. `positions`
+    /// and `target` are addresses of device memory with the sizes that [`RasterPass`] states. This memory exists until
+    /// the pass has ended.
     ///
     /// # Errors
-    /// `Fault` when the device refuses.
+    /// `Fault` when the device fails.
     pub unsafe fn draw(&self, device: &Device, pass: &RasterPass<'_>) -> Result<()> {
         let _current = device.enter()?;
         // SAFETY: the caller guarantees the target.
         unsafe { self.clear(device, pass) }?;
         let (args, functions) = (self.args(pass), pass.functions);
-        // SAFETY: the args refer to the mesh, whose triangles refer to existing vertices and whose groups to existing
+        // SAFETY: `args` refers to the mesh, whose triangles refer to existing vertices. The groups refer to existing
         // triangles. The queues have capacity for each triangle. The caller guarantees positions and target.
         let start = |function, blocks, args| unsafe { start(device, function, blocks, args) };
         for group in pass.groups {
-            let (whole, cut) = self.split(*group);
-            for (function, own) in [(Some(&functions.raster), whole), (functions.raster_cut_outs.as_ref(), cut)] {
-                if let Some(function) = function.filter(|_| own.triangles > 0) {
-                    let faces = u32::from(own.cull_mode == CullMode::Back);
-                    let args = RasterArgs { first: own.first, count: own.triangles, faces, ..args };
-                    start(function, own.triangles.div_ceil(BLOCK), args)?;
+            let (opaque_range, cut_out_range) = self.split(*group);
+            for (function, range) in
+                [(Some(&functions.raster), opaque_range), (functions.raster_cut_outs.as_ref(), cut_out_range)]
+            {
+                if let Some(function) = function.filter(|_| range.triangles > 0) {
+                    let faces = u32::from(range.cull_mode == CullMode::Back);
+                    let args = RasterArgs { first: range.first, count: range.triangles, faces, ..args };
+                    start(function, range.triangles.div_ceil(BLOCK_THREADS), args)?;
                 }
             }
         }
@@ -198,22 +204,23 @@ impl RasterPipeline {
 
     /// Number of launches of a pass over these groups.
     pub fn launches(&self, groups: &[DrawRange]) -> usize {
-        let of_group = |group: &DrawRange| {
-            let (whole, cut) = self.split(*group);
-            usize::from(whole.triangles > 0) + usize::from(cut.triangles > 0)
+        let group_launches = |group: &DrawRange| {
+            let (opaque_range, cut_out_range) = self.split(*group);
+            usize::from(opaque_range.triangles > 0) + usize::from(cut_out_range.triangles > 0)
         };
-        2 + groups.iter().map(of_group).sum::<usize>()
+        2 + groups.iter().map(group_launches).sum::<usize>()
     }
 
-    /// Splits a group before the first cut-out.
+    /// Splits a group into opaque triangles and cut-outs.
     fn split(&self, group: DrawRange) -> (DrawRange, DrawRange) {
-        let first = self.cut.as_ref().map_or(u32::MAX, |cut| cut.first);
-        let whole = first.saturating_sub(group.first).min(group.triangles);
-        let cut = DrawRange { first: group.first + whole, triangles: group.triangles - whole, ..group };
-        (DrawRange { triangles: whole, ..group }, cut)
+        let first_cut_out = self.cut_outs.as_ref().map_or(u32::MAX, |cut_outs| cut_outs.first);
+        let opaque_count = first_cut_out.saturating_sub(group.first).min(group.triangles);
+        let cut_outs =
+            DrawRange { first: group.first + opaque_count, triangles: group.triangles - opaque_count, ..group };
+        (DrawRange { triangles: opaque_count, ..group }, cut_outs)
     }
 
-    /// Triangle counts of the last pass, indexed by `Path` of the kernels; zeros unless the form counts.
+    /// Numbers of triangles of the last pass, indexed by `TriangleBin` of the kernels; zeros unless the variant counts.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -224,8 +231,8 @@ impl RasterPipeline {
     }
 
     fn args(&self, pass: &RasterPass<'_>) -> RasterArgs {
-        let cut = self.cut.as_ref();
-        let addresses = cut.map(CutOutBuffers::addresses).unwrap_or_default();
+        let cut_outs = self.cut_outs.as_ref();
+        let addresses = cut_outs.map(CutOutBuffers::addresses).unwrap_or_default();
         RasterArgs {
             positions: pass.positions,
             triangles: self.triangles.address(),
@@ -240,7 +247,7 @@ impl RasterPipeline {
             uvs: addresses.uvs,
             material_indices: addresses.material_indices,
             materials: addresses.materials,
-            first_cut_out: cut.map_or(u32::MAX, |cut| cut.first),
+            first_cut_out: cut_outs.map_or(u32::MAX, |cut_outs| cut_outs.first),
             ..RasterArgs::zeroed()
         }
     }
@@ -251,15 +258,15 @@ impl RasterPipeline {
     /// The target of the pass has the bytes of its window.
     unsafe fn clear(&self, device: &Device, pass: &RasterPass<'_>) -> Result<()> {
         let variant = pass.functions.variant;
-        let nothing = if variant.depth_only { 1.0_f32.to_bits() } else { EMPTY_SAMPLE };
+        let empty_sample = if variant.depth_only { 1.0_f32.to_bits() } else { EMPTY_SAMPLE };
         let words = variant.bytes(pass.window) / 4;
         let counters = (self.counters.address(), 0, size_of::<RasterCounters>() as u64 / 4);
-        for (buffer, word, words) in [(pass.target, nothing, words), counters] {
+        for (buffer, word, words) in [(pass.target, empty_sample, words), counters] {
             let stream = device.stream().cu_stream();
             // SAFETY: the counters are one `RasterCounters`, and the caller guarantees the target. The stream orders the
             // writes before their readers.
-            let set = unsafe { sys::cuMemsetD32Async(buffer, word, words as usize, stream) };
-            set.result().map_err(cuda_error("raster"))?;
+            let result = unsafe { sys::cuMemsetD32Async(buffer, word, words as usize, stream) };
+            result.result().map_err(cuda_error("raster"))?;
         }
         Ok(())
     }
@@ -268,7 +275,7 @@ impl RasterPipeline {
 /// # Safety
 /// The addresses in `args` are those of memory that the kernels may access.
 unsafe fn start(device: &Device, function: &CudaFunction, blocks: u32, args: RasterArgs) -> Result<()> {
-    let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK, 1, 1), shared_mem_bytes: 0 };
+    let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK_THREADS, 1, 1), shared_mem_bytes: 0 };
     // SAFETY: the kernels' only argument is a `RasterArgs`; the caller guarantees the addresses.
     unsafe { launch_kernel(device, function, config, LaunchOrder::Serial, &args) }
 }

@@ -1,4 +1,4 @@
-//! Asynchronous readback of vertices: a stream of its own copies them to the host while the next step runs.
+//! Asynchronous readback of vertices: a separate stream copies them to the host while the next step runs.
 //!
 //! ```text
 //! step k   [copy in][kernels]
@@ -6,8 +6,8 @@
 //! step k+1                   [copy in][kernels]      into the other output set
 //! ```
 //! OpenGL's buffers cannot be double-buffered. They are first copied to a back buffer on the device, which takes a
-//! small part of the readback time; the next step may overwrite them after that copy. Displacements and boxes exist
-//! once on the device, so their copies are synchronous.
+//! small part of the readback time. The next step may overwrite them after that copy. There is only one device buffer
+//! for displacements and one for boxes, so their copies are synchronous.
 //!
 //! Streams, events and memory are allocated on the first fetch.
 
@@ -27,7 +27,7 @@ use modalcast_model::scene::BoundingBox;
 
 const STAGE: &str = "fetch";
 
-/// Unused host slots that are kept for later readbacks.
+/// Maximum number of free host slots that are kept for later readbacks.
 const MAX_SPARE_SLOTS: usize = 3;
 
 /// The copy stream, and the host slots that it fills.
@@ -36,20 +36,20 @@ pub(super) struct ReadbackPool {
     stream: Option<Arc<CudaStream>>,
     slots: Vec<ReadbackSlot>,
     /// Number of copies started.
-    started: u64,
-    /// Per output set, the end of the last copy from it. With OpenGL's buffers: the end of the last copy from the back
+    started_copies: u64,
+    /// Per output set, the end of the last copy from it; with OpenGL's buffers, the end of the last copy from the back
     /// buffer.
     read_done: Vec<CudaEvent>,
-    /// Only with OpenGL's buffers.
-    back: Option<BackBuffer>,
+    /// Only with OpenGL's buffers. Allocated on the first readback.
+    back_buffer: Option<BackBuffer>,
 }
 
-/// Copy of OpenGL's buffers on the device.
+/// A copy of OpenGL's buffers on the device.
 #[derive(Debug)]
 struct BackBuffer {
     /// Positions and normals; each is allocated on its first use.
     parts: [Option<DeviceBuffer>; 2],
-    /// End of the last copy into it.
+    /// End of the last copy into the back buffer.
     filled: CudaEvent,
 }
 
@@ -58,12 +58,12 @@ struct BackBuffer {
 struct ReadbackSlot {
     /// The slot is free while it has the only reference to the surface.
     surface: PinnedSurface,
-    /// End of the last copy into it.
+    /// End of the last copy into the surface.
     ready: CudaEvent,
     lengths: SurfaceLengths,
-    /// Sequence number of that copy.
-    age: u64,
-    /// Number of that copy's readback in `OutputRing`, if it read an output set.
+    /// Sequence number of the last copy.
+    copy_number: u64,
+    /// Number of the last readback in `OutputRing`, if it read an output set.
     read_id: Option<u64>,
 }
 
@@ -76,17 +76,17 @@ pub(super) struct ReadbackRequest<'a> {
     /// Number of the readback in `OutputRing`, if an output set is read.
     pub read_id: Option<u64>,
     /// End of the step that wrote the output set.
-    pub after: &'a CudaEvent,
+    pub step_done: &'a CudaEvent,
 }
 
-/// Attributes that exist once on the device. Their copies are complete when a readback starts.
+/// Lists of attributes that are copied synchronously, because the device has only one buffer of each.
 pub(super) struct SynchronousLists<'a> {
-    /// Empty unless displacements are wanted.
+    /// Empty unless displacements are requested.
     pub displacements: &'a mut [f32],
     pub boxes: &'a mut Vec<BoundingBox>,
 }
 
-/// Where a readback of an output set reads.
+/// Device addresses from which a readback copies.
 #[derive(Debug, Clone, Copy)]
 struct ReadbackSource {
     positions: u64,
@@ -94,119 +94,121 @@ struct ReadbackSource {
 }
 
 impl ReadbackPool {
-    /// Starts the copy of the wanted positions and normals. Meanwhile `copy_rest` fills the other lists. When it fails
-    /// or panics, the copy has ended before this returns.
+    /// Starts the copy of the requested positions and normals. Meanwhile `copy_other_lists` fills the other lists. If it
+    /// fails or panics, the copy has ended before this returns.
     pub(super) fn start(
         &mut self,
         device: &Device,
         output: &mut OutputBuffers,
         request: ReadbackRequest<'_>,
-        copy_rest: impl FnOnce(SynchronousLists<'_>) -> Result<()>,
+        copy_other_lists: impl FnOnce(SynchronousLists<'_>) -> Result<()>,
     ) -> Result<VertexReadback> {
         let _current = device.enter()?;
-        let at = self.acquire_slot(device, request.lengths)?;
-        self.started += 1;
-        (self.slots[at].age, self.slots[at].read_id) = (self.started, request.read_id);
+        let slot_index = self.acquire_slot(device, request.lengths)?;
+        self.started_copies += 1;
+        (self.slots[slot_index].copy_number, self.slots[slot_index].read_id) = (self.started_copies, request.read_id);
         let reads_output = request.read_id.is_some();
         let source = if reads_output { Some(self.prepare_source(device, output, &request)?) } else { None };
-        let slot = &mut self.slots[at];
+        let slot = &mut self.slots[slot_index];
         let lists = slot.surface.lists()?;
         lists.boxes.clear();
-        // While the device writes positions and normals, no reference to their numbers exists: `lists` is not used for
-        // them again, and the surface is given out only by `wait`.
-        let pending = match (source, &self.stream) {
-            (Some(source), Some(own)) => {
-                let guard = WaitForStream::new(own);
-                for (from, to) in [(source.positions, lists.positions), (source.normals, lists.normals)] {
-                    // SAFETY: the outputs have the bytes of the plan, and each list has that length or is empty. The
-                    // slot keeps the lists. It is dropped or used again only after its event, which is recorded below,
-                    // has completed, or the stream is synchronized; until then the guard waits.
-                    unsafe { copy(from, to, own) }?;
+        // While the device writes positions and normals, no reference to these lists exists: `lists` is not used for them
+        // again, and readers get the surface from `wait`.
+        let stream_guard = match (source, &self.stream) {
+            (Some(source), Some(copy_stream)) => {
+                let guard = WaitForStream::new(copy_stream);
+                for (source_address, target) in [(source.positions, lists.positions), (source.normals, lists.normals)] {
+                    // SAFETY: the outputs have the bytes of the plan, and each list has that length or is empty. The slot
+                    // owns the lists. It is dropped or reused only after its event `ready` has completed or the stream is
+                    // synchronized. If this fails before the event is recorded, the guard synchronizes the stream.
+                    unsafe { copy(source_address, target, copy_stream) }?;
                 }
-                slot.ready.record(own).map_err(cuda_error(STAGE))?;
-                self.read_done[request.set].record(own).map_err(cuda_error(STAGE))?;
+                slot.ready.record(copy_stream).map_err(cuda_error(STAGE))?;
+                self.read_done[request.set].record(copy_stream).map_err(cuda_error(STAGE))?;
                 Some(guard)
             }
             _ => None,
         };
-        copy_rest(SynchronousLists { displacements: lists.displacements, boxes: lists.boxes })?;
-        if let Some(guard) = pending {
+        copy_other_lists(SynchronousLists { displacements: lists.displacements, boxes: lists.boxes })?;
+        if let Some(guard) = stream_guard {
             guard.disarm();
         }
         let surface = Arc::clone(slot.surface.surface());
         Ok(if reads_output { VertexReadback::pending(surface) } else { VertexReadback::ready(surface) })
     }
 
-    /// Makes the copy stream wait for the step that wrote an output set. Returns the addresses to read.
+    /// Makes the copy stream wait for the step that wrote the output set. Returns the addresses to read.
     fn prepare_source(
         &mut self,
         device: &Device,
         output: &mut OutputBuffers,
         request: &ReadbackRequest<'_>,
     ) -> Result<ReadbackSource> {
-        let fail = cuda_error(STAGE);
-        let own = match &self.stream {
+        let to_fault = cuda_error(STAGE);
+        let copy_stream = match &self.stream {
             Some(stream) => Arc::clone(stream),
-            None => Arc::clone(self.stream.insert(device.context().new_stream().map_err(&fail)?)),
+            None => Arc::clone(self.stream.insert(device.context().new_stream().map_err(&to_fault)?)),
         };
         while self.read_done.len() <= request.set {
-            self.read_done.push(device.context().new_event(None).map_err(&fail)?);
+            self.read_done.push(device.context().new_event(None).map_err(&to_fault)?);
         }
         if output.is_shared() {
-            return self.fill_back_buffer(device, output, request, &own);
+            return self.fill_back_buffer(device, output, request, &copy_stream);
         }
-        own.wait(request.after).map_err(&fail)?;
+        copy_stream.wait(request.step_done).map_err(&to_fault)?;
         // The sets live until the deformer is dropped, which waits for the copies first.
-        let from = output.owned_addresses(request.set)?;
-        Ok(ReadbackSource { positions: from.positions, normals: from.normals })
+        let addresses = output.owned_addresses(request.set)?;
+        Ok(ReadbackSource { positions: addresses.positions, normals: addresses.normals })
     }
 
-    /// Copies OpenGL's buffers to the back buffer and makes `own` wait for that copy. Returns the addresses of the
-    /// copies.
+    /// Copies OpenGL's buffers to the back buffer and makes `copy_stream` wait for that copy. Returns the addresses of
+    /// the copies.
     fn fill_back_buffer(
         &mut self,
         device: &Device,
         output: &mut OutputBuffers,
         request: &ReadbackRequest<'_>,
-        own: &CudaStream,
+        copy_stream: &CudaStream,
     ) -> Result<ReadbackSource> {
         let bytes = [request.lengths.positions, request.lengths.normals].map(|length| 4 * length);
         self.wait_for_reads(device, request.set)?;
-        let back = match &mut self.back {
-            Some(back) => back,
-            none => none.insert(BackBuffer {
+        let back_buffer = match &mut self.back_buffer {
+            Some(back_buffer) => back_buffer,
+            empty => empty.insert(BackBuffer {
                 parts: [None, None],
                 filled: device.context().new_event(None).map_err(cuda_error(STAGE))?,
             }),
         };
-        let mut to = [0; 2];
-        for ((part, bytes), to) in back.parts.iter_mut().zip(bytes).zip(&mut to).filter(|((_, bytes), _)| *bytes > 0) {
-            *to = match part {
+        let mut copy_addresses = [0; 2];
+        for ((part, bytes), copy_address) in
+            back_buffer.parts.iter_mut().zip(bytes).zip(&mut copy_addresses).filter(|((_, bytes), _)| *bytes > 0)
+        {
+            *copy_address = match part {
                 Some(part) => part.address(),
-                none => none.insert(DeviceBuffer::zeroed(device, bytes as u64)?).address(),
+                empty => empty.insert(DeviceBuffer::zeroed(device, bytes as u64)?).address(),
             };
         }
-        output.with_addresses(device, OutputAccess { set: request.set, access: MapAccess::Read }, |from| {
-            let copies = [from.positions, from.normals].into_iter().zip(to).zip(bytes);
-            for ((from, to), bytes) in copies.filter(|(_, bytes)| *bytes > 0) {
-                // SAFETY: outputs and back buffer have the bytes of the plan for each wanted list. Both live until the
+        output.with_addresses(device, OutputAccess { set: request.set, access: MapAccess::Read }, |outputs| {
+            let copies = [outputs.positions, outputs.normals].into_iter().zip(copy_addresses).zip(bytes);
+            for ((output_address, copy_address), bytes) in copies.filter(|(_, bytes)| *bytes > 0) {
+                // SAFETY: outputs and back buffer have the bytes of the plan for each requested list. Both live until the
                 // stream is synchronized.
-                unsafe { result::memcpy_dtod_async(to, from, bytes, device.stream().cu_stream()) }
+                unsafe { result::memcpy_dtod_async(copy_address, output_address, bytes, device.stream().cu_stream()) }
                     .map_err(cuda_error(STAGE))?;
             }
             Ok(())
         })?;
-        back.filled.record(device.stream()).map_err(cuda_error(STAGE))?;
-        own.wait(&back.filled).map_err(cuda_error(STAGE))?;
-        let [positions, normals] = to;
+        back_buffer.filled.record(device.stream()).map_err(cuda_error(STAGE))?;
+        copy_stream.wait(&back_buffer.filled).map_err(cuda_error(STAGE))?;
+        let [positions, normals] = copy_addresses;
         Ok(ReadbackSource { positions, normals })
     }
 
     /// Waits for a copy. Returns its surface and the number of its readback.
     pub(super) fn wait(&self, readback: &VertexReadback) -> Result<(Arc<DeformedSurface>, Option<u64>)> {
-        let own = self.slots.iter().find(|slot| readback.is_of(slot.surface.surface()));
-        let stranger = || Error::Fault { stage: STAGE, reason: "not a fetch of this deformer".into() };
-        let slot = own.ok_or_else(stranger)?;
+        let slot = self.slots.iter().find(|slot| readback.is_of(slot.surface.surface()));
+        let unknown_readback = || Error::Fault { stage: STAGE, reason: "expected a readback of this deformer".into() };
+        let slot = slot.ok_or_else(unknown_readback)?;
         slot.ready.synchronize().map_err(cuda_error(STAGE))?;
         Ok((Arc::clone(slot.surface.surface()), slot.read_id))
     }
@@ -222,23 +224,24 @@ impl ReadbackPool {
     /// Waits for all copies.
     pub(super) fn synchronize(&self) {
         if let Some(stream) = &self.stream {
-            // The device's own stream reports the same fault.
+            // The stream of the device reports the same fault.
             stream.synchronize().ok();
         }
     }
 
-    /// A free slot with these list lengths. Frees the oldest free slots beyond [`MAX_SPARE_SLOTS`], of any lengths, whose copies
-    /// have ended.
+    /// Returns a free slot with these list lengths; allocates one if there is none. Drops the oldest free slots beyond
+    /// [`MAX_SPARE_SLOTS`] whose copies have ended.
     fn acquire_slot(&mut self, device: &Device, lengths: SurfaceLengths) -> Result<usize> {
         let is_free = |slot: &ReadbackSlot| slot.surface.is_unused();
-        let mut ages: Vec<u64> = self.slots.iter().filter(|slot| is_free(slot)).map(|slot| slot.age).collect();
-        ages.sort_unstable();
-        let oldest = ages.len().checked_sub(MAX_SPARE_SLOTS).map_or(0, |beyond| ages[beyond]);
-        self.slots.retain(|slot| !is_free(slot) || slot.age >= oldest || !slot.ready.is_complete());
-        // Take the slot with the oldest copy: that copy has most likely ended.
-        let free = self.slots.iter().enumerate().filter(|(_, slot)| is_free(slot) && slot.lengths == lengths);
-        if let Some((at, _)) = free.min_by_key(|(_, slot)| slot.age) {
-            return Ok(at);
+        let mut copy_numbers: Vec<u64> =
+            self.slots.iter().filter(|slot| is_free(slot)).map(|slot| slot.copy_number).collect();
+        copy_numbers.sort_unstable();
+        let oldest_kept = copy_numbers.len().checked_sub(MAX_SPARE_SLOTS).map_or(0, |excess| copy_numbers[excess]);
+        self.slots.retain(|slot| !is_free(slot) || slot.copy_number >= oldest_kept || !slot.ready.is_complete());
+        // Take the slot with the oldest copy, because that copy has most likely ended.
+        let matching_slots = self.slots.iter().enumerate().filter(|(_, slot)| is_free(slot) && slot.lengths == lengths);
+        if let Some((slot_index, _)) = matching_slots.min_by_key(|(_, slot)| slot.copy_number) {
+            return Ok(slot_index);
         }
         self.slots.push(ReadbackSlot::new(device, lengths)?);
         Ok(self.slots.len() - 1)
@@ -250,19 +253,19 @@ impl ReadbackSlot {
         let ready = device.context().new_event(None).map_err(cuda_error(STAGE))?;
         let mut surface = PinnedSurface::empty();
         surface.allocate(device, lengths)?;
-        Ok(Self { surface, ready, lengths, age: 0, read_id: None })
+        Ok(Self { surface, ready, lengths, copy_number: 0, read_id: None })
     }
 }
 
 /// Starts a device-to-host copy.
 ///
 /// # Safety
-/// `from` is the address of at least as many bytes of device memory as `to` has, and `to` is not accessed before the
-/// stream has completed the copy.
-unsafe fn copy(from: u64, to: &mut [f32], stream: &CudaStream) -> Result<()> {
-    if to.is_empty() {
+/// `source` is the address of at least as many bytes of device memory as `target` has, and `target` is not accessed
+/// before the stream has completed the copy.
+unsafe fn copy(source: u64, target: &mut [f32], stream: &CudaStream) -> Result<()> {
+    if target.is_empty() {
         return Ok(());
     }
     // SAFETY: the caller guarantees both conditions.
-    unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) }.map_err(cuda_error(STAGE))
+    unsafe { result::memcpy_dtoh_async(target, source, stream.cu_stream()) }.map_err(cuda_error(STAGE))
 }

@@ -1,6 +1,6 @@
 //! A ring slot: the memory of one step in flight. It holds the input values and lists, the pinned memory for the bounds
-//! that are read back, and the graphs that refer to this memory. A second slot is made when a step is submitted before
-//! the previous one has ended.
+//! that are read back, and the graphs that refer to this memory. A second slot is allocated when a step is submitted
+//! before the previous one has ended.
 
 use cudarc::driver::sys::CUevent_flags;
 use cudarc::driver::{CudaEvent, CudaGraph, result};
@@ -28,41 +28,44 @@ pub(super) struct StepKernels {
     pub apply: Option<ApplyKernel>,
 }
 
-/// Pinned memory of a step, and its graphs. The graphs refer to this memory and to the buffers of the deformer: they are
-/// launched only by the deformer, which owns all of it and waits for its steps before it drops anything. An idle graph
+/// Pinned memory of a step, and its graphs. The graphs refer to this memory and to the buffers of the deformer. Only the
+/// deformer launches them. It owns all of this memory and waits for its steps before it drops anything. An idle graph
 /// accesses no memory, so the order in which the fields are dropped does not matter.
 pub(super) struct StepSlot {
     full_graph: CudaGraph,
     /// Graph of a partial step.
-    change_list_graph: Option<CudaGraph>,
+    partial_graph: Option<CudaGraph>,
     pub values: StagingBuffer,
-    pub list: Option<ChangeListBuffer>,
+    /// Only in a scene that can have partial steps.
+    pub change_list: Option<ChangeListBuffer>,
     bounds_keys: PinnedBuffer<u32>,
-    /// Recorded after each step.
+    /// End of the last step.
     pub done: CudaEvent,
-    /// Only with OpenGL's buffers: recorded after each mapping, which waits for frames in flight.
+    /// End of the last mapping, which waits for frames in flight. Only with OpenGL's buffers.
     mapped_event: Option<CudaEvent>,
-    /// Host milliseconds of the step before it requested the mapping.
+    /// Host time of the step before it requested the mapping, in milliseconds.
     pub host_ms: f64,
 }
 
 impl StepSlot {
-    /// `is_timed`: measure the time of steps on the device, from the end of the mapping.
+    /// If `is_timed` is set, the device measures the time of steps from the end of the mapping.
     pub(super) fn new(device: &Device, kernels: &StepKernels, inputs: &StepInputs, is_timed: bool) -> Result<Self> {
         let values = inputs.staging(device)?;
-        let list = kernels.apply.as_ref().map(|apply| apply.list(device)).transpose()?;
+        let change_list = kernels.apply.as_ref().map(|apply| apply.allocate_list(device)).transpose()?;
         let mut bounds_keys = PinnedBuffer::zeroed(device, kernels.bounds.words(), PinnedUse::FromDevice)?;
         let mut submission = StepSubmission { kernels, inputs, values: &values, bounds_keys: &mut bounds_keys };
         let full_graph = capture(device, || submission.submit(device, None))?;
-        let change_list_graph =
-            list.as_ref().map(|list| capture(device, || submission.submit(device, Some(list)))).transpose()?;
-        let event = |flags| device.context().new_event(flags).map_err(cuda_error("allocate"));
+        let partial_graph = change_list
+            .as_ref()
+            .map(|change_list| capture(device, || submission.submit(device, Some(change_list))))
+            .transpose()?;
+        let new_event = |flags| device.context().new_event(flags).map_err(cuda_error("allocate"));
         let flags = is_timed.then_some(CUevent_flags::CU_EVENT_DEFAULT);
-        let (mapped_event, done) = (flags.map(|flags| event(Some(flags))).transpose()?, event(flags)?);
-        Ok(Self { full_graph, change_list_graph, values, list, bounds_keys, done, mapped_event, host_ms: 0.0 })
+        let (mapped_event, done) = (flags.map(|flags| new_event(Some(flags))).transpose()?, new_event(flags)?);
+        Ok(Self { full_graph, partial_graph, values, change_list, bounds_keys, done, mapped_event, host_ms: 0.0 })
     }
 
-    /// Records on the stream that the mapping has ended, after which the step may write its outputs.
+    /// Records on the stream that the mapping has ended and the step may write its outputs.
     pub(super) fn record_mapped(&self, device: &Device) -> Result<()> {
         match &self.mapped_event {
             Some(mapped_event) => mapped_event.record(device.stream()).map_err(cuda_error("deform")),
@@ -70,26 +73,25 @@ impl StepSlot {
         }
     }
 
-    /// Milliseconds of a step that has ended, without the wait for frames; `None` if steps are not timed. Host work
-    /// after the mapping counts only as far as the device waited for it.
+    /// Time of a step that has ended, in milliseconds, without the wait for frames; `None` if steps are not timed. Host
+    /// work after the mapping counts only while the device waits for it.
     pub(super) fn device_ms(&self) -> Result<Option<f64>> {
         let Some(mapped_event) = &self.mapped_event else { return Ok(None) };
         let ms = mapped_event.elapsed_ms(&self.done).map_err(cuda_error("deform"))?;
         Ok(Some(self.host_ms + f64::from(ms)))
     }
 
-    /// Starts the graph of a full step, or that of a partial step, on the device's stream; its values are already
-    /// written.
+    /// Starts the graph of a full or partial step on the device's stream. The caller has written the values.
     pub(super) fn launch(&self, kind: StepKind) -> Result<()> {
         let graph = match kind {
             StepKind::Full => Some(&self.full_graph),
-            StepKind::Partial => self.change_list_graph.as_ref(),
+            StepKind::Partial => self.partial_graph.as_ref(),
         };
-        let missing = || Error::Fault { stage: "deform", reason: "no graph was captured".into() };
-        graph.ok_or_else(missing)?.launch().map_err(cuda_error("deform"))
+        let missing_graph = || Error::Fault { stage: "deform", reason: "expected a captured graph, got none".into() };
+        graph.ok_or_else(missing_graph)?.launch().map_err(cuda_error("deform"))
     }
 
-    /// Waits for the end of the step. Returns its bounds, and those along the bounding axes of the deformer if it has any.
+    /// Waits for the end of the step. Returns its bounds, and those along the bounding axes if the deformer has axes.
     pub(super) fn wait(&self) -> Result<(BoundingBox, Option<OrientedBounds>)> {
         self.done.synchronize().map_err(cuda_error("deform"))?;
         let keys = self.bounds_keys.as_slice()?;
@@ -113,18 +115,18 @@ struct StepSubmission<'a> {
 }
 
 impl StepSubmission<'_> {
-    /// Submits a step: upload, kernels, readback of the bounds. `list`: the change list of a partial step.
-    fn submit(&mut self, device: &Device, list: Option<&ChangeListBuffer>) -> Result<()> {
+    /// Submits a step: upload, kernels and readback of the bounds. A partial step has a change list.
+    fn submit(&mut self, device: &Device, change_list: Option<&ChangeListBuffer>) -> Result<()> {
         let Self { kernels, inputs, values, bounds_keys } = self;
-        let part = if list.is_some() { InputPart::Header } else { InputPart::Whole };
+        let input_part = if change_list.is_some() { InputPart::Header } else { InputPart::All };
         // SAFETY: the work is captured in a graph. The deformer owns the graph, the kernels, the inputs and the pinned
         // memory, all for one scene. It writes a header with the addresses of outputs of the plan's sizes, and valid
         // lists, before each launch, and waits for the launch before it writes or drops the memory.
         unsafe {
-            inputs.send(device, values, part)?;
-            match (list, &kernels.apply) {
-                (Some(list), Some(apply)) => {
-                    apply.launch(device, list, inputs, &kernels.deform)?;
+            inputs.send(device, values, input_part)?;
+            match (change_list, &kernels.apply) {
+                (Some(change_list), Some(apply)) => {
+                    apply.launch(device, change_list, inputs, &kernels.deform)?;
                     kernels.deform.launch_tile_list(device, inputs)?;
                 }
                 _ => kernels.deform.launch(device, inputs)?,
@@ -132,10 +134,11 @@ impl StepSubmission<'_> {
             kernels.bounds.launch(device, inputs, &kernels.deform)?;
             kernels.normals.as_ref().map_or(Ok(()), |normals| normals.launch(device, inputs))?;
         }
-        let bounds = inputs.addresses().header + std::mem::offset_of!(Header, bounds) as u64;
+        let bounds_address = inputs.addresses().header + std::mem::offset_of!(Header, bounds) as u64;
         let keys = bounds_keys.as_mut_slice()?;
         // SAFETY: the header has twelve words of bounds and `keys` at most as many. The deformer waits for the step
         // before it reads or drops them.
-        unsafe { result::memcpy_dtoh_async(keys, bounds, device.stream().cu_stream()) }.map_err(cuda_error("capture"))
+        unsafe { result::memcpy_dtoh_async(keys, bounds_address, device.stream().cu_stream()) }
+            .map_err(cuda_error("capture"))
     }
 }

@@ -2,21 +2,22 @@ use super::*;
 use crate::testing::{TestRng, shape, with_columns};
 
 /// A random transform with shear, possibly mirroring.
-fn transform(noise: &mut TestRng) -> ComposedTransform {
-    Transform(std::array::from_fn(|_| 2.0 * noise.next())).into()
+fn transform(rng: &mut TestRng) -> ComposedTransform {
+    Transform(std::array::from_fn(|_| 2.0 * rng.next())).into()
 }
 
-/// The sums that the module describes, in f32 on stored entries. Reads axis `axis + turn` in place of `axis`.
-fn chained(shape: &Shape, tiles: &TiledModes, step: &ErrorBoundInput, turn: usize) -> Vec<[f32; 3]> {
+/// World positions by the f32 sums that the module describes, on stored entries. Reads axis `axis + axis_shift` of U in
+/// place of `axis`.
+fn sum_in_f32(shape: &Shape, tiles: &TiledModes, step: &ErrorBoundInput, axis_shift: usize) -> Vec<[f32; 3]> {
     let t = step.transform.to_f32().0;
     let position = |vertex: usize| {
-        let place = vertex / crate::storage::QUAD / crate::storage::TILE_QUADS;
-        let bent: [f32; 3] = std::array::from_fn(|axis| {
+        let tile = vertex / crate::storage::QUAD / crate::storage::TILE_QUADS;
+        let deformed: [f32; 3] = std::array::from_fn(|axis| {
             let mut sum = 0.0_f32;
             for (mode, q) in step.q.iter().enumerate() {
-                let factor = factor(tiles, place, mode);
+                let factor = factor(tiles, tile, mode);
                 if factor > 0.0 {
-                    let stored = tiles.decode_entry(vertex, (axis + turn) % 3, mode) / f64::from(factor);
+                    let stored = tiles.decode_entry(vertex, (axis + axis_shift) % 3, mode) / f64::from(factor);
                     sum = (stored as f32).mul_add(q * factor, sum);
                 }
             }
@@ -24,133 +25,133 @@ fn chained(shape: &Shape, tiles: &TiledModes, step: &ErrorBoundInput, turn: usiz
         });
         std::array::from_fn(|row| {
             let [x, y, z, offset] = [0, 1, 2, 3].map(|column| t[4 * row + column]);
-            z.mul_add(bent[2], y.mul_add(bent[1], x.mul_add(bent[0], offset)))
+            z.mul_add(deformed[2], y.mul_add(deformed[1], x.mul_add(deformed[0], offset)))
         })
     };
     (0..tiles.vertices()).map(position).collect()
 }
 
-fn exact(shape: &Shape, step: &ErrorBoundInput) -> Vec<[f64; 3]> {
+fn positions_f64(shape: &Shape, step: &ErrorBoundInput) -> Vec<[f64; 3]> {
     let t = step.transform.to_f64();
     let position = |vertex: usize| {
-        let bent = [0, 1, 2].map(|axis| {
-            let part = |(mode, q): (usize, &f32)| f64::from(*q) * f64::from(shape.modes.entry(vertex, axis, mode));
-            f64::from(shape.mesh.rest_positions()[vertex][axis]) + step.q.iter().enumerate().map(part).sum::<f64>()
+        let deformed = [0, 1, 2].map(|axis| {
+            let mode_term = |(mode, q): (usize, &f32)| f64::from(*q) * f64::from(shape.modes.entry(vertex, axis, mode));
+            f64::from(shape.mesh.rest_positions()[vertex][axis]) + step.q.iter().enumerate().map(mode_term).sum::<f64>()
         });
-        [0, 4, 8].map(|row| t[row] * bent[0] + t[row + 1] * bent[1] + t[row + 2] * bent[2] + t[row + 3])
+        [0, 4, 8].map(|row| t[row] * deformed[0] + t[row + 1] * deformed[1] + t[row + 2] * deformed[2] + t[row + 3])
     };
     (0..shape.mesh.rest_positions().len()).map(position).collect()
 }
 
-/// The largest error relative to the bound of its tile; infinite for a NaN.
-fn worst(got: &[[f32; 3]], want: &[[f64; 3]], bounds: impl Fn(usize) -> f64) -> f64 {
-    let part = |(vertex, (got, want)): (usize, (&[f32; 3], &[f64; 3]))| {
-        let error = length([0, 1, 2].map(|axis| f64::from(got[axis]) - want[axis]));
-        let part = error / bounds(vertex / 128);
-        if part.is_nan() { f64::INFINITY } else { part }
+/// The largest ratio of a vertex's error to the bound of its tile; infinite for a NaN.
+fn max_error_ratio(got: &[[f32; 3]], expected: &[[f64; 3]], bounds: impl Fn(usize) -> f64) -> f64 {
+    let ratio = |(vertex, (got, expected)): (usize, (&[f32; 3], &[f64; 3]))| {
+        let error = norm_f64([0, 1, 2].map(|axis| f64::from(got[axis]) - expected[axis]));
+        let ratio = error / bounds(vertex / 128);
+        if ratio.is_nan() { f64::INFINITY } else { ratio }
     };
-    got.iter().zip(want).enumerate().map(part).fold(0.0, f64::max)
+    got.iter().zip(expected).enumerate().map(ratio).fold(0.0, f64::max)
 }
 
-/// Measured error over bound, for correct axes and for swapped axes.
-fn judge(shape: &Shape, storage: StorageType, step: &ErrorBoundInput) -> [f64; 2] {
+/// Ratios of error to bound, for correct axes and for swapped axes.
+fn error_ratios(shape: &Shape, storage: StorageType, step: &ErrorBoundInput) -> [f64; 2] {
     let tiles = TiledModes::new(shape, storage);
-    let reaches = ShapeErrorModel::new(shape, &tiles);
-    let want = exact(shape, step);
-    let bounds = |tile: usize| reaches.tile(tile, step).total();
-    assert!((0..tiles.count()).all(|tile| bounds(tile) <= reaches.domain(step).total()));
-    [0, 1].map(|turn| worst(&chained(shape, &tiles, step, turn), &want, bounds))
+    let model = ShapeErrorModel::new(shape, &tiles);
+    let expected = positions_f64(shape, step);
+    let bounds = |tile: usize| model.tile(tile, step).total();
+    assert!((0..tiles.count()).all(|tile| bounds(tile) <= model.domain(step).total()));
+    [0, 1].map(|axis_shift| max_error_ratio(&sum_in_f32(shape, &tiles, step, axis_shift), &expected, bounds))
 }
 
 #[test]
-fn the_bound_holds_for_every_storage_size_and_seed_and_mistaken_axes_break_it() {
+fn bound_holds_for_every_storage_and_fails_for_swapped_axes() {
     let sizes = [(1, 1), (1, 512), (7, 3), (130, 31), (129, 33), (40, 5), (5, 512), (300, 1)];
     for seed in 0..120_u64 {
-        let mut noise = TestRng(seed);
+        let mut rng = TestRng(seed);
         let (vertices, rank) = sizes[seed as usize % sizes.len()];
-        let shape = shape(vertices, rank, &mut noise);
-        let q: Vec<f32> = (0..rank).map(|_| noise.next() * f32::exp2(6.0 * noise.next())).collect();
-        let step = ErrorBoundInput { q: &q, transform: transform(&mut noise), compensated: false };
+        let shape = shape(vertices, rank, &mut rng);
+        let q: Vec<f32> = (0..rank).map(|_| rng.next() * f32::exp2(6.0 * rng.next())).collect();
+        let step = ErrorBoundInput { q: &q, transform: transform(&mut rng), compensated: false };
         for storage in StorageType::ALL {
-            let [right, wrong] = judge(&shape, storage, &step);
-            assert!(right <= 1.0, "{storage:?}, {vertices} x {rank}, seed {seed}: {right} of the bound");
-            assert!(
-                wrong > 1.0,
-                "{storage:?}, {vertices} x {rank}, seed {seed}: mistaken axes at {wrong} of the bound"
-            );
+            let [correct, swapped] = error_ratios(&shape, storage, &step);
+            let case = format!("{storage:?}, {vertices} x {rank}, seed {seed}");
+            assert!(correct <= 1.0, "{case}: expected an error within the bound, got {correct} times the bound");
+            assert!(swapped > 1.0, "{case}: expected swapped axes to exceed the bound, got {swapped} times the bound");
         }
     }
 }
 
 #[test]
-fn the_bound_of_a_follower_holds_for_every_seed_and_breaks_where_its_frame_is_left_out_or_rounds_more() {
-    let (mut largest, mut coarser) = (0.0_f64, 0);
+fn bound_of_a_follower_holds_and_fails_for_a_wrong_frame() {
+    let (mut largest_ratio, mut coarse_failures) = (0.0_f64, 0);
     for seed in 0..120_u64 {
-        let mut noise = TestRng(500 + seed);
-        let shape = shape(40, 3, &mut noise);
-        let q: Vec<f32> = (0..3).map(|_| noise.next()).collect();
-        let (root, frame) = (transform(&mut noise).root, transform(&mut noise).root);
+        let mut rng = TestRng(500 + seed);
+        let shape = shape(40, 3, &mut rng);
+        let q: Vec<f32> = (0..3).map(|_| rng.next()).collect();
+        let (root, frame) = (transform(&mut rng).root, transform(&mut rng).root);
         let step = |transform| ErrorBoundInput { q: &q, transform, compensated: false };
-        let follows = ComposedTransform { root, frame: Some(frame) };
+        let follower = ComposedTransform { root, frame: Some(frame) };
         let tiles = TiledModes::new(&shape, StorageType::F32);
-        let bound = ShapeErrorModel::new(&shape, &tiles).domain(&step(follows));
-        let want = exact(&shape, &step(follows));
-        let part = |transform: ComposedTransform| {
-            worst(&chained(&shape, &tiles, &step(transform), 0), &want, |_| bound.total())
+        let bound = ShapeErrorModel::new(&shape, &tiles).domain(&step(follower));
+        let expected = positions_f64(&shape, &step(follower));
+        let ratio = |transform: ComposedTransform| {
+            max_error_ratio(&sum_in_f32(&shape, &tiles, &step(transform), 0), &expected, |_| bound.total())
         };
-        largest = largest.max(part(follows));
-        assert!(part(follows) <= 1.0, "seed {seed}: {} of the bound", part(follows));
-        assert!(part(root.into()) > 1.0, "seed {seed}: without its frame at {}", part(root.into()));
-        // A frame of ten bits, as if products were rounded to bf16.
+        largest_ratio = largest_ratio.max(ratio(follower));
+        assert!(ratio(follower) <= 1.0, "seed {seed}: expected at most the bound, got {} times it", ratio(follower));
+        let rootless = ratio(root.into());
+        assert!(rootless > 1.0, "seed {seed}: expected an error above the bound without the frame, got {rootless}");
+        // A frame with ten mantissa bits.
         let coarse = Transform(frame.0.map(|entry| f32::from_bits(entry.to_bits() & 0xffff_e000)));
-        coarser += usize::from(part(ComposedTransform { root, frame: Some(coarse) }) > 1.0);
+        coarse_failures += usize::from(ratio(ComposedTransform { root, frame: Some(coarse) }) > 1.0);
     }
-    assert!(largest > 0.01, "{largest} of the bound at most: it would be of no use");
-    assert_eq!(coarser, 120);
+    assert!(largest_ratio > 0.01, "expected a bound below 100 times the error, got the ratio {largest_ratio}");
+    assert_eq!(coarse_failures, 120);
 }
 
 #[test]
-fn rounding_the_product_of_a_frame_is_within_its_part_of_the_bound_and_the_norm_covers_both() {
+fn frame_rounding_stays_within_its_bound_and_norm_covers_it() {
     for seed in 0..200_u64 {
-        let mut noise = TestRng(900 + seed);
-        let scale = f32::exp2(40.0 * noise.next());
-        let root = Transform(transform(&mut noise).root.0.map(|entry| entry * scale));
-        let follows = ComposedTransform { root, frame: Some(transform(&mut noise).root) };
-        let (got, want, [turned, moved]) = (follows.to_f32(), follows.to_f64(), rounding(&follows));
-        let error = |linear: bool| {
-            let entries = (0..12).filter(|at| (at % 4 != 3) == linear);
-            entries.map(|at| (f64::from(got.0[at]) - want[at]).powi(2)).sum::<f64>().sqrt()
+        let mut rng = TestRng(900 + seed);
+        let scale = f32::exp2(40.0 * rng.next());
+        let root = Transform(transform(&mut rng).root.0.map(|entry| entry * scale));
+        let follower = ComposedTransform { root, frame: Some(transform(&mut rng).root) };
+        let (got, expected, bound) = (follower.to_f32(), follower.to_f64(), frame_rounding_error(&follower));
+        let error = |is_linear: bool| {
+            let entries = (0..12).filter(|index| (index % 4 != 3) == is_linear);
+            entries.map(|index| (f64::from(got.0[index]) - expected[index]).powi(2)).sum::<f64>().sqrt()
         };
-        assert!(error(true) <= turned && error(false) <= moved, "seed {seed}");
-        assert!(error(true) > 1e-3 * turned, "seed {seed}: {} of {turned}", error(true));
-        for linear in [follows.linear(), got.linear()] {
-            let (singular, norm) = (linear.singular_values().max(), norm(&follows));
-            assert!(norm >= singular && norm <= singular * (1.0 + 1e-5), "{norm} for {singular}");
+        assert!(error(true) <= bound.linear && error(false) <= bound.translation, "seed {seed}");
+        assert!(error(true) > 1e-3 * bound.linear, "seed {seed}: {} of {}", error(true), bound.linear);
+        for linear in [follower.linear(), got.linear()] {
+            let (largest_singular, norm) = (linear.singular_values().max(), norm(&follower));
+            let limit = largest_singular * (1.0 + 1e-5);
+            assert!((largest_singular..=limit).contains(&norm), "expected {largest_singular} to {limit}, got {norm}");
         }
     }
-    assert_eq!(rounding(&Transform::IDENTITY.into()), [0.0; 2]);
+    assert_eq!(frame_rounding_error(&Transform::IDENTITY.into()), FrameError::default());
 }
 
 #[test]
-fn columns_that_differ_by_a_factor_of_1e12_keep_their_digits_in_f16_and_would_overflow_unscaled() {
-    let mut noise = TestRng(9);
+fn f16_columns_of_very_different_scales_keep_their_precision() {
+    let mut rng = TestRng(9);
     let scale = |mode: usize| 10_f32.powi(6 - 4 * mode as i32);
     let columns: Vec<f32> =
-        (0..4).flat_map(|mode| (0..600).map(move |_| mode)).map(|m| noise.next() * scale(m)).collect();
-    let shape = with_columns(200, 4, columns, &mut noise);
-    assert!(!half::f16::from_f32(shape.modes.column(0)[0]).is_finite());
+        (0..4).flat_map(|mode| (0..600).map(move |_| mode)).map(|mode| rng.next() * scale(mode)).collect();
+    let shape = with_columns(200, 4, columns, &mut rng);
+    assert!(!half::f16::from_f32(shape.modes.column(0)[0]).is_finite(), "expected overflow without scaling");
     let tiles = TiledModes::new(&shape, StorageType::F16);
     for mode in 0..4 {
-        let alone: Vec<f32> = (0..4).map(|other| if other == mode { 1.0 / scale(mode) } else { 0.0 }).collect();
-        let step = ErrorBoundInput { q: &alone, transform: Transform::IDENTITY.into(), compensated: false };
-        assert!(judge(&shape, StorageType::F16, &step)[0] <= 1.0);
+        let q: Vec<f32> = (0..4).map(|other| if other == mode { 1.0 / scale(mode) } else { 0.0 }).collect();
+        let step = ErrorBoundInput { q: &q, transform: Transform::IDENTITY.into(), compensated: false };
+        assert!(error_ratios(&shape, StorageType::F16, &step)[0] <= 1.0);
         assert!(ShapeErrorModel::new(&shape, &tiles).domain(&step).storage <= 1e-3, "mode {mode}");
     }
 }
 
 #[test]
-fn denormal_columns_zero_tiles_and_extreme_amounts_stay_within_the_bound() {
-    let mut noise = TestRng(11);
+fn denormal_zero_and_extreme_values_stay_within_the_bound() {
+    let mut rng = TestRng(11);
     // Mode 0 is denormal, mode 1 is zero in the first tile, mode 2 is zero everywhere. Mode 3 has one entry far below
     // the rest, and all of its second tile is too small for f16.
     let entry = |mode: usize, row: usize, value: f32| match mode {
@@ -161,8 +162,8 @@ fn denormal_columns_zero_tiles_and_extreme_amounts_stay_within_the_bound() {
         3 if row >= 3 * 128 => value * 5e-13,
         _ => value,
     };
-    let columns = (0..4 * 600).map(|at| entry(at / 600, at % 600, noise.next())).collect();
-    let shape = with_columns(200, 4, columns, &mut noise);
+    let columns = (0..4 * 600).map(|index| entry(index / 600, index % 600, rng.next())).collect();
+    let shape = with_columns(200, 4, columns, &mut rng);
     for q in [
         [1.0, 1.0, 1.0, 1.0],
         [0.0, 0.0, 0.0, 1e8],
@@ -170,51 +171,56 @@ fn denormal_columns_zero_tiles_and_extreme_amounts_stay_within_the_bound() {
         [1e-38, 1e-45, 0.0, 1e-40],
         [3e38, 1e30, 1.0, -1e30],
     ] {
-        let step = ErrorBoundInput { q: &q, transform: transform(&mut noise), compensated: false };
+        let step = ErrorBoundInput { q: &q, transform: transform(&mut rng), compensated: false };
         for storage in StorageType::ALL {
-            let [right, wrong] = judge(&shape, storage, &step);
-            assert!(right <= 1.0, "{storage:?} {q:?}: {right} of the bound");
-            assert!(wrong > 1.0 || q[1] < 1e-40, "{storage:?} {q:?}: mistaken axes at {wrong}");
+            let [correct, swapped] = error_ratios(&shape, storage, &step);
+            assert!(correct <= 1.0, "{storage:?} {q:?}: expected at most the bound, got {correct} times it");
+            let may_hold = q[1] < 1e-40;
+            assert!(
+                swapped > 1.0 || may_hold,
+                "{storage:?} {q:?}: expected more than the bound, got {swapped} times it"
+            );
         }
     }
 }
 
 #[test]
-fn sources_are_zero_where_there_is_no_such_error() {
-    let mut noise = TestRng(4);
-    let shape = shape(50, 6, &mut noise);
+fn bounds_are_zero_for_sources_without_error() {
+    let mut rng = TestRng(4);
+    let shape = shape(50, 6, &mut rng);
     let q = [0.3; 6];
     let bound = |storage, q: &[f32]| {
-        let reaches = ShapeErrorModel::new(&shape, &TiledModes::new(&shape, storage));
-        reaches.domain(&ErrorBoundInput { q, transform: Transform::IDENTITY.into(), compensated: false })
+        let model = ShapeErrorModel::new(&shape, &TiledModes::new(&shape, storage));
+        model.domain(&ErrorBoundInput { q, transform: Transform::IDENTITY.into(), compensated: false })
     };
-    let plain = bound(StorageType::F32, &q);
-    assert_eq!((plain.storage, plain.coordinates), (0.0, 0.0));
-    assert!(plain.accumulation > 0.0 && plain.rest > 0.0 && plain.transform > 0.0);
-    assert_eq!(bound(StorageType::F16, &q).coordinates, 0.0, "a power of two rounds nothing");
+    let f32_bound = bound(StorageType::F32, &q);
+    assert_eq!((f32_bound.storage, f32_bound.coordinates), (0.0, 0.0));
+    assert!(f32_bound.accumulation > 0.0 && f32_bound.rest > 0.0 && f32_bound.transform > 0.0);
+    assert_eq!(bound(StorageType::F16, &q).coordinates, 0.0, "expected factors that are powers of two");
     assert!(bound(StorageType::Int8, &q).coordinates > 0.0);
     let [f16, bf16, int8] =
         [StorageType::F16, StorageType::Bf16, StorageType::Int8].map(|storage| bound(storage, &q).storage);
     assert!(f16 < bf16 && f16 < int8 && f16 > 0.0);
-    let still = bound(StorageType::Int8, &[0.0; 6]);
-    assert_eq!((still.storage, still.coordinates, still.accumulation, still.rest), (0.0, 0.0, 0.0, 0.0));
+    let zero = bound(StorageType::Int8, &[0.0; 6]);
+    assert_eq!((zero.storage, zero.coordinates, zero.accumulation, zero.rest), (0.0, 0.0, 0.0, 0.0));
 }
 
 #[test]
-fn the_norm_is_not_below_the_largest_singular_value_and_hardly_above_it() {
-    let mut noise = TestRng(6);
-    let judge = |linear: nalgebra::Matrix3<f64>| {
+fn norm_is_a_tight_upper_bound_of_the_largest_singular_value() {
+    let mut rng = TestRng(6);
+    let check_norm = |linear: nalgebra::Matrix3<f64>| {
         let transform = Transform::from_parts(&linear, &nalgebra::Vector3::zeros());
         let exact = transform.linear().singular_values().max();
         let norm = norm(&transform.into());
-        assert!(norm >= exact * (1.0 - 1e-15) && norm <= exact * (1.0 + 2e-7), "{norm} for {exact} of {linear}");
+        let limits = exact * (1.0 - 1e-15)..=exact * (1.0 + 2e-7);
+        assert!(limits.contains(&norm), "expected {exact}, got {norm} for {linear}");
     };
-    let turn = nalgebra::Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
+    let rotation = nalgebra::Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
     for scale in [1.0, 1e-3, 1e-40, 1e30, -2.0] {
-        judge(turn * scale);
-        judge(nalgebra::Matrix3::from_diagonal(&nalgebra::Vector3::new(1.0, 1.0, 0.0)) * scale);
-        judge(nalgebra::Matrix3::from_element(scale));
+        check_norm(rotation * scale);
+        check_norm(nalgebra::Matrix3::from_diagonal(&nalgebra::Vector3::new(1.0, 1.0, 0.0)) * scale);
+        check_norm(nalgebra::Matrix3::from_element(scale));
     }
-    (0..1000).for_each(|_| judge(nalgebra::Matrix3::from_fn(|_, _| f64::from(noise.next()))));
+    (0..1000).for_each(|_| check_norm(nalgebra::Matrix3::from_fn(|_, _| f64::from(rng.next()))));
     assert_eq!(norm(&Transform([0.0; 12]).into()), 0.0);
 }

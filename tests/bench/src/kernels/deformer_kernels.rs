@@ -147,7 +147,7 @@ impl DeformerBenchmark {
         let too_many = || invalid("changed", allowed, changed.len());
         let mut apply =
             ApplyKernel::new(device, self.deform.packing(), self.plan.kernel(KernelKind::Apply).ok_or_else(too_many)?)?;
-        let mut list = apply.list(device)?;
+        let mut list = apply.allocate_list(device)?;
         let full_step = Header { last_full_step: 1, ..self.header() };
         for (inputs, state) in self.inputs.iter_mut().zip(states) {
             let mut staging = inputs.staging(device)?;
@@ -231,7 +231,7 @@ fn upload_step(
 ) -> Result<()> {
     inputs.write(staging, header, state)?;
     // SAFETY: the next statement waits for the copy.
-    unsafe { inputs.send(device, staging, InputPart::Whole) }?;
+    unsafe { inputs.send(device, staging, InputPart::All) }?;
     device.stream().synchronize().map_err(fault_in("upload"))
 }
 

@@ -5,7 +5,7 @@ use super::kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::RasterVariant;
 use modalcast_compute::gpu::launch::DeviceBuffer;
-use modalcast_compute::gpu::launchers::{RasterFunctions, RasterPass, RasterPipeline, check, check_cut_outs};
+use modalcast_compute::gpu::launchers::{RasterFunctions, RasterPass, RasterPipeline, check_cut_outs, check_mesh};
 use modalcast_model::error::Result;
 use modalcast_model::raster::CutOuts;
 use modalcast_model::scene::{DrawRange, Viewport};
@@ -64,7 +64,7 @@ impl RasterBenchmark {
     /// `Invalid` when there are 2^24 triangles or more, a triangle refers to no vertex, or a group to no triangle;
     /// `Unavailable` when NVRTC is missing; `Fault` when the device fails.
     pub fn new(device: &Device, mesh: RasterMesh<'_>, window: Viewport, variant: RasterVariant) -> Result<Self> {
-        check(mesh.positions.len() as u64 / 3, mesh.triangles, mesh.groups)?;
+        check_mesh(mesh.positions.len() as u64 / 3, mesh.triangles, mesh.groups)?;
         if let Some(cut_outs) = mesh.cut_outs {
             check_cut_outs(mesh.triangles.len(), cut_outs)?;
         }

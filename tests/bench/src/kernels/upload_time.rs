@@ -28,7 +28,7 @@ impl KernelBenchmark for UploadBenchmark {
     fn launch(&self, device: &Device, _turn: usize) -> Result<()> {
         // SAFETY: `time` waits for each replay, so no copy runs when `self` is dropped, and nothing writes the staging
         // buffer.
-        unsafe { self.inputs.send(device, &self.staging, InputPart::Whole) }
+        unsafe { self.inputs.send(device, &self.staging, InputPart::All) }
     }
 
     fn launches_per_step(&self) -> usize {

@@ -32,7 +32,8 @@ fn max_error_over_bound(scene: &Scene, state: &SceneState, positions: &[f32]) ->
             transform: state.composed_transform(scene, domain),
             compensated: false,
         };
-        let bound = error_model.tile(tile, &step).total() + error_model.products(tile, &step, tensor_core_error);
+        let bound =
+            error_model.tile(tile, &step).total() + error_model.tensor_core_bound(tile, &step, tensor_core_error);
         let squared_difference = |axis: usize| (f64::from(position[axis]) - reference_positions[packed][axis]).powi(2);
         let error = (0..3).map(squared_difference).sum::<f64>().sqrt();
         if error.is_nan() { f64::INFINITY } else { error / bound }

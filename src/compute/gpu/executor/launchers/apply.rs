@@ -36,12 +36,12 @@ impl ApplyKernel {
     ///
     /// # Errors
     /// `Fault` when the driver cannot lock so much memory.
-    pub fn list(&self, device: &Device) -> Result<ChangeListBuffer> {
+    pub fn allocate_list(&self, device: &Device) -> Result<ChangeListBuffer> {
         PinnedBuffer::zeroed(device, self.writer.layout().end, PinnedUse::ToDevice)
     }
 
     /// Writes the lists of a partial step. The caller has waited for the last launch with `list`. Returns `None` when
-    /// the lists have no capacity for the changes, or when a full step is less work.
+    /// the changes exceed the capacity of the lists, or when a full step is less work.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -59,7 +59,7 @@ impl ApplyKernel {
     /// among the values has the lengths of the lists.
     ///
     /// # Safety
-    /// `list` is from [`Self::list`], and [`Self::write`] wrote it for the packing of `inputs` and `deform`, or the
+    /// `list` is from [`Self::allocate_list`]. [`Self::write`] wrote it for the packing of `inputs` and `deform`, or the
     /// header has lengths of 0. All of them exist, and `list` is not written, until the kernel has ended.
     ///
     /// # Errors
@@ -73,13 +73,13 @@ impl ApplyKernel {
     ) -> Result<()> {
         let (values, layout) = (inputs.addresses(), self.writer.layout());
         let changes = list.address()?;
-        let part = |first: usize| changes + 4 * first as u64;
+        let address_of = |first_word: usize| changes + 4 * first_word as u64;
         let args = ApplyArgs {
             header: values.header,
             changes,
-            new_transforms: part(layout.transforms),
-            new_q: part(layout.q),
-            dirty_tiles: part(layout.tiles),
+            new_transforms: address_of(layout.transforms),
+            new_q: address_of(layout.q),
+            dirty_tiles: address_of(layout.tiles),
             transform_links: values.transform_links,
             transforms: values.transforms,
             q: values.q,
@@ -87,8 +87,8 @@ impl ApplyKernel {
             tile_list: deform.tile_list(),
         };
         // SAFETY: the kernel's only argument is an `ApplyArgs`. Pinned memory has the same address on host and device
-        // (unified addressing). The lists refer to domains and coordinates of the scene that the buffers were made for,
-        // and the caller keeps all of them.
+        // (unified addressing). The lists refer to domains and coordinates of the scene of the buffers. The caller keeps
+        // lists and buffers.
         unsafe { launch_kernel(device, &self.function, self.config, LaunchOrder::Serial, &args) }
     }
 }

@@ -35,16 +35,16 @@ impl BatchKernel {
     /// Compiles the kernel and uploads its work list.
     pub(super) fn new(device: &Device, kernel: &KernelDescriptor, batched: &BatchTables) -> Result<Self> {
         let function = kernel.compile(device)?;
-        let shared = batch_shared_bytes(batched, &kernel.defines);
+        let shared_bytes = batch_shared_bytes(batched, &kernel.defines);
         // Give all of the L1 cache to shared memory, so that registers alone limit the number of resident blocks.
         let carveout = CUfunction_attribute::CU_FUNC_ATTRIBUTE_PREFERRED_SHARED_MEMORY_CARVEOUT;
-        let most = CUfunction_attribute::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES;
-        for (attribute, value) in [(carveout, 100), (most, shared as i32)] {
+        let max_shared_bytes = CUfunction_attribute::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES;
+        for (attribute, value) in [(carveout, 100), (max_shared_bytes, shared_bytes as i32)] {
             function.set_attribute(attribute, value).map_err(cuda_error("batch"))?;
         }
         Ok(Self {
             function,
-            config: LaunchConfig { shared_mem_bytes: shared as u32, ..kernel.config() },
+            config: LaunchConfig { shared_mem_bytes: shared_bytes as u32, ..kernel.config() },
             blocks: DeviceBuffer::upload(device, &batched.blocks)?,
             groups: DeviceBuffer::upload(device, &batched.groups)?,
             members: DeviceBuffer::upload(device, &batched.members)?,
@@ -101,27 +101,29 @@ mod tests {
     use modalcast_model::backend_settings::BatchPolicy;
     use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState, StorageType};
 
-    /// A scene with shapes of so many vertices and modes, each used by `instances` domains, and a random state of it.
+    /// A scene of random shapes with these (vertices, rank), each used by `instances` domains, and a random state.
     fn ensemble(storage: StorageType, shapes: &[(usize, usize)], instances: usize) -> (Arc<Scene>, SceneState) {
-        let one = scene_and_state(&shapes.iter().map(|(vertices, rank)| (*vertices, *rank, 1)).collect::<Vec<_>>()).0;
+        let shapes_scene =
+            scene_and_state(&shapes.iter().map(|(vertices, rank)| (*vertices, *rank, 1)).collect::<Vec<_>>()).0;
         let mut parts = SceneParts::named("ensemble");
-        (parts.shapes, parts.materials) = (one.shapes.clone(), one.materials.clone());
+        (parts.shapes, parts.materials) = (shapes_scene.shapes.clone(), shapes_scene.materials.clone());
         parts.deformation = DeformationSettings { storage, ..DeformationSettings::default() };
-        parts.domains = (0..instances * shapes.len()).map(|at| one.domains[at % shapes.len()].clone()).collect();
-        let scene = Scene::new(parts).expect("a scene");
-        let (mut random, mut state) = (TestRng(instances as u64), SceneState::rest(&scene));
-        state.q.iter_mut().for_each(|coordinate| *coordinate = random.next());
-        state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| random.next()));
+        parts.domains =
+            (0..instances * shapes.len()).map(|index| shapes_scene.domains[index % shapes.len()].clone()).collect();
+        let scene = Scene::new(parts).expect("a valid scene");
+        let (mut rng, mut state) = (TestRng(instances as u64), SceneState::rest(&scene));
+        state.q.iter_mut().for_each(|coordinate| *coordinate = rng.next());
+        state.transforms.iter_mut().for_each(|transform| transform.0 = [0; 12].map(|_| rng.next()));
         (scene, state)
     }
 
-    /// Emulates `batch` block by block, with its ring of stages and its coalesced stores.
+    /// Emulates `batch` block by block. Returns the positions.
     fn twin_of_batch(tables: &Tables) -> Vec<f32> {
         let mut positions = vec![f32::NAN; 3 * tables.scene.layout.vertices];
         let tiles =
             tables.work.batched.blocks.iter().flat_map(|block| (block.tile..block.end).map(|tile| (block.group, tile)));
-        for (place, warp) in tiles.flat_map(|place| [0, 1].map(|warp| (place, warp))) {
-            let mut warp = Warp::new(tables, place, warp);
+        for (tile, warp) in tiles.flat_map(|tile| [0, 1].map(|warp| (tile, warp))) {
+            let mut warp = Warp::new(tables, tile, warp);
             if warp.quads > 0 {
                 let sums = warp.sums();
                 for member in (0..warp.group.members as usize).step_by(2) {
@@ -136,14 +138,14 @@ mod tests {
     fn x_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usize) -> [f32; 3] {
         let (shape, q) = (scene.shape_of(domain), state.q_of(scene, domain));
         let rest = shape.mesh.rest_positions()[vertex];
-        let bent = [0, 1, 2].map(|axis| {
+        let deformed = [0, 1, 2].map(|axis| {
             let entry = |(mode, q): (usize, &f32)| (shape.modes.entry(vertex, axis, mode), *q);
             rest[axis] + q.iter().enumerate().map(entry).fold(0.0_f32, |sum, (entry, q)| entry.mul_add(q, sum))
         });
-        [0, 1, 2].map(|row| transformed_axis(&state.transforms[domain].0[4 * row..], bent))
+        [0, 1, 2].map(|row| transformed_axis(&state.transforms[domain].0[4 * row..], deformed))
     }
 
-    /// Shapes, and the number of domains of each.
+    /// (vertices, rank) of the shapes of a scene, and the number of domains of each shape.
     const LOADS: [(&[(usize, usize)], usize); 6] = [
         (&[(1, 3), (63, 13)], 2),
         (&[(64, 4), (300, 0)], 16),
@@ -154,7 +156,7 @@ mod tests {
     ];
 
     #[test]
-    fn every_number_of_a_batch_is_written_once_and_has_the_bits_of_the_plain_sum() {
+    fn batch_positions_are_bit_identical_to_plain_sums() {
         for (shapes, instances) in LOADS {
             let (scene, state) = ensemble(StorageType::F32, shapes, instances);
             let got = twin_of_batch(&Tables::of(&scene, &state));
@@ -162,30 +164,34 @@ mod tests {
                 for vertex in 0..slot.vertices {
                     let got = &got[3 * (slot.first_vertex + vertex)..][..3];
                     if slot.rank == 0 {
-                        assert!(got.iter().all(|number| number.is_nan()), "left to `deform`");
+                        assert!(
+                            got.iter().all(|number| number.is_nan()),
+                            "expected rigid domains to be left to `deform`"
+                        );
                         continue;
                     }
                     let bits = |x: &[f32]| x.iter().map(|number| number.to_bits()).collect::<Vec<_>>();
                     assert_eq!(bits(got), bits(&x_of(&scene, &state, domain, vertex)), "{shapes:?} {domain} {vertex}");
-                    let next = (domain + shapes.len()) % scene.domains.len();
-                    assert_ne!(bits(got), bits(&x_of(&scene, &state, next, vertex)), "the judge can fail");
+                    let other_domain = (domain + shapes.len()) % scene.domains.len();
+                    assert_ne!(bits(got), bits(&x_of(&scene, &state, other_domain, vertex)));
                 }
             }
         }
     }
 
     #[test]
-    fn every_storage_finds_its_entries_scales_and_factors_in_a_batch() {
+    fn batch_decodes_entries_of_every_storage() {
         for (storage, tolerance) in StorageType::ALL.into_iter().zip([1e-5, 1e-2, 8e-2, 8e-2]) {
             for (shapes, instances) in LOADS {
                 let (scene, state) = ensemble(storage, shapes, instances);
                 let got = twin_of_batch(&Tables::of(&scene, &state));
                 for (domain, slot) in scene.layout.domains.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
                     for vertex in 0..slot.vertices {
-                        let (got, want) =
-                            (&got[3 * (slot.first_vertex + vertex)..][..3], x_of(&scene, &state, domain, vertex));
-                        let near = got.iter().zip(want).all(|(got, want)| (got - want).abs() < tolerance);
-                        assert!(near, "{storage:?} {shapes:?}: {got:?} not {want:?}");
+                        let got = &got[3 * (slot.first_vertex + vertex)..][..3];
+                        let expected = x_of(&scene, &state, domain, vertex);
+                        let is_close =
+                            got.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < tolerance);
+                        assert!(is_close, "{storage:?} {shapes:?}: expected {expected:?}, got {got:?}");
                     }
                 }
             }
@@ -193,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn groups_are_as_large_as_each_other_and_side_by_side_in_each_tile() {
+    fn groups_have_similar_sizes_and_are_adjacent_within_a_tile() {
         let (scene, _) = ensemble(StorageType::F32, &[(261, 12)], 40);
         let work = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::Always);
         let sizes: Vec<u32> = work.batched.groups.iter().map(|group| group.members).collect();
@@ -203,37 +209,43 @@ mod tests {
         assert_eq!(
             (work.full_step_tiles, work.tiles.len()),
             (120, 240),
-            "three tiles of corners and three of vertices each"
+            "expected three corner tiles and three vertex tiles per domain"
         );
         let members: Vec<u32> = work.batched.members.iter().map(|member| member.first_tile).collect();
-        assert!(members.iter().zip(&work.spans).all(|(first, spans)| *first == spans[0].0), "boxes lie by tiles");
+        assert!(
+            members.iter().zip(&work.spans).all(|(first, spans)| *first == spans[0].0),
+            "expected boxes in the order of tiles"
+        );
     }
 
     #[test]
-    fn blocks_of_large_scenes_have_runs_of_tiles_that_cover_each_shape_once() {
+    fn blocks_of_large_scenes_cover_each_tile_once() {
         let (scene, _) = ensemble(StorageType::F32, &[(128 * 6001, 1), (128 * 3000, 1)], 2);
         let batched = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::Always).batched;
-        assert!(batched.blocks.iter().all(|block| (1..=2).contains(&(block.end - block.tile))), "9001 tiles");
+        assert!(
+            batched.blocks.iter().all(|block| (1..=2).contains(&(block.end - block.tile))),
+            "expected one or two tiles per block"
+        );
         for (group, tiles) in [6001, 3000].into_iter().enumerate() {
-            let own = batched.blocks.iter().filter(|block| block.group == group as u32);
-            let covered: Vec<u32> = own.flat_map(|block| block.tile..block.end).collect();
+            let group_blocks = batched.blocks.iter().filter(|block| block.group == group as u32);
+            let covered: Vec<u32> = group_blocks.flat_map(|block| block.tile..block.end).collect();
             assert_eq!(covered, (0..tiles).collect::<Vec<u32>>());
         }
     }
 
     #[test]
-    fn a_scene_compiles_batches_when_it_has_any_and_for_as_many_vectors_as_it_needs() {
+    fn batch_variant_fits_the_number_of_instances() {
         let defines = |instances: usize| {
             let options = CudaDeformerOptions { batches: BatchPolicy::Always, ..CudaDeformerOptions::default() };
             let plan = plan(&ensemble(StorageType::F16, &[(261, 12)], instances).0, options);
-            let kernel = plan.kernel(KernelKind::Batch).expect("a batch").clone();
+            let kernel = plan.kernel(KernelKind::Batch).expect("a batch kernel").clone();
             (kernel.defines.join(" "), kernel.blocks)
         };
         assert_eq!(defines(2), ("STORE_F16 BATCH_4".into(), 3));
         assert_eq!(defines(8), ("STORE_F16 BATCH_8".into(), 3));
         assert_eq!(defines(17), ("STORE_F16".into(), 6));
-        let none = plan(&corners_match(&[(261, 12)]), CudaDeformerOptions::default());
-        assert!(none.kernel(KernelKind::Batch).is_none(), "too few to pay");
-        assert_eq!(none.bytes(BufferRole::Batches), 0);
+        let unbatched = plan(&corners_match(&[(261, 12)]), CudaDeformerOptions::default());
+        assert!(unbatched.kernel(KernelKind::Batch).is_none(), "expected no batch of a single domain");
+        assert_eq!(unbatched.bytes(BufferRole::Batches), 0);
     }
 }

@@ -17,14 +17,14 @@ use modalcast_model::error::Result;
 pub struct BoundsKernel {
     function: CudaFunction,
     config: LaunchConfig,
-    /// Axes of the second box of the result; none without it.
+    /// Axes of the second box of the result; `None` if the result has one box.
     axes: Option<BoundingAxes>,
     /// Only in a scene that keeps boxes.
     pub(crate) boxes: Option<DomainBoxes>,
 }
 
 impl BoundsKernel {
-    /// Compiles the kernel. If `deform` has pieces of domains, the kernel also computes a box of each domain.
+    /// Compiles the kernel. If `deform` has segments of domains, the kernel also computes a box of each domain.
     ///
     /// # Errors
     /// As [`Device::function`]; `Fault` when the device has not enough memory.
@@ -47,7 +47,7 @@ impl BoundsKernel {
         &self.function
     }
 
-    /// Words of the result: keys of one box, or of two with axes.
+    /// Number of words of the result: six keys per box.
     pub(crate) const fn words(&self) -> usize {
         if self.axes.is_some() { 12 } else { 6 }
     }
@@ -62,21 +62,21 @@ impl BoundsKernel {
     /// `Fault` when the device fails.
     pub unsafe fn launch(&self, device: &Device, inputs: &StepInputs, deform: &DeformKernel) -> Result<()> {
         let (values, warp_boxes) = (inputs.addresses(), deform.boxes());
-        let domains = self.boxes.as_ref().map(DomainBoxes::addresses).unwrap_or_default();
+        let segment_addresses = self.boxes.as_ref().map(DomainBoxes::addresses).unwrap_or_default();
         let args = BoundsArgs {
             header: values.header,
             boxes: warp_boxes.address,
-            segments: domains.segments,
+            segments: segment_addresses.segments,
             change_steps: values.change_steps,
-            segment_boxes: domains.boxes,
+            segment_boxes: segment_addresses.boxes,
             count: warp_boxes.count,
-            segment_count: domains.count,
+            segment_count: segment_addresses.count,
             bounding_axes: axes_to_f32(self.axes),
             reserved: 0,
         };
-        // SAFETY: the kernel's only argument is a `BoundsArgs`; `boxes` has six words for each of `count`, as
-        // `DeformKernel` allocated them, and `segment_boxes` has six for each piece. Pieces refer to boxes, vertices and
-        // domains of the same scene. The kernel calls `wait_for_prerequisite_grids` before it accesses memory.
+        // SAFETY: the kernel's only argument is a `BoundsArgs`. `boxes` has six words for each of `count` boxes, and
+        // `segment_boxes` has six for each segment. Segments refer to boxes, vertices and domains of the same scene. The
+        // kernel calls `wait_for_prerequisite_grids` before it accesses memory.
         unsafe { launch_kernel(device, &self.function, self.config, LaunchOrder::Dependent, &args) }
     }
 }

@@ -19,10 +19,10 @@ use crate::storage::{PackedWord, TILE_QUADS, TiledModes};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::Scene;
 
-/// Approximate cost of one batched tile of a group in tiles of `deform`.
+/// Approximate cost of one batched tile of a group, in units of a tile of `deform`.
 const DEFORM_TILES_PER_BATCH_TILE: usize = 2;
 
-/// Words of U per upload, which limits the staging memory while U is packed.
+/// Minimum number of words of U per upload. Bounds the staging memory while U is packed.
 const UPLOAD_WORDS: usize = 1 << 22;
 
 /// The descriptors of the kernels that write positions.
@@ -46,9 +46,9 @@ pub(super) struct WarpBoxes {
 pub struct DeformKernel {
     function: CudaFunction,
     config: LaunchConfig,
-    /// Only in a scene with batches: domains whose U is read once per group.
+    /// The kernel for groups of domains that share U; only in a scene with batches.
     batch: Option<BatchKernel>,
-    /// The kernel for a tile list; only in a scene that can have partial steps.
+    /// The function for a tile list; only in a scene that can have partial steps.
     list_function: Option<CudaFunction>,
     tiles: DeviceBuffer,
     mixed_quads: DeviceBuffer,
@@ -59,16 +59,17 @@ pub struct DeformKernel {
     tangents: DeviceBuffer,
     corner_offsets: DeviceBuffer,
     scales: DeviceBuffer,
-    list: DeviceBuffer,
+    tile_list: DeviceBuffer,
     /// Four boxes of six keys per tile.
     boxes: DeviceBuffer,
-    /// Number of tiles, and number of those that a full step launches.
+    /// Number of tiles.
     count: u32,
+    /// Number of tiles that a full step launches.
     full_step_tiles: u32,
-    /// Quads before the first that has normals.
+    /// Index of the first quad that has normals.
     first_with_normals: u64,
     packing: Arc<InputPacker>,
-    /// Pieces that `bounds` reduces to boxes; only if the scene keeps boxes.
+    /// Segments of domains that `bounds` reduces to boxes; only if the scene keeps boxes.
     segments: Option<Vec<BoxSegment>>,
 }
 
@@ -85,19 +86,19 @@ impl DeformKernel {
     ) -> Result<Self> {
         let DeviceTables { coordinates, work, segments, rest, rest_normals, rest_tangents, listed_tiles, .. } = tables;
         let kernel = kernels.deform;
-        let mut load = ModeUploader::new(device, scene, &work)?;
-        work.sources.iter().try_for_each(|source| load.add(source))?;
-        let UploadedModes { words, scales, factors } = load.finish()?;
+        let mut uploader = ModeUploader::new(device, scene, &work)?;
+        work.sources.iter().try_for_each(|source| uploader.add(source))?;
+        let UploadedModes { words, scales, factors } = uploader.finish()?;
         let has_lists = listed_tiles > 0;
-        // Without rigid normals there is nothing to compute in tiles of corners alone.
+        // Tiles that have only corners are needed only for rigid normals.
         let full_step_tiles =
             if kernel.defines.contains(&"RIGID_NORMALS") { work.full_step_tiles } else { work.vertex_tiles };
         let config = LaunchConfig { grid_dim: (deform_blocks(kernel, full_step_tiles), 1, 1), ..kernel.config() };
         Ok(Self {
-            function: function(device, kernel)?,
+            function: compile_function(device, kernel)?,
             config,
             batch: kernels.batch.map(|kernel| BatchKernel::new(device, kernel, &work.batched)).transpose()?,
-            list_function: has_lists.then(|| list_function(device, kernel)).transpose()?,
+            list_function: has_lists.then(|| compile_list_function(device, kernel)).transpose()?,
             tiles: DeviceBuffer::upload(device, &work.tiles)?,
             mixed_quads: DeviceBuffer::upload(device, &work.mixed_quads)?,
             mixed_quad_scales: DeviceBuffer::upload(device, &work.mixed_quad_scales)?,
@@ -107,7 +108,7 @@ impl DeformKernel {
             tangents: DeviceBuffer::upload(device, &rest_tangents)?,
             corner_offsets: DeviceBuffer::upload(device, &work.corner_offsets)?,
             scales,
-            list: DeviceBuffer::zeroed(device, 4 * listed_tiles as u64)?,
+            tile_list: DeviceBuffer::zeroed(device, 4 * listed_tiles as u64)?,
             boxes: DeviceBuffer::zeroed(device, work.box_bytes())?,
             count: work.tiles.len() as u32,
             full_step_tiles: full_step_tiles as u32,
@@ -131,19 +132,19 @@ impl DeformKernel {
         &self.packing
     }
 
-    /// The pieces that boxes of domains are made of, if the scene keeps boxes.
+    /// The segments of all domains, if the scene keeps boxes.
     pub(super) fn segments(&self) -> Option<&[BoxSegment]> {
         self.segments.as_deref()
     }
 
-    /// The boxes of all warps.
+    /// The boxes of all warps of all tiles.
     pub(super) fn boxes(&self) -> WarpBoxes {
         WarpBoxes { address: self.boxes.address(), count: 4 * self.count }
     }
 
     /// Address of the tile list that `apply` writes.
     pub(super) fn tile_list(&self) -> u64 {
-        self.list.address()
+        self.tile_list.address()
     }
 
     /// Names and functions of the kernels that a full step launches.
@@ -155,7 +156,7 @@ impl DeformKernel {
     /// Starts the kernels of a full step.
     ///
     /// # Safety
-    /// `inputs` has the layout of [`Self::packing`] and contains a whole step when the kernels run. Its header has the
+    /// `inputs` has the layout of [`Self::packing`] and contains a full step when the kernels run. Its header has the
     /// addresses of the outputs that the kernels write, with the sizes of the scene: positions; normals and tangents if
     /// they are rigid; displacements if the scene keeps them. All of them exist until the kernels have ended.
     ///
@@ -185,8 +186,9 @@ impl DeformKernel {
     pub unsafe fn launch_tile_list(&self, device: &Device, inputs: &StepInputs) -> Result<()> {
         let grid_dim = ((4 * self.count).min(MAX_LIST_BLOCKS), 1, 1);
         let config = LaunchConfig { grid_dim, block_dim: (TILE_QUADS as u32, 1, 1), shared_mem_bytes: 0 };
-        let missing = || Error::Fault { stage: "deform", reason: "the scene has no lists".into() };
-        let function = self.list_function.as_ref().ok_or_else(missing)?;
+        let missing_function =
+            || Error::Fault { stage: "deform", reason: "expected a scene with partial steps".into() };
+        let function = self.list_function.as_ref().ok_or_else(missing_function)?;
         // SAFETY: the caller guarantees it.
         unsafe { self.launch_variant(device, inputs, function, config) }
     }
@@ -217,7 +219,7 @@ impl DeformKernel {
             transform_links: values.transform_links,
             frames: values.frames,
             q: values.q,
-            tile_list: self.list.address(),
+            tile_list: self.tile_list.address(),
             retained_counts: values.retained_counts,
             retained: values.retained,
             boxes: self.boxes.address(),
@@ -239,39 +241,40 @@ fn compile(device: &Device, kernel: &KernelDescriptor, defines: &[&str]) -> Resu
     device.function(kernel.name, kernel.source.0, &defines)
 }
 
-/// The function of a kernel.
+/// Compiles the function of full steps.
 ///
 /// # Errors
-/// `Fault` when it is compiled for another block size than planned.
-fn function(device: &Device, kernel: &KernelDescriptor) -> Result<CudaFunction> {
+/// `Fault` when the function is compiled for another block size than planned.
+fn compile_function(device: &Device, kernel: &KernelDescriptor) -> Result<CudaFunction> {
     let function = compile(device, kernel, &kernel.defines)?;
-    let most = function.max_threads_per_block().map_err(cuda_error("deform"))?;
-    if most == kernel.threads as i32 {
+    let max_threads = function.max_threads_per_block().map_err(cuda_error("deform"))?;
+    if max_threads == kernel.threads as i32 {
         return Ok(function);
     }
-    let reason = format!("the kernel is made for {most} threads a block, {} were planned", kernel.threads);
+    let reason = format!("expected a kernel for blocks of {} threads, got {max_threads}", kernel.threads);
     Err(Error::Fault { stage: "deform", reason })
 }
 
-/// The function of the kernel that computes the tiles of a list.
-fn list_function(device: &Device, kernel: &KernelDescriptor) -> Result<CudaFunction> {
-    // One lane per item: lists are short, and would otherwise leave most of the device idle.
+/// Compiles the function that computes the tiles of a list.
+fn compile_list_function(device: &Device, kernel: &KernelDescriptor) -> Result<CudaFunction> {
+    // Lists are short: with more than one item per lane, most of the device would be idle.
     let defines = kernel.defines.iter().copied().filter(|define| *define != "ONE_ITEM_PER_LANE");
-    let list_function: Vec<&str> = defines.chain(["ONE_ITEM_PER_LANE", "TILE_LIST"]).collect();
-    compile(device, kernel, &list_function)
+    let list_defines: Vec<&str> = defines.chain(["ONE_ITEM_PER_LANE", "TILE_LIST"]).collect();
+    compile(device, kernel, &list_defines)
 }
 
-/// Blocks that loop over a tile list: as many as are resident on a large device.
+/// Maximum number of blocks that loop over a tile list: as many as are resident on a large device.
 const MAX_LIST_BLOCKS: u32 = 132 * 12;
 
-/// Upload of U, source by source. Collects the small tables of all shapes until the end.
+/// Uploads U source by source, and collects the scales and factors of all shapes.
 struct ModeUploader<'a> {
     device: &'a Device,
     scene: &'a Scene,
     work: &'a WorkList,
     words: DeviceBuffer,
-    sent: u64,
-    piece: Vec<PackedWord>,
+    uploaded_bytes: u64,
+    /// Words that are not yet uploaded.
+    pending_words: Vec<PackedWord>,
     scales: Vec<f32>,
     factors: Vec<Vec<f32>>,
 }
@@ -283,46 +286,48 @@ impl<'a> ModeUploader<'a> {
             scene,
             work,
             words: DeviceBuffer::zeroed(device, 16 * work.words)?,
-            sent: 0,
-            piece: Vec::new(),
+            uploaded_bytes: 0,
+            pending_words: Vec::new(),
             scales: vec![0.0; work.scales as usize],
             factors: vec![Vec::new(); scene.shapes.len()],
         })
     }
 
+    /// Encodes the words of a source, and uploads the pending words if they are many.
     fn add(&mut self, source: &WordSource) -> Result<()> {
         match source {
             WordSource::Shape(shape) => {
                 let tiles = self.tiles_of(*shape);
-                self.piece.extend_from_slice(tiles.packed_words());
+                self.pending_words.extend_from_slice(tiles.packed_words());
             }
             WordSource::Mixed(shapes) => {
-                let all: Vec<TiledModes> = shapes.iter().map(|shape| self.tiles_of(*shape)).collect();
-                self.piece.extend(side_by_side(&all));
+                let shape_tiles: Vec<TiledModes> = shapes.iter().map(|shape| self.tiles_of(*shape)).collect();
+                self.pending_words.extend(side_by_side(&shape_tiles));
             }
         }
-        if self.piece.len() >= UPLOAD_WORDS { self.send() } else { Ok(()) }
+        if self.pending_words.len() >= UPLOAD_WORDS { self.flush() } else { Ok(()) }
     }
 
-    /// The tiles of a shape; collects their scales and factors.
+    /// Returns the tiles of a shape, and collects their scales and factors.
     fn tiles_of(&mut self, shape: usize) -> TiledModes {
         let tiles = TiledModes::new(&self.scene.shapes[shape], self.scene.deformation.storage);
-        let scale = self.work.first_scale[shape] as usize;
-        self.scales[scale..][..tiles.scales().len()].copy_from_slice(tiles.scales());
+        let first_scale = self.work.first_scale[shape] as usize;
+        self.scales[first_scale..][..tiles.scales().len()].copy_from_slice(tiles.scales());
         self.factors[shape] = tiles.factors().to_vec();
         tiles
     }
 
-    fn send(&mut self) -> Result<()> {
-        self.words.write(self.device, self.sent, &self.piece)?;
-        self.sent += size_of_val(self.piece.as_slice()) as u64;
-        self.piece.clear();
+    /// Uploads the pending words.
+    fn flush(&mut self) -> Result<()> {
+        self.words.write(self.device, self.uploaded_bytes, &self.pending_words)?;
+        self.uploaded_bytes += size_of_val(self.pending_words.as_slice()) as u64;
+        self.pending_words.clear();
         Ok(())
     }
 
-    /// Uploads the remaining words and the small tables.
+    /// Uploads the remaining words and the scales.
     fn finish(mut self) -> Result<UploadedModes> {
-        self.send()?;
+        self.flush()?;
         let scales = DeviceBuffer::upload(self.device, &self.scales)?;
         Ok(UploadedModes { words: self.words, scales, factors: self.factors })
     }

@@ -6,18 +6,18 @@ use crate::gpu::tables::layout::BoxSegment;
 use modalcast_model::error::Result;
 use modalcast_model::scene::BoundingBox;
 
-/// Pieces of domains and their boxes on the device.
+/// Segments of domains and their boxes on the device.
 #[derive(Debug)]
 pub(crate) struct DomainBoxes {
     segments: DeviceBuffer,
     boxes: DeviceBuffer,
-    /// The domain of each piece.
+    /// The domain of each segment.
     domains: Vec<u32>,
     /// Pinned memory for the readback, allocated on the first read.
     keys: Option<PinnedBuffer<u32>>,
 }
 
-/// Addresses of the pieces and their boxes, and the number of pieces; zeros without boxes.
+/// Addresses of the segments and their boxes, and the number of segments; zeros without boxes.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct DomainBoxAddresses {
     pub segments: u64,
@@ -26,11 +26,11 @@ pub(super) struct DomainBoxAddresses {
 }
 
 impl DomainBoxes {
-    pub(super) fn new(device: &Device, list: &[BoxSegment]) -> Result<Self> {
+    pub(super) fn new(device: &Device, segments: &[BoxSegment]) -> Result<Self> {
         Ok(Self {
-            segments: DeviceBuffer::upload(device, list)?,
-            boxes: DeviceBuffer::zeroed(device, box_bytes(list.len()))?,
-            domains: list.iter().map(|piece| piece.domain).collect(),
+            segments: DeviceBuffer::upload(device, segments)?,
+            boxes: DeviceBuffer::zeroed(device, box_bytes(segments.len()))?,
+            domains: segments.iter().map(|segment| segment.domain).collect(),
             keys: None,
         })
     }
@@ -44,17 +44,17 @@ impl DomainBoxes {
     }
 
     /// Copies the boxes of all domains, and waits for the copy.
-    pub(crate) fn read(&mut self, device: &Device, to: &mut Vec<BoundingBox>) -> Result<()> {
+    pub(crate) fn read(&mut self, device: &Device, boxes: &mut Vec<BoundingBox>) -> Result<()> {
         let keys = match &mut self.keys {
             Some(keys) => keys,
-            none => {
+            empty => {
                 let length = BOX_KEYS * self.domains.len();
-                none.insert(PinnedBuffer::zeroed(device, length, PinnedUse::FromDevice)?)
+                empty.insert(PinnedBuffer::zeroed(device, length, PinnedUse::FromDevice)?)
             }
         };
         let keys = keys.as_mut_slice()?;
         self.boxes.read(device, 0, keys)?;
-        union_per_domain(&self.domains, keys, to);
+        union_per_domain(&self.domains, keys, boxes);
         Ok(())
     }
 }

@@ -34,17 +34,18 @@ impl NormalsKernel {
     /// As [`Device::function`]; `Fault` when the scene's normals do not follow the surface, or when the device has not
     /// enough memory.
     pub fn new(device: &Device, scene: &Scene, tables: &DeviceTables, kernel: &KernelDescriptor) -> Result<Self> {
-        let missing = || Error::Fault { stage: "normals", reason: "the scene has rigid normals".into() };
+        let missing_tables =
+            || Error::Fault { stage: "normals", reason: "expected a scene whose normals follow the surface".into() };
         let NormalTables { slots, first_domains, rest_normals, rest_tangents, rings } =
-            tables.normals.as_ref().ok_or_else(missing)?;
-        let tangents = || DeviceBuffer::upload(device, rest_tangents);
+            tables.normals.as_ref().ok_or_else(missing_tables)?;
+        let upload_tangents = || DeviceBuffer::upload(device, rest_tangents);
         Ok(Self {
             function: kernel.compile(device)?,
             config: kernel.config(),
             slots: DeviceBuffer::upload(device, slots)?,
             first_domains: DeviceBuffer::upload(device, first_domains)?,
             rest_normals: DeviceBuffer::upload(device, rest_normals)?,
-            rest_tangents: scene.features.normal_maps.then(tangents).transpose()?,
+            rest_tangents: scene.features.normal_maps.then(upload_tangents).transpose()?,
             members: DeviceBuffer::upload(device, &rings.members)?,
             ring_offsets: DeviceBuffer::upload(device, &rings.ring_offsets)?,
             rings: DeviceBuffer::upload(device, &rings.rings)?,

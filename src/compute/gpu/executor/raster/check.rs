@@ -5,52 +5,54 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::raster::{AlphaImage, CutOuts};
 use modalcast_model::scene::DrawRange;
 
-/// Exclusive limit of triangles: 24 bits count queue entries, next to 40 bits of tiles.
+/// Exclusive limit of the number of triangles: a counter has 24 bits for queue entries and 40 bits for tiles.
 const MAX_TRIANGLES: usize = 1 << 24;
 
-/// Refuses meshes that would cause out-of-bounds reads or queue overflows. Groups must not overlap, or a triangle could
-/// be queued twice.
+/// Rejects meshes that would cause out-of-bounds reads or queue overflows. Groups must not overlap, because a triangle
+/// must not be queued twice.
 ///
 /// # Errors
 /// `Invalid` with the name of the invalid field.
-pub fn check(vertices: u64, triangles: &[[u32; 3]], groups: &[DrawRange]) -> Result<()> {
-    let count = triangles.len();
-    if count >= MAX_TRIANGLES {
-        return Err(invalid("triangles", format!("fewer than {MAX_TRIANGLES}"), count));
+pub fn check_mesh(vertices: u64, triangles: &[[u32; 3]], groups: &[DrawRange]) -> Result<()> {
+    let triangle_count = triangles.len();
+    if triangle_count >= MAX_TRIANGLES {
+        return Err(invalid("triangles", format!("fewer than {MAX_TRIANGLES}"), triangle_count));
     }
     if let Some(vertex) = triangles.as_flattened().iter().find(|vertex| u64::from(**vertex) >= vertices) {
         return Err(invalid("triangles", format!("vertices below {vertices}"), vertex));
     }
     let mut end = 0;
     for group in groups {
-        let own = group.first as usize + group.triangles as usize;
-        if (group.first as usize) < end || own > count {
-            let expected = format!("groups one after the other within {count} triangles");
+        let group_end = group.first as usize + group.triangles as usize;
+        if (group.first as usize) < end || group_end > triangle_count {
+            let expected = format!("ascending, disjoint groups within {triangle_count} triangles");
             return Err(invalid("groups", expected, format!("{group:?}")));
         }
-        end = own;
+        end = group_end;
     }
     Ok(())
 }
 
-/// Refuses cut-outs that do not fit a mesh of `triangles` triangles, or that are inconsistent.
+/// Rejects cut-outs that do not fit a mesh of `triangles` triangles, or that are inconsistent.
 ///
 /// # Errors
 /// `Invalid` with the name of the invalid field.
 pub fn check_cut_outs(triangles: usize, cut_outs: &CutOuts) -> Result<()> {
     let CutOuts { first, uvs, material_indices, materials, images, anisotropy } = cut_outs;
-    let left = triangles.saturating_sub(*first as usize);
-    for (field, given) in [("texture coordinates", uvs.len()), ("surfaces", material_indices.len())] {
-        if given != left {
-            return Err(invalid(field, format!("{left}, one a triangle from {first} on"), given));
+    let cut_out_count = triangles.saturating_sub(*first as usize);
+    for (field, got) in [("texture coordinates", uvs.len()), ("material indices", material_indices.len())] {
+        if got != cut_out_count {
+            return Err(invalid(field, format!("{cut_out_count}, one per triangle from {first} on"), got));
         }
     }
-    if let Some(surface) = material_indices.iter().find(|surface| **surface as usize >= materials.len()) {
-        return Err(invalid("surfaces", format!("places below {}", materials.len()), surface));
+    if let Some(material_index) =
+        material_indices.iter().find(|material_index| **material_index as usize >= materials.len())
+    {
+        return Err(invalid("material indices", format!("indices below {}", materials.len()), material_index));
     }
-    let asked = materials.iter().filter_map(|surface| surface.image);
-    if let Some(image) = asked.into_iter().find(|image| *image as usize >= images.len()) {
-        return Err(invalid("surfaces", format!("images below {}", images.len()), image));
+    let image_indices = materials.iter().filter_map(|material_index| material_index.image);
+    if let Some(image) = image_indices.into_iter().find(|image| *image as usize >= images.len()) {
+        return Err(invalid("materials", format!("image indices below {}", images.len()), image));
     }
     if anisotropy.is_nan() || *anisotropy < 1.0 {
         return Err(invalid("anisotropy", "1 or more", anisotropy));
@@ -81,9 +83,9 @@ mod tests {
     use modalcast_model::scene::CullMode;
 
     #[test]
-    fn cut_outs_that_would_be_read_out_of_bounds_are_refused() {
+    fn cut_outs_with_invalid_indices_or_sizes_are_rejected() {
         let image = AlphaImage { width: 3, height: 2, levels: vec![vec![0; 6], vec![0; 1]] };
-        let good = CutOuts {
+        let valid = CutOuts {
             first: 2,
             uvs: vec![[[0.0; 2]; 3]; 2],
             material_indices: vec![0, 1],
@@ -94,37 +96,41 @@ mod tests {
             images: vec![image.clone()],
             anisotropy: 1.0,
         };
-        check_cut_outs(4, &good).expect("good");
-        let refused = |triangles: usize, change: fn(&mut CutOuts)| {
-            let mut own = good.clone();
-            change(&mut own);
-            check_cut_outs(triangles, &own).is_err()
+        check_cut_outs(4, &valid).expect("valid cut-outs");
+        let is_rejected = |triangles: usize, change: fn(&mut CutOuts)| {
+            let mut changed = valid.clone();
+            change(&mut changed);
+            check_cut_outs(triangles, &changed).is_err()
         };
-        assert!(refused(3, |_| ()) && refused(5, |_| ()));
-        assert!(refused(4, |own| own.first = 1));
-        assert!(refused(4, |own| own.material_indices[1] = 2));
-        assert!(refused(4, |own| own.materials[1].image = Some(1)));
-        assert!(refused(4, |own| own.anisotropy = f32::NAN) && refused(4, |own| own.anisotropy = 0.5));
-        assert!(refused(4, |own| own.images[0].levels.truncate(1)));
-        assert!(refused(4, |own| own.images[0].levels[1].push(0)));
-        assert!(refused(4, |own| own.images[0].width = 0));
-        assert!(refused(4, |own| own.images[0].height = 4));
+        assert!(is_rejected(3, |_| ()) && is_rejected(5, |_| ()));
+        assert!(is_rejected(4, |cut_outs| cut_outs.first = 1));
+        assert!(is_rejected(4, |cut_outs| cut_outs.material_indices[1] = 2));
+        assert!(is_rejected(4, |cut_outs| cut_outs.materials[1].image = Some(1)));
+        assert!(is_rejected(4, |cut_outs| cut_outs.anisotropy = f32::NAN));
+        assert!(is_rejected(4, |cut_outs| cut_outs.anisotropy = 0.5));
+        assert!(is_rejected(4, |cut_outs| cut_outs.images[0].levels.truncate(1)));
+        assert!(is_rejected(4, |cut_outs| cut_outs.images[0].levels[1].push(0)));
+        assert!(is_rejected(4, |cut_outs| cut_outs.images[0].width = 0));
+        assert!(is_rejected(4, |cut_outs| cut_outs.images[0].height = 4));
     }
 
     #[test]
-    fn meshes_that_would_be_read_out_of_bounds_are_refused() {
+    fn meshes_with_invalid_indices_or_groups_are_rejected() {
         let group = |first, triangles| DrawRange { first, triangles, cull_mode: CullMode::None };
-        let of = |triangles: &[[u32; 3]], groups: &[DrawRange]| check(3, triangles, groups).is_ok();
-        let two = [[0, 1, 2], [2, 1, 0]];
-        assert!(of(&two, &[group(0, 1), group(1, 1)]) && of(&[], &[]));
-        assert!(!of(&[[0, 1, 3]], &[]));
-        assert!(!of(&two, &[group(0, 3)]) && !of(&two, &[group(0, 2), group(1, 1)]) && !of(&two, &[group(2, 1)]));
+        let is_valid = |triangles: &[[u32; 3]], groups: &[DrawRange]| check_mesh(3, triangles, groups).is_ok();
+        let triangles = [[0, 1, 2], [2, 1, 0]];
+        assert!(is_valid(&triangles, &[group(0, 1), group(1, 1)]));
+        assert!(is_valid(&[], &[]));
+        assert!(!is_valid(&[[0, 1, 3]], &[]));
+        assert!(!is_valid(&triangles, &[group(0, 3)]));
+        assert!(!is_valid(&triangles, &[group(0, 2), group(1, 1)]));
+        assert!(!is_valid(&triangles, &[group(2, 1)]));
     }
 
     #[test]
-    fn triangles_that_the_queues_cannot_count_are_refused() {
-        let list = vec![[0; 3]; MAX_TRIANGLES];
-        assert!(check(1, &list[1..], &[]).is_ok());
-        assert!(check(1, &list, &[]).is_err());
+    fn more_triangles_than_the_queues_can_count_are_rejected() {
+        let triangles = vec![[0; 3]; MAX_TRIANGLES];
+        assert!(check_mesh(1, &triangles[1..], &[]).is_ok());
+        assert!(check_mesh(1, &triangles, &[]).is_err());
     }
 }

@@ -3,7 +3,9 @@
 use std::sync::Arc;
 
 use super::super::interop::{GlInterop, MapAccess, Mapping, RegisteredBuffer, with_mapped};
-use super::{RasterFunctions, RasterGranularity, RasterPass, RasterPipeline, RasterVariant, check, check_cut_outs};
+use super::{
+    RasterFunctions, RasterGranularity, RasterPass, RasterPipeline, RasterVariant, check_cut_outs, check_mesh,
+};
 use crate::gpu::launch::Device;
 use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::raster::{DrawTarget, GlBuffer, RasterGeometry, Rasterizer};
@@ -12,18 +14,19 @@ use modalcast_model::scene::{CullMode, DrawRange};
 /// Bytes of a vertex position.
 const POSITION_BYTES: u64 = 12;
 
-/// Draws one mesh with CUDA. It stays on the thread that created it, which owns the OpenGL context. Dropping it waits for all passes before any memory that they use is released.
+/// Draws one mesh with CUDA. It stays on the thread that created it, which owns the OpenGL context. Dropping it waits for
+/// all passes before any memory that they use is released.
 #[derive(Debug)]
 pub struct CudaRasterizer {
     positions: RegisteredBuffer,
     depth: PassState,
     ids: PassState,
-    sharing: GlInterop,
-    core: RasterPipeline,
+    interop: GlInterop,
+    pipeline: RasterPipeline,
     device: Arc<Device>,
 }
 
-/// A kind of pass, depth or ids: its kernels, and the target buffer, registered by its first pass.
+/// The state of the depth pass or the id pass. Its first draw compiles the kernels and registers the target buffer.
 #[derive(Debug)]
 struct PassState {
     target: Option<RegisteredBuffer>,
@@ -32,8 +35,12 @@ struct PassState {
     groups: Vec<DrawRange>,
 }
 
-/// Kernels, groups and target of a pass that is ready.
-type PreparedPass<'a> = (&'a RasterFunctions, &'a [DrawRange], &'a mut RegisteredBuffer);
+/// A pass that is ready to be drawn.
+struct PreparedPass<'a> {
+    functions: &'a RasterFunctions,
+    groups: &'a [DrawRange],
+    target: &'a mut RegisteredBuffer,
+}
 
 impl PassState {
     const fn new(depth_only: bool, groups: Vec<DrawRange>) -> Self {
@@ -41,32 +48,37 @@ impl PassState {
         Self { target: None, functions: None, variant, groups }
     }
 
-    /// The kernels, compiled at the first call.
-    fn ensure_compiled(&mut self, device: &Device, core: &RasterPipeline) -> Result<&RasterFunctions> {
+    /// Returns the kernels, compiled at the first call.
+    fn ensure_compiled(&mut self, device: &Device, pipeline: &RasterPipeline) -> Result<&RasterFunctions> {
         let functions = match self.functions.take() {
             Some(functions) => functions,
-            None => RasterFunctions::new(device, self.variant, core.has_cut_outs())?,
+            None => RasterFunctions::new(device, self.variant, pipeline.has_cut_outs())?,
         };
         Ok(self.functions.insert(functions))
     }
 
-    /// Compiles the kernels and registers the target of a pass, unless that has been done before.
+    /// Compiles the kernels and registers the target, if this is not yet done.
     fn prepare(
         &mut self,
         device: &Device,
-        (sharing, core): (&GlInterop, &RasterPipeline),
+        interop: &GlInterop,
+        pipeline: &RasterPipeline,
         target: &GlBuffer,
     ) -> Result<PreparedPass<'_>> {
-        self.ensure_compiled(device, core)?;
-        if self.target.as_ref().is_some_and(|own| own.buffer() != target) {
+        self.ensure_compiled(device, pipeline)?;
+        if self.target.as_ref().is_some_and(|registered| registered.buffer() != target) {
             self.release(device);
         }
         let registered = match self.target.take() {
-            Some(own) => own,
-            None => sharing.register(device, target.clone())?,
+            Some(registered) => registered,
+            None => interop.register(device, target.clone())?,
         };
-        let missing = || fault_in("raster")("no kernels were compiled");
-        Ok((self.functions.as_ref().ok_or_else(missing)?, &self.groups, self.target.insert(registered)))
+        let missing_functions = || fault_in("raster")("expected compiled kernels");
+        Ok(PreparedPass {
+            functions: self.functions.as_ref().ok_or_else(missing_functions)?,
+            groups: &self.groups,
+            target: self.target.insert(registered),
+        })
     }
 
     /// Unregisters the target after all work on it has completed.
@@ -78,50 +90,50 @@ impl PassState {
 }
 
 impl CudaRasterizer {
-    /// Uploads a mesh's triangles and registers its positions, a buffer of OpenGL. Kernels are compiled by
+    /// Uploads the triangles of a mesh and registers the OpenGL buffer of its positions. Kernels are compiled by
     /// [`Rasterizer::precompile`], or at the first pass that needs them.
     ///
     /// # Errors
-    /// `Invalid` when there are 2^24 triangles or more, a triangle refers to a missing vertex, a group to missing
-    /// triangles, or the cut-outs do not fit the mesh. `Fault` when the device refuses, or CUDA cannot share OpenGL's
-    /// buffer.
+    /// `Invalid` when [`check_mesh`] or [`check_cut_outs`] rejects the mesh. `Fault` when the device fails, or when CUDA
+    /// cannot share OpenGL's buffer.
     pub fn new(device: &Arc<Device>, mesh: RasterGeometry) -> Result<Self> {
-        check(mesh.positions.bytes / POSITION_BYTES, &mesh.triangles, &mesh.groups)?;
+        check_mesh(mesh.positions.bytes / POSITION_BYTES, &mesh.triangles, &mesh.groups)?;
         let cut_outs = mesh.cut_outs.filter(|cut_outs| (cut_outs.first as usize) < mesh.triangles.len());
         if let Some(cut_outs) = &cut_outs {
             check_cut_outs(mesh.triangles.len(), cut_outs)?;
         }
         let _current = device.enter()?;
-        let sharing = GlInterop::open(device, &mesh.positions)?;
-        let all = DrawRange { first: 0, triangles: mesh.triangles.len() as u32, cull_mode: CullMode::None };
+        let interop = GlInterop::open(device, &mesh.positions)?;
+        let all_triangles = DrawRange { first: 0, triangles: mesh.triangles.len() as u32, cull_mode: CullMode::None };
         Ok(Self {
-            positions: sharing.register(device, mesh.positions)?,
-            depth: PassState::new(true, vec![all]),
+            positions: interop.register(device, mesh.positions)?,
+            depth: PassState::new(true, vec![all_triangles]),
             ids: PassState::new(false, mesh.groups),
-            sharing,
-            core: RasterPipeline::new(device, &mesh.triangles, cut_outs.as_ref())?,
+            interop,
+            pipeline: RasterPipeline::new(device, &mesh.triangles, cut_outs.as_ref())?,
             device: Arc::clone(device),
         })
     }
 
-    /// Draws one window or two, with all buffers mapped together.
-    fn pass(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
-        let Self { positions, depth: of_depth, ids: of_ids, sharing, core, device } = self;
+    /// Draws one or two windows, with all buffers mapped together.
+    fn draw_windows(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
+        let Self { positions, depth: depth_pass, ids: id_pass, interop, pipeline, device } = self;
         let _current = device.enter()?;
-        let mut ready = Vec::new();
-        for (kind, order) in [(of_depth, depth), (of_ids, ids)] {
-            let Some((window, target)) = order else { continue };
-            let needed = kind.variant.bytes(window);
-            if target.bytes < needed {
-                let reason = format!("buffer {} has {} bytes, {needed} are needed", target.name, target.bytes);
+        let mut prepared = Vec::new();
+        for (pass_state, draw_target) in [(depth_pass, depth), (id_pass, ids)] {
+            let Some((window, target)) = draw_target else { continue };
+            let needed_bytes = pass_state.variant.bytes(window);
+            if target.bytes < needed_bytes {
+                let reason =
+                    format!("buffer {}: expected at least {needed_bytes} bytes, got {}", target.name, target.bytes);
                 return Err(Error::Fault { stage: "raster", reason });
             }
-            ready.push((window, kind.prepare(device, (sharing, core), target)?));
+            prepared.push((window, pass_state.prepare(device, interop, pipeline, target)?));
         }
         // Not `WriteDiscard`: the kernels read the samples that they wrote.
         let mut mappings = vec![Mapping { buffer: positions, access: MapAccess::Read }];
         let mut passes = Vec::new();
-        for (window, (functions, groups, target)) in ready {
+        for (window, PreparedPass { functions, groups, target }) in prepared {
             mappings.push(Mapping { buffer: target, access: MapAccess::ReadWrite });
             passes.push((window, functions, groups));
         }
@@ -132,7 +144,7 @@ impl CudaRasterizer {
                 // SAFETY: `new` checked mesh and groups against the size of the positions, and this function checked the
                 // size of the target. The mapping checks that the buffers have these sizes, and they stay registered
                 // until `release` or `drop` has waited for the pass.
-                unsafe { core.draw(device, &pass) }
+                unsafe { pipeline.draw(device, &pass) }
             })
         })
     }
@@ -141,19 +153,19 @@ impl CudaRasterizer {
 impl Rasterizer for CudaRasterizer {
     /// Draws the requested windows. After a failure the targets are unregistered.
     fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
-        let drawn = if depth.is_some() || ids.is_some() { self.pass(depth, ids) } else { Ok(()) };
-        if drawn.is_err() {
+        let result = if depth.is_some() || ids.is_some() { self.draw_windows(depth, ids) } else { Ok(()) };
+        if result.is_err() {
             self.depth.release(&self.device);
             self.ids.release(&self.device);
         }
-        drawn
+        result
     }
 
     fn precompile(&mut self, depth: bool, ids: bool) -> Result<()> {
-        let Self { depth: of_depth, ids: of_ids, core, device, .. } = self;
-        for (kind, wanted) in [(of_depth, depth), (of_ids, ids)] {
-            if wanted {
-                kind.ensure_compiled(device, core)?;
+        let Self { depth: depth_pass, ids: id_pass, pipeline, device, .. } = self;
+        for (pass_state, is_requested) in [(depth_pass, depth), (id_pass, ids)] {
+            if is_requested {
+                pass_state.ensure_compiled(device, pipeline)?;
             }
         }
         Ok(())

@@ -1,4 +1,4 @@
-//! Cut-outs on the device: texture coordinates, surfaces, and alpha images as textures with hardware filtering.
+//! Cut-outs on the device: texture coordinates, materials, and alpha images as textures with hardware filtering.
 
 use std::sync::Arc;
 
@@ -15,7 +15,7 @@ use modalcast_model::raster::{AlphaImage, CutOuts};
 /// Maximum anisotropy that the hardware supports.
 const MAX_ANISOTROPY: f32 = 16.0;
 
-/// An entry of the surface table.
+/// An entry of the material table. `image` is a texture object, 0 without an image.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct AlphaMaterial {
@@ -26,7 +26,7 @@ struct AlphaMaterial {
 
 const _: () = assert!(size_of::<AlphaMaterial>() == 16, "AlphaMaterial differs from kernels/cut_out.cuh");
 
-/// Device tables that the kernels read with `CUT`.
+/// Device tables that the kernels for cut-outs read.
 #[derive(Debug)]
 pub(super) struct CutOutBuffers {
     /// The first cut-out triangle.
@@ -34,6 +34,7 @@ pub(super) struct CutOutBuffers {
     uvs: DeviceBuffer,
     material_indices: DeviceBuffer,
     materials: DeviceBuffer,
+    /// The textures that `materials` refers to.
     _images: Vec<AlphaTexture>,
 }
 
@@ -49,17 +50,17 @@ impl CutOutBuffers {
     /// Uploads cut-outs, which `check_cut_outs` must have accepted.
     ///
     /// # Errors
-    /// `Fault` when the device refuses, for example an image that exceeds its texture size.
+    /// `Fault` when the device fails, for example because an image exceeds its texture size.
     pub(super) fn new(device: &Device, cut_outs: &CutOuts) -> Result<Self> {
-        let image = |image| AlphaTexture::new(device, image, cut_outs.anisotropy);
-        let images = cut_outs.images.iter().map(image).collect::<Result<Vec<_>>>()?;
-        let handle = |place: u32| images[place as usize].texture;
-        let entry = |surface: &modalcast_model::raster::AlphaMaterial| AlphaMaterial {
-            image: surface.image.map_or(0, handle),
-            alpha: surface.alpha,
-            cutoff: surface.cutoff,
+        let upload = |image| AlphaTexture::new(device, image, cut_outs.anisotropy);
+        let images = cut_outs.images.iter().map(upload).collect::<Result<Vec<_>>>()?;
+        let texture_of = |image: u32| images[image as usize].texture;
+        let table_entry = |material: &modalcast_model::raster::AlphaMaterial| AlphaMaterial {
+            image: material.image.map_or(0, texture_of),
+            alpha: material.alpha,
+            cutoff: material.cutoff,
         };
-        let materials: Vec<AlphaMaterial> = cut_outs.materials.iter().map(entry).collect();
+        let materials: Vec<AlphaMaterial> = cut_outs.materials.iter().map(table_entry).collect();
         Ok(Self {
             first: cut_outs.first,
             uvs: DeviceBuffer::upload(device, cut_outs.uvs.as_flattened())?,
@@ -91,28 +92,29 @@ impl AlphaTexture {
     /// Creates the texture and waits for the copy of its texels.
     fn new(device: &Device, image: &AlphaImage, anisotropy: f32) -> Result<Self> {
         let _current = device.enter()?;
-        let fail = cuda_error("texture");
-        let array = create(image).map_err(&fail)?;
-        // From here on, dropping `own` waits for the copies and destroys the objects created so far.
-        let mut own = Self { texture: 0, array, stream: Arc::clone(device.stream()) };
+        let to_fault = cuda_error("texture");
+        let array = create_array(image).map_err(&to_fault)?;
+        // From here on, dropping `texture` waits for the copies and destroys the objects created so far.
+        let mut texture = Self { texture: 0, array, stream: Arc::clone(device.stream()) };
         for (level, texels) in image.levels.iter().enumerate() {
-            own.fill(device, level as u32, (size_of_level(image, level), texels)).map_err(&fail)?;
+            texture.copy_level(device, level as u32, size_of_level(image, level), texels).map_err(&to_fault)?;
         }
-        own.texture = own.filtered(image, anisotropy).map_err(&fail)?;
+        texture.texture = texture.create_texture(image, anisotropy).map_err(&to_fault)?;
         device.synchronize("texture")?;
-        Ok(own)
+        Ok(texture)
     }
 
     /// Copies a mip level from the host, on the device's stream.
-    fn fill(
+    fn copy_level(
         &self,
         device: &Device,
         level: u32,
-        ([width, height], texels): ([usize; 2], &[u8]),
+        [width, height]: [usize; 2],
+        texels: &[u8],
     ) -> Result<(), DriverError> {
-        let mut to = std::ptr::null_mut();
+        let mut level_array = std::ptr::null_mut();
         // SAFETY: `to` is a live pointer, and the array has this level.
-        unsafe { sys::cuMipmappedArrayGetLevel(&mut to, self.array, level) }.result()?;
+        unsafe { sys::cuMipmappedArrayGetLevel(&mut level_array, self.array, level) }.result()?;
         let copy = sys::CUDA_MEMCPY2D_st {
             srcXInBytes: 0,
             srcY: 0,
@@ -126,7 +128,7 @@ impl AlphaTexture {
             dstMemoryType: sys::CUmemorytype_enum::CU_MEMORYTYPE_ARRAY,
             dstHost: std::ptr::null_mut(),
             dstDevice: 0,
-            dstArray: to,
+            dstArray: level_array,
             dstPitch: 0,
             WidthInBytes: width,
             Height: height,
@@ -137,7 +139,7 @@ impl AlphaTexture {
     }
 
     /// Creates a texture object with wrap addressing and trilinear, anisotropic filtering.
-    fn filtered(&self, image: &AlphaImage, anisotropy: f32) -> Result<CUtexObject, DriverError> {
+    fn create_texture(&self, image: &AlphaImage, anisotropy: f32) -> Result<CUtexObject, DriverError> {
         use sys::CUaddress_mode_enum::CU_TR_ADDRESS_MODE_WRAP as WRAP;
         use sys::CUfilter_mode_enum::CU_TR_FILTER_MODE_LINEAR as LINEAR;
         let resource = sys::CUDA_RESOURCE_DESC_st {
@@ -167,7 +169,7 @@ impl AlphaTexture {
     }
 }
 
-fn create(image: &AlphaImage) -> Result<CUmipmappedArray, DriverError> {
+fn create_array(image: &AlphaImage) -> Result<CUmipmappedArray, DriverError> {
     let description = sys::CUDA_ARRAY3D_DESCRIPTOR_st {
         Width: image.width as usize,
         Height: image.height as usize,

@@ -4,23 +4,24 @@ use modalcast_model::scene::Viewport;
 
 pub(super) const SOURCE: &str = include_str!("../../../../../kernels/raster.cu");
 
-/// The functions of the source: two launched per group, for its opaque triangles and for its cut-outs, and two that
-/// process the queues. Without [`CUT_OUTS_DEFINE`] the source has no `raster_cut_outs`.
+/// The functions of the source with [`CUT_OUTS_DEFINE`]. `raster` draws the opaque triangles of a group,
+/// `raster_cut_outs` draws its cut-outs, and the others process the queues.
 pub(super) const FUNCTIONS: [&str; 4] = ["raster", "raster_cut_outs", "raster_warps", "raster_tiles"];
+/// The functions of the source without [`CUT_OUTS_DEFINE`].
 pub(super) const OPAQUE_FUNCTIONS: [&str; 3] = [FUNCTIONS[0], FUNCTIONS[2], FUNCTIONS[3]];
 
 /// The macro for meshes with cut-outs.
 const CUT_OUTS_DEFINE: &str = "CUT_OUTS";
 
-/// Which path draws the triangles that are small enough for a thread; for benchmarks, the result is the same.
+/// The kernels that draw small and medium triangles. Benchmarks compare them; the results are the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum RasterGranularity {
-    /// Threads and warps by triangle size.
+    /// A thread draws a small triangle, a warp a medium one, and several warps the tiles of a large one.
     #[default]
     BySize,
-    /// No threads: warps, and tiles for large triangles.
+    /// As `BySize`, but warps also draw small triangles.
     Warps,
-    /// Only tiles.
+    /// All triangles are divided into tiles.
     Tiles,
 }
 
@@ -36,20 +37,20 @@ pub struct RasterVariant {
 }
 
 impl RasterVariant {
-    /// The macros of this form, for meshes with or without cut-outs.
-    pub(super) fn defines(self, cut: bool) -> Vec<&'static str> {
-        let more = [(cut, CUT_OUTS_DEFINE), (self.count_triangles, "COUNT_TRIANGLES")]
+    /// The macros of this variant, for meshes with or without cut-outs.
+    pub(super) fn defines(self, has_cut_outs: bool) -> Vec<&'static str> {
+        let optional_defines = [(has_cut_outs, CUT_OUTS_DEFINE), (self.count_triangles, "COUNT_TRIANGLES")]
             .into_iter()
-            .filter_map(|(wanted, name)| wanted.then_some(name));
+            .filter_map(|(is_enabled, name)| is_enabled.then_some(name));
         if self.depth_only {
-            return std::iter::once("DEPTH_ONLY").chain(more).collect();
+            return std::iter::once("DEPTH_ONLY").chain(optional_defines).collect();
         }
         let granularity: &[&str] = match self.granularity {
             RasterGranularity::BySize => &[],
             RasterGranularity::Warps => &["MAX_THREAD_SAMPLES=0"],
             RasterGranularity::Tiles => &["MAX_THREAD_SAMPLES=0", "MAX_WARP_EXTENT=-1"],
         };
-        more.chain(granularity.iter().copied()).collect()
+        optional_defines.chain(granularity.iter().copied()).collect()
     }
 
     /// Bytes of all samples of a window.
@@ -64,7 +65,7 @@ mod tests {
     use super::*;
     use crate::testing::assert_compiles;
 
-    /// What a server or a trial ever compiles.
+    /// Macros of all variants for meshes without cut-outs.
     const WITHOUT_CUT_OUTS: &[&[&str]] = &[
         &[],
         &["DEPTH_ONLY"],
@@ -76,6 +77,7 @@ mod tests {
         &["COUNT_TRIANGLES", "MAX_THREAD_SAMPLES=0", "MAX_WARP_EXTENT=-1"],
     ];
 
+    /// Macros of all variants for meshes with cut-outs.
     const WITH_CUT_OUTS: &[&[&str]] = &[
         &["CUT_OUTS"],
         &["DEPTH_ONLY", "CUT_OUTS"],
@@ -88,7 +90,7 @@ mod tests {
     ];
 
     #[test]
-    fn every_form_is_a_variant_that_is_compiled_in_the_check() {
+    fn defines_of_every_variant_are_in_the_compiled_lists() {
         for depth_only in [false, true] {
             for count_triangles in [false, true] {
                 for granularity in [RasterGranularity::BySize, RasterGranularity::Warps, RasterGranularity::Tiles] {

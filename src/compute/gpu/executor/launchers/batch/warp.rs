@@ -13,12 +13,15 @@ use crate::storage::{PackedWord, TILE_QUADS, modes_per_chunk};
 use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
 
-/// Quads and vertices of a warp, 16-byte words of a stage, and stages of its ring.
+/// Quads of a warp.
 const WARP_QUADS: usize = TILE_QUADS / BATCH_WARPS;
+/// Vertices of a warp.
 const WARP_VERTICES: usize = 4 * WARP_QUADS;
-const STAGE: usize = 12 * WARP_QUADS;
-const STAGES: usize = 3;
-/// Fill for memory that no result may depend on: a NaN in every storage type but `Int8`.
+/// 16-byte words of a stage.
+const STAGE_WORDS: usize = 12 * WARP_QUADS;
+/// Stages of the ring.
+const STAGE_COUNT: usize = 3;
+/// Content of memory that no result may depend on: a NaN in every storage type except `Int8`.
 const POISON: PackedWord = PackedWord([0xff; 16]);
 
 /// The inputs of the kernel.
@@ -38,10 +41,10 @@ impl Tables {
         let mut q = vec![f32::NAN; coordinates.total];
         let packing = InputPacker { factors: loaded.factors.clone(), ..InputPacker::sizes_only(scene) };
         for domain in 0..scene.domains.len() {
-            let mut at = packing.coordinates.first[domain] as usize;
+            let mut index = packing.coordinates.first[domain] as usize;
             packing.put_q(domain, state.q_of(scene, domain), |number| {
-                q[at] = number;
-                at += 1;
+                q[index] = number;
+                index += 1;
             });
         }
         Self { scene: Arc::clone(scene), work, loaded, state: state.clone(), q }
@@ -54,29 +57,29 @@ pub(super) struct Warp<'a> {
     pub group: BatchGroup,
     tile: usize,
     first_word: usize,
-    width: usize,
-    /// Quads of the tile before those of the warp.
-    before: usize,
+    tile_quads: usize,
+    /// Index of the warp's first quad in the tile.
+    warp_quad: usize,
     pub quads: usize,
-    first: usize,
+    first_vertex: usize,
     ring: Vec<PackedWord>,
 }
 
 impl<'a> Warp<'a> {
     pub(super) fn new(tables: &'a Tables, (group, tile): (u32, u32), warp: usize) -> Self {
         let (group, tile) = (tables.work.batched.groups[group as usize], tile as usize);
-        let width = TILE_QUADS.min((group.vertices as usize).div_ceil(4) - TILE_QUADS * tile);
-        let before = WARP_QUADS * warp;
+        let tile_quads = TILE_QUADS.min((group.vertices as usize).div_ceil(4) - TILE_QUADS * tile);
+        let warp_quad = WARP_QUADS * warp;
         Self {
             tables,
             group,
             tile,
-            first_word: group.first_word as usize + 3 * group.chunks as usize * TILE_QUADS * tile + before,
-            width,
-            before,
-            quads: width.saturating_sub(before).min(WARP_QUADS),
-            first: 4 * (TILE_QUADS * tile + before),
-            ring: vec![POISON; STAGES * STAGE],
+            first_word: group.first_word as usize + 3 * group.chunks as usize * TILE_QUADS * tile + warp_quad,
+            tile_quads,
+            warp_quad,
+            quads: tile_quads.saturating_sub(warp_quad).min(WARP_QUADS),
+            first_vertex: 4 * (TILE_QUADS * tile + warp_quad),
+            ring: vec![POISON; STAGE_COUNT * STAGE_WORDS],
         }
     }
 
@@ -85,105 +88,108 @@ impl<'a> Warp<'a> {
     }
 
     fn copy_stage(&mut self, stage: usize) {
-        let at = stage % STAGES * STAGE;
-        self.ring[at..][..STAGE].fill(POISON);
-        for (lane, i) in (0..32).flat_map(|lane| (0..STAGE / 32).map(move |i| (lane, i))) {
-            let row = 12 * stage + lane / WARP_QUADS + i * (32 / WARP_QUADS);
+        let ring_word = stage % STAGE_COUNT * STAGE_WORDS;
+        self.ring[ring_word..][..STAGE_WORDS].fill(POISON);
+        for (lane, step) in (0..32).flat_map(|lane| (0..STAGE_WORDS / 32).map(move |step| (lane, step))) {
+            let row = 12 * stage + lane / WARP_QUADS + step * (32 / WARP_QUADS);
             if row < 3 * self.group.chunks as usize {
-                let from = self.first_word + row * self.width + (lane % WARP_QUADS).min(self.quads - 1);
-                self.ring[at + lane + 32 * i] = self.tables.loaded.words[from];
+                let word = self.first_word + row * self.tile_quads + (lane % WARP_QUADS).min(self.quads - 1);
+                self.ring[ring_word + lane + 32 * step] = self.tables.loaded.words[word];
             }
         }
     }
 
     fn entry(&self, byte: usize) -> f32 {
         let bytes: &[u8] = bytemuck::cast_slice(&self.ring);
-        let two = [bytes[byte], bytes.get(byte + 1).copied().unwrap_or(0)];
+        let first_bytes = [bytes[byte], bytes.get(byte + 1).copied().unwrap_or(0)];
         match self.tables.scene.deformation.storage {
             StorageType::F32 => bytemuck::pod_read_unaligned(&bytes[byte..byte + 4]),
-            StorageType::F16 => half::f16::from_le_bytes(two).to_f32(),
-            StorageType::Bf16 => half::bf16::from_le_bytes(two).to_f32(),
+            StorageType::F16 => half::f16::from_le_bytes(first_bytes).to_f32(),
+            StorageType::Bf16 => half::bf16::from_le_bytes(first_bytes).to_f32(),
             StorageType::Int8 => f32::from(bytes[byte]) - 128.0,
         }
     }
 
-    /// A lane's sums, [2 * axis + vertex][member].
+    /// Sums of all lanes, `[lane][2 * axis + vertex][member]`.
     pub(super) fn sums(&mut self) -> Vec<[[f32; MAX_BATCH_SIZE]; 6]> {
         let chunks = self.group.chunks as usize;
-        let per_chunk = modes_per_chunk(self.tables.scene.deformation.storage);
-        let size = 4 / per_chunk;
+        let chunk_modes = modes_per_chunk(self.tables.scene.deformation.storage);
+        let size = 4 / chunk_modes;
         let scales = &self.tables.loaded.scales[self.group.first_scale as usize..];
         let mut sums = vec![[[0.0_f32; MAX_BATCH_SIZE]; 6]; 32];
-        (0..STAGES).for_each(|stage| self.copy_stage(stage));
+        (0..STAGE_COUNT).for_each(|stage| self.copy_stage(stage));
         for stage in 0..chunks.div_ceil(4) {
-            for (chunk, mode) in (0..4.min(chunks - 4 * stage)).flat_map(|c| (0..per_chunk).map(move |m| (c, m))) {
-                let at = (4 * stage + chunk) * per_chunk + mode;
-                let scale = scales.get(self.tile * chunks * per_chunk + at).copied().unwrap_or(1.0);
+            for (chunk, mode) in (0..4.min(chunks - 4 * stage)).flat_map(|c| (0..chunk_modes).map(move |m| (c, m))) {
+                let mode_index = (4 * stage + chunk) * chunk_modes + mode;
+                let scale = scales.get(self.tile * chunks * chunk_modes + mode_index).copied().unwrap_or(1.0);
                 for (lane, sums) in sums.iter_mut().enumerate() {
-                    let lanes = 16 * (stage % STAGES * STAGE + lane / 2) + 2 * size * (lane % 2);
+                    let lane_byte = 16 * (stage % STAGE_COUNT * STAGE_WORDS + lane / 2) + 2 * size * (lane % 2);
                     for (axis, vertex) in (0..3).flat_map(|axis| (0..2).map(move |vertex| (axis, vertex))) {
                         let byte = 4 * size * (3 * mode + axis);
-                        let place = byte / 16 * (16 * WARP_QUADS) + byte % 16 + vertex * size;
-                        let entry = self.entry(lanes + chunk * (3 * 16 * WARP_QUADS) + place);
+                        let entry_byte = byte / 16 * (16 * WARP_QUADS) + byte % 16 + vertex * size;
+                        let entry = self.entry(lane_byte + chunk * (3 * 16 * WARP_QUADS) + entry_byte);
                         let members = self.group.members as usize;
                         for (index, sum) in sums[2 * axis + vertex].iter_mut().enumerate().take(members) {
-                            *sum = entry.mul_add(self.tables.q[self.member(index).first_q as usize + at] * scale, *sum);
+                            *sum = entry
+                                .mul_add(self.tables.q[self.member(index).first_q as usize + mode_index] * scale, *sum);
                         }
                     }
                 }
             }
-            self.copy_stage(stage + STAGES);
+            self.copy_stage(stage + STAGE_COUNT);
         }
         sums
     }
 
-    /// What the warp stages for two domains, [domain][vertex][3].
+    /// Positions of two domains as the warp stages them before the stores, `[domain][vertex][3]`.
     pub(super) fn staged(&self, sums: &[[[f32; MAX_BATCH_SIZE]; 6]], member: usize) -> Vec<f32> {
         let mut staged = vec![f32::NAN; 2 * 3 * WARP_VERTICES];
-        let tile = 3 * (self.group.rest as usize + TILE_QUADS * self.tile);
-        for (lane, i) in (0..32).flat_map(|lane| (0..4).map(move |i| (lane, i))) {
-            let (one, vertex) = (i / 2, i % 2);
-            if member + one >= self.group.members as usize {
+        let tile_rest = 3 * (self.group.rest as usize + TILE_QUADS * self.tile);
+        for (lane, item) in (0..32).flat_map(|lane| (0..4).map(move |item| (lane, item))) {
+            let (member_offset, vertex) = (item / 2, item % 2);
+            if member + member_offset >= self.group.members as usize {
                 continue;
             }
-            let quad = self.before + (lane / 2).min(self.quads - 1);
-            let bent = [0, 1, 2].map(|axis| {
-                let rest = self.tables.loaded.rest[tile + axis * self.width + quad][2 * (lane % 2) + vertex];
-                rest + sums[lane][2 * axis + vertex][member + one]
+            let quad = self.warp_quad + (lane / 2).min(self.quads - 1);
+            let deformed = [0, 1, 2].map(|axis| {
+                let rest = self.tables.loaded.rest[tile_rest + axis * self.tile_quads + quad][2 * (lane % 2) + vertex];
+                rest + sums[lane][2 * axis + vertex][member + member_offset]
             });
-            let rows = self.tables.state.transforms[self.member(member + one).domain as usize].0;
+            let rows = self.tables.state.transforms[self.member(member + member_offset).domain as usize].0;
             for axis in 0..3 {
-                let at = one * 3 * WARP_VERTICES + 6 * lane + 3 * vertex + axis;
-                staged[at] = transformed_axis(&rows[4 * axis..], bent);
+                let index = member_offset * 3 * WARP_VERTICES + 6 * lane + 3 * vertex + axis;
+                staged[index] = transformed_axis(&rows[4 * axis..], deformed);
             }
         }
         staged
     }
 
     pub(super) fn store(&self, staged: &[f32], member: usize, positions: &mut [f32]) {
-        let mut put = |member: usize, number: usize, value: f32| {
-            let at = 3 * (self.member(member).first as usize + self.first) + number;
-            assert!(positions[at].is_nan(), "number {at} is written once");
-            positions[at] = value;
+        let mut put_number = |member: usize, number: usize, value: f32| {
+            let index = 3 * (self.member(member).first as usize + self.first_vertex) + number;
+            assert!(positions[index].is_nan(), "expected number {index} to be written once");
+            positions[index] = value;
         };
-        let vertices = WARP_VERTICES.min(self.group.vertices as usize - self.first);
+        let vertices = WARP_VERTICES.min(self.group.vertices as usize - self.first_vertex);
         let members = self.group.members as usize;
-        let aligned = || (0..2).all(|one| self.member(member + one).first.is_multiple_of(4));
-        if vertices == WARP_VERTICES && member + 1 < members && aligned() {
-            for (lane, i) in (0..32).flat_map(|lane| (0..12).map(move |i| (lane, i))) {
-                let (word, within) = (i / 4, i % 4);
-                let (to, first) = match word {
+        let are_aligned = || (0..2).all(|member_offset| self.member(member + member_offset).first.is_multiple_of(4));
+        if vertices == WARP_VERTICES && member + 1 < members && are_aligned() {
+            for (lane, step) in (0..32).flat_map(|lane| (0..12).map(move |step| (lane, step))) {
+                let (word, component) = (step / 4, step % 4);
+                let (target_member, first_vertex) = match word {
                     0 => (member, lane),
                     1 if lane < 16 => (member, 32 + lane),
                     1 => (member + 1, lane - 16),
                     _ => (member + 1, 16 + lane),
                 };
-                put(to, 4 * first + within, staged[4 * (32 * word + lane) + within]);
+                put_number(target_member, 4 * first_vertex + component, staged[4 * (32 * word + lane) + component]);
             }
             return;
         }
-        for one in (0..2).filter(|one| member + one < members) {
-            (0..3 * vertices).for_each(|k| put(member + one, k, staged[one * 3 * WARP_VERTICES + k]));
+        for member_offset in (0..2).filter(|member_offset| member + member_offset < members) {
+            (0..3 * vertices).for_each(|number| {
+                put_number(member + member_offset, number, staged[member_offset * 3 * WARP_VERTICES + number])
+            });
         }
     }
 }
