@@ -20,23 +20,29 @@ type QueryAttribute = unsafe extern "system" fn(EglHandle, i32, *mut isize) -> u
 type QueryString = unsafe extern "system" fn(EglHandle, i32) -> *const c_char;
 type PlatformDisplay = unsafe extern "system" fn(u32, *mut c_void, *const i32) -> EglHandle;
 
+/// EGL_PLATFORM_DEVICE_EXT.
 const PLATFORM_DEVICE: u32 = 0x313F;
+/// EGL_PLATFORM_SURFACELESS_MESA.
 const PLATFORM_SURFACELESS: u32 = 0x31DD;
+/// EGL_CUDA_DEVICE_NV.
 const CUDA_DEVICE: i32 = 0x323A;
+/// EGL_DRM_DEVICE_FILE_EXT.
 const DRM_DEVICE_FILE: i32 = 0x3233;
+/// EGL_DRIVER_NAME_EXT.
 const DRIVER_NAME: i32 = 0x335E;
-/// EGL_CONTEXT_FLAGS_KHR and EGL_CONTEXT_OPENGL_DEBUG_BIT_KHR.
+/// EGL_CONTEXT_FLAGS_KHR.
 const CONTEXT_FLAGS: i32 = 0x30FC;
+/// EGL_CONTEXT_OPENGL_DEBUG_BIT_KHR.
 const DEBUG_BIT: i32 = 1;
 const REMEDY: &str = "Install libegl1 with libegl-mesa0 and libgl1-mesa-dri (Mesa's software rasterizer), or the NVIDIA \
                       driver's libEGL_nvidia.so.0 with its vendor file 10_nvidia.json in /usr/share/glvnd/egl_vendor.d";
 
-/// Serializes display queries and the creation and destruction of contexts: drivers are known to race there.
+/// Serializes display queries and the creation and destruction of contexts, because these race in some drivers.
 static CONTEXT_LOCK: Mutex<()> = Mutex::new(());
 
 thread_local! {
-    /// The context that is current on this thread; dangling if there is none or EGL has to be asked again. It has no
-    /// destructor, so that it is also valid while other thread-local values are dropped.
+    /// The context that is current on this thread; dangling if there is none or if the current context is unknown. It has
+    /// no destructor, so that it is also valid while other thread-local values are dropped.
     static CURRENT_CONTEXT: ManuallyDrop<RefCell<Weak<ContextHandle>>> =
         const { ManuallyDrop::new(RefCell::new(Weak::new())) };
 }
@@ -46,9 +52,13 @@ thread_local! {
 pub(crate) struct Candidate {
     /// Index among EGL's devices; `None` for Mesa's surfaceless platform.
     pub(crate) index: Option<usize>,
+    /// Name of the vendor or driver.
     pub(crate) vendor: String,
+    /// Extensions of the device.
     pub(crate) extensions: Vec<String>,
+    /// Ordinal of the corresponding CUDA device.
     pub(crate) cuda_device: Option<i32>,
+    /// DRM node, such as `/dev/dri/card0`.
     pub(crate) drm_node: Option<String>,
     /// Whether the device reports that it is a software renderer.
     pub(crate) software: bool,
@@ -59,17 +69,17 @@ pub(crate) struct Candidate {
 #[derive(Debug)]
 pub(crate) struct Context {
     handle: Rc<ContextHandle>,
-    /// Whether it is a debug context.
+    /// Whether this is a debug context.
     pub(crate) is_debug: bool,
 }
 
-/// Keeps a context current on this thread. When the guard is dropped, also by a panic that unwinds, the context that was
-/// current before becomes current again. If there was none, the context stays current: nothing relies on a thread without
-/// a context, and each switch flushes the commands of the device.
+/// Keeps a context current on this thread. When the guard is dropped, also by a panic that unwinds, the previous context
+/// becomes current again. If there was none, the context stays current, because each switch flushes the commands of the
+/// device.
 #[derive(Debug)]
 #[must_use = "the previous context becomes current again when the guard is dropped"]
 pub(crate) struct CurrentContext {
-    /// The context to restore; none if nothing has to be restored.
+    /// The context to restore; `None` if there is nothing to restore.
     previous: Option<Weak<ContextHandle>>,
 }
 
@@ -80,6 +90,7 @@ struct ContextHandle {
     context: egl::Context,
 }
 
+/// libEGL, and its extension functions; `None` if libEGL lacks a function.
 struct EglApi {
     instance: Instance,
     query_devices: Option<QueryDevices>,
@@ -97,6 +108,7 @@ fn lock_contexts() -> MutexGuard<'static, ()> {
     CONTEXT_LOCK.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// Loads libEGL on the first call.
 fn api() -> Result<&'static EglApi> {
     static API: OnceLock<Result<EglApi>> = OnceLock::new();
     API.get_or_init(EglApi::load).as_ref().map_err(Clone::clone)
@@ -104,78 +116,85 @@ fn api() -> Result<&'static EglApi> {
 
 impl EglApi {
     fn load() -> Result<Self> {
-        // SAFETY: loading libEGL runs the initializers of libEGL and of its vendor libraries, which is their purpose.
+        // SAFETY: loading libEGL runs the initializers of libEGL and of its vendor libraries.
         let instance = unsafe { Instance::load_required_from_filename("libEGL.so.1") }
             .map_err(|error| unavailable(format!("libEGL.so.1 cannot be loaded ({error})")))?;
-        let find = |name: &str| instance.get_proc_address(name);
+        let find_function = |name: &str| instance.get_proc_address(name);
         // SAFETY: the types are those of EGL_EXT_device_enumeration, EGL_EXT_device_query and EGL_EXT_platform_base.
         // EGL may return an address for an extension that it lacks; calling it then returns an error.
         let (query_devices, query_attribute, query_string, platform_display) = unsafe {
             (
-                find("eglQueryDevicesEXT")
-                    .map(|found| std::mem::transmute::<extern "system" fn(), QueryDevices>(found)),
-                find("eglQueryDeviceAttribEXT")
-                    .map(|found| std::mem::transmute::<extern "system" fn(), QueryAttribute>(found)),
-                find("eglQueryDeviceStringEXT")
-                    .map(|found| std::mem::transmute::<extern "system" fn(), QueryString>(found)),
-                find("eglGetPlatformDisplayEXT")
-                    .map(|found| std::mem::transmute::<extern "system" fn(), PlatformDisplay>(found)),
+                find_function("eglQueryDevicesEXT")
+                    .map(|function| std::mem::transmute::<extern "system" fn(), QueryDevices>(function)),
+                find_function("eglQueryDeviceAttribEXT")
+                    .map(|function| std::mem::transmute::<extern "system" fn(), QueryAttribute>(function)),
+                find_function("eglQueryDeviceStringEXT")
+                    .map(|function| std::mem::transmute::<extern "system" fn(), QueryString>(function)),
+                find_function("eglGetPlatformDisplayEXT")
+                    .map(|function| std::mem::transmute::<extern "system" fn(), PlatformDisplay>(function)),
             )
         };
         Ok(Self { instance, query_devices, query_attribute, query_string, platform_display })
     }
 
+    /// EGL's devices, at most 64.
     fn devices(&self) -> Vec<EglHandle> {
-        let Some(query) = self.query_devices else { return Vec::new() };
+        let Some(query_devices) = self.query_devices else { return Vec::new() };
         let mut devices = [std::ptr::null_mut(); 64];
         let mut count = 0;
         // SAFETY: the array has capacity for the 64 handles that the call may write, and the count outlives the call.
-        let good = unsafe { query(devices.len() as i32, devices.as_mut_ptr(), &raw mut count) };
-        let count = if good == 0 { 0 } else { usize::try_from(count).unwrap_or(0) };
+        let status = unsafe { query_devices(devices.len() as i32, devices.as_mut_ptr(), &raw mut count) };
+        let count = if status == 0 { 0 } else { usize::try_from(count).unwrap_or(0) };
         devices[..count.min(devices.len())].to_vec()
     }
 
-    fn text(&self, device: EglHandle, name: i32) -> Option<String> {
-        let query = self.query_string?;
+    fn query_text(&self, device: EglHandle, name: i32) -> Option<String> {
+        let query_string = self.query_string?;
         // SAFETY: the device came from eglQueryDevicesEXT; the result is null or a string that lives as long as EGL.
         unsafe {
-            let text = query(device, name);
+            let text = query_string(device, name);
             (!text.is_null()).then(|| CStr::from_ptr(text).to_string_lossy().into_owned())
         }
     }
 
+    /// Ordinal of the CUDA device that a device is.
     fn cuda_device(&self, device: EglHandle) -> Option<i32> {
         let mut value = -1_isize;
         // SAFETY: the device came from eglQueryDevicesEXT and the value outlives the call.
-        let good = unsafe { self.query_attribute?(device, CUDA_DEVICE, &raw mut value) };
-        (good != 0).then(|| i32::try_from(value).ok()).flatten()
+        let status = unsafe { self.query_attribute?(device, CUDA_DEVICE, &raw mut value) };
+        (status != 0).then(|| i32::try_from(value).ok()).flatten()
     }
 
-    fn display(&self, platform: u32, native: EglHandle) -> Option<egl::Display> {
-        let none = [egl::NONE];
-        // SAFETY: `native` is a device of eglQueryDevicesEXT, or null for the surfaceless platform; NONE ends the list.
-        let display = unsafe { self.platform_display?(platform, native, none.as_ptr()) };
+    /// The display of a device, or of the surfaceless platform.
+    fn display(&self, platform: u32, native_display: EglHandle) -> Option<egl::Display> {
+        let empty_attributes = [egl::NONE];
+        // SAFETY: `native_display` is a device of eglQueryDevicesEXT, or null for the surfaceless platform; NONE ends the list.
+        let display = unsafe { self.platform_display?(platform, native_display, empty_attributes.as_ptr()) };
         // SAFETY: EGL created the display, and this process never terminates it.
         (!display.is_null()).then(|| unsafe { egl::Display::from_ptr(display) })
     }
 
+    /// Describes a device; `None` if it has no display.
     fn candidate(&self, index: usize, device: EglHandle) -> Option<Candidate> {
         let extensions: Vec<String> =
-            self.text(device, egl::EXTENSIONS).unwrap_or_default().split_whitespace().map(String::from).collect();
-        let has = |name: &str| extensions.iter().any(|extension| extension == name);
-        let drm = has("EGL_EXT_device_drm").then(|| self.text(device, DRM_DEVICE_FILE)).flatten();
-        let cuda = has("EGL_NV_device_cuda").then(|| self.cuda_device(device)).flatten();
-        let named = has("EGL_EXT_device_query_name").then(|| self.text(device, egl::VENDOR)).flatten();
-        let driver = has("EGL_EXT_device_persistent_id").then(|| self.text(device, DRIVER_NAME)).flatten();
-        let software = has("EGL_MESA_device_software");
+            self.query_text(device, egl::EXTENSIONS).unwrap_or_default().split_whitespace().map(String::from).collect();
+        let has_extension = |name: &str| extensions.iter().any(|extension| extension == name);
+        let drm_node = has_extension("EGL_EXT_device_drm").then(|| self.query_text(device, DRM_DEVICE_FILE)).flatten();
+        let cuda_device = has_extension("EGL_NV_device_cuda").then(|| self.cuda_device(device)).flatten();
+        let vendor_name =
+            has_extension("EGL_EXT_device_query_name").then(|| self.query_text(device, egl::VENDOR)).flatten();
+        let driver_name =
+            has_extension("EGL_EXT_device_persistent_id").then(|| self.query_text(device, DRIVER_NAME)).flatten();
+        let software = has_extension("EGL_MESA_device_software");
         let display = self.display(PLATFORM_DEVICE, device)?;
-        let vendor =
-            named.or(driver).unwrap_or_else(|| if software { "Mesa software".into() } else { "unnamed".into() });
+        let vendor = vendor_name
+            .or(driver_name)
+            .unwrap_or_else(|| if software { "Mesa software".into() } else { "unnamed".into() });
         Some(Candidate {
             index: Some(index),
             vendor,
-            cuda_device: cuda,
-            drm_node: drm.filter(|node| !node.is_empty()),
+            cuda_device,
+            drm_node: drm_node.filter(|node| !node.is_empty()),
             software,
             extensions,
             display,
@@ -189,11 +208,11 @@ impl EglApi {
 /// `Unavailable` when libEGL cannot be loaded.
 pub(crate) fn candidates() -> Result<Vec<Candidate>> {
     let api = api()?;
-    let _door = lock_contexts();
-    let mut found: Vec<Candidate> =
+    let _lock = lock_contexts();
+    let mut candidates: Vec<Candidate> =
         api.devices().into_iter().enumerate().filter_map(|(index, device)| api.candidate(index, device)).collect();
     let surfaceless = api.display(PLATFORM_SURFACELESS, std::ptr::null_mut());
-    found.extend(surfaceless.map(|display| Candidate {
+    candidates.extend(surfaceless.map(|display| Candidate {
         index: None,
         vendor: "Mesa surfaceless".into(),
         extensions: Vec::new(),
@@ -202,33 +221,33 @@ pub(crate) fn candidates() -> Result<Vec<Candidate>> {
         software: false,
         display,
     }));
-    Ok(found)
+    Ok(candidates)
 }
 
-/// Error when no candidate is suitable.
-pub(crate) fn no_device_error(wanted: &str, tried: &[String]) -> Error {
-    let tried = if tried.is_empty() { "no EGL device is there".to_string() } else { tried.join("; ") };
-    unavailable(format!("no context on {wanted}: {tried}"))
+/// Error that no candidate is suitable. `attempts` describe the candidates that were tried.
+pub(crate) fn no_device_error(expected: &str, attempts: &[String]) -> Error {
+    let attempts = if attempts.is_empty() { "EGL has no device".to_string() } else { attempts.join("; ") };
+    unavailable(format!("no context on {expected}: {attempts}"))
 }
 
 impl Context {
-    /// Creates a context on a candidate, on request a debug context, which reports more and can be slower.
+    /// Creates a context on a candidate. A debug context reports more and can be slower.
     ///
     /// # Errors
-    /// `Unavailable` without libEGL; `Fault` when EGL refuses the context.
+    /// `Unavailable` without libEGL; `Fault` when EGL cannot create the context.
     pub(crate) fn open(candidate: &Candidate, is_debug: bool) -> Result<Self> {
         let instance = &api()?.instance;
         let display = candidate.display;
-        let fail = fault_in::<egl::Error>("EGL context");
-        let _door = lock_contexts();
+        let to_fault = fault_in::<egl::Error>("EGL context");
+        let _lock = lock_contexts();
         instance.initialize(display).map_err(fault_in("EGL initialize"))?;
-        let extensions = instance.query_string(Some(display), egl::EXTENSIONS).map_err(&fail)?.to_string_lossy();
+        let extensions = instance.query_string(Some(display), egl::EXTENSIONS).map_err(&to_fault)?.to_string_lossy();
         if !extensions.contains("EGL_KHR_surfaceless_context") {
-            return Err(fault_in("EGL context")("EGL_KHR_surfaceless_context is missing"));
+            return Err(fault_in("EGL context")("expected the extension EGL_KHR_surfaceless_context"));
         }
-        instance.bind_api(egl::OPENGL_API).map_err(&fail)?;
-        let config = config(instance, display)?;
-        let wanted = [
+        instance.bind_api(egl::OPENGL_API).map_err(&to_fault)?;
+        let config = choose_config(instance, display)?;
+        let attributes = [
             egl::CONTEXT_MAJOR_VERSION,
             4,
             egl::CONTEXT_MINOR_VERSION,
@@ -239,15 +258,15 @@ impl Context {
             DEBUG_BIT,
             egl::NONE,
         ];
-        let context = instance.create_context(display, config, None, &wanted).map_err(&fail)?;
+        let context = instance.create_context(display, config, None, &attributes).map_err(&to_fault)?;
         Ok(Self { handle: Rc::new(ContextHandle { display, context }), is_debug })
     }
 
     /// Makes the context current on this thread.
     ///
     /// # Errors
-    /// `Fault` when EGL refuses, for example because the context is current on another thread. No command of this
-    /// context may be issued then.
+    /// `Fault` when EGL fails, for example because the context is current on another thread. No command of this context
+    /// may be issued then.
     pub(crate) fn make_current(&self) -> Result<CurrentContext> {
         let previous = CURRENT_CONTEXT.with(|current| current.borrow().clone());
         if std::ptr::eq(previous.as_ptr(), Rc::as_ptr(&self.handle)) {
@@ -259,8 +278,8 @@ impl Context {
 
     /// Address of an OpenGL function, or null.
     pub(crate) fn address(&self, name: &str) -> *const c_void {
-        let found = api().ok().and_then(|api| api.instance.get_proc_address(name));
-        found.map_or(std::ptr::null(), |found| found as *const c_void)
+        let function = api().ok().and_then(|api| api.instance.get_proc_address(name));
+        function.map_or(std::ptr::null(), |function| function as *const c_void)
     }
 }
 
@@ -275,8 +294,8 @@ impl Drop for CurrentContext {
     fn drop(&mut self) {
         let Some(previous) = self.previous.as_ref().and_then(Weak::upgrade) else { return };
         if let Err(error) = previous.bind() {
-            // Each use of the previous context makes it current first, and then returns the error.
-            tracing::warn!(%error, "the OpenGL context that was current before is not current again");
+            // The next use of the previous context makes it current first, or returns the error.
+            tracing::warn!(%error, "the previous OpenGL context is not current again");
         }
     }
 }
@@ -284,10 +303,10 @@ impl Drop for CurrentContext {
 impl ContextHandle {
     /// Asks EGL to make the context current on this thread.
     fn bind(self: &Rc<Self>) -> Result<()> {
-        // After a failure EGL is asked again, whichever context is used next.
+        // If EGL fails, the current context is unknown.
         CURRENT_CONTEXT.with(|current| current.replace(Weak::new()));
-        let made = api()?.instance.make_current(self.display, None, None, Some(self.context));
-        made.map_err(fault_in("eglMakeCurrent"))?;
+        let result = api()?.instance.make_current(self.display, None, None, Some(self.context));
+        result.map_err(fault_in("eglMakeCurrent"))?;
         CURRENT_CONTEXT.with(|current| current.replace(Rc::downgrade(self)));
         Ok(())
     }
@@ -296,25 +315,25 @@ impl ContextHandle {
 impl Drop for ContextHandle {
     fn drop(&mut self) {
         let Ok(api) = api() else { return };
-        let _door = lock_contexts();
-        // The count of a context is 0 while it is dropped. If another context is current, it stays current.
+        let _lock = lock_contexts();
+        // The reference count of a context is 0 while it is dropped. If another context is current, it stays current.
         if CURRENT_CONTEXT.with(|current| current.borrow().strong_count()) == 0 {
             api.instance.make_current(self.display, None, None, None).ok();
         }
-        // Destroying fails only for a context that no longer exists, which is the wanted state.
+        // Destroying fails only for a context that no longer exists.
         api.instance.destroy_context(self.display, self.context).ok();
     }
 }
 
-/// A config without window support: the default surface type is WINDOW, which headless devices do not offer.
-fn config(instance: &Instance, display: egl::Display) -> Result<egl::Config> {
-    for surface in [egl::PBUFFER_BIT, 0] {
-        let wanted = [egl::SURFACE_TYPE, surface, egl::RENDERABLE_TYPE, egl::OPENGL_BIT, egl::NONE];
-        if let Ok(Some(config)) = instance.choose_first_config(display, &wanted) {
+/// Chooses a config without window support. The default surface type is WINDOW, which headless devices do not offer.
+fn choose_config(instance: &Instance, display: egl::Display) -> Result<egl::Config> {
+    for surface_type in [egl::PBUFFER_BIT, 0] {
+        let attributes = [egl::SURFACE_TYPE, surface_type, egl::RENDERABLE_TYPE, egl::OPENGL_BIT, egl::NONE];
+        if let Ok(Some(config)) = instance.choose_first_config(display, &attributes) {
             return Ok(config);
         }
     }
-    Err(fault_in("EGL config")("no config renders desktop OpenGL, with a pbuffer or without"))
+    Err(fault_in("EGL config")("expected a config for desktop OpenGL, got none"))
 }
 
 #[cfg(test)]
@@ -324,9 +343,9 @@ pub(crate) mod testing {
 
     use super::*;
 
-    /// Keeps a context current on another thread, so that EGL refuses to make it current on this one.
+    /// Keeps a context current on another thread, so that EGL cannot make it current on this thread.
     pub(crate) struct OccupiedContext {
-        release: Option<SyncSender<()>>,
+        release_sender: Option<SyncSender<()>>,
         thread: Option<JoinHandle<()>>,
     }
 
@@ -336,22 +355,23 @@ pub(crate) mod testing {
             let instance = &api().expect("EGL").instance;
             if self.is_current() {
                 CURRENT_CONTEXT.with(|current| current.replace(Weak::new()));
-                instance.make_current(self.handle.display, None, None, None).expect("released");
+                instance.make_current(self.handle.display, None, None, None).expect("a released context");
             }
-            let ((release, released), (occupied, is_occupied)) = (sync_channel::<()>(1), sync_channel(1));
+            let ((release_sender, release_receiver), (occupied_sender, occupied_receiver)) =
+                (sync_channel::<()>(1), sync_channel(1));
             let thread = std::thread::spawn(move || {
                 // SAFETY: the handles of a context and its display, which outlive the thread: it is joined on drop.
                 let (display, context) = unsafe {
                     (egl::Display::from_ptr(handles[0] as EglHandle), egl::Context::from_ptr(handles[1] as EglHandle))
                 };
                 instance.bind_api(egl::OPENGL_API).expect("OpenGL");
-                instance.make_current(display, None, None, Some(context)).expect("current");
-                occupied.send(()).expect("awaited");
-                released.recv().ok();
-                instance.make_current(display, None, None, None).expect("released");
+                instance.make_current(display, None, None, Some(context)).expect("a current context");
+                occupied_sender.send(()).expect("a waiting receiver");
+                release_receiver.recv().ok();
+                instance.make_current(display, None, None, None).expect("a released context");
             });
-            is_occupied.recv().expect("occupied");
-            OccupiedContext { release: Some(release), thread: Some(thread) }
+            occupied_receiver.recv().expect("an occupied context");
+            OccupiedContext { release_sender: Some(release_sender), thread: Some(thread) }
         }
 
         /// Whether EGL says that the context is current on this thread.
@@ -363,8 +383,8 @@ pub(crate) mod testing {
 
     impl Drop for OccupiedContext {
         fn drop(&mut self) {
-            self.release.take();
-            self.thread.take().map(JoinHandle::join).expect("one thread").expect("no panic");
+            self.release_sender.take();
+            self.thread.take().map(JoinHandle::join).expect("a thread").expect("no panic");
         }
     }
 }

@@ -10,9 +10,9 @@ use modalcast_model::error::{Error, Result};
 /// A device that may offer OpenGL, as EGL describes it.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct EglDevice {
-    /// Index among EGL's devices; none for Mesa's surfaceless platform, which needs no device.
+    /// Index among EGL's devices; `None` for Mesa's surfaceless platform, which needs no device.
     pub index: Option<usize>,
-    /// Vendor or driver.
+    /// Name of the vendor or driver.
     pub vendor: String,
     /// Extensions of the device.
     pub extensions: Vec<String>,
@@ -20,26 +20,26 @@ pub struct EglDevice {
     pub cuda_device: Option<i32>,
     /// DRM node, such as `/dev/dri/card0`.
     pub drm_node: Option<String>,
-    /// GL_RENDERER and GL_VERSION; none when no context could be created.
+    /// GL_RENDERER; `None` if no context could be created.
     pub renderer: Option<String>,
+    /// GL_VERSION; `None` if no context could be created.
     pub version: Option<String>,
-    /// Whether it draws on the CPU. Without a context, this is what the device itself reports.
+    /// Whether it draws on the CPU; as the device reports if no context could be created.
     pub software: bool,
-    /// Why no context could be created.
+    /// Reason why no context could be created.
     pub problem: Option<String>,
 }
 
-/// All EGL devices; a context is tried on each.
+/// Describes all EGL devices, after trying to create a context on each.
 ///
 /// # Errors
 /// `Unavailable` with the package name when libEGL cannot be loaded.
 pub fn devices() -> Result<Vec<EglDevice>> {
-    Ok(candidates()?.into_iter().map(describe).collect())
+    Ok(candidates()?.into_iter().map(describe_device).collect())
 }
 
-fn describe(candidate: Candidate) -> EglDevice {
-    let tried = open_candidate(&candidate);
-    let (limits, problem) = match tried {
+fn describe_device(candidate: Candidate) -> EglDevice {
+    let (limits, problem) = match open_candidate(&candidate) {
         Ok(gl) => (Some(gl.limits.clone()), None),
         Err(error) => (None, Some(error.to_string())),
     };
@@ -56,62 +56,64 @@ fn describe(candidate: Candidate) -> EglDevice {
     }
 }
 
+/// Creates a context on a candidate.
 fn open_candidate(candidate: &Candidate) -> Result<Rc<Gl>> {
     Gl::new(Context::open(candidate, gl::is_debug_enabled())?)
 }
 
-/// Opens the preferred device, leaves its context current on this thread and returns it with the ordinal of its CUDA device.
-pub(crate) fn open(prefer: DevicePreference) -> Result<(Rc<Gl>, Option<i32>)> {
-    let mut tried = Vec::new();
-    for (candidate, software) in rank_candidates(candidates()?, prefer) {
+/// Opens the preferred device and leaves its context current on this thread. Returns the context and the ordinal of the
+/// corresponding CUDA device.
+pub(crate) fn open(preference: DevicePreference) -> Result<(Rc<Gl>, Option<i32>)> {
+    let mut attempts = Vec::new();
+    for (candidate, expected_software) in rank_candidates(candidates()?, preference) {
         let name = candidate.index.map_or("surfaceless".to_string(), |index| format!("device {index}"));
         match open_candidate(&candidate) {
-            Ok(gl) if software.is_none_or(|software| software == gl.limits.software) => {
+            Ok(gl) if expected_software.is_none_or(|expected_software| expected_software == gl.limits.software) => {
                 gl.stay_current()?;
                 return Ok((gl, candidate.cuda_device));
             }
-            Ok(gl) => tried.push(format!("{name} ({}) draws with {}", candidate.vendor, gl.limits.renderer)),
-            Err(error) => tried.push(format!("{name} ({}): {error}", candidate.vendor)),
+            Ok(gl) => attempts.push(format!("{name} ({}) draws with {}", candidate.vendor, gl.limits.renderer)),
+            Err(error) => attempts.push(format!("{name} ({}): {error}", candidate.vendor)),
         }
     }
-    Err(refusal(prefer, &tried))
+    Err(selection_error(preference, &attempts))
 }
 
-fn refusal(prefer: DevicePreference, tried: &[String]) -> Error {
-    match prefer {
+fn selection_error(preference: DevicePreference, attempts: &[String]) -> Error {
+    match preference {
         DevicePreference::Cuda(ordinal) => {
-            no_device_error(&format!("the EGL device that is CUDA device {ordinal}"), tried)
+            no_device_error(&format!("the EGL device that is CUDA device {ordinal}"), attempts)
         }
-        DevicePreference::Any => no_device_error("any device", tried),
-        DevicePreference::Software => no_device_error("Mesa's software rasterizer", tried),
+        DevicePreference::Any => no_device_error("any device", attempts),
+        DevicePreference::Software => no_device_error("Mesa's software rasterizer", attempts),
     }
 }
 
-/// The candidates to try, best first. The flag says whether the context must be a software one (`true`) or hardware
+/// The candidates to try, best first. The flag states whether the context must draw in software (`true`) or on hardware
 /// (`false`).
-fn rank_candidates(found: Vec<Candidate>, prefer: DevicePreference) -> Vec<(Candidate, Option<bool>)> {
-    let hardware = |candidate: &Candidate| match (candidate.cuda_device, &candidate.drm_node) {
+fn rank_candidates(candidates: Vec<Candidate>, preference: DevicePreference) -> Vec<(Candidate, Option<bool>)> {
+    let hardware_rank = |candidate: &Candidate| match (candidate.cuda_device, &candidate.drm_node) {
         (Some(_), _) => 0,
         (None, Some(_)) => 1,
         (None, None) => 2,
     };
-    let software = |candidate: &Candidate| if candidate.software { 0 } else { 1 };
-    let sorted = |rank: &dyn Fn(&Candidate) -> i32, wanted: Option<bool>| {
-        let mut list = found.clone();
-        list.sort_by_key(rank);
-        list.into_iter().map(|candidate| (candidate, wanted)).collect::<Vec<_>>()
+    let software_rank = |candidate: &Candidate| if candidate.software { 0 } else { 1 };
+    let sort_by_rank = |rank: &dyn Fn(&Candidate) -> i32, expected_software: Option<bool>| {
+        let mut ranked = candidates.clone();
+        ranked.sort_by_key(rank);
+        ranked.into_iter().map(|candidate| (candidate, expected_software)).collect::<Vec<_>>()
     };
-    match prefer {
+    match preference {
         DevicePreference::Cuda(ordinal) => {
-            let is_it = |candidate: &Candidate| candidate.cuda_device == Some(ordinal);
-            found.into_iter().filter(is_it).map(|candidate| (candidate, None)).collect()
+            let is_preferred = |candidate: &Candidate| candidate.cuda_device == Some(ordinal);
+            candidates.into_iter().filter(is_preferred).map(|candidate| (candidate, None)).collect()
         }
-        DevicePreference::Software => sorted(&software, Some(true)),
+        DevicePreference::Software => sort_by_rank(&software_rank, Some(true)),
         DevicePreference::Any => {
-            let mut list = sorted(&hardware, Some(false));
-            list.retain(|(candidate, _)| !candidate.software);
-            list.extend(sorted(&software, Some(true)));
-            list
+            let mut ranked = sort_by_rank(&hardware_rank, Some(false));
+            ranked.retain(|(candidate, _)| !candidate.software);
+            ranked.extend(sort_by_rank(&software_rank, Some(true)));
+            ranked
         }
     }
 }

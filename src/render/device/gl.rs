@@ -57,19 +57,19 @@ pub(crate) struct Gl {
     pub(crate) limits: Limits,
     /// glGetGraphicsResetStatus, where the context has it.
     reset_status: Option<GetResetStatus>,
-    /// The first error of a command that was not issued, until the next check.
-    skipped: RefCell<Option<String>>,
-    /// Whether the log names the objects that could not be deleted.
+    /// The first error of a command that was not issued since the last check.
+    skipped_error: RefCell<Option<String>>,
+    /// Whether a leak of objects is already logged.
     is_leak_logged: Cell<bool>,
     /// Pool of timer queries that are not in use.
     free_queries: RefCell<Vec<glow::Query>>,
     /// Buffers that will be freed once their readers are done.
-    retired: RefCell<Vec<staging::RetiredBuffer>>,
+    retired_buffers: RefCell<Vec<staging::RetiredBuffer>>,
 }
 
 /// Keeps a context current on this thread, so that commands can be issued without a switch. Dropping the guard restores
-/// the context that was current before. If a panic unwinds, the guard also discards the errors of the interrupted
-/// commands, so that the next check does not report them for other commands.
+/// the previous context. If a panic unwinds, the guard also discards the errors of the interrupted commands, so that the
+/// next check does not report them for other commands.
 #[derive(Debug)]
 #[must_use = "the previous context becomes current again when the guard is dropped"]
 pub(crate) struct CurrentGl {
@@ -101,8 +101,8 @@ impl Drop for CurrentGl {
 
 impl Drop for Gl {
     fn drop(&mut self) {
-        // The functions remove their debug callback from the current context, which must be this one. Otherwise they
-        // leak, and with them the callback, which the driver may still call.
+        // Dropping the functions removes their debug callback from the current context, so this context must be current.
+        // If it is not, functions and callback leak, because the driver may still call the callback.
         match self.context.make_current() {
             // SAFETY: dropped once, here, and not used afterwards.
             Ok(_current) => unsafe { ManuallyDrop::drop(&mut self.functions) },
@@ -117,10 +117,11 @@ impl std::fmt::Debug for Gl {
     }
 }
 
-/// A vertex attribute: location, buffer, number of 32-bit components, and whether it is an integer.
+/// A vertex attribute, tightly packed in a buffer.
 pub(crate) struct VertexAttribute<'a> {
     pub(crate) location: u32,
     pub(crate) buffer: &'a Buffer,
+    /// Number of 32-bit components.
     pub(crate) components: i32,
     pub(crate) integer: bool,
 }
@@ -128,17 +129,17 @@ pub(crate) struct VertexAttribute<'a> {
 /// A copy between two buffers; offsets are in bytes.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct BufferCopy<'a> {
-    pub(crate) from: &'a Buffer,
-    pub(crate) from_offset: u64,
-    pub(crate) to: &'a Buffer,
-    pub(crate) to_offset: u64,
+    pub(crate) source: &'a Buffer,
+    pub(crate) source_offset: u64,
+    pub(crate) target: &'a Buffer,
+    pub(crate) target_offset: u64,
     pub(crate) bytes: u64,
 }
 
 impl<'a> BufferCopy<'a> {
-    /// A copy of the first `bytes` bytes to the start of the other buffer.
-    pub(crate) const fn first(bytes: u64, from: &'a Buffer, to: &'a Buffer) -> Self {
-        Self { from, from_offset: 0, to, to_offset: 0, bytes }
+    /// Copies the first `bytes` bytes to the start of the target.
+    pub(crate) const fn first(bytes: u64, source: &'a Buffer, target: &'a Buffer) -> Self {
+        Self { source, source_offset: 0, target, target_offset: 0, bytes }
     }
 }
 
@@ -158,43 +159,43 @@ pub(crate) struct PipelineState {
     /// Depth is offset away from the camera, so that surfaces in the same plane stay visible.
     pub(crate) polygon_offset: bool,
     pub(crate) cull: bool,
-    /// Colors are blended over the existing ones; alpha becomes the transmittance: the share of the background that
-    /// remains visible.
+    /// Colors are blended over the existing colors. Alpha accumulates the transmittance: the fraction of the background
+    /// that remains visible.
     pub(crate) blend: bool,
 }
 
 impl Gl {
     pub(crate) fn new(context: Context) -> Result<Rc<Self>> {
         let current = context.make_current()?;
-        let address = |name: &std::ffi::CStr| name.to_str().map_or(std::ptr::null(), |name| context.address(name));
+        let load_address = |name: &std::ffi::CStr| name.to_str().map_or(std::ptr::null(), |name| context.address(name));
         // SAFETY: the context is current on this thread, and EGL returned the addresses for this context.
-        let mut functions = unsafe { glow::Context::from_loader_function_cstr(address) };
+        let mut functions = unsafe { glow::Context::from_loader_function_cstr(load_address) };
         let limits = Limits::of(&functions);
         if context.is_debug {
             debug::install_debug_callback(&mut functions);
         }
         let reset_status = limits::has_reset_status(&functions).then(|| context.address("glGetGraphicsResetStatus"));
         // SAFETY: the function has this signature in OpenGL 4.5 and GL_KHR_robustness, one of which the context has.
-        let reset_status = reset_status
-            .filter(|address| !address.is_null())
-            .map(|address| unsafe { std::mem::transmute::<*const std::ffi::c_void, GetResetStatus>(address) });
+        let reset_status = reset_status.filter(|load_address| !load_address.is_null()).map(|load_address| unsafe {
+            std::mem::transmute::<*const std::ffi::c_void, GetResetStatus>(load_address)
+        });
         drop(current);
         Ok(Rc::new(Self {
             reset_status,
             functions: ManuallyDrop::new(functions),
             context,
             limits,
-            skipped: RefCell::default(),
+            skipped_error: RefCell::default(),
             is_leak_logged: Cell::default(),
             free_queries: RefCell::default(),
-            retired: RefCell::default(),
+            retired_buffers: RefCell::default(),
         }))
     }
 
     /// Makes the context current on this thread while the returned guard exists.
     ///
     /// # Errors
-    /// `Fault` when EGL refuses; no command can be issued then.
+    /// `Fault` when EGL cannot make the context current. No command can be issued then.
     pub(crate) fn make_current(self: &Rc<Self>) -> Result<CurrentGl> {
         Ok(CurrentGl { gl: Rc::clone(self), _context: self.context.make_current()? })
     }
@@ -202,7 +203,7 @@ impl Gl {
     /// Makes the context current and leaves it current.
     ///
     /// # Errors
-    /// `Fault` when EGL refuses.
+    /// `Fault` when EGL cannot make the context current.
     pub(crate) fn stay_current(&self) -> Result<()> {
         self.context.make_current().map(CurrentContext::keep)
     }
@@ -221,7 +222,7 @@ impl Gl {
 
     /// Records the error of a command that is not issued; the next check returns the first one.
     fn skip(&self, reason: String) {
-        self.skipped.borrow_mut().get_or_insert(reason);
+        self.skipped_error.borrow_mut().get_or_insert(reason);
     }
 
     /// Deletes an object. If the context cannot be made current, the object leaks until the context is destroyed.
@@ -238,13 +239,13 @@ impl Gl {
         }
     }
 
-    /// Fails if a command failed since the last check.
+    /// Checks that no command has failed since the last check.
     ///
     /// # Errors
     /// `Fault` of `stage` with the first error of a command that was not issued, or with an error of OpenGL;
     /// `DeviceLost` when the context is lost.
     pub(crate) fn check(&self, stage: &'static str) -> Result<()> {
-        if let Some(reason) = self.skipped.take() {
+        if let Some(reason) = self.skipped_error.take() {
             return Err(fault_in(stage)(reason));
         }
         let gl = self.functions().map_err(fault_in(stage))?;
@@ -273,11 +274,12 @@ impl Gl {
         Some(Error::DeviceLost { stage, reason: reason.into() })
     }
 
-    /// Forgets the errors since the last check.
+    /// Discards the errors since the last check.
     fn discard_errors(&self) {
-        self.skipped.take();
+        self.skipped_error.take();
         let Ok(gl) = self.functions() else { return };
-        // OpenGL may have one error per unit of the driver. A lost context never stops reporting errors.
+        // A driver may record several errors, for example one per thread. The loop is bounded, because a lost context
+        // reports errors forever.
         for _ in 0..16 {
             // SAFETY: a query without side effects on memory; the context is current.
             if unsafe { gl.get_error() } == glow::NO_ERROR {
@@ -290,15 +292,15 @@ impl Gl {
     /// undefined without data.
     ///
     /// # Errors
-    /// `Fault` when the data has another length, the buffer is over 2 GiB, or OpenGL refuses.
+    /// `Fault` when the data has another length, the buffer exceeds 2 GiB, or OpenGL fails.
     pub(crate) fn buffer(self: &Rc<Self>, bytes: u64, usage: u32, data: Option<&[u8]>) -> Result<Buffer> {
-        let fail = fault_in("buffer");
+        let to_fault = fault_in("buffer");
         let size = i32::try_from(bytes.max(4))
-            .map_err(|_| fail(format!("{bytes} bytes is over the 2 GiB that one buffer may have")))?;
+            .map_err(|_| to_fault(format!("expected at most 2 GiB in a buffer, got {bytes} bytes")))?;
         if let Some(data) = data
             && data.len() as u64 != bytes
         {
-            return Err(fail(format!("expected {bytes} bytes of data, got {}", data.len())));
+            return Err(to_fault(format!("expected {bytes} bytes of data, got {}", data.len())));
         }
         let gl = self.functions()?;
         // SAFETY: a new name, which the buffer owns.
@@ -318,6 +320,7 @@ impl Gl {
         self.check("buffer").map(|()| buffer)
     }
 
+    /// Creates a texture with undefined content.
     pub(crate) fn texture(self: &Rc<Self>, desc: TextureDesc) -> Result<Texture> {
         let gl = self.functions()?;
         let [width, height, depth, levels] = [desc.width, desc.height, desc.depth, desc.levels].map(|side| side as i32);
@@ -338,7 +341,7 @@ impl Gl {
         self.check("texture").map(|()| texture)
     }
 
-    /// Creates a buffer texture over a whole buffer, which it keeps alive.
+    /// Creates a buffer texture over a complete buffer. It keeps the buffer alive.
     pub(crate) fn buffer_texture(self: &Rc<Self>, buffer: &Buffer, format: u32) -> Result<Texture> {
         let gl = self.functions()?;
         let target = glow::TEXTURE_BUFFER;
@@ -354,10 +357,10 @@ impl Gl {
         self.check("texture").map(|()| texture)
     }
 
-    /// Compiles and links a program from pairs of stage and source.
+    /// Compiles and links a program from pairs of shader stage and source.
     pub(crate) fn program(self: &Rc<Self>, label: &str, stages: &[(u32, &str)]) -> Result<Program> {
         let gl = self.functions()?;
-        let fail = |log: String| fault_in("shader")(format!("{label}: {log}"));
+        let to_fault = |log: String| fault_in("shader")(format!("{label}: {log}"));
         // SAFETY: new objects; the shaders are flagged for deletion and live until the program is deleted.
         unsafe {
             let name = gl.create_program().map_err(fault_in("shader"))?;
@@ -369,26 +372,26 @@ impl Gl {
                 gl.attach_shader(name, shader);
                 gl.delete_shader(shader);
                 if !gl.get_shader_compile_status(shader) {
-                    return Err(fail(gl.get_shader_info_log(shader)));
+                    return Err(to_fault(gl.get_shader_info_log(shader)));
                 }
             }
             gl.link_program(name);
-            if gl.get_program_link_status(name) { Ok(program) } else { Err(fail(gl.get_program_info_log(name))) }
+            if gl.get_program_link_status(name) { Ok(program) } else { Err(to_fault(gl.get_program_info_log(name))) }
         }
     }
 
-    /// Creates a framebuffer over whole images.
+    /// Creates a framebuffer of complete images.
     pub(crate) fn framebuffer(self: &Rc<Self>, color: Option<&Texture>, depth: &Texture) -> Result<Framebuffer> {
         let depth = Attachment { image: depth, layer: None };
         self.attach_framebuffer(color.map(|image| Attachment { image, layer: None }), Some(depth))
     }
 
-    /// Creates a framebuffer with a color attachment and no depth.
+    /// Creates a framebuffer with a color attachment and no depth attachment.
     pub(crate) fn color_framebuffer(self: &Rc<Self>, color: &Texture) -> Result<Framebuffer> {
         self.attach_framebuffer(Some(Attachment { image: color, layer: None }), None)
     }
 
-    /// Creates a framebuffer of one layer of an array texture: of its depth, or of its only color attachment.
+    /// Creates a framebuffer whose only attachment, depth or color, is one layer of an array texture.
     pub(crate) fn layer_framebuffer(
         self: &Rc<Self>,
         image: &Texture,
@@ -411,17 +414,19 @@ impl Gl {
         let gl = self.functions()?;
         // SAFETY: a new name, which the framebuffer owns.
         let name = unsafe { gl.create_framebuffer() }.map_err(fault_in("framebuffer"))?;
-        let attached = [color, depth].into_iter().flatten().map(|attachment| attachment.image);
-        let framebuffer = Framebuffer::new(self, name, attached);
+        let images = [color, depth].into_iter().flatten().map(|attachment| attachment.image);
+        let framebuffer = Framebuffer::new(self, name, images);
         let target = glow::FRAMEBUFFER;
         // SAFETY: attaches textures of this context, which the framebuffer keeps alive.
         let status = unsafe {
             gl.bind_framebuffer(target, Some(name));
-            for (point, attachment) in [(glow::COLOR_ATTACHMENT0, color), (glow::DEPTH_ATTACHMENT, depth)] {
+            for (attachment_point, attachment) in [(glow::COLOR_ATTACHMENT0, color), (glow::DEPTH_ATTACHMENT, depth)] {
                 let Some(Attachment { image, layer }) = attachment else { continue };
                 match layer {
-                    Some(layer) => gl.framebuffer_texture_layer(target, point, Some(image.name()), 0, layer as i32),
-                    None => gl.framebuffer_texture(target, point, Some(image.name()), 0),
+                    Some(layer) => {
+                        gl.framebuffer_texture_layer(target, attachment_point, Some(image.name()), 0, layer as i32)
+                    }
+                    None => gl.framebuffer_texture(target, attachment_point, Some(image.name()), 0),
                 }
             }
             gl.draw_buffers(&[if color.is_some() { glow::COLOR_ATTACHMENT0 } else { glow::NONE }]);
@@ -429,24 +434,27 @@ impl Gl {
         };
         match status {
             glow::FRAMEBUFFER_COMPLETE => self.check("framebuffer").map(|()| framebuffer),
-            status => Err(fault_in("framebuffer")(format!("incomplete, 0x{status:04X}"))),
+            status => {
+                Err(fault_in("framebuffer")(format!("expected a complete framebuffer, got status 0x{status:04X}")))
+            }
         }
     }
 
-    /// Creates a vertex array over an index buffer and attributes, which it keeps alive.
+    /// Creates a vertex array of an index buffer and attributes. It keeps their buffers alive.
     pub(crate) fn vertex_array(
         self: &Rc<Self>,
-        index: Option<&Buffer>,
-        from: &[VertexAttribute<'_>],
+        index_buffer: Option<&Buffer>,
+        attributes: &[VertexAttribute<'_>],
     ) -> Result<VertexArray> {
         let gl = self.functions()?;
         // SAFETY: a new name, which the vertex array owns.
         let name = unsafe { gl.create_vertex_array() }.map_err(fault_in("vertex array"))?;
-        let array = VertexArray::new(self, name, from.iter().map(|attribute| attribute.buffer).chain(index));
+        let array =
+            VertexArray::new(self, name, attributes.iter().map(|attribute| attribute.buffer).chain(index_buffer));
         // SAFETY: tightly packed attributes of 32-bit components in buffers of this context.
         unsafe {
             gl.bind_vertex_array(Some(name));
-            for attribute in from {
+            for attribute in attributes {
                 gl.bind_buffer(glow::ARRAY_BUFFER, Some(attribute.buffer.name()));
                 gl.enable_vertex_attrib_array(attribute.location);
                 if attribute.integer {
@@ -455,14 +463,14 @@ impl Gl {
                     gl.vertex_attrib_pointer_f32(attribute.location, attribute.components, glow::FLOAT, false, 0, 0);
                 }
             }
-            gl.bind_buffer(glow::ELEMENT_ARRAY_BUFFER, index.map(Buffer::name));
+            gl.bind_buffer(glow::ELEMENT_ARRAY_BUFFER, index_buffer.map(Buffer::name));
             gl.bind_vertex_array(None);
         }
         self.check("vertex array").map(|()| array)
     }
 
     /// Sample positions within the pixels of a framebuffer, 0 to 1 from the lower left.
-    pub(crate) fn sample_positions(&self, of: &Framebuffer, samples: u32) -> Result<Vec<[f32; 2]>> {
+    pub(crate) fn sample_positions(&self, framebuffer: &Framebuffer, samples: u32) -> Result<Vec<[f32; 2]>> {
         type GetMultisample = unsafe extern "system" fn(u32, u32, *mut f32);
         let gl = self.functions()?;
         let address = self.context.address("glGetMultisamplefv");
@@ -471,38 +479,39 @@ impl Gl {
         }
         // SAFETY: the address is that of glGetMultisamplefv, which has this signature and writes two floats.
         unsafe {
-            let ask = std::mem::transmute::<*const std::ffi::c_void, GetMultisample>(address);
-            gl.bind_framebuffer(glow::FRAMEBUFFER, Some(of.name));
-            let mut places = vec![[0.5; 2]; samples as usize];
-            for (index, place) in (0..).zip(&mut places) {
-                ask(glow::SAMPLE_POSITION, index, place.as_mut_ptr());
+            let get_multisample = std::mem::transmute::<*const std::ffi::c_void, GetMultisample>(address);
+            gl.bind_framebuffer(glow::FRAMEBUFFER, Some(framebuffer.name));
+            let mut positions = vec![[0.5; 2]; samples as usize];
+            for (index, position) in (0..).zip(&mut positions) {
+                get_multisample(glow::SAMPLE_POSITION, index, position.as_mut_ptr());
             }
-            self.check("samples").map(|()| places)
+            self.check("samples").map(|()| positions)
         }
     }
 
-    pub(crate) fn set_pipeline_state(&self, fixed: PipelineState) {
+    /// Sets the fixed-function state of the next draws.
+    pub(crate) fn set_pipeline_state(&self, state: PipelineState) {
         let Some(gl) = self.functions_or_skip() else { return };
-        let flip = |flag: u32, on: bool| {
+        let set_flag = |flag: u32, is_enabled: bool| {
             // SAFETY: flags that every 4.3 core context accepts.
-            unsafe { if on { gl.enable(flag) } else { gl.disable(flag) } }
+            unsafe { if is_enabled { gl.enable(flag) } else { gl.disable(flag) } }
         };
-        flip(glow::DEPTH_TEST, true);
-        flip(glow::DEPTH_CLAMP, fixed.depth_clamp);
-        flip(glow::POLYGON_OFFSET_FILL, fixed.polygon_offset);
-        flip(glow::CULL_FACE, fixed.cull);
-        flip(glow::BLEND, fixed.blend);
+        set_flag(glow::DEPTH_TEST, true);
+        set_flag(glow::DEPTH_CLAMP, state.depth_clamp);
+        set_flag(glow::POLYGON_OFFSET_FILL, state.polygon_offset);
+        set_flag(glow::CULL_FACE, state.cull);
+        set_flag(glow::BLEND, state.blend);
         // SAFETY: sets state; no memory is accessed.
         unsafe {
             gl.depth_func(glow::LEQUAL);
             gl.polygon_offset(1.0, 8.0);
-            gl.depth_mask(fixed.depth_write);
-            let left = glow::ONE_MINUS_SRC_ALPHA;
-            gl.blend_func_separate(glow::SRC_ALPHA, left, glow::ZERO, left);
+            gl.depth_mask(state.depth_write);
+            let one_minus_alpha = glow::ONE_MINUS_SRC_ALPHA;
+            gl.blend_func_separate(glow::SRC_ALPHA, one_minus_alpha, glow::ZERO, one_minus_alpha);
         }
     }
 
-    /// Draws `triangles` triangles of an array's index buffer from triangle `first` on.
+    /// Draws `triangles` triangles of the index buffer of `array`, from triangle `first` on.
     pub(crate) fn draw_indexed(&self, array: &VertexArray, first: usize, triangles: usize) {
         let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: the indices come from validated meshes and stay below the number of elements of each attribute.
@@ -513,7 +522,7 @@ impl Gl {
         }
     }
 
-    /// Draws vertices that the vertex shader derives from their index.
+    /// Draws vertices that the vertex shader computes from their index.
     pub(crate) fn draw_procedural(&self, array: &VertexArray, vertices: u32) {
         let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: no attribute is read.
@@ -532,7 +541,7 @@ impl Gl {
         unsafe { gl.dispatch_compute(groups_x, groups_y, 1) }
     }
 
-    /// Like [`Self::dispatch`]; the first three words of a buffer give the number of workgroups.
+    /// Like [`Self::dispatch`]. The first three words of `groups` are the numbers of workgroups in x, y and z.
     pub(crate) fn dispatch_indirect(&self, groups: &Buffer) {
         let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: the buffer holds more than three words; the shaders check their own bounds.
@@ -544,18 +553,24 @@ impl Gl {
 
     /// Copies bytes between two buffers.
     pub(crate) fn copy(&self, copy: BufferCopy<'_>) {
-        let BufferCopy { from, from_offset, to, to_offset, bytes } = copy;
-        let ends = [from_offset.checked_add(bytes), to_offset.checked_add(bytes)];
-        if ends.into_iter().zip([from, to]).any(|(end, buffer)| end.is_none_or(|end| end > buffer.bytes)) {
-            return self.skip(format!("a copy beyond the end of a buffer: {copy:?}"));
+        let BufferCopy { source, source_offset, target, target_offset, bytes } = copy;
+        let range_ends = [source_offset.checked_add(bytes), target_offset.checked_add(bytes)];
+        if range_ends.into_iter().zip([source, target]).any(|(end, buffer)| end.is_none_or(|end| end > buffer.bytes)) {
+            return self.skip(format!("expected a copy inside of both buffers, got {copy:?}"));
         }
         let Some(gl) = self.functions_or_skip() else { return };
-        let (read, write) = (glow::COPY_READ_BUFFER, glow::COPY_WRITE_BUFFER);
+        let (read_binding, write_binding) = (glow::COPY_READ_BUFFER, glow::COPY_WRITE_BUFFER);
         // SAFETY: the ranges are inside the buffers, whose sizes fit into an i32.
         unsafe {
-            gl.bind_buffer(read, Some(from.name()));
-            gl.bind_buffer(write, Some(to.name()));
-            gl.copy_buffer_sub_data(read, write, from_offset as i32, to_offset as i32, bytes as i32);
+            gl.bind_buffer(read_binding, Some(source.name()));
+            gl.bind_buffer(write_binding, Some(target.name()));
+            gl.copy_buffer_sub_data(
+                read_binding,
+                write_binding,
+                source_offset as i32,
+                target_offset as i32,
+                bytes as i32,
+            );
         }
     }
 }
@@ -568,9 +583,9 @@ impl Gl {
     }
 }
 
-/// Error for a size above a device limit, which the caller can act on.
-pub(crate) fn too_large(what: &str, limit: u64, given: u64) -> Error {
-    modalcast_model::error::invalid(what, format!("at most {limit} on this device"), given)
+/// `Invalid`: a size exceeds a limit of the device.
+pub(crate) fn too_large(field: &str, limit: u64, got: u64) -> Error {
+    modalcast_model::error::invalid(field, format!("at most {limit} on this device"), got)
 }
 
 #[cfg(test)]

@@ -1,4 +1,5 @@
-//! Ring of staging buffers for the readback of frames of one form; it grows on demand to [`MAX_FRAMES_IN_FLIGHT`] buffers.
+//! Ring of staging buffers for the readback of frames in one format. It grows on demand to [`MAX_FRAMES_IN_FLIGHT`]
+//! buffers.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
@@ -8,14 +9,16 @@ use std::time::Duration;
 use super::gl::{Gl, StagingBuffer};
 use modalcast_model::error::{Error, Result};
 
-/// Maximum number of frames of one form in flight.
+/// Maximum number of frames of one format in flight.
 pub const MAX_FRAMES_IN_FLIGHT: usize = 3;
 
-/// The staging buffers of one form.
+/// The staging buffers of one format.
 #[derive(Debug)]
 pub(crate) struct ReadbackRing {
     gl: Rc<Gl>,
+    /// Size of each buffer.
     bytes: u64,
+    /// Number of allocated buffers.
     allocated: Cell<usize>,
     /// Buffers without a frame in flight, in the order in which they were returned. Readers may still copy from some.
     free: RefCell<VecDeque<StagingBuffer>>,
@@ -33,15 +36,15 @@ impl ReadbackRing {
         Rc::new(Self { gl: Rc::clone(gl), bytes, allocated: Cell::new(0), free: RefCell::default() })
     }
 
-    /// Takes a staging buffer for a frame; creates one when all existing ones are in use. When the ring is full, this
-    /// waits at most `limit` for the oldest buffer that is only being copied from.
+    /// Takes a free staging buffer for a frame, or allocates one. If the ring is full, this waits at most `limit` for the
+    /// reader of the oldest buffer without a frame in flight.
     ///
     /// # Errors
     /// `Busy` when all buffers have frames in flight or the reader exceeds `limit`; `Fault` of OpenGL.
     pub(crate) fn acquire(self: &Rc<Self>, limit: Duration) -> Result<ReadbackSlot> {
         let slot = |staging: StagingBuffer| ReadbackSlot { readback_ring: Rc::clone(self), staging: Some(staging) };
-        let free = self.free.borrow().iter().position(|staging| staging.is_read(Duration::ZERO));
-        if let Some(staging) = free.and_then(|at| self.free.borrow_mut().remove(at)) {
+        let free_index = self.free.borrow().iter().position(|staging| staging.is_read(Duration::ZERO));
+        if let Some(staging) = free_index.and_then(|index| self.free.borrow_mut().remove(index)) {
             return Ok(slot(staging));
         }
         if self.allocated.get() < MAX_FRAMES_IN_FLIGHT {
@@ -49,9 +52,9 @@ impl ReadbackRing {
             self.allocated.set(self.allocated.get() + 1);
             return Ok(slot(staging));
         }
-        let is_read = self.free.borrow().front().is_some_and(|staging| staging.is_read(limit));
-        let read = if is_read { self.free.borrow_mut().pop_front() } else { None };
-        read.map(slot).ok_or(Error::Busy { queue: "frames in flight", limit: MAX_FRAMES_IN_FLIGHT })
+        let is_front_read = self.free.borrow().front().is_some_and(|staging| staging.is_read(limit));
+        let oldest = if is_front_read { self.free.borrow_mut().pop_front() } else { None };
+        oldest.map(slot).ok_or(Error::Busy { queue: "frames in flight", limit: MAX_FRAMES_IN_FLIGHT })
     }
 
     /// Number of buffers in the ring.
@@ -70,7 +73,8 @@ impl ReadbackSlot {
 
 impl Drop for ReadbackSlot {
     fn drop(&mut self) {
-        // An abandoned frame may still write it; so will the next frame, which is later in the command stream.
+        // The commands of an abandoned frame may still write the buffer. The next frame writes it later in the same
+        // command stream, so this is safe.
         self.readback_ring.free.borrow_mut().extend(self.staging.take());
     }
 }

@@ -6,7 +6,7 @@ pub(crate) mod oit;
 
 use crate::scene_data::textures::MAX_ARRAYS;
 
-/// Texture units, the same as in the shaders. Color and normal arrays take one unit per array.
+/// Texture units, as the shaders declare them. Color and normal textures take one unit per texture array.
 pub(crate) const SHADOW_UNIT: u32 = 0;
 pub(crate) const COLOR_UNIT: u32 = 1;
 pub(crate) const NORMAL_UNIT: u32 = COLOR_UNIT + MAX_ARRAYS as u32;
@@ -25,7 +25,7 @@ pub(crate) const VALUE_UNIT: u32 = 24;
 pub(crate) const TRIANGLE_ID_UNIT: u32 = 25;
 /// Depth of the samples whose ids are at [`ID_UNIT`].
 pub(crate) const DEPTH_UNIT: u32 = 26;
-/// Unit of the only image that a blur, bloom or encode program reads.
+/// Texture unit of the image that a blur, bloom or encode program reads.
 pub(crate) const SOURCE_UNIT: u32 = 0;
 /// Maximum number of textures that the shading reads in addition to the scene's images.
 pub(crate) const FIXED_TEXTURE_READS: usize = 13;
@@ -40,13 +40,13 @@ pub(crate) const CULL_BLOCK: u32 = 3;
 pub(crate) const WORDS_BINDING: u32 = 0;
 pub(crate) const TILES_BINDING: u32 = 1;
 
-/// Lanes of a compute workgroup, along x.
+/// Invocations of a compute workgroup, along x.
 pub(crate) const WORKGROUP_SIZE: u32 = 64;
 /// Side of the square of pixels that a workgroup shades.
 pub(crate) const TILE: u32 = 8;
-/// Workgroups in a row of the dispatch over listed tiles.
+/// Number of workgroups in a row of the dispatch over listed tiles.
 pub(crate) const TILE_ROW: u32 = 64;
-/// Initial indirect dispatch over listed tiles: group counts (TILE_ROW, 0 rows, 1), then the tile count 0.
+/// Header of an empty tile list: the workgroup counts of the indirect dispatch (TILE_ROW, 0 rows, 1), and the tile count.
 pub(crate) const EMPTY_TILE_LIST: [u32; 4] = [TILE_ROW, 0, 1, 0];
 
 /// Bytes of the tile list of an image: [`EMPTY_TILE_LIST`], then one word per tile.
@@ -54,7 +54,7 @@ pub(crate) fn tile_list_bytes([width, height]: [u32; 2]) -> u64 {
     size_of_val(&EMPTY_TILE_LIST) as u64 + 4 * u64::from(width.div_ceil(TILE)) * u64::from(height.div_ceil(TILE))
 }
 
-/// Width and height in one word, as the shaders expect them.
+/// Packs width and height into one word, as the shaders expect them.
 pub(crate) const fn pack_size([width, height]: [u32; 2]) -> u32 {
     width | height << 16
 }

@@ -118,8 +118,7 @@ impl AovReader {
         }
         let mut recorder = PassRecorder { gl: &gl, stats: &mut FrameStats::default() };
         let readback = Readback { field, mask: mask.as_deref(), program: &program, bytes };
-        let drawn =
-            gl.time_pass((Pass::Aov.name(), limit), || readback.record(&mut recorder, buffers, shot, target))?;
+        let drawn = gl.time_pass(Pass::Aov.name(), limit, || readback.record(&mut recorder, buffers, shot, target))?;
         gl.wait(Pass::Aov.name(), limit)?;
         let begin = Instant::now();
         let bytes = target.staging.read(bytes as usize)?;

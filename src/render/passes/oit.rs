@@ -37,10 +37,10 @@ fn reset(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
         if let Some((_, listed)) = buffers.visible_draws(BlendMode::Blend) {
             let to = COMMANDS_OFFSET + size_of::<[u32; 5]>() * index;
             gl.copy(BufferCopy {
-                from: listed,
-                from_offset: command_offset(place) as u64,
-                to: &target.counters,
-                to_offset: to as u64,
+                source: listed,
+                source_offset: command_offset(place) as u64,
+                target: &target.counters,
+                target_offset: to as u64,
                 bytes: size_of::<u32>() as u64,
             });
         }

@@ -74,7 +74,7 @@ pub(crate) fn copy_frame(recorder: &PassRecorder<'_>, frame: &FrameContext<'_>, 
     for (from, to) in counters.into_iter().zip(target.desc.readback_ranges()) {
         if let Some(from) = from.filter(|_| !to.is_empty()) {
             let copy = BufferCopy::first(to.end - to.start, from, staging);
-            recorder.gl.copy(BufferCopy { to_offset: to.start, ..copy });
+            recorder.gl.copy(BufferCopy { target_offset: to.start, ..copy });
         }
     }
     recorder.check(Pass::Read)

@@ -27,7 +27,7 @@ pub(crate) enum BufferName {
     PreviouslyVisible,
 }
 
-/// Vertices, corners and triangles.
+/// Buffers of vertices, corners and triangles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct GeometryBuffers<T> {
     /// 3 f32 per vertex, deformed.
@@ -46,7 +46,7 @@ pub(crate) struct GeometryBuffers<T> {
     pub(crate) corner_vertices: Option<T>,
 }
 
-/// Material table.
+/// Buffers of materials.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct MaterialBuffers<T> {
     pub(crate) materials: T,
@@ -69,13 +69,13 @@ pub(crate) struct CullBuffers<T> {
     /// Indirect draws of the groups, then the number of visible triangles per super block.
     pub(crate) draws: T,
     pub(crate) counters: T,
-    /// One bit per triangle that passed the tests.
+    /// One bit per triangle: whether it passed the culling tests.
     pub(crate) visible_bits: T,
     /// Ids of the visible triangles.
     pub(crate) triangle_ids: T,
     /// Three indices per visible triangle.
     pub(crate) indices: T,
-    /// One bit per triangle that the last frame saw; only with occlusion culling.
+    /// One bit per triangle that was visible in the last frame; only with occlusion culling.
     pub(crate) previously_visible: Option<T>,
 }
 
@@ -141,7 +141,7 @@ impl<T> SceneBufferSet<T> {
     /// The buffers with their names, in the order of plans.
     pub(crate) fn named(&self) -> impl Iterator<Item = (BufferName, &T)> {
         let Self { geometry, materials, uniforms, culling } = self;
-        let all = [
+        let buffers = [
             (BufferName::Positions, Some(&geometry.positions)),
             (BufferName::Normals, Some(&geometry.normals)),
             (BufferName::Triangles, Some(&geometry.triangles)),
@@ -154,8 +154,8 @@ impl<T> SceneBufferSet<T> {
             (BufferName::TriangleMaterials, materials.triangle_materials.as_ref()),
             (BufferName::ShadowCascades, uniforms.cascades.as_ref()),
         ];
-        let all = all.into_iter().filter_map(|(name, buffer)| Some((name, buffer?)));
-        all.chain(culling.iter().flat_map(CullBuffers::named))
+        let buffers = buffers.into_iter().filter_map(|(name, buffer)| Some((name, buffer?)));
+        buffers.chain(culling.iter().flat_map(CullBuffers::named))
     }
 
     /// Converts each buffer, for example its size to an allocated buffer.
@@ -163,45 +163,53 @@ impl<T> SceneBufferSet<T> {
     /// # Errors
     /// The first error of `convert`.
     pub(crate) fn try_map<U>(&self, mut convert: impl FnMut(BufferName, &T) -> Result<U>) -> Result<SceneBufferSet<U>> {
-        let mut one = |name, buffer: &T| convert(name, buffer);
+        let mut convert_buffer = |name, buffer: &T| convert(name, buffer);
         let Self { geometry, materials, uniforms, culling } = self;
         let geometry = GeometryBuffers {
-            positions: one(BufferName::Positions, &geometry.positions)?,
-            normals: one(BufferName::Normals, &geometry.normals)?,
-            tangents: geometry.tangents.as_ref().map(|own| one(BufferName::Tangents, own)).transpose()?,
-            uvs: geometry.uvs.as_ref().map(|own| one(BufferName::Uvs, own)).transpose()?,
-            triangles: one(BufferName::Triangles, &geometry.triangles)?,
-            triangle_vertices: one(BufferName::TriangleVertices, &geometry.triangle_vertices)?,
+            positions: convert_buffer(BufferName::Positions, &geometry.positions)?,
+            normals: convert_buffer(BufferName::Normals, &geometry.normals)?,
+            tangents: geometry
+                .tangents
+                .as_ref()
+                .map(|buffer| convert_buffer(BufferName::Tangents, buffer))
+                .transpose()?,
+            uvs: geometry.uvs.as_ref().map(|buffer| convert_buffer(BufferName::Uvs, buffer)).transpose()?,
+            triangles: convert_buffer(BufferName::Triangles, &geometry.triangles)?,
+            triangle_vertices: convert_buffer(BufferName::TriangleVertices, &geometry.triangle_vertices)?,
             corner_vertices: geometry
                 .corner_vertices
                 .as_ref()
-                .map(|own| one(BufferName::CornerVertices, own))
+                .map(|buffer| convert_buffer(BufferName::CornerVertices, buffer))
                 .transpose()?,
         };
         let materials = MaterialBuffers {
-            materials: one(BufferName::Materials, &materials.materials)?,
+            materials: convert_buffer(BufferName::Materials, &materials.materials)?,
             triangle_materials: materials
                 .triangle_materials
                 .as_ref()
-                .map(|own| one(BufferName::TriangleMaterials, own))
+                .map(|buffer| convert_buffer(BufferName::TriangleMaterials, buffer))
                 .transpose()?,
         };
         let uniforms = UniformBuffers {
-            frame: one(BufferName::FrameUniforms, &uniforms.frame)?,
-            cascades: uniforms.cascades.as_ref().map(|own| one(BufferName::ShadowCascades, own)).transpose()?,
+            frame: convert_buffer(BufferName::FrameUniforms, &uniforms.frame)?,
+            cascades: uniforms
+                .cascades
+                .as_ref()
+                .map(|buffer| convert_buffer(BufferName::ShadowCascades, buffer))
+                .transpose()?,
         };
         let culling = match culling {
             Some(culling) => Some(CullBuffers {
-                uniforms: one(BufferName::CullUniforms, &culling.uniforms)?,
-                draws: one(BufferName::CullDraws, &culling.draws)?,
-                counters: one(BufferName::CullCounters, &culling.counters)?,
-                visible_bits: one(BufferName::CullVisibleBits, &culling.visible_bits)?,
-                triangle_ids: one(BufferName::VisibleTriangleIds, &culling.triangle_ids)?,
-                indices: one(BufferName::VisibleIndices, &culling.indices)?,
+                uniforms: convert_buffer(BufferName::CullUniforms, &culling.uniforms)?,
+                draws: convert_buffer(BufferName::CullDraws, &culling.draws)?,
+                counters: convert_buffer(BufferName::CullCounters, &culling.counters)?,
+                visible_bits: convert_buffer(BufferName::CullVisibleBits, &culling.visible_bits)?,
+                triangle_ids: convert_buffer(BufferName::VisibleTriangleIds, &culling.triangle_ids)?,
+                indices: convert_buffer(BufferName::VisibleIndices, &culling.indices)?,
                 previously_visible: culling
                     .previously_visible
                     .as_ref()
-                    .map(|own| one(BufferName::PreviouslyVisible, own))
+                    .map(|buffer| convert_buffer(BufferName::PreviouslyVisible, buffer))
                     .transpose()?,
             }),
             None => None,
@@ -243,7 +251,7 @@ mod tests {
             Ok(*number)
         });
         assert_eq!(numbers.expect("no errors"), sizes);
-        assert!(sizes.named().zip(0..).all(|((name, number), at)| name as usize == at && *number == at));
+        assert!(sizes.named().zip(0..).all(|((name, number), index)| name as usize == index && *number == index));
         assert_eq!(sizes.named().count(), 18);
     }
 }

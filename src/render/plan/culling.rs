@@ -7,42 +7,44 @@ use crate::pass::Pass;
 use crate::scene_data::geometry::groups;
 use modalcast_model::scene::{Culling, Scene};
 
-/// Number of triangles from which a scene is culled on hardware by default; lies between the measurements given at
-/// `select_culling`.
+/// Minimum number of triangles of a scene that is culled on hardware by default. It lies between the measurements given
+/// at `select_culling`.
 const MIN_TRIANGLES: usize = 1 << 20;
 
-/// Culling method of a scene on a device: the look's choice, or the one that suits both. None if the lists exceed the
-/// largest buffer of the device.
+/// Selects the culling method of a scene on a device: the method of the look, or for `Auto` the faster one. `None` if
+/// the lists exceed the largest buffer of the device.
 ///
-/// On hardware (H200, 1080p), a field of 3 M triangles takes 6.32 ms per frame without culling, 5.78 ms with the test
-/// for samples, and more with occlusion culling. A field of 262,144 triangles takes 2.04 ms without culling, 2.08 ms
-/// and 2.76 ms with the two methods; the almond tree (37,560 triangles, double-sided leaves, four samples) takes 1.57
-/// ms without, 1.59 ms and 2.09 ms with them. Culling does not pay for the two smaller scenes.
+/// Milliseconds per frame on hardware (H200, 1080p). The almond tree has double-sided leaves and four samples per pixel.
 ///
-/// In software it does not pay either: on two cores, the visibility pass of the almond tree (37,560 triangles, 1080p,
-/// four samples) takes 83 ms instead of 80 ms when the 3 % of triangles without a sample are culled, and four times as
-/// long with occlusion culling.
+/// | scene | triangles | `None` | `Triangles` | `Occlusion` |
+/// |---|---:|---:|---:|---:|
+/// | field | 3 M | 6.32 | 5.78 | more than 5.78 |
+/// | field | 262,144 | 2.04 | 2.08 | 2.76 |
+/// | almond tree | 37,560 | 1.57 | 1.59 | 2.09 |
+///
+/// In software, culling is slower: on two cores, the visibility pass of the almond tree (1080p, four samples) takes 80 ms
+/// with `None`, 83 ms with `Triangles`, which culls 3 % of the triangles, and four times as long with `Occlusion`.
 pub(crate) fn select_culling(scene: &Scene, limits: &Limits) -> Culling {
     let software = limits.software;
-    let wanted = match scene.look.culling {
+    let selected = match scene.look.culling {
         Culling::Auto if software || scene.layout.triangles < MIN_TRIANGLES => Culling::None,
         Culling::Auto => Culling::Triangles,
         Culling::Occlusion if software && interpolates_at_centroid(scene) => Culling::Triangles,
-        named => named,
+        explicit => explicit,
     };
-    let sizes = cull_buffer_sizes(scene, wanted);
+    let sizes = cull_buffer_sizes(scene, selected);
     let fits = sizes.iter().flat_map(CullBuffers::named).all(|(_, bytes)| *bytes <= limits.max_storage_bytes);
-    if fits { wanted } else { Culling::None }
+    if fits { selected } else { Culling::None }
 }
 
 /// Whether cut-outs sample a texture at the centroid of their covered samples. Mesa's rasterizer takes the centroid of
-/// the samples that also pass the depth test. Hidden triangles drawn earlier thus move the centroid, and about one
-/// pixel in a million differs when they are culled.
+/// the samples that also pass the depth test. Culling hidden triangles therefore moves the centroid of about one pixel
+/// in a million.
 fn interpolates_at_centroid(scene: &Scene) -> bool {
     scene.look.samples_per_pixel() > 1 && scene.features.mask && scene.features.textures
 }
 
-/// The passes of the camera's lists, in execution order.
+/// The culling passes for the camera, in execution order.
 pub(crate) fn cull_passes(culling: Culling) -> &'static [Pass] {
     match culling {
         Culling::Occlusion => &[Pass::Occluders, Pass::Cull],
@@ -51,7 +53,7 @@ pub(crate) fn cull_passes(culling: Culling) -> &'static [Pass] {
     }
 }
 
-/// Sizes of the buffers of a culled scene; none without culling.
+/// Sizes of the culling buffers of a scene; `None` without culling.
 pub(crate) fn cull_buffer_sizes(scene: &Scene, culling: Culling) -> Option<CullBuffers<u64>> {
     if culling == Culling::None {
         return None;

@@ -3,7 +3,7 @@
 use crate::types::BlurMethod;
 use modalcast_model::scene::{Culling, ShadowMethod, ShadowSettings};
 
-/// What the shaders of a scene must do; everything else is compiled out.
+/// Features that the shaders of a scene need. Code of other features is not compiled.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ShaderFeatures {
     /// Some triangle has a color texture.
@@ -43,7 +43,7 @@ impl ShaderFeatures {
 
     /// The defines of the shader sources.
     pub(crate) fn defines(&self) -> Vec<&'static str> {
-        let branches = [
+        let feature_defines = [
             ("TEXTURES", self.textures),
             ("NORMAL_MAPS", self.normal_maps),
             ("UVS", self.textures || self.normal_maps),
@@ -53,32 +53,32 @@ impl ShaderFeatures {
             ("OIT", self.oit),
             ("OPAQUE_PARTS", self.opaque_parts),
         ];
-        let branches = branches.into_iter().filter_map(|(name, on)| on.then_some(name));
+        let feature_defines = feature_defines.into_iter().filter_map(|(name, is_enabled)| is_enabled.then_some(name));
         let shadow = self.shadow.iter().flat_map(shadow_defines);
         let culling: &[&str] = match self.culling {
             Culling::Occlusion => &["CULLED", "OCCLUSION_CULLING"],
             Culling::Triangles => &["CULLED"],
             Culling::None | Culling::Auto => &[],
         };
-        branches.chain(shadow).chain(culling.iter().copied()).collect()
+        feature_defines.chain(shadow).chain(culling.iter().copied()).collect()
     }
 
-    /// Shadow settings when the map is a variance map.
+    /// Shadow settings, if the shadow map is a variance shadow map.
     pub(crate) fn variance_shadow(&self) -> Option<&ShadowSettings> {
         self.shadow.as_ref().filter(|shadow| shadow.method == ShadowMethod::Variance)
     }
 
-    /// Define of the number of cascades, when the shadow map is split.
+    /// Define of the number of cascades, if the shadow map has several.
     pub(crate) fn cascade_define(&self) -> Option<&'static str> {
         self.shadow.as_ref().and_then(cascade_define)
     }
 
-    /// Whether triangles are culled at all.
+    /// Whether triangles are culled.
     pub(crate) fn has_culling(&self) -> bool {
         self.culling != Culling::None
     }
 
-    /// Whether hidden triangles are culled.
+    /// Whether occluded triangles are culled.
     pub(crate) fn has_occlusion_culling(&self) -> bool {
         self.culling == Culling::Occlusion
     }

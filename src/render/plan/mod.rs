@@ -1,8 +1,8 @@
-//! Plan of the device resources of a scene, derived once from its [`modalcast_model::scene::SceneFeatures`]: buffers, textures,
-//! passes and shader branches. It also lists the features that were left out, and what each saves compared with a scene
-//! that uses every feature.
+//! Plan of the device resources of a scene: buffers, textures, passes and shader defines. It is derived once from the
+//! scene's [`modalcast_model::scene::SceneFeatures`]. It also lists the omitted features, and the savings of each omission
+//! compared with a scene that uses every feature.
 //!
-//! The renderer allocates and compiles exactly what the plan lists. Planning is pure and needs no device.
+//! The renderer allocates and compiles exactly the resources of the plan. Planning needs no device.
 
 pub(crate) mod buffers;
 pub(crate) mod culling;
@@ -53,11 +53,12 @@ pub struct RenderPlan {
     /// Passes of a frame, in execution order. The ground pass runs only when the camera is above the ground and
     /// something lies below it.
     pub passes: Vec<Pass>,
-    /// Draw calls of the occluders, visibility and blended passes, fourteen at most; independent of the number of
-    /// domains and materials.
+    /// Draw calls of the occluder, visibility and blend passes: at most fourteen, independent of the number of domains
+    /// and materials.
     pub draw_calls: usize,
     /// Defines that the shaders are compiled with.
     pub defines: Vec<&'static str>,
+    /// Features that the scene does not need.
     pub omitted: Vec<OmittedFeature>,
 }
 
@@ -79,18 +80,18 @@ pub(crate) struct ScenePlan {
     /// Sizes in bytes.
     pub(crate) buffers: SceneBufferSet<u64>,
     pub(crate) features: ShaderFeatures,
-    /// The same plan by name.
+    /// The same plan with names, for reports.
     pub(crate) report: RenderPlan,
 }
 
-/// Plans a scene for a GPU without limits.
+/// Plans a scene for a GPU without size limits.
 pub fn plan(scene: &Scene) -> RenderPlan {
     let limits = Limits { max_storage_bytes: u64::MAX, ..Limits::default() };
     ScenePlan::new(scene, &limits, BlurMethod::Auto).report
 }
 
 impl ScenePlan {
-    /// Plans a scene for a device, which may be a software rasterizer.
+    /// Plans a scene for a device with these limits.
     pub(crate) fn new(scene: &Scene, limits: &Limits, blur_method: BlurMethod) -> Self {
         let (groups, _) = groups(scene);
         let culling = select_culling(scene, limits);
@@ -103,7 +104,7 @@ impl ScenePlan {
             passes: passes(scene, &groups, &features),
             draw_calls: draw_calls(scene, &groups) + occluder_draw_calls(&groups, culling),
             defines: features.defines(),
-            omitted: omitted(scene, culling),
+            omitted: omitted_features(scene, culling),
         };
         Self { buffers, features, report }
     }
@@ -111,14 +112,14 @@ impl ScenePlan {
 
 /// The passes of a frame, in execution order.
 fn passes(scene: &Scene, groups: &[DrawGroup], features: &ShaderFeatures) -> Vec<Pass> {
-    let has = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
+    let has_blend_mode = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
     let mut passes = Vec::new();
     if let Some(shadow) = features.shadow {
         passes.extend(features.has_culling().then_some(Pass::ShadowCull));
         passes.push(Pass::Shadow);
         passes.extend(shadow.has_moments().then_some(Pass::Blur));
     }
-    let has_visibility = has(BlendMode::Opaque) || has(BlendMode::Mask) || features.opaque_parts;
+    let has_visibility = has_blend_mode(BlendMode::Opaque) || has_blend_mode(BlendMode::Mask) || features.opaque_parts;
     passes.extend(cull_passes(features.culling));
     passes.extend(has_visibility.then_some(Pass::Visibility));
     passes.extend(features.ground.then_some(Pass::Ground));
@@ -138,31 +139,32 @@ const fn blend_passes(scene: &Scene) -> &'static [Pass] {
     }
 }
 
-/// Whether some blended triangle may reach the alpha threshold above which two-pass transparency draws it as opaque.
-fn opaque_parts(scene: &Scene) -> bool {
+/// Whether two-pass transparency may draw parts of blended triangles as opaque: some material reaches the alpha
+/// threshold.
+fn has_opaque_parts(scene: &Scene) -> bool {
     let (look, materials) = (scene.look, used_materials(scene));
-    let dense = |material: usize| {
+    let is_opaque_enough = |material: usize| {
         let material = &scene.materials[material];
         blend_mode(material) == BlendMode::Blend && material.alpha >= look.opaque_alpha
     };
-    look.transparency == Transparency::TwoPass && materials.into_iter().any(dense)
+    look.transparency == Transparency::TwoPass && materials.into_iter().any(is_opaque_enough)
 }
 
-/// Draw calls of the occluder pass: culling by depth draws opaque and cut-out groups twice.
+/// Number of draw calls of the occluder pass, which draws opaque and cut-out groups.
 fn occluder_draw_calls(groups: &[DrawGroup], culling: Culling) -> usize {
-    let hiding = groups.iter().filter(|group| group.blend_mode != BlendMode::Blend).count();
-    if culling == Culling::Occlusion { hiding } else { 0 }
+    let occluder_groups = groups.iter().filter(|group| group.blend_mode != BlendMode::Blend).count();
+    if culling == Culling::Occlusion { occluder_groups } else { 0 }
 }
 
-/// Draw calls without occluders. Exact transparency draws blended triangles in three phases, the third only on demand;
-/// two-pass transparency draws their opaque parts in a second phase.
+/// Number of draw calls without the occluder pass. Order-independent transparency draws blended triangles in three
+/// phases, the third only on demand. Two-pass transparency draws their opaque parts in a second phase.
 fn draw_calls(scene: &Scene, groups: &[DrawGroup]) -> usize {
     let blended = groups.iter().filter(|group| group.blend_mode == BlendMode::Blend).count();
-    let turns = match scene.look.transparency {
+    let phases = match scene.look.transparency {
         Transparency::OrderIndependent => 3,
-        Transparency::TwoPass => 1 + usize::from(opaque_parts(scene)),
+        Transparency::TwoPass => 1 + usize::from(has_opaque_parts(scene)),
     };
-    groups.len() + (turns - 1) * blended
+    groups.len() + (phases - 1) * blended
 }
 
 fn buffer_sizes(scene: &Scene, culling: Culling) -> SceneBufferSet<u64> {
@@ -193,9 +195,9 @@ fn buffer_sizes(scene: &Scene, culling: Culling) -> SceneBufferSet<u64> {
 
 fn textures(scene: &Scene, blur_method: BlurMethod) -> Vec<Allocation> {
     let mut textures = Vec::new();
-    for (purpose, word) in [(TextureRole::Color, "colors"), (TextureRole::Normal, "normals")] {
-        for array in arrays(scene, purpose) {
-            let name = format!("{word} {} x {} x {}", array.width, array.height, array.layers.len());
+    for (role, label) in [(TextureRole::Color, "colors"), (TextureRole::Normal, "normals")] {
+        for array in arrays(scene, role) {
+            let name = format!("{label} {} x {} x {}", array.width, array.height, array.layers.len());
             textures.push(Allocation { name, bytes: array.bytes() });
         }
     }
@@ -222,30 +224,58 @@ fn features(scene: &Scene, blur_method: BlurMethod, culling: Culling) -> ShaderF
         ground: look.ground.is_some(),
         blend_layers: features.blend,
         oit: features.blend && look.transparency == Transparency::OrderIndependent,
-        opaque_parts: opaque_parts(scene),
+        opaque_parts: has_opaque_parts(scene),
         shadow: look.shadow,
         blur_method,
         culling,
     }
 }
 
-fn omitted(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
+fn omitted_features(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
     let (features, layout, look) = (scene.features, &scene.layout, &scene.look);
-    let map: u64 = shadow_allocations(&look.shadow.unwrap_or_default(), BlurMethod::Auto).map(|part| part.bytes).sum();
-    let per_corner = |bytes: usize| (bytes * layout.corners) as u64;
-    let uvs = if features.textures || features.normal_maps { 0 } else { per_corner(8) };
-    let all: [(bool, &str, u64, &[Pass], &str); 12] = [
-        (features.normal_maps, "normal maps", per_corner(16), &[], "no tangent frame, no normal map lookup"),
-        (features.textures, "textures", uvs, &[], "no colour lookup"),
-        (features.mask, "mask", 0, &[], "no discard, no sample mask; depth needs no fragment shader"),
-        (features.blend, "blend", 0, blend_passes(scene), "no layers in the shading, 8 bytes a sample less"),
-        (features.shadows, "shadows", map, &[Pass::Shadow, Pass::Blur], "no shadow lookup"),
-        (uses_material_table(scene), "many materials", 4 * layout.triangles as u64, &[], "no lookup per triangle"),
-        (look.ground.is_some(), "ground", 0, &[Pass::Ground], "no ground program"),
-        (look.bloom.is_some(), "bloom", 0, &[Pass::Bloom], "what glows is not kept, 10.7 bytes a pixel less"),
-        (look.tone != ToneMapping::None, "tone curve", 0, &[], "light is shown as it is"),
-        (look.antialias == Antialiasing::Fxaa, "fxaa", 0, &[], "no search for edges in the picture"),
-        (
+    let shadow_bytes: u64 =
+        shadow_allocations(&look.shadow.unwrap_or_default(), BlurMethod::Auto).map(|allocation| allocation.bytes).sum();
+    let corner_bytes = |bytes: usize| (bytes * layout.corners) as u64;
+    let uvs = if features.textures || features.normal_maps { 0 } else { corner_bytes(8) };
+    let omit_unless = |is_needed: bool, feature, bytes, passes: &[Pass], shaders| {
+        (!is_needed).then(|| OmittedFeature { feature, bytes, passes: passes.to_vec(), shaders })
+    };
+    let omitted = [
+        omit_unless(
+            features.normal_maps,
+            "normal maps",
+            corner_bytes(16),
+            &[],
+            "no tangent frame, no normal map lookup",
+        ),
+        omit_unless(features.textures, "textures", uvs, &[], "no color texture lookup"),
+        omit_unless(features.mask, "mask", 0, &[], "no discard, no sample mask; depth needs no fragment shader"),
+        omit_unless(
+            features.blend,
+            "blend",
+            0,
+            blend_passes(scene),
+            "no layers in the shading, 8 bytes per sample less",
+        ),
+        omit_unless(features.shadows, "shadows", shadow_bytes, &[Pass::Shadow, Pass::Blur], "no shadow lookup"),
+        omit_unless(
+            uses_material_table(scene),
+            "many materials",
+            4 * layout.triangles as u64,
+            &[],
+            "no lookup per triangle",
+        ),
+        omit_unless(look.ground.is_some(), "ground", 0, &[Pass::Ground], "no ground program"),
+        omit_unless(
+            look.bloom.is_some(),
+            "bloom",
+            0,
+            &[Pass::Bloom],
+            "no image of bright light, 10.7 bytes per pixel less",
+        ),
+        omit_unless(look.tone != ToneMapping::None, "tone curve", 0, &[], "no tone mapping of light"),
+        omit_unless(look.antialias == Antialiasing::Fxaa, "fxaa", 0, &[], "no search for edges in the image"),
+        omit_unless(
             culling != Culling::None,
             "culling",
             cull_buffer_sizes(scene, Culling::Triangles)
@@ -254,14 +284,11 @@ fn omitted(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
                 .map(|(_, bytes)| *bytes)
                 .sum(),
             cull_passes(Culling::Triangles),
-            "fragments know their triangle without a lookup",
+            "no triangle id lookup in fragments",
         ),
-        (look.dither, "dither", 0, &[], "levels are rounded without a pattern"),
+        omit_unless(look.dither, "dither", 0, &[], "no dither pattern"),
     ];
-    let unneeded = all.into_iter().filter(|row| !row.0);
-    unneeded
-        .map(|(_, feature, bytes, passes, shaders)| OmittedFeature { feature, bytes, passes: passes.to_vec(), shaders })
-        .collect()
+    omitted.into_iter().flatten().collect()
 }
 
 #[cfg(test)]
@@ -279,14 +306,15 @@ mod tests {
         plan.passes.iter().map(|pass| pass.name()).collect()
     }
 
-    fn everything() -> modalcast_model::scene::SceneParts {
+    /// A scene that needs every feature.
+    fn full_featured_parts() -> modalcast_model::scene::SceneParts {
         let materials = vec![
             Material { color_texture: Some(0), normal_texture: Some(0), ..Material::default() },
             Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() },
             Material { alpha_mode: AlphaMode::Blend, ..Material::default() },
         ];
         let mut parts = squares(materials);
-        parts.textures.push(Texture::new("one", 1, 1, vec![255; 4]).expect("fits"));
+        parts.textures.push(Texture::new("one", 1, 1, vec![255; 4]).expect("a valid texture"));
         let look =
             RenderSettings { bloom: Some(Bloom::default()), tone: ToneMapping::Aces, dither: true, ..parts.look };
         parts.look = RenderSettings { antialias: Antialiasing::Fxaa, culling: Culling::Occlusion, ..look };
@@ -294,54 +322,57 @@ mod tests {
     }
 
     #[test]
-    fn a_plain_scene_without_shadow_leaves_out_everything_and_says_what_that_saved() {
+    fn plan_of_a_plain_scene_omits_every_feature() {
         let mut parts = squares(vec![Material::default()]);
         parts.look.shadow = None;
         parts.look.ground = None;
-        let scene = Scene::new(parts).expect("good");
+        let scene = Scene::new(parts).expect("a valid scene");
         let plan = plan(&scene);
         assert_eq!(pass_names(&plan), ["visibility", "background", "shade", "encode"]);
         let expected = ["positions", "normals", "triangles", "triangle vertices", "materials", "frame uniforms"];
         assert_eq!(names(&plan.buffers), expected);
         assert!(plan.textures.is_empty() && plan.defines.is_empty());
-        let left: Vec<&str> = plan.omitted.iter().map(|saving| saving.feature).collect();
-        let materials = ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"];
-        assert_eq!(left, [&materials[..], &["bloom", "tone curve", "fxaa", "culling", "dither"]].concat());
-        assert_eq!(plan.omitted[0].bytes, 16 * 4, "tangents of four corners");
-        assert_eq!(plan.omitted[4].bytes, 12 * 1024 * 1024, "map and moments");
+        let omitted: Vec<&str> = plan.omitted.iter().map(|omitted| omitted.feature).collect();
+        let scene_features = ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"];
+        assert_eq!(omitted, [&scene_features[..], &["bloom", "tone curve", "fxaa", "culling", "dither"]].concat());
+        assert_eq!(plan.omitted[0].bytes, 16 * 4, "expected the tangents of four corners");
+        assert_eq!(plan.omitted[4].bytes, 12 * 1024 * 1024, "expected the shadow map and its moments");
     }
 
     #[test]
-    fn a_scene_that_is_all_glass_rasterises_no_ids_and_shades_no_triangle_that_hides_others() {
-        let glass = |transparency, alpha| {
+    fn plan_of_a_blended_scene_has_visibility_only_for_opaque_parts() {
+        let plan_blended = |transparency, alpha| {
             let mut parts = squares(vec![Material { alpha_mode: AlphaMode::Blend, alpha, ..Material::default() }]);
             (parts.look.shadow, parts.look.transparency) = (None, transparency);
-            plan(&Scene::new(parts).expect("good"))
+            plan(&Scene::new(parts).expect("a valid scene"))
         };
-        let passes = glass(Transparency::TwoPass, 0.5);
-        assert_eq!(pass_names(&passes), ["ground", "blended", "background", "encode"]);
-        assert_eq!((passes.draw_calls, passes.defines), (1, vec!["HAS_GROUND", "BLEND_LAYERS"]));
-        assert_eq!(passes.buffers.last().map(|last| last.name.as_str()), Some("corner vertices"));
-        let exact = glass(Transparency::OrderIndependent, 1.0);
+        let two_pass = plan_blended(Transparency::TwoPass, 0.5);
+        assert_eq!(pass_names(&two_pass), ["ground", "blended", "background", "encode"]);
+        assert_eq!((two_pass.draw_calls, two_pass.defines), (1, vec!["HAS_GROUND", "BLEND_LAYERS"]));
+        assert_eq!(two_pass.buffers.last().map(|buffer| buffer.name.as_str()), Some("corner vertices"));
+        let oit = plan_blended(Transparency::OrderIndependent, 1.0);
         assert_eq!(
-            pass_names(&exact),
+            pass_names(&oit),
             ["ground", "oit count", "oit allocate", "oit fill", "oit resolve", "background", "encode"]
         );
-        assert_eq!((exact.draw_calls, exact.defines), (3, vec!["HAS_GROUND", "BLEND_LAYERS", "OIT"]));
-        let dense = glass(Transparency::TwoPass, 1.0);
+        assert_eq!((oit.draw_calls, oit.defines), (3, vec!["HAS_GROUND", "BLEND_LAYERS", "OIT"]));
+        let with_opaque_parts = plan_blended(Transparency::TwoPass, 1.0);
         assert_eq!(
-            pass_names(&dense),
+            pass_names(&with_opaque_parts),
             ["visibility", "ground", "blended", "background", "shade", "encode"],
-            "it may be opaque"
+            "expected visibility and shade passes for opaque parts"
         );
-        assert_eq!((dense.draw_calls, dense.defines), (2, vec!["HAS_GROUND", "BLEND_LAYERS", "OPAQUE_PARTS"]));
+        assert_eq!(
+            (with_opaque_parts.draw_calls, with_opaque_parts.defines),
+            (2, vec!["HAS_GROUND", "BLEND_LAYERS", "OPAQUE_PARTS"])
+        );
     }
 
     #[test]
-    fn a_scene_that_needs_all_leaves_out_nothing() {
-        let mut parts = everything();
+    fn plan_of_a_full_featured_scene_omits_nothing() {
+        let mut parts = full_featured_parts();
         parts.look.transparency = Transparency::TwoPass;
-        let plan = plan(&Scene::new(parts).expect("good"));
+        let plan = plan(&Scene::new(parts).expect("a valid scene"));
         assert_eq!(
             pass_names(&plan),
             [

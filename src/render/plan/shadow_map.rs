@@ -11,15 +11,15 @@ pub(crate) struct ShadowTexture {
     pub(crate) layers: u32,
 }
 
-/// The textures of a map.
+/// The textures of a shadow map.
 pub(crate) fn shadow_textures(shadow: &ShadowSettings, blur_method: BlurMethod) -> Vec<ShadowTexture> {
     let texture = |name, texel_bytes, layers| ShadowTexture { name, texel_bytes, layers };
-    let pair = if shadow.moments == MomentFormat::F16 { 4 } else { 8 };
+    let moment_bytes = if shadow.moments == MomentFormat::F16 { 4 } else { 8 };
     let mut textures = vec![texture("shadow depth", 4, shadow.splits)];
     if shadow.has_moments() {
-        textures.push(texture("shadow moments", pair, shadow.splits));
+        textures.push(texture("shadow moments", moment_bytes, shadow.splits));
         if matches!(blur_method, BlurMethod::Rows | BlurMethod::Fragments) {
-            textures.push(texture("shadow moments, blurred in x", pair, 1));
+            textures.push(texture("shadow moments, blurred in x", moment_bytes, 1));
         }
     }
     textures

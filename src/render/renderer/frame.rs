@@ -174,7 +174,7 @@ impl Renderer {
 
     /// Measures the passes that `commands` records, under the name of one of them.
     fn time_pass(&self, pass: Pass, commands: impl FnOnce() -> Result<()>) -> Result<(Pass, PassTimer)> {
-        self.gl.time_pass((pass.name(), self.frame_timeout), commands).map(|timer| (pass, timer))
+        self.gl.time_pass(pass.name(), self.frame_timeout, commands).map(|timer| (pass, timer))
     }
 
     /// Copies the pixels, then the list and culling statistics, to the staging buffer.

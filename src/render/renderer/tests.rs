@@ -178,10 +178,10 @@ fn a_frame_comes_back_when_the_images_of_its_form_were_freed_meanwhile() {
     assert!(renderer.targets.iter().all(|target| target.desc.width != 64));
     let pixels = renderer.map_pixels(early).expect("draws");
     renderer.draw(&buffers, &shot(&scene, 41)).expect("draws while somebody reads what was freed");
-    assert_eq!(renderer.gl.retired(), 1);
+    assert_eq!(renderer.gl.retired_buffer_count(), 1);
     assert!(pixels.into_image().rgba == alone(0.0).0);
     renderer.draw(&buffers, &shot(&scene, 42)).expect("draws");
-    assert_eq!(renderer.gl.retired(), 0);
+    assert_eq!(renderer.gl.retired_buffer_count(), 0);
 }
 
 #[test]

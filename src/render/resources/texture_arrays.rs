@@ -44,7 +44,7 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &TextureArray, purpose: Textu
         for (offset, chain) in chains.iter().enumerate() {
             for (level, rgba) in chain.iter().enumerate() {
                 let size = [(array.width >> level).max(1), (array.height >> level).max(1)];
-                texture.fill(level as u32, (8 * chunk + offset) as u32, size, rgba)?;
+                texture.upload_pixels(level as u32, (8 * chunk + offset) as u32, size, rgba)?;
             }
         }
     }

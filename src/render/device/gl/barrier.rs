@@ -1,4 +1,4 @@
-//! Memory barriers: they order what shaders write to images and storage buffers with later accesses.
+//! Memory barriers. They order shader writes to images and storage buffers before later accesses.
 
 use std::ops::BitOr;
 

@@ -1,4 +1,4 @@
-//! Begins a pass: binds its framebuffer, restricts drawing to a region and clears what earlier frames wrote.
+//! Begins a pass: binds its framebuffer, restricts drawing to a region and clears the pixels that earlier frames wrote.
 
 use glow::HasContext as _;
 
@@ -12,15 +12,17 @@ pub(crate) struct VisibilityDirty {
     pub(crate) depth: DirtyRegion,
 }
 
-/// How a pass initializes its framebuffer. With a known dirty region only that is cleared, else the whole image.
+/// The initialization of a framebuffer by a pass. If the dirty region is known, only this region is cleared, otherwise
+/// the complete image.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum ClearOp<'a> {
     /// Depth to 1.
     Depth(Option<&'a DirtyRegion>),
     /// Depth to 1 and ids to 0.
     DepthAndIds(Option<&'a VisibilityDirty>),
+    /// Color to a value.
     Color([f32; 4], &'a DirtyRegion),
-    /// Integer words to 0; there is no depth.
+    /// Integer words to 0, without depth.
     Uint(&'a DirtyRegion),
     /// The content is kept.
     Load,
@@ -37,38 +39,38 @@ enum ClearValue {
 }
 
 impl Gl {
-    /// Binds a framebuffer, clears it and sets the scissor: later draws reach only `part`.
-    pub(crate) fn begin_pass(&self, into: &Framebuffer, part: Region, clear: ClearOp<'_>) {
+    /// Binds a framebuffer, clears it and sets the scissor, so that later draws affect only `region`.
+    pub(crate) fn begin_pass(&self, framebuffer: &Framebuffer, region: Region, clear: ClearOp<'_>) {
         let Some(gl) = self.functions_or_skip() else { return };
-        let [width, height] = part.frame().map(|side| side as i32);
+        let [width, height] = region.frame().map(|side| side as i32);
         // SAFETY: sets state with a complete framebuffer.
         unsafe {
-            gl.bind_framebuffer(glow::FRAMEBUFFER, Some(into.name));
+            gl.bind_framebuffer(glow::FRAMEBUFFER, Some(framebuffer.name));
             gl.viewport(0, 0, width, height);
             gl.enable(glow::SCISSOR_TEST);
             gl.depth_mask(true);
         }
         match clear {
-            ClearOp::Depth(dirty) => self.fill(part, dirty, ClearValue::FarDepth),
+            ClearOp::Depth(dirty) => self.clear_region(region, dirty, ClearValue::FarDepth),
             ClearOp::DepthAndIds(dirty) => {
-                self.fill(part, dirty.map(|both| &both.depth), ClearValue::FarDepth);
-                self.fill(part, dirty.map(|both| &both.ids), ClearValue::Zero);
+                self.clear_region(region, dirty.map(|regions| &regions.depth), ClearValue::FarDepth);
+                self.clear_region(region, dirty.map(|regions| &regions.ids), ClearValue::Zero);
             }
-            ClearOp::Uint(dirty) => self.fill(part, Some(dirty), ClearValue::Zero),
-            ClearOp::Color(color, dirty) => self.fill(part, Some(dirty), ClearValue::Color(color)),
+            ClearOp::Uint(dirty) => self.clear_region(region, Some(dirty), ClearValue::Zero),
+            ClearOp::Color(color, dirty) => self.clear_region(region, Some(dirty), ClearValue::Color(color)),
             ClearOp::Load => {}
         }
-        self.set_scissor(part);
+        self.set_scissor(region);
     }
 
-    /// Clears the dirty region of an attachment and marks `part` as dirty.
-    fn fill(&self, part: Region, dirty: Option<&DirtyRegion>, with: ClearValue) {
-        let last = dirty.and_then(|dirty| dirty.replace(part));
-        self.set_scissor(last.unwrap_or_else(|| Region::whole(part.frame())));
+    /// Clears the dirty region of an attachment and marks `region` as dirty.
+    fn clear_region(&self, region: Region, dirty: Option<&DirtyRegion>, value: ClearValue) {
+        let previous_region = dirty.and_then(|dirty| dirty.replace(region));
+        self.set_scissor(previous_region.unwrap_or_else(|| Region::whole(region.frame())));
         let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: a clear of a complete framebuffer.
         unsafe {
-            match with {
+            match value {
                 ClearValue::FarDepth => gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]),
                 ClearValue::Zero => gl.clear_buffer_u32_slice(glow::COLOR, 0, &[0; 4]),
                 ClearValue::Color(color) => gl.clear_buffer_f32_slice(glow::COLOR, 0, &color),
@@ -76,8 +78,8 @@ impl Gl {
         }
     }
 
-    fn set_scissor(&self, to: Region) {
-        let [x, y, width, height] = to.rect().map(|number| number as i32);
+    fn set_scissor(&self, region: Region) {
+        let [x, y, width, height] = region.rect().map(|number| number as i32);
         let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: sets state; no memory is accessed.
         unsafe { gl.scissor(x, y, width, height) };

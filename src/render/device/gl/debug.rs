@@ -8,11 +8,11 @@ use std::sync::{Mutex, PoisonError};
 use glow::HasContext as _;
 use tracing::{Level, dispatcher};
 
-/// Distinct messages that are counted separately; further ones share one counter.
-const KINDS: usize = 256;
+/// Maximum number of distinct messages that are counted separately. Further messages share one counter.
+const MAX_COUNTED_MESSAGES: usize = 256;
 
 /// Source, type and id of a message.
-type Key = [u32; 3];
+type MessageKey = [u32; 3];
 
 /// Whether the log accepts the messages of a debug context: target `opengl` at `debug` or below
 /// (`RUST_LOG=opengl=debug`).
@@ -20,18 +20,18 @@ pub(crate) fn is_enabled() -> bool {
     tracing::enabled!(target: "opengl", Level::DEBUG)
 }
 
-/// Sends the driver's messages to the log of this thread, on whatever thread the driver calls back. The callback lives
-/// as long as `gl`, which removes it from the context when dropped.
+/// Sends the driver's messages to the log of this thread; the driver may call back on any thread. The callback lives as
+/// long as `gl`, which removes it from the context when dropped.
 pub(super) fn install_debug_callback(gl: &mut glow::Context) {
     if !gl.supports_debug() {
         return;
     }
-    let (log, heard) = (dispatcher::get_default(Clone::clone), MessageCounts::default());
-    // A panic must not unwind into the driver. The state behind it is a counter and the log, which both stay usable.
+    let (log, message_counts) = (dispatcher::get_default(Clone::clone), MessageCounts::default());
+    // A panic must not unwind into the driver. The callback shares only counters and the log, which remain usable.
     let forward = move |source, kind, id, severity, text: &str| {
         catch_unwind(AssertUnwindSafe(|| {
-            if let Some(times) = heard.record([source, kind, id]) {
-                dispatcher::with_default(&log, || log_message((source, kind, id), severity, times, text));
+            if let Some(count) = message_counts.record([source, kind, id]) {
+                dispatcher::with_default(&log, || log_message((source, kind, id), severity, count, text));
             }
         }))
         .ok();
@@ -39,7 +39,7 @@ pub(super) fn install_debug_callback(gl: &mut glow::Context) {
     // SAFETY: the callback owns all its data, may be called on any thread and does not unwind.
     unsafe {
         gl.enable(glow::DEBUG_OUTPUT);
-        // Asynchronous output: the driver need not stop for its messages.
+        // With asynchronous output, the driver does not stop at each message.
         gl.disable(glow::DEBUG_OUTPUT_SYNCHRONOUS);
         gl.debug_message_callback(forward);
     }
@@ -47,17 +47,17 @@ pub(super) fn install_debug_callback(gl: &mut glow::Context) {
 
 /// Number of occurrences of each message.
 #[derive(Debug, Default)]
-struct MessageCounts(Mutex<HashMap<Key, u64>>);
+struct MessageCounts(Mutex<HashMap<MessageKey, u64>>);
 
 impl MessageCounts {
-    /// Counts a message. Returns the count when it is to be logged, at 1, 2, 4, 8 and so on, so that a driver that
-    /// repeats a message in each frame does not flood the log.
-    fn record(&self, key: Key) -> Option<u64> {
+    /// Counts a message. Returns the count if the message is to be logged: at 1, 2, 4, 8 and so on. Messages that the
+    /// driver repeats in each frame thus do not flood the log.
+    fn record(&self, key: MessageKey) -> Option<u64> {
         let mut counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let key = if counts.len() < KINDS || counts.contains_key(&key) { key } else { [0; 3] };
-        let times = counts.entry(key).or_default();
-        *times += 1;
-        times.is_power_of_two().then_some(*times)
+        let key = if counts.len() < MAX_COUNTED_MESSAGES || counts.contains_key(&key) { key } else { [0; 3] };
+        let count = counts.entry(key).or_default();
+        *count += 1;
+        count.is_power_of_two().then_some(*count)
     }
 }
 
@@ -104,12 +104,13 @@ mod tests {
     use super::*;
     use crate::{DevicePreference, device};
 
+    /// A log in memory.
     #[derive(Clone, Default)]
     struct Lines(Arc<Mutex<Vec<u8>>>);
 
     impl Write for Lines {
         fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-            self.0.lock().expect("whole").extend_from_slice(bytes);
+            self.0.lock().expect("an unpoisoned lock").extend_from_slice(bytes);
             Ok(bytes.len())
         }
 
@@ -118,18 +119,18 @@ mod tests {
         }
     }
 
-    /// With a single subscriber in the process, `tracing` caches whether a callsite is enabled, as decided by the
-    /// thread that reaches it first: another test without a log would disable the callsite. With two subscribers,
-    /// `tracing` asks each thread. The callsite is registered before the second subscriber is created.
-    fn keep_a_second_log() {
-        static SECOND: OnceLock<Dispatch> = OnceLock::new();
+    /// With a single subscriber in the process, `tracing` caches whether a callsite is enabled. The thread that reaches the
+    /// callsite first decides, so another test without a log would disable it. With two subscribers, `tracing` asks each
+    /// thread. The callsite is registered before the second subscriber is created.
+    fn register_second_subscriber() {
+        static SECOND_SUBSCRIBER: OnceLock<Dispatch> = OnceLock::new();
         is_enabled();
-        SECOND.get_or_init(|| Dispatch::new(tracing_subscriber::registry()));
+        SECOND_SUBSCRIBER.get_or_init(|| Dispatch::new(tracing_subscriber::registry()));
     }
 
-    /// The log after a context was misused this many times.
-    fn log_of(filter: &str, wrong: usize) -> String {
-        keep_a_second_log();
+    /// Returns the log after this many invalid OpenGL calls.
+    fn log_of(filter: &str, invalid_calls: usize) -> String {
+        register_second_subscriber();
         let lines = Lines::default();
         let writer = lines.clone();
         let log = tracing_subscriber::fmt()
@@ -139,53 +140,57 @@ mod tests {
             .finish();
         tracing::subscriber::with_default(log, || {
             let (gl, _) = device::open(DevicePreference::Any).expect("EGL");
-            for _ in 0..wrong {
+            for _ in 0..invalid_calls {
                 // SAFETY: the flag does not exist, and OpenGL rejects it.
                 unsafe { gl.functions().expect("current").enable(0xFFFF) }
-                assert!(gl.check("test").is_err(), "the error is seen without the log too");
+                assert!(gl.check("test").is_err(), "expected an error of OpenGL, too");
             }
             // SAFETY: waits for the commands, so that a driver with delayed messages has sent them.
             unsafe { gl.functions().expect("current").finish() }
         });
-        String::from_utf8(lines.0.lock().expect("whole").clone()).expect("text")
+        String::from_utf8(lines.0.lock().expect("an unpoisoned lock").clone()).expect("text")
     }
 
     #[test]
-    fn an_error_of_opengl_is_in_the_log_with_its_source_and_type_where_somebody_listens() {
+    fn opengl_errors_are_logged_with_source_and_type() {
         let log = log_of("opengl=debug", 1);
         let line = log.lines().find(|line| line.contains("ERROR")).unwrap_or_else(|| panic!("no error in: {log}"));
         for part in ["opengl: ", "source=\"api\"", "kind=\"error\"", " id=", "times=1"] {
-            assert!(line.contains(part), "{part} in {line}");
+            assert!(line.contains(part), "expected {part} in {line}");
         }
-        assert_eq!(log_of("opengl=debug", 0).matches("ERROR").count(), 0, "control: nothing wrong, nothing said");
-        assert_eq!(log_of("opengl=info", 1), "", "control: nobody listens");
+        assert_eq!(
+            log_of("opengl=debug", 0).matches("ERROR").count(),
+            0,
+            "control: expected no message without an error"
+        );
+        assert_eq!(log_of("opengl=info", 1), "", "control: expected an empty log above level debug");
     }
 
     #[test]
-    fn a_thread_without_a_log_does_not_decide_that_no_thread_has_one() {
-        keep_a_second_log();
+    fn threads_without_a_log_do_not_disable_callsites_of_others() {
+        register_second_subscriber();
         let log = tracing_subscriber::fmt().with_max_level(Level::TRACE).with_writer(std::io::sink).finish();
         // A callsite that no thread has reached yet.
-        let asks = || tracing::enabled!(target: "opengl", Level::WARN);
+        let is_callsite_enabled = || tracing::enabled!(target: "opengl", Level::WARN);
         tracing::subscriber::with_default(log, || {
-            let other = std::thread::spawn(asks).join().expect("asks");
-            assert!(!other && asks());
+            let is_enabled_without_log = std::thread::spawn(is_callsite_enabled).join().expect("no panic");
+            assert!(!is_enabled_without_log && is_callsite_enabled());
         });
     }
 
     #[test]
-    fn what_a_driver_repeats_is_told_less_and_less() {
+    fn repeated_messages_are_logged_at_powers_of_two() {
         let log = log_of("opengl=debug", 100);
-        let told = log.matches("ERROR").count();
-        assert_eq!(told, 7, "at 1, 2, 4 .. 64: {log}");
+        assert_eq!(log.matches("ERROR").count(), 7, "expected messages at 1, 2, 4, ..., 64: {log}");
     }
 
     #[test]
-    fn no_number_of_different_messages_fills_the_memory() {
-        let heard = MessageCounts::default();
-        let told = (0..10_000).filter(|id| heard.record([1, 2, *id]).is_some()).count();
-        assert!(heard.0.lock().expect("whole").len() <= KINDS + 1);
-        assert!(told < KINDS + 20, "{told}");
+    fn number_of_counted_messages_is_bounded() {
+        let message_counts = MessageCounts::default();
+        let logged = (0..10_000).filter(|id| message_counts.record([1, 2, *id]).is_some()).count();
+        assert!(message_counts.0.lock().expect("an unpoisoned lock").len() <= MAX_COUNTED_MESSAGES + 1);
+        let limit = MAX_COUNTED_MESSAGES + 20;
+        assert!(logged < limit, "expected fewer than {limit} logged messages, got {logged}");
     }
 
     #[test]
@@ -196,7 +201,7 @@ mod tests {
 
     #[test]
     fn panics_of_the_log_do_not_reach_the_driver() {
-        keep_a_second_log();
+        register_second_subscriber();
         let panics = std::sync::Arc::new(std::sync::atomic::AtomicUsize::new(0));
         let counter = Arc::clone(&panics);
         let writer = move || -> std::io::Sink {
@@ -212,8 +217,8 @@ mod tests {
             functions.enable(0xFFFF);
             functions.finish();
         }
-        assert!(gl.check("test").is_err(), "the error is seen without the log too");
-        gl.check("test").expect("commands go on");
-        assert!(panics.load(std::sync::atomic::Ordering::Relaxed) > 0, "the log was reached");
+        assert!(gl.check("test").is_err(), "expected an error of OpenGL, too");
+        gl.check("test").expect("no error of later commands");
+        assert!(panics.load(std::sync::atomic::Ordering::Relaxed) > 0, "expected a panic of the log");
     }
 }

@@ -8,7 +8,7 @@ use glow::HasContext as _;
 use super::Gl;
 use modalcast_model::error::{Result, fault_in};
 
-/// Signaled once all commands before it are complete.
+/// A fence: signaled once all commands before it are complete.
 #[derive(Debug)]
 pub(crate) struct Fence {
     gl: Rc<Gl>,
@@ -37,7 +37,7 @@ impl Gl {
 }
 
 impl Fence {
-    /// Whether the commands are complete or will never be; in the second case [`Self::wait`] returns the reason.
+    /// Whether waiting is over: the commands are complete, or the wait fails and [`Self::wait`] returns the reason.
     pub(crate) fn is_done(&self) -> bool {
         self.is_done_within(Duration::ZERO)
     }
@@ -50,25 +50,25 @@ impl Fence {
     /// Waits until the commands are complete.
     ///
     /// # Errors
-    /// `Fault` of `stage` when the device does not finish within `limit` or cannot be asked; `DeviceLost` when the
+    /// `Fault` of `stage` when the device does not finish within `limit` or when the wait fails; `DeviceLost` when the
     /// context is lost.
     pub(crate) fn wait(&self, stage: &'static str, limit: Duration) -> Result<()> {
-        let begin = Instant::now();
-        while !self.poll(stage, limit.saturating_sub(begin.elapsed()))? {
-            if begin.elapsed() >= limit {
+        let start = Instant::now();
+        while !self.poll(stage, limit.saturating_sub(start.elapsed()))? {
+            if start.elapsed() >= limit {
                 return Err(fault_in(stage)(format!("the device did not finish within {limit:?}")));
             }
         }
         Ok(())
     }
 
-    /// Whether the commands are complete, after waiting at most `limit` or one second.
+    /// Whether the commands are complete, after waiting at most `limit`, and at most one second.
     fn poll(&self, stage: &'static str, limit: Duration) -> Result<bool> {
-        // One second fits into glow's 32-bit nanoseconds.
-        let slice = limit.min(Duration::from_secs(1)).as_nanos() as i32;
+        // glow has 32 bits for the nanoseconds, so one call waits at most one second.
+        let timeout_ns = limit.min(Duration::from_secs(1)).as_nanos() as i32;
         let gl = self.gl.functions().map_err(fault_in(stage))?;
         // SAFETY: the fence lives as long as this value.
-        let status = unsafe { gl.client_wait_sync(self.name, glow::SYNC_FLUSH_COMMANDS_BIT, slice) };
+        let status = unsafe { gl.client_wait_sync(self.name, glow::SYNC_FLUSH_COMMANDS_BIT, timeout_ns) };
         #[cfg(test)]
         let status = if self.is_broken { glow::WAIT_FAILED } else { status };
         match status {
@@ -102,38 +102,38 @@ mod tests {
     use crate::device::gl::TextureDesc;
     use crate::{DevicePreference, device};
 
-    /// Draws a picture that takes long; in software, on threads of the driver.
-    fn draw_for_long(gl: &Rc<Gl>, turns: u32) {
+    /// Draws an image that takes long; in software, on threads of the driver.
+    fn draw_for_long(gl: &Rc<Gl>, iterations: u32) {
         let (target, format) = (glow::TEXTURE_2D, glow::RGBA8);
         let desc = TextureDesc { target, format, width: 2048, height: 2048, depth: 1, levels: 1 };
         let color = gl.texture(desc).expect("a texture");
-        let into = gl.color_framebuffer(&color).expect("complete");
-        let vertex = "#version 430 core\nvoid main() { gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2) - 1, \
+        let framebuffer = gl.color_framebuffer(&color).expect("complete");
+        let vertex_source = "#version 430 core\nvoid main() { gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2) - 1, \
                       0, 1); }";
-        let fragment = format!(
-            "#version 430 core\nout vec4 colour;\nvoid main() {{ float x = gl_FragCoord.x; for (int i = 0; i < {turns}; ++i) \
+        let fragment_source = format!(
+            "#version 430 core\nout vec4 colour;\nvoid main() {{ float x = gl_FragCoord.x; for (int i = 0; i < {iterations}; ++i) \
              x = sin(x); colour = vec4(x); }}"
         );
-        let stages = [(glow::VERTEX_SHADER, vertex), (glow::FRAGMENT_SHADER, &fragment)];
+        let stages = [(glow::VERTEX_SHADER, vertex_source), (glow::FRAGMENT_SHADER, &fragment_source)];
         let program = gl.program("long", &stages).expect("compiles");
         let empty_vertex_array = gl.vertex_array(None, &[]).expect("an array");
         gl.set_pipeline_state(super::super::PipelineState::default());
         program.bind(None);
-        gl.draw_fullscreen_triangle(&into, 2048, &empty_vertex_array);
+        gl.draw_fullscreen_triangle(&framebuffer, 2048, &empty_vertex_array);
     }
 
     #[test]
-    fn what_takes_too_long_is_an_error_with_its_name_and_no_hang() {
+    fn wait_returns_an_error_with_its_stage_after_the_limit() {
         let (gl, _) = device::open(DevicePreference::Any).expect("EGL");
         draw_for_long(&gl, if gl.limits.software { 400 } else { 40_000 });
         let fence = gl.fence("long").expect("a fence");
-        assert!(!fence.is_done(), "it has only begun");
-        let late = fence.wait("long", Duration::from_millis(1)).expect_err("too late").to_string();
-        assert!(late.contains("long") && late.contains("the device did not finish within 1ms"), "{late}");
-        fence.wait("long", Duration::from_secs(60)).expect("it ends");
+        assert!(!fence.is_done(), "expected an unfinished draw");
+        let timeout = fence.wait("long", Duration::from_millis(1)).expect_err("a timeout").to_string();
+        assert!(timeout.contains("long") && timeout.contains("the device did not finish within 1ms"), "{timeout}");
+        fence.wait("long", Duration::from_secs(60)).expect("a finished draw");
         assert!(fence.is_done() && fence.is_done_within(Duration::from_secs(9)));
-        fence.wait("long", Duration::ZERO).expect("what is over is never late");
-        let lost = gl.broken_fence().wait("gone", Duration::from_secs(60)).expect_err("lost").to_string();
-        assert!(lost.contains("gone") && lost.contains("the wait for the device failed"), "{lost}");
+        fence.wait("long", Duration::ZERO).expect("no timeout of a signaled fence");
+        let failure = gl.broken_fence().wait("gone", Duration::from_secs(60)).expect_err("a failed wait").to_string();
+        assert!(failure.contains("gone") && failure.contains("the wait for the device failed"), "{failure}");
     }
 }

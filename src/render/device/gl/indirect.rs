@@ -1,15 +1,15 @@
-//! OpenGL commands for lists that shaders write: indirect draws.
+//! Indirect draws, whose commands shaders may write.
 
 use glow::HasContext as _;
 
 use super::{Buffer, Gl, VertexArray};
 
 impl Gl {
-    /// Draws triangles of an array's index buffer with an indirect command, which a shader may have written.
+    /// Draws triangles of the index buffer of `array` with the indirect command at `offset` bytes in `commands`.
     pub(crate) fn draw_indexed_indirect(&self, array: &VertexArray, commands: &Buffer, offset: usize) {
         let Some(gl) = self.functions_or_skip() else { return };
-        // SAFETY: the command names a checked range of the index buffer. Shaders change only the number of instances or
-        // of indices; they write the indices themselves, from checked ones and never beyond the range.
+        // SAFETY: the host has written a command with a valid range of the index buffer. Shaders change only the number
+        // of instances or of indices. They also write the indices: copies of valid indices inside of the range.
         unsafe {
             gl.bind_vertex_array(Some(array.name));
             gl.bind_buffer(glow::DRAW_INDIRECT_BUFFER, Some(commands.name()));

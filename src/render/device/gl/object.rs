@@ -1,5 +1,5 @@
 //! Buffers, textures, programs, framebuffers and vertex arrays. Each owns its OpenGL name and deletes it when dropped.
-//! An object that refers to others shares their names, so that they are deleted after it.
+//! An object that refers to other objects shares ownership of their names, so that they are deleted after it.
 
 use std::rc::Rc;
 
@@ -16,8 +16,7 @@ pub(crate) struct Buffer {
     pub(crate) bytes: u64,
 }
 
-/// The name of a buffer, which is deleted once nothing refers to it: no [`Buffer`], no object that reads it, and no other
-/// API that registered it.
+/// The name of a buffer. It is deleted once no [`Buffer`], no other object and no other API refers to it.
 #[derive(Debug)]
 pub(super) struct BufferObject {
     pub(super) gl: Rc<Gl>,
@@ -31,8 +30,9 @@ pub(crate) struct TextureDesc {
     pub(crate) format: u32,
     pub(crate) width: u32,
     pub(crate) height: u32,
-    /// Layers of an array, samples of a multisampled image, else 1.
+    /// Number of layers of an array or of samples of a multisampled image, else 1.
     pub(crate) depth: u32,
+    /// Number of mipmap levels.
     pub(crate) levels: u32,
 }
 
@@ -43,7 +43,7 @@ pub(crate) struct Texture {
     pub(crate) desc: TextureDesc,
 }
 
-/// The name of a texture, which is deleted once no [`Texture`] and no framebuffer refers to it.
+/// The name of a texture. It is deleted once no [`Texture`] and no framebuffer refers to it.
 #[derive(Debug)]
 struct TextureObject {
     gl: Rc<Gl>,
@@ -52,12 +52,14 @@ struct TextureObject {
     _buffer: Option<Rc<BufferObject>>,
 }
 
+/// A linked shader program.
 #[derive(Debug)]
 pub(crate) struct Program {
     pub(super) gl: Rc<Gl>,
     pub(super) name: glow::Program,
 }
 
+/// A framebuffer object. It keeps its attachments alive.
 #[derive(Debug)]
 pub(crate) struct Framebuffer {
     gl: Rc<Gl>,
@@ -65,6 +67,7 @@ pub(crate) struct Framebuffer {
     _attachments: Vec<Rc<TextureObject>>,
 }
 
+/// A vertex array object. It keeps its buffers alive.
 #[derive(Debug)]
 pub(crate) struct VertexArray {
     gl: Rc<Gl>,
@@ -76,7 +79,7 @@ pub(crate) struct VertexArray {
 struct ReadMapping<'a> {
     gl: super::Functions<'a>,
     name: glow::Buffer,
-    first: *const u8,
+    pointer: *const u8,
     bytes: usize,
 }
 
@@ -84,21 +87,22 @@ impl<'a> ReadMapping<'a> {
     /// Maps the first bytes of a buffer, at least one. Waits for pending writes.
     fn new(buffer: &'a Buffer, bytes: usize) -> Result<Self> {
         let (gl, name) = (buffer.object.gl.functions()?, buffer.name());
-        // SAFETY: OpenGL refuses a range that is not inside the buffer or that is mapped already.
-        let first = unsafe {
+        // SAFETY: OpenGL rejects a range that is not inside the buffer or that is already mapped.
+        let pointer = unsafe {
             gl.bind_buffer(glow::COPY_READ_BUFFER, Some(name));
             gl.map_buffer_range(glow::COPY_READ_BUFFER, 0, bytes as i32, glow::MAP_READ_BIT)
         };
-        if first.is_null() {
-            return Err(fault_in("read")("the pixels cannot be mapped"));
+        if pointer.is_null() {
+            return Err(fault_in("read")("the buffer cannot be mapped"));
         }
-        Ok(Self { gl, name, first, bytes })
+        Ok(Self { gl, name, pointer, bytes })
     }
 
+    /// The mapped bytes.
     fn bytes(&self) -> &[u8] {
-        // SAFETY: the range is mapped while this value exists, and no command that writes it is issued meanwhile: the
-        // only user copies it at once.
-        unsafe { std::slice::from_raw_parts(self.first, self.bytes) }
+        // SAFETY: the range is mapped while this value exists. No command that writes the range is issued meanwhile,
+        // because the only caller copies the bytes at once.
+        unsafe { std::slice::from_raw_parts(self.pointer, self.bytes) }
     }
 }
 
@@ -126,7 +130,7 @@ impl Buffer {
         &self.object
     }
 
-    /// A handle with which other APIs register the buffer. It keeps the buffer alive.
+    /// A handle that other APIs need to register the buffer. It keeps the buffer alive.
     pub(crate) fn shared(&self) -> GlBuffer {
         let owner = Rc::clone(&self.object);
         GlBuffer { name: self.object.name.0.get(), bytes: self.bytes, owner }
@@ -136,7 +140,7 @@ impl Buffer {
     pub(crate) fn write(&self, data: &[u8]) {
         let gl = &self.object.gl;
         if data.len() as u64 > self.bytes {
-            return gl.skip(format!("a write of {} bytes to a buffer of {}", data.len(), self.bytes));
+            return gl.skip(format!("expected a write of at most {} bytes, got {}", self.bytes, data.len()));
         }
         let Some(gl) = gl.functions_or_skip() else { return };
         // SAFETY: the data fits into the buffer.
@@ -160,17 +164,18 @@ impl Buffer {
         Ok(ReadMapping::new(self, bytes)?.bytes().to_vec())
     }
 
+    /// Binds the buffer as a storage buffer of shaders.
     pub(crate) fn bind_storage(&self, binding: u32) {
         let Some(gl) = self.object.gl.functions_or_skip() else { return };
         // SAFETY: binding points below the eight that every context has.
         unsafe { gl.bind_buffer_base(glow::SHADER_STORAGE_BUFFER, binding, Some(self.object.name)) }
     }
 
-    /// Binds the first `bytes` bytes.
+    /// Binds the first `bytes` bytes as a uniform block.
     pub(crate) fn bind_uniform(&self, binding: u32, bytes: usize) {
         let gl = &self.object.gl;
         if bytes as u64 > self.bytes {
-            return gl.skip(format!("{bytes} bytes of uniforms from a buffer of {}", self.bytes));
+            return gl.skip(format!("expected at most {} bytes of uniforms, got {bytes}", self.bytes));
         }
         let Some(gl) = gl.functions_or_skip() else { return };
         // SAFETY: binding points below the 36 that every context has; the range is inside the buffer.
@@ -185,7 +190,7 @@ impl GlBufferOwner for BufferObject {
 }
 
 impl Framebuffer {
-    /// Takes ownership of a name, and shares the textures that will be attached.
+    /// Takes ownership of a name, and keeps the textures alive that will be attached.
     pub(super) fn new<'a>(
         gl: &Rc<Gl>,
         name: glow::Framebuffer,
@@ -196,14 +201,14 @@ impl Framebuffer {
 }
 
 impl VertexArray {
-    /// Takes ownership of a name, and shares the buffers that will be attached.
+    /// Takes ownership of a name, and keeps the buffers alive that will be attached.
     pub(super) fn new<'a>(gl: &Rc<Gl>, name: glow::VertexArray, buffers: impl Iterator<Item = &'a Buffer>) -> Self {
         Self { gl: Rc::clone(gl), name, _buffers: buffers.map(|buffer| Rc::clone(&buffer.object)).collect() }
     }
 }
 
 impl Texture {
-    /// Takes ownership of a name, and shares the buffer of a buffer texture.
+    /// Takes ownership of a name, and keeps the buffer of a buffer texture alive.
     pub(super) fn new(gl: &Rc<Gl>, name: glow::Texture, desc: TextureDesc, buffer: Option<&Buffer>) -> Self {
         let _buffer = buffer.map(|buffer| Rc::clone(&buffer.object));
         Self { object: Rc::new(TextureObject { gl: Rc::clone(gl), name, _buffer }), desc }
@@ -217,11 +222,14 @@ impl Texture {
         &self.object.gl
     }
 
-    /// Uploads RGBA8 pixels to one layer of one mipmap level, first row first.
-    pub(crate) fn fill(&self, level: u32, layer: u32, size: [u32; 2], rgba: &[u8]) -> Result<()> {
+    /// Uploads RGBA8 pixels to one layer of one mipmap level, row by row from the first.
+    pub(crate) fn upload_pixels(&self, level: u32, layer: u32, size: [u32; 2], rgba: &[u8]) -> Result<()> {
         let [width, height] = size.map(|side| side as i32);
         if rgba.len() != 4 * width as usize * height as usize {
-            return Err(fault_in("texture")(format!("{} bytes for {width} x {height} pixels", rgba.len())));
+            return Err(fault_in("texture")(format!(
+                "expected {width} x {height} pixels of 4 bytes, got {} bytes",
+                rgba.len()
+            )));
         }
         let gl = self.gl().functions()?;
         let pixels = glow::PixelUnpackData::Slice(Some(rgba));
@@ -230,13 +238,13 @@ impl Texture {
         unsafe {
             gl.bind_texture(self.desc.target, Some(self.name()));
             gl.pixel_store_i32(glow::UNPACK_ALIGNMENT, 1);
-            let (format, ty) = (glow::RGBA, glow::UNSIGNED_BYTE);
-            gl.tex_sub_image_3d(self.desc.target, level, 0, 0, layer, width, height, 1, format, ty, pixels);
+            let (format, data_type) = (glow::RGBA, glow::UNSIGNED_BYTE);
+            gl.tex_sub_image_3d(self.desc.target, level, 0, 0, layer, width, height, 1, format, data_type, pixels);
         }
         self.gl().check("texture")
     }
 
-    /// Sets sampler parameters: pairs of OpenGL parameter and value.
+    /// Sets sampler parameters, which are pairs of OpenGL parameter and value.
     pub(crate) fn set_sampling(&self, parameters: &[(u32, u32)], anisotropy: f32) {
         let Some(gl) = self.gl().functions_or_skip() else { return };
         // SAFETY: plain parameters of a texture of this context.
@@ -251,6 +259,7 @@ impl Texture {
         }
     }
 
+    /// Binds the texture to a texture unit.
     pub(crate) fn bind(&self, unit: u32) {
         let Some(gl) = self.gl().functions_or_skip() else { return };
         // SAFETY: units below the 96 that every context has over all stages.
@@ -274,8 +283,8 @@ impl Texture {
         let Some(gl) = self.gl().functions_or_skip() else { return };
         // SAFETY: level 0 of a texture whose format the shader declares.
         unsafe {
-            let layered = self.desc.target == glow::TEXTURE_2D_ARRAY;
-            gl.bind_image_texture(unit, Some(self.name()), 0, layered, 0, access, self.desc.format);
+            let is_layered = self.desc.target == glow::TEXTURE_2D_ARRAY;
+            gl.bind_image_texture(unit, Some(self.name()), 0, is_layered, 0, access, self.desc.format);
         }
     }
 
@@ -291,8 +300,8 @@ impl Texture {
 }
 
 impl Program {
-    /// Makes the program current. `number`, for example the first triangle, goes to location 0 of programs that declare
-    /// one.
+    /// Makes the program current. `number`, for example the first triangle, is the uniform at location 0 of programs that
+    /// declare it.
     pub(crate) fn bind(&self, number: Option<u32>) {
         let Some(gl) = self.gl.functions_or_skip() else { return };
         // SAFETY: a linked program.
@@ -324,7 +333,8 @@ impl Program {
     }
 }
 
-macro_rules! freed_by {
+/// Implements `Drop`, which deletes the OpenGL name.
+macro_rules! delete_on_drop {
     ($($object:ty => $delete:ident),*) => {$(
         impl Drop for $object {
             fn drop(&mut self) {
@@ -335,7 +345,7 @@ macro_rules! freed_by {
     )*};
 }
 
-freed_by!(
+delete_on_drop!(
     BufferObject => delete_buffer,
     TextureObject => delete_texture,
     Program => delete_program,

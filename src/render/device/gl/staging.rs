@@ -17,15 +17,15 @@ use modalcast_model::error::{Result, fault_in};
 #[derive(Debug)]
 pub(crate) struct StagingBuffer {
     pub(crate) buffer: Buffer,
-    /// Address of the persistent mapping; none where the context does not support it.
-    mapped: Option<*const u8>,
-    /// Disconnects when the current reader is done.
+    /// Address of the persistent mapping; `None` if the context does not support it.
+    mapping: Option<*const u8>,
+    /// Disconnects when the current reader is done; `None` without a reader.
     reader: RefCell<Option<Receiver<()>>>,
 }
 
 /// The buffer of a dropped staging buffer that a reader still uses.
 pub(super) struct RetiredBuffer {
-    /// Keeps the mapping.
+    /// Keeps the mapping valid.
     _object: Rc<BufferObject>,
     reader: Receiver<()>,
 }
@@ -34,17 +34,14 @@ pub(super) struct RetiredBuffer {
 /// does not write them, so it must be short-lived.
 #[derive(Debug)]
 pub(crate) enum ReadbackView {
-    /// Address and length of the mapped bytes. Dropping the sender tells the staging buffer that the reader is done.
-    Mapped {
-        first: *const u8,
-        bytes: usize,
-        _done: SyncSender<()>,
-    },
+    /// Address and length of the mapped bytes. Dropping the sender disconnects the staging buffer's `reader`.
+    Mapped { pointer: *const u8, bytes: usize, _done: SyncSender<()> },
+    /// A copy of the bytes, if the buffer is not persistently mapped.
     Copied(Vec<u8>),
 }
 
 // SAFETY: the memory is mapped for reading only. Nothing writes it before the staging buffer sees that this value was
-// dropped, and it is unmapped after that or never.
+// dropped. It is unmapped after that, or never.
 unsafe impl Send for ReadbackView {}
 
 impl Gl {
@@ -53,7 +50,7 @@ impl Gl {
         self.free_retired_buffers(Duration::ZERO);
         let reader = RefCell::default();
         if !self.limits.persistent_mapping {
-            return Ok(StagingBuffer { buffer: self.buffer(bytes, glow::STREAM_READ, None)?, mapped: None, reader });
+            return Ok(StagingBuffer { buffer: self.buffer(bytes, glow::STREAM_READ, None)?, mapping: None, reader });
         }
         let size = i32::try_from(bytes).map_err(fault_in("readback"))?;
         let access = glow::MAP_READ_BIT | glow::MAP_PERSISTENT_BIT | glow::MAP_COHERENT_BIT;
@@ -63,30 +60,30 @@ impl Gl {
         let buffer = Buffer::new(self, name, bytes);
         // SAFETY: immutable storage, mapped as a whole for reading, for as long as the buffer exists: OpenGL unmaps it
         // when the name is deleted.
-        let mapped = unsafe {
+        let mapping = unsafe {
             gl.bind_buffer(glow::COPY_READ_BUFFER, Some(name));
             gl.buffer_storage(glow::COPY_READ_BUFFER, size, None, access | glow::CLIENT_STORAGE_BIT);
             gl.map_buffer_range(glow::COPY_READ_BUFFER, 0, size, access)
         };
         self.check("readback")?;
-        if mapped.is_null() {
-            return Err(fault_in("readback")(format!("{bytes} bytes cannot be mapped")));
+        if mapping.is_null() {
+            return Err(fault_in("readback")(format!("cannot map {bytes} bytes")));
         }
-        Ok(StagingBuffer { buffer, mapped: Some(mapped.cast_const()), reader })
+        Ok(StagingBuffer { buffer, mapping: Some(mapping.cast_const()), reader })
     }
 
-    /// Frees the retired buffers whose readers are done, after waiting for each reader at most `limit`. Buffers that
-    /// are still read survive, and with them the context: a leak is better than a read of unmapped memory.
+    /// Frees the retired buffers whose readers are done, after waiting for each reader at most `limit`. Buffers with
+    /// active readers remain, and keep the context alive: a leak is better than a read of unmapped memory.
     pub(crate) fn free_retired_buffers(&self, limit: Duration) {
-        let mut retired = mem::take(&mut *self.retired.borrow_mut());
-        retired.retain(|buffer| !is_done(&buffer.reader, limit));
-        self.retired.borrow_mut().extend(retired);
+        let mut retired_buffers = mem::take(&mut *self.retired_buffers.borrow_mut());
+        retired_buffers.retain(|buffer| !is_done(&buffer.reader, limit));
+        self.retired_buffers.borrow_mut().extend(retired_buffers);
     }
 }
 
 impl StagingBuffer {
-    /// The first `bytes` bytes. Call it once a fence after the last command that writes them has passed; no command may write
-    /// the buffer while the bytes are lent.
+    /// A view of the first `bytes` bytes. The caller has waited for a fence after the last command that writes them. No
+    /// command may write the buffer while the view exists.
     ///
     /// # Errors
     /// `Fault` when the buffer is smaller or cannot be mapped.
@@ -94,21 +91,21 @@ impl StagingBuffer {
         if bytes as u64 > self.buffer.bytes {
             return Err(fault_in("readback")(format!("expected at most {} bytes, got {bytes}", self.buffer.bytes)));
         }
-        let Some(first) = self.mapped else { return self.buffer.read(bytes).map(ReadbackView::Copied) };
-        // No message is ever sent; the reader signals with the disconnect alone.
-        let (done, reader) = mpsc::sync_channel(1);
+        let Some(pointer) = self.mapping else { return self.buffer.read(bytes).map(ReadbackView::Copied) };
+        // No message is sent. The disconnect signals that the reader is done.
+        let (sender, reader) = mpsc::sync_channel(1);
         self.reader.replace(Some(reader));
-        Ok(ReadbackView::Mapped { first, bytes, _done: done })
+        Ok(ReadbackView::Mapped { pointer, bytes, _done: sender })
     }
 
     /// Waits at most `limit` for the reader and returns whether it is done.
     pub(crate) fn is_read(&self, limit: Duration) -> bool {
         let mut reader = self.reader.borrow_mut();
-        let over = reader.as_ref().is_none_or(|reader| is_done(reader, limit));
-        if over {
+        let is_read = reader.as_ref().is_none_or(|reader| is_done(reader, limit));
+        if is_read {
             *reader = None;
         }
-        over
+        is_read
     }
 
     /// Copies a range of bytes, under the same conditions as [`Self::view`].
@@ -117,7 +114,7 @@ impl StagingBuffer {
         view.bytes()
             .get(range)
             .map(<[u8]>::to_vec)
-            .ok_or_else(|| fault_in("readback")("the range ends before its start"))
+            .ok_or_else(|| fault_in("readback")("expected a range that does not end before its start"))
     }
 }
 
@@ -126,13 +123,13 @@ impl Drop for StagingBuffer {
     fn drop(&mut self) {
         if let Some(reader) = self.reader.take().filter(|reader| !is_done(reader, Duration::ZERO)) {
             let object = self.buffer.object();
-            let retired = RetiredBuffer { _object: Rc::clone(object), reader };
-            object.gl.retired.borrow_mut().push(retired);
+            let retired_buffer = RetiredBuffer { _object: Rc::clone(object), reader };
+            object.gl.retired_buffers.borrow_mut().push(retired_buffer);
         }
     }
 }
 
-/// Whether the reader is done, after waiting at most `limit`. The disconnect signals its end.
+/// Whether the reader is done, that is, has disconnected, after waiting at most `limit`.
 fn is_done(reader: &Receiver<()>, limit: Duration) -> bool {
     match limit {
         Duration::ZERO => reader.try_recv() == Err(TryRecvError::Disconnected),
@@ -144,7 +141,7 @@ impl ReadbackView {
     pub(crate) fn bytes(&self) -> &[u8] {
         match self {
             // SAFETY: the range is inside the mapping, which stays mapped and unwritten while this value exists.
-            Self::Mapped { first, bytes, .. } => unsafe { std::slice::from_raw_parts(*first, *bytes) },
+            Self::Mapped { pointer, bytes, .. } => unsafe { std::slice::from_raw_parts(*pointer, *bytes) },
             Self::Copied(bytes) => bytes,
         }
     }
@@ -153,7 +150,7 @@ impl ReadbackView {
 #[cfg(test)]
 impl Gl {
     /// Number of buffers that wait for their readers.
-    pub(crate) fn retired(&self) -> usize {
-        self.retired.borrow().len()
+    pub(crate) fn retired_buffer_count(&self) -> usize {
+        self.retired_buffers.borrow().len()
     }
 }

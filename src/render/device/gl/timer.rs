@@ -8,10 +8,11 @@ use glow::HasContext as _;
 use super::Gl;
 use modalcast_model::error::{Result, fault_in};
 
-/// Milliseconds of a sequence of commands. Hardware uses a timer query. Software uses the wall clock and waits before
-/// and after, because its timer queries are meaningless.
+/// Measures the time of a sequence of commands. On hardware this is a timer query. Timer queries of software rasterizers
+/// are meaningless, so there the wall clock measures the commands between two waits.
 #[derive(Debug)]
 pub(crate) enum PassTimer {
+    /// Milliseconds by the wall clock.
     Wall(f64),
     Query(Rc<Gl>, glow::Query),
 }
@@ -25,47 +26,48 @@ impl Gl {
         self.fence(stage)?.wait(stage, limit)
     }
 
-    /// Runs the commands of a pass and measures their device time. In software this waits for them, at most `limit`.
-    /// Each pass owns a query until its timer is dropped, so that several frames can be in flight.
+    /// Runs the commands of a pass and measures their device time. A software rasterizer waits for the commands, at most
+    /// `limit`. Each timer has its own query until it is dropped, so that several frames can be in flight.
     ///
     /// # Errors
-    /// Those of the commands; `Fault` of the pass when software does not finish in time.
+    /// Those of the commands; `Fault` of the pass when a software rasterizer exceeds `limit`.
     pub(crate) fn time_pass(
         self: &Rc<Self>,
-        (pass, limit): (&'static str, Duration),
+        pass: &'static str,
+        limit: Duration,
         commands: impl FnOnce() -> Result<()>,
     ) -> Result<PassTimer> {
         if self.limits.software {
             self.wait(pass, limit)?;
-            let begin = Instant::now();
+            let start = Instant::now();
             commands()?;
             self.wait(pass, limit)?;
-            return Ok(PassTimer::Wall(begin.elapsed().as_secs_f64() * 1e3));
+            return Ok(PassTimer::Wall(start.elapsed().as_secs_f64() * 1e3));
         }
-        let timer = PassTimer::Query(Rc::clone(self), self.query()?);
-        let active = ActiveQuery::begin(&timer)?;
+        let timer = PassTimer::Query(Rc::clone(self), self.acquire_query()?);
+        let active_query = ActiveQuery::begin(&timer)?;
         commands()?;
-        drop(active);
+        drop(active_query);
         Ok(timer)
     }
 
-    /// A query that no timer uses.
-    fn query(&self) -> Result<glow::Query> {
-        let free = self.free_queries.borrow_mut().pop();
+    /// Takes a query from the pool, or creates one.
+    fn acquire_query(&self) -> Result<glow::Query> {
+        let free_query = self.free_queries.borrow_mut().pop();
         let gl = self.functions()?;
         // SAFETY: a new name, which stays in the pool until the context is destroyed.
-        free.map_or_else(|| unsafe { gl.create_query() }.map_err(fault_in("timer")), Ok)
+        free_query.map_or_else(|| unsafe { gl.create_query() }.map_err(fault_in("timer")), Ok)
     }
 }
 
-/// A query that measures the commands while this value exists. It ends also if the commands fail or panic, so that the
-/// next query can begin.
+/// A timer query that has begun. Dropping this value ends the query, also if the commands fail or panic, so that the next
+/// query can begin.
 struct ActiveQuery<'a> {
     gl: &'a Gl,
 }
 
 impl<'a> ActiveQuery<'a> {
-    /// Begins the query of a timer; none is active meanwhile.
+    /// Begins the query of a timer. No other query may be active.
     fn begin(timer: &'a PassTimer) -> Result<Option<Self>> {
         let PassTimer::Query(gl, query) = timer else { return Ok(None) };
         // SAFETY: the query belongs to the timer alone. OpenGL reports an error if another one is active.
@@ -83,7 +85,8 @@ impl Drop for ActiveQuery<'_> {
 }
 
 impl PassTimer {
-    /// Milliseconds. Waits for the result if the device has not finished. 0 if the context cannot be made current.
+    /// The time in milliseconds. Waits for the result if the device has not finished. 0 if the context cannot be made
+    /// current.
     pub(crate) fn ms(&self) -> f64 {
         match self {
             Self::Wall(ms) => *ms,
@@ -119,7 +122,7 @@ impl Drop for PassTimer {
 
 #[cfg(test)]
 impl Gl {
-    /// A timer of commands that the device never reaches.
+    /// A timer that is never done.
     pub(crate) fn unstarted_timer(self: &Rc<Self>) -> PassTimer {
         // SAFETY: a new name; reading a query that was never begun is an OpenGL error without a result.
         let query = unsafe { self.functions().expect("current").create_query() }.expect("a query");
