@@ -5,9 +5,9 @@
 
 use std::sync::Arc;
 
-pub use crate::gpu::{CompiledVariant, assert_compiles};
+pub use crate::gpu::{CAPABILITIES, CompiledVariant, assert_compiles};
 
-use modalcast_model::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
+use modalcast_model::domain::{Corners, Domain, Material, Mesh, Modes, Shape};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState};
 
 /// Deterministic random numbers from -1 to 1.
@@ -46,24 +46,9 @@ pub fn scene(sizes: &[(usize, usize)], deformation: DeformationSettings, rng: &m
     parts.materials = vec![Material::default()];
     for (index, (vertices, rank)) in sizes.iter().enumerate() {
         parts.shapes.push(shape(*vertices, *rank, rng));
-        parts.domains.push(domain(index));
+        parts.domains.push(Domain::new(format!("noise {index}"), index));
     }
     Scene::new(parts).expect("a valid scene")
-}
-
-fn domain(shape: usize) -> Domain {
-    Domain {
-        name: format!("noise {shape}"),
-        shape,
-        material: 0,
-        material_ranges: vec![],
-        placement: Transform::IDENTITY,
-        attachment: None,
-        follows: None,
-        rest_q: vec![],
-        shares_q_with: None,
-        metadata: Metadata::default(),
-    }
 }
 
 /// One domain for each (vertices, rank, triangles), with random corner normals, and a random state.
@@ -73,7 +58,7 @@ pub fn scene_and_state(shapes: &[(usize, usize, usize)]) -> (Arc<Scene>, SceneSt
     parts.materials = vec![Material::default()];
     for (shape, (vertices, rank, triangles)) in shapes.iter().enumerate() {
         parts.shapes.push(shape_with_corners(&mut rng, *vertices, *rank, *triangles));
-        parts.domains.push(domain(shape));
+        parts.domains.push(Domain::new(format!("noise {shape}"), shape));
     }
     let scene = Scene::new(parts).expect("a valid scene");
     let mut state = SceneState::rest(&scene);

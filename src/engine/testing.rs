@@ -7,7 +7,7 @@ use super::source::SceneSource;
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
-use modalcast_model::domain::{Attachment, Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
+use modalcast_model::domain::{Attachment, Domain, Material, Mesh, Modes, Shape, Transform};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::load::OpenedScene;
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState};
@@ -28,18 +28,7 @@ fn strips(deformation: DeformationSettings) -> Arc<Scene> {
         Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
     let columns = (0..24).map(|entry| if entry % 5 == 0 { 0.5 } else { 0.0 }).collect();
     let shape = Shape::new(mesh, Modes::from_columns(12, 2, columns).expect("12 x 2")).expect("fits");
-    let domain = |name: &str, attachment| Domain {
-        name: name.into(),
-        shape: 0,
-        material: 0,
-        material_ranges: vec![],
-        placement: Transform::IDENTITY,
-        attachment,
-        follows: None,
-        rest_q: vec![],
-        shares_q_with: None,
-        metadata: Metadata::default(),
-    };
+    let domain = |name: &str, attachment| Domain { attachment, ..Domain::new(name, 0) };
     let joint = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 2] };
     let domains = vec![domain("left", None), domain("right", Some(joint))];
     let (shapes, materials) = (vec![shape], vec![Material::default()]);

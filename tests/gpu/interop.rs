@@ -6,13 +6,15 @@ use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, Device};
 use modalcast_model::deform::{Deformer, VertexAttributes};
 use modalcast_model::raster::{GlBuffer, GlVertexBuffers};
 use modalcast_model::scene::{Camera, Scene};
-use modalcast_render::{DevicePreference, FrameParams, MAX_FRAMES_IN_FLIGHT, Renderer, SceneBuffers};
+use modalcast_render::{DevicePreference, FrameParams, MAX_FRAMES_IN_FLIGHT, Renderer};
 
 use crate::accuracy::{assert_equals_reference, have_equal_bits};
 use crate::scenes;
 
-fn shared_buffers(buffers: &SceneBuffers) -> GlVertexBuffers {
-    buffers.vertex_buffers()
+/// Opens a deformer that writes into `buffers`, or, with `None`, into memory of its own.
+fn open_deformer(device: &Arc<Device>, scene: &Arc<Scene>, buffers: Option<GlVertexBuffers>) -> CudaDeformer {
+    let options = CudaDeformerOptions::with_bounding_axes(scene.light_axes());
+    CudaDeformer::new(device, scene, buffers, options).expect("expected a CUDA deformer")
 }
 
 fn open_renderer() -> (Renderer, Arc<Device>, Arc<Scene>) {
@@ -26,16 +28,8 @@ fn open_renderer() -> (Renderer, Arc<Device>, Arc<Scene>) {
 fn gpu_shared_buffers_have_the_bits_of_copied_buffers() {
     let (mut renderer, device, scene) = open_renderer();
     let buffers = renderer.load(&scene).expect("expected the scene to load");
-    let mut sharing_deformer = CudaDeformer::new(
-        &device,
-        &scene,
-        Some(shared_buffers(&buffers)),
-        CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
-    )
-    .expect("expected a CUDA deformer");
-    let mut copying_deformer =
-        CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))
-            .expect("expected a CUDA deformer");
+    let mut sharing_deformer = open_deformer(&device, &scene, Some(buffers.vertex_buffers()));
+    let mut copying_deformer = open_deformer(&device, &scene, None);
     assert!(sharing_deformer.shares_buffers(), "expected shared buffers");
     assert!(!copying_deformer.shares_buffers());
     for seed in 0..3 {
@@ -58,16 +52,8 @@ fn gpu_shared_buffers_have_the_bits_of_copied_buffers() {
 fn gpu_shared_buffers_are_read_back_during_the_next_step() {
     let (mut renderer, device, scene) = open_renderer();
     let buffers = renderer.load(&scene).expect("expected the scene to load");
-    let mut sharing_deformer = CudaDeformer::new(
-        &device,
-        &scene,
-        Some(shared_buffers(&buffers)),
-        CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
-    )
-    .expect("expected a CUDA deformer");
-    let mut copying_deformer =
-        CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))
-            .expect("expected a CUDA deformer");
+    let mut sharing_deformer = open_deformer(&device, &scene, Some(buffers.vertex_buffers()));
+    let mut copying_deformer = open_deformer(&device, &scene, None);
     assert!(sharing_deformer.shares_buffers(), "expected shared buffers");
     let mut pending = None;
     for seed in 0..50 {
@@ -102,13 +88,7 @@ fn gpu_frames_of_shared_and_uploaded_buffers_are_equal() {
         renderer.load(&scene).expect("expected the scene to load"),
         renderer.load(&scene).expect("expected the scene to load"),
     );
-    let mut sharing_deformer = CudaDeformer::new(
-        &device,
-        &scene,
-        Some(shared_buffers(&shared_scene)),
-        CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
-    )
-    .expect("expected a CUDA deformer");
+    let mut sharing_deformer = open_deformer(&device, &scene, Some(shared_scene.vertex_buffers()));
     let bounds = sharing_deformer.deform(&state).expect("expected the step to succeed").bounds;
     let params =
         FrameParams { camera: Camera::fit_to_scene(&scene, 64, 64), width: 320, height: 240, bounds, light: None };
@@ -137,16 +117,8 @@ fn gpu_frames_in_flight_keep_the_vertices_of_their_step() {
         renderer.load(&scene).expect("expected the scene to load"),
         renderer.load(&scene).expect("expected the scene to load"),
     );
-    let mut sharing_deformer = CudaDeformer::new(
-        &device,
-        &scene,
-        Some(shared_buffers(&shared_scene)),
-        CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
-    )
-    .expect("expected a CUDA deformer");
-    let mut copying_deformer =
-        CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))
-            .expect("expected a CUDA deformer");
+    let mut sharing_deformer = open_deformer(&device, &scene, Some(shared_scene.vertex_buffers()));
+    let mut copying_deformer = open_deformer(&device, &scene, None);
     assert!(sharing_deformer.shares_buffers(), "expected shared buffers");
     // A large image, so that a frame takes longer than a step.
     let params = |bounds| FrameParams {
@@ -194,31 +166,19 @@ fn gpu_unknown_or_small_buffers_fall_back_to_copies() {
     let small_scene =
         renderer.load(&scenes::random_scene(&[(4, 0)], 1, true, false)).expect("expected the scene to load");
     let loaded_scene = renderer.load(&scene).expect("expected the scene to load");
-    let GlVertexBuffers { positions, normals, .. } = shared_buffers(&loaded_scene);
+    let GlVertexBuffers { positions, normals, .. } = loaded_scene.vertex_buffers();
     let unknown_buffers = GlVertexBuffers {
         positions: GlBuffer { name: 999_999, ..positions.clone() },
         normals: GlBuffer { name: 999_998, ..normals },
         tangents: Some(GlBuffer { name: 999_997, ..positions }),
     };
-    let without_tangents = GlVertexBuffers { tangents: None, ..shared_buffers(&loaded_scene) };
-    for buffers in [shared_buffers(&small_scene), unknown_buffers, without_tangents] {
-        let mut deformer = CudaDeformer::new(
-            &device,
-            &scene,
-            Some(buffers.clone()),
-            CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
-        )
-        .expect("expected a CUDA deformer");
+    let without_tangents = GlVertexBuffers { tangents: None, ..loaded_scene.vertex_buffers() };
+    for buffers in [small_scene.vertex_buffers(), unknown_buffers, without_tangents] {
+        let mut deformer = open_deformer(&device, &scene, Some(buffers.clone()));
         assert!(!deformer.shares_buffers(), "{buffers:?}");
         assert_equals_reference("copied buffers", &scene, &scenes::random_state(&scene, 3), &mut deformer);
     }
-    let mut sharing_deformer = CudaDeformer::new(
-        &device,
-        &scene,
-        Some(shared_buffers(&loaded_scene)),
-        CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
-    )
-    .expect("expected a CUDA deformer");
+    let mut sharing_deformer = open_deformer(&device, &scene, Some(loaded_scene.vertex_buffers()));
     assert!(sharing_deformer.shares_buffers(), "expected shared buffers after rejected ones");
     assert_equals_reference("after rejected buffers", &scene, &scenes::random_state(&scene, 3), &mut sharing_deformer);
 }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use modalcast_model::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
+use modalcast_model::domain::{Corners, Domain, Material, Mesh, Modes, Shape, Texture, Transform};
 use modalcast_model::scene::{Scene, SceneParts, SceneState};
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
@@ -61,18 +61,7 @@ pub(crate) fn random_shape(random: &mut Random, vertices: usize, rank: usize) ->
 }
 
 pub(crate) fn new_domain(shape: usize, material: usize) -> Domain {
-    Domain {
-        name: format!("shape {shape}"),
-        shape,
-        material,
-        placement: Transform::IDENTITY,
-        material_ranges: vec![],
-        attachment: None,
-        follows: None,
-        rest_q: Vec::new(),
-        shares_q_with: None,
-        metadata: Metadata::default(),
-    }
+    Domain { material, ..Domain::new(format!("shape {shape}"), shape) }
 }
 
 /// Index of the material with a normal map in [`parts_of_shapes`]. Material 0 has no normal map.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::reference;
 use modalcast_model::deform::Deformer;
-use modalcast_model::domain::{Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
+use modalcast_model::domain::{Corners, Domain, Material, Mesh, Modes, Shape, Texture};
 use modalcast_model::scene::{Scene, SceneParts, SceneState};
 
 use crate::tolerance::{Tolerance, find_difference, max_distance};
@@ -39,21 +39,6 @@ pub(crate) fn random_strip(vertices: usize, rank: usize, random: &mut TestRng) -
     Shape::new(mesh, modes).expect("expected a valid shape")
 }
 
-pub(crate) fn domain(shape: usize, name: String) -> Domain {
-    Domain {
-        name,
-        shape,
-        material: 0,
-        placement: Transform::IDENTITY,
-        attachment: None,
-        follows: None,
-        material_ranges: vec![],
-        rest_q: vec![],
-        shares_q_with: None,
-        metadata: Metadata::default(),
-    }
-}
-
 /// A scene of strips with a normal map; each strip has n vertices and rank r, given as (n, r).
 fn strips_scene(sizes: &[(usize, usize)]) -> Arc<Scene> {
     let mut random = TestRng(42);
@@ -62,7 +47,7 @@ fn strips_scene(sizes: &[(usize, usize)]) -> Arc<Scene> {
     parts.materials = vec![Material { normal_texture: Some(0), ..Material::default() }];
     for (index, (vertices, rank)) in sizes.iter().enumerate() {
         parts.shapes.push(random_strip(*vertices, *rank, &mut random));
-        parts.domains.push(domain(index, format!("strip {index}")));
+        parts.domains.push(Domain::new(format!("strip {index}"), index));
     }
     Scene::new(parts).expect("expected a valid scene")
 }
@@ -154,7 +139,7 @@ fn normals_stay_orthogonal_to_a_sheared_plane() {
         Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("expected a valid mesh");
     parts.shapes = vec![Shape::new(mesh, Modes::rigid()).expect("expected a valid shape")];
     parts.materials = vec![Material::default()];
-    parts.domains = vec![domain(0, "plane".into())];
+    parts.domains = vec![Domain::new("plane", 0)];
     let scene = Scene::new(parts).expect("expected a valid scene");
     let mut state = SceneState::rest(&scene);
     // z += x tilts the plane about y. Transforming the normal by A itself would leave it upright.
@@ -195,7 +180,7 @@ fn runs_are_bit_identical_and_zero_rows_do_not_move() {
     shape.modes = Modes::from_columns(900, 8, columns).expect("expected valid modes");
     parts.shapes = vec![shape];
     parts.materials = vec![Material::default()];
-    parts.domains = vec![domain(0, "clamped".into())];
+    parts.domains = vec![Domain::new("clamped", 0)];
     let scene = Scene::new(parts).expect("expected a valid scene");
     let mut cpu = CpuDeformer::new(&scene);
     let mut deform = |state: &SceneState| {

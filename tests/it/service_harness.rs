@@ -134,18 +134,7 @@ fn grid(side: u32) -> Mesh {
 }
 
 fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
-    Domain {
-        name: name.into(),
-        shape: 0,
-        material: 0,
-        material_ranges: vec![],
-        placement: Transform::IDENTITY,
-        attachment,
-        follows: None,
-        rest_q: vec![],
-        shares_q_with: None,
-        metadata: Metadata::default(),
-    }
+    Domain { attachment, ..Domain::new(name, 0) }
 }
 
 fn scene(name: &str, shape: Shape, domains: Vec<Domain>) -> Arc<Scene> {

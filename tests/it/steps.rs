@@ -1,6 +1,6 @@
 //! Steps over the wire: vertices are those of the acknowledged steps, under both policies.
 
-use modalcast::engine::{Delivery, OutputSpec, StepSelector};
+use modalcast::engine::{Delivery, OutputSpec, StepSelector, Subscription};
 use modalcast_model::deform::VertexAttributes;
 use modalcast_proto::v1;
 use v1::Policy;
@@ -12,6 +12,13 @@ use crate::service_harness::{
 
 fn vertices_of(scene: &str) -> v1::GetVerticesRequest {
     v1::GetVerticesRequest { scene: scene.into(), ..v1::GetVerticesRequest::default() }
+}
+
+/// Subscribes to positions and normals of all domains of the open scene "strips".
+async fn subscribe_vertices(server: &Server, delivery: Delivery) -> Subscription {
+    let scene = server.engine.find("strips").expect("expected an open scene");
+    let spec = OutputSpec::Vertices(VertexAttributes::VERTICES);
+    scene.subscribe(spec, delivery).await.expect("expected a subscription")
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -77,15 +84,9 @@ async fn lossless_subscriber_gets_every_step_in_order() {
 async fn overlapped_steps_keep_their_order_and_vertices() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let engine = server.engine.find("strips").expect("expected an open scene");
     let mut subscriptions = Vec::new();
     for delivery in [Delivery::Lossless, Delivery::Lossless, Delivery::Latest] {
-        subscriptions.push(
-            engine
-                .subscribe(OutputSpec::Vertices(VertexAttributes::VERTICES), delivery)
-                .await
-                .expect("expected a subscription"),
-        );
+        subscriptions.push(subscribe_vertices(&server, delivery).await);
     }
     let steps: Vec<_> = (0..40).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();
     let mut driver = server.drive("strips", Policy::Lossless, 40).await;
@@ -123,13 +124,7 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
 async fn unread_lossless_subscription_applies_back_pressure() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let mut subscription = server
-        .engine
-        .find("strips")
-        .expect("expected an open scene")
-        .subscribe(OutputSpec::Vertices(VertexAttributes::VERTICES), Delivery::Lossless)
-        .await
-        .expect("expected a subscription");
+    let mut subscription = subscribe_vertices(&server, Delivery::Lossless).await;
     let mut driver = server.drive("strips", Policy::Lossless, 2).await;
     // Two steps are queued in the subscription. The third is computed but not acknowledged, the fourth waits, and the
     // fifth exceeds the window.
@@ -157,13 +152,7 @@ async fn stalled_subscriber_is_disconnected_and_writer_continues() {
     let stall_timeout = std::time::Duration::from_millis(50);
     let server = Server::start_with(|config| modalcast::config::Config { stall_timeout, ..config }).await;
     server.open("strips").await;
-    let mut subscription = server
-        .engine
-        .find("strips")
-        .expect("expected an open scene")
-        .subscribe(OutputSpec::Vertices(VertexAttributes::VERTICES), Delivery::Lossless)
-        .await
-        .expect("expected a subscription");
+    let mut subscription = subscribe_vertices(&server, Delivery::Lossless).await;
     let mut driver = server.drive("strips", Policy::Lossless, 1).await;
     for number in 1..=6 {
         driver.step_acknowledged(step(number, &[0], &[0.1, 0.0])).await;
@@ -211,11 +200,7 @@ async fn latest_subscriber_gets_current_step_and_skip_count() {
     server.open("strips").await;
     let mut driver = server.drive("strips", Policy::Lossless, 0).await;
     driver.step_acknowledged(step(3, &[0], &[0.1, 0.0])).await;
-    let host = server.engine.find("strips").expect("expected an open scene");
-    let mut subscription = host
-        .subscribe(OutputSpec::Vertices(VertexAttributes::VERTICES), Delivery::Latest)
-        .await
-        .expect("expected a subscription");
+    let mut subscription = subscribe_vertices(&server, Delivery::Latest).await;
     let first = with_timeout(subscription.next()).await.expect("the current step");
     assert_eq!((first.step.number, first.skipped), (3, 0));
     for number in 4..=8 {

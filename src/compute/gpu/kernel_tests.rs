@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::launch::compile::{CompileJob, nvrtc};
-use super::launch::{CompiledVariant, KernelSource};
+use super::launch::{CAPABILITIES, CompiledVariant, KernelSource};
 use super::tables::occupancy::deform_tuning;
 use super::tables::{kernels, layout};
 use modalcast_model::error::Error;
@@ -48,14 +48,17 @@ fn variants_of_deform(features: &[&'static str]) -> Vec<Variant> {
     }
     for storage in storages() {
         let sum = |more: &[&'static str]| [&["MODES"], storage.as_slice(), more].concat();
-        for more in subsets(&["MODE_TRUNCATION", "COMPENSATED_SUM"]) {
-            with(&sum(&more), &orient, &[]);
+        let largest = ["MODE_TRUNCATION", "COMPENSATED_SUM"];
+        // The two 16-bit types decode with the same registers, so the sums between the smallest and the largest one are
+        // compiled for one of them.
+        let mut sums = subsets(&largest);
+        sums.retain(|more| storage != ["STORE_BF16"] || more.len() != 1);
+        for more in &sums {
+            with(&sum(more), &orient, &[]);
         }
-        // The registers that readback outputs and followers add, to the smallest and to the largest sum.
-        for more in [&[][..], &["MODE_TRUNCATION", "COMPENSATED_SUM"]] {
-            with(&sum(more), &orient[1..3], &["DISPLACEMENTS"]);
-            with(&sum(more), &orient[1..3], &["FOLLOWERS"]);
-        }
+        // The registers that readback outputs and followers add to the largest sum.
+        with(&sum(&largest), &orient[1..3], &["DISPLACEMENTS"]);
+        with(&sum(&largest), &orient[1..3], &["FOLLOWERS"]);
     }
     for storage in storages() {
         let smallest = [&["MODES"], storage.as_slice()].concat();
@@ -81,11 +84,8 @@ fn variants_of_batch(features: &[&'static str]) -> Vec<Variant> {
 
 /// All variants of the other kernels.
 fn variants_of_others(features: &[&'static str]) -> Vec<Variant> {
-    let capabilities = [(7, 5), (8, 0), (9, 0), (12, 0)];
-    capabilities
-        .into_iter()
-        .flat_map(|capability| subsets(features).into_iter().map(move |set| (set, capability)))
-        .collect()
+    let variants_of = |capability| subsets(features).into_iter().map(move |set| (set, capability));
+    CAPABILITIES.into_iter().flat_map(variants_of).collect()
 }
 
 /// Compiles all variants on all cores. NVRTC programs are independent of each other.

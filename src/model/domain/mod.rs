@@ -134,6 +134,22 @@ pub struct Domain {
 }
 
 impl Domain {
+    /// An unattached domain with material 0, at rest in the frame of the scene.
+    pub fn new(name: impl Into<String>, shape: usize) -> Self {
+        Self {
+            name: name.into(),
+            shape,
+            material: 0,
+            material_ranges: vec![],
+            placement: Transform::IDENTITY,
+            attachment: None,
+            follows: None,
+            rest_q: vec![],
+            shares_q_with: None,
+            metadata: Metadata::default(),
+        }
+    }
+
     /// Indices of the materials of the domain's triangles, one per range.
     pub fn materials(&self) -> impl Iterator<Item = usize> + '_ {
         let single_material = self.material_ranges.is_empty().then_some(self.material);

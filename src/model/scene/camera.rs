@@ -319,24 +319,13 @@ mod tests {
     }
 
     fn block(size: [f32; 3]) -> std::sync::Arc<Scene> {
-        use crate::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
+        use crate::domain::{Domain, Material, Mesh, Modes, Shape};
         let rest = vec![[0.0; 3], size, [size[0], 0.0, 0.0]];
         let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("a mesh");
         let mut parts = crate::scene::SceneParts::named("block");
         parts.shapes = vec![Shape::new(mesh, Modes::rigid()).expect("a shape")];
         parts.materials = vec![Material::default()];
-        parts.domains = vec![Domain {
-            name: "block".into(),
-            shape: 0,
-            material: 0,
-            placement: Transform::IDENTITY,
-            attachment: None,
-            follows: None,
-            material_ranges: vec![],
-            rest_q: vec![],
-            shares_q_with: None,
-            metadata: Metadata::default(),
-        }];
+        parts.domains = vec![Domain::new("block", 0)];
         Scene::new(parts).expect("a scene")
     }
 }

@@ -375,18 +375,7 @@ mod tests {
         let rest_positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
         let mesh = Mesh::from_indexed(rest_positions, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
             .expect("a square");
-        let domain = Domain {
-            name: "square".into(),
-            shape: 0,
-            material: 0,
-            material_ranges,
-            placement: Transform::IDENTITY,
-            attachment: None,
-            follows: None,
-            rest_q: vec![],
-            shares_q_with: None,
-            metadata: crate::domain::Metadata::default(),
-        };
+        let domain = Domain { material_ranges, ..Domain::new("square", 0) };
         let mut parts = SceneParts::named("square");
         parts.shapes.push(Shape::new(mesh, Modes::rigid()).expect("rigid"));
         parts.materials = vec![Material::default(), Material { alpha_mode: AlphaMode::Blend, ..Material::default() }];

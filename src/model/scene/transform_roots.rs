@@ -163,7 +163,7 @@ pub(super) fn check_transform_targets(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::domain::{FollowConstraint, Material, Mesh, Metadata, Modes, Shape};
+    use crate::domain::{FollowConstraint, Material, Mesh, Modes, Shape};
     use crate::scene::{Scene, SceneParts};
 
     fn translate_x(x: f32) -> Transform {
@@ -173,18 +173,7 @@ mod tests {
     }
 
     fn point_domain(index: usize) -> Domain {
-        Domain {
-            name: format!("point {index}"),
-            shape: 0,
-            material: 0,
-            material_ranges: vec![],
-            placement: Transform::IDENTITY,
-            attachment: None,
-            follows: None,
-            rest_q: vec![],
-            shares_q_with: None,
-            metadata: Metadata::default(),
-        }
+        Domain::new(format!("point {index}"), 0)
     }
 
     /// Five domains of one vertex. Each pair (child, parent) adds a follower with a frame at x = 1, 2, 3, ...

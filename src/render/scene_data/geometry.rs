@@ -199,7 +199,7 @@ fn winding_disagrees(mesh: &modalcast_model::domain::Mesh, triangle: [u32; 3]) -
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use modalcast_model::domain::{MaterialRange, Mesh, Metadata, Modes, Shape, Transform};
+    use modalcast_model::domain::{MaterialRange, Mesh, Modes, Shape, Transform};
     use modalcast_model::scene::SceneParts;
 
     /// A scene of one unit square (two triangles) per material.
@@ -216,18 +216,7 @@ pub(crate) mod tests {
     }
 
     fn domain(material: usize, placement: Transform) -> Domain {
-        Domain {
-            name: format!("square {material}"),
-            shape: 0,
-            material,
-            material_ranges: vec![],
-            placement,
-            attachment: None,
-            follows: None,
-            rest_q: vec![],
-            shares_q_with: None,
-            metadata: Metadata::default(),
-        }
+        Domain { material, placement, ..Domain::new(format!("square {material}"), 0) }
     }
 
     fn of(alpha_mode: AlphaMode, double_sided: bool) -> Material {

@@ -4,9 +4,7 @@ use std::sync::Arc;
 
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer};
-use modalcast_model::domain::{
-    Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform, smooth_normals,
-};
+use modalcast_model::domain::{Corners, Domain, Material, Mesh, Modes, Shape, Texture, Transform, smooth_normals};
 use modalcast_model::scene::{NormalMethod, Scene, SceneParts, SceneState};
 use nalgebra::{Matrix3, Vector3};
 
@@ -119,24 +117,9 @@ pub(crate) fn scene_with_normals(shapes: Vec<Shape>, normals: NormalMethod) -> A
     parts.deformation.normals = normals;
     parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("expected a valid texture")];
     parts.materials = vec![Material { normal_texture: Some(0), ..Material::default() }];
-    parts.domains = (0..shapes.len()).map(domain).collect();
+    parts.domains = (0..shapes.len()).map(|shape| Domain::new(format!("shape {shape}"), shape)).collect();
     parts.shapes = shapes;
     Scene::new(parts).expect("expected a valid scene")
-}
-
-fn domain(shape: usize) -> Domain {
-    Domain {
-        name: format!("shape {shape}"),
-        shape,
-        material: 0,
-        placement: Transform::IDENTITY,
-        attachment: None,
-        follows: None,
-        material_ranges: vec![],
-        rest_q: vec![],
-        shares_q_with: None,
-        metadata: Metadata::default(),
-    }
 }
 
 /// A state in which every coordinate is q and every transform has the given linear part and translation.

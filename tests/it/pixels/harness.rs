@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformSummary, Deformer as _};
-use modalcast_model::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform};
+use modalcast_model::domain::{Domain, Material, Mesh, Modes, Shape, Texture};
 use modalcast_model::scene::{Camera, Lens, Scene, SceneParts, SceneState, View};
 use modalcast_render::{Allocation, DevicePreference, FrameImage, FrameParams, FrameStats, Pass, Renderer, plan};
 
@@ -45,16 +45,8 @@ impl SceneBuilder {
         self.parts.shapes.push(Shape::new(mesh, Modes::rigid()).expect("expected a valid shape"));
         self.parts.materials.push(material);
         self.parts.domains.push(Domain {
-            name: format!("domain {}", self.parts.domains.len()),
-            shape: self.parts.shapes.len() - 1,
             material: self.parts.materials.len() - 1,
-            material_ranges: vec![],
-            placement: Transform::IDENTITY,
-            attachment: None,
-            follows: None,
-            rest_q: vec![],
-            shares_q_with: None,
-            metadata: Metadata::default(),
+            ..Domain::new(format!("domain {}", self.parts.domains.len()), self.parts.shapes.len() - 1)
         });
         self
     }

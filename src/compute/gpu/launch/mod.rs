@@ -24,7 +24,7 @@ mod probe;
 
 pub use capture::capture;
 #[cfg(any(test, feature = "testing"))]
-pub use compile::{CompiledVariant, assert_compiles};
+pub use compile::{CAPABILITIES, CompiledVariant, assert_compiles};
 pub use device::Device;
 pub use kernel::{KernelDescriptor, KernelKind, LaunchOrder, launch_kernel};
 pub(crate) use kernel::{KernelSource, KernelText};

@@ -2,9 +2,7 @@
 
 use std::sync::Arc;
 
-use modalcast_model::domain::{
-    Attachment, Corners, Domain, FollowConstraint, Material, Mesh, Metadata, Modes, Shape, Texture, Transform,
-};
+use modalcast_model::domain::{Corners, Domain, FollowConstraint, Material, Mesh, Modes, Shape, Texture, Transform};
 use modalcast_model::scene::{DeformationSettings, NormalMethod, Scene, SceneParts, StorageType};
 
 fn shape(vertices: usize, rank: usize) -> Shape {
@@ -21,18 +19,7 @@ fn shape(vertices: usize, rank: usize) -> Shape {
 }
 
 fn domain(shape: usize, material: usize) -> Domain {
-    Domain {
-        name: String::new(),
-        shape,
-        material,
-        placement: Transform::IDENTITY,
-        attachment: None::<Attachment>,
-        follows: None,
-        material_ranges: vec![],
-        rest_q: Vec::new(),
-        shares_q_with: None,
-        metadata: Metadata::default(),
-    }
+    Domain { material, ..Domain::new(String::new(), shape) }
 }
 
 /// A scene whose shapes have these vertices and ranks, each used by two domains.

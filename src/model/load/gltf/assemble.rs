@@ -13,7 +13,7 @@ use super::material::MaterialConverter;
 use super::primitive;
 use super::texture::TextureLoader;
 use super::warnings::{ImportWarnings, sanitize};
-use crate::domain::{Attachment, Domain, Metadata, Shape, Transform};
+use crate::domain::{Attachment, Domain, Shape, Transform};
 use crate::error::{Result, invalid};
 use crate::scene::{MAX_DOMAINS, SceneParts};
 
@@ -109,16 +109,12 @@ impl GltfAssembler<'_> {
             self.reader.bytes.charge_budget(4 * rest_q.len() as u64)?;
             let twin = *twins.entry(rank).or_insert(self.domains.len());
             self.domains.push(Domain {
-                name: format!("{name}.{flatten_hierarchy}"),
-                shape: made.shape,
                 material: made.material,
-                material_ranges: vec![],
                 placement,
                 attachment: attachment.clone(),
-                follows: None,
                 rest_q,
                 shares_q_with: (rank > 0 && twin < self.domains.len()).then_some(twin),
-                metadata: Metadata::default(),
+                ..Domain::new(format!("{name}.{flatten_hierarchy}"), made.shape)
             });
         }
         Ok((self.domains.len() > first).then_some(first))

@@ -1,7 +1,7 @@
 //! Change lists of steps, distant translations, and merged steps.
 
 use super::*;
-use crate::domain::{Domain, Material, Mesh, Metadata, Modes, Shape};
+use crate::domain::{Domain, Material, Mesh, Modes, Shape};
 use crate::scene::{ORIGIN_GRID, RawStepUpdate, SceneParts, TransformFormat};
 
 /// Domains of one vertex and two modes. Domains 2 and 4 share the coordinates of domain 1; domain 5 has no modes.
@@ -14,16 +14,8 @@ fn scene(count: usize) -> Arc<Scene> {
         vec![Shape::new(mesh(), modes).expect("a valid shape"), Shape::new(mesh(), Modes::rigid()).expect("rigid")];
     parts.materials = vec![Material::default()];
     let domain = |index: usize| Domain {
-        name: format!("point {index}"),
-        shape: usize::from(index == 5),
-        material: 0,
-        material_ranges: vec![],
-        placement: Transform::IDENTITY,
-        attachment: None,
-        follows: None,
-        rest_q: vec![],
         shares_q_with: [(2, 1), (4, 2)].into_iter().find(|(domain, _)| *domain == index).map(|(_, twin)| twin),
-        metadata: Metadata::default(),
+        ..Domain::new(format!("point {index}"), usize::from(index == 5))
     };
     parts.domains = (0..count).map(domain).collect();
     Scene::new(parts).expect("a scene")

@@ -126,11 +126,11 @@ impl CompiledKernel {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use modalcast_compute::testing::assert_compiles;
+    use modalcast_compute::testing::{CAPABILITIES, assert_compiles};
 
     /// Compiles every function with every set of macros; panics if a kernel spills registers.
     pub(in super::super) fn compile_all(source: &BenchmarkSource) {
-        assert_compiles(source.text, source.functions, source.define_sets);
+        assert_compiles(source.text, source.functions, source.define_sets, &CAPABILITIES);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Adds rigid domains to the scenes that are drawn.
 
-use modalcast_model::domain::{Domain, Material, Mesh, Metadata, Modes, Shape, Transform};
+use modalcast_model::domain::{Domain, Material, Mesh, Modes, Shape};
 use modalcast_model::error::Result;
 use modalcast_model::scene::SceneParts;
 
@@ -8,17 +8,6 @@ use modalcast_model::scene::SceneParts;
 pub(super) fn add_rigid_domain(parts: &mut SceneParts, name: &str, mesh: Mesh, material: Material) -> Result<()> {
     parts.shapes.push(Shape::new(mesh, Modes::rigid())?);
     parts.materials.push(Material { name: name.into(), ..material });
-    parts.domains.push(Domain {
-        name: name.into(),
-        shape: parts.shapes.len() - 1,
-        material: parts.materials.len() - 1,
-        material_ranges: Vec::new(),
-        placement: Transform::IDENTITY,
-        attachment: None,
-        follows: None,
-        rest_q: Vec::new(),
-        shares_q_with: None,
-        metadata: Metadata::default(),
-    });
+    parts.domains.push(Domain { material: parts.materials.len() - 1, ..Domain::new(name, parts.shapes.len() - 1) });
     Ok(())
 }

@@ -5,9 +5,7 @@ use fastrand::Rng;
 use nalgebra::{Rotation3, Vector3};
 use rayon::prelude::*;
 
-use modalcast_model::domain::{
-    Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform, smooth_normals,
-};
+use modalcast_model::domain::{Corners, Domain, Material, Mesh, Modes, Shape, Texture, Transform, smooth_normals};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Scene, SceneParts};
 
@@ -149,16 +147,8 @@ pub(super) fn build_patch_scene(
         let position = [index % side, index / side % side, index / side / side].map(|cell| cell as f64 * spacing);
         let rotation = if count > 1 { random_rotation(&mut rng) } else { Rotation3::identity() };
         Domain {
-            name: index.to_string(),
-            shape: index % shapes.len(),
-            material: 0,
-            material_ranges: Vec::new(),
             placement: Transform::from_parts(&rotation.into_inner(), &Vector3::from(position)),
-            attachment: None,
-            follows: None,
-            rest_q: Vec::new(),
-            shares_q_with: None,
-            metadata: Metadata::default(),
+            ..Domain::new(index.to_string(), index % shapes.len())
         }
     };
     let domains = (0..count).map(domain).collect();

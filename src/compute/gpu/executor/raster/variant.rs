@@ -63,12 +63,13 @@ impl RasterVariant {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::assert_compiles;
+    use crate::testing::{CAPABILITIES, assert_compiles};
 
-    /// Macros of all variants for meshes without cut-outs.
-    const WITHOUT_CUT_OUTS: &[&[&str]] = &[
-        &[],
-        &["DEPTH_ONLY"],
+    /// Variants that the server compiles.
+    const SERVER_WITHOUT_CUT_OUTS: &[&[&str]] = &[&[], &["DEPTH_ONLY"]];
+    const SERVER_WITH_CUT_OUTS: &[&[&str]] = &[&["CUT_OUTS"], &["DEPTH_ONLY", "CUT_OUTS"]];
+    /// Variants that only the benchmarks compile.
+    const BENCHMARK_WITHOUT_CUT_OUTS: &[&[&str]] = &[
         &["COUNT_TRIANGLES"],
         &["DEPTH_ONLY", "COUNT_TRIANGLES"],
         &["MAX_THREAD_SAMPLES=0"],
@@ -77,10 +78,7 @@ mod tests {
         &["COUNT_TRIANGLES", "MAX_THREAD_SAMPLES=0", "MAX_WARP_EXTENT=-1"],
     ];
 
-    /// Macros of all variants for meshes with cut-outs.
-    const WITH_CUT_OUTS: &[&[&str]] = &[
-        &["CUT_OUTS"],
-        &["DEPTH_ONLY", "CUT_OUTS"],
+    const BENCHMARK_WITH_CUT_OUTS: &[&[&str]] = &[
         &["CUT_OUTS", "COUNT_TRIANGLES"],
         &["DEPTH_ONLY", "CUT_OUTS", "COUNT_TRIANGLES"],
         &["CUT_OUTS", "MAX_THREAD_SAMPLES=0"],
@@ -95,8 +93,15 @@ mod tests {
             for count_triangles in [false, true] {
                 for granularity in [RasterGranularity::BySize, RasterGranularity::Warps, RasterGranularity::Tiles] {
                     let variant = RasterVariant { depth_only, count_triangles, granularity };
-                    for (cut, variants) in [(false, WITHOUT_CUT_OUTS), (true, WITH_CUT_OUTS)] {
-                        assert!(variants.contains(&variant.defines(cut).as_slice()), "{variant:?}");
+                    let is_used_by_server =
+                        !count_triangles && (depth_only || granularity == RasterGranularity::BySize);
+                    for (cut_outs, server_variants, benchmark_variants) in [
+                        (false, SERVER_WITHOUT_CUT_OUTS, BENCHMARK_WITHOUT_CUT_OUTS),
+                        (true, SERVER_WITH_CUT_OUTS, BENCHMARK_WITH_CUT_OUTS),
+                    ] {
+                        let defines = variant.defines(cut_outs);
+                        let variants = if is_used_by_server { server_variants } else { benchmark_variants };
+                        assert!(variants.contains(&defines.as_slice()), "{variant:?}");
                     }
                 }
             }
@@ -106,7 +111,10 @@ mod tests {
     #[test]
     #[ignore = "needs NVRTC: deploy/check installs it"]
     fn nvrtc_compiles_every_raster() {
-        assert_compiles(SOURCE, &OPAQUE_FUNCTIONS, WITHOUT_CUT_OUTS);
-        assert_compiles(SOURCE, &FUNCTIONS, WITH_CUT_OUTS);
+        assert_compiles(SOURCE, &OPAQUE_FUNCTIONS, SERVER_WITHOUT_CUT_OUTS, &CAPABILITIES);
+        assert_compiles(SOURCE, &FUNCTIONS, SERVER_WITH_CUT_OUTS, &CAPABILITIES);
+        // The benchmarks run on the H200.
+        assert_compiles(SOURCE, &OPAQUE_FUNCTIONS, BENCHMARK_WITHOUT_CUT_OUTS, &[(9, 0)]);
+        assert_compiles(SOURCE, &FUNCTIONS, BENCHMARK_WITH_CUT_OUTS, &[(9, 0)]);
     }
 }

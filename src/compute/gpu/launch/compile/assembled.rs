@@ -34,10 +34,13 @@ fn spill_bytes(log: &str) -> usize {
     stores[..stores.len() - 1].iter().map(|before| number(before).expect("a number")).sum()
 }
 
-/// Compiles a source with each list of macros for four architectures. Panics when a variant does not compile, lacks one of
+/// Compute capabilities that the tests compile for: the oldest supported one, A100, H100 and H200, and consumer Blackwell.
+pub const CAPABILITIES: [(i32, i32); 4] = [(7, 5), (8, 0), (9, 0), (12, 0)];
+
+/// Compiles a source with each list of macros for each capability. Panics when a variant does not compile, lacks one of
 /// the `functions` (the first names the program), or spills registers.
-pub fn assert_compiles(source: &str, functions: &[&str], variants: &[&[&str]]) {
-    for capability in [(7, 5), (8, 0), (9, 0), (12, 0)] {
+pub fn assert_compiles(source: &str, functions: &[&str], variants: &[&[&str]], capabilities: &[(i32, i32)]) {
+    for &capability in capabilities {
         for defines in variants {
             let compiled = CompiledVariant::new(functions[0], source, defines, capability);
             for function in functions {

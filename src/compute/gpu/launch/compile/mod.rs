@@ -8,7 +8,7 @@ mod nvrtc;
 use std::path::PathBuf;
 
 #[cfg(any(test, feature = "testing"))]
-pub use self::assembled::{CompiledVariant, assert_compiles};
+pub use self::assembled::{CAPABILITIES, CompiledVariant, assert_compiles};
 use self::cache::{CubinCache, cache_key};
 pub(crate) use self::nvrtc::{CompileJob, nvrtc};
 use modalcast_model::error::Result;

@@ -11,7 +11,7 @@ use nalgebra::{Matrix4, Rotation3, Translation3, Vector3};
 use super::needles;
 use crate::render::rigid_domain::add_rigid_domain;
 use modalcast_model::domain::{
-    AlphaMode, Corners, Domain, Material, Mesh, Metadata, Modes, Shape, Texture, Transform, smooth_normals,
+    AlphaMode, Corners, Domain, Material, Mesh, Modes, Shape, Texture, Transform, smooth_normals,
 };
 use modalcast_model::error::Result;
 use modalcast_model::scene::SceneParts;
@@ -122,18 +122,7 @@ pub(super) fn build(parameters: &ConiferParameters, bark: [&Texture; 2]) -> Resu
 }
 
 fn bough_domain(name: String, placement: Matrix4<f64>) -> Domain {
-    Domain {
-        name,
-        shape: 1,
-        material: 1,
-        material_ranges: Vec::new(),
-        placement: Transform::from_matrix(&placement),
-        attachment: None,
-        follows: None,
-        rest_q: Vec::new(),
-        shares_q_with: None,
-        metadata: Metadata::default(),
-    }
+    Domain { material: 1, placement: Transform::from_matrix(&placement), ..Domain::new(name, 1) }
 }
 
 /// Placement of a bough. Boughs become shorter and steeper towards the top.
