@@ -29,7 +29,6 @@ pub use scene::encoded_subscription::EncodedSubscription;
 pub use scene::handle::{SceneHandle, WriterSession};
 pub use scene::message::StepSelector;
 pub use scene::step_queue::{Policy, StepReport};
-pub use scene::subscriber::Subscription;
 pub use scene::subscriber::{Delivery, Subscription};
 pub use source::SceneSource;
 pub use storage::scene_catalog::{SceneProvenance, validate_scene_name};

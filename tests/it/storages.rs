@@ -7,10 +7,10 @@ use modalcast_compute::reference;
 use modalcast_compute::storage::bound::{ErrorBoundInput, ShapeErrorModel};
 use modalcast_compute::storage::{QUAD, TILE_QUADS, TiledModes};
 use modalcast_model::deform::{DeformSummary, Deformer};
-use modalcast_model::domain::{Material, Modes, Shape, Transform};
+use modalcast_model::domain::{Domain, Material, Modes, Shape, Transform};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState, StorageType};
 
-use crate::deformers::{TestRng, domain, random_state, random_strip};
+use crate::deformers::{TestRng, random_state, random_strip};
 
 const SIZES: [(usize, usize); 9] =
     [(1, 1), (1, 0), (7, 3), (129, 31), (1500, 33), (7, 512), (129, 0), (128, 6), (1500, 1)];
@@ -24,10 +24,10 @@ fn scene_of(deformation: DeformationSettings) -> Arc<Scene> {
     parts.materials = vec![Material::default()];
     for (index, (vertices, rank)) in SIZES.iter().enumerate() {
         parts.shapes.push(random_strip(*vertices, *rank, &mut random));
-        parts.domains.push(domain(index, format!("strip {index}")));
+        parts.domains.push(Domain::new(format!("strip {index}"), index));
     }
-    parts.domains.push(domain(0, "instance of 0".into()));
-    let mut sharing_domain = domain(3, "instance of 3".into());
+    parts.domains.push(Domain::new("instance of 0", 0));
+    let mut sharing_domain = Domain::new("instance of 3", 3);
     sharing_domain.shares_q_with = Some(3);
     parts.domains.push(sharing_domain);
     Scene::new(parts).expect("expected a valid scene")
@@ -47,7 +47,7 @@ fn scene_from_columns(vertices: usize, columns: Vec<f32>, deformation: Deformati
     let rank = columns.len() / (3 * vertices);
     let modes = Modes::from_columns(3 * vertices, rank, columns).expect("expected valid modes");
     parts.shapes = vec![Shape::new(mesh.expect("expected a valid mesh"), modes).expect("expected a valid shape")];
-    parts.domains = vec![domain(0, "columns".into())];
+    parts.domains = vec![Domain::new("columns", 0)];
     Scene::new(parts).expect("expected a valid scene")
 }
 
@@ -238,7 +238,7 @@ fn truncation_budget_in_meters_holds_in_scene_units() {
         parts.deformation.truncation = Some(1e-3);
         parts.materials = vec![Material::default()];
         parts.shapes = vec![random_strip(300, 24, &mut TestRng(2))];
-        parts.domains = vec![domain(0, "strip".into())];
+        parts.domains = vec![Domain::new("strip", 0)];
         let scene = Scene::new(parts).expect("expected a valid scene");
         let mut state = SceneState::rest(&scene);
         state.q.iter_mut().enumerate().for_each(|(mode, number)| *number = f32::exp2(-(mode as f32)));
