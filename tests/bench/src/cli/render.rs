@@ -95,7 +95,8 @@ pub(super) fn run(args: &Args) -> Outcome {
 }
 
 fn rasters(args: &Args, request: &RenderReportOptions) -> Outcome {
-    let rasters = with_spinner("measuring", || render::rasters(request, |what| tracing::info!(what, "measuring")))?;
+    let rasters =
+        with_spinner("measuring", || render::compare_rasterizers(request, |what| tracing::info!(what, "measuring")))?;
     rasters.write(&args.out)?;
     rasters.rows.iter().for_each(|row| print_line(row.line()));
     rasters.frames.iter().for_each(|row| print_line(row.line()));
@@ -151,7 +152,7 @@ fn request(args: &Args) -> Result<RenderReportOptions> {
     for name in &args.loads {
         match plants_named(name) {
             Some(named) => plants.extend(named),
-            None => loads.push(RenderWorkload::named(name)?),
+            None => loads.push(RenderWorkload::from_name(name)?),
         }
     }
     if args.loads.is_empty() {
@@ -191,13 +192,13 @@ fn lines(report: &RenderReport) -> Vec<String> {
             |number: Option<f64>, digits: usize| number.map_or("-".into(), |number| format!("{number:.digits$}"));
         let cells = [
             show(row.median_us(), 1),
-            show(Some(row.color.mean), 3),
-            show(Some(row.color_of_reference.mean), 3),
-            show(Some(row.light_of_aim.all.mean), 4),
-            show(Some(row.light_of_aim.penumbra.mean), 4),
-            show(row.light_of_aim.in_umbra, 4),
+            show(Some(row.color_errors.mean), 3),
+            show(Some(row.intended_color_errors.mean), 3),
+            show(Some(row.intended_light_errors.all_pixels.mean), 4),
+            show(Some(row.intended_light_errors.penumbra.mean), 4),
+            show(row.intended_light_errors.umbra_visibility, 4),
             show(row.flicker.map(|flicker| flicker.mean), 3),
-            match (row.passed, row.to_fail) {
+            match (row.passed, row.is_expected_to_fail) {
                 (true, _) => "yes".into(),
                 (false, true) => "as expected".into(),
                 (false, false) => "NO".into(),
@@ -224,10 +225,10 @@ fn lines(report: &RenderReport) -> Vec<String> {
         let (depth, visibility) = (minimal.depth.median_us, minimal.visibility.median_us);
         lines.push(format!(
             "{:<18}map {}: bare depth {depth:.1} us, bare visibility {visibility:.1} us",
-            minimal.load, minimal.map
+            minimal.load, minimal.map_size
         ));
-        lines.extend([&minimal.unculled, &minimal.default_culling].map(|frame| {
-            format!("{:<18}{} takes {:.1} us, {:.1} us beyond both", "", frame.name, frame.frame_us, frame.beyond_us)
+        lines.extend([&minimal.without_culling, &minimal.with_default_culling].map(|frame| {
+            format!("{:<18}{} takes {:.1} us, {:.1} us beyond both", "", frame.name, frame.frame_us, frame.excess_us)
         }));
     }
     lines.extend(report.raster.iter().map(render::RasterComparison::line));

@@ -29,20 +29,20 @@ pub(super) const MIN_SPEEDUP: f64 = 40.0;
 pub(super) const MAX_COMPUTE_US: f64 = 200.0;
 
 impl BlurComparison {
-    /// Every map that was timed with both methods.
+    /// Compares the times of each map that was timed with both methods.
     pub(super) fn pair_rows(rows: &[RenderRow]) -> Vec<Self> {
-        let is_by_fragments = |row: &RenderRow| row.blur_method == BlurMethod::Fragments;
-        let fragments = rows.iter().filter(|row| is_by_fragments(row)).filter_map(|row| Some((row, row.shadow?)));
+        let uses_fragments = |row: &RenderRow| row.blur_method == BlurMethod::Fragments;
+        let fragment_rows = rows.iter().filter(|row| uses_fragments(row)).filter_map(|row| Some((row, row.shadow?)));
         let compare = |(row, shadow): (&RenderRow, ShadowSettings)| {
             let is_same_map =
-                |other: &&RenderRow| other.load == row.load && other.shadow == Some(shadow) && !is_by_fragments(other);
+                |other: &&RenderRow| other.load == row.load && other.shadow == Some(shadow) && !uses_fragments(other);
             let compute_us = rows.iter().filter(is_same_map).filter_map(blur_us).min_by(f64::total_cmp)?;
             let fragments_us = blur_us(row)?;
             let ratio = fragments_us / compute_us;
             let taps = 2 * shadow.blur_radius() + 1;
             Some(Self { load: row.load.clone(), size: shadow.size, taps, compute_us, fragments_us, ratio })
         };
-        fragments.filter_map(compare).collect()
+        fragment_rows.filter_map(compare).collect()
     }
 }
 
@@ -59,7 +59,7 @@ mod tests {
     use crate::timing::Timing;
     use modalcast_model::scene::Culling;
 
-    fn row(load: &str, (size, blur_method): (u32, BlurMethod), us: f64) -> RenderRow {
+    fn render_row(load: &str, (size, blur_method): (u32, BlurMethod), us: f64) -> RenderRow {
         let timing = Timing::of(vec![us]).expect("a timing");
         RenderRow {
             load: load.into(),
@@ -71,33 +71,33 @@ mod tests {
             culling: Culling::default(),
             bounds: ERROR_LIMITS,
             passed: true,
-            to_fail: false,
+            is_expected_to_fail: false,
             faults: Vec::new(),
-            color: ErrorDistribution::default(),
-            color_of_reference: ErrorDistribution::default(),
-            light: LightErrors::default(),
-            light_of_aim: LightErrors::default(),
+            color_errors: ErrorDistribution::default(),
+            intended_color_errors: ErrorDistribution::default(),
+            light_errors: LightErrors::default(),
+            intended_light_errors: LightErrors::default(),
             flicker: None,
-            no_flicker: None,
+            flicker_skip_reason: None,
             passes: vec![PassTime { name: "blur", timing }],
             bytes: 0,
             shadow_bytes: 0,
             image_bytes: 0,
             samples: 4,
             draws: 1,
-            culled: None,
+            cull_stats: None,
         }
     }
 
     #[test]
     fn compares_fragments_with_fastest_compute_of_same_map() {
         let rows = [
-            row("a", (4096, BlurMethod::Tiles), 200.0),
-            row("a", (4096, BlurMethod::Rows), 400.0),
-            row("a", (4096, BlurMethod::Fragments), 9000.0),
-            row("a", (1024, BlurMethod::Tiles), 1.0),
-            row("b", (4096, BlurMethod::Tiles), 1.0),
-            row("b", (1024, BlurMethod::Fragments), 50.0),
+            render_row("a", (4096, BlurMethod::Tiles), 200.0),
+            render_row("a", (4096, BlurMethod::Rows), 400.0),
+            render_row("a", (4096, BlurMethod::Fragments), 9000.0),
+            render_row("a", (1024, BlurMethod::Tiles), 1.0),
+            render_row("b", (4096, BlurMethod::Tiles), 1.0),
+            render_row("b", (1024, BlurMethod::Fragments), 50.0),
         ];
         let [comparison] = &BlurComparison::pair_rows(&rows)[..] else { panic!("expected one map with both methods") };
         assert_eq!((comparison.load.as_str(), comparison.size, comparison.taps), ("a", 4096, 15));

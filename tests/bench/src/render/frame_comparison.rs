@@ -7,11 +7,11 @@ use serde::Serialize;
 
 use super::harness::{LoadedScene, PassTime, RenderHarness, Size};
 use super::light_meter::with_settings;
-use super::measure::STILL;
+use super::measure::STILL_STEP;
 use super::metrics::{ErrorDistribution, compare_colors};
-use super::raster_comparison::{MAPS, MAX_DIFFERING};
+use super::raster_comparison::MAX_DIFFERING_FRACTION;
 use super::rigid_domain::add_rigid_domain;
-use super::workloads::{room, screen};
+use super::workloads::{room_mesh, screen_mesh};
 use super::{RenderReportOptions, harness};
 use modalcast_compute::gpu::Device;
 use modalcast_model::error::Result;
@@ -20,27 +20,31 @@ use modalcast_model::scene::{
 };
 use modalcast_render::{FrameCullStats, FrameImage, RasterBackends, VisibilityId};
 
-/// Results of one load with both rasterizers.
+/// Results of one workload with both rasterizers.
 #[derive(Debug, Clone, Serialize)]
 pub struct FrameComparison {
     pub load: String,
     pub triangles: usize,
     /// Side of the shadow map, texels.
-    pub map: u32,
+    #[serde(rename = "map")]
+    pub map_size: u32,
     /// Taps of the map's blur per direction.
     pub taps: u32,
     /// Rasterizer of each pass when CUDA is available.
     #[serde(rename = "paths")]
     pub raster_backends: RasterBackends,
     /// Pixels whose id differs from OpenGL's.
-    pub differing: usize,
+    #[serde(rename = "differing")]
+    pub differing_ids: usize,
     pub pixels: usize,
     /// Color differences from OpenGL's image, of 255.
     #[serde(rename = "colours")]
     pub colors: ErrorDistribution,
     /// Times of OpenGL with automatic culling; "frame" is the sum without readback.
     pub opengl: Vec<PassTime>,
-    pub culled: Option<FrameCullStats>,
+    /// Culling counts of OpenGL's last timed frame, where triangles are culled.
+    #[serde(rename = "culled")]
+    pub cull_stats: Option<FrameCullStats>,
     /// Times with CUDA; `None` where too many ids differ.
     pub cuda: Option<Vec<PassTime>>,
 }
@@ -65,10 +69,10 @@ impl FrameComparison {
             pass_times(&self.opengl),
             self.cuda.as_deref().map_or("not timed".into(), pass_times),
             self.ratio().unwrap_or(f64::NAN),
-            self.differing,
+            self.differing_ids,
             self.pixels,
             self.colors.mean,
-            self.colors.largest
+            self.colors.max
         )
     }
 }
@@ -81,37 +85,37 @@ struct FrameSetup {
     camera: Camera,
 }
 
-/// Measures the loads of a request, a room and two triangles that fill the frame.
+/// Measures the selected workloads, a room, and two triangles that fill the frame.
 ///
 /// # Errors
 /// Errors of drawing and of the device.
 pub(super) fn measure(
     harness: &mut RenderHarness,
     device: &Arc<Device>,
-    request: &RenderReportOptions,
+    options: &RenderReportOptions,
     progress: &mut dyn FnMut(&str),
 ) -> Result<Vec<FrameComparison>> {
     let mut setups = Vec::new();
-    for workload in &request.loads {
+    for workload in &options.loads {
         let animation = workload.build()?;
         setups.push(FrameSetup::new(
             &animation.name,
             &animation.scene,
-            (animation.state(STILL), animation.camera(request.size)),
-            request,
+            (animation.state(STILL_STEP), animation.camera(options.size)),
+            options,
         )?);
     }
-    for (name, (mesh, camera)) in [("room", room()?), ("screen", screen()?)] {
+    for (name, (mesh, camera)) in [("room", room_mesh()?), ("screen", screen_mesh()?)] {
         let mut parts = SceneParts::named(name);
         add_rigid_domain(&mut parts, name, mesh, modalcast_model::domain::Material::default())?;
         let scene = Scene::new(parts)?;
-        setups.push(FrameSetup::new(name, &scene, (SceneState::rest(&scene), camera), request)?);
+        setups.push(FrameSetup::new(name, &scene, (SceneState::rest(&scene), camera), options)?);
     }
     let mut comparisons = Vec::new();
     for setup in setups {
         progress(&format!("{}: frames by OpenGL and by CUDA", setup.name));
         let mut loaded_scene = harness.load(&setup.scene)?;
-        let measured = setup.measure(harness, &mut loaded_scene, device, request);
+        let measured = setup.measure(harness, &mut loaded_scene, device, options);
         harness.unload(loaded_scene);
         comparisons.push(measured?);
     }
@@ -123,10 +127,9 @@ impl FrameSetup {
         name: &str,
         scene: &Scene,
         (state, camera): (SceneState, Camera),
-        request: &RenderReportOptions,
+        options: &RenderReportOptions,
     ) -> Result<Self> {
-        let size = if request.quick { MAPS.1 } else { MAPS.0 };
-        let shadow = Some(ShadowSettings { size, ..ShadowSettings::default() });
+        let shadow = Some(ShadowSettings { size: options.shadow_map_size(), ..ShadowSettings::default() });
         let look = RenderSettings { shadow, antialias: Antialiasing::Fxaa, culling: Culling::Auto, ..scene.look };
         Ok(Self { name: name.into(), scene: with_settings(scene, look)?, state, camera })
     }
@@ -136,33 +139,34 @@ impl FrameSetup {
         harness: &mut RenderHarness,
         loaded_scene: &mut LoadedScene,
         device: &Arc<Device>,
-        request: &RenderReportOptions,
+        options: &RenderReportOptions,
     ) -> Result<FrameComparison> {
-        let (size, replays) = (request.size, request.replays);
+        let (size, replays) = (options.size, options.replays);
         harness.deform(loaded_scene, &self.state)?;
         let (opengl_image, opengl_ids) = self.draw_with_ids(harness, loaded_scene, size)?;
-        let opengl = harness.time(loaded_scene, self.camera, size, replays)?;
-        let culled = harness.renderer.stats().culled;
+        let opengl = harness.time_passes(loaded_scene, self.camera, size, replays)?;
+        let cull_stats = harness.renderer.stats().culled;
         harness.attach_rasterizer(loaded_scene, device)?;
         let (cuda_image, cuda_ids) = self.draw_with_ids(harness, loaded_scene, size)?;
         let raster_backends = harness.renderer.stats().raster_backends;
-        let differing = cuda_ids.iter().zip(&opengl_ids).filter(|(cuda, opengl)| cuda != opengl).count();
-        let agrees = differing as f64 <= MAX_DIFFERING * opengl_ids.len() as f64;
-        let cuda = if agrees { Some(harness.time(loaded_scene, self.camera, size, replays)?) } else { None };
+        let differing_ids = cuda_ids.iter().zip(&opengl_ids).filter(|(cuda, opengl)| cuda != opengl).count();
+        let is_accepted = differing_ids as f64 <= MAX_DIFFERING_FRACTION * opengl_ids.len() as f64;
+        let cuda =
+            if is_accepted { Some(harness.time_passes(loaded_scene, self.camera, size, replays)?) } else { None };
         let reference: Vec<[f32; 3]> =
             opengl_image.rgba.chunks_exact(4).map(|pixel| [0, 1, 2].map(|channel| f32::from(pixel[channel]))).collect();
         let shadow = self.scene.look.shadow.unwrap_or_default();
         Ok(FrameComparison {
             load: self.name.clone(),
             triangles: self.scene.layout.triangles,
-            map: shadow.size,
+            map_size: shadow.size,
             taps: 2 * shadow.blur_radius() + 1,
             raster_backends,
-            differing,
+            differing_ids,
             pixels: opengl_ids.len(),
             colors: compare_colors(&cuda_image.rgba, &reference),
             opengl,
-            culled,
+            cull_stats,
             cuda,
         })
     }
@@ -179,12 +183,12 @@ impl FrameSetup {
     }
 }
 
-/// Reasons why frames were not timed.
-pub(super) fn faults(comparisons: &[FrameComparison]) -> Vec<String> {
-    let untimed = comparisons.iter().filter(|comparison| comparison.cuda.is_none());
-    untimed
+/// Describes why frames were not timed.
+pub(super) fn describe_faults(comparisons: &[FrameComparison]) -> Vec<String> {
+    let untimed_comparisons = comparisons.iter().filter(|comparison| comparison.cuda.is_none());
+    untimed_comparisons
         .map(|frame| {
-            format!("{}: expected equal ids, {} of {} pixels differ", frame.load, frame.differing, frame.pixels)
+            format!("{}: expected equal ids, {} of {} pixels differ", frame.load, frame.differing_ids, frame.pixels)
         })
         .collect()
 }
@@ -192,12 +196,12 @@ pub(super) fn faults(comparisons: &[FrameComparison]) -> Vec<String> {
 /// The section of whole frames in `raster.md`.
 pub(super) fn markdown(comparisons: &[FrameComparison]) -> String {
     use crate::markdown_table::{dash, table};
-    let head = [
+    let header = [
         "load",
         "triangles",
         "map",
         "taps",
-        "drawn by CUDA",
+        "passes drawn by CUDA",
         "frame us: OpenGL",
         "CUDA",
         "speedup",
@@ -216,31 +220,33 @@ pub(super) fn markdown(comparisons: &[FrameComparison]) -> String {
         "\n## Whole frames\n\nOne sample per pixel with FXAA, by OpenGL with automatic culling and by the CUDA \
          rasterizer where it supports the pass, in the same run. Times of passes: OpenGL / CUDA, us; \"raster\" is \
          CUDA time within \"shadow\", as is \"blur\". A load is not timed if more than {} % of its ids differ.\n\n",
-        100.0 * MAX_DIFFERING
+        100.0 * MAX_DIFFERING_FRACTION
     );
     let row = |frame: &FrameComparison| {
-        let median = |passes: &[harness::PassTime], name: &str| {
+        let format_median = |passes: &[harness::PassTime], name: &str| {
             passes
                 .iter()
                 .find(|pass| pass.name == name)
                 .map_or_else(dash, |pass| format!("{:.1}", pass.timing.median_us))
         };
         let cuda = frame.cuda.as_deref().unwrap_or_default();
-        let both_times = |name: &str| format!("{} / {}", median(&frame.opengl, name), median(cuda, name));
-        let by_cuda: Vec<&str> =
+        let format_both_times =
+            |name: &str| format!("{} / {}", format_median(&frame.opengl, name), format_median(cuda, name));
+        let cuda_passes: Vec<&str> =
             [("shadow", frame.raster_backends.shadow), ("visibility", frame.raster_backends.visibility)]
                 .into_iter()
                 .filter(|(_, backend)| *backend == Some(modalcast_render::RasterBackend::Cuda))
                 .map(|(name, _)| name)
                 .collect();
-        let sizes = [frame.load.clone(), frame.triangles.to_string(), frame.map.to_string(), frame.taps.to_string()];
-        let frame_times = [by_cuda.join(", "), median(&frame.opengl, "frame"), median(cuda, "frame")];
+        let sizes =
+            [frame.load.clone(), frame.triangles.to_string(), frame.map_size.to_string(), frame.taps.to_string()];
+        let frame_times = [cuda_passes.join(", "), format_median(&frame.opengl, "frame"), format_median(cuda, "frame")];
         let ratio = frame.ratio().map_or_else(dash, |ratio| format!("{ratio:.1}"));
-        let passes = ["raster", "shadow", "blur", "visibility", "shade", "encode"].map(both_times);
-        let ids = format!("{} of {}", frame.differing, frame.pixels);
-        let colors = [frame.colors.mean, frame.colors.p99, frame.colors.largest].map(|error| format!("{error:.3}"));
+        let passes = ["raster", "shadow", "blur", "visibility", "shade", "encode"].map(format_both_times);
+        let ids = format!("{} of {}", frame.differing_ids, frame.pixels);
+        let colors = [frame.colors.mean, frame.colors.p99, frame.colors.max].map(|error| format!("{error:.3}"));
         sizes.into_iter().chain(frame_times).chain([ratio]).chain(passes).chain([ids]).chain(colors)
     };
-    text.push_str(&table(&head, comparisons.iter().map(row)));
+    text.push_str(&table(&header, comparisons.iter().map(row)));
     text
 }

@@ -35,10 +35,10 @@ pub struct SceneFrameTimes {
     pub look: LookTable,
     /// Samples per pixel.
     pub samples: u32,
-    /// Rasterizers that drew it.
+    /// Rasterizers that drew the passes.
     #[serde(rename = "paths")]
     pub raster_backends: RasterBackends,
-    /// `clip_from_world`, column-major; the camera frames the scene.
+    /// Column-major matrix of the camera, which frames the scene.
     pub clip_from_world: Vec<f64>,
     pub eye: [f64; 3],
     pub to_sun: [f64; 3],
@@ -67,41 +67,41 @@ pub struct FrameTimeReport {
 ///
 /// # Errors
 /// `Unavailable` without OpenGL; errors of loading and drawing a scene.
-pub fn time_scenes(request: &FrameTimeOptions, mut progress: impl FnMut(&str)) -> Result<FrameTimeReport> {
+pub fn time_scenes(options: &FrameTimeOptions, mut progress: impl FnMut(&str)) -> Result<FrameTimeReport> {
     let mut harness = RenderHarness::open()?;
     let (mut scenes, mut files) = (Vec::new(), Vec::new());
-    for source in &request.scenes {
+    for source in &options.scenes {
         progress(source);
-        let (entry, file) = time_scene(&mut harness, request, source)?;
-        scenes.push(entry);
+        let (scene_times, file) = time_scene(&mut harness, options, source)?;
+        scenes.push(scene_times);
         files.push(file);
     }
     let renderer = harness.renderer.info().clone();
-    Ok(FrameTimeReport { provenance: Provenance::here(), renderer, size: request.size, scenes, files })
+    Ok(FrameTimeReport { provenance: Provenance::here(), renderer, size: options.size, scenes, files })
 }
 
 fn time_scene(
     harness: &mut RenderHarness,
-    request: &FrameTimeOptions,
+    options: &FrameTimeOptions,
     source: &str,
 ) -> Result<(SceneFrameTimes, ImageFile)> {
-    let (OpenedScene { scene, backends }, size) = (load::open(source)?, request.size);
+    let (OpenedScene { scene, backends }, size) = (load::open(source)?, options.size);
     let name = Path::new(source).file_stem().map_or_else(|| "scene".into(), |stem| stem.to_string_lossy());
     let mut loaded_scene = harness.load(&scene)?;
     harness.deform(&mut loaded_scene, &SceneState::rest(&scene))?;
     let camera = Camera::fit_to_scene(&scene, size.width, size.height);
     harness.select_rasterizer(&mut loaded_scene, backends.raster, camera, size)?;
-    let passes = harness.time(&loaded_scene, camera, size, request.replays)?;
-    let mut times = Vec::new();
-    for _ in 0..request.replays.max(MIN_REPETITIONS) {
+    let passes = harness.time_passes(&loaded_scene, camera, size, options.replays)?;
+    let mut wall_clock_us = Vec::new();
+    for _ in 0..options.replays.max(MIN_REPETITIONS) {
         let begin = Instant::now();
         harness.draw(&loaded_scene, camera, size)?;
-        times.push(begin.elapsed().as_secs_f64() * 1e6);
+        wall_clock_us.push(begin.elapsed().as_secs_f64() * 1e6);
     }
     let (image, frame_params) = (harness.draw(&loaded_scene, camera, size)?, loaded_scene.frame_params(camera, size));
     let file = image_files::encode_grid(&name, size, 1, &[image.rgba])?;
     let clip = camera.clip_from_camera(size.width, size.height, &frame_params.bounds) * camera.camera_from_world();
-    let entry = SceneFrameTimes {
+    let scene_times = SceneFrameTimes {
         name: name.into_owned(),
         vertices: scene.layout.vertices,
         triangles: scene.layout.triangles,
@@ -112,11 +112,12 @@ fn time_scene(
         eye: camera.eye().into(),
         to_sun: scene.look.to_sun(scene.up).into(),
         passes,
-        wall_clock: Timing::of(times).ok_or_else(|| fault_in("time")("expected at least one frame, got none"))?,
+        wall_clock: Timing::of(wall_clock_us)
+            .ok_or_else(|| fault_in("time")("expected at least one frame, got none"))?,
         picture: file.name.clone(),
     };
     harness.unload(loaded_scene);
-    Ok((entry, file))
+    Ok((scene_times, file))
 }
 
 impl FrameTimeReport {
@@ -126,9 +127,9 @@ impl FrameTimeReport {
     /// `Fault` when a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<()> {
         std::fs::create_dir_all(folder).map_err(fault_in("times"))?;
-        let write = |name: &str, bytes: &[u8]| std::fs::write(folder.join(name), bytes).map_err(fault_in("times"));
-        self.files.iter().try_for_each(|file| write(&file.name, &file.png))?;
-        write("times.json", &serde_json::to_vec_pretty(self).map_err(fault_in("times"))?)
+        let write_file = |name: &str, bytes: &[u8]| std::fs::write(folder.join(name), bytes).map_err(fault_in("times"));
+        self.files.iter().try_for_each(|file| write_file(&file.name, &file.png))?;
+        write_file("times.json", &serde_json::to_vec_pretty(self).map_err(fault_in("times"))?)
     }
 }
 
@@ -138,14 +139,14 @@ mod tests {
 
     #[test]
     fn times_a_scene_and_records_a_centering_matrix() {
-        let request =
+        let options =
             FrameTimeOptions { scenes: vec!["tree".into()], size: Size { width: 32, height: 24 }, replays: 1 };
-        let report = time_scenes(&request, |_| {}).expect("a report");
-        let entry = &report.scenes[0];
-        assert!(entry.wall_clock.median_us > 0.0 && entry.wall_clock.replays == MIN_REPETITIONS);
-        assert!(entry.passes.iter().any(|pass| pass.name == "frame"));
+        let report = time_scenes(&options, |_| {}).expect("a report");
+        let scene_times = &report.scenes[0];
+        assert!(scene_times.wall_clock.median_us > 0.0 && scene_times.wall_clock.replays == MIN_REPETITIONS);
+        assert!(scene_times.passes.iter().any(|pass| pass.name == "frame"));
         let scene = load::open("tree").expect("a scene").scene;
-        let clip = nalgebra::Matrix4::from_column_slice(&entry.clip_from_world);
+        let clip = nalgebra::Matrix4::from_column_slice(&scene_times.clip_from_world);
         let center = clip.transform_point(&scene.rest_bounds.center());
         assert!(center.x.abs() < 1e-9 && center.y.abs() < 1e-9, "{center}");
         let folder = tempfile::tempdir().expect("a folder");

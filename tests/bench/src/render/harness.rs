@@ -1,4 +1,4 @@
-//! Test harness around the renderer: one scene with one look, deformed on the CPU, drawn and timed.
+//! Benchmark harness around the renderer: loads scenes, deforms them on the CPU, and draws and times frames.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -20,7 +20,7 @@ pub(super) fn cuda_device() -> Option<Arc<Device>> {
     Device::open(0).ok().filter(|device| device.check_compiler().is_ok())
 }
 
-/// Size of a picture in pixels.
+/// Size of an image in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct Size {
     pub width: u32,
@@ -47,6 +47,7 @@ pub(super) struct LoadedScene {
     scene: Arc<Scene>,
     pub(super) buffers: SceneBuffers,
     deformer: CpuDeformer,
+    /// Bounds of the last deformed vertices, in world space and in light space.
     bounds: BoundingBox,
     light_box: Option<OrientedBounds>,
 }
@@ -105,7 +106,7 @@ impl RenderHarness {
 
     /// Draws the same frame repeatedly and returns the times per pass; "frame" is the sum of all passes except the
     /// readback.
-    pub(super) fn time(
+    pub(super) fn time_passes(
         &mut self,
         loaded_scene: &LoadedScene,
         camera: Camera,
@@ -156,7 +157,7 @@ impl LoadedScene {
     }
 
     /// Bounds of the last deformed vertices, in world and in light space.
-    pub(super) const fn extents(&self) -> (BoundingBox, Option<OrientedBounds>) {
+    pub(super) const fn deformed_bounds(&self) -> (BoundingBox, Option<OrientedBounds>) {
         (self.bounds, self.light_box)
     }
 

@@ -49,8 +49,8 @@ pub(super) fn encode_grid(name: &str, size: Size, columns: usize, images: &[Vec<
     for (index, rgba) in images.iter().enumerate() {
         let (left, top) = (index % columns * (width + GUTTER), index / columns * (height + GUTTER));
         for (row, pixels) in rgba.chunks_exact(4 * width).enumerate() {
-            let target = &mut rgb[3 * ((top + row) * grid_width + left)..][..3 * width];
-            for (rgb_pixel, rgba_pixel) in target.chunks_exact_mut(3).zip(pixels.chunks_exact(4)) {
+            let destination = &mut rgb[3 * ((top + row) * grid_width + left)..][..3 * width];
+            for (rgb_pixel, rgba_pixel) in destination.chunks_exact_mut(3).zip(pixels.chunks_exact(4)) {
                 rgb_pixel.copy_from_slice(&rgba_pixel[..3]);
             }
         }

@@ -17,8 +17,8 @@ pub(super) fn with_settings(scene: &Scene, look: RenderSettings) -> Result<Arc<S
     Scene::new(SceneParts { look, ..scene.parts() })
 }
 
-/// The scene with white, matte surfaces. Blended surfaces keep their alpha and cut-outs their holes. The sunlight is 1,
-/// the maximum of the display.
+/// The scene with white, matte surfaces. The alpha of blended surfaces and cut-outs remains. The sunlight is 1, the
+/// maximum of the display.
 ///
 /// # Errors
 /// Only those that the scene itself would cause.
@@ -40,19 +40,19 @@ pub(super) fn meter_scene(scene: &Scene) -> Result<Arc<Scene>> {
     for index in color_textures {
         let texture = &parts.textures[index];
         let white_rgba = texture.rgba().chunks_exact(4).flat_map(|texel| [255, 255, 255, texel[3]]).collect();
-        let white = Texture::new(texture.name.clone(), texture.width(), texture.height(), white_rgba)?;
-        // An image may be used for colors and for normals; the normals keep the original.
-        parts.textures.push(white);
-        let last = parts.textures.len() - 1;
+        let white_texture = Texture::new(texture.name.clone(), texture.width(), texture.height(), white_rgba)?;
+        // The original remains, because another material may use it as a normal map.
+        parts.textures.push(white_texture);
+        let white_index = parts.textures.len() - 1;
         for material in parts.materials.iter_mut().filter(|material| material.color_texture == Some(index)) {
-            material.color_texture = Some(last);
+            material.color_texture = Some(white_index);
         }
     }
     Scene::new(parts)
 }
 
-/// Sun visibility per pixel from frames of [`meter_scene`] with and without shadows, both RGBA. The resolution of 8-bit
-/// sRGB is one part in a hundred at [`MIN_SUNLIGHT`], and better where it is brighter.
+/// Sun visibility per pixel from frames of [`meter_scene`] with and without shadows, both RGBA. At [`MIN_SUNLIGHT`] the
+/// resolution of 8-bit sRGB is 1 %; brighter pixels have a better resolution.
 pub(super) fn read_sun_visibility(shadowed: &[u8], unshadowed: &[u8]) -> Vec<Option<f32>> {
     let sunlight = |pixel: &[u8]| linear_from_srgb(f64::from(pixel[1]) / 255.0);
     let pairs = shadowed.chunks_exact(4).zip(unshadowed.chunks_exact(4));
@@ -69,12 +69,16 @@ mod tests {
 
     #[test]
     fn reads_visibility_only_above_the_minimum_sunlight() {
-        let byte = |linear: f64| (255.0 * srgb_from_linear(linear)).round() as u8;
-        let pixel = |linear: f64| [byte(linear); 4];
+        let encode = |linear: f64| (255.0 * srgb_from_linear(linear)).round() as u8;
+        let gray_pixel = |linear: f64| [encode(linear); 4];
         for (sunlight, visibility) in [(1.0, 0.5), (0.5, 0.25), (0.11, 1.0), (0.8, 0.0)] {
-            let found = read_sun_visibility(&pixel(sunlight * visibility), &pixel(sunlight))[0].expect("a visibility");
-            assert!((f64::from(found) - visibility).abs() < 0.01, "expected {visibility}, got {found}");
+            let measured_visibility = read_sun_visibility(&gray_pixel(sunlight * visibility), &gray_pixel(sunlight))[0]
+                .expect("a visibility");
+            assert!(
+                (f64::from(measured_visibility) - visibility).abs() < 0.01,
+                "expected {visibility}, got {measured_visibility}"
+            );
         }
-        assert_eq!(read_sun_visibility(&pixel(0.05), &pixel(0.05)), [None]);
+        assert_eq!(read_sun_visibility(&gray_pixel(0.05), &gray_pixel(0.05)), [None]);
     }
 }

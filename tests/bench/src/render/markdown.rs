@@ -4,7 +4,7 @@ use super::{RenderReport, RenderRow, RenderWorkloadSummary, ShadowTexelSize, com
 use crate::markdown_table::{dash, table};
 use modalcast_render::CullStats;
 
-/// The whole page.
+/// Formats the report.
 pub(super) fn markdown(report: &RenderReport) -> String {
     let (provenance, size) = (&report.provenance, report.size);
     let mut text = format!("# Rendering: error against run time\n\n{}\n", provenance.line());
@@ -19,33 +19,35 @@ pub(super) fn markdown(report: &RenderReport) -> String {
         true => format!(
             "\nEvery variant is within its bounds against its intended result: mean color error {} of 255, mean sun \
              visibility error {}; mean sun visibility {} in the umbra (rows may have a lower bound); {} lost outside of shadows. \
-             that are stated to fail do.\n",
-            bounds.mean_color, bounds.mean_light, bounds.bleeding, bounds.lost
+             Variants that are expected to exceed their bounds do.\n",
+            bounds.mean_color, bounds.mean_light, bounds.bleeding, bounds.lost_visibility
         ),
         false => format!("\nFailed:\n\n- {}\n", report.failed.join("\n- ")),
     });
-    for load in &report.loads {
-        text.push_str(&load_section(load, report.rows.iter().filter(|row| row.load == load.name)));
+    for workload in &report.loads {
+        let rows = report.rows.iter().filter(|row| row.load == workload.name);
+        text.push_str(&workload_section(workload, rows));
     }
     text.push_str(&super::readback::readback_section(&report.readback));
     text + &comparison_tables::markdown(report)
 }
 
+/// Meaning of the columns of [`HEADER`].
 const EXPLANATION: &str = "Colors are compared in sRGB, of 255, by the largest difference of the three channels: \
 against hard shadow rays, and against the intended result (no shadow, or the hard shadow filtered by the blur's \
 footprint). Light is the sun visibility, compared with the same two references. Bleeding is the mean sun visibility \
-in the umbra of the filtered reference. Flicker is the change of the error from step to step. `frame` is all passes \
-except the readback. Of the triangles tested by culling for the camera, `listed` are passed to the rasterizer, and \
-behind what the last frame saw.\n";
+in the umbra of the filtered reference. Flicker is the change of the error from step to step. `frame` is the time of all \
+passes except the readback. Culling passes the `listed` triangles to the rasterizer; `hidden` triangles are occluded by \
+the depth of the last frame.\n";
 
-const HEAD: [&str; 25] = [
+const HEADER: [&str; 25] = [
     "variant",
     "frame us",
     "quartiles us",
     "shadow us",
-    "of it blur us",
+    "thereof blur us",
     "draw us",
-    "of it cull us",
+    "thereof cull us",
     "visibility us",
     "blended us",
     "shade us",
@@ -58,38 +60,49 @@ const HEAD: [&str; 25] = [
     "colour mean",
     "p99",
     "largest",
-    "colour of aim mean",
-    "light of aim mean",
+    "intended colour mean",
+    "intended light mean",
     "penumbra",
     "bleeding",
     "flicker mean",
     "passed",
 ];
 
-fn load_section<'a>(load: &RenderWorkloadSummary, rows: impl Iterator<Item = &'a RenderRow>) -> String {
+fn workload_section<'a>(workload: &RenderWorkloadSummary, rows: impl Iterator<Item = &'a RenderRow>) -> String {
     let RenderWorkloadSummary {
-        name, vertices, triangles, domains, samples, taps, reference_ms, steps, texels, ..
-    } = load;
+        name,
+        vertices,
+        triangles,
+        domains,
+        samples,
+        taps,
+        reference_ms,
+        steps,
+        texel_size,
+        ..
+    } = workload;
     let mut text = format!(
-        "\n## {name}\n\n{vertices} vertices, {triangles} triangles, {domains} domains. References: {samples} samples a \
-         pixel, {taps} rays each over a footprint, {:.1} s; {}.{}\n\n",
+        "\n## {name}\n\n{vertices} vertices, {triangles} triangles, {domains} domains. References: {samples} samples per \
+         pixel, {taps} rays per sample of a filtered shadow, {:.1} s; {}.{}\n\n",
         reference_ms / 1e3,
-        load.no_flicker
+        workload.flicker_skip_reason
             .as_ref()
             .map_or_else(|| format!("flicker over {steps} steps"), |reason| format!("no flicker: {reason}")),
-        texels.map_or_else(String::new, |ShadowTexelSize { size, side, by_corners }| format!(
-            " A texel of a map of {size} is {side:.5} long, {by_corners:.5} if it were fitted to the corners of the bounds."
+        texel_size.map_or_else(String::new, |ShadowTexelSize { map_size, vertex_fit_side, corner_fit_side }| format!(
+            " A texel of the shadow map of {map_size} is {vertex_fit_side:.5} long; if the map were fitted to the corners \
+             of the bounding box, it would be {corner_fit_side:.5} long."
         ))
     );
-    text.push_str(&table(&HEAD, rows.map(row_cells)));
+    text.push_str(&table(&HEADER, rows.map(row_cells)));
     text
 }
 
 fn row_cells(row: &RenderRow) -> [String; 25] {
     let timing = |name: &str| row.passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
     let median = |name: &str| timing(name).map_or_else(dash, |timing| format!("{:.1}", timing.median_us));
-    let four_decimals = |value: f64| format!("{value:.4}");
-    let count = |field: fn(&CullStats) -> u32| row.culled.map_or_else(dash, |culled| field(&culled.camera).to_string());
+    let format_four_decimals = |value: f64| format!("{value:.4}");
+    let culling_count =
+        |field: fn(&CullStats) -> u32| row.cull_stats.map_or_else(dash, |stats| field(&stats.camera).to_string());
     let megabytes = |bytes: u64| format!("{:.1}", bytes as f64 / 1e6);
     [
         row.name.clone(),
@@ -104,23 +117,23 @@ fn row_cells(row: &RenderRow) -> [String; 25] {
         median("shade"),
         median("bloom"),
         median("encode"),
-        count(|camera| camera.visible),
-        count(|camera| camera.occluded),
+        culling_count(|camera| camera.visible),
+        culling_count(|camera| camera.occluded),
         megabytes(row.bytes),
         megabytes(row.shadow_bytes),
-        format!("{:.3}", row.color.mean),
-        format!("{:.1}", row.color.p99),
-        format!("{:.1}", row.color.largest),
-        format!("{:.3}", row.color_of_reference.mean),
-        four_decimals(row.light_of_aim.all.mean),
-        four_decimals(row.light_of_aim.penumbra.mean),
-        row.light_of_aim.in_umbra.map_or_else(dash, four_decimals),
-        match (row.flicker, &row.no_flicker) {
+        format!("{:.3}", row.color_errors.mean),
+        format!("{:.1}", row.color_errors.p99),
+        format!("{:.1}", row.color_errors.max),
+        format!("{:.3}", row.intended_color_errors.mean),
+        format_four_decimals(row.intended_light_errors.all_pixels.mean),
+        format_four_decimals(row.intended_light_errors.penumbra.mean),
+        row.intended_light_errors.umbra_visibility.map_or_else(dash, format_four_decimals),
+        match (row.flicker, &row.flicker_skip_reason) {
             (Some(flicker), _) => format!("{:.3}", flicker.mean),
             (None, Some(reason)) => format!("skipped: {reason}"),
             (None, None) => dash(),
         },
-        match (row.passed, row.to_fail) {
+        match (row.passed, row.is_expected_to_fail) {
             (true, _) => "yes".into(),
             (false, true) => format!("no, as expected: {}", row.faults.join("; ")),
             (false, false) => format!("no: {}", row.faults.join("; ")),

@@ -1,20 +1,21 @@
-//! Error metrics of an image against its reference. Colors are compared as displayed: sRGB, 0 to 255, the largest
-//! difference of the three channels. Shadows are compared as sun visibility, the fraction of the unshadowed sunlight
-//! that reaches the surface.
+//! Error metrics of an image against its reference. Colors are compared in sRGB, 0 to 255; the error of a pixel is the
+//! largest difference of its three channels. Shadows are compared as sun visibility, the fraction of the unshadowed
+//! sunlight that reaches the surface.
 
 use serde::Serialize;
 
-/// A reference pixel is in the penumbra when its sun visibility is between this and one minus this.
-const PENUMBRA: f32 = 0.02;
+/// A reference pixel is in the penumbra when its sun visibility is from this to one minus this.
+const MIN_PENUMBRA_VISIBILITY: f32 = 0.02;
 /// A reference pixel is in the umbra when its sun visibility is at most this.
-const UMBRA: f32 = 1e-6;
+const MAX_UMBRA_VISIBILITY: f32 = 1e-6;
 
 /// Mean, 99th percentile and maximum of a set of numbers; all 0 for an empty set.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct ErrorDistribution {
     pub mean: f64,
     pub p99: f64,
-    pub largest: f64,
+    #[serde(rename = "largest")]
+    pub max: f64,
     pub count: usize,
 }
 
@@ -22,11 +23,11 @@ impl ErrorDistribution {
     fn from_values(mut values: Vec<f32>) -> Self {
         values.sort_by(f32::total_cmp);
         let count = values.len();
-        let Some(last) = values.last() else { return Self::default() };
+        let Some(max_value) = values.last() else { return Self::default() };
         let mean = values.iter().map(|value| f64::from(*value)).sum::<f64>() / count as f64;
         // Nearest-rank percentile: the smallest number that at least 99 % of the numbers do not exceed.
         let rank = (99 * count).div_ceil(100).clamp(1, count);
-        Self { mean, p99: f64::from(values[rank - 1]), largest: f64::from(*last), count }
+        Self { mean, p99: f64::from(values[rank - 1]), max: f64::from(*max_value), count }
     }
 }
 
@@ -46,14 +47,17 @@ pub fn differences<'a>(rendered: &'a [u8], reference: &'a [[f32; 3]]) -> impl It
 /// Errors of the sun visibility over the pixels where both images define it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct LightErrors {
-    pub all: ErrorDistribution,
+    #[serde(rename = "all")]
+    pub all_pixels: ErrorDistribution,
     /// Over the pixels in the reference's penumbra only.
     pub penumbra: ErrorDistribution,
     /// Light bleeding: mean sun visibility in the reference's umbra. `None` without such pixels.
-    pub in_umbra: Option<f64>,
+    #[serde(rename = "in_umbra")]
+    pub umbra_visibility: Option<f64>,
     pub umbra_pixels: usize,
-    /// Mean missing sun visibility where the reference is fully lit. `None` without such pixels.
-    pub lost: Option<f64>,
+    /// Mean missing sun visibility where the reference has no shadow. `None` without such pixels.
+    #[serde(rename = "lost")]
+    pub lost_visibility: Option<f64>,
     /// Mean of rendered minus reference; positive when the image is too bright.
     pub bias: f64,
 }
@@ -63,35 +67,37 @@ pub fn compare_light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> Lig
     let pairs: Vec<(f32, f32)> =
         rendered.iter().zip(reference).filter_map(|(rendered, reference)| rendered.zip(*reference)).collect();
     let error = |(rendered, reference): &(f32, f32)| (rendered - reference).abs();
-    let is_penumbra = |(_, reference): &&(f32, f32)| (PENUMBRA..=1.0 - PENUMBRA).contains(reference);
-    let umbra: Vec<f64> = pairs.iter().filter(|pair| pair.1 <= UMBRA).map(|pair| f64::from(pair.0)).collect();
-    let fully_lit = pairs.iter().filter(|pair| pair.1 >= 1.0 - UMBRA);
-    let lost: Vec<f64> = fully_lit.map(|pair| f64::from(pair.1 - pair.0)).collect();
+    let is_penumbra =
+        |(_, reference): &&(f32, f32)| (MIN_PENUMBRA_VISIBILITY..=1.0 - MIN_PENUMBRA_VISIBILITY).contains(reference);
+    let umbra_visibilities: Vec<f64> =
+        pairs.iter().filter(|pair| pair.1 <= MAX_UMBRA_VISIBILITY).map(|pair| f64::from(pair.0)).collect();
+    let sunlit_pairs = pairs.iter().filter(|pair| pair.1 >= 1.0 - MAX_UMBRA_VISIBILITY);
+    let missing_visibilities: Vec<f64> = sunlit_pairs.map(|pair| f64::from(pair.1 - pair.0)).collect();
     let mean = |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
     let bias = pairs.iter().map(|(rendered, reference)| f64::from(rendered - reference)).sum::<f64>();
     LightErrors {
-        all: ErrorDistribution::from_values(pairs.iter().map(error).collect()),
+        all_pixels: ErrorDistribution::from_values(pairs.iter().map(error).collect()),
         penumbra: ErrorDistribution::from_values(pairs.iter().filter(is_penumbra).map(error).collect()),
-        in_umbra: mean(&umbra),
-        umbra_pixels: umbra.len(),
-        lost: mean(&lost),
+        umbra_visibility: mean(&umbra_visibilities),
+        umbra_pixels: umbra_visibilities.len(),
+        lost_visibility: mean(&missing_visibilities),
         bias: bias / pairs.len().max(1) as f64,
     }
 }
 
-/// Flicker of a moving scene: the change of the error from frame to frame, as the largest of the three channels, of
-/// 255. A constant error does not flicker.
+/// Measures the flicker of a moving scene: the change of a pixel's error from frame to frame, as the largest of the three
+/// channels, of 255. A constant error does not flicker.
 #[derive(Debug, Default)]
-pub struct Flicker {
-    /// Signed error of each pixel of the last frame.
+pub struct FlickerMeter {
+    /// Signed error of each pixel of the last frame; rendered minus reference.
     last_errors: Vec<[f32; 3]>,
     /// Absolute changes of the errors of all pixels and frames.
     changes: Vec<f32>,
 }
 
-impl Flicker {
+impl FlickerMeter {
     /// Adds the next frame and its reference.
-    pub fn push(&mut self, rendered: &[u8], reference: &[[f32; 3]]) {
+    pub fn add_frame(&mut self, rendered: &[u8], reference: &[[f32; 3]]) {
         let error = |(pixel, expected): (&[u8], &[f32; 3])| {
             std::array::from_fn(|channel| f32::from(pixel[channel]) - expected[channel])
         };
@@ -120,10 +126,10 @@ mod tests {
     #[test]
     fn one_wrong_pixel_in_a_hundred_gives_known_errors() {
         let reference = vec![[100.0; 3]; 100];
-        assert_eq!(compare_colors(&gray([100; 100]), &reference).largest, 0.0, "control: equal images");
+        assert_eq!(compare_colors(&gray([100; 100]), &reference).max, 0.0, "control: equal images");
         let one_wrong = gray((0..100).map(|pixel| if pixel == 7 { 150 } else { 100 }));
-        let found = compare_colors(&one_wrong, &reference);
-        assert_eq!((found.mean, found.p99, found.largest, found.count), (0.5, 0.0, 50.0, 100));
+        let errors = compare_colors(&one_wrong, &reference);
+        assert_eq!((errors.mean, errors.p99, errors.max, errors.count), (0.5, 0.0, 50.0, 100));
         let two_wrong = gray((0..100).map(|pixel| if pixel < 2 { 150 } else { 100 }));
         assert_eq!(
             compare_colors(&two_wrong, &reference).p99,
@@ -132,7 +138,7 @@ mod tests {
         );
         let mut tinted = gray([100; 100]);
         tinted[1] = 90;
-        assert_eq!(compare_colors(&tinted, &reference).largest, 10.0, "an error in one channel is counted");
+        assert_eq!(compare_colors(&tinted, &reference).max, 10.0, "an error in one channel is counted");
         assert_eq!(compare_colors(&[], &[]), ErrorDistribution::default());
     }
 
@@ -141,34 +147,48 @@ mod tests {
         let ramp = |shift: i32| -> Vec<Option<f32>> {
             (0..100).map(|pixel| Some(((pixel - 40 - shift) as f32 / 20.0).clamp(0.0, 1.0))).collect()
         };
-        let still = compare_light(&ramp(0), &ramp(0));
-        assert_eq!((still.all.largest, still.penumbra.count, still.bias), (0.0, 19, 0.0), "control: the same ramp");
-        let moved = compare_light(&ramp(2), &ramp(0));
-        assert!((moved.penumbra.largest - 0.1).abs() < 1e-6 && moved.penumbra.mean > 0.09, "{moved:?}");
-        assert!((moved.all.mean - 0.02).abs() < 1e-6 && (moved.bias + 0.02).abs() < 1e-6, "{moved:?}");
-        assert_eq!(moved.in_umbra, Some(0.0), "a displaced shadow does not bleed");
+        let unshifted_errors = compare_light(&ramp(0), &ramp(0));
+        assert_eq!(
+            (unshifted_errors.all_pixels.max, unshifted_errors.penumbra.count, unshifted_errors.bias),
+            (0.0, 19, 0.0),
+            "control: the same ramp"
+        );
+        let shifted_errors = compare_light(&ramp(2), &ramp(0));
+        assert!(
+            (shifted_errors.penumbra.max - 0.1).abs() < 1e-6 && shifted_errors.penumbra.mean > 0.09,
+            "{shifted_errors:?}"
+        );
+        assert!(
+            (shifted_errors.all_pixels.mean - 0.02).abs() < 1e-6 && (shifted_errors.bias + 0.02).abs() < 1e-6,
+            "{shifted_errors:?}"
+        );
+        assert_eq!(shifted_errors.umbra_visibility, Some(0.0), "a displaced shadow does not bleed");
     }
 
     #[test]
     fn only_light_in_the_umbra_counts_as_bleeding() {
         let reference: Vec<Option<f32>> = (0..10).map(|pixel| Some(if pixel < 4 { 0.0 } else { 1.0 })).collect();
-        let mut leaking = reference.clone();
-        leaking[1] = Some(0.2);
-        let found = compare_light(&leaking, &reference);
-        assert!((found.in_umbra.expect("umbra pixels") - 0.05).abs() < 1e-7 && found.umbra_pixels == 4);
-        let mut dark = reference.clone();
-        dark[9] = Some(0.5);
-        let found = compare_light(&dark, &reference);
-        assert_eq!(found.in_umbra, Some(0.0), "control: an error in the light");
-        assert!((found.lost.expect("fully lit pixels") - 0.5 / 6.0).abs() < 1e-7, "{found:?}");
-        assert_eq!(compare_light(&leaking, &reference).lost, Some(0.0), "control: an error in the umbra");
+        let mut leaking_image = reference.clone();
+        leaking_image[1] = Some(0.2);
+        let errors = compare_light(&leaking_image, &reference);
+        assert!((errors.umbra_visibility.expect("umbra pixels") - 0.05).abs() < 1e-7 && errors.umbra_pixels == 4);
+        let mut dark_image = reference.clone();
+        dark_image[9] = Some(0.5);
+        let errors = compare_light(&dark_image, &reference);
+        assert_eq!(errors.umbra_visibility, Some(0.0), "control: an error in the light");
+        assert!((errors.lost_visibility.expect("fully lit pixels") - 0.5 / 6.0).abs() < 1e-7, "{errors:?}");
         assert_eq!(
-            compare_light(&[Some(0.5)], &[Some(1.0)]).in_umbra,
+            compare_light(&leaking_image, &reference).lost_visibility,
+            Some(0.0),
+            "control: an error in the umbra"
+        );
+        assert_eq!(
+            compare_light(&[Some(0.5)], &[Some(1.0)]).umbra_visibility,
             None,
             "bleeding is undefined without umbra pixels"
         );
         assert_eq!(
-            compare_light(&[None, Some(1.0)], &[Some(0.0), None]).all.count,
+            compare_light(&[None, Some(1.0)], &[Some(0.0), None]).all_pixels.count,
             0,
             "pixels that either image leaves undefined are skipped"
         );
@@ -177,17 +197,17 @@ mod tests {
     #[test]
     fn only_changes_of_the_error_are_flicker() {
         let flicker = |rendered: &dyn Fn(usize) -> u8, reference: &dyn Fn(usize) -> f32| {
-            let mut flicker = Flicker::default();
-            (0..60).for_each(|step| flicker.push(&gray([rendered(step); 4]), &[[reference(step); 3]; 4]));
+            let mut flicker = FlickerMeter::default();
+            (0..60).for_each(|step| flicker.add_frame(&gray([rendered(step); 4]), &[[reference(step); 3]; 4]));
             flicker.into_distribution()
         };
-        let still = flicker(&|_| 90, &|_| 100.0);
-        assert_eq!((still.largest, still.count), (0.0, 59 * 4), "a constant error does not flicker");
-        let moving = flicker(&|step| 3 * step as u8, &|step| 3.0 * step as f32);
-        assert_eq!(moving.largest, 0.0, "an image that follows its reference does not flicker");
-        let blinking = flicker(&|step| 100 + 10 * (step % 2) as u8, &|_| 100.0);
-        assert_eq!((blinking.mean, blinking.largest), (10.0, 10.0));
-        let frozen = flicker(&|_| 100, &|step| 100.0 + 10.0 * (step % 2) as f32);
-        assert_eq!(frozen.mean, 10.0, "an image that misses a change of the reference flickers");
+        let constant_error = flicker(&|_| 90, &|_| 100.0);
+        assert_eq!((constant_error.max, constant_error.count), (0.0, 59 * 4), "a constant error does not flicker");
+        let following_image = flicker(&|step| 3 * step as u8, &|step| 3.0 * step as f32);
+        assert_eq!(following_image.max, 0.0, "an image that follows its reference does not flicker");
+        let alternating_image = flicker(&|step| 100 + 10 * (step % 2) as u8, &|_| 100.0);
+        assert_eq!((alternating_image.mean, alternating_image.max), (10.0, 10.0));
+        let constant_image = flicker(&|_| 100, &|step| 100.0 + 10.0 * (step % 2) as f32);
+        assert_eq!(constant_image.mean, 10.0, "an image that misses a change of the reference flickers");
     }
 }

@@ -1,5 +1,5 @@
-//! Times the minimal passes of a scene, a lower limit of the cost of drawing its mesh: one draw of the depth of the
-//! shadow map without a fragment shader, and one draw of the ids and depth of the frame.
+//! Times the minimal passes of a scene. They are a lower limit of the cost to draw its mesh: one draw of the shadow map's
+//! depth without a fragment shader, and one draw of the frame's ids and depth.
 //!
 //! The scene is stripped to one opaque, two-sided, white material. Culling, images, cut-outs, shadow moments and the
 //! ground are off.
@@ -14,22 +14,24 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::{Culling, RenderSettings, Scene, SceneParts, ShadowMethod, ShadowSettings};
 use modalcast_render::{FrameStats, Pass};
 
-/// Times of both passes on one load.
+/// Times of both passes on one workload.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct MinimalPasses {
     pub load: String,
     pub triangles: usize,
     /// Side of the depth map, texels.
-    pub map: u32,
+    #[serde(rename = "map")]
+    pub map_size: u32,
     /// Samples per pixel of ids and depth, as in the compared frames.
     pub samples: u32,
     pub depth: Timing,
     pub visibility: Timing,
     /// A frame without culling. Its excess over both passes is the overhead of the renderer.
-    pub unculled: FrameBaseline,
-    /// A frame with the culling of the load's own settings.
+    #[serde(rename = "unculled")]
+    pub without_culling: FrameBaseline,
+    /// A frame with the culling of the scene's own settings.
     #[serde(rename = "usual")]
-    pub default_culling: FrameBaseline,
+    pub with_default_culling: FrameBaseline,
 }
 
 /// A frame of the renderer with the same map, for comparison with both passes.
@@ -40,30 +42,30 @@ pub struct FrameBaseline {
     /// Time of the frame, microseconds.
     pub frame_us: f64,
     /// Time in excess of both minimal passes, microseconds.
-    pub beyond_us: f64,
+    #[serde(rename = "beyond_us")]
+    pub excess_us: f64,
 }
 
 impl MinimalPasses {
     /// Fills in each frame's excess over both passes.
     pub(super) fn with_frame_differences(mut self) -> Self {
         let sum_us = self.depth.median_us + self.visibility.median_us;
-        for frame in [&mut self.unculled, &mut self.default_culling] {
-            frame.beyond_us = frame.frame_us - sum_us;
+        for frame in [&mut self.without_culling, &mut self.with_default_culling] {
+            frame.excess_us = frame.frame_us - sum_us;
         }
         self
     }
 }
 
-/// Limit of the excess over both passes, microseconds, for a frame of three million triangles without culling on an
-/// H200.
+/// Limit of a frame's excess over both passes, microseconds: three million triangles without culling on an H200.
 pub(super) const MAX_EXCESS_US: f64 = 600.0;
 
-/// The scene with one material and a standard shadow map of this size.
+/// The scene with one material and a standard shadow map of `map_size` texels per side.
 ///
 /// # Errors
 /// Only those that the scene itself would cause.
-pub(super) fn strip_to_mesh(scene: &Scene, map: u32) -> Result<Arc<Scene>> {
-    let shadow = ShadowSettings { method: ShadowMethod::Standard, size: map, ..ShadowSettings::default() };
+pub(super) fn strip_to_mesh(scene: &Scene, map_size: u32) -> Result<Arc<Scene>> {
+    let shadow = ShadowSettings { method: ShadowMethod::Standard, size: map_size, ..ShadowSettings::default() };
     let look = RenderSettings { shadow: Some(shadow), ground: None, bloom: None, culling: Culling::None, ..scene.look };
     let materials = vec![Material { double_sided: true, ..Material::default() }];
     let mut parts = SceneParts { look, materials, textures: Vec::new(), ..scene.parts() };
@@ -95,14 +97,14 @@ mod tests {
             !stripped_scene.features.textures && !stripped_scene.features.mask && !stripped_scene.features.normal_maps
         );
         let size = Size { width: 32, height: 24 };
-        let mut stats = |scene: &Arc<Scene>| {
+        let mut frame_stats = |scene: &Arc<Scene>| {
             let mut loaded_scene = harness.load(scene).expect("a loaded scene");
             harness.deform(&mut loaded_scene, &animation.state(0)).expect("deformed vertices");
             harness.draw(&loaded_scene, animation.camera(size), size).expect("a frame");
             harness.unload(loaded_scene);
             harness.renderer.stats().clone()
         };
-        assert!(is_minimal(&stats(&stripped_scene)));
-        assert!(!is_minimal(&stats(&animation.scene)), "control: leaves and bark need separate draws");
+        assert!(is_minimal(&frame_stats(&stripped_scene)));
+        assert!(!is_minimal(&frame_stats(&animation.scene)), "control: leaves and bark need separate draws");
     }
 }

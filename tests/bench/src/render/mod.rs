@@ -66,7 +66,7 @@ pub use self::measure::RenderRow;
 pub use self::minimal_passes::{FrameBaseline, MinimalPasses};
 use self::plants::PlantResult;
 pub use self::raster_comparison::RasterComparison;
-pub use self::raster_report::{RasterReport, rasters};
+pub use self::raster_report::{RasterReport, compare_rasterizers};
 pub use self::readback::ReadbackRates;
 use self::variants::RenderVariant;
 use self::workloads::RenderWorkload;
@@ -76,36 +76,41 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::Scene;
 use modalcast_render::{FrameParams, RendererInfo, shadow_texel_axes};
 
-/// Settings of a report.
+/// Settings of a report. Workloads are named `load` in records and on the command line.
 #[derive(Debug, Clone)]
 pub struct RenderReportOptions {
     pub loads: Vec<RenderWorkload>,
-    /// Plants of table 4.5 to deform and draw, as indices from 0.
+    /// Plants of the thesis's table 4.5 to deform and draw, as indices from 0.
     pub plants: Vec<usize>,
     /// Variants to measure: full names, or prefixes that end in `*`. An empty list selects all.
     pub variants: Vec<String>,
     pub size: Size,
-    /// Uses fewer variants, samples and steps, for machines with few cores.
+    /// Uses fewer variants, samples and triangles, for machines with few cores.
     pub quick: bool,
     /// Frames per median.
     pub replays: usize,
 }
 
 impl RenderReportOptions {
+    /// Texels per side of the shadow maps of plants and of rasterizer comparisons.
+    fn shadow_map_size(&self) -> u32 {
+        if self.quick { 1024 } else { 4096 }
+    }
+
     /// The variants to measure. A quick run has fewer, but includes every variant that is named in full.
     pub fn selected_variants(&self) -> Vec<RenderVariant> {
-        let (quick_variants, mut selected) = (variants::all(self.quick), variants::all(false));
-        selected.retain(|variant| {
+        let (quick_variants, mut selected_variants) = (variants::all(self.quick), variants::all(false));
+        selected_variants.retain(|variant| {
             let is_named = self.variants.contains(&variant.name);
             is_named
                 || is_selected(&self.variants, &variant.name)
                     && quick_variants.iter().any(|quick| quick.name == variant.name)
         });
-        selected
+        selected_variants
     }
 }
 
-/// Sizes, sample counts and reference times of one load in a report.
+/// Sizes, sample counts and reference times of one workload in a report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RenderWorkloadSummary {
     pub name: String,
@@ -118,25 +123,30 @@ pub struct RenderWorkloadSummary {
     pub taps: usize,
     /// Time to trace all references of the still image.
     pub reference_ms: f64,
-    /// Texel size of the shadow map of the load's own settings; `None` without shadows.
-    pub texels: Option<ShadowTexelSize>,
+    /// Texel size of the shadow map with the scene's own settings; `None` without shadows.
+    #[serde(rename = "texels")]
+    pub texel_size: Option<ShadowTexelSize>,
     /// Steps over which flicker was measured.
     pub steps: usize,
     /// Size of the images of the moving scene.
     pub steps_size: Size,
     /// Reason why flicker was not measured.
-    pub no_flicker: Option<String>,
+    #[serde(rename = "no_flicker")]
+    pub flicker_skip_reason: Option<String>,
 }
 
 /// Longer side of a texel of a shadow map, in scene units.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ShadowTexelSize {
     /// Texels per side of the map.
-    pub size: u32,
-    /// For a map that is fitted to the extent of the vertices in light space, as the renderer does.
-    pub side: f64,
+    #[serde(rename = "size")]
+    pub map_size: u32,
+    /// For a map that is fitted to the extent of the vertices in light space, as in the renderer.
+    #[serde(rename = "side")]
+    pub vertex_fit_side: f64,
     /// For a map that is fitted to the corners of the bounding box.
-    pub by_corners: f64,
+    #[serde(rename = "by_corners")]
+    pub corner_fit_side: f64,
 }
 
 impl ShadowTexelSize {
@@ -144,9 +154,9 @@ impl ShadowTexelSize {
         let longer_side = |frame_params: &FrameParams| {
             shadow_texel_axes(scene, frame_params).map(|axes| axes[0].norm().max(axes[1].norm()))
         };
-        let (side, by_corners) =
-            (longer_side(frame_params)?, longer_side(&FrameParams { light: None, ..*frame_params })?);
-        scene.look.shadow.map(|shadow| Self { size: shadow.size, side, by_corners })
+        let vertex_fit_side = longer_side(frame_params)?;
+        let corner_fit_side = longer_side(&FrameParams { light: None, ..*frame_params })?;
+        scene.look.shadow.map(|shadow| Self { map_size: shadow.size, vertex_fit_side, corner_fit_side })
     }
 }
 
@@ -161,58 +171,58 @@ pub struct RenderReport {
     pub bounds: variants::ErrorLimits,
     pub loads: Vec<RenderWorkloadSummary>,
     pub rows: Vec<RenderRow>,
-    /// One entry per load.
+    /// One entry per workload.
     pub readback: Vec<ReadbackRates>,
-    /// Times of the minimal passes on each load.
+    /// Times of the minimal passes on each workload.
     #[serde(rename = "bare")]
     pub minimal_passes: Vec<MinimalPasses>,
     /// Times of the minimal passes by CUDA and by OpenGL; empty without a CUDA device.
     pub raster: Vec<RasterComparison>,
     /// Times to compute the same moment map by compute shaders and by fragment shaders.
     pub blurs: Vec<BlurComparison>,
-    /// Plants of table 4.5, deformed and drawn.
+    /// Plants of the thesis's table 4.5, deformed and drawn.
     pub plants: Vec<PlantResult>,
-    /// Unexpected results, as `load: variant: reason`: variants that failed unexpectedly, and variants that passed
-    /// although they were expected to fail.
+    /// Unexpected results, as `workload: variant: reason`. A variant may fail unexpectedly, or pass although it is
+    /// expected to fail.
     pub failed: Vec<String>,
     /// Reference images and comparison strips.
     #[serde(skip)]
     pub pictures: Vec<ImageFile>,
 }
 
-/// Measures everything that is requested; `progress` receives a description of each stage.
+/// Measures the selected variants on all workloads, and the plants; `progress` receives a description of each stage.
 ///
 /// # Errors
 /// `Unavailable` without OpenGL; errors of loading and drawing a scene.
-pub fn render(request: &RenderReportOptions, mut progress: impl FnMut(&str)) -> Result<RenderReport> {
+pub fn render(options: &RenderReportOptions, mut progress: impl FnMut(&str)) -> Result<RenderReport> {
     let mut harness = RenderHarness::open()?;
     let (mut loads, mut rows, mut minimal_passes, mut pictures) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     let mut readback = Vec::new();
-    for workload in &request.loads {
+    for workload in &options.loads {
         progress(&format!("{}: building", workload.name()));
-        let measured = measure::measure_workload(&mut harness, request, *workload, &mut progress)?;
-        loads.push(measured.summary);
-        rows.extend(measured.rows);
-        minimal_passes.extend(measured.minimal_passes);
-        pictures.extend(measured.files);
+        let result = measure::measure_workload(&mut harness, options, *workload, &mut progress)?;
+        loads.push(result.summary);
+        rows.extend(result.rows);
+        minimal_passes.extend(result.minimal_passes);
+        pictures.extend(result.files);
         progress(&format!("{}: measuring readback", workload.name()));
-        readback.push(readback::measure(&mut harness, request, *workload)?);
+        readback.push(readback::measure(&mut harness, options, *workload)?);
     }
     let device = harness::cuda_device();
     let raster = match &device {
-        Some(device) => raster_comparison::measure(&mut harness, device, request, &mut progress)?,
+        Some(device) => raster_comparison::measure(&mut harness, device, options, &mut progress)?,
         None => Vec::new(),
     };
     let mut plants = Vec::new();
-    for index in &request.plants {
+    for index in &options.plants {
         progress(&format!("plant-{}", index + 1));
-        plants.push(plants::measure(&mut harness, device.as_ref(), request, *index)?);
+        plants.push(plants::measure(&mut harness, device.as_ref(), options, *index)?);
     }
     let failed = rows.iter().filter(|row: &&RenderRow| !row.is_as_expected()).map(describe_failure);
-    let failed = failed.chain(raster.iter().filter_map(RasterComparison::fault)).collect();
+    let failed = failed.chain(raster.iter().filter_map(RasterComparison::describe_fault)).collect();
     let (provenance, renderer, bounds) = (Provenance::here(), harness.renderer.info().clone(), variants::ERROR_LIMITS);
     let blurs = BlurComparison::pair_rows(&rows);
-    let size = request.size;
+    let size = options.size;
     Ok(RenderReport {
         provenance,
         renderer,

@@ -10,8 +10,8 @@ use crate::plot::render_png;
 use crate::timing::Timing;
 use modalcast_model::error::{Result, fault_in};
 
-/// Columns of `report.csv`: name, and the JSON pointer of the value in a row of `report.json`. Columns of times have the
-/// name of the pass instead of a pointer.
+/// Columns of `report.csv`: the name, and the source of the value. The source is a JSON pointer into a row of
+/// `report.json`, or the name of a pass whose time the column contains.
 const COLUMNS: [(&str, &str); 55] = [
     ("load", "/load"),
     ("variant", "/name"),
@@ -108,92 +108,93 @@ fn rows_csv(rows: &[RenderRow]) -> Result<Vec<u8>> {
     encode_csv(COLUMNS.map(|(name, _)| name.to_owned()), lines)
 }
 
-/// The CSV of minimal passes, rasterizers and blurs. Each line has a time, and after `beside` the time that it is
-/// compared with.
+/// The CSV of minimal passes, rasterizers and blurs. Each line has a time and, in the columns `beside` and `beside_us`,
+/// the time that it is compared with.
 fn passes_csv(report: &RenderReport) -> Result<Vec<u8>> {
-    let head =
+    let header =
         ["load", "what", "size", "samples_or_taps", "median_us", "beside", "beside_us", "difference_us", "ratio"];
     let mut lines = Vec::new();
-    for minimal in &report.minimal_passes {
+    let frame_size = format!("{}x{}", report.size.width, report.size.height);
+    for minimal_passes in &report.minimal_passes {
         let passes = [
-            ("bare depth pass", minimal.map, minimal.depth),
-            ("bare visibility pass", minimal.samples, minimal.visibility),
+            ("bare depth pass", minimal_passes.map_size.to_string(), 1, minimal_passes.depth),
+            ("bare visibility pass", frame_size.clone(), minimal_passes.samples, minimal_passes.visibility),
         ];
-        for (pass_name, number, timing) in passes {
-            let [size, sample_count] = if pass_name == "bare depth pass" {
-                [number.to_string(), "1".into()]
-            } else {
-                [format!("{}x{}", report.size.width, report.size.height), number.to_string()]
-            };
-            let median = timing.median_us.to_string();
-            lines.push([&minimal.load, pass_name, &size, &sample_count, &median, "", "", "", ""].map(String::from));
+        for (pass_name, size, sample_count, timing) in passes {
+            let [sample_count, median] = [f64::from(sample_count), timing.median_us].map(|number| number.to_string());
+            lines.push(
+                [&minimal_passes.load, pass_name, &size, &sample_count, &median, "", "", "", ""].map(String::from),
+            );
         }
-        let sum_us = (minimal.depth.median_us + minimal.visibility.median_us).to_string();
-        for frame in [&minimal.unculled, &minimal.default_culling] {
-            let [frame_us, beyond_us, size] =
-                [frame.frame_us, frame.beyond_us, f64::from(minimal.map)].map(|number| number.to_string());
+        let sum_us = (minimal_passes.depth.median_us + minimal_passes.visibility.median_us).to_string();
+        for frame in [&minimal_passes.without_culling, &minimal_passes.with_default_culling] {
+            let [frame_us, excess_us, size] =
+                [frame.frame_us, frame.excess_us, f64::from(minimal_passes.map_size)].map(|number| number.to_string());
             let pass_name = "both bare passes";
             lines.push(
-                [&minimal.load, pass_name, &size, "", &sum_us, &frame.name, &frame_us, &beyond_us, ""]
+                [&minimal_passes.load, pass_name, &size, "", &sum_us, &frame.name, &frame_us, &excess_us, ""]
                     .map(String::from),
             );
         }
     }
     for (comparison, passes) in report.raster.iter().filter_map(|entry| entry.passes.map(|passes| (entry, passes))) {
-        let frame = format!("{}x{}", report.size.width, report.size.height);
         let pairs = [
-            ("raster depth in CUDA", comparison.map.to_string(), passes.depth),
-            ("raster ids in CUDA", frame, passes.visibility),
+            ("raster depth in CUDA", comparison.map_size.to_string(), passes.depth),
+            ("raster ids in CUDA", frame_size.clone(), passes.visibility),
         ];
         for (pass_name, size, pair) in pairs {
             let [cuda, opengl, ratio] =
-                [pair.cuda.median_us, pair.opengl.median_us, pair.ratio()].map(|us| us.to_string());
+                [pair.cuda.median_us, pair.opengl.median_us, pair.ratio()].map(|number| number.to_string());
             lines.push(
                 [&comparison.load, pass_name, &size, "1", &cuda, "in OpenGL", &opengl, "", &ratio].map(String::from),
             );
         }
     }
-    for blurs in &report.blurs {
-        let [size, taps] = [blurs.size, blurs.taps].map(|number| number.to_string());
+    for blur in &report.blurs {
+        let [size, taps] = [blur.size, blur.taps].map(|number| number.to_string());
         let [compute_us, fragments_us, ratio] =
-            [blurs.compute_us, blurs.fragments_us, blurs.ratio].map(|number| number.to_string());
+            [blur.compute_us, blur.fragments_us, blur.ratio].map(|number| number.to_string());
         let pass_name = "moments and blur in compute";
         lines.push(
-            [&blurs.load, pass_name, &size, &taps, &compute_us, "in fragments", &fragments_us, "", &ratio]
+            [&blur.load, pass_name, &size, &taps, &compute_us, "in fragments", &fragments_us, "", &ratio]
                 .map(String::from),
         );
     }
-    encode_csv(head.map(String::from), lines)
+    encode_csv(header.map(String::from), lines)
 }
 
 /// The CSV of plants, one per line: our measurements and those of the thesis.
 fn plants_csv(plants: &[PlantResult]) -> Result<Vec<u8>> {
-    let head =
+    let header =
         ["load", "species", "full", "backend", "shared", "triangles", "domains", "map_size", "deform_ms", "upload_ms"];
-    let head = head.into_iter().chain(["render_ms", "t_vbr_ms", "frame_ms", "fps", "memory_mb", "o_vbr"]);
-    let head = head.chain(["thesis_t_vbr_ms", "thesis_fps", "thesis_memory_mb", "thesis_o_vbr"]);
+    let header = header.into_iter().chain(["render_ms", "t_vbr_ms", "frame_ms", "fps", "memory_mb", "o_vbr"]);
+    let header = header.chain(["thesis_t_vbr_ms", "thesis_fps", "thesis_memory_mb", "thesis_o_vbr"]);
     let line = |plant: &PlantResult| {
-        let ms = |timing: Timing| (timing.median_us / 1e3).to_string();
+        let median_ms = |timing: Timing| (timing.median_us / 1e3).to_string();
         let thesis = plant.thesis.drawn;
-        let (backend, shared, full) = (plant.backend.name(), plant.shared, plant.full);
-        let texts =
-            [plant.load.clone(), plant.thesis.name.into(), full.to_string(), backend.into(), shared.to_string()];
-        let sizes = [plant.triangles, plant.domains, plant.map as usize].map(|number| number.to_string());
-        let times = [plant.deform, plant.upload, plant.render, plant.vbr, plant.frame].map(ms);
+        let texts = [
+            plant.load.clone(),
+            plant.thesis.name.into(),
+            plant.is_full_size.to_string(),
+            plant.backend.name().into(),
+            plant.shares_buffers.to_string(),
+        ];
+        let sizes = [plant.triangles, plant.domains, plant.map_size as usize].map(|number| number.to_string());
+        let times = [plant.deform, plant.upload, plant.render, plant.vbr, plant.frame].map(median_ms);
         let rates = [plant.fps, plant.bytes as f64 / 1e6, plant.occupation];
         let thesis = [thesis.gpu_vbr_ms, thesis.gpu_fps, thesis.gpu_mb, thesis.gpu_vbr_occupation];
         let numbers = rates.iter().chain(&thesis).map(|number| number.to_string());
         texts.into_iter().chain(sizes).chain(times).chain(numbers).collect::<Vec<String>>()
     };
-    encode_csv(head.map(String::from), plants.iter().map(line))
+    encode_csv(header.map(String::from), plants.iter().map(line))
 }
 
 fn encode_csv<L: IntoIterator<Item = String>>(
-    head: impl IntoIterator<Item = String>,
+    header: impl IntoIterator<Item = String>,
     lines: impl IntoIterator<Item = L>,
 ) -> Result<Vec<u8>> {
     let mut writer = csv::Writer::from_writer(Vec::new());
-    writer.write_record(head).map_err(fault_in("report"))?;
+    writer.write_record(header).map_err(fault_in("report"))?;
     for line in lines {
         writer.write_record(line).map_err(fault_in("report"))?;
     }
@@ -244,10 +245,13 @@ mod tests {
         for (name, _) in &passes {
             assert!(COLUMNS.iter().any(|(_, source)| source == name), "expected a column for pass {name}");
         }
-        let sum =
+        let sum_of =
             |names: &[&str]| -> f64 { passes.iter().filter(|pass| names.contains(&pass.0)).map(|pass| pass.1).sum() };
-        let (draw, parts) = (sum(&["draw"]), ["cull", "visibility", "blended", "shade", "bloom", "encode"]);
-        assert!((draw - sum(&parts)).abs() < 1e-9 * draw, "{passes:?}");
-        assert!(sum(&parts[1..]) < draw && sum(&["bloom"]) > 0.0, "expected non-zero times of culling and bloom");
+        let (draw_ms, parts) = (sum_of(&["draw"]), ["cull", "visibility", "blended", "shade", "bloom", "encode"]);
+        assert!((draw_ms - sum_of(&parts)).abs() < 1e-9 * draw_ms, "{passes:?}");
+        assert!(
+            sum_of(&parts[1..]) < draw_ms && sum_of(&["bloom"]) > 0.0,
+            "expected non-zero times of culling and bloom"
+        );
     }
 }

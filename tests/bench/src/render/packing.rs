@@ -6,13 +6,14 @@
 //!
 //! The renderer uses an array per size class, without a scale. For the comparison, a scene is rebuilt so that the
 //! renderer reproduces the thesis's method: images are repeated to the common size, and the corners of every triangle
-//! have the coordinates of the equation. The equation wraps each fragment. Wrapping whole triangles is equivalent if no
-//! triangle crosses the edge of its image.
+//! have the coordinates of the equation. The equation wraps the coordinates of each fragment. To wrap those of triangles
+//! is equivalent if no triangle crosses the edge of its image.
 //!
-//! On the `images` load the corrected scale has a slightly smaller error than arrays by size: 3.93 against 4.24 of 255,
-//! measured in software at 640 x 360. The load has seven sizes and the renderer six arrays, so the two smallest, 16 x 16
-//! and 25 x 15, share an array of 25 x 16 and are stretched to it. Arrays by size lose on their panels, which are seen
-//! with several pixels per texel, by up to 7 of 255. On the floor arrays by size are nearer, by up to half a level.
+//! On the `images` workload, the corrected scale has a slightly smaller error than arrays by size: 3.93 compared with 4.24
+//! of 255, with software rendering at 640 x 360. The workload has seven image sizes and the renderer six arrays. The two
+//! smallest images, 16 x 16 and 25 x 15, share an array of 25 x 16 and are stretched to this size. On their panels, where
+//! a texel covers several pixels, the error of arrays by size is larger by up to 7 of 255. On the floor it is smaller by
+//! up to half a level.
 
 use std::sync::Arc;
 
@@ -24,62 +25,67 @@ use modalcast_model::scene::{Scene, SceneParts};
 
 /// Packing of images in arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "kebab-case")]
 pub enum Packing {
-    /// An array per size class, as the renderer does.
-    Classes,
+    /// An array per size class, as in the renderer.
+    #[serde(rename = "classes")]
+    SizeClasses,
     /// Equation 3.13 as printed: it does not reach the last column and row of an image.
-    Repeated,
+    #[serde(rename = "repeated")]
+    PrintedRepetition,
     /// Equation 3.13 with s = (w / w_t, h / h_t), which covers the whole image.
-    RepeatedWhole,
+    #[serde(rename = "repeated-whole")]
+    CorrectedRepetition,
 }
 
-/// Packs the images of a scene by this method. The scene must be rigid, and all its images must be colors.
+/// Packs the images of a scene by this method. The scene must be rigid, and its images must be color images.
 ///
 /// # Errors
 /// `Invalid` when a triangle crosses the edge of its image.
 pub(super) fn pack_images(scene: &Scene, packing: Packing) -> Result<Arc<Scene>> {
     let mut parts = scene.parts();
-    if packing != Packing::Classes {
+    if packing != Packing::SizeClasses {
         repeat_images(&mut parts, packing)?;
     }
     Scene::new(parts)
 }
 
 fn repeat_images(parts: &mut SceneParts, packing: Packing) -> Result<()> {
-    let largest = |side: fn(&Texture) -> u32| parts.textures.iter().map(side).max().unwrap_or(1);
-    let size = [largest(Texture::width), largest(Texture::height)];
+    let max_side = |side: fn(&Texture) -> u32| parts.textures.iter().map(side).max().unwrap_or(1);
+    let layer_size = [max_side(Texture::width), max_side(Texture::height)];
     let mut shapes = Vec::new();
     for domain in &mut parts.domains {
-        let image = parts.materials[domain.material].color_texture.map(|image| &parts.textures[image]);
-        let scale = image.map_or([1.0; 2], |image| uv_scale(image, size, packing));
+        let texture = parts.materials[domain.material].color_texture.map(|texture| &parts.textures[texture]);
+        let scale = texture.map_or([1.0; 2], |texture| uv_scale(texture, layer_size, packing));
         shapes.push(Shape::new(wrap_uvs(&parts.shapes[domain.shape].mesh, scale)?, Modes::rigid())?);
         domain.shape = shapes.len() - 1;
     }
     parts.shapes = shapes;
-    parts.textures = parts.textures.iter().map(|image| fill_by_repetition(image, size)).collect::<Result<_>>()?;
+    parts.textures =
+        parts.textures.iter().map(|texture| fill_by_repetition(texture, layer_size)).collect::<Result<_>>()?;
     Ok(())
 }
 
 /// s of equation 3.13 per axis.
-fn uv_scale(image: &Texture, size: [u32; 2], packing: Packing) -> [f32; 2] {
-    let image_size = [image.width(), image.height()];
+fn uv_scale(texture: &Texture, layer_size: [u32; 2], packing: Packing) -> [f32; 2] {
+    let image_size = [texture.width(), texture.height()];
     std::array::from_fn(|axis| match packing {
-        Packing::Repeated => f64::from(image_size[axis] - 1) / f64::from((size[axis] - 1).max(1)),
-        Packing::Classes | Packing::RepeatedWhole => f64::from(image_size[axis]) / f64::from(size[axis]),
+        Packing::PrintedRepetition => f64::from(image_size[axis] - 1) / f64::from((layer_size[axis] - 1).max(1)),
+        Packing::SizeClasses | Packing::CorrectedRepetition => {
+            f64::from(image_size[axis]) / f64::from(layer_size[axis])
+        }
     } as f32)
 }
 
 /// The image repeated until it fills this size.
-fn fill_by_repetition(image: &Texture, [width, height]: [u32; 2]) -> Result<Texture> {
-    let (columns, rows) = (image.width() as usize, image.height() as usize);
-    let pixel = |index: usize| {
+fn fill_by_repetition(texture: &Texture, [width, height]: [u32; 2]) -> Result<Texture> {
+    let (columns, rows) = (texture.width() as usize, texture.height() as usize);
+    let texel_bytes = |index: usize| {
         let (x, y) = (index % width as usize % columns, index / width as usize % rows);
-        let first = 4 * (y * columns + x);
-        image.rgba()[first..first + 4].iter().copied()
+        let first_byte = 4 * (y * columns + x);
+        texture.rgba()[first_byte..first_byte + 4].iter().copied()
     };
-    let rgba = (0..width as usize * height as usize).flat_map(pixel).collect();
-    Texture::new(image.name.clone(), width, height, rgba)
+    let rgba = (0..width as usize * height as usize).flat_map(texel_bytes).collect();
+    Texture::new(texture.name.clone(), width, height, rgba)
 }
 
 /// A mesh with separate corners per triangle and wrapped, scaled texture coordinates.
@@ -90,8 +96,8 @@ fn wrap_uvs(mesh: &Mesh, scale: [f32; 2]) -> Result<Mesh> {
         let uvs = triangle.map(|corner| mesh_corners.uvs[corner as usize]);
         let min_uv = [0, 1].map(|axis| uvs.iter().map(|uv| uv[axis]).fold(f32::MAX, f32::min).floor());
         for (corner, uv) in triangle.iter().zip(uvs) {
-            let wrapped = [0, 1].map(|axis| uv[axis] - min_uv[axis]);
-            if wrapped.iter().any(|coordinate| *coordinate > 1.0) {
+            let wrapped_uv = [0, 1].map(|axis| uv[axis] - min_uv[axis]);
+            if wrapped_uv.iter().any(|coordinate| *coordinate > 1.0) {
                 return Err(invalid(
                     "packing",
                     "triangles that stay within one repetition of their image",
@@ -100,14 +106,14 @@ fn wrap_uvs(mesh: &Mesh, scale: [f32; 2]) -> Result<Mesh> {
             }
             corners.vertices.push(mesh_corners.vertices[*corner as usize]);
             corners.normals.push(mesh_corners.normals[*corner as usize]);
-            corners.uvs.push([0, 1].map(|axis| wrapped[axis] * scale[axis]));
+            corners.uvs.push([0, 1].map(|axis| wrapped_uv[axis] * scale[axis]));
         }
     }
-    let count = corners.vertices.len() as u32 / 3;
+    let triangle_count = corners.vertices.len() as u32 / 3;
     Mesh::new(
         mesh.rest_positions().to_vec(),
         corners,
-        (0..count).map(|triangle| [3 * triangle, 3 * triangle + 1, 3 * triangle + 2]).collect(),
+        (0..triangle_count).map(|triangle| [3 * triangle, 3 * triangle + 1, 3 * triangle + 2]).collect(),
     )
 }
 
@@ -118,31 +124,31 @@ mod tests {
 
     #[test]
     fn repeats_small_images_and_scales_uvs_by_equation_3_13() {
-        let scene = RenderWorkload::Images.build().expect("built").scene;
-        let [as_printed, corrected] = [Packing::Repeated, Packing::RepeatedWhole]
+        let scene = RenderWorkload::Images.build().expect("a workload").scene;
+        let [printed_scene, corrected_scene] = [Packing::PrintedRepetition, Packing::CorrectedRepetition]
             .map(|packing| pack_images(&scene, packing).expect("a packed scene"));
-        let small = scene
+        let small_index = scene
             .textures
             .iter()
             .position(|image| (image.width(), image.height()) == (25, 15))
             .expect("an image of 25 x 15");
-        let (image, filled) = (&scene.textures[small], &as_printed.textures[small]);
-        assert_eq!((filled.width(), filled.height()), (128, 128));
+        let (image, filled_image) = (&scene.textures[small_index], &printed_scene.textures[small_index]);
+        assert_eq!((filled_image.width(), filled_image.height()), (128, 128));
         let red = |image: &Texture, x: u32, y: u32| image.rgba()[4 * (y * image.width() + x) as usize];
         for (x, y) in [(0, 0), (24, 14), (25, 15), (127, 127), (63, 40)] {
-            assert_eq!(red(filled, x, y), red(image, x % 25, y % 15), "({x}, {y})");
+            assert_eq!(red(filled_image, x, y), red(image, x % 25, y % 15), "({x}, {y})");
         }
         let max_uv = |scene: &Scene| {
             let domain =
-                scene.domains.iter().find(|domain| scene.materials[domain.material].color_texture == Some(small));
+                scene.domains.iter().find(|domain| scene.materials[domain.material].color_texture == Some(small_index));
             let uvs = &scene.shapes[domain.expect("a domain with the image").shape].mesh.corners().uvs;
             uvs.iter().fold([0.0_f32; 2], |max, uv| [max[0].max(uv[0]), max[1].max(uv[1])])
         };
-        let is_near = |uv: [f32; 2], expected: [f32; 2]| {
+        let is_close = |uv: [f32; 2], expected: [f32; 2]| {
             uv.iter().zip(expected).all(|(uv, expected)| (uv - expected).abs() < 1e-6)
         };
-        assert!(is_near(max_uv(&as_printed), [24.0 / 127.0, 14.0 / 127.0]), "{:?}", max_uv(&as_printed));
-        assert!(is_near(max_uv(&corrected), [25.0 / 128.0, 15.0 / 128.0]), "{:?}", max_uv(&corrected));
+        assert!(is_close(max_uv(&printed_scene), [24.0 / 127.0, 14.0 / 127.0]), "{:?}", max_uv(&printed_scene));
+        assert!(is_close(max_uv(&corrected_scene), [25.0 / 128.0, 15.0 / 128.0]), "{:?}", max_uv(&corrected_scene));
         assert!(max_uv(&scene)[0] > 1.5, "control: the panel repeats its image");
     }
 

@@ -1,11 +1,12 @@
 //! Deforms and draws the plants of table 4.5 and compares the results with the rendering columns of tables 4.6 and 4.7 of
 //! the thesis.
 //!
-//! Definitions of the thesis: `t_vbr` is the time to update the vertices and render, `O_vbr` its fraction of the whole
-//! frame, FPS are whole frames per second, s is device memory. Our `t_vbr` is a step of the deformer (upload of q and
-//! T, and U q), the upload of vertices where the deformer does not write the renderer's buffers, and all passes except
-//! the readback. Our frame consists of these, the waits in between, and the readback of the pixels. The thesis's frame
-//! includes the simulation, ours does not.
+//! Definitions of the thesis: `t_vbr` is the time to update the vertices and render them. `O_vbr` is its fraction of the
+//! whole frame. FPS are whole frames per second. s is device memory.
+//!
+//! Our `t_vbr` is the sum of three times: a step of the deformer (upload of q and T, and U q), the upload of vertices if
+//! the deformer does not write the renderer's buffers, and all passes except the readback. Our frame also contains the
+//! waits between these and the readback of the pixels. The thesis's frame includes the simulation, ours does not.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -17,7 +18,7 @@ use super::{RenderReportOptions, light_meter};
 use crate::motion::WorkloadMotion;
 use crate::thesis::{PLANTS, ThesisPlant};
 use crate::timing::{MIN_REPETITIONS, Timing};
-use crate::workloads::{Size as Scale, Workload, WorkloadKind};
+use crate::workloads::{Size as WorkloadSize, Workload, WorkloadKind};
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{self, BufferRole, CudaDeformer, CudaDeformerOptions, Device};
 use modalcast_model::deform::{Backend, DeformSummary, Deformer, VertexAttributes};
@@ -31,15 +32,18 @@ pub struct PlantResult {
     pub load: String,
     pub thesis: ThesisPlant,
     /// Whether the plant has the size of its row in table 4.5. The results are comparable only if it has.
-    pub full: bool,
+    #[serde(rename = "full")]
+    pub is_full_size: bool,
     pub remarks: Vec<String>,
     pub backend: Backend,
     /// Whether the deformer writes the renderer's buffers, so that vertices do not pass through the host.
-    pub shared: bool,
+    #[serde(rename = "shared")]
+    pub shares_buffers: bool,
     pub triangles: usize,
     pub domains: usize,
     /// Side of its variance shadow map, texels.
-    pub map: u32,
+    #[serde(rename = "map")]
+    pub map_size: u32,
     /// A step of the deformer.
     pub deform: Timing,
     /// Upload of the vertices; 0 with shared buffers.
@@ -58,8 +62,6 @@ pub struct PlantResult {
 
 /// Number of states, which the frames use in turn.
 const STATES: usize = 8;
-/// Sides of the shadow map in a full and in a quick run, texels.
-const MAPS: (u32, u32) = (4096, 1024);
 
 /// A plant's deformer and renderer buffers. The deformer is dropped first, because it may write the buffers.
 struct PlantSetup {
@@ -73,33 +75,33 @@ struct PlantSetup {
 pub(super) fn measure(
     harness: &mut RenderHarness,
     device: Option<&Arc<Device>>,
-    request: &RenderReportOptions,
+    options: &RenderReportOptions,
     index: usize,
 ) -> Result<PlantResult> {
-    let scale = if request.quick { Scale::Quick } else { Scale::Full };
-    let load = WorkloadKind::Plant(index).build(scale)?;
-    let map = if request.quick { MAPS.1 } else { MAPS.0 };
-    let shadow = Some(ShadowSettings { size: map, ..ShadowSettings::default() });
-    let scene = light_meter::with_settings(&load.scene, RenderSettings { shadow, ..load.scene.look })?;
-    let states = motion_states(&Workload { scene: Arc::clone(&scene), ..load.clone() });
+    let workload_size = if options.quick { WorkloadSize::Quick } else { WorkloadSize::Full };
+    let workload = WorkloadKind::Plant(index).build(workload_size)?;
+    let map_size = options.shadow_map_size();
+    let shadow = Some(ShadowSettings { size: map_size, ..ShadowSettings::default() });
+    let scene = light_meter::with_settings(&workload.scene, RenderSettings { shadow, ..workload.scene.look })?;
+    let states = motion_states(&Workload { scene: Arc::clone(&scene), ..workload.clone() });
     let mut setup = create_setup(harness, device, &scene)?;
-    let times = time_frames(harness, &mut setup, &scene, (request.size, request.replays), &states)?;
+    let times = time_frames(harness, &mut setup, &scene, (options.size, options.replays), &states)?;
     let PlantSetup { deformer, bytes, buffers } = setup;
-    let (backend, shared) = (deformer.backend(), deformer.shares_buffers());
+    let (backend, shares_buffers) = (deformer.backend(), deformer.shares_buffers());
     let bytes = bytes + buffers.plan().bytes();
     drop(deformer);
     harness.renderer.unload(buffers);
     let [deform, upload, render, vbr, frame] = times;
     Ok(PlantResult {
-        load: load.name,
+        load: workload.name,
         thesis: PLANTS[index],
-        full: scale == Scale::Full,
-        remarks: load.remarks,
+        is_full_size: workload_size == WorkloadSize::Full,
+        remarks: workload.remarks,
         backend,
-        shared,
+        shares_buffers,
         triangles: scene.layout.triangles,
         domains: scene.domains.len(),
-        map,
+        map_size,
         deform,
         upload,
         render,
@@ -111,8 +113,8 @@ pub(super) fn measure(
     })
 }
 
-fn motion_states(load: &Workload) -> Vec<SceneState> {
-    let motion = WorkloadMotion::new(load, None);
+fn motion_states(workload: &Workload) -> Vec<SceneState> {
+    let motion = WorkloadMotion::new(workload, None);
     let state =
         |step: usize| SceneState { step: step as u64 + 1, serial: step as u64 + 1, ..motion.step(step).state() };
     (0..STATES).map(state).collect()
@@ -129,8 +131,9 @@ fn create_setup(harness: &mut RenderHarness, device: Option<&Arc<Device>>, scene
     };
     let renderer_device = harness.renderer.info().cuda_device.map(|ordinal| usize::try_from(ordinal).ok());
     let is_shared = renderer_device == Some(Some(device.ordinal()));
-    let gl = if is_shared { Some(buffers.vertex_buffers()) } else { None };
-    let deformer = CudaDeformer::new(device, scene, gl, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))?;
+    let vertex_buffers = if is_shared { Some(buffers.vertex_buffers()) } else { None };
+    let deformer =
+        CudaDeformer::new(device, scene, vertex_buffers, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))?;
     Ok(PlantSetup {
         bytes: unshared_bytes(deformer.plan(), deformer.shares_buffers()),
         deformer: Box::new(deformer),
@@ -139,12 +142,12 @@ fn create_setup(harness: &mut RenderHarness, device: Option<&Arc<Device>>, scene
 }
 
 /// Device bytes of a deformer, without outputs that it shares with the renderer.
-fn unshared_bytes(plan: &gpu::DeformPlan, shared: bool) -> u64 {
+fn unshared_bytes(plan: &gpu::DeformPlan, shares_buffers: bool) -> u64 {
     let outputs = [BufferRole::Positions, BufferRole::Normals, BufferRole::Tangents].map(|role| plan.bytes(role));
-    plan.total_bytes() - if shared { outputs.iter().sum() } else { 0 }
+    plan.total_bytes() - if shares_buffers { outputs.iter().sum() } else { 0 }
 }
 
-/// Times of deforming, uploading, rendering, their sum, and the whole frame.
+/// Times of deforming, uploading, rendering, their sum, and the whole frame, in this order.
 fn time_frames(
     harness: &mut RenderHarness,
     setup: &mut PlantSetup,
@@ -155,7 +158,7 @@ fn time_frames(
     let camera = Camera::fit_to_scene(scene, size.width, size.height);
     let begin = Instant::now();
     let mut warm_up_frames = 0;
-    // The first frames compile shaders and allocate textures, and the clock rates rise.
+    // The first frames compile shaders and allocate textures, and the clock rates of the device rise.
     while warm_up_frames < 2 || (!harness.renderer.info().software && begin.elapsed() < super::harness::WARM_UP) {
         time_frame(harness, setup, (camera, size), &states[warm_up_frames % states.len()])?;
         warm_up_frames += 1;
@@ -203,7 +206,7 @@ mod tests {
     #[test]
     fn deforms_and_draws_a_plant_with_consistent_times() {
         let mut harness = RenderHarness::open().expect("a renderer");
-        let request = RenderReportOptions {
+        let options = RenderReportOptions {
             loads: vec![],
             plants: vec![1],
             variants: vec![],
@@ -211,9 +214,9 @@ mod tests {
             quick: true,
             replays: 1,
         };
-        let plant = measure(&mut harness, None, &request, 1).expect("a result");
+        let plant = measure(&mut harness, None, &options, 1).expect("a result");
         assert_eq!(
-            (plant.thesis.name, plant.full, plant.backend, plant.shared),
+            (plant.thesis.name, plant.is_full_size, plant.backend, plant.shares_buffers),
             ("Conifer", false, Backend::Cpu, false)
         );
         assert!(plant.vbr.median_us > plant.deform.median_us && plant.render.median_us > 0.0);
@@ -225,7 +228,7 @@ mod tests {
 
     #[test]
     fn shared_output_buffers_count_once() {
-        let scene = WorkloadKind::Plant(0).build(Scale::Quick).expect("a workload").scene;
+        let scene = WorkloadKind::Plant(0).build(WorkloadSize::Quick).expect("a workload").scene;
         let plan = gpu::plan(&scene, CudaDeformerOptions::with_bounding_axes(scene.light_axes()));
         let outputs = 12 * (scene.layout.vertices + scene.layout.corners) as u64;
         assert_eq!(unshared_bytes(&plan, false) - unshared_bytes(&plan, true), outputs);

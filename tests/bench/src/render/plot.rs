@@ -60,7 +60,7 @@ fn min_samples(report: &RenderReport) -> usize {
 }
 
 fn row_point(row: &RenderRow) -> Option<Point<'_>> {
-    let (time_us, error) = (row.median_us()?, row.color.mean);
+    let (time_us, error) = (row.median_us()?, row.color_errors.mean);
     Some(Point { name: &row.name, time_us, error, is_filled: true, is_candidate: true })
 }
 

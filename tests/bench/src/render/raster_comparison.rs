@@ -1,4 +1,4 @@
-//! Compares the CUDA rasterizer with OpenGL in one run on two passes: ids with depth, and depth alone. The scene is
+//! Compares the CUDA rasterizer with OpenGL in one run on two passes: ids with depth, and depth only. The scene is
 //! stripped to its mesh and has one sample per pixel. Ids are compared before the passes are timed.
 
 use std::sync::Arc;
@@ -7,9 +7,9 @@ use nalgebra::Matrix4;
 use serde::Serialize;
 
 use super::harness::{LoadedScene, RenderHarness, Size};
-use super::measure::STILL;
+use super::measure::STILL_STEP;
 use super::rigid_domain::add_rigid_domain;
-use super::workloads::{RenderWorkload, room, screen};
+use super::workloads::{RenderWorkload, room_mesh, screen_mesh};
 use super::{RenderReportOptions, minimal_passes};
 use crate::kernels;
 use crate::kernels::{KernelBenchmark as _, RasterBenchmark, RasterCounts, RasterMesh};
@@ -19,22 +19,21 @@ use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Camera, CullMode, DrawRange, RenderSettings, Scene, SceneParts, SceneState, Viewport};
 use modalcast_render::{FrameParams, VisibilityId, shadow_clip_from_world};
 
-/// Sides of the depth map in a full and in a quick run, texels.
-pub(super) const MAPS: (u32, u32) = (4096, 1024);
+/// Largest fraction of samples whose ids may differ from OpenGL's. Ids differ at edges and depth ties. If more ids differ,
+/// the passes are not timed.
+pub(super) const MAX_DIFFERING_FRACTION: f64 = 0.01;
 
-/// Largest fraction of samples whose ids may differ from OpenGL's because of edges and depth ties. If more differ, the
-/// passes are not timed.
-pub(super) const MAX_DIFFERING: f64 = 0.01;
-
-/// Both passes by both rasterizers on one load.
+/// Both passes by both rasterizers on one workload.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RasterComparison {
     pub load: String,
     pub triangles: usize,
     /// Side of the depth map, texels.
-    pub map: u32,
+    #[serde(rename = "map")]
+    pub map_size: u32,
     /// Samples of the frame whose id differs from OpenGL's.
-    pub differing: usize,
+    #[serde(rename = "differing")]
+    pub differing_ids: usize,
     pub samples: usize,
     /// `None` where too many ids differ.
     pub passes: Option<PassPairs>,
@@ -65,7 +64,7 @@ impl TimingPair {
     }
 }
 
-/// Numbers of triangles by the way they were drawn or dropped.
+/// Numbers of triangles by how they were drawn or why they were dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct TriangleCounts {
     /// Drawn by one thread each.
@@ -74,7 +73,7 @@ pub struct TriangleCounts {
     pub medium: u32,
     /// Drawn tile by tile.
     pub large: u32,
-    /// Between the samples.
+    /// Not drawn, because they cover no sample.
     pub missed: u32,
     /// Not finite, outside of the view, without area, or back-facing.
     pub dropped: u32,
@@ -88,28 +87,30 @@ impl From<RasterCounts> for TriangleCounts {
 }
 
 impl RasterComparison {
-    /// Reason why the passes are not timed.
-    pub(super) fn fault(&self) -> Option<String> {
-        let Self { load, differing, samples, passes, .. } = self;
-        passes.is_none().then(|| format!("{load}: raster: expected equal ids, {differing} of {samples} samples differ"))
+    /// Describes why the passes were not timed; `None` if they were.
+    pub(super) fn describe_fault(&self) -> Option<String> {
+        let Self { load, differing_ids, samples, passes, .. } = self;
+        passes
+            .is_none()
+            .then(|| format!("{load}: raster: expected equal ids, {differing_ids} of {samples} samples differ"))
     }
 }
 
 impl RasterComparison {
     /// The results as one line of text.
     pub fn line(&self) -> String {
-        let pair = |pair: TimingPair| {
+        let format_pair = |format_pair: TimingPair| {
             format!(
                 "{:.1} us by OpenGL, {:.1} by CUDA, {:.1} times as fast",
-                pair.opengl.median_us,
-                pair.cuda.median_us,
-                pair.ratio()
+                format_pair.opengl.median_us,
+                format_pair.cuda.median_us,
+                format_pair.ratio()
             )
         };
         let times = self.passes.map_or("not timed".into(), |passes| {
-            format!("depth {} {}; ids {}", self.map, pair(passes.depth), pair(passes.visibility))
+            format!("depth {} {}; ids {}", self.map_size, format_pair(passes.depth), format_pair(passes.visibility))
         });
-        format!("{:<18}{times}; {} of {} ids differ", self.load, self.differing, self.samples)
+        format!("{:<18}{times}; {} of {} ids differ", self.load, self.differing_ids, self.samples)
     }
 }
 
@@ -120,45 +121,45 @@ struct RasterSetup {
     state: SceneState,
     camera: Camera,
     size: Size,
-    map: u32,
+    map_size: u32,
     replays: usize,
 }
 
-/// Measures the loads of a request, a room and two triangles that fill the frame.
+/// Measures the selected workloads, a room, and two triangles that fill the frame.
 ///
 /// # Errors
 /// Errors of drawing and of the device.
 pub(super) fn measure(
     harness: &mut RenderHarness,
     device: &Device,
-    request: &RenderReportOptions,
+    options: &RenderReportOptions,
     progress: &mut dyn FnMut(&str),
 ) -> Result<Vec<RasterComparison>> {
-    let mut list = Vec::new();
-    for workload in &request.loads {
+    let mut comparisons = Vec::new();
+    for workload in &options.loads {
         progress(&format!("{}: raster", workload.name()));
-        list.push(measure_load(harness, device, request, *workload)?);
+        comparisons.push(measure_workload(harness, device, options, *workload)?);
     }
-    for (name, (mesh, camera)) in [("room", room()?), ("screen", screen()?)] {
+    for (name, (mesh, camera)) in [("room", room_mesh()?), ("screen", screen_mesh()?)] {
         progress(&format!("{name}: raster"));
         let mut parts = SceneParts { look: RenderSettings::default(), ..SceneParts::named(name) };
         add_rigid_domain(&mut parts, name, mesh, modalcast_model::domain::Material::default())?;
         let scene = Scene::new(parts)?;
         let state = SceneState::rest(&scene);
-        list.push(RasterSetup::new(name, &scene, (state, camera), request)?.measure(harness, device)?);
+        comparisons.push(RasterSetup::new(name, &scene, (state, camera), options)?.measure(harness, device)?);
     }
-    Ok(list)
+    Ok(comparisons)
 }
 
-fn measure_load(
+fn measure_workload(
     harness: &mut RenderHarness,
     device: &Device,
-    request: &RenderReportOptions,
+    options: &RenderReportOptions,
     workload: RenderWorkload,
 ) -> Result<RasterComparison> {
     let animation = workload.build()?;
-    let view = (animation.state(STILL), animation.camera(request.size));
-    RasterSetup::new(&animation.name, &animation.scene, view, request)?.measure(harness, device)
+    let view = (animation.state(STILL_STEP), animation.camera(options.size));
+    RasterSetup::new(&animation.name, &animation.scene, view, options)?.measure(harness, device)
 }
 
 impl RasterSetup {
@@ -166,28 +167,28 @@ impl RasterSetup {
         name: &str,
         scene: &Scene,
         (state, camera): (SceneState, Camera),
-        request: &RenderReportOptions,
+        options: &RenderReportOptions,
     ) -> Result<Self> {
-        let map = if request.quick { MAPS.1 } else { MAPS.0 };
-        let single_sample =
+        let map_size = options.shadow_map_size();
+        let single_sample_scene =
             Scene::new(SceneParts { look: RenderSettings { samples: 1, ..scene.look }, ..scene.parts() })?;
-        let (size, replays) = (request.size, request.replays.max(MIN_REPETITIONS));
+        let (size, replays) = (options.size, options.replays.max(MIN_REPETITIONS));
         Ok(Self {
             name: name.into(),
-            scene: minimal_passes::strip_to_mesh(&single_sample, map)?,
+            scene: minimal_passes::strip_to_mesh(&single_sample_scene, map_size)?,
             state,
             camera,
             size,
-            map,
+            map_size,
             replays,
         })
     }
 
     fn measure(&self, harness: &mut RenderHarness, device: &Device) -> Result<RasterComparison> {
         let mut loaded_scene = harness.load(&self.scene)?;
-        let measured = self.measure_loaded(harness, &mut loaded_scene, device);
+        let comparison = self.measure_loaded(harness, &mut loaded_scene, device);
         harness.unload(loaded_scene);
-        measured
+        comparison
     }
 
     fn measure_loaded(
@@ -202,42 +203,43 @@ impl RasterSetup {
         let frame_params = loaded_scene.frame_params(self.camera, self.size);
         let triangles = self.scene.triangle_vertices();
         let positions = loaded_scene.surface()?.positions.clone();
-        let group = [DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None }];
-        let mesh = RasterMesh { positions: &positions, triangles: &triangles, groups: &group, cut_outs: None };
-        let (frame, map) = (self.frame_viewport(&frame_params)?, self.map_viewport(&frame_params)?);
-        let [frame_raster, map_raster] = [(frame, false), (map, true)].map(|(viewport, depth_only)| {
-            RasterBenchmark::new(device, mesh, viewport, RasterVariant { depth_only, ..RasterVariant::default() })
-        });
+        let draw_ranges = [DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None }];
+        let mesh = RasterMesh { positions: &positions, triangles: &triangles, groups: &draw_ranges, cut_outs: None };
+        let (frame_viewport, map_viewport) = (self.frame_viewport(&frame_params)?, self.map_viewport(&frame_params)?);
+        let [frame_raster, map_raster] =
+            [(frame_viewport, false), (map_viewport, true)].map(|(viewport, depth_only)| {
+                RasterBenchmark::new(device, mesh, viewport, RasterVariant { depth_only, ..RasterVariant::default() })
+            });
         let (frame_raster, map_raster) = (frame_raster?, map_raster?);
         frame_raster.launch(device, 0)?;
         let keys = frame_raster.keys(device)?;
-        let differing = keys.iter().zip(&ids).filter(|(key, id)| **key as u32 != **id).count();
-        let agrees = differing as f64 <= MAX_DIFFERING * ids.len() as f64;
-        let passes = if agrees {
-            Some(self.time_passes(harness, loaded_scene, device, [&map_raster, &frame_raster])?)
+        let differing_ids = keys.iter().zip(&ids).filter(|(key, id)| **key as u32 != **id).count();
+        let is_accepted = differing_ids as f64 <= MAX_DIFFERING_FRACTION * ids.len() as f64;
+        let passes = if is_accepted {
+            Some(self.time_pass_pairs(harness, loaded_scene, device, [&map_raster, &frame_raster])?)
         } else {
             None
         };
         Ok(RasterComparison {
             load: self.name.clone(),
             triangles: triangles.len(),
-            map: self.map,
-            differing,
+            map_size: self.map_size,
+            differing_ids,
             samples: ids.len(),
             passes,
-            in_frame: count_triangles(device, mesh, frame, false)?,
-            in_map: count_triangles(device, mesh, map, true)?,
+            in_frame: count_triangles(device, mesh, frame_viewport, false)?,
+            in_map: count_triangles(device, mesh, map_viewport, true)?,
         })
     }
 
-    /// Ids that OpenGL drew, as indices of packed triangles; `u32::MAX` where it drew no triangle.
+    /// Converts ids that OpenGL drew to indices of packed triangles; `u32::MAX` where it drew no triangle.
     fn packed_ids(&self, visibility: &[VisibilityId], loaded_scene: &LoadedScene) -> Vec<u32> {
-        let slots = &self.scene.layout.domains;
+        let domain_slots = &self.scene.layout.domains;
         let source_triangle = |id: &VisibilityId| match id {
             VisibilityId::Triangle(triangle) => loaded_scene.buffers.source_triangle(*triangle),
             _ => None,
         };
-        let packed_index = |(domain, triangle): (usize, usize)| (slots[domain].first_triangle + triangle) as u32;
+        let packed_index = |(domain, triangle): (usize, usize)| (domain_slots[domain].first_triangle + triangle) as u32;
         visibility.iter().map(|id| source_triangle(id).map_or(u32::MAX, packed_index)).collect()
     }
 
@@ -254,24 +256,27 @@ impl RasterSetup {
     fn map_viewport(&self, frame_params: &FrameParams) -> Result<Viewport> {
         let clip: Matrix4<f64> = shadow_clip_from_world(&self.scene, frame_params)
             .ok_or_else(|| fault_in("raster")("expected a scene with a shadow map"))?;
-        Viewport::new(&clip, self.map, self.map)
+        Viewport::new(&clip, self.map_size, self.map_size)
     }
 
-    fn time_passes(
+    fn time_pass_pairs(
         &self,
         harness: &mut RenderHarness,
         loaded_scene: &LoadedScene,
         device: &Device,
         cuda_rasters: [&RasterBenchmark; 2],
     ) -> Result<PassPairs> {
-        let passes = harness.time(loaded_scene, self.camera, self.size, self.replays)?;
-        let pair = |name: &str, raster: &RasterBenchmark| {
+        let passes = harness.time_passes(loaded_scene, self.camera, self.size, self.replays)?;
+        let time_pair = |name: &str, raster: &RasterBenchmark| {
             let opengl = passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
             let opengl = opengl.ok_or_else(|| fault_in("raster")(format!("expected a pass named {name}")))?;
             let cuda = kernels::time(device, raster, CacheState::Warm, self.replays)?;
             Ok(TimingPair { opengl, cuda })
         };
-        Ok(PassPairs { depth: pair("shadow", cuda_rasters[0])?, visibility: pair("visibility", cuda_rasters[1])? })
+        Ok(PassPairs {
+            depth: time_pair("shadow", cuda_rasters[0])?,
+            visibility: time_pair("visibility", cuda_rasters[1])?,
+        })
     }
 }
 
@@ -301,11 +306,11 @@ mod tests {
     #[test]
     fn viewports_and_triangles_match_the_opengl_frame() {
         let mut harness = RenderHarness::open().expect("OpenGL");
-        let (mesh, camera) = room().expect("a room");
+        let (mesh, camera) = room_mesh().expect("a room");
         let mut parts = SceneParts::named("room");
         add_rigid_domain(&mut parts, "room", mesh, modalcast_model::domain::Material::default()).expect("a domain");
         let scene = Scene::new(parts).expect("a scene");
-        let request = RenderReportOptions {
+        let options = RenderReportOptions {
             loads: vec![],
             plants: vec![],
             variants: vec![],
@@ -313,7 +318,7 @@ mod tests {
             quick: true,
             replays: 1,
         };
-        let setup = RasterSetup::new("room", &scene, (SceneState::rest(&scene), camera), &request).expect("a setup");
+        let setup = RasterSetup::new("room", &scene, (SceneState::rest(&scene), camera), &options).expect("a setup");
         assert!((9_000..11_000).contains(&setup.scene.layout.triangles));
         let mut loaded_scene = harness.load(&setup.scene).expect("a loaded scene");
         harness.deform(&mut loaded_scene, &setup.state).expect("deformed vertices");
@@ -327,9 +332,9 @@ mod tests {
             loaded_scene.surface().expect("a surface").positions.clone(),
         );
         let triangles = setup.scene.triangle_vertices();
-        let clip = viewport.clip_from_positions();
+        let clip_from_world = viewport.clip_from_positions();
         let clip_coordinate = |row: usize, p: [f32; 3]| {
-            (0..3).map(|axis| clip[4 * row + axis] * p[axis]).sum::<f32>() + clip[4 * row + 3]
+            (0..3).map(|axis| clip_from_world[4 * row + axis] * p[axis]).sum::<f32>() + clip_from_world[4 * row + 3]
         };
         // Each bounding box contains its sample within half a pixel.
         let mut contained_samples = 0;
@@ -338,25 +343,26 @@ mod tests {
                 triangles[*id as usize].map(|vertex| [0, 1, 2].map(|axis| positions[3 * vertex as usize + axis]));
             let [x, y] = [0, 1].map(|axis| corners.map(|p| clip_coordinate(axis, p) / clip_coordinate(3, p)));
             let sample = [(pixel % 160) as f32 + 0.5, (pixel / 160) as f32 + 0.5];
-            let contains = |corners: [f32; 3], center: f32, tolerance: f32| {
+            let contains_sample = |corners: [f32; 3], center: f32, tolerance: f32| {
                 corners.iter().any(|corner| *corner <= center + tolerance)
                     && corners.iter().any(|corner| *corner >= center - tolerance)
             };
-            let inside =
-                contains(x, sample[0] / 80.0 - 1.0, 1.0 / 160.0) && contains(y, 1.0 - sample[1] / 45.0, 1.0 / 90.0);
-            contained_samples += usize::from(inside);
+            let is_inside = contains_sample(x, sample[0] / 80.0 - 1.0, 1.0 / 160.0)
+                && contains_sample(y, 1.0 - sample[1] / 45.0, 1.0 / 90.0);
+            contained_samples += usize::from(is_inside);
         }
         assert_eq!(contained_samples, ids.len());
         let map = setup.map_viewport(&frame_params).expect("a viewport of the map");
         assert_eq!(map.size(), [1024; 2]);
-        let inside = |p: &[f32]| {
+        let is_inside = |p: &[f32]| {
             (0..3).all(|axis| {
-                let clip = map.clip_from_positions();
-                let coordinate: f32 = (0..3).map(|k| clip[4 * axis + k] * p[k]).sum::<f32>() + clip[4 * axis + 3];
+                let clip_from_world = map.clip_from_positions();
+                let coordinate: f32 =
+                    (0..3).map(|k| clip_from_world[4 * axis + k] * p[k]).sum::<f32>() + clip_from_world[4 * axis + 3];
                 coordinate.abs() <= 1.0
             })
         };
-        assert!(positions.chunks_exact(3).all(inside), "expected all vertices inside the map");
+        assert!(positions.chunks_exact(3).all(is_inside), "expected all vertices inside the map");
         harness.unload(loaded_scene);
     }
 

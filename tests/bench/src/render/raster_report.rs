@@ -7,14 +7,14 @@ use serde::Serialize;
 
 use super::frame_comparison::{self, FrameComparison};
 use super::harness::{RenderHarness, Size};
-use super::raster_comparison::{RasterComparison, measure};
+use super::raster_comparison::{self, RasterComparison};
 use super::{RenderReportOptions, comparison_tables};
 use crate::provenance::Provenance;
 use modalcast_compute::gpu::Device;
 use modalcast_model::error::{Result, fault_in};
 use modalcast_render::RendererInfo;
 
-/// Results of all loads.
+/// Results of all workloads.
 #[derive(Debug, Clone, Serialize)]
 pub struct RasterReport {
     #[serde(rename = "made")]
@@ -51,20 +51,20 @@ impl RasterReport {
 
     /// Whether all passes and frames were timed.
     pub fn passed(&self) -> bool {
-        self.rows.iter().all(|row| row.passes.is_some()) && frame_comparison::faults(&self.frames).is_empty()
+        self.rows.iter().all(|row| row.passes.is_some()) && frame_comparison::describe_faults(&self.frames).is_empty()
     }
 }
 
-/// Compares the rasterizers on all loads; `progress` receives a description of each stage.
+/// Compares the rasterizers on all workloads; `progress` receives a description of each stage.
 ///
 /// # Errors
 /// `Unavailable` without OpenGL, a CUDA device or NVRTC; errors of loading and drawing a scene.
-pub fn rasters(request: &RenderReportOptions, mut progress: impl FnMut(&str)) -> Result<RasterReport> {
+pub fn compare_rasterizers(options: &RenderReportOptions, mut progress: impl FnMut(&str)) -> Result<RasterReport> {
     let device = Device::open(0)?;
     device.check_compiler()?;
     let mut harness = RenderHarness::open()?;
-    let rows = measure(&mut harness, &device, request, &mut progress)?;
-    let frames = frame_comparison::measure(&mut harness, &device, request, &mut progress)?;
+    let rows = raster_comparison::measure(&mut harness, &device, options, &mut progress)?;
+    let frames = frame_comparison::measure(&mut harness, &device, options, &mut progress)?;
     let renderer = harness.renderer.info().clone();
-    Ok(RasterReport { provenance: Provenance::here(), renderer, size: request.size, rows, frames })
+    Ok(RasterReport { provenance: Provenance::here(), renderer, size: options.size, rows, frames })
 }

@@ -1,7 +1,7 @@
 //! The ray-cast scene of the references: deformed triangles in a bounding volume hierarchy (BVH), and ray queries.
 //!
-//! Triangle tests are f64. Boxes are f32 and padded, so a box test may give false positives but no false negatives:
-//! positions in the BVH are relative to the center of the scene and rays begin near it, so that rounding errors stay
+//! Triangle tests are f64. Boxes are f32 and padded, so a box test may give false positives but no false negatives. In
+//! the BVH, positions are relative to the center of the scene and rays begin near the scene, so that rounding errors are
 //! below the padding.
 
 use nalgebra::Vector3;
@@ -36,13 +36,13 @@ impl Ray {
     }
 }
 
-/// One triangle: a corner and the two edges that start there.
+/// One triangle: the position of a corner and the two edges that start there.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Triangle {
-    pub(super) corner: Vector3<f64>,
+    pub(super) first_corner: Vector3<f64>,
     pub(super) edges: [Vector3<f64>; 2],
     /// Indices of the corners in the packed normals, in winding order.
-    pub(super) corners: [u32; 3],
+    pub(super) corner_indices: [u32; 3],
     /// Index in the packed triangles, which breaks depth ties.
     pub(super) packed_index: u32,
     /// Index into [`RayScene::materials`].
@@ -58,7 +58,7 @@ pub(super) struct Hit {
     /// Index into [`RayScene::triangles`].
     pub(super) triangle: usize,
     /// Whether the ray hits the side on which the winding is counter-clockwise.
-    pub(super) front: bool,
+    pub(super) is_front: bool,
 }
 
 /// The ray-cast scene.
@@ -86,15 +86,15 @@ impl Boundable for PaddedTriangle<'_> {
     fn aabb(&self) -> Aabb {
         let Self { triangle, center, padding } = self;
         let [a, b, c] = triangle.points().map(|point| point - *center);
-        let (low, high) = (a.inf(&b).inf(&c).add_scalar(-padding), a.sup(&b).sup(&c).add_scalar(*padding));
-        let narrow = |v: Vector3<f64>| glam::Vec3A::new(v.x as f32, v.y as f32, v.z as f32);
-        Aabb::new(narrow(low), narrow(high))
+        let (min_corner, max_corner) = (a.inf(&b).inf(&c).add_scalar(-padding), a.sup(&b).sup(&c).add_scalar(*padding));
+        let to_f32 = |v: Vector3<f64>| glam::Vec3A::new(v.x as f32, v.y as f32, v.z as f32);
+        Aabb::new(to_f32(min_corner), to_f32(max_corner))
     }
 }
 
 impl Triangle {
     fn points(&self) -> [Vector3<f64>; 3] {
-        [self.corner, self.corner + self.edges[0], self.corner + self.edges[1]]
+        [self.first_corner, self.first_corner + self.edges[0], self.first_corner + self.edges[1]]
     }
 
     /// Geometric normal of the counter-clockwise side; zero for triangles without area.
@@ -102,14 +102,15 @@ impl Triangle {
         self.edges[0].cross(&self.edges[1]).try_normalize(0.0).unwrap_or_default()
     }
 
-    /// Intersection test by Möller and Trumbore: (t, u, v, front). Points on an edge are inside.
-    fn intersect(&self, ray: &Ray) -> Option<(f64, f64, f64, bool)> {
+    /// Intersection test by Möller and Trumbore. Points on an edge are inside. `index` is that of the triangle in
+    /// [`RayScene::triangles`].
+    fn intersect(&self, index: usize, ray: &Ray) -> Option<Hit> {
         let direction_cross_edge = ray.direction.cross(&self.edges[1]);
         let determinant = self.edges[0].dot(&direction_cross_edge);
         if determinant == 0.0 {
             return None;
         }
-        let from_corner = ray.origin - self.corner;
+        let from_corner = ray.origin - self.first_corner;
         let u = from_corner.dot(&direction_cross_edge) / determinant;
         if !(0.0..=1.0).contains(&u) {
             return None;
@@ -119,7 +120,8 @@ impl Triangle {
         if v < 0.0 || u + v > 1.0 {
             return None;
         }
-        Some((self.edges[1].dot(&corner_cross_edge) / determinant, u, v, determinant > 0.0))
+        let t = self.edges[1].dot(&corner_cross_edge) / determinant;
+        Some(Hit { t, u, v, triangle: index, is_front: determinant > 0.0 })
     }
 }
 
@@ -130,21 +132,21 @@ impl RayScene {
         let materials = ReferenceMaterial::from_scene(scene);
         let triangles = triangles(scene, surface);
         let (center, radius) = bounding_sphere(&triangles);
-        let padded: Vec<PaddedTriangle<'_>> = triangles
+        let padded_triangles: Vec<PaddedTriangle<'_>> = triangles
             .iter()
             .map(|triangle| PaddedTriangle { triangle, center: &center, padding: PADDING * radius })
             .collect();
-        let bvh = build_bvh2(&padded, BvhBuildParams::medium_build(), &mut std::time::Duration::default());
+        let bvh = build_bvh2(&padded_triangles, BvhBuildParams::medium_build(), &mut std::time::Duration::default());
         // Triangles are stored in BVH order, so that those of a leaf are contiguous.
-        let ordered = bvh.primitive_indices.iter().map(|index| triangles[*index as usize]).collect();
+        let ordered_triangles = bvh.primitive_indices.iter().map(|index| triangles[*index as usize]).collect();
         Self {
-            triangles: ordered,
+            triangles: ordered_triangles,
             normals: normals(surface),
             tangents: tangents(surface),
             uvs: uvs(scene),
             has_blended: triangles
                 .iter()
-                .any(|triangle| materials[triangle.material as usize].kind == AlphaKind::Blend),
+                .any(|triangle| materials[triangle.material as usize].alpha_kind == AlphaKind::Blend),
             materials,
             center,
             radius,
@@ -152,9 +154,8 @@ impl RayScene {
         }
     }
 
-    /// Updates the scene to the vertices of another step by refitting the BVH. The topology of the BVH, images and
-    /// texture coordinates remain.
-    /// Queries give the same results as with a rebuilt BVH, but are slower where triangles moved far.
+    /// Updates the scene to the vertices of another step. The BVH is refitted and keeps its topology. Queries give the
+    /// same results as with a rebuilt BVH, but are slower where triangles moved far.
     pub(super) fn refit(self, scene: &Scene, surface: &DeformedSurface) -> Self {
         let triangles = triangles(scene, surface);
         // The set of finite triangles changed, so the BVH must be rebuilt.
@@ -163,9 +164,10 @@ impl RayScene {
         }
         let (center, radius) = bounding_sphere(&triangles);
         let mut bvh = self.bvh;
-        let ordered: Vec<Triangle> = bvh.primitive_indices.par_iter().map(|index| triangles[*index as usize]).collect();
+        let ordered_triangles: Vec<Triangle> =
+            bvh.primitive_indices.par_iter().map(|index| triangles[*index as usize]).collect();
         bvh.nodes.par_iter_mut().filter(|node| node.is_leaf()).for_each(|leaf| {
-            let leaf_triangles = &ordered[leaf.first_index as usize..][..leaf.prim_count as usize];
+            let leaf_triangles = &ordered_triangles[leaf.first_index as usize..][..leaf.prim_count as usize];
             let boxes = leaf_triangles
                 .iter()
                 .map(|triangle| PaddedTriangle { triangle, center: &center, padding: PADDING * radius }.aabb());
@@ -173,95 +175,84 @@ impl RayScene {
         });
         bvh.refit_all();
         let (normals, tangents) = (normals(surface), tangents(surface));
-        Self { triangles: ordered, normals, tangents, center, radius, bvh, ..self }
+        Self { triangles: ordered_triangles, normals, tangents, center, radius, bvh, ..self }
     }
 
     /// The ray relative to the BVH's center in f32, and the parameter t at its start.
     fn box_ray(&self, ray: &Ray, min_t: f64, max_t: f64) -> (BoxRay, f64) {
         let length_squared = ray.direction.norm_squared();
         let closest_t = ray.direction.dot(&(self.center - ray.origin)) / length_squared;
-        let begin = (closest_t - 1.5 * self.radius / length_squared.sqrt()).max(min_t);
-        let origin = (ray.point_at(begin) - self.center).cast::<f32>();
+        let begin_t = (closest_t - 1.5 * self.radius / length_squared.sqrt()).max(min_t);
+        let origin = (ray.point_at(begin_t) - self.center).cast::<f32>();
         let (origin, direction) = (<[f32; 3]>::from(origin), <[f32; 3]>::from(ray.direction.cast::<f32>()));
-        (BoxRay::new(origin.into(), direction.into(), 0.0, (max_t - begin).max(0.0) as f32), begin)
+        (BoxRay::new(origin.into(), direction.into(), 0.0, (max_t - begin_t).max(0.0) as f32), begin_t)
     }
 
-    /// The nearest hit with t between `min_t` and `max_t` that `accepts` accepts.
+    /// The nearest hit with t from `min_t` to `max_t` for which `accepts` is true.
     pub(super) fn nearest_hit(
         &self,
         ray: &Ray,
         (min_t, max_t): (f64, f64),
         accepts: impl Fn(&Hit) -> bool,
     ) -> Option<Hit> {
-        let (box_ray, begin) = self.box_ray(ray, min_t, max_t);
-        let mut best: Option<Hit> = None;
+        let (box_ray, begin_t) = self.box_ray(ray, min_t, max_t);
+        let mut nearest: Option<Hit> = None;
         self.bvh.ray_traverse(box_ray, &mut RayHit::none(), |_, index| {
-            let is_nearer = |t: f64| t >= min_t && t <= max_t && best.is_none_or(|best| t <= best.t);
-            let Some((t, u, v, front)) =
-                self.triangles[index].intersect(ray).filter(|intersection| is_nearer(intersection.0))
-            else {
+            let is_in_range = |t: f64| t >= min_t && t <= max_t && nearest.is_none_or(|nearest| t <= nearest.t);
+            let Some(hit) = self.triangles[index].intersect(index, ray).filter(|hit| is_in_range(hit.t)) else {
                 return f32::INFINITY;
             };
-            let hit = Hit { t, u, v, triangle: index, front };
-            let precedes = |best: Hit| t < best.t || self.packed_index(&hit) < self.packed_index(&best);
-            if !best.is_none_or(precedes) || !accepts(&hit) {
+            let precedes = |other: Hit| hit.t < other.t || self.packed_index(&hit) < self.packed_index(&other);
+            if !nearest.is_none_or(precedes) || !accepts(&hit) {
                 return f32::INFINITY;
             }
-            best = Some(hit);
-            // Rounded up, so that the BVH does not skip hits at the same distance.
-            ((t - begin) as f32).next_up()
+            nearest = Some(hit);
+            // Round up, so that the BVH does not skip hits at the same distance.
+            ((hit.t - begin_t) as f32).next_up()
         });
-        best
+        nearest
     }
 
-    /// All hits with t from `min_t` to below `max_t` that `accepts` accepts, farthest first; with equal t by descending
-    /// packed index. A ray through a shared edge of two triangles counts as one hit.
+    /// All hits with t from `min_t` to below `max_t` for which `accepts` is true, farthest first. Hits with equal t are
+    /// ordered by descending packed index. A hit on a shared edge of two triangles counts once.
     pub(super) fn all_hits(&self, ray: &Ray, (min_t, max_t): (f64, f64), accepts: impl Fn(&Hit) -> bool) -> Vec<Hit> {
         let (box_ray, _) = self.box_ray(ray, min_t, max_t);
         let mut hits = Vec::new();
         self.bvh.ray_traverse_anyhit(box_ray, |_, index| {
-            if let Some((t, u, v, front)) = self.triangles[index]
-                .intersect(ray)
-                .filter(|intersection| intersection.0 >= min_t && intersection.0 < max_t)
-            {
-                hits.push(Hit { t, u, v, triangle: index, front });
-            }
+            hits.extend(self.triangles[index].intersect(index, ray).filter(|hit| hit.t >= min_t && hit.t < max_t));
         });
         hits.retain(accepts);
         hits.sort_by(|a, b| b.t.total_cmp(&a.t).then(self.packed_index(b).cmp(&self.packed_index(a))));
-        hits.dedup_by(|one, other| self.are_same_hit(one, other));
+        hits.dedup_by(|first, second| self.are_same_hit(first, second));
         hits
     }
 
-    /// Whether two hits lie on a shared edge of their triangles.
-    fn are_same_hit(&self, one: &Hit, other: &Hit) -> bool {
+    /// Whether two hits are the same point on a shared edge of their triangles.
+    fn are_same_hit(&self, first: &Hit, second: &Hit) -> bool {
         let is_on_edge = |hit: &Hit| hit.u.min(hit.v).min(1.0 - hit.u - hit.v) < 1e-9;
-        if (one.t - other.t).abs() > 1e-9 * one.t.abs() || !is_on_edge(one) || !is_on_edge(other) {
+        if (first.t - second.t).abs() > 1e-9 * first.t.abs() || !is_on_edge(first) || !is_on_edge(second) {
             return false;
         }
-        let [points, other_points] = [one, other].map(|hit| self.triangles[hit.triangle].points());
+        let [first_points, second_points] = [first, second].map(|hit| self.triangles[hit.triangle].points());
         let is_equal = |a: &Vector3<f64>, b: &Vector3<f64>| (a - b).norm() <= 1e-9 * self.radius;
-        points.iter().filter(|point| other_points.iter().any(|other| is_equal(point, other))).count() >= 2
+        first_points.iter().filter(|point| second_points.iter().any(|second| is_equal(point, second))).count() >= 2
     }
 
     /// Whether a shadow caster other than triangle `receiver` intersects the ray beyond `min_t`.
     pub(super) fn is_occluded(&self, ray: &Ray, min_t: f64, receiver: Option<usize>) -> bool {
         let (box_ray, _) = self.box_ray(ray, min_t, f64::MAX);
         let box_ray = BoxRay { tmax: f32::MAX, ..box_ray };
-        let blocks = |index: usize| {
-            let (t, u, v, front) =
-                self.triangles[index].intersect(ray).filter(|intersection| intersection.0 > min_t)?;
-            let is_caster = receiver != Some(index) && self.casts_shadow(&Hit { t, u, v, triangle: index, front });
-            is_caster.then_some(())
+        let find_occluder = |index: usize| {
+            let hit = self.triangles[index].intersect(index, ray).filter(|hit| hit.t > min_t)?;
+            (receiver != Some(index) && self.casts_shadow(&hit)).then_some(hit)
         };
-        !self.bvh.ray_traverse_miss(box_ray, |_, index| blocks(index).map_or(f32::INFINITY, |()| 0.0))
+        !self.bvh.ray_traverse_miss(box_ray, |_, index| find_occluder(index).map_or(f32::INFINITY, |_| 0.0))
     }
 
     /// Intersection of a ray with one triangle.
     #[cfg(test)]
     pub(super) fn intersect(&self, triangle: usize, ray: &Ray) -> Option<Hit> {
-        let (t, u, v, front) = self.triangles[triangle].intersect(ray).filter(|intersection| intersection.0 >= 0.0)?;
-        Some(Hit { t, u, v, triangle, front })
+        self.triangles[triangle].intersect(triangle, ray).filter(|hit| hit.t >= 0.0)
     }
 
     pub(super) fn packed_index(&self, hit: &Hit) -> u32 {
@@ -272,12 +263,12 @@ impl RayScene {
         &self.materials[self.triangles[hit.triangle].material as usize]
     }
 
-    /// Whether a hit is opaque: not a culled back face, not cut out, not blended.
+    /// Whether a hit is opaque: neither on a culled back face, nor cut out, nor blended.
     pub(super) fn is_opaque(&self, hit: &Hit) -> bool {
         let material = self.material(hit);
-        let is_visible_side = hit.front || material.double_sided;
+        let is_visible_side = hit.is_front || material.double_sided;
         is_visible_side
-            && match material.kind {
+            && match material.alpha_kind {
                 AlphaKind::Opaque => true,
                 AlphaKind::Mask => self.alpha(hit) >= material.alpha_cutoff,
                 AlphaKind::Blend => false,
@@ -287,22 +278,22 @@ impl RayScene {
     /// Whether a hit is blended over the surfaces behind it.
     pub(super) fn is_blended(&self, hit: &Hit) -> bool {
         let material = self.material(hit);
-        material.kind == AlphaKind::Blend && (hit.front || material.double_sided)
+        material.alpha_kind == AlphaKind::Blend && (hit.is_front || material.double_sided)
     }
 
-    /// Whether a hit casts a shadow: both sides do, except where alpha is below the caster threshold.
+    /// Whether a hit casts a shadow. Both sides of a triangle do, except where alpha is below the shadow's alpha cutoff.
     fn casts_shadow(&self, hit: &Hit) -> bool {
         let material = self.material(hit);
-        material.kind == AlphaKind::Opaque || self.alpha(hit) >= material.shadow_alpha_cutoff
+        material.alpha_kind == AlphaKind::Opaque || self.alpha(hit) >= material.shadow_alpha_cutoff
     }
 
     pub(super) fn alpha(&self, hit: &Hit) -> f64 {
         let material = self.material(hit);
-        material.alpha * material.color.as_ref().map_or(1.0, |image| image.sample_alpha(self.uv(hit)))
+        material.alpha * material.color_texture.as_ref().map_or(1.0, |texture| texture.sample_alpha(self.uv(hit)))
     }
 
     pub(super) fn uv(&self, hit: &Hit) -> [f64; 2] {
-        let [a, b, c] = self.triangles[hit.triangle].corners.map(|corner| self.uvs[corner as usize]);
+        let [a, b, c] = self.triangles[hit.triangle].corner_indices.map(|corner| self.uvs[corner as usize]);
         [0, 1].map(|axis| (1.0 - hit.u - hit.v) * a[axis] + hit.u * b[axis] + hit.v * c[axis])
     }
 }
@@ -349,23 +340,23 @@ fn triangles(scene: &Scene, surface: &DeformedSurface) -> Vec<Triangle> {
         let vertices = &mesh.corners().vertices;
         mesh.triangles().par_iter().with_min_len(MIN_TASK_TRIANGLES).enumerate().filter_map(
             move |(triangle, corners)| {
-                let run = domain.material_ranges.iter().rev().find(|run| run.first_triangle <= triangle);
-                let material = run.map_or(domain.material, |run| run.material);
+                let range = domain.material_ranges.iter().rev().find(|range| range.first_triangle <= triangle);
+                let material = range.map_or(domain.material, |range| range.material);
                 // The front side of a double-sided triangle is the side that its rest normals point to.
                 let is_reversed = scene.materials[material].double_sided && is_winding_reversed(mesh, *corners);
                 let [a, b, c] = *corners;
                 let corners = if is_mirrored == is_reversed { [a, b, c] } else { [a, c, b] };
                 let point = |corner: u32| {
-                    let first = 3 * (slot.first_vertex + vertices[corner as usize] as usize);
-                    let position = &surface.positions[first..first + 3];
+                    let first_coordinate = 3 * (slot.first_vertex + vertices[corner as usize] as usize);
+                    let position = &surface.positions[first_coordinate..first_coordinate + 3];
                     Vector3::new(position[0], position[1], position[2]).cast::<f64>()
                 };
                 let [a, b, c] = corners.map(point);
                 let is_finite = [a, b, c].iter().all(|point| point.iter().all(|coordinate| coordinate.is_finite()));
                 is_finite.then(|| Triangle {
-                    corner: a,
+                    first_corner: a,
                     edges: [b - a, c - a],
-                    corners: corners.map(|corner| corner + slot.first_corner as u32),
+                    corner_indices: corners.map(|corner| corner + slot.first_corner as u32),
                     packed_index: (slot.first_triangle + triangle) as u32,
                     material: material as u32,
                 })
@@ -378,9 +369,9 @@ fn triangles(scene: &Scene, surface: &DeformedSurface) -> Vec<Triangle> {
 /// Whether the rest normals point to the clockwise side of a triangle.
 fn is_winding_reversed(mesh: &Mesh, [a, b, c]: [u32; 3]) -> bool {
     let corners = mesh.corners();
-    let position =
+    let rest_position =
         |corner: u32| Vector3::from(mesh.rest_positions()[corners.vertices[corner as usize] as usize]).cast::<f64>();
     let normal_sum: Vector3<f64> =
         [a, b, c].iter().map(|corner| Vector3::from(corners.normals[*corner as usize]).cast::<f64>()).sum();
-    (position(b) - position(a)).cross(&(position(c) - position(a))).dot(&normal_sum) < 0.0
+    (rest_position(b) - rest_position(a)).cross(&(rest_position(c) - rest_position(a))).dot(&normal_sum) < 0.0
 }

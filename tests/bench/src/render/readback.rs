@@ -2,9 +2,9 @@
 //! each frame, and with asynchronous readbacks through the ring while the next frames are drawn.
 //!
 //! All three methods keep at most as many frames in flight as the ring has slots, so that they differ only in the
-//! readback. Rounds of the three methods alternate, and the medians over the rounds are compared. Two more methods,
-//! without readback and through the ring, upload the vertices of another step before every frame, as a moving scene
-//! does.
+//! readback. Rounds of the three methods alternate, and the medians over the rounds are compared. Two of the methods,
+//! without readback and through the ring, are also measured with a moving scene: the vertices of another step are
+//! uploaded before every frame.
 //!
 //! Frames are validated before they are timed: frames of two alternating cameras are read through the ring and must
 //! equal, in order, the frames of blocking readbacks, with and without uploads between them.
@@ -17,7 +17,7 @@ use serde::Serialize;
 
 use super::RenderReportOptions;
 use super::harness::{LoadedScene, RenderHarness, Size};
-use super::measure::STILL;
+use super::measure::STILL_STEP;
 use super::workloads::{AnimatedScene, RenderWorkload};
 use crate::markdown_table::table;
 use crate::timing::{MIN_REPETITIONS, quantile};
@@ -29,7 +29,7 @@ use modalcast_render::{FrameImage, FrameParams, MAX_FRAMES_IN_FLIGHT};
 /// Rounds per method.
 const ROUNDS: usize = 5;
 
-/// Frames per second of one load.
+/// Frames per second of one workload.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ReadbackRates {
     pub load: String,
@@ -37,12 +37,14 @@ pub struct ReadbackRates {
     /// Frames per round.
     pub frames: usize,
     pub unread_fps: f64,
-    pub at_once_fps: f64,
+    #[serde(rename = "at_once_fps")]
+    pub blocking_fps: f64,
     pub ring_fps: f64,
     /// Loss of frames per second by the readback, percent.
-    pub at_once_loss: f64,
+    #[serde(rename = "at_once_loss")]
+    pub blocking_loss: f64,
     pub ring_loss: f64,
-    /// Rates and loss with an upload of the vertices of another step before every frame.
+    /// Rates and loss with a moving scene: the vertices of another step are uploaded before every frame.
     pub stepped_unread_fps: f64,
     pub stepped_ring_fps: f64,
     pub stepped_ring_loss: f64,
@@ -69,29 +71,29 @@ enum ReadbackMode {
     Ring,
 }
 
-/// Measures one load with its own render settings.
+/// Measures one workload with the render settings of its scene.
 ///
 /// # Errors
 /// Errors of drawing; `Fault` when a frame that was read through the ring differs from its blocking readback.
 pub(super) fn measure(
     harness: &mut RenderHarness,
-    request: &RenderReportOptions,
+    options: &RenderReportOptions,
     workload: RenderWorkload,
 ) -> Result<ReadbackRates> {
     let animation = workload.build()?;
-    let camera = animation.camera(request.size);
+    let camera = animation.camera(options.size);
     let mut loaded_scene = harness.load(&animation.scene)?;
-    let stepped = FrameSource::stepped(harness, &mut loaded_scene, &animation, request.size)?;
-    let still = FrameSource { frame_params: stepped.frame_params, steps: None };
-    [&still, &stepped].into_iter().try_for_each(|source| validate(harness, &loaded_scene, source))?;
+    let moving_source = FrameSource::with_two_steps(harness, &mut loaded_scene, &animation, options.size)?;
+    let still_source = FrameSource { frame_params: moving_source.frame_params, steps: None };
+    [&still_source, &moving_source].into_iter().try_for_each(|source| validate(harness, &loaded_scene, source))?;
     // Use one camera, so that all rounds draw the same image.
-    let [still, stepped] =
-        [still, stepped].map(|source| FrameSource { frame_params: [source.frame_params[0]; 2], ..source });
-    harness.warm_up(&loaded_scene, camera, request.size)?;
+    let [still_source, moving_source] =
+        [still_source, moving_source].map(|source| FrameSource { frame_params: [source.frame_params[0]; 2], ..source });
+    harness.warm_up(&loaded_scene, camera, options.size)?;
     // A software renderer is about a thousand times slower than a GPU, so it draws the minimum number of frames.
-    let frames = if harness.renderer.info().software { MIN_REPETITIONS } else { request.replays.max(MIN_REPETITIONS) };
-    let modes = [ReadbackMode::Unread, ReadbackMode::Blocking, ReadbackMode::Ring].map(|mode| (mode, &still));
-    let modes = modes.into_iter().chain([ReadbackMode::Unread, ReadbackMode::Ring].map(|mode| (mode, &stepped)));
+    let frames = if harness.renderer.info().software { MIN_REPETITIONS } else { options.replays.max(MIN_REPETITIONS) };
+    let modes = [ReadbackMode::Unread, ReadbackMode::Blocking, ReadbackMode::Ring].map(|mode| (mode, &still_source));
+    let modes = modes.into_iter().chain([ReadbackMode::Unread, ReadbackMode::Ring].map(|mode| (mode, &moving_source)));
     let mut fps = [const { Vec::new() }; 5];
     for _ in 0..ROUNDS {
         for ((mode, source), rates) in modes.clone().zip(&mut fps) {
@@ -99,15 +101,15 @@ pub(super) fn measure(
         }
     }
     harness.unload(loaded_scene);
-    let [unread, at_once, ring, stepped_unread, stepped_ring] = fps.map(median);
+    let [unread, blocking, ring, stepped_unread, stepped_ring] = fps.map(median);
     Ok(ReadbackRates {
         load: animation.name,
-        size: request.size,
+        size: options.size,
         frames,
         unread_fps: unread,
-        at_once_fps: at_once,
+        blocking_fps: blocking,
         ring_fps: ring,
-        at_once_loss: loss(unread, at_once),
+        blocking_loss: loss(unread, blocking),
         ring_loss: loss(unread, ring),
         stepped_unread_fps: stepped_unread,
         stepped_ring_fps: stepped_ring,
@@ -116,8 +118,8 @@ pub(super) fn measure(
 }
 
 impl FrameSource {
-    /// Two cameras and the vertices of two steps; the shadow's bounds cover both.
-    fn stepped(
+    /// Two cameras and the vertices of two steps; the bounds of the shadow map cover both steps.
+    fn with_two_steps(
         harness: &mut RenderHarness,
         loaded_scene: &mut LoadedScene,
         animation: &AnimatedScene,
@@ -125,17 +127,21 @@ impl FrameSource {
     ) -> Result<Self> {
         let mut deform = |step: usize| -> Result<_> {
             harness.deform(loaded_scene, &animation.state(step))?;
-            Ok((loaded_scene.surface()?.clone(), loaded_scene.extents()))
+            Ok((loaded_scene.surface()?.clone(), loaded_scene.deformed_bounds()))
         };
-        let ((second, second_extents), (first, first_extents)) = (deform(STILL + STEP_DISTANCE)?, deform(STILL)?);
+        let (second_surface, (second_bounds, second_light_box)) = deform(STILL_STEP + STEP_DISTANCE)?;
+        let (first_surface, (first_bounds, first_light_box)) = deform(STILL_STEP)?;
         let camera = animation.camera(size);
-        let light = first_extents.1.zip(second_extents.1).map(|(first, second)| first.union(second));
+        let light = first_light_box.zip(second_light_box).map(|(first, second)| first.union(second));
         let frame_params = |camera: Camera| FrameParams {
-            bounds: first_extents.0.union(second_extents.0),
+            bounds: first_bounds.union(second_bounds),
             light,
             ..loaded_scene.frame_params(camera, size)
         };
-        Ok(Self { frame_params: [camera, farther(camera)].map(frame_params), steps: Some([first, second]) })
+        Ok(Self {
+            frame_params: [camera, move_camera_back(camera)].map(frame_params),
+            steps: Some([first_surface, second_surface]),
+        })
     }
 
     /// Uploads the vertices of a frame, if the source has steps.
@@ -145,7 +151,7 @@ impl FrameSource {
 }
 
 /// The same view from a 25 % larger distance.
-fn farther(camera: Camera) -> Camera {
+fn move_camera_back(camera: Camera) -> Camera {
     let View::LookAt { eye, target, up } = camera.view else { return camera };
     let eye = std::array::from_fn(|axis| target[axis] + 1.25 * (eye[axis] - target[axis]));
     Camera { view: View::LookAt { eye, target, up }, ..camera }
@@ -180,12 +186,12 @@ fn check_frames(expected: &[FrameImage; 2], received: &[(usize, FrameImage)], fr
             "expected two cameras with different images, got equal ones: swapped frames would not be detected",
         ));
     }
-    let numbers: std::collections::BTreeSet<usize> = received.iter().map(|(frame, _)| *frame).collect();
-    let wrong = received.iter().filter(|(frame, image)| image.rgba != expected[frame % 2].rgba).count();
-    match (numbers.len() == frames && received.len() == frames, wrong) {
+    let received_numbers: std::collections::BTreeSet<usize> = received.iter().map(|(frame, _)| *frame).collect();
+    let differing = received.iter().filter(|(frame, image)| image.rgba != expected[frame % 2].rgba).count();
+    match (received_numbers.len() == frames && received.len() == frames, differing) {
         (true, 0) => Ok(()),
-        (false, _) => Err(fault_in("readback")(format!("expected {frames} frames, got {}", numbers.len()))),
-        _ => Err(fault_in("readback")(format!("expected frames equal to blocking readbacks, {wrong} differ"))),
+        (false, _) => Err(fault_in("readback")(format!("expected {frames} frames, got {}", received_numbers.len()))),
+        _ => Err(fault_in("readback")(format!("expected frames equal to blocking readbacks, {differing} differ"))),
     }
 }
 
@@ -199,7 +205,8 @@ fn measure_round(
     // The channel has capacity for all frames, so that the copying threads do not wait.
     let (frame_sender, receiver) = mpsc::sync_channel::<(usize, FrameImage)>(frames);
     let begin = Instant::now();
-    let counter = std::thread::spawn(move || receiver.iter().filter(|(_, image)| !image.rgba.is_empty()).count());
+    let receiver_thread =
+        std::thread::spawn(move || receiver.iter().filter(|(_, image)| !image.rgba.is_empty()).count());
     match mode {
         ReadbackMode::Blocking => {
             for frame in 0..frames {
@@ -214,7 +221,7 @@ fn measure_round(
         }
         ReadbackMode::Ring => draw_pipelined(harness, loaded_scene, source, (frames, Some(frame_sender)))?,
     }
-    let received = counter.join().map_err(|_| fault_in("readback")("the receiving thread panicked"))?;
+    let received = receiver_thread.join().map_err(|_| fault_in("readback")("the receiving thread panicked"))?;
     let seconds = begin.elapsed().as_secs_f64();
     match received == if mode == ReadbackMode::Unread { 0 } else { frames } {
         true => Ok(frames as f64 / seconds),
@@ -254,28 +261,28 @@ fn draw_pipelined(
 }
 
 /// The Markdown section of the report.
-pub(super) fn readback_section(list: &[ReadbackRates]) -> String {
-    let head = ["load", "frames/s, no readback", "blocking readback", "loss", "readback through the ring", "loss"];
-    let head = [&head[..], &["with uploads, no readback", "with uploads, through the ring", "loss"]].concat();
+pub(super) fn readback_section(rows: &[ReadbackRates]) -> String {
+    let header = ["load", "frames/s, no readback", "blocking readback", "loss", "readback through the ring", "loss"];
+    let header = [&header[..], &["with uploads, no readback", "with uploads, through the ring", "loss"]].concat();
     let mut text = String::from(
         "\n## Reading every frame back\n\nWithout uploads, and with the vertices of another step uploaded from host \
          memory before every frame.\n\n",
     );
     let cells = |row: &ReadbackRates| {
-        let percent = |loss: f64| format!("{loss:.1} %");
+        let format_percent = |loss: f64| format!("{loss:.1} %");
         [
             row.load.clone(),
             format!("{:.1}", row.unread_fps),
-            format!("{:.1}", row.at_once_fps),
-            percent(row.at_once_loss),
+            format!("{:.1}", row.blocking_fps),
+            format_percent(row.blocking_loss),
             format!("{:.1}", row.ring_fps),
-            percent(row.ring_loss),
+            format_percent(row.ring_loss),
             format!("{:.1}", row.stepped_unread_fps),
             format!("{:.1}", row.stepped_ring_fps),
-            percent(row.stepped_ring_loss),
+            format_percent(row.stepped_ring_loss),
         ]
     };
-    text.push_str(&table(&head, list.iter().map(cells)));
+    text.push_str(&table(&header, rows.iter().map(cells)));
     text
 }
 
@@ -285,7 +292,7 @@ mod tests {
 
     #[test]
     fn measures_all_readback_methods_and_fills_the_table() {
-        let request = RenderReportOptions {
+        let options = RenderReportOptions {
             loads: vec![],
             plants: vec![],
             variants: vec![],
@@ -294,11 +301,11 @@ mod tests {
             replays: 20,
         };
         let mut harness = RenderHarness::open().expect("a renderer");
-        let row = measure(&mut harness, &request, RenderWorkload::Square).expect("rates");
-        assert!(row.unread_fps > 0.0 && row.at_once_fps > 0.0 && row.ring_fps > 0.0, "{row:?}");
-        assert!(row.stepped_unread_fps > 0.0 && row.stepped_ring_fps > 0.0 && row.stepped_ring_loss < 100.0);
-        assert!(row.ring_loss < 100.0 && row.at_once_loss < 100.0 && row.frames >= 20);
-        let markdown = readback_section(std::slice::from_ref(&row));
+        let rates = measure(&mut harness, &options, RenderWorkload::Square).expect("rates");
+        assert!(rates.unread_fps > 0.0 && rates.blocking_fps > 0.0 && rates.ring_fps > 0.0, "{rates:?}");
+        assert!(rates.stepped_unread_fps > 0.0 && rates.stepped_ring_fps > 0.0 && rates.stepped_ring_loss < 100.0);
+        assert!(rates.ring_loss < 100.0 && rates.blocking_loss < 100.0 && rates.frames >= 20);
+        let markdown = readback_section(std::slice::from_ref(&rates));
         assert!(markdown.lines().any(|line| line.contains("square") && line.contains('%')), "{markdown}");
         assert_eq!((loss(200.0, 190.0), median(vec![3.0, 1.0, 2.0])), (5.000000000000004, 2.0));
     }
@@ -309,7 +316,8 @@ mod tests {
         let size = Size { width: 64, height: 36 };
         let mut harness = RenderHarness::open().expect("a renderer");
         let mut loaded_scene = harness.load(&animation.scene).expect("a loaded scene");
-        let mut source = FrameSource::stepped(&mut harness, &mut loaded_scene, &animation, size).expect("two steps");
+        let mut source =
+            FrameSource::with_two_steps(&mut harness, &mut loaded_scene, &animation, size).expect("two steps");
         validate(&mut harness, &loaded_scene, &source).expect("equal frames with uploads between them");
         let expected = [0, 1].map(|frame| {
             source.upload_step(&mut harness, &loaded_scene, frame).expect("uploaded vertices");
@@ -321,17 +329,17 @@ mod tests {
         let mut frames: Vec<(usize, FrameImage)> = receiver.iter().collect();
         frames.sort_by_key(|(number, _)| *number);
         check_frames(&expected, &frames, 6).expect("control: equal frames");
-        let error =
+        let describe_rejection =
             |frames: &[(usize, FrameImage)]| check_frames(&expected, frames, 6).expect_err("a rejection").to_string();
-        assert!(error(&frames[1..]).contains("expected 6 frames, got 5"));
+        assert!(describe_rejection(&frames[1..]).contains("expected 6 frames, got 5"));
         (frames[2].0, frames[3].0) = (frames[3].0, frames[2].0);
-        assert!(error(&frames).contains("2 differ"), "two swapped frames");
+        assert!(describe_rejection(&frames).contains("2 differ"), "two swapped frames");
         (frames[2].0, frames[3].0) = (frames[3].0, frames[2].0);
         frames[4].1.rgba[100] ^= 1;
-        assert!(error(&frames).contains("1 differ"), "one wrong byte");
+        assert!(describe_rejection(&frames).contains("1 differ"), "one wrong byte");
         source.frame_params[1] = source.frame_params[0];
         source.steps = None;
-        let error = validate(&mut harness, &loaded_scene, &source).expect_err("equal images");
+        let error = validate(&mut harness, &loaded_scene, &source).expect_err("a rejection of equal images");
         assert!(error.to_string().contains("two cameras with different images"), "{error}");
     }
 }

@@ -1,26 +1,25 @@
-//! Traces reference images: every sample of every pixel is ray-cast, transparent layers are sorted, and shadows are
-//! determined by rays to the sun.
+//! Traces reference images. Every sample of a pixel is ray-cast, transparent layers are sorted, and rays to the sun
+//! determine shadows.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::ray_scene::{Ray, RayScene};
 use super::reference_texture::srgb_from_linear;
-use super::reference_view::View;
+use super::reference_view::ReferenceView;
 use super::sample_pattern;
 use super::shade::{self, ShadedPoint};
 
 /// The shadow model: determines the sun visibility of a point.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum SunTerm {
+pub(super) enum ShadowModel {
     /// No shadows: visibility 1.
     Unshadowed,
     /// One ray to the sun.
     Hard,
     /// Fraction of unoccluded rays. The ray origins have a Gaussian distribution in the plane perpendicular to the
-    /// light; the two vectors are one standard deviation each. Origins are projected onto the receiver's tangent plane.
-    /// Casters closer than half of the origin's offset are ignored, because at this distance they are the receiver
-    /// itself.
+    /// light; each of the two vectors is one standard deviation. Origins are projected onto the receiver's tangent plane.
+    /// Casters nearer than half of the origin's offset are ignored, because at this distance they are the receiver.
     Filtered([Vector3<f64>; 2]),
 }
 
@@ -40,32 +39,43 @@ pub(super) const MIN_SUNLIGHT: f64 = 0.1;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct SampleCounts {
     /// Samples along each side of a pixel.
-    pub(super) side: usize,
+    pub(super) samples_per_side: usize,
     /// Rays to the sun per sample of a filtered shadow.
     pub(super) taps: usize,
 }
 
 impl SampleCounts {
     /// 64 samples per pixel.
-    pub(super) const FULL: Self = Self { side: 8, taps: 1 };
+    pub(super) const FULL: Self = Self { samples_per_side: 8, taps: 1 };
     /// A quarter of the samples, for machines with few cores.
-    pub(super) const QUICK: Self = Self { side: 4, taps: 4 };
+    pub(super) const QUICK: Self = Self { samples_per_side: 4, taps: 4 };
 }
 
 /// Traces one image per shadow model; camera rays are shared.
-pub(super) fn trace(ray_scene: &RayScene, view: &View, terms: &[SunTerm], counts: SampleCounts) -> Vec<ReferenceImage> {
-    let samples = sample_pattern::pixel_samples(counts.side);
+pub(super) fn trace_reference_images(
+    ray_scene: &RayScene,
+    view: &ReferenceView,
+    shadow_models: &[ShadowModel],
+    counts: SampleCounts,
+) -> Vec<ReferenceImage> {
+    let samples = sample_pattern::pixel_samples(counts.samples_per_side);
     let pixels: Vec<Vec<([f32; 3], Option<f32>)>> = (0..view.width * view.height)
         .into_par_iter()
         .map(|pixel| {
-            trace_pixel(ray_scene, view, terms, (pixel % view.width, pixel / view.width), (&samples, counts.taps))
+            trace_pixel(
+                ray_scene,
+                view,
+                shadow_models,
+                (pixel % view.width, pixel / view.width),
+                (&samples, counts.taps),
+            )
         })
         .collect();
-    let image = |term: usize| ReferenceImage {
-        colors: pixels.iter().map(|pixel| pixel[term].0).collect(),
-        light: pixels.iter().map(|pixel| pixel[term].1).collect(),
+    let extract_image = |shadow_model: usize| ReferenceImage {
+        colors: pixels.iter().map(|pixel| pixel[shadow_model].0).collect(),
+        light: pixels.iter().map(|pixel| pixel[shadow_model].1).collect(),
     };
-    (0..terms.len()).map(image).collect()
+    (0..shadow_models.len()).map(extract_image).collect()
 }
 
 /// Sums over the samples of a pixel with one shadow model.
@@ -78,37 +88,36 @@ struct PixelSum {
     unshadowed: f64,
 }
 
-/// Sample positions within a pixel, and rays to the sun per sample.
-type Samples<'a> = (&'a [[f64; 2]], usize);
-
+/// Color and sun visibility of a pixel with each shadow model. `samples` are positions within the pixel, `taps` is the
+/// number of rays to the sun per sample.
 fn trace_pixel(
     ray_scene: &RayScene,
-    view: &View,
-    terms: &[SunTerm],
+    view: &ReferenceView,
+    shadow_models: &[ShadowModel],
     (x, y): (u32, u32),
-    (samples, taps): Samples<'_>,
+    (samples, taps): (&[[f64; 2]], usize),
 ) -> Vec<([f32; 3], Option<f32>)> {
     let gaussian_samples = sample_pattern::gaussian_samples(samples.len() * taps, sample_pattern::pixel_shift(x, y));
-    let mut sums = vec![PixelSum::default(); terms.len()];
+    let mut sums = vec![PixelSum::default(); shadow_models.len()];
     for (index, [dx, dy]) in samples.iter().enumerate() {
         let layers = trace_layers(ray_scene, view, &view.ray(f64::from(x) + dx, f64::from(y) + dy));
-        // The number of samples is a power of two, so any odd stride visits all points. This stride keeps the points of
-        // neighboring samples far from each other.
+        // The number of samples is a power of two, so every odd stride visits all points. With this stride, neighboring
+        // samples get points that are far from each other.
         let sun_samples: Vec<[f64; 2]> =
             (0..taps).map(|tap| gaussian_samples[((index * 37 + 11) % samples.len()) * taps + tap]).collect();
-        for (sum, term) in sums.iter_mut().zip(terms) {
-            add_sample(sum, &layers, |point| sun_visibility(ray_scene, view, point, *term, &sun_samples));
+        for (sum, shadow_model) in sums.iter_mut().zip(shadow_models) {
+            add_sample(sum, &layers, |point| sun_visibility(ray_scene, view, point, *shadow_model, &sun_samples));
         }
     }
     sums.iter().map(|sum| sum.resolve(samples.len())).collect()
 }
 
 /// The layers along a ray, farthest first: one opaque layer, then every transparent layer in front of it.
-fn trace_layers(ray_scene: &RayScene, view: &View, ray: &Ray) -> Vec<ShadedPoint> {
+fn trace_layers(ray_scene: &RayScene, view: &ReferenceView, ray: &Ray) -> Vec<ShadedPoint> {
     let (near, far) = view.depth_range;
     let mut opaque = ray_scene.nearest_hit(ray, (near, far), |hit| ray_scene.is_opaque(hit));
     let ground = view.intersect_ground(ray);
-    // Triangles in the plane of the ground hide the ground.
+    // A triangle in the plane of the ground hides the ground, so the ground must be nearer by a tolerance.
     if let (Some(hit), Some(t)) = (opaque, ground)
         && hit.t > t + 1e-6 * ray_scene.radius
     {
@@ -156,25 +165,25 @@ impl PixelSum {
 /// Sun visibility of a point, 0 to 1.
 fn sun_visibility(
     ray_scene: &RayScene,
-    view: &View,
+    view: &ReferenceView,
     point: &ShadedPoint,
-    term: SunTerm,
+    shadow_model: ShadowModel,
     gaussian_samples: &[[f64; 2]],
 ) -> f64 {
     let is_occluded = |origin: Vector3<f64>, min_t: f64| {
         ray_scene.is_occluded(&Ray { origin, direction: view.to_sun }, min_t + 1e-9 * ray_scene.radius, point.triangle)
     };
-    match term {
-        SunTerm::Unshadowed => 1.0,
-        SunTerm::Hard => f64::from(u8::from(!is_occluded(point.point, 0.0))),
-        SunTerm::Filtered([x_axis, y_axis]) => {
+    match shadow_model {
+        ShadowModel::Unshadowed => 1.0,
+        ShadowModel::Hard => f64::from(u8::from(!is_occluded(point.point, 0.0))),
+        ShadowModel::Filtered([x_axis, y_axis]) => {
             let cosine = point.geometric_normal.dot(&view.to_sun).max(0.05);
-            let unoccluded = gaussian_samples.iter().filter(|[x, y]| {
+            let unoccluded_samples = gaussian_samples.iter().filter(|[x, y]| {
                 let offset = x_axis * *x + y_axis * *y;
                 let height = -point.geometric_normal.dot(&offset) / cosine;
                 !is_occluded(point.point + offset + view.to_sun * height, 0.5 * offset.norm())
             });
-            unoccluded.count() as f64 / gaussian_samples.len() as f64
+            unoccluded_samples.count() as f64 / gaussian_samples.len() as f64
         }
     }
 }

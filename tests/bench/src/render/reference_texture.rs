@@ -1,4 +1,4 @@
-//! Samples images for the references: bilinear, repeating, without mip levels. Decoded texels are f32.
+//! Samples textures for the references: bilinear, repeating, without mip levels. Decoded texels are f32.
 
 use modalcast_model::domain::Texture;
 
@@ -22,26 +22,26 @@ pub(super) struct ReferenceTexture {
 
 impl ReferenceTexture {
     pub(super) fn new(texture: &Texture, role: TextureRole) -> Self {
-        let decode: [f32; 256] = std::array::from_fn(|byte| match role {
+        let decoded_levels: [f32; 256] = std::array::from_fn(|byte| match role {
             TextureRole::Color => linear_from_srgb(byte as f64 / 255.0) as f32,
             TextureRole::Normal => byte as f32 / 255.0,
         });
-        let texel = |bytes: &[u8]| {
-            let [r, g, b] = [0, 1, 2].map(|channel| decode[usize::from(bytes[channel])]);
+        let decode_texel = |bytes: &[u8]| {
+            let [r, g, b] = [0, 1, 2].map(|channel| decoded_levels[usize::from(bytes[channel])]);
             [r, g, b, f32::from(bytes[3]) / 255.0]
         };
-        let rgba = texture.rgba().chunks_exact(4).map(texel).collect();
+        let rgba = texture.rgba().chunks_exact(4).map(decode_texel).collect();
         Self { width: texture.width() as usize, height: texture.height() as usize, role, rgba }
     }
 
-    /// The four texels around a point and their weights.
+    /// The four texels around a point, with their bilinear weights.
     fn bilinear_footprint(&self, uv: [f64; 2]) -> [([f32; 4], f64); 4] {
         let neighbors = |coordinate: f64, count: usize| {
             // Wrap before scaling, so that large coordinates keep the precision of their fraction.
             let position = coordinate.rem_euclid(1.0) * count as f64 - 0.5;
-            let lower = position.floor();
-            let wrap = |index: f64| (index as i64).rem_euclid(count as i64) as usize;
-            (wrap(lower), wrap(lower + 1.0), position - lower)
+            let lower_index = position.floor();
+            let wrap_index = |index: f64| (index as i64).rem_euclid(count as i64) as usize;
+            (wrap_index(lower_index), wrap_index(lower_index + 1.0), position - lower_index)
         };
         let ((left, right, u), (top, bottom, v)) = (neighbors(uv[0], self.width), neighbors(uv[1], self.height));
         let texel = |x: usize, y: usize| self.rgba[y * self.width + x];
@@ -58,20 +58,20 @@ impl ReferenceTexture {
         self.bilinear_footprint(uv).iter().map(|(texel, weight)| f64::from(texel[3]) * weight).sum()
     }
 
-    /// Samples all four channels. Fully transparent texels have no color, so the color weights of the other texels are
-    /// renormalized.
+    /// Samples all four channels. Fully transparent texels have no color, so the weights of the other texels' colors are
+    /// normalized to the sum 1.
     pub(super) fn sample(&self, uv: [f64; 2]) -> [f64; 4] {
         let footprint = self.bilinear_footprint(uv);
         let has_color = |texel: &[f32; 4]| self.role == TextureRole::Normal || texel[3] > 0.0;
         let color_weight: f64 = footprint.iter().filter(|(texel, _)| has_color(texel)).map(|(_, weight)| weight).sum();
-        let mut sum = [0.0; 4];
+        let mut rgba = [0.0; 4];
         for (texel, weight) in &footprint {
-            sum[3] += f64::from(texel[3]) * weight;
+            rgba[3] += f64::from(texel[3]) * weight;
             if has_color(texel) && color_weight > 0.0 {
-                (0..3).for_each(|channel| sum[channel] += f64::from(texel[channel]) * weight / color_weight);
+                (0..3).for_each(|channel| rgba[channel] += f64::from(texel[channel]) * weight / color_weight);
             }
         }
-        sum
+        rgba
     }
 }
 
@@ -89,27 +89,27 @@ pub(super) fn srgb_from_linear(linear: f64) -> f64 {
 mod tests {
     use super::*;
 
-    fn two_texels(role: TextureRole) -> ReferenceTexture {
+    fn texture_of_two_texels(role: TextureRole) -> ReferenceTexture {
         ReferenceTexture::new(&Texture::new("two", 2, 1, vec![255, 0, 0, 255, 0, 255, 0, 0]).expect("a texture"), role)
     }
 
     #[test]
     fn texel_centers_are_exact_and_images_repeat() {
-        let texels = two_texels(TextureRole::Normal);
+        let texture = texture_of_two_texels(TextureRole::Normal);
         for offset in [-3.0, 0.0, 1e6] {
-            assert_eq!(texels.sample([0.25 + offset, 0.5]), [1.0, 0.0, 0.0, 1.0]);
-            assert_eq!(texels.sample([0.75 + offset, 7.5]), [0.0, 1.0, 0.0, 0.0]);
+            assert_eq!(texture.sample([0.25 + offset, 0.5]), [1.0, 0.0, 0.0, 1.0]);
+            assert_eq!(texture.sample([0.75 + offset, 7.5]), [0.0, 1.0, 0.0, 0.0]);
         }
-        assert_eq!(texels.sample([0.5, 0.5]), [0.5, 0.5, 0.0, 0.5]);
-        assert_eq!(texels.sample([0.0, 0.5]), [0.5, 0.5, 0.0, 0.5], "the edge is interpolated with the opposite edge");
+        assert_eq!(texture.sample([0.5, 0.5]), [0.5, 0.5, 0.0, 0.5]);
+        assert_eq!(texture.sample([0.0, 0.5]), [0.5, 0.5, 0.0, 0.5], "the edge is interpolated with the opposite edge");
     }
 
     #[test]
     fn transparent_texels_do_not_affect_color() {
-        let texels = two_texels(TextureRole::Color);
-        assert_eq!(texels.sample([0.5, 0.5]), [1.0, 0.0, 0.0, 0.5]);
-        assert_eq!(texels.sample_alpha([0.5, 0.5]), 0.5);
-        assert_eq!(texels.sample([0.75, 0.5]), [0.0; 4]);
+        let texture = texture_of_two_texels(TextureRole::Color);
+        assert_eq!(texture.sample([0.5, 0.5]), [1.0, 0.0, 0.0, 0.5]);
+        assert_eq!(texture.sample_alpha([0.5, 0.5]), 0.5);
+        assert_eq!(texture.sample([0.75, 0.5]), [0.0; 4]);
     }
 
     #[test]

@@ -8,7 +8,7 @@ use modalcast_render::FrameParams;
 
 /// Parameters of one frame. Colors are linear, lengths are scene units.
 #[derive(Debug, Clone)]
-pub(super) struct View {
+pub(super) struct ReferenceView {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) eye: Vector3<f64>,
@@ -31,21 +31,21 @@ pub(super) struct View {
 pub(super) struct GroundPlane {
     height: f64,
     center: Vector3<f64>,
-    /// Distance from `center` at which exp(-1) of the ground color is left.
-    fade: f64,
+    /// Distance from `center` at which the fraction exp(-1) of the ground color remains.
+    fade_distance: f64,
     color: Vector3<f64>,
 }
 
-impl View {
+impl ReferenceView {
     /// The view of a frame of a scene. Positions are relative to the scene's origin.
     pub(super) fn new(scene: &Scene, frame_params: &FrameParams) -> Self {
-        let look = &scene.look;
+        let settings = &scene.look;
         let to_f64 = |color: [f32; 3]| Vector3::from(color).cast::<f64>();
         let (width, height) = (f64::from(frame_params.width), f64::from(frame_params.height));
         let lens = match frame_params.camera.lens {
             Lens::FieldOfView(degrees) => {
-                let focal = 0.5 * height / (0.5 * degrees).to_radians().tan();
-                [focal, focal, 0.5 * width, 0.5 * height]
+                let focal_length = 0.5 * height / (0.5 * degrees).to_radians().tan();
+                [focal_length, focal_length, 0.5 * width, 0.5 * height]
             }
             Lens::Intrinsics { fx, fy, cx, cy } => [fx, fy, cx, cy],
         };
@@ -55,7 +55,7 @@ impl View {
             frame_params.height,
             &frame_params.bounds.union(scene.rest_bounds),
         );
-        let (scale, shift) = (clip[(2, 2)], clip[(2, 3)]);
+        let (depth_scale, depth_shift) = (clip[(2, 2)], clip[(2, 3)]);
         let eye = frame_params.camera.eye();
         let up = scene.up.index();
         let is_above_ground = eye[up] > scene.rest_bounds.min[up];
@@ -63,17 +63,17 @@ impl View {
             width: frame_params.width,
             height: frame_params.height,
             eye,
-            depth_range: (shift / (scale - 1.0), shift / (scale + 1.0)),
-            to_sun: look.to_sun(scene.up),
-            sunlight: to_f64(look.sunlight),
-            skylight: to_f64(look.skylight),
+            depth_range: (depth_shift / (depth_scale - 1.0), depth_shift / (depth_scale + 1.0)),
+            to_sun: settings.to_sun(scene.up),
+            sunlight: to_f64(settings.sunlight),
+            skylight: to_f64(settings.skylight),
             up: scene.up.vector(),
-            ground: look
+            ground: settings
                 .ground
                 .filter(|_| is_above_ground)
                 .map(|ground| GroundPlane::new(scene, eye, to_f64(ground.color))),
-            zenith: to_f64(look.zenith),
-            horizon: to_f64(look.horizon),
+            zenith: to_f64(settings.zenith),
+            horizon: to_f64(settings.horizon),
             world_from_camera: rotation.try_inverse().unwrap_or_else(Matrix3::identity),
             lens,
         }
@@ -90,11 +90,11 @@ impl View {
     /// sine of the elevation.
     pub(super) fn sky_color(&self, direction: &Vector3<f64>) -> Vector3<f64> {
         let sine = direction.normalize().dot(&self.up).max(0.0);
-        let share = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
-        self.horizon.lerp(&self.zenith, share)
+        let zenith_weight = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
+        self.horizon.lerp(&self.zenith, zenith_weight)
     }
 
-    /// The t where a ray hits the ground in front of its origin.
+    /// The parameter t at which a ray hits the ground in front of its origin.
     pub(super) fn intersect_ground(&self, ray: &Ray) -> Option<f64> {
         let plane = self.ground?;
         let slope = self.up.dot(&ray.direction);
@@ -102,9 +102,10 @@ impl View {
         (slope < 0.0 && t > 0.0 && t.is_finite()).then_some(t)
     }
 
-    /// Fraction of the ground color that the haze leaves, from 1 under the scene to 0 far away.
+    /// Fraction of the ground color that remains in the haze: 1 below the scene, 0 at the horizon.
     pub(super) fn ground_visibility(&self, point: &Vector3<f64>) -> f64 {
-        let squared_distance = |plane: GroundPlane| (point - plane.center).norm_squared() / (plane.fade * plane.fade);
+        let squared_distance =
+            |plane: GroundPlane| (point - plane.center).norm_squared() / (plane.fade_distance * plane.fade_distance);
         self.ground.map_or(0.0, |plane| (-squared_distance(plane)).exp())
     }
 
@@ -115,15 +116,20 @@ impl View {
 }
 
 impl GroundPlane {
-    /// A plane at the lowest rest position. The fade distance is 3.5 times the scene's diagonal or the horizontal
-    /// distance of the eye, whichever is larger.
+    /// A plane at the lowest rest position. The fade distance is 3.5 times the larger of the scene's diagonal and the
+    /// horizontal distance of the eye.
     fn new(scene: &Scene, eye: Vector3<f64>, color: Vector3<f64>) -> Self {
-        let (rest, up) = (scene.rest_bounds, scene.up.index());
-        let height = rest.min[up];
-        let mut center = rest.center().coords;
+        let (rest_bounds, up) = (scene.rest_bounds, scene.up.index());
+        let height = rest_bounds.min[up];
+        let mut center = rest_bounds.center().coords;
         center[up] = height;
-        let mut horizontal = eye - center;
-        horizontal[up] = 0.0;
-        Self { height, center, fade: 3.5 * rest.diagonal().max(horizontal.norm()).max(1e-6), color }
+        let mut horizontal_offset = eye - center;
+        horizontal_offset[up] = 0.0;
+        Self {
+            height,
+            center,
+            fade_distance: 3.5 * rest_bounds.diagonal().max(horizontal_offset.norm()).max(1e-6),
+            color,
+        }
     }
 }

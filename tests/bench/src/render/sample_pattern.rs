@@ -2,19 +2,20 @@
 
 use std::f64::consts::TAU;
 
-/// Samples of one pixel in `side` x `side` cells. The offset of a sample within its cell is given by its index in the
-/// other direction, x = (i + (j + 1/2) / side) / side and likewise y, so that all x and all y are different.
+/// Samples of one pixel, one in each of `side` x `side` cells. The sample of cell (i, j) has x = (i + (j + 1/2) / side) /
+/// side, and y with i and j exchanged. All x are different, and so are all y.
 pub(super) fn pixel_samples(side: usize) -> Vec<[f64; 2]> {
     let count = side as f64;
-    let coordinate = |cell: usize, other: usize| (cell as f64 + (other as f64 + 0.5) / count) / count;
+    let coordinate = |cell: usize, other_cell: usize| (cell as f64 + (other_cell as f64 + 0.5) / count) / count;
     (0..side * side)
         .map(|index| (index % side, index / side))
         .map(|(i, j)| [coordinate(i, j), coordinate(j, i)])
         .collect()
 }
 
-/// Points of a two-dimensional normal distribution with standard deviation 1: Hammersley points, transformed by Box and
-/// Muller. `shift` (both 0 to 1) shifts all points, so that the errors of neighboring pixels are uncorrelated.
+/// Points of a two-dimensional normal distribution with standard deviation 1: Hammersley points after a Box-Muller
+/// transform. `shift` (each component 0 to 1) is added to the Hammersley points. With a different shift per pixel, the
+/// errors of neighboring pixels are uncorrelated.
 pub(super) fn gaussian_samples(count: usize, shift: [f64; 2]) -> Vec<[f64; 2]> {
     let point = |index: usize| {
         let radical_inverse = f64::from((index as u32).reverse_bits()) / 4_294_967_296.0;
@@ -29,13 +30,13 @@ pub(super) fn gaussian_samples(count: usize, shift: [f64; 2]) -> Vec<[f64; 2]> {
 
 /// Two pseudo-random numbers in [0, 1) per pixel.
 pub(super) fn pixel_shift(x: u32, y: u32) -> [f64; 2] {
-    let mix = |mut word: u64| {
+    let mix_bits = |mut word: u64| {
         word = (word ^ (word >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
         word = (word ^ (word >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
         word ^ (word >> 31)
     };
-    let seed = mix((u64::from(x) << 32 | u64::from(y)).wrapping_add(0x9E37_79B9_7F4A_7C15));
-    [seed >> 40, mix(seed) >> 40].map(|bits| bits as f64 / (1_u64 << 24) as f64)
+    let seed = mix_bits((u64::from(x) << 32 | u64::from(y)).wrapping_add(0x9E37_79B9_7F4A_7C15));
+    [seed >> 40, mix_bits(seed) >> 40].map(|bits| bits as f64 / (1_u64 << 24) as f64)
 }
 
 #[cfg(test)]

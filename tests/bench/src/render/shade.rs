@@ -6,15 +6,15 @@
 use nalgebra::Vector3;
 
 use super::ray_scene::{Hit, Ray, RayScene};
-use super::reference_view::View;
+use super::reference_view::ReferenceView;
 
 /// Shading of one point that a camera ray hits.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ShadedPoint {
     pub(super) point: Vector3<f64>,
-    /// Geometric normal, on the sun's side.
+    /// Geometric normal, flipped to the sun's side.
     pub(super) geometric_normal: Vector3<f64>,
-    /// The triangle; `None` for ground and sky.
+    /// Index of the triangle; `None` for ground and sky.
     pub(super) triangle: Option<usize>,
     /// Linear radiance without the sun.
     pub(super) ambient: Vector3<f64>,
@@ -26,7 +26,7 @@ pub(super) struct ShadedPoint {
 }
 
 /// Shades the sky.
-pub(super) fn shade_sky(view: &View, ray: &Ray) -> ShadedPoint {
+pub(super) fn shade_sky(view: &ReferenceView, ray: &Ray) -> ShadedPoint {
     let (point, zero) = (ray.origin, Vector3::zeros());
     ShadedPoint {
         point,
@@ -40,7 +40,7 @@ pub(super) fn shade_sky(view: &View, ray: &Ray) -> ShadedPoint {
 }
 
 /// Shades the Lambertian ground, with haze, at ray parameter `t`.
-pub(super) fn shade_ground(view: &View, ray: &Ray, t: f64) -> ShadedPoint {
+pub(super) fn shade_ground(view: &ReferenceView, ray: &Ray, t: f64) -> ShadedPoint {
     let point = ray.point_at(t);
     let (color, haze) = view.ground_colors();
     let visibility = view.ground_visibility(&point);
@@ -57,11 +57,12 @@ pub(super) fn shade_ground(view: &View, ray: &Ray, t: f64) -> ShadedPoint {
 }
 
 /// Shades a point of a triangle.
-pub(super) fn shade_triangle(ray_scene: &RayScene, view: &View, ray: &Ray, hit: &Hit) -> ShadedPoint {
+pub(super) fn shade_triangle(ray_scene: &RayScene, view: &ReferenceView, ray: &Ray, hit: &Hit) -> ShadedPoint {
     let material = ray_scene.material(hit);
     let point = ray.point_at(hit.t);
-    let [r, g, b, a] = material.color.as_ref().map_or([1.0; 4], |image| image.sample(ray_scene.uv(hit)));
-    let tint = Vector3::new(r, g, b);
+    let [r, g, b, texture_alpha] =
+        material.color_texture.as_ref().map_or([1.0; 4], |texture| texture.sample(ray_scene.uv(hit)));
+    let texture_color = Vector3::new(r, g, b);
     let normal = shading_normal(ray_scene, hit);
     let cosine = normal.dot(&view.to_sun);
     let mut sun = Vector3::zeros();
@@ -70,7 +71,7 @@ pub(super) fn shade_triangle(ray_scene: &RayScene, view: &View, ray: &Ray, hit: 
         let reflected = 2.0 * to_eye.dot(&normal) * normal - to_eye;
         let specular_cosine = reflected.dot(&view.to_sun);
         let highlight = if specular_cosine > 0.0 { specular_cosine.powf(material.exponent) } else { 0.0 };
-        let reflectance = cosine * material.diffuse.component_mul(&tint) + highlight * material.specular;
+        let reflectance = cosine * material.diffuse.component_mul(&texture_color) + highlight * material.specular;
         sun = reflectance.component_mul(&view.sunlight);
     }
     let geometric_normal = ray_scene.triangles[hit.triangle].geometric_normal();
@@ -78,21 +79,22 @@ pub(super) fn shade_triangle(ray_scene: &RayScene, view: &View, ray: &Ray, hit: 
         point,
         geometric_normal: if geometric_normal.dot(&view.to_sun) < 0.0 { -geometric_normal } else { geometric_normal },
         triangle: Some(hit.triangle),
-        ambient: view.skylight.component_mul(&material.ambient).component_mul(&tint),
+        ambient: view.skylight.component_mul(&material.ambient).component_mul(&texture_color),
         sun,
         cosine: cosine.max(0.0),
-        alpha: if ray_scene.is_blended(hit) { material.alpha * a } else { 1.0 },
+        alpha: if ray_scene.is_blended(hit) { material.alpha * texture_alpha } else { 1.0 },
     }
 }
 
 /// The interpolated normal, perturbed by the normal map and flipped to the visible side.
 fn shading_normal(ray_scene: &RayScene, hit: &Hit) -> Vector3<f64> {
-    let corners = ray_scene.triangles[hit.triangle].corners.map(|corner| corner as usize);
+    let corners = ray_scene.triangles[hit.triangle].corner_indices.map(|corner| corner as usize);
     let weights = [1.0 - hit.u - hit.v, hit.u, hit.v];
     let mut normal: Vector3<f64> =
         corners.iter().zip(weights).map(|(corner, weight)| ray_scene.normals[*corner] * weight).sum();
     normal = normalize(normal);
-    if let Some(image) = ray_scene.material(hit).normal.as_ref().filter(|_| !ray_scene.tangents.is_empty()) {
+    if let Some(normal_map) = ray_scene.material(hit).normal_texture.as_ref().filter(|_| !ray_scene.tangents.is_empty())
+    {
         let tangent_component = |axis: usize| {
             corners.iter().zip(weights).map(|(corner, weight)| ray_scene.tangents[*corner][axis] * weight).sum()
         };
@@ -100,13 +102,13 @@ fn shading_normal(ray_scene: &RayScene, hit: &Hit) -> Vector3<f64> {
         let tangent = Vector3::new(x, y, z);
         if tangent.norm_squared() > 0.0 {
             let [r, g, b] =
-                std::array::from_fn(|channel| (image.sample(ray_scene.uv(hit))[channel] * 255.0 - 128.0) / 127.0);
+                std::array::from_fn(|channel| (normal_map.sample(ray_scene.uv(hit))[channel] * 255.0 - 128.0) / 127.0);
             let tangent = normalize(tangent - normal * normal.dot(&tangent));
             let bitangent = normal.cross(&tangent) * if sign < 0.0 { -1.0 } else { 1.0 };
             normal = normalize(tangent * r + bitangent * g + normal * b);
         }
     }
-    if hit.front { normal } else { -normal }
+    if hit.is_front { normal } else { -normal }
 }
 
 fn normalize(vector: Vector3<f64>) -> Vector3<f64> {

@@ -8,9 +8,9 @@ use super::harness::{RenderHarness, Size};
 use super::light_meter;
 use super::metrics;
 use super::ray_scene::{Ray, RayScene};
-use super::reference_image::{ReferenceImage, SampleCounts, SunTerm, trace};
+use super::reference_image::{ReferenceImage, SampleCounts, ShadowModel, trace_reference_images};
 use super::reference_texture::linear_from_srgb;
-use super::reference_view::View;
+use super::reference_view::ReferenceView;
 use super::rigid_domain::add_rigid_domain;
 use super::variants;
 use super::workloads::{RenderWorkload, horizontal_square, quad};
@@ -18,7 +18,7 @@ use super::{RenderReportOptions, render};
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh, Texture};
-use modalcast_model::scene::{BoundingBox, Camera, Ground, Lens, Scene, SceneParts, SceneState, View as Eye};
+use modalcast_model::scene::{BoundingBox, Camera, Ground, Lens, Scene, SceneParts, SceneState, View};
 use modalcast_render::FrameParams;
 
 /// A scene without domains, sky and ground; the sun is behind the camera.
@@ -42,11 +42,11 @@ fn deform_at_rest(scene: &Arc<Scene>) -> (DeformedSurface, BoundingBox) {
 
 /// Parameters of a square frame with ten pixels per unit in the plane z = 0, or y = 0 when seen from above. The origin
 /// is at the center of the frame.
-fn frame_params(bounds: BoundingBox, side: u32, above: bool) -> FrameParams {
+fn frame_params(bounds: BoundingBox, side: u32, from_above: bool) -> FrameParams {
     let center = f64::from(side) / 2.0;
-    let (eye, up) = if above { ([0.0, 10.0, 0.0], [0.0, 0.0, -1.0]) } else { ([0.0, 0.0, 10.0], [0.0, 1.0, 0.0]) };
+    let (eye, up) = if from_above { ([0.0, 10.0, 0.0], [0.0, 0.0, -1.0]) } else { ([0.0, 0.0, 10.0], [0.0, 1.0, 0.0]) };
     let camera = Camera {
-        view: Eye::LookAt { eye, target: [0.0; 3], up },
+        view: View::LookAt { eye, target: [0.0; 3], up },
         lens: Lens::Intrinsics { fx: 100.0, fy: 100.0, cx: center, cy: center },
         near: 0.0,
         far: 0.0,
@@ -54,11 +54,11 @@ fn frame_params(bounds: BoundingBox, side: u32, above: bool) -> FrameParams {
     FrameParams { camera, width: side, height: side, bounds, light: None }
 }
 
-fn trace_images(parts: SceneParts, above: bool, terms: &[SunTerm], side: u32) -> Vec<ReferenceImage> {
+fn trace_images(parts: SceneParts, from_above: bool, shadow_models: &[ShadowModel], side: u32) -> Vec<ReferenceImage> {
     let scene = Scene::new(parts).expect("a valid scene");
     let (surface, bounds) = deform_at_rest(&scene);
-    let view = View::new(&scene, &frame_params(bounds, side, above));
-    trace(&RayScene::new(&scene, &surface), &view, terms, SampleCounts::FULL)
+    let view = ReferenceView::new(&scene, &frame_params(bounds, side, from_above));
+    trace_reference_images(&RayScene::new(&scene, &surface), &view, shadow_models, SampleCounts::FULL)
 }
 
 fn linear_color(image: &ReferenceImage, pixel: usize) -> Vector3<f64> {
@@ -72,11 +72,11 @@ fn pixels_are_as_bright_as_their_covered_area() {
     // 10.35 by 7.8 pixels; the left edge bisects a column of pixels.
     add_rigid_domain(&mut parts, "square", upright_square([-0.55, -0.38, 0.485, 0.4], 0.0), white).expect("a domain");
     parts.look.skylight = [1.0; 3];
-    let image = trace_images(parts, false, &[SunTerm::Unshadowed], 32).remove(0);
+    let image = trace_images(parts, false, &[ShadowModel::Unshadowed], 32).remove(0);
     let area: f64 = (0..32 * 32).map(|pixel| linear_color(&image, pixel).x).sum();
     assert!((area - 10.35 * 7.8).abs() < 0.25, "{area}");
-    let half = linear_color(&image, 16 * 32 + 10).x;
-    assert!((half - 0.5).abs() < 1e-6, "{half}");
+    let half_covered = linear_color(&image, 16 * 32 + 10).x;
+    assert!((half_covered - 0.5).abs() < 1e-6, "{half_covered}");
     assert_eq!((linear_color(&image, 16 * 32 + 9).x, linear_color(&image, 16 * 32 + 12).x.round()), (0.0, 1.0));
 }
 
@@ -92,14 +92,14 @@ fn shades_one_pixel_by_equation_3_12() {
     };
     add_rigid_domain(&mut parts, "square", upright_square([-3.0, -3.0, 3.0, 3.0], 0.0), material).expect("a domain");
     parts.look.sun = [3.0, 0.0, 4.0];
-    let image = trace_images(parts, false, &[SunTerm::Unshadowed], 41).remove(0);
+    let image = trace_images(parts, false, &[ShadowModel::Unshadowed], 41).remove(0);
     // The center of the middle pixel is the origin, so the eye is straight ahead and v_e' is n.
     let cosine: f64 = 0.8;
     let expected = [(0.2, 0.5, 0.3), (0.4, 0.25, 0.2), (0.6, 0.1, 0.1)]
         .map(|(ambient, diffuse, specular)| 0.25 * ambient + 0.5 * (cosine * diffuse + cosine.powi(3) * specular));
-    let found = linear_color(&image, 20 * 41 + 20);
-    for (found, expected) in found.iter().zip(expected) {
-        assert!((found - expected).abs() < 2e-4, "expected {expected}, got {found}");
+    let color = linear_color(&image, 20 * 41 + 20);
+    for (color, expected) in color.iter().zip(expected) {
+        assert!((color - expected).abs() < 2e-4, "expected {expected}, got {color}");
     }
 }
 
@@ -111,7 +111,7 @@ fn back_face_is_visible_only_if_double_sided() {
             quad([[1.0, -1.0, 0.0], [-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, 1.0, 0.0]], [0.0, 0.0, -1.0]);
         let material = Material { double_sided, ..Material::default() };
         add_rigid_domain(&mut parts, "square", away_facing.expect("a square"), material).expect("a domain");
-        linear_color(&trace_images(parts, false, &[SunTerm::Unshadowed], 9).remove(0), 40).x
+        linear_color(&trace_images(parts, false, &[ShadowModel::Unshadowed], 9).remove(0), 40).x
     };
     assert!((center_color(true) - 0.75).abs() < 1e-6 && center_color(false) == 0.0);
 }
@@ -129,7 +129,7 @@ fn sorts_transparent_layers_in_any_order() {
         let background = Material { ambient: [0.0, 0.0, 1.0], diffuse: [0.0; 3], ..Material::default() };
         add_rigid_domain(&mut parts, "background", upright_square([-2.0, -2.0, 2.0, 2.0], -0.5), background)
             .expect("a domain");
-        linear_color(&trace_images(parts, false, &[SunTerm::Unshadowed], 9).remove(0), 40)
+        linear_color(&trace_images(parts, false, &[ShadowModel::Unshadowed], 9).remove(0), 40)
     };
     let red_first = center_color([0.5, 0.0]);
     assert!((red_first - Vector3::new(0.5, 0.25, 0.25)).norm() < 1e-6, "{red_first}");
@@ -157,9 +157,9 @@ fn shadow_edge(caster: Material) -> SceneParts {
 fn hard_and_gaussian_shadow_edges_match_the_formula() {
     // Deviations of 0.4 in the plane perpendicular to the light: 0.4 / 0.8 on the ground along x.
     let filter_axes = [Vector3::new(4.0, -3.0, 0.0) / 5.0 * 0.4, Vector3::z() * 0.4];
-    let terms = [SunTerm::Hard, SunTerm::Filtered(filter_axes), SunTerm::Unshadowed];
+    let shadow_models = [ShadowModel::Hard, ShadowModel::Filtered(filter_axes), ShadowModel::Unshadowed];
     let [hard, filtered, unshadowed]: [ReferenceImage; 3] =
-        trace_images(shadow_edge(Material::default()), true, &terms, 40).try_into().expect("three images");
+        trace_images(shadow_edge(Material::default()), true, &shadow_models, 40).try_into().expect("three images");
     let visibility = |image: &ReferenceImage, column: usize| {
         f64::from(image.light[20 * 40 + column].expect("defined sun visibility"))
     };
@@ -170,13 +170,16 @@ fn hard_and_gaussian_shadow_edges_match_the_formula() {
     for column in 4..40 {
         let offset = (column as f64 + 0.5 - 23.0) / deviation;
         let expected = 0.5 * (1.0 - erf(offset / 2f64.sqrt()));
-        let found: f64 = (12..28)
+        let mean: f64 = (12..28)
             .map(|row| f64::from(filtered.light[row * 40 + column].expect("defined sun visibility")))
             .sum::<f64>()
             / 16.0;
-        assert!((found - expected).abs() < 0.015, "column {column}: expected {expected}, got {found}");
-        let pixel = visibility(&filtered, column);
-        assert!((pixel - expected).abs() < 0.08, "pixel of column {column}: expected {expected}, got {pixel}");
+        assert!((mean - expected).abs() < 0.015, "column {column}: expected {expected}, got {mean}");
+        let pixel_visibility = visibility(&filtered, column);
+        assert!(
+            (pixel_visibility - expected).abs() < 0.08,
+            "pixel of column {column}: expected {expected}, got {pixel_visibility}"
+        );
     }
 }
 
@@ -192,8 +195,8 @@ fn erf(x: f64) -> f64 {
 fn cut_outs_and_glass_cast_shadows_above_alpha_threshold() {
     let is_in_shadow = |alpha_mode: AlphaMode, alpha: f32, texel: u8| {
         let mut parts = shadow_edge(Material { alpha_mode, alpha, color_texture: Some(0), ..Material::default() });
-        parts.textures.push(Texture::new("leaf", 1, 1, vec![255, 255, 255, texel]).expect("valid input"));
-        let image = trace_images(parts, true, &[SunTerm::Hard], 40).remove(0);
+        parts.textures.push(Texture::new("leaf", 1, 1, vec![255, 255, 255, texel]).expect("valid settings"));
+        let image = trace_images(parts, true, &[ShadowModel::Hard], 40).remove(0);
         image.light[20 * 40 + 38].expect("defined sun visibility") == 0.0
     };
     let mask = AlphaMode::Mask { cutoff: 0.5 };
@@ -214,14 +217,14 @@ fn ray_queries_match_a_linear_search_at_any_position() {
             let (origin, target) =
                 (ray_scene.center + 40.0 * random_vector(), ray_scene.center + ray_scene.radius * random_vector());
             let ray = Ray { origin, direction: target - origin };
-            let all = ray_scene.all_hits(&ray, (0.0, f64::INFINITY), |_| true);
-            let nearest = ray_scene.nearest_hit(&ray, (0.0, f64::INFINITY), |_| true);
-            let linear_search = (0..ray_scene.triangles.len())
+            let all_hits = ray_scene.all_hits(&ray, (0.0, f64::INFINITY), |_| true);
+            let nearest_hit = ray_scene.nearest_hit(&ray, (0.0, f64::INFINITY), |_| true);
+            let linear_search_hit = (0..ray_scene.triangles.len())
                 .filter_map(|triangle| ray_scene.intersect(triangle, &ray))
                 .min_by(|a, b| a.t.total_cmp(&b.t));
-            assert_eq!(nearest.map(|hit| hit.t), linear_search.map(|hit| hit.t), "{seed}");
-            assert_eq!(nearest.map(|hit| hit.t), all.last().map(|hit| hit.t), "{seed}");
-            assert_eq!(ray_scene.is_occluded(&ray, 0.0, None), linear_search.is_some(), "{seed}");
+            assert_eq!(nearest_hit.map(|hit| hit.t), linear_search_hit.map(|hit| hit.t), "{seed}");
+            assert_eq!(nearest_hit.map(|hit| hit.t), all_hits.last().map(|hit| hit.t), "{seed}");
+            assert_eq!(ray_scene.is_occluded(&ray, 0.0, None), linear_search_hit.is_some(), "{seed}");
         }
     }
 }
@@ -232,23 +235,23 @@ fn drawn_scene_matches_reference_unless_sun_moves() {
     let size = Size { width: 160, height: 90 };
     let variant = variants::all(true).remove(1);
     let mut harness = RenderHarness::open().expect("EGL and OpenGL 4.3 (libegl1, libegl-mesa0, libgl1-mesa-dri)");
-    let mut errors = |sun: [f32; 3]| {
+    let mut color_errors = |sun: [f32; 3]| {
         let look = modalcast_model::scene::RenderSettings { sun, ..variant.settings(animation.scene.look) };
-        let lit_scene = light_meter::with_settings(&animation.scene, look).expect("valid input");
+        let lit_scene = light_meter::with_settings(&animation.scene, look).expect("valid settings");
         let mut loaded_scene = harness.load(&lit_scene).expect("a loaded scene");
         harness.deform(&mut loaded_scene, &SceneState::rest(&lit_scene)).expect("deformed vertices");
         let camera = Camera::fit_to_scene(&lit_scene, size.width, size.height);
         let image = harness.draw(&loaded_scene, camera, size).expect("a frame");
-        let view = View::new(&animation.scene, &loaded_scene.frame_params(camera, size));
+        let view = ReferenceView::new(&animation.scene, &loaded_scene.frame_params(camera, size));
         let ray_scene = RayScene::new(&animation.scene, loaded_scene.surface().expect("a surface"));
-        let reference = trace(&ray_scene, &view, &[SunTerm::Hard], SampleCounts::QUICK).remove(0);
+        let reference = trace_reference_images(&ray_scene, &view, &[ShadowModel::Hard], SampleCounts::QUICK).remove(0);
         harness.unload(loaded_scene);
         metrics::compare_colors(&image.rgba, &reference.colors)
     };
     let [x, y, z] = animation.scene.look.sun;
-    let with_same_sun = errors([x, y, z]);
+    let with_same_sun = color_errors([x, y, z]);
     assert!(with_same_sun.mean < 1.0 && with_same_sun.p99 < 20.0, "{with_same_sun:?}");
-    let with_moved_sun = errors([x + 0.3, y, z]);
+    let with_moved_sun = color_errors([x + 0.3, y, z]);
     assert!(
         with_moved_sun.mean > 1.5 * with_same_sun.mean && with_moved_sun.p99 > 40.0,
         "control: expected larger errors than {with_same_sun:?}, got {with_moved_sun:?}"
@@ -257,7 +260,7 @@ fn drawn_scene_matches_reference_unless_sun_moves() {
 
 #[test]
 fn report_measures_selected_variants_and_writes_files() {
-    let request = RenderReportOptions {
+    let options = RenderReportOptions {
         plants: vec![],
         loads: vec![RenderWorkload::Square],
         variants: vec!["none".into(), "variance 512, blur 4".into()],
@@ -265,15 +268,15 @@ fn report_measures_selected_variants_and_writes_files() {
         quick: true,
         replays: 20,
     };
-    let report = render(&request, |_| {}).expect("a report");
+    let report = render(&options, |_| {}).expect("a report");
     assert!(report.passed(), "{:?}", report.failed);
     let [unshadowed, filtered] = &report.rows[..] else { panic!("expected two rows, got {:?}", report.rows) };
     assert!(
-        unshadowed.color.mean > 2.0 * filtered.color.mean,
+        unshadowed.color_errors.mean > 2.0 * filtered.color_errors.mean,
         "without shadows, colors differ from the shadowed reference"
     );
     assert!(
-        unshadowed.color_of_reference.mean < 1.5 && unshadowed.light_of_aim.all.largest == 0.0,
+        unshadowed.intended_color_errors.mean < 1.5 && unshadowed.intended_light_errors.all_pixels.max == 0.0,
         "without shadows, the image matches the unshadowed reference"
     );
     assert!(
@@ -284,24 +287,25 @@ fn report_measures_selected_variants_and_writes_files() {
     }
     let folder = tempfile::tempdir().expect("a folder");
     report.write(folder.path()).expect("report files");
-    let read = |name: &str| std::fs::read(folder.path().join(name)).expect(name);
-    let json: serde_json::Value = serde_json::from_slice(&read("report.json")).expect("JSON");
+    let read_file = |name: &str| std::fs::read(folder.path().join(name)).expect(name);
+    let json: serde_json::Value = serde_json::from_slice(&read_file("report.json")).expect("JSON");
     assert_eq!(json["rows"][1]["shadow"]["size"], 512);
     assert_eq!(json["rows"][1]["passes"][0]["name"], "frame");
-    let mut table = csv::Reader::from_reader(std::io::Cursor::new(read("report.csv")));
-    let frame_column = table.headers().expect("a header").iter().position(|name| name == "frame_us").expect("a column");
-    assert!(table.records().all(|row| row.expect("a record")[frame_column].parse::<f64>().is_ok()));
-    assert!(String::from_utf8(read("report.md")).expect("UTF-8").contains("variance 512, blur 4"));
-    assert!(read("report.svg").starts_with(b"<svg") && image::load_from_memory(&read("report.png")).is_ok());
+    let mut csv_reader = csv::Reader::from_reader(std::io::Cursor::new(read_file("report.csv")));
+    let frame_column =
+        csv_reader.headers().expect("a header").iter().position(|name| name == "frame_us").expect("a column");
+    assert!(csv_reader.records().all(|row| row.expect("a record")[frame_column].parse::<f64>().is_ok()));
+    assert!(String::from_utf8(read_file("report.md")).expect("UTF-8").contains("variance 512, blur 4"));
+    assert!(read_file("report.svg").starts_with(b"<svg") && image::load_from_memory(&read_file("report.png")).is_ok());
     for name in ["square-hard.png", "square-hard-light.png", "square-none.png", "square-variance-512-blur-4.png"] {
-        let image = image::load_from_memory(&read(&format!("pictures/{name}"))).expect("a PNG");
+        let image = image::load_from_memory(&read_file(&format!("pictures/{name}"))).expect("a PNG");
         assert_eq!(image.height(), 54, "{name}");
     }
 }
 
 #[test]
 fn minimal_passes_have_a_baseline_without_culling() {
-    let request = RenderReportOptions {
+    let options = RenderReportOptions {
         plants: vec![],
         loads: vec![RenderWorkload::Triangles(800)],
         variants: vec!["culling triangles".into()],
@@ -309,26 +313,29 @@ fn minimal_passes_have_a_baseline_without_culling() {
         quick: true,
         replays: 20,
     };
-    let report = render(&request, |_| {}).expect("a report");
-    let ([row], [minimal]) = (&report.rows[..], &report.minimal_passes[..]) else {
+    let report = render(&options, |_| {}).expect("a report");
+    let ([row], [minimal_passes]) = (&report.rows[..], &report.minimal_passes[..]) else {
         panic!("expected one row and one entry, got {report:?}")
     };
-    assert!(row.culled.is_some() && minimal.map == 2048, "control: the row culls");
-    assert_eq!(minimal.unculled.name, "variance 2048, blur 1.5: without culling");
-    assert_eq!(minimal.default_culling.name, "variance 2048, blur 1.5: as the load culls");
-    let sum_us = minimal.depth.median_us + minimal.visibility.median_us;
-    for frame in [&minimal.unculled, &minimal.default_culling] {
-        assert!((frame.frame_us - sum_us - frame.beyond_us).abs() < 1e-6 && Some(frame.frame_us) != row.median_us());
+    assert!(row.cull_stats.is_some() && minimal_passes.map_size == 2048, "control: the row culls");
+    assert_eq!(minimal_passes.without_culling.name, "variance 2048, blur 1.5: without culling");
+    assert_eq!(minimal_passes.with_default_culling.name, "variance 2048, blur 1.5: as the load culls");
+    let sum_us = minimal_passes.depth.median_us + minimal_passes.visibility.median_us;
+    for frame in [&minimal_passes.without_culling, &minimal_passes.with_default_culling] {
+        assert!((frame.frame_us - sum_us - frame.excess_us).abs() < 1e-6 && Some(frame.frame_us) != row.median_us());
     }
-    let request = RenderReportOptions { variants: vec!["culling none".into(), "culling triangles".into()], ..request };
-    let report = render(&request, |_| {}).expect("a report");
-    assert_eq!(report.minimal_passes[0].unculled.name, "culling none: without culling", "the timed row is reused");
-    assert_eq!(Some(report.minimal_passes[0].unculled.frame_us), report.rows[0].median_us());
+    let options = RenderReportOptions { variants: vec!["culling none".into(), "culling triangles".into()], ..options };
+    let report = render(&options, |_| {}).expect("a report");
+    assert_eq!(
+        report.minimal_passes[0].without_culling.name, "culling none: without culling",
+        "the timed row is reused"
+    );
+    assert_eq!(Some(report.minimal_passes[0].without_culling.frame_us), report.rows[0].median_us());
 }
 
 #[test]
 fn exact_transparency_is_closer_to_reference_than_two_pass() {
-    let request = RenderReportOptions {
+    let options = RenderReportOptions {
         plants: vec![],
         loads: vec![RenderWorkload::Panes, RenderWorkload::Square],
         variants: vec!["exact transparency".into(), "two-pass transparency".into()],
@@ -336,9 +343,9 @@ fn exact_transparency_is_closer_to_reference_than_two_pass() {
         quick: true,
         replays: 20,
     };
-    let report = render(&request, |_| {}).expect("a report");
+    let report = render(&options, |_| {}).expect("a report");
     let [exact, two_pass] = &report.rows[..] else { panic!("expected two rows of the panes, got {:?}", report.rows) };
-    let [exact_error, two_pass_error] = [exact, two_pass].map(|row| row.color_of_reference.mean);
+    let [exact_error, two_pass_error] = [exact, two_pass].map(|row| row.intended_color_errors.mean);
     assert!(exact_error < 1.0 && two_pass_error > 3.0 * exact_error, "{exact_error} and {two_pass_error} of 255");
     assert!(report.passed(), "{:?}", report.failed);
 }
@@ -351,14 +358,22 @@ fn refitted_bvh_gives_the_same_images_as_a_rebuilt_one() {
         let bounds = deformer.deform(&animation.state(step)).expect("deformed vertices").bounds;
         (deformer.surface().expect("a surface").clone(), bounds)
     };
-    let ((first, _), (later, bounds)) = (deform(0), deform(30));
+    let ((first_surface, _), (later_surface, bounds)) = (deform(0), deform(30));
     let size = Size { width: 48, height: 32 };
-    let view = View::new(
+    let view = ReferenceView::new(
         &animation.scene,
         &FrameParams { camera: animation.camera(size), width: 48, height: 32, bounds, light: None },
     );
-    let trace_hard = |ray_scene: &RayScene| trace(ray_scene, &view, &[SunTerm::Hard], SampleCounts::QUICK);
-    let rebuilt = trace_hard(&RayScene::new(&animation.scene, &later));
-    assert_eq!(trace_hard(&RayScene::new(&animation.scene, &first).refit(&animation.scene, &later)), rebuilt);
-    assert_ne!(trace_hard(&RayScene::new(&animation.scene, &first)), rebuilt, "control: the first step differs");
+    let trace_hard =
+        |ray_scene: &RayScene| trace_reference_images(ray_scene, &view, &[ShadowModel::Hard], SampleCounts::QUICK);
+    let rebuilt_images = trace_hard(&RayScene::new(&animation.scene, &later_surface));
+    assert_eq!(
+        trace_hard(&RayScene::new(&animation.scene, &first_surface).refit(&animation.scene, &later_surface)),
+        rebuilt_images
+    );
+    assert_ne!(
+        trace_hard(&RayScene::new(&animation.scene, &first_surface)),
+        rebuilt_images,
+        "control: the first step differs"
+    );
 }

@@ -1,4 +1,4 @@
-//! The `images` scene: upright panels with images of different sizes, and a long floor. Each repeats its image.
+//! The `images` scene: upright panels with images of different sizes, and a floor. Each surface repeats its image.
 
 use std::f32::consts::TAU;
 
@@ -7,8 +7,8 @@ use modalcast_model::domain::{Material, Mesh, Texture};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{RenderSettings, SceneParts};
 
-/// Image sizes of the upright panels, from left to right, lower row first. In a frame of default size the texels of the
-/// smallest are four pixels wide, those of the largest half a pixel.
+/// Image sizes of the upright panels, from left to right, lower row first. In a frame of default size, a texel of the
+/// smallest image is four pixels wide and a texel of the largest half a pixel.
 const SIZES: [[u32; 2]; 6] = [[16, 16], [25, 15], [32, 32], [64, 64], [75, 50], [128, 128]];
 /// Repetitions of the image along each side of an upright panel.
 const PANEL_REPETITIONS: usize = 2;
@@ -48,24 +48,28 @@ fn repeated_quads(corner: [f32; 3], sides: [[f32; 3]; 2], repetitions: usize) ->
         let [u, v] = [u, v].map(|index| index as f32 / repetitions as f32);
         std::array::from_fn(|axis| corner[axis] + u * sides[0][axis] + v * sides[1][axis])
     };
-    let (mut rest, mut uvs, mut triangles): (Vec<[f32; 3]>, _, Vec<[u32; 3]>) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut positions, mut uvs, mut triangles): (Vec<[f32; 3]>, _, Vec<[u32; 3]>) =
+        (Vec::new(), Vec::new(), Vec::new());
     for (column, row) in (0..repetitions * repetitions).map(|cell| (cell % repetitions, cell / repetitions)) {
-        let first = rest.len() as u32;
+        let first_corner = positions.len() as u32;
         for (u, v) in [(0, 0), (1, 0), (1, 1), (0, 1)] {
-            rest.push(point(column + u, row + v));
+            positions.push(point(column + u, row + v));
             uvs.push([(column + u) as f32, (row + v) as f32]);
         }
-        triangles.extend([[first, first + 1, first + 2], [first, first + 2, first + 3]]);
+        triangles.extend([
+            [first_corner, first_corner + 1, first_corner + 2],
+            [first_corner, first_corner + 2, first_corner + 3],
+        ]);
     }
     let normal = if sides[1][1] > 0.0 { [0.0, 0.0, 1.0] } else { [0.0, 1.0, 0.0] };
-    let normals = vec![normal; rest.len()];
-    Mesh::from_indexed(rest, normals, uvs, triangles)
+    let normals = vec![normal; positions.len()];
+    Mesh::from_indexed(positions, normals, uvs, triangles)
 }
 
 /// A seamless image: waves of whole periods in three colors, with a thin dark border that marks its edges.
 fn test_image(name: &str, width: u32, height: u32) -> Result<Texture> {
     let wave = |phase: f32| 0.5 + 0.5 * (TAU * phase).sin();
-    let pixel = |index: u32| {
+    let texel = |index: u32| {
         let (x, y) = (index % width, index / width);
         let (u, v) = ((x as f32 + 0.5) / width as f32, (y as f32 + 0.5) / height as f32);
         let is_border = x < width.div_ceil(32) || y < height.div_ceil(32);
@@ -74,5 +78,5 @@ fn test_image(name: &str, width: u32, height: u32) -> Result<Texture> {
         let [r, g, b] = color.map(|channel| (255.0 * channel * brightness) as u8);
         [r, g, b, 255]
     };
-    Texture::new(name, width, height, (0..width * height).flat_map(pixel).collect())
+    Texture::new(name, width, height, (0..width * height).flat_map(texel).collect())
 }

@@ -43,12 +43,12 @@ mod tests {
 
     #[test]
     fn stops_after_two_steps_if_budget_would_be_exceeded() {
-        let mut long = TimeBudget::new(Duration::from_secs(1000), 60);
-        assert!((0..60).all(|_| long.finish_step("frames").is_none()));
-        let mut short = TimeBudget::new(Duration::from_millis(50), 60);
-        assert_eq!(short.finish_step("frames"), None, "the first step does not decide");
+        let mut large_budget = TimeBudget::new(Duration::from_secs(1000), 60);
+        assert!((0..60).all(|_| large_budget.finish_step("frames").is_none()));
+        let mut small_budget = TimeBudget::new(Duration::from_millis(50), 60);
+        assert_eq!(small_budget.finish_step("frames"), None, "the first step does not decide");
         std::thread::sleep(Duration::from_millis(5));
-        let reason = short.finish_step("frames").expect("a reason to stop: 59 steps of 5 ms exceed 50 ms");
+        let reason = small_budget.finish_step("frames").expect("a reason to stop: 59 steps of 5 ms exceed 50 ms");
         assert!(reason.starts_with("expected frames of 60 steps in at most"), "{reason}");
     }
 }

@@ -47,7 +47,8 @@ pub struct ErrorLimits {
     /// Mean sun visibility inside the umbra (light bleeding), of 1.
     pub bleeding: f64,
     /// Mean sun visibility that is missing outside of shadows, of 1.
-    pub lost: f64,
+    #[serde(rename = "lost")]
+    pub lost_visibility: f64,
 }
 
 /// One way to draw a scene.
@@ -57,7 +58,7 @@ pub struct RenderVariant {
     pub name: String,
     pub method: ShadowVariant,
     pub shadow: Option<ShadowSettings>,
-    /// Transparency method, for variants that compare it; `None` uses that of the load's settings.
+    /// Transparency method, for variants that compare it; `None` uses that of the scene's settings.
     pub transparency: Option<Transparency>,
     /// Packing of images in arrays, for variants that compare it.
     pub packing: Option<Packing>,
@@ -65,25 +66,26 @@ pub struct RenderVariant {
     pub culling: Option<Culling>,
     /// Implementation of the shadow blur. It changes the image only by rounding.
     pub blur_method: BlurMethod,
-    pub intended: ReferenceKind,
+    pub intended_reference: ReferenceKind,
 }
 
-/// Twice the errors of small images with many leaves, where each leaf covers a pixel or two; all other errors are far
-/// smaller. A missing or displaced shadow exceeds `bleeding` or `lost` even if it covers a small part of the image.
+/// Twice the errors of small images with many leaves, where each leaf covers a pixel or two. All other errors are far
+/// smaller. A missing or displaced shadow exceeds `bleeding` or `lost_visibility` even if it covers a small part of the
+/// image.
 pub(super) const ERROR_LIMITS: ErrorLimits =
-    ErrorLimits { mean_color: 16.0, mean_light: 0.2, bleeding: 0.25, lost: 0.25 };
+    ErrorLimits { mean_color: 16.0, mean_light: 0.2, bleeding: 0.25, lost_visibility: 0.25 };
 /// Bound on light bleeding of a filtered map where no two casters overlap: Chebyshev's bound is exact there, and only
 /// rounding remains.
 const EXACT_BLEEDING_LIMIT: f64 = 0.01;
 /// Bound on the mean light error of the shelf. Its shadow fills half of the image and is narrower than the widest blur.
-/// The depths of the ground itself then vary as much as the shelf's height above it, and most of the sunlight
-/// leaks through.
+/// Within that blur the depths of the ground vary as much as the height of the shelf above it, so most of the sunlight
+/// leaks into the shadow.
 const SHELF_MEAN_LIGHT_LIMIT: f64 = 0.4;
 
 /// Sides of shadow maps, texels.
-const SIZES: [u32; 4] = [512, 1024, 2048, 4096];
+const MAP_SIZES: [u32; 4] = [512, 1024, 2048, 4096];
 /// Standard deviations of the blur, texels.
-const BLURS: [f32; 3] = [0.0, 1.5, 4.0];
+const BLUR_DEVIATIONS: [f32; 3] = [0.0, 1.5, 4.0];
 
 impl RenderVariant {
     /// The render settings of a scene as this variant draws it.
@@ -93,32 +95,33 @@ impl RenderVariant {
         RenderSettings { shadow: self.shadow, transparency, culling, ..look }
     }
 
-    /// Whether a load has the features that the variant compares.
-    pub fn is_applicable(&self, load: RenderWorkload) -> bool {
-        let is_large = matches!(load, RenderWorkload::Tree | RenderWorkload::Grove | RenderWorkload::Triangles(_));
-        let has_images = self.packing.is_some() == (load == RenderWorkload::Images);
-        has_images
-            && (self.transparency.is_none() || load == RenderWorkload::Panes)
+    /// Whether a workload has the features that the variant compares.
+    pub fn is_applicable(&self, workload: RenderWorkload) -> bool {
+        let is_large = matches!(workload, RenderWorkload::Tree | RenderWorkload::Grove | RenderWorkload::Triangles(_));
+        let matches_packing = self.packing.is_some() == (workload == RenderWorkload::Images);
+        matches_packing
+            && (self.transparency.is_none() || workload == RenderWorkload::Panes)
             && (self.culling.is_none() || is_large)
     }
 
-    /// Error bounds on a load.
-    pub fn bounds(&self, load: RenderWorkload) -> ErrorLimits {
-        let bleeding = match (self.intended, load) {
+    /// Error bounds on a workload.
+    pub fn error_limits(&self, workload: RenderWorkload) -> ErrorLimits {
+        let bleeding = match (self.intended_reference, workload) {
             (ReferenceKind::Filtered { .. }, RenderWorkload::Square | RenderWorkload::Shelf) => EXACT_BLEEDING_LIMIT,
             _ => ERROR_LIMITS.bleeding,
         };
-        let mean_light = if load == RenderWorkload::Shelf { SHELF_MEAN_LIGHT_LIMIT } else { ERROR_LIMITS.mean_light };
+        let mean_light =
+            if workload == RenderWorkload::Shelf { SHELF_MEAN_LIGHT_LIMIT } else { ERROR_LIMITS.mean_light };
         ErrorLimits { bleeding, mean_light, ..ERROR_LIMITS }
     }
 
-    /// Whether the variant is expected to exceed its bounds on a load: with f16 second moments, light bleeds into a
+    /// Whether the variant is expected to exceed its bounds on a workload: with f16 second moments, light bleeds into a
     /// shadow near its caster.
-    pub fn is_expected_to_fail(&self, load: RenderWorkload) -> bool {
-        load == RenderWorkload::Shelf && self.shadow.is_some_and(|shadow| shadow.moments == MomentFormat::F16)
+    pub fn is_expected_to_fail(&self, workload: RenderWorkload) -> bool {
+        workload == RenderWorkload::Shelf && self.shadow.is_some_and(|shadow| shadow.moments == MomentFormat::F16)
     }
 
-    fn unshadowed() -> Self {
+    fn without_shadow() -> Self {
         Self {
             name: "none".into(),
             method: ShadowVariant::None,
@@ -127,12 +130,12 @@ impl RenderVariant {
             packing: None,
             culling: None,
             blur_method: BlurMethod::Auto,
-            intended: ReferenceKind::Unshadowed,
+            intended_reference: ReferenceKind::Unshadowed,
         }
     }
 
-    /// One standard map. The intended result is the hard shadow, whatever the size of the texels.
-    fn standard(size: u32) -> Self {
+    /// One standard map. The intended result is the hard shadow for every map size.
+    fn with_standard_map(size: u32) -> Self {
         let shadow = ShadowSettings { method: ShadowMethod::Standard, size, ..ShadowSettings::default() };
         Self {
             name: format!("standard {size}"),
@@ -142,18 +145,18 @@ impl RenderVariant {
             packing: None,
             culling: None,
             blur_method: BlurMethod::Auto,
-            intended: ReferenceKind::Hard,
+            intended_reference: ReferenceKind::Hard,
         }
     }
 
     /// A map whose comparisons are weighted by a Gaussian of `blur` texels around the shaded point (PCF).
-    fn filtered(size: u32, blur: f32) -> Self {
+    fn with_filtered_map(size: u32, blur: f32) -> Self {
         let shadow = ShadowSettings { method: ShadowMethod::PercentageCloser, size, blur, ..ShadowSettings::default() };
         Self::with_soft_shadow(format!("filtered {size}, blur {blur}"), ShadowVariant::Filtered, shadow)
     }
 
     /// A variance map whose moments are blurred by a Gaussian of `blur` texels and then interpolated.
-    fn variance(size: u32, blur: f32) -> Self {
+    fn with_variance_map(size: u32, blur: f32) -> Self {
         let shadow = ShadowSettings { size, blur, ..ShadowSettings::default() };
         Self::with_soft_shadow(format!("variance {size}, blur {blur}"), ShadowVariant::Variance, shadow)
     }
@@ -171,12 +174,12 @@ impl RenderVariant {
     }
 
     /// A map that is fitted to the corners of the bounding box, as in the thesis.
-    fn fitted_to_corners(size: u32) -> Self {
+    fn with_corner_fit(size: u32) -> Self {
         let shadow = ShadowSettings { size, fit: ShadowFit::Corners, ..ShadowSettings::default() };
         Self::with_soft_shadow(format!("variance {size}, fitted to corners"), ShadowVariant::Variance, shadow)
     }
 
-    /// A variance map with this implementation of the blur: a baseline for times.
+    /// A variance map with this implementation of the blur, to compare times.
     fn with_blur_method((size, blur): (u32, f32), (name, blur_method): (&str, BlurMethod)) -> Self {
         let shadow = ShadowSettings { size, blur, ..ShadowSettings::default() };
         let name = format!("variance {size}, blur {blur}, {name}");
@@ -195,28 +198,32 @@ impl RenderVariant {
             packing: None,
             culling: None,
             blur_method: BlurMethod::Auto,
-            intended: ReferenceKind::Hard,
+            intended_reference: ReferenceKind::Hard,
         }
     }
 
     /// Panes with this transparency method, without shadows.
     fn with_transparency(name: &str, transparency: Transparency) -> Self {
-        Self { name: name.into(), transparency: Some(transparency), ..Self::unshadowed() }
+        Self { name: name.into(), transparency: Some(transparency), ..Self::without_shadow() }
     }
 
     /// Images with this packing, without shadows.
     fn with_packing(name: &str, packing: Packing) -> Self {
-        Self { name: name.into(), packing: Some(packing), ..Self::unshadowed() }
+        Self { name: name.into(), packing: Some(packing), ..Self::without_shadow() }
     }
 
-    /// The same image with this culling.
+    /// The default variance map with this culling, which does not change the image.
     fn with_culling((name, culling): (&str, Culling)) -> Self {
-        Self { name: format!("culling {name}"), culling: Some(culling), ..Self::variance(2048, BLURS[1]) }
+        Self {
+            name: format!("culling {name}"),
+            culling: Some(culling),
+            ..Self::with_variance_map(2048, BLUR_DEVIATIONS[1])
+        }
     }
 
     /// A variant whose intended result is the filtered shadow.
     fn with_soft_shadow(name: String, method: ShadowVariant, shadow: ShadowSettings) -> Self {
-        let intended = ReferenceKind::Filtered { texels: shadow.filter_deviation() };
+        let intended_reference = ReferenceKind::Filtered { texels: shadow.filter_deviation() };
         Self {
             name,
             method,
@@ -225,7 +232,7 @@ impl RenderVariant {
             packing: None,
             culling: None,
             blur_method: BlurMethod::Auto,
-            intended,
+            intended_reference,
         }
     }
 }
@@ -235,58 +242,58 @@ pub fn all(quick: bool) -> Vec<RenderVariant> {
     if quick {
         return quick_variants();
     }
-    let mut all = vec![RenderVariant::unshadowed()];
-    for size in SIZES {
-        all.push(RenderVariant::standard(size));
-        all.extend(BLURS[1..].iter().map(|blur| RenderVariant::filtered(size, *blur)));
-        all.extend(BLURS.iter().map(|blur| RenderVariant::variance(size, *blur)));
+    let mut variants = vec![RenderVariant::without_shadow()];
+    for size in MAP_SIZES {
+        variants.push(RenderVariant::with_standard_map(size));
+        variants.extend(BLUR_DEVIATIONS[1..].iter().map(|blur| RenderVariant::with_filtered_map(size, *blur)));
+        variants.extend(BLUR_DEVIATIONS.iter().map(|blur| RenderVariant::with_variance_map(size, *blur)));
     }
-    all.extend([2048, 4096].map(RenderVariant::with_f16_moments));
-    all.extend(BLURS[1..].iter().map(|blur| RenderVariant::without_bleeding_reduction(1024, *blur)));
-    all.extend((2..=4).map(|splits| RenderVariant::with_splits(1024, splits)));
-    all.push(RenderVariant::fitted_to_corners(2048));
-    let passes = [("tiles", BlurMethod::Tiles), ("rows", BlurMethod::Rows), ("fragments", BlurMethod::Fragments)];
+    variants.extend([2048, 4096].map(RenderVariant::with_f16_moments));
+    variants.extend(BLUR_DEVIATIONS[1..].iter().map(|blur| RenderVariant::without_bleeding_reduction(1024, *blur)));
+    variants.extend((2..=4).map(|splits| RenderVariant::with_splits(1024, splits)));
+    variants.push(RenderVariant::with_corner_fit(2048));
+    let blur_methods = [("tiles", BlurMethod::Tiles), ("rows", BlurMethod::Rows), ("fragments", BlurMethod::Fragments)];
     // Blurs of 25 taps per direction, and of 15.
     for map in [(1024, 4.0), (4096, 4.0), (4096, 2.3)] {
-        all.extend(passes.map(|pass| RenderVariant::with_blur_method(map, pass)));
+        variants.extend(blur_methods.map(|blur_method| RenderVariant::with_blur_method(map, blur_method)));
     }
-    all.push(RenderVariant::with_transparency("exact transparency", Transparency::OrderIndependent));
-    all.push(RenderVariant::with_transparency("two-pass transparency", Transparency::TwoPass));
-    all.extend(packings());
-    all.extend(cullings());
-    all
+    variants.push(RenderVariant::with_transparency("exact transparency", Transparency::OrderIndependent));
+    variants.push(RenderVariant::with_transparency("two-pass transparency", Transparency::TwoPass));
+    variants.extend(packing_variants());
+    variants.extend(culling_variants());
+    variants
 }
 
-fn packings() -> [RenderVariant; 3] {
+fn packing_variants() -> [RenderVariant; 3] {
     [
-        RenderVariant::with_packing("images by size", Packing::Classes),
-        RenderVariant::with_packing("images repeat-filled", Packing::Repeated),
-        RenderVariant::with_packing("images repeat-filled, whole", Packing::RepeatedWhole),
+        RenderVariant::with_packing("images by size", Packing::SizeClasses),
+        RenderVariant::with_packing("images repeat-filled", Packing::PrintedRepetition),
+        RenderVariant::with_packing("images repeat-filled, whole", Packing::CorrectedRepetition),
     ]
 }
 
-fn cullings() -> [RenderVariant; 3] {
+fn culling_variants() -> [RenderVariant; 3] {
     [("none", Culling::None), ("triangles", Culling::Triangles), ("depth", Culling::Occlusion)]
         .map(RenderVariant::with_culling)
 }
 
 fn quick_variants() -> Vec<RenderVariant> {
-    let mut quick = vec![
-        RenderVariant::unshadowed(),
-        RenderVariant::variance(512, BLURS[1]),
-        RenderVariant::variance(512, BLURS[2]),
-        RenderVariant::variance(2048, BLURS[1]),
-        RenderVariant::standard(1024),
-        RenderVariant::filtered(1024, BLURS[1]),
+    let mut variants = vec![
+        RenderVariant::without_shadow(),
+        RenderVariant::with_variance_map(512, BLUR_DEVIATIONS[1]),
+        RenderVariant::with_variance_map(512, BLUR_DEVIATIONS[2]),
+        RenderVariant::with_variance_map(2048, BLUR_DEVIATIONS[1]),
+        RenderVariant::with_standard_map(1024),
+        RenderVariant::with_filtered_map(1024, BLUR_DEVIATIONS[1]),
         RenderVariant::with_f16_moments(2048),
         RenderVariant::with_splits(1024, 3),
-        RenderVariant::fitted_to_corners(2048),
+        RenderVariant::with_corner_fit(2048),
         RenderVariant::with_transparency("exact transparency", Transparency::OrderIndependent),
         RenderVariant::with_transparency("two-pass transparency", Transparency::TwoPass),
     ];
-    quick.extend(packings());
-    quick.extend(cullings());
-    quick
+    variants.extend(packing_variants());
+    variants.extend(culling_variants());
+    variants
 }
 
 #[cfg(test)]
@@ -296,18 +303,19 @@ mod tests {
     #[test]
     fn names_are_unique_and_variants_change_only_their_feature() {
         for quick in [false, true] {
-            let all = all(quick);
-            let names: std::collections::BTreeSet<&str> = all.iter().map(|variant| variant.name.as_str()).collect();
-            assert_eq!((names.len(), all.len()), if quick { (17, 17) } else { (50, 50) });
-            for variant in &all {
-                let look = variant.settings(RenderSettings::default());
+            let variants = all(quick);
+            let names: std::collections::BTreeSet<&str> =
+                variants.iter().map(|variant| variant.name.as_str()).collect();
+            assert_eq!((names.len(), variants.len()), if quick { (17, 17) } else { (50, 50) });
+            for variant in &variants {
+                let settings = variant.settings(RenderSettings::default());
                 let transparency = variant.transparency.unwrap_or_default();
                 let culling = variant.culling.unwrap_or_default();
                 let expected = RenderSettings { shadow: None, transparency, culling, ..RenderSettings::default() };
-                assert_eq!(RenderSettings { shadow: None, ..look }, expected);
+                assert_eq!(RenderSettings { shadow: None, ..settings }, expected);
                 let (has_transparency, has_packing) = (variant.transparency.is_some(), variant.packing.is_some());
                 let is_applicable = [RenderWorkload::Panes, RenderWorkload::Tree, RenderWorkload::Images]
-                    .map(|load| variant.is_applicable(load));
+                    .map(|workload| variant.is_applicable(workload));
                 let has_culling = variant.culling.is_some();
                 assert_eq!(
                     is_applicable,
@@ -315,27 +323,30 @@ mod tests {
                     "{}",
                     variant.name
                 );
-                assert_eq!(look.shadow.is_none(), variant.intended == ReferenceKind::Unshadowed);
+                assert_eq!(settings.shadow.is_none(), variant.intended_reference == ReferenceKind::Unshadowed);
             }
         }
     }
+
     #[test]
     fn only_f16_on_the_shelf_is_expected_to_fail() {
         for variant in all(false) {
-            let loads: Vec<RenderWorkload> =
-                RenderWorkload::all(false).into_iter().filter(|load| variant.is_expected_to_fail(*load)).collect();
+            let workloads: Vec<RenderWorkload> = RenderWorkload::all(false)
+                .into_iter()
+                .filter(|workload| variant.is_expected_to_fail(*workload))
+                .collect();
             let expected: &[RenderWorkload] = if variant.name.contains("f16") { &[RenderWorkload::Shelf] } else { &[] };
-            assert_eq!(loads, expected, "{}", variant.name);
+            assert_eq!(workloads, expected, "{}", variant.name);
         }
     }
 
     #[test]
     fn only_filtered_maps_get_the_exact_bleeding_bound() {
-        let filtered = RenderVariant::variance(512, 1.5);
+        let with_filtered_map = RenderVariant::with_variance_map(512, 1.5);
         assert!(
-            filtered.bounds(RenderWorkload::Square).bleeding < 0.02
-                && filtered.bounds(RenderWorkload::Tree) == ERROR_LIMITS
+            with_filtered_map.error_limits(RenderWorkload::Square).bleeding < 0.02
+                && with_filtered_map.error_limits(RenderWorkload::Tree) == ERROR_LIMITS
         );
-        assert_eq!(RenderVariant::standard(512).bounds(RenderWorkload::Square), ERROR_LIMITS);
+        assert_eq!(RenderVariant::with_standard_map(512).error_limits(RenderWorkload::Square), ERROR_LIMITS);
     }
 }

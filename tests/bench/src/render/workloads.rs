@@ -26,7 +26,7 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::load;
 use modalcast_model::scene::{Camera, Lens, RenderSettings, Scene, SceneParts, SceneState, View};
 
-/// Identifies a load: a scene of the benchmark.
+/// Identifies a scene of the benchmark.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RenderWorkload {
     Square,
@@ -62,17 +62,17 @@ const SLIDE_RADIUS: f64 = 0.02;
 const SWAY_AMPLITUDE: f64 = 0.2;
 
 impl RenderWorkload {
-    /// Every load, in the order of the report.
+    /// Every workload, in the order of the report.
     pub fn all(quick: bool) -> Vec<Self> {
         let field = Self::Triangles(if quick { FIELD_TRIANGLES.1 } else { FIELD_TRIANGLES.0 });
         vec![Self::Square, Self::Shelf, Self::Panes, Self::Images, Self::Tree, Self::Grove, field]
     }
 
-    /// The load with this name.
+    /// The workload with this name.
     ///
     /// # Errors
     /// `Invalid` when there is none.
-    pub fn named(name: &str) -> Result<Self> {
+    pub fn from_name(name: &str) -> Result<Self> {
         let workload = match name {
             "square" => Some(Self::Square),
             "shelf" => Some(Self::Shelf),
@@ -81,8 +81,8 @@ impl RenderWorkload {
             "tree" => Some(Self::Tree),
             "grove" => Some(Self::Grove),
             _ => {
-                let count = name.strip_prefix("triangles-").and_then(|count| count.parse().ok());
-                count.filter(|count| (2..=MAX_TRIANGLES).contains(count)).map(Self::Triangles)
+                let triangle_count = name.strip_prefix("triangles-").and_then(|count| count.parse().ok());
+                triangle_count.filter(|count| (2..=MAX_TRIANGLES).contains(count)).map(Self::Triangles)
             }
         };
         let expected = format!("square, shelf, panes, images, tree, grove, or triangles-N (2 to {MAX_TRIANGLES})");
@@ -108,13 +108,13 @@ impl RenderWorkload {
     /// Errors of [`Scene::new`] and of generating the tree.
     pub(super) fn build(self) -> Result<AnimatedScene> {
         let (scene, sliding_domain) = match self {
-            Self::Square => (Scene::new(square()?)?, Some(1)),
-            Self::Shelf => (Scene::new(shelf()?)?, None),
-            Self::Panes => (Scene::new(panes()?)?, Some(1)),
+            Self::Square => (Scene::new(build_square()?)?, Some(1)),
+            Self::Shelf => (Scene::new(build_shelf()?)?, None),
+            Self::Panes => (Scene::new(build_panes()?)?, Some(1)),
             Self::Images => (Scene::new(texture_panels::build_panels()?)?, Some(0)),
             Self::Tree => (load::open("tree")?.scene, None),
-            Self::Grove => (Scene::new(grove(load::open("tree")?.scene.as_ref()))?, None),
-            Self::Triangles(count) => (Scene::new(field(count)?)?, Some(1)),
+            Self::Grove => (Scene::new(build_grove(load::open("tree")?.scene.as_ref()))?, None),
+            Self::Triangles(count) => (Scene::new(build_field(count)?)?, Some(1)),
         };
         Ok(AnimatedScene::new(self, scene, sliding_domain))
     }
@@ -127,30 +127,29 @@ impl AnimatedScene {
         Self { name: load.name, workload, scene: load.scene, motion, sliding_domain }
     }
 
-    /// The camera of the load's images. It frames the whole scene, except for `shelf` (only the shadow) and
-    /// `images`.
+    /// The camera of the workload's images. It frames the whole scene, except for `shelf` and `images`.
     pub(super) fn camera(&self, size: Size) -> Camera {
         match self.workload {
-            RenderWorkload::Shelf => {}
+            // The shadow fills half of the image.
+            RenderWorkload::Shelf => {
+                let point = |height: f64| [f64::from(SHELF_EDGE) - 0.06, height, 0.0];
+                let view = View::LookAt { eye: point(2.0), target: point(0.0), up: [0.0, 0.0, -1.0] };
+                Camera { view, lens: Lens::FieldOfView(2.9), near: 0.0, far: 0.0 }
+            }
             // The panels fill the image; the floor extends beyond it.
             RenderWorkload::Images => {
                 let view = View::LookAt { eye: [0.5, 1.5, 4.6], target: [0.0, 1.05, 0.0], up: [0.0, 1.0, 0.0] };
-                return Camera { view, lens: Lens::FieldOfView(34.0), near: 0.0, far: 0.0 };
+                Camera { view, lens: Lens::FieldOfView(34.0), near: 0.0, far: 0.0 }
             }
-            _ => return Camera::fit_to_scene(&self.scene, size.width, size.height),
+            _ => Camera::fit_to_scene(&self.scene, size.width, size.height),
         }
-        let eye = |height: f64| [f64::from(SHELF_EDGE) - 0.06, height, 0.0];
-        let view = View::LookAt { eye: eye(2.0), target: eye(0.0), up: [0.0, 0.0, -1.0] };
-        Camera { view, lens: Lens::FieldOfView(2.9), near: 0.0, far: 0.0 }
     }
 
-    /// The state at a step of the motion. Modes oscillate with all domains at their placements; in scenes with a
-    /// sliding domain, that domain moves on a small circle.
+    /// The state at a step of the motion. Modes oscillate, and the sliding domain moves on a small circle. All other
+    /// domains keep their placements.
     pub(super) fn state(&self, step: usize) -> SceneState {
         let mut state = SceneState::rest(&self.scene);
-        for (q, displacement) in state.q.iter_mut().zip(self.motion.step(step).q) {
-            *q += (SWAY_AMPLITUDE * displacement) as f32;
-        }
+        add_sway(&mut state, &self.motion, step);
         if let Some(domain) = self.sliding_domain {
             let (radius, angle) = (SLIDE_RADIUS * self.scene.rest_bounds.diagonal(), TAU * 0.5 * step as f64 * DT);
             let from_y_up = self.scene.up.rotation_from_y_up();
@@ -163,13 +162,18 @@ impl AnimatedScene {
     }
 }
 
-/// State of a scene in a light wind.
-pub(super) fn swaying_state(scene: &Arc<Scene>) -> SceneState {
-    let load = Workload::new(scene.name.clone(), Arc::clone(scene));
-    let mut state = SceneState::rest(scene);
-    for (q, displacement) in state.q.iter_mut().zip(WorkloadMotion::new(&load, None).step(10).q) {
+/// Adds the modal coordinates of a motion's step with reduced amplitudes.
+fn add_sway(state: &mut SceneState, motion: &WorkloadMotion, step: usize) {
+    for (q, displacement) in state.q.iter_mut().zip(motion.step(step).q) {
         *q += (SWAY_AMPLITUDE * displacement) as f32;
     }
+}
+
+/// State of a scene in a light wind.
+pub(super) fn swaying_state(scene: &Arc<Scene>) -> SceneState {
+    let workload = Workload::new(scene.name.clone(), Arc::clone(scene));
+    let mut state = SceneState::rest(scene);
+    add_sway(&mut state, &WorkloadMotion::new(&workload, None), 10);
     state.mark_all_dirty();
     state
 }
@@ -186,31 +190,31 @@ pub(super) fn horizontal_square(half_side: f32, height: f32) -> Result<Mesh> {
 }
 
 /// A room of about 10,000 triangles seen from inside. It fills the frame and is used by the rasterizer benchmarks only.
-pub(super) fn room() -> Result<(Mesh, Camera)> {
+pub(super) fn room_mesh() -> Result<(Mesh, Camera)> {
     const CELLS: u32 = 29;
-    let (mut rest, mut normals, mut triangles) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut positions, mut normals, mut triangles) = (Vec::new(), Vec::new(), Vec::new());
     for (axis, side) in (0..3).flat_map(|axis| [(axis, -1.0_f32), (axis, 1.0)]) {
-        let first = rest.len() as u32;
+        let first_vertex = positions.len() as u32;
         for (row, column) in (0..=CELLS).flat_map(|row| (0..=CELLS).map(move |column| (row, column))) {
             let coordinate = |cell: u32| 2.0 * cell as f32 / CELLS as f32 - 1.0;
             let mut point = [0.0; 3];
             (point[axis], point[(axis + 1) % 3], point[(axis + 2) % 3]) = (side, coordinate(column), coordinate(row));
-            rest.push([3.0 * point[0], 1.5 * point[1], 3.0 * point[2]]);
+            positions.push([3.0 * point[0], 1.5 * point[1], 3.0 * point[2]]);
             normals.push(std::array::from_fn(|component| if component == axis { -side } else { 0.0 }));
         }
         for (row, column) in (0..CELLS).flat_map(|row| (0..CELLS).map(move |column| (row, column))) {
-            let a = first + row * (CELLS + 1) + column;
+            let a = first_vertex + row * (CELLS + 1) + column;
             let (b, c, d) = (a + 1, a + CELLS + 2, a + CELLS + 1);
             triangles.extend(if side < 0.0 { [[a, b, c], [a, c, d]] } else { [[a, c, b], [a, d, c]] });
         }
     }
     let view = View::LookAt { eye: [2.1, 0.4, 2.3], target: [-1.0, -0.3, -1.2], up: [0.0, 1.0, 0.0] };
     let camera = Camera { view, lens: Lens::FieldOfView(60.0), near: 0.05, far: 20.0 };
-    Ok((Mesh::from_indexed(rest, normals, Vec::new(), triangles)?, camera))
+    Ok((Mesh::from_indexed(positions, normals, Vec::new(), triangles)?, camera))
 }
 
 /// Two triangles that fill the frame.
-pub(super) fn screen() -> Result<(Mesh, Camera)> {
+pub(super) fn screen_mesh() -> Result<(Mesh, Camera)> {
     let mesh = quad([[-3.0, -3.0, 0.0], [3.0, -3.0, 0.0], [3.0, 3.0, 0.0], [-3.0, 3.0, 0.0]], [0.0, 0.0, 1.0])?;
     let view = View::LookAt { eye: [0.1, 0.0, 1.2], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
     Ok((mesh, Camera { view, lens: Lens::FieldOfView(50.0), near: 0.1, far: 10.0 }))
@@ -227,8 +231,8 @@ fn two_sided_material(diffuse: [f32; 3]) -> Material {
     }
 }
 
-/// A square of 1.4 units at height 1. A slab keeps the ground, which is at the lowest vertex, at height 0.
-fn square() -> Result<SceneParts> {
+/// Builds a square of 1.4 units at height 1. The ground is at the lowest vertex; a slab keeps it at height 0.
+fn build_square() -> Result<SceneParts> {
     let mut parts = SceneParts::named("square");
     add_rigid_domain(&mut parts, "slab", horizontal_square(1.6, 0.0)?, two_sided_material([0.75, 0.72, 0.68]))?;
     add_rigid_domain(&mut parts, "square", horizontal_square(0.7, 1.0)?, two_sided_material([0.80, 0.35, 0.25]))?;
@@ -239,9 +243,9 @@ fn square() -> Result<SceneParts> {
 /// x of the shelf's edge, where the visible part of its shadow begins.
 const SHELF_EDGE: f32 = -3.5;
 
-/// A square of two units, 0.03 above the ground; its shadow extends 0.09 beyond it. Two slabs keep the ground at height 0
-/// and widen the scene, so that the shadow lies near the end of the depth range.
-fn shelf() -> Result<SceneParts> {
+/// Builds a square of two units, 0.03 above the ground; its shadow extends 0.09 beyond it. Two slabs keep the ground at
+/// height 0 and widen the scene, so that the shadow is near the end of the depth range.
+fn build_shelf() -> Result<SceneParts> {
     let mut parts = SceneParts::named("shelf");
     let square_at = |half_side: f32, height: f32, x: f32, z: f32| {
         let point = |dx: f32, dz: f32| [x + dx * half_side, height, z + dz * half_side];
@@ -259,8 +263,8 @@ fn shelf() -> Result<SceneParts> {
     Ok(parts)
 }
 
-/// Three panes of red, green and blue glass, listed from nearest to farthest, in front of a pale wall.
-fn panes() -> Result<SceneParts> {
+/// Builds three panes of red, green and blue glass, listed from nearest to farthest, in front of a pale wall.
+fn build_panes() -> Result<SceneParts> {
     let mut parts = SceneParts::named("panes");
     let upright_rectangle = |[left, bottom, right, top]: [f32; 4], z: f32| {
         quad([[left, bottom, z], [right, bottom, z], [right, top, z], [left, top, z]], [0.0, 0.0, 1.0])
@@ -295,8 +299,8 @@ fn panes() -> Result<SceneParts> {
     Ok(parts)
 }
 
-/// Four copies of one tree, each rotated and translated; they share shapes, materials and textures.
-fn grove(tree: &Scene) -> SceneParts {
+/// Builds four copies of one tree, each rotated and translated. The copies share shapes, materials and textures.
+fn build_grove(tree: &Scene) -> SceneParts {
     let mut parts = SceneParts::named("grove");
     parts.shapes.clone_from(&tree.shapes);
     parts.materials.clone_from(&tree.materials);
@@ -323,40 +327,43 @@ fn grove(tree: &Scene) -> SceneParts {
     parts
 }
 
-/// Rolling hills of about `count` triangles on a square of four units, and four poles that cast shadows on them.
-fn field(count: usize) -> Result<SceneParts> {
+/// Builds rolling hills of about `triangle_count` triangles on a square of four units, and four poles that cast shadows
+/// on them.
+fn build_field(triangle_count: usize) -> Result<SceneParts> {
     let mut parts = SceneParts::named("field");
-    let side = ((count as f64 / 2.0).sqrt().round() as usize).max(1);
+    let cells_per_side = ((triangle_count as f64 / 2.0).sqrt().round() as usize).max(1);
     let point = |column: usize, row: usize| {
-        let [x, z] = [column, row].map(|index| 4.0 * (index as f64 / side as f64 - 0.5));
+        let [x, z] = [column, row].map(|index| 4.0 * (index as f64 / cells_per_side as f64 - 0.5));
         let wave = |fx: f64, fz: f64, phase: f64| (fx * x + fz * z + phase).sin();
         let height = 0.16 * wave(2.1, 1.3, 0.4) + 0.11 * wave(-1.7, 3.1, 1.9) + 0.03 * wave(9.0, 7.0, 0.7);
         [x as f32, (0.4 + height) as f32, z as f32]
     };
-    let rest: Vec<[f32; 3]> = (0..=side).flat_map(|row| (0..=side).map(move |column| point(column, row))).collect();
-    let corner = |column: usize, row: usize| (row * (side + 1) + column) as u32;
+    let positions: Vec<[f32; 3]> =
+        (0..=cells_per_side).flat_map(|row| (0..=cells_per_side).map(move |column| point(column, row))).collect();
+    let corner = |column: usize, row: usize| (row * (cells_per_side + 1) + column) as u32;
     let cell_triangles = |cell: usize| {
-        let (column, row) = (cell % side, cell / side);
+        let (column, row) = (cell % cells_per_side, cell / cells_per_side);
         let [a, b] = [corner(column, row), corner(column + 1, row)];
         let [c, d] = [corner(column + 1, row + 1), corner(column, row + 1)];
         [[a, d, c], [a, c, b]]
     };
-    let triangles: Vec<[u32; 3]> = (0..side * side).flat_map(cell_triangles).collect();
-    let corners: Vec<u32> = (0..rest.len() as u32).collect();
-    let normals = smooth_normals(&rest, &corners, &triangles);
-    let mesh = Mesh::from_indexed(rest, normals, Vec::new(), triangles)?;
+    let triangles: Vec<[u32; 3]> = (0..cells_per_side * cells_per_side).flat_map(cell_triangles).collect();
+    let corners: Vec<u32> = (0..positions.len() as u32).collect();
+    let normals = smooth_normals(&positions, &corners, &triangles);
+    let mesh = Mesh::from_indexed(positions, normals, Vec::new(), triangles)?;
     add_rigid_domain(
         &mut parts,
         "field",
         mesh,
         Material { double_sided: false, ..two_sided_material([0.52, 0.60, 0.34]) },
     )?;
-    let pole = |x: f32, z: f32| [[x - 0.05, 0.2, z], [x + 0.05, 0.2, z], [x + 0.05, 1.5, z], [x - 0.05, 1.5, z]];
-    let positions = [[-0.9, 0.0], [0.9, 0.2], [0.0, -0.9], [0.1, 0.8]];
-    let rest: Vec<[f32; 3]> = positions.iter().flat_map(|[x, z]| pole(*x, *z)).collect();
+    let pole_corners =
+        |x: f32, z: f32| [[x - 0.05, 0.2, z], [x + 0.05, 0.2, z], [x + 0.05, 1.5, z], [x - 0.05, 1.5, z]];
+    let pole_positions = [[-0.9, 0.0], [0.9, 0.2], [0.0, -0.9], [0.1, 0.8]];
+    let positions: Vec<[f32; 3]> = pole_positions.iter().flat_map(|[x, z]| pole_corners(*x, *z)).collect();
     let triangles =
         (0..4).flat_map(|pole| [[0, 1, 2], [0, 2, 3]].map(|corners: [u32; 3]| corners.map(|corner| corner + 4 * pole)));
-    let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 16], Vec::new(), triangles.collect())?;
+    let mesh = Mesh::from_indexed(positions, vec![[0.0, 0.0, 1.0]; 16], Vec::new(), triangles.collect())?;
     add_rigid_domain(&mut parts, "poles", mesh, two_sided_material([0.70, 0.30, 0.22]))?;
     parts.look = RenderSettings { sun: [0.55, 0.5, 0.45], ..RenderSettings::default() };
     Ok(parts)
@@ -367,12 +374,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn finds_every_load_by_name_and_rejects_others() {
+    fn finds_every_workload_by_name_and_rejects_others() {
         for workload in RenderWorkload::all(false).into_iter().chain(RenderWorkload::all(true)) {
-            assert_eq!(RenderWorkload::named(&workload.name()), Ok(workload));
+            assert_eq!(RenderWorkload::from_name(&workload.name()), Ok(workload));
         }
         for name in ["", "triangles", "triangles-", "triangles-1", "triangles-9000000", "Tree", "a"] {
-            assert!(RenderWorkload::named(name).is_err(), "{name}");
+            assert!(RenderWorkload::from_name(name).is_err(), "{name}");
         }
     }
 
@@ -387,10 +394,10 @@ mod tests {
     #[test]
     fn only_the_sliding_domain_moves() {
         let animation = RenderWorkload::Square.build().expect("a workload");
-        let (rest, moved) = (SceneState::rest(&animation.scene), animation.state(30));
-        assert_eq!(animation.state(0).transforms, rest.transforms);
-        assert_eq!(moved.transforms[0], rest.transforms[0]);
-        let shift = (moved.transforms[1].translation() - rest.transforms[1].translation()).norm();
+        let (rest_state, moved_state) = (SceneState::rest(&animation.scene), animation.state(30));
+        assert_eq!(animation.state(0).transforms, rest_state.transforms);
+        assert_eq!(moved_state.transforms[0], rest_state.transforms[0]);
+        let shift = (moved_state.transforms[1].translation() - rest_state.transforms[1].translation()).norm();
         let radius = SLIDE_RADIUS * animation.scene.rest_bounds.diagonal();
         assert!((shift - radius * 2f64.sqrt()).abs() < 1e-6, "expected a shift of sqrt(2) x {radius}, got {shift}");
     }

@@ -2,7 +2,7 @@
 
 use modalcast_bench::kernels::{KernelBenchmark as _, RasterBenchmark, RasterCounts, RasterMesh};
 use modalcast_bench::render::workloads::RenderWorkload;
-use modalcast_bench::render::{RenderReportOptions, Size, rasters};
+use modalcast_bench::render::{RenderReportOptions, Size, compare_rasterizers};
 use modalcast_compute::gpu::{Device, RasterGranularity, RasterVariant};
 use modalcast_compute::reference::raster::{CullReason, clipped_polygon};
 
@@ -101,7 +101,7 @@ fn gpu_ids_of_scenes_match_opengl_and_both_are_timed() {
         quick: true,
         replays: 20,
     };
-    let report = rasters(&options, |_| {}).expect("expected a report");
+    let report = compare_rasterizers(&options, |_| {}).expect("expected a report");
     report.rows.iter().for_each(|row| eprintln!("{}", row.line()));
     assert_eq!(report.rows.len(), 4);
     for row in &report.rows {

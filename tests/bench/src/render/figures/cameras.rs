@@ -11,46 +11,49 @@ const FILL_FRACTION: f64 = 0.86;
 /// Vertical field of view of [`frame_scene`], degrees.
 const FIELD_OF_VIEW: f64 = 28.0;
 
-fn look_at(eye: Vector3<f64>, target: Vector3<f64>, degrees: f64) -> Camera {
+fn look_at(eye: Vector3<f64>, target: Vector3<f64>, field_of_view: f64) -> Camera {
     let view = View::LookAt { eye: eye.into(), target: target.into(), up: [0.0, 1.0, 0.0] };
-    Camera { view, lens: Lens::FieldOfView(degrees), near: 0.0, far: 0.0 }
+    Camera { view, lens: Lens::FieldOfView(field_of_view), near: 0.0, far: 0.0 }
 }
 
-/// Frames a scene from slightly to the right and above; `elevation` is the y component of the unnormalized view
-/// direction.
+/// Frames a scene from the front, slightly from the right. `elevation` is the height of the eye relative to the
+/// horizontal distance, approximately.
 pub(super) fn frame_scene(scene: &Scene, size: Size, elevation: f64) -> Camera {
     let to_eye = Vector3::new(0.30, elevation, 0.95).normalize();
     let right = Vector3::y().cross(&to_eye).normalize();
     let view_up = to_eye.cross(&right);
-    let slope = FILL_FRACTION * (0.5 * FIELD_OF_VIEW).to_radians().tan();
+    // At distance 1 from the eye.
+    let framed_half_height = FILL_FRACTION * (0.5 * FIELD_OF_VIEW).to_radians().tan();
     let aspect = f64::from(size.width) / f64::from(size.height);
     let center = scene.rest_bounds.center().coords;
-    // Use vertices, because a tree has no leaves at the corners of its bounding box.
-    let distance = |point: Vector3<f64>| {
+    // Frame the vertices, because a tree has no leaves at the corners of its bounding box.
+    let min_distance = |point: Vector3<f64>| {
         let offset = point - center;
-        let horizontal = (offset.dot(&right) / (slope * aspect)).abs();
-        offset.dot(&to_eye) + horizontal.max((offset.dot(&view_up) / slope).abs())
+        let horizontal = (offset.dot(&right) / (framed_half_height * aspect)).abs();
+        offset.dot(&to_eye) + horizontal.max((offset.dot(&view_up) / framed_half_height).abs())
     };
-    let distance = rest_positions(scene).map(distance).fold(0.0, f64::max);
+    let distance = world_positions(scene).map(min_distance).fold(0.0, f64::max);
     look_at(center + to_eye * distance, center, FIELD_OF_VIEW)
 }
 
-/// Rest positions of all vertices.
-fn rest_positions(scene: &Scene) -> impl Iterator<Item = Vector3<f64>> + '_ {
+/// World positions of all vertices at rest.
+fn world_positions(scene: &Scene) -> impl Iterator<Item = Vector3<f64>> + '_ {
     scene.domains.iter().flat_map(|domain| {
         let placement = domain.placement.to_matrix();
-        let rest = scene.shapes[domain.shape].mesh.rest_positions();
-        rest.iter().map(move |point| placement.transform_point(&nalgebra::Point3::from(point.map(f64::from))).coords)
+        let positions = scene.shapes[domain.shape].mesh.rest_positions();
+        positions
+            .iter()
+            .map(move |point| placement.transform_point(&nalgebra::Point3::from(point.map(f64::from))).coords)
     })
 }
 
 /// A close-up of a trunk at the origin.
-pub(super) fn trunk() -> Camera {
+pub(super) fn trunk_closeup() -> Camera {
     look_at(Vector3::new(0.25, 1.0, 0.72), Vector3::new(0.0, 0.92, 0.0), 34.0)
 }
 
 /// Frames the shadow of a tree at the origin and the base of its trunk.
-pub(super) fn shadow(scene: &Scene) -> Camera {
+pub(super) fn frame_shadow(scene: &Scene) -> Camera {
     let to_sun = scene.look.to_sun(scene.up);
     let height = scene.rest_bounds.max[1];
     // The shadow of the center of the crown on the ground.
@@ -65,9 +68,9 @@ pub(super) fn shadow(scene: &Scene) -> Camera {
 pub(super) fn leaf_closeup(scene: &Scene) -> Result<Camera> {
     let to_viewer = Vector3::new(0.30, -0.15, 0.95).normalize();
     let leaves = scene.domains.iter().filter(|domain| domain.name.starts_with("leaf"));
-    let nearest = leaves
+    let nearest_leaf = leaves
         .map(|domain| domain.placement.translation())
         .max_by(|a, b| a.dot(&to_viewer).total_cmp(&b.dot(&to_viewer)))
         .ok_or_else(|| fault_in("figures")("expected a tree with leaves"))?;
-    Ok(look_at(nearest + Vector3::new(0.25, 0.25, 1.35), nearest, 36.0))
+    Ok(look_at(nearest_leaf + Vector3::new(0.25, 0.25, 1.35), nearest_leaf, 36.0))
 }

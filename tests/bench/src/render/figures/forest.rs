@@ -29,18 +29,18 @@ pub(super) fn combine_plants(
 ) -> SceneParts {
     let mut forest = SceneParts { look, ..SceneParts::named(name) };
     let first_indices: Vec<[usize; 2]> = species.iter().map(|species| add_shared_data(&mut forest, species)).collect();
-    for (number, instance) in instances.iter().enumerate() {
-        let [shape, material] = first_indices[instance.species];
+    for (plant_number, instance) in instances.iter().enumerate() {
+        let [first_shape, first_material] = first_indices[instance.species];
         let placement = Matrix4::new_translation(&Vector3::new(instance.x, 0.0, instance.z))
             * Rotation3::new(Vector3::y() * instance.rotation).to_homogeneous()
             * Matrix4::new_scaling(instance.scale);
         let first_domain = forest.domains.len();
         for domain in &species[instance.species].domains {
             let mut copy = domain.clone();
-            copy.name = format!("{} of plant {number}", domain.name);
-            copy.shape += shape;
-            copy.material += material;
-            copy.material_ranges.iter_mut().for_each(|run| run.material += material);
+            copy.name = format!("{} of plant {plant_number}", domain.name);
+            copy.shape += first_shape;
+            copy.material += first_material;
+            copy.material_ranges.iter_mut().for_each(|range| range.material += first_material);
             copy.placement = Transform::from_matrix(&(placement * domain.placement.to_matrix()));
             if let Some(attachment) = &mut copy.attachment {
                 attachment.parent += first_domain;
@@ -67,7 +67,7 @@ fn add_shared_data(forest: &mut SceneParts, species: &SceneParts) -> [usize; 2] 
     [first_shape, first_material]
 }
 
-/// The tree in blossom: its light leaves become petals, its other leaves become a young green.
+/// The tree in blossom: leaves of the material `light leaf` become petals, those of `leaf` become light green.
 ///
 /// # Errors
 /// Only those that the tree's own images would cause.
@@ -85,11 +85,11 @@ pub(super) fn build_blossoming_tree(tree: &SceneParts) -> Result<SceneParts> {
 
 /// An image with its colors multiplied by a tint and clamped to 255; alpha is unchanged.
 fn tint_texture(image: &Texture, tint: [f32; 3]) -> Result<Texture> {
-    let texel = |texel: &[u8]| {
-        let tinted = |channel: usize| (f32::from(texel[channel]) * tint[channel]).round().min(255.0) as u8;
-        [tinted(0), tinted(1), tinted(2), texel[3]]
+    let tint_texel = |texel: &[u8]| {
+        let tint_channel = |channel: usize| (f32::from(texel[channel]) * tint[channel]).round().min(255.0) as u8;
+        [tint_channel(0), tint_channel(1), tint_channel(2), texel[3]]
     };
-    let rgba = image.rgba().chunks_exact(4).flat_map(texel).collect();
+    let rgba = image.rgba().chunks_exact(4).flat_map(tint_texel).collect();
     Texture::new(image.name.clone(), image.width(), image.height(), rgba)
 }
 
@@ -107,13 +107,15 @@ mod tests {
         let instance = |species: usize, x: f64| PlantInstance { species, x, z: 0.0, rotation: 1.0, scale: 0.5 };
         let instances = [instance(0, -5.0), instance(1, 0.0), instance(1, 5.0)];
         let forest = combine_plants("three", &[&tree, &blossom], &instances, tree.look);
-        let count = tree.domains.len();
-        assert_eq!((forest.shapes.len(), forest.domains.len()), (2 * tree.shapes.len(), 3 * count));
+        let domain_count = tree.domains.len();
+        assert_eq!((forest.shapes.len(), forest.domains.len()), (2 * tree.shapes.len(), 3 * domain_count));
         for (index, domain) in forest.domains.iter().enumerate() {
-            let has_own_parent =
-                domain.attachment.as_ref().is_none_or(|attachment| attachment.parent / count == index / count);
+            let has_own_parent = domain
+                .attachment
+                .as_ref()
+                .is_none_or(|attachment| attachment.parent / domain_count == index / domain_count);
             assert!(
-                has_own_parent && domain.shape / tree.shapes.len() == usize::from(index >= count),
+                has_own_parent && domain.shape / tree.shapes.len() == usize::from(index >= domain_count),
                 "{}",
                 domain.name
             );

@@ -127,8 +127,8 @@ fn bark_textures(tree: &SceneParts) -> Result<[&Texture; 2]> {
 }
 
 /// Settings with a shadow map that resolves single leaves.
-fn with_large_shadow_map(look: RenderSettings) -> RenderSettings {
-    RenderSettings { shadow: Some(ShadowSettings { size: 4096, ..ShadowSettings::default() }), ..look }
+fn with_large_shadow_map(settings: RenderSettings) -> RenderSettings {
+    RenderSettings { shadow: Some(ShadowSettings { size: 4096, ..ShadowSettings::default() }), ..settings }
 }
 
 /// One image to draw.
@@ -140,6 +140,7 @@ struct FigureView<'a> {
 }
 
 impl FigureRenderer {
+    /// Draws one image as RGBA. The scene bends as in a light wind.
     fn draw(&mut self, view: &FigureView<'_>) -> Result<Vec<u8>> {
         let mut loaded_scene = self.harness.load(view.scene)?;
         self.harness.deform(&mut loaded_scene, &workloads::swaying_state(view.scene))?;
@@ -163,6 +164,7 @@ impl FigureRenderer {
         Ok(())
     }
 
+    /// A view of default size.
     fn view<'a>(&self, caption: &str, scene: &'a Arc<Scene>, camera: Camera) -> FigureView<'a> {
         FigureView { caption: caption.into(), scene, camera, size: self.size }
     }
@@ -173,7 +175,7 @@ fn single_instance(rotation: f64) -> [PlantInstance; 1] {
     [PlantInstance { species: 0, x: 0.0, z: 0.0, rotation, scale: 1.0 }]
 }
 
-/// Figure 4.1: single trees.
+/// Draws figure 4.1: single trees.
 fn draw_single_trees(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Result<()> {
     let build_scene = |(plant, rotation): (&SceneParts, f64)| {
         Scene::new(forest::combine_plants(
@@ -194,15 +196,15 @@ fn draw_single_trees(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Re
     renderer.draw_figure("4.1", "single-trees", 2, &views)
 }
 
-/// Figure 4.2: four firs; three species and twenty trees.
+/// Draws figure 4.2: four firs, and twenty trees of three species.
 fn draw_groups(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Result<()> {
     let look = with_large_shadow_map(plants.tree.look);
-    let firs: Vec<PlantInstance> = [[-4.2, 0.4], [-1.3, -0.9], [1.5, 0.7], [4.3, -0.3]]
+    let fir_instances: Vec<PlantInstance> = [[-4.2, 0.4], [-1.3, -0.9], [1.5, 0.7], [4.3, -0.3]]
         .iter()
         .enumerate()
         .map(|(index, position)| fir_instance(index, *position))
         .collect();
-    let firs = Scene::new(forest::combine_plants("four firs", &[&plants.fir], &firs, look))?;
+    let four_firs = Scene::new(forest::combine_plants("four firs", &[&plants.fir], &fir_instances, look))?;
     let species = [&plants.tree, &plants.peach, &plants.hemlock];
     let instances: Vec<PlantInstance> = (0..20).map(mixed_instance).collect();
     let twenty_trees = Scene::new(forest::combine_plants("twenty trees", &species, &instances, look))?;
@@ -213,7 +215,7 @@ fn draw_groups(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Result<(
         camera: cameras::frame_scene(scene, size, elevation),
         size,
     };
-    let views = [view("four firs", &firs, 0.16), view("twenty trees of three species", &twenty_trees, 0.50)];
+    let views = [view("four firs", &four_firs, 0.16), view("twenty trees of three species", &twenty_trees, 0.50)];
     renderer.draw_figure("4.2", "multiple-trees", 1, &views)
 }
 
@@ -223,7 +225,7 @@ fn fir_instance(index: usize, [x, z]: [f64; 2]) -> PlantInstance {
     PlantInstance { species: 0, x, z, rotation: 1.7 * index as f64, scale }
 }
 
-/// Four rows of five plants with irregular offsets.
+/// One of 20 plants in four rows with irregular offsets.
 fn mixed_instance(index: usize) -> PlantInstance {
     let (row, column) = (index / 5, index % 5);
     let (x_jitter, z_jitter) = ((2.3 * index as f64).sin(), (4.1 * index as f64).cos());
@@ -236,7 +238,7 @@ fn mixed_instance(index: usize) -> PlantInstance {
     }
 }
 
-/// Figure 4.3: trunks with and without bump mapping.
+/// Draws figure 4.3: trunks with and without bump mapping.
 fn draw_bump_mapping(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Result<()> {
     let mut scenes = Vec::new();
     for (name, plant) in [("peach tree", &plants.peach), ("blue spruce", &plants.spruce)] {
@@ -248,20 +250,20 @@ fn draw_bump_mapping(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Re
         scenes.push((format!("{name} trunk without bump mapping"), Scene::new(without_normal_map)?));
     }
     let views: Vec<FigureView<'_>> =
-        scenes.iter().map(|(caption, scene)| renderer.view(caption, scene, cameras::trunk())).collect();
+        scenes.iter().map(|(caption, scene)| renderer.view(caption, scene, cameras::trunk_closeup())).collect();
     renderer.draw_figure("4.3", "bump-mapping", 2, &views)
 }
 
-/// Figures 4.4 and 4.5: standard and variance shadow maps of two sizes.
+/// Draws figures 4.4 and 4.5: standard and variance shadow maps of two sizes.
 fn draw_shadow_maps(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Result<()> {
     let tree = Scene::new(forest::combine_plants("shadows", &[&plants.tree], &single_instance(0.6), plants.tree.look))?;
     for (name, size) in [("4.4", 4096), ("4.5", 512)] {
-        let standard = ShadowSettings { method: ShadowMethod::Standard, size, ..ShadowSettings::default() };
-        let variance = ShadowSettings { size, ..ShadowSettings::default() };
+        let standard_settings = ShadowSettings { method: ShadowMethod::Standard, size, ..ShadowSettings::default() };
+        let variance_settings = ShadowSettings { size, ..ShadowSettings::default() };
         let with_shadow =
             |shadow| light_meter::with_settings(&tree, RenderSettings { shadow: Some(shadow), ..tree.look });
-        let (standard, variance) = (with_shadow(standard)?, with_shadow(variance)?);
-        let camera = cameras::shadow(&tree);
+        let (standard, variance) = (with_shadow(standard_settings)?, with_shadow(variance_settings)?);
+        let camera = cameras::frame_shadow(&tree);
         let views = [
             renderer.view(&format!("standard shadow map, {size} x {size}"), &standard, camera),
             renderer.view(&format!("variance shadow map, {size} x {size}"), &variance, camera),
@@ -271,7 +273,7 @@ fn draw_shadow_maps(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Res
     Ok(())
 }
 
-/// Figure 4.6: leaves with transparency, and as opaque cards.
+/// Draws figure 4.6: leaves with transparency, and as opaque cards.
 fn draw_transparency(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Result<()> {
     let build_scene = |mode: AlphaMode| {
         let mut parts = forest::combine_plants(
@@ -291,7 +293,7 @@ fn draw_transparency(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Re
     renderer.draw_figure("4.6", "transparency", 2, &views)
 }
 
-/// A user-supplied scene with its own settings, and with default shadows if it has none.
+/// Draws a user-supplied scene with its own settings, and with default shadows if it has none.
 fn draw_user_scene(renderer: &mut FigureRenderer, source: &str) -> Result<()> {
     let scene = load::open(source)?.scene;
     let scene = light_meter::with_settings(
@@ -313,10 +315,11 @@ impl Figures {
     /// `Fault` when a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<()> {
         std::fs::create_dir_all(folder).map_err(fault_in("figures"))?;
-        let write = |name: &str, bytes: &[u8]| std::fs::write(folder.join(name), bytes).map_err(fault_in("figures"));
-        self.files.iter().try_for_each(|file| write(&file.name, &file.png))?;
-        write("figures.json", &serde_json::to_vec_pretty(self).map_err(fault_in("figures"))?)?;
-        write("figures.md", self.markdown().as_bytes())
+        let write_file =
+            |name: &str, bytes: &[u8]| std::fs::write(folder.join(name), bytes).map_err(fault_in("figures"));
+        self.files.iter().try_for_each(|file| write_file(&file.name, &file.png))?;
+        write_file("figures.json", &serde_json::to_vec_pretty(self).map_err(fault_in("figures"))?)?;
+        write_file("figures.md", self.markdown().as_bytes())
     }
 
     fn markdown(&self) -> String {
