@@ -2,9 +2,9 @@
 // boxes of an earlier step. With ORIENTED_BOUNDS, also computes the bounds along `bounding_axes` from the same boxes. With
 // DOMAIN_BOXES, also computes one box per segment of a domain: from tile boxes, or from vertices if the domain shares a tile
 // with others.
-//   boxes          [count][6] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z; four per tile            (in)
+//   boxes          [box_count][6] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z; four per tile        (in)
 //   bounding_axes  with ORIENTED_BOUNDS: three orthogonal unit vectors                                        (in)
-//   bounds         in the header: the maxima over all boxes; zeros before the launch                          (in, out)
+//   bounds         in the header: the maxima of all boxes; zeros before the launch                            (in, out)
 //   segments       with DOMAIN_BOXES: parts of domains; each is reduced to one box                            (in)
 //   change_steps   with DOMAIN_BOXES: per domain, the step that last changed it                               (in)
 //   positions      with DOMAIN_BOXES: address in the header                                                   (in)
@@ -25,8 +25,8 @@ constexpr unsigned THREADS_PER_SEGMENT = 8;
 
 // Merges one tile box or vertex of a segment into the running maxima.
 __device__ __forceinline__ void merge_item(const BoundsArgs& args, const BoxSegment& segment, unsigned item, unsigned (&keys)[6]) {
-    if (segment.from_vertices) {
-        const float* position = args.header->positions + 3 * (size_t)(segment.first + item);
+    if (segment.is_vertex_range) {
+        const float* position = args.header->positions + 3 * (size_t)(segment.first_item + item);
 #pragma unroll
         for (unsigned axis = 0; axis < 3; ++axis) {
             const float coordinate = position[axis];
@@ -34,7 +34,7 @@ __device__ __forceinline__ void merge_item(const BoundsArgs& args, const BoxSegm
             keys[3 + axis] = max(keys[3 + axis], float_to_ordered(coordinate));
         }
     } else {
-        const unsigned* box = args.boxes + 6 * (size_t)(segment.first + item);
+        const unsigned* box = args.boxes + 6 * (size_t)(segment.first_item + item);
 #pragma unroll
         for (unsigned side = 0; side < 6; ++side) {
             keys[side] = max(keys[side], box[side]);
@@ -42,7 +42,7 @@ __device__ __forceinline__ void merge_item(const BoundsArgs& args, const BoxSegm
     }
 }
 
-// All threads of a group share one segment, so they stay converged in the loop.
+// Each group of THREADS_PER_SEGMENT threads reduces one segment at a time, so its threads stay converged in the loop.
 __device__ __forceinline__ void compute_segment_boxes(const BoundsArgs& args) {
     const unsigned group_rank = threadIdx.x % THREADS_PER_SEGMENT;
     const unsigned group_mask = 0xffu << threadIdx.x % 32 / THREADS_PER_SEGMENT * THREADS_PER_SEGMENT;
@@ -53,7 +53,7 @@ __device__ __forceinline__ void compute_segment_boxes(const BoundsArgs& args) {
             continue;
         }
         unsigned keys[6] = {0, 0, 0, 0, 0, 0};
-        for (unsigned item = group_rank; item < segment.count; item += THREADS_PER_SEGMENT) {
+        for (unsigned item = group_rank; item < segment.item_count; item += THREADS_PER_SEGMENT) {
             merge_item(args, segment, item, keys);
         }
 #pragma unroll
@@ -69,6 +69,7 @@ __device__ __forceinline__ void compute_segment_boxes(const BoundsArgs& args) {
 }
 #endif
 
+// Keys of `Header::bounds` that are computed.
 #ifdef ORIENTED_BOUNDS
 constexpr unsigned KEY_COUNT = 12;
 #else
@@ -82,7 +83,7 @@ struct OrientedExtent {
     float axis[3];
     unsigned extent_keys[2];
 
-    __device__ __forceinline__ void begin(const BoundsArgs& args) {
+    __device__ __forceinline__ void load_axis(const BoundsArgs& args) {
         const float* bounding_axis = args.bounding_axes + 3 * min(threadIdx.x % 4, 2u);
         axis[0] = bounding_axis[0];
         axis[1] = bounding_axis[1];
@@ -104,16 +105,16 @@ struct OrientedExtent {
         if (box[0] == 0) {
             return;
         }
-        float negated_min = 0.0f, max_extent = 0.0f;
+        float axis_negated_min = 0.0f, axis_max = 0.0f;
 #pragma unroll
         for (unsigned i = 0; i < 3; ++i) {
             const float box_negated_min = ordered_to_float(box[i]), box_max = ordered_to_float(box[3 + i]);
             const bool is_nonnegative = axis[i] >= 0.0f;
-            negated_min = __fmaf_ru(fabsf(axis[i]), is_nonnegative ? box_negated_min : box_max, negated_min);
-            max_extent = __fmaf_ru(fabsf(axis[i]), is_nonnegative ? box_max : box_negated_min, max_extent);
+            axis_negated_min = __fmaf_ru(fabsf(axis[i]), is_nonnegative ? box_negated_min : box_max, axis_negated_min);
+            axis_max = __fmaf_ru(fabsf(axis[i]), is_nonnegative ? box_max : box_negated_min, axis_max);
         }
-        extent_keys[0] = max(extent_keys[0], float_to_ordered(negated_min));
-        extent_keys[1] = max(extent_keys[1], float_to_ordered(max_extent));
+        extent_keys[0] = max(extent_keys[0], float_to_ordered(axis_negated_min));
+        extent_keys[1] = max(extent_keys[1], float_to_ordered(axis_max));
     }
 
     // Reduces over the lanes of a warp with the same axis (lane % 4); lanes 0 to 2 then hold x, y and z. All lanes must
@@ -148,14 +149,14 @@ extern "C" __global__ void __launch_bounds__(BLOCK) bounds(const __grid_constant
     unsigned keys[6] = {0, 0, 0, 0, 0, 0};
 #ifdef ORIENTED_BOUNDS
     OrientedExtent oriented_extent;
-    oriented_extent.begin(args);
+    oriented_extent.load_axis(args);
 #endif
-    for (unsigned box = blockIdx.x * BLOCK + threadIdx.x; box < args.count; box += gridDim.x * BLOCK) {
-        const uint2* sides = (const uint2*)(args.boxes + 6 * (size_t)box);
+    for (unsigned box = blockIdx.x * BLOCK + threadIdx.x; box < args.box_count; box += gridDim.x * BLOCK) {
+        const uint2* key_pairs = (const uint2*)(args.boxes + 6 * (size_t)box);
         unsigned box_keys[6];
 #pragma unroll
         for (unsigned pair = 0; pair < 3; ++pair) {
-            const uint2 key_pair = sides[pair];
+            const uint2 key_pair = key_pairs[pair];
             box_keys[2 * pair] = key_pair.x;
             box_keys[2 * pair + 1] = key_pair.y;
         }

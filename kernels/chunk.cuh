@@ -11,7 +11,7 @@ constexpr unsigned CHUNK_MODES = 1;
 #endif
 constexpr unsigned ENTRY_BYTES = 4 / CHUNK_MODES;
 
-// Decodes the entry in the lowest bits of `bits`, without the factor or scale of its mode.
+// Decodes the entry in the lowest bits of `bits`. The result is not yet multiplied by the factor or scale of its mode.
 __device__ __forceinline__ float decode_bits(unsigned bits) {
 #if defined(STORE_F16)
     float number;
@@ -27,27 +27,27 @@ __device__ __forceinline__ float decode_bits(unsigned bits) {
 #endif
 }
 
-// Entry `entry` of a chunk whose twelve words are in registers; `entry` is a compile-time constant.
-__device__ __forceinline__ float decode_entry(const unsigned (&words)[12], unsigned entry) {
-    const unsigned word = words[entry / CHUNK_MODES];
+// Decodes one entry of a chunk in registers. `entry` must be a compile-time constant, so that the array stays in registers.
+__device__ __forceinline__ float decode_entry(const unsigned (&registers)[12], unsigned entry) {
+    const unsigned bits = registers[entry / CHUNK_MODES];
 #if defined(STORE_INT8)
-    return __uint_as_float(__byte_perm(word, 0x4b000000u, 0x7650u | entry % 4)) - 8388736.0f;
+    return __uint_as_float(__byte_perm(bits, 0x4b000000u, 0x7650u | entry % 4)) - 8388736.0f;
 #else
-    return decode_bits(entry % CHUNK_MODES == 0 ? word : word >> 16);
+    return decode_bits(entry % CHUNK_MODES == 0 ? bits : bits >> 16);
 #endif
 }
 
-// Loads the single entry (mode, axis) of vertex `vertex` of a chunk. `words` is the quad's first word of 16 bytes, and
-// `stride` leads from one word of the quad to the next.
-__device__ __forceinline__ float load_entry(const uint4* words, unsigned stride, unsigned mode, unsigned axis,
-                                          unsigned vertex) {
-    const unsigned byte = ((mode * 3 + axis) * 4) * ENTRY_BYTES;
-    const char* word = (const char*)(words + (size_t)(byte / 16) * stride) + byte % 16 + vertex * ENTRY_BYTES;
+// Loads the entry (mode, axis, vertex) of a chunk. `words` points to the first 16-byte word of the quad's chunk. The next
+// word of the chunk is `word_stride` words later.
+__device__ __forceinline__ float load_entry(const uint4* words, unsigned word_stride, unsigned mode, unsigned axis,
+                                            unsigned vertex) {
+    const unsigned byte_offset = ((mode * 3 + axis) * 4) * ENTRY_BYTES;
+    const char* entry = (const char*)(words + (size_t)(byte_offset / 16) * word_stride) + byte_offset % 16 + vertex * ENTRY_BYTES;
 #if defined(STORE_F16) || defined(STORE_BF16)
-    return decode_bits(__ldcs((const unsigned short*)word));
+    return decode_bits(__ldcs((const unsigned short*)entry));
 #elif defined(STORE_INT8)
-    return decode_bits(__ldcs((const unsigned char*)word));
+    return decode_bits(__ldcs((const unsigned char*)entry));
 #else
-    return __ldcs((const float*)word);
+    return __ldcs((const float*)entry);
 #endif
 }

@@ -8,15 +8,15 @@ constexpr unsigned BLOCK = 256;
 constexpr unsigned TILE_QUADS = 32;
 // `first_tangent` of a shape without tangents.
 constexpr unsigned NO_TANGENTS = 0xffffffffu;
-// `first_member` of a shape without smoothing groups.
+// `first_corner_group` of a shape without smoothing groups.
 constexpr unsigned NO_GROUPS = 0xffffffffu;
 // Flag of the first vertex of each fan of a ring.
 constexpr unsigned RING_START = 0x80000000u;
 
-// `frame` of a domain that follows no other domain.
+// `TransformLink::frame` of a domain that is its own transform root.
 constexpr unsigned NO_FRAME = 0xffffffffu;
 
-// Start of the upload of a step: output addresses, and what to compute.
+// Start of the upload of a step: output addresses, and which parts to compute.
 struct Header {
     float* positions;
     float* normals;
@@ -25,50 +25,52 @@ struct Header {
     unsigned output_step;    // the output buffers contain all changes up to this step
     unsigned last_full_step; // the last step that changed all domains
     unsigned step;           // number of this step, from 1
-    unsigned changed;        // number of `Change` entries for `apply`
-    unsigned dirty_tiles;    // number of tiles in the tile list
+    unsigned change_count;   // number of `Change` entries for `apply`
+    unsigned dirty_tile_count; // number of tiles in the tile list
     unsigned reserved[3];
-    unsigned bounds[12]; // `float_to_ordered` maxima of -x, -y, -z, x, y, z; with ORIENTED_BOUNDS also along `BoundsArgs::bounding_axes`; sent as zeros
+    // `float_to_ordered` maxima of -x, -y, -z, x, y, z, and with ORIENTED_BOUNDS the same along `BoundsArgs::bounding_axes`.
+    // The host sends zeros.
+    unsigned bounds[12];
 };
 static_assert(sizeof(Header) == 112, "Header differs from src/compute/gpu/tables/layout.rs");
 
-// Bit fields of a tile's `kind`: the number of items of its last quad (0 in a mixed tile), whether the tile computes
+// Bit fields of `WarpTile::kind`: the number of items of the last quad (0 in a mixed tile), whether the tile computes
 // positions, and whether it computes normals and tangents. A tile with both flags computes corner i of a shape together
-// with vertex i.
-constexpr unsigned TILE_LAST = 7;
+// with vertex i. An item is a vertex, or a corner in a tile without vertices.
+constexpr unsigned LAST_QUAD_ITEMS = 7;
 constexpr unsigned TILE_VERTICES = 8;
 constexpr unsigned TILE_CORNERS = 16;
 
-// The work of one warp: up to 32 quads and their part of U, [chunk][3][width] words of 16 bytes.
+// The work of one warp: up to 32 quads and their part of U, [chunk_count][3][quad_count] words of 16 bytes.
 struct WarpTile {
-    unsigned long long first_word; // of its U
-    unsigned first;                // first packed vertex or corner; in a mixed tile, first entry of `mixed_quads`
-    unsigned rest;                 // first quad of x0, normals and tangents
+    unsigned long long first_word; // first word of U
+    unsigned first_item;           // first packed vertex or corner; in a mixed tile, first entry of `mixed_quads`
+    unsigned rest_quad;            // first quad of x0, normals and tangents
     unsigned domain;
     unsigned first_q;
     unsigned first_scale;
-    unsigned short chunks;
-    unsigned char width; // quads
+    unsigned short chunk_count;
+    unsigned char quad_count;
     unsigned char kind;
 };
 static_assert(sizeof(WarpTile) == 32, "WarpTile differs from src/compute/gpu/tables/layout.rs");
 
 // A quad of a mixed tile.
 struct MixedQuad {
-    unsigned item;   // first packed vertex or corner
-    unsigned rest;   // quad of x0, normals and tangents
-    unsigned domain; // 4 * index of the domain + items of the quad - 1
+    unsigned first_item;    // first packed vertex or corner
+    unsigned rest_quad;     // quad of x0, normals and tangents
+    unsigned packed_domain; // 4 * index of the domain + number of items - 1
     unsigned first_q;
 };
 static_assert(sizeof(MixedQuad) == 16, "MixedQuad differs from src/compute/gpu/tables/layout.rs");
 
-// Offsets of a domain for `normals`. Domains of the same shape share all fields except `first` and `first_vertex`.
+// Offsets of a domain for `normals`. Domains of one shape differ only in `first_corner` and `first_vertex`.
 struct NormalSlot {
-    unsigned first; // packed corner
-    unsigned first_normal;
+    unsigned first_corner; // packed corner
+    unsigned first_normal; // in `rest_normals`
     unsigned first_tangent;
     unsigned first_vertex; // packed vertex
-    unsigned first_member;
+    unsigned first_corner_group;
 };
 static_assert(sizeof(NormalSlot) == 20, "NormalSlot differs from src/compute/gpu/tables/layout.rs");
 
@@ -76,15 +78,15 @@ static_assert(sizeof(NormalSlot) == 20, "NormalSlot differs from src/compute/gpu
 struct Change {
     unsigned domain;
     unsigned first_q; // in the packed coordinates
-    unsigned count;   // number of coordinates
-    unsigned source;  // offset of its coordinates in `new_q`
+    unsigned q_count; // number of coordinates
+    unsigned first_new_q; // in `new_q`
 };
 static_assert(sizeof(Change) == 16, "Change differs from src/compute/gpu/tables/layout.rs");
 
-// The transform root of a domain, and its frame relative to that root; with FOLLOWERS.
+// The transform root of a domain, and its frame: its constant transform relative to that root. Used only with FOLLOWERS.
 struct TransformLink {
-    unsigned root; // index in the transforms
-    unsigned frame;
+    unsigned root;  // index into `transforms`
+    unsigned frame; // index into `frames`, or NO_FRAME
 };
 static_assert(sizeof(TransformLink) == 8, "TransformLink differs from src/compute/gpu/tables/layout.rs");
 
@@ -93,7 +95,7 @@ struct DeformArgs {
     const WarpTile* tiles;
     const MixedQuad* mixed_quads;
     const uint4* words;
-    const float4* rest;
+    const float4* rest_positions;
     const float4* rest_normals;
     const float4* rest_tangents;
     const unsigned* corner_offsets;
@@ -107,26 +109,26 @@ struct DeformArgs {
     const unsigned* retained_counts;
     const unsigned short* retained;
     unsigned* boxes;
-    unsigned count; // number of tiles
+    unsigned tile_count;
     unsigned reserved;
 };
 static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/compute/gpu/tables/layout.rs");
 
-// A group of domains of one shape, for which `batch` reads U once.
+// A group of domains (its members) of one shape, for which `batch` reads U once.
 struct BatchGroup {
     unsigned long long first_word;
-    unsigned rest; // first quad of x0
+    unsigned rest_quad; // first quad of x0
     unsigned first_scale;
-    unsigned vertices; // of the shape
+    unsigned vertex_count; // of the shape
     unsigned first_member;
-    unsigned chunks;
-    unsigned members; // number of domains in the group
+    unsigned chunk_count;
+    unsigned member_count;
 };
 static_assert(sizeof(BatchGroup) == 32, "BatchGroup differs from src/compute/gpu/tables/layout.rs");
 
 // A domain of a group.
 struct BatchMember {
-    unsigned first; // packed vertex
+    unsigned first_vertex; // packed vertex
     unsigned first_q;
     unsigned domain;
     unsigned first_tile; // first tile of the domain in `deform`, for its boxes
@@ -136,8 +138,8 @@ static_assert(sizeof(BatchMember) == 16, "BatchMember differs from src/compute/g
 // The work of one block of `batch`.
 struct BatchBlock {
     unsigned group;
-    unsigned tile; // first tile of the block, in its shape
-    unsigned end;  // tile after the last one
+    unsigned first_tile; // first tile of the block, in its shape
+    unsigned end_tile;   // one past the last tile
     unsigned reserved;
 };
 static_assert(sizeof(BatchBlock) == 16, "BatchBlock differs from src/compute/gpu/tables/layout.rs");
@@ -148,7 +150,7 @@ struct BatchArgs {
     const BatchGroup* groups;
     const BatchMember* members;
     const uint4* words;
-    const float4* rest;
+    const float4* rest_positions;
     const float* scales;
     const float4* transforms;
     const TransformLink* transform_links;
@@ -160,10 +162,10 @@ static_assert(sizeof(BatchArgs) == 96, "BatchArgs differs from src/compute/gpu/t
 
 // A part of a domain that `bounds` reduces to one box.
 struct BoxSegment {
-    unsigned first; // first packed vertex, or first box of `deform`
-    unsigned count;
+    unsigned first_item; // first packed vertex, or first box of `deform`
+    unsigned item_count;
     unsigned domain;
-    unsigned from_vertices; // 1: a range of vertices, 0: a range of boxes
+    unsigned is_vertex_range; // 1: the items are vertices, 0: the items are boxes
 };
 static_assert(sizeof(BoxSegment) == 16, "BoxSegment differs from src/compute/gpu/tables/layout.rs");
 
@@ -173,7 +175,7 @@ struct BoundsArgs {
     const BoxSegment* segments;
     const unsigned* change_steps;
     unsigned* segment_boxes;
-    unsigned count;
+    unsigned box_count;
     unsigned segment_count;
     float bounding_axes[9]; // with ORIENTED_BOUNDS: three orthogonal unit vectors
     unsigned reserved;
@@ -204,13 +206,13 @@ struct NormalsArgs {
     const TransformLink* transform_links;
     const float4* frames;
     const unsigned* change_steps;
-    const unsigned* members;
+    const unsigned* corner_groups;
     const unsigned* ring_offsets;
     const unsigned* rings;
     const float* group_normals;
-    unsigned corners;
-    unsigned rest_corners;
-    unsigned groups;
+    unsigned corner_count;
+    unsigned rest_corner_count;
+    unsigned group_count;
     unsigned reserved;
 };
 static_assert(sizeof(NormalsArgs) == 120, "NormalsArgs differs from src/compute/gpu/tables/layout.rs");
@@ -220,15 +222,14 @@ __device__ inline bool is_dirty(const Header* header, const unsigned* change_ste
     return max(__ldg(&header->last_full_step), __ldg(change_steps + domain)) > __ldg(&header->output_step);
 }
 
-// The domain of a packed corner: the last slot that begins at or before it. `first_domains[b]` is the domain of the
-// first item of block b, followed by the last domain. A block inside one domain needs no search.
-template <typename Slot>
-__device__ inline unsigned domain_of(const Slot* slots, const unsigned* first_domains, unsigned item) {
+// Finds the domain of a packed corner: the last slot that begins at or before it. `first_domains[b]` is the domain of the
+// first corner of block b, and the last entry is the last domain. A block inside one domain needs no search.
+__device__ inline unsigned find_domain(const NormalSlot* slots, const unsigned* first_domains, unsigned corner) {
     unsigned low = first_domains[blockIdx.x];
     unsigned high = first_domains[blockIdx.x + 1];
     while (low < high) {
         const unsigned mid = (low + high + 1) / 2;
-        if (slots[mid].first <= item) {
+        if (slots[mid].first_corner <= corner) {
             low = mid;
         } else {
             high = mid - 1;
@@ -237,12 +238,12 @@ __device__ inline unsigned domain_of(const Slot* slots, const unsigned* first_do
     return low;
 }
 
-// Writes three floats per item of the block as one contiguous run, so that warps write whole sectors. The caller must
+// Writes three floats per item of the block as one contiguous range, so that warps write whole sectors. The caller must
 // synchronize the block between writing `staged` and this call.
-__device__ inline void store_triples(float* packed, const float* staged, unsigned items) {
-    const unsigned begin = blockIdx.x * BLOCK;
-    const unsigned floats = 3 * min(BLOCK, items - begin);
-    for (unsigned i = threadIdx.x; i < floats; i += BLOCK) {
-        packed[3 * begin + i] = staged[i];
+__device__ inline void store_triples(float* packed, const float* staged, unsigned item_count) {
+    const unsigned first_item = blockIdx.x * BLOCK;
+    const unsigned float_count = 3 * min(BLOCK, item_count - first_item);
+    for (unsigned i = threadIdx.x; i < float_count; i += BLOCK) {
+        packed[3 * first_item + i] = staged[i];
     }
 }

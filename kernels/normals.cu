@@ -1,11 +1,11 @@
 // Unit normals and tangents that follow the deformed triangles, for every corner of every domain, in one launch.
-//   rest_normals   [3][rest_corners] f32, one plane per axis                                            (in)
+//   rest_normals   [3][rest_corner_count] f32, one plane per axis                                       (in)
 //   rest_tangents  [..] float4: unit tangent, sign of the bitangent; read only with NORMAL_MAPS         (in)
 //   transforms     [roots][3] float4: the rows of world_from_domain; A is their first three columns   (in)
 //   transform_links, frames  with FOLLOWERS, as for `deform`                                            (in)
-//   members        [..] u32: the smoothing group of each corner of a shape that has groups              (in)
-//   ring_offsets, rings  [groups + 1] u32 offsets into the rings: src/model/domain/smoothing_groups.rs  (in)
-//   group_normals  [3][groups] f32: geometric unit normals at rest, zeros if undefined                  (in)
+//   corner_groups  [..] u32: the smoothing group of each corner of a shape that has groups              (in)
+//   ring_offsets, rings  [group_count + 1] u32 offsets into the rings: src/model/domain/smoothing_groups.rs (in)
+//   group_normals  [3][group_count] f32: geometric unit normals at rest, zeros if undefined             (in)
 //   positions      [vertices][3] f32, world, of this step; address in the header                        (in)
 //   normals        [corners][3] f32, world; address in the header                                       (out)
 //   tangents       [corners] float4, world; zeros for shapes without tangents; only with NORMAL_MAPS (out)
@@ -13,21 +13,21 @@
 // is skipped if none of its domains has changed since this output was written. CPU twin:
 // src/compute/reference/normals.rs, which defines the result.
 //
-// There is a thread per corner, not per group: corners of one group repeat its sum from the cache. A separate pass over
+// Each corner has a thread, so the corners of one group repeat its sum with data from the cache. A separate pass over
 // groups would write and read 12 bytes per group and cost a launch, which pays off only with two or more corners per
-// group on average. With groups of k triangles and one corner each, the DRAM traffic per corner is 4 bytes of `members`,
-// 4 of `ring_offsets`, 4 (k + 2) of `rings`, 12 of `group_normals`, 12 of positions, and 24 of the rest normal and the
-// result: 88 bytes at k = 6.
+// group on average. With groups of k triangles and one corner each, the DRAM traffic per corner is 4 bytes of
+// `corner_groups`, 4 of `ring_offsets`, 4 (k + 2) of `rings`, 12 of `group_normals`, 12 of positions, and 24 of the rest
+// normal and the result: 88 bytes at k = 6.
 //
-// Each thread sums in the order of the ring, without atomics, so runs agree bit by bit. Sums are f64:
-// differences and products of two f32 are exact or nearly exact, and neither over- nor underflow, so no scaling is
-// needed for large, small or distant domains.
+// Each thread sums in the order of the ring, without atomics, so runs agree bit by bit. Sums are f64. Differences and
+// products of two f32 are then exact or nearly exact and cannot overflow or underflow, so large, small and distant domains
+// need no scaling.
 #include "dependent_launch.cuh"
 #include "direction.cuh"
 
-// An area vector is defined if it is longer than this fraction of its rounding scale B; as in the twin.
+// An area vector is defined if it is longer than this fraction of its rounding scale B, as in the twin.
 constexpr double RESOLUTION = 1.0 / 262144.0;
-// Two unit vectors are opposite if the squared length of their sum is below this; as in the twin.
+// Two unit vectors are opposite if the squared length of their sum is below this, as in the twin.
 constexpr float MIN_BISECTOR_SQUARED_LENGTH = 1e-10f;
 
 // The smallest rotation of the surface at a corner: from the rigid to the deformed unit normal.
@@ -61,7 +61,7 @@ __device__ double l1_norm(const double3& v) {
 // The sum of the area vectors of a group's triangles, and its rounding scale B as the twin defines it.
 struct Area {
     double3 sum;
-    double rounding;
+    double rounding_scale;
 };
 
 // The first entry of a ring is the center; the others are the vertices of the fans around it. There must be at least two.
@@ -69,7 +69,7 @@ __device__ Area sum_areas(const unsigned* ring, const unsigned* end, const float
     const double3 center = load_position(positions, __ldg(ring));
     const double center_norm = l1_norm(center);
     double3 sum = make_double3(0.0, 0.0, 0.0), previous_edge = sum;
-    double rounding = 0.0, previous_rounding = 0.0;
+    double rounding_scale = 0.0, previous_edge_rounding = 0.0;
     for (++ring; ring < end; ++ring) {
         const unsigned entry = __ldg(ring);
         const double3 neighbor = load_position(positions, entry & ~RING_START);
@@ -80,54 +80,54 @@ __device__ Area sum_areas(const unsigned* ring, const unsigned* end, const float
             sum.x += previous_edge.y * edge.z - previous_edge.z * edge.y;
             sum.y += previous_edge.z * edge.x - previous_edge.x * edge.z;
             sum.z += previous_edge.x * edge.y - previous_edge.y * edge.x;
-            rounding += previous_rounding + edge_rounding;
+            rounding_scale += previous_edge_rounding + edge_rounding;
         }
         previous_edge = edge;
-        previous_rounding = edge_rounding;
+        previous_edge_rounding = edge_rounding;
     }
-    return {sum, rounding};
+    return {sum, rounding_scale};
 }
 
-__device__ ShortestArc surface_rotation(const NormalsArgs& args, const NormalSlot& slot, const Mat3d& linear, unsigned corner) {
-    ShortestArc arc = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}, false};
-    if (slot.first_member == NO_GROUPS) {
-        return arc;
+__device__ ShortestArc compute_surface_rotation(const NormalsArgs& args, const NormalSlot& slot, const Mat3d& linear, unsigned corner) {
+    ShortestArc rotation = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}, false};
+    if (slot.first_corner_group == NO_GROUPS) {
+        return rotation;
     }
-    const unsigned group = __ldg(args.members + slot.first_member + (corner - slot.first));
-    const float* rest = args.group_normals + group;
-    const size_t plane = args.groups;
-    const double3 normal = make_double3(__ldg(rest), __ldg(rest + plane), __ldg(rest + 2 * plane));
+    const unsigned group = __ldg(args.corner_groups + slot.first_corner_group + (corner - slot.first_corner));
+    const float* rest_normal = args.group_normals + group;
+    const size_t plane_stride = args.group_count;
+    const double3 normal = make_double3(__ldg(rest_normal), __ldg(rest_normal + plane_stride), __ldg(rest_normal + 2 * plane_stride));
     if (normal.x == 0.0 && normal.y == 0.0 && normal.z == 0.0) {
-        return arc;
+        return rotation;
     }
     const float* positions = args.header->positions + 3 * (size_t)slot.first_vertex;
     const unsigned* rings = args.rings;
     const Area area = sum_areas(rings + __ldg(args.ring_offsets + group), rings + __ldg(args.ring_offsets + group + 1), positions);
-    const double min_length = RESOLUTION * area.rounding;
+    const double min_length = RESOLUTION * area.rounding_scale;
     const double3 sum = area.sum;
     // Also false if a position is not finite.
-    arc.is_defined = sum.x * sum.x + sum.y * sum.y + sum.z * sum.z > min_length * min_length;
-    if (!arc.is_defined) {
-        return arc;
+    rotation.is_defined = sum.x * sum.x + sum.y * sum.y + sum.z * sum.z > min_length * min_length;
+    if (!rotation.is_defined) {
+        return rotation;
     }
-    // The sum transforms by the cofactors and the rest normal by the inverse transpose; they differ by the sign of the
-    // determinant.
+    // The area sum transforms by the cofactor matrix, the rest normal by the inverse transpose. Their directions differ by
+    // the sign of the determinant.
     const double sign = determinant_sign(linear);
-    arc.deformed_normal = normalize(make_double3(sign * sum.x, sign * sum.y, sign * sum.z));
-    arc.rigid_normal = transform_normal(linear, normal);
-    return arc;
+    rotation.deformed_normal = normalize(make_double3(sign * sum.x, sign * sum.y, sign * sum.z));
+    rotation.rigid_normal = transform_normal(linear, normal);
+    return rotation;
 }
 
 // Applies the smallest rotation that takes the rigid to the deformed normal: the component along the rigid normal becomes
 // a component along the deformed normal, and the perpendicular component is reflected at the plane perpendicular to their
 // bisector.
-__device__ float3 rotate(const ShortestArc& arc, const float3& v) {
-    const float normal_component = dot(arc.rigid_normal, v);
-    const float3 perpendicular = add_scaled(v, arc.rigid_normal, -normal_component);
-    const float3 bisector = add_scaled(arc.rigid_normal, arc.deformed_normal, 1.0f);
+__device__ float3 rotate(const ShortestArc& rotation, const float3& v) {
+    const float normal_component = dot(rotation.rigid_normal, v);
+    const float3 perpendicular = add_scaled(v, rotation.rigid_normal, -normal_component);
+    const float3 bisector = add_scaled(rotation.rigid_normal, rotation.deformed_normal, 1.0f);
     const float squared_length = dot(bisector, bisector);
     const float reflection = squared_length < MIN_BISECTOR_SQUARED_LENGTH ? 0.0f : 2.0f * dot(bisector, perpendicular) / squared_length;
-    return add_scaled(add_scaled(perpendicular, bisector, -reflection), arc.deformed_normal, normal_component);
+    return add_scaled(add_scaled(perpendicular, bisector, -reflection), rotation.deformed_normal, normal_component);
 }
 
 __device__ float3 normalize(const float3& v) {
@@ -149,36 +149,36 @@ extern "C" __global__ void __launch_bounds__(BLOCK) normals(const __grid_constan
     wait_for_prerequisite_grids();
     __shared__ float staged_normals[3 * BLOCK];
     const unsigned corner = blockIdx.x * BLOCK + threadIdx.x;
-    const unsigned domain = domain_of(args.slots, args.first_domains, min(corner, args.corners - 1));
+    const unsigned domain = find_domain(args.slots, args.first_domains, min(corner, args.corner_count - 1));
     if (!__syncthreads_or(is_dirty(args.header, args.change_steps, domain))) {
         return;
     }
-    if (corner < args.corners) {
+    if (corner < args.corner_count) {
         const NormalSlot slot = args.slots[domain];
-        const Mat3d linear = linear_part(transforms_of(args), domain);
-        const ShortestArc surface_arc = surface_rotation(args, slot, linear, corner);
-        const float* rest = args.rest_normals + slot.first_normal + (corner - slot.first);
-        const size_t plane = args.rest_corners;
-        float3 normal = transform_normal(linear, make_double3(__ldg(rest), __ldg(rest + plane), __ldg(rest + 2 * plane)));
-        if (surface_arc.is_defined) {
-            normal = normalize(rotate(surface_arc, normal));
+        const Mat3d linear = load_linear_part(transforms_of(args), domain);
+        const ShortestArc rotation = compute_surface_rotation(args, slot, linear, corner);
+        const float* rest_normal = args.rest_normals + slot.first_normal + (corner - slot.first_corner);
+        const size_t plane_stride = args.rest_corner_count;
+        float3 normal = transform_normal(linear, make_double3(__ldg(rest_normal), __ldg(rest_normal + plane_stride), __ldg(rest_normal + 2 * plane_stride)));
+        if (rotation.is_defined) {
+            normal = normalize(rotate(rotation, normal));
         }
         staged_normals[3 * threadIdx.x] = normal.x;
         staged_normals[3 * threadIdx.x + 1] = normal.y;
         staged_normals[3 * threadIdx.x + 2] = normal.z;
 #ifdef NORMAL_MAPS
-        float4 tangent_output = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        float4 packed_tangent = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
         if (slot.first_tangent != NO_TANGENTS) {
-            const float4 tangent = __ldg(args.rest_tangents + slot.first_tangent + (corner - slot.first));
+            const float4 tangent = __ldg(args.rest_tangents + slot.first_tangent + (corner - slot.first_corner));
             float3 world_tangent = transform_direction(linear, make_double3(tangent.x, tangent.y, tangent.z));
-            if (surface_arc.is_defined) {
-                world_tangent = orthogonalize(rotate(surface_arc, world_tangent), normal);
+            if (rotation.is_defined) {
+                world_tangent = orthogonalize(rotate(rotation, world_tangent), normal);
             }
-            tangent_output = make_float4(world_tangent.x, world_tangent.y, world_tangent.z, tangent.w * (float)determinant_sign(linear));
+            packed_tangent = make_float4(world_tangent.x, world_tangent.y, world_tangent.z, tangent.w * (float)determinant_sign(linear));
         }
-        args.header->tangents[corner] = tangent_output;
+        args.header->tangents[corner] = packed_tangent;
 #endif
     }
     __syncthreads();
-    store_triples(args.header->normals, staged_normals, args.corners);
+    store_triples(args.header->normals, staged_normals, args.corner_count);
 }

@@ -12,7 +12,7 @@ __device__ inline unsigned float_to_ordered(float x) {
     return x != x ? 0xffffffffu : non_nan_to_ordered(x);
 }
 
-// The number of a key. Key 0, which no number has, and the key of NaN give NaN.
+// The inverse of `float_to_ordered`. Key 0, which no number has, gives NaN.
 __device__ inline float ordered_to_float(unsigned key) {
     return __uint_as_float(key >> 31 ? key & 0x7fffffffu : ~key);
 }
@@ -30,7 +30,7 @@ __device__ inline unsigned warp_max(unsigned key) {
 }
 
 // Reduces each of six keys to its maximum over the warp. Lane i returns the maximum of key i % 6.
-__device__ inline unsigned warp_box(const unsigned (&keys)[6]) {
+__device__ inline unsigned reduce_box_keys(const unsigned (&keys)[6]) {
     const unsigned side = threadIdx.x % 32 % 6;
     unsigned lane_key = 0;
 #pragma unroll

@@ -1,16 +1,17 @@
-// Compute rasterizer: one sample per pixel. For each sample it finds the least depth and the id of its triangle, by one
+// Compute rasterizer: one sample per pixel. For each sample it finds the minimum depth and the id of that triangle, by one
 // atomic minimum of both. The result does not depend on the order of execution.
-//   raster        a thread per triangle of a group: culls it, draws it if few samples are near, or queues it
-//   raster_cut_outs    the same for cut-out triangles
-//   raster_warps  a warp per triangle of the medium queue
-//   raster_tiles  a warp per tile of a triangle of the large queue, or per strip of a tile if there are few tiles; also
-//                 draws clipped triangles
-// Macros: DEPTH_ONLY   depth alone, f32, no ids: a shadow map
-//         CUT_OUTS     the mesh has cut-outs: triangles from args.cut on, tested for alpha before the atomic
-//         COUNT_TRIANGLES   count the triangles by path, including the reasons for culling
-//         MAX_THREAD_SAMPLES     maximum number of samples near a triangle that a thread draws
-//         MAX_WARP_EXTENT  maximum extent, in 1/256 pixel, of a triangle that a warp draws; at most 16384, so that its edge
-//                 functions fit 32 bits
+//   raster           a thread per triangle of a range: culls it, draws it if its rectangle has few samples, or queues it
+//   raster_cut_outs  the same for cut-out triangles
+//   raster_warps     a warp per triangle of the medium queue
+//   raster_tiles     a warp per tile of a triangle of the large queue, or per strip of a tile if there are few tiles; also
+//                    draws clipped triangles
+// Macros:
+//   DEPTH_ONLY          the target is f32 depth without ids: a shadow map
+//   CUT_OUTS            triangles from `first_cut_out` on are cut-outs, which pass an alpha test before the atomic
+//   COUNT_TRIANGLES     count the triangles per `TriangleBin`
+//   MAX_THREAD_SAMPLES  maximum number of samples in the rectangle of a triangle that a thread draws
+//   MAX_WARP_EXTENT     maximum extent, in 1/256 pixel, of a triangle that a warp draws; at most 16384, so that 32 bits
+//                       hold its edge functions
 // Launch: BLOCK threads per block. raster and raster_cut_outs need a thread per triangle; the others loop over their queue,
 // with any number of blocks. CPU twin: VisibilityBuffer::draw.
 #include "cut_out.cuh"
@@ -24,180 +25,181 @@
 
 constexpr unsigned BLOCK = 128, WARPS = BLOCK / 32;
 constexpr int TILE_SIZE = 64;
-constexpr unsigned MAX_STRIP_SPLITS = 3;          // maximum number of times that a tile is halved into strips
-constexpr unsigned TILE_COUNT_BITS = 40;
+constexpr unsigned MAX_STRIP_SPLITS = 3;  // a tile is halved into strips at most so many times
+constexpr unsigned TILE_COUNT_BITS = 40;  // of `RasterCounters::large_count`
 
-// The path of a triangle, and its setup.
+// The bin of a triangle and its setup. Fields from `is_flipped` on are valid only for unclipped triangles.
 struct BinnedTriangle {
-    TriangleBin path;
-    PixelRect box;
+    TriangleBin bin;
+    PixelRect rect;
     bool is_flipped;
-    long long area;
+    long long doubled_area;
     SnappedVertex a, b, c;
 };
 
-__device__ inline bool is_empty(const PixelRect& box) {
-    return box.x0 > box.x1 || box.y0 > box.y1;
+__device__ inline bool is_empty(const PixelRect& rect) {
+    return rect.x0 > rect.x1 || rect.y0 > rect.y1;
 }
 
-// The path of a triangle by the sign of its area and its samples.
-__device__ inline TriangleBin classify_area(const RasterArgs& args, long long area, const PixelRect& box) {
-    return area == 0                     ? DEGENERATE
-           : args.faces == 1 && area > 0 ? BACK_FACING
-           : is_empty(box)               ? NO_SAMPLE
-                                         : LARGE;
+// Culls a triangle by its area and its samples, or returns LARGE.
+__device__ inline TriangleBin classify_by_area(const RasterArgs& args, long long doubled_area, const PixelRect& rect) {
+    return doubled_area == 0                                ? DEGENERATE
+           : args.culls_back_faces == 1 && doubled_area > 0 ? BACK_FACING
+           : is_empty(rect)                                 ? NO_SAMPLE
+                                                            : LARGE;
 }
 
-// The path of a clipped triangle. A separate function with a struct in local memory: clipped triangles are rare, and
-// the others keep their setup in registers.
+// Setup of a clipped triangle. It is in a struct of its own in local memory, so that the many unclipped triangles keep their
+// setup in registers.
 struct ClippedSetup {
-    TriangleBin path;
-    PixelRect box;
+    TriangleBin bin;
+    PixelRect rect;
 };
 
 __device__ __noinline__ void setup_clipped(const RasterArgs& args, float4 a, float4 b, float4 c, ClippedSetup& clipped) {
     ClippedPolygon polygon;
     clip_triangle(args, a, b, c, polygon);
     if (polygon.count == 0) {
-        clipped.path = OUTSIDE_FRUSTUM;
+        clipped.bin = OUTSIDE_FRUSTUM;
         return;
     }
-    clipped.box = pixel_rect(args, polygon);
-    clipped.path = classify_area(args, area_of(polygon), clipped.box);
+    clipped.rect = pixel_rect(args, polygon);
+    clipped.bin = classify_by_area(args, doubled_area(polygon), clipped.rect);
 }
 
-__device__ inline void setup_unclipped(const RasterArgs& args, const float4 (&corners)[3], BinnedTriangle& triangle_setup) {
+__device__ inline void setup_unclipped(const RasterArgs& args, const float4 (&corners)[3], BinnedTriangle& binned) {
     const SnappedVertex a = snap(args, corners[0]), b = snap(args, corners[1]), c = snap(args, corners[2]);
     const int x0 = min(a.x, min(b.x, c.x)), x1 = max(a.x, max(b.x, c.x));
     const int y0 = min(a.y, min(b.y, c.y)), y1 = max(a.y, max(b.y, c.y));
-    triangle_setup.box = pixel_rect(args, x0, y0, x1, y1);
-    triangle_setup.area = area_of(a, b, c);
-    triangle_setup.path = classify_area(args, triangle_setup.area, triangle_setup.box);
-    if (triangle_setup.path == LARGE && x1 - x0 <= MAX_WARP_EXTENT && y1 - y0 <= MAX_WARP_EXTENT) {
-        const int samples = (triangle_setup.box.x1 - triangle_setup.box.x0 + 1) * (triangle_setup.box.y1 - triangle_setup.box.y0 + 1);
-        triangle_setup.path = samples <= MAX_THREAD_SAMPLES ? SMALL : MEDIUM;
+    binned.rect = pixel_rect(args, x0, y0, x1, y1);
+    binned.doubled_area = doubled_area(a, b, c);
+    binned.bin = classify_by_area(args, binned.doubled_area, binned.rect);
+    if (binned.bin == LARGE && x1 - x0 <= MAX_WARP_EXTENT && y1 - y0 <= MAX_WARP_EXTENT) {
+        const int samples = (binned.rect.x1 - binned.rect.x0 + 1) * (binned.rect.y1 - binned.rect.y0 + 1);
+        binned.bin = samples <= MAX_THREAD_SAMPLES ? SMALL : MEDIUM;
     }
-    triangle_setup.is_flipped = triangle_setup.area < 0;
-    triangle_setup.area = triangle_setup.is_flipped ? -triangle_setup.area : triangle_setup.area;
-    triangle_setup.a = a;
-    triangle_setup.b = b;
-    triangle_setup.c = c;
+    binned.is_flipped = binned.doubled_area < 0;
+    binned.doubled_area = binned.is_flipped ? -binned.doubled_area : binned.doubled_area;
+    binned.a = a;
+    binned.b = b;
+    binned.c = c;
 }
 
-__device__ inline void classify_triangle(const RasterArgs& args, unsigned triangle, BinnedTriangle& triangle_setup) {
+__device__ inline void classify_triangle(const RasterArgs& args, unsigned triangle, BinnedTriangle& binned) {
     float4 corners[3];
     load_triangle(args, triangle, corners);
     if (!is_finite(corners[0]) || !is_finite(corners[1]) || !is_finite(corners[2])) {
-        triangle_setup.path = NOT_FINITE;
+        binned.bin = NOT_FINITE;
     } else if (is_outside(corners)) {
-        triangle_setup.path = OUTSIDE_FRUSTUM;
+        binned.bin = OUTSIDE_FRUSTUM;
     } else if (is_inside_guard_band(args, corners[0]) && is_inside_guard_band(args, corners[1]) && is_inside_guard_band(args, corners[2])) {
-        setup_unclipped(args, corners, triangle_setup);
+        setup_unclipped(args, corners, binned);
     } else {
         ClippedSetup clipped;
         setup_clipped(args, corners[0], corners[1], corners[2], clipped);
-        triangle_setup.path = clipped.path;
-        triangle_setup.box = clipped.box;
+        binned.bin = clipped.bin;
+        binned.rect = clipped.rect;
     }
 }
 
-template <typename Kind>
-__device__ inline void draw_small(const RasterArgs& args, const BinnedTriangle& triangle_setup, unsigned triangle) {
-    const TriangleSetup<int> piece(triangle_setup.a, triangle_setup.b, triangle_setup.c, triangle_setup.is_flipped, (int)triangle_setup.area);
-    const Kind surface(args, triangle);
-    for (int row = triangle_setup.box.y0; row <= triangle_setup.box.y1; ++row) {
-        for (int column = triangle_setup.box.x0; column <= triangle_setup.box.x1; ++column) {
+template <typename AlphaTestPolicy>
+__device__ inline void draw_small(const RasterArgs& args, const BinnedTriangle& binned, unsigned triangle) {
+    const TriangleSetup<int> setup(binned.a, binned.b, binned.c, binned.is_flipped, (int)binned.doubled_area);
+    const AlphaTestPolicy alpha_test(args, triangle);
+    for (int row = binned.rect.y0; row <= binned.rect.y1; ++row) {
+        for (int column = binned.rect.x0; column <= binned.rect.x1; ++column) {
             float depth;
-            if (piece.covers(column, row, depth)) {
-                write_sample(args, surface, column, row, depth, triangle);
+            if (setup.covers(column, row, depth)) {
+                write_sample(args, alpha_test, column, row, depth, triangle);
             }
         }
     }
 }
 
-// One atomic per warp; all lanes of the warp take part.
-__device__ inline void push_medium(const RasterArgs& args, bool wanted, unsigned triangle) {
-    const unsigned lanes = __ballot_sync(0xffffffffu, wanted), lane = threadIdx.x % 32;
-    if (lanes == 0) {
+// Appends the medium triangles of a warp to the medium queue with one atomic. All lanes must call this.
+__device__ inline void push_medium(const RasterArgs& args, bool is_medium, unsigned triangle) {
+    const unsigned medium_lanes = __ballot_sync(0xffffffffu, is_medium), lane = threadIdx.x % 32;
+    if (medium_lanes == 0) {
         return;
     }
-    unsigned first = 0;
+    unsigned first_entry = 0;
     if (lane == 0) {
-        first = atomicAdd(&((RasterCounters*)args.counters)->medium, __popc(lanes));
+        first_entry = atomicAdd(&((RasterCounters*)args.counters)->medium_count, __popc(medium_lanes));
     }
-    first = __shfl_sync(0xffffffffu, first, 0);
-    if (wanted) {
-        ((unsigned*)args.medium)[first + __popc(lanes & ((1u << lane) - 1))] = triangle;
+    first_entry = __shfl_sync(0xffffffffu, first_entry, 0);
+    if (is_medium) {
+        ((unsigned*)args.medium_queue)[first_entry + __popc(medium_lanes & ((1u << lane) - 1))] = triangle;
     }
 }
 
-// One atomic returns both the queue entry and its first tile, so first tiles ascend with the entries.
-__device__ inline void push_large(const RasterArgs& args, const PixelRect& box, unsigned triangle) {
-    const unsigned x = box.x0 / TILE_SIZE, y = box.y0 / TILE_SIZE;
-    const unsigned across = box.x1 / TILE_SIZE - x + 1, down = box.y1 / TILE_SIZE - y + 1;
-    const unsigned long long own = 1ull << TILE_COUNT_BITS | (unsigned long long)across * down;
-    const unsigned long long before = atomicAdd(&((RasterCounters*)args.counters)->large, own);
+// Appends a triangle to the large queue. One atomic returns both the index of the entry and its first tile, so the first
+// tiles ascend with the entries.
+__device__ inline void push_large(const RasterArgs& args, const PixelRect& rect, unsigned triangle) {
+    const unsigned x = rect.x0 / TILE_SIZE, y = rect.y0 / TILE_SIZE;
+    const unsigned column_count = rect.x1 / TILE_SIZE - x + 1, row_count = rect.y1 / TILE_SIZE - y + 1;
+    const unsigned long long increment = 1ull << TILE_COUNT_BITS | (unsigned long long)column_count * row_count;
+    const unsigned long long previous = atomicAdd(&((RasterCounters*)args.counters)->large_count, increment);
     LargeTriangle entry;
-    entry.first = before & ((1ull << TILE_COUNT_BITS) - 1);
+    entry.first_tile = previous & ((1ull << TILE_COUNT_BITS) - 1);
     entry.triangle = triangle;
-    entry.box = x | y << 8 | (across - 1) << 16;
-    ((LargeTriangle*)args.large)[before >> TILE_COUNT_BITS] = entry;
+    entry.tile_rect = x | y << 8 | (column_count - 1) << 16;
+    ((LargeTriangle*)args.large_queue)[previous >> TILE_COUNT_BITS] = entry;
 }
 
-__device__ inline void count(const RasterArgs& args, TriangleBin path) {
+__device__ inline void count_bins(const RasterArgs& args, TriangleBin bin) {
 #ifdef COUNT_TRIANGLES
-    for (unsigned own = 0; own < NO_BIN; ++own) {
-        const unsigned lanes = __ballot_sync(0xffffffffu, path == own);
-        if (threadIdx.x % 32 == 0 && lanes != 0) {
-            atomicAdd(&((RasterCounters*)args.counters)->counts[own], __popc(lanes));
+    for (unsigned bin_index = 0; bin_index < NO_BIN; ++bin_index) {
+        const unsigned bin_lanes = __ballot_sync(0xffffffffu, bin == bin_index);
+        if (threadIdx.x % 32 == 0 && bin_lanes != 0) {
+            atomicAdd(&((RasterCounters*)args.counters)->bin_counts[bin_index], __popc(bin_lanes));
         }
     }
 #endif
 }
 
-template <typename Kind>
-__device__ inline void draw_group(const RasterArgs& args) {
-    const unsigned at = blockIdx.x * BLOCK + threadIdx.x, triangle = args.first + at;
-    BinnedTriangle triangle_setup;
-    triangle_setup.path = NO_BIN;
-    if (at < args.count) {
-        classify_triangle(args, triangle, triangle_setup);
+template <typename AlphaTestPolicy>
+__device__ inline void draw_range(const RasterArgs& args) {
+    const unsigned index = blockIdx.x * BLOCK + threadIdx.x, triangle = args.first_triangle + index;
+    BinnedTriangle binned;
+    binned.bin = NO_BIN;
+    if (index < args.triangle_count) {
+        classify_triangle(args, triangle, binned);
     }
     __syncwarp();
-    push_medium(args, triangle_setup.path == MEDIUM, triangle);
-    count(args, triangle_setup.path);
-    if (triangle_setup.path == LARGE) {
-        push_large(args, triangle_setup.box, triangle);
+    push_medium(args, binned.bin == MEDIUM, triangle);
+    count_bins(args, binned.bin);
+    if (binned.bin == LARGE) {
+        push_large(args, binned.rect, triangle);
     }
-    if (triangle_setup.path == SMALL) {
-        draw_small<Kind>(args, triangle_setup, triangle);
+    if (binned.bin == SMALL) {
+        draw_small<AlphaTestPolicy>(args, binned, triangle);
     }
 }
 
 extern "C" __global__ void __launch_bounds__(BLOCK) raster(const __grid_constant__ RasterArgs args) {
-    draw_group<OpaqueTest>(args);
+    draw_range<OpaqueTest>(args);
 }
 
 #ifdef CUT_OUTS
 extern "C" __global__ void __launch_bounds__(BLOCK) raster_cut_outs(const __grid_constant__ RasterArgs args) {
-    draw_group<AlphaTest>(args);
+    draw_range<AlphaTest>(args);
 }
 #endif
 
-template <typename Kind>
+template <typename AlphaTestPolicy>
 __device__ inline void draw_medium(const RasterArgs& args, unsigned triangle) {
     float4 corners[3];
     load_triangle(args, triangle, corners);
-    BinnedTriangle triangle_setup;
-    setup_unclipped(args, corners, triangle_setup);
-    const TriangleSetup<int> piece(triangle_setup.a, triangle_setup.b, triangle_setup.c, triangle_setup.is_flipped, (int)triangle_setup.area);
-    const Kind surface(args, triangle);
+    BinnedTriangle binned;
+    setup_unclipped(args, corners, binned);
+    const TriangleSetup<int> setup(binned.a, binned.b, binned.c, binned.is_flipped, (int)binned.doubled_area);
+    const AlphaTestPolicy alpha_test(args, triangle);
     const int lane = (int)threadIdx.x % 32;
-    for (int row = triangle_setup.box.y0 + lane / 8; row <= triangle_setup.box.y1; row += 4) {
-        for (int column = triangle_setup.box.x0 + lane % 8; column <= triangle_setup.box.x1; column += 8) {
+    for (int row = binned.rect.y0 + lane / 8; row <= binned.rect.y1; row += 4) {
+        for (int column = binned.rect.x0 + lane % 8; column <= binned.rect.x1; column += 8) {
             float depth;
-            if (piece.covers(column, row, depth)) {
-                write_sample(args, surface, column, row, depth, triangle);
+            if (setup.covers(column, row, depth)) {
+                write_sample(args, alpha_test, column, row, depth, triangle);
             }
         }
     }
@@ -212,9 +214,9 @@ __device__ inline bool is_cut_out(const RasterArgs& args, unsigned triangle) {
 }
 
 extern "C" __global__ void __launch_bounds__(BLOCK, 4) raster_warps(const __grid_constant__ RasterArgs args) {
-    const unsigned queued = ((const RasterCounters*)args.counters)->medium, warps = gridDim.x * WARPS;
-    for (unsigned at = blockIdx.x * WARPS + threadIdx.x / 32; at < queued; at += warps) {
-        const unsigned triangle = ((const unsigned*)args.medium)[at];
+    const unsigned queue_length = ((const RasterCounters*)args.counters)->medium_count, warp_count = gridDim.x * WARPS;
+    for (unsigned index = blockIdx.x * WARPS + threadIdx.x / 32; index < queue_length; index += warp_count) {
+        const unsigned triangle = ((const unsigned*)args.medium_queue)[index];
         if (is_cut_out(args, triangle)) {
             draw_medium<AlphaTest>(args, triangle);
         } else {
@@ -223,20 +225,20 @@ extern "C" __global__ void __launch_bounds__(BLOCK, 4) raster_warps(const __grid
     }
 }
 
-// The last entry whose first tile is at or before `tile`. The warp tests 32 entries at a time.
-__device__ inline LargeTriangle find_large_triangle(const RasterArgs& args, unsigned entries, unsigned long long tile) {
-    const LargeTriangle* list = (const LargeTriangle*)args.large;
-    unsigned low = 0, high = entries;
+// Finds the last entry whose first tile is at or before `tile`. The warp tests 32 entries at a time.
+__device__ inline LargeTriangle find_large_triangle(const RasterArgs& args, unsigned entry_count, unsigned long long tile) {
+    const LargeTriangle* queue = (const LargeTriangle*)args.large_queue;
+    unsigned low = 0, high = entry_count;
     while (high - low > 1) {
-        const unsigned step = (high - low + 31) / 32, own = low + step * (threadIdx.x % 32);
-        const unsigned before = __popc(__ballot_sync(0xffffffffu, own < high && list[own].first <= tile));
-        low += step * (before - 1);
+        const unsigned step = (high - low + 31) / 32, probe = low + step * (threadIdx.x % 32);
+        const unsigned preceding_count = __popc(__ballot_sync(0xffffffffu, probe < high && queue[probe].first_tile <= tile));
+        low += step * (preceding_count - 1);
         high = min(low + step, high);
     }
-    return list[low];
+    return queue[low];
 }
 
-__device__ inline void clipped_corners(const RasterArgs& args, unsigned triangle, ClippedPolygon& polygon) {
+__device__ inline void load_clipped_polygon(const RasterArgs& args, unsigned triangle, ClippedPolygon& polygon) {
     float4 corners[3];
     load_triangle(args, triangle, corners);
     if (is_inside_guard_band(args, corners[0]) && is_inside_guard_band(args, corners[1]) && is_inside_guard_band(args, corners[2])) {
@@ -249,107 +251,109 @@ __device__ inline void clipped_corners(const RasterArgs& args, unsigned triangle
     }
 }
 
-__device__ inline PixelRect intersect(const PixelRect& one, const PixelRect& other) {
-    return {max(one.x0, other.x0), max(one.y0, other.y0), min(one.x1, other.x1), min(one.y1, other.y1)};
+__device__ inline PixelRect intersect_rects(const PixelRect& a, const PixelRect& b) {
+    return {max(a.x0, b.x0), max(a.y0, b.y0), min(a.x1, b.x1), min(a.y1, b.y1)};
 }
 
-// Whether all samples of a box lie outside one edge: the edge function has its largest value at one of the four
-// corners.
-__device__ inline bool is_outside_edge(const SnappedVertex& from, const SnappedVertex& to, int top_left_bias, const PixelRect& box) {
-    const int x = SUBPIXEL_STEPS * (to.y > from.y ? box.x0 : box.x1) + SUBPIXEL_STEPS / 2;
-    const int y = SUBPIXEL_STEPS * (to.x > from.x ? box.y1 : box.y0) + SUBPIXEL_STEPS / 2;
-    return TriangleSetup<long long>::edge(from, to, x, y) < top_left_bias;
+// Whether all samples of a rectangle lie outside an edge. The edge function has its maximum at one of the four corners.
+__device__ inline bool is_outside_edge(const SnappedVertex& edge_start, const SnappedVertex& edge_end, int min_covered_edge, const PixelRect& rect) {
+    const int x = SUBPIXEL_STEPS * (edge_end.y > edge_start.y ? rect.x0 : rect.x1) + SUBPIXEL_STEPS / 2;
+    const int y = SUBPIXEL_STEPS * (edge_end.x > edge_start.x ? rect.y1 : rect.y0) + SUBPIXEL_STEPS / 2;
+    return TriangleSetup<long long>::edge_function(edge_start, edge_end, x, y) < min_covered_edge;
 }
 
-template <typename Kind>
-__device__ inline void draw_tile(const RasterArgs& args, const Kind& surface, const TriangleSetup<long long>& piece, const PixelRect& box,
+template <typename AlphaTestPolicy>
+__device__ inline void draw_tile(const RasterArgs& args, const AlphaTestPolicy& alpha_test, const TriangleSetup<long long>& setup, const PixelRect& rect,
                                  unsigned triangle) {
-    if (is_outside_edge(piece.b, piece.c, piece.least_a, box) || is_outside_edge(piece.c, piece.a, piece.least_b, box) ||
-        is_outside_edge(piece.a, piece.b, piece.least_c, box)) {
+    if (is_outside_edge(setup.b, setup.c, setup.min_edge_a, rect) || is_outside_edge(setup.c, setup.a, setup.min_edge_b, rect) ||
+        is_outside_edge(setup.a, setup.b, setup.min_edge_c, rect)) {
         return;
     }
     const int lane = (int)threadIdx.x % 32;
-    for (int row = box.y0 + lane / 8; row <= box.y1; row += 4) {
-        for (int column = box.x0 + lane % 8; column <= box.x1; column += 8) {
+    for (int row = rect.y0 + lane / 8; row <= rect.y1; row += 4) {
+        for (int column = rect.x0 + lane % 8; column <= rect.x1; column += 8) {
             float depth;
-            if (piece.covers(column, row, depth)) {
-                write_sample(args, surface, column, row, depth, triangle);
+            if (setup.covers(column, row, depth)) {
+                write_sample(args, alpha_test, column, row, depth, triangle);
             }
         }
     }
 }
 
-// The work of all warps. In shared memory, to save registers, like `TileJob`.
+// The work of all warps. Like `TileJob`, it is in shared memory to save registers.
 struct TileSchedule {
-    unsigned long long count;
-    unsigned entries;
-    unsigned strip_splits;                    // of each tile into strips
+    unsigned long long job_count;
+    unsigned entry_count;
+    unsigned strip_splits; // number of times that each tile is halved
 };
 
-// What a warp draws in one iteration.
+// The work of a warp in one iteration: the part of a polygon inside a tile or strip.
 struct TileJob {
     ClippedPolygon polygon;
-    PixelRect box;
+    PixelRect rect;
     unsigned triangle;
 };
 
 // A tile takes 128 iterations of a warp. If there are fewer tiles than warps, one tile would determine the run time, so
 // tiles are split into strips.
-__device__ inline void schedule_tiles(const RasterArgs& args, TileSchedule& turns) {
-    const unsigned long long large = ((const RasterCounters*)args.counters)->large, tiles = large & ((1ull << TILE_COUNT_BITS) - 1);
-    turns.entries = (unsigned)(large >> TILE_COUNT_BITS);
-    turns.strip_splits = 0;
-    while (turns.strip_splits < MAX_STRIP_SPLITS && tiles << (turns.strip_splits + 1) <= WARPS * gridDim.x) {
-        ++turns.strip_splits;
+__device__ inline void schedule_tiles(const RasterArgs& args, TileSchedule& schedule) {
+    const unsigned long long large_count = ((const RasterCounters*)args.counters)->large_count;
+    const unsigned long long tile_count = large_count & ((1ull << TILE_COUNT_BITS) - 1);
+    schedule.entry_count = (unsigned)(large_count >> TILE_COUNT_BITS);
+    schedule.strip_splits = 0;
+    while (schedule.strip_splits < MAX_STRIP_SPLITS && tile_count << (schedule.strip_splits + 1) <= WARPS * gridDim.x) {
+        ++schedule.strip_splits;
     }
-    turns.count = tiles << turns.strip_splits;
+    schedule.job_count = tile_count << schedule.strip_splits;
 }
 
-__device__ inline void load_tile_job(const RasterArgs& args, const TileSchedule& turns, const LargeTriangle& entry, unsigned long long at,
-                                 TileJob& turn) {
-    const unsigned own = (unsigned)((at >> turns.strip_splits) - entry.first), across = (entry.box >> 16 & 255) + 1;
-    const int tall = TILE_SIZE >> turns.strip_splits, strip = (int)at & ((1 << turns.strip_splits) - 1);
-    const int x = TILE_SIZE * (int)((entry.box & 255) + own % across);
-    const int y = TILE_SIZE * (int)((entry.box >> 8 & 255) + own / across) + tall * strip;
-    clipped_corners(args, entry.triangle, turn.polygon);
-    turn.box = intersect(pixel_rect(args, turn.polygon), {x, y, x + TILE_SIZE - 1, y + tall - 1});
-    turn.triangle = entry.triangle;
+__device__ inline void load_tile_job(const RasterArgs& args, const TileSchedule& schedule, const LargeTriangle& entry, unsigned long long job_index,
+                                 TileJob& job) {
+    const unsigned tile_in_entry = (unsigned)((job_index >> schedule.strip_splits) - entry.first_tile);
+    const unsigned column_count = (entry.tile_rect >> 16 & 255) + 1;
+    const int strip_height = TILE_SIZE >> schedule.strip_splits, strip = (int)job_index & ((1 << schedule.strip_splits) - 1);
+    const int x = TILE_SIZE * (int)((entry.tile_rect & 255) + tile_in_entry % column_count);
+    const int y = TILE_SIZE * (int)((entry.tile_rect >> 8 & 255) + tile_in_entry / column_count) + strip_height * strip;
+    load_clipped_polygon(args, entry.triangle, job.polygon);
+    job.rect = intersect_rects(pixel_rect(args, job.polygon), {x, y, x + TILE_SIZE - 1, y + strip_height - 1});
+    job.triangle = entry.triangle;
 }
 
-// All pieces of a polygon have the orientation of the whole. A piece that rounding turned around has no samples of its
-// own.
-template <typename Kind>
-__device__ inline void draw_fan(const RasterArgs& args, const TileJob& turn) {
-    const ClippedPolygon& polygon = turn.polygon;
-    const bool is_flipped = area_of(polygon) < 0;
-    const Kind surface(args, turn.triangle);
+// Draws a polygon as a fan of triangles, which have the orientation of the polygon. Rounding may invert a triangle; it then
+// covers no sample that the other triangles do not cover.
+template <typename AlphaTestPolicy>
+__device__ inline void draw_fan(const RasterArgs& args, const TileJob& job) {
+    const ClippedPolygon& polygon = job.polygon;
+    const bool is_flipped = doubled_area(polygon) < 0;
+    const AlphaTestPolicy alpha_test(args, job.triangle);
     for (unsigned i = 1; i + 1 < polygon.count; ++i) {
         const SnappedVertex &a = polygon.corners[0], &b = polygon.corners[i], &c = polygon.corners[i + 1];
-        const long long area = area_of(a, b, c), own = is_flipped ? -area : area;
-        if (own > 0) {
-            draw_tile(args, surface, TriangleSetup<long long>(a, b, c, is_flipped, own), turn.box, turn.triangle);
+        const long long signed_area = doubled_area(a, b, c), triangle_area = is_flipped ? -signed_area : signed_area;
+        if (triangle_area > 0) {
+            draw_tile(args, alpha_test, TriangleSetup<long long>(a, b, c, is_flipped, triangle_area), job.rect, job.triangle);
         }
     }
 }
 
 extern "C" __global__ void __launch_bounds__(BLOCK, 5) raster_tiles(const __grid_constant__ RasterArgs args) {
-    __shared__ TileSchedule turns;
-    __shared__ TileJob own[WARPS];
+    __shared__ TileSchedule schedule;
+    __shared__ TileJob jobs[WARPS];
     if (threadIdx.x == 0) {
-        schedule_tiles(args, turns);
+        schedule_tiles(args, schedule);
     }
     __syncthreads();
-    TileJob& turn = own[threadIdx.x / 32];
-    for (unsigned long long at = blockIdx.x * WARPS + threadIdx.x / 32; at < turns.count; at += WARPS * gridDim.x) {
-        const LargeTriangle entry = find_large_triangle(args, turns.entries, at >> turns.strip_splits);
+    TileJob& job = jobs[threadIdx.x / 32];
+    for (unsigned long long job_index = blockIdx.x * WARPS + threadIdx.x / 32; job_index < schedule.job_count;
+         job_index += WARPS * gridDim.x) {
+        const LargeTriangle entry = find_large_triangle(args, schedule.entry_count, job_index >> schedule.strip_splits);
         if (threadIdx.x % 32 == 0) {
-            load_tile_job(args, turns, entry, at, turn);
+            load_tile_job(args, schedule, entry, job_index, job);
         }
         __syncwarp();
-        if (is_cut_out(args, turn.triangle)) {
-            draw_fan<AlphaTest>(args, turn);
+        if (is_cut_out(args, job.triangle)) {
+            draw_fan<AlphaTest>(args, job);
         } else {
-            draw_fan<OpaqueTest>(args, turn);
+            draw_fan<OpaqueTest>(args, job);
         }
         __syncwarp();
     }

@@ -1,11 +1,11 @@
-// The transform T of a domain: its own or, with FOLLOWERS, that of its transform root times a constant frame. CPU twin:
-// src/model/domain/composed_transform.rs, which defines the order of operations; results are bit-identical.
+// The transform T of a domain. With FOLLOWERS, T of a follower is the transform of its transform root times a constant
+// frame. CPU twin: src/model/domain/composed_transform.rs, which defines the order of operations; results are bit-identical.
 #pragma once
 #include "layout.cuh"
 
 // The three rows of a transform.
 struct Affine {
-    float4 a, b, c;
+    float4 row0, row1, row2;
 };
 
 // Tables from which T is composed.
@@ -43,8 +43,8 @@ __device__ __forceinline__ float dot_row_column(const float4& t, float x, float 
 }
 
 __device__ __forceinline__ float4 compose_row(const float4& t, const Affine& f) {
-    return make_float4(dot_row_column(t, f.a.x, f.b.x, f.c.x), dot_row_column(t, f.a.y, f.b.y, f.c.y),
-                       dot_row_column(t, f.a.z, f.b.z, f.c.z), fmaf(t.x, f.a.w, fmaf(t.y, f.b.w, fmaf(t.z, f.c.w, t.w))));
+    return make_float4(dot_row_column(t, f.row0.x, f.row1.x, f.row2.x), dot_row_column(t, f.row0.y, f.row1.y, f.row2.y),
+                       dot_row_column(t, f.row0.z, f.row1.z, f.row2.z), fmaf(t.x, f.row0.w, fmaf(t.y, f.row1.w, fmaf(t.z, f.row2.w, t.w))));
 }
 #endif
 
@@ -56,7 +56,7 @@ __device__ __forceinline__ Affine load_transform(const Transforms& transforms, u
         return t;
     }
     const Affine f = load_affine(transforms.frames, link.frame);
-    return {compose_row(t.a, f), compose_row(t.b, f), compose_row(t.c, f)};
+    return {compose_row(t.row0, f), compose_row(t.row1, f), compose_row(t.row2, f)};
 #else
     return load_affine(transforms.rows, domain);
 #endif
@@ -74,7 +74,7 @@ __device__ __forceinline__ void transform_point_f64(const float4* rows, const do
     }
 }
 
-// T of a domain times a point, computed in f64 and rounded once. Overwrites `point`.
+// Transforms a point by T of a domain in f64 and rounds the result once. Overwrites `point`.
 __device__ __forceinline__ float3 transform_domain_point_f64(const Transforms& transforms, unsigned domain, double (&point)[3]) {
     double world[3];
 #ifdef FOLLOWERS

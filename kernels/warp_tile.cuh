@@ -1,15 +1,14 @@
-// The tile of a warp: which vertices and corners its lanes compute, and coalesced stores of the results.
+// Assignment of the items (vertices or corners) of a tile to lanes, and coalesced stores of the results.
 #pragma once
 #include "layout.cuh"
 
-// Vertices or corners per lane. With ONE_ITEM_PER_LANE a lane has one, and four warps share a tile, so that small scenes fill the
-// device too.
+// With ONE_ITEM_PER_LANE four warps share a tile, so that small scenes also fill the device.
 #ifdef ONE_ITEM_PER_LANE
 constexpr unsigned ITEMS_PER_LANE = 1;
 #else
 constexpr unsigned ITEMS_PER_LANE = 4;
 #endif
-constexpr unsigned WARPS_PER_TILE = 4 / ITEMS_PER_LANE; // warps per tile
+constexpr unsigned WARPS_PER_TILE = 4 / ITEMS_PER_LANE;
 constexpr unsigned FLOATS_PER_LANE = 3 * ITEMS_PER_LANE;
 
 __device__ __forceinline__ unsigned lane_id() {
@@ -18,140 +17,141 @@ __device__ __forceinline__ unsigned lane_id() {
 
 // One lane's part of a tile.
 struct LaneSlice {
-    unsigned kind;
-    unsigned quad; // in the tile
-    unsigned width;
-    unsigned chunks;
-    unsigned long long first_word;
-    unsigned within; // first item of the lane in its quad
-    unsigned item;   // its packed index: a vertex, or a corner in a tile of corners alone
-    unsigned count;  // number of items to write
+    unsigned kind;       // as in `WarpTile`
+    unsigned quad;       // in the tile
+    unsigned quad_count; // of the tile
+    unsigned chunk_count;
+    unsigned long long first_word; // of the tile
+    unsigned item_in_quad;         // first item of the lane in its quad
+    unsigned first_item;           // packed index of the lane's first vertex, or corner in a tile without vertices
+    unsigned item_count;           // number of items to write
     unsigned domain;
-    unsigned run;    // items of the whole warp in a tile of one domain, from lane 0 on; else 0
-    unsigned rest;   // quad of x0, normals and tangents: the tile's first, or the lane's own in a mixed tile
-    unsigned stride; // float4 from one component of the quad to the next
+    unsigned warp_item_count;  // items of the warp in a tile of one domain; 0 in a mixed tile
+    unsigned rest_quad;        // quad of x0, normals and tangents: first quad of the tile, or the lane's quad in a mixed tile
+    unsigned component_stride; // float4 vectors from one component of a quad to the next
     unsigned first_q;
     unsigned first_scale;
 };
 
-// A lane without an item has a count of 0 and reads the items of quad 0.
-__device__ __forceinline__ LaneSlice load_lane_slice(const DeformArgs& args, unsigned tile, unsigned share) {
-    const uint4 head = __ldg((const uint4*)(args.tiles + tile));
-    const uint4 tail = __ldg((const uint4*)(args.tiles + tile) + 1);
-    const unsigned place = share * 32 + lane_id();
-    LaneSlice part;
-    part.quad = place / WARPS_PER_TILE;
-    part.within = place % WARPS_PER_TILE * ITEMS_PER_LANE;
-    part.kind = tail.w >> 24;
-    part.width = tail.w >> 16 & 0xff;
-    part.chunks = tail.w & 0xffff;
-    part.first_word = head.x | (unsigned long long)head.y << 32;
-    const unsigned last = part.kind & TILE_LAST;
-    unsigned items = 0;
-    part.run = 0;
-    part.item = part.domain = part.rest = part.first_q = part.first_scale = 0;
-    part.stride = last > 0 ? part.width : 1;
-    if (last > 0) {
-        items = part.quad + 1 == part.width ? last : part.quad < part.width ? 4 : 0;
-        part.item = head.z + 4 * part.quad;
-        const unsigned all = 4 * (part.width - 1) + last, before = 32 * ITEMS_PER_LANE * share;
-        part.run = all > before ? min(32 * ITEMS_PER_LANE, all - before) : 0;
-        part.domain = tail.x;
-        part.rest = head.w;
-        part.first_q = tail.y;
-        part.first_scale = tail.z;
+// A lane without an item has `item_count` 0 and reads quad 0. `tile_warp` is the index of the warp in its tile.
+__device__ __forceinline__ LaneSlice load_lane_slice(const DeformArgs& args, unsigned tile, unsigned tile_warp) {
+    // The two halves of a `WarpTile`; below, `quad_words` is a `MixedQuad`. Their fields are in the order of layout.cuh.
+    const uint4 low_words = __ldg((const uint4*)(args.tiles + tile));
+    const uint4 high_words = __ldg((const uint4*)(args.tiles + tile) + 1);
+    const unsigned tile_lane = tile_warp * 32 + lane_id();
+    LaneSlice slice;
+    slice.quad = tile_lane / WARPS_PER_TILE;
+    slice.item_in_quad = tile_lane % WARPS_PER_TILE * ITEMS_PER_LANE;
+    slice.kind = high_words.w >> 24;
+    slice.quad_count = high_words.w >> 16 & 0xff;
+    slice.chunk_count = high_words.w & 0xffff;
+    slice.first_word = low_words.x | (unsigned long long)low_words.y << 32;
+    const unsigned last_quad_items = slice.kind & LAST_QUAD_ITEMS;
+    unsigned quad_items = 0;
+    slice.warp_item_count = 0;
+    slice.first_item = slice.domain = slice.rest_quad = slice.first_q = slice.first_scale = 0;
+    slice.component_stride = last_quad_items > 0 ? slice.quad_count : 1;
+    if (last_quad_items > 0) {
+        quad_items = slice.quad + 1 == slice.quad_count ? last_quad_items : slice.quad < slice.quad_count ? 4 : 0;
+        slice.first_item = low_words.z + 4 * slice.quad;
+        const unsigned tile_items = 4 * (slice.quad_count - 1) + last_quad_items, preceding_items = 32 * ITEMS_PER_LANE * tile_warp;
+        slice.warp_item_count = tile_items > preceding_items ? min(32 * ITEMS_PER_LANE, tile_items - preceding_items) : 0;
+        slice.domain = high_words.x;
+        slice.rest_quad = low_words.w;
+        slice.first_q = high_words.y;
+        slice.first_scale = high_words.z;
     } else {
-        const unsigned at = head.z + (part.quad < part.width ? part.quad : 0);
-        const uint4 lane = __ldg((const uint4*)(args.mixed_quads + at));
-        items = part.quad < part.width ? 1 + lane.z % 4 : 0;
-        part.item = lane.x;
-        part.domain = lane.z / 4;
-        part.rest = lane.y;
-        part.first_q = lane.w;
+        const unsigned mixed_quad = low_words.z + (slice.quad < slice.quad_count ? slice.quad : 0);
+        const uint4 quad_words = __ldg((const uint4*)(args.mixed_quads + mixed_quad));
+        quad_items = slice.quad < slice.quad_count ? 1 + quad_words.z % 4 : 0;
+        slice.first_item = quad_words.x;
+        slice.domain = quad_words.z / 4;
+        slice.rest_quad = quad_words.y;
+        slice.first_q = quad_words.w;
 #ifdef STORE_INT8
-        part.first_scale = __ldg(args.mixed_quad_scales + at);
+        slice.first_scale = __ldg(args.mixed_quad_scales + mixed_quad);
 #endif
     }
-    part.item += part.within;
-    part.count = items > part.within ? min(ITEMS_PER_LANE, items - part.within) : 0;
-    if (part.quad >= part.width) {
-        part.quad = part.within = 0;
+    slice.first_item += slice.item_in_quad;
+    slice.item_count = quad_items > slice.item_in_quad ? min(ITEMS_PER_LANE, quad_items - slice.item_in_quad) : 0;
+    if (slice.quad >= slice.quad_count) {
+        slice.quad = slice.item_in_quad = 0;
     }
-    return part;
+    return slice;
 }
 
-// Shared memory for coalesced stores of a warp, [lane][item][component], and the destination of each lane's items.
-struct OutputStage {
-    float4 numbers[32 * ITEMS_PER_LANE]; // capacity for four components per item
-    uint2 item_ranges[32];          // first item and number of items
+// Staging buffer of a warp in shared memory, for coalesced stores.
+struct OutputStaging {
+    float4 vectors[32 * ITEMS_PER_LANE]; // [lane][item][component]; capacity for four components per item
+    uint2 item_ranges[32];               // per lane: first packed item and number of items
 };
 
-__device__ __forceinline__ float* stage_data(OutputStage& stage) {
-    return (float*)stage.numbers;
+__device__ __forceinline__ float* staged_floats(OutputStaging& staging) {
+    return (float*)staging.vectors;
 }
 
-// Stages three components per item; `first` is the lane's first item.
-__device__ __forceinline__ void stage_triples(OutputStage& stage, const LaneSlice& part, unsigned first, const float (&numbers)[FLOATS_PER_LANE]) {
+// Writes three components per item to the staging buffer. `first_item` is the packed index of the lane's first item.
+__device__ __forceinline__ void stage_triples(OutputStaging& staging, const LaneSlice& slice, unsigned first_item, const float (&triples)[FLOATS_PER_LANE]) {
 #ifdef ONE_ITEM_PER_LANE
-    float* to = stage_data(stage) + 3 * lane_id();
-    to[0] = numbers[0];
-    to[1] = numbers[1];
-    to[2] = numbers[2];
+    float* lane_floats = staged_floats(staging) + 3 * lane_id();
+    lane_floats[0] = triples[0];
+    lane_floats[1] = triples[1];
+    lane_floats[2] = triples[2];
 #else
-    float4* to = stage.numbers + 3 * lane_id();
-    to[0] = make_float4(numbers[0], numbers[1], numbers[2], numbers[3]);
-    to[1] = make_float4(numbers[4], numbers[5], numbers[6], numbers[7]);
-    to[2] = make_float4(numbers[8], numbers[9], numbers[10], numbers[11]);
+    float4* lane_vectors = staging.vectors + 3 * lane_id();
+    lane_vectors[0] = make_float4(triples[0], triples[1], triples[2], triples[3]);
+    lane_vectors[1] = make_float4(triples[4], triples[5], triples[6], triples[7]);
+    lane_vectors[2] = make_float4(triples[8], triples[9], triples[10], triples[11]);
 #endif
-    stage.item_ranges[lane_id()] = make_uint2(first, part.count);
+    staging.item_ranges[lane_id()] = make_uint2(first_item, slice.item_count);
 }
 
-// Writes the staged numbers so that whole sectors are written. A warp of one domain writes one run, with 16 bytes per
-// lane if the run is aligned.
-__device__ __forceinline__ void store_stage(float* packed, OutputStage& stage, const LaneSlice& part) {
+// Stores the staged triples so that whole sectors are written. The items of a tile of one domain are contiguous; they are
+// written with 16 bytes per lane if aligned.
+__device__ __forceinline__ void store_staged_triples(float* packed, OutputStaging& staging, const LaneSlice& slice) {
     __syncwarp();
-    if (part.kind & TILE_LAST) {
-        const unsigned first = stage.item_ranges[0].x, floats = 3 * part.run;
-        float* run = packed + 3 * (size_t)first;
-        const unsigned fours = first % 4 == 0 ? floats / 4 : 0;
+    if (slice.kind & LAST_QUAD_ITEMS) {
+        const unsigned first_item = staging.item_ranges[0].x, float_count = 3 * slice.warp_item_count;
+        float* output = packed + 3 * (size_t)first_item;
+        const unsigned vector_count = first_item % 4 == 0 ? float_count / 4 : 0;
 #pragma unroll
         for (unsigned i = lane_id(); i < 8 * FLOATS_PER_LANE; i += 32) {
-            if (i < fours) {
-                __stcs((float4*)run + i, stage.numbers[i]);
+            if (i < vector_count) {
+                __stcs((float4*)output + i, staging.vectors[i]);
             }
         }
-        for (unsigned i = 4 * fours + lane_id(); i < floats; i += 32) {
-            __stcs(run + i, stage_data(stage)[i]);
+        for (unsigned i = 4 * vector_count + lane_id(); i < float_count; i += 32) {
+            __stcs(output + i, staged_floats(staging)[i]);
         }
     } else {
-        // Number 32 k + lane of the stage belongs to lane (32 k + lane) / FLOATS. The pattern repeats every three k,
-        // shifted by a whole number of lanes.
-        unsigned owner[3], within[3];
+        // Staged float 32 k + lane belongs to lane (32 k + lane) / FLOATS_PER_LANE. The pattern repeats after three values
+        // of k, shifted by a whole number of lanes.
+        unsigned owner_lane[3], number_in_lane[3];
 #pragma unroll
         for (unsigned k = 0; k < 3; ++k) {
-            owner[k] = (32 * k + lane_id()) / FLOATS_PER_LANE;
-            within[k] = (32 * k + lane_id()) % FLOATS_PER_LANE;
+            owner_lane[k] = (32 * k + lane_id()) / FLOATS_PER_LANE;
+            number_in_lane[k] = (32 * k + lane_id()) % FLOATS_PER_LANE;
         }
 #pragma unroll
         for (unsigned k = 0; k < FLOATS_PER_LANE; ++k) {
-            const uint2 place = stage.item_ranges[owner[k % 3] + 96 / FLOATS_PER_LANE * (k / 3)];
-            if (within[k % 3] < 3 * place.y) {
-                __stcs(packed + (3 * (size_t)place.x + within[k % 3]), stage_data(stage)[32 * k + lane_id()]);
+            const uint2 item_range = staging.item_ranges[owner_lane[k % 3] + 96 / FLOATS_PER_LANE * (k / 3)];
+            if (number_in_lane[k % 3] < 3 * item_range.y) {
+                __stcs(packed + (3 * (size_t)item_range.x + number_in_lane[k % 3]), staged_floats(staging)[32 * k + lane_id()]);
             }
         }
     }
     __syncwarp();
 }
 
-// Writes four components per item, which are already staged; the destinations are those of the last `stage_triples`.
-__device__ __forceinline__ void store_quadruples(float4* packed, OutputStage& stage) {
+// Stores the staged quadruples to the items of the last `stage_triples`.
+__device__ __forceinline__ void store_staged_quadruples(float4* packed, OutputStaging& staging) {
     __syncwarp();
 #pragma unroll
     for (unsigned k = 0; k < ITEMS_PER_LANE; ++k) {
         const unsigned i = 32 * k + lane_id();
-        const uint2 place = stage.item_ranges[i / ITEMS_PER_LANE];
-        if (i % ITEMS_PER_LANE < place.y) {
-            __stcs(packed + place.x + i % ITEMS_PER_LANE, stage.numbers[i]);
+        const uint2 item_range = staging.item_ranges[i / ITEMS_PER_LANE];
+        if (i % ITEMS_PER_LANE < item_range.y) {
+            __stcs(packed + item_range.x + i % ITEMS_PER_LANE, staging.vectors[i]);
         }
     }
     __syncwarp();
@@ -162,25 +162,25 @@ struct LaneItems {
     float values[ITEMS_PER_LANE];
 };
 
-// The first component of a lane's first item in a table with `numbers` components per item: [tile][numbers][width]
-// float4, or [quad][numbers] float4 for quads of mixed tiles.
-__device__ __forceinline__ const float* item_pointer(const float4* table, const LaneSlice& part, unsigned numbers) {
-    const unsigned quad = part.kind & TILE_LAST ? part.quad : 0;
-    return (const float*)(table + numbers * (size_t)part.rest + quad) + part.within;
+// Pointer to the first component of a lane's first item. The table holds [component_count][quad_count] float4 per tile of
+// one domain, or [component_count] float4 per quad of a mixed tile.
+__device__ __forceinline__ const float* item_pointer(const float4* table, const LaneSlice& slice, unsigned component_count) {
+    const unsigned quad = slice.kind & LAST_QUAD_ITEMS ? slice.quad : 0;
+    return (const float*)(table + component_count * (size_t)slice.rest_quad + quad) + slice.item_in_quad;
 }
 
-// Component `number` of a lane's items.
-__device__ __forceinline__ LaneItems load_items(const float4* table, const LaneSlice& part, unsigned numbers, unsigned number) {
-    const float* from = item_pointer(table, part, numbers) + 4 * number * part.stride;
+// Loads one component of a lane's items.
+__device__ __forceinline__ LaneItems load_items(const float4* table, const LaneSlice& slice, unsigned component_count, unsigned component) {
+    const float* source = item_pointer(table, slice, component_count) + 4 * component * slice.component_stride;
     LaneItems items;
 #ifdef ONE_ITEM_PER_LANE
-    items.values[0] = __ldg(from);
+    items.values[0] = __ldg(source);
 #else
-    const float4 four = __ldg((const float4*)from);
-    items.values[0] = four.x;
-    items.values[1] = four.y;
-    items.values[2] = four.z;
-    items.values[3] = four.w;
+    const float4 vector = __ldg((const float4*)source);
+    items.values[0] = vector.x;
+    items.values[1] = vector.y;
+    items.values[2] = vector.z;
+    items.values[3] = vector.w;
 #endif
     return items;
 }

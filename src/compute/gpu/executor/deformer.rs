@@ -97,11 +97,11 @@ impl CudaDeformer {
                 &deform,
             )?,
             normals,
-            apply: apply.map(|apply| ApplyKernel::new(device, deform.packing(), apply)).transpose()?,
+            apply: apply.map(|apply| ApplyKernel::new(device, deform.packer(), apply)).transpose()?,
             deform,
         };
         let output = OutputBuffers::new(device, &plan, gl_buffers)?;
-        let inputs = StepInputs::new(device, kernels.deform.packing())?;
+        let inputs = StepInputs::new(device, kernels.deform.packer())?;
         Ok(Self {
             step_slots: vec![StepSlot::new(device, &kernels, &inputs, output.is_shared())?],
             output_ring: OutputRing::new(output.max_sets(), max_changed_domains(scene)),
@@ -205,7 +205,7 @@ impl CudaDeformer {
         let list_lengths = match (&target.dirty_domains, &state.changed, &mut step_slot.change_list, &mut kernels.apply)
         {
             (Some(outdated), DirtyDomains::Some(changed), Some(list), Some(apply)) => {
-                apply.write(list, kernels.deform.packing(), state, ChangedDomains { changed, outdated })?
+                apply.write(list, kernels.deform.packer(), state, ChangedDomains { changed, outdated })?
             }
             _ => None,
         };
@@ -333,8 +333,8 @@ fn header(target: &StepTarget, list_lengths: Option<ChangeListLengths>, last_ful
         output_step: if list_lengths.is_some() { target.shown_step } else { 0 },
         last_full_step,
         step: target.step,
-        changed: lengths.changed,
-        dirty_tiles: lengths.dirty_tiles,
+        change_count: lengths.change_count,
+        dirty_tile_count: lengths.dirty_tile_count,
         ..Header::default()
     }
 }

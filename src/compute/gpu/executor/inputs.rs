@@ -54,14 +54,14 @@ pub enum InputPart {
 }
 
 impl StepInputs {
-    /// Allocates the buffers for steps in the layout of `packing`.
+    /// Allocates the buffers for steps in the layout of `packer`.
     ///
     /// # Errors
     /// `Fault` when the device has not enough memory.
-    pub fn new(device: &Device, packing: &Arc<InputPacker>) -> Result<Self> {
-        let (scene, sizes) = (&packing.scene, InputSizes::of(&packing.scene, &packing.coordinates));
+    pub fn new(device: &Device, packer: &Arc<InputPacker>) -> Result<Self> {
+        let (scene, sizes) = (&packer.scene, InputSizes::of(&packer.scene, &packer.coordinates));
         Ok(Self {
-            writer: InputWriter::new(packing),
+            writer: InputWriter::new(packer),
             buffer: DeviceBuffer::zeroed(device, sizes.total())?,
             change_steps: DeviceBuffer::zeroed(device, 4 * scene.domains.len() as u64)?,
             transform_links: DeviceBuffer::upload(device, &transform_links(scene))?,

@@ -48,19 +48,19 @@ struct RasterArgs {
     positions: u64,
     triangles: u64,
     target: u64,
-    medium: u64,
-    large: u64,
+    medium_queue: u64,
+    large_queue: u64,
     counters: u64,
     uvs: u64,
     material_indices: u64,
     materials: u64,
-    clip: [f32; 16],
-    half: [f32; 2],
-    guard: [f32; 2],
+    clip_from_position: [f32; 16],
+    half_size: [f32; 2],
+    guard_band: [f32; 2],
     size: [u32; 2],
-    first: u32,
-    count: u32,
-    faces: u32,
+    first_triangle: u32,
+    triangle_count: u32,
+    culls_back_faces: u32,
     first_cut_out: u32,
 }
 
@@ -70,10 +70,10 @@ const _: () = assert!(size_of::<RasterArgs>() == 176, "RasterArgs differs from k
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct RasterCounters {
-    medium: u32,
+    medium_count: u32,
     pad: u32,
-    large: u64,
-    counts: [u32; 8],
+    large_count: u64,
+    bin_counts: [u32; 8],
 }
 
 const _: () = assert!(size_of::<RasterCounters>() == 48, "RasterCounters differs from kernels/raster.cuh");
@@ -134,8 +134,8 @@ pub struct RasterPass<'a> {
 #[derive(Debug)]
 pub struct RasterPipeline {
     triangles: DeviceBuffer,
-    medium: DeviceBuffer,
-    large: DeviceBuffer,
+    medium_queue: DeviceBuffer,
+    large_queue: DeviceBuffer,
     counters: DeviceBuffer,
     cut_outs: Option<CutOutBuffers>,
     /// Number of blocks of the kernels that loop over a queue.
@@ -156,8 +156,8 @@ impl RasterPipeline {
         let count = triangles.len() as u64;
         Ok(Self {
             triangles: DeviceBuffer::upload(device, triangles.as_flattened())?,
-            medium: DeviceBuffer::zeroed(device, 4 * count)?,
-            large: DeviceBuffer::zeroed(device, LARGE_ENTRY_BYTES * count)?,
+            medium_queue: DeviceBuffer::zeroed(device, 4 * count)?,
+            large_queue: DeviceBuffer::zeroed(device, LARGE_ENTRY_BYTES * count)?,
             counters: DeviceBuffer::zeroed(device, size_of::<RasterCounters>() as u64)?,
             cut_outs: cut_outs.map(|cut_outs| CutOutBuffers::new(device, cut_outs)).transpose()?,
             blocks: BLOCKS_PER_SM * multiprocessors,
@@ -192,8 +192,12 @@ impl RasterPipeline {
                 [(Some(&functions.raster), opaque_range), (functions.raster_cut_outs.as_ref(), cut_out_range)]
             {
                 if let Some(function) = function.filter(|_| range.triangles > 0) {
-                    let faces = u32::from(range.cull_mode == CullMode::Back);
-                    let args = RasterArgs { first: range.first, count: range.triangles, faces, ..args };
+                    let args = RasterArgs {
+                        first_triangle: range.first,
+                        triangle_count: range.triangles,
+                        culls_back_faces: u32::from(range.cull_mode == CullMode::Back),
+                        ..args
+                    };
                     start(function, range.triangles.div_ceil(BLOCK_THREADS), args)?;
                 }
             }
@@ -227,7 +231,7 @@ impl RasterPipeline {
     pub fn counts(&self, device: &Device) -> Result<[u32; 8]> {
         let mut counters = [RasterCounters::zeroed()];
         self.counters.read(device, 0, &mut counters)?;
-        Ok(counters[0].counts)
+        Ok(counters[0].bin_counts)
     }
 
     fn args(&self, pass: &RasterPass<'_>) -> RasterArgs {
@@ -237,12 +241,12 @@ impl RasterPipeline {
             positions: pass.positions,
             triangles: self.triangles.address(),
             target: pass.target,
-            medium: self.medium.address(),
-            large: self.large.address(),
+            medium_queue: self.medium_queue.address(),
+            large_queue: self.large_queue.address(),
             counters: self.counters.address(),
-            clip: *pass.window.clip_from_positions(),
-            half: pass.window.half_size(),
-            guard: pass.window.guard_band(),
+            clip_from_position: *pass.window.clip_from_positions(),
+            half_size: pass.window.half_size(),
+            guard_band: pass.window.guard_band(),
             size: pass.window.size(),
             uvs: addresses.uvs,
             material_indices: addresses.material_indices,

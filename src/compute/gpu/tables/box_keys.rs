@@ -1,4 +1,5 @@
-//! Boxes as the kernels write them: keys of -x, -y, -z, x, y, z, whose order as integers is that of the numbers. Pure.
+//! Boxes as the kernels write them: the maxima of -x, -y, -z, x, y, z as integer keys, which have the order of the numbers.
+//! Pure.
 
 use nalgebra::Vector3;
 
@@ -7,19 +8,19 @@ use modalcast_model::scene::{BoundingBox, OrientedBounds};
 /// The bounding axes as arguments of `bounds`; zeros without any.
 pub(crate) fn axes_to_f32(axes: Option<[Vector3<f64>; 3]>) -> [f32; 9] {
     let axes = axes.unwrap_or_default();
-    std::array::from_fn(|at| axes[at / 3][at % 3] as f32)
+    std::array::from_fn(|index| axes[index / 3][index % 3] as f32)
 }
 
 /// The bounds along the bounding axes, from the last six of twelve keys; `None` when there are only six keys.
 ///
 /// The kernel rounds its sums outward, but its axes are f32. A component of a unit vector in f32 has an error of at
-/// most 2^-25, so an end of the bounds has an error of at most 2^-25 times the sum of the largest coordinates. This
-/// function widens the bounds by twice that.
+/// most 2^-25, so each bound has an error of at most 2^-25 times the sum of the largest absolute x, y and z. This function
+/// widens the bounds by twice that.
 pub(crate) fn oriented_bounds_from_keys(keys: &[u32]) -> Option<OrientedBounds> {
     let (world, oriented) = keys.split_at_checked(6).filter(|(_, oriented)| oriented.len() == 6)?;
     let world = bounds_from_keys(world);
-    let farthest: f64 = world.min.iter().zip(&world.max).map(|(min, max)| min.abs().max(max.abs())).sum();
-    Some(OrientedBounds(bounds_from_keys(oriented)).expanded_by(farthest * f64::from(f32::EPSILON) / 2.0))
+    let coordinate_sum: f64 = world.min.iter().zip(&world.max).map(|(min, max)| min.abs().max(max.abs())).sum();
+    Some(OrientedBounds(bounds_from_keys(oriented)).expanded_by(coordinate_sum * f64::from(f32::EPSILON) / 2.0))
 }
 
 /// The bounds that six keys encode.
@@ -32,8 +33,8 @@ pub(crate) fn bounds_from_keys(keys: &[u32]) -> BoundingBox {
     bounds
 }
 
-/// `ordered_to_float` of `kernels/ordered_float.cuh`, the inverse of `float_to_ordered`. The key 0, which encodes no number, gives a NaN like
-/// the key of NaN.
+/// Twin of `ordered_to_float` in `kernels/ordered_float.cuh`, the inverse of `float_to_ordered`. Key 0, which no number has,
+/// gives NaN.
 fn ordered_to_float(key: u32) -> f32 {
     f32::from_bits(if key >> 31 == 1 { key & 0x7fff_ffff } else { !key })
 }
@@ -42,7 +43,7 @@ fn ordered_to_float(key: u32) -> f32 {
 mod tests {
     use super::*;
 
-    /// `float_to_ordered` of the kernel, branch by branch.
+    /// Twin of `float_to_ordered` in the kernels.
     fn float_to_ordered(x: f32) -> u32 {
         match x {
             x if x.is_nan() => u32::MAX,
@@ -52,58 +53,57 @@ mod tests {
     }
 
     #[test]
-    fn oriented_bounds_are_the_last_six_keys_and_hold_what_the_axes_lost_in_f32() {
+    fn oriented_bounds_cover_the_rounding_error_of_the_axes() {
         let world = [1000.0_f32, 10.0, 1.0, 2000.0, 10.0, -0.5].map(float_to_ordered);
         let oriented = [1.0_f32, -2.0, 0.0, 4.0, 5.0, 6.0].map(float_to_ordered);
-        assert_eq!(oriented_bounds_from_keys(&world), None, "without axes there are six");
-        let OrientedBounds(got) = oriented_bounds_from_keys(&[world, oriented].concat()).expect("twelve");
+        assert_eq!(oriented_bounds_from_keys(&world), None, "six keys have no oriented bounds");
+        let OrientedBounds(bounds) = oriented_bounds_from_keys(&[world, oriented].concat()).expect("oriented bounds");
         let margin = (2000.0 + 10.0 + 1.0) * 2.0_f64.powi(-24);
-        for (end, want) in [(got.min, [-1.0, 2.0, 0.0]), (got.max, [4.0, 5.0, 6.0])] {
-            let out = |axis: usize| if want[axis] == end[axis] { 0.0 } else { (want[axis] - end[axis]).abs() };
-            assert!((0..3).all(|axis| (out(axis) - margin).abs() < 1e-12), "{end:?}");
+        for (widened, exact) in [(bounds.min, [-1.0_f64, 2.0, 0.0]), (bounds.max, [4.0, 5.0, 6.0])] {
+            let widening = |axis: usize| (exact[axis] - widened[axis]).abs();
+            assert!((0..3).all(|axis| (widening(axis) - margin).abs() < 1e-12), "{widened:?}");
         }
-        assert!(got.min[0] < -1.0 && got.max[2] > 6.0, "outwards");
-        let mut lost = oriented;
-        lost[4] = float_to_ordered(f32::NAN);
-        assert!(!oriented_bounds_from_keys(&[world, lost].concat()).is_some_and(|oriented| oriented.is_valid()));
-        assert!(
-            !oriented_bounds_from_keys(&[0; 12]).is_some_and(|oriented| oriented.is_valid()),
-            "nothing was measured"
-        );
+        assert!(bounds.min[0] < -1.0 && bounds.max[2] > 6.0, "expected wider bounds, got {bounds:?}");
+        let is_valid = |keys: &[u32]| oriented_bounds_from_keys(keys).is_some_and(|bounds| bounds.is_valid());
+        let mut with_nan = oriented;
+        with_nan[4] = float_to_ordered(f32::NAN);
+        assert!(!is_valid(&[world, with_nan].concat()));
+        assert!(!is_valid(&[0; 12]), "keys that no number has");
     }
 
     #[test]
-    fn the_margin_covers_axes_in_f32_whatever_the_sun() {
-        let mut worst = 0.0_f64;
+    fn rounding_error_of_axes_is_at_most_two_to_minus_25() {
+        let mut max_error = 0.0_f64;
         for step in 0..1000 {
             let angle = 0.1 * f64::from(step);
             let sun = Vector3::new(angle.sin(), (1.7 * angle).cos(), (0.3 * angle).sin()).normalize();
             let axes = modalcast_model::scene::light_axes(sun, modalcast_model::scene::UpAxis::Y);
-            for (axis, axes_to_f32) in axes.iter().zip(axes_to_f32(Some(axes)).chunks_exact(3)) {
-                (0..3).for_each(|at| worst = worst.max((axis[at] - f64::from(axes_to_f32[at])).abs()));
+            for (axis, rounded_axis) in axes.iter().zip(axes_to_f32(Some(axes)).chunks_exact(3)) {
+                let error = |component: usize| (axis[component] - f64::from(rounded_axis[component])).abs();
+                max_error = (0..3).map(error).fold(max_error, f64::max);
             }
         }
-        assert!(worst <= 2.0_f64.powi(-25) && worst > 2.0_f64.powi(-28), "{worst}");
+        assert!(max_error <= 2.0_f64.powi(-25) && max_error > 2.0_f64.powi(-28), "{max_error}");
         assert_eq!(axes_to_f32(None), [0.0; 9]);
     }
 
     #[test]
-    fn keys_keep_the_order_of_numbers_and_a_nan_or_nothing_is_not_finite() {
-        let rising = [f32::NEG_INFINITY, -1e30, -1.0, -1e-45, -0.0, 0.0, 1e-45, 2.5, f32::MAX, f32::INFINITY];
-        for pair in rising.windows(2) {
+    fn keys_have_the_order_of_numbers() {
+        let ascending = [f32::NEG_INFINITY, -1e30, -1.0, -1e-45, -0.0, 0.0, 1e-45, 2.5, f32::MAX, f32::INFINITY];
+        for pair in ascending.windows(2) {
             assert!(float_to_ordered(pair[0]) < float_to_ordered(pair[1]), "{pair:?}");
             assert!(float_to_ordered(pair[0]) > 0);
         }
-        for number in rising {
+        for number in ascending {
             assert_eq!(ordered_to_float(float_to_ordered(number)).to_bits(), number.to_bits());
         }
         assert!(ordered_to_float(float_to_ordered(f32::NAN)).is_nan());
         assert!(ordered_to_float(0).is_nan());
-        let good = [-1.0_f32, -2.0, -3.0, 4.0, 5.0, 6.0].map(float_to_ordered);
-        assert_eq!(bounds_from_keys(&good), BoundingBox { min: [1.0, 2.0, 3.0], max: [4.0, 5.0, 6.0] });
-        for bad in [f32::NAN, f32::INFINITY] {
-            let mut keys = good;
-            keys[4] = float_to_ordered(bad);
+        let finite = [-1.0_f32, -2.0, -3.0, 4.0, 5.0, 6.0].map(float_to_ordered);
+        assert_eq!(bounds_from_keys(&finite), BoundingBox { min: [1.0, 2.0, 3.0], max: [4.0, 5.0, 6.0] });
+        for non_finite in [f32::NAN, f32::INFINITY] {
+            let mut keys = finite;
+            keys[4] = float_to_ordered(non_finite);
             assert!(!bounds_from_keys(&keys).is_finite());
         }
         assert!(!bounds_from_keys(&[0; 6]).is_finite());

@@ -2,43 +2,42 @@
 //! coordinates, and the tiles to compute. Pure.
 //!
 //! ```text
-//! [changes][transforms: 12 words each][q][tiles]
+//! [changes][new transforms: 12 words each][new q][dirty tiles]
 //! ```
 
 use super::input_packing::InputPacker;
 use super::layout::Change;
 use modalcast_model::scene::{Scene, SceneState};
 
-/// A partial step pays off up to 1 / `MAX_CHANGED_DIVISOR` of the domains; beyond that the whole state is copied.
+/// A partial step changes at most 1 / `MAX_CHANGED_DIVISOR` of the domains. With more changes, copying the whole state is
+/// faster.
 const MAX_CHANGED_DIVISOR: usize = 4;
 
 /// Lengths of the lists of a step.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ChangeListLengths {
-    pub changed: u32,
-    pub dirty_tiles: u32,
+    pub change_count: u32,
+    pub dirty_tile_count: u32,
 }
 
 /// Words of a [`Change`] and of a transform.
 const CHANGE_WORDS: usize = size_of::<Change>() / 4;
 const TRANSFORM_WORDS: usize = 12;
 
-/// Maximum number of changed domains in a partial step; 0 where steps are always full: when the scene has too few
-/// domains, or when it truncates modes. The set of truncated modes depends on q and is uploaded only with the whole
-/// state.
+/// Maximum number of changed domains in a partial step. 0 if all steps are full, because the scene has too few domains or
+/// truncates modes. The set of truncated modes depends on q and is uploaded only with the whole state.
 pub(crate) const fn max_changed_domains(scene: &Scene) -> usize {
     if scene.features.truncation { 0 } else { scene.domains.len() / MAX_CHANGED_DIVISOR }
 }
 
-/// Maximum number of entries of such a list: silent domains have none.
+/// Maximum number of [`Change`]s of a partial step.
 pub(crate) fn max_change_entries(scene: &Scene) -> usize {
-    let silent = (0..scene.domains.len()).filter(|domain| needs_no_entry(scene, *domain)).count();
-    max_changed_domains(scene).min(scene.domains.len() - silent)
+    let domain_count = (0..scene.domains.len()).filter(|domain| !needs_no_entry(scene, *domain)).count();
+    max_changed_domains(scene).min(domain_count)
 }
 
-/// Whether a step never has to send a change of this domain: the domain follows another domain's transform, has no
-/// coordinates, and the scene keeps neither exact normals nor boxes, which read the step of its last change. Its tiles
-/// are recomputed nevertheless.
+/// Whether a changed domain needs no [`Change`], only new tiles: it follows another domain's transform, has no
+/// coordinates, and the scene keeps neither exact normals nor boxes, which read the step of the domain's last change.
 fn needs_no_entry(scene: &Scene, domain: usize) -> bool {
     let features = scene.features;
     features.followers
@@ -47,26 +46,27 @@ fn needs_no_entry(scene: &Scene, domain: usize) -> bool {
         && scene.transform_roots.frame_of(domain).is_some()
 }
 
-/// Where each list begins in the memory of a partial step, in words, and the number of all words.
+/// Offsets of the lists in the memory of a partial step, in words. The changes have offset 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct ChangeListLayout {
     pub transforms: usize,
     pub q: usize,
     pub tiles: usize,
-    pub end: usize,
+    /// Number of words of all lists.
+    pub word_count: usize,
 }
 
 impl ChangeListLayout {
-    /// `entries`: maximum number of changed domains; `coordinates` and `tiles`: numbers of all of a scene.
-    pub(crate) const fn new(entries: usize, coordinates: usize, tiles: usize) -> Self {
-        let transforms = CHANGE_WORDS * entries;
-        let q = transforms + TRANSFORM_WORDS * entries;
-        Self { transforms, q, tiles: q + coordinates, end: q + coordinates + tiles }
+    /// `max_changes`: maximum number of [`Change`]s; `coordinates` and `tiles`: their numbers in the scene.
+    pub(crate) const fn new(max_changes: usize, coordinates: usize, tiles: usize) -> Self {
+        let transforms = CHANGE_WORDS * max_changes;
+        let q = transforms + TRANSFORM_WORDS * max_changes;
+        Self { transforms, q, tiles: q + coordinates, word_count: q + coordinates + tiles }
     }
 
     /// Bytes of the lists.
     pub(crate) const fn bytes(self) -> u64 {
-        4 * self.end as u64
+        4 * self.word_count as u64
     }
 }
 
@@ -75,7 +75,7 @@ impl ChangeListLayout {
 pub struct ChangedDomains<'a> {
     /// Domains that the step changes.
     pub changed: &'a [u32],
-    /// Further domains that the output lacks. Their values are already on the device.
+    /// Further domains that are outdated in the output. Their values are already on the device.
     pub outdated: &'a [u32],
 }
 
@@ -83,122 +83,124 @@ pub struct ChangedDomains<'a> {
 #[derive(Debug)]
 pub(crate) struct ChangeListWriter {
     layout: ChangeListLayout,
-    /// Per tile, the number of the last list that contains it; and the number of lists written.
-    named: Vec<u32>,
-    lists: u32,
+    /// Per tile, the number of the last tile list that contains it.
+    last_lists: Vec<u32>,
+    /// Number of the current tile list.
+    list_number: u32,
 }
 
 impl ChangeListWriter {
-    pub(crate) fn new(packing: &InputPacker) -> Self {
-        let (entries, tiles) = (max_change_entries(&packing.scene), packing.dirty_tile_layout.tiles);
-        let layout = ChangeListLayout::new(entries, packing.coordinates.total, tiles);
-        Self { layout, named: vec![0; tiles], lists: 0 }
+    pub(crate) fn new(packer: &InputPacker) -> Self {
+        let (max_changes, tiles) = (max_change_entries(&packer.scene), packer.dirty_tile_layout.tile_count);
+        let layout = ChangeListLayout::new(max_changes, packer.coordinates.total, tiles);
+        Self { layout, last_lists: vec![0; tiles], list_number: 0 }
     }
 
     pub(crate) const fn layout(&self) -> ChangeListLayout {
         self.layout
     }
 
-    /// Writes the lists of a step to `words`, which has the words of the layout. Returns `None` when the lists have no
+    /// Writes the lists of a step to `words`, which has the length of the layout. Returns `None` when the lists have no
     /// capacity for the changes, or when a full step is less work.
     pub(crate) fn write(
         &mut self,
         words: &mut [u32],
-        packing: &InputPacker,
+        packer: &InputPacker,
         state: &SceneState,
         domains: ChangedDomains<'_>,
     ) -> Option<ChangeListLengths> {
-        let (scene, layout) = (&packing.scene, self.layout);
+        let (scene, layout) = (&packer.scene, self.layout);
         if domains.changed.len() > max_changed_domains(scene) {
             return None;
         }
         let (words, tiles) = words.split_at_mut(layout.tiles);
         let (words, q) = words.split_at_mut(layout.q);
         let (changes, transforms) = words.split_at_mut(layout.transforms);
-        let (mut source, mut count) = (0, 0);
-        let entries = domains.changed.iter().filter(|domain| !needs_no_entry(scene, **domain as usize));
-        for (index, domain) in entries.enumerate() {
-            let (at, first) = (*domain as usize, source);
+        let (mut q_count, mut change_count) = (0, 0);
+        let domains_with_entry = domains.changed.iter().filter(|domain| !needs_no_entry(scene, **domain as usize));
+        for (index, domain_id) in domains_with_entry.enumerate() {
+            let (domain, first_new_q) = (*domain_id as usize, q_count);
             // The kernel does not read the transform of a follower.
-            let transform: [u32; TRANSFORM_WORDS] =
-                bytemuck::cast(state.transforms[scene.transform_roots.root_of(at)].0);
+            let root = scene.transform_roots.root_of(domain);
+            let transform: [u32; TRANSFORM_WORDS] = bytemuck::cast(state.transforms[root].0);
             transforms[TRANSFORM_WORDS * index..][..TRANSFORM_WORDS].copy_from_slice(&transform);
-            let own = state.q_of(scene, at);
-            if source + own.len().next_multiple_of(4) > q.len() {
-                // Domains can share coordinates, so the entries may need more coordinates than the scene has.
+            let domain_q = state.q_of(scene, domain);
+            if q_count + domain_q.len().next_multiple_of(4) > q.len() {
+                // Domains can share coordinates, so the changes may need more coordinates than the scene has.
                 return None;
             }
-            packing.put_q(at, own, |number| {
-                q[source] = number.to_bits();
-                source += 1;
+            packer.put_q(domain, domain_q, |coordinate| {
+                q[q_count] = coordinate.to_bits();
+                q_count += 1;
             });
             let change = Change {
-                domain: *domain,
-                first_q: packing.coordinates.first[at],
-                count: (source - first) as u32,
-                source: first as u32,
+                domain: *domain_id,
+                first_q: packer.coordinates.first[domain],
+                q_count: (q_count - first_new_q) as u32,
+                first_new_q: first_new_q as u32,
             };
             changes[CHANGE_WORDS * index..][..CHANGE_WORDS].copy_from_slice(bytemuck::cast_slice(&[change]));
-            count += 1;
+            change_count += 1;
         }
-        if self.lists == u32::MAX {
-            self.named.fill(0);
-            self.lists = 0;
-        }
-        self.lists += 1;
-        let all = domains.changed.iter().chain(domains.outdated);
-        let dirty_tiles = self.list_tiles(packing, all, tiles);
-        if dirty_tiles as usize > packing.dirty_tile_layout.whole {
+        let dirty_domains = domains.changed.iter().chain(domains.outdated);
+        let dirty_tile_count = self.list_tiles(packer, dirty_domains, tiles);
+        if dirty_tile_count as usize > packer.dirty_tile_layout.full_step_cost {
             return None;
         }
-        Some(ChangeListLengths { changed: count, dirty_tiles })
+        Some(ChangeListLengths { change_count, dirty_tile_count })
     }
 
-    /// Lists the tiles of these domains, each once. Returns their number.
+    /// Lists the tiles of the domains, each tile once. Returns the number of tiles.
     fn list_tiles<'a>(
         &mut self,
-        packing: &InputPacker,
+        packer: &InputPacker,
         domains: impl Iterator<Item = &'a u32>,
         tiles: &mut [u32],
     ) -> u32 {
-        let mut count = 0;
+        if self.list_number == u32::MAX {
+            self.last_lists.fill(0);
+            self.list_number = 0;
+        }
+        self.list_number += 1;
+        let mut tile_count = 0;
         for domain in domains {
-            for (first, length) in packing.dirty_tile_layout.spans[*domain as usize] {
-                for tile in first..first + length {
-                    let mark = &mut self.named[tile as usize];
-                    if *mark != self.lists {
-                        *mark = self.lists;
-                        tiles[count] = tile;
-                        count += 1;
+            let domain_tiles = packer.dirty_tile_layout.domain_tiles[*domain as usize];
+            for span in [domain_tiles.vertices, domain_tiles.corners] {
+                for tile in span.first..span.first + span.count {
+                    let last_list = &mut self.last_lists[tile as usize];
+                    if *last_list != self.list_number {
+                        *last_list = self.list_number;
+                        tiles[tile_count] = tile;
+                        tile_count += 1;
                     }
                 }
             }
         }
-        count as u32
+        tile_count as u32
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::test_scenes::{deformed, followed};
+    use super::super::test_scenes::{scene_with_deformation, scene_with_followers};
     use super::*;
     use modalcast_model::scene::{DeformationSettings, NormalMethod};
 
     #[test]
-    fn followers_without_coordinates_have_entries_where_somebody_asks_for_their_stamps_alone() {
-        let plain = DeformationSettings::default();
-        let exact = DeformationSettings { normals: NormalMethod::Exact, ..plain };
-        let boxes = DeformationSettings { boxes: true, ..plain };
-        let displacements = DeformationSettings { displacements: true, ..plain };
+    fn rigid_followers_have_entries_only_for_their_change_steps() {
+        let defaults = DeformationSettings::default();
+        let exact = DeformationSettings { normals: NormalMethod::Exact, ..defaults };
+        let boxes = DeformationSettings { boxes: true, ..defaults };
+        let displacements = DeformationSettings { displacements: true, ..defaults };
         let mut sizes = [(7, 0); 8];
-        // Without modes, normals would not follow the surface.
+        // In a scene without modes, exact normals would not be computed.
         sizes[7].1 = 1;
-        let entries = |deformation| max_change_entries(&followed(&sizes, deformation));
-        // A quarter of sixteen domains may change; one is the transform root, and two have coordinates.
-        assert_eq!([plain, exact, boxes, displacements].map(entries), [3, 4, 4, 3]);
-        assert_eq!(max_change_entries(&deformed(&sizes, plain)), 4, "nobody follows");
-        assert_eq!(max_changed_domains(&followed(&sizes, plain)), 4, "followers count among what changes");
-        let truncated = DeformationSettings { truncation: Some(0.1), ..plain };
-        assert_eq!(max_change_entries(&followed(&sizes, truncated)), 0);
+        let max_entries = |deformation| max_change_entries(&scene_with_followers(&sizes, deformation));
+        // A quarter of sixteen domains may change. One domain is the transform root, and two have coordinates.
+        assert_eq!([defaults, exact, boxes, displacements].map(max_entries), [3, 4, 4, 3]);
+        assert_eq!(max_change_entries(&scene_with_deformation(&sizes, defaults)), 4, "a scene without followers");
+        assert_eq!(max_changed_domains(&scene_with_followers(&sizes, defaults)), 4, "followers also change");
+        let truncated = DeformationSettings { truncation: Some(0.1), ..defaults };
+        assert_eq!(max_entries(truncated), 0);
     }
 }

@@ -1,11 +1,11 @@
 //! All constant tables of a scene on the device. The plan counts their bytes, and the launchers upload them. Pure.
 
-use super::box_segments;
+use super::box_segments::box_segments;
 use super::change_list::max_change_entries;
 use super::input_packing::{InputSizes, transform_links};
 use super::layout::{BoxSegment, NormalSlot, TransformLink};
 use super::normal_tables;
-use super::rings::{self, RingTables};
+use super::rings::{RingTables, normal_slots};
 use super::work::{CoordinateLayout, WorkList, rest_directions, rest_positions};
 use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::deform::BoundingAxes;
@@ -36,8 +36,8 @@ pub struct DeviceTables {
     /// The parts of domains that `bounds` reduces to boxes.
     pub(crate) segments: Vec<BoxSegment>,
     /// x0, three float4 per quad.
-    pub(crate) rest: Vec<[f32; 4]>,
-    /// Rigid normals and tangents at rest, three and four float4 per quad; empty where `deform` computes none.
+    pub(crate) rest_positions: Vec<[f32; 4]>,
+    /// Normals and tangents at rest, three and four float4 per quad; empty where `deform` computes none.
     pub(crate) rest_normals: Vec<[f32; 4]>,
     pub(crate) rest_tangents: Vec<[f32; 4]>,
     /// Only if normals follow the surface.
@@ -45,8 +45,8 @@ pub struct DeviceTables {
     pub(crate) transform_links: Vec<TransformLink>,
     /// Sizes of the values of a step.
     pub(crate) inputs: InputSizes,
-    /// Number of entries of the tile list of a partial step; 0 for a scene whose steps are always full.
-    pub(crate) listed_tiles: usize,
+    /// Capacity of the tile list of a partial step; 0 for a scene whose steps are always full.
+    pub(crate) tile_list_capacity: usize,
     /// Axes along which `bounds` reduces the boxes in addition to the world's axes.
     pub(crate) bounding_axes: Option<BoundingAxes>,
 }
@@ -59,14 +59,14 @@ impl DeviceTables {
         let [rest_normals, rest_tangents] = rest_directions(scene, &work);
         Self {
             bounding_axes: options.bounding_axes,
-            segments: box_segments::segments(scene, &work),
-            rest: rest_positions(scene, &work),
+            segments: box_segments(scene, &work),
+            rest_positions: rest_positions(scene, &work),
             rest_normals,
             rest_tangents,
             normals: scene.features.exact_normals.then(|| NormalTables::new(scene)),
             transform_links: transform_links(scene),
             inputs: InputSizes::of(scene, &coordinates),
-            listed_tiles: if max_change_entries(scene) > 0 { work.tiles.len() } else { 0 },
+            tile_list_capacity: if max_change_entries(scene) > 0 { work.tiles.len() } else { 0 },
             work,
             coordinates,
         }
@@ -88,9 +88,10 @@ pub(crate) struct NormalTables {
 
 impl NormalTables {
     fn new(scene: &Scene) -> Self {
-        let slots = rings::slots(scene);
+        let slots = normal_slots(scene);
+        let first_corners = slots.iter().map(|slot| slot.first_corner);
         Self {
-            first_domains: normal_tables::first_domains(slots.iter().map(|slot| slot.first), scene.layout.corners),
+            first_domains: normal_tables::first_domains(first_corners, scene.layout.corners),
             rest_normals: normal_tables::rest_normals(scene),
             rest_tangents: if scene.features.normal_maps { normal_tables::rest_tangents(scene) } else { Vec::new() },
             rings: RingTables::new(scene),

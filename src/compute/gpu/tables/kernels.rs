@@ -1,4 +1,4 @@
-//! The kernels of a step: their sources, and the macros and grids that a scene needs. Pure.
+//! The kernels of a step: their sources, and the macros and grid sizes for a scene. Pure.
 
 use super::change_list::max_change_entries;
 use super::device_tables::DeviceTables;
@@ -48,17 +48,19 @@ pub(crate) const KERNELS: [KernelSource; 5] = [
 /// The macros that select the storage type of U; f32 has none.
 pub(crate) const STORAGE_DEFINES: [&str; 3] = ["STORE_F16", "STORE_BF16", "STORE_INT8"];
 
-/// Below this number of tiles a lane computes one vertex instead of four, because the tiles would not fill the device:
-/// eight warps for each multiprocessor of a large device.
+/// Below this number of tiles a lane computes one item instead of four, because one warp per tile would not fill the
+/// device. The number is eight warps for each multiprocessor of a large device.
 const MIN_FOUR_ITEM_TILES: usize = 1024;
 
-/// Smaller maximum group sizes (vectors q_b) that the kernel can be compiled for, with their macros; the default is
+/// Smaller maximum group sizes that `batch` can be compiled for, in ascending order, with their macros. The default is
 /// [`MAX_BATCH_SIZE`].
 const SMALLER_BATCHES: [(usize, &str); 2] = [(4, "BATCH_4"), (8, "BATCH_8")];
 
-/// Warps per block of `batch`, and bytes of shared memory: per warp, and per vector without its q.
+/// Warps per block of `batch`.
 pub(crate) const BATCH_WARPS: usize = 2;
+/// Bytes of `WarpStorage` and `WarpSlice` in `kernels/batch_load.cuh`, per warp.
 const WARP_BYTES: usize = 9984 + 72;
+/// Bytes of a transform and a `BatchMember`, per member.
 const MEMBER_BYTES: usize = 64;
 
 /// The macro of a storage type.
@@ -76,55 +78,66 @@ pub(crate) const fn has_one_item_per_lane(work: &WorkList) -> bool {
     work.full_step_tiles < MIN_FOUR_ITEM_TILES
 }
 
-/// Threads per block of `deform`: 32 WARPS of its source, which the launcher verifies.
+/// Threads per block of `deform`: 32 * WARPS of its source, which the launcher verifies.
 fn block_threads(defines: &[&str]) -> u32 {
-    let one = ["MODES", "SHEAR", "TILE_LIST"].iter().any(|macro_name| defines.contains(macro_name));
-    TILE_QUADS as u32 * if one { 1 } else { 2 }
+    let has_one_warp = ["MODES", "SHEAR", "TILE_LIST"].iter().any(|name| defines.contains(name));
+    TILE_QUADS as u32 * if has_one_warp { 1 } else { 2 }
 }
 
-/// Number of blocks of `deform` for so many tiles.
-pub(crate) fn deform_blocks(kernel: &KernelDescriptor, tiles: usize) -> u32 {
-    let warps = tiles * if kernel.defines.contains(&"ONE_ITEM_PER_LANE") { 4 } else { 1 };
+/// Number of blocks of `deform` for a number of tiles.
+pub(crate) fn deform_blocks(kernel: &KernelDescriptor, tile_count: usize) -> u32 {
+    let warps = tile_count * if kernel.defines.contains(&"ONE_ITEM_PER_LANE") { 4 } else { 1 };
     warps.div_ceil(kernel.threads as usize / TILE_QUADS) as u32
 }
 
 /// The kernels of a scene in launch order, except `apply`, which is last.
-pub(crate) fn kernels(scene: &Scene, tables: &DeviceTables) -> Vec<KernelDescriptor> {
+pub(crate) fn plan_kernels(scene: &Scene, tables: &DeviceTables) -> Vec<KernelDescriptor> {
     let (features, work, segments) = (scene.features, &tables.work, &tables.segments);
     let [deform, batch, bounds, apply, normals] = KERNELS;
-    let defines = deform_defines(scene, work);
-    let threads = block_threads(&defines);
-    let kind = KernelKind::Deform;
-    let mut deform =
-        KernelDescriptor { kind, name: deform.name, defines, blocks: 0, threads, source: KernelText(deform.source) };
-    deform.blocks = deform_blocks(&deform, work.full_step_tiles);
-    let walk = |kind, kernel: &KernelSource, blocks: usize| {
-        let defines = [
+    let describe = |kind, kernel: &KernelSource, blocks: usize| {
+        let flags = [
             ("NORMAL_MAPS", features.normal_maps),
             ("SHEAR", features.shear),
             ("FOLLOWERS", features.followers),
             ("ORIENTED_BOUNDS", tables.bounding_axes.is_some()),
             ("DOMAIN_BOXES", features.boxes),
         ];
-        let on = defines.iter().filter(|(name, on)| *on && kernel.features.contains(name));
-        let (defines, blocks) = (on.map(|(name, _)| *name).collect(), blocks as u32);
-        KernelDescriptor { kind, name: kernel.name, defines, blocks, threads: BLOCK, source: KernelText(kernel.source) }
+        let is_defined = |(name, is_used): &&(&'static str, bool)| *is_used && kernel.features.contains(name);
+        let defines = flags.iter().filter(is_defined).map(|(name, _)| *name).collect();
+        let (blocks, source) = (blocks as u32, KernelText(kernel.source));
+        KernelDescriptor { kind, name: kernel.name, defines, blocks, threads: BLOCK, source }
     };
-    let few = (4 * work.tiles.len()).div_ceil(BLOCK as usize).min(MAX_GRID_BLOCKS / 4);
-    // Eight threads reduce one piece of a domain and mostly wait for memory, so more blocks hide the latency.
-    let many = segments.len().div_ceil(BLOCK as usize / 8).min(4 * MAX_GRID_BLOCKS);
-    let boxes = if features.boxes { few.max(many) } else { few };
-    let batch = (!work.batched.blocks.is_empty()).then(|| batch_kernel(scene, &work.batched, batch));
-    let mut kernels: Vec<KernelDescriptor> = batch.into_iter().chain([deform]).collect();
-    kernels.push(walk(KernelKind::Bounds, &bounds, boxes));
+    let box_blocks = (4 * work.tiles.len()).div_ceil(BLOCK as usize).min(MAX_GRID_BLOCKS / 4);
+    // Eight threads reduce one segment and mostly wait for memory, so more blocks hide the latency.
+    let segment_blocks = segments.len().div_ceil(BLOCK as usize / 8).min(4 * MAX_GRID_BLOCKS);
+    let bounds_blocks = if features.boxes { box_blocks.max(segment_blocks) } else { box_blocks };
+    let batch = (!work.batched.blocks.is_empty()).then(|| describe_batch(scene, &work.batched, batch));
+    let mut kernels: Vec<KernelDescriptor> = batch.into_iter().chain([describe_deform(scene, work, deform)]).collect();
+    kernels.push(describe(KernelKind::Bounds, &bounds, bounds_blocks));
     if features.exact_normals {
-        kernels.push(walk(KernelKind::Normals, &normals, scene.layout.corners.div_ceil(BLOCK as usize)));
+        kernels.push(describe(KernelKind::Normals, &normals, scene.layout.corners.div_ceil(BLOCK as usize)));
     }
-    let changes = max_change_entries(scene);
-    if changes > 0 {
-        kernels.push(walk(KernelKind::Apply, &apply, changes.div_ceil(BLOCK as usize / 32).min(MAX_GRID_BLOCKS)));
+    let max_changes = max_change_entries(scene);
+    if max_changes > 0 {
+        let apply_blocks = max_changes.div_ceil(BLOCK as usize / 32).min(MAX_GRID_BLOCKS);
+        kernels.push(describe(KernelKind::Apply, &apply, apply_blocks));
     }
     kernels
+}
+
+/// The kernel `deform` of a scene.
+fn describe_deform(scene: &Scene, work: &WorkList, source: KernelSource) -> KernelDescriptor {
+    let defines = deform_defines(scene, work);
+    let mut kernel = KernelDescriptor {
+        kind: KernelKind::Deform,
+        name: source.name,
+        threads: block_threads(&defines),
+        defines,
+        blocks: 0,
+        source: KernelText(source.source),
+    };
+    kernel.blocks = deform_blocks(&kernel, work.full_step_tiles);
+    kernel
 }
 
 /// The macros of `deform`.
@@ -142,21 +155,22 @@ fn deform_defines(scene: &Scene, work: &WorkList) -> Vec<&'static str> {
         ("SHEAR", has_rigid_normals && features.shear),
         ("FOLLOWERS", features.followers),
     ];
-    let on = flags.iter().filter(|(_, on)| *on).map(|(name, _)| *name);
-    on.chain(storage_define(scene.deformation.storage).filter(|_| features.modes)).collect()
+    let defines = flags.iter().filter(|(_, is_used)| *is_used).map(|(name, _)| *name);
+    defines.chain(storage_define(scene.deformation.storage).filter(|_| features.modes)).collect()
 }
 
 /// Maximum number of blocks of the kernels that loop over lists: two per multiprocessor of a large device.
 const MAX_GRID_BLOCKS: usize = 264;
 
-/// The kernel of a scene with batches.
-fn batch_kernel(scene: &Scene, batched: &BatchTables, source: KernelSource) -> KernelDescriptor {
-    let vectors = SMALLER_BATCHES.iter().find(|(vectors, _)| batched.max_members <= *vectors).map(|(_, name)| *name);
-    let follows = scene.features.followers.then_some("FOLLOWERS");
+/// The kernel `batch` of a scene with batches.
+fn describe_batch(scene: &Scene, batched: &BatchTables, source: KernelSource) -> KernelDescriptor {
+    let size_define = SMALLER_BATCHES.iter().find(|(size, _)| batched.max_members <= *size).map(|(_, name)| *name);
+    let followers_define = scene.features.followers.then_some("FOLLOWERS");
+    let defines = storage_define(scene.deformation.storage).into_iter().chain(size_define).chain(followers_define);
     KernelDescriptor {
         kind: KernelKind::Batch,
         name: source.name,
-        defines: storage_define(scene.deformation.storage).into_iter().chain(vectors).chain(follows).collect(),
+        defines: defines.collect(),
         blocks: batched.blocks.len() as u32,
         threads: 32 * BATCH_WARPS as u32,
         source: KernelText(source.source),
@@ -164,16 +178,16 @@ fn batch_kernel(scene: &Scene, batched: &BatchTables, source: KernelSource) -> K
 }
 
 /// Maximum group size of the kernel compiled with these macros.
-fn batch_size_of(defines: &[&str]) -> usize {
-    SMALLER_BATCHES.iter().find(|(_, name)| defines.contains(name)).map_or(MAX_BATCH_SIZE, |(vectors, _)| *vectors)
+fn batch_size(defines: &[&str]) -> usize {
+    SMALLER_BATCHES.iter().find(|(_, name)| defines.contains(name)).map_or(MAX_BATCH_SIZE, |(size, _)| *size)
 }
 
-/// Shared memory of a block of `batch` in bytes: the part of each warp, T and the members of all vectors, and q.
+/// Shared memory of a block of `batch` in bytes: storage of each warp, T and the members, and q.
 pub(crate) fn batch_shared_bytes(batched: &BatchTables, defines: &[&str]) -> usize {
-    let storage =
-        StorageType::ALL.into_iter().find(|storage| storage_define(*storage).is_some_and(|own| defines.contains(&own)));
-    let (vectors, modes) = (batch_size_of(defines), batched.chunks * modes_per_chunk(storage.unwrap_or_default()));
-    BATCH_WARPS * WARP_BYTES + MEMBER_BYTES * vectors + 4 * vectors * modes
+    let is_defined = |storage: &StorageType| storage_define(*storage).is_some_and(|name| defines.contains(&name));
+    let storage = StorageType::ALL.into_iter().find(is_defined).unwrap_or_default();
+    let (batch_size, mode_count) = (batch_size(defines), batched.max_chunks * modes_per_chunk(storage));
+    BATCH_WARPS * WARP_BYTES + MEMBER_BYTES * batch_size + 4 * batch_size * mode_count
 }
 
 #[cfg(test)]
@@ -181,15 +195,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shared_memory_holds_all_modes_of_every_batch() {
-        let longest = BatchTables { chunks: modalcast_model::domain::MAX_RANK, ..BatchTables::default() };
+    fn shared_memory_holds_all_modes_of_a_batch() {
+        let tables = |max_chunks| BatchTables { max_chunks, ..BatchTables::default() };
         // 64 KiB is the shared memory of the smallest supported device.
-        assert!(batch_shared_bytes(&longest, &[]) <= 64 << 10);
-        assert_eq!(batch_shared_bytes(&BatchTables::default(), &["BATCH_4"]), BATCH_WARPS * WARP_BYTES + 64 * 4);
-        let chunks = BatchTables { chunks: 3, ..BatchTables::default() };
-        assert_eq!(
-            batch_shared_bytes(&chunks, &["STORE_INT8"]) - batch_shared_bytes(&BatchTables::default(), &[]),
-            4 * 16 * 12
-        );
+        assert!(batch_shared_bytes(&tables(modalcast_model::domain::MAX_RANK), &[]) <= 64 << 10);
+        assert_eq!(batch_shared_bytes(&tables(0), &["BATCH_4"]), BATCH_WARPS * WARP_BYTES + 64 * 4);
+        let q_bytes = batch_shared_bytes(&tables(3), &["STORE_INT8"]) - batch_shared_bytes(&tables(0), &[]);
+        assert_eq!(q_bytes, 4 * 16 * 12);
     }
 }

@@ -1,5 +1,5 @@
-//! The structs that host and kernels share, field by field as in `kernels/layout.cuh`. Both sides assert the sizes, and
-//! tests compare the offsets.
+//! The structs that host and kernels share, field by field as in `kernels/layout.cuh`, which documents the fields. Both
+//! sides assert the sizes, and tests compare the offsets.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -13,15 +13,15 @@ pub(crate) const BLOCK: u32 = 256;
 /// `first_tangent` of a shape without tangents.
 pub(crate) const NO_TANGENTS: u32 = u32::MAX;
 
-/// `first_member` of a shape without smoothing groups.
+/// `first_corner_group` of a shape without smoothing groups.
 pub(crate) const NO_GROUPS: u32 = u32::MAX;
 
-/// `frame` of a domain that follows no other domain.
+/// [`TransformLink::frame`] of a domain that is its own transform root.
 pub(crate) const NO_FRAME: u32 = TransformRoots::NO_FRAME;
 
-/// Bit fields of [`WarpTile::kind`]: the number of items of the last quad (0 in a mixed tile), and flags for whether the
-/// tile computes vertices and corners.
-pub(crate) const TILE_LAST: u8 = 7;
+/// Bit fields of [`WarpTile::kind`]: the number of items of the last quad (0 in a mixed tile), and whether the tile computes
+/// vertices and corners.
+pub(crate) const LAST_QUAD_ITEMS: u8 = 7;
 pub(crate) const TILE_VERTICES: u8 = 8;
 pub(crate) const TILE_CORNERS: u8 = 16;
 
@@ -36,8 +36,8 @@ pub struct Header {
     pub output_step: u32,
     pub last_full_step: u32,
     pub step: u32,
-    pub changed: u32,
-    pub dirty_tiles: u32,
+    pub change_count: u32,
+    pub dirty_tile_count: u32,
     pub reserved: [u32; 3],
     pub bounds: [u32; 12],
 }
@@ -47,13 +47,13 @@ pub struct Header {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(crate) struct WarpTile {
     pub first_word: u64,
-    pub first: u32,
-    pub rest: u32,
+    pub first_item: u32,
+    pub rest_quad: u32,
     pub domain: u32,
     pub first_q: u32,
     pub first_scale: u32,
-    pub chunks: u16,
-    pub width: u8,
+    pub chunk_count: u16,
+    pub quad_count: u8,
     pub kind: u8,
 }
 
@@ -61,9 +61,9 @@ pub(crate) struct WarpTile {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(crate) struct MixedQuad {
-    pub item: u32,
-    pub rest: u32,
-    pub domain: u32,
+    pub first_item: u32,
+    pub rest_quad: u32,
+    pub packed_domain: u32,
     pub first_q: u32,
 }
 
@@ -73,8 +73,8 @@ pub(crate) struct MixedQuad {
 pub(crate) struct Change {
     pub domain: u32,
     pub first_q: u32,
-    pub count: u32,
-    pub source: u32,
+    pub q_count: u32,
+    pub first_new_q: u32,
 }
 
 /// The transform root of a domain and its frame relative to that root; only in scenes with followers.
@@ -93,7 +93,7 @@ pub(crate) struct DeformArgs {
     pub tiles: u64,
     pub mixed_quads: u64,
     pub words: u64,
-    pub rest: u64,
+    pub rest_positions: u64,
     pub rest_normals: u64,
     pub rest_tangents: u64,
     pub corner_offsets: u64,
@@ -107,7 +107,7 @@ pub(crate) struct DeformArgs {
     pub retained_counts: u64,
     pub retained: u64,
     pub boxes: u64,
-    pub count: u32,
+    pub tile_count: u32,
     pub reserved: u32,
 }
 
@@ -116,19 +116,19 @@ pub(crate) struct DeformArgs {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(crate) struct BatchGroup {
     pub first_word: u64,
-    pub rest: u32,
+    pub rest_quad: u32,
     pub first_scale: u32,
-    pub vertices: u32,
+    pub vertex_count: u32,
     pub first_member: u32,
-    pub chunks: u32,
-    pub members: u32,
+    pub chunk_count: u32,
+    pub member_count: u32,
 }
 
 /// A domain of a [`BatchGroup`].
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(crate) struct BatchMember {
-    pub first: u32,
+    pub first_vertex: u32,
     pub first_q: u32,
     pub domain: u32,
     pub first_tile: u32,
@@ -139,8 +139,8 @@ pub(crate) struct BatchMember {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(crate) struct BatchBlock {
     pub group: u32,
-    pub tile: u32,
-    pub end: u32,
+    pub first_tile: u32,
+    pub end_tile: u32,
     pub reserved: u32,
 }
 
@@ -153,7 +153,7 @@ pub(crate) struct BatchArgs {
     pub groups: u64,
     pub members: u64,
     pub words: u64,
-    pub rest: u64,
+    pub rest_positions: u64,
     pub scales: u64,
     pub transforms: u64,
     pub transform_links: u64,
@@ -166,10 +166,10 @@ pub(crate) struct BatchArgs {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(crate) struct BoxSegment {
-    pub first: u32,
-    pub count: u32,
+    pub first_item: u32,
+    pub item_count: u32,
     pub domain: u32,
-    pub from_vertices: u32,
+    pub is_vertex_range: u32,
 }
 
 /// Arguments of `bounds`.
@@ -181,7 +181,7 @@ pub(crate) struct BoundsArgs {
     pub segments: u64,
     pub change_steps: u64,
     pub segment_boxes: u64,
-    pub count: u32,
+    pub box_count: u32,
     pub segment_count: u32,
     pub bounding_axes: [f32; 9],
     pub reserved: u32,
@@ -207,11 +207,11 @@ pub(crate) struct ApplyArgs {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(crate) struct NormalSlot {
-    pub first: u32,
+    pub first_corner: u32,
     pub first_normal: u32,
     pub first_tangent: u32,
     pub first_vertex: u32,
-    pub first_member: u32,
+    pub first_corner_group: u32,
 }
 
 /// Arguments of `normals`.
@@ -227,13 +227,13 @@ pub(crate) struct NormalsArgs {
     pub transform_links: u64,
     pub frames: u64,
     pub change_steps: u64,
-    pub members: u64,
+    pub corner_groups: u64,
     pub ring_offsets: u64,
     pub rings: u64,
     pub group_normals: u64,
-    pub corners: u32,
-    pub rest_corners: u32,
-    pub groups: u32,
+    pub corner_count: u32,
+    pub rest_corner_count: u32,
+    pub group_count: u32,
     pub reserved: u32,
 }
 
@@ -263,12 +263,12 @@ pub struct LayoutConstant {
 }
 
 macro_rules! layout_constants {
-    ($($of:ident { $($field:ident),* })*) => {
+    ($($struct_name:ident { $($field:ident),* })*) => {
         vec![$(
-            LayoutConstant { expression: concat!("sizeof(", stringify!($of), ")").into(), host: size_of::<$of>() as u32 },
+            LayoutConstant { expression: concat!("sizeof(", stringify!($struct_name), ")").into(), host: size_of::<$struct_name>() as u32 },
             $(LayoutConstant {
-                expression: concat!("OFFSET(", stringify!($of), ", ", stringify!($field), ")").into(),
-                host: std::mem::offset_of!($of, $field) as u32,
+                expression: concat!("OFFSET(", stringify!($struct_name), ", ", stringify!($field), ")").into(),
+                host: std::mem::offset_of!($struct_name, $field) as u32,
             },)*
         )*]
     };
@@ -278,32 +278,36 @@ macro_rules! layout_constants {
 pub fn layout_constants() -> Vec<LayoutConstant> {
     let mut list = layout_constants! {
         Header {
-            positions, normals, tangents, displacements, output_step, last_full_step, step, changed, dirty_tiles, reserved, bounds
+            positions, normals, tangents, displacements, output_step, last_full_step, step, change_count, dirty_tile_count,
+            reserved, bounds
         }
-        WarpTile { first_word, first, rest, domain, first_q, first_scale, chunks, width, kind }
-        MixedQuad { item, rest, domain, first_q }
-        Change { domain, first_q, count, source }
+        WarpTile { first_word, first_item, rest_quad, domain, first_q, first_scale, chunk_count, quad_count, kind }
+        MixedQuad { first_item, rest_quad, packed_domain, first_q }
+        Change { domain, first_q, q_count, first_new_q }
         TransformLink { root, frame }
         DeformArgs {
-            header, tiles, mixed_quads, words, rest, rest_normals, rest_tangents, corner_offsets, scales, mixed_quad_scales,
-            transforms, transform_links, frames, q, tile_list, retained_counts, retained, boxes, count, reserved
+            header, tiles, mixed_quads, words, rest_positions, rest_normals, rest_tangents, corner_offsets, scales,
+            mixed_quad_scales, transforms, transform_links, frames, q, tile_list, retained_counts, retained, boxes, tile_count,
+            reserved
         }
-        BatchGroup { first_word, rest, first_scale, vertices, first_member, chunks, members }
-        BatchMember { first, first_q, domain, first_tile }
-        BatchBlock { group, tile, end, reserved }
+        BatchGroup { first_word, rest_quad, first_scale, vertex_count, first_member, chunk_count, member_count }
+        BatchMember { first_vertex, first_q, domain, first_tile }
+        BatchBlock { group, first_tile, end_tile, reserved }
         BatchArgs {
-            header, blocks, groups, members, words, rest, scales, transforms, transform_links, frames, q, boxes
+            header, blocks, groups, members, words, rest_positions, scales, transforms, transform_links, frames, q, boxes
         }
-        BoxSegment { first, count, domain, from_vertices }
-        BoundsArgs { header, boxes, segments, change_steps, segment_boxes, count, segment_count, bounding_axes, reserved }
+        BoxSegment { first_item, item_count, domain, is_vertex_range }
+        BoundsArgs { header, boxes, segments, change_steps, segment_boxes, box_count, segment_count, bounding_axes, reserved }
         ApplyArgs { header, changes, new_transforms, new_q, dirty_tiles, transform_links, transforms, q, change_steps, tile_list }
-        NormalSlot { first, first_normal, first_tangent, first_vertex, first_member }
+        NormalSlot { first_corner, first_normal, first_tangent, first_vertex, first_corner_group }
         NormalsArgs {
-            header, slots, first_domains, rest_normals, rest_tangents, transforms, transform_links, frames, change_steps, members,
-            ring_offsets, rings, group_normals, corners, rest_corners, groups, reserved
+            header, slots, first_domains, rest_normals, rest_tangents, transforms, transform_links, frames, change_steps,
+            corner_groups, ring_offsets, rings, group_normals, corner_count, rest_corner_count, group_count, reserved
         }
     };
-    for (name, host) in [("TILE_LAST", TILE_LAST), ("TILE_VERTICES", TILE_VERTICES), ("TILE_CORNERS", TILE_CORNERS)] {
+    for (name, host) in
+        [("LAST_QUAD_ITEMS", LAST_QUAD_ITEMS), ("TILE_VERTICES", TILE_VERTICES), ("TILE_CORNERS", TILE_CORNERS)]
+    {
         list.push(LayoutConstant { expression: name.into(), host: u32::from(host) });
     }
     list.push(LayoutConstant { expression: "TILE_QUADS".into(), host: TILE_QUADS as u32 });
@@ -315,13 +319,15 @@ pub fn layout_constants() -> Vec<LayoutConstant> {
     list
 }
 
-/// The start of a source that contains agreements. NVRTC has no `offsetof`; `OFFSET` is what that macro expands to.
+/// The start of a source that evaluates the expressions of [`LayoutConstant`]s. NVRTC has no `offsetof`, so `OFFSET` is
+/// defined as its usual expansion.
 pub(crate) const PRELUDE: &str = "#include \"layout.cuh\"\n#define OFFSET(of, field) __INTADDR__(&(((of*)0)->field))\n";
 
-/// Source of a kernel `report` that writes the device's value of every agreement, in order, to its only argument.
+/// Source of a kernel `layout_values` that writes the device's value of every layout constant, in order, to its only
+/// argument.
 pub(crate) fn layout_kernel_source() -> String {
-    let line = |(index, agreement): (usize, &LayoutConstant)| {
-        format!("    values[{index}] = (unsigned)({});\n", agreement.expression)
+    let line = |(index, constant): (usize, &LayoutConstant)| {
+        format!("    values[{index}] = (unsigned)({});\n", constant.expression)
     };
     let lines: String = layout_constants().iter().enumerate().map(line).collect();
     format!("{PRELUDE}extern \"C\" __global__ void layout_values(unsigned* values) {{\n{lines}}}\n")

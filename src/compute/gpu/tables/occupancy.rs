@@ -6,7 +6,7 @@ const MIN_BLOCKS_DEFINE: &str = "MIN_BLOCKS_PER_SM";
 /// First compute capability of the last column of [`MIN_BLOCKS`].
 const SM_90: (i32, i32) = (9, 0);
 
-/// Blocks per multiprocessor of variants that have all of some macros.
+/// Resident blocks per multiprocessor of the variants that define all of `macros`.
 struct MinBlocks {
     macros: &'static [&'static str],
     /// Compute capability below 9.0.
@@ -19,13 +19,13 @@ const fn row(macros: &'static [&'static str], before_sm_90: u32, sm_90: u32) -> 
     MinBlocks { macros, before_sm_90, sm_90 }
 }
 
-/// The first row whose macros a variant has all of applies to it.
+/// A variant uses the first row whose macros it defines.
 ///
-/// The compiler limits the registers of a thread so that this many blocks fit. More blocks hide more latency of the
-/// memory that `deform` streams, but a variant that needs more registers than the limit spills them.
+/// The compiler limits the registers of a thread so that this many blocks fit. More blocks hide more memory latency, but
+/// a variant that needs more registers than the limit spills them.
 ///
-/// Chosen by the assembler's report (`ptxas -v`): variants with more accumulators or outputs have fewer blocks, and none
-/// spills. The test `nvrtc_compiles_every_kernel_without_spilling` repeats the measurement. One row differs by
+/// The numbers were chosen with the report of `ptxas -v`: variants with more accumulators or outputs have fewer blocks,
+/// and none spills. The test `nvrtc_compiles_every_kernel_without_spilling` repeats the measurement. One row differs by
 /// architecture. With MODES and RIGID_NORMALS, NVRTC 13.0 reports for 28 blocks (72 registers) no spills on sm_90 and 16
 /// bytes on sm_80, and for 32 blocks (64 registers) 80 bytes on sm_90.
 const MIN_BLOCKS: [MinBlocks; 22] = [
@@ -69,10 +69,10 @@ pub(crate) fn deform_tuning(defines: &[&str], capability: (i32, i32)) -> String 
 mod tests {
     use super::*;
 
-    /// The nested conditions that chose the number before the table, branch by branch.
-    fn by_conditions(defines: &[&str], capability: (i32, i32)) -> u32 {
+    /// The same numbers by nested conditions, as an independent definition.
+    fn min_blocks_by_conditions(defines: &[&str], capability: (i32, i32)) -> u32 {
         let has = |name: &str| defines.contains(&name);
-        let halves = has("STORE_F16") || has("STORE_BF16");
+        let has_16_bit_storage = has("STORE_F16") || has("STORE_BF16");
         if has("ONE_ITEM_PER_LANE") && has("MODES") {
             if has("MODE_TRUNCATION") && has("TILE_LIST") { 8 } else { 10 }
         } else if has("SHEAR") || has("TILE_LIST") {
@@ -83,12 +83,12 @@ mod tests {
             } else if has("COMPENSATED_SUM")
                 || (has("RIGID_NORMALS") && has("STORE_INT8"))
                 || (has("NORMAL_MAPS") && (has("MODE_TRUNCATION") || has("FOLLOWERS")))
-                || (has("DISPLACEMENTS") && (halves || has("STORE_INT8")))
+                || (has("DISPLACEMENTS") && (has_16_bit_storage || has("STORE_INT8")))
             {
                 20
             } else if (has("DISPLACEMENTS") && has("RIGID_NORMALS"))
                 || has("NORMAL_MAPS")
-                || (has("RIGID_NORMALS") && (halves || has("FOLLOWERS")))
+                || (has("RIGID_NORMALS") && (has_16_bit_storage || has("FOLLOWERS")))
                 || (has("MODE_TRUNCATION") && has("STORE_INT8"))
                 || capability < (9, 0)
             {
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn table_equals_the_former_conditions_for_every_variant() {
+    fn table_equals_the_conditions_for_every_variant() {
         let macros = [
             "MODES",
             "ONE_ITEM_PER_LANE",
@@ -117,18 +117,18 @@ mod tests {
             "FOLLOWERS",
             "TILE_LIST",
         ];
-        let mut seen = std::collections::BTreeSet::new();
+        let mut used_numbers = std::collections::BTreeSet::new();
         for set in 0..1_u32 << macros.len() {
             for storage in [None, Some("STORE_F16"), Some("STORE_BF16"), Some("STORE_INT8")] {
-                let chosen = macros.iter().enumerate().filter(|(bit, _)| set >> bit & 1 == 1).map(|(_, name)| *name);
-                let defines: Vec<&str> = chosen.chain(storage).collect();
+                let selected = macros.iter().enumerate().filter(|(bit, _)| set >> bit & 1 == 1).map(|(_, name)| *name);
+                let defines: Vec<&str> = selected.chain(storage).collect();
                 for capability in [(7, 5), (8, 0), (8, 9), (9, 0), (12, 0)] {
                     let blocks = min_blocks(&defines, capability);
-                    assert_eq!(blocks, by_conditions(&defines, capability), "{defines:?} {capability:?}");
-                    seen.insert(blocks);
+                    assert_eq!(blocks, min_blocks_by_conditions(&defines, capability), "{defines:?} {capability:?}");
+                    used_numbers.insert(blocks);
                 }
             }
         }
-        assert!(seen.into_iter().eq([8, 10, 12, 16, 20, 24, 28]), "every number occurs");
+        assert!(used_numbers.into_iter().eq([8, 10, 12, 16, 20, 24, 28]), "expected every number of the table");
     }
 }

@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::box_segments::box_bytes;
 use super::change_list::{ChangeListLayout, max_change_entries};
 use super::device_tables::{CudaDeformerOptions, DeviceTables, NormalTables};
-use super::kernels::kernels;
+use super::kernels::plan_kernels;
 use super::layout::NormalSlot;
 use super::normal_tables;
 use super::rings::possible_corner_group_bytes;
@@ -31,7 +31,7 @@ pub enum BufferRole {
     CornerOffsets,
     /// Groups of domains, and the work of each block of `batch`.
     Batches,
-    /// A bounding box of each warp's vertices.
+    /// Four bounding boxes per tile.
     WarpBoxes,
     /// The step that last changed each domain.
     ChangeSteps,
@@ -56,8 +56,9 @@ pub enum BufferRole {
     Tangents,
     /// u; only if the scene keeps displacements.
     Displacements,
-    /// The pieces of domains that `bounds` reduces to boxes, and their boxes; only if the scene keeps boxes.
+    /// The segments of domains that `bounds` reduces to boxes; only if the scene keeps boxes.
     BoxSegments,
+    /// The boxes of these segments.
     DomainBoxes,
 }
 
@@ -73,13 +74,13 @@ pub struct BufferDescriptor {
 pub struct OmittedFeature {
     /// The flag of [`modalcast_model::scene::SceneFeatures`] that is off, or "batches".
     pub feature: &'static str,
-    /// Features that are not compiled, computed or stored.
+    /// Code and data that are not compiled, computed or stored.
     pub what: &'static str,
-    /// Device bytes saved, as far as they are known: the length of rings is unknown until they are built.
+    /// Device bytes saved, without the rings of `normals`: their length is unknown until they are built.
     pub bytes: u64,
 }
 
-/// What the CUDA deformer compiles, allocates and launches for a scene.
+/// The kernels, buffers and copies of the CUDA deformer for a scene.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct DeformPlan {
     /// The kernels of the scene in launch order, except `apply`, which is last here and first in a partial step.
@@ -100,17 +101,17 @@ pub fn plan(scene: &Scene, options: CudaDeformerOptions) -> DeformPlan {
 
 /// The plan of a scene from existing tables.
 pub fn plan_from_tables(scene: &Scene, tables: &DeviceTables) -> DeformPlan {
-    let changes = match max_change_entries(scene) {
+    let change_list_bytes = match max_change_entries(scene) {
         0 => 0,
-        entries => ChangeListLayout::new(entries, tables.coordinates.total, tables.work.tiles.len()).bytes(),
+        max_changes => ChangeListLayout::new(max_changes, tables.coordinates.total, tables.work.tiles.len()).bytes(),
     };
     DeformPlan {
-        kernels: kernels(scene, tables),
-        buffers: buffers(scene, tables),
+        kernels: plan_kernels(scene, tables),
+        buffers: plan_buffers(scene, tables),
         bytes_in: tables.inputs.total(),
         bytes_out: if tables.bounding_axes.is_some() { 48 } else { 24 },
-        change_list_bytes: changes,
-        omitted: omitted(scene, tables),
+        change_list_bytes,
+        omitted: list_omitted_features(scene, tables),
     }
 }
 
@@ -119,15 +120,15 @@ fn bytes_of<T>(table: &[T]) -> u64 {
 }
 
 /// The buffers of a scene with the bytes of their tables.
-fn buffers(scene: &Scene, tables: &DeviceTables) -> Vec<BufferDescriptor> {
+fn plan_buffers(scene: &Scene, tables: &DeviceTables) -> Vec<BufferDescriptor> {
     let (features, layout, work) = (scene.features, &scene.layout, &tables.work);
     let normals = tables.normals.as_ref();
     let (vertices, corners) = (layout.vertices as u64, layout.corners as u64);
     let mut buffers = vec![
-        (BufferRole::ModeWords, 16 * work.words),
-        (BufferRole::RestPositions, bytes_of(&tables.rest)),
-        (BufferRole::Scales, 4 * work.scales),
-        (BufferRole::WarpTiles, bytes_of(&work.tiles) + 4 * tables.listed_tiles as u64),
+        (BufferRole::ModeWords, 16 * work.word_count),
+        (BufferRole::RestPositions, bytes_of(&tables.rest_positions)),
+        (BufferRole::Scales, 4 * work.scale_count),
+        (BufferRole::WarpTiles, bytes_of(&work.tiles) + 4 * tables.tile_list_capacity as u64),
         (BufferRole::MixedQuads, bytes_of(&work.mixed_quads) + bytes_of(&work.mixed_quad_scales)),
         (BufferRole::CornerOffsets, bytes_of(&work.corner_offsets)),
         (BufferRole::WarpBoxes, work.box_bytes()),
@@ -159,9 +160,9 @@ fn buffers(scene: &Scene, tables: &DeviceTables) -> Vec<BufferDescriptor> {
     if let Some(NormalTables { slots, first_domains, rings, .. }) = normals {
         buffers.push((BufferRole::CornerSlots, bytes_of(slots)));
         buffers.push((BufferRole::CornerBlocks, bytes_of(first_domains)));
-        buffers.push((BufferRole::CornerGroups, bytes_of(&rings.members)));
+        buffers.push((BufferRole::CornerGroups, bytes_of(&rings.corner_groups)));
         buffers.push((BufferRole::RingTables, bytes_of(&rings.ring_offsets) + bytes_of(&rings.rings)));
-        buffers.push((BufferRole::GroupNormals, bytes_of(&rings.normals)));
+        buffers.push((BufferRole::GroupNormals, bytes_of(&rings.group_normals)));
     }
     if features.followers {
         let frames = bytes_of(scene.transform_roots.frames()) + bytes_of(&tables.transform_links);
@@ -170,16 +171,16 @@ fn buffers(scene: &Scene, tables: &DeviceTables) -> Vec<BufferDescriptor> {
     buffers.into_iter().map(|(role, bytes)| BufferDescriptor { role, bytes }).collect()
 }
 
-fn omitted(scene: &Scene, tables: &DeviceTables) -> Vec<OmittedFeature> {
+fn list_omitted_features(scene: &Scene, tables: &DeviceTables) -> Vec<OmittedFeature> {
     let (features, layout) = (scene.features, &scene.layout);
     let is_batched = !tables.work.batched.blocks.is_empty();
-    let slots = size_of::<NormalSlot>() * scene.domains.len();
-    let tangents = 16 * (normal_tables::rest_corners(scene) + layout.corners) as u64;
-    let boxes = bytes_of(&tables.segments) + box_bytes(tables.segments.len());
+    let slot_bytes = (size_of::<NormalSlot>() * scene.domains.len()) as u64;
+    let tangent_bytes = 16 * (normal_tables::rest_corner_count(scene) + layout.corners) as u64;
+    let segment_bytes = bytes_of(&tables.segments) + box_bytes(tables.segments.len());
     let feature = |feature, what, bytes| OmittedFeature { feature, what, bytes };
-    let all = [
+    let features = [
         (features.modes, feature("modes", "the sum U q in `deform`", 0)),
-        (features.normal_maps, feature("normal_maps", "tangents and their two buffers", tangents)),
+        (features.normal_maps, feature("normal_maps", "tangents and their two buffers", tangent_bytes)),
         (features.shear, feature("shear", "the inverse transpose", 0)),
         (features.truncation, feature("truncation", "lists of modes in `deform`", 0)),
         (
@@ -187,17 +188,17 @@ fn omitted(scene: &Scene, tables: &DeviceTables) -> Vec<OmittedFeature> {
             feature(
                 "exact_normals",
                 "`normals` behind `deform`, and its rings",
-                possible_corner_group_bytes(scene) + slots as u64,
+                possible_corner_group_bytes(scene) + slot_bytes,
             ),
         ),
         (features.compensated, feature("compensated", "the compensation in `deform`", 0)),
         (features.followers, feature("followers", "frames, and products of transforms", 0)),
         (features.displacements, feature("displacements", "u as an output of `deform`", 12 * layout.vertices as u64)),
         (tables.bounding_axes.is_some(), feature("shadows", "bounds in light space", 0)),
-        (features.boxes, feature("boxes", "a box of each domain in `bounds`", boxes)),
+        (features.boxes, feature("boxes", "a box of each domain in `bounds`", segment_bytes)),
         (is_batched, feature("batches", "`batch`, and groups of domains", 0)),
     ];
-    all.into_iter().filter(|(is_used, _)| !is_used).map(|(_, omitted)| omitted).collect()
+    features.into_iter().filter(|(is_used, _)| !is_used).map(|(_, feature)| feature).collect()
 }
 
 impl DeformPlan {
@@ -225,9 +226,9 @@ impl DeformPlan {
     /// Maximum number of kernel launches of one step, for any number of domains.
     pub fn launches(&self) -> usize {
         // A full step may launch `batch` but not `apply`; a partial step may launch `apply` but not `batch`.
-        let whole = self.kernels.iter().filter(|kernel| kernel.kind != KernelKind::Apply).count();
-        let listed = self.kernels.iter().filter(|kernel| kernel.kind != KernelKind::Batch).count();
-        if self.kernel(KernelKind::Apply).is_some() { whole.max(listed) } else { whole }
+        let count_except = |omitted: KernelKind| self.kernels.iter().filter(|kernel| kernel.kind != omitted).count();
+        let (full_step, partial_step) = (count_except(KernelKind::Apply), count_except(KernelKind::Batch));
+        if self.kernel(KernelKind::Apply).is_some() { full_step.max(partial_step) } else { full_step }
     }
 }
 

@@ -5,23 +5,23 @@ use super::normal_tables::{self, CornerSlot};
 use modalcast_model::domain::{Domain, Shape, SmoothingGroups};
 use modalcast_model::scene::{DomainLayout, Scene};
 
-/// The tables; groups are numbered through all shapes.
+/// Smoothing groups of all shapes, numbered consecutively over the shapes.
 #[derive(Debug, Default)]
 pub(crate) struct RingTables {
     /// The group of each corner of the shapes that have groups.
-    pub members: Vec<u32>,
+    pub corner_groups: Vec<u32>,
     /// Offset of each group's ring, and the end of the last one.
     pub ring_offsets: Vec<u32>,
     pub rings: Vec<u32>,
-    /// Geometric normals at rest, one plane per axis.
-    pub normals: Vec<f32>,
+    /// Geometric normal of each group at rest, one plane per axis.
+    pub group_normals: Vec<f32>,
 }
 
-fn smoothings(scene: &Scene) -> impl Iterator<Item = &SmoothingGroups> {
+fn smoothing_groups(scene: &Scene) -> impl Iterator<Item = &SmoothingGroups> {
     scene.shapes.iter().filter_map(Shape::smoothing)
 }
 
-/// Bytes that [`RingTables::members`] would need in a scene with exact normals. The size of its rings is unknown until
+/// Bytes that [`RingTables::corner_groups`] would need in a scene with exact normals. The size of its rings is unknown until
 /// they are built.
 pub(crate) fn possible_corner_group_bytes(scene: &Scene) -> u64 {
     let shapes = scene.shapes.iter().filter(|shape| shape.modes.rank() > 0);
@@ -30,65 +30,69 @@ pub(crate) fn possible_corner_group_bytes(scene: &Scene) -> u64 {
 
 impl RingTables {
     pub(crate) fn new(scene: &Scene) -> Self {
-        let mut all = Self::default();
-        for smoothing in smoothings(scene) {
-            // Every index fits: a scene has at most `MAX_RING_TRIANGLES` triangles in rings.
-            let (group, ring) = (all.ring_offsets.len() as u32, all.rings.len() as u32);
-            all.members.extend(smoothing.corner_groups().iter().map(|member| member + group));
-            all.ring_offsets.extend(smoothing.ring_offsets()[..smoothing.groups()].iter().map(|begin| begin + ring));
-            all.rings.extend_from_slice(smoothing.rings());
+        let mut tables = Self::default();
+        for groups in smoothing_groups(scene) {
+            // Every index fits in u32, because a scene has at most `MAX_RING_TRIANGLES` triangles in rings.
+            let (first_group, ring_base) = (tables.ring_offsets.len() as u32, tables.rings.len() as u32);
+            tables.corner_groups.extend(groups.corner_groups().iter().map(|group| first_group + group));
+            tables
+                .ring_offsets
+                .extend(groups.ring_offsets()[..groups.groups()].iter().map(|offset| ring_base + offset));
+            tables.rings.extend_from_slice(groups.rings());
         }
-        all.ring_offsets.push(all.rings.len() as u32);
-        let plane = |axis: usize| smoothings(scene).flat_map(SmoothingGroups::normals).map(move |normal| normal[axis]);
-        all.normals = (0..3).flat_map(plane).collect();
-        all
+        tables.ring_offsets.push(tables.rings.len() as u32);
+        let plane =
+            |axis: usize| smoothing_groups(scene).flat_map(SmoothingGroups::normals).map(move |normal| normal[axis]);
+        tables.group_normals = (0..3).flat_map(plane).collect();
+        tables
     }
 }
 
 /// The slots of `normals`, one per domain.
-pub(crate) fn slots(scene: &Scene) -> Vec<NormalSlot> {
-    let mut members = 0;
-    let first_member = |shape: &Shape| {
-        shape.smoothing().map_or(NO_GROUPS, |smoothing| {
-            let first = members;
-            members += smoothing.corner_groups().len() as u32;
+pub(crate) fn normal_slots(scene: &Scene) -> Vec<NormalSlot> {
+    let mut corner_count = 0;
+    let first_corner_group = |shape: &Shape| {
+        shape.smoothing().map_or(NO_GROUPS, |groups| {
+            let first = corner_count;
+            corner_count += groups.corner_groups().len() as u32;
             first
         })
     };
-    let first_members: Vec<u32> = scene.shapes.iter().map(first_member).collect();
-    let slot = |(corner, (domain, slot)): (CornerSlot, (&Domain, &DomainLayout))| NormalSlot {
-        first: corner.first,
-        first_normal: corner.first_normal,
-        first_tangent: corner.first_tangent,
-        first_vertex: slot.first_vertex as u32,
-        first_member: first_members[domain.shape],
+    let first_corner_groups: Vec<u32> = scene.shapes.iter().map(first_corner_group).collect();
+    let normal_slot = |(corners, (domain, layout)): (CornerSlot, (&Domain, &DomainLayout))| NormalSlot {
+        first_corner: corners.first_corner,
+        first_normal: corners.first_normal,
+        first_tangent: corners.first_tangent,
+        first_vertex: layout.first_vertex as u32,
+        first_corner_group: first_corner_groups[domain.shape],
     };
     let domains = scene.domains.iter().zip(&scene.layout.domains);
-    normal_tables::corner_slots(scene).into_iter().zip(domains).map(slot).collect()
+    normal_tables::corner_slots(scene).into_iter().zip(domains).map(normal_slot).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::test_scenes::exact;
+    use super::super::test_scenes::scene_with_exact_normals;
     use super::*;
 
     #[test]
-    fn every_corner_finds_the_ring_and_the_normal_of_its_group_and_rigid_shapes_have_none() {
-        let scene = exact(&[(7, 2), (300, 0), (8, 5), (513, 1)]);
-        let (rings, slots) = (RingTables::new(&scene), slots(&scene));
-        let groups = rings.ring_offsets.len() - 1;
-        assert_eq!((rings.normals.len(), rings.ring_offsets[groups] as usize), (3 * groups, rings.rings.len()));
-        assert_eq!(slots[2].first_member, NO_GROUPS);
-        assert_eq!(slots[4].first_member, slots[5].first_member, "instances share");
+    fn corners_have_rings_and_normals_of_their_groups() {
+        let scene = scene_with_exact_normals(&[(7, 2), (300, 0), (8, 5), (513, 1)]);
+        let (tables, slots) = (RingTables::new(&scene), normal_slots(&scene));
+        let group_count = tables.ring_offsets.len() - 1;
+        assert_eq!(tables.group_normals.len(), 3 * group_count);
+        assert_eq!(tables.ring_offsets[group_count] as usize, tables.rings.len());
+        assert_eq!(slots[2].first_corner_group, NO_GROUPS, "a shape without modes");
+        assert_eq!(slots[4].first_corner_group, slots[5].first_corner_group, "domains of one shape share its groups");
         for (domain, slot) in slots.iter().enumerate() {
             assert_eq!(slot.first_vertex as usize, scene.layout.domains[domain].first_vertex);
-            let Some(smoothing) = scene.shape_of(domain).smoothing() else { continue };
-            for (corner, member) in smoothing.corner_groups().iter().enumerate() {
-                let group = rings.members[slot.first_member as usize + corner] as usize;
-                let ring = &rings.rings[rings.ring_offsets[group] as usize..rings.ring_offsets[group + 1] as usize];
-                assert_eq!(ring, smoothing.ring(*member as usize));
-                let normal = [0, 1, 2].map(|axis| rings.normals[axis * groups + group]);
-                assert_eq!(normal, smoothing.normals()[*member as usize]);
+            let Some(shape_groups) = scene.shape_of(domain).smoothing() else { continue };
+            for (corner, shape_group) in shape_groups.corner_groups().iter().enumerate() {
+                let group = tables.corner_groups[slot.first_corner_group as usize + corner] as usize;
+                let ring = &tables.rings[tables.ring_offsets[group] as usize..tables.ring_offsets[group + 1] as usize];
+                assert_eq!(ring, shape_groups.ring(*shape_group as usize));
+                let normal = [0, 1, 2].map(|axis| tables.group_normals[axis * group_count + group]);
+                assert_eq!(normal, shape_groups.normals()[*shape_group as usize]);
             }
         }
     }

@@ -129,7 +129,7 @@ impl DeformerBenchmark {
         let mut staging = None;
         for state in states {
             let header = Header { last_full_step: 1, step: 1, ..benchmark.header() };
-            let mut inputs = StepInputs::new(device, benchmark.deform.packing())?;
+            let mut inputs = StepInputs::new(device, benchmark.deform.packer())?;
             let staging = match &mut staging {
                 Some(staging) => staging,
                 empty => empty.insert(inputs.staging(device)?),
@@ -146,17 +146,17 @@ impl DeformerBenchmark {
         let allowed = "a quarter of the domains at most, no truncation, and less work than a whole step";
         let too_many = || invalid("changed", allowed, changed.len());
         let mut apply =
-            ApplyKernel::new(device, self.deform.packing(), self.plan.kernel(KernelKind::Apply).ok_or_else(too_many)?)?;
+            ApplyKernel::new(device, self.deform.packer(), self.plan.kernel(KernelKind::Apply).ok_or_else(too_many)?)?;
         let mut list = apply.allocate_list(device)?;
         let full_step = Header { last_full_step: 1, ..self.header() };
         for (inputs, state) in self.inputs.iter_mut().zip(states) {
             let mut staging = inputs.staging(device)?;
             let lengths =
-                apply.write(&mut list, self.deform.packing(), state, ChangedDomains { changed, outdated: &[] })?;
-            let ChangeListLengths { changed, dirty_tiles } = lengths.ok_or_else(too_many)?;
-            let header = Header { output_step: 1, step: 2, changed, dirty_tiles, ..full_step };
+                apply.write(&mut list, self.deform.packer(), state, ChangedDomains { changed, outdated: &[] })?;
+            let ChangeListLengths { change_count, dirty_tile_count } = lengths.ok_or_else(too_many)?;
+            let header = Header { output_step: 1, step: 2, change_count, dirty_tile_count, ..full_step };
             upload_step(device, (inputs, &mut staging), &header, state)?;
-            // SAFETY: the lists were written above for the packing of `deform` and of the inputs, and the next statement
+            // SAFETY: the lists were written above for the packer of `deform` and of the inputs, and the next statement
             // waits for the kernel.
             unsafe { apply.launch(device, &list, inputs, &self.deform) }?;
             device.stream().synchronize().map_err(fault_in("upload"))?;

@@ -220,10 +220,10 @@ fn time_input_writes(
     states: &[SceneState],
     steps: usize,
 ) -> Result<(u64, [f64; 2])> {
-    let packing = Arc::new(InputPacker::sizes_only(scene));
-    let mut staging = StepInputs::new(device, &packing)?.staging(device)?;
+    let packer = Arc::new(InputPacker::sizes_only(scene));
+    let mut staging = StepInputs::new(device, &packer)?.staging(device)?;
     let words = staging.as_mut_slice()?;
-    let mut writer = InputWriter::new(&packing);
+    let mut writer = InputWriter::new(&packer);
     let bytes = size_of_val(words) as u64;
     let mut measure = move || {
         let mut time_write = |step: usize| {

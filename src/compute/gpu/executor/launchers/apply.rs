@@ -24,12 +24,12 @@ pub struct ApplyKernel {
 pub type ChangeListBuffer = PinnedBuffer<u32>;
 
 impl ApplyKernel {
-    /// Compiles the kernel for scenes in the layout of `packing`.
+    /// Compiles the kernel for scenes in the layout of `packer`.
     ///
     /// # Errors
     /// As [`Device::function`].
-    pub fn new(device: &Device, packing: &InputPacker, kernel: &KernelDescriptor) -> Result<Self> {
-        Ok(Self { function: kernel.compile(device)?, config: kernel.config(), writer: ChangeListWriter::new(packing) })
+    pub fn new(device: &Device, packer: &InputPacker, kernel: &KernelDescriptor) -> Result<Self> {
+        Ok(Self { function: kernel.compile(device)?, config: kernel.config(), writer: ChangeListWriter::new(packer) })
     }
 
     /// Allocates pinned memory for the lists of a step.
@@ -37,7 +37,7 @@ impl ApplyKernel {
     /// # Errors
     /// `Fault` when the driver cannot lock so much memory.
     pub fn allocate_list(&self, device: &Device) -> Result<ChangeListBuffer> {
-        PinnedBuffer::zeroed(device, self.writer.layout().end, PinnedUse::ToDevice)
+        PinnedBuffer::zeroed(device, self.writer.layout().word_count, PinnedUse::ToDevice)
     }
 
     /// Writes the lists of a partial step. The caller has waited for the last launch with `list`. Returns `None` when
@@ -48,18 +48,18 @@ impl ApplyKernel {
     pub fn write(
         &mut self,
         list: &mut ChangeListBuffer,
-        packing: &InputPacker,
+        packer: &InputPacker,
         state: &SceneState,
         domains: ChangedDomains<'_>,
     ) -> Result<Option<ChangeListLengths>> {
-        Ok(self.writer.write(list.as_mut_slice()?, packing, state, domains))
+        Ok(self.writer.write(list.as_mut_slice()?, packer, state, domains))
     }
 
     /// Starts the kernel, which updates the values of `inputs` and copies the tile list to that of `deform`. The header
     /// among the values has the lengths of the lists.
     ///
     /// # Safety
-    /// `list` is from [`Self::allocate_list`]. [`Self::write`] wrote it for the packing of `inputs` and `deform`, or the
+    /// `list` is from [`Self::allocate_list`]. [`Self::write`] wrote it for the packer of `inputs` and `deform`, or the
     /// header has lengths of 0. All of them exist, and `list` is not written, until the kernel has ended.
     ///
     /// # Errors

@@ -26,7 +26,7 @@ pub(super) struct BatchKernel {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SharedTables<'a> {
     pub words: &'a DeviceBuffer,
-    pub rest: &'a DeviceBuffer,
+    pub rest_positions: &'a DeviceBuffer,
     pub scales: &'a DeviceBuffer,
     pub boxes: &'a DeviceBuffer,
 }
@@ -68,7 +68,7 @@ impl BatchKernel {
             groups: self.groups.address(),
             members: self.members.address(),
             words: shared.words.address(),
-            rest: shared.rest.address(),
+            rest_positions: shared.rest_positions.address(),
             scales: shared.scales.address(),
             transforms: values.transforms,
             transform_links: values.transform_links,
@@ -95,7 +95,7 @@ mod tests {
     use crate::gpu::launch::KernelKind;
     use crate::gpu::tables::device_tables::CudaDeformerOptions;
     use crate::gpu::tables::plan::{BufferRole, plan};
-    use crate::gpu::tables::test_scenes::corners_match;
+    use crate::gpu::tables::test_scenes::scene_with_matching_corners;
     use crate::gpu::tables::work::{CoordinateLayout, WorkList};
     use crate::testing::{TestRng, scene_and_state, transformed_axis};
     use modalcast_model::backend_settings::BatchPolicy;
@@ -120,13 +120,17 @@ mod tests {
     /// Emulates `batch` block by block. Returns the positions.
     fn twin_of_batch(tables: &Tables) -> Vec<f32> {
         let mut positions = vec![f32::NAN; 3 * tables.scene.layout.vertices];
-        let tiles =
-            tables.work.batched.blocks.iter().flat_map(|block| (block.tile..block.end).map(|tile| (block.group, tile)));
+        let tiles = tables
+            .work
+            .batched
+            .blocks
+            .iter()
+            .flat_map(|block| (block.first_tile..block.end_tile).map(|tile| (block.group, tile)));
         for (tile, warp) in tiles.flat_map(|tile| [0, 1].map(|warp| (tile, warp))) {
             let mut warp = Warp::new(tables, tile, warp);
             if warp.quads > 0 {
                 let sums = warp.sums();
-                for member in (0..warp.group.members as usize).step_by(2) {
+                for member in (0..warp.group.member_count as usize).step_by(2) {
                     warp.store(&warp.staged(&sums, member), member, &mut positions);
                 }
             }
@@ -202,9 +206,9 @@ mod tests {
     fn groups_have_similar_sizes_and_are_adjacent_within_a_tile() {
         let (scene, _) = ensemble(StorageType::F32, &[(261, 12)], 40);
         let work = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::Always);
-        let sizes: Vec<u32> = work.batched.groups.iter().map(|group| group.members).collect();
+        let sizes: Vec<u32> = work.batched.groups.iter().map(|group| group.member_count).collect();
         assert_eq!(sizes, [14, 14, 12]);
-        let blocks: Vec<(u32, u32)> = work.batched.blocks.iter().map(|block| (block.tile, block.group)).collect();
+        let blocks: Vec<(u32, u32)> = work.batched.blocks.iter().map(|block| (block.first_tile, block.group)).collect();
         assert_eq!(blocks, [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 0), (2, 1), (2, 2)]);
         assert_eq!(
             (work.full_step_tiles, work.tiles.len()),
@@ -213,7 +217,7 @@ mod tests {
         );
         let members: Vec<u32> = work.batched.members.iter().map(|member| member.first_tile).collect();
         assert!(
-            members.iter().zip(&work.spans).all(|(first, spans)| *first == spans[0].0),
+            members.iter().zip(&work.domain_tiles).all(|(first, tiles)| *first == tiles.vertices.first),
             "expected boxes in the order of tiles"
         );
     }
@@ -223,12 +227,12 @@ mod tests {
         let (scene, _) = ensemble(StorageType::F32, &[(128 * 6001, 1), (128 * 3000, 1)], 2);
         let batched = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::Always).batched;
         assert!(
-            batched.blocks.iter().all(|block| (1..=2).contains(&(block.end - block.tile))),
+            batched.blocks.iter().all(|block| (1..=2).contains(&(block.end_tile - block.first_tile))),
             "expected one or two tiles per block"
         );
         for (group, tiles) in [6001, 3000].into_iter().enumerate() {
             let group_blocks = batched.blocks.iter().filter(|block| block.group == group as u32);
-            let covered: Vec<u32> = group_blocks.flat_map(|block| block.tile..block.end).collect();
+            let covered: Vec<u32> = group_blocks.flat_map(|block| block.first_tile..block.end_tile).collect();
             assert_eq!(covered, (0..tiles).collect::<Vec<u32>>());
         }
     }
@@ -244,7 +248,7 @@ mod tests {
         assert_eq!(defines(2), ("STORE_F16 BATCH_4".into(), 3));
         assert_eq!(defines(8), ("STORE_F16 BATCH_8".into(), 3));
         assert_eq!(defines(17), ("STORE_F16".into(), 6));
-        let unbatched = plan(&corners_match(&[(261, 12)]), CudaDeformerOptions::default());
+        let unbatched = plan(&scene_with_matching_corners(&[(261, 12)]), CudaDeformerOptions::default());
         assert!(unbatched.kernel(KernelKind::Batch).is_none(), "expected no batch of a single domain");
         assert_eq!(unbatched.bytes(BufferRole::Batches), 0);
     }

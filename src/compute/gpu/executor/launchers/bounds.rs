@@ -69,7 +69,7 @@ impl BoundsKernel {
             segments: segment_addresses.segments,
             change_steps: values.change_steps,
             segment_boxes: segment_addresses.boxes,
-            count: warp_boxes.count,
+            box_count: warp_boxes.count,
             segment_count: segment_addresses.count,
             bounding_axes: axes_to_f32(self.axes),
             reserved: 0,

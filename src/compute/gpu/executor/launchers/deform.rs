@@ -14,7 +14,7 @@ use crate::gpu::tables::input_packing::{DirtyTileLayout, InputPacker};
 use crate::gpu::tables::kernels::deform_blocks;
 use crate::gpu::tables::layout::{BoxSegment, DeformArgs};
 use crate::gpu::tables::occupancy::deform_tuning;
-use crate::gpu::tables::work::{WordSource, WorkList, side_by_side};
+use crate::gpu::tables::work::{WordSource, WorkList, mix_tiles};
 use crate::storage::{PackedWord, TILE_QUADS, TiledModes};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::Scene;
@@ -54,7 +54,7 @@ pub struct DeformKernel {
     mixed_quads: DeviceBuffer,
     mixed_quad_scales: DeviceBuffer,
     words: DeviceBuffer,
-    rest: DeviceBuffer,
+    rest_positions: DeviceBuffer,
     normals: DeviceBuffer,
     tangents: DeviceBuffer,
     corner_offsets: DeviceBuffer,
@@ -63,12 +63,12 @@ pub struct DeformKernel {
     /// Four boxes of six keys per tile.
     boxes: DeviceBuffer,
     /// Number of tiles.
-    count: u32,
-    /// Number of tiles that a full step launches.
+    tile_count: u32,
+    /// Number of leading tiles that a full step computes.
     full_step_tiles: u32,
     /// Index of the first quad that has normals.
-    first_with_normals: u64,
-    packing: Arc<InputPacker>,
+    first_direction_quad: u64,
+    packer: Arc<InputPacker>,
     /// Segments of domains that `bounds` reduces to boxes; only if the scene keeps boxes.
     segments: Option<Vec<BoxSegment>>,
 }
@@ -84,12 +84,21 @@ impl DeformKernel {
         kernels: PositionKernels<'_>,
         tables: DeviceTables,
     ) -> Result<Self> {
-        let DeviceTables { coordinates, work, segments, rest, rest_normals, rest_tangents, listed_tiles, .. } = tables;
+        let DeviceTables {
+            coordinates,
+            work,
+            segments,
+            rest_positions,
+            rest_normals,
+            rest_tangents,
+            tile_list_capacity,
+            ..
+        } = tables;
         let kernel = kernels.deform;
         let mut uploader = ModeUploader::new(device, scene, &work)?;
         work.sources.iter().try_for_each(|source| uploader.add(source))?;
         let UploadedModes { words, scales, factors } = uploader.finish()?;
-        let has_lists = listed_tiles > 0;
+        let has_lists = tile_list_capacity > 0;
         // Tiles that have only corners are needed only for rigid normals.
         let full_step_tiles =
             if kernel.defines.contains(&"RIGID_NORMALS") { work.full_step_tiles } else { work.vertex_tiles };
@@ -103,33 +112,33 @@ impl DeformKernel {
             mixed_quads: DeviceBuffer::upload(device, &work.mixed_quads)?,
             mixed_quad_scales: DeviceBuffer::upload(device, &work.mixed_quad_scales)?,
             words,
-            rest: DeviceBuffer::upload(device, &rest)?,
+            rest_positions: DeviceBuffer::upload(device, &rest_positions)?,
             normals: DeviceBuffer::upload(device, &rest_normals)?,
             tangents: DeviceBuffer::upload(device, &rest_tangents)?,
             corner_offsets: DeviceBuffer::upload(device, &work.corner_offsets)?,
             scales,
-            tile_list: DeviceBuffer::zeroed(device, 4 * listed_tiles as u64)?,
+            tile_list: DeviceBuffer::zeroed(device, 4 * tile_list_capacity as u64)?,
             boxes: DeviceBuffer::zeroed(device, work.box_bytes())?,
-            count: work.tiles.len() as u32,
+            tile_count: work.tiles.len() as u32,
             full_step_tiles: full_step_tiles as u32,
-            first_with_normals: work.quads.first_with_normals,
+            first_direction_quad: work.quads.first_direction_quad,
             segments: scene.features.boxes.then_some(segments),
-            packing: Arc::new(InputPacker {
+            packer: Arc::new(InputPacker {
                 scene: Arc::clone(scene),
                 coordinates,
                 factors,
                 dirty_tile_layout: DirtyTileLayout {
-                    spans: work.spans,
-                    tiles: work.tiles.len(),
-                    whole: work.full_step_tiles + DEFORM_TILES_PER_BATCH_TILE * work.batched.tiles(),
+                    domain_tiles: work.domain_tiles,
+                    tile_count: work.tiles.len(),
+                    full_step_cost: work.full_step_tiles + DEFORM_TILES_PER_BATCH_TILE * work.batched.tiles(),
                 },
             }),
         })
     }
 
     /// The layout of coordinates that the kernel expects.
-    pub const fn packing(&self) -> &Arc<InputPacker> {
-        &self.packing
+    pub const fn packer(&self) -> &Arc<InputPacker> {
+        &self.packer
     }
 
     /// The segments of all domains, if the scene keeps boxes.
@@ -139,7 +148,7 @@ impl DeformKernel {
 
     /// The boxes of all warps of all tiles.
     pub(super) fn boxes(&self) -> WarpBoxes {
-        WarpBoxes { address: self.boxes.address(), count: 4 * self.count }
+        WarpBoxes { address: self.boxes.address(), count: 4 * self.tile_count }
     }
 
     /// Address of the tile list that `apply` writes.
@@ -156,7 +165,7 @@ impl DeformKernel {
     /// Starts the kernels of a full step.
     ///
     /// # Safety
-    /// `inputs` has the layout of [`Self::packing`] and contains a full step when the kernels run. Its header has the
+    /// `inputs` has the layout of [`Self::packer`] and contains a full step when the kernels run. Its header has the
     /// addresses of the outputs that the kernels write, with the sizes of the scene: positions; normals and tangents if
     /// they are rigid; displacements if the scene keeps them. All of them exist until the kernels have ended.
     ///
@@ -164,9 +173,9 @@ impl DeformKernel {
     /// `Fault` when the device fails.
     pub unsafe fn launch(&self, device: &Device, inputs: &StepInputs) -> Result<()> {
         if let Some(batch) = &self.batch {
-            let Self { words, rest, scales, boxes, .. } = self;
+            let Self { words, rest_positions, scales, boxes, .. } = self;
             // SAFETY: the caller guarantees the inputs; the tables are of the same scene.
-            unsafe { batch.launch(device, inputs.addresses(), SharedTables { words, rest, scales, boxes }) }?;
+            unsafe { batch.launch(device, inputs.addresses(), SharedTables { words, rest_positions, scales, boxes }) }?;
         }
         // `batch` may have covered all tiles.
         if self.full_step_tiles == 0 {
@@ -184,7 +193,7 @@ impl DeformKernel {
     /// # Errors
     /// `Fault` when the scene's steps are always full, or when the device fails.
     pub unsafe fn launch_tile_list(&self, device: &Device, inputs: &StepInputs) -> Result<()> {
-        let grid_dim = ((4 * self.count).min(MAX_LIST_BLOCKS), 1, 1);
+        let grid_dim = ((4 * self.tile_count).min(MAX_LIST_BLOCKS), 1, 1);
         let config = LaunchConfig { grid_dim, block_dim: (TILE_QUADS as u32, 1, 1), shared_mem_bytes: 0 };
         let missing_function =
             || Error::Fault { stage: "deform", reason: "expected a scene with partial steps".into() };
@@ -208,10 +217,10 @@ impl DeformKernel {
             tiles: self.tiles.address(),
             mixed_quads: self.mixed_quads.address(),
             words: self.words.address(),
-            rest: self.rest.address(),
+            rest_positions: self.rest_positions.address(),
             // Quads without normals come first and have no storage. No tile with corners refers to them.
-            rest_normals: self.normals.address().wrapping_sub(48 * self.first_with_normals),
-            rest_tangents: self.tangents.address().wrapping_sub(64 * self.first_with_normals),
+            rest_normals: self.normals.address().wrapping_sub(48 * self.first_direction_quad),
+            rest_tangents: self.tangents.address().wrapping_sub(64 * self.first_direction_quad),
             corner_offsets: self.corner_offsets.address(),
             scales: self.scales.address(),
             mixed_quad_scales: self.mixed_quad_scales.address(),
@@ -223,7 +232,7 @@ impl DeformKernel {
             retained_counts: values.retained_counts,
             retained: values.retained,
             boxes: self.boxes.address(),
-            count: self.full_step_tiles,
+            tile_count: self.full_step_tiles,
             reserved: 0,
         };
         // SAFETY: the kernel's only argument is a `DeformArgs`. The tables come from `WorkList`, whose tiles lie inside the
@@ -285,10 +294,10 @@ impl<'a> ModeUploader<'a> {
             device,
             scene,
             work,
-            words: DeviceBuffer::zeroed(device, 16 * work.words)?,
+            words: DeviceBuffer::zeroed(device, 16 * work.word_count)?,
             uploaded_bytes: 0,
             pending_words: Vec::new(),
-            scales: vec![0.0; work.scales as usize],
+            scales: vec![0.0; work.scale_count as usize],
             factors: vec![Vec::new(); scene.shapes.len()],
         })
     }
@@ -302,7 +311,7 @@ impl<'a> ModeUploader<'a> {
             }
             WordSource::Mixed(shapes) => {
                 let shape_tiles: Vec<TiledModes> = shapes.iter().map(|shape| self.tiles_of(*shape)).collect();
-                self.pending_words.extend(side_by_side(&shape_tiles));
+                self.pending_words.extend(mix_tiles(&shape_tiles));
             }
         }
         if self.pending_words.len() >= UPLOAD_WORDS { self.flush() } else { Ok(()) }
@@ -311,7 +320,7 @@ impl<'a> ModeUploader<'a> {
     /// Returns the tiles of a shape, and collects their scales and factors.
     fn tiles_of(&mut self, shape: usize) -> TiledModes {
         let tiles = TiledModes::new(&self.scene.shapes[shape], self.scene.deformation.storage);
-        let first_scale = self.work.first_scale[shape] as usize;
+        let first_scale = self.work.first_scales[shape] as usize;
         self.scales[first_scale..][..tiles.scales().len()].copy_from_slice(tiles.scales());
         self.factors[shape] = tiles.factors().to_vec();
         tiles

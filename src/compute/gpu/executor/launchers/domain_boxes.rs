@@ -1,7 +1,7 @@
 //! The bounding box of each domain on the device, and its readback.
 
 use crate::gpu::launch::{Device, DeviceBuffer, PinnedBuffer, PinnedUse};
-use crate::gpu::tables::box_segments::{BOX_KEYS, box_bytes, union_per_domain};
+use crate::gpu::tables::box_segments::{BOX_KEYS, box_bytes, unite_boxes};
 use crate::gpu::tables::layout::BoxSegment;
 use modalcast_model::error::Result;
 use modalcast_model::scene::BoundingBox;
@@ -54,7 +54,7 @@ impl DomainBoxes {
         };
         let keys = keys.as_mut_slice()?;
         self.boxes.read(device, 0, keys)?;
-        union_per_domain(&self.domains, keys, boxes);
+        unite_boxes(&self.domains, keys, boxes);
         Ok(())
     }
 }

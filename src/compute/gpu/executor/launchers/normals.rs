@@ -18,13 +18,13 @@ pub struct NormalsKernel {
     first_domains: DeviceBuffer,
     rest_normals: DeviceBuffer,
     rest_tangents: Option<DeviceBuffer>,
-    members: DeviceBuffer,
+    corner_groups: DeviceBuffer,
     ring_offsets: DeviceBuffer,
     rings: DeviceBuffer,
     group_normals: DeviceBuffer,
-    corners: u32,
-    rest_corners: u32,
-    groups: u32,
+    corner_count: u32,
+    rest_corner_count: u32,
+    group_count: u32,
 }
 
 impl NormalsKernel {
@@ -46,13 +46,13 @@ impl NormalsKernel {
             first_domains: DeviceBuffer::upload(device, first_domains)?,
             rest_normals: DeviceBuffer::upload(device, rest_normals)?,
             rest_tangents: scene.features.normal_maps.then(upload_tangents).transpose()?,
-            members: DeviceBuffer::upload(device, &rings.members)?,
+            corner_groups: DeviceBuffer::upload(device, &rings.corner_groups)?,
             ring_offsets: DeviceBuffer::upload(device, &rings.ring_offsets)?,
             rings: DeviceBuffer::upload(device, &rings.rings)?,
-            group_normals: DeviceBuffer::upload(device, &rings.normals)?,
-            corners: scene.layout.corners as u32,
-            rest_corners: (rest_normals.len() / 3) as u32,
-            groups: (rings.normals.len() / 3) as u32,
+            group_normals: DeviceBuffer::upload(device, &rings.group_normals)?,
+            corner_count: scene.layout.corners as u32,
+            rest_corner_count: (rest_normals.len() / 3) as u32,
+            group_count: (rings.group_normals.len() / 3) as u32,
         })
     }
 
@@ -81,17 +81,17 @@ impl NormalsKernel {
             transform_links: values.transform_links,
             frames: values.frames,
             change_steps: values.change_steps,
-            members: self.members.address(),
+            corner_groups: self.corner_groups.address(),
             ring_offsets: self.ring_offsets.address(),
             rings: self.rings.address(),
             group_normals: self.group_normals.address(),
-            corners: self.corners,
-            rest_corners: self.rest_corners,
-            groups: self.groups,
+            corner_count: self.corner_count,
+            rest_corner_count: self.rest_corner_count,
+            group_count: self.group_count,
             reserved: 0,
         };
         // SAFETY: the kernel's only argument is a `NormalsArgs`, and the kernel calls `wait_for_prerequisite_grids` before it
-        // accesses memory. The tables come from `NormalTables`: members refer to groups, rings refer to vertices of
+        // accesses memory. The tables come from `NormalTables`: corners refer to groups, rings refer to vertices of
         // their shape, and slots lie inside the rest normals, tangents, positions and transforms of the same scene.
         // Tangents are read and written only by a kernel that was compiled for a scene with normal maps. The caller
         // guarantees the outputs.

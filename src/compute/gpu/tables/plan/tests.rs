@@ -2,13 +2,16 @@
 
 use super::super::kernels::storage_define;
 use super::super::rings::RingTables;
-use super::super::test_scenes::{deformed, exact, kept, on_the_first, scene, stored, unlit};
+use super::super::test_scenes::{
+    scene, scene_with_deformation, scene_with_exact_normals, scene_with_followers, scene_with_readbacks,
+    scene_with_storage, scene_without_shadow,
+};
 use super::super::work::{CoordinateLayout, WorkList};
 use super::*;
 use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::scene::{DeformationSettings, StorageType};
 
-/// The plan for a deformer that bounds the positions along the axes of the scene's shadow, if it has one.
+/// The plan for a deformer that bounds the positions along the axes of the light, if the scene has a shadow.
 fn plan(scene: &Scene) -> DeformPlan {
     super::plan(scene, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))
 }
@@ -18,27 +21,27 @@ fn defines(plan: &DeformPlan) -> Vec<(&str, Vec<&str>)> {
 }
 
 #[test]
-fn a_scene_without_modes_normal_maps_and_shear_compiles_none_of_their_branches() {
-    let bare = plan(&scene(&[(7, 0), (300, 0)], false, true));
+fn unused_features_are_not_compiled_or_scene_with_storage() {
+    let minimal = plan(&scene(&[(7, 0), (300, 0)], false, true));
     assert_eq!(
-        defines(&bare),
+        defines(&minimal),
         [
             ("deform", vec!["ONE_ITEM_PER_LANE", "RIGID_NORMALS", "CORNER_OFFSETS"]),
             ("bounds", vec!["ORIENTED_BOUNDS"]),
             ("apply", vec![])
         ]
     );
-    assert_eq!(bare.bytes(BufferRole::Tangents) + bare.bytes(BufferRole::RestTangents), 0);
-    assert_eq!((bare.bytes(BufferRole::ModeWords), bare.bytes(BufferRole::Scales)), (0, 0));
-    assert_eq!(bare.bytes_in, 112 + 48 * 4, "a header and four transforms, no q");
-    let omitted: Vec<_> = bare.omitted.iter().map(|part| part.feature).collect();
-    let last = ["truncation", "exact_normals", "compensated", "followers", "displacements", "boxes", "batches"];
-    assert_eq!(omitted, [&["modes", "normal_maps", "shear"][..], &last].concat());
-    assert_eq!(bare.omitted[1].bytes, 16 * (311 + 622), "rest and world tangents of every corner");
+    assert_eq!(minimal.bytes(BufferRole::Tangents) + minimal.bytes(BufferRole::RestTangents), 0);
+    assert_eq!((minimal.bytes(BufferRole::ModeWords), minimal.bytes(BufferRole::Scales)), (0, 0));
+    assert_eq!(minimal.bytes_in, 112 + 48 * 4, "a header and four transforms, no q");
+    let omitted: Vec<_> = minimal.omitted.iter().map(|omitted| omitted.feature).collect();
+    let never_used = ["truncation", "exact_normals", "compensated", "followers", "displacements", "boxes", "batches"];
+    assert_eq!(omitted, [&["modes", "normal_maps", "shear"][..], &never_used].concat());
+    assert_eq!(minimal.omitted[1].bytes, 16 * (311 + 622), "rest and world tangents of every corner");
 }
 
 #[test]
-fn a_scene_that_needs_more_leaves_less_out() {
+fn used_features_are_compiled_and_scene_with_storage() {
     let full = plan(&scene(&[(7, 2), (300, 0)], true, false));
     assert_eq!(
         full.kernels[0].defines,
@@ -51,21 +54,24 @@ fn a_scene_that_needs_more_leaves_less_out() {
 }
 
 #[test]
-fn followers_need_no_room_in_a_step_and_cost_frames_and_a_macro_once() {
-    let (own, on_others) = (scene(&[(7, 2), (300, 0)], false, true), on_the_first(&[(7, 2), (300, 0)]));
-    let (alone, follows) = (plan(&own), plan(&on_others));
-    assert_eq!((alone.bytes_in, follows.bytes_in), (112 + 48 * 4 + 4 * 4, 112 + 48 + 4 * 4), "three of four follow");
-    assert_eq!(follows.bytes(BufferRole::FollowerFrames), 8 * 4 + 48 * 3);
-    assert_eq!(alone.bytes(BufferRole::FollowerFrames), 0);
-    let with = |plan: &DeformPlan| defines(plan).iter().filter(|(_, macros)| macros.contains(&"FOLLOWERS")).count();
-    assert_eq!((with(&alone), with(&follows)), (0, 2), "in `deform` and `apply`");
-    assert_eq!(follows.launches(), alone.launches());
+fn followers_upload_no_transforms_but_keep_frames() {
+    let sizes = [(7, 2), (300, 0)];
+    let independent = plan(&scene(&sizes, false, true));
+    let followers = plan(&scene_with_followers(&sizes, DeformationSettings::default()));
+    assert_eq!(independent.bytes_in, 112 + 48 * 4 + 4 * 4);
+    assert_eq!(followers.bytes_in, 112 + 48 + 4 * 4, "three of four domains follow");
+    assert_eq!(followers.bytes(BufferRole::FollowerFrames), 8 * 4 + 48 * 3);
+    assert_eq!(independent.bytes(BufferRole::FollowerFrames), 0);
+    let count_macros =
+        |plan: &DeformPlan| defines(plan).iter().filter(|(_, macros)| macros.contains(&"FOLLOWERS")).count();
+    assert_eq!((count_macros(&independent), count_macros(&followers)), (0, 2), "in `deform` and `apply`");
+    assert_eq!(followers.launches(), independent.launches());
 }
 
 #[test]
-fn storage_decides_the_bytes_of_u_and_the_macro_that_reads_it() {
+fn storage_selects_the_bytes_and_the_macro_of_u() {
     let bytes = |storage| {
-        let plan = plan(&stored(&[(300, 8)], storage));
+        let plan = plan(&scene_with_storage(&[(300, 8)], storage));
         assert_eq!(plan.kernels[0].defines.last().copied(), storage_define(storage).or(Some("SHEAR")));
         plan.bytes(BufferRole::ModeWords)
     };
@@ -73,88 +79,107 @@ fn storage_decides_the_bytes_of_u_and_the_macro_that_reads_it() {
 }
 
 #[test]
-fn exact_normals_come_behind_the_positions_and_their_tables_are_planned() {
-    let scene = exact(&[(7, 2), (300, 0), (513, 4)]);
+fn exact_normals_add_a_kernel_and_its_tables() {
+    let scene = scene_with_exact_normals(&[(7, 2), (300, 0), (513, 4)]);
     let (plan, rings) = (plan(&scene), RingTables::new(&scene));
-    let normals = plan.kernel(KernelKind::Normals).expect("asked for");
+    let normals = plan.kernel(KernelKind::Normals).expect("the kernel `normals`");
     assert_eq!((normals.name, normals.defines.as_slice()), ("normals", ["SHEAR"].as_slice()));
     assert_eq!(plan.kernels[0].defines, ["MODES", "ONE_ITEM_PER_LANE"]);
     assert_eq!(plan.launches(), 4);
     for (role, bytes) in [
-        (BufferRole::CornerSlots, size_of_val(super::super::rings::slots(&scene).as_slice())),
-        (BufferRole::CornerGroups, size_of_val(rings.members.as_slice())),
+        (BufferRole::CornerSlots, size_of_val(super::super::rings::normal_slots(&scene).as_slice())),
+        (BufferRole::CornerGroups, size_of_val(rings.corner_groups.as_slice())),
         (BufferRole::RingTables, size_of_val(rings.ring_offsets.as_slice()) + size_of_val(rings.rings.as_slice())),
-        (BufferRole::GroupNormals, size_of_val(rings.normals.as_slice())),
+        (BufferRole::GroupNormals, size_of_val(rings.group_normals.as_slice())),
     ] {
         assert_eq!(plan.bytes(role), bytes as u64, "{role:?}");
     }
     assert_eq!(plan.bytes(BufferRole::CornerGroups), 4 * (9 + 515), "the shape without modes has no groups");
-    let rigid = super::plan(&stored(&[(7, 2), (300, 0), (513, 4)], StorageType::F32), CudaDeformerOptions::default());
+    let rigid = super::plan(
+        &scene_with_storage(&[(7, 2), (300, 0), (513, 4)], StorageType::F32),
+        CudaDeformerOptions::default(),
+    );
     assert_eq!(
         rigid.bytes(BufferRole::CornerGroups)
             + rigid.bytes(BufferRole::RingTables)
             + rigid.bytes(BufferRole::GroupNormals),
         0
     );
-    let omitted = rigid.omitted.iter().find(|part| part.feature == "exact_normals").expect("left out");
-    assert_eq!(omitted.bytes, 4 * (9 + 515) + 20 * 6, "members and slots");
+    let omitted = rigid.omitted.iter().find(|omitted| omitted.feature == "exact_normals").expect("an omitted feature");
+    assert_eq!(omitted.bytes, 4 * (9 + 515) + 20 * 6, "corner groups and slots");
 }
 
 #[test]
-fn displacements_and_boxes_are_outputs_and_macros_of_kernels_that_are_there_and_cost_nothing_unless_kept() {
+fn readbacks_add_buffers_and_macros_but_no_kernels() {
     let sizes = [(7, 2), (300, 0)];
-    let bare = plan(&stored(&sizes, StorageType::F32));
-    let kept = plan(&kept(&sizes));
+    let without_readbacks = plan(&scene_with_storage(&sizes, StorageType::F32));
+    let with_readbacks = plan(&scene_with_readbacks(&sizes));
     let roles = [BufferRole::Displacements, BufferRole::BoxSegments, BufferRole::DomainBoxes];
-    // Two domains of each shape, in one piece each.
-    assert_eq!(roles.map(|role| bare.bytes(role)), [0; 3]);
-    assert_eq!(roles.map(|role| kept.bytes(role)), [12 * 2 * (7 + 300), 16 * 4, 24 * 4]);
-    assert_eq!(kept.total_bytes() - bare.total_bytes(), 12 * 2 * (7 + 300) + 40 * 4);
-    assert!(bare.kernels.iter().all(|kernel| !kernel.defines.iter().any(|name| KEPT.contains(name))));
-    let with = |kernel: usize| kept.kernels[kernel].defines.iter().filter(|name| KEPT.contains(name)).count();
-    assert_eq!([with(0), with(1), with(2)], [1, 1, 0]);
-    assert_eq!((kept.launches(), kept.bytes_in, kept.bytes_out), (bare.launches(), bare.bytes_in, bare.bytes_out));
-    let bytes = |name: &str| bare.omitted.iter().find(|part| part.feature == name).map(|part| part.bytes);
-    assert_eq!([bytes("displacements"), bytes("boxes")], [Some(12 * 2 * (7 + 300)), Some(40 * 4)]);
+    // Two domains of each shape, with one segment each.
+    assert_eq!(roles.map(|role| without_readbacks.bytes(role)), [0; 3]);
+    assert_eq!(roles.map(|role| with_readbacks.bytes(role)), [12 * 2 * (7 + 300), 16 * 4, 24 * 4]);
+    assert_eq!(with_readbacks.total_bytes() - without_readbacks.total_bytes(), 12 * 2 * (7 + 300) + 40 * 4);
+    assert!(
+        without_readbacks
+            .kernels
+            .iter()
+            .all(|kernel| !kernel.defines.iter().any(|name| READBACK_DEFINES.contains(name)))
+    );
+    let count_macros = |kernel: usize| {
+        with_readbacks.kernels[kernel].defines.iter().filter(|name| READBACK_DEFINES.contains(name)).count()
+    };
+    assert_eq!([count_macros(0), count_macros(1), count_macros(2)], [1, 1, 0]);
+    assert_eq!(
+        (with_readbacks.launches(), with_readbacks.bytes_in, with_readbacks.bytes_out),
+        (without_readbacks.launches(), without_readbacks.bytes_in, without_readbacks.bytes_out)
+    );
+    let omitted_bytes =
+        |name: &str| without_readbacks.omitted.iter().find(|omitted| omitted.feature == name).map(|part| part.bytes);
+    assert_eq!([omitted_bytes("displacements"), omitted_bytes("boxes")], [Some(12 * 2 * (7 + 300)), Some(40 * 4)]);
 }
 
-/// The macros of outputs that are kept for readers.
-const KEPT: [&str; 2] = ["DISPLACEMENTS", "DOMAIN_BOXES"];
+/// The macros of displacements and boxes.
+const READBACK_DEFINES: [&str; 2] = ["DISPLACEMENTS", "DOMAIN_BOXES"];
 
 #[test]
-fn light_space_is_measured_by_a_macro_of_a_kernel_that_is_there_and_only_for_a_shadow() {
+fn shadow_adds_oriented_bounds_but_no_kernel() {
     let sizes = [(7, 2), (300, 0)];
-    let (lit, dark) = (plan(&stored(&sizes, StorageType::F32)), plan(&unlit(&sizes)));
-    let defines = |plan: &DeformPlan| plan.kernel(KernelKind::Bounds).expect("always").defines.clone();
-    assert_eq!((defines(&lit), defines(&dark)), (vec!["ORIENTED_BOUNDS"], vec![]));
-    assert_eq!((lit.bytes_out, dark.bytes_out), (48, 24));
-    assert_eq!((lit.launches(), lit.total_bytes()), (dark.launches(), dark.total_bytes()));
-    let omitted = |plan: &DeformPlan| plan.omitted.iter().any(|part| part.feature == "shadows");
-    assert!(omitted(&dark) && !omitted(&lit));
+    let (with_shadow, without_shadow) =
+        (plan(&scene_with_storage(&sizes, StorageType::F32)), plan(&scene_without_shadow(&sizes)));
+    let defines = |plan: &DeformPlan| plan.kernel(KernelKind::Bounds).expect("the kernel `bounds`").defines.clone();
+    assert_eq!((defines(&with_shadow), defines(&without_shadow)), (vec!["ORIENTED_BOUNDS"], vec![]));
+    assert_eq!((with_shadow.bytes_out, without_shadow.bytes_out), (48, 24));
+    assert_eq!(
+        (with_shadow.launches(), with_shadow.total_bytes()),
+        (without_shadow.launches(), without_shadow.total_bytes())
+    );
+    let omits_shadow = |plan: &DeformPlan| plan.omitted.iter().any(|omitted| omitted.feature == "shadows");
+    assert!(omits_shadow(&without_shadow) && !omits_shadow(&with_shadow));
 }
 
 #[test]
 fn launches_do_not_grow_with_the_number_of_domains() {
-    let (few, many) = (scene(&[(7, 1)], false, false), scene(&[(7, 1); 3000], false, false));
-    assert_eq!((plan(&few).launches(), plan(&many).launches()), (2, 3));
+    let (two_domains, many_domains) = (scene(&[(7, 1)], false, false), scene(&[(7, 1); 3000], false, false));
+    // Two domains are too few for partial steps, which launch `apply`.
+    assert_eq!((plan(&two_domains).launches(), plan(&many_domains).launches()), (2, 3));
 }
 
 #[test]
-fn a_scene_whose_steps_are_always_whole_plans_nothing_for_lists() {
-    let lists = |scene: &Scene| {
+fn scenes_without_partial_steps_have_no_change_lists() {
+    let has_lists = |scene: &Scene| {
         let plan = plan(scene);
         assert_eq!(plan.kernel(KernelKind::Apply).is_some(), plan.change_list_bytes > 0);
         plan.change_list_bytes > 0
     };
     // Two instances of each shape.
-    assert!(!lists(&scene(&[(7, 1)], false, false)), "a quarter of two domains is none");
-    assert!(lists(&scene(&[(7, 1), (7, 1)], false, false)));
+    assert!(!has_lists(&scene(&[(7, 1)], false, false)), "a quarter of two domains is less than one domain");
+    assert!(has_lists(&scene(&[(7, 1), (7, 1)], false, false)));
     let truncated = DeformationSettings { truncation: Some(0.1), ..DeformationSettings::default() };
-    assert!(!lists(&deformed(&[(7, 1), (7, 1)], truncated)), "the kept modes go with the whole state");
+    assert!(!has_lists(&scene_with_deformation(&[(7, 1), (7, 1)], truncated)), "truncation requires full steps");
 }
 
 #[test]
-fn planned_bytes_are_those_of_the_tables() {
+fn planned_bytes_equal_the_bytes_of_the_tables() {
     let scene = scene(&[(7, 2), (300, 0), (513, 4)], true, false);
     let plan = plan(&scene);
     let work = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::default());

@@ -1,166 +1,207 @@
-//! Tests that walk the work list of `deform` as the kernel does.
+//! Tests that read the work list of `deform` in the same way as the kernel.
 
-use super::super::layout::TILE_LAST;
-use super::super::test_scenes::{scene, stored};
+use super::super::layout::LAST_QUAD_ITEMS;
+use super::super::test_scenes::{scene, scene_with_matching_corners, scene_with_storage, scene_without_sharing};
 use super::*;
 use std::sync::Arc;
 
-/// Words, scales and x0 of a scene, as `deform` loads them.
-pub(crate) struct Loaded {
+/// The tables that `deform` reads.
+pub(crate) struct LoadedTables {
     pub words: Vec<PackedWord>,
     pub scales: Vec<f32>,
-    pub rest: Vec<[f32; 4]>,
+    pub rest_positions: Vec<[f32; 4]>,
+    /// Per shape and mode.
     pub factors: Vec<Vec<f32>>,
 }
 
-pub(crate) fn load(scene: &Scene, work: &WorkList) -> Loaded {
+pub(crate) fn load_tables(scene: &Scene, work: &WorkList) -> LoadedTables {
     let tiles = |shape: usize| TiledModes::new(&scene.shapes[shape], scene.deformation.storage);
-    let mut loaded = Loaded {
+    let mut loaded = LoadedTables {
         words: Vec::new(),
-        scales: vec![0.0; work.scales as usize],
-        rest: rest_positions(scene, work),
+        scales: vec![0.0; work.scale_count as usize],
+        rest_positions: rest_positions(scene, work),
         factors: Vec::new(),
     };
     for source in &work.sources {
         match source {
             WordSource::Shape(shape) => loaded.words.extend_from_slice(tiles(*shape).packed_words()),
             WordSource::Mixed(shapes) => {
-                loaded.words.extend(side_by_side(&shapes.iter().map(|shape| tiles(*shape)).collect::<Vec<_>>()));
+                loaded.words.extend(mix_tiles(&shapes.iter().map(|shape| tiles(*shape)).collect::<Vec<_>>()));
             }
         }
     }
     for shape in 0..scene.shapes.len() {
-        let own = tiles(shape);
-        loaded.scales[work.first_scale[shape] as usize..][..own.scales().len()].copy_from_slice(own.scales());
-        loaded.factors.push(own.factors().to_vec());
+        let tiles = tiles(shape);
+        loaded.scales[work.first_scales[shape] as usize..][..tiles.scales().len()].copy_from_slice(tiles.scales());
+        loaded.factors.push(tiles.factors().to_vec());
     }
     loaded
 }
 
-/// A lane as the kernel sees it: domain, first item, number of items, first quad of x0, first q, first scale.
-fn lane(work: &WorkList, tile: &WarpTile, quad: usize) -> (usize, u32, usize, u32, u32, u32) {
-    let last = usize::from(tile.kind & TILE_LAST);
-    if last > 0 {
-        let count = if quad + 1 == usize::from(tile.width) { last } else { 4 };
-        let step = quad as u32;
-        let item = tile.first + 4 * step;
-        (tile.domain as usize, item, count, tile.rest, tile.first_q, tile.first_scale)
+/// A quad of a tile, as `load_lane_slice` of the kernel derives it.
+struct Quad {
+    domain: usize,
+    /// First packed vertex or corner.
+    first_item: u32,
+    item_count: usize,
+    /// First quad of the tile, or this quad in a mixed tile.
+    rest_quad: u32,
+    /// Index of this quad behind `rest_quad`.
+    quad_in_tile: usize,
+    /// Quads between the components of x0.
+    component_stride: usize,
+    first_q: u32,
+    first_scale: u32,
+}
+
+fn load_quad(work: &WorkList, tile: &WarpTile, quad: usize) -> Quad {
+    let last_quad_items = usize::from(tile.kind & LAST_QUAD_ITEMS);
+    let quad_count = usize::from(tile.quad_count);
+    if last_quad_items > 0 {
+        Quad {
+            domain: tile.domain as usize,
+            first_item: tile.first_item + 4 * quad as u32,
+            item_count: if quad + 1 == quad_count { last_quad_items } else { 4 },
+            rest_quad: tile.rest_quad,
+            quad_in_tile: quad,
+            component_stride: quad_count,
+            first_q: tile.first_q,
+            first_scale: tile.first_scale,
+        }
     } else {
-        let at = tile.first as usize + quad;
-        let lane = work.mixed_quads[at];
-        let scale = work.mixed_quad_scales.get(at).copied().unwrap_or(0);
-        let (domain, count) = ((lane.domain / 4) as usize, 1 + lane.domain as usize % 4);
-        (domain, lane.item, count, lane.rest, lane.first_q, scale)
+        let index = tile.first_item as usize + quad;
+        let mixed_quad = work.mixed_quads[index];
+        Quad {
+            domain: (mixed_quad.packed_domain / 4) as usize,
+            first_item: mixed_quad.first_item,
+            item_count: 1 + mixed_quad.packed_domain as usize % 4,
+            rest_quad: mixed_quad.rest_quad,
+            quad_in_tile: 0,
+            component_stride: 1,
+            first_q: mixed_quad.first_q,
+            first_scale: work.mixed_quad_scales.get(index).copied().unwrap_or(0),
+        }
     }
 }
 
-/// Counts the tiles that compute each packed corner, and checks the offset of its rest normal.
+/// Checks that one tile computes each packed corner, and that it finds the rest normal of the corner.
 fn check_corners(scene: &Scene, work: &WorkList) {
-    let mut seen = vec![0; scene.layout.corners];
-    let shifts = &work.corner_offsets;
+    let mut tile_counts = vec![0; scene.layout.corners];
     for tile in work.tiles.iter().filter(|tile| tile.kind & TILE_CORNERS > 0) {
-        for in_tile in 0..usize::from(tile.width) {
-            let (domain, item, count, rest, ..) = lane(work, tile, in_tile);
-            let both = tile.kind & TILE_VERTICES > 0;
-            let shift = if both { shifts.get(domain).copied().unwrap_or(0) } else { 0 };
-            let slot = scene.layout.domains[domain];
-            for within in 0..count {
-                let corner = item.wrapping_add(shift) as usize + within;
-                seen[corner] += 1;
-                let quad = work.quads.corners[scene.domains[domain].shape] as usize;
-                let own = usize::from(tile.kind & TILE_LAST) > 0;
-                let lane = if own { in_tile } else { 0 };
-                assert_eq!(rest as usize + lane, quad + (corner - slot.first_corner) / 4);
-                assert!(rest as u64 >= work.quads.first_with_normals && (rest as u64) < work.quads.end);
+        for quad in (0..usize::from(tile.quad_count)).map(|quad| load_quad(work, tile, quad)) {
+            let has_offset = tile.kind & TILE_VERTICES > 0 && !work.corner_offsets.is_empty();
+            let offset = if has_offset { work.corner_offsets[quad.domain] } else { 0 };
+            let layout = scene.layout.domains[quad.domain];
+            let first_quad = work.quads.corner_quads[scene.domains[quad.domain].shape] as usize;
+            for item in 0..quad.item_count {
+                let corner = quad.first_item.wrapping_add(offset) as usize + item;
+                tile_counts[corner] += 1;
+                let rest_quad = quad.rest_quad as usize + quad.quad_in_tile;
+                assert_eq!(rest_quad, first_quad + (corner - layout.first_corner) / 4);
+                let quads_with_normals = work.quads.first_direction_quad..work.quads.quad_count;
+                assert!(quads_with_normals.contains(&u64::from(quad.rest_quad)));
             }
         }
     }
-    assert!(seen.iter().all(|times| *times == 1), "every corner is computed once");
+    assert!(tile_counts.iter().all(|count| *count == 1), "expected one tile per corner");
 }
 
-/// Walks the work list as the kernel does and checks that every vertex finds its x0, its entries and its q.
-fn check(scene: &Arc<Scene>) -> WorkList {
+/// Reads the work list as the kernel does. Checks that one tile computes each vertex, and that it finds x0, the entries
+/// of U and q of the vertex.
+fn check_work_list(scene: &Arc<Scene>) -> WorkList {
     let coordinates = CoordinateLayout::new(scene);
     let work = WorkList::new(scene, &coordinates, BatchPolicy::default());
-    let loaded = load(scene, &work);
-    assert_eq!(loaded.words.len() as u64, work.words);
-    let per_chunk = modes_per_chunk(scene.deformation.storage);
-    let mut seen = vec![0; scene.layout.vertices];
+    let loaded = load_tables(scene, &work);
+    assert_eq!(loaded.words.len() as u64, work.word_count);
     check_corners(scene, &work);
+    let per_chunk = modes_per_chunk(scene.deformation.storage);
+    let mut tile_counts = vec![0; scene.layout.vertices];
     for (index, tile) in work.tiles.iter().enumerate().filter(|(_, tile)| tile.kind & TILE_VERTICES > 0) {
-        assert!((1..=TILE_QUADS).contains(&usize::from(tile.width)));
-        for quad in 0..usize::from(tile.width) {
-            let (domain, first, count, rest, first_q, first_scale) = lane(&work, tile, quad);
-            let shape = &scene.shapes[scene.domains[domain].shape];
-            assert_eq!(first_q, coordinates.first[domain]);
-            let (begin, tiles) = work.spans[domain][0];
-            assert!((begin..begin + tiles).contains(&(index as u32)), "the domain knows its tiles");
-            assert_eq!(usize::from(tile.chunks), shape.modes.rank().div_ceil(per_chunk));
-            for within in 0..count {
-                let packed = first as usize + within;
-                seen[packed] += 1;
-                let vertex = packed - scene.layout.domains[domain].first_vertex;
+        assert!((1..=TILE_QUADS).contains(&usize::from(tile.quad_count)));
+        for quad_index in 0..usize::from(tile.quad_count) {
+            let quad = load_quad(&work, tile, quad_index);
+            let shape = &scene.shapes[scene.domains[quad.domain].shape];
+            assert_eq!(quad.first_q, coordinates.first[quad.domain]);
+            let span = work.domain_tiles[quad.domain].vertices;
+            assert!((span.first..span.first + span.count).contains(&(index as u32)), "{span:?} lacks tile {index}");
+            assert_eq!(usize::from(tile.chunk_count), shape.modes.rank().div_ceil(per_chunk));
+            for item in 0..quad.item_count {
+                let packed_vertex = quad.first_item as usize + item;
+                tile_counts[packed_vertex] += 1;
+                let vertex = packed_vertex - scene.layout.domains[quad.domain].first_vertex;
                 for axis in 0..3 {
-                    let own = usize::from(tile.kind & TILE_LAST) > 0;
-                    let (step, lane) = if own { (usize::from(tile.width), quad) } else { (1, 0) };
-                    let at = 3 * rest as usize + axis * step + lane;
-                    assert_eq!(loaded.rest[at][within], shape.mesh.rest_positions()[vertex][axis]);
+                    let x0 = 3 * quad.rest_quad as usize + axis * quad.component_stride + quad.quad_in_tile;
+                    assert_eq!(loaded.rest_positions[x0][item], shape.mesh.rest_positions()[vertex][axis]);
                     for mode in 0..shape.modes.rank() {
-                        let size = 4 / per_chunk;
-                        let byte = ((mode % per_chunk * 3 + axis) * 4 + within) * size;
-                        let row = mode / per_chunk * 3 + byte / 16;
-                        let at = tile.first_word as usize + row * usize::from(tile.width) + quad;
-                        let bytes = &loaded.words[at].0[byte % 16..][..size];
-                        let factor = loaded.factors[scene.domains[domain].shape].get(mode).copied();
-                        let got = match scene.deformation.storage {
-                            StorageType::F32 => bytemuck::pod_read_unaligned::<f32>(bytes),
-                            StorageType::F16 => half::f16::from_le_bytes([bytes[0], bytes[1]]).to_f32(),
-                            StorageType::Bf16 => half::bf16::from_le_bytes([bytes[0], bytes[1]]).to_f32(),
-                            StorageType::Int8 => {
-                                (f32::from(bytes[0]) - 128.0) * loaded.scales[first_scale as usize + mode]
-                            }
-                        };
-                        let (got, want) = (got * factor.unwrap_or(1.0), shape.modes.entry(vertex, axis, mode));
-                        assert!((got - want).abs() <= want.abs() / 100.0 + 1.0, "{got} is not {want}");
+                        let entry = load_entry(scene, &loaded, (tile, quad_index), &quad, [mode, axis, item]);
+                        let expected = shape.modes.entry(vertex, axis, mode);
+                        let tolerance = expected.abs() / 100.0 + 1.0;
+                        assert!((entry - expected).abs() <= tolerance, "expected {expected}, got {entry}");
                     }
                 }
             }
         }
     }
-    assert!(seen.iter().all(|times| *times == 1), "every vertex is computed once");
+    assert!(tile_counts.iter().all(|count| *count == 1), "expected one tile per vertex");
     work
+}
+
+/// Decodes the entry `[mode, axis, item]` of U of a quad.
+fn load_entry(
+    scene: &Scene,
+    loaded: &LoadedTables,
+    (tile, quad_index): (&WarpTile, usize),
+    quad: &Quad,
+    [mode, axis, item]: [usize; 3],
+) -> f32 {
+    let storage = scene.deformation.storage;
+    let per_chunk = modes_per_chunk(storage);
+    let entry_bytes = 4 / per_chunk;
+    let byte_offset = ((mode % per_chunk * 3 + axis) * 4 + item) * entry_bytes;
+    let row = mode / per_chunk * 3 + byte_offset / 16;
+    let word = tile.first_word as usize + row * usize::from(tile.quad_count) + quad_index;
+    let bytes = &loaded.words[word].0[byte_offset % 16..][..entry_bytes];
+    let stored = match storage {
+        StorageType::F32 => bytemuck::pod_read_unaligned::<f32>(bytes),
+        StorageType::F16 => half::f16::from_le_bytes([bytes[0], bytes[1]]).to_f32(),
+        StorageType::Bf16 => half::bf16::from_le_bytes([bytes[0], bytes[1]]).to_f32(),
+        StorageType::Int8 => (f32::from(bytes[0]) - 128.0) * loaded.scales[quad.first_scale as usize + mode],
+    };
+    let factor = loaded.factors[scene.domains[quad.domain].shape].get(mode).copied();
+    stored * factor.unwrap_or(1.0)
 }
 
 const SHAPES: [(usize, usize); 7] = [(7, 2), (300, 0), (1, 5), (513, 1), (130, 33), (64, 2), (65, 2)];
 
 #[test]
-fn every_vertex_finds_its_entries_whatever_the_storage_and_the_tile() {
+fn every_vertex_finds_its_entries_in_every_storage() {
     for storage in StorageType::ALL {
-        check(&stored(&SHAPES, storage));
+        check_work_list(&scene_with_storage(&SHAPES, storage));
     }
 }
 
 #[test]
-fn small_rigid_domains_fill_tiles_together_and_those_with_modes_do_unless_they_share_them() {
-    let vertices = |work: &WorkList| -> Vec<WarpTile> {
+fn small_domains_share_tiles_unless_they_share_modes() {
+    let vertex_tiles = |work: &WorkList| -> Vec<WarpTile> {
         work.tiles.iter().filter(|tile| tile.kind & TILE_VERTICES > 0).copied().collect()
     };
-    // Two instances of each shape: those with modes share U and have tiles of their own.
-    let work = check(&scene(&[(7, 0); 40], false, false));
-    assert_eq!(vertices(&work).len(), 80 * 2 / 32);
-    assert!(vertices(&work).iter().all(|tile| (tile.kind & TILE_LAST, tile.width) == (0, 32)));
-    let work = check(&scene(&[(7, 3); 40], false, false));
-    assert_eq!((vertices(&work).len(), work.words), (80, 40 * 2 * 3 * 3));
-    let work = check(&single(&[(7, 3); 80]));
-    assert_eq!((vertices(&work).len(), work.words), (80 * 2 / 32, 80 * 2 * 3 * 3));
+    // Two domains of each shape. With modes they share U and have tiles of their own.
+    let work = check_work_list(&scene(&[(7, 0); 40], false, false));
+    assert_eq!(vertex_tiles(&work).len(), 80 * 2 / 32);
+    assert!(vertex_tiles(&work).iter().all(|tile| (tile.kind & LAST_QUAD_ITEMS, tile.quad_count) == (0, 32)));
+    let work = check_work_list(&scene(&[(7, 3); 40], false, false));
+    assert_eq!((vertex_tiles(&work).len(), work.word_count), (80, 40 * 2 * 3 * 3));
+    let work = check_work_list(&scene_without_sharing(&[(7, 3); 80]));
+    assert_eq!((vertex_tiles(&work).len(), work.word_count), (80 * 2 / 32, 80 * 2 * 3 * 3));
 }
 
 #[test]
-fn corners_that_are_the_vertices_share_their_tiles_and_have_no_room_of_their_own() {
-    let work = check(&super::super::test_scenes::corners_match(&[(7, 2), (300, 0), (9, 0)]));
+fn matching_corners_share_tiles_and_quads_with_vertices() {
+    let work = check_work_list(&scene_with_matching_corners(&[(7, 2), (300, 0), (9, 0)]));
     assert!(work.tiles.iter().all(|tile| tile.kind & (TILE_VERTICES | TILE_CORNERS) == TILE_VERTICES | TILE_CORNERS));
-    assert_eq!((work.quads.first_with_normals, work.quads.end), (0, work.quads.rest));
-    let work = check(&single(&[(7, 2), (300, 0)]));
+    let quads = &work.quads;
+    assert_eq!((quads.first_direction_quad, quads.quad_count), (0, quads.position_quad_count));
+    let work = check_work_list(&scene_without_sharing(&[(7, 2), (300, 0)]));
     assert!(
         work.tiles
             .iter()
@@ -168,24 +209,19 @@ fn corners_that_are_the_vertices_share_their_tiles_and_have_no_room_of_their_own
     );
 }
 
-/// Every shape used by one domain.
-fn single(shapes: &[(usize, usize)]) -> Arc<Scene> {
-    super::super::test_scenes::used_once(shapes)
-}
-
 #[test]
 fn tiles_with_the_most_modes_come_first() {
-    let work = check(&single(&[(7, 1), (700, 9), (9, 0), (200, 40), (8, 9)]));
-    let chunks: Vec<u16> = work.tiles.iter().map(|tile| tile.chunks).collect();
+    let work = check_work_list(&scene_without_sharing(&[(7, 1), (700, 9), (9, 0), (200, 40), (8, 9)]));
+    let chunks: Vec<u16> = work.tiles.iter().map(|tile| tile.chunk_count).collect();
     assert!(chunks.windows(2).all(|pair| pair[0] >= pair[1]), "{chunks:?}");
     assert_eq!((chunks[0], chunks[chunks.len() - 1]), (40, 0));
 }
 
 #[test]
-fn coordinates_fill_whole_chunks_unless_chunks_are_single_modes() {
+fn coordinates_are_padded_to_whole_chunks() {
     let shapes = [(7, 3), (9, 5)];
-    let packed = CoordinateLayout::new(&stored(&shapes, StorageType::F32));
+    let packed = CoordinateLayout::new(&scene_with_storage(&shapes, StorageType::F32));
     assert_eq!((packed.first.as_slice(), packed.total, packed.is_scene_order), ([0, 3, 6, 11].as_slice(), 16, true));
-    let chunked = CoordinateLayout::new(&stored(&shapes, StorageType::Int8));
+    let chunked = CoordinateLayout::new(&scene_with_storage(&shapes, StorageType::Int8));
     assert_eq!((chunked.first.as_slice(), chunked.total), ([0, 4, 8, 16].as_slice(), 24));
 }

@@ -7,7 +7,7 @@ use crate::gpu::tables::input_packing::InputPacker;
 use crate::gpu::tables::kernels::BATCH_WARPS;
 use crate::gpu::tables::layout::{BatchGroup, BatchMember};
 use crate::gpu::tables::work::batches::MAX_BATCH_SIZE;
-use crate::gpu::tables::work::tests::{Loaded, load};
+use crate::gpu::tables::work::tests::{LoadedTables, load_tables};
 use crate::gpu::tables::work::{CoordinateLayout, WorkList};
 use crate::storage::{PackedWord, TILE_QUADS, modes_per_chunk};
 use modalcast_model::backend_settings::BatchPolicy;
@@ -28,7 +28,7 @@ const POISON: PackedWord = PackedWord([0xff; 16]);
 pub(super) struct Tables {
     pub scene: Arc<Scene>,
     pub work: WorkList,
-    loaded: Loaded,
+    loaded: LoadedTables,
     state: SceneState,
     q: Vec<f32>,
 }
@@ -37,12 +37,12 @@ impl Tables {
     pub(super) fn of(scene: &Arc<Scene>, state: &SceneState) -> Self {
         let coordinates = CoordinateLayout::new(scene);
         let work = WorkList::new(scene, &coordinates, BatchPolicy::Always);
-        let loaded = load(scene, &work);
+        let loaded = load_tables(scene, &work);
         let mut q = vec![f32::NAN; coordinates.total];
-        let packing = InputPacker { factors: loaded.factors.clone(), ..InputPacker::sizes_only(scene) };
+        let packer = InputPacker { factors: loaded.factors.clone(), ..InputPacker::sizes_only(scene) };
         for domain in 0..scene.domains.len() {
-            let mut index = packing.coordinates.first[domain] as usize;
-            packing.put_q(domain, state.q_of(scene, domain), |number| {
+            let mut index = packer.coordinates.first[domain] as usize;
+            packer.put_q(domain, state.q_of(scene, domain), |number| {
                 q[index] = number;
                 index += 1;
             });
@@ -68,13 +68,13 @@ pub(super) struct Warp<'a> {
 impl<'a> Warp<'a> {
     pub(super) fn new(tables: &'a Tables, (group, tile): (u32, u32), warp: usize) -> Self {
         let (group, tile) = (tables.work.batched.groups[group as usize], tile as usize);
-        let tile_quads = TILE_QUADS.min((group.vertices as usize).div_ceil(4) - TILE_QUADS * tile);
+        let tile_quads = TILE_QUADS.min((group.vertex_count as usize).div_ceil(4) - TILE_QUADS * tile);
         let warp_quad = WARP_QUADS * warp;
         Self {
             tables,
             group,
             tile,
-            first_word: group.first_word as usize + 3 * group.chunks as usize * TILE_QUADS * tile + warp_quad,
+            first_word: group.first_word as usize + 3 * group.chunk_count as usize * TILE_QUADS * tile + warp_quad,
             tile_quads,
             warp_quad,
             quads: tile_quads.saturating_sub(warp_quad).min(WARP_QUADS),
@@ -92,7 +92,7 @@ impl<'a> Warp<'a> {
         self.ring[ring_word..][..STAGE_WORDS].fill(POISON);
         for (lane, step) in (0..32).flat_map(|lane| (0..STAGE_WORDS / 32).map(move |step| (lane, step))) {
             let row = 12 * stage + lane / WARP_QUADS + step * (32 / WARP_QUADS);
-            if row < 3 * self.group.chunks as usize {
+            if row < 3 * self.group.chunk_count as usize {
                 let word = self.first_word + row * self.tile_quads + (lane % WARP_QUADS).min(self.quads - 1);
                 self.ring[ring_word + lane + 32 * step] = self.tables.loaded.words[word];
             }
@@ -112,7 +112,7 @@ impl<'a> Warp<'a> {
 
     /// Sums of all lanes, `[lane][2 * axis + vertex][member]`.
     pub(super) fn sums(&mut self) -> Vec<[[f32; MAX_BATCH_SIZE]; 6]> {
-        let chunks = self.group.chunks as usize;
+        let chunks = self.group.chunk_count as usize;
         let chunk_modes = modes_per_chunk(self.tables.scene.deformation.storage);
         let size = 4 / chunk_modes;
         let scales = &self.tables.loaded.scales[self.group.first_scale as usize..];
@@ -128,7 +128,7 @@ impl<'a> Warp<'a> {
                         let byte = 4 * size * (3 * mode + axis);
                         let entry_byte = byte / 16 * (16 * WARP_QUADS) + byte % 16 + vertex * size;
                         let entry = self.entry(lane_byte + chunk * (3 * 16 * WARP_QUADS) + entry_byte);
-                        let members = self.group.members as usize;
+                        let members = self.group.member_count as usize;
                         for (index, sum) in sums[2 * axis + vertex].iter_mut().enumerate().take(members) {
                             *sum = entry
                                 .mul_add(self.tables.q[self.member(index).first_q as usize + mode_index] * scale, *sum);
@@ -144,15 +144,16 @@ impl<'a> Warp<'a> {
     /// Positions of two domains as the warp stages them before the stores, `[domain][vertex][3]`.
     pub(super) fn staged(&self, sums: &[[[f32; MAX_BATCH_SIZE]; 6]], member: usize) -> Vec<f32> {
         let mut staged = vec![f32::NAN; 2 * 3 * WARP_VERTICES];
-        let tile_rest = 3 * (self.group.rest as usize + TILE_QUADS * self.tile);
+        let tile_rest = 3 * (self.group.rest_quad as usize + TILE_QUADS * self.tile);
         for (lane, item) in (0..32).flat_map(|lane| (0..4).map(move |item| (lane, item))) {
             let (member_offset, vertex) = (item / 2, item % 2);
-            if member + member_offset >= self.group.members as usize {
+            if member + member_offset >= self.group.member_count as usize {
                 continue;
             }
             let quad = self.warp_quad + (lane / 2).min(self.quads - 1);
             let deformed = [0, 1, 2].map(|axis| {
-                let rest = self.tables.loaded.rest[tile_rest + axis * self.tile_quads + quad][2 * (lane % 2) + vertex];
+                let rest = self.tables.loaded.rest_positions[tile_rest + axis * self.tile_quads + quad]
+                    [2 * (lane % 2) + vertex];
                 rest + sums[lane][2 * axis + vertex][member + member_offset]
             });
             let rows = self.tables.state.transforms[self.member(member + member_offset).domain as usize].0;
@@ -166,13 +167,14 @@ impl<'a> Warp<'a> {
 
     pub(super) fn store(&self, staged: &[f32], member: usize, positions: &mut [f32]) {
         let mut put_number = |member: usize, number: usize, value: f32| {
-            let index = 3 * (self.member(member).first as usize + self.first_vertex) + number;
+            let index = 3 * (self.member(member).first_vertex as usize + self.first_vertex) + number;
             assert!(positions[index].is_nan(), "expected number {index} to be written once");
             positions[index] = value;
         };
-        let vertices = WARP_VERTICES.min(self.group.vertices as usize - self.first_vertex);
-        let members = self.group.members as usize;
-        let are_aligned = || (0..2).all(|member_offset| self.member(member + member_offset).first.is_multiple_of(4));
+        let vertices = WARP_VERTICES.min(self.group.vertex_count as usize - self.first_vertex);
+        let members = self.group.member_count as usize;
+        let are_aligned =
+            || (0..2).all(|member_offset| self.member(member + member_offset).first_vertex.is_multiple_of(4));
         if vertices == WARP_VERTICES && member + 1 < members && are_aligned() {
             for (lane, step) in (0..32).flat_map(|lane| (0..12).map(move |step| (lane, step))) {
                 let (word, component) = (step / 4, step % 4);
