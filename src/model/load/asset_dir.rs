@@ -16,10 +16,11 @@ pub(super) const MAX_TEXT_BYTES: u64 = 64 << 20;
 /// The largest number of directory entries that are read.
 const MAX_ENTRIES: usize = 10_000;
 
-/// A folder whose files a loader may read. With `root`, every path must stay inside that root after symbolic links
-/// are resolved. Without, any path is allowed.
+/// A folder whose files a loader may read. With a `root`, every path must stay inside the root after symbolic links are
+/// resolved. Without a `root`, any path is allowed.
 #[derive(Debug, Clone)]
 pub(super) struct AssetDir {
+    /// The folder to which paths are relative.
     base: PathBuf,
     root: Option<PathBuf>,
 }
@@ -32,7 +33,7 @@ pub(super) enum EntryKind {
 }
 
 impl AssetDir {
-    /// Allows paths relative to `base` and absolute ones, without confinement.
+    /// Allows any path: absolute or relative to `base`.
     pub(super) fn unrestricted(base: &Path) -> Self {
         Self { base: base.to_path_buf(), root: None }
     }
@@ -50,7 +51,7 @@ impl AssetDir {
         Ok(Self { base: self.resolve(relative)?, root: self.root.clone() })
     }
 
-    /// The last component of the resolved path, or `scene` if there is none.
+    /// The last component of the resolved path, or `scene` if it has none or does not resolve.
     pub(super) fn resolved_name(&self, relative: &str) -> String {
         let path = self.resolve(relative).ok();
         let name = path.as_deref().and_then(Path::file_name).and_then(|name| name.to_str());
@@ -61,22 +62,23 @@ impl AssetDir {
     ///
     /// # Errors
     /// `Invalid` if the path is outside the root, does not exist, is not a regular file, is too large or unreadable.
-    /// The error names the path as it was given, never the resolved path.
+    /// The error contains the unresolved path, so that it does not reveal the location of the root.
     pub(super) fn read(&self, relative: &str, limit: u64) -> Result<Vec<u8>> {
         let path = self.resolve(relative)?;
-        let refuse = |given: &dyn std::fmt::Display| invalid(field(relative), "a readable file", given);
-        // Check the type before opening, because opening a pipe or a device may block, and reading it may never end.
-        let about = path.metadata().map_err(|error| refuse(&error.kind()))?;
-        if !about.is_file() {
-            return Err(refuse(&"something that is no regular file"));
+        let unreadable = |given: &dyn std::fmt::Display| invalid(field_of(relative), "a regular, readable file", given);
+        // Check the type before the file is opened, because opening a pipe or a device may block, and reading it may
+        // never end.
+        let metadata = path.metadata().map_err(|error| unreadable(&error.kind()))?;
+        if !metadata.is_file() {
+            return Err(unreadable(&"a folder or a special file"));
         }
-        let too_large = |size: u64| invalid(field(relative), format!("at most {limit} bytes"), size);
-        if about.len() > limit {
-            return Err(too_large(about.len()));
+        let too_large = |size: u64| invalid(field_of(relative), format!("at most {limit} bytes"), size);
+        if metadata.len() > limit {
+            return Err(too_large(metadata.len()));
         }
         let mut bytes = Vec::new();
-        let file = File::open(&path).map_err(|error| refuse(&error.kind()))?;
-        file.take(limit.saturating_add(1)).read_to_end(&mut bytes).map_err(|error| refuse(&error.kind()))?;
+        let file = File::open(&path).map_err(|error| unreadable(&error.kind()))?;
+        file.take(limit.saturating_add(1)).read_to_end(&mut bytes).map_err(|error| unreadable(&error.kind()))?;
         // The file may have grown after its size was read.
         if bytes.len() as u64 > limit {
             return Err(too_large(bytes.len() as u64));
@@ -89,16 +91,11 @@ impl AssetDir {
     /// # Errors
     /// `Invalid` for a path that leaves the root.
     pub(super) fn kind(&self, relative: &str) -> Result<Option<EntryKind>> {
-        let path = self.join(relative)?;
-        if !path.exists() {
+        if !self.join(relative)?.exists() {
             return Ok(None);
         }
         let path = self.resolve(relative)?;
-        Ok(match () {
-            () if path.is_dir() => Some(EntryKind::Directory),
-            () if path.is_file() => Some(EntryKind::File),
-            () => None,
-        })
+        Ok(if path.is_dir() { Some(EntryKind::Directory) } else { path.is_file().then_some(EntryKind::File) })
     }
 
     /// Names and kinds of the folder's direct entries, sorted. Reads at most [`MAX_ENTRIES`] entries.
@@ -117,10 +114,10 @@ impl AssetDir {
     /// `Invalid` if the path leaves the root or does not exist.
     pub(super) fn resolve(&self, relative: &str) -> Result<PathBuf> {
         let path = self.join(relative)?;
-        let missing = |error: std::io::Error| invalid(field(relative), "a file that is there", error.kind());
-        let canonical = path.canonicalize().map_err(missing)?;
+        let missing_file = |error: std::io::Error| invalid(field_of(relative), "an existing file", error.kind());
+        let canonical = path.canonicalize().map_err(missing_file)?;
         match &self.root {
-            Some(root) if !canonical.starts_with(root) => Err(outside(relative)),
+            Some(root) if !canonical.starts_with(root) => Err(outside_error(relative)),
             _ => Ok(canonical),
         }
     }
@@ -128,7 +125,7 @@ impl AssetDir {
     /// Joins the path lexically, so that an error reveals nothing about files outside the root.
     fn join(&self, relative: &str) -> Result<PathBuf> {
         if relative.is_empty() || relative.contains('\0') {
-            return Err(invalid(field(relative), "a path", format!("{relative:?}")));
+            return Err(invalid(field_of(relative), "a path without NUL", format!("{relative:?}")));
         }
         let Some(root) = &self.root else { return Ok(self.base.join(relative)) };
         let mut path = self.base.clone();
@@ -139,10 +136,10 @@ impl AssetDir {
                 Component::ParentDir => {
                     path.pop();
                     if !path.starts_with(root) {
-                        return Err(outside(relative));
+                        return Err(outside_error(relative));
                     }
                 }
-                Component::RootDir | Component::Prefix(_) => return Err(outside(relative)),
+                Component::RootDir | Component::Prefix(_) => return Err(outside_error(relative)),
             }
         }
         Ok(path)
@@ -163,12 +160,13 @@ pub(super) fn file_name_of(path: &str) -> &str {
     path.rsplit_once('/').map_or(path, |(_, name)| name)
 }
 
-fn field(relative: &str) -> String {
+/// The field of an error about a file.
+fn field_of(relative: &str) -> String {
     format!("file '{relative}'")
 }
 
-fn outside(relative: &str) -> crate::error::Error {
-    invalid(field(relative), "a path inside the repository", "one that leaves it")
+fn outside_error(relative: &str) -> crate::error::Error {
+    invalid(field_of(relative), "a path inside the repository", "a path outside of it")
 }
 
 #[cfg(test)]
@@ -176,42 +174,44 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_confined_reader_refuses_each_way_out_and_tells_nothing_of_what_is_there() {
-        let outer = tempfile::tempdir().expect("a folder");
+    fn confined_reads_reject_paths_outside_without_revealing_files() {
+        let outer = tempfile::tempdir().expect("a temporary folder");
         let root = outer.path().join("root");
-        std::fs::create_dir_all(root.join("sub")).expect("made");
-        std::fs::write(outer.path().join("secret.txt"), "secret").expect("written");
-        std::fs::write(root.join("inside.txt"), "inside").expect("written");
-        std::os::unix::fs::symlink(outer.path().join("secret.txt"), root.join("link.txt")).expect("linked");
-        std::os::unix::fs::symlink(outer.path(), root.join("folder")).expect("linked");
-        let files = AssetDir::confined_to(&root.canonicalize().expect("there")).within("sub").expect("there");
-        assert_eq!(files.read("../inside.txt", 6).expect("inside"), b"inside");
+        std::fs::create_dir_all(root.join("sub")).expect("a new folder");
+        std::fs::write(outer.path().join("secret.txt"), "secret").expect("a writable file");
+        std::fs::write(root.join("inside.txt"), "inside").expect("a writable file");
+        std::os::unix::fs::symlink(outer.path().join("secret.txt"), root.join("link.txt")).expect("a symbolic link");
+        std::os::unix::fs::symlink(outer.path(), root.join("folder")).expect("a symbolic link");
+        let root = root.canonicalize().expect("an existing folder");
+        let files = AssetDir::confined_to(&root).within("sub").expect("an existing folder");
+        assert_eq!(files.read("../inside.txt", 6).expect("a file inside the root"), b"inside");
         let secret = outer.path().join("secret.txt");
-        for path in ["../../secret.txt", "../link.txt", "../folder/secret.txt", secret.to_str().expect("utf-8")] {
-            let refusal = files.read(path, 100).expect_err(path).to_string();
-            let expected = format!("file '{path}': expected a path inside the repository, got one that leaves it");
-            assert_eq!(refusal, expected);
+        for path in ["../../secret.txt", "../link.txt", "../folder/secret.txt", secret.to_str().expect("a UTF-8 path")]
+        {
+            let message = files.read(path, 100).expect_err(path).to_string();
+            let expected = format!("file '{path}': expected a path inside the repository, got a path outside of it");
+            assert_eq!(message, expected);
         }
-        let absent = files.read("../../absent.txt", 100).expect_err("absent").to_string();
-        assert!(absent.ends_with("expected a path inside the repository, got one that leaves it"), "{absent}");
-        assert_eq!(AssetDir::unrestricted(&root).read("../secret.txt", 100).expect("unconfined"), b"secret");
+        let absent = files.read("../../absent.txt", 100).expect_err("a missing file outside").to_string();
+        assert!(absent.ends_with("expected a path inside the repository, got a path outside of it"), "{absent}");
+        assert_eq!(AssetDir::unrestricted(&root).read("../secret.txt", 100).expect("a readable file"), b"secret");
     }
 
     #[test]
-    fn files_over_the_limit_missing_files_and_folders_are_refused_by_the_path_as_given() {
-        let root = tempfile::tempdir().expect("a folder");
-        std::fs::write(root.path().join("a.bin"), [0; 5]).expect("written");
-        std::fs::create_dir(root.path().join("d")).expect("made");
+    fn unreadable_files_are_rejected_with_the_requested_path() {
+        let root = tempfile::tempdir().expect("a temporary folder");
+        std::fs::write(root.path().join("a.bin"), [0; 5]).expect("a writable file");
+        std::fs::create_dir(root.path().join("d")).expect("a new folder");
         let files = AssetDir::unrestricted(root.path());
-        for (path, refusal) in [
+        for (path, message) in [
             ("a.bin", "file 'a.bin': expected at most 4 bytes, got 5"),
-            ("b.bin", "file 'b.bin': expected a file that is there, got entity not found"),
-            ("d", "file 'd': expected a readable file, got something that is no regular file"),
-            ("", "file '': expected a path, got \"\""),
-            ("a\0b", "file 'a\0b': expected a path, got \"a\\0b\""),
+            ("b.bin", "file 'b.bin': expected an existing file, got entity not found"),
+            ("d", "file 'd': expected a regular, readable file, got a folder or a special file"),
+            ("", "file '': expected a path without NUL, got \"\""),
+            ("a\0b", "file 'a\0b': expected a path without NUL, got \"a\\0b\""),
         ] {
-            assert_eq!(files.read(path, 4).expect_err(path).to_string(), refusal);
+            assert_eq!(files.read(path, 4).expect_err(path).to_string(), message);
         }
-        assert_eq!(files.read("a.bin", 5).expect("fits").len(), 5);
+        assert_eq!(files.read("a.bin", 5).expect("a readable file").len(), 5);
     }
 }

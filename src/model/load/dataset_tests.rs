@@ -1,4 +1,5 @@
-//! Tests of the loaders with real input files from other tools.
+//! Tests of the loaders with datasets from other tools. They are ignored by default, because the datasets are not part
+//! of the repository.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -6,60 +7,64 @@ use std::sync::Arc;
 use crate::domain::AlphaMode;
 use crate::scene::{Scene, UpAxis};
 
-fn data(path: &str) -> String {
+fn dataset_path(path: &str) -> String {
     let root = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../../../shared/data"), PathBuf::from);
-    root.join(path).to_str().expect("UTF-8").to_owned()
+    root.join(path).to_str().expect("a UTF-8 path").to_owned()
 }
 
-fn open(path: &str) -> Arc<Scene> {
-    super::open(&data(path)).unwrap_or_else(|error| panic!("{path}: {error}")).scene
+fn open_scene(path: &str) -> Arc<Scene> {
+    super::open(&dataset_path(path)).unwrap_or_else(|error| panic!("{path}: {error}")).scene
 }
 
-/// Opens a folder that contains this scene.toml.
-fn manifest(text: &str) -> crate::error::Result<Arc<Scene>> {
-    let folder = tempfile::tempdir().expect("a folder");
-    std::fs::write(folder.path().join("scene.toml"), text).expect("written");
-    super::open(folder.path().to_str().expect("UTF-8")).map(|opened| opened.scene)
+/// Opens a folder with a `scene.toml` of this text.
+fn open_manifest(text: &str) -> crate::error::Result<Arc<Scene>> {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    std::fs::write(folder.path().join("scene.toml"), text).expect("a writable file");
+    super::open(folder.path().to_str().expect("a UTF-8 path")).map(|opened| opened.scene)
 }
 
-fn fixed_rows(scene: &Scene) -> usize {
+fn count_fixed_vertices(scene: &Scene) -> usize {
     let modes = &scene.shapes[0].modes;
-    let is_zero = |vertex: &usize| (0..3 * modes.rank()).all(|at| modes.entry(*vertex, at % 3, at / 3) == 0.0);
+    let is_zero = |vertex: &usize| (0..3 * modes.rank()).all(|entry| modes.at(*vertex, entry % 3, entry / 3) == 0.0);
     (0..modes.vertices()).filter(is_zero).count()
 }
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 fn real_simple_bridge_keeps_the_numbering_of_its_file() {
-    let scene = open("vega/simpleBridge");
-    let slot = scene.layout.domains[0];
-    assert_eq!((slot.vertices, slot.corners, slot.triangles, slot.rank), (16085, 61612, 32014, 20));
-    assert_eq!(fixed_rows(&scene), 59);
+    let scene = open_scene("vega/simpleBridge");
+    let layout = scene.layout.domains[0];
+    assert_eq!((layout.vertices, layout.corners, layout.triangles, layout.rank), (16085, 61612, 32014, 20));
+    assert_eq!(count_fixed_vertices(&scene), 59);
     assert_eq!(scene.domains.len(), 1);
-    // Numbering by first use, which would be wrong, would differ in nearly every row.
-    let mut seen = vec![false; slot.vertices];
+    // Control: a loader that numbers vertices by first use would change most rows.
+    let mut is_seen = vec![false; layout.vertices];
     let corners = &scene.shapes[0].mesh.corners().vertices;
-    let by_first_use: Vec<u32> =
-        corners.iter().copied().filter(|vertex| !std::mem::replace(&mut seen[*vertex as usize], true)).collect();
-    let moved = by_first_use.iter().zip(0..).filter(|(vertex, index)| *vertex != index).count();
-    assert!(moved > 15_000, "{moved}");
-    let text = std::fs::read_to_string(data("vega/simpleBridge/simpleBridge.obj")).expect("read");
+    let first_use_order: Vec<u32> =
+        corners.iter().copied().filter(|vertex| !std::mem::replace(&mut is_seen[*vertex as usize], true)).collect();
+    let moved_count = first_use_order.iter().zip(0..).filter(|(vertex, index)| *vertex != index).count();
+    assert!(moved_count > 15_000, "{moved_count}");
+    let text = std::fs::read_to_string(dataset_path("vega/simpleBridge/simpleBridge.obj")).expect("a readable file");
     let lines = text.lines().filter_map(|line| line.strip_prefix("v "));
-    for (line, rest) in lines.zip(scene.shapes[0].mesh.rest_positions()) {
-        let numbers: Vec<f32> = line.split_whitespace().map(|word| word.parse().expect("a number")).collect();
-        assert_eq!(numbers, rest);
+    for (line, rest_position) in lines.zip(scene.shapes[0].mesh.rest()) {
+        let coordinates: Vec<f32> = line.split_whitespace().map(|word| word.parse().expect("a number")).collect();
+        assert_eq!(coordinates, rest_position);
     }
     let notes = &scene.domains[0].metadata.notes;
     assert_eq!((notes["vega.baseFrequency"].as_str(), notes["vega.cubic"].as_str()), ("0.25", "simpleBridge.cub"));
-    assert_eq!(open("vega/simpleBridge/simpleBridge.obj").rank_of(0), 20, "the file alone takes its modes too");
+    assert_eq!(
+        open_scene("vega/simpleBridge/simpleBridge.obj").rank_of(0),
+        20,
+        "expected the path of the file to load the modes, too"
+    );
 }
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 fn real_a_has_vertices_that_no_face_uses() {
-    let scene = open("vega/A");
-    let slot = scene.layout.domains[0];
-    assert_eq!((slot.vertices, slot.triangles, slot.rank), (575, 834, 20));
+    let scene = open_scene("vega/A");
+    let layout = scene.layout.domains[0];
+    assert_eq!((layout.vertices, layout.triangles, layout.rank), (575, 834, 20));
     let mut used: Vec<u32> = scene.shapes[0].mesh.corners().vertices.clone();
     used.sort_unstable();
     used.dedup();
@@ -68,54 +73,58 @@ fn real_a_has_vertices_that_no_face_uses() {
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-fn real_sofa_models_open_with_their_binary_modes_which_the_text_confirms() {
+fn real_sofa_binary_modes_equal_the_text_modes() {
     for (name, vertices, triangles, rank) in
         [("hexaBeam", 320, 492, 8), ("finger", 158, 306, 3), ("diamond", 1628, 3268, 32)]
     {
-        let scene = open(&format!("sofa/{name}"));
-        let slot = scene.layout.domains[0];
-        assert_eq!((slot.vertices, slot.triangles, slot.rank), (vertices, triangles, rank), "{name}");
+        let scene = open_scene(&format!("sofa/{name}"));
+        let layout = scene.layout.domains[0];
+        assert_eq!((layout.vertices, layout.triangles, layout.rank), (vertices, triangles, rank), "{name}");
         let (model, modes) =
-            (data(&format!("sofa/{name}/{name}.derived.obj")), data(&format!("sofa/{name}/modes.txt")));
-        let text = manifest(&format!("model = '{model}'\nmodes = '{modes}'\n")).expect("opens");
-        let pairs = scene.shapes[0].modes.columns().iter().zip(text.shapes[0].modes.columns());
-        let apart = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-        assert!(apart <= 1e-5, "{name}: {apart}");
+            (dataset_path(&format!("sofa/{name}/{name}.derived.obj")), dataset_path(&format!("sofa/{name}/modes.txt")));
+        let text_scene = open_manifest(&format!("model = '{model}'\nmodes = '{modes}'\n")).expect("a valid scene");
+        let pairs = scene.shapes[0].modes.columns().iter().zip(text_scene.shapes[0].modes.columns());
+        let max_difference = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(max_difference <= 1e-5, "{name}: {max_difference}");
     }
-    assert_eq!(fixed_rows(&open("sofa/hexaBeam")), 16);
+    assert_eq!(count_fixed_vertices(&open_scene("sofa/hexaBeam")), 16);
 }
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-fn real_ball_is_refused_with_what_is_declared_and_what_is_delivered() {
-    let folder = super::open(&data("sofa/ball")).expect_err("no mesh that is read").to_string();
+fn real_ball_is_rejected_with_declared_and_actual_size() {
+    let folder_error = super::open(&dataset_path("sofa/ball")).expect_err("no readable mesh").to_string();
     assert!(
-        folder.contains("expected scene.toml or one .glb, .gltf or .obj file, got none among: modes.txt"),
-        "{folder}"
+        folder_error.contains("expected scene.toml or one .glb, .gltf or .obj file, got no model among: modes.txt"),
+        "{folder_error}"
     );
-    let (model, modes) = (data("sofa/finger/finger.derived.obj"), data("sofa/ball/modes.txt"));
-    let refusal = manifest(&format!("model = '{model}'\nmodes = '{modes}'\n")).expect_err("malformed").to_string();
-    assert!(refusal.ends_with("values: expected 684 x 32 values as the header declares, got 684 x 35"), "{refusal}");
+    let (model, modes) = (dataset_path("sofa/finger/finger.derived.obj"), dataset_path("sofa/ball/modes.txt"));
+    let message = open_manifest(&format!("model = '{model}'\nmodes = '{modes}'\n")).expect_err("malformed").to_string();
+    assert!(message.ends_with("values: expected 684 x 32 values as the header declares, got 684 x 35"), "{message}");
 }
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-fn real_almond_is_1447_domains_upright_and_no_face_is_lost() {
+fn real_almond_has_1447_domains_and_all_faces() {
     let start = std::time::Instant::now();
-    let scene = open("plants/almond");
+    let scene = open_scene("plants/almond");
     let seconds = start.elapsed().as_secs_f64();
-    assert!(seconds < 5.0, "{seconds} s");
+    assert!(seconds < 5.0, "expected less than 5 s, got {seconds} s");
     assert_eq!((scene.domains.len(), scene.layout.triangles), (1447, 37560));
     assert_eq!(scene.domains.iter().filter(|domain| domain.name.starts_with("shoot ")).count(), 139);
     assert_eq!(scene.domains.iter().filter(|domain| domain.attachment.is_none()).count(), 1);
     assert_eq!(scene.up, UpAxis::Z);
     let height = scene.rest_bounds.max[2] - scene.rest_bounds.min[2];
     assert!((height - 2.6745).abs() < 1e-3, "{height}");
-    assert!(scene.features.mask && !scene.features.modes && !scene.features.normal_maps);
-    assert_eq!(open("plants/almond/almond.obj").domains.len(), 1447, "the file alone is the same plant");
+    assert!(scene.needs.mask && !scene.needs.modes && !scene.needs.normal_maps);
+    assert_eq!(
+        open_scene("plants/almond/almond.obj").domains.len(),
+        1447,
+        "expected the path of the file to load the plant, too"
+    );
     let leaf = scene.domains.iter().find(|domain| domain.name.starts_with("leaf ")).expect("a leaf");
     let materials: Vec<_> = leaf.materials().map(|material| &scene.materials[material]).collect();
-    assert_eq!(materials.len(), 2, "leaf and petiole");
+    assert_eq!(materials.len(), 2, "expected the materials of leaf and petiole");
     assert!(materials.iter().any(|material| matches!(material.alpha_mode, AlphaMode::Mask { .. })));
     for (name, color) in [("material0", [1.0; 3]), ("material2", [0.0; 3])] {
         let material = scene.materials.iter().find(|material| material.name == name).expect(name);
@@ -125,52 +134,59 @@ fn real_almond_is_1447_domains_upright_and_no_face_is_lost() {
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-fn real_plants_lie_where_their_file_says_and_petioles_reach_their_leaves() {
+fn real_plants_have_the_bounds_of_their_file_and_compact_leaves() {
     for (name, domains, triangles) in [("almond", 1447, 37560), ("bean", 237, 42824)] {
-        let scene = open(&format!("plants/{name}"));
+        let scene = open_scene(&format!("plants/{name}"));
         assert_eq!((scene.domains.len(), scene.layout.triangles), (domains, triangles), "{name}");
-        let text = std::fs::read_to_string(data(&format!("plants/{name}/{name}.obj"))).expect("read");
+        let text =
+            std::fs::read_to_string(dataset_path(&format!("plants/{name}/{name}.obj"))).expect("a readable file");
         let mut bounds = crate::scene::BoundingBox::EMPTY;
         for line in text.lines().filter_map(|line| line.strip_prefix("v ")) {
-            let numbers: Vec<f64> = line.split_whitespace().map(|word| word.parse().expect("a number")).collect();
-            bounds.include([numbers[0], numbers[1], numbers[2]]);
+            let position: Vec<f64> = line.split_whitespace().map(|word| word.parse().expect("a number")).collect();
+            bounds.include([position[0], position[1], position[2]]);
         }
         for axis in 0..3 {
             assert!((bounds.min[axis] - scene.rest_bounds.min[axis]).abs() < 1e-6, "{name}");
             assert!((bounds.max[axis] - scene.rest_bounds.max[axis]).abs() < 1e-6, "{name}");
         }
-        // A petiole that was assigned to another leaf would lie far from the frame of its domain.
-        let reach = if name == "almond" { 0.2 } else { 0.4 };
+        // A petiole that is assigned to the wrong leaf is far from the frame of its domain.
+        let max_distance = if name == "almond" { 0.2 } else { 0.4 };
         for (index, domain) in scene.domains.iter().enumerate().filter(|(_, domain)| domain.name.starts_with("leaf ")) {
-            let far = |rest: &[f32; 3]| nalgebra::Vector3::from(*rest).norm();
-            let farthest = scene.shape_of(index).mesh.rest_positions().iter().map(far).fold(0.0, f32::max);
-            assert!(farthest < reach, "{name}: {}: {farthest}", domain.name);
+            let distance = |rest: &[f32; 3]| nalgebra::Vector3::from(*rest).norm();
+            let actual_distance = scene.shape_of(index).mesh.rest().iter().map(distance).fold(0.0, f32::max);
+            assert!(
+                actual_distance < max_distance,
+                "{name}: {}: expected below {max_distance}, got {actual_distance}",
+                domain.name
+            );
         }
     }
 }
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-fn real_inputs_are_listed_and_those_outside_the_repository_are_not_reached() {
-    let repository = super::SceneRepository::new(Some(data("").as_ref())).expect("there");
+fn real_datasets_are_listed_if_their_folder_has_one_model() {
+    let repository = super::SceneRepository::new(Some(dataset_path("").as_ref())).expect("an existing folder");
     let names = repository.list();
     for name in ["tree", "plants/almond", "vega/simpleBridge", "sofa/hexaBeam", "gltf/fern/fern_02.glb"] {
         assert!(names.iter().any(|listed| listed == name), "{name} is not among {names:?}");
     }
     assert!(!names.iter().any(|name| name == "sofa/ball" || name == "vega/volumetric/beam3"));
-    assert_eq!(repository.open("vega/A").expect("opens").scene.rank_of(0), 20);
-    let refusal = super::open(&data("vega/volumetric/beam3")).expect_err("two models").to_string();
-    assert!(refusal.ends_with("got 2: beam3.obj, beam3_tet.obj"), "{refusal}");
+    assert_eq!(repository.open("vega/A").expect("a valid scene").scene.rank_of(0), 20);
+    let message = super::open(&dataset_path("vega/volumetric/beam3")).expect_err("two models").to_string();
+    assert!(message.ends_with("got 2: beam3.obj, beam3_tet.obj"), "{message}");
 }
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-fn real_fern_takes_its_leaves_from_a_derived_texture() {
-    let (model, texture) = (data("gltf/fern/fern_02.glb"), data("gltf/fern/fern_02_basecolor_alpha_1k.derived.png"));
-    let scene = manifest(&format!("model = '{model}'\nmaterial.'*'.colour_texture = '{texture}'\n")).expect("opens");
+fn real_fern_is_masked_by_an_override_of_its_texture() {
+    let (model, texture) =
+        (dataset_path("gltf/fern/fern_02.glb"), dataset_path("gltf/fern/fern_02_basecolor_alpha_1k.derived.png"));
+    let scene = open_manifest(&format!("model = '{model}'\nmaterial.'*'.colour_texture = '{texture}'\n"))
+        .expect("a valid scene");
     assert_eq!(scene.domains.len(), 4);
     let color = scene.materials[0].color_texture.expect("a colour texture");
     assert!(scene.textures[color].has_alpha() && scene.textures[color].width() == 1024);
     assert!(matches!(scene.materials[0].alpha_mode, AlphaMode::Mask { .. }));
-    assert_eq!(scene.textures.len(), 2, "the replaced texture is dropped");
+    assert_eq!(scene.textures.len(), 2, "expected the replaced texture to be removed");
 }

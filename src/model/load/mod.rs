@@ -3,8 +3,10 @@
 //! # Scene names
 //! A scene is a built-in name (`tree`), a folder with `scene.toml` (its keys are documented in `manifest`), a `.glb`,
 //! `.gltf` or `.obj` file, or a folder with exactly one such file. A folder with several is rejected with an error that
-//! lists them. The modes of an OBJ file are found by their file names next to it (`modes::beside`), and an OBJ file
-//! with a plant's structure next to it is loaded as a plant.
+//! lists them.
+//!
+//! The modes of an OBJ file are found by their file names in the same folder (`modes::find_sidecar`). An OBJ file is
+//! loaded as a plant if its folder also contains the structure of the plant (`plant`).
 //!
 //! # Conventions
 //! - Rows of U follow the `v` lines of an OBJ file, including unreferenced and coincident vertices.
@@ -35,7 +37,7 @@ use crate::backend_settings::BackendSettings;
 use crate::error::Result;
 use crate::scene::{Scene, SceneParts};
 
-/// A scene that was opened by name or path.
+/// A scene that was opened by name or path, with its backend settings.
 #[derive(Debug, Clone)]
 pub struct OpenedScene {
     pub scene: Arc<Scene>,

@@ -6,10 +6,10 @@ use super::asset_dir::{AssetDir, EntryKind};
 use super::{OpenedScene, manifest, source};
 use crate::error::{Error, Result};
 
-/// Depth of folders, below the root, up to which scenes are listed. Deeper scenes can still be opened by their path.
+/// The largest depth of listed folders below the root. Deeper scenes can still be opened by their path.
 const MAX_LIST_DEPTH: usize = 4;
-/// The largest number of listed names.
-const MAX_LISTED: usize = 4096;
+/// The largest number of listed names, without built-in scenes.
+const MAX_LISTED_NAMES: usize = 4096;
 
 /// The server's folder of scenes. Every path stays inside it, after symbolic links are resolved.
 #[derive(Debug, Clone)]
@@ -27,7 +27,7 @@ impl SceneRepository {
         let unavailable = |reason: String| Error::Unavailable {
             what: "scene repository",
             reason: format!("{}: {reason}", root.display()),
-            remedy: "Name a folder that is there".into(),
+            remedy: "Pass an existing folder".into(),
         };
         let canonical = root.canonicalize().map_err(|error| unavailable(error.to_string()))?;
         if !canonical.is_dir() {
@@ -53,32 +53,34 @@ impl SceneRepository {
     pub fn list(&self) -> Vec<String> {
         let mut names: Vec<String> = source::BUILT_IN.map(str::to_owned).to_vec();
         if let Some(root) = &self.root {
-            let mut found = Vec::new();
-            collect(&AssetDir::confined_to(root), "", MAX_LIST_DEPTH, &mut found);
-            found.sort();
-            names.append(&mut found);
+            let mut root_names = Vec::new();
+            collect_names(&AssetDir::confined_to(root), "", MAX_LIST_DEPTH, &mut root_names);
+            root_names.sort();
+            names.append(&mut root_names);
         }
         names
     }
 }
 
-fn collect(folder: &AssetDir, prefix: &str, depth: usize, found: &mut Vec<String>) {
+/// Appends the scenes in `folder` to `names`. `prefix` is the path of the folder below the root with a final `/`, or
+/// empty. Subfolders are searched down to `depth` levels.
+fn collect_names(folder: &AssetDir, prefix: &str, depth: usize, names: &mut Vec<String>) {
     let entries = folder.entries();
-    let is_manifest = entries.contains(&(manifest::MANIFEST_FILE.to_owned(), EntryKind::File));
-    if is_manifest || source::models(folder).len() == 1 {
-        found.push(if prefix.is_empty() { ".".into() } else { prefix.trim_end_matches('/').into() });
+    let has_manifest = entries.contains(&(manifest::MANIFEST_FILE.to_owned(), EntryKind::File));
+    if has_manifest || source::find_models(folder).len() == 1 {
+        names.push(if prefix.is_empty() { ".".into() } else { prefix.trim_end_matches('/').into() });
     }
     for (name, kind) in entries {
         // Skip hidden entries: uploads in progress, version control.
-        if found.len() >= MAX_LISTED || name.starts_with('.') {
+        if names.len() >= MAX_LISTED_NAMES || name.starts_with('.') {
             continue;
         }
         let path = format!("{prefix}{name}");
         match kind {
-            EntryKind::File if source::recognize_model(&name).is_some() => found.push(path),
+            EntryKind::File if source::recognize_model(&name).is_some() => names.push(path),
             EntryKind::Directory if depth > 0 => {
-                if let Ok(sub) = folder.within(&name) {
-                    collect(&sub, &format!("{path}/"), depth - 1, found);
+                if let Ok(subfolder) = folder.within(&name) {
+                    collect_names(&subfolder, &format!("{path}/"), depth - 1, names);
                 }
             }
             _ => {}
@@ -93,19 +95,19 @@ mod tests {
     const TRIANGLE: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
 
     fn repository(files: &[(&str, &str)]) -> (tempfile::TempDir, SceneRepository) {
-        let outer = tempfile::tempdir().expect("a folder");
+        let outer = tempfile::tempdir().expect("a temporary folder");
         for (name, text) in files {
             let path = outer.path().join("root").join(name);
-            std::fs::create_dir_all(path.parent().expect("a parent")).expect("made");
-            std::fs::write(path, text).expect("written");
+            std::fs::create_dir_all(path.parent().expect("a parent")).expect("a new folder");
+            std::fs::write(path, text).expect("a writable file");
         }
-        let repository = SceneRepository::new(Some(&outer.path().join("root"))).expect("there");
+        let repository = SceneRepository::new(Some(&outer.path().join("root"))).expect("an existing folder");
         (outer, repository)
     }
 
     #[test]
-    fn what_is_listed_can_be_opened() {
-        let (_keep, repository) = repository(&[
+    fn listed_scenes_can_be_opened() {
+        let (_folder, repository) = repository(&[
             ("one/a.obj", TRIANGLE),
             ("two/b.obj", TRIANGLE),
             ("two/c.obj", TRIANGLE),
@@ -117,15 +119,15 @@ mod tests {
         let names = repository.list();
         assert_eq!(names, ["tree", "deep/er/scene", "one", "one/a.obj", "two/b.obj", "two/c.obj"]);
         for name in &names[1..] {
-            let scene = repository.open(name).unwrap_or_else(|error| panic!("{name}: {error}"));
-            assert_eq!(scene.scene.domains.len(), 1);
+            let opened = repository.open(name).unwrap_or_else(|error| panic!("{name}: {error}"));
+            assert_eq!(opened.scene.domains.len(), 1);
         }
-        assert_eq!(repository.open("deep/er/scene").expect("there").scene.name, "scene");
-        assert!(repository.open("a/b/c/d/e/f/far.obj").is_ok(), "too deep for the list, not for its path");
+        assert_eq!(repository.open("deep/er/scene").expect("a valid scene").scene.name, "scene");
+        assert!(repository.open("a/b/c/d/e/f/far.obj").is_ok(), "expected an unlisted path to open");
     }
 
     #[test]
-    fn paths_that_leave_the_repository_are_refused_alike_whether_something_is_there_or_not() {
+    fn paths_outside_are_rejected_without_revealing_files() {
         let (outer, repository) = repository(&[
             ("one/a.obj", TRIANGLE),
             ("out/scene.toml", "model = '../../secret.obj'\n"),
@@ -133,8 +135,8 @@ mod tests {
             ("map/a.obj", "mtllib ../../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
             ("patch/scene.toml", "model = '../one/a.obj'\nmaterial.'*'.colour_texture = '../../x.png'\n"),
         ]);
-        std::fs::write(outer.path().join("secret.obj"), TRIANGLE).expect("written");
-        std::os::unix::fs::symlink(outer.path(), outer.path().join("root/link")).expect("linked");
+        std::fs::write(outer.path().join("secret.obj"), TRIANGLE).expect("a writable file");
+        std::os::unix::fs::symlink(outer.path(), outer.path().join("root/link")).expect("a symbolic link");
         for source in [
             "../secret.obj",
             "../absent.obj",
@@ -148,23 +150,23 @@ mod tests {
             "map",
             "patch",
         ] {
-            let refusal = repository.open(source).expect_err(source).to_string();
-            assert!(refusal.contains("expected a path inside the repository"), "{source}: {refusal}");
-            let outside = outer.path().to_str().expect("utf-8");
-            assert!(!refusal.contains(outside), "{source}: {refusal}");
+            let message = repository.open(source).expect_err(source).to_string();
+            assert!(message.contains("expected a path inside the repository"), "{source}: {message}");
+            let outside = outer.path().to_str().expect("a UTF-8 path");
+            assert!(!message.contains(outside), "{source}: {message}");
         }
         assert!(!repository.list().iter().any(|name| name.starts_with("link")));
     }
 
     #[test]
-    fn unknown_names_and_folders_are_told_apart() {
+    fn missing_ambiguous_and_empty_folders_have_different_errors() {
         let (outer, repository) = repository(&[("two/b.obj", TRIANGLE), ("two/c.obj", TRIANGLE), ("none/x.txt", "")]);
-        let absent = repository.open("absent").expect_err("absent");
+        let absent = repository.open("absent").expect_err("a missing scene");
         assert_eq!(absent, Error::NotFound { what: "scene", given: "absent".into() });
         let ambiguous = repository.open("two").expect_err("two models").to_string();
-        assert_eq!(ambiguous, "folder 'two': expected scene.toml, or one model to choose, got 2: b.obj, c.obj");
+        assert_eq!(ambiguous, "folder 'two': expected scene.toml or one .glb, .gltf or .obj file, got 2: b.obj, c.obj");
         let empty = repository.open("none").expect_err("no model").to_string();
-        assert!(empty.ends_with("got none among: x.txt"), "{empty}");
+        assert!(empty.ends_with("got no model among: x.txt"), "{empty}");
         assert!(matches!(SceneRepository::new(Some(&outer.path().join("no"))), Err(Error::Unavailable { .. })));
         let built_in = SceneRepository::new(None).expect("built-in scenes only");
         assert_eq!(built_in.list(), ["tree"]);

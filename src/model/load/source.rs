@@ -18,7 +18,10 @@ pub(super) enum ModelFile {
     Plant(String),
 }
 
-/// A scene of any kind. Only `scene.toml` contains settings of the backends; those of other scenes are the defaults.
+/// The largest number of names in an error message.
+const MAX_LISTED_NAMES: usize = 16;
+
+/// Reads a scene of any kind. Only `scene.toml` contains backend settings; other scenes have the defaults.
 ///
 /// # Errors
 /// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
@@ -36,37 +39,38 @@ pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneDescription> {
             let folder = files.within(source)?;
             match folder.kind(manifest::MANIFEST_FILE)? {
                 Some(EntryKind::File) => manifest::read(&folder, manifest::MANIFEST_FILE, &files.resolved_name(source)),
-                _ => model(files, source, ModesSource::Sidecar).map(SceneDescription::from),
+                _ => read_model(files, source, ModesSource::Sidecar).map(SceneDescription::from),
             }
         }
-        Some(EntryKind::File) => model(files, source, ModesSource::Sidecar).map(SceneDescription::from),
+        Some(EntryKind::File) => read_model(files, source, ModesSource::Sidecar).map(SceneDescription::from),
     }
 }
 
-/// The parts of one model: a file, or a folder with exactly one recognized model.
+/// Reads one model: a file, or a folder with exactly one recognized model.
 ///
 /// # Errors
 /// `Invalid` with the file, the field, and the expected and given value.
-pub(super) fn model(files: &AssetDir, path: &str, modes: ModesSource) -> Result<SceneParts> {
+pub(super) fn read_model(files: &AssetDir, path: &str, modes: ModesSource) -> Result<SceneParts> {
     match files.kind(path)? {
         Some(EntryKind::Directory) => {
             let folder = files.within(path)?;
-            let mut parts = read_model(&folder, &single_model(&folder, path)?, modes)?;
+            let mut parts = read_model_file(&folder, &choose_single_model(&folder, path)?, modes)?;
             parts.name = files.resolved_name(path);
             Ok(parts)
         }
         Some(EntryKind::File) => {
             let folder = files.within(parent_of(path))?;
-            let found = recognize_model(file_name_of(path))
-                .ok_or_else(|| invalid(format!("file '{path}'"), "a file ending in .glb, .gltf or .obj", "another"))?;
-            let found = detect_plant(found, &file_names(&folder));
-            read_model(&folder, &found, modes)
+            let file_name = file_name_of(path);
+            let model = recognize_model(file_name)
+                .ok_or_else(|| invalid(format!("file '{path}'"), "a file ending in .glb, .gltf or .obj", file_name))?;
+            let model = detect_plant(model, &file_names(&folder));
+            read_model_file(&folder, &model, modes)
         }
-        None => Err(invalid(format!("file '{path}'"), "a model that is there", "nothing of that name")),
+        None => Err(invalid(format!("file '{path}'"), "an existing model", "no file of this name")),
     }
 }
 
-fn read_model(folder: &AssetDir, model: &ModelFile, modes: ModesSource) -> Result<SceneParts> {
+fn read_model_file(folder: &AssetDir, model: &ModelFile, modes: ModesSource) -> Result<SceneParts> {
     match model {
         ModelFile::Gltf(name) => gltf::read(folder, name),
         ModelFile::Obj(name) => obj::read(folder, name, modes),
@@ -84,20 +88,20 @@ pub(super) fn recognize_model(name: &str) -> Option<ModelFile> {
 }
 
 /// All models in a folder.
-pub(super) fn models(folder: &AssetDir) -> Vec<ModelFile> {
+pub(super) fn find_models(folder: &AssetDir) -> Vec<ModelFile> {
     let names = file_names(folder);
     names.iter().filter_map(|name| recognize_model(name)).map(|model| detect_plant(model, &names)).collect()
 }
 
-/// Turns an OBJ file into a plant if the files of a plant's structure are next to it.
+/// Recognizes an OBJ file as a plant if the files of the plant's structure are in the same folder.
 fn detect_plant(model: ModelFile, names: &[String]) -> ModelFile {
     let stem = match &model {
         ModelFile::Obj(name) => name.strip_suffix(".obj"),
         _ => None,
     };
     let is_plant = |stem: &&str| {
-        let company = [format!("{stem}.structure.json"), format!("{stem}_object_id.dat")];
-        company.iter().all(|name| names.contains(name))
+        let structure_files = [format!("{stem}.structure.json"), format!("{stem}_object_id.dat")];
+        structure_files.iter().all(|name| names.contains(name))
     };
     stem.filter(is_plant).map(|stem| ModelFile::Plant(stem.into())).unwrap_or(model)
 }
@@ -107,23 +111,24 @@ fn file_names(folder: &AssetDir) -> Vec<String> {
     folder.entries().into_iter().filter(|(_, kind)| *kind == EntryKind::File).map(|(name, _)| name).collect()
 }
 
-fn single_model(folder: &AssetDir, path: &str) -> Result<ModelFile> {
-    let mut found = models(folder);
-    let shown = |names: Vec<String>| names.into_iter().take(16).collect::<Vec<_>>().join(", ");
+fn choose_single_model(folder: &AssetDir, path: &str) -> Result<ModelFile> {
+    let mut models = find_models(folder);
+    let join_names = |names: Vec<String>| names.into_iter().take(MAX_LISTED_NAMES).collect::<Vec<_>>().join(", ");
     let field = format!("folder '{path}'");
-    match found.len() {
-        1 => Ok(found.remove(0)),
+    let expected = "scene.toml or one .glb, .gltf or .obj file";
+    match models.len() {
+        1 => Ok(models.remove(0)),
         0 => {
-            let given = shown(folder.entries().into_iter().map(|(name, _)| name).collect());
-            Err(invalid(field, "scene.toml or one .glb, .gltf or .obj file", format!("none among: {given}")))
+            let given = join_names(folder.entries().into_iter().map(|(name, _)| name).collect());
+            Err(invalid(field, expected, format!("no model among: {given}")))
         }
-        count => {
+        model_count => {
             let name = |model| match model {
                 ModelFile::Gltf(name) | ModelFile::Obj(name) => name,
                 ModelFile::Plant(stem) => format!("{stem} (a plant)"),
             };
-            let given = shown(found.into_iter().map(name).collect());
-            Err(invalid(field, "scene.toml, or one model to choose", format!("{count}: {given}")))
+            let given = join_names(models.into_iter().map(name).collect());
+            Err(invalid(field, expected, format!("{model_count}: {given}")))
         }
     }
 }

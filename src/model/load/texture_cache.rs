@@ -6,15 +6,15 @@ use super::asset_dir::{AssetDir, MAX_IMAGE_BYTES};
 use crate::domain::Texture;
 use crate::error::Result;
 
-/// Textures by the name of their file.
+/// The textures of a scene and their indices by name.
 #[derive(Debug, Default)]
 pub(super) struct TextureCache {
-    list: Vec<Texture>,
-    by_name: HashMap<String, usize>,
+    textures: Vec<Texture>,
+    index_by_name: HashMap<String, usize>,
 }
 
 impl TextureCache {
-    /// The index of the texture in `path`, which is decoded on the first call.
+    /// Returns the index of the texture in the file `path`. The first call for a file decodes it.
     ///
     /// # Errors
     /// `Invalid` if the file does not exist or is not a PNG or JPEG image.
@@ -22,27 +22,27 @@ impl TextureCache {
         self.get_or_insert_with(path, || decode(files, path))
     }
 
-    /// The index of the texture called `name`, which `make` creates on the first call.
+    /// Returns the index of the texture called `name`. The first call for a name creates the texture with `create`.
     ///
     /// # Errors
-    /// Those of `make`.
-    pub(super) fn get_or_insert_with(&mut self, name: &str, make: impl FnOnce() -> Result<Texture>) -> Result<usize> {
-        if let Some(index) = self.by_name.get(name) {
+    /// Those of `create`.
+    pub(super) fn get_or_insert_with(&mut self, name: &str, create: impl FnOnce() -> Result<Texture>) -> Result<usize> {
+        if let Some(index) = self.index_by_name.get(name) {
             return Ok(*index);
         }
-        self.list.push(make()?);
-        self.by_name.insert(name.to_owned(), self.list.len() - 1);
-        Ok(self.list.len() - 1)
+        self.textures.push(create()?);
+        self.index_by_name.insert(name.to_owned(), self.textures.len() - 1);
+        Ok(self.textures.len() - 1)
     }
 
-    /// The textures loaded so far.
-    pub(super) fn list(&self) -> &[Texture] {
-        &self.list
+    /// All textures so far.
+    pub(super) fn textures(&self) -> &[Texture] {
+        &self.textures
     }
 
     /// Converts to the list of all textures.
     pub(super) fn into_textures(self) -> Vec<Texture> {
-        self.list
+        self.textures
     }
 }
 

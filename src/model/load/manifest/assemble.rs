@@ -16,10 +16,11 @@ use crate::load::obj::ModesSource;
 use crate::load::{modes, source, texture_cache};
 use crate::scene::{MAX_DOMAINS, SceneParts, UpAxis};
 
-/// Number of carrying vertices of a deformable parent for an entry without `rows`.
+/// Number of parent vertices that carry the domains of an entry without `rows`.
 const DEFAULT_ATTACHMENT_ROWS: usize = 8;
 
-/// The scene of all entries, and the settings of the backends.
+/// Assembles the scene of all entries and reads its backend settings. `default_name` is the name of a scene whose
+/// manifest has none.
 ///
 /// # Errors
 /// `Invalid` with the entry.
@@ -27,21 +28,21 @@ pub(super) fn assemble(
     files: &AssetDir,
     manifest: &Manifest,
     entries: &[DomainEntry],
-    own_name: &str,
+    default_name: &str,
 ) -> Result<SceneDescription> {
-    let name = manifest.name.clone().unwrap_or_else(|| own_name.to_owned());
+    let name = manifest.name.clone().unwrap_or_else(|| default_name.to_owned());
     let mut assembly = ManifestAssembler {
         files,
         manifest,
         parts: SceneParts::named(name),
         texture_by_path: HashMap::new(),
         models: HashMap::new(),
-        by_name: HashMap::new(),
-        patched: HashSet::new(),
+        domain_by_name: HashMap::new(),
+        material_names: HashSet::new(),
     };
     for (index, entry) in entries.iter().enumerate() {
         assembly
-            .add(index, entry)
+            .add_entry(index, entry)
             .map_err(|error| error.prefix_field(&format!("domain {} ('{}')", index, entry.model)))?;
     }
     assembly.check_patches()?;
@@ -70,8 +71,8 @@ pub(super) fn assemble(
     Ok(SceneDescription { parts, backends })
 }
 
-/// A model that was read. The indices in its domains refer to the lists of the whole scene, except indices of other
-/// domains, which are relative to the model.
+/// The domains of a loaded model. Their indices of shapes and materials refer to the lists of the scene. Their indices
+/// of other domains are relative to the model.
 struct LoadedModel {
     domains: Vec<Domain>,
 }
@@ -79,16 +80,18 @@ struct LoadedModel {
 struct ManifestAssembler<'a> {
     files: &'a AssetDir,
     manifest: &'a Manifest,
+    /// The scene with the entries so far.
     parts: SceneParts,
     texture_by_path: HashMap<String, usize>,
+    /// Models by the path of the model file and the name of the modes file.
     models: HashMap<(PathBuf, Option<String>), LoadedModel>,
-    by_name: HashMap<String, usize>,
-    /// Names of all materials that were looked up in the overrides.
-    patched: HashSet<String>,
+    domain_by_name: HashMap<String, usize>,
+    /// Names of the materials of all models.
+    material_names: HashSet<String>,
 }
 
 impl TextureLookup for ManifestAssembler<'_> {
-    fn index(&mut self, path: &str) -> Result<usize> {
+    fn load_texture(&mut self, path: &str) -> Result<usize> {
         if let Some(index) = self.texture_by_path.get(path) {
             return Ok(*index);
         }
@@ -97,41 +100,44 @@ impl TextureLookup for ManifestAssembler<'_> {
         Ok(self.parts.textures.len() - 1)
     }
 
-    fn at(&self, index: usize) -> Option<&Texture> {
+    fn texture(&self, index: usize) -> Option<&Texture> {
         self.parts.textures.get(index)
     }
 }
 
 impl ManifestAssembler<'_> {
-    fn add(&mut self, index: usize, entry: &DomainEntry) -> Result<()> {
+    /// Adds the domains of an entry. The first entry with a model loads it.
+    fn add_entry(&mut self, index: usize, entry: &DomainEntry) -> Result<()> {
         let path = self.files.resolve(&entry.model)?;
-        let key = (path, entry.modes.clone());
-        if !self.models.contains_key(&key) {
-            let loaded = self.load(index, entry)?;
-            self.models.insert(key.clone(), loaded);
+        let model_key = (path, entry.modes.clone());
+        if !self.models.contains_key(&model_key) {
+            let model = self.load_model(index, entry)?;
+            self.models.insert(model_key.clone(), model);
         }
-        let Some(loaded) = self.models.get(&key) else { return Ok(()) };
-        let mut domains = loaded.domains.clone();
-        let first = self.parts.domains.len();
-        if first + domains.len() > MAX_DOMAINS {
-            return Err(invalid("domains", format!("at most {MAX_DOMAINS} in a scene"), first + domains.len()));
+        let Some(model) = self.models.get(&model_key) else { return Ok(()) };
+        let mut domains = model.domains.clone();
+        let domain_offset = self.parts.domains.len();
+        let domain_count = domain_offset + domains.len();
+        if domain_count > MAX_DOMAINS {
+            return Err(invalid("domains", format!("at most {MAX_DOMAINS} in a scene"), domain_count));
         }
-        self.place(entry, &mut domains)?;
+        self.place_domains(entry, &mut domains)?;
         add_follow_constraints(entry, &mut domains)?;
         self.apply_entry_material(entry, &mut domains)?;
-        self.annotate(entry, &mut domains)?;
+        self.set_metadata(entry, &mut domains)?;
         for domain in &mut domains {
-            domain.shares_q_with = domain.shares_q_with.map(|twin| twin + first);
+            domain.shares_q_with = domain.shares_q_with.map(|other| other + domain_offset);
         }
-        self.name(entry, &mut domains)?;
+        self.name_domains(entry, &mut domains)?;
         self.parts.domains.append(&mut domains);
         Ok(())
     }
 
-    /// Reads a model and appends its shapes, materials and textures to those of the scene.
-    fn load(&mut self, index: usize, entry: &DomainEntry) -> Result<LoadedModel> {
-        let source = if entry.modes.is_some() { ModesSource::None } else { ModesSource::Sidecar };
-        let mut model = source::model(self.files, &entry.model, source)?;
+    /// Reads a model and appends its shapes, materials and textures to those of the scene. The model of the first entry
+    /// (`index` 0) also sets the scene's up axis, unit and render settings.
+    fn load_model(&mut self, index: usize, entry: &DomainEntry) -> Result<LoadedModel> {
+        let modes_source = if entry.modes.is_some() { ModesSource::None } else { ModesSource::Sidecar };
+        let mut model = source::read_model(self.files, &entry.model, modes_source)?;
         if let Some(file) = &entry.modes {
             replace_modes(self.files, file, &mut model)?;
         }
@@ -140,24 +146,25 @@ impl ManifestAssembler<'_> {
         }
         let up = self.manifest.up.unwrap_or(self.parts.up);
         if entry.up.is_none() && model.up != up {
-            let remark = format!("{:?} is up in it and {up:?} in the scene; its entry can say so with `up`", model.up);
+            let remark =
+                format!("its up axis is {:?}, but that of the scene is {up:?}; set `up` in its entry", model.up);
             model.remarks.push(remark);
         }
-        let (shapes, materials) = (self.parts.shapes.len(), self.parts.materials.len());
-        let textures = self.parts.textures.len();
+        let (shape_offset, material_offset) = (self.parts.shapes.len(), self.parts.materials.len());
+        let texture_offset = self.parts.textures.len();
         for domain in &mut model.domains {
-            domain.shape += shapes;
-            domain.material += materials;
-            domain.material_ranges.iter_mut().for_each(|run| run.material += materials);
+            domain.shape += shape_offset;
+            domain.material += material_offset;
+            domain.material_ranges.iter_mut().for_each(|range| range.material += material_offset);
         }
         self.parts.shapes.append(&mut model.shapes);
         self.parts.textures.append(&mut model.textures);
         for mut material in model.materials {
             for texture in [&mut material.color_texture, &mut material.normal_texture] {
-                *texture = texture.map(|texture| texture + textures);
+                *texture = texture.map(|texture| texture + texture_offset);
             }
             let manifest = self.manifest;
-            self.patched.insert(material.name.clone());
+            self.material_names.insert(material.name.clone());
             for name in ["*", material.name.clone().as_str()] {
                 if let Some(patch) = manifest.material.get(name) {
                     patch.apply(&mut material, self)?;
@@ -170,28 +177,29 @@ impl ManifestAssembler<'_> {
         Ok(LoadedModel { domains: model.domains })
     }
 
+    /// Checks that every override names a material of a model.
     fn check_patches(&self) -> Result<()> {
-        let known = |name: &&String| name.as_str() == "*" || self.patched.contains(*name);
-        let Some(stray) = self.manifest.material.keys().find(|name| !known(name)) else { return Ok(()) };
-        let mut names: Vec<&str> = self.patched.iter().map(String::as_str).collect();
+        let is_known = |name: &&String| name.as_str() == "*" || self.material_names.contains(*name);
+        let Some(unknown_name) = self.manifest.material.keys().find(|name| !is_known(name)) else { return Ok(()) };
+        let mut names: Vec<&str> = self.material_names.iter().map(String::as_str).collect();
         names.sort_unstable();
         names.truncate(16);
-        Err(invalid("material", format!("* or one of {}", names.join(", ")), stray))
+        Err(invalid("material", format!("* or one of: {}", names.join(", ")), unknown_name))
     }
 
     /// Places the domains, and attaches those without a parent to the entry's parent.
-    fn place(&self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
-        let first = self.parts.domains.len();
-        let said = |placement: &Option<super::Placement>, key: &str| match placement {
-            Some(placement) => placement.transform().map_err(|error| error.prefix_field(key)),
+    fn place_domains(&self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
+        let domain_offset = self.parts.domains.len();
+        let to_transform = |placement: &Option<super::Placement>, key: &str| match placement {
+            Some(placement) => placement.to_transform().map_err(|error| error.prefix_field(key)),
             None => Ok(Transform::IDENTITY),
         };
-        let parent = self.parent(entry)?;
+        let parent = self.find_parent(entry)?;
         let world_from_entry = match parent {
             Some(parent) if entry.frame.is_some() => {
-                self.parts.domains[parent].placement.compose(said(&entry.frame, "frame")?)
+                self.parts.domains[parent].placement.compose(to_transform(&entry.frame, "frame")?)
             }
-            _ => said(&entry.placement, "placement")?,
+            _ => to_transform(&entry.placement, "placement")?,
         };
         let world_from_model =
             world_from_entry.compose(up_axis_rotation(entry.up, self.manifest.up.unwrap_or(self.parts.up)));
@@ -199,38 +207,41 @@ impl ManifestAssembler<'_> {
             domain.placement = world_from_model.compose(domain.placement);
             match (&mut domain.attachment, parent) {
                 (Some(attachment), _) => {
-                    attachment.parent += first;
-                    domain.follows.iter_mut().for_each(|add_follow_constraints| add_follow_constraints.parent += first);
+                    attachment.parent += domain_offset;
+                    domain.follows.iter_mut().for_each(|constraint| constraint.parent += domain_offset);
                 }
-                (None, Some(parent)) => domain.attachment = Some(self.attach(entry, parent, domain.placement)?),
+                (None, Some(parent)) => {
+                    domain.attachment = Some(self.create_attachment(entry, parent, domain.placement)?);
+                }
                 (None, None) => {}
             }
         }
         Ok(())
     }
 
-    fn parent(&self, entry: &DomainEntry) -> Result<Option<usize>> {
+    /// The index of the entry's parent, or `None` for an entry without a parent.
+    fn find_parent(&self, entry: &DomainEntry) -> Result<Option<usize>> {
         let Some(name) = &entry.parent else {
             return match (&entry.frame, &entry.rows) {
                 (None, None) => Ok(None),
-                _ => Err(invalid("frame, rows", "none without a parent", "some")),
+                _ => Err(invalid("parent", "a parent for the keys frame and rows", "none")),
             };
         };
         if entry.frame.is_some() && entry.placement.is_some() {
-            return Err(invalid("frame", "either a frame in the parent or a placement in the world", "both"));
+            return Err(invalid("frame, placement", "only one of these keys", "both"));
         }
-        let found = self.by_name.get(name).copied();
-        found.map(Some).ok_or_else(|| invalid("parent", "the name of a domain of an earlier entry", name))
+        let parent = self.domain_by_name.get(name).copied();
+        parent.map(Some).ok_or_else(|| invalid("parent", "the name of a domain of an earlier entry", name))
     }
 
-    fn attach(&self, entry: &DomainEntry, parent: usize, world_from_child: Transform) -> Result<Attachment> {
-        let carrier = &self.parts.domains[parent];
-        let parent_from_world = carrier.placement.inverse();
-        let singular = || invalid("parent", "a parent whose placement has an inverse", &carrier.name);
-        let frame = parent_from_world.ok_or_else(singular)?.compose(world_from_child);
+    fn create_attachment(&self, entry: &DomainEntry, parent: usize, world_from_child: Transform) -> Result<Attachment> {
+        let parent_domain = &self.parts.domains[parent];
+        let parent_from_world = parent_domain.placement.inverse();
+        let singular_placement = || invalid("parent", "a parent whose placement has an inverse", &parent_domain.name);
+        let frame = parent_from_world.ok_or_else(singular_placement)?.compose(world_from_child);
         let rows = match &entry.rows {
             Some(rows) => rows.clone(),
-            None => nearest_vertices(&self.parts.shapes[carrier.shape], frame),
+            None => nearest_vertices(&self.parts.shapes[parent_domain.shape], frame),
         };
         Ok(Attachment { parent, frame, rows })
     }
@@ -239,28 +250,29 @@ impl ManifestAssembler<'_> {
     fn apply_entry_material(&mut self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
         let Some(patch) = &entry.material else { return Ok(()) };
         let mut copies = HashMap::new();
-        let mut used: Vec<usize> = domains.iter().flat_map(Domain::materials).collect();
-        used.sort_unstable();
-        used.dedup();
-        for index in used {
+        let mut material_indices: Vec<usize> = domains.iter().flat_map(Domain::materials).collect();
+        material_indices.sort_unstable();
+        material_indices.dedup();
+        for index in material_indices {
             let mut copy: Material = self.parts.materials[index].clone();
             MaterialPatch::apply(patch, &mut copy, self)?;
             self.parts.materials.push(copy);
             copies.insert(index, self.parts.materials.len() - 1);
         }
-        let copied = |index: &mut usize| *index = copies.get(index).copied().unwrap_or(*index);
+        let replace_by_copy = |index: &mut usize| *index = copies.get(index).copied().unwrap_or(*index);
         for domain in domains {
-            copied(&mut domain.material);
-            domain.material_ranges.iter_mut().for_each(|run| copied(&mut run.material));
+            replace_by_copy(&mut domain.material);
+            domain.material_ranges.iter_mut().for_each(|range| replace_by_copy(&mut range.material));
         }
         Ok(())
     }
 
-    fn annotate(&self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
+    /// Sets the eigenvalues and adds the notes of the entry.
+    fn set_metadata(&self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
         if let Some(eigenvalues) = &entry.eigenvalues {
             let ranks: Vec<_> = domains.iter().map(|domain| self.parts.shapes[domain.shape].modes.rank()).collect();
             if ranks[..] != [eigenvalues.len()] || !eigenvalues.iter().all(|value| value.is_finite()) {
-                let expected = format!("finite numbers for one domain of as many modes (there: {ranks:?})");
+                let expected = format!("one domain, and one finite number per mode (modes per domain: {ranks:?})");
                 return Err(invalid("eigenvalues", expected, format!("{} numbers", eigenvalues.len())));
             }
             domains[0].metadata.eigenvalues.clone_from(eigenvalues);
@@ -272,77 +284,81 @@ impl ManifestAssembler<'_> {
     }
 
     /// Gives every domain a unique name: the entry's name, as a prefix if the model has several domains.
-    fn name(&mut self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
-        let single = domains.len() == 1;
+    fn name_domains(&mut self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
+        let is_single = domains.len() == 1;
         for (offset, domain) in domains.iter_mut().enumerate() {
             let index = self.parts.domains.len() + offset;
             match &entry.name {
-                Some(name) if single => domain.name.clone_from(name),
+                Some(name) if is_single => domain.name.clone_from(name),
                 Some(name) => domain.name = format!("{name}/{}", domain.name),
                 None => {}
             }
-            let wanted = domain.name.clone();
-            let mut count = 1;
-            while self.by_name.contains_key(&domain.name) {
-                if entry.name.is_some() && single {
-                    return Err(invalid("name", "a name that no earlier domain has", wanted));
+            let base_name = domain.name.clone();
+            let mut number = 1;
+            while self.domain_by_name.contains_key(&domain.name) {
+                if entry.name.is_some() && is_single {
+                    return Err(invalid("name", "a name that no earlier domain has", base_name));
                 }
-                count += 1;
-                domain.name = format!("{wanted} {count}");
+                number += 1;
+                domain.name = format!("{base_name} {number}");
             }
-            self.by_name.insert(domain.name.clone(), index);
+            self.domain_by_name.insert(domain.name.clone(), index);
         }
-        if let (Some(name), false) = (&entry.name, single) {
-            // As a parent of later entries, the entry's name denotes its first domain.
-            self.by_name.entry(name.clone()).or_insert(self.parts.domains.len());
+        if let (Some(name), false) = (&entry.name, is_single) {
+            // If a later entry has this name as its `parent`, the name denotes the first domain of this entry.
+            self.domain_by_name.entry(name.clone()).or_insert(self.parts.domains.len());
         }
         Ok(())
     }
 }
 
-/// Makes the domains with the entry's name prefix followers of their parents, with their rest poses as frames.
+/// Constrains the domains whose names start with `entry.follows` to move rigidly with their parents. The frame of a
+/// constraint is that of the domain's attachment.
 fn add_follow_constraints(entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
-    let Some(start) = &entry.follows else { return Ok(()) };
-    let mut any = false;
-    for domain in domains.iter_mut().filter(|domain| domain.name.starts_with(start.as_str())) {
-        let add_follow_constraints = |on: &Attachment| FollowConstraint { parent: on.parent, frame: on.frame };
-        domain.follows = domain.attachment.as_ref().map(add_follow_constraints).or(domain.follows);
-        any |= domain.follows.is_some();
+    let Some(prefix) = &entry.follows else { return Ok(()) };
+    let mut has_followers = false;
+    for domain in domains.iter_mut().filter(|domain| domain.name.starts_with(prefix.as_str())) {
+        let to_constraint =
+            |attachment: &Attachment| FollowConstraint { parent: attachment.parent, frame: attachment.frame };
+        domain.follows = domain.attachment.as_ref().map(to_constraint).or(domain.follows);
+        has_followers |= domain.follows.is_some();
     }
-    match any {
+    match has_followers {
         true => Ok(()),
-        false => Err(invalid("follows", "how the names of domains begin that hang on others", start)),
+        false => Err(invalid("follows", "a name prefix of domains with a parent", prefix)),
     }
 }
 
 /// Replaces U of a model with one shape, and clears the rest coordinates, which belong to the old modes.
 fn replace_modes(files: &AssetDir, file: &str, model: &mut SceneParts) -> Result<()> {
     let [shape] = &mut model.shapes[..] else {
-        return Err(invalid("modes", "a model of one domain", format!("one of {}", model.shapes.len())));
+        return Err(invalid("modes", "a model with one shape", format!("{} shapes", model.shapes.len())));
     };
-    let found = if file.is_empty() { Modes::rigid() } else { modes::read(files, file)? };
-    *shape = Shape::new(shape.mesh.clone(), found).map_err(|error| error.prefix_field(&format!("file '{file}'")))?;
+    let modes = if file.is_empty() { Modes::rigid() } else { modes::read(files, file)? };
+    *shape = Shape::new(shape.mesh.clone(), modes).map_err(|error| error.prefix_field(&format!("file '{file}'")))?;
     model.domains.iter_mut().for_each(|domain| domain.rest_q.clear());
     Ok(())
 }
 
-/// The rotation from up axis `from` to `to`; the identity if `from` is `None`.
-fn up_axis_rotation(from: Option<UpAxis>, to: UpAxis) -> Transform {
-    let Some(from) = from.filter(|from| *from != to) else { return Transform::IDENTITY };
-    let turn = to.rotation_from_y_up() * from.rotation_from_y_up().inverse();
-    Transform::from_parts(turn.matrix(), &nalgebra::Vector3::zeros())
+/// The rotation that maps the up axis of a model to that of the scene; the identity if `model_up` is `None`.
+fn up_axis_rotation(model_up: Option<UpAxis>, scene_up: UpAxis) -> Transform {
+    let Some(model_up) = model_up.filter(|axis| *axis != scene_up) else { return Transform::IDENTITY };
+    let rotation = scene_up.rotation_from_y_up() * model_up.rotation_from_y_up().inverse();
+    Transform::from_parts(rotation.matrix(), &nalgebra::Vector3::zeros())
 }
 
-/// The vertices of a deformable shape that are nearest to the origin of `frame`, ascending. Empty for a rigid shape.
+/// The [`DEFAULT_ATTACHMENT_ROWS`] vertices of a deformable shape nearest to the origin of `frame`, in ascending order.
+/// Empty for a rigid shape.
 fn nearest_vertices(shape: &Shape, frame: Transform) -> Vec<u32> {
     if shape.modes.rank() == 0 {
         return Vec::new();
     }
     let origin = frame.translation();
-    let rest = shape.mesh.rest_positions();
-    let distance = |vertex: u32| (nalgebra::Vector3::from(rest[vertex as usize]).cast::<f64>() - origin).norm_squared();
-    let mut vertices: Vec<u32> = (0..rest.len() as u32).collect();
-    vertices.sort_by(|a, b| distance(*a).total_cmp(&distance(*b)));
+    let rest_positions = shape.mesh.rest();
+    let squared_distance =
+        |vertex: u32| (nalgebra::Vector3::from(rest_positions[vertex as usize]).cast::<f64>() - origin).norm_squared();
+    let mut vertices: Vec<u32> = (0..rest_positions.len() as u32).collect();
+    vertices.sort_by(|a, b| squared_distance(*a).total_cmp(&squared_distance(*b)));
     vertices.truncate(DEFAULT_ATTACHMENT_ROWS);
     vertices.sort_unstable();
     vertices
@@ -350,31 +366,34 @@ fn nearest_vertices(shape: &Shape, frame: Transform) -> Vec<u32> {
 
 /// Removes unused materials and textures, for example replaced textures.
 fn drop_unused(parts: &mut SceneParts) {
-    let mut used = vec![false; parts.materials.len()];
+    let mut is_material_used = vec![false; parts.materials.len()];
     for domain in &parts.domains {
-        used[domain.material] = true;
-        domain.material_ranges.iter().for_each(|run| used[run.material] = true);
+        domain.materials().for_each(|material| is_material_used[material] = true);
     }
-    let new = retain_used(&mut parts.materials, &used);
+    let new_materials = retain_used(&mut parts.materials, &is_material_used);
     for domain in &mut parts.domains {
-        domain.material = new[domain.material];
-        domain.material_ranges.iter_mut().for_each(|run| run.material = new[run.material]);
+        domain.material = new_materials[domain.material];
+        domain.material_ranges.iter_mut().for_each(|range| range.material = new_materials[range.material]);
     }
-    let mut used = vec![false; parts.textures.len()];
+    let mut is_texture_used = vec![false; parts.textures.len()];
     let textures = |material: &Material| [material.color_texture, material.normal_texture];
-    parts.materials.iter().flat_map(textures).flatten().for_each(|texture| used[texture] = true);
-    let new = retain_used(&mut parts.textures, &used);
+    parts.materials.iter().flat_map(textures).flatten().for_each(|texture| is_texture_used[texture] = true);
+    let new_textures = retain_used(&mut parts.textures, &is_texture_used);
     for material in &mut parts.materials {
-        material.color_texture = material.color_texture.map(|texture| new[texture]);
-        material.normal_texture = material.normal_texture.map(|texture| new[texture]);
+        material.color_texture = material.color_texture.map(|texture| new_textures[texture]);
+        material.normal_texture = material.normal_texture.map(|texture| new_textures[texture]);
     }
 }
 
-/// Keeps the used elements, and returns the new index of each of them.
-fn retain_used<T>(list: &mut Vec<T>, used: &[bool]) -> Vec<usize> {
-    let before: Vec<usize> =
-        used.iter().scan(0, |kept, used| Some(std::mem::replace(kept, *kept + usize::from(*used)))).collect();
-    let mut flags = used.iter();
+/// Retains the used elements. Returns the new index of each old index; that of a removed element is meaningless.
+fn retain_used<T>(list: &mut Vec<T>, is_used: &[bool]) -> Vec<usize> {
+    let mut retained_count = 0;
+    let mut new_indices = Vec::with_capacity(list.len());
+    for is_used in is_used {
+        new_indices.push(retained_count);
+        retained_count += usize::from(*is_used);
+    }
+    let mut flags = is_used.iter();
     list.retain(|_| *flags.next().unwrap_or(&false));
-    before
+    new_indices
 }

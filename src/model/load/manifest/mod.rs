@@ -74,7 +74,7 @@ use super::asset_dir::AssetDir;
 use crate::error::{Result, invalid};
 use crate::scene::UpAxis;
 
-/// The file name that makes a folder a scene.
+/// The file name of a manifest. A folder that contains it is a scene.
 pub(super) const MANIFEST_FILE: &str = "scene.toml";
 /// The largest size of a `scene.toml` in bytes.
 const MAX_MANIFEST_BYTES: u64 = 1 << 20;
@@ -135,16 +135,16 @@ struct DomainEntry {
     notes: BTreeMap<String, String>,
 }
 
-/// Reads the manifest `file` in the folder `files`. `own_name` is the default name of the scene.
+/// Reads the manifest `file` in the folder `files`. `default_name` is the name of a scene whose manifest has none.
 ///
 /// # Errors
 /// `Invalid` with the manifest, the line or entry, and the expected and given value.
-pub(super) fn read(files: &AssetDir, file: &str, own_name: &str) -> Result<SceneDescription> {
-    let place = format!("file '{file}'");
+pub(super) fn read(files: &AssetDir, file: &str, default_name: &str) -> Result<SceneDescription> {
+    let location = format!("file '{file}'");
     let bytes = files.read(file, MAX_MANIFEST_BYTES)?;
-    let mut manifest = parse(&bytes).map_err(|error| error.prefix_field(&place))?;
-    let entries = entries(&mut manifest).map_err(|error| error.prefix_field(&place))?;
-    assemble::assemble(files, &manifest, &entries, own_name).map_err(|error| error.prefix_field(&place))
+    let mut manifest = parse(&bytes).map_err(|error| error.prefix_field(&location))?;
+    let entries = take_entries(&mut manifest).map_err(|error| error.prefix_field(&location))?;
+    assemble::assemble(files, &manifest, &entries, default_name).map_err(|error| error.prefix_field(&location))
 }
 
 fn parse(bytes: &[u8]) -> Result<Manifest> {
@@ -155,8 +155,8 @@ fn parse(bytes: &[u8]) -> Result<Manifest> {
     })
 }
 
-/// The entries. A top-level `model` is the only entry.
-fn entries(manifest: &mut Manifest) -> Result<Vec<DomainEntry>> {
+/// Takes the entries out of the manifest. A manifest with a top-level `model` has one entry.
+fn take_entries(manifest: &mut Manifest) -> Result<Vec<DomainEntry>> {
     let entries = std::mem::take(&mut manifest.domain);
     match (manifest.model.take(), entries.is_empty()) {
         (Some(model), true) => {
@@ -164,10 +164,10 @@ fn entries(manifest: &mut Manifest) -> Result<Vec<DomainEntry>> {
             let follows = manifest.follows.take();
             Ok(vec![DomainEntry { model, modes, placement, follows, ..DomainEntry::default() }])
         }
-        (Some(_), false) => Err(invalid("model", "either one model or [[domain]] entries", "both")),
-        (None, true) => Err(invalid("model", "a model, or [[domain]] entries", "neither")),
+        (Some(_), false) => Err(invalid("model", "either one model or [[domain]] entries", "both of them")),
+        (None, true) => Err(invalid("model", "one model or [[domain]] entries", "neither")),
         (None, false) if manifest.modes.is_some() || manifest.placement.is_some() || manifest.follows.is_some() => {
-            Err(invalid("modes, placement, follows", "none beside [[domain]] entries, which have their own", "some"))
+            Err(invalid("modes, placement, follows", "these keys in the [[domain]] entries", "a top-level key"))
         }
         (None, false) => Ok(entries),
     }

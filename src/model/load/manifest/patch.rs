@@ -31,10 +31,9 @@ enum AlphaModeKey {
 
 /// The textures of the scene whose materials are overridden.
 pub(super) trait TextureLookup {
-    /// The index of the texture in a file, which is read on the first call.
-    fn index(&mut self, path: &str) -> Result<usize>;
-    /// The texture at an index.
-    fn at(&self, index: usize) -> Option<&Texture>;
+    /// Returns the index of the texture in the file `path`. The first call for a file reads it.
+    fn load_texture(&mut self, path: &str) -> Result<usize>;
+    fn texture(&self, index: usize) -> Option<&Texture>;
 }
 
 impl MaterialPatch {
@@ -45,39 +44,41 @@ impl MaterialPatch {
     ///
     /// # Errors
     /// `Invalid` with the material and the key, for a texture that cannot be read or a cutoff without alpha mode mask.
-    pub(super) fn apply(&self, material: &mut Material, gallery: &mut impl TextureLookup) -> Result<()> {
-        let place = |key: &str| format!("material '{}': {key}", material.name);
-        let mut texture = |path: &str, key: &str| match path {
+    pub(super) fn apply(&self, material: &mut Material, lookup: &mut impl TextureLookup) -> Result<()> {
+        let field_of = |key: &str| format!("material '{}': {key}", material.name);
+        let mut load_texture = |path: &str, key: &str| match path {
             "" => Ok(None),
-            path => gallery.index(path).map(Some).map_err(|error| error.prefix_field(&place(key))),
+            path => lookup.load_texture(path).map(Some).map_err(|error| error.prefix_field(&field_of(key))),
         };
-        let color = self.color_texture.as_deref().map(|path| texture(path, "colour_texture")).transpose()?;
-        let normal = self.normal_texture.as_deref().map(|path| texture(path, "normal_texture")).transpose()?;
-        let cut_out = color.flatten().and_then(|index| gallery.at(index)).is_some_and(Texture::has_alpha);
-        let mode = match (self.alpha_mode, material.alpha_mode) {
+        let color_texture =
+            self.color_texture.as_deref().map(|path| load_texture(path, "colour_texture")).transpose()?;
+        let normal_texture =
+            self.normal_texture.as_deref().map(|path| load_texture(path, "normal_texture")).transpose()?;
+        let has_alpha = color_texture.flatten().and_then(|index| lookup.texture(index)).is_some_and(Texture::has_alpha);
+        let alpha_mode = match (self.alpha_mode, material.alpha_mode) {
             (Some(AlphaModeKey::Opaque), _) => AlphaMode::Opaque,
             (Some(AlphaModeKey::Blend), _) => AlphaMode::Blend,
             (Some(AlphaModeKey::Mask), AlphaMode::Mask { cutoff }) => AlphaMode::Mask { cutoff },
             (Some(AlphaModeKey::Mask), _) => AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF },
             (None, AlphaMode::Opaque) if self.alpha.is_some_and(|alpha| alpha < 1.0) => AlphaMode::Blend,
-            (None, AlphaMode::Opaque) if cut_out => AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF },
-            (None, kept) => kept,
+            (None, AlphaMode::Opaque) if has_alpha => AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF },
+            (None, alpha_mode) => alpha_mode,
         };
-        let mode = match (mode, self.cutoff) {
-            (mode, None) => mode,
+        let alpha_mode = match (alpha_mode, self.cutoff) {
+            (alpha_mode, None) => alpha_mode,
             (AlphaMode::Mask { .. }, Some(cutoff)) => AlphaMode::Mask { cutoff },
-            (_, Some(cutoff)) => return Err(invalid(place("cutoff"), "the alpha_mode mask with it", cutoff)),
+            (_, Some(cutoff)) => return Err(invalid(field_of("cutoff"), "alpha_mode mask or no cutoff", cutoff)),
         };
-        // An override of the diffuse color also applies in the shade.
+        // An override of the diffuse color also overrides the ambient color, unless that has an override.
         material.ambient = self.ambient.or(self.diffuse).unwrap_or(material.ambient);
         material.diffuse = self.diffuse.unwrap_or(material.diffuse);
         material.specular = self.specular.unwrap_or(material.specular);
         material.shininess = self.shininess.unwrap_or(material.shininess);
         material.alpha = self.alpha.unwrap_or(material.alpha);
-        material.color_texture = color.unwrap_or(material.color_texture);
-        material.normal_texture = normal.unwrap_or(material.normal_texture);
+        material.color_texture = color_texture.unwrap_or(material.color_texture);
+        material.normal_texture = normal_texture.unwrap_or(material.normal_texture);
         material.double_sided = self.double_sided.unwrap_or(material.double_sided);
-        material.alpha_mode = mode;
+        material.alpha_mode = alpha_mode;
         Ok(())
     }
 }
@@ -86,42 +87,43 @@ impl MaterialPatch {
 mod tests {
     use super::*;
 
-    struct Two(Vec<Texture>);
+    struct LoadedTextures(Vec<Texture>);
 
-    impl TextureLookup for Two {
-        fn index(&mut self, path: &str) -> Result<usize> {
-            let found = self.0.iter().position(|texture| texture.name == path);
-            found.ok_or_else(|| invalid(format!("file '{path}'"), "a file that is there", "none"))
+    impl TextureLookup for LoadedTextures {
+        fn load_texture(&mut self, path: &str) -> Result<usize> {
+            let index = self.0.iter().position(|texture| texture.name == path);
+            index.ok_or_else(|| invalid(format!("file '{path}'"), "an existing file", "none"))
         }
-        fn at(&self, index: usize) -> Option<&Texture> {
+
+        fn texture(&self, index: usize) -> Option<&Texture> {
             self.0.get(index)
         }
     }
 
-    fn patched(text: &str, before: Material) -> Result<Material> {
-        let texture = |name: &str, alpha: u8| Texture::new(name, 1, 1, vec![1, 2, 3, alpha]).expect("a texel");
-        let mut material = before;
+    /// Applies the overrides in `text` to `material`. There are the textures "solid" (0) and "leaf" (1, transparent).
+    fn patch_material(text: &str, mut material: Material) -> Result<Material> {
+        let texture = |name: &str, alpha: u8| Texture::new(name, 1, 1, vec![1, 2, 3, alpha]).expect("a valid texture");
         let patch: MaterialPatch = toml::from_str(text).map_err(|error| invalid("toml", "a patch", error.message()))?;
-        patch.apply(&mut material, &mut Two(vec![texture("solid", 255), texture("leaf", 0)]))?;
+        patch.apply(&mut material, &mut LoadedTextures(vec![texture("solid", 255), texture("leaf", 0)]))?;
         Ok(material)
     }
 
     #[test]
-    fn what_is_said_changes_and_what_is_not_stays() {
-        let before = || Material { color_texture: Some(9), specular: [0.5; 3], ..Material::default() };
-        assert_eq!(patched("", before()).expect("nothing"), before());
-        let after =
-            patched("alpha = 0.5\ncolour_texture = ''\ndiffuse = [1, 0, 0]\nnormal_texture = 'solid'", before());
-        let after = after.expect("good");
-        assert_eq!((after.color_texture, after.normal_texture, after.alpha_mode), (None, Some(0), AlphaMode::Blend));
-        assert_eq!((after.diffuse, after.specular), ([1.0, 0.0, 0.0], [0.5; 3]));
+    fn patch_changes_only_the_given_keys() {
+        let base = || Material { color_texture: Some(9), specular: [0.5; 3], ..Material::default() };
+        assert_eq!(patch_material("", base()).expect("a valid patch"), base());
+        let text = "alpha = 0.5\ncolour_texture = ''\ndiffuse = [1, 0, 0]\nnormal_texture = 'solid'";
+        let patched = patch_material(text, base()).expect("a valid patch");
+        assert_eq!((patched.color_texture, patched.normal_texture), (None, Some(0)));
+        assert_eq!((patched.diffuse, patched.specular), ([1.0, 0.0, 0.0], [0.5; 3]));
+        assert_eq!(patched.alpha_mode, AlphaMode::Blend);
     }
 
     #[test]
-    fn alpha_modes_follow_the_texture_unless_they_are_stated() {
+    fn texture_alpha_selects_mask_unless_a_mode_is_given() {
         let mask = |cutoff| AlphaMode::Mask { cutoff };
         let masked = || Material { alpha_mode: mask(0.3), ..Material::default() };
-        for (text, before, after) in [
+        for (text, base, alpha_mode) in [
             ("colour_texture = 'leaf'", Material::default(), mask(0.5)),
             ("colour_texture = 'solid'", Material::default(), AlphaMode::Opaque),
             ("colour_texture = 'leaf'", masked(), mask(0.3)),
@@ -130,20 +132,20 @@ mod tests {
             ("colour_texture = 'leaf'\nalpha_mode = 'blend'", masked(), AlphaMode::Blend),
             ("alpha_mode = 'opaque'", masked(), AlphaMode::Opaque),
         ] {
-            assert_eq!(patched(text, before).expect(text).alpha_mode, after, "{text}");
+            assert_eq!(patch_material(text, base).expect(text).alpha_mode, alpha_mode, "{text}");
         }
     }
 
     #[test]
-    fn missing_textures_unknown_keys_and_stray_cutoffs_are_refused() {
+    fn invalid_overrides_are_rejected_with_their_key() {
         for (text, start) in [
-            ("colour_texture = 'no'", "material 'white': colour_texture: file 'no': expected a file that is there"),
-            ("cutoff = 0.5", "material 'white': cutoff: expected the alpha_mode mask with it"),
+            ("colour_texture = 'no'", "material 'white': colour_texture: file 'no': expected an existing file"),
+            ("cutoff = 0.5", "material 'white': cutoff: expected alpha_mode mask or no cutoff"),
             ("color_texture = 'leaf'", "toml: expected a patch, got unknown field `color_texture`"),
             ("alpha_mode = 'cut'", "toml: expected a patch, got unknown variant `cut`"),
         ] {
-            let refusal = patched(text, Material::default()).expect_err(text).to_string();
-            assert!(refusal.starts_with(start), "{refusal}");
+            let message = patch_material(text, Material::default()).expect_err(text).to_string();
+            assert!(message.starts_with(start), "{message}");
         }
     }
 }

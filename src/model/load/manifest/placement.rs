@@ -20,22 +20,22 @@ pub(super) struct Placement {
 }
 
 #[derive(Debug, Clone, Copy, serde::Deserialize)]
-#[serde(untagged, expecting = "a number or three")]
+#[serde(untagged, expecting = "a number or an array of three numbers")]
 enum Scale {
     Uniform(f64),
     PerAxis([f64; 3]),
 }
 
 impl Placement {
-    /// Converts to a transform.
-    ///
     /// # Errors
-    /// `Invalid` with the key if two keys conflict, one requires another, or a number is not finite.
-    pub(super) fn transform(&self) -> Result<Transform> {
-        let parts = [self.translation.is_some(), self.axis.is_some(), self.quaternion.is_some(), self.scale.is_some()];
+    /// `Invalid` with the keys if they conflict or one is missing, and with the entry of the matrix if a number is not
+    /// finite.
+    pub(super) fn to_transform(&self) -> Result<Transform> {
+        let components =
+            [self.translation.is_some(), self.axis.is_some(), self.quaternion.is_some(), self.scale.is_some()];
         let transform = match self.matrix {
-            Some(_) if parts.contains(&true) || self.degrees.is_some() => {
-                return Err(invalid("matrix", "either a matrix or its parts", "both"));
+            Some(_) if components.contains(&true) || self.degrees.is_some() => {
+                return Err(invalid("matrix", "either a matrix or translation, rotation and scale", "both"));
             }
             Some(entries) => Transform(entries.map(|entry| entry as f32)),
             None => {
@@ -52,7 +52,7 @@ impl Placement {
     }
 
     fn rotation(&self) -> Result<Rotation3<f64>> {
-        let length = |field: &str, squared: f64| match squared.is_finite() && squared > 1e-24 {
+        let check_length = |field: &str, squared: f64| match squared.is_finite() && squared > 1e-24 {
             true => Ok(()),
             false => Err(invalid(field, "finite numbers that are not all zero", format!("length {}", squared.sqrt()))),
         };
@@ -60,15 +60,19 @@ impl Placement {
             (None, None, None) => Ok(Rotation3::identity()),
             (Some(axis), Some(degrees), None) => {
                 let axis = Vector3::from(axis);
-                length("axis", axis.norm_squared())?;
+                check_length("axis", axis.norm_squared())?;
                 Ok(Rotation3::from_axis_angle(&Unit::new_normalize(axis), degrees.to_radians()))
             }
             (None, None, Some([x, y, z, w])) => {
                 let quaternion = Quaternion::new(w, x, y, z);
-                length("quaternion", quaternion.norm_squared())?;
+                check_length("quaternion", quaternion.norm_squared())?;
                 Ok(UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix())
             }
-            _ => Err(invalid("turn", "axis and degrees together, or quaternion alone", "another mixture")),
+            _ => Err(invalid(
+                "axis, degrees, quaternion",
+                "axis and degrees, or only quaternion",
+                "another combination of these keys",
+            )),
         }
     }
 }
@@ -77,42 +81,43 @@ impl Placement {
 mod tests {
     use super::*;
 
-    fn read(text: &str) -> Result<Transform> {
-        toml::from_str::<Placement>(text).map_err(|error| invalid("toml", "a placement", error.message()))?.transform()
+    fn parse(text: &str) -> Result<Transform> {
+        let placement: Placement = toml::from_str(text).map_err(|error| invalid("toml", "TOML", error.message()))?;
+        placement.to_transform()
     }
 
-    fn close(a: Transform, b: [f32; 12]) -> bool {
+    fn is_close(a: Transform, b: [f32; 12]) -> bool {
         a.0.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-6)
     }
 
     #[test]
-    fn the_same_placement_can_be_said_in_three_ways() {
+    fn equivalent_keys_give_equal_transforms() {
         let expected = [0.0, -2.0, 0.0, 1.0, 2.0, 0.0, 0.0, 2.0, 0.0, 0.0, 2.0, 3.0];
         for text in [
             "translation = [1, 2, 3]\naxis = [0, 0, 5]\ndegrees = 90\nscale = 2",
             "translation = [1.0, 2.0, 3.0]\nquaternion = [0.0, 0.0, 1.0, 1.0]\nscale = [2.0, 2.0, 2.0]",
             "matrix = [0, -2, 0, 1, 2, 0, 0, 2, 0, 0, 2, 3]",
         ] {
-            assert!(close(read(text).expect(text), expected), "{text}");
+            assert!(is_close(parse(text).expect(text), expected), "{text}");
         }
-        assert!(close(read("").expect("nothing said"), Transform::IDENTITY.0));
+        assert!(is_close(parse("").expect("the identity"), Transform::IDENTITY.0));
     }
 
     #[test]
-    fn contradictions_and_numbers_that_are_none_are_refused() {
+    fn conflicting_keys_and_invalid_numbers_are_rejected() {
         for (text, start) in [
             ("matrix = [1,0,0,0, 0,1,0,0, 0,0,1,0]\nscale = 1", "matrix: expected either"),
-            ("axis = [0,0,1]", "turn: expected axis and degrees together"),
+            ("axis = [0,0,1]", "axis, degrees, quaternion: expected axis and degrees"),
             ("axis = [0,0,0]\ndegrees = 1", "axis: expected finite numbers that are not all zero"),
             ("quaternion = [0,0,0,nan]", "quaternion: expected"),
             ("translation = [inf,0,0]", "transform[3]: expected a finite number"),
             ("scale = 1e300", "transform[0]: expected a finite number"),
-            ("scale = 'big'", "toml: expected a placement, got a number or three"),
+            ("scale = 'big'", "toml: expected TOML, got a number or an array of three numbers"),
             ("matrix = [1]", "toml:"),
             ("rotation = 1", "toml:"),
         ] {
-            let refusal = read(text).expect_err(text).to_string();
-            assert!(refusal.starts_with(start), "{refusal}");
+            let message = parse(text).expect_err(text).to_string();
+            assert!(message.starts_with(start), "{message}");
         }
     }
 }

@@ -1,5 +1,4 @@
-//! The tables `look` and `deform` of `scene.toml`. Some of their keys are settings of the scene, the others are settings
-//! of the backends.
+//! The tables `look` and `deform` of `scene.toml`. They contain settings of the scene and of the backends.
 
 use crate::backend_settings::{BatchPolicy, RasterPolicy};
 use crate::scene::{
