@@ -1,4 +1,4 @@
-//! Loaders of the modal matrix U: 3n rows, r columns, f32.
+//! Loaders of the modal matrix U: 3n rows for n vertices, r columns for r modes, f32.
 
 mod npy;
 mod safetensors;
@@ -11,7 +11,7 @@ use super::asset_dir::{AssetDir, EntryKind, MAX_MODEL_BYTES};
 use crate::domain::Modes;
 use crate::error::{Result, invalid};
 
-/// Endings of mode files in order of preference: binary files before text, which has fewer digits.
+/// Name endings of mode files in order of preference: binary files before text files, which have fewer digits.
 const EXTENSIONS: [&str; 5] = [".URendering.float", ".U.float", ".npy", ".safetensors", "modes.txt"];
 
 /// Reads the modes in `name`. The extension determines the format.
@@ -42,18 +42,18 @@ fn parse_npy(bytes: &[u8]) -> Result<Modes> {
 
 /// Finds the modes of the OBJ file `name` in its folder, if any.
 ///
-/// The candidates have its name (without `.obj` and `.derived`), optionally `.U`, and one of the first four
-/// [`EXTENSIONS`], in that order. If the folder has no other OBJ file, any file with one of the [`EXTENSIONS`] is accepted,
-/// in that order too.
+/// A file belongs to the OBJ file if its name consists of the OBJ file's name (without `.obj` and `.derived`), optionally
+/// `.U`, and one of the first four [`EXTENSIONS`]. If there is no such file and no other OBJ file in the folder, any file
+/// with one of the [`EXTENSIONS`] is accepted. The order of the extensions decides between several files.
 ///
 /// # Errors
-/// `Invalid` with the candidates if two files have the same ending.
+/// `Invalid` with the candidates if several files have the same ending.
 pub(super) fn find_sidecar(files: &AssetDir, name: &str) -> Result<Option<String>> {
     let stem = name.strip_suffix(".obj").unwrap_or(name);
     let stem = stem.strip_suffix(".derived").unwrap_or(stem);
     for ending in &EXTENSIONS[..4] {
-        for middle in ["", ".U"] {
-            let candidate = format!("{stem}{middle}{ending}");
+        for infix in ["", ".U"] {
+            let candidate = format!("{stem}{infix}{ending}");
             if files.kind(&candidate)? == Some(EntryKind::File) {
                 return Ok(Some(candidate));
             }
@@ -66,13 +66,13 @@ pub(super) fn find_sidecar(files: &AssetDir, name: &str) -> Result<Option<String
     }
     for ending in EXTENSIONS {
         // `q.npy` and `*.q.npy` contain coordinates, not modes.
-        let fits = |name: &&String| name.ends_with(ending) && *name != "q.npy" && !name.ends_with(".q.npy");
-        let found: Vec<&String> = names.iter().filter(fits).collect();
-        match found[..] {
+        let is_candidate = |name: &&String| name.ends_with(ending) && *name != "q.npy" && !name.ends_with(".q.npy");
+        let candidates: Vec<&String> = names.iter().filter(is_candidate).collect();
+        match candidates[..] {
             [] => {}
-            [one] => return Ok(Some(one.clone())),
+            [candidate] => return Ok(Some(candidate.clone())),
             _ => {
-                let given = found.iter().map(|name| name.as_str()).collect::<Vec<_>>().join(", ");
+                let given = candidates.iter().map(|name| name.as_str()).collect::<Vec<_>>().join(", ");
                 return Err(invalid("modes", format!("one file ending in {ending}"), given));
             }
         }
@@ -84,16 +84,16 @@ pub(super) fn find_sidecar(files: &AssetDir, name: &str) -> Result<Option<String
 mod tests {
     use super::*;
 
-    fn found(names: &[&str], obj: &str) -> Result<Option<String>> {
-        let folder = tempfile::tempdir().expect("a folder");
+    fn find_sidecar_among(names: &[&str], obj_name: &str) -> Result<Option<String>> {
+        let folder = tempfile::tempdir().expect("a temporary folder");
         for name in names {
-            std::fs::write(folder.path().join(name), "").expect("written");
+            std::fs::write(folder.path().join(name), "").expect("a writable file");
         }
-        find_sidecar(&AssetDir::unrestricted(folder.path()), obj)
+        find_sidecar(&AssetDir::unrestricted(folder.path()), obj_name)
     }
 
     #[test]
-    fn modes_of_a_files_own_name_come_first_and_binary_before_text() {
+    fn find_sidecar_prefers_same_name_and_binary_files() {
         for (names, expected) in [
             (&["a.obj", "a.URendering.float", "a.U.float", "modes.txt"][..], Some("a.URendering.float")),
             (&["a.obj", "a.U.float", "modes.txt"], Some("a.U.float")),
@@ -103,24 +103,32 @@ mod tests {
             (&["a.obj", "b.obj", "modes.txt"], None),
             (&["a.obj", "a.mtl"], None),
         ] {
-            assert_eq!(found(names, "a.obj").expect("clear").as_deref(), expected, "{names:?}");
+            assert_eq!(
+                find_sidecar_among(names, "a.obj").expect("at most one candidate").as_deref(),
+                expected,
+                "{names:?}"
+            );
         }
         assert_eq!(
-            found(&["a.derived.obj", "a.U.float"], "a.derived.obj").expect("clear").as_deref(),
+            find_sidecar_among(&["a.derived.obj", "a.U.float"], "a.derived.obj")
+                .expect("at most one candidate")
+                .as_deref(),
             Some("a.U.float")
         );
     }
 
     #[test]
-    fn two_candidates_of_one_ending_are_refused_by_name() {
-        let refusal = found(&["a.obj", "x.npy", "y.npy"], "a.obj").expect_err("ambiguous").to_string();
-        assert_eq!(refusal, "modes: expected one file ending in .npy, got x.npy, y.npy");
+    fn several_files_with_one_ending_are_rejected() {
+        let message =
+            find_sidecar_among(&["a.obj", "x.npy", "y.npy"], "a.obj").expect_err("two candidates").to_string();
+        assert_eq!(message, "modes: expected one file ending in .npy, got x.npy, y.npy");
     }
 
     #[test]
-    fn an_unknown_ending_is_refused_before_anything_is_read() {
-        let refusal =
-            read(&AssetDir::unrestricted(std::path::Path::new(".")), "u.mat").expect_err("unknown").to_string();
-        assert!(refusal.ends_with(".npy, .safetensors or .txt, got u.mat"), "{refusal}");
+    fn unknown_ending_is_rejected_before_reading() {
+        let message = read(&AssetDir::unrestricted(std::path::Path::new(".")), "u.mat")
+            .expect_err("an unknown ending")
+            .to_string();
+        assert!(message.ends_with(".npy, .safetensors or .txt, got u.mat"), "{message}");
     }
 }

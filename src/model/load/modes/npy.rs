@@ -22,24 +22,24 @@ pub struct NpyArray {
 /// # Errors
 /// `Invalid` if the bytes are not such a file, or their number does not match the shape.
 pub fn parse(bytes: &[u8]) -> Result<NpyArray> {
-    let (header, body) = split(bytes)?;
-    let description = value(header, "descr")?.trim_matches(['\'', '"']);
-    let fortran_order = match value(header, "fortran_order")? {
+    let (header, body) = split_header(bytes)?;
+    let dtype = find_value(header, "descr")?.trim_matches(['\'', '"']);
+    let fortran_order = match find_value(header, "fortran_order")? {
         "True" => true,
         "False" => false,
         other => return Err(invalid("fortran_order", "True or False", other)),
     };
-    let shape = shape(value(header, "shape")?)?;
-    let width = match description {
+    let shape = parse_shape(find_value(header, "shape")?)?;
+    let entry_bytes = match dtype {
         "<f4" | ">f4" => 4,
         "<f8" | ">f8" => 8,
         other => return Err(invalid("descr", "f4 or f8", other)),
     };
-    let size = shape.iter().try_fold(width, |size: usize, side| size.checked_mul(*side));
+    let size = shape.iter().try_fold(entry_bytes, |size: usize, extent| size.checked_mul(*extent));
     if size != Some(body.len()) {
-        return Err(invalid("data", format!("{width} bytes for each entry of {shape:?}"), body.len()));
+        return Err(invalid("data", format!("{entry_bytes} bytes for each entry of {shape:?}"), body.len()));
     }
-    let entries = match description {
+    let entries = match dtype {
         "<f4" => super::vega::read_f32_le(body),
         "<f8" => super::vega::read_f64_le_as_f32(body),
         ">f4" => body.as_chunks().0.iter().map(|entry| f32::from_be_bytes(*entry)).collect(),
@@ -49,48 +49,49 @@ pub fn parse(bytes: &[u8]) -> Result<NpyArray> {
 }
 
 /// Splits the file into the text of the header and the data after it.
-fn split(bytes: &[u8]) -> Result<(&str, &[u8])> {
-    let cut = || invalid("header", "a whole .npy header", format!("{} bytes", bytes.len()));
-    let start = bytes.get(..8).ok_or_else(cut)?;
-    if &start[..6] != b"\x93NUMPY" || !(1..=3).contains(&start[6]) {
-        return Err(invalid("header", "the magic of .npy version 1 to 3", format!("{start:02x?}")));
+fn split_header(bytes: &[u8]) -> Result<(&str, &[u8])> {
+    let truncated = || invalid("header", "a complete .npy header", format!("{} bytes", bytes.len()));
+    let magic = bytes.get(..8).ok_or_else(truncated)?;
+    if &magic[..6] != b"\x93NUMPY" || !(1..=3).contains(&magic[6]) {
+        return Err(invalid("header", "the magic of .npy version 1 to 3", format!("{magic:02x?}")));
     }
-    let (length, rest) = if start[6] == 1 {
-        let (length, rest) = bytes[8..].split_first_chunk().ok_or_else(cut)?;
-        (usize::from(u16::from_le_bytes(*length)), rest)
+    let (length, remainder) = if magic[6] == 1 {
+        let (length, remainder) = bytes[8..].split_first_chunk().ok_or_else(truncated)?;
+        (usize::from(u16::from_le_bytes(*length)), remainder)
     } else {
-        let (length, rest) = bytes[8..].split_first_chunk().ok_or_else(cut)?;
-        (u32::from_le_bytes(*length) as usize, rest)
+        let (length, remainder) = bytes[8..].split_first_chunk().ok_or_else(truncated)?;
+        (u32::from_le_bytes(*length) as usize, remainder)
     };
     if length > MAX_HEADER_BYTES {
         return Err(invalid("header", format!("at most {MAX_HEADER_BYTES} bytes"), length));
     }
-    let (header, body) = rest.split_at_checked(length).ok_or_else(cut)?;
+    let (header, body) = remainder.split_at_checked(length).ok_or_else(truncated)?;
     let text = std::str::from_utf8(header).map_err(|error| invalid("header", "text", error))?;
     Ok((text, body))
 }
 
-/// The value of a key: up to the closing parenthesis of a tuple, or the next comma or brace.
-fn value<'a>(header: &'a str, key: &str) -> Result<&'a str> {
+/// The text of a key's value, which ends at the closing parenthesis of a tuple, or before the next comma or brace.
+fn find_value<'a>(header: &'a str, key: &str) -> Result<&'a str> {
     let missing = || -> Error { invalid("header", format!("the key '{key}'"), header.trim()) };
-    let after = [format!("'{key}'"), format!("\"{key}\"")]
+    let value_text = [format!("'{key}'"), format!("\"{key}\"")]
         .iter()
         .find_map(|quoted| header.split_once(quoted.as_str()))
-        .and_then(|(_, rest)| rest.trim_start().strip_prefix(':'))
+        .and_then(|(_, text_after_key)| text_after_key.trim_start().strip_prefix(':'))
         .ok_or_else(missing)?
         .trim_start();
-    let end = match after.strip_prefix('(') {
-        Some(inner) => inner.find(')').map(|at| at + 2),
-        None => after.find([',', '}']),
+    let end = match value_text.strip_prefix('(') {
+        // Include both parentheses.
+        Some(tuple) => tuple.find(')').map(|index| index + 2),
+        None => value_text.find([',', '}']),
     };
-    Ok(after[..end.ok_or_else(missing)?].trim())
+    Ok(value_text[..end.ok_or_else(missing)?].trim())
 }
 
-fn shape(text: &str) -> Result<Vec<usize>> {
-    let refuse = || invalid("shape", "a tuple of whole numbers", text);
-    let inner = text.strip_prefix('(').and_then(|text| text.strip_suffix(')')).ok_or_else(refuse)?;
-    let sides = inner.split(',').map(str::trim).filter(|side| !side.is_empty());
-    sides.map(|side| side.parse().map_err(|_| refuse())).collect()
+fn parse_shape(text: &str) -> Result<Vec<usize>> {
+    let invalid_shape = || invalid("shape", "a tuple of whole numbers", text);
+    let extents_text = text.strip_prefix('(').and_then(|text| text.strip_suffix(')')).ok_or_else(invalid_shape)?;
+    let extents = extents_text.split(',').map(str::trim).filter(|extent| !extent.is_empty());
+    extents.map(|extent| extent.parse().map_err(|_| invalid_shape())).collect()
 }
 
 #[cfg(test)]
@@ -100,57 +101,63 @@ mod tests {
 
     use super::*;
 
-    fn written<A: ndarray_npy::WritableElement>(array: &ndarray::Array2<A>) -> Vec<u8> {
+    fn to_npy<A: ndarray_npy::WritableElement>(array: &ndarray::Array2<A>) -> Vec<u8> {
         let mut bytes = Vec::new();
-        array.write_npy(&mut bytes).expect("written");
+        array.write_npy(&mut bytes).expect("an encoded array");
         bytes
     }
 
     #[test]
-    fn both_orders_and_widths_give_the_same_matrix() {
+    fn index_orders_and_entry_types_give_the_same_matrix() {
         let entry = |(row, column): (usize, usize)| (2 * row + column) as f32;
-        let c = ndarray::Array2::from_shape_fn((3, 2), entry);
-        let fortran_order = ndarray::Array2::from_shape_fn((3, 2).f(), entry);
-        let double = c.mapv(f64::from);
-        let modes: Vec<_> = [written(&c), written(&fortran_order), written(&double)]
+        let row_major = ndarray::Array2::from_shape_fn((3, 2), entry);
+        let column_major = ndarray::Array2::from_shape_fn((3, 2).f(), entry);
+        let f64_array = row_major.mapv(f64::from);
+        let modes: Vec<_> = [to_npy(&row_major), to_npy(&column_major), to_npy(&f64_array)]
             .iter()
-            .map(|bytes| super::super::parse_npy(bytes).expect("good"))
+            .map(|bytes| super::super::parse_npy(bytes).expect("a valid .npy file"))
             .collect();
-        assert_eq!(modes[0].entry(0, 2, 1), 5.0);
-        assert!(parse(&written(&fortran_order)).expect("good").fortran_order, "the writer kept the order");
+        assert_eq!(modes[0].at(0, 2, 1), 5.0);
+        assert!(
+            parse(&to_npy(&column_major)).expect("a valid .npy file").fortran_order,
+            "control: expected a column-major file"
+        );
         assert_eq!(modes[0], modes[1]);
         assert_eq!(modes[0], modes[2]);
     }
 
-    fn file(header: &str, body: usize) -> Vec<u8> {
-        let length = u16::try_from(header.len()).expect("short");
+    fn npy_file(header: &str, body: usize) -> Vec<u8> {
+        let length = u16::try_from(header.len()).expect("a header below 64 KiB");
         [b"\x93NUMPY\x01\x00", &length.to_le_bytes()[..], header.as_bytes(), &vec![0; body]].concat()
     }
 
     #[test]
-    fn hostile_files_are_refused_before_anything_is_allocated() {
-        let described =
-            |text: &str| file(&format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {text}, }}"), 12);
+    fn invalid_files_are_rejected_before_allocation() {
+        let file_with_shape =
+            |text: &str| npy_file(&format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {text}, }}"), 12);
         let brackets = "(".repeat(4000);
         for (bytes, start) in [
-            (b"\x93NUMPY".to_vec(), "header: expected a whole .npy header, got 6 bytes"),
+            (b"\x93NUMPY".to_vec(), "header: expected a complete .npy header, got 6 bytes"),
             (b"PK\x03\x04aaaa".to_vec(), "header: expected the magic"),
             (b"\x93NUMPY\x02\x00\xff\xff\xff\xff".to_vec(), "header: expected at most 4096 bytes, got 4294967295"),
-            (b"\x93NUMPY\x01\x00\x40\x00ab".to_vec(), "header: expected a whole"),
-            (described("(3, 2)"), "data: expected 4 bytes for each entry of [3, 2], got 12"),
-            (described("(3, 0)"), "data: expected 4 bytes for each entry of [3, 0], got 12"),
-            (described("(4294967296, 4294967296)"), "data: expected"),
-            (described("(9223372036854775807, 3)"), "data: expected"),
-            (described("(3, -1)"), "shape: expected a tuple of whole numbers"),
-            (described(&brackets), "header: expected the key 'shape'"),
-            (file("{'descr': '<i4', 'fortran_order': False, 'shape': (3,1)}", 12), "descr: expected f4 or f8, got <i4"),
-            (file("{'descr': '<f4', 'fortran_order': No, 'shape': (3,1)}", 12), "fortran_order: expected"),
-            (file("{}", 0), "header: expected the key 'descr'"),
+            (b"\x93NUMPY\x01\x00\x40\x00ab".to_vec(), "header: expected a complete"),
+            (file_with_shape("(3, 2)"), "data: expected 4 bytes for each entry of [3, 2], got 12"),
+            (file_with_shape("(3, 0)"), "data: expected 4 bytes for each entry of [3, 0], got 12"),
+            (file_with_shape("(4294967296, 4294967296)"), "data: expected"),
+            (file_with_shape("(9223372036854775807, 3)"), "data: expected"),
+            (file_with_shape("(3, -1)"), "shape: expected a tuple of whole numbers"),
+            (file_with_shape(&brackets), "header: expected the key 'shape'"),
+            (
+                npy_file("{'descr': '<i4', 'fortran_order': False, 'shape': (3,1)}", 12),
+                "descr: expected f4 or f8, got <i4",
+            ),
+            (npy_file("{'descr': '<f4', 'fortran_order': No, 'shape': (3,1)}", 12), "fortran_order: expected"),
+            (npy_file("{}", 0), "header: expected the key 'descr'"),
         ] {
-            let refusal = parse(&bytes).expect_err(start).to_string();
-            assert!(refusal.starts_with(start), "{refusal}");
+            let message = parse(&bytes).expect_err(start).to_string();
+            assert!(message.starts_with(start), "{message}");
         }
-        let flat = super::super::parse_npy(&described("(3,)")).expect_err("flat").to_string();
-        assert_eq!(flat, "shape: expected two dimensions, 3n x r, got [3]");
+        let message = super::super::parse_npy(&file_with_shape("(3,)")).expect_err("one dimension").to_string();
+        assert_eq!(message, "shape: expected two dimensions, 3n x r, got [3]");
     }
 }

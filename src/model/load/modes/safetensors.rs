@@ -1,4 +1,5 @@
-//! Parser of safetensors files: the tensor `U`, or the only one, as row-major f64, f32, f16 or bf16.
+//! Parser of safetensors files. U is the tensor named `U` or the only tensor of the file, row-major, as f64, f32, f16 or
+//! bf16.
 
 use safetensors::{Dtype, SafeTensors};
 
@@ -14,12 +15,12 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
         SafeTensors::deserialize(bytes).map_err(|error| invalid("header", "a safetensors file", error))?;
     let names = safetensors.names();
     let name = match names[..] {
-        [only] => only,
+        [name] => name,
         _ => "U",
     };
     let missing = |_| {
         let given = names.iter().take(16).copied().collect::<Vec<_>>().join(", ");
-        invalid("tensor", "one tensor, or one named U", format!("{} ({given})", names.len()))
+        invalid("tensor", "one tensor, or one named U", format!("{} tensors ({given})", names.len()))
     };
     let tensor = safetensors.tensor(name).map_err(missing)?;
     let [rows, rank] = *tensor.shape() else {
@@ -29,11 +30,11 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
     let entries = match tensor.dtype() {
         Dtype::F64 => super::vega::read_f64_le_as_f32(body),
         Dtype::F32 => super::vega::read_f32_le(body),
-        Dtype::F16 => body.as_chunks().0.iter().map(|half| f16_to_f32(u16::from_le_bytes(*half))).collect(),
+        Dtype::F16 => body.as_chunks().0.iter().map(|bits| f16_to_f32(u16::from_le_bytes(*bits))).collect(),
         // bf16 is the upper half of an f32.
         Dtype::BF16 => {
-            let wide = |half: &[u8; 2]| f32::from_bits(u32::from(u16::from_le_bytes(*half)) << 16);
-            body.as_chunks().0.iter().map(wide).collect()
+            let bf16_to_f32 = |bits: &[u8; 2]| f32::from_bits(u32::from(u16::from_le_bytes(*bits)) << 16);
+            body.as_chunks().0.iter().map(bf16_to_f32).collect()
         }
         other => return Err(invalid(format!("tensor '{name}': type"), "F64, F32, F16 or BF16", format!("{other:?}"))),
     };
@@ -41,16 +42,16 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
 }
 
 /// IEEE 754 binary16 to f32, exact.
-fn f16_to_f32(half: u16) -> f32 {
-    let sign = if half & 0x8000 == 0 { 1.0 } else { -1.0 };
-    let (exponent, fraction) = (i32::from(half >> 10 & 0x1f), f32::from(half & 0x3ff));
-    let size = match exponent {
+fn f16_to_f32(bits: u16) -> f32 {
+    let sign = if bits & 0x8000 == 0 { 1.0 } else { -1.0 };
+    let (exponent, fraction) = (i32::from(bits >> 10 & 0x1f), f32::from(bits & 0x3ff));
+    let magnitude = match exponent {
         0 => fraction * 2f32.powi(-24),
         31 if fraction == 0.0 => f32::INFINITY,
         31 => f32::NAN,
         _ => (1024.0 + fraction) * 2f32.powi(exponent - 25),
     };
-    sign * size
+    sign * magnitude
 }
 
 #[cfg(test)]
@@ -59,31 +60,31 @@ mod tests {
 
     use super::*;
 
-    fn file(safetensors: &[(&str, Dtype, Vec<usize>, &[u8])]) -> Vec<u8> {
+    fn serialize_tensors(tensors: &[(&str, Dtype, Vec<usize>, &[u8])]) -> Vec<u8> {
         let view = |(name, dtype, shape, data): &(&str, Dtype, Vec<usize>, &'static [u8])| {
-            (name.to_string(), TensorView::new(*dtype, shape.clone(), data).expect("a view"))
+            (name.to_string(), TensorView::new(*dtype, shape.clone(), data).expect("a valid tensor"))
         };
-        let safetensors: Vec<(&str, Dtype, Vec<usize>, &'static [u8])> = safetensors
+        let tensors: Vec<(&str, Dtype, Vec<usize>, &'static [u8])> = tensors
             .iter()
             .map(|(name, dtype, shape, data)| (*name, *dtype, shape.clone(), &*data.to_vec().leak()))
             .collect();
-        safetensors::serialize(safetensors.iter().map(view), None).expect("serialised")
+        safetensors::serialize(tensors.iter().map(view), None).expect("a serialized file")
     }
 
     #[test]
-    fn all_four_types_give_the_same_column() {
+    fn all_entry_types_give_the_same_column() {
         let f64s: Vec<u8> = [1.0f64, -0.5, 2.0].iter().flat_map(|entry| entry.to_le_bytes()).collect();
         let f32s: Vec<u8> = [1.0f32, -0.5, 2.0].iter().flat_map(|entry| entry.to_le_bytes()).collect();
-        let halves: Vec<u8> = [0x3c00u16, 0xb800, 0x4000].iter().flat_map(|entry| entry.to_le_bytes()).collect();
-        let brains: Vec<u8> = [0x3f80u16, 0xbf00, 0x4000].iter().flat_map(|entry| entry.to_le_bytes()).collect();
-        for (dtype, body) in [(Dtype::F64, f64s), (Dtype::F32, f32s), (Dtype::F16, halves), (Dtype::BF16, brains)] {
-            let modes = parse(&file(&[("anything", dtype, vec![3, 1], &body)])).expect("good");
+        let f16s: Vec<u8> = [0x3c00u16, 0xb800, 0x4000].iter().flat_map(|entry| entry.to_le_bytes()).collect();
+        let bf16s: Vec<u8> = [0x3f80u16, 0xbf00, 0x4000].iter().flat_map(|entry| entry.to_le_bytes()).collect();
+        for (dtype, body) in [(Dtype::F64, f64s), (Dtype::F32, f32s), (Dtype::F16, f16s), (Dtype::BF16, bf16s)] {
+            let modes = parse(&serialize_tensors(&[("anything", dtype, vec![3, 1], &body)])).expect("a valid file");
             assert_eq!(modes.column(0), [1.0, -0.5, 2.0], "{dtype:?}");
         }
     }
 
     #[test]
-    fn halves_are_exact_at_the_ends_of_their_range() {
+    fn f16_to_f32_is_exact_at_the_ends_of_the_range() {
         assert_eq!(f16_to_f32(1), 2f32.powi(-24));
         assert_eq!(f16_to_f32(0x0400), 2f32.powi(-14));
         assert_eq!(f16_to_f32(0x7bff), 65504.0);
@@ -91,24 +92,24 @@ mod tests {
     }
 
     #[test]
-    fn other_types_shapes_names_and_broken_headers_are_refused() {
+    fn invalid_tensors_and_headers_are_rejected() {
         let zeros = [0; 12];
-        let two = [("U", Dtype::F32, vec![3, 1], &zeros[..]), ("V", Dtype::F32, vec![3, 1], &zeros[..])];
-        assert!(parse(&file(&two)).is_ok(), "U is chosen by name");
+        let two_tensors = [("U", Dtype::F32, vec![3, 1], &zeros[..]), ("V", Dtype::F32, vec![3, 1], &zeros[..])];
+        assert!(parse(&serialize_tensors(&two_tensors)).is_ok(), "expected the tensor U to be selected by name");
         for (bytes, start) in [
             (
-                file(&[("a", Dtype::F32, vec![3, 1], &zeros[..]), two[1].clone()]),
+                serialize_tensors(&[("a", Dtype::F32, vec![3, 1], &zeros[..]), two_tensors[1].clone()]),
                 "tensor: expected one tensor, or one named U",
             ),
-            (file(&[("U", Dtype::I32, vec![3, 1], &zeros[..])]), "tensor 'U': type"),
-            (file(&[("U", Dtype::F32, vec![3], &zeros[..])]), "tensor 'U': shape"),
-            (file(&[("U", Dtype::F32, vec![1, 3], &zeros[..])]), "modes.rows"),
+            (serialize_tensors(&[("U", Dtype::I32, vec![3, 1], &zeros[..])]), "tensor 'U': type"),
+            (serialize_tensors(&[("U", Dtype::F32, vec![3], &zeros[..])]), "tensor 'U': shape"),
+            (serialize_tensors(&[("U", Dtype::F32, vec![1, 3], &zeros[..])]), "modes.rows"),
             (vec![255; 64], "header: expected a safetensors file"),
             (b"\x02\0\0\0\0\0\0\0{}".to_vec(), "tensor: expected one tensor"),
             (vec![], "header: expected a safetensors file"),
         ] {
-            let refusal = parse(&bytes).expect_err(start).to_string();
-            assert!(refusal.starts_with(start), "{refusal}");
+            let message = parse(&bytes).expect_err(start).to_string();
+            assert!(message.starts_with(start), "{message}");
         }
     }
 }

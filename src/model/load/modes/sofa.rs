@@ -11,46 +11,48 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
     let text = std::str::from_utf8(bytes).map_err(|error| invalid("text", "ASCII numbers", error))?;
     let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
     let (_, header) = lines.next().ok_or_else(|| invalid("header", "rows and columns", "an empty file"))?;
-    let (rows, rank) = sizes(header)?;
+    let (rows, rank) = parse_sizes(header)?;
     let mut entries = Vec::new();
-    let mut widths = Vec::new();
+    let mut entries_per_line = Vec::new();
     for (index, line) in lines {
-        let before = entries.len();
+        let previous_count = entries.len();
         for word in line.split_ascii_whitespace() {
             let entry: f32 = word.parse().map_err(|_| invalid(format!("line {}", index + 1), "a number", word))?;
             entries.push(entry);
         }
-        widths.push(entries.len() - before);
+        entries_per_line.push(entries.len() - previous_count);
     }
-    compare(rows, rank, &widths)?;
+    check_entry_count(rows, rank, &entries_per_line)?;
     Modes::from_rows(rows, rank, &entries)
 }
 
-/// Parses the two whole numbers of the header; some tools write them as `684. 32.`.
-fn sizes(header: &str) -> Result<(usize, usize)> {
+/// Parses the header: two whole numbers, which some tools write as `684. 32.`.
+fn parse_sizes(header: &str) -> Result<(usize, usize)> {
     let words: Vec<&str> = header.split_ascii_whitespace().collect();
-    let whole = |word: &str| word.strip_suffix('.').unwrap_or(word).parse::<usize>().ok();
+    let parse_size = |word: &str| word.strip_suffix('.').unwrap_or(word).parse::<usize>().ok();
     match words[..] {
-        [rows, rank] => whole(rows).zip(whole(rank)),
+        [rows, rank] => parse_size(rows).zip(parse_size(rank)),
         _ => None,
     }
     .ok_or_else(|| {
-        invalid("header", "rows and columns, two whole numbers", header.chars().take(80).collect::<String>())
+        invalid("header", "two whole numbers, rows and columns", header.chars().take(80).collect::<String>())
     })
 }
 
-fn compare(rows: usize, rank: usize, widths: &[usize]) -> Result<()> {
-    let delivered: usize = widths.iter().sum();
-    let declared = rows.checked_mul(rank);
-    let one_line_each = widths.len() == rows && widths.iter().all(|width| *width == rank);
-    // Values may be wrapped at other places; then only their total number can be checked.
-    if declared == Some(delivered) && (one_line_each || widths.len() != rows) {
+fn check_entry_count(rows: usize, rank: usize, entries_per_line: &[usize]) -> Result<()> {
+    let actual_count: usize = entries_per_line.iter().sum();
+    let expected_count = rows.checked_mul(rank);
+    let has_one_row_per_line = entries_per_line.len() == rows && entries_per_line.iter().all(|count| *count == rank);
+    // A file may wrap lines at other places. In this case, only the total number of entries can be checked.
+    if expected_count == Some(actual_count) && (has_one_row_per_line || entries_per_line.len() != rows) {
         return Ok(());
     }
     let expected = format!("{rows} x {rank} values as the header declares");
-    let given = match widths {
-        [width, others @ ..] if others.iter().all(|other| other == width) => format!("{} x {width}", widths.len()),
-        _ => format!("{delivered} values in {} lines", widths.len()),
+    let given = match entries_per_line {
+        [count, other_counts @ ..] if other_counts.iter().all(|other_count| other_count == count) => {
+            format!("{} x {count}", entries_per_line.len())
+        }
+        _ => format!("{actual_count} values in {} lines", entries_per_line.len()),
     };
     Err(invalid("values", expected, given))
 }
@@ -60,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rows_stand_one_per_line_or_wrapped() {
+    fn rows_may_be_wrapped_at_any_place() {
         for text in ["3 2\n1 2\n3 4\n5 6\n", "3. 2.\n1 2 3 4\n5 6\n", "\n3 2\n\n  1e0 2 3 4 5 6"] {
             let modes = parse(text.as_bytes()).expect(text);
             assert_eq!((modes.entry(0, 2, 0), modes.entry(0, 2, 1)), (5.0, 6.0));
@@ -68,11 +70,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_delivered_is_compared_with_what_is_declared() {
-        for (text, refusal) in [
+    fn declared_and_actual_sizes_must_match() {
+        for (text, message) in [
             ("", "header: expected rows and columns, got an empty file"),
-            ("3\n1\n", "header: expected rows and columns, two whole numbers, got 3"),
-            ("3 -1\n1\n", "header: expected rows and columns, two whole numbers, got 3 -1"),
+            ("3\n1\n", "header: expected two whole numbers, rows and columns, got 3"),
+            ("3 -1\n1\n", "header: expected two whole numbers, rows and columns, got 3 -1"),
             ("3 1\n1 2\n3 4\n5 6\n", "values: expected 3 x 1 values as the header declares, got 3 x 2"),
             ("3 2\n1 2\n3 4 5\n6\n", "values: expected 3 x 2 values as the header declares, got 6 values in 3 lines"),
             ("3 2\n1 2\n3 4\n", "values: expected 3 x 2 values as the header declares, got 2 x 2"),
@@ -84,7 +86,7 @@ mod tests {
             ("3 1\n1\nnan\n3\n", "modes[1, 0]: expected a finite number, got NaN"),
             ("4 1\n1 2 3 4\n", "modes.rows: expected a positive multiple of 3, got 4"),
         ] {
-            assert_eq!(parse(text.as_bytes()).expect_err(text).to_string(), refusal);
+            assert_eq!(parse(text.as_bytes()).expect_err(text).to_string(), message);
         }
         assert!(parse(b"3 1\n\xff").is_err());
     }

@@ -1,4 +1,4 @@
-//! Builds a triangle mesh, grouped into runs of one material, from the polygons of an OBJ file.
+//! Builds a triangle mesh from the polygons of an OBJ file, with one range of triangles per material.
 
 use std::collections::HashMap;
 
@@ -7,12 +7,13 @@ use super::triangulate::triangulate;
 use crate::domain::{Corners, MaterialRange, Mesh, smooth_normals};
 use crate::error::Result;
 
-/// A mesh and its runs of materials (indices into [`ObjFile::materials`]).
+/// A mesh and its materials, as indices into [`ObjFile::materials`].
 #[derive(Debug)]
 pub(in crate::load) struct ObjMesh {
     pub(in crate::load) mesh: Mesh,
+    /// The material of the first triangle.
     pub(in crate::load) material: usize,
-    /// Empty if there is only one material.
+    /// The ranges of all materials; empty if there is only one material.
     pub(in crate::load) material_ranges: Vec<MaterialRange>,
 }
 
@@ -22,29 +23,39 @@ pub(in crate::load) struct ObjMesh {
 /// `Invalid` as for [`Mesh::new`].
 pub(in crate::load) fn build_all_faces(obj: &ObjFile) -> Result<ObjMesh> {
     let faces: Vec<usize> = (0..obj.faces.len()).collect();
-    let mut builder = ObjMeshBuilder { rest: obj.positions.clone(), ..ObjMeshBuilder::new(obj) };
-    builder.add(&faces);
+    let mut builder = ObjMeshBuilder { rest_positions: obj.positions.clone(), ..ObjMeshBuilder::new(obj) };
+    builder.add_faces(&faces);
     builder.finish()
 }
 
-/// Builds a mesh from some faces and only the vertices that they use, with positions relative to `base`.
+/// Builds a mesh from some faces and only the vertices that they use, with positions relative to `origin`.
 ///
 /// # Errors
 /// `Invalid` as for [`Mesh::new`].
-pub(in crate::load) fn build_faces(obj: &ObjFile, faces: &[usize], base: [f64; 3]) -> Result<ObjMesh> {
-    let mut builder = ObjMeshBuilder { local: Some((HashMap::new(), base)), ..ObjMeshBuilder::new(obj) };
-    builder.add(faces);
+pub(in crate::load) fn build_faces(obj: &ObjFile, faces: &[usize], origin: [f64; 3]) -> Result<ObjMesh> {
+    let used_vertices = UsedVertices { new_indices: HashMap::new(), origin };
+    let mut builder = ObjMeshBuilder { used_vertices: Some(used_vertices), ..ObjMeshBuilder::new(obj) };
+    builder.add_faces(faces);
     builder.finish()
+}
+
+/// The vertices that [`build_faces`] uses.
+struct UsedVertices {
+    /// Index in the mesh by index in the file.
+    new_indices: HashMap<u32, u32>,
+    origin: [f64; 3],
 }
 
 struct ObjMeshBuilder<'a> {
     obj: &'a ObjFile,
-    /// For [`build_faces`]: the new index of each used vertex, by its index in the file, and the base.
-    local: Option<(HashMap<u32, u32>, [f64; 3])>,
-    rest: Vec<[f32; 3]>,
-    corner_of: HashMap<Corner, u32>,
+    /// `None` if the mesh has all vertices of the file.
+    used_vertices: Option<UsedVertices>,
+    rest_positions: Vec<[f32; 3]>,
+    /// Index of each corner in `corners`.
+    corner_indices: HashMap<Corner, u32>,
     corners: Vec<Corner>,
-    vertices: Vec<u32>,
+    /// The vertex of each corner in the mesh.
+    corner_vertices: Vec<u32>,
     triangles: Vec<[u32; 3]>,
     material_ranges: Vec<MaterialRange>,
 }
@@ -53,75 +64,84 @@ impl<'a> ObjMeshBuilder<'a> {
     fn new(obj: &'a ObjFile) -> Self {
         Self {
             obj,
-            local: None,
-            rest: Vec::new(),
-            corner_of: HashMap::new(),
+            used_vertices: None,
+            rest_positions: Vec::new(),
+            corner_indices: HashMap::new(),
             corners: Vec::new(),
-            vertices: Vec::new(),
+            corner_vertices: Vec::new(),
             triangles: Vec::new(),
             material_ranges: Vec::new(),
         }
     }
 
-    fn add(&mut self, faces: &[usize]) {
-        // Sort by material, so that there are no more runs than materials. The sort is stable: file order within a run.
+    fn add_faces(&mut self, faces: &[usize]) {
+        // Sort by material, so that each material has one range. The sort is stable, so a range is in file order.
         let mut faces = faces.to_vec();
         faces.sort_by_key(|face| self.obj.faces[*face].material);
         for face in faces {
             let material = self.obj.faces[face].material;
-            if self.material_ranges.last().is_none_or(|run| run.material != material) {
+            if self.material_ranges.last().is_none_or(|range| range.material != material) {
                 self.material_ranges.push(MaterialRange { first_triangle: self.triangles.len(), material });
             }
-            self.face(face);
+            self.add_face(face);
         }
     }
 
-    fn face(&mut self, face: usize) {
+    fn add_face(&mut self, face: usize) {
         let corners = self.obj.corners_of(face);
-        let points: Vec<_> = corners.iter().map(|corner| self.obj.positions[corner.v as usize]).collect();
-        let numbers: Vec<u32> = corners.iter().map(|corner| self.corner(*corner)).collect();
-        self.triangles.extend(triangulate(&points).into_iter().map(|triangle| triangle.map(|index| numbers[index])));
+        let positions: Vec<_> = corners.iter().map(|corner| self.obj.positions[corner.v as usize]).collect();
+        let corner_indices: Vec<u32> = corners.iter().map(|corner| self.corner_index(*corner)).collect();
+        self.triangles
+            .extend(triangulate(&positions).into_iter().map(|triangle| triangle.map(|index| corner_indices[index])));
     }
 
-    /// The index of the rendered corner of a (v, vt, vn), which is created on first use.
-    fn corner(&mut self, corner: Corner) -> u32 {
-        if let Some(known) = self.corner_of.get(&corner) {
-            return *known;
+    /// Returns the index of a corner in the mesh. The first call for a corner adds it to the mesh.
+    fn corner_index(&mut self, corner: Corner) -> u32 {
+        if let Some(index) = self.corner_indices.get(&corner) {
+            return *index;
         }
-        let number = self.corners.len() as u32;
-        let vertex = self.vertex(corner.v);
-        self.vertices.push(vertex);
+        let index = self.corners.len() as u32;
+        let vertex = self.vertex_index(corner.v);
+        self.corner_vertices.push(vertex);
         self.corners.push(corner);
-        self.corner_of.insert(corner, number);
-        number
+        self.corner_indices.insert(corner, index);
+        index
     }
 
-    fn vertex(&mut self, v: u32) -> u32 {
-        let Some((numbers, base)) = &mut self.local else { return v };
-        *numbers.entry(v).or_insert_with(|| {
+    /// Returns the index in the mesh of a vertex of the file. [`build_faces`] adds a vertex on the first call for it.
+    fn vertex_index(&mut self, v: u32) -> u32 {
+        let Some(UsedVertices { new_indices, origin }) = &mut self.used_vertices else { return v };
+        *new_indices.entry(v).or_insert_with(|| {
             let position = self.obj.positions[v as usize];
-            self.rest.push([0, 1, 2].map(|axis| (f64::from(position[axis]) - base[axis]) as f32));
-            self.rest.len() as u32 - 1
+            self.rest_positions.push([0, 1, 2].map(|axis| (f64::from(position[axis]) - origin[axis]) as f32));
+            self.rest_positions.len() as u32 - 1
         })
     }
 
     fn finish(self) -> Result<ObjMesh> {
         let normals = self.normals();
         let uvs = if self.corners.iter().all(|corner| corner.vt == NO_INDEX) { Vec::new() } else { self.uvs() };
-        let material = self.material_ranges.first().map_or(0, |run| run.material);
+        let material = self.material_ranges.first().map_or(0, |range| range.material);
         let material_ranges = if self.material_ranges.len() > 1 { self.material_ranges } else { Vec::new() };
-        let mesh = Mesh::new(self.rest, Corners { vertices: self.vertices, normals, uvs }, self.triangles)?;
+        let mesh =
+            Mesh::new(self.rest_positions, Corners { vertices: self.corner_vertices, normals, uvs }, self.triangles)?;
         Ok(ObjMesh { mesh, material, material_ranges })
     }
 
-    /// The file's normals. Corners with none or a zero normal get the smooth normal of their vertex.
+    /// The normals of the corners. A corner whose normal is missing or zero in the file has the smooth normal of its
+    /// vertex.
     fn normals(&self) -> Vec<[f32; 3]> {
-        let given = |corner: &Corner| self.obj.normals.get(corner.vn as usize).filter(|normal| **normal != [0.0; 3]);
-        if let Some(all) = self.corners.iter().map(|corner| given(corner).copied()).collect() {
-            return all;
+        let file_normal =
+            |corner: &Corner| self.obj.normals.get(corner.vn as usize).filter(|normal| **normal != [0.0; 3]);
+        if let Some(file_normals) = self.corners.iter().map(|corner| file_normal(corner).copied()).collect() {
+            return file_normals;
         }
-        let smooth = smooth_normals(&self.rest, &self.vertices, &self.triangles);
-        self.corners.iter().zip(smooth).map(|(corner, smooth)| given(corner).copied().unwrap_or(smooth)).collect()
+        let smooth = smooth_normals(&self.rest_positions, &self.corner_vertices, &self.triangles);
+        self.corners
+            .iter()
+            .zip(smooth)
+            .map(|(corner, smooth_normal)| file_normal(corner).copied().unwrap_or(smooth_normal))
+            .collect()
     }
 
     fn uvs(&self) -> Vec<[f32; 2]> {
@@ -134,51 +154,57 @@ impl<'a> ObjMeshBuilder<'a> {
 mod tests {
     use super::*;
 
-    /// Two squares in one plane. The middle edge is duplicated, one vertex is unused, and materials alternate.
+    /// Two squares in one plane. The shared edge is duplicated, one vertex is unused, and materials alternate.
     const SQUARES: &str = "v 9 9 9\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 1 0 0\nv 2 0 0\nv 2 1 0\nv 1 1 0\n\
         vt 0 0\nvt 1 1\nusemtl b\nf 2/1 3/1 4/1 5/1\nusemtl a\nf 6 7 8 9\nusemtl b\nf 2/2 3/2 4/2\n";
 
-    fn parsed() -> ObjFile {
-        ObjFile::parse(SQUARES.as_bytes()).expect("good")
+    fn parse_squares() -> ObjFile {
+        ObjFile::parse(SQUARES.as_bytes()).expect("a valid OBJ file")
     }
 
     #[test]
-    fn rows_follow_the_v_lines_with_unreferenced_and_coincident_vertices_kept() {
-        let obj = parsed();
-        let mesh = build_all_faces(&obj).expect("good").mesh;
-        assert_eq!(mesh.rest_positions(), obj.positions);
-        assert_eq!(mesh.corners().vertices, [1, 2, 3, 4, 1, 2, 3, 5, 6, 7, 8], "v/1 and v/2 are corners of one vertex");
+    fn build_all_faces_keeps_all_v_lines_in_file_order() {
+        let obj = parse_squares();
+        let mesh = build_all_faces(&obj).expect("a valid OBJ file").mesh;
+        assert_eq!(mesh.rest(), obj.positions);
+        assert_eq!(
+            mesh.corners().vertices,
+            [1, 2, 3, 4, 1, 2, 3, 5, 6, 7, 8],
+            "expected v/1 and v/2 to be corners of one vertex"
+        );
         assert_eq!(mesh.corners().uvs[4], [1.0, 0.0]);
-        assert_eq!(mesh.corners().uvs[7], [0.0, 0.0], "a corner without vt among others with");
+        assert_eq!(mesh.corners().uvs[7], [0.0, 0.0], "expected (0, 0) for a corner without vt");
         assert_eq!(mesh.corners().normals, [[0.0, 0.0, 1.0]; 11]);
     }
 
     #[test]
-    fn faces_of_one_material_make_one_run_and_one_material_makes_none() {
-        let obj = parsed();
-        let piece = build_all_faces(&obj).expect("good");
+    fn faces_are_merged_into_one_range_per_material() {
+        let obj = parse_squares();
+        let obj_mesh = build_all_faces(&obj).expect("a valid OBJ file");
         assert_eq!(obj.materials, ["b", "a"]);
         assert_eq!(
-            piece.material_ranges,
+            obj_mesh.material_ranges,
             [MaterialRange { first_triangle: 0, material: 0 }, MaterialRange { first_triangle: 3, material: 1 }]
         );
-        assert_eq!(piece.mesh.triangles().len(), 5);
-        let only = build_faces(&obj, &[1], [0.0; 3]).expect("good");
-        assert_eq!((only.material, only.material_ranges.len()), (1, 0));
+        assert_eq!(obj_mesh.mesh.triangles().len(), 5);
+        let single_face_mesh = build_faces(&obj, &[1], [0.0; 3]).expect("a valid OBJ file");
+        assert_eq!((single_face_mesh.material, single_face_mesh.material_ranges.len()), (1, 0));
     }
 
     #[test]
-    fn a_part_has_its_own_vertices_relative_to_its_base() {
-        let piece = build_faces(&parsed(), &[1], [1.0, 0.0, 0.5]).expect("good");
-        let rest = [[0.0, 0.0, -0.5], [1.0, 0.0, -0.5], [1.0, 1.0, -0.5], [0.0, 1.0, -0.5]];
-        assert_eq!(piece.mesh.rest_positions(), rest);
-        assert!(piece.mesh.corners().uvs.is_empty());
+    fn build_faces_keeps_used_vertices_relative_to_origin() {
+        let obj_mesh = build_faces(&parse_squares(), &[1], [1.0, 0.0, 0.5]).expect("a valid OBJ file");
+        let rest_positions = [[0.0, 0.0, -0.5], [1.0, 0.0, -0.5], [1.0, 1.0, -0.5], [0.0, 1.0, -0.5]];
+        assert_eq!(obj_mesh.mesh.rest(), rest_positions);
+        assert!(obj_mesh.mesh.corners().uvs.is_empty());
     }
 
     #[test]
-    fn missing_and_zero_normals_are_computed_and_given_ones_kept() {
+    fn missing_and_zero_normals_become_smooth_normals() {
         let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 1 0 0\nvn 0 0 0\nf 1//1 2//2 3\n";
-        let mesh = build_all_faces(&ObjFile::parse(text.as_bytes()).expect("good")).expect("good").mesh;
+        let mesh = build_all_faces(&ObjFile::parse(text.as_bytes()).expect("a valid OBJ file"))
+            .expect("a valid OBJ file")
+            .mesh;
         assert_eq!(mesh.corners().normals, [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]);
     }
 }

@@ -9,39 +9,38 @@ use crate::load::texture_cache::TextureCache;
 /// The alpha-test cutoff of materials whose alpha comes from an image.
 pub(in crate::load) const DEFAULT_ALPHA_CUTOFF: f32 = 0.5;
 
-/// The material of `statements`, with images read from `files`.
+/// Creates the material of `statements`, with images read from `files`.
 ///
-/// Alpha in an image selects the alpha test; an opacity below 1 selects blending. Materials are double-sided, because
-/// OBJ cannot express this property and leaves are usually single sheets.
+/// An image with alpha selects the alpha test; an opacity below 1 selects blending. Materials are double-sided, because
+/// MTL cannot express this property and leaves are usually single sheets.
 ///
 /// # Errors
 /// `Invalid` with the material and the statement: a missing or unreadable image, or a number out of range.
-pub(super) fn material(
+pub(super) fn create_material(
     name: &str,
     statements: &MtlMaterial,
     files: &AssetDir,
     texture_cache: &mut TextureCache,
     remarks: &mut Vec<String>,
 ) -> Result<Material> {
-    let place = |statement: &str| format!("material '{name}': {statement}");
+    let field_of = |statement: &str| format!("material '{name}': {statement}");
     let diffuse = statements.diffuse.unwrap_or([1.0; 3]);
-    let color_texture =
-        color_texture(statements, files, texture_cache).map_err(|error| error.prefix_field(&place("map_Kd, map_d")))?;
+    let color_texture = load_color_texture(statements, files, texture_cache)
+        .map_err(|error| error.prefix_field(&field_of("map_Kd, map_d")))?;
     let normal_texture = match &statements.normal_map {
-        Some(path) => {
-            normal_texture(path, files, texture_cache).map_err(|error| error.prefix_field(&place("normal map")))?
-        }
+        Some(path) => load_normal_texture(path, files, texture_cache)
+            .map_err(|error| error.prefix_field(&field_of("normal map")))?,
         None => None,
     };
     remarks.extend(statements.remarks.iter().cloned());
     if let (Some(path), None) = (&statements.normal_map, normal_texture) {
-        remarks.push(place(&format!("'{path}' is a grey height map, not a normal map, and is not used")));
+        remarks.push(field_of(&format!("'{path}' is a gray height map and is not used: expected a normal map")));
     }
     let alpha = statements.opacity.unwrap_or(1.0);
-    let cut_out = color_texture.is_some_and(|index| texture_cache.list()[index].has_alpha());
+    let has_alpha = color_texture.is_some_and(|index| texture_cache.textures()[index].has_alpha());
     let alpha_mode = match () {
         () if alpha < 1.0 => AlphaMode::Blend,
-        () if cut_out => AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF },
+        () if has_alpha => AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF },
         () => AlphaMode::Opaque,
     };
     let material = Material {
@@ -49,7 +48,7 @@ pub(super) fn material(
         ambient: statements.ambient.unwrap_or(diffuse),
         diffuse,
         specular: statements.specular.unwrap_or([0.0; 3]),
-        // Below 1, the highlight would extend past the light's horizon; files use 0 for "not specified".
+        // An exponent below 1 would extend the highlight beyond the light's horizon. Files use 0 for "not specified".
         shininess: statements.exponent.unwrap_or(1.0).clamp(1.0, 1e6),
         alpha,
         color_texture,
@@ -60,24 +59,28 @@ pub(super) fn material(
     material.validated()
 }
 
-/// The color image with the alpha of `map_d`, as far as they are given.
-fn color_texture(
+/// Loads the image of `map_Kd` with the alpha of `map_d`. A missing `map_Kd` is white; `None` if both are missing.
+fn load_color_texture(
     statements: &MtlMaterial,
     files: &AssetDir,
     texture_cache: &mut TextureCache,
 ) -> Result<Option<usize>> {
     match (&statements.color_map, &statements.alpha_map) {
-        (Some(color), Some(alpha)) if color != alpha => {
-            let key = format!("{color} with the alpha of {alpha}");
+        (Some(color_path), Some(alpha_path)) if color_path != alpha_path => {
+            let texture_name = format!("{color_path} with the alpha of {alpha_path}");
             texture_cache
-                .get_or_insert_with(&key, || with_alpha(&key, Some(&decode(files, color)?), &decode(files, alpha)?))
+                .get_or_insert_with(&texture_name, || {
+                    with_alpha(&texture_name, Some(&decode(files, color_path)?), &decode(files, alpha_path)?)
+                })
                 .map(Some)
         }
-        (None, Some(alpha)) => {
-            let key = format!("white with the alpha of {alpha}");
-            texture_cache.get_or_insert_with(&key, || with_alpha(&key, None, &decode(files, alpha)?)).map(Some)
+        (None, Some(alpha_path)) => {
+            let texture_name = format!("white with the alpha of {alpha_path}");
+            texture_cache
+                .get_or_insert_with(&texture_name, || with_alpha(&texture_name, None, &decode(files, alpha_path)?))
+                .map(Some)
         }
-        (Some(color), _) => texture_cache.load(files, color).map(Some),
+        (Some(color_path), _) => texture_cache.load(files, color_path).map(Some),
         (None, None) => Ok(None),
     }
 }
@@ -86,67 +89,72 @@ fn decode(files: &AssetDir, path: &str) -> Result<Texture> {
     crate::load::texture_cache::decode(files, path)
 }
 
-/// Copies the alpha channel of `alpha`, or its red channel if it is opaque, to the texels of `color` (nearest
-/// neighbor).
+/// Replaces the alpha of `color` by the alpha channel of `alpha`, or by its red channel if `alpha` is opaque. Samples
+/// the nearest texel of `alpha`. A missing `color` is white.
 fn with_alpha(name: &str, color: Option<&Texture>, alpha: &Texture) -> Result<Texture> {
     let (width, height) = color.map_or((alpha.width(), alpha.height()), |image| (image.width(), image.height()));
-    let channel = if alpha.has_alpha() { 3 } else { 0 };
+    let source_channel = if alpha.has_alpha() { 3 } else { 0 };
     let mut rgba = color.map_or_else(|| vec![255; alpha.rgba().len()], |image| image.rgba().to_vec());
     let mut texels = rgba.chunks_exact_mut(4);
     for row in 0..u64::from(height) {
-        let from_row = row * u64::from(alpha.height()) / u64::from(height);
+        let source_row = row * u64::from(alpha.height()) / u64::from(height);
         for column in 0..u64::from(width) {
-            let from = from_row * u64::from(alpha.width()) + column * u64::from(alpha.width()) / u64::from(width);
+            let source_texel =
+                source_row * u64::from(alpha.width()) + column * u64::from(alpha.width()) / u64::from(width);
             if let Some(texel) = texels.next() {
-                texel[3] = alpha.rgba()[4 * from as usize + channel];
+                texel[3] = alpha.rgba()[4 * source_texel as usize + source_channel];
             }
         }
     }
     Texture::new(name, width, height, rgba)
 }
 
-/// Loads a normal map. `bump` may also name a gray height map, which is not supported and yields `None`.
-fn normal_texture(path: &str, files: &AssetDir, texture_cache: &mut TextureCache) -> Result<Option<usize>> {
+/// Loads a normal map. Returns `None` for a gray image, because `bump` may also name a height map, which is not
+/// supported.
+fn load_normal_texture(path: &str, files: &AssetDir, texture_cache: &mut TextureCache) -> Result<Option<usize>> {
     let index = texture_cache.load(files, path)?;
-    let gray =
-        texture_cache.list()[index].rgba().chunks_exact(4).all(|texel| texel[0] == texel[1] && texel[1] == texel[2]);
-    Ok((!gray).then_some(index))
+    let is_gray = texture_cache.textures()[index]
+        .rgba()
+        .chunks_exact(4)
+        .all(|texel| texel[0] == texel[1] && texel[1] == texel[2]);
+    Ok((!is_gray).then_some(index))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn png(folder: &std::path::Path, name: &str, side: u32, texel: [u8; 4]) {
+    fn write_png(folder: &std::path::Path, name: &str, side: u32, texel: [u8; 4]) {
         let image = image::RgbaImage::from_pixel(side, side, image::Rgba(texel));
-        image.save(folder.join(name)).expect("written");
+        image.save(folder.join(name)).expect("a writable file");
     }
 
     fn read(text: &str, folder: &std::path::Path) -> Result<(Material, TextureCache, Vec<String>)> {
-        let all = super::super::mtl::parse(text.as_bytes())?;
+        let statements = super::super::mtl::parse(text.as_bytes())?;
         let (mut texture_cache, mut remarks) = (TextureCache::default(), Vec::new());
-        let material = material("m", &all["m"], &AssetDir::unrestricted(folder), &mut texture_cache, &mut remarks)?;
+        let files = AssetDir::unrestricted(folder);
+        let material = create_material("m", &statements["m"], &files, &mut texture_cache, &mut remarks)?;
         Ok((material, texture_cache, remarks))
     }
 
     #[test]
-    fn missing_colours_have_stated_values_and_black_stays_black() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let (plain, ..) = read("newmtl m\nNs 0\n", folder.path()).expect("good");
-        assert_eq!((plain.diffuse, plain.ambient, plain.specular), ([1.0; 3], [1.0; 3], [0.0; 3]));
-        assert_eq!((plain.shininess, plain.alpha_mode), (1.0, AlphaMode::Opaque));
-        let (black, ..) = read("newmtl m\nKd 0 0 0\n", folder.path()).expect("good");
+    fn missing_colors_have_defaults_and_black_remains_black() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let (default, ..) = read("newmtl m\nNs 0\n", folder.path()).expect("a valid material");
+        assert_eq!((default.diffuse, default.ambient, default.specular), ([1.0; 3], [1.0; 3], [0.0; 3]));
+        assert_eq!((default.shininess, default.alpha_mode), (1.0, AlphaMode::Opaque));
+        let (black, ..) = read("newmtl m\nKd 0 0 0\n", folder.path()).expect("a valid material");
         assert_eq!((black.diffuse, black.ambient), ([0.0; 3], [0.0; 3]));
     }
 
     #[test]
-    fn alpha_of_an_image_masks_and_opacity_blends() {
-        let folder = tempfile::tempdir().expect("a folder");
-        png(folder.path(), "leaf.png", 2, [9, 8, 7, 0]);
-        png(folder.path(), "solid.png", 2, [9, 8, 7, 255]);
-        png(folder.path(), "grey.png", 3, [100, 100, 100, 255]);
+    fn image_alpha_selects_mask_and_opacity_selects_blend() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        write_png(folder.path(), "leaf.png", 2, [9, 8, 7, 0]);
+        write_png(folder.path(), "solid.png", 2, [9, 8, 7, 255]);
+        write_png(folder.path(), "grey.png", 3, [100, 100, 100, 255]);
         let mask = AlphaMode::Mask { cutoff: 0.5 };
-        for (text, mode, alpha) in [
+        for (text, alpha_mode, alpha) in [
             ("map_Kd leaf.png\nmap_d leaf.png", mask, Some(0)),
             ("map_Kd leaf.png", mask, Some(0)),
             ("map_Kd solid.png", AlphaMode::Opaque, Some(255)),
@@ -156,36 +164,36 @@ mod tests {
             ("map_Kd leaf.png\nTr 0.5", AlphaMode::Blend, Some(0)),
         ] {
             let (material, texture_cache, _) = read(&format!("newmtl m\n{text}\n"), folder.path()).expect(text);
-            assert_eq!(material.alpha_mode, mode, "{text}");
-            let texel = material.color_texture.map(|index| texture_cache.list()[index].rgba()[7]);
+            assert_eq!(material.alpha_mode, alpha_mode, "{text}");
+            let texel = material.color_texture.map(|index| texture_cache.textures()[index].rgba()[7]);
             assert_eq!(texel, alpha, "{text}");
         }
     }
 
     #[test]
-    fn normal_maps_are_taken_and_grey_height_maps_are_remarked() {
-        let folder = tempfile::tempdir().expect("a folder");
-        png(folder.path(), "n.png", 1, [128, 128, 255, 255]);
-        png(folder.path(), "h.png", 1, [128, 128, 128, 255]);
-        assert_eq!(read("newmtl m\nnorm n.png\n", folder.path()).expect("good").0.normal_texture, Some(0));
-        let (material, _, remarks) = read("newmtl m\nbump h.png\n", folder.path()).expect("good");
+    fn normal_maps_are_loaded_and_height_maps_are_skipped() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        write_png(folder.path(), "n.png", 1, [128, 128, 255, 255]);
+        write_png(folder.path(), "h.png", 1, [128, 128, 128, 255]);
+        assert_eq!(read("newmtl m\nnorm n.png\n", folder.path()).expect("a valid material").0.normal_texture, Some(0));
+        let (material, _, remarks) = read("newmtl m\nbump h.png\n", folder.path()).expect("a valid material");
         assert_eq!(material.normal_texture, None);
-        assert!(remarks[0].contains("'h.png' is a grey height map"), "{remarks:?}");
+        assert!(remarks[0].contains("'h.png' is a gray height map"), "{remarks:?}");
     }
 
     #[test]
-    fn a_missing_or_broken_image_and_an_alpha_of_seven_are_refused_by_material() {
-        let folder = tempfile::tempdir().expect("a folder");
-        std::fs::write(folder.path().join("broken.png"), b"\x89PNG\r\n").expect("written");
+    fn invalid_images_and_numbers_are_rejected_with_material() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        std::fs::write(folder.path().join("broken.png"), b"\x89PNG\r\n").expect("a writable file");
         for (statement, start) in [
-            ("map_Kd no.png", "material 'm': map_Kd, map_d: file 'no.png': expected a file that is there"),
+            ("map_Kd no.png", "material 'm': map_Kd, map_d: file 'no.png': expected an existing file"),
             ("map_Kd broken.png", "material 'm': map_Kd, map_d: texture 'broken.png': expected a PNG or JPEG image"),
-            ("norm no.png", "material 'm': normal map: file 'no.png': expected a file that is there"),
+            ("norm no.png", "material 'm': normal map: file 'no.png': expected an existing file"),
             ("d 7", "material 'm': alpha: expected 0 to 1, got 7"),
             ("Ka 0 0 0\nKd 1 1 2", "material 'm': diffuse: expected 0 to 1, got 2"),
         ] {
-            let refusal = read(&format!("newmtl m\n{statement}\n"), folder.path()).expect_err(statement).to_string();
-            assert!(refusal.starts_with(start), "{refusal}");
+            let message = read(&format!("newmtl m\n{statement}\n"), folder.path()).expect_err(statement).to_string();
+            assert!(message.starts_with(start), "{message}");
         }
     }
 }

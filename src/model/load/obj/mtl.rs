@@ -4,10 +4,10 @@
 
 use std::collections::BTreeMap;
 
-use super::parse::{number, rest_of, words};
+use super::parse::{parse_number, rest_of, words};
 use crate::error::{Result, invalid};
 
-/// The statements of one `newmtl`; `None` for missing ones.
+/// The statements of one `newmtl`. A missing statement is `None`.
 #[derive(Debug, Default, Clone, PartialEq)]
 pub(super) struct MtlMaterial {
     pub(super) ambient: Option<[f32; 3]>,
@@ -24,50 +24,51 @@ pub(super) struct MtlMaterial {
     pub(super) remarks: Vec<String>,
 }
 
-/// Parses a whole file. Of several definitions of a name, the last is used.
+/// Parses a file. If a name is defined several times, the last definition is used.
 ///
 /// # Errors
 /// `Invalid` with the line and the statement.
 pub(super) fn parse(bytes: &[u8]) -> Result<BTreeMap<String, MtlMaterial>> {
-    let mut all = BTreeMap::new();
+    let mut materials = BTreeMap::new();
     let mut current: Option<(String, MtlMaterial)> = None;
     for (index, line) in bytes.split(|byte| *byte == b'\n').enumerate() {
         let Some(key) = words(line).next() else { continue };
         if key == b"newmtl" {
-            all.extend(current.replace((rest_of(line), MtlMaterial::default())));
+            materials.extend(current.replace((rest_of(line), MtlMaterial::default())));
         } else if let Some((name, statements)) = &mut current {
-            let place = || format!("line {}: {}", index + 1, String::from_utf8_lossy(key));
-            statements.read(key, line, name).map_err(|error| error.prefix_field(&place()))?;
+            let location = || format!("line {}: {}", index + 1, String::from_utf8_lossy(key));
+            statements.parse_statement(key, line, name).map_err(|error| error.prefix_field(&location()))?;
         }
     }
-    all.extend(current);
-    Ok(all)
+    materials.extend(current);
+    Ok(materials)
 }
 
 impl MtlMaterial {
-    fn read(&mut self, key: &[u8], line: &[u8], name: &str) -> Result<()> {
+    fn parse_statement(&mut self, key: &[u8], line: &[u8], name: &str) -> Result<()> {
         match key.to_ascii_lowercase().as_slice() {
-            b"ka" => self.ambient = Some(color(line)?),
-            b"kd" => self.diffuse = Some(color(line)?),
-            b"ks" => self.specular = Some(color(line)?),
-            b"ns" => self.exponent = Some(last_number(line)?),
-            b"d" => self.opacity = Some(last_number(line)?),
-            b"tr" => self.opacity = Some(1.0 - last_number(line)?),
-            b"map_kd" => self.color_map = self.image(line, name)?,
-            b"map_d" => self.alpha_map = self.image(line, name)?,
-            b"norm" | b"map_bump" | b"bump" => self.normal_map = self.image(line, name)?,
-            // Ambient maps repeat the color map. Illumination models and the other statements have no equivalent here.
+            b"ka" => self.ambient = Some(parse_color(line)?),
+            b"kd" => self.diffuse = Some(parse_color(line)?),
+            b"ks" => self.specular = Some(parse_color(line)?),
+            b"ns" => self.exponent = Some(parse_last_number(line)?),
+            b"d" => self.opacity = Some(parse_last_number(line)?),
+            b"tr" => self.opacity = Some(1.0 - parse_last_number(line)?),
+            b"map_kd" => self.color_map = self.parse_image_path(line, name)?,
+            b"map_d" => self.alpha_map = self.parse_image_path(line, name)?,
+            b"norm" | b"map_bump" | b"bump" => self.normal_map = self.parse_image_path(line, name)?,
+            // Ambient maps repeat the color map. Illumination models and all other statements have no equivalent in
+            // `Material`.
             _ => {}
         }
         Ok(())
     }
 
     /// The path after the options of an image statement.
-    fn image(&mut self, line: &[u8], name: &str) -> Result<Option<String>> {
+    fn parse_image_path(&mut self, line: &[u8], name: &str) -> Result<Option<String>> {
         let text = rest_of(line);
-        let mut rest = text.as_str();
-        while let Some((option, after)) = rest.strip_prefix('-').map(next_word) {
-            let most = match option {
+        let mut remainder = text.as_str();
+        while let Some((option, next)) = remainder.strip_prefix('-').map(next_word) {
+            let max_arguments = match option {
                 "s" | "o" | "t" => 3,
                 "mm" => 2,
                 "blendu" | "blendv" | "cc" | "clamp" | "bm" | "boost" | "imfchan" | "texres" | "type" => 1,
@@ -77,41 +78,42 @@ impl MtlMaterial {
             if !self.remarks.contains(&remark) {
                 self.remarks.push(remark);
             }
-            rest = after;
-            for argument in 0..most {
-                let (word, after) = next_word(rest);
+            remainder = next;
+            for argument in 0..max_arguments {
+                let (word, next) = next_word(remainder);
                 // -s, -o and -t have one to three arguments.
                 if argument > 0 && word.parse::<f32>().is_err() {
                     break;
                 }
-                rest = after;
+                remainder = next;
             }
         }
-        if rest.is_empty() {
+        if remainder.is_empty() {
             return Err(invalid("path", "the name of an image file", "none"));
         }
-        Ok(Some(rest.replace('\\', "/")))
+        Ok(Some(remainder.replace('\\', "/")))
     }
 }
 
+/// Splits off the first word.
 fn next_word(text: &str) -> (&str, &str) {
     text.split_once(|letter: char| letter.is_ascii_whitespace())
         .map_or((text, ""), |(word, rest)| (word, rest.trim_start()))
 }
 
-/// Three numbers, or one for all three channels.
-fn color(line: &[u8]) -> Result<[f32; 3]> {
-    let found: Option<Vec<f32>> = words(line).skip(1).map(number).collect();
-    match found.as_deref() {
+/// Parses one number per channel, or one number for all channels.
+fn parse_color(line: &[u8]) -> Result<[f32; 3]> {
+    let numbers: Option<Vec<f32>> = words(line).skip(1).map(parse_number).collect();
+    match numbers.as_deref() {
         Some([gray]) => Ok([*gray; 3]),
         Some([red, green, blue]) => Ok([*red, *green, *blue]),
         _ => Err(invalid("colour", "one or three finite numbers", rest_of(line))),
     }
 }
 
-/// The last word as a number, which also handles `d -halo 0.5`.
-fn last_number(line: &[u8]) -> Result<f32> {
-    let value = words(line).skip(1).last().and_then(number);
+/// Parses the last word as a number, because options may precede it as in `d -halo 0.5`.
+fn parse_last_number(line: &[u8]) -> Result<f32> {
+    let value = words(line).skip(1).last().and_then(parse_number);
     value.ok_or_else(|| invalid("value", "a finite number", rest_of(line)))
 }
 
@@ -120,23 +122,23 @@ mod tests {
     use super::*;
 
     #[test]
-    fn statements_are_read_in_any_case_and_with_image_options() {
+    fn parse_ignores_letter_case_and_image_options() {
         let text = b"# head\nKd 1 0 0\nnewmtl old bark\nKa 0.1 0.2 0.3\nKd 0.5\nNs 7\r\nTr 0.25\n\
             map_Kd -s 2 2 -clamp on my bark.png\nmap_Bump -bm 0.5 maps\\n.png\nnewmtl black\nKd 0 0 0\nd -halo 0.5\n";
-        let all = parse(text).expect("good");
-        let bark = &all["old bark"];
+        let materials = parse(text).expect("a valid file");
+        let bark = &materials["old bark"];
         assert_eq!(bark.ambient, Some([0.1, 0.2, 0.3]));
         assert_eq!(bark.diffuse, Some([0.5; 3]));
         assert_eq!((bark.exponent, bark.opacity), (Some(7.0), Some(0.75)));
         assert_eq!(bark.color_map.as_deref(), Some("my bark.png"));
         assert_eq!(bark.normal_map.as_deref(), Some("maps/n.png"));
         assert_eq!(bark.remarks.len(), 3);
-        assert_eq!((all["black"].diffuse, all["black"].opacity), (Some([0.0; 3]), Some(0.5)));
+        assert_eq!((materials["black"].diffuse, materials["black"].opacity), (Some([0.0; 3]), Some(0.5)));
     }
 
     #[test]
-    fn bad_statements_are_refused_with_their_line() {
-        for (statement, refusal) in [
+    fn invalid_statements_are_rejected_with_their_line() {
+        for (statement, message) in [
             ("Kd 1 2", "line 2: Kd: colour: expected one or three finite numbers, got 1 2"),
             ("Kd spectral a.rfl", "line 2: Kd: colour: expected one or three finite numbers, got spectral a.rfl"),
             ("Ns", "line 2: Ns: value: expected a finite number, got "),
@@ -146,7 +148,7 @@ mod tests {
             ("map_Kd -zoom a.png", "line 2: map_Kd: option: expected an image option of MTL, got -zoom"),
         ] {
             let text = format!("newmtl a\n{statement}\n");
-            assert_eq!(parse(text.as_bytes()).expect_err(statement).to_string(), refusal);
+            assert_eq!(parse(text.as_bytes()).expect_err(statement).to_string(), message);
         }
         assert!(parse(b"\xff\nnewmtl \xff\nmap_Kd \xff").is_ok());
     }

@@ -1,13 +1,13 @@
 //! Parser of OBJ files: lists and polygons with validated indices from 0.
 //!
 //! The `tobj` crate is not used because it renumbers vertices by first use. The rows of U follow the `v` lines of the
-//! file: after renumbering they would be wrong without any error, as their number would still match.
+//! file. Renumbered vertices would get wrong rows, and no check would notice because the number of rows still matches.
 
 use std::collections::{BTreeMap, HashMap};
 
 use crate::error::{Error, Result, invalid};
 
-/// Marks a missing texture coordinate or normal of a corner.
+/// The index of a missing texture coordinate or normal of a corner.
 pub(in crate::load) const NO_INDEX: u32 = u32::MAX;
 
 /// One corner of a polygon, as indices into the lists of the file.
@@ -21,8 +21,8 @@ pub(in crate::load) struct Corner {
 /// One polygon: its corners, its material and its line in the file.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::load) struct Face {
-    first: usize,
-    count: usize,
+    first_corner: usize,
+    corner_count: usize,
     /// Index into [`ObjFile::materials`].
     pub(in crate::load) material: usize,
     line: usize,
@@ -51,21 +51,21 @@ impl ObjFile {
     /// `Invalid` with the line and the statement.
     pub(in crate::load) fn parse(bytes: &[u8]) -> Result<Self> {
         let mut parser = Parser::default();
-        let mut joined = Vec::new();
+        let mut joined_line = Vec::new();
         for (index, line) in bytes.split(|byte| *byte == b'\n').enumerate() {
             let line = line.strip_suffix(b"\r").unwrap_or(line);
             // A backslash at the end of a line continues it on the next one.
-            if let Some(head) = line.strip_suffix(b"\\") {
-                joined.extend_from_slice(head);
-                joined.push(b' ');
+            if let Some(line_start) = line.strip_suffix(b"\\") {
+                joined_line.extend_from_slice(line_start);
+                joined_line.push(b' ');
                 continue;
             }
-            let number = index + 1;
-            if joined.is_empty() {
-                parser.line(line, number)?;
+            let line_number = index + 1;
+            if joined_line.is_empty() {
+                parser.parse_line(line, line_number)?;
             } else {
-                joined.extend_from_slice(line);
-                parser.line(&std::mem::take(&mut joined), number)?;
+                joined_line.extend_from_slice(line);
+                parser.parse_line(&std::mem::take(&mut joined_line), line_number)?;
             }
         }
         parser.finish()
@@ -74,21 +74,21 @@ impl ObjFile {
     /// The corners of a polygon.
     pub(in crate::load) fn corners_of(&self, face: usize) -> &[Corner] {
         let face = &self.faces[face];
-        &self.corners[face.first..][..face.count]
+        &self.corners[face.first_corner..][..face.corner_count]
     }
 
-    fn check(&self) -> Result<()> {
+    fn check_faces(&self) -> Result<()> {
         if self.faces.is_empty() {
             return Err(invalid("f", "at least one face", 0));
         }
         for (index, face) in self.faces.iter().enumerate() {
             for corner in self.corners_of(index) {
-                below(face.line, "v", corner.v, self.positions.len())?;
+                check_index(face.line, "v", corner.v, self.positions.len())?;
                 if corner.vt != NO_INDEX {
-                    below(face.line, "vt", corner.vt, self.uvs.len())?;
+                    check_index(face.line, "vt", corner.vt, self.uvs.len())?;
                 }
                 if corner.vn != NO_INDEX {
-                    below(face.line, "vn", corner.vn, self.normals.len())?;
+                    check_index(face.line, "vn", corner.vn, self.normals.len())?;
                 }
             }
         }
@@ -96,7 +96,7 @@ impl ObjFile {
     }
 }
 
-fn below(line: usize, list: &str, index: u32, count: usize) -> Result<()> {
+fn check_index(line: usize, list: &str, index: u32, count: usize) -> Result<()> {
     if (index as usize) < count {
         return Ok(());
     }
@@ -106,80 +106,83 @@ fn below(line: usize, list: &str, index: u32, count: usize) -> Result<()> {
 #[derive(Default)]
 struct Parser {
     obj: ObjFile,
-    /// The name of the last `usemtl`, and its index in [`ObjFile::materials`] once a face uses it.
+    /// The name of the last `usemtl`.
     current_material: String,
-    material: Option<usize>,
-    by_name: HashMap<String, usize>,
-    ignored: BTreeMap<String, usize>,
+    /// The index of `current_material` in [`ObjFile::materials`]; `None` until a face uses it.
+    current_index: Option<usize>,
+    /// Indices in [`ObjFile::materials`] by name.
+    material_indices: HashMap<String, usize>,
+    /// Number of statements per unsupported key.
+    unused_statements: BTreeMap<String, usize>,
 }
 
 impl Parser {
-    fn line(&mut self, line: &[u8], number: usize) -> Result<()> {
+    fn parse_line(&mut self, line: &[u8], line_number: usize) -> Result<()> {
         let mut words = words(line);
         let Some(key) = words.next() else { return Ok(()) };
         match key {
-            b"v" => self.obj.positions.push(numbers(words, "v", number)?),
-            b"vn" => self.obj.normals.push(numbers(words, "vn", number)?),
+            b"v" => self.obj.positions.push(parse_vector(words, "v", line_number)?),
+            b"vn" => self.obj.normals.push(parse_vector(words, "vn", line_number)?),
             b"vt" => {
-                let [u, v] = texture_coordinates(words, number)?;
-                // The file measures v from the bottom of the image, meshes from the top.
+                let [u, v] = parse_texture_coordinates(words, line_number)?;
+                // In the file, v = 0 is the bottom of the image; in meshes, it is the top.
                 self.obj.uvs.push([u, 1.0 - v]);
             }
-            b"f" => self.face(words, number)?,
-            b"usemtl" => (self.current_material, self.material) = (rest_of(line), None),
+            b"f" => self.add_face(words, line_number)?,
+            b"usemtl" => (self.current_material, self.current_index) = (rest_of(line), None),
             b"mtllib" => self.obj.libraries.push(rest_of(line)),
             // Groups and smoothing groups do not affect geometry: normals come from the file or are computed.
             b"o" | b"g" | b"s" => {}
-            other => *self.ignored.entry(String::from_utf8_lossy(other).into_owned()).or_default() += 1,
+            other => *self.unused_statements.entry(String::from_utf8_lossy(other).into_owned()).or_default() += 1,
         }
         Ok(())
     }
 
-    /// The index of the current material, assigned at the first face that uses it.
-    fn number(&mut self) -> usize {
-        let list = &mut self.obj.materials;
-        let made = || {
-            list.push(self.current_material.clone());
-            list.len() - 1
-        };
-        match self.material {
-            Some(known) => known,
-            None => *self.material.insert(*self.by_name.entry(self.current_material.clone()).or_insert_with(made)),
+    /// The index of the current material. The first face with a material adds it to the list.
+    fn current_material_index(&mut self) -> usize {
+        if let Some(index) = self.current_index {
+            return index;
         }
+        let materials = &mut self.obj.materials;
+        let index = *self.material_indices.entry(self.current_material.clone()).or_insert_with(|| {
+            materials.push(self.current_material.clone());
+            materials.len() - 1
+        });
+        *self.current_index.insert(index)
     }
 
-    fn face<'a>(&mut self, words: impl Iterator<Item = &'a [u8]>, line: usize) -> Result<()> {
-        let first = self.obj.corners.len();
+    fn add_face<'a>(&mut self, words: impl Iterator<Item = &'a [u8]>, line: usize) -> Result<()> {
+        let first_corner = self.obj.corners.len();
         for word in words {
-            let mut parts = word.split(|byte| *byte == b'/');
-            let mut index = |list: &str, count: usize| match parts.next() {
+            let mut fields = word.split(|byte| *byte == b'/');
+            let mut index = |list: &str, count: usize| match fields.next() {
                 None | Some(b"") => Ok(NO_INDEX),
                 Some(digits) => {
-                    resolve(digits, count).map_err(|error| error.prefix_field(&format!("line {line}: f: {list}")))
+                    resolve_index(digits, count).map_err(|error| error.prefix_field(&format!("line {line}: f: {list}")))
                 }
             };
             let v = index("v", self.obj.positions.len())?;
             let vt = index("vt", self.obj.uvs.len())?;
             let vn = index("vn", self.obj.normals.len())?;
-            if v == NO_INDEX || parts.next().is_some() {
+            if v == NO_INDEX || fields.next().is_some() {
                 let given = String::from_utf8_lossy(word).into_owned();
                 return Err(invalid(format!("line {line}: f"), "corners of the form v, v/vt, v//vn or v/vt/vn", given));
             }
             self.obj.corners.push(Corner { v, vt, vn });
         }
-        let count = self.obj.corners.len() - first;
-        if count < 3 {
-            return Err(invalid(format!("line {line}: f"), "at least 3 corners", count));
+        let corner_count = self.obj.corners.len() - first_corner;
+        if corner_count < 3 {
+            return Err(invalid(format!("line {line}: f"), "at least 3 corners", corner_count));
         }
-        let material = self.number();
-        self.obj.faces.push(Face { first, count, material, line });
+        let material = self.current_material_index();
+        self.obj.faces.push(Face { first_corner, corner_count, material, line });
         Ok(())
     }
 
     fn finish(mut self) -> Result<ObjFile> {
-        self.obj.check()?;
+        self.obj.check_faces()?;
         let remark = |(key, count): (&String, &usize)| format!("{count} statements '{key}' are not used");
-        self.obj.remarks.extend(self.ignored.iter().take(16).map(remark));
+        self.obj.remarks.extend(self.unused_statements.iter().take(16).map(remark));
         Ok(self.obj)
     }
 }
@@ -193,45 +196,50 @@ pub(super) fn words(line: &[u8]) -> impl Iterator<Item = &[u8]> {
 /// The text after the first word: a name that may contain spaces.
 pub(super) fn rest_of(line: &[u8]) -> String {
     let text = String::from_utf8_lossy(line);
-    text.trim().split_once(|letter: char| letter.is_ascii_whitespace()).map_or("", |(_, rest)| rest.trim()).to_owned()
+    text.trim()
+        .split_once(|character: char| character.is_ascii_whitespace())
+        .map_or("", |(_, remainder)| remainder.trim())
+        .to_owned()
 }
 
 /// Parses a finite number.
-pub(super) fn number(word: &[u8]) -> Option<f32> {
+pub(super) fn parse_number(word: &[u8]) -> Option<f32> {
     std::str::from_utf8(word).ok()?.parse().ok().filter(|number: &f32| number.is_finite())
 }
 
-fn numbers<'a>(mut words: impl Iterator<Item = &'a [u8]>, key: &str, line: usize) -> Result<[f32; 3]> {
-    let mut found = [0.0; 3];
-    for slot in &mut found {
+fn parse_vector<'a>(mut words: impl Iterator<Item = &'a [u8]>, key: &str, line: usize) -> Result<[f32; 3]> {
+    let mut numbers = [0.0; 3];
+    for number_slot in &mut numbers {
         let word = words.next();
-        *slot = word.and_then(number).ok_or_else(|| unreadable(key, "three finite numbers", word, line))?;
+        *number_slot =
+            word.and_then(parse_number).ok_or_else(|| number_error(key, "three finite numbers", word, line))?;
     }
-    Ok(found)
+    Ok(numbers)
 }
 
-fn texture_coordinates<'a>(mut words: impl Iterator<Item = &'a [u8]>, line: usize) -> Result<[f32; 2]> {
+fn parse_texture_coordinates<'a>(mut words: impl Iterator<Item = &'a [u8]>, line: usize) -> Result<[f32; 2]> {
     let (u, v) = (words.next(), words.next());
-    let read = |word: Option<&[u8]>| {
-        word.and_then(number).ok_or_else(|| unreadable("vt", "one to three finite numbers", word, line))
+    let parse = |word: Option<&[u8]>| {
+        word.and_then(parse_number).ok_or_else(|| number_error("vt", "one to three finite numbers", word, line))
     };
-    Ok([read(u)?, if v.is_some() { read(v)? } else { 0.0 }])
+    Ok([parse(u)?, if v.is_some() { parse(v)? } else { 0.0 }])
 }
 
-fn unreadable(key: &str, expected: &str, word: Option<&[u8]>, line: usize) -> Error {
+fn number_error(key: &str, expected: &str, word: Option<&[u8]>, line: usize) -> Error {
     let given = word.map_or("the end of the line".into(), String::from_utf8_lossy);
     invalid(format!("line {line}: {key}"), expected, given)
 }
 
-/// Converts an index that counts from 1, or backwards from the end if negative, to an index from 0.
-fn resolve(digits: &[u8], count: usize) -> Result<u32> {
+/// Converts an index of the file to an index from 0. A positive index counts from 1, a negative one backwards from the
+/// last of the `count` elements so far.
+fn resolve_index(digits: &[u8], count: usize) -> Result<u32> {
     let text = String::from_utf8_lossy(digits);
-    let refuse = |expected: String| invalid("index", expected, &text);
-    let index: i64 = text.parse().map_err(|_| refuse("a whole number".into()))?;
+    let invalid_index = |expected: String| invalid("index", expected, &text);
+    let index: i64 = text.parse().map_err(|_| invalid_index("a whole number".into()))?;
     let from_zero =
         if index < 0 { i64::try_from(count).ok().and_then(|count| count.checked_add(index)) } else { Some(index - 1) };
-    let in_range = from_zero.and_then(|index| u32::try_from(index).ok()).filter(|index| *index != NO_INDEX);
-    in_range.ok_or_else(|| refuse(format!("1 to {count} or -{count} to -1")))
+    let valid_index = from_zero.and_then(|index| u32::try_from(index).ok()).filter(|index| *index != NO_INDEX);
+    valid_index.ok_or_else(|| invalid_index(format!("1 to {count} or -{count} to -1")))
 }
 
 #[cfg(test)]
@@ -241,20 +249,20 @@ mod tests {
     const TRIANGLE: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\n";
 
     #[test]
-    fn negative_indices_count_back_from_the_last_line_so_far() {
+    fn negative_indices_count_back_from_the_last_element() {
         let text = format!("{TRIANGLE}vt 0.25 0.25\nvn 0 0 1\nf -3/-1/-1 -2/-1/-1 -1/-1/-1\nv 9 9 9\n");
-        let obj = ObjFile::parse(text.as_bytes()).expect("good");
-        let found: Vec<_> = obj.corners_of(0).iter().map(|corner| (corner.v, corner.vt, corner.vn)).collect();
-        assert_eq!(found, [(0, 0, 0), (1, 0, 0), (2, 0, 0)]);
-        assert_eq!(obj.uvs, [[0.25, 0.75]], "v is flipped");
-        assert_eq!(obj.positions.len(), 4, "an unreferenced vertex stays");
+        let obj = ObjFile::parse(text.as_bytes()).expect("a valid file");
+        let indices: Vec<_> = obj.corners_of(0).iter().map(|corner| (corner.v, corner.vt, corner.vn)).collect();
+        assert_eq!(indices, [(0, 0, 0), (1, 0, 0), (2, 0, 0)]);
+        assert_eq!(obj.uvs, [[0.25, 0.75]], "expected a flipped v");
+        assert_eq!(obj.positions.len(), 4, "expected the unreferenced vertex");
     }
 
     #[test]
-    fn comments_line_ends_continuations_and_names_with_blanks_are_read() {
+    fn comments_continuations_and_names_with_spaces_are_parsed() {
         let text = "# head\r\nmtllib my file.mtl\r\nv 0 0 0 # first\r\nv 1 \\\r\n 0 0\r\nv 0 1 0 1 0 0\r\n\
                     usemtl dark bark\r\nf 1 2 \\\n 3\r\nl 1 2\r\nusemtl none\nusemtl light\nf 3 2 1 # back\n";
-        let obj = ObjFile::parse(text.as_bytes()).expect("good");
+        let obj = ObjFile::parse(text.as_bytes()).expect("a valid file");
         assert_eq!(obj.libraries, ["my file.mtl"]);
         assert_eq!(obj.materials, ["dark bark", "light"]);
         assert_eq!(obj.positions, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
@@ -263,8 +271,8 @@ mod tests {
     }
 
     #[test]
-    fn bad_statements_are_refused_with_their_line() {
-        for (statement, refusal) in [
+    fn invalid_statements_are_rejected_with_their_line() {
+        for (statement, message) in [
             ("f 1 2 4", "line 4: f: index of v: expected 1 to 3, got 4"),
             ("f 1 2 0", "line 4: f: v: index: expected 1 to 3 or -3 to -1, got 0"),
             ("f 1 2 -4", "line 4: f: v: index: expected 1 to 3 or -3 to -1, got -4"),
@@ -284,12 +292,12 @@ mod tests {
             ("", "f: expected at least one face, got 0"),
         ] {
             let text = format!("{TRIANGLE}{statement}\n");
-            assert_eq!(ObjFile::parse(text.as_bytes()).expect_err(statement).to_string(), refusal);
+            assert_eq!(ObjFile::parse(text.as_bytes()).expect_err(statement).to_string(), message);
         }
     }
 
     #[test]
-    fn no_bytes_make_the_parser_panic() {
+    fn parser_rejects_malformed_bytes_without_panic() {
         for text in [
             &b"\xff\xfe\0\0"[..],
             b"f",
