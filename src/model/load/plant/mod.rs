@@ -1,6 +1,6 @@
-//! Loader of plants (`STEM.obj`, `STEM.structure.json`, `STEM_object_id.dat`): each shoot and each leaf becomes a rigid
-//! domain. Lengths are in meters, Z is up. Every domain can be moved independently; a `scene.toml` with
-//! `follows = "leaf"` keeps leaves attached to their shoots.
+//! Loader of plants (`STEM.obj`, `STEM.structure.json`, `STEM_object_id.dat`). Each shoot and each leaf becomes a rigid
+//! domain. Lengths are in meters, Z is up. Steps can move every domain independently. A `scene.toml` with
+//! `follows = "leaf"` makes leaves move with their shoots instead.
 
 mod organs;
 mod structure;
@@ -18,94 +18,97 @@ use crate::scene::{SceneParts, UpAxis};
 
 /// Reads the plant `stem` in the folder `files`.
 ///
-/// The frame of a domain has the axes of the scene. Its origin is the point from which the member grows: the first
-/// point of a shoot, the start of a leaf's petiole, or the base of a leaf whose petiole belongs to another leaf.
+/// The frame of a domain has the axes of the scene. Its origin is the base of the organ: the first point of a shoot, the
+/// start of a leaf's petiole, or the base of a leaf whose petiole belongs to another leaf.
 ///
 /// # Errors
 /// `Invalid` with the file, and the expected and given value.
 pub(super) fn read(files: &AssetDir, stem: &str) -> Result<SceneParts> {
-    let (json, ids) = (format!("{stem}.structure.json"), format!("{stem}_object_id.dat"));
-    let in_file = |name: &str| format!("file '{name}'");
+    let (structure_file, ids_file) = (format!("{stem}.structure.json"), format!("{stem}_object_id.dat"));
+    let file_field = |name: &str| format!("file '{name}'");
     let obj = obj::parse_file(files, &format!("{stem}.obj"))?;
-    let structure = PlantStructure::parse(&files.read(&json, MAX_TEXT_BYTES)?)
-        .map_err(|error| error.prefix_field(&in_file(&json)))?;
-    let objects = parse_object_ids(&files.read(&ids, MAX_TEXT_BYTES)?, obj.faces.len());
-    let objects = objects.map_err(|error| error.prefix_field(&in_file(&ids)))?;
-    let assign_organs =
-        assign_organs(&structure, &points_of(&obj, &objects)).map_err(|error| error.prefix_field(&in_file(&json)))?;
+    let structure = PlantStructure::parse(&files.read(&structure_file, MAX_TEXT_BYTES)?)
+        .map_err(|error| error.prefix_field(&file_field(&structure_file)))?;
+    let object_ids = parse_object_ids(&files.read(&ids_file, MAX_TEXT_BYTES)?, obj.faces.len());
+    let object_ids = object_ids.map_err(|error| error.prefix_field(&file_field(&ids_file)))?;
+    let organs = assign_organs(&structure, &positions_by_object(&obj, &object_ids))
+        .map_err(|error| error.prefix_field(&file_field(&structure_file)))?;
     let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem) };
     obj::add_materials(&obj, files, &mut parts)?;
     let mut faces: HashMap<Organ, Vec<usize>> = HashMap::new();
-    for (face, object) in objects.iter().enumerate() {
-        // Always `Some`: `assign_organs` received every object that has faces.
-        if let Some(member) = assign_organs.get(object) {
-            faces.entry(*member).or_default().push(face);
+    for (face, object_id) in object_ids.iter().enumerate() {
+        // Always `Some`, because `assign_organs` received every object that has faces.
+        if let Some(organ) = organs.get(object_id) {
+            faces.entry(*organ).or_default().push(face);
         }
     }
-    PlantBuilder { obj: &obj, structure: &structure, faces, domain_of: HashMap::new(), parts }.build()
+    PlantBuilder { obj: &obj, structure: &structure, faces, organ_domains: HashMap::new(), parts }.build()
 }
 
-/// Positions of the corners of each object.
-fn points_of(obj: &ObjFile, objects: &[u64]) -> BTreeMap<u64, Vec<[f32; 3]>> {
-    let mut points: BTreeMap<u64, Vec<[f32; 3]>> = BTreeMap::new();
-    for (face, object) in objects.iter().enumerate() {
+/// The positions of the corners of each object.
+fn positions_by_object(obj: &ObjFile, object_ids: &[u64]) -> BTreeMap<u64, Vec<[f32; 3]>> {
+    let mut positions: BTreeMap<u64, Vec<[f32; 3]>> = BTreeMap::new();
+    for (face, object_id) in object_ids.iter().enumerate() {
         let corners = obj.corners_of(face).iter().map(|corner| obj.positions[corner.v as usize]);
-        points.entry(*object).or_default().extend(corners);
+        positions.entry(*object_id).or_default().extend(corners);
     }
-    points
+    positions
 }
 
 struct PlantBuilder<'a> {
     obj: &'a ObjFile,
     structure: &'a PlantStructure,
     faces: HashMap<Organ, Vec<usize>>,
-    domain_of: HashMap<Organ, (usize, [f64; 3])>,
+    /// Index and origin of the domain of each organ so far.
+    organ_domains: HashMap<Organ, (usize, [f64; 3])>,
     parts: SceneParts,
 }
 
 impl PlantBuilder<'_> {
-    /// Adds the shoots, parents first, then the leaves with a petiole, then the other leaflets, whose parents they are.
+    /// Adds the shoots, parents first, then the leaves with a petiole, then the other leaflets. The parent of such a
+    /// leaflet is the leaf with its petiole.
     fn build(mut self) -> Result<SceneParts> {
         let structure = self.structure;
         for index in &structure.order {
             let shoot = &structure.shoots[*index];
             let parent = structure.shoot(shoot.parent).map(Organ::Shoot);
-            self.add(Organ::Shoot(*index), format!("shoot {}", shoot.id), shoot.vertices[0], parent)?;
+            self.add_domain(Organ::Shoot(*index), format!("shoot {}", shoot.id), shoot.vertices[0], parent)?;
         }
-        let mut carriers = HashMap::new();
+        let mut petiole_leaves = HashMap::new();
         for (index, leaf) in structure.leaves.iter().enumerate() {
-            let Some(line) = &leaf.petiole_vertices else { continue };
-            carriers.entry((leaf.shoot, leaf.node, leaf.petiole)).or_insert(Organ::Leaf(index));
+            let Some(petiole) = &leaf.petiole_vertices else { continue };
+            petiole_leaves.entry((leaf.shoot, leaf.node, leaf.petiole)).or_insert(Organ::Leaf(index));
             let parent = structure.shoot(leaf.shoot).map(Organ::Shoot);
-            self.add(Organ::Leaf(index), format!("leaf {}", leaf.object_id), line[0], parent)?;
+            self.add_domain(Organ::Leaf(index), format!("leaf {}", leaf.object_id), petiole[0], parent)?;
         }
         for (index, leaf) in structure.leaves.iter().enumerate() {
             if leaf.petiole_vertices.is_none() {
-                let carrier = carriers.get(&(leaf.shoot, leaf.node, leaf.petiole)).copied();
-                let parent = carrier.or_else(|| structure.shoot(leaf.shoot).map(Organ::Shoot));
-                self.add(Organ::Leaf(index), format!("leaf {}", leaf.object_id), leaf.base, parent)?;
+                let petiole_leaf = petiole_leaves.get(&(leaf.shoot, leaf.node, leaf.petiole)).copied();
+                let parent = petiole_leaf.or_else(|| structure.shoot(leaf.shoot).map(Organ::Shoot));
+                self.add_domain(Organ::Leaf(index), format!("leaf {}", leaf.object_id), leaf.base, parent)?;
             }
         }
         Ok(self.parts)
     }
 
-    fn add(&mut self, member: Organ, name: String, base: [f64; 3], parent: Option<Organ>) -> Result<()> {
-        let faces = self.faces.remove(&member).unwrap_or_default();
-        let piece = obj::build_faces(self.obj, &faces, base).map_err(|error| error.prefix_field(&name))?;
-        self.parts.shapes.push(Shape::new(piece.mesh, Modes::rigid())?);
-        let attachment = parent.and_then(|parent| self.domain_of.get(&parent)).map(|(index, parent_base)| Attachment {
-            parent: *index,
-            frame: translation_transform([0, 1, 2].map(|axis| base[axis] - parent_base[axis])),
-            rows: Vec::new(),
-        });
-        self.domain_of.insert(member, (self.parts.domains.len(), base));
-        let kind = if matches!(member, Organ::Shoot(_)) { "shoot" } else { "leaf" };
+    fn add_domain(&mut self, organ: Organ, name: String, origin: [f64; 3], parent: Option<Organ>) -> Result<()> {
+        let faces = self.faces.remove(&organ).unwrap_or_default();
+        let obj_mesh = obj::build_faces(self.obj, &faces, origin).map_err(|error| error.prefix_field(&name))?;
+        self.parts.shapes.push(Shape::new(obj_mesh.mesh, Modes::rigid())?);
+        let attachment =
+            parent.and_then(|parent| self.organ_domains.get(&parent)).map(|(index, parent_origin)| Attachment {
+                parent: *index,
+                frame: translation_transform([0, 1, 2].map(|axis| origin[axis] - parent_origin[axis])),
+                rows: Vec::new(),
+            });
+        self.organ_domains.insert(organ, (self.parts.domains.len(), origin));
+        let kind = if matches!(organ, Organ::Shoot(_)) { "shoot" } else { "leaf" };
         self.parts.domains.push(Domain {
             name,
             shape: self.parts.shapes.len() - 1,
-            material: piece.material,
-            material_ranges: piece.material_ranges,
-            placement: translation_transform(base),
+            material: obj_mesh.material,
+            material_ranges: obj_mesh.material_ranges,
+            placement: translation_transform(origin),
             attachment,
             follows: None,
             rest_q: Vec::new(),
@@ -137,18 +140,19 @@ mod tests {
         ]
     }"#;
 
-    fn plant(files: &[(&str, &str)]) -> Result<SceneParts> {
-        let folder = tempfile::tempdir().expect("a folder");
+    /// Reads the plant with some of its files replaced by `files`.
+    fn read_plant(files: &[(&str, &str)]) -> Result<SceneParts> {
+        let folder = tempfile::tempdir().expect("a temporary folder");
         for (name, text) in [("p.obj", OBJ), ("p_object_id.dat", IDS), ("p.structure.json", JSON)].iter().chain(files) {
-            std::fs::write(folder.path().join(name), text).expect("written");
+            std::fs::write(folder.path().join(name), text).expect("a writable file");
         }
         read(&AssetDir::unrestricted(folder.path()), "p")
     }
 
     #[test]
-    fn every_face_finds_its_member_and_every_member_its_parent() {
-        let parts = plant(&[]).expect("good");
-        let found: Vec<_> = parts
+    fn organs_have_their_faces_and_parents() {
+        let parts = read_plant(&[]).expect("a valid plant");
+        let domains: Vec<_> = parts
             .domains
             .iter()
             .map(|domain| {
@@ -162,41 +166,45 @@ mod tests {
             })
             .collect();
         let expected = [("shoot 0", 2, None, 0), ("leaf 2", 2, Some(0), 2), ("leaf 3", 1, Some(1), 0)];
-        assert_eq!(found, expected, "the leaflet hangs on the leaf that carries the petiole");
+        assert_eq!(domains, expected, "expected the leaf with the petiole as parent of the leaflet");
         assert_eq!(parts.up, UpAxis::Z);
     }
 
     #[test]
-    fn a_member_lies_where_its_faces_were_and_hangs_where_it_grows_from() {
-        let parts = plant(&[]).expect("good");
+    fn leaf_keeps_its_position_and_attaches_at_its_petiole() {
+        let parts = read_plant(&[]).expect("a valid plant");
         let leaf = &parts.domains[1];
         assert_eq!(leaf.placement.translation(), nalgebra::Vector3::new(0.0, 0.0, 2.0));
         assert_eq!(
-            leaf.attachment.as_ref().expect("attached").frame.translation(),
+            leaf.attachment.as_ref().expect("an attachment").frame.translation(),
             nalgebra::Vector3::new(0.0, 0.0, 1.0)
         );
-        let world: Vec<_> = parts.shapes[leaf.shape]
+        let world_positions: Vec<_> = parts.shapes[leaf.shape]
             .mesh
             .rest_positions()
             .iter()
-            .map(|point| leaf.placement.translation() + nalgebra::Vector3::from(*point).cast::<f64>())
+            .map(|position| leaf.placement.translation() + nalgebra::Vector3::from(*position).cast::<f64>())
             .collect();
-        assert!(world.contains(&nalgebra::Vector3::new(1.0, 1.0, 2.0)), "{world:?}");
-        let scene = crate::scene::Scene::new(parts).expect("a scene");
-        assert_eq!((scene.rest_bounds.min, scene.rest_bounds.max), ([0.0, 0.0, 1.0], [1.0, 1.0, 2.0]), "and no more");
+        assert!(world_positions.contains(&nalgebra::Vector3::new(1.0, 1.0, 2.0)), "{world_positions:?}");
+        let scene = crate::scene::Scene::new(parts).expect("a valid scene");
+        assert_eq!((scene.rest_bounds.min, scene.rest_bounds.max), ([0.0, 0.0, 1.0], [1.0, 1.0, 2.0]));
     }
 
     #[test]
-    fn files_that_do_not_belong_together_are_refused_by_name() {
+    fn inconsistent_files_are_rejected_by_name() {
         for (name, text, start) in [
-            ("p_object_id.dat", "1\n4\n", "file 'p_object_id.dat': lines: expected 5, one per face, got 2"),
-            ("p_object_id.dat", "1\n4\n2\n3\n6\n", "file 'p.structure.json': object: expected one of the structure"),
+            ("p_object_id.dat", "1\n4\n", "file 'p_object_id.dat': lines: expected 5 (one per face), got 2"),
+            (
+                "p_object_id.dat",
+                "1\n4\n2\n3\n6\n",
+                "file 'p.structure.json': object: expected the id of an object of the structure",
+            ),
             ("p_object_id.dat", "1\n4\n2\n2\n5\n", "leaf 3: mesh: expected at least one vertex and one triangle"),
             ("p.structure.json", "{}", "file 'p.structure.json': json: expected objects"),
             ("p.obj", "f 1 2 3\n", "file 'p.obj': line 1: f: index of v"),
         ] {
-            let refusal = plant(&[(name, text)]).expect_err(start).to_string();
-            assert!(refusal.starts_with(start), "{refusal}");
+            let message = read_plant(&[(name, text)]).expect_err(start).to_string();
+            assert!(message.starts_with(start), "{message}");
         }
     }
 }
