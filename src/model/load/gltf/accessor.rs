@@ -13,13 +13,14 @@ const U16: u64 = 5123;
 const U32: u64 = 5125;
 const F32: u64 = 5126;
 
-/// The accepted formats of an attribute.
+/// The formats in which an attribute is accepted.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct AttributeFormat {
-    /// Whether normalized unsigned integers are accepted too.
-    pub(super) integers: bool,
-    /// The number of elements, if another accessor already determines it. Only then may the data be omitted (all zeros,
-    /// or zeros with sparse values): otherwise a count without data could request any amount of memory.
+    /// Whether normalized unsigned integers are accepted in addition to floats.
+    pub(super) allows_integers: bool,
+    /// The number of elements, if another accessor determines it. Only in this case, the accessor may lack a buffer view
+    /// (its elements are zero, unless it has sparse values). Otherwise, a large count without data could exhaust the
+    /// memory.
     pub(super) count: Option<usize>,
 }
 
@@ -27,138 +28,146 @@ pub(super) struct AttributeFormat {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct AccessorReader<'a> {
     pub(super) document: &'a Document,
-    pub(super) bytes: &'a GltfBuffers<'a>,
+    pub(super) buffers: &'a GltfBuffers<'a>,
 }
 
 impl AccessorReader<'_> {
-    /// Elements of `N` floats.
+    /// Decodes the accessor `index` to vectors of `N` floats.
     ///
     /// # Errors
     /// `Invalid` with the accessor and the field.
-    pub(super) fn vectors<const N: usize>(&self, index: usize, form: AttributeFormat) -> Result<Vec<[f32; N]>> {
+    pub(super) fn decode_vectors<const N: usize>(
+        &self,
+        index: usize,
+        format: AttributeFormat,
+    ) -> Result<Vec<[f32; N]>> {
         let accessor = get_element(&self.document.accessors, index, "accessor")?;
-        self.vectors_of(accessor, form).map_err(|error| error.prefix_field(&format!("accessors[{index}]")))
+        self.decode_vectors_of(accessor, format).map_err(|error| error.prefix_field(&format!("accessors[{index}]")))
     }
 
-    fn vectors_of<const N: usize>(&self, accessor: &Accessor, form: AttributeFormat) -> Result<Vec<[f32; N]>> {
+    fn decode_vectors_of<const N: usize>(&self, accessor: &Accessor, format: AttributeFormat) -> Result<Vec<[f32; N]>> {
         expect_kind(accessor, ["SCALAR", "VEC2", "VEC3", "VEC4"][N - 1])?;
         let component = accessor.component_type;
-        let integer = form.integers && accessor.normalized && matches!(component, U8 | U16);
-        if component != F32 && !integer {
-            let also = if form.integers { ", or normalized 5121 (u8) or 5123 (u16)" } else { "" };
+        let is_normalized_integer = format.allows_integers && accessor.normalized && matches!(component, U8 | U16);
+        if component != F32 && !is_normalized_integer {
+            let integer_types = if format.allows_integers { ", or normalized 5121 (u8) or 5123 (u16)" } else { "" };
             let given = format!("{component}, normalized: {}", accessor.normalized);
-            return Err(invalid("componentType", format!("{F32} (f32){also}"), given));
+            return Err(invalid("componentType", format!("{F32} (f32){integer_types}"), given));
         }
-        if let Some(count) = form.count.filter(|count| *count != accessor.count) {
-            return Err(invalid("count", format!("{count}, as many as positions"), accessor.count));
+        if let Some(count) = format.count.filter(|count| *count != accessor.count) {
+            return Err(invalid("count", format!("{count}, the number of positions"), accessor.count));
         }
-        if form.count.is_none() && accessor.buffer_view.is_none() {
+        if format.count.is_none() && accessor.buffer_view.is_none() {
             return Err(invalid("bufferView", "an index", "none"));
         }
-        let packed = self.packed(accessor, N)?;
-        // Four bytes per component whatever its type in the file.
-        self.bytes.charge_budget(4 * N as u64 * accessor.count as u64)?;
+        let packed_bytes = self.pack_elements(accessor, N)?;
+        // Components of all types are decoded to four bytes.
+        self.buffers.charge_budget(4 * N as u64 * accessor.count as u64)?;
         Ok(match component {
-            U8 => grouped(packed.iter().map(|byte| f32::from(*byte) / 255.0)),
-            U16 => grouped(words::<2>(&packed).map(|word| f32::from(u16::from_le_bytes(word)) / 65535.0)),
-            _ => grouped(words::<4>(&packed).map(f32::from_le_bytes)),
+            U8 => group_components(packed_bytes.iter().map(|byte| f32::from(*byte) / 255.0)),
+            U16 => {
+                group_components(words::<2>(&packed_bytes).map(|word| f32::from(u16::from_le_bytes(word)) / 65535.0))
+            }
+            _ => group_components(words::<4>(&packed_bytes).map(f32::from_le_bytes)),
         })
     }
 
-    /// Indices, each below `vertices`.
+    /// Decodes the accessor `index` to vertex indices, and checks that they are below `vertex_count`.
     ///
     /// # Errors
     /// `Invalid` with the accessor and the field.
-    pub(super) fn indices(&self, index: usize, vertices: usize) -> Result<Vec<u32>> {
+    pub(super) fn decode_indices(&self, index: usize, vertex_count: usize) -> Result<Vec<u32>> {
         let accessor = get_element(&self.document.accessors, index, "accessor")?;
-        self.indices_of(accessor, vertices).map_err(|error| error.prefix_field(&format!("accessors[{index}]")))
+        self.decode_indices_of(accessor, vertex_count)
+            .map_err(|error| error.prefix_field(&format!("accessors[{index}]")))
     }
 
-    fn indices_of(&self, accessor: &Accessor, vertices: usize) -> Result<Vec<u32>> {
+    fn decode_indices_of(&self, accessor: &Accessor, vertex_count: usize) -> Result<Vec<u32>> {
         expect_kind(accessor, "SCALAR")?;
         if accessor.buffer_view.is_none() {
             return Err(invalid("bufferView", "an index", "none"));
         }
         index_size(accessor.component_type)?;
-        let packed = self.packed(accessor, 1)?;
-        self.bytes.charge_budget(4 * accessor.count as u64)?;
-        let indices = integers(&packed, accessor.component_type);
-        match indices.iter().position(|index| *index as usize >= vertices) {
+        let packed_bytes = self.pack_elements(accessor, 1)?;
+        self.buffers.charge_budget(4 * accessor.count as u64)?;
+        let indices = decode_integers(&packed_bytes, accessor.component_type);
+        match indices.iter().position(|index| *index as usize >= vertex_count) {
             None => Ok(indices),
-            Some(get_element) => Err(invalid(
-                format!("element {get_element}"),
-                format!("an index below {vertices}"),
-                indices[get_element],
-            )),
+            Some(element) => {
+                Err(invalid(format!("element {element}"), format!("an index below {vertex_count}"), indices[element]))
+            }
         }
     }
 
-    /// The accessor's elements of `components` components each, without gaps.
-    fn packed(&self, accessor: &Accessor, components: usize) -> Result<Vec<u8>> {
-        let size = components * component_size(accessor.component_type);
-        let total = accessor.count.checked_mul(size).filter(|_| accessor.count > 0);
-        let total = total.ok_or_else(|| invalid("count", "a number of elements from 1 on", accessor.count))?;
-        let mut packed = Vec::new();
+    /// Copies the accessor's elements of `components` components each without gaps, and applies its sparse values.
+    fn pack_elements(&self, accessor: &Accessor, components: usize) -> Result<Vec<u8>> {
+        let element_size = components * component_size(accessor.component_type);
+        let total_bytes = accessor.count.checked_mul(element_size).filter(|_| accessor.count > 0);
+        let total_bytes =
+            total_bytes.ok_or_else(|| invalid("count", "at least 1 element of addressable size", accessor.count))?;
+        let mut packed_bytes = Vec::new();
         match accessor.buffer_view {
             Some(view) => {
-                let (view, stride) = self.bytes.view(view)?;
-                let stride = stride.unwrap_or(size);
-                if stride < size {
-                    return Err(invalid("bufferView.byteStride", format!("at least {size}"), stride));
+                let (view, stride) = self.buffers.view(view)?;
+                let stride = stride.unwrap_or(element_size);
+                if stride < element_size {
+                    return Err(invalid("bufferView.byteStride", format!("at least {element_size}"), stride));
                 }
-                let elements = elements(view, accessor.byte_offset, [stride, size], accessor.count)?;
-                self.bytes.charge_budget(total as u64)?;
-                packed.reserve_exact(total);
-                elements.for_each(|element| packed.extend_from_slice(element));
+                let elements = elements(view, accessor.byte_offset, [stride, element_size], accessor.count)?;
+                self.buffers.charge_budget(total_bytes as u64)?;
+                packed_bytes.reserve_exact(total_bytes);
+                elements.for_each(|element| packed_bytes.extend_from_slice(element));
             }
             None => {
-                self.bytes.charge_budget(total as u64)?;
-                packed.resize(total, 0);
+                self.buffers.charge_budget(total_bytes as u64)?;
+                packed_bytes.resize(total_bytes, 0);
             }
         }
         if let Some(sparse) = &accessor.sparse {
-            self.apply_sparse(&mut packed, sparse, size).map_err(|error| error.prefix_field("sparse"))?;
+            self.apply_sparse(&mut packed_bytes, sparse, element_size).map_err(|error| error.prefix_field("sparse"))?;
         }
-        Ok(packed)
+        Ok(packed_bytes)
     }
 
     /// Replaces elements by the sparse values.
-    fn apply_sparse(&self, packed: &mut [u8], sparse: &Sparse, size: usize) -> Result<()> {
-        let count = packed.len() / size;
-        if sparse.count == 0 || sparse.count > count {
-            return Err(invalid("count", format!("1 to {count}"), sparse.count));
+    fn apply_sparse(&self, packed_bytes: &mut [u8], sparse: &Sparse, element_size: usize) -> Result<()> {
+        let element_count = packed_bytes.len() / element_size;
+        if sparse.count == 0 || sparse.count > element_count {
+            return Err(invalid("count", format!("1 to {element_count}"), sparse.count));
         }
-        let width = index_size(sparse.indices.component_type).map_err(|error| error.prefix_field("indices"))?;
-        let (view, _) = self.bytes.view(sparse.indices.buffer_view).map_err(|error| error.prefix_field("indices"))?;
-        let places = elements(view, sparse.indices.byte_offset, [width; 2], sparse.count);
-        let places: Vec<u8> = places.map_err(|error| error.prefix_field("indices"))?.flatten().copied().collect();
-        let (view, _) = self.bytes.view(sparse.values.buffer_view).map_err(|error| error.prefix_field("values"))?;
-        let values = elements(view, sparse.values.byte_offset, [size; 2], sparse.count);
-        let mut least = 0;
-        for (place, value) in integers(&places, sparse.indices.component_type)
+        let index_bytes = index_size(sparse.indices.component_type).map_err(|error| error.prefix_field("indices"))?;
+        let (view, _) = self.buffers.view(sparse.indices.buffer_view).map_err(|error| error.prefix_field("indices"))?;
+        let index_data = elements(view, sparse.indices.byte_offset, [index_bytes; 2], sparse.count);
+        let index_data: Vec<u8> =
+            index_data.map_err(|error| error.prefix_field("indices"))?.flatten().copied().collect();
+        let (view, _) = self.buffers.view(sparse.values.buffer_view).map_err(|error| error.prefix_field("values"))?;
+        let values = elements(view, sparse.values.byte_offset, [element_size; 2], sparse.count);
+        let mut min_element = 0;
+        for (element, value) in decode_integers(&index_data, sparse.indices.component_type)
             .into_iter()
             .zip(values.map_err(|error| error.prefix_field("values"))?)
         {
-            let place = place as usize;
-            if place < least || place >= count {
-                return Err(invalid("indices", format!("ascending indices, here {least} to {}", count - 1), place));
+            let element = element as usize;
+            if element < min_element || element >= element_count {
+                let expected = format!("ascending indices (next: {min_element} to {})", element_count - 1);
+                return Err(invalid("indices", expected, element));
             }
-            packed[place * size..][..size].copy_from_slice(value);
-            least = place + 1;
+            packed_bytes[element * element_size..][..element_size].copy_from_slice(value);
+            min_element = element + 1;
         }
         Ok(())
     }
 }
 
-/// `count` (at least one) elements of `size` bytes at intervals of `stride` bytes.
+/// The bytes of `count` elements of `size` bytes at intervals of `stride` bytes. `count` must be at least 1.
 fn elements(
     view: &[u8],
     offset: usize,
     [stride, size]: [usize; 2],
     count: usize,
 ) -> Result<impl Iterator<Item = &[u8]>> {
-    let reach = stride.checked_mul(count - 1).and_then(|reach| reach.checked_add(size)?.checked_add(offset));
-    if reach.is_none_or(|reach| reach > view.len()) {
+    let end = stride.checked_mul(count - 1).and_then(|end| end.checked_add(size)?.checked_add(offset));
+    if end.is_none_or(|end| end > view.len()) {
         return Err(invalid(
             "byteOffset + stride x (count - 1) + size",
             format!("at most {}, the bytes of the buffer view", view.len()),
@@ -191,19 +200,18 @@ fn index_size(component: u64) -> Result<usize> {
     }
 }
 
-fn integers(packed: &[u8], component: u64) -> Vec<u32> {
+fn decode_integers(packed_bytes: &[u8], component: u64) -> Vec<u32> {
     match component {
-        U8 => packed.iter().map(|byte| u32::from(*byte)).collect(),
-        U16 => words::<2>(packed).map(|word| u32::from(u16::from_le_bytes(word))).collect(),
-        _ => words::<4>(packed).map(u32::from_le_bytes).collect(),
+        U8 => packed_bytes.iter().map(|byte| u32::from(*byte)).collect(),
+        U16 => words::<2>(packed_bytes).map(|word| u32::from(u16::from_le_bytes(word))).collect(),
+        _ => words::<4>(packed_bytes).map(u32::from_le_bytes).collect(),
     }
 }
 
-fn words<const W: usize>(packed: &[u8]) -> impl Iterator<Item = [u8; W]> {
-    packed.as_chunks::<W>().0.iter().copied()
+fn words<const W: usize>(packed_bytes: &[u8]) -> impl Iterator<Item = [u8; W]> {
+    packed_bytes.as_chunks::<W>().0.iter().copied()
 }
 
-fn grouped<const N: usize>(numbers: impl Iterator<Item = f32>) -> Vec<[f32; N]> {
-    let flat: Vec<f32> = numbers.collect();
-    flat.as_chunks::<N>().0.to_vec()
+fn group_components<const N: usize>(components: impl Iterator<Item = f32>) -> Vec<[f32; N]> {
+    components.collect::<Vec<f32>>().as_chunks::<N>().0.to_vec()
 }

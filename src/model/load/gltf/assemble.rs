@@ -17,14 +17,14 @@ use crate::domain::{Attachment, Domain, Shape, Transform};
 use crate::error::{Result, invalid};
 use crate::scene::{MAX_DOMAINS, SceneParts};
 
-/// The nearest domain at or above a node, which becomes the parent of domains below.
+/// The parent of the domains in a node's children: the first domain of the node, or of its nearest ancestor with domains.
 #[derive(Debug, Clone, Copy)]
 struct ParentDomain {
     domain: usize,
     domain_from_node: Matrix4<f64>,
 }
 
-/// The converted primitive of a mesh, shared by all instances of the mesh.
+/// A converted primitive, shared by all instances of its mesh.
 #[derive(Debug, Clone, Copy)]
 struct LoadedPrimitive {
     shape: usize,
@@ -35,7 +35,9 @@ struct LoadedPrimitive {
 struct GltfAssembler<'a> {
     reader: AccessorReader<'a>,
     material_converter: MaterialConverter<'a>,
-    made: HashMap<(usize, usize), Option<LoadedPrimitive>>,
+    /// Converted primitives by the indices of mesh and primitive; `None` for points and lines.
+    primitives: HashMap<(usize, usize), Option<LoadedPrimitive>>,
+    /// Names of all nodes with a mesh so far.
     names: HashSet<String>,
     shapes: Vec<Shape>,
     domains: Vec<Domain>,
@@ -45,32 +47,32 @@ struct GltfAssembler<'a> {
 /// Builds all domains of the document's default scene.
 ///
 /// # Errors
-/// `Invalid` with the place in the document.
+/// `Invalid` with the element of the document.
 pub(super) fn assemble(
     name: &str,
     document: &Document,
-    bytes: &GltfBuffers<'_>,
+    buffers: &GltfBuffers<'_>,
     mut remarks: ImportWarnings,
 ) -> Result<SceneParts> {
     let nodes = hierarchy::flatten_hierarchy(document, &mut remarks)?;
     let mut assembly = GltfAssembler {
-        reader: AccessorReader { document, bytes },
-        material_converter: MaterialConverter::new(document, TextureLoader::new(document, bytes)),
-        made: HashMap::new(),
+        reader: AccessorReader { document, buffers },
+        material_converter: MaterialConverter::new(document, TextureLoader::new(document, buffers)),
+        primitives: HashMap::new(),
         names: HashSet::new(),
         shapes: Vec::new(),
         domains: Vec::new(),
         remarks,
     };
-    let mut carriers: Vec<Option<ParentDomain>> = Vec::with_capacity(nodes.len());
-    for placed in &nodes {
-        let above = placed.parent.and_then(|parent| carriers[parent]);
-        let above =
-            above.map(|above| ParentDomain { domain_from_node: above.domain_from_node * placed.local, ..above });
-        let first = assembly.add_node(placed, above);
-        let first = first.map_err(|error| error.prefix_field(&format!("nodes[{}]", placed.node)))?;
-        let own = first.map(|domain| ParentDomain { domain, domain_from_node: Matrix4::identity() });
-        carriers.push(own.or(above));
+    let mut parent_domains: Vec<Option<ParentDomain>> = Vec::with_capacity(nodes.len());
+    for placed_node in &nodes {
+        let parent_domain = placed_node.parent.and_then(|parent| parent_domains[parent]);
+        let parent_domain = parent_domain
+            .map(|parent| ParentDomain { domain_from_node: parent.domain_from_node * placed_node.local, ..parent });
+        let first_domain = assembly.add_node(placed_node, parent_domain);
+        let first_domain = first_domain.map_err(|error| error.prefix_field(&format!("nodes[{}]", placed_node.node)))?;
+        let node_domain = first_domain.map(|domain| ParentDomain { domain, domain_from_node: Matrix4::identity() });
+        parent_domains.push(node_domain.or(parent_domain));
     }
     if assembly.domains.is_empty() {
         return Err(invalid("scenes", "a node with at least one primitive of triangles", "none"));
@@ -80,54 +82,62 @@ pub(super) fn assemble(
 
 impl GltfAssembler<'_> {
     /// Adds a domain for each primitive of the node's mesh and returns the index of the first.
-    fn add_node(&mut self, placed: &PlacedNode, above: Option<ParentDomain>) -> Result<Option<usize>> {
+    fn add_node(&mut self, placed_node: &PlacedNode, parent_domain: Option<ParentDomain>) -> Result<Option<usize>> {
         let document = self.reader.document;
-        let node = &document.nodes[placed.node];
+        let node = &document.nodes[placed_node.node];
         let Some(mesh_index) = node.mesh else { return Ok(None) };
         let mesh = get_element(&document.meshes, mesh_index, "mesh")?;
         let weights = node.weights.as_ref().or(mesh.weights.as_ref());
-        let placement = transform(&placed.world)?;
-        let attachment = above.map(|above| attach(&above)).transpose()?;
-        let first = self.domains.len();
-        // The node's first domain of each rank. The node's other domains of this rank share its coordinates.
-        let mut twins: HashMap<usize, usize> = HashMap::new();
-        let name = self.name(node.name.as_ref().or(mesh.name.as_ref()), placed.node);
-        for (flatten_hierarchy, primitive) in mesh.primitives.iter().enumerate() {
-            let targets = primitive.targets.len();
-            if let Some(given) = weights.map(Vec::len).filter(|given| targets > 0 && *given != targets) {
-                return Err(invalid("weights", format!("{targets}, one per morph target"), given));
+        let placement = to_transform(&placed_node.world)?;
+        let attachment = parent_domain.map(|parent_domain| create_attachment(&parent_domain)).transpose()?;
+        let first_domain = self.domains.len();
+        // The node's first domain by rank. All domains of the node with the same rank share coordinates.
+        let mut first_by_rank: HashMap<usize, usize> = HashMap::new();
+        let name = self.unique_name(node.name.as_ref().or(mesh.name.as_ref()), placed_node.node);
+        for (primitive_index, primitive) in mesh.primitives.iter().enumerate() {
+            let target_count = primitive.targets.len();
+            if let Some(weight_count) =
+                weights.map(Vec::len).filter(|weight_count| target_count > 0 && *weight_count != target_count)
+            {
+                return Err(invalid("weights", format!("{target_count} (one per morph target)"), weight_count));
             }
-            let within = |error: crate::error::Error| {
-                error.prefix_field(&format!("meshes[{mesh_index}].primitives[{flatten_hierarchy}]"))
+            let in_primitive = |error: crate::error::Error| {
+                error.prefix_field(&format!("meshes[{mesh_index}].primitives[{primitive_index}]"))
             };
-            let Some(made) = self.load_primitive(mesh_index, flatten_hierarchy).map_err(within)? else { continue };
+            let Some(loaded) = self.load_primitive(mesh_index, primitive_index).map_err(in_primitive)? else {
+                continue;
+            };
             if self.domains.len() == MAX_DOMAINS {
-                return Err(invalid("domains", format!("at most {MAX_DOMAINS}"), "more"));
+                return Err(invalid("domains", format!("at most {MAX_DOMAINS}"), MAX_DOMAINS + 1));
             }
-            let rank = self.shapes[made.shape].modes.rank();
+            let rank = self.shapes[loaded.shape].modes.rank();
             let rest_q = weights.filter(|_| rank > 0).cloned().unwrap_or_default();
-            self.reader.bytes.charge_budget(4 * rest_q.len() as u64)?;
-            let twin = *twins.entry(rank).or_insert(self.domains.len());
+            self.reader.buffers.charge_budget(4 * rest_q.len() as u64)?;
+            let first_of_rank = *first_by_rank.entry(rank).or_insert(self.domains.len());
             self.domains.push(Domain {
-                material: made.material,
+                name: format!("{name}.{primitive_index}"),
+                shape: loaded.shape,
+                material: loaded.material,
+                material_ranges: vec![],
                 placement,
                 attachment: attachment.clone(),
                 rest_q,
-                shares_q_with: (rank > 0 && twin < self.domains.len()).then_some(twin),
-                ..Domain::new(format!("{name}.{flatten_hierarchy}"), made.shape)
+                shares_q_with: (rank > 0 && first_of_rank < self.domains.len()).then_some(first_of_rank),
+                metadata: Metadata::default(),
             });
         }
-        Ok((self.domains.len() > first).then_some(first))
+        Ok((self.domains.len() > first_domain).then_some(first_domain))
     }
 
-    /// The shape and material of a primitive, converted on first use; `None` for points and lines.
-    fn load_primitive(&mut self, mesh: usize, flatten_hierarchy: usize) -> Result<Option<LoadedPrimitive>> {
-        if let Some(made) = self.made.get(&(mesh, flatten_hierarchy)) {
-            return Ok(*made);
+    /// Returns the shape and material of a primitive, or `None` for points and lines. The first call for a primitive
+    /// converts it.
+    fn load_primitive(&mut self, mesh: usize, primitive_index: usize) -> Result<Option<LoadedPrimitive>> {
+        if let Some(loaded) = self.primitives.get(&(mesh, primitive_index)) {
+            return Ok(*loaded);
         }
-        let primitive = &self.reader.document.meshes[mesh].primitives[flatten_hierarchy];
+        let primitive = &self.reader.document.meshes[mesh].primitives[primitive_index];
         let uv_set = self.material_converter.uv_set(primitive.material)?;
-        let made = match primitive::shape(self.reader, primitive, uv_set, &mut self.remarks)? {
+        let loaded = match primitive::convert_primitive(self.reader, primitive, uv_set, &mut self.remarks)? {
             None => None,
             Some(shape) => {
                 let has_uvs = !shape.mesh.corners().uvs.is_empty();
@@ -137,16 +147,17 @@ impl GltfAssembler<'_> {
                 Some(LoadedPrimitive { shape: self.shapes.len() - 1, material })
             }
         };
-        self.made.insert((mesh, flatten_hierarchy), made);
-        Ok(made)
+        self.primitives.insert((mesh, primitive_index), loaded);
+        Ok(loaded)
     }
 
-    /// The name of the node or else of its mesh, made unique by the node's index.
-    fn name(&mut self, given: Option<&String>, index: usize) -> String {
-        let given = given.map(|name| sanitize(name, 120)).filter(|name| !name.is_empty());
-        let mut name = given.unwrap_or_else(|| format!("node {index}"));
+    /// A unique name of a node: `preferred_name` if it is not empty and not used yet; otherwise it contains the index of
+    /// the node.
+    fn unique_name(&mut self, preferred_name: Option<&String>, node_index: usize) -> String {
+        let preferred_name = preferred_name.map(|name| sanitize(name, 120)).filter(|name| !name.is_empty());
+        let mut name = preferred_name.unwrap_or_else(|| format!("node {node_index}"));
         if self.names.contains(&name) {
-            name = format!("{name} #{index}");
+            name = format!("{name} #{node_index}");
         }
         while !self.names.insert(name.clone()) {
             name.push('\'');
@@ -166,12 +177,12 @@ impl GltfAssembler<'_> {
     }
 }
 
-fn attach(above: &ParentDomain) -> Result<Attachment> {
-    let frame = transform(&above.domain_from_node)?;
-    // A node is attached to its parent's frame, which morph targets do not move.
-    Ok(Attachment { parent: above.domain, frame, rows: vec![] })
+fn create_attachment(parent_domain: &ParentDomain) -> Result<Attachment> {
+    let frame = to_transform(&parent_domain.domain_from_node)?;
+    // Without rows, because morph targets do not move the frame of a node in glTF.
+    Ok(Attachment { parent: parent_domain.domain, frame, rows: vec![] })
 }
 
-fn transform(matrix: &Matrix4<f64>) -> Result<Transform> {
+fn to_transform(matrix: &Matrix4<f64>) -> Result<Transform> {
     Transform::new(Transform::from_matrix(matrix).0)
 }

@@ -8,12 +8,12 @@ use base64::engine::general_purpose::STANDARD_PAD_INDIFFERENT;
 
 use super::document::{BufferView, Document};
 use super::warnings::sanitize;
-use super::{MAX_FILE, get_element};
+use super::{MAX_FILE_BYTES, get_element};
 use crate::error::{Result, invalid};
 use crate::load::asset_dir::AssetDir;
 
-/// The most bytes that one model may use in buffers, decoded accessors and pixels together. Otherwise a small file that
-/// refers to one large buffer or image many times could exhaust the memory.
+/// The largest total size in bytes of a model's buffers, decoded accessors and pixels. Without this limit, a small file
+/// that refers to one large buffer or image many times could exhaust the memory.
 pub(super) const MEMORY_BUDGET: u64 = 1 << 31;
 
 /// The buffers of a document.
@@ -22,6 +22,7 @@ pub(super) struct GltfBuffers<'a> {
     document: &'a Document,
     folder: &'a AssetDir,
     buffers: Vec<Cow<'a, [u8]>>,
+    /// The part of [`MEMORY_BUDGET`] that is not used yet.
     remaining_budget: Cell<u64>,
 }
 
@@ -31,25 +32,28 @@ impl<'a> GltfBuffers<'a> {
     /// # Errors
     /// `Invalid` with the buffer if its data is missing, shorter than declared or outside the folder.
     pub(super) fn load(document: &'a Document, folder: &'a AssetDir, bin: Option<&'a [u8]>) -> Result<Self> {
-        let mut bytes = Self { document, folder, buffers: Vec::new(), remaining_budget: Cell::new(MEMORY_BUDGET) };
+        let mut gltf_buffers =
+            Self { document, folder, buffers: Vec::new(), remaining_budget: Cell::new(MEMORY_BUDGET) };
         for index in 0..document.buffers.len() {
-            let buffer = bytes.buffer(index, bin).map_err(|error| error.prefix_field(&format!("buffers[{index}]")))?;
-            bytes.buffers.push(buffer);
+            let buffer = gltf_buffers
+                .load_buffer(index, bin)
+                .map_err(|error| error.prefix_field(&format!("buffers[{index}]")))?;
+            gltf_buffers.buffers.push(buffer);
         }
-        Ok(bytes)
+        Ok(gltf_buffers)
     }
 
-    fn buffer(&self, index: usize, bin: Option<&'a [u8]>) -> Result<Cow<'a, [u8]>> {
+    fn load_buffer(&self, index: usize, bin: Option<&'a [u8]>) -> Result<Cow<'a, [u8]>> {
         let buffer = &self.document.buffers[index];
         let content = match (&buffer.uri, bin) {
-            (Some(uri), _) => Cow::Owned(self.fetch(uri)?),
+            (Some(uri), _) => Cow::Owned(self.read_uri(uri)?),
             (None, Some(bin)) if index == 0 => Cow::Borrowed(bin),
             (None, _) => return Err(invalid("uri", "a URI, or a GLB's binary chunk for buffer 0", "neither")),
         };
         if content.len() < buffer.byte_length {
             return Err(invalid(
                 "byteLength",
-                format!("at most the {} bytes there are", content.len()),
+                format!("at most {}, the size of the data", content.len()),
                 buffer.byte_length,
             ));
         }
@@ -84,7 +88,7 @@ impl<'a> GltfBuffers<'a> {
     pub(super) fn image(&self, index: usize) -> Result<Cow<'_, [u8]>> {
         let image = &self.document.images[index];
         match (&image.uri, image.buffer_view) {
-            (Some(uri), _) => Ok(Cow::Owned(self.fetch(uri)?)),
+            (Some(uri), _) => Ok(Cow::Owned(self.read_uri(uri)?)),
             (None, Some(view)) => Ok(Cow::Borrowed(self.view(view)?.0)),
             (None, None) => Err(invalid("uri", "a URI or a bufferView", "neither")),
         }
@@ -97,15 +101,15 @@ impl<'a> GltfBuffers<'a> {
     pub(super) fn charge_budget(&self, bytes: u64) -> Result<()> {
         let remaining_budget = self.remaining_budget.get().checked_sub(bytes);
         let remaining_budget = remaining_budget
-            .ok_or_else(|| invalid("decoded size", format!("at most {MEMORY_BUDGET} bytes in all"), "more"))?;
+            .ok_or_else(|| invalid("decoded size", format!("at most {MEMORY_BUDGET} bytes in total"), "more"))?;
         self.remaining_budget.set(remaining_budget);
         Ok(())
     }
 
-    fn fetch(&self, uri: &str) -> Result<Vec<u8>> {
+    fn read_uri(&self, uri: &str) -> Result<Vec<u8>> {
         let content = match uri.strip_prefix("data:") {
-            Some(data) => decode_data(data)?,
-            None => self.folder.read(&relative(uri)?, MAX_FILE.min(self.remaining_budget.get()))?,
+            Some(data) => decode_data_uri(data)?,
+            None => self.folder.read(&relative_path(uri)?, MAX_FILE_BYTES.min(self.remaining_budget.get()))?,
         };
         self.charge_budget(content.len() as u64)?;
         Ok(content)
@@ -113,34 +117,35 @@ impl<'a> GltfBuffers<'a> {
 }
 
 /// Decodes the part of a data URI after `data:`, which must be Base64.
-fn decode_data(data: &str) -> Result<Vec<u8>> {
-    let Some((kind, payload)) = data.split_once(',').filter(|(kind, _)| kind.ends_with(";base64")) else {
+fn decode_data_uri(data: &str) -> Result<Vec<u8>> {
+    let Some((media_type, payload)) = data.split_once(',').filter(|(media_type, _)| media_type.ends_with(";base64"))
+    else {
         return Err(invalid("uri", "data:...;base64,...", format!("data:{}", sanitize(data, 40))));
     };
-    let refuse = |error| invalid("uri", format!("Base64 after 'data:{},'", sanitize(kind, 40)), error);
-    STANDARD_PAD_INDIFFERENT.decode(payload).map_err(refuse)
+    let invalid_base64 = |error| invalid("uri", format!("Base64 after 'data:{},'", sanitize(media_type, 40)), error);
+    STANDARD_PAD_INDIFFERENT.decode(payload).map_err(invalid_base64)
 }
 
 /// The path of a relative URI. A model may read files only in and below its own folder.
-fn relative(uri: &str) -> Result<String> {
-    let path = percent_decoded(uri);
-    let scheme = path.split('/').next().is_some_and(|first| first.contains(':'));
-    let leaves = path.starts_with('/') || path.split('/').any(|part| part == "..");
-    if path.is_empty() || scheme || leaves || path.contains(['\\', '\0']) {
+fn relative_path(uri: &str) -> Result<String> {
+    let path = decode_percent_escapes(uri);
+    let has_scheme = path.split('/').next().is_some_and(|component| component.contains(':'));
+    let leaves_folder = path.starts_with('/') || path.split('/').any(|component| component == "..");
+    if path.is_empty() || has_scheme || leaves_folder || path.contains(['\\', '\0']) {
         return Err(invalid("uri", "a data URI or a path in or below the model's folder", sanitize(uri, 120)));
     }
     Ok(path)
 }
 
 /// Decodes escapes such as `%20`. If the result is not UTF-8, the text is returned unchanged.
-fn percent_decoded(uri: &str) -> String {
+fn decode_percent_escapes(uri: &str) -> String {
     let mut bytes = Vec::with_capacity(uri.len());
-    let mut rest = uri.as_bytes();
-    while let [first, tail @ ..] = rest {
-        let code = tail.first_chunk::<2>().and_then(|pair| std::str::from_utf8(pair).ok());
-        match code.filter(|_| *first == b'%').and_then(|code| u8::from_str_radix(code, 16).ok()) {
-            Some(byte) => (bytes.push(byte), rest = &tail[2..]),
-            None => (bytes.push(*first), rest = tail),
+    let mut remainder = uri.as_bytes();
+    while let [byte, next_bytes @ ..] = remainder {
+        let hex_digits = next_bytes.first_chunk::<2>().and_then(|digits| std::str::from_utf8(digits).ok());
+        match hex_digits.filter(|_| *byte == b'%').and_then(|hex_digits| u8::from_str_radix(hex_digits, 16).ok()) {
+            Some(byte) => (bytes.push(byte), remainder = &next_bytes[2..]),
+            None => (bytes.push(*byte), remainder = next_bytes),
         };
     }
     String::from_utf8(bytes).unwrap_or_else(|_| uri.into())
@@ -151,7 +156,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_uri_stays_below_its_folder_whatever_its_spelling() {
+    fn uris_outside_of_the_folder_are_rejected() {
         let outside = [
             "../secret.bin",
             "a/../../b.bin",
@@ -167,19 +172,19 @@ mod tests {
             "..",
         ];
         for uri in outside {
-            assert!(relative(uri).is_err(), "{uri:?} passed");
+            assert!(relative_path(uri).is_err(), "{uri:?}: expected an error");
         }
-        assert_eq!(relative("my%20buffer%2e1.bin").expect("inside"), "my buffer.1.bin");
-        assert_eq!(relative("sub/100%.bin").expect("inside"), "sub/100%.bin");
-        assert_eq!(relative("a..b/c:d").expect("inside"), "a..b/c:d");
+        assert_eq!(relative_path("my%20buffer%2e1.bin").expect("a relative path"), "my buffer.1.bin");
+        assert_eq!(relative_path("sub/100%.bin").expect("a relative path"), "sub/100%.bin");
+        assert_eq!(relative_path("a..b/c:d").expect("a relative path"), "a..b/c:d");
     }
 
     #[test]
     fn only_base64_data_uris_are_decoded() {
-        assert_eq!(decode_data("application/octet-stream;base64,AAEC").expect("valid"), [0, 1, 2]);
-        assert_eq!(decode_data(";base64,AA").expect("padding may be left out"), [0]);
-        assert!(decode_data("text/plain,hello").is_err());
-        assert!(decode_data(";base64,A*==").is_err());
-        assert!(decode_data(";base64").is_err());
+        assert_eq!(decode_data_uri("application/octet-stream;base64,AAEC").expect("valid Base64"), [0, 1, 2]);
+        assert_eq!(decode_data_uri(";base64,AA").expect("valid Base64 without padding"), [0]);
+        assert!(decode_data_uri("text/plain,hello").is_err());
+        assert!(decode_data_uri(";base64,A*==").is_err());
+        assert!(decode_data_uri(";base64").is_err());
     }
 }

@@ -11,8 +11,8 @@ use crate::error::{Result, invalid};
 const MAX_OBJECTS: usize = 1 << 21;
 /// The largest number of commas, which limits the elements of all lists in the same way.
 const MAX_COMMAS: usize = 1 << 24;
-/// The longest text that is parsed a second time to locate an error.
-const MAX_SEARCHED: usize = 1 << 22;
+/// The largest document that is parsed a second time to locate an error, in bytes.
+const MAX_LOCATABLE_BYTES: usize = 1 << 22;
 const MAGIC: &[u8] = b"glTF";
 const JSON: u32 = 0x4E4F_534A;
 const BIN: u32 = 0x004E_4942;
@@ -29,88 +29,92 @@ pub(super) struct Container<'a> {
 ///
 /// # Errors
 /// `Invalid` with the field of the header or the chunk.
-pub(super) fn split(content: &[u8]) -> Result<Container<'_>> {
+pub(super) fn split_container(content: &[u8]) -> Result<Container<'_>> {
     if !content.starts_with(MAGIC) {
         return Ok(Container { json: content, bin: None });
     }
-    let version = word(content, 4, "glb.version")?;
+    let version = read_word(content, 4, "glb.version")?;
     if version != 2 {
         return Err(invalid("glb.version", "2", version));
     }
-    let length = word(content, 8, "glb.length")?;
+    let length = read_word(content, 8, "glb.length")?;
     if u64::from(length) != content.len() as u64 {
         return Err(invalid("glb.length", format!("{}, the size of the file", content.len()), length));
     }
-    let (kind, json, rest) = chunk(content, 12)?;
+    let (kind, json, next_start) = read_chunk(content, 12)?;
     if kind != JSON {
         return Err(invalid("glb.chunk[0].type", format!("{JSON:#x} (JSON)"), format!("{kind:#x}")));
     }
-    if rest == content.len() {
+    if next_start == content.len() {
         return Ok(Container { json, bin: None });
     }
-    let (kind, bin, _) = chunk(content, rest)?;
+    let (kind, bin, _) = read_chunk(content, next_start)?;
     // Chunks of unknown types must be ignored; the only known type after JSON is BIN.
     Ok(Container { json, bin: (kind == BIN).then_some(bin) })
 }
 
 /// Type and content of the chunk at `start`, and the start of the next one.
-fn chunk(content: &[u8], start: usize) -> Result<(u32, &[u8], usize)> {
-    let length = word(content, start, "glb.chunk.length")? as usize;
-    let kind = word(content, start + 4, "glb.chunk.type")?;
+fn read_chunk(content: &[u8], start: usize) -> Result<(u32, &[u8], usize)> {
+    let length = read_word(content, start, "glb.chunk.length")? as usize;
+    let kind = read_word(content, start + 4, "glb.chunk.type")?;
     let body = &content[start + 8..];
     if length > body.len() {
-        return Err(invalid("glb.chunk.length", format!("at most {} bytes, the rest of the file", body.len()), length));
+        return Err(invalid(
+            "glb.chunk.length",
+            format!("at most {}, the remaining bytes of the file", body.len()),
+            length,
+        ));
     }
     Ok((kind, &body[..length], start + 8 + length))
 }
 
-fn word(content: &[u8], start: usize, field: &str) -> Result<u32> {
+fn read_word(content: &[u8], start: usize, field: &str) -> Result<u32> {
     let bytes = content.get(start..).and_then(|rest| rest.first_chunk::<4>());
-    let cut = || invalid(field, format!("four bytes at {start}"), format!("a file of {} bytes", content.len()));
-    Ok(u32::from_le_bytes(*bytes.ok_or_else(cut)?))
+    let truncated = || invalid(field, format!("four bytes at {start}"), format!("a file of {} bytes", content.len()));
+    Ok(u32::from_le_bytes(*bytes.ok_or_else(truncated)?))
 }
 
-/// Parses the JSON text.
+/// Parses the JSON document.
 ///
 /// # Errors
 /// `Invalid` with the list and the element that do not conform to glTF.
-pub(super) fn parse(json: &[u8]) -> Result<Document> {
-    for (sign, what, most) in [(b'{', "objects", MAX_OBJECTS), (b',', "commas", MAX_COMMAS)] {
-        let count = json.iter().filter(|byte| **byte == sign).count();
-        if count > most {
-            return Err(invalid("json", format!("at most {most} {what}"), count));
+pub(super) fn parse_document(json: &[u8]) -> Result<Document> {
+    for (character, noun, limit) in [(b'{', "objects", MAX_OBJECTS), (b',', "commas", MAX_COMMAS)] {
+        let count = json.iter().filter(|byte| **byte == character).count();
+        if count > limit {
+            return Err(invalid("json", format!("at most {limit} {noun}"), count));
         }
     }
     serde_json::from_slice(json).map_err(|error| {
-        let (place, given) = locate(json).unwrap_or_else(|| ("json".into(), error.to_string()));
-        invalid(place, "a glTF 2.0 document", given)
+        let (field, given) = locate_error(json).unwrap_or_else(|| ("json".into(), error.to_string()));
+        invalid(field, "a glTF 2.0 document", given)
     })
 }
 
-/// The first element of a top-level list that does not parse on its own, with the reason. The parser itself reports
-/// only line and column, which do not help in a file of one line.
-fn locate(json: &[u8]) -> Option<(String, String)> {
+/// Finds the first element of a top-level list that does not parse on its own. Returns its field and the reason. The
+/// parser reports only line and column, which do not help because documents often have only one line.
+fn locate_error(json: &[u8]) -> Option<(String, String)> {
     use super::document as doc;
-    let root: Value = serde_json::from_slice(Some(json).filter(|json| json.len() <= MAX_SEARCHED)?).ok()?;
-    let search = [
-        ("scenes", first_bad::<doc::Scene> as fn(&Value) -> Option<(usize, String)>),
-        ("nodes", first_bad::<doc::Node>),
-        ("meshes", first_bad::<doc::Mesh>),
-        ("accessors", first_bad::<doc::Accessor>),
-        ("bufferViews", first_bad::<doc::BufferView>),
-        ("buffers", first_bad::<doc::Buffer>),
-        ("materials", first_bad::<doc::Material>),
-        ("textures", first_bad::<doc::Texture>),
-        ("images", first_bad::<doc::Image>),
-        ("samplers", first_bad::<doc::Sampler>),
+    let root: Value = serde_json::from_slice(Some(json).filter(|json| json.len() <= MAX_LOCATABLE_BYTES)?).ok()?;
+    let checks = [
+        ("scenes", first_invalid_element::<doc::Scene> as fn(&Value) -> Option<(usize, String)>),
+        ("nodes", first_invalid_element::<doc::Node>),
+        ("meshes", first_invalid_element::<doc::Mesh>),
+        ("accessors", first_invalid_element::<doc::Accessor>),
+        ("bufferViews", first_invalid_element::<doc::BufferView>),
+        ("buffers", first_invalid_element::<doc::Buffer>),
+        ("materials", first_invalid_element::<doc::Material>),
+        ("textures", first_invalid_element::<doc::Texture>),
+        ("images", first_invalid_element::<doc::Image>),
+        ("samplers", first_invalid_element::<doc::Sampler>),
     ];
-    search.into_iter().find_map(|(list, bad)| {
-        let (index, reason) = bad(root.get(list)?)?;
-        Some((format!("{list}[{index}]"), reason))
+    checks.into_iter().find_map(|(list_name, find_invalid)| {
+        let (index, reason) = find_invalid(root.get(list_name)?)?;
+        Some((format!("{list_name}[{index}]"), reason))
     })
 }
 
-fn first_bad<T: DeserializeOwned>(list: &Value) -> Option<(usize, String)> {
+fn first_invalid_element<T: DeserializeOwned>(list: &Value) -> Option<(usize, String)> {
     let reason = |element: &Value| T::deserialize(element).err().map(|error| error.to_string());
     list.as_array()?.iter().enumerate().find_map(|(index, element)| Some((index, reason(element)?)))
 }

@@ -1,5 +1,5 @@
-//! The supported part of glTF 2.0's JSON as plain structures. Values are not validated: indices may be out of range and
-//! counts may be any 64-bit number. Names follow the specification.
+//! The supported part of a glTF 2.0 document as plain structures. Values are not validated: indices may be out of range,
+//! and counts may be any 64-bit number. Names follow the specification.
 
 use std::collections::BTreeMap;
 
@@ -74,7 +74,7 @@ pub(super) struct Primitive {
     #[serde(default)]
     pub(super) material: Option<usize>,
     /// 4: triangles, 5: strip, 6: fan; 0 to 3: points and lines.
-    #[serde(default = "triangles")]
+    #[serde(default = "default_mode")]
     pub(super) mode: u64,
     #[serde(default)]
     pub(super) targets: Vec<BTreeMap<String, usize>>,
@@ -158,9 +158,9 @@ pub(super) struct Texture {
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Sampler {
-    #[serde(default = "repeat")]
+    #[serde(default = "default_wrap_mode")]
     pub(super) wrap_s: u64,
-    #[serde(default = "repeat")]
+    #[serde(default = "default_wrap_mode")]
     pub(super) wrap_t: u64,
 }
 
@@ -207,7 +207,7 @@ pub(super) struct TextureInfo {
     pub(super) index: usize,
     #[serde(default)]
     pub(super) tex_coord: u32,
-    /// For normal textures only.
+    /// Factor of x and y of the normals; for normal textures only.
     #[serde(default)]
     pub(super) scale: Option<f32>,
     #[serde(default)]
@@ -220,14 +220,14 @@ pub(super) struct TextureExtensions {
     pub(super) transform: Option<IgnoredAny>,
 }
 
-const fn triangles() -> u64 {
+/// The value of OpenGL's `GL_TRIANGLES`.
+const fn default_mode() -> u64 {
     4
 }
 
-/// The value of OpenGL's `GL_REPEAT`.
-const fn repeat() -> u64 {
+const fn default_wrap_mode() -> u64 {
     REPEAT
 }
 
-/// The only wrap mode that the renderer supports.
+/// The value of OpenGL's `GL_REPEAT`, the only wrap mode that the renderer supports.
 pub(super) const REPEAT: u64 = 10497;

@@ -1,8 +1,8 @@
 //! Converts glTF's metallic-roughness materials to Phong materials (equation 3.12 of the thesis).
 //!
-//! With base color factor c, metalness m and roughness p (each of m and p is its factor times the mean of its texture
-//! channel, because Phong's parameters are constant over a surface), alpha = p^2 and the reflectance at normal
-//! incidence f = 0.04 (1 - m) + c m:
+//! The inputs are the base color factor c, the metalness m and the roughness p. Both m and p are the product of their
+//! factor and the mean of their texture channel, because Phong's parameters are constant over a surface. With
+//! alpha = p^2 and the reflectance at normal incidence f = 0.04 (1 - m) + c m:
 //!
 //! ```text
 //! diffuse   = c (1 - m / 2)            a metal mirrors its surroundings, which are not rendered; half remains diffuse
@@ -12,8 +12,8 @@
 //! ```
 //!
 //! `shininess` is clamped to 1 to 10,000. The base color texture multiplies diffuse, ambient and alpha. Normal textures
-//! have +Y up, as in [`Material`]. A mask material remains one even if its base color texture has no alpha, because a
-//! scene file may replace the texture.
+//! have +Y up, as in [`Material`]. A material with alpha mode "mask" keeps this mode even if its base color texture has
+//! no alpha, because a scene file may replace the texture.
 
 use std::collections::HashMap;
 
@@ -31,53 +31,56 @@ pub(super) struct MaterialConverter<'a> {
     pub(super) texture_loader: TextureLoader<'a>,
     /// The converted materials.
     pub(super) materials: Vec<Material>,
-    /// Indices in `materials`, by index in the document (`None` is the default material) and usability of textures.
-    known: HashMap<(Option<usize>, bool), usize>,
+    /// Indices in `materials` by key. A key is the index in the document (`None` for the default material) and whether
+    /// the primitive has texture coordinates.
+    converted: HashMap<(Option<usize>, bool), usize>,
 }
 
 impl<'a> MaterialConverter<'a> {
     pub(super) fn new(document: &'a Document, texture_loader: TextureLoader<'a>) -> Self {
-        Self { document, texture_loader, materials: Vec::new(), known: HashMap::new() }
+        Self { document, texture_loader, materials: Vec::new(), converted: HashMap::new() }
     }
 
-    /// The set of texture coordinates of a material: that of the base color, else of the normal map, else 0.
+    /// The set of texture coordinates of a material: that of the base color texture, otherwise that of the normal map,
+    /// otherwise 0.
     ///
     /// # Errors
     /// `Invalid` if the material does not exist.
     pub(super) fn uv_set(&self, material: Option<usize>) -> Result<u32> {
         let Some(index) = material else { return Ok(0) };
         let material = get_element(&self.document.materials, index, "material")?;
-        let base = material.pbr_metallic_roughness.base_color_texture.as_ref();
-        Ok(base.or(material.normal_texture.as_ref()).map_or(0, |wanted| wanted.tex_coord))
+        let base_color_texture = material.pbr_metallic_roughness.base_color_texture.as_ref();
+        Ok(base_color_texture.or(material.normal_texture.as_ref()).map_or(0, |texture| texture.tex_coord))
     }
 
-    /// The index of a converted material. It has no textures if the primitive lacks the texture coordinates.
+    /// Returns the index of a converted material. The first call for a material converts it. The material has no textures
+    /// if the primitive lacks the texture coordinates.
     ///
     /// # Errors
     /// `Invalid` with the material and the field.
     pub(super) fn material_index(
         &mut self,
-        wanted: Option<usize>,
+        material_key: Option<usize>,
         has_uvs: bool,
         remarks: &mut ImportWarnings,
     ) -> Result<usize> {
-        if let Some(known) = self.known.get(&(wanted, has_uvs)) {
-            return Ok(*known);
+        if let Some(index) = self.converted.get(&(material_key, has_uvs)) {
+            return Ok(*index);
         }
-        let material = match wanted {
+        let material = match material_key {
             None => Material::default(),
             Some(index) => {
                 let source = get_element(&self.document.materials, index, "material")?;
-                let made = self.phong(source, index, has_uvs, remarks);
-                made.map_err(|error| error.prefix_field(&format!("materials[{index}]")))?
+                let converted_material = self.convert_to_phong(source, index, has_uvs, remarks);
+                converted_material.map_err(|error| error.prefix_field(&format!("materials[{index}]")))?
             }
         };
         self.materials.push(material);
-        self.known.insert((wanted, has_uvs), self.materials.len() - 1);
+        self.converted.insert((material_key, has_uvs), self.materials.len() - 1);
         Ok(self.materials.len() - 1)
     }
 
-    fn phong(
+    fn convert_to_phong(
         &mut self,
         source: &document::Material,
         index: usize,
@@ -88,94 +91,100 @@ impl<'a> MaterialConverter<'a> {
         let name = name.map_or_else(|| format!("material {index}"), |name| sanitize(name, 120));
         let pbr = &source.pbr_metallic_roughness;
         check_factors(pbr)?;
-        let color = self.base_color(pbr, &name, has_uvs, remarks)?;
-        let normal = self.normal_map(source, &name, has_uvs, remarks)?;
-        let (metal, roughness) = self.metal_and_roughness(pbr, &name, remarks)?;
+        let color_texture = self.load_base_color(pbr, &name, has_uvs, remarks)?;
+        let normal_texture = self.load_normal_map(source, &name, has_uvs, remarks)?;
+        let (metalness, roughness) = self.mean_metalness_and_roughness(pbr, &name, remarks)?;
         if source.occlusion_texture.is_some() {
             remarks.add(format!("material '{name}': the occlusion texture is ignored"));
         }
-        if source.emissive_texture.is_some() || source.emissive_factor.is_some_and(|color| color != [0.0; 3]) {
+        if source.emissive_texture.is_some()
+            || source.emissive_factor.is_some_and(|color_texture| color_texture != [0.0; 3])
+        {
             remarks.add(format!("material '{name}': emission is ignored"));
         }
         let [red, green, blue, alpha] = pbr.base_color_factor;
-        let base = [red, green, blue];
-        let square = roughness.powi(4).max(1e-8);
+        let base_color = [red, green, blue];
+        // alpha^2 of the GGX distribution; the minimum prevents a division by 0.
+        let alpha2 = roughness.powi(4).max(1e-8);
         Material {
-            ambient: base,
-            diffuse: base.map(|channel| channel * (1.0 - 0.5 * metal)),
-            specular: base.map(|channel| ((0.04 * (1.0 - metal) + channel * metal) / (4.0 * square)).min(1.0)),
-            shininess: ((2.0 / square - 2.0) / 4.0).clamp(1.0, 1e4),
+            ambient: base_color,
+            diffuse: base_color.map(|channel| channel * (1.0 - 0.5 * metalness)),
+            specular: base_color
+                .map(|channel| ((0.04 * (1.0 - metalness) + channel * metalness) / (4.0 * alpha2)).min(1.0)),
+            shininess: ((2.0 / alpha2 - 2.0) / 4.0).clamp(1.0, 1e4),
             alpha,
-            color_texture: color,
-            normal_texture: normal,
-            alpha_mode: alpha_mode(source)?,
+            color_texture,
+            normal_texture,
+            alpha_mode: convert_alpha_mode(source)?,
             double_sided: source.double_sided,
             name,
         }
         .validated()
     }
 
-    fn base_color(
+    fn load_base_color(
         &mut self,
         pbr: &document::PbrMetallicRoughness,
         name: &str,
         has_uvs: bool,
         remarks: &mut ImportWarnings,
     ) -> Result<Option<usize>> {
-        let Some(wanted) = &pbr.base_color_texture else { return Ok(None) };
+        let Some(texture) = &pbr.base_color_texture else { return Ok(None) };
         if !has_uvs {
-            let set = wanted.tex_coord;
-            remarks.add(format!("material '{name}': a primitive lacks TEXCOORD_{set}, its colour texture is left out"));
+            let uv_set = texture.tex_coord;
+            remarks
+                .add(format!("material '{name}': the color texture is ignored: a primitive lacks TEXCOORD_{uv_set}"));
             return Ok(None);
         }
         self.texture_loader
-            .texture_index(wanted, remarks)
+            .texture_index(texture, remarks)
             .map(Some)
-            .map_err(within("pbrMetallicRoughness.baseColorTexture"))
+            .map_err(prefix_with("pbrMetallicRoughness.baseColorTexture"))
     }
 
-    fn normal_map(
+    fn load_normal_map(
         &mut self,
         source: &document::Material,
         name: &str,
         has_uvs: bool,
         remarks: &mut ImportWarnings,
     ) -> Result<Option<usize>> {
-        let Some(wanted) = &source.normal_texture else { return Ok(None) };
-        let base = source.pbr_metallic_roughness.base_color_texture.as_ref();
-        let other_set = base.is_some_and(|base| base.tex_coord != wanted.tex_coord);
-        if other_set || !has_uvs {
-            let reason = if other_set { "it wants another set than the colour texture:" } else { "a primitive lacks" };
-            let set = wanted.tex_coord;
-            remarks.add(format!("material '{name}': the normal map is left out, {reason} TEXCOORD_{set}"));
+        let Some(texture) = &source.normal_texture else { return Ok(None) };
+        let base_color_texture = source.pbr_metallic_roughness.base_color_texture.as_ref();
+        let has_other_uv_set =
+            base_color_texture.is_some_and(|base_color_texture| base_color_texture.tex_coord != texture.tex_coord);
+        if has_other_uv_set || !has_uvs {
+            let reason = if has_other_uv_set { "the color texture does not use" } else { "a primitive lacks" };
+            let uv_set = texture.tex_coord;
+            remarks.add(format!("material '{name}': the normal map is ignored: {reason} TEXCOORD_{uv_set}"));
             return Ok(None);
         }
-        if let Some(scale) = wanted.scale.filter(|scale| *scale != 1.0) {
+        if let Some(scale) = texture.scale.filter(|scale| *scale != 1.0) {
             remarks.add(format!("material '{name}': the normal map's scale of {scale} is ignored"));
         }
-        self.texture_loader.texture_index(wanted, remarks).map(Some).map_err(within("normalTexture"))
+        self.texture_loader.texture_index(texture, remarks).map(Some).map_err(prefix_with("normalTexture"))
     }
 
-    /// Metalness and roughness, 0 to 1. Their texture stores them in blue and green.
-    fn metal_and_roughness(
+    /// Mean metalness and roughness, 0 to 1. The texture contains metalness in blue and roughness in green.
+    fn mean_metalness_and_roughness(
         &mut self,
         pbr: &document::PbrMetallicRoughness,
         name: &str,
         remarks: &mut ImportWarnings,
     ) -> Result<(f32, f32)> {
         let factors = (pbr.metallic_factor, pbr.roughness_factor);
-        let Some(wanted) = &pbr.metallic_roughness_texture else { return Ok(factors) };
+        let Some(texture) = &pbr.metallic_roughness_texture else { return Ok(factors) };
         let channel_means = self
             .texture_loader
-            .channel_means(wanted, remarks)
-            .map_err(within("pbrMetallicRoughness.metallicRoughnessTexture"))?;
-        remarks.add(format!("material '{name}': of the metallic-roughness texture only the mean is used"));
+            .channel_means(texture, remarks)
+            .map_err(prefix_with("pbrMetallicRoughness.metallicRoughnessTexture"))?;
+        remarks.add(format!("material '{name}': only the mean of the metallic-roughness texture is used"));
         Ok((factors.0 * channel_means[2], factors.1 * channel_means[1]))
     }
 }
 
-fn within(place: &str) -> impl Fn(crate::error::Error) -> crate::error::Error {
-    move |error| error.prefix_field(place)
+fn prefix_with(field: &str) -> impl Fn(crate::error::Error) -> crate::error::Error {
+    move |error| error.prefix_field(field)
 }
 
 fn check_factors(pbr: &document::PbrMetallicRoughness) -> Result<()> {
@@ -194,7 +203,7 @@ fn check_factors(pbr: &document::PbrMetallicRoughness) -> Result<()> {
     }
 }
 
-fn alpha_mode(source: &document::Material) -> Result<AlphaMode> {
+fn convert_alpha_mode(source: &document::Material) -> Result<AlphaMode> {
     match source.alpha_mode.as_deref() {
         None | Some("OPAQUE") => Ok(AlphaMode::Opaque),
         Some("BLEND") => Ok(AlphaMode::Blend),

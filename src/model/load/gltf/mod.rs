@@ -2,8 +2,8 @@
 //! targets become the columns of U (3n x r), weights become q, and nodes become transforms. Units are meters, Y is up.
 //!
 //! The JSON is parsed into our own structures, and all data is read with checked arithmetic. The `gltf` crate (1.4.1)
-//! is not used: its validation panics on some inputs, overflowing counts silently yield zero elements, and extensions
-//! that it was not built with are invisible, so that none of its checks could be relied on.
+//! is not used for three reasons: its validation panics on some inputs, overflowing counts silently yield zero elements,
+//! and it hides extensions that it was not built with.
 
 mod accessor;
 mod assemble;
@@ -28,9 +28,10 @@ use buffers::GltfBuffers;
 use warnings::ImportWarnings;
 
 /// The largest file in bytes: the model itself, or a buffer or image next to it.
-const MAX_FILE: u64 = 1 << 29;
+const MAX_FILE_BYTES: u64 = 1 << 29;
 
-/// Extensions that affect only the appearance of surfaces and lights; the geometry is correct without them.
+/// Name prefixes of extensions that affect only the appearance of surfaces and lights. The geometry is correct without
+/// them.
 const APPEARANCE_EXTENSIONS: [&str; 4] = ["KHR_materials_", "KHR_texture_transform", "KHR_lights_punctual", "KHR_xmp"];
 
 /// Reads the glTF or GLB file `path`. Its buffers and images must be in the file itself or in or below its folder.
@@ -38,7 +39,7 @@ const APPEARANCE_EXTENSIONS: [&str; 4] = ["KHR_materials_", "KHR_texture_transfo
 /// # Errors
 /// `Invalid` with the file, the field, and the expected and given value.
 pub(super) fn read(files: &AssetDir, path: &str) -> Result<SceneParts> {
-    let content = files.read(path, MAX_FILE)?;
+    let content = files.read(path, MAX_FILE_BYTES)?;
     let folder = match Path::new(path).parent().and_then(Path::to_str) {
         None | Some("") => files.clone(),
         Some(parent) => files.within(parent)?,
@@ -49,20 +50,20 @@ pub(super) fn read(files: &AssetDir, path: &str) -> Result<SceneParts> {
 
 /// Parses the bytes of a file. Relative URIs start at `folder`.
 fn parse(folder: &AssetDir, name: &str, content: &[u8]) -> Result<SceneParts> {
-    let container = container::split(content)?;
-    let document = container::parse(container.json)?;
+    let container = container::split_container(content)?;
+    let document = container::parse_document(container.json)?;
     let mut remarks = ImportWarnings::default();
     check_version(&document)?;
     check_extensions(&document, &mut remarks)?;
     warn_about_ignored_features(&document, &mut remarks);
-    let bytes = GltfBuffers::load(&document, folder, container.bin)?;
-    assemble::assemble(name, &document, &bytes, remarks)
+    let buffers = GltfBuffers::load(&document, folder, container.bin)?;
+    assemble::assemble(name, &document, &buffers, remarks)
 }
 
 fn check_version(document: &document::Document) -> Result<()> {
     let asset = &document.asset;
     // A later minor version is compatible unless the file requires it as minimum.
-    if asset.version.starts_with("2.") && asset.min_version.as_ref().is_none_or(|least| least == "2.0") {
+    if asset.version.starts_with("2.") && asset.min_version.as_ref().is_none_or(|min_version| min_version == "2.0") {
         return Ok(());
     }
     let given = format!("'{}' with minVersion {:?}", warnings::sanitize(&asset.version, 20), asset.min_version);
@@ -70,11 +71,11 @@ fn check_version(document: &document::Document) -> Result<()> {
 }
 
 fn check_extensions(document: &document::Document, remarks: &mut ImportWarnings) -> Result<()> {
-    let look_only = |name: &str| APPEARANCE_EXTENSIONS.iter().any(|start| name.starts_with(start));
-    for (get_element, name) in document.extensions_required.iter().enumerate() {
-        if !look_only(name) {
-            let field = format!("extensionsRequired[{get_element}]");
-            return Err(invalid(field, "an extension that is supported here (none that changes geometry is)", name));
+    let affects_only_appearance = |name: &str| APPEARANCE_EXTENSIONS.iter().any(|prefix| name.starts_with(prefix));
+    for (index, name) in document.extensions_required.iter().enumerate() {
+        if !affects_only_appearance(name) {
+            let field = format!("extensionsRequired[{index}]");
+            return Err(invalid(field, "no extension that changes geometry", name));
         }
     }
     for name in document.extensions_used.iter().chain(&document.extensions_required) {
@@ -84,18 +85,18 @@ fn check_extensions(document: &document::Document, remarks: &mut ImportWarnings)
 }
 
 fn warn_about_ignored_features(document: &document::Document, remarks: &mut ImportWarnings) {
-    for (count, what, why) in [
-        (document.animations.len(), "animations", "motion comes from the physics process"),
+    for (count, feature, reason) in [
+        (document.animations.len(), "animations", "simulations provide the motion"),
         (document.skins.len(), "skins", "meshes keep their bind pose"),
-        (document.cameras.len(), "cameras", "frames bring their own"),
+        (document.cameras.len(), "cameras", "clients provide the cameras"),
     ] {
         if count > 0 {
-            remarks.add(format!("{what} ({count}) are ignored: {why}"));
+            remarks.add(format!("{feature} ({count}) are ignored: {reason}"));
         }
     }
 }
 
-/// The element `index` of a list; an error names the list.
+/// The element `index` of a list. `field` is the field of an error.
 fn get_element<'a, T>(list: &'a [T], index: usize, field: &str) -> Result<&'a T> {
     list.get(index).ok_or_else(|| invalid(field, format!("an index below {}", list.len()), index))
 }

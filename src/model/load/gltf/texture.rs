@@ -4,8 +4,8 @@ use std::collections::HashMap;
 
 use super::buffers::GltfBuffers;
 use super::document::{Document, REPEAT, TextureInfo};
+use super::get_element;
 use super::warnings::{ImportWarnings, sanitize};
-use super::{buffers, get_element};
 use crate::domain::Texture;
 use crate::error::{Result, invalid};
 
@@ -13,41 +13,47 @@ use crate::error::{Result, invalid};
 #[derive(Debug)]
 pub(super) struct TextureLoader<'a> {
     document: &'a Document,
-    bytes: &'a buffers::GltfBuffers<'a>,
+    buffers: &'a GltfBuffers<'a>,
     /// The decoded textures.
     pub(super) textures: Vec<Texture>,
-    by_image: HashMap<usize, usize>,
-    means: HashMap<usize, [f32; 4]>,
+    /// Indices in `textures` by the index of the image.
+    texture_indices: HashMap<usize, usize>,
+    /// Channel means by the index of the image.
+    channel_means: HashMap<usize, [f32; 4]>,
 }
 
 impl<'a> TextureLoader<'a> {
-    pub(super) fn new(document: &'a Document, bytes: &'a GltfBuffers<'a>) -> Self {
-        Self { document, bytes, textures: Vec::new(), by_image: HashMap::new(), means: HashMap::new() }
+    pub(super) fn new(document: &'a Document, buffers: &'a GltfBuffers<'a>) -> Self {
+        Self { document, buffers, textures: Vec::new(), texture_indices: HashMap::new(), channel_means: HashMap::new() }
     }
 
-    /// The index of a decoded texture.
+    /// Returns the index of a texture. The first call for an image decodes it.
     ///
     /// # Errors
     /// `Invalid` if the texture does not exist or is not a PNG or JPEG image.
-    pub(super) fn texture_index(&mut self, wanted: &TextureInfo, remarks: &mut ImportWarnings) -> Result<usize> {
-        let image = self.image_of(wanted, remarks)?;
-        if let Some(known) = self.by_image.get(&image) {
-            return Ok(*known);
+    pub(super) fn texture_index(&mut self, texture_info: &TextureInfo, remarks: &mut ImportWarnings) -> Result<usize> {
+        let image_index = self.image_of(texture_info, remarks)?;
+        if let Some(index) = self.texture_indices.get(&image_index) {
+            return Ok(*index);
         }
-        let texture = self.decode(image)?;
+        let texture = self.decode(image_index)?;
         self.textures.push(texture);
-        self.by_image.insert(image, self.textures.len() - 1);
+        self.texture_indices.insert(image_index, self.textures.len() - 1);
         Ok(self.textures.len() - 1)
     }
 
-    /// The mean of each of the four channels, 0 to 1. The texture itself is not kept.
+    /// The mean of each of the four channels, 0 to 1. The texture is not added to `textures`.
     ///
     /// # Errors
     /// As for [`Self::texture_index`].
-    pub(super) fn channel_means(&mut self, wanted: &TextureInfo, remarks: &mut ImportWarnings) -> Result<[f32; 4]> {
-        let image = self.image_of(wanted, remarks)?;
-        if let Some(known) = self.means.get(&image) {
-            return Ok(*known);
+    pub(super) fn channel_means(
+        &mut self,
+        texture_info: &TextureInfo,
+        remarks: &mut ImportWarnings,
+    ) -> Result<[f32; 4]> {
+        let image = self.image_of(texture_info, remarks)?;
+        if let Some(means) = self.channel_means.get(&image) {
+            return Ok(*means);
         }
         let texture = self.decode(image)?;
         let mut sums = [0_u64; 4];
@@ -56,33 +62,34 @@ impl<'a> TextureLoader<'a> {
         }
         let pixels = f64::from(texture.width()) * f64::from(texture.height());
         let means = sums.map(|sum| (sum as f64 / (255.0 * pixels)) as f32);
-        self.means.insert(image, means);
+        self.channel_means.insert(image, means);
         Ok(means)
     }
 
     /// The image of a texture. Unsupported sampler settings are recorded as remarks.
-    fn image_of(&self, wanted: &TextureInfo, remarks: &mut ImportWarnings) -> Result<usize> {
-        let texture = get_element(&self.document.textures, wanted.index, "index")?;
-        let place = format!("textures[{}]", wanted.index);
+    fn image_of(&self, texture_info: &TextureInfo, remarks: &mut ImportWarnings) -> Result<usize> {
+        let texture = get_element(&self.document.textures, texture_info.index, "index")?;
+        let texture_field = format!("textures[{}]", texture_info.index);
         if let Some(sampler) = texture.sampler {
-            let sampler = get_element(&self.document.samplers, sampler, &format!("{place}.sampler"))?;
+            let sampler = get_element(&self.document.samplers, sampler, &format!("{texture_field}.sampler"))?;
             if (sampler.wrap_s, sampler.wrap_t) != (REPEAT, REPEAT) {
                 remarks.add("samplers that clamp or mirror are ignored: textures repeat".into());
             }
         }
-        if wanted.extensions.transform.is_some() {
-            remarks.add("KHR_texture_transform is not supported: texture coordinates stay as they are".into());
+        if texture_info.extensions.transform.is_some() {
+            remarks.add("KHR_texture_transform is not supported: texture coordinates remain unchanged".into());
         }
-        let source = texture.source.ok_or_else(|| invalid(format!("{place}.source"), "an image", "none"))?;
-        get_element(&self.document.images, source, &format!("{place}.source"))?;
-        Ok(source)
+        let image_index =
+            texture.source.ok_or_else(|| invalid(format!("{texture_field}.source"), "an image", "none"))?;
+        get_element(&self.document.images, image_index, &format!("{texture_field}.source"))?;
+        Ok(image_index)
     }
 
     fn decode(&self, image: usize) -> Result<Texture> {
-        let within = |error: crate::error::Error| error.prefix_field(&format!("images[{image}]"));
-        let encoded = self.bytes.image(image).map_err(within)?;
-        let texture = Texture::decode(self.name(image), &encoded).map_err(within)?;
-        self.bytes.charge_budget(texture.rgba().len() as u64).map_err(within)?;
+        let in_image = |error: crate::error::Error| error.prefix_field(&format!("images[{image}]"));
+        let encoded = self.buffers.image(image).map_err(in_image)?;
+        let texture = Texture::decode(self.name(image), &encoded).map_err(in_image)?;
+        self.buffers.charge_budget(texture.rgba().len() as u64).map_err(in_image)?;
         Ok(texture)
     }
 

@@ -1,12 +1,13 @@
 //! Messages about features of a model that the loader does not support, without duplicates.
 
-/// The largest number of stored remarks, so that a hostile file cannot flood the log.
+/// The largest number of stored remarks, so that a malicious file cannot flood the log.
 const MAX_WARNINGS: usize = 64;
 
 /// Remarks in order of occurrence.
 #[derive(Debug, Default)]
 pub(super) struct ImportWarnings {
     messages: Vec<String>,
+    /// Number of remarks that exceeded the limit.
     suppressed: usize,
 }
 
@@ -21,7 +22,7 @@ impl ImportWarnings {
         }
     }
 
-    /// All remarks, and the number of remarks that exceeded the limit.
+    /// All remarks, then a message with the number of remarks that exceeded the limit.
     pub(super) fn into_list(mut self) -> Vec<String> {
         if self.suppressed > 0 {
             self.messages.push(format!("and {} more remarks", self.suppressed));
@@ -31,8 +32,8 @@ impl ImportWarnings {
 }
 
 /// Sanitizes text from a file for display: no control characters, at most `most` characters.
-pub(super) fn sanitize(text: &str, most: usize) -> String {
-    text.chars().filter(|letter| !letter.is_control()).take(most).collect()
+pub(super) fn sanitize(text: &str, max_characters: usize) -> String {
+    text.chars().filter(|character| !character.is_control()).take(max_characters).collect()
 }
 
 #[cfg(test)]
@@ -40,7 +41,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_remark_is_made_once_and_a_flood_is_cut_and_counted() {
+    fn remarks_are_unique_and_limited() {
         let mut remarks = ImportWarnings::default();
         (0..3).for_each(|_| remarks.add("same\u{1b}[31m".into()));
         (0..100).for_each(|index| remarks.add(format!("other {index}")));

@@ -9,20 +9,20 @@ use crate::domain::{AlphaMode, Material};
 use crate::scene::Scene;
 
 /// A 2 x 2 PNG of one color.
-pub(super) fn png(pixel: [u8; 4]) -> Vec<u8> {
+pub(super) fn encode_png(pixel: [u8; 4]) -> Vec<u8> {
     let image = image::RgbaImage::from_pixel(2, 2, image::Rgba(pixel));
     let mut bytes = Cursor::new(Vec::new());
-    image.write_to(&mut bytes, image::ImageFormat::Png).expect("encoded");
+    image.write_to(&mut bytes, image::ImageFormat::Png).expect("an encoded PNG");
     bytes.into_inner()
 }
 
 /// A triangle with two sets of texture coordinates, one image as textures 0 and 1, and one material.
-pub(super) fn textured(material: Value) -> Model {
+pub(super) fn textured_triangle(material: Value) -> Model {
     let mut model = Model::triangle();
-    let near = model.floats("VEC2", 3, &[0.0, 0.0, 1.0, 0.0, 0.0, 1.0]);
-    let far = model.floats("VEC2", 3, &[5.0, 5.0, 6.0, 5.0, 5.0, 6.0]);
-    let image = model.view(&png([0, 128, 255, 255]));
-    model.primitive()["attributes"] = json!({"POSITION": 0, "TEXCOORD_0": near, "TEXCOORD_1": far});
+    let first_uvs = model.add_floats("VEC2", 3, &[0.0, 0.0, 1.0, 0.0, 0.0, 1.0]);
+    let second_uvs = model.add_floats("VEC2", 3, &[5.0, 5.0, 6.0, 5.0, 5.0, 6.0]);
+    let image = model.add_view(&encode_png([0, 128, 255, 255]));
+    model.primitive()["attributes"] = json!({"POSITION": 0, "TEXCOORD_0": first_uvs, "TEXCOORD_1": second_uvs});
     model.primitive()["material"] = 0.into();
     model.json["images"] = json!([{"name": "swatch", "bufferView": image, "mimeType": "image/png"}]);
     model.json["samplers"] = json!([{"wrapS": 33071, "magFilter": 9729}]);
@@ -31,94 +31,94 @@ pub(super) fn textured(material: Value) -> Model {
     model
 }
 
-fn material(source: Value) -> Material {
-    textured(source).parts().materials.remove(0)
+fn read_material(source: Value) -> Material {
+    textured_triangle(source).parts().materials.remove(0)
 }
 
 #[test]
-fn metalness_tints_the_specular_colour_and_roughness_sets_the_exponent() {
-    let factors = |metal: f32, rough: f32| {
+fn metalness_and_roughness_become_phong_parameters() {
+    let material_with_factors = |metalness: f32, roughness: f32| {
         let pbr = json!({
-            "baseColorFactor": [0.8, 0.4, 0.2, 0.5], "metallicFactor": metal, "roughnessFactor": rough
+            "baseColorFactor": [0.8, 0.4, 0.2, 0.5], "metallicFactor": metalness, "roughnessFactor": roughness
         });
-        material(json!({"pbrMetallicRoughness": pbr}))
+        read_material(json!({"pbrMetallicRoughness": pbr}))
     };
-    let plastic = factors(0.0, 0.5);
+    let plastic = material_with_factors(0.0, 0.5);
     assert_eq!((plastic.diffuse, plastic.ambient, plastic.alpha), ([0.8, 0.4, 0.2], [0.8, 0.4, 0.2], 0.5));
     // alpha^2 = 0.5^4 = 1/16: a peak of 0.04 x 16 / 4 and an exponent of (32 - 2) / 4.
     for channel in plastic.specular {
         assert!((channel - 0.16).abs() <= 1e-6, "{channel}");
     }
     assert!((plastic.shininess - 7.5).abs() <= 1e-5, "{}", plastic.shininess);
-    let metal = factors(1.0, 1.0);
+    let metal = material_with_factors(1.0, 1.0);
     assert_eq!(metal.diffuse, [0.4, 0.2, 0.1]);
     assert_eq!(metal.specular, [0.2, 0.1, 0.05]);
     assert_eq!(metal.shininess, 1.0);
-    let mirror = factors(1.0, 0.0);
+    let mirror = material_with_factors(1.0, 0.0);
     assert_eq!((mirror.specular, mirror.shininess), ([1.0; 3], 1e4));
 }
 
 #[test]
-fn the_metallic_roughness_texture_counts_by_its_mean_and_is_not_kept() {
+fn metallic_roughness_texture_is_replaced_by_its_mean() {
     let pbr = json!({"roughnessFactor": 0.5, "metallicRoughnessTexture": {"index": 0}});
-    let parts = textured(json!({"name": "m", "pbrMetallicRoughness": pbr})).parts();
+    let parts = textured_triangle(json!({"name": "m", "pbrMetallicRoughness": pbr})).parts();
     assert!(parts.textures.is_empty());
-    // Blue is 255: metal; green is 128 of 255: a quarter rough.
-    let square = (0.5 * 128.0 / 255.0_f32).powi(4);
+    // Blue is 255, so the metalness is 1. Green is 128, so the roughness is 0.5 x 128 / 255.
+    let alpha2 = (0.5 * 128.0 / 255.0_f32).powi(4);
     assert_eq!(parts.materials[0].diffuse, [0.5; 3]);
-    assert!((parts.materials[0].shininess / ((2.0 / square - 2.0) / 4.0) - 1.0).abs() <= 1e-5);
-    assert!(parts.remarks[0].contains("only the mean is used"), "{:?}", parts.remarks);
+    assert!((parts.materials[0].shininess / ((2.0 / alpha2 - 2.0) / 4.0) - 1.0).abs() <= 1e-5);
+    assert!(parts.remarks[0].contains("only the mean of the metallic-roughness texture"), "{:?}", parts.remarks);
 }
 
 #[test]
-fn alpha_modes_cutoffs_and_double_sides_are_kept_even_when_no_image_has_alpha() {
-    let mask = material(json!({
+fn alpha_mode_and_double_sided_do_not_depend_on_images() {
+    let mask = read_material(json!({
         "name": "leaf", "alphaMode": "MASK", "alphaCutoff": 0.25, "doubleSided": true,
         "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}
     }));
     assert_eq!((mask.name.as_str(), mask.alpha_mode), ("leaf", AlphaMode::Mask { cutoff: 0.25 }));
     assert!(mask.double_sided && mask.color_texture == Some(0));
-    assert_eq!(material(json!({"alphaMode": "MASK"})).alpha_mode, AlphaMode::Mask { cutoff: 0.5 });
-    assert_eq!(material(json!({"alphaMode": "BLEND"})).alpha_mode, AlphaMode::Blend);
-    assert_eq!(material(json!({})).alpha_mode, AlphaMode::Opaque);
-    assert!(!material(json!({})).double_sided);
+    assert_eq!(read_material(json!({"alphaMode": "MASK"})).alpha_mode, AlphaMode::Mask { cutoff: 0.5 });
+    assert_eq!(read_material(json!({"alphaMode": "BLEND"})).alpha_mode, AlphaMode::Blend);
+    assert_eq!(read_material(json!({})).alpha_mode, AlphaMode::Opaque);
+    assert!(!read_material(json!({})).double_sided);
 }
 
 #[test]
-fn an_image_is_decoded_once_for_both_of_its_roles() {
+fn image_of_two_textures_is_decoded_once() {
     let source = json!({
         "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}},
         "normalTexture": {"index": 1, "scale": 0.5}
     });
-    let parts = textured(source).parts();
+    let parts = textured_triangle(source).parts();
     assert_eq!((parts.textures.len(), parts.textures[0].name.as_str()), (1, "swatch"));
     assert_eq!(parts.textures[0].rgba()[..4], [0, 128, 255, 255]);
     assert_eq!((parts.materials[0].color_texture, parts.materials[0].normal_texture), (Some(0), Some(0)));
-    for said in ["scale of 0.5", "samplers that clamp"] {
-        assert!(parts.remarks.iter().any(|remark| remark.contains(said)), "{said} in {:?}", parts.remarks);
+    for text in ["scale of 0.5", "samplers that clamp"] {
+        assert!(parts.remarks.iter().any(|remark| remark.contains(text)), "expected '{text}', got {:?}", parts.remarks);
     }
-    let scene = Scene::new(parts).expect("a scene");
+    let scene = Scene::new(parts).expect("a valid scene");
     assert_eq!(scene.shapes[0].tangents().len(), 3);
 }
 
 #[test]
-fn the_colour_texture_chooses_the_set_and_a_normal_map_of_another_set_is_left_out() {
+fn color_texture_selects_uv_set_and_excludes_other_normal_maps() {
     let source = json!({
         "pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1}},
         "normalTexture": {"index": 0}
     });
-    let parts = textured(source).parts();
+    let parts = textured_triangle(source).parts();
     assert_eq!(parts.shapes[0].mesh.corners().uvs[0], [5.0, 5.0]);
     assert_eq!((parts.materials[0].color_texture, parts.materials[0].normal_texture), (Some(0), None));
-    assert!(parts.remarks[0].contains("it wants another set"), "{:?}", parts.remarks);
-    let normal_only = textured(json!({"normalTexture": {"index": 0, "texCoord": 1}})).parts();
+    assert!(parts.remarks[0].contains("the color texture does not use TEXCOORD_0"), "{:?}", parts.remarks);
+    let normal_only = textured_triangle(json!({"normalTexture": {"index": 0, "texCoord": 1}})).parts();
     assert_eq!(normal_only.shapes[0].mesh.corners().uvs[0], [5.0, 5.0]);
     assert_eq!(normal_only.materials[0].normal_texture, Some(0));
 }
 
 #[test]
-fn a_primitive_without_coordinates_gets_its_material_without_textures() {
-    let mut model = textured(json!({"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}));
+fn primitive_without_uvs_has_a_material_without_textures() {
+    let mut model = textured_triangle(json!({"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}));
     push(&mut model.json["meshes"][0]["primitives"], json!({"attributes": {"POSITION": 0}, "material": 0}));
     push(&mut model.json["meshes"][0]["primitives"], json!({"attributes": {"POSITION": 0}}));
     let parts = model.parts();
@@ -130,13 +130,13 @@ fn a_primitive_without_coordinates_gets_its_material_without_textures() {
 
 #[test]
 fn occlusion_emission_and_texture_transforms_are_reported() {
-    let transform = json!({"index": 0, "extensions": {"KHR_texture_transform": {"scale": [2, 2]}}});
+    let transformed_texture = json!({"index": 0, "extensions": {"KHR_texture_transform": {"scale": [2, 2]}}});
     let source = json!({
         "name": "all", "occlusionTexture": {"index": 0}, "emissiveFactor": [0, 1, 0],
-        "pbrMetallicRoughness": {"baseColorTexture": transform}
+        "pbrMetallicRoughness": {"baseColorTexture": transformed_texture}
     });
-    let remarks = textured(source).parts().remarks;
-    for said in ["KHR_texture_transform", "'all': the occlusion texture", "'all': emission"] {
-        assert!(remarks.iter().any(|remark| remark.contains(said)), "{said} in {remarks:?}");
+    let remarks = textured_triangle(source).parts().remarks;
+    for text in ["KHR_texture_transform", "'all': the occlusion texture", "'all': emission"] {
+        assert!(remarks.iter().any(|remark| remark.contains(text)), "expected '{text}', got {remarks:?}");
     }
 }

@@ -1,4 +1,4 @@
-//! Tests of the glTF reader with small generated models.
+//! Tests of the glTF loader with small generated models.
 
 mod malformed;
 mod materials;
@@ -36,11 +36,12 @@ impl Model {
             "accessors": []
         });
         let mut model = Self { json, bin: Vec::new() };
-        model.floats("VEC3", 3, &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
+        model.add_floats("VEC3", 3, &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
         model
     }
 
-    fn view(&mut self, bytes: &[u8]) -> usize {
+    /// Appends the bytes to the binary chunk. Returns the index of their buffer view.
+    fn add_view(&mut self, bytes: &[u8]) -> usize {
         self.bin.resize(self.bin.len().next_multiple_of(4), 0);
         let view = json!({"buffer": 0, "byteOffset": self.bin.len(), "byteLength": bytes.len()});
         self.bin.extend_from_slice(bytes);
@@ -48,24 +49,27 @@ impl Model {
         push(&mut self.json["bufferViews"], view)
     }
 
-    fn accessor(&mut self, bytes: &[u8], component: u64, kind: &str, count: usize) -> usize {
-        let view = self.view(bytes);
+    /// Returns the index of the accessor.
+    fn add_accessor(&mut self, bytes: &[u8], component: u64, kind: &str, count: usize) -> usize {
+        let view = self.add_view(bytes);
         let accessor = json!({"bufferView": view, "componentType": component, "type": kind, "count": count});
         push(&mut self.json["accessors"], accessor)
     }
 
-    fn floats(&mut self, kind: &str, count: usize, numbers: &[f32]) -> usize {
-        self.accessor(bytemuck::cast_slice(numbers), F32, kind, count)
+    /// Returns the index of the accessor.
+    fn add_floats(&mut self, kind: &str, count: usize, numbers: &[f32]) -> usize {
+        self.add_accessor(bytemuck::cast_slice(numbers), F32, kind, count)
     }
 
+    /// The only primitive of the first mesh.
     fn primitive(&mut self) -> &mut Value {
         &mut self.json["meshes"][0]["primitives"][0]
     }
 
     /// The model with a value set at a JSON pointer.
     fn with(mut self, pointer: &str, value: Value) -> Self {
-        let (parent, key) = pointer.rsplit_once('/').expect("a pointer");
-        let parent = self.json.pointer_mut(parent).expect("there");
+        let (parent, key) = pointer.rsplit_once('/').expect("a JSON pointer");
+        let parent = self.json.pointer_mut(parent).expect("an existing parent");
         match parent.as_array_mut() {
             Some(list) => list[key.parse::<usize>().expect("an index")] = value,
             None => parent[key] = value,
@@ -73,7 +77,7 @@ impl Model {
         self
     }
 
-    fn glb(&self) -> Vec<u8> {
+    fn to_glb(&self) -> Vec<u8> {
         let mut text = self.json.to_string().into_bytes();
         text.resize(text.len().next_multiple_of(4), b' ');
         let mut glb = b"glTF\x02\0\0\0\0\0\0\0".to_vec();
@@ -88,14 +92,15 @@ impl Model {
     }
 
     fn read(&self) -> Result<SceneParts> {
-        super::parse(&AssetDir::unrestricted(&std::env::temp_dir()), "model", &self.glb())
+        super::parse(&AssetDir::unrestricted(&std::env::temp_dir()), "model", &self.to_glb())
     }
 
     fn parts(&self) -> SceneParts {
-        self.read().expect("a sound model")
+        self.read().expect("a valid model")
     }
 }
 
+/// Appends a value to a JSON list. Returns its index.
 fn push(list: &mut Value, value: Value) -> usize {
     let list = list.as_array_mut().expect("a list");
     list.push(value);
@@ -103,16 +108,16 @@ fn push(list: &mut Value, value: Value) -> usize {
 }
 
 /// A triangle with two targets. The second is sparse without base data and moves only vertex 2.
-fn morphed() -> Model {
+fn morphed_triangle() -> Model {
     let mut model = Model::triangle();
-    let dense = model.floats("VEC3", 3, &[0.0, 0.0, 1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 3.0]);
-    let places = model.view(&[2]);
-    let values = model.view(bytemuck::cast_slice(&[0.5_f32, -0.5, 0.25]));
+    let dense = model.add_floats("VEC3", 3, &[0.0, 0.0, 1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 3.0]);
+    let sparse_indices = model.add_view(&[2]);
+    let values = model.add_view(bytemuck::cast_slice(&[0.5_f32, -0.5, 0.25]));
     let sparse = json!({
         "componentType": F32, "type": "VEC3", "count": 3,
         "sparse": {
             "count": 1,
-            "indices": {"bufferView": places, "componentType": U8},
+            "indices": {"bufferView": sparse_indices, "componentType": U8},
             "values": {"bufferView": values}
         }
     });
@@ -122,32 +127,32 @@ fn morphed() -> Model {
 }
 
 #[test]
-fn morph_positions_are_the_columns_of_u_dense_or_sparse_and_normal_targets_are_reported() {
-    let parts = morphed().parts();
+fn position_targets_are_columns_of_u_and_normals_are_ignored() {
+    let parts = morphed_triangle().parts();
     let modes = &parts.shapes[0].modes;
     assert_eq!((modes.rank(), modes.vertices()), (2, 3));
     assert_eq!(modes.column(0), [0.0, 0.0, 1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 3.0]);
     assert_eq!(modes.column(1), [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, -0.5, 0.25]);
     assert_eq!(parts.domains[0].rest_q, [] as [f32; 0]);
     assert!(parts.remarks.iter().any(|remark| remark.starts_with("NORMAL targets are ignored")), "{:?}", parts.remarks);
-    assert_eq!(Scene::new(parts).expect("a scene").rank_of(0), 2);
+    assert_eq!(Scene::new(parts).expect("a valid scene").rank_of(0), 2);
 }
 
 #[test]
-fn sparse_values_lie_over_the_dense_ones() {
-    let mut model = morphed();
+fn sparse_values_replace_dense_values() {
+    let mut model = morphed_triangle();
     model.json["accessors"][2]["bufferView"] = 0.into();
     let parts = model.parts();
     assert_eq!(parts.shapes[0].modes.column(1), [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.5, -0.5, 0.25]);
 }
 
 #[test]
-fn targets_without_motion_make_a_rigid_domain_and_one_that_moves_keeps_them_all() {
+fn only_zero_targets_are_dropped_together() {
     let mut model = Model::triangle();
-    let zeros = model.floats("VEC3", 3, &[0.0; 9]);
-    let void = json!({"componentType": F32, "type": "VEC3", "count": 3});
-    let void = push(&mut model.json["accessors"], void);
-    model.primitive()["targets"] = json!([{"POSITION": zeros}, {"POSITION": void}, {}]);
+    let zeros = model.add_floats("VEC3", 3, &[0.0; 9]);
+    let empty = json!({"componentType": F32, "type": "VEC3", "count": 3});
+    let empty = push(&mut model.json["accessors"], empty);
+    model.primitive()["targets"] = json!([{"POSITION": zeros}, {"POSITION": empty}, {}]);
     model.json["nodes"][0]["weights"] = json!([1.0, 2.0, 3.0]);
     let parts = model.parts();
     assert_eq!(parts.shapes[0].modes.rank(), 0);
@@ -157,30 +162,30 @@ fn targets_without_motion_make_a_rigid_domain_and_one_that_moves_keeps_them_all(
 }
 
 #[test]
-fn weights_of_the_node_win_over_those_of_the_mesh_and_primitives_of_one_node_share_them() {
-    let mut model = morphed();
-    let moving = model.primitive().clone();
+fn node_weights_override_mesh_weights_for_all_primitives() {
+    let mut model = morphed_triangle();
+    let morphed_primitive = model.primitive().clone();
     push(&mut model.json["meshes"][0]["primitives"], json!({"attributes": {"POSITION": 0}}));
-    push(&mut model.json["meshes"][0]["primitives"], moving);
+    push(&mut model.json["meshes"][0]["primitives"], morphed_primitive);
     push(&mut model.json["nodes"], json!({"mesh": 0, "weights": [3.0, 4.0]}));
     let model = model.with("/meshes/0/weights", json!([1.0, 2.0])).with("/scenes/0/nodes", json!([0, 1]));
     let parts = model.parts();
     let weights: Vec<&[f32]> = parts.domains.iter().map(|domain| domain.rest_q.as_slice()).collect();
     assert_eq!(weights, [&[1.0, 2.0][..], &[], &[1.0, 2.0], &[3.0, 4.0], &[], &[3.0, 4.0]]);
-    let shared: Vec<_> = parts.domains.iter().map(|domain| domain.shares_q_with).collect();
-    assert_eq!(shared, [None, None, Some(0), None, None, Some(3)]);
+    let shares_q_with: Vec<_> = parts.domains.iter().map(|domain| domain.shares_q_with).collect();
+    assert_eq!(shares_q_with, [None, None, Some(0), None, None, Some(3)]);
     let shapes: Vec<_> = parts.domains.iter().map(|domain| domain.shape).collect();
     assert_eq!((shapes, parts.shapes.len()), (vec![0, 1, 2, 0, 1, 2], 3));
-    Scene::new(parts).expect("a scene");
+    Scene::new(parts).expect("a valid scene");
 }
 
 #[test]
-fn nodes_are_placed_by_the_product_of_their_matrices_and_hang_on_the_nearest_mesh_above() {
-    let half = std::f64::consts::FRAC_1_SQRT_2;
+fn nodes_are_placed_and_attached_to_the_nearest_ancestor_mesh() {
+    let sqrt_half = std::f64::consts::FRAC_1_SQRT_2;
     let nodes = json!([
         {"name": "leaf", "mesh": 0, "translation": [0, 0, 1]},
         {"name": "root", "mesh": 0, "children": [2], "translation": [10, 0, 0], "scale": [2, 2, 2]},
-        {"name": "joint", "children": [0], "rotation": [0, 0, half, half]},
+        {"name": "joint", "children": [0], "rotation": [0, 0, sqrt_half, sqrt_half]},
         {"name": "leaf", "mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 5, 0, 1]}
     ]);
     let model = Model::triangle().with("/nodes", nodes).with("/scenes/0/nodes", json!([1, 3]));
@@ -188,76 +193,77 @@ fn nodes_are_placed_by_the_product_of_their_matrices_and_hang_on_the_nearest_mes
     let names: Vec<&str> = parts.domains.iter().map(|domain| domain.name.as_str()).collect();
     assert_eq!(names, ["root.0", "leaf.0", "leaf #3.0"]);
     assert_eq!(parts.shapes.len(), 1);
-    close(&parts.domains[1].placement.0, &[0.0, -2.0, 0.0, 10.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0]);
-    close(&parts.domains[2].placement.0, &[1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 5.0, 0.0, 0.0, 1.0, 0.0]);
-    let attachment = parts.domains[1].attachment.as_ref().expect("hangs on root");
+    assert_close(&parts.domains[1].placement.0, &[0.0, -2.0, 0.0, 10.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0, 2.0]);
+    assert_close(&parts.domains[2].placement.0, &[1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 5.0, 0.0, 0.0, 1.0, 0.0]);
+    let attachment = parts.domains[1].attachment.as_ref().expect("an attachment to the root");
     assert_eq!((attachment.parent, attachment.rows.len()), (0, 0));
-    close(&attachment.frame.0, &[0.0, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]);
-    let composed = parts.domains[0].placement.compose(attachment.frame);
-    close(&composed.0, &parts.domains[1].placement.0);
+    assert_close(&attachment.frame.0, &[0.0, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]);
+    let world_from_leaf = parts.domains[0].placement.compose(attachment.frame);
+    assert_close(&world_from_leaf.0, &parts.domains[1].placement.0);
     assert!(parts.domains[0].attachment.is_none() && parts.domains[2].attachment.is_none());
-    Scene::new(parts).expect("a scene");
+    Scene::new(parts).expect("a valid scene");
 }
 
-fn close(got: &[f32; 12], want: &[f32; 12]) {
-    assert!(got.iter().zip(want).all(|(got, want)| (got - want).abs() <= 1e-6), "{got:?} is not {want:?}");
+fn assert_close(actual: &[f32; 12], expected: &[f32; 12]) {
+    let is_close = actual.iter().zip(expected).all(|(a, b)| (a - b).abs() <= 1e-6);
+    assert!(is_close, "expected {expected:?}, got {actual:?}");
 }
 
 #[test]
-fn a_chain_of_a_hundred_thousand_nodes_is_walked_without_recursion() {
-    let last = 100_000;
-    let mut nodes: Vec<Value> = (0..last).map(|node| json!({"children": [node + 1]})).collect();
+fn chain_of_100000_nodes_is_read_without_recursion() {
+    let node_count = 100_000;
+    let mut nodes: Vec<Value> = (0..node_count).map(|node| json!({"children": [node + 1]})).collect();
     nodes.push(json!({"mesh": 0, "translation": [0, 2, 0]}));
     let parts = Model::triangle().with("/nodes", nodes.into()).parts();
     assert_eq!((parts.domains.len(), parts.domains[0].placement.0[7]), (1, 2.0));
 }
 
 #[test]
-fn indices_of_one_two_and_four_bytes_give_the_same_triangles_and_lists_strips_and_fans_the_right_ones() {
+fn all_index_types_and_topologies_give_correct_triangles() {
     let mut model = Model::triangle();
     model.json["accessors"] = json!([]);
-    model.floats("VEC3", 5, &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 2.0, 0.0]);
-    let order = [0_u32, 1, 2, 3, 3, 4];
-    let bytes = order.map(|index| index as u8);
-    let shorts = order.map(|index| index as u16);
+    model.add_floats("VEC3", 5, &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 2.0, 0.0]);
+    let u32_indices = [0_u32, 1, 2, 3, 3, 4];
+    let u8_indices = u32_indices.map(|index| index as u8);
+    let u16_indices = u32_indices.map(|index| index as u16);
     let accessors = [
-        model.accessor(&bytes, U8, "SCALAR", 6),
-        model.accessor(bytemuck::cast_slice(&shorts), U16, "SCALAR", 6),
-        model.accessor(bytemuck::cast_slice(&order), U32, "SCALAR", 6),
+        model.add_accessor(&u8_indices, U8, "SCALAR", 6),
+        model.add_accessor(bytemuck::cast_slice(&u16_indices), U16, "SCALAR", 6),
+        model.add_accessor(bytemuck::cast_slice(&u32_indices), U32, "SCALAR", 6),
     ];
-    let mut triangles = |mode: u64, indices: usize| {
-        *model.primitive() = json!({"attributes": {"POSITION": 0}, "indices": indices, "mode": mode});
+    let mut triangles = |mode: u64, accessor: usize| {
+        *model.primitive() = json!({"attributes": {"POSITION": 0}, "indices": accessor, "mode": mode});
         model.parts().shapes[0].mesh.triangles().to_vec()
     };
-    for indices in accessors {
-        assert_eq!(triangles(4, indices), [[0, 1, 2], [3, 3, 4]]);
-        assert_eq!(triangles(5, indices), [[0, 1, 2], [1, 3, 2]]);
-        assert_eq!(triangles(6, indices), [[1, 2, 0], [2, 3, 0], [3, 3, 0], [3, 4, 0]]);
+    for accessor in accessors {
+        assert_eq!(triangles(4, accessor), [[0, 1, 2], [3, 3, 4]]);
+        assert_eq!(triangles(5, accessor), [[0, 1, 2], [1, 3, 2]]);
+        assert_eq!(triangles(6, accessor), [[1, 2, 0], [2, 3, 0], [3, 3, 0], [3, 4, 0]]);
     }
 }
 
 #[test]
-fn points_and_lines_are_left_out_and_said_so() {
+fn points_and_lines_are_ignored_with_a_remark() {
     let mut model = Model::triangle();
     for mode in 0..4 {
         push(&mut model.json["meshes"][0]["primitives"], json!({"attributes": {"POSITION": 0}, "mode": mode}));
     }
     let parts = model.parts();
     assert_eq!(parts.domains.len(), 1);
-    assert_eq!(parts.remarks, ["primitives of points or lines are left out"]);
+    assert_eq!(parts.remarks, ["primitives of points or lines are ignored"]);
 }
 
 #[test]
-fn interleaved_vertices_and_normalised_coordinates_are_read_and_missing_normals_computed() {
+fn interleaved_and_normalized_attributes_are_decoded() {
     let mut model = Model::triangle();
-    assert_eq!(model.parts().shapes[0].mesh.corners().normals, [[0.0, 0.0, 1.0]; 3]);
-    // Twelve bytes of position, four of coordinates; the last stride may be shorter than the others.
+    assert_eq!(model.parts().shapes[0].mesh.corners().normals, [[0.0, 0.0, 1.0]; 3], "expected smooth normals");
+    // A vertex has twelve bytes of position and four bytes of texture coordinates.
     let mut bytes = Vec::new();
     for (x, u) in [(0.0_f32, 0_u16), (4.0, 65535), (8.0, 13107)] {
         bytes.extend(bytemuck::cast_slice::<f32, u8>(&[x, x * x, 0.0]));
         bytes.extend(bytemuck::cast_slice::<u16, u8>(&[u, 65535 - u]));
     }
-    let view = model.view(&bytes);
+    let view = model.add_view(&bytes);
     model.json["bufferViews"][view]["byteStride"] = 16.into();
     model.json["accessors"] = json!([
         {"bufferView": view, "componentType": F32, "type": "VEC3", "count": 3},
@@ -270,61 +276,67 @@ fn interleaved_vertices_and_normalised_coordinates_are_read_and_missing_normals_
 }
 
 #[test]
-fn a_gltf_reads_data_uris_and_files_beside_it_and_not_those_of_another_folder() {
+fn buffers_are_read_from_data_uris_and_the_model_folder_only() {
     use base64::Engine;
-    let folder = tempfile::tempdir().expect("a folder");
+    let folder = tempfile::tempdir().expect("a temporary folder");
     let mut model = Model::triangle();
-    std::fs::create_dir(folder.path().join("sub")).expect("made");
-    std::fs::write(folder.path().join("sub/my buffer.bin"), &model.bin).expect("written");
-    std::fs::write(folder.path().join("secret.bin"), &model.bin).expect("written");
+    std::fs::create_dir(folder.path().join("sub")).expect("a new folder");
+    std::fs::write(folder.path().join("sub/my buffer.bin"), &model.bin).expect("a writable file");
+    std::fs::write(folder.path().join("secret.bin"), &model.bin).expect("a writable file");
     let files = AssetDir::unrestricted(folder.path());
-    let mut read = |uri: String| {
+    let mut read_buffer_uri = |uri: String| {
         model.json["buffers"][0]["uri"] = uri.into();
-        std::fs::write(folder.path().join("sub/model.gltf"), model.json.to_string()).expect("written");
+        std::fs::write(folder.path().join("sub/model.gltf"), model.json.to_string()).expect("a writable file");
         super::read(&files, "sub/model.gltf")
     };
     let data = base64::engine::general_purpose::STANDARD.encode(&Model::triangle().bin);
-    let embedded = read(format!("data:application/octet-stream;base64,{data}")).expect("embedded");
-    let beside = read("my%20buffer.bin".into()).expect("beside");
-    assert_eq!(embedded.shapes[0].mesh, beside.shapes[0].mesh);
-    assert_eq!((beside.name.as_str(), beside.domains[0].name.as_str()), ("model", "one.0"));
+    let from_data_uri = read_buffer_uri(format!("data:application/octet-stream;base64,{data}")).expect("a valid model");
+    let from_file = read_buffer_uri("my%20buffer.bin".into()).expect("a valid model");
+    assert_eq!(from_data_uri.shapes[0].mesh, from_file.shapes[0].mesh);
+    assert_eq!((from_file.name.as_str(), from_file.domains[0].name.as_str()), ("model", "one.0"));
     let secret = folder.path().join("secret.bin");
-    for uri in ["../secret.bin", "%2e%2e/secret.bin", "file:///x", "https://host/x", secret.to_str().expect("utf-8")] {
-        let refusal = read(uri.into()).expect_err(uri).to_string();
+    for uri in
+        ["../secret.bin", "%2e%2e/secret.bin", "file:///x", "https://host/x", secret.to_str().expect("a UTF-8 path")]
+    {
+        let message = read_buffer_uri(uri.into()).expect_err(uri).to_string();
         let expected =
             "file 'sub/model.gltf': buffers[0]: uri: expected a data URI or a path in or below the model's folder";
-        assert!(refusal.starts_with(expected), "{refusal}");
+        assert!(message.starts_with(expected), "{message}");
     }
-    let missing = read("absent.bin".into()).expect_err("absent").to_string();
-    assert!(missing.contains("buffers[0]: file 'absent.bin'"), "{missing}");
+    let message = read_buffer_uri("absent.bin".into()).expect_err("a missing file").to_string();
+    assert!(message.contains("buffers[0]: file 'absent.bin'"), "{message}");
 }
 
 #[test]
-fn what_is_left_out_is_said_once_and_required_extensions_that_change_geometry_are_refused_by_name() {
+fn unsupported_features_are_reported_or_rejected() {
     let model = Model::triangle()
         .with("/animations", json!([{"channels": [{"x": 1}]}, {}]))
         .with("/skins", json!([{}]))
         .with("/extensionsUsed", json!(["KHR_materials_unlit", "KHR_texture_transform"]))
         .with("/extensionsRequired", json!(["KHR_texture_transform"]));
     let remarks = model.parts().remarks;
-    for said in ["KHR_materials_unlit", "KHR_texture_transform", "animations (2)", "skins (1)"] {
-        assert_eq!(remarks.iter().filter(|remark| remark.contains(said)).count(), 1, "{said} in {remarks:?}");
+    for feature in ["KHR_materials_unlit", "KHR_texture_transform", "animations (2)", "skins (1)"] {
+        assert_eq!(
+            remarks.iter().filter(|remark| remark.contains(feature)).count(),
+            1,
+            "expected one remark on {feature}, got {remarks:?}"
+        );
     }
     for name in ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh_quantization"] {
-        let refusal = Model::triangle().with("/extensionsRequired", json!([name])).read().expect_err(name).to_string();
-        assert!(refusal.starts_with("extensionsRequired[0]") && refusal.ends_with(name), "{refusal}");
+        let message = Model::triangle().with("/extensionsRequired", json!([name])).read().expect_err(name).to_string();
+        assert!(message.starts_with("extensionsRequired[0]") && message.ends_with(name), "{message}");
     }
 }
 
 #[test]
-fn only_the_scene_of_the_document_is_loaded() {
+fn only_the_default_scene_is_loaded() {
     let model = Model::triangle()
         .with("/nodes", json!([{"name": "a", "mesh": 0}, {"name": "b", "mesh": 0}]))
         .with("/scenes", json!([{"nodes": [0]}, {"nodes": [1]}]))
         .with("/scene", json!(1));
     let parts = model.parts();
     assert_eq!((parts.domains.len(), parts.domains[0].name.as_str()), (1, "b.0"));
-    assert_eq!(parts.remarks, ["of 2 scenes only number 1 is loaded"]);
-    let bare = model.with("/scenes", json!([])).with("/scene", Value::Null).parts();
-    assert_eq!(bare.domains.len(), 2);
+    assert_eq!(parts.remarks, ["only scene 1 of 2 scenes is loaded"]);
+    let parts_without_scenes = model.with("/scenes", json!([])).with("/scene", Value::Null).parts();
+    assert_eq!(parts_without_scenes.domains.len(), 2);
 }

@@ -1,4 +1,4 @@
-//! Tests with the real models among the inputs.
+//! Tests with real models. They are ignored by default, because the datasets are not part of the repository.
 
 use std::path::PathBuf;
 
@@ -6,16 +6,16 @@ use crate::domain::{AlphaMode, Texture};
 use crate::load::asset_dir::AssetDir;
 use crate::scene::{Scene, SceneParts};
 
-fn read(path: &str) -> SceneParts {
-    let here = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
-    let data = std::env::var_os("MODALCAST_DATA").map_or(here, PathBuf::from);
-    super::super::read(&AssetDir::unrestricted(&data), path).expect("the real input")
+fn read_dataset(path: &str) -> SceneParts {
+    let default_folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
+    let folder = std::env::var_os("MODALCAST_DATA").map_or(default_folder, PathBuf::from);
+    super::super::read(&AssetDir::unrestricted(&folder), path).expect("a valid model")
 }
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-fn real_morph_stress_test_has_a_rigid_plate_and_a_block_of_eight_modes() {
-    let parts = read("gltf/MorphStressTest/MorphStressTest.gltf");
+fn real_morph_stress_test_has_a_rigid_and_a_modal_domain() {
+    let parts = read_dataset("gltf/MorphStressTest/MorphStressTest.gltf");
     assert_eq!(parts.name, "MorphStressTest");
     let names: Vec<&str> = parts.domains.iter().map(|domain| domain.name.as_str()).collect();
     assert_eq!(names, ["Main.0", "Main.1"]);
@@ -28,22 +28,24 @@ fn real_morph_stress_test_has_a_rigid_plate_and_a_block_of_eight_modes() {
     // The accessors declare these extrema of the eight targets.
     for mode in 0..8 {
         let column = parts.shapes[1].modes.column(mode);
-        let most = |axis: usize| column.iter().skip(axis).step_by(3).fold(0.0_f32, |most, entry| most.max(entry.abs()));
-        assert!((most(0) - 0.05).abs() <= 1e-6 && most(1) == 1.0 && most(2) == 0.0, "mode {mode}");
+        let max_entry = |axis: usize| {
+            column.iter().skip(axis).step_by(3).fold(0.0_f32, |max_entry, entry| max_entry.max(entry.abs()))
+        };
+        assert!((max_entry(0) - 0.05).abs() <= 1e-6 && max_entry(1) == 1.0 && max_entry(2) == 0.0, "mode {mode}");
     }
     let textures: Vec<&str> = parts.textures.iter().map(|texture| texture.name.as_str()).collect();
     assert_eq!(textures, ["TinyGrid", "ColorSwatches"]);
-    for said in ["animations (3)", "NORMAL targets", "'Base': the occlusion texture"] {
-        assert!(parts.remarks.iter().any(|remark| remark.contains(said)), "{said} in {:?}", parts.remarks);
+    for text in ["animations (3)", "NORMAL targets", "'Base': the occlusion texture"] {
+        assert!(parts.remarks.iter().any(|remark| remark.contains(text)), "expected '{text}', got {:?}", parts.remarks);
     }
-    let scene = Scene::new(parts).expect("a scene");
-    assert!(scene.rest_bounds.max[1] > 0.49, "upright: {:?}", scene.rest_bounds);
+    let scene = Scene::new(parts).expect("a valid scene");
+    assert!(scene.rest_bounds.max[1] > 0.49, "expected y up, got {:?}", scene.rest_bounds);
 }
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 fn real_ferns_are_four_masked_plants_with_a_normal_map() {
-    let parts = read("gltf/fern/fern_02.glb");
+    let parts = read_dataset("gltf/fern/fern_02.glb");
     let sizes: Vec<_> = parts
         .domains
         .iter()
@@ -57,10 +59,13 @@ fn real_ferns_are_four_masked_plants_with_a_normal_map() {
     let [material] = parts.materials.as_slice() else { panic!("{:?}", parts.materials) };
     assert_eq!(material.alpha_mode, AlphaMode::Mask { cutoff: 0.5 });
     assert!(material.double_sided);
-    let side = |texture: Option<usize>| texture.map(|index| &parts.textures[index]).map(Texture::width);
-    assert_eq!((side(material.color_texture), side(material.normal_texture)), (Some(2048), Some(2048)));
+    let texture_width = |texture: Option<usize>| texture.map(|index| &parts.textures[index]).map(Texture::width);
+    assert_eq!(
+        (texture_width(material.color_texture), texture_width(material.normal_texture)),
+        (Some(2048), Some(2048))
+    );
     assert_eq!(parts.textures[0].name, "fern_02_diff-fern_02_alpha");
     assert_eq!(parts.textures.len(), 2);
-    let scene = Scene::new(parts).expect("a scene");
-    assert!(scene.features.mask && scene.features.normal_maps);
+    let scene = Scene::new(parts).expect("a valid scene");
+    assert!(scene.needs.mask && scene.needs.normal_maps);
 }
