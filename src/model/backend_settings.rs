@@ -1,26 +1,28 @@
-//! Settings of the backends: which implementation computes a scene, and how. A scene does not contain them because they
-//! change run time and memory, but its vertices and images at most by rounding.
+//! Settings of the backends: which implementation computes a scene, and how. They are not part of a
+//! [`Scene`](crate::scene::Scene), because they change run time and memory, but vertices and images only by rounding.
 
 use crate::scene::{DeformationSettings, RenderSettings};
 
-/// Which rasterizer draws the shadow map's depth pass and the camera's pass.
+/// The rasterizer of the shadow depth pass and the visibility pass.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum RasterPolicy {
     /// OpenGL's rasterizer, the reference.
     #[default]
     OpenGl,
-    /// The compute rasterizer in CUDA, where it is supported: on a CUDA device that also draws, for variance shadow
-    /// maps without splits, and for frames with one sample per pixel and no blended triangles. OpenGL draws everything
-    /// else, and each frame reports which rasterizer drew it. The visible triangle of a sample may differ only where
-    /// depths tie, within 1/256 pixel of an edge, and at the border of textured cut-outs.
+    /// The compute rasterizer in CUDA. It requires that CUDA and OpenGL use the same device. It draws the depth pass of
+    /// variance shadow maps with one cascade, and the visibility pass of frames with one sample per pixel and no
+    /// blended triangles. OpenGL draws everything else, and each frame reports which rasterizer drew it.
+    ///
+    /// The visible triangle of a sample may differ from OpenGL's at equal depths, within 1/256 pixel of an edge, or at
+    /// the border of alpha-tested texels.
     Cuda,
-    /// For each pass the faster of both, measured when the scene is loaded.
+    /// The faster rasterizer of each pass, measured when the scene is loaded.
     Fastest,
 }
 
-/// Whether domains that share a shape are deformed in a batch, so that U is read once for all of them. The results are
-/// bit-identical.
+/// Whether domains that share a shape are deformed in a batch, so that U is read once for all of them. Results with and
+/// without batches are bit-identical.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum BatchPolicy {
@@ -29,20 +31,19 @@ pub enum BatchPolicy {
     Auto,
     /// No batches.
     Never,
-    /// Batches of all domains that share a shape with modes.
+    /// Batches of all domains whose shape has modes and is used by several domains.
     Always,
 }
 
 /// Settings of all backends for one scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct BackendSettings {
-    /// Selects between the renderer's OpenGL passes and the compute rasterizer.
     pub raster: RasterPolicy,
-    /// Batching in the CUDA deformer. Not available with truncation, compensated sums or stored displacements.
+    /// Batching in the CUDA deformer. Ignored with truncation, compensated sums or stored displacements.
     pub batches: BatchPolicy,
 }
 
-/// The table `look` of a scene file, which contains the choice of the rasterizer in addition to the scene's settings.
+/// The table `look` of a scene file. In addition to the scene's render settings, it contains the rasterizer.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct LookTable {
     #[serde(flatten)]
@@ -50,7 +51,7 @@ pub struct LookTable {
     pub raster: RasterPolicy,
 }
 
-/// The table `deform` of a scene file, which contains the batching in addition to the scene's settings.
+/// The table `deform` of a scene file. In addition to the scene's deformation settings, it contains the batching.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct DeformTable {
     #[serde(flatten)]

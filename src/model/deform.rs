@@ -15,8 +15,8 @@ use crate::scene::{BoundingBox, OrientedBounds, SceneState};
 /// Deformed vertices of a whole scene, packed as in [`Layout`](crate::scene::Layout).
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct DeformedSurface {
-    /// World positions, three numbers per vertex, relative to the floating origin of their domain ([`SceneState::origin_of`]). It
-    /// is the scene's origin unless a step with f64 translations moved the domain far from it.
+    /// World positions, three numbers per vertex, relative to the origin of their domain ([`SceneState::origin_of`]).
+    /// This is the scene's origin unless a step with f64 translations moved the domain far from it.
     pub positions: Vec<f32>,
     /// World-space unit normals, three numbers per corner.
     pub normals: Vec<f32>,
@@ -32,14 +32,14 @@ pub struct DeformedSurface {
 
 impl DeformedSurface {
     /// Copies the requested attributes. Tangents are never copied: only the renderer uses them.
-    fn select(&self, wanted: VertexAttributes) -> Self {
-        let list = |wanted: bool, list: &Vec<f32>| if wanted { list.clone() } else { Vec::new() };
+    fn select(&self, attributes: VertexAttributes) -> Self {
+        let copy_if = |is_requested: bool, array: &Vec<f32>| if is_requested { array.clone() } else { Vec::new() };
         Self {
-            positions: list(wanted.positions, &self.positions),
-            normals: list(wanted.normals, &self.normals),
+            positions: copy_if(attributes.positions, &self.positions),
+            normals: copy_if(attributes.normals, &self.normals),
             tangents: Vec::new(),
-            displacements: list(wanted.displacements, &self.displacements),
-            boxes: if wanted.boxes { self.boxes.clone() } else { Vec::new() },
+            displacements: copy_if(attributes.displacements, &self.displacements),
+            boxes: if attributes.boxes { self.boxes.clone() } else { Vec::new() },
         }
     }
 }
@@ -48,7 +48,7 @@ impl DeformedSurface {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct VertexAttributes {
     pub positions: bool,
-    /// Normals, and tangents where a deformer reads them in place. A [`VertexReadback`] never contains tangents.
+    /// Normals. A deformer whose output is in host memory also returns tangents; a [`VertexReadback`] never does.
     pub normals: bool,
     pub displacements: bool,
     pub boxes: bool,
@@ -149,13 +149,15 @@ pub type BoundingAxes = [nalgebra::Vector3<f64>; 3];
 /// The result of [`Deformer::deform`] apart from the vertices.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DeformSummary {
-    /// Bounds of all deformed positions in the coordinates of [`DeformedSurface::positions`]. Not finite if f32 overflowed in a
-    /// position or in a stored displacement.
+    /// Bounds of all deformed positions in the coordinates of [`DeformedSurface::positions`]. Not finite if f32
+    /// overflowed in a position or in a stored displacement.
     pub bounds: BoundingBox,
     /// Bounds of the same positions along the [`BoundingAxes`] of the deformer, relative to the same origin. `None` if
-    /// it was constructed without axes. The bounds contain every vertex. `reference` returns the tight bounds. The other backends bound boxes of up to 128 vertices
-    /// each: they exceed the tight bounds by less than the diagonal of such a box, and never extend beyond the corners
-    /// of `bounds` by more than rounding.
+    /// the deformer was constructed without axes.
+    ///
+    /// The bounds contain every vertex. `reference` returns the tight bounds. The other backends first compute the boxes
+    /// of groups of up to 128 vertices, then bound these boxes. Their bounds exceed the tight bounds by less than the
+    /// diagonal of such a box, and extend beyond the corners of `bounds` at most by rounding.
     pub oriented_bounds: Option<OrientedBounds>,
     /// Milliseconds from the call until the vertices were complete. If they are written to the renderer's own buffers,
     /// the wait for frames that still read these buffers is not included.
@@ -184,23 +186,23 @@ pub trait Deformer {
     /// `Fault` if the copy from the device fails.
     fn surface(&mut self) -> Result<&DeformedSurface>;
 
-    /// Like [`Self::surface`], but only the attributes in `wanted` are guaranteed. The others may be empty or belong to
-    /// an earlier step. A deformer whose output is in host memory returns all of them.
+    /// Like [`Self::surface`], but guarantees only the given attributes. The others may be empty or belong to an
+    /// earlier step. A deformer whose output is in host memory returns all of them.
     ///
     /// # Errors
     /// As for [`Self::surface`].
-    fn read(&mut self, _wanted: VertexAttributes) -> Result<&DeformedSurface> {
+    fn read(&mut self, _attributes: VertexAttributes) -> Result<&DeformedSurface> {
         self.surface()
     }
 
-    /// Starts a readback of the attributes in `wanted` of the last [`Self::deform`]. All other arrays of the resulting
-    /// [`DeformedSurface`] are empty; tangents are never read back. Positions and normals may still be in flight while the next
-    /// step is deformed. Displacements and boxes are complete when this returns.
+    /// Starts a readback of the given attributes of the last [`Self::deform`]. All other arrays of the resulting
+    /// [`DeformedSurface`] are empty; tangents are never read back. Positions and normals may still be in flight while
+    /// the next step is deformed. Displacements and boxes are complete when this returns.
     ///
     /// # Errors
     /// `Fault` if no step was deformed yet, or if the copy from the device fails.
-    fn readback(&mut self, wanted: VertexAttributes) -> Result<VertexReadback> {
-        Ok(VertexReadback::ready(Arc::new(self.read(wanted)?.select(wanted))))
+    fn readback(&mut self, attributes: VertexAttributes) -> Result<VertexReadback> {
+        Ok(VertexReadback::ready(Arc::new(self.read(attributes)?.select(attributes))))
     }
 
     /// Blocks until the readback is complete.
@@ -208,7 +210,7 @@ pub trait Deformer {
     /// # Errors
     /// `Fault` if the copy from the device fails, or if another deformer started the readback.
     fn wait_readback(&mut self, readback: &VertexReadback) -> Result<Arc<DeformedSurface>> {
-        readback.complete().cloned().ok_or_else(|| fault_in("fetch")("it was begun by another deformer"))
+        readback.complete().cloned().ok_or_else(|| fault_in("readback")("another deformer started it"))
     }
 }
 
@@ -217,7 +219,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_reader_is_served_by_what_holds_all_that_it_wants() {
+    fn contains_compares_attribute_sets() {
         let boxes = VertexAttributes { boxes: true, ..VertexAttributes::default() };
         assert!(
             VertexAttributes::ALL.contains(VertexAttributes::VERTICES.union(boxes))
@@ -228,9 +230,9 @@ mod tests {
     }
 
     /// A deformer whose output is in host memory.
-    struct OnHost(DeformedSurface);
+    struct HostDeformer(DeformedSurface);
 
-    impl Deformer for OnHost {
+    impl Deformer for HostDeformer {
         fn backend(&self) -> Backend {
             Backend::Cpu
         }
@@ -245,29 +247,29 @@ mod tests {
     }
 
     #[test]
-    fn a_pending_fetch_of_another_deformer_is_refused() {
-        let mut deformer = OnHost(DeformedSurface { positions: vec![1.0], ..DeformedSurface::default() });
-        let own = deformer.readback(VertexAttributes::ALL).expect("fetches");
-        assert_eq!(deformer.wait_readback(&own).expect("its own").positions, [1.0]);
+    fn pending_readback_of_another_deformer_is_rejected() {
+        let mut deformer = HostDeformer(DeformedSurface { positions: vec![1.0], ..DeformedSurface::default() });
+        let ready = deformer.readback(VertexAttributes::ALL).expect("a ready readback");
+        assert_eq!(deformer.wait_readback(&ready).expect("a complete readback").positions, [1.0]);
         let pending = VertexReadback::pending(Arc::new(DeformedSurface::default()));
-        let error = deformer.wait_readback(&pending).expect_err("a device may be writing it").to_string();
+        let error = deformer.wait_readback(&pending).expect_err("a pending readback").to_string();
         assert!(error.contains("another deformer"), "{error}");
         let surface = Arc::new(DeformedSurface { positions: vec![1234.5], ..DeformedSurface::default() });
-        assert!(!format!("{:?}", VertexReadback::pending(surface)).contains("1234"), "its vertices are not read");
+        assert!(!format!("{:?}", VertexReadback::pending(surface)).contains("1234"), "expected no vertices in Debug");
     }
 
     #[test]
-    fn a_copy_has_what_is_wanted_and_never_tangents() {
-        let whole = DeformedSurface {
+    fn select_copies_requested_attributes_but_no_tangents() {
+        let surface = DeformedSurface {
             positions: vec![1.0],
             normals: vec![2.0],
             tangents: vec![3.0],
             displacements: vec![4.0],
             boxes: vec![BoundingBox::EMPTY],
         };
-        assert_eq!(whole.select(VertexAttributes::ALL), DeformedSurface { tangents: vec![], ..whole.clone() });
-        assert_eq!(whole.select(VertexAttributes::default()), DeformedSurface::default());
+        assert_eq!(surface.select(VertexAttributes::ALL), DeformedSurface { tangents: vec![], ..surface.clone() });
+        assert_eq!(surface.select(VertexAttributes::default()), DeformedSurface::default());
         let normals = VertexAttributes { normals: true, ..VertexAttributes::default() };
-        assert_eq!(whole.select(normals), DeformedSurface { normals: vec![2.0], ..DeformedSurface::default() });
+        assert_eq!(surface.select(normals), DeformedSurface { normals: vec![2.0], ..DeformedSurface::default() });
     }
 }

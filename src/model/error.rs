@@ -11,7 +11,7 @@ pub enum Error {
     #[error("{what} not found: {given}")]
     NotFound { what: &'static str, given: String },
     /// Another client holds the resource; it may become free.
-    #[error("{what} is taken: {holder}")]
+    #[error("{what} is in use: {holder}")]
     Taken { what: &'static str, holder: String },
     /// The requested step has already been superseded.
     #[error("{what}: expected {expected}, got {given}")]
@@ -20,7 +20,7 @@ pub enum Error {
     #[error("{queue} is full ({limit})")]
     Busy { queue: &'static str, limit: usize },
     /// The caller's deadline expired first.
-    #[error("{what} did not come within {ms} ms")]
+    #[error("{what}: expected within {ms} ms, got none")]
     Deadline { what: String, ms: u64 },
     /// A resource or program is missing; the operator must install, mount or free it.
     #[error("{what} is not available: {reason}. {remedy}")]
@@ -28,8 +28,8 @@ pub enum Error {
     /// An internal error, or a failure of the device or a library.
     #[error("{stage} failed: {reason}")]
     Fault { stage: &'static str, reason: String },
-    /// The device context is lost with all its memory, for example after an illegal access by a kernel. Every later call
-    /// to that device fails as well, so only the operator can act: by a restart of the server.
+    /// The device context and its memory are lost, for example after an illegal access by a kernel. All later calls to
+    /// the device fail, so the operator must restart the server.
     #[error("{stage} failed: the device is lost ({reason}). Restart the server")]
     DeviceLost { stage: &'static str, reason: String },
 }
@@ -48,12 +48,12 @@ pub fn fault_in<E: std::fmt::Display>(stage: &'static str) -> impl Fn(E) -> Erro
 }
 
 impl Error {
-    /// Prefixes the field of an [`Error::Invalid`] with `place`, so that the message contains the whole path. Other
-    /// variants remain unchanged.
-    pub fn prefix_field(self, place: &str) -> Self {
+    /// Prefixes the field of an [`Error::Invalid`] with its location, such as a file, so that the message contains the
+    /// whole path. Other variants remain unchanged.
+    pub fn prefix_field(self, location: &str) -> Self {
         match self {
             Self::Invalid { field, expected, given } => {
-                Self::Invalid { field: format!("{place}: {field}"), expected, given }
+                Self::Invalid { field: format!("{location}: {field}"), expected, given }
             }
             other => other,
         }

@@ -21,12 +21,13 @@ pub trait GlBufferOwner: std::fmt::Debug {
     fn make_current(&self) -> Result<Box<dyn Any>>;
 }
 
-/// A handle to an OpenGL buffer, which exists at least as long as the handle. An API that registers the buffer keeps a
-/// handle, so that the buffer is not deleted while it is registered.
+/// A handle to an OpenGL buffer. The buffer exists at least as long as the handle, so code that registers a buffer with
+/// CUDA keeps a handle until it unregisters the buffer.
 #[derive(Debug, Clone)]
 pub struct GlBuffer {
     /// OpenGL name of the buffer in its context.
     pub name: u32,
+    /// Size of the buffer.
     pub bytes: u64,
     pub owner: Rc<dyn GlBufferOwner>,
 }
@@ -63,7 +64,7 @@ pub struct RasterGeometry {
     pub cut_outs: Option<CutOuts>,
 }
 
-/// The alpha-tested triangles: a sample survives only where alpha reaches a cutoff.
+/// The alpha-tested triangles.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CutOuts {
     /// Index of the first alpha-tested triangle. All triangles from it on are alpha-tested.
@@ -87,7 +88,7 @@ pub struct AlphaMaterial {
     pub image: Option<u32>,
 }
 
-/// The alpha channel of an image with wrap mode "repeat". Texels have 8 bits for 0 to 1; rows are in the order of
+/// The alpha channel of an image with wrap mode "repeat". A texel is one byte; 255 is opaque. Rows are in the order of
 /// increasing v.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AlphaImage {
@@ -97,7 +98,7 @@ pub struct AlphaImage {
     pub levels: Vec<Vec<u8>>,
 }
 
-/// A window and the buffer that receives its samples.
+/// A viewport and the buffer that receives its samples.
 pub type DrawTarget<'a> = (&'a Viewport, &'a GlBuffer);
 
 /// Draws one mesh. Buffer accesses are ordered with OpenGL commands before and after each call without blocking the
@@ -106,12 +107,15 @@ pub trait Rasterizer: std::fmt::Debug {
     /// Draws depths, ids, or both. One call for both is cheaper, because the switch from OpenGL to CUDA and back takes
     /// longer than either pass.
     ///
-    /// Depths are one f32 per sample from 0 to 1, and 1 where no triangle is; triangles are drawn two-sided. Ids are
-    /// one u64 per sample: the bits of the nearest depth in the upper half and the triangle in the lower half, and all
-    /// ones where no triangle is. Each group has its own cull mode.
+    /// Depths are one f32 per sample from 0 to 1. A sample without a triangle has depth 1. The depth pass draws both
+    /// faces of every triangle.
+    ///
+    /// Ids are one u64 per sample. The upper half contains the bits of the nearest depth, the lower half the index of
+    /// the triangle. A sample without a triangle has all bits set. The id pass draws the faces that the triangle's
+    /// group ([`RasterGeometry::groups`]) selects.
     ///
     /// # Errors
-    /// `Fault` if the device fails, or if a buffer is unknown or smaller than its window.
+    /// `Fault` if the device fails, or if a buffer is unknown or smaller than its viewport.
     fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()>;
 
     /// Compiles the kernels for depth, id, or both passes ahead of the first frame.
