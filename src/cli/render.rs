@@ -112,7 +112,7 @@ fn render_color_map(
     let scene = Arc::clone(loaded_scene.scene());
     let (aov, legend) = device.render_aov(loaded_scene, &camera(args, &scene), args.size, frame_output)?;
     let legend = legend.ok_or_else(|| fault_in("encode")("a color map without a legend"))?;
-    let rgba = frame::color_map(&aov.bytes, aov.samples, args.size.to_array(), &legend)?;
+    let rgba = frame::draw_color_map(&aov.bytes, aov.samples, args.size.to_array(), &legend)?;
     frame::encode_png(args.size.width, args.size.height, &rgba)
 }
 

@@ -1,12 +1,12 @@
 //! Color mapping: viridis, and the conversion of an AOV of values to RGBA8 sRGB.
 
-/// The viridis color map: maps 0 to 1 to encoded sRGB, 0 to 1 per channel; values outside are clamped. It is
-/// perceptually uniform and suitable for color-blind readers.
+/// The viridis color map. Maps a fraction of the axis to encoded sRGB with channels from 0 to 1. A fraction outside of
+/// 0 to 1 is clamped. The map is perceptually uniform and suitable for color-blind readers.
 ///
 /// The map is by Smith and van der Walt (matplotlib, 2015). The polynomial of degree six is Matt Zucker's fit
 /// (shadertoy.com/view/WlfXRN, CC0). Its colors differ from the table by at most 0.02 per channel.
-pub fn viridis(share: f32) -> [f32; 3] {
-    const TERMS: [[f32; 3]; 7] = [
+pub fn viridis(fraction: f32) -> [f32; 3] {
+    const COEFFICIENTS: [[f32; 3]; 7] = [
         [0.277_727_33, 0.005_407_344_5, 0.334_099_8],
         [0.105_093_04, 1.404_613_5, 1.384_590_2],
         [-0.330_861_83, 0.214_847_56, 0.095_095_16],
@@ -15,56 +15,58 @@ pub fn viridis(share: f32) -> [f32; 3] {
         [4.776_385, -13.745_145, -65.353_03],
         [-5.435_456, 4.645_852_6, 26.312_435],
     ];
-    let share = share.clamp(0.0, 1.0);
+    let fraction = fraction.clamp(0.0, 1.0);
     [0, 1, 2].map(|channel| {
-        let sum = TERMS.iter().rev().fold(0.0, |sum, term| sum * share + term[channel]);
-        sum.clamp(0.0, 1.0)
+        let value = COEFFICIENTS.iter().rev().fold(0.0, |value, coefficients| value * fraction + coefficients[channel]);
+        value.clamp(0.0, 1.0)
     })
 }
 
 /// Gray level of the background, linear.
 const BACKGROUND: f32 = 0.87;
 /// The fraction of the light that does not depend on the orientation of the surface.
-const AMBIENT_SHARE: f32 = 0.62;
+const AMBIENT_FRACTION: f32 = 0.62;
 
-/// Converts samples of values from the renderer to RGBA8 sRGB. Each sample is a word with the fraction of the scale
-/// (lower 16 bits) and the cosine of the angle between normal and view direction (upper 16 bits); 0 means background. A
-/// surface that faces the camera has exactly the viridis color. A surface that turns away has up to 38 % less light, so
-/// that the shape is visible. A pixel is the mean of its samples in linear light.
+/// Converts the samples of an AOV of values to RGBA8 sRGB. A sample is one word: 0 for the background; otherwise the
+/// value as a fraction of the axis in the lower 16 bits, and the cosine of the angle between normal and view direction
+/// in the upper 16 bits, both scaled by 65535.
+///
+/// A surface that faces the camera has exactly the viridis color. An inclined surface has up to 38 % less light, so that
+/// the shape is visible. A pixel is the mean of its samples in linear light.
 pub fn apply_colormap(words: &[u32], samples: usize) -> Vec<u8> {
-    let light = |word: u32| match word {
+    let linear_color = |word: u32| match word {
         0 => [BACKGROUND; 3],
         word => {
-            let shade = AMBIENT_SHARE + (1.0 - AMBIENT_SHARE) * (word >> 16) as f32 / 65535.0;
-            viridis((word & 0xFFFF) as f32 / 65535.0).map(|channel| shade * linear(channel))
+            let shade = AMBIENT_FRACTION + (1.0 - AMBIENT_FRACTION) * (word >> 16) as f32 / 65535.0;
+            viridis((word & 0xFFFF) as f32 / 65535.0).map(|channel| shade * srgb_to_linear(channel))
         }
     };
-    let pixel = |words: &[u32]| {
+    let mean_color = |words: &[u32]| {
         let mut sum = [0.0; 3];
         for word in words {
-            let light = light(*word);
-            (0..3).for_each(|channel| sum[channel] += light[channel] / words.len() as f32);
+            let color = linear_color(*word);
+            (0..3).for_each(|channel| sum[channel] += color[channel] / words.len() as f32);
         }
-        let [r, g, b] = sum.map(|channel| (255.0 * encoded(channel)).round() as u8);
+        let [r, g, b] = sum.map(|channel| (255.0 * linear_to_srgb(channel)).round() as u8);
         [r, g, b, 255]
     };
-    // Cache the last pixel, because neighboring pixels mostly show the same background.
-    let mut last = (Vec::new(), [0; 4]);
+    // Cache the color of the last pixel, because most neighboring pixels show the background.
+    let (mut cached_words, mut cached_color) = (Vec::new(), [0; 4]);
     let mut rgba = Vec::with_capacity(4 * words.len() / samples.max(1));
-    for words in words.chunks_exact(samples.max(1)) {
-        if last.0 != words {
-            last = (words.to_vec(), pixel(words));
+    for pixel_words in words.chunks_exact(samples.max(1)) {
+        if cached_words != pixel_words {
+            (cached_words, cached_color) = (pixel_words.to_vec(), mean_color(pixel_words));
         }
-        rgba.extend(last.1);
+        rgba.extend(cached_color);
     }
     rgba
 }
 
-fn linear(encoded: f32) -> f32 {
+fn srgb_to_linear(encoded: f32) -> f32 {
     if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
 }
 
-fn encoded(linear: f32) -> f32 {
+fn linear_to_srgb(linear: f32) -> f32 {
     if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 
@@ -73,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn viridis_has_the_colours_of_its_table_and_grows_lighter_all_along() {
+    fn viridis_matches_matplotlib_with_increasing_luminance() {
         // matplotlib's table at 0, 1/4, 1/2, 3/4 and 1.
         let table = [
             [0.267_004, 0.004_874, 0.329_415],
@@ -82,27 +84,29 @@ mod tests {
             [0.369_214, 0.788_888, 0.382_914],
             [0.993_248, 0.906_157, 0.143_936],
         ];
-        for (at, want) in table.iter().enumerate() {
-            let got = viridis(at as f32 / 4.0);
-            assert!(got.iter().zip(want).all(|(got, want): (&f32, &f32)| (got - want).abs() < 0.02), "{at}: {got:?}");
+        for (quarter, expected) in table.iter().enumerate() {
+            let actual = viridis(quarter as f32 / 4.0);
+            let is_close = actual.iter().zip(expected).all(|(a, b)| (a - b).abs() < 0.02);
+            assert!(is_close, "{quarter}/4: expected {expected:?}, got {actual:?}");
         }
-        let luminance = |share: f32| {
-            let [r, g, b] = viridis(share).map(linear);
+        let luminance = |fraction: f32| {
+            let [r, g, b] = viridis(fraction).map(srgb_to_linear);
             0.2126 * r + 0.7152 * g + 0.0722 * b
         };
-        assert!((0..100).all(|at| luminance((at + 1) as f32 / 100.0) > luminance(at as f32 / 100.0)));
+        assert!((0..100).all(|percent| luminance((percent + 1) as f32 / 100.0) > luminance(percent as f32 / 100.0)));
         assert_eq!((viridis(-1.0), viridis(f32::INFINITY)), (viridis(0.0), viridis(1.0)));
     }
 
     #[test]
-    fn a_surface_that_faces_the_eye_has_the_maps_colour_and_samples_are_mixed_as_light() {
-        let faces = |share: u32| 0xFFFF_0000 | share;
-        let rgba = apply_colormap(&[faces(0), faces(65535), 0, 0x0001_0000], 1);
-        let want = |share: f32| viridis(share).map(|channel| (255.0 * channel).round() as u8);
-        assert_eq!((&rgba[..3], &rgba[4..7]), (&want(0.0)[..], &want(1.0)[..]));
-        assert_eq!(rgba[8], rgba[9], "grey behind");
-        assert!(rgba[14] < rgba[2] && rgba[14] > rgba[2] / 2, "darker, not black");
-        let mixed = apply_colormap(&[0, faces(0)], 2);
-        assert!(mixed[0] < rgba[8] && mixed[0] > rgba[0]);
+    fn apply_colormap_shades_surfaces_and_averages_samples() {
+        let facing_word = |value: u32| 0xFFFF_0000 | value;
+        let edge_on_word = 0x0001_0000;
+        let rgba = apply_colormap(&[facing_word(0), facing_word(65535), 0, edge_on_word], 1);
+        let expected = |fraction: f32| viridis(fraction).map(|channel| (255.0 * channel).round() as u8);
+        assert_eq!((&rgba[..3], &rgba[4..7]), (&expected(0.0)[..], &expected(1.0)[..]));
+        assert_eq!(rgba[8], rgba[9], "expected a gray background");
+        assert!(rgba[14] < rgba[2] && rgba[14] > rgba[2] / 2, "expected a darker color, but not black");
+        let mean = apply_colormap(&[0, facing_word(0)], 2);
+        assert!(mean[0] < rgba[8] && mean[0] > rgba[0], "expected a color between background and surface");
     }
 }

@@ -77,7 +77,7 @@ pub(in crate::engine) fn fit_legend(scene: &Scene, frame_output: FrameOutput, va
         _ => (String::new(), 0.0, 1e-30),
     };
     let largest = if asked > 0.0 { asked } else { nice_ceiling(most.max(least)) };
-    Legend { title, largest: largest.clamp(1e-30, 1e30) }
+    Legend { title, scale_max: largest.clamp(1e-30, 1e30) }
 }
 
 #[cfg(test)]
@@ -108,11 +108,11 @@ mod tests {
             largest = largest.max(moved[4 + vertex]);
         }
         assert!(largest > 0.5, "control: something moves");
-        let fitted = fit_legend(&scene, FrameOutput::Displacement { largest: 0.0 }, &moved).largest;
+        let fitted = fit_legend(&scene, FrameOutput::Displacement { largest: 0.0 }, &moved).scale_max;
         assert!(fitted >= f64::from(largest) && fitted <= 2.5 * f64::from(largest));
-        assert_eq!(fit_legend(&scene, FrameOutput::Displacement { largest: 3.0 }, &moved).largest, 3.0);
+        assert_eq!(fit_legend(&scene, FrameOutput::Displacement { largest: 3.0 }, &moved).scale_max, 3.0);
         assert!(
-            fit_legend(&scene, FrameOutput::Displacement { largest: 0.0 }, &[1e-9]).largest > 1e-6,
+            fit_legend(&scene, FrameOutput::Displacement { largest: 0.0 }, &[1e-9]).scale_max > 1e-6,
             "rounding is no motion"
         );
         validate_mode(&scene, 1).expect("two modes");

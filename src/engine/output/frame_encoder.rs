@@ -114,7 +114,7 @@ impl FrameEncoder {
 
 fn color_map(image: &AovImage, legend: &Legend, format: FrameFormat) -> Result<Vec<u8>> {
     let size = [image.width, image.height];
-    let rgba = frame::color_map(&image.bytes, image.samples, size, legend)?;
+    let rgba = frame::draw_color_map(&image.bytes, image.samples, size, legend)?;
     if format == FrameFormat::Png { frame::encode_png(size[0], size[1], &rgba) } else { Ok(rgba) }
 }
 
