@@ -24,60 +24,62 @@ pub(crate) fn with_displacements_and_boxes(deformation: DeformationSettings) -> 
 
 /// The first domain whose box differs from the bounds of its positions.
 pub(crate) fn find_wrong_box(scene: &Scene, result: &StepResult) -> Option<usize> {
-    let slots = &scene.layout.domains;
-    assert_eq!(result.surface.boxes.len(), slots.len(), "expected a box per domain");
+    let layouts = &scene.layout.domains;
+    assert_eq!(result.surface.boxes.len(), layouts.len(), "expected a box per domain");
     let position_bounds = |domain: usize| {
-        let positions = &result.surface.positions[3 * slots[domain].first_vertex..][..3 * slots[domain].vertices];
+        let positions = &result.surface.positions[3 * layouts[domain].first_vertex..][..3 * layouts[domain].vertices];
         BoundingBox::from_positions(positions)
     };
-    (0..slots.len()).find(|domain| result.surface.boxes[*domain] != position_bounds(*domain))
+    (0..layouts.len()).find(|domain| result.surface.boxes[*domain] != position_bounds(*domain))
 }
 
-/// Number of vertices and rank of each shape, for every kind of tile: shared by domains, used by one domain, and several
-/// per domain. With `many` there are so many domains that a lane computes four vertices.
-fn shape_sizes(many: bool) -> Vec<(usize, usize)> {
-    let small_count = [(1, 3), (7, 2), (9, 0), (31, 1), (64, 5), (65, 0), (130, 33), (1, 0), (300, 4)];
-    let large_count = (0..900).map(|index| (3 + index % 9, index % 4)).chain([(4097, 0), (5000, 3)]);
-    if many { large_count.collect() } else { small_count.to_vec() }
+/// Number of vertices and rank of each shape. There is every kind of tile: shared by domains, used by one domain, and
+/// several per domain. With `has_many_domains`, there are so many tiles that a lane computes four vertices.
+fn shape_sizes(has_many_domains: bool) -> Vec<(usize, usize)> {
+    if has_many_domains {
+        return (0..900).map(|index| (3 + index % 9, index % 4)).chain([(4097, 0), (5000, 3)]).collect();
+    }
+    vec![(1, 3), (7, 2), (9, 0), (31, 1), (64, 5), (65, 0), (130, 33), (1, 0), (300, 4)]
 }
 
-/// A scene with two domains per shape, or with `many` one domain per shape and 30 of the last.
-fn scene(deformation: DeformationSettings, many: bool) -> Arc<Scene> {
+/// A scene with two domains per shape. With `has_many_domains`, a scene with one domain per shape and 29 further domains
+/// of the last shape.
+fn create_scene(deformation: DeformationSettings, has_many_domains: bool) -> Arc<Scene> {
     let mut random = Random(101);
     let shape = |(index, (vertices, rank)): (usize, (usize, usize))| match index % 2 {
         0 => strip_shape(&mut random, vertices, rank),
         _ => scenes::random_shape(&mut random, vertices, rank),
     };
-    let mut parts = scenes::parts_of_shapes(shape_sizes(many).into_iter().enumerate().map(shape).collect());
+    let mut parts = scenes::parts_of_shapes(shape_sizes(has_many_domains).into_iter().enumerate().map(shape).collect());
     parts.deformation = deformation;
     let count = parts.shapes.len();
-    let further_domains = if many { vec![count - 1; 29] } else { (0..count).collect() };
+    let further_domains = if has_many_domains { vec![count - 1; 29] } else { (0..count).collect() };
     let domain = |(index, shape): (usize, usize)| Domain {
         name: format!("domain {index}"),
-        ..scenes::new_domain(shape, if many { 0 } else { NORMAL_MAPPED })
+        ..scenes::new_domain(shape, if has_many_domains { 0 } else { NORMAL_MAPPED })
     };
     parts.domains = (0..count).chain(further_domains).enumerate().map(domain).collect();
     Scene::new(parts).expect("expected a valid scene")
 }
 
-/// Displacements are within their bound, boxes are tight, and vertices have the bits that they have without these
-/// attributes.
+/// Displacements are within their bound, boxes are tight, and vertices have the same bits as without these attributes.
 pub(crate) fn check_displacements_and_boxes<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
-    for (storage, compensated, many) in StorageType::ALL.into_iter().flat_map(|storage| {
+    for (storage, compensated, has_many_domains) in StorageType::ALL.into_iter().flat_map(|storage| {
         [(storage, false, false), (storage, true, false), (storage, storage == StorageType::Bf16, true)]
     }) {
         let deformation = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
-        let (plain_scene, scene) = (scene(deformation, many), scene(with_displacements_and_boxes(deformation), many));
+        let plain_scene = create_scene(deformation, has_many_domains);
+        let scene = create_scene(with_displacements_and_boxes(deformation), has_many_domains);
         let state = scenes::random_state(&scene, 102);
         let (plain_result, result) =
             (run_step(&mut create_deformer(&plain_scene), &state), run_step(&mut create_deformer(&scene), &state));
-        assert_eq!(has_one_item_per_lane(&scene), !many);
+        assert_eq!(has_one_item_per_lane(&scene), !has_many_domains);
         let name = format!("{}, compensated {compensated}, {} domains", storage.name(), scene.domains.len());
         assert!(plain_result.surface.displacements.is_empty() && plain_result.surface.boxes.is_empty(), "{name}");
-        let mut vertices_only = result.clone();
-        (vertices_only.surface.displacements, vertices_only.surface.boxes) = (vec![], vec![]);
+        let mut result_vertices = result.clone();
+        (result_vertices.surface.displacements, result_vertices.surface.boxes) = (vec![], vec![]);
         assert_eq!(
-            vertices_only.difference(&plain_result),
+            result_vertices.difference(&plain_result),
             None,
             "{name}: expected the same vertices with and without attributes"
         );
@@ -111,83 +113,91 @@ pub(crate) fn check_scene_without_modes<D: Deformer>(create_deformer: impl Fn(&A
 
 /// Reading some attributes returns those of the last step, and the other attributes can be read afterwards.
 pub(crate) fn check_separate_reads<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
-    let scene = scene(with_displacements_and_boxes(DeformationSettings::default()), false);
+    let scene = create_scene(with_displacements_and_boxes(DeformationSettings::default()), false);
     let (mut deformer, mut random) = (create_deformer(&scene), Random(105));
     let mut state = scenes::random_state(&scene, 106);
-    let mut last = run_step(&mut deformer, &state);
-    let none = VertexAttributes::default();
+    let mut previous = run_step(&mut deformer, &state);
+    let no_attributes = VertexAttributes::default();
     for (step, requested) in [
-        VertexAttributes { boxes: true, ..none },
-        VertexAttributes { displacements: true, ..none },
-        VertexAttributes { positions: true, ..none },
-        VertexAttributes { displacements: true, boxes: true, ..none },
+        VertexAttributes { boxes: true, ..no_attributes },
+        VertexAttributes { displacements: true, ..no_attributes },
+        VertexAttributes { positions: true, ..no_attributes },
+        VertexAttributes { displacements: true, boxes: true, ..no_attributes },
     ]
     .into_iter()
     .enumerate()
     {
         partial_steps::apply_random_step(&scene, &mut state, &mut random, &[1, 6, step as u32 + 8], &[2, 6]);
-        let want = run_step(&mut create_deformer(&scene), &state);
+        let expected = run_step(&mut create_deformer(&scene), &state);
         deformer.deform(&state).expect("expected the step to succeed");
-        let got = deformer.read(requested).expect("expected a surface").clone();
-        let [new, old] = [&want.surface, &last.surface];
+        let actual = deformer.read(requested).expect("expected a surface").clone();
+        let [new_surface, old_surface] = [&expected.surface, &previous.surface];
         if requested.boxes {
-            assert!(got.boxes == new.boxes && new.boxes != old.boxes, "step {step}");
+            assert!(actual.boxes == new_surface.boxes && new_surface.boxes != old_surface.boxes, "step {step}");
         }
         if requested.displacements {
-            let is_new = new.displacements != old.displacements;
-            assert!(got.displacements == new.displacements && is_new, "step {step}");
+            let is_new = new_surface.displacements != old_surface.displacements;
+            assert!(actual.displacements == new_surface.displacements && is_new, "step {step}");
         }
         if requested.positions {
-            assert!(got.positions == new.positions && new.positions != old.positions, "step {step}");
+            assert!(
+                actual.positions == new_surface.positions && new_surface.positions != old_surface.positions,
+                "step {step}"
+            );
         }
-        let full_result = StepResult {
-            bounds: want.bounds,
-            light: want.light,
+        let result_after_read = StepResult {
+            bounds: expected.bounds,
+            light_bounds: expected.light_bounds,
             surface: deformer.surface().expect("expected a surface").clone(),
         };
-        assert_eq!(full_result.difference(&want), None, "step {step}: after a partial read");
-        last = want;
+        assert_eq!(result_after_read.difference(&expected), None, "step {step}: after a partial read");
+        previous = expected;
     }
 }
 
-/// A readback returns the requested attributes of its own step and no others. Other requests for the same step succeed
-/// too, and readbacks stay valid when later steps are computed.
+/// A readback returns the requested attributes of its own step and no others. Several requests for the same step
+/// succeed, and readbacks remain valid when later steps are computed.
 pub(crate) fn check_separate_readbacks<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
-    let scene = scene(with_displacements_and_boxes(DeformationSettings::default()), false);
+    let scene = create_scene(with_displacements_and_boxes(DeformationSettings::default()), false);
     let (mut deformer, mut random, mut state) =
         (create_deformer(&scene), Random(108), scenes::random_state(&scene, 109));
     let mut pending = Vec::new();
     for step in 0..20 {
         partial_steps::apply_random_step(&scene, &mut state, &mut random, &[1, 6, step % 4 + 8], &[2, 6]);
-        let want = run_step(&mut create_deformer(&scene), &state).surface;
+        let expected = run_step(&mut create_deformer(&scene), &state).surface;
         deformer.deform(&state).expect("expected the step to succeed");
         let requests = [step, step / 4 * 3 + 1, step * 7 + 2].map(|bits| attributes_of_bits(bits as usize % 16));
         let readbacks =
             requests.map(|requested| (requested, deformer.readback(requested).expect("expected a readback to start")));
-        for (want, readbacks) in std::mem::replace(&mut pending, vec![(want, readbacks)]) {
+        for (expected, readbacks) in std::mem::replace(&mut pending, vec![(expected, readbacks)]) {
             for (requested, readback) in readbacks.iter().rev() {
-                let got = deformer.wait_readback(readback).expect("expected the readback to complete");
+                let actual = deformer.wait_readback(readback).expect("expected the readback to complete");
                 let comparisons = [
-                    (requested.positions, got.positions == want.positions, got.positions.is_empty()),
-                    (requested.normals, got.normals == want.normals, got.normals.is_empty()),
-                    (requested.displacements, got.displacements == want.displacements, got.displacements.is_empty()),
-                    (requested.boxes, got.boxes == want.boxes, got.boxes.is_empty()),
+                    (requested.positions, actual.positions == expected.positions, actual.positions.is_empty()),
+                    (requested.normals, actual.normals == expected.normals, actual.normals.is_empty()),
+                    (
+                        requested.displacements,
+                        actual.displacements == expected.displacements,
+                        actual.displacements.is_empty(),
+                    ),
+                    (requested.boxes, actual.boxes == expected.boxes, actual.boxes.is_empty()),
                 ];
                 // A request may also receive attributes that an earlier request for the same step included.
-                let is_valid = |(requested, same, empty): &(bool, bool, bool)| *same || !requested && *empty;
+                let is_valid =
+                    |(requested, is_equal, is_empty): &(bool, bool, bool)| *is_equal || !requested && *is_empty;
                 assert!(
-                    comparisons.iter().all(is_valid) && got.tangents.is_empty(),
+                    comparisons.iter().all(is_valid) && actual.tangents.is_empty(),
                     "before step {step}: {requested:?}, {comparisons:?}"
                 );
             }
         }
     }
     // Negative control: the next step has other attributes.
-    let (last, _) = pending.pop().expect("expected a valid step");
+    let (last_surface, _) = pending.pop().expect("expected a valid step");
     partial_steps::apply_random_step(&scene, &mut state, &mut random, &[1, 6], &[2, 6]);
-    let next = run_step(&mut deformer, &state).surface;
-    assert!(last.positions != next.positions && last.normals != next.normals);
-    assert!(last.displacements != next.displacements && last.boxes != next.boxes);
+    let next_surface = run_step(&mut deformer, &state).surface;
+    assert!(last_surface.positions != next_surface.positions && last_surface.normals != next_surface.normals);
+    assert!(last_surface.displacements != next_surface.displacements && last_surface.boxes != next_surface.boxes);
 }
 
 /// The combination of attributes given by the lowest four bits.
@@ -203,7 +213,7 @@ fn scene_of_ones(deformation: DeformationSettings) -> Arc<Scene> {
     scene_from_columns(5, columns, deformation)
 }
 
-/// A transform that scales so much down that x is finite where u overflows.
+/// A transform whose scale is so small that x is finite where u overflows.
 const TINY_SCALE: Transform = Transform([1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6, 0.0]);
 
 /// A displacement in the range of f32 survives intermediate overflow. One that overflows is reported, even if x is
@@ -241,23 +251,25 @@ pub(crate) fn check_displacement_overflow<D: Deformer>(create_deformer: impl Fn(
     let result = run_step(&mut create_deformer(&scene), &state);
     assert!(result.bounds.is_finite() && find_wrong_box(&scene, &result).is_none(), "{:?}", result.bounds);
     for u in result.surface.displacements.chunks_exact(3) {
-        let relative_error = |got: f32, want: f32| (got - want).abs() / want.abs();
-        let max_error = relative_error(u[0], 5e37).max(relative_error(u[1], -5e37)).max(relative_error(u[2], 2.5e37));
-        assert!(max_error < 1e-6, "{u:?}");
+        let expected = [5e37_f32, -5e37, 2.5e37];
+        let mut relative_errors =
+            u.iter().zip(expected).map(|(actual, expected)| ((actual - expected) / expected).abs());
+        assert!(relative_errors.all(|error| error < 1e-6), "expected {expected:?}, got {u:?}");
     }
 }
 
-/// A step with an overflowing displacement is rejected with the name of its domain, and readers keep the last valid step.
+/// A step with an overflowing displacement is rejected with the name of its domain, and the vertices of the last valid
+/// step remain readable.
 pub(crate) fn check_displacement_overflow_rejection(backend: BackendChoice) {
     let config = Config { backend, renderer: RendererChoice::Off, ..Config::default() };
     let mut context = DeviceContext::open(&config).expect("expected a device context");
-    let scene = scene(with_displacements_and_boxes(DeformationSettings::default()), false);
+    let scene = create_scene(with_displacements_and_boxes(DeformationSettings::default()), false);
     let (mut loaded_scene, mut random) =
         (context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load"), Random(107));
     let mut valid_state = SceneState::rest(&scene);
     partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[1, 4], &[4]);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
-    let before = loaded_scene.surface().expect("vertices").clone();
+    let valid_surface = loaded_scene.surface().expect("vertices").clone();
     for domain in [4, 6] {
         let mut overflowing_state = valid_state.clone();
         partial_steps::apply_random_step(
@@ -267,16 +279,16 @@ pub(crate) fn check_displacement_overflow_rejection(backend: BackendChoice) {
             &[domain as u32],
             &[domain as u32],
         );
-        overflowing_state.transforms[domain] = Transform(TINY_SCALE.0.map(|number| number * 1e-18));
-        let slot = scene.layout.domains[domain];
-        overflowing_state.q[slot.first_q..][..slot.rank].fill(f32::MAX);
+        overflowing_state.transforms[domain] = Transform(TINY_SCALE.0.map(|entry| entry * 1e-18));
+        let layout = scene.layout.domains[domain];
+        overflowing_state.q[layout.first_q..][..layout.rank].fill(f32::MAX);
         let error = loaded_scene.deform(&overflowing_state).expect_err("expected an overflow error").to_string();
         eprintln!("{error}");
         assert!(error.starts_with(&format!("step.q of domain 'domain {domain}'")), "{error}");
-        assert_eq!(loaded_scene.surface().expect("vertices"), &before);
+        assert_eq!(loaded_scene.surface().expect("vertices"), &valid_surface);
     }
     partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[8], &[]);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
-    assert_ne!(loaded_scene.surface().expect("vertices"), &before, "expected the step to change vertices");
+    assert_ne!(loaded_scene.surface().expect("vertices"), &valid_surface, "expected the step to change vertices");
     context.unload_scene(loaded_scene);
 }

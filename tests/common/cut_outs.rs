@@ -15,7 +15,7 @@ pub(crate) struct CutOutSoup {
 }
 
 impl CutOutSoup {
-    /// Ids and depths by the reference rasterizer.
+    /// Draws the soup with the reference rasterizer.
     pub(crate) fn rasterize(&self) -> VisibilityBuffer {
         let Soup { viewport, positions, triangles, groups, .. } = &self.soup;
         let mut raster = VisibilityBuffer::new(*viewport);
@@ -38,12 +38,13 @@ impl CutOutSoup {
             let (corners, uvs) = (corners(&soup.viewport, &soup.positions, vertices), &cut_outs.uvs[cut_out as usize]);
             let cutoff = cut_outs.materials[cut_outs.material_indices[cut_out as usize] as usize].cutoff;
             let [x0, y0, x1, y1] = clipped_polygon.samples;
-            for triangle_piece in fan_triangles(&clipped_polygon) {
+            for clipped_triangle in fan_triangles(&clipped_polygon) {
                 for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
-                    if depth_at(&triangle_piece, column, row).is_some() {
+                    if depth_at(&clipped_triangle, column, row).is_some() {
                         let footprint = footprint(&soup.viewport, &corners, uvs, [column, row]);
-                        let is_near = (alpha(cut_outs, triangle, &footprint) - cutoff).abs() <= tolerance;
-                        is_ambiguous[row as usize * soup.viewport.size()[0] as usize + column as usize] |= is_near;
+                        let is_near_cutoff = (alpha(cut_outs, triangle, &footprint) - cutoff).abs() <= tolerance;
+                        is_ambiguous[row as usize * soup.viewport.size()[0] as usize + column as usize] |=
+                            is_near_cutoff;
                     }
                 }
             }
@@ -61,8 +62,8 @@ pub(crate) fn alpha_image(width: u32, height: u32, mut texel: impl FnMut(u32, u3
     AlphaImage { width, height, levels: levels.collect() }
 }
 
-/// All soups with uniform images or without images, so that the result does not depend on the texture filter. All
-/// but the first third of the triangles are alpha-tested.
+/// All soups with uniform images or without images, so that the result does not depend on the texture filter. The last
+/// two thirds of the triangles are alpha-tested.
 pub(crate) fn uniform_cut_out_soups() -> Vec<CutOutSoup> {
     let mut random = Random(21);
     let material = |alpha, cutoff, image| AlphaMaterial { alpha, cutoff, image };
@@ -76,16 +77,16 @@ pub(crate) fn uniform_cut_out_soups() -> Vec<CutOutSoup> {
         material(1.0, f32::NAN, None),
     ];
     let images = vec![alpha_image(5, 3, |_, _, _| 0), alpha_image(8, 1, |_, _, _| 255)];
-    let with_cut_outs = |soup: Soup| {
+    let add_cut_outs = |soup: Soup| {
         let first = soup.triangles.len() as u32 / 3;
         let count = soup.triangles.len() - first as usize;
-        let mut uv = || [random.next_number(), random.next_number()].map(|number| 3.0 * number);
-        let uvs = (0..count).map(|_| [uv(), uv(), uv()]).collect();
+        let mut random_uv = || [random.next_number(), random.next_number()].map(|coordinate| 3.0 * coordinate);
+        let uvs = (0..count).map(|_| [random_uv(), random_uv(), random_uv()]).collect();
         let material_indices = (0..count).map(|index| (index % materials.len()) as u32).collect();
         let (materials, images) = (materials.clone(), images.clone());
         CutOutSoup { soup, cut_outs: CutOuts { first, uvs, material_indices, materials, images, anisotropy: 8.0 } }
     };
-    all_soups().into_iter().map(with_cut_outs).collect()
+    all_soups().into_iter().map(add_cut_outs).collect()
 }
 
 /// Two triangles that fill a viewport of `side` x `side` pixels with one image; u grows to the right, v downwards. If the
@@ -109,21 +110,21 @@ pub(crate) fn sheet_soup(side: u32, image: AlphaImage) -> CutOutSoup {
     }
 }
 
-/// A floor one unit below the eye that continues behind it, split into `cuts` x `cuts` rectangles, and an opaque wall at
-/// its end. The floor's image is smooth, so that filters of low precision differ little.
-pub(crate) fn floor_soup(cuts: u32) -> CutOutSoup {
+/// A floor one unit below the camera, split into `divisions` x `divisions` rectangles, and an opaque wall at its far end.
+/// The floor extends behind the camera. Its image is smooth, so that filters of low precision differ little.
+pub(crate) fn floor_soup(divisions: u32) -> CutOutSoup {
     let mut positions = [[-20.0, -9.0, -20.5], [20.0, -9.0, -20.5], [20.0, 9.0, -20.5], [-20.0, 9.0, -20.5]].concat();
     let mut triangles = vec![[0, 1, 2], [0, 2, 3]];
-    let fraction = |index: u32| index as f32 / cuts as f32;
-    let grid = (0..=cuts).flat_map(|row| (0..=cuts).map(move |column| (column, row)));
+    let fraction = |index: u32| index as f32 / divisions as f32;
+    let grid = (0..=divisions).flat_map(|row| (0..=divisions).map(move |column| (column, row)));
     positions.extend(grid.flat_map(|(x, z)| [18.0 * fraction(x) - 9.0, -1.0, 9.0 - 29.0 * fraction(z)]));
     let mut uvs = Vec::new();
-    for (column, row) in (0..cuts).flat_map(|row| (0..cuts).map(move |column| (column, row))) {
+    for (column, row) in (0..divisions).flat_map(|row| (0..divisions).map(move |column| (column, row))) {
         let corners =
             [(0, 0), (1, 0), (1, 1), (0, 1)].map(|(next_column, next_row)| (column + next_column, row + next_row));
         for vertex_order in [[0, 1, 2], [0, 2, 3]] {
             let corners = vertex_order.map(|corner: usize| corners[corner]);
-            triangles.push(corners.map(|(x, z)| 4 + z * (cuts + 1) + x));
+            triangles.push(corners.map(|(x, z)| 4 + z * (divisions + 1) + x));
             uvs.push(corners.map(|(x, z)| [3.0 * fraction(x), 5.0 * fraction(z)]));
         }
     }
@@ -132,7 +133,7 @@ pub(crate) fn floor_soup(cuts: u32) -> CutOutSoup {
         material_indices: vec![0; uvs.len()],
         uvs,
         materials: vec![AlphaMaterial { alpha: 1.0, cutoff: 0.4, image: Some(0) }],
-        images: vec![waves()],
+        images: vec![wave_image()],
         anisotropy: 1.0,
     };
     let viewport: Viewport = perspective_viewport(192, 128, 0.1, 100.0);
@@ -144,11 +145,11 @@ pub(crate) fn floor_soup(cuts: u32) -> CutOutSoup {
 }
 
 /// One sine wave per axis. The amplitude differs per mip level, so that reading a wrong level is detected.
-fn waves() -> AlphaImage {
-    let wave = |texel: u32, side: u32| (std::f32::consts::TAU * (texel as f32 + 0.5) / side as f32).sin();
+fn wave_image() -> AlphaImage {
+    let sine = |texel: u32, side: u32| (std::f32::consts::TAU * (texel as f32 + 0.5) / side as f32).sin();
     alpha_image(64, 32, |level, column, row| {
         let sides = [64, 32].map(|side: u32| (side >> level).max(1));
         let amplitude = 60.0 - 4.0 * level as f32;
-        (127.5 + amplitude * (wave(column, sides[0]) + wave(row, sides[1]))).round() as u8
+        (127.5 + amplitude * (sine(column, sides[0]) + sine(row, sides[1]))).round() as u8
     })
 }

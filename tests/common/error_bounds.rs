@@ -8,13 +8,13 @@ use modalcast_model::scene::{Scene, SceneState};
 /// Vertices per tile; all vertices of a tile have the same bound.
 const TILE_VERTICES: usize = QUAD * TILE_QUADS;
 
-/// Largest position error of each domain relative to the bound of its tile; infinite if a position is not finite.
-/// `truncation_bound`, in scene units, is added to the bound.
+/// Largest position error of each domain relative to the bound of its tile; infinite if a position is not finite. The
+/// bound is increased by `truncation_bound`, in scene units.
 fn position_error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], truncation_bound: f64) -> Vec<f64> {
     let bound = |model: &ShapeErrorModel, tile: usize, step: &ErrorBoundInput| {
         model.tile(tile, step).total() + truncation_bound
     };
-    error_ratios(scene, state, Comparison { got: positions, want: &reference::deform(scene, state) }, bound)
+    error_ratios(scene, state, Comparison { actual: positions, expected: &reference::deform(scene, state) }, bound)
 }
 
 /// Largest displacement error of each domain relative to the bound of its tile; infinite if a displacement is not
@@ -23,47 +23,50 @@ fn displacement_error_ratios(scene: &Scene, state: &SceneState, displacements: &
     let bound = |model: &ShapeErrorModel, tile: usize, step: &ErrorBoundInput| {
         model.displacement(tile, step.q, step.compensated)
     };
-    let want = reference::displacements(scene, state);
-    error_ratios(scene, state, Comparison { got: displacements, want: &want }, bound)
+    let expected = reference::displacements(scene, state);
+    error_ratios(scene, state, Comparison { actual: displacements, expected: &expected }, bound)
 }
 
-/// Vectors of all packed vertices: computed ones, three numbers each, and those of the reference.
+/// Vectors of all packed vertices. `actual` contains three numbers per vertex, `expected` the vectors of the reference.
 struct Comparison<'a> {
-    got: &'a [f32],
-    want: &'a [[f64; 3]],
+    actual: &'a [f32],
+    expected: &'a [[f64; 3]],
 }
 
 impl Comparison<'_> {
     /// Length of the difference at a packed vertex.
     fn error(&self, vertex: usize) -> f64 {
-        let squared = |axis: usize| (f64::from(self.got[3 * vertex + axis]) - self.want[vertex][axis]).powi(2);
+        let squared = |axis: usize| (f64::from(self.actual[3 * vertex + axis]) - self.expected[vertex][axis]).powi(2);
         (0..3).map(squared).sum::<f64>().sqrt()
     }
 }
 
+/// Largest error of each domain relative to the bound of its tile.
 fn error_ratios(
     scene: &Scene,
     state: &SceneState,
     comparison: Comparison<'_>,
     bound: impl Fn(&ShapeErrorModel, usize, &ErrorBoundInput) -> f64,
 ) -> Vec<f64> {
-    assert_eq!(comparison.got.len(), 3 * comparison.want.len(), "expected three numbers per vertex");
+    assert_eq!(comparison.actual.len(), 3 * comparison.expected.len(), "expected three numbers per vertex");
     let storage = scene.deformation.storage;
-    let model = |shape| ShapeErrorModel::new(shape, &TiledModes::new(shape, storage));
-    let models: Vec<ShapeErrorModel> = scene.shapes.iter().map(model).collect();
+    let create_model = |shape| ShapeErrorModel::new(shape, &TiledModes::new(shape, storage));
+    let models: Vec<ShapeErrorModel> = scene.shapes.iter().map(create_model).collect();
     let domain_ratio = |domain: usize| {
-        let (slot, compensated) = (scene.layout.domains[domain], scene.deformation.compensated);
+        let (layout, compensated) = (scene.layout.domains[domain], scene.deformation.compensated);
         let step = ErrorBoundInput {
             q: state.q_of(scene, domain),
             transform: state.composed_transform(scene, domain),
             compensated,
         };
-        let tile_ratio = |first: usize| {
-            let bound = bound(&models[scene.domains[domain].shape], first / TILE_VERTICES, &step);
-            let vertices = first..slot.vertices.min(first + TILE_VERTICES);
-            vertices.map(|vertex| error_ratio(comparison.error(slot.first_vertex + vertex), bound)).fold(0.0, f64::max)
+        let tile_ratio = |first_vertex: usize| {
+            let tile_bound = bound(&models[scene.domains[domain].shape], first_vertex / TILE_VERTICES, &step);
+            let vertices = first_vertex..layout.vertices.min(first_vertex + TILE_VERTICES);
+            vertices
+                .map(|vertex| error_ratio(comparison.error(layout.first_vertex + vertex), tile_bound))
+                .fold(0.0, f64::max)
         };
-        (0..slot.vertices).step_by(TILE_VERTICES).map(tile_ratio).fold(0.0, f64::max)
+        (0..layout.vertices).step_by(TILE_VERTICES).map(tile_ratio).fold(0.0, f64::max)
     };
     (0..scene.domains.len()).map(domain_ratio).collect()
 }
@@ -91,10 +94,10 @@ pub(crate) fn assert_displacements_within_bound(name: &str, scene: &Scene, state
 }
 
 fn assert_ratios(name: &str, scene: &Scene, ratios: &[f64]) {
-    let worst = (0..ratios.len()).max_by(|a, b| ratios[*a].total_cmp(&ratios[*b])).expect("at least one domain");
-    let (ratio, domain) = (ratios[worst], &scene.domains[worst].name);
+    let max_domain = (0..ratios.len()).max_by(|a, b| ratios[*a].total_cmp(&ratios[*b])).expect("at least one domain");
+    let (ratio, domain_name) = (ratios[max_domain], &scene.domains[max_domain].name);
     eprintln!("{name}: the largest error is {ratio:.3} of its bound");
-    assert!(ratio <= 1.0, "{name}: expected an error within the bound, got {ratio} of the bound in '{domain}'");
+    assert!(ratio <= 1.0, "{name}: expected an error within the bound, got {ratio} of the bound in '{domain_name}'");
 }
 
 /// Domains with a displacement error that exceeds its bound.
@@ -128,10 +131,10 @@ fn error_bounds_reject_wrong_and_non_finite_vertices() {
     let state = crate::scenes::random_state(&scene, 2);
     let positions: Vec<f32> = reference::deform(&scene, &state).as_flattened().iter().map(|x| *x as f32).collect();
     assert_eq!(domains_beyond_bound(&scene, &state, &positions, 0.0), [0; 0]);
-    for (index, number) in [(3 * 129, f32::NAN), (3 * 129, f32::INFINITY), (3 * 129 + 2, 0.125), (0, 7.0)] {
-        let mut wrong = positions.clone();
-        wrong[index] = number;
-        assert_eq!(domains_beyond_bound(&scene, &state, &wrong, 0.0), [0], "{number}");
+    for (index, wrong_number) in [(3 * 129, f32::NAN), (3 * 129, f32::INFINITY), (3 * 129 + 2, 0.125), (0, 7.0)] {
+        let mut modified = positions.clone();
+        modified[index] = wrong_number;
+        assert_eq!(domains_beyond_bound(&scene, &state, &modified, 0.0), [0], "{wrong_number}");
     }
     let mut wrong_positions = positions;
     wrong_positions[3 * 136] += 1e-3;
@@ -139,10 +142,10 @@ fn error_bounds_reject_wrong_and_non_finite_vertices() {
     let displacements = reference::displacements(&scene, &state);
     let displacements: Vec<f32> = displacements.as_flattened().iter().map(|u| *u as f32).collect();
     assert_eq!(domains_beyond_displacement_bound(&scene, &state, &displacements), [0; 0]);
-    for (index, number, domain) in [(5, f32::NAN, 0), (3 * 129, 0.125, 0), (3 * 136, 1e-30, 1)] {
-        let mut wrong = displacements.clone();
-        wrong[index] = number;
-        assert_eq!(domains_beyond_displacement_bound(&scene, &state, &wrong), [domain], "{number}");
+    for (index, wrong_number, domain) in [(5, f32::NAN, 0), (3 * 129, 0.125, 0), (3 * 136, 1e-30, 1)] {
+        let mut modified = displacements.clone();
+        modified[index] = wrong_number;
+        assert_eq!(domains_beyond_displacement_bound(&scene, &state, &modified), [domain], "{wrong_number}");
     }
     assert_eq!(domains_beyond_bound(&scene, &state, &wrong_positions, 2e-3), [0; 0]);
 }

@@ -1,5 +1,5 @@
-//! Comparison of the ids of two rasterizers. Exact arithmetic in f64 finds samples on an edge and samples where depths
-//! tie, because two rasterizers may see different triangles there.
+//! Comparison of the ids of two rasterizers. They may draw different triangles at samples on an edge and at samples with
+//! equal depths. Arithmetic in f64 finds these samples.
 
 use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
@@ -19,7 +19,7 @@ pub(crate) struct ExactTriangle {
 }
 
 impl ExactTriangle {
-    /// `clip` maps scene to clip coordinates; `size` is that of the viewport in pixels.
+    /// `clip` maps scene to clip coordinates; `size` is the width and height of the viewport in pixels.
     pub(crate) fn new(clip: &Matrix4<f64>, size: [u32; 2], corners: [[f32; 3]; 3]) -> Self {
         let clip_corners =
             corners.map(|corner| clip * Vector4::new(corner[0].into(), corner[1].into(), corner[2].into(), 1.0));
@@ -55,36 +55,38 @@ impl ExactTriangle {
     }
 }
 
-/// Numbers of differing samples.
+/// Number of differing samples by reason.
 #[derive(Debug, Default, PartialEq)]
 pub(crate) struct Differences {
     /// Samples on an edge of one of the two triangles.
     pub(crate) edges: usize,
-    /// Samples where the depths of the two triangles tie.
+    /// Samples where both triangles have the same depth within the tolerance.
     pub(crate) ties: usize,
     /// Other samples.
     pub(crate) wrong: usize,
 }
 
-/// Compares the triangle indices that two rasterizers see in a viewport of `width` pixels. Depths tie if they differ by
-/// `depth_tolerance` or less.
+/// Compares the triangle indices that two rasterizers draw in a viewport of `width` pixels. Depths tie if they differ by
+/// at most `depth_tolerance`.
 pub(crate) fn compare_ids(
-    got: &[Option<u32>],
-    want: &[Option<u32>],
+    actual_ids: &[Option<u32>],
+    expected_ids: &[Option<u32>],
     triangles: &[ExactTriangle],
     width: u32,
     depth_tolerance: f64,
 ) -> Differences {
     let mut differences = Differences::default();
-    for (index, (got, want)) in got.iter().zip(want).enumerate().filter(|(_, (got, want))| got != want) {
+    let pairs = actual_ids.iter().zip(expected_ids).enumerate();
+    for (index, (actual, expected)) in pairs.filter(|(_, (actual, expected))| actual != expected) {
         let (x, y) = (index % width as usize, index / width as usize);
         let sample = Vector3::new(x as f64 + 0.5, y as f64 + 0.5, 1.0);
-        let hits: Vec<&ExactTriangle> = [got, want].into_iter().flatten().map(|id| &triangles[*id as usize]).collect();
+        let triangles_at_sample: Vec<&ExactTriangle> =
+            [actual, expected].into_iter().flatten().map(|id| &triangles[*id as usize]).collect();
         let is_tie =
             |a: &ExactTriangle, b: &ExactTriangle| (a.depth(sample) - b.depth(sample)).abs() <= depth_tolerance;
-        if hits.iter().any(|triangle| triangle.is_on_edge(sample)) {
+        if triangles_at_sample.iter().any(|triangle| triangle.is_on_edge(sample)) {
             differences.edges += 1;
-        } else if hits.len() == 2 && is_tie(hits[0], hits[1]) {
+        } else if triangles_at_sample.len() == 2 && is_tie(triangles_at_sample[0], triangles_at_sample[1]) {
             differences.ties += 1;
         } else {
             differences.wrong += 1;

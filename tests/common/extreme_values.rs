@@ -94,7 +94,7 @@ pub(crate) fn check_column_scales<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     }
 }
 
-/// Least expected ratio of the error of the plain sum to the bound of the compensated sum, for nearly canceling modes.
+/// The smallest expected error of the plain sum relative to the bound of the compensated sum, for nearly canceling modes.
 const MIN_PLAIN_ERROR_RATIO: f64 = 1000.0;
 
 /// Pairs of modes that nearly cancel: the compensated sum keeps the digits that the plain sum loses.
@@ -114,23 +114,29 @@ pub(crate) fn check_canceling_modes<D: Deformer>(create_deformer: impl Fn(&Arc<S
         let positions = run_step(&mut create_deformer(&scene), &state).surface.positions;
         assert_within_bound(&format!("nearly canceling, compensated {compensated}"), &scene, &state, &positions, 0.0);
         let modes = &scene.shape_of(0).modes;
-        let want = reference::deform(&scene, &state).into_flattened();
-        let ratio = |(row, (got, want)): (usize, (&f32, &f64))| {
-            let term = |mode: usize| (f64::from(modes.entry(row / 3, row % 3, mode)) * f64::from(state.q[mode])).abs();
+        let expected = reference::deform(&scene, &state).into_flattened();
+        let ratio = |(row, (actual, expected)): (usize, (&f32, &f64))| {
+            let term = |mode: usize| (f64::from(modes.at(row / 3, row % 3, mode)) * f64::from(state.q[mode])).abs();
             // Bound of the compensated dot product Dot2: half a unit in the last place of the sum, plus gamma squared
             // times the sum of absolute terms. Four further roundings follow.
             let terms = (0..rank).map(term).sum::<f64>();
-            let bound = f64::exp2(-24.0) * 5.0 * want.abs() + (65.0 * f64::exp2(-24.0)).powi(2) * terms;
-            (f64::from(*got) - want).abs() / bound
+            let bound = f64::exp2(-24.0) * 5.0 * expected.abs() + (65.0 * f64::exp2(-24.0)).powi(2) * terms;
+            (f64::from(*actual) - expected).abs() / bound
         };
-        positions.iter().zip(&want).enumerate().map(ratio).fold(0.0, f64::max)
+        positions.iter().zip(&expected).enumerate().map(ratio).fold(0.0, f64::max)
     });
-    let [compensated, plain] = ratios;
+    let [compensated_ratio, plain_ratio] = ratios;
     eprintln!(
-        "nearly canceling, error relative to the compensated bound: compensated {compensated:.3}, plain {plain:.0}"
+        "nearly canceling, error relative to the compensated bound: compensated {compensated_ratio:.3}, plain {plain_ratio:.0}"
     );
-    assert!(compensated <= 1.0, "expected the compensated sum within its bound, got {compensated} of the bound");
-    assert!(plain > MIN_PLAIN_ERROR_RATIO, "negative control: the error of the plain sum is {plain} of the bound");
+    assert!(
+        compensated_ratio <= 1.0,
+        "expected the compensated sum within its bound, got {compensated_ratio} of the bound"
+    );
+    assert!(
+        plain_ratio > MIN_PLAIN_ERROR_RATIO,
+        "negative control: the error of the plain sum is {plain_ratio} of the bound"
+    );
 }
 
 /// Partial sums overflow f32 although the total is finite, and a transform that subtracts two infinities in f32.
@@ -143,16 +149,18 @@ pub(crate) fn check_intermediate_overflow<D: Deformer>(create_deformer: impl Fn(
         let scene = scene_from_columns(5, columns.clone(), deformation);
         let (mut deformer, mut state) = (create_deformer(&scene), SceneState::rest(&scene));
         state.q = vec![3e38, 3e38, -3e38, -3e38, 0.75];
-        assert!((state.q[0] + state.q[1]).is_infinite());
-        let mut assert_positions = |state: &SceneState, want: [f32; 3]| {
+        assert!((state.q[0] + state.q[1]).is_infinite(), "control: expected a partial sum beyond f32");
+        let mut assert_positions = |state: &SceneState, expected: [f32; 3]| {
             let result = run_step(&mut deformer, state);
             assert!(result.bounds.is_finite(), "{name}: {:?}", result.bounds);
             let positions = &result.surface.positions;
             assert!(positions.iter().all(|number| number.is_finite()), "{name}: {positions:?}");
-            let vertex = |got: &[f32]| got.iter().zip(want).map(|(got, want)| (got - want).abs()).fold(0.0, f32::max);
-            let error = positions.chunks_exact(3).map(vertex).fold(0.0, f32::max);
-            eprintln!("{name}: error of {want:?} is {error:e}");
-            assert!(error <= 1e-5, "{name}: {positions:?}");
+            let vertex_error = |actual: &[f32]| {
+                actual.iter().zip(expected).map(|(actual, expected)| (actual - expected).abs()).fold(0.0, f32::max)
+            };
+            let error = positions.chunks_exact(3).map(vertex_error).fold(0.0, f32::max);
+            eprintln!("{name}: error of {expected:?} is {error:e}");
+            assert!(error <= 1e-5, "{name}: expected {expected:?} per vertex, got {positions:?}");
         };
         assert_positions(&state, [0.0, 0.0, 0.75]);
         // x0 + U q has x = y = 6e38, which is infinite in f32. The first row of T computes infinity minus infinity, the
@@ -175,7 +183,7 @@ pub(crate) fn check_zero_tiles<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>
     let mut columns = shape.modes.columns().to_vec();
     for (mode, column) in columns.chunks_exact_mut(3 * vertices).enumerate() {
         column[3 * 128..3 * 256].fill(0.0);
-        // One mode is zero in the first tile too.
+        // One mode is also zero in the first tile.
         column[..if mode == 2 { 3 * 128 } else { 0 }].fill(0.0);
     }
     let modes = Modes::from_columns(3 * vertices, rank, columns).expect("expected valid modes");
@@ -183,26 +191,26 @@ pub(crate) fn check_zero_tiles<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>
     for deformation in deformations() {
         let scene = scene_of_shapes(vec![shape.clone()], 1, deformation, false);
         let (mut deformer, mut state) = (create_deformer(&scene), scenes::random_state(&scene, 4));
-        let deformed = run_step(&mut deformer, &state).surface.positions;
+        let deformed_positions = run_step(&mut deformer, &state).surface.positions;
         assert_within_bound(
             &format!("{}, a tile of zeros", format_deformation(deformation)),
             &scene,
             &state,
-            &deformed,
+            &deformed_positions,
             0.0,
         );
         let mut positions_at = |scale: f32| {
             state.q.fill(scale);
             run_step(&mut deformer, &state).surface.positions
         };
-        let (rest, huge_q) = (positions_at(0.0), positions_at(3e38));
+        let (rest_positions, huge_q_positions) = (positions_at(0.0), positions_at(3e38));
         let zero_tile = 3 * 128..3 * 256;
-        for positions in [&deformed, &huge_q] {
+        for positions in [&deformed_positions, &huge_q_positions] {
             let is_unmoved =
-                zero_tile.clone().all(|positions_at| positions[positions_at].to_bits() == rest[positions_at].to_bits());
+                zero_tile.clone().all(|index| positions[index].to_bits() == rest_positions[index].to_bits());
             assert!(is_unmoved, "{}: expected the zero tile not to move", format_deformation(deformation));
             assert!(
-                positions[0] != rest[0] && positions[3 * 256] != rest[3 * 256],
+                positions[0] != rest_positions[0] && positions[3 * 256] != rest_positions[3 * 256],
                 "expected vertices of other tiles to move"
             );
         }

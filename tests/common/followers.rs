@@ -24,10 +24,11 @@ const MAX_DIRECTION_ERROR: f64 = 1e-4;
 const SIZES: [(usize, usize); 9] =
     [(1, 0), (1, 3), (7, 0), (31, 1), (33, 4), (130, 31), (257, 0), (300, 33), (2000, 2)];
 
-/// A similarity transform; every third is mirrored. Unless `rigid`, every second is sheared too.
-fn frame(random: &mut Random, index: usize, rigid: bool) -> Transform {
+/// A similarity transform. A transform with an index divisible by 3 is mirrored. Unless `is_rigid`, a transform with an
+/// even index is also sheared.
+fn random_frame(random: &mut Random, index: usize, is_rigid: bool) -> Transform {
     let mut frame = random.next_similarity(index.is_multiple_of(3));
-    if !rigid && index.is_multiple_of(2) {
+    if !is_rigid && index.is_multiple_of(2) {
         frame.0[1] += 0.3 * random.next_number();
         frame.0[8] -= 0.2 * random.next_number();
     }
@@ -36,7 +37,7 @@ fn frame(random: &mut Random, index: usize, rigid: bool) -> Transform {
 
 /// A scene in which one third of the domains are transform roots. Each other domain follows an earlier one, which may
 /// be a follower itself.
-pub(crate) fn follower_scene_parts(count: usize, deformation: DeformationSettings, rigid: bool) -> SceneParts {
+pub(crate) fn follower_scene_parts(count: usize, deformation: DeformationSettings, is_rigid: bool) -> SceneParts {
     let mut random = Random(count as u64);
     let mut shapes: Vec<Shape> =
         SIZES.iter().map(|(vertices, rank)| strip_shape(&mut random, *vertices, *rank)).collect();
@@ -44,11 +45,12 @@ pub(crate) fn follower_scene_parts(count: usize, deformation: DeformationSetting
     shapes.push(scenes::random_shape(&mut random, 40, 2));
     let shape_count = shapes.len();
     let mut parts = scenes::parts_of_shapes(shapes);
-    (parts.deformation, parts.rigid_transforms) = (deformation, rigid);
+    (parts.deformation, parts.rigid_transforms) = (deformation, is_rigid);
+
     for index in 0..count {
         let follows = (index % 3 != 0).then(|| {
             let parent = ((random.next_number().abs() * index as f32) as usize).min(index - 1);
-            FollowConstraint { parent, frame: frame(&mut random, index, rigid) }
+            FollowConstraint { parent, frame: random_frame(&mut random, index, is_rigid) }
         });
         let material = if index % 4 == 0 { NORMAL_MAPPED } else { 0 };
         let name = format!("domain {index}");
@@ -80,12 +82,12 @@ fn direction_errors(result: &StepResult, scene: &Scene, state: &SceneState) -> [
 
 /// Mirrored, sheared and chained frames of small and large shapes for every storage type.
 pub(crate) fn check_frames<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
-    for (storage, rigid) in StorageType::ALL.into_iter().flat_map(|storage| [(storage, false), (storage, true)]) {
-        let name = format!("followers, {}, rigid {rigid}", storage.name());
+    for (storage, is_rigid) in StorageType::ALL.into_iter().flat_map(|storage| [(storage, false), (storage, true)]) {
+        let name = format!("followers, {}, rigid {is_rigid}", storage.name());
         let parts =
-            || follower_scene_parts(45, DeformationSettings { storage, ..DeformationSettings::default() }, rigid);
+            || follower_scene_parts(45, DeformationSettings { storage, ..DeformationSettings::default() }, is_rigid);
         let scene = Scene::new(parts()).expect("expected a valid scene");
-        assert_eq!((scene.transform_roots.count(), scene.features.shear), (15, !rigid));
+        assert_eq!((scene.transform_roots.count(), scene.needs.shear), (15, !is_rigid));
         let state = scenes::random_state(&scene, 61);
         let result = run_step(&mut create_deformer(&scene), &state);
         assert_within_bound(&name, &scene, &state, &result.surface.positions, 0.0);
@@ -116,9 +118,9 @@ fn bits(numbers: &[f32]) -> Vec<u32> {
     numbers.iter().map(|number| number.to_bits()).collect()
 }
 
-/// The transform root of a domain, found along its parents.
+/// The transform root of a domain, found by ascending to its ancestors.
 fn transform_root(scene: &Scene, domain: usize) -> usize {
-    scene.domains[domain].follows.map_or(domain, |follow| transform_root(scene, follow.parent))
+    scene.domains[domain].follows.map_or(domain, |constraint| transform_root(scene, constraint.parent))
 }
 
 /// Domains that a step changes: those in `q_domains`, and those whose transform root is in `transform_domains`.
@@ -131,19 +133,19 @@ fn changed_domains(scene: &Scene, q_domains: &[u32], transform_domains: &[u32]) 
 
 /// A partial step that moves some roots and deforms some followers gives the bits of a full step.
 pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
-    let plain = DeformationSettings::default();
+    let default = DeformationSettings::default();
     for deformation in [
-        plain,
-        with_displacements_and_boxes(plain),
-        DeformationSettings { normals: NormalMethod::Exact, ..plain },
-        DeformationSettings { normals: NormalMethod::Exact, storage: StorageType::Int8, ..plain },
-        DeformationSettings { truncation: Some(0.2), storage: StorageType::F16, ..plain },
+        default,
+        with_displacements_and_boxes(default),
+        DeformationSettings { normals: NormalMethod::Exact, ..default },
+        DeformationSettings { normals: NormalMethod::Exact, storage: StorageType::Int8, ..default },
+        DeformationSettings { truncation: Some(0.2), storage: StorageType::F16, ..default },
     ] {
         let name = format!("{deformation:?}");
         let scene = Scene::new(follower_scene_parts(120, deformation, false)).expect("expected a valid scene");
         let (mut partial_deformer, mut full_deformer) = (create_deformer(&scene), create_deformer(&scene));
         let (mut state, mut random) = (scenes::random_state(&scene, 63), Random(62));
-        let mut last = run_step(&mut partial_deformer, &state);
+        let mut previous_result = run_step(&mut partial_deformer, &state);
         run_step(&mut full_deformer, &state);
         let roots: Vec<u32> = scene.transform_roots.domains().collect();
         let mut partial_steps = 0;
@@ -152,35 +154,42 @@ pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn
             let transform_domains = if step == 7 { &roots[..] } else { &two_roots[..step % 3] };
             let q_domains: &[u32] = if step % 4 == 1 { &[1, 5, 64] } else { &[] };
             apply_random_step(&scene, &mut state, &mut random, q_domains, transform_domains);
-            let expected = changed_domains(&scene, q_domains, transform_domains);
-            assert_eq!(state.changed, DirtyDomains::Some(expected.clone()), "step {step}");
+            let expected_domains = changed_domains(&scene, q_domains, transform_domains);
+            assert_eq!(state.changed, DirtyDomains::Some(expected_domains.clone()), "step {step}");
             let result = run_step(&mut partial_deformer, &state);
             let mut dirty_state = state.clone();
             dirty_state.mark_all_dirty();
             let full_result = run_step(&mut full_deformer, &dirty_state);
             assert_eq!(result.difference(&full_result), None, "{name}, step {step}");
-            let moved: Vec<u32> = (0..120).filter(|domain| has_moved(&scene, *domain, [&last, &result])).collect();
+            let moved_domains: Vec<u32> =
+                (0..120).filter(|domain| has_moved(&scene, *domain, [&previous_result, &result])).collect();
             let has_new_transform =
                 |domain: &u32| transform_domains.contains(&(transform_root(&scene, *domain as usize) as u32));
-            assert!(moved.iter().all(|domain| expected.contains(domain)));
-            assert!(expected.iter().filter(|domain| has_new_transform(domain)).all(|domain| moved.contains(domain)));
-            assert!(!scene.features.boxes || find_wrong_box(&scene, &result).is_none(), "step {step}");
+            assert!(moved_domains.iter().all(|domain| expected_domains.contains(domain)));
+            assert!(
+                expected_domains
+                    .iter()
+                    .filter(|domain| has_new_transform(domain))
+                    .all(|domain| moved_domains.contains(domain))
+            );
+            assert!(!scene.needs.boxes || find_wrong_box(&scene, &result).is_none(), "step {step}");
             // A partial step changes at most a quarter of the domains.
-            partial_steps += usize::from(!expected.is_empty() && expected.len() <= 30);
-            last = result;
+            partial_steps += usize::from(!expected_domains.is_empty() && expected_domains.len() <= 30);
+            previous_result = result;
         }
         assert!(partial_steps >= 5, "expected at least 5 partial steps, got {partial_steps}");
     }
 }
 
 /// Whether the positions of a domain differ between two steps.
-fn has_moved(scene: &Scene, domain: u32, [before, after]: [&StepResult; 2]) -> bool {
-    let slot = scene.layout.domains[domain as usize];
-    let positions = |result: &StepResult| bits(&result.surface.positions[3 * slot.first_vertex..][..3 * slot.vertices]);
-    positions(before) != positions(after)
+fn has_moved(scene: &Scene, domain: u32, [previous, current]: [&StepResult; 2]) -> bool {
+    let layout = scene.layout.domains[domain as usize];
+    let positions =
+        |result: &StepResult| bits(&result.surface.positions[3 * layout.first_vertex..][..3 * layout.vertices]);
+    positions(previous) != positions(current)
 }
 
-/// A step that moves a domain by an f64 translation without rotating it.
+/// A step that sets the transform of a domain to an f64 translation.
 fn far_step(domain: u32, translation: [f64; 3]) -> RawStepUpdate {
     let rotation = [0.0_f32, 0.0, 0.0, 1.0].into_iter().flat_map(f32::to_le_bytes);
     let bytes: Vec<u8> = rotation.chain(translation.into_iter().flat_map(f64::to_le_bytes)).collect();
@@ -192,7 +201,8 @@ fn far_step(domain: u32, translation: [f64; 3]) -> RawStepUpdate {
     }
 }
 
-/// A follower uses the floating origin of its root, so a far follower is as precise as one near the origin.
+/// The positions of a follower are relative to the local origin of its root, so a far follower is as precise as one near
+/// the scene's origin.
 pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(64);
     let mut parts = scenes::parts_of_shapes(vec![strip_shape(&mut random, 50, 0)]);
@@ -206,38 +216,42 @@ pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     state.apply(&scene, &StepUpdate::parse(&scene, &far_step(0, translation)).expect("expected a valid step"));
     assert_eq!((scene.transform_roots.root_of(1), state.transforms.len()), (0, 2));
     let result = run_step(&mut create_deformer(&scene), &state);
-    let (slot, origin) = (scene.layout.domains[1], state.origin_of(scene.transform_roots.root_of(1)));
-    let [mut error, mut f32_error] = [0.0_f64; 2];
-    for (vertex, rest) in scene.shape_of(1).mesh.rest_positions().iter().enumerate() {
-        let inside = frame.to_matrix().transform_point(&nalgebra::Point3::from(*rest).cast());
+    let (layout, origin) = (scene.layout.domains[1], state.origin_of(scene.transform_roots.of(1)));
+    let [mut max_error, mut max_f32_error] = [0.0_f64; 2];
+    for (vertex, rest_position) in scene.shape_of(1).mesh.rest().iter().enumerate() {
+        let position_in_root = frame.to_matrix().transform_point(&nalgebra::Point3::from(*rest_position).cast());
         for axis in 0..3 {
-            let want = translation[axis] + inside[axis];
-            let got = origin[axis] + f64::from(result.surface.positions[3 * (slot.first_vertex + vertex) + axis]);
-            error = error.max((got - want).abs());
-            f32_error = f32_error.max((f64::from(want as f32) - want).abs());
+            let expected = translation[axis] + position_in_root[axis];
+            let actual = origin[axis] + f64::from(result.surface.positions[3 * (layout.first_vertex + vertex) + axis]);
+            max_error = max_error.max((actual - expected).abs());
+            max_f32_error = max_f32_error.max((f64::from(expected as f32) - expected).abs());
         }
     }
-    eprintln!("error of a follower at 10,000 km: {error:.2e} m");
-    assert!(error <= 1e-3, "expected at most 1 mm, got {error} m");
-    assert!(f32_error > 0.1, "negative control: expected more than 0.1 m for f32 world positions, got {f32_error} m");
+    eprintln!("error of a follower at 10,000 km: {max_error:.2e} m");
+    assert!(max_error <= 1e-3, "expected at most 1 mm, got {max_error} m");
+    assert!(
+        max_f32_error > 0.1,
+        "negative control: expected more than 0.1 m for f32 world positions, got {max_f32_error} m"
+    );
 }
 
 /// The product T F exceeds the range of f32, but tiny rest positions keep the deformed positions in range.
 pub(crate) fn check_overflowing_frame_products<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(65);
-    let rest: Vec<[f32; 3]> = (0..37).map(|_| random.next_triple().map(|number| number * 1e-20)).collect();
+    let rest_positions: Vec<[f32; 3]> =
+        (0..37).map(|_| random.next_triple().map(|coordinate| coordinate * 1e-20)).collect();
     let normals = (0..37).map(|_| random.next_triple()).collect();
     let triangles = (0..35).map(|index| [index, index + 1, index + 2]).collect();
-    let mesh = Mesh::from_indexed(rest, normals, vec![], triangles).expect("expected a valid mesh");
+    let mesh = Mesh::from_indexed(rest_positions, normals, vec![], triangles).expect("expected a valid mesh");
     let scaled_linear_part = |transform: Transform, scale: f32| {
         let mut entries = transform.0.map(|entry| entry * scale);
         [3, 7, 11].into_iter().for_each(|index| entries[index] = 0.0);
         Transform(entries)
     };
-    for rigid in [true, false] {
+    for is_rigid in [true, false] {
         let mut parts =
             scenes::parts_of_shapes(vec![Shape::new(mesh.clone(), Modes::rigid()).expect("expected a valid shape")]);
-        parts.rigid_transforms = rigid;
+        parts.rigid_transforms = is_rigid;
         let frame = scaled_linear_part(random.next_similarity(true), 1e25);
         for follows in [None, Some(FollowConstraint { parent: 0, frame })] {
             parts.domains.push(Domain { follows, ..scenes::new_domain(0, 0) });
@@ -248,10 +262,12 @@ pub(crate) fn check_overflowing_frame_products<D: Deformer>(create_deformer: imp
         assert!(!state.transform_of(&scene, 1).0[0].is_finite(), "expected a product beyond f32");
         let result = run_step(&mut create_deformer(&scene), &state);
         assert!(result.bounds.is_finite());
-        let want = reference::deform(&scene, &state);
-        let max_coordinate =
-            want.as_flattened().iter().fold(0.0_f64, |max_coordinate, number| max_coordinate.max(number.abs()));
-        let error = max_abs_error(&result.surface.positions, want.as_flattened()) / max_coordinate;
+        let expected = reference::deform(&scene, &state);
+        let max_coordinate = expected
+            .as_flattened()
+            .iter()
+            .fold(0.0_f64, |max_coordinate, coordinate| max_coordinate.max(coordinate.abs()));
+        let error = max_abs_error(&result.surface.positions, expected.as_flattened()) / max_coordinate;
         assert!(error <= 1e-6, "expected a relative error of at most 1e-6, got {error}");
         let [normals, _] = direction_errors(&result, &scene, &state);
         assert!(normals <= MAX_DIRECTION_ERROR, "expected at most {MAX_DIRECTION_ERROR}, got {normals}");

@@ -21,15 +21,16 @@ pub(crate) fn coil_shape(vertices: usize, rank: usize) -> Shape {
         let (t, angle) = (2.0 * fraction(vertex) - 1.0, 300.0 * fraction(vertex));
         [t + 0.02 * angle.cos(), t + 0.02 * angle.sin(), t]
     };
-    let rest: Vec<[f32; 3]> = (0..vertices).map(position).collect();
+    let rest_positions: Vec<[f32; 3]> = (0..vertices).map(position).collect();
     let entry_value =
         |entry: usize| 0.05 * ((entry / (3 * vertices) + 1) as f32 * 3.0 * fraction(entry / 3 % vertices)).sin();
     let modes = Modes::from_columns(3 * vertices, rank, (0..3 * vertices * rank).map(entry_value).collect())
         .expect("expected valid modes");
-    let last = vertices as u32 - 1;
-    let triangles = (0..=last).map(|index| [index, (index + 1).min(last), (index + 2).min(last)]).collect();
-    let mesh =
-        Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; vertices], vec![], triangles).expect("expected a valid mesh");
+    let last_vertex = vertices as u32 - 1;
+    let triangles =
+        (0..=last_vertex).map(|index| [index, (index + 1).min(last_vertex), (index + 2).min(last_vertex)]).collect();
+    let mesh = Mesh::from_indexed(rest_positions, vec![[0.0, 0.0, 1.0]; vertices], vec![], triangles)
+        .expect("expected a valid mesh");
     Shape::new(mesh, modes).expect("expected a valid shape")
 }
 
@@ -62,10 +63,10 @@ fn max_tile_diagonal(positions: &[f32]) -> f64 {
     positions.chunks(3 * TILE_VERTICES).map(|tile| BoundingBox::from_positions(tile).diagonal()).fold(0.0, f64::max)
 }
 
-/// The light-space bounds of a step. Asserts that they contain every vertex, and that they exceed the light-space box of
-/// the scene bounds only by rounding.
-fn checked_light_bounds(name: &str, scene: &Scene, result: &StepResult) -> OrientedBounds {
-    let light_box = result.light.expect("expected a scene with a shadow");
+/// Returns the light-space bounds of a step. Asserts that they contain every vertex, and that they exceed the light-space
+/// box of the scene bounds only by rounding.
+fn verify_light_bounds(name: &str, scene: &Scene, result: &StepResult) -> OrientedBounds {
+    let light_box = result.light_bounds.expect("expected a scene with a shadow");
     let (vertex_box, corner_box) =
         (bounds_in_light_space(scene, &result.surface.positions, 1), bounds_of_corners(scene, &result.bounds));
     let magnitude = coordinate_magnitude(&result.bounds);
@@ -77,11 +78,8 @@ fn checked_light_bounds(name: &str, scene: &Scene, result: &StepResult) -> Orien
         max_excess(&corner_box, &light_box) <= 4e-7 * magnitude,
         "{name}: expected {light_box:?} within {corner_box:?}"
     );
-    let shrunken_box = vertex_box.expanded_by(-1e-3 * result.bounds.diagonal());
-    assert!(
-        result.bounds.diagonal() == 0.0 || max_excess(&shrunken_box, &vertex_box) > 0.0,
-        "{name}: negative control"
-    );
+    let shrunk_box = vertex_box.expanded_by(-1e-3 * result.bounds.diagonal());
+    assert!(result.bounds.diagonal() == 0.0 || max_excess(&shrunk_box, &vertex_box) > 0.0, "{name}: negative control");
     light_box
 }
 
@@ -89,25 +87,25 @@ fn bounds_of_corners(scene: &Scene, bounds: &BoundingBox) -> OrientedBounds {
     OrientedBounds::enclosing(&scene.light_axes().expect("expected a scene with a shadow"), bounds)
 }
 
-/// Light bounds contain every vertex of scenes that are random, smooth, far from the origin or tiny, that have one
-/// vertex, or whose domains share tiles.
+/// Light bounds contain every vertex of random, smooth, distant and tiny scenes, of a scene with one vertex, and of a
+/// scene whose domains share tiles.
 pub(crate) fn check_containment<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>, BatchPolicy) -> D) {
-    let policy = BatchPolicy::default();
+    let default_policy = BatchPolicy::default();
     let scenes = [
-        ("coils", policy, coil_scene(DeformationSettings::default())),
+        ("coils", default_policy, coil_scene(DeformationSettings::default())),
         ("batched coils", BatchPolicy::Always, coil_scene(DeformationSettings::default())),
-        ("one vertex", policy, scenes::random_scene(&[(1, 1)], 1, false, true)),
-        ("small domains", policy, scenes::random_scene(&[(7, 3), (40, 0), (300, 5)], 5, false, false)),
+        ("one vertex", default_policy, scenes::random_scene(&[(1, 1)], 1, false, true)),
+        ("small domains", default_policy, scenes::random_scene(&[(7, 3), (40, 0), (300, 5)], 5, false, false)),
     ];
-    for (name, batches, scene) in scenes {
-        let mut deformer = create_deformer(&scene, batches);
+    for (name, batch_policy, scene) in scenes {
+        let mut deformer = create_deformer(&scene, batch_policy);
         for seed in 0..3 {
             let mut state = scenes::random_state(&scene, seed);
-            checked_light_bounds(name, &scene, &run_step(&mut deformer, &state));
+            verify_light_bounds(name, &scene, &run_step(&mut deformer, &state));
             state.transforms.iter_mut().for_each(|transform| transform.0[3] += 1e6);
-            checked_light_bounds(&format!("{name}, far"), &scene, &run_step(&mut deformer, &state));
+            verify_light_bounds(&format!("{name}, far"), &scene, &run_step(&mut deformer, &state));
             state.transforms.iter_mut().for_each(|transform| transform.0.iter_mut().for_each(|entry| *entry *= 1e-20));
-            checked_light_bounds(&format!("{name}, tiny"), &scene, &run_step(&mut deformer, &state));
+            verify_light_bounds(&format!("{name}, tiny"), &scene, &run_step(&mut deformer, &state));
         }
     }
 }
@@ -117,24 +115,25 @@ pub(crate) fn check_containment<D: Deformer>(create_deformer: impl Fn(&Arc<Scene
 pub(crate) fn check_tightness<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let scene = scene_of_shapes(vec![coil_shape(5000, 4)], 1, DeformationSettings::default(), false);
     let result = run_step(&mut create_deformer(&scene), &SceneState::rest(&scene));
-    let light_box = checked_light_bounds("coil", &scene, &result);
+    let light_box = verify_light_bounds("coil", &scene, &result);
     let (vertex_box, corner_box) =
         (bounds_in_light_space(&scene, &result.surface.positions, 1), bounds_of_corners(&scene, &result.bounds));
     let tile_diagonal = max_tile_diagonal(&result.surface.positions);
     assert!(
         max_excess(&vertex_box, &light_box) < tile_diagonal,
-        "{light_box:?} beyond {vertex_box:?}, tiles of {tile_diagonal}"
+        "expected {light_box:?} to exceed {vertex_box:?} by less than {tile_diagonal}"
     );
     let volume = |OrientedBounds(bounds): &OrientedBounds| {
         (0..3).map(|axis| bounds.max[axis] - bounds.min[axis]).product::<f64>()
     };
-    let [light_box, vertex_box, corner_box] = [light_box, vertex_box, corner_box].map(|bounds| volume(&bounds));
+    let [light_volume, vertex_volume, corner_volume] =
+        [light_box, vertex_box, corner_box].map(|bounds| volume(&bounds));
     eprintln!(
         "coil, volume relative to the box of the scene bounds: light bounds {:.3}, vertices {:.3}",
-        light_box / corner_box,
-        vertex_box / corner_box
+        light_volume / corner_volume,
+        vertex_volume / corner_volume
     );
-    assert!(light_box < 0.5 * corner_box && vertex_box <= light_box);
+    assert!(light_volume < 0.5 * corner_volume && vertex_volume <= light_volume);
 }
 
 /// A scene without a shadow has no light bounds. Light bounds of a step that overflows are invalid, for that step only.
@@ -143,15 +142,22 @@ pub(crate) fn check_missing_shadow_and_overflow<D: Deformer>(create_deformer: im
     parts.domains = vec![scenes::new_domain(0, 0); 2];
     parts.look.shadow = None;
     let unshadowed_scene = Scene::new(parts).expect("expected a valid scene");
-    assert_eq!(run_step(&mut create_deformer(&unshadowed_scene), &SceneState::rest(&unshadowed_scene)).light, None);
+    assert_eq!(
+        run_step(&mut create_deformer(&unshadowed_scene), &SceneState::rest(&unshadowed_scene)).light_bounds,
+        None
+    );
     let scene = scenes::random_scene(&[(300, 2)], 2, false, false);
     let (mut deformer, valid_state) = (create_deformer(&scene), SceneState::rest(&scene));
-    let before = run_step(&mut deformer, &valid_state).light;
-    assert!(before.is_some_and(|light| light.is_valid()));
-    for entry in [f32::NAN, f32::INFINITY, f32::MAX] {
+    let valid_bounds = run_step(&mut deformer, &valid_state).light_bounds;
+    assert!(valid_bounds.is_some_and(|light| light.is_valid()));
+    for invalid_entry in [f32::NAN, f32::INFINITY, f32::MAX] {
         let mut overflowing_state = valid_state.clone();
-        overflowing_state.transforms[1].0.fill(entry);
-        assert!(run_step(&mut deformer, &overflowing_state).light.is_some_and(|light| !light.is_valid()), "{entry}");
-        assert_eq!(run_step(&mut deformer, &valid_state).light, before, "forgotten");
+        overflowing_state.transforms[1].0.fill(invalid_entry);
+        assert!(
+            run_step(&mut deformer, &overflowing_state).light_bounds.is_some_and(|light| !light.is_valid()),
+            "{invalid_entry}"
+        );
+        let light_bounds = run_step(&mut deformer, &valid_state).light_bounds;
+        assert_eq!(light_bounds, valid_bounds, "expected no effect on the next step");
     }
 }

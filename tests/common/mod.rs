@@ -1,6 +1,6 @@
 //! Checks that every deformer must pass: extreme values, partial steps, followers and optional attributes. Each check
-//! takes a function that creates the deformer of a scene, and prints the errors that it measured. `tests/it` runs all
-//! checks on the CPU, `tests/gpu` on the GPU.
+//! takes a function that creates the deformer of a scene, and prints the measured errors. `tests/it` runs all checks on
+//! the CPU, `tests/gpu` on the GPU.
 
 pub(crate) mod attributes;
 #[allow(dead_code, reason = "each test binary uses a part")]
@@ -28,19 +28,20 @@ pub(crate) use error_bounds::{
     assert_displacements_within_bound, assert_within_bound, domains_beyond_bound, domains_beyond_displacement_bound,
 };
 
-/// Results of a step.
+/// The results of a step.
 #[derive(Debug, Clone)]
 pub(crate) struct StepResult {
     pub(crate) bounds: BoundingBox,
-    pub(crate) light: Option<OrientedBounds>,
+    /// Light-space bounds; `None` for a scene without a shadow.
+    pub(crate) light_bounds: Option<OrientedBounds>,
     pub(crate) surface: DeformedSurface,
 }
 
 /// Deforms a state and reads back all attributes.
 pub(crate) fn run_step(deformer: &mut dyn Deformer, state: &SceneState) -> StepResult {
-    let DeformSummary { bounds, oriented_bounds: light, .. } =
+    let DeformSummary { bounds, oriented_bounds: light_bounds, .. } =
         deformer.deform(state).expect("expected the step to succeed");
-    StepResult { bounds, light, surface: deformer.surface().expect("expected a surface").clone() }
+    StepResult { bounds, light_bounds, surface: deformer.surface().expect("expected a surface").clone() }
 }
 
 impl StepResult {
@@ -50,12 +51,17 @@ impl StepResult {
             let DeformedSurface { positions, normals, tangents, displacements, .. } = result.surface.clone();
             [("position", positions), ("normal", normals), ("tangent", tangents), ("displacement", displacements)]
         };
-        for ((name, left), (_, right)) in attribute_lists(self).into_iter().zip(attribute_lists(other)) {
-            if left.len() != right.len() {
-                return Some(format!("{name}s have {} and {} numbers", left.len(), right.len()));
+        for ((name, numbers), (_, other_numbers)) in attribute_lists(self).into_iter().zip(attribute_lists(other)) {
+            if numbers.len() != other_numbers.len() {
+                return Some(format!("{name}s have {} and {} numbers", numbers.len(), other_numbers.len()));
             }
-            if let Some(index) = (0..left.len()).find(|index| left[*index].to_bits() != right[*index].to_bits()) {
-                return Some(format!("{name}s differ at number {index}: {} and {}", left[index], right[index]));
+            if let Some(index) =
+                (0..numbers.len()).find(|index| numbers[*index].to_bits() != other_numbers[*index].to_bits())
+            {
+                return Some(format!(
+                    "{name}s differ at number {index}: {} and {}",
+                    numbers[index], other_numbers[index]
+                ));
             }
         }
         if self.surface.boxes != other.surface.boxes {
@@ -69,8 +75,9 @@ impl StepResult {
 pub(crate) fn strip_shape(random: &mut Random, vertices: usize, rank: usize) -> Shape {
     let shape = scenes::random_shape(random, vertices, rank);
     let normals = (0..vertices).map(|_| random.next_triple()).collect();
-    let last = vertices as u32 - 1;
-    let triangles = (0..=last).map(|index| [index, (index + 1).min(last), (index + 2).min(last)]).collect();
+    let last_vertex = vertices as u32 - 1;
+    let triangles =
+        (0..=last_vertex).map(|index| [index, (index + 1).min(last_vertex), (index + 2).min(last_vertex)]).collect();
     let uvs = shape.mesh.corners().uvs[..vertices].to_vec();
     let mesh = Mesh::from_indexed(shape.mesh.rest_positions().to_vec(), normals, uvs, triangles).expect("a valid mesh");
     Shape::new(mesh, shape.modes).expect("a valid shape")
@@ -83,20 +90,20 @@ pub(crate) fn scene_of_shapes(
     deformation: DeformationSettings,
     normal_maps: bool,
 ) -> Arc<Scene> {
-    let count = shapes.len();
+    let shape_count = shapes.len();
     let mut parts = scenes::parts_of_shapes(shapes);
     parts.deformation = deformation;
     let material = if normal_maps { NORMAL_MAPPED } else { 0 };
-    let domain =
-        |index: usize| Domain { name: format!("domain {index}"), ..scenes::new_domain(index % count, material) };
-    parts.domains = (0..instances * count).map(domain).collect();
+    let create_domain =
+        |index: usize| Domain { name: format!("domain {index}"), ..scenes::new_domain(index % shape_count, material) };
+    parts.domains = (0..instances * shape_count).map(create_domain).collect();
     Scene::new(parts).expect("a valid scene")
 }
 
 #[test]
 fn difference_detects_bits_lengths_and_bounds() {
     let surface = DeformedSurface { positions: vec![0.0; 3], normals: vec![1.0; 3], ..DeformedSurface::default() };
-    let result = StepResult { bounds: BoundingBox { min: [0.0; 3], max: [0.0; 3] }, light: None, surface };
+    let result = StepResult { bounds: BoundingBox { min: [0.0; 3], max: [0.0; 3] }, light_bounds: None, surface };
     assert_eq!(result.difference(&result), None);
     let difference_after = |modify: &dyn Fn(&mut StepResult)| {
         let mut other = result.clone();

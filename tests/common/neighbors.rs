@@ -1,4 +1,5 @@
-//! The bits of a domain do not depend on the other domains of its scene, even if those change the kernel variant.
+//! The bits of a domain do not depend on the other domains of its scene, even if the other domains change the kernel
+//! variant.
 
 use std::sync::Arc;
 
@@ -10,7 +11,8 @@ use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType
 use super::{StepResult, run_step, strip_shape};
 use crate::scenes::{self, NORMAL_MAPPED, Random};
 
-/// Shapes under test. Their vertex counts are not multiples of a quad. Some share a tile, some have tiles of their own.
+/// Shapes under test. Their vertex counts are not multiples of four (a quad). Small shapes share a tile, and the large
+/// shape has separate tiles.
 fn tested_shapes() -> Vec<Shape> {
     let mut random = Random(61);
     vec![
@@ -25,37 +27,41 @@ fn tested_shapes() -> Vec<Shape> {
 /// `instances` domains of a shape of four tiles. Also returns the index of the first domain under test.
 fn embedded_scene(
     deformation: DeformationSettings,
-    (before, after): (usize, usize),
+    (preceding_count, following_count): (usize, usize),
     instances: usize,
 ) -> (Arc<Scene>, usize) {
     let mut random = Random(62);
-    let mut shapes: Vec<Shape> =
-        (0..before + after).map(|index| strip_shape(&mut random, 3 + index % 6, index % 6)).collect();
+    let mut shapes: Vec<Shape> = (0..preceding_count + following_count)
+        .map(|index| strip_shape(&mut random, 3 + index % 6, index % 6))
+        .collect();
     let shapes_under_test = tested_shapes();
-    let count = shapes_under_test.len();
-    shapes.splice(before..before, shapes_under_test);
+    let tested_count = shapes_under_test.len();
+    shapes.splice(preceding_count..preceding_count, shapes_under_test);
     shapes.push(strip_shape(&mut random, 500, 2));
     let instanced_shape = shapes.len() - 1;
     let mut parts = scenes::parts_of_shapes(shapes);
     parts.deformation = deformation;
-    let domain = |(index, shape): (usize, usize)| Domain {
+    let create_domain = |(index, shape): (usize, usize)| Domain {
         name: format!("{index}"),
         ..scenes::new_domain(shape, NORMAL_MAPPED)
     };
-    parts.domains =
-        (0..instanced_shape).chain(std::iter::repeat_n(instanced_shape, instances)).enumerate().map(domain).collect();
-    assert!(before + count <= parts.domains.len());
-    (Scene::new(parts).expect("expected a valid scene"), before)
+    parts.domains = (0..instanced_shape)
+        .chain(std::iter::repeat_n(instanced_shape, instances))
+        .enumerate()
+        .map(create_domain)
+        .collect();
+    assert!(preceding_count + tested_count <= parts.domains.len());
+    (Scene::new(parts).expect("expected a valid scene"), preceding_count)
 }
 
 /// A state with the values of `tested_state` for the domains from `first` on, and random values for the others.
-fn state_of(scene: &Scene, first: usize, tested_state: &SceneState) -> SceneState {
+fn state_of(scene: &Scene, first_domain: usize, tested_state: &SceneState) -> SceneState {
     let mut state = scenes::random_state(scene, 63);
     let mut q = tested_state.q.iter();
     for domain in 0..tested_state.transforms.len() {
-        state.transforms[first + domain] = tested_state.transforms[domain];
-        let slot = scene.layout.domains[first + domain];
-        state.q[slot.first_q..][..slot.rank]
+        state.transforms[first_domain + domain] = tested_state.transforms[domain];
+        let layout = scene.layout.domains[first_domain + domain];
+        state.q[layout.first_q..][..layout.rank]
             .iter_mut()
             .zip(q.by_ref())
             .for_each(|(coordinate, tested_coordinate)| *coordinate = *tested_coordinate);
@@ -65,11 +71,11 @@ fn state_of(scene: &Scene, first: usize, tested_state: &SceneState) -> SceneStat
 
 /// Positions, normals and tangents of a domain, as bits.
 fn bits_of(result: &StepResult, scene: &Scene, domain: usize) -> [Vec<u32>; 3] {
-    let (slot, surface) = (scene.layout.domains[domain], &result.surface);
+    let (layout, surface) = (scene.layout.domains[domain], &result.surface);
     [
-        &surface.positions[3 * slot.first_vertex..][..3 * slot.vertices],
-        &surface.normals[3 * slot.first_corner..][..3 * slot.corners],
-        &surface.tangents[4 * slot.first_corner..][..4 * slot.corners],
+        &surface.positions[3 * layout.first_vertex..][..3 * layout.vertices],
+        &surface.normals[3 * layout.first_corner..][..3 * layout.corners],
+        &surface.tangents[4 * layout.first_corner..][..4 * layout.corners],
     ]
     .map(|numbers| numbers.iter().map(|number| number.to_bits()).collect())
 }
@@ -83,29 +89,42 @@ pub(crate) fn has_one_item_per_lane(scene: &Scene) -> bool {
         .contains(&"ONE_ITEM_PER_LANE")
 }
 
-/// Compares the bits of the domains under test in a scene of their own, among a thousand other domains, and with 270
-/// further instances of a large shape.
+/// Compares the bits of the domains under test in a separate scene, among a thousand other domains, and with 270 further
+/// instances of a large shape.
 pub(crate) fn check_independence_of_neighbors<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     for (storage, compensated) in StorageType::ALL.map(|storage| (storage, storage == StorageType::Bf16)) {
         let deformation = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
         let (small_scene, _) = embedded_scene(deformation, (0, 0), 0);
         let tested_state = scenes::random_state(&small_scene, 64);
-        let want = run_step(&mut create_deformer(&small_scene), &tested_state);
+        let expected = run_step(&mut create_deformer(&small_scene), &tested_state);
         let name = storage.name();
-        for (neighbors, instances, has_one_item) in [((500, 500), 0, true), ((501, 499), 270, false)] {
-            let (scene, first) = embedded_scene(deformation, neighbors, instances);
-            assert_eq!((has_one_item_per_lane(&small_scene), has_one_item_per_lane(&scene)), (true, has_one_item));
-            let (mut deformer, state) = (create_deformer(&scene), state_of(&scene, first, &tested_state));
-            let got = run_step(&mut deformer, &state);
+        for (neighbor_counts, instance_count, is_one_item_expected) in [((500, 500), 0, true), ((501, 499), 270, false)]
+        {
+            let (scene, first_domain) = embedded_scene(deformation, neighbor_counts, instance_count);
+            assert_eq!(
+                (has_one_item_per_lane(&small_scene), has_one_item_per_lane(&scene)),
+                (true, is_one_item_expected)
+            );
+            let (mut deformer, state) = (create_deformer(&scene), state_of(&scene, first_domain, &tested_state));
+            let actual = run_step(&mut deformer, &state);
             for index in 0..tested_state.transforms.len() {
-                let (got, want) = (bits_of(&got, &scene, first + index), bits_of(&want, &small_scene, index));
-                assert!(got == want, "{name}, shape {index} among {} others", scene.domains.len());
+                let actual_bits = bits_of(&actual, &scene, first_domain + index);
+                let is_equal = actual_bits == bits_of(&expected, &small_scene, index);
+                assert!(
+                    is_equal,
+                    "{name}, shape {index} among {} domains: expected the same bits",
+                    scene.domains.len()
+                );
             }
             // Negative control: another state gives other bits. It does not affect later steps.
-            let other = run_step(&mut deformer, &scenes::random_state(&scene, 65));
-            assert!(bits_of(&other, &scene, first) != bits_of(&want, &small_scene, 0));
-            assert_eq!(run_step(&mut deformer, &state).difference(&got), None, "{name}: same state again");
-            assert_eq!(run_step(&mut create_deformer(&scene), &state).difference(&got), None, "{name}: new deformer");
+            let other_result = run_step(&mut deformer, &scenes::random_state(&scene, 65));
+            assert!(bits_of(&other_result, &scene, first_domain) != bits_of(&expected, &small_scene, 0));
+            assert_eq!(run_step(&mut deformer, &state).difference(&actual), None, "{name}: same state again");
+            assert_eq!(
+                run_step(&mut create_deformer(&scene), &state).difference(&actual),
+                None,
+                "{name}: new deformer"
+            );
             eprintln!("{name}: same bits among {} domains", scene.domains.len());
         }
     }

@@ -12,7 +12,7 @@ use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType
 use super::{partial_steps, run_step, scene_of_shapes, strip_shape};
 use crate::scenes::{self, Random};
 
-/// A scene with so many domains that a step that changes two of them is a partial step.
+/// A scene with eight domains, so that a step that changes two of them is a partial step.
 fn test_scene(storage: StorageType) -> Arc<Scene> {
     let mut random = Random(71);
     let shapes = vec![
@@ -33,8 +33,8 @@ pub(crate) fn check_overflow_affects_one_step<D: Deformer>(create_deformer: impl
         let scene = test_scene(storage);
         let (mut deformer, mut random) = (create_deformer(&scene), Random(72));
         let mut valid_state = scenes::random_state(&scene, 73);
-        let before = run_step(&mut deformer, &valid_state);
-        assert!(before.bounds.is_finite());
+        let previous_result = run_step(&mut deformer, &valid_state);
+        assert!(previous_result.bounds.is_finite());
         for coordinate in [f32::MAX, -f32::MAX] {
             let mut overflowing_state = valid_state.clone();
             partial_steps::apply_random_step(&scene, &mut overflowing_state, &mut random, &[1], &[1]);
@@ -48,10 +48,10 @@ pub(crate) fn check_overflow_affects_one_step<D: Deformer>(create_deformer: impl
             );
             // The next valid state has no overflow in its history, and its step changes another domain.
             partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[2], &[]);
-            let after = run_step(&mut deformer, &valid_state);
-            assert!(after.bounds.is_finite() && after.difference(&before).is_some());
+            let result = run_step(&mut deformer, &valid_state);
+            assert!(result.bounds.is_finite() && result.difference(&previous_result).is_some());
             assert_eq!(
-                after.difference(&run_step(&mut create_deformer(&scene), &valid_state)),
+                result.difference(&run_step(&mut create_deformer(&scene), &valid_state)),
                 None,
                 "{}: {coordinate:e}",
                 storage.name()
@@ -60,7 +60,7 @@ pub(crate) fn check_overflow_affects_one_step<D: Deformer>(create_deformer: impl
     }
 }
 
-/// A step that overflows is rejected with the name of its domain, and the vertices stay those of the last valid step.
+/// A step that overflows is rejected with the name of its domain, and the vertices remain those of the last valid step.
 pub(crate) fn check_overflow_rejection(backend: BackendChoice) {
     let config = Config { backend, renderer: RendererChoice::Off, ..Config::default() };
     let mut context = DeviceContext::open(&config).expect("expected a device context");
@@ -70,7 +70,7 @@ pub(crate) fn check_overflow_rejection(backend: BackendChoice) {
     let mut valid_state = SceneState::rest(&scene);
     partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[0, 5], &[5]);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
-    let before = loaded_scene.surface().expect("vertices").clone();
+    let valid_surface = loaded_scene.surface().expect("vertices").clone();
     for (domain, coordinate) in [(5, f32::MAX), (2, -f32::MAX), (5, 1e30)] {
         let mut overflowing_state = valid_state.clone();
         partial_steps::apply_random_step(&scene, &mut overflowing_state, &mut random, &[domain], &[]);
@@ -78,17 +78,17 @@ pub(crate) fn check_overflow_rejection(backend: BackendChoice) {
         let error = loaded_scene.deform(&overflowing_state).expect_err("expected an overflow error").to_string();
         eprintln!("{error}");
         assert!(error.starts_with(&format!("step.q of domain 'domain {domain}'")), "{error}");
-        assert_eq!(loaded_scene.surface().expect("vertices"), &before);
+        assert_eq!(loaded_scene.surface().expect("vertices"), &valid_surface);
         assert!(loaded_scene.bounds().is_finite());
     }
     // The next step applies to the last valid step.
     partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[6], &[]);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
-    let after = loaded_scene.surface().expect("vertices").clone();
-    assert_ne!(after, before, "expected the step to change vertices");
+    let next_surface = loaded_scene.surface().expect("vertices").clone();
+    assert_ne!(next_surface, valid_surface, "expected the step to change vertices");
     let mut new_scene = context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
     new_scene.deform(&valid_state).expect("expected a valid step");
-    assert_eq!(new_scene.surface().expect("vertices"), &after);
+    assert_eq!(new_scene.surface().expect("vertices"), &next_surface);
     context.unload_scene(loaded_scene);
     context.unload_scene(new_scene);
 }

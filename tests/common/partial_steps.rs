@@ -55,8 +55,8 @@ const SHARER: u32 = 29;
 /// Number of domains of [`mixed_scene`]. A step that changes more than a quarter of them is computed in full.
 const DOMAINS: u32 = 40;
 
-/// A scene of small domains of many ranks, with and without separate corners, a large domain, one without modes,
-/// instances, and domains of one shape or of two shapes that share coordinates.
+/// A scene of small domains of many ranks, with and without separate corners. It also has a large domain, a domain
+/// without modes, instances, and domains of one or two shapes that share coordinates.
 fn mixed_scene(deformation: DeformationSettings, normal_maps: bool) -> Arc<Scene> {
     let mut random = Random(50);
     let mut shapes: Vec<Shape> = (0..20).map(|index| strip_shape(&mut random, 5 + index % 9, index % 5)).collect();
@@ -65,7 +65,7 @@ fn mixed_scene(deformation: DeformationSettings, normal_maps: bool) -> Arc<Scene
     shapes.push(strip_shape(&mut random, 200, 0));
     shapes.push(strip_shape(&mut random, 40, 4));
     let mut domain_shapes: Vec<usize> = (0..29).collect();
-    // A domain that shares the coordinates of another shape, then instances.
+    // First a domain that shares the coordinates of another shape, then instances.
     domain_shapes.extend([9, 28, 28, 28, 4, 4, 28, 28, 28, 0, 27]);
     let mut parts = scenes::parts_of_shapes(shapes);
     parts.deformation = deformation;
@@ -89,7 +89,7 @@ enum Interruption {
     None,
     /// A step is applied but its state is not deformed.
     SkippedStep,
-    /// A state that overflows is deformed, then the state before it again.
+    /// A state that overflows is deformed, then the previous state is deformed again.
     Overflow,
     /// A state with another history is deformed.
     OtherHistory,
@@ -105,10 +105,10 @@ struct ScriptedStep {
 
 fn scripted_steps() -> Vec<ScriptedStep> {
     use Interruption::{None, OtherHistory, Overflow, SkippedStep};
-    let all: Vec<u32> = (0..DOMAINS).collect();
-    let quarter = (0..DOMAINS / 4).collect();
-    let above_quarter = (3..4 + DOMAINS / 4).collect();
-    let step =
+    let all_domains: Vec<u32> = (0..DOMAINS).collect();
+    let quarter_of_domains = (0..DOMAINS / 4).collect();
+    let more_than_quarter = (3..4 + DOMAINS / 4).collect();
+    let create_step =
         |(q_domains, transform_domains, interruption)| ScriptedStep { q_domains, transform_domains, interruption };
     [
         (vec![], vec![], None),
@@ -117,12 +117,12 @@ fn scripted_steps() -> Vec<ScriptedStep> {
         (vec![3], vec![3], None),
         (vec![], vec![RIGID], None),
         (vec![LARGE], vec![1], None),
-        (all.clone(), all, None),
+        (all_domains.clone(), all_domains, None),
         (vec![22, 24], vec![22], None),
         (vec![SHARER - 1], vec![], None),
         (vec![SHARER], vec![SHARER], None),
-        (quarter, vec![], None),
-        (vec![], above_quarter, None),
+        (quarter_of_domains, vec![], None),
+        (vec![], more_than_quarter, None),
         (vec![], vec![], None),
         (vec![7], vec![], SkippedStep),
         (vec![8, 33], vec![9], None),
@@ -132,7 +132,7 @@ fn scripted_steps() -> Vec<ScriptedStep> {
         (vec![11, 38], vec![LARGE, 39], None),
         (vec![], vec![], OtherHistory),
     ]
-    .map(step)
+    .map(create_step)
     .into()
 }
 
@@ -158,7 +158,11 @@ impl<D: Deformer> DeformerPair<D> {
                 assert_eq!(find_wrong_box(&self.scene, &partial), None, "{name}, state {}", self.states);
             }
             assert_eq!(partial.difference(&full), None, "{name}, state {}", self.states);
-            assert!(partial.light.is_some() && partial.light == full.light, "{name}, state {}", self.states);
+            assert!(
+                partial.light_bounds.is_some() && partial.light_bounds == full.light_bounds,
+                "{name}, state {}",
+                self.states
+            );
         }
         self.states += 1;
         partial
@@ -174,68 +178,72 @@ fn compare_scripted_steps<D: Deformer>(name: &str, scene: &Arc<Scene>, create_de
         states: 0,
     };
     let (mut state, mut other_state) = (scenes::random_state(scene, 52), scenes::random_state(scene, 53));
-    let (mut last, mut changed_steps) = (deformers.deform(&state, name), 0);
+    let (mut previous_result, mut changed_steps) = (deformers.deform(&state, name), 0);
     for ScriptedStep { q_domains, transform_domains, interruption } in scripted_steps() {
         match interruption {
             Interruption::None => {}
             Interruption::SkippedStep => apply_random_step(scene, &mut state, &mut random, &[5, 6], &[RIGID]),
             Interruption::Overflow => {
-                let mut overflowing = state.clone();
-                apply_random_step(scene, &mut overflowing, &mut random, &[12], &[4]);
-                overflowing.transforms[4].0.fill(f32::MAX);
-                assert!(!deformers.deform(&overflowing, name).bounds.is_finite());
-                assert_eq!(deformers.deform(&state, name).difference(&last), None, "{name}: after an overflow");
+                let mut overflowing_state = state.clone();
+                apply_random_step(scene, &mut overflowing_state, &mut random, &[12], &[4]);
+                overflowing_state.transforms[4].0.fill(f32::MAX);
+                assert!(!deformers.deform(&overflowing_state, name).bounds.is_finite());
+                assert_eq!(
+                    deformers.deform(&state, name).difference(&previous_result),
+                    None,
+                    "{name}: after an overflow"
+                );
             }
             Interruption::OtherHistory => {
                 apply_random_step(scene, &mut other_state, &mut random, &[2], &[]);
-                assert!(deformers.deform(&other_state, name).difference(&last).is_some());
+                assert!(deformers.deform(&other_state, name).difference(&previous_result).is_some());
             }
         }
         apply_random_step(scene, &mut state, &mut random, &q_domains, &transform_domains);
         let result = deformers.deform(&state, name);
         if !q_domains.is_empty() || !transform_domains.is_empty() {
-            assert!(result.difference(&last).is_some(), "{name}: expected the step to change vertices");
+            assert!(result.difference(&previous_result).is_some(), "{name}: expected the step to change vertices");
             changed_steps += 1;
         }
-        last = result;
+        previous_result = result;
     }
-    assert_eq!(deformers.deform(&state, name).difference(&last), None, "{name}: the same state again");
+    assert_eq!(deformers.deform(&state, name).difference(&previous_result), None, "{name}: the same state again");
     // Without truncation the result does not depend on earlier steps.
     if !scene.features.truncation {
         let new_result = run_step(&mut create_deformer(scene), &state);
-        assert_eq!(new_result.difference(&last), None, "{name}: a new deformer");
+        assert_eq!(new_result.difference(&previous_result), None, "{name}: a new deformer");
     }
     eprintln!("{name}: {} states, {changed_steps} of them after changes, have equal bits", deformers.states);
 }
 
 /// Runs the scripted steps for every storage type and every deformation feature, and with batches.
 pub(crate) fn check_partial_steps<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>, BatchPolicy) -> D) {
-    let stored = |storage| DeformationSettings { storage, ..DeformationSettings::default() };
-    let exact = |storage| DeformationSettings { normals: NormalMethod::Exact, ..stored(storage) };
-    let compensated = |deformation| DeformationSettings { compensated: true, ..deformation };
-    let truncated = |storage| DeformationSettings { truncation: Some(0.2), ..stored(storage) };
+    let with_storage = |storage| DeformationSettings { storage, ..DeformationSettings::default() };
+    let with_exact_normals = |storage| DeformationSettings { normals: NormalMethod::Exact, ..with_storage(storage) };
+    let with_compensation = |deformation| DeformationSettings { compensated: true, ..deformation };
+    let with_truncation = |storage| DeformationSettings { truncation: Some(0.2), ..with_storage(storage) };
     for (deformation, normal_maps) in [
-        (stored(StorageType::F32), true),
-        (exact(StorageType::F32), true),
-        (compensated(exact(StorageType::F32)), false),
-        (truncated(StorageType::F32), false),
-        (stored(StorageType::F16), true),
-        (truncated(StorageType::F16), true),
-        (exact(StorageType::Bf16), true),
-        (stored(StorageType::Int8), true),
-        (compensated(exact(StorageType::Int8)), false),
-        (with_displacements_and_boxes(stored(StorageType::F32)), true),
-        (with_displacements_and_boxes(truncated(StorageType::F16)), false),
-        (with_displacements_and_boxes(compensated(exact(StorageType::Int8))), false),
+        (with_storage(StorageType::F32), true),
+        (with_exact_normals(StorageType::F32), true),
+        (with_compensation(with_exact_normals(StorageType::F32)), false),
+        (with_truncation(StorageType::F32), false),
+        (with_storage(StorageType::F16), true),
+        (with_truncation(StorageType::F16), true),
+        (with_exact_normals(StorageType::Bf16), true),
+        (with_storage(StorageType::Int8), true),
+        (with_compensation(with_exact_normals(StorageType::Int8)), false),
+        (with_displacements_and_boxes(with_storage(StorageType::F32)), true),
+        (with_displacements_and_boxes(with_truncation(StorageType::F16)), false),
+        (with_displacements_and_boxes(with_compensation(with_exact_normals(StorageType::Int8))), false),
     ] {
         let name = format!("{deformation:?}, normal maps {normal_maps}");
         let create_deformer = |scene: &Arc<Scene>| create_deformer(scene, BatchPolicy::default());
         compare_scripted_steps(&name, &mixed_scene(deformation, normal_maps), &create_deformer);
     }
     for deformation in [
-        stored(StorageType::F32),
-        exact(StorageType::F16),
-        DeformationSettings { boxes: true, ..stored(StorageType::Int8) },
+        with_storage(StorageType::F32),
+        with_exact_normals(StorageType::F16),
+        DeformationSettings { boxes: true, ..with_storage(StorageType::Int8) },
     ] {
         let name = format!("batched {deformation:?}");
         let create_deformer = |scene: &Arc<Scene>| create_deformer(scene, BatchPolicy::Always);
@@ -249,15 +257,15 @@ pub(crate) fn relies_on_dirty_list<D: Deformer>(create_deformer: impl Fn(&Arc<Sc
     let scene = mixed_scene(DeformationSettings::default(), false);
     let mut deformer = create_deformer(&scene);
     let mut state = scenes::random_state(&scene, 54);
-    let before = run_step(&mut deformer, &state).surface.positions;
+    let previous_positions = run_step(&mut deformer, &state).surface.positions;
     apply_random_step(&scene, &mut state, &mut Random(55), &[LARGE, 3], &[]);
     assert_eq!(state.changed, DirtyDomains::Some(vec![3, LARGE]));
     state.changed = DirtyDomains::Some(vec![3]);
-    let after = run_step(&mut deformer, &state).surface.positions;
+    let positions = run_step(&mut deformer, &state).surface.positions;
     let is_unchanged = |domain: u32| {
-        let slot = scene.layout.domains[domain as usize];
-        let range = 3 * slot.first_vertex..3 * (slot.first_vertex + slot.vertices);
-        before[range.clone()] == after[range]
+        let layout = scene.layout.domains[domain as usize];
+        let range = 3 * layout.first_vertex..3 * (layout.first_vertex + layout.vertices);
+        previous_positions[range.clone()] == positions[range]
     };
     assert!(!is_unchanged(3), "expected the listed domain to be computed");
     is_unchanged(LARGE)

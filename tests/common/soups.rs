@@ -37,7 +37,7 @@ impl Soup {
         )
     }
 
-    /// Ids and depths by the reference rasterizer.
+    /// Draws the soup with the reference rasterizer.
     pub(crate) fn rasterize(&self) -> VisibilityBuffer {
         let mut raster = VisibilityBuffer::new(self.viewport);
         self.groups.iter().for_each(|group| raster.draw(&self.positions, &self.triangles, *group));
@@ -59,7 +59,7 @@ pub(crate) fn clip_space_viewport(width: u32, height: u32) -> Viewport {
 
 /// Positions of triangles with random corners around random centers. Centers are within `extent` of the origin, corners
 /// within `size` of their center per axis.
-fn scattered(random: &mut Random, count: usize, extent: f32, size: [f32; 3]) -> Vec<f32> {
+fn scattered_triangles(random: &mut Random, count: usize, extent: f32, size: [f32; 3]) -> Vec<f32> {
     let mut positions = Vec::with_capacity(9 * count);
     for _ in 0..count {
         let center = random.next_triple().map(|number| extent * number);
@@ -71,7 +71,7 @@ fn scattered(random: &mut Random, count: usize, extent: f32, size: [f32; 3]) -> 
     positions
 }
 
-/// A fan around a center; its rim lies beyond the border of [`clip_space_viewport`].
+/// A fan around a center. Its outer vertices lie outside of [`clip_space_viewport`].
 pub(crate) fn fan_soup(viewport: Viewport) -> Soup {
     let mut random = Random(11);
     let mut positions = vec![0.05, -0.03, 0.0];
@@ -86,9 +86,9 @@ pub(crate) fn fan_soup(viewport: Viewport) -> Soup {
     soup
 }
 
-/// Triangles without area: repeated vertices or collinear corners. Some triangles between them have an area.
-fn degenerate() -> Soup {
-    let mut positions = scattered(&mut Random(9), 8, 0.8, [0.6; 3]);
+/// Mostly triangles without area, with repeated vertices or collinear corners. The others have an area.
+fn degenerate_soup() -> Soup {
+    let mut positions = scattered_triangles(&mut Random(9), 8, 0.8, [0.6; 3]);
     positions.extend([[-0.9, -0.9, 0.0], [0.0, 0.0, 0.1], [0.9, 0.9, 0.2]].concat());
     let triangles = (0..24).flat_map(|vertex: u32| {
         let (a, b) = (vertex, (vertex + 7) % 24);
@@ -101,22 +101,22 @@ fn degenerate() -> Soup {
 pub(crate) fn all_soups() -> Vec<Soup> {
     let mut random = Random(5);
     let random = &mut random;
-    let mut non_finite = scattered(random, 600, 1.0, [0.3; 3]);
+    let mut non_finite = scattered_triangles(random, 600, 1.0, [0.3; 3]);
     for (index, value) in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX].into_iter().enumerate() {
-        (index..non_finite.len()).step_by(61 + index).for_each(|number| non_finite[number] = value);
+        (index..non_finite.len()).step_by(61 + index).for_each(|coordinate| non_finite[coordinate] = value);
     }
-    let coincident = scattered(random, 40, 0.7, [0.4; 3]).repeat(3);
+    let coincident = scattered_triangles(random, 40, 0.7, [0.4; 3]).repeat(3);
     let far_projection = {
         let eye = Point3::new(1e7, 1e7, 1e7 + 8.0);
         let view = Matrix4::look_at_rh(&eye, &Point3::new(1e7, 1e7, 1e7), &Vector3::y());
         nalgebra::Perspective3::new(1.5, 0.9, 0.1, 100.0).to_homogeneous() * view
     };
     let far_positions: Vec<f32> =
-        scattered(random, 300, 3.0, [2.0; 3]).into_iter().map(|number| number + 1e7).collect();
-    let positions_behind = scattered(random, 100, 1.0, [0.5; 3]);
+        scattered_triangles(random, 300, 3.0, [2.0; 3]).into_iter().map(|coordinate| coordinate + 1e7).collect();
+    let positions_behind = scattered_triangles(random, 100, 1.0, [0.5; 3]);
     let positions_behind = positions_behind.chunks_exact(3).flat_map(|p| [p[0], p[1], p[2] + 5.0]).collect();
     let mut scattered_soup = |name, count, extent, size, viewport| {
-        Soup::with_separate_triangles(name, scattered(random, count, extent, size), viewport)
+        Soup::with_separate_triangles(name, scattered_triangles(random, count, extent, size), viewport)
     };
     let nan_viewport = Viewport::new(&Matrix4::from_element(f64::NAN), 8, 8).expect("expected a valid viewport");
     vec![
@@ -142,7 +142,7 @@ pub(crate) fn all_soups() -> Vec<Soup> {
         scattered_soup("tall viewport", 40, 1.0, [1.0; 3], clip_space_viewport(2, 16384)),
         scattered_soup("NaN viewport", 9, 1.0, [1.0; 3], nan_viewport),
         Soup::with_separate_triangles("no triangles", Vec::new(), clip_space_viewport(8, 8)),
-        degenerate(),
+        degenerate_soup(),
         fan_soup(clip_space_viewport(128, 128)),
     ]
 }

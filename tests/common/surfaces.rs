@@ -14,40 +14,44 @@ use crate::scenes::{self, Random};
 const MAX_DIRECTION_ERROR: f64 = 2e-5;
 
 /// Largest absolute difference; infinite for a NaN or if the lengths differ.
-pub(crate) fn max_abs_error(got: &[f32], want: &[f64]) -> f64 {
-    let error = |(got, want): (&f32, &f64)| {
-        let error = (f64::from(*got) - want).abs();
+pub(crate) fn max_abs_error(actual: &[f32], expected: &[f64]) -> f64 {
+    let error = |(actual, expected): (&f32, &f64)| {
+        let error = (f64::from(*actual) - expected).abs();
         if error.is_nan() { f64::INFINITY } else { error }
     };
-    if got.len() == want.len() { got.iter().zip(want).map(error).fold(0.0, f64::max) } else { f64::INFINITY }
+    if actual.len() == expected.len() {
+        actual.iter().zip(expected).map(error).fold(0.0, f64::max)
+    } else {
+        f64::INFINITY
+    }
 }
 
 /// Positions, normals and tangents under a mirror, a shear, both, and a strongly anisotropic scale.
 pub(crate) fn check_shears_and_mirrors<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let scene = scenes::random_scene(&[(40, 3), (200, 2)], 2, true, false);
     let mut state = scenes::random_state(&scene, 6);
-    let linear: [[f32; 9]; 4] = [
+    let linear_parts: [[f32; 9]; 4] = [
         [-1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         [1.0, 0.7, -0.2, 0.0, 0.5, 0.4, 0.1, 0.0, 1.5],
         [1.0, 3.0, 0.0, 0.0, 1.0, 0.0, 0.0, 2.0, -1.0],
         [30.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -0.1],
     ];
-    for (transform, [a, b, c, d, e, f, g, h, i]) in state.transforms.iter_mut().zip(linear) {
+    for (transform, [a, b, c, d, e, f, g, h, i]) in state.transforms.iter_mut().zip(linear_parts) {
         *transform = Transform([a, b, c, 1.0, d, e, f, -2.0, g, h, i, 0.5]);
     }
     let result = run_step(&mut create_deformer(&scene), &state);
     assert_within_bound("shears and mirrors", &scene, &state, &result.surface.positions, 0.0);
-    let errors = |state: &SceneState| {
+    let direction_errors = |state: &SceneState| {
         let normals = max_abs_error(&result.surface.normals, rigid_normals(&scene, state).as_flattened());
         (normals, max_abs_error(&result.surface.tangents, rigid_tangents(&scene, state).as_flattened()))
     };
-    let (normal, tangent) = errors(&state);
-    eprintln!("shears and mirrors: error of normals {normal:.2e}, of tangents {tangent:.2e}");
-    assert!(normal <= MAX_DIRECTION_ERROR && tangent <= MAX_DIRECTION_ERROR);
+    let (normal_error, tangent_error) = direction_errors(&state);
+    eprintln!("shears and mirrors: error of normals {normal_error:.2e}, of tangents {tangent_error:.2e}");
+    assert!(normal_error <= MAX_DIRECTION_ERROR && tangent_error <= MAX_DIRECTION_ERROR);
     // Negative control: without its mirror, the first domain has other normals and tangents.
     state.transforms[0] = Transform::IDENTITY;
-    let (normal, tangent) = errors(&state);
-    assert!(normal > 0.1 && tangent > 0.1);
+    let (normal_error, tangent_error) = direction_errors(&state);
+    assert!(normal_error > 0.1 && tangent_error > 0.1);
 }
 
 /// Position of a vertex.
@@ -58,7 +62,7 @@ type TriangleFn = fn(u32) -> [u32; 3];
 type UvsFn = fn(usize) -> Vec<[f32; 2]>;
 
 /// Meshes whose triangles have no area, with and without texture coordinates.
-fn flat_meshes() -> Vec<Mesh> {
+fn zero_area_meshes() -> Vec<Mesh> {
     let position_functions: [PositionFn; 3] =
         [|_| [0.5, -0.25, 1.0], |index| [index as f32, 0.0, 0.0], |index| [index as f32, (index * index) as f32, 1.0]];
     let triangle_functions: [TriangleFn; 3] = [
@@ -71,27 +75,30 @@ fn flat_meshes() -> Vec<Mesh> {
     let mut meshes = Vec::new();
     for (position_of, triangle_of) in position_functions.into_iter().zip(triangle_functions) {
         for uvs_of in uv_functions {
-            let rest: Vec<[f32; 3]> = (0..9).map(position_of).collect();
+            let rest_positions: Vec<[f32; 3]> = (0..9).map(position_of).collect();
             let normals =
                 (0..9).map(|index| if index % 4 == 0 { [0.0; 3] } else { [0.0, index as f32, 1.0] }).collect();
             let corners = Corners { vertices: (0..9).collect(), normals, uvs: uvs_of(9) };
-            meshes.push(Mesh::new(rest, corners, (0..7).map(triangle_of).collect()).expect("expected a valid mesh"));
+            meshes.push(
+                Mesh::new(rest_positions, corners, (0..7).map(triangle_of).collect()).expect("expected a valid mesh"),
+            );
         }
     }
     meshes
 }
 
-/// Whether the first three numbers of every group of `width` are a unit vector.
-fn are_unit(numbers: &[f32], width: usize) -> bool {
-    let length = |vector: &[f32]| vector[..3].iter().map(|number| number * number).sum::<f32>().sqrt();
-    numbers.chunks_exact(width).all(|vector| (length(vector) - 1.0).abs() < 1e-5)
+/// Whether the first three of every `width` numbers form a unit vector.
+fn are_unit_vectors(components: &[f32], width: usize) -> bool {
+    let length = |vector: &[f32]| vector[..3].iter().map(|component| component * component).sum::<f32>().sqrt();
+    components.chunks_exact(width).all(|vector| (length(vector) - 1.0).abs() < 1e-5)
 }
 
 /// Triangles or texture coordinates without area, and missing texture coordinates, give unit normals and tangents.
 pub(crate) fn check_zero_area_and_missing_uvs<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
-    assert!(are_unit(&[0.6, 0.8, 0.0], 3) && !are_unit(&[0.0; 3], 3) && !are_unit(&[f32::NAN; 3], 3));
+    assert!(are_unit_vectors(&[0.6, 0.8, 0.0], 3));
+    assert!(!are_unit_vectors(&[0.0; 3], 3) && !are_unit_vectors(&[f32::NAN; 3], 3));
     let modes = scenes::random_shape(&mut Random(35), 9, 2).modes;
-    let shapes: Vec<Shape> = flat_meshes()
+    let shapes: Vec<Shape> = zero_area_meshes()
         .into_iter()
         .map(|mesh| Shape::new(mesh, modes.clone()).expect("expected a valid shape"))
         .collect();
@@ -104,13 +111,13 @@ pub(crate) fn check_zero_area_and_missing_uvs<D: Deformer>(create_deformer: impl
             state.q.iter_mut().for_each(|number| *number *= scale);
             let result = run_step(&mut deformer, &state);
             assert!(result.bounds.is_finite());
-            assert!(are_unit(&result.surface.normals, 3), "{normals:?}, q of {scale:e}");
-            for (domain, slot) in scene.layout.domains.iter().enumerate() {
-                let tangents = &result.surface.tangents[4 * slot.first_corner..][..4 * slot.corners];
+            assert!(are_unit_vectors(&result.surface.normals, 3), "{normals:?}, q of {scale:e}");
+            for (domain, layout) in scene.layout.domains.iter().enumerate() {
+                let tangents = &result.surface.tangents[4 * layout.first_corner..][..4 * layout.corners];
                 let is_valid = if scene.shape_of(domain).tangents().is_empty() {
                     tangents.iter().all(|number| *number == 0.0)
                 } else {
-                    are_unit(tangents, 4) && tangents.iter().skip(3).step_by(4).all(|sign| sign.abs() == 1.0)
+                    are_unit_vectors(tangents, 4) && tangents.iter().skip(3).step_by(4).all(|sign| sign.abs() == 1.0)
                 };
                 assert!(is_valid, "{normals:?}, q of {scale:e}, domain {domain}: {tangents:?}");
             }

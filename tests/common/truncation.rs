@@ -9,11 +9,11 @@ use super::extreme_values::scene_from_columns;
 use super::{assert_within_bound, domains_beyond_bound, partial_steps, run_step, scene_of_shapes, strip_shape};
 use crate::scenes::{self, Random};
 
-/// Budget in meters, which are scene units here.
+/// Truncation budget in meters. The scenes of this file have a unit of one meter.
 const BUDGET: f64 = 0.02;
 
-/// Deforms twenty random states, each of which changes two domains. Errors stay within their bounds plus the reported
-/// truncation bound, and that bound stays within the budget. `truncation_bound` reads it from a deformer, in scene
+/// Deforms twenty random states, each of which changes two domains. Errors are within their bounds plus the truncation
+/// bound, and the truncation bound is within the budget. `truncation_bound` returns the bound of a deformer, in scene
 /// units.
 pub(crate) fn check_error_budget<D: Deformer>(
     create_deformer: impl Fn(&Arc<Scene>) -> D,
@@ -38,8 +38,8 @@ pub(crate) fn check_error_budget<D: Deformer>(
             partial_steps::apply_random_step(&scene, &mut state, &mut random, &domains, &domains);
             // Amplitudes decrease with the mode, as for a vibrating body.
             for domain in domains {
-                let slot = scene.layout.domains[domain as usize];
-                let q = &mut state.q[slot.first_q..][..slot.rank];
+                let layout = scene.layout.domains[domain as usize];
+                let q = &mut state.q[layout.first_q..][..layout.rank];
                 q.iter_mut().enumerate().for_each(|(mode, amplitude)| *amplitude *= f32::exp2(-(mode as f32)));
             }
             let positions = run_step(&mut deformer, &state).surface.positions;
@@ -77,7 +77,7 @@ fn count_mode_toggles(storage: StorageType, mut deform: impl FnMut(&Arc<Scene>, 
     );
     let mut state = SceneState::rest(&scene);
     state.q[0] = 10.0;
-    let (mut toggles, mut previous) = (0, None);
+    let (mut toggles, mut was_truncated) = (0, None);
     for step in 0..60 {
         state.q[oscillating_mode] = 0.5 + 0.1 * (0.7 * step as f32).sin();
         state.mark_all_dirty();
@@ -85,13 +85,13 @@ fn count_mode_toggles(storage: StorageType, mut deform: impl FnMut(&Arc<Scene>, 
         assert!((positions[1] - 10.0).abs() < 1e-3, "expected mode 0 not to be truncated");
         let is_truncated = positions[0] == 0.0;
         assert!(is_truncated || (positions[0] - state.q[oscillating_mode]).abs() < 0.01);
-        toggles += usize::from(previous.is_some_and(|previous| previous != is_truncated));
-        previous = Some(is_truncated);
+        toggles += usize::from(was_truncated == Some(!is_truncated));
+        was_truncated = Some(is_truncated);
     }
     toggles
 }
 
-/// Hysteresis: a mode near the limit stays truncated. Negative control: with a new deformer per step, the mode is
+/// Hysteresis: a mode near the limit remains truncated. Negative control: with a new deformer per step, the mode is
 /// truncated and restored many times.
 pub(crate) fn check_hysteresis<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     for storage in StorageType::ALL {
