@@ -77,9 +77,9 @@ impl VertexAttributes {
     }
 }
 
-/// A readback of one step's vertices, in flight or complete. Deforming later steps does not change its contents. It can
-/// be awaited at any time, more than once, or never. Its memory stays allocated while this handle or the result of
-/// [`Deformer::wait_readback`] is alive.
+/// A readback of one step's vertices, in flight or complete. Later steps do not change its contents. A caller may wait
+/// for it at any time, repeatedly, or never. Its memory remains allocated while this handle or the result of
+/// [`Deformer::wait_readback`] exists.
 ///
 /// A pending readback does not expose its vertices, because the device may still write them. Only the deformer that
 /// started it can complete it.
@@ -118,7 +118,7 @@ impl VertexReadback {
     }
 
     /// The vertices, or `None` if they may still be in flight.
-    fn complete(&self) -> Option<&Arc<DeformedSurface>> {
+    fn completed_surface(&self) -> Option<&Arc<DeformedSurface>> {
         self.is_ready.then_some(&self.surface)
     }
 }
@@ -143,7 +143,8 @@ impl Backend {
     }
 }
 
-/// Orthogonal unit vectors in the world, along which a deformer bounds the positions in addition to the world's axes.
+/// Orthogonal unit vectors in world space. A deformer bounds the positions along these axes in addition to the axes of
+/// the world.
 pub type BoundingAxes = [nalgebra::Vector3<f64>; 3];
 
 /// The result of [`Deformer::deform`] apart from the vertices.
@@ -210,7 +211,7 @@ pub trait Deformer {
     /// # Errors
     /// `Fault` if the copy from the device fails, or if another deformer started the readback.
     fn wait_readback(&mut self, readback: &VertexReadback) -> Result<Arc<DeformedSurface>> {
-        readback.complete().cloned().ok_or_else(|| fault_in("readback")("another deformer started it"))
+        readback.completed_surface().cloned().ok_or_else(|| fault_in("readback")("another deformer started it"))
     }
 }
 

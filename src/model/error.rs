@@ -1,22 +1,22 @@
-//! The error type of all crates. Variants are grouped by who can act on the error, and carry the values that this party
-//! needs.
+//! The error type of all crates. Each variant is for one party that can act on the error: the caller, another client or
+//! the operator. It contains the values that this party needs.
 
 /// The error type of the server.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
-    /// The caller sent a value that is never acceptable.
+    /// The caller sent an invalid value.
     #[error("{field}: expected {expected}, got {given}")]
     Invalid { field: String, expected: String, given: String },
     /// The caller named an object that does not exist.
     #[error("{what} not found: {given}")]
     NotFound { what: &'static str, given: String },
-    /// Another client holds the resource; it may become free.
+    /// Another client uses the resource. A later attempt may succeed.
     #[error("{what} is in use: {holder}")]
     Taken { what: &'static str, holder: String },
     /// The requested step has already been superseded.
     #[error("{what}: expected {expected}, got {given}")]
     Gone { what: &'static str, expected: String, given: String },
-    /// A queue is full; a later attempt may succeed.
+    /// A queue is full. A later attempt may succeed.
     #[error("{queue} is full ({limit})")]
     Busy { queue: &'static str, limit: usize },
     /// The caller's deadline expired first.

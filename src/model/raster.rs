@@ -1,9 +1,9 @@
 //! The trait of the compute rasterizer, the alternative to OpenGL's rasterizer for some passes. The renderer calls it;
 //! `gpu` implements it in CUDA.
 //!
-//! Images have one sample per pixel and rows from top to bottom. `reference::raster` defines which samples a triangle
-//! covers, their depths, and which samples of cut-outs survive the alpha test. Implementations may differ from it in
-//! the last bits of filtered images.
+//! Images have one sample per pixel and rows from top to bottom. `reference::raster` defines the samples of a triangle,
+//! their depths, and the result of the alpha test. Implementations may differ from `reference::raster` in the last bits
+//! of filtered images.
 
 use std::any::Any;
 use std::rc::Rc;

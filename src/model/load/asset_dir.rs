@@ -122,10 +122,11 @@ impl AssetDir {
         }
     }
 
-    /// Joins the path lexically, so that an error reveals nothing about files outside the root.
+    /// Joins the path to `base` without access to the file system, so that an error reveals nothing about files outside
+    /// the root.
     fn join(&self, relative: &str) -> Result<PathBuf> {
         if relative.is_empty() || relative.contains('\0') {
-            return Err(invalid(field_of(relative), "a path without NUL", format!("{relative:?}")));
+            return Err(invalid(field_of(relative), "a non-empty path without NUL", format!("{relative:?}")));
         }
         let Some(root) = &self.root else { return Ok(self.base.join(relative)) };
         let mut path = self.base.clone();
@@ -207,8 +208,8 @@ mod tests {
             ("a.bin", "file 'a.bin': expected at most 4 bytes, got 5"),
             ("b.bin", "file 'b.bin': expected an existing file, got entity not found"),
             ("d", "file 'd': expected a regular, readable file, got a folder or a special file"),
-            ("", "file '': expected a path without NUL, got \"\""),
-            ("a\0b", "file 'a\0b': expected a path without NUL, got \"a\\0b\""),
+            ("", "file '': expected a non-empty path without NUL, got \"\""),
+            ("a\0b", "file 'a\0b': expected a non-empty path without NUL, got \"a\\0b\""),
         ] {
             assert_eq!(files.read(path, 4).expect_err(path).to_string(), message);
         }

@@ -99,7 +99,8 @@ fn real_ball_is_rejected_with_declared_and_actual_size() {
         "{folder_error}"
     );
     let (model, modes) = (dataset_path("sofa/finger/finger.derived.obj"), dataset_path("sofa/ball/modes.txt"));
-    let message = open_manifest(&format!("model = '{model}'\nmodes = '{modes}'\n")).expect_err("malformed").to_string();
+    let message =
+        open_manifest(&format!("model = '{model}'\nmodes = '{modes}'\n")).expect_err("mismatching modes").to_string();
     assert!(message.ends_with("values: expected 684 x 32 values as the header declares, got 684 x 35"), "{message}");
 }
 

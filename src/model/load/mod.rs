@@ -12,7 +12,7 @@
 //! - Rows of U follow the `v` lines of an OBJ file, including unreferenced and coincident vertices.
 //! - Texture coordinates have (0, 0) at the top left of the image; OBJ's v is flipped.
 //! - Colors in files are linear factors. Color images are sRGB; normal maps are linear with +Y up.
-//! - OBJ and glTF have Y up and plants Z up, and units are meters, unless `scene.toml` says otherwise.
+//! - OBJ and glTF have Y up, plants have Z up, and units are meters. `scene.toml` can override these defaults.
 
 mod asset_dir;
 #[cfg(test)]

@@ -11,7 +11,7 @@ const MAX_LIST_DEPTH: usize = 4;
 /// The largest number of listed names, without built-in scenes.
 const MAX_LISTED_NAMES: usize = 4096;
 
-/// The server's folder of scenes. Every path stays inside it, after symbolic links are resolved.
+/// The server's folder of scenes. Paths cannot leave it, because symbolic links are resolved before the check.
 #[derive(Debug, Clone)]
 pub struct SceneRepository {
     root: Option<PathBuf>,
@@ -165,7 +165,7 @@ mod tests {
         assert_eq!(absent, Error::NotFound { what: "scene", given: "absent".into() });
         let ambiguous = repository.open("two").expect_err("two models").to_string();
         assert_eq!(ambiguous, "folder 'two': expected scene.toml or one .glb, .gltf or .obj file, got 2: b.obj, c.obj");
-        let empty = repository.open("none").expect_err("no model").to_string();
+        let empty = repository.open("none").expect_err("a folder without models").to_string();
         assert!(empty.ends_with("got no model among: x.txt"), "{empty}");
         assert!(matches!(SceneRepository::new(Some(&outer.path().join("no"))), Err(Error::Unavailable { .. })));
         let built_in = SceneRepository::new(None).expect("built-in scenes only");

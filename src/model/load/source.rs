@@ -78,7 +78,7 @@ fn read_model_file(folder: &AssetDir, model: &ModelFile, modes: ModesSource) -> 
     }
 }
 
-/// The model whose main file has this name, by its extension.
+/// Recognizes a model by the extension of its main file `name`.
 pub(super) fn recognize_model(name: &str) -> Option<ModelFile> {
     match name.rsplit_once('.')?.1.to_ascii_lowercase().as_str() {
         "glb" | "gltf" => Some(ModelFile::Gltf(name.into())),

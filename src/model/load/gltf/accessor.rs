@@ -46,12 +46,12 @@ impl AccessorReader<'_> {
     }
 
     fn decode_vectors_of<const N: usize>(&self, accessor: &Accessor, format: AttributeFormat) -> Result<Vec<[f32; N]>> {
-        expect_kind(accessor, ["SCALAR", "VEC2", "VEC3", "VEC4"][N - 1])?;
-        let component = accessor.component_type;
-        let is_normalized_integer = format.allows_integers && accessor.normalized && matches!(component, U8 | U16);
-        if component != F32 && !is_normalized_integer {
+        check_kind(accessor, ["SCALAR", "VEC2", "VEC3", "VEC4"][N - 1])?;
+        let component_type = accessor.component_type;
+        let is_normalized_integer = format.allows_integers && accessor.normalized && matches!(component_type, U8 | U16);
+        if component_type != F32 && !is_normalized_integer {
             let integer_types = if format.allows_integers { ", or normalized 5121 (u8) or 5123 (u16)" } else { "" };
-            let given = format!("{component}, normalized: {}", accessor.normalized);
+            let given = format!("{component_type}, normalized: {}", accessor.normalized);
             return Err(invalid("componentType", format!("{F32} (f32){integer_types}"), given));
         }
         if let Some(count) = format.count.filter(|count| *count != accessor.count) {
@@ -63,7 +63,7 @@ impl AccessorReader<'_> {
         let packed_bytes = self.pack_elements(accessor, N)?;
         // Components of all types are decoded to four bytes.
         self.buffers.charge_budget(4 * N as u64 * accessor.count as u64)?;
-        Ok(match component {
+        Ok(match component_type {
             U8 => group_components(packed_bytes.iter().map(|byte| f32::from(*byte) / 255.0)),
             U16 => {
                 group_components(words::<2>(&packed_bytes).map(|word| f32::from(u16::from_le_bytes(word)) / 65535.0))
@@ -83,7 +83,7 @@ impl AccessorReader<'_> {
     }
 
     fn decode_indices_of(&self, accessor: &Accessor, vertex_count: usize) -> Result<Vec<u32>> {
-        expect_kind(accessor, "SCALAR")?;
+        check_kind(accessor, "SCALAR")?;
         if accessor.buffer_view.is_none() {
             return Err(invalid("bufferView", "an index", "none"));
         }
@@ -177,37 +177,39 @@ fn elements(
     Ok(view[offset..].chunks(stride).take(count).map(move |element| &element[..size]))
 }
 
-fn expect_kind(accessor: &Accessor, kind: &str) -> Result<()> {
+fn check_kind(accessor: &Accessor, kind: &str) -> Result<()> {
     match accessor.kind == kind {
         true => Ok(()),
         false => Err(invalid("type", kind, super::warnings::sanitize(&accessor.kind, 20))),
     }
 }
 
-/// Size of a component in bytes. The type must have been checked.
-const fn component_size(component: u64) -> usize {
-    match component {
+/// Size of a component in bytes. `component_type` must be one of the supported types.
+const fn component_size(component_type: u64) -> usize {
+    match component_type {
         U8 => 1,
         U16 => 2,
         _ => 4,
     }
 }
 
-fn index_size(component: u64) -> Result<usize> {
-    match component {
-        U8 | U16 | U32 => Ok(component_size(component)),
-        _ => Err(invalid("componentType", "5121 (u8), 5123 (u16) or 5125 (u32)", component)),
+/// Size of an index in bytes.
+fn index_size(component_type: u64) -> Result<usize> {
+    match component_type {
+        U8 | U16 | U32 => Ok(component_size(component_type)),
+        _ => Err(invalid("componentType", "5121 (u8), 5123 (u16) or 5125 (u32)", component_type)),
     }
 }
 
-fn decode_integers(packed_bytes: &[u8], component: u64) -> Vec<u32> {
-    match component {
+fn decode_integers(packed_bytes: &[u8], component_type: u64) -> Vec<u32> {
+    match component_type {
         U8 => packed_bytes.iter().map(|byte| u32::from(*byte)).collect(),
         U16 => words::<2>(packed_bytes).map(|word| u32::from(u16::from_le_bytes(word))).collect(),
         _ => words::<4>(packed_bytes).map(u32::from_le_bytes).collect(),
     }
 }
 
+/// The bytes of the components of `W` bytes each.
 fn words<const W: usize>(packed_bytes: &[u8]) -> impl Iterator<Item = [u8; W]> {
     packed_bytes.as_chunks::<W>().0.iter().copied()
 }

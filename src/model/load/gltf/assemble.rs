@@ -131,11 +131,11 @@ impl GltfAssembler<'_> {
 
     /// Returns the shape and material of a primitive, or `None` for points and lines. The first call for a primitive
     /// converts it.
-    fn load_primitive(&mut self, mesh: usize, primitive_index: usize) -> Result<Option<LoadedPrimitive>> {
-        if let Some(loaded) = self.primitives.get(&(mesh, primitive_index)) {
+    fn load_primitive(&mut self, mesh_index: usize, primitive_index: usize) -> Result<Option<LoadedPrimitive>> {
+        if let Some(loaded) = self.primitives.get(&(mesh_index, primitive_index)) {
             return Ok(*loaded);
         }
-        let primitive = &self.reader.document.meshes[mesh].primitives[primitive_index];
+        let primitive = &self.reader.document.meshes[mesh_index].primitives[primitive_index];
         let uv_set = self.material_converter.uv_set(primitive.material)?;
         let loaded = match primitive::convert_primitive(self.reader, primitive, uv_set, &mut self.remarks)? {
             None => None,
@@ -147,7 +147,7 @@ impl GltfAssembler<'_> {
                 Some(LoadedPrimitive { shape: self.shapes.len() - 1, material })
             }
         };
-        self.primitives.insert((mesh, primitive_index), loaded);
+        self.primitives.insert((mesh_index, primitive_index), loaded);
         Ok(loaded)
     }
 

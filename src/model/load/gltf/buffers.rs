@@ -116,7 +116,7 @@ impl<'a> GltfBuffers<'a> {
     }
 }
 
-/// Decodes the part of a data URI after `data:`, which must be Base64.
+/// Decodes a data URI with Base64 content. `data` is the part after `data:`.
 fn decode_data_uri(data: &str) -> Result<Vec<u8>> {
     let Some((media_type, payload)) = data.split_once(',').filter(|(media_type, _)| media_type.ends_with(";base64"))
     else {

@@ -9,11 +9,12 @@ use crate::error::{Result, invalid};
 /// The largest number of JSON objects in a document. Each object takes at least two bytes of text but about 300 bytes
 /// of memory.
 const MAX_OBJECTS: usize = 1 << 21;
-/// The largest number of commas, which limits the elements of all lists in the same way.
+/// The largest number of commas. It limits the memory of list elements, as [`MAX_OBJECTS`] does for objects.
 const MAX_COMMAS: usize = 1 << 24;
 /// The largest document that is parsed a second time to locate an error, in bytes.
 const MAX_LOCATABLE_BYTES: usize = 1 << 22;
 const MAGIC: &[u8] = b"glTF";
+/// Chunk types of a GLB.
 const JSON: u32 = 0x4E4F_534A;
 const BIN: u32 = 0x004E_4942;
 
@@ -68,6 +69,7 @@ fn read_chunk(content: &[u8], start: usize) -> Result<(u32, &[u8], usize)> {
     Ok((kind, &body[..length], start + 8 + length))
 }
 
+/// Reads a little-endian u32. `field` is the field of an error.
 fn read_word(content: &[u8], start: usize, field: &str) -> Result<u32> {
     let bytes = content.get(start..).and_then(|rest| rest.first_chunk::<4>());
     let truncated = || invalid(field, format!("four bytes at {start}"), format!("a file of {} bytes", content.len()));

@@ -33,7 +33,7 @@ pub(super) fn flatten_hierarchy(document: &Document, remarks: &mut ImportWarning
     if all_nodes.len() < parents.len() {
         let mut is_reachable = vec![false; parents.len()];
         all_nodes.iter().for_each(|(node, _)| is_reachable[*node] = true);
-        let unreachable = is_reachable.iter().position(|is_reachable| !is_reachable).unwrap_or_default();
+        let unreachable = is_reachable.iter().position(|reachable| !reachable).unwrap_or_default();
         return Err(invalid(format!("nodes[{unreachable}].children"), "a tree", "a cycle"));
     }
     let Some(scene) = document.scene.or((!document.scenes.is_empty()).then_some(0)) else {
@@ -60,13 +60,14 @@ fn find_parents(document: &Document) -> Result<Vec<Option<usize>>> {
                     let given = format!("node {child}, a child of node {other_parent}");
                     return Err(invalid(field(), "a node without another parent", given));
                 }
-                Some(unassigned) => *unassigned = Some(parent),
+                Some(child_parent) => *child_parent = Some(parent),
             }
         }
     }
     Ok(parents)
 }
 
+/// Checks that the root nodes of a scene exist, have no parent and are different.
 fn check_roots(nodes: &[usize], parents: &[Option<usize>]) -> Result<()> {
     let mut is_listed = vec![false; parents.len()];
     for (root_index, node) in nodes.iter().enumerate() {

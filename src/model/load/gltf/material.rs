@@ -5,7 +5,7 @@
 //! alpha = p^2 and the reflectance at normal incidence f = 0.04 (1 - m) + c m:
 //!
 //! ```text
-//! diffuse   = c (1 - m / 2)            a metal mirrors its surroundings, which are not rendered; half remains diffuse
+//! diffuse   = c (1 - m / 2)            half remains for metals, because reflections of surroundings are not rendered
 //! ambient   = c
 //! specular  = min(1, f / (4 alpha^2))  the peak of a GGX lobe relative to a white diffuse surface
 //! shininess = (2 / alpha^2 - 2) / 4    exponent of a half-vector lobe; that of a reflected vector is a quarter of it
@@ -53,21 +53,21 @@ impl<'a> MaterialConverter<'a> {
         Ok(base_color_texture.or(material.normal_texture.as_ref()).map_or(0, |texture| texture.tex_coord))
     }
 
-    /// Returns the index of a converted material. The first call for a material converts it. The material has no textures
-    /// if the primitive lacks the texture coordinates.
+    /// Returns the index of a converted material. The first call for a material converts it. `material` is its index in
+    /// the document; `None` is the default material. Without texture coordinates, the converted material has no textures.
     ///
     /// # Errors
     /// `Invalid` with the material and the field.
     pub(super) fn material_index(
         &mut self,
-        material_key: Option<usize>,
+        material: Option<usize>,
         has_uvs: bool,
         remarks: &mut ImportWarnings,
     ) -> Result<usize> {
-        if let Some(index) = self.converted.get(&(material_key, has_uvs)) {
+        if let Some(index) = self.converted.get(&(material, has_uvs)) {
             return Ok(*index);
         }
-        let material = match material_key {
+        let phong_material = match material {
             None => Material::default(),
             Some(index) => {
                 let source = get_element(&self.document.materials, index, "material")?;
@@ -75,8 +75,8 @@ impl<'a> MaterialConverter<'a> {
                 converted_material.map_err(|error| error.prefix_field(&format!("materials[{index}]")))?
             }
         };
-        self.materials.push(material);
-        self.converted.insert((material_key, has_uvs), self.materials.len() - 1);
+        self.materials.push(phong_material);
+        self.converted.insert((material, has_uvs), self.materials.len() - 1);
         Ok(self.materials.len() - 1)
     }
 
@@ -97,9 +97,7 @@ impl<'a> MaterialConverter<'a> {
         if source.occlusion_texture.is_some() {
             remarks.add(format!("material '{name}': the occlusion texture is ignored"));
         }
-        if source.emissive_texture.is_some()
-            || source.emissive_factor.is_some_and(|color_texture| color_texture != [0.0; 3])
-        {
+        if source.emissive_texture.is_some() || source.emissive_factor.is_some_and(|color| color != [0.0; 3]) {
             remarks.add(format!("material '{name}': emission is ignored"));
         }
         let [red, green, blue, alpha] = pbr.base_color_factor;
@@ -151,8 +149,7 @@ impl<'a> MaterialConverter<'a> {
     ) -> Result<Option<usize>> {
         let Some(texture) = &source.normal_texture else { return Ok(None) };
         let base_color_texture = source.pbr_metallic_roughness.base_color_texture.as_ref();
-        let has_other_uv_set =
-            base_color_texture.is_some_and(|base_color_texture| base_color_texture.tex_coord != texture.tex_coord);
+        let has_other_uv_set = base_color_texture.is_some_and(|base_color| base_color.tex_coord != texture.tex_coord);
         if has_other_uv_set || !has_uvs {
             let reason = if has_other_uv_set { "the color texture does not use" } else { "a primitive lacks" };
             let uv_set = texture.tex_coord;
@@ -172,14 +169,15 @@ impl<'a> MaterialConverter<'a> {
         name: &str,
         remarks: &mut ImportWarnings,
     ) -> Result<(f32, f32)> {
-        let factors = (pbr.metallic_factor, pbr.roughness_factor);
-        let Some(texture) = &pbr.metallic_roughness_texture else { return Ok(factors) };
+        let (metalness, roughness) = (pbr.metallic_factor, pbr.roughness_factor);
+        let Some(texture) = &pbr.metallic_roughness_texture else { return Ok((metalness, roughness)) };
         let channel_means = self
             .texture_loader
             .channel_means(texture, remarks)
             .map_err(prefix_with("pbrMetallicRoughness.metallicRoughnessTexture"))?;
         remarks.add(format!("material '{name}': only the mean of the metallic-roughness texture is used"));
-        Ok((factors.0 * channel_means[2], factors.1 * channel_means[1]))
+        let [_, green, blue, _] = channel_means;
+        Ok((metalness * blue, roughness * green))
     }
 }
 

@@ -18,6 +18,8 @@ use crate::scene::{MAX_DOMAINS, SceneParts, UpAxis};
 
 /// Number of parent vertices that carry the domains of an entry without `rows`.
 const DEFAULT_ATTACHMENT_ROWS: usize = 8;
+/// The largest number of names in an error message.
+const MAX_LISTED_NAMES: usize = 16;
 
 /// Assembles the scene of all entries and reads its backend settings. `default_name` is the name of a scene whose
 /// manifest has none.
@@ -45,7 +47,7 @@ pub(super) fn assemble(
             .add_entry(index, entry)
             .map_err(|error| error.prefix_field(&format!("domain {} ('{}')", index, entry.model)))?;
     }
-    assembly.check_patches()?;
+    assembly.check_override_names()?;
     let mut parts = assembly.parts;
     parts.up = manifest.up.unwrap_or(parts.up);
     parts.unit = manifest.unit.unwrap_or(parts.unit);
@@ -107,11 +109,11 @@ impl TextureLookup for ManifestAssembler<'_> {
 
 impl ManifestAssembler<'_> {
     /// Adds the domains of an entry. The first entry with a model loads it.
-    fn add_entry(&mut self, index: usize, entry: &DomainEntry) -> Result<()> {
+    fn add_entry(&mut self, entry_index: usize, entry: &DomainEntry) -> Result<()> {
         let path = self.files.resolve(&entry.model)?;
         let model_key = (path, entry.modes.clone());
         if !self.models.contains_key(&model_key) {
-            let model = self.load_model(index, entry)?;
+            let model = self.load_model(entry_index, entry)?;
             self.models.insert(model_key.clone(), model);
         }
         let Some(model) = self.models.get(&model_key) else { return Ok(()) };
@@ -134,14 +136,14 @@ impl ManifestAssembler<'_> {
     }
 
     /// Reads a model and appends its shapes, materials and textures to those of the scene. The model of the first entry
-    /// (`index` 0) also sets the scene's up axis, unit and render settings.
-    fn load_model(&mut self, index: usize, entry: &DomainEntry) -> Result<LoadedModel> {
+    /// (`entry_index` 0) also sets the scene's up axis, unit and render settings.
+    fn load_model(&mut self, entry_index: usize, entry: &DomainEntry) -> Result<LoadedModel> {
         let modes_source = if entry.modes.is_some() { ModesSource::None } else { ModesSource::Sidecar };
         let mut model = source::read_model(self.files, &entry.model, modes_source)?;
         if let Some(file) = &entry.modes {
             replace_modes(self.files, file, &mut model)?;
         }
-        if index == 0 {
+        if entry_index == 0 {
             (self.parts.up, self.parts.unit, self.parts.look) = (model.up, model.unit, model.look);
         }
         let up = self.manifest.up.unwrap_or(self.parts.up);
@@ -178,12 +180,12 @@ impl ManifestAssembler<'_> {
     }
 
     /// Checks that every override names a material of a model.
-    fn check_patches(&self) -> Result<()> {
+    fn check_override_names(&self) -> Result<()> {
         let is_known = |name: &&String| name.as_str() == "*" || self.material_names.contains(*name);
         let Some(unknown_name) = self.manifest.material.keys().find(|name| !is_known(name)) else { return Ok(()) };
         let mut names: Vec<&str> = self.material_names.iter().map(String::as_str).collect();
         names.sort_unstable();
-        names.truncate(16);
+        names.truncate(MAX_LISTED_NAMES);
         Err(invalid("material", format!("* or one of: {}", names.join(", ")), unknown_name))
     }
 
@@ -285,26 +287,26 @@ impl ManifestAssembler<'_> {
 
     /// Gives every domain a unique name: the entry's name, as a prefix if the model has several domains.
     fn name_domains(&mut self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
-        let is_single = domains.len() == 1;
+        let has_one_domain = domains.len() == 1;
         for (offset, domain) in domains.iter_mut().enumerate() {
             let index = self.parts.domains.len() + offset;
             match &entry.name {
-                Some(name) if is_single => domain.name.clone_from(name),
+                Some(name) if has_one_domain => domain.name.clone_from(name),
                 Some(name) => domain.name = format!("{name}/{}", domain.name),
                 None => {}
             }
             let base_name = domain.name.clone();
-            let mut number = 1;
+            let mut suffix = 1;
             while self.domain_by_name.contains_key(&domain.name) {
-                if entry.name.is_some() && is_single {
+                if entry.name.is_some() && has_one_domain {
                     return Err(invalid("name", "a name that no earlier domain has", base_name));
                 }
-                number += 1;
-                domain.name = format!("{base_name} {number}");
+                suffix += 1;
+                domain.name = format!("{base_name} {suffix}");
             }
             self.domain_by_name.insert(domain.name.clone(), index);
         }
-        if let (Some(name), false) = (&entry.name, is_single) {
+        if let (Some(name), false) = (&entry.name, has_one_domain) {
             // If a later entry has this name as its `parent`, the name denotes the first domain of this entry.
             self.domain_by_name.entry(name.clone()).or_insert(self.parts.domains.len());
         }

@@ -34,12 +34,12 @@
 //!
 //! model = "fern_02.glb"      # a scene of one model; or several [[domain]] entries
 //! modes = "fern.npy"         # U of a model with one shape; "" for none
-//! follows = "leaf"           # domains whose name in the model starts with "leaf" and that have a parent move rigidly
-//!                            # with it, and steps cannot set their transforms; "" for all domains with a parent
+//! follows = "leaf"           # name prefix of domains that move rigidly with their parents, so that steps cannot set
+//!                            # their transforms; "" for all domains with a parent
 //! placement = { translation = [0, 0, 0], axis = [0, 1, 0], degrees = 90, scale = 2.0 }
 //!
 //! [material."*"]             # overrides by material name, or * for all; missing keys keep the model's values
-//! diffuse = [0.8, 0.1, 0.1]  # linear, 0 to 1; also sets ambient unless that is given
+//! diffuse = [0.8, 0.1, 0.1]  # linear, 0 to 1; also sets ambient, unless ambient is given
 //! specular = [0.2, 0.2, 0.2] # also shininess, alpha
 //! colour_texture = "leaf.png"   # "" removes it; also normal_texture
 //! alpha_mode = "mask"        # opaque, mask or blend
@@ -49,7 +49,7 @@
 //! [[domain]]                 # entries with the same model are instances: they share mesh and U
 //! name = "branch"
 //! model = "../branch.obj"    # also modes, follows and placement, as above
-//! up = "z"                   # up axis of the model, which is rotated to that of the scene
+//! up = "z"                   # up axis of the model; the model is rotated to the up axis of the scene
 //! parent = "trunk"           # a domain of an earlier entry
 //! frame = { translation = [0, 1, 0] }   # parent_from_model, instead of a placement
 //! rows = [3, 4, 5]           # vertices of the parent that carry it; default: the nearest eight of a deformable parent
@@ -79,6 +79,7 @@ pub(super) const MANIFEST_FILE: &str = "scene.toml";
 /// The largest size of a `scene.toml` in bytes.
 const MAX_MANIFEST_BYTES: u64 = 1 << 20;
 
+/// A parsed `scene.toml`. The documentation of this module describes its keys.
 #[derive(Debug, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Manifest {
@@ -104,6 +105,7 @@ struct Manifest {
     domain: Vec<DomainEntry>,
 }
 
+/// The transforms that steps may contain.
 #[derive(Debug, Clone, Copy, Default, PartialEq, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 enum TransformKind {
@@ -112,18 +114,20 @@ enum TransformKind {
     Affine,
 }
 
-/// One model and its placement.
+/// A model and its placement: a `[[domain]]` table, or the top-level keys of a scene of one model.
 #[derive(Debug, Default, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 struct DomainEntry {
     model: String,
     name: Option<String>,
     modes: Option<String>,
-    /// Up axis of the model, which is rotated to that of the scene.
+    /// Up axis of the model. The model is rotated to the up axis of the scene.
     up: Option<UpAxis>,
     placement: Option<Placement>,
     parent: Option<String>,
+    /// `parent_from_model`.
     frame: Option<Placement>,
+    /// Vertices of the parent that carry the model.
     rows: Option<Vec<u32>>,
     /// Name prefix of the domains that move rigidly with their parent.
     follows: Option<String>,

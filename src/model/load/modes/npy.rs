@@ -1,7 +1,7 @@
 //! Parser of NumPy's `.npy` files to arrays of f32.
 //!
-//! It does not use a general parser of Python literals: a header may have up to 4 GiB, and such a parser would recurse
-//! as deep as the header's brackets nest and could overflow the stack.
+//! The parser of the header only finds known keys. A general parser of Python literals would recurse as deep as brackets
+//! nest and could overflow the stack, because a header may have up to 4 GiB.
 
 use crate::error::{Error, Result, invalid};
 
@@ -20,7 +20,7 @@ pub struct NpyArray {
 /// Parses an array of f32 or f64 (rounded to f32) in either byte order.
 ///
 /// # Errors
-/// `Invalid` if the bytes are not such a file, or their number does not match the shape.
+/// `Invalid` if the header or the type is not supported, or if the size of the data does not match the shape.
 pub fn parse(bytes: &[u8]) -> Result<NpyArray> {
     let (header, body) = split_header(bytes)?;
     let dtype = find_value(header, "descr")?.trim_matches(['\'', '"']);

@@ -9,7 +9,7 @@ use crate::error::{Result, invalid};
 /// Parses U.
 ///
 /// # Errors
-/// `Invalid` if the bytes are not such a file, contain no such tensor, or it has an unsupported type or shape.
+/// `Invalid` if the bytes are not a safetensors file, U is missing, or U has an unsupported type or shape.
 pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
     let safetensors =
         SafeTensors::deserialize(bytes).map_err(|error| invalid("header", "a safetensors file", error))?;

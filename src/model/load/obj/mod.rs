@@ -87,14 +87,14 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
         }
     }
     parts.remarks.extend(obj.remarks.iter().cloned());
-    let mut undefined = Vec::new();
+    let mut undefined_names = Vec::new();
     for name in &obj.materials {
         let material = match statements_by_name.get(name) {
             Some((statements, folder)) => {
                 material::create_material(name, statements, folder, &mut texture_cache, &mut parts.remarks)?
             }
             None if obj.libraries.is_empty() || name.is_empty() => {
-                undefined.push(format!("'{name}'"));
+                undefined_names.push(format!("'{name}'"));
                 white_material(name)
             }
             None => {
@@ -104,10 +104,12 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
         };
         parts.materials.push(material);
     }
-    if !undefined.is_empty() {
-        let undefined_count = undefined.len();
-        undefined.truncate(8);
-        parts.remarks.push(format!("undefined materials are white ({undefined_count}): {}", undefined.join(", ")));
+    if !undefined_names.is_empty() {
+        let undefined_count = undefined_names.len();
+        undefined_names.truncate(8);
+        parts
+            .remarks
+            .push(format!("undefined materials are white ({undefined_count}): {}", undefined_names.join(", ")));
     }
     parts.textures.append(&mut texture_cache.into_textures());
     Ok(())
@@ -117,7 +119,8 @@ fn white_material(name: &str) -> Material {
     Material { name: if name.is_empty() { "white" } else { name }.into(), double_sided: true, ..Material::default() }
 }
 
-/// The files of an `mtllib` statement. It may list several files, and a file name may contain spaces.
+/// The paths in an `mtllib` statement. The statement is one path if a file of this name exists, because file names may
+/// contain spaces. Otherwise, spaces separate several paths.
 fn library_paths(files: &AssetDir, statement: &str) -> Result<Vec<String>> {
     let path = statement.replace('\\', "/");
     if files.kind(&path)?.is_some() || !path.contains(' ') {

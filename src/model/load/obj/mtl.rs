@@ -4,7 +4,7 @@
 
 use std::collections::BTreeMap;
 
-use super::parse::{parse_number, rest_of, words};
+use super::parse::{parse_number, text_after_key, words};
 use crate::error::{Result, invalid};
 
 /// The statements of one `newmtl`. A missing statement is `None`.
@@ -34,7 +34,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<BTreeMap<String, MtlMaterial>> {
     for (index, line) in bytes.split(|byte| *byte == b'\n').enumerate() {
         let Some(key) = words(line).next() else { continue };
         if key == b"newmtl" {
-            materials.extend(current.replace((rest_of(line), MtlMaterial::default())));
+            materials.extend(current.replace((text_after_key(line), MtlMaterial::default())));
         } else if let Some((name, statements)) = &mut current {
             let location = || format!("line {}: {}", index + 1, String::from_utf8_lossy(key));
             statements.parse_statement(key, line, name).map_err(|error| error.prefix_field(&location()))?;
@@ -65,9 +65,9 @@ impl MtlMaterial {
 
     /// The path after the options of an image statement.
     fn parse_image_path(&mut self, line: &[u8], name: &str) -> Result<Option<String>> {
-        let text = rest_of(line);
+        let text = text_after_key(line);
         let mut remainder = text.as_str();
-        while let Some((option, next)) = remainder.strip_prefix('-').map(next_word) {
+        while let Some((option, text_after_option)) = remainder.strip_prefix('-').map(split_first_word) {
             let max_arguments = match option {
                 "s" | "o" | "t" => 3,
                 "mm" => 2,
@@ -78,14 +78,14 @@ impl MtlMaterial {
             if !self.remarks.contains(&remark) {
                 self.remarks.push(remark);
             }
-            remainder = next;
+            remainder = text_after_option;
             for argument in 0..max_arguments {
-                let (word, next) = next_word(remainder);
+                let (word, text_after_word) = split_first_word(remainder);
                 // -s, -o and -t have one to three arguments.
                 if argument > 0 && word.parse::<f32>().is_err() {
                     break;
                 }
-                remainder = next;
+                remainder = text_after_word;
             }
         }
         if remainder.is_empty() {
@@ -96,9 +96,9 @@ impl MtlMaterial {
 }
 
 /// Splits off the first word.
-fn next_word(text: &str) -> (&str, &str) {
-    text.split_once(|letter: char| letter.is_ascii_whitespace())
-        .map_or((text, ""), |(word, rest)| (word, rest.trim_start()))
+fn split_first_word(text: &str) -> (&str, &str) {
+    text.split_once(|character: char| character.is_ascii_whitespace())
+        .map_or((text, ""), |(word, remainder)| (word, remainder.trim_start()))
 }
 
 /// Parses one number per channel, or one number for all channels.
@@ -107,14 +107,14 @@ fn parse_color(line: &[u8]) -> Result<[f32; 3]> {
     match numbers.as_deref() {
         Some([gray]) => Ok([*gray; 3]),
         Some([red, green, blue]) => Ok([*red, *green, *blue]),
-        _ => Err(invalid("colour", "one or three finite numbers", rest_of(line))),
+        _ => Err(invalid("color", "one or three finite numbers", text_after_key(line))),
     }
 }
 
 /// Parses the last word as a number, because options may precede it as in `d -halo 0.5`.
 fn parse_last_number(line: &[u8]) -> Result<f32> {
     let value = words(line).skip(1).last().and_then(parse_number);
-    value.ok_or_else(|| invalid("value", "a finite number", rest_of(line)))
+    value.ok_or_else(|| invalid("value", "a finite number", text_after_key(line)))
 }
 
 #[cfg(test)]
@@ -139,8 +139,8 @@ mod tests {
     #[test]
     fn invalid_statements_are_rejected_with_their_line() {
         for (statement, message) in [
-            ("Kd 1 2", "line 2: Kd: colour: expected one or three finite numbers, got 1 2"),
-            ("Kd spectral a.rfl", "line 2: Kd: colour: expected one or three finite numbers, got spectral a.rfl"),
+            ("Kd 1 2", "line 2: Kd: color: expected one or three finite numbers, got 1 2"),
+            ("Kd spectral a.rfl", "line 2: Kd: color: expected one or three finite numbers, got spectral a.rfl"),
             ("Ns", "line 2: Ns: value: expected a finite number, got "),
             ("d inf", "line 2: d: value: expected a finite number, got inf"),
             ("map_Kd", "line 2: map_Kd: path: expected the name of an image file, got none"),

@@ -45,7 +45,7 @@ pub(in crate::load) struct ObjFile {
 }
 
 impl ObjFile {
-    /// Parses a whole file.
+    /// Parses a file.
     ///
     /// # Errors
     /// `Invalid` with the line and the statement.
@@ -96,11 +96,12 @@ impl ObjFile {
     }
 }
 
-fn check_index(line: usize, list: &str, index: u32, count: usize) -> Result<()> {
+/// Checks that an index of a face is below the number of elements in its list.
+fn check_index(line: usize, list_name: &str, index: u32, count: usize) -> Result<()> {
     if (index as usize) < count {
         return Ok(());
     }
-    Err(invalid(format!("line {line}: f: index of {list}"), format!("1 to {count}"), u64::from(index) + 1))
+    Err(invalid(format!("line {line}: f: index of {list_name}"), format!("1 to {count}"), u64::from(index) + 1))
 }
 
 #[derive(Default)]
@@ -129,8 +130,8 @@ impl Parser {
                 self.obj.uvs.push([u, 1.0 - v]);
             }
             b"f" => self.add_face(words, line_number)?,
-            b"usemtl" => (self.current_material, self.current_index) = (rest_of(line), None),
-            b"mtllib" => self.obj.libraries.push(rest_of(line)),
+            b"usemtl" => (self.current_material, self.current_index) = (text_after_key(line), None),
+            b"mtllib" => self.obj.libraries.push(text_after_key(line)),
             // Groups and smoothing groups do not affect geometry: normals come from the file or are computed.
             b"o" | b"g" | b"s" => {}
             other => *self.unused_statements.entry(String::from_utf8_lossy(other).into_owned()).or_default() += 1,
@@ -155,15 +156,15 @@ impl Parser {
         let first_corner = self.obj.corners.len();
         for word in words {
             let mut fields = word.split(|byte| *byte == b'/');
-            let mut index = |list: &str, count: usize| match fields.next() {
+            let mut parse_index = |list: &str, count: usize| match fields.next() {
                 None | Some(b"") => Ok(NO_INDEX),
                 Some(digits) => {
                     resolve_index(digits, count).map_err(|error| error.prefix_field(&format!("line {line}: f: {list}")))
                 }
             };
-            let v = index("v", self.obj.positions.len())?;
-            let vt = index("vt", self.obj.uvs.len())?;
-            let vn = index("vn", self.obj.normals.len())?;
+            let v = parse_index("v", self.obj.positions.len())?;
+            let vt = parse_index("vt", self.obj.uvs.len())?;
+            let vn = parse_index("vn", self.obj.normals.len())?;
             if v == NO_INDEX || fields.next().is_some() {
                 let given = String::from_utf8_lossy(word).into_owned();
                 return Err(invalid(format!("line {line}: f"), "corners of the form v, v/vt, v//vn or v/vt/vn", given));
@@ -194,7 +195,7 @@ pub(super) fn words(line: &[u8]) -> impl Iterator<Item = &[u8]> {
 }
 
 /// The text after the first word: a name that may contain spaces.
-pub(super) fn rest_of(line: &[u8]) -> String {
+pub(super) fn text_after_key(line: &[u8]) -> String {
     let text = String::from_utf8_lossy(line);
     text.trim()
         .split_once(|character: char| character.is_ascii_whitespace())
@@ -207,12 +208,12 @@ pub(super) fn parse_number(word: &[u8]) -> Option<f32> {
     std::str::from_utf8(word).ok()?.parse().ok().filter(|number: &f32| number.is_finite())
 }
 
+/// Parses three finite numbers. `key` and `line` are part of the error.
 fn parse_vector<'a>(mut words: impl Iterator<Item = &'a [u8]>, key: &str, line: usize) -> Result<[f32; 3]> {
     let mut numbers = [0.0; 3];
-    for number_slot in &mut numbers {
+    for number in &mut numbers {
         let word = words.next();
-        *number_slot =
-            word.and_then(parse_number).ok_or_else(|| number_error(key, "three finite numbers", word, line))?;
+        *number = word.and_then(parse_number).ok_or_else(|| number_error(key, "three finite numbers", word, line))?;
     }
     Ok(numbers)
 }
@@ -236,9 +237,9 @@ fn resolve_index(digits: &[u8], count: usize) -> Result<u32> {
     let text = String::from_utf8_lossy(digits);
     let invalid_index = |expected: String| invalid("index", expected, &text);
     let index: i64 = text.parse().map_err(|_| invalid_index("a whole number".into()))?;
-    let from_zero =
+    let zero_based_index =
         if index < 0 { i64::try_from(count).ok().and_then(|count| count.checked_add(index)) } else { Some(index - 1) };
-    let valid_index = from_zero.and_then(|index| u32::try_from(index).ok()).filter(|index| *index != NO_INDEX);
+    let valid_index = zero_based_index.and_then(|index| u32::try_from(index).ok()).filter(|index| *index != NO_INDEX);
     valid_index.ok_or_else(|| invalid_index(format!("1 to {count} or -{count} to -1")))
 }
 

@@ -147,7 +147,7 @@ mod tests {
         assert_eq!(message, "object: expected the id of an object of the structure, got 77");
         let text = STRUCTURE.replace(r#""9": "internode", "#, "");
         let structure = PlantStructure::parse(text.as_bytes()).expect("a valid structure");
-        let message = assign_organs(&structure, &BTreeMap::new()).expect_err("one internode").to_string();
+        let message = assign_organs(&structure, &BTreeMap::new()).expect_err("a missing internode").to_string();
         assert_eq!(message, "objects: expected 2 internodes, one per shoot, got 1");
     }
 }

@@ -79,8 +79,8 @@ impl PlantStructure {
         let shoots = self.shoots.iter().map(|shoot| (format!("shoot {}", shoot.id), &shoot.vertices[..]));
         let leaves = self.leaves.iter().flat_map(|leaf| {
             let polyline = leaf.petiole_vertices.as_deref().unwrap_or(std::slice::from_ref(&leaf.base));
-            let base = std::slice::from_ref(&leaf.base);
-            [polyline, base].map(|polyline| (format!("leaf {}", leaf.object_id), polyline))
+            let base_point = std::slice::from_ref(&leaf.base);
+            [polyline, base_point].map(|polyline| (format!("leaf {}", leaf.object_id), polyline))
         });
         for (name, polyline) in shoots.chain(leaves) {
             if polyline.is_empty() || !polyline.as_flattened().iter().all(|coordinate| (*coordinate as f32).is_finite())
