@@ -269,7 +269,7 @@ pub(crate) fn check_displacement_overflow_rejection(backend: BackendChoice) {
     let mut valid_state = SceneState::rest(&scene);
     partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[1, 4], &[4]);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
-    let valid_surface = loaded_scene.surface().expect("vertices").clone();
+    let valid_surface = loaded_scene.surface().expect("expected a surface").clone();
     for domain in [4, 6] {
         let mut overflowing_state = valid_state.clone();
         partial_steps::apply_random_step(
@@ -285,10 +285,14 @@ pub(crate) fn check_displacement_overflow_rejection(backend: BackendChoice) {
         let error = loaded_scene.deform(&overflowing_state).expect_err("expected an overflow error").to_string();
         eprintln!("{error}");
         assert!(error.starts_with(&format!("step.q of domain 'domain {domain}'")), "{error}");
-        assert_eq!(loaded_scene.surface().expect("vertices"), &valid_surface);
+        assert_eq!(loaded_scene.surface().expect("expected a surface"), &valid_surface);
     }
     partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[8], &[]);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
-    assert_ne!(loaded_scene.surface().expect("vertices"), &valid_surface, "expected the step to change vertices");
+    assert_ne!(
+        loaded_scene.surface().expect("expected a surface"),
+        &valid_surface,
+        "expected the step to change vertices"
+    );
     context.unload_scene(loaded_scene);
 }

@@ -35,8 +35,8 @@ fn random_frame(random: &mut Random, index: usize, is_rigid: bool) -> Transform 
     frame
 }
 
-/// A scene in which one third of the domains are transform roots. Each other domain follows an earlier one, which may
-/// be a follower itself.
+/// A scene in which one third of the domains are transform roots. Each other domain follows an earlier domain, either a
+/// root or a follower.
 pub(crate) fn follower_scene_parts(count: usize, deformation: DeformationSettings, is_rigid: bool) -> SceneParts {
     let mut random = Random(count as u64);
     let mut shapes: Vec<Shape> =

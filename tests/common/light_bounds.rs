@@ -88,7 +88,7 @@ fn bounds_of_corners(scene: &Scene, bounds: &BoundingBox) -> OrientedBounds {
 }
 
 /// Light bounds contain every vertex of random, smooth, distant and tiny scenes, of a scene with one vertex, and of a
-/// scene whose domains share tiles.
+/// scene with several domains per tile.
 pub(crate) fn check_containment<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>, BatchPolicy) -> D) {
     let default_policy = BatchPolicy::default();
     let scenes = [

@@ -70,7 +70,7 @@ pub(crate) fn check_overflow_rejection(backend: BackendChoice) {
     let mut valid_state = SceneState::rest(&scene);
     partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[0, 5], &[5]);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
-    let valid_surface = loaded_scene.surface().expect("vertices").clone();
+    let valid_surface = loaded_scene.surface().expect("expected a surface").clone();
     for (domain, coordinate) in [(5, f32::MAX), (2, -f32::MAX), (5, 1e30)] {
         let mut overflowing_state = valid_state.clone();
         partial_steps::apply_random_step(&scene, &mut overflowing_state, &mut random, &[domain], &[]);
@@ -78,17 +78,17 @@ pub(crate) fn check_overflow_rejection(backend: BackendChoice) {
         let error = loaded_scene.deform(&overflowing_state).expect_err("expected an overflow error").to_string();
         eprintln!("{error}");
         assert!(error.starts_with(&format!("step.q of domain 'domain {domain}'")), "{error}");
-        assert_eq!(loaded_scene.surface().expect("vertices"), &valid_surface);
+        assert_eq!(loaded_scene.surface().expect("expected a surface"), &valid_surface);
         assert!(loaded_scene.bounds().is_finite());
     }
     // The next step applies to the last valid step.
     partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[6], &[]);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
-    let next_surface = loaded_scene.surface().expect("vertices").clone();
+    let next_surface = loaded_scene.surface().expect("expected a surface").clone();
     assert_ne!(next_surface, valid_surface, "expected the step to change vertices");
     let mut new_scene = context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
     new_scene.deform(&valid_state).expect("expected a valid step");
-    assert_eq!(new_scene.surface().expect("vertices"), &next_surface);
+    assert_eq!(new_scene.surface().expect("expected a surface"), &next_surface);
     context.unload_scene(loaded_scene);
     context.unload_scene(new_scene);
 }

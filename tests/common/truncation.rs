@@ -12,7 +12,7 @@ use crate::scenes::{self, Random};
 /// Truncation budget in meters. The scenes of this file have a unit of one meter.
 const BUDGET: f64 = 0.02;
 
-/// Deforms twenty random states, each of which changes two domains. Errors are within their bounds plus the truncation
+/// Deforms twenty random states. Each state changes two domains. Errors are within their bounds plus the truncation
 /// bound, and the truncation bound is within the budget. `truncation_bound` returns the bound of a deformer, in scene
 /// units.
 pub(crate) fn check_error_budget<D: Deformer>(
