@@ -15,8 +15,9 @@ use crate::scene::{BoundingBox, OrientedBounds, SceneState};
 /// Deformed vertices of a whole scene, packed as in [`Layout`](crate::scene::Layout).
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct DeformedSurface {
-    /// World positions, three numbers per vertex, relative to the origin of their domain ([`SceneState::origin_of`]).
-    /// This is the scene's origin unless a step with f64 translations moved the domain far from it.
+    /// World positions, three numbers per vertex, relative to the floating origin of their domain
+    /// ([`SceneState::origin_of`]). This is the scene's origin unless a step with f64 translations moved the domain far
+    /// from it.
     pub positions: Vec<f32>,
     /// World-space unit normals, three numbers per corner.
     pub normals: Vec<f32>,

@@ -116,7 +116,7 @@ pub(crate) fn check_canceling_modes<D: Deformer>(create_deformer: impl Fn(&Arc<S
         let modes = &scene.shape_of(0).modes;
         let expected = reference::deform(&scene, &state).into_flattened();
         let ratio = |(row, (actual, expected)): (usize, (&f32, &f64))| {
-            let term = |mode: usize| (f64::from(modes.at(row / 3, row % 3, mode)) * f64::from(state.q[mode])).abs();
+            let term = |mode: usize| (f64::from(modes.entry(row / 3, row % 3, mode)) * f64::from(state.q[mode])).abs();
             // Bound of the compensated dot product Dot2: half a unit in the last place of the sum, plus gamma squared
             // times the sum of absolute terms. Four further roundings follow.
             let terms = (0..rank).map(term).sum::<f64>();

@@ -87,7 +87,7 @@ pub(crate) fn check_frames<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) ->
         let parts =
             || follower_scene_parts(45, DeformationSettings { storage, ..DeformationSettings::default() }, is_rigid);
         let scene = Scene::new(parts()).expect("expected a valid scene");
-        assert_eq!((scene.transform_roots.count(), scene.needs.shear), (15, !is_rigid));
+        assert_eq!((scene.transform_roots.count(), scene.features.shear), (15, !is_rigid));
         let state = scenes::random_state(&scene, 61);
         let result = run_step(&mut create_deformer(&scene), &state);
         assert_within_bound(&name, &scene, &state, &result.surface.positions, 0.0);
@@ -172,7 +172,7 @@ pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn
                     .filter(|domain| has_new_transform(domain))
                     .all(|domain| moved_domains.contains(domain))
             );
-            assert!(!scene.needs.boxes || find_wrong_box(&scene, &result).is_none(), "step {step}");
+            assert!(!scene.features.boxes || find_wrong_box(&scene, &result).is_none(), "step {step}");
             // A partial step changes at most a quarter of the domains.
             partial_steps += usize::from(!expected_domains.is_empty() && expected_domains.len() <= 30);
             previous_result = result;
@@ -201,7 +201,7 @@ fn far_step(domain: u32, translation: [f64; 3]) -> RawStepUpdate {
     }
 }
 
-/// The positions of a follower are relative to the local origin of its root, so a far follower is as precise as one near
+/// The positions of a follower are relative to the floating origin of its root, so a far follower is as precise as one near
 /// the scene's origin.
 pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(64);
@@ -216,9 +216,9 @@ pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     state.apply(&scene, &StepUpdate::parse(&scene, &far_step(0, translation)).expect("expected a valid step"));
     assert_eq!((scene.transform_roots.root_of(1), state.transforms.len()), (0, 2));
     let result = run_step(&mut create_deformer(&scene), &state);
-    let (layout, origin) = (scene.layout.domains[1], state.origin_of(scene.transform_roots.of(1)));
+    let (layout, origin) = (scene.layout.domains[1], state.origin_of(scene.transform_roots.root_of(1)));
     let [mut max_error, mut max_f32_error] = [0.0_f64; 2];
-    for (vertex, rest_position) in scene.shape_of(1).mesh.rest().iter().enumerate() {
+    for (vertex, rest_position) in scene.shape_of(1).mesh.rest_positions().iter().enumerate() {
         let position_in_root = frame.to_matrix().transform_point(&nalgebra::Point3::from(*rest_position).cast());
         for axis in 0..3 {
             let expected = translation[axis] + position_in_root[axis];

@@ -25,7 +25,7 @@ fn open_manifest(text: &str) -> crate::error::Result<Arc<Scene>> {
 
 fn count_fixed_vertices(scene: &Scene) -> usize {
     let modes = &scene.shapes[0].modes;
-    let is_zero = |vertex: &usize| (0..3 * modes.rank()).all(|entry| modes.at(*vertex, entry % 3, entry / 3) == 0.0);
+    let is_zero = |vertex: &usize| (0..3 * modes.rank()).all(|entry| modes.entry(*vertex, entry % 3, entry / 3) == 0.0);
     (0..modes.vertices()).filter(is_zero).count()
 }
 
@@ -46,7 +46,7 @@ fn real_simple_bridge_keeps_the_numbering_of_its_file() {
     assert!(moved_count > 15_000, "{moved_count}");
     let text = std::fs::read_to_string(dataset_path("vega/simpleBridge/simpleBridge.obj")).expect("a readable file");
     let lines = text.lines().filter_map(|line| line.strip_prefix("v "));
-    for (line, rest_position) in lines.zip(scene.shapes[0].mesh.rest()) {
+    for (line, rest_position) in lines.zip(scene.shapes[0].mesh.rest_positions()) {
         let coordinates: Vec<f32> = line.split_whitespace().map(|word| word.parse().expect("a number")).collect();
         assert_eq!(coordinates, rest_position);
     }
@@ -117,7 +117,7 @@ fn real_almond_has_1447_domains_and_all_faces() {
     assert_eq!(scene.up, UpAxis::Z);
     let height = scene.rest_bounds.max[2] - scene.rest_bounds.min[2];
     assert!((height - 2.6745).abs() < 1e-3, "{height}");
-    assert!(scene.needs.mask && !scene.needs.modes && !scene.needs.normal_maps);
+    assert!(scene.features.mask && !scene.features.modes && !scene.features.normal_maps);
     assert_eq!(
         open_scene("plants/almond/almond.obj").domains.len(),
         1447,
@@ -154,7 +154,7 @@ fn real_plants_have_the_bounds_of_their_file_and_compact_leaves() {
         let max_distance = if name == "almond" { 0.2 } else { 0.4 };
         for (index, domain) in scene.domains.iter().enumerate().filter(|(_, domain)| domain.name.starts_with("leaf ")) {
             let distance = |rest: &[f32; 3]| nalgebra::Vector3::from(*rest).norm();
-            let actual_distance = scene.shape_of(index).mesh.rest().iter().map(distance).fold(0.0, f32::max);
+            let actual_distance = scene.shape_of(index).mesh.rest_positions().iter().map(distance).fold(0.0, f32::max);
             assert!(
                 actual_distance < max_distance,
                 "{name}: {}: expected below {max_distance}, got {actual_distance}",

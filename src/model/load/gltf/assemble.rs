@@ -115,15 +115,12 @@ impl GltfAssembler<'_> {
             self.reader.buffers.charge_budget(4 * rest_q.len() as u64)?;
             let first_of_rank = *first_by_rank.entry(rank).or_insert(self.domains.len());
             self.domains.push(Domain {
-                name: format!("{name}.{primitive_index}"),
-                shape: loaded.shape,
                 material: loaded.material,
-                material_ranges: vec![],
                 placement,
                 attachment: attachment.clone(),
                 rest_q,
                 shares_q_with: (rank > 0 && first_of_rank < self.domains.len()).then_some(first_of_rank),
-                metadata: Metadata::default(),
+                ..Domain::new(format!("{name}.{primitive_index}"), loaded.shape)
             });
         }
         Ok((self.domains.len() > first_domain).then_some(first_domain))

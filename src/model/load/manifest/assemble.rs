@@ -356,7 +356,7 @@ fn nearest_vertices(shape: &Shape, frame: Transform) -> Vec<u32> {
         return Vec::new();
     }
     let origin = frame.translation();
-    let rest_positions = shape.mesh.rest();
+    let rest_positions = shape.mesh.rest_positions();
     let squared_distance =
         |vertex: u32| (nalgebra::Vector3::from(rest_positions[vertex as usize]).cast::<f64>() - origin).norm_squared();
     let mut vertices: Vec<u32> = (0..rest_positions.len() as u32).collect();

@@ -117,7 +117,7 @@ mod tests {
             .iter()
             .map(|bytes| super::super::parse_npy(bytes).expect("a valid .npy file"))
             .collect();
-        assert_eq!(modes[0].at(0, 2, 1), 5.0);
+        assert_eq!(modes[0].entry(0, 2, 1), 5.0);
         assert!(
             parse(&to_npy(&column_major)).expect("a valid .npy file").fortran_order,
             "control: expected a column-major file"

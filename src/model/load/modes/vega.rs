@@ -55,7 +55,7 @@ mod tests {
         let f64s: Vec<u8> = (0..6u8).flat_map(|entry| f64::from(entry).to_le_bytes()).collect();
         for body in [f32s, f64s] {
             let modes = parse(&vega_file(3, 2, &body)).expect("a valid file");
-            assert_eq!((modes.rank(), modes.at(0, 1, 0), modes.at(0, 1, 1)), (2, 1.0, 4.0));
+            assert_eq!((modes.rank(), modes.entry(0, 1, 0), modes.entry(0, 1, 1)), (2, 1.0, 4.0));
         }
         assert_eq!(parse(&vega_file(3, 0, &[])).expect("a file without modes").rank(), 0);
     }

@@ -166,7 +166,7 @@ mod tests {
     fn build_all_faces_keeps_all_v_lines_in_file_order() {
         let obj = parse_squares();
         let mesh = build_all_faces(&obj).expect("a valid OBJ file").mesh;
-        assert_eq!(mesh.rest(), obj.positions);
+        assert_eq!(mesh.rest_positions(), obj.positions);
         assert_eq!(
             mesh.corners().vertices,
             [1, 2, 3, 4, 1, 2, 3, 5, 6, 7, 8],
@@ -195,7 +195,7 @@ mod tests {
     fn build_faces_keeps_used_vertices_relative_to_origin() {
         let obj_mesh = build_faces(&parse_squares(), &[1], [1.0, 0.0, 0.5]).expect("a valid OBJ file");
         let rest_positions = [[0.0, 0.0, -0.5], [1.0, 0.0, -0.5], [1.0, 1.0, -0.5], [0.0, 1.0, -0.5]];
-        assert_eq!(obj_mesh.mesh.rest(), rest_positions);
+        assert_eq!(obj_mesh.mesh.rest_positions(), rest_positions);
         assert!(obj_mesh.mesh.corners().uvs.is_empty());
     }
 

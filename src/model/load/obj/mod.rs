@@ -15,7 +15,7 @@ pub(super) use parse::ObjFile;
 use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, MAX_TEXT_BYTES, parent_of};
 use super::modes;
 use super::texture_cache::TextureCache;
-use crate::domain::{Domain, Material, Metadata, Modes, Shape, Transform};
+use crate::domain::{Domain, Material, Metadata, Modes, Shape};
 use crate::error::{Result, invalid};
 use crate::scene::SceneParts;
 
@@ -46,16 +46,10 @@ pub(super) fn read(files: &AssetDir, name: &str, source: ModesSource) -> Result<
     let location = || format!("file '{}'", modes_file.as_deref().unwrap_or(name));
     parts.shapes.push(shape.map_err(|error| error.prefix_field(&location()))?);
     parts.domains.push(Domain {
-        name: parts.name.clone(),
-        shape: 0,
         material: obj_mesh.material,
         material_ranges: obj_mesh.material_ranges,
-        placement: Transform::IDENTITY,
-        attachment: None,
-        follows: None,
-        rest_q: Vec::new(),
-        shares_q_with: None,
         metadata: Metadata { eigenvalues: Vec::new(), notes: super::vega_config::read_notes(files, name)? },
+        ..Domain::new(parts.name.clone(), 0)
     });
     Ok(parts)
 }
@@ -156,7 +150,7 @@ mod tests {
         assert_eq!(parts.materials.iter().map(|material| material.name.as_str()).collect::<Vec<_>>(), ["red", "blue"]);
         assert_eq!(parts.domains.len(), 1);
         assert_eq!(parts.domains[0].material_ranges.len(), 2);
-        assert_eq!(parts.shapes[0].modes.at(2, 2, 0), 2.0);
+        assert_eq!(parts.shapes[0].modes.entry(2, 2, 0), 2.0);
         let parts_without_modes =
             read(&AssetDir::unrestricted(folder.path()), "a.obj", ModesSource::None).expect("a valid OBJ file");
         assert_eq!(parts_without_modes.shapes[0].modes.rank(), 0);

@@ -104,16 +104,12 @@ impl PlantBuilder<'_> {
         self.organ_domains.insert(organ, (self.parts.domains.len(), origin));
         let kind = if matches!(organ, Organ::Shoot(_)) { "shoot" } else { "leaf" };
         self.parts.domains.push(Domain {
-            name,
-            shape: self.parts.shapes.len() - 1,
             material: obj_mesh.material,
             material_ranges: obj_mesh.material_ranges,
             placement: translation_transform(origin),
             attachment,
-            follows: None,
-            rest_q: Vec::new(),
-            shares_q_with: None,
             metadata: Metadata { eigenvalues: Vec::new(), notes: [("plant.kind".into(), kind.into())].into() },
+            ..Domain::new(name, self.parts.shapes.len() - 1)
         });
         Ok(())
     }

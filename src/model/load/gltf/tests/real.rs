@@ -67,5 +67,5 @@ fn real_ferns_are_four_masked_plants_with_a_normal_map() {
     assert_eq!(parts.textures[0].name, "fern_02_diff-fern_02_alpha");
     assert_eq!(parts.textures.len(), 2);
     let scene = Scene::new(parts).expect("a valid scene");
-    assert!(scene.needs.mask && scene.needs.normal_maps);
+    assert!(scene.features.mask && scene.features.normal_maps);
 }
