@@ -95,7 +95,7 @@ async fn run_sim(url: &str, arguments: &[&str]) -> SimOutput {
 
 /// The numbers of a `.npy` file with the 128-byte header that the recorder writes.
 fn read_npy(path: &Path) -> Vec<f32> {
-    fake::floats(&std::fs::read(path).expect("a record")[128..])
+    fake::decode_f32(&std::fs::read(path).expect("a record")[128..])
 }
 
 /// The distance between the vertices `a` and `b`.
@@ -149,7 +149,7 @@ async fn tree_sways_and_subscribers_receive_closed_joints() {
     assert_eq!(steps[0].transform_domains, [0, 1, 2, 3]);
     let sends_trunk_transform = steps[5..].iter().any(|step| step.transform_domains.contains(&0));
     assert!(!sends_trunk_transform, "expected no transform of the trunk, which does not change");
-    assert_eq!(fake::floats(&steps[40].q), q[40 * 6..41 * 6]);
+    assert_eq!(fake::decode_f32(&steps[40].q), q[40 * 6..41 * 6]);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -199,7 +199,7 @@ fn vega_domain(name: &str) -> FakeDomain {
     let file = std::fs::read(vega_folder(name).join(format!("{name}.URendering.float"))).expect("a file of U");
     let read_size =
         |offset: usize| i32::from_le_bytes(file[offset..offset + 4].try_into().expect("four bytes")) as usize;
-    let (rows, columns, entries) = (read_size(0), read_size(4), fake::floats(&file[8..]));
+    let (rows, columns, entries) = (read_size(0), read_size(4), fake::decode_f32(&file[8..]));
     assert_eq!(rows, rest_positions.len());
     let modes = (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column)));
     FakeDomain::new(

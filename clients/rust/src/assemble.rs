@@ -1,5 +1,5 @@
-//! Assembles chunks into complete replies. A reply states its total size, and a chunk its offset. Both are checked. A
-//! total above the limit is an error before any byte is stored.
+//! Assembles chunks into complete replies. The first chunk states the total size of the reply, and each chunk its
+//! offset. Both are checked. A total above the limit is an error before any byte is stored.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use tokio_stream::Stream;
 
 use crate::error::{Error, Result, malformed_reply};
 
-/// Numbers are little-endian on the wire and are copied without conversion.
+// Numbers are little-endian on the wire and are copied without conversion.
 const _: () = assert!(cfg!(target_endian = "little"), "the client supports little-endian hosts only");
 
 /// Decodes an array of little-endian numbers, or of fixed-size arrays of them, at any alignment.
@@ -26,25 +26,25 @@ pub(crate) fn decode<T: Pod>(field: &str, bytes: &[u8]) -> Result<Vec<T>> {
     Ok(bytemuck::pod_collect_to_vec(bytes))
 }
 
-/// The messages of a server stream. Its errors name the server.
+/// The messages of a server stream. Its errors contain the server's URL.
 pub(crate) struct Replies<M> {
     messages: tonic::Streaming<M>,
-    server: Arc<str>,
+    url: Arc<str>,
 }
 
 impl<M> Replies<M> {
-    pub(crate) const fn new(messages: tonic::Streaming<M>, server: Arc<str>) -> Self {
-        Self { messages, server }
+    pub(crate) const fn new(messages: tonic::Streaming<M>, url: Arc<str>) -> Self {
+        Self { messages, url }
     }
 
     /// The next message, or `None` at the end of the stream.
     pub(crate) async fn next(&mut self) -> Result<Option<M>> {
-        self.messages.message().await.map_err(|status| Error::from_status(status, &self.server))
+        self.messages.message().await.map_err(|status| Error::from_status(status, &self.url))
     }
 
     fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<M>>> {
         let message = ready!(Pin::new(&mut self.messages).poll_next(context));
-        Poll::Ready(message.map(|message| message.map_err(|status| Error::from_status(status, &self.server))))
+        Poll::Ready(message.map(|message| message.map_err(|status| Error::from_status(status, &self.url))))
     }
 }
 
@@ -158,7 +158,9 @@ impl<M, C: WireChunk> ChunkedReplies<M, C> {
             let reply = match ready!(self.messages.poll(context)) {
                 Some(Ok(message)) => self.add_message(message),
                 Some(Err(error)) => Err(error),
-                None if self.assembler.is_open() => Err(Error::StreamEnded { what: "the last chunk of a reply" }),
+                None if self.assembler.is_open() => {
+                    Err(Error::StreamEnded { awaited_reply: "the last chunk of a reply" })
+                }
                 None => {
                     self.has_ended = true;
                     return Poll::Ready(None);
@@ -202,7 +204,7 @@ mod tests {
         for chunk in chunks {
             replies.extend(assembler.push(chunk)?.map(|((), bytes)| bytes));
         }
-        if assembler.is_open() { Err(Error::StreamEnded { what: "chunk" }) } else { Ok(replies) }
+        if assembler.is_open() { Err(Error::StreamEnded { awaited_reply: "the last chunk" }) } else { Ok(replies) }
     }
 
     #[test]
@@ -256,9 +258,9 @@ mod tests {
         let mut bytes = vec![0];
         bytes.extend(1.5_f32.to_le_bytes());
         bytes.extend((-2.0_f32).to_le_bytes());
-        assert_eq!(decode::<f32>("q", &bytes[1..]).expect("whole numbers"), [1.5, -2.0]);
-        assert_eq!(decode::<[f32; 2]>("q", &bytes[1..]).expect("whole numbers"), [[1.5, -2.0]]);
-        assert_eq!(decode::<u32>("q", &7_u32.to_le_bytes()).expect("whole numbers"), [7]);
+        assert_eq!(decode::<f32>("q", &bytes[1..]).expect("a valid length"), [1.5, -2.0]);
+        assert_eq!(decode::<[f32; 2]>("q", &bytes[1..]).expect("a valid length"), [[1.5, -2.0]]);
+        assert_eq!(decode::<u32>("q", &7_u32.to_le_bytes()).expect("a valid length"), [7]);
         let error = decode::<f32>("q", &bytes).expect_err("nine bytes").to_string();
         assert!(error.contains("a multiple of 4 bytes"), "{error}");
     }

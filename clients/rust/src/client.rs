@@ -17,12 +17,11 @@ pub const REPLY_LIMIT: u64 = 1 << 30;
 /// HTTP/2 flow-control window of a stream, in bytes. A stream that is not read fills its own window only.
 const STREAM_WINDOW: u32 = 4 << 20;
 
-/// HTTP/2 flow-control window of the connection, in bytes. Sixteen streams that are not read fill it, and every other
-/// call then waits.
+/// HTTP/2 flow-control window of the connection, in bytes. Sixteen unread streams fill it and block all other calls.
 const CONNECTION_WINDOW: u32 = 16 * STREAM_WINDOW;
 
-/// The largest HTTP/2 frame that the server may send, in bytes: one chunk of a reply. The default of 16 KiB halves the
-/// rate of large replies.
+/// The largest HTTP/2 frame that the server may send, in bytes: one chunk of a reply. With the default of 16 KiB, large
+/// replies arrive at half the rate.
 const MAX_FRAME_SIZE: u32 = 1 << 20;
 
 /// Time limit of a connection attempt.
@@ -39,8 +38,8 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 pub struct Client {
     pub(crate) channel: Channel,
     pub(crate) reply_limit: u64,
-    /// The URL of the server, as the caller passed it. Errors contain it.
-    server: Arc<str>,
+    /// The URL of the server, as the caller passed it, for errors.
+    url: Arc<str>,
 }
 
 /// Version, devices and limits of a server.
@@ -84,7 +83,7 @@ impl Client {
             .http2_keep_alive_interval(KEEP_ALIVE)
             .keep_alive_timeout(KEEP_ALIVE);
         let channel = endpoint.connect().await.map_err(connect_error)?;
-        Ok(Self { channel, reply_limit: REPLY_LIMIT, server: url.into() })
+        Ok(Self { channel, reply_limit: REPLY_LIMIT, url: url.into() })
     }
 
     /// Connects, and retries until a server answers or `timeout` has passed.
@@ -158,13 +157,13 @@ impl Client {
         v1::scene_service_client::SceneServiceClient::new(self.channel.clone())
     }
 
-    /// The reply of a call; an error names the server.
+    /// The reply of a call; an error contains the server's URL.
     pub(crate) fn reply<M>(&self, response: Result<Response<M>, Status>) -> Result<M> {
-        response.map(Response::into_inner).map_err(|status| Error::from_status(status, &self.server))
+        response.map(Response::into_inner).map_err(|status| Error::from_status(status, &self.url))
     }
 
-    /// The reply messages of a call; errors name the server.
+    /// The reply messages of a call; errors contain the server's URL.
     pub(crate) fn replies<M>(&self, response: Result<Response<Streaming<M>>, Status>) -> Result<Replies<M>> {
-        Ok(Replies::new(self.reply(response)?, Arc::clone(&self.server)))
+        Ok(Replies::new(self.reply(response)?, Arc::clone(&self.url)))
     }
 }

@@ -1,4 +1,4 @@
-//! Errors of the client. A rejection by the server names the field, what the server expected and what it got.
+//! Errors of the client. A rejection by the server names the field, the expected value and the received value.
 
 use modalcast_proto::v1;
 use prost::Message as _;
@@ -34,24 +34,24 @@ impl std::fmt::Display for Rejection {
 /// The error type of this crate.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum Error {
-    /// No connection, or the connection was lost.
+    /// The connection failed or was lost.
     #[error("{url}: no connection: {reason}")]
     Connect { url: String, reason: String },
-    /// The server rejected a call. `rejection` is present if the server sent details.
+    /// The server rejected a call with a gRPC status. `rejection` is present if the server sent details.
     #[error("rejected ({code:?}): {message}")]
     Status { code: tonic::Code, message: String, rejection: Option<Box<Rejection>> },
-    /// The server rejected a step, or the opening of a step stream. A rejected step does not end its stream.
+    /// The server sent a rejection on a step stream: of one step, which does not end the stream, or of the stream.
     #[error("rejected: {0}")]
     Rejected(Box<Rejection>),
     /// The reply of the server contradicts itself or the wire contract.
     #[error("malformed reply: {field}: expected {expected}, got {given}")]
     Malformed { field: String, expected: String, given: String },
     /// A stream ended too early.
-    #[error("the stream ended before {what}")]
-    StreamEnded { what: &'static str },
+    #[error("the stream ended before {awaited_reply}")]
+    StreamEnded { awaited_reply: &'static str },
     /// A reply did not arrive in time.
-    #[error("{what} did not arrive within {ms} ms")]
-    Deadline { what: &'static str, ms: u64 },
+    #[error("{awaited_reply} did not arrive within {ms} ms")]
+    Deadline { awaited_reply: &'static str, ms: u64 },
     /// A step cannot be encoded as one message, so it was not sent.
     #[error("step {step} cannot be sent: {reason}")]
     Step { step: u64, reason: &'static str },
@@ -82,10 +82,10 @@ pub(crate) fn malformed_reply(field: impl Into<String>, expected: impl ToString,
 }
 
 impl Error {
-    /// Converts the status of a call to the server with this URL.
-    pub(crate) fn from_status(status: tonic::Status, server: &str) -> Self {
+    /// Converts the gRPC status of a call. `url` is the server's URL.
+    pub(crate) fn from_status(status: tonic::Status, url: &str) -> Self {
         if is_connection_lost(&status) {
-            return Self::Connect { url: server.to_owned(), reason: describe_causes(&status) };
+            return Self::Connect { url: url.to_owned(), reason: describe_causes(&status) };
         }
         let has_details = !status.details().is_empty();
         let rejection = has_details.then(|| v1::Rejection::decode(status.details()).ok()).flatten();
@@ -97,9 +97,9 @@ impl Error {
     }
 }
 
-/// Whether the connection failed. The transport reports a broken connection as `Unknown` or `Unavailable` with a cause;
-/// a status that the server sent has no cause. A proxy answers `Unavailable` without details for a server that it cannot
-/// reach; a rejection by the server with that code has details.
+/// Whether the connection failed. tonic reports a broken connection as `Unknown` or `Unavailable` with a cause; a status
+/// sent by the server has no cause. `Unavailable` without details comes from a proxy that cannot reach the server,
+/// because the server adds details to this code.
 fn is_connection_lost(status: &tonic::Status) -> bool {
     let has_cause = std::error::Error::source(status).is_some();
     match status.code() {
@@ -109,7 +109,7 @@ fn is_connection_lost(status: &tonic::Status) -> bool {
     }
 }
 
-/// An error and its causes in one line, because the message of an error of tonic is only "transport error".
+/// Joins the messages of an error and its causes, because tonic's own message is only "transport error".
 pub(crate) fn describe_causes(error: &dyn std::error::Error) -> String {
     let causes = std::iter::successors(Some(error), |error| error.source());
     causes.map(ToString::to_string).collect::<Vec<_>>().join(": ")

@@ -25,8 +25,7 @@ pub enum FrameFormat {
     #[default]
     Png,
     Rgba,
-    /// Little-endian f32, one per pixel: depth in meters. The server chooses this and the other number formats by the
-    /// output.
+    /// Little-endian f32, one per pixel: depth in meters. The output alone selects this format or `U32` or `F32x3`.
     F32,
     /// Little-endian u32, one per pixel: domain indices.
     U32,
@@ -81,7 +80,7 @@ pub struct Camera {
     pub clip: Option<(f64, f64)>,
 }
 
-/// Size, format, camera and output of a picture. Without a camera the server frames the scene; 0 x 0 means 1280 x 720.
+/// Size, format, camera and output of a picture. Without a camera, the whole scene is visible. 0 x 0 means 1280 x 720.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Picture {
     pub width: u32,
@@ -150,11 +149,11 @@ impl Client {
         };
         let messages = self.replies(FrameServiceClient::new(self.channel.clone()).render_frame(wire).await)?;
         let frame = ChunkedReplies::new(messages, |message| message.chunk, self.reply_limit).next().await;
-        frame.unwrap_or(Err(Error::StreamEnded { what: "the first frame" }))
+        frame.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the first frame" }))
     }
 
-    /// Subscribes to frames. When this returns, the server has accepted the subscription, so that no later step is
-    /// missed.
+    /// Subscribes to frames. When this returns, the server has accepted the subscription: the client receives every later
+    /// step if the delivery is lossless.
     ///
     /// # Errors
     /// `Status` if the scene does not exist; `Connect` if the connection is lost.

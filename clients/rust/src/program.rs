@@ -8,12 +8,12 @@ use crate::error::Error;
 /// The exit code of a program that cannot use a local file or resource.
 const LOCAL_ERROR: u8 = 4;
 
-/// Runs the main task of a program on a new multi-threaded runtime and returns its exit code. An error is printed on
-/// standard error after `name`, and `exit_code` selects its exit code.
+/// Runs the main task of a program on a new multi-threaded runtime and returns its exit code. Prints an error as
+/// `name: error` on standard error and maps it to an exit code with `exit_code_of`.
 pub fn run<E: Display>(
     name: &str,
     main: impl Future<Output = Result<u8, E>>,
-    exit_code: impl FnOnce(&E) -> u8,
+    exit_code_of: impl FnOnce(&E) -> u8,
 ) -> ExitCode {
     let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
         Ok(runtime) => runtime,
@@ -24,13 +24,13 @@ pub fn run<E: Display>(
     };
     let code = runtime.block_on(main).unwrap_or_else(|error| {
         eprintln!("{name}: {error}");
-        exit_code(&error)
+        exit_code_of(&error)
     });
     ExitCode::from(code)
 }
 
-/// The exit code of an error of the client, as the help texts document it: 1 rejected by the server, 3 connection failed
-/// or lost, 4 local file error, 5 malformed, truncated or late reply.
+/// Maps an error of the client to the exit code that the help texts document: 1 rejected by the server or not encodable,
+/// 3 connection failed or lost, 4 local file error, 5 malformed, truncated or late reply.
 pub const fn exit_code(error: &Error) -> u8 {
     match error {
         Error::Connect { .. } | Error::Status { code: tonic::Code::Unavailable, .. } => 3,

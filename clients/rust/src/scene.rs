@@ -22,7 +22,7 @@ pub struct Attachment {
     pub parent_vertices: Vec<u32>,
 }
 
-/// One domain: n vertices, r modes, and the requested arrays (the others are empty).
+/// One domain: n vertices, r modes, and arrays. Arrays that were not requested are empty.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Domain {
     pub index: usize,
@@ -118,7 +118,7 @@ impl Client {
     /// `Status` if the scene, the domain or a vertex does not exist; `Malformed` if the reply does not have 3 r
     /// numbers per vertex.
     pub async fn read_modes(&self, scene: &str, domain: usize, vertices: &[u32]) -> Result<ModeRows> {
-        // No server has a domain with the index u32::MAX, so that it answers with a `Status`.
+        // No scene has a domain u32::MAX, so the server rejects this index.
         let domain = u32::try_from(domain).unwrap_or(u32::MAX);
         let request = v1::ReadModesRequest { scene: scene.to_owned(), domain, vertices: vertices.to_vec() };
         let mut messages = self.replies(self.scenes().read_modes(request).await)?;
@@ -130,9 +130,9 @@ impl Client {
             complete_reply = reply.or(complete_reply);
         }
         if assembler.is_open() {
-            return Err(Error::StreamEnded { what: "the last chunk of the modes" });
+            return Err(Error::StreamEnded { awaited_reply: "the last chunk of the modes" });
         }
-        // A rigid domain has no rows; a server may answer without any message.
+        // U of a rigid domain is empty, and the server may then send no message.
         let (rank, bytes) = complete_reply.unwrap_or((0, Bytes::new()));
         let vertex_bytes = 12 * u64::from(rank);
         let expected_bytes = vertex_bytes.saturating_mul(vertices.len() as u64);
@@ -245,7 +245,7 @@ impl DescriptionBuilder {
 
     fn finish(self, arrays: &[DomainArray]) -> Result<SceneDescription> {
         if self.partial_array.is_some() {
-            return Err(Error::StreamEnded { what: "the last chunk of an array" });
+            return Err(Error::StreamEnded { awaited_reply: "the last chunk of an array" });
         }
         let info = self.info.ok_or_else(|| malformed_reply("describe.scene", "a scene", "none"))?;
         for domain in &self.domains {

@@ -116,7 +116,7 @@ impl Step {
     /// Checks that all transforms have the same format, because one message has one format.
     pub(crate) fn check_formats(&self) -> Result<()> {
         if self.has_mixed_formats {
-            return Err(Error::Step { step: self.number, reason: "its transforms are of several formats" });
+            return Err(Error::Step { step: self.number, reason: "expected transforms of one format, got several" });
         }
         Ok(())
     }
@@ -186,7 +186,7 @@ mod tests {
         );
         for step in [step.clone().domain_transform(1, &rigid_f64), step.transform(1, &[0.0; 12])] {
             let error = step.check_formats().expect_err("mixed formats").to_string();
-            assert_eq!(error, "step 0 cannot be sent: its transforms are of several formats");
+            assert_eq!(error, "step 0 cannot be sent: expected transforms of one format, got several");
         }
     }
 }

@@ -1,7 +1,7 @@
 //! A step stream: sends steps, receives acknowledgements and rejections, and limits the steps in flight to the window.
 //!
-//! A separate task reads the replies all the time, because the server closes the connection of a client that does not
-//! read many small messages.
+//! A separate task reads the replies all the time, because the server closes a connection on which many small messages
+//! stay unread.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -101,7 +101,10 @@ impl Client {
         let (requests, queue) = mpsc::channel(64);
         let open = v1::OpenDrive { scene: scene.to_owned(), policy: policy.into(), window };
         let open_request = v1::DriveSceneRequest { kind: Some(RequestKind::Open(open)) };
-        requests.send(open_request).await.map_err(|_| Error::StreamEnded { what: "the stream opened" })?;
+        requests
+            .send(open_request)
+            .await
+            .map_err(|_| Error::StreamEnded { awaited_reply: "the reply to its opening" })?;
         let mut service = v1::step_service_client::StepServiceClient::new(self.channel.clone());
         let mut replies = self.replies(service.drive_scene(ReceiverStream::new(queue)).await)?;
         let opened = match replies.next().await?.and_then(|reply| reply.kind) {
@@ -110,7 +113,7 @@ impl Client {
             Some(ResponseKind::Ack(_)) => {
                 return Err(malformed_reply("drive.opened", "`opened` first", "an acknowledgement"));
             }
-            None => return Err(Error::StreamEnded { what: "the stream opened" }),
+            None => return Err(Error::StreamEnded { awaited_reply: "the reply to its opening" }),
         };
         let progress = Arc::new(Mutex::new(Progress::default()));
         let (change_sender, progress_changes) = watch::channel(());
@@ -140,7 +143,7 @@ impl StepStream {
         self.wait_until(|progress, window| progress.in_flight.len() < window).await?;
         lock(&self.progress).in_flight.push_back(step.number());
         let message = v1::DriveSceneRequest { kind: Some(RequestKind::Step(step.to_wire())) };
-        let requests = self.requests.as_ref().ok_or(Error::StreamEnded { what: "this step" })?;
+        let requests = self.requests.as_ref().ok_or(Error::StreamEnded { awaited_reply: "this step was sent" })?;
         if requests.send(message).await.is_err() {
             // The stream has ended; the reading task receives the reason.
             self.wait_until(|_, _| false).await?;
@@ -195,7 +198,7 @@ impl StepStream {
     /// Waits for all acknowledgements, then ends the stream. Rejections are counted and are not errors.
     ///
     /// # Errors
-    /// The error that ended the stream before all steps were acknowledged.
+    /// The error that ended the stream. A stream that has already ended is an error even if all steps are acknowledged.
     pub async fn finish(mut self) -> Result<StreamSummary> {
         self.wait_until(|progress, _| progress.in_flight.is_empty()).await?;
         self.requests = None;
@@ -213,14 +216,16 @@ impl StepStream {
             {
                 let progress = lock(&self.progress);
                 if let Some(end) = &progress.end {
-                    return Err(end.clone().unwrap_or(Error::StreamEnded { what: "the acknowledgement" }));
+                    return Err(end
+                        .clone()
+                        .unwrap_or(Error::StreamEnded { awaited_reply: "the acknowledgement of a step" }));
                 }
                 if condition(&progress, self.window) {
                     return Ok(());
                 }
             }
             if self.progress_changes.changed().await.is_err() && lock(&self.progress).end.is_none() {
-                return Err(Error::StreamEnded { what: "the acknowledgement" });
+                return Err(Error::StreamEnded { awaited_reply: "the acknowledgement of a step" });
             }
         }
     }

@@ -91,7 +91,7 @@ impl Client {
         };
         let messages = self.replies(VertexServiceClient::new(self.channel.clone()).get_vertices(wire).await)?;
         let set = ChunkedReplies::new(messages, |message| message.chunk, self.reply_limit).next().await;
-        set.unwrap_or(Err(Error::StreamEnded { what: "the first reply of vertices" }))
+        set.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the first reply of vertices" }))
     }
 
     /// Subscribes to vertices. When this returns, the server has accepted the subscription.

@@ -14,7 +14,7 @@ pub(crate) use serve::serve;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct FakeDomain {
     pub(crate) wire: v1::DomainDescription,
-    pub(crate) rest: Vec<f32>,
+    pub(crate) rest_positions: Vec<f32>,
     pub(crate) modes: Vec<f32>,
     pub(crate) indices: Vec<u32>,
 }
@@ -24,10 +24,11 @@ pub(crate) const IDENTITY: [f32; 12] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 
 
 impl FakeDomain {
     /// A domain at the origin with one corner per vertex.
-    pub(crate) fn new(index: u32, rest: Vec<f32>, rank: u32, modes: Vec<f32>) -> Self {
-        let vertices = (rest.len() / 3) as u32;
-        assert_eq!(modes.len(), rest.len() * rank as usize, "U has 3n rows");
-        let indices: Vec<u32> = (0..vertices.saturating_sub(2)).flat_map(|first| first..first + 3).collect();
+    pub(crate) fn new(index: u32, rest_positions: Vec<f32>, rank: u32, modes: Vec<f32>) -> Self {
+        let vertices = (rest_positions.len() / 3) as u32;
+        assert_eq!(modes.len(), rest_positions.len() * rank as usize, "expected 3n rows of U");
+        let indices: Vec<u32> =
+            (0..vertices.saturating_sub(2)).flat_map(|first_vertex| first_vertex..first_vertex + 3).collect();
         let wire = v1::DomainDescription {
             domain: index,
             name: format!("domain {index}"),
@@ -39,19 +40,21 @@ impl FakeDomain {
             shape: index,
             ..Default::default()
         };
-        Self { wire, rest, modes, indices }
+        Self { wire, rest_positions, modes, indices }
     }
 
-    /// World positions at coordinates `q` and transform `pose`.
-    fn positions(&self, q: &[f32], pose: &[f32]) -> Vec<f32> {
-        let mut local: Vec<f64> = self.rest.iter().map(|number| f64::from(*number)).collect();
-        for (row, entry) in local.iter_mut().enumerate() {
+    /// World positions T (x0 + U q); `transform` is T, row-major 3x4.
+    fn positions(&self, q: &[f32], transform: &[f32]) -> Vec<f32> {
+        let mut local_positions: Vec<f64> = self.rest_positions.iter().map(|number| f64::from(*number)).collect();
+        for (row, entry) in local_positions.iter_mut().enumerate() {
             let modes = &self.modes[row * q.len()..][..q.len()];
             *entry += modes.iter().zip(q).map(|(mode, q)| f64::from(*mode) * f64::from(*q)).sum::<f64>();
         }
-        let at = |row: usize, column: usize| f64::from(pose[4 * row + column]);
-        let world = |x: &[f64], row| at(row, 0) * x[0] + at(row, 1) * x[1] + at(row, 2) * x[2] + at(row, 3);
-        local.chunks(3).flat_map(|x| (0..3).map(move |row| world(x, row) as f32)).collect()
+        let transform_entry = |row: usize, column: usize| f64::from(transform[4 * row + column]);
+        let world_coordinate = |x: &[f64], row| {
+            (0..3).map(|column| transform_entry(row, column) * x[column]).sum::<f64>() + transform_entry(row, 3)
+        };
+        local_positions.chunks(3).flat_map(|x| (0..3).map(move |row| world_coordinate(x, row) as f32)).collect()
     }
 }
 
@@ -67,34 +70,37 @@ pub(crate) struct FakeServer {
     pub(crate) domains: Vec<FakeDomain>,
     pub(crate) bounds: [f64; 6],
     pub(crate) window: u32,
-    /// Acknowledgements that may still be sent; practically unlimited unless a test restricts them.
+    /// Number of acknowledgements that may still be sent; unlimited unless a test restricts it.
     pub(crate) permits: Semaphore,
     pub(crate) steps: Mutex<Vec<v1::Step>>,
     pub(crate) uploads: Mutex<Vec<(String, Vec<u8>)>>,
-    pub(crate) shown: broadcast::Sender<StepOutput>,
+    /// The state after each step, for the subscribers.
+    pub(crate) outputs: broadcast::Sender<StepOutput>,
     state: Mutex<State>,
 }
 
 struct State {
     run: u64,
-    taken: bool,
+    has_writer: bool,
     q: Vec<Vec<f32>>,
     transforms: Vec<Vec<f32>>,
-    last: Option<v1::StepId>,
+    last_step: Option<v1::StepId>,
 }
 
 impl FakeServer {
     pub(crate) fn new(domains: Vec<FakeDomain>) -> Self {
         let q = domains.iter().map(|domain| vec![0.0; domain.wire.rank as usize]).collect();
-        let transforms = domains.iter().map(|domain| floats(&domain.wire.placement)).collect();
+        let transforms = domains.iter().map(|domain| decode_f32(&domain.wire.placement)).collect();
         let positions: Vec<f32> = domains
             .iter()
-            .flat_map(|domain| domain.positions(&vec![0.0; domain.wire.rank as usize], &floats(&domain.wire.placement)))
+            .flat_map(|domain| {
+                domain.positions(&vec![0.0; domain.wire.rank as usize], &decode_f32(&domain.wire.placement))
+            })
             .collect();
         let mut bounds = [f64::MAX, f64::MAX, f64::MAX, f64::MIN, f64::MIN, f64::MIN];
-        for (at, number) in positions.iter().enumerate() {
-            bounds[at % 3] = bounds[at % 3].min(f64::from(*number));
-            bounds[at % 3 + 3] = bounds[at % 3 + 3].max(f64::from(*number));
+        for (index, number) in positions.iter().enumerate() {
+            bounds[index % 3] = bounds[index % 3].min(f64::from(*number));
+            bounds[index % 3 + 3] = bounds[index % 3 + 3].max(f64::from(*number));
         }
         Self {
             domains,
@@ -103,8 +109,8 @@ impl FakeServer {
             permits: Semaphore::new(Semaphore::MAX_PERMITS),
             steps: Mutex::default(),
             uploads: Mutex::default(),
-            shown: broadcast::channel(1 << 14).0,
-            state: Mutex::new(State { run: 0, taken: false, q, transforms, last: None }),
+            outputs: broadcast::channel(1 << 14).0,
+            state: Mutex::new(State { run: 0, has_writer: false, q, transforms, last_step: None }),
         }
     }
 
@@ -124,54 +130,54 @@ impl FakeServer {
             unit: 1.0,
             origin: vec![0.0; 3],
             bounds: self.bounds.to_vec(),
-            last_step: self.state.lock().unwrap().last,
+            last_step: self.state.lock().unwrap().last_step,
             ..Default::default()
         }
     }
 
     /// Acquires the writer lease. Fails if another run has it.
-    fn take(&self) -> Result<u64, v1::Rejection> {
+    fn acquire_writer_lease(&self) -> Result<u64, v1::Rejection> {
         let mut state = self.state.lock().unwrap();
-        if std::mem::replace(&mut state.taken, true) {
+        if std::mem::replace(&mut state.has_writer, true) {
             return Err(rejection(None, "scene", "a scene without a writer", "the writer of another run"));
         }
         state.run += 1;
         Ok(state.run)
     }
 
-    fn release(&self) {
-        self.state.lock().unwrap().taken = false;
+    fn release_writer_lease(&self) {
+        self.state.lock().unwrap().has_writer = false;
     }
 
     /// Applies a step atomically, or returns the rejection.
     fn apply(&self, step: &v1::Step) -> Result<(), v1::Rejection> {
-        let wrong = |field, expected: String, given| Err(rejection(Some(step.number), field, expected, given));
+        let reject = |field, expected: String, given| Err(rejection(Some(step.number), field, expected, given));
         let expected: usize = step.q_domains.iter().map(|index| self.rank(*index)).sum();
         if step.q.len() != 4 * expected {
-            return wrong("step.q", format!("{} bytes", 4 * expected), format!("{} bytes", step.q.len()));
+            return reject("step.q", format!("{} bytes", 4 * expected), format!("{} bytes", step.q.len()));
         }
         if step.transforms.len() != 48 * step.transform_domains.len() {
-            return wrong("step.transforms", "48 bytes each".into(), format!("{} bytes", step.transforms.len()));
+            return reject("step.transforms", "48 bytes each".into(), format!("{} bytes", step.transforms.len()));
         }
-        let (q, transforms) = (floats(&step.q), floats(&step.transforms));
+        let (q, transforms) = (decode_f32(&step.q), decode_f32(&step.transforms));
         if !q.iter().chain(&transforms).all(|number| number.is_finite()) {
-            return wrong("step", "finite numbers".into(), "others".into());
+            return reject("step", "finite numbers".into(), "NaN or infinity".into());
         }
         let mut state = self.state.lock().unwrap();
-        let mut first = 0;
+        let mut start = 0;
         for index in &step.q_domains {
             let rank = self.rank(*index);
-            state.q[*index as usize] = q[first..][..rank].to_vec();
-            first += rank;
+            state.q[*index as usize] = q[start..][..rank].to_vec();
+            start += rank;
         }
-        for (index, pose) in step.transform_domains.iter().zip(transforms.chunks(12)) {
-            state.transforms[*index as usize] = pose.to_vec();
+        for (index, transform) in step.transform_domains.iter().zip(transforms.chunks(12)) {
+            state.transforms[*index as usize] = transform.to_vec();
         }
         let id = v1::StepId { run: state.run, number: step.number, time: step.time };
-        state.last = Some(id);
+        state.last_step = Some(id);
         drop(state);
         self.steps.lock().unwrap().push(step.clone());
-        self.shown.send(self.output()).ok();
+        self.outputs.send(self.output()).ok();
         Ok(())
     }
 
@@ -183,12 +189,12 @@ impl FakeServer {
     pub(crate) fn output(&self) -> StepOutput {
         let state = self.state.lock().unwrap();
         let q = |index: usize| {
-            let owner = self.domains[index].wire.shares_q_with.map_or(index, |twin| twin as usize);
+            let owner = self.domains[index].wire.shares_q_with.map_or(index, |owner| owner as usize);
             &state.q[owner]
         };
         let domains = self.domains.iter().enumerate();
         let positions = domains.flat_map(|(index, domain)| domain.positions(q(index), &state.transforms[index]));
-        StepOutput { step: state.last.unwrap_or_default(), positions: positions.collect() }
+        StepOutput { step: state.last_step.unwrap_or_default(), positions: positions.collect() }
     }
 }
 
@@ -201,14 +207,14 @@ pub(crate) fn rejection(
     v1::Rejection { step, field: field.into(), expected: expected.to_string(), given: given.to_string() }
 }
 
-/// A status with a rejection in its details.
-fn refuse(code: tonic::Code, rejection: &v1::Rejection) -> Status {
+/// A gRPC status with a rejection in its details.
+fn rejection_status(code: tonic::Code, rejection: &v1::Rejection) -> Status {
     let details = prost::Message::encode_to_vec(rejection);
     Status::with_details(code, format!("{}: {}", rejection.field, rejection.given), details.into())
 }
 
 /// Decodes little-endian f32 at any alignment.
-pub(crate) fn floats(bytes: &[u8]) -> Vec<f32> {
+pub(crate) fn decode_f32(bytes: &[u8]) -> Vec<f32> {
     bytemuck::pod_collect_to_vec(bytes)
 }
 

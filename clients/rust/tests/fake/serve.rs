@@ -17,18 +17,18 @@ use v1::server_service_server::{ServerService, ServerServiceServer};
 use v1::step_service_server::{StepService, StepServiceServer};
 use v1::vertex_service_server::{VertexService, VertexServiceServer};
 
-use super::{FakeServer, StepOutput, pack, refuse, rejection};
+use super::{FakeServer, StepOutput, pack, rejection, rejection_status};
 
-const CHUNK: usize = 1 << 20;
+const CHUNK_BYTES: usize = 1 << 20;
 
-type Replies<T> = Pin<Box<dyn tokio_stream::Stream<Item = Result<T, Status>> + Send>>;
+type ResponseStream<T> = Pin<Box<dyn tokio_stream::Stream<Item = Result<T, Status>> + Send>>;
 
-/// Serves a world on a free loopback port. Returns its URL.
-pub(crate) async fn serve(world: Arc<FakeServer>) -> String {
+/// Serves the fake server's scene on a free loopback port. Returns the URL.
+pub(crate) async fn serve(fake_server: Arc<FakeServer>) -> String {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a free port");
-    let url = format!("http://{}", listener.local_addr().expect("bound"));
+    let url = format!("http://{}", listener.local_addr().expect("an address"));
     let server = tonic::transport::Server::builder();
-    tokio::spawn(server.serve_with_incoming(Router(FakeService(world)), TcpListenerStream::new(listener)));
+    tokio::spawn(server.serve_with_incoming(Router(FakeService(fake_server)), TcpListenerStream::new(listener)));
     url
 }
 
@@ -48,24 +48,24 @@ impl Service<http::Request<tonic::body::Body>> for Router {
     }
 
     fn call(&mut self, request: http::Request<tonic::body::Body>) -> Self::Future {
-        let fake = self.0.clone();
+        let service = self.0.clone();
         let path = request.uri().path().to_owned();
         match path.split('/').nth(1).and_then(|service| service.strip_prefix("modalcast.v1.")) {
-            Some("SceneService") => SceneServiceServer::new(fake).call(request),
-            Some("StepService") => StepServiceServer::new(fake).call(request),
-            Some("FrameService") => FrameServiceServer::new(fake).call(request),
-            Some("VertexService") => VertexServiceServer::new(fake).call(request),
-            _ => ServerServiceServer::new(fake).call(request),
+            Some("SceneService") => SceneServiceServer::new(service).call(request),
+            Some("StepService") => StepServiceServer::new(service).call(request),
+            Some("FrameService") => FrameServiceServer::new(service).call(request),
+            Some("VertexService") => VertexServiceServer::new(service).call(request),
+            _ => ServerServiceServer::new(service).call(request),
         }
     }
 }
 
 impl FakeService {
-    fn known(&self, scene: &str) -> Result<(), Status> {
+    fn check_scene(&self, scene: &str) -> Result<(), Status> {
         if scene == "toy" {
             return Ok(());
         }
-        Err(refuse(tonic::Code::NotFound, &rejection(None, "scene", "an open scene", scene)))
+        Err(rejection_status(tonic::Code::NotFound, &rejection(None, "scene", "an open scene", scene)))
     }
 }
 
@@ -87,7 +87,7 @@ impl SceneService for FakeService {
         &self,
         request: Request<v1::OpenSceneRequest>,
     ) -> Result<Response<v1::OpenSceneResponse>, Status> {
-        self.known(&request.into_inner().source)?;
+        self.check_scene(&request.into_inner().source)?;
         Ok(Response::new(v1::OpenSceneResponse { scene: Some(self.0.info()) }))
     }
 
@@ -101,7 +101,7 @@ impl SceneService for FakeService {
         while let Some(message) = stream.message().await? {
             match message.part {
                 Some(Part::File(file)) => files.push((file.path, vec![])),
-                Some(Part::Chunk(chunk)) => files.last_mut().expect("a file first").1.extend(chunk),
+                Some(Part::Chunk(chunk)) => files.last_mut().expect("a file before its first chunk").1.extend(chunk),
                 Some(Part::Header(_)) | None => {}
             }
         }
@@ -118,11 +118,11 @@ impl SceneService for FakeService {
         &self,
         request: Request<v1::DeleteSceneRequest>,
     ) -> Result<Response<v1::DeleteSceneResponse>, Status> {
-        self.known(&request.into_inner().scene)?;
+        self.check_scene(&request.into_inner().scene)?;
         Ok(Response::new(v1::DeleteSceneResponse {}))
     }
 
-    type DescribeSceneStream = Replies<v1::DescribeSceneResponse>;
+    type DescribeSceneStream = ResponseStream<v1::DescribeSceneResponse>;
 
     async fn describe_scene(
         &self,
@@ -130,7 +130,7 @@ impl SceneService for FakeService {
     ) -> Result<Response<Self::DescribeSceneStream>, Status> {
         use v1::describe_scene_response::Part;
         let request = request.into_inner();
-        self.known(&request.scene)?;
+        self.check_scene(&request.scene)?;
         let mut parts = vec![Part::Scene(self.0.info())];
         for domain in &self.0.domains {
             parts.push(Part::Domains(v1::DomainDescriptions { domains: vec![domain.wire.clone()] }));
@@ -140,135 +140,134 @@ impl SceneService for FakeService {
                 let bytes = match v1::Array::try_from(*array) {
                     Ok(v1::Array::Indices) => pack(&domain.indices),
                     Ok(v1::Array::CornerVertices) => pack(&(0..domain.wire.vertices).collect::<Vec<_>>()),
-                    Ok(v1::Array::RestPositions) => pack(&domain.rest),
+                    Ok(v1::Array::RestPositions) => pack(&domain.rest_positions),
                     _ => vec![],
                 };
-                for (offset, data) in chunks(bytes) {
-                    let total = data.1;
-                    let (domain, array, data) = (domain.wire.domain, *array, data.0);
+                for ByteChunk { offset, total, data } in split_bytes(bytes) {
+                    let (domain, array) = (domain.wire.domain, *array);
                     parts.push(Part::Chunk(v1::ArrayChunk { domain, array, offset, total, data }));
                 }
             }
         }
-        Ok(replies(parts.into_iter().map(|part| v1::DescribeSceneResponse { part: Some(part) }).collect()))
+        Ok(stream_messages(parts.into_iter().map(|part| v1::DescribeSceneResponse { part: Some(part) }).collect()))
     }
 
-    type ReadModesStream = Replies<v1::ReadModesResponse>;
+    type ReadModesStream = ResponseStream<v1::ReadModesResponse>;
 
     async fn read_modes(
         &self,
         request: Request<v1::ReadModesRequest>,
     ) -> Result<Response<Self::ReadModesStream>, Status> {
         let request = request.into_inner();
-        self.known(&request.scene)?;
+        self.check_scene(&request.scene)?;
         let domain = &self.0.domains[request.domain as usize];
-        let width = 3 * domain.wire.rank as usize;
-        let all: Vec<u32> = (0..domain.wire.vertices).collect();
-        let vertices = if request.vertices.is_empty() { all } else { request.vertices };
+        let row_numbers = 3 * domain.wire.rank as usize;
+        let all_vertices: Vec<u32> = (0..domain.wire.vertices).collect();
+        let vertices = if request.vertices.is_empty() { all_vertices } else { request.vertices };
         let mut bytes = vec![];
         for vertex in vertices {
-            bytes.extend(pack(&domain.modes[width * vertex as usize..][..width]));
+            bytes.extend(pack(&domain.modes[row_numbers * vertex as usize..][..row_numbers]));
         }
         let rank = domain.wire.rank;
-        let message = |(offset, (data, total))| v1::ReadModesResponse { rank, offset, total, data };
-        Ok(replies(chunks(bytes).into_iter().map(message).collect()))
+        let message = |ByteChunk { offset, total, data }| v1::ReadModesResponse { rank, offset, total, data };
+        Ok(stream_messages(split_bytes(bytes).into_iter().map(message).collect()))
     }
 }
 
 #[tonic::async_trait]
 impl StepService for FakeService {
-    type DriveSceneStream = Replies<v1::DriveSceneResponse>;
+    type DriveSceneStream = ResponseStream<v1::DriveSceneResponse>;
 
     async fn drive_scene(
         &self,
         request: Request<Streaming<v1::DriveSceneRequest>>,
     ) -> Result<Response<Self::DriveSceneStream>, Status> {
-        let (sender, replies) = tokio::sync::mpsc::channel(64);
-        let fake = self.clone();
-        tokio::spawn(async move { fake.drive(request.into_inner(), &sender).await });
-        Ok(Response::new(Box::pin(ReceiverStream::new(replies))))
+        let (sender, responses) = tokio::sync::mpsc::channel(64);
+        let service = self.clone();
+        tokio::spawn(async move { service.drive(request.into_inner(), &sender).await });
+        Ok(Response::new(Box::pin(ReceiverStream::new(responses))))
     }
 }
 
-type Answers = tokio::sync::mpsc::Sender<Result<v1::DriveSceneResponse, Status>>;
+type ResponseSender = tokio::sync::mpsc::Sender<Result<v1::DriveSceneResponse, Status>>;
 
 impl FakeService {
-    async fn drive(&self, mut requests: Streaming<v1::DriveSceneRequest>, answers: &Answers) {
+    async fn drive(&self, mut requests: Streaming<v1::DriveSceneRequest>, sender: &ResponseSender) {
         use v1::drive_scene_request::Kind as RequestKind;
         use v1::drive_scene_response::Kind as ResponseKind;
-        let mut mine = false;
+        let mut has_lease = false;
         while let Ok(Some(request)) = requests.message().await {
-            let answer = match request.kind {
+            let response = match request.kind {
                 Some(RequestKind::Open(open)) if open.scene != "toy" => {
                     ResponseKind::Rejection(rejection(None, "scene", "an open scene", open.scene))
                 }
-                Some(RequestKind::Open(open)) => match self.0.take() {
-                    Err(refusal) => ResponseKind::Rejection(refusal),
+                Some(RequestKind::Open(open)) => match self.0.acquire_writer_lease() {
+                    Err(rejection_reply) => ResponseKind::Rejection(rejection_reply),
                     Ok(run) => {
-                        mine = true;
+                        has_lease = true;
                         let window = if open.window == 0 { self.0.window } else { open.window.min(self.0.window) };
                         let scene = Some(self.0.info());
                         ResponseKind::Opened(v1::Opened { run, policy: open.policy, window, scene })
                     }
                 },
                 Some(RequestKind::Step(step)) => match self.0.apply(&step) {
-                    Err(refusal) => ResponseKind::Rejection(refusal),
+                    Err(rejection_reply) => ResponseKind::Rejection(rejection_reply),
                     Ok(()) => {
-                        self.0.permits.acquire().await.expect("open").forget();
+                        self.0.permits.acquire().await.expect("an open semaphore").forget();
                         let stages = vec![v1::StageTime { stage: "deform".into(), milliseconds: 1.5 }];
                         ResponseKind::Ack(v1::Acknowledgement { step: step.number, skipped: 0, stages })
                     }
                 },
                 None => continue,
             };
-            if answers.send(Ok(v1::DriveSceneResponse { kind: Some(answer) })).await.is_err() {
+            if sender.send(Ok(v1::DriveSceneResponse { kind: Some(response) })).await.is_err() {
                 break;
             }
         }
-        if mine {
-            self.0.release();
+        if has_lease {
+            self.0.release_writer_lease();
         }
     }
 }
 
 #[tonic::async_trait]
 impl FrameService for FakeService {
-    type RenderFrameStream = Replies<v1::RenderFrameResponse>;
+    type RenderFrameStream = ResponseStream<v1::RenderFrameResponse>;
 
     async fn render_frame(
         &self,
         request: Request<v1::RenderFrameRequest>,
     ) -> Result<Response<Self::RenderFrameStream>, Status> {
         let request = request.into_inner();
-        self.known(&request.scene)?;
-        let chunks = frame(&self.0.output(), &request.picture.unwrap_or_default());
-        Ok(replies(chunks.into_iter().map(|chunk| v1::RenderFrameResponse { chunk: Some(chunk) }).collect()))
+        self.check_scene(&request.scene)?;
+        let chunks = encode_frame(&self.0.output(), &request.picture.unwrap_or_default());
+        Ok(stream_messages(chunks.into_iter().map(|chunk| v1::RenderFrameResponse { chunk: Some(chunk) }).collect()))
     }
 
-    type PickStream = Replies<v1::PickResponse>;
+    type PickStream = ResponseStream<v1::PickResponse>;
 
     async fn pick(&self, _: Request<v1::PickRequest>) -> Result<Response<Self::PickStream>, Status> {
-        Err(Status::unimplemented("there is no surface here"))
+        Err(Status::unimplemented("the fake server does not pick"))
     }
 
-    type StreamFramesStream = Replies<v1::StreamFramesResponse>;
+    type StreamFramesStream = ResponseStream<v1::StreamFramesResponse>;
 
     async fn stream_frames(
         &self,
         request: Request<v1::StreamFramesRequest>,
     ) -> Result<Response<Self::StreamFramesStream>, Status> {
         let request = request.into_inner();
-        self.known(&request.scene)?;
+        self.check_scene(&request.scene)?;
         let picture = request.picture.unwrap_or_default();
         let limit = if request.frames == 0 { usize::MAX } else { request.frames as usize };
-        let shown = BroadcastStream::new(self.0.shown.subscribe()).filter_map(Result::ok).take(limit);
+        let outputs = BroadcastStream::new(self.0.outputs.subscribe()).filter_map(Result::ok).take(limit);
         let (sender, receiver) = tokio::sync::mpsc::channel(4);
         tokio::spawn(async move {
-            let mut shown = Box::pin(shown);
-            while let Some(shown) = shown.next().await {
-                for chunk in frame(&shown, &picture) {
-                    let sent = sender.send(Ok(v1::StreamFramesResponse { chunk: Some(chunk) })).await;
-                    if sent.is_err() {
+            let mut outputs = Box::pin(outputs);
+            while let Some(output) = outputs.next().await {
+                for chunk in encode_frame(&output, &picture) {
+                    let result = sender.send(Ok(v1::StreamFramesResponse { chunk: Some(chunk) })).await;
+                    if result.is_err() {
                         return;
                     }
                 }
@@ -280,35 +279,35 @@ impl FrameService for FakeService {
 
 #[tonic::async_trait]
 impl VertexService for FakeService {
-    type GetVerticesStream = Replies<v1::GetVerticesResponse>;
+    type GetVerticesStream = ResponseStream<v1::GetVerticesResponse>;
 
     async fn get_vertices(
         &self,
         request: Request<v1::GetVerticesRequest>,
     ) -> Result<Response<Self::GetVerticesStream>, Status> {
-        self.known(&request.into_inner().scene)?;
-        let chunks = self.vertices(&self.0.output());
-        Ok(replies(chunks.into_iter().map(|chunk| v1::GetVerticesResponse { chunk: Some(chunk) }).collect()))
+        self.check_scene(&request.into_inner().scene)?;
+        let chunks = self.encode_vertices(&self.0.output());
+        Ok(stream_messages(chunks.into_iter().map(|chunk| v1::GetVerticesResponse { chunk: Some(chunk) }).collect()))
     }
 
-    type StreamVerticesStream = Replies<v1::StreamVerticesResponse>;
+    type StreamVerticesStream = ResponseStream<v1::StreamVerticesResponse>;
 
     async fn stream_vertices(
         &self,
         request: Request<v1::StreamVerticesRequest>,
     ) -> Result<Response<Self::StreamVerticesStream>, Status> {
         let request = request.into_inner();
-        self.known(&request.scene)?;
+        self.check_scene(&request.scene)?;
         let limit = if request.steps == 0 { usize::MAX } else { request.steps as usize };
-        let shown = BroadcastStream::new(self.0.shown.subscribe()).filter_map(Result::ok).take(limit);
+        let outputs = BroadcastStream::new(self.0.outputs.subscribe()).filter_map(Result::ok).take(limit);
         let (sender, receiver) = tokio::sync::mpsc::channel(4);
-        let fake = self.clone();
+        let service = self.clone();
         tokio::spawn(async move {
-            let mut shown = Box::pin(shown);
-            while let Some(shown) = shown.next().await {
-                for chunk in fake.vertices(&shown) {
-                    let sent = sender.send(Ok(v1::StreamVerticesResponse { chunk: Some(chunk) })).await;
-                    if sent.is_err() {
+            let mut outputs = Box::pin(outputs);
+            while let Some(output) = outputs.next().await {
+                for chunk in service.encode_vertices(&output) {
+                    let result = sender.send(Ok(v1::StreamVerticesResponse { chunk: Some(chunk) })).await;
+                    if result.is_err() {
                         return;
                     }
                 }
@@ -319,11 +318,11 @@ impl VertexService for FakeService {
 }
 
 impl FakeService {
-    /// All positions, without normals.
-    fn vertices(&self, shown: &StepOutput) -> Vec<v1::VertexChunk> {
-        let bytes = pack(&shown.positions);
+    /// The positions of all domains, without normals, in chunks.
+    fn encode_vertices(&self, output: &StepOutput) -> Vec<v1::VertexChunk> {
+        let bytes = pack(&output.positions);
         let mut head = Some(v1::VertexHead {
-            step: Some(shown.step),
+            step: Some(output.step),
             origin: vec![0.0; 3],
             domains: (0..self.0.domains.len() as u32).collect(),
             vertices: self.0.domains.iter().map(|domain| domain.wire.vertices).collect(),
@@ -332,17 +331,17 @@ impl FakeService {
             total: bytes.len() as u64,
             ..Default::default()
         });
-        let chunk = |(offset, (data, _))| v1::VertexChunk { head: head.take(), offset, data };
-        chunks(bytes).into_iter().map(chunk).collect()
+        let chunk = |ByteChunk { offset, data, .. }| v1::VertexChunk { head: head.take(), offset, data };
+        split_bytes(bytes).into_iter().map(chunk).collect()
     }
 }
 
-/// A raw picture in chunks. Every byte is the number of the step.
-fn frame(shown: &StepOutput, picture: &v1::Picture) -> Vec<v1::FrameChunk> {
+/// An RGBA frame in chunks. Every byte is the low byte of the step number.
+fn encode_frame(output: &StepOutput, picture: &v1::Picture) -> Vec<v1::FrameChunk> {
     let (width, height) = (picture.width.max(1), picture.height.max(1));
-    let bytes = vec![shown.step.number as u8; 4 * (width * height) as usize];
+    let bytes = vec![output.step.number as u8; 4 * (width * height) as usize];
     let mut head = Some(v1::FrameHead {
-        step: Some(shown.step),
+        step: Some(output.step),
         width,
         height,
         format: v1::Format::Rgba.into(),
@@ -352,17 +351,29 @@ fn frame(shown: &StepOutput, picture: &v1::Picture) -> Vec<v1::FrameChunk> {
         shadow_drawn_by: v1::DrawnBy::Unspecified.into(),
         visibility_drawn_by: v1::DrawnBy::Cuda.into(),
     });
-    chunks(bytes).into_iter().map(|(offset, (data, _))| v1::FrameChunk { head: head.take(), offset, data }).collect()
+    let chunk = |ByteChunk { offset, data, .. }| v1::FrameChunk { head: head.take(), offset, data };
+    split_bytes(bytes).into_iter().map(chunk).collect()
 }
 
-/// Splits bytes into pieces of at most 1 MiB: offset, piece, total. Empty input gives one empty piece.
-fn chunks(bytes: Vec<u8>) -> Vec<(u64, (Bytes, u64))> {
-    let (bytes, total) = (Bytes::from(bytes), 0);
-    let total = total + bytes.len() as u64;
-    let starts = (0..bytes.len().max(1)).step_by(CHUNK);
-    starts.map(|at| (at as u64, (bytes.slice(at..(at + CHUNK).min(bytes.len())), total))).collect()
+/// A part of a reply. `total` is the size of the reply in bytes.
+struct ByteChunk {
+    offset: u64,
+    total: u64,
+    data: Bytes,
 }
 
-fn replies<T: Send + 'static>(messages: Vec<T>) -> Response<Replies<T>> {
+/// Splits bytes into chunks of at most 1 MiB. Empty input gives one empty chunk.
+fn split_bytes(bytes: Vec<u8>) -> Vec<ByteChunk> {
+    let bytes = Bytes::from(bytes);
+    let total = bytes.len() as u64;
+    let starts = (0..bytes.len().max(1)).step_by(CHUNK_BYTES);
+    let chunk = |start: usize| {
+        let data = bytes.slice(start..(start + CHUNK_BYTES).min(bytes.len()));
+        ByteChunk { offset: start as u64, total, data }
+    };
+    starts.map(chunk).collect()
+}
+
+fn stream_messages<T: Send + 'static>(messages: Vec<T>) -> Response<ResponseStream<T>> {
     Response::new(Box::pin(tokio_stream::iter(messages.into_iter().map(Ok))))
 }

@@ -13,12 +13,12 @@ Examples:
   modalcast-fetch --server http://10.0.0.2:50051 info
 
 `frames`, and `vertices` with --count, print the line `ready` on standard output when the server has accepted the
-subscription. A physics process that starts after that line loses no step.
+subscription. It then receives every step of a physics process that starts after that line.
 
 Exit codes: 0 done; 1 rejected by the server; 2 invalid command line; 3 connection failed or lost; 4 local file error;
 5 malformed, truncated or late reply.";
 
-/// Saves frames or vertices of a modalcast server.
+/// Saves frames or vertices from a modalcast server, prints its scenes and settings, and closes scenes.
 #[derive(Debug, Parser)]
 #[command(name = "modalcast-fetch", version, after_help = EXAMPLES)]
 pub(crate) struct Cli {
@@ -39,10 +39,10 @@ pub(crate) struct Cli {
 pub(crate) enum Command {
     /// Save one frame per step.
     #[command(after_help = EXAMPLES)]
-    Frames(FramesOptions),
+    Frames(FrameStreamOptions),
     /// Save one frame.
     #[command(after_help = EXAMPLES)]
-    Frame(FrameOptions),
+    Frame(SingleFrameOptions),
     /// Save deformed vertices as a NumPy file, steps x vertices x 3.
     #[command(after_help = EXAMPLES)]
     Vertices(VerticesOptions),
@@ -64,7 +64,7 @@ pub(crate) struct SceneOptions {
     /// The scene's name on the server.
     #[arg(long)]
     pub(crate) scene: String,
-    /// Source in the server's repository to open first, under the name of --scene.
+    /// Source to open before the command (`list` prints the sources). The scene gets the name --scene.
     #[arg(long, value_name = "SOURCE")]
     pub(crate) open: Option<String>,
 }
@@ -75,7 +75,8 @@ pub(crate) struct PictureOptions {
     /// Image size in pixels.
     #[arg(long, default_value = "1280x720", value_name = "WxH", value_parser = parse_size)]
     size: (u32, u32),
-    /// Content of the picture: color, depth (f32 meters), domains (u32), normals (3 f32), or a color map with a legend.
+    /// Content of the picture: color, depth (f32 meters), domains (u32), normals (3 f32), or a color map of
+    /// `displacement` or `mode-shape` with a legend.
     #[arg(long, value_enum, default_value = "color")]
     output: OutputOption,
     /// Index of the column of U for `--output mode-shape`, from 0.
@@ -87,7 +88,7 @@ pub(crate) struct PictureOptions {
     /// Encoding of color pictures: PNG, or raw RGBA8 (top row first, sRGB).
     #[arg(long, value_enum, default_value = "png")]
     pub(crate) format: FormatOption,
-    /// Position of the camera in scene units. Default: a camera that frames the scene.
+    /// Position of the camera in scene units. Default: a camera that shows the whole scene.
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_vector, requires = "target", allow_hyphen_values = true)]
     eye: Option<[f64; 3]>,
     /// Point that the camera looks at, in scene units.
@@ -155,7 +156,7 @@ impl From<DeliveryOption> for Delivery {
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct FramesOptions {
+pub(crate) struct FrameStreamOptions {
     #[command(flatten)]
     pub(crate) scene: SceneOptions,
     #[command(flatten)]
@@ -196,7 +197,7 @@ impl StepOptions {
 }
 
 #[derive(Debug, Args)]
-pub(crate) struct FrameOptions {
+pub(crate) struct SingleFrameOptions {
     #[command(flatten)]
     pub(crate) scene: SceneOptions,
     #[command(flatten)]
@@ -229,7 +230,7 @@ pub(crate) struct VerticesOptions {
     /// Domain indices, separated by commas. Default: all domains.
     #[arg(long, value_delimiter = ',')]
     pub(crate) domains: Vec<u32>,
-    /// Number of steps to receive by a subscription. Default: one step, without a subscription.
+    /// Subscribe and receive this many steps. Default: one step by a single request.
     #[arg(long, conflicts_with_all = ["step", "min_step"], value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) count: Option<u64>,
     /// lossless: receive every step; latest: skip to the newest step.

@@ -21,13 +21,13 @@ fn main() -> ExitCode {
 
 async fn run_command(arguments: &Cli) -> Result<()> {
     let client = Client::connect_with_retry(&arguments.server, Duration::from_secs_f64(arguments.wait)).await?;
-    let json = arguments.json;
+    let as_json = arguments.json;
     match &arguments.command {
-        Command::Frames(options) => frames::fetch_stream(&client, options, json).await,
-        Command::Frame(options) => frames::fetch_single(&client, options, json).await,
-        Command::Vertices(options) => vertices::fetch(&client, options, json).await,
-        Command::Info => output::print_info(&client, json).await,
-        Command::List => output::print_list(&client, json).await,
+        Command::Frames(options) => frames::fetch_stream(&client, options, as_json).await,
+        Command::Frame(options) => frames::fetch_single(&client, options, as_json).await,
+        Command::Vertices(options) => vertices::fetch(&client, options, as_json).await,
+        Command::Info => output::print_info(&client, as_json).await,
+        Command::List => output::print_list(&client, as_json).await,
         Command::Close { scene } => client.delete_scene(scene).await,
     }
 }

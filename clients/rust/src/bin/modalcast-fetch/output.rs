@@ -1,4 +1,4 @@
-//! Prints summaries on standard output, as text or as one line of JSON.
+//! Output of the commands: summaries on standard output, as text or as one line of JSON, and progress on standard error.
 
 use std::time::Instant;
 
@@ -8,27 +8,28 @@ use serde_json::{Value, json};
 
 use crate::cli::SceneOptions;
 
-/// Step, size and times of a received reply.
-pub(crate) struct ReceivedStep<'a> {
-    pub(crate) step: StepId,
+/// Step, size and stage times of one received frame or vertex set.
+pub(crate) struct ReceivedReply<'a> {
+    pub(crate) step_id: StepId,
     pub(crate) bytes: u64,
     pub(crate) skipped: u64,
     pub(crate) stages: &'a StageTimes,
 }
 
+/// Arrival times of the first and the last reply.
 #[derive(Clone, Copy)]
 struct ReplyTimes {
     first: Instant,
-    newest: Instant,
+    last: Instant,
 }
 
 /// Totals of the received frames or vertices.
 pub(crate) struct Summary {
     start: Instant,
-    /// When the first and the newest reply were complete.
+    /// `None` before the first reply.
     reply_times: Option<ReplyTimes>,
-    steps: Vec<u64>,
-    runs: Vec<u64>,
+    step_numbers: Vec<u64>,
+    run_numbers: Vec<u64>,
     bytes: u64,
     skipped: u64,
     stages: StageSamples,
@@ -39,8 +40,8 @@ impl Summary {
         Self {
             start: Instant::now(),
             reply_times: None,
-            steps: vec![],
-            runs: vec![],
+            step_numbers: vec![],
+            run_numbers: vec![],
             bytes: 0,
             skipped: 0,
             stages: StageSamples::default(),
@@ -48,33 +49,32 @@ impl Summary {
     }
 
     /// Counts one reply.
-    pub(crate) fn add(&mut self, reply: &ReceivedStep<'_>) {
+    pub(crate) fn add(&mut self, reply: &ReceivedReply<'_>) {
         let now = Instant::now();
-        self.reply_times = Some(ReplyTimes { first: self.reply_times.map_or(now, |times| times.first), newest: now });
-        self.runs.push(reply.step.run);
-        self.steps.push(reply.step.number);
+        self.reply_times = Some(ReplyTimes { first: self.reply_times.map_or(now, |times| times.first), last: now });
+        self.run_numbers.push(reply.step_id.run);
+        self.step_numbers.push(reply.step_id.number);
         self.bytes += reply.bytes;
         self.skipped += reply.skipped;
         self.stages.add(reply.stages);
     }
 
-    /// Replies per second from the first to the newest reply, without the wait for the first; 0 for fewer than two
-    /// replies.
+    /// Replies per second from the first to the last reply; 0 for fewer than two replies.
     fn replies_per_second(&self) -> f64 {
-        let seconds = self.reply_times.map_or(0.0, |times| (times.newest - times.first).as_secs_f64());
-        if seconds > 0.0 { (self.steps.len() - 1) as f64 / seconds } else { 0.0 }
+        let seconds = self.reply_times.map_or(0.0, |times| (times.last - times.first).as_secs_f64());
+        if seconds > 0.0 { (self.step_numbers.len() - 1) as f64 / seconds } else { 0.0 }
     }
 
-    /// Prints the number of replies under the name `unit` (frames, steps), the output path, and the origin of vertices in
-    /// meters.
-    pub(crate) fn print(self, unit: &str, out: &std::path::Path, origin: Option<Vec<f64>>, json: bool) {
+    /// Prints the summary. `reply_noun` is `frames` or `steps`; as JSON, it is the key of the number of replies. Only the
+    /// JSON contains `origin`, in meters.
+    pub(crate) fn print(self, reply_noun: &str, out: &std::path::Path, origin: Option<Vec<f64>>, as_json: bool) {
         let rate = self.replies_per_second();
         let medians = self.stages.medians();
         let elapsed = self.start.elapsed().as_secs_f64();
-        let count = self.steps.len();
-        if json {
+        let count = self.step_numbers.len();
+        if as_json {
             let mut summary = json!({
-                unit: count, "out": out.display().to_string(), "steps": self.steps, "runs": self.runs,
+                reply_noun: count, "out": out.display().to_string(), "steps": self.step_numbers, "runs": self.run_numbers,
                 "bytes": self.bytes, "skipped": self.skipped, "elapsed_s": elapsed,
                 "per_second": rate, "stages_ms": medians,
             });
@@ -85,7 +85,10 @@ impl Summary {
             return;
         }
         let (bytes, skipped) = (self.bytes, self.skipped);
-        println!("{count} {unit}, {bytes} bytes, {elapsed:.2} s ({rate:.1}/s), {skipped} skipped: {}", out.display());
+        println!(
+            "{count} {reply_noun}, {bytes} bytes, {elapsed:.2} s ({rate:.1}/s), {skipped} skipped: {}",
+            out.display()
+        );
         for (stage, milliseconds) in medians {
             println!("  {stage:8} {milliseconds:8.3} ms (median)");
         }
@@ -93,9 +96,9 @@ impl Summary {
 }
 
 /// A progress bar on standard error; hidden unless standard error is a terminal.
-pub(crate) fn create_progress_bar(count: u64, unit: &'static str) -> ProgressBar {
+pub(crate) fn create_progress_bar(count: u64, reply_noun: &'static str) -> ProgressBar {
     let style = ProgressStyle::with_template("{msg} [{bar:32}] {pos}/{len} {per_sec} eta {eta}");
-    ProgressBar::new(count).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())).with_message(unit)
+    ProgressBar::new(count).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())).with_message(reply_noun)
 }
 
 /// Opens the scene if `--open` is given. Returns its name on the server.
@@ -107,10 +110,10 @@ pub(crate) async fn open_scene(client: &Client, options: &SceneOptions) -> Resul
 }
 
 /// Prints backend, renderer and limits of the server.
-pub(crate) async fn print_info(client: &Client, json: bool) -> Result<()> {
+pub(crate) async fn print_info(client: &Client, as_json: bool) -> Result<()> {
     let info = client.server_info().await?;
     let limits = &info.limits;
-    if json {
+    if as_json {
         let limits = json!({
             "message_bytes": limits.message_bytes, "frame_side": limits.frame_side, "scenes": limits.scenes,
             "window": limits.window, "upload_bytes": limits.upload_bytes, "deadline_ms": limits.deadline_ms,
@@ -135,9 +138,9 @@ pub(crate) async fn print_info(client: &Client, json: bool) -> Result<()> {
 }
 
 /// Prints the open scenes and the available sources.
-pub(crate) async fn print_list(client: &Client, json: bool) -> Result<()> {
+pub(crate) async fn print_list(client: &Client, as_json: bool) -> Result<()> {
     let SceneList { scenes, sources } = client.list_scenes().await?;
-    if json {
+    if as_json {
         let scenes: Vec<_> = scenes.iter().map(scene_json).collect();
         println!("{}", json!({ "scenes": scenes, "sources": sources }));
         return Ok(());
@@ -145,6 +148,7 @@ pub(crate) async fn print_list(client: &Client, json: bool) -> Result<()> {
     for scene in scenes {
         let last_step =
             scene.last_step.map_or("no step yet".into(), |step| format!("step {} of run {}", step.number, step.run));
+        // These fields are counts.
         let SceneInfo { scene: name, source, domains, vertices, triangles, coordinates, .. } = scene;
         println!(
             "{name} ({source}): {domains} domains, {vertices} vertices, {triangles} triangles, {coordinates} \
@@ -172,16 +176,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rate_counts_from_the_first_reply_to_the_newest() {
+    fn rate_excludes_the_wait_for_the_first_reply() {
         let mut summary = Summary::new();
         assert_eq!(summary.replies_per_second(), 0.0);
-        for step in 0..3 {
-            let step = StepId { run: 1, number: step, time: 0.0 };
-            summary.add(&ReceivedStep { step, bytes: 8, skipped: 0, stages: &vec![] });
+        for number in 0..3 {
+            let step_id = StepId { run: 1, number, time: 0.0 };
+            summary.add(&ReceivedReply { step_id, bytes: 8, skipped: 0, stages: &vec![] });
         }
         let start = summary.start;
         let time = |seconds| start + std::time::Duration::from_secs(seconds);
-        summary.reply_times = Some(ReplyTimes { first: time(60), newest: time(64) });
+        summary.reply_times = Some(ReplyTimes { first: time(60), last: time(64) });
         assert_eq!(summary.replies_per_second(), 0.5);
     }
 }

@@ -7,16 +7,16 @@ use modalcast_client::npy::Writer as NpyWriter;
 use modalcast_client::{Client, Error, Result, VertexRequest, VertexSelection, VertexSet, VertexStreamRequest};
 
 use crate::cli::VerticesOptions;
-use crate::output::{ReceivedStep, Summary, create_progress_bar, open_scene};
+use crate::output::{ReceivedReply, Summary, create_progress_bar, open_scene};
 
-pub(crate) async fn fetch(client: &Client, options: &VerticesOptions, json: bool) -> Result<()> {
+pub(crate) async fn fetch(client: &Client, options: &VerticesOptions, as_json: bool) -> Result<()> {
     let scene = open_scene(client, &options.scene).await?;
     let mut files = OutputFiles { options, writers: Vec::new(), origin: vec![], summary: Summary::new() };
     match options.count {
         None => files.write_set(&fetch_single(client, options, &scene).await?)?,
         Some(count) => fetch_stream(client, &scene, count, &mut files).await?,
     }
-    files.finish(json)
+    files.finish(as_json)
 }
 
 async fn fetch_single(client: &Client, options: &VerticesOptions, scene: &str) -> Result<VertexSet> {
@@ -34,9 +34,9 @@ async fn fetch_stream(client: &Client, scene: &str, count: u64, files: &mut Outp
     let timeout = Duration::from_secs_f64(options.timeout);
     let progress_bar = create_progress_bar(count, "steps");
     for _ in 0..count {
-        let deadline_error = Error::Deadline { what: "the next step", ms: timeout.as_millis() as u64 };
+        let deadline_error = Error::Deadline { awaited_reply: "the next step", ms: timeout.as_millis() as u64 };
         let result = tokio::time::timeout(timeout, vertex_stream.next()).await.map_err(|_| deadline_error)?;
-        files.write_set(&result.unwrap_or(Err(Error::StreamEnded { what: "the last step" }))?)?;
+        files.write_set(&result.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the last step" }))?)?;
         progress_bar.inc(1);
     }
     progress_bar.finish_and_clear();
@@ -53,7 +53,7 @@ fn vertex_selection(options: &VerticesOptions) -> VertexSelection {
     }
 }
 
-/// The values of one step of an array.
+/// The numbers of one array in one step: one row of its file.
 struct ArrayRow<'a> {
     path: &'a Path,
     shape: Vec<usize>,
@@ -94,18 +94,20 @@ impl OutputFiles<'_> {
         }
         if set.origin != self.origin || !set.domain_origins.is_empty() {
             let step = set.step.number;
-            let reason = format!("step {step}: expected the origin of the previous steps, got another one or several");
+            let reason = format!(
+                "step {step}: expected the origin of the previous steps, got a different one or one per domain"
+            );
             return Err(Error::file(&self.options.out, reason));
         }
         self.writers.iter_mut().zip(&rows).try_for_each(|(writer, row)| writer.write_row(row.numbers))?;
         let bytes = rows.iter().map(|row| size_of_val(row.numbers) as u64).sum();
-        self.summary.add(&ReceivedStep { step: set.step, bytes, skipped: set.skipped, stages: &set.stages });
+        self.summary.add(&ReceivedReply { step_id: set.step, bytes, skipped: set.skipped, stages: &set.stages });
         Ok(())
     }
 
-    fn finish(self, json: bool) -> Result<()> {
+    fn finish(self, as_json: bool) -> Result<()> {
         self.writers.into_iter().try_for_each(|writer| writer.finish().map(drop))?;
-        self.summary.print("steps", &self.options.out, Some(self.origin), json);
+        self.summary.print("steps", &self.options.out, Some(self.origin), as_json);
         Ok(())
     }
 }
