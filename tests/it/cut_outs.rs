@@ -9,7 +9,7 @@ use nalgebra::{Matrix3, Vector3};
 use crate::common::cut_outs::{alpha_image, floor_soup, sheet_soup, uniform_cut_out_soups};
 use crate::common::soups::{clip_space_viewport, perspective_viewport};
 
-/// Texture coordinates at the point where the ray through a sample meets the plane of a triangle, in f64. The eye is
+/// Texture coordinates where the ray through the sample (`x`, `y`) meets the plane of a triangle, in f64. The camera is
 /// that of [`perspective_viewport`], with a vertical field of view of 60 degrees.
 fn ray_cast_uv(viewport: &Viewport, triangle: [[f64; 3]; 3], uvs: [[f64; 2]; 3], [x, y]: [f64; 2]) -> [f64; 2] {
     let [width, height] = viewport.size().map(f64::from);
@@ -32,48 +32,48 @@ struct Case {
 }
 
 impl Case {
-    /// Largest error of the texture coordinates of the footprint, and largest error of their derivatives. The
-    /// derivatives are compared with central differences.
-    fn errors(&self) -> (f64, f64) {
+    /// Largest error of the footprint's texture coordinates, and of their derivatives against central differences.
+    fn max_errors(&self) -> (f64, f64) {
         let positions: Vec<f32> = self.triangle.as_flattened().iter().map(|number| *number as f32).collect();
         let corners = corners(&self.viewport, &positions, [0, 1, 2]);
-        let got = footprint(&self.viewport, &corners, &self.uvs.map(|uv| uv.map(|number| number as f32)), self.pixel);
-        let center = self.pixel.map(|uv_at| f64::from(uv_at) + 0.5);
+        let result =
+            footprint(&self.viewport, &corners, &self.uvs.map(|uv| uv.map(|number| number as f32)), self.pixel);
+        let center = self.pixel.map(|index| f64::from(index) + 0.5);
         let uv_at =
             |x: f64, y: f64| ray_cast_uv(&self.viewport, self.triangle, self.uvs, [center[0] + x, center[1] + y]);
-        let max_error = |got: [f32; 2], want: [f64; 2]| {
-            (0..2).map(|axis| (f64::from(got[axis]) - want[axis]).abs()).fold(0.0, f64::max)
+        let max_error = |actual: [f32; 2], expected: [f64; 2]| {
+            (0..2).map(|axis| (f64::from(actual[axis]) - expected[axis]).abs()).fold(0.0, f64::max)
         };
         let central_difference =
             |upper: [f64; 2], lower: [f64; 2]| [0, 1].map(|axis| (upper[axis] - lower[axis]) / 2e-3);
-        let across = max_error(got.duv_dx, central_difference(uv_at(1e-3, 0.0), uv_at(-1e-3, 0.0)));
-        let down = max_error(got.duv_dy, central_difference(uv_at(0.0, 1e-3), uv_at(0.0, -1e-3)));
-        (max_error(got.uv, uv_at(0.0, 0.0)), across.max(down))
+        let column_error = max_error(result.duv_dx, central_difference(uv_at(1e-3, 0.0), uv_at(-1e-3, 0.0)));
+        let row_error = max_error(result.duv_dy, central_difference(uv_at(0.0, 1e-3), uv_at(0.0, -1e-3)));
+        (max_error(result.uv, uv_at(0.0, 0.0)), column_error.max(row_error))
     }
 }
 
-/// Footprints equal the ray-cast texture coordinates and derivatives, also for triangles with corners behind the eye.
+/// Also for a triangle with corners behind the eye.
 #[test]
-fn texture_coordinates_match_ray_cast_behind_the_eye() {
+fn footprints_match_ray_cast_texture_coordinates() {
     let viewport = perspective_viewport(192, 128, 0.1, 100.0);
     let uvs = [[0.0, 0.0], [3.0, 0.0], [3.0, 5.0]];
-    let tilted = [[-2.0, -2.0, -3.0], [2.5, -1.0, -5.0], [0.3, 3.0, -9.0]];
-    let behind_eye = [[-9.0, -1.0, 9.0], [9.0, -1.0, 9.0], [2.0, -1.0, -20.0]];
+    let tilted_triangle = [[-2.0, -2.0, -3.0], [2.5, -1.0, -5.0], [0.3, 3.0, -9.0]];
+    let triangle_behind_eye = [[-9.0, -1.0, 9.0], [9.0, -1.0, 9.0], [2.0, -1.0, -20.0]];
     let mut max_errors = (0.0_f64, 0.0_f64);
     for (triangle, pixels) in
-        [(tilted, [[90, 60], [101, 70], [80, 66]]), (behind_eye, [[96, 80], [96, 120], [99, 100]])]
+        [(tilted_triangle, [[90, 60], [101, 70], [80, 66]]), (triangle_behind_eye, [[96, 80], [96, 120], [99, 100]])]
     {
         for pixel in pixels {
-            let (uv_error, derivative_error) = Case { triangle, uvs, pixel, viewport }.errors();
+            let (uv_error, derivative_error) = Case { triangle, uvs, pixel, viewport }.max_errors();
             max_errors = (max_errors.0.max(uv_error), max_errors.1.max(derivative_error));
         }
     }
     assert!(max_errors.0 < 1e-5 && max_errors.1 < 1e-4, "{max_errors:?}");
-    let affine = ray_cast_uv(&viewport, tilted.map(|[x, y, z]| [-x / z, -y / z, -1.0]), uvs, [90.5, 60.5]);
-    let perspective = ray_cast_uv(&viewport, tilted, uvs, [90.5, 60.5]);
+    let affine_uv = ray_cast_uv(&viewport, tilted_triangle.map(|[x, y, z]| [-x / z, -y / z, -1.0]), uvs, [90.5, 60.5]);
+    let perspective_uv = ray_cast_uv(&viewport, tilted_triangle, uvs, [90.5, 60.5]);
     assert!(
-        (affine[0] - perspective[0]).abs() > 0.05,
-        "negative control: without perspective {affine:?}, with perspective {perspective:?}"
+        (affine_uv[0] - perspective_uv[0]).abs() > 0.05,
+        "negative control: without perspective {affine_uv:?}, with perspective {perspective_uv:?}"
     );
 }
 
@@ -90,25 +90,25 @@ fn small_triangles_at_window_border_keep_precision() {
         .iter()
         .map(|number| *number as f32)
         .collect();
-    let got =
+    let result =
         footprint(&viewport, &corners(&viewport, &positions, [0, 1, 2]), &[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]], pixel);
-    // f32 resolves 1/16384^2 of the window here, which is a twentieth of this triangle.
-    assert!((got.uv[0] - 0.5).abs() < 0.06 && (got.uv[1] - 0.5).abs() < 0.06, "{got:?}");
-    assert!((got.duv_dx[0] / 50.0 - 1.0).abs() < 0.1, "{got:?}");
-    // The sample lies outside of the triangle by a rounding step. Its coordinates are those of the nearest point of the
-    // triangle, not extrapolated ones.
-    let positions_beside = [position(0.2, -1.0), position(2.0, -1.0), position(1.2, 1.0)]
+    // Here f32 resolves 1/16384^2 of the window, a twentieth of this triangle.
+    assert!((result.uv[0] - 0.5).abs() < 0.06 && (result.uv[1] - 0.5).abs() < 0.06, "{result:?}");
+    assert!((result.duv_dx[0] / 50.0 - 1.0).abs() < 0.1, "{result:?}");
+    // The sample lies outside of the triangle by a rounding error. It gets the texture coordinates of the nearest point
+    // of the triangle, not extrapolated ones.
+    let shifted_positions = [position(0.2, -1.0), position(2.0, -1.0), position(1.2, 1.0)]
         .as_flattened()
         .iter()
         .map(|n| *n as f32)
         .collect::<Vec<_>>();
-    let got = footprint(
+    let result = footprint(
         &viewport,
-        &corners(&viewport, &positions_beside, [0, 1, 2]),
+        &corners(&viewport, &shifted_positions, [0, 1, 2]),
         &[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]],
         pixel,
     );
-    assert!((0.0..=1.0).contains(&got.uv[0]) && (0.0..=1.0).contains(&got.uv[1]), "{got:?}");
+    assert!((0.0..=1.0).contains(&result.uv[0]) && (0.0..=1.0).contains(&result.uv[1]), "{result:?}");
 }
 
 /// Triangles without area, overflowing corners and texture coordinates that are not finite give a zero footprint.
@@ -117,13 +117,16 @@ fn degenerate_footprints_are_zero() {
     let viewport = clip_space_viewport(8, 8);
     let uvs = [[0.5, 0.25], [1.0, 0.0], [0.0, 1.0]];
     let footprint_of = |corners: [[f32; 4]; 3], uvs: [[f32; 2]; 3]| footprint(&viewport, &corners, &uvs, [3, 3]);
-    let valid = [[-1.0, -1.0, 0.0, 1.0], [1.0, -1.0, 0.0, 1.0], [0.0, 1.0, 0.0, 1.0]];
-    assert!(footprint_of(valid, uvs) != Footprint::default());
-    assert_eq!(footprint_of([valid[0]; 3], uvs), Footprint::default());
-    assert_eq!(footprint_of(valid.map(|corner| corner.map(|number| number * 1e30)), uvs), Footprint::default());
-    assert_eq!(footprint_of(valid.map(|corner| corner.map(|number| number * 1e-30)), uvs), Footprint::default());
-    assert_eq!(footprint_of(valid, [[f32::NAN; 2], uvs[1], uvs[2]]), Footprint::default());
-    assert_eq!(footprint_of(valid, [[3e38, 0.0], [-3e38, 0.0], uvs[2]]), Footprint::default());
+    let valid_corners = [[-1.0, -1.0, 0.0, 1.0], [1.0, -1.0, 0.0, 1.0], [0.0, 1.0, 0.0, 1.0]];
+    assert!(footprint_of(valid_corners, uvs) != Footprint::default());
+    assert_eq!(footprint_of([valid_corners[0]; 3], uvs), Footprint::default());
+    assert_eq!(footprint_of(valid_corners.map(|corner| corner.map(|number| number * 1e30)), uvs), Footprint::default());
+    assert_eq!(
+        footprint_of(valid_corners.map(|corner| corner.map(|number| number * 1e-30)), uvs),
+        Footprint::default()
+    );
+    assert_eq!(footprint_of(valid_corners, [[f32::NAN; 2], uvs[1], uvs[2]]), Footprint::default());
+    assert_eq!(footprint_of(valid_corners, [[3e38, 0.0], [-3e38, 0.0], uvs[2]]), Footprint::default());
 }
 
 fn cut_outs_of_image(image: AlphaImage) -> CutOuts {
@@ -147,7 +150,8 @@ fn alpha_images_repeat_and_filter_trilinearly() {
         let footprint = Footprint { uv: [u, 0.3], duv_dx: [derivative, 0.0], duv_dy: [0.0; 2] };
         alpha(&cut_outs, 4, &footprint)
     };
-    let assert_close = |got: f32, want: f32| assert!((got - want).abs() < 1e-6, "expected {want}, got {got}");
+    let assert_close =
+        |actual: f32, expected: f32| assert!((actual - expected).abs() < 1e-6, "expected {expected}, got {actual}");
     assert_close(alpha_at(0.125, 0.0), 0.0);
     assert_close(alpha_at(0.375, 0.25), 0.2);
     assert_close(alpha_at(0.5, 0.1), 0.3);
@@ -170,20 +174,23 @@ fn sheet_reproduces_its_image_at_levels_0_and_1() {
     let image = alpha_image(64, 64, |_, _, _| if random.next_number() < 0.0 { 0 } else { 255 });
     for level in [0, 1] {
         let keys = sheet_soup(64 >> level, image.clone()).rasterize();
-        let got: Vec<bool> = keys.ids().iter().map(Option::is_some).collect();
-        let want: Vec<bool> = image.levels[level].iter().map(|texel| *texel == 255).collect();
-        assert!(got == want, "level {level}");
+        let is_covered: Vec<bool> = keys.ids().iter().map(Option::is_some).collect();
+        let is_opaque: Vec<bool> = image.levels[level].iter().map(|texel| *texel == 255).collect();
+        assert!(is_covered == is_opaque, "level {level}");
     }
     let reversed = image.levels[0].iter().rev().map(|texel| *texel == 255).collect::<Vec<_>>();
-    assert!(sheet_soup(64, image).rasterize().ids().iter().map(Option::is_some).ne(reversed), "negative control");
+    assert!(
+        sheet_soup(64, image).rasterize().ids().iter().map(Option::is_some).ne(reversed),
+        "negative control: the reversed image differs"
+    );
 }
 
 #[test]
 fn uniform_images_keep_all_or_nothing_of_a_triangle() {
-    let mut differing = 0;
+    let mut different_samples = 0;
     for cut_out_soup in uniform_cut_out_soups() {
         let (soup, cut_outs) = (&cut_out_soup.soup, &cut_out_soup.cut_outs);
-        // Whether each surface of the table keeps any sample.
+        // Per material of the soup: whether the alpha test keeps all samples. It discards all samples of the others.
         let is_material_opaque = [false, true, false, true, true, false, false];
         let mut expected = VisibilityBuffer::new(soup.viewport);
         for group in &soup.groups {
@@ -200,14 +207,10 @@ fn uniform_images_keep_all_or_nothing_of_a_triangle() {
         }
         let rasterized = cut_out_soup.rasterize();
         assert!(rasterized.keys == expected.keys, "{}", soup.name);
-        differing += rasterized
-            .keys
-            .iter()
-            .zip(&soup.rasterize().keys)
-            .filter(|(with_cut_outs, without)| with_cut_outs != without)
-            .count();
+        different_samples +=
+            rasterized.keys.iter().zip(&soup.rasterize().keys).filter(|(key, plain_key)| key != plain_key).count();
     }
-    assert!(differing > 10_000, "negative control: {differing} samples differ from those without cut-outs");
+    assert!(different_samples > 10_000, "negative control: {different_samples} samples differ without cut-outs");
 }
 
 /// The wall is visible through the cut-outs of the floor. Few samples are ambiguous, and splitting the floor into smaller
@@ -221,12 +224,19 @@ fn wall_shows_through_holes_of_the_floor() {
     let opaque_samples = cut_out_soup.soup.rasterize().ids().iter().flatten().filter(|id| **id >= 2).count();
     assert!(
         floor_samples > opaque_samples / 5 && floor_samples < opaque_samples * 4 / 5 && wall_samples > 1000,
-        "{floor_samples} of {opaque_samples}, {wall_samples}"
+        "{floor_samples} of {opaque_samples} floor samples remain, {wall_samples} samples of the wall are visible"
     );
-    let ambiguous = cut_out_soup.ambiguous_samples(1.0 / 16.0).iter().filter(|is_ambiguous| **is_ambiguous).count();
-    assert!((100..opaque_samples / 4).contains(&ambiguous), "{ambiguous} of {opaque_samples}");
+    let ambiguous_samples =
+        cut_out_soup.ambiguous_samples(1.0 / 16.0).iter().filter(|is_ambiguous| **is_ambiguous).count();
+    assert!(
+        (100..opaque_samples / 4).contains(&ambiguous_samples),
+        "{ambiguous_samples} of {opaque_samples} samples are ambiguous"
+    );
     let split_ids = floor_soup(40).rasterize().ids();
     let is_same = |(a, b): (&Option<u32>, &Option<u32>)| a.is_some_and(|id| id >= 2) == b.is_some_and(|id| id >= 2);
-    let different = ids.iter().zip(&split_ids).filter(|pair| !is_same(*pair)).count();
-    assert!(different < opaque_samples / 50, "split floor: {different} of {opaque_samples} samples differ");
+    let different_samples = ids.iter().zip(&split_ids).filter(|pair| !is_same(*pair)).count();
+    assert!(
+        different_samples < opaque_samples / 50,
+        "split floor: {different_samples} of {opaque_samples} samples differ"
+    );
 }

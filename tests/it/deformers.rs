@@ -10,7 +10,7 @@ use modalcast_model::scene::{Scene, SceneParts, SceneState};
 
 use crate::tolerance::{Tolerance, find_difference, max_distance};
 
-/// Deterministic pseudo-random numbers in -1 to 1.
+/// Generator of deterministic pseudo-random numbers in [-1, 1).
 pub(crate) struct TestRng(pub(crate) u64);
 
 impl TestRng {
@@ -22,14 +22,15 @@ impl TestRng {
 
 /// A strip of triangles between random vertices, with random modes.
 pub(crate) fn random_strip(vertices: usize, rank: usize, random: &mut TestRng) -> Shape {
-    let rest: Vec<[f32; 3]> = (0..vertices).map(|_| [random.next(), random.next(), random.next()]).collect();
-    let normals = rest.iter().map(|_| [random.next(), random.next(), random.next() + 2.0]).collect();
-    let uvs = rest.iter().map(|_| [random.next(), random.next()]).collect();
+    let rest_positions: Vec<[f32; 3]> = (0..vertices).map(|_| [random.next(), random.next(), random.next()]).collect();
+    let normals = rest_positions.iter().map(|_| [random.next(), random.next(), random.next() + 2.0]).collect();
+    let uvs = rest_positions.iter().map(|_| [random.next(), random.next()]).collect();
     let corners = Corners { vertices: (0..vertices as u32).collect(), normals, uvs };
-    let last = vertices as u32 - 1;
-    let triangles =
-        (0..vertices as u32).map(|vertex| [vertex, (vertex + 1).min(last), (vertex + 2).min(last)]).collect();
-    let mesh = Mesh::new(rest, corners, triangles).expect("expected a valid mesh");
+    let last_vertex = vertices as u32 - 1;
+    let triangles = (0..vertices as u32)
+        .map(|vertex| [vertex, (vertex + 1).min(last_vertex), (vertex + 2).min(last_vertex)])
+        .collect();
+    let mesh = Mesh::new(rest_positions, corners, triangles).expect("expected a valid mesh");
     let entries = (0..3 * vertices * rank).map(|_| random.next()).collect();
     let modes = if rank == 0 {
         Modes::rigid()
@@ -72,21 +73,21 @@ fn cpu_equals_reference_for_all_sizes_ranks_and_transforms() {
     let state = random_state(&scene);
     let mut cpu = CpuDeformer::new(&scene);
     let summary = cpu.deform(&state).expect("expected the step to succeed");
-    let want = reference::deform(&scene, &state);
+    let reference_positions = reference::deform(&scene, &state);
     let surface = cpu.surface().expect("expected a surface");
     let diagonal = summary.bounds.diagonal();
-    let error = max_distance(&surface.positions, &want) / diagonal;
+    let error = max_distance(&surface.positions, &reference_positions) / diagonal;
     assert!(error <= 1e-6, "expected a position error of at most 1e-6 of the diagonal, got {error}");
     let tolerance = Tolerance { abs: 2e-5, rel: 0.0 };
     let normals = reference::rigid_normals(&scene, &state).into_flattened();
     assert_eq!(find_difference(&surface.normals, &normals, tolerance), None);
     let tangents = reference::rigid_tangents(&scene, &state).into_flattened();
     assert_eq!(find_difference(&surface.tangents, &tangents, tolerance), None);
-    for point in &want {
+    for point in &reference_positions {
         let margin = 1e-6 * diagonal;
-        let intervals = point.iter().zip(summary.bounds.min.iter().zip(&summary.bounds.max));
-        intervals
-            .for_each(|(coordinate, (min, max))| assert!(*coordinate >= min - margin && *coordinate <= max + margin));
+        for (coordinate, (min, max)) in point.iter().zip(summary.bounds.min.iter().zip(&summary.bounds.max)) {
+            assert!((min - margin..=max + margin).contains(coordinate), "{coordinate} is outside {min} to {max}");
+        }
     }
 }
 
@@ -95,25 +96,25 @@ fn cpu_equals_reference_for_all_sizes_ranks_and_transforms() {
 fn wrong_q_transform_or_missing_mode_is_detected() {
     let scene = strips_scene(&SIZES);
     let state = random_state(&scene);
-    let want = reference::deform(&scene, &state);
+    let reference_positions = reference::deform(&scene, &state);
     let mut cpu = CpuDeformer::new(&scene);
     let mut error_after = |modify: &dyn Fn(&mut SceneState)| {
         let mut wrong_state = state.clone();
         modify(&mut wrong_state);
         cpu.deform(&wrong_state).expect("expected the step to succeed");
-        max_distance(&cpu.surface().expect("expected a surface").positions, &want)
+        max_distance(&cpu.surface().expect("expected a surface").positions, &reference_positions)
     };
     assert!(error_after(&|state| state.q[30] += 0.01) > 1e-3);
     assert!(error_after(&|state| *state.q.last_mut().expect("expected coordinates") = 0.0) > 1e-3);
     assert!(error_after(&|state| state.transforms.swap(4, 5)) > 1e-3);
 }
 
-/// q = 0 gives the rest positions, q = 1 adds one column of U, and other values scale that column.
+/// q = 0 gives the rest positions. A single nonzero coordinate adds its column of U times the coordinate.
 #[test]
 fn reference_is_linear_in_q() {
     let scene = strips_scene(&[(50, 6)]);
     let modes = &scene.shape_of(0).modes;
-    let rest = scene.shape_of(0).mesh.rest_positions();
+    let mesh_positions = scene.shape_of(0).mesh.rest_positions();
     let mut state = SceneState::rest(&scene);
     let rest_positions = reference::deform(&scene, &state);
     state.q[4] = 1.0;
@@ -122,7 +123,7 @@ fn reference_is_linear_in_q() {
     let scaled_positions = reference::deform(&scene, &state);
     for vertex in 0..50 {
         for axis in 0..3 {
-            assert_eq!(rest_positions[vertex][axis], f64::from(rest[vertex][axis]));
+            assert_eq!(rest_positions[vertex][axis], f64::from(mesh_positions[vertex][axis]));
             let column = f64::from(modes.entry(vertex, axis, 4));
             assert!((unit_positions[vertex][axis] - rest_positions[vertex][axis] - column).abs() < 1e-12);
             assert!((scaled_positions[vertex][axis] - rest_positions[vertex][axis] + 2.5 * column).abs() < 1e-12);
@@ -134,15 +135,15 @@ fn reference_is_linear_in_q() {
 #[test]
 fn normals_stay_orthogonal_to_a_sheared_plane() {
     let mut parts = SceneParts::named("plane");
-    let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
-    let mesh =
-        Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("expected a valid mesh");
+    let rest_positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
+    let mesh = Mesh::from_indexed(rest_positions, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]])
+        .expect("expected a valid mesh");
     parts.shapes = vec![Shape::new(mesh, Modes::rigid()).expect("expected a valid shape")];
     parts.materials = vec![Material::default()];
     parts.domains = vec![Domain::new("plane", 0)];
     let scene = Scene::new(parts).expect("expected a valid scene");
     let mut state = SceneState::rest(&scene);
-    // z += x tilts the plane about y. Transforming the normal by A itself would leave it upright.
+    // z += x tilts the plane about y. The linear part A maps the normal (0, 0, 1) to itself, which is wrong.
     state.transforms[0].0[8] = 1.0;
     let mut cpu = CpuDeformer::new(&scene);
     cpu.deform(&state).expect("expected the step to succeed");

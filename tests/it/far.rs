@@ -25,40 +25,40 @@ fn quaternion(roll: f64, pitch: f64, yaw: f64) -> [f32; 4] {
     [rotation.i, rotation.j, rotation.k, rotation.w].map(|number| number as f32)
 }
 
-/// World positions in meters, computed in f64: unit (R (x0 + U q) + t) with t as sent.
+/// World positions in meters, computed in f64: unit (R (x0 + U q) + t).
 fn expected_positions(scene: &Scene, domain: usize, q: &[f32], (rotation, translation): Pose) -> Vec<Vector3<f64>> {
     let [x, y, z, w] = rotation.map(f64::from);
     let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
     let shape = scene.shape_of(domain);
-    let world_position = |(vertex, rest): (usize, &[f32; 3])| {
-        let deformed = Vector3::from_fn(|axis, _| {
+    let world_position = |(vertex, rest_position): (usize, &[f32; 3])| {
+        let deformed_position = Vector3::from_fn(|axis, _| {
             let modes = q.iter().enumerate();
             let displacement: f64 =
                 modes.map(|(mode, q)| f64::from(shape.modes.entry(vertex, axis, mode)) * f64::from(*q)).sum();
-            f64::from(rest[axis]) + displacement
+            f64::from(rest_position[axis]) + displacement
         });
-        scene.unit * (rotation * deformed + Vector3::from(translation))
+        scene.unit * (rotation * deformed_position + Vector3::from(translation))
     };
     shape.mesh.rest_positions().iter().enumerate().map(world_position).collect()
 }
 
 /// World positions in meters, decoded from the reply.
-fn decode_positions(scene: &Scene, got: &ReceivedVertices) -> Vec<Vector3<f64>> {
-    let mut points = got.positions.chunks_exact(3);
-    let mut world = Vec::new();
-    for (index, vertices) in got.head.vertices.iter().enumerate() {
-        let origin = if got.origins.is_empty() { &got.head.origin } else { &got.origins[3 * index..][..3] };
+fn decode_positions(scene: &Scene, reply: &ReceivedVertices) -> Vec<Vector3<f64>> {
+    let mut positions = reply.positions.chunks_exact(3);
+    let mut world_positions = Vec::new();
+    for (index, vertices) in reply.head.vertices.iter().enumerate() {
+        let origin = if reply.origins.is_empty() { &reply.head.origin } else { &reply.origins[3 * index..][..3] };
         let origin = Vector3::from_column_slice(origin);
-        for point in points.by_ref().take(*vertices as usize) {
-            world.push(origin + scene.unit * Vector3::from_column_slice(point).cast::<f64>());
+        for position in positions.by_ref().take(*vertices as usize) {
+            world_positions.push(origin + scene.unit * Vector3::from_column_slice(position).cast::<f64>());
         }
     }
-    world
+    world_positions
 }
 
-fn max_distance(got: &[Vector3<f64>], want: &[Vector3<f64>]) -> f64 {
-    assert_eq!(got.len(), want.len());
-    got.iter().zip(want).map(|(got, want)| (got - want).norm()).fold(0.0, f64::max)
+fn max_distance(positions: &[Vector3<f64>], expected_positions: &[Vector3<f64>]) -> f64 {
+    assert_eq!(positions.len(), expected_positions.len());
+    positions.iter().zip(expected_positions).map(|(a, b)| (a - b).norm()).fold(0.0, f64::max)
 }
 
 async fn start_cpu_server() -> Server {
@@ -69,35 +69,39 @@ async fn start_cpu_server() -> Server {
 async fn transform_formats_agree_at_any_byte_alignment() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
     let pose = (quaternion(0.3, -0.8, 2.0), [1.5, -2.25, 1e3]);
     let matrix = state_after_steps(&strips(), &[rigid_step(0, RigidF32, &[(1, pose.0, pose.1)])]).transforms[1];
-    let affine = |format: v1::TransformFormat| v1::Step {
+    let affine_step = |format: v1::TransformFormat| v1::Step {
         transform_domains: vec![1],
         transforms: bytemuck::cast_slice::<f32, u8>(&matrix.0).to_vec().into(),
         transform_format: format.into(),
         ..step(0, &[], &[])
     };
     let steps = [
-        affine(Unspecified),
-        affine(AffineF32),
+        affine_step(Unspecified),
+        affine_step(AffineF32),
         rigid_step(0, RigidF32, &[(1, pose.0, pose.1)]),
         rigid_step(0, RigidF64, &[(1, pose.0, pose.1)]),
     ];
-    let want = reference_vertices(&strips(), &steps[..1]);
+    let expected_vertices = reference_vertices(&strips(), &steps[..1]);
     for (number, mut step) in steps.into_iter().enumerate() {
         step.number = number as u64;
         // An odd number of bytes before the transforms changes their alignment within the message.
         step.q_domains = vec![0; usize::from(number % 2 == 1)];
         step.q = vec![0; 8 * step.q_domains.len()].into();
-        driver.step_acknowledged(step).await;
-        let got = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
-        assert_eq!((&got.positions, &got.normals), (&want.0, &want.1), "step {number}");
-        assert_eq!((got.head.origin.as_slice(), got.origins.len()), ([0.0; 3].as_slice(), 0));
+        writer.send_step_and_wait(step).await;
+        let reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
+        assert_eq!(
+            (&reply.positions, &reply.normals),
+            (&expected_vertices.positions, &expected_vertices.normals),
+            "step {number}"
+        );
+        assert_eq!((reply.head.origin.as_slice(), reply.origins.len()), ([0.0; 3].as_slice(), 0));
     }
     // Negative control: another rotation gives other vertices.
-    let other = rigid_step(9, RigidF32, &[(1, quaternion(0.3, -0.8, 2.1), pose.1)]);
-    assert_ne!(reference_vertices(&strips(), &[other]).0, want.0);
+    let other_step = rigid_step(9, RigidF32, &[(1, quaternion(0.3, -0.8, 2.1), pose.1)]);
+    assert_ne!(reference_vertices(&strips(), &[other_step]).positions, expected_vertices.positions);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -105,39 +109,45 @@ async fn far_scene_and_far_domain_keep_millimeter_precision() {
     let server = start_cpu_server().await;
     let scene = far_strips();
     server.open("far").await;
-    let mut driver = server.drive("far", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive("far", v1::Policy::Lossless, 0).await;
     let q = [0.25, -0.5, 0.125, 0.75_f32];
-    driver.step_acknowledged(step(0, &[], &q)).await;
+    writer.send_step_and_wait(step(0, &[], &q)).await;
     // In half meters from the world origin. The first domain is near the scene origin, the second is 10,000 km east of
     // it.
     let origin = scene.origin.map(|meters| meters / scene.unit);
     let near_pose = (quaternion(0.1, 0.2, 0.3), [origin[0] + 3.001, origin[1] - 2.003, origin[2] + 0.007]);
     let far_pose = (quaternion(-1.0, 0.5, 0.9), [origin[0] + 2e7 + 1.234, origin[1] + 0.001, origin[2] - 700.021]);
-    driver
-        .step_acknowledged(rigid_step(1, RigidF64, &[(0, near_pose.0, near_pose.1), (1, far_pose.0, far_pose.1)]))
+    writer
+        .send_step_and_wait(rigid_step(1, RigidF64, &[(0, near_pose.0, near_pose.1), (1, far_pose.0, far_pose.1)]))
         .await;
-    let got = get_vertices(&server, vertex_request("far", &[])).await.expect("expected vertices");
-    assert_eq!((got.head.origin.as_slice(), got.head.origin_bytes), (scene.origin.as_slice(), 48));
-    assert_eq!(got.origins[..3], scene.origin);
-    let want =
+    let reply = get_vertices(&server, vertex_request("far", &[])).await.expect("expected vertices");
+    assert_eq!((reply.head.origin.as_slice(), reply.head.origin_bytes), (scene.origin.as_slice(), 48));
+    assert_eq!(reply.origins[..3], scene.origin);
+    let expected =
         [expected_positions(&scene, 0, &q[..2], near_pose), expected_positions(&scene, 1, &q[2..], far_pose)].concat();
-    let error = max_distance(&decode_positions(&scene, &got), &want);
+    let error = max_distance(&decode_positions(&scene, &reply), &expected);
     assert!(error <= 1e-3, "expected at most 1 mm, got {error} m");
     // Negative control: a far translation rounded to f32 relative to the scene origin has an error of more than 1 cm.
     let f32_error = far_pose.1[0] - origin[0] - f64::from((far_pose.1[0] - origin[0]) as f32);
-    assert!(scene.unit * f32_error.abs() > 1e-2, "{f32_error}");
-    // A selection of domains in another order and without normals, then one domain only.
+    assert!(
+        scene.unit * f32_error.abs() > 1e-2,
+        "expected an f32 rounding error of more than 1 cm, got {f32_error} units"
+    );
+    // Also for a selection in another order without normals, and for a selection of one domain.
     let selection = Some(v1::VertexSelection { domains: vec![1, 0], positions_only: true, ..Default::default() });
-    let swapped = get_vertices(&server, v1::GetVerticesRequest { selection, ..vertex_request("far", &[]) })
+    let swapped_reply = get_vertices(&server, v1::GetVerticesRequest { selection, ..vertex_request("far", &[]) })
         .await
         .expect("expected vertices");
-    let want =
+    let expected =
         [expected_positions(&scene, 1, &q[2..], far_pose), expected_positions(&scene, 0, &q[..2], near_pose)].concat();
-    assert!(swapped.normals.is_empty() && max_distance(&decode_positions(&scene, &swapped), &want) <= 1e-3);
-    let near_only = get_vertices(&server, vertex_request("far", &[0])).await.expect("expected vertices");
-    assert_eq!(near_only.head.origin_bytes, 0);
     assert!(
-        max_distance(&decode_positions(&scene, &near_only), &expected_positions(&scene, 0, &q[..2], near_pose)) <= 1e-3
+        swapped_reply.normals.is_empty() && max_distance(&decode_positions(&scene, &swapped_reply), &expected) <= 1e-3
+    );
+    let near_reply = get_vertices(&server, vertex_request("far", &[0])).await.expect("expected vertices");
+    assert_eq!(near_reply.head.origin_bytes, 0);
+    assert!(
+        max_distance(&decode_positions(&scene, &near_reply), &expected_positions(&scene, 0, &q[..2], near_pose))
+            <= 1e-3
     );
 }
 
@@ -150,35 +160,37 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
     let server = Server::start(settings()).await;
     let scene = strips();
     server.open("strips").await;
-    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
     let poses = [
         (quaternion(0.0, 0.4, 0.0), [1e7 + 0.004, 5.006, -1e7 - 0.002]),
         (quaternion(1.0, 0.0, 0.0), [1e7 + 9.5, 0.0, -1e7]),
     ];
-    let both_domains =
+    let pose_step =
         |number| rigid_step(number, RigidF64, &[0, 1].map(|index| (index as u32, poses[index].0, poses[index].1)));
-    driver.step_acknowledged(both_domains(4)).await;
-    let got = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
+    writer.send_step_and_wait(pose_step(4)).await;
+    let reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
     assert_eq!(
-        (got.head.origin.as_slice(), got.head.origin_bytes),
+        (reply.head.origin.as_slice(), reply.head.origin_bytes),
         ([9766.0 * 1024.0, 0.0, -9766.0 * 1024.0].as_slice(), 0)
     );
-    let want = [expected_positions(&scene, 0, &[], poses[0]), expected_positions(&scene, 1, &[], poses[1])].concat();
-    let error = max_distance(&decode_positions(&scene, &got), &want);
+    let expected =
+        [expected_positions(&scene, 0, &[], poses[0]), expected_positions(&scene, 1, &[], poses[1])].concat();
+    let error = max_distance(&decode_positions(&scene, &reply), &expected);
     assert!(error <= 1e-3, "expected at most 1 mm, got {error} m");
-    driver.finish().await;
+    writer.finish().await;
     server.stop().await.expect("expected the server to stop without an error");
     let server = Server::start(settings()).await;
-    let restored = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
+    let restored_reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
     assert_eq!(
-        (restored.step().number, &restored.positions, &restored.head.origin),
-        (4, &got.positions, &got.head.origin)
+        (restored_reply.step().number, &restored_reply.positions, &restored_reply.head.origin),
+        (4, &reply.positions, &reply.head.origin)
     );
     // The next f64 transform applies to the state restored from the checkpoint.
-    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
     let new_pose = (poses[1].0, [1e7 + 11.5, 0.001, -1e7]);
-    driver.step_acknowledged(rigid_step(0, RigidF64, &[(1, new_pose.0, new_pose.1)])).await;
-    let got = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
-    let want = [expected_positions(&scene, 0, &[], poses[0]), expected_positions(&scene, 1, &[], new_pose)].concat();
-    assert!(got.origins.is_empty() && max_distance(&decode_positions(&scene, &got), &want) <= 1e-3);
+    writer.send_step_and_wait(rigid_step(0, RigidF64, &[(1, new_pose.0, new_pose.1)])).await;
+    let reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
+    let expected =
+        [expected_positions(&scene, 0, &[], poses[0]), expected_positions(&scene, 1, &[], new_pose)].concat();
+    assert!(reply.origins.is_empty() && max_distance(&decode_positions(&scene, &reply), &expected) <= 1e-3);
 }

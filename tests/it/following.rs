@@ -8,9 +8,10 @@ const BRANCH: u32 = 1;
 const LEAF: u32 = 2;
 const LEAFLET: u32 = 3;
 
-/// A step that moves domains; each row is a 3 x 4 matrix of 12 numbers.
-fn transform_step(number: u64, domains: &[u32], rows: &[[f32; 12]]) -> v1::Step {
-    let transforms = rows.as_flattened().iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
+/// A step that sets the transforms of domains; each transform is a row-major 3 x 4 matrix.
+fn transform_step(number: u64, domains: &[u32], transforms: &[[f32; 12]]) -> v1::Step {
+    let transforms =
+        transforms.as_flattened().iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
     v1::Step { transform_domains: domains.to_vec(), transforms, ..step(number, &[], &[]) }
 }
 
@@ -26,56 +27,63 @@ const TRANSLATION: [f32; 12] = [1.0, 0.0, 0.0, 7.0, 0.0, 1.0, 0.0, 8.0, 0.0, 0.0
 async fn moved_branch_moves_only_its_leaves() {
     let server = Server::start_default().await;
     server.open("twig").await;
-    let mut driver = server.drive("twig", v1::Policy::Lossless, 0).await;
-    let at_rest = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
+    let mut writer = server.drive("twig", v1::Policy::Lossless, 0).await;
+    let rest_positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
     let step = transform_step(0, &[BRANCH], &[ROTATION]);
-    driver.step_acknowledged(step.clone()).await;
-    let got = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
-    assert_eq!(got, reference_vertices(&twig(), &[step]).0);
-    assert_eq!(got[..12], at_rest[..12], "expected the other strip not to move");
+    writer.send_step_and_wait(step.clone()).await;
+    let positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
+    assert_eq!(positions, reference_vertices(&twig(), &[step]).positions);
+    assert_eq!(positions[..12], rest_positions[..12], "expected the other strip not to move");
     // The first vertex of the leaf is the origin of the leaf's frame, which is at (0.5, 1, -0.25) in the branch's
     // frame. The leaflet applies the same frame again within the leaf's frame.
     let rotate = |[x, y, z]: [f32; 3]| [2.0 - y, x, z - 3.0];
-    let first_vertex = |domain: usize| [got[12 * domain], got[12 * domain + 1], got[12 * domain + 2]];
+    let first_vertex = |domain: usize| [positions[12 * domain], positions[12 * domain + 1], positions[12 * domain + 2]];
     assert_eq!(first_vertex(LEAF as usize), rotate([0.5, 1.0, -0.25]));
     assert_eq!(first_vertex(LEAFLET as usize), rotate([-0.5, 1.5, -0.5]));
-    assert!((1..4).all(|domain| got[12 * domain..][..12] != at_rest[12 * domain..][..12]), "negative control");
-    driver.finish().await;
+    assert!(
+        (1..4).all(|domain| positions[12 * domain..][..12] != rest_positions[12 * domain..][..12]),
+        "negative control: the branch and its followers move"
+    );
+    writer.finish().await;
 }
 
-/// A step without a list of domains has one transform per transform root. A step that contains the transform of a
-/// follower is rejected as a whole.
+/// A step that contains the transform of a follower is rejected as a whole. Without a list of domains, a step has one
+/// transform per transform root, which excludes followers.
 #[tokio::test(flavor = "multi_thread")]
 async fn step_with_transform_of_a_follower_is_rejected() {
     let server = Server::start_default().await;
     server.open("twig").await;
-    let mut driver = server.drive("twig", v1::Policy::Lossless, 0).await;
-    // Transforms without a list of domains are those of both strips; the followers have none.
+    let mut writer = server.drive("twig", v1::Policy::Lossless, 0).await;
+    // The transform roots are the two strips.
     let root_step = transform_step(0, &[], &[TRANSLATION, ROTATION]);
-    driver.step_acknowledged(root_step.clone()).await;
-    let got = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
-    assert_eq!(got, reference_vertices(&twig(), &[root_step]).0);
+    writer.send_step_and_wait(root_step.clone()).await;
+    let positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
+    assert_eq!(positions, reference_vertices(&twig(), &[root_step]).positions);
     let invalid_step = v1::Step {
         q_domains: vec![0],
         q: vec![1; 8].into(),
         ..transform_step(1, &[BRANCH, LEAFLET], &[TRANSLATION, ROTATION])
     };
-    driver.step(invalid_step).await;
-    let rejection = driver.rejection().await;
+    writer.send_step(invalid_step).await;
+    let rejection = writer.receive_rejection().await;
     assert_eq!(
         (rejection.field.as_str(), rejection.expected.as_str(), rejection.given.as_str()),
         ("step.transform_domains[1]", "a domain with a transform of its own", "3 ('leaflet'), which follows 'right'")
     );
     assert_eq!(
         get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions,
-        got,
+        positions,
         "expected no change by a rejected step"
     );
-    driver.finish().await;
+    writer.finish().await;
     // A follower has its own coordinates: the step deforms only the leaf.
-    let mut driver = server.drive("twig", v1::Policy::Lossless, 0).await;
-    driver.step_acknowledged(step(2, &[LEAF], &[0.5, -0.25])).await;
-    let deformed = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
-    assert!(deformed[..24] == got[..24] && deformed[24..36] != got[24..36] && deformed[36..] == got[36..]);
-    driver.finish().await;
+    let mut writer = server.drive("twig", v1::Policy::Lossless, 0).await;
+    writer.send_step_and_wait(step(2, &[LEAF], &[0.5, -0.25])).await;
+    let deformed_positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
+    assert!(
+        deformed_positions[..24] == positions[..24]
+            && deformed_positions[24..36] != positions[24..36]
+            && deformed_positions[36..] == positions[36..]
+    );
+    writer.finish().await;
 }

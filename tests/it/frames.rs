@@ -5,11 +5,11 @@ use modalcast::config::{Config, RendererChoice};
 use modalcast_proto::v1;
 use prost::Message as _;
 use tonic::{Code, Status, Streaming};
-use v1::render_frame_request::Step as Which;
+use v1::render_frame_request::Step as RequestedStep;
 
 use crate::service_harness::{Server, rejection_details, step, with_timeout};
 
-async fn server() -> Server {
+async fn start_server() -> Server {
     let server = Server::start_with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
     server.open("strips").await;
     server
@@ -19,7 +19,7 @@ fn picture_of_size(width: u32, height: u32, format: v1::Format) -> Option<v1::Pi
     Some(v1::Picture { width, height, format: format.into(), ..v1::Picture::default() })
 }
 
-fn request() -> v1::RenderFrameRequest {
+fn rgba_request() -> v1::RenderFrameRequest {
     let picture = picture_of_size(64, 48, v1::Format::Rgba);
     v1::RenderFrameRequest { scene: "strips".into(), picture, ..v1::RenderFrameRequest::default() }
 }
@@ -45,14 +45,14 @@ async fn render(server: &Server, request: v1::RenderFrameRequest) -> Result<Fram
     Ok(Frame { head, bytes })
 }
 
-async fn next(stream: &mut Streaming<v1::StreamFramesResponse>) -> Option<v1::FrameHead> {
+async fn next_head(stream: &mut Streaming<v1::StreamFramesResponse>) -> Option<v1::FrameHead> {
     let mut head: Option<v1::FrameHead> = None;
-    let mut got = 0;
+    let mut received_bytes = 0;
     while let Some(response) = with_timeout(stream.message()).await.expect("expected another message") {
         let chunk = response.chunk.expect("expected a chunk");
-        got += chunk.data.len() as u64;
+        received_bytes += chunk.data.len() as u64;
         head = head.or(chunk.head);
-        if head.as_ref().is_some_and(|head| head.total == got) {
+        if head.as_ref().is_some_and(|head| head.total == received_bytes) {
             return head;
         }
     }
@@ -61,24 +61,25 @@ async fn next(stream: &mut Streaming<v1::StreamFramesResponse>) -> Option<v1::Fr
 
 #[tokio::test(flavor = "multi_thread")]
 async fn frame_names_its_step_and_png_equals_rgba() {
-    let server = server().await;
-    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
-    let rest = render(&server, request()).await.expect("expected a frame at rest");
-    assert_eq!(rest.head.step.map(|step| step.run), Some(0));
-    driver.step_acknowledged(step(5, &[], &[0.9, 0.3, -0.9, 0.2])).await;
-    let raw = render(&server, v1::RenderFrameRequest { step: Some(Which::ExactStep(5)), ..request() }).await;
-    let raw = raw.expect("expected a frame");
-    assert_eq!(raw.head.step, Some(v1::StepId { run: 1, number: 5, time: 2.5 }));
-    assert_eq!((raw.head.width, raw.head.height, raw.bytes.len()), (64, 48, 64 * 48 * 4));
-    assert_ne!(raw.bytes, rest.bytes, "expected another image than at rest");
-    let png = v1::RenderFrameRequest { picture: picture_of_size(64, 48, v1::Format::Png), ..request() };
-    let png = render(&server, png).await.expect("expected a frame");
-    let decoded = image::load_from_memory(&png.bytes).expect("expected a PNG file").into_rgba8();
-    assert_eq!(decoded.into_raw(), raw.bytes);
-    let stages: Vec<&str> = png.head.stages.iter().map(|stage| stage.stage.as_str()).collect();
+    let server = start_server().await;
+    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let rest_frame = render(&server, rgba_request()).await.expect("expected a frame at rest");
+    assert_eq!(rest_frame.head.step.map(|step| step.run), Some(0));
+    writer.send_step_and_wait(step(5, &[], &[0.9, 0.3, -0.9, 0.2])).await;
+    let rgba_frame =
+        render(&server, v1::RenderFrameRequest { step: Some(RequestedStep::ExactStep(5)), ..rgba_request() }).await;
+    let rgba_frame = rgba_frame.expect("expected a frame");
+    assert_eq!(rgba_frame.head.step, Some(v1::StepId { run: 1, number: 5, time: 2.5 }));
+    assert_eq!((rgba_frame.head.width, rgba_frame.head.height, rgba_frame.bytes.len()), (64, 48, 64 * 48 * 4));
+    assert_ne!(rgba_frame.bytes, rest_frame.bytes, "expected another image than at rest");
+    let png_request = v1::RenderFrameRequest { picture: picture_of_size(64, 48, v1::Format::Png), ..rgba_request() };
+    let png_frame = render(&server, png_request).await.expect("expected a frame");
+    let decoded_png = image::load_from_memory(&png_frame.bytes).expect("expected a PNG file").into_rgba8();
+    assert_eq!(decoded_png.into_raw(), rgba_frame.bytes);
+    let stages: Vec<&str> = png_frame.head.stages.iter().map(|stage| stage.stage.as_str()).collect();
     for stage in ["deform", "draw", "read", "encode"] {
-        let times = stages.iter().filter(|other| **other == stage).count();
-        assert_eq!(times, 1, "{stage} in {stages:?}");
+        let count = stages.iter().filter(|other| **other == stage).count();
+        assert_eq!(count, 1, "expected one time of stage {stage}, got {stages:?}");
     }
 }
 
@@ -86,20 +87,21 @@ async fn frame_names_its_step_and_png_equals_rgba() {
 /// size and format.
 #[tokio::test(flavor = "multi_thread")]
 async fn large_frame_is_chunked_for_default_client_limits() {
-    let server = server().await;
-    let large = v1::RenderFrameRequest { picture: picture_of_size(1600, 1000, v1::Format::Rgba), ..request() };
-    let frame = render(&server, large).await.expect("expected a frame");
+    let server = start_server().await;
+    let large_request =
+        v1::RenderFrameRequest { picture: picture_of_size(1600, 1000, v1::Format::Rgba), ..rgba_request() };
+    let frame = render(&server, large_request).await.expect("expected a frame");
     assert_eq!(frame.bytes.len(), 1600 * 1000 * 4);
-    let unsized_picture = v1::RenderFrameRequest { picture: None, ..request() };
-    let frame = render(&server, unsized_picture).await.expect("expected a frame");
+    let default_request = v1::RenderFrameRequest { picture: None, ..rgba_request() };
+    let frame = render(&server, default_request).await.expect("expected a frame");
     assert_eq!((frame.head.width, frame.head.height, frame.head.format()), (1280, 720, v1::Format::Png));
 }
 
-/// A lossless stream delivers every step and ends after its count. A latest stream only moves forward and counts the
-/// steps that it skips.
+/// A lossless stream delivers every step and ends after the requested number. The steps of a latest stream increase, and
+/// it counts the steps that it skips.
 #[tokio::test(flavor = "multi_thread")]
 async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
-    let server = server().await;
+    let server = start_server().await;
     let subscribe = |delivery: v1::Delivery, frames| v1::StreamFramesRequest {
         scene: "strips".into(),
         picture: picture_of_size(32, 32, v1::Format::Png),
@@ -110,29 +112,29 @@ async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
     let lossless = client.stream_frames(subscribe(v1::Delivery::Lossless, 12)).await.expect("expected a subscription");
     let latest = client.stream_frames(subscribe(v1::Delivery::Latest, 0)).await.expect("expected a subscription");
     let (mut lossless, mut latest) = (lossless.into_inner(), latest.into_inner());
-    let mut driver = server.drive("strips", v1::Policy::Lossless, 3).await;
+    let mut writer = server.drive("strips", v1::Policy::Lossless, 3).await;
     let send_steps = async {
         for number in 1..=12 {
-            driver.step_acknowledged(step(number, &[0], &[0.1 * number as f32, 0.0])).await;
+            writer.send_step_and_wait(step(number, &[0], &[0.1 * number as f32, 0.0])).await;
         }
     };
     let read_lossless = async {
         for number in 1..=12 {
-            let head = next(&mut lossless).await.expect("expected a frame");
+            let head = next_head(&mut lossless).await.expect("expected a frame");
             assert_eq!((head.step.map(|step| step.number), head.skipped), (Some(number), 0));
         }
-        assert!(next(&mut lossless).await.is_none(), "expected the stream to end after 12 frames");
+        assert!(next_head(&mut lossless).await.is_none(), "expected the stream to end after 12 frames");
     };
     let read_latest = async {
-        let mut last = 0;
-        let mut counted = 0;
-        while last < 12 {
-            let head = next(&mut latest).await.expect("expected a frame");
+        let mut last_number = 0;
+        let mut counted_steps = 0;
+        while last_number < 12 {
+            let head = next_head(&mut latest).await.expect("expected a frame");
             let number = head.step.expect("expected a valid step").number;
-            assert!(number > last);
-            counted += 1 + head.skipped;
-            assert_eq!(counted, number, "expected each step to be received or counted as skipped");
-            last = number;
+            assert!(number > last_number);
+            counted_steps += 1 + head.skipped;
+            assert_eq!(counted_steps, number, "expected each step to be received or counted as skipped");
+            last_number = number;
         }
     };
     tokio::join!(send_steps, read_lossless, read_latest);
@@ -140,18 +142,18 @@ async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn invalid_pictures_are_rejected_and_deadlines_hold() {
-    let server = server().await;
+    let server = start_server().await;
     let camera_at = |eye: Vec<f64>, up: Vec<f64>| v1::Camera {
         view: Some(v1::camera::View::LookAt(v1::LookAt { eye, target: vec![0.0; 3], up })),
         ..v1::Camera::default()
     };
     let camera_with_lens = |lens| v1::Camera { lens: Some(lens), ..v1::Camera::default() };
-    let up = || vec![0.0, 1.0, 0.0];
+    let y_axis = || vec![0.0, 1.0, 0.0];
     let cameras: Vec<(v1::Camera, &str)> = vec![
-        (camera_at(vec![0.0; 2], up()), "picture: camera.look_at.eye"),
-        (camera_at(vec![f64::NAN, 0.0, 1.0], up()), "picture: camera.look_at"),
-        (camera_at(vec![0.0; 3], up()), "picture: camera.look_at"),
-        (camera_at(vec![0.0, 2.0, 0.0], up()), "picture: camera.look_at"),
+        (camera_at(vec![0.0; 2], y_axis()), "picture: camera.look_at.eye"),
+        (camera_at(vec![f64::NAN, 0.0, 1.0], y_axis()), "picture: camera.look_at"),
+        (camera_at(vec![0.0; 3], y_axis()), "picture: camera.look_at"),
+        (camera_at(vec![0.0, 2.0, 0.0], y_axis()), "picture: camera.look_at"),
         (camera_with_lens(v1::camera::Lens::FieldOfView(180.0)), "picture: camera.field_of_view"),
         (camera_with_lens(v1::camera::Lens::Intrinsics(v1::Intrinsics::default())), "picture: camera.intrinsics"),
         (v1::Camera { near: 2.0, far: 1.0, ..v1::Camera::default() }, "picture: camera.near/far"),
@@ -165,23 +167,24 @@ async fn invalid_pictures_are_rejected_and_deadlines_hold() {
         ),
     ];
     for (camera, field) in cameras {
-        let mut invalid_request = request();
+        let mut invalid_request = rgba_request();
         invalid_request.picture.as_mut().expect("expected a picture").camera = Some(camera);
         let status = render(&server, invalid_request).await.err().expect(field);
         assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
-        assert!(rejection_details(&status).field.starts_with(field), "{:?} is not {field}", rejection_details(&status));
+        assert!(rejection_details(&status).field.starts_with(field), "expected {field}, got {status:?}");
     }
     for (width, height) in [(0, 48), (48, 0), (1_000_000, 48), (48, u32::MAX)] {
         let invalid_request =
-            v1::RenderFrameRequest { picture: picture_of_size(width, height, v1::Format::Png), ..request() };
+            v1::RenderFrameRequest { picture: picture_of_size(width, height, v1::Format::Png), ..rgba_request() };
         let status = render(&server, invalid_request).await.err().expect("expected an invalid-size error");
         assert_eq!((status.code(), rejection_details(&status).field.as_str()), (Code::InvalidArgument, "picture.size"));
         assert_eq!(rejection_details(&status).given, format!("{width} x {height}"));
     }
-    let late_request = v1::RenderFrameRequest { step: Some(Which::MinimumStep(1)), deadline_ms: 60, ..request() };
+    let late_request =
+        v1::RenderFrameRequest { step: Some(RequestedStep::MinimumStep(1)), deadline_ms: 60, ..rgba_request() };
     assert_eq!(render(&server, late_request).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
     let mut short_deadline =
-        tonic::Request::new(v1::RenderFrameRequest { step: Some(Which::MinimumStep(1)), ..request() });
+        tonic::Request::new(v1::RenderFrameRequest { step: Some(RequestedStep::MinimumStep(1)), ..rgba_request() });
     short_deadline.metadata_mut().insert("grpc-timeout", "60m".parse().expect("a header"));
     let result = async {
         let mut stream = server.frames().await.render_frame(short_deadline).await?.into_inner();

@@ -11,7 +11,7 @@ use v1::drive_scene_response::Kind as ResponseKind;
 use v1::upload_scene_request::Part;
 
 use crate::service_harness::{
-    Driver, Server, get_vertices, reference_vertices, rejection_details, rigid_step, step, strips, with_timeout,
+    Server, StepWriter, get_vertices, reference_vertices, rejection_details, rigid_step, step, strips, with_timeout,
 };
 
 /// An invalid step: the name of the case, the step, and the prefixes of field, expected and given.
@@ -26,8 +26,8 @@ fn invalid_steps() -> Vec<InvalidStep> {
         transforms: numbers.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into(),
         ..step(11, &[], &[])
     };
-    let mut infinite = [1.0; 12];
-    infinite[7] = f32::INFINITY;
+    let mut infinite_transform = [1.0; 12];
+    infinite_transform[7] = f32::INFINITY;
     let mut truncated_q = step(11, &[0], &[0.0, 0.0]);
     truncated_q.q = truncated_q.q.slice(..7);
     let nan_time = v1::Step { time: f64::NAN, ..step(11, &[0], &[0.0, 0.0]) };
@@ -68,7 +68,7 @@ fn invalid_steps() -> Vec<InvalidStep> {
         ("T too short", transforms(&[0], &[0.0; 11]), ["step.transforms", "48 bytes", "44 bytes"]),
         (
             "infinity in T",
-            transforms(&[1], &infinite),
+            transforms(&[1], &infinite_transform),
             ["step.transforms of domain 'right': transform[7]", "a finite", "inf"],
         ),
         ("NaN time", nan_time, ["step.time", "a finite number", "NaN"]),
@@ -79,29 +79,29 @@ fn invalid_steps() -> Vec<InvalidStep> {
 
 /// Invalid steps in the rigid transform formats, and steps with a format that does not match their bytes.
 fn invalid_formats() -> Vec<InvalidStep> {
-    let bytes = |format: i32| v1::Step {
+    let step_with_format = |format: i32| v1::Step {
         transform_domains: vec![0],
         transforms: vec![0; 48].into(),
         transform_format: format,
         ..step(11, &[], &[])
     };
-    let wrong_format = |format: v1::TransformFormat| bytes(format.into());
-    let overflow = rigid_step(
+    let step_with_known_format = |format: v1::TransformFormat| step_with_format(format.into());
+    let overflowing_step = rigid_step(
         11,
         v1::TransformFormat::RigidF64,
         &[(0, IDENTITY_QUATERNION, [1e7; 3]), (1, IDENTITY_QUATERNION, [1e7; 3])],
     );
-    let overflow = v1::Step { q_domains: vec![1], q: step(11, &[1], &[f32::MAX, 0.0]).q, ..overflow };
+    let overflowing_step = v1::Step { q_domains: vec![1], q: step(11, &[1], &[f32::MAX, 0.0]).q, ..overflowing_step };
     vec![
-        ("a format of no version", bytes(9), ["step.transform_format", "a format of this version", "9"]),
+        ("unknown format", step_with_format(9), ["step.transform_format", "a format of this version", "9"]),
         (
             "affine bytes in format RigidF32",
-            wrong_format(v1::TransformFormat::RigidF32),
+            step_with_known_format(v1::TransformFormat::RigidF32),
             ["step.transforms", "28 bytes (1 tr", "48 bytes"],
         ),
         (
             "affine bytes in format RigidF64",
-            wrong_format(v1::TransformFormat::RigidF64),
+            step_with_known_format(v1::TransformFormat::RigidF64),
             ["step.transforms", "40 bytes (1 tr", "48 bytes"],
         ),
         (
@@ -136,7 +136,7 @@ fn invalid_formats() -> Vec<InvalidStep> {
         ),
         (
             "q moves a vertex out of range at a far origin",
-            overflow,
+            overflowing_step,
             ["step.q of domain 'right'", "q and transform", "vertex"],
         ),
     ]
@@ -153,12 +153,12 @@ async fn stream_stays_open_after_invalid_steps() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "other".into() };
-    server.scenes().await.open_scene(request).await.expect("opens");
-    let mut other = server.drive("other", Policy::Lossless, 0).await;
-    let mut driver = server.drive("strips", Policy::Lossless, 0).await;
+    server.scenes().await.open_scene(request).await.expect("expected the scene to open");
+    let mut other_writer = server.drive("other", Policy::Lossless, 0).await;
+    let mut writer = server.drive("strips", Policy::Lossless, 0).await;
     let valid_step = step(10, &[], &[0.1, 0.2, 0.3, 0.4]);
-    driver.step_acknowledged(valid_step.clone()).await;
-    let want = reference_vertices(&strips(), &[valid_step]);
+    writer.send_step_and_wait(valid_step.clone()).await;
+    let expected_vertices = reference_vertices(&strips(), &[valid_step]);
     let request = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
     // A step rejected for overflow still consumes its number, so each case needs a higher one.
     for (index, (name, mut invalid_step, prefixes)) in invalid_steps().into_iter().chain(invalid_formats()).enumerate()
@@ -166,42 +166,46 @@ async fn stream_stays_open_after_invalid_steps() {
         let is_decreasing = invalid_step.number < 11;
         invalid_step.number += if is_decreasing { 0 } else { index as u64 };
         let number = invalid_step.number;
-        driver.step(invalid_step).await;
-        let rejection = driver.rejection().await;
+        writer.send_step(invalid_step).await;
+        let rejection = writer.receive_rejection().await;
         let prefixes = if is_decreasing { [prefixes[0], "a number above", prefixes[2]] } else { prefixes };
         assert!(has_prefixes(&rejection, prefixes), "{name}: {rejection:?}");
         assert_eq!(rejection.step, Some(number), "{name}");
-        let got = get_vertices(&server, request.clone()).await.expect("vertices");
-        assert_eq!((got.step().number, &got.positions, &got.normals), (10, &want.0, &want.1), "{name}");
-        assert_eq!((got.head.origin.as_slice(), got.origins.len()), ([0.0; 3].as_slice(), 0), "{name}");
-        other.step_acknowledged(step(index as u64, &[0], &[0.5, 0.5])).await;
+        let reply = get_vertices(&server, request.clone()).await.expect("expected vertices");
+        assert_eq!(
+            (reply.step().number, &reply.positions, &reply.normals),
+            (10, &expected_vertices.positions, &expected_vertices.normals),
+            "{name}"
+        );
+        assert_eq!((reply.head.origin.as_slice(), reply.origins.len()), ([0.0; 3].as_slice(), 0), "{name}");
+        other_writer.send_step_and_wait(step(index as u64, &[0], &[0.5, 0.5])).await;
     }
-    driver.step_acknowledged(step(1000, &[0], &[0.0, 0.0])).await;
+    writer.send_step_and_wait(step(1000, &[0], &[0.0, 0.0])).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn stream_opens_after_rejected_openings() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let mut driver = Driver::connect(server.channel().await).await;
-    driver.step(step(1, &[], &[])).await;
-    assert!(has_prefixes(&driver.rejection().await, ["kind", "open, before any step", "a step"]));
-    let ResponseKind::Rejection(unknown_scene) = driver.open("nowhere", Policy::Lossless, 0).await else {
-        panic!("opened")
+    let mut writer = StepWriter::connect(server.channel().await).await;
+    writer.send_step(step(1, &[], &[])).await;
+    assert!(has_prefixes(&writer.receive_rejection().await, ["kind", "open, before any step", "a step"]));
+    let ResponseKind::Rejection(unknown_scene) = writer.open("nowhere", Policy::Lossless, 0).await else {
+        panic!("expected a rejection of an unknown scene")
     };
     assert!(has_prefixes(&unknown_scene, ["scene", "a scene that is there", "'nowhere'"]), "{unknown_scene:?}");
     let open = v1::OpenDrive { scene: "strips".into(), policy: 77, window: 0 };
-    driver.send(RequestKind::Open(open)).await;
-    assert!(has_prefixes(&driver.rejection().await, ["open.policy", "a policy of this version", "77"]));
-    assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
-    let ResponseKind::Rejection(second_open) = driver.open("strips", Policy::Lossless, 0).await else {
-        panic!("opened twice")
+    writer.send(RequestKind::Open(open)).await;
+    assert!(has_prefixes(&writer.receive_rejection().await, ["open.policy", "a policy of this version", "77"]));
+    assert!(matches!(writer.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
+    let ResponseKind::Rejection(second_open) = writer.open("strips", Policy::Lossless, 0).await else {
+        panic!("expected a rejection of a second open message")
     };
     assert!(has_prefixes(&second_open, ["open", "one open per stream", "a second"]), "{second_open:?}");
-    driver.step_acknowledged(step(0, &[0], &[0.0, 0.0])).await;
+    writer.send_step_and_wait(step(0, &[0], &[0.0, 0.0])).await;
 }
 
-/// The scene keeps its last good step, and the other stream on the same connection continues.
+/// The scene keeps its last valid step, and the other stream on the same connection continues.
 #[tokio::test(flavor = "multi_thread")]
 async fn oversized_message_ends_only_its_own_stream() {
     let server = Server::start_with(|config| modalcast::config::Config { message_bytes: 64 << 10, ..config }).await;
@@ -209,23 +213,23 @@ async fn oversized_message_ends_only_its_own_stream() {
     // Both streams share one connection.
     let channel = server.channel().await;
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "other".into() };
-    server.scenes().await.open_scene(request).await.expect("opens");
-    let mut other = Driver::connect(channel.clone()).await;
-    assert!(matches!(other.open("other", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
-    let mut driver = Driver::connect(channel).await;
-    assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
+    server.scenes().await.open_scene(request).await.expect("expected the scene to open");
+    let mut other_writer = StepWriter::connect(channel.clone()).await;
+    assert!(matches!(other_writer.open("other", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
+    let mut writer = StepWriter::connect(channel).await;
+    assert!(matches!(writer.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
     let valid_step = step(1, &[0], &[0.5, 0.25]);
-    driver.step_acknowledged(valid_step.clone()).await;
-    driver.step(step(2, &[0], &vec![0.0; 20_000])).await;
-    let end = with_timeout(driver.replies.message()).await.expect_err("expected the stream to end with an error");
-    assert_eq!(end.code(), Code::ResourceExhausted);
-    assert_eq!(rejection_details(&end).expected, "at most 65536 bytes");
+    writer.send_step_and_wait(valid_step.clone()).await;
+    writer.send_step(step(2, &[0], &vec![0.0; 20_000])).await;
+    let status = with_timeout(writer.replies.message()).await.expect_err("expected the stream to end with an error");
+    assert_eq!(status.code(), Code::ResourceExhausted);
+    assert_eq!(rejection_details(&status).expected, "at most 65536 bytes");
     let request = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
-    let got = get_vertices(&server, request).await.expect("vertices");
-    assert_eq!((got.step().number, got.positions), (1, reference_vertices(&strips(), &[valid_step]).0));
-    other.step_acknowledged(step(1, &[0], &[0.5, 0.5])).await;
+    let reply = get_vertices(&server, request).await.expect("expected vertices");
+    assert_eq!((reply.step().number, reply.positions), (1, reference_vertices(&strips(), &[valid_step]).positions));
+    other_writer.send_step_and_wait(step(1, &[0], &[0.5, 0.5])).await;
     let mut second_writer = server.drive("strips", Policy::Lossless, 0).await;
-    second_writer.step_acknowledged(step(0, &[0], &[0.0, 0.0])).await;
+    second_writer.send_step_and_wait(step(0, &[0], &[0.0, 0.0])).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -279,8 +283,8 @@ async fn invalid_requests_return_code_and_details() {
     server.open("strips").await;
 }
 
-/// An upload of one file, `scene.txt`. Tests modify it to make it invalid.
-fn upload(contents: &[u8]) -> Vec<Part> {
+/// The messages of a valid upload of one file, `scene.txt`.
+fn upload_parts(contents: &[u8]) -> Vec<Part> {
     let header =
         v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: contents.len() as u64 };
     let sha256 = Sha256::digest(contents).to_vec().into();
@@ -288,14 +292,14 @@ fn upload(contents: &[u8]) -> Vec<Part> {
     vec![Part::Header(header), Part::File(file), Part::Chunk(contents.to_vec().into())]
 }
 
-async fn send(server: &Server, parts: Vec<Part>) -> Result<v1::UploadSceneResponse, tonic::Status> {
+async fn upload(server: &Server, parts: Vec<Part>) -> Result<v1::UploadSceneResponse, tonic::Status> {
     let requests = parts.into_iter().map(|part| v1::UploadSceneRequest { part: Some(part) }).collect::<Vec<_>>();
     let response = server.scenes().await.upload_scene(tokio_stream::iter(requests)).await;
     response.map(tonic::Response::into_inner)
 }
 
 fn modified_upload(modify: impl FnOnce(&mut v1::UploadHeader, &mut v1::UploadFile)) -> Vec<Part> {
-    let mut parts = upload(b"strips");
+    let mut parts = upload_parts(b"strips");
     if let [Part::Header(header), Part::File(file), _] = parts.as_mut_slice() {
         modify(header, file);
     }
@@ -309,7 +313,7 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
     let path = |path: &'static str| modified_upload(move |_, file| file.path = path.into());
     let cases: Vec<(&str, Vec<Part>, [&str; 3])> = vec![
         ("empty stream", vec![], ["part", "a header first", "nothing"]),
-        ("no header", upload(b"strips").split_off(1), ["part", "a header first", "a file or chunk"]),
+        ("no header", upload_parts(b"strips").split_off(1), ["part", "a header first", "a file or chunk"]),
         (
             "other hash",
             modified_upload(|_, file| file.sha256 = vec![7; 32].into()),
@@ -319,7 +323,7 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
         ("path outside of the folder", path("../scene.txt"), ["file.path", "a relative path", "\"../scene.txt\""]),
         ("absolute", path("/etc/scene.txt"), ["file.path", "a relative path", "\"/etc/scene.txt\""]),
         ("backslashes", path("..\\scene.txt"), ["file.path", "a relative path", ""]),
-        ("truncated", upload(b"strips")[..2].to_vec(), ["file.bytes of 'scene.txt'", "6 bytes", "0 bytes"]),
+        ("truncated", upload_parts(b"strips")[..2].to_vec(), ["file.bytes of 'scene.txt'", "6 bytes", "0 bytes"]),
         (
             "too few bytes announced",
             modified_upload(|header, _| header.total_bytes = 5),
@@ -338,24 +342,24 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
             ["header.entry", "a relative path", "\"../x\""],
         ),
         ("missing entry", modified_upload(|header, _| header.entry = "x".into()), ["entry", "a file", ""]),
-        ("unknown source in the file", upload(b"lunch"), ["scene", "a scene", "lunch"]),
+        ("unknown source in the file", upload_parts(b"lunch"), ["scene", "a scene", "lunch"]),
     ];
     for (name, parts, prefixes) in cases {
-        let status = send(&server, parts).await.expect_err(name);
+        let status = upload(&server, parts).await.expect_err(name);
         assert!(has_prefixes(&rejection_details(&status), prefixes), "{name}: {:?}", rejection_details(&status));
         assert_eq!(
-            std::fs::read_dir(&uploads).expect("expected a temporary folder").count(),
+            std::fs::read_dir(&uploads).expect("expected an uploads folder").count(),
             0,
             "{name}: expected no files"
         );
     }
-    send(&server, upload(b"strips")).await.expect("expected the upload to succeed after rejected ones");
-    let status = send(&server, upload(b"strips")).await.expect_err("expected a name conflict");
+    upload(&server, upload_parts(b"strips")).await.expect("expected the upload to succeed after rejected ones");
+    let status = upload(&server, upload_parts(b"strips")).await.expect_err("expected a name conflict");
     assert_eq!(status.code(), Code::AlreadyExists);
     assert!(uploads.join("up/scene.txt").exists());
     let delete = v1::DeleteSceneRequest { scene: "up".into() };
     server.scenes().await.delete_scene(delete).await.expect("expected the deletion to succeed");
-    assert_eq!(std::fs::read_dir(&uploads).expect("expected a temporary folder").count(), 0);
+    assert_eq!(std::fs::read_dir(&uploads).expect("expected an uploads folder").count(), 0);
 }
 
 /// Status details are sent in an HTTP/2 header, so a rejection of a very long input is truncated.

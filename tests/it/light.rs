@@ -10,13 +10,13 @@ use modalcast_render::{FrameParams, shadow_texel_axes};
 
 /// Side lengths of a shadow map texel in scene units, for a deformation.
 fn texel_size(scene: &Scene, summary: &DeformSummary, uses_light_bounds: bool) -> [f64; 2] {
-    let light = summary.oriented_bounds.filter(|_| uses_light_bounds);
+    let light_bounds = summary.oriented_bounds.filter(|_| uses_light_bounds);
     let params = FrameParams {
         camera: Camera::fit_to_scene(scene, 64, 64),
         width: 64,
         height: 64,
         bounds: summary.bounds,
-        light,
+        light: light_bounds,
     };
     shadow_texel_axes(scene, &params).expect("expected a scene with a shadow").map(|side| side.norm())
 }
@@ -27,18 +27,26 @@ fn texel_size(scene: &Scene, summary: &DeformSummary, uses_light_bounds: bool) -
 fn fitted_shadow_texels_of_the_tree_have_half_the_area() {
     let scene = load::open("tree").expect("expected the built-in scene").scene;
     let state = SceneState::rest(&scene);
-    let exact = ReferenceDeformer::new(&scene)
+    let vertex_fit = ReferenceDeformer::new(&scene)
         .with_bounding_axes(scene.light_axes())
         .deform(&state)
         .expect("expected the step to succeed");
-    let tiled = CpuDeformer::new(&scene)
+    let tile_fit = CpuDeformer::new(&scene)
         .with_bounding_axes(scene.light_axes())
         .deform(&state)
         .expect("expected the step to succeed");
-    let [corners, tiled, exact] =
-        [texel_size(&scene, &exact, false), texel_size(&scene, &tiled, true), texel_size(&scene, &exact, true)];
-    eprintln!("texel of the tree: {corners:?} fitted to corners, {tiled:?} to boxes of tiles, {exact:?} to vertices");
+    let [corner_fit, tile_fit, vertex_fit] = [
+        texel_size(&scene, &vertex_fit, false),
+        texel_size(&scene, &tile_fit, true),
+        texel_size(&scene, &vertex_fit, true),
+    ];
+    eprintln!(
+        "texel size of the tree, fitted to corners: {corner_fit:?}, to tiles: {tile_fit:?}, to vertices: {vertex_fit:?}"
+    );
     let area = |[x, y]: [f64; 2]| x * y;
-    assert!(area(tiled) < 0.5 * area(corners), "{tiled:?}, {corners:?}");
-    assert!(area(exact) <= area(tiled) && area(tiled) < 1.2 * area(exact), "{tiled:?}, {exact:?}");
+    assert!(area(tile_fit) < 0.5 * area(corner_fit), "{tile_fit:?}, {corner_fit:?}");
+    assert!(
+        area(vertex_fit) <= area(tile_fit) && area(tile_fit) < 1.2 * area(vertex_fit),
+        "{tile_fit:?}, {vertex_fit:?}"
+    );
 }

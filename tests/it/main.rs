@@ -2,6 +2,7 @@
 
 #[path = "../common/mod.rs"]
 mod common;
+mod cpu_checks;
 mod cut_outs;
 mod deformers;
 mod far;
@@ -24,7 +25,6 @@ mod service;
 mod service_faults;
 mod service_files;
 mod service_harness;
-mod stability;
 mod steps;
 mod storages;
 mod streams;

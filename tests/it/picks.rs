@@ -11,14 +11,14 @@ use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
 use crate::service_harness::{Server, far_strips, rigid_step, sheet, state_after_steps, step, strips};
 
-/// Tolerance of picked positions against the reference's triangle, in scene units, for f32 vertices of a few units.
+/// Maximum distance of a picked position from the reference, in scene units. The f32 vertices are a few units large.
 const TOLERANCE: f64 = 2e-6;
 
 async fn start_server(source: &str) -> (Server, Client) {
-    let start_server = Server::start_with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
-    start_server.open(source).await;
-    let client = Client::connect(&start_server.address).await.expect("expected a connection");
-    (start_server, client)
+    let server = Server::start_with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
+    server.open(source).await;
+    let client = Client::connect(&server.address).await.expect("expected a connection");
+    (server, client)
 }
 
 /// A camera in front of the strips, 40 pixels per unit at z = 0.
@@ -44,8 +44,8 @@ fn mode_matrix(scene: &Scene, domain: u32) -> DMatrix<f64> {
     DMatrix::from_iterator(rows, rank, shape.modes.columns().iter().map(|entry| f64::from(*entry)))
 }
 
-/// U^T A^T f of a force f that acts on the vertices of a triangle, weighted by the barycentric coordinates.
-fn full_reduced_force(scene: &Scene, hit: &Hit, linear: Matrix3<f64>, force: Vector3<f64>) -> DVector<f64> {
+/// U^T A^T f with the complete U: distributes f to the vertices of the triangle by the barycentric coordinates.
+fn project_force(scene: &Scene, hit: &Hit, linear: Matrix3<f64>, force: Vector3<f64>) -> DVector<f64> {
     let mode_matrix = mode_matrix(scene, hit.domain);
     let mut vertex_forces = DVector::zeros(mode_matrix.nrows());
     for (vertex, weight) in hit.vertices.iter().zip(hit.barycentric) {
@@ -56,21 +56,25 @@ fn full_reduced_force(scene: &Scene, hit: &Hit, linear: Matrix3<f64>, force: Vec
 }
 
 fn reference_position(scene: &Scene, steps: &[v1::Step], hit: &Hit) -> Vector3<f64> {
-    let deformed = reference::deform(scene, &state_after_steps(scene, steps));
-    let first = scene.layout.domains[hit.domain as usize].first_vertex;
-    let corners = hit.vertices.iter().map(|vertex| Vector3::from(deformed[first + *vertex as usize]));
+    let positions = reference::deform(scene, &state_after_steps(scene, steps));
+    let first_vertex = scene.layout.domains[hit.domain as usize].first_vertex;
+    let corners = hit.vertices.iter().map(|vertex| Vector3::from(positions[first_vertex + *vertex as usize]));
     corners.zip(hit.barycentric).map(|(corner, weight)| corner * weight).sum()
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn reduced_force_of_a_pick_equals_the_force_of_the_scene() {
-    let (start_server, client) = start_server("strips").await;
+async fn reduced_force_of_a_hit_matches_the_complete_modes() {
+    let (server, client) = start_server("strips").await;
     let scene = strips();
-    let mut driver = start_server.drive("strips", v1::Policy::Lossless, 0).await;
-    let half = std::f32::consts::FRAC_1_SQRT_2;
+    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let frac_1_sqrt_2 = std::f32::consts::FRAC_1_SQRT_2;
     let steps = [
         step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3]),
-        rigid_step(2, v1::TransformFormat::RigidF32, &[(1, [0.0, 0.0, half, half], [1.0, 0.25, -0.5])]),
+        rigid_step(
+            2,
+            v1::TransformFormat::RigidF32,
+            &[(1, [0.0, 0.0, frac_1_sqrt_2, frac_1_sqrt_2], [1.0, 0.25, -0.5])],
+        ),
     ];
     let rest_picks = client
         .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 44, 37)))
@@ -78,7 +82,7 @@ async fn reduced_force_of_a_pick_equals_the_force_of_the_scene() {
         .expect("expected a pick");
     assert_eq!((rest_picks.step.run, rest_picks.hits.len()), (0, 1));
     for step in steps.clone() {
-        driver.step_acknowledged(step).await;
+        writer.send_step_and_wait(step).await;
     }
     let request = PickRequest::new("strips", PickRectangle::pixel(picture(), 0, 0).size(64, 64)).exact_step(2);
     let picks = client.pick(&request).await.expect("expected a pick");
@@ -89,9 +93,12 @@ async fn reduced_force_of_a_pick_equals_the_force_of_the_scene() {
     for hit in &picks.hits {
         counts[hit.domain as usize] += 1;
         let linear = state.transforms[hit.domain as usize].linear();
-        let want = full_reduced_force(&scene, hit, linear, force);
-        let got = DVector::from_vec(hit.reduced_force(force.into()));
-        assert!((&got - &want).norm() < 1e-6 * force.norm(), "expected {want}, got {got}");
+        let expected_force = project_force(&scene, hit, linear, force);
+        let reduced_force = DVector::from_vec(hit.reduced_force(force.into()));
+        assert!(
+            (&reduced_force - &expected_force).norm() < 1e-6 * force.norm(),
+            "expected {expected_force}, got {reduced_force}"
+        );
         assert!(
             (Vector3::from(hit.position) - reference_position(&scene, &steps, hit)).norm() < TOLERANCE
                 && is_on_ray(hit),
@@ -100,9 +107,9 @@ async fn reduced_force_of_a_pick_equals_the_force_of_the_scene() {
     }
     assert!(counts.iter().all(|count| *count > 200), "expected hits of both domains, got {counts:?}");
     let rotated_hit = picks.hits.iter().find(|hit| hit.domain == 1).expect("expected a hit of domain 1");
-    let unrotated_force = full_reduced_force(&scene, rotated_hit, Matrix3::identity(), force);
-    let got = DVector::from_vec(rotated_hit.reduced_force(force.into()));
-    assert!((got - unrotated_force).norm() > 0.1, "negative control: without the rotation");
+    let unrotated_force = project_force(&scene, rotated_hit, Matrix3::identity(), force);
+    let reduced_force = DVector::from_vec(rotated_hit.reduced_force(force.into()));
+    assert!((reduced_force - unrotated_force).norm() > 0.1, "negative control: the force without the rotation differs");
     let current_picks = client
         .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 44, 37)))
         .await
@@ -121,31 +128,31 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
     let view = View::LookAt { eye: [150.0, 150.0, 40.0], target: [150.0, 150.0, 0.0], up: [0.0, 1.0, 0.0] };
     let camera = Some(Camera { view, lens: Lens::FieldOfView(20.0), clip: None });
     let picture = Picture { width: 640, height: 480, camera, ..Picture::default() };
-    let all = client
+    let picks = client
         .pick(&PickRequest::new("sheet", PickRectangle::pixel(picture, 100, 100).size(64, 64)))
         .await
         .expect("expected a pick");
-    assert_eq!(all.hits.len(), 64 * 64, "expected the sheet to fill the view");
+    assert_eq!(picks.hits.len(), 64 * 64, "expected the sheet to fill the view");
     let scene = sheet();
-    for hit in all.hits.iter().step_by(97) {
-        let want = full_reduced_force(&scene, hit, Matrix3::identity(), Vector3::new(1.0, 2.0, -3.0));
-        let got = DVector::from_vec(hit.reduced_force([1.0, 2.0, -3.0]));
-        assert!((got - want).norm() < 1e-5);
+    for hit in picks.hits.iter().step_by(97) {
+        let expected_force = project_force(&scene, hit, Matrix3::identity(), Vector3::new(1.0, 2.0, -3.0));
+        let reduced_force = DVector::from_vec(hit.reduced_force([1.0, 2.0, -3.0]));
+        assert!((reduced_force - expected_force).norm() < 1e-5);
     }
-    let without_modes = client
+    let picks_without_modes = client
         .pick(&PickRequest::new(
             "sheet",
             PickRectangle { omit_modes: true, ..PickRectangle::pixel(picture, 0, 0).size(2, 1) },
         ))
         .await
         .expect("expected a pick");
-    assert!(without_modes.hits.iter().all(|hit| hit.modes.is_empty() && hit.rank == 4));
+    assert!(picks_without_modes.hits.iter().all(|hit| hit.modes.is_empty() && hit.rank == 4));
 
-    let (start_server, client) = start_far_server().await;
+    let (server, client) = start_server("far").await;
     let scene = far_strips();
     let poses = [0, 1].map(|domain| (domain, [0.0, 0.0, 0.0, 1.0], [3e7, -2e7 + 0.125, 2e7]));
     let far_step = rigid_step(1, v1::TransformFormat::RigidF64, &poses);
-    start_server.drive("far", v1::Policy::Lossless, 0).await.step_acknowledged(far_step.clone()).await;
+    server.drive("far", v1::Policy::Lossless, 0).await.send_step_and_wait(far_step.clone()).await;
     // In scene units from the scene origin.
     let translation: [f64; 3] = std::array::from_fn(|axis| poses[0].2[axis] - scene.origin[axis] / scene.unit);
     let offset_point = |x: f64, y: f64, z: f64| [translation[0] + x, translation[1] + y, translation[2] + z];
@@ -160,17 +167,13 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
         .hits
         .remove(0);
     let distance = (Vector3::from(hit.position) - Vector3::from(offset_point(0.4, 0.45, 0.0))).norm();
-    assert!(distance < 1e-3, "{distance} units at {translation:?}");
+    assert!(distance < 1e-3, "expected the target of the camera, got a distance of {distance} units");
     assert!((hit.depth - 1.5).abs() < 1e-3, "expected a depth of 1.5 m, got {}", hit.depth);
-}
-
-async fn start_far_server() -> (Server, Client) {
-    start_server("far").await
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn invalid_rectangles_outputs_and_steps_are_rejected() {
-    let (start_server, client) = start_server("strips").await;
+    let (server, client) = start_server("strips").await;
     for (corner, size, field) in [
         ([0, 0], [65, 1], "rectangle.size"),
         ([0, 0], [0, 3], "rectangle.size"),
@@ -180,16 +183,16 @@ async fn invalid_rectangles_outputs_and_steps_are_rejected() {
         let request =
             PickRequest::new("strips", PickRectangle::pixel(picture(), corner[0], corner[1]).size(size[0], size[1]));
         let error = client.pick(&request).await.expect_err(field);
-        assert_eq!(error.rejection().map(|refusal| refusal.field.as_str()), Some(field), "{error}");
+        assert_eq!(error.rejection().map(|rejection| rejection.field.as_str()), Some(field), "{error}");
     }
     let corner = client
         .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 95, 79)))
         .await
         .expect("expected a pick");
     assert!(corner.hits.is_empty(), "expected no hit");
-    let late_request =
+    let unanswered_request =
         PickRequest::new("strips", PickRectangle::pixel(picture(), 0, 0)).minimum_step(1).deadline_ms(60);
-    let error = client.pick(&late_request).await.expect_err("expected a timeout");
+    let error = client.pick(&unanswered_request).await.expect_err("expected a timeout");
     assert!(matches!(error, modalcast_client::Error::Status { code: Code::DeadlineExceeded, .. }), "{error}");
 
     let wire_picture = |output: v1::Output, format: v1::Format| v1::Picture {
@@ -201,29 +204,29 @@ async fn invalid_rectangles_outputs_and_steps_are_rejected() {
     };
     let depth_as_png = wire_picture(v1::Output::Depth, v1::Format::Png);
     let colour_as_floats = wire_picture(v1::Output::Colour, v1::Format::F32);
-    let third_mode = v1::Picture { mode: 2, ..wire_picture(v1::Output::ModeShape, v1::Format::Png) };
+    let missing_mode = v1::Picture { mode: 2, ..wire_picture(v1::Output::ModeShape, v1::Format::Png) };
     let scaled_depth = v1::Picture { largest: 1.0, ..wire_picture(v1::Output::Depth, v1::Format::F32) };
     let nan_scale = v1::Picture { largest: f64::NAN, ..wire_picture(v1::Output::Displacement, v1::Format::Png) };
     let unknown_output = v1::Picture { output: 99, ..v1::Picture::default() };
     for (picture, field) in [
         (depth_as_png, "picture.format"),
         (colour_as_floats, "picture.format"),
-        (third_mode, "picture.mode"),
+        (missing_mode, "picture.mode"),
         (scaled_depth, "picture.largest"),
         (nan_scale, "picture.largest"),
         (unknown_output, "picture.output"),
     ] {
         let request = v1::RenderFrameRequest { scene: "strips".into(), picture: Some(picture), ..Default::default() };
-        let status = start_server.frames().await.render_frame(request).await.expect_err(field);
+        let status = server.frames().await.render_frame(request).await.expect_err(field);
         assert_eq!(crate::service_harness::rejection_details(&status).field, field);
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn outputs_have_their_format_and_agree_with_picks() {
-    let (start_server, client) = start_server("strips").await;
-    let mut driver = start_server.drive("strips", v1::Policy::Lossless, 0).await;
-    driver.step_acknowledged(step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3])).await;
+    let (server, client) = start_server("strips").await;
+    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
+    writer.send_step_and_wait(step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3])).await;
     let render = async |output| {
         let request = FrameRequest::new("strips", Picture { output, ..picture() });
         client.render_frame(&request.minimum_step(1)).await.expect("expected a frame")
@@ -238,17 +241,22 @@ async fn outputs_have_their_format_and_agree_with_picks() {
         .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 20, 10).size(64, 64)))
         .await
         .expect("expected a pick");
-    let word = |bytes: &[u8], index: usize| <[u8; 4]>::try_from(&bytes[4 * index..][..4]).expect("expected four bytes");
-    let mut different = 0;
+    let read_word =
+        |bytes: &[u8], index: usize| <[u8; 4]>::try_from(&bytes[4 * index..][..4]).expect("expected four bytes");
+    let mut different_pixels = 0;
     for hit in &picks.hits {
         let index = (hit.pixel[1] * 96 + hit.pixel[0]) as usize;
-        let is_same_domain = u32::from_le_bytes(word(&domains.bytes, index)) == hit.domain;
-        let depth_error = (f64::from(f32::from_le_bytes(word(&depth.bytes, index))) / hit.depth - 1.0).abs();
-        let normal = (0..3).map(|axis| f64::from(f32::from_le_bytes(word(&normals.bytes, 3 * index + axis))));
-        let normal_error = normal.zip(hit.normal).map(|(got, want)| (got - want).abs()).fold(0.0, f64::max);
-        different += usize::from(!(is_same_domain && depth_error < 1e-5 && normal_error < 1e-5));
+        let is_same_domain = u32::from_le_bytes(read_word(&domains.bytes, index)) == hit.domain;
+        let depth_error = (f64::from(f32::from_le_bytes(read_word(&depth.bytes, index))) / hit.depth - 1.0).abs();
+        let normal = (0..3).map(|axis| f64::from(f32::from_le_bytes(read_word(&normals.bytes, 3 * index + axis))));
+        let normal_error = normal.zip(hit.normal).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        different_pixels += usize::from(!(is_same_domain && depth_error < 1e-5 && normal_error < 1e-5));
     }
-    assert!(picks.hits.len() > 1000 && different <= 3, "{different} of {} pixels", picks.hits.len());
+    assert!(
+        picks.hits.len() > 1000 && different_pixels <= 3,
+        "{different_pixels} of {} pixels differ",
+        picks.hits.len()
+    );
     let color = render(Output::Color).await.bytes;
     let maps = [
         render(Output::Displacement { scale_max: 0.0 }).await,
@@ -268,10 +276,10 @@ async fn outputs_have_their_format_and_agree_with_picks() {
 /// One domain is far from the other. A camera near either domain picks it with full precision.
 #[tokio::test(flavor = "multi_thread")]
 async fn distant_domains_are_picked_by_nearby_cameras() {
-    let (start_server, client) = start_server("strips").await;
+    let (server, client) = start_server("strips").await;
     let translation = [1e7 + 1.25, 0.0, -1e7];
     let far_step = rigid_step(1, v1::TransformFormat::RigidF64, &[(1, [0.0, 0.0, 0.0, 1.0], translation)]);
-    start_server.drive("strips", v1::Policy::Lossless, 0).await.step_acknowledged(far_step).await;
+    server.drive("strips", v1::Policy::Lossless, 0).await.send_step_and_wait(far_step).await;
     for (domain, center) in [(1, translation), (0, [0.0; 3]), (1, translation)] {
         let offset_point = |x: f64, y: f64, z: f64| [center[0] + x, center[1] + y, center[2] + z];
         let view = View::LookAt {
@@ -287,6 +295,9 @@ async fn distant_domains_are_picked_by_nearby_cameras() {
             .expect("expected a pick")
             .hits;
         let distance = (Vector3::from(hits[0].position) - Vector3::from(offset_point(0.4, 0.45, 0.0))).norm();
-        assert!(hits[0].domain == domain && distance < 1e-3, "{distance} units from {center:?}: {hits:?}");
+        assert!(
+            hits[0].domain == domain && distance < 1e-3,
+            "expected domain {domain} at the target, got a distance of {distance} units and {hits:?}"
+        );
     }
 }

@@ -1,5 +1,4 @@
-//! The definition of the compute rasterizer is compared with geometry, and a CPU twin of the kernels' traversal with
-//! the definition.
+//! Tests of the reference rasterizer against geometry, and of a CPU twin of the raster kernels against the reference.
 
 use modalcast_compute::reference::raster::{
     ClippedPolygon, CullReason, EMPTY_KEY, SnappedVertex, VisibilityBuffer, clipped_polygon, depth_at, edge,
@@ -14,184 +13,221 @@ const MAX_THREAD_SAMPLES: i32 = 32;
 const MAX_WARP_EXTENT: i32 = 16384;
 const TILE_SIZE: i32 = 64;
 const MAX_STRIP_SPLITS: u32 = 3;
-const BITS: u32 = 40;
+const TILE_COUNT_BITS: u32 = 40;
 
-/// CPU twin of the raster kernels for one window. Queues may have any order, and the per-thread and per-warp paths use
-/// 32-bit edge functions.
-struct Walk<'a> {
+/// CPU twin of the raster kernels for one window. The per-thread and per-warp paths use 32-bit edge functions.
+struct RasterTraversal<'a> {
     soup: &'a Soup,
     keys: Vec<u64>,
-    medium: Vec<u32>,
-    /// First tile, triangle, packed box.
-    large: Vec<(u64, u32, u32)>,
-    tally: u64,
-    paths: [usize; 3],
+    /// Triangles of the per-warp path, in any order.
+    warp_queue: Vec<u32>,
+    /// Triangles of the per-tile path, in any order.
+    tile_queue: Vec<TileEntry>,
+    /// Length of `tile_queue` in the high bits, and total number of its tiles in the low [`TILE_COUNT_BITS`] bits.
+    packed_counts: u64,
+    /// Number of triangles on each path.
+    triangle_counts: [usize; 3],
 }
 
-impl Walk<'_> {
-    fn put(&mut self, column: i32, row: i32, depth: f32, triangle: u32) {
-        let at = row as usize * self.soup.viewport.size()[0] as usize + column as usize;
-        self.keys[at] = self.keys[at].min(u64::from(depth.to_bits()) << 32 | u64::from(triangle));
+/// A triangle of the per-tile path.
+struct TileEntry {
+    /// Number of tiles of all earlier entries.
+    first_tile: u64,
+    triangle: u32,
+    /// Column and row of the first tile, and number of tile columns minus 1; one byte each.
+    packed_box: u32,
+}
+
+impl RasterTraversal<'_> {
+    fn write_sample(&mut self, column: i32, row: i32, depth: f32, triangle: u32) {
+        let index = row as usize * self.soup.viewport.size()[0] as usize + column as usize;
+        self.keys[index] = self.keys[index].min(u64::from(depth.to_bits()) << 32 | u64::from(triangle));
     }
 
     fn clipped_polygon(&self, triangle: u32, cull_mode: CullMode) -> Result<ClippedPolygon, CullReason> {
         clipped_polygon(&self.soup.viewport, &self.soup.positions, self.soup.triangles[triangle as usize], cull_mode)
     }
 
-    /// `raster`: the narrow tests of `setup_unclipped`, and the entries that each path pushes.
-    fn aim(&mut self, triangle: u32, cull_mode: CullMode) {
+    /// Twin of kernel `raster`: draws a small triangle, and queues any other.
+    fn bin_triangle(&mut self, triangle: u32, cull_mode: CullMode) {
         let Ok(clipped_polygon) = self.clipped_polygon(triangle, cull_mode) else { return };
-        let extent = |of: fn(&SnappedVertex) -> i32| {
-            let all = || clipped_polygon.corners.iter().map(of);
-            all().max().expect("corners") - all().min().expect("corners")
+        let extent = |coordinate: fn(&SnappedVertex) -> i32| {
+            let coordinates = || clipped_polygon.corners.iter().map(coordinate);
+            coordinates().max().expect("expected corners") - coordinates().min().expect("expected corners")
         };
         let [x0, y0, x1, y1] = clipped_polygon.samples;
-        let narrow = !clipped_polygon.is_clipped
+        let fits_32_bits = !clipped_polygon.is_clipped
             && extent(|corner| corner.x) <= MAX_WARP_EXTENT
             && extent(|corner| corner.y) <= MAX_WARP_EXTENT;
-        if narrow && (x1 - x0 + 1) * (y1 - y0 + 1) <= MAX_THREAD_SAMPLES {
-            self.paths[0] += 1;
-            self.draw_narrow(&clipped_polygon, triangle);
-        } else if narrow {
-            self.paths[1] += 1;
-            self.medium.push(triangle);
+        if fits_32_bits && (x1 - x0 + 1) * (y1 - y0 + 1) <= MAX_THREAD_SAMPLES {
+            self.triangle_counts[0] += 1;
+            self.draw_32_bits(&clipped_polygon, triangle);
+        } else if fits_32_bits {
+            self.triangle_counts[1] += 1;
+            self.warp_queue.push(triangle);
         } else {
-            self.paths[2] += 1;
+            self.triangle_counts[2] += 1;
             let (x, y) = (x0 / TILE_SIZE, y0 / TILE_SIZE);
-            let (across, down) = (x1 / TILE_SIZE - x + 1, y1 / TILE_SIZE - y + 1);
-            assert!(x < 256 && y < 256 && across <= 256, "boxes are three bytes");
-            let before = self.tally;
-            self.tally += 1 << BITS | (across * down) as u64;
-            let box_of = (x | y << 8 | (across - 1) << 16) as u32;
-            assert_eq!((before >> BITS) as usize, self.large.len());
-            self.large.push((before & ((1 << BITS) - 1), triangle, box_of));
+            let (columns, rows) = (x1 / TILE_SIZE - x + 1, y1 / TILE_SIZE - y + 1);
+            assert!(x < 256 && y < 256 && columns <= 256, "expected a box that fits into three bytes");
+            let counts_before = self.packed_counts;
+            self.packed_counts += 1 << TILE_COUNT_BITS | (columns * rows) as u64;
+            let packed_box = (x | y << 8 | (columns - 1) << 16) as u32;
+            assert_eq!((counts_before >> TILE_COUNT_BITS) as usize, self.tile_queue.len());
+            let first_tile = counts_before & ((1 << TILE_COUNT_BITS) - 1);
+            self.tile_queue.push(TileEntry { first_tile, triangle, packed_box });
         }
     }
 
-    /// Checked arithmetic panics when an edge function overflows 32 bits.
-    fn draw_narrow(&mut self, clipped_polygon: &ClippedPolygon, triangle: u32) {
+    /// Draws a triangle with 32-bit edge functions. Panics if one overflows.
+    fn draw_32_bits(&mut self, clipped_polygon: &ClippedPolygon, triangle: u32) {
         let edge = |from: &SnappedVertex, to: &SnappedVertex, x: i32, y: i32| -> i32 {
-            let [one, other] = [(to.x - from.x, y - from.y), (to.y - from.y, x - from.x)];
-            let product = |(a, b): (i32, i32)| a.checked_mul(b).expect("32 bits hold it");
-            product(one).checked_sub(product(other)).expect("32 bits hold it")
+            let [left, right] = [(to.x - from.x, y - from.y), (to.y - from.y, x - from.x)];
+            let product = |(a, b): (i32, i32)| a.checked_mul(b).expect("expected a value within 32 bits");
+            product(left).checked_sub(product(right)).expect("expected a value within 32 bits")
         };
         let [a, b, c] = fan_triangles(clipped_polygon)[0];
         let area = edge(&a, &b, c.x, c.y);
         let [x0, y0, x1, y1] = clipped_polygon.samples;
         for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
             let (x, y) = (256 * column + 128, 256 * row + 128);
-            let inside = [(&b, &c), (&c, &a), (&a, &b)].iter().all(|(from, to)| {
-                let takes = to.y < from.y || (to.y == from.y && to.x > from.x);
-                edge(from, to, x, y) >= i32::from(!takes)
+            let is_inside = [(&b, &c), (&c, &a), (&a, &b)].iter().all(|(from, to)| {
+                let owns_edge = to.y < from.y || (to.y == from.y && to.x > from.x);
+                edge(from, to, x, y) >= i32::from(!owns_edge)
             });
-            let [share_b, share_c] = [edge(&c, &a, x, y), edge(&a, &b, x, y)].map(|at| at as f32 * (1.0 / area as f32));
-            let z = a.z + (share_b * (b.z - a.z) + share_c * (c.z - a.z));
-            if inside && z <= 1.0 {
-                self.put(column, row, if z > 0.0 { z } else { 0.0 }, triangle);
+            let [weight_b, weight_c] =
+                [edge(&c, &a, x, y), edge(&a, &b, x, y)].map(|edge_value| edge_value as f32 * (1.0 / area as f32));
+            let z = a.z + (weight_b * (b.z - a.z) + weight_c * (c.z - a.z));
+            if is_inside && z <= 1.0 {
+                self.write_sample(column, row, if z > 0.0 { z } else { 0.0 }, triangle);
             }
         }
     }
 
-    /// Index of the list entry that contains a tile, found by the 32-way search of a warp.
-    fn find(&self, tile: u64) -> usize {
-        let (mut low, mut high) = (0, self.large.len());
+    /// Index of the entry of `tile_queue` that contains a tile, found by the 32-way search of a warp.
+    fn find_entry(&self, tile: u64) -> usize {
+        let (mut low, mut high) = (0, self.tile_queue.len());
         while high - low > 1 {
             let step = (high - low).div_ceil(32);
-            let is_before = |own: &usize| *own < high && self.large[*own].0 <= tile;
+            let is_before = |entry: &usize| *entry < high && self.tile_queue[*entry].first_tile <= tile;
             low += step * ((0..32).map(|lane| low + step * lane).filter(is_before).count() - 1);
             high = high.min(low + step);
         }
         low
     }
 
-    /// `raster_tiles`: one strip of a listed tile, clipped to the triangle's samples. A strip that lies entirely beyond
-    /// an edge is rejected.
-    fn strip(&mut self, at: u64, strip_splits: u32) {
-        let tile = at >> strip_splits;
-        let (first, triangle, box_of) = self.large[self.find(tile)];
-        let (own, across) = ((tile - first) as u32, (box_of >> 16 & 255) + 1);
-        let tall = TILE_SIZE >> strip_splits;
-        let x = TILE_SIZE * ((box_of & 255) + own % across) as i32;
-        let y =
-            TILE_SIZE * ((box_of >> 8 & 255) + own / across) as i32 + tall * (at as i32 & ((1 << strip_splits) - 1));
-        let clipped_polygon = self.clipped_polygon(triangle, CullMode::None).expect("queued");
+    /// Twin of kernel `raster_tiles`: draws one strip of a queued tile, clipped to the triangle's samples. Skips a strip
+    /// that lies entirely outside an edge.
+    fn draw_strip(&mut self, strip: u64, strip_splits: u32) {
+        let tile = strip >> strip_splits;
+        let TileEntry { first_tile, triangle, packed_box } = self.tile_queue[self.find_entry(tile)];
+        let (tile_of_entry, columns) = ((tile - first_tile) as u32, (packed_box >> 16 & 255) + 1);
+        let strip_height = TILE_SIZE >> strip_splits;
+        let first_column = TILE_SIZE * ((packed_box & 255) + tile_of_entry % columns) as i32;
+        let first_row = TILE_SIZE * ((packed_box >> 8 & 255) + tile_of_entry / columns) as i32
+            + strip_height * (strip as i32 & ((1 << strip_splits) - 1));
+        let clipped_polygon =
+            self.clipped_polygon(triangle, CullMode::None).expect("expected a triangle that is not culled");
         let [x0, y0, x1, y1] = clipped_polygon.samples;
-        let (x, right, y, bottom) = (x.max(x0), (x + TILE_SIZE - 1).min(x1), y.max(y0), (y + tall - 1).min(y1));
-        for piece in fan_triangles(&clipped_polygon) {
-            let beyond = |from: &SnappedVertex, to: &SnappedVertex| {
-                let column = if to.y > from.y { x } else { right };
-                let row = if to.x > from.x { bottom } else { y };
-                let takes = to.y < from.y || (to.y == from.y && to.x > from.x);
-                edge(from, to, 256 * column + 128, 256 * row + 128) < i64::from(!takes)
+        let (first_column, last_column, first_row, last_row) = (
+            first_column.max(x0),
+            (first_column + TILE_SIZE - 1).min(x1),
+            first_row.max(y0),
+            (first_row + strip_height - 1).min(y1),
+        );
+        for triangle_piece in fan_triangles(&clipped_polygon) {
+            let is_beyond = |from: &SnappedVertex, to: &SnappedVertex| {
+                let column = if to.y > from.y { first_column } else { last_column };
+                let row = if to.x > from.x { last_row } else { first_row };
+                let owns_edge = to.y < from.y || (to.y == from.y && to.x > from.x);
+                edge(from, to, 256 * column + 128, 256 * row + 128) < i64::from(!owns_edge)
             };
-            let [a, b, c] = &piece;
-            if beyond(b, c) || beyond(c, a) || beyond(a, b) {
+            let [a, b, c] = &triangle_piece;
+            if is_beyond(b, c) || is_beyond(c, a) || is_beyond(a, b) {
                 continue;
             }
-            for (row, column) in (y..=bottom).flat_map(|row| (x..=right).map(move |column| (row, column))) {
-                if let Some(depth) = depth_at(&piece, column, row) {
-                    self.put(column, row, depth, triangle);
+            for (row, column) in
+                (first_row..=last_row).flat_map(|row| (first_column..=last_column).map(move |column| (row, column)))
+            {
+                if let Some(depth) = depth_at(&triangle_piece, column, row) {
+                    self.write_sample(column, row, depth, triangle);
                 }
             }
         }
     }
 }
 
-/// Runs `raster`, `raster_warps` and `raster_tiles` in sequence, with reversed queues and tiles halved `strip_splits`
-/// times.
-fn twin_of_raster(soup: &Soup, strip_splits: u32) -> (Vec<u64>, [usize; 3]) {
+/// Runs the twins of `raster`, `raster_warps` and `raster_tiles` with reversed queues and with tiles that are halved
+/// `strip_splits` times. Returns the keys and the number of triangles on each path.
+fn rasterize_like_kernels(soup: &Soup, strip_splits: u32) -> (Vec<u64>, [usize; 3]) {
     let keys = vec![EMPTY_KEY; soup.viewport.pixel_count()];
-    let mut walk = Walk { soup, keys, medium: vec![], large: vec![], tally: 0, paths: [0; 3] };
+    let mut traversal = RasterTraversal {
+        soup,
+        keys,
+        warp_queue: vec![],
+        tile_queue: vec![],
+        packed_counts: 0,
+        triangle_counts: [0; 3],
+    };
     for group in &soup.groups {
-        (group.first..group.first + group.triangles).rev().for_each(|triangle| walk.aim(triangle, group.cull_mode));
+        (group.first..group.first + group.triangles)
+            .rev()
+            .for_each(|triangle| traversal.bin_triangle(triangle, group.cull_mode));
     }
-    for triangle in std::mem::take(&mut walk.medium) {
-        let clipped_polygon = walk.clipped_polygon(triangle, CullMode::None).expect("queued");
-        walk.draw_narrow(&clipped_polygon, triangle);
+    for triangle in std::mem::take(&mut traversal.warp_queue) {
+        let clipped_polygon =
+            traversal.clipped_polygon(triangle, CullMode::None).expect("expected a triangle that is not culled");
+        traversal.draw_32_bits(&clipped_polygon, triangle);
     }
-    (0..(walk.tally & ((1 << BITS) - 1)) << strip_splits).rev().for_each(|at| walk.strip(at, strip_splits));
-    (walk.keys, walk.paths)
+    (0..(traversal.packed_counts & ((1 << TILE_COUNT_BITS) - 1)) << strip_splits)
+        .rev()
+        .for_each(|strip| traversal.draw_strip(strip, strip_splits));
+    (traversal.keys, traversal.triangle_counts)
 }
 
-/// The per-thread, per-warp and per-tile paths equal the definition, and the 32-bit edge functions of the first two do
-/// not overflow.
+/// Also, the 32-bit edge functions of the per-thread and per-warp paths do not overflow.
 #[test]
-fn all_raster_paths_equal_the_definition() {
+fn all_raster_paths_equal_the_reference() {
     let text = include_str!("../../kernels/raster.cu");
     for line in [
         format!("#define MAX_THREAD_SAMPLES {MAX_THREAD_SAMPLES}"),
         format!("#define MAX_WARP_EXTENT {MAX_WARP_EXTENT}"),
         format!("constexpr int TILE_SIZE = {TILE_SIZE};"),
         format!("constexpr unsigned MAX_STRIP_SPLITS = {MAX_STRIP_SPLITS};"),
-        format!("constexpr unsigned TILE_COUNT_BITS = {BITS};"),
+        format!("constexpr unsigned TILE_COUNT_BITS = {TILE_COUNT_BITS};"),
     ] {
-        assert!(text.contains(&line), "the kernel has another {line}");
+        assert!(text.contains(&line), "expected the kernel to contain '{line}'");
     }
-    let mut all = [0; 3];
+    let mut path_counts = [0; 3];
     for soup in all_soups() {
-        let want = soup.rasterize().keys;
+        let reference_keys = soup.rasterize().keys;
         for strip_splits in 0..=MAX_STRIP_SPLITS {
-            let (keys, paths) = twin_of_raster(&soup, strip_splits);
-            assert!(keys == want, "{}, {strip_splits} halvings", soup.name);
-            (0..3).for_each(|path| all[path] += paths[path]);
+            let (keys, triangle_counts) = rasterize_like_kernels(&soup, strip_splits);
+            assert!(keys == reference_keys, "{}, strip_splits = {strip_splits}", soup.name);
+            (0..3).for_each(|path| path_counts[path] += triangle_counts[path]);
         }
     }
-    assert!(all.iter().all(|path| *path > 10), "every path is taken: {all:?}");
+    assert!(path_counts.iter().all(|path| *path > 10), "expected triangles on every path, got {path_counts:?}");
 }
 
-/// Number of pieces that cover each sample, with the top-left rule or with all edges closed.
-fn takers(soup: &Soup, closed: bool) -> Vec<usize> {
+/// Number of triangle pieces that cover each sample. With `is_closed`, a piece covers all samples on its edges; without,
+/// the top-left rule holds.
+fn count_covering_pieces(soup: &Soup, is_closed: bool) -> Vec<usize> {
     let [width, height] = soup.viewport.size().map(|side| side as i32);
-    let all: Vec<[SnappedVertex; 3]> = (soup.triangles.iter())
+    let pieces: Vec<[SnappedVertex; 3]> = (soup.triangles.iter())
         .filter_map(|triangle| clipped_polygon(&soup.viewport, &soup.positions, *triangle, CullMode::None).ok())
         .flat_map(|clipped_polygon| fan_triangles(&clipped_polygon))
         .collect();
-    let takes = |piece: &[SnappedVertex; 3], column: i32, row: i32| {
+    let covers = |piece: &[SnappedVertex; 3], column: i32, row: i32| {
         let [a, b, c] = piece;
-        let inside = |from, to| edge(from, to, 256 * column + 128, 256 * row + 128) >= 0;
-        if closed { inside(a, b) && inside(b, c) && inside(c, a) } else { depth_at(piece, column, row).is_some() }
+        let is_inside = |from, to| edge(from, to, 256 * column + 128, 256 * row + 128) >= 0;
+        if is_closed {
+            is_inside(a, b) && is_inside(b, c) && is_inside(c, a)
+        } else {
+            depth_at(piece, column, row).is_some()
+        }
     };
-    let count = |column, row| all.iter().filter(|piece| takes(piece, column, row)).count();
+    let count = |column, row| pieces.iter().filter(|piece| covers(piece, column, row)).count();
     (0..height).flat_map(|row| (0..width).map(move |column| (column, row))).map(|(x, y)| count(x, y)).collect()
 }
 
@@ -201,14 +237,17 @@ fn fan_covers_every_sample_once() {
     // The center is on a sample and some spokes run along rows and columns, so many samples lie on edges.
     soup.positions[..2].copy_from_slice(&[1.0 / 128.0, 1.0 / 128.0]);
     for spoke in [0, 10, 20, 30] {
-        let own = &mut soup.positions[3 * (1 + spoke)..][..2];
+        let position = &mut soup.positions[3 * (1 + spoke)..][..2];
         let axis = usize::from(spoke % 20 == 0);
-        own[axis] = 1.0 / 128.0;
+        position[axis] = 1.0 / 128.0;
     }
     soup.positions.chunks_exact_mut(3).for_each(|position| position[2] = 0.0);
-    assert!(takers(&soup, false).iter().all(|count| *count == 1));
-    let twice = takers(&soup, true).iter().filter(|count| **count > 1).count();
-    assert!(twice > 100, "negative control: without the rule {twice} samples are taken twice or more");
+    assert!(count_covering_pieces(&soup, false).iter().all(|count| *count == 1));
+    let shared_samples = count_covering_pieces(&soup, true).iter().filter(|count| **count > 1).count();
+    assert!(
+        shared_samples > 100,
+        "negative control: without the top-left rule {shared_samples} samples are covered more than once"
+    );
 }
 
 #[test]
@@ -219,15 +258,15 @@ fn fan_clipped_by_near_plane_covers_every_sample_once() {
         let [x, y] = [position[0], position[1]];
         position.copy_from_slice(&[30.0 * x, -1.0, 30.0 * y]);
     }
-    let counts = takers(&soup, false);
+    let counts = count_covering_pieces(&soup, false);
     assert!(counts.iter().all(|count| *count <= 1));
-    // The floor ends at a distance of 57: 1 / 57 below the horizon, half a row. The near plane is at 0.5, so all rows
-    // below are floor.
+    // The floor ends at a distance of 57, half a row below the horizon. The near plane is at 0.5, so the floor fills all
+    // rows below.
     let rows = counts.chunks_exact(96).map(|row| row.iter().sum::<usize>()).collect::<Vec<_>>();
     assert!(rows[..32].iter().all(|count| *count == 0) && rows[34..].iter().all(|count| *count == 96), "{rows:?}");
 }
 
-/// A nearer triangle wins whatever its id.
+/// A nearer triangle is visible regardless of its id.
 #[test]
 fn depth_ties_go_to_the_lower_id() {
     let square = |z: f32| [[-1.0, -1.0, z], [3.0, -1.0, z], [-1.0, 3.0, z]].concat();
@@ -247,19 +286,19 @@ fn depth_ties_go_to_the_lower_id() {
 #[test]
 fn dropped_triangles_report_the_reason() {
     let viewport = clip_space_viewport(10, 10);
-    let why = |corners: [[f32; 3]; 3], cull_mode: CullMode| {
+    let cull_reason = |corners: [[f32; 3]; 3], cull_mode: CullMode| {
         clipped_polygon(&viewport, &corners.concat(), [0, 1, 2], cull_mode).err()
     };
     let front = [[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.5, 0.0]];
     let back = [front[1], front[0], front[2]];
-    assert_eq!(why(front, CullMode::Back), None);
-    assert_eq!(why(back, CullMode::None), None);
-    assert_eq!(why(back, CullMode::Back), Some(CullReason::BackFacing));
-    assert_eq!(why([[f32::NAN, 0.0, 0.0], front[1], front[2]], CullMode::None), Some(CullReason::NotFinite));
-    assert_eq!(why(front.map(|[x, y, z]| [x + 2.0, y, z]), CullMode::None), Some(CullReason::OutsideFrustum));
-    assert_eq!(why(front.map(|[x, y, z]| [x, y, z + 1.5]), CullMode::None), Some(CullReason::OutsideFrustum));
-    assert_eq!(why([front[0], front[0], front[1]], CullMode::None), Some(CullReason::Degenerate));
-    assert_eq!(why(front.map(|[x, y, z]| [0.05 * x, 0.05 * y, z]), CullMode::None), Some(CullReason::NoSample));
+    assert_eq!(cull_reason(front, CullMode::Back), None);
+    assert_eq!(cull_reason(back, CullMode::None), None);
+    assert_eq!(cull_reason(back, CullMode::Back), Some(CullReason::BackFacing));
+    assert_eq!(cull_reason([[f32::NAN, 0.0, 0.0], front[1], front[2]], CullMode::None), Some(CullReason::NotFinite));
+    assert_eq!(cull_reason(front.map(|[x, y, z]| [x + 2.0, y, z]), CullMode::None), Some(CullReason::OutsideFrustum));
+    assert_eq!(cull_reason(front.map(|[x, y, z]| [x, y, z + 1.5]), CullMode::None), Some(CullReason::OutsideFrustum));
+    assert_eq!(cull_reason([front[0], front[0], front[1]], CullMode::None), Some(CullReason::Degenerate));
+    assert_eq!(cull_reason(front.map(|[x, y, z]| [0.05 * x, 0.05 * y, z]), CullMode::None), Some(CullReason::NoSample));
 }
 
 #[test]
@@ -273,18 +312,18 @@ fn plane_depth_and_rectangle_coverage_are_exact() {
     let [a, b, c] = corners.map(nalgebra::Vector3::from);
     let normal = (b - a).cross(&(c - a));
     let focal = 1.0 / 30.0_f64.to_radians().tan();
-    let (mut seen, mut worst) = (0, 0.0_f64);
-    for (at, depth) in raster.depths().into_iter().enumerate().filter(|(at, _)| raster.ids()[*at].is_some()) {
-        let pixel = |place: usize| (place as f64 + 0.5) / 100.0 - 1.0;
-        let ray = nalgebra::Vector3::new(pixel(at % 200) / focal, -pixel(at / 200) / focal, -1.0);
+    let (mut samples, mut max_error) = (0, 0.0_f64);
+    for (index, depth) in raster.depths().into_iter().enumerate().filter(|(index, _)| raster.ids()[*index].is_some()) {
+        let pixel = |coordinate: usize| (coordinate as f64 + 0.5) / 100.0 - 1.0;
+        let ray = nalgebra::Vector3::new(pixel(index % 200) / focal, -pixel(index / 200) / focal, -1.0);
         let distance = normal.dot(&a) / normal.dot(&ray);
         let z = (far + near) / (far - near) - 2.0 * far * near / ((far - near) * distance);
-        worst = worst.max((f64::from(depth) - (0.5 * z + 0.5)).abs());
-        seen += 1;
+        max_error = max_error.max((f64::from(depth) - (0.5 * z + 0.5)).abs());
+        samples += 1;
     }
     // Corners move by up to 1/512 pixel when they are snapped, and the depth of this plane changes by less than 1e-3
     // per pixel.
-    assert!(seen > 1000 && worst < 4e-6, "{seen} samples, off by up to {worst:e}");
+    assert!(samples > 1000 && max_error < 4e-6, "{samples} samples, maximum error {max_error:e}");
 
     let mut raster = VisibilityBuffer::new(clip_space_viewport(100, 100));
     let square = [[-0.6, -0.4, 0.0], [0.2, -0.4, 0.0], [0.2, 0.8, 0.0], [-0.6, 0.8, 0.0]].concat();

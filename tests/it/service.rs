@@ -13,16 +13,16 @@ use crate::service_harness::{
     Server, get_vertices, reference_vertices, rejection_details, sheet, strips, with_timeout,
 };
 
-/// A source whose first opening fails on a signal, and whose later openings take 100 ms.
-struct FailsOnce {
-    opened: std::sync::atomic::AtomicUsize,
-    fail: std::sync::Mutex<std::sync::mpsc::Receiver<()>>,
+/// A source whose first opening waits for a signal and then fails. Later openings take 100 ms and succeed.
+struct FailingOnceSource {
+    open_count: std::sync::atomic::AtomicUsize,
+    fail_signal: std::sync::Mutex<std::sync::mpsc::Receiver<()>>,
 }
 
-impl SceneSource for FailsOnce {
+impl SceneSource for FailingOnceSource {
     fn open(&self, source: &str) -> Result<OpenedScene> {
-        if self.opened.fetch_add(1, std::sync::atomic::Ordering::SeqCst) == 0 {
-            self.fail.lock().expect("expected an unpoisoned mutex").recv().expect("expected a signal");
+        if self.open_count.fetch_add(1, std::sync::atomic::Ordering::SeqCst) == 0 {
+            self.fail_signal.lock().expect("expected an unpoisoned mutex").recv().expect("expected a signal");
             return Err(modalcast_model::error::invalid("source", "a second try", source));
         }
         std::thread::sleep(std::time::Duration::from_millis(100));
@@ -38,26 +38,26 @@ impl SceneSource for FailsOnce {
     }
 }
 
-/// Two openings of one name overlap. The first fails, the second succeeds and stays registered.
+/// Two openings of one name overlap. The first fails, and the second succeeds and registers the scene.
 #[tokio::test(flavor = "multi_thread")]
 async fn opening_after_a_concurrent_failure_is_registered() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
-    let (fail, fail_receiver) = std::sync::mpsc::sync_channel(1);
-    let source = std::sync::Arc::new(FailsOnce { opened: 0.into(), fail: fail_receiver.into() });
+    let (fail_sender, fail_receiver) = std::sync::mpsc::sync_channel(1);
+    let source = std::sync::Arc::new(FailingOnceSource { open_count: 0.into(), fail_signal: fail_receiver.into() });
     let server = Server::start_from(crate::service_harness::config(folder.path()), source.clone()).await;
     let open = || {
         let engine = server.engine.clone();
         tokio::spawn(async move { engine.open("strips", "").await })
     };
-    let first = open();
-    while source.opened.load(std::sync::atomic::Ordering::SeqCst) == 0 {
+    let first_opening = open();
+    while source.open_count.load(std::sync::atomic::Ordering::SeqCst) == 0 {
         tokio::time::sleep(std::time::Duration::from_millis(1)).await;
     }
-    let second = open();
+    let second_opening = open();
     tokio::time::sleep(std::time::Duration::from_millis(50)).await;
-    fail.send(()).expect("expected a waiting source");
-    assert!(with_timeout(first).await.expect("expected the task not to panic").is_err());
-    with_timeout(second).await.expect("expected the task not to panic").expect("opens");
+    fail_sender.send(()).expect("expected a waiting source");
+    assert!(with_timeout(first_opening).await.expect("expected the task not to panic").is_err());
+    with_timeout(second_opening).await.expect("expected the task not to panic").expect("expected the scene to open");
     server.engine.find("strips").expect("expected an open scene");
     server.engine.close("strips").await.expect("expected the scene to close");
     server.engine.open("other", "strips").await.expect("expected an unused name");
@@ -69,31 +69,31 @@ const MAX_MESSAGE_BYTES: usize = (1 << 20) + 4096;
 async fn describe(server: &Server, scene: &str, arrays: &[Array]) -> (Vec<v1::DomainDescription>, Vec<Vec<u8>>) {
     let arrays = arrays.iter().map(|array| (*array).into()).collect();
     let request = v1::DescribeSceneRequest { scene: scene.into(), domains: vec![], arrays };
-    let mut stream = server.scenes().await.describe_scene(request).await.expect("describes").into_inner();
+    let mut stream = server.scenes().await.describe_scene(request).await.expect("expected a description").into_inner();
     let mut domains = Vec::new();
-    let mut contents: Vec<Vec<u8>> = Vec::new();
+    let mut array_bytes: Vec<Vec<u8>> = Vec::new();
     while let Some(response) = with_timeout(stream.message()).await.expect("expected another message") {
         assert!(response.encoded_len() <= MAX_MESSAGE_BYTES);
-        match response.part.expect("a part") {
+        match response.part.expect("expected a part") {
             Part::Scene(info) => assert_eq!(info.scene, scene),
             Part::Domains(part) => domains.extend(part.domains),
             Part::Chunk(chunk) => {
                 if chunk.offset == 0 {
-                    contents.push(Vec::new());
+                    array_bytes.push(Vec::new());
                 }
-                let array = contents.last_mut().expect("expected an array that starts at offset 0");
+                let array = array_bytes.last_mut().expect("expected an array that starts at offset 0");
                 assert_eq!(chunk.offset, array.len() as u64);
                 array.extend_from_slice(&chunk.data);
                 assert!(array.len() as u64 <= chunk.total);
             }
         }
     }
-    (domains, contents)
+    (domains, array_bytes)
 }
 
 async fn read_modes(server: &Server, scene: &str, domain: u32, vertices: &[u32]) -> Vec<f32> {
     let request = v1::ReadModesRequest { scene: scene.into(), domain, vertices: vertices.to_vec() };
-    let mut stream = server.scenes().await.read_modes(request).await.expect("reads").into_inner();
+    let mut stream = server.scenes().await.read_modes(request).await.expect("expected rows of U").into_inner();
     let mut bytes = Vec::new();
     let mut total = 0;
     while let Some(response) = with_timeout(stream.message()).await.expect("expected another message") {
@@ -112,18 +112,18 @@ async fn client_can_read_the_whole_scene() {
     let info = server.open("strips").await;
     assert_eq!((info.domains, info.vertices, info.corners, info.triangles, info.coordinates), (2, 8, 8, 4, 4));
     assert_eq!((info.up.as_str(), info.unit, info.last_step), ("y", 1.0, None));
-    let all = [Array::Indices, Array::CornerVertices, Array::RestPositions, Array::Uvs, Array::RestNormals];
-    let (domains, contents) = describe(&server, "strips", &all).await;
+    let arrays = [Array::Indices, Array::CornerVertices, Array::RestPositions, Array::Uvs, Array::RestNormals];
+    let (domains, array_bytes) = describe(&server, "strips", &arrays).await;
     let scene = strips();
     let mesh = &scene.shapes[0].mesh;
-    let want: [Vec<u8>; 5] = [
+    let expected_bytes: [Vec<u8>; 5] = [
         bytemuck::cast_slice(mesh.triangles()).to_vec(),
         bytemuck::cast_slice(&mesh.corners().vertices).to_vec(),
         bytemuck::cast_slice(mesh.rest_positions()).to_vec(),
         bytemuck::cast_slice(&mesh.corners().uvs).to_vec(),
         bytemuck::cast_slice(&mesh.corners().normals).to_vec(),
     ];
-    assert_eq!(contents, [want.clone(), want].concat());
+    assert_eq!(array_bytes, [expected_bytes.clone(), expected_bytes].concat());
     let [left, right] = domains.as_slice() else { panic!("{domains:?}") };
     assert_eq!((left.name.as_str(), left.vertices, left.rank, left.parent), ("left", 4, 2, None));
     assert_eq!((left.eigenvalues.as_slice(), left.notes["species"].as_str()), ([1.0, 4.0].as_slice(), "none"));
@@ -132,8 +132,8 @@ async fn client_can_read_the_whole_scene() {
         ("right", Some(0), [1, 3].as_slice())
     );
     assert_eq!((right.attachment_frame.len(), right.placement.len(), right.shape), (48, 48, 0));
-    let columns = &scene.shapes[0].modes;
-    let rows = |vertex: usize| (0..3).flat_map(move |part| (0..2).map(move |mode| columns.entry(vertex, part, mode)));
+    let modes = &scene.shapes[0].modes;
+    let rows = |vertex: usize| (0..3).flat_map(move |axis| (0..2).map(move |mode| modes.entry(vertex, axis, mode)));
     assert_eq!(read_modes(&server, "strips", 1, &[3, 0]).await, rows(3).chain(rows(0)).collect::<Vec<_>>());
 }
 
@@ -156,39 +156,45 @@ async fn large_replies_are_chunked_for_default_client_limits() {
     let server = Server::start_default().await;
     server.open("sheet").await;
     let scene = sheet();
-    let (_, contents) = describe(&server, "sheet", &[Array::Indices, Array::RestPositions]).await;
+    let (_, array_bytes) = describe(&server, "sheet", &[Array::Indices, Array::RestPositions]).await;
     let mesh = &scene.shapes[0].mesh;
-    assert_eq!(contents[0], bytemuck::cast_slice::<_, u8>(mesh.triangles()));
-    assert_eq!(contents[1], bytemuck::cast_slice::<_, u8>(mesh.rest_positions()));
+    assert_eq!(array_bytes[0], bytemuck::cast_slice::<_, u8>(mesh.triangles()));
+    assert_eq!(array_bytes[1], bytemuck::cast_slice::<_, u8>(mesh.rest_positions()));
     let rows = read_modes(&server, "sheet", 0, &[]).await;
-    let columns = &scene.shapes[0].modes;
-    assert_eq!(rows.len(), columns.columns().len());
-    assert!((0..90_000).all(|vertex| rows[12 * vertex + 7] == columns.entry(vertex, 1, 3)));
+    let modes = &scene.shapes[0].modes;
+    assert_eq!(rows.len(), modes.columns().len());
+    assert!((0..90_000).all(|vertex| rows[12 * vertex + 7] == modes.entry(vertex, 1, 3)));
     let request = v1::GetVerticesRequest { scene: "sheet".into(), ..v1::GetVerticesRequest::default() };
-    let got = get_vertices(&server, request).await.expect("expected vertices");
-    assert_eq!(got.step().run, 0, "expected run 0 before the first step");
-    assert_eq!((got.positions, got.normals), reference_vertices(&scene, &[]));
+    let reply = get_vertices(&server, request).await.expect("expected vertices");
+    assert_eq!(reply.step().run, 0, "expected run 0 before the first step");
+    let expected = reference_vertices(&scene, &[]);
+    assert_eq!((reply.positions, reply.normals), (expected.positions, expected.normals));
 }
 
-/// Deleting the scene ends the streams of all readers and writers with `NotFound`.
 #[tokio::test(flavor = "multi_thread")]
-async fn concurrent_openings_share_one_scene() {
+async fn openings_share_one_scene_and_deletion_ends_its_streams() {
     let server = Server::start_default().await;
-    let (a, b, c) = tokio::join!(server.open("strips"), server.open("strips"), server.open("strips"));
-    assert!(a == b && b == c);
-    let list = server.scenes().await.list_scenes(v1::ListScenesRequest {}).await.expect("lists").into_inner();
+    let infos = tokio::join!(server.open("strips"), server.open("strips"), server.open("strips"));
+    assert!(infos.0 == infos.1 && infos.1 == infos.2, "expected the same scene three times, got {infos:?}");
+    let list = server
+        .scenes()
+        .await
+        .list_scenes(v1::ListScenesRequest {})
+        .await
+        .expect("expected a list of scenes")
+        .into_inner();
     assert_eq!(list.scenes.iter().map(|scene| scene.scene.as_str()).collect::<Vec<_>>(), ["strips"]);
     assert_eq!(list.sources, ["panic", "sheet", "strips"]);
     let request = v1::StreamVerticesRequest { scene: "strips".into(), ..v1::StreamVerticesRequest::default() };
     let mut stream =
         server.vertices().await.stream_vertices(request).await.expect("expected a subscription").into_inner();
-    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
-    let delete = v1::DeleteSceneRequest { scene: "strips".into() };
-    server.scenes().await.delete_scene(delete).await.expect("expected the deletion to succeed");
-    let end = with_timeout(stream.message()).await.expect_err("expected a deleted-scene error");
-    assert_eq!((end.code(), rejection_details(&end).given.as_str()), (tonic::Code::NotFound, "'strips'"));
-    let end = with_timeout(driver.replies.message()).await.expect_err("expected a deleted-scene error");
-    assert_eq!(end.code(), tonic::Code::NotFound);
+    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let delete_request = v1::DeleteSceneRequest { scene: "strips".into() };
+    server.scenes().await.delete_scene(delete_request).await.expect("expected the deletion to succeed");
+    let status = with_timeout(stream.message()).await.expect_err("expected a deleted-scene error");
+    assert_eq!((status.code(), rejection_details(&status).given.as_str()), (tonic::Code::NotFound, "'strips'"));
+    let status = with_timeout(writer.replies.message()).await.expect_err("expected a deleted-scene error");
+    assert_eq!(status.code(), tonic::Code::NotFound);
     server.open("strips").await;
 }
 
@@ -220,7 +226,7 @@ async fn server_without_renderer_rejects_only_frames() {
         client.get_server_info(v1::GetServerInfoRequest {}).await.expect("expected the server info").into_inner();
     assert_eq!((info.backend.as_str(), info.software), ("reference", false));
     assert!(info.renderer.contains("switched off"), "{}", info.renderer);
-    let limits = info.limits.expect("limits");
+    let limits = info.limits.expect("expected the limits");
     assert_eq!((limits.message_bytes, limits.window, limits.scenes), (1 << 20, 256, 16));
     let request = v1::StreamFramesRequest { scene: "strips".into(), ..v1::StreamFramesRequest::default() };
     let status = server.frames().await.stream_frames(request).await.expect_err("expected an error without a renderer");
@@ -249,14 +255,14 @@ async fn health_and_reflection_answer_and_stop_ends_streams() {
     let mut client = ServerReflectionClient::new(server.channel().await);
     let mut replies =
         client.server_reflection_info(tokio_stream::iter([request])).await.expect("expected a reply").into_inner();
-    let reply = replies.next().await.expect("one").expect("fine").message_response;
+    let reply = replies.next().await.expect("expected a reply").expect("expected a valid reply").message_response;
     let Some(MessageResponse::ListServicesResponse(list)) = reply else { panic!("{reply:?}") };
     let names: Vec<_> = list.service.into_iter().map(|service| service.name).collect();
     for service in ["modalcast.v1.SceneService", "modalcast.v1.FrameService", "grpc.health.v1.Health"] {
         assert!(names.iter().any(|name| name == service), "{service} is not in {names:?}");
     }
-    let mut driver = server.drive("strips", v1::Policy::Lossless, 0).await;
-    driver.step_acknowledged(crate::service_harness::step(1, &[0], &[0.0, 0.0])).await;
+    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
+    writer.send_step_and_wait(crate::service_harness::step(1, &[0], &[0.0, 0.0])).await;
     let health_stream = health.watch(tonic_health::pb::HealthCheckRequest { service: String::new() }).await;
     let mut health_stream = health_stream.expect("expected a health stream").into_inner();
     assert_eq!(health_stream.message().await.expect("expected a reply").expect("expected a message").status, 1);
@@ -266,9 +272,9 @@ async fn health_and_reflection_answer_and_stop_ends_streams() {
             2,
             "expected NOT_SERVING"
         );
-        let end = with_timeout(driver.replies.message()).await.expect_err("expected the stream to end");
-        assert_eq!(end.code(), tonic::Code::Unavailable);
-        drop((health_stream, driver, health, client, replies));
+        let status = with_timeout(writer.replies.message()).await.expect_err("expected the stream to end");
+        assert_eq!(status.code(), tonic::Code::Unavailable);
+        drop((health_stream, writer, health, client, replies));
     };
     let (result, ()) = tokio::join!(server.stop(), read_until_stop);
     result.expect("expected the server to stop without an error");

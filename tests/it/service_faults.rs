@@ -1,5 +1,5 @@
-//! Transport faults and timeouts: excess steps, silent connections, frozen peers and clients that do not read. Only the
-//! faulty client is disconnected.
+//! Transport faults and timeouts: more steps than the server can process, silent connections, frozen peers and clients
+//! that do not read. Only the faulty client is disconnected.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -15,48 +15,45 @@ use v1::Policy;
 use v1::drive_scene_response::Kind as ResponseKind;
 use v1::upload_scene_request::Part;
 
-use crate::service_harness::{Driver, Server, TIMEOUT, step, with_timeout};
+use crate::service_harness::{Server, StepWriter, TIMEOUT, step, with_timeout};
 
-/// Steps beyond the server's rate are merged under `POLICY_LATEST`, and another stream of the connection is not delayed.
+/// Under `POLICY_LATEST` the server merges steps that it has no time to process. Another stream of the same connection
+/// still gets all its acknowledgements.
 #[tokio::test(flavor = "multi_thread")]
 async fn latest_policy_merges_excess_steps() {
     let server = Server::start_default().await;
     server.open("sheet").await;
     server.open("strips").await;
     let channel = server.channel().await;
-    let mut fast_driver = Driver::connect(channel.clone()).await;
-    assert!(matches!(fast_driver.open("sheet", Policy::Latest, 0).await, ResponseKind::Opened(_)));
-    let mut other = Driver::connect(channel).await;
-    assert!(matches!(other.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
-    const COUNT: u64 = 20_000;
-    let (sender, mut replies) = fast_driver.split();
+    let mut fast_writer = StepWriter::connect(channel.clone()).await;
+    assert!(matches!(fast_writer.open("sheet", Policy::Latest, 0).await, ResponseKind::Opened(_)));
+    let mut other_writer = StepWriter::connect(channel).await;
+    assert!(matches!(other_writer.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
+    const STEP_COUNT: u64 = 20_000;
+    let (sender, mut replies) = fast_writer.split();
     let send_steps = async {
-        for number in 1..=COUNT {
+        for number in 1..=STEP_COUNT {
             let kind = Some(v1::drive_scene_request::Kind::Step(step(number, &[], &[])));
             sender.send(v1::DriveSceneRequest { kind }).await.expect("expected an open stream");
         }
     };
     let await_last_ack = async {
         loop {
-            match with_timeout(replies.message())
-                .await
-                .expect("expected another message")
-                .expect("expected a reply")
-                .kind
-            {
-                Some(ResponseKind::Ack(ack)) if ack.step == COUNT => return ack.skipped,
+            let message = with_timeout(replies.message()).await.expect("expected another message");
+            match message.expect("expected a reply").kind {
+                Some(ResponseKind::Ack(ack)) if ack.step == STEP_COUNT => return ack.skipped,
                 Some(ResponseKind::Ack(_)) => {}
-                other => panic!("{other:?}"),
+                kind => panic!("expected an acknowledgement, got {kind:?}"),
             }
         }
     };
-    let drive_other = async {
+    let send_other_steps = async {
         for number in 0..50 {
-            other.step_acknowledged(step(number, &[0], &[0.1, 0.2])).await;
+            other_writer.send_step_and_wait(step(number, &[0], &[0.1, 0.2])).await;
         }
     };
-    let ((), skipped, ()) = tokio::join!(send_steps, await_last_ack, drive_other);
-    assert!(skipped > 0 && skipped < COUNT);
+    let ((), skipped, ()) = tokio::join!(send_steps, await_last_ack, send_other_steps);
+    assert!(skipped > 0 && skipped < STEP_COUNT, "expected some skipped steps, got {skipped} of {STEP_COUNT}");
 }
 
 /// The server ends the stream of a writer that reads no rejections. The connection stays usable.
@@ -65,14 +62,14 @@ async fn stream_of_writer_that_reads_no_rejections_ends() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let channel = server.channel().await;
-    let mut driver = Driver::connect(channel.clone()).await;
-    assert!(matches!(driver.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
+    let mut writer = StepWriter::connect(channel.clone()).await;
+    assert!(matches!(writer.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
     // Enough long rejections to fill every buffer between server and client.
-    let open = v1::OpenDrive { scene: "x".repeat(600), policy: 0, window: 0 };
-    let (sender, mut replies) = driver.split();
+    let open_message = v1::OpenDrive { scene: "x".repeat(600), policy: 0, window: 0 };
+    let (sender, mut replies) = writer.split();
     let send_task = tokio::spawn(async move {
         for _ in 0..20_000 {
-            let kind = Some(v1::drive_scene_request::Kind::Open(open.clone()));
+            let kind = Some(v1::drive_scene_request::Kind::Open(open_message.clone()));
             if sender.send(v1::DriveSceneRequest { kind }).await.is_err() {
                 return;
             }
@@ -81,14 +78,14 @@ async fn stream_of_writer_that_reads_no_rejections_ends() {
     // The client reads nothing until it has lost its writer lease and another client has acquired it.
     let acquire_lease = async {
         loop {
-            let mut candidate = Driver::connect(channel.clone()).await;
+            let mut candidate = StepWriter::connect(channel.clone()).await;
             if matches!(candidate.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)) {
                 return candidate;
             }
         }
     };
     let mut second_writer = with_timeout(acquire_lease).await;
-    second_writer.step_acknowledged(step(0, &[0], &[0.1, 0.2])).await;
+    second_writer.send_step_and_wait(step(0, &[0], &[0.1, 0.2])).await;
     let mut rejections = 0;
     let error = loop {
         match with_timeout(replies.message()).await {
@@ -97,22 +94,22 @@ async fn stream_of_writer_that_reads_no_rejections_ends() {
             Err(status) => break status,
         }
     };
-    assert!(rejections < 20_000, "{rejections}");
+    assert!(rejections < 20_000, "expected the stream to end before the last rejection");
     assert_eq!(error.code(), Code::ResourceExhausted, "{error:?}");
     with_timeout(send_task).await.expect("expected the task to end with its stream");
-    second_writer.step_acknowledged(step(1, &[0], &[0.1, 0.2])).await;
+    second_writer.send_step_and_wait(step(1, &[0], &[0.1, 0.2])).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn silent_connection_is_closed_and_active_one_is_not() {
     let server = Server::start_with(|config| Config { first_byte_timeout: Duration::from_millis(60), ..config }).await;
     server.open("strips").await;
-    let mut driver = server.drive("strips", Policy::Lossless, 0).await;
+    let mut writer = server.drive("strips", Policy::Lossless, 0).await;
     let address = server.address.trim_start_matches("http://").to_owned();
     let mut silent_connection = TcpStream::connect(address).await.expect("expected a connection");
     let result = with_timeout(silent_connection.read(&mut [0; 1])).await;
     assert!(matches!(result, Ok(0) | Err(_)), "{result:?}");
-    driver.step_acknowledged(step(1, &[0], &[0.1, 0.2])).await;
+    writer.send_step_and_wait(step(1, &[0], &[0.1, 0.2])).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -121,21 +118,22 @@ async fn frozen_writer_loses_its_lease() {
     let server = Server::start_with(|config| Config { keepalive_interval, keepalive_timeout, ..config }).await;
     server.open("strips").await;
     let proxy = FreezableProxy::start(server.address.trim_start_matches("http://").to_owned()).await;
-    let mut frozen = Driver::connect(proxy.channel().await).await;
-    assert!(matches!(frozen.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
-    frozen.step_acknowledged(step(1, &[0], &[0.1, 0.2])).await;
+    let mut frozen_writer = StepWriter::connect(proxy.channel().await).await;
+    assert!(matches!(frozen_writer.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
+    frozen_writer.send_step_and_wait(step(1, &[0], &[0.1, 0.2])).await;
     proxy.freeze();
-    let begin = Instant::now();
+    let start = Instant::now();
     let acquire_lease = async {
         loop {
-            let mut candidate = Driver::connect(server.channel().await).await;
+            let mut candidate = StepWriter::connect(server.channel().await).await;
             if matches!(candidate.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)) {
                 return;
             }
         }
     };
     with_timeout(acquire_lease).await;
-    assert!(begin.elapsed() < Duration::from_secs(10), "{:?}", begin.elapsed());
+    let elapsed = start.elapsed();
+    assert!(elapsed < Duration::from_secs(10), "expected a new writer within 10 s, got {elapsed:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -143,21 +141,22 @@ async fn server_stops_in_time_despite_unread_streams() {
     let drain_timeout = Duration::from_millis(300);
     let server = Server::start_with(|config| Config { drain_timeout, ..config }).await;
     server.open("sheet").await;
-    let subscribe = v1::StreamVerticesRequest {
+    let request = v1::StreamVerticesRequest {
         scene: "sheet".into(),
         delivery: v1::Delivery::Lossless.into(),
         ..v1::StreamVerticesRequest::default()
     };
     // A subscriber that never reads, and a writer that never reads its replies.
-    let unread = server.vertices().await.stream_vertices(subscribe).await.expect("expected a subscription");
-    let driver = server.drive("sheet", Policy::Lossless, 8).await;
+    let unread_stream = server.vertices().await.stream_vertices(request).await.expect("expected a subscription");
+    let unread_writer = server.drive("sheet", Policy::Lossless, 8).await;
     for number in 1..=8 {
-        driver.step(step(number, &[], &[])).await;
+        unread_writer.send_step(step(number, &[], &[])).await;
     }
-    let begin = Instant::now();
+    let start = Instant::now();
     server.stop().await.expect("expected the server to stop without an error");
-    assert!(begin.elapsed() < Duration::from_secs(5), "{:?}", begin.elapsed());
-    drop((unread, driver));
+    let elapsed = start.elapsed();
+    assert!(elapsed < Duration::from_secs(5), "expected the server to stop within 5 s, got {elapsed:?}");
+    drop((unread_stream, unread_writer));
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -170,7 +169,7 @@ async fn silent_upload_times_out_and_leaves_no_files() {
         with_timeout(server.scenes().await.upload_scene(stalled_requests)).await.expect_err("expected a timeout");
     assert_eq!(status.code(), Code::DeadlineExceeded);
     let uploads = server.engine.config().state.join("uploads");
-    assert_eq!(std::fs::read_dir(uploads).expect("expected a temporary folder").count(), 0);
+    assert_eq!(std::fs::read_dir(uploads).expect("expected an uploads folder").count(), 0);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -185,36 +184,37 @@ async fn upload_below_minimum_rate_times_out() {
     let status = with_timeout(server.scenes().await.upload_scene(slow_requests)).await.expect_err("expected a timeout");
     assert_eq!(status.code(), Code::DeadlineExceeded);
     let uploads = server.engine.config().state.join("uploads");
-    assert_eq!(std::fs::read_dir(uploads).expect("expected a temporary folder").count(), 0);
+    assert_eq!(std::fs::read_dir(uploads).expect("expected an uploads folder").count(), 0);
 }
 
 /// Forwards connections until it is frozen. Then it keeps them open and forwards nothing.
 struct FreezableProxy {
     address: String,
-    frozen: Arc<watch::Sender<bool>>,
+    is_frozen: Arc<watch::Sender<bool>>,
 }
 
 impl FreezableProxy {
-    async fn start(server: String) -> Self {
+    async fn start(server_address: String) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("expected a free port");
         let address = format!("http://{}", listener.local_addr().expect("expected a socket address"));
-        let frozen = Arc::new(watch::Sender::new(false));
-        let frozen_sender = Arc::clone(&frozen);
+        let is_frozen = Arc::new(watch::Sender::new(false));
+        let freeze_signal = Arc::clone(&is_frozen);
         tokio::spawn(async move {
             while let Ok((mut client, _)) = listener.accept().await {
-                let mut upstream = TcpStream::connect(&server).await.expect("expected a connection to the server");
-                let mut frozen = frozen_sender.subscribe();
+                let mut upstream =
+                    TcpStream::connect(&server_address).await.expect("expected a connection to the server");
+                let mut is_frozen = freeze_signal.subscribe();
                 tokio::spawn(async move {
                     tokio::select! {
                         _ = tokio::io::copy_bidirectional(&mut client, &mut upstream) => {}
-                        () = async { frozen.wait_for(|frozen| *frozen).await.map(drop).unwrap_or_default() } => {
+                        () = async { is_frozen.wait_for(|is_frozen| *is_frozen).await.map(drop).unwrap_or_default() } => {
                             tokio::time::sleep(TIMEOUT).await;
                         }
                     }
                 });
             }
         });
-        Self { address, frozen }
+        Self { address, is_frozen }
     }
 
     async fn channel(&self) -> Channel {
@@ -226,6 +226,6 @@ impl FreezableProxy {
     }
 
     fn freeze(&self) {
-        self.frozen.send_replace(true);
+        self.is_frozen.send_replace(true);
     }
 }

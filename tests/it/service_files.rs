@@ -1,5 +1,5 @@
-//! Scene files over the wire: paths cannot leave the repository, uploads have the same grammar, and invalid files are
-//! rejected with their name.
+//! Scene files over the wire: paths cannot leave the repository, the repository and uploads accept the same scene.toml,
+//! and a rejection names the invalid file.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -31,9 +31,9 @@ fn lift_mode() -> Vec<u8> {
     encode_npy(12, 1, &entries)
 }
 
-async fn server(state: &Path, scenes: &Path) -> Server {
-    let repository = SceneRepository::new(Some(scenes)).expect("expected a repository");
-    Server::start_from(config(state), Arc::new(repository)).await
+async fn start_server(state_folder: &Path, repository_folder: &Path) -> Server {
+    let repository = SceneRepository::new(Some(repository_folder)).expect("expected a repository");
+    Server::start_from(config(state_folder), Arc::new(repository)).await
 }
 
 async fn open(server: &Server, source: &str) -> Result<v1::SceneInfo, Status> {
@@ -55,33 +55,33 @@ async fn upload(server: &Server, entry: &str, files: &[(&str, &[u8])]) -> Result
     Ok(response.into_inner().scene.expect("expected the scene info"))
 }
 
-/// Drives the single mode of a scene and returns the position of its last vertex.
-async fn drive_last_vertex(server: &Server, scene: &str) -> [f32; 3] {
-    let mut driver = server.drive(scene, v1::Policy::Lossless, 0).await;
-    driver.step_acknowledged(step(1, &[0], &[1.5])).await;
+/// Sets the single coordinate of a scene to 1.5 and returns the position of the last vertex.
+async fn deform_last_vertex(server: &Server, scene: &str) -> [f32; 3] {
+    let mut writer = server.drive(scene, v1::Policy::Lossless, 0).await;
+    writer.send_step_and_wait(step(1, &[0], &[1.5])).await;
     let request = v1::GetVerticesRequest { scene: scene.into(), ..v1::GetVerticesRequest::default() };
-    let got = get_vertices(server, request).await.expect("expected vertices");
-    [9, 10, 11].map(|index| got.positions[index])
+    let reply = get_vertices(server, request).await.expect("expected vertices");
+    [9, 10, 11].map(|index| reply.positions[index])
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn repository_paths_open_and_cannot_escape() {
-    let (state, parent) = (
+    let (state_folder, parent_folder) = (
         tempfile::tempdir().expect("expected a temporary folder"),
         tempfile::tempdir().expect("expected a temporary folder"),
     );
-    let scenes = parent.path().join("scenes");
-    std::fs::create_dir_all(scenes.join("deep")).expect("expected to create a folder");
-    std::fs::write(scenes.join("deep/square.obj"), SQUARE).expect("expected to write a file");
-    std::fs::write(scenes.join("deep/square.npy"), lift_mode()).expect("expected to write a file");
-    std::fs::write(parent.path().join("secret.obj"), SQUARE).expect("expected to write a file");
-    std::os::unix::fs::symlink(parent.path().join("secret.obj"), scenes.join("link.obj"))
+    let repository_folder = parent_folder.path().join("scenes");
+    std::fs::create_dir_all(repository_folder.join("deep")).expect("expected to create a folder");
+    std::fs::write(repository_folder.join("deep/square.obj"), SQUARE).expect("expected to write a file");
+    std::fs::write(repository_folder.join("deep/square.npy"), lift_mode()).expect("expected to write a file");
+    std::fs::write(parent_folder.path().join("secret.obj"), SQUARE).expect("expected to write a file");
+    std::os::unix::fs::symlink(parent_folder.path().join("secret.obj"), repository_folder.join("link.obj"))
         .expect("expected to create a link");
-    let server = server(state.path(), &scenes).await;
+    let server = start_server(state_folder.path(), &repository_folder).await;
     let info = open(&server, "deep/square.obj").await.expect("expected the scene to open");
     assert_eq!((info.scene.as_str(), info.vertices, info.coordinates), ("square", 4, 1));
-    assert_eq!(drive_last_vertex(&server, "square").await, [0.0, 1.0, 3.0]);
-    let outside_path = parent.path().join("secret.obj").to_string_lossy().into_owned();
+    assert_eq!(deform_last_vertex(&server, "square").await, [0.0, 1.0, 3.0]);
+    let outside_path = parent_folder.path().join("secret.obj").to_string_lossy().into_owned();
     for path in ["../secret.obj", "deep/../../secret.obj", outside_path.as_str(), "link.obj"] {
         let status = open(&server, path).await.expect_err(path);
         assert_eq!(status.code(), Code::InvalidArgument, "{path}: {status:?}");
@@ -94,27 +94,27 @@ async fn repository_paths_open_and_cannot_escape() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn upload_has_the_grammar_of_the_repository() {
-    let (state, scenes) = (
+async fn uploaded_scene_toml_opens_like_one_of_the_repository() {
+    let (state_folder, repository_folder) = (
         tempfile::tempdir().expect("expected a temporary folder"),
         tempfile::tempdir().expect("expected a temporary folder"),
     );
-    let server = server(state.path(), scenes.path()).await;
+    let server = start_server(state_folder.path(), repository_folder.path()).await;
     let manifest = b"model = \"parts/square.obj\"\nmodes = \"parts/u.npy\"\nup = \"z\"\n";
     let files: [(&str, &[u8]); 3] =
         [("scene.toml", manifest), ("parts/square.obj", SQUARE.as_bytes()), ("parts/u.npy", &lift_mode())];
     let info = upload(&server, "", &files).await.expect("expected the upload to succeed");
     assert_eq!((info.scene.as_str(), info.up.as_str(), info.coordinates), ("sent", "z", 1));
-    assert_eq!(drive_last_vertex(&server, "sent").await, [0.0, 1.0, 3.0]);
+    assert_eq!(deform_last_vertex(&server, "sent").await, [0.0, 1.0, 3.0]);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn invalid_files_are_rejected_and_leave_no_files() {
-    let (state, scenes) = (
+    let (state_folder, repository_folder) = (
         tempfile::tempdir().expect("expected a temporary folder"),
         tempfile::tempdir().expect("expected a temporary folder"),
     );
-    let server = server(state.path(), scenes.path()).await;
+    let server = start_server(state_folder.path(), repository_folder.path()).await;
     let square = SQUARE.as_bytes();
     let truncated_modes = &lift_mode()[..150];
     let missing_texture = b"model = \"a.obj\"\n[material.\"*\"]\ncolour_texture = \"nowhere.png\"\n";
@@ -122,11 +122,11 @@ async fn invalid_files_are_rejected_and_leave_no_files() {
     let escaping_path = b"model = \"../../../scenes.json\"\n";
     let index_out_of_range = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n";
     type Files<'a> = Vec<(&'a str, &'a [u8])>;
-    let wrong_rows = encode_npy(9, 1, &[0.0; 9]);
+    let too_few_rows = encode_npy(9, 1, &[0.0; 9]);
     let nan_modes = encode_npy(12, 1, &[f32::NAN; 12]);
     // Name of the case, files, and words that the error must contain.
     let cases: Vec<(&str, Files<'_>, [&str; 2])> = vec![
-        ("rows that are not 3n", vec![("a.obj", square), ("a.npy", &wrong_rows)], ["rows", "12"]),
+        ("rows that are not 3n", vec![("a.obj", square), ("a.npy", &too_few_rows)], ["rows", "12"]),
         ("truncated modes", vec![("a.obj", square), ("a.npy", truncated_modes)], ["a.npy", ""]),
         ("modes that are not finite", vec![("a.obj", square), ("a.npy", &nan_modes)], ["modes[0, 0]", "NaN"]),
         ("malformed SOFA modes", vec![("a.obj", square), ("modes.txt", b"12 1\n1 2 x")], ["modes.txt", ""]),
@@ -148,7 +148,7 @@ async fn invalid_files_are_rejected_and_leave_no_files() {
             assert!(status.message().contains(word), "{name}: expected '{word}' in {status:?}");
         }
         assert_eq!(
-            std::fs::read_dir(state.path().join("uploads")).expect("expected a temporary folder").count(),
+            std::fs::read_dir(state_folder.path().join("uploads")).expect("expected an uploads folder").count(),
             0,
             "{name}"
         );

@@ -32,11 +32,11 @@ use v1::scene_service_client::SceneServiceClient;
 use v1::step_service_client::StepServiceClient;
 use v1::vertex_service_client::VertexServiceClient;
 
-/// Longest time that a test waits for an answer.
+/// Maximum time that a test waits for one reply.
 pub(crate) const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Source of scenes built in code: `strips` (two small domains), `far` (the same, far from the origin), `twig` (with
-/// followers), `kept` (with displacements and boxes), `sheet` (more than 1 MiB per array) and `panic` (a loader that
+/// followers), `attributes` (with displacements and boxes), `sheet` (more than 1 MiB per array) and `panic` (the loader
 /// panics).
 pub(crate) struct SyntheticScenes;
 
@@ -46,9 +46,9 @@ impl SceneSource for SyntheticScenes {
             "strips" => strips(),
             "far" => far_strips(),
             "twig" => twig(),
-            "kept" => strips_with_attributes(),
+            "attributes" => strips_with_attributes(),
             "sheet" => sheet(),
-            "panic" => panic!("a planted panic of a loader"),
+            "panic" => panic!("intended panic of the loader"),
             _ => return Err(Error::NotFound { what: "scene", given: source.into() }),
         };
         Ok(scene.into())
@@ -101,36 +101,43 @@ pub(crate) fn strips_with_attributes() -> Arc<Scene> {
     let (shape, domains) = two_strips(4.0);
     let deformation = DeformationSettings { displacements: true, boxes: true, ..DeformationSettings::default() };
     let (shapes, materials) = (vec![shape], vec![Material::default()]);
-    Scene::new(SceneParts { shapes, materials, domains, deformation, ..SceneParts::named("kept") })
+    Scene::new(SceneParts { shapes, materials, domains, deformation, ..SceneParts::named("attributes") })
         .expect("expected a valid scene")
 }
 
-fn two_strips(size: f32) -> (Shape, Vec<Domain>) {
-    let entry = |entry: u32| if entry.is_multiple_of(5) { 0.5 } else { 0.125 * (entry % 3) as f32 };
-    let columns = (0..24).map(|at| size * entry(at)).collect();
-    let shape = Shape::new(grid(2), Modes::from_columns(12, 2, columns).expect("12 x 2")).expect("fits");
-    let joint = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 3] };
+/// The shape and the domains of [`strips`], with the entries of U times `mode_scale`.
+fn two_strips(mode_scale: f32) -> (Shape, Vec<Domain>) {
+    let unscaled_entry = |index: u32| if index.is_multiple_of(5) { 0.5 } else { 0.125 * (index % 3) as f32 };
+    let columns = (0..24).map(|index| mode_scale * unscaled_entry(index)).collect();
+    let modes = Modes::from_columns(12, 2, columns).expect("expected valid modes");
+    let shape = Shape::new(grid(2), modes).expect("expected a valid shape");
+    let attachment = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 3] };
     let notes = [("species".to_owned(), "none".to_owned())].into();
     let metadata = Metadata { eigenvalues: vec![1.0, 4.0], notes };
     let left = Domain { metadata, ..domain("left", None) };
-    (shape, vec![left, domain("right", Some(joint))])
+    (shape, vec![left, domain("right", Some(attachment))])
 }
 
 /// One sheet of 300 x 300 vertices and four modes.
 pub(crate) fn sheet() -> Arc<Scene> {
     let rows = 3 * 300 * 300;
     let columns = (0..4 * rows).map(|entry| ((entry % 1009) as f32 - 504.0) / 1009.0).collect();
-    let shape = Shape::new(grid(300), Modes::from_columns(rows, 4, columns).expect("fits")).expect("fits");
+    let shape = Shape::new(grid(300), Modes::from_columns(rows, 4, columns).expect("expected valid modes"))
+        .expect("expected a valid shape");
     scene("sheet", shape, vec![domain("sheet", None)])
 }
 
+/// A square of `side` x `side` vertices with unit spacing.
 fn grid(side: u32) -> Mesh {
-    let rest = (0..side * side).map(|at| [(at % side) as f32, (at / side) as f32, 0.0]).collect::<Vec<_>>();
-    let uvs = rest.iter().map(|[x, y, _]| [x / side as f32, y / side as f32]).collect();
+    let positions =
+        (0..side * side).map(|index| [(index % side) as f32, (index / side) as f32, 0.0]).collect::<Vec<_>>();
+    let uvs = positions.iter().map(|[x, y, _]| [x / side as f32, y / side as f32]).collect();
     let cells = (0..(side - 1) * (side - 1)).map(|cell| cell % (side - 1) + cell / (side - 1) * side);
-    let triangles = cells.flat_map(|at| [[at, at + 1, at + side], [at + 1, at + side + 1, at + side]]).collect();
-    let normals = vec![[0.0, 0.0, 1.0]; rest.len()];
-    Mesh::from_indexed(rest, normals, uvs, triangles).expect("expected a valid mesh")
+    let triangles = cells
+        .flat_map(|index| [[index, index + 1, index + side], [index + 1, index + side + 1, index + side]])
+        .collect();
+    let normals = vec![[0.0, 0.0, 1.0]; positions.len()];
+    Mesh::from_indexed(positions, normals, uvs, triangles).expect("expected a valid mesh")
 }
 
 fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
@@ -164,7 +171,7 @@ pub(crate) fn config(state: &Path) -> Config {
 pub(crate) struct Server {
     pub(crate) engine: Engine,
     pub(crate) address: String,
-    stop: Option<oneshot::Sender<()>>,
+    stop_sender: Option<oneshot::Sender<()>>,
     task: JoinHandle<Result<()>>,
     /// Deleted after the server has stopped.
     folder: Option<tempfile::TempDir>,
@@ -192,12 +199,12 @@ impl Server {
         let listener = service::bind(&config).await.expect("expected a free port");
         let address = format!("http://{}", listener.local_addr().expect("expected a socket address"));
         let engine = Engine::start(config, source).await.expect("expected an engine");
-        let (stop, stop_receiver) = oneshot::channel();
+        let (stop_sender, stop_receiver) = oneshot::channel();
         let shutdown = async {
             stop_receiver.await.ok();
         };
         let task = tokio::spawn(service::serve(engine.clone(), listener, shutdown));
-        Self { engine, address, stop: Some(stop), task, folder: None }
+        Self { engine, address, stop_sender: Some(stop_sender), task, folder: None }
     }
 
     pub(crate) async fn channel(&self) -> Channel {
@@ -227,23 +234,23 @@ impl Server {
             .await
             .open_scene(request)
             .await
-            .expect("opens")
+            .expect("expected the scene to open")
             .into_inner()
             .scene
             .expect("expected the scene info")
     }
 
     /// Opens a step stream and expects success.
-    pub(crate) async fn drive(&self, scene: &str, policy: v1::Policy, window: u32) -> Driver {
-        let mut driver = Driver::connect(self.channel().await).await;
-        let opened = driver.open(scene, policy, window).await;
+    pub(crate) async fn drive(&self, scene: &str, policy: v1::Policy, window: u32) -> StepWriter {
+        let mut writer = StepWriter::connect(self.channel().await).await;
+        let opened = writer.open(scene, policy, window).await;
         assert!(matches!(opened, ResponseKind::Opened(_)), "{opened:?}");
-        driver
+        writer
     }
 
     /// Stops the server and waits for its end.
     pub(crate) async fn stop(mut self) -> Result<()> {
-        self.stop.take().expect("expected a running server").send(()).ok();
+        self.stop_sender.take().expect("expected a running server").send(()).ok();
         with_timeout(self.task).await.expect("expected the task not to panic")
     }
 }
@@ -254,12 +261,12 @@ pub(crate) async fn with_timeout<T>(work: impl Future<Output = T>) -> T {
 }
 
 /// Client end of a step stream, as a physics process uses it.
-pub(crate) struct Driver {
+pub(crate) struct StepWriter {
     sender: mpsc::Sender<v1::DriveSceneRequest>,
     pub(crate) replies: Streaming<v1::DriveSceneResponse>,
 }
 
-impl Driver {
+impl StepWriter {
     pub(crate) async fn connect(channel: Channel) -> Self {
         let (sender, requests) = mpsc::channel(1024);
         let mut client = StepServiceClient::new(channel);
@@ -273,36 +280,36 @@ impl Driver {
     pub(crate) async fn open(&mut self, scene: &str, policy: v1::Policy, window: u32) -> ResponseKind {
         let open = v1::OpenDrive { scene: scene.into(), policy: policy.into(), window };
         self.send(RequestKind::Open(open)).await;
-        self.reply().await
+        self.receive_reply().await
     }
 
     pub(crate) async fn send(&self, kind: RequestKind) {
         self.sender.send(v1::DriveSceneRequest { kind: Some(kind) }).await.expect("expected an open stream");
     }
 
-    pub(crate) async fn step(&self, step: v1::Step) {
+    pub(crate) async fn send_step(&self, step: v1::Step) {
         self.send(RequestKind::Step(step)).await;
     }
 
-    pub(crate) async fn reply(&mut self) -> ResponseKind {
+    pub(crate) async fn receive_reply(&mut self) -> ResponseKind {
         let reply =
             with_timeout(self.replies.message()).await.expect("expected another message").expect("expected a reply");
         reply.kind.expect("expected a message kind")
     }
 
-    /// Sends a step and expects its acknowledgement.
-    pub(crate) async fn step_acknowledged(&mut self, step: v1::Step) -> v1::Acknowledgement {
+    /// Sends a step, waits for the reply and expects its acknowledgement.
+    pub(crate) async fn send_step_and_wait(&mut self, step: v1::Step) -> v1::Acknowledgement {
         let number = step.number;
-        self.step(step).await;
-        match self.reply().await {
+        self.send_step(step).await;
+        match self.receive_reply().await {
             ResponseKind::Ack(ack) if ack.step == number => ack,
             other => panic!("expected an acknowledgement of step {number}, got {other:?}"),
         }
     }
 
-    /// Expects a rejection.
-    pub(crate) async fn rejection(&mut self) -> v1::Rejection {
-        match self.reply().await {
+    /// Receives a reply and expects a rejection.
+    pub(crate) async fn receive_rejection(&mut self) -> v1::Rejection {
+        match self.receive_reply().await {
             ResponseKind::Rejection(rejection) => rejection,
             other => panic!("expected a rejection, got {other:?}"),
         }
@@ -315,7 +322,7 @@ impl Driver {
         while with_timeout(replies.message()).await.expect("expected the stream to end without an error").is_some() {}
     }
 
-    /// Both directions, for concurrent use.
+    /// Splits the stream into its two directions, for concurrent use.
     pub(crate) fn split(self) -> (mpsc::Sender<v1::DriveSceneRequest>, Streaming<v1::DriveSceneResponse>) {
         (self.sender, self.replies)
     }
@@ -348,24 +355,33 @@ pub(crate) fn rigid_step(number: u64, format: v1::TransformFormat, poses: &[(u32
     }
 }
 
+#[derive(Debug, PartialEq)]
+pub(crate) struct ReferenceVertices {
+    pub(crate) positions: Vec<f32>,
+    pub(crate) normals: Vec<f32>,
+}
+
 /// Positions and normals of the reference after some steps.
-pub(crate) fn reference_vertices(scene: &Scene, steps: &[v1::Step]) -> (Vec<f32>, Vec<f32>) {
+pub(crate) fn reference_vertices(scene: &Scene, steps: &[v1::Step]) -> ReferenceVertices {
     let state = state_after_steps(scene, steps);
-    let round = |list: Vec<[f64; 3]>| list.into_flattened().into_iter().map(|number| number as f32).collect();
-    (round(reference::deform(scene, &state)), round(reference::rigid_normals(scene, &state)))
+    let round_to_f32 = |list: Vec<[f64; 3]>| list.into_flattened().into_iter().map(|number| number as f32).collect();
+    ReferenceVertices {
+        positions: round_to_f32(reference::deform(scene, &state)),
+        normals: round_to_f32(reference::rigid_normals(scene, &state)),
+    }
 }
 
 /// State of the scene after some steps.
 pub(crate) fn state_after_steps(scene: &Scene, steps: &[v1::Step]) -> SceneState {
-    use v1::TransformFormat as Wire;
+    use v1::TransformFormat as WireFormat;
     let mut state = SceneState::rest(scene);
     for step in steps.iter().cloned() {
         let transform_format = match step.transform_format() {
-            Wire::Unspecified | Wire::AffineF32 => TransformFormat::Affine,
-            Wire::RigidF32 => TransformFormat::RigidF32,
-            Wire::RigidF64 => TransformFormat::RigidF64,
+            WireFormat::Unspecified | WireFormat::AffineF32 => TransformFormat::Affine,
+            WireFormat::RigidF32 => TransformFormat::RigidF32,
+            WireFormat::RigidF64 => TransformFormat::RigidF64,
         };
-        let raw = RawStepUpdate {
+        let raw_update = RawStepUpdate {
             number: step.number,
             time: step.time,
             q_domains: step.q_domains,
@@ -374,7 +390,7 @@ pub(crate) fn state_after_steps(scene: &Scene, steps: &[v1::Step]) -> SceneState
             transforms: step.transforms,
             transform_format,
         };
-        state.apply(scene, &StepUpdate::parse(scene, &raw).expect("expected a valid step"));
+        state.apply(scene, &StepUpdate::parse(scene, &raw_update).expect("expected a valid step"));
     }
     state
 }
@@ -409,7 +425,7 @@ pub(crate) async fn get_vertices(
         assert!(response.encoded_len() <= (1 << 20) + 4096, "{} bytes", response.encoded_len());
         chunks.push(response.chunk.expect("expected a chunk"));
     }
-    Ok(join(chunks))
+    Ok(join_chunks(chunks))
 }
 
 /// Reads the next step of a vertex stream; `None` at its end.
@@ -421,14 +437,14 @@ pub(crate) async fn next_vertices(
         chunks.push(response.chunk.expect("expected a chunk"));
         let total = chunks[0].head.as_ref().expect("expected a head as the first message").total;
         if chunks.iter().map(|chunk| chunk.data.len() as u64).sum::<u64>() == total {
-            return Ok(Some(join(chunks)));
+            return Ok(Some(join_chunks(chunks)));
         }
     }
     assert!(chunks.is_empty(), "expected the stream to end after a complete step");
     Ok(None)
 }
 
-fn join(mut chunks: Vec<v1::VertexChunk>) -> ReceivedVertices {
+fn join_chunks(mut chunks: Vec<v1::VertexChunk>) -> ReceivedVertices {
     let head = chunks[0].head.take().expect("expected a head as the first message");
     let mut bytes = Vec::new();
     for chunk in chunks {

@@ -10,7 +10,7 @@ use crate::service_harness::{
     Server, get_vertices, next_vertices, reference_vertices, sheet, step, strips, with_timeout,
 };
 
-fn vertices_of(scene: &str) -> v1::GetVerticesRequest {
+fn vertex_request(scene: &str) -> v1::GetVerticesRequest {
     v1::GetVerticesRequest { scene: scene.into(), ..v1::GetVerticesRequest::default() }
 }
 
@@ -25,24 +25,25 @@ async fn subscribe_vertices(server: &Server, delivery: Delivery) -> Subscription
 async fn acknowledged_steps_have_vertices_of_the_reference() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let mut driver = server.drive("strips", Policy::Lossless, 0).await;
+    let mut writer = server.drive("strips", Policy::Lossless, 0).await;
     let mut rotated_step = step(1, &[1], &[0.5, -0.25]);
-    let matrix = [0.0_f32, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0];
+    let transform = [0.0_f32, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0];
     rotated_step.transform_domains = vec![1];
-    rotated_step.transforms = matrix.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
+    rotated_step.transforms = transform.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
     let steps = [step(0, &[], &[0.1, 0.2, 0.3, 0.4]), rotated_step, step(7, &[0], &[0.75, 0.0])];
     for index in 0..steps.len() {
-        let ack = driver.step_acknowledged(steps[index].clone()).await;
+        let ack = writer.send_step_and_wait(steps[index].clone()).await;
         let stages: Vec<&str> = ack.stages.iter().map(|stage| stage.stage.as_str()).collect();
         assert_eq!(stages, ["parse", "queue", "deform"]);
-        let got = get_vertices(&server, vertices_of("strips")).await.expect("expected vertices");
-        assert_eq!((got.positions.clone(), got.normals.clone()), reference_vertices(&strips(), &steps[..=index]));
-        let want = v1::StepId { run: 1, number: steps[index].number, time: steps[index].time };
-        assert_eq!(got.step(), want);
+        let reply = get_vertices(&server, vertex_request("strips")).await.expect("expected vertices");
+        let expected = reference_vertices(&strips(), &steps[..=index]);
+        assert_eq!((&reply.positions, &reply.normals), (&expected.positions, &expected.normals));
+        let expected_step = v1::StepId { run: 1, number: steps[index].number, time: steps[index].time };
+        assert_eq!(reply.step(), expected_step);
     }
     // Negative control: other steps give other vertices.
     assert_ne!(reference_vertices(&strips(), &steps[..2]), reference_vertices(&strips(), &steps));
-    driver.finish().await;
+    writer.finish().await;
 }
 
 /// The stream ends after the requested number of steps.
@@ -59,21 +60,21 @@ async fn lossless_subscriber_gets_every_step_in_order() {
     // Subscribing needs no step and no writer.
     let mut stream =
         server.vertices().await.stream_vertices(request).await.expect("expected a subscription").into_inner();
-    let mut driver = server.drive("strips", Policy::Lossless, 4).await;
+    let mut writer = server.drive("strips", Policy::Lossless, 4).await;
     let steps: Vec<_> = (0..40).map(|number| step(number * 2, &[1], &[0.01 * number as f32, 1.0])).collect();
     let read_steps = async {
         for index in 0..30 {
-            let got =
+            let vertices =
                 next_vertices(&mut stream).await.expect("expected another message").expect("expected a valid step");
-            assert_eq!((got.step().number, got.head.skipped), (steps[index].number, 0));
-            assert_eq!(got.positions, reference_vertices(&strips(), &steps[..=index]).0[12..]);
-            assert!(got.normals.is_empty());
+            assert_eq!((vertices.step().number, vertices.head.skipped), (steps[index].number, 0));
+            assert_eq!(vertices.positions, reference_vertices(&strips(), &steps[..=index]).positions[12..]);
+            assert!(vertices.normals.is_empty());
         }
-        assert!(next_vertices(&mut stream).await.expect("a clean end").is_none());
+        assert!(next_vertices(&mut stream).await.expect("expected the stream to end without an error").is_none());
     };
     let send_steps = async {
         for step in &steps {
-            driver.step_acknowledged(step.clone()).await;
+            writer.send_step_and_wait(step.clone()).await;
         }
     };
     tokio::join!(read_steps, send_steps);
@@ -89,23 +90,27 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
         subscriptions.push(subscribe_vertices(&server, delivery).await);
     }
     let steps: Vec<_> = (0..40).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();
-    let mut driver = server.drive("strips", Policy::Lossless, 40).await;
+    let mut writer = server.drive("strips", Policy::Lossless, 40).await;
     // All steps are sent at once, so that a step is always queued.
     for step in &steps {
-        driver.step(step.clone()).await;
+        writer.send_step(step.clone()).await;
     }
     let check_output = |output: &modalcast::engine::StepOutput| {
-        let modalcast::engine::OutputBody::Vertices(surface) = &output.body else { panic!("not vertices") };
+        let modalcast::engine::OutputBody::Vertices(surface) = &output.body else { panic!("expected vertices") };
         let index = output.step.number as usize;
         let stages: Vec<_> = output.stages.iter().map(|(stage, _)| stage.name()).collect();
         assert_eq!(stages, ["parse", "queue", "deform", "copy"]);
-        assert_eq!(surface.positions, reference_vertices(&strips(), &steps[..=index]).0, "step {index}");
-        assert_ne!(surface.positions, reference_vertices(&strips(), &steps[..=(index + 1) % 40]).0, "negative control");
+        assert_eq!(surface.positions, reference_vertices(&strips(), &steps[..=index]).positions, "step {index}");
+        assert_ne!(
+            surface.positions,
+            reference_vertices(&strips(), &steps[..=(index + 1) % 40]).positions,
+            "negative control: the next step has other positions"
+        );
         index
     };
-    let mut latest = subscriptions.pop().expect("expected three subscriptions");
-    let latest_index = check_output(&with_timeout(latest.next()).await.expect("expected the newest step"));
-    drop(latest);
+    let mut latest_subscription = subscriptions.pop().expect("expected three subscriptions");
+    let latest_index = check_output(&with_timeout(latest_subscription.next()).await.expect("expected the newest step"));
+    drop(latest_subscription);
     assert!(latest_index < 40);
     for index in 0..40 {
         for subscription in &mut subscriptions {
@@ -114,9 +119,9 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
         }
     }
     for index in 0..40 {
-        assert!(matches!(driver.reply().await, ResponseKind::Ack(ack) if ack.step == index));
+        assert!(matches!(writer.receive_reply().await, ResponseKind::Ack(ack) if ack.step == index));
     }
-    driver.finish().await;
+    writer.finish().await;
 }
 
 /// A subscriber that does not read applies back-pressure to the writer. A step beyond the window is rejected.
@@ -125,15 +130,15 @@ async fn unread_lossless_subscription_applies_back_pressure() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let mut subscription = subscribe_vertices(&server, Delivery::Lossless).await;
-    let mut driver = server.drive("strips", Policy::Lossless, 2).await;
+    let mut writer = server.drive("strips", Policy::Lossless, 2).await;
     // Two steps are queued in the subscription. The third is computed but not acknowledged, the fourth waits, and the
     // fifth exceeds the window.
-    driver.step_acknowledged(step(1, &[0], &[0.1, 0.0])).await;
-    driver.step_acknowledged(step(2, &[0], &[0.2, 0.0])).await;
+    writer.send_step_and_wait(step(1, &[0], &[0.1, 0.0])).await;
+    writer.send_step_and_wait(step(2, &[0], &[0.2, 0.0])).await;
     for number in 3..=5 {
-        driver.step(step(number, &[0], &[number as f32 / 10.0, 0.0])).await;
+        writer.send_step(step(number, &[0], &[number as f32 / 10.0, 0.0])).await;
     }
-    let rejection = driver.rejection().await;
+    let rejection = writer.receive_rejection().await;
     assert_eq!((rejection.step, rejection.field.as_str()), (Some(5), "window"));
     assert_eq!(rejection.expected, "at most 2 steps without acknowledgement");
     // Reading releases the remaining steps. The rejected step was not applied.
@@ -141,10 +146,10 @@ async fn unread_lossless_subscription_applies_back_pressure() {
         assert_eq!(with_timeout(subscription.next()).await.expect("expected another message").step.number, number);
     }
     for number in 3..=4 {
-        assert!(matches!(driver.reply().await, ResponseKind::Ack(ack) if ack.step == number));
+        assert!(matches!(writer.receive_reply().await, ResponseKind::Ack(ack) if ack.step == number));
     }
-    let got = get_vertices(&server, vertices_of("strips")).await.expect("expected vertices");
-    assert_eq!(got.positions, reference_vertices(&strips(), &[step(4, &[0], &[0.4, 0.0])]).0);
+    let reply = get_vertices(&server, vertex_request("strips")).await.expect("expected vertices");
+    assert_eq!(reply.positions, reference_vertices(&strips(), &[step(4, &[0], &[0.4, 0.0])]).positions);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -153,9 +158,9 @@ async fn stalled_subscriber_is_disconnected_and_writer_continues() {
     let server = Server::start_with(|config| modalcast::config::Config { stall_timeout, ..config }).await;
     server.open("strips").await;
     let mut subscription = subscribe_vertices(&server, Delivery::Lossless).await;
-    let mut driver = server.drive("strips", Policy::Lossless, 1).await;
+    let mut writer = server.drive("strips", Policy::Lossless, 1).await;
     for number in 1..=6 {
-        driver.step_acknowledged(step(number, &[0], &[0.1, 0.0])).await;
+        writer.send_step_and_wait(step(number, &[0], &[0.1, 0.0])).await;
     }
     let error = with_timeout(subscription.disconnected()).await;
     assert!(matches!(error, modalcast_model::error::Error::Busy { .. }), "{error}");
@@ -164,80 +169,81 @@ async fn stalled_subscriber_is_disconnected_and_writer_continues() {
     assert_eq!(with_timeout(subscription.next()).await.expect_err("expected the subscription to end"), error);
 }
 
-/// The final state equals that after applying every step.
+/// Merging does not lose an update: the final state equals that after applying every step.
 #[tokio::test(flavor = "multi_thread")]
 async fn latest_policy_merges_steps_and_counts_skipped_ones() {
     let server = Server::start_default().await;
     server.open("sheet").await;
-    let mut driver = server.drive("sheet", Policy::Latest, 4).await;
+    let mut writer = server.drive("sheet", Policy::Latest, 4).await;
     let transform = |offset: f32| -> Vec<u8> {
-        let rows = [1.0, 0.0, 0.0, offset, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0_f32];
-        rows.iter().flat_map(|number| number.to_le_bytes()).collect()
+        let matrix = [1.0, 0.0, 0.0, offset, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0_f32];
+        matrix.iter().flat_map(|number| number.to_le_bytes()).collect()
     };
     // Only the first step moves the sheet, so a lost step changes the result.
     let mut steps = vec![v1::Step { transforms: transform(5.0).into(), ..step(1, &[], &[]) }];
     steps.extend((2..=200).map(|number| step(number, &[0], &[0.001 * number as f32, 0.5, 0.0, 1.0])));
     for step in &steps {
-        driver.step(step.clone()).await;
+        writer.send_step(step.clone()).await;
     }
-    let mut acks = 0;
-    let last = loop {
-        match driver.reply().await {
+    let mut earlier_acks = 0;
+    let last_ack = loop {
+        match writer.receive_reply().await {
             ResponseKind::Ack(ack) if ack.step == 200 => break ack,
-            ResponseKind::Ack(_) => acks += 1,
-            other => panic!("{other:?}"),
+            ResponseKind::Ack(_) => earlier_acks += 1,
+            kind => panic!("expected an acknowledgement, got {kind:?}"),
         }
     };
-    assert!(last.skipped > 0, "expected skipped steps, got {acks} acknowledgements before the last");
-    assert!(last.skipped + acks < 200);
-    let got = get_vertices(&server, vertices_of("sheet")).await.expect("expected vertices");
-    assert_eq!((got.positions, got.normals), reference_vertices(&sheet(), &steps));
+    assert!(last_ack.skipped > 0, "expected skipped steps, got {earlier_acks} acknowledgements before the last");
+    assert!(last_ack.skipped + earlier_acks < 200);
+    let reply = get_vertices(&server, vertex_request("sheet")).await.expect("expected vertices");
+    let expected = reference_vertices(&sheet(), &steps);
+    assert_eq!((reply.positions, reply.normals), (expected.positions, expected.normals));
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn latest_subscriber_gets_current_step_and_skip_count() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let mut driver = server.drive("strips", Policy::Lossless, 0).await;
-    driver.step_acknowledged(step(3, &[0], &[0.1, 0.0])).await;
+    let mut writer = server.drive("strips", Policy::Lossless, 0).await;
+    writer.send_step_and_wait(step(3, &[0], &[0.1, 0.0])).await;
     let mut subscription = subscribe_vertices(&server, Delivery::Latest).await;
-    let first = with_timeout(subscription.next()).await.expect("the current step");
-    assert_eq!((first.step.number, first.skipped), (3, 0));
+    let first_output = with_timeout(subscription.next()).await.expect("expected the current step");
+    assert_eq!((first_output.step.number, first_output.skipped), (3, 0));
     for number in 4..=8 {
-        driver.step_acknowledged(step(number, &[0], &[0.1, 0.0])).await;
+        writer.send_step_and_wait(step(number, &[0], &[0.1, 0.0])).await;
     }
-    let second = with_timeout(subscription.next()).await.expect("the newest step");
-    assert_eq!((second.step.number, second.skipped), (8, 4));
+    let second_output = with_timeout(subscription.next()).await.expect("expected the newest step");
+    assert_eq!((second_output.step.number, second_output.skipped), (8, 4));
 }
 
-/// The rejection of the second writer names the address and the run of the first. The same stream opens the scene once
-/// the first writer has left.
+/// The rejection of the second writer names the address and the run of the first writer. After that writer has left, the
+/// rejected stream can open the scene.
 #[tokio::test(flavor = "multi_thread")]
 async fn second_writer_waits_for_the_first_to_leave() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let mut first = server.drive("strips", Policy::Lossless, 0).await;
-    first.step_acknowledged(step(100, &[0], &[0.1, 0.0])).await;
-    let mut second = crate::service_harness::Driver::connect(server.channel().await).await;
-    let ResponseKind::Rejection(rejection) = second.open("strips", Policy::Lossless, 0).await else {
+    let mut first_writer = server.drive("strips", Policy::Lossless, 0).await;
+    first_writer.send_step_and_wait(step(100, &[0], &[0.1, 0.0])).await;
+    let mut second_writer = crate::service_harness::StepWriter::connect(server.channel().await).await;
+    let ResponseKind::Rejection(rejection) = second_writer.open("strips", Policy::Lossless, 0).await else {
         panic!("expected a rejection")
     };
     assert!(rejection.field.contains("writer"), "{rejection:?}");
     assert!(rejection.given.contains("127.0.0.1") && rejection.given.contains("run 1"), "{rejection:?}");
-    first.step_acknowledged(step(101, &[0], &[0.2, 0.0])).await;
-    first.finish().await;
-    // The rejected stream can open the scene now, and its step numbers start again.
-    let ResponseKind::Opened(opened) = second.open("strips", Policy::Latest, 100_000).await else {
+    first_writer.send_step_and_wait(step(101, &[0], &[0.2, 0.0])).await;
+    first_writer.finish().await;
+    // The step numbers of a new run start again.
+    let ResponseKind::Opened(opened) = second_writer.open("strips", Policy::Latest, 100_000).await else {
         panic!("expected the stream to open")
     };
     assert_eq!((opened.run, opened.window), (2, 256));
     assert_eq!(opened.scene.and_then(|scene| scene.last_step).map(|step| (step.run, step.number)), Some((1, 101)));
-    second.step_acknowledged(step(0, &[0], &[0.3, 0.0])).await;
-    second.disconnect();
+    second_writer.send_step_and_wait(step(0, &[0], &[0.3, 0.0])).await;
+    second_writer.disconnect();
     let open_third = async {
         loop {
-            let mut open_third = crate::service_harness::Driver::connect(server.channel().await).await;
-            if let ResponseKind::Opened(opened) = open_third.open("strips", Policy::Lossless, 0).await {
+            let mut third_writer = crate::service_harness::StepWriter::connect(server.channel().await).await;
+            if let ResponseKind::Opened(opened) = third_writer.open("strips", Policy::Lossless, 0).await {
                 return opened.run;
             }
         }
@@ -250,28 +256,28 @@ async fn requests_of_departed_clients_free_their_slots() {
     let server = Server::start_with(|config| modalcast::config::Config { max_pending_requests: 4, ..config }).await;
     server.open("strips").await;
     let step = Some(v1::get_vertices_request::Step::MinimumStep(99));
-    let pending_request = v1::GetVerticesRequest { deadline_ms: 600_000, step, ..vertices_of("strips") };
+    let pending_request = v1::GetVerticesRequest { deadline_ms: 600_000, step, ..vertex_request("strips") };
     let mut client = server.vertices().await;
     // Eight requests wait for a step that is never sent. Four of them are rejected, and so is every later request.
     let mut streams = Vec::new();
     for _ in 0..8 {
         streams.push(client.get_vertices(pending_request.clone()).await.expect("expected a stream").into_inner());
     }
-    let mut pending = tokio::task::JoinSet::new();
+    let mut pending_requests = tokio::task::JoinSet::new();
     for mut stream in streams {
-        pending.spawn(async move { stream.message().await.expect_err("expected an error").code() });
+        pending_requests.spawn(async move { stream.message().await.expect_err("expected an error").code() });
     }
     for _ in 0..4 {
-        let code = with_timeout(pending.join_next())
+        let code = with_timeout(pending_requests.join_next())
             .await
             .expect("expected eight tasks")
             .expect("expected the task not to panic");
         assert_eq!(code, tonic::Code::ResourceExhausted);
     }
-    let error = get_vertices(&server, vertices_of("strips")).await.expect_err("expected a busy error");
+    let error = get_vertices(&server, vertex_request("strips")).await.expect_err("expected a busy error");
     assert_eq!(error.code(), tonic::Code::ResourceExhausted);
-    pending.shutdown().await;
-    let retry = async { while get_vertices(&server, vertices_of("strips")).await.is_err() {} };
+    pending_requests.shutdown().await;
+    let retry = async { while get_vertices(&server, vertex_request("strips")).await.is_err() {} };
     with_timeout(retry).await;
 }
 
@@ -280,31 +286,37 @@ async fn requests_of_departed_clients_free_their_slots() {
 async fn requests_wait_for_exact_and_minimum_steps() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let mut driver = server.drive("strips", Policy::Lossless, 0).await;
-    let host = server.engine.find("strips").expect("expected an open scene");
-    let mut waiting = [StepSelector::Exact(2), StepSelector::Minimum(3), StepSelector::Exact(5)]
-        .map(|selector| Box::pin(host.request_output(selector, OutputSpec::Vertices(VertexAttributes::VERTICES))));
-    for request in &mut waiting {
+    let mut writer = server.drive("strips", Policy::Lossless, 0).await;
+    let scene_handle = server.engine.find("strips").expect("expected an open scene");
+    let mut pending_requests =
+        [StepSelector::Exact(2), StepSelector::Minimum(3), StepSelector::Exact(5)].map(|selector| {
+            Box::pin(scene_handle.request_output(selector, OutputSpec::Vertices(VertexAttributes::VERTICES)))
+        });
+    for pending_request in &mut pending_requests {
         // One poll registers the request.
-        assert!(tokio::time::timeout(std::time::Duration::ZERO, request).await.is_err(), "expected no step yet");
+        assert!(
+            tokio::time::timeout(std::time::Duration::ZERO, pending_request).await.is_err(),
+            "expected no step yet"
+        );
     }
     for number in [1, 2, 4, 5] {
-        driver.step_acknowledged(step(number, &[0], &[number as f32, 0.0])).await;
+        writer.send_step_and_wait(step(number, &[0], &[number as f32, 0.0])).await;
     }
-    let mut shown = Vec::new();
-    for request in waiting {
-        shown.push(with_timeout(request).await.expect("expected the requested step").step.number);
+    let mut step_numbers = Vec::new();
+    for pending_request in pending_requests {
+        step_numbers.push(with_timeout(pending_request).await.expect("expected the requested step").step.number);
     }
-    assert_eq!(shown, [2, 4, 5]);
-    let request_step = |step| v1::GetVerticesRequest { step: Some(step), ..vertices_of("strips") };
+    assert_eq!(step_numbers, [2, 4, 5]);
+    let request_step = |step| v1::GetVerticesRequest { step: Some(step), ..vertex_request("strips") };
     use v1::get_vertices_request::Step::{ExactStep, MinimumStep};
-    let gone = get_vertices(&server, request_step(ExactStep(4))).await.expect_err("it has passed");
-    assert_eq!(gone.code(), tonic::Code::FailedPrecondition);
-    let why = crate::service_harness::rejection_details(&gone);
-    assert!(why.given == "4" && why.expected.starts_with('5'), "{why:?}");
-    let begin = std::time::Instant::now();
-    let late = v1::GetVerticesRequest { deadline_ms: 80, ..request_step(MinimumStep(99)) };
-    let late = get_vertices(&server, late).await.expect_err("it never comes");
-    assert_eq!(late.code(), tonic::Code::DeadlineExceeded);
-    assert!(begin.elapsed() < std::time::Duration::from_secs(5), "{:?}", begin.elapsed());
+    let status = get_vertices(&server, request_step(ExactStep(4))).await.expect_err("expected an error of a past step");
+    assert_eq!(status.code(), tonic::Code::FailedPrecondition);
+    let rejection = crate::service_harness::rejection_details(&status);
+    assert!(rejection.given == "4" && rejection.expected.starts_with('5'), "{rejection:?}");
+    let start = std::time::Instant::now();
+    let late_request = v1::GetVerticesRequest { deadline_ms: 80, ..request_step(MinimumStep(99)) };
+    let status = get_vertices(&server, late_request).await.expect_err("expected a timeout");
+    assert_eq!(status.code(), tonic::Code::DeadlineExceeded);
+    let elapsed = start.elapsed();
+    assert!(elapsed < std::time::Duration::from_secs(5), "expected a timeout after 80 ms, got {elapsed:?}");
 }

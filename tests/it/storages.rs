@@ -17,7 +17,7 @@ const SIZES: [(usize, usize); 9] =
 
 /// A scene of strips of [`SIZES`]. The last two domains are instances of the first and of the fourth shape; the last
 /// one also shares the coordinates of the fourth domain.
-fn scene_of(deformation: DeformationSettings) -> Arc<Scene> {
+fn random_scene(deformation: DeformationSettings) -> Arc<Scene> {
     let mut random = TestRng(42);
     let mut parts = SceneParts::named("storages");
     parts.deformation = deformation;
@@ -77,14 +77,15 @@ fn tile_bounds(scene: &Scene, state: &SceneState, deformer: &CpuDeformer, domain
 
 /// Largest error of each domain relative to the bound of its tile; infinite for NaN.
 fn error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], deformer: &CpuDeformer) -> Vec<f64> {
-    let want = reference::deform(scene, state);
+    let expected = reference::deform(scene, state);
     let domain_ratio = |domain: usize| {
         let slot = scene.layout.domains[domain];
         let bounds = tile_bounds(scene, state, deformer, domain);
         let vertex_ratio = |vertex: usize| {
-            let packed = slot.first_vertex + vertex;
-            let square = |axis: usize| (f64::from(positions[3 * packed + axis]) - want[packed][axis]).powi(2);
-            let ratio = (0..3).map(square).sum::<f64>().sqrt() / bounds[vertex / (QUAD * TILE_QUADS)];
+            let packed_vertex = slot.first_vertex + vertex;
+            let squared_error =
+                |axis: usize| (f64::from(positions[3 * packed_vertex + axis]) - expected[packed_vertex][axis]).powi(2);
+            let ratio = (0..3).map(squared_error).sum::<f64>().sqrt() / bounds[vertex / (QUAD * TILE_QUADS)];
             if ratio.is_nan() { f64::INFINITY } else { ratio }
         };
         (0..slot.vertices).map(vertex_ratio).fold(0.0, f64::max)
@@ -92,17 +93,25 @@ fn error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], deformer: 
     (0..scene.domains.len()).map(domain_ratio).collect()
 }
 
-/// Negative control: a state with the opposite sign exceeds the bound.
+/// Negative control: the positions of the negated coordinates exceed the bound.
 #[test]
 fn errors_stay_within_bounds_in_every_storage() {
     for storage in StorageType::ALL {
         for (compensated, truncation) in [(false, None), (true, None), (false, Some(0.02)), (true, Some(0.02))] {
-            let scene =
-                scene_of(DeformationSettings { storage, compensated, truncation, ..DeformationSettings::default() });
+            let scene = random_scene(DeformationSettings {
+                storage,
+                compensated,
+                truncation,
+                ..DeformationSettings::default()
+            });
             let mut state = random_state(&scene);
             // Decreasing amplitudes, so that some modes may be truncated.
-            let count = state.q.len() as f32;
-            state.q.iter_mut().enumerate().for_each(|(mode, number)| *number *= f32::exp2(-12.0 * mode as f32 / count));
+            let coordinate_count = state.q.len() as f32;
+            state
+                .q
+                .iter_mut()
+                .enumerate()
+                .for_each(|(mode, number)| *number *= f32::exp2(-12.0 * mode as f32 / coordinate_count));
             let mut deformer = CpuDeformer::new(&scene);
             let (_, positions) = deform(&mut deformer, &state);
             for (domain, ratio) in error_ratios(&scene, &state, &positions, &deformer).into_iter().enumerate() {
@@ -111,12 +120,12 @@ fn errors_stay_within_bounds_in_every_storage() {
             let mut negated_state = state.clone();
             negated_state.q.iter_mut().for_each(|number| *number = -*number);
             let ratios = error_ratios(&scene, &negated_state, &positions, &deformer);
-            // Truncation may drop a mode within the budget, so its sign has no effect on the error.
+            // With truncation, modes may be dropped, and then the sign of their coordinates has no effect.
             let is_sensitive = |domain: usize| scene.rank_of(domain) > 0 && truncation.is_none();
             for domain in (0..ratios.len()).filter(|domain| is_sensitive(*domain)) {
                 assert!(
                     ratios[domain] > 1.0,
-                    "{storage:?}, domain {domain}: a wrong sign is {} of the bound",
+                    "{storage:?}, domain {domain}: expected a wrong sign to exceed the bound, got {} of it",
                     ratios[domain]
                 );
             }
@@ -127,10 +136,10 @@ fn errors_stay_within_bounds_in_every_storage() {
 #[test]
 fn positions_do_not_depend_on_threads_or_earlier_steps() {
     for storage in StorageType::ALL {
-        let scene = scene_of(DeformationSettings { storage, ..DeformationSettings::default() });
+        let scene = random_scene(DeformationSettings { storage, ..DeformationSettings::default() });
         let mut state = random_state(&scene);
-        let mut retained = CpuDeformer::new(&scene);
-        deform(&mut retained, &state);
+        let mut reused_deformer = CpuDeformer::new(&scene);
+        deform(&mut reused_deformer, &state);
         let mut random = TestRng(5);
         for step in 0..6 {
             // Each step changes q of one domain and the transform of another. The last step changes nothing, the one
@@ -141,32 +150,35 @@ fn positions_do_not_depend_on_threads_or_earlier_steps() {
                 state.q[changed_q].iter_mut().for_each(|number| *number = random.next());
                 state.transforms[[1, 6, 10, 3, 5][step]].0[3] += 0.5;
             }
-            let (summary, positions) = deform(&mut retained, &state);
+            let (summary, positions) = deform(&mut reused_deformer, &state);
             for threads in [1, 2, 5] {
                 let pool =
                     rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("expected a thread pool");
                 let mut new_deformer = CpuDeformer::new(&scene);
                 let (new_summary, new_positions) = pool.install(|| deform(&mut new_deformer, &state));
-                assert_eq!(bits(&positions), bits(&new_positions), "{storage:?}, step {step}, {threads} threads");
+                assert_eq!(
+                    f32_bits(&positions),
+                    f32_bits(&new_positions),
+                    "{storage:?}, step {step}, {threads} threads"
+                );
                 assert_eq!(summary.bounds, new_summary.bounds);
-                let (retained, new_deformer) = (
-                    retained.surface().expect("expected a surface"),
+                let (reused_deformer, new_deformer) = (
+                    reused_deformer.surface().expect("expected a surface"),
                     new_deformer.surface().expect("expected a surface"),
                 );
-                assert_eq!(retained.normals, new_deformer.normals);
+                assert_eq!(reused_deformer.normals, new_deformer.normals);
             }
         }
     }
 }
 
-fn bits(numbers: &[f32]) -> Vec<u32> {
+fn f32_bits(numbers: &[f32]) -> Vec<u32> {
     numbers.iter().map(|number| number.to_bits()).collect()
 }
 
 #[test]
 fn vertices_do_not_depend_on_the_tiling() {
-    // The first 129 vertices of a shape of 1500 vertices, together with the others or alone, fall into tiles of
-    // different sizes.
+    // The first 129 vertices of the large shape form the small shape. Their tiles differ in size.
     let mut random = TestRng(8);
     let columns: Vec<f32> = (0..4500 * 9).map(|_| random.next()).collect();
     let first_columns: Vec<f32> = columns.chunks_exact(4500).flat_map(|column| column[..387].to_vec()).collect();
@@ -178,7 +190,7 @@ fn vertices_do_not_depend_on_the_tiling() {
         );
         let state = random_state(&large);
         let [large, small] = [&large, &small].map(|scene| deform(&mut CpuDeformer::new(scene), &state).1);
-        assert_eq!(bits(&large[..387]), bits(&small), "{storage:?}");
+        assert_eq!(f32_bits(&large[..387]), f32_bits(&small), "{storage:?}");
     }
 }
 
@@ -186,7 +198,7 @@ fn vertices_do_not_depend_on_the_tiling() {
 fn huge_tiny_and_denormal_q_stay_within_the_bound() {
     for storage in StorageType::ALL {
         for compensated in [false, true] {
-            let scene = scene_of(DeformationSettings { storage, compensated, ..DeformationSettings::default() });
+            let scene = random_scene(DeformationSettings { storage, compensated, ..DeformationSettings::default() });
             let mut deformer = CpuDeformer::new(&scene);
             for scale in [1e30, 1e-38, 1e-42, 1e-45, 0.0] {
                 let mut state = random_state(&scene);
@@ -201,7 +213,8 @@ fn huge_tiny_and_denormal_q_stay_within_the_bound() {
     }
 }
 
-/// A sum that overflows itself is reported by bounds that are not finite, for that step only.
+/// Terms of U q may overflow while their sum is finite. If the sum overflows, the bounds are not finite for that step
+/// only.
 #[test]
 fn finite_sums_survive_overflowing_terms() {
     let mode = |entry: f32| vec![entry; 3 * 5];
@@ -251,16 +264,16 @@ fn truncation_budget_in_meters_holds_in_scene_units() {
         assert!(retained.len() > 2 && retained.len() < 20, "{retained:?}");
         assert!(error_ratios(&scene, &state, &positions, &deformer)[0] <= 1.0);
         // Truncated modes contribute nothing: the result has the bits of a state with zeros for these modes.
-        let mut zeroed = state.clone();
-        (0..24).filter(|mode| !retained.contains(&(*mode as u16))).for_each(|mode| zeroed.q[mode] = 0.0);
-        let untruncated_scene = without_truncation(&scene);
-        assert_eq!(bits(&deform(&mut CpuDeformer::new(&untruncated_scene), &zeroed).1), bits(&positions));
-        assert_ne!(bits(&deform(&mut CpuDeformer::new(&untruncated_scene), &state).1), bits(&positions));
+        let mut zeroed_state = state.clone();
+        (0..24).filter(|mode| !retained.contains(&(*mode as u16))).for_each(|mode| zeroed_state.q[mode] = 0.0);
+        let untruncated_scene = copy_without_truncation(&scene);
+        assert_eq!(f32_bits(&deform(&mut CpuDeformer::new(&untruncated_scene), &zeroed_state).1), f32_bits(&positions));
+        assert_ne!(f32_bits(&deform(&mut CpuDeformer::new(&untruncated_scene), &state).1), f32_bits(&positions));
     }
 }
 
 /// The same scene without a truncation budget.
-fn without_truncation(scene: &Scene) -> Arc<Scene> {
+fn copy_without_truncation(scene: &Scene) -> Arc<Scene> {
     let mut parts = SceneParts::named("plain");
     parts.materials = scene.materials.clone();
     parts.shapes = scene.shapes.clone();

@@ -19,11 +19,11 @@ const STEPS: u64 = 30;
 const REJECTED_STEP: u64 = 13;
 
 fn cameras(count: usize) -> Vec<Camera> {
-    let first = Camera::fit_to_scene(&strips_with_attributes(), SIZE.width, SIZE.height);
-    (0..count).map(|index| Camera { lens: Lens::FieldOfView(30.0 + 4.0 * index as f64), ..first }).collect()
+    let fitted_camera = Camera::fit_to_scene(&strips_with_attributes(), SIZE.width, SIZE.height);
+    (0..count).map(|index| Camera { lens: Lens::FieldOfView(30.0 + 4.0 * index as f64), ..fitted_camera }).collect()
 }
 
-fn frame_of(camera: Camera) -> OutputSpec {
+fn frame_output(camera: Camera) -> OutputSpec {
     OutputSpec::Frame { camera, size: SIZE, frame_output: FrameOutput::Color }
 }
 
@@ -32,60 +32,71 @@ fn steps() -> Vec<v1::Step> {
     (0..STEPS).map(|number| step(number, &[1], &[q(number), 0.5])).collect()
 }
 
-/// Images of every valid step per camera, rendered one by one.
-fn reference_images(cameras: &[Camera]) -> Vec<(u64, Vec<Vec<u8>>)> {
+/// The images of one step, one per camera.
+struct StepImages {
+    step: u64,
+    images: Vec<Vec<u8>>,
+}
+
+/// Images of every valid step, rendered one by one.
+fn reference_images(cameras: &[Camera]) -> Vec<StepImages> {
     let (scene, steps) = (strips_with_attributes(), steps());
     let config = Config { backend: BackendChoice::Cpu, ..Config::default() };
     let mut context = DeviceContext::open(&config).expect("expected a device context");
     let mut loaded_scene = context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
-    let mut images = Vec::new();
+    let mut steps_with_images = Vec::new();
     for step in steps.iter().filter(|step| step.number != REJECTED_STEP) {
         loaded_scene
             .deform(&state_after_steps(&scene, std::slice::from_ref(step)))
             .expect("expected the step to succeed");
         let mut draw = |camera: &Camera| context.draw(&mut loaded_scene, camera, SIZE).expect("expected a frame").rgba;
-        images.push((step.number, cameras.iter().map(&mut draw).collect()));
+        steps_with_images.push(StepImages { step: step.number, images: cameras.iter().map(&mut draw).collect() });
     }
     context.unload_scene(loaded_scene);
-    images
+    steps_with_images
 }
 
-fn pixels(output: &StepOutput) -> &[u8] {
+fn frame_bytes(output: &StepOutput) -> &[u8] {
     let OutputBody::Frame(image) = &output.body else { panic!("expected a frame") };
     &image.rgba
 }
 
 async fn start_server() -> Server {
-    let start_server =
+    let server =
         Server::start_with(|config| Config { backend: BackendChoice::Cpu, renderer: RendererChoice::Auto, ..config })
             .await;
-    start_server.open("kept").await;
-    start_server
+    server.open("attributes").await;
+    server
 }
 
-/// With more cameras than frames can be in flight, every frame is that of its step, and steps are answered in order.
+/// There are more cameras than frames can be in flight. Every frame shows its step, and replies to steps keep their order.
 #[tokio::test(flavor = "multi_thread")]
 async fn frames_of_many_cameras_show_their_own_step() {
-    let (start_server, cameras) = (start_server().await, cameras(5));
-    let host = start_server.engine.find("kept").expect("expected an open scene");
+    let (server, cameras) = (start_server().await, cameras(5));
+    let scene_handle = server.engine.find("attributes").expect("expected an open scene");
     let mut subscriptions = Vec::new();
     for camera in &cameras {
-        subscriptions
-            .push(host.subscribe(frame_of(*camera), Delivery::Lossless).await.expect("expected a subscription"));
+        subscriptions.push(
+            scene_handle.subscribe(frame_output(*camera), Delivery::Lossless).await.expect("expected a subscription"),
+        );
     }
     let positions = modalcast_model::deform::VertexAttributes { positions: true, ..Default::default() };
-    let mut vertices =
-        host.subscribe(OutputSpec::Vertices(positions), Delivery::Lossless).await.expect("expected a subscription");
+    let mut vertex_subscription = scene_handle
+        .subscribe(OutputSpec::Vertices(positions), Delivery::Lossless)
+        .await
+        .expect("expected a subscription");
     // One subscription is dropped at step 8, and one is never read.
-    let mut dropped_subscription =
-        Some(host.subscribe(frame_of(cameras[0]), Delivery::Lossless).await.expect("expected a subscription"));
-    let _idle = host.subscribe(frame_of(cameras[0]), Delivery::Latest).await.expect("expected a subscription");
-    let mut driver = start_server.drive("kept", Policy::Lossless, 40).await;
+    let mut dropped_subscription = Some(
+        scene_handle.subscribe(frame_output(cameras[0]), Delivery::Lossless).await.expect("expected a subscription"),
+    );
+    let _unread_subscription =
+        scene_handle.subscribe(frame_output(cameras[0]), Delivery::Latest).await.expect("expected a subscription");
+    let mut writer = server.drive("attributes", Policy::Lossless, 40).await;
     for step in steps() {
-        driver.step(step).await;
+        writer.send_step(step).await;
     }
-    let want = reference_images(&cameras);
-    for (number, images) in &want {
+    let expected_images = reference_images(&cameras);
+    for StepImages { step: number, images } in &expected_images {
         if *number == 8 {
             dropped_subscription = None;
         }
@@ -95,43 +106,50 @@ async fn frames_of_many_cameras_show_their_own_step() {
         for (subscription, image) in subscriptions.iter_mut().zip(images) {
             let output = with_timeout(subscription.next()).await.expect("expected another message");
             assert_eq!((output.step.number, output.skipped), (*number, 0));
-            assert!(pixels(&output) == image, "step {number}");
+            assert!(frame_bytes(&output) == image, "step {number}");
         }
-        assert_eq!(with_timeout(vertices.next()).await.expect("expected another message").step.number, *number);
+        assert_eq!(
+            with_timeout(vertex_subscription.next()).await.expect("expected another message").step.number,
+            *number
+        );
     }
     for number in 0..STEPS {
-        match driver.reply().await {
+        match writer.receive_reply().await {
             ResponseKind::Ack(ack) => assert!(ack.step == number && number != REJECTED_STEP, "{ack:?}"),
             ResponseKind::Rejection(_) => {
                 assert_eq!(number, REJECTED_STEP, "expected a rejection of step {REJECTED_STEP} only")
             }
-            other => panic!("{other:?}"),
+            kind => panic!("expected an acknowledgement or a rejection, got {kind:?}"),
         }
     }
-    assert!(want[0].1[0] != want[1].1[0] && want[0].1[0] != want[0].1[1], "negative control: steps and cameras differ");
-    driver.finish().await;
+    assert!(
+        expected_images[0].images[0] != expected_images[1].images[0]
+            && expected_images[0].images[0] != expected_images[0].images[1],
+        "negative control: steps and cameras differ"
+    );
+    writer.finish().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn closing_a_scene_delivers_frames_in_flight() {
-    let (start_server, cameras) = (start_server().await, cameras(2));
-    let host = Arc::clone(&start_server.engine.find("kept").expect("expected an open scene"));
+    let (server, cameras) = (start_server().await, cameras(2));
+    let scene_handle = Arc::clone(&server.engine.find("attributes").expect("expected an open scene"));
     let mut subscription =
-        host.subscribe(frame_of(cameras[0]), Delivery::Lossless).await.expect("expected a subscription");
-    let driver = start_server.drive("kept", Policy::Lossless, 40).await;
+        scene_handle.subscribe(frame_output(cameras[0]), Delivery::Lossless).await.expect("expected a subscription");
+    let writer = server.drive("attributes", Policy::Lossless, 40).await;
     for step in steps().into_iter().take(12) {
-        driver.step(step).await;
+        writer.send_step(step).await;
     }
-    let want = reference_images(&cameras);
+    let expected_images = reference_images(&cameras);
     let output = with_timeout(subscription.next()).await.expect("expected a frame");
-    assert!(pixels(&output) == want[0].1[0]);
-    with_timeout(start_server.engine.close("kept")).await.expect("expected the scene to close");
+    assert!(frame_bytes(&output) == expected_images[0].images[0]);
+    with_timeout(server.engine.close("attributes")).await.expect("expected the scene to close");
     let mut number = 1;
     while let Ok(output) = with_timeout(subscription.next()).await {
         assert_eq!(output.step.number, number);
-        assert!(pixels(&output) == want[number as usize].1[0]);
+        assert!(frame_bytes(&output) == expected_images[number as usize].images[0]);
         number += 1;
     }
     assert!(number <= 12);
-    start_server.stop().await.expect("expected the server to stop without an error");
+    server.stop().await.expect("expected the server to stop without an error");
 }

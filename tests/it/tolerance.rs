@@ -1,4 +1,4 @@
-//! Comparison of numbers with a tolerance, and the test that the comparison can fail.
+//! Comparison of numbers with a tolerance, and a test that it detects differences.
 
 /// Absolute and relative tolerance.
 #[derive(Clone, Copy, Debug)]
@@ -7,34 +7,35 @@ pub(crate) struct Tolerance {
     pub(crate) rel: f64,
 }
 
-/// Describes the first element where `got` is not close to `want`. NaN is close to nothing.
-pub(crate) fn find_difference(got: &[f32], want: &[f64], tolerance: Tolerance) -> Option<String> {
-    if got.len() != want.len() || want.is_empty() {
-        return Some(format!("expected {} numbers and at least one, got {}", want.len(), got.len()));
+/// Describes the first element of `actual` that is not close to that of `expected`. NaN is close to nothing.
+pub(crate) fn find_difference(actual: &[f32], expected: &[f64], tolerance: Tolerance) -> Option<String> {
+    if actual.len() != expected.len() || expected.is_empty() {
+        return Some(format!("expected {} numbers and at least one, got {}", expected.len(), actual.len()));
     }
-    got.iter().zip(want).enumerate().find_map(|(index, (got, want))| {
-        let is_close = (f64::from(*got) - want).abs() <= tolerance.abs + tolerance.rel * want.abs();
-        (!is_close).then(|| format!("[{index}] is {got}, expected {want}"))
+    actual.iter().zip(expected).enumerate().find_map(|(index, (actual, expected))| {
+        let is_close = (f64::from(*actual) - expected).abs() <= tolerance.abs + tolerance.rel * expected.abs();
+        (!is_close).then(|| format!("[{index}] is {actual}, expected {expected}"))
     })
 }
 
 /// Largest distance between two lists of points; infinite if a point is not finite.
-pub(crate) fn max_distance(got: &[f32], want: &[[f64; 3]]) -> f64 {
-    assert_eq!(got.len(), 3 * want.len(), "expected three numbers per point");
-    let error = |(got, want): (&[f32], &[f64; 3])| {
-        let squared: f64 = got.iter().zip(want).map(|(got, want)| (f64::from(*got) - want).powi(2)).sum();
-        if squared.is_nan() { f64::INFINITY } else { squared.sqrt() }
+pub(crate) fn max_distance(actual: &[f32], expected: &[[f64; 3]]) -> f64 {
+    assert_eq!(actual.len(), 3 * expected.len(), "expected three numbers per point");
+    let distance = |(actual, expected): (&[f32], &[f64; 3])| {
+        let squared_distance: f64 =
+            actual.iter().zip(expected).map(|(actual, expected)| (f64::from(*actual) - expected).powi(2)).sum();
+        if squared_distance.is_nan() { f64::INFINITY } else { squared_distance.sqrt() }
     };
-    got.chunks_exact(3).zip(want).map(error).fold(0.0, f64::max)
+    actual.chunks_exact(3).zip(expected).map(distance).fold(0.0, f64::max)
 }
 
 #[test]
 fn difference_detects_wrong_and_non_finite_numbers() {
     let tolerance = Tolerance { abs: 1e-6, rel: 1e-6 };
-    let want = [1.0, 2.0];
-    assert_eq!(find_difference(&[1.0, 2.0], &want, tolerance), None);
-    for got in [&[1.0, 2.1][..], &[1.0, f32::NAN], &[1.0, f32::INFINITY], &[2.0, 1.0], &[1.0], &[]] {
-        assert!(find_difference(got, &want, tolerance).is_some(), "{got:?} passed");
+    let expected = [1.0, 2.0];
+    assert_eq!(find_difference(&[1.0, 2.0], &expected, tolerance), None);
+    for actual in [&[1.0, 2.1][..], &[1.0, f32::NAN], &[1.0, f32::INFINITY], &[2.0, 1.0], &[1.0], &[]] {
+        assert!(find_difference(actual, &expected, tolerance).is_some(), "{actual:?} passed");
     }
     assert!(find_difference(&[], &[], tolerance).is_some(), "expected empty lists to fail");
     assert_eq!(max_distance(&[3.0, 0.0, f32::NAN], &[[0.0; 3]]), f64::INFINITY);

@@ -244,14 +244,21 @@ fn client_depends_on_neither_cuda_nor_opengl() {
     assert_eq!(server_count, gpu_packages.len(), "negative control: the server's list contains all of them");
 }
 
-/// Runs `modalcast-fetch`. Returns its exit code, standard output and standard error.
-async fn fetch(url: &str, arguments: &[&str]) -> (i32, String, String) {
+struct FetchOutput {
+    exit_code: i32,
+    stdout: String,
+    stderr: String,
+}
+
+/// Runs `modalcast-fetch` with a server.
+async fn run_fetch(url: &str, arguments: &[&str]) -> FetchOutput {
     let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_modalcast-fetch"));
     command.args(arguments).args(["--server", url]);
     let output = tokio::task::spawn_blocking(move || command.output());
     let output = output.await.expect("a finished task").expect("modalcast-fetch starts");
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    (output.status.code().unwrap_or(-1), text(&output.stdout), text(&output.stderr))
+    let exit_code = output.status.code().unwrap_or(-1);
+    FetchOutput { exit_code, stdout: text(&output.stdout), stderr: text(&output.stderr) }
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -273,29 +280,29 @@ async fn fetch_saves_files_and_exits_with_documented_codes() {
     let picture_arguments = ["--scene", "toy", "--size", "20x10", "--format", "raw"];
     let stream_arguments =
         [&["frames", "--json", "--count", "3", "--open", "toy", "--out", &frames], &picture_arguments[..]].concat();
-    let (code, stdout, stderr) = fetch(&url, &stream_arguments).await;
-    assert_eq!(code, 0, "{stderr}");
-    let (ready, json) = stdout.trim().split_once('\n').expect("two lines");
+    let output = run_fetch(&url, &stream_arguments).await;
+    assert_eq!(output.exit_code, 0, "{}", output.stderr);
+    let (ready, json) = output.stdout.trim().split_once('\n').expect("two lines");
     let summary: serde_json::Value = serde_json::from_str(json).expect("JSON");
     assert_eq!((ready, &summary["frames"], summary["stages_ms"]["draw"].as_f64()), ("ready", &3.into(), Some(2.0)));
     for (index, step) in summary["steps"].as_array().expect("steps").iter().enumerate() {
         let bytes = std::fs::read(format!("{frames}/frame_{index:05}.rgba")).expect("a frame");
         assert_eq!((bytes.len(), u64::from(bytes[0])), (800, step.as_u64().expect("a number") % 256));
     }
-    let (code, _, stderr) = fetch(&url, &["vertices", "--scene", "toy", "--count", "2", "--out", &vertices]).await;
-    assert_eq!(code, 0, "{stderr}");
+    let output = run_fetch(&url, &["vertices", "--scene", "toy", "--count", "2", "--out", &vertices]).await;
+    assert_eq!(output.exit_code, 0, "{}", output.stderr);
     assert_eq!(std::fs::read(&vertices).expect("a file").len(), 128 + 2 * 48);
     send_task.abort();
     let frame_path = path("one.rgba");
     let frame_arguments = [&["frame", "--out", &frame_path], &picture_arguments[..]].concat();
-    assert_eq!(fetch(&url, &frame_arguments).await.0, 0);
-    assert_eq!(fetch(&url, &["info"]).await.0, 0);
-    assert!(fetch(&url, &["list", "--json"]).await.1.contains("\"scene\":\"toy\""));
-    assert_eq!(fetch(&url, &["frame", "--scene", "none", "--out", &path("x.png")]).await.0, 1);
-    assert_eq!(fetch(&url, &["frame", "--out", &path("x.png")]).await.0, 2);
-    assert_eq!(fetch("http://127.0.0.1:1", &["info"]).await.0, 3);
+    assert_eq!(run_fetch(&url, &frame_arguments).await.exit_code, 0);
+    assert_eq!(run_fetch(&url, &["info"]).await.exit_code, 0);
+    assert!(run_fetch(&url, &["list", "--json"]).await.stdout.contains("\"scene\":\"toy\""));
+    assert_eq!(run_fetch(&url, &["frame", "--scene", "none", "--out", &path("x.png")]).await.exit_code, 1);
+    assert_eq!(run_fetch(&url, &["frame", "--out", &path("x.png")]).await.exit_code, 2);
+    assert_eq!(run_fetch("http://127.0.0.1:1", &["info"]).await.exit_code, 3);
     let unwritable_arguments = [&["frame", "--out", "/nowhere/x.png"], &picture_arguments[..]].concat();
-    assert_eq!(fetch(&url, &unwritable_arguments).await.0, 4);
+    assert_eq!(run_fetch(&url, &unwritable_arguments).await.exit_code, 4);
     let timeout_arguments = ["frames", "--scene", "toy", "--out", &frames, "--timeout", "0.2"];
-    assert_eq!(fetch(&url, &timeout_arguments).await.0, 5);
+    assert_eq!(run_fetch(&url, &timeout_arguments).await.exit_code, 5);
 }

@@ -1,4 +1,4 @@
-//! Exact normals of extreme surfaces: without area, far from the origin, tiny, huge, overflowed or folded.
+//! Exact normals of extreme surfaces: without area, far from the origin, tiny, huge, overflowing or folded.
 
 use modalcast_compute::reference;
 use modalcast_model::scene::Scene;
@@ -10,29 +10,33 @@ use super::fixtures::{
 };
 use super::{MAX_ANGLE_DEGREES, linear_parts, parabola};
 
-/// Rounding error relative to a position: twice that of one f32 rounding, because the CPU's sum is rounded several times.
+/// Bound of the relative rounding error of a position: two f32 units in the last place, because the CPU rounds its sum
+/// several times.
 const ROUNDING_BOUND: f64 = 2.0 / 8_388_608.0;
 
 /// Largest ratio of the angular error of a corner to its bound; see `reference/normals.rs`.
-fn max_error_ratio(scene: &Scene, positions: &[[f64; 3]], got: &[f32], want: &[[f64; 3]]) -> f64 {
+fn max_error_ratio(scene: &Scene, positions: &[[f64; 3]], normals: &[f32], reference_normals: &[[f64; 3]]) -> f64 {
     let mesh = &scene.shapes[0].mesh;
-    let mut sums = vec![(Vector3::zeros(), 0.0); want.len()];
+    let mut corner_sums = vec![(Vector3::zeros(), 0.0); reference_normals.len()];
     for triangle in mesh.triangles() {
         for corner in 0..3 {
             let position = |offset: usize| {
                 Vector3::from(positions[mesh.corners().vertices[triangle[(corner + offset) % 3] as usize] as usize])
             };
-            let (origin, edge, other) = (position(0), position(1) - position(0), position(2) - position(0));
-            let (sum, rounding) = &mut sums[triangle[corner] as usize];
-            *sum += edge.cross(&other);
-            let (l, m, w) = (edge.abs().sum(), other.abs().sum(), origin.abs().sum());
-            *rounding += l * (l + w) + m * (m + w);
+            let (corner_position, first_edge, second_edge) =
+                (position(0), position(1) - position(0), position(2) - position(0));
+            let (area_sum, rounding_sum) = &mut corner_sums[triangle[corner] as usize];
+            *area_sum += first_edge.cross(&second_edge);
+            let (l, m, w) = (first_edge.abs().sum(), second_edge.abs().sum(), corner_position.abs().sum());
+            *rounding_sum += l * (l + w) + m * (m + w);
         }
     }
     let mut max_ratio = 0.0_f64;
-    for ((got, want), (sum, rounding)) in got.chunks_exact(3).zip(want).zip(&sums) {
-        let error = angle_degrees([0, 1, 2].map(|axis| f64::from(got[axis])), *want).to_radians();
-        let ratio = error / (ROUNDING_BOUND * rounding / sum.norm() + 2e-7);
+    for ((normals, reference_normals), (area_sum, rounding_sum)) in
+        normals.chunks_exact(3).zip(reference_normals).zip(&corner_sums)
+    {
+        let error = angle_degrees([0, 1, 2].map(|axis| f64::from(normals[axis])), *reference_normals).to_radians();
+        let ratio = error / (ROUNDING_BOUND * rounding_sum / area_sum.norm() + 2e-7);
         max_ratio = if ratio.is_nan() { f64::INFINITY } else { max_ratio.max(ratio) };
     }
     max_ratio
@@ -42,7 +46,8 @@ fn max_error_ratio(scene: &Scene, positions: &[[f64; 3]], got: &[f32], want: &[[
 /// of its folded surface.
 #[test]
 fn collapsed_sheet_keeps_its_rigid_normals() {
-    let collapse = |axes: [f32; 3]| move |rest: [f32; 3]| [0, 1, 2].map(|axis| -axes[axis] * rest[axis]);
+    let collapse =
+        |axes: [f32; 3]| move |rest_position: [f32; 3]| [0, 1, 2].map(|axis| -axes[axis] * rest_position[axis]);
     for axes in [[1.0, 0.0, 0.0], [1.0, 1.0, 1.0]] {
         let scene = scene(vec![shape_with_mode(sheet(9, 9), collapse(axes))]);
         for linear in linear_parts() {
@@ -50,16 +55,18 @@ fn collapsed_sheet_keeps_its_rigid_normals() {
             let (normals, tangents) = reference_normals_and_tangents(&scene, &state);
             assert_eq!(normals, reference::rigid_normals(&scene, &state));
             assert_eq!(tangents, reference::rigid_tangents(&scene, &state));
-            let cpu = deform_on_cpu(&scene, &state);
-            assert!(max_angle_degrees(&cpu.normals, &normals) < MAX_ANGLE_DEGREES);
-            assert!(cpu.tangents.iter().all(|number| number.is_finite()));
+            let surface = deform_on_cpu(&scene, &state);
+            assert!(max_angle_degrees(&surface.normals, &normals) < MAX_ANGLE_DEGREES);
+            assert!(surface.tangents.iter().all(|number| number.is_finite()));
         }
     }
     // Almost collapsed to a line: a thousandth of the width is left, and the normals follow the folded surface.
-    let folded = scene(vec![shape_with_mode(sheet(9, 9), |[x, _, _]| [-0.999 * x, 0.0, 0.002 * x])]);
-    let (normals, _) = reference_normals_and_tangents(&folded, &uniform_q_state(&folded, 1.0));
+    let folded_scene = scene(vec![shape_with_mode(sheet(9, 9), |[x, _, _]| [-0.999 * x, 0.0, 0.002 * x])]);
+    let (normals, _) = reference_normals_and_tangents(&folded_scene, &uniform_q_state(&folded_scene, 1.0));
     assert!(normals.iter().all(|normal| angle_degrees(*normal, [-0.002, 0.0, 0.001]) < 0.01));
-    assert!(max_angle_degrees(&deform_on_cpu(&folded, &uniform_q_state(&folded, 1.0)).normals, &normals) < 0.1);
+    assert!(
+        max_angle_degrees(&deform_on_cpu(&folded_scene, &uniform_q_state(&folded_scene, 1.0)).normals, &normals) < 0.1
+    );
 }
 
 /// Corners without triangles keep their rest normals.
@@ -67,7 +74,7 @@ fn collapsed_sheet_keeps_its_rigid_normals() {
 fn zero_area_triangles_do_not_change_normals() {
     let mesh = sheet(5, 5);
     let mut triangles = mesh.triangles().to_vec();
-    let (clean, corners) = (triangles.clone(), mesh.corners().clone());
+    let (original_triangles, corners) = (triangles.clone(), mesh.corners().clone());
     // The added triangles are collinear in x or repeat vertices. No remaining triangle contains corner 24.
     triangles.extend([[0, 1, 3], [6, 6, 7], [8, 8, 8]]);
     triangles.retain(|triangle| !triangle.contains(&24));
@@ -81,35 +88,41 @@ fn zero_area_triangles_do_not_change_normals() {
         );
         scene(vec![shape_with_mode(mesh.expect("expected a valid mesh"), |[x, y, _]| [0.0, 0.0, x + 0.5 * y])])
     };
-    let (degenerate, clean) = (scene_of_triangles(triangles), scene_of_triangles(clean));
-    let state = uniform_q_state(&degenerate, 0.8);
-    let (got, want) =
-        (reference_normals_and_tangents(&degenerate, &state), reference_normals_and_tangents(&clean, &state));
+    let (degenerate_scene, original_triangles) =
+        (scene_of_triangles(triangles), scene_of_triangles(original_triangles));
+    let state = uniform_q_state(&degenerate_scene, 0.8);
+    let (degenerate_result, original_result) = (
+        reference_normals_and_tangents(&degenerate_scene, &state),
+        reference_normals_and_tangents(&original_triangles, &state),
+    );
     for corner in 0..24 {
-        assert!(angle_degrees(got.0[corner], want.0[corner]) < 1e-5, "corner {corner}");
+        assert!(angle_degrees(degenerate_result.0[corner], original_result.0[corner]) < 1e-5, "corner {corner}");
     }
-    assert_eq!(got.0[24], [0.0, 0.0, 1.0]);
-    assert!(angle_degrees(want.0[24], got.0[24]) > 30.0);
-    assert!(max_angle_degrees(&deform_on_cpu(&degenerate, &state).normals, &got.0) < MAX_ANGLE_DEGREES);
+    assert_eq!(degenerate_result.0[24], [0.0, 0.0, 1.0]);
+    assert!(angle_degrees(original_result.0[24], degenerate_result.0[24]) > 30.0);
+    assert!(
+        max_angle_degrees(&deform_on_cpu(&degenerate_scene, &state).normals, &degenerate_result.0) < MAX_ANGLE_DEGREES
+    );
 }
 
 #[test]
 fn normals_do_not_depend_on_the_scale_of_a_domain() {
     let scene = scene(vec![shape_with_mode(sheet(17, 9), parabola)]);
     for linear in linear_parts() {
-        let (want, unscaled_tangents) = reference_normals_and_tangents(&scene, &state(&scene, 0.5, linear, [0.0; 3]));
+        let (unscaled_normals, unscaled_tangents) =
+            reference_normals_and_tangents(&scene, &state(&scene, 0.5, linear, [0.0; 3]));
         for scale in [1e-40, 1e-30, 1e-20, 1e18, 1e30, 1e37] {
             let state = state(&scene, 0.5, linear * scale, [0.0; 3]);
-            let cpu = deform_on_cpu(&scene, &state);
+            let surface = deform_on_cpu(&scene, &state);
             // Positions of 1e-40 are denormal, with about five significant digits.
             let tolerance = if scale < 1e-38 { 0.1 } else { MAX_ANGLE_DEGREES };
-            let error = max_angle_degrees(&cpu.normals, &want);
+            let error = max_angle_degrees(&surface.normals, &unscaled_normals);
             assert!(error < tolerance, "scale {scale}: expected less than {tolerance} degrees, got {error}");
             let (reference_normals, tangents) = reference_normals_and_tangents(&scene, &state);
-            assert!(max_angle_degrees(&cpu.normals, &reference_normals) < tolerance, "scale {scale}");
-            for (tangent, unscaled_tangents) in tangents.iter().zip(&unscaled_tangents) {
+            assert!(max_angle_degrees(&surface.normals, &reference_normals) < tolerance, "scale {scale}");
+            for (tangent, unscaled_tangent) in tangents.iter().zip(&unscaled_tangents) {
                 assert!(
-                    angle_degrees([0, 1, 2].map(|axis| tangent[axis]), [0, 1, 2].map(|axis| unscaled_tangents[axis]))
+                    angle_degrees([0, 1, 2].map(|axis| tangent[axis]), [0, 1, 2].map(|axis| unscaled_tangent[axis]))
                         < tolerance
                 );
             }
@@ -127,15 +140,15 @@ fn normals_far_from_the_origin_stay_within_their_bound() {
             let state = state(&scene, 0.3, linear * size, translation);
             let positions = reference::deform(&scene, &state);
             let (normals, _) = reference_normals_and_tangents(&scene, &state);
-            let rigid = reference::rigid_normals(&scene, &state);
-            let cpu = deform_on_cpu(&scene, &state).normals;
-            assert_eq!(normals != rigid, keeps_shape, "size {size}");
+            let rigid_normals = reference::rigid_normals(&scene, &state);
+            let cpu_normals = deform_on_cpu(&scene, &state).normals;
+            assert_eq!(normals != rigid_normals, keeps_shape, "size {size}");
             if keeps_shape {
-                let ratio = max_error_ratio(&scene, &positions, &cpu, &normals);
+                let ratio = max_error_ratio(&scene, &positions, &cpu_normals, &normals);
                 assert!(ratio <= 1.0, "size {size}: expected an error within the bound, got {ratio} of the bound");
                 assert!(ratio > 1e-3, "size {size}: expected a tight bound, got an error of {ratio} of the bound");
             } else {
-                assert!(max_angle_degrees(&cpu, &rigid) < MAX_ANGLE_DEGREES, "size {size}");
+                assert!(max_angle_degrees(&cpu_normals, &rigid_normals) < MAX_ANGLE_DEGREES, "size {size}");
             }
         }
     }
@@ -146,18 +159,18 @@ fn overflow_and_half_turns_give_unit_normals() {
     let scene = scene(vec![shape_with_mode(tube(16, 4, 0.0), |[x, y, z]| [-2.0 * x, y, -2.0 * z])]);
     for q in [1.0, 1e30, 3e38, -3e38] {
         for scale in [1.0, 1e-30, 1e10] {
-            let cpu = deform_on_cpu(&scene, &state(&scene, q, Matrix3::identity() * scale, [0.0; 3]));
-            for (normal, tangent) in cpu.normals.chunks_exact(3).zip(cpu.tangents.chunks_exact(4)) {
+            let surface = deform_on_cpu(&scene, &state(&scene, q, Matrix3::identity() * scale, [0.0; 3]));
+            for (normal, tangent) in surface.normals.chunks_exact(3).zip(surface.tangents.chunks_exact(4)) {
                 let length = |vector: &[f32]| vector.iter().map(|number| number * number).sum::<f32>().sqrt();
                 assert!((length(normal) - 1.0).abs() < 1e-6, "q {q}, scale {scale}: {normal:?}");
                 assert!((length(&tangent[..3]) - 1.0).abs() < 1e-6, "q {q}, scale {scale}: {tangent:?}");
             }
         }
     }
-    // Half a turn about y: the normals turn with the surface, up to twice the angle between them and the normals of the
-    // triangles. That angle is at most half of one of the tube's 16 sides.
+    // The mode rotates the tube by 180 degrees about y. The tube has 16 sides, so a normal differs from the normal of an
+    // adjacent triangle by at most 11.25 degrees, and the rotation of a normal by at most twice that angle.
     let (normals, _) = reference_normals_and_tangents(&scene, &uniform_q_state(&scene, 1.0));
-    for (normal, rest) in normals.iter().zip(&scene.shapes[0].mesh.corners().normals) {
-        assert!(angle_degrees(*normal, rest.map(f64::from)) >= 180.0 - 22.5);
+    for (normal, rest_normal) in normals.iter().zip(&scene.shapes[0].mesh.corners().normals) {
+        assert!(angle_degrees(*normal, rest_normal.map(f64::from)) >= 180.0 - 22.5);
     }
 }

@@ -10,9 +10,9 @@ use nalgebra::{Matrix3, Vector3};
 
 pub(crate) const UP: [f32; 3] = [0.0, 0.0, 1.0];
 
-/// A shape with one mode; the function gives the displacement at each rest position.
+/// A shape with one mode. `displacement` returns its displacement at a rest position.
 pub(crate) fn shape_with_mode(mesh: Mesh, displacement: impl Fn([f32; 3]) -> [f32; 3]) -> Shape {
-    let column: Vec<f32> = mesh.rest_positions().iter().flat_map(|rest| displacement(*rest)).collect();
+    let column: Vec<f32> = mesh.rest_positions().iter().flat_map(|position| displacement(*position)).collect();
     let modes = Modes::from_columns(column.len(), 1, column).expect("expected valid modes");
     Shape::new(mesh, modes).expect("expected a valid shape")
 }
@@ -22,17 +22,19 @@ pub(crate) fn sheet(columns: u32, rows: u32) -> Mesh {
     let coordinate = |index: u32, count: u32| 2.0 * index as f32 / (count - 1) as f32 - 1.0;
     let grid =
         (0..rows).flat_map(|row| (0..columns).map(move |column| (coordinate(column, columns), coordinate(row, rows))));
-    let rest: Vec<_> = grid.clone().map(|(x, y)| [x, y, 0.0]).collect();
+    let rest_positions: Vec<_> = grid.clone().map(|(x, y)| [x, y, 0.0]).collect();
     let uvs = grid.map(|(x, y)| [0.5 * x + 0.5, 0.5 - 0.5 * y]).collect();
-    let normals = vec![UP; rest.len()];
-    Mesh::from_indexed(rest, normals, uvs, quads(columns, rows)).expect("expected a valid mesh")
+    let normals = vec![UP; rest_positions.len()];
+    Mesh::from_indexed(rest_positions, normals, uvs, quads(columns, rows)).expect("expected a valid mesh")
 }
 
 /// Two triangles per cell of a grid, all split along the same diagonal.
 pub(crate) fn quads(columns: u32, rows: u32) -> Vec<[u32; 3]> {
     let cells = (0..rows - 1).flat_map(|row| (0..columns - 1).map(move |column| row * columns + column));
     cells
-        .flat_map(|first| [[first, first + 1, first + columns + 1], [first, first + columns + 1, first + columns]])
+        .flat_map(|corner| {
+            [[corner, corner + 1, corner + columns + 1], [corner, corner + columns + 1, corner + columns]]
+        })
         .collect()
 }
 
@@ -40,7 +42,7 @@ pub(crate) fn quads(columns: u32, rows: u32) -> Vec<[u32; 3]> {
 /// coordinates. The normals of the last column are rotated by `tilt` degrees.
 pub(crate) fn tube(columns: u32, rows: u32, tilt: f32) -> Mesh {
     let column_angle = |column: u32| column as f32 / columns as f32 * std::f32::consts::TAU;
-    let rest = (0..rows).flat_map(|row| {
+    let rest_positions = (0..rows).flat_map(|row| {
         (0..columns).map(move |column| [column_angle(column).cos(), row as f32, -column_angle(column).sin()])
     });
     let mut corners = Corners::default();
@@ -50,54 +52,55 @@ pub(crate) fn tube(columns: u32, rows: u32, tilt: f32) -> Mesh {
         corners.normals.push([angle.cos(), 0.0, -angle.sin()]);
         corners.uvs.push([column as f32 / columns as f32, 1.0 - row as f32]);
     }
-    Mesh::new(rest.collect(), corners, quads(columns + 1, rows)).expect("expected a valid mesh")
+    Mesh::new(rest_positions.collect(), corners, quads(columns + 1, rows)).expect("expected a valid mesh")
 }
 
 /// A unit cube of 8 vertices and 24 corners; every edge is hard.
 pub(crate) fn cube() -> Mesh {
-    let rest = (0..8_u8).map(|vertex| [0, 1, 2].map(|axis| f32::from(vertex >> axis & 1))).collect();
+    let rest_positions = (0..8_u8).map(|vertex| [0, 1, 2].map(|axis| f32::from(vertex >> axis & 1))).collect();
     let (mut corners, mut triangles) = (Corners::default(), Vec::new());
     for (axis, side) in (0..3_usize).flat_map(|axis| [(axis, 0_u32), (axis, 1)]) {
         let (second_axis, third_axis) = (1_u32 << ((axis + 1) % 3), 1_u32 << ((axis + 2) % 3));
-        let first = corners.vertices.len() as u32;
+        let first_corner = corners.vertices.len() as u32;
         corners
             .vertices
             .extend([0, second_axis, second_axis | third_axis, third_axis].map(|vertex| vertex | side << axis));
         let mut normal = [0.0; 3];
         normal[axis] = if side == 1 { 1.0 } else { -1.0 };
         corners.normals.extend([normal; 4]);
-        let split = if side == 1 { [[0, 1, 2], [0, 2, 3]] } else { [[0, 2, 1], [0, 3, 2]] };
-        triangles.extend(split.map(|triangle| triangle.map(|corner| first + corner)));
+        let quad_triangles = if side == 1 { [[0, 1, 2], [0, 2, 3]] } else { [[0, 2, 1], [0, 3, 2]] };
+        triangles.extend(quad_triangles.map(|triangle| triangle.map(|corner| first_corner + corner)));
     }
-    Mesh::new(rest, corners, triangles).expect("expected a valid mesh")
+    Mesh::new(rest_positions, corners, triangles).expect("expected a valid mesh")
 }
 
 /// A unit sphere of 8 x 4^level triangles with area-weighted normals.
 pub(crate) fn sphere(level: u32) -> Mesh {
-    let mut triangles: Vec<[Vector3<f64>; 3]> = octants();
+    let mut triangles: Vec<[Vector3<f64>; 3]> = octahedron_faces();
     for _ in 0..level {
-        let split = |[a, b, c]: [Vector3<f64>; 3]| {
+        let split_triangle = |[a, b, c]: [Vector3<f64>; 3]| {
             let [ab, bc, ca] = [a + b, b + c, c + a].map(|middle| middle.normalize());
             [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
         };
-        triangles = triangles.into_iter().flat_map(split).collect();
+        triangles = triangles.into_iter().flat_map(split_triangle).collect();
     }
-    let mut rest: Vec<[f32; 3]> = Vec::new();
+    let mut rest_positions: Vec<[f32; 3]> = Vec::new();
     let mut vertex_index = |position: Vector3<f64>| {
         let position: [f32; 3] = position.cast::<f32>().into();
         let is_near = |other: &[f32; 3]| (0..3).all(|axis| (other[axis] - position[axis]).abs() < 1e-5);
-        rest.iter().position(is_near).unwrap_or_else(|| {
-            rest.push(position);
-            rest.len() - 1
+        rest_positions.iter().position(is_near).unwrap_or_else(|| {
+            rest_positions.push(position);
+            rest_positions.len() - 1
         }) as u32
     };
     let triangles: Vec<_> = triangles.into_iter().map(|triangle| triangle.map(&mut vertex_index)).collect();
-    let vertices: Vec<u32> = (0..rest.len() as u32).collect();
-    let normals = smooth_normals(&rest, &vertices, &triangles);
-    Mesh::from_indexed(rest, normals, vec![], triangles).expect("expected a valid mesh")
+    let vertices: Vec<u32> = (0..rest_positions.len() as u32).collect();
+    let normals = smooth_normals(&rest_positions, &vertices, &triangles);
+    Mesh::from_indexed(rest_positions, normals, vec![], triangles).expect("expected a valid mesh")
 }
 
-fn octants() -> Vec<[Vector3<f64>; 3]> {
+/// The faces of an octahedron.
+fn octahedron_faces() -> Vec<[Vector3<f64>; 3]> {
     let signs = (0..8).map(|bits| [0, 1, 2].map(|axis| if bits >> axis & 1 == 1 { -1.0 } else { 1.0 }));
     let triangle = |[x, y, z]: [f64; 3]| {
         let [a, b, c] = [Vector3::x() * x, Vector3::y() * y, Vector3::z() * z];
@@ -137,9 +140,9 @@ pub(crate) fn uniform_q_state(scene: &Scene, q: f32) -> SceneState {
 
 /// The surface that the CPU deformer computes for a state.
 pub(crate) fn deform_on_cpu(scene: &Arc<Scene>, state: &SceneState) -> DeformedSurface {
-    let mut cpu = CpuDeformer::new(scene);
-    cpu.deform(state).expect("expected the step to succeed");
-    cpu.surface().expect("expected a surface").clone()
+    let mut deformer = CpuDeformer::new(scene);
+    deformer.deform(state).expect("expected the step to succeed");
+    deformer.surface().expect("expected a surface").clone()
 }
 
 /// Exact normals and tangents of the reference.
@@ -156,13 +159,13 @@ pub(crate) fn angle_degrees(a: [f64; 3], b: [f64; 3]) -> f64 {
 }
 
 /// Largest angle in degrees between f32 triples and directions; infinite if a triple is NaN or not of unit length.
-pub(crate) fn max_angle_degrees(got: &[f32], want: &[[f64; 3]]) -> f64 {
-    assert_eq!(got.len(), 3 * want.len(), "expected three numbers per direction");
-    let angle = |(got, want): (&[f32], &[f64; 3])| {
-        let got: [f64; 3] = [0, 1, 2].map(|axis| f64::from(got[axis]));
-        let is_unit = (Vector3::from(got).norm() - 1.0).abs() < 1e-6;
-        let angle = angle_degrees(got, *want);
+pub(crate) fn max_angle_degrees(normals: &[f32], expected_normals: &[[f64; 3]]) -> f64 {
+    assert_eq!(normals.len(), 3 * expected_normals.len(), "expected three numbers per direction");
+    let angle = |(normal, expected): (&[f32], &[f64; 3])| {
+        let normal: [f64; 3] = [0, 1, 2].map(|axis| f64::from(normal[axis]));
+        let is_unit = (Vector3::from(normal).norm() - 1.0).abs() < 1e-6;
+        let angle = angle_degrees(normal, *expected);
         if is_unit && !angle.is_nan() { angle } else { f64::INFINITY }
     };
-    got.chunks_exact(3).zip(want).map(angle).fold(0.0, f64::max)
+    normals.chunks_exact(3).zip(expected_normals).map(angle).fold(0.0, f64::max)
 }

@@ -13,19 +13,19 @@ fn wave([x, y, z]: [f32; 3]) -> [f32; 3] {
     [0.3 * y * z, 0.2 * x * x, (2.0 * x + y).sin() + 0.4 * z]
 }
 
-fn bits(numbers: &[f32]) -> Vec<u32> {
+fn f32_bits(numbers: &[f32]) -> Vec<u32> {
     numbers.iter().map(|number| number.to_bits()).collect()
 }
 
 /// Positions, normals and tangents of a surface as bits.
 fn surface_bits(surface: &DeformedSurface) -> [Vec<u32>; 3] {
-    [&surface.positions, &surface.normals, &surface.tangents].map(|numbers| bits(numbers))
+    [&surface.positions, &surface.normals, &surface.tangents].map(|numbers| f32_bits(numbers))
 }
 
 /// Normals of one domain as bits.
-fn normals_of(scene: &Scene, surface: &DeformedSurface, domain: usize) -> Vec<u32> {
+fn normal_bits(scene: &Scene, surface: &DeformedSurface, domain: usize) -> Vec<u32> {
     let slot = scene.layout.domains[domain];
-    bits(&surface.normals[3 * slot.first_corner..][..3 * slot.corners])
+    f32_bits(&surface.normals[3 * slot.first_corner..][..3 * slot.corners])
 }
 
 /// Changes q of some domains, their transforms, or both, depending on the step. Returns the changed domains.
@@ -57,24 +57,24 @@ fn unchanged_domains_keep_their_normals() {
     let mut state = state(&scene, 0.4, linear_parts()[2], [1.0, 2.0, 3.0]);
     let mut deformer = CpuDeformer::new(&scene);
     deformer.deform(&state).expect("expected the step to succeed");
-    let (mut random, mut last) = (TestRng(3), deformer.surface().expect("one").clone());
+    let (mut random, mut previous_surface) = (TestRng(3), deformer.surface().expect("expected a surface").clone());
     for step in 0..5 {
-        let changed = change_domains(&scene, &mut state, step, &mut random);
+        let changed_domains = change_domains(&scene, &mut state, step, &mut random);
         deformer.deform(&state).expect("expected the step to succeed");
-        let current = deformer.surface().expect("one").clone();
+        let surface = deformer.surface().expect("expected a surface").clone();
         for domain in 0..scene.domains.len() {
-            let is_unchanged = normals_of(&scene, &current, domain) == normals_of(&scene, &last, domain);
-            assert_eq!(is_unchanged, !changed.contains(&domain), "step {step}, domain {domain}");
+            let is_unchanged = normal_bits(&scene, &surface, domain) == normal_bits(&scene, &previous_surface, domain);
+            assert_eq!(is_unchanged, !changed_domains.contains(&domain), "step {step}, domain {domain}");
         }
         for threads in [1, 2, 5] {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("expected a thread pool");
             let mut new_deformer = CpuDeformer::new(&scene);
             pool.install(|| new_deformer.deform(&state)).expect("expected the step to succeed");
             assert!(
-                surface_bits(new_deformer.surface().expect("one")) == surface_bits(&current),
+                surface_bits(new_deformer.surface().expect("expected a surface")) == surface_bits(&surface),
                 "step {step}, {threads} threads"
             );
         }
-        last = current;
+        previous_surface = surface;
     }
 }

@@ -30,16 +30,16 @@ fn read_aov(builder: SceneBuilder, camera: Camera, size: u32, aov: Aov) -> AovIm
     renderer.render_aov(&buffers, &params, aov).expect("expected AOVs")
 }
 
-fn floats(image: &AovImage) -> Vec<f32> {
+fn decode_f32(image: &AovImage) -> Vec<f32> {
     bytemuck::pod_collect_to_vec(&image.bytes)
 }
 
-fn oblique() -> Camera {
+fn oblique_camera() -> Camera {
     let view = View::LookAt { eye: [3.0, 5.0, 4.0], target: [0.0, 0.0, -6.0], up: [0.0, 1.0, 0.0] };
     Camera { view, lens: Lens::Intrinsics { fx: 60.0, fy: 60.0, cx: 32.0, cy: 32.0 }, near: 0.0, far: 0.0 }
 }
 
-/// Depth along the view axis where the ray of a pixel meets the plane y = 0; `None` for rays that do not go down.
+/// Depth along the view axis where the ray of a pixel intersects the plane y = 0; `None` for rays that do not go down.
 fn depth_of_floor(x: u32, y: u32) -> Option<f64> {
     let forward = Vector3::new(-3.0, -5.0, -10.0_f64).normalize();
     let right = forward.cross(&Vector3::y()).normalize();
@@ -57,20 +57,24 @@ fn depth_is_in_meters_along_the_view_axis() {
         builder.parts.look.ground = ground.then(Ground::default);
         // With a ground the square is small, so that most pixels show the ground.
         let half_side = if ground { 1.0 } else { 40.0 };
-        let depth =
-            read_aov(builder.add_domain(floor_mesh(half_side, 0.0), Material::default()), oblique(), 64, Aov::Depth);
-        assert_eq!((depth.width, depth.height, depth.samples), (64, 64, 1));
-        let (mut covered, mut max_error) = (0, 0.0_f64);
-        for (pixel, got) in floats(&depth).into_iter().enumerate() {
-            let want = depth_of_floor(pixel as u32 % 64, pixel as u32 / 64).map(|depth| depth * unit);
-            if got.is_finite() {
-                covered += 1;
-                let want = want.expect("expected depth below the horizon only");
-                max_error = max_error.max((f64::from(got) / want - 1.0).abs());
+        let image = read_aov(
+            builder.add_domain(floor_mesh(half_side, 0.0), Material::default()),
+            oblique_camera(),
+            64,
+            Aov::Depth,
+        );
+        assert_eq!((image.width, image.height, image.samples), (64, 64, 1));
+        let (mut covered_pixels, mut max_error) = (0, 0.0_f64);
+        for (pixel, depth) in decode_f32(&image).into_iter().enumerate() {
+            let expected = depth_of_floor(pixel as u32 % 64, pixel as u32 / 64).map(|scene_units| scene_units * unit);
+            if depth.is_finite() {
+                covered_pixels += 1;
+                let expected = expected.expect("expected depth below the horizon only");
+                max_error = max_error.max((f64::from(depth) / expected - 1.0).abs());
             }
         }
-        assert!(covered > 2000 && max_error < 1e-4, "{covered} pixels, relative error {max_error:e}");
-        assert!(floats(&depth)[0] == f32::INFINITY || ground, "the sky");
+        assert!(covered_pixels > 2000 && max_error < 1e-4, "{covered_pixels} pixels, relative error {max_error:e}");
+        assert!(decode_f32(&image)[0] == f32::INFINITY || ground, "expected infinite depth in the sky");
     }
 }
 
@@ -92,14 +96,19 @@ fn normals_face_the_viewer_and_are_zero_elsewhere() {
     let double_sided = Material { double_sided: true, ..Material::default() };
     let builder = SceneBuilder::new().add_domain(facing_rectangle(-2.0, -2.0, 0.0, 2.0, 0.0), double_sided);
     let view_from_behind = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
-    let normals = floats(&read_aov(builder, Camera { view: view_from_behind, ..front_camera(64) }, 64, Aov::Normals));
+    let normals =
+        decode_f32(&read_aov(builder, Camera { view: view_from_behind, ..front_camera(64) }, 64, Aov::Normals));
     let normal_at = |x: usize, y: usize| &normals[3 * (64 * y + x)..][..3];
     assert_eq!((normal_at(40, 30), normal_at(20, 30)), (&[0.0, 0.0, -1.0][..], &[0.0; 3][..]));
     let mut builder = SceneBuilder::new();
     builder.parts.look.ground = Some(Ground::default());
-    let normals =
-        floats(&read_aov(builder.add_domain(floor_mesh(1.0, 0.0), Material::default()), oblique(), 64, Aov::Normals));
-    assert_eq!(&normals[3 * (64 * 63 + 32)..][..3], [0.0; 3], "the ground");
+    let normals = decode_f32(&read_aov(
+        builder.add_domain(floor_mesh(1.0, 0.0), Material::default()),
+        oblique_camera(),
+        64,
+        Aov::Normals,
+    ));
+    assert_eq!(&normals[3 * (64 * 63 + 32)..][..3], [0.0; 3], "expected zeros on the ground");
 }
 
 #[test]
@@ -115,18 +124,18 @@ fn values_are_interpolated_linearly_and_clamped() {
             Aov::Values { largest },
         );
         assert_eq!(frame.samples, samples);
-        let samples_of_image: Vec<u32> = bytemuck::pod_collect_to_vec(&frame.bytes);
+        let image_samples: Vec<u32> = bytemuck::pod_collect_to_vec(&frame.bytes);
         for x in 13..51_usize {
-            let pixel_samples = &samples_of_image[samples as usize * (64 * 30 + x)..][..samples as usize];
+            let pixel_samples = &image_samples[samples as usize * (64 * 30 + x)..][..samples as usize];
             let mean = pixel_samples.iter().map(|sample| f64::from(sample & 0xFFFF) / 65535.0).sum::<f64>()
                 / f64::from(samples);
-            let want = ((x as f64 + 0.5 - 32.0) / 10.0 / f64::from(largest)).clamp(0.0, 1.0);
+            let expected = ((x as f64 + 0.5 - 32.0) / 10.0 / f64::from(largest)).clamp(0.0, 1.0);
             // Near the clamped ends, the samples of one pixel may mix clamped and linear values.
-            let tolerance = if (0.05..0.95).contains(&want) { 1e-4 } else { 0.1 };
-            assert!((mean - want).abs() < tolerance, "{x}: expected {want}, got {mean}");
+            let tolerance = if (0.05..0.95).contains(&expected) { 1e-4 } else { 0.1 };
+            assert!((mean - expected).abs() < tolerance, "{x}: expected {expected}, got {mean}");
             assert!(pixel_samples.iter().all(|sample| sample >> 16 > 60000), "expected full coverage");
         }
-        assert!(samples_of_image[..samples as usize * 64 * 5].iter().all(|sample| *sample == 0));
+        assert!(image_samples[..samples as usize * 64 * 5].iter().all(|sample| *sample == 0));
     }
 }
 
@@ -146,8 +155,8 @@ fn aovs_allocate_on_demand_and_do_not_change_frames() {
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
     let params =
         FrameParams { camera: front_camera(64), width: 64, height: 64, bounds: scene.rest_bounds, light: None };
-    let before = renderer.draw(&buffers, &params).expect("expected a frame").rgba;
-    let (stats, initial_allocations) = (renderer.stats().clone(), buffers.allocations());
+    let expected_rgba = renderer.draw(&buffers, &params).expect("expected a frame").rgba;
+    let (expected_stats, initial_allocations) = (renderer.stats().clone(), buffers.allocations());
     renderer.upload_vertex_values(&mut buffers, &[0.0, 1.0, 2.0, 3.0]).expect("expected the upload to succeed");
     assert_eq!(
         buffers.allocations().len(),
@@ -156,8 +165,8 @@ fn aovs_allocate_on_demand_and_do_not_change_frames() {
     );
     for aov in [Aov::Depth, Aov::Domains, Aov::Normals, Aov::Values { largest: 3.0 }] {
         renderer.render_aov(&buffers, &params, aov).expect("expected AOVs");
-        assert_eq!(renderer.draw(&buffers, &params).expect("expected a frame").rgba, before);
-        assert_eq!(renderer.stats(), &stats);
+        assert_eq!(renderer.draw(&buffers, &params).expect("expected a frame").rgba, expected_rgba);
+        assert_eq!(renderer.stats(), &expected_stats);
     }
     for [width, height] in [[0, 64], [64, u32::MAX]] {
         renderer

@@ -27,7 +27,7 @@ fn camera_above_ground() -> Camera {
 }
 
 /// The 32-bit words of an AOV and the picks of all pixels, with the wall lowered by half of its height.
-fn measure(scene: &Arc<Scene>, aov: Aov) -> (Vec<u32>, Vec<PickHit>) {
+fn read_aov_and_picks(scene: &Arc<Scene>, aov: Aov) -> (Vec<u32>, Vec<PickHit>) {
     let mut state = SceneState::rest(scene);
     state.transforms[0] = Transform::from_matrix(&Matrix4::new_translation(&Vector3::new(0.0, -1.5, 0.0)));
     let mut deformer = ReferenceDeformer::new(scene);
@@ -45,32 +45,32 @@ fn measure(scene: &Arc<Scene>, aov: Aov) -> (Vec<u32>, Vec<PickHit>) {
 }
 
 #[test]
-fn measurements_below_the_ground_equal_those_without_ground() {
+fn aovs_and_picks_below_the_ground_ignore_the_ground() {
     for (samples, aov) in
         [(1, Aov::Domains), (1, Aov::Normals), (1, Aov::Values { largest: 1.0 }), (4, Aov::Values { largest: 1.0 })]
     {
-        let [with_ground, without_ground] =
-            [Some(Ground::default()), None].map(|ground| measure(&wall_scene(samples, ground), aov));
-        assert_eq!(with_ground, without_ground, "{aov:?}, {samples} samples");
-        assert!(with_ground.1.len() > 900, "{aov:?}: {} pixels picked", with_ground.1.len());
-        let below_ground = with_ground.1.iter().filter(|hit| hit.position[1] < 0.0).count();
+        let [results_with_ground, results_without_ground] =
+            [Some(Ground::default()), None].map(|ground| read_aov_and_picks(&wall_scene(samples, ground), aov));
+        assert_eq!(results_with_ground, results_without_ground, "{aov:?}, {samples} samples");
+        assert!(results_with_ground.1.len() > 900, "{aov:?}: {} pixels picked", results_with_ground.1.len());
+        let below_ground = results_with_ground.1.iter().filter(|hit| hit.position[1] < 0.0).count();
         assert!(below_ground > 400, "{aov:?}: {below_ground} pixels below the ground");
     }
 }
 
 #[test]
 fn depth_includes_the_ground() {
-    let [with_ground, without_ground] =
-        [Some(Ground::default()), None].map(|ground| measure(&wall_scene(1, ground), Aov::Depth).0);
+    let [words_with_ground, words_without_ground] =
+        [Some(Ground::default()), None].map(|ground| read_aov_and_picks(&wall_scene(1, ground), Aov::Depth).0);
     let count_infinite =
         |aov_words: &[u32]| aov_words.iter().filter(|word| f32::from_bits(**word) == f32::INFINITY).count();
     assert!(
-        count_infinite(&without_ground) > count_infinite(&with_ground) + 1000,
+        count_infinite(&words_without_ground) > count_infinite(&words_with_ground) + 1000,
         "expected the depth of the ground beside the wall"
     );
-    let nearer_pixels = with_ground.iter().zip(&without_ground).filter(|(with_ground, without_ground)| {
-        let [with_ground, without_ground] = [with_ground, without_ground].map(|word| f32::from_bits(**word));
-        without_ground.is_finite() && with_ground < without_ground
+    let nearer_pixels = words_with_ground.iter().zip(&words_without_ground).filter(|words| {
+        let (ground_depth, wall_depth) = (f32::from_bits(*words.0), f32::from_bits(*words.1));
+        wall_depth.is_finite() && ground_depth < wall_depth
     });
     assert!(nearer_pixels.count() > 400, "expected the depth of the ground in front of the lower part of the wall");
 }

@@ -1,5 +1,5 @@
-//! Culled frames have the bits of frames without culling and do not depend on earlier frames. The counts of culled
-//! triangles equal computed ones.
+//! Culled frames are bit-identical to frames without culling and do not depend on earlier frames. The numbers of culled
+//! triangles equal the expected ones.
 
 use std::sync::{Arc, OnceLock};
 
@@ -71,11 +71,12 @@ fn camera_at(eye: [f64; 3], target: [f64; 3]) -> Camera {
 
 /// A mesh of separate triangles that share no vertices.
 fn separate_triangles(triangles: &[[[f32; 3]; 3]]) -> Mesh {
-    let rest = triangles.as_flattened().to_vec();
-    let count = rest.len() as u32;
-    let uvs = (0..count).map(|corner| [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]][corner as usize % 3]).collect();
-    let indices = (0..count / 3).map(|first| [3 * first, 3 * first + 1, 3 * first + 2]).collect();
-    Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; count as usize], uvs, indices).expect("expected a valid mesh")
+    let positions = triangles.as_flattened().to_vec();
+    let corner_count = positions.len() as u32;
+    let uvs = (0..corner_count).map(|corner| [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]][corner as usize % 3]).collect();
+    let indices = (0..corner_count / 3).map(|triangle| [3 * triangle, 3 * triangle + 1, 3 * triangle + 2]).collect();
+    Mesh::from_indexed(positions, vec![[0.0, 0.0, 1.0]; corner_count as usize], uvs, indices)
+        .expect("expected a valid mesh")
 }
 
 /// Triangles of many sizes around the origin; some have no area.
@@ -109,19 +110,19 @@ fn mixed_builder(samples: u32, transparency: Transparency) -> SceneBuilder {
     (builder.parts.look.samples, builder.parts.look.transparency) = (samples, transparency);
     builder.parts.look.ground = Some(Ground::default());
     builder.parts.look.shadow = Some(ShadowSettings { size: 256, ..ShadowSettings::default() });
-    let leaf = builder.add_texture(8, 8, |x, y| [90, 200, 60, if (x / 2 + y / 2) % 2 == 0 { 255 } else { 10 }]);
+    let leaf_image = builder.add_texture(8, 8, |x, y| [90, 200, 60, if (x / 2 + y / 2) % 2 == 0 { 255 } else { 10 }]);
     let mask = AlphaMode::Mask { cutoff: 0.5 };
     for (seed, double_sided) in [(1, false), (2, true)] {
         // With several samples, a software renderer reads cut-out images at centroids that depend on hidden triangles;
         // see `Culling::Occlusion`.
-        let image = (samples == 1 || !is_software()).then_some(leaf);
-        let leaves = Material { color_texture: image, alpha: 0.75, ..material(mask, double_sided, [1.0; 3]) };
+        let visible_image = (samples == 1 || !is_software()).then_some(leaf_image);
+        let leaves = Material { color_texture: visible_image, alpha: 0.75, ..material(mask, double_sided, [1.0; 3]) };
         let glass = Material { alpha: 0.5, ..material(AlphaMode::Blend, double_sided, [0.2, 0.4, 0.9]) };
         builder = builder
             .add_domain(random_triangles(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.8, 0.3, 0.2]))
             .add_domain(random_triangles(seed + 2, 400, 3.0), leaves)
             .add_domain(random_triangles(seed + 4, 60, 3.0), glass)
-            // The same triangles again in another color: every depth exists twice.
+            // The opaque triangles again in another color.
             .add_domain(random_triangles(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.2, 0.9, 0.3]));
     }
     builder
@@ -194,9 +195,9 @@ fn long_triangle_lists_keep_their_order() {
     let frames = assert_same_frames(&builder, &|harness| {
         [0.0, 0.1, 0.2].map(|x| harness.draw(camera_at([x, 1.0, 14.0], [x, 0.0, 0.0]), [SIZE, SIZE])).into()
     });
-    let camera = frames[2].culled().camera;
-    assert_eq!(camera.visible + camera.culled(), 82_000);
-    assert!(camera.occluded > 10_000 && camera.visible < 40_000, "{camera:?}");
+    let camera_stats = frames[2].culled().camera;
+    assert_eq!(camera_stats.visible + camera_stats.culled(), 82_000);
+    assert!(camera_stats.occluded > 10_000 && camera_stats.visible < 40_000, "{camera_stats:?}");
 }
 
 #[test]
@@ -249,11 +250,11 @@ fn culling_handles_far_scenes_and_extreme_clip_planes() {
 fn culling_keeps_huge_triangles_and_single_ones() {
     let huge_builder = || {
         let wall = |z: f32| [[-1e5, -1e5, z], [1e5, -1e5, z], [0.0, 1e5, z]];
-        let crossing = [[-3.0, -1.0, 20.0], [3.0, -1.0, 20.0], [0.0, -1.0, -20.0]];
+        let crossing_triangle = [[-3.0, -1.0, 20.0], [3.0, -1.0, 20.0], [0.0, -1.0, -20.0]];
         let mesh = separate_triangles(&[
             wall(-2.0),
             wall(-2.5),
-            crossing,
+            crossing_triangle,
             [[0.0, 0.0, 0.0], [1e9, 0.0, 0.0], [0.0, 1e9, 0.0]],
         ]);
         SceneBuilder::new().add_domain(mesh, material(AlphaMode::Opaque, true, [0.7; 3]))
@@ -269,7 +270,7 @@ fn culling_keeps_huge_triangles_and_single_ones() {
             let camera = Camera { near: 0.01, far: 1e3, ..front_camera(64) };
             (0..3).map(|_| harness.draw(camera, [64, 64])).collect()
         });
-        assert!(frames[2].ids.iter().any(|seen| matches!(seen, VisibilityId::Triangle(_))));
+        assert!(frames[2].ids.iter().any(|id| matches!(id, VisibilityId::Triangle(_))));
     }
 }
 
@@ -290,20 +291,20 @@ fn half_hidden_builder(culling: Culling) -> SceneBuilder {
 #[test]
 fn hidden_count_equals_triangles_behind_the_square() {
     let mut harness = CullHarness::new(half_hidden_builder(Culling::Occlusion), Culling::Occlusion);
-    let first = harness.draw(front_camera(128), [128, 128]).culled().camera;
-    assert_eq!((first.occluded, first.visible), (0, 1024 + 2));
-    let second = harness.draw(front_camera(128), [128, 128]).culled().camera;
-    // The grid is a tenth farther from the eye than the square, which hides everything left of x = 0. The column next
-    // to its edge shares a pixel with visible triangles.
-    assert_eq!((second.outside_view, second.back_facing, second.no_sample), (0, 0, 0));
-    assert!((15 * 32..=16 * 32).contains(&second.occluded), "{second:?}");
-    assert_eq!(second.visible + second.occluded, 1024 + 2);
+    let first_stats = harness.draw(front_camera(128), [128, 128]).culled().camera;
+    assert_eq!((first_stats.occluded, first_stats.visible), (0, 1024 + 2));
+    let second_stats = harness.draw(front_camera(128), [128, 128]).culled().camera;
+    // The grid is 10 % farther from the eye than the square, which hides everything left of x = 0. The grid's column at
+    // the edge of the square shares a pixel with visible triangles, so it may count as visible.
+    assert_eq!((second_stats.outside_view, second_stats.back_facing, second_stats.no_sample), (0, 0, 0));
+    assert!((15 * 32..=16 * 32).contains(&second_stats.occluded), "{second_stats:?}");
+    assert_eq!(second_stats.visible + second_stats.occluded, 1024 + 2);
     // From behind, nothing is hidden, and the square faces away.
-    let from_behind = harness.draw(camera_at([0.0, 0.0, -12.0], [0.0; 3]), [SIZE, SIZE]).culled().camera;
-    assert_eq!((from_behind.back_facing, from_behind.occluded), (2, 0));
-    // A camera that looks away: everything is outside of the frustum.
-    let looking_away = harness.draw(camera_at([0.0, 0.0, 12.0], [0.0, 0.0, 30.0]), [SIZE, SIZE]).culled().camera;
-    assert_eq!((looking_away.outside_view, looking_away.visible), (1026, 0));
+    let stats_from_behind = harness.draw(camera_at([0.0, 0.0, -12.0], [0.0; 3]), [SIZE, SIZE]).culled().camera;
+    assert_eq!((stats_from_behind.back_facing, stats_from_behind.occluded), (2, 0));
+    // For a camera that looks away, everything is outside of the frustum.
+    let stats_looking_away = harness.draw(camera_at([0.0, 0.0, 12.0], [0.0, 0.0, 30.0]), [SIZE, SIZE]).culled().camera;
+    assert_eq!((stats_looking_away.outside_view, stats_looking_away.visible), (1026, 0));
 }
 
 /// A triangle between the samples is culled; a triangle of the same size that contains a sample is drawn.
@@ -315,8 +316,8 @@ fn triangles_without_a_sample_are_culled() {
     let mut builder = SceneBuilder::new().add_domain(mesh, Material::default());
     builder.parts.look.samples = 1;
     let frame = CullHarness::new(builder, Culling::Triangles).draw(front_camera(64), [64, 64]);
-    let camera = frame.culled().camera;
-    assert_eq!((camera.no_sample, camera.visible), (1, 1), "{camera:?}");
+    let camera_stats = frame.culled().camera;
+    assert_eq!((camera_stats.no_sample, camera_stats.visible), (1, 1), "{camera_stats:?}");
     assert_eq!(
         frame.ids.iter().filter(|id| **id == VisibilityId::Triangle(1)).count(),
         1,
@@ -356,8 +357,8 @@ fn software_renderers_draw_hidden_multisampled_cut_outs() {
     ] {
         let mut builder = SceneBuilder::new();
         builder.parts.look.samples = samples;
-        let image = Some(builder.add_texture(1, 1, |_, _| [255; 4]));
-        let material_with_image = Material { color_texture: image, ..material(alpha_mode, true, [1.0; 3]) };
+        let white_image = Some(builder.add_texture(1, 1, |_, _| [255; 4]));
+        let material_with_image = Material { color_texture: white_image, ..material(alpha_mode, true, [1.0; 3]) };
         let mut harness = CullHarness::new(
             builder.add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), material_with_image),
             Culling::Occlusion,
@@ -378,15 +379,16 @@ fn picks_aovs_and_rebased_frames_do_not_depend_on_culling() {
         let pick = harness.renderer.begin_pick(&harness.buffers, &params, rectangle).expect("expected a pick to start");
         let hits = harness.renderer.finish_pick(pick).expect("expected hits");
         let depth = harness.renderer.render_aov(&harness.buffers, &params, Aov::Depth).expect("expected AOVs").bytes;
-        // Rebased positions: shifted, with another origin.
-        let rest = harness.scene.shapes.iter().flat_map(|shape| shape.mesh.rest_positions());
-        let shifted: Vec<f32> = rest.flat_map(|[x, y, z]| [x + 0.75, *y, *z]).collect();
+        // Rebased positions are shifted and have another origin.
+        let rest_positions = harness.scene.shapes.iter().flat_map(|shape| shape.mesh.rest_positions());
+        let shifted_positions: Vec<f32> = rest_positions.flat_map(|[x, y, z]| [x + 0.75, *y, *z]).collect();
         harness
             .renderer
-            .upload_rebased(&mut harness.buffers, &shifted, [0.25, 0.0, 0.0])
+            .upload_rebased(&mut harness.buffers, &shifted_positions, [0.25, 0.0, 0.0])
             .expect("expected the upload to succeed");
-        let rebased = [harness.draw(camera, [SIZE, SIZE]), harness.draw(camera, [SIZE, SIZE])].map(|frame| frame.rgba);
-        (hits, depth, rebased)
+        let rebased_images =
+            [harness.draw(camera, [SIZE, SIZE]), harness.draw(camera, [SIZE, SIZE])].map(|frame| frame.rgba);
+        (hits, depth, rebased_images)
     });
     assert!(!results[0].0.is_empty() && results[0].2[0] == results[0].2[1]);
     assert!(results[1] == results[0] && results[2] == results[0]);
@@ -395,9 +397,9 @@ fn picks_aovs_and_rebased_frames_do_not_depend_on_culling() {
 /// A small scene with the default culling allocates no culling buffers.
 #[test]
 fn culled_draw_calls_do_not_grow_with_domains() {
-    let default_culling = CullHarness::new(half_hidden_builder(Culling::Auto), Culling::Auto);
+    let default_harness = CullHarness::new(half_hidden_builder(Culling::Auto), Culling::Auto);
     assert!(
-        default_culling
+        default_harness
             .buffers
             .allocations()
             .iter()

@@ -1,4 +1,4 @@
-//! The almond tree has the same image with and without culling. Prints the times of its passes.
+//! Test that the almond tree has the same image with and without culling. It prints the times of the passes.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -13,43 +13,50 @@ use modalcast_render::{FrameCullStats, FrameParams, FrameTimes, Renderer};
 use super::harness::open_renderer;
 
 const SIZE: [u32; 2] = [1920, 1080];
-const FRAMES: usize = 9;
+const FRAME_COUNT: usize = 9;
 
-/// The same scene with another look.
-fn with_look(scene: &Scene, look: RenderSettings) -> Arc<Scene> {
+/// A copy of the scene with other render settings.
+fn replace_look(scene: &Scene, look: RenderSettings) -> Arc<Scene> {
     Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene")
 }
 
-/// The image, the median times of some passes in milliseconds, and the culling statistics.
-fn draw_frames(
-    renderer: &mut Renderer,
-    scene: &Arc<Scene>,
-) -> (Vec<u8>, Vec<(&'static str, f64)>, Option<FrameCullStats>) {
+/// The result of [`FRAME_COUNT`] equal frames.
+struct DrawnFrames {
+    rgba: Vec<u8>,
+    /// Names of some passes and their median times in milliseconds.
+    pass_times: Vec<(&'static str, f64)>,
+    cull_stats: Option<FrameCullStats>,
+}
+
+fn draw_frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> DrawnFrames {
     let mut deformer = ReferenceDeformer::new(scene);
     let bounds = deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed").bounds;
     let buffers = renderer.load(scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
     let camera = Camera::fit_to_scene(scene, SIZE[0], SIZE[1]);
     let params = FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds, light: None };
-    let images: Vec<_> = (0..FRAMES).map(|_| renderer.draw(&buffers, &params).expect("expected a frame")).collect();
+    let images: Vec<_> =
+        (0..FRAME_COUNT).map(|_| renderer.draw(&buffers, &params).expect("expected a frame")).collect();
     assert!(images.iter().all(|image| image.rgba == images[0].rgba), "expected identical frames");
-    let median = |name: &'static str| {
+    let median_time = |name: &'static str| {
         let pass_time = |times: &FrameTimes| times.iter().find(|(key, _)| key.name() == name).map_or(0.0, |(_, ms)| ms);
         let mut times: Vec<f64> = images[1..].iter().map(|image| pass_time(&image.times)).collect();
         times.sort_by(f64::total_cmp);
         (name, times[times.len() / 2])
     };
-    let passes = ["shadow", "blur", "cull", "visibility", "blended", "draw"].map(median).to_vec();
-    let culled = renderer.stats().culled;
+    let pass_times = ["shadow", "blur", "cull", "visibility", "blended", "draw"].map(median_time).to_vec();
+    let cull_stats = renderer.stats().culled;
     renderer.unload(buffers);
-    (images[0].rgba.clone(), passes, culled)
+    DrawnFrames { rgba: images[0].rgba.clone(), pass_times, cull_stats }
 }
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 fn real_almond_with_culling_is_the_same_picture() {
-    let root = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
-    let scene = modalcast_model::load::open(&root.join("plants/almond").to_string_lossy()).expect("the almond").scene;
+    let data_folder = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
+    let scene = modalcast_model::load::open(&data_folder.join("plants/almond").to_string_lossy())
+        .expect("expected the almond tree")
+        .scene;
     let mut renderer = open_renderer();
     for transparency in [Transparency::OrderIndependent, Transparency::TwoPass] {
         let look = RenderSettings {
@@ -59,14 +66,14 @@ fn real_almond_with_culling_is_the_same_picture() {
         };
         let mut unculled_image = None;
         for culling in [Culling::None, Culling::Triangles, Culling::Occlusion] {
-            let (rgba, passes, culled) =
-                draw_frames(&mut renderer, &with_look(&scene, RenderSettings { culling, ..look }));
-            println!("{transparency:?}, {culling:?}: {passes:.3?} {culled:?}");
+            let DrawnFrames { rgba, pass_times, cull_stats } =
+                draw_frames(&mut renderer, &replace_look(&scene, RenderSettings { culling, ..look }));
+            println!("{transparency:?}, {culling:?}: {pass_times:.3?} {cull_stats:?}");
             assert!(
                 unculled_image.get_or_insert_with(|| rgba.clone()) == &rgba,
                 "{culling:?}: expected the image without culling"
             );
-            assert_eq!(culled.is_some_and(|culled| culled.camera.culled() > 0), culling != Culling::None);
+            assert_eq!(cull_stats.is_some_and(|cull_stats| cull_stats.camera.culled() > 0), culling != Culling::None);
         }
     }
 }

@@ -12,9 +12,9 @@ use super::harness::{SceneBuilder, facing_rectangle, front_camera, open_renderer
 const SIZE: u32 = 96;
 
 /// An opaque square, a cut-out leaf in front of it, and a glass pane in front of the leaf.
-fn test_scene(look: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
+fn test_scene(modify: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
     let mut builder = SceneBuilder::new();
-    look(&mut builder.parts.look);
+    modify(&mut builder.parts.look);
     let cut_out_image = builder.add_texture(8, 8, |x, y| [200, 220, 90, if (x + y) % 2 == 0 { 255 } else { 0 }]);
     let colored_material = |diffuse: [f32; 3]| Material { diffuse, double_sided: true, ..Material::default() };
     let glass_material = Material { alpha_mode: AlphaMode::Blend, alpha: 0.4, ..colored_material([0.2, 0.9, 0.3]) };
@@ -52,12 +52,16 @@ fn shifted_camera([x, y]: [f64; 2]) -> Camera {
     camera
 }
 
-type Frame = (Vec<u8>, Vec<VisibilityId>);
+#[derive(PartialEq)]
+struct Frame {
+    rgba: Vec<u8>,
+    ids: Vec<VisibilityId>,
+}
 
 fn draw_frame(renderer: &mut Renderer, buffers: &SceneBuffers, camera: Camera, bounds: BoundingBox) -> Frame {
     let params = FrameParams { camera, width: SIZE, height: SIZE, bounds, light: None };
     let rgba = renderer.draw(buffers, &params).expect("expected a frame").rgba;
-    (rgba, renderer.read_visibility().expect("expected visibility ids"))
+    Frame { rgba, ids: renderer.read_visibility().expect("expected visibility ids") }
 }
 
 #[test]
@@ -73,18 +77,18 @@ fn reused_targets_render_like_a_fresh_renderer() {
     let shifts = [[0.0; 2], [30.0, 20.0], [-25.0, -30.0], [500.0, 0.0], [20.0, -20.0], [0.0; 2]];
     for (index, look) in looks.into_iter().enumerate() {
         let scene = test_scene(look);
-        let (mut reused_renderer, mut last) = (open_renderer(), None::<Frame>);
+        let (mut reused_renderer, mut previous_frame) = (open_renderer(), None::<Frame>);
         let buffers = load_at_rest(&mut reused_renderer, &scene);
         for shift in shifts {
             let (mut new_renderer, camera) = (open_renderer(), shifted_camera(shift));
             let new_buffers = load_at_rest(&mut new_renderer, &scene);
-            let want = draw_frame(&mut new_renderer, &new_buffers, camera, scene.rest_bounds);
-            let got = draw_frame(&mut reused_renderer, &buffers, camera, scene.rest_bounds);
-            assert!(got == want, "look {index} at {shift:?}");
-            let triangles = got.1.iter().filter(|id| matches!(id, VisibilityId::Triangle(_))).count();
+            let expected_frame = draw_frame(&mut new_renderer, &new_buffers, camera, scene.rest_bounds);
+            let frame = draw_frame(&mut reused_renderer, &buffers, camera, scene.rest_bounds);
+            assert!(frame == expected_frame, "look {index} at {shift:?}");
+            let triangles = frame.ids.iter().filter(|id| matches!(id, VisibilityId::Triangle(_))).count();
             assert_eq!(triangles > 100, shift[0] < 100.0, "look {index} at {shift:?}: {triangles} pixels");
-            assert!(last.as_ref() != Some(&got), "negative control: look {index} at {shift:?}");
-            last = Some(got);
+            assert!(previous_frame.as_ref() != Some(&frame), "negative control: look {index} at {shift:?}");
+            previous_frame = Some(frame);
         }
     }
 }
@@ -106,31 +110,35 @@ fn scenes_sharing_a_target_do_not_affect_each_other() {
         open_renderer(),
     );
     let buffers = [0, 1].map(|index| load_at_rest(&mut shared_renderer, &scenes[index]));
-    for (draw, shift) in [[0.0; 2], [30.0, 20.0], [-25.0, -30.0], [12.0, 3.0]].into_iter().enumerate() {
-        let (index, mut new_renderer) = (draw % 2, open_renderer());
+    for (frame_index, shift) in [[0.0; 2], [30.0, 20.0], [-25.0, -30.0], [12.0, 3.0]].into_iter().enumerate() {
+        let (index, mut new_renderer) = (frame_index % 2, open_renderer());
         let new_buffers = load_at_rest(&mut new_renderer, &scenes[index]);
         let bounds = scenes[index].rest_bounds;
-        let want = draw_frame(&mut new_renderer, &new_buffers, shifted_camera(shift), bounds);
+        let expected_frame = draw_frame(&mut new_renderer, &new_buffers, shifted_camera(shift), bounds);
         assert!(
-            draw_frame(&mut shared_renderer, &buffers[index], shifted_camera(shift), bounds) == want,
-            "turn {draw}"
+            draw_frame(&mut shared_renderer, &buffers[index], shifted_camera(shift), bounds) == expected_frame,
+            "frame {frame_index}"
         );
     }
 }
 
 #[test]
-fn geometry_outside_the_bounds_leaves_no_remains() {
+fn geometry_outside_the_bounds_leaves_no_stale_pixels() {
     for transparency in [Transparency::TwoPass, Transparency::OrderIndependent] {
         let scene = test_scene(|look| look.transparency = transparency);
         let mut renderer = open_renderer();
         let buffers = load_at_rest(&mut renderer, &scene);
-        // Bounds smaller than the scene. They cut it on all sides, inside a quad of pixels or at the border of a quad.
+        // These bounds cut the scene on all sides. With the two shifts, the cuts lie within and at the border of a quad
+        // of 2 x 2 pixels.
         let small_bounds = BoundingBox { min: [-0.3, -0.3, -0.5], max: [0.1, 0.2, -0.4] };
         let mut draw = |shift: [f64; 2]| draw_frame(&mut renderer, &buffers, shifted_camera(shift), small_bounds);
         for shift in [[0.0; 2], [1.0; 2]] {
-            let first = draw(shift);
-            assert!(draw([30.0, 20.0]) != first, "negative control");
-            assert!(draw(shift) == first && draw(shift) == first, "expected the same frame again at {shift:?}");
+            let first_frame = draw(shift);
+            assert!(draw([30.0, 20.0]) != first_frame, "negative control: a shifted camera");
+            assert!(
+                draw(shift) == first_frame && draw(shift) == first_frame,
+                "expected the same frame again at {shift:?}"
+            );
         }
     }
 }
@@ -140,11 +148,14 @@ fn nothing_is_drawn_outside_the_given_bounds() {
     let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
     let buffers = load_at_rest(&mut renderer, &scene);
     let mut count_triangle_pixels = |bounds: BoundingBox| {
-        let (_, ids) = draw_frame(&mut renderer, &buffers, front_camera(SIZE), bounds);
-        ids.iter().filter(|ids| matches!(ids, VisibilityId::Triangle(_))).count()
+        let frame = draw_frame(&mut renderer, &buffers, front_camera(SIZE), bounds);
+        frame.ids.iter().filter(|id| matches!(id, VisibilityId::Triangle(_))).count()
     };
-    let full = count_triangle_pixels(scene.rest_bounds);
-    let half_bounds = count_triangle_pixels(BoundingBox { max: [0.0, 1.0, 0.5], ..scene.rest_bounds });
-    let nan_bounds = count_triangle_pixels(BoundingBox { max: [f64::NAN; 3], ..scene.rest_bounds });
-    assert!(half_bounds < full * 3 / 4 && full == nan_bounds, "{half_bounds} and {nan_bounds} of {full} pixels");
+    let all_pixels = count_triangle_pixels(scene.rest_bounds);
+    let half_bounds_pixels = count_triangle_pixels(BoundingBox { max: [0.0, 1.0, 0.5], ..scene.rest_bounds });
+    let nan_bounds_pixels = count_triangle_pixels(BoundingBox { max: [f64::NAN; 3], ..scene.rest_bounds });
+    assert!(
+        half_bounds_pixels < all_pixels * 3 / 4 && all_pixels == nan_bounds_pixels,
+        "{half_bounds_pixels} and {nan_bounds_pixels} of {all_pixels} pixels"
+    );
 }

@@ -27,18 +27,18 @@ fn move_domains(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> SceneSta
         let rotation = [0.0, 0.0, 0.0, 1.0_f32].into_iter().flat_map(f32::to_le_bytes);
         rotation.chain([x, y, z].into_iter().flat_map(f64::to_le_bytes))
     };
-    let raw = RawStepUpdate {
+    let raw_update = RawStepUpdate {
         transform_domains: domains.to_vec(),
         transforms: domains.iter().flat_map(|_| transform_bytes()).collect(),
         transform_format: TransformFormat::RigidF64,
         ..RawStepUpdate::default()
     };
     let mut state = SceneState::rest(scene);
-    state.apply(scene, &StepUpdate::parse(scene, &raw).expect("expected a valid step"));
+    state.apply(scene, &StepUpdate::parse(scene, &raw_update).expect("expected a valid step"));
     state
 }
 
-/// A camera that looks obliquely from above at a square around `at`.
+/// A camera that looks obliquely from above at a square around `target`.
 fn camera_at(target: [f64; 3]) -> Camera {
     let eye = [target[0] + 1.7, target[1] + 2.1, target[2] + 3.3];
     let view = View::LookAt { eye, target: [target[0], target[1] + 0.2, target[2]], up: [0.0, 1.0, 0.0] };
@@ -76,35 +76,38 @@ fn far_scene_renders_like_the_scene_at_the_origin() {
     let mut context = open_context();
     // Texels of a shadow map are aligned to a grid, so the edge of a shadow looks the same only after a move by
     // multiples of the grid.
-    let on_grid = [9766.0 * ORIGIN_GRID, 0.0, -9767.0 * ORIGIN_GRID];
+    let grid_position = [9766.0 * ORIGIN_GRID, 0.0, -9767.0 * ORIGIN_GRID];
     // Off the grid, positions round differently, by 1/500 pixel. A sample closer than that to an edge may change sides,
     // which affects at most one pixel in a thousand.
     let base = ShadowSettings::default();
     let cases = [
-        (Some(base), on_grid, 0),
-        (Some(ShadowSettings { method: ShadowMethod::Standard, ..base }), on_grid, 0),
-        (Some(ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }), on_grid, 0),
-        (Some(ShadowSettings { splits: 3, ..base }), on_grid, 0),
+        (Some(base), grid_position, 0),
+        (Some(ShadowSettings { method: ShadowMethod::Standard, ..base }), grid_position, 0),
+        (Some(ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }), grid_position, 0),
+        (Some(ShadowSettings { splits: 3, ..base }), grid_position, 0),
         (None, FAR_POSITION, 9),
     ];
-    for (shadow, position, max_different) in cases {
+    for (shadow, position, max_different_pixels) in cases {
         let scene = table_scene(shadow);
-        let home_frame = draw_frame(&mut context, &scene, &SceneState::rest(&scene), &camera_at([0.0; 3]));
+        let origin_frame = draw_frame(&mut context, &scene, &SceneState::rest(&scene), &camera_at([0.0; 3]));
         let far_state = move_domains(&scene, &[0, 1], position);
         assert!(far_state.origins.as_ref().is_some_and(|origins| origins.is_uniform()));
         let far_frame = draw_frame(&mut context, &scene, &far_state, &camera_at(position));
-        let (max, count) = max_difference(&home_frame, &far_frame);
-        assert!(count <= max_different, "{count} pixels at {position:?}, by {max} levels at most");
+        let (max, count) = max_difference(&origin_frame, &far_frame);
+        assert!(count <= max_different_pixels, "{count} pixels differ at {position:?}, by up to {max} levels");
     }
     let scene = table_scene(None);
-    let home_frame = draw_frame(&mut context, &scene, &SceneState::rest(&scene), &camera_at([0.0; 3]));
+    let origin_frame = draw_frame(&mut context, &scene, &SceneState::rest(&scene), &camera_at([0.0; 3]));
     let far_state = move_domains(&scene, &[0, 1], FAR_POSITION);
     // Negative controls: a camera position rounded to f32, and a camera moved by 0.1 units.
-    let rounded = FAR_POSITION.map(|number| f64::from(number as f32));
-    assert!(max_difference(&home_frame, &draw_frame(&mut context, &scene, &far_state, &camera_at(rounded))).0 > 8);
+    let rounded_position = FAR_POSITION.map(|number| f64::from(number as f32));
+    assert!(
+        max_difference(&origin_frame, &draw_frame(&mut context, &scene, &far_state, &camera_at(rounded_position))).0
+            > 8
+    );
     assert!(
         max_difference(
-            &home_frame,
+            &origin_frame,
             &draw_frame(&mut context, &scene, &far_state, &camera_at([FAR_POSITION[0] + 0.1, 0.0, FAR_POSITION[2]]))
         )
         .0 > 8
@@ -120,28 +123,36 @@ fn distant_domains_are_seen_by_nearby_cameras() {
     let scene =
         SceneBuilder::new().add_domain(square(0.0), Material::default()).add_domain(square(-0.1), red.clone()).build();
     let single_domain_scene = |material: Material, z| SceneBuilder::new().add_domain(square(z), material).build();
-    let (gray, red) = (single_domain_scene(Material::default(), 0.0), single_domain_scene(red, -0.1));
+    let (gray_scene, red_scene) = (single_domain_scene(Material::default(), 0.0), single_domain_scene(red, -0.1));
     let mut draw_at_rest =
         |scene: &Arc<Scene>| draw_frame(&mut context, scene, &SceneState::rest(scene), &camera_at([0.0; 3]));
-    let (gray, red, both_frame) = (draw_at_rest(&gray), draw_at_rest(&red), draw_at_rest(&scene));
-    let separated = move_domains(&scene, &[1], FAR_POSITION);
-    assert!(separated.origins.as_ref().is_some_and(|origins| !origins.is_uniform()));
+    let frames = [draw_at_rest(&gray_scene), draw_at_rest(&red_scene), draw_at_rest(&scene)];
+    let separated_state = move_domains(&scene, &[1], FAR_POSITION);
+    assert!(separated_state.origins.as_ref().is_some_and(|origins| !origins.is_uniform()));
     let mut loaded_scene = context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
-    let mut compare_with_single = |state: &SceneState, index| {
+    let mut compare_with_single = |state: &SceneState, target| {
         loaded_scene.deform(state).expect("expected the step to succeed");
         let image =
-            context.draw(&mut loaded_scene, &camera_at(index), FrameSize::new(96, 96)).expect("expected a frame");
-        [&gray, &red, &both_frame].map(|want| max_difference(&image, want).0)
+            context.draw(&mut loaded_scene, &camera_at(target), FrameSize::new(96, 96)).expect("expected a frame");
+        [0, 1, 2].map(|index| max_difference(&image, &frames[index]).0)
     };
-    let is_only = |levels: [u8; 3], expected: usize| (0..3).all(|index| (levels[index] <= 1) == (index == expected));
+    // Whether the image equals the frame with the index `expected` and neither of the others.
+    let equals_only = |max_differences: [u8; 3], expected: usize| {
+        (0..3).all(|index| (max_differences[index] <= 1) == (index == expected))
+    };
     // Twice, because no frame may contain pixels of an earlier frame.
     for _ in 0..2 {
-        let levels = [
-            compare_with_single(&separated, FAR_POSITION),
-            compare_with_single(&separated, [0.0; 3]),
+        let max_differences = [
+            compare_with_single(&separated_state, FAR_POSITION),
+            compare_with_single(&separated_state, [0.0; 3]),
             compare_with_single(&SceneState::rest(&scene), [0.0; 3]),
         ];
-        assert!(is_only(levels[0], 1) && is_only(levels[1], 0) && is_only(levels[2], 2), "{levels:?}");
+        assert!(
+            equals_only(max_differences[0], 1)
+                && equals_only(max_differences[1], 0)
+                && equals_only(max_differences[2], 2),
+            "{max_differences:?}"
+        );
     }
     context.unload_scene(loaded_scene);
 }

@@ -1,4 +1,4 @@
-//! Samples without a triangle intersect the ground analytically. The result equals that of the ground pass.
+//! For samples without a triangle, the ground is intersected analytically. The result equals that of the ground pass.
 
 use std::sync::Arc;
 
@@ -50,7 +50,7 @@ struct Frame {
 }
 
 impl Frame {
-    /// Renders the scene at rest, lowered by `sunk`, with bounds whose lowest point is at `lowest`.
+    /// Renders the scene at rest, lowered by `lowering`, with bounds that begin at `min_y`.
     fn new(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, (lowering, min_y): (f32, f64)) -> Self {
         let buffers = renderer.load(scene).expect("expected the scene to load");
         let collect_from_meshes = |attribute: fn(&modalcast_model::domain::Mesh) -> &[[f32; 3]]| -> Vec<f32> {
@@ -92,7 +92,7 @@ impl Frame {
     }
 }
 
-/// Lower bound in y that requires the ground pass: far enough below the ground to exceed rounding, but too little to
+/// Lower bound in y that requires the ground pass. It is far enough below the ground to exceed rounding, but too close to
 /// affect the shadow map or the depth range.
 const BELOW_GROUND: f64 = -1e-5;
 
@@ -110,48 +110,49 @@ fn analytic_ground_equals_drawn_ground() {
     for (index, look) in looks.into_iter().enumerate() {
         let scene = test_scene(look);
         for eye in [[0.5, 1.0, 7.0], [3.0, 4.0, 5.0], [-4.0, 0.05, 1.0], [0.0, 0.8, 60.0]] {
-            let mut frame = |min_y: f64| Frame::new(&mut renderer, &scene, camera_at(eye), (0.0, min_y));
-            let (analytic, drawn) = (frame(0.0), frame(BELOW_GROUND));
-            assert_eq!([analytic.draws_ground(), drawn.draws_ground()], [false, true]);
+            let mut draw_frame = |min_y: f64| Frame::new(&mut renderer, &scene, camera_at(eye), (0.0, min_y));
+            let (analytic_frame, drawn_frame) = (draw_frame(0.0), draw_frame(BELOW_GROUND));
+            assert_eq!([analytic_frame.draws_ground(), drawn_frame.draws_ground()], [false, true]);
             // Samples at the horizon may round to the ground or to the sky, which have the same color there.
-            let [colors, ids] = analytic.count_differences(&drawn);
+            let [colors, ids] = analytic_frame.count_differences(&drawn_frame);
             assert!(
                 colors == 0 && ids <= 2,
                 "look {index} from {eye:?}: {colors} colors and {ids} ids of {}",
                 SIZE * SIZE
             );
-            let ground_pixels = analytic.ids.iter().filter(|id| **id == VisibilityId::Ground).count();
+            let ground_pixels = analytic_frame.ids.iter().filter(|id| **id == VisibilityId::Ground).count();
             assert!(ground_pixels > 500, "look {index} from {eye:?}: {ground_pixels} pixels of ground");
         }
     }
 }
 
-/// Bounds that overflowed require the ground pass, because geometry may be below the ground.
+/// Overflowed bounds require the ground pass, because geometry may be below the ground.
 #[test]
 fn ground_hides_geometry_below_and_is_one_sided() {
     let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
     let camera = camera_at([0.5, 1.0, 7.0]);
-    let mut frame = |eye: Camera, lowering: f32, min_y: f64| Frame::new(&mut renderer, &scene, eye, (lowering, min_y));
-    let (with_pass, without_pass) = (frame(camera, 0.7, -0.7), frame(camera, 0.7, 0.0));
-    assert_eq!([with_pass.draws_ground(), without_pass.draws_ground()], [true, false]);
-    let [colors, ids] = without_pass.count_differences(&with_pass);
+    let mut draw_frame =
+        |camera: Camera, lowering: f32, min_y: f64| Frame::new(&mut renderer, &scene, camera, (lowering, min_y));
+    let (frame_with_pass, frame_without_pass) = (draw_frame(camera, 0.7, -0.7), draw_frame(camera, 0.7, 0.0));
+    assert_eq!([frame_with_pass.draws_ground(), frame_without_pass.draws_ground()], [true, false]);
+    let [colors, ids] = frame_without_pass.count_differences(&frame_with_pass);
     assert!(colors > 200 && ids > 100, "negative control: {colors} colors and {ids} ids differ");
-    let from_below = frame(camera_at([0.5, -1.0, 7.0]), 0.0, 0.0);
-    assert!(!from_below.draws_ground() && from_below.ids.iter().all(|seen| *seen != VisibilityId::Ground));
-    let nan_bounds = frame(camera, 0.0, f64::NAN);
-    assert!(nan_bounds.draws_ground(), "expected the ground pass for bounds that overflowed");
+    let frame_from_below = draw_frame(camera_at([0.5, -1.0, 7.0]), 0.0, 0.0);
+    assert!(!frame_from_below.draws_ground() && frame_from_below.ids.iter().all(|id| *id != VisibilityId::Ground));
+    let nan_bounds_frame = draw_frame(camera, 0.0, f64::NAN);
+    assert!(nan_bounds_frame.draws_ground(), "expected the ground pass for bounds that overflowed");
 }
 
 #[test]
 fn geometry_on_the_ground_is_visible_despite_rounding() {
     let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
     let camera = camera_at([1.0, 5.0, 4.0]);
-    let rounded = BoundingBox { min: [0.0, -4e-7, 0.0], ..scene.rest_bounds }.min[1];
-    let frame = Frame::new(&mut renderer, &scene, camera, (4e-7, rounded));
+    let rounded_min_y = BoundingBox { min: [0.0, -4e-7, 0.0], ..scene.rest_bounds }.min[1];
+    let frame = Frame::new(&mut renderer, &scene, camera, (4e-7, rounded_min_y));
     assert!(!frame.draws_ground());
-    let with_pass = Frame::new(&mut renderer, &scene, camera, (4e-7, BELOW_GROUND));
-    let [colors, ids] = frame.count_differences(&with_pass);
-    assert!(with_pass.draws_ground() && colors == 0 && ids <= 2, "{colors} colors and {ids} ids");
+    let frame_with_pass = Frame::new(&mut renderer, &scene, camera, (4e-7, BELOW_GROUND));
+    let [colors, ids] = frame.count_differences(&frame_with_pass);
+    assert!(frame_with_pass.draws_ground() && colors == 0 && ids <= 2, "{colors} colors and {ids} ids");
     let red_pixels = frame.rgba.chunks_exact(4).filter(|pixel| pixel[0] > pixel[1].saturating_add(30)).count();
     assert!(red_pixels > 300, "{red_pixels} pixels of the red square");
 }

@@ -40,7 +40,7 @@ impl SceneBuilder {
         self.parts.textures.len() - 1
     }
 
-    /// Adds a rigid domain with a mesh and a material of its own.
+    /// Adds a rigid domain with a new shape and a new material.
     pub(super) fn add_domain(mut self, mesh: Mesh, material: Material) -> Self {
         self.parts.shapes.push(Shape::new(mesh, Modes::rigid()).expect("expected a valid shape"));
         self.parts.materials.push(material);
@@ -58,24 +58,24 @@ impl SceneBuilder {
 
 /// A rectangle that faces +Z, from (left, bottom) to (right, top) at depth z.
 pub(super) fn facing_rectangle(left: f32, bottom: f32, right: f32, top: f32, z: f32) -> Mesh {
-    let rest = vec![[left, bottom, z], [right, bottom, z], [right, top, z], [left, top, z]];
-    rectangle(rest, [0.0, 0.0, 1.0])
+    let positions = vec![[left, bottom, z], [right, bottom, z], [right, top, z], [left, top, z]];
+    rectangle(positions, [0.0, 0.0, 1.0])
 }
 
-/// A square that faces +Y at height y and extends `half` to each side of the origin.
+/// A square that faces +Y at height y and extends by `half_side` from the y axis along x and z.
 pub(super) fn floor_mesh(half_side: f32, y: f32) -> Mesh {
-    let rest = vec![
+    let positions = vec![
         [-half_side, y, half_side],
         [half_side, y, half_side],
         [half_side, y, -half_side],
         [-half_side, y, -half_side],
     ];
-    rectangle(rest, [0.0, 1.0, 0.0])
+    rectangle(positions, [0.0, 1.0, 0.0])
 }
 
-fn rectangle(rest: Vec<[f32; 3]>, normal: [f32; 3]) -> Mesh {
+fn rectangle(positions: Vec<[f32; 3]>, normal: [f32; 3]) -> Mesh {
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
-    Mesh::from_indexed(rest, vec![normal; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("expected a valid mesh")
+    Mesh::from_indexed(positions, vec![normal; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("expected a valid mesh")
 }
 
 /// A camera at z = 10 with ten pixels per unit in the plane z = 0 and the origin at the center of the image.
@@ -107,11 +107,11 @@ pub(super) fn render_sized(
     [width, height]: [u32; 2],
 ) -> RenderedFrame {
     let mut deformer = ReferenceDeformer::new(scene).with_bounding_axes(scene.light_axes());
-    let DeformSummary { bounds, oriented_bounds: light, .. } =
+    let DeformSummary { bounds, oriented_bounds: light_bounds, .. } =
         deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed");
     let buffers = renderer.load(scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
-    let params = FrameParams { camera, width, height, bounds, light };
+    let params = FrameParams { camera, width, height, bounds, light: light_bounds };
     let image = renderer.draw(&buffers, &params).expect("expected a frame");
     let (stats, allocations) = (renderer.stats().clone(), buffers.allocations());
     renderer.unload(buffers);
@@ -126,8 +126,8 @@ pub(super) fn render(scene: &Arc<Scene>) -> RenderedFrame {
 impl RenderedFrame {
     /// Red, green and blue of a pixel; (0, 0) is the top left.
     pub(super) fn pixel(&self, x: u32, y: u32) -> [u8; 3] {
-        let first = 4 * (y * self.image.width + x) as usize;
-        let [r, g, b, a] = [0, 1, 2, 3].map(|channel| self.image.rgba[first + channel]);
+        let offset = 4 * (y * self.image.width + x) as usize;
+        let [r, g, b, a] = [0, 1, 2, 3].map(|channel| self.image.rgba[offset + channel]);
         assert_eq!(a, 255, "expected an opaque pixel");
         [r, g, b]
     }
@@ -141,7 +141,7 @@ impl RenderedFrame {
     }
 }
 
-/// The planned passes of a scene without geometry below its ground, which skips the ground pass.
+/// The planned passes without the ground pass, which a frame skips if no geometry is below the ground.
 pub(super) fn planned_passes_above_ground(scene: &Scene) -> Vec<Pass> {
     plan(scene).passes.into_iter().filter(|pass| *pass != Pass::Ground).collect()
 }

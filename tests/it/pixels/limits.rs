@@ -1,4 +1,5 @@
-//! Unused features allocate and run nothing. Frames of extreme sizes, cameras and vertices are valid and deterministic.
+//! Unused features have no allocations and no passes. Frames of extreme sizes, cameras and vertices are valid and
+//! deterministic.
 
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
@@ -21,11 +22,11 @@ fn default_look_builder() -> SceneBuilder {
 #[test]
 fn unused_features_allocate_and_run_nothing() {
     let plain_frame = render(&default_look_builder().add_domain(floor_mesh(1.0, -0.5), Material::default()).build());
-    let names = |allocations: &[modalcast_render::Allocation]| {
+    let allocation_names = |allocations: &[modalcast_render::Allocation]| {
         allocations.iter().map(|allocation| allocation.name.clone()).collect::<Vec<_>>()
     };
     for name in ["tangents", "uvs", "triangle materials"] {
-        assert!(!names(&plain_frame.allocations).contains(&name.to_string()), "{name}");
+        assert!(!allocation_names(&plain_frame.allocations).contains(&name.to_string()), "{name}");
     }
     assert_eq!(
         plain_frame.stats.passes,
@@ -43,7 +44,7 @@ fn unused_features_allocate_and_run_nothing() {
     let scene = builder.build();
     let full_frame = render(&scene);
     for name in ["tangents", "uvs", "triangle materials"] {
-        assert!(names(&full_frame.allocations).contains(&name.to_string()), "{name}");
+        assert!(allocation_names(&full_frame.allocations).contains(&name.to_string()), "{name}");
     }
     assert_eq!(
         full_frame.stats.passes,
@@ -60,9 +61,9 @@ fn unused_features_allocate_and_run_nothing() {
             Pass::Encode
         ]
     );
-    let mut planned = plan(&scene).buffers;
-    planned.sort_by(|a, b| a.name.cmp(&b.name));
-    assert_eq!(full_frame.allocations, planned, "expected the planned allocations");
+    let mut planned_buffers = plan(&scene).buffers;
+    planned_buffers.sort_by(|a, b| a.name.cmp(&b.name));
+    assert_eq!(full_frame.allocations, planned_buffers, "expected the planned allocations");
     assert_eq!(full_frame.stats.passes, planned_passes_above_ground(&scene), "expected the planned passes");
 }
 
@@ -123,27 +124,31 @@ fn frames_are_deterministic() {
         .add_domain(floor_mesh(0.5, 1.0), Material::default())
         .build();
     let mut renderer = open_renderer();
-    let first = render_square(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96);
+    let first_frame = render_square(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96);
     assert!(
-        first.image.rgba == render_square(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96).image.rgba
+        first_frame.image.rgba
+            == render_square(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96).image.rgba
     );
     assert!(
-        first.image.rgba
+        first_frame.image.rgba
             == render_square(&mut open_renderer(), &scene, Camera::fit_to_scene(&scene, 64, 64), 96).image.rgba,
-        "another context"
+        "expected the same image in another context"
     );
     let mut other_camera = Camera::fit_to_scene(&scene, 64, 64);
     other_camera.lens = modalcast_model::scene::Lens::FieldOfView(33.0);
-    assert!(first.image.rgba != render_square(&mut renderer, &scene, other_camera, 96).image.rgba, "negative control");
+    assert!(
+        first_frame.image.rgba != render_square(&mut renderer, &scene, other_camera, 96).image.rgba,
+        "negative control: another camera"
+    );
 }
 
 /// Triangles without area, a sun straight above, and a camera inside the mesh.
 #[test]
 fn degenerate_scenes_suns_and_cameras_are_drawn() {
-    let collinear = vec![[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.0]];
+    let positions = vec![[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 0.0]];
     let triangles = vec![[0, 1, 2], [0, 0, 0], [0, 3, 1]];
     let degenerate_mesh =
-        Mesh::from_indexed(collinear, vec![[0.0, 0.0, 1.0]; 4], vec![], triangles).expect("expected a valid mesh");
+        Mesh::from_indexed(positions, vec![[0.0, 0.0, 1.0]; 4], vec![], triangles).expect("expected a valid mesh");
     let mut builder = default_look_builder();
     builder.parts.look.sun = [0.0, 1.0, 0.0];
     let scene = builder
@@ -199,19 +204,22 @@ fn scene_far_from_the_origin_is_rendered() {
 
 #[test]
 fn renderers_work_on_many_threads_and_two_on_one() {
-    let draw_one = || {
+    let draw_frame = || {
         let scene = default_look_builder().add_domain(floor_mesh(1.0, 0.5), Material::default()).build();
         render_square(&mut open_renderer(), &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba
     };
-    let first = draw_one();
-    let threads: Vec<_> = (0..4).map(|_| std::thread::spawn(move || [draw_one(), draw_one()])).collect();
+    let expected_rgba = draw_frame();
+    let threads: Vec<_> = (0..4).map(|_| std::thread::spawn(move || [draw_frame(), draw_frame()])).collect();
     for thread in threads {
-        assert!(thread.join().expect("expected the thread not to panic").iter().all(|bytes| *bytes == first));
+        assert!(thread.join().expect("expected the thread not to panic").iter().all(|bytes| *bytes == expected_rgba));
     }
     let (mut first_renderer, mut second_renderer) = (open_renderer(), open_renderer());
     let scene = default_look_builder().add_domain(floor_mesh(1.0, 0.5), Material::default()).build();
     let buffers = first_renderer.load(&scene).expect("expected the scene to load");
-    assert!(render_square(&mut second_renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba == first);
+    assert!(
+        render_square(&mut second_renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba
+            == expected_rgba
+    );
     drop(second_renderer);
     let mut deformer = ReferenceDeformer::new(&scene);
     let bounds = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed").bounds;
@@ -221,21 +229,21 @@ fn renderers_work_on_many_threads_and_two_on_one() {
     let params =
         FrameParams { camera: Camera::fit_to_scene(&scene, 64, 64), width: 32, height: 32, bounds, light: None };
     assert!(
-        first_renderer.draw(&buffers, &params).expect("expected a frame").rgba == first,
+        first_renderer.draw(&buffers, &params).expect("expected a frame").rgba == expected_rgba,
         "expected independent contexts on one thread"
     );
 }
 
 #[test]
 fn devices_are_listed_and_unknown_ones_rejected() {
-    let devices_found = devices().expect("expected libEGL");
-    assert!(devices_found.iter().any(|device| device.renderer.is_some()), "{devices_found:?}");
-    for device in &devices_found {
+    let device_list = devices().expect("expected libEGL");
+    assert!(device_list.iter().any(|device| device.renderer.is_some()), "{device_list:?}");
+    for device in &device_list {
         assert_eq!(device.renderer.is_none(), device.problem.is_some(), "{device:?}");
     }
     let error = Renderer::open(DevicePreference::Cuda(4711)).expect_err("expected an unknown-device error").to_string();
     assert!(error.contains("CUDA device 4711") && error.contains("10_nvidia.json"), "{error}");
-    if devices_found.iter().any(|device| device.software && device.renderer.is_some()) {
+    if device_list.iter().any(|device| device.software && device.renderer.is_some()) {
         assert!(Renderer::open(DevicePreference::Software).expect("expected a software renderer").info().software);
     }
 }

@@ -60,8 +60,8 @@ fn two_layers_blend_exactly_in_either_order() {
             if is_near_first {
                 panes.reverse();
             }
-            let add = |builder: SceneBuilder, (mesh, material)| builder.add_domain(mesh, material);
-            render(&panes.into_iter().fold(create_builder(transparency, samples), add).build()).pixel(30, 30)
+            let add_pane = |builder: SceneBuilder, (mesh, material)| builder.add_domain(mesh, material);
+            render(&panes.into_iter().fold(create_builder(transparency, samples), add_pane).build()).pixel(30, 30)
         };
         for is_near_first in [false, true] {
             let pixel = render_with(Transparency::OrderIndependent, is_near_first);
@@ -69,51 +69,54 @@ fn two_layers_blend_exactly_in_either_order() {
         }
         assert!(
             is_close(render_with(Transparency::TwoPass, false), expected, 1.0),
-            "two passes in back-to-front order"
+            "expected two passes to be correct in back-to-front order"
         );
-        assert!(!is_close(render_with(Transparency::TwoPass, true), expected, 8.0), "negative control: two passes");
+        assert!(
+            !is_close(render_with(Transparency::TwoPass, true), expected, 8.0),
+            "negative control: expected two passes to be wrong in front-to-back order"
+        );
     }
 }
 
 /// Three planes that intersect each other, added in the given order.
 fn render_crossing_planes(transparency: Transparency, order: [usize; 3]) -> Vec<u8> {
-    let tilted = |x: f32, y: f32| {
+    let tilted_plane = |x: f32, y: f32| {
         let corner = |[u, v]: [f32; 2]| [2.0 * u, 2.0 * v, x * u + y * v + 0.013 * x];
-        let rest = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]].map(corner).to_vec();
-        Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
+        let positions = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]].map(corner).to_vec();
+        Mesh::from_indexed(positions, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
             .expect("expected a valid mesh")
     };
-    let planes = [(tilted(0.9, 0.1), RED), (tilted(-0.7, 0.3), GREEN), (tilted(0.07, -0.8), BLUE)];
-    let add = |builder: SceneBuilder, index: usize| {
+    let planes = [(tilted_plane(0.9, 0.1), RED), (tilted_plane(-0.7, 0.3), GREEN), (tilted_plane(0.07, -0.8), BLUE)];
+    let add_plane = |builder: SceneBuilder, index: usize| {
         builder.add_domain(planes[index].0.clone(), glass_material(planes[index].1, 0.6))
     };
-    render(&order.into_iter().fold(create_builder(transparency, 4), add).build()).image.rgba
+    render(&order.into_iter().fold(create_builder(transparency, 4), add_plane).build()).image.rgba
 }
 
 /// Negative control: with two passes the picture depends on the order.
 #[test]
 fn crossing_layers_do_not_depend_on_the_order() {
     let orders = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
-    let first = render_crossing_planes(Transparency::OrderIndependent, orders[0]);
+    let expected_image = render_crossing_planes(Transparency::OrderIndependent, orders[0]);
     for order in &orders[1..] {
-        assert!(render_crossing_planes(Transparency::OrderIndependent, *order) == first, "{order:?}");
+        assert!(render_crossing_planes(Transparency::OrderIndependent, *order) == expected_image, "{order:?}");
     }
-    let unsorted = render_crossing_planes(Transparency::TwoPass, orders[0]);
+    let two_pass_image = render_crossing_planes(Transparency::TwoPass, orders[0]);
     assert!(
-        unsorted != render_crossing_planes(Transparency::TwoPass, orders[5]),
+        two_pass_image != render_crossing_planes(Transparency::TwoPass, orders[5]),
         "negative control: two passes depend on the order"
     );
-    assert!(unsorted != first, "negative control: two passes");
+    assert!(two_pass_image != expected_image, "negative control: two passes differ");
 }
 
 #[test]
 fn later_of_coplanar_layers_is_in_front() {
-    for (first, second) in [(RED, BLUE), (BLUE, RED)] {
+    for (first_color, second_color) in [(RED, BLUE), (BLUE, RED)] {
         let scene = create_builder(Transparency::OrderIndependent, 4)
-            .add_domain(pane(0.0), glass_material(first, 0.5))
-            .add_domain(pane(0.0), glass_material(second, 0.5));
+            .add_domain(pane(0.0), glass_material(first_color, 0.5))
+            .add_domain(pane(0.0), glass_material(second_color, 0.5));
         let pixel = render(&scene.build()).pixel(30, 25);
-        assert!(is_close(pixel, blend(&[(first, 0.5), (second, 0.5)]), 1.0), "{pixel:?}");
+        assert!(is_close(pixel, blend(&[(first_color, 0.5), (second_color, 0.5)]), 1.0), "{pixel:?}");
     }
 }
 
@@ -155,28 +158,28 @@ fn cut_outs_and_glass_keep_their_depth_order() {
             .add_domain(pane(0.0), leaf)
             .add_domain(pane(1.0), glass_material(RED, 0.25));
         let frame = render(&scene.build());
-        let (hole, solid) = (blend(&[(BLUE, 0.5), (RED, 0.25)]), blend(&[(GREEN, 1.0), (RED, 0.25)]));
-        assert!(is_close(frame.pixel(18, 30), hole, 1.0), "{transparency:?}: {:?}", frame.pixel(18, 30));
-        assert!(is_close(frame.pixel(46, 30), solid, 1.0), "{transparency:?}: {:?}", frame.pixel(46, 30));
+        let (hole_color, leaf_color) = (blend(&[(BLUE, 0.5), (RED, 0.25)]), blend(&[(GREEN, 1.0), (RED, 0.25)]));
+        assert!(is_close(frame.pixel(18, 30), hole_color, 1.0), "{transparency:?}: {:?}", frame.pixel(18, 30));
+        assert!(is_close(frame.pixel(46, 30), leaf_color, 1.0), "{transparency:?}: {:?}", frame.pixel(46, 30));
     }
 }
 
 #[test]
 fn edges_of_glass_and_opaque_surfaces_are_multisampled() {
-    for (edge, coverage) in [(0.25_f32, 0.25), (0.5, 0.5), (0.75, 0.75)] {
-        let strip = || facing_rectangle(-1.0, -1.0, 0.1 * edge, 1.0, 0.0);
+    for (edge_position, coverage) in [(0.25_f32, 0.25), (0.5, 0.5), (0.75, 0.75)] {
+        let strip = || facing_rectangle(-1.0, -1.0, 0.1 * edge_position, 1.0, 0.0);
         let render_with = |builder: SceneBuilder| render(&builder.build()).pixel(32, 30);
         let glass_pixel = render_with(
             create_builder(Transparency::OrderIndependent, 4).add_domain(strip(), glass_material([1.0; 3], 0.5)),
         );
-        assert!(is_close(glass_pixel, [0.5 * coverage; 3], 1.0), "{edge}: {glass_pixel:?}");
+        assert!(is_close(glass_pixel, [0.5 * coverage; 3], 1.0), "{edge_position}: {glass_pixel:?}");
         let opaque_pixel = render_with(
             create_builder(Transparency::OrderIndependent, 4)
                 .add_domain(strip(), unlit_material([1.0; 3]))
                 .add_domain(pane(-1.0), glass_material(RED, 0.5)),
         );
         let expected = RED.map(|channel| coverage + (1.0 - coverage) * 0.5 * f64::from(channel));
-        assert!(is_close(opaque_pixel, expected, 1.0), "{edge}: {opaque_pixel:?} instead of {expected:?}");
+        assert!(is_close(opaque_pixel, expected, 1.0), "{edge_position}: {opaque_pixel:?} instead of {expected:?}");
     }
     let builder = create_builder(Transparency::OrderIndependent, 1)
         .add_domain(facing_rectangle(-1.0, -1.0, 0.025, 1.0, 0.0), glass_material([1.0; 3], 0.5));
@@ -211,7 +214,7 @@ fn layer(depth_index: u32, count: u32) -> ([f32; 3], f32) {
     ([shade, 1.0 - shade, 0.5], 0.1 + 0.2 * shade)
 }
 
-/// The same stack, with all but the nearest `layers` fully transparent.
+/// The same stack; all layers but the nearest `layers` ones are fully transparent.
 fn nearest_layers(count: u32, layers: u32) -> Arc<Scene> {
     let opacity_scale = |depth_index: u32| if depth_index >= count - layers { 1.0 } else { 0.0 };
     (0..count)
@@ -224,17 +227,21 @@ fn nearest_layers(count: u32, layers: u32) -> Arc<Scene> {
 #[test]
 fn long_fragment_lists_are_sorted() {
     for count in [31, 32, 33, 34, 61, 97] {
-        let sorted = render(&layer_stack(count, |index| index, |_| ()));
-        let shuffled = render(&layer_stack(count, |index| index * 7 % count, |_| ()));
-        let reversed = render(&layer_stack(count, |index| count - 1 - index, |_| ()));
+        let sorted_frame = render(&layer_stack(count, |index| index, |_| ()));
+        let shuffled_frame = render(&layer_stack(count, |index| index * 7 % count, |_| ()));
+        let reversed_frame = render(&layer_stack(count, |index| count - 1 - index, |_| ()));
         let fragments = 1600 * u64::from(count);
         assert_eq!(
-            oit_stats(&sorted),
+            oit_stats(&sorted_frame),
             OitStats { fragments, stored: fragments, max_per_pixel: count, per_pixel_limit: None }
         );
-        assert!(shuffled.image.rgba == sorted.image.rgba && reversed.image.rgba == sorted.image.rgba, "{count}");
+        assert!(
+            shuffled_frame.image.rgba == sorted_frame.image.rgba
+                && reversed_frame.image.rgba == sorted_frame.image.rgba,
+            "{count}"
+        );
         let layers: Vec<_> = (0..count).map(|depth_index| layer(depth_index, count)).collect();
-        assert!(is_close(sorted.pixel(20, 40), blend(&layers), 1.0), "{count}: {:?}", sorted.pixel(20, 40));
+        assert!(is_close(sorted_frame.pixel(20, 40), blend(&layers), 1.0), "{count}: {:?}", sorted_frame.pixel(20, 40));
     }
 }
 
@@ -244,7 +251,7 @@ fn fragments_over_budget_keep_the_nearest() {
     let render_limited = |budget: Option<u32>, order: fn(u32) -> u32| {
         render(&layer_stack(10, order, |builder| builder.parts.look.fragments = budget))
     };
-    let complete = render_limited(None, |index| index);
+    let complete_frame = render_limited(None, |index| index);
     for (budget, per_pixel_limit) in [(8000, 5), (9599, 5), (9600, 6), (1600, 1), (1599, 0), (1, 0)] {
         let frame = render_limited(Some(budget), |index| index);
         let stored = 1600 * u64::from(per_pixel_limit);
@@ -253,13 +260,13 @@ fn fragments_over_budget_keep_the_nearest() {
             OitStats { fragments: 16000, stored, max_per_pixel: 10, per_pixel_limit: Some(per_pixel_limit) },
             "{budget}"
         );
-        let nearest_layers = render(&nearest_layers(10, per_pixel_limit));
-        assert!(frame.image.rgba == nearest_layers.image.rgba, "{budget}");
+        let nearest_frame = render(&nearest_layers(10, per_pixel_limit));
+        assert!(frame.image.rgba == nearest_frame.image.rgba, "{budget}");
         for order in [(|index| 9 - index) as fn(u32) -> u32, |index| index * 3 % 10] {
-            let reordered = render_limited(Some(budget), order);
-            assert!(reordered.image.rgba == frame.image.rgba && reordered.stats == frame.stats, "{budget}");
+            let reordered_frame = render_limited(Some(budget), order);
+            assert!(reordered_frame.image.rgba == frame.image.rgba && reordered_frame.stats == frame.stats, "{budget}");
         }
-        assert!(frame.image.rgba != complete.image.rgba, "negative control: expected missing fragments");
+        assert!(frame.image.rgba != complete_frame.image.rgba, "negative control: expected missing fragments");
     }
     assert_eq!(
         oit_stats(&render_limited(Some(16000), |index| index)).per_pixel_limit,
@@ -273,8 +280,8 @@ fn latest_of_coplanar_layers_are_kept_over_budget() {
     let colors = [RED, GREEN, BLUE, RED, GREEN];
     let mut builder = create_builder(Transparency::OrderIndependent, 1);
     builder.parts.look.fragments = Some(3200);
-    let add = |builder: SceneBuilder, color: [f32; 3]| builder.add_domain(pane(0.0), glass_material(color, 0.5));
-    let frame = render(&colors.into_iter().fold(builder, add).build());
+    let add_pane = |builder: SceneBuilder, color: [f32; 3]| builder.add_domain(pane(0.0), glass_material(color, 0.5));
+    let frame = render(&colors.into_iter().fold(builder, add_pane).build());
     assert_eq!((oit_stats(&frame).stored, oit_stats(&frame).per_pixel_limit), (3200, Some(2)));
     assert!(is_close(frame.pixel(30, 40), blend(&[(RED, 0.5), (GREEN, 0.5)]), 1.0), "{:?}", frame.pixel(30, 40));
 }
@@ -289,11 +296,11 @@ fn scene_over_budget_is_deterministic() {
         },
     );
     let mut renderer = open_renderer();
-    let first = render_square(&mut renderer, &scene, front_camera(64), 64);
-    assert!(oit_stats(&first).dropped() > 0);
+    let first_frame = render_square(&mut renderer, &scene, front_camera(64), 64);
+    assert!(oit_stats(&first_frame).dropped() > 0);
     for _ in 0..5 {
-        let repeated = render_square(&mut renderer, &scene, front_camera(64), 64);
-        assert!(repeated.image.rgba == first.image.rgba && repeated.stats == first.stats);
+        let repeated_frame = render_square(&mut renderer, &scene, front_camera(64), 64);
+        assert!(repeated_frame.image.rgba == first_frame.image.rgba && repeated_frame.stats == first_frame.stats);
     }
 }
 
@@ -307,21 +314,24 @@ fn two_passes_draw_alpha_above_threshold_as_opaque() {
         // The farther pane comes later in the scene, so only the depth test keeps it behind.
         render(&builder.add_domain(pane(0.0), leaf).add_domain(pane(-1.0), glass_material(RED, 0.5)).build())
     };
-    let (split, unsplit) = (render_with(0.95), render_with(1.5));
-    assert!(is_close(split.pixel(42, 30), GREEN.map(f64::from), 1.0), "{:?}", split.pixel(42, 30));
+    let (split_frame, unsplit_frame) = (render_with(0.95), render_with(1.5));
+    assert!(is_close(split_frame.pixel(42, 30), GREEN.map(f64::from), 1.0), "{:?}", split_frame.pixel(42, 30));
     assert!(
-        is_close(unsplit.pixel(42, 30), blend(&[(GREEN, 1.0), (RED, 0.5)]), 2.0),
+        is_close(unsplit_frame.pixel(42, 30), blend(&[(GREEN, 1.0), (RED, 0.5)]), 2.0),
         "negative control: {:?}",
-        unsplit.pixel(42, 30)
+        unsplit_frame.pixel(42, 30)
     );
-    let scene_order = blend(&[(GREEN, 128.0 / 255.0), (RED, 0.5)]);
-    // Near the center of the half-transparent texel; the other texel is opaque around its center.
+    let blended_color = blend(&[(GREEN, 128.0 / 255.0), (RED, 0.5)]);
+    // This pixel is near the center of the half-transparent texel.
     assert!(
-        is_close(split.pixel(22, 30), scene_order, 2.0),
+        is_close(split_frame.pixel(22, 30), blended_color, 2.0),
         "expected blending in scene order, got {:?}",
-        split.pixel(22, 30)
+        split_frame.pixel(22, 30)
     );
-    assert_eq!((split.stats.draw_calls, unsplit.stats.draw_calls), (2, 1));
-    assert_eq!(unsplit.stats.passes, [Pass::Blended, Pass::Background, Pass::Encode]);
-    assert_eq!(split.stats.passes, [Pass::Visibility, Pass::Blended, Pass::Background, Pass::Shade, Pass::Encode]);
+    assert_eq!((split_frame.stats.draw_calls, unsplit_frame.stats.draw_calls), (2, 1));
+    assert_eq!(unsplit_frame.stats.passes, [Pass::Blended, Pass::Background, Pass::Encode]);
+    assert_eq!(
+        split_frame.stats.passes,
+        [Pass::Visibility, Pass::Blended, Pass::Background, Pass::Shade, Pass::Encode]
+    );
 }

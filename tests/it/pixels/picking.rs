@@ -49,8 +49,8 @@ impl PickHarness {
     }
 }
 
-fn max_difference(got: [f64; 3], want: [f64; 3]) -> f64 {
-    (Vector3::from(got) - Vector3::from(want)).abs().max()
+fn max_difference(left: [f64; 3], right: [f64; 3]) -> f64 {
+    (Vector3::from(left) - Vector3::from(right)).abs().max()
 }
 
 /// Intersection of the ray through the center of a pixel of [`front_camera`]`(64)` with the plane z = 0.
@@ -63,7 +63,7 @@ fn pick_has_domain_triangle_position_normal_and_depth() {
     let builder = SceneBuilder::new().add_domain(facing_rectangle(-3.0, -3.0, -2.5, -2.5, 0.0), Material::default());
     let scene = builder.add_domain(facing_rectangle(-2.0, -1.0, 2.0, 1.0, 0.0), Material::default()).build();
     let hits = PickHarness::at_rest(&scene).pick(front_camera(64), 64, [40, 30], [1, 1]);
-    let [hit] = &hits[..] else { panic!("{hits:?}") };
+    let [hit] = &hits[..] else { panic!("expected one hit, got {hits:?}") };
     let [x, y, _] = plane_point(40, 30);
     assert_eq!((hit.pixel, hit.domain, hit.triangle, hit.vertices), ([40, 30], 1, 0, [0, 1, 2]));
     assert!(
@@ -72,9 +72,12 @@ fn pick_has_domain_triangle_position_normal_and_depth() {
         "{hit:?}"
     );
     assert!((hit.depth - 10.0).abs() < TOLERANCE);
-    // Corners (-2, -1), (2, -1), (2, 1); the second barycentric coordinate is the remainder.
-    let [first, third] = [(2.0 - x) / 4.0, (y + 1.0) / 2.0];
-    assert!(max_difference(hit.barycentrics, [first, 1.0 - first - third, third]) < TOLERANCE, "{hit:?}");
+    // The corners are (-2, -1), (2, -1), (2, 1), and the barycentric coordinates sum to 1.
+    let [first_weight, third_weight] = [(2.0 - x) / 4.0, (y + 1.0) / 2.0];
+    assert!(
+        max_difference(hit.barycentrics, [first_weight, 1.0 - first_weight - third_weight, third_weight]) < TOLERANCE,
+        "{hit:?}"
+    );
 }
 
 /// A hit on the back side has a flipped normal.
@@ -105,23 +108,24 @@ fn pick_follows_the_deformed_surface() {
     let mesh = facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0);
     let columns = (0..12).map(|row| if row % 3 == 2 { 1.0 } else { 0.0 }).collect();
     let mut builder = SceneBuilder::new().add_domain(mesh.clone(), Material::default());
-    builder.parts.shapes[0] = Shape::new(mesh, Modes::from_columns(12, 1, columns).expect("12 x 1")).expect("fits");
+    builder.parts.shapes[0] = Shape::new(mesh, Modes::from_columns(12, 1, columns).expect("expected valid modes"))
+        .expect("expected a valid shape");
     let scene = builder.build();
     let mut state = SceneState::rest(&scene);
     for q in [0.0, 2.0, -3.0_f32] {
         state.q[0] = q;
         let hit = PickHarness::with_state(&scene, &state).pick(front_camera(64), 64, [36, 27], [1, 1]).remove(0);
         let (z, [x, y, _]) = (f64::from(q), plane_point(36, 27));
-        // The ray from (0, 0, 10) meets the plane at this z instead of the plane z = 0.
-        let want = [x * (10.0 - z) / 10.0, y * (10.0 - z) / 10.0, z];
+        // The ray from (0, 0, 10) intersects the plane at this z instead of the plane z = 0.
+        let expected = [x * (10.0 - z) / 10.0, y * (10.0 - z) / 10.0, z];
         assert!(
-            max_difference(hit.position, want) < TOLERANCE && (hit.depth - 10.0 + z).abs() < TOLERANCE,
+            max_difference(hit.position, expected) < TOLERANCE && (hit.depth - 10.0 + z).abs() < TOLERANCE,
             "{q}: {hit:?}"
         );
     }
 }
 
-/// Rectangles of the largest size and at the border of the image.
+/// The four rectangles cover the image. The first one has the maximum size.
 #[test]
 fn picks_agree_with_the_visibility_of_the_frame() {
     let mut builder = SceneBuilder::new();
@@ -142,24 +146,24 @@ fn picks_agree_with_the_visibility_of_the_frame() {
         let frame_params = harness.frame_params(camera, 100);
         harness.renderer.draw(&harness.buffers, &frame_params).expect("expected a frame");
         let frame_ids = harness.renderer.read_visibility().expect("expected visibility ids");
-        let (mut different, mut misses, mut hits_per_domain) = (0, 0, [0; 3]);
+        let (mut mismatches, mut misses, mut hits_per_domain) = (0, 0, [0; 3]);
         for (corner, size) in [([0, 0], [64, 64]), ([64, 0], [36, 64]), ([0, 64], [64, 36]), ([64, 64], [36, 36])] {
             let hits = harness.pick(camera, 100, corner, size);
             for y in corner[1]..corner[1] + size[1] {
                 for x in corner[0]..corner[0] + size[0] {
-                    let want = match frame_ids[(100 * y + x) as usize] {
+                    let visible_triangle = match frame_ids[(100 * y + x) as usize] {
                         VisibilityId::Triangle(index) => harness.buffers.source_triangle(index),
                         _ => None,
                     };
-                    let got = hits.iter().find(|hit| hit.pixel == [x, y]);
-                    different += usize::from(got.map(|hit| (hit.domain, hit.triangle)) != want);
-                    misses += usize::from(got.is_none());
-                    got.into_iter().for_each(|hit| hits_per_domain[hit.domain] += 1);
+                    let hit = hits.iter().find(|hit| hit.pixel == [x, y]);
+                    mismatches += usize::from(hit.map(|hit| (hit.domain, hit.triangle)) != visible_triangle);
+                    misses += usize::from(hit.is_none());
+                    hit.into_iter().for_each(|hit| hits_per_domain[hit.domain] += 1);
                 }
             }
         }
         // Ids may differ where an edge passes a sample within the rasterizer's precision of 1/256 pixel.
-        assert!(different <= 5, "{different} of 10000 pixels");
+        assert!(mismatches <= 5, "expected at most 5 different pixels of 10000, got {mismatches}");
         assert!(
             misses > 500 && hits_per_domain.iter().all(|count| *count > 100),
             "negative control: {misses} {hits_per_domain:?}"
@@ -207,7 +211,7 @@ fn concurrent_picks_finish_in_any_order() {
         SceneBuilder::new().add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), Material::default()).build();
     let mut harness = PickHarness::at_rest(&scene);
     let frame_params = harness.frame_params(front_camera(64), 64);
-    let picks: Vec<_> = (10..50)
+    let pending_picks: Vec<_> = (10..50)
         .map(|x| {
             let rectangle = PixelRect::within([64; 2], [x, 20], [1, 1]).expect("expected a valid rectangle");
             (
@@ -220,7 +224,7 @@ fn concurrent_picks_finish_in_any_order() {
         })
         .collect();
     harness.renderer.draw(&harness.buffers, &frame_params).expect("expected a frame");
-    for (x, pick) in picks.into_iter().rev() {
+    for (x, pick) in pending_picks.into_iter().rev() {
         let hits = harness.renderer.finish_pick(pick).expect("expected hits");
         assert!(max_difference(hits[0].position, plane_point(x, 20)) < TOLERANCE, "{x}: {hits:?}");
     }

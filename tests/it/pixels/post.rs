@@ -42,31 +42,32 @@ fn tone_curves_have_their_known_values() {
         )
         .pixel(32, 32)
     };
-    // A threshold that only the light of 1e30 exceeds. The bloom pass inverts the tone curve and applies it again.
+    // Only the light of 1e30 exceeds this threshold, so the bloom pass only inverts the tone curve and applies it again.
     let idle_bloom = Some(Bloom { threshold: 1000.0, ..Bloom::default() });
     for light in [[0.01, 0.18, 0.5], [1.0, 2.0, 8.0], [0.0, 30.0, 1e30]] {
         let linear_light = light.map(f64::from);
         for bloom in [None, idle_bloom] {
-            for (tone, want) in [
+            for (tone, expected) in [
                 (ToneMapping::Reinhard, linear_light.map(reinhard)),
                 (ToneMapping::Aces, linear_light.map(aces)),
                 (ToneMapping::None, linear_light),
             ] {
-                let want = want.map(|value| if value.is_finite() { value } else { 1.0 });
-                let got = render_with(light, &|look| RenderSettings { tone, bloom, ..look });
-                assert!(is_close(got, want, 1.0), "{tone:?}, {bloom:?}, {light:?}: {got:?}");
+                let expected = expected.map(|value| if value.is_finite() { value } else { 1.0 });
+                let pixel = render_with(light, &|look| RenderSettings { tone, bloom, ..look });
+                assert!(is_close(pixel, expected, 1.0), "{tone:?}, {bloom:?}, {light:?}: {pixel:?}");
             }
         }
     }
-    let got = render_with([0.09, 0.25, 1.0], &|look| RenderSettings { tone: ToneMapping::Aces, exposure: 2.0, ..look });
-    assert!(is_close(got, [0.18, 0.5, 2.0].map(aces), 1.0), "{got:?}");
+    let pixel =
+        render_with([0.09, 0.25, 1.0], &|look| RenderSettings { tone: ToneMapping::Aces, exposure: 2.0, ..look });
+    assert!(is_close(pixel, [0.18, 0.5, 2.0].map(aces), 1.0), "{pixel:?}");
     assert!(
-        !is_close(got, [0.09, 0.25, 1.0].map(aces), 10.0),
+        !is_close(pixel, [0.09, 0.25, 1.0].map(aces), 10.0),
         "negative control: expected exposure to change the color"
     );
     assert!(
-        !is_close(got, [0.18, 0.5, 2.0].map(reinhard), 10.0),
-        "negative control: expected another color of the other curve"
+        !is_close(pixel, [0.18, 0.5, 2.0].map(reinhard), 10.0),
+        "negative control: expected another color with the other curve"
     );
 }
 
@@ -86,10 +87,10 @@ fn sum_and_centroid(frame: &RenderedFrame) -> (f64, [f64; 2]) {
 #[test]
 fn bloom_of_one_pixel_keeps_its_light_and_centroid() {
     let render_with = |light: f32, bloom: Option<Bloom>, size: [u32; 2]| {
-        // One pixel, the second from the center: x = 33, and y = 30 from the top.
-        let pixel = facing_rectangle(0.1, 0.1, 0.2, 0.2, 0.0);
+        // A square that covers one pixel: x = 33, and y = 30 from the top.
+        let square = facing_rectangle(0.1, 0.1, 0.2, 0.2, 0.0);
         let scene = builder_with_light([light; 3], |look| RenderSettings { bloom, ..look })
-            .add_domain(pixel, white_material())
+            .add_domain(square, white_material())
             .build();
         render_sized(&mut open_renderer(), &scene, front_camera(64), size)
     };
@@ -100,9 +101,12 @@ fn bloom_of_one_pixel_keeps_its_light_and_centroid() {
     {
         let (sum, centroid) = sum_and_centroid(&render_with(light, full_bloom(threshold, levels), size));
         assert!((sum / f64::from(light) - 1.0).abs() < 0.01, "{size:?}, {levels} levels: a sum of {sum}");
-        let (_, source) = sum_and_centroid(&render_with(light, None, size));
-        let shift = [centroid[0] - source[0], centroid[1] - source[1]];
-        assert!(shift.iter().all(|shift| shift.abs() < 0.05), "{size:?}, {levels} levels: {shift:?} from {source:?}");
+        let (_, source_centroid) = sum_and_centroid(&render_with(light, None, size));
+        let shift = [centroid[0] - source_centroid[0], centroid[1] - source_centroid[1]];
+        assert!(
+            shift.iter().all(|shift| shift.abs() < 0.05),
+            "{size:?}, {levels} levels: {shift:?} from {source_centroid:?}"
+        );
     }
     let (sum, _) = sum_and_centroid(&render_with(8.0, None, [64, 64]));
     assert!((sum - 1.0).abs() < 1e-9, "negative control: expected one white pixel without bloom, got a sum of {sum}");
@@ -121,27 +125,27 @@ fn bloom_is_symmetric_and_respects_its_threshold() {
     let frame = render(&builder(1.0).add_domain(square.clone(), white_material()).build());
     for (x, y) in (0..32).flat_map(|x| (0..32).map(move |y| (x, y))) {
         let pixel = frame.pixel(x, y);
-        for mirrored in [frame.pixel(63 - x, y), frame.pixel(x, 63 - y), frame.pixel(y, x)] {
+        for mirrored_pixel in [frame.pixel(63 - x, y), frame.pixel(x, 63 - y), frame.pixel(y, x)] {
             assert!(
-                (0..3).all(|channel| pixel[channel].abs_diff(mirrored[channel]) <= 1),
-                "({x}, {y}): {pixel:?}, {mirrored:?}"
+                (0..3).all(|channel| pixel[channel].abs_diff(mirrored_pixel[channel]) <= 1),
+                "({x}, {y}): {pixel:?}, {mirrored_pixel:?}"
             );
         }
     }
     let [r, g, b] = frame.pixel(36, 32);
     assert!(r > g && g > b && b > 0, "expected bloom with the hue of its light, got {r} {g} {b}");
-    let plain = render(
+    let unbloomed_frame = render(
         &builder_with_light([30.0, 12.0, 5.0], |look| look).add_domain(square.clone(), white_material()).build(),
     );
     assert!(
-        render(&builder(30.5).add_domain(square, white_material()).build()).image.rgba == plain.image.rgba,
+        render(&builder(30.5).add_domain(square, white_material()).build()).image.rgba == unbloomed_frame.image.rgba,
         "expected no bloom below the threshold"
     );
-    assert!(frame.image.rgba != plain.image.rgba, "negative control");
+    assert!(frame.image.rgba != unbloomed_frame.image.rgba, "negative control: expected bloom to change the image");
 }
 
-/// The tone curve, a clamp here, is applied to each sample before the samples of a pixel are averaged. Bloom extracts
-/// its light from the samples before tone mapping.
+/// The tone curve (here a clamp) is applied to each sample before the samples of a pixel are averaged. Bloom uses the light
+/// of the samples before tone mapping.
 #[test]
 fn bright_edges_stay_antialiased_with_bloom() {
     let render_with = |bloom: Option<Bloom>| {
@@ -153,30 +157,33 @@ fn bright_edges_stay_antialiased_with_bloom() {
             .add_domain(facing_rectangle(-2.0, 0.0, 2.0, 2.0, 0.1), glass);
         render(&scene.build())
     };
-    let plain = render_with(None);
-    let zero_bloom = render_with(Some(Bloom { strength: 0.0, ..Bloom::default() }));
-    assert_eq!(plain.stats.samples, 4);
-    assert!(plain.image.rgba == zero_bloom.image.rgba, "expected no change by bloom of strength 0");
+    let unbloomed_frame = render_with(None);
+    let zero_bloom_frame = render_with(Some(Bloom { strength: 0.0, ..Bloom::default() }));
+    assert_eq!(unbloomed_frame.stats.samples, 4);
+    assert!(unbloomed_frame.image.rgba == zero_bloom_frame.image.rgba, "expected no change by bloom of strength 0");
     for y in [20, 40] {
         assert!(
-            is_close(plain.pixel(32, y), [0.5; 3], 1.0) && plain.pixel(33, y) == [255; 3],
+            is_close(unbloomed_frame.pixel(32, y), [0.5; 3], 1.0) && unbloomed_frame.pixel(33, y) == [255; 3],
             "{:?}",
-            plain.pixel(32, y)
+            unbloomed_frame.pixel(32, y)
         );
     }
-    assert!(plain.image.rgba != render_with(Some(Bloom::default())).image.rgba, "negative control");
+    assert!(
+        unbloomed_frame.image.rgba != render_with(Some(Bloom::default())).image.rgba,
+        "negative control: expected bloom to change the image"
+    );
 }
 
 /// Renders a white rhombus with slanted edges on gray to `scale` times 64 pixels per side.
 fn render_rhombus(antialias: Antialiasing, samples: u32, scale: u32) -> RenderedFrame {
-    let rest = vec![[-2.1, -1.37, 0.0], [1.63, -2.23, 0.0], [2.17, 1.41, 0.0], [-1.57, 2.29, 0.0]];
-    let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
+    let positions = vec![[-2.1, -1.37, 0.0], [1.63, -2.23, 0.0], [2.17, 1.41, 0.0], [-1.57, 2.29, 0.0]];
+    let mesh = Mesh::from_indexed(positions, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
         .expect("expected a valid mesh");
     let mut builder = builder_with_light([0.9; 3], |look| RenderSettings { antialias, samples, ..look });
     (builder.parts.look.zenith, builder.parts.look.horizon) = ([0.1; 3], [0.1; 3]);
     let center = f64::from(32 * scale);
-    let focal = f64::from(100 * scale);
-    let lens = Lens::Intrinsics { fx: focal, fy: focal, cx: center, cy: center };
+    let focal_length = f64::from(100 * scale);
+    let lens = Lens::Intrinsics { fx: focal_length, fy: focal_length, cx: center, cy: center };
     render_square(
         &mut open_renderer(),
         &builder.add_domain(mesh, white_material()).build(),
@@ -187,21 +194,23 @@ fn render_rhombus(antialias: Antialiasing, samples: u32, scale: u32) -> Rendered
 
 /// Mean difference from the average linear light of 8 x 8 reference pixels, in levels.
 fn mean_error(frame: &RenderedFrame, reference: &RenderedFrame) -> f64 {
-    let expected = |x: u32, y: u32| {
+    let expected_level = |x: u32, y: u32| {
         let light = |i: u32| decode_srgb(reference.pixel(8 * x + i % 8, 8 * y + i / 8)[0]);
         encode_srgb((0..64).map(light).sum::<f64>() / 64.0)
     };
-    let error = |(x, y): (u32, u32)| (f64::from(frame.pixel(x, y)[0]) - expected(x, y)).abs();
+    let error = |(x, y): (u32, u32)| (f64::from(frame.pixel(x, y)[0]) - expected_level(x, y)).abs();
     (0..64).flat_map(|y| (0..64).map(move |x| (x, y))).map(error).sum::<f64>() / 4096.0
 }
 
 #[test]
 fn fxaa_smooths_slanted_edges_and_keeps_flat_areas() {
     let reference = render_rhombus(Antialiasing::None, 1, 8);
-    let (aliased, fxaa) = (render_rhombus(Antialiasing::None, 1, 1), render_rhombus(Antialiasing::Fxaa, 4, 1));
+    let (aliased_frame, fxaa_frame) =
+        (render_rhombus(Antialiasing::None, 1, 1), render_rhombus(Antialiasing::Fxaa, 4, 1));
     let [aliased_error, fxaa_error, msaa_error] =
-        [&aliased, &fxaa, &render_rhombus(Antialiasing::Msaa, 4, 1)].map(|frame| mean_error(frame, &reference));
-    assert_eq!((aliased.stats.samples, fxaa.stats.samples), (1, 1));
+        [&aliased_frame, &fxaa_frame, &render_rhombus(Antialiasing::Msaa, 4, 1)]
+            .map(|frame| mean_error(frame, &reference));
+    assert_eq!((aliased_frame.stats.samples, fxaa_frame.stats.samples), (1, 1));
     assert!(
         fxaa_error < 0.45 * aliased_error,
         "error in levels: one sample {aliased_error}, FXAA {fxaa_error}, MSAA {msaa_error}"
@@ -210,15 +219,15 @@ fn fxaa_smooths_slanted_edges_and_keeps_flat_areas() {
         msaa_error < 0.6 * aliased_error,
         "expected a smaller error with MSAA, got {msaa_error} and {aliased_error}"
     );
-    assert!(render_rhombus(Antialiasing::Msaa, 1, 1).image.rgba == aliased.image.rgba);
-    let mut changed = 0;
+    assert!(render_rhombus(Antialiasing::Msaa, 1, 1).image.rgba == aliased_frame.image.rgba);
+    let mut changed_pixels = 0;
     for (x, y) in (1..63).flat_map(|x| (1..63).map(move |y| (x, y))) {
-        let pixel = aliased.pixel(x, y);
-        let is_flat = (0..9).all(|i| aliased.pixel(x + i % 3 - 1, y + i / 3 - 1) == pixel);
-        assert!(!is_flat || fxaa.pixel(x, y) == pixel, "({x}, {y}): expected no change in a uniform area");
-        changed += usize::from(fxaa.pixel(x, y) != pixel);
+        let pixel = aliased_frame.pixel(x, y);
+        let is_flat = (0..9).all(|i| aliased_frame.pixel(x + i % 3 - 1, y + i / 3 - 1) == pixel);
+        assert!(!is_flat || fxaa_frame.pixel(x, y) == pixel, "({x}, {y}): expected no change in a uniform area");
+        changed_pixels += usize::from(fxaa_frame.pixel(x, y) != pixel);
     }
-    assert!(changed > 100, "negative control: expected changed edges, got {changed} pixels");
+    assert!(changed_pixels > 100, "negative control: expected changed edges, got {changed_pixels} pixels");
 }
 
 /// Renders a sky whose values lie between two levels in each channel.
@@ -240,25 +249,26 @@ fn exact_sky_level(x: u32, y: u32, channel: usize) -> f64 {
 
 #[test]
 fn dithering_stays_within_one_level_and_keeps_the_mean() {
-    let (undithered, dithered) = (render_sky(false), render_sky(true));
+    let (undithered_frame, dithered_frame) = (render_sky(false), render_sky(true));
     let pixels = || (0..64).flat_map(|y| (0..64).map(move |x| (x, y)));
     for (x, y) in pixels() {
-        let (a, b) = (undithered.pixel(x, y), dithered.pixel(x, y));
+        let (a, b) = (undithered_frame.pixel(x, y), dithered_frame.pixel(x, y));
         assert!((0..3).all(|channel| a[channel].abs_diff(b[channel]) <= 1), "({x}, {y})");
     }
-    // Only the upper half, because the sky has one color below the horizon.
-    let bias = |frame: &RenderedFrame, channel: usize| {
-        let block = |block_index: (u32, u32)| {
+    // Only blocks of the upper half: below the horizon, the sky has one color.
+    let max_block_bias = |frame: &RenderedFrame, channel: usize| {
+        let block_bias = |block_index: (u32, u32)| {
             let error = |i: u32| {
                 let (x, y) = (8 * block_index.0 + i % 8, 8 * block_index.1 + i / 8);
                 f64::from(frame.pixel(x, y)[channel]) - exact_sky_level(x, y, channel)
             };
             ((0..64).map(error).sum::<f64>() / 64.0).abs()
         };
-        (0..4).flat_map(|y| (0..8).map(move |x| (x, y))).map(block).fold(0.0, f64::max)
+        (0..4).flat_map(|y| (0..8).map(move |x| (x, y))).map(block_bias).fold(0.0, f64::max)
     };
     for channel in 0..3 {
-        let (undithered_bias, dithered_bias) = (bias(&undithered, channel), bias(&dithered, channel));
+        let (undithered_bias, dithered_bias) =
+            (max_block_bias(&undithered_frame, channel), max_block_bias(&dithered_frame, channel));
         assert!(
             dithered_bias < 0.1 && undithered_bias > 0.2,
             "channel {channel}: {dithered_bias} levels with dithering, {undithered_bias} without"
@@ -283,7 +293,7 @@ fn with_all_effects(look: RenderSettings) -> RenderSettings {
     }
 }
 
-/// Frames repeat bit by bit, and only the post-processing passes that the scene enables run.
+/// Repeated frames are bit-identical, and only the post-processing passes that the scene enables run.
 #[test]
 fn post_processing_is_deterministic() {
     let scene = |look: RenderSettings| {
@@ -296,17 +306,17 @@ fn post_processing_is_deterministic() {
     };
     let all_effects = scene(with_all_effects(RenderSettings::default()));
     let mut renderer = open_renderer();
-    let first = render_square(&mut renderer, &all_effects, front_camera(96), 96);
-    assert_eq!(first.stats.passes, planned_passes_above_ground(&all_effects));
-    assert!(first.stats.passes.contains(&Pass::Bloom));
-    let plain = render_square(&mut renderer, &scene(RenderSettings::default()), front_camera(96), 96);
-    assert!(!plain.stats.passes.contains(&Pass::Bloom));
-    assert!(render_square(&mut renderer, &all_effects, front_camera(96), 96).image.rgba == first.image.rgba);
+    let first_frame = render_square(&mut renderer, &all_effects, front_camera(96), 96);
+    assert_eq!(first_frame.stats.passes, planned_passes_above_ground(&all_effects));
+    assert!(first_frame.stats.passes.contains(&Pass::Bloom));
+    let plain_frame = render_square(&mut renderer, &scene(RenderSettings::default()), front_camera(96), 96);
+    assert!(!plain_frame.stats.passes.contains(&Pass::Bloom));
+    assert!(render_square(&mut renderer, &all_effects, front_camera(96), 96).image.rgba == first_frame.image.rgba);
     assert!(
-        render_square(&mut open_renderer(), &all_effects, front_camera(96), 96).image.rgba == first.image.rgba,
-        "another context"
+        render_square(&mut open_renderer(), &all_effects, front_camera(96), 96).image.rgba == first_frame.image.rgba,
+        "expected the same image in another context"
     );
-    assert!(plain.image.rgba != first.image.rgba, "negative control");
+    assert!(plain_frame.image.rgba != first_frame.image.rgba, "negative control: expected bloom to change the image");
 }
 
 #[test]
@@ -323,9 +333,9 @@ fn nan_and_infinite_light_affect_no_other_pixel() {
             let mut renderer = open_renderer();
             let mut deformer = ReferenceDeformer::new(&scene);
             let bounds = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed").bounds;
-            let rest = deformer.surface().expect("expected a surface").clone();
+            let rest_surface = deformer.surface().expect("expected a surface").clone();
             let mut render_with = |normal: [f32; 3]| {
-                let mut surface = DeformedSurface { normals: rest.normals.clone(), ..rest.clone() };
+                let mut surface = DeformedSurface { normals: rest_surface.normals.clone(), ..rest_surface.clone() };
                 surface.normals[..12].copy_from_slice(&normal.repeat(4));
                 let buffers = renderer.load(&scene).expect("expected the scene to load");
                 renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
@@ -341,13 +351,13 @@ fn nan_and_infinite_light_affect_no_other_pixel() {
                 lit_frame.pixel(7, 57)
             );
             let nan_frame = render_with([f32::NAN; 3]);
-            let want = match tone {
+            let expected = match tone {
                 ToneMapping::None => 0.25,
                 ToneMapping::Reinhard => reinhard(0.25),
                 ToneMapping::Aces => aces(0.25),
             };
             assert!(
-                is_close(nan_frame.pixel(32, 32), [want; 3], 1.0),
+                is_close(nan_frame.pixel(32, 32), [expected; 3], 1.0),
                 "{tone:?} {bloom:?}: {:?}",
                 nan_frame.pixel(32, 32)
             );

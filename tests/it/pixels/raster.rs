@@ -19,24 +19,24 @@ const SIZE: [u32; 2] = [320, 240];
 const DEPTH_TOLERANCE: f64 = 2.0 / (1 << 24) as f64;
 
 /// A scene of one domain with triangles of many sizes around and behind the eye, and its triangles.
-fn scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
+fn random_scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
     let mut random = Random(seed);
-    let mut rest = Vec::new();
+    let mut positions = Vec::new();
     for index in 0..1500 {
         let size =
             [0.02, 0.1, 0.5, 3.0][index % 4] * if index % 4 == 3 { f32::from(u8::from(index % 60 == 3)) } else { 1.0 };
         let center = random.next_triple().map(|number| 3.0 * number);
         for _ in 0..3 {
             let offset = random.next_triple();
-            rest.push(std::array::from_fn(|axis| center[axis] + size * offset[axis]));
+            positions.push(std::array::from_fn(|axis| center[axis] + size * offset[axis]));
         }
     }
     let triangles: Vec<[u32; 3]> =
-        (0..rest.len() as u32 / 3).map(|index| [3 * index, 3 * index + 1, 3 * index + 2]).collect();
-    let count = rest.len();
-    let normals = vec![[0.0, 0.0, 1.0]; count];
-    let mesh =
-        Mesh::from_indexed(rest, normals, vec![[0.0; 2]; count], triangles.clone()).expect("expected a valid mesh");
+        (0..positions.len() as u32 / 3).map(|index| [3 * index, 3 * index + 1, 3 * index + 2]).collect();
+    let vertex_count = positions.len();
+    let normals = vec![[0.0, 0.0, 1.0]; vertex_count];
+    let mesh = Mesh::from_indexed(positions, normals, vec![[0.0; 2]; vertex_count], triangles.clone())
+        .expect("expected a valid mesh");
     let mut builder = SceneBuilder::new();
     (builder.parts.look.samples, builder.parts.look.culling) = (1, Culling::None);
     (builder.add_domain(mesh, Material { double_sided: true, ..Material::default() }).build(), triangles)
@@ -46,7 +46,7 @@ fn scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
 fn ids_equal_opengl_except_on_edges_and_depth_ties() {
     let mut renderer = open_renderer();
     for (seed, eye) in [(1, [0.0, 0.5, 9.0]), (2, [0.3, 0.2, 0.5]), (3, [-6.0, 4.0, 2.0])] {
-        let (scene, triangles) = scene(seed);
+        let (scene, triangles) = random_scene(seed);
         let view = View::LookAt { eye, target: [0.0; 3], up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, lens: Lens::FieldOfView(50.0), near: 0.1, far: 40.0 };
         let mut deformer = ReferenceDeformer::new(&scene);
@@ -61,7 +61,7 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
             VisibilityId::Triangle(index) => buffers.source_triangle(*index).map(|(_, triangle)| triangle as u32),
             _ => None,
         };
-        let want: Vec<Option<u32>> =
+        let opengl_ids: Vec<Option<u32>> =
             renderer.read_visibility().expect("expected visibility ids").iter().map(source_triangle).collect();
         renderer.unload(buffers);
 
@@ -69,22 +69,23 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
         let corner = |vertex: u32| std::array::from_fn(|axis| surface.positions[3 * vertex as usize + axis]);
         let exact_triangles: Vec<ExactTriangle> =
             triangles.iter().map(|triangle| ExactTriangle::new(&clip, SIZE, triangle.map(corner))).collect();
-        let ids = |clip: &Matrix4<f64>| {
+        let rasterize_ids = |clip: &Matrix4<f64>| {
             let mut raster =
                 VisibilityBuffer::new(Viewport::new(clip, width, height).expect("expected a valid viewport"));
             let group = DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None };
             raster.draw(&surface.positions, &triangles, group);
             raster.ids()
         };
-        let differences = compare_ids(&ids(&clip), &want, &exact_triangles, SIZE[0], DEPTH_TOLERANCE);
-        let covered = want.iter().flatten().count();
-        eprintln!("eye {eye:?}: {covered} samples see a triangle; {differences:?}");
-        assert!(covered > 5000 && differences.wrong == 0, "{covered} covered, {differences:?}");
-        assert!(differences.edges + differences.ties < covered / 100, "{differences:?}");
+        let differences = compare_ids(&rasterize_ids(&clip), &opengl_ids, &exact_triangles, SIZE[0], DEPTH_TOLERANCE);
+        let covered_samples = opengl_ids.iter().flatten().count();
+        eprintln!("eye {eye:?}: {covered_samples} covered samples, {differences:?}");
+        assert!(covered_samples > 5000 && differences.wrong == 0, "{covered_samples} covered samples, {differences:?}");
+        assert!(differences.edges + differences.ties < covered_samples / 100, "{differences:?}");
 
-        let mut shifted = Matrix4::identity();
-        shifted[(0, 3)] = 0.1 / f64::from(width);
-        let control = compare_ids(&ids(&(shifted * clip)), &want, &exact_triangles, SIZE[0], DEPTH_TOLERANCE);
-        assert!(control.wrong > 5, "negative control: shifted by 1/20 pixel: {control:?}");
+        let mut shift = Matrix4::identity();
+        shift[(0, 3)] = 0.1 / f64::from(width);
+        let shifted_differences =
+            compare_ids(&rasterize_ids(&(shift * clip)), &opengl_ids, &exact_triangles, SIZE[0], DEPTH_TOLERANCE);
+        assert!(shifted_differences.wrong > 5, "negative control: shifted by 1/20 pixel: {shifted_differences:?}");
     }
 }

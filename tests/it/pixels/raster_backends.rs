@@ -19,7 +19,7 @@ use nalgebra::{Matrix4, Vector3};
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, open_renderer};
 
-/// The reference rasterizer, reading and writing buffers of the current OpenGL context.
+/// The reference rasterizer. It reads and writes buffers of the current OpenGL context.
 struct ReferenceRasterizer {
     mesh: RasterGeometry,
     gl: glow::Context,
@@ -39,7 +39,7 @@ impl ReferenceRasterizer {
         // loaded the library.
         let egl =
             unsafe { khronos_egl::DynamicInstance::<khronos_egl::EGL1_4>::load_required() }.expect("expected libEGL");
-        let address = |name: &str| egl.get_proc_address(name).map_or(std::ptr::null(), |place| place as *const _);
+        let address = |name: &str| egl.get_proc_address(name).map_or(std::ptr::null(), |function| function as *const _);
         // SAFETY: a context is current on this thread while its scene is loaded, and `address` returns the functions of
         // that context.
         let gl = unsafe { glow::Context::from_loader_function(address) };
@@ -86,8 +86,9 @@ impl Rasterizer for ReferenceRasterizer {
 
     fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
         if let Some((viewport, target)) = depth {
-            let all = DrawRange { first: 0, triangles: self.mesh.triangles.len() as u32, cull_mode: CullMode::None };
-            self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &[all]).depths()))?;
+            let all_triangles =
+                DrawRange { first: 0, triangles: self.mesh.triangles.len() as u32, cull_mode: CullMode::None };
+            self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &[all_triangles]).depths()))?;
         }
         let Some((viewport, target)) = ids else { return Ok(()) };
         self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &self.mesh.groups).keys))
@@ -148,12 +149,12 @@ fn yard_builder(shadow: Option<ShadowSettings>, samples: u32) -> SceneBuilder {
     (builder.parts.look.ground, builder.parts.look.horizon) = (defaults.ground, defaults.horizon);
     (builder.parts.look.sun, builder.parts.look.shadow, builder.parts.look.samples) =
         ([1.0, 3.0, 2.0], shadow, samples);
-    let plain = || Material { double_sided: true, ..Material::default() };
+    let double_sided = || Material { double_sided: true, ..Material::default() };
     let wall = facing_rectangle(-1.0, 0.0, 0.2, 1.1, -0.4);
     builder
-        .add_domain(wall, plain())
+        .add_domain(wall, double_sided())
         .add_domain(floor_mesh(0.45, 0.7), Material::default())
-        .add_domain(floor_mesh(0.3, 0.0), plain())
+        .add_domain(floor_mesh(0.3, 0.0), double_sided())
 }
 
 fn default_camera() -> Camera {
@@ -182,38 +183,53 @@ fn compute_rasterized_frame_equals_opengl() {
             renderer.set_blur_method(blur_method);
             draw_frame_with(&mut renderer, &scene, default_camera(), backend)
         };
-        let want = draw_frame(Backend::OpenGl);
-        let got = draw_frame(Backend::Compute(0.0));
+        let opengl_frame = draw_frame(Backend::OpenGl);
+        let compute_frame = draw_frame(Backend::Compute(0.0));
         let cuda = Some(RasterBackend::Cuda);
-        assert_eq!(got.stats.raster_backends, RasterBackends { shadow: cuda, visibility: cuda });
+        assert_eq!(compute_frame.stats.raster_backends, RasterBackends { shadow: cuda, visibility: cuda });
         assert_eq!(
-            want.stats.raster_backends,
+            opengl_frame.stats.raster_backends,
             RasterBackends { shadow: Some(RasterBackend::OpenGl), visibility: Some(RasterBackend::OpenGl) }
         );
-        assert_eq!(got.stats.passes[..3], [Pass::RasterShadow, Pass::Blur, Pass::Unpack]);
+        assert_eq!(compute_frame.stats.passes[..3], [Pass::RasterShadow, Pass::Blur, Pass::Unpack]);
         assert!(
-            !got.stats.passes.contains(&Pass::Ground)
-                && got.allocations.iter().any(|name| name == "raster shadow depths")
+            !compute_frame.stats.passes.contains(&Pass::Ground)
+                && compute_frame.allocations.iter().any(|name| name == "raster shadow depths")
         );
         assert!(
-            !want.allocations.iter().any(|name| name == "raster visibility keys" || name == "raster shadow depths"),
+            !opengl_frame
+                .allocations
+                .iter()
+                .any(|name| name == "raster visibility keys" || name == "raster shadow depths"),
             "expected no allocations for the compute rasterizer"
         );
-        let kinds = |kind: fn(&VisibilityId) -> bool| want.ids.iter().filter(|seen| kind(seen)).count();
+        let count_ids =
+            |predicate: fn(&VisibilityId) -> bool| opengl_frame.ids.iter().filter(|id| predicate(id)).count();
         assert!(
-            kinds(|seen| *seen == VisibilityId::Ground) > 5000
-                && kinds(|seen| matches!(seen, VisibilityId::Triangle(_))) > 2000
+            count_ids(|id| *id == VisibilityId::Ground) > 5000
+                && count_ids(|id| matches!(id, VisibilityId::Triangle(_))) > 2000
         );
-        let (ids, pixels) = (count_differences(&got.ids, &want.ids), count_different_bytes(&got.image, &want.image));
-        assert!(ids <= 12 && pixels <= 60, "{blur_method:?}: {ids} ids, {pixels} bytes differ");
-        let x_offset = draw_frame(Backend::Compute(0.02));
-        let (ids, pixels) =
-            (count_differences(&x_offset.ids, &want.ids), count_different_bytes(&x_offset.image, &want.image));
-        assert!(ids > 100 && pixels > 300, "negative control: shifted by two pixels: {ids} ids, {pixels} bytes");
+        let (different_ids, different_bytes) = (
+            count_differences(&compute_frame.ids, &opengl_frame.ids),
+            count_different_bytes(&compute_frame.image, &opengl_frame.image),
+        );
+        assert!(
+            different_ids <= 12 && different_bytes <= 60,
+            "{blur_method:?}: {different_ids} ids, {different_bytes} bytes differ"
+        );
+        let shifted_frame = draw_frame(Backend::Compute(0.02));
+        let (different_ids, different_bytes) = (
+            count_differences(&shifted_frame.ids, &opengl_frame.ids),
+            count_different_bytes(&shifted_frame.image, &opengl_frame.image),
+        );
+        assert!(
+            different_ids > 100 && different_bytes > 300,
+            "negative control: shifted by two pixels, {different_ids} ids and {different_bytes} bytes differ"
+        );
     }
 }
 
-/// Frames of both paths alternate on one render target, and each equals the frame of a fresh renderer.
+/// Frames of both rasterizers alternate on one render target. Each equals the frame of a new renderer.
 #[test]
 fn opengl_and_compute_frames_share_a_target() {
     let mut builder = yard_builder(None, 1);
@@ -235,15 +251,21 @@ fn opengl_and_compute_frames_share_a_target() {
         buffers
     });
     let [width, height] = SIZE;
-    for (frame, x) in [-2.5, 2.5, 0.0, 1.0, -1.0].into_iter().enumerate() {
+    for (frame_index, x) in [-2.5, 2.5, 0.0, 1.0, -1.0].into_iter().enumerate() {
         let params = FrameParams { camera: camera_at(x), width, height, bounds, light: None };
-        let image = renderer.draw(&scene_buffers[frame % 2], &params).expect("expected a frame");
-        let expected =
-            draw_frame(&scene, camera_at(x), if frame % 2 == 0 { Backend::OpenGl } else { Backend::Compute(0.0) });
+        let image = renderer.draw(&scene_buffers[frame_index % 2], &params).expect("expected a frame");
+        let expected = draw_frame(
+            &scene,
+            camera_at(x),
+            if frame_index % 2 == 0 { Backend::OpenGl } else { Backend::Compute(0.0) },
+        );
         assert_eq!(image.raster_backends, expected.stats.raster_backends);
-        assert!(image.rgba == expected.image.rgba, "turn {frame}");
-        let triangles = expected.ids.iter().filter(|seen| matches!(seen, VisibilityId::Triangle(_))).count();
-        assert!((200..12_000).contains(&triangles), "{triangles} pixels");
+        assert!(image.rgba == expected.image.rgba, "frame {frame_index}");
+        let triangle_pixels = expected.ids.iter().filter(|id| matches!(id, VisibilityId::Triangle(_))).count();
+        assert!(
+            (200..12_000).contains(&triangle_pixels),
+            "expected 200 to 12000 pixels of triangles, got {triangle_pixels}"
+        );
     }
 }
 
@@ -266,37 +288,42 @@ fn ground_hides_geometry_below_but_not_in_its_plane() {
         renderer
             .draw(&buffers, &FrameParams { camera: default_camera(), width, height, bounds, light: None })
             .expect("expected a frame");
-        let domain = |visible_domains: &VisibilityId| match visible_domains {
+        let domain = |id: &VisibilityId| match id {
             VisibilityId::Triangle(index) => buffers.source_triangle(*index).map(|(domain, _)| domain),
             _ => None,
         };
-        let visible_domains: Vec<Option<usize>> =
-            renderer.read_visibility().expect("expected visibility ids").iter().map(domain).collect();
-        visible_domains
+        let ids = renderer.read_visibility().expect("expected visibility ids");
+        ids.iter().map(domain).collect::<Vec<Option<usize>>>()
     };
-    let count = |visible_domains: &[Option<usize>], domain: usize| {
-        visible_domains.iter().filter(|visible| **visible == Some(domain)).count()
-    };
-    let (above_ground, want, got) = (
+    let count =
+        |domains: &[Option<usize>], domain: usize| domains.iter().filter(|visible| **visible == Some(domain)).count();
+    let (above_ground, opengl_domains, compute_domains) = (
         visible_domains(Backend::OpenGl, 0.0),
         visible_domains(Backend::OpenGl, 0.8),
         visible_domains(Backend::Compute(0.0), 0.8),
     );
-    assert!(count_differences(&got, &want) <= 8, "{} samples differ", count_differences(&got, &want));
     assert!(
-        count(&want, 0) > 100 && 2 * count(&got, 0) < count(&above_ground, 0),
+        count_differences(&compute_domains, &opengl_domains) <= 8,
+        "{} samples differ",
+        count_differences(&compute_domains, &opengl_domains)
+    );
+    assert!(
+        count(&opengl_domains, 0) > 100 && 2 * count(&compute_domains, 0) < count(&above_ground, 0),
         "expected the ground to hide most of the wall"
     );
-    assert!(count(&above_ground, 1) > 100 && count(&got, 1) == 0, "expected the ground to hide the floating square");
-    let in_plane = [count(&above_ground, 2), count(&want, 2), count(&got, 2)];
     assert!(
-        in_plane[0] > 100 && in_plane == [in_plane[0]; 3],
-        "expected a visible square in the plane of the ground, got {in_plane:?}"
+        count(&above_ground, 1) > 100 && count(&compute_domains, 1) == 0,
+        "expected the ground to hide the floating square"
+    );
+    let in_plane_counts = [count(&above_ground, 2), count(&opengl_domains, 2), count(&compute_domains, 2)];
+    assert!(
+        in_plane_counts[0] > 100 && in_plane_counts == [in_plane_counts[0]; 3],
+        "expected a visible square in the plane of the ground, got {in_plane_counts:?}"
     );
 }
 
 #[test]
-fn opengl_draws_what_the_compute_rasterizer_cannot() {
+fn opengl_draws_frames_that_compute_does_not_support() {
     let raster_backends = |builder: SceneBuilder| {
         draw_frame(&builder.build(), default_camera(), Backend::Compute(0.0)).stats.raster_backends
     };
@@ -338,30 +365,34 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
         FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds: summary.bounds, light: summary.oriented_bounds }
     };
     let (first_params, second_params) = (create_params([1.4, 1.9, 4.0]), create_params([-2.0, 1.2, 3.0]));
-    let unshared = renderer.draw(&buffers, &second_params).expect("expected a frame");
+    let unshared_image = renderer.draw(&buffers, &second_params).expect("expected a frame");
     buffers.set_step(7);
     let draw = |renderer: &mut Renderer, buffers: &SceneBuffers, params: &FrameParams| {
         let image = renderer.draw(buffers, params).expect("expected a frame");
         (image, renderer.stats().passes[..2].to_vec())
     };
     assert_eq!(draw(&mut renderer, &buffers, &first_params).1, [Pass::RasterShadow, Pass::Blur]);
-    let (shared, passes) = draw(&mut renderer, &buffers, &second_params);
+    let (shared_image, passes) = draw(&mut renderer, &buffers, &second_params);
     assert_eq!(passes, [Pass::RasterVisibility, Pass::Unpack], "expected no second shadow pass");
-    assert_eq!(shared.raster_backends, RasterBackends { shadow: None, visibility: Some(RasterBackend::Cuda) });
-    assert!(shared.rgba == unshared.rgba, "expected the same image with a shared shadow");
+    assert_eq!(shared_image.raster_backends, RasterBackends { shadow: None, visibility: Some(RasterBackend::Cuda) });
+    assert!(shared_image.rgba == unshared_image.rgba, "expected the same image with a shared shadow");
     let positions = deformer.surface().expect("expected a surface").positions.clone();
     renderer.upload_rebased(&mut buffers, &positions, [0.0; 3]).expect("expected the upload to succeed");
-    let (rebased, passes) = draw(&mut renderer, &buffers, &second_params);
+    let (rebased_image, passes) = draw(&mut renderer, &buffers, &second_params);
     assert_eq!(
-        (passes[0], rebased.raster_backends.visibility),
+        (passes[0], rebased_image.raster_backends.visibility),
         (Pass::Shadow, Some(RasterBackend::OpenGl)),
         "expected OpenGL for rebased positions"
     );
-    assert!(count_different_bytes(&rebased, &unshared) <= 60, "{}", count_different_bytes(&rebased, &unshared));
+    assert!(
+        count_different_bytes(&rebased_image, &unshared_image) <= 60,
+        "{}",
+        count_different_bytes(&rebased_image, &unshared_image)
+    );
     buffers.set_origin([0.0; 3]);
-    let (restored, _) = draw(&mut renderer, &buffers, &second_params);
-    assert_eq!(restored.raster_backends.visibility, Some(RasterBackend::Cuda));
-    assert!(restored.rgba == unshared.rgba, "expected the first image again");
+    let (restored_image, _) = draw(&mut renderer, &buffers, &second_params);
+    assert_eq!(restored_image.raster_backends.visibility, Some(RasterBackend::Cuda));
+    assert!(restored_image.rgba == unshared_image.rgba, "expected the first image again");
 }
 
 /// A rasterizer whose draw calls always fail.
@@ -382,7 +413,7 @@ impl Rasterizer for FailingRasterizer {
 #[test]
 fn failing_rasterizer_falls_back_to_opengl() {
     let scene = yard_builder(Some(ShadowSettings { size: 128, ..ShadowSettings::default() }), 1).build();
-    let want = draw_frame(&scene, default_camera(), Backend::OpenGl);
+    let opengl_frame = draw_frame(&scene, default_camera(), Backend::OpenGl);
     let (mut renderer, mut deformer) = (open_renderer(), ReferenceDeformer::new(&scene));
     let summary = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed");
     let mut buffers = renderer.load(&scene).expect("expected the scene to load");
@@ -394,8 +425,8 @@ fn failing_rasterizer_falls_back_to_opengl() {
     let params = FrameParams { camera: default_camera(), width, height, bounds: summary.bounds, light: None };
     for _ in 0..2 {
         let image = renderer.draw(&buffers, &params).expect("expected a frame");
-        assert_eq!(image.raster_backends, want.stats.raster_backends);
-        assert!(image.rgba == want.image.rgba);
+        assert_eq!(image.raster_backends, opengl_frame.stats.raster_backends);
+        assert!(image.rgba == opengl_frame.image.rgba);
     }
 }
 
@@ -418,7 +449,9 @@ impl Rasterizer for UncompiledRasterizer {
 #[test]
 fn rasterizer_is_compiled_when_the_scene_is_loaded() {
     let shadow = Some(ShadowSettings { size: 128, ..ShadowSettings::default() });
-    for (shadow, samples, want) in [(shadow, 1, [true; 2]), (shadow, 4, [true, false]), (None, 1, [false, true])] {
+    for (shadow, samples, expected_pipelines) in
+        [(shadow, 1, [true; 2]), (shadow, 4, [true, false]), (None, 1, [false, true])]
+    {
         let scene = yard_builder(shadow, samples).build();
         let (mut renderer, mut deformer) = (open_renderer(), ReferenceDeformer::new(&scene));
         let summary = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed");
@@ -426,10 +459,14 @@ fn rasterizer_is_compiled_when_the_scene_is_loaded() {
         renderer
             .upload(&buffers, deformer.surface().expect("expected a surface"))
             .expect("expected the upload to succeed");
-        let requested = std::rc::Rc::default();
-        let rasterizer = UncompiledRasterizer(std::rc::Rc::clone(&requested));
+        let requested_pipelines = std::rc::Rc::default();
+        let rasterizer = UncompiledRasterizer(std::rc::Rc::clone(&requested_pipelines));
         let result = renderer.attach_rasterizer(&mut buffers, |_| Ok(Box::new(rasterizer) as Box<dyn Rasterizer>));
-        assert!(result.is_err() && requested.get() == want, "{:?}", requested.get());
+        assert!(
+            result.is_err() && requested_pipelines.get() == expected_pipelines,
+            "expected {expected_pipelines:?}, got {:?}",
+            requested_pipelines.get()
+        );
         let [width, height] = SIZE;
         let params = FrameParams { camera: default_camera(), width, height, bounds: summary.bounds, light: None };
         let raster_backends = renderer.draw(&buffers, &params).expect("expected a frame").raster_backends;

@@ -31,7 +31,7 @@ fn square_covers_exactly_its_pixels() {
 }
 
 #[test]
-fn top_row_comes_first_and_left_is_left() {
+fn first_row_is_the_top_and_first_column_the_left() {
     let red = facing_rectangle(-3.2, 2.2, -2.2, 3.2, 0.0);
     let green = facing_rectangle(2.2, -3.2, 3.2, -2.2, 0.0);
     let frame = render(
@@ -51,7 +51,7 @@ fn first_image_row_is_the_top_of_the_surface() {
     let image = builder.add_texture(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 0, 255]);
     let material = Material { color_texture: Some(image), ..Material::default() };
     let frame = render(&builder.add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), material).build());
-    // Half a texel from the edge of the image, each texel has its own color.
+    // These four pixels show the centers of the four texels.
     for (x, y, color) in [(17, 17, [0.0, 0.0]), (46, 17, [1.0, 0.0]), (17, 46, [0.0, 1.0]), (46, 46, [1.0, 1.0])] {
         let [r, g, b] = frame.pixel(x, y);
         assert!(b == 0, "{x} {y}");
@@ -99,8 +99,8 @@ fn phong_shading_equals_f64_arithmetic() {
             let expected = expected_phong(&settings, &material, point, Vector3::new(0.0, 0.0, 10.0));
             assert!(is_close(frame.pixel(x, y), expected, 1.0), "{sun:?} ({x}, {y}): {:?}", frame.pixel(x, y));
             let matte = Material { specular: [0.0; 3], ..material.clone() };
-            let without_highlight = expected_phong(&settings, &matte, point, Vector3::new(0.0, 0.0, 10.0));
-            highlights += usize::from(!is_close(frame.pixel(x, y), without_highlight, 1.0));
+            let matte_color = expected_phong(&settings, &matte, point, Vector3::new(0.0, 0.0, 10.0));
+            highlights += usize::from(!is_close(frame.pixel(x, y), matte_color, 1.0));
         }
         assert_eq!(highlights > 0, has_highlight, "{sun:?}: {highlights} pixels with a highlight");
     }
@@ -145,16 +145,16 @@ fn normal_map_changes_shading_and_a_flat_one_does_not() {
     // Tangent space: x along u, y against v, z along the normal. 0.6 and 0.8 are encoded in steps of 1/127.
     assert!(
         is_close(render_with(Some([204, 128, 230, 255])).pixel(32, 32), expected(1.0), 1.0),
-        "normal tilted towards the sun"
+        "expected a brighter surface with the normal tilted towards the sun"
     );
     assert!(
         is_close(render_with(Some([52, 128, 230, 255])).pixel(32, 32), expected(0.28), 2.0),
-        "normal tilted away from the sun"
+        "expected a darker surface with the normal tilted away from the sun"
     );
     let tilted_up = render_with(Some([128, 204, 230, 255]));
     assert!(
         is_close(tilted_up.pixel(32, 32), expected(0.64), 2.0),
-        "normal tilted up, perpendicular to the sun's azimuth"
+        "expected a darker surface with the normal tilted up"
     );
 }
 
@@ -170,11 +170,11 @@ fn plus_y_of_a_normal_map_points_up_the_image() {
     assert!(is_close(render_with(204), [0.75; 3], 1.0) && is_close(render_with(52), [0.25 + 0.5 * 0.28; 3], 2.0));
 }
 
-/// A red leaf in front of an empty background; the middle half of each of its axes is cut away.
+/// A red leaf in front of a black background, with a hole of half its side length in the center.
 fn render_leaf(alpha_mode: AlphaMode) -> super::harness::RenderedFrame {
     let mut builder = SceneBuilder::new();
-    let hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
-    let image = builder.add_texture(64, 64, |x, y| [255, 0, 0, if hole(x, y) { 0 } else { 255 }]);
+    let is_in_hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
+    let image = builder.add_texture(64, 64, |x, y| [255, 0, 0, if is_in_hole(x, y) { 0 } else { 255 }]);
     let material = Material { color_texture: Some(image), alpha_mode, ..Material::default() };
     render(&builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), material).build())
 }
@@ -193,30 +193,31 @@ fn cut_out_shows_the_background_and_opaque_does_not() {
 
 #[test]
 fn two_blended_layers_equal_arithmetic() {
-    let layers = |near: f32, far: f32, alpha_mode: AlphaMode| {
+    let render_layers = |near_alpha: f32, far_alpha: f32, alpha_mode: AlphaMode| {
         let layer = |diffuse, alpha| Material { alpha, alpha_mode, ..matte_material(diffuse) };
-        // Blended in the order of the scene, the farther layer first.
+        // Layers are blended in scene order, so the farther one comes first.
         let scene = SceneBuilder::new()
             .add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, -2.0), matte_material([0.2, 0.2, 1.0]))
-            .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, -1.0), layer([0.0, 1.0, 0.0], far))
-            .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), layer([1.0, 0.0, 0.0], near))
+            .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, -1.0), layer([0.0, 1.0, 0.0], far_alpha))
+            .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), layer([1.0, 0.0, 0.0], near_alpha))
             .build();
         render(&scene)
     };
-    let expected = |near: f64, far: f64| {
-        let background = [0.2, 0.2, 1.0].map(|channel| channel * (1.0 - far));
-        let behind_near = [background[0], background[1] + far, background[2]].map(|channel| channel * (1.0 - near));
-        [behind_near[0] + near, behind_near[1], behind_near[2]].map(|channel| 0.75 * channel)
+    let expected = |near_alpha: f64, far_alpha: f64| {
+        let background = [0.2, 0.2, 1.0].map(|channel| channel * (1.0 - far_alpha));
+        let behind_near =
+            [background[0], background[1] + far_alpha, background[2]].map(|channel| channel * (1.0 - near_alpha));
+        [behind_near[0] + near_alpha, behind_near[1], behind_near[2]].map(|channel| 0.75 * channel)
     };
-    let frame = layers(0.25, 0.5, AlphaMode::Blend);
+    let frame = render_layers(0.25, 0.5, AlphaMode::Blend);
     assert!(is_close(frame.pixel(32, 32), expected(0.25, 0.5), 1.0), "{:?}", frame.pixel(32, 32));
     assert!(
         !is_close(frame.pixel(32, 32), expected(0.5, 0.25), 4.0),
         "negative control: expected other colors for other alphas"
     );
-    assert!(is_close(layers(0.5, 0.25, AlphaMode::Blend).pixel(32, 32), expected(0.5, 0.25), 1.0));
+    assert!(is_close(render_layers(0.5, 0.25, AlphaMode::Blend).pixel(32, 32), expected(0.5, 0.25), 1.0));
     assert!(
-        is_close(layers(0.25, 0.5, AlphaMode::Opaque).pixel(32, 32), [0.75, 0.0, 0.0], 1.0),
+        is_close(render_layers(0.25, 0.5, AlphaMode::Opaque).pixel(32, 32), [0.75, 0.0, 0.0], 1.0),
         "expected opaque materials to ignore alpha"
     );
 }
@@ -225,11 +226,11 @@ fn two_blended_layers_equal_arithmetic() {
 fn two_pass_blending_writes_no_depth() {
     let layer = |diffuse| Material { alpha: 0.5, alpha_mode: AlphaMode::Blend, ..matte_material(diffuse) };
     let render_with = |second_z: f32| {
-        let first = facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0);
+        let first_pane = facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0);
         let mut builder = SceneBuilder::new();
         builder.parts.look.transparency = Transparency::TwoPass;
         let scene = builder
-            .add_domain(first, layer([1.0, 0.0, 0.0]))
+            .add_domain(first_pane, layer([1.0, 0.0, 0.0]))
             .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, second_z), layer([0.0, 1.0, 0.0]))
             .build();
         render(&scene).pixel(32, 32)
@@ -266,18 +267,18 @@ fn only_double_sided_back_faces_are_drawn() {
 #[test]
 fn images_of_many_sizes_keep_their_materials() {
     let mut builder = SceneBuilder::new();
-    let mut expected = Vec::new();
+    let mut colors = Vec::new();
     for index in 0..9_u32 {
         let shade = 20 + 25 * index as u8;
         let image = builder.add_texture(3 + 5 * index, 40 - 4 * index, |_, _| [shade, 255 - shade, 0, 255]);
         let material = Material { color_texture: Some(image), ..Material::default() };
         let left = -2.7 + 0.6 * index as f32;
         builder = builder.add_domain(facing_rectangle(left, -1.0, left + 0.6, 1.0, 0.0), material);
-        expected.push([shade, 255 - shade, 0]);
+        colors.push([shade, 255 - shade, 0]);
     }
     let frame = render_square(&mut open_renderer(), &builder.build(), front_camera(64), 64);
     let linear = |byte: u8| ((f64::from(byte) / 255.0 + 0.055) / 1.055).powf(2.4);
-    for (index, [r, g, _]) in expected.into_iter().enumerate() {
+    for (index, [r, g, _]) in colors.into_iter().enumerate() {
         let pixel = frame.pixel(5 + 6 * index as u32 + 3, 32);
         assert!(is_close(pixel, [0.75 * linear(r), 0.75 * linear(g), 0.0], 1.0), "image {index}: {pixel:?}");
     }

@@ -32,8 +32,8 @@ fn render_from_above(builder: SceneBuilder) -> RenderedFrame {
     render_square(&mut open_renderer(), &builder.build(), camera, 64)
 }
 
-/// Renders from above a floating square of two units and its shadow. The sun comes from the side, so that the square
-/// does not hide its shadow.
+/// Renders from above a floating square of two units per side and its shadow. The sun comes from the side, so that the
+/// square does not hide its shadow.
 fn render_square_shadow(builder: SceneBuilder, alpha_mode: AlphaMode, alpha: f32) -> RenderedFrame {
     render_from_above(with_square(builder, alpha_mode, alpha))
 }
@@ -41,15 +41,19 @@ fn render_square_shadow(builder: SceneBuilder, alpha_mode: AlphaMode, alpha: f32
 /// Adds the square, whose shadow on the ground covers x and z of -1 to 1.
 pub(super) fn with_square(mut builder: SceneBuilder, alpha_mode: AlphaMode, alpha: f32) -> SceneBuilder {
     builder.parts.look.sun = [3.0, 4.0, 0.0];
-    let hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
-    let image = builder.add_texture(64, 64, |x, y| [255, 255, 255, if hole(x, y) { 0 } else { 255 }]);
+    let is_in_hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
+    let image = builder.add_texture(64, 64, |x, y| [255, 255, 255, if is_in_hole(x, y) { 0 } else { 255 }]);
     let material =
         Material { alpha_mode, alpha, color_texture: Some(image), double_sided: true, ..Material::default() };
-    let mut square = floor_mesh(1.0, 4.0).rest_positions().to_vec();
-    square.iter_mut().for_each(|vertex| vertex[0] += 3.0);
+    let mut positions = floor_mesh(1.0, 4.0).rest_positions().to_vec();
+    positions.iter_mut().for_each(|vertex| vertex[0] += 3.0);
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
-    let mesh =
-        modalcast_model::domain::Mesh::from_indexed(square, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
+    let mesh = modalcast_model::domain::Mesh::from_indexed(
+        positions,
+        vec![[0.0, 1.0, 0.0]; 4],
+        uvs,
+        vec![[0, 1, 2], [0, 2, 3]],
+    );
     builder.add_domain(mesh.expect("expected a valid mesh"), material)
 }
 
@@ -62,22 +66,37 @@ fn ground_color(visibility: f64, cosine: f64) -> [f64; 3] {
 /// Negative control: without the caster, or without a shadow map, the ground is lit.
 #[test]
 fn shadow_of_a_floating_square_has_only_ambient_light() {
-    let shaded = render_square_shadow(create_builder(), AlphaMode::Opaque, 1.0);
-    assert!(is_close(shaded.pixel(32, 32), ground_color(0.0, 0.8), 2.0), "umbra: {:?}", shaded.pixel(32, 32));
-    assert!(is_close(shaded.pixel(32, 12), ground_color(1.0, 0.8), 2.0), "beside it: {:?}", shaded.pixel(32, 12));
-    assert!(is_close(shaded.pixel(12, 32), ground_color(1.0, 0.8), 2.0), "beside it: {:?}", shaded.pixel(12, 32));
-    let dark_pixels = shaded.count_pixels(|[r, ..]| f64::from(r) < 150.0);
+    let frame = render_square_shadow(create_builder(), AlphaMode::Opaque, 1.0);
+    assert!(
+        is_close(frame.pixel(32, 32), ground_color(0.0, 0.8), 2.0),
+        "expected ambient light in the umbra, got {:?}",
+        frame.pixel(32, 32)
+    );
+    assert!(
+        is_close(frame.pixel(32, 12), ground_color(1.0, 0.8), 2.0),
+        "expected sunlight beside the shadow, got {:?}",
+        frame.pixel(32, 12)
+    );
+    assert!(
+        is_close(frame.pixel(12, 32), ground_color(1.0, 0.8), 2.0),
+        "expected sunlight beside the shadow, got {:?}",
+        frame.pixel(12, 32)
+    );
+    let dark_pixels = frame.count_pixels(|[r, ..]| f64::from(r) < 150.0);
     assert!((330..=470).contains(&dark_pixels), "expected about 20 x 20 dark pixels, got {dark_pixels}");
 
-    let mut without_shadow = create_builder();
-    without_shadow.parts.look.shadow = None;
-    let unshaded = render_square_shadow(without_shadow, AlphaMode::Opaque, 1.0);
-    assert!(is_close(unshaded.pixel(32, 32), ground_color(1.0, 0.8), 2.0), "negative control: without a shadow map");
-    assert!(!unshaded.stats.passes.contains(&Pass::Shadow) && shaded.stats.passes.contains(&Pass::Shadow));
-    let mut without_caster = create_builder();
-    without_caster.parts.look.sun = [3.0, 4.0, 0.0];
+    let mut builder_without_shadow = create_builder();
+    builder_without_shadow.parts.look.shadow = None;
+    let unshadowed_frame = render_square_shadow(builder_without_shadow, AlphaMode::Opaque, 1.0);
     assert!(
-        is_close(render_from_above(without_caster).pixel(32, 32), ground_color(1.0, 0.8), 2.0),
+        is_close(unshadowed_frame.pixel(32, 32), ground_color(1.0, 0.8), 2.0),
+        "negative control: without a shadow map"
+    );
+    assert!(!unshadowed_frame.stats.passes.contains(&Pass::Shadow) && frame.stats.passes.contains(&Pass::Shadow));
+    let mut builder_without_caster = create_builder();
+    builder_without_caster.parts.look.sun = [3.0, 4.0, 0.0];
+    assert!(
+        is_close(render_from_above(builder_without_caster).pixel(32, 32), ground_color(1.0, 0.8), 2.0),
         "negative control: without a caster"
     );
 }
@@ -85,9 +104,9 @@ fn shadow_of_a_floating_square_has_only_ambient_light() {
 #[test]
 fn shadow_removes_everything_but_ambient_light() {
     let floor = Material { ambient: [0.9, 0.5, 0.2], specular: [0.5; 3], shininess: 1.0, ..Material::default() };
-    let shaded = render_square_shadow(create_builder().add_domain(floor_mesh(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
-    assert!(is_close(shaded.pixel(32, 32), [0.25 * 0.9, 0.25 * 0.5, 0.25 * 0.2], 1.0), "{:?}", shaded.pixel(32, 32));
-    let [r, g, b] = shaded.pixel(32, 8);
+    let frame = render_square_shadow(create_builder().add_domain(floor_mesh(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
+    assert!(is_close(frame.pixel(32, 32), [0.25 * 0.9, 0.25 * 0.5, 0.25 * 0.2], 1.0), "{:?}", frame.pixel(32, 32));
+    let [r, g, b] = frame.pixel(32, 8);
     assert!(
         r > 190 && g > 190 && b > 190,
         "negative control: expected sunlight beside the shadow, got {:?}",
@@ -95,8 +114,8 @@ fn shadow_removes_everything_but_ambient_light() {
     );
 }
 
-/// The printed ambient term equals this one only in sunlight that has the color of the sky; in the shadow the printed
-/// term is black.
+/// The ambient term that the thesis prints equals that of the renderer only in sunlight of the sky's color. In the shadow
+/// the printed term is black.
 #[test]
 fn ambient_term_is_lit_by_the_sky_and_not_as_printed() {
     // Without a highlight, equation 3.12 as printed is s_f I_l (C_a + (n . v_l) C_d): the sun also lights C_a, and the
@@ -114,16 +133,17 @@ fn ambient_term_is_lit_by_the_sky_and_not_as_printed() {
         let floor = Material { ambient, diffuse, specular: [0.0; 3], ..Material::default() };
         let frame = render_square_shadow(builder.add_domain(floor_mesh(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
         for (visibility, pixel) in [(1.0, frame.pixel(32, 8)), (0.0, frame.pixel(32, 32))] {
-            let (printed, expected) = (color(visibility * 0.5, visibility * 0.5), color(skylight, visibility * 0.5));
+            let (printed_color, expected_color) =
+                (color(visibility * 0.5, visibility * 0.5), color(skylight, visibility * 0.5));
             assert!(
-                is_close(pixel, expected, 1.0),
-                "sky {skylight}, sun {visibility}: {pixel:?}, expected {expected:?}"
+                is_close(pixel, expected_color, 1.0),
+                "sky {skylight}, sun {visibility}: {pixel:?}, expected {expected_color:?}"
             );
             let is_equal = skylight == 0.5 && visibility == 1.0;
             assert_eq!(
-                is_close(pixel, printed, 1.0),
+                is_close(pixel, printed_color, 1.0),
                 is_equal,
-                "sky {skylight}, sun {visibility}: {pixel:?}, printed {printed:?}"
+                "sky {skylight}, sun {visibility}: {pixel:?}, printed {printed_color:?}"
             );
         }
     }
@@ -131,29 +151,40 @@ fn ambient_term_is_lit_by_the_sky_and_not_as_printed() {
 
 #[test]
 fn shadow_of_a_cut_out_has_its_hole() {
-    let cut_out = render_square_shadow(create_builder(), AlphaMode::Mask { cutoff: 0.5 }, 1.0);
-    assert!(is_close(cut_out.pixel(32, 32), ground_color(1.0, 0.8), 4.0), "the hole: {:?}", cut_out.pixel(32, 32));
-    assert!(is_close(cut_out.pixel(24, 32), ground_color(0.0, 0.8), 4.0), "the rim: {:?}", cut_out.pixel(24, 32));
-    let opaque = render_square_shadow(create_builder(), AlphaMode::Opaque, 1.0);
-    assert!(is_close(opaque.pixel(32, 32), ground_color(0.0, 0.8), 4.0), "negative control: an opaque square");
+    let cut_out_frame = render_square_shadow(create_builder(), AlphaMode::Mask { cutoff: 0.5 }, 1.0);
+    assert!(
+        is_close(cut_out_frame.pixel(32, 32), ground_color(1.0, 0.8), 4.0),
+        "expected sunlight in the hole, got {:?}",
+        cut_out_frame.pixel(32, 32)
+    );
+    assert!(
+        is_close(cut_out_frame.pixel(24, 32), ground_color(0.0, 0.8), 4.0),
+        "expected shadow around the hole, got {:?}",
+        cut_out_frame.pixel(24, 32)
+    );
+    let opaque_frame = render_square_shadow(create_builder(), AlphaMode::Opaque, 1.0);
+    assert!(
+        is_close(opaque_frame.pixel(32, 32), ground_color(0.0, 0.8), 4.0),
+        "negative control: expected shadow under an opaque square"
+    );
 }
 
 #[test]
 fn blended_surface_casts_above_the_alpha_threshold() {
-    let above_threshold = render_square_shadow(create_builder(), AlphaMode::Blend, 0.6);
+    let frame_above_threshold = render_square_shadow(create_builder(), AlphaMode::Blend, 0.6);
     assert!(
-        is_close(above_threshold.pixel(24, 32), ground_color(0.0, 0.8), 4.0)
-            && is_close(above_threshold.pixel(32, 32), ground_color(1.0, 0.8), 4.0)
+        is_close(frame_above_threshold.pixel(24, 32), ground_color(0.0, 0.8), 4.0)
+            && is_close(frame_above_threshold.pixel(32, 32), ground_color(1.0, 0.8), 4.0)
     );
-    let below_threshold = render_square_shadow(create_builder(), AlphaMode::Blend, 0.4);
+    let frame_below_threshold = render_square_shadow(create_builder(), AlphaMode::Blend, 0.4);
     assert!(
-        is_close(below_threshold.pixel(24, 32), ground_color(1.0, 0.8), 4.0),
+        is_close(frame_below_threshold.pixel(24, 32), ground_color(1.0, 0.8), 4.0),
         "{:?}",
-        below_threshold.pixel(24, 32)
+        frame_below_threshold.pixel(24, 32)
     );
 }
 
-/// Light bleeding reduction is applied to the bound.
+/// Also with light bleeding reduction, which is applied to the bound.
 #[test]
 fn unblurred_texel_gives_the_chebyshev_bound() {
     // A square at height 4 that covers the whole map. The near and far planes of the light lie 1 % of the diagonal of
@@ -171,12 +202,12 @@ fn unblurred_texel_gives_the_chebyshev_bound() {
     for (least_variance, bleeding) in [(0.5_f32, 0.0_f32), (0.1, 0.0), (0.5, 0.2), (0.02, 0.3)] {
         let variance = f64::from(least_variance);
         let bound = variance / (variance + depth_difference * depth_difference);
-        let bleeding_share = f64::from(bleeding);
-        let visibility = ((bound - bleeding_share) / (1.0 - bleeding_share)).max(0.0);
+        let bleeding_f64 = f64::from(bleeding);
+        let visibility = ((bound - bleeding_f64) / (1.0 - bleeding_f64)).max(0.0);
         let pixel = render_with(least_variance, bleeding);
         assert!(
             is_close(pixel, ground_color(visibility, 1.0), 2.0),
-            "{least_variance} {bleeding}: {pixel:?}, share {visibility}"
+            "least_variance {least_variance}, bleeding {bleeding}: expected a visibility of {visibility}, got {pixel:?}"
         );
         assert!(!is_close(pixel, ground_color(visibility + 0.05, 1.0), 2.0), "negative control: visibility + 0.05");
     }
@@ -190,16 +221,19 @@ fn blur_widens_the_edge_of_a_shadow() {
             Some(ShadowSettings { size: 256, blur, bleeding: 0.0, ..ShadowSettings::default() });
         let frame = render_square_shadow(builder, AlphaMode::Opaque, 1.0);
         let row: Vec<f64> = (8..56).map(|y| f64::from(frame.pixel(32, y)[0])).collect();
-        let (dark, light) = (row[24], row[0]);
-        let penumbra_pixels = row.iter().filter(|byte| **byte > dark + 4.0 && **byte < light - 4.0).count();
+        let (dark_level, light_level) = (row[24], row[0]);
+        let penumbra_pixels = row.iter().filter(|byte| **byte > dark_level + 4.0 && **byte < light_level - 4.0).count();
         assert!(
             row[..20].windows(2).all(|pair| pair[0] >= pair[1] - 1.0),
             "expected decreasing light towards the center, got {row:?}"
         );
         penumbra_pixels
     };
-    let (unblurred, blurred) = (count_penumbra_pixels(0.0), count_penumbra_pixels(4.0));
-    assert!(blurred >= unblurred + 6, "expected a wider penumbra with blur, got {unblurred} and {blurred} pixels");
+    let (unblurred_pixels, blurred_pixels) = (count_penumbra_pixels(0.0), count_penumbra_pixels(4.0));
+    assert!(
+        blurred_pixels >= unblurred_pixels + 6,
+        "expected a wider penumbra with blur, got {unblurred_pixels} and {blurred_pixels} pixels"
+    );
 }
 
 #[test]
@@ -223,8 +257,8 @@ fn floor_in_the_plane_of_the_ground_covers_it() {
             create_builder()
                 .add_domain(floor_mesh(1.5, height), Material { ambient: [1.0, 0.0, 0.0], ..unlit_material() }),
         );
-        let floor = frame.count_pixels(|[r, g, b]| r > 100 && g < 10 && b < 10);
-        assert_eq!(floor, 900, "at {height}");
+        let floor_pixels = frame.count_pixels(|[r, g, b]| r > 100 && g < 10 && b < 10);
+        assert_eq!(floor_pixels, 900, "floor at height {height}");
     }
 }
 
@@ -243,21 +277,22 @@ fn every_up_axis_gives_the_same_picture() {
         let mesh = floor_mesh(1.0, 1.0);
         let rotate =
             |vector: &[f32; 3]| (rotation * nalgebra::Vector3::from(*vector).cast::<f64>()).cast::<f32>().into();
-        let rest: Vec<[f32; 3]> =
+        let positions: Vec<[f32; 3]> =
             mesh.rest_positions().iter().chain(floor_mesh(0.4, 0.0).rest_positions()).map(rotate).collect();
         let normals = vec![rotate(&[0.0, 1.0, 0.0]); 8];
         let triangles = vec![[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]];
-        let mesh = modalcast_model::domain::Mesh::from_indexed(rest, normals, vec![], triangles)
+        let mesh = modalcast_model::domain::Mesh::from_indexed(positions, normals, vec![], triangles)
             .expect("expected a valid mesh");
         let scene = builder.add_domain(mesh, Material { double_sided: true, ..Material::default() }).build();
         render_square(&mut open_renderer(), &scene, Camera::fit_to_scene(&scene, 64, 64), 64)
     };
-    let y_up = render_with(UpAxis::Y);
+    let y_up_frame = render_with(UpAxis::Y);
     for up in [UpAxis::X, UpAxis::Z] {
-        let rotated = render_with(up);
-        let different = y_up.image.rgba.iter().zip(&rotated.image.rgba).filter(|(a, b)| a.abs_diff(**b) > 4).count();
-        assert!(different < 60, "{up:?}: {different} bytes differ");
+        let rotated_frame = render_with(up);
+        let different_bytes =
+            y_up_frame.image.rgba.iter().zip(&rotated_frame.image.rgba).filter(|(a, b)| a.abs_diff(**b) > 4).count();
+        assert!(different_bytes < 60, "{up:?}: {different_bytes} bytes differ");
     }
-    let ground_pixel = y_up.pixel(32, 60);
-    assert!(y_up.count_pixels(|pixel| pixel == ground_pixel) < 4000, "expected geometry in the image");
+    let ground_pixel = y_up_frame.pixel(32, 60);
+    assert!(y_up_frame.count_pixels(|pixel| pixel == ground_pixel) < 4000, "expected geometry in the image");
 }

@@ -54,35 +54,35 @@ fn count_black(image: &FrameImage) -> usize {
 
 #[test]
 fn extreme_suns_cameras_and_scenes_have_no_nan_pixel() {
-    let single = [triangle([[0.0, 0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 1.0, 1.0]])];
-    let point = [triangle([[5.0, 2.0, 5.0]; 3])];
-    let edge_on = [triangle([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])];
-    let far_away = [triangle([[1e7, 0.5, 0.0], [1e7 + 2.0, 0.5, 0.0], [1e7, 1.0, 2.0]])];
-    let squares = Vec::from([floor_mesh(2.0, 0.0), floor_mesh(1.0, 1.0)]);
+    let triangle_mesh = [triangle([[0.0, 0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 1.0, 1.0]])];
+    let point_mesh = [triangle([[5.0, 2.0, 5.0]; 3])];
+    let edge_on_mesh = [triangle([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])];
+    let far_mesh = [triangle([[1e7, 0.5, 0.0], [1e7 + 2.0, 0.5, 0.0], [1e7, 1.0, 2.0]])];
+    let square_meshes = Vec::from([floor_mesh(2.0, 0.0), floor_mesh(1.0, 1.0)]);
     let scenes: [(&[Mesh], &str); 5] = [
-        (&single, "one triangle"),
-        (&point, "one point"),
-        (&edge_on, "edge on"),
-        (&far_away, "far away"),
-        (&squares, "two squares"),
+        (&triangle_mesh, "one triangle"),
+        (&point_mesh, "one point"),
+        (&edge_on_mesh, "edge on"),
+        (&far_mesh, "far away"),
+        (&square_meshes, "two squares"),
     ];
     let suns = [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1e-4, 0.2], [0.3, -1.0, 0.2], [0.4, 0.8, 0.5]];
     for shadow in shadow_settings() {
         for (meshes, name) in scenes {
             for sun in suns {
-                let frame = render_scene(meshes, sun, shadow, None);
-                assert_eq!(count_black(&frame), 0, "{name}, sun {sun:?}, {shadow:?}");
+                let image = render_scene(meshes, sun, shadow, None);
+                assert_eq!(count_black(&image), 0, "{name}, sun {sun:?}, {shadow:?}");
             }
         }
         assert_eq!(
-            count_black(&render_scene(&squares, suns[4], shadow, Some((1e-6, 1e9)))),
+            count_black(&render_scene(&square_meshes, suns[4], shadow, Some((1e-6, 1e9)))),
             0,
             "extreme clip planes, {shadow:?}"
         );
     }
-    let mut modified = render_scene(&squares, suns[4], shadow_settings()[0], None);
-    modified.rgba[..3].fill(0);
-    assert_eq!(count_black(&modified), 1, "negative control: one black pixel");
+    let mut modified_image = render_scene(&square_meshes, suns[4], shadow_settings()[0], None);
+    modified_image.rgba[..3].fill(0);
+    assert_eq!(count_black(&modified_image), 1, "negative control: expected one black pixel");
 }
 
 #[test]
@@ -99,28 +99,28 @@ fn static_shadow_does_not_flicker_while_bounds_grow() {
     for method in [ShadowMethod::Variance, ShadowMethod::Standard, ShadowMethod::PercentageCloser] {
         let scene = table_scene(ShadowSettings { method, ..base });
         for has_light_bounds in [false, true] {
-            let steps = render_growing_bounds(&scene, has_light_bounds);
-            let changes: Vec<usize> = steps.windows(2).map(|pair| count_different(&pair[0], &pair[1])).collect();
+            let frames = render_growing_bounds(&scene, has_light_bounds);
+            let changes: Vec<usize> = frames.windows(2).map(|pair| count_different(&pair[0], &pair[1])).collect();
             let changed_steps = changes.iter().filter(|change| **change > 0).count();
-            // Over 60 steps the bounds grow by 1/4 along x and 1/8 along z. Each side of the map crosses two
-            // quantization steps, and so does its depth range. A tightly fitted box would change the image in every
-            // step.
+            // Over 60 frames the bounds grow by 0.25 scene units along x and by 0.125 along z. The size of the map is
+            // quantized, and each side and the depth range cross two quantization steps. A tightly fitted map would
+            // change the image in every frame.
             assert!(
                 changed_steps <= 10,
                 "{method:?}: expected at most 10 changed frames, got {changed_steps}: {changes:?}"
             );
             assert!(
-                count_different(&steps[0], &steps[59]) > 0,
+                count_different(&frames[0], &frames[59]) > 0,
                 "negative control: expected a different image of the largest bounds"
             );
         }
     }
 }
 
-/// Renders 60 frames of a scene at rest whose bounds grow. With `has_light_bounds`, light-space bounds are given too.
+/// Renders 60 frames of a scene at rest with growing bounds, and with light-space bounds if `has_light_bounds`.
 fn render_growing_bounds(scene: &std::sync::Arc<Scene>, has_light_bounds: bool) -> Vec<FrameImage> {
     let mut deformer = ReferenceDeformer::new(scene);
-    let rest = deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed").bounds;
+    let rest_bounds = deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed").bounds;
     let mut renderer = open_renderer();
     let buffers = renderer.load(scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
@@ -129,23 +129,24 @@ fn render_growing_bounds(scene: &std::sync::Arc<Scene>, has_light_bounds: bool) 
     let bounds_of_step = |step: u32| {
         let growth = 0.125 * f64::from(step) / 59.0;
         BoundingBox {
-            min: rest.min,
-            max: [rest.max[0] * (1.0 + 2.0 * growth), rest.max[1], rest.max[2] * (1.0 + growth)],
+            min: rest_bounds.min,
+            max: [rest_bounds.max[0] * (1.0 + 2.0 * growth), rest_bounds.max[1], rest_bounds.max[2] * (1.0 + growth)],
         }
     };
     let axes = scene.light_axes().expect("expected a scene with a shadow");
     let mut draw_frame = |step: u32| {
         let bounds = bounds_of_step(step);
-        // Light bounds slightly larger than the box of the scene bounds.
-        let light = OrientedBounds::enclosing(&axes, &bounds).expanded_by(0.02 * bounds.diagonal());
-        let params = FrameParams { camera, width: 96, height: 96, bounds, light: has_light_bounds.then_some(light) };
+        // Light bounds slightly larger than the light-space box of the scene bounds.
+        let light_bounds = OrientedBounds::enclosing(&axes, &bounds).expanded_by(0.02 * bounds.diagonal());
+        let params =
+            FrameParams { camera, width: 96, height: 96, bounds, light: has_light_bounds.then_some(light_bounds) };
         renderer.draw(&buffers, &params).expect("expected a frame")
     };
     (0..60).map(&mut draw_frame).collect()
 }
 
 /// Number of pixels that differ by more than one level.
-fn count_different(one: &FrameImage, other: &FrameImage) -> usize {
-    let pairs = one.rgba.chunks_exact(4).zip(other.rgba.chunks_exact(4));
+fn count_different(left: &FrameImage, right: &FrameImage) -> usize {
+    let pairs = left.rgba.chunks_exact(4).zip(right.rgba.chunks_exact(4));
     pairs.filter(|(a, b)| a.iter().zip(*b).any(|(a, b)| a.abs_diff(*b) > 1)).count()
 }

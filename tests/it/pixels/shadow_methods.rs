@@ -11,8 +11,8 @@ use super::shadow::{create_builder, with_square};
 
 /// Pixels per unit of the ground in the image of the edge.
 const PIXELS_PER_UNIT: f64 = 100.0;
-/// Half the extent of the light box across the edge: the bounds extend to 5 there, rounded up to a larger multiple of
-/// 4 / 16.
+/// Half the extent of the light box across the edge: the bounds extend to 5 there and are rounded up to the next multiple
+/// of 4 / 16.
 const LIGHT_BOX_HALF_EXTENT: f64 = 5.25;
 
 fn variance_settings() -> ShadowSettings {
@@ -37,9 +37,9 @@ fn render_edge(shadow: ShadowSettings) -> RenderedFrame {
 }
 
 /// [`render_edge`] with this implementation of the blur.
-fn render_edge_with_blur(method: BlurMethod, shadow: ShadowSettings) -> RenderedFrame {
+fn render_edge_with_blur(blur_method: BlurMethod, shadow: ShadowSettings) -> RenderedFrame {
     let mut renderer = open_renderer();
-    renderer.set_blur_method(method);
+    renderer.set_blur_method(blur_method);
     let view = View::LookAt { eye: [0.0, 20.0, 1.0], target: [0.0, 0.0, 1.0], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 20.0 * PIXELS_PER_UNIT, fy: 20.0 * PIXELS_PER_UNIT, cx: 32.0, cy: 32.0 };
     render_square(&mut renderer, &square_scene(shadow), Camera { view, lens, near: 0.0, far: 0.0 }, 64)
@@ -51,22 +51,22 @@ fn ground_z(row: u32) -> f64 {
 }
 
 /// Fraction of the sun's light that reaches the ground in a pixel.
-fn sun_visibility([byte, ..]: [u8; 3]) -> f64 {
-    (decode_srgb(byte) / 0.8 - 0.25) / (0.5 * 0.8)
+fn sun_visibility([level, ..]: [u8; 3]) -> f64 {
+    (decode_srgb(level) / 0.8 - 0.25) / (0.5 * 0.8)
 }
 
 fn visibility_profile(frame: &RenderedFrame, column: u32) -> Vec<f64> {
     (0..64).map(|row| sun_visibility(frame.pixel(column, row))).collect()
 }
 
-/// Expected fraction of sunlight at z: texels whose center the square covers are dark. The result is blurred with the
-/// Gaussian and interpolated linearly between texels.
+/// Expected fraction of sunlight at z. A texel is dark if the square covers its center. The texels are blurred with the
+/// Gaussian and interpolated linearly.
 fn expected_visibility(shadow: &ShadowSettings, z: f64) -> f64 {
     let (texel_size, radius) = (texel_size(shadow), shadow.blur_radius() as i64);
     let gaussian =
         |step: i64| if step == 0 { 1.0 } else { (-0.5 * (step as f64 / f64::from(shadow.blur)).powi(2)).exp() };
     let sum: f64 = (-radius..=radius).map(gaussian).sum();
-    // The grid starts at the center; texel edges are at multiples of a texel.
+    // Texel edges are at multiples of the texel size from the origin.
     let is_lit = |index: i64| f64::from(u8::from((index as f64 + 0.5) * texel_size > 1.0));
     let blurred = |index: i64| (-radius..=radius).map(|step| gaussian(step) / sum * is_lit(index + step)).sum::<f64>();
     let texel_position = z / texel_size - 0.5;
@@ -74,7 +74,7 @@ fn expected_visibility(shadow: &ShadowSettings, z: f64) -> f64 {
     (1.0 - fraction) * blurred(texel_position.floor() as i64) + fraction * blurred(texel_position.floor() as i64 + 1)
 }
 
-/// The fraction of sunlight is correct to about a hundredth, for every way of blurring.
+/// The fraction of sunlight is correct to about 0.01 for every blur implementation.
 #[test]
 fn filtered_and_variance_maps_give_the_blurred_edge() {
     let base = variance_settings();
@@ -94,7 +94,11 @@ fn filtered_and_variance_maps_give_the_blurred_edge() {
                 |row: u32| (visibility[row as usize] - expected_visibility(&shadow, ground_z(row) + shift)).abs();
             (0..64).map(error).fold(0.0, f64::max)
         };
-        assert!(max_error(0.0) < 0.012, "{method:?}, {shadow:?}: {} at the worst", max_error(0.0));
+        assert!(
+            max_error(0.0) < 0.012,
+            "{method:?}, {shadow:?}: expected a maximum error below 0.012, got {}",
+            max_error(0.0)
+        );
         assert!(max_error(0.5 * texel_size(&shadow)) > 0.02, "negative control: edge shifted by half a texel");
     }
 }
@@ -115,7 +119,7 @@ fn all_blur_implementations_agree() {
         );
         let wider =
             render_edge(ShadowSettings { size, blur: (blur + 1.0).min(15.0), ..variance_settings() }).image.rgba;
-        assert!(max_difference(&wider) > 1, "negative control: a wider blur");
+        assert!(max_difference(&wider) > 1, "negative control: expected a different image with a wider blur");
     }
 }
 
@@ -125,8 +129,8 @@ fn edge_z(visibility_profile: &[f64]) -> f64 {
         .iter()
         .position(|sun_visibility| *sun_visibility > 0.5)
         .expect("expected a lit side of the edge");
-    let (dark, light) = (visibility_profile[row - 1], visibility_profile[row]);
-    ground_z(row as u32) - (light - 0.5) / (light - dark) / PIXELS_PER_UNIT
+    let (dark_value, light_value) = (visibility_profile[row - 1], visibility_profile[row]);
+    ground_z(row as u32) - (light_value - 0.5) / (light_value - dark_value) / PIXELS_PER_UNIT
 }
 
 #[test]
@@ -174,8 +178,8 @@ fn only_standard_maps_have_hard_edges() {
     }
 }
 
-/// Number of pixels of a lit square of six units per side that are darker than the sun makes them; the square casts and
-/// receives.
+/// Number of pixels of a lit square with the wrong brightness. The square has six units per side, casts a shadow and
+/// receives shadows.
 fn count_self_shadowed(casters: &[Mesh], shadow: ShadowSettings, sun: [f32; 3]) -> usize {
     let mut builder = create_builder();
     (builder.parts.look.shadow, builder.parts.look.sun) = (Some(shadow), sun);
@@ -204,8 +208,11 @@ fn no_method_shadows_a_lit_surface() {
             assert_eq!(count_self_shadowed(&[], shadow, sun), 0, "{sun:?} {shadow:?}");
         }
     }
-    let darkened = count_self_shadowed(&[floor_mesh(0.5, 3.0)], base, [1.0, 0.4, 0.6]);
-    assert!(darkened > 20, "negative control: expected the shadow of a caster, got {darkened} dark pixels");
+    let shadowed_pixels = count_self_shadowed(&[floor_mesh(0.5, 3.0)], base, [1.0, 0.4, 0.6]);
+    assert!(
+        shadowed_pixels > 20,
+        "negative control: expected the shadow of a caster, got {shadowed_pixels} dark pixels"
+    );
 }
 
 /// Number of lit pixels in a strip of ground that is fully in the shadow of a square just above it.
@@ -213,25 +220,25 @@ fn count_lit_in_umbra(moments: MomentFormat) -> usize {
     let mut builder = create_builder();
     builder.parts.look.shadow = Some(ShadowSettings { size: 2048, blur: 0.5, moments, ..ShadowSettings::default() });
     builder.parts.look.sun = [3.0, 1.0, 0.0];
-    // Far from the center of the depth range, where f16 is coarse. The shadow extends 0.09 beyond the square.
-    let mut rest = floor_mesh(1.0, 0.03).rest_positions().to_vec();
-    rest.iter_mut().for_each(|vertex| vertex[0] -= 2.5);
-    let mesh = Mesh::from_indexed(rest, vec![[0.0, 1.0, 0.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
+    // The square is far from the center of the depth range, where f16 is coarse. Its shadow extends 0.09 beyond it.
+    let mut positions = floor_mesh(1.0, 0.03).rest_positions().to_vec();
+    positions.iter_mut().for_each(|vertex| vertex[0] -= 2.5);
+    let mesh = Mesh::from_indexed(positions, vec![[0.0, 1.0, 0.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
         .expect("expected a valid mesh");
     let square_scene = builder.add_domain(mesh, Material { double_sided: true, ..Material::default() }).build();
     let view = View::LookAt { eye: [-3.545, 20.0, 0.0], target: [-3.545, 0.0, 0.0], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 2e4, fy: 2e4, cx: 32.0, cy: 32.0 };
     let frame = render_square(&mut open_renderer(), &square_scene, Camera { view, lens, near: 0.0, far: 0.0 }, 64);
-    let dark = [0.8 * 0.25; 3];
-    (0..64 * 64).filter(|pixel| !is_close(frame.pixel(pixel % 64, pixel / 64), dark, 3.0)).count()
+    let umbra_color = [0.8 * 0.25; 3];
+    (0..64 * 64).filter(|pixel| !is_close(frame.pixel(pixel % 64, pixel / 64), umbra_color, 3.0)).count()
 }
 
 /// Moments in f32 leak no light.
 #[test]
 fn f16_moments_leak_light_near_the_caster() {
     assert_eq!(count_lit_in_umbra(MomentFormat::F32), 0);
-    let leaking = count_lit_in_umbra(MomentFormat::F16);
-    assert!(leaking > 400, "expected more than 400 lit pixels of 4096, got {leaking}");
+    let lit_pixels = count_lit_in_umbra(MomentFormat::F16);
+    assert!(lit_pixels > 400, "expected more than 400 lit pixels of 4096, got {lit_pixels}");
 }
 
 /// Number of half-lit pixels in the middle column of a close-up of the edge of the shadow.
@@ -241,7 +248,10 @@ fn count_half_lit(splits: u32) -> usize {
     let square_scene = square_scene(ShadowSettings { size: 64, splits, ..variance_settings() });
     let frame = render_square(&mut open_renderer(), &square_scene, Camera { view, lens, near: 0.0, far: 0.0 }, 128);
     let column: Vec<f64> = (0..128).map(|row| sun_visibility(frame.pixel(64, row))).collect();
-    assert!(column[0] < 0.1 && column[127] > 0.9, "dark behind the edge and lit before it, {splits} maps: {column:?}");
+    assert!(
+        column[0] < 0.1 && column[127] > 0.9,
+        "{splits} maps: expected a dark first row and a lit last row, got {column:?}"
+    );
     column.iter().filter(|sun_visibility| (0.1..0.9).contains(*sun_visibility)).count()
 }
 
@@ -261,14 +271,14 @@ fn unused_shadow_resources_are_not_allocated() {
         let (frame, plan) = (render_edge(shadow), plan(&square_scene));
         assert_eq!(frame.stats.passes, planned_passes_above_ground(&square_scene), "expected the planned passes");
         let textures: Vec<String> = plan.textures.iter().map(|allocation| allocation.name.clone()).collect();
-        let maps: Vec<String> = textures.into_iter().filter(|name| name.starts_with("shadow")).collect();
-        let splits = frame.allocations.iter().any(|allocation| allocation.name == "shadow cascades");
-        (frame.stats.passes.contains(&Pass::Blur), maps, splits)
+        let map_names: Vec<String> = textures.into_iter().filter(|name| name.starts_with("shadow")).collect();
+        let has_cascades = frame.allocations.iter().any(|allocation| allocation.name == "shadow cascades");
+        (frame.stats.passes.contains(&Pass::Blur), map_names, has_cascades)
     };
     let base = ShadowSettings { size: 64, ..ShadowSettings::default() };
-    let depth = vec!["shadow depth".to_string()];
+    let depth_only = vec!["shadow depth".to_string()];
     for method in [ShadowMethod::Standard, ShadowMethod::PercentageCloser] {
-        assert_eq!(allocations(ShadowSettings { method, ..base }), (false, depth.clone(), false));
+        assert_eq!(allocations(ShadowSettings { method, ..base }), (false, depth_only.clone(), false));
     }
     let depth_and_moments = vec!["shadow depth".to_string(), "shadow moments".to_string()];
     assert_eq!(allocations(base), (true, depth_and_moments.clone(), false));

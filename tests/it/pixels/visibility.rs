@@ -56,21 +56,21 @@ fn cut_out_edge_is_resolved_per_sample() {
         render(&builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), cut_out_material).build())
     };
     let total_light = |frame: &RenderedFrame| (14..50).map(|x| decode_srgb(frame.pixel(x, 30)[0])).sum::<f64>();
-    for quarter in 0..4 {
-        // The edge lies `quarter` quarters of a pixel plus 0.01 into a pixel.
-        let edge_x = f64::from(20 + 12 - 12) + 0.25 * f64::from(quarter) + 0.01;
+    for quarters in 0..4 {
+        // Distance of the cut-out's edge from the left side of the square, in pixels.
+        let edge_x = 20.0 + 0.25 * f64::from(quarters) + 0.01;
         let cutoff = ((edge_x / 40.0 * 256.0 - 0.5) / 255.0) as f32;
         let (multisampled, single_sample) = (render_with(cutoff, 4), render_with(cutoff, 1));
         let expected_pixels = 50.0 - 12.0 - edge_x;
         assert!(
             (total_light(&multisampled) - expected_pixels).abs() < 0.3,
-            "{quarter}: {} of {expected_pixels} pixels",
+            "{quarters}: {} of {expected_pixels} pixels",
             total_light(&multisampled)
         );
         let count_gray = |frame: &RenderedFrame| frame.count_pixels(|[red, ..]| red > 4 && red < 251);
         assert!(
             count_gray(&single_sample) == 0 && count_gray(&multisampled) <= 2 * 40,
-            "{quarter}: {} and {}",
+            "{quarters}: {} and {}",
             count_gray(&single_sample),
             count_gray(&multisampled)
         );
@@ -85,9 +85,9 @@ fn cut_out_edge_is_resolved_per_sample() {
 fn render_stripes(size: u32, max_uv: f32) -> RenderedFrame {
     let mut builder = create_builder();
     let image = builder.add_texture(size, size, |x, _| if x % 4 < 2 { [255; 4] } else { [0, 0, 0, 255] });
-    let rest = facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0).rest_positions().to_vec();
+    let positions = facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0).rest_positions().to_vec();
     let uvs = vec![[0.0, max_uv], [max_uv, max_uv], [max_uv, 0.0], [0.0, 0.0]];
-    let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]])
+    let mesh = Mesh::from_indexed(positions, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]])
         .expect("expected a valid mesh");
     render(&builder.add_domain(mesh, unlit_material(Some(image))).build())
 }
@@ -137,14 +137,14 @@ fn coordinates_are_perspective_correct_behind_the_camera() {
     let mut builder = create_builder();
     let image = builder.add_texture(64, 64, |x, y| [4 * x as u8, 4 * y as u8, 0, 255]);
     let half_side = 40.0_f32;
-    let rest = vec![
+    let positions = vec![
         [-half_side, 0.0, half_side],
         [half_side, 0.0, half_side],
         [half_side, 0.0, -half_side],
         [-half_side, 0.0, -half_side],
     ];
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
-    let mesh = Mesh::from_indexed(rest, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]])
+    let mesh = Mesh::from_indexed(positions, vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]])
         .expect("expected a valid mesh");
     let eye = Vector3::new(3.0, 5.0, 4.0);
     let view = View::LookAt { eye: eye.into(), target: [3.0, 0.0, -6.0], up: [0.0, 1.0, 0.0] };
@@ -162,13 +162,13 @@ fn coordinates_are_perspective_correct_behind_the_camera() {
         let up_offset = (32.0 - f64::from(y) - 0.5) / 60.0;
         let ray = forward + right_offset * right + up_offset * up;
         let point = eye - ray * (eye.y / ray.y);
-        // Texel i is centered at (i + 1/2) / 64. Filtering mixes linear light, but on so gentle a ramp the result is
-        // close to mixing bytes.
+        // Texel i is centered at (i + 1/2) / 64. Filtering mixes linear light, but neighboring texels differ so little
+        // that mixing bytes gives nearly the same result.
         let [u, v] = [point.x, point.z].map(|number| (number + 40.0) / 80.0 * 64.0 - 0.5);
-        let want = [4.0 * u, 4.0 * v, 0.0];
-        let got = frame.pixel(x, y).map(f64::from);
-        let error = got.iter().zip(want).map(|(got, want)| (got - want).abs()).fold(0.0, f64::max);
-        assert!(error < 3.0, "({x}, {y}): {got:?}, expected {want:?}");
+        let expected = [4.0 * u, 4.0 * v, 0.0];
+        let color = frame.pixel(x, y).map(f64::from);
+        let error = color.iter().zip(expected).map(|(color, expected)| (color - expected).abs()).fold(0.0, f64::max);
+        assert!(error < 3.0, "({x}, {y}): {color:?}, expected {expected:?}");
     }
 }
 
@@ -186,21 +186,21 @@ fn equations_3_12_and_3_14_hold_as_corrected() {
     for x in [5, 15, 17, 20, 32, 48] {
         let point = Vector3::new((f64::from(x) + 0.5 - 32.0) / 10.0, -0.05, 0.0);
         let to_eye = (Vector3::new(0.0, 0.0, 10.0) - point).normalize();
-        let mirrored = |direction: Vector3<f64>| 2.0 * direction.dot(&normal) * normal - direction;
-        let light = |direction: Vector3<f64>| [0.5 * mirrored(direction).dot(&sun).max(0.0).powi(60); 3];
-        assert!(is_close(frame.pixel(x, 32), light(to_eye), 1.0), "{x}: {:?}", frame.pixel(x, 32));
+        let reflect = |direction: Vector3<f64>| 2.0 * direction.dot(&normal) * normal - direction;
+        let highlight = |direction: Vector3<f64>| [0.5 * reflect(direction).dot(&sun).max(0.0).powi(60); 3];
+        assert!(is_close(frame.pixel(x, 32), highlight(to_eye), 1.0), "{x}: {:?}", frame.pixel(x, 32));
         // As printed, v_e points away from the camera.
-        differing_pixels += usize::from(!is_close(frame.pixel(x, 32), light(-to_eye), 1.0));
+        differing_pixels += usize::from(!is_close(frame.pixel(x, 32), highlight(-to_eye), 1.0));
     }
     assert!(differing_pixels > 2, "negative control: expected the printed sign of v_e to give other colors");
 
     // Equation 3.14: s_tex = 1 selects the color of the image; as printed, it would select the material's own color.
-    let render_with = |textured: bool| {
+    let render_with = |has_texture: bool| {
         let mut builder = create_builder();
         let image = builder.add_texture(1, 1, |_, _| [188, 10, 90, 255]);
         render(
             &builder
-                .add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), unlit_material(textured.then_some(image)))
+                .add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), unlit_material(has_texture.then_some(image)))
                 .build(),
         )
         .pixel(30, 30)
@@ -209,7 +209,7 @@ fn equations_3_12_and_3_14_hold_as_corrected() {
 }
 
 #[test]
-fn every_pixel_sees_its_triangle_the_ground_or_nothing() {
+fn visibility_ids_are_triangles_the_ground_or_background() {
     let mut builder = create_builder();
     builder.parts.look.ground = Some(Ground::default());
     // The first domain is a cut-out and the second is opaque. The renderer draws the opaque one first.
@@ -229,7 +229,7 @@ fn every_pixel_sees_its_triangle_the_ground_or_nothing() {
         VisibilityId::Triangle(index) => buffers.source_triangle(index),
         _ => None,
     };
-    // The first triangle of each square is right of and below the diagonal.
+    // The first triangle of each square is below the diagonal.
     assert_eq!((source_at(19, 34), source_at(15, 29)), (Some((0, 0)), Some((0, 1))));
     assert_eq!((source_at(49, 34), source_at(45, 29)), (Some((1, 0)), Some((1, 1))));
     assert_eq!((ids[64 * 5 + 32], ids[64 * 60 + 32]), (VisibilityId::Background, VisibilityId::Ground));
@@ -250,13 +250,16 @@ fn five_hundred_and_twelve_images_are_drawn_in_one_call() {
     let frame = render(&builder.build());
     assert_eq!(frame.stats.draw_calls, 1);
     for index in [0, 1, 100, 255, 256, 300, 511_u32] {
-        let seen = frame.pixel(2 * (index % 32), 64 - 2 - 4 * (index / 32));
-        let want = [(index % 256) as u8, 255 - (index % 256) as u8, (index / 2) as u8];
-        assert!(seen.iter().zip(want).all(|(a, b)| a.abs_diff(b) <= 1), "image {index}: {seen:?}, expected {want:?}");
+        let pixel = frame.pixel(2 * (index % 32), 64 - 2 - 4 * (index / 32));
+        let expected = [(index % 256) as u8, 255 - (index % 256) as u8, (index / 2) as u8];
+        assert!(
+            pixel.iter().zip(expected).all(|(a, b)| a.abs_diff(b) <= 1),
+            "image {index}: {pixel:?}, expected {expected:?}"
+        );
     }
 }
 
-/// Renders one square with an image and a normal map, with these normals and tangents at its corners.
+/// Renders the square of a scene with this normal and tangent at all corners.
 fn render_with_normals(scene: &Arc<Scene>, normals: [f32; 3], tangents: [f32; 4], is_flattened: bool) -> Vec<u8> {
     let mut renderer = open_renderer();
     let buffers = renderer.load(scene).expect("expected the scene to load");

@@ -15,7 +15,7 @@ fn cpu_deformer(scene: &Arc<Scene>) -> CpuDeformer {
     CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())
 }
 
-/// Largest bound of all domains on the error from truncated modes, in scene units.
+/// Maximum error that truncated modes cause in any domain, in scene units.
 fn truncation_bound(deformer: &CpuDeformer, scene: &Scene) -> f64 {
     let bound = |domain| deformer.truncation(domain).map_or(0.0, Truncation::bound);
     (0..scene.domains.len()).map(bound).fold(0.0, f64::max)
@@ -42,7 +42,7 @@ fn finite_sums_survive_intermediate_overflow() {
 }
 
 #[test]
-fn zero_tiles_do_not_move() {
+fn tiles_without_modes_ignore_q() {
     extreme_values::check_zero_tiles(cpu_deformer);
 }
 
@@ -88,7 +88,7 @@ fn partial_steps_have_the_bits_of_full_steps() {
 }
 
 #[test]
-fn displacements_and_boxes_equal_their_twins() {
+fn displacements_are_within_bound_and_boxes_tight() {
     attributes::check_displacements_and_boxes(cpu_deformer);
 }
 
@@ -134,7 +134,7 @@ fn followers_10000_km_away_keep_the_millimeter() {
 }
 
 #[test]
-fn overflowing_frame_products_keep_finite_vertices() {
+fn overflowing_transform_products_keep_finite_vertices() {
     followers::check_overflowing_frame_products(cpu_deformer);
 }
 
