@@ -155,7 +155,7 @@ pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn
             let q_domains: &[u32] = if step % 4 == 1 { &[1, 5, 64] } else { &[] };
             apply_random_step(&scene, &mut state, &mut random, q_domains, transform_domains);
             let expected_domains = changed_domains(&scene, q_domains, transform_domains);
-            assert_eq!(state.changed, DirtyDomains::Some(expected_domains.clone()), "step {step}");
+            assert_eq!(state.dirty_domains, DirtyDomains::Some(expected_domains.clone()), "step {step}");
             let result = run_step(&mut partial_deformer, &state);
             let mut dirty_state = state.clone();
             dirty_state.mark_all_dirty();

@@ -259,8 +259,8 @@ pub(crate) fn relies_on_dirty_list<D: Deformer>(create_deformer: impl Fn(&Arc<Sc
     let mut state = scenes::random_state(&scene, 54);
     let previous_positions = run_step(&mut deformer, &state).surface.positions;
     apply_random_step(&scene, &mut state, &mut Random(55), &[LARGE, 3], &[]);
-    assert_eq!(state.changed, DirtyDomains::Some(vec![3, LARGE]));
-    state.changed = DirtyDomains::Some(vec![3]);
+    assert_eq!(state.dirty_domains, DirtyDomains::Some(vec![3, LARGE]));
+    state.dirty_domains = DirtyDomains::Some(vec![3]);
     let positions = run_step(&mut deformer, &state).surface.positions;
     let is_unchanged = |domain: u32| {
         let layout = scene.layout.domains[domain as usize];

@@ -8,7 +8,7 @@ pub enum AlphaMode {
     /// Alpha is ignored.
     #[default]
     Opaque,
-    /// Fragments below the cutoff are discarded, also in the shadow pass.
+    /// Fragments with an alpha below the cutoff are discarded, also in the shadow pass.
     Mask { cutoff: f32 },
     /// Drawn after opaque triangles and blended by alpha.
     Blend,

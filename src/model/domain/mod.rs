@@ -121,7 +121,8 @@ pub struct Domain {
     /// Ranges of triangles with different materials, ascending. The first range begins at triangle 0. Empty if all
     /// triangles have `material`.
     pub material_ranges: Vec<MaterialRange>,
-    /// `world_from_domain` at rest. [`crate::scene::Scene::new`] ignores the placement of a follower and computes it from the frame.
+    /// `world_from_domain` at rest. [`crate::scene::Scene::new`] replaces the placement of a follower by that of its
+    /// root, composed with its frame.
     pub placement: Transform,
     pub attachment: Option<Attachment>,
     /// Present if the domain moves with another one. Steps cannot set the transform of such a domain.

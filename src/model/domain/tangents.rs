@@ -37,7 +37,7 @@ fn uv_gradients(mesh: &Mesh, triangle: [u32; 3]) -> Option<(Vector3<f64>, Vector
     let uv = |corner: u32| corners.uvs[corner as usize].map(f64::from);
     let [a, b, c] = triangle;
     let (edge1, edge2) = (position(b) - position(a), position(c) - position(a));
-    // Corners store v downwards from the top of the image; the tangent frame of a normal map has v upwards.
+    // Corners have v downwards from the top of the image. The tangent frame of a normal map has v upwards.
     let (s1, t1) = (uv(b)[0] - uv(a)[0], uv(a)[1] - uv(b)[1]);
     let (s2, t2) = (uv(c)[0] - uv(a)[0], uv(a)[1] - uv(c)[1]);
     let uv_area = s1 * t2 - s2 * t1;
@@ -47,6 +47,7 @@ fn uv_gradients(mesh: &Mesh, triangle: [u32; 3]) -> Option<(Vector3<f64>, Vector
         .then(|| ((edge1 * t2 - edge2 * t1) * inverse_area, (edge2 * s1 - edge1 * s2) * inverse_area))
 }
 
+/// The tangent, orthogonalized against the normal, and the sign of the bitangent.
 fn orthogonalize(normal: Vector3<f64>, tangent: Vector3<f64>, bitangent: Vector3<f64>) -> [f32; 4] {
     let projected = (tangent - normal * normal.dot(&tangent)).try_normalize(1e-20);
     let (unit_tangent, sign) = match projected {
@@ -67,8 +68,8 @@ mod tests {
     use super::*;
 
     fn square(uvs: Vec<[f32; 2]>) -> Mesh {
-        let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
-        Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a square")
+        let rest_positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+        Mesh::from_indexed(rest_positions, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a square")
     }
 
     #[test]

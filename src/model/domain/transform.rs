@@ -100,8 +100,8 @@ mod tests {
         let rotation = nalgebra::Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
         let transform = Transform::from_parts(&(rotation * 2.0), &Vector3::new(1.0, -2.0, 3.0));
         let product = transform.compose(transform.inverse().expect("an invertible transform"));
-        for (got, want) in product.0.iter().zip(Transform::IDENTITY.0) {
-            assert!((got - want).abs() <= 1e-6, "expected {want}, got {got}");
+        for (actual, expected) in product.0.iter().zip(Transform::IDENTITY.0) {
+            assert!((actual - expected).abs() <= 1e-6, "expected {expected}, got {actual}");
         }
         assert!(transform.is_similarity());
     }

@@ -111,14 +111,14 @@ impl Camera {
         let right = up.cross(&to_camera).normalize();
         let camera_up = to_camera.cross(&right);
         // A corner is inside the view frustum if its depth is at least its larger lateral offset, divided by the slope.
-        let distance = |corner: &Point3<f64>| {
+        let required_distance = |corner: &Point3<f64>| {
             let offset = corner - bounds.center();
             let horizontal = offset.dot(&right).abs() / (slope * aspect);
             offset.dot(&to_camera) + horizontal.max(offset.dot(&camera_up).abs() / slope)
         };
-        let distance = bounds.corners().iter().map(distance).fold(0.0, f64::max);
-        let distance = if distance > 0.0 { distance } else { 1.0 };
-        let eye = bounds.center() + to_camera * distance;
+        let required_distance = bounds.corners().iter().map(required_distance).fold(0.0, f64::max);
+        let required_distance = if required_distance > 0.0 { required_distance } else { 1.0 };
+        let eye = bounds.center() + to_camera * required_distance;
         let view = View::LookAt { eye: eye.coords.into(), target: bounds.center().coords.into(), up: up.into() };
         Self { view, lens: Lens::FieldOfView(field_of_view), near: 0.0, far: 0.0 }
     }
@@ -143,7 +143,7 @@ impl Camera {
         if let View::Pose(pose) = self.view
             && !(pose.iter().all(|number| number.is_finite()) && invert_pose(pose).is_some())
         {
-            return Err(invalid("camera.pose", "a finite, regular transform", format!("{pose:?}")));
+            return Err(invalid("camera.pose", "a finite, invertible transform", format!("{pose:?}")));
         }
         match self.lens {
             Lens::FieldOfView(degrees) if !(degrees > 0.1 && degrees < 179.0) => {
@@ -285,12 +285,12 @@ mod tests {
             let scene = block(size);
             let camera = Camera::fit_to_scene(&scene, width, height);
             let clip = camera.clip_from_camera(width, height, &scene.rest_bounds) * camera.camera_from_world();
-            let extent = scene.rest_bounds.corners().map(|corner| {
+            let max_extent = scene.rest_bounds.corners().map(|corner| {
                 let point = clip.transform_point(&corner);
                 point.x.abs().max(point.y.abs())
             });
-            let extent = extent.into_iter().fold(0.0, f64::max);
-            assert!((extent - IMAGE_FILL).abs() < 1e-6, "{size:?}: expected {IMAGE_FILL}, got {extent}");
+            let max_extent = max_extent.into_iter().fold(0.0, f64::max);
+            assert!((max_extent - IMAGE_FILL).abs() < 1e-6, "{size:?}: expected {IMAGE_FILL}, got {max_extent}");
         }
     }
 
@@ -320,8 +320,9 @@ mod tests {
 
     fn block(size: [f32; 3]) -> std::sync::Arc<Scene> {
         use crate::domain::{Domain, Material, Mesh, Modes, Shape};
-        let rest = vec![[0.0; 3], size, [size[0], 0.0, 0.0]];
-        let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("a mesh");
+        let rest_positions = vec![[0.0; 3], size, [size[0], 0.0, 0.0]];
+        let mesh =
+            Mesh::from_indexed(rest_positions, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("a mesh");
         let mut parts = crate::scene::SceneParts::named("block");
         parts.shapes = vec![Shape::new(mesh, Modes::rigid()).expect("a shape")];
         parts.materials = vec![Material::default()];

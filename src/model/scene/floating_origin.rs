@@ -44,7 +44,8 @@ pub struct FloatingOrigins {
     set_translation_count: usize,
 }
 
-/// Equality ignores the counters.
+/// Equality ignores the counters: `outlier_count` follows from the other fields, and `set_translation_count` only
+/// schedules searches.
 impl PartialEq for FloatingOrigins {
     fn eq(&self, other: &Self) -> bool {
         self.shared_origin == other.shared_origin && self.translations == other.translations
@@ -131,14 +132,14 @@ impl FloatingOrigins {
     /// The new shared origin is the grid point nearest to the per-axis median, which is robust to a few very distant
     /// domains. If this function returns true, the caller must call [`Self::rebase_transform`] for every transform.
     pub(super) fn update_shared_origin(&mut self) -> bool {
-        let count = self.translations.len();
-        if 2 * self.outlier_count <= count || self.set_translation_count < count {
+        let root_count = self.translations.len();
+        if 2 * self.outlier_count <= root_count || self.set_translation_count < root_count {
             return false;
         }
         self.set_translation_count = 0;
         let median_along = |axis: usize| {
             let mut coordinates: Vec<f64> = self.translations.iter().map(|translation| translation[axis]).collect();
-            *coordinates.select_nth_unstable_by(count / 2, f64::total_cmp).1
+            *coordinates.select_nth_unstable_by(root_count / 2, f64::total_cmp).1
         };
         let shared_origin = snap_to_origin_grid([0, 1, 2].map(median_along));
         let outlier_count =

@@ -65,7 +65,7 @@ impl Layout {
             layout.triangles += domain_layout.triangles;
             layout.coordinates += if shared_first_q.is_some() { 0 } else { rank };
             if let Some(twin) = domain.shares_q_with.filter(|_| rank > 0) {
-                // The list begins with the domain that owns the coordinates. If `twin` shares them too, the list exists.
+                // The list begins with the domain that owns the coordinates. It exists already if `twin` shares them.
                 layout
                     .domains_sharing_q
                     .entry(domain_layout.first_q)

@@ -1,4 +1,5 @@
-//! Light space: the coordinate axes of the sun's shadow map (section 3.3.1 of the thesis), and bounding boxes in it.
+//! Light space: the coordinate axes of the sun's shadow map (section 3.3.1 of the thesis), and bounding boxes along
+//! these axes.
 //!
 //! The thesis fits the shadow map to the eight corners of the world's axis-aligned bounding box. Here, the box in light
 //! space is tighter: it bounds the vertices, or the corners of the bounding boxes of small parts of the surface.
@@ -20,7 +21,8 @@ pub fn light_axes(to_sun: Vector3<f64>, up: UpAxis) -> [Vector3<f64>; 3] {
 }
 
 impl Scene {
-    /// The axes along which deformers compute bounds of the vertices. `None` if no shadow map is fitted to the vertices.
+    /// The axes along which deformers compute bounds of the vertices. `None` unless a shadow map is fitted to the
+    /// vertices.
     pub fn light_axes(&self) -> Option<[Vector3<f64>; 3]> {
         let is_fitted = self.look.shadow.is_some_and(|shadow| shadow.fit == ShadowFit::Vertices);
         is_fitted.then(|| light_axes(self.look.to_sun(self.up), self.up))

@@ -28,7 +28,8 @@ pub enum MomentFormat {
     #[default]
     F32,
     /// Half the memory, but insufficient precision: the second moment is rounded by up to 2^-14, which is thirty times
-    /// the default `least_variance`. Shadows near their occluder are speckled with light. Intended for measurements only.
+    /// the default `least_variance`. Shadows near their occluder are speckled with light. Intended for measurements
+    /// only.
     F16,
 }
 

@@ -37,14 +37,14 @@ pub struct SceneState {
     /// The f64 translations and floating origins. Present after the first step with f64 translations.
     pub origins: Option<Arc<FloatingOrigins>>,
     /// Number of updates of this state; 0 at rest. If a deformer computed the state with serial s and receives the one
-    /// with serial s + 1, it may compute only the domains in `changed`. It must compute all domains for any other pair
+    /// with serial s + 1, it may compute only the domains in `dirty_domains`. It must compute all domains for any other pair
     /// of serials, including equal ones, and after a failed step.
     pub serial: u64,
     /// The domains that the last update changed.
-    pub changed: DirtyDomains,
+    pub dirty_domains: DirtyDomains,
 }
 
-/// Equality ignores `serial` and `changed`.
+/// Equality ignores `serial` and `dirty_domains`.
 impl PartialEq for SceneState {
     fn eq(&self, other: &Self) -> bool {
         (self.run, self.step, self.time) == (other.run, other.step, other.time)
@@ -63,7 +63,7 @@ impl SceneState {
         }
         let transforms =
             scene.transform_roots.domains().map(|domain| scene.domains[domain as usize].placement).collect();
-        Self { run: 0, step: 0, time: 0.0, q, transforms, origins: None, serial: 0, changed: DirtyDomains::All }
+        Self { run: 0, step: 0, time: 0.0, q, transforms, origins: None, serial: 0, dirty_domains: DirtyDomains::All }
     }
 
     /// Applies a step. Domains that the step does not contain keep their values. The cost is proportional to the number
@@ -89,10 +89,11 @@ impl SceneState {
         changed.sort_unstable();
         changed.dedup();
         let is_rebased = self.apply_transforms(&scene.transform_roots, update);
-        self.changed = if is_rebased { DirtyDomains::All } else { DirtyDomains::Some(changed) };
+        self.dirty_domains = if is_rebased { DirtyDomains::All } else { DirtyDomains::Some(changed) };
     }
 
-    /// Sets the transforms of a step. Returns true if transforms of other domains were rebased to a new floating origin.
+    /// Sets the transforms of a step. Returns true if transforms of other domains were rebased to another floating
+    /// origin.
     fn apply_transforms(&mut self, transform_roots: &TransformRoots, update: &StepUpdate) -> bool {
         let is_first_f64 = self.origins.is_none() && update.has_f64_translations();
         if is_first_f64 {
@@ -149,11 +150,11 @@ impl SceneState {
         }
     }
 
-    /// Marks the whole state as changed. Call it after writing `q` or `transforms` directly, because `changed` does not
+    /// Marks the whole state as changed. Call it after writing `q` or `transforms` directly, because `dirty_domains` does not
     /// list such writes.
     pub fn mark_all_dirty(&mut self) {
         self.serial += 1;
-        self.changed = DirtyDomains::All;
+        self.dirty_domains = DirtyDomains::All;
     }
 
     /// The coordinates of one domain.

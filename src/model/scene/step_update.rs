@@ -25,8 +25,13 @@ pub struct RawStepUpdate {
     pub transform_format: TransformFormat,
 }
 
-/// A domain, and the offset and number of its coordinates in `StepUpdate::values`.
-type CoordinateSpan = (u32, usize, usize);
+/// The coordinates of one domain within `StepUpdate::values`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct CoordinateSpan {
+    domain: u32,
+    first: usize,
+    rank: usize,
+}
 
 /// A validated step: every index is in range, every length matches, every number is finite.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,6 +39,7 @@ pub struct StepUpdate {
     pub number: u64,
     pub time: f64,
     spans: Vec<CoordinateSpan>,
+    /// The coordinates of all spans, concatenated.
     values: Vec<f32>,
     /// The transforms of the step, relative to the scene's origin and rounded to f32.
     pub transforms: Vec<(u32, Transform)>,
@@ -75,7 +81,7 @@ impl StepUpdate {
 
     /// Each domain with new coordinates, and its r numbers.
     pub fn coordinates(&self) -> impl Iterator<Item = (usize, &[f32])> {
-        self.spans.iter().map(|(domain, first, count)| (*domain as usize, &self.values[*first..][..*count]))
+        self.spans.iter().map(|span| (span.domain as usize, &self.values[span.first..][..span.rank]))
     }
 
     /// Merges this step with an older one. Applying the result equals applying both in order.
@@ -103,13 +109,14 @@ impl StepUpdate {
             translations: translations.into_iter().collect(),
         };
         for (domain, values) in coordinates {
-            merged.spans.push((domain, merged.values.len(), values.len()));
+            merged.spans.push(CoordinateSpan { domain, first: merged.values.len(), rank: values.len() });
             merged.values.extend_from_slice(values);
         }
         merged
     }
 }
 
+/// Parses the coordinates of a step: the span of each domain, and the values of all spans.
 fn parse_coordinates(scene: &Scene, raw: &RawStepUpdate) -> Result<(Vec<CoordinateSpan>, Vec<f32>)> {
     let is_for_all_domains = raw.q_domains.is_empty() && !raw.q.is_empty();
     let domains = match is_for_all_domains {
@@ -120,19 +127,19 @@ fn parse_coordinates(scene: &Scene, raw: &RawStepUpdate) -> Result<(Vec<Coordina
     let mut spans = Vec::with_capacity(domains.len());
     for domain in domains {
         let rank = scene.layout.domains[domain as usize].rank;
-        spans.push((domain, coordinate_count, rank));
+        spans.push(CoordinateSpan { domain, first: coordinate_count, rank });
         coordinate_count += rank;
     }
     if raw.q.len() != 4 * coordinate_count {
         let field = match spans.as_slice() {
-            [(domain, ..)] => format!("step.q of domain '{}'", scene.domains[*domain as usize].name),
+            [span] => format!("step.q of domain '{}'", scene.domains[span.domain as usize].name),
             _ => "step.q".into(),
         };
         let expected_bytes = format!("{} bytes ({coordinate_count} coordinates)", 4 * coordinate_count);
         return Err(invalid(field, expected_bytes, format!("{} bytes", raw.q.len())));
     }
-    let values = floats(&raw.q);
-    for (domain, first, rank) in &spans {
+    let values = decode_f32_values(&raw.q);
+    for CoordinateSpan { domain, first, rank } in &spans {
         if let Some(mode) = values[*first..][..*rank].iter().position(|number| !number.is_finite()) {
             let field = format!("step.q of domain '{}', mode {mode}", scene.domains[*domain as usize].name);
             return Err(invalid(field, "a finite number", values[first + mode]));
@@ -141,7 +148,7 @@ fn parse_coordinates(scene: &Scene, raw: &RawStepUpdate) -> Result<(Vec<Coordina
     Ok((spans, values))
 }
 
-/// The transforms of a step, and the translations that were given in f64. Both are with their domains.
+/// The transforms of a step, and the translations that were given in f64, each with the index of its domain.
 type ParsedTransforms = (Vec<(u32, Transform)>, Vec<(u32, [f64; 3])>);
 
 fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransforms> {
@@ -150,22 +157,23 @@ fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransfor
         true => scene.transform_roots.domains().collect(),
         false => parse_domain_list(scene, "step.transform_domains", &raw.transform_domains)?,
     };
-    check_transform_targets(&scene.transform_roots, &scene.domains, ("step.transform_domains", &domains))?;
-    let size = raw.transform_format.bytes();
-    if raw.transforms.len() != size * domains.len() {
-        let expected = format!("{} bytes ({} transforms of {size})", size * domains.len(), domains.len());
+    check_transform_targets(&scene.transform_roots, &scene.domains, "step.transform_domains", &domains)?;
+    let transform_bytes = raw.transform_format.bytes();
+    if raw.transforms.len() != transform_bytes * domains.len() {
+        let expected =
+            format!("{} bytes ({} transforms of {transform_bytes})", transform_bytes * domains.len(), domains.len());
         return Err(invalid("step.transforms", expected, format!("{} bytes", raw.transforms.len())));
     }
     let origin = scene.origin.map(|meters| meters / scene.unit);
     let (mut transforms, mut translations) = (Vec::with_capacity(domains.len()), Vec::new());
-    for (domain, bytes) in domains.into_iter().zip(raw.transforms.chunks_exact(size)) {
+    for (domain, bytes) in domains.into_iter().zip(raw.transforms.chunks_exact(transform_bytes)) {
         let parsed = match raw.transform_format {
             TransformFormat::Affine => parse_affine(scene, bytes),
             TransformFormat::RigidF32 => transform_format::parse_rigid_f32(bytes),
             TransformFormat::RigidF64 => transform_format::parse_rigid_f64(bytes, origin),
         };
-        let name = || format!("step.transforms of domain '{}'", scene.domains[domain as usize].name);
-        let (transform, translation) = parsed.map_err(|error| error.prefix_field(&name()))?;
+        let field = || format!("step.transforms of domain '{}'", scene.domains[domain as usize].name);
+        let (transform, translation) = parsed.map_err(|error| error.prefix_field(&field()))?;
         transforms.push((domain, transform));
         translations.extend(translation.map(|translation| (domain, translation)));
     }
@@ -184,16 +192,16 @@ fn parse_affine(scene: &Scene, bytes: &[u8]) -> Result<ParsedTransform> {
 
 /// Validates a list of domain indices: in range and without duplicates.
 fn parse_domain_list(scene: &Scene, field: &str, list: &[u32]) -> Result<Vec<u32>, Error> {
-    let count = scene.domains.len();
-    if list.len() > count {
-        return Err(invalid(field, format!("at most {count} indices"), list.len()));
+    let domain_count = scene.domains.len();
+    if list.len() > domain_count {
+        return Err(invalid(field, format!("at most {domain_count} indices"), list.len()));
     }
     // A bit set of all domains, because searching the list for duplicates would take quadratic time.
-    let mut seen_bits = vec![0_u64; count.div_ceil(64)];
+    let mut seen_bits = vec![0_u64; domain_count.div_ceil(64)];
     for (position, domain) in list.iter().enumerate() {
         let index = *domain as usize;
-        if index >= count {
-            return Err(invalid(format!("{field}[{position}]"), format!("an index below {count}"), domain));
+        if index >= domain_count {
+            return Err(invalid(format!("{field}[{position}]"), format!("an index below {domain_count}"), domain));
         }
         let (word, bit) = (index / 64, 1 << (index % 64));
         if seen_bits[word] & bit != 0 {
@@ -205,6 +213,6 @@ fn parse_domain_list(scene: &Scene, field: &str, list: &[u32]) -> Result<Vec<u32
 }
 
 /// Decodes little-endian numbers at any alignment.
-fn floats(bytes: &[u8]) -> Vec<f32> {
+fn decode_f32_values(bytes: &[u8]) -> Vec<f32> {
     bytes.chunks_exact(4).map(|word| f32::from_le_bytes([word[0], word[1], word[2], word[3]])).collect()
 }

@@ -15,6 +15,7 @@ pub struct TransformRoots {
     table: Option<FollowTable>,
 }
 
+/// The followers of a scene, and their roots and frames.
 #[derive(Debug, Clone, PartialEq, Default)]
 struct FollowTable {
     /// Per root, its domain.
@@ -140,21 +141,23 @@ impl FollowTable {
     }
 }
 
-/// Rejects a step that sets the transform of a follower.
+/// Rejects a step that sets the transform of a follower. `targets` are the domains whose transforms the step sets.
 pub(super) fn check_transform_targets(
     transform_roots: &TransformRoots,
     domains: &[Domain],
-    (field, list): (&str, &[u32]),
+    field: &str,
+    targets: &[u32],
 ) -> Result<()> {
     if transform_roots.table.is_none() {
         return Ok(());
     }
-    match list.iter().position(|domain| domains[*domain as usize].follows.is_some()) {
+    match targets.iter().position(|domain| domains[*domain as usize].follows.is_some()) {
         None => Ok(()),
         Some(position) => {
             let name = |domain: u32| &domains[domain as usize].name;
-            let root = transform_roots.domain(transform_roots.root_of(list[position] as usize));
-            let actual = format!("{} ('{}'), which follows '{}'", list[position], name(list[position]), name(root));
+            let root = transform_roots.domain(transform_roots.root_of(targets[position] as usize));
+            let actual =
+                format!("{} ('{}'), which follows '{}'", targets[position], name(targets[position]), name(root));
             Err(invalid(format!("{field}[{position}]"), "a domain with a transform of its own", actual))
         }
     }

@@ -105,8 +105,8 @@ fn add_linear(matrix: &mut Matrix12, dof: usize, block: [f64; 4]) {
     }
 }
 
-/// Adds bending in both planes. The sign of the second plane is negative, because a rotation about y decreases the slope
-/// dz/dx.
+/// Adds bending in both planes. The sign of the second plane is negative, because a rotation about y decreases the
+/// slope dz/dx.
 fn add_bending(matrix: &mut Matrix12, block: &Matrix4<f64>) {
     for (dofs, sign) in [([1, 5, 7, 11], 1.0), ([2, 4, 8, 10], -1.0)] {
         for row in 0..4 {

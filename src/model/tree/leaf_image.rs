@@ -1,5 +1,5 @@
-//! Procedural leaf texture from a seed: a 256 x 256 sRGB image with alpha. It shows one leaf with its tip at the top, and
-//! an opaque strip at the right edge, which is the texture of stems.
+//! Procedural leaf texture from a seed: a 256 x 256 sRGB image with alpha. It shows one leaf with its tip at the top,
+//! and an opaque strip at the right edge, which is the texture of stems.
 
 use super::noise::{GradientNoise, lerp_color, smoothstep};
 use super::random::SplitMix64;

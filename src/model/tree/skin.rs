@@ -31,7 +31,8 @@ pub(super) struct Tube<'a> {
 /// How a texture is mapped to a tube.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum UvMapping {
-    /// The image repeats a whole number of times around the tube. Along the tube, it repeats such that texels are square.
+    /// The image repeats a whole number of times around the tube. Along the tube, it repeats such that texels are
+    /// square.
     Bark { repeats: u32 },
     /// One column of the image, along the tube from the bottom of the image to its top.
     Strip { u: f32 },
@@ -72,8 +73,8 @@ impl SkinBuilder {
         Mesh::new(self.rest_positions.clone(), corners, self.triangles.clone())
     }
 
-    /// Adds a tube with one ring per sample of its centerline and a closed tip. `radius_factor` maps an arc length and an
-    /// angle to a factor of the radius. Each ring remains centered on the centerline.
+    /// Adds a tube with one ring per sample of its centerline and a closed tip. `radius_factor` maps an arc length and
+    /// an angle to a factor of the radius. Each ring remains centered on the centerline.
     pub(super) fn add_tube(&mut self, tube: &Tube, radius_factor: impl Fn(f64, f64) -> f64) {
         let (centerline, sides) = (tube.centerline, tube.sides);
         let last_ring = centerline.points.len() - 1;

@@ -1,5 +1,5 @@
-//! Templates of tree parts. A template has a centerline, radii, a skin, carried masses and joints. It is converted to a
-//! shape with modes. Several parts of a tree can be instances of one template.
+//! Templates of tree parts. A template has a centerline, radii, a skin, carried masses and joints. It is converted to
+//! a shape with modes. Several parts of a tree can be instances of one template.
 
 use std::collections::BTreeMap;
 
@@ -36,8 +36,8 @@ pub(super) struct ChildJoint {
 #[derive(Debug, Clone)]
 pub(super) struct PartTemplate {
     pub(super) kind: PartKind,
-    /// Branching level: 0 for the trunk, 1 for boughs, 2 for twigs. `None` for leaf clusters, whose templates are used at
-    /// several levels.
+    /// Branching level: 0 for the trunk, 1 for boughs, 2 for twigs. `None` for leaf clusters, because boughs and twigs
+    /// share their templates.
     pub(super) level: Option<usize>,
     pub(super) centerline: Centerline,
     /// One radius per ring, meters.

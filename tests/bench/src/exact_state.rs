@@ -19,7 +19,16 @@ impl ExactState {
         let transforms = self.transforms.iter().map(|entries| Transform(entries.map(|entry| entry as f32)));
         let q = self.q.iter().map(|number| *number as f32).collect();
         let transforms = transforms.collect();
-        SceneState { run: 0, step: 0, time: 0.0, q, transforms, origins: None, serial: 0, changed: DirtyDomains::All }
+        SceneState {
+            run: 0,
+            step: 0,
+            time: 0.0,
+            q,
+            transforms,
+            origins: None,
+            serial: 0,
+            dirty_domains: DirtyDomains::All,
+        }
     }
 
     /// A truth that equals a state exactly.

@@ -202,13 +202,13 @@ impl CudaDeformer {
         let target = self.output_ring.begin_step(state);
         let Self { step_slots, kernels, inputs, .. } = self;
         let step_slot = &mut step_slots[slot_index];
-        let list_lengths = match (&target.dirty_domains, &state.changed, &mut step_slot.change_list, &mut kernels.apply)
-        {
-            (Some(outdated), DirtyDomains::Some(changed), Some(list), Some(apply)) => {
-                apply.write(list, kernels.deform.packer(), state, ChangedDomains { changed, outdated })?
-            }
-            _ => None,
-        };
+        let list_lengths =
+            match (&target.dirty_domains, &state.dirty_domains, &mut step_slot.change_list, &mut kernels.apply) {
+                (Some(outdated), DirtyDomains::Some(changed), Some(list), Some(apply)) => {
+                    apply.write(list, kernels.deform.packer(), state, ChangedDomains { changed, outdated })?
+                }
+                _ => None,
+            };
         let last_full_step = self.output_ring.update_last_full_step(list_lengths.is_none());
         let header = header(&target, list_lengths, last_full_step);
         // Shared OpenGL buffers are copied to the back buffer on this stream, so the copy already precedes the step.

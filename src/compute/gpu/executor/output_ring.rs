@@ -98,7 +98,7 @@ impl OutputRing {
         let output_state = &mut self.outputs[self.current];
         let (shown_step, dirty_domains) =
             (std::mem::take(&mut output_state.shown_step), output_state.dirty_domains.take());
-        let fits_list = |dirty_domains: &Vec<u32>| match &state.changed {
+        let fits_list = |dirty_domains: &Vec<u32>| match &state.dirty_domains {
             DirtyDomains::Some(changed) => {
                 self.is_consecutive && shown_step > 0 && changed.len() + dirty_domains.len() <= self.max_changes
             }
@@ -131,7 +131,7 @@ impl OutputRing {
                 (output.shown_step, output.dirty_domains) = (self.last_step, Some(Vec::new()));
                 continue;
             }
-            match (&mut output.dirty_domains, &state.changed) {
+            match (&mut output.dirty_domains, &state.dirty_domains) {
                 (Some(dirty_domains), DirtyDomains::Some(changed))
                     if self.is_consecutive && dirty_domains.len() + changed.len() <= self.max_changes =>
                 {
@@ -177,7 +177,7 @@ mod tests {
     /// A state that follows the previous one by these changes.
     fn state(serial: u64, changed: &[u32]) -> SceneState {
         let mut state = SceneState::rest(&scene(&[(7, 1)], false, false));
-        (state.serial, state.changed) = (serial, DirtyDomains::Some(changed.to_vec()));
+        (state.serial, state.dirty_domains) = (serial, DirtyDomains::Some(changed.to_vec()));
         state
     }
 
@@ -291,7 +291,7 @@ mod tests {
         }
         assert!(step(&mut output_ring, &state(3, &[])).dirty_domains.is_some());
         let mut full_change = state(4, &[]);
-        full_change.changed = DirtyDomains::All;
+        full_change.dirty_domains = DirtyDomains::All;
         assert_eq!(step(&mut output_ring, &full_change).dirty_domains, None);
         assert_eq!(output_ring.last_full_step, output_ring.last_step);
         output_ring.last_step = u32::MAX;

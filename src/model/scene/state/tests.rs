@@ -67,7 +67,7 @@ fn world_position(state: &SceneState, domain: usize) -> [f64; 3] {
 fn changed_domains_include_those_that_share_coordinates() {
     let scene = scene(7);
     let rest = SceneState::rest(&scene);
-    assert_eq!((rest.serial, &rest.changed), (0, &DirtyDomains::All));
+    assert_eq!((rest.serial, &rest.dirty_domains), (0, &DirtyDomains::All));
     let mut state = rest;
     for (serial, (raw, changed)) in [
         (coordinates_step(&[3, 0], &[0.0; 4]), vec![0, 3]),
@@ -84,13 +84,13 @@ fn changed_domains_include_those_that_share_coordinates() {
     .enumerate()
     {
         state.apply(&scene, &parse_step(&scene, &raw));
-        assert_eq!((state.serial, &state.changed), (serial as u64 + 1, &DirtyDomains::Some(changed)));
+        assert_eq!((state.serial, &state.dirty_domains), (serial as u64 + 1, &DirtyDomains::Some(changed)));
     }
     state.mark_all_dirty();
-    assert_eq!((state.serial, &state.changed), (9, &DirtyDomains::All));
+    assert_eq!((state.serial, &state.dirty_domains), (9, &DirtyDomains::All));
 }
 
-/// Recomputing only the domains in `changed` must suffice, and no entry of the list may be superfluous.
+/// Recomputing only the domains in `dirty_domains` must suffice, and no entry of the list may be superfluous.
 #[test]
 fn changed_domains_are_complete_and_minimal() {
     let scene = scene(7);
@@ -108,7 +108,7 @@ fn changed_domains_are_complete_and_minimal() {
         coordinates_step(&[4, 0], &[1.0, -1.0, 3.0, 4.0]),
     ] {
         state.apply(&scene, &parse_step(&scene, &raw));
-        let DirtyDomains::Some(changed) = &state.changed else { panic!("expected a list of domains") };
+        let DirtyDomains::Some(changed) = &state.dirty_domains else { panic!("expected a list of domains") };
         let (updated, expected) = updated_fingerprints(&state, &previous, changed);
         assert_eq!(updated, expected);
         for removed in 0..changed.len() {
@@ -142,7 +142,7 @@ fn near_translations_keep_the_scene_origin() {
     assert_eq!((state.origins.as_ref(), state.transforms[1].0[3]), (None, 1e6));
     let state = state_after(&scene, &[f64_step(&[0, 1], &[[4096.0, -4096.0, 0.1], [1.0, 2.0, 3.0]])]);
     assert_eq!((state.origin_of(0), state.transforms[0].0[11]), ([0.0; 3], 0.1));
-    assert_eq!(state.changed, DirtyDomains::Some(vec![0, 1]));
+    assert_eq!(state.dirty_domains, DirtyDomains::Some(vec![0, 1]));
     assert!(state.origins.is_some_and(|origins| origins.is_uniform()));
 }
 
@@ -151,7 +151,7 @@ fn distant_domain_has_its_own_floating_origin() {
     let scene = scene(3);
     let position = [1e7 + 0.001, -1e7 - 0.002, 3.0];
     let mut state = state_after(&scene, &[f64_step(&[2], &[position])]);
-    assert_eq!(state.changed, DirtyDomains::Some(vec![2]));
+    assert_eq!(state.dirty_domains, DirtyDomains::Some(vec![2]));
     assert_eq!(
         (state.origin_of(0), state.origin_of(2)),
         ([0.0; 3], [9766.0 * ORIGIN_GRID, -9766.0 * ORIGIN_GRID, 0.0])
@@ -182,7 +182,7 @@ fn shared_origin_follows_the_majority_of_the_domains() {
     );
     assert_eq!(state.origins.as_ref().map(|origins| origins.shared_origin()), Some([0.0; 3]));
     let mut state = state_after(&scene, &steps);
-    assert_eq!((state.serial, &state.changed), (2, &DirtyDomains::All), "expected all transforms to be rebased");
+    assert_eq!((state.serial, &state.dirty_domains), (2, &DirtyDomains::All), "expected all transforms to be rebased");
     assert_eq!(
         state.origins.as_ref().map(|origins| (origins.shared_origin(), origins.is_uniform())),
         Some((state.origin_of(0), false))
@@ -195,12 +195,12 @@ fn shared_origin_follows_the_majority_of_the_domains() {
     // Within reach, the shared origin remains. Beyond, it moves.
     state.apply(&scene, &parse_step(&scene, &f64_step(&[0, 1, 2, 3], &distant_positions(1e7 + 4000.0))));
     assert_eq!(
-        (state.origin_of(0), &state.changed),
+        (state.origin_of(0), &state.dirty_domains),
         ([9766.0 * ORIGIN_GRID, 0.0, -9766.0 * ORIGIN_GRID], &DirtyDomains::Some(vec![0, 1, 2, 3]))
     );
     state.apply(&scene, &parse_step(&scene, &f64_step(&[0, 1, 2, 3], &distant_positions(1e7 + 9000.0))));
     assert_eq!(
-        (state.origin_of(0), &state.changed),
+        (state.origin_of(0), &state.dirty_domains),
         ([9774.0 * ORIGIN_GRID, 0.0, -9774.0 * ORIGIN_GRID], &DirtyDomains::All)
     );
 }
@@ -211,7 +211,7 @@ fn first_f64_step_rebases_distant_f32_transforms() {
     let mut state = state_after(&scene, &[f32_step(3, [1e6, 2.0, 0.0])]);
     state.apply(&scene, &parse_step(&scene, &f64_step(&[0], &[[1.0, 0.0, 0.0]])));
     assert_eq!((state.origin_of(3), world_position(&state, 3)), ([977.0 * ORIGIN_GRID, 0.0, 0.0], [1e6, 2.0, 0.0]));
-    assert_eq!(state.changed, DirtyDomains::All);
+    assert_eq!(state.dirty_domains, DirtyDomains::All);
 }
 
 #[test]
@@ -222,7 +222,7 @@ fn scattered_scene_is_not_searched_in_every_step() {
     let shared_origin = state.origins.as_ref().map(|origins| origins.shared_origin());
     for _ in 0..3 {
         state.apply(&scene, &parse_step(&scene, &f64_step(&[3], &[positions[3]])));
-        assert_eq!(state.changed, DirtyDomains::Some(vec![3]));
+        assert_eq!(state.dirty_domains, DirtyDomains::Some(vec![3]));
         assert_eq!(state.origins.as_ref().map(|origins| origins.shared_origin()), shared_origin);
     }
     for (domain, expected) in positions.iter().enumerate() {
@@ -249,7 +249,7 @@ fn merged_step_gives_the_state_of_all_its_steps() {
     let sequential_state = state_after(&scene, &steps);
     assert_eq!(merged_state, sequential_state);
     assert_eq!((merged_state.serial, sequential_state.serial), (1, 4));
-    assert_eq!(merged_state.changed, DirtyDomains::Some(vec![0, 1, 2, 3]));
+    assert_eq!(merged_state.dirty_domains, DirtyDomains::Some(vec![0, 1, 2, 3]));
     assert_eq!(world_position(&merged_state, 3), [-1e7 - 0.125, 0.0, 0.0]);
     // The f32 translation of domain 0 in the second step changes the result.
     assert_ne!(state_after(&scene, &[steps[0].clone(), steps[2].clone(), steps[3].clone()]), sequential_state);
