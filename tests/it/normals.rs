@@ -72,7 +72,7 @@ fn sheared_box_has_face_normals_and_hard_edges() {
     let deformation_gradient = Matrix3::new(1.0, -0.5, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.3);
     let corners = scene.shapes[0].mesh.corners();
     assert_eq!(
-        scene.shapes[0].smoothing().expect("expected smoothing groups").groups(),
+        scene.shapes[0].smoothing().expect("expected smoothing groups").group_count(),
         24,
         "expected a group per corner"
     );

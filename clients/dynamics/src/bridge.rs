@@ -170,8 +170,8 @@ impl LoadDirection {
     }
 }
 
-/// Computes U^T times a unit force that is spread over the middle tenth of the longer horizontal axis, or over the whole
-/// domain if the middle tenth cannot move.
+/// Computes U^T times a unit force that is spread over the middle tenth of the longer horizontal axis, or over the
+/// whole domain if the middle tenth cannot move.
 fn compute_unit_load(model: &Model, domain: &DomainModel, load_direction: LoadDirection) -> Result<DVector<f64>> {
     let axis = model.ground_axes().long_axis;
     let axis_coordinate = |rest_position: &Vector3<f64>| domain.placement.apply(rest_position).dot(&axis);

@@ -135,8 +135,8 @@ pub(crate) struct WindOptions {
     /// Peak displacement of the crown at wind 1, as a fraction of the scene's height.
     #[arg(long = "sway", value_name = "SWAY", default_value_t = 0.05, value_parser = parse_fraction)]
     pub(crate) sway_fraction: f64,
-    /// Direction that the wind blows to, in degrees about the up axis from the first horizontal axis. At 25, the default
-    /// camera sees the sway from the side.
+    /// Direction that the wind blows to, in degrees about the up axis from the first horizontal axis. At 25, the
+    /// default camera sees the sway from the side.
     #[arg(
         long = "direction",
         value_name = "DIRECTION",

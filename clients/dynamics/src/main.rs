@@ -60,7 +60,8 @@ async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
     tokio::spawn(async move {
         wait_for_shutdown_signal().await;
         stop_sender.send_replace(true);
-        // The first signal ends the run after the current step. A later Ctrl-C exits at once, even if the server stalls.
+        // The first signal ends the run after the current step. A later Ctrl-C exits at once, even if the server
+        // stalls.
         if tokio::signal::ctrl_c().await.is_ok() {
             std::process::exit(130);
         }

@@ -127,8 +127,8 @@ impl DomainModel {
 }
 
 impl Model {
-    /// Reads a scene from its server. `max_surface_samples` limits the surface samples per domain. The limit is reduced,
-    /// to no less than 8, so that the surface samples of all domains have at most 8 Mi entries of U.
+    /// Reads a scene from its server. `max_surface_samples` limits the surface samples per domain. The limit is
+    /// reduced, to no less than 8, so that the surface samples of all domains have at most 8 Mi entries of U.
     ///
     /// # Errors
     /// `Client` as for the calls; `Invalid` if the description contradicts itself.

@@ -9,14 +9,14 @@
 //! ```
 //!
 //! with the predictors q_p and v_p of the step. Its gradient is Newmark's equation. A static solution has c = d = 0 and
-//! no damping term. A line search along Newton's direction ensures that the objective decreases, so the iteration cannot
-//! diverge.
+//! no damping term. A line search along Newton's direction ensures that the objective decreases, so the iteration
+//! cannot diverge.
 //!
 //! Average acceleration conserves the energy of a linear system exactly and that of a nonlinear system approximately.
 //! The energy error is the spurious gain accumulated over the steps. It may not exceed `ENERGY_TOLERANCE` times the
-//! highest energy so far. A step that would exceed this bound is repeated with backward Euler. The velocity of that step
-//! is scaled down if its energy exceeds the previous energy plus the work of the load. The solution therefore stays
-//! bounded at any step size.
+//! highest energy so far. A step that would exceed this bound is repeated with backward Euler. The velocity of that
+//! step is scaled down if its energy exceeds the previous energy plus the work of the load. The solution therefore
+//! stays bounded at any step size.
 
 use nalgebra::{Cholesky, DMatrix, DVector};
 
@@ -155,8 +155,8 @@ impl ReducedSystem {
             return NewmarkState { energy_error, max_energy, ..next_state };
         }
         let mut next_state = self.step_backward_euler(state, dt, end_load);
-        // Backward Euler damps fast modes, but it can gain energy where the potential is not convex (buckling). Limit the
-        // velocity so that the energy does not exceed the previous energy plus the work of the load.
+        // Backward Euler damps fast modes, but it can gain energy where the potential is not convex (buckling). Limit
+        // the velocity so that the energy does not exceed the previous energy plus the work of the load.
         let available_energy = (self.energy(state) + end_load.dot(&(&next_state.q - &state.q))).max(0.0);
         let max_kinetic_energy = available_energy - self.scale * self.force.potential(&next_state.q);
         let speed = next_state.v.norm();

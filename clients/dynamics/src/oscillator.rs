@@ -112,8 +112,8 @@ impl Response {
         sum
     }
 
-    /// Underdamped, critically damped and slightly overdamped modes, whose roots are complex or close together: e^-sigma
-    /// times cosine and sine, or cosh and sinh.
+    /// Underdamped, critically damped and slightly overdamped modes, whose roots are complex or close together:
+    /// e^-sigma times cosine and sine, or cosh and sinh.
     fn from_complex_roots(w: f64, sigma: f64) -> Self {
         let d_squared = (w - sigma) * (w + sigma);
         let d = d_squared.abs().sqrt();

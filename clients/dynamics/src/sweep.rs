@@ -1,6 +1,6 @@
 //! Kinematic motion for scenes without known physics. Each coordinate in turn performs one period of a sine. At its
-//! peak, the most displaced sample moves by a given fraction of the diagonal of the scene's rest bounds. A scene without
-//! coordinates rocks about the center of its base.
+//! peak, the most displaced sample moves by a given fraction of the diagonal of the scene's rest bounds. A scene
+//! without coordinates rocks about the center of its base.
 
 use std::f64::consts::TAU;
 

@@ -1,10 +1,10 @@
-//! A tree that sways in the wind. Each mode is integrated exactly. The force of a mode is U^T times the wind pressure on
-//! the surface samples, plus the forces of child domains at their joints. `hierarchy` computes the transforms.
+//! A tree that sways in the wind. Each mode is integrated exactly. The force of a mode is U^T times the wind pressure
+//! on the surface samples, plus the forces of child domains at their joints. `hierarchy` computes the transforms.
 //!
-//! The load is calibrated to a given sway. A calibration run first applies the same wind at unit strength. The modes are
-//! linear, so their response scales with the strength. The strength is then chosen so that the peak of the crown's mean
-//! displacement is the requested fraction of the height. The bending of each branch is limited to a fraction of its
-//! diagonal, because linear modes do not represent large bending.
+//! The load is calibrated to a given sway. A calibration run first applies the same wind at unit strength. The modes
+//! are linear, so their response scales with the strength. The strength is then chosen so that the peak of the crown's
+//! mean displacement is the requested fraction of the height. The bending of each branch is limited to a fraction of
+//! its diagonal, because linear modes do not represent large bending.
 
 use nalgebra::Vector3;
 use serde_json::json;
@@ -275,8 +275,8 @@ impl TreeScenario {
         self.model.domains.iter().zip(bending).map(gain).collect()
     }
 
-    /// The strength at which the trunk reaches its bending limit. If no trunk deforms, the strength at which all branches
-    /// have reached their limits.
+    /// The strength at which the trunk reaches its bending limit. If no trunk deforms, the strength at which all
+    /// branches have reached their limits.
     fn max_strength(&self, bending: &[f64]) -> f64 {
         let bending_domains = || self.model.domains.iter().zip(bending).filter(|(_, bending)| **bending > 0.0);
         let strength_at = |limit: f64, domain: &DomainModel, bending: f64| {

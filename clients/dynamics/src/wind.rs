@@ -1,6 +1,6 @@
 //! Wind pressure by time and position: a steady component, gusts that travel downwind, and turbulence per domain.
-//! Pressures are dimensionless: the tree scenario multiplies them by a calibrated strength. The same seed gives the same
-//! wind.
+//! Pressures are dimensionless: the tree scenario multiplies them by a calibrated strength. The same seed gives the
+//! same wind.
 
 use std::f64::consts::TAU;
 
@@ -62,8 +62,8 @@ impl Wind {
         }
     }
 
-    /// Turbulence from -1 to 1: the mean of three sines. Their frequencies (0.3 to 2 Hz) and phases are random per domain
-    /// and channel. Channel 0 is downwind, channel 1 crosswind.
+    /// Turbulence from -1 to 1: the mean of three sines. Their frequencies (0.3 to 2 Hz) and phases are random per
+    /// domain and channel. Channel 0 is downwind, channel 1 crosswind.
     pub fn turbulence(&self, time: f64, domain: usize, channel: u64) -> f64 {
         let sine = |index: u64| {
             let counter = (domain as u64) * 16 + channel * 8 + 2 * index;

@@ -63,7 +63,7 @@ impl SmoothingGroups {
     }
 
     /// The number of groups.
-    pub fn groups(&self) -> usize {
+    pub fn group_count(&self) -> usize {
         self.normals.len()
     }
 
@@ -289,7 +289,7 @@ mod tests {
             let mesh = mesh(&corners, triangles.clone());
             let groups = SmoothingGroups::from_mesh(&mesh);
             let vertex = |corner: u32| corners[corner as usize].0;
-            for group in 0..groups.groups() {
+            for group in 0..groups.group_count() {
                 let mut expected_edges = Vec::new();
                 for (i, triangle) in triangles.iter().flat_map(|triangle| (0..3).map(move |i| (i, triangle))) {
                     let [a, b, c] = [0, 1, 2].map(|offset| vertex(triangle[(i + offset) % 3]));
@@ -342,8 +342,8 @@ mod tests {
         };
         let corners: Vec<_> = (0..100_000).map(|index| (0, spiral_normal(index))).collect();
         let smoothing = SmoothingGroups::from_mesh(&mesh(&corners, vec![[0, 1, 2]; 100_000]));
-        assert!(smoothing.groups() > 50_000, "{} groups", smoothing.groups());
-        let groups = smoothing.groups() as u64;
-        assert_eq!(smoothing.bytes(), 4 * 100_000 + 20 * groups + 4, "degenerate triangles need no memory");
+        assert!(smoothing.group_count() > 50_000, "{} groups", smoothing.group_count());
+        let group_count = smoothing.group_count() as u64;
+        assert_eq!(smoothing.bytes(), 4 * 100_000 + 20 * group_count + 4, "degenerate triangles need no memory");
     }
 }

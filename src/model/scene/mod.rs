@@ -191,11 +191,6 @@ impl Scene {
         self.shape_of(domain).modes.rank()
     }
 
-    /// The index of the domain with this name.
-    pub fn find(&self, name: &str) -> Option<usize> {
-        self.domains.iter().position(|domain| domain.name == name)
-    }
-
     fn compute_rest_bounds(&self) -> BoundingBox {
         let mut bounds = BoundingBox::EMPTY;
         for domain in &self.domains {
@@ -221,6 +216,7 @@ fn check_textures(parts: &SceneParts) -> Result<()> {
     Ok(())
 }
 
+/// Validates the indices, transforms, coordinates and sizes of one domain.
 fn check_domain(parts: &SceneParts, index: usize) -> Result<()> {
     let domain = &parts.domains[index];
     let check_index = |field: &str, given: usize, limit: usize| match given < limit {
@@ -265,6 +261,7 @@ fn check_domain(parts: &SceneParts, index: usize) -> Result<()> {
     Ok(())
 }
 
+/// Limits the sizes of a domain's name and notes.
 fn check_text_sizes(domain: &Domain) -> Result<()> {
     if domain.name.len() > MAX_NAME_BYTES {
         return Err(invalid("name", format!("at most {MAX_NAME_BYTES} bytes"), domain.name.len()));

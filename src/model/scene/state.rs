@@ -37,8 +37,8 @@ pub struct SceneState {
     /// The f64 translations and floating origins. Present after the first step with f64 translations.
     pub origins: Option<Arc<FloatingOrigins>>,
     /// Number of updates of this state; 0 at rest. If a deformer computed the state with serial s and receives the one
-    /// with serial s + 1, it may compute only the domains in `dirty_domains`. It must compute all domains for any other pair
-    /// of serials, including equal ones, and after a failed step.
+    /// with serial s + 1, it may compute only the domains in `dirty_domains`. It must compute all domains for any other
+    /// pair of serials, including equal ones, and after a failed step.
     pub serial: u64,
     /// The domains that the last update changed.
     pub dirty_domains: DirtyDomains,
@@ -150,8 +150,8 @@ impl SceneState {
         }
     }
 
-    /// Marks the whole state as changed. Call it after writing `q` or `transforms` directly, because `dirty_domains` does not
-    /// list such writes.
+    /// Marks the whole state as changed. Call it after writing `q` or `transforms` directly, because `dirty_domains`
+    /// does not list such writes.
     pub fn mark_all_dirty(&mut self) {
         self.serial += 1;
         self.dirty_domains = DirtyDomains::All;

@@ -113,15 +113,14 @@ mod tests {
     }
 
     #[test]
-    fn f32_and_f64_formats_give_the_same_rotation() {
+    fn f32_and_f64_formats_give_the_same_transform() {
         let expected_rotation = UnitQuaternion::from_euler_angles(0.4, -1.3, 2.2);
         let rotation = [expected_rotation.i, expected_rotation.j, expected_rotation.k, expected_rotation.w]
             .map(|number| number as f32);
-        let f32_transform = pack(rotation, [1.5_f32, -2.0, 0.25].map(|number| number.to_le_bytes().to_vec()));
-        let f64_transform = pack(rotation, [1.5_f64, -2.0, 0.25].map(|number| number.to_le_bytes().to_vec()));
-        let (f32_transform, no_translation) = parse_rigid_f32(&f32_transform[1..]).expect("a valid transform");
-        let (f64_transform, f64_translation) =
-            parse_rigid_f64(&f64_transform[1..], [0.0; 3]).expect("a valid transform");
+        let f32_bytes = pack(rotation, [1.5_f32, -2.0, 0.25].map(|number| number.to_le_bytes().to_vec()));
+        let f64_bytes = pack(rotation, [1.5_f64, -2.0, 0.25].map(|number| number.to_le_bytes().to_vec()));
+        let (f32_transform, no_translation) = parse_rigid_f32(&f32_bytes[1..]).expect("a valid transform");
+        let (f64_transform, f64_translation) = parse_rigid_f64(&f64_bytes[1..], [0.0; 3]).expect("a valid transform");
         assert_eq!((f32_transform, no_translation, f64_translation), (f64_transform, None, Some([1.5, -2.0, 0.25])));
         let error = (f32_transform.linear() - expected_rotation.to_rotation_matrix().into_inner()).abs().max();
         assert!(error <= 2e-7, "{error}");

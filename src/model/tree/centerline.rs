@@ -16,15 +16,16 @@ pub(super) struct GrowthParameters {
     pub(super) elements: usize,
     /// Number of skin rings per beam element.
     pub(super) rings: usize,
-    /// Node i of N is at arc length `length (i / N)^grading`: above 1, nodes are denser near the root.
+    /// Exponent of the node spacing: node i of N is at arc length `length (i / N)^grading`. Above 1, nodes are denser
+    /// near the root.
     pub(super) grading: f64,
     /// Unit direction at the root.
     pub(super) start: Vector3<f64>,
     /// Unit direction of the light, opposite to gravity.
     pub(super) up: Vector3<f64>,
-    /// Downward bend of the inner half by weight.
+    /// Downward bend by weight, strongest at the root.
     pub(super) sag: f64,
-    /// Upward bend of the outer half towards the light.
+    /// Upward bend towards the light, strongest at the tip.
     pub(super) rise: f64,
     /// Amplitude of the random bends.
     pub(super) wander: f64,
@@ -69,6 +70,7 @@ impl Centerline {
         centerline
     }
 
+    /// The length in meters.
     pub(super) fn length(&self) -> f64 {
         self.arc_lengths.last().copied().unwrap_or(0.0)
     }

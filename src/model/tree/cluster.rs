@@ -13,7 +13,7 @@ use super::template::{PartKind, PartTemplate};
 const SHOOT: ElasticConstants = ElasticConstants { youngs_modulus: 3.0e9, shear_modulus: 2.0e8, density: 850.0 };
 
 /// Fresh mass of a leaf in kg per m^2 of one side.
-const LEAF_MASS: f64 = 0.17;
+const LEAF_MASS_PER_AREA: f64 = 0.17;
 
 /// The fraction of a card's area that the leaf outline covers.
 const LEAF_COVERAGE: f64 = 0.55;
@@ -126,7 +126,7 @@ fn add_leaf(template: &mut PartTemplate, fraction: f64, azimuth: f64, length: f6
     };
     let area = LEAF_COVERAGE * blade.length * blade.width;
     template.skin.add_blade(&blade, station);
-    template.point_masses.push((station, LEAF_MASS * area));
+    template.point_masses.push((station, LEAF_MASS_PER_AREA * area));
     template.leaf_area += area;
 }
 

@@ -9,8 +9,8 @@ use crate::error::Result;
 /// Side of the image in pixels.
 const SIDE: usize = 256;
 
-/// The range of u that the leaf covers. The margin on the left separates it from the strip at the right edge, which
-/// filtering with wrap mode "repeat" blends into the left edge.
+/// The range of u that the leaf covers. It has a margin on the left, because filtering with wrap mode "repeat" blends
+/// the strip at the right edge into the left edge.
 pub(super) const LEAF_SPAN: [f32; 2] = [0.03, 0.90];
 
 /// The center of the strip for stems.
@@ -22,7 +22,7 @@ const STRIP_LEFT: f32 = 0.93;
 /// Length of the petiole at the bottom of the image, as a fraction of the height.
 const PETIOLE_LENGTH: f32 = 0.13;
 
-/// Largest half-width of the blade, as a fraction of [`LEAF_SPAN`].
+/// Largest half-width of the blade, as a fraction of the width of [`LEAF_SPAN`].
 const MAX_HALF_WIDTH: f32 = 0.46;
 
 /// Number of teeth per side of the outline.
@@ -86,11 +86,11 @@ fn shade_leaf(palette: &LeafColors, x: f32, y: f32) -> ([f32; 3], f32) {
 
 /// Half-width of the blade: egg-shaped with an elongated tip and forward-pointing teeth.
 fn half_width(blade_fraction: f32) -> f32 {
-    let t = blade_fraction.clamp(0.0, 1.0);
-    let egg = (std::f32::consts::PI * t.powf(0.74)).sin().max(0.0).powf(0.72);
-    let tip = 1.0 - 0.42 * smoothstep(0.70, 0.96, t);
-    let tooth = (t * TOOTH_COUNT).fract();
-    MAX_HALF_WIDTH * egg * tip * (0.93 + 0.07 * tooth * tooth.sqrt())
+    let blade_fraction = blade_fraction.clamp(0.0, 1.0);
+    let egg_profile = (std::f32::consts::PI * blade_fraction.powf(0.74)).sin().max(0.0).powf(0.72);
+    let tip_factor = 1.0 - 0.42 * smoothstep(0.70, 0.96, blade_fraction);
+    let tooth_fraction = (blade_fraction * TOOTH_COUNT).fract();
+    MAX_HALF_WIDTH * egg_profile * tip_factor * (0.93 + 0.07 * tooth_fraction * tooth_fraction.sqrt())
 }
 
 /// Intensity of the side veins, and smoothed distance from the nearest one: 0 on the vein, 1 halfway between two.

@@ -50,7 +50,7 @@ pub(super) struct Blade {
     pub(super) width: f64,
     /// Angle in radians by which the tip points below the base.
     pub(super) curl: f64,
-    /// Angle in radians by which each half is raised at the midrib.
+    /// Angle in radians by which each half is raised from the midrib outwards.
     pub(super) fold: f64,
     /// Left and right texture coordinate of the leaf in the image.
     pub(super) u_range: [f32; 2],

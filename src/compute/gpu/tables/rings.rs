@@ -37,7 +37,7 @@ impl RingTables {
             tables.corner_groups.extend(groups.corner_groups().iter().map(|group| first_group + group));
             tables
                 .ring_offsets
-                .extend(groups.ring_offsets()[..groups.groups()].iter().map(|offset| ring_base + offset));
+                .extend(groups.ring_offsets()[..groups.group_count()].iter().map(|offset| ring_base + offset));
             tables.rings.extend_from_slice(groups.rings());
         }
         tables.ring_offsets.push(tables.rings.len() as u32);
