@@ -1,10 +1,11 @@
-// AOV (arbitrary output variable) readback: one number or three for each pixel, top row first.
-//   ids      [height][width][SAMPLES]  R32UI, bottom row first                                         (in)
-//   values   [vertices]                a scalar per vertex                                (in, with VALUES)
-//   words    DEPTH    [height][width]           f32 along the view axis times `scale`; infinite without an id  (out)
-//            NORMALS  [height][width][3]        f32, unit normal on the visible side; zeros without an id
-//            VALUES   [height][width][SAMPLES]  value times `scale`, and the cosine to the eye, 16 bits each;
-//                                               0 without an id, else the cosine is at least 1 / 65535
+// AOV (arbitrary output variable) readback of one field: DEPTH, NORMALS or VALUES.
+//   ids      (in)  [height][width][SAMPLES]  R32UI, bottom row first
+//   values   (in)  [vertices]                a scalar per vertex, with VALUES
+//   words    (out) top row first, one of
+//     DEPTH    [height][width]           f32 along the view axis times `scale`; infinite without an id
+//     NORMALS  [height][width][3]        f32, unit normal on the visible side; zeros without an id
+//     VALUES   [height][width][SAMPLES]  value times `scale`, and the cosine to the eye, 16 bits each. Both are 0
+//                                        without an id; otherwise the cosine is at least 1 / 65535.
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(location = 0) uniform int scale_bits;
 layout(std430, binding = 0) writeonly buffer Words { uint words[]; };
@@ -14,89 +15,84 @@ layout(binding = 24) uniform samplerBuffer values;
 
 // A triangle, evaluated at an image point.
 struct SurfacePoint {
-    vec3 share;
-    vec3 depths;
+    vec3 weights;    // barycentric coordinates
+    vec3 depths;     // of the corners, along the view axis
     vec3 world;
-    vec3 normal; // on the visible side; not normalized
+    vec3 normal;     // on the visible side; not normalized
     ivec3 vertices;
 };
 
-SurfacePoint interpolate_surface(int number, vec2 image) {
-    SurfacePoint met;
-    ivec3 corners = ivec3(texelFetch(triangle_corners, number).xyz);
-    met.vertices = ivec3(texelFetch(triangle_vertices, number).xyz);
+SurfacePoint interpolate_surface(int triangle, vec2 ndc) {
+    SurfacePoint surface;
+    ivec3 corners = ivec3(texelFetch(triangle_corners, triangle).xyz);
+    surface.vertices = ivec3(texelFetch(triangle_vertices, triangle).xyz);
     mat3 world, clip, normal;
-    for (int index = 0; index < 3; index++) {
-        world[index] = texelFetch(positions, met.vertices[index]).xyz;
-        vec4 there = to_clip(world[index]);
-        clip[index] = vec3(there.xy - image * there.w, there.w);
-        met.depths[index] = there.w;
-        normal[index] = texelFetch(normals, corners[index]).xyz;
+    for (int corner = 0; corner < 3; corner++) {
+        world[corner] = texelFetch(positions, surface.vertices[corner]).xyz;
+        vec4 corner_clip = to_clip(world[corner]);
+        clip[corner] = vec3(corner_clip.xy - ndc * corner_clip.w, corner_clip.w);
+        surface.depths[corner] = corner_clip.w;
+        normal[corner] = texelFetch(normals, corners[corner]).xyz;
     }
-    Barycentrics found = barycentrics(clip[0], clip[1], clip[2], vec2(0.0));
-    met.share = found.weights;
-    met.world = world * met.share;
-    met.normal = found.front ? normal * met.share : -(normal * met.share);
-    return met;
+    Barycentrics bary = compute_barycentrics(clip[0], clip[1], clip[2], vec2(0.0));
+    surface.weights = bary.weights;
+    surface.world = world * surface.weights;
+    surface.normal = bary.is_front_facing ? normal * surface.weights : -(normal * surface.weights);
+    return surface;
 }
 
 vec3 normalize_or_zero(vec3 v) {
-    float most = max(max(abs(v.x), abs(v.y)), abs(v.z));
-    return most > 0.0 && !isinf(most) ? normalize(v / most) : vec3(0.0);
+    float max_component = max(max(abs(v.x), abs(v.y)), abs(v.z));
+    return max_component > 0.0 && !isinf(max_component) ? normalize(v / max_component) : vec3(0.0);
 }
 
 #ifdef DEPTH
-// For the ground: the ray has unit length along the view axis, so the ray parameter is the depth.
-float depth(uint id, vec2 image) {
+float depth_of(uint id, vec2 ndc) {
     if (id == NO_ID) return uintBitsToFloat(0x7F800000u);
 #ifdef HAS_GROUND
-    if (id == GROUND_ID) {
-        vec3 direction = mat3(frame.world_from_ndc) * vec3(image, 1.0);
-        float fall = min(dot(direction, frame.up.xyz), -1e-9 * length(direction));
-        return (frame.up.w - dot(frame.eye.xyz, frame.up.xyz)) / fall;
-    }
+    if (id == GROUND_ID) return ground_ray_depth(view_ray(ndc));
 #endif
-    SurfacePoint met = interpolate_surface(int(id - 1u), image);
-    return dot(met.depths, met.share);
+    SurfacePoint surface = interpolate_surface(int(id - 1u), ndc);
+    return dot(surface.depths, surface.weights);
 }
 #endif
 
 #ifdef NORMALS
-vec3 normal_of(uint id, vec2 image) {
+vec3 normal_of(uint id, vec2 ndc) {
     if (id == NO_ID) return vec3(0.0);
-    return normalize_or_zero(interpolate_surface(int(id - 1u), image).normal);
+    return normalize_or_zero(interpolate_surface(int(id - 1u), ndc).normal);
 }
 #endif
 
 #ifdef VALUES
-uint value_of(uint id, vec2 image, float scale) {
+uint value_of(uint id, vec2 ndc, float scale) {
     if (id == NO_ID) return 0u;
-    SurfacePoint met = interpolate_surface(int(id - 1u), image);
-    vec3 own = vec3(0.0);
-    for (int index = 0; index < 3; index++) own[index] = texelFetch(values, met.vertices[index]).x;
-    float facing = dot(normalize_or_zero(met.normal), normalize_or_zero(frame.eye.xyz - met.world));
-    return packUnorm2x16(vec2(dot(own, met.share) * scale, max(facing, 1.0 / 65535.0)));
+    SurfacePoint surface = interpolate_surface(int(id - 1u), ndc);
+    vec3 corner_values = vec3(0.0);
+    for (int corner = 0; corner < 3; corner++) corner_values[corner] = texelFetch(values, surface.vertices[corner]).x;
+    float facing = dot(normalize_or_zero(surface.normal), normalize_or_zero(frame.eye.xyz - surface.world));
+    return packUnorm2x16(vec2(dot(corner_values, surface.weights) * scale, max(facing, 1.0 / 65535.0)));
 }
 #endif
 
 void main() {
     ivec2 size = id_image_size();
-    ivec2 at = ivec2(gl_GlobalInvocationID.xy);
-    if (at.x >= size.x) return;
-    uint place = uint(size.y - 1 - at.y) * uint(size.x) + uint(at.x);
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    if (pixel.x >= size.x) return;
+    uint output_index = uint(size.y - 1 - pixel.y) * uint(size.x) + uint(pixel.x);
     float scale = intBitsToFloat(scale_bits);
-    for (int index = 0; index < SAMPLES; index++) {
-        uint id = texelFetch(ids, at, index).x;
-        vec2 image = 2.0 * (vec2(at) + SAMPLE_POSITIONS[index]) / vec2(size) - 1.0;
+    for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
+        uint id = texelFetch(ids, pixel, sample_index).x;
+        vec2 ndc = 2.0 * (vec2(pixel) + SAMPLE_POSITIONS[sample_index]) / vec2(size) - 1.0;
 #ifdef DEPTH
-        words[place] = floatBitsToUint(scale * depth(id, image));
+        words[output_index] = floatBitsToUint(scale * depth_of(id, ndc));
 #endif
 #ifdef NORMALS
-        vec3 normal = normal_of(id, image);
-        for (int axis = 0; axis < 3; axis++) words[3u * place + uint(axis)] = floatBitsToUint(normal[axis]);
+        vec3 normal = normal_of(id, ndc);
+        for (int axis = 0; axis < 3; axis++) words[3u * output_index + uint(axis)] = floatBitsToUint(normal[axis]);
 #endif
 #ifdef VALUES
-        words[uint(SAMPLES) * place + uint(index)] = value_of(id, image, scale);
+        words[uint(SAMPLES) * output_index + uint(sample_index)] = value_of(id, ndc, scale);
 #endif
     }
 }

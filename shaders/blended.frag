@@ -1,5 +1,5 @@
-// Blends a translucent surface over the layers drawn before: the layer accumulates their light, and in alpha the
-// transmittance. Shading is the same as for opaque surfaces.
+// Blends a translucent surface over the surfaces drawn before it. The render target accumulates light in rgb and
+// transmittance in alpha. Shading is the same as for opaque surfaces.
 in vec3 world;
 // Centroid sampling: at the edge of a triangle the pixel center may lie outside it, where texture coordinates wrap
 // around and normals overshoot.
@@ -26,7 +26,7 @@ void main() {
 #endif
     normal = gl_FrontFacing ? normal : -normal;
 #ifdef OPAQUE_PARTS
-    // Samples that reach the threshold were drawn as opaque.
+    // Samples that reach the threshold were already drawn as opaque.
     keep_uncovered_samples(material.ambient.a * tint.a, material.diffuse.a);
 #endif
     color = vec4(phong(material, tint.rgb, normal, geometric_normal, world), material.ambient.a * tint.a);

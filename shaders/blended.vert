@@ -1,4 +1,4 @@
-// A corner: position of its vertex, normal and tangent, all deformed, and texture coordinates.
+// Projects a corner of a blended triangle. Position, normal and tangent are already deformed.
 layout(location = 0) in uint vertex;
 layout(location = 1) in vec3 normal;
 layout(binding = 13) uniform samplerBuffer positions;

@@ -1,9 +1,8 @@
-// Compacts the triangles whose bits are set, in their order: three indices each for the draw, and the index in the draw
-// order that their fragments write as id. A group's list begins at the offset of the group. A prefix sum gives the
-// offset of each block, so that the order does not depend on scheduling: totals of the preceding super blocks, then
-// bits of the preceding blocks.
-//   indices  [triangles][3]  of vertices, or of corners
-//   names    [triangles]     indices in the draw order
+// Compacts the triangles whose bits are set, in draw order. A group's list begins at the group's first triangle. The
+// offset of a block is a prefix sum: totals of the preceding superblocks plus bits of the preceding blocks. So the
+// order does not depend on scheduling.
+//   indices       (out)  [triangles][3]  of vertices, or of corners
+//   triangle_ids  (out)  [triangles]     index in the draw order, which the fragments write as id
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(binding = 17) uniform usamplerBuffer triangle_corners;
 layout(binding = 18) uniform usamplerBuffer triangle_vertices;
@@ -19,20 +18,20 @@ void main() {
     Block block = current_block();
     memoryBarrierShared();
     barrier();
-    uint super_block = block.place / SUPERBLOCK, sum = 0u;
-    for (uint at = groups.ranges[block.group].w / SUPERBLOCK + lane; at < super_block; at += uint(WORKGROUP_SIZE)) sum += draws.totals[at];
-    for (uint at = super_block * SUPERBLOCK * MASK_WORDS + lane; at < block.place * MASK_WORDS; at += uint(WORKGROUP_SIZE)) sum += bitCount(bits[at]);
-    if (sum > 0u) atomicAdd(preceding_count, sum);
+    uint superblock = block.index / SUPERBLOCK, partial_sum = 0u;
+    for (uint index = groups.ranges[block.group].w / SUPERBLOCK + lane; index < superblock; index += uint(WORKGROUP_SIZE)) partial_sum += draws.totals[index];
+    for (uint index = superblock * SUPERBLOCK * MASK_WORDS + lane; index < block.index * MASK_WORDS; index += uint(WORKGROUP_SIZE)) partial_sum += bitCount(bits[index]);
+    if (partial_sum > 0u) atomicAdd(preceding_count, partial_sum);
     memoryBarrierShared();
     barrier();
-    uint first_word = block.place * MASK_WORDS, own_word = first_word + lane / 32u, below = (1u << (lane & 31u)) - 1u;
-    uint word = bits[own_word];
-    if ((word & (below + 1u)) == 0u) return;
-    uint place = groups.ranges[block.group].x + preceding_count + bitCount(word & below);
-    for (uint at = first_word; at < own_word; at++) place += bitCount(bits[at]);
+    uint first_word = block.index * MASK_WORDS, lane_word = first_word + lane / 32u, lower_lanes = (1u << (lane & 31u)) - 1u;
+    uint mask = bits[lane_word];
+    if ((mask & (lower_lanes + 1u)) == 0u) return;
+    uint output_index = groups.ranges[block.group].x + preceding_count + bitCount(mask & lower_lanes);
+    for (uint word_index = first_word; word_index < lane_word; word_index++) output_index += bitCount(bits[word_index]);
     uint triangle = groups.ranges[block.group].x + block.triangle;
-    bool is_solid = groups.flags[block.group].y != 0u;
-    uvec3 corners = is_solid ? texelFetch(triangle_vertices, int(triangle)).xyz : texelFetch(triangle_corners, int(triangle)).xyz;
-    triangle_ids[place] = triangle;
-    for (uint corner = 0u; corner < 3u; corner++) indices[3u * place + corner] = corners[corner];
+    bool is_position_only = groups.flags[block.group].y != 0u;
+    uvec3 corners = is_position_only ? texelFetch(triangle_vertices, int(triangle)).xyz : texelFetch(triangle_corners, int(triangle)).xyz;
+    triangle_ids[output_index] = triangle;
+    for (uint corner = 0u; corner < 3u; corner++) indices[3u * output_index + corner] = corners[corner];
 }

@@ -1,8 +1,8 @@
-// Writes the id of the ground, which is shaded later like the triangles.
-in vec2 image;
+// Writes the id of the ground.
+in vec2 ndc;
 layout(location = 0) out uint id;
 
 void main() {
-    if (!ray_hits_ground(view_ray(image))) discard;
+    if (!ray_hits_ground(view_ray(ndc))) discard;
     id = GROUND_ID;
 }

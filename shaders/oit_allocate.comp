@@ -1,32 +1,27 @@
-// Allocates the list of each pixel: an exclusive prefix sum over the counts of a tile, which allocates its records in
-// one piece. The order of the tiles varies, but does not affect the picture. Tiles with lists are listed for the
-// indirect dispatch over them.
+// Allocates the list of each pixel. A tile allocates its records contiguously; an exclusive prefix sum over its pixels
+// gives the offset of each list. The order of the tiles varies, but does not affect the image. Appends the tiles with
+// fragments to the tile list.
 layout(local_size_x = TILE, local_size_y = TILE) in;
 layout(std430, binding = 2) writeonly buffer Records { uint records[]; };
-layout(std430, binding = 1) buffer Tiles {
-    uint groups[3];
-    uint count;
-    uint tiles[];
-};
 shared uint scan[TILE * TILE];
 shared uint per_pixel_limit;
-shared uint first;
+shared uint tile_first_record;
 shared uint tile_has_fragments;
 
-// Maximum number of records per pixel for which all lists fit; unlimited if all fragments fit. With b_k pixels of k
-// fragments, raising the maximum from k to k + 1 costs one record for each pixel with more than k fragments: the sum of
-// b_j over j > k.
+// Maximum number of records per pixel for which all lists fit the budget; UNBOUNDED if all fragments fit. Let b_k be the
+// number of pixels with k fragments. Raising the limit from k to k + 1 needs a record for each pixel with more than k
+// fragments: the sum of b_j over j > k.
 uint fit_per_pixel_limit() {
     if (counters.total[1] == 0u && counters.total[0] <= counters.budget) return UNBOUNDED;
-    uint more = 0u;
-    for (int bin = 0; bin < BINS; bin++) more += counters.bins[bin];
-    uint sum = 0u, kept = 0u;
-    while (kept < uint(BINS) && more <= counters.budget - sum) {
-        sum += more;
-        more -= counters.bins[kept];
-        kept++;
+    uint pixels_above = 0u;
+    for (int bin = 0; bin < BINS; bin++) pixels_above += counters.bins[bin];
+    uint record_count = 0u, limit = 0u;
+    while (limit < uint(BINS) && pixels_above <= counters.budget - record_count) {
+        record_count += pixels_above;
+        pixels_above -= counters.bins[limit];
+        limit++;
     }
-    return kept;
+    return limit;
 }
 
 void main() {
@@ -36,42 +31,38 @@ void main() {
         per_pixel_limit = fit_per_pixel_limit();
         if (gl_WorkGroupID.xy == uvec2(0u)) {
             counters.per_pixel_limit = per_pixel_limit;
-            // Instance counts: none when nothing is dropped.
+            // Instance counts of the last phase, which runs only if fragments are dropped.
             counters.commands[1] = counters.commands[6] = per_pixel_limit == UNBOUNDED ? 0u : 1u;
         }
     }
     memoryBarrierShared();
     barrier();
-    ivec2 at = ivec2(gl_GlobalInvocationID.xy);
-    bool inside = all(lessThan(at, imageSize(fragment_counts)));
-    uint count_here = inside ? imageLoad(fragment_counts, at).x : 0u;
-    uint own = min(count_here, per_pixel_limit);
-    scan[lane] = own;
-    if (count_here > 0u) tile_has_fragments = 1u;
-    for (uint reach = 1u; reach < TILE * TILE; reach *= 2u) {
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    bool is_inside = all(lessThan(pixel, imageSize(fragment_counts)));
+    uint fragment_count = is_inside ? imageLoad(fragment_counts, pixel).x : 0u;
+    uint record_count = min(fragment_count, per_pixel_limit);
+    scan[lane] = record_count;
+    if (fragment_count > 0u) tile_has_fragments = 1u;
+    for (uint stride = 1u; stride < TILE * TILE; stride *= 2u) {
         memoryBarrierShared();
         barrier();
-        uint before = lane >= reach ? scan[lane - reach] : 0u;
+        uint preceding_sum = lane >= stride ? scan[lane - stride] : 0u;
         memoryBarrierShared();
         barrier();
-        scan[lane] += before;
+        scan[lane] += preceding_sum;
     }
     memoryBarrierShared();
     barrier();
-    if (lane == TILE * TILE - 1u) first = scan[lane] > 0u ? atomicAdd(counters.allocated, scan[lane]) : 0u;
+    if (lane == TILE * TILE - 1u) tile_first_record = scan[lane] > 0u ? atomicAdd(counters.allocated, scan[lane]) : 0u;
     memoryBarrierShared();
     barrier();
-    uint begin = first + scan[lane] - own;
-    if (inside) imageStore(cursors, at, uvec4(begin));
-    if (count_here > own) {
-        for (uint index = begin; index < begin + own; index++) {
+    uint first_record = tile_first_record + scan[lane] - record_count;
+    if (is_inside) imageStore(cursors, pixel, uvec4(first_record));
+    if (fragment_count > record_count) {
+        for (uint index = first_record; index < first_record + record_count; index++) {
             records[2u * index] = UNBOUNDED;
             records[2u * index + 1u] = 0u;
         }
     }
-    if (lane == 0u && tile_has_fragments > 0u) {
-        uint place = atomicAdd(count, 1u);
-        if (place % TILES_PER_ROW == 0u) atomicAdd(groups[1], 1u);
-        tiles[place] = gl_WorkGroupID.x | gl_WorkGroupID.y << 16;
-    }
+    if (lane == 0u && tile_has_fragments > 0u) append_tile();
 }

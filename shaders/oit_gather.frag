@@ -1,10 +1,10 @@
 // Adds a fragment of a blended triangle to the list of its pixel. One program runs in three phases, so that all phases see
-// the same fragments. The first phase counts them, the second fills the lists, and the third adds ids to the kept depths
-// of pixels with too many fragments. Early depth tests reject fragments behind opaque surfaces; fully transparent
-// fragments are skipped.
+// the same fragments: the first counts them and the second fills the lists. For a pixel with more fragments than the
+// limit, the second phase stores only the nearest depths, and the third adds their ids. Early depth tests reject
+// fragments behind opaque surfaces. Fully transparent fragments are skipped.
 layout(early_fragment_tests) in;
 #if SAMPLES > 1 && defined(POST_DEPTH_COVERAGE)
-// Coverage after the depth test, instead of the triangle's full coverage.
+// gl_SampleMaskIn contains only samples that pass the depth test.
 layout(post_depth_coverage) in;
 #endif
 #ifdef TEXTURES
@@ -21,52 +21,54 @@ uint sample_coverage() {
 #elif defined(POST_DEPTH_COVERAGE)
     return uint(gl_SampleMaskIn[0]) & 15u;
 #else
-    // Using gl_SampleID runs the shader once for each sample that passes.
+    // Reading gl_SampleID runs the shader once for each sample that passes the depth test.
     return 1u << gl_SampleID;
 #endif
 }
 
-// Keeps the nearest depths of a pixel in order. Each slot keeps the minimum of all depths it gets and passes the other
-// on, so that in the end the slots are sorted regardless of the order of the fragments.
-void insert_depth(uint first, uint depth) {
+// Inserts a depth into the sorted list of a pixel, which keeps the nearest depths. Each record takes the minimum of its
+// depth and the inserted one; the maximum goes on to the next record. The result does not depend on the order of the
+// fragments.
+void insert_depth(uint first_record, uint depth) {
     for (uint index = 0u; index < counters.per_pixel_limit && depth != UNBOUNDED; index++) {
-        uint there = atomicMin(records[2u * (first + index)], depth);
-        depth = max(there, depth);
+        uint previous = atomicMin(records[2u * (first_record + index)], depth);
+        depth = max(previous, depth);
     }
 }
 
-// The same for ids, among slots of the same depth: later triangles first; excess ids are dropped in that order.
-void insert_id(uint first, uint depth, uint word) {
-    for (uint index = 0u; index < counters.per_pixel_limit && word != 0u; index++) {
-        if (records[2u * (first + index)] != depth) continue;
-        uint there = atomicMax(records[2u * (first + index) + 1u], word);
-        word = min(there, word);
+// Inserts an id among the records of equal depth, sorted by descending id. If there are more ids than records, the
+// smallest are dropped.
+void insert_id(uint first_record, uint depth, uint id_and_coverage) {
+    for (uint index = 0u; index < counters.per_pixel_limit && id_and_coverage != 0u; index++) {
+        if (records[2u * (first_record + index)] != depth) continue;
+        uint previous = atomicMax(records[2u * (first_record + index) + 1u], id_and_coverage);
+        id_and_coverage = min(previous, id_and_coverage);
     }
 }
 
 void main() {
     float alpha = material_of(current_triangle()).ambient.a;
 #ifdef TEXTURES
-    ivec2 image = material_of(current_triangle()).images.xy;
-    vec4 texel = color_texel(image, uv_image);
-    if (image.x >= 0) alpha *= texel.a;
+    ivec2 color_image = material_of(current_triangle()).images.xy;
+    vec4 texel = color_texel(color_image, uv_image);
+    if (color_image.x >= 0) alpha *= texel.a;
 #endif
-    ivec2 at = ivec2(gl_FragCoord.xy);
+    ivec2 pixel = ivec2(gl_FragCoord.xy);
     uint depth = floatBitsToUint(abs(clamp(gl_FragCoord.z, 0.0, 1.0)));
-    uint word = uint(current_triangle()) + 1u << 4 | sample_coverage();
+    uint id_and_coverage = uint(current_triangle()) + 1u << 4 | sample_coverage();
     if (!(alpha > 0.0)) return;
     if (phase == PHASE_COUNT) {
-        imageAtomicAdd(fragment_counts, at, 1u);
+        imageAtomicAdd(fragment_counts, pixel, 1u);
         return;
     }
-    bool fits = imageLoad(fragment_counts, at).x <= counters.per_pixel_limit;
-    if (fits && phase == PHASE_FILL) {
-        uint place = imageAtomicAdd(cursors, at, 1u);
-        records[2u * place] = depth;
-        records[2u * place + 1u] = word;
+    bool is_below_limit = imageLoad(fragment_counts, pixel).x <= counters.per_pixel_limit;
+    if (is_below_limit && phase == PHASE_FILL) {
+        uint record = imageAtomicAdd(cursors, pixel, 1u);
+        records[2u * record] = depth;
+        records[2u * record + 1u] = id_and_coverage;
     }
-    if (fits) return;
-    uint first = imageLoad(cursors, at).x;
-    if (phase == PHASE_FILL) insert_depth(first, depth);
-    else insert_id(first, depth, word);
+    if (is_below_limit) return;
+    uint first_record = imageLoad(cursors, pixel).x;
+    if (phase == PHASE_FILL) insert_depth(first_record, depth);
+    else insert_id(first_record, depth, id_and_coverage);
 }

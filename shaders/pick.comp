@@ -1,27 +1,27 @@
-// Reads back the triangles that the pixels of a small rectangle see; the host computes the intersections in f64.
-//   ids     [height][width]  R32UI; the rectangle is at the lower left, bottom row first (in)
-//   picked  [rows][columns]  top row first: id, three corners, three positions, three normals; 22 words (out)
+// Reads back the triangles that are visible in a small rectangle of pixels. The host computes the intersections in f64.
+//   ids     (in)   [height][width]      R32UI, bottom row first; the rectangle is at the lower left
+//   picked  (out)  [rows][columns][22]  top row first: id, three corners, three positions, three normals
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(location = 0) uniform int rectangle; // columns, and rows shifted by 16
 layout(std430, binding = 0) writeonly buffer Words { uint picked[]; };
 
 void main() {
     ivec2 size = ivec2(rectangle & 0xFFFF, rectangle >> 16);
-    ivec2 at = ivec2(gl_GlobalInvocationID.xy);
-    if (any(greaterThanEqual(at, size))) return;
-    uint id = texelFetch(ids, at, 0).x;
-    uint first = 22u * uint((size.y - 1 - at.y) * size.x + at.x);
-    picked[first] = id;
+    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    if (any(greaterThanEqual(pixel, size))) return;
+    uint id = texelFetch(ids, pixel, 0).x;
+    uint first_word = 22u * uint((size.y - 1 - pixel.y) * size.x + pixel.x);
+    picked[first_word] = id;
     if (id == NO_ID) return;
     ivec3 corners = ivec3(texelFetch(triangle_corners, int(id - 1u)).xyz);
     ivec3 vertices = ivec3(texelFetch(triangle_vertices, int(id - 1u)).xyz);
-    for (int index = 0; index < 3; index++) {
-        vec3 position = texelFetch(positions, vertices[index]).xyz;
-        vec3 normal = texelFetch(normals, corners[index]).xyz;
-        picked[first + 1u + uint(index)] = uint(corners[index]);
+    for (int corner = 0; corner < 3; corner++) {
+        vec3 position = texelFetch(positions, vertices[corner]).xyz;
+        vec3 normal = texelFetch(normals, corners[corner]).xyz;
+        picked[first_word + 1u + uint(corner)] = uint(corners[corner]);
         for (int axis = 0; axis < 3; axis++) {
-            picked[first + 4u + uint(3 * index + axis)] = floatBitsToUint(position[axis]);
-            picked[first + 13u + uint(3 * index + axis)] = floatBitsToUint(normal[axis]);
+            picked[first_word + 4u + uint(3 * corner + axis)] = floatBitsToUint(position[axis]);
+            picked[first_word + 13u + uint(3 * corner + axis)] = floatBitsToUint(normal[axis]);
         }
     }
 }

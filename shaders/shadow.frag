@@ -1,4 +1,5 @@
-// Discards cut-out texels and nearly transparent fragments, which cast no shadow (the thesis's t_alpha).
+// Discards fragments that cast no shadow: below the cutoff of a cut-out material, or nearly transparent (t_alpha of the
+// thesis).
 #ifdef UVS
 in vec2 uv_image;
 #endif

@@ -1,4 +1,4 @@
-// Projects a corner to the shadow map; for opaque triangles, a vertex.
+// Projects a corner to the shadow map. Opaque triangles use vertices instead of corners.
 #ifdef POSITION_ONLY
 layout(location = 0) in vec3 position;
 #else
@@ -19,12 +19,12 @@ void main() {
 #else
     vec3 world = texelFetch(positions, int(vertex)).xyz;
 #endif
-    vec3 at = (frame.shadow_from_world * vec4(world, 1.0)).xyz;
+    vec3 map_position = (frame.shadow_from_world * vec4(world, 1.0)).xyz;
 #ifdef CASCADES
-    at.xy = to_cascade(at.xy, layer);
+    map_position.xy = to_cascade(map_position.xy, layer);
 #endif
-    bool bad = any(isnan(at)) || any(isinf(at));
-    gl_Position = bad ? vec4(0.0, 0.0, -2.0, 1.0) : vec4(2.0 * at - 1.0, 1.0);
+    bool is_not_finite = any(isnan(map_position)) || any(isinf(map_position));
+    gl_Position = is_not_finite ? vec4(0.0, 0.0, -2.0, 1.0) : vec4(2.0 * map_position - 1.0, 1.0);
 #if defined(UVS) && !defined(POSITION_ONLY)
     uv_image = uv;
 #endif

@@ -1,4 +1,4 @@
-// Writes the id of a triangle. Fragments that are cut out are discarded before.
+// Writes the id of a triangle, for masked materials only to the samples that the cut-out surface covers.
 #if defined(MASK) && defined(TEXTURES)
 // Centroid sampling: at the edge of a triangle the pixel center may lie outside it, where texture coordinates wrap
 // around.

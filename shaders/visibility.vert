@@ -1,4 +1,5 @@
-// Projects a corner to the screen. Opaque triangles use vertices instead of corners, which more triangles share.
+// Projects a corner to the screen. Opaque triangles use vertices instead of corners, because more triangles share a
+// vertex than a corner.
 #ifdef MASK
 layout(location = 0) in uint vertex;
 layout(binding = 13) uniform samplerBuffer positions;

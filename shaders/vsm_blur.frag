@@ -1,4 +1,4 @@
-// One direction of the Gaussian blur as in the thesis, with one fragment per texel: the baseline of the report.
+// One direction of the Gaussian blur with one fragment per texel, as in the thesis. Baseline for the other variants.
 layout(location = 0) out vec4 blurred;
 
 void main() {

@@ -1,22 +1,33 @@
-// Whether a view ray meets the ground: from above, within a square around the scene. A ray that is so level that the
-// intersection is not finite fails the comparison. Twin: `FrameUniforms::ray_hits_ground` in src/render/frame_uniforms.rs.
+// Whether a view ray hits the ground from above, within a square around the scene. If the ray is almost level, the
+// intersection may not be finite; then the comparison fails. Twin: `FrameUniforms::ray_hits_ground` in
+// src/render/uniforms/frame.rs.
 bool ray_hits_ground(vec3 direction) {
-    float fall = -dot(direction, frame.up.xyz), above = dot(frame.eye.xyz, frame.up.xyz) - frame.up.w;
-    vec3 aside = abs(frame.eye.xyz - frame.ground_center.xyz + above / fall * direction) * (1.0 - frame.up.xyz);
-    return fall > 0.0 && above > 0.0 && all(lessThanEqual(aside, vec3(frame.ground_center.w)));
+    float descent = -dot(direction, frame.up.xyz), eye_height = dot(frame.eye.xyz, frame.up.xyz) - frame.up.w;
+    vec3 offset = abs(frame.eye.xyz - frame.ground_center.xyz + eye_height / descent * direction) * (1.0 - frame.up.xyz);
+    return descent > 0.0 && eye_height > 0.0 && all(lessThanEqual(offset, vec3(frame.ground_center.w)));
 }
 
-// World-space direction of a view ray, one unit of depth long.
-vec3 view_ray(vec2 image) { return mat3(frame.world_from_ndc) * vec3(image, 1.0); }
+// World-space direction of the view ray through an image point. Its length along the view axis is 1, so a distance in
+// units of this vector is a depth.
+vec3 view_ray(vec2 ndc) { return mat3(frame.world_from_ndc) * vec3(ndc, 1.0); }
+
+#ifdef HAS_GROUND
+// Depth along a view ray where it meets the ground plane. The ray must hit the ground.
+float ground_ray_depth(vec3 direction) {
+    // The ray points down; rounding must not turn it upwards.
+    float ascent = min(dot(direction, frame.up.xyz), -1e-9 * length(direction));
+    return (frame.up.w - dot(frame.eye.xyz, frame.up.xyz)) / ascent;
+}
+#endif
 
 // Depth of the ground plane in normalized device coordinates at an image point. It is linear in the image, also above
-// the horizon. `slope`: its change per unit of x and y.
-float ground_plane_depth(vec2 image, out vec2 slope) {
-    float above = dot(frame.eye.xyz, frame.up.xyz) - frame.up.w;
-    // Inverse distance to the plane along a ray.
-    vec3 falls = -frame.up.xyz * mat3(frame.world_from_ndc) / above;
-    vec2 from = (frame.clip_from_world * vec4(frame.eye.xyz, 1.0)).zw;
-    vec2 there = (frame.clip_from_world * vec4(view_ray(image), 0.0)).zw + dot(falls, vec3(image, 1.0)) * from;
-    slope = from.x / there.y * falls.xy;
-    return there.x / there.y;
+// the horizon. `slope`: change of the depth per unit of x and y.
+float ground_plane_depth(vec2 ndc, out vec2 slope) {
+    float eye_height = dot(frame.eye.xyz, frame.up.xyz) - frame.up.w;
+    // The inverse depth along a ray through (x, y) is descents.x x + descents.y y + descents.z.
+    vec3 descents = -frame.up.xyz * mat3(frame.world_from_ndc) / eye_height;
+    vec2 eye_zw = (frame.clip_from_world * vec4(frame.eye.xyz, 1.0)).zw;
+    vec2 plane_zw = (frame.clip_from_world * vec4(view_ray(ndc), 0.0)).zw + dot(descents, vec3(ndc, 1.0)) * eye_zw;
+    slope = eye_zw.x / plane_zw.y * descents.xy;
+    return plane_zw.x / plane_zw.y;
 }

@@ -1,16 +1,15 @@
-// Accumulates the samples of a pixel. The tone curve (a clamp if the look names none) is applied to each sample, so
-// that the pixel is the mean of the displayed samples and one bright sample does not whiten an edge. The curve removes
-// light above 1, so bloom takes its bright light from each sample before.
+// Accumulates the samples of a pixel. The tone curve (a clamp if the look has none) is applied to each sample, so that
+// one bright sample does not whiten an edge. The curve compresses bright light, so bloom light is extracted before it.
 struct PixelAccumulator {
-    vec3 shown;
-    vec3 glow;
+    vec3 color;  // sum of the samples after the tone curve
+    vec3 bloom;  // sum of the samples' light above the bloom threshold
 };
 
 #ifdef BLOOM
-// The part of the light above the threshold, as measured by the brightest channel, with unchanged hue.
-vec3 bloom_part(vec3 light) {
-    float most = max(light.r, max(light.g, light.b));
-    return light * (max(most - BLOOM_THRESHOLD, 0.0) / max(most, 1e-6));
+// The light above the threshold, measured by the brightest channel. The hue does not change.
+vec3 extract_bloom(vec3 light) {
+    float max_channel = max(light.r, max(light.g, light.b));
+    return light * (max(max_channel - BLOOM_THRESHOLD, 0.0) / max(max_channel, 1e-6));
 }
 #endif
 
@@ -18,14 +17,14 @@ void accumulate_sample(inout PixelAccumulator sum, vec3 light, float count) {
 #ifdef EXPOSURE
     light *= EXPOSURE;
 #endif
-    // A NaN fails the comparison and becomes black.
-    bvec3 some = greaterThan(light, vec3(0.0));
+    // NaN fails the comparison and becomes 0.
+    bvec3 is_positive = greaterThan(light, vec3(0.0));
 #ifdef BLOOM
     // Clamped far above white, so that one sample does not overflow.
-    light = mix(vec3(0.0), min(light, vec3(MAX_RADIANCE)), some);
-    vec3 glow = bloom_part(light);
-    sum.glow += count * glow;
-    light -= BLOOM_STRENGTH * glow;
+    light = mix(vec3(0.0), min(light, vec3(MAX_RADIANCE)), is_positive);
+    vec3 bloom = extract_bloom(light);
+    sum.bloom += count * bloom;
+    light -= BLOOM_STRENGTH * bloom;
 #endif
-    sum.shown += count * mix(vec3(0.0), tone_map(light), some);
+    sum.color += count * mix(vec3(0.0), tone_map(light), is_positive);
 }

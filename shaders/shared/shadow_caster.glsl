@@ -1,4 +1,4 @@
-// Discards fragments whose alpha is below the threshold: they cast no shadow.
-void discard_below(float alpha, float least) {
-    if (alpha < least) discard;
+// Discards a fragment whose alpha is below the threshold: it casts no shadow.
+void discard_below(float alpha, float min_alpha) {
+    if (alpha < min_alpha) discard;
 }

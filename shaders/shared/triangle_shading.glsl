@@ -1,4 +1,4 @@
-// Color and alpha of a triangle at an image point.
+// `shade_triangle`: color and alpha of a triangle at an image point.
 #ifdef UVS
 layout(binding = 19) uniform samplerBuffer uvs;
 #endif
@@ -8,35 +8,37 @@ layout(binding = 20) uniform samplerBuffer tangents;
 
 vec2 finite_or_zero(vec2 slope) { return any(isnan(slope)) || any(isinf(slope)) ? vec2(0.0) : slope; }
 
-vec4 shade_triangle(int number, vec2 image, vec2 texel) {
-    ivec3 corners = ivec3(texelFetch(triangle_corners, number).xyz);
-    ivec3 vertices = ivec3(texelFetch(triangle_vertices, number).xyz);
+vec4 shade_triangle(int triangle, vec2 ndc, vec2 pixel_size) {
+    ivec3 corners = ivec3(texelFetch(triangle_corners, triangle).xyz);
+    ivec3 vertices = ivec3(texelFetch(triangle_vertices, triangle).xyz);
     mat3 world, clip, normal;
-    for (int index = 0; index < 3; index++) {
-        world[index] = texelFetch(positions, vertices[index]).xyz;
-        vec4 there = to_clip(world[index]);
-        clip[index] = vec3(there.xy - image * there.w, there.w);
-        normal[index] = texelFetch(normals, corners[index]).xyz;
+    for (int corner = 0; corner < 3; corner++) {
+        world[corner] = texelFetch(positions, vertices[corner]).xyz;
+        vec4 corner_clip = to_clip(world[corner]);
+        clip[corner] = vec3(corner_clip.xy - ndc * corner_clip.w, corner_clip.w);
+        normal[corner] = texelFetch(normals, corners[corner]).xyz;
     }
-    Barycentrics share = barycentrics(clip[0], clip[1], clip[2], texel);
-    Material material = material_of(number);
+    Barycentrics bary = compute_barycentrics(clip[0], clip[1], clip[2], pixel_size);
+    Material material = material_of(triangle);
     vec4 tint = vec4(1.0);
-    vec3 geometric_normal = safe_normalize(normal * share.weights), facing = geometric_normal;
+    vec3 geometric_normal = safe_normalize(normal * bary.weights), shading_normal = geometric_normal;
 #ifdef UVS
-    mat3x2 uv;
-    for (int index = 0; index < 3; index++) uv[index] = texelFetch(uvs, corners[index]).xy;
-    vec2 place = uv * share.weights, by_x = finite_or_zero(uv * share.ddx), by_y = finite_or_zero(uv * share.ddy);
+    mat3x2 corner_uvs;
+    for (int corner = 0; corner < 3; corner++) corner_uvs[corner] = texelFetch(uvs, corners[corner]).xy;
+    vec2 uv = corner_uvs * bary.weights;
+    vec2 uv_ddx = finite_or_zero(corner_uvs * bary.ddx), uv_ddy = finite_or_zero(corner_uvs * bary.ddy);
 #endif
 #ifdef TEXTURES
-    vec4 color = color_texel(material.images.xy, place, by_x, by_y);
+    vec4 color = color_texel(material.images.xy, uv, uv_ddx, uv_ddy);
     if (material.images.x >= 0) tint = color;
 #endif
 #ifdef NORMAL_MAPS
-    mat3x4 along_u;
-    for (int index = 0; index < 3; index++) along_u[index] = texelFetch(tangents, corners[index]);
-    vec3 bump = normal_texel(material.images.zw, place, by_x, by_y).xyz;
-    if (material.images.z >= 0) facing = apply_normal_map(facing, along_u * share.weights, bump);
+    mat3x4 corner_tangents;
+    for (int corner = 0; corner < 3; corner++) corner_tangents[corner] = texelFetch(tangents, corners[corner]);
+    vec3 bump = normal_texel(material.images.zw, uv, uv_ddx, uv_ddy).xyz;
+    if (material.images.z >= 0) shading_normal = apply_normal_map(shading_normal, corner_tangents * bary.weights, bump);
 #endif
-    vec3 light = phong(material, tint.rgb, share.front ? facing : -facing, geometric_normal, world * share.weights);
+    shading_normal = bary.is_front_facing ? shading_normal : -shading_normal;
+    vec3 light = phong(material, tint.rgb, shading_normal, geometric_normal, world * bary.weights);
     return vec4(light, material.ambient.a * tint.a);
 }

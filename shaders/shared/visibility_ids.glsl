@@ -1,5 +1,5 @@
-// Id of a sample in the visibility image: nothing, the ground, or a triangle's index in the draw order plus 1. Twin:
-// `VisibilityId` in src/render/visibility_id.rs.
+// Id of a sample in the visibility image: NO_ID, GROUND_ID, or the index of a triangle in the draw order plus 1. Twin:
+// `VisibilityId` in src/render/types.rs.
 const uint NO_ID = 0u;
 const uint GROUND_ID = 0xFFFFFFFFu;
 
@@ -7,14 +7,13 @@ const uint GROUND_ID = 0xFFFFFFFFu;
 #if SAMPLES > 1
 layout(binding = 21) uniform usampler2DMS ids;
 ivec2 id_image_size() { return textureSize(ids); }
-// Depth of the same samples. An id is valid where something was drawn, that is, nearer than the far plane. The ids are
-// not cleared: clearing those of four samples would take as long as clearing their depth, 0.59 ms at 1920 x 1080 on an
-// H200.
+// Depth of the same samples. An id is valid only if its depth is less than 1. Multisampled ids are not cleared: clearing
+// four samples takes as long as clearing their depth, 0.59 ms at 1920 x 1080 on an H200.
 layout(binding = 26) uniform sampler2DMS visibility_depth;
-uint load_id(ivec2 at, int index) { return texelFetch(visibility_depth, at, index).x < 1.0 ? texelFetch(ids, at, index).x : NO_ID; }
+uint load_id(ivec2 pixel, int sample_index) { return texelFetch(visibility_depth, pixel, sample_index).x < 1.0 ? texelFetch(ids, pixel, sample_index).x : NO_ID; }
 #else
 layout(binding = 21) uniform usampler2D ids;
 ivec2 id_image_size() { return textureSize(ids, 0); }
-uint load_id(ivec2 at, int index) { return texelFetch(ids, at, 0).x; }
+uint load_id(ivec2 pixel, int sample_index) { return texelFetch(ids, pixel, 0).x; }
 #endif
 #endif

@@ -1,35 +1,35 @@
 //! Headless OpenGL renderer: uploads a scene to the device, draws frames of it and reads their pixels back.
 //!
-//! | pass | what it does | runs when |
+//! | pass | output | condition |
 //! |---|---|---|
-//! | raster | shadow depth, visibility or both, drawn by the compute rasterizer ([`RasterBackend`]) | the look asks for it |
-//! | shadow cull | lists of the triangles that may appear in the shadow map (compute) | triangles are culled |
-//! | shadow | depth as seen from the sun; cut-outs leave holes | the look has a shadow |
+//! | raster shadow, raster visibility | shadow depth, visibility or both, drawn by the compute rasterizer ([`RasterBackend`]) | a compute rasterizer is attached |
+//! | shadow cull | lists of the triangles that may cast a shadow (compute) | triangles are culled |
+//! | shadow | depth as seen from the sun, with holes of cut-outs | the look has a shadow |
 //! | blur | depth to moments, blurred in x and in y (compute) | the shadow is a variance map |
-//! | occluders | depth of the triangles that the last frame saw, and its pyramid (compute) | hidden triangles are culled |
+//! | occluders | depth of the triangles that were visible in the last frame, and its Hi-Z pyramid (compute) | occlusion culling |
 //! | cull | lists of the triangles that the camera may see (compute) | triangles are culled |
-//! | visibility | triangle id and depth of each sample; masked materials discard | some triangle is not blended |
-//! | unpack | keys of the compute rasterizer, and the ground, to ids (compute) | it drew the visibility |
+//! | visibility | triangle id and depth of each sample, with holes of cut-outs | some triangle is not blended |
+//! | record visible | triangles that are visible, as the occluders of the next frame (compute) | occlusion culling |
+//! | unpack | keys of the compute rasterizer, and the ground, to ids (compute) | the compute rasterizer drew the visibility |
 //! | ground | id and depth of the ground | the look has a ground, the camera is above it, and something is below it |
-//! | blended | light of translucent triangles over each other; no depth writes | two-pass transparency, some triangle is blended |
-//! | count, scan, fill | a list of the blended fragments of each pixel | exact transparency, some triangle is blended |
-//! | resolve | lists sorted by depth, shaded and blended (compute) | exact transparency, some triangle is blended |
-//! | backdrop | shades tiles that see no opaque triangle; lists the other tiles (compute) | always |
-//! | shade | Phong shading in the listed tiles; samples to pixels (compute) | some triangle is not blended |
-//! | bloom | spreads bright light, then applies the tone curve (compute) | the look has a bloom |
-//! | encode | linear light to sRGB bytes, top row first; smooths edges and dithers (compute) | always |
+//! | blended | light of blended triangles in draw order, without depth writes | two-pass transparency, some triangle is blended |
+//! | oit count, oit allocate, oit fill | a list of the blended fragments of each pixel | exact transparency, some triangle is blended |
+//! | oit resolve | lists sorted by depth, shaded and blended (compute) | exact transparency, some triangle is blended |
+//! | background | shaded tiles without opaque triangles, and a list of the other tiles (compute) | always |
+//! | shade | Phong shading of the listed tiles; samples to pixels (compute) | some triangle is not blended |
+//! | bloom | blurred bright light, added to the shaded image (compute) | the look has a bloom |
+//! | encode | sRGB bytes, top row first, optionally with anti-aliasing and dithering (compute) | always |
 //!
-//! Submitting a frame and collecting its pixels are separate calls, so that several frames can be in flight
+//! Submitting a frame and reading its pixels are separate calls, so that several frames can be in flight
 //! ([`PendingFrame`]).
 //!
-//! Two outputs are drawn only on request, with programs and buffers that are created on first use: picking, which finds
-//! the triangles at a few pixels ([`PendingPick`]), and AOV (arbitrary output variable) readbacks, which deliver numbers
-//! instead of colors ([`AovImage`]).
+//! Two outputs are drawn only on request, with programs and buffers that are created on first use. Picking finds the
+//! triangles at a few pixels ([`PendingPick`]). AOV (arbitrary output variable) readbacks deliver numbers instead of colors
+//! ([`AovImage`]).
 //!
-//! Shading is deferred: the rasterizer writes ids only, and each visible triangle is shaded once per pixel, whatever
-//! lies behind it. Multisampled id buffers are not cleared; the depth buffer says which samples hold an id. A frame
-//! draws only into the screen region that the bounds of the vertices can reach, and clears only the region that earlier
-//! frames wrote.
+//! Shading is deferred: the rasterizer writes only ids, and each visible triangle is shaded once per pixel. Multisampled
+//! id buffers are not cleared; the depth buffer tells which ids are valid. A frame draws only into the screen region that
+//! the bounds of the vertices can cover, and clears only the region that earlier frames wrote.
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 

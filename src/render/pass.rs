@@ -6,12 +6,12 @@ use std::fmt;
 
 use serde::{Serialize, Serializer};
 
-/// A pass of the renderer. The order of the variants is the order of execution; the last ones run only on request.
+/// A pass of the renderer. The order of the variants is the order of execution. The last three run only on request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Pass {
     /// Writes the uniforms of the frame and resets its counters.
     UniformUpload,
-    /// Draws the shadow depth with the compute rasterizer, and the visibility if it draws that too.
+    /// Draws the shadow depth with the compute rasterizer, and the visibility if the compute rasterizer draws both.
     RasterShadow,
     /// Draws the visibility with the compute rasterizer.
     RasterVisibility,
@@ -21,13 +21,13 @@ pub enum Pass {
     Shadow,
     /// Converts shadow depth to moments and blurs them.
     Blur,
-    /// Draws the depth of the triangles that the last frame saw, and builds the pyramid of that depth.
+    /// Draws the depth of the triangles that were visible in the last frame, and builds the Hi-Z pyramid.
     Occluders,
     /// Lists the triangles that the camera may see.
     Cull,
     /// Draws the triangle id and the depth of each sample.
     Visibility,
-    /// Records the triangles that the ids name, for the occluders of the next frame.
+    /// Records the visible triangles as the occluders of the next frame.
     RecordVisible,
     /// Converts the keys of the compute rasterizer to ids.
     Unpack,
@@ -47,21 +47,21 @@ pub enum Pass {
     Background,
     /// Shades the listed tiles.
     Shade,
-    /// Spreads bright light and applies the tone curve.
+    /// Adds blurred bright light to the shaded image.
     Bloom,
     /// Encodes linear light to sRGB bytes.
     Encode,
     /// Copies the bytes and the statistics to the staging buffer.
     Read,
-    /// Packs the ids of each pixel's first sample, on request.
+    /// Reads back the id of the first sample of each pixel.
     VisibilityReadback,
-    /// Draws and reads the triangles of a few pixels, on request.
+    /// Draws and reads back the triangles of a few pixels.
     Pick,
-    /// Draws and reads numbers instead of colors, on request.
+    /// Draws and reads back an AOV field instead of colors.
     Aov,
 }
 
-/// A part of a frame whose time is reported as one number: the sum over its passes.
+/// A part of a frame whose time is reported as the sum over its passes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum RenderStage {
     /// Upload of deformed vertices from host memory; measured by the caller.
@@ -132,7 +132,7 @@ impl Pass {
         }
     }
 
-    /// The stage to whose time the pass adds.
+    /// The stage that includes the time of the pass.
     pub const fn stage(self) -> RenderStage {
         match self {
             Self::RasterShadow | Self::ShadowCull | Self::Shadow | Self::Blur => RenderStage::Shadow,
@@ -166,13 +166,13 @@ impl RenderStage {
     }
 }
 
-/// What a measured time belongs to.
+/// The stage or pass of a measured time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TimeKey {
     Stage(RenderStage),
-    /// One or several passes that are timed together, by the name of one of them. "visibility" includes the ground and
-    /// the conversion of keys, "cull" the occluders, "blended" the fragment lists, "shade" the backdrop, and
-    /// "raster shadow" the visibility if the compute rasterizer draws both at once.
+    /// Passes that are timed together have the name of one of them. "visibility" includes the ground and the conversion of
+    /// keys, "cull" the occluders, "blended" the fragment lists, "shade" the background, and "raster shadow" the visibility
+    /// if the compute rasterizer draws both.
     Pass(Pass),
 }
 
@@ -191,16 +191,17 @@ impl TimeKey {
 pub struct FrameTimes(Vec<(TimeKey, f64)>);
 
 impl FrameTimes {
-    /// Sums the passes of a frame to stages. The shadow pass is not listed on its own: its name is that of its stage.
+    /// Sums the times of a frame's passes to stages. The shadow pass has no entry of its own, because its stage has the
+    /// same name.
     pub(crate) fn of_passes(passes: &[(Pass, f64)]) -> Self {
-        let of = |stage: RenderStage| passes.iter().filter(move |(pass, _)| pass.stage() == stage);
-        let sum = |stage: RenderStage| of(stage).map(|(_, ms)| ms).fold(0.0, |sum, ms| sum + ms);
-        let entry = |(pass, ms): &(Pass, f64)| (TimeKey::Pass(*pass), *ms);
-        let mut times = vec![(TimeKey::Stage(RenderStage::Shadow), sum(RenderStage::Shadow))];
-        times.extend(of(RenderStage::Shadow).filter(|(pass, _)| *pass != Pass::Shadow).map(entry));
-        times.push((TimeKey::Stage(RenderStage::Draw), sum(RenderStage::Draw)));
-        times.extend(of(RenderStage::Draw).map(entry));
-        times.extend(of(RenderStage::Read).map(|(_, ms)| (TimeKey::Stage(RenderStage::Read), *ms)));
+        let passes_of = |stage: RenderStage| passes.iter().filter(move |(pass, _)| pass.stage() == stage);
+        let stage_ms = |stage: RenderStage| passes_of(stage).map(|(_, ms)| ms).fold(0.0, |stage_ms, ms| stage_ms + ms);
+        let timed_pass = |(pass, ms): &(Pass, f64)| (TimeKey::Pass(*pass), *ms);
+        let mut times = vec![(TimeKey::Stage(RenderStage::Shadow), stage_ms(RenderStage::Shadow))];
+        times.extend(passes_of(RenderStage::Shadow).filter(|(pass, _)| *pass != Pass::Shadow).map(timed_pass));
+        times.push((TimeKey::Stage(RenderStage::Draw), stage_ms(RenderStage::Draw)));
+        times.extend(passes_of(RenderStage::Draw).map(timed_pass));
+        times.extend(passes_of(RenderStage::Read).map(|(_, ms)| (TimeKey::Stage(RenderStage::Read), *ms)));
         Self(times)
     }
 
@@ -247,8 +248,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn all_lists_every_pass_once_with_its_own_name() {
-        assert!(Pass::ALL.is_sorted_by(|one, next| one < next));
+    fn all_contains_each_pass_with_a_unique_name() {
+        assert!(Pass::ALL.is_sorted_by(|pass, next_pass| pass < next_pass));
         assert_eq!(Pass::ALL.len(), Pass::Aov as usize + 1);
         let mut names = Pass::ALL.map(Pass::name);
         names.sort_unstable();
@@ -267,7 +268,7 @@ mod tests {
         ];
         let mut times = FrameTimes::of_passes(&passes);
         times.add(RenderStage::Read, 64.0);
-        let named: Vec<(&str, f64)> = times.iter().map(|(key, ms)| (key.name(), ms)).collect();
+        let named_times: Vec<(&str, f64)> = times.iter().map(|(key, ms)| (key.name(), ms)).collect();
         let expected = [
             ("shadow", 7.0),
             ("raster shadow", 1.0),
@@ -277,7 +278,7 @@ mod tests {
             ("encode", 16.0),
             ("read", 96.0),
         ];
-        assert_eq!(named, expected);
+        assert_eq!(named_times, expected);
         assert_eq!((times.pass(Pass::Blur), times.pass(Pass::Shadow)), (Some(4.0), None));
         assert_eq!((times.stage(RenderStage::Shadow), times.drawing_ms()), (Some(7.0), 31.0));
     }

@@ -1,14 +1,14 @@
-//! Values that the renderer takes and returns. They refer to no device.
+//! Parameters and results of the renderer, without references to a device.
 
 use crate::pass::{FrameTimes, Pass};
 use modalcast_model::scene::{BoundingBox, Camera, OrientedBounds};
 
-/// Preference for the EGL device that draws.
+/// Selects the EGL device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DevicePreference {
     /// The EGL device that corresponds to this CUDA device ordinal.
     Cuda(i32),
-    /// Any hardware device; Mesa's software rasterizer when there is none.
+    /// Any hardware device, or Mesa's software rasterizer if there is none.
     Any,
     /// Mesa's software rasterizer.
     Software,
@@ -25,21 +25,21 @@ pub struct RendererInfo {
     pub software: bool,
     /// Ordinal of the corresponding CUDA device, from EGL_CUDA_DEVICE_NV.
     pub cuda_device: Option<i32>,
-    /// Longest side of a frame, in pixels.
+    /// Maximum width and height of a frame, in pixels.
     pub max_side: u32,
 }
 
-/// Parameters of one frame; the geometry is the current content of the scene's buffers.
+/// Parameters of one frame. The geometry is the current content of the scene's buffers.
 #[derive(Debug, Clone, Copy)]
 pub struct FrameParams {
     pub camera: Camera,
     pub width: u32,
     pub height: u32,
-    /// Bounds of all deformed vertices, in scene units. The frame draws nothing outside them; bounds that are not
-    /// finite are ignored.
+    /// Bounds of all deformed vertices, in scene units. Geometry outside the bounds may be missing in the frame. Bounds
+    /// that are not finite are ignored.
     pub bounds: BoundingBox,
-    /// Bounds of the same vertices in light space, to which the shadow map is fitted. Without them, the map is fitted
-    /// to the corners of `bounds`.
+    /// Bounds of the same vertices in light space. The shadow map is fitted to them, or to the corners of `bounds` if
+    /// there are none.
     pub light: Option<OrientedBounds>,
 }
 
@@ -79,7 +79,7 @@ pub enum RasterBackend {
     Cuda,
 }
 
-/// The rasterizers of a frame's passes; none where the frame has no such pass.
+/// Rasterizers of a frame's passes; none if the frame has no such pass.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct RasterBackends {
     pub shadow: Option<RasterBackend>,
@@ -87,7 +87,7 @@ pub struct RasterBackends {
 }
 
 impl RasterBackend {
-    /// Name in looks and on the wire.
+    /// Name in results and on the wire.
     pub const fn name(self) -> &'static str {
         match self {
             Self::OpenGl => "opengl",
@@ -99,28 +99,28 @@ impl RasterBackend {
 /// Fragment statistics of a frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct OitStats {
-    /// Blended fragments that are not wholly transparent and not hidden by something opaque.
+    /// Blended fragments that are neither fully transparent nor behind opaque surfaces.
     pub fragments: u64,
-    /// Fragments within the budget. The others, the farthest of their pixels, are missing in the picture.
+    /// Fragments within the budget. The other fragments, the farthest of their pixels, are not drawn.
     pub stored: u64,
     /// Largest number of fragments in a pixel.
     pub max_per_pixel: u32,
-    /// Maximum number of fragments per pixel, when the budget was exceeded.
+    /// Number of fragments per pixel to which the lists were limited, if the budget was exceeded.
     pub per_pixel_limit: Option<u32>,
 }
 
 impl OitStats {
-    /// Fragments that are missing in the picture.
+    /// Fragments that are not drawn.
     pub const fn dropped(&self) -> u64 {
         self.fragments - self.stored
     }
 }
 
-/// Culling result of one view. For the sun, the counts add up over all cascades; they are zero in frames that reuse a
-/// shadow map.
+/// Numbers of triangles by culling result, for one view. For the shadow map, these are sums over all cascades; they are 0
+/// in frames that reuse a shadow map.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct CullStats {
-    /// Passed on to the rasterizer.
+    /// Triangles that the rasterizer processes.
     pub visible: u32,
     /// Outside the view volume, or outside the box of the shadow map.
     pub outside_view: u32,
@@ -128,7 +128,7 @@ pub struct CullStats {
     pub back_facing: u32,
     /// Triangles that cover no sample or have no area.
     pub no_sample: u32,
-    /// Behind the depth of the triangles that the last frame saw.
+    /// Behind the triangles that were visible in the last frame.
     pub occluded: u32,
 }
 
@@ -136,7 +136,7 @@ pub struct CullStats {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct FrameCullStats {
     pub camera: CullStats,
-    /// Casters of the shadow map.
+    /// Shadow casters.
     pub shadow: CullStats,
 }
 
@@ -147,13 +147,13 @@ impl CullStats {
     }
 }
 
-/// What a sample of a frame sees.
+/// The object that is visible in a sample of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum VisibilityId {
     /// Neither triangle nor ground, that is, the sky.
     Background,
     Ground,
-    /// A triangle, by its index in the renderer's draw order; [`crate::SceneBuffers::source_triangle`] maps it to its domain.
+    /// Index of a triangle in the renderer's draw order. [`crate::SceneBuffers::source_triangle`] maps it to its domain.
     Triangle(usize),
 }
 
@@ -163,7 +163,7 @@ impl VisibilityId {
         match id {
             0 => Self::Background,
             u32::MAX => Self::Ground,
-            place => Self::Triangle(place as usize - 1),
+            id => Self::Triangle(id as usize - 1),
         }
     }
 }
@@ -173,7 +173,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ids_of_the_sky_the_ground_and_the_first_triangle_are_told_apart() {
+    fn background_ground_and_first_triangle_have_different_ids() {
         assert_eq!(
             [0, 1, u32::MAX].map(VisibilityId::from_id),
             [VisibilityId::Background, VisibilityId::Triangle(0), VisibilityId::Ground]
@@ -181,14 +181,13 @@ mod tests {
     }
 }
 
-/// The implementation of the moments' blur. All of them yield the same map up to rounding.
+/// Implementation of the blur of a variance shadow map. All methods give the same map up to rounding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum BlurMethod {
-    /// `Tiles` on hardware, `Rows` on software implementations.
+    /// `Tiles` on hardware, `Rows` on software rasterizers.
     #[default]
     Auto,
-    /// One compute pass. It works on strips with sums in registers; for a blur above 8, whose radius is too
-    /// large for this, on tiles in shared memory.
+    /// One compute pass: by strips with sums in registers if the blur is at most 8, else by tiles in shared memory.
     Tiles,
     /// Two compute passes without shared memory.
     Rows,
@@ -197,10 +196,10 @@ pub enum BlurMethod {
 }
 
 impl BlurMethod {
-    /// The method that `Auto` stands for on a device of this kind; the others stand for themselves.
-    pub(crate) fn resolve(self, software: bool) -> Self {
+    /// Replaces `Auto` by the method for the device.
+    pub(crate) fn resolve(self, is_software: bool) -> Self {
         match self {
-            Self::Auto if software => Self::Rows,
+            Self::Auto if is_software => Self::Rows,
             Self::Auto => Self::Tiles,
             method => method,
         }

@@ -1,15 +1,15 @@
-//! The resources that each pass reads and writes, and the memory barriers that follow from them.
+//! Resources that each pass reads and writes, and the memory barriers that follow from them.
 //!
-//! OpenGL orders all accesses by itself, except those of shaders that write images or storage buffers. Each pass issues
-//! one barrier before its first command ([`barrier_before`]), and one between its own dispatches or draws where a later
-//! one uses the result of an earlier one ([`barrier_within`]).
+//! OpenGL orders all accesses, except shader writes to images and storage buffers. Each pass issues a barrier before its
+//! first command ([`barrier_before`]), and a barrier between two of its commands if the second uses outputs of the first
+//! ([`barrier_within`]).
 
 use std::sync::LazyLock;
 
 use crate::device::gl::MemoryBarriers;
 use crate::pass::Pass;
 
-/// A buffer or an image of a scene or of a frame. Pictures of several frames share them.
+/// A buffer or an image of a scene or of a render target. Consecutive frames share them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Resource {
     ShadowDepth,
@@ -39,7 +39,7 @@ pub(super) enum Resource {
     Tiles,
     SceneColor,
     BloomMips,
-    /// What is copied to the staging buffer: pixels, ids or numbers.
+    /// Data to copy to the staging buffer: pixels, ids or AOV fields.
     ReadbackSource,
 }
 
@@ -49,10 +49,10 @@ pub(super) enum Access {
     /// Texture lookup, also of buffer textures.
     Sampled,
     ImageRead,
-    /// Image stores or atomics, possibly loads too.
+    /// Image stores or atomics, and possibly loads.
     ImageWrite,
     StorageRead,
-    /// Stores or atomics of a storage buffer, possibly loads too.
+    /// Stores or atomics to a storage buffer, and possibly loads.
     StorageWrite,
     /// Arguments of an indirect draw or dispatch.
     Indirect,
@@ -62,16 +62,17 @@ pub(super) enum Access {
     Attachment,
     /// Writes and copies by API calls.
     Transfer,
-    /// Accesses of the compute rasterizer. Its interoperation with OpenGL orders them.
+    /// Accesses of the compute rasterizer, ordered by the CUDA interoperability calls.
     External,
 }
 
 impl Access {
-    /// Whether OpenGL does not order the access with others.
+    /// Whether the access is a shader write, which OpenGL orders only at barriers.
     const fn is_shader_write(self) -> bool {
         matches!(self, Self::ImageWrite | Self::StorageWrite)
     }
 
+    /// Barrier that makes earlier shader writes visible to this access.
     const fn barrier(self) -> MemoryBarriers {
         match self {
             Self::Sampled => MemoryBarriers::TEXTURE_FETCH,
@@ -88,14 +89,14 @@ impl Access {
 
 type Accesses = &'static [(Resource, Access)];
 
-/// Draws of listed triangles.
+/// Draws of culled lists.
 const VISIBLE_LISTS: Accesses = &[
     (Resource::CullDraws, Access::Indirect),
     (Resource::VisibleIndices, Access::Index),
     (Resource::VisibleTriangleIds, Access::Sampled),
 ];
 
-/// Resets, fills and compacts the lists.
+/// Reset, culling tests and compaction of the lists.
 const LIST_TRIANGLES: Accesses = &[
     (Resource::CullDraws, Access::Transfer),
     (Resource::CullDraws, Access::StorageWrite),
@@ -122,7 +123,7 @@ const SHADING: Accesses = &[
 /// Ids and depth that a pass draws.
 const DRAW_IDS: Accesses = &[(Resource::Ids, Access::Attachment), (Resource::Depth, Access::Attachment)];
 
-/// Ids to words, and their copy.
+/// Conversion of ids to words, and their copy.
 const READ_IDS: Accesses = &[
     (Resource::Ids, Access::Sampled),
     (Resource::Depth, Access::Sampled),
@@ -130,9 +131,9 @@ const READ_IDS: Accesses = &[
     (Resource::ReadbackSource, Access::Transfer),
 ];
 
-/// Everything that a pass reads and writes and that some shader writes, in groups, in the order of [`Pass::ALL`].
-/// Resources that no shader writes need no entry; those whose writer is optional have one.
-const DECLARED: [(Pass, &[Accesses]); Pass::ALL.len()] = [
+/// Accesses of each pass, in the order of [`Pass::ALL`]. Resources that no shader of any configuration writes need no
+/// entry.
+const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
     (Pass::UniformUpload, &[&[(Resource::CullCounters, Access::Transfer)]]),
     (
         Pass::RasterShadow,
@@ -275,39 +276,38 @@ const DECLARED: [(Pass, &[Accesses]); Pass::ALL.len()] = [
     (Pass::Aov, &[DRAW_IDS, READ_IDS]),
 ];
 
-fn each_access(pass: Pass) -> impl Iterator<Item = (Resource, Access)> {
-    DECLARED[pass as usize].1.iter().flat_map(|group| group.iter().copied())
+fn accesses_of(pass: Pass) -> impl Iterator<Item = (Resource, Access)> {
+    PASS_ACCESSES[pass as usize].1.iter().flat_map(|group| group.iter().copied())
 }
 
 fn is_written_by_shaders(pass: Pass, resource: Resource) -> bool {
-    each_access(pass).any(|(own, access)| own == resource && access.is_shader_write())
+    accesses_of(pass).any(|(accessed, access)| accessed == resource && access.is_shader_write())
 }
 
-/// The barrier of these accesses. All barriers come from here: to compare with a build in which each barrier orders
-/// all accesses, or in which one kind is left out, change the returned value here.
+/// Barrier for these accesses. All barriers are computed here, so an experiment with other barriers needs one change.
 fn barrier_of(accesses: impl Iterator<Item = Access>) -> MemoryBarriers {
     accesses.fold(MemoryBarriers::NONE, |kinds, access| kinds | access.barrier())
 }
 
 fn compute_barrier_before(pass: Pass) -> MemoryBarriers {
     let is_written = |resource| Pass::ALL.into_iter().any(|pass| is_written_by_shaders(pass, resource));
-    barrier_of(each_access(pass).filter(|(resource, _)| is_written(*resource)).map(|(_, access)| access))
+    barrier_of(accesses_of(pass).filter(|(resource, _)| is_written(*resource)).map(|(_, access)| access))
 }
 
 fn compute_barrier_within(pass: Pass) -> MemoryBarriers {
-    let own = each_access(pass).filter(|(resource, _)| is_written_by_shaders(pass, *resource));
-    barrier_of(own.map(|(_, access)| access))
+    let accesses = accesses_of(pass).filter(|(resource, _)| is_written_by_shaders(pass, *resource));
+    barrier_of(accesses.map(|(_, access)| access))
 }
 
-/// The barrier before the first command of a pass: for its accesses of resources that shaders write in any pass, this
-/// one included, because the resources outlive the frame.
+/// Barrier before the first command of a pass. It covers all resources that shaders write in any pass, including the same
+/// pass of an earlier frame.
 pub(super) fn barrier_before(pass: Pass) -> MemoryBarriers {
     static BARRIERS: LazyLock<[MemoryBarriers; Pass::ALL.len()]> =
         LazyLock::new(|| Pass::ALL.map(compute_barrier_before));
     BARRIERS[pass as usize]
 }
 
-/// The barrier between the commands of a pass: for its accesses of resources that its own shaders write.
+/// Barrier between commands of a pass. It covers the resources that shaders of this pass write.
 pub(super) fn barrier_within(pass: Pass) -> MemoryBarriers {
     static BARRIERS: LazyLock<[MemoryBarriers; Pass::ALL.len()]> =
         LazyLock::new(|| Pass::ALL.map(compute_barrier_within));
@@ -319,17 +319,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_pass_has_its_own_declaration() {
-        assert_eq!(DECLARED.map(|(pass, _)| pass), Pass::ALL);
+    fn each_pass_has_its_own_accesses() {
+        assert_eq!(PASS_ACCESSES.map(|(pass, _)| pass), Pass::ALL);
     }
 
     #[test]
-    fn every_shader_write_is_followed_by_the_barrier_of_each_reader() {
-        let covers = |kinds: MemoryBarriers, one: MemoryBarriers| kinds | one == kinds;
+    fn barriers_cover_all_readers_of_shader_writes() {
+        let covers = |barriers: MemoryBarriers, barrier: MemoryBarriers| barriers | barrier == barriers;
         let mut pairs = 0;
         for writer in Pass::ALL {
             for reader in Pass::ALL {
-                for (resource, access) in each_access(reader) {
+                for (resource, access) in accesses_of(reader) {
                     if is_written_by_shaders(writer, resource) {
                         pairs += 1;
                         assert!(covers(barrier_before(reader), access.barrier()), "{writer} to {reader}: {resource:?}");
@@ -337,21 +337,21 @@ mod tests {
                 }
             }
         }
-        assert!(pairs > 100, "{pairs}");
+        assert!(pairs > 100, "expected more than 100 pairs, got {pairs}");
     }
 
     #[test]
-    fn overwriting_waits_for_earlier_readers() {
-        // A store waits for earlier accesses of any kind only behind a barrier of its own kind.
+    fn shader_writes_wait_for_earlier_accesses() {
+        // A store waits for earlier accesses only after a barrier of its own kind.
         for pass in Pass::ALL {
-            for (resource, access) in each_access(pass).filter(|(_, access)| access.is_shader_write()) {
+            for (resource, access) in accesses_of(pass).filter(|(_, access)| access.is_shader_write()) {
                 assert_eq!(barrier_before(pass) | access.barrier(), barrier_before(pass), "{pass}: {resource:?}");
             }
         }
     }
 
     #[test]
-    fn barriers_name_only_the_kinds_of_their_consumers() {
+    fn barriers_contain_only_kinds_that_the_pass_uses() {
         use MemoryBarriers as Kinds;
         assert_eq!(barrier_before(Pass::UniformUpload), Kinds::BUFFER_UPDATE);
         assert_eq!(barrier_before(Pass::RasterShadow), Kinds::NONE);

@@ -1,6 +1,5 @@
-//! AOV (arbitrary output variable) readback: numbers instead of colors for every pixel of a frame, namely depth,
-//! domains, normals or a scalar per vertex. Programs are compiled and buffers allocated on the first readback; frames
-//! before and after do not change.
+//! AOV (arbitrary output variable) readback: depth, domains, normals or vertex values for every pixel of a frame.
+//! The first readback compiles programs and allocates buffers. Readbacks do not change later frames.
 
 use std::rc::Rc;
 use std::time::{Duration, Instant};
@@ -25,8 +24,8 @@ use crate::types::{FrameParams, FrameStats, VisibilityId};
 use crate::uniforms::frame::FrameUniforms;
 use modalcast_model::error::{Result, fault_in};
 
-/// Attribute to read back. Blended triangles are ignored; the surface behind them is read. Only depth includes the
-/// ground: in the other fields, the ground hides nothing below it.
+/// Attribute to read back. Blended triangles are ignored. The ground is part of the depth only; the other fields ignore
+/// it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Aov {
     /// f32: meters along the view axis, not along the ray; infinite where nothing is visible. Includes the ground.
@@ -35,9 +34,9 @@ pub enum Aov {
     Domains,
     /// Three f32: unit normal on the visible side; zeros where no triangle is visible.
     Normals,
-    /// One word per sample. Lower 16 bits: a scalar per vertex ([`crate::Renderer::upload_vertex_values`]) divided by `largest`,
-    /// clamped to 0 to 1, as unorm. Upper 16 bits: the cosine between normal and eye, as unorm. 0 where no triangle is
-    /// visible.
+    /// One word per sample; 0 where no triangle is visible. Lower 16 bits: the interpolated vertex value
+    /// ([`crate::Renderer::upload_vertex_values`]) divided by `largest`, clamped to 0 to 1, as unorm. Upper 16 bits: the
+    /// cosine between the normal and the direction to the eye, as unorm.
     Values { largest: f32 },
 }
 
@@ -53,7 +52,7 @@ pub struct AovImage {
     pub times: FrameTimes,
 }
 
-/// Reads AOV fields. Keeps the render target of the last readback.
+/// Reads AOV fields. Caches the render target of the last readback.
 #[derive(Debug)]
 pub(crate) struct AovReader {
     gl: Rc<Gl>,
@@ -65,12 +64,13 @@ pub(crate) struct AovReader {
 struct AovTarget {
     desc: TargetDesc,
     /// 32-bit words per pixel.
-    words: u64,
+    words_per_pixel: u64,
     ids: IdTarget,
     staging: Buffer,
 }
 
 impl Aov {
+    /// Define that selects the field in `shaders/aov.comp`, which does not compute domains.
     const fn define(self) -> &'static str {
         match self {
             Self::Depth => "DEPTH",
@@ -86,31 +86,31 @@ impl AovReader {
         Self { gl: Rc::clone(gl), target: None }
     }
 
-    /// Reads a field for the current content of the shared buffers; waits at most `limit`.
+    /// Reads a field for the current content of the scene's buffers; waits at most `timeout`.
     ///
     /// # Errors
-    /// `Invalid` for a camera whose matrices overflow; `Fault` when no values were uploaded, OpenGL reports an error or
-    /// the device does not finish in time.
+    /// `Invalid` for a camera whose matrices overflow; `Fault` if no values were uploaded, OpenGL reports an error or the
+    /// device does not finish in time.
     pub(crate) fn render(
         &mut self,
         programs: &mut ProgramCache,
         buffers: &SceneBuffers,
-        shot: &FrameParams,
+        params: &FrameParams,
         field: Aov,
-        limit: Duration,
+        timeout: Duration,
     ) -> Result<AovImage> {
         let samples = if matches!(field, Aov::Values { .. }) { buffers.scene.look.samples_per_pixel() } else { 1 };
-        let desc = TargetDesc::plain(&self.gl, [shot.width, shot.height], samples);
-        let words = if field == Aov::Normals { 3 } else { u64::from(desc.samples) };
-        let uniforms = FrameUniforms::new(&buffers.scene, shot, buffers.origin)?;
+        let desc = TargetDesc::ids_and_depth(&self.gl, [params.width, params.height], samples);
+        let words_per_pixel = if field == Aov::Normals { 3 } else { u64::from(desc.samples) };
+        let uniforms = FrameUniforms::new(&buffers.scene, params, buffers.origin)?;
         let mask = buffers.mask_program(desc.samples, &mut |source| programs.program(source))?;
         let program = match field {
             Aov::Domains => programs.program(shaders::readback::visibility_readback(desc.samples))?,
             _ => buffers.aov_program(field.define(), desc.samples, &mut |source| programs.program(source))?,
         };
         let gl = Rc::clone(&self.gl);
-        let target = self.ensure_target(desc, words)?;
-        let bytes = 4 * words * u64::from(desc.width) * u64::from(desc.height);
+        let target = self.ensure_target(desc, words_per_pixel)?;
+        let bytes = 4 * words_per_pixel * u64::from(desc.width) * u64::from(desc.height);
         upload_frame(buffers, &uniforms);
         if let Aov::Values { .. } = field {
             let values = buffers.values.as_ref().ok_or_else(|| fault_in("aov")("no values were uploaded"))?;
@@ -118,33 +118,37 @@ impl AovReader {
         }
         let mut recorder = PassRecorder { gl: &gl, stats: &mut FrameStats::default() };
         let readback = Readback { field, mask: mask.as_deref(), program: &program, bytes };
-        let drawn = gl.time_pass(Pass::Aov.name(), limit, || readback.record(&mut recorder, buffers, shot, target))?;
-        gl.wait(Pass::Aov.name(), limit)?;
-        let begin = Instant::now();
+        let timer =
+            gl.time_pass(Pass::Aov.name(), timeout, || readback.record(&mut recorder, buffers, params, target))?;
+        gl.wait(Pass::Aov.name(), timeout)?;
+        let start = Instant::now();
         let bytes = target.staging.read(bytes as usize)?;
         gl.check(Pass::Aov.name())?;
         let bytes = if field == Aov::Domains { domain_indices(buffers, bytes) } else { bytes };
-        let read_ms = begin.elapsed().as_secs_f64() * 1e3;
-        let times = FrameTimes::of_stages(&[(RenderStage::Draw, drawn.ms()), (RenderStage::Read, read_ms)]);
+        let read_ms = start.elapsed().as_secs_f64() * 1e3;
+        let times = FrameTimes::of_stages(&[(RenderStage::Draw, timer.ms()), (RenderStage::Read, read_ms)]);
         Ok(AovImage { width: desc.width, height: desc.height, samples: desc.samples, bytes, times })
     }
 
-    /// Keeps the last render target if its form and words per pixel match, else replaces it.
-    fn ensure_target(&mut self, desc: TargetDesc, words: u64) -> Result<&AovTarget> {
-        let last = self.target.take().filter(|last| (last.desc, last.words) == (desc, words));
-        let target = match last {
-            Some(last) => last,
+    /// Returns the cached render target if it fits, else replaces it.
+    fn ensure_target(&mut self, desc: TargetDesc, words_per_pixel: u64) -> Result<&AovTarget> {
+        let cached_target = self
+            .target
+            .take()
+            .filter(|cached_target| (cached_target.desc, cached_target.words_per_pixel) == (desc, words_per_pixel));
+        let target = match cached_target {
+            Some(cached_target) => cached_target,
             None => {
-                let bytes = 4 * words * u64::from(desc.width) * u64::from(desc.height);
+                let bytes = 4 * words_per_pixel * u64::from(desc.width) * u64::from(desc.height);
                 let ids = IdTarget::new(&self.gl, desc, bytes)?;
-                AovTarget { desc, words, ids, staging: self.gl.buffer(bytes, gl::STREAM_READ, None)? }
+                AovTarget { desc, words_per_pixel, ids, staging: self.gl.buffer(bytes, gl::STREAM_READ, None)? }
             }
         };
         Ok(self.target.insert(target))
     }
 }
 
-/// The commands of a readback.
+/// Programs and parameters of a readback.
 #[derive(Debug)]
 struct Readback<'a> {
     field: Aov,
@@ -154,11 +158,12 @@ struct Readback<'a> {
 }
 
 impl Readback<'_> {
+    /// Draws the ids, converts them to the field, and copies it to the staging buffer.
     fn record(
         &self,
         recorder: &mut PassRecorder<'_>,
         buffers: &SceneBuffers,
-        shot: &FrameParams,
+        params: &FrameParams,
         target: &AovTarget,
     ) -> Result<()> {
         let size = [target.desc.width, target.desc.height];
@@ -166,29 +171,29 @@ impl Readback<'_> {
             framebuffer: &target.ids.framebuffer,
             clear: ClearOp::DepthAndIds(None),
             region: Region::whole(size),
-            set: TriangleSet::All,
+            triangles: TriangleSet::All,
             mask: self.mask,
             opaque_parts: None,
         };
         recorder.begin(Pass::Aov);
         draw_ids(recorder, buffers, &ids)?;
         if self.field == Aov::Depth {
-            draw_ground(recorder, buffers, shot)?;
+            draw_ground(recorder, buffers, params)?;
         }
         let scale = match self.field {
             Aov::Depth => Some(buffers.scene.unit as f32),
             Aov::Values { largest } => Some(largest.recip()),
             Aov::Domains | Aov::Normals => None,
         };
-        let words = WordPass {
+        let word_pass = WordPass {
             pass: Pass::Aov,
             program: self.program,
-            number: scale.map(f32::to_bits),
+            uniform: scale.map(f32::to_bits),
             size,
             staging: &target.staging,
             bytes: self.bytes,
         };
-        target.ids.read(recorder, &words)
+        target.ids.read(recorder, &word_pass)
     }
 }
 
@@ -196,20 +201,20 @@ impl Readback<'_> {
 fn domain_indices(buffers: &SceneBuffers, ids: Vec<u8>) -> Vec<u8> {
     let mut words: Vec<u32> = bytemuck::pod_collect_to_vec(&ids);
     let spans = &buffers.spans[..];
-    let locate_triangle = |id: u32| match VisibilityId::from_id(id) {
-        VisibilityId::Triangle(place) => {
-            geometry::locate_triangle(spans, place).map_or(u32::MAX, |(domain, _)| domain as u32)
+    let domain_of = |id: u32| match VisibilityId::from_id(id) {
+        VisibilityId::Triangle(triangle) => {
+            geometry::locate_triangle(spans, triangle).map_or(u32::MAX, |(domain, _)| domain as u32)
         }
         VisibilityId::Background | VisibilityId::Ground => u32::MAX,
     };
     words.par_chunks_mut(4096).for_each(|words| {
-        // Neighboring pixels mostly see the same triangle.
-        let mut last = (0, u32::MAX);
+        // Neighboring pixels usually have the same id.
+        let mut previous = (0, u32::MAX);
         for word in words {
-            if *word != last.0 {
-                last = (*word, locate_triangle(*word));
+            if *word != previous.0 {
+                previous = (*word, domain_of(*word));
             }
-            *word = last.1;
+            *word = previous.1;
         }
     });
     bytemuck::cast_slice(&words).to_vec()

@@ -1,27 +1,27 @@
-//! Blended triangles in front of the opaque ones: in draw order into one layer, or sorted (`oit`).
+//! Draws blended triangles: in draw order into one layer, or with exact transparency (`oit`).
 
-use super::draw::{KindDraw, bind_shadow, draw_groups, triangle_set};
+use super::draw::{TriangleDraw, bind_shadow, draw_groups, triangle_set};
 use super::recorder::{FrameContext, PassRecorder};
 use crate::device::gl::{ClearOp, PipelineState};
 use crate::pass::Pass;
 use crate::scene_data::geometry::BlendMode;
 use modalcast_model::error::Result;
 
-/// Cleared layer: no light, full transmittance.
+/// Clear value of the layer: no light, full transmittance.
 const CLEAR_LAYER: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
-/// Draws the layers of the blended triangles, if there are any.
+/// Draws the blended triangles of a scene, if it has any.
 pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
     let FrameContext { buffers, target, programs, .. } = *frame;
     if let (Some(programs), Some(oit)) = (&programs.oit, &target.oit) {
         return super::oit::draw(recorder, buffers, oit, programs, target.draw_region.get());
     }
-    let (Some(program), Some(layer)) = (&programs.blended, &target.layer) else { return Ok(()) };
+    let (Some(program), Some(layer)) = (&programs.blended, &target.blend_layer) else { return Ok(()) };
     recorder.begin(Pass::Blended);
-    let clear = ClearOp::Color(CLEAR_LAYER, &layer.dirty);
+    let clear = ClearOp::Color(CLEAR_LAYER, &layer.dirty_region);
     recorder.gl.begin_pass(&layer.framebuffer, target.draw_region.get(), clear);
     bind_shadow(buffers);
-    let draw = KindDraw { blend_mode: BlendMode::Blend, program, set: triangle_set(buffers) };
+    let draw = TriangleDraw { blend_mode: BlendMode::Blend, program, triangles: triangle_set(buffers) };
     draw_groups(recorder, buffers, draw, PipelineState { blend: true, ..PipelineState::default() });
     recorder.finish(Pass::Blended)
 }

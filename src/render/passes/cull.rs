@@ -1,35 +1,33 @@
-//! Triangle culling on the GPU. Before the rasterizer processes a group of triangles, a compute pass tests each
-//! triangle and lists those that may be visible; one indirect draw per group draws the list. Rasterizer throughput is
-//! scarce (about 0.4 G triangles/s on a data-center GPU), compute throughput is not.
+//! Triangle culling on the GPU. A compute pass tests each triangle of a draw group and lists those that may be visible;
+//! an indirect draw then draws the list. This is worthwhile because a data-center GPU rasterizes only about 0.4 G
+//! triangles/s, while its compute throughput is high.
 //!
 //! # Tests
 //! Culling removes triangles outside one plane of the view volume, back faces of single-sided materials, triangles so
-//! small that no sample lies in their bounding box and, if the look asks for it, triangles behind nearer ones. Each
-//! bound is widened by the rounding errors of the shaders and of the rasterizer, so that culling changes no bit of the
-//! picture. The counts are read back with the pixels.
+//! small that no sample lies in their bounding box and, with occlusion culling, triangles behind nearer ones. Each
+//! bound is widened by the rounding errors of the shaders and of the rasterizer, so that culling does not change the
+//! image. The counts are read back with the pixels.
 //!
 //! # Occlusion culling
-//! The pass first draws the depth of the triangles that the last frame saw, at their current positions. A hierarchical
-//! depth pyramid holds the farthest depth of ever larger squares. All triangles are tested against the pyramid, and the
-//! survivors are drawn into a cleared image in their original order. The picture does not depend on the history. The
-//! occluders have this frame's positions, so a triangle strictly behind their depth at every sample is also behind the
-//! picture's depth and would not be visible. The set of hidden triangles, and so their count, does depend on the
-//! history: the first frame hides none.
+//! The occluders are the triangles that were visible in the last frame. Their depth is drawn at their current positions,
+//! and reduced to a Hi-Z pyramid of farthest depths. All triangles are tested against the pyramid, and those that are
+//! not culled are drawn into cleared images in their original order.
 //!
-//! Drawing the remembered triangles once, with ids, and then only the rest would avoid drawing them twice, but it is
-//! not exact: at equal depths the later triangle must win, and one of the rest may have equal depth and an earlier
-//! position. Fragment shaders cannot read the current id, and a depth comparison in the shader would force per-sample
-//! shading. The occluders are therefore drawn twice, the first time without ids. The depth is cleared in between
-//! because the depths of both draws would otherwise have to match to the bit; with the clear they only need to match
-//! within the margin.
+//! The image does not depend on earlier frames: the occluders have the positions of this frame, so a triangle that is
+//! strictly behind them at every sample is not visible. The number of culled triangles does depend on earlier frames.
+//! The first frame has no occluders.
+//!
+//! The occluders are drawn twice, the first time without ids. Drawing them once with ids, and then the other triangles,
+//! is not exact: at equal depths, the later triangle in draw order must win. Fragment shaders cannot read the current
+//! id, and a depth comparison in the shader would force per-sample shading. The depth is cleared between the two draws.
+//! Therefore the depths of both draws need to match only within the margin, not exactly.
 //!
 //! # Lists
-//! A list keeps the order of its triangles, because it is compacted with a prefix sum over bits instead of atomics, and
-//! begins at the offset of its group. It holds indices and not only triangles, so that triangles still share
-//! transformed vertices: without an index buffer, each vertex would be transformed three times. Fragments find the id
-//! of their triangle with one texel fetch, which is uniform over a triangle.
+//! A list begins at the offset of its group. Its triangles are in draw order, because it is compacted with a prefix sum
+//! over bits instead of atomics. It contains vertex indices, so that triangles still share transformed vertices.
+//! Fragments get the id of their triangle with one texel fetch.
 
-use super::draw::{KindDraw, TriangleSet, bind_visibility, draw_groups};
+use super::draw::{TriangleDraw, TriangleSet, bind_visibility, draw_groups};
 use super::recorder::{FrameContext, PassRecorder};
 use crate::device::gl::{ClearOp, PipelineState, Program};
 use crate::layout::cull::MAX_LEVEL;
@@ -43,21 +41,21 @@ use crate::resources::target::RenderTarget;
 use crate::scene_data::geometry::BlendMode;
 use modalcast_model::error::Result;
 
-/// Side of the square of pixels whose ids one workgroup records.
+/// Side of the square of pixels whose ids a workgroup records.
 const RECORD_TILE: u32 = 8;
-/// Levels that one dispatch adds to the depth pyramid below its first level; two dispatches reach the coarsest level.
+/// Coarser levels that one dispatch adds to the depth pyramid.
 const LEVELS_PER_DISPATCH: u32 = 4;
-const _: () = assert!(2 * LEVELS_PER_DISPATCH == MAX_LEVEL, "two dispatches build the pyramid");
-/// Side of the square of texels that a workgroup of the pyramid reduces.
+const _: () = assert!(2 * LEVELS_PER_DISPATCH == MAX_LEVEL, "two dispatches must build the pyramid");
+/// Side of the square of texels that a workgroup of the depth pyramid reduces.
 const PYRAMID_TILE: u32 = 1 << LEVELS_PER_DISPATCH;
 
-/// Runs the bound culling program and compacts its result to lists. The caller has bound their inputs.
+/// Runs the bound culling program and compacts its result to lists. The caller has bound the inputs.
 fn compact_triangles(recorder: &PassRecorder<'_>, pass: Pass, culler: &TriangleCuller, compact: &Program) {
-    let [wide, tall] = culler.uniforms.dispatch();
-    recorder.gl.dispatch(wide, tall);
-    recorder.continue_pass(pass);
+    let [columns, rows] = culler.uniforms.dispatch();
+    recorder.gl.dispatch(columns, rows);
+    recorder.barrier_within_pass(pass);
     compact.bind(None);
-    recorder.gl.dispatch(wide, tall);
+    recorder.gl.dispatch(columns, rows);
     culler.triangle_ids.bind(TRIANGLE_ID_UNIT);
 }
 
@@ -68,8 +66,8 @@ fn begin_lists(recorder: &PassRecorder<'_>, pass: Pass, culler: &TriangleCuller)
     culler.bind();
 }
 
-/// Lists the triangles that may cast a shadow into one layer of the map, whose side is `size` texels. `set_layer` sets
-/// the layer of the bound program. Does nothing in a scene that is not culled.
+/// Lists the triangles that may cast a shadow into one layer of the map. `size`: side of the map in texels. `set_layer`
+/// sets the layer of the bound program. Does nothing without culling.
 pub(super) fn cull_shadow_casters(
     recorder: &PassRecorder<'_>,
     buffers: &SceneBuffers,
@@ -84,21 +82,21 @@ pub(super) fn cull_shadow_casters(
     recorder.check(Pass::ShadowCull)
 }
 
-/// Lists the triangles that the camera may see. Does nothing in a scene that is not culled.
+/// Lists the triangles that the camera may see. Does nothing without culling.
 pub(crate) fn cull_for_camera(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
     let FrameContext { buffers, target, programs, .. } = *frame;
     let (Some(culler), Some(programs)) = (&buffers.culler, &programs.cull) else { return Ok(()) };
-    if let (Some(pyramid), Some(occlusion)) = (&target.pyramid, &programs.occlusion) {
+    if let (Some(pyramid), Some(occlusion)) = (&target.depth_pyramid, &programs.occlusion) {
         begin_lists(recorder, Pass::Occluders, culler);
         occlusion.cull_previous.bind(None);
         compact_triangles(recorder, Pass::Occluders, culler, &programs.compact);
-        recorder.continue_pass(Pass::Occluders);
+        recorder.barrier_within_pass(Pass::Occluders);
         draw_occluders(recorder, frame, pyramid);
         build_pyramid(recorder, target, pyramid, occlusion);
         recorder.finish(Pass::Occluders)?;
     }
     begin_lists(recorder, Pass::Cull, culler);
-    if let Some(pyramid) = &target.pyramid {
+    if let Some(pyramid) = &target.depth_pyramid {
         pyramid.bind();
     }
     programs.cull_triangles.bind(Some(pack_size([target.desc.width, target.desc.height])));
@@ -109,13 +107,19 @@ pub(crate) fn cull_for_camera(recorder: &mut PassRecorder<'_>, frame: &FrameCont
 /// Draws the depth of the listed triangles.
 fn draw_occluders(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, pyramid: &DepthPyramid) {
     let FrameContext { buffers, target, programs, .. } = *frame;
-    let clear = ClearOp::Depth(Some(&target.dirty.depth));
-    recorder.gl.begin_pass(&pyramid.occluders, target.draw_region.get(), clear);
-    let kinds = [(BlendMode::Opaque, buffers.programs.opaque.as_deref()), (BlendMode::Mask, programs.mask.as_deref())];
+    let clear = ClearOp::Depth(Some(&target.dirty_regions.depth));
+    recorder.gl.begin_pass(&pyramid.occluder_fbo, target.draw_region.get(), clear);
+    let blend_modes =
+        [(BlendMode::Opaque, buffers.programs.opaque.as_deref()), (BlendMode::Mask, programs.mask.as_deref())];
     let state = PipelineState { depth_write: true, ..PipelineState::default() };
-    for (blend_mode, program) in kinds {
+    for (blend_mode, program) in blend_modes {
         if let Some(program) = program {
-            draw_groups(recorder, buffers, KindDraw { blend_mode, program, set: TriangleSet::Visible }, state);
+            draw_groups(
+                recorder,
+                buffers,
+                TriangleDraw { blend_mode, program, triangles: TriangleSet::Visible },
+                state,
+            );
         }
     }
 }
@@ -133,13 +137,12 @@ fn build_pyramid(
     target.depth.bind(DEPTH_UNIT);
     programs.fine_levels.bind(Some(pack_size(size)));
     recorder.gl.dispatch(groups[0], groups[1]);
-    recorder.continue_pass(Pass::Occluders);
+    recorder.barrier_within_pass(Pass::Occluders);
     programs.coarse_levels.bind(Some(pack_size(size)));
     recorder.gl.dispatch(groups[0].div_ceil(PYRAMID_TILE), groups[1].div_ceil(PYRAMID_TILE));
 }
 
-/// Records the triangles that the ids name, which are the occluders of the next frame. Does nothing without occlusion
-/// culling.
+/// Records the visible triangles as the occluders of the next frame. Does nothing without occlusion culling.
 pub(super) fn record_visible(recorder: &PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
     let FrameContext { buffers, target, programs, .. } = *frame;
     let occlusion = programs.cull.as_ref().and_then(|programs| programs.occlusion.as_ref());

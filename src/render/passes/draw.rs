@@ -1,4 +1,4 @@
-//! Draw calls that several passes share: groups of triangles, listed or not, and the inputs that all passes bind.
+//! Draw calls and bindings that several passes share.
 
 use super::recorder::PassRecorder;
 use crate::device::gl::{Gl, PipelineState, Program};
@@ -12,7 +12,7 @@ use crate::scene_data::geometry::{BlendMode, DrawGroup};
 use crate::uniforms::cascades::ShadowCascades;
 use crate::uniforms::frame::FrameUniforms;
 
-/// Which triangles of a kind a pass draws.
+/// Triangles of a blend mode that a pass draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum TriangleSet {
     All,
@@ -20,18 +20,18 @@ pub(super) enum TriangleSet {
     Visible,
 }
 
-/// A draw of the triangles of one kind.
+/// A draw of the triangles with one blend mode.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct KindDraw<'a> {
+pub(super) struct TriangleDraw<'a> {
     pub(super) blend_mode: BlendMode,
     pub(super) program: &'a Program,
-    pub(super) set: TriangleSet,
+    pub(super) triangles: TriangleSet,
 }
 
 /// Binds the buffers and textures that all passes read.
 pub(super) fn bind_scene(buffers: &SceneBuffers) {
     buffers.position_texture().bind(POSITION_UNIT);
-    for (unit, view) in &buffers.buffer_textures.others {
+    for (unit, view) in &buffers.buffer_textures.unit_views {
         view.bind(*unit);
     }
     buffers.uniforms.frame.bind_uniform(FRAME_BLOCK, size_of::<FrameUniforms>());
@@ -41,12 +41,12 @@ pub(super) fn bind_scene(buffers: &SceneBuffers) {
     for (unit, texture) in (COLOR_UNIT..).zip(&buffers.color_arrays) {
         texture.bind(unit);
     }
-    for (unit, texture) in (NORMAL_UNIT..).zip(&buffers.normals) {
+    for (unit, texture) in (NORMAL_UNIT..).zip(&buffers.normal_arrays) {
         texture.bind(unit);
     }
 }
 
-/// Binds ids and depth. Depth says which samples hold a valid id.
+/// Binds ids and depth. Depth tells which samples have a valid id.
 pub(super) fn bind_visibility(target: &RenderTarget) {
     target.ids.bind(ID_UNIT);
     target.depth.bind(DEPTH_UNIT);
@@ -55,35 +55,35 @@ pub(super) fn bind_visibility(target: &RenderTarget) {
 /// Binds the shadow map for lookups.
 pub(super) fn bind_shadow(buffers: &SceneBuffers) {
     if let Some(map) = &buffers.shadow {
-        map.lookup().bind(SHADOW_UNIT);
+        map.lookup_texture().bind(SHADOW_UNIT);
     }
 }
 
-/// The groups of one kind with their indices.
+/// Draw groups with one blend mode, and their indices.
 pub(super) fn groups_of(buffers: &SceneBuffers, blend_mode: BlendMode) -> impl Iterator<Item = (usize, &DrawGroup)> {
     buffers.groups.iter().enumerate().filter(move |(_, group)| group.blend_mode == blend_mode)
 }
 
-/// Draws the triangles of one kind: one call for single-sided, one for double-sided ones.
+/// Draws the triangles with one blend mode: one call for single-sided and one for double-sided triangles.
 pub(super) fn draw_groups(
     recorder: &mut PassRecorder<'_>,
     buffers: &SceneBuffers,
-    draw: KindDraw<'_>,
+    draw: TriangleDraw<'_>,
     state: PipelineState,
 ) {
     for (index, group) in groups_of(buffers, draw.blend_mode) {
         recorder.gl.set_pipeline_state(PipelineState { cull: !group.double_sided, ..state });
-        draw.program.bind(Some(first_triangle_of(group, draw.set)));
-        draw_group(recorder.gl, buffers, index, draw.set);
+        draw.program.bind(Some(first_triangle_of(group, draw.triangles)));
+        draw_group(recorder.gl, buffers, index, draw.triangles);
         recorder.stats.draw_calls += 1;
     }
 }
 
-/// Draws the triangles of one kind, single- and double-sided alike, with the bound program: in one call, or in one call
-/// per culled list.
-pub(super) fn draw_kind(gl: &Gl, buffers: &SceneBuffers, draw: KindDraw<'_>) {
+/// Draws the triangles with one blend mode without back-face culling, in one call or in one call per culled list. The
+/// program is bound.
+pub(super) fn draw_double_sided(gl: &Gl, buffers: &SceneBuffers, draw: TriangleDraw<'_>) {
     let has_fragments = draw.blend_mode != BlendMode::Opaque;
-    if draw.set == TriangleSet::All {
+    if draw.triangles == TriangleSet::All {
         let (first, count) = buffers.triangles(draw.blend_mode);
         if has_fragments {
             draw.program.set_first_triangle(first as u32);
@@ -95,30 +95,30 @@ pub(super) fn draw_kind(gl: &Gl, buffers: &SceneBuffers, draw: KindDraw<'_>) {
     }
     for (index, group) in groups_of(buffers, draw.blend_mode) {
         if has_fragments {
-            draw.program.set_first_triangle(first_triangle_of(group, draw.set));
+            draw.program.set_first_triangle(first_triangle_of(group, draw.triangles));
         }
-        draw_group(gl, buffers, index, draw.set);
+        draw_group(gl, buffers, index, draw.triangles);
     }
 }
 
-/// The culled lists when the scene is culled, else all triangles.
+/// Selects the culled lists if the scene has them, else all triangles.
 pub(super) fn triangle_set(buffers: &SceneBuffers) -> TriangleSet {
     if buffers.culler.is_some() { TriangleSet::Visible } else { TriangleSet::All }
 }
 
-/// Offset of a group for the shaders: its first triangle, or the complement of it for a list
-/// (`shaders/shared/triangle_id.glsl`).
-pub(super) const fn first_triangle_of(group: &DrawGroup, set: TriangleSet) -> u32 {
-    match set {
+/// Uniform `first_triangle` of `shaders/shared/triangle_id.glsl`: the first triangle of a group, or its complement for a
+/// culled list.
+pub(super) const fn first_triangle_of(group: &DrawGroup, triangles: TriangleSet) -> u32 {
+    match triangles {
         TriangleSet::All => group.first_triangle as u32,
         TriangleSet::Visible => !(group.first_triangle as u32),
     }
 }
 
 /// Draws a group, or the culled list of the group.
-pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, index: usize, set: TriangleSet) {
+pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, index: usize, triangles: TriangleSet) {
     let group = buffers.groups[index];
-    match set {
+    match triangles {
         TriangleSet::All => {
             if let Some(array) = buffers.vertex_array(group.blend_mode) {
                 gl.draw_indexed(array, group.first_triangle, group.triangles);

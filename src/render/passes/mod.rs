@@ -1,7 +1,7 @@
 //! Records the OpenGL commands of each pass.
 //!
-//! A pass is one value of [`Pass`]: its inputs, outputs and barriers are in `accesses`, its commands in the file of its
-//! technique. [`PassRecorder`] issues the barriers, checks for errors and lists the passes that ran.
+//! A pass is a value of [`Pass`]. Its inputs, outputs and barriers are in `accesses`, its commands in the file of its
+//! technique. [`PassRecorder`] issues the barriers, checks for errors and collects statistics.
 
 mod accesses;
 pub(crate) mod aov;

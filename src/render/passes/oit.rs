@@ -1,8 +1,8 @@
 //! Exact order-independent transparency: a list of all blended fragments of each pixel, in bounded memory.
 //!
 //! One pass counts the fragments, a prefix sum allocates a list for each pixel, and another pass fills the lists in any
-//! order. The lists are sorted by depth and id before they are blended, so the picture does not depend on the order of
-//! the fragments.
+//! order. The lists are sorted by depth and id before blending, so the image does not depend on the order of the
+//! fragments.
 
 use super::draw::{bind_shadow, draw_group, first_triangle_of, groups_of, triangle_set};
 use super::recorder::PassRecorder;
@@ -21,34 +21,34 @@ use crate::resources::scene_buffers::SceneBuffers;
 use crate::scene_data::geometry::BlendMode;
 use modalcast_model::error::Result;
 
-/// Resets the counters: nothing is counted, and the number of records per pixel is unlimited.
+/// Resets the counters. The number of records per pixel is unlimited until the allocation.
 fn reset(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
     let mut commands = [[0; 5]; 2];
     for (command, (_, group)) in commands.iter_mut().zip(groups_of(buffers, BlendMode::Blend)) {
         *command = [3 * group.triangles as u32, 0, 3 * group.first_triangle as u32, 0, 0];
     }
     let budget = (target.records.bytes / RECORD_BYTES) as u32;
-    let head = OitCounters { total: [0; 2], max_per_pixel: 0, per_pixel_limit: u32::MAX, used: 0, budget, commands };
+    let header = OitCounters { total: [0; 2], max_per_pixel: 0, per_pixel_limit: u32::MAX, used: 0, budget, commands };
     let mut bytes = vec![0; COUNTERS_BYTES];
-    bytes[..COUNTERS_HEADER_BYTES].copy_from_slice(bytemuck::bytes_of(&head));
+    bytes[..COUNTERS_HEADER_BYTES].copy_from_slice(bytemuck::bytes_of(&header));
     target.counters.write(&bytes);
-    for (index, (place, _)) in groups_of(buffers, BlendMode::Blend).enumerate() {
-        // A culled scene draws only as many indices as are listed.
-        if let Some((_, listed)) = buffers.visible_draws(BlendMode::Blend) {
-            let to = COMMANDS_OFFSET + size_of::<[u32; 5]>() * index;
+    for (index, (group_index, _)) in groups_of(buffers, BlendMode::Blend).enumerate() {
+        // With culling, the number of indices is that of the culled list.
+        if let Some((_, culled_draws)) = buffers.visible_draws(BlendMode::Blend) {
+            let command_in_counters = COMMANDS_OFFSET + size_of::<[u32; 5]>() * index;
             gl.copy(BufferCopy {
-                source: listed,
-                source_offset: command_offset(place) as u64,
+                source: culled_draws,
+                source_offset: command_offset(group_index) as u64,
                 target: &target.counters,
-                target_offset: to as u64,
+                target_offset: command_in_counters as u64,
                 bytes: size_of::<u32>() as u64,
             });
         }
     }
-    target.tiles.write(bytemuck::cast_slice(&EMPTY_TILE_LIST));
+    target.tile_list.write(bytemuck::cast_slice(&EMPTY_TILE_LIST));
 }
 
-/// Draws the layers of the blended triangles in front of the opaque ones, against whose depth they are tested.
+/// Draws the layers of the blended triangles. They are tested against the depth of the opaque triangles.
 pub(super) fn draw(
     recorder: &mut PassRecorder<'_>,
     buffers: &SceneBuffers,
@@ -61,31 +61,31 @@ pub(super) fn draw(
     let gather = Gather { buffers, target, programs, region };
     recorder.begin(Pass::OitCount);
     reset(gl, buffers, target);
-    gl.begin_pass(&target.clear_framebuffer, region, ClearOp::Uint(&target.dirty));
+    gl.begin_pass(&target.counts_fbo, region, ClearOp::Uint(&target.dirty_region));
     target.bind();
     gather.draw(recorder, PHASE_COUNT);
     recorder.finish(Pass::OitCount)?;
     recorder.begin(Pass::OitAllocate);
     programs.histogram.bind(None);
     gl.dispatch(width.div_ceil(HISTOGRAM_TILE), height.div_ceil(HISTOGRAM_TILE));
-    recorder.continue_pass(Pass::OitAllocate);
+    recorder.barrier_within_pass(Pass::OitAllocate);
     programs.allocate.bind(None);
     gl.dispatch(width.div_ceil(TILE), height.div_ceil(TILE));
     recorder.finish(Pass::OitAllocate)?;
     recorder.begin(Pass::OitFill);
     gather.draw(recorder, PHASE_FILL);
-    recorder.continue_pass(Pass::OitFill);
+    recorder.barrier_within_pass(Pass::OitFill);
     gather.draw(recorder, PHASE_JOIN_IDS);
     recorder.finish(Pass::OitFill)?;
     recorder.begin(Pass::OitResolve);
     bind_shadow(buffers);
     target.layers.bind_image(LAYERS_IMAGE);
     programs.resolve.bind(None);
-    gl.dispatch_indirect(&target.tiles);
+    gl.dispatch_indirect(&target.tile_list);
     recorder.finish(Pass::OitResolve)
 }
 
-/// Draws of all blended triangles with the gather program.
+/// Draws all blended triangles with the gather program.
 #[derive(Debug)]
 struct Gather<'a> {
     buffers: &'a SceneBuffers,
@@ -95,21 +95,21 @@ struct Gather<'a> {
 }
 
 impl Gather<'_> {
-    /// Draws one phase. In the last phase the counters give the number of instances: none when all fragments fit.
+    /// Draws one phase. In the last phase, indirect draws have no instances if all fragments fit.
     fn draw(&self, recorder: &mut PassRecorder<'_>, phase: i32) {
         let Self { buffers, target, programs, region } = *self;
         let (gl, set) = (recorder.gl, triangle_set(buffers));
-        let listed = buffers.visible_draws(BlendMode::Blend).map(|(array, _)| array);
-        let Some(array) = listed.or_else(|| buffers.vertex_array(BlendMode::Blend)) else { return };
-        gl.begin_pass(&target.depth_only, region, ClearOp::Load);
-        for (index, (place, group)) in groups_of(buffers, BlendMode::Blend).enumerate() {
+        let culled_array = buffers.visible_draws(BlendMode::Blend).map(|(array, _)| array);
+        let Some(array) = culled_array.or_else(|| buffers.vertex_array(BlendMode::Blend)) else { return };
+        gl.begin_pass(&target.depth_fbo, region, ClearOp::Load);
+        for (index, (group_index, group)) in groups_of(buffers, BlendMode::Blend).enumerate() {
             gl.set_pipeline_state(PipelineState { cull: !group.double_sided, ..PipelineState::default() });
             programs.gather.bind(Some(first_triangle_of(group, set)));
             programs.gather.set_phase(phase);
             if phase == PHASE_JOIN_IDS {
                 gl.draw_indexed_indirect(array, &target.counters, COMMANDS_OFFSET + size_of::<[u32; 5]>() * index);
             } else {
-                draw_group(gl, buffers, place, set);
+                draw_group(gl, buffers, group_index, set);
             }
             recorder.stats.draw_calls += 1;
         }

@@ -1,10 +1,9 @@
-//! Picking: finds the triangles and surface points that the pixels of a small rectangle see on the deformed surface.
-//! Only the rectangle is rendered, as an image of its own with one sample at the center of each pixel, and only the
-//! visible triangles are read back. The host computes the intersections in f64.
+//! Picking: finds the triangles and surface points of the deformed surface that are visible in a small rectangle of
+//! pixels. Only the rectangle is rendered, with one sample at the center of each pixel. The visible triangles are read
+//! back, and the host computes the intersections in f64.
 //!
-//! Beginning and finishing a pick are separate calls, so that the device gets other work in between. Holes of cut-out
-//! materials are holes. Blended triangles cannot be picked; the surface behind them is. The ground is not drawn: it is
-//! never hit and hides nothing.
+//! Beginning and finishing a pick are separate calls, so that the device can do other work in between. Fragments below
+//! the cutoff of a cut-out material are not hit. Blended triangles and the ground are ignored.
 
 use std::rc::Rc;
 use std::sync::Arc;
@@ -33,6 +32,7 @@ use modalcast_model::scene::{Camera, PixelRect, Scene};
 
 /// 32-bit words per pixel that `shaders/pick.comp` writes.
 const WORDS_PER_PIXEL: usize = 22;
+/// Maximum width and height of the rectangle, in pixels.
 const MAX_SIDE: u32 = PixelRect::MAX_SIDE;
 const MAX_BYTES: u64 = 4 * WORDS_PER_PIXEL as u64 * MAX_SIDE as u64 * MAX_SIDE as u64;
 
@@ -44,25 +44,25 @@ pub struct PickHit {
     pub domain: usize,
     /// Index of the triangle in the domain's mesh.
     pub triangle: usize,
-    /// Vertices of the triangle in the domain's mesh (row of U divided by three).
+    /// Vertices of the triangle in the domain's mesh. Vertex i has the rows 3 i to 3 i + 2 of U.
     pub vertices: [u32; 3],
     /// Barycentric coordinates of the point, in the order of `vertices`: 0 to 1, with sum 1.
     pub barycentrics: [f64; 3],
     /// The point, in scene units from the scene's origin.
     pub position: [f64; 3],
-    /// Interpolated unit normal on the visible side; zero when the corner normals cancel.
+    /// Interpolated unit normal on the visible side; zero if the interpolated normal is zero.
     pub normal: [f64; 3],
     /// Distance along the view axis, in scene units.
     pub depth: f64,
 }
 
-/// Begins and finishes picks. The render target is created by the first pick.
+/// Begins and finishes picks. The first pick creates the render target.
 #[derive(Debug)]
 pub(crate) struct Picker {
     gl: Rc<Gl>,
     target: Option<IdTarget>,
     /// Staging buffers of finished picks, for reuse.
-    free: Vec<Buffer>,
+    free_staging: Vec<Buffer>,
 }
 
 /// A pick in flight.
@@ -80,10 +80,10 @@ pub struct PendingPick {
 
 impl Picker {
     pub(crate) fn new(gl: &Rc<Gl>) -> Self {
-        Self { gl: Rc::clone(gl), target: None, free: Vec::new() }
+        Self { gl: Rc::clone(gl), target: None, free_staging: Vec::new() }
     }
 
-    /// Begins a pick in a rectangle of the picture that `shot` describes, without waiting for the device.
+    /// Begins a pick in a rectangle of the picture that `params` describes, without waiting for the device.
     ///
     /// # Errors
     /// `Invalid` for a camera whose matrices overflow, `Fault` when OpenGL reports an error.
@@ -91,13 +91,13 @@ impl Picker {
         &mut self,
         programs: &mut ProgramCache,
         buffers: &SceneBuffers,
-        shot: &FrameParams,
+        params: &FrameParams,
         rectangle: PixelRect,
     ) -> Result<PendingPick> {
         let size @ [width, height] = rectangle.size();
-        let camera = shot.camera.cropped_to([shot.width, shot.height], rectangle);
-        let shot = FrameParams { camera, width, height, ..*shot };
-        let uniforms = FrameUniforms::new(&buffers.scene, &shot, buffers.origin)?;
+        let camera = params.camera.cropped_to([params.width, params.height], rectangle);
+        let params = FrameParams { camera, width, height, ..*params };
+        let uniforms = FrameUniforms::new(&buffers.scene, &params, buffers.origin)?;
         let mask = buffers.mask_program(1, &mut |source| programs.program(source))?;
         let program = programs.program(shaders::readback::pick())?;
         let target = match self.target.take() {
@@ -108,7 +108,7 @@ impl Picker {
             }
         };
         let target = self.target.insert(target);
-        let staging = match self.free.pop() {
+        let staging = match self.free_staging.pop() {
             Some(staging) => staging,
             None => self.gl.buffer(MAX_BYTES, gl::STREAM_READ, None)?,
         };
@@ -118,21 +118,21 @@ impl Picker {
             framebuffer: &target.framebuffer,
             clear: ClearOp::DepthAndIds(None),
             region: Region::whole(size),
-            set: TriangleSet::All,
+            triangles: TriangleSet::All,
             mask: mask.as_deref(),
             opaque_parts: None,
         };
         recorder.begin(Pass::Pick);
         draw_ids(&mut recorder, buffers, &ids)?;
-        let words = WordPass {
+        let word_pass = WordPass {
             pass: Pass::Pick,
             program: &program,
-            number: Some(pack_size(size)),
+            uniform: Some(pack_size(size)),
             size,
             staging: &staging,
             bytes: 4 * (WORDS_PER_PIXEL * width as usize * height as usize) as u64,
         };
-        target.read(&recorder, &words)?;
+        target.read(&recorder, &word_pass)?;
         Ok(PendingPick {
             staging,
             fence: self.gl.fence(Pass::Pick.name())?,
@@ -148,15 +148,16 @@ impl Picker {
     ///
     /// # Errors
     /// `Fault` when the device does not finish in time.
-    pub(crate) fn finish(&mut self, pick: PendingPick, limit: Duration) -> Result<Vec<PickHit>> {
-        pick.fence.wait(Pass::Pick.name(), limit)?;
+    pub(crate) fn finish(&mut self, pick: PendingPick, timeout: Duration) -> Result<Vec<PickHit>> {
+        pick.fence.wait(Pass::Pick.name(), timeout)?;
         let [width, height] = pick.rectangle.size();
         let words = WORDS_PER_PIXEL * width as usize * height as usize;
         let words: Vec<u32> = bytemuck::pod_collect_to_vec(&pick.staging.read(4 * words)?);
-        let rays = PixelRays::of(&pick);
+        let rays = PixelRays::new(&pick);
         let pixels = words.chunks_exact(WORDS_PER_PIXEL).zip(0..);
-        let hits = pixels.filter_map(|(words, at)| hit(&pick, &rays, words, [at % width, at / width])).collect();
-        self.free.push(pick.staging);
+        let hits =
+            pixels.filter_map(|(words, index)| find_hit(&pick, &rays, words, [index % width, index / width])).collect();
+        self.free_staging.push(pick.staging);
         self.gl.check(Pass::Pick.name()).map(|()| hits)
     }
 }
@@ -171,66 +172,76 @@ impl PendingPick {
 /// View rays through the pixels of the rectangle.
 struct PixelRays {
     camera_from_world: Matrix4<f64>,
-    /// fx, fy, cx and cy.
-    lens: [f64; 4],
+    /// fx, fy, cx and cy in pixels.
+    intrinsics: [f64; 4],
 }
 
 impl PixelRays {
-    fn of(pick: &PendingPick) -> Self {
-        let lens = pick.camera.intrinsics(pick.rectangle.size());
-        Self { camera_from_world: pick.camera.camera_from_world(), lens }
+    fn new(pick: &PendingPick) -> Self {
+        let intrinsics = pick.camera.intrinsics(pick.rectangle.size());
+        Self { camera_from_world: pick.camera.camera_from_world(), intrinsics }
     }
 
-    /// Ray from the eye through the center of a pixel, in camera space, one unit of depth long.
-    fn through(&self, [x, y]: [u32; 2]) -> Vector3<f64> {
-        let [fx, fy, cx, cy] = self.lens;
+    /// Ray from the eye through the center of a pixel, in camera space. Its length along the view axis is 1.
+    fn through_pixel(&self, [x, y]: [u32; 2]) -> Vector3<f64> {
+        let [fx, fy, cx, cy] = self.intrinsics;
         Vector3::new((f64::from(x) + 0.5 - cx) / fx, (cy - f64::from(y) - 0.5) / fy, -1.0)
     }
 }
 
-/// Hit of one pixel of the rectangle, from the words that the device wrote.
-fn hit(pick: &PendingPick, rays: &PixelRays, words: &[u32], at: [u32; 2]) -> Option<PickHit> {
-    let VisibilityId::Triangle(place) = VisibilityId::from_id(words[0]) else { return None };
-    let (domain, triangle) = locate_triangle(&pick.spans, place)?;
+/// Finds the hit of a pixel of the rectangle, from the words that `shaders/pick.comp` wrote.
+fn find_hit(pick: &PendingPick, rays: &PixelRays, words: &[u32], pixel: [u32; 2]) -> Option<PickHit> {
+    let VisibilityId::Triangle(triangle_index) = VisibilityId::from_id(words[0]) else { return None };
+    let (domain, triangle) = locate_triangle(&pick.spans, triangle_index)?;
     let mesh = &pick.scene.shapes[pick.scene.domains[domain].shape].mesh;
     let corners = *mesh.triangles().get(triangle)?;
-    let first = pick.scene.layout.domains[domain].first_corner as u32;
+    let first_corner = pick.scene.layout.domains[domain].first_corner as u32;
     // The renderer reverses the winding of some triangles; the result uses the order of the mesh.
-    let drawn: [u32; 3] = [words[1], words[2], words[3]];
-    let order = corners.map(|corner| drawn.iter().position(|own| *own == corner + first).unwrap_or(0));
-    let point = |from: usize, index: usize| {
-        Vector3::from_fn(|axis, _| f64::from(f32::from_bits(words[from + 3 * index + axis])))
+    let drawn_corners: [u32; 3] = [words[1], words[2], words[3]];
+    let drawn_order = corners.map(|corner| {
+        drawn_corners.iter().position(|drawn_corner| *drawn_corner == corner + first_corner).unwrap_or(0)
+    });
+    let attribute = |first_word: usize, index: usize| {
+        Vector3::from_fn(|axis, _| f64::from(f32::from_bits(words[first_word + 3 * index + axis])))
     };
-    let ray = rays.through(at);
-    let in_camera = [0, 1, 2].map(|index| rays.camera_from_world.transform_point(&point(4, index).into()).coords);
-    let (barycentrics, front) = intersect_triangle(&in_camera, &ray);
+    let ray = rays.through_pixel(pixel);
+    let camera_positions =
+        [0, 1, 2].map(|index| rays.camera_from_world.transform_point(&attribute(4, index).into()).coords);
+    let (barycentrics, is_front_facing) = intersect_triangle(&camera_positions, &ray);
     let barycentrics = Vector3::from(barycentrics);
-    let mix = |from: usize| Matrix3::from_columns(&[point(from, 0), point(from, 1), point(from, 2)]) * barycentrics;
-    let normal = mix(13).try_normalize(1e-30).filter(|unit| unit.iter().all(|number| number.is_finite()));
+    let interpolate = |first_word: usize| {
+        Matrix3::from_columns(&[attribute(first_word, 0), attribute(first_word, 1), attribute(first_word, 2)])
+            * barycentrics
+    };
+    let normal = interpolate(13).try_normalize(1e-30).filter(|normal| normal.iter().all(|number| number.is_finite()));
     let normal = normal.unwrap_or_default();
     Some(PickHit {
-        pixel: [pick.rectangle.x() + at[0], pick.rectangle.y() + at[1]],
+        pixel: [pick.rectangle.x() + pixel[0], pick.rectangle.y() + pixel[1]],
         domain,
         triangle,
         vertices: corners.map(|corner| mesh.corners().vertices[corner as usize]),
-        barycentrics: order.map(|index| barycentrics[index]),
-        position: (mix(4) + Vector3::from(pick.origin)).into(),
-        normal: if front { normal } else { -normal }.into(),
-        depth: -(Matrix3::from_columns(&in_camera) * barycentrics).z,
+        barycentrics: drawn_order.map(|index| barycentrics[index]),
+        position: (interpolate(4) + Vector3::from(pick.origin)).into(),
+        normal: if is_front_facing { normal } else { -normal }.into(),
+        depth: -(Matrix3::from_columns(&camera_positions) * barycentrics).z,
     })
 }
 
-/// Barycentric coordinates of the intersection of a ray from the origin with a triangle, and whether its front side is
-/// visible. Corner i has the share d . (v_j x v_k) of their sum. The ray may miss the triangle by the rounding of the
-/// rasterizer (1/256 pixel); negative shares are then clamped to 0. A triangle without screen area gets equal shares.
+/// Barycentric coordinates of the intersection of a ray d from the origin with a triangle, and whether its front side is
+/// visible. The coordinate of corner i is proportional to d . (v_j x v_k). The ray may miss the triangle by the rounding
+/// of the rasterizer (1/256 pixel); negative coordinates are then clamped to 0. The coordinates of a triangle without
+/// screen area are equal.
 fn intersect_triangle([a, b, c]: &[Vector3<f64>; 3], ray: &Vector3<f64>) -> ([f64; 3], bool) {
     let volumes = [b.cross(c), c.cross(a), a.cross(b)].map(|normal| ray.dot(&normal));
     let sum: f64 = volumes.iter().sum();
-    let inside = volumes.map(|volume| (volume / sum).max(0.0));
-    let whole: f64 = inside.iter().sum();
+    let clamped = volumes.map(|volume| (volume / sum).max(0.0));
+    let clamped_sum: f64 = clamped.iter().sum();
     // NaN fails the comparison.
-    let barycentrics =
-        if whole > 0.5 && whole.is_finite() { inside.map(|share| share / whole) } else { [1.0 / 3.0; 3] };
+    let barycentrics = if clamped_sum > 0.5 && clamped_sum.is_finite() {
+        clamped.map(|volume| volume / clamped_sum)
+    } else {
+        [1.0 / 3.0; 3]
+    };
     // Rays point away from the eye, so the front side is visible when the sum is negative.
     (barycentrics, sum < 0.0)
 }
@@ -240,23 +251,31 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_ray_meets_a_triangle_where_its_point_is_and_a_degenerate_one_gives_finite_shares() {
+    fn ray_hits_triangle_at_the_expected_coordinates() {
         let corners = [Vector3::new(-1.0, -1.0, -4.0), Vector3::new(3.0, -1.0, -9.0), Vector3::new(0.5, 2.0, -2.0)];
-        let want = [0.2, 0.5, 0.3];
-        let point: Vector3<f64> = corners.iter().zip(want).map(|(corner, share)| corner * share).sum();
-        let (barycentrics, front) = intersect_triangle(&corners, &(point / -point.z));
-        assert!(barycentrics.iter().zip(want).all(|(got, want)| (got - want).abs() < 1e-14), "{barycentrics:?}");
-        assert!(front, "counter-clockwise");
-        let turned = [corners[0], corners[2], corners[1]];
-        assert!(!intersect_triangle(&turned, &(point / -point.z)).1);
-        for flat in [[corners[0]; 3], [Vector3::zeros(); 3], [corners[0] * f64::NAN; 3]] {
-            let (barycentrics, _) = intersect_triangle(&flat, &Vector3::new(0.1, 0.2, -1.0));
+        let expected = [0.2, 0.5, 0.3];
+        let point: Vector3<f64> = corners.iter().zip(expected).map(|(corner, weight)| corner * weight).sum();
+        let (barycentrics, is_front_facing) = intersect_triangle(&corners, &(point / -point.z));
+        assert!(
+            barycentrics.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-14),
+            "{barycentrics:?}"
+        );
+        assert!(is_front_facing, "counter-clockwise");
+        let reversed = [corners[0], corners[2], corners[1]];
+        assert!(!intersect_triangle(&reversed, &(point / -point.z)).1);
+    }
+
+    #[test]
+    fn degenerate_triangle_gives_finite_coordinates() {
+        let corner = Vector3::new(-1.0, -1.0, -4.0);
+        for degenerate in [[corner; 3], [Vector3::zeros(); 3], [corner * f64::NAN; 3]] {
+            let (barycentrics, _) = intersect_triangle(&degenerate, &Vector3::new(0.1, 0.2, -1.0));
             assert!((barycentrics.iter().sum::<f64>() - 1.0).abs() < 1e-12, "{barycentrics:?}");
         }
     }
 
     #[test]
-    fn a_ray_that_passes_by_is_moved_onto_the_rim() {
+    fn ray_beside_the_triangle_is_clamped_to_its_edge() {
         let corners = [Vector3::new(0.0, 0.0, -1.0), Vector3::new(1.0, 0.0, -1.0), Vector3::new(0.0, 1.0, -1.0)];
         let (barycentrics, _) = intersect_triangle(&corners, &Vector3::new(0.5, -0.01, -1.0));
         assert!(barycentrics[2] == 0.0 && (barycentrics[0] + barycentrics[1] - 1.0).abs() < 1e-15, "{barycentrics:?}");

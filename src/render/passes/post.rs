@@ -1,4 +1,4 @@
-//! Post-processing between shading and output bytes: bloom and tone curve, then the encoding.
+//! Post-processing: bloom, then sRGB encoding to the readback buffer.
 
 use super::recorder::{FrameContext, PassRecorder};
 use crate::device::gl::{Gl, Texture};
@@ -9,36 +9,37 @@ use modalcast_model::error::Result;
 /// Image unit that the bloom writes.
 const DESTINATION_IMAGE: u32 = 0;
 
-/// Spreads the bright light over the picture and applies the tone curve, in place.
+/// Adds bloom to the scene color, in place. The composite program inverts the tone curve, adds the blurred light and
+/// applies the curve again.
 pub(crate) fn bloom(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
     let mips = &frame.target.bloom_mips;
-    let (Some(bloom), Some(coarsest)) = (&frame.buffers.post.bloom, mips.last()) else { return Ok(()) };
+    let (Some(bloom), Some(coarsest_mip)) = (&frame.buffers.post.bloom, mips.last()) else { return Ok(()) };
     recorder.begin(Pass::Bloom);
-    bloom.down.bind(None);
-    for (from, to) in mips.iter().zip(mips.iter().skip(1)) {
-        from.bind(SOURCE_UNIT);
-        to.bind_image(DESTINATION_IMAGE);
-        dispatch_tiles(recorder.gl, to);
-        recorder.continue_pass(Pass::Bloom);
+    bloom.downsample.bind(None);
+    for (source, destination) in mips.iter().zip(mips.iter().skip(1)) {
+        source.bind(SOURCE_UNIT);
+        destination.bind_image(DESTINATION_IMAGE);
+        dispatch_tiles(recorder.gl, destination);
+        recorder.barrier_within_pass(Pass::Bloom);
     }
-    let mut from = coarsest;
-    for (coarser, to) in (1..).zip(mips.iter().skip(1).rev().skip(1)) {
-        bloom.up.bind(Some(coarser));
-        from.bind(SOURCE_UNIT);
-        to.bind_image_read_write(DESTINATION_IMAGE);
-        dispatch_tiles(recorder.gl, to);
-        recorder.continue_pass(Pass::Bloom);
-        from = to;
+    let mut source = coarsest_mip;
+    for (coarser_levels, destination) in (1..).zip(mips.iter().skip(1).rev().skip(1)) {
+        bloom.upsample.bind(Some(coarser_levels));
+        source.bind(SOURCE_UNIT);
+        destination.bind_image_read_write(DESTINATION_IMAGE);
+        dispatch_tiles(recorder.gl, destination);
+        recorder.barrier_within_pass(Pass::Bloom);
+        source = destination;
     }
-    // The last program has no uniform for the number of levels.
-    bloom.last.bind(None);
-    from.bind(SOURCE_UNIT);
+    // The composite program has no uniform `coarser_levels`.
+    bloom.composite.bind(None);
+    source.bind(SOURCE_UNIT);
     frame.target.scene_color.bind_image_read_write(DESTINATION_IMAGE);
     dispatch_tiles(recorder.gl, &frame.target.scene_color);
     recorder.finish(Pass::Bloom)
 }
 
-/// Encodes the picture to bytes in a buffer that can be copied to the host.
+/// Encodes the scene color to sRGB bytes in the readback source.
 pub(crate) fn encode(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
     let target = frame.target;
     recorder.begin(Pass::Encode);
@@ -49,6 +50,7 @@ pub(crate) fn encode(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) 
     recorder.finish(Pass::Encode)
 }
 
-fn dispatch_tiles(gl: &Gl, of: &Texture) {
-    gl.dispatch(of.desc.width.div_ceil(TILE), of.desc.height.div_ceil(TILE));
+/// Dispatches a workgroup for each tile of a texture.
+fn dispatch_tiles(gl: &Gl, texture: &Texture) {
+    gl.dispatch(texture.desc.width.div_ceil(TILE), texture.desc.height.div_ceil(TILE));
 }

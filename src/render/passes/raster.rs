@@ -1,4 +1,4 @@
-//! Passes of the compute rasterizer: its draws, and the conversion of its keys to ids.
+//! Passes of the compute rasterizer: the draws, and the conversion of visibility keys to ids.
 
 use super::recorder::{FrameContext, PassRecorder};
 use crate::layout::{TILE, WORDS_BINDING};
@@ -13,49 +13,49 @@ use modalcast_model::scene::Viewport;
 const IDS_IMAGE: u32 = 0;
 
 impl RasterPasses {
-    /// The pass under whose name the draw of these passes is listed and timed.
-    pub(crate) const fn name(self) -> Pass {
+    /// The pass whose name the draw of these passes has in statistics and times.
+    pub(crate) const fn stats_pass(self) -> Pass {
         if self.shadow { Pass::RasterShadow } else { Pass::RasterVisibility }
     }
 }
 
-/// Draws the selected outputs of this frame.
+/// Draws the selected passes of a frame with the compute rasterizer.
 pub(crate) fn draw(
     recorder: &mut PassRecorder<'_>,
     frame: &FrameContext<'_>,
     compute_rasterizer: &ComputeRasterizer,
     passes: RasterPasses,
 ) -> Result<()> {
-    let FrameContext { buffers, shot, .. } = *frame;
+    let FrameContext { buffers, params, .. } = *frame;
     let (scene, origin) = (&buffers.scene, buffers.origin);
-    let side = scene.look.shadow.map_or(1, |shadow| shadow.size);
-    let map = match passes.shadow {
-        true => Some(Viewport::new(&shadow_clip_from_positions(scene, shot, origin), side, side)?),
+    let map_size = scene.look.shadow.map_or(1, |shadow| shadow.size);
+    let shadow_viewport = match passes.shadow {
+        true => Some(Viewport::new(&shadow_clip_from_positions(scene, params, origin), map_size, map_size)?),
         false => None,
     };
-    let view = Viewport::new(&clip_from_positions(scene, shot, origin), shot.width, shot.height)?;
-    recorder.begin(passes.name());
-    compute_rasterizer.draw(recorder.gl, map.as_ref(), passes.visibility.then_some(&view))?;
-    recorder.stats.passes.push(passes.name());
+    let frame_viewport = Viewport::new(&clip_from_positions(scene, params, origin), params.width, params.height)?;
+    recorder.begin(passes.stats_pass());
+    compute_rasterizer.draw(recorder.gl, shadow_viewport.as_ref(), passes.visibility.then_some(&frame_viewport))?;
+    recorder.stats.passes.push(passes.stats_pass());
     recorder.stats.raster_backends.shadow = passes.shadow.then_some(RasterBackend::Cuda);
     recorder.stats.raster_backends.visibility = passes.visibility.then_some(RasterBackend::Cuda);
     Ok(())
 }
 
-/// Converts the keys to the ids that the camera sees, including the ground.
+/// Converts the visibility keys to ids, and adds the ground.
 pub(crate) fn unpack(
     recorder: &mut PassRecorder<'_>,
     frame: &FrameContext<'_>,
     compute_rasterizer: &ComputeRasterizer,
 ) -> Result<()> {
     let target = frame.target;
-    let missing = || fault_in(Pass::Unpack.name())("no keys were drawn");
-    let (keys, program) = compute_rasterizer.unpack_input().ok_or_else(missing)?;
+    let missing_keys = || fault_in(Pass::Unpack.name())("no keys were drawn");
+    let (keys, program) = compute_rasterizer.unpack_input().ok_or_else(missing_keys)?;
     recorder.begin(Pass::Unpack);
     program.bind(None);
     keys.bind_storage(WORDS_BINDING);
     target.ids.bind_image(IDS_IMAGE);
-    target.dirty.ids.mark_all();
+    target.dirty_regions.ids.mark_all();
     recorder.gl.dispatch(target.desc.width.div_ceil(TILE), target.desc.height.div_ceil(TILE));
     recorder.finish(Pass::Unpack)
 }

@@ -1,4 +1,4 @@
-//! Readback of ids as words in a buffer: the common part of visibility readback, picking and AOV readback.
+//! Conversion of ids to 32-bit words and their readback: the common part of visibility readback, picking and AOVs.
 
 use std::rc::Rc;
 
@@ -11,7 +11,7 @@ use crate::resources::target::RenderTarget;
 use crate::resources::target_desc::{TargetDesc, create_image};
 use modalcast_model::error::Result;
 
-/// Ids and depth without the other images of a frame, and the buffer of the words that are read back.
+/// Render target with ids and depth only, and the buffer of the words to read back.
 #[derive(Debug)]
 pub(super) struct IdTarget {
     pub(super) ids: Texture,
@@ -19,16 +19,17 @@ pub(super) struct IdTarget {
     pub(super) readback_source: Buffer,
 }
 
-/// A conversion of ids to words.
+/// Parameters of a conversion of ids to words.
 #[derive(Debug)]
 pub(super) struct WordPass<'a> {
     pub(super) pass: Pass,
     pub(super) program: &'a Program,
     /// Uniform at location 0 of programs that have one.
-    pub(super) number: Option<u32>,
+    pub(super) uniform: Option<u32>,
+    /// Width and height in pixels.
     pub(super) size: [u32; 2],
     pub(super) staging: &'a Buffer,
-    /// Bytes that are copied to the staging buffer.
+    /// Bytes to copy to the staging buffer.
     pub(super) bytes: u64,
 }
 
@@ -42,14 +43,14 @@ impl IdTarget {
         })
     }
 
-    /// Converts the ids that the pass has drawn, and copies the words to the staging buffer.
-    pub(super) fn read(&self, recorder: &PassRecorder<'_>, words: &WordPass<'_>) -> Result<()> {
+    /// Converts the ids of this target, and copies the words to the staging buffer.
+    pub(super) fn read(&self, recorder: &PassRecorder<'_>, word_pass: &WordPass<'_>) -> Result<()> {
         self.ids.bind(ID_UNIT);
-        convert(recorder, &self.readback_source, words)
+        convert_ids(recorder, &self.readback_source, word_pass)
     }
 }
 
-/// Copies the id that each pixel's first sample sees to a staging buffer of `desc.bytes()` bytes, top row first.
+/// Copies the id of the first sample of each pixel to a staging buffer of `desc.encoded_bytes()` bytes, top row first.
 pub(crate) fn read_visibility(
     recorder: &PassRecorder<'_>,
     target: &RenderTarget,
@@ -59,33 +60,33 @@ pub(crate) fn read_visibility(
     recorder.begin(Pass::VisibilityReadback);
     bind_visibility(target);
     let size = [target.desc.width, target.desc.height];
-    let bytes = target.desc.bytes();
-    let words = WordPass { pass: Pass::VisibilityReadback, program, number: None, size, staging, bytes };
-    convert(recorder, &target.readback_source, &words)
+    let bytes = target.desc.encoded_bytes();
+    let word_pass = WordPass { pass: Pass::VisibilityReadback, program, uniform: None, size, staging, bytes };
+    convert_ids(recorder, &target.readback_source, &word_pass)
 }
 
 /// Copies the pixels of a frame, then its list and culling statistics, to a staging buffer.
 pub(crate) fn copy_frame(recorder: &PassRecorder<'_>, frame: &FrameContext<'_>, staging: &Buffer) -> Result<()> {
     let FrameContext { buffers, target, .. } = *frame;
     recorder.begin(Pass::Read);
-    recorder.gl.copy(BufferCopy::first(target.desc.bytes(), &target.readback_source, staging));
+    recorder.gl.copy(BufferCopy::first(target.desc.encoded_bytes(), &target.readback_source, staging));
     let counters =
         [target.oit.as_ref().map(|oit| &oit.counters), buffers.culler.as_ref().map(|culler| &culler.buffers.counters)];
-    for (from, to) in counters.into_iter().zip(target.desc.readback_ranges()) {
-        if let Some(from) = from.filter(|_| !to.is_empty()) {
-            let copy = BufferCopy::first(to.end - to.start, from, staging);
-            recorder.gl.copy(BufferCopy { target_offset: to.start, ..copy });
+    for (source, range) in counters.into_iter().zip(target.desc.readback_ranges()) {
+        if let Some(source) = source.filter(|_| !range.is_empty()) {
+            let copy = BufferCopy::first(range.end - range.start, source, staging);
+            recorder.gl.copy(BufferCopy { target_offset: range.start, ..copy });
         }
     }
     recorder.check(Pass::Read)
 }
 
-/// Runs the conversion of the bound ids.
-fn convert(recorder: &PassRecorder<'_>, readback_source: &Buffer, words: &WordPass<'_>) -> Result<()> {
-    words.program.bind(words.number);
+/// Converts the bound ids, and copies the words to the staging buffer.
+fn convert_ids(recorder: &PassRecorder<'_>, readback_source: &Buffer, word_pass: &WordPass<'_>) -> Result<()> {
+    word_pass.program.bind(word_pass.uniform);
     readback_source.bind_storage(WORDS_BINDING);
-    recorder.gl.dispatch(words.size[0].div_ceil(WORKGROUP_SIZE), words.size[1]);
-    recorder.continue_pass(words.pass);
-    recorder.gl.copy(BufferCopy::first(words.bytes, readback_source, words.staging));
-    recorder.check(words.pass)
+    recorder.gl.dispatch(word_pass.size[0].div_ceil(WORKGROUP_SIZE), word_pass.size[1]);
+    recorder.barrier_within_pass(word_pass.pass);
+    recorder.gl.copy(BufferCopy::first(word_pass.bytes, readback_source, word_pass.staging));
+    recorder.check(word_pass.pass)
 }

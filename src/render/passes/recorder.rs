@@ -1,4 +1,4 @@
-//! What all passes of a frame use, and the bookkeeping of a pass.
+//! Inputs that all passes of a frame share, and the recorder of passes.
 
 use std::rc::Rc;
 
@@ -17,10 +17,10 @@ pub(crate) struct FrameContext<'a> {
     pub(crate) buffers: &'a SceneBuffers,
     pub(crate) target: &'a RenderTarget,
     pub(crate) programs: &'a SampleCountPrograms,
-    pub(crate) shot: &'a FrameParams,
+    pub(crate) params: &'a FrameParams,
 }
 
-/// Records passes, and collects the statistics of those that ran.
+/// Issues the barriers of passes, checks for errors, and collects statistics.
 #[derive(Debug)]
 pub(crate) struct PassRecorder<'a> {
     pub(crate) gl: &'a Rc<Gl>,
@@ -33,15 +33,15 @@ impl PassRecorder<'_> {
         self.gl.barrier(barrier_before(pass));
     }
 
-    /// Issues the barrier between two commands of a pass, the later of which uses what the earlier one wrote.
-    pub(super) fn continue_pass(&self, pass: Pass) {
+    /// Issues the barrier between two commands of a pass, if the second uses outputs of the first.
+    pub(super) fn barrier_within_pass(&self, pass: Pass) {
         self.gl.barrier(barrier_within(pass));
     }
 
-    /// Lists a pass as one that ran.
+    /// Adds a pass to the statistics as executed.
     ///
     /// # Errors
-    /// `Fault` of the pass when OpenGL reported an error.
+    /// `Fault` of the pass if OpenGL reported an error.
     pub(super) fn finish(&mut self, pass: Pass) -> Result<()> {
         self.stats.passes.push(pass);
         self.check(pass)

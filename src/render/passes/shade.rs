@@ -1,4 +1,4 @@
-//! Deferred shading of the visible surfaces to linear light, tile by tile.
+//! Deferred shading of the visible surfaces.
 
 use super::draw::{bind_shadow, bind_visibility};
 use super::recorder::{FrameContext, PassRecorder};
@@ -6,35 +6,35 @@ use crate::layout::{COUNT_UNIT, EMPTY_TILE_LIST, LAYER_UNIT, TILE, TILES_BINDING
 use crate::pass::Pass;
 use modalcast_model::error::Result;
 
-/// Image units of the shading.
+/// Image units of the outputs.
 const COLOR_IMAGE: u32 = 0;
 const BLOOM_IMAGE: u32 = 1;
 
-/// Shades tiles without opaque triangles and lists the others, then shades those.
+/// Shades tiles without opaque triangles and lists the other tiles; then shades the listed tiles.
 pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
     let FrameContext { buffers, target, programs, .. } = *frame;
     recorder.begin(Pass::Background);
     bind_shadow(buffers);
     bind_visibility(target);
-    if let Some(layer) = &target.layer {
+    if let Some(layer) = &target.blend_layer {
         layer.color.bind(LAYER_UNIT);
     }
     if let Some(oit) = &target.oit {
         oit.layers.bind(LAYER_UNIT);
-        oit.counts.bind(COUNT_UNIT);
+        oit.fragment_counts.bind(COUNT_UNIT);
     }
     target.scene_color.bind_image(COLOR_IMAGE);
     if let Some(source) = target.bloom_mips.first() {
         source.bind_image(BLOOM_IMAGE);
     }
-    target.tiles.write(bytemuck::cast_slice(&EMPTY_TILE_LIST));
-    target.tiles.bind_storage(TILES_BINDING);
+    target.tile_list.write(bytemuck::cast_slice(&EMPTY_TILE_LIST));
+    target.tile_list.bind_storage(TILES_BINDING);
     programs.background.bind(None);
     recorder.gl.dispatch(target.desc.width.div_ceil(TILE), target.desc.height.div_ceil(TILE));
     recorder.finish(Pass::Background)?;
     let Some(program) = &programs.shade else { return Ok(()) };
     recorder.begin(Pass::Shade);
     program.bind(None);
-    recorder.gl.dispatch_indirect(&target.tiles);
+    recorder.gl.dispatch_indirect(&target.tile_list);
     recorder.finish(Pass::Shade)
 }

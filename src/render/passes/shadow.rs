@@ -1,7 +1,7 @@
-//! Draws the shadow map: depth from the sun and, for a variance map, its blurred moments.
+//! Draws the shadow map: depth from the sun, and the blurred moments of a variance shadow map.
 
 use super::cull::cull_shadow_casters;
-use super::draw::{KindDraw, draw_kind, triangle_set};
+use super::draw::{TriangleDraw, draw_double_sided, triangle_set};
 use super::recorder::PassRecorder;
 use crate::device::gl::{ClearOp, PipelineState, Program, Texture};
 use crate::layout::{SOURCE_UNIT, WORDS_BINDING, WORKGROUP_SIZE};
@@ -22,7 +22,7 @@ const DESTINATION_IMAGE: u32 = 0;
 pub(crate) fn draw_depth(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> Result<()> {
     let Some(map) = buffers.shadow.as_ref().filter(|_| buffers.shadow_rasterizer().is_none()) else { return Ok(()) };
     recorder.stats.raster_backends.shadow = Some(RasterBackend::OpenGl);
-    let (size, set) = (map.shadow.size, triangle_set(buffers));
+    let (size, triangles) = (map.shadow.size, triangle_set(buffers));
     for (layer, framebuffer) in (0..).zip(&map.framebuffers) {
         cull_shadow_casters(recorder, buffers, size, |program| set_layer(program, map, layer))?;
         recorder.begin(Pass::Shadow);
@@ -34,7 +34,7 @@ pub(crate) fn draw_depth(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers
             let Some(program) = program else { continue };
             program.bind(None);
             set_layer(program, map, layer);
-            draw_kind(recorder.gl, buffers, KindDraw { blend_mode, program, set });
+            draw_double_sided(recorder.gl, buffers, TriangleDraw { blend_mode, program, triangles });
         }
     }
     if buffers.culler.is_some() {
@@ -50,53 +50,55 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> R
     let gl = recorder.gl;
     let mut programs: Vec<&Program> = buffers.programs.blur.iter().map(AsRef::as_ref).collect();
     recorder.begin(Pass::Blur);
-    if let (Some((depths, program)), Some(first)) =
+    if let (Some((depths, buffer_program)), Some(first_program)) =
         (buffers.shadow_rasterizer().and_then(ComputeRasterizer::blur_input), programs.first_mut())
     {
-        *first = program;
+        *first_program = buffer_program;
         depths.bind_storage(WORDS_BINDING);
     }
     for layer in 0..map.shadow.splits {
         match (programs.as_slice(), &blurred.horizontal) {
-            ([both], None) => {
-                let groups = texels_per_workgroup(&map.shadow).map(|side| map.shadow.size.div_ceil(side));
-                bind_blur(both, &map.depth, map, layer);
+            ([program], None) => {
+                let workgroups = texels_per_workgroup(&map.shadow).map(|side| map.shadow.size.div_ceil(side));
+                bind_blur(program, &map.depth, map, layer);
                 blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
-                gl.dispatch(groups[0], groups[1]);
+                gl.dispatch(workgroups[0], workgroups[1]);
             }
-            ([x, y], Some(horizontal)) if blurred.framebuffers.is_empty() => {
-                let (size, runs) = (map.shadow.size, map.shadow.size.div_ceil(TEXELS_PER_INVOCATION));
-                // The previous layer has read the image that this one writes.
-                recorder.continue_pass(Pass::Blur);
-                bind_blur(x, &map.depth, map, layer);
+            ([x_program, y_program], Some(horizontal)) if blurred.framebuffers.is_empty() => {
+                let (size, run_count) = (map.shadow.size, map.shadow.size.div_ceil(TEXELS_PER_INVOCATION));
+                // Wait until the previous layer has read `horizontal`.
+                recorder.barrier_within_pass(Pass::Blur);
+                bind_blur(x_program, &map.depth, map, layer);
                 horizontal.bind_image(DESTINATION_IMAGE);
-                gl.dispatch(runs.div_ceil(WORKGROUP_SIZE), size);
-                recorder.continue_pass(Pass::Blur);
-                bind_blur(y, horizontal, map, layer);
+                gl.dispatch(run_count.div_ceil(WORKGROUP_SIZE), size);
+                recorder.barrier_within_pass(Pass::Blur);
+                bind_blur(y_program, horizontal, map, layer);
                 blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
-                gl.dispatch(size.div_ceil(WORKGROUP_SIZE), runs);
+                gl.dispatch(size.div_ceil(WORKGROUP_SIZE), run_count);
             }
-            ([x, y], Some(horizontal)) => {
+            ([x_program, y_program], Some(horizontal)) => {
                 gl.set_pipeline_state(PipelineState::default());
-                let into = [&blurred.framebuffers[0], &blurred.framebuffers[1 + layer as usize]];
-                for ((program, from), into) in [(x, &map.depth), (y, horizontal)].into_iter().zip(into) {
-                    bind_blur(program, from, map, layer);
-                    gl.draw_fullscreen_triangle(into, map.shadow.size, &buffers.empty_vertex_array);
+                let framebuffers = [&blurred.framebuffers[0], &blurred.framebuffers[1 + layer as usize]];
+                for ((program, source), framebuffers) in
+                    [(x_program, &map.depth), (y_program, horizontal)].into_iter().zip(framebuffers)
+                {
+                    bind_blur(program, source, map, layer);
+                    gl.draw_fullscreen_triangle(framebuffers, map.shadow.size, &buffers.empty_vertex_array);
                 }
             }
-            _ => return Err(fault_in(Pass::Blur.name())("the plan has no program for this map")),
+            _ => return Err(fault_in(Pass::Blur.name())("the blur programs do not match the shadow map")),
         }
     }
     recorder.finish(Pass::Blur)
 }
 
-fn bind_blur(program: &Program, from: &Texture, map: &ShadowMap, layer: u32) {
+fn bind_blur(program: &Program, source: &Texture, map: &ShadowMap, layer: u32) {
     program.bind(None);
-    from.bind(SOURCE_UNIT);
+    source.bind(SOURCE_UNIT);
     set_layer(program, map, layer);
 }
 
-/// Sets the layer of the bound program, which has that uniform only when the map is split.
+/// Sets the layer of the bound program. The uniform exists only if the map is split.
 fn set_layer(program: &Program, map: &ShadowMap, layer: u32) {
     if map.shadow.splits > 1 {
         program.set_layer(layer);

@@ -1,5 +1,5 @@
-//! Writes the uniforms of a frame and resets its counters, with stream-ordered commands: frames in flight keep their
-//! own values.
+//! Writes the uniforms of a frame and resets its counters. The commands are stream-ordered, so frames in flight keep
+//! their values.
 
 use super::draw::bind_scene;
 use super::recorder::PassRecorder;
@@ -10,16 +10,16 @@ use crate::types::FrameParams;
 use crate::uniforms::cascades::ShadowCascades;
 use crate::uniforms::frame::{FrameUniforms, light_box_params};
 
-/// Writes and binds the uniforms of a picture.
-pub(crate) fn upload(recorder: &PassRecorder<'_>, buffers: &SceneBuffers, shot: &FrameParams, frame: &FrameUniforms) {
+/// Writes and binds the uniforms of a frame.
+pub(crate) fn upload(recorder: &PassRecorder<'_>, buffers: &SceneBuffers, params: &FrameParams, frame: &FrameUniforms) {
     recorder.begin(Pass::UniformUpload);
     upload_frame(buffers, frame);
     if let Some(culler) = &buffers.culler {
         culler.buffers.counters.write(&[0; COUNTER_BYTES]);
     }
     if let Some(cascades) = &buffers.uniforms.cascades {
-        let fit = light_box_params(&buffers.scene, shot, buffers.origin);
-        cascades.write(bytemuck::bytes_of(&ShadowCascades::new(&buffers.scene, shot, &fit, buffers.origin)));
+        let box_params = light_box_params(&buffers.scene, params, buffers.origin);
+        cascades.write(bytemuck::bytes_of(&ShadowCascades::new(&buffers.scene, params, &box_params, buffers.origin)));
     }
 }
 

@@ -1,6 +1,6 @@
 //! Visibility buffer: the triangle id and the depth of each sample.
 
-use super::draw::{KindDraw, TriangleSet, draw_groups, triangle_set};
+use super::draw::{TriangleDraw, TriangleSet, draw_groups, triangle_set};
 use super::recorder::{FrameContext, PassRecorder};
 use crate::device::gl::{ClearOp, Framebuffer, PipelineState, Program};
 use crate::pass::Pass;
@@ -11,70 +11,69 @@ use crate::types::{FrameParams, RasterBackend};
 use crate::uniforms::frame::camera_is_above_ground;
 use modalcast_model::error::Result;
 
-/// A draw of ids and depth into `region` of a framebuffer that is at least as large as the region's frame.
+/// Parameters of a draw of ids and depth. The framebuffer is at least as large as the region's frame.
 #[derive(Debug)]
 pub(super) struct IdDraw<'a> {
     pub(super) framebuffer: &'a Framebuffer,
     pub(super) clear: ClearOp<'a>,
     pub(super) region: Region,
-    pub(super) set: TriangleSet,
+    pub(super) triangles: TriangleSet,
     /// Draws cut-outs; none without such triangles.
     pub(super) mask: Option<&'a Program>,
     /// Draws the opaque parts of blended triangles; none if they are ignored.
     pub(super) opaque_parts: Option<&'a Program>,
 }
 
-/// Draws the id and depth of each sample, of the ground too if it must be rasterized.
-pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, ground: bool) -> Result<()> {
-    let FrameContext { buffers, target, programs, shot } = *frame;
-    // With several samples, depth says where an id is valid; the ids need no clear.
+/// Draws the id and depth of each sample. `draws_ground`: whether the ground must be rasterized.
+pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, draws_ground: bool) -> Result<()> {
+    let FrameContext { buffers, target, programs, params } = *frame;
+    // Multisampled ids are not cleared: the depth tells which ids are valid.
     let clear = match target.desc.samples {
-        1 => ClearOp::DepthAndIds(Some(&target.dirty)),
-        _ => ClearOp::Depth(Some(&target.dirty.depth)),
+        1 => ClearOp::DepthAndIds(Some(&target.dirty_regions)),
+        _ => ClearOp::Depth(Some(&target.dirty_regions.depth)),
     };
     recorder.begin(Pass::Visibility);
     let ids = IdDraw {
         framebuffer: &target.visibility_fbo,
         clear,
         region: target.draw_region.get(),
-        set: triangle_set(buffers),
+        triangles: triangle_set(buffers),
         mask: programs.mask.as_deref(),
         opaque_parts: programs.opaque_parts.as_deref(),
     };
     draw_ids(recorder, buffers, &ids)?;
     super::cull::record_visible(recorder, frame)?;
-    if ground { draw_ground(recorder, buffers, shot) } else { Ok(()) }
+    if draws_ground { draw_ground(recorder, buffers, params) } else { Ok(()) }
 }
 
-/// Draws ids and depth of all kinds of triangles that have a program.
+/// Draws ids and depth of the triangles of each blend mode that has a program.
 pub(super) fn draw_ids(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, ids: &IdDraw<'_>) -> Result<()> {
     recorder.gl.begin_pass(ids.framebuffer, ids.region, ids.clear);
-    // Cut-outs come after opaque triangles: where something opaque is nearer, the depth test saves their texture
-    // lookups.
-    let kinds = [
+    // Cut-outs are drawn after opaque triangles, so that the depth test can save their texture lookups.
+    let programs = [
         (BlendMode::Opaque, buffers.programs.opaque.as_deref()),
         (BlendMode::Mask, ids.mask),
         (BlendMode::Blend, ids.opaque_parts),
     ];
     let state = PipelineState { depth_write: true, ..PipelineState::default() };
-    let mut any = false;
-    for (blend_mode, program) in kinds {
+    let mut has_triangles = false;
+    for (blend_mode, program) in programs {
         if let Some(program) = program {
-            draw_groups(recorder, buffers, KindDraw { blend_mode, program, set: ids.set }, state);
-            any = true;
+            draw_groups(recorder, buffers, TriangleDraw { blend_mode, program, triangles: ids.triangles }, state);
+            has_triangles = true;
         }
     }
-    if any {
+    if has_triangles {
         recorder.stats.passes.push(Pass::Visibility);
         recorder.stats.raster_backends.visibility = Some(RasterBackend::OpenGl);
     }
     recorder.check(Pass::Visibility)
 }
 
-/// Draws the ground into ids and depth of the bound framebuffer. A picture draws it only when something lies below it;
-/// otherwise the shading finds the ground.
-pub(super) fn draw_ground(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, shot: &FrameParams) -> Result<()> {
-    let Some(program) = buffers.programs.ground.as_ref().filter(|_| camera_is_above_ground(&buffers.scene, shot))
+/// Draws the ground into ids and depth of the bound framebuffer. A frame draws it only if something lies below it;
+/// otherwise the shading adds the ground.
+pub(super) fn draw_ground(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, params: &FrameParams) -> Result<()> {
+    let Some(program) = buffers.programs.ground.as_ref().filter(|_| camera_is_above_ground(&buffers.scene, params))
     else {
         return Ok(());
     };

@@ -6,64 +6,67 @@ use crate::resources::scene_buffers::SceneBuffers;
 use crate::types::{FrameParams, RasterBackend, RasterBackends};
 use modalcast_model::error::Result;
 
-/// Frames per combination; the first one warms up, and the median of the others counts.
+/// Frames per combination. The first one warms up; the result is the median of the others.
 const TRIAL_FRAMES: usize = 6;
 
 impl Renderer {
-    /// Times all combinations of OpenGL and the compute rasterizer for shadow map and visibility, and keeps the
-    /// fastest: the cost of one pass depends on who draws the other. Returns the choice, which is OpenGL without a
-    /// compute rasterizer. A compute rasterizer that draws nothing is dropped.
+    /// Selects the fastest combination of OpenGL and the compute rasterizer for shadow map and visibility, and returns it.
+    /// All combinations are timed, because the time of one pass depends on the rasterizer of the other. A compute
+    /// rasterizer that draws no pass is dropped. Without a compute rasterizer, no backends are returned.
     ///
     /// # Errors
-    /// Those of drawing. The compute rasterizer then draws the passes that it drew before.
-    pub fn select_raster_backends(&mut self, buffers: &mut SceneBuffers, shot: &FrameParams) -> Result<RasterBackends> {
+    /// Errors of drawing. The compute rasterizer then draws the same passes as before.
+    pub fn select_raster_backends(
+        &mut self,
+        buffers: &mut SceneBuffers,
+        params: &FrameParams,
+    ) -> Result<RasterBackends> {
         let Some(rasterizer) = &buffers.compute_rasterizer else { return Ok(RasterBackends::default()) };
-        let able = rasterizer.enabled();
-        let fastest = self.fastest_combination(buffers, shot, able);
+        let supported_passes = rasterizer.enabled();
+        let fastest = self.find_fastest_passes(buffers, params, supported_passes);
         let Some(rasterizer) = &buffers.compute_rasterizer else { return Ok(RasterBackends::default()) };
-        let chosen = fastest.inspect_err(|_| rasterizer.enable(able))?;
-        rasterizer.enable(chosen);
-        if !chosen.any() {
+        let fastest_passes = fastest.inspect_err(|_| rasterizer.enable(supported_passes))?;
+        rasterizer.enable(fastest_passes);
+        if !fastest_passes.has_any() {
             buffers.compute_rasterizer = None;
         }
         let backend = |is_compute: bool| Some(if is_compute { RasterBackend::Cuda } else { RasterBackend::OpenGl });
-        Ok(RasterBackends { shadow: backend(chosen.shadow), visibility: backend(chosen.visibility) })
+        Ok(RasterBackends { shadow: backend(fastest_passes.shadow), visibility: backend(fastest_passes.visibility) })
     }
 
-    /// The fastest combination of passes for the compute rasterizer, among those that it is able to draw. Leaves the
-    /// last combination enabled.
-    fn fastest_combination(
+    /// Times all subsets of the supported passes, and returns the fastest. Leaves the last subset enabled.
+    fn find_fastest_passes(
         &mut self,
         buffers: &SceneBuffers,
-        shot: &FrameParams,
-        able: RasterPasses,
+        params: &FrameParams,
+        supported_passes: RasterPasses,
     ) -> Result<RasterPasses> {
         let Some(rasterizer) = &buffers.compute_rasterizer else { return Ok(RasterPasses::NONE) };
-        let mut measured = Vec::new();
+        let mut timings = Vec::new();
         for (shadow, visibility) in [(false, false), (true, false), (false, true), (true, true)] {
             let combination = RasterPasses { shadow, visibility };
-            if !combination.is_subset_of(able) {
+            if !combination.is_subset_of(supported_passes) {
                 continue;
             }
             rasterizer.enable(combination);
-            let ms = self.median_ms(buffers, shot)?;
-            // A combination that failed was disabled, and the timing is that of OpenGL.
+            let ms = self.measure_median_ms(buffers, params)?;
+            // After an error, the compute rasterizer is disabled and the time is that of OpenGL.
             if rasterizer.enabled() == combination {
-                measured.push((combination, ms));
+                timings.push((combination, ms));
             }
         }
-        tracing::info!(?measured, "milliseconds per frame by the passes of the compute rasterizer");
-        let fastest = measured.into_iter().min_by(|one, other| one.1.total_cmp(&other.1));
+        tracing::info!(measured = ?timings, "milliseconds per frame by the passes of the compute rasterizer");
+        let fastest = timings.into_iter().min_by(|(_, a_ms), (_, b_ms)| a_ms.total_cmp(b_ms));
         Ok(fastest.map_or(RasterPasses::NONE, |(combination, _)| combination))
     }
 
-    /// Median milliseconds of a frame including its shadow map, without readback.
-    fn median_ms(&mut self, buffers: &SceneBuffers, shot: &FrameParams) -> Result<f64> {
+    /// Median time of a frame in milliseconds, including its shadow map, without readback.
+    fn measure_median_ms(&mut self, buffers: &SceneBuffers, params: &FrameParams) -> Result<f64> {
         let mut times = Vec::new();
         for _ in 0..TRIAL_FRAMES {
             buffers.shadow_cache.invalidate();
-            // Submitted unread, so that the trial does not compete for the staging buffers of frames in flight.
-            let ticket = self.submit_without_readback(buffers, shot)?;
+            // Without readback, the trial needs no staging buffer, which frames in flight may occupy.
+            let ticket = self.submit_without_readback(buffers, params)?;
             times.push(self.read_image(ticket)?.times.drawing_ms());
         }
         times.remove(0);

@@ -1,4 +1,5 @@
-//! Negative controls: culling tests that remove too much change the picture. Also tests which scenes are culled at all.
+//! Negative controls of culling: tests that remove too many triangles change the image. Also tests when culling is
+//! omitted.
 
 use std::rc::Rc;
 use std::sync::Arc;
@@ -17,39 +18,47 @@ use modalcast_model::scene::{Camera, Culling, Lens, Scene, View};
 
 /// A sheet of 24 x 24 squares behind a smaller sheet; both are single-sided.
 fn sheets() -> Arc<Scene> {
-    let mut rest = Vec::new();
+    let mut rest_positions = Vec::new();
     let mut indices = Vec::new();
-    for (half, z) in [(2.0, 0.0), (1.0, 0.5)] {
-        for index in 0..24_u32 * 24 {
-            let [x, y] = [index % 24, index / 24].map(|step| half * (step as f32 / 12.0 - 1.0));
-            let (first, side) = (rest.len() as u32, half / 12.0);
-            rest.extend([[x, y, z], [x + side, y, z], [x + side, y + side, z], [x, y + side, z]]);
-            indices.extend([[first, first + 1, first + 2], [first, first + 2, first + 3]]);
+    for (half_side, z) in [(2.0, 0.0), (1.0, 0.5)] {
+        for square in 0..24_u32 * 24 {
+            let [x, y] = [square % 24, square / 24].map(|step| half_side * (step as f32 / 12.0 - 1.0));
+            let (first_vertex, square_side) = (rest_positions.len() as u32, half_side / 12.0);
+            rest_positions.extend([
+                [x, y, z],
+                [x + square_side, y, z],
+                [x + square_side, y + square_side, z],
+                [x, y + square_side, z],
+            ]);
+            indices.extend([
+                [first_vertex, first_vertex + 1, first_vertex + 2],
+                [first_vertex, first_vertex + 2, first_vertex + 3],
+            ]);
         }
     }
-    let normals = vec![[0.0, 0.0, 1.0]; rest.len()];
-    let mesh = Mesh::from_indexed(rest, normals, vec![], indices).expect("sheets");
+    let normals = vec![[0.0, 0.0, 1.0]; rest_positions.len()];
+    let mesh = Mesh::from_indexed(rest_positions, normals, vec![], indices).expect("sheets");
     let mut parts = squares(vec![Material::default()]);
     parts.shapes[0] = Shape::new(mesh, Modes::rigid()).expect("rigid");
     parts.look.culling = Culling::Occlusion;
     (parts.look.shadow, parts.look.ground) = (None, None);
-    Scene::new(parts).expect("good")
+    Scene::new(parts).expect("a valid scene")
 }
 
-/// The second frame of a scene whose culling shader has `greedy` in place of `just`.
-fn picture(scene: &Arc<Scene>, (just, greedy): (&str, &str)) -> Vec<u8> {
+/// Draws the second frame of a scene, with `original` replaced by `replacement` in the culling shader.
+fn draw_second_frame(scene: &Arc<Scene>, (original, replacement): (&str, &str)) -> Vec<u8> {
     let mut renderer = Renderer::open(DevicePreference::Any).expect("EGL and OpenGL 4.3");
-    let (gl, places) = (Rc::clone(&renderer.gl), renderer.sample_positions.clone());
-    let mut found = false;
+    let (gl, sample_positions) = (Rc::clone(&renderer.gl), renderer.sample_positions.clone());
+    let mut is_found = false;
     let compile = &mut |mut source: ProgramSource| {
         for (_, text) in &mut source.stages {
-            found |= source.label.starts_with("cull triangles, 4") && text.contains(just);
-            *text = text.replace(just, greedy);
+            is_found |= source.label.starts_with("cull triangles, 4") && text.contains(original);
+            *text = text.replace(original, replacement);
         }
         renderer.programs.program(source)
     };
-    let buffers = SceneBuffers::new(&gl, scene, &places, BlurMethod::Auto, compile).expect("loads");
-    assert!(found, "the shader says no '{just}'");
+    let buffers = SceneBuffers::new(&gl, scene, &sample_positions, BlurMethod::Auto, compile).expect("loads");
+    assert!(is_found, "expected '{original}' in the shader");
     let corners = scene.shapes[0].mesh.corners();
     let (positions, normals) = (scene.shapes[0].mesh.rest_positions().as_flattened(), corners.normals.as_flattened());
     let surface =
@@ -58,46 +67,48 @@ fn picture(scene: &Arc<Scene>, (just, greedy): (&str, &str)) -> Vec<u8> {
     let view = View::LookAt { eye: [0.3, 0.2, 4.0], target: [0.1, 0.0, 0.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 90.0, fy: 90.0, cx: 32.0, cy: 32.0 };
     let camera = Camera { view, lens, near: 0.0, far: 0.0 };
-    let shot = FrameParams { camera, width: 64, height: 64, bounds: scene.rest_bounds, light: None };
-    renderer.draw(&buffers, &shot).expect("draws");
-    let second = renderer.draw(&buffers, &shot).expect("draws").rgba;
+    let params = FrameParams { camera, width: 64, height: 64, bounds: scene.rest_bounds, light: None };
+    renderer.draw(&buffers, &params).expect("draws");
+    let image = renderer.draw(&buffers, &params).expect("draws").rgba;
     assert!(renderer.stats().culled.is_some_and(|culled| culled.camera.culled() > 0));
-    second
+    image
 }
 
 #[test]
-fn a_scene_whose_lists_are_larger_than_a_buffer_may_be_is_not_culled_and_says_so() {
+fn culling_is_omitted_if_lists_exceed_the_buffer_limit() {
     let mut parts = squares(vec![Material::default()]);
     for culling in [Culling::Triangles, Culling::Occlusion] {
         parts.look.culling = culling;
-        let scene = Scene::new(parts.clone()).expect("good");
-        let sizes = cull_buffer_sizes(&scene, culling).expect("culled");
-        let largest = sizes.named().map(|(_, bytes)| *bytes).max().expect("lists");
+        let scene = Scene::new(parts.clone()).expect("a valid scene");
+        let sizes = cull_buffer_sizes(&scene, culling).expect("culling buffers");
+        let max_buffer_bytes = sizes.named().map(|(_, bytes)| *bytes).max().expect("buffers");
         assert_eq!(sizes.indices, 12 * scene.layout.triangles as u64);
-        let on = |max_storage_bytes: u64| select_culling(&scene, &Limits { max_storage_bytes, ..Limits::default() });
-        assert_eq!((on(largest), on(largest - 1)), (culling, Culling::None));
-        let limits = Limits { max_storage_bytes: largest - 1, ..Limits::default() };
+        let select_for =
+            |max_storage_bytes: u64| select_culling(&scene, &Limits { max_storage_bytes, ..Limits::default() });
+        assert_eq!((select_for(max_buffer_bytes), select_for(max_buffer_bytes - 1)), (culling, Culling::None));
+        let limits = Limits { max_storage_bytes: max_buffer_bytes - 1, ..Limits::default() };
         let plan = ScenePlan::new(&scene, &limits, BlurMethod::Auto).report;
         assert!(!plan.defines("CULLED") && !plan.passes.contains(&Pass::Cull));
-        assert!(plan.omitted.iter().any(|saving| saving.feature == "culling"));
+        assert!(plan.omitted.iter().any(|feature| feature.feature == "culling"));
     }
 }
 
 #[test]
-fn each_test_that_is_too_greedy_is_seen_in_the_picture() {
+fn each_culling_test_that_removes_too_much_changes_the_image() {
     let scene = sheets();
-    let just = picture(&scene, ("shared", "shared"));
-    for greedy in [
-        ("below[axis] && low[axis] < -margin[axis]", "below[axis] && low[axis] < 2.0"),
-        ("above[axis] && high[axis] < -margin[axis]", "above[axis] && high[axis] < 2.0"),
-        ("area < -unsure", "area < unsure + 20.0"),
-        ("ceil(low - place)", "ceil(low - place + 8.0)"),
+    let expected_image = draw_second_frame(&scene, ("shared", "shared"));
+    for replacement in [
+        ("is_below[axis] && lower_distance[axis] < -margin[axis]", "is_below[axis] && lower_distance[axis] < 2.0"),
+        ("is_above[axis] && upper_distance[axis] < -margin[axis]", "is_above[axis] && upper_distance[axis] < 2.0"),
+        ("area < -area_error", "area < area_error + 20.0"),
+        ("ceil(min_position - sample_position)", "ceil(min_position - sample_position + 8.0)"),
         ("nearest - margin))", "nearest + 0.5))"),
         (
-            "if (!(depths[base + y * size.x + x] < depth)) return false;",
-            "if (depths[base + y * size.x + x] < depth) return true;",
+            "if (!(depths[level_offset + y * size.x + x] < depth)) return false;",
+            "if (depths[level_offset + y * size.x + x] < depth) return true;",
         ),
     ] {
-        assert!(picture(&scene, greedy) != just, "{greedy:?} changes nothing");
+        let image = draw_second_frame(&scene, replacement);
+        assert!(image != expected_image, "expected another image with {replacement:?}");
     }
 }

@@ -1,8 +1,8 @@
-//! Asynchronous frames: [`Renderer::submit`] records the commands of a frame, [`Renderer::read_image`] takes its pixels
-//! when they are ready. In between, the host can do other work or submit more frames.
+//! Asynchronous frames: [`Renderer::submit`] records the commands of a frame, [`Renderer::read_image`] waits for its
+//! pixels and copies them. In between, the host can do other work or submit more frames.
 //!
-//! The uniforms of a frame (camera, cascades, the initial values of the counters) are written with stream-ordered
-//! OpenGL commands. Frames in flight therefore keep their own values; the same holds for uploaded vertices.
+//! Uniforms, initial counter values and uploaded vertices are written with stream-ordered OpenGL commands, so frames in
+//! flight keep their values.
 
 use std::cell::Cell;
 use std::ops::Range;
@@ -27,60 +27,60 @@ impl Renderer {
     /// Draws one frame of the current buffers and waits for its pixels.
     ///
     /// # Errors
-    /// Those of [`Self::submit`] and [`Self::map_pixels`].
-    pub fn draw(&mut self, buffers: &SceneBuffers, shot: &FrameParams) -> Result<FrameImage> {
-        let ticket = self.submit(buffers, shot)?;
+    /// Errors of [`Self::submit`] and [`Self::map_pixels`].
+    pub fn draw(&mut self, buffers: &SceneBuffers, params: &FrameParams) -> Result<FrameImage> {
+        let ticket = self.submit(buffers, params)?;
         self.read_image(ticket)
     }
 
     /// Submits one frame of the current buffers; later changes of the buffers do not affect it. At most
-    /// [`crate::MAX_FRAMES_IN_FLIGHT`] frames of one form may be in flight. A further one is refused until the oldest is
-    /// collected.
+    /// [`crate::MAX_FRAMES_IN_FLIGHT`] frames of one render target may be in flight.
     ///
     /// # Errors
-    /// `Busy` when too many frames are in flight, `Invalid` for a size above the limit or a camera whose matrices
-    /// overflow, `Fault` naming the pass when OpenGL reports an error.
-    pub fn submit(&mut self, buffers: &SceneBuffers, shot: &FrameParams) -> Result<PendingFrame> {
-        self.submit_frame(buffers, shot, true)
+    /// `Busy` if too many frames are in flight; `Invalid` for a size above the limit or a camera whose matrices overflow;
+    /// `Fault` with the pass if OpenGL reports an error.
+    pub fn submit(&mut self, buffers: &SceneBuffers, params: &FrameParams) -> Result<PendingFrame> {
+        self.submit_frame(buffers, params, true)
     }
 
-    /// Submits a frame whose pixels stay on the device, like a frame that is shown on a screen: its image is empty.
-    /// Such frames use no staging buffer, so their number in flight is not limited.
+    /// Submits a frame whose pixels stay on the device; its image is empty. Such frames use no staging buffer, so their
+    /// number in flight is not limited.
     ///
     /// # Errors
-    /// Those of [`Self::submit`] except `Busy`.
-    pub fn submit_without_readback(&mut self, buffers: &SceneBuffers, shot: &FrameParams) -> Result<PendingFrame> {
-        self.submit_frame(buffers, shot, false)
+    /// Errors of [`Self::submit`] except `Busy`.
+    pub fn submit_without_readback(&mut self, buffers: &SceneBuffers, params: &FrameParams) -> Result<PendingFrame> {
+        self.submit_frame(buffers, params, false)
     }
 
     /// Waits for a frame and copies its pixels.
     ///
     /// # Errors
-    /// Those of [`Self::map_pixels`].
+    /// Errors of [`Self::map_pixels`].
     pub fn read_image(&mut self, ticket: PendingFrame) -> Result<FrameImage> {
         self.map_pixels(ticket).map(MappedPixels::into_image)
     }
 
-    /// Waits for a frame and returns its pixels uncopied, so that another thread can copy them.
+    /// Waits for a frame and maps its pixels, so that another thread can copy them.
     ///
     /// # Errors
-    /// `Fault` naming the pass that did not finish within the time limit, or the OpenGL error.
+    /// `Fault` with the pass that did not finish within the time limit, or with the OpenGL error.
     pub fn map_pixels(&mut self, ticket: PendingFrame) -> Result<MappedPixels> {
         let _current = self.gl.make_current()?;
         ticket.wait()?;
         let PendingFrame { desc, slot, passes, mut stats, .. } = ticket;
         let staging = slot.as_ref().and_then(ReadbackSlot::staging);
         if let Some(staging) = staging {
-            let [listed, culled] = desc.readback_ranges().map(|part| part.start as usize..part.end as usize);
-            let read = |part: Range<usize>| if part.is_empty() { Ok(None) } else { staging.read(part).map(Some) };
+            let [oit_range, cull_range] = desc.readback_ranges().map(|range| range.start as usize..range.end as usize);
+            let read_range =
+                |range: Range<usize>| if range.is_empty() { Ok(None) } else { staging.read(range).map(Some) };
             (stats.oit, stats.culled) = (
-                read(listed)?.map(|head| layout::oit::parse_counters(&head)),
-                read(culled)?.map(|counts| layout::cull::parse_counters(&counts)),
+                read_range(oit_range)?.map(|counters| layout::oit::parse_counters(&counters)),
+                read_range(cull_range)?.map(|counts| layout::cull::parse_counters(&counts)),
             );
         }
-        // When the compute rasterizer drew the visibility there are no camera counts; the sun's are dropped with them.
+        // If the compute rasterizer drew the visibility, there are no camera counts. Then the shadow counts are dropped, too.
         stats.culled = stats.culled.filter(|_| stats.raster_backends.visibility != Some(RasterBackend::Cuda));
-        let view = staging.map(|staging| staging.view(desc.bytes() as usize)).transpose()?;
+        let view = staging.map(|staging| staging.view(desc.encoded_bytes() as usize)).transpose()?;
         self.gl.check(Pass::Read.name())?;
         warn_of_dropped_fragments(&self.stats, &stats);
         if let Some(culled) = &stats.culled {
@@ -93,28 +93,29 @@ impl Renderer {
         Ok(MappedPixels { width: desc.width, height: desc.height, view, times, raster_backends })
     }
 
-    fn submit_frame(&mut self, buffers: &SceneBuffers, shot: &FrameParams, is_read: bool) -> Result<PendingFrame> {
+    fn submit_frame(&mut self, buffers: &SceneBuffers, params: &FrameParams, is_read: bool) -> Result<PendingFrame> {
         let _current = self.gl.make_current()?;
-        self.check_size(shot)?;
-        let uniforms = FrameUniforms::new(&buffers.scene, shot, buffers.origin)?;
+        self.check_size(params)?;
+        let uniforms = FrameUniforms::new(&buffers.scene, params, buffers.origin)?;
         let look = &buffers.scene.look;
-        let size = [shot.width, shot.height];
+        let size = [params.width, params.height];
         let desc = TargetDesc::new(&self.gl, size, look, blend_storage(&self.gl, &buffers.scene, size)?);
         let desc = TargetDesc { culling: buffers.culling(), ..desc };
         self.ensure_target(desc)?;
         let programs = buffers.sample_programs(desc.samples, &mut |source| self.programs.program(source))?;
         let Some(target) = self.targets.last() else { return Err(fault_in("draw")("no target")) };
         let slot = if is_read { Some(target.readback_ring.acquire(self.frame_timeout)?) } else { None };
-        // A pass that fails or panics leaves the images undefined, so the target is cached again only after all passes.
+        // If a pass fails or panics, the images are undefined. The target is removed from the cache until all passes are
+        // recorded.
         self.last_frame = None;
         let Some(target) = self.targets.pop() else { return Err(fault_in("draw")("no target")) };
-        let ground = draws_ground(buffers, shot);
-        target.draw_region.set(draw_region(buffers, shot, ground));
+        let draws_ground = must_draw_ground(buffers, params);
+        target.draw_region.set(draw_region(buffers, params, draws_ground));
         let mut stats = FrameStats { samples: desc.samples, ..FrameStats::default() };
         let mut recorder = PassRecorder { gl: &self.gl, stats: &mut stats };
-        passes::uniforms::upload(&recorder, buffers, shot, &uniforms);
-        let frame = FrameContext { buffers, target: &target, programs: &programs, shot };
-        let passes = self.record_passes(&mut recorder, &frame, ground).and_then(|mut passes| {
+        passes::uniforms::upload(&recorder, buffers, params, &uniforms);
+        let frame = FrameContext { buffers, target: &target, programs: &programs, params };
+        let passes = self.record_passes(&mut recorder, &frame, draws_ground).and_then(|mut passes| {
             passes.extend(self.record_readback(&recorder, &frame, slot.as_ref())?);
             Ok(passes)
         });
@@ -127,26 +128,27 @@ impl Renderer {
             fence: self.gl.fence(Pass::Read.name())?,
             passes,
             stats,
-            limit: self.frame_timeout,
+            timeout: self.frame_timeout,
             first_wait: Cell::new(None),
         })
     }
 
-    /// Records the passes that make the picture.
+    /// Records all passes except the readback.
     fn record_passes(
         &self,
         recorder: &mut PassRecorder<'_>,
         frame: &FrameContext<'_>,
-        ground: bool,
+        draws_ground: bool,
     ) -> Result<Vec<(Pass, PassTimer)>> {
         let buffers = frame.buffers;
         let mut times = Vec::new();
-        let content = buffers.shadow_key(frame.shot);
+        let content = buffers.shadow_key(frame.params);
         if let Some((rasterizer, enabled)) = buffers.active_rasterizer() {
-            let wanted = RasterPasses { shadow: enabled.shadow && buffers.shadow_cache.is_stale(content), ..enabled };
-            if wanted.any() {
-                let draw = || passes::raster::draw(recorder, frame, rasterizer, wanted);
-                match self.time_pass(wanted.name(), draw) {
+            let raster_passes =
+                RasterPasses { shadow: enabled.shadow && buffers.shadow_cache.is_stale(content), ..enabled };
+            if raster_passes.has_any() {
+                let draw = || passes::raster::draw(recorder, frame, rasterizer, raster_passes);
+                match self.time_pass(raster_passes.stats_pass(), draw) {
                     Ok(time) => times.push(time),
                     Err(error) => rasterizer.disable(&error),
                 }
@@ -163,7 +165,7 @@ impl Renderer {
         }
         times.push(self.time_pass(Pass::Visibility, || match rasterizer {
             Some(rasterizer) => passes::raster::unpack(recorder, frame, rasterizer),
-            None => passes::visibility::draw(recorder, frame, ground),
+            None => passes::visibility::draw(recorder, frame, draws_ground),
         })?);
         times.push(self.time_pass(Pass::Blended, || passes::blended::draw(recorder, frame))?);
         times.push(self.time_pass(Pass::Shade, || passes::shade::draw(recorder, frame))?);
@@ -172,7 +174,7 @@ impl Renderer {
         Ok(times)
     }
 
-    /// Measures the passes that `commands` records, under the name of one of them.
+    /// Times the passes that `commands` records under the name of one of them.
     fn time_pass(&self, pass: Pass, commands: impl FnOnce() -> Result<()>) -> Result<(Pass, PassTimer)> {
         self.gl.time_pass(pass.name(), self.frame_timeout, commands).map(|timer| (pass, timer))
     }
@@ -191,26 +193,26 @@ impl Renderer {
 }
 
 /// Whether the ground must be rasterized.
-fn draws_ground(buffers: &SceneBuffers, shot: &FrameParams) -> bool {
+fn must_draw_ground(buffers: &SceneBuffers, params: &FrameParams) -> bool {
     let scene = &buffers.scene;
     // The bounds of a rebased scene exclude distant domains.
-    let is_last = buffers.rebased.is_none() && ground_is_behind_scene(scene, shot, buffers.origin);
-    scene.look.ground.is_some() && camera_is_above_ground(scene, shot) && !is_last
+    let is_background = buffers.rebased.is_none() && ground_is_behind_scene(scene, params, buffers.origin);
+    scene.look.ground.is_some() && camera_is_above_ground(scene, params) && !is_background
 }
 
 /// Region of the frame that may show triangles or rasterized ground.
-fn draw_region(buffers: &SceneBuffers, shot: &FrameParams, ground: bool) -> Region {
-    let size = [shot.width, shot.height];
-    if buffers.rebased.is_some() || ground {
+fn draw_region(buffers: &SceneBuffers, params: &FrameParams, draws_ground: bool) -> Region {
+    let size = [params.width, params.height];
+    if buffers.rebased.is_some() || draws_ground {
         return Region::whole(size);
     }
-    Region::project(&clip_from_positions(&buffers.scene, shot, buffers.origin), &shot.bounds, size)
+    Region::project(&clip_from_positions(&buffers.scene, params, buffers.origin), &params.bounds, size)
 }
 
-/// Warns when a frame drops blended fragments and the previous one did not.
-fn warn_of_dropped_fragments(last: &FrameStats, stats: &FrameStats) {
-    let lacks = |stats: &FrameStats| stats.oit.filter(|oit| oit.dropped() > 0);
-    if let (Some(oit), None) = (lacks(stats), lacks(last)) {
+/// Warns if a frame drops blended fragments and the previous one did not.
+fn warn_of_dropped_fragments(previous: &FrameStats, stats: &FrameStats) {
+    let drops_fragments = |stats: &FrameStats| stats.oit.filter(|oit| oit.dropped() > 0);
+    if let (Some(oit), None) = (drops_fragments(stats), drops_fragments(previous)) {
         let (dropped, kept) = (oit.dropped(), oit.stored);
         tracing::warn!(
             dropped,

@@ -1,4 +1,4 @@
-//! The renderer: a context, its caches, and the calls that load scenes and draw them.
+//! The renderer: an OpenGL context, its caches, and the calls that load scenes and draw them.
 
 mod autotune;
 mod frame;
@@ -32,13 +32,13 @@ use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{PixelRect, Scene};
 
-/// Longest side of a frame in pixels, even on devices that support more.
+/// Maximum width and height of a frame in pixels, also on devices that support more.
 const MAX_SIDE: u32 = 8192;
-/// Number of render targets that are cached, by frame form.
+/// Maximum number of cached render targets.
 const MAX_TARGETS: usize = 4;
-/// Maximum time that a dropped renderer waits for each thread that still copies pixels.
+/// Maximum time that dropping a renderer waits for each thread that still copies pixels.
 const READER_TIMEOUT: Duration = Duration::from_secs(1);
-/// Time limit of the device for one frame.
+/// Time limit for one frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// A headless OpenGL context with its cached programs and render targets. It is created, used and dropped on the device
@@ -50,7 +50,7 @@ pub struct Renderer {
     programs: ProgramCache,
     sample_positions: Vec<[f32; 2]>,
     blur_method: BlurMethod,
-    /// Least recently used first.
+    /// Cached render targets, least recently used first.
     targets: Vec<RenderTarget>,
     stats: FrameStats,
     /// The last frame that was submitted without an error.
@@ -60,7 +60,7 @@ pub struct Renderer {
     aov_reader: AovReader,
 }
 
-/// A submitted frame whose ids the target of its form shows.
+/// The last submitted frame. The cached render target with `desc` contains its ids.
 #[derive(Debug)]
 struct LastFrame {
     desc: TargetDesc,
@@ -72,8 +72,8 @@ impl Renderer {
     ///
     /// # Errors
     /// `Unavailable` with the name of the missing library or vendor file.
-    pub fn open(prefer: DevicePreference) -> Result<Self> {
-        let (gl, cuda_device) = device::open(prefer)?;
+    pub fn open(preference: DevicePreference) -> Result<Self> {
+        let (gl, cuda_device) = device::open(preference)?;
         Self::new(gl, cuda_device)
     }
 
@@ -118,7 +118,7 @@ impl Renderer {
     /// Uploads the static data of a scene and allocates the buffers of the deformed data.
     ///
     /// # Errors
-    /// `Invalid` when the scene is over a limit of the device, `Fault` when a shader or a buffer is refused.
+    /// `Invalid` if the scene exceeds a limit of the device; `Fault` if a shader or a buffer cannot be created.
     pub fn load(&mut self, scene: &Arc<Scene>) -> Result<SceneBuffers> {
         let _current = self.gl.make_current()?;
         let compile = &mut |source| self.programs.program(source);
@@ -135,7 +135,7 @@ impl Renderer {
     /// Uploads a deformed surface from host memory into the shared buffers.
     ///
     /// # Errors
-    /// `Fault` when an array of the surface has another length than its buffer, or OpenGL reports an error.
+    /// `Fault` if the length of an array differs from its buffer, or OpenGL reports an error.
     pub fn upload(&mut self, buffers: &SceneBuffers, surface: &DeformedSurface) -> Result<()> {
         let _current = self.gl.make_current()?;
         buffers.shadow_cache.invalidate();
@@ -145,33 +145,23 @@ impl Renderer {
             ("normals", Some(&geometry.normals), &surface.normals),
             ("tangents", geometry.tangents.as_ref(), &surface.tangents),
         ];
-        for (name, buffer, list) in attributes {
+        for (name, buffer, numbers) in attributes {
             let Some(buffer) = buffer else { continue };
-            if 4 * list.len() as u64 != buffer.bytes {
-                return Err(fault_in("upload")(format!(
-                    "{} numbers of {name}, {} expected",
-                    list.len(),
-                    buffer.bytes / 4
-                )));
-            }
-            buffer.write(bytemuck::cast_slice(list));
+            check_length(name, numbers, buffer.bytes / 4)?;
+            buffer.write(bytemuck::cast_slice(numbers));
         }
         self.gl.check("upload")
     }
 
-    /// Uploads positions that are drawn instead of the shared ones until the next [`SceneBuffers::set_origin`]. For
-    /// scenes whose domains have separate local origins: the shared positions then have no common origin, and
-    /// `positions` are rebased to `origin` (scene units, from the scene's origin).
+    /// Uploads positions that are drawn instead of the shared ones until the next [`SceneBuffers::set_origin`]. This is
+    /// for scenes whose domains have separate local origins, so that the shared positions have no common origin.
+    /// `positions` are relative to `origin`, which is in scene units from the scene's origin.
     ///
     /// # Errors
-    /// `Fault` when the number of positions differs from the scene's, or OpenGL reports an error.
+    /// `Fault` if the number of positions is wrong, or OpenGL reports an error.
     pub fn upload_rebased(&mut self, buffers: &mut SceneBuffers, positions: &[f32], origin: [f64; 3]) -> Result<()> {
         let _current = self.gl.make_current()?;
-        let bytes = buffers.geometry.positions.bytes;
-        if 4 * positions.len() as u64 != bytes {
-            let given = format!("{} numbers of positions, {} expected", positions.len(), bytes / 4);
-            return Err(fault_in("upload")(given));
-        }
+        check_length("positions", positions, buffers.geometry.positions.bytes / 4)?;
         let rebased = match buffers.rebased.take() {
             Some(rebased) => rebased,
             None => RebasedPositions::new(&self.gl, buffers)?,
@@ -186,116 +176,115 @@ impl Renderer {
     /// Uploads a scalar per vertex, in the vertex order of the scene's layout, for readbacks of [`Aov::Values`].
     ///
     /// # Errors
-    /// `Fault` when the count differs from the scene's number of vertices, or OpenGL reports an error.
+    /// `Fault` if the number of values is wrong, or OpenGL reports an error.
     pub fn upload_vertex_values(&mut self, buffers: &mut SceneBuffers, values: &[f32]) -> Result<()> {
         let _current = self.gl.make_current()?;
         let count = buffers.scene.layout.vertices;
-        if values.len() != count {
-            return Err(fault_in("upload")(format!("{} numbers of values, {count} expected", values.len())));
-        }
-        let held = match buffers.values.take() {
-            Some(held) => held,
+        check_length("values", values, count as u64)?;
+        let vertex_values = match buffers.values.take() {
+            Some(vertex_values) => vertex_values,
             None => {
                 let buffer = self.gl.buffer(4 * count as u64, gl::DYNAMIC_DRAW, None)?;
                 VertexValues { view: self.gl.buffer_texture(&buffer, gl::R32F)?, buffer }
             }
         };
-        held.buffer.write(bytemuck::cast_slice(values));
-        buffers.values = Some(held);
+        vertex_values.buffer.write(bytemuck::cast_slice(values));
+        buffers.values = Some(vertex_values);
         self.gl.check("upload")
     }
 
-    /// Attaches a compute rasterizer to a scene; `make` creates it from the scene's mesh. It draws the passes that it
-    /// supports from now on. Nothing is created for a scene without such passes.
+    /// Attaches a compute rasterizer to a scene, which draws all passes that it supports. Does nothing for a scene without
+    /// such passes.
     ///
     /// # Errors
-    /// Those of `make` and of [`Rasterizer::precompile`], and `Fault` of OpenGL; OpenGL then still draws the scene.
+    /// Errors of `create_rasterizer` and [`Rasterizer::precompile`], and `Fault` of OpenGL. OpenGL then draws all passes.
     pub fn attach_rasterizer(
         &mut self,
         buffers: &mut SceneBuffers,
-        make: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
+        create_rasterizer: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
     ) -> Result<()> {
         let _current = self.gl.make_current()?;
-        buffers.attach_rasterizer(&self.gl, &mut |source| self.programs.program(source), make)
+        buffers.attach_rasterizer(&self.gl, &mut |source| self.programs.program(source), create_rasterizer)
     }
 
-    /// Begins a pick in a rectangle of the picture that `shot` describes, without waiting for the device.
+    /// Begins a pick in a rectangle of the frame that `params` describes, without waiting for the device.
     ///
     /// # Errors
-    /// `Invalid` for a camera whose matrices overflow, `Fault` when OpenGL reports an error.
+    /// `Invalid` for a camera whose matrices overflow; `Fault` if OpenGL reports an error.
     pub fn begin_pick(
         &mut self,
         buffers: &SceneBuffers,
-        shot: &FrameParams,
+        params: &FrameParams,
         rectangle: PixelRect,
     ) -> Result<PendingPick> {
         let _current = self.gl.make_current()?;
-        self.picker.begin(&mut self.programs, buffers, shot, rectangle)
+        self.picker.begin(&mut self.programs, buffers, params, rectangle)
     }
 
     /// Waits for a pick and returns its hits row by row. Pixels without a triangle have no entry.
     ///
     /// # Errors
-    /// `Fault` when the device does not finish in time.
+    /// `Fault` if the device does not finish in time.
     pub fn finish_pick(&mut self, pick: PendingPick) -> Result<Vec<PickHit>> {
         let _current = self.gl.make_current()?;
         self.picker.finish(pick, self.frame_timeout)
     }
 
-    /// Reads a field for the current content of the shared buffers. Depth, domains and normals are sampled at pixel
+    /// Reads a field for the current content of the scene's buffers. Depth, domains and normals are sampled at pixel
     /// centers.
     ///
     /// # Errors
-    /// `Invalid` for a size above the limit or a camera whose matrices overflow; `Fault` when no values were uploaded,
+    /// `Invalid` for a size above the limit or a camera whose matrices overflow; `Fault` if no values were uploaded,
     /// OpenGL reports an error or the device does not finish in time.
-    pub fn render_aov(&mut self, buffers: &SceneBuffers, shot: &FrameParams, field: Aov) -> Result<AovImage> {
+    pub fn render_aov(&mut self, buffers: &SceneBuffers, params: &FrameParams, field: Aov) -> Result<AovImage> {
         let _current = self.gl.make_current()?;
-        self.check_size(shot)?;
-        self.aov_reader.render(&mut self.programs, buffers, shot, field, self.frame_timeout)
+        self.check_size(params)?;
+        self.aov_reader.render(&mut self.programs, buffers, params, field, self.frame_timeout)
     }
 
-    /// Ids that the first sample of each pixel of the last frame sees, top row first. The last frame is the one that was
-    /// submitted last without an error, even if other frames were collected since.
+    /// Reads the id of the first sample of each pixel of the last frame, top row first. The last frame is the last one
+    /// that was submitted without an error.
     ///
     /// # Errors
-    /// `Fault` when no frame was drawn, its images were freed, or the device does not finish in time.
+    /// `Fault` if no frame was drawn, its images were freed, or the device does not finish in time.
     pub fn read_visibility(&mut self) -> Result<Vec<VisibilityId>> {
         let _current = self.gl.make_current()?;
-        let nothing = || fault_in("visibility readback")("no frame was drawn, or its images were freed");
-        let last = self.last_frame.as_ref().ok_or_else(nothing)?;
-        let program = self.programs.program(shaders::readback::visibility_readback(last.desc.samples))?;
-        let target = self.targets.iter().find(|target| target.desc == last.desc).ok_or_else(nothing)?;
-        // A temporary staging buffer, because the ring may be full of frames in flight.
-        let bytes = target.desc.bytes();
+        let no_frame = || fault_in("visibility readback")("no frame was drawn, or its images were freed");
+        let frame = self.last_frame.as_ref().ok_or_else(no_frame)?;
+        let program = self.programs.program(shaders::readback::visibility_readback(frame.desc.samples))?;
+        let target = self.targets.iter().find(|target| target.desc == frame.desc).ok_or_else(no_frame)?;
+        // Uses a temporary staging buffer, because the ring may be full of frames in flight.
+        let bytes = target.desc.encoded_bytes();
         let staging = self.gl.buffer(bytes, gl::STREAM_READ, None)?;
         let recorder = PassRecorder { gl: &self.gl, stats: &mut FrameStats::default() };
         readback::read_visibility(&recorder, target, &program, &staging)?;
         self.gl.wait("visibility readback", self.frame_timeout)?;
         let words = staging.read(bytes as usize)?;
-        let id = |word: &[u8]| word.iter().rev().fold(0, |id, byte| id << 8 | u32::from(*byte));
-        let place = if last.desc.samples > 1 { self.sample_positions[0] } else { [0.5; 2] };
-        let size = [last.desc.width, last.desc.height];
-        let sees_ground = |pixel: u32| last.uniforms.ray_hits_ground(ndc_from_pixel(pixel, size, place));
-        let seen = words.chunks_exact(4).zip(0..).map(|(word, pixel)| match VisibilityId::from_id(id(word)) {
+        let parse_id = |word: &[u8]| word.iter().rev().fold(0, |parse_id, byte| parse_id << 8 | u32::from(*byte));
+        let sample_position = if frame.desc.samples > 1 { self.sample_positions[0] } else { [0.5; 2] };
+        let size = [frame.desc.width, frame.desc.height];
+        let sees_ground = |pixel: u32| frame.uniforms.ray_hits_ground(ndc_from_pixel(pixel, size, sample_position));
+        let ids = words.chunks_exact(4).zip(0..).map(|(word, pixel)| match VisibilityId::from_id(parse_id(word)) {
             VisibilityId::Background if sees_ground(pixel) => VisibilityId::Ground,
-            seen => seen,
+            id => id,
         });
-        Ok(seen.collect())
+        Ok(ids.collect())
     }
 
-    fn check_size(&self, shot: &FrameParams) -> Result<()> {
+    /// Fails if a side of the frame is 0 or above the limit.
+    fn check_size(&self, params: &FrameParams) -> Result<()> {
         let limit = self.info.max_side;
-        if [shot.width, shot.height].iter().all(|side| (1..=limit).contains(side)) {
+        if [params.width, params.height].iter().all(|side| (1..=limit).contains(side)) {
             return Ok(());
         }
-        let given = format!("{} x {}", shot.width, shot.height);
+        let given = format!("{} x {}", params.width, params.height);
         Err(invalid("frame.size", format!("1 to {limit} pixels a side"), given))
     }
 
-    /// Moves the target of this form to the end of the cache, and creates it if it is not cached.
+    /// Moves the target with this description to the end of the cache, and creates it if it is not cached.
     fn ensure_target(&mut self, desc: TargetDesc) -> Result<()> {
-        if let Some(at) = self.targets.iter().position(|target| target.desc == desc) {
-            self.targets[at..].rotate_left(1);
+        if let Some(index) = self.targets.iter().position(|target| target.desc == desc) {
+            self.targets[index..].rotate_left(1);
             return Ok(());
         }
         if self.targets.len() >= MAX_TARGETS {
@@ -306,12 +295,21 @@ impl Renderer {
     }
 }
 
-/// Normalized device coordinates of a point in a pixel. `pixel` counts from the top left; `place` is measured from the
-/// pixel's lower left corner, 0 to 1.
-fn ndc_from_pixel(pixel: u32, [width, height]: [u32; 2], place: [f32; 2]) -> [f64; 2] {
+/// Fails if the number of values of an uploaded array is wrong.
+fn check_length(name: &str, numbers: &[f32], expected: u64) -> Result<()> {
+    if numbers.len() as u64 == expected {
+        return Ok(());
+    }
+    Err(fault_in("upload")(format!("expected {expected} numbers of {name}, got {}", numbers.len())))
+}
+
+/// Normalized device coordinates of a point in a pixel. `pixel` counts row by row from the top left. `sample_position` is
+/// relative to the pixel's lower left corner, 0 to 1.
+fn ndc_from_pixel(pixel: u32, [width, height]: [u32; 2], sample_position: [f32; 2]) -> [f64; 2] {
     let (column, row) = (pixel % width, height - 1 - pixel / width);
-    let across = |at: u32, place: f32, side: u32| 2.0 * (f64::from(at) + f64::from(place)) / f64::from(side) - 1.0;
-    [across(column, place[0], width), across(row, place[1], height)]
+    let to_ndc =
+        |pixel: u32, offset: f32, side: u32| 2.0 * (f64::from(pixel) + f64::from(offset)) / f64::from(side) - 1.0;
+    [to_ndc(column, sample_position[0], width), to_ndc(row, sample_position[1], height)]
 }
 
 impl Drop for Renderer {

@@ -1,4 +1,4 @@
-//! Order-independent transparency: pictures of both ways to find the coverage of a fragment, and compiled programs.
+//! Tests of order-independent transparency: images with and without post-depth coverage, and compiled programs.
 
 use std::rc::Rc;
 
@@ -10,12 +10,11 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{BoundingBox, Camera, Scene, Transparency};
 
-/// Draws a glass square in front of an opaque square and another behind it, 64 pixels wide; returns the pixels and
-/// the renderer.
-fn drawn(transparency: Transparency, alpha_mode: AlphaMode, post_depth_coverage: bool) -> (Vec<u8>, Renderer) {
+/// Draws an opaque square between two glass squares into 64 x 64 pixels; returns the pixels and the renderer.
+fn draw_glass(transparency: Transparency, alpha_mode: AlphaMode, post_depth_coverage: bool) -> (Vec<u8>, Renderer) {
     let glass = Material { alpha: 0.5, alpha_mode, double_sided: true, ..Material::default() };
     let mut parts = squares(vec![Material { diffuse: [0.9, 0.2, 0.1], ..Material::default() }, glass.clone(), glass]);
-    // No shadow: light that varies within a pixel would reveal where in the pixel a fragment is shaded.
+    // No shadow: light must not vary within a pixel, because the two methods shade at different points of it.
     (parts.look.transparency, parts.look.shadow) = (transparency, None);
     // Slightly rotated, so that edges cross pixels.
     let corner = |z: f32, angle: f32, [x, y]: [f32; 2]| {
@@ -25,7 +24,7 @@ fn drawn(transparency: Transparency, alpha_mode: AlphaMode, post_depth_coverage:
     let square = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
     let positions: Vec<[f32; 3]> = [(0.0, 0.3), (0.3, 0.5), (-0.3, 0.7)]
         .into_iter()
-        .flat_map(|(z, angle)| square.map(|at| corner(z, angle, at)))
+        .flat_map(|(z, angle)| square.map(|point| corner(z, angle, point)))
         .collect();
     let mut bounds = BoundingBox::EMPTY;
     positions.iter().for_each(|position| bounds.include(position.map(f64::from)));
@@ -34,10 +33,10 @@ fn drawn(transparency: Transparency, alpha_mode: AlphaMode, post_depth_coverage:
         normals: [0.0, 0.0, 1.0].repeat(positions.len()),
         ..DeformedSurface::default()
     };
-    let scene = Scene::new(parts).expect("good");
+    let scene = Scene::new(parts).expect("a valid scene");
     let (mut gl, cuda_device) = device::open(DevicePreference::Any).expect("EGL");
-    Rc::get_mut(&mut gl).expect("not shared yet").limits.post_depth_coverage &= post_depth_coverage;
-    let mut renderer = Renderer::new(gl, cuda_device).expect("images");
+    Rc::get_mut(&mut gl).expect("the only reference").limits.post_depth_coverage &= post_depth_coverage;
+    let mut renderer = Renderer::new(gl, cuda_device).expect("a renderer");
     let buffers = renderer.load(&scene).expect("loads");
     renderer.upload(&buffers, &surface).expect("uploads");
     let camera = Camera::fit_to_scene(&scene, 64, 64);
@@ -47,21 +46,25 @@ fn drawn(transparency: Transparency, alpha_mode: AlphaMode, post_depth_coverage:
 }
 
 #[test]
-fn a_fragment_a_pixel_with_its_samples_and_a_fragment_a_sample_give_the_same_picture() {
-    let (known, renderer) = drawn(Transparency::OrderIndependent, AlphaMode::Blend, true);
-    let (apart, other) = drawn(Transparency::OrderIndependent, AlphaMode::Blend, false);
-    let worst = known.iter().zip(&apart).map(|(a, b)| a.abs_diff(*b)).max();
-    assert!(worst <= Some(2), "{worst:?} levels");
-    let [few, many] = [&renderer, &other].map(|renderer| renderer.stats().oit.expect("exact").fragments);
-    assert!(!renderer.gl.limits.post_depth_coverage || many > 3 * few, "control: {few} and {many} fragments");
+fn per_pixel_and_per_sample_fragments_give_the_same_image() {
+    let (pixel_shaded, pixel_renderer) = draw_glass(Transparency::OrderIndependent, AlphaMode::Blend, true);
+    let (sample_shaded, sample_renderer) = draw_glass(Transparency::OrderIndependent, AlphaMode::Blend, false);
+    let max_difference = pixel_shaded.iter().zip(&sample_shaded).map(|(a, b)| a.abs_diff(*b)).max();
+    assert!(max_difference <= Some(2), "expected a difference of at most 2 levels, got {max_difference:?}");
+    let [pixel_fragments, sample_fragments] = [&pixel_renderer, &sample_renderer]
+        .map(|pixel_renderer| pixel_renderer.stats().oit.expect("list statistics").fragments);
+    assert!(
+        !pixel_renderer.gl.limits.post_depth_coverage || sample_fragments > 3 * pixel_fragments,
+        "expected different methods, got {pixel_fragments} and {sample_fragments} fragments"
+    );
 }
 
 #[test]
-fn only_the_method_that_the_look_names_is_compiled_and_neither_without_blended_triangles() {
+fn only_programs_of_the_used_transparency_are_compiled() {
     let compiled = |transparency, alpha_mode| {
-        let (_, renderer) = drawn(transparency, alpha_mode, true);
-        let any = |name: &str| renderer.programs.labels().any(|label| label.starts_with(name));
-        (["oit gather", "oit histogram", "oit allocate", "oit resolve"].map(any), any("blended"))
+        let (_, renderer) = draw_glass(transparency, alpha_mode, true);
+        let has_program = |prefix: &str| renderer.programs.labels().any(|label| label.starts_with(prefix));
+        (["oit gather", "oit histogram", "oit allocate", "oit resolve"].map(has_program), has_program("blended"))
     };
     assert_eq!(compiled(Transparency::OrderIndependent, AlphaMode::Opaque), ([false; 4], false));
     assert_eq!(compiled(Transparency::TwoPass, AlphaMode::Opaque), ([false; 4], false));

@@ -1,4 +1,4 @@
-//! Frames in flight, and pixels that any thread may copy.
+//! Frames in flight, and their mapped pixels.
 
 use std::cell::Cell;
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ use crate::resources::target_desc::TargetDesc;
 use crate::types::{FrameImage, FrameStats, RasterBackends};
 use modalcast_model::error::{Error, Result};
 
-/// Bytes that one thread copies at a time: large enough that the cost of starting a task is small in comparison.
+/// Bytes that a task copies: enough to hide the cost of starting the task.
 const COPY_CHUNK_BYTES: usize = 1 << 20;
 
 /// A frame in flight. Dropping the ticket abandons the frame.
@@ -25,13 +25,14 @@ pub struct PendingFrame {
     /// Passes in execution order, each with its timer.
     pub(super) passes: Vec<(Pass, PassTimer)>,
     pub(super) stats: FrameStats,
-    pub(super) limit: Duration,
+    /// Maximum time from `first_wait` until the frame is finished.
+    pub(super) timeout: Duration,
     /// When the host first polled or waited for the frame.
     pub(super) first_wait: Cell<Option<Instant>>,
 }
 
-/// Pixels of a finished frame, still in the staging buffer that the device wrote. Any thread may copy them. The ring
-/// cannot reuse the staging buffer until then, so copy them soon.
+/// Pixels of a finished frame in a mapped staging buffer. Any thread may copy them. The ring cannot reuse the staging
+/// buffer before, so copy them soon.
 #[derive(Debug)]
 pub struct MappedPixels {
     pub(super) width: u32,
@@ -47,49 +48,53 @@ impl PendingFrame {
         self.is_ready_within(Duration::ZERO)
     }
 
-    /// Waits at most `limit` for the frame and returns whether it is ready. A frame that exceeds the watchdog's limit
+    /// Waits at most `timeout` for the frame and returns whether it is ready. A frame that exceeds its own time limit
     /// counts as ready: retrieving it reports the timeout.
-    pub fn is_ready_within(&self, limit: Duration) -> bool {
-        self.time_left().is_zero() || self.fence.is_done_within(limit)
+    pub fn is_ready_within(&self, timeout: Duration) -> bool {
+        self.time_left().is_zero() || self.fence.is_done_within(timeout)
     }
 
-    /// Remaining watchdog time. The clock starts at the first poll or wait.
+    /// Remaining time until the frame's time limit. The clock starts at the first poll or wait.
     pub(super) fn time_left(&self) -> Duration {
         let begin = self.first_wait.get().unwrap_or_else(Instant::now);
         self.first_wait.set(Some(begin));
-        self.limit.saturating_sub(begin.elapsed())
+        self.timeout.saturating_sub(begin.elapsed())
     }
 
     pub(super) fn wait(&self) -> Result<()> {
         self.fence.wait(Pass::Read.name(), self.time_left()).map_err(|error| self.name_failed_pass(error))
     }
 
-    /// Names the pass at which the device stopped: the one after the last pass that is known to be finished.
+    /// Replaces the stage of a fault by the first pass that the device did not finish.
     fn name_failed_pass(&self, error: Error) -> Error {
         let Error::Fault { stage, reason } = error else { return error };
-        let over = self.passes.iter().take_while(|(_, timer)| timer.is_done()).count();
-        let stage = self.passes.get(over).map_or(stage, |(pass, _)| pass.name());
-        let last = over.checked_sub(1).map_or("none".into(), |last| format!("'{}'", self.passes[last].0));
-        Error::Fault { stage, reason: format!("{reason} ({:?}); the last pass that it finished: {last}", self.limit) }
+        let finished_count = self.passes.iter().take_while(|(_, timer)| timer.is_done()).count();
+        let stage = self.passes.get(finished_count).map_or(stage, |(pass, _)| pass.name());
+        let last_pass =
+            finished_count.checked_sub(1).map_or("none".into(), |last_pass| format!("'{}'", self.passes[last_pass].0));
+        Error::Fault {
+            stage,
+            reason: format!("{reason} ({:?}); the last pass that it finished: {last_pass}", self.timeout),
+        }
     }
 }
 
 impl MappedPixels {
-    /// Adds the milliseconds of the upload that preceded the frame.
+    /// Adds the time of the upload before the frame, in milliseconds.
     #[must_use]
     pub fn with_upload_time(mut self, ms: f64) -> Self {
         self.times.insert_first(RenderStage::Upload, ms);
         self
     }
 
-    /// Copies the pixels; several threads share the work when there are many.
+    /// Copies the pixels, with several threads if there are many.
     pub fn into_image(self) -> FrameImage {
         let begin = Instant::now();
         let Self { width, height, view, mut times, raster_backends } = self;
         let bytes = view.as_ref().map_or(&[][..], ReadbackView::bytes);
         let mut rgba = vec![0; bytes.len()];
-        let stretches = rgba.par_chunks_mut(COPY_CHUNK_BYTES).zip(bytes.par_chunks(COPY_CHUNK_BYTES));
-        stretches.for_each(|(to, from)| to.copy_from_slice(from));
+        let chunks = rgba.par_chunks_mut(COPY_CHUNK_BYTES).zip(bytes.par_chunks(COPY_CHUNK_BYTES));
+        chunks.for_each(|(destination, source)| destination.copy_from_slice(source));
         drop(view);
         times.add(RenderStage::Read, begin.elapsed().as_secs_f64() * 1e3);
         FrameImage { width, height, rgba, times, raster_backends }

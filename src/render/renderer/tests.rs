@@ -1,4 +1,4 @@
-//! Tests of frames in flight, with a renderer that does not wait between passes, like one on hardware.
+//! Tests of frames in flight. Even on a software device, the renderer does not wait between passes.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::rc::Rc;
@@ -18,12 +18,11 @@ use modalcast_model::error::{Error, Result};
 use modalcast_model::raster::{DrawTarget, Rasterizer};
 use modalcast_model::scene::{Camera, Scene, Transparency};
 
-/// A renderer that times its passes with queries on any device, so that its frames are in flight after they were
-/// submitted.
+/// A renderer that behaves as on hardware: it times passes with queries, so that submitted frames are in flight.
 fn open() -> Renderer {
     let (mut gl, cuda_device) = device::open(DevicePreference::Any).expect("EGL");
-    Rc::get_mut(&mut gl).expect("not shared yet").limits.software = false;
-    Renderer::new(gl, cuda_device).expect("images")
+    Rc::get_mut(&mut gl).expect("the only reference").limits.software = false;
+    Renderer::new(gl, cuda_device).expect("a renderer")
 }
 
 /// An opaque square, and a glass square in front of it.
@@ -32,32 +31,33 @@ fn scene() -> Arc<Scene> {
     let red = Material { diffuse: [0.9, 0.2, 0.1], double_sided: true, ..Material::default() };
     let mut parts = squares(vec![red, glass]);
     parts.look.transparency = Transparency::OrderIndependent;
-    Scene::new(parts).expect("good")
+    Scene::new(parts).expect("a valid scene")
 }
 
-/// Both squares; the glass is wider by `by`.
-fn surface(by: f32) -> DeformedSurface {
-    let square = |z: f32, wide: f32| [[0.0, 0.0, z], [wide, 0.0, z], [wide, 1.0, z], [0.0, 1.0, z]];
-    let positions = [square(0.0, 1.0), square(0.3, 0.25 + by)].concat();
+/// Positions and normals of both squares. The glass has the width 0.25 + `extra_width`.
+fn surface(extra_width: f32) -> DeformedSurface {
+    let square = |z: f32, width: f32| [[0.0, 0.0, z], [width, 0.0, z], [width, 1.0, z], [0.0, 1.0, z]];
+    let positions = [square(0.0, 1.0), square(0.3, 0.25 + extra_width)].concat();
     let normals = [0.0, 0.0, 1.0].repeat(positions.len());
     DeformedSurface { positions: positions.as_flattened().to_vec(), normals, ..DeformedSurface::default() }
 }
 
-fn shot(scene: &Scene, side: u32) -> FrameParams {
+fn params(scene: &Scene, side: u32) -> FrameParams {
     let camera = Camera::fit_to_scene(scene, side, side);
     FrameParams { camera, width: side, height: side, bounds: scene.rest_bounds, light: None }
 }
 
-/// The picture of one surface drawn alone, and its number of blended fragments.
-fn alone(by: f32) -> (Vec<u8>, u64) {
+/// Pixels of a surface drawn by a new renderer, and its number of blended fragments.
+fn draw_frame(extra_width: f32) -> (Vec<u8>, u64) {
     let (mut renderer, scene) = (open(), scene());
     let buffers = renderer.load(&scene).expect("loads");
-    renderer.upload(&buffers, &surface(by)).expect("uploads");
-    let image = renderer.draw(&buffers, &shot(&scene, 64)).expect("draws");
-    (image.rgba, renderer.stats().oit.expect("exact").fragments)
+    renderer.upload(&buffers, &surface(extra_width)).expect("uploads");
+    let image = renderer.draw(&buffers, &params(&scene, 64)).expect("draws");
+    (image.rgba, renderer.stats().oit.expect("list statistics").fragments)
 }
 
-fn loaded() -> (Renderer, Arc<Scene>, SceneBuffers) {
+/// A renderer with a loaded scene and its uploaded surface.
+fn load_renderer() -> (Renderer, Arc<Scene>, SceneBuffers) {
     let (mut renderer, scene) = (open(), scene());
     let buffers = renderer.load(&scene).expect("loads");
     renderer.upload(&buffers, &surface(0.0)).expect("uploads");
@@ -65,142 +65,142 @@ fn loaded() -> (Renderer, Arc<Scene>, SceneBuffers) {
 }
 
 #[test]
-fn each_frame_under_way_keeps_its_vertices_camera_and_counts_whatever_comes_after_it() {
-    let (mut renderer, scene, buffers) = loaded();
-    let moved = [0.0, 0.2, 0.6];
+fn frames_in_flight_keep_their_vertices_and_counts() {
+    let (mut renderer, scene, buffers) = load_renderer();
+    let widths = [0.0, 0.2, 0.6];
     let mut tickets = Vec::new();
-    for by in moved {
-        renderer.upload(&buffers, &surface(by)).expect("uploads");
-        tickets.push(renderer.submit(&buffers, &shot(&scene, 64)).expect("submits"));
+    for extra_width in widths {
+        renderer.upload(&buffers, &surface(extra_width)).expect("uploads");
+        tickets.push(renderer.submit(&buffers, &params(&scene, 64)).expect("submits"));
     }
-    // Last frame first: the host chooses the order of waiting.
-    let mut seen = Vec::new();
-    for by in moved.into_iter().rev() {
-        let ticket = tickets.pop().expect("as many");
+    // Last frame first: the host may wait in any order.
+    let mut frames = Vec::new();
+    for extra_width in widths.into_iter().rev() {
+        let ticket = tickets.pop().expect("a ticket");
         let image = renderer.read_image(ticket).expect("draws");
-        let (rgba, fragments) = alone(by);
-        assert!(image.rgba == rgba, "{by}");
-        assert_eq!(renderer.stats().oit.expect("exact").fragments, fragments);
+        let (rgba, fragments) = draw_frame(extra_width);
+        assert!(image.rgba == rgba, "{extra_width}");
+        assert_eq!(renderer.stats().oit.expect("list statistics").fragments, fragments);
         let names: Vec<&str> = image.times.iter().map(|(key, _)| key.name()).collect();
         assert_eq!(names[..3], ["shadow", "blur", "draw"]);
         assert!(image.times.iter().all(|(_, ms)| ms.is_finite() && ms >= 0.0), "{:?}", image.times);
-        seen.push((rgba, fragments));
+        frames.push((rgba, fragments));
     }
-    assert!(seen[0] != seen[1] && seen[1] != seen[2] && seen[0].1 > seen[2].1, "control: the frames differ");
+    assert!(frames[0] != frames[1] && frames[1] != frames[2] && frames[0].1 > frames[2].1, "expected different frames");
 }
 
 #[test]
-fn a_fourth_frame_of_a_form_is_refused_and_a_scene_that_is_read_at_once_has_one_buffer() {
-    let (mut renderer, scene, buffers) = loaded();
-    let shot = shot(&scene, 64);
-    let made = |renderer: &Renderer| renderer.targets.last().expect("drawn").readback_ring.count();
+fn frames_in_flight_are_limited_per_target() {
+    let (mut renderer, scene, buffers) = load_renderer();
+    let params = params(&scene, 64);
+    let staging_count = |renderer: &Renderer| renderer.targets.last().expect("drawn").readback_ring.count();
     for _ in 0..5 {
-        renderer.draw(&buffers, &shot).expect("draws");
+        renderer.draw(&buffers, &params).expect("draws");
     }
-    assert_eq!(made(&renderer), 1);
+    assert_eq!(staging_count(&renderer), 1);
     let unread: Vec<_> =
-        (0..5).map(|_| renderer.submit_without_readback(&buffers, &shot).expect("as many as one likes")).collect();
+        (0..5).map(|_| renderer.submit_without_readback(&buffers, &params).expect("submits")).collect();
     for ticket in unread {
         assert!(renderer.read_image(ticket).expect("draws").rgba.is_empty());
     }
-    assert_eq!(made(&renderer), 1, "what nobody reads takes none");
-    let mut tickets: Vec<_> = (0..3).map(|_| renderer.submit(&buffers, &shot).expect("has room")).collect();
-    assert_eq!((made(&renderer), MAX_FRAMES_IN_FLIGHT), (3, 3));
-    let refusal = renderer.submit(&buffers, &shot).expect_err("full");
-    assert_eq!(refusal, Error::Busy { queue: "frames in flight", limit: 3 });
-    let smaller = FrameParams { width: 32, height: 32, ..shot };
-    renderer.draw(&buffers, &smaller).expect("another form has its own");
-    let first = renderer.read_image(tickets.remove(0)).expect("draws");
-    tickets.push(renderer.submit(&buffers, &shot).expect("there is room again"));
+    assert_eq!(staging_count(&renderer), 1, "a frame without readback needs no staging buffer");
+    let mut tickets: Vec<_> = (0..3).map(|_| renderer.submit(&buffers, &params).expect("submits")).collect();
+    assert_eq!((staging_count(&renderer), MAX_FRAMES_IN_FLIGHT), (3, 3));
+    let error = renderer.submit(&buffers, &params).expect_err("a full ring");
+    assert_eq!(error, Error::Busy { queue: "frames in flight", limit: 3 });
+    let smaller_params = FrameParams { width: 32, height: 32, ..params };
+    renderer.draw(&buffers, &smaller_params).expect("a ring of its own");
+    let first_image = renderer.read_image(tickets.remove(0)).expect("draws");
+    tickets.push(renderer.submit(&buffers, &params).expect("a free slot"));
     drop(tickets.remove(0));
-    tickets.push(renderer.submit(&buffers, &shot).expect("one that was given up makes room"));
+    tickets.push(renderer.submit(&buffers, &params).expect("the slot of the dropped ticket"));
     for ticket in tickets {
-        assert!(renderer.read_image(ticket).expect("draws").rgba == first.rgba);
+        assert!(renderer.read_image(ticket).expect("draws").rgba == first_image.rgba);
     }
-    assert!(!renderer.read_visibility().expect("beside the ring").is_empty());
+    assert!(!renderer.read_visibility().expect("a staging buffer outside the ring").is_empty());
 }
 
 #[test]
-fn a_frame_that_does_not_end_is_an_error_with_the_name_of_the_pass_and_the_next_is_drawn() {
-    let (mut renderer, scene, buffers) = loaded();
-    let shot = shot(&scene, 64);
+fn timeout_names_the_pass_and_the_next_frame_is_drawn() {
+    let (mut renderer, scene, buffers) = load_renderer();
+    let params = params(&scene, 64);
     let passes =
         [Pass::Shadow, Pass::Blur, Pass::Visibility, Pass::Blended, Pass::Shade, Pass::Bloom, Pass::Encode, Pass::Read];
-    for stuck in 0..passes.len() {
-        let mut ticket = renderer.submit(&buffers, &shot).expect("submits");
-        renderer.gl.wait("test", Duration::from_secs(60)).expect("all of it");
+    for failing_index in 0..passes.len() {
+        let mut ticket = renderer.submit(&buffers, &params).expect("submits");
+        renderer.gl.wait("test", Duration::from_secs(60)).expect("a finished frame");
         let timed: Vec<Pass> = ticket.passes.iter().map(|(pass, _)| *pass).collect();
         assert_eq!(timed, passes);
         ticket.fence = renderer.gl.broken_fence();
-        for (_, timer) in &mut ticket.passes[stuck..] {
+        for (_, timer) in &mut ticket.passes[failing_index..] {
             *timer = renderer.gl.unstarted_timer();
         }
-        assert!(ticket.is_ready(), "to be given up");
-        let Err(Error::Fault { stage, reason }) = renderer.read_image(ticket) else { panic!("no fault") };
-        assert_eq!(stage, passes[stuck].name());
-        let last = if stuck == 0 { "none".to_owned() } else { format!("'{}'", passes[stuck - 1]) };
+        assert!(ticket.is_ready(), "expected a timed-out frame to be ready");
+        let Err(Error::Fault { stage, reason }) = renderer.read_image(ticket) else { panic!("expected a fault") };
+        assert_eq!(stage, passes[failing_index].name());
+        let last = if failing_index == 0 { "none".to_owned() } else { format!("'{}'", passes[failing_index - 1]) };
         assert!(reason.ends_with(&format!("the last pass that it finished: {last}")), "{reason}");
         // Discards the errors of querying objects that do not exist.
         renderer.gl.check("test").ok();
-        renderer.draw(&buffers, &shot).expect("the next one is drawn");
+        renderer.draw(&buffers, &params).expect("draws");
     }
 }
 
 #[test]
-fn a_frame_that_fails_halfway_leaves_no_images_of_which_nobody_knows_what_they_hold() {
-    let (mut renderer, scene, mut buffers) = loaded();
-    let shot = shot(&scene, 64);
-    let want = renderer.draw(&buffers, &shot).expect("draws").rgba;
-    let blur = std::mem::take(&mut buffers.programs.blur);
-    let Err(Error::Fault { stage, .. }) = renderer.draw(&buffers, &shot) else { panic!("no fault") };
+fn failed_frame_drops_its_render_target() {
+    let (mut renderer, scene, mut buffers) = load_renderer();
+    let params = params(&scene, 64);
+    let expected_rgba = renderer.draw(&buffers, &params).expect("draws").rgba;
+    let blur_programs = std::mem::take(&mut buffers.programs.blur);
+    let Err(Error::Fault { stage, .. }) = renderer.draw(&buffers, &params) else { panic!("expected a fault") };
     assert_eq!((stage, renderer.targets.len()), ("blur", 0));
-    buffers.programs.blur = blur;
-    assert!(renderer.draw(&buffers, &shot).expect("draws again").rgba == want);
+    buffers.programs.blur = blur_programs;
+    assert!(renderer.draw(&buffers, &params).expect("draws again").rgba == expected_rgba);
 }
 
 #[test]
-fn a_frame_that_is_late_by_more_than_the_limit_is_ready_to_be_given_up() {
-    let (mut renderer, scene, buffers) = loaded();
+fn frame_that_exceeds_its_time_limit_is_ready() {
+    let (mut renderer, scene, buffers) = load_renderer();
     renderer.frame_timeout = Duration::from_millis(5);
-    let ticket = renderer.submit_without_readback(&buffers, &shot(&scene, 64)).expect("submits");
+    let ticket = renderer.submit_without_readback(&buffers, &params(&scene, 64)).expect("submits");
     ticket.is_ready();
     thread::sleep(Duration::from_millis(6));
     assert!(ticket.time_left().is_zero() && ticket.is_ready_within(Duration::from_secs(60)));
 }
 
 #[test]
-fn a_frame_comes_back_when_the_images_of_its_form_were_freed_meanwhile() {
-    let (mut renderer, scene, buffers) = loaded();
-    let early = renderer.submit(&buffers, &shot(&scene, 64)).expect("submits");
+fn frame_is_readable_after_its_target_was_freed() {
+    let (mut renderer, scene, buffers) = load_renderer();
+    let ticket = renderer.submit(&buffers, &params(&scene, 64)).expect("submits");
     for side in 32..40 {
-        renderer.draw(&buffers, &shot(&scene, side)).expect("draws");
+        renderer.draw(&buffers, &params(&scene, side)).expect("draws");
     }
     assert!(renderer.targets.iter().all(|target| target.desc.width != 64));
-    let pixels = renderer.map_pixels(early).expect("draws");
-    renderer.draw(&buffers, &shot(&scene, 41)).expect("draws while somebody reads what was freed");
+    let pixels = renderer.map_pixels(ticket).expect("draws");
+    renderer.draw(&buffers, &params(&scene, 41)).expect("draws while the freed pixels are mapped");
     assert_eq!(renderer.gl.retired_buffer_count(), 1);
-    assert!(pixels.into_image().rgba == alone(0.0).0);
-    renderer.draw(&buffers, &shot(&scene, 42)).expect("draws");
+    assert!(pixels.into_image().rgba == draw_frame(0.0).0);
+    renderer.draw(&buffers, &params(&scene, 42)).expect("draws");
     assert_eq!(renderer.gl.retired_buffer_count(), 0);
 }
 
 #[test]
-fn pixels_outlive_a_renderer_whose_thread_holds_them() {
-    let (mut renderer, scene, buffers) = loaded();
-    let ticket = renderer.submit(&buffers, &shot(&scene, 64)).expect("submits");
+fn mapped_pixels_outlive_the_renderer() {
+    let (mut renderer, scene, buffers) = load_renderer();
+    let ticket = renderer.submit(&buffers, &params(&scene, 64)).expect("submits");
     let pixels = renderer.map_pixels(ticket).expect("draws");
     drop(renderer);
     drop(buffers);
-    assert!(pixels.into_image().rgba == alone(0.0).0);
+    assert!(pixels.into_image().rgba == draw_frame(0.0).0);
 }
 
 #[test]
-fn pixels_are_copied_by_another_thread_and_their_memory_waits_for_it_whatever_goes_meanwhile() {
-    let (want, _) = alone(0.0);
-    let (mut renderer, scene, buffers) = loaded();
-    let shot = shot(&scene, 64);
-    let slow = |renderer: &mut Renderer, buffers: &SceneBuffers| {
-        let ticket = renderer.submit(buffers, &shot).expect("has room");
+fn staging_memory_is_freed_after_another_thread_copied_it() {
+    let (expected_rgba, _) = draw_frame(0.0);
+    let (mut renderer, scene, buffers) = load_renderer();
+    let params = params(&scene, 64);
+    let spawn_reader = |renderer: &mut Renderer, buffers: &SceneBuffers| {
+        let ticket = renderer.submit(buffers, &params).expect("submits");
         let pixels = renderer.map_pixels(ticket).expect("draws");
         thread::spawn(move || {
             thread::sleep(Duration::from_millis(50));
@@ -208,31 +208,31 @@ fn pixels_are_copied_by_another_thread_and_their_memory_waits_for_it_whatever_go
         })
     };
     // The fourth frame waits until the first was copied.
-    let readers: Vec<_> = (0..4).map(|_| slow(&mut renderer, &buffers)).collect();
+    let readers: Vec<_> = (0..4).map(|_| spawn_reader(&mut renderer, &buffers)).collect();
     renderer.unload(buffers);
     drop(renderer);
     for reader in readers {
-        let FrameImage { rgba, .. } = reader.join().expect("lives");
-        assert!(rgba == want);
+        let FrameImage { rgba, .. } = reader.join().expect("no panic");
+        assert!(rgba == expected_rgba);
     }
 }
 
 #[test]
-fn pixels_that_are_held_for_too_long_refuse_frames_and_block_none_for_ever() {
-    let (mut renderer, scene, buffers) = loaded();
+fn submit_times_out_while_all_staging_buffers_are_mapped() {
+    let (mut renderer, scene, buffers) = load_renderer();
     renderer.frame_timeout = Duration::from_secs(20);
-    let shot = shot(&scene, 64);
-    let mut held = Vec::new();
+    let params = params(&scene, 64);
+    let mut mapped_frames = Vec::new();
     for _ in 0..3 {
-        let ticket = renderer.submit(&buffers, &shot).expect("has room");
-        held.push(renderer.map_pixels(ticket).expect("draws"));
+        let ticket = renderer.submit(&buffers, &params).expect("submits");
+        mapped_frames.push(renderer.map_pixels(ticket).expect("draws"));
     }
     renderer.frame_timeout = Duration::from_millis(20);
-    assert!(matches!(renderer.submit(&buffers, &shot), Err(Error::Busy { .. })));
+    assert!(matches!(renderer.submit(&buffers, &params), Err(Error::Busy { .. })));
     renderer.frame_timeout = Duration::from_secs(20);
-    let images: Vec<FrameImage> = held.into_iter().map(MappedPixels::into_image).collect();
-    let after = renderer.draw(&buffers, &shot).expect("there is room again");
-    assert!(images.iter().all(|image| image.rgba == after.rgba));
+    let images: Vec<FrameImage> = mapped_frames.into_iter().map(MappedPixels::into_image).collect();
+    let last_image = renderer.draw(&buffers, &params).expect("draws");
+    assert!(images.iter().all(|image| image.rgba == last_image.rgba));
 }
 
 /// Panics instead of drawing.
@@ -252,43 +252,47 @@ impl Rasterizer for PanickingRasterizer {
 /// The panic happens while the context is current, a timer query is active and a target is in use.
 #[test]
 fn other_scenes_are_drawn_after_a_panic_within_a_frame() {
-    let (mut renderer, scene, buffers) = loaded();
-    let want = renderer.draw(&buffers, &shot(&scene, 64)).expect("draws").rgba;
+    let (mut renderer, scene, buffers) = load_renderer();
+    let expected_rgba = renderer.draw(&buffers, &params(&scene, 64)).expect("draws").rgba;
     let mut parts = squares(vec![Material { double_sided: true, ..Material::default() }]);
     parts.look.samples = 1;
-    let other = Scene::new(parts).expect("good");
-    let mut panicking = renderer.load(&other).expect("loads");
-    let make = |_| Ok(Box::new(PanickingRasterizer) as Box<dyn Rasterizer>);
-    renderer.attach_rasterizer(&mut panicking, make).expect("attached");
+    let panicking_scene = Scene::new(parts).expect("a valid scene");
+    let mut panicking_buffers = renderer.load(&panicking_scene).expect("loads");
+    let create_rasterizer = |_| Ok(Box::new(PanickingRasterizer) as Box<dyn Rasterizer>);
+    renderer.attach_rasterizer(&mut panicking_buffers, create_rasterizer).expect("attaches");
     // A second renderer, whose context is current before and after.
-    let (mut bystander, _, bystander_buffers) = loaded();
+    let (mut other_renderer, _, other_buffers) = load_renderer();
     for _ in 0..MAX_FRAMES_IN_FLIGHT + 2 {
-        let drawn = catch_unwind(AssertUnwindSafe(|| renderer.draw(&panicking, &shot(&other, 64))));
-        assert!(drawn.is_err(), "the rasterizer is asked");
-        renderer.gl.check("test").expect("no error remains");
-        assert!(renderer.draw(&buffers, &shot(&scene, 64)).expect("draws").rgba == want);
-        assert!(bystander.draw(&bystander_buffers, &shot(&scene, 64)).expect("draws").rgba == want);
+        let result =
+            catch_unwind(AssertUnwindSafe(|| renderer.draw(&panicking_buffers, &params(&panicking_scene, 64))));
+        assert!(result.is_err(), "expected a panic of the rasterizer");
+        renderer.gl.check("test").expect("no OpenGL error");
+        assert!(renderer.draw(&buffers, &params(&scene, 64)).expect("draws").rgba == expected_rgba);
+        assert!(other_renderer.draw(&other_buffers, &params(&scene, 64)).expect("draws").rgba == expected_rgba);
     }
 }
 
 #[test]
 fn frames_without_their_context_are_errors_and_later_ones_are_drawn() {
-    let (mut renderer, scene, buffers) = loaded();
-    let want = renderer.draw(&buffers, &shot(&scene, 64)).expect("draws").rgba;
-    let (mut bystander, _, bystander_buffers) = loaded();
-    let in_flight = renderer.submit(&buffers, &shot(&scene, 64)).expect("submits");
-    let occupied = renderer.gl.occupy();
-    let refused = [
-        renderer.draw(&buffers, &shot(&scene, 64)).err(),
+    let (mut renderer, scene, buffers) = load_renderer();
+    let expected_rgba = renderer.draw(&buffers, &params(&scene, 64)).expect("draws").rgba;
+    let (mut other_renderer, _, other_buffers) = load_renderer();
+    let in_flight = renderer.submit(&buffers, &params(&scene, 64)).expect("submits");
+    let occupied_context = renderer.gl.occupy();
+    let errors = [
+        renderer.draw(&buffers, &params(&scene, 64)).err(),
         renderer.upload(&buffers, &surface(0.5)).err(),
         renderer.load(&scene).err(),
         renderer.read_image(in_flight).err(),
     ];
-    for error in refused {
-        let error = error.expect("no context").to_string();
+    for error in errors {
+        let error = error.expect("an error without a context").to_string();
         assert!(error.contains("eglMakeCurrent"), "{error}");
     }
-    assert!(bystander.draw(&bystander_buffers, &shot(&scene, 64)).expect("draws").rgba == want);
-    drop(occupied);
-    assert!(renderer.draw(&buffers, &shot(&scene, 64)).expect("draws").rgba == want, "the upload was not issued");
+    assert!(other_renderer.draw(&other_buffers, &params(&scene, 64)).expect("draws").rgba == expected_rgba);
+    drop(occupied_context);
+    assert!(
+        renderer.draw(&buffers, &params(&scene, 64)).expect("draws").rgba == expected_rgba,
+        "the upload was not issued"
+    );
 }

@@ -1,8 +1,8 @@
 //! A compute rasterizer that draws selected passes instead of OpenGL, and its output buffers.
 //!
 //! The compute rasterizer writes into OpenGL buffers: depth for the blur, and visibility keys that a compute pass
-//! converts to ids. All later passes are the same. A scene whose look does not ask for a compute rasterizer has none of
-//! these resources.
+//! converts to ids. All later passes are the same as with OpenGL. A scene has these resources only if its backend
+//! settings select a compute rasterizer.
 
 use std::cell::{Cell, Ref, RefCell};
 use std::rc::Rc;
@@ -30,14 +30,15 @@ pub(crate) struct ComputeRasterizer {
     enabled: Cell<RasterPasses>,
 }
 
-/// Output buffers of a compute rasterizer, and the programs that read them; none for passes that it does not draw.
+/// Output buffers of a compute rasterizer, and the programs that read them. An output is absent if the compute rasterizer
+/// does not support its pass.
 #[derive(Debug)]
 pub(crate) struct RasterOutputs {
     shadow: Option<ShadowDepths>,
     visibility: Option<VisibilityKeys>,
 }
 
-/// Depth output of the shadow map.
+/// Depth of the shadow map.
 #[derive(Debug)]
 struct ShadowDepths {
     buffer: Buffer,
@@ -45,7 +46,7 @@ struct ShadowDepths {
     blur: Rc<Program>,
 }
 
-/// Visibility output.
+/// Visibility keys of a frame.
 #[derive(Debug)]
 struct VisibilityKeys {
     /// Sized for the largest frame so far.
@@ -59,31 +60,31 @@ const KEY_BYTES: u64 = 8;
 impl RasterPasses {
     pub(crate) const NONE: Self = Self { shadow: false, visibility: false };
 
-    /// The passes of a scene that a compute rasterizer may draw. The shadow map must have moments and only one cascade.
-    /// Frames must have one sample per pixel and no blended triangles, which are tested against depth.
+    /// The passes of a scene that a compute rasterizer may draw. The shadow pass needs moments and only one cascade. The
+    /// visibility pass needs one sample per pixel and no blended triangles, because no depth image is written.
     pub(crate) fn supported(scene: &Scene) -> Self {
         let look = &scene.look;
-        let shadow = look.shadow.is_some_and(|shadow| shadow.has_moments() && shadow.splits == 1);
-        let triangles = scene.layout.triangles > 0;
+        let is_shadow_supported = look.shadow.is_some_and(|shadow| shadow.has_moments() && shadow.splits == 1);
+        let has_triangles = scene.layout.triangles > 0;
         Self {
-            shadow: triangles && shadow,
-            visibility: triangles && look.samples_per_pixel() == 1 && !scene.features.blend,
+            shadow: has_triangles && is_shadow_supported,
+            visibility: has_triangles && look.samples_per_pixel() == 1 && !scene.features.blend,
         }
     }
 
     /// Whether any pass is selected.
-    pub(crate) const fn any(self) -> bool {
+    pub(crate) const fn has_any(self) -> bool {
         self.shadow || self.visibility
     }
 
-    /// Whether all these passes are among the others.
-    pub(crate) const fn is_subset_of(self, others: Self) -> bool {
-        (others.shadow || !self.shadow) && (others.visibility || !self.visibility)
+    /// Whether `other` contains all these passes.
+    pub(crate) const fn is_subset_of(self, other: Self) -> bool {
+        (other.shadow || !self.shadow) && (other.visibility || !self.visibility)
     }
 }
 
 impl RasterOutputs {
-    /// Creates the outputs of the passes. `options` are those of the scene.
+    /// Creates the outputs of the passes. `options` are the shader options of the scene.
     pub(crate) fn new(
         gl: &Rc<Gl>,
         passes: RasterPasses,
@@ -105,25 +106,25 @@ impl RasterOutputs {
         Ok(Self { shadow, visibility })
     }
 
-    /// The passes that have an output.
+    /// Passes that have an output.
     pub(crate) const fn passes(&self) -> RasterPasses {
         RasterPasses { shadow: self.shadow.is_some(), visibility: self.visibility.is_some() }
     }
 }
 
 impl ComputeRasterizer {
-    /// A rasterizer that draws all passes that have an output.
+    /// Draws all passes that have an output.
     pub(crate) fn new(rasterizer: Box<dyn Rasterizer>, outputs: RasterOutputs) -> Self {
         let enabled = Cell::new(outputs.passes());
         Self { rasterizer: RefCell::new(rasterizer), outputs, enabled }
     }
 
-    /// The passes that it draws now.
+    /// Passes that the compute rasterizer draws at present.
     pub(crate) fn enabled(&self) -> RasterPasses {
         self.enabled.get()
     }
 
-    /// Selects the passes that it draws from now on.
+    /// Selects the passes that the compute rasterizer draws; OpenGL draws the others.
     pub(crate) fn enable(&self, passes: RasterPasses) {
         self.enabled.set(passes);
     }
@@ -137,30 +138,44 @@ impl ComputeRasterizer {
     /// Draws the depth of the shadow map, the visibility of the frame, or both.
     ///
     /// # Errors
-    /// Those of the rasterizer; `Fault` when OpenGL has no memory for the keys.
-    pub(crate) fn draw(&self, gl: &Rc<Gl>, map: Option<&Viewport>, frame: Option<&Viewport>) -> Result<()> {
-        let depths = self.outputs.shadow.as_ref().zip(map).map(|(depths, map)| (map, depths.buffer.shared()));
-        let keys = match self.outputs.visibility.as_ref().zip(frame) {
-            Some((keys, frame)) => Some((frame, keys.reserve(gl, KEY_BYTES * frame.pixel_count() as u64)?)),
+    /// Errors of the rasterizer; `Fault` if OpenGL has no memory for the keys.
+    pub(crate) fn draw(
+        &self,
+        gl: &Rc<Gl>,
+        shadow_viewport: Option<&Viewport>,
+        frame_viewport: Option<&Viewport>,
+    ) -> Result<()> {
+        let depths = self
+            .outputs
+            .shadow
+            .as_ref()
+            .zip(shadow_viewport)
+            .map(|(depths, shadow_viewport)| (shadow_viewport, depths.buffer.shared()));
+        let keys = match self.outputs.visibility.as_ref().zip(frame_viewport) {
+            Some((keys, frame_viewport)) => {
+                Some((frame_viewport, keys.reserve(gl, KEY_BYTES * frame_viewport.pixel_count() as u64)?))
+            }
             None => None,
         };
-        let depths = depths.as_ref().map(|(map, buffer)| (*map, buffer));
-        self.rasterizer.borrow_mut().draw(depths, keys.as_ref().map(|(frame, buffer)| (*frame, buffer)))
+        let depths = depths.as_ref().map(|(shadow_viewport, buffer)| (*shadow_viewport, buffer));
+        self.rasterizer
+            .borrow_mut()
+            .draw(depths, keys.as_ref().map(|(frame_viewport, buffer)| (*frame_viewport, buffer)))
     }
 
-    /// Input buffer and program of the first blur pass; none unless it draws the shadow map.
+    /// Input buffer and program of the first blur pass; none without shadow output.
     pub(crate) fn blur_input(&self) -> Option<(&Buffer, &Program)> {
         self.outputs.shadow.as_ref().map(|depths| (&depths.buffer, depths.blur.as_ref()))
     }
 
-    /// Keys of the last frame and the program that converts them; none unless it has drawn visibility.
+    /// Keys of the last frame and the program that converts them; none before the first visibility pass.
     pub(crate) fn unpack_input(&self) -> Option<(Ref<'_, Buffer>, &Program)> {
         let keys = self.outputs.visibility.as_ref()?;
         let buffer = Ref::filter_map(keys.buffer.borrow(), Option::as_ref).ok()?;
         Some((buffer, keys.unpack.as_ref()))
     }
 
-    /// Buffers that it holds, by name and bytes.
+    /// Name and bytes of each buffer.
     pub(crate) fn allocations(&self) -> impl Iterator<Item = (&'static str, u64)> {
         let keys =
             self.outputs.visibility.as_ref().and_then(|keys| keys.buffer.borrow().as_ref().map(|buffer| buffer.bytes));
@@ -172,11 +187,11 @@ impl ComputeRasterizer {
 }
 
 impl VisibilityKeys {
-    /// A handle to the buffer, which grows to at least `bytes` bytes.
+    /// Returns a handle to the buffer, after it was reallocated if it is smaller than `bytes`.
     fn reserve(&self, gl: &Rc<Gl>, bytes: u64) -> Result<GlBuffer> {
         let mut buffer = self.buffer.borrow_mut();
         match buffer.take().filter(|buffer| buffer.bytes >= bytes) {
-            Some(large) => Ok(buffer.insert(large).shared()),
+            Some(reusable_buffer) => Ok(buffer.insert(reusable_buffer).shared()),
             None => Ok(buffer.insert(gl.buffer(bytes, gl::STREAM_COPY, None)?).shared()),
         }
     }

@@ -1,4 +1,4 @@
-//! Lists of the triangles that passed the culling tests.
+//! Lists of triangles that passed the culling tests.
 
 use std::rc::Rc;
 
@@ -12,47 +12,52 @@ use crate::plan::buffers::CullBuffers;
 use crate::scene_data::geometry::{BlendMode, DrawGroup};
 use modalcast_model::error::Result;
 
-/// The lists of a culled scene, one per group, and the vertex arrays that draw them.
+/// Lists of a culled scene, one per draw group, and the vertex arrays that draw them.
 #[derive(Debug)]
 pub(crate) struct TriangleCuller {
     pub(crate) buffers: CullBuffers<Buffer>,
     pub(crate) uniforms: CullUniforms,
     /// Buffer texture over the ids of the listed triangles.
     pub(crate) triangle_ids: Texture,
-    arrays: CullVertexArrays,
+    vertex_arrays: CullVertexArrays,
 }
 
-/// Vertex arrays that index the lists.
+/// Vertex arrays whose index buffer contains the lists.
 #[derive(Debug)]
 pub(crate) struct CullVertexArrays {
-    /// Of opaque triangles.
-    pub(crate) positions: VertexArray,
-    /// Of cut-out and blended triangles; none without such triangles.
-    pub(crate) corners: Option<VertexArray>,
+    /// For opaque triangles.
+    pub(crate) position_array: VertexArray,
+    /// For cut-out and blended triangles; none without such triangles.
+    pub(crate) corner_array: Option<VertexArray>,
 }
 
 impl TriangleCuller {
-    /// Initializes the buffers of the lists: no triangle was visible before.
+    /// Writes the uniforms, and marks all triangles as not visible in the previous frame.
     pub(crate) fn new(
         gl: &Rc<Gl>,
         buffers: CullBuffers<Buffer>,
         groups: &[DrawGroup],
-        arrays: CullVertexArrays,
+        vertex_arrays: CullVertexArrays,
     ) -> Result<Self> {
         debug_assert!(groups.len() <= MAX_GROUPS);
         let uniforms = CullUniforms::new(groups, gl.limits.subpixel_step());
         buffers.uniforms.write(bytemuck::bytes_of(&uniforms));
-        if let Some(previous) = &buffers.previously_visible {
-            previous.write(&vec![0; uniforms.mask_bytes()]);
+        if let Some(bitmap) = &buffers.previously_visible {
+            bitmap.write(&vec![0; uniforms.mask_bytes()]);
         }
-        Ok(Self { triangle_ids: gl.buffer_texture(&buffers.triangle_ids, gl::R32UI)?, buffers, uniforms, arrays })
+        Ok(Self {
+            triangle_ids: gl.buffer_texture(&buffers.triangle_ids, gl::R32UI)?,
+            buffers,
+            uniforms,
+            vertex_arrays,
+        })
     }
 
-    /// Vertex array of one kind of listed triangle.
+    /// Vertex array of the listed triangles with this blend mode.
     pub(crate) const fn vertex_array(&self, blend_mode: BlendMode) -> Option<&VertexArray> {
         match blend_mode {
-            BlendMode::Opaque => Some(&self.arrays.positions),
-            BlendMode::Mask | BlendMode::Blend => self.arrays.corners.as_ref(),
+            BlendMode::Opaque => Some(&self.vertex_arrays.position_array),
+            BlendMode::Mask | BlendMode::Blend => self.vertex_arrays.corner_array.as_ref(),
         }
     }
 
@@ -63,8 +68,8 @@ impl TriangleCuller {
         draws.bind_storage(DRAWS_BINDING);
         visible_bits.bind_storage(VISIBLE_BITS_BINDING);
         counters.bind_storage(COUNTERS_BINDING);
-        if let Some(previous) = previously_visible {
-            previous.bind_storage(PREVIOUSLY_VISIBLE_BINDING);
+        if let Some(bitmap) = previously_visible {
+            bitmap.bind_storage(PREVIOUSLY_VISIBLE_BINDING);
         }
         triangle_ids.bind_storage(TRIANGLE_IDS_BINDING);
         indices.bind_storage(INDICES_BINDING);

@@ -1,4 +1,4 @@
-//! Hierarchical depth pyramid: the farthest depth of ever larger squares of a frame.
+//! Hi-Z pyramid: each texel is the farthest depth of 2 x 2 texels of the level below.
 
 use std::rc::Rc;
 
@@ -7,16 +7,18 @@ use crate::device::gl::{self, Buffer, Framebuffer, Gl, Texture};
 use crate::layout::cull::{MAX_LEVEL, PYRAMID_BINDING};
 use modalcast_model::error::Result;
 
-/// Framebuffer of the occluders and the pyramid of their depth, for frames of one form.
+/// Hi-Z pyramid for occlusion culling, and the framebuffer into which the occluders are drawn. Valid for one
+/// [`TargetDesc`].
 #[derive(Debug)]
 pub(crate) struct DepthPyramid {
-    /// Framebuffer with the frame's depth only.
-    pub(crate) occluders: Framebuffer,
-    depths: Buffer,
+    /// Depth-only framebuffer; shares the depth texture of the frame.
+    pub(crate) occluder_fbo: Framebuffer,
+    /// Depths of all levels, one level after another.
+    levels: Buffer,
 }
 
-/// Texels of all levels.
-fn texels([mut width, mut height]: [u32; 2]) -> u64 {
+/// Number of texels of all levels.
+fn count_texels([mut width, mut height]: [u32; 2]) -> u64 {
     let mut sum = 0;
     for _ in 0..=MAX_LEVEL {
         sum += u64::from(width) * u64::from(height);
@@ -27,13 +29,13 @@ fn texels([mut width, mut height]: [u32; 2]) -> u64 {
 
 impl DepthPyramid {
     pub(crate) fn new(gl: &Rc<Gl>, desc: TargetDesc, depth: &Texture) -> Result<Self> {
-        let depths = gl.buffer(4 * texels([desc.width, desc.height]), gl::STREAM_COPY, None)?;
-        Ok(Self { occluders: gl.framebuffer(None, depth)?, depths })
+        let levels = gl.buffer(4 * count_texels([desc.width, desc.height]), gl::STREAM_COPY, None)?;
+        Ok(Self { occluder_fbo: gl.framebuffer(None, depth)?, levels })
     }
 
     /// Binds the levels for the programs that write or test them.
     pub(crate) fn bind(&self) {
-        self.depths.bind_storage(PYRAMID_BINDING);
+        self.levels.bind_storage(PYRAMID_BINDING);
     }
 }
 
@@ -42,9 +44,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_level_is_half_as_wide_rounded_up() {
-        assert_eq!(texels([1, 1]), 9);
-        assert_eq!(texels([256, 256]), (0..=8).map(|level| 1 << (2 * level)).sum::<u64>());
-        assert_eq!(texels([3, 5]), 15 + 6 + 2 + 6);
+    fn level_sizes_are_halved_and_rounded_up() {
+        assert_eq!(count_texels([1, 1]), 9);
+        assert_eq!(count_texels([256, 256]), (0..=8).map(|level| 1 << (2 * level)).sum::<u64>());
+        assert_eq!(count_texels([3, 5]), 15 + 6 + 2 + 6);
     }
 }

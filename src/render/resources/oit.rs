@@ -15,72 +15,78 @@ use crate::region::DirtyRegion;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{MAX_FRAGMENTS, RenderSettings, Scene, Transparency};
 
-/// Default budget in fragments per pixel, and its minimum per frame.
 const DEFAULT_FRAGMENTS_PER_PIXEL: u64 = 8;
+/// Minimum of the default budget of a frame.
 const MIN_FRAGMENTS: u64 = 1 << 20;
 
-/// Images and buffers of exact transparency for frames of one form.
+/// Images and buffers of exact transparency for one [`TargetDesc`].
 #[derive(Debug)]
 pub(crate) struct OitTarget {
     /// Blended fragments of each pixel.
-    pub(crate) counts: Texture,
+    pub(crate) fragment_counts: Texture,
+    /// Index of the next record of each pixel.
     pub(crate) cursors: Texture,
-    /// One array layer per sample.
+    /// Light and transmittance of the blended triangles; one array layer per sample.
     pub(crate) layers: Texture,
-    /// Framebuffer that clears the counts.
-    pub(crate) clear_framebuffer: Framebuffer,
-    pub(crate) dirty: DirtyRegion,
-    /// Framebuffer with depth only, for the depth test.
-    pub(crate) depth_only: Framebuffer,
+    /// Framebuffer to clear `fragment_counts`.
+    pub(crate) counts_fbo: Framebuffer,
+    pub(crate) dirty_region: DirtyRegion,
+    /// Depth-only framebuffer for the depth test.
+    pub(crate) depth_fbo: Framebuffer,
     pub(crate) records: Buffer,
     pub(crate) counters: Buffer,
-    pub(crate) tiles: Buffer,
+    pub(crate) tile_list: Buffer,
 }
 
-/// Number of fragment records that a frame may use.
+/// Maximum number of fragment records of a frame.
 ///
 /// # Errors
-/// `Invalid` when the look asks for more records than fit into one buffer of the device.
+/// `Invalid` if the look asks for more records than fit into one buffer of the device.
 fn budget(limits: &Limits, look: &RenderSettings, [width, height]: [u32; 2]) -> Result<u32> {
-    let most = u64::from(MAX_FRAGMENTS).min(limits.max_storage_bytes / RECORD_BYTES);
+    let max_fragments = u64::from(MAX_FRAGMENTS).min(limits.max_storage_bytes / RECORD_BYTES);
     if let Some(fragments) = look.fragments {
-        let fits = u64::from(fragments) <= most;
-        return if fits { Ok(fragments) } else { Err(gl::too_large("look.fragments", most, fragments.into())) };
+        let is_allowed = u64::from(fragments) <= max_fragments;
+        return if is_allowed {
+            Ok(fragments)
+        } else {
+            Err(gl::too_large("look.fragments", max_fragments, fragments.into()))
+        };
     }
-    Ok((DEFAULT_FRAGMENTS_PER_PIXEL * u64::from(width) * u64::from(height)).max(MIN_FRAGMENTS).min(most) as u32)
+    Ok((DEFAULT_FRAGMENTS_PER_PIXEL * u64::from(width) * u64::from(height)).max(MIN_FRAGMENTS).min(max_fragments)
+        as u32)
 }
 
 impl OitTarget {
     pub(crate) fn new(gl: &Rc<Gl>, desc: TargetDesc, budget: u32, depth: &Texture) -> Result<Self> {
         let TargetDesc { width, height, samples, .. } = desc;
-        let image = |target: u32, format: u32, depth: u32| {
+        let create_image = |target: u32, format: u32, depth: u32| {
             create_nearest_texture(gl, TextureDesc { target, format, width, height, depth, levels: 1 })
         };
-        let counts = image(gl::TEXTURE_2D, gl::R32UI, 1)?;
+        let fragment_counts = create_image(gl::TEXTURE_2D, gl::R32UI, 1)?;
         Ok(Self {
-            clear_framebuffer: gl.color_framebuffer(&counts)?,
-            dirty: DirtyRegion::default(),
-            depth_only: gl.framebuffer(None, depth)?,
-            counts,
-            cursors: image(gl::TEXTURE_2D, gl::R32UI, 1)?,
-            layers: image(gl::TEXTURE_2D_ARRAY, gl::RGBA16F, samples)?,
+            counts_fbo: gl.color_framebuffer(&fragment_counts)?,
+            dirty_region: DirtyRegion::default(),
+            depth_fbo: gl.framebuffer(None, depth)?,
+            fragment_counts,
+            cursors: create_image(gl::TEXTURE_2D, gl::R32UI, 1)?,
+            layers: create_image(gl::TEXTURE_2D_ARRAY, gl::RGBA16F, samples)?,
             records: gl.buffer(RECORD_BYTES * u64::from(budget), gl::STREAM_COPY, None)?,
             counters: gl.buffer(COUNTERS_BYTES as u64, gl::STREAM_COPY, None)?,
-            tiles: gl.buffer(tile_list_bytes([width, height]), gl::STREAM_COPY, None)?,
+            tile_list: gl.buffer(tile_list_bytes([width, height]), gl::STREAM_COPY, None)?,
         })
     }
 
-    /// Binds the images and buffers for all passes but the last.
+    /// Binds the images and buffers, except `layers`.
     pub(crate) fn bind(&self) {
-        self.counts.bind_image_read_write(COUNTS_IMAGE);
+        self.fragment_counts.bind_image_read_write(COUNTS_IMAGE);
         self.cursors.bind_image_read_write(CURSORS_IMAGE);
         self.records.bind_storage(RECORDS_BINDING);
         self.counters.bind_storage(COUNTERS_BINDING);
-        self.tiles.bind_storage(TILES_BINDING);
+        self.tile_list.bind_storage(TILES_BINDING);
     }
 }
 
-/// How a frame of this look draws blended triangles.
+/// Resources that a frame of a scene needs for blended triangles.
 pub(crate) fn blend_storage(gl: &Gl, scene: &Scene, size: [u32; 2]) -> Result<BlendStorage> {
     match scene.look.transparency {
         _ if !scene.features.blend => Ok(BlendStorage::None),
@@ -94,16 +100,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_budget_is_eight_a_pixel_or_what_the_look_says_as_far_as_one_buffer_reaches() {
+    fn budget_is_bounded_by_the_buffer_size() {
         let limits = |max_storage_bytes: u64| Limits { max_storage_bytes, ..Limits::default() };
-        let of = |fragments: Option<u32>, max_storage_bytes: u64, size: [u32; 2]| {
+        let budget_for = |fragments: Option<u32>, max_storage_bytes: u64, size: [u32; 2]| {
             budget(&limits(max_storage_bytes), &RenderSettings { fragments, ..RenderSettings::default() }, size)
         };
-        assert_eq!(of(None, 1 << 31, [640, 480]).expect("fits"), 8 * 640 * 480);
-        assert_eq!(of(None, 1 << 31, [1, 1]).expect("fits"), 1 << 20);
-        assert_eq!(of(None, 1 << 27, [8192, 8192]).expect("less"), 1 << 24, "as many as fit");
-        assert_eq!(of(Some(100), 1 << 27, [8192, 8192]).expect("fits"), 100);
-        let refusal = of(Some(1 << 25), 1 << 27, [64, 64]).expect_err("refused").to_string();
-        assert_eq!(refusal, "look.fragments: expected at most 16777216 on this device, got 33554432");
+        assert_eq!(budget_for(None, 1 << 31, [640, 480]).expect("a valid budget"), 8 * 640 * 480);
+        assert_eq!(budget_for(None, 1 << 31, [1, 1]).expect("a valid budget"), 1 << 20);
+        assert_eq!(budget_for(None, 1 << 27, [8192, 8192]).expect("a valid budget"), 1 << 24);
+        assert_eq!(budget_for(Some(100), 1 << 27, [8192, 8192]).expect("a valid budget"), 100);
+        let error = budget_for(Some(1 << 25), 1 << 27, [64, 64]).expect_err("an error").to_string();
+        assert_eq!(error, "look.fragments: expected at most 16777216 on this device, got 33554432");
     }
 }

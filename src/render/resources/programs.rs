@@ -1,5 +1,4 @@
-//! Shader programs of a scene's passes, with the branches that its materials need, and the cache that shares them
-//! between scenes.
+//! Shader programs of a scene's passes, and the cache that shares programs between scenes.
 
 use std::collections::HashMap;
 use std::rc::Rc;
@@ -16,23 +15,23 @@ const MAX_PROGRAMS: usize = 128;
 /// Returns the program of a source, compiled or from the cache.
 pub(crate) type ProgramCompiler<'a> = dyn FnMut(ProgramSource) -> Result<Rc<Program>> + 'a;
 
-/// Compiled programs by source, at most [`MAX_PROGRAMS`].
+/// Compiled programs by their source; at most [`MAX_PROGRAMS`].
 #[derive(Debug)]
 pub(crate) struct ProgramCache {
     gl: Rc<Gl>,
     programs: HashMap<ProgramSource, Rc<Program>>,
 }
 
-/// Programs that do not depend on the samples per pixel; none where the scene has no such pass or triangles.
+/// Programs that do not depend on the samples per pixel. An optional program is absent if the scene does not need it.
 #[derive(Debug)]
 pub(crate) struct ScenePrograms {
-    /// In execution order; empty when the shadow map has no moments.
+    /// In execution order; empty if the shadow map has no moments.
     pub(crate) blur: Vec<Rc<Program>>,
-    /// Shadow casters of each kind.
+    /// Draws shadow casters; one per blend mode.
     pub(crate) shadow: [Option<Rc<Program>>; 3],
     pub(crate) opaque: Option<Rc<Program>>,
     pub(crate) ground: Option<Rc<Program>>,
-    /// Culling of shadow casters.
+    /// Culls shadow casters.
     pub(crate) shadow_cull: Option<ShadowCullPrograms>,
 }
 
@@ -41,8 +40,8 @@ pub(crate) struct ScenePrograms {
 pub(crate) struct SampleCountPrograms {
     pub(crate) samples: u32,
     pub(crate) mask: Option<Rc<Program>>,
-    /// Two-pass transparency: the opaque parts of blended triangles, if there may be any. `blended` draws the rest of
-    /// them.
+    /// Two-pass transparency: draws the opaque parts of blended triangles, if there may be any. `blended` draws the
+    /// other parts.
     pub(crate) opaque_parts: Option<Rc<Program>>,
     pub(crate) blended: Option<Rc<Program>>,
     /// Exact transparency.
@@ -53,7 +52,7 @@ pub(crate) struct SampleCountPrograms {
     pub(crate) cull: Option<CullPrograms>,
 }
 
-/// Programs of the camera's lists, for one number of samples per pixel.
+/// Programs that list the triangles for the camera, for one number of samples per pixel.
 #[derive(Debug, Clone)]
 pub(crate) struct CullPrograms {
     pub(crate) cull_triangles: Rc<Program>,
@@ -68,11 +67,11 @@ pub(crate) struct OcclusionPrograms {
     pub(crate) record_visible: Rc<Program>,
     /// Builds the first levels of the depth pyramid.
     pub(crate) fine_levels: Rc<Program>,
-    /// Builds the remaining levels from them.
+    /// Builds the remaining levels.
     pub(crate) coarse_levels: Rc<Program>,
 }
 
-/// Programs of the shadow casters' lists.
+/// Programs that list the shadow casters.
 #[derive(Debug)]
 pub(crate) struct ShadowCullPrograms {
     pub(crate) cull_triangles: Rc<Program>,
@@ -88,19 +87,19 @@ pub(crate) struct OitPrograms {
     pub(crate) resolve: Rc<Program>,
 }
 
-/// The post-processing programs of one look.
+/// Post-processing programs of one look.
 #[derive(Debug)]
 pub(crate) struct PostPrograms {
     pub(crate) encode: Rc<Program>,
     pub(crate) bloom: Option<BloomPrograms>,
 }
 
-/// The bloom programs: downsample, upsample, and the last upsample onto the picture.
+/// Bloom programs. `composite` is the last upsampling, onto the scene color.
 #[derive(Debug)]
 pub(crate) struct BloomPrograms {
-    pub(crate) down: Rc<Program>,
-    pub(crate) up: Rc<Program>,
-    pub(crate) last: Rc<Program>,
+    pub(crate) downsample: Rc<Program>,
+    pub(crate) upsample: Rc<Program>,
+    pub(crate) composite: Rc<Program>,
 }
 
 impl ProgramCache {
@@ -108,8 +107,8 @@ impl ProgramCache {
         Self { gl: Rc::clone(gl), programs: HashMap::new() }
     }
 
-    /// The program of a source, compiled unless it is cached. A full cache first drops the programs that no scene uses,
-    /// or all of them if scenes use all.
+    /// Returns the program of a source, compiled unless it is cached. A full cache first drops all programs that no scene
+    /// uses, or all programs if every one is used.
     ///
     /// # Errors
     /// `Fault` with the compiler's log.
@@ -136,13 +135,13 @@ impl ProgramCache {
     }
 }
 
-/// Compiles a program if it is wanted.
+/// Compiles a program if the scene needs it.
 fn compile_if(
-    wanted: bool,
+    is_needed: bool,
     compile: &mut ProgramCompiler<'_>,
     source: impl FnOnce() -> ProgramSource,
 ) -> Result<Option<Rc<Program>>> {
-    if wanted { compile(source()).map(Some) } else { Ok(None) }
+    if is_needed { compile(source()).map(Some) } else { Ok(None) }
 }
 
 impl ScenePrograms {
@@ -151,22 +150,23 @@ impl ScenePrograms {
         groups: &[DrawGroup],
         compile: &mut ProgramCompiler<'_>,
     ) -> Result<Self> {
-        let any = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
+        let has_triangles = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
         let has_shadow = options.features.shadow.is_some();
-        let mut caster =
-            |blend_mode: BlendMode| compile_if(has_shadow && any(blend_mode), compile, || options.shadow(blend_mode));
+        let mut caster = |blend_mode: BlendMode| {
+            compile_if(has_shadow && has_triangles(blend_mode), compile, || options.shadow(blend_mode))
+        };
         let shadow = [caster(BlendMode::Opaque)?, caster(BlendMode::Mask)?, caster(BlendMode::Blend)?];
         let shadow_cull = match has_shadow && options.features.has_culling() {
             true => Some(ShadowCullPrograms {
                 cull_triangles: compile(options.cull_casters())?,
-                compact: compile(options.compact())?,
+                compact: compile(options.cull_compact())?,
             }),
             false => None,
         };
         Ok(Self {
             blur: options.blur().into_iter().map(&mut *compile).collect::<Result<_>>()?,
             shadow,
-            opaque: compile_if(any(BlendMode::Opaque), compile, || options.visibility(BlendMode::Opaque, 1))?,
+            opaque: compile_if(has_triangles(BlendMode::Opaque), compile, || options.visibility(BlendMode::Opaque, 1))?,
             ground: compile_if(options.features.ground, compile, || options.ground())?,
             shadow_cull,
         })
@@ -180,14 +180,14 @@ impl SampleCountPrograms {
         samples: u32,
         compile: &mut ProgramCompiler<'_>,
     ) -> Result<Self> {
-        let any = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
+        let has_triangles = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
         let (oit, opaque_parts) = (options.features.oit, options.features.opaque_parts);
-        let has_visibility = any(BlendMode::Opaque) || any(BlendMode::Mask) || opaque_parts;
+        let has_visibility = has_triangles(BlendMode::Opaque) || has_triangles(BlendMode::Mask) || opaque_parts;
         Ok(Self {
             samples,
-            mask: compile_if(any(BlendMode::Mask), compile, || options.visibility(BlendMode::Mask, samples))?,
+            mask: compile_if(has_triangles(BlendMode::Mask), compile, || options.visibility(BlendMode::Mask, samples))?,
             opaque_parts: compile_if(opaque_parts, compile, || options.visibility(BlendMode::Blend, samples))?,
-            blended: compile_if(any(BlendMode::Blend) && !oit, compile, || options.blended(samples))?,
+            blended: compile_if(has_triangles(BlendMode::Blend) && !oit, compile, || options.blended(samples))?,
             oit: if oit { Some(OitPrograms::compile(options, samples, compile)?) } else { None },
             background: compile(options.background(samples))?,
             shade: compile_if(has_visibility, compile, || options.shade(samples))?,
@@ -202,13 +202,13 @@ impl SampleCountPrograms {
 
 impl CullPrograms {
     fn compile(options: &ShaderOptions, samples: u32, compile: &mut ProgramCompiler<'_>) -> Result<Self> {
-        let (cull_triangles, compact) = (compile(options.cull_triangles(samples))?, compile(options.compact())?);
+        let (cull_triangles, compact) = (compile(options.cull_triangles(samples))?, compile(options.cull_compact())?);
         let occlusion = match options.features.has_occlusion_culling() {
             true => Some(OcclusionPrograms {
                 cull_previous: compile(options.cull_previously_visible())?,
                 record_visible: compile(options.record_visible(samples))?,
-                fine_levels: compile(options.pyramid(samples, true))?,
-                coarse_levels: compile(options.pyramid(samples, false))?,
+                fine_levels: compile(options.depth_pyramid(samples, true))?,
+                coarse_levels: compile(options.depth_pyramid(samples, false))?,
             }),
             false => None,
         };
@@ -231,9 +231,9 @@ impl PostPrograms {
     pub(crate) fn compile(look: &RenderSettings, compile: &mut ProgramCompiler<'_>) -> Result<Self> {
         let bloom = match look.bloom {
             Some(bloom) => Some(BloomPrograms {
-                down: compile(shaders::post::bloom_downsample())?,
-                up: compile(shaders::post::bloom_upsample(look, bloom, false))?,
-                last: compile(shaders::post::bloom_upsample(look, bloom, true))?,
+                downsample: compile(shaders::post::bloom_downsample())?,
+                upsample: compile(shaders::post::bloom_upsample(look, bloom, false))?,
+                composite: compile(shaders::post::bloom_upsample(look, bloom, true))?,
             }),
             None => None,
         };

@@ -1,4 +1,4 @@
-//! Device resources of one scene: buffers, texture arrays, shadow map and programs, exactly as its plan says.
+//! Device resources of one scene: buffers, texture arrays, shadow map and programs, as listed in its plan.
 
 use std::rc::Rc;
 use std::sync::Arc;
@@ -31,31 +31,31 @@ use modalcast_model::scene::{Culling, Scene};
 /// A scene's buffers, textures and programs on the device; freed when dropped.
 #[derive(Debug)]
 pub struct SceneBuffers {
-    /// Compute rasterizer that draws some passes instead of OpenGL; present when the look asks for it and one was
-    /// given. It keeps the buffers alive that it has registered.
+    /// Compute rasterizer that draws some passes instead of OpenGL, if one was attached. It owns handles to the buffers
+    /// that it has registered.
     pub(crate) compute_rasterizer: Option<ComputeRasterizer>,
     pub(crate) scene: Arc<Scene>,
     pub(crate) geometry: GeometryBuffers<Buffer>,
-    /// Read through buffer textures only.
+    /// Keeps the buffers of the buffer textures alive.
     _materials: MaterialBuffers<Buffer>,
     pub(crate) uniforms: UniformBuffers<Buffer>,
-    /// Lists of culled triangles; present when triangles are culled.
+    /// Lists of visible triangles; present with culling.
     pub(crate) culler: Option<TriangleCuller>,
     pub(crate) buffer_textures: BufferTextures,
     pub(crate) groups: Vec<DrawGroup>,
     /// Vertex array of opaque triangles.
     position_array: VertexArray,
     /// Vertex array of cut-out and blended triangles; none without such triangles.
-    corners: Option<VertexArray>,
-    /// Vertex array without attributes, for triangles that a vertex shader generates.
+    corner_array: Option<VertexArray>,
+    /// Vertex array without attributes, for vertices that a shader generates.
     pub(crate) empty_vertex_array: VertexArray,
     pub(crate) color_arrays: Vec<Texture>,
-    pub(crate) normals: Vec<Texture>,
+    pub(crate) normal_arrays: Vec<Texture>,
     pub(crate) shadow: Option<ShadowMap>,
     pub(crate) shadow_cache: ShadowCache,
     pub(crate) programs: ScenePrograms,
     pub(crate) post: PostPrograms,
-    /// Programs for the number of samples per pixel that the look asks for.
+    /// Programs for the look's number of samples per pixel.
     sample_programs: SampleCountPrograms,
     options: ShaderOptions,
     pub(crate) spans: Rc<[TriangleSpan]>,
@@ -66,8 +66,8 @@ pub struct SceneBuffers {
     /// A scalar per vertex for AOV readbacks; allocated by the first upload.
     pub(crate) values: Option<VertexValues>,
     plan: RenderPlan,
-    /// The buffers of the plan as they were allocated, by name.
-    allocated: Vec<Allocation>,
+    /// Names and sizes of the plan's buffers as they were allocated, sorted by name.
+    plan_allocations: Vec<Allocation>,
 }
 
 /// Positions rebased to one origin, for scenes whose domains have separate local origins.
@@ -76,8 +76,8 @@ pub(crate) struct RebasedPositions {
     pub(crate) buffer: Buffer,
     view: Texture,
     position_array: VertexArray,
-    /// Vertex array of the culled lists, when triangles are culled.
-    listed: Option<VertexArray>,
+    /// Vertex array of the culled lists; present with culling.
+    culled_position_array: Option<VertexArray>,
 }
 
 impl RebasedPositions {
@@ -85,13 +85,14 @@ impl RebasedPositions {
         let buffer = gl.buffer(scene.geometry.positions.bytes, gl::DYNAMIC_DRAW, None)?;
         let view = gl.buffer_texture(&buffer, gl::RGB32F)?;
         let position_array = self::position_array(gl, &buffer, &scene.geometry.triangle_vertices)?;
-        let lists = scene.culler.as_ref().map(|culler| &culler.buffers.indices);
-        let listed = lists.map(|indices| self::position_array(gl, &buffer, indices)).transpose()?;
-        Ok(Self { view, position_array, listed, buffer })
+        let culled_indices = scene.culler.as_ref().map(|culler| &culler.buffers.indices);
+        let culled_position_array =
+            culled_indices.map(|indices| self::position_array(gl, &buffer, indices)).transpose()?;
+        Ok(Self { view, position_array, culled_position_array, buffer })
     }
 }
 
-/// A scalar per vertex, which the shader of an AOV readback interpolates.
+/// A scalar per vertex, which an AOV shader interpolates.
 #[derive(Debug)]
 pub(crate) struct VertexValues {
     pub(crate) buffer: Buffer,
@@ -103,11 +104,11 @@ pub(crate) struct VertexValues {
 pub(crate) struct BufferTextures {
     positions: Texture,
     /// Texture unit and view.
-    pub(crate) others: Vec<(u32, Texture)>,
+    pub(crate) unit_views: Vec<(u32, Texture)>,
 }
 
 impl SceneBuffers {
-    /// Allocates and fills the buffers that the scene's plan lists. `compile` returns programs, which scenes may share.
+    /// Creates the resources that the scene's plan lists. `compile` may return programs that other scenes share.
     pub(crate) fn new(
         gl: &Rc<Gl>,
         scene: &Arc<Scene>,
@@ -122,12 +123,12 @@ impl SceneBuffers {
         let buffers = allocate(gl, &sizes, &mesh, &pack_materials(scene, &images))?;
         let allocation =
             |(name, buffer): (BufferName, &Buffer)| Allocation { name: name.to_string(), bytes: buffer.bytes };
-        let mut allocated: Vec<Allocation> = buffers.named().map(allocation).collect();
-        allocated.sort_by(|one, other| one.name.cmp(&other.name));
+        let mut plan_allocations: Vec<Allocation> = buffers.named().map(allocation).collect();
+        plan_allocations.sort_by(|a, b| a.name.cmp(&b.name));
         let SceneBufferSet { geometry, materials, uniforms, culling } = buffers;
         let options = ShaderOptions {
             features,
-            used: used(scene, &images),
+            used_materials: material_uses(scene, &images),
             sample_positions: sample_positions.to_vec(),
             sample_resolve: post::sample_resolve(&scene.look),
             post_depth_coverage: gl.limits.post_depth_coverage,
@@ -136,27 +137,27 @@ impl SceneBuffers {
         let culler = match culling {
             Some(culling) => {
                 let arrays = CullVertexArrays {
-                    positions: position_array(gl, &geometry.positions, &culling.indices)?,
-                    corners: corner_array(gl, &geometry, &culling.indices)?,
+                    position_array: position_array(gl, &geometry.positions, &culling.indices)?,
+                    corner_array: corner_array(gl, &geometry, &culling.indices)?,
                 };
                 Some(TriangleCuller::new(gl, culling, &mesh.groups, arrays)?)
             }
             None => None,
         };
-        let [color_arrays, normals] = &images;
+        let [color_arrays, normal_arrays] = &images;
         Ok(Self {
             compute_rasterizer: None,
             scene: Arc::clone(scene),
             buffer_textures: BufferTextures::new(gl, &geometry, &materials)?,
             position_array: position_array(gl, &geometry.positions, &geometry.triangle_vertices)?,
-            corners: corner_array(gl, &geometry, &geometry.triangles)?,
+            corner_array: corner_array(gl, &geometry, &geometry.triangles)?,
             culler,
             geometry,
             _materials: materials,
             uniforms,
             empty_vertex_array: gl.vertex_array(None, &[])?,
             color_arrays: upload_arrays(gl, scene, color_arrays, TextureRole::Color)?,
-            normals: upload_arrays(gl, scene, normals, TextureRole::Normal)?,
+            normal_arrays: upload_arrays(gl, scene, normal_arrays, TextureRole::Normal)?,
             shadow: features.shadow.map(|shadow| ShadowMap::new(gl, shadow, features.blur_method)).transpose()?,
             shadow_cache: ShadowCache::default(),
             programs: ScenePrograms::compile(&options, &mesh.groups, compile)?,
@@ -169,11 +170,11 @@ impl SceneBuffers {
             rebased: None,
             values: None,
             plan,
-            allocated,
+            plan_allocations,
         })
     }
 
-    /// The programs for this number of samples per pixel; compiled now unless the look asked for the same number.
+    /// Programs for this number of samples per pixel, compiled unless it is the number of the look.
     pub(crate) fn sample_programs(
         &self,
         samples: u32,
@@ -185,17 +186,16 @@ impl SceneBuffers {
         }
     }
 
-    /// The program that draws ids of cut-out triangles with this number of samples per pixel; none without such
-    /// triangles.
+    /// Program that draws ids of cut-out triangles with this number of samples per pixel; none without such triangles.
     pub(crate) fn mask_program(&self, samples: u32, compile: &mut ProgramCompiler<'_>) -> Result<Option<Rc<Program>>> {
         if self.sample_programs.samples == samples {
             return Ok(self.sample_programs.mask.clone());
         }
-        let any = self.groups.iter().any(|group| group.blend_mode == BlendMode::Mask);
-        if any { compile(self.options.visibility(BlendMode::Mask, samples)).map(Some) } else { Ok(None) }
+        let has_mask = self.groups.iter().any(|group| group.blend_mode == BlendMode::Mask);
+        if has_mask { compile(self.options.visibility(BlendMode::Mask, samples)).map(Some) } else { Ok(None) }
     }
 
-    /// The program that reads an AOV field from ids with this number of samples per pixel.
+    /// Program that computes an AOV field from ids with this number of samples per pixel.
     pub(crate) fn aov_program(
         &self,
         field: &'static str,
@@ -205,83 +205,84 @@ impl SceneBuffers {
         compile(self.options.aov(field, samples))
     }
 
-    /// First triangle and number of triangles of one kind; they are contiguous.
+    /// First triangle and number of triangles with this blend mode; they are contiguous.
     pub(crate) fn triangles(&self, blend_mode: BlendMode) -> (usize, usize) {
-        let mut of_kind = self.groups.iter().filter(|group| group.blend_mode == blend_mode);
-        let first = of_kind.next().map_or((0, 0), |group| (group.first_triangle, group.triangles));
-        of_kind.fold(first, |(first, count), group| (first, count + group.triangles))
+        let mut groups = self.groups.iter().filter(|group| group.blend_mode == blend_mode);
+        let first_range = groups.next().map_or((0, 0), |group| (group.first_triangle, group.triangles));
+        groups.fold(first_range, |(first_range, count), group| (first_range, count + group.triangles))
     }
 
-    /// Domain of a triangle that an id of a frame names (`place` is the id minus 1), and its index in the domain's
-    /// mesh.
-    pub fn source_triangle(&self, place: usize) -> Option<(usize, usize)> {
-        if place < self.scene.layout.triangles { locate_triangle(&self.spans, place) } else { None }
+    /// Domain of a triangle, and its index in the mesh of the domain. `triangle` is an index in the draw order: an id
+    /// minus 1.
+    pub fn source_triangle(&self, triangle: usize) -> Option<(usize, usize)> {
+        if triangle < self.scene.layout.triangles { locate_triangle(&self.spans, triangle) } else { None }
     }
 
-    /// Sets the origin of the shared positions, in scene units from the scene's origin, and draws the shared positions
-    /// from now on. Before the first call, positions are relative to the scene's origin.
+    /// Sets the origin of the shared positions, in scene units from the scene's origin. Later frames draw the shared
+    /// positions instead of rebased ones. Before the first call, positions are relative to the scene's origin.
     pub fn set_origin(&mut self, origin: [f64; 3]) {
         self.origin = origin;
         self.rebased = None;
     }
 
-    /// The positions that are drawn: the rebased ones if there are any, else the shared ones.
+    /// Positions to draw: the rebased ones if present, else the shared ones.
     pub(crate) fn position_texture(&self) -> &Texture {
         self.rebased.as_ref().map_or(&self.buffer_textures.positions, |rebased| &rebased.view)
     }
 
-    /// Vertex array of one kind of triangle, for ids and depth; none without such triangles.
+    /// Vertex array of all triangles with this blend mode; none without such triangles.
     pub(crate) fn vertex_array(&self, blend_mode: BlendMode) -> Option<&VertexArray> {
         match blend_mode {
             BlendMode::Opaque => {
                 Some(self.rebased.as_ref().map_or(&self.position_array, |rebased| &rebased.position_array))
             }
-            BlendMode::Mask | BlendMode::Blend => self.corners.as_ref(),
+            BlendMode::Mask | BlendMode::Blend => self.corner_array.as_ref(),
         }
     }
 
-    /// Vertex array of the culled list of one kind, and the buffer with the indirect draw commands; none when triangles
-    /// are not culled.
+    /// Vertex array of the culled lists with this blend mode, and the buffer with the indirect draw commands; none without
+    /// culling.
     pub(crate) fn visible_draws(&self, blend_mode: BlendMode) -> Option<(&VertexArray, &Buffer)> {
         let culler = self.culler.as_ref()?;
-        let rebased = self
+        let rebased_array = self
             .rebased
             .as_ref()
-            .and_then(|rebased| rebased.listed.as_ref())
+            .and_then(|rebased| rebased.culled_position_array.as_ref())
             .filter(|_| blend_mode == BlendMode::Opaque);
-        rebased.or_else(|| culler.vertex_array(blend_mode)).map(|array| (array, &culler.buffers.draws))
+        rebased_array.or_else(|| culler.vertex_array(blend_mode)).map(|array| (array, &culler.buffers.draws))
     }
 
-    /// Attaches a compute rasterizer that draws the passes that it supports; `make` creates it from the scene's mesh.
-    /// Nothing is created for a scene without such passes.
+    /// Attaches a compute rasterizer, which draws all passes that it supports. Does nothing for a scene without such
+    /// passes.
     ///
     /// # Errors
-    /// Those of `make` and of [`Rasterizer::precompile`], and `Fault` of OpenGL; OpenGL then still draws the scene.
+    /// Errors of `create_rasterizer` and [`Rasterizer::precompile`], and `Fault` of OpenGL. OpenGL then draws all passes.
     pub(crate) fn attach_rasterizer(
         &mut self,
         gl: &Rc<Gl>,
         compile: &mut ProgramCompiler<'_>,
-        make: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
+        create_rasterizer: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
     ) -> Result<()> {
         let supported = RasterPasses::supported(&self.scene);
-        if !supported.any() {
+        if !supported.has_any() {
             return Ok(());
         }
         let outputs = RasterOutputs::new(gl, supported, &self.options, compile)?;
         let passes = outputs.passes();
         let positions = self.geometry.positions.shared();
-        let mut rasterizer = make(raster_mesh::raster_geometry(&self.scene, positions, gl.limits.anisotropy))?;
+        let mut rasterizer =
+            create_rasterizer(raster_mesh::raster_geometry(&self.scene, positions, gl.limits.anisotropy))?;
         rasterizer.precompile(passes.shadow, passes.visibility)?;
         self.compute_rasterizer = Some(ComputeRasterizer::new(rasterizer, outputs));
         Ok(())
     }
 
-    /// The compute rasterizer, and the passes that it draws. None where OpenGL draws all, as in rebased scenes: the
-    /// rasterizer has registered the shared positions only.
+    /// The compute rasterizer and the passes that it draws; none if OpenGL draws all passes. This includes rebased scenes,
+    /// because the compute rasterizer has registered only the shared positions.
     pub(crate) fn active_rasterizer(&self) -> Option<(&ComputeRasterizer, RasterPasses)> {
         let compute_rasterizer = self.compute_rasterizer.as_ref().filter(|_| self.rebased.is_none())?;
         let enabled = compute_rasterizer.enabled();
-        enabled.any().then_some((compute_rasterizer, enabled))
+        enabled.has_any().then_some((compute_rasterizer, enabled))
     }
 
     /// The compute rasterizer if it draws the depth of the shadow map.
@@ -295,17 +296,17 @@ impl SceneBuffers {
         active.map(|(compute_rasterizer, _)| compute_rasterizer)
     }
 
-    /// Names the step whose vertices the buffers hold. Frames of the same step, bounds and origin share one shadow map,
-    /// unless the map is split into cascades, which follow the camera. Code that writes the buffers directly must name
-    /// another step afterwards; an upload clears the name. Without a name, every frame draws its shadow map.
+    /// Sets the step whose vertices the buffers contain. Frames with the same step, bounds and origin share one shadow
+    /// map, unless it is split into cascades, which follow the camera. Code that writes the buffers directly must set
+    /// another step afterwards. An upload clears the step; then every frame draws its shadow map.
     pub fn set_step(&self, step: u64) {
         self.shadow_cache.set_step(step);
     }
 
-    /// Content of the shadow map for this frame; none when it cannot be shared with other frames.
-    pub(crate) fn shadow_key(&self, shot: &FrameParams) -> Option<ShadowKey> {
+    /// Key of the shadow map for this frame; none if other frames cannot share the map.
+    pub(crate) fn shadow_key(&self, params: &FrameParams) -> Option<ShadowKey> {
         let splits = self.scene.look.shadow.map_or(1, |shadow| shadow.splits);
-        self.shadow_cache.key(shot, self.origin).filter(|_| splits == 1)
+        self.shadow_cache.key(params, self.origin).filter(|_| splits == 1)
     }
 
     /// Culling method; never the automatic choice.
@@ -313,24 +314,25 @@ impl SceneBuffers {
         self.options.features.culling
     }
 
-    /// The plan that the buffers follow.
+    /// Plan from which the buffers were created.
     pub const fn plan(&self) -> &RenderPlan {
         &self.plan
     }
 
-    /// The buffers that the device holds for this scene, by name.
+    /// Names and sizes of all buffers of this scene on the device.
     pub fn allocations(&self) -> Vec<Allocation> {
         let rebased = self
             .rebased
             .iter()
             .map(|rebased| Allocation { name: "rebased positions".into(), bytes: rebased.buffer.bytes });
-        let values = self.values.iter().map(|own| Allocation { name: "vertex values".into(), bytes: own.buffer.bytes });
-        let compute_rasterizer = self.compute_rasterizer.iter().flat_map(ComputeRasterizer::allocations);
-        let compute_rasterizer = compute_rasterizer.map(|(name, bytes)| Allocation { name: name.into(), bytes });
-        self.allocated.iter().cloned().chain(rebased).chain(values).chain(compute_rasterizer).collect()
+        let values =
+            self.values.iter().map(|values| Allocation { name: "vertex values".into(), bytes: values.buffer.bytes });
+        let outputs = self.compute_rasterizer.iter().flat_map(ComputeRasterizer::allocations);
+        let outputs = outputs.map(|(name, bytes)| Allocation { name: name.into(), bytes });
+        self.plan_allocations.iter().cloned().chain(rebased).chain(values).chain(outputs).collect()
     }
 
-    /// The buffers that a deformer can write directly, instead of an upload. The handles keep them alive.
+    /// Handles to the vertex buffers, which a deformer can write directly. The handles keep the buffers alive.
     pub fn vertex_buffers(&self) -> GlVertexBuffers {
         GlVertexBuffers {
             positions: self.geometry.positions.shared(),
@@ -341,27 +343,30 @@ impl SceneBuffers {
 
     /// Number of textures that the device holds for this scene: texture arrays and shadow map textures.
     pub fn texture_count(&self) -> usize {
-        self.color_arrays.len() + self.normals.len() + self.shadow.as_ref().map_or(0, ShadowMap::texture_count)
+        self.color_arrays.len() + self.normal_arrays.len() + self.shadow.as_ref().map_or(0, ShadowMap::texture_count)
     }
 }
 
-/// The properties of each material that the shader sources depend on.
-fn used(scene: &Scene, images: &[Vec<TextureArray>; 2]) -> Vec<MaterialUse> {
-    let array = |arrays: &[TextureArray], texture: Option<usize>| Some(find_layer(arrays, texture?)?.0);
-    let one = |material: usize| {
+/// Properties of the used materials that the shader sources depend on.
+fn material_uses(scene: &Scene, images: &[Vec<TextureArray>; 2]) -> Vec<MaterialUse> {
+    let array_of = |arrays: &[TextureArray], texture: Option<usize>| Some(find_layer(arrays, texture?)?.0);
+    let material_use = |material: usize| {
         let material = &scene.materials[material];
-        let (color, normal) = (array(&images[0], material.color_texture), array(&images[1], material.normal_texture));
-        MaterialUse { blend_mode: blend_mode(material), color, normal }
+        MaterialUse {
+            blend_mode: blend_mode(material),
+            color_array: array_of(&images[0], material.color_texture),
+            normal_array: array_of(&images[1], material.normal_texture),
+        }
     };
-    used_materials(scene).into_iter().map(one).collect()
+    used_materials(scene).into_iter().map(material_use).collect()
 }
 
 /// Checks the number and size of the texture arrays against the limits of the device.
 fn check_texture_limits(gl: &Gl, scene: &Scene, images: &[Vec<TextureArray>; 2]) -> Result<()> {
     check_texture_budget(images)?;
-    let (reads, most) = (FIXED_TEXTURE_READS + images[0].len() + images[1].len(), gl.limits.max_compute_textures);
-    if reads > most as usize {
-        return Err(gl::too_large("textures read by the shading", most.into(), reads as u64));
+    let (reads, max_reads) = (FIXED_TEXTURE_READS + images[0].len() + images[1].len(), gl.limits.max_compute_textures);
+    if reads > max_reads as usize {
+        return Err(gl::too_large("textures read by the shading", max_reads.into(), reads as u64));
     }
     let layout = &scene.layout;
     for (field, count) in [("vertices", layout.vertices), ("corners", layout.corners), ("triangles", layout.triangles)]
@@ -373,6 +378,7 @@ fn check_texture_limits(gl: &Gl, scene: &Scene, images: &[Vec<TextureArray>; 2])
     Ok(())
 }
 
+/// Allocates all buffers of the scene, and fills those whose content does not change.
 fn allocate(
     gl: &Rc<Gl>,
     sizes: &SceneBufferSet<u64>,
@@ -395,7 +401,7 @@ fn allocate(
 
 impl BufferTextures {
     fn new(gl: &Rc<Gl>, geometry: &GeometryBuffers<Buffer>, materials: &MaterialBuffers<Buffer>) -> Result<Self> {
-        let read = [
+        let views = [
             (MATERIAL_UNIT, gl::RGBA32F, Some(&materials.materials)),
             (TRIANGLE_MATERIAL_UNIT, gl::R32UI, materials.triangle_materials.as_ref()),
             (CORNER_NORMAL_UNIT, gl::RGB32F, Some(&geometry.normals)),
@@ -404,13 +410,13 @@ impl BufferTextures {
             (UV_UNIT, gl::RG32F, geometry.uvs.as_ref()),
             (TANGENT_UNIT, gl::RGBA32F, geometry.tangents.as_ref()),
         ];
-        let mut others = Vec::new();
-        for (unit, format, buffer) in read {
+        let mut unit_views = Vec::new();
+        for (unit, format, buffer) in views {
             if let Some(buffer) = buffer {
-                others.push((unit, gl.buffer_texture(buffer, format)?));
+                unit_views.push((unit, gl.buffer_texture(buffer, format)?));
             }
         }
-        Ok(Self { positions: gl.buffer_texture(&geometry.positions, gl::RGB32F)?, others })
+        Ok(Self { positions: gl.buffer_texture(&geometry.positions, gl::RGB32F)?, unit_views })
     }
 }
 
@@ -426,8 +432,8 @@ fn position_array(gl: &Rc<Gl>, positions: &Buffer, index: &Buffer) -> Result<Ver
 /// Vertex array over the corners of cut-out and blended triangles; none without such triangles.
 fn corner_array(gl: &Rc<Gl>, geometry: &GeometryBuffers<Buffer>, index: &Buffer) -> Result<Option<VertexArray>> {
     let Some(vertices) = &geometry.corner_vertices else { return Ok(None) };
-    let mut from = vec![attribute(0, vertices, 1, true), attribute(1, &geometry.normals, 3, false)];
-    from.extend(geometry.uvs.as_ref().map(|buffer| attribute(2, buffer, 2, false)));
-    from.extend(geometry.tangents.as_ref().map(|buffer| attribute(3, buffer, 4, false)));
-    gl.vertex_array(Some(index), &from).map(Some)
+    let mut attributes = vec![attribute(0, vertices, 1, true), attribute(1, &geometry.normals, 3, false)];
+    attributes.extend(geometry.uvs.as_ref().map(|buffer| attribute(2, buffer, 2, false)));
+    attributes.extend(geometry.tangents.as_ref().map(|buffer| attribute(3, buffer, 4, false)));
+    gl.vertex_array(Some(index), &attributes).map(Some)
 }

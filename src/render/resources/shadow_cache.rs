@@ -1,5 +1,5 @@
-//! Reuse of the shadow map between the frames of a step. A map that does not depend on the camera is drawn once while
-//! the vertices, their origin and the bounds stay the same. The look never changes.
+//! Reuse of the shadow map between the frames of a step. A map that does not depend on the camera is drawn again only if
+//! the vertices, their origin or the bounds change. The look of a scene never changes.
 
 use std::cell::Cell;
 
@@ -7,15 +7,16 @@ use crate::types::FrameParams;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{BoundingBox, OrientedBounds};
 
-/// Identity of the current vertices, and what the map was last drawn from.
+/// Step of the current vertices, and content of the map.
 #[derive(Debug, Default)]
 pub(crate) struct ShadowCache {
-    /// None while the vertices have no name; every frame then draws the map.
+    /// Step of the vertices. If it is unknown, every frame draws the map.
     step: Cell<Option<u64>>,
-    drawn: Cell<Option<ShadowKey>>,
+    /// Key of the map's present content; none if it is invalid or depends on the camera.
+    content: Cell<Option<ShadowKey>>,
 }
 
-/// Everything that the content of a map depends on.
+/// All inputs that determine the content of a map.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ShadowKey {
     step: u64,
@@ -25,36 +26,36 @@ pub(crate) struct ShadowKey {
 }
 
 impl ShadowCache {
-    /// Forgets the name of the vertices because they were overwritten.
+    /// Forgets the step because the vertices were overwritten.
     pub(crate) fn invalidate(&self) {
         self.step.set(None);
     }
 
-    /// Names the current vertices.
+    /// Sets the step of the current vertices.
     pub(crate) fn set_step(&self, step: u64) {
         self.step.set(Some(step));
     }
 
-    /// Content of a map that does not depend on the camera; none while the vertices have no name.
-    pub(crate) fn key(&self, shot: &FrameParams, origin: [f64; 3]) -> Option<ShadowKey> {
+    /// Key of a map that does not depend on the camera; none if the step is unknown.
+    pub(crate) fn key(&self, params: &FrameParams, origin: [f64; 3]) -> Option<ShadowKey> {
         let step = self.step.get()?;
-        Some(ShadowKey { step, bounds: shot.bounds, light: shot.light, origin })
+        Some(ShadowKey { step, bounds: params.bounds, light: params.light, origin })
     }
 
     /// Whether the map must be drawn to show this content.
-    pub(crate) fn is_stale(&self, content: Option<ShadowKey>) -> bool {
-        content.is_none() || content != self.drawn.get()
+    pub(crate) fn is_stale(&self, key: Option<ShadowKey>) -> bool {
+        key.is_none() || key != self.content.get()
     }
 
     /// Calls `draw` unless the map already shows this content, and returns whether it did. A map whose drawing failed
     /// has no valid content.
-    pub(crate) fn draw_if_stale(&self, content: Option<ShadowKey>, draw: impl FnOnce() -> Result<()>) -> Result<bool> {
-        let wanted = self.is_stale(content);
-        self.drawn.take();
-        if wanted {
+    pub(crate) fn draw_if_stale(&self, key: Option<ShadowKey>, draw: impl FnOnce() -> Result<()>) -> Result<bool> {
+        let is_stale = self.is_stale(key);
+        self.content.take();
+        if is_stale {
             draw()?;
         }
-        self.drawn.set(content);
-        Ok(wanted)
+        self.content.set(key);
+        Ok(is_stale)
     }
 }

@@ -14,26 +14,26 @@ pub(crate) struct ShadowMap {
     pub(crate) shadow: ShadowSettings,
     blur_method: BlurMethod,
     pub(crate) depth: Texture,
-    /// One per layer of the depth.
+    /// One framebuffer per layer of `depth`.
     pub(crate) framebuffers: Vec<Framebuffer>,
     pub(crate) blurred: Option<BlurredMoments>,
 }
 
-/// The blurred moments of a variance map.
+/// Blurred moments of a variance shadow map.
 #[derive(Debug)]
 pub(crate) struct BlurredMoments {
     pub(crate) moments: Texture,
-    /// One layer of moments blurred in x; none when tiles are blurred in both directions at once.
+    /// One layer of moments blurred in x; none if one pass blurs both directions.
     pub(crate) horizontal: Option<Texture>,
-    /// For `horizontal`, then for each layer of the moments; empty when compute shaders blur.
+    /// Framebuffer of `horizontal`, then one per layer of `moments`; empty if compute shaders blur.
     pub(crate) framebuffers: Vec<Framebuffer>,
 }
 
 impl ShadowMap {
     pub(crate) fn new(gl: &Rc<Gl>, shadow: ShadowSettings, blur_method: BlurMethod) -> Result<Self> {
-        let most = gl.limits.max_side;
-        if shadow.size > most {
-            return Err(gl::too_large("look.shadow.size", u64::from(most), u64::from(shadow.size)));
+        let max_size = gl.limits.max_side;
+        if shadow.size > max_size {
+            return Err(gl::too_large("look.shadow.size", u64::from(max_size), u64::from(shadow.size)));
         }
         let depth = create_image(gl, &shadow, gl::DEPTH_COMPONENT32F, gl::NEAREST, shadow.splits)?;
         let framebuffers =
@@ -42,8 +42,8 @@ impl ShadowMap {
         Ok(Self { shadow, blur_method, depth, framebuffers, blurred })
     }
 
-    /// The texture that the shading samples: moments if there are any, else depth.
-    pub(crate) fn lookup(&self) -> &Texture {
+    /// Texture that the shading samples: moments if there are any, else depth.
+    pub(crate) fn lookup_texture(&self) -> &Texture {
         self.blurred.as_ref().map_or(&self.depth, |blurred| &blurred.moments)
     }
 
@@ -72,6 +72,7 @@ impl BlurredMoments {
     }
 }
 
+/// Creates an image of the map's size with one array layer per cascade.
 fn create_image(gl: &Rc<Gl>, shadow: &ShadowSettings, format: u32, filter: u32, layers: u32) -> Result<Texture> {
     let size = shadow.size;
     let target = gl::TEXTURE_2D_ARRAY;

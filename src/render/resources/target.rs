@@ -1,4 +1,4 @@
-//! Render target of a frame: ids, depth and blended layer of each sample, the picture, and the buffers for its
+//! Render target of a frame: ids, depth and blended layer of each sample, the scene color, and the buffers for its
 //! readback.
 
 use std::cell::Cell;
@@ -14,50 +14,54 @@ use crate::region::{DirtyRegion, Region};
 use modalcast_model::error::Result;
 use modalcast_model::scene::Culling;
 
-/// The images and buffers of frames of one form.
+/// Images and buffers of a frame. Consecutive frames with the same [`TargetDesc`] share them.
 #[derive(Debug)]
 pub(crate) struct RenderTarget {
     pub(crate) desc: TargetDesc,
-    /// Id of each sample; kept until the next frame, like depth.
+    /// Id of each sample; valid until the next frame, like `depth`.
     pub(crate) ids: Texture,
     pub(crate) visibility_fbo: Framebuffer,
-    pub(crate) dirty: VisibilityDirty,
+    pub(crate) dirty_regions: VisibilityDirty,
     /// Region of the current frame that may show triangles or rasterized ground.
     pub(crate) draw_region: Cell<Region>,
-    pub(crate) layer: Option<BlendLayer>,
+    pub(crate) blend_layer: Option<BlendLayer>,
     pub(crate) oit: Option<OitTarget>,
-    /// Indirect dispatch arguments, then the tiles that see triangles.
-    pub(crate) tiles: Buffer,
-    /// Linear light, one value per pixel.
+    /// Tiles that see triangles, for an indirect dispatch.
+    pub(crate) tile_list: Buffer,
+    /// Shaded image: linear light per pixel.
     pub(crate) scene_color: Texture,
-    /// Bright light of each pixel, then levels of half the size; empty without bloom.
+    /// Bloom pyramid; empty without bloom. Level 0 has the size of the frame.
     pub(crate) bloom_mips: Vec<Texture>,
-    /// RGBA8, top row first, as the encoder writes it.
+    /// Output of the encoder: RGBA8, top row first.
     pub(crate) readback_source: Buffer,
     /// Staging buffers for the readback of `readback_source`.
     pub(crate) readback_ring: Rc<ReadbackRing>,
-    /// Depth pyramid of occlusion culling.
-    pub(crate) pyramid: Option<DepthPyramid>,
+    /// Present with occlusion culling.
+    pub(crate) depth_pyramid: Option<DepthPyramid>,
     pub(crate) depth: Texture,
 }
 
-/// Blended light of the translucent triangles per sample, and their transmittance in alpha.
+/// Light of the blended triangles per sample, and their transmittance in alpha.
 #[derive(Debug)]
 pub(crate) struct BlendLayer {
     pub(crate) framebuffer: Framebuffer,
     pub(crate) color: Texture,
-    pub(crate) dirty: DirtyRegion,
+    pub(crate) dirty_region: DirtyRegion,
 }
 
 impl RenderTarget {
     pub(crate) fn new(gl: &Rc<Gl>, desc: TargetDesc) -> Result<Self> {
         let TargetDesc { width, height, samples, blended, .. } = desc;
         let (ids, depth) = (create_image(gl, desc, gl::R32UI)?, create_image(gl, desc, gl::DEPTH_COMPONENT32F)?);
-        let layer = |color: Texture| {
-            Ok(BlendLayer { framebuffer: gl.framebuffer(Some(&color), &depth)?, color, dirty: DirtyRegion::default() })
+        let create_layer = |color: Texture| {
+            Ok(BlendLayer {
+                framebuffer: gl.framebuffer(Some(&color), &depth)?,
+                color,
+                dirty_region: DirtyRegion::default(),
+            })
         };
-        let layer = if blended == BlendStorage::SingleLayer {
-            Some(layer(create_image(gl, desc, gl::RGBA16F)?)?)
+        let blend_layer = if blended == BlendStorage::SingleLayer {
+            Some(create_layer(create_image(gl, desc, gl::RGBA16F)?)?)
         } else {
             None
         };
@@ -65,35 +69,39 @@ impl RenderTarget {
             BlendStorage::FragmentLists(budget) => Some(OitTarget::new(gl, desc, budget, &depth)?),
             BlendStorage::None | BlendStorage::SingleLayer => None,
         };
-        let bytes = desc.bytes();
+        let bytes = desc.encoded_bytes();
         Ok(Self {
             desc: TargetDesc { samples, ..desc },
             visibility_fbo: gl.framebuffer(Some(&ids), &depth)?,
-            dirty: VisibilityDirty::default(),
+            dirty_regions: VisibilityDirty::default(),
             draw_region: Cell::new(Region::whole([width, height])),
             ids,
-            layer,
+            blend_layer,
             oit,
-            tiles: gl.buffer(tile_list_bytes([width, height]), gl::STREAM_COPY, None)?,
+            tile_list: gl.buffer(tile_list_bytes([width, height]), gl::STREAM_COPY, None)?,
             scene_color: create_image(gl, TargetDesc { samples: 1, ..desc }, gl::RGBA16F)?,
-            bloom_mips: bloom_mips(gl, desc)?,
+            bloom_mips: create_bloom_mips(gl, desc)?,
             readback_source: gl.buffer(bytes, gl::STREAM_COPY, None)?,
             readback_ring: ReadbackRing::new(gl, desc.readback_ranges()[1].end),
-            pyramid: if desc.culling == Culling::Occlusion { Some(DepthPyramid::new(gl, desc, &depth)?) } else { None },
+            depth_pyramid: if desc.culling == Culling::Occlusion {
+                Some(DepthPyramid::new(gl, desc, &depth)?)
+            } else {
+                None
+            },
             depth,
         })
     }
 }
 
-/// The bloom pyramid: the bright light of each pixel, then levels of half the size, rounded up.
-fn bloom_mips(gl: &Rc<Gl>, desc: TargetDesc) -> Result<Vec<Texture>> {
+/// Creates the bloom pyramid: level 0 with the size of the frame, then levels of half the size, rounded up.
+fn create_bloom_mips(gl: &Rc<Gl>, desc: TargetDesc) -> Result<Vec<Texture>> {
     if desc.bloom_levels == 0 {
         return Ok(Vec::new());
     }
-    let half = |level: u32| {
+    let create_level = |level: u32| {
         let [width, height] = [desc.width, desc.height].map(|side| side.div_ceil(1 << level));
         let desc = TextureDesc { target: gl::TEXTURE_2D, format: gl::RGBA16F, width, height, depth: 1, levels: 1 };
         create_nearest_texture(gl, desc)
     };
-    (0..=desc.bloom_levels).map(half).collect()
+    (0..=desc.bloom_levels).map(create_level).collect()
 }

@@ -1,4 +1,4 @@
-//! Form of a frame: the properties that determine its images and buffers.
+//! Description of a render target, and creation of its images.
 
 use std::ops::Range;
 use std::rc::Rc;
@@ -9,9 +9,9 @@ use crate::layout::oit::COUNTERS_HEADER_BYTES;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Culling, RenderSettings};
 
-/// Maximum number of pixels of a multisampled frame: with depth, ids and a blended layer they take 704 MiB of device
-/// memory. Larger frames are drawn with one sample per pixel.
-const MULTISAMPLED_PIXELS: u64 = 11 << 20;
+/// Maximum number of pixels of a multisampled frame. Larger frames have one sample per pixel. With four samples of depth,
+/// ids and a blended layer, these pixels take 704 MiB of device memory.
+const MAX_MULTISAMPLED_PIXELS: u64 = 11 << 20;
 
 /// Properties of a frame that determine its images and buffers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -20,7 +20,7 @@ pub(crate) struct TargetDesc {
     pub(crate) height: u32,
     pub(crate) samples: u32,
     pub(crate) blended: BlendStorage,
-    /// Levels of the bloom pyramid below the picture's size.
+    /// Levels of the bloom pyramid that are smaller than the frame.
     pub(crate) bloom_levels: u32,
     /// Culling method; never the automatic choice.
     pub(crate) culling: Culling,
@@ -30,9 +30,9 @@ pub(crate) struct TargetDesc {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum BlendStorage {
     None,
-    /// A layer into which they are blended in draw order.
+    /// A layer for blending in draw order.
     SingleLayer,
-    /// Lists with this budget of fragments.
+    /// Fragment lists with this budget in fragments.
     FragmentLists(u32),
 }
 
@@ -41,32 +41,33 @@ impl TargetDesc {
     pub(crate) const EMPTY: Self =
         Self { width: 0, height: 0, samples: 1, blended: BlendStorage::None, bloom_levels: 0, culling: Culling::None };
 
-    /// The form of a frame of a look.
+    /// Target of a frame of a look.
     pub(crate) fn new(gl: &Gl, [width, height]: [u32; 2], look: &RenderSettings, blended: BlendStorage) -> Self {
         let bloom_levels = look.bloom.map_or(0, |bloom| bloom.levels);
-        Self { blended, bloom_levels, ..Self::plain(gl, [width, height], look.samples_per_pixel()) }
+        Self { blended, bloom_levels, ..Self::ids_and_depth(gl, [width, height], look.samples_per_pixel()) }
     }
 
-    /// The form of a frame with ids and depth only, with `wanted` samples per pixel if the device and the frame size
-    /// allow it, else one.
-    pub(crate) fn plain(gl: &Gl, [width, height]: [u32; 2], wanted: u32) -> Self {
-        let fits = u64::from(width) * u64::from(height) <= MULTISAMPLED_PIXELS && wanted <= gl.limits.max_samples;
-        Self { width, height, samples: if fits { wanted } else { 1 }, ..Self::EMPTY }
+    /// Target with ids and depth only. It has `samples` samples per pixel if the device and the frame size allow it, else
+    /// one.
+    pub(crate) fn ids_and_depth(gl: &Gl, [width, height]: [u32; 2], samples: u32) -> Self {
+        let is_supported =
+            u64::from(width) * u64::from(height) <= MAX_MULTISAMPLED_PIXELS && samples <= gl.limits.max_samples;
+        Self { width, height, samples: if is_supported { samples } else { 1 }, ..Self::EMPTY }
     }
 
-    /// Bytes of the encoded picture.
-    pub(crate) fn bytes(&self) -> u64 {
+    /// Bytes of the encoded frame.
+    pub(crate) fn encoded_bytes(&self) -> u64 {
         4 * u64::from(self.width) * u64::from(self.height)
     }
 
-    /// Byte ranges of the list and culling statistics, which follow the picture in the staging buffer; empty without
-    /// lists or culling.
+    /// Byte ranges of the list and culling statistics, which follow the encoded frame in the staging buffer. They are
+    /// empty without lists or culling.
     pub(crate) fn readback_ranges(&self) -> [Range<u64>; 2] {
-        let lists =
+        let list_bytes =
             if matches!(self.blended, BlendStorage::FragmentLists(_)) { COUNTERS_HEADER_BYTES as u64 } else { 0 };
-        let culled = if self.culling == Culling::None { 0 } else { COUNTER_BYTES as u64 };
-        let (first, second) = (self.bytes(), self.bytes() + lists);
-        [first..second, second..second + culled]
+        let cull_bytes = if self.culling == Culling::None { 0 } else { COUNTER_BYTES as u64 };
+        let (list_begin, cull_begin) = (self.encoded_bytes(), self.encoded_bytes() + list_bytes);
+        [list_begin..cull_begin, cull_begin..cull_begin + cull_bytes]
     }
 }
 

@@ -14,33 +14,33 @@ pub(crate) fn upload_arrays(
     gl: &Rc<Gl>,
     scene: &Scene,
     arrays: &[TextureArray],
-    purpose: TextureRole,
+    role: TextureRole,
 ) -> Result<Vec<Texture>> {
-    arrays.iter().map(|array| upload_array(gl, scene, array, purpose)).collect()
+    arrays.iter().map(|array| upload_array(gl, scene, array, role)).collect()
 }
 
-fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &TextureArray, purpose: TextureRole) -> Result<Texture> {
-    let layers = array.layers.len() as u32;
-    if layers > gl.limits.max_layers {
+/// Creates a texture array and fills all mipmap levels of its layers.
+fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &TextureArray, role: TextureRole) -> Result<Texture> {
+    let layer_count = array.layers.len() as u32;
+    if layer_count > gl.limits.max_layers {
         let field = format!("textures of {} x {}", array.width, array.height);
-        return Err(gl::too_large(&field, u64::from(gl.limits.max_layers), u64::from(layers)));
+        return Err(gl::too_large(&field, u64::from(gl.limits.max_layers), u64::from(layer_count)));
     }
     let texture = gl.texture(TextureDesc {
         target: gl::TEXTURE_2D_ARRAY,
-        format: if purpose == TextureRole::Color { gl::SRGB8_ALPHA8 } else { gl::RGBA8 },
+        format: if role == TextureRole::Color { gl::SRGB8_ALPHA8 } else { gl::RGBA8 },
         width: array.width,
         height: array.height,
-        depth: layers,
+        depth: layer_count,
         levels: array.levels(),
     })?;
-    // Few layers at a time: the mipmap chains of all layers of a large scene would take many times the memory of its
-    // textures.
-    for (chunk, part) in array.layers.chunks(8).enumerate() {
-        let chain = |layer: &usize| {
-            let cutoff = if purpose == TextureRole::Color { cutoff(scene, *layer) } else { None };
-            mip_levels(&scene.textures[*layer], array, purpose, cutoff)
+    // Process few layers at a time, because mipmap chains take much host memory.
+    for (chunk, textures) in array.layers.chunks(8).enumerate() {
+        let build_chain = |layer: &usize| {
+            let cutoff = if role == TextureRole::Color { cutoff(scene, *layer) } else { None };
+            mip_levels(&scene.textures[*layer], array, role, cutoff)
         };
-        let chains: Vec<Vec<Vec<u8>>> = part.par_iter().map(chain).collect();
+        let chains: Vec<Vec<Vec<u8>>> = textures.par_iter().map(build_chain).collect();
         for (offset, chain) in chains.iter().enumerate() {
             for (level, rgba) in chain.iter().enumerate() {
                 let size = [(array.width >> level).max(1), (array.height >> level).max(1)];
@@ -48,10 +48,10 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &TextureArray, purpose: Textu
             }
         }
     }
-    // On a CPU, blending two mipmap levels costs a sixth of the frame time and is hardly visible.
-    let between = if gl.limits.software { gl::LINEAR_MIPMAP_NEAREST } else { gl::LINEAR_MIPMAP_LINEAR };
+    // With a software rasterizer, blending two mipmap levels takes a sixth of the frame time and is hardly visible.
+    let min_filter = if gl.limits.software { gl::LINEAR_MIPMAP_NEAREST } else { gl::LINEAR_MIPMAP_LINEAR };
     let sampling = [
-        (gl::TEXTURE_MIN_FILTER, between),
+        (gl::TEXTURE_MIN_FILTER, min_filter),
         (gl::TEXTURE_MAG_FILTER, gl::LINEAR),
         (gl::TEXTURE_WRAP_S, gl::REPEAT),
         (gl::TEXTURE_WRAP_T, gl::REPEAT),

@@ -10,8 +10,8 @@ const CULL: &str = include_str!("../../../shaders/shared/cull.glsl");
 impl ShaderOptions {
     /// Tests which triangles the camera may see; with occlusion culling also against the depth pyramid.
     pub(crate) fn cull_triangles(&self, samples: u32) -> ProgramSource {
-        let more: &[&str] = if self.features.has_occlusion_culling() { &["CULL_OCCLUDED"] } else { &[] };
-        let head = self.cull_head(more)
+        let defines: &[&str] = if self.features.has_occlusion_culling() { &["CULL_OCCLUDED"] } else { &[] };
+        let head = self.cull_head(defines)
             + &format!("#define FIRST_COUNTER {CAMERA_COUNTERS}\n")
             + &self.sample_defines(samples);
         let body = include_str!("../../../shaders/cull_triangles.comp");
@@ -24,10 +24,10 @@ impl ShaderOptions {
             + &format!("#define FIRST_COUNTER {SHADOW_COUNTERS}\n")
             + &self.sample_defines(1);
         let body = include_str!("../../../shaders/cull_triangles.comp");
-        ProgramSource::compute("cull triangles, shadow", [&head, FRAME, self.splits(), CULL, body].concat())
+        ProgramSource::compute("cull triangles, shadow", [&head, FRAME, self.cascade_source(), CULL, body].concat())
     }
 
-    /// Selects the triangles that the last frame saw.
+    /// Selects the triangles that were visible in the last frame.
     pub(crate) fn cull_previously_visible(&self) -> ProgramSource {
         let head = self.cull_head(&["CULL_PREVIOUS"]);
         ProgramSource::compute(
@@ -37,7 +37,7 @@ impl ShaderOptions {
     }
 
     /// Compacts the selected triangles to index lists.
-    pub(crate) fn compact(&self) -> ProgramSource {
+    pub(crate) fn cull_compact(&self) -> ProgramSource {
         let head = self.cull_head(&[]);
         ProgramSource::compute(
             "cull compact",
@@ -45,7 +45,7 @@ impl ShaderOptions {
         )
     }
 
-    /// Records which triangles the ids of a frame name.
+    /// Records the triangles that are visible in a frame.
     pub(crate) fn record_visible(&self, samples: u32) -> ProgramSource {
         let head = self.cull_head(&[]) + &self.sample_defines(samples);
         let body = include_str!("../../../shaders/cull_record_visible.comp");
@@ -55,16 +55,19 @@ impl ShaderOptions {
         )
     }
 
-    /// Builds the first levels of the depth pyramid, or the remaining ones from them.
-    pub(crate) fn pyramid(&self, samples: u32, first: bool) -> ProgramSource {
-        let head = self.cull_head(if first { &["FROM_DEPTH"] } else { &[] }) + &self.sample_defines(samples);
-        let label = format!("cull depth pyramid, {samples} samples, {}", if first { "fine" } else { "coarse" });
+    /// Builds the first levels of the depth pyramid from the depth, or further levels from them.
+    pub(crate) fn depth_pyramid(&self, samples: u32, is_first_dispatch: bool) -> ProgramSource {
+        let head =
+            self.cull_head(if is_first_dispatch { &["FROM_DEPTH"] } else { &[] }) + &self.sample_defines(samples);
+        let label =
+            format!("cull depth pyramid, {samples} samples, {}", if is_first_dispatch { "fine" } else { "coarse" });
         ProgramSource::compute(label, head + include_str!("../../../shaders/cull_depth_pyramid.comp"))
     }
 
-    fn cull_head(&self, more: &[&str]) -> String {
+    /// Version and defines of a culling shader.
+    fn cull_head(&self, defines: &[&str]) -> String {
         let mut head = String::from(VERSION);
-        for define in self.features.cascade_define().iter().chain(more) {
+        for define in self.features.cascade_define().iter().chain(defines) {
             writeln!(head, "#define {define}").ok();
         }
         writeln!(

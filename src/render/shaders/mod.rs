@@ -1,4 +1,4 @@
-//! Assembles the shader sources from the files under `shaders/`, with only the branches that a scene needs.
+//! Shader sources, assembled from the files in `shaders/` with only the branches that a scene needs.
 
 mod blur_strip;
 mod cull;
@@ -31,6 +31,7 @@ const GROUND_PLANE: &str = include_str!("../../../shaders/shared/ground_plane.gl
 const PHONG: &str = include_str!("../../../shaders/shared/phong.glsl");
 const BARYCENTRICS: &str = include_str!("../../../shaders/shared/barycentrics.glsl");
 const TRIANGLE_SHADING: &str = include_str!("../../../shaders/shared/triangle_shading.glsl");
+const TILE_LIST: &str = include_str!("../../../shaders/shared/tile_list.glsl");
 
 /// First line of every shader.
 pub(crate) const VERSION: &str = "#version 430 core\n";
@@ -40,24 +41,24 @@ pub(crate) const VERSION: &str = "#version 430 core\n";
 pub(crate) struct ShaderOptions {
     pub(crate) features: ShaderFeatures,
     /// The materials that triangles use.
-    pub(crate) used: Vec<MaterialUse>,
+    pub(crate) used_materials: Vec<MaterialUse>,
     /// Sample positions within a multisampled pixel.
     pub(crate) sample_positions: Vec<[f32; 2]>,
-    /// Source that is applied to the light of each sample.
+    /// GLSL that accumulates the samples of a pixel, see [`post::sample_resolve`].
     pub(crate) sample_resolve: String,
-    /// Whether a fragment can read its coverage after the depth test.
+    /// Whether the device supports `GL_ARB_post_depth_coverage`.
     pub(crate) post_depth_coverage: bool,
 }
 
-/// A material that triangles use: the pipeline that draws them, and the arrays of its images.
+/// A material that triangles use: their blend mode, and the texture arrays of its images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct MaterialUse {
     pub(crate) blend_mode: BlendMode,
-    pub(crate) color: Option<usize>,
-    pub(crate) normal: Option<usize>,
+    pub(crate) color_array: Option<usize>,
+    pub(crate) normal_array: Option<usize>,
 }
 
-/// The source text of a program's stages.
+/// Source text of a program's stages, with the OpenGL type of each stage.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(crate) struct ProgramSource {
     pub(crate) label: String,
@@ -72,62 +73,65 @@ impl ProgramSource {
 }
 
 impl ShaderOptions {
-    pub(crate) fn head(&self, more: &[&str]) -> String {
+    /// Version and defines of a shader: those of the features, and `defines`.
+    pub(crate) fn head(&self, defines: &[&str]) -> String {
         let mut text = String::from(VERSION);
-        for define in self.features.defines().iter().chain(more) {
+        for define in self.features.defines().iter().chain(defines) {
             writeln!(text, "#define {define}").ok();
         }
         writeln!(text, "#define MATERIAL_STRIDE {}", MATERIAL_BYTES / 16).ok();
         text
     }
 
-    /// Defines for triangles of these kinds: for their images, and for the material lookup if they have several
-    /// materials.
-    pub(crate) fn material_defines(&self, kinds: &[BlendMode]) -> String {
-        let mut own = (0..).zip(&self.used).filter(|(_, used)| kinds.contains(&used.blend_mode));
-        let mut text = match (own.next(), own.next()) {
-            (Some((only, _)), None) => format!("#undef MATERIAL_TABLE\n#define SINGLE_MATERIAL {only}\n"),
+    /// Defines for triangles with these blend modes: undefines image features that they do not use, and replaces the
+    /// material lookup by a constant if they have one material.
+    pub(crate) fn material_defines(&self, blend_modes: &[BlendMode]) -> String {
+        let mut materials = (0..).zip(&self.used_materials).filter(|(_, used)| blend_modes.contains(&used.blend_mode));
+        let mut text = match (materials.next(), materials.next()) {
+            (Some((index, _)), None) => format!("#undef MATERIAL_TABLE\n#define SINGLE_MATERIAL {index}\n"),
             _ => String::new(),
         };
-        let (colors, normals) = (self.arrays(kinds, TextureRole::Color), self.arrays(kinds, TextureRole::Normal));
-        for (define, unneeded) in [
+        let (colors, normals) =
+            (self.arrays(blend_modes, TextureRole::Color), self.arrays(blend_modes, TextureRole::Normal));
+        for (define, is_unneeded) in [
             ("TEXTURES", colors.is_empty()),
             ("NORMAL_MAPS", normals.is_empty()),
             ("UVS", colors.is_empty() && normals.is_empty()),
         ] {
-            if unneeded {
+            if is_unneeded {
                 writeln!(text, "#undef {define}").ok();
             }
         }
         text
     }
 
-    /// Lookup functions for the images and materials of these kinds.
-    pub(crate) fn material_lookups(&self, kinds: &[BlendMode], slopes: UvDerivatives) -> String {
-        let colors = sampler("color", COLOR_UNIT, &self.arrays(kinds, TextureRole::Color), slopes);
-        let normals = sampler("normal", NORMAL_UNIT, &self.arrays(kinds, TextureRole::Normal), slopes);
+    /// Lookup functions for the materials of these blend modes and their images.
+    pub(crate) fn material_lookups(&self, blend_modes: &[BlendMode], derivatives: UvDerivatives) -> String {
+        let colors = sampler("color", COLOR_UNIT, &self.arrays(blend_modes, TextureRole::Color), derivatives);
+        let normals = sampler("normal", NORMAL_UNIT, &self.arrays(blend_modes, TextureRole::Normal), derivatives);
         [MATERIAL, &colors, &normals].concat()
     }
 
-    /// Texture arrays that hold images of these kinds' materials.
-    fn arrays(&self, kinds: &[BlendMode], purpose: TextureRole) -> BTreeSet<usize> {
-        let image = |used: &MaterialUse| match purpose {
-            TextureRole::Color => used.color,
-            TextureRole::Normal => used.normal,
+    /// Texture arrays of the images that materials with these blend modes use in a role.
+    fn arrays(&self, blend_modes: &[BlendMode], role: TextureRole) -> BTreeSet<usize> {
+        let array_of = |material: &MaterialUse| match role {
+            TextureRole::Color => material.color_array,
+            TextureRole::Normal => material.normal_array,
         };
-        self.used.iter().filter(|used| kinds.contains(&used.blend_mode)).filter_map(image).collect()
+        let materials = self.used_materials.iter().filter(|material| blend_modes.contains(&material.blend_mode));
+        materials.filter_map(array_of).collect()
     }
 
-    /// Defines that depend on the samples per pixel.
+    /// Number of samples per pixel, and their positions within the pixel.
     pub(crate) fn sample_defines(&self, samples: u32) -> String {
-        let middle = vec![[0.5; 2]];
-        let places = if samples > 1 { &self.sample_positions } else { &middle };
-        let places: Vec<String> = places.iter().map(|[x, y]| format!("vec2({x:?}, {y:?})")).collect();
-        let list = places.join(", ");
-        format!("#define SAMPLES {samples}\nconst vec2 SAMPLE_POSITIONS[{}] = vec2[]({list});\n", places.len())
+        let pixel_center = vec![[0.5; 2]];
+        let positions = if samples > 1 { &self.sample_positions } else { &pixel_center };
+        let positions: Vec<String> = positions.iter().map(|[x, y]| format!("vec2({x:?}, {y:?})")).collect();
+        let vectors = positions.join(", ");
+        format!("#define SAMPLES {samples}\nconst vec2 SAMPLE_POSITIONS[{}] = vec2[]({vectors});\n", positions.len())
     }
 
-    /// Draws ids and depth of one kind of triangle.
+    /// Draws ids and depth of triangles with this blend mode.
     pub(crate) fn visibility(&self, blend_mode: BlendMode, samples: u32) -> ProgramSource {
         let label = format!("visibility, {blend_mode:?}, {samples} samples");
         let (vertex, body) =
@@ -152,9 +156,11 @@ impl ShaderOptions {
         let material_lookups = self.material_lookups(&[BlendMode::Blend], UvDerivatives::Implicit);
         let vertex = [&head, FRAME, CLIP, include_str!("../../../shaders/blended.vert")].concat();
         let body = include_str!("../../../shaders/blended.frag");
-        let parts =
+        let sample_coverage =
             if self.features.opaque_parts { self.sample_defines(samples) + ALPHA_COVERAGE } else { String::new() };
-        let fragment = [&head, FRAME, &material_lookups, TRIANGLE_ID, &self.sun(), PHONG, &parts, body].concat();
+        let fragment =
+            [&head, FRAME, &material_lookups, TRIANGLE_ID, &self.sun_visibility(), PHONG, &sample_coverage, body]
+                .concat();
         ProgramSource { label: "blended".into(), stages: vertex_and_fragment(vertex, fragment) }
     }
 
@@ -165,20 +171,21 @@ impl ShaderOptions {
         ProgramSource::compute(format!("background, {samples} samples"), text)
     }
 
-    /// Shades the other tiles.
+    /// Shades tiles in which a triangle is visible.
     pub(crate) fn shade(&self, samples: u32) -> ProgramSource {
-        let all = [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend];
-        let kinds = if self.features.opaque_parts { &all } else { &all[..2] };
-        let mut text = self.shading(samples, &[]) + &self.material_defines(kinds);
-        text +=
-            &[&self.material_lookups(kinds, UvDerivatives::Explicit), PHONG, BARYCENTRICS, TRIANGLE_SHADING].concat();
+        let all_modes = [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend];
+        let blend_modes = if self.features.opaque_parts { &all_modes } else { &all_modes[..2] };
+        let mut text = self.shading(samples, &[]) + &self.material_defines(blend_modes);
+        text += &[&self.material_lookups(blend_modes, UvDerivatives::Explicit), PHONG, BARYCENTRICS, TRIANGLE_SHADING]
+            .concat();
         text += include_str!("../../../shaders/shade.comp");
         ProgramSource::compute(format!("shade, {samples} samples"), text)
     }
 
-    fn shading(&self, samples: u32, more: &[&str]) -> String {
-        let mut head = self.head(more);
-        writeln!(head, "#define TILE {TILE}\n#define TILES_PER_ROW {TILE_ROW}u").ok();
+    /// Common part of the shading programs, without the material lookups.
+    fn shading(&self, samples: u32, defines: &[&str]) -> String {
+        let mut head = self.head(defines);
+        head += &tile_list();
         let ground = if self.features.ground { GROUND } else { "" };
         [
             &head,
@@ -187,7 +194,7 @@ impl ShaderOptions {
             CLIP,
             VISIBILITY_IDS,
             GROUND_PLANE,
-            &self.sun(),
+            &self.sun_visibility(),
             SKY,
             ground,
             &self.sample_resolve,
@@ -205,6 +212,7 @@ impl ShaderOptions {
         ProgramSource::compute("unpack", text)
     }
 
+    /// Draws id and depth of the ground.
     pub(crate) fn ground(&self) -> ProgramSource {
         let head = self.head(&[]);
         let vertex = [&head, FRAME, GROUND_PLANE, include_str!("../../../shaders/ground.vert")].concat();
@@ -218,38 +226,44 @@ pub(crate) fn vertex_and_fragment(vertex: String, fragment: String) -> Vec<(u32,
     vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)]
 }
 
-/// Lookup in texture arrays. Implicit derivatives are undefined in divergent control flow, so with several arrays the
-/// derivatives are computed before the array is chosen.
-fn sampler(name: &str, unit: u32, arrays: &BTreeSet<usize>, slopes: UvDerivatives) -> String {
+/// Number and row length of tiles, and the tile list.
+fn tile_list() -> String {
+    format!("#define TILE {TILE}\n#define TILES_PER_ROW {TILE_ROW}u\n{TILE_LIST}")
+}
+
+/// Function `{name}_texel` that samples an image in one of several texture arrays. Implicit derivatives are undefined in
+/// divergent control flow, so with several arrays the derivatives are computed before the array is selected.
+fn sampler(name: &str, unit: u32, arrays: &BTreeSet<usize>, derivatives: UvDerivatives) -> String {
     let mut text = String::new();
     let Some(first) = arrays.first() else { return text };
     for index in arrays {
         let unit = unit as usize + index;
         writeln!(text, "layout(binding = {unit}) uniform sampler2DArray {name}_{index};").ok();
     }
-    let given = if slopes == UvDerivatives::Explicit { ", vec2 dx, vec2 dy" } else { "" };
-    writeln!(text, "vec4 {name}_texel(ivec2 place, vec2 uv{given}) {{").ok();
-    writeln!(text, "    vec3 at = vec3(uv, float(max(place.y, 0)));").ok();
-    if slopes == UvDerivatives::Implicit && arrays.len() == 1 {
-        writeln!(text, "    return texture({name}_{first}, at);\n}}").ok();
+    let parameters = if derivatives == UvDerivatives::Explicit { ", vec2 dx, vec2 dy" } else { "" };
+    writeln!(text, "vec4 {name}_texel(ivec2 array_and_layer, vec2 uv{parameters}) {{").ok();
+    writeln!(text, "    vec3 coordinates = vec3(uv, float(max(array_and_layer.y, 0)));").ok();
+    if derivatives == UvDerivatives::Implicit && arrays.len() == 1 {
+        writeln!(text, "    return texture({name}_{first}, coordinates);\n}}").ok();
         return text;
     }
-    if slopes == UvDerivatives::Implicit {
+    if derivatives == UvDerivatives::Implicit {
         writeln!(text, "    vec2 dx = dFdx(uv), dy = dFdy(uv);").ok();
     }
     for index in arrays.iter().skip(1) {
-        writeln!(text, "    if (place.x == {index}) return textureGrad({name}_{index}, at, dx, dy);").ok();
+        let condition = format!("array_and_layer.x == {index}");
+        writeln!(text, "    if ({condition}) return textureGrad({name}_{index}, coordinates, dx, dy);").ok();
     }
-    writeln!(text, "    return textureGrad({name}_{first}, at, dx, dy);\n}}").ok();
+    writeln!(text, "    return textureGrad({name}_{first}, coordinates, dx, dy);\n}}").ok();
     text
 }
 
-/// Source of the derivatives of texture coordinates.
+/// How a lookup gets the derivatives of texture coordinates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum UvDerivatives {
-    /// Differences between the fragments of a quad.
+    /// From differences between the fragments of a quad.
     Implicit,
-    /// Arguments of the lookup.
+    /// As arguments.
     Explicit,
 }
 
@@ -268,9 +282,15 @@ mod tests {
         let plan =
             ScenePlan::new(&scene, &Limits { max_storage_bytes: u64::MAX, ..Limits::default() }, BlurMethod::Tiles);
         let sample_positions = vec![[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
-        let used = vec![MaterialUse { blend_mode: BlendMode::Opaque, color: None, normal: None }];
+        let used_materials = vec![MaterialUse { blend_mode: BlendMode::Opaque, color_array: None, normal_array: None }];
         let sample_resolve = post::sample_resolve(&scene.look);
-        ShaderOptions { features: plan.features, used, sample_positions, sample_resolve, post_depth_coverage: false }
+        ShaderOptions {
+            features: plan.features,
+            used_materials,
+            sample_positions,
+            sample_resolve,
+            post_depth_coverage: false,
+        }
     }
 
     fn text(source: ProgramSource) -> String {
@@ -278,62 +298,72 @@ mod tests {
     }
 
     #[test]
-    fn only_cut_out_triangles_have_a_discard_in_their_shader_and_depth_alone_needs_no_fragment_shader() {
+    fn only_masked_triangles_are_discarded() {
         let options = options(AlphaMode::Opaque);
         assert!(!text(options.visibility(BlendMode::Opaque, 4)).contains("discard;"));
         assert!(!text(options.blended(4)).contains("discard;"));
-        for (samples, masks) in [(4, true), (1, false)] {
+        for (samples, is_multisampled) in [(4, true), (1, false)] {
             let text = text(options.visibility(BlendMode::Mask, samples));
             assert!(text.contains("discard;") && text.contains(&format!("SAMPLES {samples}")));
-            assert_eq!(text.contains("vec2(0.375, 0.125)"), masks, "places of the samples");
+            assert_eq!(text.contains("vec2(0.375, 0.125)"), is_multisampled, "sample positions for {samples} samples");
         }
-        assert_eq!(options.shadow(BlendMode::Opaque).stages.len(), 1);
     }
 
     #[test]
-    fn the_shading_of_a_plain_scene_knows_no_image_no_shadow_no_ground_and_no_layer() {
-        let plain = ShaderOptions { features: ShaderFeatures::NONE, ..options(AlphaMode::Opaque) };
-        let [background, shading] = [plain.background(4), plain.shade(4)].map(text);
-        assert!(!background.contains("vec4 shade_triangle("), "no triangle, no shading of one");
+    fn opaque_shadow_needs_no_fragment_shader() {
+        assert_eq!(options(AlphaMode::Opaque).shadow(BlendMode::Opaque).stages.len(), 1);
+    }
+
+    #[test]
+    fn shading_contains_only_features_of_the_scene() {
+        let plain_options = ShaderOptions { features: ShaderFeatures::NONE, ..options(AlphaMode::Opaque) };
+        let [background, shading] = [plain_options.background(4), plain_options.shade(4)].map(text);
+        assert!(!background.contains("vec4 shade_triangle("), "the background contains no triangle");
         assert!(shading.contains("vec4 shade_triangle("));
         for text in [&background, &shading] {
             assert!(!text.contains("vec3 shade_ground(") && !text.contains("textureGrad"));
         }
-        let used = vec![MaterialUse { blend_mode: BlendMode::Opaque, color: Some(0), normal: None }];
+        let used_materials =
+            vec![MaterialUse { blend_mode: BlendMode::Opaque, color_array: Some(0), normal_array: None }];
         let features = ShaderFeatures { textures: true, ground: true, ..ShaderFeatures::NONE };
-        let full = ShaderOptions { features, used, ..plain };
-        let shading = text(full.shade(1));
+        let textured_options = ShaderOptions { features, used_materials, ..plain_options };
+        let shading = text(textured_options.shade(1));
         assert!(shading.contains("vec3 shade_ground(") && shading.contains("textureGrad(color_0"));
     }
 
     #[test]
-    fn each_kind_reads_the_arrays_of_its_own_materials_and_looks_up_a_material_only_among_several() {
-        let of = |blend_mode, color, normal| MaterialUse { blend_mode, color, normal };
-        let used = vec![
-            of(BlendMode::Opaque, Some(0), Some(0)),
-            of(BlendMode::Mask, Some(1), None),
-            of(BlendMode::Blend, None, None),
-            of(BlendMode::Blend, Some(2), None),
+    fn lookups_use_only_materials_of_the_blend_modes() {
+        let material = |blend_mode, color_array, normal_array| MaterialUse { blend_mode, color_array, normal_array };
+        let used_materials = vec![
+            material(BlendMode::Opaque, Some(0), Some(0)),
+            material(BlendMode::Mask, Some(1), None),
+            material(BlendMode::Blend, None, None),
+            material(BlendMode::Blend, Some(2), None),
         ];
-        let options = ShaderOptions { used, ..options(AlphaMode::Opaque) };
-        let of =
-            |kinds: &[BlendMode], slopes| options.material_defines(kinds) + &options.material_lookups(kinds, slopes);
-        let mask = of(&[BlendMode::Mask], UvDerivatives::Implicit);
-        assert!(mask.contains("texture(color_1, at)") && !mask.contains("color_0") && !mask.contains("textureGrad"));
+        let options = ShaderOptions { used_materials, ..options(AlphaMode::Opaque) };
+        let lookups = |blend_modes: &[BlendMode], derivatives| {
+            options.material_defines(blend_modes) + &options.material_lookups(blend_modes, derivatives)
+        };
+        let mask = lookups(&[BlendMode::Mask], UvDerivatives::Implicit);
+        assert!(
+            mask.contains("texture(color_1, coordinates)")
+                && !mask.contains("color_0")
+                && !mask.contains("textureGrad")
+        );
         assert!(mask.contains("#undef NORMAL_MAPS") && !mask.contains("#undef UVS"));
         assert!(mask.contains("SINGLE_MATERIAL 1") && mask.contains("#undef MATERIAL_TABLE"));
-        let blend = of(&[BlendMode::Blend], UvDerivatives::Implicit);
+        let blend = lookups(&[BlendMode::Blend], UvDerivatives::Implicit);
         assert!(!blend.contains("#undef MATERIAL_TABLE") && !blend.contains("#undef TEXTURES"));
-        let shade = of(&[BlendMode::Opaque, BlendMode::Mask], UvDerivatives::Explicit);
-        assert!(shade.contains("if (place.x == 1) return textureGrad(color_1") && !shade.contains("dFdx"));
+        let shade = lookups(&[BlendMode::Opaque, BlendMode::Mask], UvDerivatives::Explicit);
+        assert!(shade.contains("if (array_and_layer.x == 1) return textureGrad(color_1") && !shade.contains("dFdx"));
         assert!(shade.contains("normal_0") && !shade.contains("color_2"));
     }
 
     #[test]
-    fn several_arrays_are_chosen_by_their_number_and_slopes_taken_before() {
+    fn derivatives_precede_the_selection_of_an_array() {
         let text = sampler("color", 1, &BTreeSet::from([0, 2, 3]), UvDerivatives::Implicit);
-        let (slopes, choice) = (text.find("dFdx"), text.find("place.x == 2"));
-        assert!(slopes.is_some() && slopes < choice, "{text}");
+        let (derivatives_offset, selection_offset) = (text.find("dFdx"), text.find("array_and_layer.x == 2"));
+        assert!(derivatives_offset.is_some() && derivatives_offset < selection_offset, "{text}");
         assert_eq!(sampler("color", 1, &BTreeSet::new(), UvDerivatives::Explicit), "");
     }
 }

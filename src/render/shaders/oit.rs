@@ -1,26 +1,23 @@
 //! Shader sources of exact transparency: gather, histogram, allocate and resolve.
 
-use std::fmt::Write as _;
-
 use super::{
     BARYCENTRICS, CLIP, FRAME, OIT_LISTS, PHONG, ProgramSource, ShaderOptions, TRIANGLE_ID, TRIANGLE_SHADING,
-    UvDerivatives, VERSION, vertex_and_fragment,
+    UvDerivatives, VERSION, tile_list, vertex_and_fragment,
 };
 use crate::layout::oit::{BINS, HISTOGRAM_TILE};
-use crate::layout::{TILE, TILE_ROW};
 use crate::scene_data::geometry::BlendMode;
 
 impl ShaderOptions {
-    /// Counts the blended fragments of each pixel, and adds them to the lists.
+    /// Counts the blended fragments of each pixel, and appends them to its list.
     pub(crate) fn oit_gather(&self, samples: u32) -> ProgramSource {
         // Extension directives must precede all other code.
         let post_depth_coverage = samples > 1 && self.post_depth_coverage;
-        let more: &[&str] = if post_depth_coverage { &["MASK", "POST_DEPTH_COVERAGE"] } else { &["MASK"] };
+        let defines: &[&str] = if post_depth_coverage { &["MASK", "POST_DEPTH_COVERAGE"] } else { &["MASK"] };
         let extension = if post_depth_coverage { "#extension GL_ARB_post_depth_coverage : require\n" } else { "" };
         let material_defines = self.material_defines(&[BlendMode::Blend]);
         let vertex =
             [&self.head(&["MASK"]), &material_defines, FRAME, CLIP, include_str!("../../../shaders/visibility.vert")];
-        let head = self.head(more) + extension + &material_defines + &bins();
+        let head = self.head(defines) + extension + &material_defines + &bins_define();
         let (material_lookups, sample_defines) =
             (self.material_lookups(&[BlendMode::Blend], UvDerivatives::Implicit), self.sample_defines(samples));
         let body = include_str!("../../../shaders/oit_gather.frag");
@@ -31,10 +28,10 @@ impl ShaderOptions {
         }
     }
 
-    /// Sorts, shades and blends the lists to layers.
+    /// Sorts, shades and blends each list to one layer per sample.
     pub(crate) fn oit_resolve(&self, samples: u32) -> ProgramSource {
-        let mut text = self.head(&[]) + &bins() + &tiles() + &self.material_defines(&[BlendMode::Blend]);
-        text += &[&self.sample_defines(samples), FRAME, CLIP, &self.sun(), OIT_LISTS].concat();
+        let mut text = self.head(&[]) + &bins_define() + &tile_list() + &self.material_defines(&[BlendMode::Blend]);
+        text += &[&self.sample_defines(samples), FRAME, CLIP, &self.sun_visibility(), OIT_LISTS].concat();
         text += &[
             &self.material_lookups(&[BlendMode::Blend], UvDerivatives::Explicit),
             PHONG,
@@ -49,26 +46,20 @@ impl ShaderOptions {
 
 /// Builds the histogram of fragments per pixel.
 pub(crate) fn histogram() -> ProgramSource {
-    let head = format!("{VERSION}#define TILE_SIDE {HISTOGRAM_TILE}\n{}", bins());
+    let head = format!("{VERSION}#define TILE_SIDE {HISTOGRAM_TILE}\n{}", bins_define());
     let text = [&head, OIT_LISTS, include_str!("../../../shaders/oit_histogram.comp")].concat();
     ProgramSource::compute("oit histogram", text)
 }
 
 /// Allocates the list of each pixel.
 pub(crate) fn allocate() -> ProgramSource {
-    let head = format!("{VERSION}{}{}", tiles(), bins());
+    let head = [VERSION, &tile_list(), &bins_define()].concat();
     let text = [&head, OIT_LISTS, include_str!("../../../shaders/oit_allocate.comp")].concat();
     ProgramSource::compute("oit allocate", text)
 }
 
-fn bins() -> String {
+fn bins_define() -> String {
     format!("#define BINS {BINS}\n")
-}
-
-fn tiles() -> String {
-    let mut text = String::new();
-    writeln!(text, "#define TILE {TILE}\n#define TILES_PER_ROW {TILE_ROW}u").ok();
-    text
 }
 
 #[cfg(test)]
@@ -78,10 +69,10 @@ mod tests {
     use crate::shaders::MaterialUse;
 
     fn options(post_depth_coverage: bool) -> ShaderOptions {
-        let used = vec![MaterialUse { blend_mode: BlendMode::Blend, color: None, normal: None }];
+        let used_materials = vec![MaterialUse { blend_mode: BlendMode::Blend, color_array: None, normal_array: None }];
         ShaderOptions {
             features: ShaderFeatures { blend_layers: true, oit: true, ..ShaderFeatures::NONE },
-            used,
+            used_materials,
             sample_positions: vec![[0.5; 2]; 4],
             sample_resolve: String::new(),
             post_depth_coverage,
@@ -89,23 +80,27 @@ mod tests {
     }
 
     #[test]
-    fn coverage_after_the_depth_test_is_asked_for_where_it_is_known_and_needed() {
-        let text = |post_depth_coverage: bool, samples: u32| {
+    fn post_depth_coverage_needs_support_and_multisampling() {
+        let gather_fragment = |post_depth_coverage: bool, samples: u32| {
             options(post_depth_coverage).oit_gather(samples).stages[1].1.clone()
         };
-        for (post_depth_coverage, samples, asked) in [(true, 4, true), (false, 4, false), (true, 1, false)] {
-            let text = text(post_depth_coverage, samples);
+        for (post_depth_coverage, samples, is_expected) in [(true, 4, true), (false, 4, false), (true, 1, false)] {
+            let fragment_text = gather_fragment(post_depth_coverage, samples);
             assert_eq!(
-                text.contains("#extension GL_ARB_post_depth_coverage"),
-                asked,
-                "{post_depth_coverage}, {samples}"
+                fragment_text.contains("#extension GL_ARB_post_depth_coverage"),
+                is_expected,
+                "{post_depth_coverage}, {samples} samples"
             );
-            assert_eq!(text.contains("#define POST_DEPTH_COVERAGE"), asked, "{post_depth_coverage}, {samples}");
+            assert_eq!(
+                fragment_text.contains("#define POST_DEPTH_COVERAGE"),
+                is_expected,
+                "{post_depth_coverage}, {samples} samples"
+            );
         }
     }
 
     #[test]
-    fn glass_without_an_image_is_gathered_and_resolved_without_a_lookup() {
+    fn oit_of_untextured_materials_has_no_texture_lookup() {
         for source in [options(true).oit_gather(4), options(true).oit_resolve(4)] {
             assert!(source.stages.iter().all(|(_, text)| !text.contains("vec4 color_texel(")), "{}", source.label);
         }

@@ -1,5 +1,5 @@
-//! Shader sources of post-processing: bloom, tone curve, anti-aliasing, dithering and encoding. They contain no code for
-//! features that the look does not use.
+//! Shader sources of post-processing: bloom, tone curve, anti-aliasing, dithering and sRGB encoding. They contain only
+//! features that the look uses.
 
 use std::fmt::Write as _;
 
@@ -10,48 +10,50 @@ use modalcast_model::scene::{Antialiasing, Bloom, RenderSettings, ToneMapping};
 const TONE_MAPPING: &str = include_str!("../../../shaders/shared/tone_mapping.glsl");
 const SAMPLE_RESOLVE: &str = include_str!("../../../shaders/shared/sample_resolve.glsl");
 const FXAA: &str = include_str!("../../../shaders/shared/fxaa.glsl");
-/// Maximum light of a sample: far above white, and well within half precision.
+/// Maximum radiance of a sample: far above white, and far below the f16 maximum of 65504.
 const MAX_RADIANCE: f32 = 1000.0;
 
-/// Shader source that the shading applies to the light of each sample.
+/// GLSL that the shading applies to each sample: exposure, bloom threshold and tone curve.
 pub(crate) fn sample_resolve(look: &RenderSettings) -> String {
-    let mut text = String::new();
+    let mut defines = String::new();
     if look.exposure != 1.0 {
-        writeln!(text, "#define EXPOSURE {:?}", look.exposure).ok();
+        writeln!(defines, "#define EXPOSURE {:?}", look.exposure).ok();
     }
     if let Some(Bloom { threshold, strength, .. }) = look.bloom {
-        write!(text, "#define BLOOM\n#define BLOOM_THRESHOLD {threshold:?}\n#define BLOOM_STRENGTH {strength:?}\n")
+        write!(defines, "#define BLOOM\n#define BLOOM_THRESHOLD {threshold:?}\n#define BLOOM_STRENGTH {strength:?}\n")
             .ok();
     }
-    [&text, &tone_curve(look), SAMPLE_RESOLVE].concat()
+    [&defines, &tone_curve(look), SAMPLE_RESOLVE].concat()
 }
 
-/// Shader source of the tone curve and its inverse.
+/// GLSL functions of the tone curve and its inverse.
 fn tone_curve(look: &RenderSettings) -> String {
-    let name = match look.tone {
+    let define = match look.tone {
         ToneMapping::None => "",
         ToneMapping::Reinhard => "#define REINHARD\n",
         ToneMapping::Aces => "#define ACES\n",
     };
-    format!("#define MAX_RADIANCE {MAX_RADIANCE:?}\n{name}{TONE_MAPPING}")
+    format!("#define MAX_RADIANCE {MAX_RADIANCE:?}\n{define}{TONE_MAPPING}")
 }
 
+/// Computes the next level of the bloom pyramid.
 pub(crate) fn bloom_downsample() -> ProgramSource {
     let head = format!("{VERSION}#define TILE {TILE}\n");
     ProgramSource::compute("bloom, half", head + include_str!("../../../shaders/bloom_downsample.comp"))
 }
 
-pub(crate) fn bloom_upsample(look: &RenderSettings, bloom: Bloom, last: bool) -> ProgramSource {
+/// Adds a level of the bloom pyramid to the next finer one, or, as the composite program, to the scene color.
+pub(crate) fn bloom_upsample(look: &RenderSettings, bloom: Bloom, is_composite: bool) -> ProgramSource {
     let mut text = format!("{VERSION}#define TILE {TILE}\n");
-    if last {
+    if is_composite {
         write!(text, "#define COMPOSITE\n#define BLOOM_STRENGTH {:?}\n", bloom.strength).ok();
         text += &tone_curve(look);
     }
     text += include_str!("../../../shaders/bloom_upsample.comp");
-    ProgramSource::compute(if last { "bloom, onto the picture" } else { "bloom, double" }, text)
+    ProgramSource::compute(if is_composite { "bloom, onto the picture" } else { "bloom, double" }, text)
 }
 
-/// Converts the picture to sRGB bytes.
+/// Encodes the scene color to sRGB bytes.
 pub(crate) fn encode(look: &RenderSettings) -> ProgramSource {
     let mut text = format!(
         "{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\nlayout(binding = 0) uniform sampler2D scene_color;\n"
@@ -76,25 +78,25 @@ mod tests {
     }
 
     #[test]
-    fn a_look_that_names_nothing_has_no_curve_no_glow_no_search_and_no_pattern() {
-        let plain = RenderSettings::default();
-        let encode_text = text(encode(&plain));
-        assert!(!encode_text.contains("#define FXAA") && !encode_text.contains("fxaa_color(ivec2 at) {"));
+    fn sources_contain_only_features_of_the_look() {
+        let default_look = RenderSettings::default();
+        let encode_text = text(encode(&default_look));
+        assert!(!encode_text.contains("#define FXAA") && !encode_text.contains("fxaa_color(ivec2 pixel) {"));
         assert!(!encode_text.contains("#define DITHER"));
-        let shading = sample_resolve(&plain);
+        let resolve_text = sample_resolve(&default_look);
         for define in ["EXPOSURE", "BLOOM", "BLOOM_STRENGTH", "REINHARD", "ACES"] {
-            assert!(!shading.contains(&format!("#define {define}")), "{define}");
+            assert!(!resolve_text.contains(&format!("#define {define}")), "{define}");
         }
-        let named = RenderSettings {
+        let full_look = RenderSettings {
             tone: ToneMapping::Aces,
             exposure: 1.5,
             antialias: Antialiasing::Fxaa,
             dither: true,
-            ..plain
+            ..default_look
         };
-        let (encode_text, shading) = (text(encode(&named)), sample_resolve(&named));
-        assert!(encode_text.contains("#define FXAA") && encode_text.contains("fxaa_color(ivec2 at) {"));
+        let (encode_text, resolve_text) = (text(encode(&full_look)), sample_resolve(&full_look));
+        assert!(encode_text.contains("#define FXAA") && encode_text.contains("fxaa_color(ivec2 pixel) {"));
         assert!(encode_text.contains("#define DITHER"));
-        assert!(shading.contains("#define EXPOSURE 1.5\n") && shading.contains("#define ACES"));
+        assert!(resolve_text.contains("#define EXPOSURE 1.5\n") && resolve_text.contains("#define ACES"));
     }
 }

@@ -1,22 +1,23 @@
-//! Shader sources of outputs that are drawn only on request: picks and AOV readbacks.
+//! Shader sources of readbacks on request: picks, AOVs and visibility ids.
 
-use super::{BARYCENTRICS, CLIP, FRAME, ProgramSource, ShaderOptions, VERSION, VISIBILITY_IDS};
+use super::{BARYCENTRICS, CLIP, FRAME, GROUND_PLANE, ProgramSource, ShaderOptions, VERSION, VISIBILITY_IDS};
 use crate::layout::WORKGROUP_SIZE;
 
 impl ShaderOptions {
-    /// Reads an AOV field from the ids: `DEPTH` and `NORMALS` of one sample per pixel, `VALUES` of all samples.
+    /// Computes an AOV field from the ids: `DEPTH` and `NORMALS` for one sample per pixel, `VALUES` for all samples.
     pub(crate) fn aov(&self, field: &'static str, samples: u32) -> ProgramSource {
         let mut text = format!("{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define {field}\n");
-        // Only the depth field draws the ground, and only if the look has one.
+        // Only the depth field contains the ground.
         let has_ground = field == "DEPTH" && self.features.ground;
         text += if has_ground { "#define HAS_GROUND\n" } else { "" };
         text += &self.sample_defines(samples);
-        text += &[FRAME, CLIP, VISIBILITY_IDS, BARYCENTRICS, include_str!("../../../shaders/aov.comp")].concat();
+        let body = include_str!("../../../shaders/aov.comp");
+        text += &[FRAME, CLIP, VISIBILITY_IDS, GROUND_PLANE, BARYCENTRICS, body].concat();
         ProgramSource::compute(format!("aov {field}, {samples} samples"), text)
     }
 }
 
-/// Reads back the triangles of a few pixels.
+/// Copies the triangles that are visible in a rectangle of pixels.
 pub(crate) fn pick() -> ProgramSource {
     let head = format!("{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define SAMPLES 1\n");
     let body = [&head, VISIBILITY_IDS, BARYCENTRICS, include_str!("../../../shaders/pick.comp")].concat();

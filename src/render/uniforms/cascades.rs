@@ -25,18 +25,18 @@ const _: () =
     assert!(size_of::<ShadowCascades>() == 80, "ShadowCascades differs from shaders/shared/shadow_cascades.glsl");
 
 impl ShadowCascades {
-    /// Fits the cascades of one shot. `fit` is the input of the whole box, relative to `origin` like the positions.
-    pub(crate) fn new(scene: &Scene, shot: &FrameParams, fit: &LightBoxParams, origin: [f64; 3]) -> Self {
+    /// Fits the cascades of one frame. `fit` is the input of the whole box, relative to `origin` like the positions.
+    pub(crate) fn new(scene: &Scene, params: &FrameParams, fit: &LightBoxParams, origin: [f64; 3]) -> Self {
         let count = scene.look.shadow.unwrap_or_default().splits as usize;
         let whole = LightBox::fit(fit);
-        let camera = shot.camera.relative_to(origin);
+        let camera = params.camera.relative_to(origin);
         let (near, far) = visible_depth_range(&camera, fit);
         let ends = split_depths(near, far, count);
         let mut splits = Self { scale_offsets: [[1.0, 1.0, 0.0, 0.0]; 4], end_depths: [f32::INFINITY; 4] };
         let mut begin = near;
         for (part, end) in ends.into_iter().enumerate() {
             splits.end_depths[part] = end as f32;
-            if let Some(sides) = fit_cascade(&whole, fit, &bounding_sphere(&camera, shot, begin, end, fit)) {
+            if let Some(sides) = fit_cascade(&whole, fit, &bounding_sphere(&camera, params, begin, end, fit)) {
                 splits.scale_offsets[part] = cascade_transform(&whole.sides, &sides);
             }
             begin = end;
@@ -69,12 +69,12 @@ fn split_depths(near: f64, far: f64, count: usize) -> Vec<f64> {
 /// Bounding sphere of the view volume between two distances; its size does not change when the camera turns.
 fn bounding_sphere(
     camera: &Camera,
-    shot: &FrameParams,
+    params: &FrameParams,
     begin: f64,
     end: f64,
     fit: &LightBoxParams,
 ) -> (Point3<f64>, f64) {
-    let clip = camera.clip_from_camera(shot.width, shot.height, &fit.bounds);
+    let clip = camera.clip_from_camera(params.width, params.height, &fit.bounds);
     let world = camera.camera_from_world().try_inverse().unwrap_or_default();
     let corners: [Point3<f64>; 8] = std::array::from_fn(|corner| {
         let sign = |bit: usize| if corner >> bit & 1 == 0 { -1.0 } else { 1.0 };
@@ -116,7 +116,7 @@ mod tests {
         LightBoxParams { to_sun, up: UpAxis::Y, bounds, light: None, ground: Some(0.0), size: 512.0, rim: 6.0 }
     }
 
-    fn shot(turn: f64) -> FrameParams {
+    fn params(turn: f64) -> FrameParams {
         let eye = [0.0, 2.0, 20.0];
         let view = View::LookAt { eye, target: [turn.sin(), 2.0, 20.0 - turn.cos()], up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, lens: Lens::FieldOfView(40.0), near: 0.1, far: 80.0 };
@@ -134,16 +134,16 @@ mod tests {
     #[test]
     fn a_part_holds_all_that_is_seen_of_it_and_keeps_its_texels_when_the_camera_turns_and_walks() {
         let (fit, whole) = (fit(), LightBox::fit(&fit()));
-        let place = |shot: &FrameParams| {
-            fit_cascade(&whole, &fit, &bounding_sphere(&shot.camera, shot, 2.0, 8.0, &fit)).expect("smaller")
+        let place = |params: &FrameParams| {
+            fit_cascade(&whole, &fit, &bounding_sphere(&params.camera, params, 2.0, 8.0, &fit)).expect("smaller")
         };
-        let first = place(&shot(0.0));
+        let first = place(&params(0.0));
         for step in 0..100 {
-            let mut shot = shot(0.03 * f64::from(step));
-            let (center, radius) = bounding_sphere(&shot.camera, &shot, 2.0, 8.0, &fit);
-            let View::LookAt { eye, target, .. } = &mut shot.camera.view else { continue };
+            let mut params = params(0.03 * f64::from(step));
+            let (center, radius) = bounding_sphere(&params.camera, &params, 2.0, 8.0, &fit);
+            let View::LookAt { eye, target, .. } = &mut params.camera.view else { continue };
             (eye[0], target[0]) = (eye[0] + 0.013 * f64::from(step), target[0] + 0.013 * f64::from(step));
-            let moved = place(&shot);
+            let moved = place(&params);
             for axis in 0..2 {
                 assert_eq!(moved[axis].half, first[axis].half, "the size of a ball does not hang on where it is");
                 let texel = 2.0 * first[axis].half / fit.size;
@@ -166,12 +166,12 @@ mod tests {
         };
         let turned = |near: f64, far: f64, eye: [f64; 3]| {
             let view = View::LookAt { eye, target: [eye[0], eye[1], eye[2] - 1.0], up: [0.0, 1.0, 0.0] };
-            FrameParams { camera: Camera { view, lens: Lens::FieldOfView(100.0), near, far }, ..shot(0.0) }
+            FrameParams { camera: Camera { view, lens: Lens::FieldOfView(100.0), near, far }, ..params(0.0) }
         };
         let point = BoundingBox { min: [5.0; 3], max: [5.0; 3] };
-        for shot in [turned(1e-6, 1e9, [0.0; 3]), turned(0.0, 0.0, [0.0, 0.0, -900.0]), turned(0.0, 0.0, [1e9; 3])] {
+        for params in [turned(1e-6, 1e9, [0.0; 3]), turned(0.0, 0.0, [0.0, 0.0, -900.0]), turned(0.0, 0.0, [1e9; 3])] {
             for bounds in [fit().bounds, point] {
-                let splits = ShadowCascades::new(&scene(4), &shot, &LightBoxParams { bounds, ..fit() }, [0.0; 3]);
+                let splits = ShadowCascades::new(&scene(4), &params, &LightBoxParams { bounds, ..fit() }, [0.0; 3]);
                 assert!(splits.scale_offsets.iter().flatten().all(|number| number.is_finite()), "{splits:?}");
                 assert!(
                     splits.end_depths[..3].iter().all(|depth| depth.is_finite()) && splits.end_depths[..3].is_sorted()

@@ -1,4 +1,4 @@
-//! Per-frame uniforms, computed in f64 from a shot and rounded to f32 at the end.
+//! Per-frame uniforms, computed in f64 and rounded to f32 at the end.
 
 use bytemuck::{Pod, Zeroable};
 use nalgebra::{Matrix4, Vector3};
@@ -40,30 +40,30 @@ const GROUND_EXTENT: f64 = 6.0;
 const GROUND_TOLERANCE_EPSILONS: f64 = 4.0;
 
 impl FrameUniforms {
-    /// Computes the uniforms of one shot. Positions are relative to `origin`, a point in scene units from the scene's
+    /// Computes the uniforms of one frame. Positions are relative to `origin`, a point in scene units from the scene's
     /// origin; it is subtracted from the camera in f64.
     ///
     /// # Errors
     /// `Invalid` when the camera's matrices overflow.
-    pub(crate) fn new(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> Result<Self> {
-        let bounds = finite_bounds(scene, shot);
+    pub(crate) fn new(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Result<Self> {
+        let bounds = finite_bounds(scene, params);
         let rebased_rest_bounds = rebased_rest_bounds(scene, bounds, origin);
         let look = &scene.look;
         let to_sun = look.to_sun(scene.up);
         let height = rebased_rest_bounds.min[scene.up.index()];
         let shadow = look.shadow.unwrap_or_default();
-        let light = LightBox::fit(&light_box_params(scene, shot, origin));
-        let viewer = shot.camera.relative_to(origin);
+        let light = LightBox::fit(&light_box_params(scene, params, origin));
+        let viewer = params.camera.relative_to(origin);
         let camera = viewer.camera_from_world();
-        let clip = clip_from_camera(scene, shot, origin);
+        let clip = clip_from_camera(scene, params, origin);
         let (center, fade) = ground_disc(scene.up.index(), rebased_rest_bounds, viewer.eye());
         let color = |[r, g, b]: [f32; 3], fourth: f64| [r, g, b, fourth as f32];
         let frame = Self {
             clip_from_world: (clip * camera).cast().into(),
             shadow_from_world: light.shadow_from_world.cast().into(),
             world_from_ndc: world_from_ndc(&clip, &camera).cast().into(),
-            eye: vec4_of(viewer.eye(), flag(look.ground.is_some() && camera_is_above_ground(scene, shot))),
-            to_sun: vec4_of(to_sun, flag(!ground_is_behind_scene(scene, shot, origin))),
+            eye: vec4_of(viewer.eye(), flag(look.ground.is_some() && camera_is_above_ground(scene, params))),
+            to_sun: vec4_of(to_sun, flag(!ground_is_behind_scene(scene, params, origin))),
             sunlight: color(look.sunlight, 0.0),
             skylight: color(look.skylight, 0.0),
             zenith: color(look.zenith, 0.0),
@@ -82,7 +82,7 @@ impl FrameUniforms {
         let numbers: &[f32] = bytemuck::cast_slice(std::slice::from_ref(&frame));
         match numbers.iter().all(|number| number.is_finite()) {
             true => Ok(frame),
-            false => Err(invalid("camera", "a camera whose matrices are finite", format!("{:?}", shot.camera))),
+            false => Err(invalid("camera", "a camera whose matrices are finite", format!("{:?}", params.camera))),
         }
     }
 
@@ -102,45 +102,45 @@ impl FrameUniforms {
 
 /// The camera's projection matrix for positions relative to `origin`. The depth range covers both the deformed and the
 /// rest state, so that the clip planes do not jump when a branch bends.
-fn clip_from_camera(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
-    let bounds = finite_bounds(scene, shot);
-    let viewer = shot.camera.relative_to(origin);
-    viewer.clip_from_camera(shot.width, shot.height, &bounds.union(rebased_rest_bounds(scene, bounds, origin)))
+fn clip_from_camera(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
+    let bounds = finite_bounds(scene, params);
+    let viewer = params.camera.relative_to(origin);
+    viewer.clip_from_camera(params.width, params.height, &bounds.union(rebased_rest_bounds(scene, bounds, origin)))
 }
 
-/// Clip space of a shot from positions relative to `origin`.
-pub(crate) fn clip_from_positions(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
-    clip_from_camera(scene, shot, origin) * shot.camera.relative_to(origin).camera_from_world()
+/// Clip space of a frame from positions relative to `origin`.
+pub(crate) fn clip_from_positions(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
+    clip_from_camera(scene, params, origin) * params.camera.relative_to(origin).camera_from_world()
 }
 
 /// Clip space of the shadow map from positions relative to `origin`. The sun looks along z; z = -1 is nearest to it.
-pub(crate) fn shadow_clip_from_positions(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
-    let map = LightBox::fit(&light_box_params(scene, shot, origin)).shadow_from_world;
+pub(crate) fn shadow_clip_from_positions(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
+    let map = LightBox::fit(&light_box_params(scene, params, origin)).shadow_from_world;
     Matrix4::new_translation(&Vector3::repeat(-1.0)) * Matrix4::new_scaling(2.0) * map
 }
 
-/// The bounds of a shot, or the rest bounds when those overflowed: overflowed bounds fit no shadow map and no depth
+/// The bounds of a frame, or the rest bounds when those overflowed: overflowed bounds fit no shadow map and no depth
 /// range.
-fn finite_bounds(scene: &Scene, shot: &FrameParams) -> BoundingBox {
-    let finite_bounds = shot.bounds.is_finite() && shot.bounds.min[0] <= shot.bounds.max[0];
-    if finite_bounds { shot.bounds } else { scene.rest_bounds }
+fn finite_bounds(scene: &Scene, params: &FrameParams) -> BoundingBox {
+    let finite_bounds = params.bounds.is_finite() && params.bounds.min[0] <= params.bounds.max[0];
+    if finite_bounds { params.bounds } else { scene.rest_bounds }
 }
 
-/// Light-space bounds of a shot; none when they or the world-space bounds overflowed.
-fn finite_light_bounds(shot: &FrameParams) -> Option<OrientedBounds> {
-    shot.light.filter(|light| light.is_valid() && shot.bounds.is_finite())
+/// Light-space bounds of a frame; none when they or the world-space bounds overflowed.
+fn finite_light_bounds(params: &FrameParams) -> Option<OrientedBounds> {
+    params.light.filter(|light| light.is_valid() && params.bounds.is_finite())
 }
 
 /// Inputs of the shadow map fit, relative to `origin` like the positions.
-pub(crate) fn light_box_params(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> LightBoxParams {
-    let bounds = finite_bounds(scene, shot);
+pub(crate) fn light_box_params(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> LightBoxParams {
+    let bounds = finite_bounds(scene, params);
     let height = rebased_rest_bounds(scene, bounds, origin).min[scene.up.index()];
     let shadow = scene.look.shadow.unwrap_or_default();
     LightBoxParams {
         to_sun: scene.look.to_sun(scene.up),
         up: scene.up,
         bounds,
-        light: finite_light_bounds(shot),
+        light: finite_light_bounds(params),
         ground: scene.look.ground.map(|_| height),
         size: f64::from(shadow.size),
         rim: f64::from(shadow.blur_radius()) + 1.0,
@@ -149,9 +149,9 @@ pub(crate) fn light_box_params(scene: &Scene, shot: &FrameParams, origin: [f64; 
 
 /// Texel of the shadow map in world space: two vectors perpendicular to the light, along x and y of the map, in scene
 /// units. None when the look has no shadow. Valid for positions relative to the scene's origin.
-pub fn shadow_texel_axes(scene: &Scene, shot: &FrameParams) -> Option<[Vector3<f64>; 2]> {
+pub fn shadow_texel_axes(scene: &Scene, params: &FrameParams) -> Option<[Vector3<f64>; 2]> {
     let shadow = scene.look.shadow?;
-    let map = LightBox::fit(&light_box_params(scene, shot, [0.0; 3])).shadow_from_world;
+    let map = LightBox::fit(&light_box_params(scene, params, [0.0; 3])).shadow_from_world;
     let texel = |row: usize| {
         let across = map.fixed_view::<1, 3>(row, 0).transpose();
         across / (across.norm_squared() * f64::from(shadow.size))
@@ -161,24 +161,24 @@ pub fn shadow_texel_axes(scene: &Scene, shot: &FrameParams) -> Option<[Vector3<f
 
 /// Matrix from world space to the clip space of the shadow map. The sun looks along z; z = -1 is nearest to it. None
 /// when the look has no shadow. Valid for positions relative to the scene's origin.
-pub fn shadow_clip_from_world(scene: &Scene, shot: &FrameParams) -> Option<Matrix4<f64>> {
-    scene.look.shadow.map(|_| shadow_clip_from_positions(scene, shot, [0.0; 3]))
+pub fn shadow_clip_from_world(scene: &Scene, params: &FrameParams) -> Option<Matrix4<f64>> {
+    scene.look.shadow.map(|_| shadow_clip_from_positions(scene, params, [0.0; 3]))
 }
 
 /// Whether the camera is above the ground; the ground is not visible from below.
-pub(crate) fn camera_is_above_ground(scene: &Scene, shot: &FrameParams) -> bool {
+pub(crate) fn camera_is_above_ground(scene: &Scene, params: &FrameParams) -> bool {
     let up = scene.up.index();
-    shot.camera.eye()[up] > scene.rest_bounds.min[up]
+    params.camera.eye()[up] > scene.rest_bounds.min[up]
 }
 
 /// Whether the ground is behind everything else: the camera is above it and no vertex is below it. Samples without an
 /// id that look down then see the ground, and it need not be rasterized.
-pub(crate) fn ground_is_behind_scene(scene: &Scene, shot: &FrameParams, origin: [f64; 3]) -> bool {
-    let (up, bounds) = (scene.up.index(), shot.bounds);
+pub(crate) fn ground_is_behind_scene(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> bool {
+    let (up, bounds) = (scene.up.index(), params.bounds);
     let height = rebased_rest_bounds(scene, bounds, origin).min[up];
     let largest = [height, bounds.min[up], bounds.max[up]].map(f64::abs).into_iter().fold(0.0, f64::max);
     let lowest = bounds.min[up] + GROUND_TOLERANCE_EPSILONS * f64::from(f32::EPSILON) * largest;
-    scene.look.ground.is_some() && camera_is_above_ground(scene, shot) && bounds.is_finite() && lowest >= height
+    scene.look.ground.is_some() && camera_is_above_ground(scene, params) && bounds.is_finite() && lowest >= height
 }
 
 /// The rest bounds in the coordinates of the positions. When positions have another origin than the scene, because the
@@ -263,15 +263,15 @@ mod tests {
         let largest = rest.min[up].abs().max(rest.max[up].abs());
         let is_last = |lowered: f64, raised: f64, origin: f64| {
             let camera = Camera::fit_to_scene(&scene, 64, 64);
-            let mut shot = FrameParams { camera, width: 64, height: 64, bounds: rest, light: None };
-            shot.bounds.min[up] -= lowered + origin;
-            shot.bounds.max[up] -= origin;
+            let mut params = FrameParams { camera, width: 64, height: 64, bounds: rest, light: None };
+            params.bounds.min[up] -= lowered + origin;
+            params.bounds.max[up] -= origin;
             let mut eye = [0.3, 0.4, 0.5];
             eye[up] = rest.min[up] + raised;
-            shot.camera.view = View::LookAt { eye, target: [0.1; 3], up: [0.6, 0.8, 0.0] };
+            params.camera.view = View::LookAt { eye, target: [0.1; 3], up: [0.6, 0.8, 0.0] };
             let mut from = [0.0; 3];
             from[up] = origin;
-            ground_is_behind_scene(&scene, &shot, from)
+            ground_is_behind_scene(&scene, &params, from)
         };
         assert!(is_last(0.0, 1.0, 0.0) && is_last(-0.1, 1.0, 0.0) && is_last(0.0, 1.0, 4096.0));
         assert!(is_last(2e-7 * largest, 1.0, 0.0), "rounding");
@@ -282,29 +282,29 @@ mod tests {
     #[test]
     fn bounds_that_overflowed_are_replaced_and_a_camera_that_overflows_is_refused() {
         let scene = Scene::new(squares(vec![Material::default()])).expect("good");
-        let mut shot = FrameParams {
+        let mut params = FrameParams {
             camera: Camera::fit_to_scene(&scene, 64, 64),
             width: 64,
             height: 64,
             bounds: scene.rest_bounds,
             light: None,
         };
-        let good = FrameUniforms::new(&scene, &shot, [0.0; 3]).expect("good");
+        let good = FrameUniforms::new(&scene, &params, [0.0; 3]).expect("good");
         let [x, y, z, may_hide] = good.to_sun;
         assert!(may_hide == 0.0 && good.eye[3] > 0.0, "nothing is below the ground");
         for bounds in [BoundingBox::EMPTY, BoundingBox { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
-            let replaced = FrameUniforms::new(&scene, &FrameParams { bounds, ..shot }, [0.0; 3]).expect("replaced");
+            let replaced = FrameUniforms::new(&scene, &FrameParams { bounds, ..params }, [0.0; 3]).expect("replaced");
             assert_eq!(replaced, FrameUniforms { to_sun: [x, y, z, 1.0], ..good }, "what overflowed may be below it");
         }
         let measured = OrientedBounds(BoundingBox { min: [-0.25; 3], max: [0.25; 3] });
         let with =
-            |light| FrameUniforms::new(&scene, &FrameParams { light: Some(light), ..shot }, [0.0; 3]).expect("good");
+            |light| FrameUniforms::new(&scene, &FrameParams { light: Some(light), ..params }, [0.0; 3]).expect("good");
         assert_ne!(with(measured), good, "control: what was measured decides");
         for lost in [OrientedBounds::EMPTY, measured.expanded_by(f64::NAN), measured.expanded_by(f64::INFINITY)] {
             assert_eq!(with(lost), good, "{lost:?}");
         }
-        shot.camera.view = View::LookAt { eye: [1e300, 0.0, 0.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
-        let refusal = FrameUniforms::new(&scene, &shot, [0.0; 3]).expect_err("overflows").to_string();
+        params.camera.view = View::LookAt { eye: [1e300, 0.0, 0.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
+        let refusal = FrameUniforms::new(&scene, &params, [0.0; 3]).expect_err("overflows").to_string();
         assert!(refusal.starts_with("camera:"), "{refusal}");
     }
 }

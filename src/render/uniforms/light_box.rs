@@ -3,7 +3,7 @@
 //!
 //! The z axis of light space is v_l, the direction to the sun; its y axis points up in the world. The box is
 //! axis-aligned in light space and symmetric about its center in x and y. It encloses the vertices as the deformer
-//! measured them; a shot without that measurement uses the corners of the world-space bounds, as in the thesis. The
+//! measured them; a frame without that measurement uses the corners of the world-space bounds, as in the thesis. The
 //! four side facets run along the light and are lengthened until they meet the ground, so that the whole shadow on the
 //! ground lies inside. All sides are quantized to steps that are fixed in the world, so that shadow edges do not crawl
 //! while the scene sways.

@@ -183,7 +183,7 @@ fn overflowed_vertices_leave_no_black_pixels() {
     let short_surface = DeformedSurface { positions: vec![0.0; 3], ..DeformedSurface::default() };
     let error =
         renderer.upload(&buffers, &short_surface).expect_err("expected an error for 3 of 12 numbers").to_string();
-    assert!(error.contains("3 numbers of positions, 12 expected"), "{error}");
+    assert!(error.contains("expected 12 numbers of positions, got 3"), "{error}");
 }
 
 #[test]

@@ -1,0 +1,25 @@
+// List of pixel tiles, in any order, and the arguments of an indirect dispatch over them: one workgroup per tile, in rows
+// of TILES_PER_ROW workgroups.
+layout(std430, binding = 1) buffer TileList {
+    uint workgroup_counts[3];  // x, y, z of the dispatch
+    uint count;
+    uint tiles[];              // column, and row shifted by 16
+} tile_list;
+
+// Appends the tile of this workgroup. Only one lane may call it.
+void append_tile() {
+    uint index = atomicAdd(tile_list.count, 1u);
+    if (index % TILES_PER_ROW == 0u) atomicAdd(tile_list.workgroup_counts[1], 1u);
+    tile_list.tiles[index] = gl_WorkGroupID.x | gl_WorkGroupID.y << 16;
+}
+
+uint listed_tile_index() { return gl_WorkGroupID.y * TILES_PER_ROW + gl_WorkGroupID.x; }
+
+// Whether the indirect dispatch has a tile for this workgroup. The last row of workgroups may be incomplete.
+bool has_listed_tile() { return listed_tile_index() < tile_list.count; }
+
+// Pixel of this lane in the tile of this workgroup.
+ivec2 listed_pixel() {
+    uint tile = tile_list.tiles[min(listed_tile_index(), tile_list.count - 1u)];
+    return TILE * ivec2(tile & 0xFFFFu, tile >> 16) + ivec2(gl_LocalInvocationID.xy);
+}
