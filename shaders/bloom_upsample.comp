@@ -18,7 +18,8 @@ void main() {
     ivec2 near_texel = destination_texel >> 1;
     ivec2 far_texel = clamp(near_texel + 2 * (destination_texel & 1) - 1, ivec2(0), max_texel);
     vec3 glow = 0.5625 * texelFetch(source, near_texel, 0).rgb + 0.0625 * texelFetch(source, far_texel, 0).rgb;
-    glow += 0.1875 * (texelFetch(source, ivec2(far_texel.x, near_texel.y), 0).rgb + texelFetch(source, ivec2(near_texel.x, far_texel.y), 0).rgb);
+    glow += 0.1875 * (texelFetch(source, ivec2(far_texel.x, near_texel.y), 0).rgb
+        + texelFetch(source, ivec2(near_texel.x, far_texel.y), 0).rgb);
     vec3 color = imageLoad(destination, destination_texel).rgb;
 #ifdef COMPOSITE
     color = tone_map(inverse_tone_map(color) + BLOOM_STRENGTH * glow);

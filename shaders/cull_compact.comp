@@ -19,19 +19,23 @@ void main() {
     memoryBarrierShared();
     barrier();
     uint superblock = block.index / SUPERBLOCK, partial_sum = 0u;
-    for (uint index = groups.ranges[block.group].w / SUPERBLOCK + lane; index < superblock; index += uint(WORKGROUP_SIZE)) partial_sum += draws.totals[index];
-    for (uint index = superblock * SUPERBLOCK * MASK_WORDS + lane; index < block.index * MASK_WORDS; index += uint(WORKGROUP_SIZE)) partial_sum += bitCount(bits[index]);
+    uint first_superblock = groups.ranges[block.group].w / SUPERBLOCK;
+    for (uint index = first_superblock + lane; index < superblock; index += uint(WORKGROUP_SIZE)) partial_sum += draws.totals[index];
+    uint superblock_word = superblock * SUPERBLOCK * MASK_WORDS, block_word = block.index * MASK_WORDS;
+    for (uint index = superblock_word + lane; index < block_word; index += uint(WORKGROUP_SIZE)) partial_sum += bitCount(bits[index]);
     if (partial_sum > 0u) atomicAdd(preceding_count, partial_sum);
     memoryBarrierShared();
     barrier();
-    uint first_word = block.index * MASK_WORDS, lane_word = first_word + lane / 32u, lower_lanes = (1u << (lane & 31u)) - 1u;
+    uint lane_word = block_word + lane / 32u, lower_lanes = (1u << (lane & 31u)) - 1u;
     uint mask = bits[lane_word];
     if ((mask & (lower_lanes + 1u)) == 0u) return;
     uint output_index = groups.ranges[block.group].x + preceding_count + bitCount(mask & lower_lanes);
-    for (uint word_index = first_word; word_index < lane_word; word_index++) output_index += bitCount(bits[word_index]);
+    for (uint word_index = block_word; word_index < lane_word; word_index++) output_index += bitCount(bits[word_index]);
     uint triangle = groups.ranges[block.group].x + block.triangle;
     bool is_position_only = groups.flags[block.group].y != 0u;
-    uvec3 corners = is_position_only ? texelFetch(triangle_vertices, int(triangle)).xyz : texelFetch(triangle_corners, int(triangle)).xyz;
+    uvec3 corners = is_position_only
+        ? texelFetch(triangle_vertices, int(triangle)).xyz
+        : texelFetch(triangle_corners, int(triangle)).xyz;
     triangle_ids[output_index] = triangle;
     for (uint corner = 0u; corner < 3u; corner++) indices[3u * output_index + corner] = corners[corner];
 }

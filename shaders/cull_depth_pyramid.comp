@@ -27,7 +27,9 @@ void main() {
     float max_depth = 0.0;
     if (all(lessThan(texel, size))) {
 #ifdef FROM_DEPTH
-        for (int sample_index = 0; sample_index < SAMPLES; sample_index++) max_depth = max(max_depth, texelFetch(depth, texel, sample_index).x);
+        for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
+            max_depth = max(max_depth, texelFetch(depth, texel, sample_index).x);
+        }
         depths[level_offset + texel.y * size.x + texel.x] = max_depth;
 #else
         max_depth = depths[level_offset + texel.y * size.x + texel.x];

@@ -29,7 +29,7 @@ shared uint class_counts[CLASS_COUNT];
 // In each evaluation, four products and three sums round by 2^-24 of that sum.
 const float ROUNDING = 1.0 / 1048576.0;
 // Error of a float of magnitude 1 after a few operations.
-const float FLOAT_SLACK = 1.0 / 4194304.0;
+const float FLOAT_ERROR = 1.0 / 4194304.0;
 // Above this magnitude of the terms, one evaluation may overflow and another may not.
 const float LARGE = 1e30;
 
@@ -93,21 +93,21 @@ bool is_occluded(uvec2 min_pixel, uvec2 max_pixel, uvec2 size, float depth) {
 // Class of a triangle whose corners are all inside the clip planes.
 uint classify_unclipped(ClipVertex corners[3], bool is_single_sided) {
     vec2 size = vec2(size_packed & 0xFFFF, size_packed >> 16 & 0xFFFF), position[3];
-    float nearest = 1.0, farthest = 0.0, depth[3], depth_error = 0.0, pixel_error = 0.0;
+    float nearest = 1.0, depth[3], depth_error = 0.0, pixel_error = 0.0;
     for (int corner = 0; corner < 3; corner++) {
         vec4 clip = corners[corner].clip, error_bound = corners[corner].error_bound;
         vec3 ndc = clip.xyz / clip.w;
-        vec3 ndc_error = (error_bound.xyz + abs(ndc) * error_bound.w) / (clip.w - error_bound.w) + FLOAT_SLACK * abs(ndc);
+        vec3 ndc_error = (error_bound.xyz + abs(ndc) * error_bound.w) / (clip.w - error_bound.w) + FLOAT_ERROR * abs(ndc);
         position[corner] = (0.5 * ndc.xy + 0.5) * size;
         depth[corner] = 0.5 * ndc.z + 0.5;
         vec2 corner_error = 0.5 * ndc_error.xy * size;
         pixel_error = max(pixel_error, max(corner_error.x, corner_error.y));
         depth_error = max(depth_error, 0.5 * ndc_error.z);
         nearest = min(nearest, depth[corner]);
-        farthest = max(farthest, depth[corner]);
     }
-    pixel_error += max(size.x, size.y) * FLOAT_SLACK + groups.subpixel_step.x;
-    vec2 min_position = min(position[0], min(position[1], position[2])) - pixel_error, max_position = max(position[0], max(position[1], position[2])) + pixel_error;
+    pixel_error += max(size.x, size.y) * FLOAT_ERROR + groups.subpixel_step.x;
+    vec2 min_position = min(position[0], min(position[1], position[2])) - pixel_error;
+    vec2 max_position = max(position[0], max(position[1], position[2])) + pixel_error;
     bool covers_sample = false;
     for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
         vec2 sample_position = SAMPLE_POSITIONS[sample_index];
@@ -115,8 +115,10 @@ uint classify_unclipped(ClipVertex corners[3], bool is_single_sided) {
     }
     if (!covers_sample) return NO_SAMPLE;
     vec2 edge_ab = position[1] - position[0], edge_ac = position[2] - position[0];
-    float area = edge_ab.x * edge_ac.y - edge_ab.y * edge_ac.x, area_magnitude = abs(edge_ab.x * edge_ac.y) + abs(edge_ab.y * edge_ac.x);
-    float area_error = 2.0 * pixel_error * (abs(edge_ab.x) + abs(edge_ab.y) + abs(edge_ac.x) + abs(edge_ac.y)) + 8.0 * pixel_error * pixel_error + FLOAT_SLACK * area_magnitude;
+    float area = edge_ab.x * edge_ac.y - edge_ab.y * edge_ac.x; // twice the signed area
+    float area_magnitude = abs(edge_ab.x * edge_ac.y) + abs(edge_ab.y * edge_ac.x);
+    float area_error = 2.0 * pixel_error * (abs(edge_ab.x) + abs(edge_ab.y) + abs(edge_ac.x) + abs(edge_ac.y))
+        + 8.0 * pixel_error * pixel_error + FLOAT_ERROR * area_magnitude;
     if (is_single_sided && area < -area_error) return BACK_FACING;
 #ifdef CULL_OCCLUDED
     float min_area = abs(area) - area_error;
@@ -151,7 +153,8 @@ uint classify_triangle(uint triangle, bool is_single_sided) {
             is_below[axis] = is_below[axis] && lower_distance[axis] < -margin[axis];
             is_above[axis] = is_above[axis] && upper_distance[axis] < -margin[axis];
         }
-        is_inside = is_inside && all(greaterThan(lower_distance, margin)) && all(greaterThan(upper_distance, margin)) && clip.w > 2.0 * error_bound.w;
+        is_inside = is_inside && all(greaterThan(lower_distance, margin)) && all(greaterThan(upper_distance, margin))
+            && clip.w > 2.0 * error_bound.w;
     }
     if (any(is_below) || any(is_above)) return OUTSIDE;
     if (!is_inside) return VISIBLE;

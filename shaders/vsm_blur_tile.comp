@@ -22,7 +22,8 @@ void main() {
             if (first_row + row < OUTPUT_ROWS + 2 * RADIUS) {
                 vec2 sums[TEXELS_PER_INVOCATION];
                 blur_row(row * DEPTH_PITCH + first_column + RADIUS, sums);
-                for (int index = 0; index < TEXELS_PER_INVOCATION; index++) rows[(first_row + row) * ROW_PITCH + first_column + index] = sums[index];
+                int first_sum = (first_row + row) * ROW_PITCH + first_column;
+                for (int index = 0; index < TEXELS_PER_INVOCATION; index++) rows[first_sum + index] = sums[index];
             }
         }
         memoryBarrierShared();

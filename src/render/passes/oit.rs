@@ -22,7 +22,7 @@ use crate::scene_data::geometry::BlendMode;
 use modalcast_model::error::Result;
 
 /// Resets the counters. The number of records per pixel is unlimited until the allocation.
-fn reset(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
+fn reset_counters(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
     let mut commands = [[0; 5]; 2];
     for (command, (_, group)) in commands.iter_mut().zip(groups_of(buffers, BlendMode::Blend)) {
         *command = [3 * group.triangles as u32, 0, 3 * group.first_triangle as u32, 0, 0];
@@ -35,12 +35,12 @@ fn reset(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
     for (index, (group_index, _)) in groups_of(buffers, BlendMode::Blend).enumerate() {
         // With culling, the number of indices is that of the culled list.
         if let Some((_, culled_draws)) = buffers.visible_draws(BlendMode::Blend) {
-            let command_in_counters = COMMANDS_OFFSET + size_of::<[u32; 5]>() * index;
+            let target_offset = COMMANDS_OFFSET + size_of::<[u32; 5]>() * index;
             gl.copy(BufferCopy {
                 source: culled_draws,
                 source_offset: command_offset(group_index) as u64,
                 target: &target.counters,
-                target_offset: command_in_counters as u64,
+                target_offset: target_offset as u64,
                 bytes: size_of::<u32>() as u64,
             });
         }
@@ -60,7 +60,7 @@ pub(super) fn draw(
     let [width, height] = region.frame();
     let gather = Gather { buffers, target, programs, region };
     recorder.begin(Pass::OitCount);
-    reset(gl, buffers, target);
+    reset_counters(gl, buffers, target);
     gl.begin_pass(&target.counts_fbo, region, ClearOp::Uint(&target.dirty_region));
     target.bind();
     gather.draw(recorder, PHASE_COUNT);

@@ -39,7 +39,7 @@ const MAX_BYTES: u64 = 4 * WORDS_PER_PIXEL as u64 * MAX_SIDE as u64 * MAX_SIDE a
 /// The surface point at the center of a pixel.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PickHit {
-    /// Column and row in the full picture; (0, 0) is the top left.
+    /// Column and row in the full frame; (0, 0) is the top left.
     pub pixel: [u32; 2],
     pub domain: usize,
     /// Index of the triangle in the domain's mesh.
@@ -83,7 +83,7 @@ impl Picker {
         Self { gl: Rc::clone(gl), target: None, free_staging: Vec::new() }
     }
 
-    /// Begins a pick in a rectangle of the picture that `params` describes, without waiting for the device.
+    /// Begins a pick in a rectangle of the frame that `params` describes, without waiting for the device.
     ///
     /// # Errors
     /// `Invalid` for a camera whose matrices overflow, `Fault` when OpenGL reports an error.

@@ -79,11 +79,11 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> R
             ([x_program, y_program], Some(horizontal)) => {
                 gl.set_pipeline_state(PipelineState::default());
                 let framebuffers = [&blurred.framebuffers[0], &blurred.framebuffers[1 + layer as usize]];
-                for ((program, source), framebuffers) in
+                for ((program, source), framebuffer) in
                     [(x_program, &map.depth), (y_program, horizontal)].into_iter().zip(framebuffers)
                 {
                     bind_blur(program, source, map, layer);
-                    gl.draw_fullscreen_triangle(framebuffers, map.shadow.size, &buffers.empty_vertex_array);
+                    gl.draw_fullscreen_triangle(framebuffer, map.shadow.size, &buffers.empty_vertex_array);
                 }
             }
             _ => return Err(fault_in(Pass::Blur.name())("the blur programs do not match the shadow map")),
@@ -92,6 +92,7 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> R
     recorder.finish(Pass::Blur)
 }
 
+/// Binds a blur program and its input, and sets the layer.
 fn bind_blur(program: &Program, source: &Texture, map: &ShadowMap, layer: u32) {
     program.bind(None);
     source.bind(SOURCE_UNIT);

@@ -93,6 +93,7 @@ impl Renderer {
         Ok(MappedPixels { width: desc.width, height: desc.height, view, times, raster_backends })
     }
 
+    /// Records and submits a frame. `is_read`: whether its pixels are read back.
     fn submit_frame(&mut self, buffers: &SceneBuffers, params: &FrameParams, is_read: bool) -> Result<PendingFrame> {
         let _current = self.gl.make_current()?;
         self.check_size(params)?;
@@ -115,11 +116,8 @@ impl Renderer {
         let mut recorder = PassRecorder { gl: &self.gl, stats: &mut stats };
         passes::uniforms::upload(&recorder, buffers, params, &uniforms);
         let frame = FrameContext { buffers, target: &target, programs: &programs, params };
-        let passes = self.record_passes(&mut recorder, &frame, draws_ground).and_then(|mut passes| {
-            passes.extend(self.record_readback(&recorder, &frame, slot.as_ref())?);
-            Ok(passes)
-        });
-        let passes = passes?;
+        let mut passes = self.record_passes(&mut recorder, &frame, draws_ground)?;
+        passes.extend(self.record_readback(&recorder, &frame, slot.as_ref())?);
         self.targets.push(target);
         self.last_frame = Some(LastFrame { desc, uniforms });
         Ok(PendingFrame {
@@ -142,10 +140,10 @@ impl Renderer {
     ) -> Result<Vec<(Pass, PassTimer)>> {
         let buffers = frame.buffers;
         let mut times = Vec::new();
-        let content = buffers.shadow_key(frame.params);
+        let shadow_key = buffers.shadow_key(frame.params);
         if let Some((rasterizer, enabled)) = buffers.active_rasterizer() {
             let raster_passes =
-                RasterPasses { shadow: enabled.shadow && buffers.shadow_cache.is_stale(content), ..enabled };
+                RasterPasses { shadow: enabled.shadow && buffers.shadow_cache.is_stale(shadow_key), ..enabled };
             if raster_passes.has_any() {
                 let draw = || passes::raster::draw(recorder, frame, rasterizer, raster_passes);
                 match self.time_pass(raster_passes.stats_pass(), draw) {
@@ -154,7 +152,7 @@ impl Renderer {
                 }
             }
         }
-        buffers.shadow_cache.draw_if_stale(content, || {
+        buffers.shadow_cache.draw_if_stale(shadow_key, || {
             times.push(self.time_pass(Pass::Shadow, || passes::shadow::draw_depth(recorder, buffers))?);
             times.push(self.time_pass(Pass::Blur, || passes::shadow::blur(recorder, buffers))?);
             Ok(())

@@ -1,5 +1,5 @@
-//! Converts a scene's domains to the static arrays: corner indices sorted into draw groups, vertex and texture
-//! coordinates of each corner, and the material of each triangle.
+//! Converts the domains of a scene to static arrays: corner indices sorted into draw groups, vertex and texture
+//! coordinates of each corner, and material of each triangle.
 //!
 //! Triangles are grouped by pipeline state, so that the number of draw calls does not grow with the number of domains.
 
@@ -8,7 +8,7 @@ use nalgebra::Vector3;
 use modalcast_model::domain::{AlphaMode, Domain, Material};
 use modalcast_model::scene::{DomainLayout, Scene};
 
-/// The pass that draws a triangle, from its material's alpha mode.
+/// Alpha mode of a material, without its parameters. It determines the pass that draws a triangle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum BlendMode {
     Opaque,
@@ -28,32 +28,32 @@ pub(crate) struct DrawGroup {
 /// A range of triangles that is contiguous both in a mesh and in the draw order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct TriangleSpan {
-    /// Its first triangle in the draw order.
+    /// First triangle, as an index in the draw order.
     pub(crate) first: usize,
     pub(crate) domain: usize,
-    /// The same triangle in the domain's mesh.
+    /// First triangle, as an index in the domain's mesh.
     pub(crate) triangle: usize,
 }
 
-/// Domain of a triangle, and its index in the domain's mesh; `place` is the triangle's index in the draw order.
-pub(crate) fn locate_triangle(spans: &[TriangleSpan], place: usize) -> Option<(usize, usize)> {
-    let after = spans.partition_point(|stretch| stretch.first <= place);
-    let stretch = spans.get(after.checked_sub(1)?)?;
-    Some((stretch.domain, stretch.triangle + place - stretch.first))
+/// Domain of a triangle, and its index in the mesh of the domain. `triangle` is its index in the draw order.
+pub(crate) fn locate_triangle(spans: &[TriangleSpan], triangle: usize) -> Option<(usize, usize)> {
+    let end = spans.partition_point(|span| span.first <= triangle);
+    let span = spans.get(end.checked_sub(1)?)?;
+    Some((span.domain, span.triangle + triangle - span.first))
 }
 
-/// The static arrays, packed as the scene's layout says; triangles are in draw order.
+/// Static arrays of a scene. Vertices and corners have the order of the scene's layout, triangles the draw order.
 #[derive(Debug, Default)]
 pub(crate) struct Geometry {
-    /// Per corner: its vertex in the packed positions.
+    /// Vertex of each corner, as an index in the positions of the scene.
     pub(crate) vertices: Vec<u32>,
-    /// Per corner; empty when nothing samples a texture.
+    /// Texture coordinates of each corner; empty if no material has a texture.
     pub(crate) uvs: Vec<[f32; 2]>,
-    /// Per triangle: three corners in the packed normals.
+    /// Corners of each triangle.
     pub(crate) triangles: Vec<[u32; 3]>,
-    /// Per triangle: the vertices of its corners.
+    /// Vertices of each triangle.
     pub(crate) triangle_vertices: Vec<[u32; 3]>,
-    /// Per triangle: index of its material among the used ones; empty when all triangles have the same material.
+    /// Material of each triangle, as an index among the used materials; empty if only one is used.
     pub(crate) materials: Vec<u32>,
     pub(crate) groups: Vec<DrawGroup>,
     /// Sorted by the first triangle.
@@ -67,22 +67,25 @@ pub(crate) fn uses_material_table(scene: &Scene) -> bool {
     used_materials(scene).len() > 1
 }
 
-/// The groups of a scene, opaque, then mask, then blend, six at most; and the group of each material.
+/// Draw groups of a scene, and the group of each material. There are at most six groups, sorted by blend mode.
 pub(crate) fn groups(scene: &Scene) -> (Vec<DrawGroup>, Vec<usize>) {
     let mut groups: Vec<DrawGroup> = Vec::new();
-    let mut of_material = vec![0; scene.materials.len()];
-    let mut used = used_materials(scene);
-    used.sort_by_key(|material| pipeline_key(&scene.materials[*material]));
-    for material in used {
+    let mut group_of_material = vec![0; scene.materials.len()];
+    let mut materials = used_materials(scene);
+    materials.sort_by_key(|material| pipeline_key(&scene.materials[*material]));
+    for material in materials {
         let (blend_mode, double_sided) = pipeline_key(&scene.materials[material]);
-        if groups.last().is_none_or(|last| (last.blend_mode, last.double_sided) != (blend_mode, double_sided)) {
+        if groups
+            .last()
+            .is_none_or(|previous| (previous.blend_mode, previous.double_sided) != (blend_mode, double_sided))
+        {
             groups.push(DrawGroup { blend_mode, double_sided, first_triangle: 0, triangles: 0 });
         }
-        of_material[material] = groups.len() - 1;
+        group_of_material[material] = groups.len() - 1;
     }
-    for (domain, slot) in scene.domains.iter().zip(&scene.layout.domains) {
-        for (material, triangles) in spans(domain, slot) {
-            groups[of_material[material]].triangles += triangles.len();
+    for (domain, layout) in scene.domains.iter().zip(&scene.layout.domains) {
+        for (material, triangles) in spans(domain, layout) {
+            groups[group_of_material[material]].triangles += triangles.len();
         }
     }
     let mut first_triangle = 0;
@@ -90,7 +93,7 @@ pub(crate) fn groups(scene: &Scene) -> (Vec<DrawGroup>, Vec<usize>) {
         group.first_triangle = first_triangle;
         first_triangle += group.triangles;
     }
-    (groups, of_material)
+    (groups, group_of_material)
 }
 
 /// Pipeline state of a material.
@@ -116,10 +119,10 @@ impl Geometry {
     pub(crate) fn new(scene: &Scene) -> Self {
         let (groups, group_of) = groups(scene);
         let layout = &scene.layout;
-        let textured = scene.features.textures || scene.features.normal_maps;
+        let has_uvs = scene.features.textures || scene.features.normal_maps;
         let mut geometry = Self {
             vertices: Vec::with_capacity(layout.corners),
-            uvs: Vec::with_capacity(if textured { layout.corners } else { 0 }),
+            uvs: Vec::with_capacity(if has_uvs { layout.corners } else { 0 }),
             triangles: vec![[0; 3]; layout.triangles],
             triangle_vertices: Vec::new(),
             materials: vec![0; if uses_material_table(scene) { layout.triangles } else { 0 }],
@@ -127,73 +130,73 @@ impl Geometry {
             spans: Vec::new(),
             group_of,
         };
-        let mut rank = vec![0; scene.materials.len()];
-        for (place, material) in (0..).zip(used_materials(scene)) {
-            rank[material] = place;
+        let mut material_indices = vec![0; scene.materials.len()];
+        for (material_index, material) in (0..).zip(used_materials(scene)) {
+            material_indices[material] = material_index;
         }
-        let mut next: Vec<usize> = geometry.groups.iter().map(|group| group.first_triangle).collect();
+        let mut next_triangles: Vec<usize> = geometry.groups.iter().map(|group| group.first_triangle).collect();
         for (index, domain) in scene.domains.iter().enumerate() {
-            geometry.add_corners(scene, domain, &scene.layout.domains[index], textured);
-            geometry.add_triangles(scene, index, &rank, &mut next);
+            geometry.add_corners(scene, domain, &scene.layout.domains[index], has_uvs);
+            geometry.add_triangles(scene, index, &material_indices, &mut next_triangles);
         }
-        let vertex = |corner: u32| geometry.vertices[corner as usize];
-        geometry.triangle_vertices = geometry.triangles.iter().map(|corners| corners.map(vertex)).collect();
-        geometry.spans.sort_unstable_by_key(|stretch| stretch.first);
+        let vertex_of = |corner: u32| geometry.vertices[corner as usize];
+        geometry.triangle_vertices = geometry.triangles.iter().map(|corners| corners.map(vertex_of)).collect();
+        geometry.spans.sort_unstable_by_key(|span| span.first);
         geometry
     }
 
-    fn add_corners(&mut self, scene: &Scene, domain: &Domain, slot: &DomainLayout, textured: bool) {
+    fn add_corners(&mut self, scene: &Scene, domain: &Domain, layout: &DomainLayout, has_uvs: bool) {
         let corners = scene.shapes[domain.shape].mesh.corners();
-        self.vertices.extend(corners.vertices.iter().map(|vertex| vertex + slot.first_vertex as u32));
-        if textured {
+        self.vertices.extend(corners.vertices.iter().map(|vertex| vertex + layout.first_vertex as u32));
+        if has_uvs {
             self.uvs.extend_from_slice(&corners.uvs);
-            // A mesh without texture coordinates samples one texel everywhere.
+            // All corners of a mesh without texture coordinates sample the same texel.
             self.uvs.resize(self.vertices.len(), [0.0; 2]);
         }
     }
 
-    fn add_triangles(&mut self, scene: &Scene, index: usize, rank: &[u32], next: &mut [usize]) {
-        let (domain, slot) = (&scene.domains[index], &scene.layout.domains[index]);
+    fn add_triangles(&mut self, scene: &Scene, index: usize, material_indices: &[u32], next_triangles: &mut [usize]) {
+        let (domain, layout) = (&scene.domains[index], &scene.layout.domains[index]);
         let mesh = &scene.shapes[domain.shape].mesh;
         // A mirroring placement reverses the winding of all triangles.
-        let mirrored = domain.placement.linear().determinant() < 0.0;
-        for (material, range) in spans(domain, slot) {
-            let blend_mode = &scene.materials[material];
-            let place = &mut next[self.group_of[material]];
-            self.spans.push(TriangleSpan { first: *place, domain: index, triangle: range.start });
+        let is_mirrored = domain.placement.linear().determinant() < 0.0;
+        for (material, range) in spans(domain, layout) {
+            let material_properties = &scene.materials[material];
+            let draw_index = &mut next_triangles[self.group_of[material]];
+            self.spans.push(TriangleSpan { first: *draw_index, domain: index, triangle: range.start });
             for triangle in &mesh.triangles()[range] {
-                let disagrees = blend_mode.double_sided && winding_disagrees(mesh, *triangle);
-                let [a, b, c] = triangle.map(|corner| corner + slot.first_corner as u32);
-                self.triangles[*place] = if mirrored == disagrees { [a, b, c] } else { [a, c, b] };
-                if let Some(slot) = self.materials.get_mut(*place) {
-                    *slot = rank[material];
+                let is_reversed = material_properties.double_sided && winding_disagrees(mesh, *triangle);
+                let [a, b, c] = triangle.map(|corner| corner + layout.first_corner as u32);
+                self.triangles[*draw_index] = if is_mirrored == is_reversed { [a, b, c] } else { [a, c, b] };
+                if let Some(layout) = self.materials.get_mut(*draw_index) {
+                    *layout = material_indices[material];
                 }
-                *place += 1;
+                *draw_index += 1;
             }
         }
     }
 }
 
-/// The material runs of a domain, as ranges of its triangles.
-fn spans<'a>(domain: &'a Domain, slot: &DomainLayout) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> + 'a {
-    let count = slot.triangles;
-    let whole = domain.material_ranges.is_empty().then_some((domain.material, 0..count));
-    let ends = domain.material_ranges.iter().skip(1).map(|run| run.first_triangle).chain([count]);
+/// Material and triangle range of each material range of a domain.
+fn spans<'a>(domain: &'a Domain, layout: &DomainLayout) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> + 'a {
+    let count = layout.triangles;
+    let single_range = domain.material_ranges.is_empty().then_some((domain.material, 0..count));
+    let range_ends = domain.material_ranges.iter().skip(1).map(|run| run.first_triangle).chain([count]);
     let material_ranges =
-        domain.material_ranges.iter().zip(ends).map(|(run, end)| (run.material, run.first_triangle..end));
-    whole.into_iter().chain(material_ranges)
+        domain.material_ranges.iter().zip(range_ends).map(|(run, end)| (run.material, run.first_triangle..end));
+    single_range.into_iter().chain(material_ranges)
 }
 
-/// Whether a triangle's winding contradicts its normals. The winding decides which side of a double-sided triangle is
-/// visible, so it must agree with the normals; not all files guarantee that.
+/// Whether a triangle's winding contradicts its normals. The renderer finds the visible side of a double-sided triangle
+/// by the winding, and some files contain triangles with the opposite winding.
 fn winding_disagrees(mesh: &modalcast_model::domain::Mesh, triangle: [u32; 3]) -> bool {
     let corners = mesh.corners();
-    let at =
+    let position_of =
         |corner: u32| Vector3::from(mesh.rest_positions()[corners.vertices[corner as usize] as usize]).cast::<f64>();
-    let normal = |corner: u32| Vector3::from(corners.normals[corner as usize]).cast::<f64>();
+    let normal_of = |corner: u32| Vector3::from(corners.normals[corner as usize]).cast::<f64>();
     let [a, b, c] = triangle;
-    let area = (at(b) - at(a)).cross(&(at(c) - at(a)));
-    area.dot(&(normal(a) + normal(b) + normal(c))) < 0.0
+    let area = (position_of(b) - position_of(a)).cross(&(position_of(c) - position_of(a)));
+    area.dot(&(normal_of(a) + normal_of(b) + normal_of(c))) < 0.0
 }
 
 #[cfg(test)]
@@ -204,10 +207,10 @@ pub(crate) mod tests {
 
     /// A scene of one unit square (two triangles) per material.
     pub(crate) fn squares(materials: Vec<Material>) -> SceneParts {
-        let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+        let rest_positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
         let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
-        let mesh =
-            Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
+        let mesh = Mesh::from_indexed(rest_positions, vec![[0.0, 0.0, 1.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]])
+            .expect("a square");
         let mut parts = SceneParts::named("squares");
         parts.shapes.push(Shape::new(mesh, Modes::rigid()).expect("rigid"));
         parts.domains = (0..materials.len()).map(|material| domain(material, Transform::IDENTITY)).collect();
@@ -219,19 +222,19 @@ pub(crate) mod tests {
         Domain { material, placement, ..Domain::new(format!("square {material}"), 0) }
     }
 
-    fn of(alpha_mode: AlphaMode, double_sided: bool) -> Material {
+    fn material(alpha_mode: AlphaMode, double_sided: bool) -> Material {
         Material { alpha_mode, double_sided, ..Material::default() }
     }
 
     #[test]
-    fn draw_groups_do_not_grow_with_domains_or_materials_and_keep_every_triangle() {
+    fn draw_groups_contain_each_triangle_once() {
         let mask = AlphaMode::Mask { cutoff: 0.5 };
-        let pattern = [of(AlphaMode::Blend, false), of(AlphaMode::Opaque, true), of(mask, true)];
+        let pattern = [material(AlphaMode::Blend, false), material(AlphaMode::Opaque, true), material(mask, true)];
         let materials: Vec<Material> = (0..300).map(|index| pattern[index % 3].clone()).collect();
-        let scene = Scene::new(squares(materials)).expect("good");
+        let scene = Scene::new(squares(materials)).expect("a valid scene");
         let geometry = Geometry::new(&scene);
-        let kinds: Vec<BlendMode> = geometry.groups.iter().map(|group| group.blend_mode).collect();
-        assert_eq!(kinds, [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend]);
+        let blend_modes: Vec<BlendMode> = geometry.groups.iter().map(|group| group.blend_mode).collect();
+        assert_eq!(blend_modes, [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend]);
         assert_eq!(geometry.groups.iter().map(|group| group.triangles).sum::<usize>(), 600);
         for group in &geometry.groups {
             for triangle in group.first_triangle..group.first_triangle + group.triangles {
@@ -239,45 +242,46 @@ pub(crate) mod tests {
                 assert_eq!(pipeline_key(material), (group.blend_mode, group.double_sided));
             }
         }
-        let mut seen = geometry.triangles.as_flattened().to_vec();
-        seen.sort_unstable();
-        seen.dedup();
-        assert_eq!(seen, (0..1200).collect::<Vec<u32>>());
+        let mut corners = geometry.triangles.as_flattened().to_vec();
+        corners.sort_unstable();
+        corners.dedup();
+        assert_eq!(corners, (0..1200).collect::<Vec<u32>>());
     }
 
     #[test]
-    fn runs_split_a_domain_between_groups() {
-        let mut parts = squares(vec![of(AlphaMode::Opaque, false), of(AlphaMode::Blend, false)]);
+    fn material_ranges_split_a_domain_between_groups() {
+        let mut parts = squares(vec![material(AlphaMode::Opaque, false), material(AlphaMode::Blend, false)]);
         parts.domains.truncate(1);
         parts.domains[0].material_ranges =
             vec![MaterialRange { first_triangle: 0, material: 1 }, MaterialRange { first_triangle: 1, material: 0 }];
-        let geometry = Geometry::new(&Scene::new(parts).expect("good"));
+        let geometry = Geometry::new(&Scene::new(parts).expect("a valid scene"));
         assert_eq!(geometry.materials, [0, 1]);
         assert_eq!(geometry.triangles, [[0, 2, 3], [0, 1, 2]]);
-        let stretch = |first, triangle| TriangleSpan { first, domain: 0, triangle };
-        assert_eq!(geometry.spans, [stretch(0, 1), stretch(1, 0)], "where each came from");
+        let span = |first, triangle| TriangleSpan { first, domain: 0, triangle };
+        assert_eq!(geometry.spans, [span(0, 1), span(1, 0)], "expected the spans of both groups");
     }
 
     #[test]
-    fn a_mirrored_placement_turns_the_winding_and_one_material_needs_no_list() {
-        let mut parts = squares(vec![of(AlphaMode::Opaque, false)]);
-        let mut mirror = Transform::IDENTITY;
-        mirror.0[0] = -1.0;
-        parts.domains[0].placement = mirror;
-        let geometry = Geometry::new(&Scene::new(parts).expect("good"));
+    fn mirrored_placement_reverses_the_winding() {
+        let mut parts = squares(vec![material(AlphaMode::Opaque, false)]);
+        let mut mirroring = Transform::IDENTITY;
+        mirroring.0[0] = -1.0;
+        parts.domains[0].placement = mirroring;
+        let geometry = Geometry::new(&Scene::new(parts).expect("a valid scene"));
         assert_eq!(geometry.triangles, [[0, 2, 1], [0, 3, 2]]);
-        assert_eq!(geometry.triangle_vertices, geometry.triangles, "here a corner is a vertex");
+        assert_eq!(geometry.triangle_vertices, geometry.triangles, "expected one corner per vertex");
         assert!(geometry.materials.is_empty() && geometry.uvs.is_empty());
     }
 
     #[test]
-    fn a_double_sided_triangle_wound_against_its_normals_is_turned_and_a_single_sided_one_is_kept() {
+    fn only_double_sided_triangles_are_wound_like_their_normals() {
         for (double_sided, expected) in [(true, [0, 2, 1]), (false, [0, 1, 2])] {
-            let mut parts = squares(vec![of(AlphaMode::Opaque, double_sided)]);
-            let rest = parts.shapes[0].mesh.rest_positions().to_vec();
-            let mesh = Mesh::from_indexed(rest, vec![[0.0, 0.0, -1.0]; 4], vec![], vec![[0, 1, 2]]).expect("good");
+            let mut parts = squares(vec![material(AlphaMode::Opaque, double_sided)]);
+            let rest_positions = parts.shapes[0].mesh.rest_positions().to_vec();
+            let mesh = Mesh::from_indexed(rest_positions, vec![[0.0, 0.0, -1.0]; 4], vec![], vec![[0, 1, 2]])
+                .expect("a triangle");
             parts.shapes[0] = Shape::new(mesh, Modes::rigid()).expect("rigid");
-            let geometry = Geometry::new(&Scene::new(parts).expect("good"));
+            let geometry = Geometry::new(&Scene::new(parts).expect("a valid scene"));
             assert_eq!(geometry.triangles, [expected]);
         }
     }

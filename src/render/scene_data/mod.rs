@@ -1,5 +1,5 @@
-//! Static data of a scene in the form in which the device gets it: index lists in draw groups, and texture arrays with
-//! mipmap levels. Computed on the host.
+//! Static data of a scene in the layout of the device, computed on the host: index lists in draw groups, and texture
+//! arrays with mipmap levels.
 
 pub(crate) mod geometry;
 pub(crate) mod textures;

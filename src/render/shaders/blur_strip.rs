@@ -29,7 +29,7 @@ pub(crate) struct BlurStrip {
 impl BlurStrip {
     /// None if the kernel is too wide. A strip also processes 2 `radius` rows that it does not store, so large maps have
     /// tall strips. Small maps have short strips, because the device needs many workgroups.
-    pub(crate) fn of(shadow: &ShadowSettings) -> Option<Self> {
+    pub(crate) fn fit(shadow: &ShadowSettings) -> Option<Self> {
         let radius = shadow.blur_radius();
         let (columns, rows_per_step) = STRIP_SHAPES[usize::from(radius > NARROW_RADIUS)];
         let input_rows = (shadow.size / 32).clamp(16, 128) + 2 * radius;
@@ -133,7 +133,7 @@ mod tests {
     use super::*;
 
     fn strip(blur: f32, size: u32) -> Option<BlurStrip> {
-        BlurStrip::of(&ShadowSettings { blur, size, ..ShadowSettings::default() })
+        BlurStrip::fit(&ShadowSettings { blur, size, ..ShadowSettings::default() })
     }
 
     #[test]

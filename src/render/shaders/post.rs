@@ -39,7 +39,7 @@ fn tone_curve(look: &RenderSettings) -> String {
 /// Computes the next level of the bloom pyramid.
 pub(crate) fn bloom_downsample() -> ProgramSource {
     let head = format!("{VERSION}#define TILE {TILE}\n");
-    ProgramSource::compute("bloom, half", head + include_str!("../../../shaders/bloom_downsample.comp"))
+    ProgramSource::compute("bloom downsample", head + include_str!("../../../shaders/bloom_downsample.comp"))
 }
 
 /// Adds a level of the bloom pyramid to the next finer one, or, as the composite program, to the scene color.
@@ -50,7 +50,7 @@ pub(crate) fn bloom_upsample(look: &RenderSettings, bloom: Bloom, is_composite: 
         text += &tone_curve(look);
     }
     text += include_str!("../../../shaders/bloom_upsample.comp");
-    ProgramSource::compute(if is_composite { "bloom, onto the picture" } else { "bloom, double" }, text)
+    ProgramSource::compute(if is_composite { "bloom composite" } else { "bloom upsample" }, text)
 }
 
 /// Encodes the scene color to sRGB bytes.

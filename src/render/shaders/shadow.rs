@@ -25,8 +25,8 @@ pub(crate) const SHARED_BYTES: u32 = 32 << 10;
 
 /// Columns and rows of the map that one workgroup writes when both directions are blurred in one pass.
 pub(crate) fn texels_per_workgroup(shadow: &ShadowSettings) -> [u32; 2] {
-    let tile = BlurTile::of(shadow);
-    BlurStrip::of(shadow).map_or([tile.columns, tile.rows], |strip| [strip.columns, strip.rows])
+    let tile = BlurTile::fit(shadow);
+    BlurStrip::fit(shadow).map_or([tile.columns, tile.rows], |strip| [strip.columns, strip.rows])
 }
 
 /// Tile of the map that a workgroup blurs, in texels.
@@ -42,7 +42,7 @@ struct BlurTile {
 
 impl BlurTile {
     /// The first candidate that fits into shared memory. A wider blur kernel needs smaller tiles.
-    fn of(shadow: &ShadowSettings) -> Self {
+    fn fit(shadow: &ShadowSettings) -> Self {
         let radius = shadow.blur_radius();
         let candidates = [(32, 64, 256), (32, 48, 256), (32, 32, 256), (32, 32, 32), (16, 64, 32), (16, 64, 16)];
         // All rows at once if they fit: a second band would leave most lanes idle.
@@ -165,14 +165,14 @@ impl ShaderOptions {
     /// Both directions of the blur in one pass: by strips if the kernel is small enough, else by tiles.
     fn blur_single_pass(&self, shadow: &ShadowSettings) -> ProgramSource {
         let weights = gaussian_weights(shadow.blur);
-        let Some(strip) = BlurStrip::of(shadow) else { return self.blur_tiles(shadow, &weights) };
+        let Some(strip) = BlurStrip::fit(shadow) else { return self.blur_tiles(shadow, &weights) };
         let text = self.blur_head(shadow, &["FROM_DEPTH"], strip.columns, 1) + &strip.text(&weights);
         ProgramSource::compute("blur, strips", text)
     }
 
     /// Both directions of the blur in one pass, by tiles.
     fn blur_tiles(&self, shadow: &ShadowSettings, weights: &[f32]) -> ProgramSource {
-        let tile = BlurTile::of(shadow);
+        let tile = BlurTile::fit(shadow);
         let BlurTile { columns, rows, band_rows, radius } = tile;
         let mut text = self.blur_head(shadow, &["FROM_DEPTH"], TILE_WORKGROUP_SIZE, TEXELS_PER_INVOCATION);
         writeln!(text, "#define OUTPUT_COLUMNS {columns}\n#define OUTPUT_ROWS {rows}\n#define BAND_ROWS {band_rows}\n#define RADIUS {radius}").ok();
@@ -247,14 +247,14 @@ mod tests {
     #[test]
     fn tiles_fit_into_shared_memory() {
         for step in 0..=160 {
-            let tile = BlurTile::of(&ShadowSettings { blur: step as f32 / 10.0, ..ShadowSettings::default() });
+            let tile = BlurTile::fit(&ShadowSettings { blur: step as f32 / 10.0, ..ShadowSettings::default() });
             let bytes = tile.shared_bytes();
             assert!(bytes <= SHARED_BYTES, "{tile:?}: {bytes} bytes");
             assert!(
                 tile.columns.is_multiple_of(TEXELS_PER_INVOCATION) && tile.rows.is_multiple_of(TEXELS_PER_INVOCATION)
             );
         }
-        let default = BlurTile::of(&ShadowSettings::default());
+        let default = BlurTile::fit(&ShadowSettings::default());
         assert_eq!((default.rows, default.band_rows), (64, 74), "the default blur has the largest tile, in one band");
     }
 

@@ -1,5 +1,5 @@
-//! Cascades of a split shadow map. The view is cut by distance; each part but the last has a map of its own within the
-//! box of the whole shadow map, and the last map is the whole box (parallel-split shadow maps, Zhang et al. 2006).
+//! Cascades of a split shadow map (parallel-split shadow maps, Zhang et al. 2006). The view volume is split by distance.
+//! Each part has a cascade: a map of a part of the light box. The last cascade covers the whole light box.
 
 use bytemuck::{Pod, Zeroable};
 use nalgebra::{Point3, Vector3};
@@ -8,12 +8,12 @@ use super::light_box::{LightBox, LightBoxParams, TexelSpan};
 use crate::types::FrameParams;
 use modalcast_model::scene::{Camera, Scene};
 
-/// Weight of the logarithmic split scheme; the rest is the uniform scheme.
+/// Weight of the logarithmic split scheme; the uniform scheme has the remaining weight.
 const SPLIT_LAMBDA: f64 = 0.5;
-/// Smallest distance at which the first part begins, relative to the farthest point.
+/// Minimum distance at which the first part begins, relative to the farthest point.
 const MIN_NEAR_FRACTION: f64 = 1e-3;
 
-/// Uniform block of the cascades. Twin of `SplitBlock` in `shaders/shared/shadow_cascades.glsl`.
+/// Uniform block of the cascades. Twin of `CascadeBlock` in `shaders/shared/shadow_cascades.glsl`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(crate) struct ShadowCascades {
@@ -25,30 +25,34 @@ const _: () =
     assert!(size_of::<ShadowCascades>() == 80, "ShadowCascades differs from shaders/shared/shadow_cascades.glsl");
 
 impl ShadowCascades {
-    /// Fits the cascades of one frame. `fit` is the input of the whole box, relative to `origin` like the positions.
-    pub(crate) fn new(scene: &Scene, params: &FrameParams, fit: &LightBoxParams, origin: [f64; 3]) -> Self {
+    /// Fits the cascades of one frame. `box_params` and the positions are relative to `origin`.
+    pub(crate) fn new(scene: &Scene, params: &FrameParams, box_params: &LightBoxParams, origin: [f64; 3]) -> Self {
         let count = scene.look.shadow.unwrap_or_default().splits as usize;
-        let whole = LightBox::fit(fit);
+        let whole_box = LightBox::fit(box_params);
         let camera = params.camera.relative_to(origin);
-        let (near, far) = visible_depth_range(&camera, fit);
-        let ends = split_depths(near, far, count);
-        let mut splits = Self { scale_offsets: [[1.0, 1.0, 0.0, 0.0]; 4], end_depths: [f32::INFINITY; 4] };
-        let mut begin = near;
-        for (part, end) in ends.into_iter().enumerate() {
-            splits.end_depths[part] = end as f32;
-            if let Some(sides) = fit_cascade(&whole, fit, &bounding_sphere(&camera, params, begin, end, fit)) {
-                splits.scale_offsets[part] = cascade_transform(&whole.sides, &sides);
+        let (min_depth, max_depth) = visible_depth_range(&camera, box_params);
+        let depths = split_depths(min_depth, max_depth, count);
+        let mut cascades = Self { scale_offsets: [[1.0, 1.0, 0.0, 0.0]; 4], end_depths: [f32::INFINITY; 4] };
+        let mut near_depth = min_depth;
+        for (cascade, far_depth) in depths.into_iter().enumerate() {
+            cascades.end_depths[cascade] = far_depth as f32;
+            if let Some(sides) = fit_cascade(
+                &whole_box,
+                box_params,
+                &bounding_sphere(&camera, params, near_depth, far_depth, box_params),
+            ) {
+                cascades.scale_offsets[cascade] = cascade_transform(&whole_box.sides, &sides);
             }
-            begin = end;
+            near_depth = far_depth;
         }
-        splits
+        cascades
     }
 }
 
-/// Nearest and farthest distance at which the camera can see a point of the bounds.
-fn visible_depth_range(camera: &Camera, fit: &LightBoxParams) -> (f64, f64) {
+/// Minimum and maximum depth at which the camera can see a point of the bounds.
+fn visible_depth_range(camera: &Camera, box_params: &LightBoxParams) -> (f64, f64) {
     let view = camera.camera_from_world();
-    let depths = fit.bounds.corners().map(|corner| -view.transform_point(&corner).z);
+    let depths = box_params.bounds.corners().map(|corner| -view.transform_point(&corner).z);
     let mut near = depths.into_iter().fold(f64::INFINITY, f64::min);
     let mut far = depths.into_iter().fold(f64::NEG_INFINITY, f64::max).max(1e-6);
     if camera.far > 0.0 {
@@ -57,51 +61,56 @@ fn visible_depth_range(camera: &Camera, fit: &LightBoxParams) -> (f64, f64) {
     (near.clamp(MIN_NEAR_FRACTION * far, far), far)
 }
 
-/// Practical split scheme: the mean of logarithmic and uniform splits. Returns the cuts between the parts.
+/// Practical split scheme: the mean of logarithmic and uniform splits. Returns the depths between the parts.
 fn split_depths(near: f64, far: f64, count: usize) -> Vec<f64> {
-    let cut = |part: usize| {
-        let share = part as f64 / count as f64;
-        SPLIT_LAMBDA * near * (far / near).powf(share) + (1.0 - SPLIT_LAMBDA) * (near + (far - near) * share)
+    let split_depth = |part: usize| {
+        let fraction = part as f64 / count as f64;
+        SPLIT_LAMBDA * near * (far / near).powf(fraction) + (1.0 - SPLIT_LAMBDA) * (near + (far - near) * fraction)
     };
-    (1..count).map(cut).collect()
+    (1..count).map(split_depth).collect()
 }
 
-/// Bounding sphere of the view volume between two distances; its size does not change when the camera turns.
+/// Bounding sphere of the view volume between two depths. Its radius does not depend on the direction of the camera.
 fn bounding_sphere(
     camera: &Camera,
     params: &FrameParams,
-    begin: f64,
-    end: f64,
-    fit: &LightBoxParams,
+    near_depth: f64,
+    far_depth: f64,
+    box_params: &LightBoxParams,
 ) -> (Point3<f64>, f64) {
-    let clip = camera.clip_from_camera(params.width, params.height, &fit.bounds);
-    let world = camera.camera_from_world().try_inverse().unwrap_or_default();
+    let clip_from_camera = camera.clip_from_camera(params.width, params.height, &box_params.bounds);
+    let world_from_camera = camera.camera_from_world().try_inverse().unwrap_or_default();
     let corners: [Point3<f64>; 8] = std::array::from_fn(|corner| {
         let sign = |bit: usize| if corner >> bit & 1 == 0 { -1.0 } else { 1.0 };
-        let depth = if corner < 4 { begin } else { end };
-        let at = |axis: usize| depth * (sign(axis) + clip[(axis, 2)]) / clip[(axis, axis)];
-        world.transform_point(&Point3::new(at(0), at(1), -depth))
+        let depth = if corner < 4 { near_depth } else { far_depth };
+        let coordinate =
+            |axis: usize| depth * (sign(axis) + clip_from_camera[(axis, 2)]) / clip_from_camera[(axis, axis)];
+        world_from_camera.transform_point(&Point3::new(coordinate(0), coordinate(1), -depth))
     });
     let center = Point3::from(corners.iter().map(|corner| corner.coords).sum::<Vector3<f64>>() / 8.0);
     (center, corners.iter().map(|corner| (corner - center).norm()).fold(0.0, f64::max))
 }
 
-/// Sides of a cascade that encloses a sphere; none if it would not be finer than the whole map, or has no size.
+/// Sides of a cascade that encloses a sphere; none if it would not be finer than the whole map, or is not finite.
 fn fit_cascade(
-    whole: &LightBox,
-    fit: &LightBoxParams,
+    whole_box: &LightBox,
+    box_params: &LightBoxParams,
     (center, radius): &(Point3<f64>, f64),
 ) -> Option<[TexelSpan; 2]> {
-    let sound = *radius > 0.0 && radius.is_finite() && center.coords.iter().all(|number| number.is_finite());
-    let sides =
-        sound.then(|| [0, 1].map(|axis: usize| TexelSpan::snap(whole.axes[axis].dot(&center.coords), *radius, fit)));
-    sides.filter(|sides| sides.iter().zip(&whole.sides).all(|(part, whole)| part.half < whole.half))
+    let is_finite = *radius > 0.0 && radius.is_finite() && center.coords.iter().all(|number| number.is_finite());
+    let sides = is_finite.then(|| {
+        [0, 1].map(|axis: usize| TexelSpan::snap(whole_box.axes[axis].dot(&center.coords), *radius, box_params))
+    });
+    sides.filter(|sides| {
+        sides.iter().zip(&whole_box.sides).all(|(side, whole_side)| side.half_length < whole_side.half_length)
+    })
 }
 
 /// Scale and offset from coordinates of the whole map to those of the cascade.
-fn cascade_transform(whole: &[TexelSpan; 2], part: &[TexelSpan; 2]) -> [f32; 4] {
-    let scale = [0, 1].map(|axis: usize| whole[axis].half / part[axis].half);
-    let offset = [0, 1].map(|axis: usize| (whole[axis].low - part[axis].low) / (2.0 * part[axis].half));
+fn cascade_transform(whole_sides: &[TexelSpan; 2], cascade_sides: &[TexelSpan; 2]) -> [f32; 4] {
+    let scale = [0, 1].map(|axis: usize| whole_sides[axis].half_length / cascade_sides[axis].half_length);
+    let offset = [0, 1]
+        .map(|axis: usize| (whole_sides[axis].low - cascade_sides[axis].low) / (2.0 * cascade_sides[axis].half_length));
     [scale[0] as f32, scale[1] as f32, offset[0] as f32, offset[1] as f32]
 }
 
@@ -110,73 +119,93 @@ mod tests {
     use super::*;
     use modalcast_model::scene::{BoundingBox, Lens, UpAxis, View};
 
-    fn fit() -> LightBoxParams {
+    fn box_params() -> LightBoxParams {
         let bounds = BoundingBox { min: [-50.0, 0.0, -50.0], max: [50.0, 5.0, 50.0] };
         let to_sun = Vector3::new(0.4, 0.8, 0.5).normalize();
-        LightBoxParams { to_sun, up: UpAxis::Y, bounds, light: None, ground: Some(0.0), size: 512.0, rim: 6.0 }
+        LightBoxParams { to_sun, up: UpAxis::Y, bounds, light: None, ground: Some(0.0), size: 512.0, margin: 6.0 }
     }
 
-    fn params(turn: f64) -> FrameParams {
+    fn params(angle: f64) -> FrameParams {
         let eye = [0.0, 2.0, 20.0];
-        let view = View::LookAt { eye, target: [turn.sin(), 2.0, 20.0 - turn.cos()], up: [0.0, 1.0, 0.0] };
+        let view = View::LookAt { eye, target: [angle.sin(), 2.0, 20.0 - angle.cos()], up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, lens: Lens::FieldOfView(40.0), near: 0.1, far: 80.0 };
-        FrameParams { camera, width: 160, height: 90, bounds: fit().bounds, light: None }
+        FrameParams { camera, width: 160, height: 90, bounds: box_params().bounds, light: None }
     }
 
     #[test]
-    fn the_view_is_cut_half_by_ratios_and_half_by_lengths() {
+    fn split_depths_are_the_mean_of_ratios_and_lengths() {
         assert_eq!(split_depths(1.0, 16.0, 2), [6.25], "the mean of 4 and 8.5");
         let split_depths = split_depths(1.0, 81.0, 4);
-        let want = [3.0, 9.0, 27.0].iter().zip([21.0, 41.0, 61.0]).map(|(ratio, even)| 0.5 * (ratio + even));
-        assert!(split_depths.iter().zip(want).all(|(cut, want)| (cut - want).abs() < 1e-12), "{split_depths:?}");
+        let expected = [3.0, 9.0, 27.0].iter().zip([21.0, 41.0, 61.0]).map(|(ratio, even)| 0.5 * (ratio + even));
+        assert!(
+            split_depths.iter().zip(expected).all(|(cut, expected)| (cut - expected).abs() < 1e-12),
+            "{split_depths:?}"
+        );
     }
 
     #[test]
-    fn a_part_holds_all_that_is_seen_of_it_and_keeps_its_texels_when_the_camera_turns_and_walks() {
-        let (fit, whole) = (fit(), LightBox::fit(&fit()));
-        let place = |params: &FrameParams| {
-            fit_cascade(&whole, &fit, &bounding_sphere(&params.camera, params, 2.0, 8.0, &fit)).expect("smaller")
+    fn cascade_encloses_its_part_and_moves_by_whole_texels() {
+        let (box_params, whole_box) = (box_params(), LightBox::fit(&box_params()));
+        let fit_at = |params: &FrameParams| {
+            fit_cascade(&whole_box, &box_params, &bounding_sphere(&params.camera, params, 2.0, 8.0, &box_params))
+                .expect("a cascade")
         };
-        let first = place(&params(0.0));
+        let first_sides = fit_at(&params(0.0));
         for step in 0..100 {
             let mut params = params(0.03 * f64::from(step));
-            let (center, radius) = bounding_sphere(&params.camera, &params, 2.0, 8.0, &fit);
+            let (center, radius) = bounding_sphere(&params.camera, &params, 2.0, 8.0, &box_params);
             let View::LookAt { eye, target, .. } = &mut params.camera.view else { continue };
             (eye[0], target[0]) = (eye[0] + 0.013 * f64::from(step), target[0] + 0.013 * f64::from(step));
-            let moved = place(&params);
+            let sides = fit_at(&params);
             for axis in 0..2 {
-                assert_eq!(moved[axis].half, first[axis].half, "the size of a ball does not hang on where it is");
-                let texel = 2.0 * first[axis].half / fit.size;
-                let shift = (moved[axis].low - first[axis].low) / texel;
+                assert_eq!(
+                    sides[axis].half_length, first_sides[axis].half_length,
+                    "expected the same size for all camera positions"
+                );
+                let texel = 2.0 * first_sides[axis].half_length / box_params.size;
+                let shift = (sides[axis].low - first_sides[axis].low) / texel;
                 assert!((shift - shift.round()).abs() < 1e-6, "moves by {shift} texels");
-                let across = whole.axes[axis].dot(&center.coords);
-                let still = fit_cascade(&whole, &fit, &(center, radius)).expect("smaller")[axis];
-                assert!((across - still.low - still.half).abs() + radius < still.half);
+                let center_coordinate = whole_box.axes[axis].dot(&center.coords);
+                let still_side = fit_cascade(&whole_box, &box_params, &(center, radius)).expect("a cascade")[axis];
+                assert!(
+                    (center_coordinate - still_side.low - still_side.half_length).abs() + radius
+                        < still_side.half_length
+                );
             }
         }
     }
 
     #[test]
-    fn extreme_cameras_leave_finite_parts_inside_the_whole() {
+    fn extreme_cameras_give_finite_cascades() {
         let scene = |splits: u32| {
             let mut parts =
                 crate::scene_data::geometry::tests::squares(vec![modalcast_model::domain::Material::default()]);
             parts.look.shadow = Some(modalcast_model::scene::ShadowSettings { splits, ..Default::default() });
-            Scene::new(parts).expect("good")
+            Scene::new(parts).expect("a valid scene")
         };
-        let turned = |near: f64, far: f64, eye: [f64; 3]| {
+        let params_with = |near: f64, far: f64, eye: [f64; 3]| {
             let view = View::LookAt { eye, target: [eye[0], eye[1], eye[2] - 1.0], up: [0.0, 1.0, 0.0] };
             FrameParams { camera: Camera { view, lens: Lens::FieldOfView(100.0), near, far }, ..params(0.0) }
         };
         let point = BoundingBox { min: [5.0; 3], max: [5.0; 3] };
-        for params in [turned(1e-6, 1e9, [0.0; 3]), turned(0.0, 0.0, [0.0, 0.0, -900.0]), turned(0.0, 0.0, [1e9; 3])] {
-            for bounds in [fit().bounds, point] {
-                let splits = ShadowCascades::new(&scene(4), &params, &LightBoxParams { bounds, ..fit() }, [0.0; 3]);
-                assert!(splits.scale_offsets.iter().flatten().all(|number| number.is_finite()), "{splits:?}");
+        for params in [
+            params_with(1e-6, 1e9, [0.0; 3]),
+            params_with(0.0, 0.0, [0.0, 0.0, -900.0]),
+            params_with(0.0, 0.0, [1e9; 3]),
+        ] {
+            for bounds in [box_params().bounds, point] {
+                let cascades =
+                    ShadowCascades::new(&scene(4), &params, &LightBoxParams { bounds, ..box_params() }, [0.0; 3]);
+                assert!(cascades.scale_offsets.iter().flatten().all(|number| number.is_finite()), "{cascades:?}");
                 assert!(
-                    splits.end_depths[..3].iter().all(|depth| depth.is_finite()) && splits.end_depths[..3].is_sorted()
+                    cascades.end_depths[..3].iter().all(|depth| depth.is_finite())
+                        && cascades.end_depths[..3].is_sorted()
                 );
-                assert_eq!(splits.scale_offsets[3], [1.0, 1.0, 0.0, 0.0], "the last is the whole");
+                assert_eq!(
+                    cascades.scale_offsets[3],
+                    [1.0, 1.0, 0.0, 0.0],
+                    "expected the whole box in the last cascade"
+                );
             }
         }
     }

@@ -30,13 +30,13 @@ pub(crate) struct FrameUniforms {
 
 const _: () = assert!(size_of::<FrameUniforms>() == 368, "FrameUniforms differs from shaders/shared/frame.glsl");
 
-/// The ground fades by exp(-(d / D)^2) and is drawn up to this multiple of D, where it equals the horizon color to the
-/// last bit.
+/// Half the side of the ground's square, in multiples of the fade distance D. The ground's weight is exp(-(d / D)^2) at
+/// distance d, so at the border its color is exactly that of the horizon.
 const GROUND_EXTENT: f64 = 6.0;
 
-/// Tolerance for vertices that count as lying on the ground, in f32::EPSILON of the largest coordinate: positions are
-/// sums in f32. The rasterized ground is drawn behind surfaces in its plane by as many roundings of depth plus its
-/// depth slope per pixel (`PipelineState::behind`).
+/// Vertices below the ground by at most this tolerance count as on the ground. In multiples of f32::EPSILON times the
+/// largest coordinate, because positions are sums in f32. Rasterized ground has a polygon offset for the same reason
+/// (`PipelineState::polygon_offset`).
 const GROUND_TOLERANCE_EPSILONS: f64 = 4.0;
 
 impl FrameUniforms {
@@ -44,40 +44,40 @@ impl FrameUniforms {
     /// origin; it is subtracted from the camera in f64.
     ///
     /// # Errors
-    /// `Invalid` when the camera's matrices overflow.
+    /// `Invalid` if the camera's matrices overflow.
     pub(crate) fn new(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Result<Self> {
         let bounds = finite_bounds(scene, params);
-        let rebased_rest_bounds = rebased_rest_bounds(scene, bounds, origin);
+        let rest_bounds = rebased_rest_bounds(scene, bounds, origin);
         let look = &scene.look;
         let to_sun = look.to_sun(scene.up);
-        let height = rebased_rest_bounds.min[scene.up.index()];
+        let ground_height = rest_bounds.min[scene.up.index()];
         let shadow = look.shadow.unwrap_or_default();
-        let light = LightBox::fit(&light_box_params(scene, params, origin));
-        let viewer = params.camera.relative_to(origin);
-        let camera = viewer.camera_from_world();
-        let clip = clip_from_camera(scene, params, origin);
-        let (center, fade) = ground_disc(scene.up.index(), rebased_rest_bounds, viewer.eye());
-        let color = |[r, g, b]: [f32; 3], fourth: f64| [r, g, b, fourth as f32];
+        let light_box = LightBox::fit(&light_box_params(scene, params, origin));
+        let rebased_camera = params.camera.relative_to(origin);
+        let camera_from_world = rebased_camera.camera_from_world();
+        let clip_from_camera = clip_from_camera(scene, params, origin);
+        let (center, fade_distance) = ground_disc(scene.up.index(), rest_bounds, rebased_camera.eye());
+        let color = |[r, g, b]: [f32; 3], w: f64| [r, g, b, w as f32];
         let frame = Self {
-            clip_from_world: (clip * camera).cast().into(),
-            shadow_from_world: light.shadow_from_world.cast().into(),
-            world_from_ndc: world_from_ndc(&clip, &camera).cast().into(),
-            eye: vec4_of(viewer.eye(), flag(look.ground.is_some() && camera_is_above_ground(scene, params))),
+            clip_from_world: (clip_from_camera * camera_from_world).cast().into(),
+            shadow_from_world: light_box.shadow_from_world.cast().into(),
+            world_from_ndc: world_from_ndc(&clip_from_camera, &camera_from_world).cast().into(),
+            eye: vec4_of(rebased_camera.eye(), flag(look.ground.is_some() && camera_is_above_ground(scene, params))),
             to_sun: vec4_of(to_sun, flag(!ground_is_behind_scene(scene, params, origin))),
             sunlight: color(look.sunlight, 0.0),
             skylight: color(look.skylight, 0.0),
             zenith: color(look.zenith, 0.0),
             horizon: color(look.horizon, 0.0),
-            up: vec4_of(scene.up.vector(), height),
-            ground: color(look.ground.unwrap_or_default().color, fade),
-            ground_center: vec4_of(center, GROUND_EXTENT * fade),
+            up: vec4_of(scene.up.vector(), ground_height),
+            ground: color(look.ground.unwrap_or_default().color, fade_distance),
+            ground_center: vec4_of(center, GROUND_EXTENT * fade_distance),
             shadow: [
                 shadow.least_variance.max(shadow.variance_floor()),
                 shadow.bleeding,
                 shadow.alpha_threshold,
                 shadow.size as f32,
             ],
-            shadow_ground_plane: vec4_of(light.ground.into(), light.texel(f64::from(shadow.size))),
+            shadow_ground_plane: vec4_of(light_box.ground.into(), light_box.texel(f64::from(shadow.size))),
         };
         let numbers: &[f32] = bytemuck::cast_slice(std::slice::from_ref(&frame));
         match numbers.iter().all(|number| number.is_finite()) {
@@ -86,81 +86,84 @@ impl FrameUniforms {
         }
     }
 
-    /// Whether the view ray through (x, y) in normalized device coordinates meets the ground. Used for samples without
-    /// an id, whose ground was not rasterized. Twin of `ray_hits_ground` in `shaders/shared/ground_plane.glsl`.
-    pub(crate) fn ray_hits_ground(&self, image: [f64; 2]) -> bool {
-        let vector = |four: [f32; 4]| Vector3::new(four[0], four[1], four[2]).cast::<f64>();
-        let [x, y, one] = [0, 1, 2].map(|column| vector(self.world_from_ndc[column]));
-        let (direction, eye, up) = (x * image[0] + y * image[1] + one, vector(self.eye), vector(self.up));
-        let (fall, above) = (-direction.dot(&up), eye.dot(&up) - f64::from(self.up[3]));
-        let aside = eye - vector(self.ground_center) + direction * (above / fall);
-        let aside = aside - up * aside.dot(&up);
-        let in_square = aside.iter().all(|side| side.abs() <= f64::from(self.ground_center[3]));
-        self.eye[3] > 0.0 && fall > 0.0 && above > 0.0 && in_square
+    /// Whether the view ray through a point in normalized device coordinates hits the ground. Used for samples without an
+    /// id, if the ground was not rasterized. Twin of `ray_hits_ground` in `shaders/shared/ground_plane.glsl`.
+    pub(crate) fn ray_hits_ground(&self, ndc: [f64; 2]) -> bool {
+        let to_vector3 = |vector4: [f32; 4]| Vector3::new(vector4[0], vector4[1], vector4[2]).cast::<f64>();
+        let [x, y, forward] = [0, 1, 2].map(|column| to_vector3(self.world_from_ndc[column]));
+        let (direction, eye, up) = (x * ndc[0] + y * ndc[1] + forward, to_vector3(self.eye), to_vector3(self.up));
+        let (descent, eye_height) = (-direction.dot(&up), eye.dot(&up) - f64::from(self.up[3]));
+        let offset = eye - to_vector3(self.ground_center) + direction * (eye_height / descent);
+        let offset = offset - up * offset.dot(&up);
+        let is_in_square = offset.iter().all(|side| side.abs() <= f64::from(self.ground_center[3]));
+        self.eye[3] > 0.0 && descent > 0.0 && eye_height > 0.0 && is_in_square
     }
 }
 
-/// The camera's projection matrix for positions relative to `origin`. The depth range covers both the deformed and the
-/// rest state, so that the clip planes do not jump when a branch bends.
+/// Projection matrix of the camera for positions relative to `origin`. The depth range covers both the deformed and the
+/// rest state, so that it changes little when the scene deforms.
 fn clip_from_camera(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
     let bounds = finite_bounds(scene, params);
-    let viewer = params.camera.relative_to(origin);
-    viewer.clip_from_camera(params.width, params.height, &bounds.union(rebased_rest_bounds(scene, bounds, origin)))
+    let rebased_camera = params.camera.relative_to(origin);
+    rebased_camera.clip_from_camera(
+        params.width,
+        params.height,
+        &bounds.union(rebased_rest_bounds(scene, bounds, origin)),
+    )
 }
 
-/// Clip space of a frame from positions relative to `origin`.
+/// Matrix from positions relative to `origin` to the clip space of a frame.
 pub(crate) fn clip_from_positions(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
     clip_from_camera(scene, params, origin) * params.camera.relative_to(origin).camera_from_world()
 }
 
-/// Clip space of the shadow map from positions relative to `origin`. The sun looks along z; z = -1 is nearest to it.
+/// Clip space of the shadow map from positions relative to `origin`; z = -1 is nearest to the sun.
 pub(crate) fn shadow_clip_from_positions(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
-    let map = LightBox::fit(&light_box_params(scene, params, origin)).shadow_from_world;
-    Matrix4::new_translation(&Vector3::repeat(-1.0)) * Matrix4::new_scaling(2.0) * map
+    let shadow_from_world = LightBox::fit(&light_box_params(scene, params, origin)).shadow_from_world;
+    Matrix4::new_translation(&Vector3::repeat(-1.0)) * Matrix4::new_scaling(2.0) * shadow_from_world
 }
 
-/// The bounds of a frame, or the rest bounds when those overflowed: overflowed bounds fit no shadow map and no depth
-/// range.
+/// Bounds of a frame, or the rest bounds if they overflowed: shadow map and depth range need finite bounds.
 fn finite_bounds(scene: &Scene, params: &FrameParams) -> BoundingBox {
-    let finite_bounds = params.bounds.is_finite() && params.bounds.min[0] <= params.bounds.max[0];
-    if finite_bounds { params.bounds } else { scene.rest_bounds }
+    let has_valid_bounds = params.bounds.is_finite() && params.bounds.min[0] <= params.bounds.max[0];
+    if has_valid_bounds { params.bounds } else { scene.rest_bounds }
 }
 
-/// Light-space bounds of a frame; none when they or the world-space bounds overflowed.
+/// Light-space bounds of a frame; none if they or the world-space bounds overflowed.
 fn finite_light_bounds(params: &FrameParams) -> Option<OrientedBounds> {
     params.light.filter(|light| light.is_valid() && params.bounds.is_finite())
 }
 
-/// Inputs of the shadow map fit, relative to `origin` like the positions.
+/// Inputs of the light box, for positions relative to `origin`.
 pub(crate) fn light_box_params(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> LightBoxParams {
     let bounds = finite_bounds(scene, params);
-    let height = rebased_rest_bounds(scene, bounds, origin).min[scene.up.index()];
+    let ground_height = rebased_rest_bounds(scene, bounds, origin).min[scene.up.index()];
     let shadow = scene.look.shadow.unwrap_or_default();
     LightBoxParams {
         to_sun: scene.look.to_sun(scene.up),
         up: scene.up,
         bounds,
         light: finite_light_bounds(params),
-        ground: scene.look.ground.map(|_| height),
+        ground: scene.look.ground.map(|_| ground_height),
         size: f64::from(shadow.size),
-        rim: f64::from(shadow.blur_radius()) + 1.0,
+        margin: f64::from(shadow.blur_radius()) + 1.0,
     }
 }
 
-/// Texel of the shadow map in world space: two vectors perpendicular to the light, along x and y of the map, in scene
-/// units. None when the look has no shadow. Valid for positions relative to the scene's origin.
+/// Sides of a shadow map texel in world space: two vectors along x and y of the map, in scene units. None if the look has
+/// no shadow. Valid for positions relative to the scene's origin.
 pub fn shadow_texel_axes(scene: &Scene, params: &FrameParams) -> Option<[Vector3<f64>; 2]> {
     let shadow = scene.look.shadow?;
-    let map = LightBox::fit(&light_box_params(scene, params, [0.0; 3])).shadow_from_world;
-    let texel = |row: usize| {
-        let across = map.fixed_view::<1, 3>(row, 0).transpose();
-        across / (across.norm_squared() * f64::from(shadow.size))
+    let shadow_from_world = LightBox::fit(&light_box_params(scene, params, [0.0; 3])).shadow_from_world;
+    let texel_axis = |row: usize| {
+        let row_vector = shadow_from_world.fixed_view::<1, 3>(row, 0).transpose();
+        row_vector / (row_vector.norm_squared() * f64::from(shadow.size))
     };
-    Some([texel(0), texel(1)])
+    Some([texel_axis(0), texel_axis(1)])
 }
 
-/// Matrix from world space to the clip space of the shadow map. The sun looks along z; z = -1 is nearest to it. None
-/// when the look has no shadow. Valid for positions relative to the scene's origin.
+/// Matrix from world space to the clip space of the shadow map; z = -1 is nearest to the sun. None if the look has no
+/// shadow. Valid for positions relative to the scene's origin.
 pub fn shadow_clip_from_world(scene: &Scene, params: &FrameParams) -> Option<Matrix4<f64>> {
     scene.look.shadow.map(|_| shadow_clip_from_positions(scene, params, [0.0; 3]))
 }
@@ -171,56 +174,61 @@ pub(crate) fn camera_is_above_ground(scene: &Scene, params: &FrameParams) -> boo
     params.camera.eye()[up] > scene.rest_bounds.min[up]
 }
 
-/// Whether the ground is behind everything else: the camera is above it and no vertex is below it. Samples without an
-/// id that look down then see the ground, and it need not be rasterized.
+/// Whether the ground is behind everything else: the camera is above it and no vertex is below it. Then the ground need
+/// not be rasterized, because the shading adds it to samples without an id.
 pub(crate) fn ground_is_behind_scene(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> bool {
     let (up, bounds) = (scene.up.index(), params.bounds);
-    let height = rebased_rest_bounds(scene, bounds, origin).min[up];
-    let largest = [height, bounds.min[up], bounds.max[up]].map(f64::abs).into_iter().fold(0.0, f64::max);
-    let lowest = bounds.min[up] + GROUND_TOLERANCE_EPSILONS * f64::from(f32::EPSILON) * largest;
-    scene.look.ground.is_some() && camera_is_above_ground(scene, params) && bounds.is_finite() && lowest >= height
+    let ground_height = rebased_rest_bounds(scene, bounds, origin).min[up];
+    let max_coordinate = [ground_height, bounds.min[up], bounds.max[up]].map(f64::abs).into_iter().fold(0.0, f64::max);
+    let min_height = bounds.min[up] + GROUND_TOLERANCE_EPSILONS * f64::from(f32::EPSILON) * max_coordinate;
+    scene.look.ground.is_some()
+        && camera_is_above_ground(scene, params)
+        && bounds.is_finite()
+        && min_height >= ground_height
 }
 
-/// The rest bounds in the coordinates of the positions. When positions have another origin than the scene, because the
-/// scene moved far from its origin, the rest bounds move along to the current center; the ground keeps its height.
+/// Rest bounds relative to `origin`. An origin other than 0 means that the scene moved far away. Then the rest bounds are
+/// moved to the center of the current bounds, but keep their height, which is that of the ground.
 fn rebased_rest_bounds(scene: &Scene, bounds: BoundingBox, origin: [f64; 3]) -> BoundingBox {
-    let rest = scene.rest_bounds;
+    let rest_bounds = scene.rest_bounds;
     if origin == [0.0; 3] {
-        return rest;
+        return rest_bounds;
     }
-    let mut shift = bounds.center() - rest.center();
+    let mut shift = bounds.center() - rest_bounds.center();
     shift[scene.up.index()] = -origin[scene.up.index()];
-    let moved = |corner: [f64; 3]| std::array::from_fn(|axis| corner[axis] + shift[axis]);
-    BoundingBox { min: moved(rest.min), max: moved(rest.max) }
+    let shifted = |corner: [f64; 3]| std::array::from_fn(|axis| corner[axis] + shift[axis]);
+    BoundingBox { min: shifted(rest_bounds.min), max: shifted(rest_bounds.max) }
 }
 
 /// Center of the ground below the scene, and the distance D over which it fades.
-fn ground_disc(up: usize, rebased_rest_bounds: BoundingBox, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
-    let mut center = rebased_rest_bounds.center().coords;
-    center[up] = rebased_rest_bounds.min[up];
-    let mut aside = eye - center;
-    aside[up] = 0.0;
-    (center, 3.5 * rebased_rest_bounds.diagonal().max(aside.norm()).max(1e-6))
+fn ground_disc(up: usize, rest_bounds: BoundingBox, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
+    let mut center = rest_bounds.center().coords;
+    center[up] = rest_bounds.min[up];
+    let mut offset = eye - center;
+    offset[up] = 0.0;
+    (center, 3.5 * rest_bounds.diagonal().max(offset.norm()).max(1e-6))
 }
 
-/// Normalized device coordinates (x, y, 1) to a direction in world space.
-fn world_from_ndc(clip: &Matrix4<f64>, camera: &Matrix4<f64>) -> Matrix4<f64> {
-    let world_from_camera = camera.fixed_view::<3, 3>(0, 0).try_inverse().unwrap_or_else(nalgebra::Matrix3::identity);
-    let mut camera_from_image = nalgebra::Matrix3::zeros();
-    camera_from_image[(0, 0)] = 1.0 / clip[(0, 0)];
-    camera_from_image[(1, 1)] = 1.0 / clip[(1, 1)];
-    camera_from_image[(0, 2)] = clip[(0, 2)] / clip[(0, 0)];
-    camera_from_image[(1, 2)] = clip[(1, 2)] / clip[(1, 1)];
-    camera_from_image[(2, 2)] = -1.0;
-    (world_from_camera * camera_from_image).to_homogeneous()
+/// Matrix from (x, y, 1) in normalized device coordinates to the direction of a view ray in world space.
+fn world_from_ndc(clip_from_camera: &Matrix4<f64>, camera_from_world: &Matrix4<f64>) -> Matrix4<f64> {
+    let world_from_camera =
+        camera_from_world.fixed_view::<3, 3>(0, 0).try_inverse().unwrap_or_else(nalgebra::Matrix3::identity);
+    let mut camera_from_ndc = nalgebra::Matrix3::zeros();
+    camera_from_ndc[(0, 0)] = 1.0 / clip_from_camera[(0, 0)];
+    camera_from_ndc[(1, 1)] = 1.0 / clip_from_camera[(1, 1)];
+    camera_from_ndc[(0, 2)] = clip_from_camera[(0, 2)] / clip_from_camera[(0, 0)];
+    camera_from_ndc[(1, 2)] = clip_from_camera[(1, 2)] / clip_from_camera[(1, 1)];
+    camera_from_ndc[(2, 2)] = -1.0;
+    (world_from_camera * camera_from_ndc).to_homogeneous()
 }
 
-const fn flag(on: bool) -> f64 {
-    if on { 1.0 } else { 0.0 }
+/// Boolean as a shader number.
+const fn flag(condition: bool) -> f64 {
+    if condition { 1.0 } else { 0.0 }
 }
 
-fn vec4_of(vector: Vector3<f64>, fourth: f64) -> [f32; 4] {
-    [vector.x as f32, vector.y as f32, vector.z as f32, fourth as f32]
+fn vec4_of(vector: Vector3<f64>, w: f64) -> [f32; 4] {
+    [vector.x as f32, vector.y as f32, vector.z as f32, w as f32]
 }
 
 #[cfg(test)]
@@ -231,57 +239,61 @@ mod tests {
     use modalcast_model::scene::{Camera, Lens, View};
 
     #[test]
-    fn a_direction_through_a_pixel_meets_the_point_that_projects_there() {
+    fn view_ray_passes_through_the_projected_point() {
         let view = View::LookAt { eye: [1.0, 2.0, 3.0], target: [0.2, 0.1, -0.4], up: [0.0, 1.0, 0.0] };
         let lens = Lens::Intrinsics { fx: 300.0, fy: 250.0, cx: 100.0, cy: 130.0 };
         let camera = Camera { view, lens, near: 0.1, far: 100.0 };
-        let (clip, from_world) = (camera.clip_from_camera(320, 200, &BoundingBox::EMPTY), camera.camera_from_world());
+        let (clip_from_camera, camera_from_world) =
+            (camera.clip_from_camera(320, 200, &BoundingBox::EMPTY), camera.camera_from_world());
         let point = nalgebra::Point3::new(0.3, -0.2, 0.7);
-        let image = (clip * from_world * point.to_homogeneous()).scale(1.0);
-        let image = Vector3::new(image.x / image.w, image.y / image.w, 1.0);
-        let direction = world_from_ndc(&clip, &from_world).fixed_view::<3, 3>(0, 0) * image;
+        let ndc = (clip_from_camera * camera_from_world * point.to_homogeneous()).scale(1.0);
+        let ndc = Vector3::new(ndc.x / ndc.w, ndc.y / ndc.w, 1.0);
+        let direction = world_from_ndc(&clip_from_camera, &camera_from_world).fixed_view::<3, 3>(0, 0) * ndc;
         let expected = (point.coords - camera.eye()).normalize();
-        assert!((direction.normalize() - expected).norm() < 1e-12, "{direction} is not {expected}");
+        assert!((direction.normalize() - expected).norm() < 1e-12, "expected {expected}, got {direction}");
     }
 
     #[test]
-    fn a_scene_that_left_for_good_rests_where_it_is_and_its_ground_stays_at_its_height() {
-        let scene = Scene::new(squares(vec![Material::default()])).expect("good");
-        let rest = scene.rest_bounds;
-        let moved = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] + 5.0, corner[2] - 7.0];
-        let bounds = BoundingBox { min: moved(rest.min), max: moved(rest.max) };
-        assert_eq!(rebased_rest_bounds(&scene, bounds, [0.0; 3]), rest, "a scene at its origin rests where it rested");
+    fn rest_bounds_move_along_but_keep_their_height() {
+        let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
+        let rest_bounds = scene.rest_bounds;
+        let shifted = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] + 5.0, corner[2] - 7.0];
+        let bounds = BoundingBox { min: shifted(rest_bounds.min), max: shifted(rest_bounds.max) };
+        assert_eq!(rebased_rest_bounds(&scene, bounds, [0.0; 3]), rest_bounds, "expected no shift without an origin");
         let rebased_rest_bounds = rebased_rest_bounds(&scene, bounds, [1024.0, 2048.0, 0.0]);
-        let want = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] - 2048.0, corner[2] - 7.0];
-        assert_eq!(rebased_rest_bounds, BoundingBox { min: want(rest.min), max: want(rest.max) });
+        let expected = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] - 2048.0, corner[2] - 7.0];
+        assert_eq!(rebased_rest_bounds, BoundingBox { min: expected(rest_bounds.min), max: expected(rest_bounds.max) });
     }
 
     #[test]
-    fn the_ground_is_last_where_nothing_lies_below_it_by_more_than_rounding_and_the_camera_is_above() {
-        let scene = Scene::new(squares(vec![Material::default()])).expect("good");
-        let (rest, up) = (scene.rest_bounds, scene.up.index());
-        let largest = rest.min[up].abs().max(rest.max[up].abs());
-        let is_last = |lowered: f64, raised: f64, origin: f64| {
+    fn ground_is_behind_scene_if_no_vertex_is_below_it() {
+        let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
+        let (rest_bounds, up) = (scene.rest_bounds, scene.up.index());
+        let max_coordinate = rest_bounds.min[up].abs().max(rest_bounds.max[up].abs());
+        let is_behind = |lowering: f64, camera_height: f64, origin: f64| {
             let camera = Camera::fit_to_scene(&scene, 64, 64);
-            let mut params = FrameParams { camera, width: 64, height: 64, bounds: rest, light: None };
-            params.bounds.min[up] -= lowered + origin;
+            let mut params = FrameParams { camera, width: 64, height: 64, bounds: rest_bounds, light: None };
+            params.bounds.min[up] -= lowering + origin;
             params.bounds.max[up] -= origin;
             let mut eye = [0.3, 0.4, 0.5];
-            eye[up] = rest.min[up] + raised;
+            eye[up] = rest_bounds.min[up] + camera_height;
             params.camera.view = View::LookAt { eye, target: [0.1; 3], up: [0.6, 0.8, 0.0] };
-            let mut from = [0.0; 3];
-            from[up] = origin;
-            ground_is_behind_scene(&scene, &params, from)
+            let mut position_origin = [0.0; 3];
+            position_origin[up] = origin;
+            ground_is_behind_scene(&scene, &params, position_origin)
         };
-        assert!(is_last(0.0, 1.0, 0.0) && is_last(-0.1, 1.0, 0.0) && is_last(0.0, 1.0, 4096.0));
-        assert!(is_last(2e-7 * largest, 1.0, 0.0), "rounding");
-        assert!(!is_last(1e-6 * largest, 1.0, 0.0) && !is_last(1e-2, 1.0, 4096.0), "below");
-        assert!(!is_last(0.0, 0.0, 0.0) && !is_last(0.0, -1.0, 0.0), "the camera is not above");
+        assert!(is_behind(0.0, 1.0, 0.0) && is_behind(-0.1, 1.0, 0.0) && is_behind(0.0, 1.0, 4096.0));
+        assert!(is_behind(2e-7 * max_coordinate, 1.0, 0.0), "expected a tolerance for rounding");
+        assert!(
+            !is_behind(1e-6 * max_coordinate, 1.0, 0.0) && !is_behind(1e-2, 1.0, 4096.0),
+            "a vertex is below the ground"
+        );
+        assert!(!is_behind(0.0, 0.0, 0.0) && !is_behind(0.0, -1.0, 0.0), "the camera is not above");
     }
 
     #[test]
-    fn bounds_that_overflowed_are_replaced_and_a_camera_that_overflows_is_refused() {
-        let scene = Scene::new(squares(vec![Material::default()])).expect("good");
+    fn overflowed_bounds_are_replaced_and_overflowed_cameras_rejected() {
+        let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
         let mut params = FrameParams {
             camera: Camera::fit_to_scene(&scene, 64, 64),
             width: 64,
@@ -289,22 +301,31 @@ mod tests {
             bounds: scene.rest_bounds,
             light: None,
         };
-        let good = FrameUniforms::new(&scene, &params, [0.0; 3]).expect("good");
-        let [x, y, z, may_hide] = good.to_sun;
-        assert!(may_hide == 0.0 && good.eye[3] > 0.0, "nothing is below the ground");
+        let uniforms = FrameUniforms::new(&scene, &params, [0.0; 3]).expect("finite uniforms");
+        let [x, y, z, must_rasterize_ground] = uniforms.to_sun;
+        assert!(must_rasterize_ground == 0.0 && uniforms.eye[3] > 0.0, "expected the ground behind the scene");
         for bounds in [BoundingBox::EMPTY, BoundingBox { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
-            let replaced = FrameUniforms::new(&scene, &FrameParams { bounds, ..params }, [0.0; 3]).expect("replaced");
-            assert_eq!(replaced, FrameUniforms { to_sun: [x, y, z, 1.0], ..good }, "what overflowed may be below it");
+            let replaced_uniforms =
+                FrameUniforms::new(&scene, &FrameParams { bounds, ..params }, [0.0; 3]).expect("finite uniforms");
+            assert_eq!(
+                replaced_uniforms,
+                FrameUniforms { to_sun: [x, y, z, 1.0], ..uniforms },
+                "expected rasterized ground, because vertices may be below it"
+            );
         }
-        let measured = OrientedBounds(BoundingBox { min: [-0.25; 3], max: [0.25; 3] });
-        let with =
-            |light| FrameUniforms::new(&scene, &FrameParams { light: Some(light), ..params }, [0.0; 3]).expect("good");
-        assert_ne!(with(measured), good, "control: what was measured decides");
-        for lost in [OrientedBounds::EMPTY, measured.expanded_by(f64::NAN), measured.expanded_by(f64::INFINITY)] {
-            assert_eq!(with(lost), good, "{lost:?}");
+        let light_bounds = OrientedBounds(BoundingBox { min: [-0.25; 3], max: [0.25; 3] });
+        let uniforms_with = |light| {
+            FrameUniforms::new(&scene, &FrameParams { light: Some(light), ..params }, [0.0; 3])
+                .expect("finite uniforms")
+        };
+        assert_ne!(uniforms_with(light_bounds), uniforms, "expected an effect of valid light bounds");
+        for invalid_bounds in
+            [OrientedBounds::EMPTY, light_bounds.expanded_by(f64::NAN), light_bounds.expanded_by(f64::INFINITY)]
+        {
+            assert_eq!(uniforms_with(invalid_bounds), uniforms, "{invalid_bounds:?}");
         }
         params.camera.view = View::LookAt { eye: [1e300, 0.0, 0.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
-        let refusal = FrameUniforms::new(&scene, &params, [0.0; 3]).expect_err("overflows").to_string();
-        assert!(refusal.starts_with("camera:"), "{refusal}");
+        let error = FrameUniforms::new(&scene, &params, [0.0; 3]).expect_err("an overflow").to_string();
+        assert!(error.starts_with("camera:"), "{error}");
     }
 }

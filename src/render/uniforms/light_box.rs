@@ -2,25 +2,24 @@
 //! 3.3.1).
 //!
 //! The z axis of light space is v_l, the direction to the sun; its y axis points up in the world. The box is
-//! axis-aligned in light space and symmetric about its center in x and y. It encloses the vertices as the deformer
-//! measured them; a frame without that measurement uses the corners of the world-space bounds, as in the thesis. The
-//! four side facets run along the light and are lengthened until they meet the ground, so that the whole shadow on the
-//! ground lies inside. All sides are quantized to steps that are fixed in the world, so that shadow edges do not crawl
-//! while the scene sways.
+//! axis-aligned in light space and symmetric about its center in x and y. It encloses the light-space bounds of the
+//! vertices, or, in frames without these bounds, the corners of the world-space bounds, as in the thesis. The far plane is
+//! moved until the box contains the whole shadow on the ground. All sides are quantized to steps that are fixed in the
+//! world, so that shadow edges do not crawl while the scene sways.
 
 use nalgebra::{Matrix4, Vector3};
 
 use modalcast_model::scene::{BoundingBox, OrientedBounds, UpAxis, light_axes};
 
-/// Maximum distance by which the ground may push the far plane below the box, in diagonals of the bounds. A grazing sun
-/// would push it to infinity. Receivers beyond the far plane are still shaded correctly.
-const MAX_GROUND_PULL: f64 = 8.0;
+/// Maximum distance between the near plane and the ground's part of the far plane, in diagonals of the bounds. A grazing
+/// sun would move the far plane to infinity. Receivers beyond the far plane are still shaded correctly.
+const MAX_GROUND_DEPTH: f64 = 8.0;
 
 /// The fitted shadow map.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LightBox {
-    /// World space to the map: x and y are 0 to 1 across the map, z is 0 at the plane nearest to the sun and 1 at the
-    /// farthest.
+    /// World space to the map: x and y are 0 to 1 across the map; z is 0 at the plane nearest to the sun and 1 at the
+    /// farthest plane.
     pub(crate) shadow_from_world: Matrix4<f64>,
     /// Depth of the ground at (x, y) of the map: a x + b y + c; (0, 0, 1) without a ground.
     pub(crate) ground: [f64; 3],
@@ -30,7 +29,7 @@ pub(crate) struct LightBox {
     pub(crate) sides: [TexelSpan; 2],
 }
 
-/// Inputs of the fit.
+/// Inputs of [`LightBox::fit`].
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct LightBoxParams {
     pub(crate) to_sun: Vector3<f64>,
@@ -40,94 +39,105 @@ pub(crate) struct LightBoxParams {
     pub(crate) light: Option<OrientedBounds>,
     /// Height of the ground along the up axis.
     pub(crate) ground: Option<f64>,
-    /// Side of the map and the empty rim that the blur needs, both in texels.
+    /// Side of the map in texels.
     pub(crate) size: f64,
-    pub(crate) rim: f64,
+    /// Empty margin of the map that the blur needs, in texels.
+    pub(crate) margin: f64,
 }
 
-/// One side of a map on a texel grid that is fixed in the world: its lower end and half its length. When the fitted
-/// bounds grow or move, the length changes in few discrete steps and the side moves by whole texels, so that shadows do
-/// not crawl.
+/// Extent of a map along one axis, on a texel grid that is fixed in the world. When the bounds grow or move, the length
+/// changes in few discrete steps, and the span moves by whole texels. So shadows do not crawl.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TexelSpan {
+    /// Lower end.
     pub(crate) low: f64,
-    pub(crate) half: f64,
+    pub(crate) half_length: f64,
 }
 
 impl TexelSpan {
-    /// Covers `reach` to each side of the center, inside the rim.
-    pub(crate) fn snap(center: f64, reach: f64, fit: &LightBoxParams) -> Self {
-        let half = next_length_step(reach) * fit.size / (fit.size - 2.0 * fit.rim).max(1.0);
-        let texel = 2.0 * half / fit.size;
-        Self { low: (center / texel).round() * texel - half, half }
+    /// The smallest quantized span whose part inside the margin covers `half_extent` to each side of `center`.
+    pub(crate) fn snap(center: f64, half_extent: f64, params: &LightBoxParams) -> Self {
+        let half_length = next_length_step(half_extent) * params.size / (params.size - 2.0 * params.margin).max(1.0);
+        let texel_side = 2.0 * half_length / params.size;
+        Self { low: (center / texel_side).round() * texel_side - half_length, half_length }
     }
 }
 
-/// The next larger quantized length, in sixteenths of the next lower power of two.
+/// Next larger quantized length. The step is a sixteenth of the largest power of two that is at most `length`.
 fn next_length_step(length: f64) -> f64 {
     let step = length.log2().floor().exp2() / 16.0;
     ((length / step).floor() + 1.0) * step
 }
 
 impl LightBox {
-    pub(crate) fn fit(fit: &LightBoxParams) -> Self {
-        let axes = light_axes(fit.to_sun, fit.up);
-        let OrientedBounds(held) = fit.light.unwrap_or_else(|| OrientedBounds::enclosing(&axes, &fit.bounds));
-        let diagonal = diagonal(fit);
+    /// Fits the box to the bounds of the vertices and their shadow on the ground.
+    pub(crate) fn fit(params: &LightBoxParams) -> Self {
+        let axes = light_axes(params.to_sun, params.up);
+        let OrientedBounds(light_bounds) =
+            params.light.unwrap_or_else(|| OrientedBounds::enclosing(&axes, &params.bounds));
+        let diagonal = diagonal(params);
         let sides = [0, 1].map(|axis: usize| {
-            let (center, reach) = (0.5 * (held.min[axis] + held.max[axis]), 0.5 * (held.max[axis] - held.min[axis]));
-            TexelSpan::snap(center, reach.max(diagonal / 64.0), fit)
+            let (center, half_extent) = (
+                0.5 * (light_bounds.min[axis] + light_bounds.max[axis]),
+                0.5 * (light_bounds.max[axis] - light_bounds.min[axis]),
+            );
+            TexelSpan::snap(center, half_extent.max(diagonal / 64.0), params)
         });
-        let plane = fit.ground.and_then(|height| ground_plane(&axes, fit.up, height));
-        let (near, far) = depth_range(fit, [held.min[2], held.max[2]], &sides, plane);
-        let range = near - far;
+        let ground_plane = params.ground.and_then(|height| ground_plane(&axes, params.up, height));
+        let (near, far) = depth_range(params, [light_bounds.min[2], light_bounds.max[2]], &sides, ground_plane);
+        let depth_extent = near - far;
         let mut shadow_from_world = Matrix4::identity();
         for (axis, side) in sides.iter().enumerate() {
-            let scale = 1.0 / (2.0 * side.half);
+            let scale = 1.0 / (2.0 * side.half_length);
             shadow_from_world.fixed_view_mut::<1, 3>(axis, 0).copy_from(&(axes[axis] * scale).transpose());
             shadow_from_world[(axis, 3)] = -side.low * scale;
         }
-        shadow_from_world.fixed_view_mut::<1, 3>(2, 0).copy_from(&(-axes[2] / range).transpose());
-        shadow_from_world[(2, 3)] = near / range;
-        let ground = plane.map_or([0.0, 0.0, 1.0], |[a, b, c]| {
-            let depth = |x: f64, y: f64| (near - (a * x + b * y + c)) / range;
+        shadow_from_world.fixed_view_mut::<1, 3>(2, 0).copy_from(&(-axes[2] / depth_extent).transpose());
+        shadow_from_world[(2, 3)] = near / depth_extent;
+        let ground = ground_plane.map_or([0.0, 0.0, 1.0], |[a, b, c]| {
+            let depth = |x: f64, y: f64| (near - (a * x + b * y + c)) / depth_extent;
             let [x, y] = sides;
             let origin = depth(x.low, y.low);
-            [depth(x.low + 2.0 * x.half, y.low) - origin, depth(x.low, y.low + 2.0 * y.half) - origin, origin]
+            [
+                depth(x.low + 2.0 * x.half_length, y.low) - origin,
+                depth(x.low, y.low + 2.0 * y.half_length) - origin,
+                origin,
+            ]
         });
         Self { shadow_from_world, ground, axes, sides }
     }
 
-    /// The longer side of a texel, in scene units.
+    /// Longer side of a texel, in scene units.
     pub(crate) fn texel(&self, size: f64) -> f64 {
-        2.0 * self.sides[0].half.max(self.sides[1].half) / size
+        2.0 * self.sides[0].half_length.max(self.sides[1].half_length) / size
     }
 }
 
-/// Reference length of the box. Bounds without extent get one that f32 can still resolve at their position.
-fn diagonal(fit: &LightBoxParams) -> f64 {
-    fit.bounds.diagonal().max(1e-6).max(1e-6 * fit.bounds.center().coords.amax())
+/// Diagonal of the bounds, at least a length that f32 can resolve at their position.
+fn diagonal(params: &LightBoxParams) -> f64 {
+    params.bounds.diagonal().max(1e-6).max(1e-6 * params.bounds.center().coords.amax())
 }
 
-/// z of light space at the planes nearest to the sun and farthest from it, quantized like the sides.
+/// z of the near and the far plane in light space, quantized like the sides. The near plane is nearest to the sun.
 fn depth_range(
-    fit: &LightBoxParams,
+    params: &LightBoxParams,
     [mut far, nearest]: [f64; 2],
     sides: &[TexelSpan; 2],
-    plane: Option<[f64; 3]>,
+    ground_plane: Option<[f64; 3]>,
 ) -> (f64, f64) {
-    let diagonal = diagonal(fit);
+    let diagonal = diagonal(params);
     let near = nearest + 0.01 * diagonal;
     for corner in 0..4 {
-        let at = |axis: usize| sides[axis].low + if corner >> axis & 1 == 0 { 0.0 } else { 2.0 * sides[axis].half };
-        let meets = plane.map_or(far, |[a, b, c]| a * at(0) + b * at(1) + c);
-        far = far.min(meets.max(near - MAX_GROUND_PULL * diagonal));
+        let coordinate =
+            |axis: usize| sides[axis].low + if corner >> axis & 1 == 0 { 0.0 } else { 2.0 * sides[axis].half_length };
+        let ground_z = ground_plane.map_or(far, |[a, b, c]| a * coordinate(0) + b * coordinate(1) + c);
+        far = far.min(ground_z.max(near - MAX_GROUND_DEPTH * diagonal));
     }
     let step = diagonal.log2().floor().exp2() / 64.0;
     ((near / step).ceil() * step, ((far - 0.01 * diagonal) / step).floor() * step)
 }
 
-/// The z of the ground in light space at (x, y): a x + b y + c; none when the sun is almost on the horizon.
+/// Coefficients of the ground's z in light space, a x + b y + c; none if the sun is almost on the horizon.
 fn ground_plane(axes: &[Vector3<f64>; 3], up: UpAxis, height: f64) -> Option<[f64; 3]> {
     let [x, y, z] = axes.map(|axis| axis[up.index()]);
     (z.abs() > 0.02).then(|| [-x / z, -y / z, height / z])
@@ -139,7 +149,7 @@ mod tests {
 
     use super::*;
 
-    fn fit(to_sun: Vector3<f64>, ground: Option<f64>) -> LightBoxParams {
+    fn test_params(to_sun: Vector3<f64>, ground: Option<f64>) -> LightBoxParams {
         let bounds = BoundingBox { min: [-1.0, 0.0, -2.0], max: [1.0, 3.0, 2.0] };
         LightBoxParams {
             to_sun: to_sun.normalize(),
@@ -148,131 +158,155 @@ mod tests {
             light: None,
             ground,
             size: 1024.0,
-            rim: 6.0,
+            margin: 6.0,
         }
     }
 
     #[test]
-    fn the_box_holds_the_bounds_and_their_shadow_and_depth_grows_away_from_the_sun() {
+    fn box_contains_the_bounds_and_their_shadow() {
         for sun in [Vector3::new(0.4, 0.8, 0.5), Vector3::y(), Vector3::new(1.0, 0.3, 0.0)] {
-            let fit = fit(sun, Some(-0.5));
-            let light = LightBox::fit(&fit);
-            for corner in fit.bounds.corners() {
-                let inside = light.shadow_from_world.transform_point(&corner);
-                let shadow = corner - fit.to_sun * ((corner.y + 0.5) / fit.to_sun.y);
-                let shadow = light.shadow_from_world.transform_point(&shadow);
-                for point in [inside, shadow] {
+            let params = test_params(sun, Some(-0.5));
+            let light_box = LightBox::fit(&params);
+            for corner in params.bounds.corners() {
+                let map_position = light_box.shadow_from_world.transform_point(&corner);
+                let shadow_position = corner - params.to_sun * ((corner.y + 0.5) / params.to_sun.y);
+                let shadow_position = light_box.shadow_from_world.transform_point(&shadow_position);
+                for point in [map_position, shadow_position] {
                     assert!(point.iter().all(|number| (0.0..=1.0).contains(number)), "{sun} {point}");
                 }
-                assert!(shadow.z > inside.z && (shadow.xy() - inside.xy()).norm() < 1e-9);
-                let [a, b, c] = light.ground;
-                assert!((a * shadow.x + b * shadow.y + c - shadow.z).abs() < 1e-9, "the ground's own depth");
+                assert!(shadow_position.z > map_position.z && (shadow_position.xy() - map_position.xy()).norm() < 1e-9);
+                let [a, b, c] = light_box.ground;
+                assert!(
+                    (a * shadow_position.x + b * shadow_position.y + c - shadow_position.z).abs() < 1e-9,
+                    "expected the depth of the ground"
+                );
             }
         }
     }
 
-    /// Points of an ellipsoid inside the bounds of [`fit`]; each axis is scaled.
-    fn ball(scale: [f64; 3]) -> Vec<Point3<f64>> {
-        let point = |at: u32| {
-            let (turn, height) = (2.4 * f64::from(at), f64::from(at) / 250.0 - 1.0);
-            let round = (1.0 - height * height).max(0.0).sqrt();
-            Point3::new(scale[0] * round * turn.cos(), 1.5 + scale[1] * height, scale[2] * round * turn.sin())
+    /// Points of an ellipsoid inside the bounds of [`test_params`]; each axis is scaled.
+    fn ellipsoid_points(scale: [f64; 3]) -> Vec<Point3<f64>> {
+        let point = |index: u32| {
+            let (angle, height) = (2.4 * f64::from(index), f64::from(index) / 250.0 - 1.0);
+            let radius = (1.0 - height * height).max(0.0).sqrt();
+            Point3::new(scale[0] * radius * angle.cos(), 1.5 + scale[1] * height, scale[2] * radius * angle.sin())
         };
         (0..=500).map(point).collect()
     }
 
-    fn held(fit: &LightBoxParams, points: &[Point3<f64>]) -> Option<OrientedBounds> {
-        let axes = light_axes(fit.to_sun, fit.up);
-        let one = |point: &Point3<f64>| {
+    fn measure_light_bounds(params: &LightBoxParams, points: &[Point3<f64>]) -> Option<OrientedBounds> {
+        let axes = light_axes(params.to_sun, params.up);
+        let bounds_of = |point: &Point3<f64>| {
             OrientedBounds::enclosing(&axes, &BoundingBox { min: (*point).into(), max: (*point).into() })
         };
-        Some(points.iter().map(one).fold(OrientedBounds::EMPTY, OrientedBounds::union))
+        Some(points.iter().map(bounds_of).fold(OrientedBounds::EMPTY, OrientedBounds::union))
     }
 
     #[test]
-    fn a_box_around_what_was_measured_holds_it_and_its_shadow_and_is_smaller_than_one_around_the_corners() {
+    fn light_bounds_give_a_smaller_box_that_contains_the_shadow() {
         for sun in [Vector3::new(0.4, 0.8, 0.5), Vector3::new(1.0, 0.3, 0.0), Vector3::new(-0.5, 0.6, 0.7)] {
-            let (corners, points) = (fit(sun, Some(-0.5)), ball([0.9, 1.4, 1.9]));
-            let fit = LightBoxParams { light: held(&corners, &points), ..corners };
-            let (light, by_corners) = (LightBox::fit(&fit), LightBox::fit(&corners));
+            let (corner_params, points) = (test_params(sun, Some(-0.5)), ellipsoid_points([0.9, 1.4, 1.9]));
+            let params = LightBoxParams { light: measure_light_bounds(&corner_params, &points), ..corner_params };
+            let (light_box, corner_box) = (LightBox::fit(&params), LightBox::fit(&corner_params));
             for point in points {
-                let shadow = point - fit.to_sun * ((point.y + 0.5) / fit.to_sun.y);
+                let shadow = point - params.to_sun * ((point.y + 0.5) / params.to_sun.y);
                 for point in [point, shadow] {
-                    let at = light.shadow_from_world.transform_point(&point);
-                    let rim = fit.rim / fit.size;
-                    assert!(at.xy().iter().all(|number| (rim..=1.0 - rim).contains(number)), "{sun} {at}");
-                    assert!((0.0..=1.0).contains(&at.z), "{sun} {at}");
+                    let map_position = light_box.shadow_from_world.transform_point(&point);
+                    let margin = params.margin / params.size;
+                    assert!(
+                        map_position.xy().iter().all(|number| (margin..=1.0 - margin).contains(number)),
+                        "{sun} {map_position}"
+                    );
+                    assert!((0.0..=1.0).contains(&map_position.z), "{sun} {map_position}");
                 }
             }
-            let area = |light: &LightBox| light.sides[0].half * light.sides[1].half;
-            assert!(area(&light) < 0.9 * area(&by_corners), "{sun}");
+            let area = |light_box: &LightBox| light_box.sides[0].half_length * light_box.sides[1].half_length;
+            assert!(area(&light_box) < 0.9 * area(&corner_box), "{sun}");
         }
     }
 
     #[test]
-    fn a_ground_far_below_and_a_sun_on_the_horizon_stay_finite() {
+    fn distant_ground_and_horizontal_sun_give_a_finite_box() {
         for (sun, ground) in [
             (Vector3::x(), Some(-0.5)),
             (Vector3::new(1.0, 0.021, 0.0), Some(-1e9)),
             (-Vector3::y(), Some(0.0)),
             (Vector3::y(), None),
         ] {
-            let light = LightBox::fit(&fit(sun, ground));
-            assert!(light.shadow_from_world.iter().chain(&light.ground).all(|number| number.is_finite()), "{sun}");
+            let light_box = LightBox::fit(&test_params(sun, ground));
+            assert!(
+                light_box.shadow_from_world.iter().chain(&light_box.ground).all(|number| number.is_finite()),
+                "{sun}"
+            );
         }
         let point = BoundingBox { min: [5.0; 3], max: [5.0; 3] };
-        let light = LightBox::fit(&LightBoxParams { bounds: point, ..fit(Vector3::y(), Some(5.0)) });
-        let center = light.shadow_from_world.transform_point(&Point3::new(5.0, 5.0, 5.0));
+        let light_box = LightBox::fit(&LightBoxParams { bounds: point, ..test_params(Vector3::y(), Some(5.0)) });
+        let center = light_box.shadow_from_world.transform_point(&Point3::new(5.0, 5.0, 5.0));
         assert!(center.iter().all(|number| (0.0..=1.0).contains(number)), "{center}");
     }
 
     /// Tracks a fixed point in the texel grid of the map while the bounds sway and grow slowly. Returns its largest
     /// movement between steps, in fractions of a texel, and the number of steps at which the map changed its quantized
     /// size, which are excluded from the movement.
-    fn crawl(is_lit: bool, place: impl Fn(&LightBoxParams) -> [f64; 2]) -> (f64, usize) {
-        let mut fit = fit(Vector3::new(0.4, 0.8, 0.5), Some(0.0));
-        let (mut last, mut most, mut jumps): (Option<([f64; 2], f64)>, f64, usize) = (None, 0.0, 0);
+    fn measure_crawl(uses_light_bounds: bool, map_position: impl Fn(&LightBoxParams) -> [f64; 2]) -> (f64, usize) {
+        let mut params = test_params(Vector3::new(0.4, 0.8, 0.5), Some(0.0));
+        let (mut previous, mut max_movement, mut size_changes): (Option<([f64; 2], f64)>, f64, usize) = (None, 0.0, 0);
         for step in 0..400 {
             let sway = f64::from(step) * 0.3;
-            fit.bounds.max = [1.0 + 0.05 * sway.sin(), 3.0 + 0.02 * (0.7 * sway).cos(), 2.0 + 1e-4 * f64::from(step)];
-            let [x, y, z] = fit.bounds.max;
+            params.bounds.max =
+                [1.0 + 0.05 * sway.sin(), 3.0 + 0.02 * (0.7 * sway).cos(), 2.0 + 1e-4 * f64::from(step)];
+            let [x, y, z] = params.bounds.max;
             // A size that does not oscillate around a quantization step.
-            fit.light = held(&fit, &ball([x, 0.5 * y, z].map(|scale| 0.95 * scale))).filter(|_| is_lit);
-            let at = place(&fit).map(|number| number * fit.size);
-            let width = LightBox::fit(&fit).sides[0].half + LightBox::fit(&fit).sides[1].half;
-            if let Some((before, was)) = last {
-                let moved = |axis: usize| (at[axis] - before[axis] - (at[axis] - before[axis]).round()).abs();
-                if was == width { most = most.max(moved(0)).max(moved(1)) } else { jumps += 1 }
+            params.light = measure_light_bounds(&params, &ellipsoid_points([x, 0.5 * y, z].map(|scale| 0.95 * scale)))
+                .filter(|_| uses_light_bounds);
+            let texel_position = map_position(&params).map(|number| number * params.size);
+            let width = LightBox::fit(&params).sides[0].half_length + LightBox::fit(&params).sides[1].half_length;
+            if let Some((previous_position, previous_width)) = previous {
+                let movement = |axis: usize| {
+                    (texel_position[axis]
+                        - previous_position[axis]
+                        - (texel_position[axis] - previous_position[axis]).round())
+                    .abs()
+                };
+                if previous_width == width {
+                    max_movement = max_movement.max(movement(0)).max(movement(1))
+                } else {
+                    size_changes += 1
+                }
             }
-            last = Some((at, width));
+            previous = Some((texel_position, width));
         }
-        (most, jumps)
+        (max_movement, size_changes)
     }
 
     #[test]
-    fn texels_stay_where_they_are_in_the_world_while_the_scene_sways_and_grows() {
+    fn texel_grid_is_fixed_in_the_world_while_the_scene_sways() {
         let point = Point3::new(0.3, 1.1, -0.7);
-        for is_lit in [false, true] {
-            let (most, jumps) = crawl(is_lit, |fit| {
-                let at = LightBox::fit(fit).shadow_from_world.cast::<f32>().cast::<f64>().transform_point(&point);
-                [at.x, at.y]
+        for uses_light_bounds in [false, true] {
+            let (max_movement, size_changes) = measure_crawl(uses_light_bounds, |params| {
+                let map_position =
+                    LightBox::fit(params).shadow_from_world.cast::<f32>().cast::<f64>().transform_point(&point);
+                [map_position.x, map_position.y]
             });
-            assert!(most < 1e-3 && jumps <= 8, "{most} texels, {jumps} rungs, measured {is_lit}");
+            assert!(
+                max_movement < 1e-3 && size_changes <= 8,
+                "{max_movement} texels, {size_changes} size changes, light bounds: {uses_light_bounds}"
+            );
         }
-        let (most, _) = crawl(false, |fit| {
-            let axes = light_axes(fit.to_sun, fit.up);
+        let (max_movement, _) = measure_crawl(false, |params| {
+            let axes = light_axes(params.to_sun, params.up);
             [0, 1].map(|axis| {
-                let ends = fit.bounds.corners().map(|corner| axes[axis].dot(&corner.coords));
-                let low = ends.into_iter().fold(f64::INFINITY, f64::min);
-                let high = ends.into_iter().fold(f64::NEG_INFINITY, f64::max);
+                let projections = params.bounds.corners().map(|corner| axes[axis].dot(&corner.coords));
+                let low = projections.into_iter().fold(f64::INFINITY, f64::min);
+                let high = projections.into_iter().fold(f64::NEG_INFINITY, f64::max);
                 (axes[axis].dot(&point.coords) - low) / (high - low)
             })
         });
-        assert!(most > 0.3, "control: a box fitted tightly moves its texels by {most}");
+        assert!(max_movement > 0.3, "expected an unquantized box to move its texels, got {max_movement}");
     }
 
     #[test]
-    fn a_box_holds_what_it_is_fitted_to_whatever_its_length_and_wastes_a_sixteenth() {
+    fn quantized_length_exceeds_the_length_by_at_most_a_sixteenth() {
         for step in -200..200 {
             let length = 1.37_f64.powi(step);
             assert!(
