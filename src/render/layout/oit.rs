@@ -35,7 +35,7 @@ pub(crate) struct OitCounters {
     /// Maximum number of stored fragments per pixel; `u32::MAX` without a limit.
     pub(crate) per_pixel_limit: u32,
     /// Number of allocated records.
-    pub(crate) used: u32,
+    pub(crate) allocated: u32,
     /// Maximum number of records.
     pub(crate) budget: u32,
     /// Indirect draws: index count, instances, first index, base vertex, base instance.
@@ -56,7 +56,7 @@ pub(crate) fn parse_counters(bytes: &[u8]) -> OitStats {
     let per_pixel_limit = (counters.per_pixel_limit != u32::MAX).then_some(counters.per_pixel_limit);
     OitStats {
         fragments: high_word << 32 | low_word,
-        stored: counters.used.into(),
+        stored: counters.allocated.into(),
         max_per_pixel: counters.max_per_pixel,
         per_pixel_limit,
     }

@@ -28,7 +28,8 @@ fn reset_counters(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
         *command = [3 * group.triangles as u32, 0, 3 * group.first_triangle as u32, 0, 0];
     }
     let budget = (target.records.bytes / RECORD_BYTES) as u32;
-    let header = OitCounters { total: [0; 2], max_per_pixel: 0, per_pixel_limit: u32::MAX, used: 0, budget, commands };
+    let header =
+        OitCounters { total: [0; 2], max_per_pixel: 0, per_pixel_limit: u32::MAX, allocated: 0, budget, commands };
     let mut bytes = vec![0; COUNTERS_BYTES];
     bytes[..COUNTERS_HEADER_BYTES].copy_from_slice(bytemuck::bytes_of(&header));
     target.counters.write(&bytes);
