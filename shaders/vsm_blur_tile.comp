@@ -13,7 +13,8 @@ void main() {
         int cell_count = min(BAND_ROWS, OUTPUT_ROWS + 2 * RADIUS - first_row) * (OUTPUT_COLUMNS + 2 * RADIUS);
         for (int cell = lane; cell < cell_count; cell += WORKGROUP_SIZE) {
             ivec2 cell_position = ivec2(cell % (OUTPUT_COLUMNS + 2 * RADIUS), cell / (OUTPUT_COLUMNS + 2 * RADIUS));
-            depths[at.y * DEPTH_PITCH + at.x] = centered_depth(corner + at + ivec2(-RADIUS, first_row - RADIUS), side);
+            ivec2 texel = corner + cell_position + ivec2(-RADIUS, first_row - RADIUS);
+            depths[cell_position.y * DEPTH_PITCH + cell_position.x] = centered_depth(texel, side);
         }
         memoryBarrierShared();
         barrier();
