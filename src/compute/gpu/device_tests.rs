@@ -1,4 +1,4 @@
-//! Tests of the guards and of a lost device on a real device.
+//! Tests on a real device: guards after panics, and a lost device.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -19,18 +19,19 @@ fn gpu_other_scenes_run_after_a_panic_during_capture() {
     let device = Device::open(0).expect("a CUDA device");
     let (scene, state) = scene_and_state(&[(300, 5, 10)]);
     let mut deformer = CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).expect("a deformer");
-    let before = deformer.deform(&state).expect("deforms").bounds;
-    let memory = DeviceBuffer::zeroed(&device, 64).expect("memory");
+    let before = deformer.deform(&state).expect("a step").bounds;
+    let memory = DeviceBuffer::zeroed(&device, 64).expect("device memory");
     let submit = || {
         // SAFETY: the buffer has 64 bytes, and the copy is captured in a graph that never runs.
-        unsafe { result::memset_d8_async(memory.address(), 1, 64, device.stream().cu_stream()) }.expect("is captured");
+        unsafe { result::memset_d8_async(memory.address(), 1, 64, device.stream().cu_stream()) }
+            .expect("captured work");
         panic!("injected");
     };
     assert!(catch_unwind(AssertUnwindSafe(|| capture(&device, submit))).is_err());
-    assert_eq!(deformer.deform(&state).expect("the stream left the capture").bounds, before);
+    assert_eq!(deformer.deform(&state).expect("a step after the capture").bounds, before);
     let mut bytes = [9_u8; 64];
-    memory.read(&device, 0, &mut bytes).expect("reads");
-    assert_eq!(bytes, [0; 64], "captured work does not run");
+    memory.read(&device, 0, &mut bytes).expect("a readback");
+    assert_eq!(bytes, [0; 64], "expected captured work not to run");
 }
 
 #[test]
@@ -40,20 +41,20 @@ fn gpu_panics_restore_the_current_context() {
     // A new thread has no current context.
     std::thread::scope(|scope| {
         let check = || {
-            assert_eq!(result::ctx::get_current().expect("answers"), None);
+            assert_eq!(result::ctx::get_current().expect("the current context"), None);
             let panicking = || {
-                let _current = device.enter().expect("enters");
-                assert_eq!(result::ctx::get_current().expect("answers"), Some(device.context().cu_ctx()));
+                let _current = device.enter().expect("a current context");
+                assert_eq!(result::ctx::get_current().expect("the current context"), Some(device.context().cu_ctx()));
                 panic!("injected");
             };
             assert!(catch_unwind(AssertUnwindSafe(panicking)).is_err());
-            assert_eq!(result::ctx::get_current().expect("answers"), None);
+            assert_eq!(result::ctx::get_current().expect("the current context"), None);
         };
-        scope.spawn(check).join().expect("no failure");
+        scope.spawn(check).join().expect("a thread without a failure");
     });
 }
 
-/// The device is lost for the whole process, so a child process loses it.
+/// A device is lost for the whole process, so this test loses it in a child process.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_lost_device_is_an_error_of_every_call_and_no_panic() {
@@ -62,8 +63,9 @@ fn gpu_lost_device_is_an_error_of_every_call_and_no_panic() {
         return;
     }
     let name = "gpu::device_tests::gpu_lost_device_is_an_error_of_every_call_and_no_panic";
-    let mut child = std::process::Command::new(std::env::current_exe().expect("a program"));
-    let output = child.args([name, "--exact", "--include-ignored"]).env(LOSE_DEVICE, "1").output().expect("starts");
+    let mut child = std::process::Command::new(std::env::current_exe().expect("the path of this program"));
+    let output =
+        child.args([name, "--exact", "--include-ignored"]).env(LOSE_DEVICE, "1").output().expect("a child process");
     let text = [output.stdout, output.stderr].map(|text| String::from_utf8_lossy(&text).into_owned()).concat();
     assert!(output.status.success() && text.contains("1 passed"), "{text}");
 }
@@ -74,24 +76,26 @@ fn lose_device() {
     }
     let device = Device::open(0).expect("a CUDA device");
     let (scene, state) = scene_and_state(&[(300, 5, 10)]);
-    let mut one = CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).expect("a deformer");
-    let mut other = CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).expect("a deformer");
-    one.deform(&state).expect("deforms");
-    other.deform(&state).expect("deforms");
-    let pending = other.readback(VertexAttributes::VERTICES).expect("begins");
+    let mut first_deformer =
+        CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).expect("a deformer");
+    let mut second_deformer =
+        CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).expect("a deformer");
+    first_deformer.deform(&state).expect("a step");
+    second_deformer.deform(&state).expect("a step");
+    let pending = second_deformer.readback(VertexAttributes::VERTICES).expect("a pending readback");
     let source = "extern \"C\" __global__ void trap(unsigned long long) { asm(\"trap;\"); }";
-    let function = device.function("trap", source, &[]).expect("compiles");
+    let function = device.function("trap", source, &[]).expect("a compiled kernel");
     let config = LaunchConfig { grid_dim: (1, 1, 1), block_dim: (1, 1, 1), shared_mem_bytes: 0 };
-    // SAFETY: the kernel's only argument is a number; it accesses no memory.
-    unsafe { launch_kernel(&device, &function, config, LaunchOrder::Serial, &0_u64) }.expect("is submitted");
-    assert!(is_lost(device.synchronize("test")), "the kernel traps");
-    assert!(is_lost(one.surface().map(|_| ())));
-    assert!(is_lost(one.deform(&state)));
-    assert!(is_lost(one.deform(&state)), "again");
-    assert!(is_lost(other.wait_readback(&pending)));
-    assert!(is_lost(other.deform(&state)), "another scene");
+    // SAFETY: the kernel's only argument is a number, and it accesses no memory.
+    unsafe { launch_kernel(&device, &function, config, LaunchOrder::Serial, &0_u64) }.expect("a launched kernel");
+    assert!(is_lost(device.synchronize("test")), "expected the kernel to trap");
+    assert!(is_lost(first_deformer.surface().map(|_| ())));
+    assert!(is_lost(first_deformer.deform(&state)));
+    assert!(is_lost(first_deformer.deform(&state)), "a second call");
+    assert!(is_lost(second_deformer.wait_readback(&pending)));
+    assert!(is_lost(second_deformer.deform(&state)), "another scene");
     assert!(is_lost(DeviceBuffer::upload(&device, &[1_u32])));
     assert!(is_lost(CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).map(|_| ())));
-    drop((one, other, pending));
-    assert!(is_lost(device.synchronize("test")), "dropping hides nothing");
+    drop((first_deformer, second_deformer, pending));
+    assert!(is_lost(device.synchronize("test")), "after all objects are dropped");
 }

@@ -8,90 +8,95 @@ use super::tables::occupancy::deform_tuning;
 use super::tables::{kernels, layout};
 use modalcast_model::error::Error;
 
-/// Macros of a variant, and the architecture.
+/// Macros of a variant, and the compute capability.
 type Variant = (Vec<&'static str>, (i32, i32));
 
-/// Macros of `deform` that are not features of a scene: LISTED, for tile lists.
-const UNPLANNED_DEFINES: [&str; 1] = ["TILE_LIST"];
+/// Macros of `deform` that are not features of a scene.
+const LAUNCHER_DEFINES: [&str; 1] = ["TILE_LIST"];
 
-/// U in f32, and in each type that has a macro.
-fn storages() -> impl Iterator<Item = Vec<&'static str>> {
+/// The macros of each storage type of U; f32 has none.
+fn storage_variants() -> impl Iterator<Item = Vec<&'static str>> {
     std::iter::once(Vec::new()).chain(kernels::STORAGE_DEFINES.map(|storage| vec![storage]))
 }
 
-/// All subsets of a few macros.
-fn subsets(of: &[&'static str]) -> Vec<Vec<&'static str>> {
-    let chosen = |set: usize| (0..of.len()).filter(move |bit| set >> bit & 1 == 1);
-    (0..1 << of.len()).map(|set| chosen(set).map(|bit| of[bit]).collect()).collect()
+/// All subsets of some macros.
+fn subsets(macros: &[&'static str]) -> Vec<Vec<&'static str>> {
+    let indices = |set: usize| (0..macros.len()).filter(move |bit| set >> bit & 1 == 1);
+    (0..1 << macros.len()).map(|set| indices(set).map(|index| macros[index]).collect()).collect()
 }
 
-/// Tested variants of `deform`: all combinations of its features would take hours.
-fn variants_of_deform(features: &[&'static str]) -> Vec<Variant> {
-    let large = (9, 0);
-    let mut list: Vec<Variant> =
-        features.iter().chain(&UNPLANNED_DEFINES).map(|feature| (vec![*feature], large)).collect();
-    // The registers that the sum, the shape of a tile and the kind of normals need; kernels for lists are always
-    // narrow.
-    let shapes: [&[&str]; 3] = [&[], &["ONE_ITEM_PER_LANE"], &["ONE_ITEM_PER_LANE", "TILE_LIST"]];
-    let orient: [&[&str]; 4] = [
+/// Tested variants of `deform`. All combinations of its features would take hours.
+fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
+    let sm_90 = (9, 0);
+    let mut variants: Vec<Variant> =
+        features.iter().chain(&LAUNCHER_DEFINES).map(|feature| (vec![*feature], sm_90)).collect();
+    // The sum, the items per lane and the kind of normals determine most registers. Kernels for tile lists always have
+    // one item per lane.
+    let lane_defines: [&[&str]; 3] = [&[], &["ONE_ITEM_PER_LANE"], &["ONE_ITEM_PER_LANE", "TILE_LIST"]];
+    let normal_defines: [&[&str]; 4] = [
         &[],
         &["RIGID_NORMALS"],
         &["RIGID_NORMALS", "NORMAL_MAPS"],
         &["RIGID_NORMALS", "CORNER_OFFSETS", "NORMAL_MAPS", "SHEAR"],
     ];
-    let mut with = |sum: &[&'static str], orient: &[&[&'static str]], more: &[&'static str]| {
-        let ends = shapes.into_iter().flat_map(|shape| orient.iter().map(move |orient| [shape, *orient].concat()));
-        list.extend(ends.map(|defines| ([sum, &defines, more].concat(), large)));
+    let mut add_variants = |sum: &[&'static str], normal_defines: &[&[&'static str]], others: &[&'static str]| {
+        for (lane, normals) in lane_defines.iter().flat_map(|lane| normal_defines.iter().map(move |one| (lane, one))) {
+            variants.push(([sum, lane, normals, others].concat(), sm_90));
+        }
     };
-    for more in subsets(&["DISPLACEMENTS", "FOLLOWERS"]) {
-        with(&[], &orient, &more);
+    for others in subsets(&["DISPLACEMENTS", "FOLLOWERS"]) {
+        add_variants(&[], &normal_defines, &others);
     }
-    for storage in storages() {
-        let sum = |more: &[&'static str]| [&["MODES"], storage.as_slice(), more].concat();
-        let largest = ["MODE_TRUNCATION", "COMPENSATED_SUM"];
-        // The two 16-bit types decode with the same registers, so the sums between the smallest and the largest one are
-        // compiled for one of them.
-        let mut sums = subsets(&largest);
-        sums.retain(|more| storage != ["STORE_BF16"] || more.len() != 1);
-        for more in &sums {
-            with(&sum(more), &orient, &[]);
+    for storage in storage_variants() {
+        let sum = |options: &[&'static str]| [&["MODES"], storage.as_slice(), options].concat();
+        let all_options = ["MODE_TRUNCATION", "COMPENSATED_SUM"];
+        // Both 16-bit types decode with the same registers. For one of them, the sums between the smallest and the largest
+        // are omitted.
+        let mut option_sets = subsets(&all_options);
+        option_sets.retain(|options| storage != ["STORE_BF16"] || options.len() != 1);
+        for options in &option_sets {
+            add_variants(&sum(options), &normal_defines, &[]);
         }
-        // The registers that readback outputs and followers add to the largest sum.
-        with(&sum(&largest), &orient[1..3], &["DISPLACEMENTS"]);
-        with(&sum(&largest), &orient[1..3], &["FOLLOWERS"]);
+        // The registers that displacements and followers add to the largest sum.
+        add_variants(&sum(&all_options), &normal_defines[1..3], &["DISPLACEMENTS"]);
+        add_variants(&sum(&all_options), &normal_defines[1..3], &["FOLLOWERS"]);
     }
-    for storage in storages() {
+    for storage in storage_variants() {
         let smallest = [&["MODES"], storage.as_slice()].concat();
-        let largest = [features, &UNPLANNED_DEFINES, &storage].concat();
-        list.push(([smallest.as_slice(), &["DISPLACEMENTS", "DISPLACEMENTS_ONLY"]].concat(), large));
-        list.push((largest.clone(), large));
+        let largest = [features, &LAUNCHER_DEFINES, &storage].concat();
+        variants.push(([smallest.as_slice(), &["DISPLACEMENTS", "DISPLACEMENTS_ONLY"]].concat(), sm_90));
+        variants.push((largest.clone(), sm_90));
         for capability in [(7, 5), (8, 0), (12, 0)] {
-            list.extend([&smallest, &largest].map(|defines| (defines.clone(), capability)));
+            variants.extend([&smallest, &largest].map(|defines| (defines.clone(), capability)));
         }
     }
-    list
+    variants
 }
 
-/// All variants of `batch` for a large device, and the largest group size for the other architectures.
-fn variants_of_batch(features: &[&'static str]) -> Vec<Variant> {
-    let counts = subsets(features).into_iter().filter(|set| !(set.contains(&"BATCH_4") && set.contains(&"BATCH_8")));
-    let large: Vec<Vec<&str>> =
-        counts.flat_map(|set| storages().map(move |storage| [set.clone(), storage].concat())).collect();
-    let others = [(7, 5), (8, 0), (12, 0)].into_iter();
-    let others = others.flat_map(|capability| storages().map(move |storage| (storage, capability)));
-    large.into_iter().map(|set| (set, (9, 0))).chain(others).collect()
+/// All variants of `batch` for compute capability 9.0, and for others those with the maximum group size.
+fn batch_variants(features: &[&'static str]) -> Vec<Variant> {
+    let has_one_size = |set: &Vec<&str>| !(set.contains(&"BATCH_4") && set.contains(&"BATCH_8"));
+    let sm_90_variants = subsets(features)
+        .into_iter()
+        .filter(has_one_size)
+        .flat_map(|set| storage_variants().map(move |storage| ([set.clone(), storage].concat(), (9, 0))));
+    let other_variants = [(7, 5), (8, 0), (12, 0)]
+        .into_iter()
+        .flat_map(|capability| storage_variants().map(move |storage| (storage, capability)));
+    sm_90_variants.chain(other_variants).collect()
 }
 
-/// All variants of the other kernels.
-fn variants_of_others(features: &[&'static str]) -> Vec<Variant> {
-    let variants_of = |capability| subsets(features).into_iter().map(move |set| (set, capability));
-    CAPABILITIES.into_iter().flat_map(variants_of).collect()
+/// All variants of another kernel.
+fn all_variants(features: &[&'static str]) -> Vec<Variant> {
+    CAPABILITIES
+        .into_iter()
+        .flat_map(|capability| subsets(features).into_iter().map(move |set| (set, capability)))
+        .collect()
 }
 
 /// Compiles all variants on all cores. NVRTC programs are independent of each other.
-fn compiled(kernel: &KernelSource, variants: &[Variant]) -> Vec<CompiledVariant> {
-    let one = |(defines, capability): &Variant| compile(kernel, defines, *capability);
-    variants.par_iter().map(one).collect()
+fn compile_variants(kernel: &KernelSource, variants: &[Variant]) -> Vec<CompiledVariant> {
+    variants.par_iter().map(|(defines, capability)| compile(kernel, defines, *capability)).collect()
 }
 
 /// Compiles a variant as its launcher does.
@@ -106,22 +111,23 @@ fn compile(kernel: &KernelSource, defines: &[&str], capability: (i32, i32)) -> C
 fn nvrtc_compiles_every_kernel_without_spilling() {
     for kernel in kernels::KERNELS {
         let variants = match kernel.name {
-            "deform" => variants_of_deform,
-            "batch" => variants_of_batch,
-            _ => variants_of_others,
+            "deform" => deform_variants,
+            "batch" => batch_variants,
+            _ => all_variants,
         }(kernel.features);
-        let spills = |(variant, compiled): (&Variant, CompiledVariant)| {
+        let describe_spill = |(variant, compiled): (&Variant, CompiledVariant)| {
             let spill_bytes = compiled.spill_bytes();
-            // The header comment of batch.cu says what it spills and how rarely.
-            let allowed = if kernel.name == "batch" { 16 } else { 0 };
-            (spill_bytes > allowed).then(|| format!("{variant:?}: {spill_bytes} bytes"))
+            // `sum_modes` of batch.cu may spill its stage counter.
+            let max_spill_bytes = if kernel.name == "batch" { 16 } else { 0 };
+            (spill_bytes > max_spill_bytes).then(|| format!("{variant:?}: {spill_bytes} bytes"))
         };
-        let spilling: Vec<String> = variants.iter().zip(compiled(&kernel, &variants)).filter_map(spills).collect();
+        let spilling: Vec<String> =
+            variants.iter().zip(compile_variants(&kernel, &variants)).filter_map(describe_spill).collect();
         assert_eq!(spilling, Vec::<String>::new(), "{} of {} of {}", spilling.len(), variants.len(), kernel.name);
     }
 }
 
-/// Macros that add code, each with the macros that it builds on. The other macros choose among code of similar length.
+/// Kernel, macro that adds code, and the macros that it requires. The other macros select among code of similar length.
 const ADDED_CODE: [(&str, &str, &[&str]); 14] = [
     ("deform", "MODES", &[]),
     ("deform", "COMPENSATED_SUM", &["MODES"]),
@@ -138,7 +144,7 @@ const ADDED_CODE: [(&str, &str, &[&str]); 14] = [
     ("normals", "SHEAR", &[]),
     ("normals", "FOLLOWERS", &[]),
 ];
-/// Macros that choose among code of similar length. FOLLOWERS of `apply` adds less code than the padding of its file.
+/// Macros that select among code of similar length. FOLLOWERS of `apply` adds less code than the padding of its cubin.
 const ALTERNATIVES: [(&str, &str); 5] = [
     ("batch", "BATCH_8"),
     ("batch", "BATCH_4"),
@@ -149,42 +155,43 @@ const ALTERNATIVES: [(&str, &str); 5] = [
 
 #[test]
 #[ignore = "needs NVRTC: deploy/check installs it"]
-fn nvrtc_leaves_out_the_code_of_a_feature_that_is_left_out() {
+fn nvrtc_omits_the_code_of_unused_features() {
     for kernel in kernels::KERNELS {
-        let bytes = |defines: &[&'static str]| compile(&kernel, defines, (9, 0)).cubin.len();
-        assert_eq!(bytes(&["UNKNOWN"]), bytes(&[]), "a macro that nothing reads changes nothing");
+        let cubin_bytes = |defines: &[&'static str]| compile(&kernel, defines, (9, 0)).cubin.len();
+        assert_eq!(cubin_bytes(&["UNKNOWN"]), cubin_bytes(&[]), "expected an unknown macro to change nothing");
         for feature in kernel.features.iter().filter(|feature| !ALTERNATIVES.contains(&(kernel.name, feature))) {
-            let (.., base) =
-                ADDED_CODE.iter().find(|(name, own, _)| (name, own) == (&kernel.name, feature)).expect("known");
-            let (without, with) = (bytes(base), bytes(&[*base, &[*feature]].concat()));
-            assert!(without < with, "{} of {}: {without} and {with} bytes", feature, kernel.name);
+            let is_feature =
+                |(kernel_name, name, _): &&(&str, &str, &[&str])| (kernel_name, name) == (&kernel.name, feature);
+            let (.., required) = ADDED_CODE.iter().find(is_feature).expect("an entry of ADDED_CODE");
+            let (bytes_without, bytes_with) = (cubin_bytes(required), cubin_bytes(&[*required, &[*feature]].concat()));
+            assert!(bytes_without < bytes_with, "{feature} of {}: {bytes_without} and {bytes_with} bytes", kernel.name);
         }
     }
 }
 
 #[test]
 #[ignore = "needs NVRTC: deploy/check installs it"]
-fn nvrtc_agrees_with_the_host_on_every_size_and_offset_and_would_notice() {
+fn nvrtc_layout_equals_the_host_layout() {
     let nvrtc = nvrtc().expect("NVRTC");
-    let check = |agreement: &layout::LayoutConstant, host: u32| {
-        let source = format!("{}static_assert(({}) == {host}u, \"\");", layout::PRELUDE, agreement.expression);
+    let compile_assertion = |constant: &layout::LayoutConstant, value: u32| {
+        let source = format!("{}static_assert(({}) == {value}u, \"\");", layout::PRELUDE, constant.expression);
         nvrtc.compile(&CompileJob::new("layout", &source, &[], (8, 0)))
     };
-    for agreement in layout::layout_constants() {
-        check(&agreement, agreement.host).expect("host and device agree");
-        check(&agreement, agreement.host ^ 4).expect_err("the judge can fail");
+    for constant in layout::layout_constants() {
+        compile_assertion(&constant, constant.host).expect("the same value on host and device");
+        compile_assertion(&constant, constant.host ^ 4).expect_err("control: a wrong value");
     }
     nvrtc
         .compile(&CompileJob::new("layout_values", &layout::layout_kernel_source(), &[], (9, 0)))
-        .expect("the report compiles");
+        .expect("a kernel that compiles");
 }
 
 #[test]
 #[ignore = "needs NVRTC: deploy/check installs it"]
-fn nvrtc_refusals_carry_the_log() {
+fn nvrtc_errors_contain_the_log() {
     let nvrtc = nvrtc().expect("NVRTC");
-    let broken = nvrtc.compile(&CompileJob::new("broken", "__global__ void f() { wrong; }", &[], (8, 0)));
-    assert!(broken.expect_err("no C++").to_string().contains("wrong"), "the log names the culprit");
-    let ancient = nvrtc.compile(&CompileJob::new("empty", "", &[], (1, 0))).expect_err("sm_10 is gone");
-    assert!(matches!(ancient, Error::Unavailable { .. }), "{ancient}");
+    let result = nvrtc.compile(&CompileJob::new("broken", "__global__ void f() { wrong; }", &[], (8, 0)));
+    assert!(result.expect_err("invalid C++").to_string().contains("wrong"));
+    let error = nvrtc.compile(&CompileJob::new("empty", "", &[], (1, 0))).expect_err("an unsupported architecture");
+    assert!(matches!(error, Error::Unavailable { .. }), "{error}");
 }

@@ -1,10 +1,10 @@
-//! The CUDA backend, in three tiers: `launch` (access to the device), `tables` (the tables and the plan of a scene, pure)
-//! and `executor` (the deformer and the rasterizer).
+//! The CUDA backend, in three tiers: `launch` (access to the device), `tables` (tables and plan of a scene; pure) and
+//! `executor` (deformer and rasterizer).
 //!
-//! The kernels are in `kernels/*.cu`. NVRTC compiles them at run time for the device that is present, with only the
-//! features that the scene needs ([`plan()`]), and a disk cache keeps the machine code. A step is one CUDA graph: a
-//! host-to-device copy, at most four kernel launches for any number of domains, and a readback of the bounds. The
-//! kernels write directly into OpenGL's buffers when the driver shares them.
+//! The kernels are in `kernels/*.cu`. NVRTC compiles them at run time for the present device, with only the features that
+//! the scene uses ([`plan()`]). A disk cache keeps the machine code. A step is one CUDA graph: a host-to-device copy, at
+//! most four kernel launches for any number of domains, and a readback of the bounds. The kernels write directly to
+//! OpenGL's buffers if the driver can share them.
 //!
 //! ```text
 //! inputs -> [apply or batch] -> deform -> bounds -> [normals] -> readback of the bounds

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use cudarc::driver::CudaStream;
 
-/// Waits for a stream when it is dropped, unless [`Self::disarm`] was called: work may have been submitted that nothing
-/// else waits for yet.
+/// Guard that waits for a stream on drop, unless [`Self::disarm`] was called. It covers submitted work that nothing else
+/// waits for yet.
 #[must_use]
 pub(crate) struct WaitForStream(Option<Arc<CudaStream>>);
 
@@ -31,11 +31,11 @@ impl Drop for WaitForStream {
 /// Runs `work`, then `cleanup`, and returns both results. When `work` panics, `cleanup` runs before the panic
 /// continues.
 pub(crate) fn with_cleanup<T, R>(work: impl FnOnce() -> T, cleanup: impl FnOnce() -> R) -> (T, R) {
-    // Unwind safety: nothing observes the state of `work` but `cleanup`, which exists for that state.
-    let done = catch_unwind(AssertUnwindSafe(work));
-    let cleaned = cleanup();
-    match done {
-        Ok(done) => (done, cleaned),
+    // Unwind safety: only `cleanup` observes the state that a panic of `work` leaves, and it expects that state.
+    let work_result = catch_unwind(AssertUnwindSafe(work));
+    let cleanup_result = cleanup();
+    match work_result {
+        Ok(work_result) => (work_result, cleanup_result),
         Err(panic) => resume_unwind(panic),
     }
 }
@@ -48,10 +48,10 @@ mod tests {
     #[test]
     fn cleanup_runs_once_after_results_and_panics() {
         let log = RefCell::new(Vec::new());
-        let note = |text| log.borrow_mut().push(text);
-        let results = with_cleanup(|| note("work"), || log.borrow().len());
+        let record = |text| log.borrow_mut().push(text);
+        let results = with_cleanup(|| record("work"), || log.borrow().len());
         assert_eq!(results, ((), 1), "the cleanup comes second");
-        let panicking = || with_cleanup(|| panic!("injected"), || note("cleanup")).1;
+        let panicking = || with_cleanup(|| panic!("injected"), || record("cleanup")).1;
         let panic = catch_unwind(AssertUnwindSafe(panicking)).expect_err("the panic continues");
         assert_eq!(panic.downcast_ref::<&str>(), Some(&"injected"));
         assert_eq!(*log.borrow(), ["work", "cleanup"]);

@@ -1,4 +1,4 @@
-//! A CUDA device: its context on this thread, its stream, and compiled kernels.
+//! A CUDA device: its context, its stream, and compiled kernels.
 
 use std::sync::Arc;
 
@@ -13,8 +13,7 @@ use modalcast_model::error::{Error, Result};
 /// Minimum CUDA driver version, as cuDriverGetVersion counts (12.0).
 const MIN_DRIVER_VERSION: i32 = 12_000;
 
-/// A CUDA device with its context current on this thread. All work is ordered by one stream. Only the readback of
-/// vertices has a stream of its own, which is ordered by events.
+/// A CUDA device. One stream orders all work. Only the readback of vertices has a stream of its own, which events order.
 #[derive(Debug)]
 pub struct Device {
     context: Arc<CudaContext>,
@@ -28,24 +27,24 @@ impl Device {
     /// Opens a device by ordinal.
     ///
     /// # Errors
-    /// `Unavailable` with the missing library and how to install it; never a panic.
+    /// `Unavailable` with the missing library and how to install it.
     pub fn open(ordinal: usize) -> Result<Arc<Self>> {
         let version = driver_version()?;
         if version < MIN_DRIVER_VERSION {
-            let reason = format!("the driver knows CUDA {}.{}", version / 1000, version % 1000 / 10);
-            return Err(Error::Unavailable { what: "CUDA 12.0", reason, remedy: UPDATE.into() });
+            let reason = format!("the driver supports only CUDA {}.{}", version / 1000, version % 1000 / 10);
+            return Err(Error::Unavailable { what: "CUDA 12.0", reason, remedy: UPDATE_REMEDY.into() });
         }
         let count = CudaContext::device_count().map_err(|error| no_device(ordinal, &error.to_string()))?;
         if ordinal >= usize::try_from(count).unwrap_or(0) {
-            return Err(no_device(ordinal, &format!("this machine has {count}")));
+            return Err(no_device(ordinal, &format!("this machine has {count} devices")));
         }
         Self::with_context(ordinal).map_err(|error| no_device(ordinal, &error.to_string()))
     }
 
     fn with_context(ordinal: usize) -> Result<Arc<Self>, DriverError> {
         let context = CudaContext::new(ordinal)?;
-        // SAFETY: event tracking orders accesses from several streams. All work on this device goes through the one
-        // stream below, which orders it; `readback` has a second stream and orders its copies by its own events.
+        // SAFETY: event tracking orders accesses from several streams. It is not needed: the stream below orders all work,
+        // and `readback` orders the copies of its second stream by its own events.
         unsafe { context.disable_event_tracking() };
         let stream = context.new_stream()?;
         let name = context.name()?;
@@ -82,7 +81,7 @@ impl Device {
     /// # Errors
     /// `Unavailable` with the remedy when NVRTC is missing or does not fit the driver.
     pub fn check_compiler(&self) -> Result<()> {
-        check_driver(nvrtc()?.version, driver_version()?)
+        check_nvrtc_version(nvrtc()?.version, driver_version()?)
     }
 
     /// The context, for calls of the driver that this crate does not wrap.
@@ -133,8 +132,8 @@ impl Device {
     }
 }
 
-const INSTALL: &str = "Install the NVIDIA driver (it brings libcuda.so.1), or use the cpu backend";
-const UPDATE: &str = "Update the NVIDIA driver, or use the cpu backend";
+const INSTALL_REMEDY: &str = "Install the NVIDIA driver (it brings libcuda.so.1), or use the cpu backend";
+const UPDATE_REMEDY: &str = "Update the NVIDIA driver, or use the cpu backend";
 
 fn no_device(ordinal: usize, reason: &str) -> Error {
     let remedy = "List devices with `modalcast doctor`, check CUDA_VISIBLE_DEVICES, or use the cpu backend";
@@ -150,26 +149,26 @@ pub(crate) fn driver_version() -> Result<i32> {
     // panic.
     if !unsafe { sys::is_culib_present() } {
         let reason = "libcuda.so.1 cannot be loaded".into();
-        return Err(Error::Unavailable { what: "CUDA", reason, remedy: INSTALL.into() });
+        return Err(Error::Unavailable { what: "CUDA", reason, remedy: INSTALL_REMEDY.into() });
     }
     let mut version = 0;
     // SAFETY: the library is loaded, and `version` is a live integer.
-    let answer = unsafe { sys::cuDriverGetVersion(&mut version) }.result().and_then(|()| result::init());
-    let broken = |error: DriverError| Error::Unavailable {
+    let start_result = unsafe { sys::cuDriverGetVersion(&mut version) }.result().and_then(|()| result::init());
+    let unusable = |error: DriverError| Error::Unavailable {
         what: "CUDA",
         reason: format!("the driver does not start: {error}"),
-        remedy: INSTALL.into(),
+        remedy: INSTALL_REMEDY.into(),
     };
-    answer.map_err(broken).map(|()| version)
+    start_result.map_err(unusable).map(|()| version)
 }
 
 /// Checks the NVRTC version: the driver does not load machine code of a newer major version.
-fn check_driver(nvrtc: (i32, i32), driver: i32) -> Result<()> {
+fn check_nvrtc_version(nvrtc: (i32, i32), driver: i32) -> Result<()> {
     if nvrtc.0 <= driver / 1000 {
         return Ok(());
     }
-    let reason = format!("NVRTC is {}.{}, the driver only knows CUDA {}.x", nvrtc.0, nvrtc.1, driver / 1000);
-    let remedy = format!("{UPDATE}, or set MODALCAST_NVRTC to the libnvrtc.so of CUDA {}", driver / 1000);
+    let reason = format!("NVRTC is {}.{}, the driver supports only CUDA {}.x", nvrtc.0, nvrtc.1, driver / 1000);
+    let remedy = format!("{UPDATE_REMEDY}, or set MODALCAST_NVRTC to the libnvrtc.so of CUDA {}", driver / 1000);
     Err(Error::Unavailable { what: "NVRTC for this driver", reason, remedy })
 }
 
@@ -178,17 +177,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_device_that_is_not_there_is_unavailable_and_no_panic() {
-        let refusal = Device::open(4096).expect_err("nobody has so many");
-        assert!(matches!(refusal, Error::Unavailable { .. }), "{refusal}");
-        assert!(refusal.to_string().contains("cpu backend"), "{refusal}");
+    fn missing_device_is_unavailable() {
+        let error = Device::open(4096).expect_err("a missing device");
+        assert!(matches!(error, Error::Unavailable { .. }), "{error}");
+        assert!(error.to_string().contains("cpu backend"), "{error}");
     }
 
     #[test]
-    fn an_nvrtc_of_a_newer_major_version_than_the_driver_is_refused_with_both_versions() {
-        check_driver((12, 9), 13_000).expect("older machine code loads");
-        check_driver((13, 1), 13_000).expect("minor versions are compatible");
-        let refusal = check_driver((13, 0), 12_040).expect_err("newer machine code does not").to_string();
-        assert!(refusal.contains("13.0") && refusal.contains("CUDA 12"), "{refusal}");
+    fn newer_nvrtc_than_the_driver_is_rejected() {
+        check_nvrtc_version((12, 9), 13_000).expect("an older NVRTC to be accepted");
+        check_nvrtc_version((13, 1), 13_000).expect("a newer minor version to be accepted");
+        let error = check_nvrtc_version((13, 0), 12_040).expect_err("a newer major version").to_string();
+        assert!(error.contains("13.0") && error.contains("CUDA 12"), "{error}");
     }
 }

@@ -1,4 +1,5 @@
-//! Converts errors of the CUDA driver to [`Error`]. Tells a lost device from a fault after which the device still works.
+//! Converts errors of the CUDA driver to [`Error`]. Distinguishes a lost device from a fault after which the device still
+//! works.
 
 use cudarc::driver::DriverError;
 use cudarc::driver::sys::CUresult;
@@ -42,7 +43,7 @@ mod tests {
 
     #[test]
     fn only_sticky_errors_lose_the_device() {
-        for (code, lost) in [
+        for (code, is_lost) in [
             (CUresult::CUDA_ERROR_ILLEGAL_ADDRESS, true),
             (CUresult::CUDA_ERROR_LAUNCH_FAILED, true),
             (CUresult::CUDA_ERROR_ILLEGAL_INSTRUCTION, true),
@@ -51,14 +52,14 @@ mod tests {
             (CUresult::CUDA_ERROR_INVALID_VALUE, false),
             (CUresult::CUDA_ERROR_ALREADY_MAPPED, false),
         ] {
-            assert_eq!(is_device_lost(code), lost, "{code:?}");
+            assert_eq!(is_device_lost(code), is_lost, "{code:?}");
         }
     }
 
     /// The name of an error is looked up in the driver library, which this test does not need.
     #[test]
-    fn lost_device_says_who_can_act() {
-        let lost = Error::DeviceLost { stage: "deform", reason: "illegal address".into() };
-        assert!(lost.to_string().ends_with("Restart the server"), "{lost}");
+    fn lost_device_error_names_the_remedy() {
+        let error = Error::DeviceLost { stage: "deform", reason: "illegal address".into() };
+        assert!(error.to_string().ends_with("Restart the server"), "{error}");
     }
 }

@@ -1,4 +1,4 @@
-//! Kernels as planned and as compiled, and their launch.
+//! Descriptors of kernels, and their launch.
 
 use std::ffi::c_void;
 
@@ -73,7 +73,7 @@ impl std::fmt::Debug for KernelText {
     }
 }
 
-/// Order of a launch after the kernel that the stream runs before it.
+/// Earliest start of a kernel, relative to the previous kernel of the stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LaunchOrder {
     /// The kernel starts when the previous one has ended.
@@ -87,9 +87,9 @@ pub enum LaunchOrder {
 /// Launches `function` on the device's stream. `args` is its only argument.
 ///
 /// # Safety
-/// The kernel has one argument, a struct with the layout of `T`. The addresses in it are those of device memory, or of
-/// pinned memory, that has the sizes which the kernel accesses, and that lives until the kernel has run. A kernel that
-/// is launched with [`LaunchOrder::Dependent`] calls `wait_for_prerequisite_grids` before it accesses memory.
+/// The kernel has one argument, a struct with the layout of `T`. Each address in it refers to device or pinned memory of
+/// at least the size that the kernel accesses, which exists until the kernel has ended. A kernel that is launched with
+/// [`LaunchOrder::Dependent`] calls `wait_for_prerequisite_grids` before it accesses memory.
 ///
 /// # Errors
 /// `Fault` when the driver refuses the launch.

@@ -13,12 +13,12 @@ use super::device::Device;
 use super::error::cuda_error;
 use modalcast_model::error::{Error, Result, fault_in};
 
-/// Bytes in device memory. All accesses by kernels and copies are ordered by the device's one stream, and so is the
-/// release of the memory when the buffer is dropped: work that was submitted before still finds the memory.
+/// Bytes in device memory. The device's stream orders all accesses by kernels and copies, and also the release of the
+/// memory on drop, so work that was submitted earlier can still use the memory.
 #[derive(Debug)]
 pub struct DeviceBuffer {
     slice: CudaSlice<u8>,
-    /// Requested bytes; the driver refuses an allocation of none, so `slice` may be longer.
+    /// Requested bytes. `slice` may be longer, because the driver refuses an allocation of 0 bytes.
     bytes: u64,
 }
 
@@ -29,8 +29,8 @@ impl DeviceBuffer {
     /// `Fault` when the device has not enough memory.
     pub fn zeroed(device: &Device, bytes: u64) -> Result<Self> {
         // A kernel that reads nothing still needs a valid address.
-        let room = usize::try_from(bytes.max(16)).map_err(fault_in("allocate"))?;
-        Ok(Self { slice: device.stream().alloc_zeros(room).map_err(cuda_error("allocate"))?, bytes })
+        let allocated_bytes = usize::try_from(bytes.max(16)).map_err(fault_in("allocate"))?;
+        Ok(Self { slice: device.stream().alloc_zeros(allocated_bytes).map_err(cuda_error("allocate"))?, bytes })
     }
 
     /// Allocates a buffer with the content of `list`, and waits for the copy.
@@ -43,29 +43,29 @@ impl DeviceBuffer {
         Ok(buffer)
     }
 
-    /// Copies `list` to the bytes from `first` on, and waits for the copy, so that the caller may free or change the
-    /// list: the driver does not promise that it stages pageable memory before it returns.
+    /// Copies `list` to the buffer at `byte_offset` and waits for the copy, because the driver may read pageable memory
+    /// after it returns. The caller may then free or change the list.
     ///
     /// # Errors
     /// `Fault` when the range exceeds the buffer, or when the device fails.
-    pub fn write<T: Pod>(&mut self, device: &Device, first: u64, list: &[T]) -> Result<()> {
-        let range = self.range(first, size_of_val(list) as u64)?;
+    pub fn write<T: Pod>(&mut self, device: &Device, byte_offset: u64, list: &[T]) -> Result<()> {
+        let range = self.checked_range(byte_offset, size_of_val(list) as u64)?;
         if range.is_empty() {
             return Ok(());
         }
         let stream = device.stream();
-        let copied = stream.memcpy_htod(bytemuck::cast_slice::<T, u8>(list), &mut self.slice.slice_mut(range));
-        copied.and(stream.synchronize()).map_err(cuda_error("upload"))
+        let copy_result = stream.memcpy_htod(bytemuck::cast_slice::<T, u8>(list), &mut self.slice.slice_mut(range));
+        copy_result.and(stream.synchronize()).map_err(cuda_error("upload"))
     }
 
-    /// Copies the bytes from `first` on to `to`, after all work that was submitted before, and waits for the copy.
+    /// Copies bytes from `byte_offset` to `target` after all work that was submitted earlier, and waits for the copy.
     ///
     /// # Errors
     /// `Fault` when the range exceeds the buffer, or when the device fails.
-    pub fn read<T: Pod>(&self, device: &Device, first: u64, to: &mut [T]) -> Result<()> {
-        self.range(first, size_of_val(to) as u64)?;
-        // SAFETY: `range` checked that the buffer has so many bytes from `first` on.
-        unsafe { download(device, self.address() + first, to) }
+    pub fn read<T: Pod>(&self, device: &Device, byte_offset: u64, target: &mut [T]) -> Result<()> {
+        self.checked_range(byte_offset, size_of_val(target) as u64)?;
+        // SAFETY: `checked_range` verified that the buffer has so many bytes from `byte_offset` on.
+        unsafe { download(device, self.address() + byte_offset, target) }
     }
 
     /// The device address of the first byte, for arguments of kernels. It is valid while the buffer exists.
@@ -78,11 +78,12 @@ impl DeviceBuffer {
         self.bytes
     }
 
-    fn range(&self, first: u64, bytes: u64) -> Result<std::ops::Range<usize>> {
-        match first.checked_add(bytes) {
-            Some(end) if end <= self.bytes => Ok(first as usize..end as usize),
+    fn checked_range(&self, byte_offset: u64, bytes: u64) -> Result<std::ops::Range<usize>> {
+        match byte_offset.checked_add(bytes) {
+            Some(end) if end <= self.bytes => Ok(byte_offset as usize..end as usize),
             _ => {
-                let reason = format!("expected a range within {} bytes, got {bytes} bytes from {first}", self.bytes);
+                let reason =
+                    format!("expected a range within {} bytes, got {bytes} bytes at offset {byte_offset}", self.bytes);
                 Err(Error::Fault { stage: "device memory", reason })
             }
         }
@@ -92,17 +93,17 @@ impl DeviceBuffer {
 /// Copies from the device and waits for the copy.
 ///
 /// # Safety
-/// `from` is the address of at least as many bytes of device memory as `to` has.
-pub(crate) unsafe fn download<T: Pod>(device: &Device, from: u64, to: &mut [T]) -> Result<()> {
-    if to.is_empty() {
+/// `address` is that of at least as many bytes of device memory as `target` has.
+pub(crate) unsafe fn download<T: Pod>(device: &Device, address: u64, target: &mut [T]) -> Result<()> {
+    if target.is_empty() {
         return Ok(());
     }
     let _current = device.enter()?;
     let stream = device.stream();
-    // SAFETY: the caller guarantees `from`; `to` remains borrowed until the stream is synchronized.
-    let copied = unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) };
-    let waited = stream.synchronize();
-    copied.and(waited).map_err(cuda_error("download"))
+    // SAFETY: the caller guarantees `address`; `target` remains borrowed until the stream is synchronized.
+    let copy_result = unsafe { result::memcpy_dtoh_async(target, address, stream.cu_stream()) };
+    let wait_result = stream.synchronize();
+    copy_result.and(wait_result).map_err(cuda_error("download"))
 }
 
 /// Use of pinned host memory.
@@ -128,12 +129,12 @@ impl<T: DeviceRepr + ValidAsZeroBits> PinnedBuffer<T> {
             PinnedUse::ToDevice => sys::CU_MEMHOSTALLOC_WRITECOMBINED | sys::CU_MEMHOSTALLOC_DEVICEMAP,
             PinnedUse::FromDevice => 0,
         };
-        // SAFETY: the memory is uninitialized; the lines below write all of it before anything reads it.
+        // SAFETY: the memory is uninitialized until `write_bytes` below, before anything reads it.
         let pinned = unsafe { device.context().alloc_pinned_with_flags::<T>(length, flags) };
         let mut pinned = pinned.map_err(cuda_error("allocate"))?;
-        let begin = pinned.as_mut_ptr().map_err(cuda_error("allocate"))?;
+        let pointer = pinned.as_mut_ptr().map_err(cuda_error("allocate"))?;
         // SAFETY: the allocation has `length` aligned elements, and zero bits are a valid `T`.
-        unsafe { begin.write_bytes(0, length) };
+        unsafe { pointer.write_bytes(0, length) };
         Ok(Self(pinned))
     }
 
@@ -155,7 +156,7 @@ impl<T: DeviceRepr + ValidAsZeroBits> PinnedBuffer<T> {
 
     /// The address of the first element, for kernels.
     pub(crate) fn address(&self) -> Result<u64> {
-        self.0.as_ptr().map(|begin| begin as u64).map_err(cuda_error("pinned memory"))
+        self.0.as_ptr().map(|pointer| pointer as u64).map_err(cuda_error("pinned memory"))
     }
 }
 
@@ -181,8 +182,8 @@ impl PageLock {
         let _current = device.enter().ok()?;
         let address = list.as_mut_ptr().cast();
         // SAFETY: the range is that of a live list, which the caller keeps in place.
-        let locked = unsafe { sys::cuMemHostRegister_v2(address, bytes, 0) }.result();
-        locked.ok().map(|()| Self { address, context: Arc::clone(device.context()) })
+        let lock_result = unsafe { sys::cuMemHostRegister_v2(address, bytes, 0) }.result();
+        lock_result.ok().map(|()| Self { address, context: Arc::clone(device.context()) })
     }
 }
 

@@ -1,16 +1,16 @@
-//! Access to a CUDA device: context, memory, compilation, launches and graphs. Knows nothing of scenes.
+//! Access to a CUDA device: context, memory, compilation, launches and graphs. Independent of scenes.
 //!
 //! | file | content |
 //! |---|---|
 //! | `device` | the device and its stream |
 //! | `context` | a context that is current on a thread |
 //! | `memory` | device buffers and pinned host memory |
-//! | `kernel` | kernels as planned and as compiled, and their launch |
+//! | `kernel` | descriptors of kernels, and their launch |
 //! | `capture` | CUDA graphs |
 //! | `compile` | machine code by NVRTC, and its cache |
 //! | `cleanup` | cleanup that also runs when work panics |
-//! | `error` | errors of the driver; tells a lost device from other faults |
-//! | `probe` | what this machine has |
+//! | `error` | conversion of driver errors; a lost device differs from other faults |
+//! | `probe` | the CUDA components of this machine |
 
 mod capture;
 pub(crate) mod cleanup;

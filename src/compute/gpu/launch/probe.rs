@@ -39,14 +39,14 @@ pub struct Probe {
 /// Probes this machine.
 pub fn probe() -> Probe {
     let mut probe = Probe {
-        driver: kernel_driver(),
+        driver: kernel_driver_version(),
         cuda: None,
         cuda_problem: None,
         devices: Vec::new(),
         nvrtc: None,
         nvrtc_version: None,
         nvrtc_problem: None,
-        kernel_cache: compile::folder().map(|folder| folder.display().to_string()),
+        kernel_cache: compile::cache_folder().map(|folder| folder.display().to_string()),
     };
     match driver_version() {
         Ok(version) => {
@@ -67,16 +67,16 @@ pub fn probe() -> Probe {
 
 impl Probe {
     fn add_devices(&mut self) {
-        let list = CudaContext::device_count().and_then(|count| (0..count).map(describe).collect());
-        match list {
-            Ok(list) => self.devices = list,
+        let devices = CudaContext::device_count().and_then(|count| (0..count).map(describe_device).collect());
+        match devices {
+            Ok(devices) => self.devices = devices,
             Err(error) => self.cuda_problem = Some(error.to_string()),
         }
     }
 }
 
 /// Name, capability and memory of a device, without a context on it.
-fn describe(ordinal: i32) -> Result<DeviceInfo, DriverError> {
+fn describe_device(ordinal: i32) -> Result<DeviceInfo, DriverError> {
     let device = result::device::get(ordinal)?;
     // SAFETY: the driver returned `device` above.
     let (major, minor, memory) = unsafe {
@@ -89,14 +89,14 @@ fn describe(ordinal: i32) -> Result<DeviceInfo, DriverError> {
 }
 
 /// The version of the NVIDIA kernel module; `None` without an NVIDIA driver.
-fn kernel_driver() -> Option<String> {
+fn kernel_driver_version() -> Option<String> {
     let read = |path: &str| std::fs::read_to_string(path).ok();
     let text = read("/sys/module/nvidia/version").or_else(|| read("/proc/driver/nvidia/version"))?;
-    version_in(&text)
+    first_version(&text)
 }
 
 /// The first word that consists of digits and dots.
-fn version_in(text: &str) -> Option<String> {
+fn first_version(text: &str) -> Option<String> {
     let is_version = |word: &&str| word.contains('.') && word.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
     text.split_whitespace().find(is_version).map(String::from)
 }
@@ -106,7 +106,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_machine_can_be_probed_and_what_is_missing_is_said() {
+    fn probe_reports_each_component_or_its_problem() {
         let probe = probe();
         assert_ne!(probe.devices.is_empty(), probe.cuda_problem.is_none(), "{probe:?}");
         assert_ne!(probe.nvrtc.is_some(), probe.nvrtc_problem.is_some());
@@ -116,10 +116,10 @@ mod tests {
     }
 
     #[test]
-    fn the_driver_version_is_read_from_either_file() {
-        let module = "NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  580.159.04  Release Build";
-        assert_eq!(version_in(module).as_deref(), Some("580.159.04"));
-        assert_eq!(version_in("580.159.04\n").as_deref(), Some("580.159.04"));
-        assert_eq!(version_in("no driver here."), None);
+    fn driver_version_is_found_in_either_file() {
+        let version_file = "NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  580.159.04  Release Build";
+        assert_eq!(first_version(version_file).as_deref(), Some("580.159.04"));
+        assert_eq!(first_version("580.159.04\n").as_deref(), Some("580.159.04"));
+        assert_eq!(first_version("no driver here."), None);
     }
 }

@@ -1,4 +1,4 @@
-//! The tables of a scene on the device, the plan of its kernels and buffers, and the values of its steps. Pure: tested
+//! The tables of a scene on the device, the plan of its kernels and buffers, and the input values of its steps. Pure: tested
 //! without a GPU.
 //!
 //! | file | content |

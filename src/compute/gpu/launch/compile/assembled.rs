@@ -1,4 +1,4 @@
-//! What NVRTC and its assembler make of a kernel, for tests: it needs no device.
+//! Compiles kernels for tests and reads the report of the assembler. Needs no device.
 
 #![allow(clippy::expect_used, clippy::panic, reason = "a test may fail")]
 
@@ -12,26 +12,27 @@ pub struct CompiledVariant {
 }
 
 impl CompiledVariant {
-    /// Compiles a source with macros and asks for what the assembler says of registers.
+    /// Compiles a source with macros and requests the assembler's report of registers.
     pub fn new(name: &str, source: &str, defines: &[&str], capability: (i32, i32)) -> Self {
         let mut job = CompileJob::new(name, source, defines, capability);
         job.options.push("--ptxas-options=-v".into());
-        let (cubin, log) = nvrtc().expect("NVRTC").compile_with_log(&job).expect("compiles");
-        assert!(cubin.starts_with(b"\x7fELF"), "machine code is an ELF file");
+        let (cubin, log) = nvrtc().expect("NVRTC").compile_with_log(&job).expect("a kernel that compiles");
+        assert!(cubin.starts_with(b"\x7fELF"), "expected an ELF file");
         Self { cubin, log }
     }
 
-    /// Bytes that all functions together store for want of registers.
+    /// Bytes of registers that all functions together spill to local memory.
     pub fn spill_bytes(&self) -> usize {
         spill_bytes(&self.log)
     }
 }
 
 fn spill_bytes(log: &str) -> usize {
-    let stores: Vec<&str> = log.split(" bytes spill stores").collect();
-    assert!(stores.len() > 1, "the assembler says what it spills: {log}");
-    let number = |before: &&str| before.rsplit(' ').next().and_then(|word| word.parse::<usize>().ok());
-    stores[..stores.len() - 1].iter().map(|before| number(before).expect("a number")).sum()
+    // The last word of each text but the last is a number of bytes.
+    let texts: Vec<&str> = log.split(" bytes spill stores").collect();
+    assert!(texts.len() > 1, "expected a report of spills, got: {log}");
+    let last_number = |text: &&str| text.rsplit(' ').next().and_then(|word| word.parse::<usize>().ok());
+    texts[..texts.len() - 1].iter().map(|text| last_number(text).expect("a number of bytes")).sum()
 }
 
 /// Compute capabilities that the tests compile for: the oldest supported one, A100, H100 and H200, and consumer Blackwell.
@@ -44,7 +45,7 @@ pub fn assert_compiles(source: &str, functions: &[&str], variants: &[&[&str]], c
         for defines in variants {
             let compiled = CompiledVariant::new(functions[0], source, defines, capability);
             for function in functions {
-                assert!(compiled.log.contains(&format!("'{function}'")), "{function} is not in: {}", compiled.log);
+                assert!(compiled.log.contains(&format!("'{function}'")), "expected {function} in: {}", compiled.log);
             }
             assert_eq!(compiled.spill_bytes(), 0, "{defines:?} {capability:?}: {}", compiled.log);
         }
@@ -56,7 +57,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn spills_of_all_functions_are_added_and_a_log_without_them_is_no_proof() {
+    fn adds_spills_and_rejects_a_log_without_a_report() {
         let line = |bytes: usize| format!("    0 bytes stack frame, {bytes} bytes spill stores, 9 bytes spill loads\n");
         assert_eq!(spill_bytes(&[line(0), line(24), line(4)].concat()), 28);
         assert_eq!(spill_bytes(&line(0)), 0);

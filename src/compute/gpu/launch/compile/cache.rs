@@ -1,5 +1,5 @@
-//! Disk cache of compiled kernels, keyed by the SHA-256 of everything that determines them. A cache failure only costs
-//! compile time.
+//! Disk cache of compiled kernels. The key is the SHA-256 of everything that determines the machine code. After a cache
+//! failure, the kernel is compiled again.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use sha2::{Digest as _, Sha256};
 
 const DIGEST_BYTES: usize = 32;
 
-/// A folder of compiled kernels, or none.
+/// The cache. Without a folder it stores nothing. A file contains the SHA-256 of the machine code, then the machine code.
 #[derive(Debug, Clone)]
 pub(super) struct CubinCache {
     folder: Option<PathBuf>,
@@ -41,16 +41,16 @@ impl CubinCache {
     pub(super) fn put(&self, key: &str, bytes: &[u8]) {
         static COUNT: AtomicU64 = AtomicU64::new(0);
         let Some(path) = self.path(key) else { return };
-        let unique = format!("{}.{}.part", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
-        let part = path.with_extension(unique);
+        let extension = format!("{}.{}.part", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let temporary_path = path.with_extension(extension);
         let content = [Sha256::digest(bytes).as_slice(), bytes].concat();
         let folder = path.parent().unwrap_or(&path);
-        let stored = std::fs::create_dir_all(folder)
-            .and_then(|()| std::fs::write(&part, content))
-            .and_then(|()| std::fs::rename(&part, &path));
-        if let Err(error) = stored {
-            // The name of the part is unique to this call, so removing it is safe.
-            std::fs::remove_file(&part).ok();
+        let store_result = std::fs::create_dir_all(folder)
+            .and_then(|()| std::fs::write(&temporary_path, content))
+            .and_then(|()| std::fs::rename(&temporary_path, &path));
+        if let Err(error) = store_result {
+            // The name of the temporary file is unique to this call, so removing it is safe.
+            std::fs::remove_file(&temporary_path).ok();
             tracing::warn!(%error, path = %path.display(), "a compiled kernel could not be cached");
         }
     }
@@ -71,10 +71,10 @@ pub(super) fn cache_key(cache_key_parts: &[&str]) -> String {
 }
 
 fn cache_folder_from(lookup: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
-    let named = |name: &str| lookup(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    named("MODALCAST_CACHE")
-        .or_else(|| Some(named("XDG_CACHE_HOME")?.join("modalcast")))
-        .or_else(|| Some(named("HOME")?.join(".cache/modalcast")))
+    let path_variable = |name: &str| lookup(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    path_variable("MODALCAST_CACHE")
+        .or_else(|| Some(path_variable("XDG_CACHE_HOME")?.join("modalcast")))
+        .or_else(|| Some(path_variable("HOME")?.join(".cache/modalcast")))
 }
 
 #[cfg(test)]
@@ -82,30 +82,30 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_put_comes_back_and_what_is_damaged_does_not() {
+    fn returns_stored_bytes_unless_the_file_is_damaged() {
         let folder = tempfile::tempdir().expect("a folder");
-        let cache = CubinCache { folder: Some(folder.path().join("deep/er")) };
+        let cache = CubinCache { folder: Some(folder.path().join("missing/folders")) };
         assert_eq!(cache.get("key"), None);
         cache.put("key", b"machine code");
         assert_eq!(cache.get("key").as_deref(), Some(&b"machine code"[..]));
         let path = cache.path("key").expect("a folder");
-        let mut bytes = std::fs::read(&path).expect("stored");
+        let mut bytes = std::fs::read(&path).expect("a stored kernel");
         for damage in [bytes.len() - 1, 0] {
             bytes[damage] ^= 1;
-            std::fs::write(&path, &bytes).expect("written");
+            std::fs::write(&path, &bytes).expect("a written file");
             assert_eq!(cache.get("key"), None, "byte {damage} changed");
             bytes[damage] ^= 1;
         }
-        std::fs::write(&path, &bytes[..20]).expect("written");
-        assert_eq!(cache.get("key"), None, "cut short");
+        std::fs::write(&path, &bytes[..20]).expect("a written file");
+        assert_eq!(cache.get("key"), None, "a truncated file");
         cache.put("key", b"machine code");
         assert!(cache.get("key").is_some(), "a damaged entry is replaced");
-        let left = std::fs::read_dir(path.parent().expect("a folder")).expect("readable").count();
-        assert_eq!(left, 1, "no part is left behind");
+        let file_count = std::fs::read_dir(path.parent().expect("a folder")).expect("a readable folder").count();
+        assert_eq!(file_count, 1, "expected no temporary file");
     }
 
     #[test]
-    fn an_unwritable_or_unnamed_folder_costs_nothing_but_time() {
+    fn missing_or_unwritable_folder_disables_the_cache() {
         let file = tempfile::NamedTempFile::new().expect("a file");
         for folder in [None, Some(file.path().join("below a file"))] {
             let cache = CubinCache { folder };
@@ -115,21 +115,24 @@ mod tests {
     }
 
     #[test]
-    fn keys_tell_apart_what_differs_only_in_where_texts_end() {
+    fn key_depends_on_the_lengths_of_the_texts() {
         assert_ne!(cache_key(&["ab", "c"]), cache_key(&["a", "bc"]));
         assert_eq!(cache_key(&["ab", "c"]), cache_key(&["ab", "c"]));
         assert_eq!(cache_key(&[]).len(), 64);
     }
 
     #[test]
-    fn the_folder_follows_the_environment_in_order() {
-        let all = [("MODALCAST_CACHE", "/a"), ("XDG_CACHE_HOME", "/b"), ("HOME", "/c")];
+    fn first_environment_variable_selects_the_folder() {
+        let variables = [("MODALCAST_CACHE", "/a"), ("XDG_CACHE_HOME", "/b"), ("HOME", "/c")];
         for (skipped, expected) in [(0, "/a"), (1, "/b/modalcast"), (2, "/c/.cache/modalcast")] {
             let lookup = |name: &str| {
-                all[skipped..].iter().find(|(known, _)| *known == name).map(|(_, value)| OsString::from(value))
+                variables[skipped..]
+                    .iter()
+                    .find(|(variable, _)| *variable == name)
+                    .map(|(_, value)| OsString::from(value))
             };
             assert_eq!(cache_folder_from(lookup), Some(PathBuf::from(expected)));
         }
-        assert_eq!(cache_folder_from(|_| Some(OsString::new())), None, "empty means unset");
+        assert_eq!(cache_folder_from(|_| Some(OsString::new())), None, "an empty variable counts as unset");
     }
 }

@@ -13,7 +13,7 @@ use self::cache::{CubinCache, cache_key};
 pub(crate) use self::nvrtc::{CompileJob, nvrtc};
 use modalcast_model::error::Result;
 
-/// Machine code (a cubin) of a source with macros, for compute capability `major.minor`.
+/// Returns the machine code (a cubin) of a source with macros, for compute capability `major.minor`.
 ///
 /// # Errors
 /// `Unavailable` when NVRTC is missing or does not know the architecture; `Fault` with the compiler's log.
@@ -33,6 +33,6 @@ pub(crate) fn cubin(name: &str, source: &str, defines: &[&str], capability: (i32
 }
 
 /// The folder of the kernel cache, if there is one.
-pub(crate) fn folder() -> Option<PathBuf> {
+pub(crate) fn cache_folder() -> Option<PathBuf> {
     CubinCache::from_env().folder().map(PathBuf::from)
 }

@@ -32,7 +32,7 @@ const INVALID_OPTION: c_int = 5;
 
 type ProgramHandle = *mut c_void;
 
-/// The NVRTC functions in use, and the library that they belong to.
+/// The NVRTC functions in use, and the libraries that they need.
 struct NvrtcApi {
     version: unsafe extern "C" fn(*mut c_int, *mut c_int) -> c_int,
     error: unsafe extern "C" fn(c_int) -> *const c_char,
@@ -80,7 +80,7 @@ impl<'a> CompileJob<'a> {
     /// Compiles `source` for compute capability `major.minor`, with the macros in `defines`.
     pub(crate) fn new(name: &'a str, source: &'a str, defines: &[&str], capability: (i32, i32)) -> Self {
         let (major, minor) = capability;
-        // Explicit rather than by default: results must follow IEEE arithmetic, including denormals.
+        // The options for arithmetic are explicit, because results must follow IEEE 754, including denormals.
         let mut options: Vec<String> =
             ["--std=c++17", "--fmad=true", "--ftz=false", "--prec-div=true", "--prec-sqrt=true"]
                 .map(String::from)
@@ -90,7 +90,7 @@ impl<'a> CompileJob<'a> {
         Self { name, source, options }
     }
 
-    /// Everything besides the compiler version that determines the machine code: the ingredients of the cache key.
+    /// Everything that determines the machine code, except the compiler version.
     pub(super) fn cache_key_parts(&self) -> Vec<&str> {
         let headers = HEADERS.iter().flat_map(|(name, text)| [*name, *text]);
         [self.name, self.source].into_iter().chain(headers).chain(self.options.iter().map(String::as_str)).collect()
@@ -108,7 +108,7 @@ pub(crate) fn nvrtc() -> Result<&'static Nvrtc> {
 
 impl Nvrtc {
     fn find(candidates: &[PathBuf]) -> Result<Self> {
-        let mut reason = format!("none of {} places has it", candidates.len());
+        let mut reason = format!("found in none of {} places", candidates.len());
         for candidate in candidates {
             match Self::load(candidate) {
                 Ok(nvrtc) => return Ok(nvrtc),
@@ -126,14 +126,14 @@ impl Nvrtc {
         let fail = fault_in("nvrtc");
         // SAFETY: NVRTC's initializers only set up the library; the operator chooses the name or path.
         let library = unsafe { Library::new(path) }.map_err(|error| fail(error.to_string()))?;
-        let functions = NvrtcApi::bind(library, builtins(path)).map_err(|error| fail(error.to_string()))?;
+        let functions = NvrtcApi::bind(library, load_builtins(path)).map_err(|error| fail(error.to_string()))?;
         let (mut major, mut minor) = (0, 0);
         // SAFETY: both pointers refer to live integers.
         let code = unsafe { (functions.version)(&mut major, &mut minor) };
         functions.check(code).map_err(fail)?;
         let nvrtc = Self { functions, path: path.to_path_buf(), version: (major, minor) };
         // Only a compilation shows whether NVRTC finds its builtins library.
-        nvrtc.compile(&CompileJob { name: "nothing", source: "", options: Vec::new() })?;
+        nvrtc.compile(&CompileJob { name: "empty", source: "", options: Vec::new() })?;
         Ok(nvrtc)
     }
 
@@ -148,7 +148,7 @@ impl Nvrtc {
     /// Machine code (a cubin) of a job, and the compiler's log.
     pub(super) fn compile_with_log(&self, job: &CompileJob) -> Result<(Vec<u8>, String)> {
         let fail = fault_in("compile");
-        let options = strings(job.options.iter().map(String::as_str))?;
+        let options = c_strings(job.options.iter().map(String::as_str))?;
         let pointers: Vec<_> = options.iter().map(|option| option.as_ptr()).collect();
         let program = NvrtcProgram::create(&self.functions, job)?;
         // SAFETY: the program is live, and `pointers` holds the stated number of NUL-terminated strings.
@@ -166,7 +166,7 @@ impl Nvrtc {
 }
 
 impl NvrtcApi {
-    fn bind(library: Library, companions: Vec<Library>) -> Result<Self, libloading::Error> {
+    fn bind(library: Library, builtins: Vec<Library>) -> Result<Self, libloading::Error> {
         // SAFETY: the types match nvrtc.h of CUDA 11.1 to 13; the library is kept as long as the functions.
         unsafe {
             Ok(Self {
@@ -179,7 +179,7 @@ impl NvrtcApi {
                 cubin: *library.get(b"nvrtcGetCUBIN\0")?,
                 log_size: *library.get(b"nvrtcGetProgramLogSize\0")?,
                 log: *library.get(b"nvrtcGetProgramLog\0")?,
-                _libraries: std::iter::once(library).chain(companions).collect(),
+                _libraries: std::iter::once(library).chain(builtins).collect(),
             })
         }
     }
@@ -201,9 +201,9 @@ struct NvrtcProgram<'a> {
 
 impl<'a> NvrtcProgram<'a> {
     fn create(functions: &'a NvrtcApi, job: &CompileJob) -> Result<Self> {
-        let texts = strings([job.source, job.name])?;
-        let names = strings(HEADERS.iter().map(|(name, _)| *name))?;
-        let headers = strings(HEADERS.iter().map(|(_, text)| *text))?;
+        let texts = c_strings([job.source, job.name])?;
+        let names = c_strings(HEADERS.iter().map(|(name, _)| *name))?;
+        let headers = c_strings(HEADERS.iter().map(|(_, text)| *text))?;
         let names: Vec<_> = names.iter().map(|name| name.as_ptr()).collect();
         let headers: Vec<_> = headers.iter().map(|text| text.as_ptr()).collect();
         let mut handle = std::ptr::null_mut();
@@ -240,61 +240,61 @@ impl Drop for NvrtcProgram<'_> {
     }
 }
 
-/// Loads NVRTC's builtins library from the folder of NVRTC. NVRTC opens it by its bare name, which the loader does not
-/// find outside the search path; a library that is already loaded under that name is found.
-fn builtins(nvrtc: &Path) -> Vec<Library> {
+/// Loads NVRTC's builtins library from the folder of NVRTC. NVRTC opens it by name without a path. The loader then finds
+/// it only in the search path, or if it is already loaded.
+fn load_builtins(nvrtc: &Path) -> Vec<Library> {
     let folder = nvrtc.parent().filter(|folder| !folder.as_os_str().is_empty());
     let files = folder.map(entries).unwrap_or_default().into_iter();
-    let wanted = |file: &PathBuf| {
+    let is_builtins = |file: &PathBuf| {
         file.file_name().is_some_and(|name| name.to_string_lossy().starts_with("libnvrtc-builtins.so"))
     };
-    // SAFETY: a data library without initializers, from the folder that the operator chose for NVRTC.
-    files.filter(wanted).filter_map(|file| unsafe { Library::new(file) }.ok()).collect()
+    // SAFETY: it is a data library without initializers, from the folder that the operator chose for NVRTC.
+    files.filter(is_builtins).filter_map(|file| unsafe { Library::new(file) }.ok()).collect()
 }
 
-fn strings<'a>(texts: impl IntoIterator<Item = &'a str>) -> Result<Vec<CString>> {
+fn c_strings<'a>(texts: impl IntoIterator<Item = &'a str>) -> Result<Vec<CString>> {
     texts.into_iter().map(|text| CString::new(text).map_err(fault_in("compile"))).collect()
 }
 
-/// Candidate paths of NVRTC, best first. If MODALCAST_NVRTC is set, it is the only candidate: no fallback.
+/// Candidate paths of NVRTC, best first. If MODALCAST_NVRTC is set, it is the only candidate.
 fn candidates() -> Vec<PathBuf> {
     if let Some(path) = std::env::var_os("MODALCAST_NVRTC").filter(|path| !path.is_empty()) {
         return vec![path.into()];
     }
-    let mut found: Vec<PathBuf> = ["libnvrtc.so.13", "libnvrtc.so"].map(PathBuf::from).into();
-    let beside = std::env::current_exe().ok();
-    let above = beside.iter().flat_map(|exe| exe.ancestors().skip(1).take(4));
+    let mut paths: Vec<PathBuf> = ["libnvrtc.so.13", "libnvrtc.so"].map(PathBuf::from).into();
+    let executable = std::env::current_exe().ok();
+    let parent_folders = executable.iter().flat_map(|path| path.ancestors().skip(1).take(4));
     // Never search the working directory: starting the server in some folder must not execute a library in it.
-    for folder in above {
-        find_libraries(&folder.join(".tools/nvrtc"), 5, &mut found);
+    for folder in parent_folders {
+        find_libraries(&folder.join(".tools/nvrtc"), 5, &mut paths);
     }
     for toolkit in entries(Path::new("/usr/local")) {
         if toolkit.file_name().is_some_and(|name| name.to_string_lossy().starts_with("cuda")) {
             let folder = toolkit.join("lib64");
-            found.extend(["libnvrtc.so.13", "libnvrtc.so"].map(|name| folder.join(name)));
+            paths.extend(["libnvrtc.so.13", "libnvrtc.so"].map(|name| folder.join(name)));
         }
     }
-    found.push("libnvrtc.so.12".into());
-    found
+    paths.push("libnvrtc.so.12".into());
+    paths
 }
 
 /// Adds every `libnvrtc.so.13` at most `depth` folders below `folder`.
-fn find_libraries(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) {
+fn find_libraries(folder: &Path, depth: usize, paths: &mut Vec<PathBuf>) {
     for entry in entries(folder) {
         if entry.file_name().is_some_and(|name| name == "libnvrtc.so.13") {
-            found.push(entry);
+            paths.push(entry);
         } else if depth > 0 && entry.is_dir() {
-            find_libraries(&entry, depth - 1, found);
+            find_libraries(&entry, depth - 1, paths);
         }
     }
 }
 
 /// Paths of the entries of a folder, sorted; empty when the folder cannot be read.
 fn entries(folder: &Path) -> Vec<PathBuf> {
-    let mut list: Vec<_> =
+    let mut paths: Vec<_> =
         std::fs::read_dir(folder).into_iter().flatten().filter_map(|entry| Some(entry.ok()?.path())).collect();
-    list.sort();
-    list
+    paths.sort();
+    paths
 }
 
 #[cfg(test)]
@@ -302,17 +302,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_missing_or_broken_nvrtc_is_refused_with_the_wheel_that_brings_it() {
+    fn missing_or_broken_nvrtc_is_unavailable() {
         let folder = tempfile::tempdir().expect("a folder");
-        let missing = Nvrtc::find(&[folder.path().join("libnvrtc.so.13")]).expect_err("missing").to_string();
+        let missing = Nvrtc::find(&[folder.path().join("libnvrtc.so.13")]).expect_err("a missing library").to_string();
         assert!(missing.contains("nvidia-cuda-nvrtc==13.0.*"), "{missing}");
         let broken = folder.path().join("nvidia/cu13/lib/libnvrtc.so.13");
         std::fs::create_dir_all(broken.parent().expect("a parent")).expect("a folder");
         std::fs::write(&broken, b"no library").expect("a file");
-        let mut found = Vec::new();
-        find_libraries(folder.path(), 5, &mut found);
-        assert_eq!(found, std::slice::from_ref(&broken));
-        let refusal = Nvrtc::find(&found).expect_err("broken").to_string();
-        assert!(refusal.contains(&broken.display().to_string()), "{refusal}");
+        let mut paths = Vec::new();
+        find_libraries(folder.path(), 5, &mut paths);
+        assert_eq!(paths, std::slice::from_ref(&broken));
+        let error = Nvrtc::find(&paths).expect_err("a broken library").to_string();
+        assert!(error.contains(&broken.display().to_string()), "{error}");
     }
 }

@@ -21,7 +21,7 @@ fn defines(plan: &DeformPlan) -> Vec<(&str, Vec<&str>)> {
 }
 
 #[test]
-fn unused_features_are_not_compiled_or_scene_with_storage() {
+fn unused_features_are_not_compiled_or_stored() {
     let minimal = plan(&scene(&[(7, 0), (300, 0)], false, true));
     assert_eq!(
         defines(&minimal),
@@ -41,7 +41,7 @@ fn unused_features_are_not_compiled_or_scene_with_storage() {
 }
 
 #[test]
-fn used_features_are_compiled_and_scene_with_storage() {
+fn used_features_are_compiled_and_stored() {
     let full = plan(&scene(&[(7, 2), (300, 0)], true, false));
     assert_eq!(
         full.kernels[0].defines,
