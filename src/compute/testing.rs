@@ -1,5 +1,5 @@
-//! Support for tests of this crate and of crates that add kernels: seeded random scenes, exact results, and the resource
-//! usage of compiled kernels. Compiled for tests and with the feature `testing` only.
+//! Support for tests of this crate and of crates that add kernels: seeded random scenes, exact results, and the
+//! resource usage of compiled kernels. Compiled for tests and with the feature `testing` only.
 
 #![allow(clippy::expect_used, clippy::panic, missing_docs, reason = "a test may fail")]
 

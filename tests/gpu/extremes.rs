@@ -1,5 +1,5 @@
-//! Zero rows of U, the signs of overflows, and singular or tiny transforms on the device. Checks for every deformer are in
-//! `tests/common`.
+//! Zero rows of U, the signs of overflows, and singular or tiny transforms on the device. Checks for every deformer are
+//! in `tests/common`.
 
 use modalcast_compute::reference::rigid_normals;
 use modalcast_model::deform::Deformer;

@@ -87,7 +87,8 @@ impl GlContext {
         }
     }
 
-    /// Reads the first `count` items of a buffer, ordered after earlier OpenGL commands. Does not synchronize with CUDA.
+    /// Reads the first `count` items of a buffer, ordered after earlier OpenGL commands. Does not synchronize with
+    /// CUDA.
     pub(crate) fn read<T: bytemuck::Pod>(&self, buffer: &GlBuffer, count: usize) -> Vec<T> {
         let mut items = vec![T::zeroed(); count];
         // SAFETY: as above; `items` has exactly the requested size.

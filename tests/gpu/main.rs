@@ -1,5 +1,5 @@
-//! Tests of the CUDA deformer and the CUDA rasterizer. They are ignored by default because they need a GPU; run them with
-//! `--include-ignored --test-threads=1`. The binary needs no build tree. Real inputs are read from the folder
+//! Tests of the CUDA deformer and the CUDA rasterizer. They are ignored by default because they need a GPU; run them
+//! with `--include-ignored --test-threads=1`. The binary needs no build tree. Real inputs are read from the folder
 //! MODALCAST_DATA.
 
 mod accuracy;

@@ -13,7 +13,8 @@ use crate::accuracy::{MAX_DIRECTION_ERROR, have_equal_bits, max_error};
 use crate::reference_comparison::cuda_deformer;
 use crate::scenes::{self, NORMAL_MAPPED, Random, new_domain};
 
-/// A tube of `columns` x `rows` vertices with a texture seam, a hard edge along every fifth row, and `rank` smooth modes.
+/// A tube of `columns` x `rows` vertices with a texture seam, a hard edge along every fifth row, and `rank` smooth
+/// modes.
 fn tube(random: &mut Random, columns: u32, rows: u32, rank: usize) -> Shape {
     let column_angle = |column: u32| column as f32 / columns as f32 * std::f32::consts::TAU;
     let position = |row: u32, column: u32| {

@@ -96,11 +96,12 @@ fn equals_ignoring_tangents(got: &DeformedSurface, want: &DeformedSurface) -> bo
 
 /// Waits for readbacks in order and compares each with the step that it belongs to.
 struct Reader<'a> {
+    /// Expected surface of each step.
     want: &'a [DeformedSurface],
     /// Steps and their readbacks, oldest first.
     pending: VecDeque<(usize, VertexReadback)>,
     /// Number of compared readbacks.
-    compared: usize,
+    compared_count: usize,
 }
 
 impl Reader<'_> {
@@ -115,9 +116,12 @@ impl Reader<'_> {
                 &surface,
                 &deformer.wait_readback(&readback).expect("expected the completed readback")
             ));
-            let other = (step + STEPS / 2) % self.want.len();
-            assert!(!equals_ignoring_tangents(&surface, &self.want[other]), "negative control with step {other}");
-            self.compared += 1;
+            let other_step = (step + STEPS / 2) % self.want.len();
+            assert!(
+                !equals_ignoring_tangents(&surface, &self.want[other_step]),
+                "negative control with step {other_step}"
+            );
+            self.compared_count += 1;
         }
     }
 }
@@ -154,7 +158,7 @@ fn gpu_overlapped_reads_equal_blocking_reads() {
         // Number of readbacks in flight when the oldest one is read.
         for max_pending in [0, 1, 2, 5] {
             let mut deformer = cuda_deformer(&scene);
-            let mut reader = Reader { want: &want, pending: VecDeque::new(), compared: 0 };
+            let mut reader = Reader { want: &want, pending: VecDeque::new(), compared_count: 0 };
             for (step, state) in states.iter().enumerate() {
                 deformer.deform(state).expect("expected the step to succeed");
                 // Some readbacks are dropped, and some steps start none.
@@ -169,7 +173,7 @@ fn gpu_overlapped_reads_equal_blocking_reads() {
                 reader.compare(&mut deformer, max_pending);
             }
             reader.compare(&mut deformer, 0);
-            assert_eq!(reader.compared, (0..STEPS).filter(|step| ![3, 5].contains(&(step % 7))).count());
+            assert_eq!(reader.compared_count, (0..STEPS).filter(|step| ![3, 5].contains(&(step % 7))).count());
             assert_eq!(deformer.outputs(), 2, "expected a second output for overlapped readbacks");
             assert!(equals_ignoring_tangents(
                 &without_tangents(deformer.surface().expect("expected a surface")),
@@ -199,7 +203,7 @@ fn gpu_two_steps_in_flight_keep_their_own_results() {
         };
         assert_ne!(bounds[0], bounds[STEPS - 1], "expected states with different bounds");
         let mut deformer = cuda_deformer(&scene);
-        let mut reader = Reader { want: &want, pending: VecDeque::new(), compared: 0 };
+        let mut reader = Reader { want: &want, pending: VecDeque::new(), compared_count: 0 };
         for step in 0..STEPS + MAX_STEPS_IN_FLIGHT {
             if step >= MAX_STEPS_IN_FLIGHT {
                 let finished_bounds = deformer.finish().expect("expected a finished step").bounds;
@@ -214,7 +218,7 @@ fn gpu_two_steps_in_flight_keep_their_own_results() {
             reader.compare(&mut deformer, MAX_STEPS_IN_FLIGHT);
         }
         reader.compare(&mut deformer, 0);
-        assert_eq!(reader.compared, STEPS);
+        assert_eq!(reader.compared_count, STEPS);
         if scene.deformation == DeformationSettings::default() && !scene.features.followers {
             assert_equals_reference("after overlapped steps", &scene, &scenes::random_state(&scene, 5), &mut deformer);
         }

@@ -1,5 +1,5 @@
-//! Frames that the server rasterizes with CUDA. They equal OpenGL frames except on edges and at depth ties. Steps that are
-//! computed while a frame is in flight do not change it. Frames are deterministic.
+//! Frames that the server rasterizes with CUDA. They equal OpenGL frames except on edges and at depth ties. Steps that
+//! are computed while a frame is in flight do not change it. Frames are deterministic.
 
 use std::sync::Arc;
 
@@ -20,9 +20,10 @@ use modalcast_render::{
 use crate::common::exact_triangle::{ExactTriangle, compare_ids};
 use crate::scenes;
 
+/// Width and height of images.
 const SIZE: [u32; 2] = [960, 540];
-/// Depths that differ by less than this are a depth tie. Hardware interpolates the depth of triangles that are hundreds of
-/// pixels wide with an error of up to 3e-7 of the depth range.
+/// Depths that differ by less than this are a depth tie. Hardware interpolates the depth of triangles that are hundreds
+/// of pixels wide with an error of up to 3e-7 of the depth range.
 const DEPTH_TOLERANCE: f64 = 4e-7;
 const CUDA_BACKENDS: RasterBackends =
     RasterBackends { shadow: Some(RasterBackend::Cuda), visibility: Some(RasterBackend::Cuda) };
@@ -64,6 +65,7 @@ struct StillImage {
     exact_triangles: Vec<ExactTriangle>,
 }
 
+/// Draws one state with CUDA or OpenGL.
 fn draw_still(scene: &Arc<Scene>, state: &SceneState, uses_cuda: bool) -> StillImage {
     let device = Device::open(0).expect("expected a CUDA device");
     let (mut renderer, mut deformer) = (
@@ -129,7 +131,10 @@ fn gpu_ids_equal_opengl_except_on_edges_and_depth_ties() {
         eprintln!("{name}: {differences:?} of {} pixels", got.visible_triangles.len());
         // At the border of a cut-out, the filtered alpha crosses its threshold. Hardware uses 8-bit filter weights.
         let max_wrong = if name == "tree" { SIZE[0] * SIZE[1] / 500 } else { 0 };
-        assert!(differences.wrong <= max_wrong as usize, "{name}: {differences:?}");
+        assert!(
+            differences.wrong <= max_wrong as usize,
+            "{name}: expected at most {max_wrong} wrong pixels, got {differences:?}"
+        );
         let other_state_image =
             draw_still(&scene, &SceneState { q: state.q.iter().map(|q| q + 0.3).collect(), ..state.clone() }, true);
         let control = compare_ids(
@@ -155,30 +160,33 @@ fn gpu_shading_of_equal_ids_equals_opengl() {
                 pixels.map(|(got, want)| got.iter().zip(want).any(|(got, want)| got.abs_diff(*want) > 6));
             let is_same_triangle =
                 got.visible_triangles.iter().zip(&want.visible_triangles).map(|(got, want)| got == want);
-            let different = is_different
+            let different_count = is_different
                 .zip(is_same_triangle)
                 .filter(|(is_different, is_same_triangle)| *is_different && *is_same_triangle)
                 .count();
             eprintln!(
-                "{name}, {:?}: {different} pixels with equal ids have different colors",
+                "{name}, {:?}: {different_count} pixels with equal ids have different colors",
                 shadow.map(|shadow| shadow.size)
             );
             let limit = got.visible_triangles.len() / 500;
-            assert!(different <= limit, "{name}: expected at most {limit} different pixels, got {different}");
+            assert!(
+                different_count <= limit,
+                "{name}: expected at most {limit} different pixels, got {different_count}"
+            );
         }
     }
     let [(_, soup, state), _] = scenes_and_states();
     let [shadowed, unshadowed] = [Some(ShadowSettings::default()), None]
         .map(|shadow| draw_still(&with_shadow(&soup, shadow), &state, true).image);
-    let different = shadowed
+    let different_count = shadowed
         .rgba
         .iter()
         .zip(&unshadowed.rgba)
         .filter(|(shadowed, unshadowed)| shadowed.abs_diff(**unshadowed) > 6)
         .count();
     assert!(
-        different > shadowed.rgba.len() / 50,
-        "negative control: expected visible shadows, got {different} different components"
+        different_count > shadowed.rgba.len() / 50,
+        "negative control: expected visible shadows, got {different_count} different components"
     );
 }
 
@@ -246,16 +254,17 @@ fn gpu_ground_hides_geometry_below_on_both_paths() {
     let [want, got] = [false, true].map(|uses_cuda| draw_still(&scene, &state, uses_cuda));
     let count_uncovered =
         |image: &StillImage| image.visible_triangles.iter().filter(|triangle| triangle.is_none()).count();
-    let different = got.visible_triangles.iter().zip(&want.visible_triangles).filter(|(got, want)| got != want).count();
+    let different_count =
+        got.visible_triangles.iter().zip(&want.visible_triangles).filter(|(got, want)| got != want).count();
     eprintln!(
-        "{different} pixels differ, {} and {} pixels show ground or sky",
+        "{different_count} pixels differ, {} and {} pixels show ground or sky",
         count_uncovered(&got),
         count_uncovered(&want)
     );
     let uncovered = count_uncovered(&want);
     assert!(uncovered > 20_000, "expected more than 20,000 pixels of ground or sky, got {uncovered}");
     let limit = got.visible_triangles.len() / 2000;
-    assert!(different < limit, "expected fewer than {limit} different pixels, got {different}");
+    assert!(different_count < limit, "expected fewer than {limit} different pixels, got {different_count}");
 }
 
 #[test]

@@ -179,8 +179,8 @@ fn add_rest(rest: &[[f32; 12]], sums: &mut TileVertices) {
     }
 }
 
-/// Writes the world positions of a tile. `deformed` is x0 + u as `[axis][vertex]` with `width` vertices per axis, and is
-/// overwritten.
+/// Writes the world positions of a tile. `deformed` is x0 + u as `[axis][vertex]` with `width` vertices per axis, and
+/// is overwritten.
 #[inline(always)]
 fn store_positions(transform: &Transform, deformed: &mut TileVertices, width: usize, out: &mut [f32]) -> TileBounds {
     let t = transform.0;
@@ -200,8 +200,8 @@ fn store_positions(transform: &Transform, deformed: &mut TileVertices, width: us
     TileBounds::of_axes([&x[..count], &y[..count], &z[..count]])
 }
 
-/// Recomputes in f64 the positions that are not finite, because only an intermediate f32 may have overflowed. Returns the
-/// bounds of all positions.
+/// Recomputes in f64 the positions that are not finite, because only an intermediate f32 may have overflowed. Returns
+/// the bounds of all positions.
 #[cold]
 #[inline(never)]
 fn repair_non_finite(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32]) -> TileBounds {

@@ -22,7 +22,8 @@ pub(super) struct DecodeBf16;
 /// Decoder of int8.
 pub(super) struct DecodeInt8;
 
-// Closures are compiled without the CPU features that intrinsics need to be inlined, so no closure here calls intrinsics.
+// Closures are compiled without the CPU features that intrinsics need to be inlined, so no closure here calls
+// intrinsics.
 
 impl Decode<2> for DecodeF16 {
     #[inline(always)]
@@ -68,8 +69,8 @@ impl Decode<4> for DecodeInt8 {
     }
 }
 
-/// Shuffle masks that move each 16-bit entry of a group to the upper bits of a word. A mask has indices into the 16 bytes
-/// of a quad, and 0x80 for zero bytes.
+/// Shuffle masks that move each 16-bit entry of a group to the upper bits of a word. A mask has indices into the 16
+/// bytes of a quad, and 0x80 for zero bytes.
 const F16_SHUFFLE: [[u8; 32]; 2] = [shuffle_mask(2, 0), shuffle_mask(2, 1)];
 
 /// Shuffle masks that move each byte of a group to the lower bits of a word.
@@ -92,8 +93,8 @@ const fn shuffle_mask(size: u8, group: u8) -> [u8; 32] {
     shuffle_mask
 }
 
-/// Adds chunks of a tile to its sums, `[axis][vertex]`. A chunk has three planes and `MODES` scaled coordinates. A group
-/// has the entries of four vertices for one mode and axis.
+/// Adds chunks of a tile to its sums, `[axis][vertex]`. A chunk has three planes and `MODES` scaled coordinates. A
+/// group has the entries of four vertices for one mode and axis.
 #[inline(always)]
 pub(super) fn add<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CHUNKS: usize>(
     simd: V3,

@@ -1,8 +1,8 @@
 //! Normals and tangents that follow the deformed triangles. Twin: `reference/normals.rs`, which defines them.
 //!
 //! Each corner reads the ring of its group and sums in the order of the ring, so threads share nothing. Positions and
-//! results are f32. Sums are f64, in which differences and products of two f32 neither overflow nor underflow. This costs
-//! little, because reading the ring takes longer than the arithmetic.
+//! results are f32. Sums are f64, in which differences and products of two f32 neither overflow nor underflow. This
+//! costs little, because reading the ring takes longer than the arithmetic.
 
 use nalgebra::{Matrix3, Vector3};
 

@@ -1,4 +1,5 @@
-//! u = U q of one tile. Each coordinate of a vertex is a chain of fused multiply-adds over the modes in ascending order.
+//! u = U q of one tile. Each coordinate of a vertex is a chain of fused multiply-adds over the modes in ascending
+//! order.
 
 use super::decode::{self, Columns};
 #[cfg(target_arch = "x86_64")]

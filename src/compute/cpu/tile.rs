@@ -41,8 +41,8 @@ pub(super) struct WorkList {
 }
 
 impl WorkList {
-    /// Creates tiles of at most `max_items` items for domains with these numbers of items, in packed order. Each item is
-    /// in one tile.
+    /// Creates tiles of at most `max_items` items for domains with these numbers of items, in packed order. Each item
+    /// is in one tile.
     pub(super) fn new(item_counts: impl Iterator<Item = usize>, max_items: usize) -> Self {
         let (mut all_tiles, mut first_tiles, mut first_packed) = (Vec::new(), vec![0], 0);
         for (domain, count) in item_counts.enumerate() {

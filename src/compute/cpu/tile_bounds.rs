@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bounds_contain_all_positions_and_non_finite_ones_make_them_nan() {
+    fn bounds_contain_positions_and_are_nan_for_non_finite_ones() {
         let axes: [Vec<f32>; 3] = [0, 1, 2].map(|axis| (0..21).map(|index| (index * 8 % 21 + axis) as f32).collect());
         let bounds_of = |axes: &[Vec<f32>; 3]| TileBounds::of_axes([&axes[0], &axes[1], &axes[2]]);
         let tile_bounds = bounds_of(&axes);

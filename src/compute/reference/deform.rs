@@ -3,7 +3,8 @@
 use modalcast_model::domain::Shape;
 use modalcast_model::scene::{Scene, SceneState};
 
-/// World positions relative to the floating origins of their domains, three f64 per vertex, in the packed order of the scene's layout.
+/// World positions relative to the floating origins of their domains, three f64 per vertex, in the packed order of the
+/// scene's layout.
 pub fn deform(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
     let mut positions = Vec::with_capacity(scene.layout.vertices);
     for domain in 0..scene.domains.len() {

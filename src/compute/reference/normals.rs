@@ -1,11 +1,11 @@
 //! Normals and tangents that follow the deformed triangles. Twin of `kernels/normals.cu`.
 //!
 //! # Definition
-//! For each smoothing group (see [`modalcast_model::domain::SmoothingGroups`]), the area vectors (b - a) x (c - a) of its
-//! triangles are summed twice. The rest sum uses the rest positions and is transformed by the cofactors of A, as area
-//! vectors are. The current sum uses the positions x of this step. The exact normal is the rigid normal of
-//! `reference/rigid_normals.rs`, rotated by the smallest rotation that takes the direction of the rest sum to that of the
-//! current sum. It follows that
+//! For each smoothing group (see [`modalcast_model::domain::SmoothingGroups`]), the area vectors (b - a) x (c - a) of
+//! its triangles are summed twice. The rest sum uses the rest positions and is transformed by the cofactors of A, as
+//! area vectors are. The current sum uses the positions x of this step. The exact normal is the rigid normal of
+//! `reference/rigid_normals.rs`, rotated by the smallest rotation that takes the direction of the rest sum to that of
+//! the current sum. It follows that
 //! - at q = 0 it is the rigid normal, also if the author smoothed, weighted or tilted the rest normals;
 //! - where rest normals are those of the triangles, it is the area-weighted normal of the deformed triangles;
 //! - where rest normals oppose the winding, it is the opposite of that normal: a rotation that takes g to h takes -g to
@@ -24,15 +24,15 @@
 //! - its group has no area at rest, or areas that cancel;
 //! - the area of its group in this step is not above [`RESOLUTION`] times B.
 //!
-//! B is the sum of l (l + w) over both edges of each triangle. l is the sum of an edge's absolute components, and w that
-//! of the position of the group. Rounding positions to f32 moves an edge by at most 2^-23 (l + w), and so the sum of area
-//! vectors by at most 2^-23 B. For positions that were rounded once, the direction of the sum is therefore off by at
-//! most asin(2^-23 B / |sum|) < 1.8 degrees. A rotation that rounding alone could cause is not applied. A domain of one
-//! meter at 10^7 meters thus has rigid normals, unless the scene's origin is near it.
+//! B is the sum of l (l + w) over both edges of each triangle. l is the sum of an edge's absolute components, and w
+//! that of the position of the group. Rounding positions to f32 moves an edge by at most 2^-23 (l + w), and so the sum
+//! of area vectors by at most 2^-23 B. For positions that were rounded once, the direction of the sum is therefore off
+//! by at most asin(2^-23 B / |sum|) < 1.8 degrees. A rotation that rounding alone could cause is not applied. A domain
+//! of one meter at 10^7 meters thus has rigid normals, unless the scene's origin is near it.
 //!
 //! Close to half a turn the axis of the smallest rotation is ill-conditioned. Rest normals that differ from the
-//! geometric ones by an angle d may be off by 2 d there. At half a turn, the component perpendicular to the normal is not
-//! rotated.
+//! geometric ones by an angle d may be off by 2 d there. At half a turn, the component perpendicular to the normal is
+//! not rotated.
 
 use nalgebra::Vector3;
 
@@ -81,8 +81,8 @@ struct ShortestArc {
 }
 
 impl ShortestArc {
-    /// Applies the smallest rotation that takes `from` to `to`. The component parallel to `from` becomes parallel to `to`.
-    /// The perpendicular component is reflected at the plane perpendicular to the bisector.
+    /// Applies the smallest rotation that takes `from` to `to`. The component parallel to `from` becomes parallel to
+    /// `to`. The perpendicular component is reflected at the plane perpendicular to the bisector.
     fn rotate(&self, vector: Vector3<f64>) -> Vector3<f64> {
         let parallel = self.from.dot(&vector);
         let perpendicular = vector - self.from * parallel;

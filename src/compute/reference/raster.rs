@@ -1,13 +1,13 @@
 //! The reference rasterizer: plain loops over samples that define the result of `kernels/raster.cu`.
 //!
-//! Corners are transformed to clip space in f32; each sum and product is rounded separately. Triangles are clipped by the
-//! near plane and a guard band around the window (Sutherland and Hodgman, "Reentrant polygon clipping", 1974), and their
-//! corners are snapped to 1/256 pixel.
+//! Corners are transformed to clip space in f32; each sum and product is rounded separately. Triangles are clipped by
+//! the near plane and a guard band around the window (Sutherland and Hodgman, "Reentrant polygon clipping", 1974), and
+//! their corners are snapped to 1/256 pixel.
 //!
-//! Coverage is then exact, in integers: a triangle covers the samples on the inner side of all its edges. A sample on an
-//! edge belongs to the triangle for which it is a top or left edge, so triangles that share an edge cover each sample
-//! exactly once. Depth is z/w, linear in the window, in f32 from the exact edge values. Cut-outs cover only samples whose
-//! alpha is large enough ([`cut_out`]).
+//! Coverage is then exact, in integers: a triangle covers the samples on the inner side of all its edges. A sample on
+//! an edge belongs to the triangle for which it is a top or left edge, so triangles that share an edge cover each
+//! sample exactly once. Depth is z/w, linear in the window, in f32 from the exact edge values. Cut-outs cover only
+//! samples whose alpha is large enough ([`cut_out`]).
 
 pub mod cut_out;
 
@@ -231,8 +231,8 @@ fn is_outside(corners: &[[f32; 4]; 3]) -> bool {
     (0..3).any(|axis| is_beyond(axis, 1.0) || is_beyond(axis, -1.0))
 }
 
-/// Signed distance to a plane, not negative on the inner side. Plane 0 is the near plane, the others are the sides of the
-/// guard band.
+/// Signed distance to a plane, not negative on the inner side. Plane 0 is the near plane, the others are the sides of
+/// the guard band.
 fn plane_distance(window: &Viewport, [x, y, z, w]: &[f32; 4], plane: usize) -> f32 {
     let [guard_x, guard_y] = window.guard_band().map(|guard| guard * w);
     [z + w, guard_x - x, guard_x + x, guard_y - y, guard_y + y][plane]

@@ -1,5 +1,5 @@
-//! Rigid normals, transformed by the inverse transpose of A, and tangents, transformed by A. Both have unit length. Twin
-//! of `kernels/rigid_normals.cuh`.
+//! Rigid normals, transformed by the inverse transpose of A, and tangents, transformed by A. Both have unit length.
+//! Twin of `kernels/rigid_normals.cuh`.
 
 use nalgebra::{Matrix3, Vector3};
 

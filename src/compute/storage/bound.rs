@@ -8,9 +8,9 @@
 //! Product, 2005, proposition 5.5), plus 5 k 2^-149.
 //!
 //! T of a follower is a product T_m F of the transform T_m of its root and its frame F. [`ComposedTransform::to_f32`]
-//! defines its rounding: three roundings per entry. The error of an entry of the linear part is at most gamma_3 |T_m| |F|.
-//! The error of the translation is at most gamma_3 (|T_m| |f| + |t_m|), where f and t_m are the translations of F and
-//! T_m.
+//! defines its rounding: three roundings per entry. The error of an entry of the linear part is at most
+//! gamma_3 |T_m| |F|. The error of the translation is at most gamma_3 (|T_m| |f| + |t_m|), where f and t_m are the
+//! translations of F and T_m.
 //!
 //! A bound is a length, the maximum error of a vertex position in scene units. It holds for sums without overflow, and
 //! is infinite where q times a factor overflows f32.
@@ -221,8 +221,8 @@ fn frame_rounding_error(transform: &ComposedTransform) -> FrameError {
     }
 }
 
-/// Upper bound of `||A||_2` for the exact A and for A as deformers round it. The bound is too large by at most a relative
-/// 1e-7, and for a follower also by the rounding error of the product with its frame.
+/// Upper bound of `||A||_2` for the exact A and for A as deformers round it. The bound is too large by at most a
+/// relative 1e-7, and for a follower also by the rounding error of the product with its frame.
 pub fn norm(transform: &ComposedTransform) -> f64 {
     (spectral_norm(&transform.to_f32()) + frame_rounding_error(transform).linear) * ROUND_UP
 }

@@ -17,8 +17,8 @@ pub(super) fn rest_quad(vertices: &[[f32; 3]]) -> [f32; 12] {
 }
 
 /// Factors 2^s per mode such that the largest stored entry lies in [2^14, 2^15) for `F16`, in [1, 2) for `Bf16`; 1 for
-/// a mode of zeros. s is at least -149, where 2^s is the smallest f32. Columns below 2^-135 therefore have smaller stored
-/// entries, without loss of precision.
+/// a mode of zeros. s is at least -149, where 2^s is the smallest f32. Columns below 2^-135 therefore have smaller
+/// stored entries, without loss of precision.
 pub(super) fn factors(modes: &Modes, storage: StorageType) -> Vec<f32> {
     let stored_exponent = match storage {
         StorageType::F16 => 14,

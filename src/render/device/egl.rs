@@ -41,8 +41,8 @@ const REMEDY: &str = "Install libegl1 with libegl-mesa0 and libgl1-mesa-dri (Mes
 static CONTEXT_LOCK: Mutex<()> = Mutex::new(());
 
 thread_local! {
-    /// The context that is current on this thread; dangling if there is none or if the current context is unknown. It has
-    /// no destructor, so that it is also valid while other thread-local values are dropped.
+    /// The context that is current on this thread; dangling if there is none or if the current context is unknown. It
+    /// has no destructor, so that it is also valid while other thread-local values are dropped.
     static CURRENT_CONTEXT: ManuallyDrop<RefCell<Weak<ContextHandle>>> =
         const { ManuallyDrop::new(RefCell::new(Weak::new())) };
 }
@@ -73,9 +73,9 @@ pub(crate) struct Context {
     pub(crate) is_debug: bool,
 }
 
-/// Keeps a context current on this thread. When the guard is dropped, also by a panic that unwinds, the previous context
-/// becomes current again. If there was none, the context stays current, because each switch flushes the commands of the
-/// device.
+/// Keeps a context current on this thread. When the guard is dropped, also by a panic that unwinds, the previous
+/// context becomes current again. If there was none, the context stays current, because each switch flushes the
+/// commands of the device.
 #[derive(Debug)]
 #[must_use = "the previous context becomes current again when the guard is dropped"]
 pub(crate) struct CurrentContext {
@@ -168,7 +168,8 @@ impl EglApi {
     /// The display of a device, or of the surfaceless platform.
     fn display(&self, platform: u32, native_display: EglHandle) -> Option<egl::Display> {
         let empty_attributes = [egl::NONE];
-        // SAFETY: `native_display` is a device of eglQueryDevicesEXT, or null for the surfaceless platform; NONE ends the list.
+        // SAFETY: `native_display` is a device of eglQueryDevicesEXT, or null for the surfaceless platform; NONE ends
+        // the list.
         let display = unsafe { self.platform_display?(platform, native_display, empty_attributes.as_ptr()) };
         // SAFETY: EGL created the display, and this process never terminates it.
         (!display.is_null()).then(|| unsafe { egl::Display::from_ptr(display) })

@@ -1,11 +1,11 @@
-//! Thin layer over OpenGL: typed objects that free themselves (`gl/object.rs`), and the few commands that the passes
+//! Thin layer over OpenGL: typed objects that delete themselves (`gl/object.rs`), and the commands that the passes
 //! need. No other module calls OpenGL.
 //!
 //! Each object keeps its context alive. Each command makes the context current, so that several renderers can share a
 //! thread. Callers that issue many commands hold a guard of [`Gl::make_current`]: the commands then do not switch.
 //!
-//! Commands that return nothing report their errors as OpenGL does: the next [`Gl::check`] returns the first of them. A
-//! command whose arguments are wrong, or whose context cannot be made current, is not issued.
+//! Commands that return nothing report their errors as OpenGL does: the next [`Gl::check`] returns the first error. A
+//! command is not issued if its arguments are invalid or its context cannot be made current.
 //!
 //! Object names stay private. Other APIs get a [`GlBuffer`](modalcast_model::raster::GlBuffer), which keeps the buffer
 //! alive.
@@ -51,11 +51,11 @@ type GetResetStatus = unsafe extern "system" fn() -> u32;
 
 /// An OpenGL context and its functions.
 pub(crate) struct Gl {
-    /// Taken by `drop`.
+    /// Dropped by `drop`, or leaked.
     functions: ManuallyDrop<glow::Context>,
     context: Context,
     pub(crate) limits: Limits,
-    /// glGetGraphicsResetStatus, where the context has it.
+    /// glGetGraphicsResetStatus; `None` if the context does not have it.
     reset_status: Option<GetResetStatus>,
     /// The first error of a command that was not issued since the last check.
     skipped_error: RefCell<Option<String>>,
@@ -63,13 +63,13 @@ pub(crate) struct Gl {
     is_leak_logged: Cell<bool>,
     /// Pool of timer queries that are not in use.
     free_queries: RefCell<Vec<glow::Query>>,
-    /// Buffers that will be freed once their readers are done.
+    /// Buffers of dropped staging buffers. They are freed once their readers are done.
     retired_buffers: RefCell<Vec<staging::RetiredBuffer>>,
 }
 
 /// Keeps a context current on this thread, so that commands can be issued without a switch. Dropping the guard restores
-/// the previous context. If a panic unwinds, the guard also discards the errors of the interrupted commands, so that the
-/// next check does not report them for other commands.
+/// the previous context. If a panic unwinds, the guard also discards the errors of the interrupted commands, so that
+/// the next check does not report them for other commands.
 #[derive(Debug)]
 #[must_use = "the previous context becomes current again when the guard is dropped"]
 pub(crate) struct CurrentGl {
@@ -101,8 +101,8 @@ impl Drop for CurrentGl {
 
 impl Drop for Gl {
     fn drop(&mut self) {
-        // Dropping the functions removes their debug callback from the current context, so this context must be current.
-        // If it is not, functions and callback leak, because the driver may still call the callback.
+        // Dropping the functions removes their debug callback from the current context, so this context must be
+        // current. If it is not, functions and callback leak, because the driver may still call the callback.
         match self.context.make_current() {
             // SAFETY: dropped once, here, and not used afterwards.
             Ok(_current) => unsafe { ManuallyDrop::drop(&mut self.functions) },

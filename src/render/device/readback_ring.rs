@@ -36,8 +36,8 @@ impl ReadbackRing {
         Rc::new(Self { gl: Rc::clone(gl), bytes, allocated: Cell::new(0), free: RefCell::default() })
     }
 
-    /// Takes a free staging buffer for a frame, or allocates one. If the ring is full, this waits at most `limit` for the
-    /// reader of the oldest buffer without a frame in flight.
+    /// Takes a free staging buffer for a frame, or allocates one. If the ring is full, this waits at most `limit` for
+    /// the reader of the oldest buffer without a frame in flight.
     ///
     /// # Errors
     /// `Busy` when all buffers have frames in flight or the reader exceeds `limit`; `Fault` of OpenGL.

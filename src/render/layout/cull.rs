@@ -39,11 +39,11 @@ const TOTALS_OFFSET: usize = COMMAND_WORDS * MAX_GROUPS + 2;
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(crate) struct CullUniforms {
-    /// First triangle, number of triangles, first workgroup, first block.
+    /// Per group: first triangle, number of triangles, first workgroup, first block.
     ranges: [[u32; 4]; MAX_GROUPS],
-    /// Whether the group is single-sided, and whether it reads only vertices.
+    /// Per group: whether it is single-sided, and whether it reads only vertices.
     flags: [[u32; 4]; MAX_GROUPS],
-    /// Numbers of groups, workgroups and blocks.
+    /// Numbers of groups, workgroups and blocks. Blocks are padded to super blocks.
     count: [u32; 4],
     /// Step of the rasterizer's subpixel grid, in pixels.
     subpixel_step: [f32; 4],

@@ -46,7 +46,8 @@ pub(crate) const WORKGROUP_SIZE: u32 = 64;
 pub(crate) const TILE: u32 = 8;
 /// Number of workgroups in a row of the dispatch over listed tiles.
 pub(crate) const TILE_ROW: u32 = 64;
-/// Header of an empty tile list: the workgroup counts of the indirect dispatch (TILE_ROW, 0 rows, 1), and the tile count.
+/// Header of an empty tile list: the workgroup counts of the indirect dispatch (TILE_ROW, 0 rows, 1), and the tile
+/// count.
 pub(crate) const EMPTY_TILE_LIST: [u32; 4] = [TILE_ROW, 0, 1, 0];
 
 /// Bytes of the tile list of an image: [`EMPTY_TILE_LIST`], then one word per tile.

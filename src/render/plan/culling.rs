@@ -14,7 +14,8 @@ const MIN_TRIANGLES: usize = 1 << 20;
 /// Selects the culling method of a scene on a device: the method of the look, or for `Auto` the faster one. `None` if
 /// the lists exceed the largest buffer of the device.
 ///
-/// Milliseconds per frame on hardware (H200, 1080p). The almond tree has double-sided leaves and four samples per pixel.
+/// Milliseconds per frame on hardware (H200, 1080p). The almond tree has double-sided leaves and four samples per
+/// pixel.
 ///
 /// | scene | triangles | `None` | `Triangles` | `Occlusion` |
 /// |---|---:|---:|---:|---:|
@@ -22,8 +23,8 @@ const MIN_TRIANGLES: usize = 1 << 20;
 /// | field | 262,144 | 2.04 | 2.08 | 2.76 |
 /// | almond tree | 37,560 | 1.57 | 1.59 | 2.09 |
 ///
-/// In software, culling is slower: on two cores, the visibility pass of the almond tree (1080p, four samples) takes 80 ms
-/// with `None`, 83 ms with `Triangles`, which culls 3 % of the triangles, and four times as long with `Occlusion`.
+/// In software, culling is slower: on two cores, the visibility pass of the almond tree (1080p, four samples) takes 80
+/// ms with `None`, 83 ms with `Triangles`, which culls 3 % of the triangles, and four times as long with `Occlusion`.
 pub(crate) fn select_culling(scene: &Scene, limits: &Limits) -> Culling {
     let software = limits.software;
     let selected = match scene.look.culling {

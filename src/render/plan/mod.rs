@@ -1,6 +1,6 @@
 //! Plan of the device resources of a scene: buffers, textures, passes and shader defines. It is derived once from the
-//! scene's [`modalcast_model::scene::SceneFeatures`]. It also lists the omitted features, and the savings of each omission
-//! compared with a scene that uses every feature.
+//! scene's [`modalcast_model::scene::SceneFeatures`]. It also lists the omitted features, and the savings of each
+//! omission compared with a scene that uses every feature.
 //!
 //! The renderer allocates and compiles exactly the resources of the plan. Planning needs no device.
 

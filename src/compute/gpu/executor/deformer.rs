@@ -52,8 +52,8 @@ pub struct CudaDeformer {
     kernels: StepKernels,
     inputs: StepInputs,
     output: OutputBuffers,
-    /// u, if the scene keeps displacements. One buffer is sufficient for all output sets, because displacements are read
-    /// before the next step is submitted. The same holds for boxes.
+    /// u, if the scene keeps displacements. One buffer is sufficient for all output sets, because displacements are
+    /// read before the next step is submitted. The same holds for boxes.
     displacements: Option<DeviceBuffer>,
     output_ring: OutputRing,
     /// Steps in flight, oldest first.
@@ -123,8 +123,8 @@ impl CudaDeformer {
         })
     }
 
-    /// The compiled kernels and allocated buffers. The plan excludes memory that is allocated on demand: the second output
-    /// set (vertices are fetched concurrently with a step), and the second ring slot (two steps are in flight).
+    /// The compiled kernels and allocated buffers. The plan excludes memory that is allocated on demand: the second
+    /// output set (vertices are fetched concurrently with a step), and the second ring slot (two steps are in flight).
     pub const fn plan(&self) -> &DeformPlan {
         &self.plan
     }
@@ -142,8 +142,8 @@ impl CudaDeformer {
     /// Starts a step without waiting for the steps in flight. [`Self::finish`] waits for the oldest step.
     ///
     /// # Errors
-    /// `Busy` when [`MAX_STEPS_IN_FLIGHT`] steps are already in flight; `Fault` of the device, after which no step is in
-    /// flight.
+    /// `Busy` when [`MAX_STEPS_IN_FLIGHT`] steps are already in flight; `Fault` of the device, after which no step is
+    /// in flight.
     pub fn submit(&mut self, state: &SceneState) -> Result<()> {
         if self.in_flight.len() == MAX_STEPS_IN_FLIGHT {
             return Err(Error::Busy { queue: "steps in flight", limit: MAX_STEPS_IN_FLIGHT });
@@ -371,8 +371,8 @@ impl Deformer for CudaDeformer {
         Ok(self.surface.surface())
     }
 
-    /// Copies positions and normals concurrently with the next step. The copies of displacements and boxes, of which the
-    /// device has only one buffer each, are complete when this returns.
+    /// Copies positions and normals concurrently with the next step. The copies of displacements and boxes, of which
+    /// the device has only one buffer each, are complete when this returns.
     fn readback(&mut self, attributes: VertexAttributes) -> Result<VertexReadback> {
         if let Some((_, readback)) = self.readback.as_ref().filter(|(copied, _)| copied.contains(attributes)) {
             return Ok(readback.clone());
@@ -393,7 +393,8 @@ impl Deformer for CudaDeformer {
 
 impl Drop for CudaDeformer {
     fn drop(&mut self) {
-        // Wait, because the device uses memory that is freed next. After a fault the call fails, but then no kernel runs.
+        // Wait, because the device uses memory that is freed next. After a fault the call fails, but then no kernel
+        // runs.
         self.device.stream().synchronize().ok();
         self.readbacks.synchronize();
     }

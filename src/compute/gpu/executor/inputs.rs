@@ -113,8 +113,8 @@ impl StepInputs {
     /// Starts the copy of a part of `staging` to the device, on the device's stream, so that a graph can capture it.
     ///
     /// # Safety
-    /// `staging` is neither written nor dropped before the copy has ended. If the copy is captured in a graph, this holds
-    /// for each launch of the graph, and `self` exists until the last launch has ended.
+    /// `staging` is neither written nor dropped before the copy has ended. If the copy is captured in a graph, this
+    /// holds for each launch of the graph, and `self` exists until the last launch has ended.
     ///
     /// # Errors
     /// `Fault` when `staging` is not a staging buffer of these inputs, or when the device fails.

@@ -85,15 +85,15 @@ impl GlInterop {
     }
 }
 
-/// An OpenGL buffer that CUDA may map; unregistered on drop. Its handle keeps the buffer and its context alive until then,
-/// and keeps this type on the thread of the context.
+/// An OpenGL buffer that CUDA may map; unregistered on drop. The buffer's owner keeps the buffer and its context alive.
+/// It is not `Send`, so this type stays on the thread of the context.
 #[derive(Debug)]
 pub(super) struct RegisteredBuffer {
     resource: CUgraphicsResource,
     buffer: GlBuffer,
     /// The access that was last announced to the driver; `None` before the first mapping and after a failure.
     map_flags: Option<MapAccess>,
-    /// Whether the buffer is mapped; outside of [`with_mapped`] only if the last unmap failed.
+    /// Whether the buffer is mapped. Outside of [`with_mapped`], this is true only if the last unmap failed.
     is_mapped: Cell<bool>,
     context: Arc<CudaContext>,
 }
@@ -147,7 +147,7 @@ impl RegisteredBuffer {
 
 impl Drop for RegisteredBuffer {
     fn drop(&mut self) {
-        // Errors are ignored: no cleanup remains, and a failed device reports its error at the next call.
+        // Ignore errors: there is no other cleanup, and a failed device reports its error at the next call.
         let _current = CurrentContext::enter(&self.context);
         let _gl = self.buffer.owner.make_current();
         // SAFETY: the resource was registered once and is unregistered once.
@@ -191,8 +191,8 @@ pub(super) fn with_mapped(
         || work(&addresses()?),
         || {
             let count = resources.len() as c_uint;
-            // SAFETY: the resources were mapped above. The device work that `work` submitted completes before OpenGL uses
-            // the buffers.
+            // SAFETY: the resources were mapped above. The device work that `work` submitted completes before OpenGL
+            // uses the buffers.
             unsafe { sys::cuGraphicsUnmapResources(count, resources.as_mut_ptr(), device.stream().cu_stream()) }
                 .result()
                 .map_err(cuda_error(STAGE))

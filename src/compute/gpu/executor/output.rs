@@ -166,8 +166,8 @@ impl OutputBuffers {
             return buffers.tangents.as_ref().map_or(Ok(()), |buffer| buffer.read(device, 0, tangents));
         }
         self.with_addresses(device, OutputAccess { set, access: MapAccess::Read }, |addresses| {
-            // SAFETY: each mapping checks that the outputs have the bytes of the plan. The lists have these sizes or are
-            // empty.
+            // SAFETY: each mapping checks that the outputs have the bytes of the plan. The lists have these sizes or
+            // are empty.
             unsafe {
                 download(device, addresses.positions, positions)?;
                 download(device, addresses.normals, normals)?;

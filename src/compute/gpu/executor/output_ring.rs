@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn without_readbacks_steps_write_only_their_changes_to_one_output() {
+    fn steps_without_readbacks_write_only_changes_to_one_output() {
         let mut output_ring = OutputRing::new(2, 10);
         let targets: Vec<StepTarget> = (1..5).map(|serial| step(&mut output_ring, &state(serial, &[3]))).collect();
         assert_eq!(targets[0].dirty_domains, None, "expected a full first step");

@@ -19,6 +19,7 @@ pub(super) struct SurfaceLengths {
 /// A surface whose large lists are page-locked. The lists keep their lengths, because a page lock covers a fixed range.
 pub(super) struct PinnedSurface {
     surface: Arc<DeformedSurface>,
+    /// The page locks of the lists of `surface`.
     locks: Vec<PageLock>,
 }
 
@@ -82,6 +83,7 @@ impl PinnedSurface {
         Arc::strong_count(&self.surface) == 1
     }
 
+    /// A mutable reference to the surface, if there is no other reference.
     fn exclusive(surface: &mut Arc<DeformedSurface>) -> Result<&mut DeformedSurface> {
         let in_use = || Error::Fault { stage: "fetch", reason: "expected no reader of the surface".into() };
         Arc::get_mut(surface).ok_or_else(in_use)

@@ -134,7 +134,9 @@ pub struct RasterPass<'a> {
 #[derive(Debug)]
 pub struct RasterPipeline {
     triangles: DeviceBuffer,
+    /// Triangles that a warp draws.
     medium_queue: DeviceBuffer,
+    /// Triangles that are divided into tiles.
     large_queue: DeviceBuffer,
     counters: DeviceBuffer,
     cut_outs: Option<CutOutBuffers>,
@@ -172,9 +174,9 @@ impl RasterPipeline {
     /// Clears the target and draws into it, on the device's stream.
     ///
     /// # Safety
-    /// [`check_mesh`] accepted this mesh and the groups of the pass for the number of vertices at `positions`. `positions`
-    /// and `target` are addresses of device memory with the sizes that [`RasterPass`] states. This memory exists until
-    /// the pass has ended.
+    /// [`check_mesh`] accepted this mesh and the groups of the pass for the number of vertices at `positions`.
+    /// `positions` and `target` are addresses of device memory with the sizes that [`RasterPass`] states. This memory
+    /// exists until the pass has ended.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -267,8 +269,8 @@ impl RasterPipeline {
         let counters = (self.counters.address(), 0, size_of::<RasterCounters>() as u64 / 4);
         for (buffer, word, words) in [(pass.target, empty_sample, words), counters] {
             let stream = device.stream().cu_stream();
-            // SAFETY: the counters are one `RasterCounters`, and the caller guarantees the target. The stream orders the
-            // writes before their readers.
+            // SAFETY: the counters are one `RasterCounters`, and the caller guarantees the target. The stream orders
+            // the writes before their readers.
             let result = unsafe { sys::cuMemsetD32Async(buffer, word, words as usize, stream) };
             result.result().map_err(cuda_error("raster"))?;
         }

@@ -94,8 +94,8 @@ struct ReadbackSource {
 }
 
 impl ReadbackPool {
-    /// Starts the copy of the requested positions and normals. Meanwhile `copy_other_lists` fills the other lists. If it
-    /// fails or panics, the copy has ended before this returns.
+    /// Starts the copy of the requested positions and normals. Meanwhile `copy_other_lists` fills the other lists. If
+    /// it fails or panics, the copy has ended before this returns.
     pub(super) fn start(
         &mut self,
         device: &Device,
@@ -112,15 +112,16 @@ impl ReadbackPool {
         let slot = &mut self.slots[slot_index];
         let lists = slot.surface.lists()?;
         lists.boxes.clear();
-        // While the device writes positions and normals, no reference to these lists exists: `lists` is not used for them
-        // again, and readers get the surface from `wait`.
+        // While the device writes positions and normals, no reference to these lists exists: `lists` is not used for
+        // them again, and readers get the surface from `wait`.
         let stream_guard = match (source, &self.stream) {
             (Some(source), Some(copy_stream)) => {
                 let guard = WaitForStream::new(copy_stream);
                 for (source_address, target) in [(source.positions, lists.positions), (source.normals, lists.normals)] {
-                    // SAFETY: the outputs have the bytes of the plan, and each list has that length or is empty. The slot
-                    // owns the lists. It is dropped or reused only after its event `ready` has completed or the stream is
-                    // synchronized. If this fails before the event is recorded, the guard synchronizes the stream.
+                    // SAFETY: the outputs have the bytes of the plan, and each list has that length or is empty. The
+                    // slot owns the lists. It is dropped or reused only after its event `ready` has completed or the
+                    // stream is synchronized. If this fails before the event is recorded, the guard synchronizes the
+                    // stream.
                     unsafe { copy(source_address, target, copy_stream) }?;
                 }
                 slot.ready.record(copy_stream).map_err(cuda_error(STAGE))?;
@@ -191,8 +192,8 @@ impl ReadbackPool {
         output.with_addresses(device, OutputAccess { set: request.set, access: MapAccess::Read }, |outputs| {
             let copies = [outputs.positions, outputs.normals].into_iter().zip(copy_addresses).zip(bytes);
             for ((output_address, copy_address), bytes) in copies.filter(|(_, bytes)| *bytes > 0) {
-                // SAFETY: outputs and back buffer have the bytes of the plan for each requested list. Both live until the
-                // stream is synchronized.
+                // SAFETY: outputs and back buffer have the bytes of the plan for each requested list. Both live until
+                // the stream is synchronized.
                 unsafe { result::memcpy_dtod_async(copy_address, output_address, bytes, device.stream().cu_stream()) }
                     .map_err(cuda_error(STAGE))?;
             }

@@ -28,9 +28,9 @@ pub(super) struct StepKernels {
     pub apply: Option<ApplyKernel>,
 }
 
-/// Pinned memory of a step, and its graphs. The graphs refer to this memory and to the buffers of the deformer. Only the
-/// deformer launches them. It owns all of this memory and waits for its steps before it drops anything. An idle graph
-/// accesses no memory, so the order in which the fields are dropped does not matter.
+/// Pinned memory of a step, and its graphs. The graphs refer to this memory and to the buffers of the deformer. Only
+/// the deformer launches them. It owns all of this memory and waits for its steps before it drops anything. An idle
+/// graph accesses no memory, so the order in which the fields are dropped does not matter.
 pub(super) struct StepSlot {
     full_graph: CudaGraph,
     /// Graph of a partial step.

@@ -1,11 +1,11 @@
-//! The alpha test of cut-outs, sample by sample: defines the result of `kernels/cut_out.cuh`.
+//! The alpha test of cut-outs for one sample. It defines the result of `kernels/cut_out.cuh`.
 //!
 //! The texture coordinates of a sample are weighted sums of those of the corners. The weights are the edge functions of
 //! the corners in homogeneous coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous
-//! coordinates", 1997): perspective-correct without clipping, also for corners behind the eye. The corners are first
-//! taken relative to the sample, so that a small triangle far from the center keeps its precision. All numbers are f32;
-//! each sum and product is rounded separately, in the order of the kernel. The image is then filtered trilinearly. The
-//! hardware filters with lower precision, and anisotropically if requested.
+//! coordinates", 1997), which are perspective-correct without clipping, also for corners behind the eye. First, the
+//! position of the sample is subtracted from the corners, which avoids cancellation for small triangles far from the
+//! center. All numbers are f32; each sum and product is rounded separately, in the order of the kernel. The image is
+//! then filtered trilinearly. The hardware filters with lower precision, and anisotropically if requested.
 
 use modalcast_model::raster::{AlphaImage, CutOuts};
 use modalcast_model::scene::Viewport;
@@ -18,8 +18,8 @@ pub struct Footprint {
     pub duv_dy: [f32; 2],
 }
 
-/// The footprint of a pixel's sample on a triangle with these corners in clip space. Zeros if it is not finite, which may
-/// occur where w is outside 2^-50 to 2^50.
+/// The footprint of a pixel's sample on a triangle with these corners in clip space. Zeros if it is not finite, which
+/// may occur where w is outside 2^-50 to 2^50.
 pub fn footprint(
     window: &Viewport,
     corners: &[[f32; 4]; 3],
@@ -76,7 +76,7 @@ pub(super) fn passes_alpha_test(
     alpha(cut_outs, triangle, &footprint) >= material.cutoff
 }
 
-/// Trilinear filtering: the two mip levels are those whose texels are about as long as the footprint's longer side.
+/// Trilinear filtering between the two mip levels whose texels are about as long as the footprint's longer side.
 fn sample_trilinear(image: &AlphaImage, footprint: &Footprint) -> f32 {
     let size = [image.width as f32, image.height as f32];
     let length = |derivative: [f32; 2]| (derivative[0] * size[0]).hypot(derivative[1] * size[1]);

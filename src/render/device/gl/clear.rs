@@ -39,7 +39,7 @@ enum ClearValue {
 }
 
 impl Gl {
-    /// Binds a framebuffer, clears it and sets the scissor, so that later draws affect only `region`.
+    /// Binds a framebuffer, clears it as `clear` states and sets the scissor, so that later draws affect only `region`.
     pub(crate) fn begin_pass(&self, framebuffer: &Framebuffer, region: Region, clear: ClearOp<'_>) {
         let Some(gl) = self.functions_or_skip() else { return };
         let [width, height] = region.frame().map(|side| side as i32);

@@ -119,9 +119,9 @@ mod tests {
         }
     }
 
-    /// With a single subscriber in the process, `tracing` caches whether a callsite is enabled. The thread that reaches the
-    /// callsite first decides, so another test without a log would disable it. With two subscribers, `tracing` asks each
-    /// thread. The callsite is registered before the second subscriber is created.
+    /// With a single subscriber in the process, `tracing` caches whether a callsite is enabled. The thread that reaches
+    /// the callsite first decides, so another test without a log would disable it. With two subscribers, `tracing` asks
+    /// each thread. The callsite is registered before the second subscriber is created.
     fn register_second_subscriber() {
         static SECOND_SUBSCRIBER: OnceLock<Dispatch> = OnceLock::new();
         is_enabled();
@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn severities_sources_and_types_have_the_names_of_the_specification() {
+    fn sources_and_types_have_the_names_of_the_specification() {
         assert_eq!(name_of_source(glow::DEBUG_SOURCE_SHADER_COMPILER), "shader compiler");
         assert_eq!((name_of_type(glow::DEBUG_TYPE_PERFORMANCE), name_of_type(0)), ("performance", "other"));
     }

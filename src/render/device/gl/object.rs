@@ -300,8 +300,8 @@ impl Texture {
 }
 
 impl Program {
-    /// Makes the program current. `number`, for example the first triangle, is the uniform at location 0 of programs that
-    /// declare it.
+    /// Makes the program current. `number`, for example the first triangle, is the uniform at location 0 of programs
+    /// that declare it.
     pub(crate) fn bind(&self, number: Option<u32>) {
         let Some(gl) = self.gl.functions_or_skip() else { return };
         // SAFETY: a linked program.

@@ -8,8 +8,8 @@ use glow::HasContext as _;
 use super::Gl;
 use modalcast_model::error::{Result, fault_in};
 
-/// Measures the time of a sequence of commands. On hardware this is a timer query. Timer queries of software rasterizers
-/// are meaningless, so there the wall clock measures the commands between two waits.
+/// Measures the time of a sequence of commands. On hardware this is a timer query. Timer queries of software
+/// rasterizers are meaningless, so there the wall clock measures the commands between two waits.
 #[derive(Debug)]
 pub(crate) enum PassTimer {
     /// Milliseconds by the wall clock.
@@ -26,8 +26,8 @@ impl Gl {
         self.fence(stage)?.wait(stage, limit)
     }
 
-    /// Runs the commands of a pass and measures their device time. A software rasterizer waits for the commands, at most
-    /// `limit`. Each timer has its own query until it is dropped, so that several frames can be in flight.
+    /// Runs the commands of a pass and measures their device time. A software rasterizer waits for the commands, at
+    /// most `limit`. Each timer has its own query until it is dropped, so that several frames can be in flight.
     ///
     /// # Errors
     /// Those of the commands; `Fault` of the pass when a software rasterizer exceeds `limit`.
@@ -60,8 +60,8 @@ impl Gl {
     }
 }
 
-/// A timer query that has begun. Dropping this value ends the query, also if the commands fail or panic, so that the next
-/// query can begin.
+/// A timer query that has begun. Dropping this value ends the query, also if the commands fail or panic, so that the
+/// next query can begin.
 struct ActiveQuery<'a> {
     gl: &'a Gl,
 }

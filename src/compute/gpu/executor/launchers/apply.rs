@@ -87,8 +87,8 @@ impl ApplyKernel {
             tile_list: deform.tile_list(),
         };
         // SAFETY: the kernel's only argument is an `ApplyArgs`. Pinned memory has the same address on host and device
-        // (unified addressing). The lists refer to domains and coordinates of the scene of the buffers. The caller keeps
-        // lists and buffers.
+        // (unified addressing). The lists refer to domains and coordinates of the scene of the buffers. The caller
+        // keeps lists and buffers.
         unsafe { launch_kernel(device, &self.function, self.config, LaunchOrder::Serial, &args) }
     }
 }

@@ -1,5 +1,6 @@
 //! Launches `kernels/bounds.cu`, which reduces the boxes of `deform` to the bounds of all positions. It also computes
-//! the bounds along the bounding axes of the deformer if it has any, and the box of each domain if the scene keeps boxes.
+//! the bounds along the bounding axes of the deformer if it has any, and the box of each domain if the scene keeps
+//! boxes.
 
 use cudarc::driver::{CudaFunction, LaunchConfig};
 
@@ -75,8 +76,8 @@ impl BoundsKernel {
             reserved: 0,
         };
         // SAFETY: the kernel's only argument is a `BoundsArgs`. `boxes` has six words for each of `count` boxes, and
-        // `segment_boxes` has six for each segment. Segments refer to boxes, vertices and domains of the same scene. The
-        // kernel calls `wait_for_prerequisite_grids` before it accesses memory.
+        // `segment_boxes` has six for each segment. Segments refer to boxes, vertices and domains of the same scene.
+        // The kernel calls `wait_for_prerequisite_grids` before it accesses memory.
         unsafe { launch_kernel(device, &self.function, self.config, LaunchOrder::Dependent, &args) }
     }
 }

@@ -235,10 +235,10 @@ impl DeformKernel {
             tile_count: self.full_step_tiles,
             reserved: 0,
         };
-        // SAFETY: the kernel's only argument is a `DeformArgs`. The tables come from `WorkList`, whose tiles lie inside the
-        // words, x0, normals, transforms and q of the same scene, and the list contains only such tiles. There are four
-        // boxes per tile, at least one for each warp. Tangents and corner offsets are read only by a kernel that was
-        // compiled for a scene that has them. The caller guarantees the outputs.
+        // SAFETY: the kernel's only argument is a `DeformArgs`. The tables come from `WorkList`, whose tiles lie inside
+        // the words, x0, normals, transforms and q of the same scene, and the list contains only such tiles. There are
+        // four boxes per tile, at least one for each warp. Tangents and corner offsets are read only by a kernel that
+        // was compiled for a scene that has them. The caller guarantees the outputs.
         unsafe { launch_kernel(device, function, config, LaunchOrder::Serial, &args) }
     }
 }

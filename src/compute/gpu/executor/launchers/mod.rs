@@ -1,5 +1,5 @@
-//! The launchers of the kernels of a step: one file per kernel, with its name. A launcher owns the constant tables of its
-//! kernel on the device.
+//! The launchers of the kernels of a step: one file per kernel, with its name. A launcher owns the constant tables of
+//! its kernel on the device.
 //!
 //! The launch functions are unsafe, because the header of a step's values contains the addresses of its outputs
 //! (`Header`), which only the caller knows.

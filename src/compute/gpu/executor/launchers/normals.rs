@@ -90,11 +90,11 @@ impl NormalsKernel {
             group_count: self.group_count,
             reserved: 0,
         };
-        // SAFETY: the kernel's only argument is a `NormalsArgs`, and the kernel calls `wait_for_prerequisite_grids` before it
-        // accesses memory. The tables come from `NormalTables`: corners refer to groups, rings refer to vertices of
-        // their shape, and slots lie inside the rest normals, tangents, positions and transforms of the same scene.
-        // Tangents are read and written only by a kernel that was compiled for a scene with normal maps. The caller
-        // guarantees the outputs.
+        // SAFETY: the kernel's only argument is a `NormalsArgs`, and the kernel calls `wait_for_prerequisite_grids`
+        // before it accesses memory. The tables come from `NormalTables`: corners refer to groups, rings refer to
+        // vertices of their shape, and slots lie inside the rest normals, tangents, positions and transforms of the
+        // same scene. Tangents are read and written only by a kernel that was compiled for a scene with normal maps.
+        // The caller guarantees the outputs.
         unsafe { launch_kernel(device, &self.function, self.config, LaunchOrder::Dependent, &args) }
     }
 }

@@ -1,4 +1,4 @@
-//! The compute rasterizer on OpenGL's buffers, which can replace OpenGL's own passes of depth and ids.
+//! The compute rasterizer on OpenGL's buffers. It can replace OpenGL's depth pass and id pass.
 
 use std::sync::Arc;
 
@@ -14,8 +14,8 @@ use modalcast_model::scene::{CullMode, DrawRange};
 /// Bytes of a vertex position.
 const POSITION_BYTES: u64 = 12;
 
-/// Draws one mesh with CUDA. It stays on the thread that created it, which owns the OpenGL context. Dropping it waits for
-/// all passes before any memory that they use is released.
+/// Draws one mesh with CUDA. It stays on the thread that created it, which owns the OpenGL context. Dropping it waits
+/// for all passes before any memory that they use is released.
 #[derive(Debug)]
 pub struct CudaRasterizer {
     positions: RegisteredBuffer,
@@ -83,7 +83,7 @@ impl PassState {
 
     /// Unregisters the target after all work on it has completed.
     fn release(&mut self, device: &Device) {
-        // A fault is reported by the next call to the device.
+        // Ignore a fault: the next call to the device reports it.
         device.stream().synchronize().ok();
         self.target = None;
     }
@@ -94,8 +94,8 @@ impl CudaRasterizer {
     /// [`Rasterizer::precompile`], or at the first pass that needs them.
     ///
     /// # Errors
-    /// `Invalid` when [`check_mesh`] or [`check_cut_outs`] rejects the mesh. `Fault` when the device fails, or when CUDA
-    /// cannot share OpenGL's buffer.
+    /// `Invalid` when [`check_mesh`] or [`check_cut_outs`] rejects the mesh. `Fault` when the device fails, or when
+    /// CUDA cannot share OpenGL's buffer.
     pub fn new(device: &Arc<Device>, mesh: RasterGeometry) -> Result<Self> {
         check_mesh(mesh.positions.bytes / POSITION_BYTES, &mesh.triangles, &mesh.groups)?;
         let cut_outs = mesh.cut_outs.filter(|cut_outs| (cut_outs.first as usize) < mesh.triangles.len());
@@ -141,9 +141,9 @@ impl CudaRasterizer {
             let Some((&positions, targets)) = addresses.split_first() else { return Ok(()) };
             passes.iter().zip(targets).try_for_each(|((window, functions, groups), &target)| {
                 let pass = RasterPass { functions, groups, window, positions, target };
-                // SAFETY: `new` checked mesh and groups against the size of the positions, and this function checked the
-                // size of the target. The mapping checks that the buffers have these sizes, and they stay registered
-                // until `release` or `drop` has waited for the pass.
+                // SAFETY: `new` checked mesh and groups against the size of the positions, and this function checked
+                // the size of the target. The mapping checks that the buffers have these sizes, and they stay
+                // registered until `release` or `drop` has waited for the pass.
                 unsafe { pipeline.draw(device, &pass) }
             })
         })
@@ -174,7 +174,7 @@ impl Rasterizer for CudaRasterizer {
 
 impl Drop for CudaRasterizer {
     fn drop(&mut self) {
-        // A fault is reported by the next call to the device.
+        // Ignore a fault: the next call to the device reports it.
         self.device.stream().synchronize().ok();
     }
 }

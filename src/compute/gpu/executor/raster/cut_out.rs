@@ -133,8 +133,8 @@ impl AlphaTexture {
             WidthInBytes: width,
             Height: height,
         };
-        // SAFETY: `check_cut_outs` verified that each level has all its texels. `new` waits for the copy before it returns,
-        // also on errors and panics, and borrows the texels until then.
+        // SAFETY: `check_cut_outs` verified that each level has all its texels. `new` waits for the copy before it
+        // returns, also on errors and panics, and borrows the texels until then.
         unsafe { sys::cuMemcpy2DAsync_v2(&copy, device.stream().cu_stream()) }.result()
     }
 
@@ -169,6 +169,7 @@ impl AlphaTexture {
     }
 }
 
+/// Allocates a mipmapped array of 8-bit texels.
 fn create_array(image: &AlphaImage) -> Result<CUmipmappedArray, DriverError> {
     let description = sys::CUDA_ARRAY3D_DESCRIPTOR_st {
         Width: image.width as usize,
@@ -191,7 +192,8 @@ pub(super) fn size_of_level(image: &AlphaImage, level: usize) -> [usize; 2] {
 
 impl Drop for AlphaTexture {
     fn drop(&mut self) {
-        // Errors are ignored: no cleanup remains, and a failed device reports its error at the next call.
+        // Ignore errors: the other objects are destroyed anyway, and a failed device reports its error at the next
+        // call.
         let _current = CurrentContext::enter(self.stream.context());
         self.stream.synchronize().ok();
         if self.texture != 0 {
