@@ -256,7 +256,7 @@ mod tests {
     fn model_and_state(deformation: DeformationSettings) -> (ErrorModel, SceneState) {
         let load = WorkloadKind::Single { power: 8, rank: 20 }.build(Size::Full).expect("expected a load");
         let scene = with_deformation(&load.scene, deformation).expect("expected a scene");
-        (ErrorModel::of(&scene), WorkloadMotion::new(&load, None).seed(0).state())
+        (ErrorModel::of(&scene), WorkloadMotion::new(&load, None).random_state(0).state())
     }
 
     #[test]

@@ -199,7 +199,7 @@ mod tests {
         let found = measure(plain(), &ExactState { q: vec![1.0 + 2f64.powi(-30), 0.5], ..representable() }, None);
         assert!(found.q.largest > 1e-10 && found.q.largest < 2e-9 && found.transform.largest == 0.0, "{found:?}");
         let rotated =
-            ExactState { transforms: WorkloadMotion::new(&load(), None).seed(0).transforms, ..representable() };
+            ExactState { transforms: WorkloadMotion::new(&load(), None).random_state(0).transforms, ..representable() };
         let found = measure(plain(), &rotated, None);
         assert!(found.transform.largest > 1e-9 && found.q.largest == 0.0, "{found:?}");
         let found = measure(DeformationSettings { storage: StorageType::Int8, ..plain() }, &representable(), None);
@@ -215,7 +215,8 @@ mod tests {
     #[test]
     fn counts_unexplained_error_as_accumulation() {
         let got = vec![1e3_f32; 3 * 256];
-        let found = measure(DeformationSettings::default(), &WorkloadMotion::new(&load(), None).seed(0), Some(&got));
+        let found =
+            measure(DeformationSettings::default(), &WorkloadMotion::new(&load(), None).random_state(0), Some(&got));
         assert!(found.accumulation.largest > 1e3, "{found:?}");
         assert!(found.origin.largest < 1e-6);
     }

@@ -260,7 +260,7 @@ mod tests {
     #[test]
     fn positions_match_the_reference_deformer() {
         for load in loads() {
-            let state = WorkloadMotion::new(&load, None).seed(0).state();
+            let state = WorkloadMotion::new(&load, None).random_state(0).state();
             let want = modalcast_compute::reference::deform(&load.scene, &state);
             let got = positions(&load.scene, &ExactState::of(&state), ErrorModelTerms::default());
             let differences = want.as_flattened().iter().zip(got.as_flattened()).map(|(a, b)| (a - b).abs());
@@ -276,7 +276,7 @@ mod tests {
             let mut cpu = modalcast_compute::cpu::CpuDeformer::new(&load.scene);
             let mut max_share = 0.0_f64;
             for seed in 0..4 {
-                let state = motion.seed(seed).state();
+                let state = motion.random_state(seed).state();
                 cpu.deform(&state).expect("expected a deformation");
                 let surface = &cpu.surface().expect("expected a surface").positions;
                 for (got, want) in surface.as_chunks::<3>().0.iter().zip(reference_vertices(&load.scene, &state)) {
@@ -294,7 +294,7 @@ mod tests {
         let load = WorkloadKind::Cancelling.build(Size::Quick).expect("built");
         let motion = WorkloadMotion::new(&load, None);
         let median = |seed: usize| {
-            let references = reference_vertices(&load.scene, &motion.seed(seed).state());
+            let references = reference_vertices(&load.scene, &motion.random_state(seed).state());
             let mut conditions: Vec<f64> = references.iter().map(|reference| reference.condition).collect();
             conditions.sort_by(f64::total_cmp);
             conditions[conditions.len() / 2]

@@ -258,7 +258,7 @@ fn measure_overlap(
     if !request.selects(OVERLAP) {
         return None;
     }
-    let states: Vec<_> = (0..ROTATING_STATES).map(|seed| motion.seed(seed).state()).collect();
+    let states: Vec<_> = (0..ROTATING_STATES).map(|seed| motion.random_state(seed).state()).collect();
     match bench.overlap(load, &states, request.replays)? {
         Ok(overlap) => {
             let differing = overlap.differing;
@@ -333,7 +333,7 @@ fn measure_variants(
         }
     }
     let (results, condition) = validate::validate(load, motion, &mut variants, (request.seeds, request.steps));
-    let states: Vec<_> = (0..ROTATING_STATES).map(|seed| motion.seed(seed).state()).collect();
+    let states: Vec<_> = (0..ROTATING_STATES).map(|seed| motion.random_state(seed).state()).collect();
     for (variant, result) in variants.iter_mut().zip(results) {
         for cache in [CacheState::Warm, CacheState::Cold] {
             let mut result = result.clone();

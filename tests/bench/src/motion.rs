@@ -62,7 +62,7 @@ impl WorkloadMotion {
 
     /// The random state of a seed: Gaussian coordinates and small rigid motions. With odd seeds displacements nearly
     /// cancel, which amplifies rounding errors: those of paired modes, otherwise those of one random row per domain.
-    pub fn seed(&self, seed: usize) -> ExactState {
+    pub fn random_state(&self, seed: usize) -> ExactState {
         let mut rng = Rng::with_seed(0x5EED ^ (seed as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
         let mut q: Vec<f64> = self.spreads.iter().map(|spread| spread.deviation * random_normal(&mut rng)).collect();
         if seed % 2 == 1 {
@@ -84,7 +84,7 @@ impl WorkloadMotion {
     }
 
     /// A step of the trajectory: the recorded one, otherwise independent oscillations of all modes.
-    pub fn step(&self, step: usize) -> ExactState {
+    pub fn trajectory_state(&self, step: usize) -> ExactState {
         if let Some(trajectory) = &self.recorded_trajectory {
             return trajectory.step(&self.scene, step);
         }
@@ -195,9 +195,9 @@ mod tests {
     #[test]
     fn seeds_are_deterministic_and_not_representable_in_f32() {
         let motion = motion(WorkloadKind::ManyDomains);
-        assert_eq!(motion.seed(3), motion.seed(3));
-        assert_ne!(motion.seed(3), motion.seed(5));
-        let exact_state = motion.seed(0);
+        assert_eq!(motion.random_state(3), motion.random_state(3));
+        assert_ne!(motion.random_state(3), motion.random_state(5));
+        let exact_state = motion.random_state(0);
         assert_ne!(ExactState::of(&exact_state.state()), exact_state, "expected a difference by rounding to f32");
         assert!(exact_state.state().transforms.iter().all(|transform| transform.is_similarity()));
     }
@@ -207,22 +207,22 @@ mod tests {
         let motion = motion(WorkloadKind::Single { power: 10, rank: 10 });
         let modes = &motion.scene.shapes[0].modes;
         let max_condition = |seed: usize| {
-            let q = motion.seed(seed).q;
+            let q = motion.random_state(seed).q;
             let row_condition = |row: usize| {
                 let terms = (0..10).map(|mode| f64::from(modes.entry(row / 3, row % 3, mode)) * q[mode]);
                 terms.clone().map(f64::abs).sum::<f64>() / terms.sum::<f64>().abs()
             };
             (0..3 * modes.vertices()).map(row_condition).fold(0.0, f64::max)
         };
-        assert!(max_condition(1) > 1e12, "{}", max_condition(1));
-        assert!(max_condition(0) < 1e6, "{}", max_condition(0));
+        assert!(max_condition(1) > 1e12, "expected a row that cancels, got condition {}", max_condition(1));
+        assert!(max_condition(0) < 1e6, "expected no row that cancels, got condition {}", max_condition(0));
     }
 
     #[test]
     fn slow_modes_are_large_and_consecutive_steps_are_close() {
         let motion = motion(WorkloadKind::OneDomain { has_normal_map: false });
         assert!(motion.spreads[0].deviation > 10.0 * motion.spreads[31].deviation);
-        let [first_state, second_state] = [0, 1].map(|step| motion.step(step));
+        let [first_state, second_state] = [0, 1].map(|step| motion.trajectory_state(step));
         assert_ne!(first_state, second_state);
         assert!((first_state.q[0] - second_state.q[0]).abs() < motion.spreads[0].deviation);
         assert_eq!(motion.steps(), TRAJECTORY_STEPS);

@@ -170,7 +170,8 @@ pub fn validate(
 ) -> (Vec<ValidationResult>, ConditionNumbers) {
     let camera = Camera::fit_to_scene(&load.scene, IMAGE_SIZE.0, IMAGE_SIZE.1);
     let error_scale = ErrorScale::new(&load.scene, &camera);
-    let truth = |index: usize| if index < seeds { motion.seed(index) } else { motion.step(index - seeds) };
+    let truth =
+        |index: usize| if index < seeds { motion.random_state(index) } else { motion.trajectory_state(index - seeds) };
     let count = seeds + motion.steps().min(steps);
     let states: Vec<SceneState> = (0..count).into_par_iter().map(|index| truth(index).state()).collect();
     let mut checks: Vec<VariantCheck<'_>> =

@@ -80,13 +80,16 @@ mod tests {
     #[test]
     fn axis_contains_values_and_clamps_non_positive_ones() {
         let axis = Axis::new([1e-7, 1e-3].into_iter(), (1.0, 10.0), (100.0, 0.0));
-        let [small, large, zero] = [1e-7, 1e-3, 0.0].map(|value| axis.pixel(value));
-        assert!(zero == 100.0 && small < 100.0 && large > 0.0 && large < small, "{zero} {small} {large}");
+        let [small_pixel, large_pixel, zero_pixel] = [1e-7, 1e-3, 0.0].map(|value| axis.pixel(value));
+        assert!(
+            zero_pixel == 100.0 && small_pixel < 100.0 && large_pixel > 0.0 && large_pixel < small_pixel,
+            "{zero_pixel} {small_pixel} {large_pixel}"
+        );
         assert_eq!(axis.ticks(), [1e-7, 1e-6, 1e-5, 1e-4, 1e-3]);
-        let narrow = Axis::new([30.0].into_iter(), (1.0, 10.0), (0.0, 1.0));
-        assert!(narrow.ticks().len() >= 3, "{:?}", narrow.ticks());
-        let empty = Axis::new(std::iter::empty(), (1.0, 1e3), (0.0, 1.0));
-        assert_eq!((empty.pixel(1.0), empty.pixel(1e3)), (0.0, 1.0));
+        let single_value_axis = Axis::new([30.0].into_iter(), (1.0, 10.0), (0.0, 1.0));
+        assert!(single_value_axis.ticks().len() >= 3, "{:?}", single_value_axis.ticks());
+        let default_axis = Axis::new(std::iter::empty(), (1.0, 1e3), (0.0, 1.0));
+        assert_eq!((default_axis.pixel(1.0), default_axis.pixel(1e3)), (0.0, 1.0));
     }
 
     #[test]

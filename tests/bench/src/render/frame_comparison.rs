@@ -115,9 +115,9 @@ pub(super) fn measure(
     for setup in setups {
         progress(&format!("{}: frames by OpenGL and by CUDA", setup.name));
         let mut loaded_scene = harness.load(&setup.scene)?;
-        let measured = setup.measure(harness, &mut loaded_scene, device, options);
+        let comparison = setup.measure(harness, &mut loaded_scene, device, options);
         harness.unload(loaded_scene);
-        comparisons.push(measured?);
+        comparisons.push(comparison?);
     }
     Ok(comparisons)
 }

@@ -104,8 +104,8 @@ impl RenderHarness {
         self.renderer.draw(&loaded_scene.buffers, &loaded_scene.frame_params(camera, size))
     }
 
-    /// Draws the same frame repeatedly and returns the times per pass; "frame" is the sum of all passes except the
-    /// readback.
+    /// Draws the same frame repeatedly and returns the times per pass. The entry "frame" is the sum of all passes except
+    /// the readback.
     pub(super) fn time_passes(
         &mut self,
         loaded_scene: &LoadedScene,
@@ -113,25 +113,25 @@ impl RenderHarness {
         size: Size,
         replays: usize,
     ) -> Result<Vec<PassTime>> {
-        let mut times: Vec<(&'static str, Vec<f64>)> = vec![("frame", Vec::new())];
+        let mut samples_by_pass: Vec<(&'static str, Vec<f64>)> = vec![("frame", Vec::new())];
         self.warm_up(loaded_scene, camera, size)?;
         for _ in 0..replays.max(MIN_REPETITIONS) {
             let image = self.draw(loaded_scene, camera, size)?;
-            times[0].1.push(1e3 * image.times.drawing_ms());
+            samples_by_pass[0].1.push(1e3 * image.times.drawing_ms());
             for (key, ms) in image.times.iter() {
                 let name = key.name();
-                match times.iter_mut().find(|(known, _)| *known == name) {
-                    Some((_, values)) => values.push(1e3 * ms),
-                    None => times.push((name, vec![1e3 * ms])),
+                match samples_by_pass.iter_mut().find(|(pass, _)| *pass == name) {
+                    Some((_, samples)) => samples.push(1e3 * ms),
+                    None => samples_by_pass.push((name, vec![1e3 * ms])),
                 }
             }
         }
-        let pass_time = |(name, values): (&'static str, Vec<f64>)| {
-            Timing::of(values)
+        let pass_time = |(name, samples): (&'static str, Vec<f64>)| {
+            Timing::of(samples)
                 .map(|timing| PassTime { name, timing })
                 .ok_or_else(|| fault_in("time")("expected at least one frame, got none"))
         };
-        times.into_iter().map(pass_time).collect()
+        samples_by_pass.into_iter().map(pass_time).collect()
     }
 
     /// Draws until times are stable. The first frame of a size compiles shaders and allocates textures, and the clock

@@ -361,17 +361,17 @@ impl WorkloadContext<'_> {
         (shadow, culling): (ShadowSettings, Culling),
     ) -> Result<FrameBaseline> {
         // A row with automatic culling counts as not culled if no triangles were culled.
-        let matches = |row: &&RenderRow| {
+        let has_settings = |row: &&RenderRow| {
             let has_culling = row.culling == culling || culling == Culling::None && row.cull_stats.is_none();
             row.shadow == Some(shadow) && has_culling
         };
-        let timed_row = rows.iter().filter(matches).find_map(|row| Some((row.name.clone(), row.median_us()?)));
+        let timed_row = rows.iter().filter(has_settings).find_map(|row| Some((row.name.clone(), row.median_us()?)));
         let (name, frame_us) = match timed_row {
             Some(name_and_time) => name_and_time,
             None => {
-                let look = RenderSettings { shadow: Some(shadow), culling, ..self.animation.scene.look };
+                let settings = RenderSettings { shadow: Some(shadow), culling, ..self.animation.scene.look };
                 let passes =
-                    self.time_still_passes(harness, &light_meter::with_settings(&self.animation.scene, look)?)?;
+                    self.time_still_passes(harness, &light_meter::with_settings(&self.animation.scene, settings)?)?;
                 let frame_us =
                     passes.iter().find(|pass| pass.name == "frame").map_or(0.0, |pass| pass.timing.median_us);
                 (format!("variance {}, blur {}", shadow.size, shadow.blur), frame_us)

@@ -85,13 +85,12 @@ pub(super) fn measure(
     let scene = light_meter::with_settings(&workload.scene, RenderSettings { shadow, ..workload.scene.look })?;
     let states = motion_states(&Workload { scene: Arc::clone(&scene), ..workload.clone() });
     let mut setup = create_setup(harness, device, &scene)?;
-    let times = time_frames(harness, &mut setup, &scene, (options.size, options.replays), &states)?;
+    let timings = time_frames(harness, &mut setup, &scene, options, &states)?;
     let PlantSetup { deformer, bytes, buffers } = setup;
     let (backend, shares_buffers) = (deformer.backend(), deformer.shares_buffers());
     let bytes = bytes + buffers.plan().bytes();
     drop(deformer);
     harness.renderer.unload(buffers);
-    let [deform, upload, render, vbr, frame] = times;
     Ok(PlantResult {
         load: workload.name,
         thesis: PLANTS[index],
@@ -102,21 +101,24 @@ pub(super) fn measure(
         triangles: scene.layout.triangles,
         domains: scene.domains.len(),
         map_size,
-        deform,
-        upload,
-        render,
-        vbr,
-        frame,
-        fps: 1e6 / frame.median_us,
-        occupation: vbr.median_us / frame.median_us,
+        deform: timings.deform,
+        upload: timings.upload,
+        render: timings.render,
+        vbr: timings.vbr,
+        frame: timings.frame,
+        fps: 1e6 / timings.frame.median_us,
+        occupation: timings.vbr.median_us / timings.frame.median_us,
         bytes,
     })
 }
 
 fn motion_states(workload: &Workload) -> Vec<SceneState> {
     let motion = WorkloadMotion::new(workload, None);
-    let state =
-        |step: usize| SceneState { step: step as u64 + 1, serial: step as u64 + 1, ..motion.step(step).state() };
+    let state = |step: usize| SceneState {
+        step: step as u64 + 1,
+        serial: step as u64 + 1,
+        ..motion.trajectory_state(step).state()
+    };
     (0..STATES).map(state).collect()
 }
 
@@ -147,14 +149,26 @@ fn unshared_bytes(plan: &gpu::DeformPlan, shares_buffers: bool) -> u64 {
     plan.total_bytes() - if shares_buffers { outputs.iter().sum() } else { 0 }
 }
 
-/// Times of deforming, uploading, rendering, their sum, and the whole frame, in this order.
+/// Times of one frame in microseconds, or their distributions over many frames.
+#[derive(Debug, Clone, Copy)]
+struct FrameTimes<T> {
+    deform: T,
+    upload: T,
+    render: T,
+    /// `t_vbr`: the sum of deform, upload and render.
+    vbr: T,
+    frame: T,
+}
+
+/// Draws frames of all states in turn and measures them.
 fn time_frames(
     harness: &mut RenderHarness,
     setup: &mut PlantSetup,
     scene: &Arc<Scene>,
-    (size, replays): (Size, usize),
+    options: &RenderReportOptions,
     states: &[SceneState],
-) -> Result<[Timing; 5]> {
+) -> Result<FrameTimes<Timing>> {
+    let size = options.size;
     let camera = Camera::fit_to_scene(scene, size.width, size.height);
     let begin = Instant::now();
     let mut warm_up_frames = 0;
@@ -163,25 +177,30 @@ fn time_frames(
         time_frame(harness, setup, (camera, size), &states[warm_up_frames % states.len()])?;
         warm_up_frames += 1;
     }
-    let mut samples: [Vec<f64>; 5] = Default::default();
-    for replay in 0..replays.max(MIN_REPETITIONS) {
-        let times = time_frame(harness, setup, (camera, size), &states[replay % states.len()])?;
-        samples.iter_mut().zip(times).for_each(|(values, time)| values.push(time));
+    let mut samples = Vec::new();
+    for replay in 0..options.replays.max(MIN_REPETITIONS) {
+        samples.push(time_frame(harness, setup, (camera, size), &states[replay % states.len()])?);
     }
-    let timing = |values: Vec<f64>| {
+    let timing = |time: fn(&FrameTimes<f64>) -> f64| {
+        let values = samples.iter().map(time).collect();
         Timing::of(values).ok_or_else(|| fault_in("plants")("expected at least one frame, got none"))
     };
-    let [deform, upload, render, vbr, frame] = samples;
-    Ok([timing(deform)?, timing(upload)?, timing(render)?, timing(vbr)?, timing(frame)?])
+    Ok(FrameTimes {
+        deform: timing(|times| times.deform)?,
+        upload: timing(|times| times.upload)?,
+        render: timing(|times| times.render)?,
+        vbr: timing(|times| times.vbr)?,
+        frame: timing(|times| times.frame)?,
+    })
 }
 
-/// One frame, microseconds, in the order of [`time_frames`].
+/// Deforms and draws one frame and measures it in microseconds.
 fn time_frame(
     harness: &mut RenderHarness,
     setup: &mut PlantSetup,
     (camera, size): (Camera, Size),
     state: &SceneState,
-) -> Result<[f64; 5]> {
+) -> Result<FrameTimes<f64>> {
     let elapsed_us = |begin: Instant| begin.elapsed().as_secs_f64() * 1e6;
     let frame_begin = Instant::now();
     let DeformSummary { bounds, oriented_bounds: light, .. } = setup.deformer.deform(state)?;
@@ -196,7 +215,7 @@ fn time_frame(
     let image = harness.renderer.draw(&setup.buffers, &frame_params)?;
     let frame = elapsed_us(frame_begin);
     let render = 1e3 * image.times.drawing_ms();
-    Ok([deform, upload, render, deform + upload + render, frame])
+    Ok(FrameTimes { deform, upload, render, vbr: deform + upload + render, frame })
 }
 
 #[cfg(test)]

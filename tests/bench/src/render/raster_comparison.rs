@@ -99,12 +99,12 @@ impl RasterComparison {
 impl RasterComparison {
     /// The results as one line of text.
     pub fn line(&self) -> String {
-        let format_pair = |format_pair: TimingPair| {
+        let format_pair = |pair: TimingPair| {
             format!(
                 "{:.1} us by OpenGL, {:.1} by CUDA, {:.1} times as fast",
-                format_pair.opengl.median_us,
-                format_pair.cuda.median_us,
-                format_pair.ratio()
+                pair.opengl.median_us,
+                pair.cuda.median_us,
+                pair.ratio()
             )
         };
         let times = self.passes.map_or("not timed".into(), |passes| {
@@ -302,7 +302,7 @@ mod tests {
     use super::*;
     use modalcast_render::Renderer;
 
-    /// Checks that the bounding box of the triangle that OpenGL drew at a sample contains the sample.
+    /// At each sample, the bounding box of the triangle that OpenGL drew contains the sample.
     #[test]
     fn viewports_and_triangles_match_the_opengl_frame() {
         let mut harness = RenderHarness::open().expect("OpenGL");

@@ -45,9 +45,12 @@ pub struct ReadbackRates {
     pub blocking_loss: f64,
     pub ring_loss: f64,
     /// Rates and loss with a moving scene: the vertices of another step are uploaded before every frame.
-    pub stepped_unread_fps: f64,
-    pub stepped_ring_fps: f64,
-    pub stepped_ring_loss: f64,
+    #[serde(rename = "stepped_unread_fps")]
+    pub moving_unread_fps: f64,
+    #[serde(rename = "stepped_ring_fps")]
+    pub moving_ring_fps: f64,
+    #[serde(rename = "stepped_ring_loss")]
+    pub moving_ring_loss: f64,
 }
 
 /// The frames to draw. Even and odd frames have different parameters and vertices.
@@ -101,7 +104,7 @@ pub(super) fn measure(
         }
     }
     harness.unload(loaded_scene);
-    let [unread, blocking, ring, stepped_unread, stepped_ring] = fps.map(median);
+    let [unread, blocking, ring, moving_unread, moving_ring] = fps.map(median);
     Ok(ReadbackRates {
         load: animation.name,
         size: options.size,
@@ -111,9 +114,9 @@ pub(super) fn measure(
         ring_fps: ring,
         blocking_loss: loss(unread, blocking),
         ring_loss: loss(unread, ring),
-        stepped_unread_fps: stepped_unread,
-        stepped_ring_fps: stepped_ring,
-        stepped_ring_loss: loss(stepped_unread, stepped_ring),
+        moving_unread_fps: moving_unread,
+        moving_ring_fps: moving_ring,
+        moving_ring_loss: loss(moving_unread, moving_ring),
     })
 }
 
@@ -277,9 +280,9 @@ pub(super) fn readback_section(rows: &[ReadbackRates]) -> String {
             format_percent(row.blocking_loss),
             format!("{:.1}", row.ring_fps),
             format_percent(row.ring_loss),
-            format!("{:.1}", row.stepped_unread_fps),
-            format!("{:.1}", row.stepped_ring_fps),
-            format_percent(row.stepped_ring_loss),
+            format!("{:.1}", row.moving_unread_fps),
+            format!("{:.1}", row.moving_ring_fps),
+            format_percent(row.moving_ring_loss),
         ]
     };
     text.push_str(&table(&header, rows.iter().map(cells)));
@@ -303,7 +306,7 @@ mod tests {
         let mut harness = RenderHarness::open().expect("a renderer");
         let rates = measure(&mut harness, &options, RenderWorkload::Square).expect("rates");
         assert!(rates.unread_fps > 0.0 && rates.blocking_fps > 0.0 && rates.ring_fps > 0.0, "{rates:?}");
-        assert!(rates.stepped_unread_fps > 0.0 && rates.stepped_ring_fps > 0.0 && rates.stepped_ring_loss < 100.0);
+        assert!(rates.moving_unread_fps > 0.0 && rates.moving_ring_fps > 0.0 && rates.moving_ring_loss < 100.0);
         assert!(rates.ring_loss < 100.0 && rates.blocking_loss < 100.0 && rates.frames >= 20);
         let markdown = readback_section(std::slice::from_ref(&rates));
         assert!(markdown.lines().any(|line| line.contains("square") && line.contains('%')), "{markdown}");

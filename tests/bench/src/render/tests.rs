@@ -74,7 +74,7 @@ fn pixels_are_as_bright_as_their_covered_area() {
     parts.look.skylight = [1.0; 3];
     let image = trace_images(parts, false, &[ShadowModel::Unshadowed], 32).remove(0);
     let area: f64 = (0..32 * 32).map(|pixel| linear_color(&image, pixel).x).sum();
-    assert!((area - 10.35 * 7.8).abs() < 0.25, "{area}");
+    assert!((area - 10.35 * 7.8).abs() < 0.25, "expected an area of 10.35 x 7.8, got {area}");
     let half_covered = linear_color(&image, 16 * 32 + 10).x;
     assert!((half_covered - 0.5).abs() < 1e-6, "{half_covered}");
     assert_eq!((linear_color(&image, 16 * 32 + 9).x, linear_color(&image, 16 * 32 + 12).x.round()), (0.0, 1.0));
@@ -98,8 +98,8 @@ fn shades_one_pixel_by_equation_3_12() {
     let expected = [(0.2, 0.5, 0.3), (0.4, 0.25, 0.2), (0.6, 0.1, 0.1)]
         .map(|(ambient, diffuse, specular)| 0.25 * ambient + 0.5 * (cosine * diffuse + cosine.powi(3) * specular));
     let color = linear_color(&image, 20 * 41 + 20);
-    for (color, expected) in color.iter().zip(expected) {
-        assert!((color - expected).abs() < 2e-4, "expected {expected}, got {color}");
+    for (channel, expected) in color.iter().zip(expected) {
+        assert!((channel - expected).abs() < 2e-4, "expected {expected}, got {channel}");
     }
 }
 
@@ -107,10 +107,10 @@ fn shades_one_pixel_by_equation_3_12() {
 fn back_face_is_visible_only_if_double_sided() {
     let center_color = |double_sided: bool| {
         let mut parts = empty_parts();
-        let away_facing =
+        let rear_square =
             quad([[1.0, -1.0, 0.0], [-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, 1.0, 0.0]], [0.0, 0.0, -1.0]);
         let material = Material { double_sided, ..Material::default() };
-        add_rigid_domain(&mut parts, "square", away_facing.expect("a square"), material).expect("a domain");
+        add_rigid_domain(&mut parts, "square", rear_square.expect("a square"), material).expect("a domain");
         linear_color(&trace_images(parts, false, &[ShadowModel::Unshadowed], 9).remove(0), 40).x
     };
     assert!((center_color(true) - 0.75).abs() < 1e-6 && center_color(false) == 0.0);
@@ -137,8 +137,8 @@ fn sorts_transparent_layers_in_any_order() {
     assert!((green_first - Vector3::new(0.25, 0.5, 0.25)).norm() < 1e-6, "{green_first}");
 }
 
-/// A ground seen from above with the edge of a shadow at `x = 0.3`. The caster is outside of the image; a peg keeps
-/// the ground at height 0.
+/// A ground seen from above with the edge of a shadow at `x = 0.3`. The caster is outside of the image. A small square
+/// at height 0 keeps the ground there.
 fn shadow_edge(caster: Material) -> SceneParts {
     let mut parts = empty_parts();
     parts.look.ground = Some(Ground { color: [1.0; 3] });
@@ -168,8 +168,8 @@ fn hard_and_gaussian_shadow_edges_match_the_formula() {
     assert_eq!((visibility(&hard, 22), visibility(&hard, 23)), (1.0, 0.0));
     let deviation = 10.0 * 0.4 / 0.8;
     for column in 4..40 {
-        let offset = (column as f64 + 0.5 - 23.0) / deviation;
-        let expected = 0.5 * (1.0 - erf(offset / 2f64.sqrt()));
+        let normalized_offset = (column as f64 + 0.5 - 23.0) / deviation;
+        let expected = 0.5 * (1.0 - erf(normalized_offset / 2f64.sqrt()));
         let mean: f64 = (12..28)
             .map(|row| f64::from(filtered.light[row * 40 + column].expect("defined sun visibility")))
             .sum::<f64>()
@@ -193,9 +193,9 @@ fn erf(x: f64) -> f64 {
 
 #[test]
 fn cut_outs_and_glass_cast_shadows_above_alpha_threshold() {
-    let is_in_shadow = |alpha_mode: AlphaMode, alpha: f32, texel: u8| {
+    let is_in_shadow = |alpha_mode: AlphaMode, alpha: f32, texel_alpha: u8| {
         let mut parts = shadow_edge(Material { alpha_mode, alpha, color_texture: Some(0), ..Material::default() });
-        parts.textures.push(Texture::new("leaf", 1, 1, vec![255, 255, 255, texel]).expect("valid settings"));
+        parts.textures.push(Texture::new("leaf", 1, 1, vec![255, 255, 255, texel_alpha]).expect("a texture"));
         let image = trace_images(parts, true, &[ShadowModel::Hard], 40).remove(0);
         image.light[20 * 40 + 38].expect("defined sun visibility") == 0.0
     };
@@ -273,11 +273,11 @@ fn report_measures_selected_variants_and_writes_files() {
     let [unshadowed, filtered] = &report.rows[..] else { panic!("expected two rows, got {:?}", report.rows) };
     assert!(
         unshadowed.color_errors.mean > 2.0 * filtered.color_errors.mean,
-        "without shadows, colors differ from the shadowed reference"
+        "expected a larger error against the shadowed reference without shadows"
     );
     assert!(
         unshadowed.intended_color_errors.mean < 1.5 && unshadowed.intended_light_errors.all_pixels.max == 0.0,
-        "without shadows, the image matches the unshadowed reference"
+        "expected the image without shadows to match the unshadowed reference"
     );
     assert!(
         filtered.shadow_bytes == 20 * 512 * 512 && filtered.bytes > unshadowed.bytes && unshadowed.shadow_bytes == 0
@@ -364,15 +364,15 @@ fn refitted_bvh_gives_the_same_images_as_a_rebuilt_one() {
         &animation.scene,
         &FrameParams { camera: animation.camera(size), width: 48, height: 32, bounds, light: None },
     );
-    let trace_hard =
+    let trace_hard_shadows =
         |ray_scene: &RayScene| trace_reference_images(ray_scene, &view, &[ShadowModel::Hard], SampleCounts::QUICK);
-    let rebuilt_images = trace_hard(&RayScene::new(&animation.scene, &later_surface));
+    let rebuilt_images = trace_hard_shadows(&RayScene::new(&animation.scene, &later_surface));
     assert_eq!(
-        trace_hard(&RayScene::new(&animation.scene, &first_surface).refit(&animation.scene, &later_surface)),
+        trace_hard_shadows(&RayScene::new(&animation.scene, &first_surface).refit(&animation.scene, &later_surface)),
         rebuilt_images
     );
     assert_ne!(
-        trace_hard(&RayScene::new(&animation.scene, &first_surface)),
+        trace_hard_shadows(&RayScene::new(&animation.scene, &first_surface)),
         rebuilt_images,
         "control: the first step differs"
     );

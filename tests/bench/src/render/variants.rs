@@ -342,10 +342,10 @@ mod tests {
 
     #[test]
     fn only_filtered_maps_get_the_exact_bleeding_bound() {
-        let with_filtered_map = RenderVariant::with_variance_map(512, 1.5);
+        let filtered_variant = RenderVariant::with_variance_map(512, 1.5);
         assert!(
-            with_filtered_map.error_limits(RenderWorkload::Square).bleeding < 0.02
-                && with_filtered_map.error_limits(RenderWorkload::Tree) == ERROR_LIMITS
+            filtered_variant.error_limits(RenderWorkload::Square).bleeding < 0.02
+                && filtered_variant.error_limits(RenderWorkload::Tree) == ERROR_LIMITS
         );
         assert_eq!(RenderVariant::with_standard_map(512).error_limits(RenderWorkload::Square), ERROR_LIMITS);
     }

@@ -164,7 +164,7 @@ impl AnimatedScene {
 
 /// Adds the modal coordinates of a motion's step with reduced amplitudes.
 fn add_sway(state: &mut SceneState, motion: &WorkloadMotion, step: usize) {
-    for (q, displacement) in state.q.iter_mut().zip(motion.step(step).q) {
+    for (q, displacement) in state.q.iter_mut().zip(motion.trajectory_state(step).q) {
         *q += (SWAY_AMPLITUDE * displacement) as f32;
     }
 }

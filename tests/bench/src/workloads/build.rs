@@ -18,7 +18,8 @@ pub(super) fn build(kind: WorkloadKind, size: Size) -> Result<Workload> {
         size: 1.0,
         seed: part_seed(&kind.name(), 0),
     };
-    let with_one_triangle = |patch: PatchSpec| PatchSpec { corners: 3, triangles: PatchTopology::One, ..patch };
+    let with_one_triangle =
+        |patch: PatchSpec| PatchSpec { corners: 3, triangles: PatchTopology::SingleTriangle, ..patch };
     let (patches, has_normal_map) = match kind {
         WorkloadKind::Single { power, rank } => {
             (vec![with_one_triangle(sheet_patch(reduce_if_quick(1 << power), rank))], false)

@@ -30,7 +30,7 @@ pub(super) struct PatchSpec {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum PatchTopology {
     /// One triangle with three corners, the minimum of a mesh.
-    One,
+    SingleTriangle,
     /// Two triangles per grid cell; one corner per vertex.
     Cells,
     /// A strip with this number of triangles. It starts again at the first corner when it reaches the last one.
@@ -61,7 +61,7 @@ pub(super) fn build_shape(patch: &PatchSpec, is_paired: bool) -> Result<Shape> {
     let vertices: Vec<u32> = (0..patch.corners).map(vertex_of_corner).collect();
     let triangles = patch_triangles(patch, columns);
     let (normals, uvs) = match patch.triangles {
-        PatchTopology::One => (vec![[0.0, 0.0, 1.0]; patch.corners], Vec::new()),
+        PatchTopology::SingleTriangle => (vec![[0.0, 0.0, 1.0]; patch.corners], Vec::new()),
         _ => {
             let uv = |vertex: &u32| {
                 [positions[*vertex as usize][0] / patch.size, positions[*vertex as usize][1] / patch.size]
@@ -77,7 +77,7 @@ pub(super) fn build_shape(patch: &PatchSpec, is_paired: bool) -> Result<Shape> {
 fn patch_triangles(patch: &PatchSpec, columns: usize) -> Vec<[u32; 3]> {
     let corners = patch.corners as u32;
     match patch.triangles {
-        PatchTopology::One => vec![[0, 1 % corners, 2 % corners]],
+        PatchTopology::SingleTriangle => vec![[0, 1 % corners, 2 % corners]],
         PatchTopology::Cells if patch.vertices < 3 || columns < 2 => vec![[0, 1 % corners, 2 % corners]],
         PatchTopology::Cells => {
             let width = columns as u32;
@@ -95,15 +95,12 @@ fn patch_triangles(patch: &PatchSpec, columns: usize) -> Vec<[u32; 3]> {
             (0..corners).flat_map(cell_triangles).collect()
         }
         PatchTopology::Strip(triangle_count) => {
-            let strip_triangle = |corner: u32| {
-                if corner.is_multiple_of(2) {
-                    [corner, corner + 1, corner + 2]
-                } else {
-                    [corner + 1, corner, corner + 2]
-                }
+            // Odd triangles are reversed, so that all have the same winding.
+            let strip_triangle = |first: u32| {
+                if first.is_multiple_of(2) { [first, first + 1, first + 2] } else { [first + 1, first, first + 2] }
             };
             (0..triangle_count as u32)
-                .map(|corner| strip_triangle(corner % corners).map(|corner| corner % corners))
+                .map(|triangle| strip_triangle(triangle % corners).map(|corner| corner % corners))
                 .collect()
         }
     }
@@ -173,7 +170,14 @@ mod tests {
     fn only_paired_modes_are_nearly_equal() {
         let max_difference = |is_paired: bool| {
             let modes = random_modes(
-                &PatchSpec { vertices: 50, rank: 3, corners: 3, triangles: PatchTopology::One, size: 1.0, seed: 5 },
+                &PatchSpec {
+                    vertices: 50,
+                    rank: 3,
+                    corners: 3,
+                    triangles: PatchTopology::SingleTriangle,
+                    size: 1.0,
+                    seed: 5,
+                },
                 is_paired,
             );
             let modes = modes.expect("modes");

@@ -24,11 +24,11 @@ const MAX_LEAF_TRIANGLES: usize = 2;
 pub(super) fn build_plant(index: usize, size: Size) -> Result<Workload> {
     let table_row = PLANTS[index];
     let counts = if size == Size::Quick { reduce_counts(&table_row) } else { table_row };
-    let patches = patches(&counts);
+    let patches = random_patches(&counts);
     let shapes = patches.par_iter().map(|patch| build_shape(patch, false)).collect::<Result<Vec<_>>>()?;
     let name = format!("plant-{}", index + 1);
     let scene = build_patch_scene(name.clone(), shapes, counts.domains, false)?;
-    Ok(Workload { species: Some(index), remarks: remarks(&table_row, &counts), ..Workload::new(name, scene) })
+    Ok(Workload { species: Some(index), remarks: describe_counts(&table_row, &counts), ..Workload::new(name, scene) })
 }
 
 /// The same plant with its leaves distributed over its branches. Each leaf follows a branch and keeps its placement at
@@ -72,7 +72,7 @@ fn reduce_counts(table_row: &ThesisPlant) -> ThesisPlant {
 }
 
 /// Describes the plant and its differences from its row in the table.
-fn remarks(table_row: &ThesisPlant, counts: &ThesisPlant) -> Vec<String> {
+fn describe_counts(table_row: &ThesisPlant, counts: &ThesisPlant) -> Vec<String> {
     let mut remarks = vec![format!("{} of table 4.5", table_row.name)];
     if counts != table_row {
         let ThesisPlant { vertices, faces, domains, deformable, modes, rows, .. } = counts;
@@ -100,7 +100,8 @@ fn leaf_size(counts: &ThesisPlant) -> (usize, usize) {
     (leaf_share(counts.vertices, MAX_LEAF_VERTICES), leaf_share(counts.faces, MAX_LEAF_TRIANGLES))
 }
 
-fn patches(counts: &ThesisPlant) -> Vec<PatchSpec> {
+/// Patches of all branches, followed by those of all leaves.
+fn random_patches(counts: &ThesisPlant) -> Vec<PatchSpec> {
     let mut rng = Rng::with_seed(part_seed(counts.name, 0));
     let (leaves, branches) = (counts.domains - counts.deformable, counts.deformable);
     let (leaf_vertices, leaf_faces) = leaf_size(counts);

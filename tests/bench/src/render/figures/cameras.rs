@@ -22,7 +22,7 @@ pub(super) fn frame_scene(scene: &Scene, size: Size, elevation: f64) -> Camera {
     let to_eye = Vector3::new(0.30, elevation, 0.95).normalize();
     let right = Vector3::y().cross(&to_eye).normalize();
     let view_up = to_eye.cross(&right);
-    // At distance 1 from the eye.
+    // Half of the framed height at distance 1.
     let framed_half_height = FILL_FRACTION * (0.5 * FIELD_OF_VIEW).to_radians().tan();
     let aspect = f64::from(size.width) / f64::from(size.height);
     let center = scene.rest_bounds.center().coords;
