@@ -1,9 +1,9 @@
 //! The engine: loads scenes, applies steps to them, and produces frames, picks and vertices. It runs one device thread
 //! and one task per open scene, and persists uploads, the list of open scenes and their last steps across restarts.
 //!
-//! A scene's task serializes all operations on the scene (`scene_actor`). A writer sends steps through a bounded queue
-//! (`step_queue`) and a subscriber receives results through a bounded channel (`subscriber`). Exceeding a bound, or blocking the
-//! writer for too long, yields an error that names the limit.
+//! The task of a scene serializes all operations on the scene (`scene::actor`). A writer sends steps through a bounded
+//! queue (`scene::step_queue`). A subscriber receives results through a bounded channel (`scene::subscriber`).
+//! Exceeding a bound, or blocking the writer for too long, yields an error that names the limit.
 
 mod blocking;
 mod catch_unwind;
@@ -74,11 +74,11 @@ struct Shared {
     encoder: FrameEncoder,
     services: SceneServices,
     registry: Registry,
-    loads: Semaphore,
-    uploads: Arc<Semaphore>,
-    next_id: AtomicU64,
+    load_permits: Semaphore,
+    upload_permits: Arc<Semaphore>,
+    next_scene_id: AtomicU64,
     stopping: AtomicBool,
-    device: Mutex<Option<JoinHandle<()>>>,
+    device_thread: Mutex<Option<JoinHandle<()>>>,
     // Last field, so that its lock on the state folder is released only after every writer above is dropped.
     scene_catalog: SceneCatalog,
 }
@@ -94,7 +94,7 @@ impl Engine {
         Self::start_with_device(config, source, move || DeviceContext::open(&device_config)).await
     }
 
-    /// An engine with the open scene "strips", whose device is lost as soon as the returned step is driven.
+    /// An engine with the open scene "strips", and a step that makes its device report a loss.
     #[cfg(test)]
     pub(crate) async fn with_losable_device(
         config: ValidatedConfig,
@@ -120,7 +120,7 @@ impl Engine {
             Ok((scene_catalog, Arc::new(checkpoints)))
         })
         .await?;
-        let DeviceThread { handle, info, thread: device } =
+        let DeviceThread { handle, info, thread: device_thread } =
             DeviceThread::start(config.open_scenes, open_device).await?;
         let shared = Shared {
             services: SceneServices { device: handle, checkpoints, config: Arc::clone(&config) },
@@ -129,11 +129,11 @@ impl Engine {
             source,
             info,
             encoder: FrameEncoder::per_core(),
-            loads: Semaphore::new(MAX_CONCURRENT_LOADS),
-            uploads: Arc::new(Semaphore::new(MAX_CONCURRENT_UPLOADS)),
-            next_id: AtomicU64::new(1),
+            load_permits: Semaphore::new(MAX_CONCURRENT_LOADS),
+            upload_permits: Arc::new(Semaphore::new(MAX_CONCURRENT_UPLOADS)),
+            next_scene_id: AtomicU64::new(1),
             stopping: AtomicBool::new(false),
-            device: Mutex::new(Some(device)),
+            device_thread: Mutex::new(Some(device_thread)),
             scene_catalog,
         };
         let engine = Self { shared: Arc::new(shared) };
@@ -158,8 +158,8 @@ impl Engine {
 
     /// The largest image side in pixels that both the configuration and the renderer allow.
     pub fn frame_side(&self) -> u32 {
-        let renderer = self.shared.info.renderer.as_ref().map_or(u32::MAX, |info| info.max_side);
-        self.shared.config.frame_side.min(renderer)
+        let max_renderer_side = self.shared.info.renderer.as_ref().map_or(u32::MAX, |info| info.max_side);
+        self.shared.config.frame_side.min(max_renderer_side)
     }
 
     /// Opens a source of the repository under a name; an empty name means the source's own name. If the name is already
@@ -210,32 +210,33 @@ impl Engine {
         validate_scene_name(&header.scene)?;
         let config = &self.shared.config;
         if header.files == 0 || header.files > config.upload_files {
-            return Err(invalid("header.files", format!("1 to {}", config.upload_files), header.files));
+            return Err(invalid("header.files", format!("1 to {} files", config.upload_files), header.files));
         }
         if header.total_bytes > config.upload_bytes {
-            let expected = format!("at most {}", config.upload_bytes);
+            let expected = format!("at most {} bytes", config.upload_bytes);
             return Err(invalid("header.total_bytes", expected, header.total_bytes));
         }
-        self.shared.registry.check_free(&header.scene)?;
-        let full = |_| Error::Busy { queue: "uploads under way", limit: MAX_CONCURRENT_UPLOADS };
-        let place = Arc::clone(&self.shared.uploads).try_acquire_owned().map_err(full)?;
-        let uploads = config.state.join("uploads");
-        run_blocking("upload", move || Upload::begin(&uploads, header, place)).await
+        self.shared.registry.check_name_free(&header.scene)?;
+        let too_many_uploads = |_| Error::Busy { queue: "list of uploads in progress", limit: MAX_CONCURRENT_UPLOADS };
+        let permit = Arc::clone(&self.shared.upload_permits).try_acquire_owned().map_err(too_many_uploads)?;
+        let upload_folder = config.state.join("uploads");
+        run_blocking("upload", move || Upload::begin(&upload_folder, header, permit)).await
     }
 
     /// Opens a complete upload as a scene. On failure the uploaded files are removed.
     ///
     /// # Errors
-    /// `Invalid` naming the missing or malformed file; `Taken` when the name was claimed in the meantime.
+    /// `Invalid` naming the missing or malformed file; `Taken` when another scene was opened under the name since
+    /// [`Self::begin_upload`].
     pub async fn finish_upload(&self, mut upload: Upload) -> Result<Arc<SceneHandle>> {
-        let finish = move || match upload.finish() {
+        let check_upload = move || match upload.finish() {
             Ok(()) => Ok(upload),
             Err(error) => {
                 upload.discard();
                 Err(error)
             }
         };
-        let upload = run_blocking("upload", finish).await?;
+        let upload = run_blocking("upload", check_upload).await?;
         let (name, entry) = (upload.header.scene.clone(), upload.header.entry.clone());
         self.open_once(name, SceneProvenance::Upload { entry }, Some(upload)).await
     }
@@ -259,18 +260,18 @@ impl Engine {
             return;
         }
         for scene_handle in self.list() {
-            scene_handle.stop(stopping()).await;
+            scene_handle.stop(server_stopping_error()).await;
         }
         let engine = self.clone();
-        let finish = move || {
+        let stop_threads = move || {
             engine.shared.services.checkpoints.finish();
-            let device = lock(&engine.shared.device).take();
+            let device_thread = lock(&engine.shared.device_thread).take();
             engine.shared.services.device.quit();
-            device.map(JoinHandle::join);
+            device_thread.map(JoinHandle::join);
             engine.shared.scene_catalog.release();
             Ok(())
         };
-        if let Err(error) = run_blocking("shutdown", finish).await {
+        if let Err(error) = run_blocking("shutdown", stop_threads).await {
             tracing::error!(%error, "the engine did not stop cleanly");
         }
     }
@@ -280,8 +281,8 @@ impl Engine {
         self.shared.stopping.load(Ordering::Acquire)
     }
 
-    /// Waits until the device is lost: the server cannot go on, every scene fails with this error, and new ones are
-    /// refused. Cancel-safe.
+    /// Waits until the device is lost and returns the error. Every open scene then fails with this error, and opening a
+    /// scene returns it. Cancel-safe.
     pub async fn device_lost(&self) -> Error {
         self.shared.services.device.loss().wait().await
     }
@@ -290,11 +291,12 @@ impl Engine {
     /// `Unavailable` when the server is shutting down, `DeviceLost`.
     fn check_running(&self) -> Result<()> {
         if self.is_stopping() {
-            return Err(stopping());
+            return Err(server_stopping_error());
         }
         self.shared.services.device.loss().error().map_or(Ok(()), Err)
     }
 
+    /// Reopens the scenes of the catalog. A scene that cannot be opened is logged.
     async fn restore(&self) {
         let mut openings = tokio::task::JoinSet::new();
         for (name, provenance) in self.shared.scene_catalog.entries() {
@@ -302,7 +304,7 @@ impl Engine {
             openings.spawn(async move {
                 if let Err(error) = engine.open_once(name.clone(), provenance, None).await {
                     // The entry remains in the list, because the files may be available again at the next start.
-                    tracing::warn!(scene = name, %error, "a kept scene could not be opened");
+                    tracing::warn!(scene = name, %error, "a scene of the last run could not be reopened");
                 }
             });
         }
@@ -320,7 +322,7 @@ impl Engine {
         self.check_running()?;
         let engine = self.clone();
         let work = async move {
-            let entry = engine.shared.registry.entry(&name, &provenance, upload.is_some())?;
+            let entry = engine.shared.registry.reserve(&name, &provenance, upload.is_some())?;
             let opened = entry.get_or_open(|| engine.open_or_discard(name.clone(), provenance, upload)).await;
             engine.shared.registry.release(&name, &entry);
             // The scene may have failed before the registry had its handle.
@@ -332,6 +334,7 @@ impl Engine {
         tokio::spawn(work).await.map_err(modalcast_model::error::fault_in("open"))?
     }
 
+    /// Loads a scene. If that fails, removes the files of a new upload.
     async fn open_or_discard(
         &self,
         name: String,
@@ -339,42 +342,46 @@ impl Engine {
         upload: Option<Upload>,
     ) -> Result<Arc<SceneHandle>> {
         let is_new_upload = upload.is_some();
-        let hosted = self.load_and_stage(&name, &provenance, upload).await;
-        if hosted.is_err() && is_new_upload {
-            let place = self.shared.scene_catalog.upload_folder(&name);
-            run_blocking("upload", move || Ok(std::fs::remove_dir_all(place).ok())).await?;
+        let result = self.load_scene(&name, &provenance, upload).await;
+        if result.is_err() && is_new_upload {
+            let upload_folder = self.shared.scene_catalog.upload_folder(&name);
+            run_blocking("upload", move || Ok(std::fs::remove_dir_all(upload_folder).ok())).await?;
         }
-        hosted.map(Arc::new)
+        result.map(Arc::new)
     }
 
-    async fn load_and_stage(
+    /// Reads a scene's files and its checkpoint, starts its task and adds it to the catalog.
+    async fn load_scene(
         &self,
         name: &str,
         provenance: &SceneProvenance,
         upload: Option<Upload>,
     ) -> Result<SceneHandle> {
-        let OpenedScene { scene, backends } = self.load(name, provenance, upload).await?;
-        let (engine, key, kept) = (self.clone(), name.to_owned(), Arc::clone(&scene));
-        let state = run_blocking("kept step", move || Ok(engine.shared.services.checkpoints.load(&key, &kept))).await?;
-        let state = state.unwrap_or_else(|error| {
-            tracing::warn!(scene = name, %error, "the scene begins at rest");
+        let OpenedScene { scene, backends } = self.read_scene_files(name, provenance, upload).await?;
+        let (engine, scene_name, restored_scene) = (self.clone(), name.to_owned(), Arc::clone(&scene));
+        let restored_state = run_blocking("checkpoint", move || {
+            Ok(engine.shared.services.checkpoints.load(&scene_name, &restored_scene))
+        })
+        .await?;
+        let restored_state = restored_state.unwrap_or_else(|error| {
+            tracing::warn!(scene = name, %error, "the checkpoint could not be loaded; the scene starts at rest");
             None
         });
-        let id = self.shared.next_id.fetch_add(1, Ordering::Relaxed);
+        let id = self.shared.next_scene_id.fetch_add(1, Ordering::Relaxed);
         let params = OpenParams {
             name: name.into(),
             provenance: provenance.clone(),
             scene,
             backends,
             id,
-            state,
-            on_failure: self.release_name_of(name, id),
+            state: restored_state,
+            on_failure: self.failure_callback(name, id),
             frames_unavailable: self.shared.info.renderer.as_ref().err().cloned(),
         };
         let scene_handle = SceneHandle::open(params, self.shared.services.clone()).await?;
-        let (engine, key, provenance) = (self.clone(), name.to_owned(), provenance.clone());
+        let (engine, scene_name, provenance) = (self.clone(), name.to_owned(), provenance.clone());
         if let Err(error) =
-            run_blocking("scenes.json", move || engine.shared.scene_catalog.add(&key, &provenance)).await
+            run_blocking("scenes.json", move || engine.shared.scene_catalog.add(&scene_name, &provenance)).await
         {
             scene_handle.stop(error.clone()).await;
             return Err(error);
@@ -384,9 +391,9 @@ impl Engine {
         Ok(scene_handle)
     }
 
-    /// What a failing scene calls: removes it from the registry. The catalog keeps the scene, so that the next start
-    /// opens it again. The callback does not keep the engine alive.
-    fn release_name_of(&self, name: &str, id: SceneId) -> Box<dyn FnOnce() + Send> {
+    /// Creates the callback of a scene for its failure, which removes the scene from the registry. The catalog keeps
+    /// the scene, so that the next start opens it again. The callback holds a weak reference to the engine.
+    fn failure_callback(&self, name: &str, id: SceneId) -> Box<dyn FnOnce() + Send> {
         let (shared, name) = (Arc::downgrade(&self.shared), name.to_owned());
         Box::new(move || {
             if let Some(shared) = shared.upgrade() {
@@ -396,48 +403,55 @@ impl Engine {
     }
 
     /// Reads a scene's files. A panic in a loader becomes a `Fault` of this call.
-    async fn load(&self, name: &str, provenance: &SceneProvenance, upload: Option<Upload>) -> Result<OpenedScene> {
-        let stopped = |_| stopping();
-        let _permit = self.shared.loads.acquire().await.map_err(stopped)?;
+    async fn read_scene_files(
+        &self,
+        name: &str,
+        provenance: &SceneProvenance,
+        upload: Option<Upload>,
+    ) -> Result<OpenedScene> {
+        let semaphore_closed = |_| server_stopping_error();
+        let _permit = self.shared.load_permits.acquire().await.map_err(semaphore_closed)?;
         let source = Arc::clone(&self.shared.source);
-        let place = self.shared.scene_catalog.upload_folder(name);
-        let (engine, key, provenance) = (self.clone(), name.to_owned(), provenance.clone());
+        let upload_folder = self.shared.scene_catalog.upload_folder(name);
+        let (engine, scene_name, provenance) = (self.clone(), name.to_owned(), provenance.clone());
         let read = move || match provenance {
             SceneProvenance::Repository { source: path } => source.open(&path),
             SceneProvenance::Upload { entry } => {
                 if let Some(upload) = upload {
                     // A checkpoint of an older scene with this name does not apply to the new one.
-                    engine.shared.services.checkpoints.remove(&key);
-                    upload.commit(&place)?;
+                    engine.shared.services.checkpoints.remove(&scene_name);
+                    upload.commit(&upload_folder)?;
                 }
-                source.open_within(&place, &entry)
+                source.open_within(&upload_folder, &entry)
             }
         };
         run_blocking("load", read).await
     }
 
+    /// Stops a scene and removes its checkpoint, its uploaded files, its catalog entry and its name.
     async fn close_scene(&self, name: &str) -> Result<()> {
         let entry = self.shared.registry.find_entry(name);
         match entry.as_ref().map(|entry| entry.scene_handle()) {
             Some(Some(scene_handle)) if scene_handle.is_closing() => return Err(scene_not_open(name)),
             Some(Some(scene_handle)) => scene_handle.stop(scene_not_open(name)).await,
-            Some(None) => return Err(Error::Busy { queue: "the name of a scene that is being opened", limit: 1 }),
+            Some(None) => return Err(Error::Busy { queue: "queue for a scene that is being opened", limit: 1 }),
             None => {}
         }
-        let (engine, key) = (self.clone(), name.to_owned());
-        let removed = run_blocking("close", move || {
-            engine.shared.services.checkpoints.remove(&key);
-            std::fs::remove_dir_all(engine.shared.scene_catalog.upload_folder(&key)).ok(); // Only uploads have a folder.
-            engine.shared.scene_catalog.remove(&key)
+        let (engine, scene_name) = (self.clone(), name.to_owned());
+        let catalog_change = run_blocking("close", move || {
+            engine.shared.services.checkpoints.remove(&scene_name);
+            // Fails for a scene of the repository, which has no such folder.
+            std::fs::remove_dir_all(engine.shared.scene_catalog.upload_folder(&scene_name)).ok();
+            engine.shared.scene_catalog.remove(&scene_name)
         })
         .await;
-        // The name is released only after the files are removed, so that a new upload under it does not lose its files.
-        // It is released even if the list could not be written.
+        // Release the name only after the files are removed, so that a new upload with this name does not lose its
+        // files. Release it even if the catalog could not be written.
         if let Some(entry) = &entry {
             self.shared.registry.remove(name, entry);
         }
-        let was_kept = removed?;
-        if entry.is_some() || was_kept { Ok(()) } else { Err(scene_not_open(name)) }
+        let was_listed = catalog_change?;
+        if entry.is_some() || was_listed { Ok(()) } else { Err(scene_not_open(name)) }
     }
 }
 
@@ -445,8 +459,9 @@ fn scene_not_open(name: &str) -> Error {
     Error::NotFound { what: "scene", given: format!("'{name}'") }
 }
 
-fn stopping() -> Error {
-    Error::Unavailable { what: "server", reason: "it stops".into(), remedy: "Try again when it is back".into() }
+fn server_stopping_error() -> Error {
+    let remedy = "Try again when it is running again".into();
+    Error::Unavailable { what: "server", reason: "it is shutting down".into(), remedy }
 }
 
 #[cfg(test)]
@@ -462,14 +477,18 @@ mod tests {
     const POSITIONS: OutputSpec =
         OutputSpec::Vertices(VertexAttributes { positions: true, normals: false, displacements: false, boxes: false });
 
-    /// An engine whose deformer injects faults, with the open scenes "faulty" and "control".
-    async fn engine(state: &std::path::Path) -> (Engine, Arc<SceneHandle>, Arc<SceneHandle>) {
-        let config = Config { state: state.to_owned(), ..Config::default() }.validated().expect("a good configuration");
-        let open = || DeviceContext::with_deformer(FaultyDeformer::boxed);
-        let engine = Engine::start_with_device(Arc::new(config), Arc::new(StripsSource), open).await.expect("starts");
-        let faulty = engine.open("strips", "faulty").await.expect("opens");
-        let control = engine.open("strips", "control").await.expect("opens");
-        (engine, faulty, control)
+    /// Starts an engine whose deformer injects faults, and opens the scenes "faulty" and "control".
+    async fn start_faulty_engine(state_folder: &std::path::Path) -> (Engine, Arc<SceneHandle>, Arc<SceneHandle>) {
+        let config = Config { state: state_folder.to_owned(), ..Config::default() }
+            .validated()
+            .expect("expected a valid configuration");
+        let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);
+        let engine = Engine::start_with_device(Arc::new(config), Arc::new(StripsSource), open_device)
+            .await
+            .expect("expected a running engine");
+        let faulty_scene = engine.open("strips", "faulty").await.expect("expected an open scene");
+        let control_scene = engine.open("strips", "control").await.expect("expected an open scene");
+        (engine, faulty_scene, control_scene)
     }
 
     fn step(number: u64, q: f32) -> RawStepUpdate {
@@ -477,14 +496,18 @@ mod tests {
         RawStepUpdate { number, q_domains: vec![0], q, ..RawStepUpdate::default() }
     }
 
-    /// Drives one step and waits for its report.
-    async fn drive(writer: &mut WriterSession, number: u64, q: f32) -> Result<StepReport> {
-        writer.step(&step(number, q))?;
-        within(writer.next_report()).await
+    /// Sends one step and waits for its report.
+    async fn send_step(writer: &mut WriterSession, number: u64, q: f32) -> Result<StepReport> {
+        writer.push_step(&step(number, q))?;
+        await_within_limit(writer.next_report()).await
     }
 
-    async fn within<T>(work: impl Future<Output = T>) -> T {
-        tokio::time::timeout(Duration::from_secs(60), work).await.expect("an answer in time")
+    async fn await_within_limit<T>(work: impl Future<Output = T>) -> T {
+        tokio::time::timeout(Duration::from_secs(60), work).await.expect("expected an answer within 60 s")
+    }
+
+    async fn acquire_writer(scene_handle: &SceneHandle) -> WriterSession {
+        scene_handle.drive("test".into(), Policy::Lossless, 4).await.expect("expected the writer lease")
     }
 
     fn is_done(report: &Result<StepReport>) -> bool {
@@ -492,71 +515,78 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn panicking_scene_fails_alone_and_can_be_opened_again() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let (engine, faulty, control) = engine(folder.path()).await;
-        let mut writer = faulty.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
-        let mut other = control.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
-        let mut feed = faulty.subscribe(POSITIONS, Delivery::Lossless).await.expect("subscribes");
-        assert!(is_done(&drive(&mut writer, 1, 0.25).await) && is_done(&drive(&mut other, 1, 0.25).await));
-        within(feed.next()).await.expect("control: the first step");
-        let waiting = faulty.request_output(StepSelector::Exact(99), POSITIONS);
-        let (waiting, ()) = within(async { tokio::join!(waiting, faulty.inject_panic()) }).await;
+    async fn panicking_scene_fails_alone_and_can_be_reopened() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let (engine, faulty_scene, control_scene) = start_faulty_engine(folder.path()).await;
+        let mut faulty_writer = acquire_writer(&faulty_scene).await;
+        let mut control_writer = acquire_writer(&control_scene).await;
+        let mut subscription =
+            faulty_scene.subscribe(POSITIONS, Delivery::Lossless).await.expect("expected a subscription");
+        assert!(is_done(&send_step(&mut faulty_writer, 1, 0.25).await));
+        assert!(is_done(&send_step(&mut control_writer, 1, 0.25).await));
+        await_within_limit(subscription.next()).await.expect("control: expected the first step");
+        let request = faulty_scene.request_output(StepSelector::Exact(99), POSITIONS);
+        let (output, ()) = await_within_limit(async { tokio::join!(request, faulty_scene.inject_panic()) }).await;
 
         let is_panic = |error: &Error| matches!(error, Error::Fault { reason, .. } if reason.contains("panicked"));
-        assert!(waiting.as_ref().is_err_and(is_panic), "{waiting:?}");
-        let report = within(writer.next_report()).await;
-        assert!(report.as_ref().is_err_and(is_panic), "{report:?}");
-        assert!(writer.step(&step(2, 0.5)).is_err_and(|error| is_panic(&error)));
-        let end = within(feed.next()).await;
-        assert!(end.as_ref().is_err_and(is_panic), "{end:?}");
-        let late = within(faulty.subscribe(POSITIONS, Delivery::Latest)).await;
-        assert!(late.as_ref().is_err_and(is_panic), "{late:?}");
+        assert!(output.as_ref().is_err_and(is_panic), "pending request: expected the panic, got {output:?}");
+        let report = await_within_limit(faulty_writer.next_report()).await;
+        assert!(report.as_ref().is_err_and(is_panic), "writer: expected the panic, got {report:?}");
+        assert!(faulty_writer.push_step(&step(2, 0.5)).is_err_and(|error| is_panic(&error)));
+        let end = await_within_limit(subscription.next()).await;
+        assert!(end.as_ref().is_err_and(is_panic), "subscription: expected the panic, got {end:?}");
+        let new_subscription = await_within_limit(faulty_scene.subscribe(POSITIONS, Delivery::Latest)).await;
+        assert!(new_subscription.as_ref().is_err_and(is_panic), "expected the panic, got {new_subscription:?}");
 
-        let gone = engine.find("faulty").expect_err("the name is free");
-        assert!(matches!(gone, Error::NotFound { .. }), "{gone}");
+        let error = engine.find("faulty").expect_err("expected an error for a failed scene");
+        assert!(matches!(error, Error::NotFound { .. }), "expected NotFound, got {error}");
         let names = engine.list().iter().map(|scene| scene.name.clone()).collect::<Vec<_>>();
         assert_eq!(names, ["control"]);
-        let device = &engine.shared.services.device;
-        let unloaded = device.deform(faulty.id(), &Arc::new(modalcast_model::scene::SceneState::rest(&faulty.scene)));
-        assert!(within(unloaded.wait()).await.is_err_and(|error| error.to_string().contains("not loaded")));
-        assert!(is_done(&drive(&mut other, 2, 0.5).await), "the other scene goes on");
-        let again = within(engine.open("strips", "faulty")).await.expect("opens again");
-        assert_eq!(again.last_step().map(|step| step.number), Some(1), "with the step of its checkpoint");
+        let rest_state = Arc::new(modalcast_model::scene::SceneState::rest(&faulty_scene.scene));
+        let deformation = engine.shared.services.device.deform(faulty_scene.id(), &rest_state);
+        let error = await_within_limit(deformation.wait()).await.expect_err("expected an unloaded scene").to_string();
+        assert!(error.contains("not loaded"), "expected 'not loaded', got {error}");
+        assert!(is_done(&send_step(&mut control_writer, 2, 0.5).await), "expected the control scene to continue");
+        let reopened_scene =
+            await_within_limit(engine.open("strips", "faulty")).await.expect("expected to reopen the scene");
+        let restored_step = reopened_scene.last_step().map(|step| step.number);
+        assert_eq!(restored_step, Some(1), "expected the step of the checkpoint");
         engine.shutdown().await;
     }
 
     #[tokio::test]
     async fn panicking_device_command_rejects_only_its_step() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let (engine, faulty, control) = engine(folder.path()).await;
-        let mut writer = faulty.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
-        let mut other = control.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
-        let rejected = drive(&mut writer, 1, InjectedFault::PanicInDeform.q()).await;
-        assert!(matches!(rejected, Ok(StepReport::Rejected { step: 1, error: Error::Fault { .. } })), "{rejected:?}");
-        assert!(is_done(&drive(&mut other, 1, 0.25).await));
-        assert!(is_done(&drive(&mut writer, 2, 0.25).await), "the scene goes on");
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let (engine, faulty_scene, control_scene) = start_faulty_engine(folder.path()).await;
+        let mut faulty_writer = acquire_writer(&faulty_scene).await;
+        let mut control_writer = acquire_writer(&control_scene).await;
+        let report = send_step(&mut faulty_writer, 1, InjectedFault::PanicInDeform.q()).await;
+        assert!(matches!(report, Ok(StepReport::Rejected { step: 1, error: Error::Fault { .. } })), "{report:?}");
+        assert!(is_done(&send_step(&mut control_writer, 1, 0.25).await));
+        assert!(is_done(&send_step(&mut faulty_writer, 2, 0.25).await), "expected the faulty scene to continue");
         engine.shutdown().await;
     }
 
     #[tokio::test]
-    async fn lost_device_fails_every_scene_and_refuses_new_ones() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let (engine, faulty, control) = engine(folder.path()).await;
-        let mut writer = faulty.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
-        let mut other = control.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
-        let mut feed = control.subscribe(POSITIONS, Delivery::Latest).await.expect("subscribes");
-        assert!(is_done(&drive(&mut other, 1, 0.25).await));
-        within(feed.next()).await.expect("control: the device works");
-        let rejected = drive(&mut writer, 1, InjectedFault::DeviceLost.q()).await;
-        let lost = testing::device_lost();
-        assert_eq!(rejected, Ok(StepReport::Rejected { step: 1, error: lost.clone() }));
-        assert_eq!(within(writer.next_report()).await, Err(lost.clone()));
-        assert_eq!(within(other.next_report()).await, Err(lost.clone()), "an idle scene fails, too");
-        assert_eq!(within(feed.next()).await.expect_err("ends"), lost);
-        assert_eq!(within(engine.device_lost()).await, lost);
-        assert_eq!(engine.find("control").expect_err("refused"), lost);
-        assert_eq!(within(engine.open("strips", "new")).await.expect_err("refused"), lost);
-        within(engine.shutdown()).await;
+    async fn lost_device_fails_every_scene_and_rejects_new_ones() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let (engine, faulty_scene, control_scene) = start_faulty_engine(folder.path()).await;
+        let mut faulty_writer = acquire_writer(&faulty_scene).await;
+        let mut control_writer = acquire_writer(&control_scene).await;
+        let mut subscription =
+            control_scene.subscribe(POSITIONS, Delivery::Latest).await.expect("expected a subscription");
+        assert!(is_done(&send_step(&mut control_writer, 1, 0.25).await));
+        await_within_limit(subscription.next()).await.expect("control: expected the first step");
+        let report = send_step(&mut faulty_writer, 1, InjectedFault::DeviceLost.q()).await;
+        let loss = testing::device_lost_error();
+        assert_eq!(report, Ok(StepReport::Rejected { step: 1, error: loss.clone() }));
+        assert_eq!(await_within_limit(faulty_writer.next_report()).await, Err(loss.clone()));
+        let idle_report = await_within_limit(control_writer.next_report()).await;
+        assert_eq!(idle_report, Err(loss.clone()), "expected the idle scene to fail, too");
+        assert_eq!(await_within_limit(subscription.next()).await.expect_err("expected the loss"), loss);
+        assert_eq!(await_within_limit(engine.device_lost()).await, loss);
+        assert_eq!(engine.find("control").expect_err("expected the loss"), loss);
+        assert_eq!(await_within_limit(engine.open("strips", "new")).await.expect_err("expected the loss"), loss);
+        await_within_limit(engine.shutdown()).await;
     }
 }

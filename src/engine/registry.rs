@@ -23,7 +23,8 @@ pub(super) struct RegistryEntry {
 }
 
 impl RegistryEntry {
-    /// The scene, loaded by the first caller. The other callers wait; if the load fails, the next caller retries it.
+    /// Returns the scene. The first caller loads it while the others wait. If the load fails, the next caller retries
+    /// it.
     ///
     /// # Errors
     /// The error of `load`; `Busy` when the scene is being closed.
@@ -34,7 +35,7 @@ impl RegistryEntry {
         let scene_handle = self.cell.get_or_try_init(load).await?;
         match scene_handle.is_closing() {
             false => Ok(Arc::clone(scene_handle)),
-            true => Err(Error::Busy { queue: "the name of a scene that is being closed", limit: 1 }),
+            true => Err(Error::Busy { queue: "queue for a scene that is being closed", limit: 1 }),
         }
     }
 
@@ -46,33 +47,38 @@ impl RegistryEntry {
 
 /// All reserved names.
 pub(super) struct Registry {
-    limit: usize,
+    max_scenes: usize,
     entries: Mutex<BTreeMap<String, Arc<RegistryEntry>>>,
 }
 
 impl Registry {
-    pub(super) const fn new(limit: usize) -> Self {
-        Self { limit, entries: Mutex::new(BTreeMap::new()) }
+    pub(super) const fn new(max_scenes: usize) -> Self {
+        Self { max_scenes, entries: Mutex::new(BTreeMap::new()) }
     }
 
-    /// Reserves a name until [`Self::release`], or joins an existing reservation with the same origin. With `fresh` the
-    /// name must be free.
+    /// Reserves a name until [`Self::release`], or joins an existing reservation with the same origin. With
+    /// `must_be_new` an existing reservation is an error.
     ///
     /// # Errors
     /// `Taken` when the name is reserved for another origin, `Busy` when too many scenes are open.
-    pub(super) fn entry(&self, name: &str, provenance: &SceneProvenance, fresh: bool) -> Result<Arc<RegistryEntry>> {
+    pub(super) fn reserve(
+        &self,
+        name: &str,
+        provenance: &SceneProvenance,
+        must_be_new: bool,
+    ) -> Result<Arc<RegistryEntry>> {
         let mut entries = self.lock();
         if let Some(entry) = entries.get(name) {
-            return match !fresh && entry.provenance == *provenance {
+            return match !must_be_new && entry.provenance == *provenance {
                 true => {
                     entry.open_calls.fetch_add(1, Ordering::Relaxed);
                     Ok(Arc::clone(entry))
                 }
-                false => Err(taken(name, entry)),
+                false => Err(name_taken_error(name, entry)),
             };
         }
-        if entries.len() >= self.limit {
-            return Err(Error::Busy { queue: "list of open scenes", limit: self.limit });
+        if entries.len() >= self.max_scenes {
+            return Err(Error::Busy { queue: "list of open scenes", limit: self.max_scenes });
         }
         let entry = Arc::new(RegistryEntry {
             provenance: provenance.clone(),
@@ -83,14 +89,20 @@ impl Registry {
         Ok(entry)
     }
 
-    pub(super) fn check_free(&self, name: &str) -> Result<()> {
-        self.lock().get(name).map_or(Ok(()), |entry| Err(taken(name, entry)))
+    /// # Errors
+    /// `Taken` when the name is reserved.
+    pub(super) fn check_name_free(&self, name: &str) -> Result<()> {
+        self.lock().get(name).map_or(Ok(()), |entry| Err(name_taken_error(name, entry)))
     }
 
     pub(super) fn find_entry(&self, name: &str) -> Option<Arc<RegistryEntry>> {
         self.lock().get(name).cloned()
     }
 
+    /// The open scene with this name.
+    ///
+    /// # Errors
+    /// `NotFound` when the scene is not loaded or is being closed.
     pub(super) fn find(&self, name: &str) -> Result<Arc<SceneHandle>> {
         let entries = self.lock();
         let scene_handle =
@@ -98,6 +110,7 @@ impl Registry {
         scene_handle.cloned().ok_or_else(|| scene_not_open(name))
     }
 
+    /// The open scenes, sorted by name.
     pub(super) fn list(&self) -> Vec<Arc<SceneHandle>> {
         self.lock()
             .values()
@@ -118,7 +131,7 @@ impl Registry {
     /// Releases the name of a closed scene unless another opening has reserved it since.
     pub(super) fn remove(&self, name: &str, entry: &Arc<RegistryEntry>) {
         let mut entries = self.lock();
-        if entries.get(name).is_some_and(|held| Arc::ptr_eq(held, entry)) {
+        if entries.get(name).is_some_and(|registered| Arc::ptr_eq(registered, entry)) {
             entries.remove(name);
         }
     }
@@ -126,7 +139,7 @@ impl Registry {
     /// Releases the name of a scene that has failed.
     pub(super) fn remove_scene(&self, name: &str, id: SceneId) {
         let mut entries = self.lock();
-        if entries.get(name).and_then(|entry| entry.scene_handle()).is_some_and(|held| held.id() == id) {
+        if entries.get(name).and_then(|entry| entry.scene_handle()).is_some_and(|registered| registered.id() == id) {
             entries.remove(name);
         }
     }
@@ -136,6 +149,6 @@ impl Registry {
     }
 }
 
-fn taken(name: &str, entry: &RegistryEntry) -> Error {
-    Error::Taken { what: "the name of the scene", holder: format!("'{name}' is {}", entry.provenance.label()) }
+fn name_taken_error(name: &str, entry: &RegistryEntry) -> Error {
+    Error::Taken { what: "scene name", holder: format!("'{name}' belongs to '{}'", entry.provenance.label()) }
 }

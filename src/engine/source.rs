@@ -1,11 +1,11 @@
-//! The source of scenes: resolves a name or path to a validated scene.
+//! The trait of scene sources, which resolve a name or path to a validated scene.
 
 use std::path::Path;
 
 use modalcast_model::error::Result;
 use modalcast_model::load::{OpenedScene, SceneRepository};
 
-/// Opens scenes for the engine. The engine calls it on threads that may block on the disk.
+/// Opens scenes for the engine. The engine calls the methods on threads that may block on the disk.
 pub trait SceneSource: Send + Sync + 'static {
     /// Opens a built-in scene or a path in the server's repository.
     ///

@@ -23,19 +23,22 @@ pub(super) fn strips_with_attributes() -> Arc<Scene> {
 }
 
 fn strips(deformation: DeformationSettings) -> Arc<Scene> {
-    let rest = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
-    let mesh =
-        Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a square");
-    let columns = (0..24).map(|entry| if entry % 5 == 0 { 0.5 } else { 0.0 }).collect();
-    let shape = Shape::new(mesh, Modes::from_columns(12, 2, columns).expect("12 x 2")).expect("fits");
+    let rest_positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+    let (normals, triangles) = (vec![[0.0, 0.0, 1.0]; 4], vec![[0, 1, 2], [0, 2, 3]]);
+    let mesh = Mesh::from_indexed(rest_positions, normals, vec![], triangles).expect("expected a valid mesh");
+    // U has 12 rows and 2 columns.
+    let entries = (0..24).map(|index| if index % 5 == 0 { 0.5 } else { 0.0 }).collect();
+    let modes = Modes::from_columns(12, 2, entries).expect("expected valid modes");
+    let shape = Shape::new(mesh, modes).expect("expected a valid shape");
     let domain = |name: &str, attachment| Domain { attachment, ..Domain::new(name, 0) };
     let joint = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 2] };
     let domains = vec![domain("left", None), domain("right", Some(joint))];
     let (shapes, materials) = (vec![shape], vec![Material::default()]);
-    Scene::new(SceneParts { shapes, materials, domains, deformation, ..SceneParts::named("strips") }).expect("a scene")
+    Scene::new(SceneParts { shapes, materials, domains, deformation, ..SceneParts::named("strips") })
+        .expect("expected a valid scene")
 }
 
-/// A fault that [`FaultyDeformer`] injects while it holds a state whose first coordinate is [`Self::q`].
+/// A fault that [`FaultyDeformer`] injects after it was given a state whose first coordinate is [`Self::q`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum InjectedFault {
     PanicInDeform,
@@ -47,13 +50,14 @@ pub(super) enum InjectedFault {
 impl InjectedFault {
     const ALL: [Self; 4] = [Self::PanicInDeform, Self::PanicInReadback, Self::PanicInWait, Self::DeviceLost];
 
-    /// The first coordinate of a state that triggers the fault.
+    /// The first coordinate of a state that triggers the fault, far above that of any valid test state.
     pub(super) fn q(self) -> f32 {
         1000.0 + self as u8 as f32
     }
 }
 
-/// The reference deformer with faults that the state triggers. Its readbacks are in flight until they are awaited.
+/// The reference deformer with faults that are triggered by the state. Its readbacks are in flight until they are
+/// awaited.
 pub(super) struct FaultyDeformer {
     inner: ReferenceDeformer,
     fault: Option<InjectedFault>,
@@ -71,11 +75,12 @@ impl Deformer for FaultyDeformer {
         Backend::Reference
     }
 
+    /// Selects the fault of the state. Faults in readbacks are injected by the later calls.
     fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
         self.fault = InjectedFault::ALL.into_iter().find(|fault| state.q[0] == fault.q());
         match self.fault {
             Some(InjectedFault::PanicInDeform) => panic!("injected into deform"),
-            Some(InjectedFault::DeviceLost) => Err(device_lost()),
+            Some(InjectedFault::DeviceLost) => Err(device_lost_error()),
             _ => self.inner.deform(state),
         }
     }
@@ -84,7 +89,7 @@ impl Deformer for FaultyDeformer {
         self.inner.surface()
     }
 
-    fn readback(&mut self, _wanted: VertexAttributes) -> Result<VertexReadback> {
+    fn readback(&mut self, _attributes: VertexAttributes) -> Result<VertexReadback> {
         assert_ne!(self.fault, Some(InjectedFault::PanicInReadback), "injected into readback");
         let surface = Arc::new(self.inner.surface()?.clone());
         self.readbacks.push(Arc::clone(&surface));
@@ -93,13 +98,17 @@ impl Deformer for FaultyDeformer {
 
     fn wait_readback(&mut self, readback: &VertexReadback) -> Result<Arc<DeformedSurface>> {
         assert_ne!(self.fault, Some(InjectedFault::PanicInWait), "injected into wait");
-        let at = self.readbacks.iter().position(|surface| readback.is_of(surface)).expect("its own readback");
-        Ok(self.readbacks.swap_remove(at))
+        let index = self
+            .readbacks
+            .iter()
+            .position(|surface| readback.is_of(surface))
+            .expect("expected a readback of this deformer");
+        Ok(self.readbacks.swap_remove(index))
     }
 }
 
 /// The error of an injected device loss.
-pub(super) fn device_lost() -> Error {
+pub(super) fn device_lost_error() -> Error {
     Error::DeviceLost { stage: "deform", reason: "injected".into() }
 }
 

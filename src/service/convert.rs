@@ -1,5 +1,5 @@
-//! Conversions between wire messages and values: scenes, steps, pictures, stage times. Numbers from the wire are
-//! untrusted until a constructor of `scene` has validated them.
+//! Conversions between wire messages and engine types. `wire_` functions create messages, `parse_` functions read them.
+//! Numbers from the wire are untrusted until a constructor of `modalcast_model::scene` has validated them.
 
 use modalcast_proto::v1;
 
@@ -17,7 +17,7 @@ mod output;
 const MAX_REMARK_BYTES: usize = 64 << 10;
 
 /// The public description of an open scene.
-pub(super) fn scene_info(scene_handle: &SceneHandle, with_remarks: bool) -> v1::SceneInfo {
+pub(super) fn wire_scene_info(scene_handle: &SceneHandle, with_remarks: bool) -> v1::SceneInfo {
     let scene = &scene_handle.scene;
     let layout = &scene.layout;
     let bounds = scene.rest_bounds;
@@ -34,45 +34,57 @@ pub(super) fn scene_info(scene_handle: &SceneHandle, with_remarks: bool) -> v1::
         origin: scene.origin.to_vec(),
         bounds: [bounds.min, bounds.max].concat(),
         affine: scene.features.shear,
-        last_step: scene_handle.last_step().map(step_id),
-        remarks: if with_remarks { remarks(scene) } else { Vec::new() },
+        last_step: scene_handle.last_step().map(wire_step_id),
+        remarks: if with_remarks { list_remarks(scene) } else { Vec::new() },
     }
 }
 
-fn remarks(scene: &Scene) -> Vec<String> {
-    let mut left = MAX_REMARK_BYTES;
-    let fits = |remark: &&String| {
-        left = left.saturating_sub(remark.len() + 8);
-        left > 0
-    };
-    let mut kept: Vec<String> = scene.remarks.iter().take_while(fits).cloned().collect();
-    if kept.len() < scene.remarks.len() {
-        kept.push(format!("and {} more", scene.remarks.len() - kept.len()));
+/// A limit on the encoded size of a list of strings.
+pub(super) struct ByteBudget(usize);
+
+impl ByteBudget {
+    /// Upper bound on the bytes that protobuf adds to a string: tag and length.
+    const STRING_OVERHEAD_BYTES: usize = 8;
+
+    pub(super) const fn new(bytes: usize) -> Self {
+        Self(bytes)
     }
-    kept
+
+    /// Subtracts the size of a string. Returns false when the budget is used up.
+    pub(super) fn take_string(&mut self, text: &str) -> bool {
+        self.0 = self.0.saturating_sub(text.len() + Self::STRING_OVERHEAD_BYTES);
+        self.0 > 0
+    }
 }
 
-pub(super) const fn step_id(step: StepId) -> v1::StepId {
+/// The remarks of a scene within [`MAX_REMARK_BYTES`].
+fn list_remarks(scene: &Scene) -> Vec<String> {
+    let mut budget = ByteBudget::new(MAX_REMARK_BYTES);
+    let mut remarks: Vec<String> =
+        scene.remarks.iter().take_while(|remark| budget.take_string(remark)).cloned().collect();
+    if remarks.len() < scene.remarks.len() {
+        remarks.push(format!("and {} more", scene.remarks.len() - remarks.len()));
+    }
+    remarks
+}
+
+pub(super) const fn wire_step_id(step: StepId) -> v1::StepId {
     v1::StepId { run: step.run, number: step.number, time: step.time }
 }
 
-pub(super) fn stages(times: &StageTimes) -> Vec<v1::StageTime> {
-    let wire = |(stage, ms): &(crate::telemetry::Stage, f64)| v1::StageTime {
-        stage: stage.name().into(),
-        milliseconds: *ms as f32,
-    };
-    times.iter().map(wire).collect()
+pub(super) fn wire_stages(times: &StageTimes) -> Vec<v1::StageTime> {
+    times.iter().map(|(stage, ms)| v1::StageTime { stage: stage.name().into(), milliseconds: *ms as f32 }).collect()
 }
 
-pub(super) const fn drawn_by(path: Option<RasterBackend>) -> v1::DrawnBy {
-    match path {
+pub(super) const fn wire_raster_backend(backend: Option<RasterBackend>) -> v1::DrawnBy {
+    match backend {
         None => v1::DrawnBy::Unspecified,
         Some(RasterBackend::OpenGl) => v1::DrawnBy::Opengl,
         Some(RasterBackend::Cuda) => v1::DrawnBy::Cuda,
     }
 }
 
-pub(super) fn raw_update(step: v1::Step) -> Result<RawStepUpdate> {
+pub(super) fn parse_step(step: v1::Step) -> Result<RawStepUpdate> {
     let transform_format = match v1::TransformFormat::try_from(step.transform_format) {
         Ok(v1::TransformFormat::Unspecified | v1::TransformFormat::AffineF32) => TransformFormat::Affine,
         Ok(v1::TransformFormat::RigidF32) => TransformFormat::RigidF32,
@@ -91,7 +103,7 @@ pub(super) fn raw_update(step: v1::Step) -> Result<RawStepUpdate> {
 }
 
 /// Parses a policy; unspecified means lossless.
-pub(super) fn policy(number: i32) -> Result<Policy> {
+pub(super) fn parse_policy(number: i32) -> Result<Policy> {
     match v1::Policy::try_from(number) {
         Ok(v1::Policy::Unspecified | v1::Policy::Lossless) => Ok(Policy::Lossless),
         Ok(v1::Policy::Latest) => Ok(Policy::Latest),
@@ -107,7 +119,7 @@ pub(super) const fn wire_policy(policy: Policy) -> v1::Policy {
 }
 
 /// Parses a delivery; unspecified means latest.
-pub(super) fn delivery(number: i32) -> Result<Delivery> {
+pub(super) fn parse_delivery(number: i32) -> Result<Delivery> {
     match v1::Delivery::try_from(number) {
         Ok(v1::Delivery::Lossless) => Ok(Delivery::Lossless),
         Ok(v1::Delivery::Unspecified | v1::Delivery::Latest) => Ok(Delivery::Latest),
@@ -115,8 +127,8 @@ pub(super) fn delivery(number: i32) -> Result<Delivery> {
     }
 }
 
-/// Validates a picture; returns the view to render and the wire format.
-pub(super) fn picture(
+/// Validates a picture. Returns the output to render and its wire format. The output is an [`OutputSpec::Frame`].
+pub(super) fn parse_picture(
     engine: &Engine,
     scene: &Scene,
     picture: Option<v1::Picture>,
@@ -127,9 +139,9 @@ pub(super) fn picture(
         (0, 0) => (1280, 720),
         size => size,
     };
-    let most = engine.frame_side();
-    if !(1..=most).contains(&width) || !(1..=most).contains(&height) {
-        let expected = format!("1 to {most} pixels a side, or 0 x 0 for 1280 x 720");
+    let max_side = engine.frame_side();
+    if !(1..=max_side).contains(&width) || !(1..=max_side).contains(&height) {
+        let expected = format!("1 to {max_side} pixels per side, or 0 x 0 for 1280 x 720");
         return Err(invalid("picture.size", expected, format!("{width} x {height}")));
     }
     let fit_to_scene = Camera::fit_to_scene(scene, width, height);
@@ -140,15 +152,16 @@ pub(super) fn picture(
     Ok((OutputSpec::Frame { camera, size: FrameSize::new(width, height), frame_output }, format))
 }
 
-/// Validates a pick request; returns the view that picks in its rectangle.
-pub(super) fn pick(engine: &Engine, scene: &Scene, request: &v1::PickRequest) -> Result<OutputSpec> {
-    let bare = request.picture.clone().map(|wire| v1::Picture {
-        width: wire.width,
-        height: wire.height,
-        camera: wire.camera,
+/// Validates a pick request. Returns an [`OutputSpec::Pick`].
+pub(super) fn parse_pick(engine: &Engine, scene: &Scene, request: &v1::PickRequest) -> Result<OutputSpec> {
+    // A pick ignores the output and the format of its picture.
+    let size_and_camera = request.picture.clone().map(|picture| v1::Picture {
+        width: picture.width,
+        height: picture.height,
+        camera: picture.camera,
         ..v1::Picture::default()
     });
-    let (OutputSpec::Frame { camera, size: picture, .. }, _) = picture(engine, scene, bare)? else {
+    let (OutputSpec::Frame { camera, size: picture, .. }, _) = parse_picture(engine, scene, size_and_camera)? else {
         return Err(invalid("picture", "a picture", "none"));
     };
     let size = match (request.width, request.height) {
@@ -169,7 +182,8 @@ pub(super) const fn wire_format(format: FrameFormat) -> v1::Format {
     }
 }
 
-/// Implements the conversion of the optional `step` of a request. A macro, because every request has its own type of it.
+/// Implements the conversion of the optional `step` of a request. A macro, because each request has its own `Step`
+/// type.
 macro_rules! step_selector_from {
     ($($step:path),+) => {$(
         impl From<Option<$step>> for StepSelector {
@@ -186,16 +200,16 @@ macro_rules! step_selector_from {
 }
 step_selector_from!(v1::pick_request::Step, v1::render_frame_request::Step, v1::get_vertices_request::Step);
 
-/// A readable name of the requested step, for errors.
+/// Describes the requested step, for errors.
 pub(super) fn describe_step_selector(selector: StepSelector, scene: &str) -> String {
     match selector {
-        StepSelector::Current => format!("the step that scene '{scene}' shows"),
+        StepSelector::Current => format!("the current step of scene '{scene}'"),
         StepSelector::Exact(number) => format!("step {number} of scene '{scene}'"),
         StepSelector::Minimum(number) => format!("step {number} or later of scene '{scene}'"),
     }
 }
 
-pub(super) fn upload_header(header: v1::UploadHeader) -> engine::UploadHeader {
+pub(super) fn parse_upload_header(header: v1::UploadHeader) -> engine::UploadHeader {
     engine::UploadHeader {
         scene: header.scene,
         entry: header.entry,

@@ -4,9 +4,11 @@
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
-use super::convert::{delivery, describe_step_selector, drawn_by, picture, stages, step_id, wire_format};
+use super::convert::{
+    describe_step_selector, parse_delivery, parse_picture, wire_format, wire_raster_backend, wire_stages, wire_step_id,
+};
 use super::picks;
-use super::status::status;
+use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
 use crate::engine::{EncodedOutput, EncodedSubscription, Engine, FrameFormat, OutputSpec, StepSelector};
 
@@ -24,15 +26,15 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let config = self.0.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(status)?;
-        let (view, format) = picture(&self.0, &scene_handle.scene, request.picture).map_err(status)?;
+        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let (output_spec, format) = parse_picture(&self.0, &scene_handle.scene, request.picture).map_err(to_status)?;
         let selector = StepSelector::from(request.step);
-        let (most, encoder) = (config.chunk_bytes, self.0.encoder().clone());
+        let (max_chunk_bytes, encoder) = (config.chunk_bytes, self.0.encoder().clone());
         Ok(respond(move |reply_sender| async move {
             let work = async {
-                let output = scene_handle.request_output(selector, view).await.map_err(status)?;
-                let frame = encoder.encode(output, format).await.map_err(status)?;
-                for chunk in chunks(&frame, view, format, most) {
+                let output = scene_handle.request_output(selector, output_spec).await.map_err(to_status)?;
+                let frame = encoder.encode(output, format).await.map_err(to_status)?;
+                for chunk in frame_chunks(&frame, output_spec, format, max_chunk_bytes) {
                     reply_sender.send(v1::RenderFrameResponse { chunk: Some(chunk) }).await?;
                 }
                 Ok(())
@@ -46,7 +48,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
     async fn pick(&self, request: Request<v1::PickRequest>) -> Result<Response<Self::PickStream>, Status> {
         let config = self.0.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
-        picks::answer(&self.0, deadline, request.into_inner())
+        picks::respond_to_pick(&self.0, deadline, request.into_inner())
     }
 
     type StreamFramesStream = ReplyStream<v1::StreamFramesResponse>;
@@ -57,61 +59,67 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
     ) -> Result<Response<Self::StreamFramesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(status)?;
-        let (view, format) = picture(&self.0, &scene_handle.scene, request.picture).map_err(status)?;
-        let delivery = delivery(request.delivery).map_err(status)?;
+        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let (output_spec, format) = parse_picture(&self.0, &scene_handle.scene, request.picture).map_err(to_status)?;
+        let delivery = parse_delivery(request.delivery).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
-        let subscription = scene_handle.subscribe(view, delivery).await.map_err(status)?;
+        let subscription = scene_handle.subscribe(output_spec, delivery).await.map_err(to_status)?;
         let frames = EncodedSubscription::new(subscription, self.0.encoder().clone(), format, request.frames);
-        let most = self.0.config().chunk_bytes;
-        let cut = move |frame: &EncodedOutput| chunks(frame, view, format, most);
+        let max_chunk_bytes = self.0.config().chunk_bytes;
+        let split_frame = move |frame: &EncodedOutput| frame_chunks(frame, output_spec, format, max_chunk_bytes);
         Ok(respond(move |reply_sender| {
-            deadline.enforce("the end of the frame stream", send_frames(frames, cut, reply_sender))
+            deadline.enforce("the frame stream", send_frames(frames, split_frame, reply_sender))
         }))
     }
 }
 
-/// Sends frames in chunks until the stream ends, the client disconnects or the feed is cut off.
+/// Sends frames in chunks until the subscription ends, the client disconnects, or the scene disconnects the subscriber.
 async fn send_frames<C: Iterator<Item = v1::FrameChunk>>(
     mut frames: EncodedSubscription,
-    cut: impl Fn(&EncodedOutput) -> C,
+    split_frame: impl Fn(&EncodedOutput) -> C,
     reply_sender: ReplySender<v1::StreamFramesResponse>,
 ) -> Result<(), Status> {
     loop {
         let frame = tokio::select! {
-            frame = frames.next() => frame.map_err(status)?,
+            frame = frames.next() => frame.map_err(to_status)?,
             () = reply_sender.closed() => return Ok(()),
         };
         let Some(frame) = frame else { return Ok(()) };
-        for chunk in cut(&frame) {
+        for chunk in split_frame(&frame) {
             tokio::select! {
                 sent = reply_sender.send(v1::StreamFramesResponse { chunk: Some(chunk) }) => sent?,
-                error = frames.disconnected() => return Err(status(error)),
+                error = frames.disconnected() => return Err(to_status(error)),
             }
         }
     }
 }
 
-fn chunks(
+/// Splits a frame into chunks, of which the first has the head.
+fn frame_chunks(
     frame: &EncodedOutput,
-    view: OutputSpec,
+    output_spec: OutputSpec,
     format: FrameFormat,
-    most: usize,
+    max_chunk_bytes: usize,
 ) -> impl Iterator<Item = v1::FrameChunk> + use<> {
-    let (width, height) = match view {
+    let (width, height) = match output_spec {
         OutputSpec::Frame { size, .. } => (size.width, size.height),
+        // `parse_picture` returns frames only.
         OutputSpec::Vertices(_) | OutputSpec::Pick { .. } => (0, 0),
     };
     let head = v1::FrameHead {
-        step: Some(step_id(frame.step)),
+        step: Some(wire_step_id(frame.step)),
         width,
         height,
         format: wire_format(format).into(),
         total: frame.bytes.len() as u64,
         skipped: frame.skipped,
-        stages: stages(&frame.stages),
-        shadow_drawn_by: drawn_by(frame.raster_backends.shadow).into(),
-        visibility_drawn_by: drawn_by(frame.raster_backends.visibility).into(),
+        stages: wire_stages(&frame.stages),
+        shadow_drawn_by: wire_raster_backend(frame.raster_backends.shadow).into(),
+        visibility_drawn_by: wire_raster_backend(frame.raster_backends.visibility).into(),
     };
-    chunks_with_head(head, frame.bytes.clone(), most, |head, offset, data| v1::FrameChunk { head, offset, data })
+    chunks_with_head(head, frame.bytes.clone(), max_chunk_bytes, |head, offset, data| v1::FrameChunk {
+        head,
+        offset,
+        data,
+    })
 }

@@ -16,7 +16,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
     ) -> Result<Response<v1::GetServerInfoResponse>, Status> {
         let info = self.0.info();
         let config = self.0.config();
-        let (renderer, software) = match &info.renderer {
+        let (renderer, is_software) = match &info.renderer {
             Ok(renderer) => (renderer.renderer.clone(), renderer.software),
             Err(error) => (format!("none: {error}"), false),
         };
@@ -33,7 +33,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             backend: info.backend.name().into(),
             device: info.device.clone(),
             renderer,
-            software,
+            software: is_software,
             limits: Some(limits),
         }))
     }

@@ -1,5 +1,6 @@
-//! Accepts connections under a limit. A permit is acquired before a connection is accepted; a connection that sends
-//! nothing is closed; when file descriptors run out, the listener pauses instead of spinning.
+//! Accepts connections under a limit. A permit is acquired before a connection is accepted. A connection that sends
+//! nothing is closed. The listener pauses after a failed accept, so that it does not spin when file descriptors run
+//! out.
 
 use std::io;
 use std::net::SocketAddr;
@@ -14,8 +15,9 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
-/// Connections with received data that may be queued for the server.
-const READY_CONNECTIONS: usize = 16;
+/// Connections with received data that may be queued for the server. Further connections wait until the queue has
+/// capacity.
+const READY_QUEUE_CAPACITY: usize = 16;
 
 /// Pause of the listener after a failed accept.
 const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(50);
@@ -28,24 +30,24 @@ pub(super) struct Connection {
     _permit: OwnedSemaphorePermit,
 }
 
-/// Accepts connections, at most `most` open at a time; each must send its first byte within `silence`. Stops when the
-/// returned stream is dropped.
-pub(super) fn connections(
+/// Accepts connections until the returned stream is dropped. At most `max_connections` are open at a time. Each must
+/// send its first byte within `first_byte_timeout`.
+pub(super) fn accept_connections(
     listener: TcpListener,
-    most: usize,
-    silence: Duration,
+    max_connections: usize,
+    first_byte_timeout: Duration,
 ) -> ReceiverStream<io::Result<Connection>> {
-    let (ready, connections) = mpsc::channel(READY_CONNECTIONS);
+    let (ready_sender, ready_receiver) = mpsc::channel(READY_QUEUE_CAPACITY);
     tokio::spawn(async move {
-        let places = Arc::new(Semaphore::new(most));
+        let permits = Arc::new(Semaphore::new(max_connections));
         loop {
-            let accepted = tokio::select! {
-                accepted = accept(&listener, &places) => accepted,
-                () = ready.closed() => return,
+            let accept_result = tokio::select! {
+                accept_result = accept(&listener, &permits) => accept_result,
+                () = ready_sender.closed() => return,
             };
-            match accepted {
+            match accept_result {
                 Ok(connection) => {
-                    tokio::spawn(await_first_byte(connection, silence, ready.clone()));
+                    tokio::spawn(await_first_byte(connection, first_byte_timeout, ready_sender.clone()));
                 }
                 Err(error) => {
                     tracing::warn!(%error, "a connection could not be accepted");
@@ -54,22 +56,26 @@ pub(super) fn connections(
             }
         }
     });
-    ReceiverStream::new(connections)
+    ReceiverStream::new(ready_receiver)
 }
 
-async fn accept(listener: &TcpListener, places: &Arc<Semaphore>) -> io::Result<Connection> {
-    let place = Arc::clone(places).acquire_owned().await.map_err(io::Error::other)?;
+async fn accept(listener: &TcpListener, permits: &Arc<Semaphore>) -> io::Result<Connection> {
+    let permit = Arc::clone(permits).acquire_owned().await.map_err(io::Error::other)?;
     let (stream, remote) = listener.accept().await?;
     stream.set_nodelay(true)?;
-    Ok(Connection { stream, remote, _permit: place })
+    Ok(Connection { stream, remote, _permit: permit })
 }
 
-/// Forwards a connection once it has sent its first byte; drops it if it sends nothing within `silence`.
-async fn await_first_byte(connection: Connection, silence: Duration, ready: mpsc::Sender<io::Result<Connection>>) {
-    let mut first = [0];
-    let spoke = tokio::time::timeout(silence, connection.stream.peek(&mut first)).await;
-    if matches!(spoke, Ok(Ok(1))) {
-        ready.send(Ok(connection)).await.ok(); // Fails only if the server has stopped.
+/// Forwards a connection once it has sent its first byte. Drops it if it sends nothing within `first_byte_timeout`.
+async fn await_first_byte(
+    connection: Connection,
+    first_byte_timeout: Duration,
+    ready_sender: mpsc::Sender<io::Result<Connection>>,
+) {
+    let mut first_byte = [0];
+    let peeked_bytes = tokio::time::timeout(first_byte_timeout, connection.stream.peek(&mut first_byte)).await;
+    if matches!(peeked_bytes, Ok(Ok(1))) {
+        ready_sender.send(Ok(connection)).await.ok(); // Fails only if the server has stopped.
     }
 }
 
@@ -82,8 +88,8 @@ impl Connected for Connection {
 }
 
 impl AsyncRead for Connection {
-    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, into: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_read(cx, into)
+    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_read(cx, buffer)
     }
 }
 
@@ -95,9 +101,9 @@ impl AsyncWrite for Connection {
     fn poll_write_vectored(
         mut self: Pin<&mut Self>,
         cx: &mut Context<'_>,
-        parts: &[io::IoSlice<'_>],
+        slices: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        Pin::new(&mut self.stream).poll_write_vectored(cx, parts)
+        Pin::new(&mut self.stream).poll_write_vectored(cx, slices)
     }
 
     fn is_write_vectored(&self) -> bool {

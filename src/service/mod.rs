@@ -1,5 +1,5 @@
-//! The gRPC services: translate between wire messages and the engine's values. The only module that uses the protobuf
-//! types; one file per group of calls.
+//! The gRPC services, which translate between wire messages and engine types. This is the only module that uses the
+//! protobuf types.
 
 mod convert;
 mod describe;
@@ -26,8 +26,8 @@ use crate::config::Config;
 use crate::engine::Engine;
 use modalcast_model::error::{Error, Result, fault_in};
 
-/// The largest message that the server sends, in bytes: a chunk of at most 1 MiB and its head. The head of a vertex
-/// reply lists up to 65 536 domains with their counts.
+/// Largest message that the server sends, in bytes: a chunk of at most 1 MiB and its head. The head of a vertex reply
+/// lists up to 65 536 domains with their counts.
 const MAX_REPLY_BYTES: usize = 3 << 20;
 
 /// Binds the configured address.
@@ -38,13 +38,13 @@ pub async fn bind(config: &Config) -> Result<TcpListener> {
     TcpListener::bind(config.listen).await.map_err(|error| Error::Unavailable {
         what: "listening address",
         reason: format!("{}: {error}", config.listen),
-        remedy: "Name another one with --listen".into(),
+        remedy: "Set another address with --listen".into(),
     })
 }
 
-/// Serves until `shutdown` completes. Then reports "not serving" to health checks, ends every stream and returns within
-/// the configured drain time, whether or not clients close their connections. A lost device does not end the server,
-/// but health checks get "not serving" from then on, so that a supervisor can restart it.
+/// Serves until `shutdown` completes. Then answers health checks with `NOT_SERVING`, ends every stream and returns
+/// within the configured drain time, whether or not clients close their connections. A lost device does not end the
+/// server, but health checks are answered with `NOT_SERVING` from then on, so that a supervisor can restart it.
 ///
 /// # Errors
 /// `Fault` when the transport fails.
@@ -54,57 +54,57 @@ pub async fn serve(
     shutdown: impl Future<Output = ()> + Send + 'static,
 ) -> Result<()> {
     let config = engine.config().clone();
-    let (health, health_server) = tonic_health::server::health_reporter();
-    set_health(&health, true).await;
+    let (health_reporter, health_server) = tonic_health::server::health_reporter();
+    set_health(&health_reporter, true).await;
     let routes = routes(&engine, &config)?.with(health_server);
-    let connections = listen::connections(listener, config.connections, config.first_byte_timeout);
-    let (stop, stopped) = oneshot::channel();
-    let drain = async move {
+    let connections = listen::accept_connections(listener, config.connections, config.first_byte_timeout);
+    let (stop_sender, stop_receiver) = oneshot::channel();
+    let stop_engine = async move {
         let mut shutdown = std::pin::pin!(shutdown);
         tokio::select! {
             () = &mut shutdown => {}
             _ = engine.device_lost() => {
-                set_health(&health, false).await;
+                set_health(&health_reporter, false).await;
                 shutdown.await;
             }
         }
-        tracing::info!("the server stops");
-        let end = Instant::now() + engine.config().drain_timeout;
-        set_health(&health, false).await;
-        if tokio::time::timeout_at(end, engine.shutdown()).await.is_err() {
-            tracing::warn!("the device did not stop in time");
+        tracing::info!("the server is shutting down");
+        let drain_deadline = Instant::now() + engine.config().drain_timeout;
+        set_health(&health_reporter, false).await;
+        if tokio::time::timeout_at(drain_deadline, engine.shutdown()).await.is_err() {
+            tracing::warn!("the engine did not stop within the drain time");
         }
-        stop.send(()).ok(); // Fails only if the transport has failed and dropped the receiver.
-        end
+        stop_sender.send(()).ok(); // Fails only if the transport has failed and dropped the receiver.
+        drain_deadline
     };
     let shutdown_signal = async {
-        stopped.await.ok(); // A dropped sender means stop, too.
+        stop_receiver.await.ok(); // A dropped sender is a stop signal, too.
     };
     let mut transport =
         std::pin::pin!(transport(&config).serve_with_incoming_shutdown(routes, connections, shutdown_signal));
-    let end = tokio::select! {
-        ended = &mut transport => return ended.map_err(fault_in("transport")),
-        end = drain => end,
+    let drain_deadline = tokio::select! {
+        result = &mut transport => return result.map_err(fault_in("transport")),
+        drain_deadline = stop_engine => drain_deadline,
     };
-    match tokio::time::timeout_at(end, transport).await {
-        Ok(ended) => ended.map_err(fault_in("transport")),
+    match tokio::time::timeout_at(drain_deadline, transport).await {
+        Ok(result) => result.map_err(fault_in("transport")),
         Err(_) => {
-            tracing::warn!("some clients did not close their connections and are left behind");
+            tracing::warn!("some clients did not close their connections within the drain time");
             Ok(())
         }
     }
 }
 
-async fn set_health(health: &HealthReporter, serving: bool) {
+async fn set_health(health: &HealthReporter, is_serving: bool) {
     use tonic_health::ServingStatus::{NotServing, Serving};
-    let status = if serving { Serving } else { NotServing };
+    let status = if is_serving { Serving } else { NotServing };
     let services = ["SceneService", "StepService", "FrameService", "VertexService", "ServerService"];
     for name in services.map(|service| format!("modalcast.v1.{service}")).into_iter().chain([String::new()]) {
         health.set_service_status(name, status).await;
     }
 }
 
-/// The transport with every limit set explicitly, because the library's defaults disable some of them.
+/// The transport. Every limit is set explicitly, because the library's defaults disable some of them.
 fn transport(config: &Config) -> Server {
     Server::builder()
         .max_concurrent_streams(128)
@@ -126,7 +126,7 @@ fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
     use v1::step_service_server::StepServiceServer;
     use v1::vertex_service_server::VertexServiceServer;
     // A macro, because the generated servers share no trait for these methods.
-    macro_rules! limited {
+    macro_rules! with_limits {
         ($server:expr) => {
             $server.max_decoding_message_size(config.message_bytes).max_encoding_message_size(MAX_REPLY_BYTES)
         };
@@ -139,11 +139,11 @@ fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
     Ok(Routes::default()
         .with(reflection().build_v1().map_err(fault_in("reflection"))?)
         .with(reflection().build_v1alpha().map_err(fault_in("reflection"))?)
-        .with(limited!(ServerServiceServer::new(info::ServerServiceImpl(engine.clone()))))
-        .with(limited!(SceneServiceServer::new(scenes::SceneServiceImpl(engine.clone()))))
-        .with(limited!(StepServiceServer::new(steps::StepServiceImpl(engine.clone()))))
-        .with(limited!(FrameServiceServer::new(frames::FrameServiceImpl(engine.clone()))))
-        .with(limited!(VertexServiceServer::new(vertices::VertexServiceImpl(engine.clone())))))
+        .with(with_limits!(ServerServiceServer::new(info::ServerServiceImpl(engine.clone()))))
+        .with(with_limits!(SceneServiceServer::new(scenes::SceneServiceImpl(engine.clone()))))
+        .with(with_limits!(StepServiceServer::new(steps::StepServiceImpl(engine.clone()))))
+        .with(with_limits!(FrameServiceServer::new(frames::FrameServiceImpl(engine.clone()))))
+        .with(with_limits!(VertexServiceServer::new(vertices::VertexServiceImpl(engine.clone())))))
 }
 
 #[cfg(test)]
@@ -158,37 +158,39 @@ mod tests {
     use super::*;
     use crate::engine::Policy;
 
-    async fn health(client: &mut HealthClient<Channel>) -> i32 {
+    async fn check_health(client: &mut HealthClient<Channel>) -> i32 {
         let request = HealthCheckRequest { service: String::new() };
-        client.check(request).await.expect("an answer").into_inner().status
+        client.check(request).await.expect("expected an answer").into_inner().status
     }
 
     #[tokio::test]
     async fn lost_device_turns_health_to_not_serving() {
-        let folder = tempfile::tempdir().expect("a folder");
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
         let config =
             Config { listen: ([127, 0, 0, 1], 0).into(), state: folder.path().to_owned(), ..Config::default() };
-        let config = config.validated().expect("a good configuration");
-        let listener = bind(&config).await.expect("a port");
-        let address = format!("http://{}", listener.local_addr().expect("an address"));
-        let (engine, step) = Engine::with_losable_device(config).await.expect("starts");
-        let (stop, stopped) = oneshot::channel::<()>();
+        let config = config.validated().expect("expected a valid configuration");
+        let listener = bind(&config).await.expect("expected a free port");
+        let address = format!("http://{}", listener.local_addr().expect("expected a bound address"));
+        let (engine, step) = Engine::with_losable_device(config).await.expect("expected a running engine");
+        let (stop_sender, stop_receiver) = oneshot::channel::<()>();
         let server = tokio::spawn(serve(engine.clone(), listener, async {
-            stopped.await.ok();
+            stop_receiver.await.ok();
         }));
-        let mut client =
-            HealthClient::new(Channel::from_shared(address).expect("a URL").connect().await.expect("connects"));
-        assert_eq!(health(&mut client).await, ServingStatus::Serving as i32);
-        let scene = engine.find("strips").expect("is open");
-        let mut writer = scene.drive("test".into(), Policy::Lossless, 4).await.expect("a lease");
-        writer.step(&step).expect("is queued");
-        let turned = async {
-            while health(&mut client).await != ServingStatus::NotServing as i32 {
+        let endpoint = Channel::from_shared(address).expect("expected a valid URL");
+        let mut client = HealthClient::new(endpoint.connect().await.expect("expected a connection"));
+        assert_eq!(check_health(&mut client).await, ServingStatus::Serving as i32);
+        let scene_handle = engine.find("strips").expect("expected an open scene");
+        let mut writer =
+            scene_handle.drive("test".into(), Policy::Lossless, 4).await.expect("expected the writer lease");
+        writer.push_step(&step).expect("expected an accepted step");
+        let wait_for_not_serving = async {
+            while check_health(&mut client).await != ServingStatus::NotServing as i32 {
                 tokio::time::sleep(Duration::from_millis(5)).await;
             }
         };
-        tokio::time::timeout(Duration::from_secs(60), turned).await.expect("health turns");
-        stop.send(()).expect("the server goes on until it is stopped");
-        server.await.expect("no panic").expect("a clean stop");
+        let timeout = Duration::from_secs(60);
+        tokio::time::timeout(timeout, wait_for_not_serving).await.expect("expected NOT_SERVING within 60 s");
+        stop_sender.send(()).expect("expected the server to run until it is stopped");
+        server.await.expect("expected no panic").expect("expected a clean stop");
     }
 }

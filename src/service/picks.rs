@@ -1,11 +1,11 @@
-//! Pick replies: a head, then the hits in messages of limited size.
+//! Pick replies. The first message has a head. Hits are sent in messages of limited size.
 
 use bytes::Bytes;
 use modalcast_proto::v1;
 use tonic::Status;
 
-use super::convert::{describe_step_selector, pick, stages, step_id};
-use super::status::status;
+use super::convert::{describe_step_selector, parse_pick, wire_stages, wire_step_id};
+use super::status::to_status;
 use super::stream::{Deadline, ReplyStream, respond};
 use crate::engine::{Engine, ModalHit, PickResult, StepSelector, resolve_picks};
 use modalcast_model::scene::Scene;
@@ -14,20 +14,21 @@ use modalcast_model::scene::Scene;
 const MAX_HIT_BYTES: usize = 256;
 
 /// Answers one pick request.
-pub(super) fn answer(
+pub(super) fn respond_to_pick(
     engine: &Engine,
     deadline: Deadline,
     request: v1::PickRequest,
 ) -> Result<tonic::Response<ReplyStream<v1::PickResponse>>, Status> {
-    let scene_handle = engine.find(&request.scene).map_err(status)?;
-    let view = pick(engine, &scene_handle.scene, &request).map_err(status)?;
+    let scene_handle = engine.find(&request.scene).map_err(to_status)?;
+    let output_spec = parse_pick(engine, &scene_handle.scene, &request).map_err(to_status)?;
     let selector = StepSelector::from(request.step);
-    let most = engine.config().chunk_bytes;
+    let max_chunk_bytes = engine.config().chunk_bytes;
     Ok(respond(move |reply_sender| async move {
         let work = async {
-            let output = scene_handle.request_output(selector, view).await.map_err(status)?;
-            let picks = resolve_picks(output, &scene_handle.scene, !request.without_modes).await.map_err(status)?;
-            for response in responses(&picks, &scene_handle.scene, most) {
+            let output = scene_handle.request_output(selector, output_spec).await.map_err(to_status)?;
+            let pick_result =
+                resolve_picks(output, &scene_handle.scene, !request.without_modes).await.map_err(to_status)?;
+            for response in split_reply(&pick_result, &scene_handle.scene, max_chunk_bytes) {
                 reply_sender.send(response).await?;
             }
             Ok(())
@@ -36,28 +37,32 @@ pub(super) fn answer(
     }))
 }
 
-/// Splits a reply into messages of about `most` bytes; at least one message.
-fn responses(picks: &PickResult, scene: &Scene, most: usize) -> Vec<v1::PickResponse> {
-    let head =
-        v1::PickHead { step: Some(step_id(picks.step)), hits: picks.hits.len() as u32, stages: stages(&picks.stages) };
+/// Splits a reply into at least one message. A message is larger than `max_chunk_bytes` only if it has a single hit or
+/// because of its head.
+fn split_reply(picks: &PickResult, scene: &Scene, max_chunk_bytes: usize) -> Vec<v1::PickResponse> {
+    let head = v1::PickHead {
+        step: Some(wire_step_id(picks.step)),
+        hits: picks.hits.len() as u32,
+        stages: wire_stages(&picks.stages),
+    };
     let mut responses = vec![v1::PickResponse { head: Some(head), hits: Vec::new() }];
-    let mut bytes = 0;
-    for picked in &picks.hits {
-        let own = MAX_HIT_BYTES + 4 * picked.modes.len();
-        if bytes > 0 && bytes + own > most {
+    let mut response_bytes = 0;
+    for modal_hit in &picks.hits {
+        let hit_bytes = MAX_HIT_BYTES + 4 * modal_hit.modes.len();
+        if response_bytes > 0 && response_bytes + hit_bytes > max_chunk_bytes {
             responses.push(v1::PickResponse::default());
-            bytes = 0;
+            response_bytes = 0;
         }
-        bytes += own;
-        if let Some(last) = responses.last_mut() {
-            last.hits.push(hit(picked, scene));
+        response_bytes += hit_bytes;
+        if let Some(last_response) = responses.last_mut() {
+            last_response.hits.push(wire_hit(modal_hit, scene));
         }
     }
     responses
 }
 
-fn hit(picked: &ModalHit, scene: &Scene) -> v1::Hit {
-    let hit = &picked.hit;
+fn wire_hit(modal_hit: &ModalHit, scene: &Scene) -> v1::Hit {
+    let hit = &modal_hit.hit;
     v1::Hit {
         x: hit.pixel[0],
         y: hit.pixel[1],
@@ -68,8 +73,8 @@ fn hit(picked: &ModalHit, scene: &Scene) -> v1::Hit {
         position: hit.position.to_vec(),
         normal: hit.normal.to_vec(),
         depth: scene.unit * hit.depth,
-        linear: picked.linear.to_vec(),
+        linear: modal_hit.linear.to_vec(),
         rank: scene.layout.domains[hit.domain].rank as u32,
-        modes: picked.modes.iter().flat_map(|entry| entry.to_le_bytes()).collect::<Bytes>(),
+        modes: modal_hit.modes.iter().flat_map(|entry| entry.to_le_bytes()).collect::<Bytes>(),
     }
 }

@@ -47,7 +47,9 @@ impl Service<Request<Body>> for Routes {
         let name = request.uri().path().split('/').nth(1).unwrap_or_default();
         match self.by_name.get(name) {
             Some(route) => route(request),
-            None => Box::pin(async { Ok(Status::unimplemented("no service of that name").into_http()) }),
+            None => Box::pin(async {
+                Ok(Status::unimplemented("expected the path of a service of this server").into_http())
+            }),
         }
     }
 }

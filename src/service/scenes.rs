@@ -7,9 +7,9 @@ use modalcast_proto::v1::upload_scene_request::Part;
 use prost::Message as _;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::convert::{scene_info, upload_header};
+use super::convert::{ByteBudget, parse_upload_header, wire_scene_info};
 use super::describe;
-use super::status::{status, transport_status};
+use super::status::{to_status, transport_status};
 use super::stream::{ReplyStream, catch_panic};
 use crate::engine::{Engine, Upload};
 use modalcast_model::error::{Error, Result, fault_in, invalid};
@@ -33,7 +33,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         let v1::OpenSceneRequest { source, scene } = request.into_inner();
         catch_panic(async move {
             let scene_handle = engine.open(&source, &scene).await?;
-            Ok(v1::OpenSceneResponse { scene: Some(scene_info(&scene_handle, true)) })
+            Ok(v1::OpenSceneResponse { scene: Some(wire_scene_info(&scene_handle, true)) })
         })
         .await
     }
@@ -43,17 +43,18 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         request: Request<Streaming<v1::UploadSceneRequest>>,
     ) -> Result<Response<v1::UploadSceneResponse>, Status> {
         let mut upload = None;
-        if let Err(status) = receive_parts(&self.0, request.into_inner(), &mut upload).await {
+        if let Err(error_status) = receive_parts(&self.0, request.into_inner(), &mut upload).await {
             if let Some(upload) = upload {
-                tokio::task::spawn_blocking(move || upload.discard()).await.ok(); // The next start removes leftovers.
+                // If the removal fails, the next start of the server removes the files.
+                tokio::task::spawn_blocking(move || upload.discard()).await.ok();
             }
-            return Err(status);
+            return Err(error_status);
         }
-        let upload = upload.ok_or_else(|| status(invalid("part", "a header first", "nothing")))?;
+        let upload = upload.ok_or_else(|| to_status(invalid("part", "a header as the first part", "nothing")))?;
         let engine = self.0.clone();
         catch_panic(async move {
             let scene_handle = engine.finish_upload(upload).await?;
-            Ok(v1::UploadSceneResponse { scene: Some(scene_info(&scene_handle, true)) })
+            Ok(v1::UploadSceneResponse { scene: Some(wire_scene_info(&scene_handle, true)) })
         })
         .await
     }
@@ -61,13 +62,9 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
     async fn list_scenes(&self, _: Request<v1::ListScenesRequest>) -> Result<Response<v1::ListScenesResponse>, Status> {
         let engine = self.0.clone();
         catch_panic(async move {
-            let scenes = engine.list().iter().map(|scene_handle| scene_info(scene_handle, false)).collect();
-            let mut left = MAX_SOURCE_BYTES;
-            let fits = |source: &String| {
-                left = left.saturating_sub(source.len() + 8);
-                left > 0
-            };
-            let sources = engine.sources().await?.into_iter().take_while(fits).collect();
+            let scenes = engine.list().iter().map(|scene_handle| wire_scene_info(scene_handle, false)).collect();
+            let mut budget = ByteBudget::new(MAX_SOURCE_BYTES);
+            let sources = engine.sources().await?.into_iter().take_while(|source| budget.take_string(source)).collect();
             Ok(v1::ListScenesResponse { scenes, sources })
         })
         .await
@@ -89,8 +86,8 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         request: Request<v1::DescribeSceneRequest>,
     ) -> Result<Response<Self::DescribeSceneStream>, Status> {
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(status)?;
-        describe::scene(scene_handle, request, self.0.config().chunk_bytes).map_err(status)
+        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        describe::respond_with_description(scene_handle, request, self.0.config().chunk_bytes).map_err(to_status)
     }
 
     type ReadModesStream = ReplyStream<v1::ReadModesResponse>;
@@ -100,21 +97,22 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         request: Request<v1::ReadModesRequest>,
     ) -> Result<Response<Self::ReadModesStream>, Status> {
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(status)?;
-        describe::modes(scene_handle, request, self.0.config().chunk_bytes).map_err(status)
+        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        describe::respond_with_modes(scene_handle, request, self.0.config().chunk_bytes).map_err(to_status)
     }
 }
 
-/// Time budget for waiting on an upload (a token bucket). Waiting consumes it and received bytes refill it, so that a
-/// client that stalls or trickles bytes does not hold its upload permit and disk space forever.
+/// Time budget for waiting on an upload (a token bucket). Waiting consumes it, and received bytes refill it. A client
+/// that sends nothing or too slowly therefore cannot hold its upload permit and disk space forever.
 struct UploadTimeBudget {
-    most: Duration,
-    left: Duration,
+    /// The full budget.
+    max_wait: Duration,
+    remaining: Duration,
 }
 
 impl UploadTimeBudget {
-    const fn new(most: Duration) -> Self {
-        Self { most, left: most }
+    const fn new(max_wait: Duration) -> Self {
+        Self { max_wait, remaining: max_wait }
     }
 
     /// Waits for the client. Only this wait consumes the budget; processing the received data does not.
@@ -123,19 +121,21 @@ impl UploadTimeBudget {
     /// `DEADLINE_EXCEEDED` when the budget is used up.
     async fn wait<T>(&mut self, part: impl Future<Output = T>) -> Result<T, Status> {
         let begin = Instant::now();
-        let late = |_| Error::Deadline { what: "enough of the upload".into(), ms: self.most.as_millis() as u64 };
-        let part = tokio::time::timeout(self.left, part).await.map_err(|end| status(late(end)))?;
-        self.left = self.left.saturating_sub(begin.elapsed());
+        let deadline_error = |_| Error::Deadline { what: "the upload".into(), ms: self.max_wait.as_millis() as u64 };
+        let part =
+            tokio::time::timeout(self.remaining, part).await.map_err(|elapsed| to_status(deadline_error(elapsed)))?;
+        self.remaining = self.remaining.saturating_sub(begin.elapsed());
         Ok(part)
     }
 
+    /// Adds the time in which the slowest accepted client sends `bytes` bytes.
     fn refill(&mut self, bytes: usize) {
-        let earned = Duration::from_secs_f64(bytes as f64 / MIN_UPLOAD_RATE);
-        self.left = self.most.min(self.left + earned);
+        let refill_time = Duration::from_secs_f64(bytes as f64 / MIN_UPLOAD_RATE);
+        self.remaining = self.max_wait.min(self.remaining + refill_time);
     }
 }
 
-/// Receives the parts of an upload until the client closes its side. After an error `upload` is what is to be discarded.
+/// Receives the parts of an upload until the client closes its side. After an error the caller discards `upload`.
 async fn receive_parts(
     engine: &Engine,
     mut parts: Streaming<v1::UploadSceneRequest>,
@@ -143,28 +143,28 @@ async fn receive_parts(
 ) -> Result<(), Status> {
     let limit = engine.config().message_bytes;
     let mut budget = UploadTimeBudget::new(engine.config().stall_timeout);
-    while let Some(request) = budget.wait(parts.message()).await?.map_err(|fault| transport_status(fault, limit))? {
+    while let Some(request) = budget.wait(parts.message()).await?.map_err(|status| transport_status(status, limit))? {
         budget.refill(request.encoded_len());
-        let part = request.part.ok_or_else(|| status(invalid("part", "header, file or chunk", "none")))?;
-        *upload = Some(receive(engine, upload.take(), part).await.map_err(status)?);
+        let part = request.part.ok_or_else(|| to_status(invalid("part", "header, file or chunk", "none")))?;
+        *upload = Some(receive_part(engine, upload.take(), part).await.map_err(to_status)?);
     }
     Ok(())
 }
 
-/// Processes one part of an upload, and discards the upload if that fails. Disk access runs on a blocking thread.
-async fn receive(engine: &Engine, upload: Option<Upload>, part: Part) -> Result<Upload> {
+/// Processes one part of an upload. Discards the upload if that fails. Disk access runs on the blocking pool.
+async fn receive_part(engine: &Engine, upload: Option<Upload>, part: Part) -> Result<Upload> {
     let (mut upload, part) = match (upload, part) {
-        (None, Part::Header(header)) => return engine.begin_upload(upload_header(header)).await,
-        (None, _) => return Err(invalid("part", "a header first", "a file or chunk")),
+        (None, Part::Header(header)) => return engine.begin_upload(parse_upload_header(header)).await,
+        (None, _) => return Err(invalid("part", "a header as the first part", "a file or chunk")),
         (Some(upload), part) => (upload, part),
     };
-    let work = move || {
-        let received = match part {
+    let process_part = move || {
+        let result = match part {
             Part::File(file) => upload.begin_file(&file.path, file.bytes, &file.sha256),
             Part::Chunk(bytes) => upload.write_chunk(&bytes),
-            Part::Header(_) => Err(invalid("part", "one header", "a second")),
+            Part::Header(_) => Err(invalid("part", "one header per upload", "a second header")),
         };
-        match received {
+        match result {
             Ok(()) => Ok(upload),
             Err(error) => {
                 upload.discard();
@@ -172,5 +172,5 @@ async fn receive(engine: &Engine, upload: Option<Upload>, part: Part) -> Result<
             }
         }
     };
-    tokio::task::spawn_blocking(work).await.map_err(fault_in("upload"))?
+    tokio::task::spawn_blocking(process_part).await.map_err(fault_in("upload"))?
 }

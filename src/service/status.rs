@@ -1,5 +1,5 @@
-//! Converts errors to gRPC statuses and to rejections. One match without a wildcard selects the status code. The
-//! details of a status are the serialized `Rejection` that a step stream would send.
+//! Converts errors to gRPC statuses and to rejections. The details of a status contain the serialized `Rejection` of
+//! the same error.
 
 use modalcast_proto::v1::Rejection;
 use prost::Message as _;
@@ -7,35 +7,36 @@ use tonic::{Code, Status};
 
 use modalcast_model::error::Error;
 
-/// Limit in characters on each text of a rejection. Clients control parts of the text, and it is sent in headers or
-/// between steps.
-const MAX_TEXT_CHARS: usize = 512;
+/// Limit in characters on each text of a rejection. Clients control parts of the text, and statuses are sent in HTTP/2
+/// headers.
+const MAX_FIELD_CHARS: usize = 512;
 
-fn truncate(text: String) -> String {
-    match text.char_indices().nth(MAX_TEXT_CHARS) {
+fn truncate_text(text: String) -> String {
+    match text.char_indices().nth(MAX_FIELD_CHARS) {
         None => text,
         Some((end, _)) => format!("{}...", &text[..end]),
     }
 }
 
-/// Converts an error to a rejection: field, expected, given. `step` is the number of the rejected step, if any.
-pub(super) fn rejection(step: Option<u64>, error: &Error) -> Rejection {
+/// Converts an error to a rejection. `step` is the number of the rejected step, if any.
+pub(super) fn to_rejection(step: Option<u64>, error: &Error) -> Rejection {
     let (field, expected, given) = match error.clone() {
         Error::Invalid { field, expected, given } => (field, expected, given),
-        Error::NotFound { what, given } => (what.into(), format!("a {what} that is there"), given),
-        Error::Taken { what, holder } => (what.into(), "nobody there".into(), holder),
+        Error::NotFound { what, given } => (what.into(), format!("an existing {what}"), given),
+        Error::Taken { what, holder } => (what.into(), format!("a free {what}"), holder),
         Error::Gone { what, expected, given } => (what.into(), expected, given),
-        Error::Busy { queue, limit } => (queue.into(), format!("at most {limit}"), "more".into()),
-        Error::Deadline { what, ms } => (what, format!("within {ms} ms"), "later".into()),
+        Error::Busy { queue, limit } => (queue.into(), format!("at most {limit}"), "one more".into()),
+        Error::Deadline { what, ms } => (what, format!("completion within {ms} ms"), "no completion in time".into()),
         Error::Unavailable { what, reason, remedy } => (what.into(), remedy, reason),
-        Error::Fault { stage, reason } => (stage.into(), "success".into(), reason),
+        Error::Fault { stage, reason } => (stage.into(), "no internal error".into(), reason),
         Error::DeviceLost { stage, reason } => (stage.into(), "a restart of the server".into(), reason),
     };
-    Rejection { step, field: truncate(field), expected: truncate(expected), given: truncate(given) }
+    Rejection { step, field: truncate_text(field), expected: truncate_text(expected), given: truncate_text(given) }
 }
 
 /// Converts an error to a gRPC status.
-pub(super) fn status(error: Error) -> Status {
+pub(super) fn to_status(error: Error) -> Status {
+    // No wildcard, so that a new error variant requires a decision here.
     let code = match error {
         Error::Invalid { .. } => Code::InvalidArgument,
         Error::NotFound { .. } => Code::NotFound,
@@ -46,23 +47,23 @@ pub(super) fn status(error: Error) -> Status {
         Error::Unavailable { .. } | Error::DeviceLost { .. } => Code::Unavailable,
         Error::Fault { .. } => Code::Internal,
     };
-    let details = rejection(None, &error);
-    Status::with_details(code, truncate(error.to_string()), details.encode_to_vec().into())
+    let details = to_rejection(None, &error);
+    Status::with_details(code, truncate_text(error.to_string()), details.encode_to_vec().into())
 }
 
-/// Converts a transport error of a client's stream. Tonic reports a message over the size limit as `OUT_OF_RANGE`; it
-/// becomes `RESOURCE_EXHAUSTED`, as in other gRPC implementations.
-pub(super) fn transport_status(fault: Status, limit: usize) -> Status {
-    if fault.code() != Code::OutOfRange {
-        return fault;
+/// Converts a transport error of a client's stream. Tonic reports a message over the size limit as `OUT_OF_RANGE`.
+/// Other gRPC implementations report `RESOURCE_EXHAUSTED`, and so does this server.
+pub(super) fn transport_status(stream_status: Status, max_message_bytes: usize) -> Status {
+    if stream_status.code() != Code::OutOfRange {
+        return stream_status;
     }
     let details = Rejection {
         step: None,
         field: "message".into(),
-        expected: format!("at most {limit} bytes"),
-        given: fault.message().into(),
+        expected: format!("at most {max_message_bytes} bytes"),
+        given: stream_status.message().into(),
     };
-    Status::with_details(Code::ResourceExhausted, fault.message(), details.encode_to_vec().into())
+    Status::with_details(Code::ResourceExhausted, stream_status.message(), details.encode_to_vec().into())
 }
 
 #[cfg(test)]
@@ -70,11 +71,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_status_carries_the_rejection_and_stays_small() {
+    fn status_contains_the_rejection_and_is_small() {
         let error = modalcast_model::error::invalid("step.q", "8 bytes", "x".repeat(100_000));
-        let status = status(error);
+        let status = to_status(error);
         assert_eq!(status.code(), Code::InvalidArgument);
-        let details = Rejection::decode(status.details()).expect("a rejection");
+        let details = Rejection::decode(status.details()).expect("expected a rejection");
         assert_eq!((details.field.as_str(), details.expected.as_str()), ("step.q", "8 bytes"));
         assert!(status.message().len() + status.details().len() < 4096);
     }

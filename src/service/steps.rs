@@ -1,5 +1,6 @@
-//! `StepService`: one bidirectional stream per physics process. The stream's task always reads, so that a slow scene
-//! never blocks the connection. A step that cannot be accepted is answered with a rejection; the stream stays open.
+//! `StepService`: one bidirectional stream per physics process. The task of the stream always reads, so that a slow
+//! scene never blocks the connection. A step that cannot be accepted is answered with a rejection, and the stream
+//! remains open.
 
 use std::collections::VecDeque;
 
@@ -8,13 +9,13 @@ use modalcast_proto::v1::drive_scene_request::Kind as RequestKind;
 use modalcast_proto::v1::drive_scene_response::Kind as ResponseKind;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::convert::{policy, raw_update, scene_info, stages, wire_policy};
-use super::status::{rejection, status, transport_status};
+use super::convert::{parse_policy, parse_step, wire_policy, wire_scene_info, wire_stages};
+use super::status::{to_rejection, to_status, transport_status};
 use super::stream::{Deadline, ReplySender, ReplyStream, respond};
 use crate::engine::{Engine, StepReport, WriterSession};
 use modalcast_model::error::{Error, Result, invalid};
 
-/// Replies that are buffered for a client that does not read. The stream ends with an error beyond this limit.
+/// Limit on replies that are buffered for a client that does not read. Beyond it, the stream ends with an error.
 const MAX_PENDING_REPLIES: usize = 256;
 
 /// Implementation of `StepService`.
@@ -34,10 +35,10 @@ impl v1::step_service_server::StepService for StepServiceImpl {
             engine: self.0.clone(),
             peer,
             inbound: request.into_inner(),
-            drive: None,
+            writer: None,
             replies: VecDeque::new(),
         };
-        Ok(respond(move |reply_sender| deadline.enforce("the end of the step stream", session.run(reply_sender))))
+        Ok(respond(move |reply_sender| deadline.enforce("the step stream", session.run(reply_sender))))
     }
 }
 
@@ -47,28 +48,28 @@ struct DriveSession {
     peer: String,
     inbound: Streaming<v1::DriveSceneRequest>,
     /// The writer lease, once it is acquired.
-    drive: Option<WriterSession>,
+    writer: Option<WriterSession>,
     replies: VecDeque<v1::DriveSceneResponse>,
 }
 
 impl DriveSession {
     /// Reads requests and sends replies until the client has closed its side and all replies are sent.
     async fn run(mut self, reply_sender: ReplySender<v1::DriveSceneResponse>) -> Result<(), Status> {
-        let mut listens = true;
+        let mut is_receiving = true;
         loop {
-            let is_drained = self.drive.as_ref().is_none_or(WriterSession::is_drained);
-            if !listens && is_drained && self.replies.is_empty() {
+            let is_drained = self.writer.as_ref().is_none_or(WriterSession::is_drained);
+            if !is_receiving && is_drained && self.replies.is_empty() {
                 return Ok(());
             }
-            let has_room = self.replies.len() < MAX_PENDING_REPLIES;
+            let has_reply_capacity = self.replies.len() < MAX_PENDING_REPLIES;
             tokio::select! {
-                message = self.inbound.message(), if listens => match message {
+                message = self.inbound.message(), if is_receiving => match message {
                     Ok(Some(message)) => self.receive(message).await?,
-                    Ok(None) => listens = false,
-                    Err(fault) => return Err(transport_status(fault, self.engine.config().message_bytes)),
+                    Ok(None) => is_receiving = false,
+                    Err(status) => return Err(transport_status(status, self.engine.config().message_bytes)),
                 },
-                report = next_report(self.drive.as_ref()), if has_room => match report {
-                    Ok(report) => self.replies.push_back(response_of(report)),
+                report = next_report(self.writer.as_ref()), if has_reply_capacity => match report {
+                    Ok(report) => self.replies.push_back(to_response(report)),
                     Err(error) => return self.close_with_error(&reply_sender, error).await,
                 },
                 permit = reply_sender.reserve(), if !self.replies.is_empty() => {
@@ -82,10 +83,12 @@ impl DriveSession {
         }
     }
 
-    /// Handles one message. Invalid input is answered with a rejection; only an overflow of the reply queue is an
-    /// error.
+    /// Handles one message. Invalid input is answered with a rejection.
+    ///
+    /// # Errors
+    /// `RESOURCE_EXHAUSTED` when the reply queue is full.
     async fn receive(&mut self, message: v1::DriveSceneRequest) -> Result<(), Status> {
-        let refused = match message.kind {
+        let rejected = match message.kind {
             Some(RequestKind::Open(open)) => self.open(open).await.err().map(|error| (None, error)),
             Some(RequestKind::Step(step)) => {
                 let number = step.number;
@@ -93,79 +96,79 @@ impl DriveSession {
             }
             None => Some((None, invalid("kind", "open or step", "neither"))),
         };
-        if let Some((step, error)) = refused {
-            self.push(ResponseKind::Rejection(rejection(step, &error)))?;
+        if let Some((step, error)) = rejected {
+            self.push_reply(ResponseKind::Rejection(to_rejection(step, &error)))?;
         }
         Ok(())
     }
 
     async fn open(&mut self, open: v1::OpenDrive) -> Result<()> {
-        if self.drive.is_some() {
-            return Err(invalid("open", "one open per stream", format!("a second, of '{}'", open.scene)));
+        if self.writer.is_some() {
+            return Err(invalid("open", "one open per stream", format!("a second open, of '{}'", open.scene)));
         }
-        let policy = policy(open.policy)?;
+        let policy = parse_policy(open.policy)?;
         let scene_handle = self.engine.find(&open.scene)?;
         let window = if open.window == 0 { self.engine.config().window } else { open.window };
-        let drive = scene_handle.drive(self.peer.clone(), policy, window).await?;
+        let writer = scene_handle.drive(self.peer.clone(), policy, window).await?;
         let opened = v1::Opened {
-            run: drive.run,
-            policy: wire_policy(drive.policy).into(),
-            window: drive.window,
-            scene: Some(scene_info(&scene_handle, true)),
+            run: writer.run,
+            policy: wire_policy(writer.policy).into(),
+            window: writer.window,
+            scene: Some(wire_scene_info(&scene_handle, true)),
         };
-        self.drive = Some(drive);
+        self.writer = Some(writer);
         self.replies.push_back(v1::DriveSceneResponse { kind: Some(ResponseKind::Opened(opened)) });
         Ok(())
     }
 
     fn step(&mut self, step: v1::Step) -> Result<()> {
-        match &mut self.drive {
-            Some(drive) => drive.step(&raw_update(step)?),
-            None => Err(invalid("kind", "open, before any step", "a step")),
+        match &mut self.writer {
+            Some(writer) => writer.push_step(&parse_step(step)?),
+            None => Err(invalid("kind", "open before the first step", "a step")),
         }
     }
 
-    fn push(&mut self, kind: ResponseKind) -> Result<(), Status> {
+    fn push_reply(&mut self, kind: ResponseKind) -> Result<(), Status> {
         if self.replies.len() >= MAX_PENDING_REPLIES {
-            return Err(status(Error::Busy { queue: "replies not read by the client", limit: MAX_PENDING_REPLIES }));
+            return Err(to_status(Error::Busy { queue: "replies not read by the client", limit: MAX_PENDING_REPLIES }));
         }
         self.replies.push_back(v1::DriveSceneResponse { kind: Some(kind) });
         Ok(())
     }
 
-    /// Ends the stream with a server-side error. First sends the buffered replies, for at most half the drain time.
+    /// Ends the stream with an error. First sends the buffered replies, for at most half the drain time.
     async fn close_with_error(
         mut self,
         reply_sender: &ReplySender<v1::DriveSceneResponse>,
         error: Error,
     ) -> Result<(), Status> {
         let timeout = self.engine.config().drain_timeout / 2;
-        let tell = async {
+        let send_replies = async {
             while let Some(reply) = self.replies.pop_front() {
                 reply_sender.send(reply).await?;
             }
             Ok::<(), Status>(())
         };
-        // The error comes last, whether or not the client has read the replies.
-        tokio::time::timeout(timeout, tell).await.ok();
-        Err(status(error))
+        // Send the error even if the client has not read all replies.
+        tokio::time::timeout(timeout, send_replies).await.ok();
+        Err(to_status(error))
     }
 }
 
-/// Waits for the next report; pends forever without a writer lease.
-async fn next_report(drive: Option<&WriterSession>) -> Result<StepReport> {
-    match drive {
-        Some(drive) => drive.next_report().await,
+/// Waits for the next report. Pends forever without a writer.
+async fn next_report(writer: Option<&WriterSession>) -> Result<StepReport> {
+    match writer {
+        Some(writer) => writer.next_report().await,
         None => std::future::pending().await,
     }
 }
 
-fn response_of(report: StepReport) -> v1::DriveSceneResponse {
+fn to_response(report: StepReport) -> v1::DriveSceneResponse {
     let kind = match report {
         StepReport::Done { step, skipped, stages: times } => {
-            ResponseKind::Ack(v1::Acknowledgement { step, skipped, stages: stages(&times) })
+            ResponseKind::Ack(v1::Acknowledgement { step, skipped, stages: wire_stages(&times) })
         }
-        StepReport::Rejected { step, error } => ResponseKind::Rejection(rejection(Some(step), &error)),
+        StepReport::Rejected { step, error } => ResponseKind::Rejection(to_rejection(Some(step), &error)),
     };
     v1::DriveSceneResponse { kind: Some(kind) }
 }

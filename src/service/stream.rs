@@ -1,5 +1,5 @@
-//! Reply streams. A task sends messages through a bounded channel; replies are split into chunks of at most 1 MiB; a
-//! deadline covers the whole reply up to the last chunk; a panic ends only its own call.
+//! Reply streams. A task sends messages through a bounded channel. Replies are split into chunks of at most 1 MiB. A
+//! deadline covers the whole reply up to its last chunk. A panic ends only its own call.
 
 use std::pin::Pin;
 use std::time::{Duration, Instant};
@@ -11,7 +11,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::metadata::MetadataMap;
 use tonic::{Response, Status};
 
-use super::status::status;
+use super::status::to_status;
 use crate::config::Config;
 use modalcast_model::error::{Error, Result};
 
@@ -26,12 +26,12 @@ const REPLY_CAPACITY: usize = 2;
 pub(super) struct ReplySender<T>(mpsc::Sender<Result<T, Status>>);
 
 impl<T> ReplySender<T> {
-    /// Sends one message.
+    /// Sends one message. Waits until the channel has capacity.
     ///
     /// # Errors
     /// `CANCELLED` when the client has disconnected.
     pub(super) async fn send(&self, message: T) -> Result<(), Status> {
-        self.0.send(Ok(message)).await.map_err(|_| gone())
+        self.0.send(Ok(message)).await.map_err(|_| disconnected_status())
     }
 
     /// Waits until the channel has capacity for a message. Cancel-safe.
@@ -39,7 +39,7 @@ impl<T> ReplySender<T> {
     /// # Errors
     /// `CANCELLED` when the client has disconnected.
     pub(super) async fn reserve(&self) -> Result<mpsc::Permit<'_, Result<T, Status>>, Status> {
-        self.0.reserve().await.map_err(|_| gone())
+        self.0.reserve().await.map_err(|_| disconnected_status())
     }
 
     /// Waits until the client has disconnected.
@@ -48,12 +48,13 @@ impl<T> ReplySender<T> {
     }
 }
 
-fn gone() -> Status {
-    Status::cancelled("the client has gone")
+fn disconnected_status() -> Status {
+    Status::cancelled("the client has disconnected")
 }
 
-/// Creates a reply stream that `work` fills. The result of `work` ends the stream; one slot of the channel is reserved
-/// for it. When the client disconnects, `work` is dropped at its next await, so that its resources are released.
+/// Creates a reply stream to which `work` sends messages. An error of `work` ends the stream; capacity of the channel
+/// is reserved for it. When the client disconnects, `work` is dropped at its next await, so that its resources are
+/// released.
 pub(super) fn respond<T, W, F>(work: W) -> Response<ReplyStream<T>>
 where
     T: Send + 'static,
@@ -61,19 +62,19 @@ where
     F: Future<Output = Result<(), Status>> + Send + 'static,
 {
     let (sender, replies) = mpsc::channel(REPLY_CAPACITY + 1);
-    let last_word = sender.clone().try_reserve_owned();
-    let client = sender.clone();
+    let end_permit = sender.clone().try_reserve_owned();
+    let client_watch = sender.clone();
     let work = work(ReplySender(sender));
     let work = tokio::spawn(async move {
         tokio::select! {
-            end = work => end,
-            () = client.closed() => Err(gone()),
+            result = work => result,
+            () = client_watch.closed() => Err(disconnected_status()),
         }
     });
     tokio::spawn(async move {
-        let end = work.await.unwrap_or_else(|_| Err(Status::internal("the call failed on our side")));
-        if let (Err(status), Ok(last_word)) = (end, last_word) {
-            last_word.send(Err(status));
+        let result = work.await.unwrap_or_else(|_| Err(Status::internal("the call panicked in the server")));
+        if let (Err(status), Ok(end_permit)) = (result, end_permit) {
+            end_permit.send(Err(status));
         }
     });
     Response::new(Box::pin(ReceiverStream::new(replies)))
@@ -84,68 +85,79 @@ pub(super) async fn catch_panic<T: Send + 'static>(
     work: impl Future<Output = Result<T>> + Send + 'static,
 ) -> Result<Response<T>, Status> {
     match tokio::spawn(work).await {
-        Ok(result) => result.map(Response::new).map_err(status),
-        Err(_) => Err(Status::internal("the call failed on our side")),
+        Ok(result) => result.map(Response::new).map_err(to_status),
+        Err(_) => Err(Status::internal("the call panicked in the server")),
     }
 }
 
-/// Splits a reply into pieces of at most `most` bytes, each with its offset. An empty reply is one empty piece.
-pub(super) fn split_into_chunks(bytes: Bytes, most: usize) -> impl Iterator<Item = (u64, Bytes)> {
-    let starts = (0..bytes.len().max(1)).step_by(most.max(1));
-    starts.map(move |start| (start as u64, bytes.slice(start..bytes.len().min(start + most))))
+/// Splits a reply into chunks of at most `max_chunk_bytes` bytes, each with its offset. An empty reply is one empty
+/// chunk.
+pub(super) fn split_into_chunks(bytes: Bytes, max_chunk_bytes: usize) -> impl Iterator<Item = (u64, Bytes)> {
+    let chunk_starts = (0..bytes.len().max(1)).step_by(max_chunk_bytes.max(1));
+    chunk_starts.map(move |start| (start as u64, bytes.slice(start..bytes.len().min(start + max_chunk_bytes))))
 }
 
 /// Splits a reply as [`split_into_chunks`] does; the first chunk carries the head.
 pub(super) fn chunks_with_head<H, C>(
     head: H,
     bytes: Bytes,
-    most: usize,
+    max_chunk_bytes: usize,
     chunk: impl Fn(Option<H>, u64, Bytes) -> C,
 ) -> impl Iterator<Item = C> {
     let mut head = Some(head);
-    split_into_chunks(bytes, most).map(move |(offset, data)| chunk(head.take(), offset, data))
+    split_into_chunks(bytes, max_chunk_bytes).map(move |(offset, data)| chunk(head.take(), offset, data))
 }
 
 /// The deadline of a call.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Deadline {
-    /// The instant, and the time limit in milliseconds for errors; `None` means no deadline.
-    at: Option<(Instant, u64)>,
+    /// `None` means no deadline.
+    limit: Option<TimeLimit>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct TimeLimit {
+    deadline: Instant,
+    /// The whole time limit in milliseconds, for errors.
+    ms: u64,
 }
 
 impl Deadline {
     /// The deadline of a single request: the smaller of `ms` (milliseconds; 0 means unset) and the `grpc-timeout`
     /// header, else the configured default; limited to the configured maximum.
     pub(super) fn of_request(metadata: &MetadataMap, ms: u32, config: &Config) -> Self {
-        let asked = (ms > 0).then(|| Duration::from_millis(ms.into()));
-        let time = asked.into_iter().chain(header(metadata)).min().unwrap_or(config.deadline);
-        Self::after(time.min(config.max_deadline))
+        let requested = (ms > 0).then(|| Duration::from_millis(ms.into()));
+        let duration = requested.into_iter().chain(grpc_timeout(metadata)).min().unwrap_or(config.deadline);
+        Self::after(duration.min(config.max_deadline))
     }
 
     /// The deadline of a stream: its `grpc-timeout` header, if present.
     pub(super) fn of_stream(metadata: &MetadataMap) -> Self {
-        header(metadata).map_or(Self { at: None }, Self::after)
+        grpc_timeout(metadata).map_or(Self { limit: None }, Self::after)
     }
 
-    fn after(time: Duration) -> Self {
-        Self { at: Instant::now().checked_add(time).map(|at| (at, time.as_millis() as u64)) }
+    fn after(duration: Duration) -> Self {
+        let ms = duration.as_millis() as u64;
+        Self { limit: Instant::now().checked_add(duration).map(|deadline| TimeLimit { deadline, ms }) }
     }
 
-    /// Awaits `work`. If the deadline passes first, drops `work` and returns `DEADLINE_EXCEEDED` naming `what`.
+    /// Awaits `work`. If the deadline passes first, drops `work` and returns `DEADLINE_EXCEEDED` with `what`, a name of
+    /// the awaited result.
     pub(super) async fn enforce<T>(
         self,
         what: &str,
         work: impl Future<Output = Result<T, Status>>,
     ) -> Result<T, Status> {
-        let Some((at, ms)) = self.at else { return work.await };
-        match tokio::time::timeout_at(at.into(), work).await {
+        let Some(TimeLimit { deadline, ms }) = self.limit else { return work.await };
+        match tokio::time::timeout_at(deadline.into(), work).await {
             Ok(result) => result,
-            Err(_) => Err(status(Error::Deadline { what: what.into(), ms })),
+            Err(_) => Err(to_status(Error::Deadline { what: what.into(), ms })),
         }
     }
 }
 
-fn header(metadata: &MetadataMap) -> Option<Duration> {
+/// The `grpc-timeout` header of a call.
+fn grpc_timeout(metadata: &MetadataMap) -> Option<Duration> {
     parse_timeout(metadata.get("grpc-timeout")?.to_str().ok()?)
 }
 
@@ -172,19 +184,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pieces_cover_a_reply_once_and_an_empty_reply_is_one_piece() {
+    fn chunks_cover_a_reply_once() {
         let bytes = Bytes::from((0..=250).collect::<Vec<u8>>());
-        let cut: Vec<_> = split_into_chunks(bytes.clone(), 100).collect();
-        assert_eq!(
-            cut.iter().map(|(at, piece)| (*at, piece.len())).collect::<Vec<_>>(),
-            [(0, 100), (100, 100), (200, 51)]
-        );
-        assert_eq!(cut.iter().flat_map(|(_, piece)| piece.to_vec()).collect::<Vec<_>>(), bytes);
+        let chunks: Vec<_> = split_into_chunks(bytes.clone(), 100).collect();
+        let offsets_and_sizes: Vec<_> = chunks.iter().map(|(offset, chunk)| (*offset, chunk.len())).collect();
+        assert_eq!(offsets_and_sizes, [(0, 100), (100, 100), (200, 51)]);
+        assert_eq!(chunks.iter().flat_map(|(_, chunk)| chunk.to_vec()).collect::<Vec<_>>(), bytes);
+    }
+
+    #[test]
+    fn empty_reply_is_one_empty_chunk() {
         assert_eq!(split_into_chunks(Bytes::new(), 100).collect::<Vec<_>>(), [(0, Bytes::new())]);
     }
 
     #[test]
-    fn a_timeout_header_is_digits_and_a_unit_and_anything_else_is_none() {
+    fn timeout_header_has_digits_and_a_unit() {
         assert_eq!(parse_timeout("250m"), Some(Duration::from_millis(250)));
         assert_eq!(parse_timeout("99999999H"), Some(Duration::from_secs(99_999_999 * 3600)));
         for text in ["", "S", "123456789S", "-1S", "1s", "1 S", "1é", "é"] {
@@ -193,49 +207,56 @@ mod tests {
     }
 
     #[test]
-    fn a_request_is_over_after_the_shortest_time_it_names_and_never_after_the_longest() {
+    fn request_has_the_shortest_given_limit_up_to_the_maximum() {
         let config = Config::default();
-        let ms = |header: Option<&'static str>, ms| {
+        let limit_ms = |deadline: Deadline| deadline.limit.map(|limit| limit.ms);
+        let metadata = |grpc_timeout: &'static str| {
             let mut metadata = MetadataMap::new();
-            if let Some(header) = header {
-                metadata.insert("grpc-timeout", header.parse().expect("a header"));
-            }
-            let of = |deadline: Deadline| deadline.at.map(|(_, ms)| ms);
-            (of(Deadline::of_request(&metadata, ms, &config)), of(Deadline::of_stream(&metadata)))
+            metadata.insert("grpc-timeout", grpc_timeout.parse().expect("expected a valid header"));
+            metadata
         };
-        assert_eq!(ms(None, 0), (Some(30_000), None));
-        assert_eq!(ms(None, 80), (Some(80), None));
-        assert_eq!(ms(Some("50m"), 80), (Some(50), Some(50)));
-        assert_eq!(ms(Some("2S"), 80), (Some(80), Some(2000)));
-        assert_eq!(ms(None, u32::MAX), (Some(600_000), None));
-        assert_eq!(ms(Some("99H"), 0), (Some(600_000), Some(99 * 3_600_000)));
+        let request_ms = |metadata: &MetadataMap, ms: u32| limit_ms(Deadline::of_request(metadata, ms, &config));
+        let no_metadata = MetadataMap::new();
+        assert_eq!(request_ms(&no_metadata, 0), Some(30_000));
+        assert_eq!(request_ms(&no_metadata, 80), Some(80));
+        assert_eq!(request_ms(&no_metadata, u32::MAX), Some(600_000));
+        assert_eq!(request_ms(&metadata("50m"), 80), Some(50));
+        assert_eq!(request_ms(&metadata("2S"), 80), Some(80));
+        assert_eq!(request_ms(&metadata("99H"), 0), Some(600_000));
+        let stream_ms = |metadata: &MetadataMap| limit_ms(Deadline::of_stream(metadata));
+        assert_eq!(stream_ms(&no_metadata), None);
+        assert_eq!(stream_ms(&metadata("2S")), Some(2000));
+        assert_eq!(stream_ms(&metadata("99H")), Some(99 * 3_600_000));
     }
 
     #[tokio::test]
-    async fn work_ends_where_it_waits_when_its_client_leaves() {
-        let (held, ended) = tokio::sync::oneshot::channel::<()>();
-        let replies = respond(move |_outlet: ReplySender<u32>| async move {
+    async fn work_is_dropped_when_the_client_disconnects() {
+        let (work_guard, work_dropped) = tokio::sync::oneshot::channel::<()>();
+        let replies = respond(move |_: ReplySender<u32>| async move {
             std::future::pending::<()>().await;
-            drop(held);
+            drop(work_guard);
             Ok(())
         });
         drop(replies);
-        let end = tokio::time::timeout(Duration::from_secs(10), ended).await.expect("the work is dropped");
-        assert!(end.is_err());
+        let result = tokio::time::timeout(Duration::from_secs(10), work_dropped).await.expect("expected dropped work");
+        assert!(result.is_err());
     }
 
+    /// The channel is full when the work panics.
     #[tokio::test]
-    async fn a_panicking_task_ends_its_stream_with_internal_even_when_nobody_reads() {
-        let respond = respond(|reply_sender: ReplySender<u32>| async move {
+    async fn panicking_work_ends_its_stream_with_internal() {
+        use tokio_stream::StreamExt as _;
+        let response = respond(|reply_sender: ReplySender<u32>| async move {
             reply_sender.send(1).await?;
             reply_sender.send(2).await?;
-            panic!("a planted panic")
+            panic!("injected")
         });
-        let mut replies = respond.into_inner();
-        use tokio_stream::StreamExt as _;
-        assert_eq!(replies.next().await.expect("a message").expect("fine"), 1);
-        assert_eq!(replies.next().await.expect("a message").expect("fine"), 2);
-        let end = replies.next().await.expect("an end").expect_err("an error");
+        let mut replies = response.into_inner();
+        for expected in [1, 2] {
+            let reply = replies.next().await.expect("expected a reply").expect("expected a message");
+            assert_eq!(reply, expected);
+        }
+        let end = replies.next().await.expect("expected an end").expect_err("expected an error");
         assert_eq!(end.code(), tonic::Code::Internal);
         assert!(replies.next().await.is_none());
     }

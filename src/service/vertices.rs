@@ -1,13 +1,13 @@
 //! `VertexService`: deformed vertices of one step with a deadline, or of every step. A reply contains positions in row
-//! order of U, then normals, and the displacements and boxes if they are requested and the scene keeps them.
+//! order of U, normals, displacements and boxes, as far as they are requested.
 
 use std::sync::Arc;
 
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
-use super::convert::{delivery, describe_step_selector, stages, step_id};
-use super::status::status;
+use super::convert::{describe_step_selector, parse_delivery, wire_stages, wire_step_id};
+use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
 use crate::engine::{
     Engine, OutputSpec, PackedVertices, SceneHandle, StepSelector, Subscription, VertexSelection, pack_vertices,
@@ -28,18 +28,18 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let config = self.0.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(status)?;
-        let selection = select(&scene_handle, request.selection)?;
+        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let selection = parse_selection(&scene_handle, request.selection)?;
         let selector = StepSelector::from(request.step);
-        let most = config.chunk_bytes;
+        let max_chunk_bytes = config.chunk_bytes;
         Ok(respond(move |reply_sender| async move {
             let work = async {
                 let output = scene_handle
-                    .request_output(selector, OutputSpec::Vertices(selection.wanted))
+                    .request_output(selector, OutputSpec::Vertices(selection.attributes))
                     .await
-                    .map_err(status)?;
-                let vertices = pack_vertices(output, &selection).await.map_err(status)?;
-                for chunk in chunks(&vertices, &selection, most) {
+                    .map_err(to_status)?;
+                let vertices = pack_vertices(output, &selection).await.map_err(to_status)?;
+                for chunk in vertex_chunks(&vertices, &selection, max_chunk_bytes) {
                     reply_sender.send(v1::GetVerticesResponse { chunk: Some(chunk) }).await?;
                 }
                 Ok(())
@@ -56,68 +56,74 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
     ) -> Result<Response<Self::StreamVerticesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(status)?;
-        let selection = select(&scene_handle, request.selection)?;
-        let delivery = delivery(request.delivery).map_err(status)?;
+        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let selection = parse_selection(&scene_handle, request.selection)?;
+        let delivery = parse_delivery(request.delivery).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription =
-            scene_handle.subscribe(OutputSpec::Vertices(selection.wanted), delivery).await.map_err(status)?;
-        let show = VertexSender { selection, most: self.0.config().chunk_bytes, steps: request.steps };
+            scene_handle.subscribe(OutputSpec::Vertices(selection.attributes), delivery).await.map_err(to_status)?;
+        let vertex_stream =
+            VertexStream { selection, max_chunk_bytes: self.0.config().chunk_bytes, steps: request.steps };
         Ok(respond(move |reply_sender| {
-            deadline.enforce("the end of the vertex stream", show.run(subscription, reply_sender))
+            deadline.enforce("the vertex stream", vertex_stream.run(subscription, reply_sender))
         }))
     }
 }
 
 /// Parameters of a vertex stream.
-struct VertexSender {
+struct VertexStream {
     selection: Arc<VertexSelection>,
-    most: usize,
-    /// Number of steps to send; 0 means no limit.
+    max_chunk_bytes: usize,
+    /// Number of steps to send. 0 means no limit.
     steps: u64,
 }
 
-impl VertexSender {
+impl VertexStream {
     async fn run(
         self,
         mut subscription: Subscription,
         reply_sender: ReplySender<v1::StreamVerticesResponse>,
     ) -> Result<(), Status> {
-        let mut sent = 0;
-        while self.steps == 0 || sent < self.steps {
+        let mut sent_steps = 0;
+        while self.steps == 0 || sent_steps < self.steps {
             let output = tokio::select! {
-                output = subscription.next() => output.map_err(status)?,
+                output = subscription.next() => output.map_err(to_status)?,
                 () = reply_sender.closed() => return Ok(()),
             };
-            let vertices = pack_vertices(output, &self.selection).await.map_err(status)?;
-            for chunk in chunks(&vertices, &self.selection, self.most) {
+            let vertices = pack_vertices(output, &self.selection).await.map_err(to_status)?;
+            for chunk in vertex_chunks(&vertices, &self.selection, self.max_chunk_bytes) {
                 tokio::select! {
-                    sent = reply_sender.send(v1::StreamVerticesResponse { chunk: Some(chunk) }) => sent?,
-                    error = subscription.disconnected() => return Err(status(error)),
+                    sent_steps = reply_sender.send(v1::StreamVerticesResponse { chunk: Some(chunk) }) => sent_steps?,
+                    error = subscription.disconnected() => return Err(to_status(error)),
                 }
             }
-            sent += 1;
+            sent_steps += 1;
         }
         Ok(())
     }
 }
 
-fn select(scene_handle: &SceneHandle, selection: Option<v1::VertexSelection>) -> Result<Arc<VertexSelection>, Status> {
+/// Validates the selection of a request.
+fn parse_selection(
+    scene_handle: &SceneHandle,
+    selection: Option<v1::VertexSelection>,
+) -> Result<Arc<VertexSelection>, Status> {
     let v1::VertexSelection { domains, positions_only, displacements, boxes, without_vertices } =
         selection.unwrap_or_default();
     let positions = !without_vertices;
-    let wanted = VertexAttributes { positions, normals: positions && !positions_only, displacements, boxes };
-    VertexSelection::new(&scene_handle.scene, domains, wanted).map(Arc::new).map_err(status)
+    let attributes = VertexAttributes { positions, normals: positions && !positions_only, displacements, boxes };
+    VertexSelection::new(&scene_handle.scene, domains, attributes).map(Arc::new).map_err(to_status)
 }
 
-fn chunks(
+/// Splits vertices into chunks, of which the first has the head.
+fn vertex_chunks(
     packed: &PackedVertices,
     selection: &VertexSelection,
-    most: usize,
+    max_chunk_bytes: usize,
 ) -> impl Iterator<Item = v1::VertexChunk> + use<> {
     let vertices = &packed.encoded;
     let head = v1::VertexHead {
-        step: Some(step_id(vertices.step)),
+        step: Some(wire_step_id(vertices.step)),
         origin: packed.origin.to_vec(),
         domains: selection.domains.clone(),
         vertices: selection.vertices().collect(),
@@ -125,10 +131,14 @@ fn chunks(
         position_bytes: selection.position_bytes(),
         total: vertices.bytes.len() as u64,
         skipped: vertices.skipped,
-        stages: stages(&vertices.stages),
+        stages: wire_stages(&vertices.stages),
         origin_bytes: packed.origin_bytes,
         displacement_bytes: selection.displacement_bytes(),
         box_bytes: selection.box_bytes(),
     };
-    chunks_with_head(head, vertices.bytes.clone(), most, |head, offset, data| v1::VertexChunk { head, offset, data })
+    chunks_with_head(head, vertices.bytes.clone(), max_chunk_bytes, |head, offset, data| v1::VertexChunk {
+        head,
+        offset,
+        data,
+    })
 }

@@ -189,11 +189,11 @@ async fn stream_opens_after_rejected_openings() {
     server.open("strips").await;
     let mut writer = StepWriter::connect(server.channel().await).await;
     writer.send_step(step(1, &[], &[])).await;
-    assert!(has_prefixes(&writer.receive_rejection().await, ["kind", "open, before any step", "a step"]));
+    assert!(has_prefixes(&writer.receive_rejection().await, ["kind", "open before the first step", "a step"]));
     let ResponseKind::Rejection(unknown_scene) = writer.open("nowhere", Policy::Lossless, 0).await else {
         panic!("expected a rejection of an unknown scene")
     };
-    assert!(has_prefixes(&unknown_scene, ["scene", "a scene that is there", "'nowhere'"]), "{unknown_scene:?}");
+    assert!(has_prefixes(&unknown_scene, ["scene", "an existing scene", "'nowhere'"]), "{unknown_scene:?}");
     let open = v1::OpenDrive { scene: "strips".into(), policy: 77, window: 0 };
     writer.send(RequestKind::Open(open)).await;
     assert!(has_prefixes(&writer.receive_rejection().await, ["open.policy", "a policy of this version", "77"]));
@@ -201,7 +201,7 @@ async fn stream_opens_after_rejected_openings() {
     let ResponseKind::Rejection(second_open) = writer.open("strips", Policy::Lossless, 0).await else {
         panic!("expected a rejection of a second open message")
     };
-    assert!(has_prefixes(&second_open, ["open", "one open per stream", "a second"]), "{second_open:?}");
+    assert!(has_prefixes(&second_open, ["open", "one open per stream", "a second open"]), "{second_open:?}");
     writer.send_step_and_wait(step(0, &[0], &[0.0, 0.0])).await;
 }
 
@@ -244,7 +244,7 @@ async fn invalid_requests_return_code_and_details() {
     rejected_calls.push((status, Code::InvalidArgument, ["selection.domains[1]", "an index below 2", "5"]));
     let request = v1::GetVerticesRequest { scene: "nowhere".into(), ..v1::GetVerticesRequest::default() };
     let status = get_vertices(&server, request).await.expect_err("expected an unknown-scene error");
-    rejected_calls.push((status, Code::NotFound, ["scene", "a scene", "'nowhere'"]));
+    rejected_calls.push((status, Code::NotFound, ["scene", "an existing scene", "'nowhere'"]));
     let request = v1::ReadModesRequest { scene: "strips".into(), domain: 2, vertices: vec![] };
     let status = scenes.read_modes(request).await.expect_err("expected an unknown-domain error");
     rejected_calls.push((status, Code::InvalidArgument, ["domain", "an index below 2", "2"]));
@@ -259,16 +259,16 @@ async fn invalid_requests_return_code_and_details() {
     rejected_calls.push((status, Code::InvalidArgument, ["arrays", "arrays of this version", "99"]));
     let request = v1::OpenSceneRequest { source: "nothing".into(), scene: String::new() };
     let status = scenes.open_scene(request).await.expect_err("expected an unknown-source error");
-    rejected_calls.push((status, Code::NotFound, ["scene", "a scene", "nothing"]));
+    rejected_calls.push((status, Code::NotFound, ["scene", "an existing scene", "nothing"]));
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "../x".into() };
     let status = scenes.open_scene(request).await.expect_err("expected an invalid-name error");
     rejected_calls.push((status, Code::InvalidArgument, ["scene", "1 to 64 of", "\"../x\""]));
     let request = v1::OpenSceneRequest { source: "sheet".into(), scene: "strips".into() };
     let status = scenes.open_scene(request).await.expect_err("expected a name conflict");
-    rejected_calls.push((status, Code::AlreadyExists, ["the name of the scene", "nobody", "'strips' is strips"]));
+    rejected_calls.push((status, Code::AlreadyExists, ["scene name", "a free scene name", "'strips' belongs to 'strips'"]));
     let request = v1::DeleteSceneRequest { scene: "nowhere".into() };
     let status = scenes.delete_scene(request).await.expect_err("expected an unknown-scene error");
-    rejected_calls.push((status, Code::NotFound, ["scene", "a scene", "'nowhere'"]));
+    rejected_calls.push((status, Code::NotFound, ["scene", "an existing scene", "'nowhere'"]));
     for (status, code, prefixes) in rejected_calls {
         assert_eq!(status.code(), code, "{status:?}");
         assert!(
@@ -312,8 +312,8 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
     let uploads = server.engine.config().state.join("uploads");
     let path = |path: &'static str| modified_upload(move |_, file| file.path = path.into());
     let cases: Vec<(&str, Vec<Part>, [&str; 3])> = vec![
-        ("empty stream", vec![], ["part", "a header first", "nothing"]),
-        ("no header", upload_parts(b"strips").split_off(1), ["part", "a header first", "a file or chunk"]),
+        ("empty stream", vec![], ["part", "a header as the first part", "nothing"]),
+        ("no header", upload_parts(b"strips").split_off(1), ["part", "a header as the first part", "a file or chunk"]),
         (
             "other hash",
             modified_upload(|_, file| file.sha256 = vec![7; 32].into()),
@@ -342,7 +342,7 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
             ["header.entry", "a relative path", "\"../x\""],
         ),
         ("missing entry", modified_upload(|header, _| header.entry = "x".into()), ["entry", "a file", ""]),
-        ("unknown source in the file", upload_parts(b"lunch"), ["scene", "a scene", "lunch"]),
+        ("unknown source in the file", upload_parts(b"lunch"), ["scene", "an existing scene", "lunch"]),
     ];
     for (name, parts, prefixes) in cases {
         let status = upload(&server, parts).await.expect_err(name);

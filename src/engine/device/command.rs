@@ -18,8 +18,13 @@ pub(in crate::engine) type SceneId = u64;
 /// The channel that carries a command's answer.
 pub(in crate::engine) type Reply<T> = oneshot::Sender<Result<T>>;
 
-/// Vertices in host memory, and the milliseconds from the start of the copy to its completion.
-pub(in crate::engine) type TimedVertices = (Arc<DeformedSurface>, f64);
+/// Vertices in host memory.
+#[derive(Debug, Clone)]
+pub(in crate::engine) struct CopiedVertices {
+    pub surface: Arc<DeformedSurface>,
+    /// Milliseconds from the start of the copy to its completion.
+    pub copy_ms: f64,
+}
 
 /// A command to the device thread with the channel for its answer.
 pub(in crate::engine) enum Command {
@@ -55,11 +60,11 @@ pub(in crate::engine) enum Command {
         rectangle: PixelRect,
         reply: Reply<Vec<PickHit>>,
     },
-    /// Copies the wanted vertex attributes to the host. The copy overlaps with the commands after it.
+    /// Copies vertex attributes to the host. The copy overlaps with the commands after it.
     ReadVertices {
         id: SceneId,
-        wanted: VertexAttributes,
-        reply: Reply<TimedVertices>,
+        attributes: VertexAttributes,
+        reply: Reply<CopiedVertices>,
     },
     UnloadScene {
         id: SceneId,
@@ -71,7 +76,7 @@ pub(in crate::engine) enum Command {
 
 impl Command {
     /// Answers the command with an error instead of executing it.
-    pub(super) fn refuse(self, error: Error) {
+    pub(super) fn reply_error(self, error: Error) {
         // A failed send means that the caller no longer waits.
         match self {
             Self::LoadScene { reply, .. } | Self::UnloadScene { reply, .. } => reply.send(Err(error)).ok(),

@@ -1,4 +1,5 @@
-//! Device context: owns the deformation backend and the optional renderer, and loads scenes onto both ([`LoadedScene`]).
+//! Device context: owns the deformation backend and the optional renderer, and loads scenes onto both
+//! ([`LoadedScene`]).
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -25,7 +26,7 @@ use modalcast_render::{
 #[derive(Debug, Clone)]
 pub struct EngineInfo {
     pub backend: Backend,
-    /// The name of the CUDA device, or the reason why none is in use.
+    /// Name of the CUDA device, or the reason why no CUDA device is used.
     pub device: String,
     /// The renderer, or the reason why there is none.
     pub renderer: Result<modalcast_render::RendererInfo>,
@@ -34,15 +35,15 @@ pub struct EngineInfo {
 /// A frame in flight.
 #[derive(Debug)]
 pub struct PendingDraw {
-    ticket: PendingFrame,
+    frame: PendingFrame,
     /// Milliseconds spent on uploading vertices to the renderer; `None` if no upload was needed.
     upload_ms: Option<f64>,
 }
 
 impl PendingDraw {
-    /// Waits for at most `limit`; returns whether [`DeviceContext::finish_draw`] would now return without waiting.
+    /// Waits for at most `limit`. Returns whether [`DeviceContext::finish_draw`] would now return immediately.
     pub fn is_ready_within(&self, limit: Duration) -> bool {
-        self.ticket.is_ready_within(limit)
+        self.frame.is_ready_within(limit)
     }
 }
 
@@ -68,11 +69,11 @@ impl DeviceContext {
     /// `Unavailable` when CUDA is requested by name and cannot be opened. A missing renderer is an error only once a
     /// frame is requested.
     pub fn open(config: &Config) -> Result<Self> {
-        let (backend, device, note) = open_backend(config)?;
+        let (backend, device, device_label) = open_backend(config)?;
         let renderer = open_renderer(config, device.is_some());
         let info = EngineInfo {
             backend,
-            device: note,
+            device: device_label,
             renderer: renderer.as_ref().map(|renderer| renderer.info().clone()).map_err(Clone::clone),
         };
         Ok(Self {
@@ -114,8 +115,9 @@ impl DeviceContext {
     pub fn load_scene(&mut self, scene: &Arc<Scene>, backends: BackendSettings) -> Result<LoadedScene> {
         let (deformer, buffers) = self.create_deformer(scene, backends.batches)?;
         let mut loaded_scene = LoadedScene::new(scene, deformer, buffers);
-        let ready = loaded_scene.rest().and_then(|()| self.attach_rasterizer(&mut loaded_scene, backends.raster));
-        match ready {
+        let result =
+            loaded_scene.deform_rest().and_then(|()| self.attach_rasterizer(&mut loaded_scene, backends.raster));
+        match result {
             Ok(()) => Ok(loaded_scene),
             Err(error) => {
                 self.unload_scene(loaded_scene);
@@ -124,15 +126,15 @@ impl DeviceContext {
         }
     }
 
-    /// Creates the deformer of a scene, and the OpenGL buffers that it writes to, if it writes to any.
+    /// Creates the deformer of a scene. If the deformer writes to OpenGL buffers, creates the buffers, too.
     fn create_deformer(
         &mut self,
         scene: &Arc<Scene>,
         batches: BatchPolicy,
     ) -> Result<(Box<dyn Deformer>, Option<SceneBuffers>)> {
         #[cfg(test)]
-        if let Some(create) = self.test_deformer {
-            return Ok((create(scene), None));
+        if let Some(create_test_deformer) = self.test_deformer {
+            return Ok((create_test_deformer(scene), None));
         }
         let device = match (self.device.clone(), self.info.backend) {
             (Some(device), Backend::Cuda) => device,
@@ -141,20 +143,20 @@ impl DeviceContext {
             }
             _ => return Ok((Box::new(CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())), None)),
         };
-        let buffers = self.shareable_buffers(scene)?;
+        let buffers = self.create_shareable_buffers(scene)?;
         let options = CudaDeformerOptions { batches, bounding_axes: scene.light_axes() };
         match CudaDeformer::new(&device, scene, buffers.as_ref().map(SceneBuffers::vertex_buffers), options) {
             Ok(deformer) => Ok((Box::new(deformer), buffers)),
             Err(error) => {
-                self.unload(buffers);
+                self.free_buffers(buffers);
                 Err(error)
             }
         }
     }
 
-    /// Creates the compute (CUDA) rasterizer of a scene unless `policy` is OpenGL, and, for [`RasterPolicy::Fastest`],
-    /// measures both rasterizers and selects the faster one per pass. If the compute rasterizer cannot be created,
-    /// OpenGL draws and the reason is logged.
+    /// Creates the compute (CUDA) rasterizer of a scene unless `policy` is OpenGL. For [`RasterPolicy::Fastest`] also
+    /// measures both rasterizers and selects the faster one for each pass. If the compute rasterizer cannot be created,
+    /// logs the reason and leaves all passes to OpenGL.
     ///
     /// # Errors
     /// `DeviceLost`; the errors of drawing the measured frames.
@@ -163,12 +165,13 @@ impl DeviceContext {
         if policy == RasterPolicy::OpenGl || renderer.info().cuda_device.is_none() {
             return Ok(());
         }
-        let make = |mesh: RasterGeometry| Ok(Box::new(CudaRasterizer::new(device, mesh)?) as Box<dyn Rasterizer>);
-        match loaded_scene.attach_rasterizer(renderer, make) {
+        let create_rasterizer =
+            |mesh: RasterGeometry| Ok(Box::new(CudaRasterizer::new(device, mesh)?) as Box<dyn Rasterizer>);
+        match loaded_scene.attach_rasterizer(renderer, create_rasterizer) {
             Ok(()) => {}
             Err(error @ Error::DeviceLost { .. }) => return Err(error),
             Err(error) => {
-                tracing::warn!(%error, "OpenGL draws: its buffers have no rasterizer in CUDA");
+                tracing::warn!(%error, "the compute rasterizer could not be created; OpenGL draws");
                 return Ok(());
             }
         }
@@ -178,7 +181,7 @@ impl DeviceContext {
     /// Frees a loaded scene.
     pub fn unload_scene(&mut self, loaded_scene: LoadedScene) {
         let buffers = loaded_scene.into_buffers();
-        self.unload(buffers);
+        self.free_buffers(buffers);
     }
 
     /// Draws the vertices of the last deformation. The image's passes include "upload" if the vertices had to be
@@ -187,8 +190,8 @@ impl DeviceContext {
     /// # Errors
     /// `Unavailable` without a renderer, `Invalid` for an invalid camera or size, `Fault` of OpenGL.
     pub fn draw(&mut self, loaded_scene: &mut LoadedScene, camera: &Camera, size: FrameSize) -> Result<FrameImage> {
-        let drawing = self.begin_draw(loaded_scene, camera, size)?;
-        self.finish_draw(drawing).map(MappedPixels::into_image)
+        let pending_draw = self.begin_draw(loaded_scene, camera, size)?;
+        self.finish_draw(pending_draw).map(MappedPixels::into_image)
     }
 
     /// Submits a frame of the last deformation without waiting for the device. The scene may be deformed again while
@@ -204,28 +207,28 @@ impl DeviceContext {
     ) -> Result<PendingDraw> {
         let camera = camera.validated()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
-        let begin = Instant::now();
-        let filled = loaded_scene.fill_buffers(renderer, &camera)?;
-        let upload_ms = filled.uploaded.then(|| ms_since(begin));
-        let params = filled.frame_params(camera, size);
-        Ok(PendingDraw { ticket: renderer.submit(loaded_scene.buffers()?, &params)?, upload_ms })
+        let upload_begin = Instant::now();
+        let contents = loaded_scene.fill_buffers(renderer, &camera)?;
+        let upload_ms = contents.is_uploaded.then(|| ms_since(upload_begin));
+        let params = contents.frame_params(camera, size);
+        Ok(PendingDraw { frame: renderer.submit(loaded_scene.buffers()?, &params)?, upload_ms })
     }
 
     /// Waits for a frame. Any thread may then copy its pixels.
     ///
     /// # Errors
     /// `Fault` when the device does not finish.
-    pub fn finish_draw(&mut self, drawing: PendingDraw) -> Result<MappedPixels> {
+    pub fn finish_draw(&mut self, pending_draw: PendingDraw) -> Result<MappedPixels> {
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
-        let pixels = renderer.map_pixels(drawing.ticket)?;
-        Ok(match drawing.upload_ms {
+        let pixels = renderer.map_pixels(pending_draw.frame)?;
+        Ok(match pending_draw.upload_ms {
             Some(ms) => pixels.with_upload_time(ms),
             None => pixels,
         })
     }
 
-    /// Renders an AOV: depth, domains, normals or the values of a color map, and the legend of a color map. For
-    /// color frames use [`Self::draw`].
+    /// Renders an AOV: depth, domains, normals or the values of a color map. Returns it with the legend if it is a
+    /// color map. [`Self::draw`] renders color frames.
     ///
     /// # Errors
     /// As [`Self::draw`].
@@ -240,17 +243,17 @@ impl DeviceContext {
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
         let params = loaded_scene.fill_buffers(renderer, &camera)?.frame_params(camera, size);
         let legend = loaded_scene.upload_scalar_field(renderer, frame_output)?;
-        let field = match (frame_output, &legend) {
+        let aov = match (frame_output, &legend) {
             (_, Some(legend)) => Aov::Values { largest: legend.scale_max as f32 },
             (FrameOutput::Depth, _) => Aov::Depth,
             (FrameOutput::Normals, _) => Aov::Normals,
             _ => Aov::Domains,
         };
-        let survey = renderer.render_aov(loaded_scene.buffers()?, &params, field)?;
-        Ok((survey, legend))
+        let image = renderer.render_aov(loaded_scene.buffers()?, &params, aov)?;
+        Ok((image, legend))
     }
 
-    /// Submits a pick in a rectangle of a picture of this size without waiting for the device.
+    /// Submits a pick without waiting for the device. `rectangle` is in pixels of a picture of this size.
     ///
     /// # Errors
     /// As [`Self::draw`].
@@ -271,35 +274,36 @@ impl DeviceContext {
     ///
     /// # Errors
     /// `Fault` when the device does not finish.
-    pub fn finish_pick(&mut self, pick: PendingPick) -> Result<Vec<PickHit>> {
-        self.renderer.as_mut().map_err(|error| error.clone())?.finish_pick(pick)
+    pub fn finish_pick(&mut self, pending_pick: PendingPick) -> Result<Vec<PickHit>> {
+        self.renderer.as_mut().map_err(|error| error.clone())?.finish_pick(pending_pick)
     }
 
-    /// Buffers that CUDA can map; `None` unless the renderer runs on a CUDA device.
-    fn shareable_buffers(&mut self, scene: &Arc<Scene>) -> Result<Option<SceneBuffers>> {
+    /// Creates buffers that CUDA can map. Returns `None` unless the renderer runs on a CUDA device.
+    fn create_shareable_buffers(&mut self, scene: &Arc<Scene>) -> Result<Option<SceneBuffers>> {
         match &mut self.renderer {
             Ok(renderer) if renderer.info().cuda_device.is_some() => renderer.load(scene).map(Some),
             _ => Ok(None),
         }
     }
 
-    fn unload(&mut self, buffers: Option<SceneBuffers>) {
+    fn free_buffers(&mut self, buffers: Option<SceneBuffers>) {
         if let (Some(buffers), Ok(renderer)) = (buffers, &mut self.renderer) {
             renderer.unload(buffers);
         }
     }
 }
 
+/// Opens the configured backend. Returns it with its CUDA device, if any, and [`EngineInfo::device`].
 fn open_backend(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, String)> {
     match config.backend {
-        BackendChoice::Cpu => Ok((Backend::Cpu, None, "not asked for".into())),
-        BackendChoice::Reference => Ok((Backend::Reference, None, "not asked for".into())),
+        BackendChoice::Cpu => Ok((Backend::Cpu, None, "not requested".into())),
+        BackendChoice::Reference => Ok((Backend::Reference, None, "not requested".into())),
         BackendChoice::Cuda => open_cuda(config),
         BackendChoice::Auto => open_cuda(config).or_else(|error| Ok((Backend::Cpu, None, error.to_string()))),
     }
 }
 
-/// Opens the CUDA device; fails if no NVRTC version fits it, since it could not compile the kernels.
+/// Opens the CUDA device. Fails if no installed NVRTC supports it, because the kernels could not be compiled.
 fn open_cuda(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, String)> {
     let device = gpu::Device::open(config.cuda_device)?;
     device.check_compiler()?;
@@ -307,25 +311,28 @@ fn open_cuda(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, Stri
     Ok((Backend::Cuda, Some(device), name))
 }
 
-fn open_renderer(config: &Config, cuda: bool) -> Result<Renderer> {
-    let refusal = |reason: &str, remedy: &str| Error::Unavailable {
+fn open_renderer(config: &Config, uses_cuda: bool) -> Result<Renderer> {
+    let renderer_unavailable = |reason: &str, remedy: &str| Error::Unavailable {
         what: "renderer",
         reason: reason.into(),
         remedy: remedy.into(),
     };
     let renderer = match config.renderer {
-        RendererChoice::Off => return Err(refusal("it was switched off", "Start the server with a renderer")),
+        RendererChoice::Off => {
+            return Err(renderer_unavailable("it was switched off", "Start the server with a renderer"));
+        }
         RendererChoice::Software => Renderer::open(DevicePreference::Software),
-        RendererChoice::Auto if cuda => {
+        RendererChoice::Auto if uses_cuda => {
             let ordinal = i32::try_from(config.cuda_device).unwrap_or(i32::MAX);
-            // A driver without EGL can still deform; another renderer then draws the frames.
+            // A driver without EGL can still deform. Another OpenGL device then draws the frames.
             Renderer::open(DevicePreference::Cuda(ordinal)).or_else(|_| Renderer::open(DevicePreference::Any))
         }
         RendererChoice::Auto => Renderer::open(DevicePreference::Any),
     }?;
     if renderer.info().software && !config.allow_software {
-        let reason = format!("only {} is there and software renderers are not allowed", renderer.info().renderer);
-        return Err(refusal(&reason, "Install the GPU's EGL driver or allow software"));
+        let reason =
+            format!("expected a GPU because software renderers are not allowed, got {}", renderer.info().renderer);
+        return Err(renderer_unavailable(&reason, "Install the GPU's EGL driver or allow software"));
     }
     Ok(renderer)
 }

@@ -1,9 +1,9 @@
 //! The command loop of the device thread: executes commands and decides in which order it answers them.
 //!
 //! Frames, picks and vertex readbacks are answered asynchronously, each type from its own bounded queue
-//! ([`InFlightQueue`]). The loop polls readbacks that were started before a command, not those that the command starts;
-//! they overlap with the next command. AOVs are read back while their command is executed, because the renderer has no
-//! asynchronous readback for them, so no AOV is ever in flight.
+//! ([`InFlightQueue`]). After each command the loop polls the readbacks that were started before this command.
+//! Readbacks that the command starts overlap with the next one. AOVs are read back while their command is executed,
+//! because the renderer has no asynchronous readback for them. AOVs are therefore never in flight.
 //!
 //! Frames pass through the renderer's ring buffer. The loop submits a frame, executes the commands after it, and
 //! answers the frame once the device has drawn it, or before the next submission when every ring slot is in flight. Two
@@ -12,9 +12,9 @@
 //! delayed copy occupies its ring slot and so delays the frames of all scenes.
 //!
 //! # Failures
-//! A panic in a command, in a poll or in a copy costs that command: its reply channel is dropped, so its caller gets an
-//! error, and the loop continues. After the first `Error::DeviceLost` the loop refuses every command with that error
-//! except `UnloadScene`.
+//! A panic in a command, in a poll or in a copy drops the reply channel of that command, so its caller gets an error.
+//! The loop continues. After the first `Error::DeviceLost` the loop answers every command with that error, except
+//! `UnloadScene`.
 
 use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -23,7 +23,7 @@ use std::time::{Duration, Instant};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use tokio::sync::mpsc;
 
-use super::command::{Command, Reply, SceneId, TimedVertices};
+use super::command::{Command, CopiedVertices, Reply, SceneId};
 use super::context::{DeviceContext, EngineInfo, PendingDraw};
 use super::device_loss::DeviceLossSender;
 use super::in_flight::{InFlight, InFlightQueue, Pollable};
@@ -40,7 +40,7 @@ const POLL_INTERVAL: Duration = Duration::from_micros(100);
 const COPY_THREADS: usize = 2;
 /// Picks in flight. A further pick first waits for the oldest one.
 const MAX_PICKS_IN_FLIGHT: usize = 16;
-/// Vertex readbacks in flight: one that was started by the last command, and one by the command before it.
+/// Vertex readbacks in flight: one of the last command, and one of the command before it.
 const MAX_VERTEX_READBACKS_IN_FLIGHT: usize = 2;
 
 /// State owned by the device thread: the device context, the loaded scenes and the readbacks in flight.
@@ -49,7 +49,7 @@ pub(super) struct DeviceLoop {
     loss: DeviceLossSender,
     copy_pool: ThreadPool,
     scenes: HashMap<SceneId, LoadedScene>,
-    vertices: InFlightQueue<PendingVertices, TimedVertices>,
+    vertices: InFlightQueue<PendingVertices, CopiedVertices>,
     picks: InFlightQueue<PendingPick, Vec<PickHit>>,
     frames: InFlightQueue<PendingDraw, FrameImage>,
 }
@@ -58,7 +58,7 @@ pub(super) struct DeviceLoop {
 struct PendingVertices {
     id: SceneId,
     readback: VertexReadback,
-    begin: Instant,
+    start: Instant,
 }
 
 impl Pollable for PendingPick {
@@ -74,14 +74,15 @@ impl Pollable for PendingDraw {
     }
 }
 
-/// Calls `act` and catches its panic. The panicking command drops its reply channel, so its caller gets an error.
-fn catch_panic(act: impl FnOnce()) {
-    if catch_unwind(AssertUnwindSafe(act)).is_err() {
+/// Runs part of a command and catches its panic. The panic drops the command's reply channel, so its caller gets an
+/// error.
+fn run_caught(work: impl FnOnce()) {
+    if catch_unwind(AssertUnwindSafe(work)).is_err() {
         tracing::error!("a command panicked on the device thread");
     }
 }
 
-/// Sends an answer and drops it if the caller no longer waits.
+/// Sends an answer. Drops it if the caller no longer waits.
 fn answer<T>(reply: Reply<T>, result: Result<T>) {
     reply.send(result).ok();
 }
@@ -105,7 +106,7 @@ impl DeviceLoop {
         })
     }
 
-    /// The backend that deforms and the renderer that draws.
+    /// The backend and the renderer in use.
     pub(super) const fn info(&self) -> &EngineInfo {
         self.context.info()
     }
@@ -116,32 +117,32 @@ impl DeviceLoop {
             if matches!(command, Command::Quit) {
                 break;
             }
-            let older_vertices = self.vertices.len();
-            catch_panic(|| self.execute(command));
-            for _ in 0..older_vertices {
-                catch_panic(|| self.finish_oldest_vertices());
+            let older_readbacks = self.vertices.len();
+            run_caught(|| self.execute(command));
+            for _ in 0..older_readbacks {
+                run_caught(|| self.finish_oldest_vertices());
             }
             while self.picks.is_oldest_ready(Duration::ZERO) {
-                catch_panic(|| self.finish_oldest_pick());
+                run_caught(|| self.finish_oldest_pick());
             }
             while self.frames.is_oldest_ready(Duration::ZERO) {
-                catch_panic(|| self.finish_oldest_frame());
+                run_caught(|| self.finish_oldest_frame());
             }
         }
         self.vertices.clear();
         self.picks.clear();
         self.frames.clear();
         for (_, scene) in self.scenes.drain() {
-            catch_panic(|| self.context.unload_scene(scene));
+            run_caught(|| self.context.unload_scene(scene));
         }
     }
 
-    /// The next command. While the command queue is empty, waits for readbacks in flight and answers them.
+    /// Returns the next command. While the command queue is empty, answers readbacks in flight.
     fn next_command(&mut self, inbox: &mut mpsc::Receiver<Command>) -> Option<Command> {
         while !(self.vertices.is_empty() && self.picks.is_empty() && self.frames.is_empty()) {
             match inbox.try_recv() {
                 Ok(command) => return Some(command),
-                Err(_) => catch_panic(|| self.finish_one()),
+                Err(_) => run_caught(|| self.finish_one()),
             }
         }
         inbox.blocking_recv()
@@ -149,21 +150,21 @@ impl DeviceLoop {
 
     fn execute(&mut self, command: Command) {
         if let Some(error) = self.loss.error().filter(|_| !matches!(command, Command::UnloadScene { .. })) {
-            return command.refuse(error);
+            return command.reply_error(error);
         }
         match command {
             Command::LoadScene { id, scene, backends, reply } => {
-                let loaded = self.loss.note(self.context.load_scene(&scene, backends)).map(|scene| {
+                let result = self.loss.record_loss(self.context.load_scene(&scene, backends)).map(|scene| {
                     self.scenes.insert(id, scene);
                 });
-                // If the caller has gone, no `UnloadScene` will follow.
-                if reply.send(loaded).is_err() {
+                // If the caller no longer waits, no `UnloadScene` will follow.
+                if reply.send(result).is_err() {
                     self.unload(id);
                 }
             }
             Command::Deform { id, state, reply } => {
                 let deformed = self.scene(id).and_then(|scene| scene.deform_shared(&state));
-                answer(reply, self.loss.note(deformed));
+                answer(reply, self.loss.record_loss(deformed));
             }
             Command::UnloadScene { id, reply } => {
                 self.unload(id);
@@ -172,13 +173,16 @@ impl DeviceLoop {
             Command::Draw { id, camera, size, reply } if !reply.is_closed() => self.draw(id, camera, size, reply),
             Command::RenderAov { id, camera, size, frame_output, reply } if !reply.is_closed() => {
                 let Self { context, scenes, .. } = self;
-                let aov = find(scenes, id).and_then(|scene| context.render_aov(scene, &camera, size, frame_output));
-                answer(reply, self.loss.note(aov));
+                let aov =
+                    find_scene(scenes, id).and_then(|scene| context.render_aov(scene, &camera, size, frame_output));
+                answer(reply, self.loss.record_loss(aov));
             }
             Command::Pick { id, camera, picture, rectangle, reply } if !reply.is_closed() => {
                 self.pick(id, camera, picture, rectangle, reply);
             }
-            Command::ReadVertices { id, wanted, reply } if !reply.is_closed() => self.read_vertices(id, wanted, reply),
+            Command::ReadVertices { id, attributes, reply } if !reply.is_closed() => {
+                self.read_vertices(id, attributes, reply)
+            }
             // The caller no longer waits, so the work is skipped.
             Command::Draw { .. }
             | Command::RenderAov { .. }
@@ -200,9 +204,9 @@ impl DeviceLoop {
             self.finish_oldest_frame();
         }
         let Self { context, scenes, .. } = self;
-        let drawing = find(scenes, id).and_then(|scene| context.begin_draw(scene, &camera, size));
-        match self.loss.note(drawing) {
-            Ok(drawing) => self.frames.push(drawing, reply),
+        let pending_draw = find_scene(scenes, id).and_then(|scene| context.begin_draw(scene, &camera, size));
+        match self.loss.record_loss(pending_draw) {
+            Ok(pending_draw) => self.frames.push(pending_draw, reply),
             Err(error) => answer(reply, Err(error)),
         }
     }
@@ -220,30 +224,31 @@ impl DeviceLoop {
             self.finish_oldest_pick();
         }
         let Self { context, scenes, .. } = self;
-        let pick = find(scenes, id).and_then(|scene| context.begin_pick(scene, &camera, picture, rectangle));
-        match self.loss.note(pick) {
-            Ok(pick) => self.picks.push(pick, reply),
+        let pending_pick =
+            find_scene(scenes, id).and_then(|scene| context.begin_pick(scene, &camera, picture, rectangle));
+        match self.loss.record_loss(pending_pick) {
+            Ok(pending_pick) => self.picks.push(pending_pick, reply),
             Err(error) => answer(reply, Err(error)),
         }
     }
 
     /// Starts a vertex readback; answers immediately if the vertices are already in host memory.
-    fn read_vertices(&mut self, id: SceneId, wanted: VertexAttributes, reply: Reply<TimedVertices>) {
+    fn read_vertices(&mut self, id: SceneId, attributes: VertexAttributes, reply: Reply<CopiedVertices>) {
         while self.vertices.is_full() {
             self.finish_oldest_vertices();
         }
-        let begin = Instant::now();
-        let readback = self.scene(id).and_then(|scene| scene.readback(wanted));
-        match self.loss.note(readback) {
+        let start = Instant::now();
+        let readback = self.scene(id).and_then(|scene| scene.readback(attributes));
+        match self.loss.record_loss(readback) {
             Ok(readback) if readback.is_ready() => {
-                self.finish_vertices(InFlight { pending: PendingVertices { id, readback, begin }, reply });
+                self.finish_vertices(InFlight { pending: PendingVertices { id, readback, start }, reply });
             }
-            Ok(readback) => self.vertices.push(PendingVertices { id, readback, begin }, reply),
+            Ok(readback) => self.vertices.push(PendingVertices { id, readback, start }, reply),
             Err(error) => answer(reply, Err(error)),
         }
     }
 
-    /// Answers one readback in flight, or waits for a frame for at most [`POLL_INTERVAL`].
+    /// Answers one readback in flight. If only frames are in flight, waits for at most [`POLL_INTERVAL`].
     fn finish_one(&mut self) {
         if !self.vertices.is_empty() {
             self.finish_oldest_vertices();
@@ -260,7 +265,7 @@ impl DeviceLoop {
     fn finish_oldest_pick(&mut self) {
         let Some(InFlight { pending, reply }) = self.picks.pop_oldest() else { return };
         let hits = self.context.finish_pick(pending);
-        answer(reply, self.loss.note(hits));
+        answer(reply, self.loss.record_loss(hits));
     }
 
     /// Waits for the oldest frame in flight; a copy thread then copies and sends its pixels.
@@ -270,8 +275,8 @@ impl DeviceLoop {
             return; // The caller no longer waits.
         }
         let pixels = self.context.finish_draw(pending);
-        match self.loss.note(pixels) {
-            Ok(pixels) => self.copy_pool.spawn(move || catch_panic(|| answer(reply, Ok(pixels.into_image())))),
+        match self.loss.record_loss(pixels) {
+            Ok(pixels) => self.copy_pool.spawn(move || run_caught(|| answer(reply, Ok(pixels.into_image())))),
             Err(error) => answer(reply, Err(error)),
         }
     }
@@ -283,18 +288,19 @@ impl DeviceLoop {
         }
     }
 
-    fn finish_vertices(&mut self, readback: InFlight<PendingVertices, TimedVertices>) {
-        let InFlight { pending: PendingVertices { id, readback, begin }, reply } = readback;
+    fn finish_vertices(&mut self, readback: InFlight<PendingVertices, CopiedVertices>) {
+        let InFlight { pending: PendingVertices { id, readback, start }, reply } = readback;
         let surface = self.scene(id).and_then(|scene| scene.wait_readback(&readback));
-        answer(reply, self.loss.note(surface).map(|surface| (surface, ms_since(begin))));
+        let vertices = self.loss.record_loss(surface);
+        answer(reply, vertices.map(|surface| CopiedVertices { surface, copy_ms: ms_since(start) }));
     }
 
     fn scene(&mut self, id: SceneId) -> Result<&mut LoadedScene> {
-        find(&mut self.scenes, id)
+        find_scene(&mut self.scenes, id)
     }
 }
 
-fn find(scenes: &mut HashMap<SceneId, LoadedScene>, id: SceneId) -> Result<&mut LoadedScene> {
+fn find_scene(scenes: &mut HashMap<SceneId, LoadedScene>, id: SceneId) -> Result<&mut LoadedScene> {
     scenes.get_mut(&id).ok_or_else(|| fault_in("device")(format!("scene {id} is not loaded")))
 }
 
@@ -309,65 +315,69 @@ mod tests {
     use modalcast_model::error::Error;
     use modalcast_model::scene::{Scene, SceneState};
 
-    const FAULTY: SceneId = 1;
-    const CONTROL: SceneId = 2;
+    const FAULTY_SCENE: SceneId = 1;
+    const CONTROL_SCENE: SceneId = 2;
     const POSITIONS: VertexAttributes =
         VertexAttributes { positions: true, normals: false, displacements: false, boxes: false };
 
-    /// A device thread with two loaded scenes.
-    async fn two_scenes() -> (DeviceHandle, Arc<Scene>) {
-        let open = || DeviceContext::with_deformer(FaultyDeformer::boxed);
-        let handle = DeviceThread::start(2, open).await.expect("starts").handle;
+    /// Starts a device thread and loads two scenes.
+    async fn start_with_two_scenes() -> (DeviceHandle, Arc<Scene>) {
+        let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);
+        let handle = DeviceThread::start(2, open_device).await.expect("expected a device thread").handle;
         let scene = testing::two_strips();
-        for id in [FAULTY, CONTROL] {
-            handle.load_scene(id, &scene, BackendSettings::default()).await.expect("loads");
+        for id in [FAULTY_SCENE, CONTROL_SCENE] {
+            handle.load_scene(id, &scene, BackendSettings::default()).await.expect("expected a loaded scene");
         }
         (handle, scene)
     }
 
-    fn state(scene: &Scene, q: f32) -> Arc<SceneState> {
+    /// A state whose first coordinate is `q`.
+    fn state_with_q(scene: &Scene, q: f32) -> Arc<SceneState> {
         let mut state = SceneState::rest(scene);
         state.q[0] = q;
         Arc::new(state)
     }
 
-    /// Deforms to `q` and returns the first positions.
-    async fn positions(handle: &DeviceHandle, id: SceneId, state: &Arc<SceneState>) -> Result<Vec<f32>> {
+    /// Deforms a scene to a state and returns the positions.
+    async fn deform_and_read(handle: &DeviceHandle, id: SceneId, state: &Arc<SceneState>) -> Result<Vec<f32>> {
         handle.deform(id, state).wait().await?;
-        handle.read_vertices(id, POSITIONS).wait().await.map(|(surface, _)| surface.positions.clone())
+        handle.read_vertices(id, POSITIONS).wait().await.map(|vertices| vertices.surface.positions.clone())
     }
 
     #[tokio::test]
-    async fn panicking_command_costs_only_that_command() {
+    async fn panicking_command_fails_only_itself() {
         use InjectedFault::{PanicInDeform, PanicInReadback, PanicInWait};
         for fault in [PanicInDeform, PanicInReadback, PanicInWait] {
-            let (handle, scene) = two_scenes().await;
-            let good = state(&scene, 0.5);
-            let before = positions(&handle, FAULTY, &good).await.expect("deforms");
-            let error = positions(&handle, FAULTY, &state(&scene, fault.q())).await.expect_err("panics");
+            let (handle, scene) = start_with_two_scenes().await;
+            let valid_state = state_with_q(&scene, 0.5);
+            let expected = deform_and_read(&handle, FAULTY_SCENE, &valid_state).await.expect("expected positions");
+            let faulty_state = state_with_q(&scene, fault.q());
+            let error = deform_and_read(&handle, FAULTY_SCENE, &faulty_state).await.expect_err("expected the panic");
             assert!(matches!(&error, Error::Fault { reason, .. } if reason.contains("panicked")), "{fault:?}: {error}");
-            let control = positions(&handle, CONTROL, &good).await;
-            assert_eq!(control.as_ref(), Ok(&before), "{fault:?}: the other scene goes on");
+            let control = deform_and_read(&handle, CONTROL_SCENE, &valid_state).await;
+            assert_eq!(control.as_ref(), Ok(&expected), "{fault:?}: expected the control scene to continue");
             if fault == PanicInDeform {
                 // The state before the panic was restored.
-                let after = handle.read_vertices(FAULTY, POSITIONS).wait().await.expect("reads").0;
-                assert_eq!(after.positions, before);
+                let restored = handle.read_vertices(FAULTY_SCENE, POSITIONS).wait().await.expect("expected vertices");
+                assert_eq!(restored.surface.positions, expected);
             }
-            assert_eq!(positions(&handle, FAULTY, &good).await.as_ref(), Ok(&before), "{fault:?}: the scene goes on");
+            let positions = deform_and_read(&handle, FAULTY_SCENE, &valid_state).await;
+            assert_eq!(positions.as_ref(), Ok(&expected), "{fault:?}: expected the faulty scene to continue");
         }
     }
 
     #[tokio::test]
-    async fn lost_device_refuses_every_later_command() {
-        let (handle, scene) = two_scenes().await;
-        let good = state(&scene, 0.5);
-        positions(&handle, CONTROL, &good).await.expect("control: the device works");
+    async fn lost_device_fails_every_later_command() {
+        let (handle, scene) = start_with_two_scenes().await;
+        let valid_state = state_with_q(&scene, 0.5);
+        deform_and_read(&handle, CONTROL_SCENE, &valid_state).await.expect("control: expected positions");
         assert_eq!(handle.loss().error(), None);
-        let lost = positions(&handle, FAULTY, &state(&scene, InjectedFault::DeviceLost.q())).await;
-        assert_eq!(lost, Err(testing::device_lost()));
-        assert_eq!(handle.loss().wait().await, testing::device_lost());
-        assert_eq!(positions(&handle, CONTROL, &good).await, Err(testing::device_lost()));
-        assert_eq!(handle.load_scene(3, &scene, BackendSettings::default()).await, Err(testing::device_lost()));
-        handle.unload_scene(CONTROL).await.expect("scenes are freed all the same");
+        let loss = testing::device_lost_error();
+        let faulty_state = state_with_q(&scene, InjectedFault::DeviceLost.q());
+        assert_eq!(deform_and_read(&handle, FAULTY_SCENE, &faulty_state).await, Err(loss.clone()));
+        assert_eq!(handle.loss().wait().await, loss);
+        assert_eq!(deform_and_read(&handle, CONTROL_SCENE, &valid_state).await, Err(loss.clone()));
+        assert_eq!(handle.load_scene(3, &scene, BackendSettings::default()).await, Err(loss));
+        handle.unload_scene(CONTROL_SCENE).await.expect("expected to unload a scene after the loss");
     }
 }

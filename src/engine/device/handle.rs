@@ -1,16 +1,16 @@
-//! Handle to the device thread, which receives commands (`command`) from a bounded queue, owns the device context and
-//! every loaded scene (`device_loop`), and answers each command at most once. Vertices, picks and frames are answered
-//! asynchronously: their readback overlaps with the commands after them.
+//! Handle to the device thread. The thread receives commands (`command`) from a bounded queue, owns the device context
+//! and every loaded scene (`device_loop`), and answers each command at most once. Vertices, picks and frames are
+//! answered asynchronously: their readback overlaps with the commands after them.
 
 use std::sync::Arc;
 
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 
-use super::command::{Command, Reply, SceneId, TimedVertices};
+use super::command::{Command, CopiedVertices, Reply, SceneId};
 use super::context::{DeviceContext, EngineInfo};
 use super::device_loop::DeviceLoop;
-use super::device_loss::{DeviceLoss, device_loss};
+use super::device_loss::{DeviceLoss, device_loss_channel};
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use modalcast_model::backend_settings::BackendSettings;
@@ -23,7 +23,7 @@ use modalcast_render::{AovImage, FrameImage, MAX_FRAMES_IN_FLIGHT, PickHit};
 #[derive(Debug, Clone)]
 pub(in crate::engine) struct DeviceHandle {
     commands: mpsc::Sender<Command>,
-    limit: usize,
+    capacity: usize,
     loss: DeviceLoss,
 }
 
@@ -35,47 +35,48 @@ pub(in crate::engine) struct DeviceThread {
 }
 
 impl DeviceThread {
-    /// Starts the thread for up to `open_scenes` scenes; waits until `open` has opened its devices.
+    /// Starts the thread for up to `open_scenes` scenes. Returns when `open_device` has opened the devices.
     ///
     /// # Errors
-    /// The errors of `open`; `Fault` when a thread cannot be started.
+    /// The errors of `open_device`; `Fault` when a thread cannot be started.
     pub(in crate::engine) async fn start(
         open_scenes: usize,
-        open: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
+        open_device: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
     ) -> Result<Self> {
-        // A scene queues at most MAX_FRAMES_IN_FLIGHT frames, one copy and the next step, and an opening queues one
-        // command more. The queue is therefore full only when scenes are opened faster than the limit on open scenes
-        // allows.
-        let limit = (3 + MAX_FRAMES_IN_FLIGHT) * open_scenes + 8;
-        let (commands, inbox) = mpsc::channel(limit);
+        // A scene queues at most MAX_FRAMES_IN_FLIGHT frames, one copy and the next step. Opening a scene queues one
+        // command more, and 8 commands are a reserve. The queue is therefore full only if more than `open_scenes`
+        // scenes use the device.
+        let capacity = (3 + MAX_FRAMES_IN_FLIGHT) * open_scenes + 8;
+        let (commands, inbox) = mpsc::channel(capacity);
         let (info_sender, info_receiver) = oneshot::channel();
-        let (loss_sender, loss) = device_loss();
+        let (loss_sender, loss) = device_loss_channel();
         let thread = std::thread::Builder::new()
             .name("device".into())
-            .spawn(move || match open().and_then(|context| DeviceLoop::new(context, loss_sender)) {
+            .spawn(move || match open_device().and_then(|context| DeviceLoop::new(context, loss_sender)) {
                 Ok(device_loop) => {
-                    info_sender.send(Ok(device_loop.info().clone())).ok(); // Fails if the caller has gone; the queue is closed then.
+                    // Fails only if the caller no longer waits. The queue is then closed and `run` returns.
+                    info_sender.send(Ok(device_loop.info().clone())).ok();
                     device_loop.run(inbox);
                 }
                 Err(error) => {
-                    info_sender.send(Err(error)).ok(); // As above.
+                    info_sender.send(Err(error)).ok(); // Fails only if the caller no longer waits.
                 }
             })
             .map_err(fault_in("device thread"))?;
-        let info = info_receiver.await.map_err(|_| no_answer())??;
-        Ok(Self { handle: DeviceHandle { commands, limit, loss }, info, thread })
+        let info = info_receiver.await.map_err(|_| no_answer_error())??;
+        Ok(Self { handle: DeviceHandle { commands, capacity, loss }, info, thread })
     }
 }
 
 impl DeviceHandle {
-    /// A handle for tests that play the device thread, and the receiver of its commands.
+    /// A handle for tests that answer the commands themselves, and the receiver of the commands.
     #[cfg(test)]
     pub(in crate::engine) fn mock() -> (Self, mpsc::Receiver<Command>) {
         let (commands, inbox) = mpsc::channel(16);
-        (Self { commands, limit: 16, loss: device_loss().1 }, inbox)
+        (Self { commands, capacity: 16, loss: device_loss_channel().1 }, inbox)
     }
 
-    /// Whether the device is lost.
+    /// The observer of a device loss.
     pub(in crate::engine) const fn loss(&self) -> &DeviceLoss {
         &self.loss
     }
@@ -126,20 +127,20 @@ impl DeviceHandle {
         self.call(|reply| Command::Pick { id, camera, picture, rectangle, reply }).await
     }
 
-    /// Starts copying the wanted attributes of the last deformation. Later commands do not affect the copy.
+    /// Starts copying attributes of the last deformation. Later commands do not affect the copy.
     pub(in crate::engine) fn read_vertices(
         &self,
         id: SceneId,
-        wanted: VertexAttributes,
-    ) -> PendingReply<TimedVertices> {
-        self.submit(|reply| Command::ReadVertices { id, wanted, reply })
+        attributes: VertexAttributes,
+    ) -> PendingReply<CopiedVertices> {
+        self.submit(|reply| Command::ReadVertices { id, attributes, reply })
     }
 
-    /// Waits for queue capacity, so that a scene never remains on the device because the queue was full.
+    /// Unloads a scene. Waits for queue capacity, so that a full queue never leaves a scene on the device.
     pub(in crate::engine) async fn unload_scene(&self, id: SceneId) -> Result<()> {
         let (reply, answer) = oneshot::channel();
-        self.commands.send(Command::UnloadScene { id, reply }).await.map_err(|_| no_answer())?;
-        answer.await.map_err(|_| no_answer())?
+        self.commands.send(Command::UnloadScene { id, reply }).await.map_err(|_| no_answer_error())?;
+        answer.await.map_err(|_| no_answer_error())?
     }
 
     /// Ends the thread after the commands already queued. Blocks until the queue has capacity, so it must not be called
@@ -149,17 +150,17 @@ impl DeviceHandle {
         self.commands.blocking_send(Command::Quit).ok();
     }
 
-    async fn call<T>(&self, make: impl FnOnce(Reply<T>) -> Command) -> Result<T> {
-        self.submit(make).wait().await
+    async fn call<T>(&self, create_command: impl FnOnce(Reply<T>) -> Command) -> Result<T> {
+        self.submit(create_command).wait().await
     }
 
     /// Sends a command; the caller awaits the answer later.
-    fn submit<T>(&self, make: impl FnOnce(Reply<T>) -> Command) -> PendingReply<T> {
+    fn submit<T>(&self, create_command: impl FnOnce(Reply<T>) -> Command) -> PendingReply<T> {
         let (reply, answer) = oneshot::channel();
-        PendingReply(match self.commands.try_send(make(reply)) {
+        PendingReply(match self.commands.try_send(create_command(reply)) {
             Ok(()) => Ok(answer),
-            Err(TrySendError::Full(_)) => Err(Error::Busy { queue: "device", limit: self.limit }),
-            Err(TrySendError::Closed(_)) => Err(no_answer()),
+            Err(TrySendError::Full(_)) => Err(Error::Busy { queue: "device", limit: self.capacity }),
+            Err(TrySendError::Closed(_)) => Err(no_answer_error()),
         })
     }
 }
@@ -173,16 +174,16 @@ impl<T> PendingReply<T> {
         self.recv().await
     }
 
-    /// As [`Self::wait`], but cancel-safe. Must not be called again after it has returned.
+    /// [`Self::wait`], but cancel-safe. Must not be called again after it has returned.
     pub(in crate::engine) async fn recv(&mut self) -> Result<T> {
         match &mut self.0 {
-            Ok(answer) => answer.await.map_err(|_| no_answer())?,
+            Ok(answer) => answer.await.map_err(|_| no_answer_error())?,
             Err(error) => Err(error.clone()),
         }
     }
 }
 
 /// The error for a dropped reply channel.
-fn no_answer() -> Error {
+fn no_answer_error() -> Error {
     fault_in("device")("the command panicked or the device thread has ended")
 }

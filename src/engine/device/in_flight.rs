@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::command::Reply;
 
-/// Work on the device whose completion can be polled.
+/// Device work whose completion can be polled.
 pub(super) trait Pollable {
     /// Waits at most `limit`. Returns whether the result can then be collected without waiting.
     fn is_ready_within(&self, limit: Duration) -> bool;
@@ -43,7 +43,7 @@ impl<P, T> InFlightQueue<P, T> {
 
     /// Adds the newest readback. The queue must not be full.
     pub(super) fn push(&mut self, pending: P, reply: Reply<T>) {
-        debug_assert!(!self.is_full(), "the oldest readback is collected first");
+        debug_assert!(!self.is_full(), "expected capacity for a readback");
         self.entries.push_back(InFlight { pending, reply });
     }
 
@@ -79,13 +79,13 @@ mod tests {
 
     use super::*;
 
-    enum Fake {
+    enum FakeReadback {
         Ready,
         Busy,
         Panics,
     }
 
-    impl Pollable for Fake {
+    impl Pollable for FakeReadback {
         fn is_ready_within(&self, _: Duration) -> bool {
             match self {
                 Self::Ready => true,
@@ -96,10 +96,10 @@ mod tests {
     }
 
     #[test]
-    fn panicking_poll_costs_only_the_polled_readback() {
-        let mut queue = InFlightQueue::<Fake, u32>::new(3);
+    fn panicking_poll_drops_only_the_polled_readback() {
+        let mut queue = InFlightQueue::<FakeReadback, u32>::new(3);
         let mut answers = Vec::new();
-        for pending in [Fake::Panics, Fake::Ready, Fake::Busy] {
+        for pending in [FakeReadback::Panics, FakeReadback::Ready, FakeReadback::Busy] {
             let (reply, answer) = oneshot::channel();
             queue.push(pending, reply);
             answers.push(answer);
@@ -107,13 +107,13 @@ mod tests {
         assert!(queue.is_full());
         assert!(!queue.is_oldest_ready(Duration::ZERO));
         assert_eq!(queue.len(), 2);
-        answers[0].try_recv().expect_err("its reply is dropped");
-        assert!(queue.is_oldest_ready(Duration::ZERO), "the next one is polled");
-        let ready = queue.pop_oldest().expect("the second");
-        ready.reply.send(Ok(7)).expect("its caller waits");
+        answers[0].try_recv().expect_err("expected a dropped reply channel");
+        assert!(queue.is_oldest_ready(Duration::ZERO), "expected the second readback to be ready");
+        let ready_readback = queue.pop_oldest().expect("expected the second readback");
+        ready_readback.reply.send(Ok(7)).expect("expected a caller that waits");
         assert_eq!(answers[1].try_recv(), Ok(Ok(7)));
         assert!(!queue.is_oldest_ready(Duration::ZERO));
-        assert_eq!(queue.len(), 1, "a readback that is not ready stays");
+        assert_eq!(queue.len(), 1, "expected the busy readback to remain");
         assert!(matches!(answers[2].try_recv(), Err(oneshot::error::TryRecvError::Empty)));
     }
 }

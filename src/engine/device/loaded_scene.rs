@@ -24,17 +24,18 @@ const BENCHMARK_SIZE: FrameSize = FrameSize::new(1920, 1080);
 #[derive(Debug, Clone, Copy)]
 pub(in crate::engine) struct BufferContents {
     bounds: BoundingBox,
-    /// `None` in a camera-relative frame, because the deformer computed them relative to the floating origins of the domains.
-    light: Option<OrientedBounds>,
-    /// Whether vertices were uploaded.
-    pub(in crate::engine) uploaded: bool,
+    /// Bounds of the vertices in light space. `None` in a camera-relative frame, because the deformer computed them
+    /// relative to the domains' floating origins.
+    light_bounds: Option<OrientedBounds>,
+    /// Whether filling the buffers included an upload of vertices.
+    pub(in crate::engine) is_uploaded: bool,
 }
 
 impl BufferContents {
     /// The parameters of a frame of these buffers.
     pub(in crate::engine) const fn frame_params(&self, camera: Camera, size: FrameSize) -> FrameParams {
         let FrameSize { width, height } = size;
-        FrameParams { camera, width, height, bounds: self.bounds, light: self.light }
+        FrameParams { camera, width, height, bounds: self.bounds, light: self.light_bounds }
     }
 }
 
@@ -44,10 +45,10 @@ pub struct LoadedScene {
     deformer: Box<dyn Deformer>,
     buffers: Option<SceneBuffers>,
     /// Whether the buffers hold the vertices of the last deformation.
-    filled: bool,
+    has_current_vertices: bool,
     bounds: BoundingBox,
-    /// Bounds of the same vertices in light space; only if the scene has a shadow.
-    light: Option<OrientedBounds>,
+    /// Bounds of the same vertices in light space. `None` if the scene has no shadow.
+    light_bounds: Option<OrientedBounds>,
     /// The state that the deformer's output shows.
     current_state: Arc<SceneState>,
     /// Number of deformations, including rejected states and the deformations that undo them, since each one changes
@@ -58,7 +59,7 @@ pub struct LoadedScene {
 }
 
 impl LoadedScene {
-    /// A scene without output. [`Self::rest`] must be called before any other method.
+    /// A scene whose vertices are not computed yet. [`Self::deform_rest`] must be called before any other method.
     pub(in crate::engine) fn new(
         scene: &Arc<Scene>,
         deformer: Box<dyn Deformer>,
@@ -69,9 +70,9 @@ impl LoadedScene {
             scene: Arc::clone(scene),
             deformer,
             buffers,
-            filled: false,
+            has_current_vertices: false,
             bounds: scene.rest_bounds,
-            light: None,
+            light_bounds: None,
             current_state,
             generation: 0,
             cached_color_map: None,
@@ -79,12 +80,16 @@ impl LoadedScene {
     }
 
     /// Deforms the rest state.
-    pub(in crate::engine) fn rest(&mut self) -> Result<()> {
+    ///
+    /// # Errors
+    /// `Invalid` when the rest state overflows; `Fault` of the device.
+    pub(in crate::engine) fn deform_rest(&mut self) -> Result<()> {
         let deformed = self.run(&Arc::clone(&self.current_state))?;
         if !is_in_range(&deformed.bounds) {
-            return Err(invalid("scene.rest", "finite vertices", format!("{:?}", deformed.bounds)));
+            let expected = format!("vertices within {MAX_COORDINATE:e}");
+            return Err(invalid("scene.rest", expected, format!("{:?}", deformed.bounds)));
         }
-        (self.bounds, self.light) = (deformed.bounds, deformed.oriented_bounds);
+        (self.bounds, self.light_bounds) = (deformed.bounds, deformed.oriented_bounds);
         Ok(())
     }
 
@@ -98,8 +103,8 @@ impl LoadedScene {
         self.bounds
     }
 
-    /// Deforms the scene to a state. If a vertex is not finite or beyond 1e18 units, the state is rejected and the
-    /// previous state is deformed again, so that no reader sees the rejected one.
+    /// Deforms the scene to a state. Rejects the state if a vertex is not finite or beyond 1e18 units. The previous
+    /// state is then deformed again, so that no reader sees the rejected one.
     ///
     /// # Errors
     /// `Invalid` naming the domain whose vertices overflow; `Fault` of the device.
@@ -109,21 +114,21 @@ impl LoadedScene {
 
     /// [`Self::deform`] of a shared state, without a copy.
     pub(in crate::engine) fn deform_shared(&mut self, state: &Arc<SceneState>) -> Result<DeformSummary> {
-        self.filled = false;
-        let attempt = catch_unwind(AssertUnwindSafe(|| self.run(state)));
-        if !matches!(attempt, Ok(Ok(_) | Err(Error::DeviceLost { .. }))) {
-            // The output may be partially written, so restore it. If that fails too, the first error says more.
+        self.has_current_vertices = false;
+        let result = catch_unwind(AssertUnwindSafe(|| self.run(state)));
+        if !matches!(result, Ok(Ok(_) | Err(Error::DeviceLost { .. }))) {
+            // The output may be partially written, so restore it. If that fails too, the first error is more specific.
             self.run(&Arc::clone(&self.current_state)).ok();
         }
-        let deformed = attempt.unwrap_or_else(|panic| resume_unwind(panic))?;
+        let deformed = result.unwrap_or_else(|panic| resume_unwind(panic))?;
         if is_in_range(&deformed.bounds) {
-            (self.bounds, self.light) = (deformed.bounds, deformed.oriented_bounds);
+            (self.bounds, self.light_bounds) = (deformed.bounds, deformed.oriented_bounds);
             self.current_state = Arc::clone(state);
             return Ok(deformed);
         }
-        let refusal = self.overflow_error(state);
+        let overflow_error = self.overflow_error(state);
         self.run(&Arc::clone(&self.current_state))?;
-        Err(refusal.unwrap_or_else(|error| error))
+        Err(overflow_error.unwrap_or_else(|error| error))
     }
 
     fn run(&mut self, state: &SceneState) -> Result<DeformSummary> {
@@ -139,35 +144,34 @@ impl LoadedScene {
         self.deformer.surface()
     }
 
-    /// Creates the buffers on first use and fills them with the last deformation. If the domains have different floating origins,
-    /// the positions are rebased to the floating origin nearest the camera.
+    /// Creates the buffers on first use and fills them with the last deformation. If the domains have different
+    /// origins, the positions are made relative to the origin nearest the camera.
     pub(in crate::engine) fn fill_buffers(
         &mut self,
         renderer: &mut Renderer,
         camera: &Camera,
     ) -> Result<BufferContents> {
-        let uploaded = self.fill_shared(renderer)?;
-        let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
-        let rebased = match &self.current_state.origins {
+        let is_uploaded = self.fill_without_rebase(renderer)?;
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
+        let origins = match &self.current_state.origins {
             Some(origins) if !origins.is_uniform() => Arc::clone(origins),
-            // All domains share one origin, so the deformer's output is drawn unchanged.
+            // All domains have the same origin, so the deformer's output is drawn unchanged.
             origins => {
                 buffers.set_origin(origins.as_ref().map_or([0.0; 3], |origins| origins.shared_origin()));
                 buffers.set_step(self.generation);
-                return Ok(BufferContents { bounds: self.bounds, light: self.light, uploaded });
+                return Ok(BufferContents { bounds: self.bounds, light_bounds: self.light_bounds, is_uploaded });
             }
         };
-        let view = snap_to_origin_grid(camera.eye().into());
+        let camera_origin = snap_to_origin_grid(camera.eye().into());
         let positions = &self.deformer.read(VertexAttributes::VERTICES)?.positions;
-        let (positions, bounds) = rebased.rebase_positions(view, &self.scene, positions);
-        renderer.upload_rebased(buffers, &positions, view)?;
-        Ok(BufferContents { bounds, light: None, uploaded: true })
+        let (positions, bounds) = origins.rebase_positions(camera_origin, &self.scene, positions);
+        renderer.upload_rebased(buffers, &positions, camera_origin)?;
+        Ok(BufferContents { bounds, light_bounds: None, is_uploaded: true })
     }
 
-    /// Starts copying the wanted attributes of the last deformation to host memory. The copy overlaps with the next
-    /// deformation.
-    pub(in crate::engine) fn readback(&mut self, wanted: VertexAttributes) -> Result<VertexReadback> {
-        self.deformer.readback(wanted)
+    /// Starts copying attributes of the last deformation to host memory. The copy overlaps with the next deformation.
+    pub(in crate::engine) fn readback(&mut self, attributes: VertexAttributes) -> Result<VertexReadback> {
+        self.deformer.readback(attributes)
     }
 
     /// Waits until the copy is complete.
@@ -175,16 +179,19 @@ impl LoadedScene {
         self.deformer.wait_readback(readback)
     }
 
-    /// Uploads the values of a color map into the buffers, which must be filled, and returns the legend; `None` if
-    /// `frame_output` is not a color map. A mode shape does not depend on the state, so it is not recomputed while its
-    /// values are in the buffers.
+    /// Uploads the values of a color map into the buffers, which must be filled, and returns the legend. Returns `None`
+    /// if `frame_output` is not a color map. A mode shape does not depend on the state, so it is not recomputed while
+    /// its values are in the buffers.
     pub(in crate::engine) fn upload_scalar_field(
         &mut self,
         renderer: &mut Renderer,
         frame_output: FrameOutput,
     ) -> Result<Option<Legend>> {
-        let fixed = matches!(frame_output, FrameOutput::ModeShape { .. });
-        if let Some((_, legend)) = self.cached_color_map.as_ref().filter(|(held, _)| fixed && *held == frame_output) {
+        let is_state_independent = matches!(frame_output, FrameOutput::ModeShape { .. });
+        if let Some((cached_output, legend)) = &self.cached_color_map
+            && is_state_independent
+            && *cached_output == frame_output
+        {
             return Ok(Some(legend.clone()));
         }
         let scalar_field = match frame_output {
@@ -197,61 +204,62 @@ impl LoadedScene {
             FrameOutput::Color | FrameOutput::Depth | FrameOutput::Domains | FrameOutput::Normals => return Ok(None),
         };
         let legend = scalar_field::fit_legend(&self.scene, frame_output, &scalar_field);
-        let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
         self.cached_color_map = None;
         renderer.upload_vertex_values(buffers, &scalar_field)?;
         self.cached_color_map = Some((frame_output, legend.clone()));
         Ok(Some(legend))
     }
 
-    /// Creates the buffers on first use and uploads the vertices unless the deformer writes the buffers itself. Returns
-    /// whether vertices were uploaded.
-    fn fill_shared(&mut self, renderer: &mut Renderer) -> Result<bool> {
-        let shares = self.deformer.shares_buffers();
+    /// Creates the buffers on first use and uploads the vertices unless the deformer writes the buffers itself. Does
+    /// not rebase positions. Returns whether vertices were uploaded.
+    fn fill_without_rebase(&mut self, renderer: &mut Renderer) -> Result<bool> {
+        let writes_buffers_itself = self.deformer.shares_buffers();
         let buffers = match self.buffers.take() {
             Some(buffers) => buffers,
             None => renderer.load(&self.scene)?,
         };
         let buffers = self.buffers.insert(buffers);
-        if self.filled || shares {
+        if self.has_current_vertices || writes_buffers_itself {
             return Ok(false);
         }
         renderer.upload(buffers, self.deformer.read(VertexAttributes::VERTICES)?)?;
-        self.filled = true;
+        self.has_current_vertices = true;
         Ok(true)
     }
 
-    /// Adds a compute rasterizer to the scene's buffers, next to OpenGL.
+    /// Attaches a compute rasterizer to the scene's buffers. OpenGL draws the passes that it does not support.
     pub(in crate::engine) fn attach_rasterizer(
         &mut self,
         renderer: &mut Renderer,
-        make: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
+        create_rasterizer: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
     ) -> Result<()> {
-        self.fill_shared(renderer)?;
-        let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
-        renderer.attach_rasterizer(buffers, make)
+        self.fill_without_rebase(renderer)?;
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
+        renderer.attach_rasterizer(buffers, create_rasterizer)
     }
 
-    /// Measures both rasterizers on frames of [`BENCHMARK_SIZE`] of the current state and selects the faster one per
-    /// pass.
+    /// Measures both rasterizers with frames of [`BENCHMARK_SIZE`] of the current state and selects the faster one for
+    /// each pass.
     pub(in crate::engine) fn select_raster_backends(&mut self, renderer: &mut Renderer) -> Result<()> {
         let camera = Camera::fit_to_scene(&self.scene, BENCHMARK_SIZE.width, BENCHMARK_SIZE.height);
-        let filled = self.fill_buffers(renderer, &camera)?;
-        let Some(buffers) = &mut self.buffers else { return Err(no_buffers()) };
-        renderer.select_raster_backends(buffers, &filled.frame_params(camera, BENCHMARK_SIZE)).map(drop)
+        let contents = self.fill_buffers(renderer, &camera)?;
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
+        renderer.select_raster_backends(buffers, &contents.frame_params(camera, BENCHMARK_SIZE)).map(drop)
     }
 
     pub(in crate::engine) fn buffers(&self) -> Result<&SceneBuffers> {
-        self.buffers.as_ref().ok_or_else(no_buffers)
+        self.buffers.as_ref().ok_or_else(no_buffers_error)
     }
 
-    /// Drops the deformer first, because it may have the buffers registered with CUDA.
+    /// Drops the deformer and returns the buffers. CUDA may have registered the buffers for the deformer, so the
+    /// deformer must not outlive them.
     pub(in crate::engine) fn into_buffers(self) -> Option<SceneBuffers> {
         drop(self.deformer);
         self.buffers
     }
 
-    /// The error that names the domain of the first vertex out of range.
+    /// Creates the error that names the domain of the first vertex out of range.
     fn overflow_error(&mut self, state: &SceneState) -> Result<Error> {
         let scene = Arc::clone(&self.scene);
         let surface = self.deformer.read(VertexAttributes {
@@ -259,19 +267,20 @@ impl LoadedScene {
             displacements: true,
             ..VertexAttributes::default()
         })?;
-        let is_far = |number: &f32| number.is_nan() || f64::from(*number).abs() > MAX_COORDINATE;
-        let far = surface.positions.iter().position(is_far);
+        let is_out_of_range = |number: &f32| number.is_nan() || f64::from(*number).abs() > MAX_COORDINATE;
+        let position_index = surface.positions.iter().position(is_out_of_range);
         // A displacement may be out of range although its position is not.
-        let at = far.or_else(|| surface.displacements.iter().position(|number| !number.is_finite())).unwrap_or(0);
-        let domain = scene.layout.domains.partition_point(|slot| slot.first_vertex <= at / 3).saturating_sub(1);
-        let largest = state.q_of(&scene, domain).iter().fold(0.0_f32, |most, amount| most.max(amount.abs()));
-        let given = format!("vertex {} out of range, largest |q| {largest:e}", at / 3);
+        let displacement_index = || surface.displacements.iter().position(|number| !number.is_finite());
+        let vertex = position_index.or_else(displacement_index).unwrap_or(0) / 3;
+        let domain = scene.layout.domains.partition_point(|slot| slot.first_vertex <= vertex).saturating_sub(1);
+        let max_q = state.q_of(&scene, domain).iter().fold(0.0_f32, |max, q| max.max(q.abs()));
+        let given = format!("vertex {vertex} out of range, largest |q| {max_q:e}");
         let field = format!("step.q of domain '{}'", scene.domains[domain].name);
         Ok(invalid(field, format!("q and transform that keep every vertex within {MAX_COORDINATE:e}"), given))
     }
 }
 
-fn no_buffers() -> Error {
+fn no_buffers_error() -> Error {
     fault_in("draw")("the scene has no buffers")
 }
 
@@ -285,33 +294,33 @@ mod tests {
     use crate::engine::testing;
     use modalcast_compute::reference::ReferenceDeformer;
 
-    fn loaded_scene() -> LoadedScene {
+    fn load_at_rest() -> LoadedScene {
         let scene = testing::two_strips();
         let deformer = Box::new(ReferenceDeformer::new(&scene).with_bounding_axes(scene.light_axes()));
         let mut loaded_scene = LoadedScene::new(&scene, deformer, None);
-        loaded_scene.rest().expect("a scene at rest");
+        loaded_scene.deform_rest().expect("expected a valid rest state");
         loaded_scene
     }
 
     #[test]
-    fn an_overflowing_step_is_refused_by_name_and_the_previous_vertices_stay() {
-        let mut loaded_scene = loaded_scene();
+    fn overflowing_state_is_rejected_and_vertices_are_restored() {
+        let mut loaded_scene = load_at_rest();
         let scene = Arc::clone(loaded_scene.scene());
-        let mut good = SceneState::rest(&scene);
-        good.q[0] = 0.25;
-        loaded_scene.deform(&good).expect("a good step");
-        let before = loaded_scene.surface().expect("vertices").clone();
-        let light = loaded_scene.light;
-        assert!(light.is_some_and(|light| light.is_valid()));
-        let last = scene.layout.domains[1].first_q;
-        for amount in [f32::MAX, 1e30] {
-            let mut bad = good.clone();
-            bad.q[last] = amount;
-            let refusal = loaded_scene.deform(&bad).expect_err("overflows").to_string();
-            assert!(refusal.starts_with("step.q of domain 'right'"), "{refusal}");
-            assert_eq!(loaded_scene.surface().expect("vertices"), &before);
-            assert!(loaded_scene.bounds().is_finite() && loaded_scene.light == light);
+        let mut valid_state = SceneState::rest(&scene);
+        valid_state.q[0] = 0.25;
+        loaded_scene.deform(&valid_state).expect("expected a valid state");
+        let expected_surface = loaded_scene.surface().expect("expected vertices").clone();
+        assert_ne!(expected_surface, DeformedSurface::default());
+        let expected_bounds = loaded_scene.light_bounds;
+        assert!(expected_bounds.is_some_and(|bounds| bounds.is_valid()));
+        let first_q_of_right_strip = scene.layout.domains[1].first_q;
+        for q in [f32::MAX, 1e30] {
+            let mut overflowing_state = valid_state.clone();
+            overflowing_state.q[first_q_of_right_strip] = q;
+            let error = loaded_scene.deform(&overflowing_state).expect_err("expected an overflow").to_string();
+            assert!(error.starts_with("step.q of domain 'right'"), "expected the right strip, got {error}");
+            assert_eq!(loaded_scene.surface().expect("expected vertices"), &expected_surface);
+            assert!(loaded_scene.bounds().is_finite() && loaded_scene.light_bounds == expected_bounds);
         }
-        assert_ne!(before, DeformedSurface::default());
     }
 }

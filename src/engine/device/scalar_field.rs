@@ -18,56 +18,56 @@ const MIN_DISPLACEMENT_SCALE: f64 = 1e-5;
 /// # Errors
 /// `Invalid` when every domain has fewer modes.
 pub fn validate_mode(scene: &Scene, mode: u32) -> Result<u32> {
-    let most = scene.layout.domains.iter().map(|slot| slot.rank).max().unwrap_or(0);
-    match (mode as usize) < most {
+    let max_rank = scene.layout.domains.iter().map(|domain| domain.rank).max().unwrap_or(0);
+    match (mode as usize) < max_rank {
         true => Ok(mode),
-        false => Err(invalid("picture.mode", format!("an index below {most}"), mode)),
+        false => Err(invalid("picture.mode", format!("an index below {max_rank}"), mode)),
     }
 }
 
-/// |u| of every vertex in meters: the distance of its deformed position from T x0, its position in the rigid domain.
+/// |u| of every vertex in meters: the distance of its deformed position from T x0, the position that it has if the
+/// domain is rigid.
 ///
-/// The error is that of the deformer's positions, because T x0 and the difference are computed in f64. The positions
-/// are f32 relative to the domain's floating origin, so a vertex one kilometer from it has an error of up to 0.1
-/// mm.
+/// T x0 and the difference are computed in f64, so the error is that of the deformer's positions. Those are f32
+/// relative to the domain's floating origin: one kilometer from it the error is up to 0.1 mm.
 pub(in crate::engine) fn displacement_magnitudes(
     scene: &Scene,
     state: &SceneState,
     surface: &DeformedSurface,
 ) -> Vec<f32> {
     let domains = scene.domains.par_iter().zip(&scene.layout.domains).enumerate();
-    let of_domain = domains.flat_map_iter(|(index, (domain, slot))| {
-        let placed = state.composed_transform(scene, index);
-        let (linear, entries) = (placed.linear(), placed.to_f64());
+    let magnitudes = domains.flat_map_iter(|(index, (domain, slot))| {
+        let world_from_domain = state.composed_transform(scene, index);
+        let (linear, entries) = (world_from_domain.linear(), world_from_domain.to_f64());
         let translation = Vector3::new(entries[3], entries[7], entries[11]);
-        let deformed = surface.positions[3 * slot.first_vertex..][..3 * slot.vertices].chunks_exact(3);
-        scene.shapes[domain.shape].mesh.rest_positions().iter().zip(deformed).map(move |(rest, deformed)| {
-            let deformed = Vector3::from_fn(|axis, _| f64::from(deformed[axis]));
-            let moved = deformed - linear * Vector3::from(*rest).cast::<f64>() - translation;
-            (scene.unit * moved.norm()) as f32
+        let deformed_positions = surface.positions[3 * slot.first_vertex..][..3 * slot.vertices].chunks_exact(3);
+        scene.shapes[domain.shape].mesh.rest_positions().iter().zip(deformed_positions).map(move |(x0, deformed_position)| {
+            let x = Vector3::from_fn(|axis, _| f64::from(deformed_position[axis]));
+            let displacement = x - linear * Vector3::from(*x0).cast::<f64>() - translation;
+            (scene.unit * displacement.norm()) as f32
         })
     });
-    of_domain.collect()
+    magnitudes.collect()
 }
 
-/// The norm of every vertex's three entries of one column of U, times the scene's unit: the displacement in meters per
-/// unit of the coordinate, before T. Zero in domains without the mode.
+/// The displacement of every vertex in meters per unit of the coordinate, before T: the norm of the vertex's three
+/// entries in one column of U, times the scene's unit. Zero in domains without the mode.
 pub(in crate::engine) fn mode_shape_magnitudes(scene: &Scene, mode: usize) -> Vec<f32> {
-    let of_domain = scene.domains.par_iter().zip(&scene.layout.domains).flat_map_iter(|(domain, slot)| {
+    let magnitudes = scene.domains.par_iter().zip(&scene.layout.domains).flat_map_iter(|(domain, slot)| {
         let modes = &scene.shapes[domain.shape].modes;
         let column = if mode < modes.rank() { modes.column(mode) } else { &[] };
-        let length = |row: &[f32]| Vector3::from_column_slice(row).cast::<f64>().norm();
-        let lengths = column.chunks_exact(3).map(move |row| (scene.unit * length(row)) as f32);
-        lengths.chain(std::iter::repeat(0.0)).take(slot.vertices)
+        let norm = |row: &[f32]| Vector3::from_column_slice(row).cast::<f64>().norm();
+        let norms = column.chunks_exact(3).map(move |row| (scene.unit * norm(row)) as f32);
+        norms.chain(std::iter::repeat(0.0)).take(slot.vertices)
     });
-    of_domain.collect()
+    magnitudes.collect()
 }
 
-/// The legend of a color map of these values. The end of the scale is that of `frame_output`, or is fitted to the largest
-/// value if that is 0.
+/// The legend of a color map of these values. The scale ends at the value in `frame_output`. If that is 0, the scale is
+/// fitted to the largest value.
 pub(in crate::engine) fn fit_legend(scene: &Scene, frame_output: FrameOutput, values: &[f32]) -> Legend {
-    let most = f64::from(values.iter().copied().fold(0.0, f32::max));
-    let (title, asked, least) = match frame_output {
+    let max_value = f64::from(values.iter().copied().fold(0.0, f32::max));
+    let (title, requested_scale, min_scale) = match frame_output {
         FrameOutput::ModeShape { mode, largest } => (format!("shape of mode {mode}, m per unit of q"), largest, 1e-30),
         FrameOutput::Displacement { largest } => (
             "displacement |u|, m".to_owned(),
@@ -76,7 +76,7 @@ pub(in crate::engine) fn fit_legend(scene: &Scene, frame_output: FrameOutput, va
         ),
         _ => (String::new(), 0.0, 1e-30),
     };
-    let largest = if asked > 0.0 { asked } else { nice_ceiling(most.max(least)) };
+    let largest = if requested_scale > 0.0 { requested_scale } else { nice_ceiling(max_value.max(min_scale)) };
     Legend { title, scale_max: largest.clamp(1e-30, 1e30) }
 }
 
@@ -86,37 +86,49 @@ mod tests {
     use crate::engine::testing;
     use modalcast_compute::reference;
 
+    /// The second strip is placed by a rotation and a scale of 2 and is deformed by its first mode.
     #[test]
-    fn displacements_are_those_of_u_whatever_the_placement_and_shapes_are_lengths_of_rows() {
+    fn displacements_and_mode_shapes_have_the_norms_of_u() {
         let scene = testing::two_strips();
         let mut state = SceneState::rest(&scene);
-        let turn = nalgebra::Rotation3::from_euler_angles(0.4, 1.0, -0.3).into_inner();
+        let rotation = nalgebra::Rotation3::from_euler_angles(0.4, 1.0, -0.3).into_inner();
         state.transforms[1] =
-            modalcast_model::domain::Transform::from_parts(&(2.0 * turn), &Vector3::new(5.0, -3.0, 1.0));
+            modalcast_model::domain::Transform::from_parts(&(2.0 * rotation), &Vector3::new(5.0, -3.0, 1.0));
         state.q[scene.layout.domains[1].first_q] = 0.75;
         let positions = reference::deform(&scene, &state).into_flattened();
         let surface =
             DeformedSurface { positions: positions.iter().map(|x| *x as f32).collect(), ..DeformedSurface::default() };
-        let (moved, shape) = (displacement_magnitudes(&scene, &state, &surface), mode_shape_magnitudes(&scene, 0));
+        let displacements = displacement_magnitudes(&scene, &state, &surface);
+        let mode_shape = mode_shape_magnitudes(&scene, 0);
         let modes = &scene.shapes[0].modes;
-        let mut largest = 0.0_f32;
+        let mut max_displacement = 0.0_f32;
         for vertex in 0..4 {
             let row = Vector3::from_fn(|axis, _| modes.entry(vertex, axis, 0));
-            assert!((shape[vertex] - row.norm()).abs() < 1e-6 && shape[4 + vertex] == shape[vertex]);
-            assert!(moved[vertex] < 1e-6, "the first strip rests: {moved:?}");
-            assert!((moved[4 + vertex] - 2.0 * 0.75 * row.norm()).abs() < 2e-6, "{moved:?}");
-            largest = largest.max(moved[4 + vertex]);
+            let vertex_of_second = 4 + vertex;
+            assert!((mode_shape[vertex] - row.norm()).abs() < 1e-6);
+            assert_eq!(mode_shape[vertex_of_second], mode_shape[vertex]);
+            assert!(displacements[vertex] < 1e-6, "expected the first strip at rest, got {displacements:?}");
+            let expected = 2.0 * 0.75 * row.norm();
+            let displacement = displacements[vertex_of_second];
+            assert!((displacement - expected).abs() < 2e-6, "expected {expected}, got {displacement}");
+            max_displacement = max_displacement.max(displacement);
         }
-        assert!(largest > 0.5, "control: something moves");
-        let fitted = fit_legend(&scene, FrameOutput::Displacement { largest: 0.0 }, &moved).scale_max;
-        assert!(fitted >= f64::from(largest) && fitted <= 2.5 * f64::from(largest));
-        assert_eq!(fit_legend(&scene, FrameOutput::Displacement { largest: 3.0 }, &moved).scale_max, 3.0);
-        assert!(
-            fit_legend(&scene, FrameOutput::Displacement { largest: 0.0 }, &[1e-9]).scale_max > 1e-6,
-            "rounding is no motion"
-        );
-        validate_mode(&scene, 1).expect("two modes");
-        validate_mode(&scene, 2).expect_err("no third");
-        assert!(mode_shape_magnitudes(&scene, 7).iter().all(|length| *length == 0.0));
+        assert!(max_displacement > 0.5, "control: expected a displacement, got {max_displacement}");
+        let scale_max = |scale_max: f64, displacements: &[f32]| {
+            fit_legend(&scene, FrameOutput::Displacement { largest: scale_max }, displacements).scale_max
+        };
+        let fitted_max = scale_max(0.0, &displacements);
+        assert!(fitted_max >= f64::from(max_displacement) && fitted_max <= 2.5 * f64::from(max_displacement));
+        assert_eq!(scale_max(3.0, &displacements), 3.0);
+        let max_of_rounding_errors = scale_max(0.0, &[1e-9]);
+        assert!(max_of_rounding_errors > 1e-6, "expected the lower bound, got {max_of_rounding_errors}");
+        assert!(mode_shape_magnitudes(&scene, 7).iter().all(|norm| *norm == 0.0));
+    }
+
+    #[test]
+    fn mode_beyond_the_largest_rank_is_rejected() {
+        let scene = testing::two_strips();
+        validate_mode(&scene, 1).expect("expected the second of two modes to be valid");
+        validate_mode(&scene, 2).expect_err("expected an error for a third mode");
     }
 }

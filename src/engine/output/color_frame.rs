@@ -5,7 +5,7 @@ use tokio::sync::OnceCell;
 
 use modalcast_render::{FrameImage, RasterBackends};
 
-/// Color pixels of one step, shared by all subscribers with the same view. The PNG is encoded once, on first use.
+/// Color pixels of one step. All subscribers with the same view share them. The PNG is encoded once, on first use.
 #[derive(Debug)]
 pub struct ColorFrame {
     pub width: u32,

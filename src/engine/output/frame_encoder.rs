@@ -44,7 +44,8 @@ pub struct EncodedOutput {
 /// Encodes frames off the device thread. Clones share one limit on threads.
 #[derive(Debug, Clone)]
 pub struct FrameEncoder {
-    threads: Arc<Semaphore>,
+    /// One permit per thread that may encode.
+    thread_permits: Arc<Semaphore>,
     cores: usize,
 }
 
@@ -55,10 +56,10 @@ impl FrameEncoder {
     }
 
     fn new(cores: usize) -> Self {
-        Self { threads: Arc::new(Semaphore::new(cores)), cores }
+        Self { thread_permits: Arc::new(Semaphore::new(cores)), cores }
     }
 
-    /// Number of frames that are encoded concurrently.
+    /// Maximum number of frames that are encoded concurrently.
     pub(in crate::engine) const fn cores(&self) -> usize {
         self.cores
     }
@@ -66,7 +67,7 @@ impl FrameEncoder {
     /// Encodes a color frame or an AOV.
     ///
     /// # Errors
-    /// `Fault` when the PNG encoder fails, or when `output` is not a picture.
+    /// `Fault` when the PNG encoder fails, or when `output` is neither a color frame nor an AOV.
     pub async fn encode(&self, output: StepOutput, format: FrameFormat) -> Result<EncodedOutput> {
         let mut stages = output.stages;
         let mut raster_backends = RasterBackends::default();
@@ -74,35 +75,37 @@ impl FrameEncoder {
             OutputBody::Frame(frame) => {
                 raster_backends = frame.raster_backends;
                 match format {
-                    FrameFormat::Png => self.png(&frame).await.map(|(bytes, ms)| (bytes, Some(ms)))?,
+                    FrameFormat::Png => self.encode_png_once(&frame).await.map(|(bytes, ms)| (bytes, Some(ms)))?,
                     _ => (frame.rgba.clone(), None),
                 }
             }
             OutputBody::Aov(image, Some(legend)) => {
-                let map = move || color_map(&image, &legend, format);
-                self.run(map).await.map(|(bytes, ms)| (bytes, Some(ms)))?
+                let encode_map = move || encode_color_map(&image, &legend, format);
+                self.run(encode_map).await.map(|(bytes, ms)| (bytes, Some(ms)))?
             }
             OutputBody::Aov(image, None) => (image.bytes.into(), None),
-            OutputBody::Vertices(_) | OutputBody::Pick(_) => return Err(fault_in("encode")("it is not a picture")),
+            OutputBody::Vertices(_) | OutputBody::Pick(_) => {
+                return Err(fault_in("encode")("expected a frame, got vertices or a pick"));
+            }
         };
         stages.extend(ms.map(|ms| (Stage::Encode, ms)));
         Ok(EncodedOutput { step: output.step, skipped: output.skipped, stages, raster_backends, bytes })
     }
 
-    /// The PNG of a frame and the milliseconds that encoding took. The first caller encodes it; if that caller is
-    /// cancelled, the next one does.
-    async fn png(&self, frame: &Arc<ColorFrame>) -> Result<(Bytes, f64)> {
-        let encode = || {
+    /// Returns the PNG of a frame and the milliseconds that encoding took. The first caller encodes it. If that caller
+    /// is cancelled, the next one encodes it.
+    async fn encode_png_once(&self, frame: &Arc<ColorFrame>) -> Result<(Bytes, f64)> {
+        let encode_png = || {
             let frame = Arc::clone(frame);
             self.run(move || frame::encode_png(frame.width, frame.height, &frame.rgba))
         };
-        frame.png.get_or_try_init(encode).await.cloned()
+        frame.png.get_or_try_init(encode_png).await.cloned()
     }
 
     /// Runs work on a blocking thread as soon as the thread limit permits. Returns the bytes and the run time in
     /// milliseconds, without the wait.
     async fn run(&self, work: impl FnOnce() -> Result<Vec<u8>> + Send + 'static) -> Result<(Bytes, f64)> {
-        let permit = Arc::clone(&self.threads).acquire_owned().await.map_err(fault_in("encode"))?;
+        let permit = Arc::clone(&self.thread_permits).acquire_owned().await.map_err(fault_in("encode"))?;
         run_blocking("encode", move || {
             let _permit = permit;
             let begin = Instant::now();
@@ -112,7 +115,8 @@ impl FrameEncoder {
     }
 }
 
-fn color_map(image: &AovImage, legend: &Legend, format: FrameFormat) -> Result<Vec<u8>> {
+/// Draws a color map with its legend and encodes it.
+fn encode_color_map(image: &AovImage, legend: &Legend, format: FrameFormat) -> Result<Vec<u8>> {
     let size = [image.width, image.height];
     let rgba = frame::draw_color_map(&image.bytes, image.samples, size, legend)?;
     if format == FrameFormat::Png { frame::encode_png(size[0], size[1], &rgba) } else { Ok(rgba) }
@@ -123,8 +127,8 @@ pub(in crate::engine) mod tests {
     use super::*;
     use modalcast_render::FrameImage;
 
-    /// A frame of noise, so that its PNG takes time.
-    pub(in crate::engine) fn noise(number: u64, side: u32) -> StepOutput {
+    /// A frame of noise, so that encoding its PNG takes time. `number` is the step number and the seed.
+    pub(in crate::engine) fn noise_frame(number: u64, side: u32) -> StepOutput {
         let mut random = fastrand::Rng::with_seed(number);
         let rgba = (0..side * side).flat_map(|_| [random.u8(..), random.u8(..), random.u8(..), 255]).collect();
         let image = FrameImage {
@@ -138,41 +142,43 @@ pub(in crate::engine) mod tests {
         StepOutput { step, skipped: 0, stages: vec![], origins: None, body: OutputBody::Frame(Arc::new(image.into())) }
     }
 
-    /// An encoder without threads. It starts to work when the test adds permits to the semaphore.
-    pub(in crate::engine) fn paused(cores: usize) -> (FrameEncoder, Arc<Semaphore>) {
-        let encoder = FrameEncoder { threads: Arc::new(Semaphore::new(0)), cores };
-        let threads = Arc::clone(&encoder.threads);
-        (encoder, threads)
+    /// An encoder without thread permits. It encodes once the test adds permits to the semaphore.
+    pub(in crate::engine) fn paused_encoder(cores: usize) -> (FrameEncoder, Arc<Semaphore>) {
+        let thread_permits = Arc::new(Semaphore::new(0));
+        (FrameEncoder { thread_permits: Arc::clone(&thread_permits), cores }, thread_permits)
     }
 
     #[tokio::test]
     async fn subscribers_share_one_png_and_raw_pixels() {
         let encoder = FrameEncoder::new(2);
-        let output = noise(1, 16);
-        let both = async |format| {
-            let (one, other) = (encoder.encode(output.clone(), format), encoder.encode(output.clone(), format));
-            let (one, other) = tokio::join!(one, other);
-            (one.expect("encodes"), other.expect("encodes"))
+        let output = noise_frame(1, 16);
+        let encode_twice = async |format| {
+            let first = encoder.encode(output.clone(), format);
+            let second = encoder.encode(output.clone(), format);
+            let (first, second) = tokio::join!(first, second);
+            (first.expect("expected an encoded frame"), second.expect("expected an encoded frame"))
         };
         for format in [FrameFormat::Png, FrameFormat::Rgba] {
-            let (one, other) = both(format).await;
-            assert_eq!((one.bytes.as_ptr(), one.bytes.len()), (other.bytes.as_ptr(), other.bytes.len()), "{format:?}");
-            assert_eq!(one.stages, other.stages, "{format:?}");
+            let (first, second) = encode_twice(format).await;
+            assert_eq!(first.bytes.as_ptr(), second.bytes.as_ptr(), "{format:?}: expected shared bytes");
+            assert_eq!(first.bytes.len(), second.bytes.len(), "{format:?}");
+            assert_eq!(first.stages, second.stages, "{format:?}");
         }
-        let separate = encoder.encode(noise(1, 16), FrameFormat::Png).await.expect("encodes");
-        let (shared, _) = both(FrameFormat::Png).await;
-        assert_eq!(separate.bytes, shared.bytes);
-        assert_ne!(separate.bytes.as_ptr(), shared.bytes.as_ptr(), "control: another drawing has its own PNG");
+        let other_frame = encoder.encode(noise_frame(1, 16), FrameFormat::Png).await.expect("expected a PNG");
+        let (shared, _) = encode_twice(FrameFormat::Png).await;
+        assert_eq!(other_frame.bytes, shared.bytes);
+        assert_ne!(other_frame.bytes.as_ptr(), shared.bytes.as_ptr(), "control: expected another PNG of another frame");
     }
 
     #[tokio::test]
-    async fn cancelled_encoding_is_taken_over_by_the_next_subscriber() {
-        let (encoder, threads) = paused(1);
-        let output = noise(2, 8);
+    async fn next_subscriber_encodes_after_a_cancelled_one() {
+        let (encoder, thread_permits) = paused_encoder(1);
+        let output = noise_frame(2, 8);
         let first = encoder.encode(output.clone(), FrameFormat::Png);
-        tokio::time::timeout(std::time::Duration::from_millis(20), first).await.expect_err("no thread is free");
-        threads.add_permits(1);
-        let second = encoder.encode(output, FrameFormat::Png).await.expect("encodes");
+        let timeout = std::time::Duration::from_millis(20);
+        tokio::time::timeout(timeout, first).await.expect_err("expected no PNG without a thread");
+        thread_permits.add_permits(1);
+        let second = encoder.encode(output, FrameFormat::Png).await.expect("expected a PNG");
         assert!(image::load_from_memory(&second.bytes).is_ok());
     }
 }

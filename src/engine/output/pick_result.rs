@@ -18,14 +18,15 @@ pub struct PickResult {
     pub hits: Vec<ModalHit>,
 }
 
-/// Adds the linear parts of the domains' transforms to hits. [`resolve_picks`] adds the modes outside the scene's task.
+/// Adds the linear parts of the domains' transforms to hits. [`resolve_picks`] adds the modes, which would take too
+/// long on the task of the scene.
 pub(in crate::engine) fn with_transforms(state: &SceneState, scene: &Scene, hits: Vec<PickHit>) -> Vec<ModalHit> {
-    let one = |hit: PickHit| {
+    let add_transform = |hit: PickHit| {
         let rows = state.transform_of(scene, hit.domain).0;
         let linear = [0, 1, 2, 4, 5, 6, 8, 9, 10].map(|entry: usize| rows[entry]);
         ModalHit { hit, linear, modes: Vec::new() }
     };
-    hits.into_iter().map(one).collect()
+    hits.into_iter().map(add_transform).collect()
 }
 
 /// Adds the block of U to every hit if `with_modes` is true.
@@ -33,14 +34,16 @@ pub(in crate::engine) fn with_transforms(state: &SceneState, scene: &Scene, hits
 /// # Errors
 /// `Fault` when `output` is not a pick.
 pub async fn resolve_picks(output: StepOutput, scene: &Arc<Scene>, with_modes: bool) -> Result<PickResult> {
-    let OutputBody::Pick(mut hits) = output.body else { return Err(fault_in("pick")("a picture is no pick")) };
+    let OutputBody::Pick(mut hits) = output.body else {
+        return Err(fault_in("pick")("expected a pick, got another output"));
+    };
     let scene = Arc::clone(scene);
-    let work = move || {
-        for picked in hits.iter_mut().filter(|_| with_modes) {
-            let shape = &scene.shapes[scene.domains[picked.hit.domain].shape];
-            picked.modes = shape.modes.block_at_point(picked.hit.vertices, picked.hit.barycentrics);
+    let add_modes = move || {
+        for modal_hit in hits.iter_mut().filter(|_| with_modes) {
+            let shape = &scene.shapes[scene.domains[modal_hit.hit.domain].shape];
+            modal_hit.modes = shape.modes.block_at_point(modal_hit.hit.vertices, modal_hit.hit.barycentrics);
         }
         Ok(hits)
     };
-    Ok(PickResult { step: output.step, stages: output.stages, hits: run_blocking("pick", work).await? })
+    Ok(PickResult { step: output.step, stages: output.stages, hits: run_blocking("pick", add_modes).await? })
 }

@@ -9,7 +9,7 @@ use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize, PixelRect, SceneState};
 use modalcast_render::{AovImage, FrameTimes, PickHit, RenderStage, TimeKey};
 
-/// The result that a subscriber requests of a step.
+/// The output that a client requests of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum OutputSpec {
     Frame {
@@ -18,9 +18,10 @@ pub enum OutputSpec {
         frame_output: FrameOutput,
     },
     Vertices(VertexAttributes),
-    /// The surface points at the pixels of a rectangle in a picture of this size in pixels.
+    /// The surface points at the pixels of a rectangle.
     Pick {
         camera: Camera,
+        /// Size of the picture that contains the rectangle.
         picture: FrameSize,
         rectangle: PixelRect,
     },
@@ -35,13 +36,16 @@ pub enum FrameOutput {
     Depth,
     Domains,
     Normals,
-    /// |u| as a color map. `largest` is the value at its bright end in meters; 0 fits the scale to each frame.
+    /// |u| as a color map.
     Displacement {
+        /// The value at the bright end of the scale in meters; 0 fits the scale to each frame.
         largest: f64,
     },
-    /// One column of U as a color map, in meters per unit of its coordinate; `largest` as above.
+    /// One column of U as a color map.
     ModeShape {
         mode: u32,
+        /// The value at the bright end of the scale in meters per unit of the coordinate; 0 fits the scale to each
+        /// frame.
         largest: f64,
     },
 }
@@ -62,21 +66,21 @@ impl StepId {
     }
 }
 
-/// The content of a result.
+/// The content of an output.
 #[derive(Debug, Clone)]
 pub enum OutputBody {
     Frame(Arc<ColorFrame>),
     Vertices(Arc<DeformedSurface>),
-    /// Values instead of colors; to be shown as a color map if a legend is present.
+    /// Values instead of colors. With a legend the values are drawn as a color map.
     Aov(AovImage, Option<Legend>),
     Pick(Vec<ModalHit>),
 }
 
-/// The result of one view of one step.
+/// The output of one step for one [`OutputSpec`].
 #[derive(Debug, Clone)]
 pub struct StepOutput {
     pub step: StepId,
-    /// Steps that this subscriber skipped since its last result.
+    /// Steps that this subscriber skipped since its last output.
     pub skipped: u64,
     pub stages: StageTimes,
     /// The floating origins that the vertices are relative to. `None` if all are relative to the scene's origin.
@@ -96,14 +100,14 @@ pub struct ModalHit {
     pub modes: Vec<f32>,
 }
 
-/// The times of a frame's stages, without those of its passes.
+/// The times of a frame's stages. The times of its passes are omitted.
 pub(in crate::engine) fn stage_times(times: &FrameTimes) -> StageTimes {
-    let stage = |key: TimeKey| match key {
+    let stage_of_key = |key: TimeKey| match key {
         TimeKey::Stage(RenderStage::Upload) => Some(Stage::Upload),
         TimeKey::Stage(RenderStage::Shadow) => Some(Stage::Shadow),
         TimeKey::Stage(RenderStage::Draw) => Some(Stage::Draw),
         TimeKey::Stage(RenderStage::Read) => Some(Stage::Read),
         TimeKey::Pass(_) => None,
     };
-    times.iter().filter_map(|(key, ms)| Some((stage(key)?, ms))).collect()
+    times.iter().filter_map(|(key, ms)| Some((stage_of_key(key)?, ms))).collect()
 }

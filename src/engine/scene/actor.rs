@@ -16,17 +16,17 @@
 //! | state | meaning | leaves it when |
 //! |---|---|---|
 //! | `Idle` | no step is in progress | the writer has queued a step |
-//! | `Deforming` | the device computes the step, while readbacks of the step before are delivered; messages wait | the device answers |
+//! | `Deforming` | the device computes the step, readbacks of the previous step are delivered, messages wait | the device answers |
 //! | `Delivering` | the step is the current one, its writer waits for the acknowledgement | no lossless subscriber applies back-pressure, or the writer cannot be blocked |
 //!
-//! Single requests and subscribers are served in `Idle` and in `Delivering`. From every state the actor ends, and
+//! Single requests and subscribers are served in `Idle` and in `Delivering`. In every state the actor ends, and
 //! [`SceneActor::close`] consumes it, when
 //! - it receives `Stop` or every sender of the mailbox is dropped: readbacks in flight are delivered first;
-//! - the device is lost: the scene has failed with `DeviceLost`;
-//! - its own code panics: the scene has failed with a `Fault`; readbacks in flight are dropped.
+//! - the device is lost: the scene fails with `DeviceLost`;
+//! - the actor's code panics: the scene fails with a `Fault`, and readbacks in flight are dropped.
 //!
-//! A failed scene is removed from the registry first. Its writer, subscribers and requests get the error, and the device
-//! unloads the scene. Other scenes continue.
+//! A failed scene is first removed from the registry. Then its writer, subscribers and requests get the error, and the
+//! device unloads the scene. Other scenes continue.
 
 use std::mem;
 use std::sync::{Arc, OnceLock};
@@ -63,7 +63,7 @@ pub(super) struct ActorParams {
     pub id: SceneId,
     pub scene: Arc<Scene>,
     pub state: Arc<SceneState>,
-    /// Wakes the actor: a step is queued, the writer has gone, or a subscriber has capacity.
+    /// Wakes the actor: a step is queued, the writer has disconnected, or a subscriber has capacity.
     pub wake: Arc<Notify>,
     /// Receives the last completed step.
     pub last_step: watch::Sender<Option<StepId>>,
@@ -77,17 +77,17 @@ pub(super) struct ActorParams {
 struct Writer {
     step_queue: Arc<StepQueue>,
     peer: String,
-    since: Instant,
+    acquired_at: Instant,
 }
 
-/// A step that the device computes.
+/// A step that the device is computing.
 struct DeformingStep {
     step_queue: Arc<StepQueue>,
     /// Number of older steps that were merged into this one.
     merged: u64,
     stages: StageTimes,
     state: Arc<SceneState>,
-    deformed: PendingReply<DeformSummary>,
+    pending_summary: PendingReply<DeformSummary>,
 }
 
 /// Progress of the step that the actor works on; see the module's documentation.
@@ -133,9 +133,9 @@ impl SceneActor {
     pub(super) fn new(params: ActorParams, services: SceneServices) -> Self {
         let ActorParams { name, id, scene, state, wake, last_step, failure, on_failure } = params;
         let SceneServices { device, checkpoints, config } = services;
-        let on_device = SceneOnDevice { name: name.clone(), id, scene: Arc::clone(&scene) };
+        let scene_on_device = SceneOnDevice { name: name.clone(), id, scene: Arc::clone(&scene) };
         Self {
-            delivery: OutputDelivery::new(on_device, device.clone(), &config),
+            delivery: OutputDelivery::new(scene_on_device, device.clone(), &config),
             checkpoints: SceneCheckpoints::new(checkpoints, name.clone()),
             name,
             id,
@@ -144,7 +144,7 @@ impl SceneActor {
             run: state.run,
             writer: None,
             phase: StepPhase::Idle,
-            current: CurrentStep::opened_with(state),
+            current: CurrentStep::on_open(state),
             last_step,
             wake,
             failure,
@@ -156,7 +156,7 @@ impl SceneActor {
     pub(super) async fn run(mut self, mut mailbox: mpsc::Receiver<Message>) {
         let end = catch_unwind_async(self.serve(&mut mailbox)).await.unwrap_or_else(|_| {
             tracing::error!(scene = self.name, "the task of the scene panicked; the scene is closed");
-            ActorEnd::Panicked(fault_in("scene")("its task panicked. Open the scene again"))
+            ActorEnd::Panicked(fault_in("scene")("the task of the scene panicked. Open the scene again"))
         });
         self.close(end, mailbox).await;
     }
@@ -173,7 +173,7 @@ impl SceneActor {
                 message = mailbox.recv() => match message {
                     Some(Message::Stop { error, done }) => return ActorEnd::Stopped { error, done: Some(done) },
                     Some(message) => self.receive(message),
-                    None => return ActorEnd::Stopped { error: stopped(), done: None },
+                    None => return ActorEnd::Stopped { error: server_stopped_error(), done: None },
                 },
                 () = self.wake.notified() => {}
                 () = sleep_until(stall_deadline) => {}
@@ -187,7 +187,7 @@ impl SceneActor {
         let applies_back_pressure = self.applies_back_pressure();
         let mode = DeliveryMode { applies_back_pressure, overlaps_next_step: self.has_queued_step() };
         self.delivery.serve_subscribers(&self.current, mode).await;
-        if self.applies_back_pressure() && self.delivery.owes_lossless(&self.current) {
+        if self.applies_back_pressure() && self.delivery.has_unserved_lossless(&self.current) {
             return self.delivery.flush().await;
         }
         self.acknowledge().await;
@@ -196,7 +196,7 @@ impl SceneActor {
         }
         if self.begin_step() {
             self.finish_step().await;
-            // There may be more work; handle waiting messages first.
+            // More steps may be queued. Handle waiting messages first.
             self.wake.notify_one();
         } else {
             self.delivery.flush().await;
@@ -210,19 +210,19 @@ impl SceneActor {
         }
     }
 
-    /// `Idle` to `Deforming`, if the writer has queued a step. Returns whether it has.
+    /// `Idle` to `Deforming`, if the writer has queued a step. Returns whether a step was started.
     fn begin_step(&mut self) -> bool {
         let Some(writer) = &self.writer else { return false };
-        let Some(queued) = writer.step_queue.take() else { return false };
-        let stages = queued.stages();
-        let QueuedStep { update, merged, .. } = queued;
+        let Some(queued_step) = writer.step_queue.take() else { return false };
+        let stages = queued_step.stages();
+        let QueuedStep { update, merged, .. } = queued_step;
         let mut state = SceneState::clone(&self.current.state);
         state.run = self.run;
         state.apply(&self.scene, &update);
         let state = Arc::new(state);
-        let deformed = self.device.deform(self.id, &state);
+        let pending_summary = self.device.deform(self.id, &state);
         let step_queue = Arc::clone(&writer.step_queue);
-        self.phase = StepPhase::Deforming(DeformingStep { step_queue, merged, stages, state, deformed });
+        self.phase = StepPhase::Deforming(DeformingStep { step_queue, merged, stages, state, pending_summary });
         true
     }
 
@@ -230,7 +230,7 @@ impl SceneActor {
     /// device computes.
     async fn finish_step(&mut self) {
         let StepPhase::Deforming(step) = &mut self.phase else { return };
-        let deformed = self.delivery.deliver_during(&mut step.deformed, &self.current).await;
+        let deformed = self.delivery.deliver_during(&mut step.pending_summary, &self.current).await;
         let StepPhase::Deforming(step) = mem::take(&mut self.phase) else { return };
         let DeformingStep { step_queue, merged, mut stages, state, .. } = step;
         match deformed {
@@ -238,7 +238,7 @@ impl SceneActor {
                 stages.push((Stage::Deform, deformed.ms));
                 self.checkpoints.save(&state);
                 self.last_step.send_replace(Some(StepId::of(&state)));
-                self.current = CurrentStep { state, count: self.current.count + 1 + merged, stages };
+                self.current = CurrentStep { state, step_count: self.current.step_count + 1 + merged, stages };
                 self.delivery.begin_step();
                 self.phase = StepPhase::Delivering(CompletedStep::new(step_queue, self.current.stages.clone()));
             }
@@ -270,29 +270,29 @@ impl SceneActor {
     /// Admits one writer at a time; a writer whose queue is closed is replaced.
     fn acquire_writer(&mut self, peer: String, policy: Policy, window: u32) -> Result<AcquiredLease> {
         if let Some(writer) = self.writer.as_ref().filter(|writer| !writer.step_queue.is_closed()) {
-            let seconds = writer.since.elapsed().as_secs();
-            let holder = format!("{} has driven run {} for {seconds} s", writer.peer, self.run);
-            return Err(Error::Taken { what: "the writer's place of the scene", holder });
+            let seconds = writer.acquired_at.elapsed().as_secs();
+            let holder = format!("{} has held it for {seconds} s (run {})", writer.peer, self.run);
+            return Err(Error::Taken { what: "writer lease", holder });
         }
         self.run += 1;
         let step_queue = Arc::new(StepQueue::new(policy, window, Arc::clone(&self.wake)));
-        self.writer = Some(Writer { step_queue: Arc::clone(&step_queue), peer, since: Instant::now() });
+        self.writer = Some(Writer { step_queue: Arc::clone(&step_queue), peer, acquired_at: Instant::now() });
         Ok(AcquiredLease { lease: WriterLease(step_queue), run: self.run })
     }
 
-    /// Whether another step is queued. If so, readbacks of the current step are only begun and overlap with computing
-    /// it.
+    /// Whether another step is queued. If so, readbacks of the current step are only started and overlap with the
+    /// computation of the next step.
     fn has_queued_step(&self) -> bool {
         self.writer.as_ref().is_some_and(|writer| !writer.step_queue.is_closed() && writer.step_queue.has_queued())
     }
 
-    /// Whether lossless subscribers exert back-pressure: only if the writer of the completed step is lossless and still
-    /// connected.
+    /// Whether lossless subscribers may block the writer: only if the writer of the completed step is lossless and
+    /// still connected.
     fn applies_back_pressure(&self) -> bool {
         matches!(&self.phase, StepPhase::Delivering(step) if step.applies_back_pressure())
     }
 
-    /// Ends all streams and requests with the error of `end`, and frees the scene on the device.
+    /// Ends all streams and requests with the error of `end`. Frees the scene on the device.
     async fn close(mut self, end: ActorEnd, mailbox: mpsc::Receiver<Message>) {
         let (error, done) = match end {
             ActorEnd::Stopped { error, done } => {
@@ -325,20 +325,20 @@ impl SceneActor {
         }
     }
 
-    /// Publishes the error with which the scene fails, and releases its name.
+    /// Publishes the error with which the scene fails. Calls `on_failure`.
     fn fail(&mut self, error: &Error) {
         self.failure.set(error.clone()).ok(); // A scene fails once.
         mem::replace(&mut self.on_failure, Box::new(|| {}))();
     }
 }
 
-fn stopped() -> Error {
+fn server_stopped_error() -> Error {
     Error::Unavailable { what: "scene", reason: "the server stops".into(), remedy: "Try again later".into() }
 }
 
-async fn sleep_until(when: Option<Instant>) {
-    match when {
-        Some(when) => tokio::time::sleep_until(when.into()).await,
+async fn sleep_until(deadline: Option<Instant>) {
+    match deadline {
+        Some(deadline) => tokio::time::sleep_until(deadline.into()).await,
         None => std::future::pending().await,
     }
 }

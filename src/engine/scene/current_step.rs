@@ -11,16 +11,16 @@ use modalcast_model::scene::SceneState;
 pub(super) struct CurrentStep {
     pub state: Arc<SceneState>,
     /// Number of steps applied to the scene, merged ones included.
-    pub count: u64,
+    pub step_count: u64,
     /// Stage times up to the end of the deformation.
     pub stages: StageTimes,
 }
 
 impl CurrentStep {
-    /// The state that a scene is opened with: the restored step, or the rest state.
-    pub(super) fn opened_with(state: Arc<SceneState>) -> Self {
-        let count = u64::from(state.run > 0);
-        Self { state, count, stages: Vec::new() }
+    /// The step of a scene that is opened with a restored state or the rest state.
+    pub(super) fn on_open(state: Arc<SceneState>) -> Self {
+        let step_count = u64::from(state.run > 0);
+        Self { state, step_count, stages: Vec::new() }
     }
 
     pub(super) fn id(&self) -> StepId {

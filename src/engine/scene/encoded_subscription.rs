@@ -1,4 +1,4 @@
-//! A frame subscription with parallel encoding: encodes several frames concurrently and delivers them in order.
+//! A frame subscription with parallel encoding. Frames are encoded concurrently and delivered in order.
 
 use std::collections::VecDeque;
 
@@ -9,33 +9,33 @@ use crate::engine::output::frame_encoder::{EncodedOutput, FrameEncoder, FrameFor
 use crate::engine::output::step_output::{OutputBody, StepOutput};
 use modalcast_model::error::{Error, Result, fault_in};
 
-/// Budget of pixel bytes that one stream may hold before it accepts no further frame. A single larger frame is encoded
-/// alone.
-const IN_FLIGHT_BYTES: usize = 128 << 20;
-/// Frames in flight of a [`Delivery::Latest`] stream. The next frame is encoded while the previous one is sent; further
-/// frames would only add latency.
-const LATEST_IN_FLIGHT: usize = 2;
+/// Bytes of pixels that one stream may hold. A stream that holds as many or more accepts no further frame.
+const MAX_PIXEL_BYTES: usize = 128 << 20;
+/// Maximum number of frames that a [`Delivery::Latest`] stream holds. The next frame is encoded while the previous one
+/// is sent. Further frames would only add latency.
+const MAX_LATEST_ENCODINGS: usize = 2;
 
-/// Encoded frames of a [`Subscription`], in its order. A lossless subscription has at most one frame in flight per core.
-/// If the client does not read them, the subscription is not read either and exerts back-pressure on the writer.
+/// The encoded frames of a [`Subscription`], in the same order. At most one frame per core is held of a lossless
+/// subscription. While the client does not read frames, the subscription is not read either and applies back-pressure
+/// to the writer.
 #[derive(Debug)]
 pub struct EncodedSubscription {
     subscription: Subscription,
     encoder: FrameEncoder,
     format: FrameFormat,
-    /// Number of frames that are still to be taken from the subscription.
+    /// Number of frames that will still be taken from the subscription.
     remaining: u64,
     /// Oldest first.
-    in_flight: VecDeque<Encoding>,
-    /// The error that ended the subscription; reported after the frames in flight.
-    ended: Option<Error>,
+    encodings: VecDeque<Encoding>,
+    /// The error that ended the subscription. It is reported after the frames that are held.
+    end_error: Option<Error>,
 }
 
-/// A frame that is being encoded. Dropping it cancels the encoding unless a thread has already started it.
+/// A frame that is encoded in a task. Dropping it cancels the encoding unless a thread has already started it.
 #[derive(Debug)]
 struct Encoding {
     task: JoinHandle<Result<EncodedOutput>>,
-    bytes: usize,
+    pixel_bytes: usize,
 }
 
 impl Drop for Encoding {
@@ -48,62 +48,62 @@ impl EncodedSubscription {
     /// Encodes the first `frames` frames of a subscription; 0 means all.
     pub fn new(subscription: Subscription, encoder: FrameEncoder, format: FrameFormat, frames: u64) -> Self {
         let remaining = if frames == 0 { u64::MAX } else { frames };
-        Self { subscription, encoder, format, remaining, in_flight: VecDeque::new(), ended: None }
+        Self { subscription, encoder, format, remaining, encodings: VecDeque::new(), end_error: None }
     }
 
-    /// The next frame; `None` after the requested number of frames. Cancel-safe.
+    /// Waits for the next frame. Returns `None` after the requested number of frames. Cancel-safe.
     ///
     /// # Errors
-    /// The error that ended the subscription, after the frames in flight; `Fault` when a frame cannot be encoded.
+    /// `Fault` when a frame cannot be encoded; the error that ended the subscription, after the frames that are held.
     pub async fn next(&mut self) -> Result<Option<EncodedOutput>> {
         loop {
             let has_capacity = self.has_capacity();
-            let Self { subscription, in_flight, .. } = self;
+            let Self { subscription, encodings, .. } = self;
             tokio::select! {
                 biased;
-                encoded = finish_oldest(in_flight), if !in_flight.is_empty() => return encoded.map(Some),
+                encoded = finish_oldest(encodings), if !encodings.is_empty() => return encoded.map(Some),
                 output = subscription.next(), if has_capacity => match output {
-                    Ok(output) => self.begin(output),
-                    Err(error) => self.ended = Some(error),
+                    Ok(output) => self.start_encoding(output),
+                    Err(error) => self.end_error = Some(error),
                 },
-                else => return self.ended.clone().map_or(Ok(None), Err),
+                else => return self.end_error.clone().map_or(Ok(None), Err),
             }
         }
     }
 
-    /// Waits until the subscription is cut off; see [`Subscription::disconnected`].
+    /// Waits until the scene disconnects the subscriber; see [`Subscription::disconnected`].
     pub async fn disconnected(&self) -> Error {
         self.subscription.disconnected().await
     }
 
     fn has_capacity(&self) -> bool {
-        let most = match self.subscription.delivery() {
+        let max_encodings = match self.subscription.delivery() {
             Delivery::Lossless => self.encoder.cores(),
-            Delivery::Latest => LATEST_IN_FLIGHT,
+            Delivery::Latest => MAX_LATEST_ENCODINGS,
         };
-        let bytes: usize = self.in_flight.iter().map(|encoding| encoding.bytes).sum();
-        let is_within_budget = self.in_flight.is_empty() || (self.in_flight.len() < most && bytes < IN_FLIGHT_BYTES);
-        is_within_budget && self.remaining > 0 && self.ended.is_none()
+        let pixel_bytes: usize = self.encodings.iter().map(|encoding| encoding.pixel_bytes).sum();
+        let is_within_limits = self.encodings.len() < max_encodings && pixel_bytes < MAX_PIXEL_BYTES;
+        is_within_limits && self.remaining > 0 && self.end_error.is_none()
     }
 
-    fn begin(&mut self, output: StepOutput) {
-        let bytes = match &output.body {
+    fn start_encoding(&mut self, output: StepOutput) {
+        let pixel_bytes = match &output.body {
             OutputBody::Frame(frame) => frame.rgba.len(),
             OutputBody::Aov(image, _) => image.bytes.len(),
             OutputBody::Vertices(_) | OutputBody::Pick(_) => 0,
         };
         let (encoder, format) = (self.encoder.clone(), self.format);
         let task = tokio::spawn(async move { encoder.encode(output, format).await });
-        self.in_flight.push_back(Encoding { task, bytes });
+        self.encodings.push_back(Encoding { task, pixel_bytes });
         self.remaining -= 1;
     }
 }
 
-/// Waits for the oldest frame in flight and removes it. Cancel-safe.
-async fn finish_oldest(in_flight: &mut VecDeque<Encoding>) -> Result<EncodedOutput> {
-    let Some(oldest) = in_flight.front_mut() else { return std::future::pending().await };
+/// Waits for the oldest encoding and removes it. Cancel-safe.
+async fn finish_oldest(encodings: &mut VecDeque<Encoding>) -> Result<EncodedOutput> {
+    let Some(oldest) = encodings.front_mut() else { return std::future::pending().await };
     let encoded = (&mut oldest.task).await;
-    in_flight.pop_front();
+    encodings.pop_front();
     encoded.map_err(fault_in("encode"))?
 }
 
@@ -116,97 +116,109 @@ mod tests {
 
     use super::super::subscriber::Subscriber;
     use super::*;
-    use crate::engine::output::frame_encoder::tests::{noise, paused};
+    use crate::engine::output::frame_encoder::tests::{noise_frame, paused_encoder};
     use crate::engine::output::step_output::OutputSpec;
     use modalcast_model::deform::VertexAttributes;
 
-    fn subscription(delivery: Delivery) -> (Subscriber, Subscription) {
+    fn subscribe(delivery: Delivery) -> (Subscriber, Subscription) {
         Subscription::new(OutputSpec::Vertices(VertexAttributes::VERTICES), delivery, Arc::default())
     }
 
-    /// Delivers frames of decreasing size for as long as the subscription accepts them. Returns how many it accepted.
-    async fn fill(subscriber: &Subscriber, frames: &mut EncodedSubscription, numbers: std::ops::Range<u64>) -> usize {
-        let mut taken = 0;
-        for number in numbers {
-            timeout(Duration::from_millis(20), frames.next()).await.expect_err("nothing is encoded yet");
+    fn send_frame(subscriber: &Subscriber, frame: StepOutput) {
+        assert!(subscriber.take_permit().send(Ok(frame)), "expected an open subscription");
+    }
+
+    /// Polls for a frame while the encoder is paused.
+    async fn poll_without_frame(frames: &mut EncodedSubscription) {
+        timeout(Duration::from_millis(20), frames.next()).await.expect_err("expected no encoded frame yet");
+    }
+
+    async fn next_frame(frames: &mut EncodedSubscription) -> EncodedOutput {
+        frames.next().await.expect("expected an encoded frame").expect("expected a frame before the end")
+    }
+
+    /// Sends frames of decreasing size while the subscriber has credits. Returns how many were sent.
+    async fn send_until_full(subscriber: &Subscriber, frames: &mut EncodedSubscription) -> usize {
+        for number in 0..20 {
+            poll_without_frame(frames).await;
             if !subscriber.has_credit() {
-                break;
+                return number;
             }
-            assert!(subscriber.take_permit().send(Ok(noise(number, 64 - number as u32))));
-            taken += 1;
+            send_frame(subscriber, noise_frame(number as u64, 64 - number as u32));
         }
-        taken
+        panic!("expected a limit on the frames that are held");
     }
 
     #[tokio::test]
-    async fn frames_in_flight_are_bounded_and_arrive_in_order() {
-        for (delivery, cores, most) in [(Delivery::Lossless, 3, 3), (Delivery::Latest, 3, LATEST_IN_FLIGHT)] {
-            let (encoder, threads) = paused(cores);
-            let (subscriber, subscription) = subscription(delivery);
+    async fn held_frames_are_bounded_and_arrive_in_order() {
+        let cores = 3;
+        // A lossless subscription buffers two more frames, which the encoder has not taken.
+        for (delivery, max_encodings, buffered) in
+            [(Delivery::Lossless, cores, 2), (Delivery::Latest, MAX_LATEST_ENCODINGS, 0)]
+        {
+            let (encoder, thread_permits) = paused_encoder(cores);
+            let (subscriber, subscription) = subscribe(delivery);
             let mut frames = EncodedSubscription::new(subscription, encoder, FrameFormat::Png, 0);
-            let taken = fill(&subscriber, &mut frames, 0..20).await;
-            // A lossless feed buffers two more frames, which the encoder has not taken.
-            let held = if delivery == Delivery::Lossless { 2 } else { 0 };
-            assert_eq!((frames.in_flight.len(), taken), (most, most + held), "{delivery:?}");
-            threads.add_permits(cores);
-            for number in 0..taken as u64 {
-                let frame = frames.next().await.expect("encodes").expect("a frame");
-                assert_eq!(frame.step.number, number);
+            let sent = send_until_full(&subscriber, &mut frames).await;
+            assert_eq!(frames.encodings.len(), max_encodings, "{delivery:?}");
+            assert_eq!(sent, max_encodings + buffered, "{delivery:?}");
+            thread_permits.add_permits(cores);
+            for number in 0..sent as u64 {
+                assert_eq!(next_frame(&mut frames).await.step.number, number);
             }
         }
     }
 
     #[tokio::test]
-    async fn a_frame_above_the_byte_budget_is_encoded_alone() {
-        let (encoder, _threads) = paused(4);
-        let (subscriber, subscription) = subscription(Delivery::Lossless);
+    async fn frame_above_the_byte_limit_is_encoded_alone() {
+        let (encoder, _thread_permits) = paused_encoder(4);
+        let (subscriber, subscription) = subscribe(Delivery::Lossless);
         let mut frames = EncodedSubscription::new(subscription, encoder, FrameFormat::Png, 0);
-        let large = |number| {
-            let mut output = noise(number, 1);
-            let image = modalcast_render::FrameImage {
-                width: 1,
-                height: 1,
-                rgba: vec![0; IN_FLIGHT_BYTES],
-                times: modalcast_render::FrameTimes::default(),
-                raster_backends: modalcast_render::RasterBackends::default(),
-            };
-            output.body = OutputBody::Frame(Arc::new(image.into()));
-            output
+        let large_image = modalcast_render::FrameImage {
+            width: 1,
+            height: 1,
+            rgba: vec![0; MAX_PIXEL_BYTES],
+            times: modalcast_render::FrameTimes::default(),
+            raster_backends: modalcast_render::RasterBackends::default(),
         };
-        assert!(subscriber.take_permit().send(Ok(large(0))) && subscriber.take_permit().send(Ok(noise(1, 4))));
-        timeout(Duration::from_millis(20), frames.next()).await.expect_err("nothing is encoded yet");
-        assert_eq!(frames.in_flight.len(), 1);
+        let large_frame = StepOutput { body: OutputBody::Frame(Arc::new(large_image.into())), ..noise_frame(0, 1) };
+        send_frame(&subscriber, large_frame);
+        send_frame(&subscriber, noise_frame(1, 4));
+        poll_without_frame(&mut frames).await;
+        assert_eq!(frames.encodings.len(), 1);
         drop(frames);
         assert!(subscriber.is_closed());
     }
 
     #[tokio::test]
-    async fn the_end_is_reported_after_the_frames_in_flight() {
-        let (encoder, threads) = paused(4);
-        let (subscriber, subscription) = subscription(Delivery::Lossless);
+    async fn end_is_reported_after_the_held_frames() {
+        let (encoder, thread_permits) = paused_encoder(4);
+        let (subscriber, subscription) = subscribe(Delivery::Lossless);
         let mut frames = EncodedSubscription::new(subscription, encoder, FrameFormat::Png, 0);
-        assert!(subscriber.take_permit().send(Ok(noise(0, 32))) && subscriber.take_permit().send(Ok(noise(1, 4))));
-        let end = Error::NotFound { what: "scene", given: "gone".into() };
-        subscriber.end(end.clone());
+        send_frame(&subscriber, noise_frame(0, 32));
+        send_frame(&subscriber, noise_frame(1, 4));
+        let end_error = Error::NotFound { what: "scene", given: "'closed'".into() };
+        subscriber.end(end_error.clone());
         drop(subscriber);
-        timeout(Duration::from_millis(20), frames.next()).await.expect_err("nothing is encoded yet");
-        threads.add_permits(1);
+        poll_without_frame(&mut frames).await;
+        thread_permits.add_permits(1);
         for number in 0..2 {
-            assert_eq!(frames.next().await.expect("encodes").expect("a frame").step.number, number);
+            assert_eq!(next_frame(&mut frames).await.step.number, number);
         }
-        assert_eq!(frames.next().await.expect_err("the end"), end);
+        assert_eq!(frames.next().await.expect_err("expected the end"), end_error);
     }
 
     #[tokio::test]
-    async fn no_more_frames_are_taken_than_were_asked_for() {
-        let (encoder, threads) = paused(4);
-        threads.add_permits(4);
-        let (subscriber, subscription) = subscription(Delivery::Lossless);
+    async fn takes_only_the_requested_number_of_frames() {
+        let (encoder, thread_permits) = paused_encoder(4);
+        thread_permits.add_permits(4);
+        let (subscriber, subscription) = subscribe(Delivery::Lossless);
         let mut frames = EncodedSubscription::new(subscription, encoder, FrameFormat::Rgba, 1);
-        assert!(subscriber.take_permit().send(Ok(noise(0, 4))) && subscriber.take_permit().send(Ok(noise(1, 4))));
-        assert!(frames.next().await.expect("encodes").is_some());
-        assert!(frames.next().await.expect("the end").is_none());
-        let kept = frames.subscription.next().await.expect("the second frame stays in the subscription");
-        assert_eq!(kept.step.number, 1);
+        send_frame(&subscriber, noise_frame(0, 4));
+        send_frame(&subscriber, noise_frame(1, 4));
+        next_frame(&mut frames).await;
+        assert!(frames.next().await.expect("expected no error").is_none());
+        let second_frame = frames.subscription.next().await.expect("expected the second frame in the subscription");
+        assert_eq!(second_frame.step.number, 1);
     }
 }

@@ -1,4 +1,4 @@
-//! Handle to one open scene: its immutable description and a sender to the bounded mailbox of its task.
+//! Handle to one open scene: the immutable description of the scene, and a sender to the bounded mailbox of its task.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -29,13 +29,13 @@ pub struct SceneHandle {
     pub provenance: SceneProvenance,
     pub scene: Arc<Scene>,
     id: SceneId,
-    /// The reason why no frame can be drawn; `None` if frames can be drawn.
+    /// The reason why no frame can be drawn. `None` if frames can be drawn.
     frames_unavailable: Option<Error>,
     max_window: u32,
     mailbox: mpsc::Sender<Message>,
     last_step: watch::Receiver<Option<StepId>>,
     wake: Arc<Notify>,
-    closing: AtomicBool,
+    is_stopping: AtomicBool,
     /// The error with which the scene has failed.
     failure: Arc<OnceLock<Error>>,
 }
@@ -67,7 +67,7 @@ impl SceneHandle {
             Some(state) => match services.device.deform(id, &state).wait().await {
                 Ok(_) => state,
                 Err(error) => {
-                    tracing::warn!(scene = name, %error, "the kept step is not usable; the scene begins at rest");
+                    tracing::warn!(scene = name, %error, "the checkpoint is not usable; the scene starts at rest");
                     Arc::new(SceneState::rest(&scene))
                 }
             },
@@ -89,7 +89,7 @@ impl SceneHandle {
         };
         let (mailbox, inbox) = mpsc::channel(MAILBOX_CAPACITY);
         tokio::spawn(SceneActor::new(actor, services).run(inbox));
-        let closing = AtomicBool::new(false);
+        let is_stopping = AtomicBool::new(false);
         Ok(Self {
             name,
             provenance,
@@ -100,7 +100,7 @@ impl SceneHandle {
             mailbox,
             last_step,
             wake,
-            closing,
+            is_stopping,
             failure,
         })
     }
@@ -110,7 +110,8 @@ impl SceneHandle {
         *self.last_step.borrow()
     }
 
-    /// Acquires the writer lease. The window is clamped to 1 through the configured limit.
+    /// Acquires the writer lease. `peer` is the address of the client, for errors. The window is clamped to the range
+    /// from 1 to the configured limit.
     ///
     /// # Errors
     /// `Taken` naming the current writer and how long it has held the lease; `NotFound` when the scene is closed;
@@ -120,7 +121,7 @@ impl SceneHandle {
         let AcquiredLease { lease, run } =
             self.call(|reply| Message::AcquireWriter { peer, policy, window, reply }).await?;
         tracing::info!(scene = self.name, run, ?policy, "driven by a new writer");
-        Ok(WriterSession { lease, scene: Arc::clone(&self.scene), run, window, policy, last: None })
+        Ok(WriterSession { lease, scene: Arc::clone(&self.scene), run, window, policy, last_number: None })
     }
 
     /// Subscribes to the scene's steps. The subscription is active when this returns.
@@ -135,7 +136,8 @@ impl SceneHandle {
         Ok(subscription)
     }
 
-    /// Waits for a step and returns a result of it. Dropping the future cancels the request before it is drawn.
+    /// Waits for a step and returns an output of it. Dropping the future cancels the request unless its output is
+    /// already being produced.
     ///
     /// # Errors
     /// `Gone` when the exact step has passed; `Unavailable` when there is no renderer; `Busy` when too many requests
@@ -147,7 +149,7 @@ impl SceneHandle {
 
     /// Ends every stream of the scene with `error` and frees the scene. Returns after the scene is freed.
     pub(in crate::engine) async fn stop(&self, error: Error) {
-        self.closing.store(true, Ordering::Release);
+        self.is_stopping.store(true, Ordering::Release);
         let (done, stopped) = oneshot::channel();
         // A closed mailbox means that the scene's task has already ended.
         if self.mailbox.send(Message::Stop { error, done }).await.is_ok() {
@@ -157,7 +159,7 @@ impl SceneHandle {
 
     /// Whether [`Self::stop`] was called or the scene has failed.
     pub(in crate::engine) fn is_closing(&self) -> bool {
-        self.closing.load(Ordering::Acquire) || self.failure().is_some()
+        self.is_stopping.load(Ordering::Acquire) || self.failure().is_some()
     }
 
     fn check_spec(&self, spec: &OutputSpec) -> Result<()> {
@@ -167,7 +169,7 @@ impl SceneHandle {
         }
     }
 
-    /// The error with which the scene has failed; `None` if it has not.
+    /// The error with which the scene has failed. `None` if it has not failed.
     pub(in crate::engine) fn failure(&self) -> Option<&Error> {
         self.failure.get()
     }
@@ -182,9 +184,9 @@ impl SceneHandle {
         self.mailbox.send(Message::Panic).await.ok();
     }
 
-    async fn call<T>(&self, make: impl FnOnce(oneshot::Sender<Result<T>>) -> Message) -> Result<T> {
+    async fn call<T>(&self, create_message: impl FnOnce(oneshot::Sender<Result<T>>) -> Message) -> Result<T> {
         let (reply, answer) = oneshot::channel();
-        match self.mailbox.try_send(make(reply)) {
+        match self.mailbox.try_send(create_message(reply)) {
             Ok(()) => match answer.await {
                 Ok(answer) => answer,
                 Err(_) => {
@@ -200,8 +202,8 @@ impl SceneHandle {
 
     /// The error of calls after the actor has ended.
     fn end_error(&self) -> Error {
-        let closed = || Error::NotFound { what: "scene", given: format!("'{}', which was closed", self.name) };
-        self.failure().cloned().unwrap_or_else(closed)
+        let scene_closed = || Error::NotFound { what: "scene", given: format!("closed scene '{}'", self.name) };
+        self.failure().cloned().unwrap_or_else(scene_closed)
     }
 }
 
@@ -210,28 +212,28 @@ impl SceneHandle {
 pub struct WriterSession {
     lease: WriterLease,
     scene: Arc<Scene>,
-    /// Number of this writer among the scene's writers, from 1.
+    /// This writer is the scene's `run`-th writer, counted from 1.
     pub run: u64,
     /// Steps that may be unacknowledged at a time.
     pub window: u32,
     pub policy: Policy,
-    last: Option<u64>,
+    /// Number of the last accepted step.
+    last_number: Option<u64>,
 }
 
 impl WriterSession {
-    /// Checks and queues a step. A rejected step has no effect.
+    /// Validates and queues a step. A rejected step has no effect.
     ///
     /// # Errors
-    /// `Invalid` with field, expected and given for a malformed step or one beyond the window; or the error with which
-    /// the server ended the stream.
-    pub fn step(&mut self, raw: &RawStepUpdate) -> Result<()> {
+    /// `Invalid` for a malformed step or one beyond the window; or the error with which the server ended the stream.
+    pub fn push_step(&mut self, raw: &RawStepUpdate) -> Result<()> {
         let begin = Instant::now();
-        if let Some(last) = self.last.filter(|last| raw.number <= *last) {
-            return Err(invalid("step.number", format!("a number above {last}"), raw.number));
+        if let Some(last_number) = self.last_number.filter(|last_number| raw.number <= *last_number) {
+            return Err(invalid("step.number", format!("a number above {last_number}"), raw.number));
         }
         let update = StepUpdate::parse(&self.scene, raw)?;
         self.lease.0.push(QueuedStep::new(update, ms_since(begin)))?;
-        self.last = Some(raw.number);
+        self.last_number = Some(raw.number);
         Ok(())
     }
 

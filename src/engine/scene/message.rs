@@ -27,7 +27,7 @@ pub(super) struct StepRequest {
 #[derive(Debug)]
 pub(super) struct AcquiredLease {
     pub lease: WriterLease,
-    /// Number of the writer among the scene's writers, from 1.
+    /// The writer is the scene's `run`-th writer, counted from 1.
     pub run: u64,
 }
 

@@ -9,9 +9,9 @@ use super::current_step::CurrentStep;
 use super::message::{StepRequest, StepSelector};
 use super::readback_queue::{PendingReadback, Readback, ReadbackQueue, Recipient};
 use super::step_queue::CompletedStep;
-use super::subscriber::{Delivery, Subscriber};
+use super::subscriber::{Delivery, LOSSLESS_CREDITS, Subscriber};
 use crate::config::Config;
-use crate::engine::device::command::SceneId;
+use crate::engine::device::command::{CopiedVertices, SceneId};
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
 use crate::engine::output::pick_result::with_transforms;
 use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, StepOutput, stage_times};
@@ -21,7 +21,7 @@ use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::Scene;
 use modalcast_render::MAX_FRAMES_IN_FLIGHT;
 
-/// Owns everything that waits for outputs of one scene: subscribers, single requests, and the readbacks in flight.
+/// Owns the subscribers and the single requests of one scene, and the readbacks in flight for them.
 pub(super) struct OutputDelivery {
     subscribers: Vec<Subscriber>,
     requests: Vec<StepRequest>,
@@ -33,10 +33,10 @@ pub(super) struct OutputDelivery {
 /// How the current step is delivered to subscribers.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct DeliveryMode {
-    /// A lossless subscriber without capacity blocks the writer and is cut off after `Config::stall_timeout`.
+    /// A lossless subscriber without a credit blocks the writer. It is disconnected after `Config::stall_timeout`.
     pub applies_back_pressure: bool,
-    /// Another step is queued: vertices and at most [`MAX_FRAMES_IN_FLIGHT`] frames are only started; they are delivered
-    /// while that step is computed.
+    /// Another step is queued. Readbacks of vertices and of at most [`MAX_FRAMES_IN_FLIGHT`] frames are only started
+    /// and are delivered while that step is computed.
     pub overlaps_next_step: bool,
 }
 
@@ -57,49 +57,50 @@ impl OutputDelivery {
         }
     }
 
-    /// Adds a subscriber. With [`Delivery::Latest`] it receives the current step if the scene has had one.
+    /// Adds a subscriber. With [`Delivery::Latest`] it receives the current step unless the scene has had no step.
     ///
     /// # Errors
     /// `Busy` when the scene has too many subscribers.
     pub(super) fn add_subscriber(&mut self, mut subscriber: Subscriber, current: &CurrentStep) -> Result<()> {
-        self.drop_closed();
+        self.drop_closed_subscribers();
         let limit = self.max_subscribers;
         if self.subscribers.len() >= limit {
             return Err(Error::Busy { queue: "subscribers of the scene", limit });
         }
-        let shows_current = subscriber.delivery == Delivery::Latest && current.state.run > 0;
-        subscriber.delivered_count = if shows_current { current.count.saturating_sub(1) } else { current.count };
+        let receives_current = subscriber.delivery == Delivery::Latest && current.state.run > 0;
+        subscriber.delivered_count =
+            if receives_current { current.step_count.saturating_sub(1) } else { current.step_count };
         self.subscribers.push(subscriber);
         Ok(())
     }
 
-    /// Adds a request; answers it with `Busy` when too many requests wait.
+    /// Adds a request. Answers it with `Busy` when too many requests wait.
     pub(super) fn add_request(&mut self, request: StepRequest) {
         self.requests.retain(|request| !request.reply.is_closed());
         let limit = self.max_pending_requests;
         if self.requests.len() < limit {
             self.requests.push(request);
         } else {
-            let full = Error::Busy { queue: "requests that wait for a step", limit };
-            request.reply.send(Err(full)).ok(); // Fails only if the caller no longer waits.
+            let queue_full = Error::Busy { queue: "requests that wait for a step", limit };
+            request.reply.send(Err(queue_full)).ok(); // Fails only if the caller no longer waits.
         }
     }
 
     /// Whether a lossless subscriber has not received the current step.
-    pub(super) fn owes_lossless(&self, current: &CurrentStep) -> bool {
-        let owes = |subscriber: &Subscriber| {
-            subscriber.delivery == Delivery::Lossless && subscriber.delivered_count < current.count
+    pub(super) fn has_unserved_lossless(&self, current: &CurrentStep) -> bool {
+        let lacks_current_step = |subscriber: &Subscriber| {
+            subscriber.delivery == Delivery::Lossless && subscriber.delivered_count < current.step_count
         };
-        self.subscribers.iter().any(owes)
+        self.subscribers.iter().any(lacks_current_step)
     }
 
-    /// Deadline at which the subscriber that has blocked the writer for the longest is cut off.
+    /// Deadline at which the subscriber that has blocked the writer for the longest time is disconnected.
     pub(super) fn next_stall_deadline(&self) -> Option<Instant> {
-        let first = self.subscribers.iter().filter_map(|subscriber| subscriber.stalled_since).min()?;
-        Some(first + self.producer.stall_timeout)
+        let earliest_stall = self.subscribers.iter().filter_map(|subscriber| subscriber.stalled_since).min()?;
+        Some(earliest_stall + self.producer.stall_timeout)
     }
 
-    /// Answers every request whose step has been reached or passed; drops requests whose caller no longer waits. `run`
+    /// Answers every request whose step has been reached or passed. Drops requests whose caller no longer waits. `run`
     /// is the run of the latest writer.
     pub(super) async fn answer_requests(&mut self, current: &CurrentStep, run: u64) {
         for request in mem::take(&mut self.requests) {
@@ -118,69 +119,77 @@ impl OutputDelivery {
         }
     }
 
-    /// Delivers the current step to every subscriber with capacity. Subscribers of the same view share one frame, and
-    /// readers of vertices share one copy.
+    /// Delivers the current step to every subscriber with a credit. Subscribers with the same view share one frame, and
+    /// subscribers to vertices share one copy.
     pub(super) async fn serve_subscribers(&mut self, current: &CurrentStep, mode: DeliveryMode) {
-        let wanted = self.combined_attributes(current);
-        let starts_copy = mode.overlaps_next_step && !self.producer.cached_attributes().contains(wanted);
+        let attributes = self.combined_attributes(current);
+        let starts_shared_copy = mode.overlaps_next_step && !self.producer.cached_attributes().contains(attributes);
         let mut round = DeliveryRound {
             current,
             mode,
-            wanted,
-            starts_copy,
-            readers: Vec::new(),
+            attributes,
+            starts_shared_copy,
+            vertex_recipients: Vec::new(),
             started_frames: Vec::new(),
             drawn_frames: Vec::new(),
         };
-        let mut at = 0;
-        while let Some(subscriber) = self.subscribers.get_mut(at) {
+        let mut index = 0;
+        while let Some(subscriber) = self.subscribers.get_mut(index) {
             if !subscriber.is_closed() && self.producer.serve(subscriber, &mut round).await {
-                at += 1;
+                index += 1;
             } else {
-                self.subscribers.remove(at);
+                self.subscribers.remove(index);
             }
         }
-        let DeliveryRound { readers, started_frames, .. } = round;
-        if !readers.is_empty() {
-            let copying = self.producer.device.read_vertices(self.producer.scene.id, wanted);
-            self.producer.readbacks.push(PendingReadback::new(current, Readback::Vertices(copying), readers));
+        let DeliveryRound { vertex_recipients, started_frames, .. } = round;
+        if !vertex_recipients.is_empty() {
+            let pending_vertices = self.producer.device.read_vertices(self.producer.scene.id, attributes);
+            self.producer.readbacks.push(PendingReadback::new(
+                current,
+                Readback::Vertices(pending_vertices),
+                vertex_recipients,
+            ));
         }
         started_frames.into_iter().for_each(|frame| self.producer.readbacks.push(frame));
-        self.drop_closed();
+        self.drop_closed_subscribers();
     }
 
     /// Delivers all readbacks in flight.
     pub(super) async fn flush(&mut self) {
         self.producer.readbacks.flush().await;
-        self.drop_closed();
+        self.drop_closed_subscribers();
     }
 
-    /// Waits for the device to compute the next step and delivers readbacks meanwhile. Afterwards at most frames of the
-    /// current step are in flight.
-    pub(super) async fn deliver_during<T>(&mut self, next: &mut PendingReply<T>, current: &CurrentStep) -> Result<T> {
+    /// Delivers readbacks until the device has computed the next step. Afterwards only frames of the current step may
+    /// be in flight.
+    pub(super) async fn deliver_during<T>(
+        &mut self,
+        pending_reply: &mut PendingReply<T>,
+        current: &CurrentStep,
+    ) -> Result<T> {
         let readbacks = &mut self.producer.readbacks;
         readbacks.flush_vertices().await;
-        let computed = loop {
+        let result = loop {
             tokio::select! {
                 biased;
-                computed = next.recv() => break computed,
+                result = pending_reply.recv() => break result,
                 () = readbacks.deliver_oldest(), if !readbacks.is_empty() => {}
             }
         };
-        readbacks.flush_before(current.count).await;
-        self.drop_closed();
-        computed
+        readbacks.flush_before(current.step_count).await;
+        self.drop_closed_subscribers();
+        result
     }
 
-    /// Acknowledges the current step after its last readback in flight.
+    /// Acknowledges the current step, or schedules that for the delivery of its last readback in flight.
     pub(super) async fn acknowledge(&mut self, current: &CurrentStep, step: CompletedStep) {
-        if let Some(step) = self.producer.readbacks.attach(current.count, step) {
+        if let Some(step) = self.producer.readbacks.attach_acknowledgement(current.step_count, step) {
             self.flush().await;
             step.acknowledge();
         }
     }
 
-    /// Forgets what was cached of the previous step.
+    /// Drops the cached vertices of the previous step.
     pub(super) fn begin_step(&mut self) {
         self.producer.cached = None;
     }
@@ -195,43 +204,46 @@ impl OutputDelivery {
 
     /// The union of the vertex attributes that all subscribers request, so that one copy serves them all.
     fn combined_attributes(&self, current: &CurrentStep) -> VertexAttributes {
-        let open = self.subscribers.iter().filter(|subscriber| !subscriber.is_closed());
-        open.filter_map(|subscriber| attributes_for(subscriber, current))
+        let open_subscribers = self.subscribers.iter().filter(|subscriber| !subscriber.is_closed());
+        open_subscribers
+            .filter_map(|subscriber| attributes_for(subscriber, current))
             .fold(VertexAttributes::default(), VertexAttributes::union)
     }
 
-    fn drop_closed(&mut self) {
+    fn drop_closed_subscribers(&mut self) {
         self.subscribers.retain(|subscriber| !subscriber.is_closed());
     }
 }
 
-/// The vertex attributes that a subscriber requests of the current step; `None` if it has no capacity or has received
-/// it.
+/// The vertex attributes that a subscriber requests of the current step. `None` if it has no credit or has received the
+/// step.
 fn attributes_for(subscriber: &Subscriber, current: &CurrentStep) -> Option<VertexAttributes> {
     match subscriber.spec {
-        OutputSpec::Vertices(wanted) if subscriber.delivered_count < current.count && subscriber.has_credit() => {
-            Some(wanted)
+        OutputSpec::Vertices(attributes)
+            if subscriber.delivered_count < current.step_count && subscriber.has_credit() =>
+        {
+            Some(attributes)
         }
         _ => None,
     }
 }
 
-/// One round over all subscribers of a scene.
+/// The state of one delivery of the current step to all subscribers.
 struct DeliveryRound<'a> {
     current: &'a CurrentStep,
     mode: DeliveryMode,
-    /// Vertex attributes that all subscribers request.
-    wanted: VertexAttributes,
-    /// Whether one copy of `wanted` is started for all readers at the end of the round.
-    starts_copy: bool,
-    readers: Vec<Recipient>,
+    /// Union of the vertex attributes that all subscribers request.
+    attributes: VertexAttributes,
+    /// Whether one copy of `attributes` is started for all `vertex_recipients` at the end of the round.
+    starts_shared_copy: bool,
+    vertex_recipients: Vec<Recipient>,
     /// Frames that this round started.
     started_frames: Vec<PendingReadback>,
-    /// Frames that this round has drawn and delivered; subscribers with the same view share them.
+    /// Frames that this round has drawn and delivered. Later subscribers with the same view receive the same frame.
     drawn_frames: Vec<(OutputSpec, StepOutput)>,
 }
 
-/// A scene that is loaded on the device.
+/// Identifies a scene that is loaded on the device.
 pub(super) struct SceneOnDevice {
     pub name: String,
     pub id: SceneId,
@@ -244,7 +256,7 @@ struct OutputProducer {
     device: DeviceHandle,
     stall_timeout: Duration,
     readbacks: ReadbackQueue,
-    /// Vertices of the current step that a single copy brought to the host, cached for later readers.
+    /// Vertices of the current step in host memory, cached for later requests and subscribers.
     cached: Option<CachedVertices>,
 }
 
@@ -255,17 +267,17 @@ struct CachedVertices {
     /// The attributes that `surface` contains.
     attributes: VertexAttributes,
     /// Duration of the copy in milliseconds.
-    ms: f64,
+    copy_ms: f64,
 }
 
 impl OutputProducer {
-    /// Delivers the current step to one subscriber, or starts the delivery. Returns false when the subscriber is to be
+    /// Delivers the current step to one subscriber, or starts the delivery. Returns false if the subscriber must be
     /// dropped.
     async fn serve(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
-        // The subscriber may have gained capacity after `wanted` was computed, so its attributes are checked again.
-        let is_reader = |own: VertexAttributes| round.wanted.contains(own);
-        if round.starts_copy && attributes_for(subscriber, round.current).is_some_and(is_reader) {
-            round.readers.push(Recipient::of(subscriber, round.current.count));
+        // The subscriber may have gained a credit after the union was computed, so check that it covers its attributes.
+        let is_covered = |attributes: VertexAttributes| round.attributes.contains(attributes);
+        if round.starts_shared_copy && attributes_for(subscriber, round.current).is_some_and(is_covered) {
+            round.vertex_recipients.push(Recipient::of(subscriber, round.current.step_count));
             return true;
         }
         if round.mode.overlaps_next_step && self.start_frame(subscriber, round) {
@@ -274,77 +286,78 @@ impl OutputProducer {
         self.serve_now(subscriber, round).await
     }
 
-    /// Subscribes a subscriber with capacity to a frame of the current step that is delivered asynchronously: a frame of
-    /// the same view in flight for another subscriber, else a new frame, unless the round has started
-    /// [`MAX_FRAMES_IN_FLIGHT`] already. Returns whether the subscriber gets a frame.
+    /// Adds a subscriber with a credit to a frame of the current step that is delivered asynchronously. This is a frame
+    /// of the same view that is in flight for another subscriber, or a new frame. A round starts at most
+    /// [`MAX_FRAMES_IN_FLIGHT`] new frames. Returns whether the subscriber was added to a frame.
     fn start_frame(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
         let OutputSpec::Frame { camera, size, frame_output: FrameOutput::Color } = subscriber.spec else {
             return false;
         };
-        let count = round.current.count;
-        if subscriber.delivered_count == count || !subscriber.has_credit() {
+        let step_count = round.current.step_count;
+        if subscriber.delivered_count == step_count || !subscriber.has_credit() {
             return false;
         }
-        let is_shared = |pending: &&mut PendingReadback| pending.is_frame_of(count, &subscriber.spec);
-        if let Some(shared) = self.readbacks.iter_mut().chain(&mut round.started_frames).find(is_shared) {
-            shared.add_recipient(Recipient::of(subscriber, count));
+        let has_same_view = |pending: &&mut PendingReadback| pending.is_frame_of(step_count, &subscriber.spec);
+        if let Some(pending_frame) = self.readbacks.iter_mut().chain(&mut round.started_frames).find(has_same_view) {
+            pending_frame.add_recipient(Recipient::of(subscriber, step_count));
             return true;
         }
         if round.started_frames.len() >= MAX_FRAMES_IN_FLIGHT {
             return false;
         }
-        let drawing = self.device.begin_draw(self.scene.id, camera, size);
-        let readback = Readback::Frame(subscriber.spec, drawing);
-        let recipients = vec![Recipient::of(subscriber, count)];
+        let pending_image = self.device.begin_draw(self.scene.id, camera, size);
+        let readback = Readback::Frame(subscriber.spec, pending_image);
+        let recipients = vec![Recipient::of(subscriber, step_count)];
         round.started_frames.push(PendingReadback::new(round.current, readback, recipients));
         true
     }
 
-    /// Delivers the current step to one subscriber and waits for it. Returns false when the subscriber is to be dropped.
+    /// Produces the current step for one subscriber and delivers it. Returns false if the subscriber must be dropped.
     async fn serve_now(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
         let current = round.current;
-        if subscriber.delivered_count == current.count {
+        if subscriber.delivered_count == current.step_count {
             return true;
         }
         if !subscriber.has_credit() {
             return self.check_stall(subscriber, round.mode);
         }
-        // Readbacks in flight for the subscriber come first.
+        // Results arrive in the order of the steps, so deliver the subscriber's readbacks in flight first.
         self.readbacks.flush_for(subscriber).await;
-        let skipped = subscriber.mark_delivered(current.count);
-        let shared = round.drawn_frames.iter().find(|(spec, _)| *spec == subscriber.spec);
-        let output = match shared {
+        let skipped = subscriber.mark_delivered(current.step_count);
+        let drawn_frame = round.drawn_frames.iter().find(|(spec, _)| *spec == subscriber.spec);
+        let output = match drawn_frame {
             Some((_, output)) => Ok(output.clone()),
-            None => self.produce(&subscriber.spec, current, round.wanted).await,
+            None => self.produce(&subscriber.spec, current, round.attributes).await,
         };
-        if let (None, Ok(output @ StepOutput { body: OutputBody::Frame(_), .. })) = (shared, &output) {
+        if let (None, Ok(output @ StepOutput { body: OutputBody::Frame(_), .. })) = (drawn_frame, &output) {
             round.drawn_frames.push((subscriber.spec, output.clone()));
         }
         subscriber.take_permit().send(output.map(|output| StepOutput { skipped, ..output }))
     }
 
-    /// Measures for how long a subscriber without capacity has blocked the writer. Returns false when it is cut off.
+    /// Disconnects a subscriber without a credit that has blocked the writer for too long. Returns false in that case.
     fn check_stall(&self, subscriber: &mut Subscriber, mode: DeliveryMode) -> bool {
         if !(mode.applies_back_pressure && subscriber.delivery == Delivery::Lossless) {
             subscriber.stalled_since = None;
             return true;
         }
-        let since = *subscriber.stalled_since.get_or_insert_with(Instant::now);
-        let is_within_timeout = since.elapsed() < self.stall_timeout;
+        let stalled_since = *subscriber.stalled_since.get_or_insert_with(Instant::now);
+        let is_within_timeout = stalled_since.elapsed() < self.stall_timeout;
         if !is_within_timeout {
             let (scene, seconds) = (&self.scene.name, self.stall_timeout.as_secs());
-            tracing::warn!(scene, seconds, "a lossless subscriber did not read and is cut off");
-            subscriber.disconnect(Error::Busy { queue: "this lossless subscriber, which did not read,", limit: 2 });
+            tracing::warn!(scene, seconds, "a lossless subscriber did not read and is disconnected");
+            let error = Error::Busy { queue: "queue of unread results of this subscriber", limit: LOSSLESS_CREDITS };
+            subscriber.disconnect(error);
         }
         is_within_timeout
     }
 
-    /// Draws, picks or copies the current step. A copy also covers the attributes in `others`.
+    /// Draws, picks or copies the current step. A copy also includes `other_attributes`.
     async fn produce(
         &mut self,
         spec: &OutputSpec,
         current: &CurrentStep,
-        others: VertexAttributes,
+        other_attributes: VertexAttributes,
     ) -> Result<StepOutput> {
         let mut stages = current.stages.clone();
         let (id, device) = (self.scene.id, &self.device);
@@ -363,9 +376,9 @@ impl OutputProducer {
                 let hits = device.pick(id, camera, picture, rectangle).await?;
                 OutputBody::Pick(with_transforms(&current.state, &self.scene.scene, hits))
             }
-            OutputSpec::Vertices(wanted) => {
-                let CachedVertices { surface, ms, .. } = self.vertices(wanted, others).await?;
-                stages.push((Stage::Copy, ms));
+            OutputSpec::Vertices(attributes) => {
+                let CachedVertices { surface, copy_ms, .. } = self.copy_vertices(attributes, other_attributes).await?;
+                stages.push((Stage::Copy, copy_ms));
                 OutputBody::Vertices(surface)
             }
         };
@@ -375,19 +388,19 @@ impl OutputProducer {
     /// Whether a request can be answered now. `run` is the run of the latest writer.
     ///
     /// # Errors
-    /// `Gone` when the scene has passed the exact step that is asked for.
+    /// `Gone` when the scene has passed the requested exact step.
     fn is_reached(&self, selector: StepSelector, current: &CurrentStep, run: u64) -> Result<bool> {
         let is_of_this_run = current.state.run == run && run > 0;
-        let here = is_of_this_run.then_some(current.state.step);
-        match (selector, here) {
+        let current_number = is_of_this_run.then_some(current.state.step);
+        match (selector, current_number) {
             (StepSelector::Current, _) => Ok(true),
-            (StepSelector::Exact(want), Some(here)) if here > want => Err(Error::Gone {
+            (StepSelector::Exact(requested), Some(current_number)) if current_number > requested => Err(Error::Gone {
                 what: "exact_step",
-                expected: format!("{here}, the step that scene '{}' shows, or a later one", self.scene.name),
-                given: want.to_string(),
+                expected: format!("{current_number} (the current step of scene '{}') or later", self.scene.name),
+                given: requested.to_string(),
             }),
-            (StepSelector::Exact(want), Some(here)) => Ok(here == want),
-            (StepSelector::Minimum(want), Some(here)) => Ok(here >= want),
+            (StepSelector::Exact(requested), Some(current_number)) => Ok(current_number == requested),
+            (StepSelector::Minimum(requested), Some(current_number)) => Ok(current_number >= requested),
             (StepSelector::Exact(_) | StepSelector::Minimum(_), None) => Ok(false),
         }
     }
@@ -397,16 +410,21 @@ impl OutputProducer {
         self.cached.as_ref().map_or(VertexAttributes::default(), |cached| cached.attributes)
     }
 
-    /// The current vertices with at least the wanted attributes. They are copied from the device once per step unless a
-    /// later request needs further attributes; a copy also covers `others`.
-    async fn vertices(&mut self, wanted: VertexAttributes, others: VertexAttributes) -> Result<CachedVertices> {
-        if let Some(cached) = self.cached.as_ref().filter(|cached| cached.attributes.contains(wanted)) {
+    /// Returns the current vertices with at least the given attributes. They are copied from the device once per step
+    /// unless a later request needs further attributes. A copy also includes `other_attributes`.
+    async fn copy_vertices(
+        &mut self,
+        attributes: VertexAttributes,
+        other_attributes: VertexAttributes,
+    ) -> Result<CachedVertices> {
+        if let Some(cached) = self.cached.as_ref().filter(|cached| cached.attributes.contains(attributes)) {
             return Ok(cached.clone());
         }
         // The cached attributes are copied again, so that alternating readers do not evict each other's attributes.
-        let attributes = self.cached_attributes().union(wanted).union(others);
-        let (surface, ms) = self.device.read_vertices(self.scene.id, attributes).wait().await?;
-        Ok(self.cached.insert(CachedVertices { surface, attributes, ms }).clone())
+        let copied_attributes = self.cached_attributes().union(attributes).union(other_attributes);
+        let CopiedVertices { surface, copy_ms } =
+            self.device.read_vertices(self.scene.id, copied_attributes).wait().await?;
+        Ok(self.cached.insert(CachedVertices { surface, attributes: copied_attributes, copy_ms }).clone())
     }
 }
 
@@ -422,10 +440,23 @@ mod tests {
     use modalcast_model::scene::{Camera, FrameSize, SceneState};
     use modalcast_render::{FrameImage, RasterBackends};
 
-    const ALONE: DeliveryMode = DeliveryMode { applies_back_pressure: false, overlaps_next_step: false };
-    const OVERLAPPED: DeliveryMode = DeliveryMode { overlaps_next_step: true, ..ALONE };
+    const WITHOUT_NEXT_STEP: DeliveryMode = DeliveryMode { applies_back_pressure: false, overlaps_next_step: false };
+    const WITH_NEXT_STEP: DeliveryMode = DeliveryMode { overlaps_next_step: true, ..WITHOUT_NEXT_STEP };
 
-    /// The delivery of a scene to some subscribers, and the receiver of its device commands.
+    /// The outputs that the subscribers of a test have received: width of the frame and step number.
+    #[derive(Debug, PartialEq)]
+    struct ReceivedFrame {
+        width: u32,
+        step: u64,
+    }
+
+    /// A frame that was requested from the device.
+    struct DrawRequest {
+        width: u32,
+        reply: Reply<FrameImage>,
+    }
+
+    /// Creates the delivery of a scene to some subscribers, and the receiver of its device commands.
     fn delivery_to(subscribers: Vec<Subscriber>) -> (OutputDelivery, mpsc::Receiver<Command>) {
         let (device, commands) = DeviceHandle::mock();
         let scene = SceneOnDevice { name: "strips".into(), id: 1, scene: testing::two_strips() };
@@ -433,14 +464,14 @@ mod tests {
         (OutputDelivery { subscribers, ..delivery }, commands)
     }
 
-    /// The scene's step with this number, which is also its count.
-    fn current(step: u64) -> CurrentStep {
-        let state = SceneState { run: 1, step, ..SceneState::rest(&testing::two_strips()) };
-        CurrentStep { state: Arc::new(state), count: step, stages: Vec::new() }
+    /// The current step with this step number and step count.
+    fn current_step(number: u64) -> CurrentStep {
+        let state = SceneState { run: 1, step: number, ..SceneState::rest(&testing::two_strips()) };
+        CurrentStep { state: Arc::new(state), step_count: number, stages: Vec::new() }
     }
 
-    /// A subscriber to frames of this width in pixels.
-    fn subscriber(delivery: Delivery, width: u32) -> (Subscriber, Subscription) {
+    /// Subscribes to frames of this width in pixels.
+    fn subscribe(delivery: Delivery, width: u32) -> (Subscriber, Subscription) {
         let camera = Camera::fit_to_scene(&testing::two_strips(), width, 8);
         Subscription::new(
             OutputSpec::Frame { camera, size: FrameSize::new(width, 8), frame_output: FrameOutput::Color },
@@ -449,15 +480,15 @@ mod tests {
         )
     }
 
-    /// The next frame that is requested from the device within `ms` milliseconds: its width and its reply channel.
-    async fn asked(device: &mut mpsc::Receiver<Command>, ms: u64) -> Option<(u32, Reply<FrameImage>)> {
+    /// Returns the next frame that is requested from the device within `ms` milliseconds.
+    async fn next_draw_request(device: &mut mpsc::Receiver<Command>, ms: u64) -> Option<DrawRequest> {
         match timeout(Duration::from_millis(ms), device.recv()).await.ok()?? {
-            Command::Draw { size, reply, .. } => Some((size.width, reply)),
+            Command::Draw { size, reply, .. } => Some(DrawRequest { width: size.width, reply }),
             _ => None,
         }
     }
 
-    fn answer((width, reply): (u32, Reply<FrameImage>)) {
+    fn answer(DrawRequest { width, reply }: DrawRequest) {
         reply
             .send(Ok(FrameImage {
                 width,
@@ -466,92 +497,110 @@ mod tests {
                 times: modalcast_render::FrameTimes::default(),
                 raster_backends: RasterBackends::default(),
             }))
-            .expect("somebody waits");
+            .expect("expected a caller that waits");
     }
 
-    /// Delivers the second step to a viewer whose frame of the first step is in flight, then to a viewer with capacity.
-    /// Returns the width of the frame that is requested before the frame in flight completes, if any, and the widths
-    /// and steps that both viewers receive.
-    async fn served(delivery: Delivery) -> (Option<u32>, Vec<(u32, u64)>) {
-        let ((slow, mut slow_feed), (fast, mut fast_feed)) =
-            (subscriber(delivery, 16), subscriber(Delivery::Lossless, 24));
-        // Polling grants a `Latest` feed one credit; a lossless feed has credits from the start.
-        timeout(Duration::ZERO, slow_feed.next()).await.expect_err("nothing yet");
-        let (mut delivery, mut device) = delivery_to(vec![slow]);
-        delivery.serve_subscribers(&current(1), OVERLAPPED).await;
-        let first = asked(&mut device, 10_000).await.expect("the first frame");
-        delivery.subscribers.push(fast);
-        let second = current(2);
-        let serving = async {
-            delivery.serve_subscribers(&second, ALONE).await;
+    /// Outcome of [`serve_slow_and_fast`].
+    struct ServedFrames {
+        /// Width of the frame that is requested while the first frame is still in flight.
+        requested_early: Option<u32>,
+        /// First the frames of the slow subscriber, then those of the fast one.
+        received: Vec<ReceivedFrame>,
+    }
+
+    /// Delivers the second step to a slow subscriber (width 16), whose frame of the first step is in flight, and to a
+    /// fast one (width 24), which has credits.
+    async fn serve_slow_and_fast(slow_delivery: Delivery) -> ServedFrames {
+        let (slow_subscriber, mut slow_subscription) = subscribe(slow_delivery, 16);
+        let (fast_subscriber, mut fast_subscription) = subscribe(Delivery::Lossless, 24);
+        // Polling grants a `Latest` subscription one credit. A lossless subscription has credits from the start.
+        timeout(Duration::ZERO, slow_subscription.next()).await.expect_err("expected no frame yet");
+        let (mut delivery, mut device) = delivery_to(vec![slow_subscriber]);
+        delivery.serve_subscribers(&current_step(1), WITH_NEXT_STEP).await;
+        let first_request = next_draw_request(&mut device, 10_000).await.expect("expected the first frame");
+        delivery.subscribers.push(fast_subscriber);
+        let second_step = current_step(2);
+        let deliver = async {
+            delivery.serve_subscribers(&second_step, WITHOUT_NEXT_STEP).await;
             delivery.flush().await;
         };
-        let playing = async {
-            let before = asked(&mut device, 500).await;
-            let soon = before.as_ref().map(|(width, _)| *width);
-            answer(first);
-            before.into_iter().for_each(answer);
-            while let Some(next) = asked(&mut device, 500).await {
-                answer(next);
+        let draw = async {
+            let early_request = next_draw_request(&mut device, 500).await;
+            let requested_early = early_request.as_ref().map(|request| request.width);
+            answer(first_request);
+            early_request.into_iter().for_each(answer);
+            while let Some(request) = next_draw_request(&mut device, 500).await {
+                answer(request);
             }
-            soon
+            requested_early
         };
-        let (_, soon) = tokio::join!(serving, playing);
-        let mut got = Vec::new();
-        for subscription in [&mut slow_feed, &mut fast_feed] {
+        let ((), requested_early) = tokio::join!(deliver, draw);
+        let mut received = Vec::new();
+        for subscription in [&mut slow_subscription, &mut fast_subscription] {
             while let Ok(Ok(StepOutput { step, body: OutputBody::Frame(image), .. })) =
                 timeout(Duration::ZERO, subscription.next()).await
             {
-                got.push((image.width, step.number));
+                received.push(ReceivedFrame { width: image.width, step: step.number });
             }
         }
-        (soon, got)
+        ServedFrames { requested_early, received }
     }
 
     #[tokio::test]
-    async fn a_viewer_whose_frame_is_late_and_who_has_no_room_keeps_nobody_waiting() {
-        assert_eq!(served(Delivery::Latest).await, (Some(24), vec![(16, 1), (24, 2)]));
+    async fn subscriber_without_credit_delays_no_other_subscriber() {
+        let served = serve_slow_and_fast(Delivery::Latest).await;
+        assert_eq!(served.requested_early, Some(24));
+        assert_eq!(served.received, [ReceivedFrame { width: 16, step: 1 }, ReceivedFrame { width: 24, step: 2 }]);
     }
 
-    /// Delivers a step to three viewers, two of which share a view. Returns how many frames the device draws and the
-    /// widths that the viewers receive.
-    async fn drawn_for_three(has_next: bool) -> (usize, Vec<u32>) {
-        let (subscribers, feeds): (Vec<_>, Vec<_>) =
-            [16, 24, 16].map(|width| subscriber(Delivery::Lossless, width)).into_iter().unzip();
+    #[tokio::test]
+    async fn lossless_subscriber_receives_its_frames_in_order() {
+        let served = serve_slow_and_fast(Delivery::Lossless).await;
+        assert_eq!(served.requested_early, None);
+        let expected = [(16, 1), (16, 2), (24, 2)].map(|(width, step)| ReceivedFrame { width, step });
+        assert_eq!(served.received, expected);
+    }
+
+    /// Outcome of [`serve_three_subscribers`].
+    #[derive(Debug, PartialEq)]
+    struct SharedFrames {
+        drawn_count: usize,
+        received_widths: Vec<u32>,
+    }
+
+    /// Delivers a step to three subscribers, of which the first and the third have the same view.
+    async fn serve_three_subscribers(mode: DeliveryMode) -> SharedFrames {
+        let (subscribers, subscriptions): (Vec<_>, Vec<_>) =
+            [16, 24, 16].map(|width| subscribe(Delivery::Lossless, width)).into_iter().unzip();
         let (mut delivery, mut device) = delivery_to(subscribers);
-        let first = current(1);
-        let serving = async {
-            delivery.serve_subscribers(&first, if has_next { OVERLAPPED } else { ALONE }).await;
+        let step = current_step(1);
+        let deliver = async {
+            delivery.serve_subscribers(&step, mode).await;
             delivery.flush().await;
         };
-        let drawing = async {
-            let mut drawn = 0;
-            while let Some(frame) = asked(&mut device, 500).await {
-                answer(frame);
-                drawn += 1;
+        let draw = async {
+            let mut drawn_count = 0;
+            while let Some(request) = next_draw_request(&mut device, 500).await {
+                answer(request);
+                drawn_count += 1;
             }
-            drawn
+            drawn_count
         };
-        let ((), drawn) = tokio::join!(serving, drawing);
-        let mut got = Vec::new();
-        for mut subscription in feeds {
-            let next = timeout(Duration::from_secs(10), subscription.next()).await.expect("a frame");
-            let Ok(StepOutput { body: OutputBody::Frame(frame), .. }) = next else { panic!("a frame") };
-            got.push(frame.width);
+        let ((), drawn_count) = tokio::join!(deliver, draw);
+        let mut received_widths = Vec::new();
+        for mut subscription in subscriptions {
+            let output = timeout(Duration::from_secs(10), subscription.next()).await.expect("expected a frame in time");
+            let Ok(StepOutput { body: OutputBody::Frame(frame), .. }) = output else { panic!("expected a frame") };
+            received_widths.push(frame.width);
         }
-        (drawn, got)
+        SharedFrames { drawn_count, received_widths }
     }
 
     #[tokio::test]
-    async fn viewers_of_one_view_share_one_drawing_of_a_step() {
-        for has_next in [false, true] {
-            assert_eq!(drawn_for_three(has_next).await, (2, vec![16, 24, 16]), "a step waits: {has_next}");
+    async fn subscribers_with_the_same_view_share_one_frame() {
+        for mode in [WITHOUT_NEXT_STEP, WITH_NEXT_STEP] {
+            let expected = SharedFrames { drawn_count: 2, received_widths: vec![16, 24, 16] };
+            assert_eq!(serve_three_subscribers(mode).await, expected, "{mode:?}");
         }
-    }
-
-    #[tokio::test]
-    async fn a_viewer_who_has_room_gets_what_is_late_first() {
-        let (soon, got) = served(Delivery::Lossless).await;
-        assert_eq!((soon, got), (None, vec![(16, 1), (16, 2), (24, 2)]));
     }
 }

@@ -1,5 +1,5 @@
-//! Device-to-host readbacks in flight. Vertices are read back while the next step is computed; frames are drawn and
-//! read back while the next step is computed and its own frames are submitted. Readbacks are delivered in order as they
+//! Device-to-host readbacks in flight. Vertices are read back while the next step is computed. Frames are drawn and
+//! read back while the next step is computed and its frames are submitted. Readbacks are delivered in order as they
 //! complete. In the diagrams `read` is the transfer of the pixels to host-readable memory.
 //!
 //! A deformer with its own vertex memory computes concurrently with the frames in flight:
@@ -26,7 +26,7 @@ use std::sync::Arc;
 use super::current_step::CurrentStep;
 use super::step_queue::CompletedStep;
 use super::subscriber::{SendPermit, Subscriber};
-use crate::engine::device::command::TimedVertices;
+use crate::engine::device::command::CopiedVertices;
 use crate::engine::device::handle::PendingReply;
 use crate::engine::output::step_output::{OutputBody, OutputSpec, StepId, StepOutput, stage_times};
 use crate::telemetry::{Stage, StageTimes};
@@ -36,7 +36,7 @@ use modalcast_render::FrameImage;
 
 /// The pending result of a readback.
 pub(super) enum Readback {
-    Vertices(PendingReply<TimedVertices>),
+    Vertices(PendingReply<CopiedVertices>),
     Frame(OutputSpec, PendingReply<FrameImage>),
 }
 
@@ -44,12 +44,12 @@ impl Readback {
     /// Waits for the result; returns it with its stage times. Cancel-safe.
     async fn recv(&mut self) -> Result<(OutputBody, StageTimes)> {
         match self {
-            Self::Vertices(copying) => {
-                let (surface, ms) = copying.recv().await?;
-                Ok((OutputBody::Vertices(surface), vec![(Stage::Copy, ms)]))
+            Self::Vertices(pending_vertices) => {
+                let CopiedVertices { surface, copy_ms } = pending_vertices.recv().await?;
+                Ok((OutputBody::Vertices(surface), vec![(Stage::Copy, copy_ms)]))
             }
-            Self::Frame(_, drawing) => {
-                let image = drawing.recv().await?;
+            Self::Frame(_, pending_image) => {
+                let image = pending_image.recv().await?;
                 let stages = stage_times(&image.times);
                 Ok((OutputBody::Frame(Arc::new(image.into())), stages))
             }
@@ -66,9 +66,9 @@ pub(super) struct Recipient {
 }
 
 impl Recipient {
-    /// Takes one of the subscriber's credits for the result of step number `count`.
-    pub(super) fn of(subscriber: &mut Subscriber, count: u64) -> Self {
-        Self { skipped: subscriber.mark_delivered(count), permit: subscriber.take_permit() }
+    /// Takes one of the subscriber's credits for the result of the scene's `step_count`-th step.
+    pub(super) fn of(subscriber: &mut Subscriber, step_count: u64) -> Self {
+        Self { skipped: subscriber.mark_delivered(step_count), permit: subscriber.take_permit() }
     }
 }
 
@@ -76,13 +76,13 @@ impl Recipient {
 pub(super) struct PendingReadback {
     readback: Readback,
     /// The scene's step count when the readback was started.
-    count: u64,
+    step_count: u64,
     step: StepId,
     stages: StageTimes,
     origins: Option<Arc<FloatingOrigins>>,
     recipients: Vec<Recipient>,
     /// The step whose acknowledgement follows this readback, because it is the last one of the step.
-    acknowledges: Option<CompletedStep>,
+    step_to_acknowledge: Option<CompletedStep>,
 }
 
 impl PendingReadback {
@@ -90,18 +90,18 @@ impl PendingReadback {
     pub(super) fn new(current: &CurrentStep, readback: Readback, recipients: Vec<Recipient>) -> Self {
         Self {
             readback,
-            count: current.count,
+            step_count: current.step_count,
             step: current.id(),
             stages: current.stages.clone(),
             origins: current.state.origins.clone(),
             recipients,
-            acknowledges: None,
+            step_to_acknowledge: None,
         }
     }
 
-    /// Whether this is a color frame of the view in step number `count`.
-    pub(super) fn is_frame_of(&self, count: u64, view: &OutputSpec) -> bool {
-        self.count == count && matches!(&self.readback, Readback::Frame(spec, _) if spec == view)
+    /// Whether this is a color frame of the view in the scene's `step_count`-th step.
+    pub(super) fn is_frame_of(&self, step_count: u64, view: &OutputSpec) -> bool {
+        self.step_count == step_count && matches!(&self.readback, Readback::Frame(spec, _) if spec == view)
     }
 
     pub(super) fn add_recipient(&mut self, recipient: Recipient) {
@@ -132,12 +132,12 @@ impl ReadbackQueue {
         self.pending.iter_mut()
     }
 
-    /// Attaches the acknowledgement of the step with this count to its last readback in flight. Returns the step if none
-    /// is in flight.
-    pub(super) fn attach(&mut self, count: u64, step: CompletedStep) -> Option<CompletedStep> {
-        match self.pending.back_mut().filter(|pending| pending.count == count) {
-            Some(pending) => {
-                pending.acknowledges = Some(step);
+    /// Attaches the acknowledgement of a step to its last readback in flight. Returns the step if it has no readback in
+    /// flight.
+    pub(super) fn attach_acknowledgement(&mut self, step_count: u64, step: CompletedStep) -> Option<CompletedStep> {
+        match self.pending.back_mut().filter(|newest| newest.step_count == step_count) {
+            Some(newest) => {
+                newest.step_to_acknowledge = Some(step);
                 None
             }
             None => Some(step),
@@ -146,28 +146,29 @@ impl ReadbackQueue {
 
     /// Waits for the oldest readback and delivers it. Cancel-safe.
     pub(super) async fn deliver_oldest(&mut self) {
-        let Some(pending) = self.pending.front_mut() else { return };
-        let result = pending.readback.recv().await;
-        let Some(PendingReadback { step, stages, origins, recipients, acknowledges, .. }) = self.pending.pop_front()
+        let Some(oldest) = self.pending.front_mut() else { return };
+        let result = oldest.readback.recv().await;
+        let Some(PendingReadback { step, stages, origins, recipients, step_to_acknowledge, .. }) =
+            self.pending.pop_front()
         else {
             return;
         };
         for Recipient { permit, skipped } in recipients {
-            let (before, origins) = (stages.clone(), origins.clone());
-            let output = result.clone().map(|(body, own)| {
-                let stages = before.into_iter().chain(own).collect();
+            let (step_stages, origins) = (stages.clone(), origins.clone());
+            let output = result.clone().map(|(body, readback_stages)| {
+                let stages = step_stages.into_iter().chain(readback_stages).collect();
                 StepOutput { step, skipped, stages, origins, body }
             });
             permit.send(output);
         }
-        if let Some(step) = acknowledges {
+        if let Some(step) = step_to_acknowledge {
             step.acknowledge();
         }
     }
 
-    /// Delivers all readbacks of steps whose count is below `count`.
-    pub(super) async fn flush_before(&mut self, count: u64) {
-        while self.pending.front().is_some_and(|pending| pending.count < count) {
+    /// Delivers all readbacks of the steps before the scene's `step_count`-th step.
+    pub(super) async fn flush_before(&mut self, step_count: u64) {
+        while self.pending.front().is_some_and(|pending| pending.step_count < step_count) {
             self.deliver_oldest().await;
         }
     }
@@ -177,8 +178,8 @@ impl ReadbackQueue {
         self.flush_before(u64::MAX).await;
     }
 
-    /// Delivers readbacks until no vertices are in flight. The submission of the next step does not wait for vertices,
-    /// but its results must not overtake them.
+    /// Delivers readbacks until no vertices are in flight. The next step is submitted before its predecessor's vertices
+    /// are delivered, but the results of the next step must not overtake them.
     pub(super) async fn flush_vertices(&mut self) {
         while self.pending.iter().any(|pending| matches!(pending.readback, Readback::Vertices(_))) {
             self.deliver_oldest().await;

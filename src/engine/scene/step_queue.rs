@@ -28,25 +28,30 @@ pub(in crate::engine) struct QueuedStep {
     /// Number of older steps that were merged into this one.
     pub merged: u64,
     parse_ms: f64,
-    since: Instant,
+    queued_at: Instant,
 }
 
 impl QueuedStep {
     pub(in crate::engine) fn new(update: StepUpdate, parse_ms: f64) -> Self {
-        Self { update, merged: 0, parse_ms, since: Instant::now() }
+        Self { update, merged: 0, parse_ms, queued_at: Instant::now() }
     }
 
     /// Parse time, and queue time until now.
     pub(in crate::engine) fn stages(&self) -> StageTimes {
-        vec![(Stage::Parse, self.parse_ms), (Stage::Queue, ms_since(self.since))]
+        vec![(Stage::Parse, self.parse_ms), (Stage::Queue, ms_since(self.queued_at))]
     }
 }
 
 /// The outcome of a step.
 #[derive(Debug, Clone, PartialEq)]
 pub enum StepReport {
-    /// All steps up to this one are completed or superseded. `skipped` counts the steps merged since the stream began.
-    Done { step: u64, skipped: u64, stages: StageTimes },
+    /// All steps up to this one are completed or merged into a later one.
+    Done {
+        step: u64,
+        /// Number of steps that were merged into later ones since the stream began.
+        skipped: u64,
+        stages: StageTimes,
+    },
     /// The step failed; the scene is as it was before the step.
     Rejected { step: u64, error: Error },
 }
@@ -56,11 +61,11 @@ pub enum StepReport {
 pub(in crate::engine) struct StepQueue {
     policy: Policy,
     window: usize,
-    inner: Mutex<QueueState>,
-    /// Notifies the scene of a new step or a closed queue.
-    scene: Arc<Notify>,
-    /// Notifies the writer of a report or the end.
-    writer: Notify,
+    state: Mutex<QueueState>,
+    /// Wakes the scene: a step was queued or the queue was closed.
+    scene_wake: Arc<Notify>,
+    /// Wakes the writer: a report was added or the queue has ended.
+    writer_wake: Notify,
 }
 
 /// A computed step whose acknowledgement is outstanding.
@@ -86,8 +91,8 @@ impl CompletedStep {
     }
 }
 
-/// The writer's lease on a scene. Dropping it closes the queue and admits the next writer, also if the reply that
-/// carries the lease is dropped because the client has disconnected.
+/// The writer's lease on a scene. Dropping it closes the queue and admits the next writer. A reply that carries the
+/// lease is dropped if the client has disconnected, which also releases the lease.
 #[derive(Debug)]
 pub(in crate::engine) struct WriterLease(pub Arc<StepQueue>);
 
@@ -100,20 +105,22 @@ impl Drop for WriterLease {
 #[derive(Debug, Default)]
 struct QueueState {
     queued: VecDeque<QueuedStep>,
-    /// Numbers of the steps taken and not yet reported, oldest first. More than one while readbacks of the earlier ones
-    /// are in flight.
+    /// Numbers of the steps that were taken and not yet reported, oldest first. There are several while readbacks of
+    /// the earlier ones are in flight.
     in_progress: VecDeque<u64>,
     reports: VecDeque<StepReport>,
+    /// Number of steps that were merged into later ones.
     skipped: u64,
-    /// The writer has dropped its lease.
-    closed: bool,
+    /// Whether the writer has dropped its lease.
+    is_closed: bool,
     /// The error with which the server ended the queue.
-    ended: Option<Error>,
+    end_error: Option<Error>,
 }
 
 impl StepQueue {
-    pub(in crate::engine) fn new(policy: Policy, window: u32, scene: Arc<Notify>) -> Self {
-        Self { policy, window: window.max(1) as usize, inner: Mutex::default(), scene, writer: Notify::new() }
+    pub(in crate::engine) fn new(policy: Policy, window: u32, scene_wake: Arc<Notify>) -> Self {
+        let window = window.max(1) as usize;
+        Self { policy, window, state: Mutex::default(), scene_wake, writer_wake: Notify::new() }
     }
 
     pub(in crate::engine) const fn policy(&self) -> Policy {
@@ -125,31 +132,35 @@ impl StepQueue {
     /// # Errors
     /// `Invalid` naming the window when the step is beyond it, or the error that ended the queue.
     pub(in crate::engine) fn push(&self, step: QueuedStep) -> Result<()> {
-        let mut inner = self.lock();
-        if let Some(error) = &inner.ended {
+        let mut state = self.lock();
+        if let Some(error) = &state.end_error {
             return Err(error.clone());
         }
-        match (self.policy, inner.queued.pop_back()) {
-            (Policy::Latest, Some(older)) => {
-                inner.skipped += 1;
-                let merged = older.merged + 1;
-                inner.queued.push_back(QueuedStep { update: step.update.merged_after(&older.update), merged, ..step });
+        match (self.policy, state.queued.pop_back()) {
+            (Policy::Latest, Some(previous)) => {
+                state.skipped += 1;
+                let merged = previous.merged + 1;
+                state.queued.push_back(QueuedStep {
+                    update: step.update.merged_after(&previous.update),
+                    merged,
+                    ..step
+                });
             }
-            (_, last) => {
-                inner.queued.extend(last);
-                self.check_window(&inner, step.update.number)?;
-                inner.queued.push_back(step);
+            (_, previous) => {
+                state.queued.extend(previous);
+                self.check_window(&state, step.update.number)?;
+                state.queued.push_back(step);
             }
         }
-        self.scene.notify_one();
+        self.scene_wake.notify_one();
         Ok(())
     }
 
     /// Removes the next step to compute. The step counts against the window until its report is taken.
     pub(in crate::engine) fn take(&self) -> Option<QueuedStep> {
-        let mut inner = self.lock();
-        let step = inner.queued.pop_front()?;
-        inner.in_progress.push_back(step.update.number);
+        let mut state = self.lock();
+        let step = state.queued.pop_front()?;
+        state.in_progress.push_back(step.update.number);
         Some(step)
     }
 
@@ -158,29 +169,29 @@ impl StepQueue {
         !self.lock().queued.is_empty()
     }
 
-    /// Reports the outcome of the oldest step in progress; does nothing if there is none.
+    /// Reports the outcome of the oldest step in progress. Does nothing if no step is in progress.
     pub(super) fn report(&self, outcome: Result<StageTimes>) {
-        let mut inner = self.lock();
-        let Some(step) = inner.in_progress.pop_front() else { return };
-        let skipped = inner.skipped;
+        let mut state = self.lock();
+        let Some(step) = state.in_progress.pop_front() else { return };
+        let skipped = state.skipped;
         let report = match outcome {
             Ok(stages) => StepReport::Done { step, skipped, stages },
             Err(error) => StepReport::Rejected { step, error },
         };
-        // Under `latest` a writer may read reports slowly. A newer `Done` covers the older one and replaces it.
-        // `Rejected` is never replaced. A writer that reads none of them is cut off with the rejection that exceeds the
-        // window; that one and later reports are dropped.
+        // Under `latest` a writer may read reports slowly. A newer `Done` also reports the older steps, so it replaces
+        // the older `Done`. `Rejected` is never replaced. The first rejection beyond the window ends the queue, and
+        // reports from then on are dropped.
         let supersedes =
-            matches!((inner.reports.back(), &report), (Some(StepReport::Done { .. }), StepReport::Done { .. }));
-        if inner.reports.len() >= self.window && supersedes {
-            inner.reports.pop_back();
+            matches!((state.reports.back(), &report), (Some(StepReport::Done { .. }), StepReport::Done { .. }));
+        if state.reports.len() >= self.window && supersedes {
+            state.reports.pop_back();
         }
-        if inner.reports.len() > self.window {
-            inner.ended.get_or_insert(Error::Busy { queue: "replies not read by the writer", limit: self.window });
+        if state.reports.len() > self.window {
+            state.end_error.get_or_insert(Error::Busy { queue: "replies not read by the writer", limit: self.window });
         } else {
-            inner.reports.push_back(report);
+            state.reports.push_back(report);
         }
-        self.writer.notify_one();
+        self.writer_wake.notify_one();
     }
 
     /// Waits for the next report. Cancel-safe.
@@ -190,56 +201,56 @@ impl StepQueue {
     pub(in crate::engine) async fn next_report(&self) -> Result<StepReport> {
         loop {
             {
-                let mut inner = self.lock();
-                if let Some(report) = inner.reports.pop_front() {
+                let mut state = self.lock();
+                if let Some(report) = state.reports.pop_front() {
                     return Ok(report);
                 }
-                if let Some(error) = &inner.ended {
+                if let Some(error) = &state.end_error {
                     return Err(error.clone());
                 }
             }
-            self.writer.notified().await;
+            self.writer_wake.notified().await;
         }
     }
 
     /// Whether every accepted step is reported and every report is taken.
     pub(in crate::engine) fn is_drained(&self) -> bool {
-        let inner = self.lock();
-        inner.in_progress.is_empty() && inner.queued.is_empty() && inner.reports.is_empty()
+        let state = self.lock();
+        state.in_progress.is_empty() && state.queued.is_empty() && state.reports.is_empty()
     }
 
     /// Called when the writer drops its lease. Drops the queued steps.
     pub(in crate::engine) fn close(&self) {
-        let mut inner = self.lock();
-        inner.closed = true;
-        inner.queued.clear();
-        self.scene.notify_one();
+        let mut state = self.lock();
+        state.is_closed = true;
+        state.queued.clear();
+        self.scene_wake.notify_one();
     }
 
     pub(in crate::engine) fn is_closed(&self) -> bool {
-        let inner = self.lock();
-        inner.closed || inner.ended.is_some()
+        let state = self.lock();
+        state.is_closed || state.end_error.is_some()
     }
 
     /// Ends the queue with an error from the scene. Drops the queued steps.
     pub(in crate::engine) fn end(&self, error: Error) {
-        let mut inner = self.lock();
-        inner.ended.get_or_insert(error);
-        inner.queued.clear();
-        self.writer.notify_one();
+        let mut state = self.lock();
+        state.end_error.get_or_insert(error);
+        state.queued.clear();
+        self.writer_wake.notify_one();
     }
 
-    fn check_window(&self, inner: &QueueState, number: u64) -> Result<()> {
-        let open = inner.queued.len() + inner.in_progress.len() + inner.reports.len();
-        if self.policy == Policy::Lossless && open >= self.window {
+    fn check_window(&self, state: &QueueState, number: u64) -> Result<()> {
+        let unacknowledged = state.queued.len() + state.in_progress.len() + state.reports.len();
+        if self.policy == Policy::Lossless && unacknowledged >= self.window {
             let expected = format!("at most {} steps without acknowledgement", self.window);
-            return Err(invalid("window", expected, format!("step {number} as number {}", open + 1)));
+            return Err(invalid("window", expected, format!("step {number} as number {}", unacknowledged + 1)));
         }
         Ok(())
     }
 
     fn lock(&self) -> MutexGuard<'_, QueueState> {
-        lock(&self.inner)
+        lock(&self.state)
     }
 }
 
@@ -257,60 +268,60 @@ mod tests {
     }
 
     #[test]
-    fn a_lossless_lane_refuses_the_step_beyond_the_window_until_a_report_is_taken() {
+    fn lossless_queue_rejects_steps_beyond_the_window() {
         let step_queue = StepQueue::new(Policy::Lossless, 2, Arc::default());
-        step_queue.push(step(1, 0, [0.0; 2])).expect("first");
-        step_queue.push(step(2, 0, [0.0; 2])).expect("second");
-        let refusal = step_queue.push(step(3, 0, [0.0; 2])).expect_err("beyond").to_string();
-        assert!(refusal.starts_with("window: expected at most 2"), "{refusal}");
+        step_queue.push(step(1, 0, [0.0; 2])).expect("expected capacity for the first step");
+        step_queue.push(step(2, 0, [0.0; 2])).expect("expected capacity for the second step");
+        let error = step_queue.push(step(3, 0, [0.0; 2])).expect_err("expected a full window").to_string();
+        assert!(error.starts_with("window: expected at most 2"), "{error}");
         assert_eq!(step_queue.take().map(|step| step.update.number), Some(1));
         step_queue.report(Ok(vec![]));
-        assert!(step_queue.push(step(3, 0, [0.0; 2])).is_err(), "the report was not taken yet");
-        step_queue.inner.lock().expect("sound").reports.clear();
-        step_queue.push(step(3, 0, [0.0; 2])).expect("room again");
+        assert!(step_queue.push(step(3, 0, [0.0; 2])).is_err(), "expected a full window until the report is taken");
+        step_queue.state.lock().expect("expected an unpoisoned lock").reports.clear();
+        step_queue.push(step(3, 0, [0.0; 2])).expect("expected capacity after the report was taken");
     }
 
     #[test]
-    fn a_latest_lane_merges_to_the_state_that_all_steps_would_have_left() {
+    fn merged_step_has_the_effect_of_all_its_steps() {
         let scene = testing::two_strips();
         let step_queue = StepQueue::new(Policy::Latest, 1, Arc::default());
-        let steps = || [step(1, 0, [1.0, 2.0]), step(2, 1, [3.0, 4.0]), step(5, 0, [5.0, 6.0])];
-        let mut want = SceneState::rest(&scene);
-        for step in steps() {
-            want.apply(&scene, &step.update);
-            step_queue.push(step).expect("never refused");
+        let mut expected_state = SceneState::rest(&scene);
+        for step in [step(1, 0, [1.0, 2.0]), step(2, 1, [3.0, 4.0]), step(5, 0, [5.0, 6.0])] {
+            expected_state.apply(&scene, &step.update);
+            step_queue.push(step).expect("expected a merge beyond the window");
         }
-        let merged = step_queue.take().expect("one step");
-        let mut got = SceneState::rest(&scene);
-        got.apply(&scene, &merged.update);
-        assert_eq!((got, merged.merged), (want, 2));
+        let merged_step = step_queue.take().expect("expected one step");
+        let mut state = SceneState::rest(&scene);
+        state.apply(&scene, &merged_step.update);
+        assert_eq!((state, merged_step.merged), (expected_state, 2));
         assert!(step_queue.take().is_none());
     }
 
     #[tokio::test]
-    async fn a_latest_writer_that_reads_late_hears_of_the_newest_step() {
+    async fn slow_latest_writer_receives_the_newest_report() {
         let step_queue = StepQueue::new(Policy::Latest, 2, Arc::default());
         for number in 1..=9 {
-            step_queue.push(step(number, 0, [0.0; 2])).expect("taken");
-            step_queue.take().expect("in work");
+            step_queue.push(step(number, 0, [0.0; 2])).expect("expected an accepted step");
+            step_queue.take().expect("expected the queued step");
             step_queue.report(Ok(vec![]));
         }
-        let mut heard = Vec::new();
+        let mut reported_numbers = Vec::new();
         while !step_queue.is_drained() {
-            heard.push(step_queue.next_report().await.expect("a report"));
+            match step_queue.next_report().await.expect("expected a report") {
+                StepReport::Done { step, .. } => reported_numbers.push(step),
+                rejected => panic!("expected a completed step, got {rejected:?}"),
+            }
         }
-        let steps: Vec<u64> =
-            heard.iter().map(|r| if let StepReport::Done { step, .. } = r { *step } else { 0 }).collect();
-        assert_eq!(steps, [1, 9]);
+        assert_eq!(reported_numbers, [1, 9]);
     }
 
     #[tokio::test]
-    async fn a_writer_that_reads_no_refusal_is_cut_off_and_an_ended_lane_says_why() {
+    async fn writer_that_reads_no_rejections_is_disconnected() {
         let step_queue = StepQueue::new(Policy::Latest, 1, Arc::default());
         for number in 1..=3 {
             if step_queue.push(step(number, 0, [0.0; 2])).is_ok() {
                 step_queue.take();
-                step_queue.report(Err(invalid("step.q", "less", "more")));
+                step_queue.report(Err(invalid("step.q", "a finite number", "NaN")));
             }
         }
         assert!(matches!(step_queue.next_report().await, Ok(StepReport::Rejected { step: 1, .. })));

@@ -1,7 +1,9 @@
-//! A subscription to a scene: the scene's end ([`Subscriber`]) and the reply stream's end ([`Subscription`]) of a bounded channel
-//! with credit-based flow control. A feed buffers at most two results. With [`Delivery::Latest`] a result is produced
-//! only when the feed is polled. If the future of that poll is dropped, the next poll returns the result that the first
-//! one requested, even if the scene shows a later step by then.
+//! A subscription to a scene: a bounded channel with credit-based flow control. The scene owns the [`Subscriber`],
+//! which sends results. The reply stream owns the [`Subscription`], which receives them and grants credits.
+//!
+//! The channel buffers at most two results. With [`Delivery::Latest`] a result is produced only after
+//! [`Subscription::next`] was polled. If the future of `next` is dropped, the next call returns the result that the
+//! dropped one requested, even if the scene has completed a later step since.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -13,7 +15,7 @@ use crate::engine::output::step_output::{OutputSpec, StepOutput};
 use modalcast_model::error::{Error, Result, fault_in};
 
 /// Results that a lossless subscriber may leave unread before it blocks the writer.
-const LOSSLESS_CREDITS: usize = 2;
+pub(super) const LOSSLESS_CREDITS: usize = 2;
 
 /// Which steps a subscriber receives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,68 +27,69 @@ pub enum Delivery {
     Latest,
 }
 
-/// Why a feed ends. `immediate` aborts a reply that is being sent.
+/// Why a subscription ends.
 #[derive(Debug, Clone)]
 struct EndReason {
     error: Error,
-    immediate: bool,
+    /// Whether buffered results are dropped and a reply that is being sent is aborted.
+    is_immediate: bool,
 }
 
-/// The scene's end of a subscription.
+/// The sender of a subscription, owned by the scene.
 #[derive(Debug)]
 pub(in crate::engine) struct Subscriber {
     pub spec: OutputSpec,
     pub delivery: Delivery,
-    /// The scene's step count at this viewer's last result.
+    /// The scene's step count at this subscriber's last result.
     pub delivered_count: u64,
-    /// When this viewer began to block the writer.
+    /// When this subscriber began to block the writer.
     pub stalled_since: Option<Instant>,
     credits: Arc<AtomicUsize>,
-    items: mpsc::Sender<Result<StepOutput>>,
-    /// Whether it has received an error, which ends the feed.
-    error_sent: Arc<AtomicBool>,
+    results: mpsc::Sender<Result<StepOutput>>,
+    /// Whether an error was sent, which ends the subscription.
+    is_error_sent: Arc<AtomicBool>,
     end: watch::Sender<Option<EndReason>>,
 }
 
-/// A permit to send one result to a viewer; it consumes one credit.
+/// A permit to send one result to a subscriber. It has consumed one credit.
 #[derive(Debug)]
 pub(in crate::engine) struct SendPermit {
-    items: mpsc::Sender<Result<StepOutput>>,
-    error_sent: Arc<AtomicBool>,
+    results: mpsc::Sender<Result<StepOutput>>,
+    is_error_sent: Arc<AtomicBool>,
 }
 
 impl SendPermit {
-    /// Sends a result; an error ends the feed. Returns false when the viewer is to be dropped.
+    /// Sends a result. An error ends the subscription. Returns false if the subscriber must be dropped.
     pub(in crate::engine) fn send(self, output: Result<StepOutput>) -> bool {
-        let lives = output.is_ok();
-        if !lives {
-            self.error_sent.store(true, Ordering::Release);
+        let is_output = output.is_ok();
+        if !is_output {
+            self.is_error_sent.store(true, Ordering::Release);
         }
-        // The channel has capacity for every credit, so this fails only if the feed was dropped or received an error.
-        self.items.try_send(output).is_ok() && lives
+        // The channel has capacity for every credit, so this fails only if the subscription was dropped or has ended.
+        self.results.try_send(output).is_ok() && is_output
     }
 
-    /// Whether the permit belongs to this viewer.
+    /// Whether the permit belongs to this subscriber.
     pub(in crate::engine) fn belongs_to(&self, subscriber: &Subscriber) -> bool {
-        self.items.same_channel(&subscriber.items)
+        self.results.same_channel(&subscriber.results)
     }
 }
 
 impl Subscriber {
-    /// Whether the viewer has a credit for a further result.
+    /// Whether the subscriber has a credit for a further result.
     pub(in crate::engine) fn has_credit(&self) -> bool {
         self.credits.load(Ordering::Acquire) > 0
     }
 
-    /// Whether the feed was dropped or has received a final error.
+    /// Whether the subscription was dropped or an error was sent.
     pub(in crate::engine) fn is_closed(&self) -> bool {
-        self.items.is_closed() || self.error_sent.load(Ordering::Acquire)
+        self.results.is_closed() || self.is_error_sent.load(Ordering::Acquire)
     }
 
-    /// Records that the viewer receives step number `count` of the scene. Returns how many steps it skipped.
-    pub(in crate::engine) fn mark_delivered(&mut self, count: u64) -> u64 {
-        let skipped = count - self.delivered_count - 1;
-        self.delivered_count = count;
+    /// Records the delivery of the scene's `step_count`-th step. Returns how many steps the subscriber has skipped.
+    pub(in crate::engine) fn mark_delivered(&mut self, step_count: u64) -> u64 {
+        let skipped = step_count - self.delivered_count - 1;
+        self.delivered_count = step_count;
         self.stalled_since = None;
         skipped
     }
@@ -94,101 +97,103 @@ impl Subscriber {
     /// Consumes one credit for a result that is sent now or later.
     pub(in crate::engine) fn take_permit(&self) -> SendPermit {
         self.credits.fetch_sub(1, Ordering::AcqRel);
-        SendPermit { items: self.items.clone(), error_sent: Arc::clone(&self.error_sent) }
+        SendPermit { results: self.results.clone(), is_error_sent: Arc::clone(&self.is_error_sent) }
     }
 
-    /// Ends the feed after its buffered results.
+    /// Ends the subscription after its buffered results.
     pub(in crate::engine) fn end(&self, error: Error) {
-        self.end.send_replace(Some(EndReason { error, immediate: false }));
+        self.end.send_replace(Some(EndReason { error, is_immediate: false }));
     }
 
-    /// Ends the feed immediately; see [`Subscription::cut_off`].
+    /// Ends the subscription immediately; see [`Subscription::disconnected`].
     pub(in crate::engine) fn disconnect(&self, error: Error) {
-        self.end.send_replace(Some(EndReason { error, immediate: true }));
+        self.end.send_replace(Some(EndReason { error, is_immediate: true }));
     }
 }
 
-/// The reply stream's end of a subscription.
+/// The receiver of a subscription, owned by a reply stream.
 #[derive(Debug)]
 pub struct Subscription {
     delivery: Delivery,
-    credit_requested: bool,
+    /// Whether a `Latest` subscription has granted a credit whose result was not received yet.
+    has_granted_credit: bool,
     credits: Arc<AtomicUsize>,
-    items: mpsc::Receiver<Result<StepOutput>>,
+    results: mpsc::Receiver<Result<StepOutput>>,
     end: watch::Receiver<Option<EndReason>>,
-    scene: Arc<Notify>,
+    /// Wakes the scene: a credit was granted or the subscription was dropped.
+    scene_wake: Arc<Notify>,
 }
 
 impl Subscription {
-    /// Creates both ends of a subscription. `scene` is notified whenever the feed grants a credit.
-    pub(in crate::engine) fn new(spec: OutputSpec, delivery: Delivery, scene: Arc<Notify>) -> (Subscriber, Self) {
-        let ahead = if delivery == Delivery::Lossless { LOSSLESS_CREDITS } else { 0 };
-        let credits = Arc::new(AtomicUsize::new(ahead));
-        let (items, inbox) = mpsc::channel(LOSSLESS_CREDITS);
-        let (end, ended) = watch::channel(None);
-        let (credit, error_sent) = (Arc::clone(&credits), Arc::default());
+    /// Creates both ends of a subscription. `scene_wake` is notified whenever the subscription grants a credit.
+    pub(in crate::engine) fn new(spec: OutputSpec, delivery: Delivery, scene_wake: Arc<Notify>) -> (Subscriber, Self) {
+        let initial_credits = if delivery == Delivery::Lossless { LOSSLESS_CREDITS } else { 0 };
+        let credits = Arc::new(AtomicUsize::new(initial_credits));
+        let (result_sender, results) = mpsc::channel(LOSSLESS_CREDITS);
+        let (end_sender, end) = watch::channel(None);
         let subscriber = Subscriber {
             spec,
             delivery,
             delivered_count: 0,
             stalled_since: None,
-            credits: credit,
-            items,
-            error_sent,
-            end,
+            credits: Arc::clone(&credits),
+            results: result_sender,
+            is_error_sent: Arc::default(),
+            end: end_sender,
         };
-        (subscriber, Self { delivery, credit_requested: false, credits, items: inbox, end: ended, scene })
+        (subscriber, Self { delivery, has_granted_credit: false, credits, results, end, scene_wake })
     }
 
-    /// Which steps the feed receives.
+    /// Which steps the subscription receives.
     pub(in crate::engine) const fn delivery(&self) -> Delivery {
         self.delivery
     }
 
-    /// The next result. Cancel-safe.
+    /// Waits for the next result. Cancel-safe.
     ///
     /// # Errors
-    /// The reason for which the feed has ended.
+    /// The error with which the subscription has ended.
     pub async fn next(&mut self) -> Result<StepOutput> {
-        if self.delivery == Delivery::Latest && !self.credit_requested {
-            self.credit_requested = true;
-            self.add_credit();
+        if self.delivery == Delivery::Latest && !self.has_granted_credit {
+            self.has_granted_credit = true;
+            self.grant_credit();
         }
-        let item = self.items.recv().await;
-        self.credit_requested = false;
+        let result = self.results.recv().await;
+        self.has_granted_credit = false;
         if self.delivery == Delivery::Lossless {
-            self.add_credit();
+            self.grant_credit();
         }
-        item.unwrap_or_else(|| Err(self.reason()))
+        result.unwrap_or_else(|| Err(self.end_error()))
     }
 
-    /// Waits until the feed is cut off.
+    /// Waits until the scene disconnects the subscriber, and returns the reason. Pends forever if the subscription ends
+    /// otherwise.
     pub async fn disconnected(&self) -> Error {
-        let mut end = self.end.clone();
-        let is_cut = |end: &Option<EndReason>| end.as_ref().is_some_and(|end| end.immediate);
-        match end.wait_for(is_cut).await.map(|end| end.clone()) {
+        let mut end_receiver = self.end.clone();
+        let is_immediate = |end: &Option<EndReason>| end.as_ref().is_some_and(|end| end.is_immediate);
+        match end_receiver.wait_for(is_immediate).await.map(|end| end.clone()) {
             Ok(Some(end)) => end.error,
-            // The scene has ended without a cut-off, so buffered results may still be read.
+            // The scene has ended without disconnecting the subscriber, so buffered results may still be read.
             _ => std::future::pending().await,
         }
     }
 
-    fn add_credit(&self) {
+    fn grant_credit(&self) {
         self.credits.fetch_add(1, Ordering::AcqRel);
-        self.scene.notify_one();
+        self.scene_wake.notify_one();
     }
 
-    fn reason(&self) -> Error {
+    fn end_error(&self) -> Error {
         let end = self.end.borrow();
-        end.as_ref().map_or_else(|| fault_in("scene")("it stopped"), |end| end.error.clone())
+        end.as_ref().map_or_else(|| fault_in("scene")("the scene ended without an error"), |end| end.error.clone())
     }
 }
 
 impl Drop for Subscription {
     fn drop(&mut self) {
-        // This feed may be the one that blocks the scene's writer.
-        self.items.close();
-        self.scene.notify_one();
+        // This subscription may have blocked the scene's writer.
+        self.results.close();
+        self.scene_wake.notify_one();
     }
 }
 
@@ -203,44 +208,48 @@ mod tests {
         Ok(StepOutput { step, skipped: 0, stages: vec![], origins: None, body: OutputBody::Vertices(Arc::default()) })
     }
 
+    fn subscribe(delivery: Delivery) -> (Subscriber, Subscription) {
+        Subscription::new(OutputSpec::Vertices(VertexAttributes::VERTICES), delivery, Arc::default())
+    }
+
     #[tokio::test]
-    async fn a_lossless_viewer_has_room_for_two_and_gets_more_as_it_reads() {
-        let (subscriber, mut subscription) =
-            Subscription::new(OutputSpec::Vertices(VertexAttributes::VERTICES), Delivery::Lossless, Arc::default());
+    async fn lossless_subscription_grants_one_credit_per_result() {
+        let (subscriber, mut subscription) = subscribe(Delivery::Lossless);
         for number in 1..=2 {
             assert!(subscriber.has_credit() && subscriber.take_permit().send(output(number)));
         }
         assert!(!subscriber.has_credit());
-        assert_eq!(subscription.next().await.expect("the first").step.number, 1);
+        assert_eq!(subscription.next().await.expect("expected the first result").step.number, 1);
         assert!(subscriber.has_credit());
     }
 
     #[tokio::test]
-    async fn a_latest_viewer_has_room_only_while_it_asks_and_asks_once() {
-        let (subscriber, mut subscription) =
-            Subscription::new(OutputSpec::Vertices(VertexAttributes::VERTICES), Delivery::Latest, Arc::default());
+    async fn latest_subscription_grants_one_credit_when_polled() {
+        let (subscriber, mut subscription) = subscribe(Delivery::Latest);
         assert!(!subscriber.has_credit());
         for _ in 0..3 {
-            let given_up = tokio::time::timeout(std::time::Duration::ZERO, subscription.next()).await;
-            assert!(given_up.is_err());
+            let result = tokio::time::timeout(std::time::Duration::ZERO, subscription.next()).await;
+            assert!(result.is_err(), "expected no result yet");
         }
         assert!(subscriber.has_credit() && subscriber.take_permit().send(output(4)) && !subscriber.has_credit());
-        assert_eq!(subscription.next().await.expect("the newest").step.number, 4);
+        assert_eq!(subscription.next().await.expect("expected the sent result").step.number, 4);
     }
 
     #[tokio::test]
-    async fn an_end_is_told_after_what_is_held_and_a_cut_at_once() {
-        let (subscriber, mut subscription) =
-            Subscription::new(OutputSpec::Vertices(VertexAttributes::VERTICES), Delivery::Lossless, Arc::default());
+    async fn end_comes_after_buffered_results() {
+        let (subscriber, mut subscription) = subscribe(Delivery::Lossless);
         subscriber.take_permit().send(output(1));
-        let error = Error::NotFound { what: "scene", given: "gone".into() };
+        let error = Error::NotFound { what: "scene", given: "'closed'".into() };
         subscriber.end(error.clone());
         drop(subscriber);
         assert!(subscription.next().await.is_ok());
-        assert_eq!(subscription.next().await.expect_err("the end"), error);
+        assert_eq!(subscription.next().await.expect_err("expected the end"), error);
+    }
 
-        let (subscriber, subscription) =
-            Subscription::new(OutputSpec::Vertices(VertexAttributes::VERTICES), Delivery::Lossless, Arc::default());
+    #[tokio::test]
+    async fn disconnection_is_reported_immediately() {
+        let (subscriber, subscription) = subscribe(Delivery::Lossless);
+        let error = Error::Busy { queue: "queue of unread results", limit: LOSSLESS_CREDITS };
         subscriber.disconnect(error.clone());
         drop(subscriber);
         assert_eq!(subscription.disconnected().await, error);

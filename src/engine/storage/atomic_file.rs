@@ -4,8 +4,8 @@ use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::Path;
 
-/// Replaces a file atomically: writes a temporary file in the same folder, syncs it, renames it, and syncs the folder. A
-/// reader sees either the old or the new content, and after a power failure the file has one of both.
+/// Replaces a file atomically: writes a temporary file in the same folder, syncs it, renames it, and syncs the folder.
+/// Readers see either the old or the new content, also after a power failure.
 pub(super) fn write_atomic(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let temporary = path.with_extension("new");
     let mut file = File::create(&temporary)?;

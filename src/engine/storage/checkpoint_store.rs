@@ -1,6 +1,6 @@
-//! Checkpoint store: persists the last step of every scene, one file per scene. A background thread writes at most ten
-//! times per second and replaces files by an atomic rename. A killed server therefore loses the last 0.1 s plus the
-//! time of one round, which syncs a file and its folder per changed scene; it never leaves a partial file.
+//! Checkpoint store: persists the last step of every scene, one file per scene. A background thread writes in rounds,
+//! at most ten per second. A round writes and syncs one file per changed scene. Files are replaced by an atomic rename,
+//! so a killed server never leaves a partial file. It loses the steps of the last 0.1 s plus the duration of one round.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -25,9 +25,10 @@ const WRITE_INTERVAL: Duration = Duration::from_millis(100);
 /// counts of coordinates and of transforms (u64), q (f32), the transforms (12 f32 each), and the SHA-256 of all bytes
 /// before the hash. Little-endian.
 const MAGIC: &[u8; 8] = b"MCSTEP01";
-/// Magic number of a checkpoint with floating origins: as above, plus the shared origin (3 f64) and one translation (3 f64) per
-/// transform after the transforms.
+/// Magic number of a checkpoint with floating origins. Between the transforms and the hash it contains the shared origin
+/// (3 f64) and one translation (3 f64) per transform.
 const MAGIC_ORIGINS: &[u8; 8] = b"MCSTEP02";
+/// The magic number and five numbers of 8 bytes.
 const HEADER_BYTES: usize = 8 + 5 * 8;
 const HASH_BYTES: usize = 32;
 
@@ -42,16 +43,17 @@ pub(in crate::engine) struct CheckpointStore {
 #[derive(Debug, Default)]
 struct Shared {
     pending: Mutex<PendingWrites>,
-    changed: Condvar,
-    /// Held while files are written or removed. Lock order: `files` before `pending`.
-    files: Mutex<()>,
+    /// Signaled when `pending` has changed.
+    change_signal: Condvar,
+    /// Held while files are read, written or removed. Lock order: `file_lock` before `pending`.
+    file_lock: Mutex<()>,
 }
 
 #[derive(Debug, Default)]
 struct PendingWrites {
-    /// Dirty states: the newest state of each scene that is not on disk yet, at most one per scene.
+    /// The newest state of each scene whose newest state is not on disk yet.
     dirty: BTreeMap<String, Arc<SceneState>>,
-    stopping: bool,
+    is_stopping: bool,
 }
 
 impl CheckpointStore {
@@ -62,10 +64,10 @@ impl CheckpointStore {
     pub(in crate::engine) fn start(folder: PathBuf) -> Result<Self> {
         fs::create_dir_all(&folder).map_err(fault_in("state folder"))?;
         let shared = Arc::new(Shared::default());
-        let (theirs, place) = (Arc::clone(&shared), folder.clone());
+        let (thread_shared, thread_folder) = (Arc::clone(&shared), folder.clone());
         let thread = std::thread::Builder::new()
             .name("checkpoints".into())
-            .spawn(move || write_loop(&theirs, &place))
+            .spawn(move || write_loop(&thread_shared, &thread_folder))
             .map_err(fault_in("checkpoint thread"))?;
         Ok(Self { folder, shared, thread: Mutex::new(Some(thread)) })
     }
@@ -73,40 +75,41 @@ impl CheckpointStore {
     /// Records the newest state of a scene. Never waits for the disk.
     pub(in crate::engine) fn enqueue(&self, name: &str, state: &Arc<SceneState>) {
         lock(&self.shared.pending).dirty.insert(name.to_owned(), Arc::clone(state));
-        self.shared.changed.notify_one();
+        self.shared.change_signal.notify_one();
     }
 
-    /// The checkpoint of a scene, if there is one: the newest recorded state, on disk or not. Waits for the disk.
+    /// Returns the newest recorded state of a scene, on disk or not. `None` if no state was recorded. Waits for the
+    /// disk.
     ///
     /// # Errors
     /// `Invalid` when the file is damaged or its size does not match the scene; `Fault` of the disk.
     pub(in crate::engine) fn load(&self, name: &str, scene: &Scene) -> Result<Option<SceneState>> {
-        let _files = lock(&self.shared.files);
+        let _files = lock(&self.shared.file_lock);
         // A scene that failed and is opened again may have a state that is not on disk yet.
         if let Some(state) = lock(&self.shared.pending).dirty.get(name) {
             return decode(&encode(state), scene).map(Some);
         }
-        match fs::read(path_of(&self.folder, name)) {
+        match fs::read(checkpoint_path(&self.folder, name)) {
             Ok(bytes) => decode(&bytes, scene).map(Some),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(error) => Err(fault_in("reading the kept step")(error)),
+            Err(error) => Err(fault_in("reading a checkpoint")(error)),
         }
     }
 
-    /// Removes a scene's file. Waits for the disk.
+    /// Removes the checkpoint of a scene. Waits for the disk.
     pub(in crate::engine) fn remove(&self, name: &str) {
-        let _files = lock(&self.shared.files);
+        let _files = lock(&self.shared.file_lock);
         lock(&self.shared.pending).dirty.remove(name);
-        // Usually the scene had no step, so there is no file.
-        fs::remove_file(path_of(&self.folder, name)).ok();
+        // A scene without steps has no file.
+        fs::remove_file(checkpoint_path(&self.folder, name)).ok();
     }
 
     /// Writes the dirty states and ends the thread. Waits for the disk.
     pub(in crate::engine) fn finish(&self) {
-        lock(&self.shared.pending).stopping = true;
-        self.shared.changed.notify_one();
+        lock(&self.shared.pending).is_stopping = true;
+        self.shared.change_signal.notify_one();
         if let Some(thread) = lock(&self.thread).take() {
-            thread.join().ok(); // The panic hook has already printed a panic of the thread.
+            thread.join().ok(); // If the thread has panicked, the panic hook has printed the panic.
         }
     }
 }
@@ -135,29 +138,37 @@ impl Drop for CheckpointStore {
     }
 }
 
+/// Writes dirty states until the store is finished and no state is dirty.
 fn write_loop(shared: &Shared, folder: &Path) {
     loop {
-        let waits = |pending: &mut PendingWrites| pending.dirty.is_empty() && !pending.stopping;
-        drop(shared.changed.wait_while(lock(&shared.pending), waits).unwrap_or_else(PoisonError::into_inner));
+        let has_no_work = |pending: &mut PendingWrites| pending.dirty.is_empty() && !pending.is_stopping;
+        drop(
+            shared.change_signal.wait_while(lock(&shared.pending), has_no_work).unwrap_or_else(PoisonError::into_inner),
+        );
         {
-            let _files = lock(&shared.files);
+            let _files = lock(&shared.file_lock);
             let dirty = std::mem::take(&mut lock(&shared.pending).dirty);
             for (name, state) in dirty {
-                if let Err(error) = write_atomic(&path_of(folder, &name), &encode(&state)) {
-                    tracing::warn!(scene = name, %error, "the last step could not be kept");
+                if let Err(error) = write_atomic(&checkpoint_path(folder, &name), &encode(&state)) {
+                    tracing::warn!(scene = name, %error, "the checkpoint could not be written");
                 }
             }
         }
         let pending = lock(&shared.pending);
-        if pending.stopping && pending.dirty.is_empty() {
+        if pending.is_stopping && pending.dirty.is_empty() {
             return;
         }
-        let runs = |pending: &mut PendingWrites| !pending.stopping;
-        drop(shared.changed.wait_timeout_while(pending, WRITE_INTERVAL, runs).unwrap_or_else(PoisonError::into_inner));
+        let is_running = |pending: &mut PendingWrites| !pending.is_stopping;
+        drop(
+            shared
+                .change_signal
+                .wait_timeout_while(pending, WRITE_INTERVAL, is_running)
+                .unwrap_or_else(PoisonError::into_inner),
+        );
     }
 }
 
-fn path_of(folder: &Path, name: &str) -> PathBuf {
+fn checkpoint_path(folder: &Path, name: &str) -> PathBuf {
     folder.join(format!("{name}.step"))
 }
 
@@ -182,45 +193,50 @@ fn encode(state: &SceneState) -> Vec<u8> {
 }
 
 fn decode(bytes: &[u8], scene: &Scene) -> Result<SceneState> {
-    let rest = SceneState::rest(scene);
-    let has_cells = bytes.starts_with(MAGIC_ORIGINS);
-    let extra = if has_cells { 24 * (1 + rest.transforms.len()) } else { 0 };
-    let size = HEADER_BYTES + 4 * rest.q.len() + 48 * rest.transforms.len() + extra + HASH_BYTES;
-    if bytes.len() != size {
-        return Err(invalid("kept step", format!("{size} bytes for this scene"), format!("{} bytes", bytes.len())));
+    let rest_state = SceneState::rest(scene);
+    let has_origins = bytes.starts_with(MAGIC_ORIGINS);
+    let origin_bytes = if has_origins { 24 * (1 + rest_state.transforms.len()) } else { 0 };
+    let file_size = HEADER_BYTES + 4 * rest_state.q.len() + 48 * rest_state.transforms.len() + origin_bytes + HASH_BYTES;
+    if bytes.len() != file_size {
+        return Err(invalid(
+            "checkpoint",
+            format!("{file_size} bytes (the size for this scene)"),
+            format!("{} bytes", bytes.len()),
+        ));
     }
-    let (body, hash) = bytes.split_at(size - HASH_BYTES);
-    if Sha256::digest(body).as_slice() != hash || !(has_cells || body.starts_with(MAGIC)) {
-        return Err(invalid("kept step", "bytes that match their SHA-256", "a damaged file"));
+    let (body, hash) = bytes.split_at(file_size - HASH_BYTES);
+    if Sha256::digest(body).as_slice() != hash || !(has_origins || body.starts_with(MAGIC)) {
+        return Err(invalid("checkpoint", "bytes that match their SHA-256", "a damaged file"));
     }
-    let word = |at: usize| {
+    // The magic number is word 0.
+    let word = |index: usize| {
         let mut word = [0; 8];
-        word.copy_from_slice(&body[8 * at..8 * at + 8]);
+        word.copy_from_slice(&body[8 * index..8 * index + 8]);
         word
     };
     let counts = [u64::from_le_bytes(word(4)), u64::from_le_bytes(word(5))];
-    if counts != [rest.q.len() as u64, rest.transforms.len() as u64] {
-        let expected = format!("{} coordinates and {} transforms", rest.q.len(), rest.transforms.len());
-        return Err(invalid("kept step", expected, format!("{counts:?}")));
+    if counts != [rest_state.q.len() as u64, rest_state.transforms.len() as u64] {
+        let expected = format!("{} coordinates and {} transforms", rest_state.q.len(), rest_state.transforms.len());
+        return Err(invalid("checkpoint", expected, format!("{counts:?}")));
     }
-    let (q, places) = body[HEADER_BYTES..].split_at(4 * rest.q.len());
-    let (transforms, origins) = places.split_at(48 * rest.transforms.len());
-    let number = |word: &[u8]| f32::from_le_bytes([word[0], word[1], word[2], word[3]]);
-    let transform = |bytes: &[u8]| Transform(std::array::from_fn(|entry| number(&bytes[4 * entry..])));
+    let (q, transforms_and_origins) = body[HEADER_BYTES..].split_at(4 * rest_state.q.len());
+    let (transforms, origins) = transforms_and_origins.split_at(48 * rest_state.transforms.len());
+    let f32_from_bytes = |word: &[u8]| f32::from_le_bytes([word[0], word[1], word[2], word[3]]);
+    let transform = |bytes: &[u8]| Transform(std::array::from_fn(|entry| f32_from_bytes(&bytes[4 * entry..])));
     Ok(SceneState {
         run: u64::from_le_bytes(word(1)),
         step: u64::from_le_bytes(word(2)),
         time: f64::from_le_bytes(word(3)),
-        q: q.chunks_exact(4).map(number).collect(),
+        q: q.chunks_exact(4).map(f32_from_bytes).collect(),
         transforms: transforms.chunks_exact(48).map(transform).collect(),
-        origins: if has_cells { Some(Arc::new(decode_origins(origins)?)) } else { None },
-        ..rest
+        origins: if has_origins { Some(Arc::new(decode_origins(origins)?)) } else { None },
+        ..rest_state
     })
 }
 
 /// Decodes the shared origin (24 bytes), then the translations (24 bytes each).
 fn decode_origins(bytes: &[u8]) -> Result<FloatingOrigins> {
-    let point = |bytes: &[u8]| {
+    let point_from_bytes = |bytes: &[u8]| {
         std::array::from_fn(|axis| {
             let mut word = [0; 8];
             word.copy_from_slice(&bytes[8 * axis..8 * axis + 8]);
@@ -228,7 +244,7 @@ fn decode_origins(bytes: &[u8]) -> Result<FloatingOrigins> {
         })
     };
     let (shared, translations) = bytes.split_at(24);
-    FloatingOrigins::restore(point(shared), translations.chunks_exact(24).map(point).collect())
+    FloatingOrigins::restore(point_from_bytes(shared), translations.chunks_exact(24).map(point_from_bytes).collect())
 }
 
 #[cfg(test)]
@@ -236,7 +252,7 @@ mod tests {
     use super::*;
     use crate::engine::testing;
 
-    fn moved(scene: &Scene) -> SceneState {
+    fn deformed_state(scene: &Scene) -> SceneState {
         let mut state = SceneState { run: 3, step: 41, time: 0.25, ..SceneState::rest(scene) };
         state.q[1] = -0.5;
         state.transforms[1].0[3] = 7.0;
@@ -244,22 +260,22 @@ mod tests {
     }
 
     #[test]
-    fn a_kept_step_comes_back_bit_for_bit_and_a_damaged_one_is_refused() {
+    fn checkpoint_is_restored_exactly_and_a_damaged_one_is_rejected() {
         let scene = testing::two_strips();
-        let state = moved(&scene);
+        let state = deformed_state(&scene);
         let bytes = encode(&state);
-        assert_eq!(decode(&bytes, &scene).expect("whole"), state);
-        for at in [0, 9, HEADER_BYTES + 2, bytes.len() - 1] {
-            let mut damaged = bytes.clone();
-            damaged[at] ^= 1;
-            assert!(decode(&damaged, &scene).is_err(), "byte {at}");
+        assert_eq!(decode(&bytes, &scene).expect("expected a valid checkpoint"), state);
+        for index in [0, 9, HEADER_BYTES + 2, bytes.len() - 1] {
+            let mut damaged_bytes = bytes.clone();
+            damaged_bytes[index] ^= 1;
+            assert!(decode(&damaged_bytes, &scene).is_err(), "expected an error for a changed byte {index}");
         }
         assert!(decode(&bytes[..bytes.len() - 1], &scene).is_err());
         assert!(decode(&[], &scene).is_err());
     }
 
     #[test]
-    fn a_step_with_cells_comes_back_with_them_and_one_cut_short_is_refused() {
+    fn checkpoint_with_origins_is_restored_and_a_truncated_one_rejected() {
         use modalcast_model::scene::{RawStepUpdate, StepUpdate, TransformFormat};
         let scene = testing::two_strips();
         let rotation = [0.0, 0.0, 0.0, 1.0_f32].into_iter().flat_map(f32::to_le_bytes);
@@ -270,26 +286,33 @@ mod tests {
             transform_format: TransformFormat::RigidF64,
             ..RawStepUpdate::default()
         };
-        let mut state = moved(&scene);
-        state.apply(&scene, &StepUpdate::parse(&scene, &raw).expect("a good step"));
+        let mut state = deformed_state(&scene);
+        state.apply(&scene, &StepUpdate::parse(&scene, &raw).expect("expected a valid step"));
         let bytes = encode(&state);
-        let kept = decode(&bytes, &scene).expect("whole");
-        assert_eq!((&kept, kept.origin_of(1)), (&state, [9766.0 * 1024.0, 0.0, 0.0]));
-        assert_ne!(SceneState { origins: None, ..kept }, state, "expected a comparison of floating origins");
+        let restored_state = decode(&bytes, &scene).expect("expected a valid checkpoint");
+        // The nearest multiple of 1024, the spacing of floating origins, to the translation 1e7 + 0.125.
+        let expected_origin = [9766.0 * 1024.0, 0.0, 0.0];
+        assert_eq!((&restored_state, restored_state.origin_of(1)), (&state, expected_origin));
+        assert_ne!(
+            SceneState { origins: None, ..restored_state },
+            state,
+            "control: expected a comparison of floating origins"
+        );
         assert!(decode(&bytes[..bytes.len() - 24], &scene).is_err());
     }
 
     #[test]
-    fn a_finished_keeper_has_written_the_newest_note_and_forgets_on_demand() {
-        let folder = tempfile::tempdir().expect("a folder");
+    fn finish_writes_the_newest_state_and_remove_deletes_it() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
         let scene = testing::two_strips();
-        let checkpoints = CheckpointStore::start(folder.path().to_owned()).expect("starts");
+        let checkpoints = CheckpointStore::start(folder.path().to_owned()).expect("expected a checkpoint thread");
         for step in 0..50 {
-            checkpoints.enqueue("strips", &Arc::new(SceneState { step, ..moved(&scene) }));
+            checkpoints.enqueue("strips", &Arc::new(SceneState { step, ..deformed_state(&scene) }));
         }
         checkpoints.finish();
-        let kept = checkpoints.load("strips", &scene).expect("fits").expect("is there");
-        assert_eq!(kept, SceneState { step: 49, ..moved(&scene) });
+        let restored_state =
+            checkpoints.load("strips", &scene).expect("expected a valid checkpoint").expect("expected a checkpoint");
+        assert_eq!(restored_state, SceneState { step: 49, ..deformed_state(&scene) });
         checkpoints.remove("strips");
         assert_eq!(checkpoints.load("strips", &scene), Ok(None));
     }

@@ -1,4 +1,4 @@
-//! The state folder: a lock that limits the folder to one server, and the catalog `scenes.json` of open scenes.
+//! The catalog of open scenes in `scenes.json`, and the lock that limits a state folder to one server.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -10,13 +10,13 @@ use super::atomic_file::write_atomic;
 use crate::engine::lock::lock;
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 
-/// The origin of a scene.
+/// Where a scene comes from.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub enum SceneProvenance {
-    /// A built-in name, or a path inside the repository.
+    /// A built-in scene or a path inside the repository.
     Repository { source: String },
-    /// Files that a client uploaded. `entry` is the path to open; empty means the folder.
+    /// Files that a client uploaded. `entry` is the path to open. An empty `entry` means the folder.
     Upload { entry: String },
 }
 
@@ -31,13 +31,13 @@ impl SceneProvenance {
     }
 }
 
-/// The catalog of open scenes: names and origins, written to disk at every change.
+/// The names and origins of the open scenes, written to disk at every change.
 #[derive(Debug)]
 pub(in crate::engine) struct SceneCatalog {
     folder: PathBuf,
     entries: Mutex<BTreeMap<String, SceneProvenance>>,
     /// File lock of the server that uses the folder. The operating system releases it when the process dies.
-    lock: Mutex<Option<File>>,
+    folder_lock: Mutex<Option<File>>,
 }
 
 impl SceneCatalog {
@@ -46,32 +46,34 @@ impl SceneCatalog {
     /// # Errors
     /// `Unavailable` when another server uses the folder, or when the folder cannot be created or read.
     pub(in crate::engine) fn open(folder: &Path) -> Result<Self> {
-        let unusable = |reason: String| Error::Unavailable {
+        let unavailable = |reason: String| Error::Unavailable {
             what: "state folder",
             reason,
             remedy: "Name another one with --state".into(),
         };
-        let refuse = |error: std::io::Error| unusable(format!("{}: {error}", folder.display()));
-        fs::create_dir_all(folder.join("uploads")).map_err(refuse)?;
-        let lock = File::create(folder.join("lock")).map_err(refuse)?;
-        lock.try_lock().map_err(|_| unusable(format!("{} is in use by another server", folder.display())))?;
-        let entries = read(&folder.join("scenes.json")).map_err(refuse)?;
+        let unusable_folder = |error: std::io::Error| unavailable(format!("{}: {error}", folder.display()));
+        fs::create_dir_all(folder.join("uploads")).map_err(unusable_folder)?;
+        let folder_lock = File::create(folder.join("lock")).map_err(unusable_folder)?;
+        folder_lock.try_lock().map_err(|_| unavailable(format!("{} is in use by another server", folder.display())))?;
+        let entries = read_catalog(&folder.join("scenes.json")).map_err(unusable_folder)?;
         remove_leftovers(&folder.join("uploads"));
-        Ok(Self { folder: folder.to_owned(), entries: Mutex::new(entries), lock: Mutex::new(Some(lock)) })
+        let (entries, folder_lock) = (Mutex::new(entries), Mutex::new(Some(folder_lock)));
+        Ok(Self { folder: folder.to_owned(), entries, folder_lock })
     }
 
     pub(in crate::engine) fn entries(&self) -> BTreeMap<String, SceneProvenance> {
-        self.guard().clone()
+        self.lock_entries().clone()
     }
 
-    /// Adds a scene. Writes to disk; a failure leaves the catalog unchanged.
+    /// Adds a scene and writes the catalog. A failure leaves the catalog unchanged.
     pub(in crate::engine) fn add(&self, name: &str, provenance: &SceneProvenance) -> Result<()> {
-        self.change(|entries| entries.insert(name.to_owned(), provenance.clone())).map(drop)
+        self.change_entries(|entries| entries.insert(name.to_owned(), provenance.clone())).map(drop)
     }
 
-    /// Removes a scene; returns whether it was listed. Writes to disk; a failure leaves the catalog unchanged.
+    /// Removes a scene and writes the catalog. Returns whether the scene was listed. A failure leaves the catalog
+    /// unchanged.
     pub(in crate::engine) fn remove(&self, name: &str) -> Result<bool> {
-        self.change(|entries| entries.remove(name)).map(|entry| entry.is_some())
+        self.change_entries(|entries| entries.remove(name)).map(|entry| entry.is_some())
     }
 
     /// The folder of the checkpoints.
@@ -86,35 +88,35 @@ impl SceneCatalog {
 
     /// Releases the lock, so that another server may use the folder.
     pub(in crate::engine) fn release(&self) {
-        lock(&self.lock).take();
+        lock(&self.folder_lock).take();
     }
 
-    /// Changes the catalog on disk first and in memory only if that succeeds, so that both agree.
-    fn change<T>(&self, change: impl FnOnce(&mut BTreeMap<String, SceneProvenance>) -> T) -> Result<T> {
-        let mut entries = self.guard();
-        let mut changed = entries.clone();
-        let result = change(&mut changed);
-        let text = serde_json::to_vec_pretty(&changed).map_err(fault_in("writing scenes.json"))?;
+    /// Changes the catalog on disk, and in memory only if that succeeds, so that both agree.
+    fn change_entries<T>(&self, change: impl FnOnce(&mut BTreeMap<String, SceneProvenance>) -> T) -> Result<T> {
+        let mut entries = self.lock_entries();
+        let mut changed_entries = entries.clone();
+        let result = change(&mut changed_entries);
+        let text = serde_json::to_vec_pretty(&changed_entries).map_err(fault_in("writing scenes.json"))?;
         write_atomic(&self.folder.join("scenes.json"), &text).map_err(fault_in("writing scenes.json"))?;
-        *entries = changed;
+        *entries = changed_entries;
         Ok(result)
     }
 
-    fn guard(&self) -> MutexGuard<'_, BTreeMap<String, SceneProvenance>> {
+    fn lock_entries(&self) -> MutexGuard<'_, BTreeMap<String, SceneProvenance>> {
         lock(&self.entries)
     }
 }
 
-/// Reads the catalog; empty if there is none. A damaged file is renamed to `scenes.json.damaged`, or to
-/// `scenes.json.damaged.1` and so on if that exists, so that it is kept and the server can start.
-fn read(path: &Path) -> io::Result<BTreeMap<String, SceneProvenance>> {
+/// Reads the catalog. A missing file yields an empty catalog. A damaged file is renamed as by [`unused_backup_path`]
+/// and yields an empty catalog, so that the server can start.
+fn read_catalog(path: &Path) -> io::Result<BTreeMap<String, SceneProvenance>> {
     let bytes = match fs::read(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(BTreeMap::new()),
-        read => read?,
+        result => result?,
     };
     serde_json::from_slice(&bytes).or_else(|error| {
         let backup = unused_backup_path(path);
-        tracing::warn!(%error, "the list of open scenes is damaged; it is kept as {} and begins empty", backup.display());
+        tracing::warn!(%error, "scenes.json is damaged and renamed to {}; no scene is reopened", backup.display());
         fs::rename(path, backup).map(|()| BTreeMap::new())
     })
 }
@@ -146,8 +148,8 @@ fn remove_leftovers(uploads: &Path) {
 /// `Invalid` unless the name has 1 to 64 ASCII letters, digits, dots, dashes and underscores and does not start with a
 /// dot.
 pub fn validate_scene_name(name: &str) -> Result<&str> {
-    let fits = |letter: char| letter.is_ascii_alphanumeric() || "._-".contains(letter);
-    if name.is_empty() || name.len() > 64 || name.starts_with('.') || !name.chars().all(fits) {
+    let is_allowed = |letter: char| letter.is_ascii_alphanumeric() || "._-".contains(letter);
+    if name.is_empty() || name.len() > 64 || name.starts_with('.') || !name.chars().all(is_allowed) {
         let expected = "1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-', no dot first";
         return Err(invalid("scene", expected, format!("{name:?}")));
     }
@@ -160,11 +162,12 @@ pub fn validate_scene_name(name: &str) -> Result<&str> {
 /// # Errors
 /// `Invalid` when the source yields no valid name.
 pub(in crate::engine) fn default_scene_name(source: &str) -> Result<String> {
-    let last = source.trim_end_matches('/').rsplit('/').next().unwrap_or_default();
-    let stem = last.rsplit_once('.').map_or(last, |(stem, _)| if stem.is_empty() { last } else { stem });
-    let fit = |letter: char| if letter.is_ascii_alphanumeric() || "._-".contains(letter) { letter } else { '-' };
+    let file_name = source.trim_end_matches('/').rsplit('/').next().unwrap_or_default();
+    let stem = file_name.rsplit_once('.').map_or(file_name, |(stem, _)| if stem.is_empty() { file_name } else { stem });
+    let replace_invalid =
+        |letter: char| if letter.is_ascii_alphanumeric() || "._-".contains(letter) { letter } else { '-' };
     let stem = if source.trim_end_matches('/') == "." { "scene" } else { stem };
-    let name: String = stem.trim_start_matches('.').chars().map(fit).take(64).collect();
+    let name: String = stem.trim_start_matches('.').chars().map(replace_invalid).take(64).collect();
     validate_scene_name(&name).map_err(|_| invalid("source", "a built-in name or a path in the repository", source))?;
     Ok(name)
 }
@@ -174,15 +177,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_that_could_leave_a_folder_are_refused() {
+    fn names_that_are_unsafe_as_file_names_are_rejected() {
         for name in ["", ".", "..", ".hidden", "a/b", "a\\b", "a\0", "ü", &"x".repeat(65)] {
-            assert!(validate_scene_name(name).is_err(), "{name:?} passed");
+            assert!(validate_scene_name(name).is_err(), "expected an error for {name:?}");
         }
         assert_eq!(validate_scene_name("tree_2.v-1"), Ok("tree_2.v-1"));
     }
 
     #[test]
-    fn a_source_gives_its_last_part_as_name() {
+    fn default_name_is_the_last_path_component() {
         for (source, name) in [
             ("tree", "tree"),
             ("vega/simpleBridge/", "simpleBridge"),
@@ -194,54 +197,56 @@ mod tests {
             assert_eq!(default_scene_name(source).as_deref(), Ok(name));
         }
         for source in ["", "/", "..", "a/.."] {
-            assert!(default_scene_name(source).is_err(), "{source:?} passed");
+            assert!(default_scene_name(source).is_err(), "expected an error for {source:?}");
         }
     }
 
     #[test]
-    fn a_damaged_list_is_set_aside_and_an_unreadable_one_is_refused() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let list = folder.path().join("scenes.json");
-        fs::write(&list, b"{\"a\":").expect("written");
-        let scene_catalog = SceneCatalog::open(folder.path()).expect("it starts");
-        assert!(scene_catalog.entries().is_empty() && !list.exists());
-        assert_eq!(fs::read(folder.path().join("scenes.json.damaged")).expect("set aside"), b"{\"a\":");
+    fn damaged_catalog_is_renamed_and_an_unreadable_one_is_an_error() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let catalog_path = folder.path().join("scenes.json");
+        let read_backup = |name: &str| fs::read(folder.path().join(name)).expect("expected a backup");
+        fs::write(&catalog_path, b"{\"a\":").expect("expected a written file");
+        let scene_catalog = SceneCatalog::open(folder.path()).expect("expected an empty catalog");
+        assert!(scene_catalog.entries().is_empty() && !catalog_path.exists());
+        assert_eq!(read_backup("scenes.json.damaged"), b"{\"a\":");
         drop(scene_catalog);
-        fs::write(&list, b"[").expect("written");
-        drop(SceneCatalog::open(folder.path()).expect("it starts"));
-        let backup = |name: &str| fs::read(folder.path().join(name)).expect("set aside");
-        assert_eq!(backup("scenes.json.damaged"), b"{\"a\":", "the first one is not overwritten");
-        assert_eq!(backup("scenes.json.damaged.1"), b"[");
+        fs::write(&catalog_path, b"[").expect("expected a written file");
+        drop(SceneCatalog::open(folder.path()).expect("expected an empty catalog"));
+        assert_eq!(read_backup("scenes.json.damaged"), b"{\"a\":", "expected the first backup to remain");
+        assert_eq!(read_backup("scenes.json.damaged.1"), b"[");
         // A folder in place of the file is unreadable for every user, root included.
-        fs::create_dir(&list).expect("a folder");
+        fs::create_dir(&catalog_path).expect("expected a new folder");
         assert!(matches!(SceneCatalog::open(folder.path()), Err(Error::Unavailable { .. })));
     }
 
     #[test]
-    fn a_list_that_cannot_be_written_stays_as_it_is() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let scene_catalog = SceneCatalog::open(folder.path()).expect("free");
+    fn failed_write_leaves_the_catalog_unchanged() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let scene_catalog = SceneCatalog::open(folder.path()).expect("expected an unlocked folder");
         let provenance = SceneProvenance::Repository { source: "strips".into() };
-        scene_catalog.add("a", &provenance).expect("written");
-        fs::create_dir(folder.path().join("scenes.new")).expect("in the way of every writing");
+        scene_catalog.add("a", &provenance).expect("expected a written catalog");
+        // A folder with the name of the temporary file makes every write fail.
+        let obstacle = folder.path().join("scenes.new");
+        fs::create_dir(&obstacle).expect("expected a new folder");
         assert!(matches!(scene_catalog.add("b", &provenance), Err(Error::Fault { .. })));
         assert!(matches!(scene_catalog.remove("a"), Err(Error::Fault { .. })));
         assert_eq!(scene_catalog.entries().into_keys().collect::<Vec<_>>(), ["a"]);
-        fs::remove_dir(folder.path().join("scenes.new")).expect("out of the way");
+        fs::remove_dir(&obstacle).expect("expected to remove the folder");
         assert_eq!(scene_catalog.remove("a"), Ok(true));
     }
 
     #[test]
-    fn the_list_survives_and_a_second_server_is_refused_while_the_first_lives() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let first = SceneCatalog::open(folder.path()).expect("free");
+    fn catalog_persists_and_locks_its_folder() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let first_catalog = SceneCatalog::open(folder.path()).expect("expected an unlocked folder");
         let provenance = SceneProvenance::Upload { entry: String::new() };
-        first.add("a", &provenance).expect("written");
-        first.add("b", &provenance).expect("written");
-        assert_eq!(first.remove("b"), Ok(true));
+        first_catalog.add("a", &provenance).expect("expected a written catalog");
+        first_catalog.add("b", &provenance).expect("expected a written catalog");
+        assert_eq!(first_catalog.remove("b"), Ok(true));
         assert!(matches!(SceneCatalog::open(folder.path()), Err(Error::Unavailable { .. })));
-        first.release();
-        let second = SceneCatalog::open(folder.path()).expect("free again");
-        assert_eq!(second.entries().into_iter().collect::<Vec<_>>(), [("a".to_owned(), provenance)]);
+        first_catalog.release();
+        let second_catalog = SceneCatalog::open(folder.path()).expect("expected an unlocked folder");
+        assert_eq!(second_catalog.entries().into_iter().collect::<Vec<_>>(), [("a".to_owned(), provenance)]);
     }
 }

@@ -1,6 +1,6 @@
-//! Writes uploaded files to disk. Paths cannot leave a new temporary folder; sizes and SHA-256 hashes are checked
-//! against the declared ones. Dropping an unfinished [`Upload`] removes its folder, on a
-//! thread of its own; [`Upload::discard`] removes it before it returns.
+//! Writes uploaded files into a new temporary folder, which their paths cannot leave. Sizes and SHA-256 hashes are
+//! checked against the declared ones. Dropping an unfinished [`Upload`] removes its folder in the background.
+//! [`Upload::discard`] removes the folder before it returns.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -14,20 +14,24 @@ use tokio::sync::OwnedSemaphorePermit;
 
 use modalcast_model::error::{Result, fault_in, invalid};
 
-/// Limits of a path: its length in bytes and its number of components, the file name included.
+/// Limit on the length of a path in bytes.
 const MAX_PATH_BYTES: usize = 240;
+/// Limit on the number of components of a path, including the file name.
 const MAX_PATH_DEPTH: usize = 16;
 
-static COUNTER: AtomicU64 = AtomicU64::new(0);
+/// Number of uploads so far. Makes the names of temporary folders unique.
+static UPLOAD_COUNTER: AtomicU64 = AtomicU64::new(0);
 
-/// The header of an upload: what the client is going to send.
+/// The header of an upload, which declares the files that the client is going to send.
 #[derive(Debug, Clone, Default)]
 pub struct UploadHeader {
-    /// The name to open the scene under.
+    /// Name of the scene.
     pub scene: String,
-    /// The uploaded path to open; empty means the folder.
+    /// The uploaded path to open. An empty path means the folder.
     pub entry: String,
+    /// Number of files.
     pub files: u32,
+    /// Sum of the sizes of all files.
     pub total_bytes: u64,
 }
 
@@ -35,12 +39,14 @@ pub struct UploadHeader {
 #[derive(Debug)]
 pub struct Upload {
     pub(in crate::engine) header: UploadHeader,
+    /// The temporary folder; empty after it was moved or removed.
     folder: PathBuf,
+    /// Paths of the files so far.
     paths: BTreeSet<String>,
     /// Sum of the declared sizes of the files so far, in bytes.
     declared_bytes: u64,
-    open: Option<OpenFile>,
-    /// Permit that counts against the limit on concurrent uploads, until the folder is moved or removed.
+    open_file: Option<OpenFile>,
+    /// Counts against the limit on concurrent uploads until the folder is moved or removed.
     permit: Option<OwnedSemaphorePermit>,
 }
 
@@ -49,9 +55,11 @@ pub struct Upload {
 struct OpenFile {
     path: String,
     file: File,
+    /// Declared size.
     bytes: u64,
-    left: u64,
+    remaining_bytes: u64,
     hasher: Sha256,
+    /// Declared hash.
     sha256: [u8; 32],
 }
 
@@ -60,14 +68,14 @@ impl Upload {
     ///
     /// # Errors
     /// `Invalid` for a malformed entry path, `Fault` of the disk.
-    pub(in crate::engine) fn begin(uploads: &Path, header: UploadHeader, place: OwnedSemaphorePermit) -> Result<Self> {
+    pub(in crate::engine) fn begin(uploads: &Path, header: UploadHeader, permit: OwnedSemaphorePermit) -> Result<Self> {
         if !header.entry.is_empty() {
             validate_path("header.entry", &header.entry)?;
         }
-        let count = COUNTER.fetch_add(1, Ordering::Relaxed);
+        let count = UPLOAD_COUNTER.fetch_add(1, Ordering::Relaxed);
         let folder = uploads.join(format!(".{}-{count}", header.scene));
         fs::create_dir_all(&folder).map_err(fault_in("upload"))?;
-        Ok(Self { header, folder, paths: BTreeSet::new(), declared_bytes: 0, open: None, permit: Some(place) })
+        Ok(Self { header, folder, paths: BTreeSet::new(), declared_bytes: 0, open_file: None, permit: Some(permit) })
     }
 
     /// Begins the next file. `bytes` is its size; `sha256` must have 32 bytes.
@@ -91,18 +99,19 @@ impl Upload {
         if self.declared_bytes > self.header.total_bytes {
             return Err(invalid("header.total_bytes", self.header.total_bytes.to_string(), self.declared_bytes));
         }
-        let place = self.folder.join(path);
-        let clash = |error: io::Error| match error.kind() {
+        let file_path = self.folder.join(path);
+        let path_conflict = |error: io::Error| match error.kind() {
             ErrorKind::AlreadyExists | ErrorKind::NotADirectory | ErrorKind::InvalidFilename => {
-                invalid("file.path", "a path whose folders are no files", path)
+                invalid("file.path", "a path that does not conflict with another file", path)
             }
             _ => fault_in("upload")(error),
         };
-        if let Some(parent) = place.parent() {
-            fs::create_dir_all(parent).map_err(clash)?;
+        if let Some(parent) = file_path.parent() {
+            fs::create_dir_all(parent).map_err(path_conflict)?;
         }
-        let file = File::create_new(&place).map_err(clash)?;
-        self.open = Some(OpenFile { path: path.into(), file, bytes, left: bytes, hasher: Sha256::new(), sha256 });
+        let file = File::create_new(&file_path).map_err(path_conflict)?;
+        self.open_file =
+            Some(OpenFile { path: path.into(), file, bytes, remaining_bytes: bytes, hasher: Sha256::new(), sha256 });
         self.finish_file()
     }
 
@@ -112,14 +121,16 @@ impl Upload {
     /// `Invalid` when the bytes exceed the declared size or the complete file has a different hash; `Fault` of the
     /// disk.
     pub fn write_chunk(&mut self, bytes: &[u8]) -> Result<()> {
-        let count = bytes.len() as u64;
-        let Some(open) = self.open.as_mut().filter(|open| count <= open.left) else {
-            let left = self.open.as_ref().map_or(0, |open| open.left);
-            return Err(invalid("chunk", format!("at most the {left} bytes that are left of the file"), count));
+        let chunk_bytes = bytes.len() as u64;
+        let Some(open_file) = self.open_file.as_mut().filter(|open_file| chunk_bytes <= open_file.remaining_bytes)
+        else {
+            let remaining_bytes = self.open_file.as_ref().map_or(0, |open_file| open_file.remaining_bytes);
+            let expected = format!("at most {remaining_bytes} bytes (the rest of the file)");
+            return Err(invalid("chunk", expected, format!("{chunk_bytes} bytes")));
         };
-        open.file.write_all(bytes).map_err(fault_in("upload"))?;
-        open.hasher.update(bytes);
-        open.left -= count;
+        open_file.file.write_all(bytes).map_err(fault_in("upload"))?;
+        open_file.hasher.update(bytes);
+        open_file.remaining_bytes -= chunk_bytes;
         self.finish_file()
     }
 
@@ -138,12 +149,12 @@ impl Upload {
         Ok(())
     }
 
-    /// Moves the folder to `place` and replaces an earlier upload of that name.
-    pub(in crate::engine) fn commit(mut self, place: &Path) -> Result<()> {
-        if place.exists() {
-            fs::remove_dir_all(place).map_err(fault_in("upload"))?;
+    /// Moves the folder to `target_folder`. Replaces the earlier upload in that folder.
+    pub(in crate::engine) fn commit(mut self, target_folder: &Path) -> Result<()> {
+        if target_folder.exists() {
+            fs::remove_dir_all(target_folder).map_err(fault_in("upload"))?;
         }
-        fs::rename(&self.folder, place).map_err(fault_in("upload"))?;
+        fs::rename(&self.folder, target_folder).map_err(fault_in("upload"))?;
         self.folder = PathBuf::new();
         Ok(())
     }
@@ -154,27 +165,27 @@ impl Upload {
     }
 
     fn finish_file(&mut self) -> Result<()> {
-        let Some(open) = self.open.take_if(|open| open.left == 0) else { return Ok(()) };
-        let given: [u8; 32] = open.hasher.finalize().into();
-        if given != open.sha256 {
-            return Err(invalid(format!("file.sha256 of '{}'", open.path), hex(&open.sha256), hex(&given)));
+        let Some(open_file) = self.open_file.take_if(|open_file| open_file.remaining_bytes == 0) else { return Ok(()) };
+        let given: [u8; 32] = open_file.hasher.finalize().into();
+        if given != open_file.sha256 {
+            return Err(invalid(format!("file.sha256 of '{}'", open_file.path), hex(&open_file.sha256), hex(&given)));
         }
         Ok(())
     }
 
     fn check_file_complete(&self) -> Result<()> {
-        match &self.open {
+        match &self.open_file {
             None => Ok(()),
-            Some(open) => {
-                let given = format!("{} bytes", open.bytes - open.left);
-                Err(invalid(format!("file.bytes of '{}'", open.path), format!("{} bytes", open.bytes), given))
+            Some(open_file) => {
+                let given = format!("{} bytes", open_file.bytes - open_file.remaining_bytes);
+                Err(invalid(format!("file.bytes of '{}'", open_file.path), format!("{} bytes", open_file.bytes), given))
             }
         }
     }
 }
 
 impl Drop for Upload {
-    /// Removes the folder on a thread that may block if this is a thread of a runtime.
+    /// Removes the folder. On a thread of a tokio runtime, removes it on the blocking pool.
     fn drop(&mut self) {
         let folder = mem::take(&mut self.folder);
         if folder.as_os_str().is_empty() {
@@ -194,9 +205,10 @@ impl Drop for Upload {
 
 /// Checks that a path is relative, uses forward slashes and consists of plain names.
 fn validate_path(field: &str, path: &str) -> Result<()> {
-    let is_plain = |part: &str| !part.is_empty() && part != "." && part != ".." && !part.contains(['\\', '\0', ':']);
-    let parts = path.split('/').count();
-    if path.len() > MAX_PATH_BYTES || parts > MAX_PATH_DEPTH || !path.split('/').all(is_plain) {
+    let is_plain_name =
+        |part: &str| !part.is_empty() && part != "." && part != ".." && !part.contains(['\\', '\0', ':']);
+    let depth = path.split('/').count();
+    if path.len() > MAX_PATH_BYTES || depth > MAX_PATH_DEPTH || !path.split('/').all(is_plain_name) {
         let expected =
             format!("a relative path of plain names, at most {MAX_PATH_BYTES} bytes and {MAX_PATH_DEPTH} parts");
         return Err(invalid(field, expected, format!("{path:?}")));
@@ -213,75 +225,79 @@ mod tests {
     use super::*;
     use modalcast_model::error::Error;
 
-    fn begin(folder: &Path, files: u32, total_bytes: u64) -> Upload {
+    fn begin_upload(folder: &Path, files: u32, total_bytes: u64) -> Upload {
         let header = UploadHeader { scene: "s".into(), entry: String::new(), files, total_bytes };
-        let places = std::sync::Arc::new(tokio::sync::Semaphore::new(1));
-        Upload::begin(folder, header, places.try_acquire_owned().expect("free")).expect("begins")
+        let permits = std::sync::Arc::new(tokio::sync::Semaphore::new(1));
+        let permit = permits.try_acquire_owned().expect("expected a free permit");
+        Upload::begin(folder, header, permit).expect("expected a temporary folder")
     }
 
-    fn sha(bytes: &[u8]) -> Vec<u8> {
+    fn sha256_of(bytes: &[u8]) -> Vec<u8> {
         Sha256::digest(bytes).to_vec()
     }
 
     #[test]
-    fn files_arrive_in_chunks_and_settle_whole() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let mut upload = begin(folder.path(), 2, 5);
-        upload.begin_file("a/b.txt", 5, &sha(b"hello")).expect("a file");
-        upload.write_chunk(b"he").expect("fits");
-        upload.write_chunk(b"llo").expect("fits");
-        upload.begin_file("empty", 0, &sha(b"")).expect("an empty file");
-        upload.finish().expect("whole");
-        upload.commit(&folder.path().join("done")).expect("settles");
-        assert_eq!(fs::read(folder.path().join("done/a/b.txt")).expect("is there"), b"hello");
-        assert_eq!(fs::read_dir(folder.path()).expect("a folder").count(), 1);
+    fn committed_upload_has_the_files_of_all_chunks() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let mut upload = begin_upload(folder.path(), 2, 5);
+        upload.begin_file("a/b.txt", 5, &sha256_of(b"hello")).expect("expected a new file");
+        upload.write_chunk(b"he").expect("expected an accepted chunk");
+        upload.write_chunk(b"llo").expect("expected an accepted chunk");
+        upload.begin_file("empty", 0, &sha256_of(b"")).expect("expected a new file");
+        upload.finish().expect("expected a complete upload");
+        upload.commit(&folder.path().join("target")).expect("expected to move the folder");
+        assert_eq!(fs::read(folder.path().join("target/a/b.txt")).expect("expected the file"), b"hello");
+        assert_eq!(fs::read_dir(folder.path()).expect("expected a folder").count(), 1);
     }
 
     #[test]
-    fn bad_paths_are_refused() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let mut upload = begin(folder.path(), 99, 0);
-        let long = "x".repeat(300);
-        let deep = ["d"; 20].join("/");
-        for path in ["", "/etc/x", "../x", "a/../x", "a//b", "./a", "a/", "a\\b", "a\0b", "C:x", &long, &deep] {
-            let refusal = upload.begin_file(path, 0, &sha(b"")).expect_err(path).to_string();
-            assert!(refusal.starts_with("file.path"), "{refusal}");
+    fn unsafe_and_conflicting_paths_are_rejected() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let mut upload = begin_upload(folder.path(), 99, 0);
+        let long_path = "x".repeat(300);
+        let deep_path = ["d"; 20].join("/");
+        let unsafe_paths = ["", "/etc/x", "../x", "a/../x", "a//b", "./a", "a/", "a\\b", "a\0b", "C:x"];
+        for path in unsafe_paths.into_iter().chain([long_path.as_str(), &deep_path]) {
+            let error = upload.begin_file(path, 0, &sha256_of(b"")).expect_err(path).to_string();
+            assert!(error.starts_with("file.path"), "expected file.path for {path:?}, got {error}");
         }
-        upload.begin_file("a", 0, &sha(b"")).expect("plain");
+        upload.begin_file("a", 0, &sha256_of(b"")).expect("expected a new file");
         for path in ["a", "a/b"] {
-            assert!(upload.begin_file(path, 0, &sha(b"")).is_err(), "{path} passed");
+            assert!(upload.begin_file(path, 0, &sha256_of(b"")).is_err(), "expected an error for {path}");
         }
     }
 
     #[test]
-    fn a_fault_of_the_disk_is_not_the_clients() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let mut upload = begin(folder.path(), 1, 0);
+    fn disk_error_is_a_fault() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let mut upload = begin_upload(folder.path(), 1, 0);
         // No user, root included, can create a folder below a symbolic link that points to itself.
-        fs::remove_dir(&upload.folder).expect("is there");
-        std::os::unix::fs::symlink(&upload.folder, &upload.folder).expect("linked");
-        assert!(matches!(upload.begin_file("a/b", 0, &sha(b"")), Err(Error::Fault { .. })));
+        fs::remove_dir(&upload.folder).expect("expected the temporary folder");
+        std::os::unix::fs::symlink(&upload.folder, &upload.folder).expect("expected a new link");
+        assert!(matches!(upload.begin_file("a/b", 0, &sha256_of(b"")), Err(Error::Fault { .. })));
     }
 
     #[test]
-    fn sizes_and_hashes_are_held_to_and_nothing_is_left_of_a_failure() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let refusal = |act: fn(&mut Upload) -> Result<()>| {
-            let mut upload = begin(folder.path(), 1, 4);
-            act(&mut upload).expect_err("refused").to_string()
-        };
-        assert!(refusal(|up| up.begin_file("a", 5, &sha(b""))).starts_with("header.total_bytes"));
-        assert!(refusal(|up| up.begin_file("a", 4, b"short")).starts_with("file.sha256"));
-        assert!(refusal(|up| up.write_chunk(b"x")).starts_with("chunk"));
-        assert!(
-            refusal(|up| up.begin_file("a", 1, &sha(b"x")).and_then(|()| up.write_chunk(b"xy"))).starts_with("chunk")
-        );
-        assert!(
-            refusal(|up| up.begin_file("a", 1, &sha(b"x")).and_then(|()| up.write_chunk(b"y")))
-                .starts_with("file.sha256")
-        );
-        assert!(refusal(|up| up.begin_file("a", 1, &sha(b"x")).and_then(|()| up.finish())).starts_with("file.bytes"));
-        assert!(refusal(Upload::finish).starts_with("header.files"));
-        assert_eq!(fs::read_dir(folder.path()).expect("a folder").count(), 0);
+    fn wrong_sizes_and_hashes_are_rejected_and_leave_no_files() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        type UploadCalls = fn(&mut Upload) -> Result<()>;
+        let calls: [(UploadCalls, &str); 7] = [
+            (|upload| upload.begin_file("a", 5, &sha256_of(b"")), "header.total_bytes"),
+            (|upload| upload.begin_file("a", 4, b"short"), "file.sha256"),
+            (|upload| upload.write_chunk(b"x"), "chunk"),
+            (|upload| upload.begin_file("a", 1, &sha256_of(b"x")).and_then(|()| upload.write_chunk(b"xy")), "chunk"),
+            (
+                |upload| upload.begin_file("a", 1, &sha256_of(b"x")).and_then(|()| upload.write_chunk(b"y")),
+                "file.sha256",
+            ),
+            (|upload| upload.begin_file("a", 1, &sha256_of(b"x")).and_then(|()| upload.finish()), "file.bytes"),
+            (Upload::finish, "header.files"),
+        ];
+        for (call, field) in calls {
+            let mut upload = begin_upload(folder.path(), 1, 4);
+            let error = call(&mut upload).expect_err(field).to_string();
+            assert!(error.starts_with(field), "expected {field}, got {error}");
+        }
+        assert_eq!(fs::read_dir(folder.path()).expect("expected a folder").count(), 0);
     }
 }
