@@ -24,7 +24,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     if args.json {
         print_line(serde_json::to_string_pretty(&report).map_err(fault_in("doctor"))?);
     } else {
-        lines(&report).into_iter().for_each(print_line);
+        text_lines(&report).into_iter().for_each(print_line);
     }
     Ok(report["can_draw"] == true)
 }
@@ -46,47 +46,49 @@ pub(super) fn diagnose() -> Value {
     })
 }
 
-/// Whether `--backend auto` would choose CUDA: it needs a device and an NVRTC version that fits the driver.
+/// Whether `--backend auto` would choose CUDA. It needs a CUDA device and an NVRTC version that supports it.
 fn deforms_on_cuda() -> bool {
     gpu::Device::open(0).and_then(|device| device.check_compiler()).is_ok()
 }
 
-fn lines(report: &Value) -> Vec<String> {
+/// The report as text, one line per entry.
+fn text_lines(report: &Value) -> Vec<String> {
     let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
     let mut lines = Vec::new();
-    let mut line = |name: &str, value: &Value, missing: &str| {
-        let shown = if value.is_null() { missing.to_owned() } else { text(value) };
-        lines.push(format!("{name:<18}{shown}"));
+    let mut push_line = |name: &str, value: &Value, missing: &str| {
+        let displayed = if value.is_null() { missing.to_owned() } else { text(value) };
+        lines.push(format!("{name:<18}{displayed}"));
     };
     let cuda = &report["cuda"];
-    line("driver", &cuda["driver"], "no NVIDIA kernel driver");
-    line("CUDA", &cuda["cuda"], &text(&cuda["cuda_problem"]));
+    push_line("driver", &cuda["driver"], "no NVIDIA kernel driver");
+    push_line("CUDA", &cuda["cuda"], &text(&cuda["cuda_problem"]));
     for device in cuda["devices"].as_array().into_iter().flatten() {
         let gib = device["memory_bytes"].as_f64().unwrap_or(0.0) / f64::from(1 << 30);
-        let what = format!("{}, capability {}, {gib:.1} GiB", text(&device["name"]), text(&device["capability"]));
-        line(&format!("CUDA device {}", device["ordinal"]), &what.into(), "");
+        let description =
+            format!("{}, capability {}, {gib:.1} GiB", text(&device["name"]), text(&device["capability"]));
+        push_line(&format!("CUDA device {}", device["ordinal"]), &description.into(), "");
     }
-    line("NVRTC", &cuda["nvrtc"], &text(&cuda["nvrtc_problem"]));
-    line("NVRTC version", &cuda["nvrtc_version"], "unknown");
+    push_line("NVRTC", &cuda["nvrtc"], &text(&cuda["nvrtc_problem"]));
+    push_line("NVRTC version", &cuda["nvrtc_version"], "unknown");
     for (index, device) in report["egl_devices"].as_array().into_iter().flatten().enumerate() {
-        let what = format!("{}, CUDA device {}", text(&device["vendor"]), text(&device["cuda_device"]));
-        line(&format!("EGL device {index}"), &what.into(), "");
+        let description = format!("{}, CUDA device {}", text(&device["vendor"]), text(&device["cuda_device"]));
+        push_line(&format!("EGL device {index}"), &description.into(), "");
     }
     if !report["egl_problem"].is_null() {
-        line("EGL", &report["egl_problem"], "");
+        push_line("EGL", &report["egl_problem"], "");
     }
     let renderer = &report["renderer"];
-    line("renderer", &renderer["renderer"], &text(&report["renderer_problem"]));
-    line("OpenGL", &renderer["version"], "none");
-    let how = match renderer["software"].as_bool() {
+    push_line("renderer", &renderer["renderer"], &text(&report["renderer_problem"]));
+    push_line("OpenGL", &renderer["version"], "none");
+    let rendering_mode = match renderer["software"].as_bool() {
         Some(true) => "software: frames are drawn on the CPU",
         Some(false) => "hardware",
         None => "none",
     };
-    line("rendering", &how.into(), "");
-    line("largest frame", &renderer["max_side"], "none");
-    line("deforms on", &report["deforms_on"], "cpu");
+    push_line("rendering", &rendering_mode.into(), "");
+    push_line("largest frame", &renderer["max_side"], "none");
+    push_line("deforms on", &report["deforms_on"], "cpu");
     let verdict = if report["can_draw"] == true { "frames can be drawn" } else { "no frame can be drawn" };
-    line("verdict", &verdict.into(), "");
+    push_line("verdict", &verdict.into(), "");
     lines
 }

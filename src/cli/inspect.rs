@@ -1,5 +1,5 @@
-//! `modalcast inspect`: prints the content of a scene, the features it needs, and the memory and passes saved by
-//! omitting the other features.
+//! `modalcast inspect`: prints the content of a scene, the features that it uses, and the memory and passes that are
+//! saved because the other features are omitted.
 
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -30,19 +30,19 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let opened = with_spinner("loading", || load::open(&args.scene))?;
+    let opened_scene = with_spinner("loading", || load::open(&args.scene))?;
     if args.json {
-        let report = serde_json::to_value(SceneReport::new(&opened)).map_err(fault_in("inspect"))?;
+        let report = serde_json::to_value(SceneReport::new(&opened_scene)).map_err(fault_in("inspect"))?;
         print_line(serde_json::to_string_pretty(&report).map_err(fault_in("inspect"))?);
     } else {
-        lines(&opened).into_iter().for_each(print_line);
+        text_lines(&opened_scene).into_iter().for_each(print_line);
     }
     Ok(true)
 }
 
 /// Bytes of a domain's shape in host memory: rest positions, corners, triangles, U, and the vertex rings if the normals
 /// need them.
-fn bytes_of(scene: &Scene, domain: usize) -> usize {
+fn shape_bytes(scene: &Scene, domain: usize) -> usize {
     let shape = scene.shape_of(domain);
     let corners = shape.mesh.corners();
     let per_corner =
@@ -118,7 +118,7 @@ impl<'a> DomainReport<'a> {
             rank: slot.rank,
             triangles: slot.triangles,
             corners: slot.corners,
-            bytes: bytes_of(scene, index),
+            bytes: shape_bytes(scene, index),
             shape: domain.shape,
             parent: domain.attachment.as_ref().map(|attachment| attachment.parent),
             follows: domain.follows.map(|follow| follow.parent),
@@ -129,10 +129,10 @@ impl<'a> DomainReport<'a> {
 
 fn totals(scene: &Scene) -> Value {
     // Instances share a shape, so each shape is counted once.
-    let mut seen = vec![false; scene.shapes.len()];
+    let mut is_counted = vec![false; scene.shapes.len()];
     let mut bytes = 0;
     for (index, domain) in scene.domains.iter().enumerate() {
-        bytes += if std::mem::replace(&mut seen[domain.shape], true) { 0 } else { bytes_of(scene, index) };
+        bytes += if std::mem::replace(&mut is_counted[domain.shape], true) { 0 } else { shape_bytes(scene, index) };
     }
     json!({
         "domains": scene.domains.len(),
@@ -146,12 +146,12 @@ fn totals(scene: &Scene) -> Value {
     })
 }
 
-fn lines(opened: &OpenedScene) -> Vec<String> {
-    let scene = &opened.scene;
+fn text_lines(opened_scene: &OpenedScene) -> Vec<String> {
+    let scene = &opened_scene.scene;
     let mut lines = vec![format!("{:<28}{:>10}{:>6}{:>12}{:>14}", "domain", "vertices", "r", "triangles", "bytes")];
     for (index, domain) in scene.domains.iter().enumerate().take(MAX_LISTED_DOMAINS) {
         let slot = scene.layout.domains[index];
-        let bytes = bytes_of(scene, index);
+        let bytes = shape_bytes(scene, index);
         lines.push(format!(
             "{:<28}{:>10}{:>6}{:>12}{:>14}",
             domain.name, slot.vertices, slot.rank, slot.triangles, bytes
@@ -161,15 +161,15 @@ fn lines(opened: &OpenedScene) -> Vec<String> {
         lines.push(format!("... and {} more (--json lists all)", scene.domains.len() - MAX_LISTED_DOMAINS));
     }
     let totals = totals(scene);
-    let numbers = totals.as_object().into_iter().flatten();
-    lines.extend(numbers.map(|(name, value)| format!("{:<28}{value:>16}", format!("total {name}"))));
+    let entries = totals.as_object().into_iter().flatten();
+    lines.extend(entries.map(|(name, value)| format!("{:<28}{value:>16}", format!("total {name}"))));
     let extent = scene.rest_bounds.diagonal();
     lines.push(format!("up {:?}, unit {} m, diagonal {extent:.4}, origin {:?}", scene.up, scene.unit, scene.origin));
     lines.extend(scene.remarks.iter().map(|remark| format!("remark: {remark}")));
     let flags = scene.features.flags().into_iter();
-    let needed: Vec<&str> = flags.filter_map(|(name, needed)| needed.then_some(name)).collect();
-    lines.push(format!("needs: {}", needed.join(", ")));
-    lines.extend(plans(opened));
+    let needed_features: Vec<&str> = flags.filter_map(|(name, is_needed)| is_needed.then_some(name)).collect();
+    lines.push(format!("needs: {}", needed_features.join(", ")));
+    lines.extend(plan_lines(opened_scene));
     lines
 }
 
@@ -183,7 +183,7 @@ fn pass_names(passes: &[Pass]) -> Vec<&str> {
 }
 
 /// The kernels, passes and memory that the deformer and the renderer plan for the scene, and the parts that they omit.
-fn plans(OpenedScene { scene, backends }: &OpenedScene) -> Vec<String> {
+fn plan_lines(OpenedScene { scene, backends }: &OpenedScene) -> Vec<String> {
     let (deform, render) = (deform_plan(scene, backends), modalcast_render::plan(scene));
     let kernels: Vec<String> =
         deform.kernels.iter().map(|kernel| format!("{} [{}]", kernel.name, kernel.defines.join(" "))).collect();
@@ -198,12 +198,12 @@ fn plans(OpenedScene { scene, backends }: &OpenedScene) -> Vec<String> {
         format!("device memory: {} bytes to deform, {} to render", deform.total_bytes(), render.bytes()),
     ];
     for part in &deform.omitted {
-        lines.push(format!("left out of deforming, {}: {}; saved {} bytes", part.feature, part.what, part.bytes));
+        lines.push(format!("omitted from deforming, {}: {}; saves {} bytes", part.feature, part.what, part.bytes));
     }
     for part in &render.omitted {
         let passes = if part.passes.is_empty() { "no pass".into() } else { pass_names(&part.passes).join(" and ") };
         lines.push(format!(
-            "left out of rendering, {}: {}; saved {} bytes and {passes}",
+            "omitted from rendering, {}: {}; saves {} bytes and {passes}",
             part.feature, part.shaders, part.bytes
         ));
     }
@@ -218,7 +218,7 @@ mod tests {
 
     use super::*;
 
-    /// Any JSON value. Its deserialization fails at an object that contains a key twice.
+    /// Any JSON value. Its deserialization fails if an object contains a key twice.
     struct UniqueKeys;
 
     impl<'de> Deserialize<'de> for UniqueKeys {
@@ -231,14 +231,14 @@ mod tests {
         type Value = Self;
 
         fn expecting(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-            out.write_str("JSON")
+            out.write_str("a JSON value with unique keys")
         }
 
         fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Self, A::Error> {
             let mut keys = BTreeSet::new();
             while let Some((key, Self)) = map.next_entry::<String, Self>()? {
                 if !keys.insert(key.clone()) {
-                    return Err(A::Error::custom(format!("the key {key} twice")));
+                    return Err(A::Error::custom(format!("expected unique keys, got '{key}' twice")));
                 }
             }
             Ok(self)
@@ -276,11 +276,14 @@ mod tests {
 
     #[test]
     fn json_has_each_key_once_and_the_deform_settings() {
-        let opened = load::open("tree").expect("loads");
-        let text = serde_json::to_string(&SceneReport::new(&opened)).expect("serializes");
-        serde_json::from_str::<UniqueKeys>(&text).map(drop).expect("unique keys");
-        assert!(serde_json::from_str::<UniqueKeys>(r#"[{"a": {"b": 1, "b": null}}]"#).is_err(), "control");
-        let value: Value = serde_json::from_str(&text).expect("JSON");
+        let opened_scene = load::open("tree").expect("expected the built-in scene");
+        let text = serde_json::to_string(&SceneReport::new(&opened_scene)).expect("expected a serialized report");
+        serde_json::from_str::<UniqueKeys>(&text).map(drop).expect("expected unique keys");
+        assert!(
+            serde_json::from_str::<UniqueKeys>(r#"[{"a": {"b": 1, "b": null}}]"#).is_err(),
+            "control: expected an error"
+        );
+        let value: Value = serde_json::from_str(&text).expect("expected JSON");
         assert!(value["deformation"]["storage"].is_string(), "{}", value["deformation"]);
         assert_eq!(value["deformation"]["batches"], "auto");
         assert!(value["deform"]["kernels"].is_array() && value["render"]["passes"].is_array(), "{text}");

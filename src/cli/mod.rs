@@ -1,4 +1,4 @@
-//! The command line: one file per command, and the exit codes.
+//! The command line: the commands, one per file, and their exit codes.
 
 mod demo;
 mod doctor;
@@ -44,7 +44,7 @@ Exit codes:
   5  a resource or a program is missing or in use; the message names it
   6  error of the server or the device";
 
-/// Result of a command: whether its own check passed, or an error.
+/// Result of a command: whether the check that it performs passed, or an error.
 pub type Outcome = modalcast_model::error::Result<bool>;
 
 /// Runs the command line and returns the process's exit code.
@@ -62,7 +62,7 @@ pub fn run() -> u8 {
     finish(outcome)
 }
 
-/// Converts an outcome to an exit code; prints an error to stderr.
+/// Converts an outcome to an exit code. Prints an error on standard error.
 pub fn finish(outcome: Outcome) -> u8 {
     match outcome {
         Ok(true) => 0,
@@ -83,12 +83,13 @@ fn exit_code(error: &Error) -> u8 {
     }
 }
 
-/// Prints a line of a command's result. Nothing else writes to standard output, so that logs never mix with results.
+/// Prints a line of a command's result on standard output. Nothing else is printed there, so that logs never mix with
+/// results.
 pub fn print_line(line: impl std::fmt::Display) {
     if let Err(error) = writeln!(std::io::stdout(), "{line}")
         && error.kind() != std::io::ErrorKind::BrokenPipe
     {
-        // A closed pipe is normal, for example with `head`; other errors such as a full disk are reported.
+        // A closed pipe is normal, for example with `head`. Other errors, such as a full disk, are reported.
         eprintln!("modalcast: standard output: {error}");
     }
 }
@@ -98,15 +99,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_command_line_is_well_formed_and_every_command_has_examples() {
+    fn command_line_is_valid_and_every_command_has_examples() {
         use clap::CommandFactory as _;
         let mut command = Cli::command();
         command.clone().debug_assert();
-        for sub in command.get_subcommands_mut() {
-            let name = sub.get_name().to_owned();
+        for subcommand in command.get_subcommands_mut() {
+            let name = subcommand.get_name().to_owned();
             if name != "help" {
-                let help = sub.render_long_help().to_string();
-                assert!(help.contains("Examples:"), "{name} shows no examples");
+                let help = subcommand.render_long_help().to_string();
+                assert!(help.contains("Examples:"), "expected examples in the help of {name}");
             }
         }
     }

@@ -45,13 +45,13 @@ pub(super) struct Args {
     /// Vertical field of view in degrees. Default: 35.
     #[arg(long, requires = "eye", value_name = "DEGREES")]
     field_of_view: Option<f64>,
-    /// What the picture shows: color, or a color map with a legend.
+    /// Content of the picture: color, or a color map with a legend.
     #[arg(long, value_enum, default_value_t)]
     output: OutputOption,
     /// Index of the column of U for `--output mode-shape`, from 0.
     #[arg(long, requires = "output", default_value_t = 0)]
     mode: u32,
-    /// Value at the bright end of the color map; 0 fits it to the frame.
+    /// Value at the bright end of the color map; 0 fits the color map to the frame.
     #[arg(long, requires = "output", default_value_t = 0.0)]
     largest: f64,
     /// Deformation backend.
@@ -75,7 +75,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     let OpenedScene { scene, backends } = with_spinner("loading", || load::open(&args.scene))?;
     let mut state = SceneState::rest(&scene);
     if let Some(path) = &args.q {
-        state.q = coordinates(&scene, path)?;
+        state.q = read_coordinates(&scene, path)?;
     }
     let mut device =
         DeviceContext::open(&Config { backend: args.backend, renderer: args.renderer, ..Config::default() })?;
@@ -95,8 +95,8 @@ pub(super) fn run(args: &Args) -> Outcome {
             render_color_map(args, &mut device, &mut loaded_scene, FrameOutput::ModeShape { mode, largest })?
         }
     };
-    let place = format!("--out {}", args.out.display());
-    fs::write(&args.out, bytes).map_err(|error| invalid(place, "a file that can be written", error))?;
+    let field = format!("--out {}", args.out.display());
+    fs::write(&args.out, bytes).map_err(|error| invalid(field, "a file that can be written", error))?;
     device.unload_scene(loaded_scene);
     print_line(format!("{} ({}, {})", args.out.display(), args.size, device.backend().name()));
     Ok(true)
@@ -111,7 +111,7 @@ fn render_color_map(
 ) -> Result<Vec<u8>> {
     let scene = Arc::clone(loaded_scene.scene());
     let (aov, legend) = device.render_aov(loaded_scene, &camera(args, &scene), args.size, frame_output)?;
-    let legend = legend.ok_or_else(|| fault_in("encode")("a color map without a legend"))?;
+    let legend = legend.ok_or_else(|| fault_in("encode")("expected a legend of the color map"))?;
     let rgba = frame::draw_color_map(&aov.bytes, aov.samples, args.size.to_array(), &legend)?;
     frame::encode_png(args.size.width, args.size.height, &rgba)
 }
@@ -126,27 +126,27 @@ fn camera(args: &Args, scene: &Scene) -> Camera {
 }
 
 /// Reads q from a .npy file and checks its shape against the scene.
-fn coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
-    let place = format!("q in {}", path.display());
-    let wanted = format!("{} coordinates, all domains in order", scene.layout.coordinates);
+fn read_coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
+    let field = format!("q in {}", path.display());
+    let expected = format!("{} coordinates, all domains in order", scene.layout.coordinates);
     if !path.exists() {
         return Err(Error::NotFound { what: "q", given: path.display().to_string() });
     }
-    let bytes = fs::metadata(path).map_err(|error| invalid(&place, "a .npy file", error))?.len();
-    // f64 entries and a .npy header: no valid file is larger.
-    let most = 8 * scene.layout.coordinates as u64 + 65536;
-    if bytes > most {
-        return Err(invalid(&place, format!("{wanted}: at most {most} bytes"), format!("{bytes} bytes")));
+    let bytes = fs::metadata(path).map_err(|error| invalid(&field, "a .npy file", error))?.len();
+    // The size of f64 entries and the longest .npy header. Checked before the file is read into memory.
+    let max_bytes = 8 * scene.layout.coordinates as u64 + 65536;
+    if bytes > max_bytes {
+        return Err(invalid(&field, format!("{expected}: at most {max_bytes} bytes"), format!("{bytes} bytes")));
     }
-    let bytes = fs::read(path).map_err(|error| invalid(&place, "a readable file", error))?;
-    let array = load::parse_numpy(&bytes).map_err(|error| error.prefix_field(&place))?;
-    // Axes of length one are accepted, because saving a single step of a trajectory leaves a leading one.
-    let sides = array.shape.iter().filter(|side| **side != 1).count();
-    if array.entries.len() != scene.layout.coordinates || sides > 1 {
-        return Err(invalid(format!("{place}: shape"), wanted, format!("{:?}", array.shape)));
+    let bytes = fs::read(path).map_err(|error| invalid(&field, "a readable file", error))?;
+    let array = load::parse_numpy(&bytes).map_err(|error| error.prefix_field(&field))?;
+    // Axes of length one are ignored, because an array of a single step may have a leading axis.
+    let long_axes = array.shape.iter().filter(|length| **length != 1).count();
+    if array.entries.len() != scene.layout.coordinates || long_axes > 1 {
+        return Err(invalid(format!("{field}: shape"), expected, format!("{:?}", array.shape)));
     }
     match array.entries.iter().position(|number| !number.is_finite()) {
         None => Ok(array.entries),
-        Some(at) => Err(invalid(format!("{place}, entry {at}"), "a finite number", array.entries[at])),
+        Some(index) => Err(invalid(format!("{field}, entry {index}"), "a finite number", array.entries[index])),
     }
 }

@@ -1,5 +1,5 @@
-//! `modalcast report`: starts `modalcast-report`, a separate executable in the same folder, so that the server is built
-//! without its benchmarks.
+//! `modalcast report`: starts `modalcast-report`, an executable in the same folder. It is separate, so that the server
+//! is built without the benchmarks.
 
 use std::ffi::OsString;
 use std::path::Path;
@@ -27,29 +27,32 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let own = std::env::current_exe().map_err(fault_in("report"))?;
-    let program = own.with_file_name(PROGRAM);
-    check_build(&program)?;
-    let status = Command::new(&program).args(&args.arguments).status().map_err(fault_in("report"))?;
+    let own_path = std::env::current_exe().map_err(fault_in("report"))?;
+    let program_path = own_path.with_file_name(PROGRAM);
+    check_build(&program_path)?;
+    let status = Command::new(&program_path).args(&args.arguments).status().map_err(fault_in("report"))?;
     // `modalcast-report` uses the same exit codes.
     std::process::exit(status.code().unwrap_or(6));
 }
 
-/// Rejects a program that is missing or was built from other sources, because it would not measure this server.
-fn check_build(program: &Path) -> Result<()> {
-    let refusal = |reason: String| Error::Unavailable {
+/// Fails if the program is missing or was built from other sources, because it would not measure this server.
+fn check_build(program_path: &Path) -> Result<()> {
+    let unavailable = |reason: String| Error::Unavailable {
         what: PROGRAM,
         reason,
         remedy: "Build it with `cargo build --release -p modalcast-bench`".into(),
     };
-    let output = Command::new(program).arg("--build").output();
-    let output = output.map_err(|error| refusal(format!("{}: {error}", program.display())))?;
+    let output = Command::new(program_path).arg("--build").output();
+    let output = output.map_err(|error| unavailable(format!("{}: {error}", program_path.display())))?;
     let build = String::from_utf8_lossy(&output.stdout);
     match build.trim() == crate::BUILD {
         true => Ok(()),
-        false => {
-            Err(refusal(format!("{}: expected build {}, got '{}'", program.display(), crate::BUILD, build.trim())))
-        }
+        false => Err(unavailable(format!(
+            "{}: expected build {}, got '{}'",
+            program_path.display(),
+            crate::BUILD,
+            build.trim()
+        ))),
     }
 }
 
@@ -60,19 +63,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_missing_sibling_and_one_of_another_build_are_refused() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let program = folder.path().join(PROGRAM);
-        let missing = check_build(&program).expect_err("missing").to_string();
-        assert!(missing.contains("cargo build --release -p modalcast-bench"), "{missing}");
-        let write = |build: &str| {
-            std::fs::write(&program, format!("#!/bin/sh\necho {build}\n")).expect("writes");
-            std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).expect("permits");
+    fn missing_program_or_program_of_another_build_is_an_error() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let program_path = folder.path().join(PROGRAM);
+        let error = check_build(&program_path).expect_err("expected a missing program").to_string();
+        assert!(error.contains("cargo build --release -p modalcast-bench"), "{error}");
+        let write_program = |build: &str| {
+            std::fs::write(&program_path, format!("#!/bin/sh\necho {build}\n")).expect("expected a written file");
+            let permissions = std::fs::Permissions::from_mode(0o755);
+            std::fs::set_permissions(&program_path, permissions).expect("expected changed permissions");
         };
-        write("0123");
-        let other = check_build(&program).expect_err("another build").to_string();
-        assert!(other.contains("got '0123'"), "{other}");
-        write(crate::BUILD);
-        check_build(&program).expect("the same build");
+        write_program("0123");
+        let error = check_build(&program_path).expect_err("expected another build").to_string();
+        assert!(error.contains("got '0123'"), "{error}");
+        write_program(crate::BUILD);
+        check_build(&program_path).expect("expected the same build");
     }
 }

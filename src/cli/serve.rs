@@ -15,10 +15,10 @@ use modalcast_model::load::SceneRepository;
 /// Serves scenes over gRPC until SIGTERM or Ctrl-C, then ends open streams and exits.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
-  modalcast serve                                   the built-in scenes on loopback
-  modalcast serve --scenes ~/scenes                 and those of a folder
-  modalcast serve --listen 0.0.0.0:50051            for other machines too
-  modalcast serve --backend cpu --renderer software as on a machine without a GPU")]
+  modalcast serve                                   built-in scenes, for clients on this machine
+  modalcast serve --scenes ~/scenes                 also the scenes of a folder
+  modalcast serve --listen 0.0.0.0:50051            also for clients on other machines
+  modalcast serve --backend cpu --renderer software without a GPU")]
 pub(super) struct Args {
     /// Address to listen on; port 0 selects a free port. The address is printed as 'listening on URL'.
     #[arg(long, env = "MODALCAST_LISTEN", default_value_t = Config::default().listen)]
@@ -99,19 +99,19 @@ async fn serve(config: ValidatedConfig) -> Result<()> {
     let engine = Engine::start(config, repository).await?;
     let address = listener.local_addr().map_err(fault_in("serve"))?;
     if !address.ip().is_loopback() {
-        tracing::warn!("{address} is open to other machines, without authentication");
+        tracing::warn!("{address} accepts clients on other machines, without authentication");
     }
-    describe(engine.info());
+    log_devices(engine.info());
     print_line(format!("listening on http://{address}"));
     service::serve(engine, listener, shutdown_signal()).await
 }
 
-/// Logs the backend and the renderer; warns about a software renderer.
-fn describe(info: &EngineInfo) {
+/// Logs the backend and the renderer. Warns about a software renderer.
+fn log_devices(info: &EngineInfo) {
     tracing::info!("deforming on {} ({})", info.backend.name(), info.device);
     match &info.renderer {
-        Ok(found) if found.software => tracing::warn!("drawing on the CPU: {}", found.renderer),
-        Ok(found) => tracing::info!("drawing on {}", found.renderer),
+        Ok(renderer) if renderer.software => tracing::warn!("drawing on the CPU: {}", renderer.renderer),
+        Ok(renderer) => tracing::info!("drawing on {}", renderer.renderer),
         Err(error) => tracing::warn!("no frames can be drawn: {error}"),
     }
 }
@@ -127,8 +127,8 @@ async fn shutdown_signal() {
             }
         }
         Err(error) => {
-            tracing::warn!("SIGTERM will not be heard: {error}");
-            interrupt.await.ok(); // If Ctrl-C cannot be handled either, the server stops.
+            tracing::warn!("SIGTERM cannot be handled: {error}");
+            interrupt.await.ok(); // If Ctrl-C cannot be handled either, returns at once, so that the server stops.
         }
     }
 }

@@ -9,16 +9,18 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Scene, SceneState};
 
 /// Tolerance for the error of received vertices, as a fraction of the scene's diagonal.
-const LARGEST_ERROR: f64 = 1e-5;
+const MAX_RELATIVE_ERROR: f64 = 1e-5;
 
 /// Tolerance for the gap of a joint, as a fraction of the scene's diagonal.
-const LARGEST_GAP: f64 = 1e-3;
+const MAX_RELATIVE_GAP: f64 = 1e-3;
 
+/// The measured results of a demo.
 pub(super) struct Evaluation {
     backend: String,
     renderer: String,
     steps: usize,
     steps_per_second: f64,
+    /// Median milliseconds per stage.
     stages: Vec<(String, f64)>,
     /// Largest distance to the reference, in scene units and as a fraction of the diagonal.
     error: f64,
@@ -28,12 +30,13 @@ pub(super) struct Evaluation {
     relative_displacement: f64,
     /// Largest distance from the rest position in the top tenth of the scene, as a fraction of the scene's height.
     sway: f64,
-    /// Largest distance of a child's origin from the displaced center of the ring that carries it, as a fraction of the
-    /// diagonal; `None` without joints.
+    /// Largest distance of a child's origin from the displaced center of its ring, as a fraction of the diagonal.
+    /// `None` without joints.
     joint_gap: Option<f64>,
-    least: MinimumMotion,
+    min_motion: MinimumMotion,
+    /// Number of frames on disk.
     frames: usize,
-    frames_wanted: usize,
+    expected_frames: usize,
 }
 
 impl Evaluation {
@@ -41,31 +44,31 @@ impl Evaluation {
     ///
     /// # Errors
     /// `Invalid` when the recorded arrays have different step counts or do not have the scene's shapes.
-    pub(super) fn of(scene: &Scene, run: &DemoRun, wanted: u32) -> Result<Self> {
+    pub(super) fn of(scene: &Scene, run: &DemoRun, expected_frames: u32) -> Result<Self> {
         let steps = run.vertices.shape()[0];
         if run.q.shape() != [steps, scene.layout.coordinates]
             || run.transforms.shape() != [steps, scene.domains.len(), 12]
             || run.vertices.shape() != [steps, scene.layout.vertices, 3]
         {
             let given = format!("{:?}, {:?}, {:?}", run.q.shape(), run.transforms.shape(), run.vertices.shape());
-            return Err(invalid("demo", "as many steps of q, transforms and vertices as frames", given));
+            return Err(invalid("demo", "q, transforms and vertices of the same steps of the scene", given));
         }
-        let rest = reference::deform(scene, &SceneState::rest(scene));
-        let crown = TopRegion::of(scene, &rest);
-        let joints = Joint::all(scene, &rest);
+        let rest_positions = reference::deform(scene, &SceneState::rest(scene));
+        let top_region = TopRegion::of(scene, &rest_positions);
+        let joints = Joint::all(scene, &rest_positions);
         let (mut error, mut displacement, mut sway, mut gap) = (0.0_f64, 0.0_f64, 0.0_f64, 0.0_f64);
         for step in 0..steps {
-            let state = state(scene, run, step);
-            let want = reference::deform(scene, &state);
-            let (got, _) = run.vertices.row(step).as_chunks::<3>();
-            gap = joints.iter().fold(gap, |gap, joint| max_error(gap, joint.gap(got, &state)));
-            for (vertex, got) in got.iter().enumerate() {
-                let got = got.map(f64::from);
-                error = max_error(error, distance(got, want[vertex]));
-                let moved = distance(got, rest[vertex]);
-                displacement = max_error(displacement, moved);
-                if crown.holds(rest[vertex]) {
-                    sway = max_error(sway, moved);
+            let state = sent_state(scene, run, step);
+            let expected_positions = reference::deform(scene, &state);
+            let (received_positions, _) = run.vertices.row(step).as_chunks::<3>();
+            gap = joints.iter().fold(gap, |gap, joint| max_error(gap, joint.gap(received_positions, &state)));
+            for (vertex, position) in received_positions.iter().enumerate() {
+                let position = position.map(f64::from);
+                error = max_error(error, distance(position, expected_positions[vertex]));
+                let vertex_displacement = distance(position, rest_positions[vertex]);
+                displacement = max_error(displacement, vertex_displacement);
+                if top_region.contains(rest_positions[vertex]) {
+                    sway = max_error(sway, vertex_displacement);
                 }
             }
         }
@@ -75,32 +78,35 @@ impl Evaluation {
             renderer: text(&run.server, "renderer"),
             steps,
             steps_per_second: run.sim["steps_per_second"].as_f64().unwrap_or(f64::NAN),
-            stages: stages(&run.frames),
+            stages: median_stage_ms(&run.frames),
             error,
             relative_error: error / diagonal,
             displacement,
             relative_displacement: displacement / diagonal,
-            sway: sway / crown.height,
+            sway: sway / top_region.scene_height,
             joint_gap: (!joints.is_empty()).then_some(gap / diagonal),
-            least: MinimumMotion::of(scene),
+            min_motion: MinimumMotion::of(scene),
             frames: run.frames_on_disk,
-            frames_wanted: wanted as usize,
+            expected_frames: expected_frames as usize,
         })
     }
 
     /// The acceptance criteria that are not met.
     pub(super) fn failed_checks(&self) -> Vec<String> {
         let criteria = [
-            (self.relative_error <= LARGEST_ERROR, format!("vertices within {LARGEST_ERROR:.0e} of the diagonal")),
-            (self.joint_gap.is_none_or(|gap| gap <= LARGEST_GAP), format!("joints within {LARGEST_GAP:.0e}")),
-            (self.frames == self.frames_wanted, format!("{} frames", self.frames_wanted)),
-            (self.sway >= self.least.sway, format!("a sway of {} % of the height", 100.0 * self.least.sway)),
             (
-                self.relative_displacement >= self.least.displacement,
-                format!("a displacement of {} % of the diagonal", 100.0 * self.least.displacement),
+                self.relative_error <= MAX_RELATIVE_ERROR,
+                format!("vertices within {MAX_RELATIVE_ERROR:.0e} of the diagonal"),
+            ),
+            (self.joint_gap.is_none_or(|gap| gap <= MAX_RELATIVE_GAP), format!("joints within {MAX_RELATIVE_GAP:.0e}")),
+            (self.frames == self.expected_frames, format!("{} frames", self.expected_frames)),
+            (self.sway >= self.min_motion.sway, format!("a sway of {} % of the height", 100.0 * self.min_motion.sway)),
+            (
+                self.relative_displacement >= self.min_motion.displacement,
+                format!("a displacement of {} % of the diagonal", 100.0 * self.min_motion.displacement),
             ),
         ];
-        criteria.into_iter().filter_map(|(met, criterion)| (!met).then_some(criterion)).collect()
+        criteria.into_iter().filter_map(|(is_met, criterion)| (!is_met).then_some(criterion)).collect()
     }
 
     pub(super) fn table(&self) -> Vec<String> {
@@ -110,17 +116,20 @@ impl Evaluation {
             ("steps".into(), format!("{} at {:.1} steps/s", self.steps, self.steps_per_second)),
         ];
         rows.extend(self.stages.iter().map(|(stage, ms)| (format!("  {stage}"), format!("{ms:.2} ms"))));
-        let share = 100.0 * self.relative_displacement;
+        let displacement_percent = 100.0 * self.relative_displacement;
         rows.extend([
             (
                 "error against f64".into(),
                 format!("{:.2e} units, {:.1e} of the diagonal", self.error, self.relative_error),
             ),
-            ("largest displacement".into(), format!("{:.3} units, {share:.1} % of the diagonal", self.displacement)),
+            (
+                "largest displacement".into(),
+                format!("{:.3} units, {displacement_percent:.1} % of the diagonal", self.displacement),
+            ),
             ("sway at the top".into(), format!("{:.1} % of the height", 100.0 * self.sway)),
         ]);
         rows.extend(self.joint_gap.map(|gap| ("largest joint gap".into(), format!("{gap:.1e} of the diagonal"))));
-        rows.push(("frames written".into(), format!("{} of {}", self.frames, self.frames_wanted)));
+        rows.push(("frames written".into(), format!("{} of {}", self.frames, self.expected_frames)));
         rows.extend(self.failed_checks().into_iter().map(|criterion| ("NOT MET".into(), criterion)));
         rows.into_iter().map(|(name, value): (String, String)| format!("{name:<22}{value}")).collect()
     }
@@ -147,21 +156,24 @@ impl Evaluation {
 
 /// The top tenth of a scene along its up axis.
 struct TopRegion {
-    axis: usize,
-    from: f64,
-    height: f64,
+    up_axis: usize,
+    /// Lower bound of the region on the up axis.
+    min_height: f64,
+    /// Height of the whole scene.
+    scene_height: f64,
 }
 
 impl TopRegion {
-    fn of(scene: &Scene, rest: &[[f64; 3]]) -> Self {
-        let axis = scene.up.index();
-        let heights = || rest.iter().map(|point| point[axis]);
-        let (low, high) = (heights().fold(f64::INFINITY, f64::min), heights().fold(f64::NEG_INFINITY, f64::max));
-        Self { axis, from: high - 0.1 * (high - low), height: (high - low).max(f64::MIN_POSITIVE) }
+    fn of(scene: &Scene, rest_positions: &[[f64; 3]]) -> Self {
+        let up_axis = scene.up.index();
+        let heights = || rest_positions.iter().map(|point| point[up_axis]);
+        let (bottom, top) = (heights().fold(f64::INFINITY, f64::min), heights().fold(f64::NEG_INFINITY, f64::max));
+        let min_height = top - 0.1 * (top - bottom);
+        Self { up_axis, min_height, scene_height: (top - bottom).max(f64::MIN_POSITIVE) }
     }
 
-    fn holds(&self, point: [f64; 3]) -> bool {
-        point[self.axis] >= self.from
+    fn contains(&self, point: [f64; 3]) -> bool {
+        point[self.up_axis] >= self.min_height
     }
 }
 
@@ -175,8 +187,8 @@ impl MinimumMotion {
     /// 2 % of the diagonal for a scene with modes, 0.01 % for a rigid one. A scene with modes and attached domains must
     /// also sway by 3 % of its height.
     fn of(scene: &Scene) -> Self {
-        let jointed = scene.features.modes && scene.domains.iter().any(|domain| domain.attachment.is_some());
-        Self { displacement: if scene.features.modes { 0.02 } else { 1e-4 }, sway: if jointed { 0.03 } else { 0.0 } }
+        let has_joints = scene.features.modes && scene.domains.iter().any(|domain| domain.attachment.is_some());
+        Self { displacement: if scene.features.modes { 0.02 } else { 1e-4 }, sway: if has_joints { 0.03 } else { 0.0 } }
     }
 }
 
@@ -196,8 +208,8 @@ impl Joint {
         let joint = |(child, domain): (usize, &modalcast_model::domain::Domain)| {
             let attachment = domain.attachment.as_ref().filter(|attachment| !attachment.rows.is_empty())?;
             let root = scene.transform_roots.frame_of(child).is_none().then(|| scene.transform_roots.root_of(child))?;
-            let first = scene.layout.domains[attachment.parent].first_vertex;
-            let joint = Self { root, ring: attachment.rows.iter().map(|row| first + *row as usize).collect() };
+            let first_vertex = scene.layout.domains[attachment.parent].first_vertex;
+            let joint = Self { root, ring: attachment.rows.iter().map(|row| first_vertex + *row as usize).collect() };
             let center = center(joint.ring.iter().map(|vertex| rest[*vertex]));
             (distance(center, joint.origin(&state)) <= 1e-5 * diagonal).then_some(joint)
         };
@@ -208,10 +220,10 @@ impl Joint {
         state.transforms[self.root].translation().into()
     }
 
-    /// Distance in scene units of the child's origin, as sent, from the center of the ring, as received.
-    fn gap(&self, got: &[[f32; 3]], state: &SceneState) -> f64 {
-        let ring = self.ring.iter().map(|vertex| got[*vertex].map(f64::from));
-        distance(center(ring), self.origin(state))
+    /// Distance in scene units of the child's sent origin from the center of the received ring.
+    fn gap(&self, received_positions: &[[f32; 3]], state: &SceneState) -> f64 {
+        let ring_positions = self.ring.iter().map(|vertex| received_positions[*vertex].map(f64::from));
+        distance(center(ring_positions), self.origin(state))
     }
 }
 
@@ -222,12 +234,12 @@ fn center(points: impl ExactSizeIterator<Item = [f64; 3]>) -> [f64; 3] {
 }
 
 /// The state that the physics process sent at one step.
-fn state(scene: &Scene, run: &DemoRun, step: usize) -> SceneState {
+fn sent_state(scene: &Scene, run: &DemoRun, step: usize) -> SceneState {
     let mut state = SceneState::rest(scene);
     state.q = run.q.row(step).to_vec();
-    let (sent, _) = run.transforms.row(step).as_chunks::<12>();
-    for (transform, sent) in state.transforms.iter_mut().zip(sent) {
-        *transform = Transform(*sent);
+    let (sent_transforms, _) = run.transforms.row(step).as_chunks::<12>();
+    for (transform, sent_transform) in state.transforms.iter_mut().zip(sent_transforms) {
+        *transform = Transform(*sent_transform);
     }
     state
 }
@@ -236,7 +248,7 @@ fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
 }
 
-/// The larger of two values; a NaN `b` counts as infinity.
+/// The larger of two values. If `b` is NaN, infinity, so that an invalid position fails the checks.
 fn max_error(a: f64, b: f64) -> f64 {
     if b.is_nan() { f64::INFINITY } else { a.max(b) }
 }
@@ -246,10 +258,10 @@ fn text(value: &Value, key: &str) -> String {
 }
 
 /// Median milliseconds per stage, as reported by the receiving client.
-fn stages(frames: &Value) -> Vec<(String, f64)> {
+fn median_stage_ms(frames: &Value) -> Vec<(String, f64)> {
     let object = frames["stages_ms"].as_object();
     object
-        .map(|all| all.iter().filter_map(|(name, ms)| Some((name.clone(), ms.as_f64()?))).collect())
+        .map(|stage_ms| stage_ms.iter().filter_map(|(name, ms)| Some((name.clone(), ms.as_f64()?))).collect())
         .unwrap_or_default()
 }
 
@@ -259,7 +271,7 @@ mod tests {
     use crate::cli::demo::step_records::StepRecords;
 
     #[test]
-    fn a_distance_that_is_not_a_number_is_the_worst() {
+    fn max_error_treats_nan_as_infinity() {
         assert_eq!(max_error(1.0, f64::NAN), f64::INFINITY);
         assert_eq!(max_error(f64::INFINITY, 1.0), f64::INFINITY);
         assert_eq!(max_error(1.0, 2.0), 2.0);
@@ -269,35 +281,38 @@ mod tests {
     fn at_rest(scene: &Scene) -> DemoRun {
         let (domains, vertices) = (scene.domains.len(), scene.layout.vertices);
         let state = SceneState::rest(scene);
-        let rest = reference::deform(scene, &state);
+        let rest_positions = reference::deform(scene, &state);
         let transforms = state.transforms.iter().flat_map(|transform| transform.0).collect();
-        let positions = rest.iter().flatten().map(|entry| *entry as f32).collect();
-        let two = |row: Vec<f32>| [row.clone(), row];
+        let positions = rest_positions.iter().flatten().map(|entry| *entry as f32).collect();
+        let repeat_row = |row: Vec<f32>| [row.clone(), row];
         DemoRun {
             frames: json!({}),
             sim: json!({}),
             server: json!({}),
-            q: StepRecords::from_rows(&[scene.layout.coordinates], &two(vec![0.0; scene.layout.coordinates])),
-            transforms: StepRecords::from_rows(&[domains, 12], &two(transforms)),
-            vertices: StepRecords::from_rows(&[vertices, 3], &two(positions)),
+            q: StepRecords::from_rows(&[scene.layout.coordinates], &repeat_row(vec![0.0; scene.layout.coordinates])),
+            transforms: StepRecords::from_rows(&[domains, 12], &repeat_row(transforms)),
+            vertices: StepRecords::from_rows(&[vertices, 3], &repeat_row(positions)),
             frames_on_disk: 2,
         }
     }
 
     #[test]
-    fn failed_checks_names_exactly_the_criteria_that_are_not_met() {
-        let scene = modalcast_model::load::open("tree").expect("the tree").scene;
-        let failed_checks = |spoil: &dyn Fn(&mut DemoRun)| {
+    fn failed_checks_names_the_criteria_that_are_not_met() {
+        let scene = modalcast_model::load::open("tree").expect("expected the built-in scene").scene;
+        let failed_checks = |change: &dyn Fn(&mut DemoRun)| {
             let mut run = at_rest(&scene);
-            spoil(&mut run);
-            Evaluation::of(&scene, &run, 2).expect("as many steps").failed_checks().join("; ")
+            change(&mut run);
+            Evaluation::of(&scene, &run, 2).expect("expected consistent records").failed_checks().join("; ")
         };
-        let still = failed_checks(&|_| {});
-        assert_eq!(still, "a sway of 3 % of the height; a displacement of 2 % of the diagonal");
+        let unchanged_result = failed_checks(&|_| {});
+        assert_eq!(unchanged_result, "a sway of 3 % of the height; a displacement of 2 % of the diagonal");
         assert!(failed_checks(&|run| run.frames_on_disk = 1).contains("2 frames"));
         assert!(failed_checks(&|run| run.vertices.row_mut(1)[3 * 77] += 0.01).contains("vertices within"));
         assert!(failed_checks(&|run| run.vertices.row_mut(1)[3 * 77] = f32::NAN).contains("vertices within"));
-        let child = scene.domains.iter().position(|domain| domain.attachment.is_some()).expect("a child");
-        assert!(failed_checks(&|run| run.transforms.row_mut(1)[12 * child + 3] += 0.1).contains("joints within"));
+        let child_domain =
+            scene.domains.iter().position(|domain| domain.attachment.is_some()).expect("expected an attached domain");
+        assert!(
+            failed_checks(&|run| run.transforms.row_mut(1)[12 * child_domain + 3] += 0.1).contains("joints within")
+        );
     }
 }

@@ -8,11 +8,12 @@ use modalcast_model::error::Result;
 use modalcast_model::load;
 use modalcast_model::scene::Scene;
 
+/// The scene that the demo runs, and the options with which the processes find its files.
 pub(super) struct DemoScene {
     pub(super) scene: Arc<Scene>,
-    /// The source name that the server opens.
+    /// Name or path of the scene in the server's repository.
     pub(super) source: String,
-    /// The server's repository; `None` for a built-in scene.
+    /// The server's repository. `None` for a built-in scene.
     pub(super) repository: Option<PathBuf>,
     /// Vega's cubic polynomial and configuration, if the model's folder contains exactly one file of each kind.
     pub(super) cubic: Option<PathBuf>,
@@ -43,11 +44,11 @@ impl DemoScene {
     }
 }
 
-/// The file with this extension in a folder; `None` unless there is exactly one.
-fn only_file(folder: &Path, ending: &str) -> Option<PathBuf> {
+/// The only file with this extension in a folder. `None` if there is no such file or more than one.
+fn only_file(folder: &Path, extension: &str) -> Option<PathBuf> {
     let entries = std::fs::read_dir(folder).ok()?;
-    let mut found = entries.filter_map(|entry| Some(entry.ok()?.path()));
-    let matches = |path: &PathBuf| path.extension().is_some_and(|own| own == ending);
-    let first = found.by_ref().find(matches)?;
-    found.all(|path| !matches(&path)).then_some(first)
+    let paths = entries.filter_map(|entry| Some(entry.ok()?.path()));
+    let mut matches = paths.filter(|path| path.extension().is_some_and(|path_extension| path_extension == extension));
+    let first_match = matches.next()?;
+    matches.next().is_none().then_some(first_match)
 }

@@ -57,24 +57,24 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args) -> Outcome {
     let input = DemoScene::find(&args.scene)?;
-    // Temporary files of the processes; removed with the folder.
-    let scratch = tempfile::tempdir().map_err(fault_in("demo"))?;
-    let run = drive(args, &input, scratch.path())?;
+    // Contains the temporary files of the processes. Dropping it removes the folder.
+    let temporary_folder = tempfile::tempdir().map_err(fault_in("demo"))?;
+    let demo_run = run_processes(args, &input, temporary_folder.path())?;
     let evaluation =
-        with_spinner("comparing with the f64 reference", || Evaluation::of(&input.scene, &run, args.frames))?;
+        with_spinner("comparing with the f64 reference", || Evaluation::of(&input.scene, &demo_run, args.frames))?;
     for line in evaluation.table() {
         print_line(line);
     }
     if let Some(path) = &args.report {
-        let text = serde_json::to_string_pretty(&record(&evaluation)).map_err(fault_in("demo"))?;
+        let text = serde_json::to_string_pretty(&report_json(&evaluation)).map_err(fault_in("demo"))?;
         fs::write(path, text + "\n").map_err(fault_in("demo"))?;
     }
     print_line(format!("frames in {}", args.out.display()));
     Ok(evaluation.failed_checks().is_empty())
 }
 
-/// The verdict as JSON, with the command, version and machine for reproducibility.
-fn record(evaluation: &Evaluation) -> serde_json::Value {
+/// The results as JSON, with the command, version and machine for reproducibility.
+fn report_json(evaluation: &Evaluation) -> serde_json::Value {
     let command: Vec<String> = std::env::args().skip(1).collect();
     serde_json::json!({
         "command": format!("modalcast {}", command.join(" ")),
@@ -87,8 +87,11 @@ fn record(evaluation: &Evaluation) -> serde_json::Value {
 
 /// The results of the demo's processes.
 struct DemoRun {
+    /// JSON output of the client that receives frames.
     frames: serde_json::Value,
+    /// JSON output of the physics process.
     sim: serde_json::Value,
+    /// JSON description of the server.
     server: serde_json::Value,
     /// Shape (steps, coordinates), as sent by the physics process.
     q: StepRecords,
@@ -99,28 +102,43 @@ struct DemoRun {
     frames_on_disk: usize,
 }
 
-fn drive(args: &Args, input: &DemoScene, scratch: &std::path::Path) -> Result<DemoRun> {
-    let end = Instant::now() + Duration::from_secs(args.timeout);
-    let (count, dt) = (args.frames.to_string(), args.dt.to_string());
+/// Starts the server and the clients, waits until the physics process has sent all steps, and collects the results.
+fn run_processes(args: &Args, input: &DemoScene, temporary_folder: &std::path::Path) -> Result<DemoRun> {
+    let deadline = Instant::now() + Duration::from_secs(args.timeout);
+    let (frame_count, dt) = (args.frames.to_string(), args.dt.to_string());
     clear_frames(&args.out)?;
-    let mut server = Process::start("server", &program_path("modalcast")?, &server_flags(args, input, scratch))?;
-    let url = server.wait_for("listening on ", end)?;
-    let common = ["--server", url.as_str(), "--scene", "demo"];
+    let mut server =
+        Process::start("server", &program_path("modalcast")?, &server_flags(args, input, temporary_folder))?;
+    let url = server.wait_for("listening on ", deadline)?;
+    let common_flags = ["--server", url.as_str(), "--scene", "demo"];
 
     let out = args.out.to_string_lossy();
     let size = args.size.to_string();
-    let mut flags = vec!["frames", "--open", input.source.as_str(), "--count", &count, "--size", &size, "--json"];
+    let mut flags = vec!["frames", "--open", input.source.as_str(), "--count", &frame_count, "--size", &size, "--json"];
     flags.extend(["--delivery", "lossless", "--out", &out]);
-    let mut frames = Process::start("fetch", &program_path("modalcast-fetch")?, &[&flags[..], &common].concat())?;
-    frames.wait_for("ready", end)?;
+    let mut frame_client =
+        Process::start("fetch", &program_path("modalcast-fetch")?, &[&flags[..], &common_flags].concat())?;
+    frame_client.wait_for("ready", deadline)?;
 
-    let vertices_file = scratch.join("vertices.npy").to_string_lossy().into_owned();
-    let flags = ["vertices", "--count", &count, "--delivery", "lossless", "--out", &vertices_file, "--json"];
-    let mut vertices = Process::start("vertices", &program_path("modalcast-fetch")?, &[&flags[..], &common].concat())?;
-    vertices.wait_for("ready", end)?;
+    let vertex_path = temporary_folder.join("vertices.npy").to_string_lossy().into_owned();
+    let flags = ["vertices", "--count", &frame_count, "--delivery", "lossless", "--out", &vertex_path, "--json"];
+    let mut vertex_client =
+        Process::start("vertices", &program_path("modalcast-fetch")?, &[&flags[..], &common_flags].concat())?;
+    vertex_client.wait_for("ready", deadline)?;
 
-    let record = scratch.join("record").to_string_lossy().into_owned();
-    let mut flags = vec!["auto", "--steps", &count, "--dt", &dt, "--policy", "lossless", "--record", &record, "--json"];
+    let record_folder = temporary_folder.join("record").to_string_lossy().into_owned();
+    let mut flags = vec![
+        "auto",
+        "--steps",
+        &frame_count,
+        "--dt",
+        &dt,
+        "--policy",
+        "lossless",
+        "--record",
+        &record_folder,
+        "--json",
+    ];
     let cubic = input.cubic.as_ref().map(|path| path.to_string_lossy().into_owned());
     let config = input.vega_config.as_ref().map(|path| path.to_string_lossy().into_owned());
     if let Some(path) = &cubic {
@@ -129,29 +147,29 @@ fn drive(args: &Args, input: &DemoScene, scratch: &std::path::Path) -> Result<De
     if let Some(path) = &config {
         flags.extend(["--config", path.as_str()]);
     }
-    let sim = Process::start("physics", &program_path("modalcast-sim")?, &[&flags[..], &common].concat())?;
+    let physics = Process::start("physics", &program_path("modalcast-sim")?, &[&flags[..], &common_flags].concat())?;
 
-    let sim = sim.finish(end)?;
-    let frames = frames.finish(end)?;
-    vertices.finish(end)?;
-    let info = Process::start("info", &program_path("modalcast-fetch")?, &["info", "--server", &url, "--json"])?;
-    let info = info.finish(end)?;
+    let sim = physics.finish(deadline)?;
+    let frames = frame_client.finish(deadline)?;
+    vertex_client.finish(deadline)?;
+    let info_client = Process::start("info", &program_path("modalcast-fetch")?, &["info", "--server", &url, "--json"])?;
+    let server_info = info_client.finish(deadline)?;
     server.stop();
-    let record = scratch.join("record");
+    let record_folder = temporary_folder.join("record");
     Ok(DemoRun {
         frames,
         sim,
-        server: info,
-        q: StepRecords::read(&record.join("q.npy"))?,
-        transforms: StepRecords::read(&record.join("transforms.npy"))?,
-        vertices: StepRecords::read(&scratch.join("vertices.npy"))?,
+        server: server_info,
+        q: StepRecords::read(&record_folder.join("q.npy"))?,
+        transforms: StepRecords::read(&record_folder.join("transforms.npy"))?,
+        vertices: StepRecords::read(&temporary_folder.join("vertices.npy"))?,
         frames_on_disk: frame_files(&args.out)?.len(),
     })
 }
 
-fn server_flags<'a>(args: &'a Args, input: &'a DemoScene, scratch: &'a std::path::Path) -> Vec<String> {
+fn server_flags<'a>(args: &'a Args, input: &'a DemoScene, temporary_folder: &'a std::path::Path) -> Vec<String> {
     let mut flags = vec!["serve".to_owned(), "--listen".into(), "127.0.0.1:0".into(), "--state".into()];
-    flags.push(scratch.join("state").to_string_lossy().into_owned());
+    flags.push(temporary_folder.join("state").to_string_lossy().into_owned());
     let backend = args.backend.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
     flags.extend(["--backend".into(), backend]);
     if let Some(repository) = &input.repository {
@@ -163,9 +181,9 @@ fn server_flags<'a>(args: &'a Args, input: &'a DemoScene, scratch: &'a std::path
 /// The frame files of a demo in a folder: `frame_00000.png` and so on. Other files are ignored.
 fn frame_files(folder: &std::path::Path) -> Result<Vec<PathBuf>> {
     let entries = fs::read_dir(folder).map_err(fault_in("demo"))?;
-    let mut files: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
-    files.retain(|path| path.file_name().is_some_and(|name| is_frame(&name.to_string_lossy())));
-    Ok(files)
+    let mut paths: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
+    paths.retain(|path| path.file_name().is_some_and(|name| is_frame(&name.to_string_lossy())));
+    Ok(paths)
 }
 
 /// Whether this is a file name that `modalcast-fetch frames` writes.
@@ -184,14 +202,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_frames_of_a_demo_are_replaced() {
-        let folder = tempfile::tempdir().expect("a folder");
-        for name in ["frame_00000.png", "frame_100000.png", "holiday.png", "frame_1.png", "frame_00001.jpg"] {
-            fs::write(folder.path().join(name), b"x").expect("written");
+    fn clear_frames_removes_only_frames_of_a_demo() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        for name in ["frame_00000.png", "frame_100000.png", "other.png", "frame_1.png", "frame_00001.jpg"] {
+            fs::write(folder.path().join(name), b"x").expect("expected a written file");
         }
-        assert_eq!(frame_files(folder.path()).expect("listed").len(), 2);
-        clear_frames(folder.path()).expect("cleared");
-        let left = fs::read_dir(folder.path()).expect("listed").count();
-        assert_eq!(left, 3, "what is no frame stays");
+        assert_eq!(frame_files(folder.path()).expect("expected a list").len(), 2);
+        clear_frames(folder.path()).expect("expected removed frames");
+        let remaining_files = fs::read_dir(folder.path()).expect("expected a list").count();
+        assert_eq!(remaining_files, 3, "expected the three other files to remain");
     }
 }

@@ -17,13 +17,13 @@ impl StepRecords {
     /// Reads a `.npy` file. The first axis counts the steps.
     ///
     /// # Errors
-    /// `Fault` if the file cannot be read; `Invalid` if it contains no array in C order.
+    /// `Fault` if the file cannot be read; `Invalid` if it does not contain an array in C order.
     pub(super) fn read(path: &Path) -> Result<Self> {
-        let place = path.display().to_string();
-        let bytes = std::fs::read(path).map_err(|error| fault_in("demo")(format!("{place}: {error}")))?;
-        let array = parse_numpy(&bytes).map_err(|error| error.prefix_field(&place))?;
+        let path_text = path.display().to_string();
+        let bytes = std::fs::read(path).map_err(|error| fault_in("demo")(format!("{path_text}: {error}")))?;
+        let array = parse_numpy(&bytes).map_err(|error| error.prefix_field(&path_text))?;
         if array.fortran_order || array.shape.is_empty() {
-            return Err(invalid(place, "an array of steps in C order", format!("the shape {:?}", array.shape)));
+            return Err(invalid(path_text, "an array of steps in C order", format!("the shape {:?}", array.shape)));
         }
         Ok(Self { shape: array.shape, entries: array.entries })
     }
@@ -60,21 +60,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn reads_the_rows_that_the_client_library_writes() {
-        let folder = tempfile::tempdir().expect("a folder");
+    fn reads_rows_of_the_client_library_and_rejects_truncated_files() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
         let path = folder.path().join("rows.npy");
-        let mut writer = modalcast_client::npy::Writer::create(&path, &[2, 2]).expect("created");
+        let mut writer = modalcast_client::npy::Writer::create(&path, &[2, 2]).expect("expected a new file");
         for row in [[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]] {
-            writer.write_row(&row).expect("written");
+            writer.write_row(&row).expect("expected a written row");
         }
-        writer.finish().expect("closed");
-        let records = StepRecords::read(&path).expect("read");
+        writer.finish().expect("expected a complete file");
+        let records = StepRecords::read(&path).expect("expected valid records");
         assert_eq!(records.shape(), [2, 2, 2]);
         assert_eq!(records.row(1), [5.0, 6.0, 7.0, 8.0]);
-        assert!(StepRecords::read(&folder.path().join("none.npy")).is_err());
-        let bytes = std::fs::read(&path).expect("read");
-        std::fs::write(&path, &bytes[..bytes.len() - 4]).expect("cut");
-        let refusal = StepRecords::read(&path).expect_err("cut").to_string();
-        assert!(refusal.contains("rows.npy") && refusal.contains("data: expected"), "{refusal}");
+        assert!(StepRecords::read(&folder.path().join("missing.npy")).is_err());
+        let bytes = std::fs::read(&path).expect("expected the file");
+        std::fs::write(&path, &bytes[..bytes.len() - 4]).expect("expected a truncated file");
+        let error = StepRecords::read(&path).expect_err("expected an error").to_string();
+        assert!(error.contains("rows.npy") && error.contains("data: expected"), "{error}");
     }
 }
