@@ -7,23 +7,23 @@ use std::path::{Path, PathBuf};
 const SOURCES: [&str; 6] = ["Cargo.lock", "Cargo.toml", "kernels", "proto", "shaders", "src"];
 
 fn main() {
-    let mut files = Vec::new();
+    let mut paths = Vec::new();
     for source in SOURCES {
         println!("cargo::rerun-if-changed={source}");
-        collect(Path::new(source), &mut files);
+        collect_files(Path::new(source), &mut paths);
     }
-    files.sort();
+    paths.sort();
     // FNV-1a, 64 bits.
-    let hash = files
+    let hash = paths
         .iter()
         .flat_map(|path| fs::read(path).unwrap_or_default())
         .fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3));
     println!("cargo::rustc-env=MODALCAST_BUILD={hash:016x}");
 }
 
-fn collect(path: &Path, files: &mut Vec<PathBuf>) {
+fn collect_files(path: &Path, paths: &mut Vec<PathBuf>) {
     match fs::read_dir(path) {
-        Ok(entries) => entries.flatten().for_each(|entry| collect(&entry.path(), files)),
-        Err(_) => files.push(path.to_owned()),
+        Ok(entries) => entries.flatten().for_each(|entry| collect_files(&entry.path(), paths)),
+        Err(_) => paths.push(path.to_owned()),
     }
 }

@@ -1,7 +1,5 @@
-//! The server's configuration: paths and the limits that depend on the deployment, in one value that is validated once
-//! and immutable afterwards. Limits that no deployment needs to change are constants beside the code that enforces
-//! them. The name or
-//! documentation of a field gives its unit: bytes, pixels or a count.
+//! The server's configuration: paths and the limits that depend on the deployment. It is validated once and immutable
+//! afterwards. Limits that no deployment needs to change are constants in the code that enforces them.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
@@ -33,12 +31,12 @@ pub enum RendererChoice {
     Off,
 }
 
-/// The server's configuration.
+/// The server's configuration. The name or the documentation of a field gives its unit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Config {
     /// The address to listen on. The default is loopback; port 0 selects a free port.
     pub listen: SocketAddr,
-    /// The folder of scenes that clients may open; `None` allows the built-in scenes only.
+    /// The folder of scenes that clients may open. `None` allows only the built-in scenes.
     pub scenes: Option<PathBuf>,
     /// The folder for uploads, the list of open scenes and their last steps. Only one server at a time can use it.
     pub state: PathBuf,
@@ -56,28 +54,34 @@ pub struct Config {
     pub frame_side: u32,
     /// Limit on open scenes.
     pub open_scenes: usize,
-    /// Default and largest acknowledgment window of a step stream, in steps.
+    /// Default acknowledgment window of a step stream, in steps.
     pub window: u32,
+    /// Largest acknowledgment window that a client may request.
     pub max_window: u32,
-    /// Limits on one upload: total size in bytes and number of files.
+    /// Limit on the total size of one upload.
     pub upload_bytes: u64,
+    /// Limit on the number of files of one upload.
     pub upload_files: u32,
-    /// Default and largest deadline of a single request.
+    /// Deadline of a single request that sets none.
     pub deadline: Duration,
+    /// Largest deadline of a single request.
     pub max_deadline: Duration,
-    /// Limits per scene: frame and vertex streams, and single requests that wait for a step.
+    /// Limit on the frame and vertex streams of one scene.
     pub max_subscribers: usize,
+    /// Limit on the single requests that wait for a step of one scene.
     pub max_pending_requests: usize,
-    /// How long a lossless subscriber may block the writer, and how long an upload may stall, before the server ends
-    /// it.
+    /// How long a lossless subscriber may block the writer, and how long an upload may stall. After this time the
+    /// server ends the subscription or the upload.
     pub stall_timeout: Duration,
     /// Time for streams to end when the server shuts down.
     pub drain_timeout: Duration,
-    /// Limit on open connections, and time within which a new connection must send its first byte.
+    /// Limit on open connections.
     pub connections: usize,
+    /// Time within which a new connection must send its first byte.
     pub first_byte_timeout: Duration,
-    /// Interval of HTTP/2 keepalive pings, and time within which the peer must answer one.
+    /// Interval of HTTP/2 keepalive pings.
     pub keepalive_interval: Duration,
+    /// Time within which the client must answer a keepalive ping.
     pub keepalive_timeout: Duration,
 }
 
@@ -117,42 +121,42 @@ impl Default for Config {
 /// the working directory.
 fn default_state() -> PathBuf {
     let folder = |name: &str| std::env::var_os(name).filter(|path| !path.is_empty()).map(PathBuf::from);
-    let base = folder("XDG_STATE_HOME").or_else(|| Some(folder("HOME")?.join(".local/state")));
-    base.map_or_else(|| PathBuf::from("modalcast-state"), |base| base.join("modalcast"))
+    let state_home = folder("XDG_STATE_HOME").or_else(|| Some(folder("HOME")?.join(".local/state")));
+    state_home.map_or_else(|| PathBuf::from("modalcast-state"), |state_home| state_home.join("modalcast"))
 }
 
 impl Config {
     /// Returns the configuration if every limit is in its range.
     ///
     /// # Errors
-    /// `Invalid` naming the limit and its range.
+    /// `Invalid` with the field and its range.
     pub fn validated(self) -> Result<ValidatedConfig> {
-        let number = |field: &str, given: u64, least: u64, most: u64| match (least..=most).contains(&given) {
+        let check_range = |field: &str, given: u64, min: u64, max: u64| match (min..=max).contains(&given) {
             true => Ok(()),
-            false => Err(invalid(format!("config.{field}"), format!("{least} to {most}"), given)),
+            false => Err(invalid(format!("config.{field}"), format!("{min} to {max}"), given)),
         };
-        let ms = |time: Duration| u64::try_from(time.as_millis()).unwrap_or(u64::MAX);
-        const HOUR: u64 = 3_600_000;
-        number("message_bytes", self.message_bytes as u64, 64 << 10, 1 << 30)?;
-        number("chunk_bytes", self.chunk_bytes as u64, 1 << 10, 1 << 20)?;
-        number("frame_side", self.frame_side.into(), 1, 16384)?;
-        number("open_scenes", self.open_scenes as u64, 1, 4096)?;
-        number("largest_window", self.max_window.into(), 1, 65536)?;
-        number("window", self.window.into(), 1, self.max_window.into())?;
-        number("upload_bytes", self.upload_bytes, 1, 1 << 40)?;
-        number("upload_files", self.upload_files.into(), 1, 1 << 20)?;
-        number("subscribers", self.max_subscribers as u64, 1, 4096)?;
-        number("waiting", self.max_pending_requests as u64, 1, 65536)?;
-        number("connections", self.connections as u64, 1, 65536)?;
-        number("longest_deadline (ms)", ms(self.max_deadline), 1, HOUR)?;
-        number("deadline (ms)", ms(self.deadline), 1, ms(self.max_deadline))?;
-        number("stall (ms)", ms(self.stall_timeout), 1, HOUR)?;
-        number("drain (ms)", ms(self.drain_timeout), 1, HOUR)?;
-        number("first_byte (ms)", ms(self.first_byte_timeout), 1, HOUR)?;
-        number("keepalive (ms)", ms(self.keepalive_interval), 100, HOUR)?;
-        number("keepalive_timeout (ms)", ms(self.keepalive_timeout), 100, HOUR)?;
+        let ms = |duration: Duration| u64::try_from(duration.as_millis()).unwrap_or(u64::MAX);
+        const HOUR_MS: u64 = 3_600_000;
+        check_range("message_bytes", self.message_bytes as u64, 64 << 10, 1 << 30)?;
+        check_range("chunk_bytes", self.chunk_bytes as u64, 1 << 10, 1 << 20)?;
+        check_range("frame_side", self.frame_side.into(), 1, 16384)?;
+        check_range("open_scenes", self.open_scenes as u64, 1, 4096)?;
+        check_range("max_window", self.max_window.into(), 1, 65536)?;
+        check_range("window", self.window.into(), 1, self.max_window.into())?;
+        check_range("upload_bytes", self.upload_bytes, 1, 1 << 40)?;
+        check_range("upload_files", self.upload_files.into(), 1, 1 << 20)?;
+        check_range("max_subscribers", self.max_subscribers as u64, 1, 4096)?;
+        check_range("max_pending_requests", self.max_pending_requests as u64, 1, 65536)?;
+        check_range("connections", self.connections as u64, 1, 65536)?;
+        check_range("max_deadline (ms)", ms(self.max_deadline), 1, HOUR_MS)?;
+        check_range("deadline (ms)", ms(self.deadline), 1, ms(self.max_deadline))?;
+        check_range("stall_timeout (ms)", ms(self.stall_timeout), 1, HOUR_MS)?;
+        check_range("drain_timeout (ms)", ms(self.drain_timeout), 1, HOUR_MS)?;
+        check_range("first_byte_timeout (ms)", ms(self.first_byte_timeout), 1, HOUR_MS)?;
+        check_range("keepalive_interval (ms)", ms(self.keepalive_interval), 100, HOUR_MS)?;
+        check_range("keepalive_timeout (ms)", ms(self.keepalive_timeout), 100, HOUR_MS)?;
         if self.state.as_os_str().is_empty() {
-            return Err(invalid("config.state", "a folder", "nothing"));
+            return Err(invalid("config.state", "the path of a folder", "an empty path"));
         }
         Ok(ValidatedConfig(self))
     }
@@ -175,23 +179,23 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_defaults_pass_and_listen_on_loopback_only() {
-        let config = Config::default().validated().expect("the defaults fit");
+    fn default_configuration_is_valid_and_listens_on_loopback() {
+        let config = Config::default().validated().expect("expected valid defaults");
         assert!(config.listen.ip().is_loopback());
     }
 
     #[test]
-    fn a_limit_out_of_range_is_refused_by_name() {
-        let bad: [(&str, Config); 5] = [
+    fn value_out_of_range_is_rejected_with_its_field() {
+        let invalid_configs: [(&str, Config); 5] = [
             ("config.chunk_bytes", Config { chunk_bytes: 2 << 20, ..Config::default() }),
             ("config.window", Config { window: 300, ..Config::default() }),
             ("config.frame_side", Config { frame_side: 0, ..Config::default() }),
-            ("config.stall (ms)", Config { stall_timeout: Duration::ZERO, ..Config::default() }),
+            ("config.stall_timeout (ms)", Config { stall_timeout: Duration::ZERO, ..Config::default() }),
             ("config.state", Config { state: PathBuf::new(), ..Config::default() }),
         ];
-        for (field, config) in bad {
-            let refusal = config.validated().expect_err(field).to_string();
-            assert!(refusal.starts_with(field), "{refusal}");
+        for (field, config) in invalid_configs {
+            let error = config.validated().expect_err(field).to_string();
+            assert!(error.starts_with(field), "expected {field}, got {error}");
         }
     }
 }
