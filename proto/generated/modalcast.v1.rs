@@ -4,7 +4,7 @@ pub struct OpenSceneRequest {
     /// A built-in name, or a path inside the server's repository.
     #[prost(string, tag = "1")]
     pub source: ::prost::alloc::string::String,
-    /// The name to open the scene under: 1 to 64 of A-Z, a-z, 0-9, '.', '\_' and '-', not starting with a dot. Empty: the
+    /// The name that the scene gets: 1 to 64 of A-Z, a-z, 0-9, '.', '\_' and '-', not starting with a dot. Empty: the
     /// last path component of the source without extension.
     #[prost(string, tag = "2")]
     pub scene: ::prost::alloc::string::String,
@@ -58,7 +58,7 @@ pub struct SceneInfo {
 /// Identifies a step. Step numbers are unique within one run; each writer starts a new run.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct StepId {
-    /// Number of the writer among the scene's writers, from 1; 0 before the first step.
+    /// The step was sent by the scene's `run`-th writer, counted from 1; 0 before the first step.
     #[prost(uint64, tag = "1")]
     pub run: u64,
     #[prost(uint64, tag = "2")]
@@ -87,7 +87,7 @@ pub mod upload_scene_request {
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct UploadHeader {
-    /// The name to open the scene under, as in OpenSceneRequest; must not be empty or in use.
+    /// The name that the scene gets, as in OpenSceneRequest; must not be empty or in use.
     #[prost(string, tag = "1")]
     pub scene: ::prost::alloc::string::String,
     /// The uploaded path to open; empty: the folder itself.
@@ -191,7 +191,7 @@ pub struct DomainDescription {
     /// parent_from_child at rest: 12 little-endian f32, row-major 3x4; empty without parent.
     #[prost(bytes = "bytes", tag = "8")]
     pub attachment_frame: ::prost::bytes::Bytes,
-    /// Vertices of the parent that carry the attachment frame.
+    /// Vertices of the parent that determine the attachment frame when the parent is deformed.
     #[prost(uint32, repeated, tag = "9")]
     pub attachment_rows: ::prost::alloc::vec::Vec<u32>,
     /// world_from_domain at rest: 12 little-endian f32, row-major 3x4.
@@ -421,9 +421,9 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.SceneService", "OpenScene"));
             self.inner.unary(req, path, codec).await
         }
-        /// Uploads files and opens them as a scene. Parts in order: one `header`, then for every file a `file` and its
-        /// `chunk`s. The call fails with DEADLINE_EXCEEDED if the client stalls for 30 s or sends less than 32 KiB/s for too
-        /// long.
+        /// Uploads files and opens them as a scene. The parts are one `header`, then for each file one `file` and its
+        /// `chunk`s. Waiting for the client consumes a time budget of 30 s. Each 32 KiB that the client sends refill 1 s of
+        /// it. The call fails with DEADLINE_EXCEEDED when the budget is used up.
         pub async fn upload_scene(
             &mut self,
             request: impl tonic::IntoStreamingRequest<
@@ -524,7 +524,7 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.SceneService", "DescribeScene"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// Returns selected rows of a domain's U, so that a client without a copy of the scene can compute U^T f.
+        /// Returns selected rows of a domain's U, so that a client without the scene's files can compute U^T f.
         pub async fn read_modes(
             &mut self,
             request: impl tonic::IntoRequest<super::ReadModesRequest>,
@@ -572,9 +572,9 @@ pub mod scene_service_server {
             tonic::Response<super::OpenSceneResponse>,
             tonic::Status,
         >;
-        /// Uploads files and opens them as a scene. Parts in order: one `header`, then for every file a `file` and its
-        /// `chunk`s. The call fails with DEADLINE_EXCEEDED if the client stalls for 30 s or sends less than 32 KiB/s for too
-        /// long.
+        /// Uploads files and opens them as a scene. The parts are one `header`, then for each file one `file` and its
+        /// `chunk`s. Waiting for the client consumes a time budget of 30 s. Each 32 KiB that the client sends refill 1 s of
+        /// it. The call fails with DEADLINE_EXCEEDED when the budget is used up.
         async fn upload_scene(
             &self,
             request: tonic::Request<tonic::Streaming<super::UploadSceneRequest>>,
@@ -617,7 +617,7 @@ pub mod scene_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// Returns selected rows of a domain's U, so that a client without a copy of the scene can compute U^T f.
+        /// Returns selected rows of a domain's U, so that a client without the scene's files can compute U^T f.
         async fn read_modes(
             &self,
             request: tonic::Request<super::ReadModesRequest>,
@@ -1023,7 +1023,7 @@ pub struct GetServerInfoResponse {
     /// The deformer in use: "cpu", "cuda" or "reference".
     #[prost(string, tag = "2")]
     pub backend: ::prost::alloc::string::String,
-    /// The name of the CUDA device, or the reason why none is in use.
+    /// The name of the CUDA device, or the reason why no CUDA device is used.
     #[prost(string, tag = "3")]
     pub device: ::prost::alloc::string::String,
     /// The name that the OpenGL renderer reports, or "none: " and the reason why there is no renderer.
@@ -1058,20 +1058,20 @@ pub struct Limits {
     #[prost(uint32, tag = "6")]
     pub deadline_ms: u32,
 }
-/// Why a request or a step was rejected. The details bytes of an error status are a serialized Rejection, too, unless
-/// the status comes from the transport. Each text has at most 512 characters, plus "..." if it was cut.
+/// Why a request or a step was rejected. The details bytes of an error status are also a serialized Rejection, unless
+/// the status comes from the transport. Each text has at most 512 characters, plus "..." if it was truncated.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Rejection {
     /// Number of the rejected step; unset if the error does not concern a step.
     #[prost(uint64, optional, tag = "1")]
     pub step: ::core::option::Option<u64>,
-    /// The field or limit that is violated.
+    /// The invalid field, the exceeded limit, or the missing or failed object.
     #[prost(string, tag = "2")]
     pub field: ::prost::alloc::string::String,
-    /// The expected value or range.
+    /// The expected value, range or condition.
     #[prost(string, tag = "3")]
     pub expected: ::prost::alloc::string::String,
-    /// The value that was sent.
+    /// The actual value or condition.
     #[prost(string, tag = "4")]
     pub given: ::prost::alloc::string::String,
 }
@@ -1456,7 +1456,7 @@ pub mod drive_scene_response {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Opened {
-    /// Number of this writer among the scene's writers, from 1.
+    /// This writer is the scene's `run`-th writer, counted from 1.
     #[prost(uint64, tag = "1")]
     pub run: u64,
     #[prost(enumeration = "Policy", tag = "2")]
@@ -1469,7 +1469,7 @@ pub struct Opened {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Acknowledgement {
-    /// All steps up to this one are completed or, with POLICY_LATEST, superseded.
+    /// All steps up to this one are completed or, with POLICY_LATEST, merged into a newer one.
     #[prost(uint64, tag = "1")]
     pub step: u64,
     /// Number of steps that were merged into a newer one since the stream began.
@@ -1648,9 +1648,9 @@ pub mod step_service_client {
             self.inner = self.inner.max_encoding_message_size(limit);
             self
         }
-        /// The first message must be `open`, which acquires the writer lease of the scene; a scene has one writer at a time.
-        /// Invalid input is answered with a Rejection on the stream, and the stream stays open. Acknowledgments are
-        /// cumulative.
+        /// The first message must be `open`, which acquires the writer lease of the scene. A scene has one writer at a time.
+        /// Invalid input is answered with a Rejection on the stream, and the stream remains open. An acknowledgment also
+        /// covers all earlier steps.
         pub async fn drive_scene(
             &mut self,
             request: impl tonic::IntoStreamingRequest<Message = super::DriveSceneRequest>,
@@ -1696,9 +1696,9 @@ pub mod step_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// The first message must be `open`, which acquires the writer lease of the scene; a scene has one writer at a time.
-        /// Invalid input is answered with a Rejection on the stream, and the stream stays open. Acknowledgments are
-        /// cumulative.
+        /// The first message must be `open`, which acquires the writer lease of the scene. A scene has one writer at a time.
+        /// Invalid input is answered with a Rejection on the stream, and the stream remains open. An acknowledgment also
+        /// covers all earlier steps.
         async fn drive_scene(
             &self,
             request: tonic::Request<tonic::Streaming<super::DriveSceneRequest>>,
@@ -1888,9 +1888,9 @@ pub struct Picture {
     #[prost(uint32, tag = "6")]
     pub mode: u32,
     /// The value at the bright end of a color map, 1e-30 to 1e30 meters (OUTPUT_DISPLACEMENT) or meters per unit of q
-    /// (OUTPUT_MODE_SHAPE). 0 fits the scale to each frame: the largest value, rounded up to 1, 2, 2.5 or 5 times a power
-    /// of ten; for displacements at least 1e-5 of the scene's diagonal. Set it in a stream, because a fitted scale changes
-    /// from frame to frame. Must be 0 for outputs that are not color maps.
+    /// (OUTPUT_MODE_SHAPE). 0 fits the scale to each frame: it ends at the largest value, rounded up to 1, 2, 2.5 or 5
+    /// times a power of ten. For displacements it ends at 1e-5 of the scene's diagonal or above. Set a value in a stream,
+    /// because a fitted scale changes from frame to frame. Must be 0 for outputs that are not color maps.
     #[prost(double, tag = "7")]
     pub largest: f64,
 }
@@ -2034,8 +2034,8 @@ pub struct FrameHead {
     pub skipped: u64,
     #[prost(message, repeated, tag = "7")]
     pub stages: ::prost::alloc::vec::Vec<StageTime>,
-    /// For color frames: the rasterizer of the shadow map and that of the visible surfaces. The shadow map is unspecified
-    /// if the frame reuses the one of another frame of its step.
+    /// For color frames: the rasterizer of the shadow map, and the rasterizer of the visible surfaces. The former is
+    /// unspecified if the frame reuses the shadow map of another frame of its step.
     #[prost(enumeration = "DrawnBy", tag = "8")]
     pub shadow_drawn_by: i32,
     #[prost(enumeration = "DrawnBy", tag = "9")]
@@ -2101,9 +2101,9 @@ pub struct PickHead {
     pub stages: ::prost::alloc::vec::Vec<StageTime>,
 }
 /// The surface point at the center of a pixel, computed in f64 on the drawn triangle. A pixel without a triangle (sky,
-/// ground, a hole of a cut-out material) has no hit, and the ground occludes no hit. Blended surfaces cannot be picked;
-/// the opaque surface behind them is picked instead. If an edge passes within 1/256 pixel of the center, the pick may
-/// resolve to either side of the edge.
+/// ground, a hole of a cut-out material) has no hit, and the ground occludes no hit. Blended surfaces cannot be picked.
+/// The opaque surface behind them is picked instead. If an edge passes within 1/256 pixel of the center, the hit may be
+/// on either side of the edge.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Hit {
     /// Column and row in the picture.
@@ -2144,8 +2144,8 @@ pub struct Hit {
     pub modes: ::prost::bytes::Bytes,
 }
 /// The quantity that a picture shows. Color is the mean of a pixel's samples. Depth, domains and normals are sampled
-/// once, at the center of the pixel. They do not contain blended surfaces but the opaque surface behind them. Only color
-/// and depth contain the ground; in all other outputs the ground occludes nothing.
+/// once, at the center of the pixel. They show the opaque surface behind blended surfaces. Only color and depth contain
+/// the ground. In all other outputs the ground occludes nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Output {
@@ -2161,9 +2161,9 @@ pub enum Output {
     /// FORMAT_F32X3: the interpolated unit normal in world axes, facing the camera, without normal maps; zeros where there
     /// is no surface.
     Normals = 4,
-    /// A color map (viridis) with a legend of |u| in meters: the distance of each point from its position in the rigid
-    /// domain. Its error is that of the drawn vertices plus rounding to 1/65535 of the scale. Surfaces that turn away from
-    /// the camera are darker.
+    /// A color map (viridis) with a legend of |u| in meters: the distance of each point from T x0, its position if the
+    /// domain is rigid. The error is that of the drawn vertices plus rounding to 1/65535 of the scale. Surfaces that are
+    /// inclined to the view direction are darker.
     Displacement = 5,
     /// A color map of one column of U: the norm of its three entries at each point, in meters per unit of q.
     ModeShape = 6,
@@ -2250,9 +2250,9 @@ impl Format {
 pub enum Delivery {
     /// DELIVERY_LATEST.
     Unspecified = 0,
-    /// Every step from the next one on, in order. A slow reader blocks the writer of a lossless step stream
-    /// (back-pressure) and is cut off if it blocks the writer for 30 s. Under a POLICY_LATEST writer a slow reader skips
-    /// steps.
+    /// Every step from the next one on, in order. A slow subscriber blocks the writer of a lossless step stream
+    /// (back-pressure) and is disconnected if it blocks the writer for 30 s. Under a POLICY_LATEST writer a slow
+    /// subscriber skips steps.
     Lossless = 1,
     /// The newest step, starting with the current one if the scene has had a step. Skipped steps are counted.
     Latest = 2,
@@ -2428,8 +2428,8 @@ pub mod frame_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.FrameService", "RenderFrame"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// Renders a frame per step. Each frame is sent in chunks of at most 1 MiB; the first chunk of a frame carries its
-        /// head. The subscription is active when the response headers arrive: the next step is delivered.
+        /// Renders a frame per step. Each frame is sent in chunks of at most 1 MiB. The first chunk of a frame has its head.
+        /// The subscription is active when the response headers arrive, so the next step is delivered.
         pub async fn stream_frames(
             &mut self,
             request: impl tonic::IntoRequest<super::StreamFramesRequest>,
@@ -2455,8 +2455,8 @@ pub mod frame_service_client {
             self.inner.server_streaming(req, path, codec).await
         }
         /// Returns the point on the deformed surface at the center of each pixel of a small rectangle, with the data that a
-        /// client needs to apply a force at that point. The first message carries the head and the first hits; further hits
-        /// follow in messages of about 1 MiB at most.
+        /// client needs to apply a force at that point. The first message has the head and the first hits. Further hits follow
+        /// in messages of at most about 1 MiB.
         pub async fn pick(
             &mut self,
             request: impl tonic::IntoRequest<super::PickRequest>,
@@ -2516,8 +2516,8 @@ pub mod frame_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// Renders a frame per step. Each frame is sent in chunks of at most 1 MiB; the first chunk of a frame carries its
-        /// head. The subscription is active when the response headers arrive: the next step is delivered.
+        /// Renders a frame per step. Each frame is sent in chunks of at most 1 MiB. The first chunk of a frame has its head.
+        /// The subscription is active when the response headers arrive, so the next step is delivered.
         async fn stream_frames(
             &self,
             request: tonic::Request<super::StreamFramesRequest>,
@@ -2532,8 +2532,8 @@ pub mod frame_service_server {
             + std::marker::Send
             + 'static;
         /// Returns the point on the deformed surface at the center of each pixel of a small rectangle, with the data that a
-        /// client needs to apply a force at that point. The first message carries the head and the first hits; further hits
-        /// follow in messages of about 1 MiB at most.
+        /// client needs to apply a force at that point. The first message has the head and the first hits. Further hits follow
+        /// in messages of at most about 1 MiB.
         async fn pick(
             &self,
             request: tonic::Request<super::PickRequest>,
@@ -2803,11 +2803,11 @@ pub struct VertexSelection {
     /// Omit the normals.
     #[prost(bool, tag = "2")]
     pub positions_only: bool,
-    /// Also send the displacements u = U q of the selected domains. Rejected unless the scene keeps them
+    /// Also send the displacements u = U q of the selected domains. Rejected unless the scene computes them
     /// (deform.displacements = true in its scene.toml).
     #[prost(bool, tag = "3")]
     pub displacements: bool,
-    /// Also send the bounding box of each selected domain. Rejected unless the scene keeps them (deform.boxes = true in
+    /// Also send the bounding box of each selected domain. Rejected unless the scene computes them (deform.boxes = true in
     /// its scene.toml).
     #[prost(bool, tag = "4")]
     pub boxes: bool,
@@ -3039,7 +3039,7 @@ pub mod vertex_service_client {
             self.inner.server_streaming(req, path, codec).await
         }
         /// Returns the vertices of every step, each in chunks of at most 1 MiB. The subscription is active when the response
-        /// headers arrive: the next step is delivered.
+        /// headers arrive, so the next step is delivered.
         pub async fn stream_vertices(
             &mut self,
             request: impl tonic::IntoRequest<super::StreamVerticesRequest>,
@@ -3100,7 +3100,7 @@ pub mod vertex_service_server {
             + std::marker::Send
             + 'static;
         /// Returns the vertices of every step, each in chunks of at most 1 MiB. The subscription is active when the response
-        /// headers arrive: the next step is delivered.
+        /// headers arrive, so the next step is delivered.
         async fn stream_vertices(
             &self,
             request: tonic::Request<super::StreamVerticesRequest>,
