@@ -100,10 +100,11 @@ impl Process {
         }
     }
 
-    fn next_line(&mut self, deadline: Instant, what: &str) -> Result<String> {
-        self.next_line_or_end(deadline, what)?.ok_or_else(|| {
+    /// Waits for the next output line. `prefix` is that of the awaited line, for errors.
+    fn next_line(&mut self, deadline: Instant, prefix: &str) -> Result<String> {
+        self.next_line_or_end(deadline, &format!("the line '{prefix}'"))?.ok_or_else(|| {
             let status = self.child.wait().map(|status| status.to_string()).unwrap_or_default();
-            fault_in("demo")(format!("{} ended with {status} before it printed '{what}'", self.name))
+            fault_in("demo")(format!("{} ended with {status} before it printed '{prefix}'", self.name))
         })
     }
 
