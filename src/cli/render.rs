@@ -81,18 +81,18 @@ pub(super) fn run(args: &Args) -> Outcome {
         DeviceContext::open(&Config { backend: args.backend, renderer: args.renderer, ..Config::default() })?;
     let mut loaded_scene = device.load_scene(&scene, backends)?;
     loaded_scene.deform(&Arc::new(state))?;
-    let largest = args.largest;
+    let scale_max = args.largest;
     let bytes = match args.output {
         OutputOption::Color => {
             let image = device.draw(&mut loaded_scene, &camera(args, &scene), args.size)?;
             frame::encode_png(image.width, image.height, &image.rgba)?
         }
         OutputOption::Displacement => {
-            render_color_map(args, &mut device, &mut loaded_scene, FrameOutput::Displacement { largest })?
+            render_color_map(args, &mut device, &mut loaded_scene, FrameOutput::Displacement { scale_max })?
         }
         OutputOption::ModeShape => {
             let mode = validate_mode(&scene, args.mode)?;
-            render_color_map(args, &mut device, &mut loaded_scene, FrameOutput::ModeShape { mode, largest })?
+            render_color_map(args, &mut device, &mut loaded_scene, FrameOutput::ModeShape { mode, scale_max })?
         }
     };
     let field = format!("--out {}", args.out.display());

@@ -77,7 +77,7 @@ struct Shared {
     load_permits: Semaphore,
     upload_permits: Arc<Semaphore>,
     next_scene_id: AtomicU64,
-    stopping: AtomicBool,
+    is_stopping: AtomicBool,
     device_thread: Mutex<Option<JoinHandle<()>>>,
     // Last field, so that its lock on the state folder is released only after every writer above is dropped.
     scene_catalog: SceneCatalog,
@@ -132,16 +132,16 @@ impl Engine {
             load_permits: Semaphore::new(MAX_CONCURRENT_LOADS),
             upload_permits: Arc::new(Semaphore::new(MAX_CONCURRENT_UPLOADS)),
             next_scene_id: AtomicU64::new(1),
-            stopping: AtomicBool::new(false),
+            is_stopping: AtomicBool::new(false),
             device_thread: Mutex::new(Some(device_thread)),
             scene_catalog,
         };
         let engine = Self { shared: Arc::new(shared) };
-        engine.restore().await;
+        engine.reopen_scenes().await;
         Ok(engine)
     }
 
-    /// The backend that deforms and the renderer that draws.
+    /// The backend and the renderer in use.
     pub fn info(&self) -> &EngineInfo {
         &self.shared.info
     }
@@ -256,7 +256,7 @@ impl Engine {
     /// Ends every stream with `Unavailable`, writes outstanding checkpoints, joins the device thread and releases the
     /// state folder.
     pub async fn shutdown(&self) {
-        if self.shared.stopping.swap(true, Ordering::AcqRel) {
+        if self.shared.is_stopping.swap(true, Ordering::AcqRel) {
             return;
         }
         for scene_handle in self.list() {
@@ -278,7 +278,7 @@ impl Engine {
 
     /// Whether [`Self::shutdown`] was called.
     pub fn is_stopping(&self) -> bool {
-        self.shared.stopping.load(Ordering::Acquire)
+        self.shared.is_stopping.load(Ordering::Acquire)
     }
 
     /// Waits until the device is lost and returns the error. Every open scene then fails with this error, and opening a
@@ -297,7 +297,7 @@ impl Engine {
     }
 
     /// Reopens the scenes of the catalog. A scene that cannot be opened is logged.
-    async fn restore(&self) {
+    async fn reopen_scenes(&self) {
         let mut openings = tokio::task::JoinSet::new();
         for (name, provenance) in self.shared.scene_catalog.entries() {
             let engine = self.clone();

@@ -134,7 +134,7 @@ pub(super) fn parse_picture(
     picture: Option<v1::Picture>,
 ) -> Result<(OutputSpec, FrameFormat)> {
     let picture = picture.unwrap_or_default();
-    let (frame_output, format) = output::parse(scene, &picture)?;
+    let (frame_output, format) = output::parse_output(scene, &picture)?;
     let (width, height) = match (picture.width, picture.height) {
         (0, 0) => (1280, 720),
         size => size,
@@ -147,7 +147,7 @@ pub(super) fn parse_picture(
     let fit_to_scene = Camera::fit_to_scene(scene, width, height);
     let camera = match picture.camera {
         None => fit_to_scene,
-        Some(camera) => camera::parse(fit_to_scene, camera).map_err(|error| error.prefix_field("picture"))?,
+        Some(camera) => camera::parse_camera(fit_to_scene, camera).map_err(|error| error.prefix_field("picture"))?,
     };
     Ok((OutputSpec::Frame { camera, size: FrameSize::new(width, height), frame_output }, format))
 }

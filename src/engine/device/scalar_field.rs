@@ -41,11 +41,13 @@ pub(in crate::engine) fn displacement_magnitudes(
         let (linear, entries) = (world_from_domain.linear(), world_from_domain.to_f64());
         let translation = Vector3::new(entries[3], entries[7], entries[11]);
         let deformed_positions = surface.positions[3 * slot.first_vertex..][..3 * slot.vertices].chunks_exact(3);
-        scene.shapes[domain.shape].mesh.rest_positions().iter().zip(deformed_positions).map(move |(x0, deformed_position)| {
-            let x = Vector3::from_fn(|axis, _| f64::from(deformed_position[axis]));
-            let displacement = x - linear * Vector3::from(*x0).cast::<f64>() - translation;
-            (scene.unit * displacement.norm()) as f32
-        })
+        scene.shapes[domain.shape].mesh.rest_positions().iter().zip(deformed_positions).map(
+            move |(x0, deformed_position)| {
+                let x = Vector3::from_fn(|axis, _| f64::from(deformed_position[axis]));
+                let displacement = x - linear * Vector3::from(*x0).cast::<f64>() - translation;
+                (scene.unit * displacement.norm()) as f32
+            },
+        )
     });
     magnitudes.collect()
 }
@@ -67,17 +69,19 @@ pub(in crate::engine) fn mode_shape_magnitudes(scene: &Scene, mode: usize) -> Ve
 /// fitted to the largest value.
 pub(in crate::engine) fn fit_legend(scene: &Scene, frame_output: FrameOutput, values: &[f32]) -> Legend {
     let max_value = f64::from(values.iter().copied().fold(0.0, f32::max));
-    let (title, requested_scale, min_scale) = match frame_output {
-        FrameOutput::ModeShape { mode, largest } => (format!("shape of mode {mode}, m per unit of q"), largest, 1e-30),
-        FrameOutput::Displacement { largest } => (
+    let (title, requested_max, min_scale_max) = match frame_output {
+        FrameOutput::ModeShape { mode, scale_max } => {
+            (format!("shape of mode {mode}, m per unit of q"), scale_max, 1e-30)
+        }
+        FrameOutput::Displacement { scale_max } => (
             "displacement |u|, m".to_owned(),
-            largest,
+            scale_max,
             MIN_DISPLACEMENT_SCALE * scene.unit * scene.rest_bounds.diagonal(),
         ),
         _ => (String::new(), 0.0, 1e-30),
     };
-    let largest = if requested_scale > 0.0 { requested_scale } else { nice_ceiling(max_value.max(min_scale)) };
-    Legend { title, scale_max: largest.clamp(1e-30, 1e30) }
+    let scale_max = if requested_max > 0.0 { requested_max } else { nice_ceiling(max_value.max(min_scale_max)) };
+    Legend { title, scale_max: scale_max.clamp(1e-30, 1e30) }
 }
 
 #[cfg(test)]
@@ -114,13 +118,13 @@ mod tests {
             max_displacement = max_displacement.max(displacement);
         }
         assert!(max_displacement > 0.5, "control: expected a displacement, got {max_displacement}");
-        let scale_max = |scale_max: f64, displacements: &[f32]| {
-            fit_legend(&scene, FrameOutput::Displacement { largest: scale_max }, displacements).scale_max
+        let legend_max = |scale_max: f64, displacements: &[f32]| {
+            fit_legend(&scene, FrameOutput::Displacement { scale_max }, displacements).scale_max
         };
-        let fitted_max = scale_max(0.0, &displacements);
+        let fitted_max = legend_max(0.0, &displacements);
         assert!(fitted_max >= f64::from(max_displacement) && fitted_max <= 2.5 * f64::from(max_displacement));
-        assert_eq!(scale_max(3.0, &displacements), 3.0);
-        let max_of_rounding_errors = scale_max(0.0, &[1e-9]);
+        assert_eq!(legend_max(3.0, &displacements), 3.0);
+        let max_of_rounding_errors = legend_max(0.0, &[1e-9]);
         assert!(max_of_rounding_errors > 1e-6, "expected the lower bound, got {max_of_rounding_errors}");
         assert!(mode_shape_magnitudes(&scene, 7).iter().all(|norm| *norm == 0.0));
     }

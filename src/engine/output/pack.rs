@@ -154,9 +154,12 @@ fn push_origins(selection: &VertexSelection, origins: Option<&FloatingOrigins>, 
     let scene = &selection.scene;
     let to_meters = |origin: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * origin[axis]);
     let Some(origins) = origins else { return scene.origin };
-    let domain_origins = || selection.domains.iter().map(|domain| origins.origin_of(scene.transform_roots.root_of(*domain as usize)));
+    let domain_origins =
+        || selection.domains.iter().map(|domain| origins.origin_of(scene.transform_roots.root_of(*domain as usize)));
     if domain_origins().any(|origin| origin != origins.shared_origin()) {
-        bytes.extend(domain_origins().map(to_meters).flat_map(|origin: [f64; 3]| origin.map(f64::to_le_bytes)).flatten());
+        bytes.extend(
+            domain_origins().map(to_meters).flat_map(|origin: [f64; 3]| origin.map(f64::to_le_bytes)).flatten(),
+        );
     }
     to_meters(origins.shared_origin())
 }
@@ -168,8 +171,8 @@ fn pack(surface: &DeformedSurface, selection: &VertexSelection) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(12 * corners + other_bytes as usize);
     let mut append_attribute = |is_selected: bool, numbers: &[f32], range: &dyn Fn(&DomainLayout) -> (usize, usize)| {
         for domain in selection.domains.iter().filter(|_| is_selected) {
-            let (first, count) = range(&layout.domains[*domain as usize]);
-            bytes.extend_from_slice(bytemuck::cast_slice(&numbers[3 * first..][..3 * count]));
+            let (first_vector, count) = range(&layout.domains[*domain as usize]);
+            bytes.extend_from_slice(bytemuck::cast_slice(&numbers[3 * first_vector..][..3 * count]));
         }
     };
     let (vertices, corners) = (

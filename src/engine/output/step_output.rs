@@ -39,14 +39,14 @@ pub enum FrameOutput {
     /// |u| as a color map.
     Displacement {
         /// The value at the bright end of the scale in meters; 0 fits the scale to each frame.
-        largest: f64,
+        scale_max: f64,
     },
     /// One column of U as a color map.
     ModeShape {
         mode: u32,
         /// The value at the bright end of the scale in meters per unit of the coordinate; 0 fits the scale to each
         /// frame.
-        largest: f64,
+        scale_max: f64,
     },
 }
 

@@ -264,7 +264,7 @@ mod tests {
         let scene = testing::two_strips();
         let q = bytes::Bytes::copy_from_slice(bytemuck::cast_slice(&q));
         let raw = RawStepUpdate { number, q_domains: vec![domain], q, ..RawStepUpdate::default() };
-        QueuedStep::new(StepUpdate::parse(&scene, &raw).expect("a step"), 0.0)
+        QueuedStep::new(StepUpdate::parse(&scene, &raw).expect("expected a valid step"), 0.0)
     }
 
     #[test]
