@@ -265,7 +265,11 @@ async fn invalid_requests_return_code_and_details() {
     rejected_calls.push((status, Code::InvalidArgument, ["scene", "1 to 64 of", "\"../x\""]));
     let request = v1::OpenSceneRequest { source: "sheet".into(), scene: "strips".into() };
     let status = scenes.open_scene(request).await.expect_err("expected a name conflict");
-    rejected_calls.push((status, Code::AlreadyExists, ["scene name", "a free scene name", "'strips' belongs to 'strips'"]));
+    rejected_calls.push((
+        status,
+        Code::AlreadyExists,
+        ["scene name", "a free scene name", "'strips' belongs to 'strips'"],
+    ));
     let request = v1::DeleteSceneRequest { scene: "nowhere".into() };
     let status = scenes.delete_scene(request).await.expect_err("expected an unknown-scene error");
     rejected_calls.push((status, Code::NotFound, ["scene", "an existing scene", "'nowhere'"]));

@@ -21,7 +21,7 @@ use crate::resources::scene_buffers::SceneBuffers;
 use crate::resources::target_desc::TargetDesc;
 use crate::types::{FrameImage, FrameParams, FrameStats, RasterBackend};
 use crate::uniforms::frame::{FrameUniforms, camera_is_above_ground, clip_from_positions, ground_is_behind_scene};
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Error, Result, fault_in};
 
 impl Renderer {
     /// Draws one frame of the current buffers and waits for its pixels.
@@ -148,6 +148,8 @@ impl Renderer {
                 let draw = || passes::raster::draw(recorder, frame, rasterizer, raster_passes);
                 match self.time_pass(raster_passes.stats_pass(), draw) {
                     Ok(time) => times.push(time),
+                    // OpenGL cannot draw on a lost device either.
+                    Err(error @ Error::DeviceLost { .. }) => return Err(error),
                     Err(error) => rasterizer.disable(&error),
                 }
             }
@@ -174,6 +176,11 @@ impl Renderer {
 
     /// Times the passes that `commands` records under the name of one of them.
     fn time_pass(&self, pass: Pass, commands: impl FnOnce() -> Result<()>) -> Result<(Pass, PassTimer)> {
+        let commands = || {
+            #[cfg(test)]
+            assert_ne!(self.injected_panic, Some(pass), "injected");
+            commands()
+        };
         self.gl.time_pass(pass.name(), self.frame_timeout, commands).map(|timer| (pass, timer))
     }
 

@@ -58,6 +58,9 @@ pub struct Renderer {
     frame_timeout: Duration,
     picker: Picker,
     aov_reader: AovReader,
+    /// The pass in which a test makes every frame panic.
+    #[cfg(test)]
+    injected_panic: Option<crate::pass::Pass>,
 }
 
 /// The last submitted frame. The cached render target with `desc` contains its ids.
@@ -96,6 +99,8 @@ impl Renderer {
             frame_timeout: FRAME_TIMEOUT,
             picker: Picker::new(&gl),
             aov_reader: AovReader::new(&gl),
+            #[cfg(test)]
+            injected_panic: None,
             gl,
         })
     }

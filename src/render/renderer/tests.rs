@@ -14,8 +14,7 @@ use crate::scene_data::geometry::tests::squares;
 use crate::{DevicePreference, FrameImage, FrameParams, SceneBuffers};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::error::{Error, Result};
-use modalcast_model::raster::{DrawTarget, Rasterizer};
+use modalcast_model::error::Error;
 use modalcast_model::scene::{Camera, Scene, Transparency};
 
 /// A renderer that behaves as on hardware: it times passes with queries, so that submitted frames are in flight.
@@ -235,20 +234,6 @@ fn submit_times_out_while_all_staging_buffers_are_mapped() {
     assert!(images.iter().all(|image| image.rgba == last_image.rgba));
 }
 
-/// Panics instead of drawing.
-#[derive(Debug)]
-struct PanickingRasterizer;
-
-impl Rasterizer for PanickingRasterizer {
-    fn draw(&mut self, _: Option<DrawTarget<'_>>, _: Option<DrawTarget<'_>>) -> Result<()> {
-        panic!("injected")
-    }
-
-    fn precompile(&mut self, _: bool, _: bool) -> Result<()> {
-        Ok(())
-    }
-}
-
 /// The panic happens while the context is current, a timer query is active and a target is in use.
 #[test]
 fn other_scenes_are_drawn_after_a_panic_within_a_frame() {
@@ -257,15 +242,15 @@ fn other_scenes_are_drawn_after_a_panic_within_a_frame() {
     let mut parts = squares(vec![Material { double_sided: true, ..Material::default() }]);
     parts.look.samples = 1;
     let panicking_scene = Scene::new(parts).expect("a valid scene");
-    let mut panicking_buffers = renderer.load(&panicking_scene).expect("loads");
-    let create_rasterizer = |_| Ok(Box::new(PanickingRasterizer) as Box<dyn Rasterizer>);
-    renderer.attach_rasterizer(&mut panicking_buffers, create_rasterizer).expect("attaches");
+    let panicking_buffers = renderer.load(&panicking_scene).expect("loads");
     // A second renderer, whose context is current before and after.
     let (mut other_renderer, _, other_buffers) = load_renderer();
     for _ in 0..MAX_FRAMES_IN_FLIGHT + 2 {
+        renderer.injected_panic = Some(Pass::Shade);
         let result =
             catch_unwind(AssertUnwindSafe(|| renderer.draw(&panicking_buffers, &params(&panicking_scene, 64))));
-        assert!(result.is_err(), "expected a panic of the rasterizer");
+        assert!(result.is_err(), "expected the injected panic");
+        renderer.injected_panic = None;
         renderer.gl.check("test").expect("no OpenGL error");
         assert!(renderer.draw(&buffers, &params(&scene, 64)).expect("draws").rgba == expected_rgba);
         assert!(other_renderer.draw(&other_buffers, &params(&scene, 64)).expect("draws").rgba == expected_rgba);

@@ -5,12 +5,13 @@
 //! settings select a compute rasterizer.
 
 use std::cell::{Cell, Ref, RefCell};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::rc::Rc;
 
 use super::programs::ProgramCompiler;
 use crate::device::gl::{self, Buffer, Gl, Program};
 use crate::shaders::ShaderOptions;
-use modalcast_model::error::{Error, Result};
+use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::raster::{GlBuffer, Rasterizer};
 use modalcast_model::scene::{Scene, Viewport};
 
@@ -138,7 +139,7 @@ impl ComputeRasterizer {
     /// Draws the depth of the shadow map, the visibility of the frame, or both.
     ///
     /// # Errors
-    /// Errors of the rasterizer; `Fault` if OpenGL has no memory for the keys.
+    /// Errors of the rasterizer; `Fault` if the rasterizer panics or OpenGL has no memory for the keys.
     pub(crate) fn draw(
         &self,
         gl: &Rc<Gl>,
@@ -158,9 +159,10 @@ impl ComputeRasterizer {
             None => None,
         };
         let depths = depths.as_ref().map(|(shadow_viewport, buffer)| (*shadow_viewport, buffer));
-        self.rasterizer
-            .borrow_mut()
-            .draw(depths, keys.as_ref().map(|(frame_viewport, buffer)| (*frame_viewport, buffer)))
+        let keys = keys.as_ref().map(|(frame_viewport, buffer)| (*frame_viewport, buffer));
+        // A panic is converted to an error, so that the caller disables the rasterizer and OpenGL draws this frame, too.
+        catch_unwind(AssertUnwindSafe(|| self.rasterizer.borrow_mut().draw(depths, keys)))
+            .unwrap_or_else(|_| Err(fault_in("rasterize")("the compute rasterizer panicked")))
     }
 
     /// Input buffer and program of the first blur pass; none without shadow output.

@@ -1,6 +1,8 @@
 //! Frames drawn by a compute rasterizer instead of OpenGL; the tests use the reference rasterizer. Images equal those of
 //! OpenGL up to a few samples on edges, and each frame reports the rasterizer that drew it.
 
+use std::cell::Cell;
+use std::rc::Rc;
 use std::sync::Arc;
 
 use glow::HasContext as _;
@@ -8,7 +10,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_compute::reference::raster::VisibilityBuffer;
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::error::{Result, invalid};
+use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::raster::{DrawTarget, GlBuffer, RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Camera, CullMode, DrawRange, Lens, Scene, SceneState, ShadowSettings, View, Viewport};
 use modalcast_render::{
@@ -397,7 +399,10 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
 
 /// A rasterizer whose draw calls always fail.
 #[derive(Debug)]
-struct FailingRasterizer;
+struct FailingRasterizer {
+    failure: fn() -> Result<()>,
+    draw_calls: Rc<Cell<u32>>,
+}
 
 impl Rasterizer for FailingRasterizer {
     fn precompile(&mut self, _: bool, _: bool) -> Result<()> {
@@ -405,34 +410,65 @@ impl Rasterizer for FailingRasterizer {
     }
 
     fn draw(&mut self, _: Option<DrawTarget<'_>>, _: Option<DrawTarget<'_>>) -> Result<()> {
-        Err(invalid("raster", "a device", "none"))
+        self.draw_calls.set(self.draw_calls.get() + 1);
+        (self.failure)()
     }
 }
 
-/// OpenGL draws the frame in which the rasterizer fails and all later frames.
+/// Draws `frame_count` frames of a scene with a [`FailingRasterizer`]. Returns them and the number of its draw calls.
+fn draw_with_failing_rasterizer(
+    scene: &Arc<Scene>,
+    failure: fn() -> Result<()>,
+    frame_count: usize,
+) -> (Vec<Result<FrameImage>>, u32) {
+    let (mut renderer, mut deformer) = (open_renderer(), ReferenceDeformer::new(scene));
+    let summary = deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed");
+    let mut buffers = renderer.load(scene).expect("expected the scene to load");
+    renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
+    let draw_calls = Rc::new(Cell::new(0));
+    let rasterizer = FailingRasterizer { failure, draw_calls: Rc::clone(&draw_calls) };
+    renderer
+        .attach_rasterizer(&mut buffers, |_| Ok(Box::new(rasterizer) as Box<dyn Rasterizer>))
+        .expect("expected a rasterizer");
+    let [width, height] = SIZE;
+    let params = FrameParams { camera: default_camera(), width, height, bounds: summary.bounds, light: None };
+    let frames = (0..frame_count).map(|_| renderer.draw(&buffers, &params)).collect();
+    (frames, draw_calls.get())
+}
+
+/// OpenGL draws the frame in which the rasterizer fails or panics, and all later frames.
 #[test]
 fn failing_rasterizer_falls_back_to_opengl() {
     let scene = yard_builder(Some(ShadowSettings { size: 128, ..ShadowSettings::default() }), 1).build();
     let opengl_frame = draw_frame(&scene, default_camera(), Backend::OpenGl);
-    let (mut renderer, mut deformer) = (open_renderer(), ReferenceDeformer::new(&scene));
-    let summary = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed");
-    let mut buffers = renderer.load(&scene).expect("expected the scene to load");
-    renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
-    renderer
-        .attach_rasterizer(&mut buffers, |_| Ok(Box::new(FailingRasterizer) as Box<dyn Rasterizer>))
-        .expect("expected a rasterizer");
-    let [width, height] = SIZE;
-    let params = FrameParams { camera: default_camera(), width, height, bounds: summary.bounds, light: None };
-    for _ in 0..2 {
-        let image = renderer.draw(&buffers, &params).expect("expected a frame");
-        assert_eq!(image.raster_backends, opengl_frame.stats.raster_backends);
-        assert!(image.rgba == opengl_frame.image.rgba);
+    let failures: [fn() -> Result<()>; 2] = [|| Err(invalid("raster", "a device", "none")), || panic!("injected")];
+    for failure in failures {
+        let (frames, draw_calls) = draw_with_failing_rasterizer(&scene, failure, 2);
+        assert_eq!(draw_calls, 1, "expected a disabled rasterizer after the first draw call");
+        for frame in frames {
+            let image = frame.expect("expected a frame");
+            assert_eq!(image.raster_backends, opengl_frame.stats.raster_backends);
+            assert!(image.rgba == opengl_frame.image.rgba);
+        }
     }
+}
+
+/// A lost device is reported, so that the server closes its scenes. OpenGL does not draw on it.
+#[test]
+fn rasterizer_on_a_lost_device_fails_the_frame() {
+    let scene = yard_builder(None, 1).build();
+    let loss = || Err(Error::DeviceLost { stage: "rasterize", reason: "injected".into() });
+    let (frames, _) = draw_with_failing_rasterizer(&scene, loss, 1);
+    assert!(
+        matches!(frames[0], Err(Error::DeviceLost { .. })),
+        "expected the loss, got {:?}",
+        frames[0].as_ref().err()
+    );
 }
 
 /// A rasterizer without a compiler. It records the pipelines that it was asked to compile.
 #[derive(Debug)]
-struct UncompiledRasterizer(std::rc::Rc<std::cell::Cell<[bool; 2]>>);
+struct UncompiledRasterizer(Rc<Cell<[bool; 2]>>);
 
 impl Rasterizer for UncompiledRasterizer {
     fn precompile(&mut self, depth: bool, ids: bool) -> Result<()> {
@@ -459,8 +495,8 @@ fn rasterizer_is_compiled_when_the_scene_is_loaded() {
         renderer
             .upload(&buffers, deformer.surface().expect("expected a surface"))
             .expect("expected the upload to succeed");
-        let requested_pipelines = std::rc::Rc::default();
-        let rasterizer = UncompiledRasterizer(std::rc::Rc::clone(&requested_pipelines));
+        let requested_pipelines = Rc::default();
+        let rasterizer = UncompiledRasterizer(Rc::clone(&requested_pipelines));
         let result = renderer.attach_rasterizer(&mut buffers, |_| Ok(Box::new(rasterizer) as Box<dyn Rasterizer>));
         assert!(
             result.is_err() && requested_pipelines.get() == expected_pipelines,
