@@ -74,7 +74,8 @@ impl Summary {
         let count = self.step_numbers.len();
         if as_json {
             let mut summary = json!({
-                reply_noun: count, "out": out.display().to_string(), "steps": self.step_numbers, "runs": self.run_numbers,
+                reply_noun: count, "out": out.display().to_string(),
+                "steps": self.step_numbers, "runs": self.run_numbers,
                 "bytes": self.bytes, "skipped": self.skipped, "elapsed_s": elapsed,
                 "per_second": rate, "stages_ms": medians,
             });
