@@ -32,7 +32,7 @@ impl<'a> TextureLoader<'a> {
     /// # Errors
     /// `Invalid` if the texture does not exist or is not a PNG or JPEG image.
     pub(super) fn texture_index(&mut self, texture_info: &TextureInfo, remarks: &mut ImportWarnings) -> Result<usize> {
-        let image_index = self.image_of(texture_info, remarks)?;
+        let image_index = self.image_index_of(texture_info, remarks)?;
         if let Some(index) = self.texture_indices.get(&image_index) {
             return Ok(*index);
         }
@@ -51,23 +51,23 @@ impl<'a> TextureLoader<'a> {
         texture_info: &TextureInfo,
         remarks: &mut ImportWarnings,
     ) -> Result<[f32; 4]> {
-        let image = self.image_of(texture_info, remarks)?;
-        if let Some(means) = self.channel_means.get(&image) {
+        let image_index = self.image_index_of(texture_info, remarks)?;
+        if let Some(means) = self.channel_means.get(&image_index) {
             return Ok(*means);
         }
-        let texture = self.decode(image)?;
+        let texture = self.decode(image_index)?;
         let mut sums = [0_u64; 4];
         for pixel in texture.rgba().as_chunks::<4>().0 {
             sums.iter_mut().zip(pixel).for_each(|(sum, channel)| *sum += u64::from(*channel));
         }
-        let pixels = f64::from(texture.width()) * f64::from(texture.height());
-        let means = sums.map(|sum| (sum as f64 / (255.0 * pixels)) as f32);
-        self.channel_means.insert(image, means);
+        let pixel_count = f64::from(texture.width()) * f64::from(texture.height());
+        let means = sums.map(|sum| (sum as f64 / (255.0 * pixel_count)) as f32);
+        self.channel_means.insert(image_index, means);
         Ok(means)
     }
 
-    /// The image of a texture. Unsupported sampler settings are recorded as remarks.
-    fn image_of(&self, texture_info: &TextureInfo, remarks: &mut ImportWarnings) -> Result<usize> {
+    /// The index of a texture's image. Unsupported sampler settings are recorded as remarks.
+    fn image_index_of(&self, texture_info: &TextureInfo, remarks: &mut ImportWarnings) -> Result<usize> {
         let texture = get_element(&self.document.textures, texture_info.index, "index")?;
         let texture_field = format!("textures[{}]", texture_info.index);
         if let Some(sampler) = texture.sampler {

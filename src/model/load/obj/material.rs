@@ -38,10 +38,12 @@ pub(super) fn create_material(
     }
     let alpha = statements.opacity.unwrap_or(1.0);
     let has_alpha = color_texture.is_some_and(|index| texture_cache.textures()[index].has_alpha());
-    let alpha_mode = match () {
-        () if alpha < 1.0 => AlphaMode::Blend,
-        () if has_alpha => AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF },
-        () => AlphaMode::Opaque,
+    let alpha_mode = if alpha < 1.0 {
+        AlphaMode::Blend
+    } else if has_alpha {
+        AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF }
+    } else {
+        AlphaMode::Opaque
     };
     let material = Material {
         name: name.to_owned(),
@@ -59,7 +61,8 @@ pub(super) fn create_material(
     material.validated()
 }
 
-/// Loads the image of `map_Kd` with the alpha of `map_d`. A missing `map_Kd` is white; `None` if both are missing.
+/// Loads the image of `map_Kd` with the alpha of `map_d`. A missing `map_Kd` is white. Returns `None` if both
+/// are missing.
 fn load_color_texture(
     statements: &MtlMaterial,
     files: &AssetDir,
@@ -70,14 +73,14 @@ fn load_color_texture(
             let texture_name = format!("{color_path} with the alpha of {alpha_path}");
             texture_cache
                 .get_or_insert_with(&texture_name, || {
-                    with_alpha(&texture_name, Some(&decode(files, color_path)?), &decode(files, alpha_path)?)
+                    replace_alpha(&texture_name, Some(&decode(files, color_path)?), &decode(files, alpha_path)?)
                 })
                 .map(Some)
         }
         (None, Some(alpha_path)) => {
             let texture_name = format!("white with the alpha of {alpha_path}");
             texture_cache
-                .get_or_insert_with(&texture_name, || with_alpha(&texture_name, None, &decode(files, alpha_path)?))
+                .get_or_insert_with(&texture_name, || replace_alpha(&texture_name, None, &decode(files, alpha_path)?))
                 .map(Some)
         }
         (Some(color_path), _) => texture_cache.load(files, color_path).map(Some),
@@ -91,7 +94,7 @@ fn decode(files: &AssetDir, path: &str) -> Result<Texture> {
 
 /// Replaces the alpha of `color` by the alpha channel of `alpha`, or by its red channel if `alpha` is opaque. Samples
 /// the nearest texel of `alpha`. A missing `color` is white.
-fn with_alpha(name: &str, color: Option<&Texture>, alpha: &Texture) -> Result<Texture> {
+fn replace_alpha(name: &str, color: Option<&Texture>, alpha: &Texture) -> Result<Texture> {
     let (width, height) = color.map_or((alpha.width(), alpha.height()), |image| (image.width(), image.height()));
     let source_channel = if alpha.has_alpha() { 3 } else { 0 };
     let mut rgba = color.map_or_else(|| vec![255; alpha.rgba().len()], |image| image.rgba().to_vec());

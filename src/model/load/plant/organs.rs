@@ -18,7 +18,7 @@ pub(super) enum Organ {
 /// The largest number of points per object whose distances to the shoots are computed.
 const MAX_SAMPLED_POINTS: usize = 32;
 
-/// Returns the organ of each object. `points` contains the corners of each object that has faces.
+/// Returns the organ of each object. `points_by_object` contains the corners of each object that has faces.
 ///
 /// The structure does not assign object ids to shoots, but the sorted ids of the internodes are in the order of the
 /// shoots. A petiole belongs to the leaf whose petiole polyline has the nearest center. Any other object belongs to the
@@ -28,7 +28,7 @@ const MAX_SAMPLED_POINTS: usize = 32;
 /// `Invalid` if the numbers of internodes and shoots differ, or an object is unknown.
 pub(super) fn assign_organs(
     structure: &PlantStructure,
-    points: &BTreeMap<u64, Vec<[f32; 3]>>,
+    points_by_object: &BTreeMap<u64, Vec<[f32; 3]>>,
 ) -> Result<HashMap<u64, Organ>> {
     let mut organs = HashMap::new();
     let internodes = structure.objects.iter().filter(|(_, kind)| *kind == "internode");
@@ -42,14 +42,14 @@ pub(super) fn assign_organs(
         structure.leaves.iter().enumerate().map(|(leaf_index, leaf)| (leaf.object_id, Organ::Leaf(leaf_index))),
     );
     let centers = petiole_centers(structure);
-    for (id, points) in points {
+    for (id, points) in points_by_object {
         let kind = structure.objects.get(id);
         let kind = kind.ok_or_else(|| invalid("object", "the id of an object of the structure", id))?;
         let organ = match kind.as_str() {
             "internode" => continue,
             "leaf" if organs.contains_key(id) => continue,
             "leaf" => return Err(invalid(format!("leaf {id}"), "an entry in leaves", "none")),
-            "petiole" => nearest_leaf(&centers, center(points.iter().map(|point| Vector3::from(*point).cast()))),
+            "petiole" => nearest_leaf(&centers, mean_point(points.iter().map(|point| Vector3::from(*point).cast()))),
             _ => None,
         };
         let organ = organ.or_else(|| nearest_shoot(structure, points));
@@ -66,7 +66,7 @@ fn petiole_centers(structure: &PlantStructure) -> Vec<(usize, Vector3<f64>)> {
         .iter()
         .enumerate()
         .filter_map(|(index, leaf)| {
-            Some((index, center(leaf.petiole_vertices.as_ref()?.iter().map(|point| (*point).into()))))
+            Some((index, mean_point(leaf.petiole_vertices.as_ref()?.iter().map(|point| (*point).into()))))
         })
         .collect();
     if !centers.is_empty() {
@@ -75,7 +75,7 @@ fn petiole_centers(structure: &PlantStructure) -> Vec<(usize, Vector3<f64>)> {
     structure.leaves.iter().enumerate().map(|(index, leaf)| (index, leaf.base.into())).collect()
 }
 
-fn center(points: impl Iterator<Item = Vector3<f64>>) -> Vector3<f64> {
+fn mean_point(points: impl Iterator<Item = Vector3<f64>>) -> Vector3<f64> {
     let (sum, count) = points.fold((Vector3::zeros(), 0.0), |(sum, count), point| (sum + point, count + 1.0));
     sum / f64::max(count, 1.0)
 }
