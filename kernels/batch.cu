@@ -73,7 +73,8 @@ __device__ __forceinline__ VertexPair load_vertex_pair(const char* chunk, unsign
 // [2 * axis + vertex][member]
 typedef float Sums[6][BATCH_SIZE];
 
-__device__ __forceinline__ void add_four_members(Sums& sums, unsigned first_member, const VertexPair (&pairs)[3], const float4& q_of_members) {
+__device__ __forceinline__ void add_four_members(Sums& sums, unsigned first_member, const VertexPair (&pairs)[3],
+                                                 const float4& q_of_members) {
     const float weights[4] = {q_of_members.x, q_of_members.y, q_of_members.z, q_of_members.w};
 #pragma unroll
     for (unsigned i = 0; i < 6; ++i) {
@@ -163,8 +164,8 @@ __device__ __forceinline__ void stage_member(const RestPositionPair& rest, const
 // Computes the boxes of the two staged members. Each half warp reduces one member, with four vertices per lane. After
 // the first exchange a lane has either the lower or the upper sides, so later exchanges move three numbers. The boxes
 // ignore NaN; `repair_non_finite` replaces them if a position is not finite.
-__device__ __forceinline__ void write_two_boxes(const BatchArgs& args, WarpSlice& slice, const BlockStorage& block, unsigned first_member,
-                                         const float4* staged) {
+__device__ __forceinline__ void write_two_boxes(const BatchArgs& args, WarpSlice& slice, const BlockStorage& block,
+                                                unsigned first_member, const float4* staged) {
     const float NEGATIVE_INFINITY = __uint_as_float(0xff800000u);
     const unsigned member = first_member + lane_id() / 16, half_lane = lane_id() % 16;
     const float4* lane_vectors = staged + 48 * (lane_id() / 16) + 3 * half_lane;
@@ -243,8 +244,8 @@ __device__ __forceinline__ void store_floats(const WarpSlice& slice, const Block
 
 // Stages and stores two members at a time, alternating between two halves of the ring. The barrier separates the reads of
 // a half from the next writes to it.
-__device__ __forceinline__ void store_members(const BatchArgs& args, WarpSlice& slice, WarpStorage& storage, const BlockStorage& block,
-                                    const Sums& sums) {
+__device__ __forceinline__ void store_members(const BatchArgs& args, WarpSlice& slice, WarpStorage& storage,
+                                              const BlockStorage& block, const Sums& sums) {
 #pragma unroll
     for (unsigned member = 0; member < BATCH_SIZE; member += 2) {
         if (member < slice.member_count) {

@@ -122,7 +122,8 @@ __device__ __forceinline__ WarpSlice load_warp_slice(const BatchArgs& args, unsi
     slice.quad_count = slice.tile_quads > preceding_quads ? min(WARP_QUADS, slice.tile_quads - preceding_quads) : 0;
     slice.first_vertex = 4 * (first_quad + preceding_quads);
     slice.vertex_count = slice.quad_count > 0 ? min(WARP_VERTICES, vertex_count - slice.first_vertex) : 0;
-    slice.words = args.words + (low_words.x | (unsigned long long)low_words.y << 32) + 3 * (size_t)slice.chunk_count * first_quad + preceding_quads;
+    slice.words = args.words + (low_words.x | (unsigned long long)low_words.y << 32) +
+                  3 * (size_t)slice.chunk_count * first_quad + preceding_quads;
     slice.positions = args.header->positions + 3 * (size_t)slice.first_vertex;
     slice.rest_positions = args.rest_positions + 3 * ((size_t)low_words.z + first_quad) + preceding_quads;
     return slice;
@@ -142,10 +143,12 @@ __device__ __forceinline__ void copy_stage(const WarpSlice& slice, WarpStorage& 
         }
         return;
     }
-    const uint4* source = slice.words + (size_t)quad_word * slice.tile_quads + min(lane_id() % WARP_QUADS, slice.quad_count - 1);
+    const uint4* source =
+        slice.words + (size_t)quad_word * slice.tile_quads + min(lane_id() % WARP_QUADS, slice.quad_count - 1);
 #pragma unroll
     for (unsigned i = 0; i < COPY_COUNT; ++i) {
-        cp_async_copy(destination + 32 * i, source + i * WORDS_PER_COPY * slice.tile_quads, quad_word + i * WORDS_PER_COPY < 3 * slice.chunk_count);
+        cp_async_copy(destination + 32 * i, source + i * WORDS_PER_COPY * slice.tile_quads,
+                      quad_word + i * WORDS_PER_COPY < 3 * slice.chunk_count);
     }
 }
 
@@ -153,7 +156,8 @@ __device__ __forceinline__ void copy_stage(const WarpSlice& slice, WarpStorage& 
 __device__ __forceinline__ void copy_rest(const WarpSlice& slice, WarpStorage& storage) {
 #pragma unroll
     for (unsigned i = lane_id(); i < lane_id() + 3 * WARP_QUADS; i += 32) {
-        const float4* source = slice.rest_positions + i / WARP_QUADS * slice.tile_quads + min(i % WARP_QUADS, slice.quad_count - 1);
+        const float4* source =
+            slice.rest_positions + i / WARP_QUADS * slice.tile_quads + min(i % WARP_QUADS, slice.quad_count - 1);
         cp_async_copy(storage.rest_positions + i, source, i < 3 * WARP_QUADS);
     }
 }

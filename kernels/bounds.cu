@@ -24,7 +24,8 @@
 constexpr unsigned THREADS_PER_SEGMENT = 8;
 
 // Merges one tile box or vertex of a segment into the running maxima.
-__device__ __forceinline__ void merge_item(const BoundsArgs& args, const BoxSegment& segment, unsigned item, unsigned (&keys)[6]) {
+__device__ __forceinline__ void merge_item(const BoundsArgs& args, const BoxSegment& segment, unsigned item,
+                                           unsigned (&keys)[6]) {
     if (segment.is_vertex_range) {
         const float* position = args.header->positions + 3 * (size_t)(segment.first_item + item);
 #pragma unroll

@@ -94,7 +94,8 @@ struct Sums {
 #ifdef COMPENSATED_SUM
         const float product = __fmul_rn(entry, weight), sum = __fadd_rn(values[i], product);
         const float rounded_product = __fadd_rn(sum, -values[i]);
-        const float sum_error = __fadd_rn(__fadd_rn(values[i], -__fadd_rn(sum, -rounded_product)), __fadd_rn(product, -rounded_product));
+        const float sum_error = __fadd_rn(__fadd_rn(values[i], -__fadd_rn(sum, -rounded_product)),
+                                          __fadd_rn(product, -rounded_product));
         compensation[i] = __fadd_rn(compensation[i], __fadd_rn(sum_error, fmaf(entry, weight, -product)));
         values[i] = sum;
 #else
@@ -178,8 +179,8 @@ struct ChunkIndices {
 // Adds the COUNT chunks that begin at index `i` of `chunk_indices`, and advances `i`. Loads all of them before it sums the
 // first.
 template <unsigned COUNT>
-__device__ __forceinline__ void sum_chunks(const DeformArgs& args, const LaneSlice& slice, const ChunkIndices& chunk_indices, unsigned& i,
-                                           Sums& sums) {
+__device__ __forceinline__ void sum_chunks(const DeformArgs& args, const LaneSlice& slice,
+                                           const ChunkIndices& chunk_indices, unsigned& i, Sums& sums) {
     const uint4* words = args.words + slice.first_word + slice.quad;
     const size_t chunk_words = 3 * (size_t)slice.quad_count;
     Chunk chunks[COUNT];
@@ -269,7 +270,8 @@ __device__ __noinline__ void repair_displacement(const DeformArgs& args, unsigne
 #endif
 
 // Computes the six sides of the box of a lane's positions, as keys. Positions beyond `count` are replaced by the first one.
-__device__ __forceinline__ void compute_lane_box_keys(const float (&positions)[FLOATS_PER_LANE], unsigned count, unsigned (&keys)[6]) {
+__device__ __forceinline__ void compute_lane_box_keys(const float (&positions)[FLOATS_PER_LANE], unsigned count,
+                                                      unsigned (&keys)[6]) {
 #pragma unroll
     for (unsigned axis = 0; axis < 3; ++axis) {
         float box_min = positions[axis], box_max = positions[axis];
@@ -286,8 +288,8 @@ __device__ __forceinline__ void compute_lane_box_keys(const float (&positions)[F
 
 // Recomputes the non-finite ones of `count` staged positions in f64, and the keys of the lane's box. NaN has the largest
 // key, so it marks the box.
-__device__ __noinline__ void repair_non_finite(const DeformArgs& args, unsigned tile, unsigned tile_warp, float* positions, unsigned count,
-                                  unsigned (&keys)[6]) {
+__device__ __noinline__ void repair_non_finite(const DeformArgs& args, unsigned tile, unsigned tile_warp,
+                                               float* positions, unsigned count, unsigned (&keys)[6]) {
     for (unsigned side = 0; side < 6; ++side) {
         keys[side] = 0;
     }
@@ -329,8 +331,9 @@ struct VertexInputs {
 };
 
 // Transforms x0 + u of a lane's vertices, and stores the positions and their box. `displacements` is u, [axis][vertex].
-__device__ __forceinline__ void write_positions(const DeformArgs& args, WarpShared& shared, const LaneSlice& slice, unsigned tile,
-                                      unsigned tile_warp, const VertexInputs& inputs, const float (&displacements)[FLOATS_PER_LANE]) {
+__device__ __forceinline__ void write_positions(const DeformArgs& args, WarpShared& shared, const LaneSlice& slice,
+                                                unsigned tile, unsigned tile_warp, const VertexInputs& inputs,
+                                                const float (&displacements)[FLOATS_PER_LANE]) {
     float positions[FLOATS_PER_LANE], non_finite_flag = 0.0f;
 #pragma unroll
     for (unsigned i = 0; i < ITEMS_PER_LANE; ++i) {
@@ -348,7 +351,8 @@ __device__ __forceinline__ void write_positions(const DeformArgs& args, WarpShar
         compute_lane_box_keys(positions, slice.item_count, keys);
         if (non_finite_flag != 0.0f) {
             unsigned(&repaired_keys)[6] = shared.repaired_keys[lane_id()];
-            repair_non_finite(args, tile, tile_warp, staged_floats(shared.staging) + FLOATS_PER_LANE * lane_id(), slice.item_count, repaired_keys);
+            repair_non_finite(args, tile, tile_warp, staged_floats(shared.staging) + FLOATS_PER_LANE * lane_id(),
+                              slice.item_count, repaired_keys);
 #pragma unroll
             for (unsigned side = 0; side < 6; ++side) {
                 keys[side] = repaired_keys[side];
@@ -364,7 +368,8 @@ __device__ __forceinline__ void write_positions(const DeformArgs& args, WarpShar
 }
 
 #ifdef MODES
-__device__ __forceinline__ void compute_displacements(const DeformArgs& args, const LaneSlice& slice, float (&displacements)[FLOATS_PER_LANE]) {
+__device__ __forceinline__ void compute_displacements(const DeformArgs& args, const LaneSlice& slice,
+                                                      float (&displacements)[FLOATS_PER_LANE]) {
     Sums sums;
     sums.clear();
     sum_modes(args, slice, sums);

@@ -84,7 +84,8 @@ __device__ inline double3 signed_cross(const double3& v, const double3& w, doubl
 // determinant matters.
 __device__ inline float3 transform_normal(const Mat3d& m, const double3& normal) {
     const double sign = determinant_sign(m);
-    return transform_direction({signed_cross(m.row1, m.row2, sign), signed_cross(m.row2, m.row0, sign), signed_cross(m.row0, m.row1, sign)}, normal);
+    return transform_direction({signed_cross(m.row1, m.row2, sign), signed_cross(m.row2, m.row0, sign),
+                                signed_cross(m.row0, m.row1, sign)}, normal);
 }
 #else
 __device__ inline float3 transform_normal(const Mat3d& m, const double3& normal) {

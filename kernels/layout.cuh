@@ -22,10 +22,10 @@ struct Header {
     float* normals;
     float4* tangents;
     float* displacements;
-    unsigned output_step;    // the output buffers contain all changes up to this step
-    unsigned last_full_step; // the last step that changed all domains
-    unsigned step;           // number of this step, from 1
-    unsigned change_count;   // number of `Change` entries for `apply`
+    unsigned output_step;      // the output buffers contain all changes up to this step
+    unsigned last_full_step;   // the last step that changed all domains
+    unsigned step;             // number of this step, from 1
+    unsigned change_count;     // number of `Change` entries for `apply`
     unsigned dirty_tile_count; // number of tiles in the tile list
     unsigned reserved[3];
     // `float_to_ordered` maxima of -x, -y, -z, x, y, z, and with ORIENTED_BOUNDS the same along `BoundsArgs::bounding_axes`.
@@ -77,8 +77,8 @@ static_assert(sizeof(NormalSlot) == 20, "NormalSlot differs from src/compute/gpu
 // An entry of the list of changed domains that `apply` reads.
 struct Change {
     unsigned domain;
-    unsigned first_q; // in the packed coordinates
-    unsigned q_count; // number of coordinates
+    unsigned first_q;     // in the packed coordinates
+    unsigned q_count;     // number of coordinates
     unsigned first_new_q; // in `new_q`
 };
 static_assert(sizeof(Change) == 16, "Change differs from src/compute/gpu/tables/layout.rs");

@@ -88,7 +88,8 @@ __device__ Area sum_areas(const unsigned* ring, const unsigned* end, const float
     return {sum, rounding_scale};
 }
 
-__device__ ShortestArc compute_surface_rotation(const NormalsArgs& args, const NormalSlot& slot, const Mat3d& linear, unsigned corner) {
+__device__ ShortestArc compute_surface_rotation(const NormalsArgs& args, const NormalSlot& slot, const Mat3d& linear,
+                                                unsigned corner) {
     ShortestArc rotation = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}, false};
     if (slot.first_corner_group == NO_GROUPS) {
         return rotation;
@@ -96,13 +97,15 @@ __device__ ShortestArc compute_surface_rotation(const NormalsArgs& args, const N
     const unsigned group = __ldg(args.corner_groups + slot.first_corner_group + (corner - slot.first_corner));
     const float* rest_normal = args.group_normals + group;
     const size_t plane_stride = args.group_count;
-    const double3 normal = make_double3(__ldg(rest_normal), __ldg(rest_normal + plane_stride), __ldg(rest_normal + 2 * plane_stride));
+    const double3 normal = make_double3(__ldg(rest_normal), __ldg(rest_normal + plane_stride),
+                                        __ldg(rest_normal + 2 * plane_stride));
     if (normal.x == 0.0 && normal.y == 0.0 && normal.z == 0.0) {
         return rotation;
     }
     const float* positions = args.header->positions + 3 * (size_t)slot.first_vertex;
     const unsigned* rings = args.rings;
-    const Area area = sum_areas(rings + __ldg(args.ring_offsets + group), rings + __ldg(args.ring_offsets + group + 1), positions);
+    const Area area = sum_areas(rings + __ldg(args.ring_offsets + group), rings + __ldg(args.ring_offsets + group + 1),
+                                positions);
     const double min_length = RESOLUTION * area.rounding_scale;
     const double3 sum = area.sum;
     // Also false if a position is not finite.
@@ -126,7 +129,8 @@ __device__ float3 rotate(const ShortestArc& rotation, const float3& v) {
     const float3 perpendicular = add_scaled(v, rotation.rigid_normal, -normal_component);
     const float3 bisector = add_scaled(rotation.rigid_normal, rotation.deformed_normal, 1.0f);
     const float squared_length = dot(bisector, bisector);
-    const float reflection = squared_length < MIN_BISECTOR_SQUARED_LENGTH ? 0.0f : 2.0f * dot(bisector, perpendicular) / squared_length;
+    const float reflection =
+        squared_length < MIN_BISECTOR_SQUARED_LENGTH ? 0.0f : 2.0f * dot(bisector, perpendicular) / squared_length;
     return add_scaled(add_scaled(perpendicular, bisector, -reflection), rotation.deformed_normal, normal_component);
 }
 
@@ -159,7 +163,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK) normals(const __grid_constan
         const ShortestArc rotation = compute_surface_rotation(args, slot, linear, corner);
         const float* rest_normal = args.rest_normals + slot.first_normal + (corner - slot.first_corner);
         const size_t plane_stride = args.rest_corner_count;
-        float3 normal = transform_normal(linear, make_double3(__ldg(rest_normal), __ldg(rest_normal + plane_stride), __ldg(rest_normal + 2 * plane_stride)));
+        float3 normal = transform_normal(linear, make_double3(__ldg(rest_normal), __ldg(rest_normal + plane_stride),
+                                                              __ldg(rest_normal + 2 * plane_stride)));
         if (rotation.is_defined) {
             normal = normalize(rotate(rotation, normal));
         }
@@ -174,7 +179,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK) normals(const __grid_constan
             if (rotation.is_defined) {
                 world_tangent = orthogonalize(rotate(rotation, world_tangent), normal);
             }
-            packed_tangent = make_float4(world_tangent.x, world_tangent.y, world_tangent.z, tangent.w * (float)determinant_sign(linear));
+            packed_tangent = make_float4(world_tangent.x, world_tangent.y, world_tangent.z,
+                                         tangent.w * (float)determinant_sign(linear));
         }
         args.header->tangents[corner] = packed_tangent;
 #endif

@@ -92,7 +92,8 @@ __device__ inline void classify_triangle(const RasterArgs& args, unsigned triang
         binned.bin = NOT_FINITE;
     } else if (is_outside(corners)) {
         binned.bin = OUTSIDE_FRUSTUM;
-    } else if (is_inside_guard_band(args, corners[0]) && is_inside_guard_band(args, corners[1]) && is_inside_guard_band(args, corners[2])) {
+    } else if (is_inside_guard_band(args, corners[0]) && is_inside_guard_band(args, corners[1]) &&
+               is_inside_guard_band(args, corners[2])) {
         setup_unclipped(args, corners, binned);
     } else {
         ClippedSetup clipped;
@@ -241,7 +242,8 @@ __device__ inline LargeTriangle find_large_triangle(const RasterArgs& args, unsi
 __device__ inline void load_clipped_polygon(const RasterArgs& args, unsigned triangle, ClippedPolygon& polygon) {
     float4 corners[3];
     load_triangle(args, triangle, corners);
-    if (is_inside_guard_band(args, corners[0]) && is_inside_guard_band(args, corners[1]) && is_inside_guard_band(args, corners[2])) {
+    if (is_inside_guard_band(args, corners[0]) && is_inside_guard_band(args, corners[1]) &&
+        is_inside_guard_band(args, corners[2])) {
         polygon.count = 3;
         for (unsigned i = 0; i < 3; ++i) {
             polygon.corners[i] = snap(args, corners[i]);
@@ -256,16 +258,18 @@ __device__ inline PixelRect intersect_rects(const PixelRect& a, const PixelRect&
 }
 
 // Whether all samples of a rectangle lie outside an edge. The edge function has its maximum at one of the four corners.
-__device__ inline bool is_outside_edge(const SnappedVertex& edge_start, const SnappedVertex& edge_end, int min_covered_edge, const PixelRect& rect) {
+__device__ inline bool is_outside_edge(const SnappedVertex& edge_start, const SnappedVertex& edge_end,
+                                       int min_covered_edge, const PixelRect& rect) {
     const int x = SUBPIXEL_STEPS * (edge_end.y > edge_start.y ? rect.x0 : rect.x1) + SUBPIXEL_STEPS / 2;
     const int y = SUBPIXEL_STEPS * (edge_end.x > edge_start.x ? rect.y1 : rect.y0) + SUBPIXEL_STEPS / 2;
     return TriangleSetup<long long>::edge_function(edge_start, edge_end, x, y) < min_covered_edge;
 }
 
 template <typename AlphaTestPolicy>
-__device__ inline void draw_tile(const RasterArgs& args, const AlphaTestPolicy& alpha_test, const TriangleSetup<long long>& setup, const PixelRect& rect,
-                                 unsigned triangle) {
-    if (is_outside_edge(setup.b, setup.c, setup.min_edge_a, rect) || is_outside_edge(setup.c, setup.a, setup.min_edge_b, rect) ||
+__device__ inline void draw_tile(const RasterArgs& args, const AlphaTestPolicy& alpha_test,
+                                 const TriangleSetup<long long>& setup, const PixelRect& rect, unsigned triangle) {
+    if (is_outside_edge(setup.b, setup.c, setup.min_edge_a, rect) ||
+        is_outside_edge(setup.c, setup.a, setup.min_edge_b, rect) ||
         is_outside_edge(setup.a, setup.b, setup.min_edge_c, rect)) {
         return;
     }
@@ -307,8 +311,8 @@ __device__ inline void schedule_tiles(const RasterArgs& args, TileSchedule& sche
     schedule.job_count = tile_count << schedule.strip_splits;
 }
 
-__device__ inline void load_tile_job(const RasterArgs& args, const TileSchedule& schedule, const LargeTriangle& entry, unsigned long long job_index,
-                                 TileJob& job) {
+__device__ inline void load_tile_job(const RasterArgs& args, const TileSchedule& schedule, const LargeTriangle& entry,
+                                     unsigned long long job_index, TileJob& job) {
     const unsigned tile_in_entry = (unsigned)((job_index >> schedule.strip_splits) - entry.first_tile);
     const unsigned column_count = (entry.tile_rect >> 16 & 255) + 1;
     const int strip_height = TILE_SIZE >> schedule.strip_splits, strip = (int)job_index & ((1 << schedule.strip_splits) - 1);

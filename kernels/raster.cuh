@@ -112,8 +112,8 @@ __device__ inline float plane_distance(const RasterArgs& args, float4 corner, un
 
 __device__ inline bool is_inside_guard_band(const RasterArgs& args, float4 corner) {
     const float x = mul_rn(args.guard_x, corner.w), y = mul_rn(args.guard_y, corner.w);
-    return add_rn(corner.z, corner.w) >= 0.0f && add_rn(x, -corner.x) >= 0.0f && add_rn(x, corner.x) >= 0.0f && add_rn(y, -corner.y) >= 0.0f &&
-           add_rn(y, corner.y) >= 0.0f && corner.w >= MIN_W;
+    return add_rn(corner.z, corner.w) >= 0.0f && add_rn(x, -corner.x) >= 0.0f && add_rn(x, corner.x) >= 0.0f &&
+           add_rn(y, -corner.y) >= 0.0f && add_rn(y, corner.y) >= 0.0f && corner.w >= MIN_W;
 }
 
 __device__ inline SnappedVertex snap(const RasterArgs& args, float4 corner) {
@@ -181,7 +181,8 @@ __device__ inline long long doubled_area(const SnappedVertex& a, const SnappedVe
 // The samples inside a rectangle in 1/256 pixel, clipped to the window.
 __device__ inline PixelRect pixel_rect(const RasterArgs& args, int x0, int y0, int x1, int y1) {
     constexpr int HALF_PIXEL = SUBPIXEL_STEPS / 2;
-    return {max(0, (x0 + HALF_PIXEL - 1) >> 8), max(0, (y0 + HALF_PIXEL - 1) >> 8), min((int)args.width - 1, (x1 - HALF_PIXEL) >> 8),
+    return {max(0, (x0 + HALF_PIXEL - 1) >> 8), max(0, (y0 + HALF_PIXEL - 1) >> 8),
+            min((int)args.width - 1, (x1 - HALF_PIXEL) >> 8),
             min((int)args.height - 1, (y1 - HALF_PIXEL) >> 8)};
 }
 
@@ -254,7 +255,8 @@ struct TriangleSetup {
 // Depths are not negative, so their bits have the order of the numbers. The plain read may be stale, but the target only
 // decreases, so if the comparison fails the atomic would change nothing. The alpha of a hidden sample is not read.
 template <typename AlphaTestPolicy>
-__device__ inline void write_sample(const RasterArgs& args, const AlphaTestPolicy& alpha_test, int column, int row, float depth, unsigned triangle) {
+__device__ inline void write_sample(const RasterArgs& args, const AlphaTestPolicy& alpha_test, int column, int row,
+                                    float depth, unsigned triangle) {
     const size_t sample = (size_t)row * args.width + column;
     const unsigned bits = __float_as_uint(depth);
 #ifdef DEPTH_ONLY

@@ -37,7 +37,8 @@ __device__ __forceinline__ Mat3f to_scaled_mat3f(const Affine& t) {
 
 #ifdef FOLLOWERS
 __device__ __forceinline__ float4 compose_linear_row(const float3& t, const Mat3f& f) {
-    return make_float4(fmaf(t.x, f.row0.x, fmaf(t.y, f.row1.x, t.z * f.row2.x)), fmaf(t.x, f.row0.y, fmaf(t.y, f.row1.y, t.z * f.row2.y)),
+    return make_float4(fmaf(t.x, f.row0.x, fmaf(t.y, f.row1.x, t.z * f.row2.x)),
+                       fmaf(t.x, f.row0.y, fmaf(t.y, f.row1.y, t.z * f.row2.y)),
                        fmaf(t.x, f.row0.z, fmaf(t.y, f.row1.z, t.z * f.row2.z)), 0.0f);
 }
 #endif
@@ -81,12 +82,14 @@ __device__ __forceinline__ Mat3d signed_cofactors(const Mat3d& m) {
 // keep their results, so that the result of a corner does not depend on its lane. `rest_directions` is the x component of
 // the lane's first direction, and y follows `axis_stride` floats later. `component_count` is 3 for normals and 4 for
 // tangents.
-__device__ __noinline__ void retransform_directions_f64(Transforms transforms, unsigned domain, const float* rest_directions, unsigned axis_stride,
+__device__ __noinline__ void retransform_directions_f64(Transforms transforms, unsigned domain,
+                                                        const float* rest_directions, unsigned axis_stride,
                                         float* staged_directions, unsigned imprecise_corners, unsigned component_count) {
     const Mat3d m = load_linear_part(transforms, domain);
     for (unsigned i = 0; i < ITEMS_PER_LANE; ++i) {
         if (imprecise_corners >> i & 1) {
-            const double3 v = make_double3(rest_directions[i], rest_directions[axis_stride + i], rest_directions[2 * axis_stride + i]);
+            const double3 v = make_double3(rest_directions[i], rest_directions[axis_stride + i],
+                                           rest_directions[2 * axis_stride + i]);
             const float3 direction = component_count == 3 ? transform_normal(m, v) : transform_direction(m, v);
             staged_directions[component_count * i] = direction.x;
             staged_directions[component_count * i + 1] = direction.y;
@@ -96,8 +99,10 @@ __device__ __noinline__ void retransform_directions_f64(Transforms transforms, u
 }
 
 // Transforms and normalizes a direction. Sets `corner_bit` in `imprecise_corners` if the result lost too much precision.
-__device__ __forceinline__ float3 transform_direction_f32(const Mat3f& m, float x, float y, float z, unsigned corner_bit, unsigned& imprecise_corners) {
-    const float3 v = make_float3(fmaf(m.row0.x, x, fmaf(m.row0.y, y, m.row0.z * z)), fmaf(m.row1.x, x, fmaf(m.row1.y, y, m.row1.z * z)),
+__device__ __forceinline__ float3 transform_direction_f32(const Mat3f& m, float x, float y, float z, unsigned corner_bit,
+                                                          unsigned& imprecise_corners) {
+    const float3 v = make_float3(fmaf(m.row0.x, x, fmaf(m.row0.y, y, m.row0.z * z)),
+                                 fmaf(m.row1.x, x, fmaf(m.row1.y, y, m.row1.z * z)),
                                  fmaf(m.row2.x, x, fmaf(m.row2.y, y, m.row2.z * z)));
     const float squared_length = fmaf(v.x, v.x, fmaf(v.y, v.y, v.z * v.z));
     // A NaN counts as short.
@@ -124,7 +129,8 @@ __device__ __forceinline__ void write_rigid_normals(const DeformArgs& args, Outp
 #pragma unroll
     for (unsigned i = 0; i < ITEMS_PER_LANE; ++i) {
         const unsigned corner_bit = i < slice.item_count ? 1u << i : 0;
-        const float3 normal = transform_direction_f32(matrix, rest_normals.x.values[i], rest_normals.y.values[i], rest_normals.z.values[i], corner_bit,
+        const float3 normal = transform_direction_f32(matrix, rest_normals.x.values[i], rest_normals.y.values[i],
+                                                      rest_normals.z.values[i], corner_bit,
                                                       imprecise_corners);
         normals[3 * i] = normal.x;
         normals[3 * i + 1] = normal.y;
@@ -132,8 +138,9 @@ __device__ __forceinline__ void write_rigid_normals(const DeformArgs& args, Outp
     }
     stage_triples(staging, slice, first_corner, normals);
     if (imprecise_corners != 0) {
-        retransform_directions_f64(transforms_of(args), slice.domain, item_pointer(args.rest_normals, slice, 3), 4 * slice.component_stride,
-                   staged_floats(staging) + FLOATS_PER_LANE * lane_id(), imprecise_corners, 3);
+        retransform_directions_f64(transforms_of(args), slice.domain, item_pointer(args.rest_normals, slice, 3),
+                                   4 * slice.component_stride, staged_floats(staging) + FLOATS_PER_LANE * lane_id(),
+                                   imprecise_corners, 3);
     }
     store_staged_triples(args.header->normals, staging, slice);
 }
@@ -149,20 +156,23 @@ __device__ __forceinline__ void write_rigid_tangents(const DeformArgs& args, Out
         // A shape without tangents has zeros, which remain zeros.
         const bool has_tangent = bitangent_signs.values[i] != 0.0f;
         const unsigned corner_bit = has_tangent ? 1u << i : 0;
-        const float3 tangent = transform_direction_f32(matrix, x.values[i], y.values[i], z.values[i], corner_bit, imprecise_corners);
-        staging.vectors[ITEMS_PER_LANE * lane_id() + i] = has_tangent
-                                                  ? make_float4(tangent.x, tangent.y, tangent.z, bitangent_signs.values[i] * handedness)
-                                                  : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        const float3 tangent = transform_direction_f32(matrix, x.values[i], y.values[i], z.values[i], corner_bit,
+                                                       imprecise_corners);
+        staging.vectors[ITEMS_PER_LANE * lane_id() + i] =
+            has_tangent ? make_float4(tangent.x, tangent.y, tangent.z, bitangent_signs.values[i] * handedness)
+                        : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
     }
     if (imprecise_corners != 0) {
-        retransform_directions_f64(transforms_of(args), slice.domain, item_pointer(args.rest_tangents, slice, 4), 4 * slice.component_stride,
-                   staged_floats(staging) + 4 * ITEMS_PER_LANE * lane_id(), imprecise_corners, 4);
+        retransform_directions_f64(transforms_of(args), slice.domain, item_pointer(args.rest_tangents, slice, 4),
+                                   4 * slice.component_stride, staged_floats(staging) + 4 * ITEMS_PER_LANE * lane_id(),
+                                   imprecise_corners, 4);
     }
     store_staged_quadruples(args.header->tangents, staging);
 }
 #endif
 
-__device__ __forceinline__ void write_rigid_directions(const DeformArgs& args, OutputStaging& staging, const LaneSlice& slice, const RestNormals& rest_normals) {
+__device__ __forceinline__ void write_rigid_directions(const DeformArgs& args, OutputStaging& staging,
+                                                       const LaneSlice& slice, const RestNormals& rest_normals) {
     unsigned first_corner = slice.first_item;
 #ifdef CORNER_OFFSETS
     if (slice.kind & TILE_VERTICES) {
@@ -170,9 +180,11 @@ __device__ __forceinline__ void write_rigid_directions(const DeformArgs& args, O
     }
 #endif
 #ifdef SHEAR
-    write_rigid_normals(args, staging, slice, rest_normals, to_scaled_mat3f(signed_cofactors(load_linear_part(transforms_of(args), slice.domain))), first_corner);
+    write_rigid_normals(args, staging, slice, rest_normals,
+                        to_scaled_mat3f(signed_cofactors(load_linear_part(transforms_of(args), slice.domain))), first_corner);
 #else
-    write_rigid_normals(args, staging, slice, rest_normals, load_scaled_linear_part(transforms_of(args), slice.domain), first_corner);
+    write_rigid_normals(args, staging, slice, rest_normals, load_scaled_linear_part(transforms_of(args), slice.domain),
+                        first_corner);
 #endif
 #ifdef NORMAL_MAPS
     const float handedness = (float)determinant_sign(load_linear_part(transforms_of(args), slice.domain));

@@ -44,7 +44,8 @@ __device__ __forceinline__ float dot_row_column(const float4& t, float x, float 
 
 __device__ __forceinline__ float4 compose_row(const float4& t, const Affine& f) {
     return make_float4(dot_row_column(t, f.row0.x, f.row1.x, f.row2.x), dot_row_column(t, f.row0.y, f.row1.y, f.row2.y),
-                       dot_row_column(t, f.row0.z, f.row1.z, f.row2.z), fmaf(t.x, f.row0.w, fmaf(t.y, f.row1.w, fmaf(t.z, f.row2.w, t.w))));
+                       dot_row_column(t, f.row0.z, f.row1.z, f.row2.z), fmaf(t.x, f.row0.w,
+                                                                             fmaf(t.y, f.row1.w, fmaf(t.z, f.row2.w, t.w))));
 }
 #endif
 
@@ -75,7 +76,8 @@ __device__ __forceinline__ void transform_point_f64(const float4* rows, const do
 }
 
 // Transforms a point by T of a domain in f64 and rounds the result once. Overwrites `point`.
-__device__ __forceinline__ float3 transform_domain_point_f64(const Transforms& transforms, unsigned domain, double (&point)[3]) {
+__device__ __forceinline__ float3 transform_domain_point_f64(const Transforms& transforms, unsigned domain,
+                                                             double (&point)[3]) {
     double world[3];
 #ifdef FOLLOWERS
     // Apply both transforms in sequence: their product may overflow f32.

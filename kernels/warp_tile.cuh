@@ -91,7 +91,8 @@ __device__ __forceinline__ float* staged_floats(OutputStaging& staging) {
 }
 
 // Writes three components per item to the staging buffer. `first_item` is the packed index of the lane's first item.
-__device__ __forceinline__ void stage_triples(OutputStaging& staging, const LaneSlice& slice, unsigned first_item, const float (&triples)[FLOATS_PER_LANE]) {
+__device__ __forceinline__ void stage_triples(OutputStaging& staging, const LaneSlice& slice, unsigned first_item,
+                                              const float (&triples)[FLOATS_PER_LANE]) {
 #ifdef ONE_ITEM_PER_LANE
     float* lane_floats = staged_floats(staging) + 3 * lane_id();
     lane_floats[0] = triples[0];
@@ -170,7 +171,8 @@ __device__ __forceinline__ const float* item_pointer(const float4* table, const 
 }
 
 // Loads one component of a lane's items.
-__device__ __forceinline__ LaneItems load_items(const float4* table, const LaneSlice& slice, unsigned component_count, unsigned component) {
+__device__ __forceinline__ LaneItems load_items(const float4* table, const LaneSlice& slice, unsigned component_count,
+                                                unsigned component) {
     const float* source = item_pointer(table, slice, component_count) + 4 * component * slice.component_stride;
     LaneItems items;
 #ifdef ONE_ITEM_PER_LANE

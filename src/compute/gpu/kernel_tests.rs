@@ -40,7 +40,9 @@ fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
         &["RIGID_NORMALS", "CORNER_OFFSETS", "NORMAL_MAPS", "SHEAR"],
     ];
     let mut add_variants = |sum: &[&'static str], normal_defines: &[&[&'static str]], others: &[&'static str]| {
-        for (lane, normals) in lane_defines.iter().flat_map(|lane| normal_defines.iter().map(move |one| (lane, one))) {
+        for (lane, normals) in
+            lane_defines.iter().flat_map(|lane| normal_defines.iter().map(move |normals| (lane, normals)))
+        {
             variants.push(([sum, lane, normals, others].concat(), sm_90));
         }
     };

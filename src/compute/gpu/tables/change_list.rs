@@ -135,7 +135,7 @@ impl ChangeListWriter {
             });
             let change = Change {
                 domain: *domain_id,
-                first_q: packer.coordinates.first[domain],
+                first_q: packer.coordinates.first_q[domain],
                 q_count: (q_count - first_new_q) as u32,
                 first_new_q: first_new_q as u32,
             };

@@ -131,7 +131,7 @@ impl InputPacker {
             writer.take(self.coordinates.total - state.q.len()).fill(0.0);
             return;
         }
-        fill_parts(device_q, &self.coordinates.first, |domains, part| {
+        fill_parts(device_q, &self.coordinates.first_q, |domains, part| {
             let mut length = 0;
             for domain in domains {
                 self.put_q(domain, state.q_of(&self.scene, domain), |coordinate| {
@@ -213,7 +213,7 @@ impl ChunkSelection {
         self.truncations.par_iter_mut().enumerate().with_min_len(MIN_DOMAINS_PER_TASK).for_each(update_truncation);
         for (domain, truncation) in self.truncations.iter().enumerate() {
             self.bound = self.bound.max(truncation.bound());
-            let first_chunk = packer.coordinates.first[domain] as usize / per_chunk;
+            let first_chunk = packer.coordinates.first_q[domain] as usize / per_chunk;
             let mut count = 0;
             for mode in truncation.retained() {
                 let chunk = mode / per_chunk as u16;
@@ -256,7 +256,7 @@ mod tests {
         let q_offset = words.len();
         words.resize(q_offset + packer.coordinates.total, 0.0);
         for domain in 0..scene.domains.len() {
-            let first = q_offset + packer.coordinates.first[domain] as usize;
+            let first = q_offset + packer.coordinates.first_q[domain] as usize;
             for (mode, coordinate) in state.q_of(scene, domain).iter().enumerate() {
                 words[first + mode] = if packer.coordinates.is_scene_order { *coordinate } else { 0.5 * coordinate };
             }

@@ -26,9 +26,9 @@ impl<'a> SliceWriter<'a> {
 
     /// Skips the next `count` words and returns them for the caller to write.
     pub(crate) fn take(&mut self, count: usize) -> &'a mut [f32] {
-        let (part, rest) = std::mem::take(&mut self.0).split_at_mut(count);
-        self.0 = rest;
-        part
+        let (skipped_words, remaining_words) = std::mem::take(&mut self.0).split_at_mut(count);
+        self.0 = remaining_words;
+        skipped_words
     }
 }
 

@@ -92,7 +92,7 @@ impl BatchTables {
                 });
                 tables.members.extend(domains.iter().map(|domain| BatchMember {
                     first_vertex: scene.layout.domains[*domain].first_vertex as u32,
-                    first_q: coordinates.first[*domain],
+                    first_q: coordinates.first_q[*domain],
                     domain: *domain as u32,
                     first_tile: work.domain_tiles[*domain].vertices.first,
                 }));

@@ -235,7 +235,7 @@ impl WorkList {
             first_item: range.first_item + (QUAD * TILE_QUADS * tile) as u32,
             rest_quad: range.rest_quad + (TILE_QUADS * tile) as u32,
             domain: domain as u32,
-            first_q: coordinates.first[domain],
+            first_q: coordinates.first_q[domain],
             first_scale: self.first_scales[shape] + preceding_scales as u32,
             chunk_count: class.chunks as u16,
             quad_count: quad_count as u8,
@@ -253,7 +253,7 @@ impl WorkList {
                     first_item: range.first_item + (QUAD * quad) as u32,
                     rest_quad: range.rest_quad + quad as u32,
                     packed_domain: (QUAD * domain + quad_items - 1) as u32,
-                    first_q: coordinates.first[*domain],
+                    first_q: coordinates.first_q[*domain],
                 });
                 self.mixed_quad_scales.push(self.first_scales[scene.domains[*domain].shape]);
             }

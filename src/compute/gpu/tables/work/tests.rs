@@ -121,7 +121,7 @@ fn check_work_list(scene: &Arc<Scene>) -> WorkList {
         for quad_index in 0..usize::from(tile.quad_count) {
             let quad = load_quad(&work, tile, quad_index);
             let shape = &scene.shapes[scene.domains[quad.domain].shape];
-            assert_eq!(quad.first_q, coordinates.first[quad.domain]);
+            assert_eq!(quad.first_q, coordinates.first_q[quad.domain]);
             let span = work.domain_tiles[quad.domain].vertices;
             assert!((span.first..span.first + span.count).contains(&(index as u32)), "{span:?} lacks tile {index}");
             assert_eq!(usize::from(tile.chunk_count), shape.modes.rank().div_ceil(per_chunk));
@@ -221,7 +221,7 @@ fn tiles_with_the_most_modes_come_first() {
 fn coordinates_are_padded_to_whole_chunks() {
     let shapes = [(7, 3), (9, 5)];
     let packed = CoordinateLayout::new(&scene_with_storage(&shapes, StorageType::F32));
-    assert_eq!((packed.first.as_slice(), packed.total, packed.is_scene_order), ([0, 3, 6, 11].as_slice(), 16, true));
+    assert_eq!((packed.first_q.as_slice(), packed.total, packed.is_scene_order), ([0, 3, 6, 11].as_slice(), 16, true));
     let chunked = CoordinateLayout::new(&scene_with_storage(&shapes, StorageType::Int8));
-    assert_eq!((chunked.first.as_slice(), chunked.total), ([0, 4, 8, 16].as_slice(), 24));
+    assert_eq!((chunked.first_q.as_slice(), chunked.total), ([0, 4, 8, 16].as_slice(), 24));
 }

@@ -41,7 +41,7 @@ impl Tables {
         let mut q = vec![f32::NAN; coordinates.total];
         let packer = InputPacker { factors: loaded.factors.clone(), ..InputPacker::sizes_only(scene) };
         for domain in 0..scene.domains.len() {
-            let mut index = packer.coordinates.first[domain] as usize;
+            let mut index = packer.coordinates.first_q[domain] as usize;
             packer.put_q(domain, state.q_of(scene, domain), |number| {
                 q[index] = number;
                 index += 1;
