@@ -47,12 +47,12 @@ void heap_sort(uint first_record, uint count) {
 }
 
 vec4 shade_fragment(uvec2 record, ivec2 pixel, vec2 pixel_size) {
-    vec2 position_sum = vec2(0.0);
+    vec2 center = vec2(0.0);
     for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
-        if ((record.y >> sample_index & 1u) != 0u) position_sum += SAMPLE_POSITIONS[sample_index];
+        if ((record.y >> sample_index & 1u) != 0u) center += SAMPLE_POSITIONS[sample_index];
     }
-    position_sum /= float(max(bitCount(record.y & 15u), 1));
-    vec4 color = shade_triangle(int((record.y >> 4) - 1u), (vec2(pixel) + position_sum) * pixel_size - 1.0, pixel_size);
+    center /= float(max(bitCount(record.y & 15u), 1));
+    vec4 color = shade_triangle(int((record.y >> 4) - 1u), (vec2(pixel) + center) * pixel_size - 1.0, pixel_size);
     return vec4(color.rgb, color.a > 0.0 ? min(color.a, 1.0) : 0.0);
 }
 

@@ -51,7 +51,7 @@ pub(crate) struct BlendLayer {
 
 impl RenderTarget {
     pub(crate) fn new(gl: &Rc<Gl>, desc: TargetDesc) -> Result<Self> {
-        let TargetDesc { width, height, samples, blended, .. } = desc;
+        let TargetDesc { width, height, samples, blend_storage, .. } = desc;
         let (ids, depth) = (create_image(gl, desc, gl::R32UI)?, create_image(gl, desc, gl::DEPTH_COMPONENT32F)?);
         let create_layer = |color: Texture| {
             Ok(BlendLayer {
@@ -60,12 +60,12 @@ impl RenderTarget {
                 dirty_region: DirtyRegion::default(),
             })
         };
-        let blend_layer = if blended == BlendStorage::SingleLayer {
+        let blend_layer = if blend_storage == BlendStorage::SingleLayer {
             Some(create_layer(create_image(gl, desc, gl::RGBA16F)?)?)
         } else {
             None
         };
-        let oit = match blended {
+        let oit = match blend_storage {
             BlendStorage::FragmentLists(budget) => Some(OitTarget::new(gl, desc, budget, &depth)?),
             BlendStorage::None | BlendStorage::SingleLayer => None,
         };

@@ -19,7 +19,7 @@ pub(crate) struct TargetDesc {
     pub(crate) width: u32,
     pub(crate) height: u32,
     pub(crate) samples: u32,
-    pub(crate) blended: BlendStorage,
+    pub(crate) blend_storage: BlendStorage,
     /// Levels of the bloom pyramid that are smaller than the frame.
     pub(crate) bloom_levels: u32,
     /// Culling method; never the automatic choice.
@@ -38,13 +38,19 @@ pub(crate) enum BlendStorage {
 
 impl TargetDesc {
     /// No pixels and no optional features.
-    pub(crate) const EMPTY: Self =
-        Self { width: 0, height: 0, samples: 1, blended: BlendStorage::None, bloom_levels: 0, culling: Culling::None };
+    pub(crate) const EMPTY: Self = Self {
+        width: 0,
+        height: 0,
+        samples: 1,
+        blend_storage: BlendStorage::None,
+        bloom_levels: 0,
+        culling: Culling::None,
+    };
 
     /// Target of a frame of a look.
-    pub(crate) fn new(gl: &Gl, [width, height]: [u32; 2], look: &RenderSettings, blended: BlendStorage) -> Self {
+    pub(crate) fn new(gl: &Gl, [width, height]: [u32; 2], look: &RenderSettings, blend_storage: BlendStorage) -> Self {
         let bloom_levels = look.bloom.map_or(0, |bloom| bloom.levels);
-        Self { blended, bloom_levels, ..Self::ids_and_depth(gl, [width, height], look.samples_per_pixel()) }
+        Self { blend_storage, bloom_levels, ..Self::ids_and_depth(gl, [width, height], look.samples_per_pixel()) }
     }
 
     /// Target with ids and depth only. It has `samples` samples per pixel if the device and the frame size allow it, else
@@ -64,7 +70,7 @@ impl TargetDesc {
     /// empty without lists or culling.
     pub(crate) fn readback_ranges(&self) -> [Range<u64>; 2] {
         let list_bytes =
-            if matches!(self.blended, BlendStorage::FragmentLists(_)) { COUNTERS_HEADER_BYTES as u64 } else { 0 };
+            if matches!(self.blend_storage, BlendStorage::FragmentLists(_)) { COUNTERS_HEADER_BYTES as u64 } else { 0 };
         let cull_bytes = if self.culling == Culling::None { 0 } else { COUNTER_BYTES as u64 };
         let (list_begin, cull_begin) = (self.encoded_bytes(), self.encoded_bytes() + list_bytes);
         [list_begin..cull_begin, cull_begin..cull_begin + cull_bytes]
