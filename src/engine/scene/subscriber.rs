@@ -31,7 +31,7 @@ pub enum Delivery {
 #[derive(Debug, Clone)]
 struct EndReason {
     error: Error,
-    /// Whether buffered results are dropped and a reply that is being sent is aborted.
+    /// Whether a reply that is being sent is aborted.
     is_immediate: bool,
 }
 
