@@ -34,8 +34,9 @@ impl BlurComparison {
         let uses_fragments = |row: &RenderRow| row.blur_method == BlurMethod::Fragments;
         let fragment_rows = rows.iter().filter(|row| uses_fragments(row)).filter_map(|row| Some((row, row.shadow?)));
         let compare = |(row, shadow): (&RenderRow, ShadowSettings)| {
-            let is_same_map =
-                |other: &&RenderRow| other.load == row.load && other.shadow == Some(shadow) && !uses_fragments(other);
+            let is_same_map = |candidate: &&RenderRow| {
+                candidate.load == row.load && candidate.shadow == Some(shadow) && !uses_fragments(candidate)
+            };
             let compute_us = rows.iter().filter(is_same_map).filter_map(blur_us).min_by(f64::total_cmp)?;
             let fragments_us = blur_us(row)?;
             let ratio = fragments_us / compute_us;

@@ -155,9 +155,9 @@ mod tests {
     #[test]
     fn rejects_triangle_that_crosses_its_image_edge() {
         let mesh = |max_u: f32| {
-            let rest = vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
+            let positions = vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
             let uvs = vec![[1.0, 0.0], [max_u, 0.0], [1.0, 1.0]];
-            Mesh::from_indexed(rest, vec![[0.0, 0.0, 1.0]; 3], uvs, vec![[0, 1, 2]]).expect("a mesh")
+            Mesh::from_indexed(positions, vec![[0.0, 0.0, 1.0]; 3], uvs, vec![[0, 1, 2]]).expect("a mesh")
         };
         assert_eq!(
             wrap_uvs(&mesh(2.0), [0.5; 2]).expect("a triangle inside of its image").corners().uvs[1],

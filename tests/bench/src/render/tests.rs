@@ -144,9 +144,9 @@ fn shadow_edge(caster: Material) -> SceneParts {
     parts.look.ground = Some(Ground { color: [1.0; 3] });
     parts.look.sun = [3.0, 4.0, 0.0];
     // The sun comes from +x: a point at height 4 casts its shadow 3 units to the left.
-    let rest = [[3.3, 4.0, 9.0], [9.0, 4.0, 9.0], [9.0, 4.0, -9.0], [3.3, 4.0, -9.0]];
+    let positions = [[3.3, 4.0, 9.0], [9.0, 4.0, 9.0], [9.0, 4.0, -9.0], [3.3, 4.0, -9.0]];
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
-    let mesh = Mesh::from_indexed(rest.to_vec(), vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
+    let mesh = Mesh::from_indexed(positions.to_vec(), vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
     add_rigid_domain(&mut parts, "caster", mesh.expect("a square"), caster).expect("a domain");
     add_rigid_domain(&mut parts, "peg", horizontal_square(0.01, 0.0).expect("a square"), Material::default())
         .expect("a domain");

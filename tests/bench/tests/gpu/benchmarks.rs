@@ -92,8 +92,8 @@ fn check_benchmark(device: &Device, scene: &Arc<Scene>, states: &[SceneState], b
         let timing =
             time(device, benchmark, cache, 10 * states.len()).unwrap_or_else(|error| panic!("{name}: {error}"));
         let positions = benchmark.positions(device).expect("expected a surface");
-        let last = states.len() - 1;
-        relative_error(scene, &states[last], &positions).unwrap_or_else(|error| panic!("{name} replayed: {error}"));
+        let last_state = &states[states.len() - 1];
+        relative_error(scene, last_state, &positions).unwrap_or_else(|error| panic!("{name} replayed: {error}"));
         eprintln!("{name} {cache:?}: {timing:?}, {} launches", benchmark.launches_per_step());
     }
     assert!(benchmark.traffic().iter().map(|traffic| traffic.bytes).sum::<u64>() > 0, "{name}");
