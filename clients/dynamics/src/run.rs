@@ -95,8 +95,8 @@ pub async fn drive_scene(
     let progress_bar = create_progress_bar(options.steps);
     let start = Instant::now();
     let mut stats = RunStats::default();
-    // The values that the server has. `None` before the first step and after a rejection.
-    let mut accepted_values: Option<StepValues> = None;
+    // The values of the last step sent. `None` before the first step and after a reported rejection.
+    let mut last_sent_values: Option<StepValues> = None;
     let mut current_values = StepValues::default();
     let mut step_number = 0;
     while options.steps.is_none_or(|steps| step_number < steps) && !*stop_receiver.borrow() {
@@ -107,15 +107,15 @@ pub async fn drive_scene(
             tokio::time::sleep_until(due_time.into()).await;
         }
         let step =
-            add_changes(scenario.model(), Step::new(step_number, time), accepted_values.as_ref(), &current_values);
+            add_changes(scenario.model(), Step::new(step_number, time), last_sent_values.as_ref(), &current_values);
         let is_rejected = stats.record_rejection(step_stream.step(&step).await)?;
         stats.payload_bytes += step.payload_bytes() as u64;
         stats.record_acknowledgements(&step_stream);
         if let Some(recorder) = &mut recorder {
             recorder.write_row(&current_values)?;
         }
-        // After a rejection the server does not have the values of that step, so the next step sends all values.
-        accepted_values = if is_rejected { None } else { Some(std::mem::take(&mut current_values)) };
+        // After a rejection the server lacks the values of some step, so the next step sends all values.
+        last_sent_values = if is_rejected { None } else { Some(std::mem::take(&mut current_values)) };
         step_number += 1;
         progress_bar.inc(1);
     }
@@ -144,24 +144,24 @@ pub async fn drive_scene(
     Ok(RunSummary { sent_steps: stream_summary.sent, rejected_steps: stream_summary.rejected, report })
 }
 
-/// Adds to a step the values whose bits changed since the accepted values, or all values if there are none.
+/// Adds to a step the values whose bits changed since the last step sent, or all values if there is none.
 fn add_changes(
     model: &Model,
     mut step: Step,
-    accepted_values: Option<&StepValues>,
+    last_sent_values: Option<&StepValues>,
     current_values: &StepValues,
 ) -> Step {
     let are_equal = |a: &[f32], b: &[f32]| a.iter().map(|x| x.to_bits()).eq(b.iter().map(|x| x.to_bits()));
     for (index, domain) in model.domains.iter().enumerate() {
         let range = domain.first_coordinate..domain.first_coordinate + domain.rank;
-        let q_changed = accepted_values.is_none_or(|accepted_values| {
-            !are_equal(&accepted_values.q[range.clone()], &current_values.q[range.clone()])
+        let q_changed = last_sent_values.is_none_or(|last_sent_values| {
+            !are_equal(&last_sent_values.q[range.clone()], &current_values.q[range.clone()])
         });
         if domain.owns_q && domain.rank > 0 && q_changed {
             step.set_q(index as u32, &current_values.q[range]);
         }
         let transform = &current_values.transforms[index];
-        if accepted_values.is_none_or(|accepted_values| !are_equal(&accepted_values.transforms[index], transform)) {
+        if last_sent_values.is_none_or(|last_sent_values| !are_equal(&last_sent_values.transforms[index], transform)) {
             step.set_transform(index as u32, transform);
         }
     }
@@ -250,8 +250,8 @@ mod tests {
     fn first_step_sends_all_values_and_later_steps_changes() {
         let model = four_domain_model();
         let rest_values = StepValues { q: vec![0.0; 6], transforms: vec![[0.0; 12]; 4] };
-        let encode_step = |accepted_values, current_values| {
-            add_changes(&model, Step::new(3, 0.5), accepted_values, current_values).to_wire()
+        let encode_step = |last_sent_values, current_values| {
+            add_changes(&model, Step::new(3, 0.5), last_sent_values, current_values).to_wire()
         };
         let all_values = encode_step(None, &rest_values);
         assert_eq!((all_values.q_domains, all_values.transform_domains), (vec![0, 1, 2], vec![0, 1, 2, 3]));

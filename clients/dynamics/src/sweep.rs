@@ -1,6 +1,6 @@
-//! Kinematic motion for scenes without known physics. Each coordinate in turn performs one period of a sine. At its
-//! peak, the most displaced sample moves by a given fraction of the diagonal of the scene's rest bounds. A scene
-//! without coordinates rocks about the center of its base.
+//! Kinematic motion for scenes without known physics. In every domain, one mode after another performs one period of a
+//! sine. At its peak, the most displaced sample moves by a given fraction of the diagonal of the scene's rest bounds. A
+//! scene without coordinates rocks about the center of its base.
 
 use std::f64::consts::TAU;
 
@@ -72,7 +72,8 @@ impl SweepScenario {
         if max_sine > 1e-6 { sine_at(coordinate_step) / max_sine } else { 1.0 }
     }
 
-    /// The coordinates of the scene at a step. All domains move the same mode at the same time.
+    /// The coordinates of the scene at a step. All domains move at the same time; a domain with fewer modes than others
+    /// starts again with its first one.
     fn compute_coordinates(&self, step: u64) -> Vec<f32> {
         let mode = step / self.steps_per_coordinate;
         let sine = self.normalized_sine(step % self.steps_per_coordinate);
@@ -116,18 +117,18 @@ impl Scenario for SweepScenario {
     }
 
     fn report(&self) -> Report {
-        let load_description = match self.model.coordinate_count {
+        let motion_description = match self.model.coordinate_count {
             0 => format!(
                 "no coordinates: the scene rocks by {ROCKING_ANGLE} rad about its base every {ROCKING_PERIOD} s"
             ),
             _ => format!(
-                "one coordinate after another as a sine, {} of the diagonal at its crest",
+                "in every domain one mode after another as a sine, {} of the diagonal at its crest",
                 self.options.displacement_fraction
             ),
         };
         let peak_displacement_fraction = self.peak_displacement / self.model.diagonal();
         Report::from_iter([
-            ("load".to_owned(), json!(load_description)),
+            ("load".to_owned(), json!(motion_description)),
             ("peak_of_diagonal".to_owned(), json!(peak_displacement_fraction)),
         ])
     }

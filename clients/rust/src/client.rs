@@ -37,7 +37,7 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 #[derive(Debug, Clone)]
 pub struct Client {
     pub(crate) channel: Channel,
-    pub(crate) reply_limit: u64,
+    pub(crate) max_reply_bytes: u64,
     /// The URL of the server, as the caller passed it, for errors.
     url: Arc<str>,
 }
@@ -83,7 +83,7 @@ impl Client {
             .http2_keep_alive_interval(KEEP_ALIVE)
             .keep_alive_timeout(KEEP_ALIVE);
         let channel = endpoint.connect().await.map_err(connect_error)?;
-        Ok(Self { channel, reply_limit: REPLY_LIMIT, url: url.into() })
+        Ok(Self { channel, max_reply_bytes: REPLY_LIMIT, url: url.into() })
     }
 
     /// Connects, and retries until a server answers or `timeout` has passed.
@@ -103,7 +103,7 @@ impl Client {
     /// Sets the limit of one reply, in bytes, on the same connection.
     #[must_use]
     pub fn with_reply_limit(mut self, bytes: u64) -> Self {
-        self.reply_limit = bytes;
+        self.max_reply_bytes = bytes;
         self
     }
 

@@ -148,7 +148,7 @@ impl Client {
             deadline_ms: request.deadline_ms,
         };
         let messages = self.replies(FrameServiceClient::new(self.channel.clone()).render_frame(wire).await)?;
-        let frame = ChunkedReplies::new(messages, |message| message.chunk, self.reply_limit).next().await;
+        let frame = ChunkedReplies::new(messages, |message| message.chunk, self.max_reply_bytes).next().await;
         frame.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the first frame" }))
     }
 
@@ -165,7 +165,7 @@ impl Client {
             frames: request.replies,
         };
         let messages = self.replies(FrameServiceClient::new(self.channel.clone()).stream_frames(wire).await)?;
-        Ok(FrameStream(ChunkedReplies::new(messages, |message| message.chunk, self.reply_limit)))
+        Ok(FrameStream(ChunkedReplies::new(messages, |message| message.chunk, self.max_reply_bytes)))
     }
 }
 

@@ -105,7 +105,7 @@ impl Client {
             arrays: arrays.iter().map(|array| *array as i32).collect(),
         };
         let mut messages = self.replies(self.scenes().describe_scene(request).await)?;
-        let mut builder = DescriptionBuilder::new(self.reply_limit);
+        let mut builder = DescriptionBuilder::new(self.max_reply_bytes);
         while let Some(message) = messages.next().await? {
             builder.add_message(message)?;
         }
@@ -122,7 +122,7 @@ impl Client {
         let domain = u32::try_from(domain).unwrap_or(u32::MAX);
         let request = v1::ReadModesRequest { scene: scene.to_owned(), domain, vertices: vertices.to_vec() };
         let mut messages = self.replies(self.scenes().read_modes(request).await)?;
-        let mut assembler = Assembler::new("modes", self.reply_limit);
+        let mut assembler = Assembler::new("modes", self.max_reply_bytes);
         let mut complete_reply = None;
         while let Some(message) = messages.next().await? {
             let head = (!assembler.is_open()).then_some((message.rank, message.total));

@@ -137,7 +137,7 @@ impl StepStream {
     /// # Errors
     /// `Rejected` reports the oldest unreported rejection. It names the rejected step, usually an earlier one; the step
     /// passed to this call has been sent and the stream stays open. `Step` means that the step passed to this call was
-    /// not sent; the stream stays open. Every other error ends the stream.
+    /// not sent because its transforms have several formats; the stream stays open. Every other error ends the stream.
     pub async fn step(&mut self, step: &Step) -> Result<()> {
         step.check_formats()?;
         self.wait_until(|progress, window| progress.in_flight.len() < window).await?;
@@ -211,7 +211,7 @@ impl StepStream {
     /// Waits until `condition` holds for the progress and the window. Fails if the stream has ended.
     async fn wait_until(&mut self, condition: impl Fn(&Progress, usize) -> bool) -> Result<()> {
         loop {
-            // Mark the value as seen before reading it, so that a change in between wakes the wait below.
+            // Mark the last change as seen before `progress` is read, so that a later change ends the wait below.
             self.progress_changes.borrow_and_update();
             {
                 let progress = lock(&self.progress);

@@ -1,5 +1,5 @@
-//! Deformed vertices of a step: positions per vertex and normals per corner, in world axes, relative to
-//! [`VertexSet::origin`]. Displacements and bounding boxes are optional.
+//! Deformed vertices of a step: positions per vertex, relative to [`VertexSet::domain_origin`], and normals per corner,
+//! both in world axes. Displacements and bounding boxes are optional.
 
 use std::ops::Range;
 use std::pin::Pin;
@@ -38,7 +38,8 @@ pub struct VertexSetDomain {
 pub struct VertexSet {
     pub step: v1::StepId,
     /// World position of the common origin of all positions, in meters. It equals the scene's origin until f64
-    /// translations move domains far from there. Then it follows the domains and may differ per step.
+    /// translations move domains far from there. Then it follows the domains and may differ per step. Does not apply if
+    /// `domain_origins` is not empty.
     pub origin: Vec<f64>,
     /// The origin of each selected domain in meters, if the origins differ; otherwise empty.
     pub domain_origins: Vec<[f64; 3]>,
@@ -90,7 +91,7 @@ impl Client {
             deadline_ms: request.deadline_ms,
         };
         let messages = self.replies(VertexServiceClient::new(self.channel.clone()).get_vertices(wire).await)?;
-        let set = ChunkedReplies::new(messages, |message| message.chunk, self.reply_limit).next().await;
+        let set = ChunkedReplies::new(messages, |message| message.chunk, self.max_reply_bytes).next().await;
         set.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the first reply of vertices" }))
     }
 
@@ -107,7 +108,7 @@ impl Client {
             steps: request.replies,
         };
         let messages = self.replies(VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await)?;
-        Ok(VertexStream(ChunkedReplies::new(messages, |message| message.chunk, self.reply_limit)))
+        Ok(VertexStream(ChunkedReplies::new(messages, |message| message.chunk, self.max_reply_bytes)))
     }
 }
 

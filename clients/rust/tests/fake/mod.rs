@@ -71,7 +71,7 @@ pub(crate) struct FakeServer {
     pub(crate) bounds: [f64; 6],
     pub(crate) window: u32,
     /// Number of acknowledgements that may still be sent; unlimited unless a test restricts it.
-    pub(crate) permits: Semaphore,
+    pub(crate) ack_permits: Semaphore,
     pub(crate) steps: Mutex<Vec<v1::Step>>,
     pub(crate) uploads: Mutex<Vec<(String, Vec<u8>)>>,
     /// The state after each step, for the subscribers.
@@ -106,7 +106,7 @@ impl FakeServer {
             domains,
             bounds,
             window: 8,
-            permits: Semaphore::new(Semaphore::MAX_PERMITS),
+            ack_permits: Semaphore::new(Semaphore::MAX_PERMITS),
             steps: Mutex::default(),
             uploads: Mutex::default(),
             outputs: broadcast::channel(1 << 14).0,

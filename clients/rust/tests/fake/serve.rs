@@ -161,12 +161,12 @@ impl SceneService for FakeService {
         let request = request.into_inner();
         self.check_scene(&request.scene)?;
         let domain = &self.0.domains[request.domain as usize];
-        let row_numbers = 3 * domain.wire.rank as usize;
+        let entries_per_vertex = 3 * domain.wire.rank as usize;
         let all_vertices: Vec<u32> = (0..domain.wire.vertices).collect();
         let vertices = if request.vertices.is_empty() { all_vertices } else { request.vertices };
         let mut bytes = vec![];
         for vertex in vertices {
-            bytes.extend(pack(&domain.modes[row_numbers * vertex as usize..][..row_numbers]));
+            bytes.extend(pack(&domain.modes[entries_per_vertex * vertex as usize..][..entries_per_vertex]));
         }
         let rank = domain.wire.rank;
         let message = |ByteChunk { offset, total, data }| v1::ReadModesResponse { rank, offset, total, data };
@@ -213,7 +213,7 @@ impl FakeService {
                 Some(RequestKind::Step(step)) => match self.0.apply(&step) {
                     Err(rejection_reply) => ResponseKind::Rejection(rejection_reply),
                     Ok(()) => {
-                        self.0.permits.acquire().await.expect("an open semaphore").forget();
+                        self.0.ack_permits.acquire().await.expect("an open semaphore").forget();
                         let stages = vec![v1::StageTime { stage: "deform".into(), milliseconds: 1.5 }];
                         ResponseKind::Ack(v1::Acknowledgement { step: step.number, skipped: 0, stages })
                     }

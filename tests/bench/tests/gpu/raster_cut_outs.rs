@@ -9,8 +9,8 @@ use crate::scenes::Random;
 
 /// Tolerance of the alpha threshold. The hardware interpolates texels and levels with 8-bit weights (CUDA C++
 /// programming guide, "Texture fetching"), so three interpolations have an error of up to 3/256. The hardware's logarithm
-/// for the level is assumed to be accurate to a sixteenth of a level. Alpha differs by at most one half between levels,
-/// so this adds up to 1/32.
+/// for the level is assumed to be accurate to a sixteenth of a level. Alpha of the floor's image differs by at most one
+/// half between levels, so this adds up to 1/32.
 const TOLERANCE: f32 = 1.0 / 16.0;
 
 const GRANULARITIES: [RasterGranularity; 3] =
@@ -108,7 +108,7 @@ fn gpu_perspective_floor_matches_the_definition() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_split_floor_matches_the_definition_on_every_path() {
+fn gpu_split_floor_matches_the_definition_at_every_granularity() {
     let device = Device::open(0).expect("expected a CUDA device");
     for (divisions, granularity) in [
         (60_u32, RasterGranularity::BySize),
@@ -137,6 +137,7 @@ fn gpu_anisotropic_filtering_keeps_more_of_far_stripes() {
     });
     let count_floor_samples = |cut_out_soup: &CutOutSoup| {
         let keys = read_keys(&device, cut_out_soup, RasterGranularity::BySize);
+        // The low 32 bits are the triangle; the floor follows the two triangles of the wall.
         keys.iter().filter(|key| **key != u64::MAX && **key as u32 >= 2).count()
     };
     let isotropic_samples = count_floor_samples(&cut_out_soup);

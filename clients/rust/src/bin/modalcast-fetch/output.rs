@@ -65,8 +65,8 @@ impl Summary {
         if seconds > 0.0 { (self.step_numbers.len() - 1) as f64 / seconds } else { 0.0 }
     }
 
-    /// Prints the summary. `reply_noun` is `frames` or `steps`; as JSON, it is the key of the number of replies. Only the
-    /// JSON contains `origin`, in meters.
+    /// Prints the summary. The JSON contains `reply_noun` as the key of the number of replies, beside `steps`, the list of
+    /// step numbers, and `origin`, the world position of the vertex origin in meters.
     pub(crate) fn print(self, reply_noun: &str, out: &std::path::Path, origin: Option<Vec<f64>>, as_json: bool) {
         let rate = self.replies_per_second();
         let medians = self.stages.medians();
@@ -149,7 +149,6 @@ pub(crate) async fn print_list(client: &Client, as_json: bool) -> Result<()> {
     for scene in scenes {
         let last_step =
             scene.last_step.map_or("no step yet".into(), |step| format!("step {} of run {}", step.number, step.run));
-        // These fields are counts.
         let SceneInfo { scene: name, source, domains, vertices, triangles, coordinates, .. } = scene;
         println!(
             "{name} ({source}): {domains} domains, {vertices} vertices, {triangles} triangles, {coordinates} \

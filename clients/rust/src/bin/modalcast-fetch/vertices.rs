@@ -107,7 +107,7 @@ impl OutputFiles<'_> {
 
     fn finish(self, as_json: bool) -> Result<()> {
         self.writers.into_iter().try_for_each(|writer| writer.finish().map(drop))?;
-        self.summary.print("steps", &self.options.out, Some(self.origin), as_json);
+        self.summary.print("vertex_sets", &self.options.out, Some(self.origin), as_json);
         Ok(())
     }
 }
