@@ -85,7 +85,7 @@ fn nearest_rotation(correlation: &Matrix3<f64>) -> Matrix3<f64> {
 mod tests {
     use super::*;
 
-    /// Points on a circle in a plane y = 2.
+    /// Points on a circle in the plane y = 2.
     fn planar_circle(point_count: usize) -> Vec<Vector3<f64>> {
         let angle = |index: usize| 2.0 * std::f64::consts::PI * index as f64 / point_count as f64;
         let point = |index| Vector3::new(angle(index).cos() * 0.1, 2.0, angle(index).sin() * 0.1);

@@ -305,7 +305,7 @@ fn create_samples(domain: &Domain, selection: &SelectedVertices, mode_rows: Opti
             Some(mode_rows) => mode_rows.rows_of(ordinal).ok_or_else(|| {
                 let field = format!("rows of U of '{}'", domain.name);
                 let expected = format!("rows of {} vertices", selection.vertices.len());
-                invalid_input(field, expected, format!("rows of {ordinal}"))
+                invalid_input(field, expected, format!("rows of {ordinal} vertices"))
             })?,
             None => &[],
         };

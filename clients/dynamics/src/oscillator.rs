@@ -188,7 +188,7 @@ mod tests {
 
     /// An independent solution: fourth-order Runge-Kutta in 20,000 small steps.
     fn integrate_runge_kutta(
-        w2: f64,
+        eigenvalue: f64,
         damping: f64,
         start: ModeState,
         start_force: f64,
@@ -199,7 +199,7 @@ mod tests {
         let dt = h / f64::from(count);
         let derivative = |time: f64, state: ModeState| {
             let force = start_force + (end_force - start_force) * time / h;
-            ModeState { q: state.v, v: force - damping * state.v - w2 * state.q }
+            ModeState { q: state.v, v: force - damping * state.v - eigenvalue * state.q }
         };
         let add_scaled = |state: ModeState, d: ModeState, factor: f64| ModeState {
             q: state.q + factor * d.q,

@@ -65,8 +65,8 @@ struct WindLoad {
     /// The mean of the parent's U over the attachment samples of the joint: 3 x r of the parent, in world axes. Empty
     /// without a parent.
     joint_modes: Vec<f64>,
-    /// Downwind distance of the domain, in scene units.
-    distance: f64,
+    /// Position of the domain along the wind, from the lower corner of the scene's bounds, in scene units.
+    downwind_position: f64,
 }
 
 /// A sample of a domain.
@@ -174,7 +174,7 @@ impl TreeScenario {
         let mut subtree_forces = vec![Vector3::zeros(); self.model.domains.len()];
         for (index, domain) in self.model.domains.iter().enumerate().rev() {
             let load = &self.loads[index];
-            let WindPressure { downwind, crosswind } = self.wind.pressure(time, index, load.distance);
+            let WindPressure { downwind, crosswind } = self.wind.pressure(time, index, load.downwind_position);
             for mode in 0..domain.rank {
                 forces[domain.first_coordinate + mode] +=
                     downwind * load.downwind[mode] + crosswind * load.crosswind[mode];
@@ -318,7 +318,7 @@ impl TreeScenario {
         let leaf_rotation = |(index, domain): (usize, &DomainModel)| {
             let is_leaf = domain.rank == 0 && domain.joint.is_some() && !has_children[index];
             (is_leaf && max_angle > 0.0).then(|| {
-                let pressure = self.wind.pressure(time, index, self.loads[index].distance).downwind;
+                let pressure = self.wind.pressure(time, index, self.loads[index].downwind_position).downwind;
                 let turbulence = self.wind.turbulence(time, index, 1);
                 let axis = domain.placement.linear.transpose() * self.wind.crosswind;
                 let angle = max_angle * (0.5 * pressure + 0.5 * pressure.abs() * turbulence);
@@ -397,7 +397,7 @@ fn compute_wind_load(model: &Model, domain: &DomainModel, wind: &Wind) -> WindLo
         (0..domain.rank).map(modal_load).collect::<Vec<f64>>()
     };
     let center = samples.iter().map(|sample| sample.rest_position).sum::<Vector3<f64>>() / samples.len().max(1) as f64;
-    let distance = (domain.placement.apply(&center) - model.bounds_min).dot(&wind.downwind);
+    let downwind_position = (domain.placement.apply(&center) - model.bounds_min).dot(&wind.downwind);
     let joint_modes = domain.joint.as_ref().map_or(vec![], |joint| {
         let parent = &model.domains[joint.parent];
         let attachment_samples = joint.attachment_samples.iter().map(|index| &parent.samples[*index]);
@@ -411,7 +411,7 @@ fn compute_wind_load(model: &Model, domain: &DomainModel, wind: &Wind) -> WindLo
         (0..3).flat_map(|component| columns.iter().map(move |column| column[component])).collect()
     });
     let (downwind, crosswind) = (reduced_load(&wind.downwind), reduced_load(&wind.crosswind));
-    WindLoad { downwind, crosswind, joint_modes, distance }
+    WindLoad { downwind, crosswind, joint_modes, downwind_position }
 }
 
 /// The largest elastic displacement of a domain's surface samples, in scene units.

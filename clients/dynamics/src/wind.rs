@@ -119,6 +119,7 @@ mod tests {
             };
             (40..300).max_by(|a, b| gust_pressure(a).total_cmp(&gust_pressure(b))).unwrap_or(0)
         };
+        // A delay of 0.2 s per scene unit over 2 units, in steps of 0.01 s.
         assert_eq!(peak_step(2.0) - peak_step(0.0), 40);
     }
 }

@@ -121,10 +121,10 @@ fn group_representatives(mesh: &Mesh) -> Vec<u32> {
         let mut candidates = vertex_representatives.iter().rev().take_while(|representative| {
             chord_distance(normal(corner), normal(**representative), 1) <= SAME_NORMAL_CHORD
         });
-        let same_group = candidates
+        let group_representative = candidates
             .find(|representative| chord_distance(normal(corner), normal(**representative), 3) <= SAME_NORMAL_CHORD)
             .copied();
-        representative_of_corner[corner as usize] = same_group.unwrap_or_else(|| {
+        representative_of_corner[corner as usize] = group_representative.unwrap_or_else(|| {
             vertex_representatives.push(corner);
             corner
         });
@@ -193,8 +193,8 @@ fn geometric_normal(mesh: &Mesh, vertex: u32, edges: &[OppositeEdge]) -> [f32; 3
 /// Chains the opposite edges of a group to fans. Reuses its buffers for all groups.
 #[derive(Default)]
 struct FanBuilder {
-    /// Per run of edges with one begin vertex, at the index of its first edge: the number of edges already in a fan.
-    used_edges: Vec<usize>,
+    /// For each begin vertex, at the index of its first edge: the number of its edges that are already in a fan.
+    used_edge_counts: Vec<usize>,
     /// The end vertices of all edges, sorted.
     ends: Vec<u32>,
 }
@@ -204,8 +204,8 @@ impl FanBuilder {
     /// closed ones. Both are in the order of their begin vertices.
     fn append_fans(&mut self, edges: &mut [OppositeEdge], ring: &mut Vec<u32>) {
         edges.sort_unstable();
-        self.used_edges.clear();
-        self.used_edges.resize(edges.len(), 0);
+        self.used_edge_counts.clear();
+        self.used_edge_counts.resize(edges.len(), 0);
         self.ends.clear();
         self.ends.extend(edges.iter().map(|(_, to)| *to));
         self.ends.sort_unstable();
@@ -230,9 +230,9 @@ impl FanBuilder {
     /// Takes an unused edge that begins at `begin`, and returns its end.
     fn take_edge(&mut self, edges: &[OppositeEdge], begin: u32) -> Option<u32> {
         let first_edge = edges.partition_point(|edge| edge.0 < begin);
-        let used_edges = self.used_edges.get_mut(first_edge)?;
-        let (_, to) = edges.get(first_edge + *used_edges).filter(|edge| edge.0 == begin)?;
-        *used_edges += 1;
+        let used_edge_count = self.used_edge_counts.get_mut(first_edge)?;
+        let (_, to) = edges.get(first_edge + *used_edge_count).filter(|edge| edge.0 == begin)?;
+        *used_edge_count += 1;
         Some(*to)
     }
 }
@@ -344,6 +344,10 @@ mod tests {
         let smoothing = SmoothingGroups::from_mesh(&mesh(&corners, vec![[0, 1, 2]; 100_000]));
         assert!(smoothing.group_count() > 50_000, "{} groups", smoothing.group_count());
         let group_count = smoothing.group_count() as u64;
-        assert_eq!(smoothing.bytes(), 4 * 100_000 + 20 * group_count + 4, "degenerate triangles need no memory");
+        assert_eq!(
+            smoothing.bytes(),
+            4 * 100_000 + 20 * group_count + 4,
+            "expected no memory for degenerate triangles"
+        );
     }
 }

@@ -49,7 +49,7 @@ impl SceneFeatures {
             mask: parts.has_masked_material(),
             blend: parts.has_used_material(|material| material.alpha_mode == crate::domain::AlphaMode::Blend),
             shadows: parts.look.shadow.is_some(),
-            shear: !parts.rigid_transforms || !parts.domains.iter().all(has_similar_transforms),
+            shear: !parts.rigid_transforms || !parts.domains.iter().all(has_similarity_transforms),
             exact_normals: modes && parts.deformation.normals == NormalMethod::Exact,
             truncation: modes && parts.deformation.truncation.is_some(),
             compensated: modes && parts.deformation.compensated,
@@ -80,6 +80,6 @@ impl SceneFeatures {
 }
 
 /// Whether the placement of a domain and, for a follower, its frame are similarities (without shear).
-fn has_similar_transforms(domain: &Domain) -> bool {
+fn has_similarity_transforms(domain: &Domain) -> bool {
     domain.placement.is_similarity() && domain.follows.is_none_or(|follow| follow.frame.is_similarity())
 }

@@ -120,9 +120,9 @@ impl FloatingOrigins {
 
     /// Sets the translation of a root, in scene units from the scene's origin.
     pub(super) fn set_translation(&mut self, root: usize, translation: [f64; 3]) {
-        let (shared_origin, stored) = (self.shared_origin, &mut self.translations[root]);
-        self.outlier_count -= usize::from(is_beyond_reach(shared_origin, *stored));
-        *stored = translation;
+        let (shared_origin, stored_translation) = (self.shared_origin, &mut self.translations[root]);
+        self.outlier_count -= usize::from(is_beyond_reach(shared_origin, *stored_translation));
+        *stored_translation = translation;
         self.outlier_count += usize::from(is_beyond_reach(shared_origin, translation));
         self.set_translation_count = self.set_translation_count.saturating_add(1);
     }
@@ -151,14 +151,19 @@ impl FloatingOrigins {
         is_improvement
     }
 
-    /// Rebases positions from the floating origins of their domains to `view`, a point in scene units from the scene's
-    /// origin. The result is computed in f64 and rounded to f32 once. `positions` has three numbers per vertex in
-    /// layout order. Also returns the bounds of the domains that are not much farther from `view` than the nearest one.
-    /// Much more distant domains are excluded, because they would make the bounds too large to fit a camera or shadow
-    /// map to.
-    pub fn rebase_positions(&self, view: [f64; 3], scene: &Scene, positions: &[f32]) -> (Vec<f32>, BoundingBox) {
+    /// Rebases positions from the floating origins of their domains to `reference_point`, in scene units from the
+    /// scene's origin. The result is computed in f64 and rounded to f32 once. `positions` has three numbers per vertex
+    /// in layout order. Also returns the bounds of the domains that are not much farther from `reference_point` than
+    /// the nearest one. Much more distant domains are excluded, because they would make the bounds too large to fit a
+    /// camera or shadow map to.
+    pub fn rebase_positions(
+        &self,
+        reference_point: [f64; 3],
+        scene: &Scene,
+        positions: &[f32],
+    ) -> (Vec<f32>, BoundingBox) {
         let layouts = &scene.layout.domains;
-        let offset = |domain| subtract(self.origin_of(scene.transform_roots.root_of(domain)), view);
+        let offset = |domain| subtract(self.origin_of(scene.transform_roots.root_of(domain)), reference_point);
         let offsets: Vec<[f64; 3]> = (0..layouts.len()).map(offset).collect();
         let distance =
             |offset: &[f64; 3]| offset.iter().fold(0.0, |largest: f64, coordinate| largest.max(coordinate.abs()));

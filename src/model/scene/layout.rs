@@ -49,7 +49,7 @@ impl Layout {
         for (index, domain) in domains.iter().enumerate() {
             let shape = &shapes[domain.shape];
             let rank = shape.modes.rank();
-            let shared_first_q = domain.shares_q_with.map(|twin| layout.domains[twin].first_q);
+            let shared_first_q = domain.shares_q_with.map(|other_domain| layout.domains[other_domain].first_q);
             let domain_layout = DomainLayout {
                 first_vertex: layout.vertices,
                 vertices: shape.mesh.rest_positions().len(),
@@ -64,12 +64,12 @@ impl Layout {
             layout.corners += domain_layout.corners;
             layout.triangles += domain_layout.triangles;
             layout.coordinates += if shared_first_q.is_some() { 0 } else { rank };
-            if let Some(twin) = domain.shares_q_with.filter(|_| rank > 0) {
+            if let Some(other_domain) = domain.shares_q_with.filter(|_| rank > 0) {
                 // The list begins with the domain that owns the coordinates. It exists already if `twin` shares them.
                 layout
                     .domains_sharing_q
                     .entry(domain_layout.first_q)
-                    .or_insert_with(|| vec![twin as u32])
+                    .or_insert_with(|| vec![other_domain as u32])
                     .push(index as u32);
             }
             layout.domains.push(domain_layout);

@@ -239,11 +239,11 @@ fn check_domain(parts: &SceneParts, index: usize) -> Result<()> {
     if !domain.rest_q.iter().all(|number| number.is_finite()) {
         return Err(invalid("rest_q", "finite numbers", format!("{:?}", domain.rest_q)));
     }
-    if let Some(twin) = domain.shares_q_with {
-        check_index("shares_q_with", twin, index)?;
-        let twin_rank = parts.shapes[parts.domains[twin].shape].modes.rank();
-        if twin_rank != rank {
-            return Err(invalid("shares_q_with", format!("a domain of rank {rank}"), twin_rank));
+    if let Some(other_domain) = domain.shares_q_with {
+        check_index("shares_q_with", other_domain, index)?;
+        let other_rank = parts.shapes[parts.domains[other_domain].shape].modes.rank();
+        if other_rank != rank {
+            return Err(invalid("shares_q_with", format!("a domain of rank {rank}"), other_rank));
         }
     }
     if let Some(attachment) = &domain.attachment {

@@ -82,9 +82,9 @@ pub enum Culling {
     /// Triangles outside the view, back faces of one-sided materials, and triangles that cover no sample. Applies to
     /// shadow maps too.
     Triangles,
-    /// As `Triangles`, plus triangles that are occluded by the triangles visible in the last frame. Software OpenGL
-    /// implementations draw hidden triangles of multisampled frames with textured cut-outs, because culling them would
-    /// change where textures are sampled.
+    /// As `Triangles`, plus triangles that are occluded by the triangles visible in the last frame. Exception: on
+    /// software OpenGL implementations, occluded triangles are not culled in multisampled frames with textured
+    /// cut-outs, because culling them would change where textures are sampled.
     #[serde(rename = "depth")]
     Occlusion,
 }

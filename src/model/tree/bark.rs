@@ -70,11 +70,11 @@ impl BarkLayers {
     fn height(&self, u: f32, v: f32) -> f32 {
         let warped_u = u + 0.035 * self.warps[0].sample(u, v) + 0.012 * self.warps[1].sample(u, v);
         // The zero crossings of the noise form long, wavering furrows. Those of the finer noise are shallow.
-        let deep = smoothstep(0.0, 0.34, self.furrows[0].sample(warped_u, v).abs());
-        let fine = smoothstep(0.0, 0.36, self.furrows[1].sample(warped_u, v).abs());
+        let deep_furrow = smoothstep(0.0, 0.34, self.furrows[0].sample(warped_u, v).abs());
+        let fine_furrow = smoothstep(0.0, 0.36, self.furrows[1].sample(warped_u, v).abs());
         let crack = smoothstep(0.0, 0.16, self.cracks.sample(warped_u, v + 0.02 * self.warps[1].sample(v, u)).abs());
         let grain = 0.6 * self.grain[0].sample(warped_u, v) + 0.4 * self.grain[1].sample(u, v);
-        let plate = deep.powf(0.7) * (0.58 + 0.42 * fine) * (0.80 + 0.20 * crack);
+        let plate = deep_furrow.powf(0.7) * (0.58 + 0.42 * fine_furrow) * (0.80 + 0.20 * crack);
         plate * (0.93 + 0.07 * grain) + 0.045 * grain
     }
 

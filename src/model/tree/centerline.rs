@@ -15,7 +15,7 @@ pub(super) struct GrowthParameters {
     /// Number of beam elements along the branch.
     pub(super) elements: usize,
     /// Number of skin rings per beam element.
-    pub(super) rings: usize,
+    pub(super) rings_per_element: usize,
     /// Exponent of the node spacing: node i of N is at arc length `length (i / N)^grading`. Above 1, nodes are denser
     /// near the root.
     pub(super) grading: f64,
@@ -31,7 +31,7 @@ pub(super) struct GrowthParameters {
     pub(super) wander: f64,
 }
 
-/// A sampled curve with one sample per ring of the skin. Every `rings`-th sample is a node of the beam. Points and arc
+/// A sampled curve with one sample per ring of the skin. Every `rings_per_element`-th sample is a node of the beam. Points and arc
 /// lengths are in meters.
 #[derive(Debug, Clone)]
 pub(super) struct Centerline {
@@ -39,11 +39,11 @@ pub(super) struct Centerline {
     /// Unit tangents.
     pub(super) tangents: Vec<Vector3<f64>>,
     /// Unit vectors perpendicular to the tangents, transported along the curve without twist.
-    pub(super) sides: Vec<Vector3<f64>>,
+    pub(super) side_vectors: Vec<Vector3<f64>>,
     /// Arc length from the root.
     pub(super) arc_lengths: Vec<f64>,
     /// Samples per beam element.
-    pub(super) rings: usize,
+    pub(super) rings_per_element: usize,
 }
 
 impl Centerline {
@@ -52,8 +52,13 @@ impl Centerline {
         let random_bends = RandomBends::new(growth, random);
         let arc_lengths = ring_arc_lengths(growth);
         let (mut point, mut tangent) = (Vector3::zeros(), growth.start);
-        let mut centerline =
-            Self { points: vec![point], tangents: vec![tangent], sides: vec![], arc_lengths, rings: growth.rings };
+        let mut centerline = Self {
+            points: vec![point],
+            tangents: vec![tangent],
+            side_vectors: vec![],
+            arc_lengths,
+            rings_per_element: growth.rings_per_element,
+        };
         for ring in 1..centerline.arc_lengths.len() {
             let step = (centerline.arc_lengths[ring] - centerline.arc_lengths[ring - 1]) / STEPS_PER_RING as f64;
             for substep in 0..STEPS_PER_RING {
@@ -66,7 +71,7 @@ impl Centerline {
             centerline.points.push(point);
             centerline.tangents.push(tangent);
         }
-        centerline.sides = parallel_transport(&centerline.tangents);
+        centerline.side_vectors = parallel_transport(&centerline.tangents);
         centerline
     }
 
@@ -96,13 +101,13 @@ impl Centerline {
 
     /// The beam's nodes.
     pub(super) fn nodes(&self) -> Vec<Vector3<f64>> {
-        self.points.iter().copied().step_by(self.rings).collect()
+        self.points.iter().copied().step_by(self.rings_per_element).collect()
     }
 
     /// The unit direction of a branch at ring `ring`: the tangent, rotated by `angle` towards the direction `side`.
     pub(super) fn branch_direction(&self, ring: usize, angle: f64, side: &Vector3<f64>) -> Vector3<f64> {
         let tangent = self.tangents[ring];
-        let perpendicular = (side - tangent * tangent.dot(side)).try_normalize(1e-9).unwrap_or(self.sides[ring]);
+        let perpendicular = (side - tangent * tangent.dot(side)).try_normalize(1e-9).unwrap_or(self.side_vectors[ring]);
         tangent * angle.cos() + perpendicular * angle.sin()
     }
 }
@@ -121,11 +126,11 @@ pub(super) fn part_orientation(y: &Vector3<f64>, up: &Vector3<f64>) -> Rotation3
 fn ring_arc_lengths(growth: &GrowthParameters) -> Vec<f64> {
     let node_arc_length = |index: usize| growth.length * (index as f64 / growth.elements as f64).powf(growth.grading);
     let ring_arc_length = |element: usize, ring: usize| {
-        let fraction = ring as f64 / growth.rings as f64;
+        let fraction = ring as f64 / growth.rings_per_element as f64;
         node_arc_length(element) * (1.0 - fraction) + node_arc_length(element + 1) * fraction
     };
     let mut arc_lengths: Vec<f64> = (0..growth.elements)
-        .flat_map(|element| (0..growth.rings).map(move |ring| (element, ring)))
+        .flat_map(|element| (0..growth.rings_per_element).map(move |ring| (element, ring)))
         .map(|(element, ring)| ring_arc_length(element, ring))
         .collect();
     arc_lengths.push(growth.length);
@@ -192,9 +197,23 @@ fn parallel_transport(tangents: &[Vector3<f64>]) -> Vec<Vector3<f64>> {
 pub(super) mod tests {
     use super::*;
 
-    pub(in super::super) fn straight_growth(length: f64, elements: usize, rings: usize) -> GrowthParameters {
+    pub(in super::super) fn straight_growth(
+        length: f64,
+        elements: usize,
+        rings_per_element: usize,
+    ) -> GrowthParameters {
         let (start, up) = (Vector3::y(), Vector3::z());
-        GrowthParameters { length, elements, rings, grading: 1.0, start, up, sag: 0.0, rise: 0.0, wander: 0.0 }
+        GrowthParameters {
+            length,
+            elements,
+            rings_per_element,
+            grading: 1.0,
+            start,
+            up,
+            sag: 0.0,
+            rise: 0.0,
+            wander: 0.0,
+        }
     }
 
     #[test]
@@ -218,10 +237,10 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn tangents_and_sides_are_orthonormal() {
+    fn tangents_and_side_vectors_are_orthonormal() {
         let growth = GrowthParameters { wander: 0.4, rise: 0.9, grading: 1.4, ..straight_growth(2.0, 10, 3) };
         let centerline = Centerline::grow(&growth, &mut SplitMix64::new(5));
-        for (tangent, side) in centerline.tangents.iter().zip(&centerline.sides) {
+        for (tangent, side) in centerline.tangents.iter().zip(&centerline.side_vectors) {
             assert!((tangent.norm() - 1.0).abs() < 1e-12);
             assert!((side.norm() - 1.0).abs() < 1e-12);
             assert!(tangent.dot(side).abs() < 1e-12);

@@ -61,7 +61,7 @@ fn grow_cluster(parameters: ClusterParameters, random: &mut SplitMix64) -> PartT
     let growth = GrowthParameters {
         length: shoot_length,
         elements: 4,
-        rings: 1,
+        rings_per_element: 1,
         grading: 1.0,
         start: Vector3::y(),
         up: Vector3::z(),

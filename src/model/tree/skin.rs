@@ -80,6 +80,7 @@ impl SkinBuilder {
         let last_ring = centerline.points.len() - 1;
         let first_vertex = self.rest_positions.len() as u32;
         let first_corner = self.corners.len() as u32;
+        // Arc length in units of the local circumference.
         let mut circumferences = 0.0;
         for ring in 0..=last_ring {
             if ring > 0 {
@@ -110,10 +111,10 @@ impl SkinBuilder {
         let last_ring_corner = first_corner + (last_ring * (sides + 1)) as u32;
         let circumferences = circumferences + tube.radii[last_ring] / (std::f64::consts::TAU * MIN_RADIUS);
         for side in 0..sides {
-            let tip = self.corners.len() as u32;
+            let tip_corner = self.corners.len() as u32;
             self.corners.push(self.rest_positions.len() as u32 - 1);
             self.uvs.push(tube.uv_mapping.uv_at((side as f64 + 0.5) / sides as f64, circumferences, 1.0));
-            self.triangles.push([last_ring_corner + side as u32, last_ring_corner + side as u32 + 1, tip]);
+            self.triangles.push([last_ring_corner + side as u32, last_ring_corner + side as u32 + 1, tip_corner]);
         }
     }
 
@@ -148,7 +149,8 @@ impl SkinBuilder {
 
     fn add_ring(&mut self, tube: &Tube, ring: usize, radius_factor: &impl Fn(f64, f64) -> f64) {
         let (centerline, sides) = (tube.centerline, tube.sides);
-        let (x_axis, z_axis) = (centerline.sides[ring], centerline.tangents[ring].cross(&centerline.sides[ring]));
+        let x_axis = centerline.side_vectors[ring];
+        let z_axis = centerline.tangents[ring].cross(&x_axis);
         let offset = |side: usize| {
             let angle = std::f64::consts::TAU * side as f64 / sides as f64;
             (x_axis * angle.cos() + z_axis * angle.sin())
@@ -171,9 +173,12 @@ impl SkinBuilder {
 /// The beam station of a ring.
 pub(super) fn station(centerline: &Centerline, ring: usize) -> Station {
     if ring + 1 == centerline.points.len() {
-        return Station { element: ring / centerline.rings - 1, fraction: 1.0 };
+        return Station { element: ring / centerline.rings_per_element - 1, fraction: 1.0 };
     }
-    Station { element: ring / centerline.rings, fraction: (ring % centerline.rings) as f64 / centerline.rings as f64 }
+    Station {
+        element: ring / centerline.rings_per_element,
+        fraction: (ring % centerline.rings_per_element) as f64 / centerline.rings_per_element as f64,
+    }
 }
 
 /// The beam station, position and unit tangent at a fraction of the length.
@@ -186,7 +191,7 @@ pub(super) fn sample_at(centerline: &Centerline, fraction: f64) -> (Station, Vec
     let weight = (arc_length - centerline.arc_lengths[next_ring - 1])
         / (centerline.arc_lengths[next_ring] - centerline.arc_lengths[next_ring - 1]);
     let mut station = station(centerline, next_ring - 1);
-    station.fraction += weight / centerline.rings as f64;
+    station.fraction += weight / centerline.rings_per_element as f64;
     let position = centerline.points[next_ring - 1].lerp(&centerline.points[next_ring], weight);
     (station, position, centerline.tangents[next_ring - 1].lerp(&centerline.tangents[next_ring], weight).normalize())
 }

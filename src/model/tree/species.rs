@@ -50,6 +50,7 @@ pub(super) fn grow_templates(random: &mut SplitMix64) -> Vec<PartTemplate> {
         trunk.attach_child(ChildJoint { ring, direction, template_index: templates.len() }, bough.mass());
         templates.push(bough);
     }
+    // Twigs of medium length form the top of the crown.
     let last_ring = trunk.centerline.points.len() - 1;
     for (ring, angle) in [(last_ring, 0.10), (last_ring - 2, 0.55), (last_ring - 4, 0.65), (last_ring - 6, 0.7)] {
         let side = perpendicular_at(&trunk.centerline, ring, GOLDEN_ANGLE * (ring + BOUGH_COUNT) as f64);
@@ -65,7 +66,7 @@ fn grow_trunk(random: &mut SplitMix64) -> PartTemplate {
     let growth = GrowthParameters {
         length: 6.8,
         elements: 16,
-        rings: 3,
+        rings_per_element: 3,
         grading: 1.25,
         start: Vector3::y(),
         up: Vector3::y(),
@@ -121,7 +122,7 @@ fn grow_bough(
     let growth = GrowthParameters {
         length,
         elements: 12,
-        rings: 2,
+        rings_per_element: 2,
         grading: 1.1,
         start: Vector3::y(),
         up: part_orientation(direction, &Vector3::y()).inverse() * Vector3::y(),
@@ -155,7 +156,7 @@ fn grow_twig(length: f64, leaves: &[PartTemplate], random: &mut SplitMix64) -> P
     let growth = GrowthParameters {
         length,
         elements: 10,
-        rings: 1,
+        rings_per_element: 1,
         grading: 1.0,
         start: Vector3::y(),
         up: Vector3::new(0.0, 0.35, 0.94).normalize(),
@@ -224,7 +225,7 @@ fn tapered_radii(centerline: &Centerline, base_radius: f64, tip_radius: f64) -> 
 
 /// A unit vector perpendicular to the centerline, at the angle `azimuth`.
 fn perpendicular_at(centerline: &Centerline, ring: usize, azimuth: f64) -> Vector3<f64> {
-    Rotation3::from_axis_angle(&Unit::new_unchecked(centerline.tangents[ring]), azimuth) * centerline.sides[ring]
+    Rotation3::from_axis_angle(&Unit::new_unchecked(centerline.tangents[ring]), azimuth) * centerline.side_vectors[ring]
 }
 
 /// A unit vector perpendicular to the centerline: alternately left and right, and more often tilted up than down.

@@ -97,16 +97,17 @@ impl PartTemplate {
 
     pub(super) fn beam(&self) -> Beam {
         let section_of_element = |first_ring: usize| {
-            let cones = self.radii[first_ring..=first_ring + self.centerline.rings]
+            let cones = self.radii[first_ring..=first_ring + self.centerline.rings_per_element]
                 .windows(2)
                 .map(|ends| Section::of_cone(ends[0], ends[1]));
-            let count = self.centerline.rings as f64;
+            let count = self.centerline.rings_per_element as f64;
             cones.fold(Section { area: 0.0, moment: 0.0 }, |sum, cone| Section {
                 area: sum.area + cone.area / count,
                 moment: sum.moment + cone.moment / count,
             })
         };
-        let sections = (0..self.radii.len() - 1).step_by(self.centerline.rings).map(section_of_element).collect();
+        let sections =
+            (0..self.radii.len() - 1).step_by(self.centerline.rings_per_element).map(section_of_element).collect();
         Beam {
             nodes: self.centerline.nodes(),
             sections,
@@ -175,16 +176,14 @@ mod tests {
             let ring_mean = |ring: usize, mode: usize| {
                 let rows = template.ring_rows(ring);
                 let count = rows.len() as f64;
-                let row_vector = |row_vector: u32| {
-                    Vector3::from_fn(|axis, _| f64::from(shape.modes.entry(row_vector as usize, axis, mode)))
-                };
+                let row_vector =
+                    |row: u32| Vector3::from_fn(|axis, _| f64::from(shape.modes.entry(row as usize, axis, mode)));
                 rows.into_iter().map(row_vector).sum::<Vector3<f64>>() / count
             };
             for mode in 0..template.rank {
                 let base_rows = template.ring_rows(0);
-                let is_zero = |row_vector: &u32| {
-                    (0..3).all(|axis| shape.modes.entry(*row_vector as usize, axis, mode).to_bits() == 0)
-                };
+                let is_zero =
+                    |row: &u32| (0..3).all(|axis| shape.modes.entry(*row as usize, axis, mode).to_bits() == 0);
                 assert!(base_rows.iter().all(is_zero), "expected a clamped base");
                 let dofs: Vec<f64> = beam_modes.mode_shapes.column(mode).iter().copied().collect();
                 let max_entry = beam_modes.mode_shapes.column(mode).amax();

@@ -65,10 +65,10 @@ impl AccessorReader<'_> {
         self.buffers.charge_budget(4 * N as u64 * accessor.count as u64)?;
         Ok(match component_type {
             U8 => group_components(packed_bytes.iter().map(|byte| f32::from(*byte) / 255.0)),
-            U16 => {
-                group_components(words::<2>(&packed_bytes).map(|word| f32::from(u16::from_le_bytes(word)) / 65535.0))
-            }
-            _ => group_components(words::<4>(&packed_bytes).map(f32::from_le_bytes)),
+            U16 => group_components(
+                split_components::<2>(&packed_bytes).map(|bytes| f32::from(u16::from_le_bytes(bytes)) / 65535.0),
+            ),
+            _ => group_components(split_components::<4>(&packed_bytes).map(f32::from_le_bytes)),
         })
     }
 
@@ -135,9 +135,10 @@ impl AccessorReader<'_> {
         if sparse.count == 0 || sparse.count > element_count {
             return Err(invalid("count", format!("1 to {element_count}"), sparse.count));
         }
-        let index_bytes = index_size(sparse.indices.component_type).map_err(|error| error.prefix_field("indices"))?;
+        let bytes_per_index =
+            index_size(sparse.indices.component_type).map_err(|error| error.prefix_field("indices"))?;
         let (view, _) = self.buffers.view(sparse.indices.buffer_view).map_err(|error| error.prefix_field("indices"))?;
-        let index_data = elements(view, sparse.indices.byte_offset, [index_bytes; 2], sparse.count);
+        let index_data = elements(view, sparse.indices.byte_offset, [bytes_per_index; 2], sparse.count);
         let index_data: Vec<u8> =
             index_data.map_err(|error| error.prefix_field("indices"))?.flatten().copied().collect();
         let (view, _) = self.buffers.view(sparse.values.buffer_view).map_err(|error| error.prefix_field("values"))?;
@@ -180,7 +181,7 @@ fn elements(
 fn check_kind(accessor: &Accessor, kind: &str) -> Result<()> {
     match accessor.kind == kind {
         true => Ok(()),
-        false => Err(invalid("type", kind, super::warnings::sanitize(&accessor.kind, 20))),
+        false => Err(invalid("type", kind, super::remarks::sanitize(&accessor.kind, 20))),
     }
 }
 
@@ -204,13 +205,13 @@ fn index_size(component_type: u64) -> Result<usize> {
 fn decode_integers(packed_bytes: &[u8], component_type: u64) -> Vec<u32> {
     match component_type {
         U8 => packed_bytes.iter().map(|byte| u32::from(*byte)).collect(),
-        U16 => words::<2>(packed_bytes).map(|word| u32::from(u16::from_le_bytes(word))).collect(),
-        _ => words::<4>(packed_bytes).map(u32::from_le_bytes).collect(),
+        U16 => split_components::<2>(packed_bytes).map(|bytes| u32::from(u16::from_le_bytes(bytes))).collect(),
+        _ => split_components::<4>(packed_bytes).map(u32::from_le_bytes).collect(),
     }
 }
 
-/// The bytes of the components of `W` bytes each.
-fn words<const W: usize>(packed_bytes: &[u8]) -> impl Iterator<Item = [u8; W]> {
+/// Splits packed bytes into components of `W` bytes.
+fn split_components<const W: usize>(packed_bytes: &[u8]) -> impl Iterator<Item = [u8; W]> {
     packed_bytes.as_chunks::<W>().0.iter().copied()
 }
 

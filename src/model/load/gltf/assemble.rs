@@ -11,8 +11,8 @@ use super::get_element;
 use super::hierarchy::{self, PlacedNode};
 use super::material::MaterialConverter;
 use super::primitive;
+use super::remarks::{ImportRemarks, sanitize};
 use super::texture::TextureLoader;
-use super::warnings::{ImportWarnings, sanitize};
 use crate::domain::{Attachment, Domain, Shape, Transform};
 use crate::error::{Result, invalid};
 use crate::scene::{MAX_DOMAINS, SceneParts};
@@ -41,7 +41,7 @@ struct GltfAssembler<'a> {
     names: HashSet<String>,
     shapes: Vec<Shape>,
     domains: Vec<Domain>,
-    remarks: ImportWarnings,
+    remarks: ImportRemarks,
 }
 
 /// Builds all domains of the document's default scene.
@@ -52,7 +52,7 @@ pub(super) fn assemble(
     name: &str,
     document: &Document,
     buffers: &GltfBuffers<'_>,
-    mut remarks: ImportWarnings,
+    mut remarks: ImportRemarks,
 ) -> Result<SceneParts> {
     let nodes = hierarchy::flatten_hierarchy(document, &mut remarks)?;
     let mut assembly = GltfAssembler {

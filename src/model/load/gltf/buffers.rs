@@ -7,7 +7,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD_PAD_INDIFFERENT;
 
 use super::document::{BufferView, Document};
-use super::warnings::sanitize;
+use super::remarks::sanitize;
 use super::{MAX_FILE_BYTES, get_element};
 use crate::error::{Result, invalid};
 use crate::load::asset_dir::AssetDir;

@@ -5,7 +5,7 @@ use nalgebra::{Matrix4, Quaternion, Rotation3, Scale3, Translation3, UnitQuatern
 
 use super::document::{Document, Node};
 use super::get_element;
-use super::warnings::ImportWarnings;
+use super::remarks::ImportRemarks;
 use crate::error::{Result, invalid};
 
 /// A node of the loaded scene.
@@ -26,7 +26,7 @@ pub(super) struct PlacedNode {
 ///
 /// # Errors
 /// `Invalid` with the node that has two parents, is its own ancestor or has an invalid transform.
-pub(super) fn flatten_hierarchy(document: &Document, remarks: &mut ImportWarnings) -> Result<Vec<PlacedNode>> {
+pub(super) fn flatten_hierarchy(document: &Document, remarks: &mut ImportRemarks) -> Result<Vec<PlacedNode>> {
     let parents = find_parents(document)?;
     let roots: Vec<usize> = (0..parents.len()).filter(|node| parents[*node].is_none()).collect();
     let all_nodes = preorder(&document.nodes, &roots);

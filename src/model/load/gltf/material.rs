@@ -19,8 +19,8 @@ use std::collections::HashMap;
 
 use super::document::{self, Document};
 use super::get_element;
+use super::remarks::{ImportRemarks, sanitize};
 use super::texture::TextureLoader;
-use super::warnings::{ImportWarnings, sanitize};
 use crate::domain::{AlphaMode, Material};
 use crate::error::{Result, invalid};
 
@@ -62,7 +62,7 @@ impl<'a> MaterialConverter<'a> {
         &mut self,
         material: Option<usize>,
         has_uvs: bool,
-        remarks: &mut ImportWarnings,
+        remarks: &mut ImportRemarks,
     ) -> Result<usize> {
         if let Some(index) = self.converted.get(&(material, has_uvs)) {
             return Ok(*index);
@@ -85,7 +85,7 @@ impl<'a> MaterialConverter<'a> {
         source: &document::Material,
         index: usize,
         has_uvs: bool,
-        remarks: &mut ImportWarnings,
+        remarks: &mut ImportRemarks,
     ) -> Result<Material> {
         let name = source.name.as_deref().filter(|name| !name.is_empty());
         let name = name.map_or_else(|| format!("material {index}"), |name| sanitize(name, 120));
@@ -125,7 +125,7 @@ impl<'a> MaterialConverter<'a> {
         pbr: &document::PbrMetallicRoughness,
         name: &str,
         has_uvs: bool,
-        remarks: &mut ImportWarnings,
+        remarks: &mut ImportRemarks,
     ) -> Result<Option<usize>> {
         let Some(texture) = &pbr.base_color_texture else { return Ok(None) };
         if !has_uvs {
@@ -145,7 +145,7 @@ impl<'a> MaterialConverter<'a> {
         source: &document::Material,
         name: &str,
         has_uvs: bool,
-        remarks: &mut ImportWarnings,
+        remarks: &mut ImportRemarks,
     ) -> Result<Option<usize>> {
         let Some(texture) = &source.normal_texture else { return Ok(None) };
         let base_color_texture = source.pbr_metallic_roughness.base_color_texture.as_ref();
@@ -167,7 +167,7 @@ impl<'a> MaterialConverter<'a> {
         &mut self,
         pbr: &document::PbrMetallicRoughness,
         name: &str,
-        remarks: &mut ImportWarnings,
+        remarks: &mut ImportRemarks,
     ) -> Result<(f32, f32)> {
         let (metalness, roughness) = (pbr.metallic_factor, pbr.roughness_factor);
         let Some(texture) = &pbr.metallic_roughness_texture else { return Ok((metalness, roughness)) };

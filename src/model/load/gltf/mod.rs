@@ -13,10 +13,10 @@ mod document;
 mod hierarchy;
 mod material;
 mod primitive;
+mod remarks;
 #[cfg(test)]
 mod tests;
 mod texture;
-mod warnings;
 
 use std::path::Path;
 
@@ -25,7 +25,7 @@ use crate::scene::SceneParts;
 
 use super::asset_dir::AssetDir;
 use buffers::GltfBuffers;
-use warnings::ImportWarnings;
+use remarks::ImportRemarks;
 
 /// The largest file in bytes: the model itself, or a buffer or image next to it.
 const MAX_FILE_BYTES: u64 = 1 << 29;
@@ -52,10 +52,10 @@ pub(super) fn read(files: &AssetDir, path: &str) -> Result<SceneParts> {
 fn parse(folder: &AssetDir, name: &str, content: &[u8]) -> Result<SceneParts> {
     let container = container::split_container(content)?;
     let document = container::parse_document(container.json)?;
-    let mut remarks = ImportWarnings::default();
+    let mut remarks = ImportRemarks::default();
     check_version(&document)?;
     check_extensions(&document, &mut remarks)?;
-    warn_about_ignored_features(&document, &mut remarks);
+    report_ignored_features(&document, &mut remarks);
     let buffers = GltfBuffers::load(&document, folder, container.bin)?;
     assemble::assemble(name, &document, &buffers, remarks)
 }
@@ -66,11 +66,11 @@ fn check_version(document: &document::Document) -> Result<()> {
     if asset.version.starts_with("2.") && asset.min_version.as_ref().is_none_or(|min_version| min_version == "2.0") {
         return Ok(());
     }
-    let given = format!("'{}' with minVersion {:?}", warnings::sanitize(&asset.version, 20), asset.min_version);
-    Err(invalid("asset.version", "2.0", warnings::sanitize(&given, 80)))
+    let given = format!("'{}' with minVersion {:?}", remarks::sanitize(&asset.version, 20), asset.min_version);
+    Err(invalid("asset.version", "2.0", remarks::sanitize(&given, 80)))
 }
 
-fn check_extensions(document: &document::Document, remarks: &mut ImportWarnings) -> Result<()> {
+fn check_extensions(document: &document::Document, remarks: &mut ImportRemarks) -> Result<()> {
     let affects_only_appearance = |name: &str| APPEARANCE_EXTENSIONS.iter().any(|prefix| name.starts_with(prefix));
     for (index, name) in document.extensions_required.iter().enumerate() {
         if !affects_only_appearance(name) {
@@ -84,7 +84,7 @@ fn check_extensions(document: &document::Document, remarks: &mut ImportWarnings)
     Ok(())
 }
 
-fn warn_about_ignored_features(document: &document::Document, remarks: &mut ImportWarnings) {
+fn report_ignored_features(document: &document::Document, remarks: &mut ImportRemarks) {
     for (count, feature, reason) in [
         (document.animations.len(), "animations", "simulations provide the motion"),
         (document.skins.len(), "skins", "meshes keep their bind pose"),

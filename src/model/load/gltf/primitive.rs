@@ -3,10 +3,12 @@
 
 use super::accessor::{AccessorReader, AttributeFormat};
 use super::document::Primitive;
-use super::warnings::ImportWarnings;
+use super::remarks::ImportRemarks;
 use crate::domain::{MAX_RANK, Mesh, Modes, Shape, smooth_normals};
 use crate::error::{Result, invalid};
 
+/// Values of [`Primitive::mode`]; lower values are points and lines.
+const TRIANGLES: u64 = 4;
 const STRIP: u64 = 5;
 const FAN: u64 = 6;
 
@@ -19,12 +21,12 @@ pub(super) fn convert_primitive(
     reader: AccessorReader<'_>,
     primitive: &Primitive,
     uv_set: u32,
-    remarks: &mut ImportWarnings,
+    remarks: &mut ImportRemarks,
 ) -> Result<Option<Shape>> {
     if primitive.mode > FAN {
         return Err(invalid("mode", "0 to 6", primitive.mode));
     }
-    if primitive.mode < 4 {
+    if primitive.mode < TRIANGLES {
         remarks.add("primitives of points or lines are ignored".into());
         return Ok(None);
     }
@@ -82,7 +84,7 @@ fn build_triangles(indices: &[u32], mode: u64) -> Result<Vec<[u32; 3]>> {
         _ => indices.len().is_multiple_of(3),
     };
     if !is_valid_count {
-        let expected = if mode == 4 { "a multiple of 3 indices" } else { "at least 3 indices" };
+        let expected = if mode == TRIANGLES { "a multiple of 3 indices" } else { "at least 3 indices" };
         return Err(invalid("indices", expected, indices.len()));
     }
     Ok(match mode {
@@ -104,7 +106,7 @@ fn read_modes(
     reader: AccessorReader<'_>,
     primitive: &Primitive,
     vertex_count: usize,
-    remarks: &mut ImportWarnings,
+    remarks: &mut ImportRemarks,
 ) -> Result<Modes> {
     let targets = &primitive.targets;
     if targets.len() > MAX_RANK {

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use super::buffers::GltfBuffers;
 use super::document::{Document, REPEAT, TextureInfo};
 use super::get_element;
-use super::warnings::{ImportWarnings, sanitize};
+use super::remarks::{ImportRemarks, sanitize};
 use crate::domain::Texture;
 use crate::error::{Result, invalid};
 
@@ -31,7 +31,7 @@ impl<'a> TextureLoader<'a> {
     ///
     /// # Errors
     /// `Invalid` if the texture does not exist or is not a PNG or JPEG image.
-    pub(super) fn texture_index(&mut self, texture_info: &TextureInfo, remarks: &mut ImportWarnings) -> Result<usize> {
+    pub(super) fn texture_index(&mut self, texture_info: &TextureInfo, remarks: &mut ImportRemarks) -> Result<usize> {
         let image_index = self.image_index_of(texture_info, remarks)?;
         if let Some(index) = self.texture_indices.get(&image_index) {
             return Ok(*index);
@@ -49,7 +49,7 @@ impl<'a> TextureLoader<'a> {
     pub(super) fn channel_means(
         &mut self,
         texture_info: &TextureInfo,
-        remarks: &mut ImportWarnings,
+        remarks: &mut ImportRemarks,
     ) -> Result<[f32; 4]> {
         let image_index = self.image_index_of(texture_info, remarks)?;
         if let Some(means) = self.channel_means.get(&image_index) {
@@ -67,7 +67,7 @@ impl<'a> TextureLoader<'a> {
     }
 
     /// The index of a texture's image. Unsupported sampler settings are recorded as remarks.
-    fn image_index_of(&self, texture_info: &TextureInfo, remarks: &mut ImportWarnings) -> Result<usize> {
+    fn image_index_of(&self, texture_info: &TextureInfo, remarks: &mut ImportRemarks) -> Result<usize> {
         let texture = get_element(&self.document.textures, texture_info.index, "index")?;
         let texture_field = format!("textures[{}]", texture_info.index);
         if let Some(sampler) = texture.sampler {

@@ -372,30 +372,30 @@ fn drop_unused(parts: &mut SceneParts) {
     for domain in &parts.domains {
         domain.materials().for_each(|material| is_material_used[material] = true);
     }
-    let new_materials = retain_used(&mut parts.materials, &is_material_used);
+    let new_material_indices = retain_used(&mut parts.materials, &is_material_used);
     for domain in &mut parts.domains {
-        domain.material = new_materials[domain.material];
-        domain.material_ranges.iter_mut().for_each(|range| range.material = new_materials[range.material]);
+        domain.material = new_material_indices[domain.material];
+        domain.material_ranges.iter_mut().for_each(|range| range.material = new_material_indices[range.material]);
     }
     let mut is_texture_used = vec![false; parts.textures.len()];
     let textures = |material: &Material| [material.color_texture, material.normal_texture];
     parts.materials.iter().flat_map(textures).flatten().for_each(|texture| is_texture_used[texture] = true);
-    let new_textures = retain_used(&mut parts.textures, &is_texture_used);
+    let new_texture_indices = retain_used(&mut parts.textures, &is_texture_used);
     for material in &mut parts.materials {
-        material.color_texture = material.color_texture.map(|texture| new_textures[texture]);
-        material.normal_texture = material.normal_texture.map(|texture| new_textures[texture]);
+        material.color_texture = material.color_texture.map(|texture| new_texture_indices[texture]);
+        material.normal_texture = material.normal_texture.map(|texture| new_texture_indices[texture]);
     }
 }
 
 /// Retains the used elements. Returns the new index of each old index; that of a removed element is meaningless.
-fn retain_used<T>(list: &mut Vec<T>, is_used: &[bool]) -> Vec<usize> {
+fn retain_used<T>(list: &mut Vec<T>, used_flags: &[bool]) -> Vec<usize> {
     let mut retained_count = 0;
     let mut new_indices = Vec::with_capacity(list.len());
-    for is_used in is_used {
+    for is_used in used_flags {
         new_indices.push(retained_count);
         retained_count += usize::from(*is_used);
     }
-    let mut flags = is_used.iter();
-    list.retain(|_| *flags.next().unwrap_or(&false));
+    let mut used_flags = used_flags.iter();
+    list.retain(|_| *used_flags.next().unwrap_or(&false));
     new_indices
 }

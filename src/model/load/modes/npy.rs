@@ -126,9 +126,9 @@ mod tests {
         assert_eq!(modes[0], modes[2]);
     }
 
-    fn npy_file(header: &str, body: usize) -> Vec<u8> {
+    fn npy_file(header: &str, data_bytes: usize) -> Vec<u8> {
         let length = u16::try_from(header.len()).expect("a header below 64 KiB");
-        [b"\x93NUMPY\x01\x00", &length.to_le_bytes()[..], header.as_bytes(), &vec![0; body]].concat()
+        [b"\x93NUMPY\x01\x00", &length.to_le_bytes()[..], header.as_bytes(), &vec![0; data_bytes]].concat()
     }
 
     #[test]

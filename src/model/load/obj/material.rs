@@ -157,7 +157,7 @@ mod tests {
         write_png(folder.path(), "solid.png", 2, [9, 8, 7, 255]);
         write_png(folder.path(), "grey.png", 3, [100, 100, 100, 255]);
         let mask = AlphaMode::Mask { cutoff: 0.5 };
-        for (text, alpha_mode, alpha) in [
+        for (text, alpha_mode, second_texel_alpha) in [
             ("map_Kd leaf.png\nmap_d leaf.png", mask, Some(0)),
             ("map_Kd leaf.png", mask, Some(0)),
             ("map_Kd solid.png", AlphaMode::Opaque, Some(255)),
@@ -168,8 +168,8 @@ mod tests {
         ] {
             let (material, texture_cache, _) = read(&format!("newmtl m\n{text}\n"), folder.path()).expect(text);
             assert_eq!(material.alpha_mode, alpha_mode, "{text}");
-            let texel = material.color_texture.map(|index| texture_cache.textures()[index].rgba()[7]);
-            assert_eq!(texel, alpha, "{text}");
+            let actual_alpha = material.color_texture.map(|index| texture_cache.textures()[index].rgba()[7]);
+            assert_eq!(actual_alpha, second_texel_alpha, "{text}");
         }
     }
 

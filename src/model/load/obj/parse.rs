@@ -1,4 +1,4 @@
-//! Parser of OBJ files: lists and polygons with validated indices from 0.
+//! Parser of OBJ files. The indices of the parsed polygons count from 0 and are validated.
 //!
 //! The `tobj` crate is not used because it renumbers vertices by first use. The rows of U follow the `v` lines of the
 //! file. Renumbered vertices would get wrong rows, and no check would notice because the number of rows still matches.

@@ -65,8 +65,8 @@ struct PlantBuilder<'a> {
 }
 
 impl PlantBuilder<'_> {
-    /// Adds the shoots, parents first, then the leaves with a petiole, then the other leaflets. The parent of such a
-    /// leaflet is the leaf with its petiole.
+    /// Adds the shoots, parents first, then the leaves with a petiole polyline, then the other leaflets. The parent of
+    /// such a leaflet is the leaf with the polyline of the same petiole or, if there is none, the shoot.
     fn build(mut self) -> Result<SceneParts> {
         let structure = self.structure;
         for index in &structure.order {

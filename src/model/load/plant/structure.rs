@@ -13,12 +13,16 @@ pub(super) struct Shoot {
     pub(super) vertices: Vec<[f64; 3]>,
 }
 
-/// A leaf. One leaf per petiole has the petiole's polyline; the other leaflets of that petiole have none.
+/// A leaf. One leaf per petiole has the petiole's polyline; the other leaflets of that petiole have none. Leaflets of one
+/// petiole have the same `shoot`, `node` and `petiole`.
 #[derive(Debug, Clone, serde::Deserialize)]
 pub(super) struct Leaf {
     pub(super) object_id: u64,
+    /// Id of the shoot.
     pub(super) shoot: i64,
+    /// Number of the node along the shoot.
     pub(super) node: i64,
+    /// Number of the petiole at the node.
     pub(super) petiole: i64,
     pub(super) base: [f64; 3],
     #[serde(default)]

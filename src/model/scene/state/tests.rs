@@ -1,4 +1,4 @@
-//! Change lists of steps, distant translations, and merged steps.
+//! Tests of dirty domains, distant translations and merged steps.
 
 use super::*;
 use crate::domain::{Domain, Material, Mesh, Modes, Shape};
@@ -14,7 +14,10 @@ fn scene(count: usize) -> Arc<Scene> {
         vec![Shape::new(mesh(), modes).expect("a valid shape"), Shape::new(mesh(), Modes::rigid()).expect("rigid")];
     parts.materials = vec![Material::default()];
     let domain = |index: usize| Domain {
-        shares_q_with: [(2, 1), (4, 2)].into_iter().find(|(domain, _)| *domain == index).map(|(_, twin)| twin),
+        shares_q_with: [(2, 1), (4, 2)]
+            .into_iter()
+            .find(|(domain, _)| *domain == index)
+            .map(|(_, other_domain)| other_domain),
         ..Domain::new(format!("point {index}"), usize::from(index == 5))
     };
     parts.domains = (0..count).map(domain).collect();
@@ -117,7 +120,7 @@ fn changed_domains_are_complete_and_minimal() {
             assert_ne!(
                 updated_fingerprints(&state, &previous, &incomplete_list).0,
                 expected,
-                "{removed} of {changed:?}"
+                "expected a wrong result without entry {removed} of {changed:?}"
             );
         }
         previous = expected;
@@ -149,6 +152,7 @@ fn near_translations_keep_the_scene_origin() {
 #[test]
 fn distant_domain_has_its_own_floating_origin() {
     let scene = scene(3);
+    // On the grid, 9766 is nearest to 1e7 / ORIGIN_GRID, and 977 to 1e6 / ORIGIN_GRID.
     let position = [1e7 + 0.001, -1e7 - 0.002, 3.0];
     let mut state = state_after(&scene, &[f64_step(&[2], &[position])]);
     assert_eq!(state.dirty_domains, DirtyDomains::Some(vec![2]));

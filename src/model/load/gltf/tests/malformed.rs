@@ -6,7 +6,7 @@ use super::materials::{encode_png, textured_triangle};
 use super::{F32, Model, U16, morphed_triangle, push};
 use crate::load::asset_dir::AssetDir;
 use crate::load::gltf::buffers::{GltfBuffers, MEMORY_BUDGET};
-use crate::load::gltf::warnings::ImportWarnings;
+use crate::load::gltf::remarks::ImportRemarks;
 use crate::load::gltf::{assemble, container};
 use crate::scene::Scene;
 
@@ -151,6 +151,7 @@ fn invalid_indices_and_non_finite_numbers_are_rejected() {
     let indices = model.add_accessor(bytemuck::cast_slice(&[0_u16, 1, 3]), U16, "SCALAR", 3);
     model.primitive()["indices"] = indices.into();
     assert_rejected(&model, "indices: accessors[1]: element 2: expected an index below 3, got 3");
+    // In `morphed_triangle`, the positions are bytes 0 to 35, and the first column of U begins at byte 36.
     for invalid_number in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let mut model = morphed_triangle();
         model.bin[16..20].copy_from_slice(&invalid_number.to_le_bytes());
@@ -178,7 +179,7 @@ fn mode_and_memory_limits_are_checked_before_allocation() {
     for (remaining_budget, is_enough) in [(100, false), (10_000, true)] {
         let buffers = GltfBuffers::load(&document, &folder, Some(&model.bin)).expect("valid buffers");
         buffers.charge_budget(MEMORY_BUDGET - remaining_budget).expect("within the budget");
-        let parts = assemble::assemble("model", &document, &buffers, ImportWarnings::default());
+        let parts = assemble::assemble("model", &document, &buffers, ImportRemarks::default());
         assert_eq!(parts.is_ok(), is_enough);
         assert!(is_enough || parts.is_err_and(|error| error.to_string().contains("decoded size: expected at most")));
     }

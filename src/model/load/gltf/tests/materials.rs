@@ -122,8 +122,9 @@ fn primitive_without_uvs_has_a_material_without_textures() {
     push(&mut model.json["meshes"][0]["primitives"], json!({"attributes": {"POSITION": 0}, "material": 0}));
     push(&mut model.json["meshes"][0]["primitives"], json!({"attributes": {"POSITION": 0}}));
     let parts = model.parts();
-    let colors: Vec<_> = parts.domains.iter().map(|domain| parts.materials[domain.material].color_texture).collect();
-    assert_eq!(colors, [Some(0), None, None]);
+    let color_textures: Vec<_> =
+        parts.domains.iter().map(|domain| parts.materials[domain.material].color_texture).collect();
+    assert_eq!(color_textures, [Some(0), None, None]);
     assert_eq!(parts.materials[parts.domains[2].material], Material::default());
     assert!(parts.remarks[0].contains("lacks TEXCOORD_0"), "{:?}", parts.remarks);
 }

@@ -61,7 +61,7 @@ impl Model {
         self.add_accessor(bytemuck::cast_slice(numbers), F32, kind, count)
     }
 
-    /// The only primitive of the first mesh.
+    /// The first primitive of the first mesh.
     fn primitive(&mut self) -> &mut Value {
         &mut self.json["meshes"][0]["primitives"][0]
     }
@@ -147,7 +147,7 @@ fn sparse_values_replace_dense_values() {
 }
 
 #[test]
-fn only_zero_targets_are_dropped_together() {
+fn targets_are_dropped_only_if_all_are_zero() {
     let mut model = Model::triangle();
     let zeros = model.add_floats("VEC3", 3, &[0.0; 9]);
     let empty = json!({"componentType": F32, "type": "VEC3", "count": 3});

@@ -1,23 +1,23 @@
-//! Messages about features of a model that the loader does not support, without duplicates.
+//! Remarks about features of a model that the loader does not support, without duplicates.
 
 /// The largest number of stored remarks, so that a malicious file cannot flood the log.
-const MAX_WARNINGS: usize = 64;
+const MAX_REMARKS: usize = 64;
 
 /// Remarks in order of occurrence.
 #[derive(Debug, Default)]
-pub(super) struct ImportWarnings {
-    messages: Vec<String>,
+pub(super) struct ImportRemarks {
+    remarks: Vec<String>,
     /// Number of remarks that exceeded the limit.
     suppressed: usize,
 }
 
-impl ImportWarnings {
+impl ImportRemarks {
     /// Adds a remark unless it already exists.
     pub(super) fn add(&mut self, remark: String) {
         let remark = sanitize(&remark, 240);
-        match self.messages.contains(&remark) {
+        match self.remarks.contains(&remark) {
             true => {}
-            false if self.messages.len() < MAX_WARNINGS => self.messages.push(remark),
+            false if self.remarks.len() < MAX_REMARKS => self.remarks.push(remark),
             false => self.suppressed += 1,
         }
     }
@@ -25,13 +25,13 @@ impl ImportWarnings {
     /// All remarks, then a message with the number of remarks that exceeded the limit.
     pub(super) fn into_list(mut self) -> Vec<String> {
         if self.suppressed > 0 {
-            self.messages.push(format!("and {} more remarks", self.suppressed));
+            self.remarks.push(format!("and {} more remarks", self.suppressed));
         }
-        self.messages
+        self.remarks
     }
 }
 
-/// Sanitizes text from a file for display: no control characters, at most `most` characters.
+/// Sanitizes text from a file for display: no control characters, at most `max_characters` characters.
 pub(super) fn sanitize(text: &str, max_characters: usize) -> String {
     text.chars().filter(|character| !character.is_control()).take(max_characters).collect()
 }
@@ -42,11 +42,11 @@ mod tests {
 
     #[test]
     fn remarks_are_unique_and_limited() {
-        let mut remarks = ImportWarnings::default();
+        let mut remarks = ImportRemarks::default();
         (0..3).for_each(|_| remarks.add("same\u{1b}[31m".into()));
         (0..100).for_each(|index| remarks.add(format!("other {index}")));
         let list = remarks.into_list();
-        assert_eq!((list.len(), list[0].as_str()), (MAX_WARNINGS + 1, "same[31m"));
-        assert_eq!(list[MAX_WARNINGS], "and 37 more remarks");
+        assert_eq!((list.len(), list[0].as_str()), (MAX_REMARKS + 1, "same[31m"));
+        assert_eq!(list[MAX_REMARKS], "and 37 more remarks");
     }
 }
