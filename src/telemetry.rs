@@ -44,7 +44,7 @@ impl Stage {
 /// Milliseconds per stage, in the order of execution.
 pub type StageTimes = Vec<(Stage, f64)>;
 
-/// Milliseconds since `begin`.
+/// Milliseconds since `start`.
 pub fn ms_since(start: std::time::Instant) -> f64 {
     start.elapsed().as_secs_f64() * 1e3
 }

@@ -422,8 +422,8 @@ pub mod scene_service_client {
             self.inner.unary(req, path, codec).await
         }
         /// Uploads files and opens them as a scene. The parts are one `header`, then for each file one `file` and its
-        /// `chunk`s. Waiting for the client consumes a time budget of 30 s. Each 32 KiB that the client sends refill 1 s of
-        /// it. The call fails with DEADLINE_EXCEEDED when the budget is used up.
+        /// `chunk`s. Waiting for the client consumes a time budget of 30 s. Every 32 KiB that the client sends adds 1 s to the
+        /// budget, up to 30 s. The call fails with DEADLINE_EXCEEDED when the budget is used up.
         pub async fn upload_scene(
             &mut self,
             request: impl tonic::IntoStreamingRequest<
@@ -573,8 +573,8 @@ pub mod scene_service_server {
             tonic::Status,
         >;
         /// Uploads files and opens them as a scene. The parts are one `header`, then for each file one `file` and its
-        /// `chunk`s. Waiting for the client consumes a time budget of 30 s. Each 32 KiB that the client sends refill 1 s of
-        /// it. The call fails with DEADLINE_EXCEEDED when the budget is used up.
+        /// `chunk`s. Waiting for the client consumes a time budget of 30 s. Every 32 KiB that the client sends adds 1 s to the
+        /// budget, up to 30 s. The call fails with DEADLINE_EXCEEDED when the budget is used up.
         async fn upload_scene(
             &self,
             request: tonic::Request<tonic::Streaming<super::UploadSceneRequest>>,

@@ -111,13 +111,13 @@ impl<'a> SceneReport<'a> {
 
 impl<'a> DomainReport<'a> {
     fn new(scene: &'a Scene, index: usize) -> Self {
-        let (domain, slot) = (&scene.domains[index], scene.layout.domains[index]);
+        let (domain, domain_layout) = (&scene.domains[index], scene.layout.domains[index]);
         Self {
             name: &domain.name,
-            vertices: slot.vertices,
-            rank: slot.rank,
-            triangles: slot.triangles,
-            corners: slot.corners,
+            vertices: domain_layout.vertices,
+            rank: domain_layout.rank,
+            triangles: domain_layout.triangles,
+            corners: domain_layout.corners,
             bytes: shape_bytes(scene, index),
             shape: domain.shape,
             parent: domain.attachment.as_ref().map(|attachment| attachment.parent),
@@ -150,11 +150,11 @@ fn text_lines(opened_scene: &OpenedScene) -> Vec<String> {
     let scene = &opened_scene.scene;
     let mut lines = vec![format!("{:<28}{:>10}{:>6}{:>12}{:>14}", "domain", "vertices", "r", "triangles", "bytes")];
     for (index, domain) in scene.domains.iter().enumerate().take(MAX_LISTED_DOMAINS) {
-        let slot = scene.layout.domains[index];
+        let domain_layout = scene.layout.domains[index];
         let bytes = shape_bytes(scene, index);
         lines.push(format!(
             "{:<28}{:>10}{:>6}{:>12}{:>14}",
-            domain.name, slot.vertices, slot.rank, slot.triangles, bytes
+            domain.name, domain_layout.vertices, domain_layout.rank, domain_layout.triangles, bytes
         ));
     }
     if scene.domains.len() > MAX_LISTED_DOMAINS {

@@ -132,11 +132,11 @@ fn read_coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
     if !path.exists() {
         return Err(Error::NotFound { what: "q", given: path.display().to_string() });
     }
-    let bytes = fs::metadata(path).map_err(|error| invalid(&field, "a .npy file", error))?.len();
+    let file_bytes = fs::metadata(path).map_err(|error| invalid(&field, "a .npy file", error))?.len();
     // The size of f64 entries and the longest .npy header. Checked before the file is read into memory.
     let max_bytes = 8 * scene.layout.coordinates as u64 + 65536;
-    if bytes > max_bytes {
-        return Err(invalid(&field, format!("{expected}: at most {max_bytes} bytes"), format!("{bytes} bytes")));
+    if file_bytes > max_bytes {
+        return Err(invalid(&field, format!("{expected}: at most {max_bytes} bytes"), format!("{file_bytes} bytes")));
     }
     let bytes = fs::read(path).map_err(|error| invalid(&field, "a readable file", error))?;
     let array = load::parse_numpy(&bytes).map_err(|error| error.prefix_field(&field))?;

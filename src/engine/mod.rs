@@ -79,7 +79,8 @@ struct Shared {
     next_scene_id: AtomicU64,
     is_stopping: AtomicBool,
     device_thread: Mutex<Option<JoinHandle<()>>>,
-    // Last field, so that its lock on the state folder is released only after every writer above is dropped.
+    // Last field, so that its lock on the state folder is released only after the fields that write into the folder
+    // are dropped.
     scene_catalog: SceneCatalog,
 }
 
@@ -162,8 +163,8 @@ impl Engine {
         self.shared.config.frame_side.min(max_renderer_side)
     }
 
-    /// Opens a source of the repository under a name; an empty name means the source's own name. If the name is already
-    /// open from the same source, returns the open scene.
+    /// Opens a source of the repository under a name; an empty name means the last path component of the source. If the
+    /// name is already open from the same source, returns the open scene.
     ///
     /// # Errors
     /// `Taken` when the name belongs to another source, `Busy` when too many scenes are open, and the errors of
@@ -358,9 +359,9 @@ impl Engine {
         upload: Option<Upload>,
     ) -> Result<SceneHandle> {
         let OpenedScene { scene, backends } = self.read_scene_files(name, provenance, upload).await?;
-        let (engine, scene_name, restored_scene) = (self.clone(), name.to_owned(), Arc::clone(&scene));
+        let (engine, scene_name, checkpoint_scene) = (self.clone(), name.to_owned(), Arc::clone(&scene));
         let restored_state = run_blocking("checkpoint", move || {
-            Ok(engine.shared.services.checkpoints.load(&scene_name, &restored_scene))
+            Ok(engine.shared.services.checkpoints.load(&scene_name, &checkpoint_scene))
         })
         .await?;
         let restored_state = restored_state.unwrap_or_else(|error| {
@@ -391,8 +392,8 @@ impl Engine {
         Ok(scene_handle)
     }
 
-    /// Creates the callback of a scene for its failure, which removes the scene from the registry. The catalog keeps
-    /// the scene, so that the next start opens it again. The callback holds a weak reference to the engine.
+    /// Creates the callback for the failure of a scene. It removes the scene from the registry. The catalog keeps the
+    /// scene, so that the next start opens it again. The callback holds a weak reference to the engine.
     fn failure_callback(&self, name: &str, id: SceneId) -> Box<dyn FnOnce() + Send> {
         let (shared, name) = (Arc::downgrade(&self.shared), name.to_owned());
         Box::new(move || {

@@ -56,11 +56,11 @@ impl Registry {
         Self { max_scenes, entries: Mutex::new(BTreeMap::new()) }
     }
 
-    /// Reserves a name until [`Self::release`], or joins an existing reservation with the same origin. With
-    /// `must_be_new` an existing reservation is an error.
+    /// Reserves a name until [`Self::release`], or joins an existing reservation with the same provenance.
+    /// With `must_be_new` an existing reservation is an error.
     ///
     /// # Errors
-    /// `Taken` when the name is reserved for another origin, `Busy` when too many scenes are open.
+    /// `Taken` when the name is reserved for another provenance, `Busy` when too many scenes are open.
     pub(super) fn reserve(
         &self,
         name: &str,
@@ -119,7 +119,7 @@ impl Registry {
             .collect()
     }
 
-    /// Ends an opening. The last one releases the name if no scene was loaded.
+    /// Ends one call that opens the name. The last such call releases the name if no scene was loaded.
     pub(super) fn release(&self, name: &str, entry: &Arc<RegistryEntry>) {
         let mut entries = self.lock();
         let is_last = entry.open_calls.fetch_sub(1, Ordering::Relaxed) == 1;

@@ -92,7 +92,7 @@ impl DriveSession {
             Some(RequestKind::Open(open)) => self.open(open).await.err().map(|error| (None, error)),
             Some(RequestKind::Step(step)) => {
                 let number = step.number;
-                self.step(step).err().map(|error| (Some(number), error))
+                self.push_step(step).err().map(|error| (Some(number), error))
             }
             None => Some((None, invalid("kind", "open or step", "neither"))),
         };
@@ -121,7 +121,7 @@ impl DriveSession {
         Ok(())
     }
 
-    fn step(&mut self, step: v1::Step) -> Result<()> {
+    fn push_step(&mut self, step: v1::Step) -> Result<()> {
         match &mut self.writer {
             Some(writer) => writer.push_step(&parse_step(step)?),
             None => Err(invalid("kind", "open before the first step", "a step")),

@@ -93,7 +93,7 @@ impl VertexStream {
             let vertices = pack_vertices(output, &self.selection).await.map_err(to_status)?;
             for chunk in vertex_chunks(&vertices, &self.selection, self.max_chunk_bytes) {
                 tokio::select! {
-                    sent_steps = reply_sender.send(v1::StreamVerticesResponse { chunk: Some(chunk) }) => sent_steps?,
+                    sent = reply_sender.send(v1::StreamVerticesResponse { chunk: Some(chunk) }) => sent?,
                     error = subscription.disconnected() => return Err(to_status(error)),
                 }
             }
@@ -121,22 +121,22 @@ fn vertex_chunks(
     selection: &VertexSelection,
     max_chunk_bytes: usize,
 ) -> impl Iterator<Item = v1::VertexChunk> + use<> {
-    let vertices = &packed.encoded;
+    let encoded = &packed.encoded;
     let head = v1::VertexHead {
-        step: Some(wire_step_id(vertices.step)),
+        step: Some(wire_step_id(encoded.step)),
         origin: packed.origin.to_vec(),
         domains: selection.domains.clone(),
         vertices: selection.vertices().collect(),
         corners: selection.corners().collect(),
         position_bytes: selection.position_bytes(),
-        total: vertices.bytes.len() as u64,
-        skipped: vertices.skipped,
-        stages: wire_stages(&vertices.stages),
+        total: encoded.bytes.len() as u64,
+        skipped: encoded.skipped,
+        stages: wire_stages(&encoded.stages),
         origin_bytes: packed.origin_bytes,
         displacement_bytes: selection.displacement_bytes(),
         box_bytes: selection.box_bytes(),
     };
-    chunks_with_head(head, vertices.bytes.clone(), max_chunk_bytes, |head, offset, data| v1::VertexChunk {
+    chunks_with_head(head, encoded.bytes.clone(), max_chunk_bytes, |head, offset, data| v1::VertexChunk {
         head,
         offset,
         data,

@@ -56,7 +56,7 @@ pub(crate) struct Chunk<H> {
     pub(crate) data: Bytes,
 }
 
-/// A chunk in its wire format, and the reply that its kind of chunks forms.
+/// A chunk in its wire format, with the types of its head and of the reply that its chunks form.
 pub(crate) trait WireChunk: Sized {
     type Head;
     type Reply;

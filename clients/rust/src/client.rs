@@ -125,7 +125,7 @@ impl Client {
     }
 
     /// Opens a scene of the server's repository, or returns the scene that is already open under that name. With an
-    /// empty `name`, the scene has the name of its source.
+    /// empty `name`, the name is the last path component of the source without extension.
     ///
     /// # Errors
     /// `Status` if the source does not exist; `Connect` if the connection is lost; `Malformed` if the reply has no scene.

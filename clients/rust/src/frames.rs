@@ -25,11 +25,11 @@ pub enum FrameFormat {
     #[default]
     Png,
     Rgba,
-    /// Little-endian f32, one per pixel: depth in meters. The output alone selects this format or `U32` or `F32x3`.
+    /// Little-endian f32, one per pixel; only and always for [`Output::Depth`].
     F32,
-    /// Little-endian u32, one per pixel: domain indices.
+    /// Little-endian u32, one per pixel; only and always for [`Output::Domains`].
     U32,
-    /// Little-endian f32, three per pixel: normals.
+    /// Little-endian f32, three per pixel; only and always for [`Output::Normals`].
     F32x3,
 }
 
@@ -47,7 +47,8 @@ pub enum Output {
     /// |u| as a color map with a legend. `scale_max` is the value at the bright end in meters; 0 selects the maximum of
     /// each frame.
     Displacement { scale_max: f64 },
-    /// The length of one column of U as a color map with a legend. `scale_max` is as for `Displacement`.
+    /// The norm of each vertex's three entries in column `mode` of U, as a color map with a legend. `scale_max` is as
+    /// for `Displacement`, but in meters per unit of q.
     ModeShape { mode: u32, scale_max: f64 },
 }
 

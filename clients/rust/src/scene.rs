@@ -177,14 +177,14 @@ struct DescriptionBuilder {
     info: Option<v1::SceneInfo>,
     domains: Vec<Domain>,
     /// From a domain's index in the scene to its index in `domains`.
-    domain_positions: BTreeMap<u32, usize>,
+    domain_ordinals: BTreeMap<u32, usize>,
     partial_array: Option<PartialArray>,
 }
 
 impl DescriptionBuilder {
     const fn new(limit: u64) -> Self {
-        let domain_positions = BTreeMap::new();
-        Self { limit, received_bytes: 0, info: None, domains: vec![], domain_positions, partial_array: None }
+        let domain_ordinals = BTreeMap::new();
+        Self { limit, received_bytes: 0, info: None, domains: vec![], domain_ordinals, partial_array: None }
     }
 
     fn add_message(&mut self, message: v1::DescribeSceneResponse) -> Result<()> {
@@ -193,7 +193,7 @@ impl DescriptionBuilder {
             Some(Part::Scene(info)) => self.info = Some(info),
             Some(Part::Domains(list)) => {
                 for wire in list.domains {
-                    self.domain_positions.insert(wire.domain, self.domains.len());
+                    self.domain_ordinals.insert(wire.domain, self.domains.len());
                     self.domains.push(decode_domain(wire)?);
                 }
             }
@@ -228,8 +228,8 @@ impl DescriptionBuilder {
             let expected = format!("at most {} bytes of arrays", self.limit);
             return Err(malformed_reply("describe.chunk", expected, self.received_bytes));
         }
-        let position = self.domain_positions.get(&key.domain);
-        let Some(domain) = position.and_then(|position| self.domains.get_mut(*position)) else {
+        let ordinal = self.domain_ordinals.get(&key.domain);
+        let Some(domain) = ordinal.and_then(|ordinal| self.domains.get_mut(*ordinal)) else {
             return Err(malformed_reply("describe.chunk.domain", "a domain described before", key.domain));
         };
         match DomainArray::try_from(key.array) {

@@ -12,17 +12,17 @@ pub enum DomainTransform {
     /// 48 bytes: row-major 3x4, with a translation relative to the scene's origin. It may shear and scale if the scene
     /// allows it.
     Affine([f32; 12]),
-    /// 28 bytes: a translation relative to the scene's origin.
+    /// 28 bytes: the rotation, then a translation relative to the scene's origin.
     RigidF32 { rotation: [f32; 4], translation: [f32; 3] },
-    /// 40 bytes: a translation relative to the world's origin; the server subtracts the scene's origin in f64. Resolves
-    /// millimeters at 10,000 km.
+    /// 40 bytes: the rotation, then a translation relative to the world's origin. The server subtracts the scene's
+    /// origin in f64. Resolves millimeters at 10,000 km.
     RigidF64 { rotation: [f32; 4], translation: [f64; 3] },
 }
 
 impl DomainTransform {
     const fn format(&self) -> v1::TransformFormat {
         match self {
-            // Servers without the other formats also accept this one.
+            // Means affine, also to a server that does not know the other formats.
             Self::Affine(_) => v1::TransformFormat::Unspecified,
             Self::RigidF32 { .. } => v1::TransformFormat::RigidF32,
             Self::RigidF64 { .. } => v1::TransformFormat::RigidF64,

@@ -26,7 +26,7 @@ const MAX_STORED: usize = 1024;
 /// How the server handles steps that arrive faster than it processes them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Policy {
-    /// Every step is deformed, in order, and rendered for each lossless subscriber.
+    /// Every step is deformed, in order, and delivered to each lossless subscriber.
     Lossless,
     /// Only the newest state is processed; steps in between are merged into it and counted.
     Latest,
@@ -143,7 +143,7 @@ impl StepStream {
         self.wait_until(|progress, window| progress.in_flight.len() < window).await?;
         lock(&self.progress).in_flight.push_back(step.number());
         let message = v1::DriveSceneRequest { kind: Some(RequestKind::Step(step.to_wire())) };
-        let requests = self.requests.as_ref().ok_or(Error::StreamEnded { awaited_reply: "this step was sent" })?;
+        let requests = self.requests.as_ref().ok_or(Error::StreamEnded { awaited_reply: "the reply to this step" })?;
         if requests.send(message).await.is_err() {
             // The stream has ended; the reading task receives the reason.
             self.wait_until(|_, _| false).await?;

@@ -65,7 +65,7 @@ fn list_files(root: &Path) -> Result<Vec<LocalFile>> {
     }
     paths.sort();
     let base = if root.is_file() { root.parent().unwrap_or(root) } else { root };
-    paths.into_iter().map(|path| read_header(base, path)).collect()
+    paths.into_iter().map(|path| describe_file(base, path)).collect()
 }
 
 /// Appends the paths of all files below a folder.
@@ -86,7 +86,7 @@ fn collect_paths(folder: &Path, depth: usize, paths: &mut Vec<PathBuf>) -> Resul
 }
 
 /// Computes the path relative to `base`, the size and the hash of a file.
-fn read_header(base: &Path, local_path: PathBuf) -> Result<LocalFile> {
+fn describe_file(base: &Path, local_path: PathBuf) -> Result<LocalFile> {
     let relative_path = local_path.strip_prefix(base).map_err(|error| Error::file(&local_path, error))?;
     let names = relative_path.components().map(|component| component.as_os_str().to_str());
     let names = names.collect::<Option<Vec<_>>>();

@@ -223,7 +223,8 @@ fn split_reply<'a>(head: &v1::VertexHead, bytes: &'a [u8]) -> Result<ReplySectio
 mod tests {
     use super::*;
 
-    /// The head of a reply with two domains: one vertex and no corner, and no vertex and one corner.
+    /// The head of a reply with two domains. The first has one vertex and no corner. The second has no vertex and one
+    /// corner.
     fn two_domain_head(origin_bytes: u64) -> v1::VertexHead {
         v1::VertexHead {
             step: Some(v1::StepId::default()),

@@ -41,6 +41,7 @@ async fn arrays_and_modes_above_4_mib_arrive_complete() {
     assert!(description.domains[0].uvs.is_empty());
     let rows = client.read_modes("toy", 0, &[]).await.expect("rows of U");
     assert_eq!((rows.rank, &rows.rows), (2, &server.domains[0].modes));
+    // A vertex has three rows of two entries.
     let selected_rows = client.read_modes("toy", 0, &[7, 2]).await.expect("rows of U");
     assert_eq!(
         (selected_rows.rows_of(0), selected_rows.rows_of(1)),
@@ -85,6 +86,7 @@ async fn subscription_before_the_first_step_receives_every_step() {
         assert_eq!(frames.next().await.expect("a frame").expect("a valid reply").step.number, number);
         let set = sets.next().await.expect("a set").expect("a valid reply");
         assert_eq!((set.step.number, set.float_range(0)), (number, Some(0..12)));
+        // The x coordinate of vertex 1: x0 is 3, and the first entry of its row of U is 6.
         assert_eq!(set.positions[3], 3.0 + 6.0 * number as f32);
     }
     assert!(frames.next().await.is_none() && sets.next().await.is_none());
@@ -94,7 +96,7 @@ async fn subscription_before_the_first_step_receives_every_step() {
 #[tokio::test]
 async fn step_beyond_the_window_waits_for_an_acknowledgement() {
     let mut slow_server = one_domain_server(4);
-    (slow_server.window, slow_server.permits) = (2, Semaphore::new(0));
+    (slow_server.window, slow_server.ack_permits) = (2, Semaphore::new(0));
     let (server, client) = connect(slow_server).await;
     let mut step_stream = client.drive("toy", Policy::Lossless, 0).await.expect("a step stream");
     let step = |number| Step::new(number, 0.0).q(0, &[0.0, 0.0]);
@@ -103,7 +105,7 @@ async fn step_beyond_the_window_waits_for_an_acknowledgement() {
     let third = step(2);
     let result = tokio::time::timeout(Duration::from_millis(200), step_stream.step(&third)).await;
     assert!(result.is_err(), "expected the third step to wait for capacity in a window of two");
-    server.permits.add_permits(100);
+    server.ack_permits.add_permits(100);
     step_stream.step(&third).await.expect("capacity in the window");
     assert_eq!(step_stream.finish().await.expect("acknowledged steps").acknowledged, Some(2));
 }
@@ -241,7 +243,7 @@ fn client_depends_on_neither_cuda_nor_opengl() {
     assert_eq!(count_gpu_dependencies("modalcast-client"), 0);
     assert!(list_dependencies("modalcast-client").iter().any(|name| name == "tonic"), "expected a dependency on tonic");
     let server_count = count_gpu_dependencies("modalcast");
-    assert_eq!(server_count, gpu_packages.len(), "negative control: the server's list contains all of them");
+    assert_eq!(server_count, gpu_packages.len(), "control: expected all of these packages for the server");
 }
 
 struct FetchOutput {
@@ -291,6 +293,7 @@ async fn fetch_saves_files_and_exits_with_documented_codes() {
     }
     let output = run_fetch(&url, &["vertices", "--scene", "toy", "--count", "2", "--out", &vertices]).await;
     assert_eq!(output.exit_code, 0, "{}", output.stderr);
+    // A header of 128 bytes, and two steps of four positions.
     assert_eq!(std::fs::read(&vertices).expect("a file").len(), 128 + 2 * 48);
     send_task.abort();
     let frame_path = path("one.rgba");

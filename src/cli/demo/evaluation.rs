@@ -61,21 +61,21 @@ impl Evaluation {
             let state = sent_state(scene, run, step);
             let expected_positions = reference::deform(scene, &state);
             let (received_positions, _) = run.vertices.row(step).as_chunks::<3>();
-            gap = joints.iter().fold(gap, |gap, joint| max_error(gap, joint.gap(received_positions, &state)));
+            gap = joints.iter().fold(gap, |gap, joint| max_or_infinity(gap, joint.gap(received_positions, &state)));
             for (vertex, position) in received_positions.iter().enumerate() {
                 let position = position.map(f64::from);
-                error = max_error(error, distance(position, expected_positions[vertex]));
+                error = max_or_infinity(error, distance(position, expected_positions[vertex]));
                 let vertex_displacement = distance(position, rest_positions[vertex]);
-                displacement = max_error(displacement, vertex_displacement);
+                displacement = max_or_infinity(displacement, vertex_displacement);
                 if top_region.contains(rest_positions[vertex]) {
-                    sway = max_error(sway, vertex_displacement);
+                    sway = max_or_infinity(sway, vertex_displacement);
                 }
             }
         }
         let diagonal = scene.rest_bounds.diagonal();
         Ok(Self {
-            backend: text(&run.server, "backend"),
-            renderer: text(&run.server, "renderer"),
+            backend: string_field(&run.server, "backend"),
+            renderer: string_field(&run.server, "renderer"),
             steps,
             steps_per_second: run.sim["steps_per_second"].as_f64().unwrap_or(f64::NAN),
             stages: median_stage_ms(&run.frames),
@@ -249,11 +249,11 @@ fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
 }
 
 /// The larger of two values. If `b` is NaN, infinity, so that an invalid position fails the checks.
-fn max_error(a: f64, b: f64) -> f64 {
+fn max_or_infinity(a: f64, b: f64) -> f64 {
     if b.is_nan() { f64::INFINITY } else { a.max(b) }
 }
 
-fn text(value: &Value, key: &str) -> String {
+fn string_field(value: &Value, key: &str) -> String {
     value[key].as_str().unwrap_or("unknown").to_owned()
 }
 
@@ -271,14 +271,14 @@ mod tests {
     use crate::cli::demo::step_records::StepRecords;
 
     #[test]
-    fn max_error_treats_nan_as_infinity() {
-        assert_eq!(max_error(1.0, f64::NAN), f64::INFINITY);
-        assert_eq!(max_error(f64::INFINITY, 1.0), f64::INFINITY);
-        assert_eq!(max_error(1.0, 2.0), 2.0);
+    fn max_or_infinity_treats_nan_as_infinity() {
+        assert_eq!(max_or_infinity(1.0, f64::NAN), f64::INFINITY);
+        assert_eq!(max_or_infinity(f64::INFINITY, 1.0), f64::INFINITY);
+        assert_eq!(max_or_infinity(1.0, 2.0), 2.0);
     }
 
     /// Results with two steps of a scene at rest, as correct processes would record them.
-    fn at_rest(scene: &Scene) -> DemoRun {
+    fn demo_run_at_rest(scene: &Scene) -> DemoRun {
         let (domains, vertices) = (scene.domains.len(), scene.layout.vertices);
         let state = SceneState::rest(scene);
         let rest_positions = reference::deform(scene, &state);
@@ -300,7 +300,7 @@ mod tests {
     fn failed_checks_names_the_criteria_that_are_not_met() {
         let scene = modalcast_model::load::open("tree").expect("expected the built-in scene").scene;
         let failed_checks = |change: &dyn Fn(&mut DemoRun)| {
-            let mut run = at_rest(&scene);
+            let mut run = demo_run_at_rest(&scene);
             change(&mut run);
             Evaluation::of(&scene, &run, 2).expect("expected consistent records").failed_checks().join("; ")
         };

@@ -184,8 +184,8 @@ impl DeviceContext {
         self.free_buffers(buffers);
     }
 
-    /// Draws the vertices of the last deformation. The image's passes include "upload" if the vertices had to be
-    /// uploaded.
+    /// Draws the vertices of the last deformation. The image's times include the stage `upload` if the vertices had to
+    /// be uploaded.
     ///
     /// # Errors
     /// `Unavailable` without a renderer, `Invalid` for an invalid camera or size, `Fault` of OpenGL.
@@ -253,7 +253,7 @@ impl DeviceContext {
         Ok((image, legend))
     }
 
-    /// Submits a pick without waiting for the device. `rectangle` is in pixels of a picture of this size.
+    /// Submits a pick without waiting for the device. `rectangle` is in pixels of a picture of size `size`.
     ///
     /// # Errors
     /// As [`Self::draw`].

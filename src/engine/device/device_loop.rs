@@ -1,9 +1,10 @@
 //! The command loop of the device thread: executes commands and decides in which order it answers them.
 //!
 //! Frames, picks and vertex readbacks are answered asynchronously, each type from its own bounded queue
-//! ([`InFlightQueue`]). After each command the loop polls the readbacks that were started before this command.
-//! Readbacks that the command starts overlap with the next one. AOVs are read back while their command is executed,
-//! because the renderer has no asynchronous readback for them. AOVs are therefore never in flight.
+//! ([`InFlightQueue`]). After each command the loop waits for the vertex readbacks that were started before this
+//! command and answers them. It also answers the picks and frames that are ready. Readbacks that the command starts
+//! overlap with the next one. AOVs are read back while their command is executed, because the renderer has no
+//! asynchronous readback for them. AOVs are therefore never in flight.
 //!
 //! Frames pass through the renderer's ring buffer. The loop submits a frame, executes the commands after it, and
 //! answers the frame once the device has drawn it, or before the next submission when every ring slot is in flight. Two

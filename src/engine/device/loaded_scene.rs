@@ -20,7 +20,7 @@ const MAX_COORDINATE: f64 = 1e18;
 /// Size of the frames that are measured to choose between the rasterizers.
 const BENCHMARK_SIZE: FrameSize = FrameSize::new(1920, 1080);
 
-/// Description of the content of the buffers, in the coordinate frame that the camera needs.
+/// Bounds of the vertices that the buffers hold, in the coordinate frame in which the camera draws them.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::engine) struct BufferContents {
     bounds: BoundingBox,
@@ -272,7 +272,11 @@ impl LoadedScene {
         // A displacement may be out of range although its position is not.
         let displacement_index = || surface.displacements.iter().position(|number| !number.is_finite());
         let vertex = position_index.or_else(displacement_index).unwrap_or(0) / 3;
-        let domain = scene.layout.domains.partition_point(|slot| slot.first_vertex <= vertex).saturating_sub(1);
+        let domain = scene
+            .layout
+            .domains
+            .partition_point(|domain_layout| domain_layout.first_vertex <= vertex)
+            .saturating_sub(1);
         let max_q = state.q_of(&scene, domain).iter().fold(0.0_f32, |max, q| max.max(q.abs()));
         let given = format!("vertex {vertex} out of range, largest |q| {max_q:e}");
         let field = format!("step.q of domain '{}'", scene.domains[domain].name);

@@ -36,11 +36,12 @@ pub(in crate::engine) fn displacement_magnitudes(
     surface: &DeformedSurface,
 ) -> Vec<f32> {
     let domains = scene.domains.par_iter().zip(&scene.layout.domains).enumerate();
-    let magnitudes = domains.flat_map_iter(|(index, (domain, slot))| {
+    let magnitudes = domains.flat_map_iter(|(index, (domain, domain_layout))| {
         let world_from_domain = state.composed_transform(scene, index);
         let (linear, entries) = (world_from_domain.linear(), world_from_domain.to_f64());
         let translation = Vector3::new(entries[3], entries[7], entries[11]);
-        let deformed_positions = surface.positions[3 * slot.first_vertex..][..3 * slot.vertices].chunks_exact(3);
+        let deformed_positions =
+            surface.positions[3 * domain_layout.first_vertex..][..3 * domain_layout.vertices].chunks_exact(3);
         scene.shapes[domain.shape].mesh.rest_positions().iter().zip(deformed_positions).map(
             move |(x0, deformed_position)| {
                 let x = Vector3::from_fn(|axis, _| f64::from(deformed_position[axis]));
@@ -55,12 +56,12 @@ pub(in crate::engine) fn displacement_magnitudes(
 /// The displacement of every vertex in meters per unit of the coordinate, before T: the norm of the vertex's three
 /// entries in one column of U, times the scene's unit. Zero in domains without the mode.
 pub(in crate::engine) fn mode_shape_magnitudes(scene: &Scene, mode: usize) -> Vec<f32> {
-    let magnitudes = scene.domains.par_iter().zip(&scene.layout.domains).flat_map_iter(|(domain, slot)| {
+    let magnitudes = scene.domains.par_iter().zip(&scene.layout.domains).flat_map_iter(|(domain, domain_layout)| {
         let modes = &scene.shapes[domain.shape].modes;
         let column = if mode < modes.rank() { modes.column(mode) } else { &[] };
         let norm = |row: &[f32]| Vector3::from_column_slice(row).cast::<f64>().norm();
         let norms = column.chunks_exact(3).map(move |row| (scene.unit * norm(row)) as f32);
-        norms.chain(std::iter::repeat(0.0)).take(slot.vertices)
+        norms.chain(std::iter::repeat(0.0)).take(domain_layout.vertices)
     });
     magnitudes.collect()
 }

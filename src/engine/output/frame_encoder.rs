@@ -167,7 +167,11 @@ pub(in crate::engine) mod tests {
         let other_frame = encoder.encode(noise_frame(1, 16), FrameFormat::Png).await.expect("expected a PNG");
         let (shared, _) = encode_twice(FrameFormat::Png).await;
         assert_eq!(other_frame.bytes, shared.bytes);
-        assert_ne!(other_frame.bytes.as_ptr(), shared.bytes.as_ptr(), "control: expected another PNG of another frame");
+        assert_ne!(
+            other_frame.bytes.as_ptr(),
+            shared.bytes.as_ptr(),
+            "control: expected separate bytes for another frame"
+        );
     }
 
     #[tokio::test]

@@ -77,14 +77,14 @@ impl VertexSelection {
 
     /// Vertex count of each selected domain.
     pub fn vertices(&self) -> impl Iterator<Item = u32> {
-        let slots = &self.scene.layout.domains;
-        self.domains.iter().map(|domain| slots[*domain as usize].vertices as u32)
+        let domain_layouts = &self.scene.layout.domains;
+        self.domains.iter().map(|domain| domain_layouts[*domain as usize].vertices as u32)
     }
 
     /// Corner count of each selected domain.
     pub fn corners(&self) -> impl Iterator<Item = u32> {
-        let slots = &self.scene.layout.domains;
-        self.domains.iter().map(|domain| slots[*domain as usize].corners as u32)
+        let domain_layouts = &self.scene.layout.domains;
+        self.domains.iter().map(|domain| domain_layouts[*domain as usize].corners as u32)
     }
 }
 
@@ -149,7 +149,8 @@ pub async fn pack_vertices(output: StepOutput, selection: &Arc<VertexSelection>)
     Ok(PackedVertices { encoded, origin, origin_bytes })
 }
 
-/// Returns the origin of the reply in meters. Appends per-domain origins to `bytes` if any differs from it.
+/// Returns the origin of the reply in meters. Appends per-domain origins to `bytes` if any differs from the reply's
+/// origin.
 fn push_origins(selection: &VertexSelection, origins: Option<&FloatingOrigins>, bytes: &mut Vec<u8>) -> [f64; 3] {
     let scene = &selection.scene;
     let to_meters = |origin: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * origin[axis]);
@@ -175,18 +176,16 @@ fn pack(surface: &DeformedSurface, selection: &VertexSelection) -> Vec<u8> {
             bytes.extend_from_slice(bytemuck::cast_slice(&numbers[3 * first_vector..][..3 * count]));
         }
     };
-    let (vertices, corners) = (
-        |slot: &DomainLayout| (slot.first_vertex, slot.vertices),
-        |slot: &DomainLayout| (slot.first_corner, slot.corners),
-    );
-    append_attribute(attributes.positions, &surface.positions, &vertices);
-    append_attribute(attributes.normals, &surface.normals, &corners);
-    append_attribute(attributes.displacements, &surface.displacements, &vertices);
+    let vertex_range = |domain_layout: &DomainLayout| (domain_layout.first_vertex, domain_layout.vertices);
+    let corner_range = |domain_layout: &DomainLayout| (domain_layout.first_corner, domain_layout.corners);
+    append_attribute(attributes.positions, &surface.positions, &vertex_range);
+    append_attribute(attributes.normals, &surface.normals, &corner_range);
+    append_attribute(attributes.displacements, &surface.displacements, &vertex_range);
     for domain in selection.domains.iter().filter(|_| attributes.boxes) {
         let BoundingBox { min, max } = surface.boxes[*domain as usize];
         // The bounds are f32 values stored as f64, so the conversion is exact.
-        let corners_f32 = [min, max].map(|corner| corner.map(|number| number as f32));
-        bytes.extend_from_slice(bytemuck::cast_slice(&corners_f32));
+        let bounds_f32 = [min, max].map(|bound| bound.map(|number| number as f32));
+        bytes.extend_from_slice(bytemuck::cast_slice(&bounds_f32));
     }
     bytes
 }

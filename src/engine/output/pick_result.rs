@@ -23,6 +23,7 @@ pub struct PickResult {
 pub(in crate::engine) fn with_transforms(state: &SceneState, scene: &Scene, hits: Vec<PickHit>) -> Vec<ModalHit> {
     let add_transform = |hit: PickHit| {
         let rows = state.transform_of(scene, hit.domain).0;
+        // The transform is 3 x 4, row-major. Its fourth column is the translation.
         let linear = [0, 1, 2, 4, 5, 6, 8, 9, 10].map(|entry: usize| rows[entry]);
         ModalHit { hit, linear, modes: Vec::new() }
     };

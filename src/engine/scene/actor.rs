@@ -13,11 +13,11 @@
 //!    +-----------------------+--------------------------------+
 //! ```
 //!
-//! | state | meaning | leaves it when |
+//! | state | meaning | ends when |
 //! |---|---|---|
 //! | `Idle` | no step is in progress | the writer has queued a step |
 //! | `Deforming` | the device computes the step, readbacks of the previous step are delivered, messages wait | the device answers |
-//! | `Delivering` | the step is the current one, its writer waits for the acknowledgement | no lossless subscriber applies back-pressure, or the writer cannot be blocked |
+//! | `Delivering` | the step is the current one, its writer waits for the acknowledgement | every lossless subscriber has received the step, or the writer cannot be blocked |
 //!
 //! Single requests and subscribers are served in `Idle` and in `Delivering`. In every state the actor ends, and
 //! [`SceneActor::close`] consumes it, when

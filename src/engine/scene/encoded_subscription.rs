@@ -9,7 +9,7 @@ use crate::engine::output::frame_encoder::{EncodedOutput, FrameEncoder, FrameFor
 use crate::engine::output::step_output::{OutputBody, StepOutput};
 use modalcast_model::error::{Error, Result, fault_in};
 
-/// Bytes of pixels that one stream may hold. A stream that holds as many or more accepts no further frame.
+/// A stream that holds at least this many bytes of pixels accepts no further frame.
 const MAX_PIXEL_BYTES: usize = 128 << 20;
 /// Maximum number of frames that a [`Delivery::Latest`] stream holds. The next frame is encoded while the previous one
 /// is sent. Further frames would only add latency.
@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn frame_above_the_byte_limit_is_encoded_alone() {
+    async fn frame_that_reaches_the_byte_limit_is_encoded_alone() {
         let (encoder, _thread_permits) = paused_encoder(4);
         let (subscriber, subscription) = subscribe(Delivery::Lossless);
         let mut frames = EncodedSubscription::new(subscription, encoder, FrameFormat::Png, 0);

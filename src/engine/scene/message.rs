@@ -31,8 +31,8 @@ pub(super) struct AcquiredLease {
     pub run: u64,
 }
 
-/// A message to a scene's actor. The mailbox is bounded: a request that finds it full fails with `Busy`; `Stop` waits
-/// for capacity.
+/// A message to a scene's actor. The mailbox is bounded. When it is full, `Stop` waits for capacity and every other
+/// message is answered with `Busy`.
 pub(super) enum Message {
     AcquireWriter {
         peer: String,

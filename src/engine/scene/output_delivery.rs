@@ -274,7 +274,7 @@ impl OutputProducer {
     /// Delivers the current step to one subscriber, or starts the delivery. Returns false if the subscriber must be
     /// dropped.
     async fn serve(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
-        // The subscriber may have gained a credit after the union was computed, so check that it covers its attributes.
+        // `round.attributes` lacks the attributes of a subscriber that gained its credit after the round had begun.
         let is_covered = |attributes: VertexAttributes| round.attributes.contains(attributes);
         if round.starts_shared_copy && attributes_for(subscriber, round.current).is_some_and(is_covered) {
             round.vertex_recipients.push(Recipient::of(subscriber, round.current.step_count));
@@ -352,7 +352,8 @@ impl OutputProducer {
         is_within_timeout
     }
 
-    /// Draws, picks or copies the current step. A copy also includes `other_attributes`.
+    /// Draws, picks or copies the current step. A copy also includes `other_attributes`, which other subscribers
+    /// request.
     async fn produce(
         &mut self,
         spec: &OutputSpec,
@@ -443,7 +444,7 @@ mod tests {
     const WITHOUT_NEXT_STEP: DeliveryMode = DeliveryMode { applies_back_pressure: false, overlaps_next_step: false };
     const WITH_NEXT_STEP: DeliveryMode = DeliveryMode { overlaps_next_step: true, ..WITHOUT_NEXT_STEP };
 
-    /// The outputs that the subscribers of a test have received: width of the frame and step number.
+    /// A frame that a subscriber of a test has received.
     #[derive(Debug, PartialEq)]
     struct ReceivedFrame {
         width: u32,
@@ -464,7 +465,7 @@ mod tests {
         (OutputDelivery { subscribers, ..delivery }, commands)
     }
 
-    /// The current step with this step number and step count.
+    /// A current step. `number` is both its step number and the scene's step count.
     fn current_step(number: u64) -> CurrentStep {
         let state = SceneState { run: 1, step: number, ..SceneState::rest(&testing::two_strips()) };
         CurrentStep { state: Arc::new(state), step_count: number, stages: Vec::new() }
@@ -503,7 +504,7 @@ mod tests {
     /// Outcome of [`serve_slow_and_fast`].
     struct ServedFrames {
         /// Width of the frame that is requested while the first frame is still in flight.
-        requested_early: Option<u32>,
+        early_frame_width: Option<u32>,
         /// First the frames of the slow subscriber, then those of the fast one.
         received: Vec<ReceivedFrame>,
     }
@@ -526,15 +527,15 @@ mod tests {
         };
         let draw = async {
             let early_request = next_draw_request(&mut device, 500).await;
-            let requested_early = early_request.as_ref().map(|request| request.width);
+            let early_frame_width = early_request.as_ref().map(|request| request.width);
             answer(first_request);
             early_request.into_iter().for_each(answer);
             while let Some(request) = next_draw_request(&mut device, 500).await {
                 answer(request);
             }
-            requested_early
+            early_frame_width
         };
-        let ((), requested_early) = tokio::join!(deliver, draw);
+        let ((), early_frame_width) = tokio::join!(deliver, draw);
         let mut received = Vec::new();
         for subscription in [&mut slow_subscription, &mut fast_subscription] {
             while let Ok(Ok(StepOutput { step, body: OutputBody::Frame(image), .. })) =
@@ -543,20 +544,20 @@ mod tests {
                 received.push(ReceivedFrame { width: image.width, step: step.number });
             }
         }
-        ServedFrames { requested_early, received }
+        ServedFrames { early_frame_width, received }
     }
 
     #[tokio::test]
     async fn subscriber_without_credit_delays_no_other_subscriber() {
         let served = serve_slow_and_fast(Delivery::Latest).await;
-        assert_eq!(served.requested_early, Some(24));
+        assert_eq!(served.early_frame_width, Some(24));
         assert_eq!(served.received, [ReceivedFrame { width: 16, step: 1 }, ReceivedFrame { width: 24, step: 2 }]);
     }
 
     #[tokio::test]
     async fn lossless_subscriber_receives_its_frames_in_order() {
         let served = serve_slow_and_fast(Delivery::Lossless).await;
-        assert_eq!(served.requested_early, None);
+        assert_eq!(served.early_frame_width, None);
         let expected = [(16, 1), (16, 2), (24, 2)].map(|(width, step)| ReceivedFrame { width, step });
         assert_eq!(served.received, expected);
     }

@@ -1,6 +1,7 @@
 //! Device-to-host readbacks in flight. Vertices are read back while the next step is computed. Frames are drawn and
 //! read back while the next step is computed and its frames are submitted. Readbacks are delivered in order as they
-//! complete. In the diagrams `read` is the transfer of the pixels to host-readable memory.
+//! complete. In the diagrams `read` is the transfer of the pixels to host-readable memory, and `upload` is the copy of
+//! the new vertices into OpenGL buffers.
 //!
 //! A deformer with its own vertex memory computes concurrently with the frames in flight:
 //!
@@ -9,10 +10,10 @@
 //! OpenGL    [draw k][read k][upload][draw k+1][read k+1][upload]
 //! ```
 //!
-//! A deformer that writes into OpenGL buffers does not: mapping them is ordered after all OpenGL commands issued before
-//! (`gpu::interop`), including the readback of frame k. Only the host's work overlaps. Step k+1 is recorded and
-//! submitted while frame k is drawn, and starts on the device as soon as frame k is read. Frame k is copied out,
-//! encoded and sent while frame k+1 is drawn.
+//! A deformer that writes into OpenGL buffers cannot overlap with frames on the device: mapping the buffers is ordered
+//! after all OpenGL commands issued before (`gpu::interop`), including the readback of frame k. Only the host's work
+//! overlaps. Step k+1 is recorded and submitted while frame k is drawn, and starts on the device as soon as frame k is
+//! read. Frame k is copied out, encoded and sent while frame k+1 is drawn.
 //!
 //! ```text
 //! device    [draw k][read k][deform k+1] [draw k+1][read k+1][deform k+2]

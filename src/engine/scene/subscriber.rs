@@ -20,8 +20,8 @@ pub(super) const LOSSLESS_CREDITS: usize = 2;
 /// Which steps a subscriber receives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Delivery {
-    /// Every step from the next one on, in order. A slow subscriber blocks a lossless writer; under a `Latest` writer
-    /// it skips steps.
+    /// Every step from the next one on, in order. A slow subscriber blocks a writer with `Policy::Lossless`. If the
+    /// writer has `Policy::Latest`, a slow subscriber skips steps.
     Lossless,
     /// The newest step, starting with the current one if the scene has had a step.
     Latest,

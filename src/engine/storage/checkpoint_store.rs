@@ -51,7 +51,7 @@ struct Shared {
 
 #[derive(Debug, Default)]
 struct PendingWrites {
-    /// The newest state of each scene whose newest state is not on disk yet.
+    /// The newest states that are not on disk yet, by scene name.
     dirty: BTreeMap<String, Arc<SceneState>>,
     is_stopping: bool,
 }
@@ -297,7 +297,7 @@ mod tests {
         assert_ne!(
             SceneState { origins: None, ..restored_state },
             state,
-            "control: expected a comparison of floating origins"
+            "control: expected states with different origins to differ"
         );
         assert!(decode(&bytes[..bytes.len() - 24], &scene).is_err());
     }

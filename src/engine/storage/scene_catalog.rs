@@ -31,7 +31,7 @@ impl SceneProvenance {
     }
 }
 
-/// The names and origins of the open scenes, written to disk at every change.
+/// The names and provenances of the open scenes, written to disk at every change.
 #[derive(Debug)]
 pub(in crate::engine) struct SceneCatalog {
     folder: PathBuf,
@@ -107,8 +107,8 @@ impl SceneCatalog {
     }
 }
 
-/// Reads the catalog. A missing file yields an empty catalog. A damaged file is renamed as by [`unused_backup_path`]
-/// and yields an empty catalog, so that the server can start.
+/// Reads the catalog. A missing file yields an empty catalog. A damaged file is renamed to
+/// [`unused_backup_path`] and yields an empty catalog, so that the server can start.
 fn read_catalog(path: &Path) -> io::Result<BTreeMap<String, SceneProvenance>> {
     let bytes = match fs::read(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(BTreeMap::new()),

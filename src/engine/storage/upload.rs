@@ -112,7 +112,7 @@ impl Upload {
         let file = File::create_new(&file_path).map_err(path_conflict)?;
         self.open_file =
             Some(OpenFile { path: path.into(), file, bytes, remaining_bytes: bytes, hasher: Sha256::new(), sha256 });
-        self.finish_file()
+        self.finish_file_if_complete()
     }
 
     /// Appends bytes to the current file.
@@ -131,7 +131,7 @@ impl Upload {
         open_file.file.write_all(bytes).map_err(fault_in("upload"))?;
         open_file.hasher.update(bytes);
         open_file.remaining_bytes -= chunk_bytes;
-        self.finish_file()
+        self.finish_file_if_complete()
     }
 
     /// Checks that all declared files and bytes have arrived.
@@ -164,7 +164,8 @@ impl Upload {
         fs::remove_dir_all(mem::take(&mut self.folder)).ok(); // The next start removes leftovers.
     }
 
-    fn finish_file(&mut self) -> Result<()> {
+    /// Checks the hash of the open file and closes it once all of its bytes have arrived.
+    fn finish_file_if_complete(&mut self) -> Result<()> {
         let Some(open_file) = self.open_file.take_if(|open_file| open_file.remaining_bytes == 0) else { return Ok(()) };
         let given: [u8; 32] = open_file.hasher.finalize().into();
         if given != open_file.sha256 {
@@ -173,6 +174,7 @@ impl Upload {
         Ok(())
     }
 
+    /// Fails if the last file is incomplete.
     fn check_file_complete(&self) -> Result<()> {
         match &self.open_file {
             None => Ok(()),

@@ -1,4 +1,4 @@
-//! Saves vertices as NumPy files. Each step adds one row to every file, for positions of shape vertices x 3.
+//! Saves vertices as NumPy files. Each step adds one row to every file. A row of positions has the shape vertices x 3.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -13,7 +13,7 @@ pub(crate) async fn fetch(client: &Client, options: &VerticesOptions, as_json: b
     let scene = open_scene(client, &options.scene).await?;
     let mut files = OutputFiles { options, writers: Vec::new(), origin: vec![], summary: Summary::new() };
     match options.count {
-        None => files.write_set(&fetch_single(client, options, &scene).await?)?,
+        None => files.write_vertex_set(&fetch_single(client, options, &scene).await?)?,
         Some(count) => fetch_stream(client, &scene, count, &mut files).await?,
     }
     files.finish(as_json)
@@ -36,7 +36,7 @@ async fn fetch_stream(client: &Client, scene: &str, count: u64, files: &mut Outp
     for _ in 0..count {
         let deadline_error = Error::Deadline { awaited_reply: "the next step", ms: timeout.as_millis() as u64 };
         let result = tokio::time::timeout(timeout, vertex_stream.next()).await.map_err(|_| deadline_error)?;
-        files.write_set(&result.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the last step" }))?)?;
+        files.write_vertex_set(&result.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the last step" }))?)?;
         progress_bar.inc(1);
     }
     progress_bar.finish_and_clear();
@@ -86,7 +86,7 @@ struct OutputFiles<'a> {
 }
 
 impl OutputFiles<'_> {
-    fn write_set(&mut self, set: &VertexSet) -> Result<()> {
+    fn write_vertex_set(&mut self, set: &VertexSet) -> Result<()> {
         let rows = array_rows(self.options, set);
         if self.writers.is_empty() {
             self.writers = rows.iter().map(|row| NpyWriter::create(row.path, &row.shape)).collect::<Result<_>>()?;
