@@ -60,8 +60,9 @@ impl WorkloadMotion {
         Self { scene: Arc::clone(scene), is_paired: workload.is_paired, spreads, recorded_trajectory }
     }
 
-    /// The random state of a seed: Gaussian coordinates and small rigid motions. With odd seeds displacements nearly
-    /// cancel, which amplifies rounding errors: those of paired modes, otherwise those of one random row per domain.
+    /// The random state of a seed: Gaussian coordinates and small rigid motions. With odd seeds, displacements nearly
+    /// cancel, which amplifies rounding errors. The terms that cancel are paired modes, or those of one random row per
+    /// domain if modes are not paired.
     pub fn random_state(&self, seed: usize) -> ExactState {
         let mut rng = Rng::with_seed(0x5EED ^ (seed as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
         let mut q: Vec<f64> = self.spreads.iter().map(|spread| spread.deviation * random_normal(&mut rng)).collect();
@@ -107,7 +108,7 @@ impl WorkloadMotion {
     /// A random transform of a domain near its placement.
     fn random_transform(&self, domain: usize, rng: &mut Rng) -> [f64; 12] {
         let mut random_vector =
-            |max_component: f64| Vector3::from_fn(|_, _| max_component * (2.0 * rng.f64() - 1.0) / 3f64.sqrt());
+            |max_length: f64| Vector3::from_fn(|_, _| max_length * (2.0 * rng.f64() - 1.0) / 3f64.sqrt());
         let axis_angle = random_vector(MAX_ROTATION);
         let translation = random_vector(MAX_RELATIVE_SHIFT * diagonal(&self.scene, domain));
         move_placement(&self.scene, domain, &Rotation3::new(axis_angle).into_inner(), &translation)
@@ -193,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn seeds_are_deterministic_and_not_representable_in_f32() {
+    fn random_states_are_deterministic_and_not_exact_in_f32() {
         let motion = motion(WorkloadKind::ManyDomains);
         assert_eq!(motion.random_state(3), motion.random_state(3));
         assert_ne!(motion.random_state(3), motion.random_state(5));

@@ -227,7 +227,7 @@ fn lines(report: &RenderReport) -> Vec<String> {
             "{:<18}map {}: bare depth {depth:.1} us, bare visibility {visibility:.1} us",
             minimal.load, minimal.map_size
         ));
-        lines.extend([&minimal.without_culling, &minimal.with_default_culling].map(|frame| {
+        lines.extend([&minimal.without_culling, &minimal.with_scene_culling].map(|frame| {
             format!("{:<18}{} takes {:.1} us, {:.1} us beyond both", "", frame.name, frame.frame_us, frame.excess_us)
         }));
     }

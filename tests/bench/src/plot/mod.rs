@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn variants_have_one_style_in_every_panel() {
+    fn lists_each_variant_once_with_a_distinct_color() {
         let rows = [
             row("a", "x", CacheState::Warm, (1.0, 1.0)),
             row("b", "y", CacheState::Warm, (1.0, 1.0)),

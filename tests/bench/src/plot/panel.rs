@@ -245,7 +245,7 @@ fn hollow_attributes(color: &str) -> String {
 pub(crate) struct MarkerStyle {
     pub(crate) color: &'static str,
     pub(crate) backend: Backend,
-    /// Number of variants before this one that have the same color. CUDA markers have a different shape for each.
+    /// Number of variants before this one that have the same color. It selects one of three shapes of CUDA markers.
     pub(crate) color_reuse: usize,
 }
 

@@ -52,8 +52,8 @@ fn minimal_passes_section(rows: &[MinimalPasses]) -> String {
             passes.samples.to_string(),
             format_us(passes.without_culling.frame_us),
             format_us(passes.without_culling.excess_us),
-            format_us(passes.with_default_culling.frame_us),
-            format_us(passes.with_default_culling.excess_us),
+            format_us(passes.with_scene_culling.frame_us),
+            format_us(passes.with_scene_culling.excess_us),
         ]
     };
     text.push_str(&table(&header, rows.iter().map(row)));

@@ -39,7 +39,7 @@ pub struct FrameComparison {
     pub pixels: usize,
     /// Color differences from OpenGL's image, of 255.
     #[serde(rename = "colours")]
-    pub colors: ErrorDistribution,
+    pub color_errors: ErrorDistribution,
     /// Times of OpenGL with automatic culling; "frame" is the sum without readback.
     pub opengl: Vec<PassTime>,
     /// Culling counts of OpenGL's last timed frame, where triangles are culled.
@@ -71,8 +71,8 @@ impl FrameComparison {
             self.ratio().unwrap_or(f64::NAN),
             self.differing_ids,
             self.pixels,
-            self.colors.mean,
-            self.colors.max
+            self.color_errors.mean,
+            self.color_errors.max
         )
     }
 }
@@ -164,7 +164,7 @@ impl FrameSetup {
             raster_backends,
             differing_ids,
             pixels: opengl_ids.len(),
-            colors: compare_colors(&cuda_image.rgba, &reference),
+            color_errors: compare_colors(&cuda_image.rgba, &reference),
             opengl,
             cull_stats,
             cuda,
@@ -244,7 +244,8 @@ pub(super) fn markdown(comparisons: &[FrameComparison]) -> String {
         let ratio = frame.ratio().map_or_else(dash, |ratio| format!("{ratio:.1}"));
         let passes = ["raster", "shadow", "blur", "visibility", "shade", "encode"].map(format_both_times);
         let ids = format!("{} of {}", frame.differing_ids, frame.pixels);
-        let colors = [frame.colors.mean, frame.colors.p99, frame.colors.max].map(|error| format!("{error:.3}"));
+        let colors = [frame.color_errors.mean, frame.color_errors.p99, frame.color_errors.max]
+            .map(|error| format!("{error:.3}"));
         sizes.into_iter().chain(frame_times).chain([ratio]).chain(passes).chain([ids]).chain(colors)
     };
     text.push_str(&table(&header, comparisons.iter().map(row)));

@@ -100,7 +100,8 @@ fn time_scene(
     }
     let (image, frame_params) = (harness.draw(&loaded_scene, camera, size)?, loaded_scene.frame_params(camera, size));
     let file = image_files::encode_grid(&name, size, 1, &[image.rgba])?;
-    let clip = camera.clip_from_camera(size.width, size.height, &frame_params.bounds) * camera.camera_from_world();
+    let clip_from_world =
+        camera.clip_from_camera(size.width, size.height, &frame_params.bounds) * camera.camera_from_world();
     let scene_times = SceneFrameTimes {
         name: name.into_owned(),
         vertices: scene.layout.vertices,
@@ -108,7 +109,7 @@ fn time_scene(
         look: LookTable { settings: scene.look, raster: backends.raster },
         samples: harness.renderer.stats().samples,
         raster_backends: harness.renderer.stats().raster_backends,
-        clip_from_world: clip.iter().copied().collect(),
+        clip_from_world: clip_from_world.iter().copied().collect(),
         eye: camera.eye().into(),
         to_sun: scene.look.to_sun(scene.up).into(),
         passes,
@@ -146,8 +147,8 @@ mod tests {
         assert!(scene_times.wall_clock.median_us > 0.0 && scene_times.wall_clock.replays == MIN_REPETITIONS);
         assert!(scene_times.passes.iter().any(|pass| pass.name == "frame"));
         let scene = load::open("tree").expect("a scene").scene;
-        let clip = nalgebra::Matrix4::from_column_slice(&scene_times.clip_from_world);
-        let center = clip.transform_point(&scene.rest_bounds.center());
+        let clip_from_world = nalgebra::Matrix4::from_column_slice(&scene_times.clip_from_world);
+        let center = clip_from_world.transform_point(&scene.rest_bounds.center());
         assert!(center.x.abs() < 1e-9 && center.y.abs() < 1e-9, "{center}");
         let folder = tempfile::tempdir().expect("a folder");
         report.write(folder.path()).expect("report files");

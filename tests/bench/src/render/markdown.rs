@@ -36,7 +36,7 @@ pub(super) fn markdown(report: &RenderReport) -> String {
 const EXPLANATION: &str = "Colors are compared in sRGB, of 255, by the largest difference of the three channels: \
 against hard shadow rays, and against the intended result (no shadow, or the hard shadow filtered by the blur's \
 footprint). Light is the sun visibility, compared with the same two references. Bleeding is the mean sun visibility \
-in the umbra of the filtered reference. Flicker is the change of the error from step to step. `frame` is the time of all \
+in the umbra of the intended result. Flicker is the change of the error from step to step. `frame` is the time of all \
 passes except the readback. Culling passes the `listed` triangles to the rasterizer; `hidden` triangles are occluded by \
 the depth of the last frame.\n";
 

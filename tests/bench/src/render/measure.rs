@@ -317,8 +317,8 @@ impl WorkloadContext<'_> {
         Ok((row, file))
     }
 
-    /// Times the passes of the scene stripped to its mesh. Frames with the largest timed variance map of default settings
-    /// are the baseline.
+    /// Times the passes of the scene stripped to its mesh. For the baselines, frames have the largest shadow map among
+    /// the timed rows whose other shadow settings are the defaults.
     fn time_minimal_passes(&self, harness: &mut RenderHarness, rows: &[RenderRow]) -> Result<Option<MinimalPasses>> {
         let timed_default_shadow = |row: &RenderRow| {
             let is_default =
@@ -336,7 +336,7 @@ impl WorkloadContext<'_> {
         if !minimal_passes::is_minimal(&stats) {
             tracing::warn!(
                 load = self.animation.name,
-                "expected two passes with one draw each of the stripped scene, got others; minimal passes are not reported"
+                "expected a shadow pass without blur and one draw of ids, got others; minimal passes are not reported"
             );
             return Ok(None);
         }
@@ -348,7 +348,7 @@ impl WorkloadContext<'_> {
             depth,
             visibility,
             without_culling: self.frame_baseline(harness, rows, (shadow, Culling::None))?,
-            with_default_culling: self.frame_baseline(harness, rows, (shadow, self.animation.scene.look.culling))?,
+            with_scene_culling: self.frame_baseline(harness, rows, (shadow, self.animation.scene.look.culling))?,
         };
         Ok(Some(passes.with_frame_differences()))
     }
@@ -399,7 +399,7 @@ impl WorkloadContext<'_> {
     ) -> RenderRow {
         let hard_image = &self.references.hard_image;
         let intended_color_errors = metrics::compare_colors(&image.rgba, &reference.colors);
-        let intended_light_errors = metrics::compare_light(sun_visibility, &reference.light);
+        let intended_light_errors = metrics::compare_light(sun_visibility, &reference.sun_visibility);
         let bounds = variant.error_limits(self.animation.workload);
         let faults = exceeded_bounds(&intended_color_errors, &intended_light_errors, &bounds);
         RenderRow {
@@ -416,7 +416,7 @@ impl WorkloadContext<'_> {
             faults,
             color_errors: metrics::compare_colors(&image.rgba, &hard_image.colors),
             intended_color_errors,
-            light_errors: metrics::compare_light(sun_visibility, &hard_image.light),
+            light_errors: metrics::compare_light(sun_visibility, &hard_image.sun_visibility),
             intended_light_errors,
             flicker: None,
             flicker_skip_reason: None,
@@ -467,8 +467,9 @@ impl WorkloadContext<'_> {
 
     /// Encodes the sun visibility of the hard reference as a gray image; blue where it is undefined.
     fn encode_sun_visibility(&self) -> Result<ImageFile> {
-        let color = |light: &Option<f32>| light.map_or([60.0, 70.0, 110.0], |light| [255.0 * light; 3]);
-        let colors: Vec<[f32; 3]> = self.references.hard_image.light.iter().map(color).collect();
+        let color =
+            |visibility: &Option<f32>| visibility.map_or([60.0, 70.0, 110.0], |visibility| [255.0 * visibility; 3]);
+        let colors: Vec<[f32; 3]> = self.references.hard_image.sun_visibility.iter().map(color).collect();
         image_files::encode_reference(&self.file_name("hard light"), self.options.size, &colors)
     }
 }

@@ -31,7 +31,7 @@ impl ErrorDistribution {
     }
 }
 
-/// Color errors over all pixels, of 255. `rendered` is RGBA, `reference` sRGB of 255.
+/// Color errors of all pixels, on a scale of 0 to 255. `rendered` is RGBA; `reference` is sRGB on the same scale.
 pub fn compare_colors(rendered: &[u8], reference: &[[f32; 3]]) -> ErrorDistribution {
     ErrorDistribution::from_values(differences(rendered, reference).collect())
 }
@@ -85,8 +85,8 @@ pub fn compare_light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> Lig
     }
 }
 
-/// Measures the flicker of a moving scene: the change of a pixel's error from frame to frame, as the largest of the three
-/// channels, of 255. A constant error does not flicker.
+/// Measures the flicker of a moving scene: how much a pixel's error changes from frame to frame, on a scale of 0 to 255.
+/// The channel with the largest change counts. A constant error does not flicker.
 #[derive(Debug, Default)]
 pub struct FlickerMeter {
     /// Signed error of each pixel of the last frame; rendered minus reference.

@@ -29,9 +29,9 @@ pub struct MinimalPasses {
     /// A frame without culling. Its excess over both passes is the overhead of the renderer.
     #[serde(rename = "unculled")]
     pub without_culling: FrameBaseline,
-    /// A frame with the culling of the scene's own settings.
+    /// A frame with the scene's own culling setting.
     #[serde(rename = "usual")]
-    pub with_default_culling: FrameBaseline,
+    pub with_scene_culling: FrameBaseline,
 }
 
 /// A frame of the renderer with the same map, for comparison with both passes.
@@ -50,7 +50,7 @@ impl MinimalPasses {
     /// Fills in each frame's excess over both passes.
     pub(super) fn with_frame_differences(mut self) -> Self {
         let sum_us = self.depth.median_us + self.visibility.median_us;
-        for frame in [&mut self.without_culling, &mut self.with_default_culling] {
+        for frame in [&mut self.without_culling, &mut self.with_scene_culling] {
             frame.excess_us = frame.frame_us - sum_us;
         }
         self
@@ -76,7 +76,7 @@ pub(super) fn strip_to_mesh(scene: &Scene, map_size: u32) -> Result<Arc<Scene>> 
     Scene::new(parts)
 }
 
-/// Whether a frame consisted of one draw of depth and one of ids, without a shadow pass that processes the depth.
+/// Whether a frame had a shadow pass without blur and one draw of ids. Draws of the shadow pass are not counted.
 pub(super) fn is_minimal(stats: &FrameStats) -> bool {
     stats.draw_calls == 1 && stats.passes.starts_with(&[Pass::Shadow, Pass::Visibility])
 }

@@ -182,8 +182,8 @@ pub struct RenderReport {
     pub blurs: Vec<BlurComparison>,
     /// Plants of the thesis's table 4.5, deformed and drawn.
     pub plants: Vec<PlantResult>,
-    /// Unexpected results, as `workload: variant: reason`. A variant may fail unexpectedly, or pass although it is
-    /// expected to fail.
+    /// Unexpected results, as `workload: variant: reason`: variants that failed unexpectedly or passed although they are
+    /// expected to fail, and rasterizer comparisons with too many differing ids.
     pub failed: Vec<String>,
     /// Reference images and comparison strips.
     #[serde(skip)]
@@ -247,7 +247,7 @@ fn describe_failure(row: &RenderRow) -> String {
 }
 
 impl RenderReport {
-    /// Whether every variant passed or failed as expected.
+    /// Whether the report has no unexpected results.
     pub fn passed(&self) -> bool {
         self.failed.is_empty()
     }

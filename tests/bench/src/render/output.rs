@@ -11,7 +11,8 @@ use crate::timing::Timing;
 use modalcast_model::error::{Result, fault_in};
 
 /// Columns of `report.csv`: the name, and the source of the value. The source is a JSON pointer into a row of
-/// `report.json`, or the name of a pass whose time the column contains.
+/// `report.json`, or the name of a pass whose time the column contains. It is empty for `faults`, which [`cell_text`]
+/// joins.
 const COLUMNS: [(&str, &str); 55] = [
     ("load", "/load"),
     ("variant", "/name"),
@@ -127,7 +128,7 @@ fn passes_csv(report: &RenderReport) -> Result<Vec<u8>> {
             );
         }
         let sum_us = (minimal_passes.depth.median_us + minimal_passes.visibility.median_us).to_string();
-        for frame in [&minimal_passes.without_culling, &minimal_passes.with_default_culling] {
+        for frame in [&minimal_passes.without_culling, &minimal_passes.with_scene_culling] {
             let [frame_us, excess_us, size] =
                 [frame.frame_us, frame.excess_us, f64::from(minimal_passes.map_size)].map(|number| number.to_string());
             let pass_name = "both bare passes";
@@ -231,7 +232,7 @@ mod tests {
     use modalcast_model::scene::{Bloom, Culling, RenderSettings};
 
     #[test]
-    fn every_pass_has_a_column_and_draw_is_their_sum() {
+    fn passes_have_columns_and_draw_is_the_sum_of_its_parts() {
         let animation = RenderWorkload::Triangles(2_000).build().expect("a workload");
         let look =
             RenderSettings { culling: Culling::Occlusion, bloom: Some(Bloom::default()), ..animation.scene.look };

@@ -213,6 +213,7 @@ impl RasterSetup {
         let (frame_raster, map_raster) = (frame_raster?, map_raster?);
         frame_raster.launch(device, 0)?;
         let keys = frame_raster.keys(device)?;
+        // The lower 32 bits of a key are the triangle.
         let differing_ids = keys.iter().zip(&ids).filter(|(key, id)| **key as u32 != **id).count();
         let is_accepted = differing_ids as f64 <= MAX_DIFFERING_FRACTION * ids.len() as f64;
         let passes = if is_accepted {
@@ -254,9 +255,9 @@ impl RasterSetup {
     }
 
     fn map_viewport(&self, frame_params: &FrameParams) -> Result<Viewport> {
-        let clip: Matrix4<f64> = shadow_clip_from_world(&self.scene, frame_params)
+        let clip_from_world: Matrix4<f64> = shadow_clip_from_world(&self.scene, frame_params)
             .ok_or_else(|| fault_in("raster")("expected a scene with a shadow map"))?;
-        Viewport::new(&clip, self.map_size, self.map_size)
+        Viewport::new(&clip_from_world, self.map_size, self.map_size)
     }
 
     fn time_pass_pairs(

@@ -158,7 +158,7 @@ impl RayScene {
     /// same results as with a rebuilt BVH, but are slower where triangles moved far.
     pub(super) fn refit(self, scene: &Scene, surface: &DeformedSurface) -> Self {
         let triangles = triangles(scene, surface);
-        // The set of finite triangles changed, so the BVH must be rebuilt.
+        // If the number of finite triangles changed, the BVH must be rebuilt.
         if triangles.len() != self.triangles.len() {
             return Self::new(scene, surface);
         }
@@ -202,6 +202,7 @@ impl RayScene {
             let Some(hit) = self.triangles[index].intersect(index, ray).filter(|hit| is_in_range(hit.t)) else {
                 return f32::INFINITY;
             };
+            // Within the range t <= other.t, so the index decides only if both are equal.
             let precedes = |other: Hit| hit.t < other.t || self.packed_index(&hit) < self.packed_index(&other);
             if !nearest.is_none_or(precedes) || !accepts(&hit) {
                 return f32::INFINITY;

@@ -53,11 +53,11 @@ pub struct ReadbackRates {
     pub moving_ring_loss: f64,
 }
 
-/// The frames to draw. Even and odd frames have different parameters and vertices.
+/// Parameters and vertices of even and of odd frames.
 struct FrameSource {
     frame_params: [FrameParams; 2],
-    /// Vertices to upload before even and odd frames, if any.
-    steps: Option<[DeformedSurface; 2]>,
+    /// Vertices of two steps, which are uploaded before even and odd frames; `None` for a still scene.
+    surfaces: Option<[DeformedSurface; 2]>,
 }
 
 /// Distance in steps between the two uploaded states.
@@ -87,9 +87,9 @@ pub(super) fn measure(
     let camera = animation.camera(options.size);
     let mut loaded_scene = harness.load(&animation.scene)?;
     let moving_source = FrameSource::with_two_steps(harness, &mut loaded_scene, &animation, options.size)?;
-    let still_source = FrameSource { frame_params: moving_source.frame_params, steps: None };
+    let still_source = FrameSource { frame_params: moving_source.frame_params, surfaces: None };
     [&still_source, &moving_source].into_iter().try_for_each(|source| validate(harness, &loaded_scene, source))?;
-    // Use one camera, so that all rounds draw the same image.
+    // Both cameras were needed for validation only. With one camera, all frames have the same view.
     let [still_source, moving_source] =
         [still_source, moving_source].map(|source| FrameSource { frame_params: [source.frame_params[0]; 2], ..source });
     harness.warm_up(&loaded_scene, camera, options.size)?;
@@ -143,13 +143,15 @@ impl FrameSource {
         };
         Ok(Self {
             frame_params: [camera, move_camera_back(camera)].map(frame_params),
-            steps: Some([first_surface, second_surface]),
+            surfaces: Some([first_surface, second_surface]),
         })
     }
 
-    /// Uploads the vertices of a frame, if the source has steps.
+    /// Uploads the vertices of a frame, unless the scene is still.
     fn upload_step(&self, harness: &mut RenderHarness, loaded_scene: &LoadedScene, frame: usize) -> Result<()> {
-        self.steps.as_ref().map_or(Ok(()), |steps| harness.renderer.upload(&loaded_scene.buffers, &steps[frame % 2]))
+        self.surfaces
+            .as_ref()
+            .map_or(Ok(()), |surfaces| harness.renderer.upload(&loaded_scene.buffers, &surfaces[frame % 2]))
     }
 }
 
@@ -327,7 +329,7 @@ mod tests {
             harness.renderer.draw(&loaded_scene.buffers, &source.frame_params[frame]).expect("a frame")
         });
         let (frame_sender, receiver) = mpsc::sync_channel(6);
-        draw_pipelined(&mut harness, &loaded_scene, &source, (6, Some(frame_sender))).expect("a frame");
+        draw_pipelined(&mut harness, &loaded_scene, &source, (6, Some(frame_sender))).expect("six frames");
         // Several threads copy, so frames are received in any order. The swap below needs an even and an odd frame.
         let mut frames: Vec<(usize, FrameImage)> = receiver.iter().collect();
         frames.sort_by_key(|(number, _)| *number);
@@ -341,7 +343,7 @@ mod tests {
         frames[4].1.rgba[100] ^= 1;
         assert!(describe_rejection(&frames).contains("1 differ"), "one wrong byte");
         source.frame_params[1] = source.frame_params[0];
-        source.steps = None;
+        source.surfaces = None;
         let error = validate(&mut harness, &loaded_scene, &source).expect_err("a rejection of equal images");
         assert!(error.to_string().contains("two cameras with different images"), "{error}");
     }

@@ -29,7 +29,7 @@ pub(super) struct ReferenceImage {
     /// sRGB, 0 to 255, not rounded, top row first.
     pub(super) colors: Vec<[f32; 3]>,
     /// Sun visibility per pixel; `None` where the unshadowed sunlight is less than [`MIN_SUNLIGHT`].
-    pub(super) light: Vec<Option<f32>>,
+    pub(super) sun_visibility: Vec<Option<f32>>,
 }
 
 /// Minimum unshadowed sunlight, of 1, for which sun visibility is defined.
@@ -73,7 +73,7 @@ pub(super) fn trace_reference_images(
         .collect();
     let extract_image = |shadow_model: usize| ReferenceImage {
         colors: pixels.iter().map(|pixel| pixel[shadow_model].0).collect(),
-        light: pixels.iter().map(|pixel| pixel[shadow_model].1).collect(),
+        sun_visibility: pixels.iter().map(|pixel| pixel[shadow_model].1).collect(),
     };
     (0..shadow_models.len()).map(extract_image).collect()
 }

@@ -9,7 +9,7 @@ use super::reference_texture::{ReferenceTexture, TextureRole};
 use modalcast_model::domain::AlphaMode;
 use modalcast_model::scene::Scene;
 
-/// Alpha mode.
+/// Alpha mode of a material, without the cutoff.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum AlphaKind {
     Opaque,

@@ -50,15 +50,15 @@ impl ReferenceView {
             Lens::Intrinsics { fx, fy, cx, cy } => [fx, fy, cx, cy],
         };
         let rotation = frame_params.camera.camera_from_world().fixed_view::<3, 3>(0, 0).into_owned();
-        let clip = frame_params.camera.clip_from_camera(
+        let clip_from_camera = frame_params.camera.clip_from_camera(
             frame_params.width,
             frame_params.height,
             &frame_params.bounds.union(scene.rest_bounds),
         );
-        let (depth_scale, depth_shift) = (clip[(2, 2)], clip[(2, 3)]);
+        let (depth_scale, depth_shift) = (clip_from_camera[(2, 2)], clip_from_camera[(2, 3)]);
         let eye = frame_params.camera.eye();
-        let up = scene.up.index();
-        let is_above_ground = eye[up] > scene.rest_bounds.min[up];
+        let up_axis = scene.up.index();
+        let is_above_ground = eye[up_axis] > scene.rest_bounds.min[up_axis];
         Self {
             width: frame_params.width,
             height: frame_params.height,
@@ -119,12 +119,12 @@ impl GroundPlane {
     /// A plane at the lowest rest position. The fade distance is 3.5 times the larger of the scene's diagonal and the
     /// horizontal distance of the eye.
     fn new(scene: &Scene, eye: Vector3<f64>, color: Vector3<f64>) -> Self {
-        let (rest_bounds, up) = (scene.rest_bounds, scene.up.index());
-        let height = rest_bounds.min[up];
+        let (rest_bounds, up_axis) = (scene.rest_bounds, scene.up.index());
+        let height = rest_bounds.min[up_axis];
         let mut center = rest_bounds.center().coords;
-        center[up] = height;
+        center[up_axis] = height;
         let mut horizontal_offset = eye - center;
-        horizontal_offset[up] = 0.0;
+        horizontal_offset[up_axis] = 0.0;
         Self {
             height,
             center,

@@ -28,7 +28,7 @@ pub(super) fn gaussian_samples(count: usize, shift: [f64; 2]) -> Vec<[f64; 2]> {
     (0..count).map(point).collect()
 }
 
-/// Two pseudo-random numbers in [0, 1) per pixel.
+/// Two pseudo-random numbers in [0, 1) per pixel, by the hash of `SplitMix64`.
 pub(super) fn pixel_shift(x: u32, y: u32) -> [f64; 2] {
     let mix_bits = |mut word: u64| {
         word = (word ^ (word >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);

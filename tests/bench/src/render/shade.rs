@@ -101,6 +101,7 @@ fn shading_normal(ray_scene: &RayScene, hit: &Hit) -> Vector3<f64> {
         let [x, y, z, sign]: [f64; 4] = [0, 1, 2, 3].map(tangent_component);
         let tangent = Vector3::new(x, y, z);
         if tangent.norm_squared() > 0.0 {
+            // As in the shaders, byte 128 is 0 and byte 255 is 1.
             let [r, g, b] =
                 std::array::from_fn(|channel| (normal_map.sample(ray_scene.uv(hit))[channel] * 255.0 - 128.0) / 127.0);
             let tangent = normalize(tangent - normal * normal.dot(&tangent));

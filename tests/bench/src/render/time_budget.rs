@@ -28,7 +28,7 @@ impl TimeBudget {
         self.finished_steps += 1;
         let first_step = *self.first_step.get_or_insert(elapsed);
         let remaining_steps = self.steps.saturating_sub(1) as u32;
-        // Decide only once, so that a sequence that continues is not cut short.
+        // Decide only once: a sequence that continues after the second step runs to its end.
         let total = (self.finished_steps == 2).then(|| first_step + (elapsed - first_step) * remaining_steps)?;
         (total > self.budget).then(|| {
             let (total, budget) = (total.as_secs_f64(), self.budget.as_secs_f64());

@@ -89,7 +89,7 @@ impl RenderWorkload {
         workload.ok_or_else(|| invalid("load", expected, name))
     }
 
-    /// The name that [`Self::named`] takes.
+    /// The name that [`Self::from_name`] takes.
     pub fn name(self) -> String {
         match self {
             Self::Square => "square".into(),
@@ -122,9 +122,9 @@ impl RenderWorkload {
 
 impl AnimatedScene {
     fn new(workload: RenderWorkload, scene: Arc<Scene>, sliding_domain: Option<usize>) -> Self {
-        let load = Workload::new(workload.name(), scene);
-        let motion = WorkloadMotion::new(&load, None);
-        Self { name: load.name, workload, scene: load.scene, motion, sliding_domain }
+        let deform_workload = Workload::new(workload.name(), scene);
+        let motion = WorkloadMotion::new(&deform_workload, None);
+        Self { name: deform_workload.name, workload, scene: deform_workload.scene, motion, sliding_domain }
     }
 
     /// The camera of the workload's images. It frames the whole scene, except for `shelf` and `images`.

@@ -1,4 +1,5 @@
-//! Builds the plants of table 4.5 with the same v, f, d, d', number of modes and u, but with arbitrary shapes.
+//! Builds the plants of table 4.5 with arbitrary shapes. The counts are those of the table: v, f (triangles), d (domains),
+//! d' (domains with modes), number of modes, and u.
 //!
 //! u counts the rows of all U: three per vertex with modes. v counts the render vertices, which are a different set.
 //! Domains with modes are branches. They have u / 3 vertices in total; their render vertices are corners that are

@@ -41,7 +41,7 @@ fn gpu_memory_rates_are_plausible_and_empty_replay_takes_time() {
 
 /// Per packed vertex, whether a triangle refers to it. The thesis's kernels compute the corners of unfolded triangles,
 /// so they do not compute other vertices.
-fn is_corner_of_triangle(scene: &Scene) -> Vec<bool> {
+fn find_referenced_vertices(scene: &Scene) -> Vec<bool> {
     let mut is_referenced = vec![false; scene.layout.vertices];
     for (domain, slot) in scene.layout.domains.iter().enumerate() {
         let mesh = &scene.shape_of(domain).mesh;
@@ -55,7 +55,7 @@ fn is_corner_of_triangle(scene: &Scene) -> Vec<bool> {
 /// Largest error of a benchmark's positions, over the vertices that a triangle refers to, as a fraction of the diagonal.
 fn relative_error(scene: &Scene, state: &SceneState, positions: &[f32]) -> Result<f64, String> {
     let (is_referenced, reference_positions) =
-        (is_corner_of_triangle(scene), modalcast_compute::reference::deform(scene, state));
+        (find_referenced_vertices(scene), modalcast_compute::reference::deform(scene, state));
     if positions.len() != 3 * is_referenced.len() {
         return Err(format!("expected {} vertices, got {} numbers", is_referenced.len(), positions.len()));
     }
@@ -77,12 +77,12 @@ fn check_benchmark(device: &Device, scene: &Arc<Scene>, states: &[SceneState], b
     assert_eq!(benchmark.input_set_count(), states.len(), "{name}");
     for (input_set, state) in states.iter().enumerate() {
         benchmark.launch(device, input_set).unwrap_or_else(|error| panic!("{name}: {error}"));
-        let positions = benchmark.positions(device).expect("expected a surface");
+        let positions = benchmark.positions(device).expect("positions");
         let error = relative_error(scene, state, &positions)
             .unwrap_or_else(|error| panic!("{name} input set {input_set}: {error}"));
         assert!(
             relative_error(scene, &states[(input_set + 1) % states.len()], &positions).is_err(),
-            "{name}: expected the next state to exceed the tolerance"
+            "control: {name}: expected an error above the tolerance against the next state"
         );
         eprintln!("{name} input set {input_set}: {error:.2e} of the diagonal");
     }
@@ -91,7 +91,7 @@ fn check_benchmark(device: &Device, scene: &Arc<Scene>, states: &[SceneState], b
         benchmark.launch(device, 0).expect("expected a launch");
         let timing =
             time(device, benchmark, cache, 10 * states.len()).unwrap_or_else(|error| panic!("{name}: {error}"));
-        let positions = benchmark.positions(device).expect("expected a surface");
+        let positions = benchmark.positions(device).expect("positions");
         let last_state = &states[states.len() - 1];
         relative_error(scene, last_state, &positions).unwrap_or_else(|error| panic!("{name} replayed: {error}"));
         eprintln!("{name} {cache:?}: {timing:?}, {} launches", benchmark.launches_per_step());
@@ -183,7 +183,7 @@ fn gpu_cublas_matches_reference_with_every_product_kind() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_thesis_kernels_reject_unsupported_scenes() {
     let device = Device::open(0).expect("expected a CUDA device");
-    let (large_scene, two_domain_scene) =
+    let (high_rank_scene, two_domain_scene) =
         (scenes::random_scene(&[(40, 33)], 1, false, false), scenes::random_scene(&[(40, 3)], 2, false, false));
     let invalid_field = |result: Result<ThesisBenchmark, Error>| match result {
         Err(Error::Invalid { field, .. }) => field,
@@ -192,8 +192,8 @@ fn gpu_thesis_kernels_reject_unsupported_scenes() {
     assert_eq!(
         invalid_field(ThesisBenchmark::multi(
             &device,
-            &large_scene,
-            &random_states(&large_scene),
+            &high_rank_scene,
+            &random_states(&high_rank_scene),
             (KernelSplit::Two, Part::Uq)
         )),
         "domain 0: modes"
@@ -202,9 +202,9 @@ fn gpu_thesis_kernels_reject_unsupported_scenes() {
         invalid_field(ThesisBenchmark::single(&device, &two_domain_scene, &random_states(&two_domain_scene), Part::Uq)),
         "scene.domains"
     );
-    assert_eq!(invalid_field(ThesisBenchmark::single(&device, &large_scene, &[], Part::Uq)), "states");
+    assert_eq!(invalid_field(ThesisBenchmark::single(&device, &high_rank_scene, &[], Part::Uq)), "states");
     assert_eq!(
-        invalid_field(ThesisBenchmark::single(&device, &large_scene, &random_states(&two_domain_scene), Part::Uq)),
+        invalid_field(ThesisBenchmark::single(&device, &high_rank_scene, &random_states(&two_domain_scene), Part::Uq)),
         "states"
     );
 }

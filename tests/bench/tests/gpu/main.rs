@@ -1,5 +1,5 @@
 //! GPU tests of the benchmarks. Tests that need a device are ignored by default; run them with `--include-ignored
-//! --test-threads=1`. The binary does not need the build tree.
+//! --test-threads=1`. The test binary also runs on a machine without the sources and the build folder.
 
 #[expect(dead_code, reason = "shared with the tests of the deformer")]
 #[path = "../../../gpu/accuracy.rs"]

@@ -31,7 +31,10 @@ fn gpu_overlapped_steps_are_faster_with_identical_vertices() {
         measurement.overlapped_us < measurement.serial_us,
         "expected overlapped steps to be faster than serial ones"
     );
-    assert!(measurement.overlapped_us > 0.5 * measurement.ideal_us, "expected at least half of the ideal time");
+    assert!(
+        measurement.overlapped_us > 0.5 * measurement.ideal_us,
+        "expected steps to take at least half of the ideal time"
+    );
     assert!(overlap(&device, &workload, &[], 5).is_err() && overlap(&device, &workload, &states, 0).is_err());
     for write in host_writes(&device, 20).expect("measured writes") {
         eprintln!("{write:?}");

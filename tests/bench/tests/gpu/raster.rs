@@ -18,7 +18,7 @@ fn launch_raster(device: &Device, soup: &Soup, variant: RasterVariant) -> Raster
 }
 
 /// Numbers of triangles that the definition drops, by reason, and the number that it draws.
-fn count_triangles(soup: &Soup) -> ([u32; 5], u32) {
+fn count_expected_triangles(soup: &Soup) -> ([u32; 5], u32) {
     let (mut counts_by_reason, mut drawn) = ([0; 5], 0);
     for group in &soup.groups {
         for triangle in &soup.triangles[group.first as usize..][..group.triangles as usize] {
@@ -37,7 +37,7 @@ fn count_triangles(soup: &Soup) -> ([u32; 5], u32) {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_samples_match_the_definition_bitwise_on_every_path() {
+fn gpu_samples_match_definition_at_every_granularity() {
     let device = Device::open(0).expect("expected a CUDA device");
     for soup in all_soups() {
         let definition = soup.rasterize();
@@ -62,20 +62,20 @@ fn gpu_samples_match_the_definition_bitwise_on_every_path() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_counts_every_triangle_once_and_takes_every_path() {
+fn gpu_counts_every_triangle_once_at_every_granularity() {
     let device = Device::open(0).expect("expected a CUDA device");
-    let mut total_by_path = [0; 3];
+    let mut totals_by_size = [0; 3];
     for soup in all_soups() {
         for granularity in [RasterGranularity::BySize, RasterGranularity::Warps, RasterGranularity::Tiles] {
             let variant = RasterVariant { count_triangles: true, granularity, ..RasterVariant::default() };
             let counts = launch_raster(&device, &soup, variant).counts(&device).expect("counts");
             let RasterCounts { small, medium, large, not_finite, outside, flat, back, missed } = counts;
-            let (expected_dropped, expected_drawn) = count_triangles(&soup);
+            let (expected_dropped, expected_drawn) = count_expected_triangles(&soup);
             assert_eq!([not_finite, outside, flat, back, missed], expected_dropped, "{}", soup.name);
             assert_eq!(small + medium + large, expected_drawn, "{}", soup.name);
             match granularity {
                 RasterGranularity::BySize => {
-                    total_by_path = [total_by_path[0] + small, total_by_path[1] + medium, total_by_path[2] + large]
+                    totals_by_size = [totals_by_size[0] + small, totals_by_size[1] + medium, totals_by_size[2] + large]
                 }
                 RasterGranularity::Warps => assert_eq!(small, 0),
                 RasterGranularity::Tiles => assert_eq!(small + medium, 0),
@@ -83,8 +83,8 @@ fn gpu_counts_every_triangle_once_and_takes_every_path() {
         }
     }
     assert!(
-        total_by_path.iter().all(|triangles| *triangles > 10),
-        "expected more than 10 triangles on every path, got {total_by_path:?}"
+        totals_by_size.iter().all(|triangles| *triangles > 10),
+        "expected more than 10 triangles of every size class, got {totals_by_size:?}"
     );
     let counts = launch_raster(&device, &all_soups()[1], RasterVariant::default()).counts(&device).expect("counts");
     assert_eq!(counts, RasterCounts::default(), "expected zeros without `count_triangles`");

@@ -72,7 +72,7 @@ fn add_shared_data(forest: &mut SceneParts, species: &SceneParts) -> [usize; 2] 
 /// # Errors
 /// Only those that the tree's own images would cause.
 pub(super) fn build_blossoming_tree(tree: &SceneParts) -> Result<SceneParts> {
-    let mut parts = SceneParts { name: "peach tree".into(), ..SceneParts::named("peach tree") };
+    let mut parts = SceneParts::named("peach tree");
     add_shared_data(&mut parts, tree);
     parts.domains.clone_from(&tree.domains);
     for (name, tint) in [("leaf", [1.25, 1.12, 0.75]), ("light leaf", [1.85, 1.02, 2.9])] {

@@ -40,13 +40,13 @@ pub(super) fn draw_texture(color: [f32; 3], seed: u64) -> Result<Texture> {
             }
         }
         let twig_coverage = (2.4 - (position[1] - 0.5 * HEIGHT as f32).abs()).clamp(0.0, 1.0);
-        let is_beside_twig = position[0] < TWIG_LENGTH;
-        let [r, g, b] = if twig_coverage > coverage && is_beside_twig {
+        let is_within_twig_length = position[0] < TWIG_LENGTH;
+        let [r, g, b] = if twig_coverage > coverage && is_within_twig_length {
             [96.0, 78.0, 58.0]
         } else {
             color.map(|channel| channel * brightness)
         };
-        let alpha = 255.0 * if is_beside_twig { coverage.max(twig_coverage) } else { coverage };
+        let alpha = 255.0 * if is_within_twig_length { coverage.max(twig_coverage) } else { coverage };
         [r, g, b, alpha].map(|channel| channel.clamp(0.0, 255.0) as u8)
     };
     let rgba: Vec<u8> = (0..WIDTH * HEIGHT).into_par_iter().flat_map_iter(texel).collect();
