@@ -96,11 +96,11 @@ struct OrientedExtent {
     // boxes, so only the union of the four is defined. Reducing the four boxes first makes the result independent of
     // which domains a step changed.
     __device__ __forceinline__ void merge_tile(unsigned (&box)[6]) {
-        const unsigned quad_mask = 0xfu << threadIdx.x % 32 / 4 * 4;
+        const unsigned tile_lane_mask = 0xfu << threadIdx.x % 32 / 4 * 4;
 #pragma unroll
         for (unsigned side = 0; side < 6; ++side) {
-            box[side] = max(box[side], __shfl_xor_sync(quad_mask, box[side], 1));
-            box[side] = max(box[side], __shfl_xor_sync(quad_mask, box[side], 2));
+            box[side] = max(box[side], __shfl_xor_sync(tile_lane_mask, box[side], 1));
+            box[side] = max(box[side], __shfl_xor_sync(tile_lane_mask, box[side], 2));
         }
         // A tile without TILE_VERTICES computes no positions; its box keys are 0.
         if (box[0] == 0) {

@@ -395,6 +395,7 @@ __device__ __forceinline__ void compute_tile(const DeformArgs& args, WarpShared&
         compute_displacements(args, slice, displacements);
 #endif
 #ifdef DISPLACEMENTS
+        // Transpose u from [axis][vertex] to [vertex][axis].
         float u[FLOATS_PER_LANE];
 #pragma unroll
         for (unsigned i = 0; i < FLOATS_PER_LANE; ++i) {

@@ -2,7 +2,7 @@
 // struct and the offset of every field.
 #pragma once
 
-// Threads per block of every kernel but `deform`, and packed corners per block of `normals`.
+// Threads per block of `apply`, `bounds` and `normals`, and packed corners per block of `normals`.
 constexpr unsigned BLOCK = 256;
 // Maximum number of quads (4 vertices of one domain) of a tile, which is the work of one warp.
 constexpr unsigned TILE_QUADS = 32;
@@ -23,7 +23,7 @@ struct Header {
     float4* tangents;
     float* displacements;
     unsigned output_step;      // the output buffers contain all changes up to this step
-    unsigned last_full_step;   // the last step that changed all domains
+    unsigned last_full_step;   // the last full step, which computed all domains
     unsigned step;             // number of this step, from 1
     unsigned change_count;     // number of `Change` entries for `apply`
     unsigned dirty_tile_count; // number of tiles in the tile list

@@ -150,14 +150,15 @@ __device__ __noinline__ void clip_triangle(const RasterArgs& args, float4 a, flo
     for (unsigned plane = 0; plane < 5; ++plane) {
         unsigned new_count = 0;
         for (unsigned i = 0; i < corner_count; ++i) {
-            const float4 a = corner_lists[source][i], b = corner_lists[source][i + 1 == corner_count ? 0 : i + 1];
-            const float distance_a = plane_distance(args, a, plane), distance_b = plane_distance(args, b, plane);
-            if (distance_a >= 0.0f && new_count < MAX_CORNERS) {
-                corner_lists[1 - source][new_count++] = a;
+            const float4 start = corner_lists[source][i], end = corner_lists[source][i + 1 == corner_count ? 0 : i + 1];
+            const float start_distance = plane_distance(args, start, plane), end_distance = plane_distance(args, end, plane);
+            if (start_distance >= 0.0f && new_count < MAX_CORNERS) {
+                corner_lists[1 - source][new_count++] = start;
             }
-            if ((distance_a >= 0.0f) != (distance_b >= 0.0f) && new_count < MAX_CORNERS) {
-                corner_lists[1 - source][new_count++] =
-                    distance_a >= 0.0f ? clip_edge(a, b, distance_a, distance_b) : clip_edge(b, a, distance_b, distance_a);
+            if ((start_distance >= 0.0f) != (end_distance >= 0.0f) && new_count < MAX_CORNERS) {
+                corner_lists[1 - source][new_count++] = start_distance >= 0.0f
+                                                            ? clip_edge(start, end, start_distance, end_distance)
+                                                            : clip_edge(end, start, end_distance, start_distance);
             }
         }
         source = 1 - source;
@@ -216,8 +217,8 @@ struct TriangleSetup {
     int min_edge_a, min_edge_b, min_edge_c; // per corner, `min_covered_edge` of the opposite edge
 
     // Minimum of the edge function at samples that count as covered: 0 includes samples on a top or left edge.
-    __device__ static int min_covered_edge(const SnappedVertex& from, const SnappedVertex& to) {
-        return to.y < from.y || (to.y == from.y && to.x > from.x) ? 0 : 1;
+    __device__ static int min_covered_edge(const SnappedVertex& start, const SnappedVertex& end) {
+        return end.y < start.y || (end.y == start.y && end.x > start.x) ? 0 : 1;
     }
 
     // `doubled_area` is positive. `is_flipped` is true if v0, v1, v2 are counterclockwise on the screen.
@@ -234,8 +235,8 @@ struct TriangleSetup {
         min_edge_c = min_covered_edge(a, b);
     }
 
-    __device__ static EdgeInt edge_function(const SnappedVertex& from, const SnappedVertex& to, int x, int y) {
-        return (EdgeInt)(to.x - from.x) * (y - from.y) - (EdgeInt)(to.y - from.y) * (x - from.x);
+    __device__ static EdgeInt edge_function(const SnappedVertex& start, const SnappedVertex& end, int x, int y) {
+        return (EdgeInt)(end.x - start.x) * (y - start.y) - (EdgeInt)(end.y - start.y) * (x - start.x);
     }
 
     // Whether a pixel's sample lies inside the triangle and not behind the far plane. Sets `depth`, clamped to at least 0.

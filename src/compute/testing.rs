@@ -26,11 +26,11 @@ impl TestRng {
 /// A shape with random vertices and modes; all numbers are from -1 to 1.
 pub fn shape(vertices: usize, rank: usize, rng: &mut TestRng) -> Shape {
     let columns = (0..3 * vertices * rank).map(|_| rng.next()).collect();
-    with_columns(vertices, rank, columns, rng)
+    shape_with_columns(vertices, rank, columns, rng)
 }
 
 /// A shape with random vertices and these columns of U.
-pub fn with_columns(vertices: usize, rank: usize, columns: Vec<f32>, rng: &mut TestRng) -> Shape {
+pub fn shape_with_columns(vertices: usize, rank: usize, columns: Vec<f32>, rng: &mut TestRng) -> Shape {
     let rest_positions: Vec<[f32; 3]> = (0..vertices).map(|_| [rng.next(), rng.next(), rng.next()]).collect();
     let normals = vec![[0.0, 0.0, 1.0]; vertices];
     let mesh = Mesh::from_indexed(rest_positions, normals, vec![], vec![[0; 3]]).expect("a valid mesh");

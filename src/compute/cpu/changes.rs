@@ -32,8 +32,8 @@ impl ChangeTracker {
         };
         let (previous_q, previous_transforms) = (&*q, &*transforms);
         self.flags.par_iter_mut().with_min_len(4096).enumerate().for_each(|(domain, flag)| {
-            let slot = &scene.layout.domains[domain];
-            let q_range = slot.first_q..slot.first_q + slot.rank;
+            let layout = &scene.layout.domains[domain];
+            let q_range = layout.first_q..layout.first_q + layout.rank;
             let root = scene.transform_roots.root_of(domain);
             *flag = as_bytes(&previous_transforms[root].0) != as_bytes(&state.transforms[root].0)
                 || as_bytes(&previous_q[q_range.clone()]) != as_bytes(&state.q[q_range]);

@@ -23,13 +23,13 @@ fn decode_f16(bits: u16) -> f32 {
     // corrects. For all other numbers, 2 x - 2^-14 is at least x.
     let bits = u32::from(bits);
     let x = f32::from_bits((bits << 13 & 0x0fff_e000) + (112 << 23));
-    let corrected = x.mul_add(2.0, -SMALLEST_NORMAL_HALF);
+    let corrected = x.mul_add(2.0, -MIN_NORMAL_F16);
     let magnitude = if x < corrected { x } else { corrected };
     f32::from_bits(magnitude.to_bits() | bits << 16 & 1 << 31)
 }
 
 /// 2^-14, the smallest normal f16.
-pub(super) const SMALLEST_NORMAL_HALF: f32 = 1.0 / (1 << 14) as f32;
+pub(super) const MIN_NORMAL_F16: f32 = 1.0 / (1 << 14) as f32;
 
 /// Decodes two modes of bf16 exactly, without their factors.
 #[inline(always)]
@@ -41,7 +41,7 @@ pub(super) fn unpack_bf16(packed_words: &[PackedWord], columns: &mut [f32]) {
     }
 }
 
-/// Decodes four modes of codes, -127 to 127, without their scales.
+/// Decodes four modes of 8-bit codes to -127 to 127, without their scales.
 #[inline(always)]
 pub(super) fn unpack_int8(packed_words: &[PackedWord], columns: &mut [f32]) {
     let quads = packed_words.len() / 3;
@@ -61,8 +61,8 @@ pub(super) fn unpack_int8(packed_words: &[PackedWord], columns: &mut [f32]) {
     }
 }
 
-/// Separates the two groups of four halves in each packed word of a plane. A plane then has the first groups of all
-/// quads, followed by their second groups.
+/// Separates the two groups of four 16-bit entries in each packed word of a plane. A plane then has the first groups of
+/// all quads, followed by their second groups.
 #[inline(always)]
 fn deinterleave<'a>(packed_words: &[PackedWord], buffer: &'a mut [u64; 6 * TILE_QUADS]) -> &'a [u64] {
     let quads = packed_words.len() / 3;

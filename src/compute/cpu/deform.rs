@@ -99,7 +99,7 @@ fn deform_tile<const COMPENSATED: bool>(
     out: TileOutput,
 ) -> TileBounds {
     let tiles = inputs.tiles_of(tile);
-    let layout = tiles.tile(tile.first() / MAX_TILE_VERTICES);
+    let layout = tiles.tile(tile.first_item() / MAX_TILE_VERTICES);
     if tiles.rank() > 0 {
         sum_modes::<COMPENSATED>(tiles, &layout, inputs.mode_selection(tile), scratch);
     } else {
@@ -107,7 +107,7 @@ fn deform_tile<const COMPENSATED: bool>(
     }
     let poison =
         out.displacements.map_or(0.0, |displacements| store_displacements(inputs, tile, &scratch.sums, displacements));
-    add_rest(&tiles.rest()[layout.first_quad..][..layout.quads], &mut scratch.sums);
+    add_rest_positions(&tiles.rest()[layout.first_quad..][..layout.quads], &mut scratch.sums);
     let transform = inputs.state.transform_of(inputs.scene, tile.domain());
     let tile_bounds = store_positions(&transform, &mut scratch.sums, 4 * layout.quads, out.positions);
     let tile_bounds =
@@ -119,7 +119,7 @@ fn deform_tile<const COMPENSATED: bool>(
 /// are repaired. Returns the result of [`repair_displacements`], else 0.
 #[inline(always)]
 fn store_displacements(inputs: &DeformInputs, tile: &DomainTile, sums: &TileVertices, out: &mut [f32]) -> f32 {
-    let width = tile.count().next_multiple_of(QUAD);
+    let width = tile.item_count().next_multiple_of(QUAD);
     let mut poison = 0.0;
     for (vertex, out) in out.chunks_exact_mut(3).enumerate() {
         out.copy_from_slice(&[sums[vertex], sums[width + vertex], sums[2 * width + vertex]]);
@@ -137,7 +137,7 @@ fn repair_displacements(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32
     let mut poison = 0.0;
     for (vertex, out) in out.chunks_exact_mut(3).enumerate() {
         if !out.iter().all(|number| number.is_finite()) {
-            let displacement = displacement_f64(tiles, q, tile.first() + vertex).map(|number| number as f32);
+            let displacement = displacement_f64(tiles, q, tile.first_item() + vertex).map(|number| number as f32);
             out.copy_from_slice(&displacement);
         }
         out.iter().for_each(|number| poison += number * 0.0);
@@ -168,7 +168,7 @@ impl<'a> DeformInputs<'a> {
 
 /// Adds x0 to the sums of a tile, `[axis][vertex]`.
 #[inline(always)]
-fn add_rest(rest: &[[f32; 12]], sums: &mut TileVertices) {
+fn add_rest_positions(rest: &[[f32; 12]], sums: &mut TileVertices) {
     let width = QUAD * rest.len();
     for (axis, sums) in sums[..3 * width].chunks_exact_mut(width).enumerate() {
         for (sums, quad) in sums.chunks_exact_mut(QUAD).zip(rest) {
@@ -211,7 +211,7 @@ fn repair_non_finite(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32]) 
     let mut tile_bounds = TileBounds::EMPTY;
     for (vertex, out) in out.chunks_exact_mut(3).enumerate() {
         if !out.iter().all(|number| number.is_finite()) {
-            let deformed = deformed_position_f64(tiles, q, tile.first() + vertex);
+            let deformed = deformed_position_f64(tiles, q, tile.first_item() + vertex);
             for (row, out) in out.iter_mut().enumerate() {
                 let [x, y, z, offset] = [0, 1, 2, 3].map(|column| transform[4 * row + column]);
                 *out = (x * deformed[0] + y * deformed[1] + z * deformed[2] + offset) as f32;

@@ -6,7 +6,7 @@ use std::arch::x86_64::{__m256, __m256i};
 use pulp::cast;
 use pulp::x86::V3;
 
-use super::decode::SMALLEST_NORMAL_HALF;
+use super::decode::MIN_NORMAL_F16;
 use crate::storage::{PackedWord, QUAD};
 
 /// Decoder of a storage type. It decodes 32 bytes, one plane of two neighboring quads, to `GROUPS` vectors. Each vector
@@ -30,12 +30,12 @@ impl Decode<2> for DecodeF16 {
     fn decode(simd: V3, packed_words: __m256i) -> [__m256; 2] {
         let mut groups = [simd.avx._mm256_set1_ps(0.0); 2];
         for (group, target) in groups.iter_mut().enumerate() {
-            let bits = simd.avx2._mm256_shuffle_epi8(packed_words, cast(F16_SHUFFLE[group]));
+            let bits = simd.avx2._mm256_shuffle_epi8(packed_words, cast(SHUFFLE_16_BIT[group]));
             // The algorithm of `decode::decode_f16`.
             let mantissa_mask = simd.avx._mm256_set1_epi32(0x0fff_e000);
             let magnitude = simd.avx2._mm256_and_si256(simd.avx2._mm256_srli_epi32::<3>(bits), mantissa_mask);
             let x = cast(simd.avx2._mm256_add_epi32(magnitude, simd.avx._mm256_set1_epi32(112 << 23)));
-            let (two, offset) = (simd.avx._mm256_set1_ps(2.0), simd.avx._mm256_set1_ps(SMALLEST_NORMAL_HALF));
+            let (two, offset) = (simd.avx._mm256_set1_ps(2.0), simd.avx._mm256_set1_ps(MIN_NORMAL_F16));
             let corrected = simd.fma._mm256_fmsub_ps(two, x, offset);
             let sign = simd.avx._mm256_and_ps(cast(bits), simd.avx._mm256_set1_ps(-0.0));
             *target = simd.avx._mm256_or_ps(sign, simd.avx._mm256_min_ps(x, corrected));
@@ -48,8 +48,8 @@ impl Decode<2> for DecodeBf16 {
     #[inline(always)]
     fn decode(simd: V3, packed_words: __m256i) -> [__m256; 2] {
         [
-            cast(simd.avx2._mm256_shuffle_epi8(packed_words, cast(F16_SHUFFLE[0]))),
-            cast(simd.avx2._mm256_shuffle_epi8(packed_words, cast(F16_SHUFFLE[1]))),
+            cast(simd.avx2._mm256_shuffle_epi8(packed_words, cast(SHUFFLE_16_BIT[0]))),
+            cast(simd.avx2._mm256_shuffle_epi8(packed_words, cast(SHUFFLE_16_BIT[1]))),
         ]
     }
 }
@@ -62,7 +62,7 @@ impl Decode<4> for DecodeInt8 {
         let bias = simd.avx._mm256_set1_ps(8_388_608.0 + 128.0);
         let mut groups = [bias; 4];
         for (group, target) in groups.iter_mut().enumerate() {
-            let bytes = simd.avx2._mm256_shuffle_epi8(packed_words, cast(INT8_SHUFFLE[group]));
+            let bytes = simd.avx2._mm256_shuffle_epi8(packed_words, cast(SHUFFLE_8_BIT[group]));
             *target = simd.avx._mm256_sub_ps(cast(simd.avx2._mm256_or_si256(bytes, exponent_bits)), bias);
         }
         groups
@@ -71,32 +71,32 @@ impl Decode<4> for DecodeInt8 {
 
 /// Shuffle masks that move each 16-bit entry of a group to the upper bits of a word. A mask has indices into the 16
 /// bytes of a quad, and 0x80 for zero bytes.
-const F16_SHUFFLE: [[u8; 32]; 2] = [shuffle_mask(2, 0), shuffle_mask(2, 1)];
+const SHUFFLE_16_BIT: [[u8; 32]; 2] = [shuffle_mask(2, 0), shuffle_mask(2, 1)];
 
 /// Shuffle masks that move each byte of a group to the lower bits of a word.
-const INT8_SHUFFLE: [[u8; 32]; 4] = [shuffle_mask(1, 0), shuffle_mask(1, 1), shuffle_mask(1, 2), shuffle_mask(1, 3)];
+const SHUFFLE_8_BIT: [[u8; 32]; 4] = [shuffle_mask(1, 0), shuffle_mask(1, 1), shuffle_mask(1, 2), shuffle_mask(1, 3)];
 
-const fn shuffle_mask(size: u8, group: u8) -> [u8; 32] {
-    let mut shuffle_mask = [0x80; 32];
+const fn shuffle_mask(entry_bytes: u8, group: u8) -> [u8; 32] {
+    let mut mask = [0x80; 32];
     let mut vertex = 0;
     while vertex < 4 {
         let mut byte = 0;
-        while byte < size {
-            // Halves go to bytes 2 and 3 of a word, codes to byte 0.
-            let target_byte = (4 * vertex + if size == 2 { 2 } else { 0 } + byte) as usize;
-            shuffle_mask[target_byte] = size * (4 * group + vertex) + byte;
-            shuffle_mask[target_byte + 16] = shuffle_mask[target_byte];
+        while byte < entry_bytes {
+            // Entries of 16 bits go to bytes 2 and 3 of a word, entries of 8 bits to byte 0.
+            let target_byte = (4 * vertex + if entry_bytes == 2 { 2 } else { 0 } + byte) as usize;
+            mask[target_byte] = entry_bytes * (4 * group + vertex) + byte;
+            mask[target_byte + 16] = mask[target_byte];
             byte += 1;
         }
         vertex += 1;
     }
-    shuffle_mask
+    mask
 }
 
 /// Adds chunks of a tile to its sums, `[axis][vertex]`. A chunk has three planes and `MODES` scaled coordinates. A
 /// group has the entries of four vertices for one mode and axis.
 #[inline(always)]
-pub(super) fn add<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CHUNKS: usize>(
+pub(super) fn add_chunks<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CHUNKS: usize>(
     simd: V3,
     chunks: [(&[PackedWord], [f32; MODES]); CHUNKS],
     sums: &mut [f32],
@@ -110,8 +110,8 @@ pub(super) fn add<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, co
     }
     if quads % 2 == 1 {
         // Process the last quad twice and drop the second result.
-        let mut padded = [[0.0; 2 * QUAD]; 3];
-        let [a, b, c] = &mut padded;
+        let mut padded_sums = [[0.0; 2 * QUAD]; 3];
+        let [a, b, c] = &mut padded_sums;
         a[..QUAD].copy_from_slice(x_tail);
         b[..QUAD].copy_from_slice(y_tail);
         c[..QUAD].copy_from_slice(z_tail);
@@ -131,19 +131,19 @@ fn add_pair<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CH
     sums: [&mut [f32; 2 * QUAD]; 3],
 ) {
     let [x, y, z] = sums;
-    let mut axes: [__m256; 3] = [cast(*x), cast(*y), cast(*z)];
+    let mut axis_sums: [__m256; 3] = [cast(*x), cast(*y), cast(*z)];
     for (packed_words, scaled_q) in chunks {
-        let count = packed_words.len() / 3;
+        let quad_count = packed_words.len() / 3;
         // Groups are ordered by mode, then axis, so this is the order of the sum.
         for plane in 0..3 {
-            let words = [packed_words[plane * count + quads[0]], packed_words[plane * count + quads[1]]];
+            let words = [packed_words[plane * quad_count + quads[0]], packed_words[plane * quad_count + quads[1]]];
             let groups = D::decode(simd, cast(words));
             for (group, entries) in groups.iter().enumerate() {
                 let column = GROUPS * plane + group;
                 let coordinate = simd.avx._mm256_set1_ps(scaled_q[column / 3]);
-                axes[column % 3] = simd.fma._mm256_fmadd_ps(*entries, coordinate, axes[column % 3]);
+                axis_sums[column % 3] = simd.fma._mm256_fmadd_ps(*entries, coordinate, axis_sums[column % 3]);
             }
         }
     }
-    (*x, *y, *z) = (cast(axes[0]), cast(axes[1]), cast(axes[2]));
+    (*x, *y, *z) = (cast(axis_sums[0]), cast(axis_sums[1]), cast(axis_sums[2]));
 }

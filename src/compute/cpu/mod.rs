@@ -68,7 +68,7 @@ impl CpuDeformer {
         let storage = scene.deformation.storage;
         let shapes: Vec<TiledModes> = scene.shapes.par_iter().map(|shape| TiledModes::new(shape, storage)).collect();
         let max_chunks = shapes.iter().map(TiledModes::chunks).max().unwrap_or(0);
-        let vertex_work = WorkList::new(layout.domains.iter().map(|slot| slot.vertices), MAX_TILE_VERTICES);
+        let vertex_work = WorkList::new(layout.domains.iter().map(|domain| domain.vertices), MAX_TILE_VERTICES);
         Self {
             scene: Arc::clone(scene),
             bounding_axes: None,
@@ -78,7 +78,7 @@ impl CpuDeformer {
             tile_bounds: vec![TileBounds::EMPTY; vertex_work.len()],
             shapes,
             vertex_work,
-            corner_work: WorkList::new(layout.domains.iter().map(|slot| slot.corners), MAX_TILE_CORNERS),
+            corner_work: WorkList::new(layout.domains.iter().map(|domain| domain.corners), MAX_TILE_CORNERS),
             surface: DeformedSurface {
                 positions: vec![0.0; 3 * layout.vertices],
                 normals: vec![0.0; 3 * layout.corners],

@@ -16,7 +16,7 @@ use modalcast_model::scene::{Scene, SceneState};
 const RESOLUTION: f64 = 1.0 / 262_144.0;
 
 /// As in the twin: squared length below which the sum of two unit vectors counts as zero.
-const OPPOSITE: f64 = 1e-10;
+const MIN_BISECTOR_SQUARED_LENGTH: f64 = 1e-10;
 
 /// Writes the normals of these tiles, three f32 per corner, and the tangents, four f32 per corner, if the scene has
 /// normal maps. Reads the surface's positions.
@@ -34,7 +34,7 @@ pub(super) fn compute_normals(scene: &Scene, state: &SceneState, tiles: &[Domain
             }
             rotate_to_surface(
                 &DeformedDomain::new(scene, state, tile.domain(), positions),
-                tile.first(),
+                tile.first_item(),
                 normals,
                 tangents,
             );
@@ -42,15 +42,17 @@ pub(super) fn compute_normals(scene: &Scene, state: &SceneState, tiles: &[Domain
     });
 }
 
-/// Rotates the rigid normals and tangents of a domain's corners, from `first` on, with the surface.
-fn rotate_to_surface(surface: &DeformedDomain, first: usize, normals: &mut [f32], tangents: &mut [f32]) {
+/// Rotates the rigid normals and tangents of a domain's corners, from `first_corner` on, with the surface.
+fn rotate_to_surface(surface: &DeformedDomain, first_corner: usize, normals: &mut [f32], tangents: &mut [f32]) {
     let Some(smoothing) = surface.smoothing else { return };
     let mut tangents = tangents.chunks_exact_mut(4);
-    for (group, normal) in smoothing.corner_groups()[first..].iter().zip(normals.chunks_exact_mut(3)) {
+    for (group, normal) in smoothing.corner_groups()[first_corner..].iter().zip(normals.chunks_exact_mut(3)) {
         let tangent = tangents.next();
         let Some(surface_rotation) = surface.surface_rotation(smoothing, *group as usize) else { continue };
-        let rotated_normal =
-            surface_rotation.rotate(to_vector(normal)).try_normalize(0.0).unwrap_or(surface_rotation.to);
+        let rotated_normal = surface_rotation
+            .rotate(to_vector(normal))
+            .try_normalize(0.0)
+            .unwrap_or(surface_rotation.deformed_direction);
         normal.copy_from_slice(rotated_normal.cast::<f32>().as_slice());
         if let Some(tangent) = tangent.filter(|tangent| tangent[3] != 0.0) {
             let rotated_tangent = orthogonalize(surface_rotation.rotate(to_vector(tangent)), rotated_normal);
@@ -70,23 +72,25 @@ struct DeformedDomain<'a> {
 
 impl<'a> DeformedDomain<'a> {
     fn new(scene: &'a Scene, state: &SceneState, domain: usize, positions: &'a [f32]) -> Self {
-        let slot = scene.layout.domains[domain];
+        let layout = scene.layout.domains[domain];
         Self {
             smoothing: scene.shape_of(domain).smoothing(),
-            positions: &positions[3 * slot.first_vertex..][..3 * slot.vertices],
+            positions: &positions[3 * layout.first_vertex..][..3 * layout.vertices],
             area_transform: cofactors(&state.composed_transform(scene, domain).linear()),
         }
     }
 
     /// The rotation of the surface around a group; `None` where it cannot be determined.
     fn surface_rotation(&self, smoothing: &SmoothingGroups, group: usize) -> Option<ShortestArc> {
-        let (area_sum, rounding) = self.sum_areas(smoothing.ring(group));
-        let is_resolved = area_sum.norm() > RESOLUTION * rounding;
+        let (area_sum, rounding_scale) = self.sum_areas(smoothing.ring(group));
+        let is_resolved = area_sum.norm() > RESOLUTION * rounding_scale;
         let rest_area = self.area_transform * Vector3::from(smoothing.normals()[group]).cast();
         // Scale first, because the squares of tiny cofactors may underflow.
-        let largest = rest_area.amax();
-        (is_resolved && largest > 0.0)
-            .then(|| ShortestArc { from: (rest_area / largest).normalize(), to: area_sum.normalize() })
+        let max_component = rest_area.amax();
+        (is_resolved && max_component > 0.0).then(|| ShortestArc {
+            rigid_direction: (rest_area / max_component).normalize(),
+            deformed_direction: area_sum.normalize(),
+        })
     }
 
     /// The sum of the area vectors around a ring, and its rounding scale B as the twin defines it.
@@ -94,7 +98,7 @@ impl<'a> DeformedDomain<'a> {
         let position = |entry: u32| to_vector(&self.positions[3 * (entry & !RING_START) as usize..]);
         let center = position(ring[0]);
         let center_l1 = center.abs().sum();
-        let (mut sum, mut rounding) = (Vector3::zeros(), 0.0);
+        let (mut sum, mut rounding_scale) = (Vector3::zeros(), 0.0);
         let (mut previous_edge, mut previous_rounding) = (Vector3::zeros(), 0.0);
         for entry in &ring[1..] {
             let edge = position(*entry) - center;
@@ -102,33 +106,33 @@ impl<'a> DeformedDomain<'a> {
             let edge_rounding = edge_l1 * (edge_l1 + center_l1);
             if entry & RING_START == 0 {
                 sum += previous_edge.cross(&edge);
-                rounding += previous_rounding + edge_rounding;
+                rounding_scale += previous_rounding + edge_rounding;
             }
             (previous_edge, previous_rounding) = (edge, edge_rounding);
         }
-        (sum, rounding)
+        (sum, rounding_scale)
     }
 }
 
-/// The rotation of a surface, as its unit directions before and after.
+/// The smallest rotation of a surface: from its rigid to its deformed unit direction.
 struct ShortestArc {
-    from: Vector3<f64>,
-    to: Vector3<f64>,
+    rigid_direction: Vector3<f64>,
+    deformed_direction: Vector3<f64>,
 }
 
 impl ShortestArc {
-    /// Applies the smallest rotation that takes `from` to `to`.
+    /// Applies the smallest rotation that takes `rigid_direction` to `deformed_direction`.
     fn rotate(&self, vector: Vector3<f64>) -> Vector3<f64> {
-        let parallel = self.from.dot(&vector);
-        let perpendicular = vector - self.from * parallel;
-        let bisector = self.from + self.to;
+        let parallel_component = self.rigid_direction.dot(&vector);
+        let perpendicular = vector - self.rigid_direction * parallel_component;
+        let bisector = self.rigid_direction + self.deformed_direction;
         let bisector_squared = bisector.norm_squared();
-        let reflected = if bisector_squared < OPPOSITE {
+        let reflected = if bisector_squared < MIN_BISECTOR_SQUARED_LENGTH {
             perpendicular
         } else {
             perpendicular - bisector * (2.0 * bisector.dot(&perpendicular) / bisector_squared)
         };
-        self.to * parallel + reflected
+        self.deformed_direction * parallel_component + reflected
     }
 }
 

@@ -12,7 +12,7 @@ use modalcast_model::scene::{Scene, SceneState};
 pub(super) struct RetainedModes {
     /// Maximum error of a vertex by truncation, in scene units.
     budget: f64,
-    /// Per shape.
+    /// Per shape and mode.
     max_row_norms: Vec<Vec<f64>>,
     domains: Vec<DomainModes>,
 }

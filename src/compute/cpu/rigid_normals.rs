@@ -31,7 +31,7 @@ pub(super) fn write_rigid_normals(scene: &Scene, state: &SceneState, tile: &Doma
     let normal_transform =
         if scene.features.shear { cofactors(&linear) * linear.determinant().signum() } else { linear };
     let normal_transform = limit_entries(normal_transform);
-    let normals = &scene.shape_of(tile.domain()).mesh.corners().normals[tile.first()..][..tile.count()];
+    let normals = &scene.shape_of(tile.domain()).mesh.corners().normals[tile.first_item()..][..tile.item_count()];
     for (normal, out) in normals.iter().zip(out.chunks_exact_mut(3)) {
         out.copy_from_slice(normalize_or_z(normal_transform * Vector3::from(*normal)).as_slice());
     }
@@ -46,7 +46,8 @@ pub(super) fn write_rigid_tangents(scene: &Scene, state: &SceneState, tile: &Dom
     let linear = state.composed_transform(scene, tile.domain()).linear();
     let determinant_sign = linear.determinant().signum() as f32;
     let tangent_transform = limit_entries(linear);
-    for ([x, y, z, sign], out) in tangents[tile.first()..][..tile.count()].iter().zip(out.chunks_exact_mut(4)) {
+    for ([x, y, z, sign], out) in tangents[tile.first_item()..][..tile.item_count()].iter().zip(out.chunks_exact_mut(4))
+    {
         out[..3].copy_from_slice(normalize_or_z(tangent_transform * Vector3::new(*x, *y, *z)).as_slice());
         out[3] = sign * determinant_sign;
     }
@@ -54,8 +55,8 @@ pub(super) fn write_rigid_tangents(scene: &Scene, state: &SceneState, tile: &Dom
 
 /// Scales entries to at most 1, so that squares of very large or small entries neither overflow nor underflow f32.
 fn limit_entries(matrix: Matrix3<f64>) -> Matrix3<f32> {
-    let largest = matrix.abs().max();
-    if largest > 0.0 { (matrix / largest).cast() } else { matrix.cast() }
+    let max_entry = matrix.abs().max();
+    if max_entry > 0.0 { (matrix / max_entry).cast() } else { matrix.cast() }
 }
 
 pub(super) fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {

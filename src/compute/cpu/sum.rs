@@ -54,6 +54,7 @@ pub(super) fn sum_modes<const COMPENSATED: bool>(
     sum_columns::<COMPENSATED>(tiles, tile, mode_selection, scratch);
 }
 
+/// Decodes columns to scratch memory, then adds them.
 #[inline(always)]
 fn sum_columns<const COMPENSATED: bool>(
     tiles: &TiledModes,
@@ -83,6 +84,7 @@ fn sum_columns<const COMPENSATED: bool>(
     }
 }
 
+/// Decodes in vector registers, without columns in memory (`fused`).
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
 fn sum_fused(
@@ -163,17 +165,17 @@ impl TileChunks<'_> {
         let with_scaled_q = |chunk: u16| (self.chunk(chunk), self.scaled_q(chunk));
         let mut pairs = self.chunks.chunks_exact(2);
         for pair in pairs.by_ref() {
-            fused::add::<D, 2, 2, 2>(simd, [with_scaled_q(pair[0]), with_scaled_q(pair[1])], sums);
+            fused::add_chunks::<D, 2, 2, 2>(simd, [with_scaled_q(pair[0]), with_scaled_q(pair[1])], sums);
         }
         for chunk in pairs.remainder() {
-            fused::add::<D, 2, 2, 1>(simd, [with_scaled_q(*chunk)], sums);
+            fused::add_chunks::<D, 2, 2, 1>(simd, [with_scaled_q(*chunk)], sums);
         }
     }
 
     #[inline(always)]
     fn fuse_int8(&self, simd: pulp::x86::V3, sums: &mut [f32]) {
         for chunk in self.chunks {
-            fused::add::<fused::DecodeInt8, 4, 4, 1>(simd, [(self.chunk(*chunk), self.scaled_q(*chunk))], sums);
+            fused::add_chunks::<fused::DecodeInt8, 4, 4, 1>(simd, [(self.chunk(*chunk), self.scaled_q(*chunk))], sums);
         }
     }
 }
@@ -276,7 +278,7 @@ fn split_columns<const N: usize>(columns: &Columns, length: usize) -> [&[f32]; N
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{TestRng, with_columns};
+    use crate::testing::{TestRng, shape_with_columns};
     use modalcast_model::domain::Shape;
 
     /// The expected sums of one tile of f32, `[axis][vertex]`.
@@ -295,7 +297,7 @@ mod tests {
             // Every fifth entry is subnormal in f16.
             let entry = |index: usize, value: f32| if index.is_multiple_of(5) { value * 1e-8 } else { value };
             let columns = (0..3 * vertices * rank).map(|index| entry(index, rng.next())).collect();
-            let shape = with_columns(vertices, rank, columns, &mut rng);
+            let shape = shape_with_columns(vertices, rank, columns, &mut rng);
             for storage in StorageType::ALL {
                 let tiles = TiledModes::new(&shape, storage);
                 let mut q: Vec<f32> = (0..rank).map(|_| rng.next()).collect();

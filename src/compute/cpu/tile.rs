@@ -3,15 +3,15 @@
 
 use super::changes::ChangeTracker;
 
-/// `count` consecutive items of one domain, from item `first` on.
+/// Consecutive items (vertices or corners) of one domain.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct DomainTile {
     pub(super) domain: u32,
     /// Index of the first item in the domain.
-    first: u32,
-    count: u32,
-    /// Index of item `first` among the packed items of all domains.
-    first_packed: u32,
+    first_item: u32,
+    item_count: u32,
+    /// Index of the first item among the packed items of all domains.
+    first_packed_item: u32,
     /// Index of the tile among all tiles.
     index: u32,
 }
@@ -22,12 +22,12 @@ impl DomainTile {
     }
 
     /// Index of the first item in the domain.
-    pub(super) const fn first(&self) -> usize {
-        self.first as usize
+    pub(super) const fn first_item(&self) -> usize {
+        self.first_item as usize
     }
 
-    pub(super) const fn count(&self) -> usize {
-        self.count as usize
+    pub(super) const fn item_count(&self) -> usize {
+        self.item_count as usize
     }
 }
 
@@ -44,12 +44,18 @@ impl WorkList {
     /// Creates tiles of at most `max_items` items for domains with these numbers of items, in packed order. Each item
     /// is in one tile.
     pub(super) fn new(item_counts: impl Iterator<Item = usize>, max_items: usize) -> Self {
-        let (mut all_tiles, mut first_tiles, mut first_packed) = (Vec::new(), vec![0], 0);
-        for (domain, count) in item_counts.enumerate() {
-            for first in (0..count).step_by(max_items) {
-                let [domain, first, count] = [domain, first, max_items.min(count - first)].map(|number| number as u32);
-                all_tiles.push(DomainTile { domain, first, count, first_packed, index: all_tiles.len() as u32 });
-                first_packed += count;
+        let (mut all_tiles, mut first_tiles, mut first_packed_item) = (Vec::new(), vec![0], 0);
+        for (domain, domain_items) in item_counts.enumerate() {
+            for first_item in (0..domain_items).step_by(max_items) {
+                let item_count = max_items.min(domain_items - first_item) as u32;
+                all_tiles.push(DomainTile {
+                    domain: domain as u32,
+                    first_item: first_item as u32,
+                    item_count,
+                    first_packed_item,
+                    index: all_tiles.len() as u32,
+                });
+                first_packed_item += item_count;
             }
             first_tiles.push(all_tiles.len());
         }
@@ -88,7 +94,7 @@ pub(super) trait SplitOutput: Sized + Send {
 #[derive(Debug)]
 pub(super) struct PackedOutput<'a> {
     /// Index of the first packed item of the part.
-    first: usize,
+    first_item: usize,
     /// Numbers per item.
     width: usize,
     numbers: &'a mut [f32],
@@ -97,21 +103,21 @@ pub(super) struct PackedOutput<'a> {
 impl<'a> PackedOutput<'a> {
     /// The complete output.
     pub(super) const fn new(width: usize, numbers: &'a mut [f32]) -> Self {
-        Self { first: 0, width, numbers }
+        Self { first_item: 0, width, numbers }
     }
 
     /// The numbers of a tile.
     pub(super) fn numbers_of(&mut self, tile: &DomainTile) -> &mut [f32] {
-        let start = self.width * (tile.first_packed as usize - self.first);
-        &mut self.numbers[start..][..self.width * tile.count()]
+        let start = self.width * (tile.first_packed_item as usize - self.first_item);
+        &mut self.numbers[start..][..self.width * tile.item_count()]
     }
 }
 
 impl SplitOutput for PackedOutput<'_> {
     fn split_at_tile(self, tile: &DomainTile) -> (Self, Self) {
-        let first = tile.first_packed as usize;
-        let (left, right) = self.numbers.split_at_mut(self.width * (first - self.first));
-        (Self { numbers: left, ..self }, Self { first, width: self.width, numbers: right })
+        let first_item = tile.first_packed_item as usize;
+        let (left, right) = self.numbers.split_at_mut(self.width * (first_item - self.first_item));
+        (Self { numbers: left, ..self }, Self { first_item, width: self.width, numbers: right })
     }
 }
 
@@ -119,27 +125,27 @@ impl SplitOutput for PackedOutput<'_> {
 #[derive(Debug)]
 pub(super) struct PerTileOutput<'a, T> {
     /// Index of the first tile of the part.
-    first: usize,
+    first_tile: usize,
     values: &'a mut [T],
 }
 
 impl<'a, T> PerTileOutput<'a, T> {
     /// The complete output.
     pub(super) const fn new(values: &'a mut [T]) -> Self {
-        Self { first: 0, values }
+        Self { first_tile: 0, values }
     }
 
     /// The value of a tile.
     pub(super) fn value_of(&mut self, tile: &DomainTile) -> &mut T {
-        &mut self.values[tile.index as usize - self.first]
+        &mut self.values[tile.index as usize - self.first_tile]
     }
 }
 
 impl<T: Send> SplitOutput for PerTileOutput<'_, T> {
     fn split_at_tile(self, tile: &DomainTile) -> (Self, Self) {
-        let first = tile.index as usize;
-        let (left, right) = self.values.split_at_mut(first - self.first);
-        (Self { first: self.first, values: left }, Self { first, values: right })
+        let first_tile = tile.index as usize;
+        let (left, right) = self.values.split_at_mut(first_tile - self.first_tile);
+        (Self { first_tile: self.first_tile, values: left }, Self { first_tile, values: right })
     }
 }
 
@@ -197,7 +203,7 @@ mod tests {
         let mut work = WorkList::new(COUNTS.into_iter(), 256);
         let tiles = work.select_changed(&ChangeTracker::with_all_changed()).to_vec();
         assert_eq!(tiles.iter().map(DomainTile::domain).collect::<Vec<_>>(), [1, 2, 3, 3, 4, 4, 4]);
-        assert!(tiles.iter().all(|tile| tile.count() >= 1 && tile.count() <= 256));
+        assert!(tiles.iter().all(|tile| tile.item_count() >= 1 && tile.item_count() <= 256));
         let mut output = vec![0.0; 3 * COUNTS.iter().sum::<usize>()];
         let mut visits = vec![0; work.len()];
         let outputs = (PackedOutput::new(3, &mut output), PerTileOutput::new(&mut visits));

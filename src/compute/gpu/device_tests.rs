@@ -15,7 +15,7 @@ const LOSE_DEVICE: &str = "MODALCAST_TEST_LOSES_DEVICE";
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_other_scenes_run_after_a_panic_during_capture() {
+fn gpu_steps_run_after_a_panic_during_capture() {
     let device = Device::open(0).expect("a CUDA device");
     let (scene, state) = scene_and_state(&[(300, 5, 10)]);
     let mut deformer = CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).expect("a deformer");
@@ -91,11 +91,11 @@ fn lose_device() {
     assert!(is_lost(device.synchronize("test")), "expected the kernel to trap");
     assert!(is_lost(first_deformer.surface().map(|_| ())));
     assert!(is_lost(first_deformer.deform(&state)));
-    assert!(is_lost(first_deformer.deform(&state)), "a second call");
+    assert!(is_lost(first_deformer.deform(&state)), "expected a second call to fail, too");
     assert!(is_lost(second_deformer.wait_readback(&pending)));
-    assert!(is_lost(second_deformer.deform(&state)), "another scene");
+    assert!(is_lost(second_deformer.deform(&state)), "expected the other deformer to fail, too");
     assert!(is_lost(DeviceBuffer::upload(&device, &[1_u32])));
     assert!(is_lost(CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).map(|_| ())));
     drop((first_deformer, second_deformer, pending));
-    assert!(is_lost(device.synchronize("test")), "after all objects are dropped");
+    assert!(is_lost(device.synchronize("test")), "expected a lost device after all objects were dropped");
 }

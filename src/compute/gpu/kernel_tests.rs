@@ -125,7 +125,14 @@ fn nvrtc_compiles_every_kernel_without_spilling() {
         };
         let spilling: Vec<String> =
             variants.iter().zip(compile_variants(&kernel, &variants)).filter_map(describe_spill).collect();
-        assert_eq!(spilling, Vec::<String>::new(), "{} of {} of {}", spilling.len(), variants.len(), kernel.name);
+        assert_eq!(
+            spilling,
+            Vec::<String>::new(),
+            "{} of {} variants of {} spill",
+            spilling.len(),
+            variants.len(),
+            kernel.name
+        );
     }
 }
 
@@ -190,7 +197,7 @@ fn nvrtc_layout_equals_the_host_layout() {
 
 #[test]
 #[ignore = "needs NVRTC: deploy/check installs it"]
-fn nvrtc_errors_contain_the_log() {
+fn nvrtc_reports_invalid_code_and_unknown_architectures() {
     let nvrtc = nvrtc().expect("NVRTC");
     let result = nvrtc.compile(&CompileJob::new("broken", "__global__ void f() { wrong; }", &[], (8, 0)));
     assert!(result.expect_err("invalid C++").to_string().contains("wrong"));

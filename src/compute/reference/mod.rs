@@ -46,8 +46,8 @@ impl ReferenceDeformer {
             }
         }
         if scene.features.boxes {
-            let box_of = |slot: &DomainLayout| {
-                BoundingBox::from_positions(&surface.positions[3 * slot.first_vertex..][..3 * slot.vertices])
+            let box_of = |layout: &DomainLayout| {
+                BoundingBox::from_positions(&surface.positions[3 * layout.first_vertex..][..3 * layout.vertices])
             };
             surface.boxes = scene.layout.domains.iter().map(box_of).collect();
         }

@@ -44,7 +44,7 @@ use modalcast_model::scene::{Scene, SceneState};
 const RESOLUTION: f64 = 1.0 / 262_144.0;
 
 /// Two unit vectors are opposite if the squared length of their sum is below this: half a turn, within 1e-5 rad.
-const OPPOSITE: f64 = 1e-10;
+const MIN_BISECTOR_SQUARED_LENGTH: f64 = 1e-10;
 
 /// World unit normals, one per corner, of a surface at `positions` (the result of `deform` for the same state).
 pub fn exact_normals(scene: &Scene, state: &SceneState, positions: &[[f64; 3]]) -> Vec<[f64; 3]> {
@@ -74,28 +74,30 @@ pub fn exact_tangents(scene: &Scene, state: &SceneState, positions: &[[f64; 3]])
     tangents
 }
 
-/// The rotation of a group's surface: unit directions of its rest sum and its current sum.
+/// The smallest rotation of a group's surface: from the unit direction of its rest sum to that of its current sum.
 struct ShortestArc {
-    from: Vector3<f64>,
-    to: Vector3<f64>,
+    rest_direction: Vector3<f64>,
+    current_direction: Vector3<f64>,
 }
 
 impl ShortestArc {
-    /// Applies the smallest rotation that takes `from` to `to`. The component parallel to `from` becomes parallel to
-    /// `to`. The perpendicular component is reflected at the plane perpendicular to the bisector.
+    /// Applies the smallest rotation that takes `rest_direction` to `current_direction`. The component parallel to
+    /// `rest_direction` becomes parallel to `current_direction`. The perpendicular component is reflected at the plane
+    /// perpendicular to the bisector.
     fn rotate(&self, vector: Vector3<f64>) -> Vector3<f64> {
-        let parallel = self.from.dot(&vector);
-        let perpendicular = vector - self.from * parallel;
-        let bisector = self.from + self.to;
-        if bisector.norm_squared() < OPPOSITE {
-            return self.to * parallel + perpendicular;
+        let parallel_component = self.rest_direction.dot(&vector);
+        let perpendicular = vector - self.rest_direction * parallel_component;
+        let bisector = self.rest_direction + self.current_direction;
+        if bisector.norm_squared() < MIN_BISECTOR_SQUARED_LENGTH {
+            return self.current_direction * parallel_component + perpendicular;
         }
-        self.to * parallel + perpendicular - bisector * (2.0 * bisector.dot(&perpendicular) / bisector.norm_squared())
+        self.current_direction * parallel_component + perpendicular
+            - bisector * (2.0 * bisector.dot(&perpendicular) / bisector.norm_squared())
     }
 }
 
 fn rotate_normal(rotation: &ShortestArc, rigid_normal: [f64; 3]) -> Vector3<f64> {
-    normalize_scaled(rotation.rotate(rigid_normal.into())).unwrap_or(rotation.to)
+    normalize_scaled(rotation.rotate(rigid_normal.into())).unwrap_or(rotation.current_direction)
 }
 
 /// A tangent without its component along the normal; if nothing remains, any unit vector perpendicular to the normal.
@@ -112,23 +114,23 @@ fn for_each_rotated_corner(
     positions: &[[f64; 3]],
     mut process: impl FnMut(usize, &ShortestArc),
 ) {
-    for (domain, slot) in scene.layout.domains.iter().enumerate() {
+    for (domain, layout) in scene.layout.domains.iter().enumerate() {
         let shape = scene.shape_of(domain);
         let Some(smoothing) = shape.smoothing() else { continue };
         let rest_areas = sum_areas(&shape.mesh, smoothing.corner_groups(), |vertex| {
             shape.mesh.rest_positions()[vertex].map(f64::from)
         });
         let current_areas =
-            sum_areas(&shape.mesh, smoothing.corner_groups(), |vertex| positions[slot.first_vertex + vertex]);
+            sum_areas(&shape.mesh, smoothing.corner_groups(), |vertex| positions[layout.first_vertex + vertex]);
         let area_transform = cofactors(&state.composed_transform(scene, domain).linear());
         for (corner, group) in smoothing.corner_groups().iter().enumerate() {
             let group = *group as usize;
             let has_normal = smoothing.normals()[group] != [0.0; 3];
-            let is_resolved = current_areas[group].sum.norm() > RESOLUTION * current_areas[group].rounding;
+            let is_resolved = current_areas[group].sum.norm() > RESOLUTION * current_areas[group].rounding_scale;
             let directions =
                 (normalize_scaled(area_transform * rest_areas[group].sum), normalize_scaled(current_areas[group].sum));
-            if let (true, (Some(from), Some(to))) = (has_normal && is_resolved, directions) {
-                process(slot.first_corner + corner, &ShortestArc { from, to });
+            if let (true, (Some(rest_direction), Some(current_direction))) = (has_normal && is_resolved, directions) {
+                process(layout.first_corner + corner, &ShortestArc { rest_direction, current_direction });
             }
         }
     }
@@ -138,12 +140,12 @@ fn for_each_rotated_corner(
 #[derive(Clone, Default)]
 struct Area {
     sum: Vector3<f64>,
-    rounding: f64,
+    rounding_scale: f64,
 }
 
 /// The areas of all groups.
-fn sum_areas(mesh: &Mesh, members: &[u32], position: impl Fn(usize) -> [f64; 3]) -> Vec<Area> {
-    let mut group_areas = vec![Area::default(); members.len()];
+fn sum_areas(mesh: &Mesh, corner_groups: &[u32], position: impl Fn(usize) -> [f64; 3]) -> Vec<Area> {
+    let mut group_areas = vec![Area::default(); corner_groups.len()];
     let l1 = |vector: Vector3<f64>| vector.abs().sum();
     for triangle in mesh.triangles() {
         let [a, b, c] = triangle.map(|corner| mesh.corners().vertices[corner as usize]);
@@ -158,9 +160,9 @@ fn sum_areas(mesh: &Mesh, members: &[u32], position: impl Fn(usize) -> [f64; 3])
                 position_of(corner + 1) - position_of(corner),
                 position_of(corner + 2) - position_of(corner),
             );
-            let area = &mut group_areas[members[triangle[corner] as usize] as usize];
+            let area = &mut group_areas[corner_groups[triangle[corner] as usize] as usize];
             area.sum += first_edge.cross(&second_edge);
-            area.rounding +=
+            area.rounding_scale +=
                 [first_edge, second_edge].map(|edge| l1(edge) * (l1(edge) + l1(center))).iter().sum::<f64>();
         }
     }
@@ -169,6 +171,6 @@ fn sum_areas(mesh: &Mesh, members: &[u32], position: impl Fn(usize) -> [f64; 3])
 
 /// A vector divided by its length, without overflow or underflow; `None` if it is zero or not finite.
 fn normalize_scaled(vector: Vector3<f64>) -> Option<Vector3<f64>> {
-    let largest = vector.amax();
-    (largest > 0.0 && largest.is_finite()).then(|| (vector / largest).normalize())
+    let max_component = vector.amax();
+    (max_component > 0.0 && max_component.is_finite()).then(|| (vector / max_component).normalize())
 }

@@ -192,8 +192,9 @@ pub fn fan_triangles(clipped_polygon: &ClippedPolygon) -> Vec<[SnappedVertex; 3]
 pub fn depth_at(triangle: &[SnappedVertex; 3], column: i32, row: i32) -> Option<f32> {
     let (x, y) = (SUBPIXEL_STEPS * column + SUBPIXEL_STEPS / 2, SUBPIXEL_STEPS * row + SUBPIXEL_STEPS / 2);
     let [a, b, c] = triangle;
-    let edge_values = [(b, c), (c, a), (a, b)].map(|(from, to)| (edge(from, to, x, y), top_left_bias(from, to)));
-    if edge_values.iter().any(|(value, top_left_bias)| value < top_left_bias) {
+    let edge_values =
+        [(b, c), (c, a), (a, b)].map(|(start, end)| (edge(start, end, x, y), min_covered_edge(start, end)));
+    if edge_values.iter().any(|(value, min_covered_edge)| value < min_covered_edge) {
         return None;
     }
     let inverse_area = 1.0 / doubled_area(triangle) as f32;
@@ -203,14 +204,14 @@ pub fn depth_at(triangle: &[SnappedVertex; 3], column: i32, row: i32) -> Option<
 }
 
 /// The edge function at a point: positive on the right of the edge, with y down.
-pub fn edge(from: &SnappedVertex, to: &SnappedVertex, x: i32, y: i32) -> i64 {
-    let [dx, dy] = [to.x - from.x, to.y - from.y].map(i64::from);
-    dx * i64::from(y - from.y) - dy * i64::from(x - from.x)
+pub fn edge(start: &SnappedVertex, end: &SnappedVertex, x: i32, y: i32) -> i64 {
+    let [dx, dy] = [end.x - start.x, end.y - start.y].map(i64::from);
+    dx * i64::from(y - start.y) - dy * i64::from(x - start.x)
 }
 
 /// Smallest value of an edge function at covered samples: 0 for top and left edges, 1 for other edges.
-fn top_left_bias(from: &SnappedVertex, to: &SnappedVertex) -> i64 {
-    i64::from(!(to.y < from.y || (to.y == from.y && to.x > from.x)))
+fn min_covered_edge(start: &SnappedVertex, end: &SnappedVertex) -> i64 {
+    i64::from(!(end.y < start.y || (end.y == start.y && end.x > start.x)))
 }
 
 /// Twice the signed area in (1/256 pixel)^2, positive if the corners are clockwise on the screen.

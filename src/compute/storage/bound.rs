@@ -24,7 +24,7 @@ use modalcast_model::scene::StorageType;
 /// Safety factor: more than the rounding error of the few thousand f64 operations of a bound.
 const ROUND_UP: f64 = 1.0 + 1e-12;
 /// u, the unit roundoff of f32.
-const UNIT: f64 = 1.0 / (1 << 24) as f64;
+const UNIT_ROUNDOFF: f64 = 1.0 / (1 << 24) as f64;
 /// 2^-150, half of the smallest f32.
 const UNDERFLOW: f64 = f64::from_bits((1023 - 150) << 52);
 const SQRT_3: f64 = 1.732_050_807_568_878;
@@ -126,10 +126,10 @@ impl ShapeErrorModel {
     }
 
     /// Bounds of the vertices of tile `tile`.
-    pub fn tile(&self, tile: usize, step: &ErrorBoundInput) -> ErrorBound {
+    pub fn tile(&self, tile: usize, input: &ErrorBoundInput) -> ErrorBound {
         let modes = &self.modes[self.rank * tile..][..self.rank];
         let mut sums = ModeSums::default();
-        for (mode, q) in modes.iter().zip(step.q) {
+        for (mode, q) in modes.iter().zip(input.q) {
             let coordinate = f64::from(q.abs());
             sums.storage += coordinate * mode.half_step;
             if coordinate == 0.0 || mode.max_row_norm == 0.0 {
@@ -142,51 +142,52 @@ impl ShapeErrorModel {
             sums.magnitudes += stored_row_norm(mode) * rounded;
             sums.terms += 1.0;
         }
-        self.bound_from_sums(tile, step, sums)
+        self.bound_from_sums(tile, input, sums)
     }
 
     /// Additional error of the vertices of tile `tile` when its sums are computed by tensor cores, in scene units.
-    pub fn tensor_core_bound(&self, tile: usize, step: &ErrorBoundInput, error: TensorCoreError) -> f64 {
-        let modes = || self.modes[self.rank * tile..][..self.rank].iter().zip(step.q);
+    pub fn tensor_core_bound(&self, tile: usize, input: &ErrorBoundInput, error: TensorCoreError) -> f64 {
+        let modes = || self.modes[self.rank * tile..][..self.rank].iter().zip(input.q);
         let scaled_coordinate = |(mode, q): (&ModeErrorTerms, &f32)| f64::from(q.abs() * mode.factor);
         let largest = modes().map(scaled_coordinate).fold(TensorCoreError::min_largest_coordinate(), f64::max);
         let mode_error = |(mode, q): (&ModeErrorTerms, &f32)| {
             let relative_error = scaled_coordinate((mode, q)) * (error.coordinate + error.sum);
             stored_row_norm(mode) * (relative_error + error.floor * largest)
         };
-        modes().map(mode_error).sum::<f64>() * norm(&step.transform) * ROUND_UP
+        modes().map(mode_error).sum::<f64>() * norm(&input.transform) * ROUND_UP
     }
 
     /// Bounds of all vertices.
-    pub fn domain(&self, step: &ErrorBoundInput) -> ErrorBound {
-        (0..self.max_rest_norms.len()).map(|tile| self.tile(tile, step)).fold(ErrorBound::default(), ErrorBound::max)
+    pub fn domain(&self, input: &ErrorBoundInput) -> ErrorBound {
+        (0..self.max_rest_norms.len()).map(|tile| self.tile(tile, input)).fold(ErrorBound::default(), ErrorBound::max)
     }
 
     /// Maximum error of u at the vertices of a tile, in scene units of the domain; independent of x0 and T.
     pub fn displacement(&self, tile: usize, q: &[f32], compensated: bool) -> f64 {
-        let step = ErrorBoundInput { q, transform: Transform::IDENTITY.into(), compensated };
-        let ErrorBound { storage, coordinates, accumulation, .. } = self.tile(tile, &step);
+        let input = ErrorBoundInput { q, transform: Transform::IDENTITY.into(), compensated };
+        let ErrorBound { storage, coordinates, accumulation, .. } = self.tile(tile, &input);
         (storage + coordinates + accumulation) * ROUND_UP
     }
 
     /// Computes the bounds of a tile from the sums over its modes.
-    fn bound_from_sums(&self, tile: usize, step: &ErrorBoundInput, sums: ModeSums) -> ErrorBound {
+    fn bound_from_sums(&self, tile: usize, input: &ErrorBoundInput, sums: ModeSums) -> ErrorBound {
         let storage = SQRT_3 * sums.storage * ROUND_UP;
         let [coordinates, magnitudes, terms] =
             [sums.coordinates, sums.magnitudes, sums.terms].map(|number| number * ROUND_UP);
-        let accumulation = match step.compensated {
+        let accumulation = match input.compensated {
             false => gamma(terms) * magnitudes + 2.0 * SQRT_3 * terms * UNDERFLOW,
-            true => UNIT * magnitudes + gamma(terms).powi(2) * magnitudes + 10.0 * SQRT_3 * terms * UNDERFLOW,
+            true => UNIT_ROUNDOFF * magnitudes + gamma(terms).powi(2) * magnitudes + 10.0 * SQRT_3 * terms * UNDERFLOW,
         };
         // Maximum norm of x0 + u.
-        let deformed = self.max_rest_norms[tile] + magnitudes + accumulation;
-        let rest = if terms > 0.0 { UNIT * deformed } else { 0.0 };
-        let (rounded_transform, norm) = (step.transform.to_f32(), norm(&step.transform));
+        let max_deformed_norm = self.max_rest_norms[tile] + magnitudes + accumulation;
+        let rest = if terms > 0.0 { UNIT_ROUNDOFF * max_deformed_norm } else { 0.0 };
+        let (rounded_transform, norm) = (input.transform.to_f32(), norm(&input.transform));
         let linear_norm = rounded_transform.linear().norm() * ROUND_UP;
         let translation_norm = rounded_transform.translation().norm() * ROUND_UP;
-        let frame_error = frame_rounding_error(&step.transform);
-        let frame = (frame_error.linear * (deformed + rest) + frame_error.translation) * ROUND_UP;
-        let transform = gamma(3.0) * (linear_norm * (deformed + rest) + translation_norm) + 6.0 * SQRT_3 * UNDERFLOW;
+        let frame_error = frame_rounding_error(&input.transform);
+        let frame = (frame_error.linear * (max_deformed_norm + rest) + frame_error.translation) * ROUND_UP;
+        let transform =
+            gamma(3.0) * (linear_norm * (max_deformed_norm + rest) + translation_norm) + 6.0 * SQRT_3 * UNDERFLOW;
         let [storage, coordinates, accumulation, rest] =
             [storage, coordinates, accumulation, rest].map(|error| error * norm * ROUND_UP);
         ErrorBound { storage, coordinates, accumulation, rest, transform: transform * ROUND_UP, frame }
@@ -252,7 +253,7 @@ fn spectral_norm(transform: &Transform) -> f64 {
 
 /// gamma_k of f32.
 fn gamma(roundings: f64) -> f64 {
-    roundings * UNIT / (1.0 - roundings * UNIT)
+    roundings * UNIT_ROUNDOFF / (1.0 - roundings * UNIT_ROUNDOFF)
 }
 
 fn norm_f64(vector: [f64; 3]) -> f64 {
@@ -264,10 +265,10 @@ fn mode_error_terms(shape: &Shape, tiles: &TiledModes, tile: usize, mode: usize)
     let row_norm = |vertex| norm_f64([0, 1, 2].map(|axis| tiles.decode_entry(vertex, axis, mode)));
     let vertices = layout.first_vertex..layout.first_vertex + layout.vertices;
     let entries = &shape.modes.column(mode)[3 * layout.first_vertex..][..3 * layout.vertices];
-    let largest = entries.iter().fold(0.0, |largest: f32, entry| largest.max(entry.abs()));
+    let max_entry = entries.iter().fold(0.0, |max_entry: f32, entry| max_entry.max(entry.abs()));
     ModeErrorTerms {
         max_row_norm: vertices.map(row_norm).fold(0.0, f64::max) * ROUND_UP,
-        half_step: half_step(tiles, tile, mode, largest),
+        half_step: half_step(tiles, tile, mode, max_entry),
         factor: factor(tiles, tile, mode),
     }
 }
@@ -286,14 +287,14 @@ fn factor(tiles: &TiledModes, tile: usize, mode: usize) -> f32 {
     }
 }
 
-/// Maximum rounding error of an entry of a tile in the storage type; `largest` is the tile's largest entry.
-fn half_step(tiles: &TiledModes, tile: usize, mode: usize, largest: f32) -> f64 {
+/// Maximum rounding error of an entry of a tile in the storage type; `max_entry` is the tile's largest magnitude.
+fn half_step(tiles: &TiledModes, tile: usize, mode: usize, max_entry: f32) -> f64 {
     let factor = f64::from(factor(tiles, tile, mode));
     // Half the spacing is 2^-11 (f16) or 2^-8 (bf16) times the power of two at or below the entry. Both types have a
     // smallest spacing.
-    let power_of_two = f64::exp2(f64::from(super::quantize::floor_log2(largest)));
+    let power_of_two = f64::exp2(f64::from(super::quantize::floor_log2(max_entry)));
     match tiles.storage() {
-        _ if largest == 0.0 => 0.0,
+        _ if max_entry == 0.0 => 0.0,
         StorageType::F32 => 0.0,
         StorageType::F16 => (power_of_two * f64::exp2(-11.0)).max(factor * f64::exp2(-25.0)),
         // The smallest spacing, not half of it: the value may be rounded twice, first to f32.

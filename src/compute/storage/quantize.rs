@@ -56,9 +56,9 @@ pub(super) fn encode_floats(
 
 /// Writes the planes and scales of `Int8`.
 pub(super) fn encode_int8(modes: &Modes, tiles: &[TileLayout], packed_words: &mut [PackedWord], scales: &mut [f32]) {
-    let tile_scales = modes.rank().next_multiple_of(modes_per_chunk(StorageType::Int8));
+    let scales_per_tile = modes.rank().next_multiple_of(modes_per_chunk(StorageType::Int8));
     let encoded_tiles =
-        par_tiles(modes, StorageType::Int8, tiles, packed_words).zip(scales.par_chunks_mut(tile_scales));
+        par_tiles(modes, StorageType::Int8, tiles, packed_words).zip(scales.par_chunks_mut(scales_per_tile));
     encoded_tiles.for_each(|((tile, packed_words), scales)| {
         packed_words.fill(PackedWord([ZERO_CODE; 16]));
         for (mode, scale) in scales.iter_mut().take(modes.rank()).enumerate() {

@@ -30,7 +30,7 @@ pub struct TileLayout {
     pub first_scale: usize,
 }
 
-/// U and x0 of one shape in tiles. The module documentation describes the layout.
+/// U and x0 of one shape in tiles. The documentation of the module `storage` describes the layout.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TiledModes {
     storage: StorageType,
@@ -63,12 +63,12 @@ impl TiledModes {
         if rank == 0 {
             return tiles;
         }
-        let layouts: Vec<TileLayout> = (0..tiles.count()).map(|tile| tiles.tile(tile)).collect();
+        let tile_layouts: Vec<TileLayout> = (0..tiles.count()).map(|tile| tiles.tile(tile)).collect();
         if storage == StorageType::Int8 {
             tiles.scales = vec![0.0; tiles.count() * tiles.chunks() * modes_per_chunk(storage)];
-            quantize::encode_int8(&shape.modes, &layouts, &mut tiles.packed_words, &mut tiles.scales);
+            quantize::encode_int8(&shape.modes, &tile_layouts, &mut tiles.packed_words, &mut tiles.scales);
         } else {
-            quantize::encode_floats(&shape.modes, &layouts, storage, &tiles.factors, &mut tiles.packed_words);
+            quantize::encode_floats(&shape.modes, &tile_layouts, storage, &tiles.factors, &mut tiles.packed_words);
         }
         tiles
     }
@@ -190,7 +190,7 @@ mod tests {
         (9, 512),
     ];
 
-    /// Half the spacing of the storage type at an entry, in units of the entry's mode.
+    /// Half the spacing of decoded values near an entry.
     fn half_step(tiles: &TiledModes, tile: TileLayout, mode: usize, entry: f64) -> f64 {
         let exponent = |value: f64| value.abs().log2().floor();
         match tiles.storage() {
@@ -272,12 +272,12 @@ mod tests {
         assert_eq!(tiles.rest()[1][4 + 2], shape.mesh.rest_positions()[6][1]);
         assert_eq!(tiles.rest()[2][1], 0.0);
         let tiles = TiledModes::new(&shape, StorageType::Int8);
-        // Chunk 0, mode 2 is group 7 of 4 vertices: plane 1, bytes 12 to 15.
+        // Mode 2, axis 1 is group 7 of 4 bytes in chunk 0: plane 1, bytes 12 to 15.
         let code = tiles.packed_words()[3 + 1].0[12 + 2];
         let expected = (shape.modes.entry(6, 1, 2) / tiles.scales()[2]).round() + 128.0;
         assert_eq!(f32::from(code), expected);
         let tiles = TiledModes::new(&shape, StorageType::F16);
-        // Mode 3 is the second mode of chunk 1: its group 4 is plane 2, bytes 0 to 7.
+        // Mode 3 is the second mode of chunk 1, and its axis 1 is group 4 of 8 bytes: plane 2, bytes 0 to 7.
         let bytes = &tiles.packed_words()[9 + 2 * 3 + 1].0[4..6];
         let stored = f16::from_ne_bytes([bytes[0], bytes[1]]).to_f32();
         assert_eq!(f16::from_f32(shape.modes.entry(6, 1, 3) / tiles.factors()[3]).to_f32(), stored);

@@ -38,7 +38,7 @@ pub struct Truncation {
     /// Per mode: maximum displacement of a vertex by the mode in this step, in scene units.
     costs: Vec<f64>,
     /// All modes by ascending cost.
-    ascending: Vec<u16>,
+    modes_by_cost: Vec<u16>,
     /// Modes that are not truncated, ascending.
     retained: Vec<u16>,
     /// Sum of the costs of truncated modes, rounded up.
@@ -52,7 +52,7 @@ impl Truncation {
         Self {
             is_truncated: vec![false; rank],
             costs: vec![0.0; rank],
-            ascending: all_modes.clone(),
+            modes_by_cost: all_modes.clone(),
             retained: all_modes,
             bound: 0.0,
         }
@@ -69,12 +69,12 @@ impl Truncation {
             *cost = input.norm * (f64::from(q.abs()) * max_row_norm);
         }
         let costs = &self.costs;
-        self.ascending.sort_unstable_by(|a, b| {
+        self.modes_by_cost.sort_unstable_by(|a, b| {
             let order = costs[usize::from(*a)].total_cmp(&costs[usize::from(*b)]);
             order.then(a.cmp(b))
         });
         let total = self.restore_modes(budget);
-        self.bound = self.drop_modes(total, budget / 2.0) * ROUND_UP;
+        self.bound = self.truncate_modes(total, budget / 2.0) * ROUND_UP;
         self.retained.clear();
         self.retained.extend((0..self.is_truncated.len() as u16).filter(|mode| !self.is_truncated[usize::from(*mode)]));
     }
@@ -92,7 +92,7 @@ impl Truncation {
     /// Restores the costliest truncated modes until the other truncated modes fit the budget. Returns their total cost.
     fn restore_modes(&mut self, budget: f64) -> f64 {
         let mut total = 0.0;
-        for mode in self.ascending.iter().map(|mode| usize::from(*mode)) {
+        for mode in self.modes_by_cost.iter().map(|mode| usize::from(*mode)) {
             if self.is_truncated[mode] {
                 let new_total = total + self.costs[mode];
                 self.is_truncated[mode] = new_total * ROUND_UP <= budget;
@@ -103,8 +103,8 @@ impl Truncation {
     }
 
     /// Truncates the cheapest modes while the total cost fits the budget. Returns the total cost.
-    fn drop_modes(&mut self, mut total: f64, budget: f64) -> f64 {
-        for mode in self.ascending.iter().map(|mode| usize::from(*mode)) {
+    fn truncate_modes(&mut self, mut total: f64, budget: f64) -> f64 {
+        for mode in self.modes_by_cost.iter().map(|mode| usize::from(*mode)) {
             if self.is_truncated[mode] {
                 continue;
             }

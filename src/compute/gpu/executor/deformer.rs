@@ -123,8 +123,9 @@ impl CudaDeformer {
         })
     }
 
-    /// The compiled kernels and allocated buffers. The plan excludes memory that is allocated on demand: the second
-    /// output set (vertices are fetched concurrently with a step), and the second ring slot (two steps are in flight).
+    /// The compiled kernels and allocated buffers. The plan excludes memory that is allocated on demand. The first fetch
+    /// of vertices concurrently with a step allocates the second output set. The second ring slot is allocated when two
+    /// steps are in flight.
     pub const fn plan(&self) -> &DeformPlan {
         &self.plan
     }
@@ -289,7 +290,7 @@ impl CudaDeformer {
         })
     }
 
-    /// Copies the attributes that `surface` does not yet have of the last step.
+    /// Copies to `surface` those of the requested attributes of the last step that it does not yet have.
     fn download_attributes(&mut self, attributes: VertexAttributes) -> Result<()> {
         let host_attributes = self.host_attributes;
         if (attributes.positions || attributes.normals) && !host_attributes.contains(VertexAttributes::VERTICES) {

@@ -74,7 +74,7 @@ impl StepInputs {
     ///
     /// # Errors
     /// `Fault` when the driver cannot lock so much memory.
-    pub fn staging(&self, device: &Device) -> Result<StagingBuffer> {
+    pub fn allocate_staging(&self, device: &Device) -> Result<StagingBuffer> {
         PinnedBuffer::zeroed(device, self.sizes.total() as usize / 4, PinnedUse::ToDevice)
     }
 

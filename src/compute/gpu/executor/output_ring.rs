@@ -1,9 +1,9 @@
-//! Double buffering of the outputs: chooses the output that a step writes, and records which domains of an output are
-//! outdated. It does not access the device.
+//! Double buffering of the outputs: chooses the output (an output set of `output`) that a step writes, and records which
+//! domains of an output are outdated. It does not access the device.
 //!
 //! While the host copies one output, the next step writes another, so neither waits. The other output shows an older
 //! step. The ring records which domains have changed since then, and the step computes them again together with its own
-//! changes. A second output is used only after a step begins while a readback is in flight.
+//! changes. The second output is first used when a step begins while a readback is in flight.
 
 use modalcast_model::scene::{DirtyDomains, SceneState};
 
@@ -12,7 +12,7 @@ use modalcast_model::scene::{DirtyDomains, SceneState};
 pub(super) struct OutputRing {
     /// The last step that began.
     last_step: u32,
-    /// The last step that changed all domains.
+    /// The last full step, which computed all domains.
     last_full_step: u32,
     /// Serial number of the state whose values are on the device; `None` after a fault.
     serial: Option<u64>,
@@ -114,7 +114,7 @@ impl OutputRing {
         }
     }
 
-    /// Returns the last step that changed all domains. If `is_full` is set, this is the current step.
+    /// Returns the last full step, which is the current step if `is_full` is set.
     pub(super) const fn update_last_full_step(&mut self, is_full: bool) -> u32 {
         if is_full {
             self.last_full_step = self.last_step;
@@ -204,8 +204,8 @@ mod tests {
             assert_eq!(target.shown_step, target.step - 1);
         }
         // A readback that ended before the next step changes nothing.
-        let number = output_ring.begin_read();
-        output_ring.end_read(number);
+        let read_id = output_ring.begin_read();
+        output_ring.end_read(read_id);
         assert_eq!(step(&mut output_ring, &state(5, &[3])).output, 0);
     }
 
@@ -232,7 +232,7 @@ mod tests {
     fn idle_output_collects_changes_until_the_list_is_full() {
         for (steps, fits_list) in [(4, true), (9, true), (10, false)] {
             let mut output_ring = OutputRing::new(2, 10);
-            // Make both outputs valid, then leave one of them idle.
+            // Make both outputs valid. Then end the readback of one output, so that the next steps write only that one.
             for serial in 1..5 {
                 step(&mut output_ring, &state(serial, &[]));
                 output_ring.begin_read();

@@ -41,16 +41,17 @@ pub(super) struct StepSlot {
     bounds_keys: PinnedBuffer<u32>,
     /// End of the last step.
     pub done: CudaEvent,
-    /// End of the last mapping, which waits for frames in flight. Only with OpenGL's buffers.
+    /// Recorded when the last step's map of OpenGL's buffers is complete. The map waits for frames in flight. Only with
+    /// OpenGL's buffers.
     mapped_event: Option<CudaEvent>,
-    /// Host time of the step before it requested the mapping, in milliseconds.
+    /// Host time of the step before it requested the map, in milliseconds.
     pub host_ms: f64,
 }
 
 impl StepSlot {
-    /// If `is_timed` is set, the device measures the time of steps from the end of the mapping.
+    /// If `is_timed` is set, the device measures the time of steps from the completion of the map.
     pub(super) fn new(device: &Device, kernels: &StepKernels, inputs: &StepInputs, is_timed: bool) -> Result<Self> {
-        let values = inputs.staging(device)?;
+        let values = inputs.allocate_staging(device)?;
         let change_list = kernels.apply.as_ref().map(|apply| apply.allocate_list(device)).transpose()?;
         let mut bounds_keys = PinnedBuffer::zeroed(device, kernels.bounds.words(), PinnedUse::FromDevice)?;
         let mut submission = StepSubmission { kernels, inputs, values: &values, bounds_keys: &mut bounds_keys };
@@ -65,7 +66,7 @@ impl StepSlot {
         Ok(Self { full_graph, partial_graph, values, change_list, bounds_keys, done, mapped_event, host_ms: 0.0 })
     }
 
-    /// Records on the stream that the mapping has ended and the step may write its outputs.
+    /// Records on the stream that the outputs are mapped and the step may write them.
     pub(super) fn record_mapped(&self, device: &Device) -> Result<()> {
         match &self.mapped_event {
             Some(mapped_event) => mapped_event.record(device.stream()).map_err(cuda_error("deform")),
@@ -74,7 +75,7 @@ impl StepSlot {
     }
 
     /// Time of a step that has ended, in milliseconds, without the wait for frames; `None` if steps are not timed. Host
-    /// work after the mapping counts only while the device waits for it.
+    /// work after the map counts only while the device waits for it.
     pub(super) fn device_ms(&self) -> Result<Option<f64>> {
         let Some(mapped_event) = &self.mapped_event else { return Ok(None) };
         let ms = mapped_event.elapsed_ms(&self.done).map_err(cuda_error("deform"))?;

@@ -56,7 +56,7 @@ mod tests {
         }
     }
 
-    /// The name of an error is looked up in the driver library, which this test does not need.
+    /// The test creates the error itself: the text of a `DriverError` comes from the driver library, which may be missing.
     #[test]
     fn lost_device_error_names_the_remedy() {
         let error = Error::DeviceLost { stage: "deform", reason: "illegal address".into() };

@@ -160,7 +160,7 @@ impl<T: DeviceRepr + ValidAsZeroBits> PinnedBuffer<T> {
     }
 }
 
-/// A lock of host memory in physical memory, so that the device copies into it at full speed.
+/// A page lock on host memory, which lets the device copy into that memory at full speed.
 #[derive(Debug)]
 pub(crate) struct PageLock {
     address: *mut c_void,

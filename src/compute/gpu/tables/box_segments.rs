@@ -1,8 +1,8 @@
 //! Bounding boxes per domain: the segments that `bounds` reduces to boxes, and their union per domain. Pure.
 //!
 //! A domain with tiles of its own is split into segments of tiles, whose boxes `deform` computed. A domain that shares a
-//! tile is one segment, a range of its positions. So a domain of millions of vertices keeps as many threads busy as
-//! 200,000 leaves. The host unites the few boxes of a large domain.
+//! tile is one segment, a range of its positions. So one domain of millions of vertices keeps as many threads busy as
+//! 200,000 small domains. The host unites the few boxes of a large domain.
 
 use super::box_keys::bounds_from_keys;
 use super::layout::{BoxSegment, LAST_QUAD_ITEMS};
@@ -18,10 +18,10 @@ pub(crate) const BOX_KEYS: usize = 6;
 /// The segments of all domains, in the order of the domains.
 pub(crate) fn box_segments(scene: &Scene, work: &WorkList) -> Vec<BoxSegment> {
     let mut segments = Vec::with_capacity(scene.domains.len());
-    for (index, (tiles, slot)) in work.domain_tiles.iter().zip(&scene.layout.domains).enumerate() {
+    for (index, (tiles, layout)) in work.domain_tiles.iter().zip(&scene.layout.domains).enumerate() {
         let (domain, span) = (index as u32, tiles.vertices);
         if work.tiles[span.first as usize].kind & LAST_QUAD_ITEMS == 0 {
-            let (first_item, item_count) = (slot.first_vertex as u32, slot.vertices as u32);
+            let (first_item, item_count) = (layout.first_vertex as u32, layout.vertices as u32);
             segments.push(BoxSegment { first_item, item_count, domain, is_vertex_range: 1 });
             continue;
         }
@@ -63,19 +63,19 @@ mod tests {
 
     /// Per vertex of a domain, the number of segments that contain it.
     fn segment_counts(scene: &Scene, work: &WorkList, domain: usize) -> Vec<u32> {
-        let slot = scene.layout.domains[domain];
-        let mut counts = vec![0; slot.vertices];
+        let layout = scene.layout.domains[domain];
+        let mut counts = vec![0; layout.vertices];
         for segment in box_segments(scene, work).iter().filter(|segment| segment.domain as usize == domain) {
             let items = segment.first_item as usize..(segment.first_item + segment.item_count) as usize;
             if segment.is_vertex_range == 1 {
-                items.for_each(|vertex| counts[vertex - slot.first_vertex] += 1);
+                items.for_each(|vertex| counts[vertex - layout.first_vertex] += 1);
                 continue;
             }
             assert!(items.start % 4 == 0 && items.end % 4 == 0, "expected the four boxes of each tile, got {items:?}");
             for tile in &work.tiles[items.start / 4..items.end / 4] {
                 assert_eq!((tile.domain as usize, tile.kind & TILE_VERTICES), (domain, TILE_VERTICES));
                 let vertex_count = 4 * (usize::from(tile.quad_count) - 1) + usize::from(tile.kind & LAST_QUAD_ITEMS);
-                let first_vertex = tile.first_item as usize - slot.first_vertex;
+                let first_vertex = tile.first_item as usize - layout.first_vertex;
                 counts[first_vertex..first_vertex + vertex_count].iter_mut().for_each(|count| *count += 1);
             }
         }
@@ -93,8 +93,8 @@ mod tests {
             assert!(segments.is_sorted_by_key(|segment| segment.domain));
             let is_short = |segment: &BoxSegment| segment.item_count <= 4 * MAX_SEGMENT_TILES;
             assert!(segments.iter().all(|segment| is_vertex_range(segment) || is_short(segment)));
-            for (domain, slot) in scene.layout.domains.iter().enumerate() {
-                assert_eq!(segment_counts(&scene, &work, domain), vec![1; slot.vertices], "domain {domain}");
+            for (domain, layout) in scene.layout.domains.iter().enumerate() {
+                assert_eq!(segment_counts(&scene, &work, domain), vec![1; layout.vertices], "domain {domain}");
             }
         }
     }

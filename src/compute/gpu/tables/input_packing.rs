@@ -4,8 +4,8 @@
 //! ```text
 //! [header][transforms: 12 f32 per transform root][q, padded to whole chunks of modes][retained counts][retained chunks]
 //! ```
-//! Each domain has a number of retained chunks and a list of them, only with truncation. The pinned memory is
-//! write-combined: the host writes it from front to back and never reads it.
+//! With truncation, each domain has the number and the indices of its retained chunks. Without truncation, these two parts
+//! are empty. The pinned memory is write-combined: the host writes it from front to back and never reads it.
 
 use std::sync::Arc;
 
@@ -39,7 +39,7 @@ pub(crate) struct DirtyTileLayout {
     pub full_step_cost: usize,
 }
 
-/// Sizes of the parts behind the header in bytes, in buffer order.
+/// Sizes of the parts behind the header in bytes, in buffer order. Each is a multiple of 16 bytes.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct InputSizes {
     pub transforms: u64,
@@ -90,12 +90,13 @@ impl InputWriter {
             selection.write(&self.packer, state, &mut writer);
         }
     }
+
     /// Number of chunks of modes that each domain sums in the last step; `None` when all are summed.
     pub(crate) fn retained_chunk_counts(&self) -> Option<&[u32]> {
         self.chunk_selection.as_ref().map(|selection| selection.counts.as_slice())
     }
 
-    /// Bound of the displacement that the truncated modes cause at any vertex in the last step, scene units.
+    /// Upper bound of any vertex's displacement by the truncated modes in the last step, in scene units.
     pub(crate) fn truncation_bound(&self) -> f64 {
         self.chunk_selection.as_ref().map_or(0.0, |selection| selection.bound)
     }

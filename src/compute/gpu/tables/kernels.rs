@@ -159,7 +159,8 @@ fn deform_defines(scene: &Scene, work: &WorkList) -> Vec<&'static str> {
     defines.chain(storage_define(scene.deformation.storage).filter(|_| features.modes)).collect()
 }
 
-/// Maximum number of blocks of the kernels that loop over lists: two per multiprocessor of a large device.
+/// Two blocks per multiprocessor of a large device. The maximum grids of kernels that loop over lists are multiples or
+/// fractions of this number.
 const MAX_GRID_BLOCKS: usize = 264;
 
 /// The kernel `batch` of a scene with batches.

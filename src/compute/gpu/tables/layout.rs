@@ -7,7 +7,7 @@ use crate::storage::TILE_QUADS;
 use modalcast_model::domain::RING_START;
 use modalcast_model::scene::TransformRoots;
 
-/// Threads per block of every kernel but `deform`, and packed corners per block of `normals`.
+/// Threads per block of `apply`, `bounds` and `normals`, and packed corners per block of `normals`.
 pub(crate) const BLOCK: u32 = 256;
 
 /// `first_tangent` of a shape without tangents.
@@ -256,7 +256,7 @@ const _: () = assert!(size_of::<NormalsArgs>() == 120, "NormalsArgs differs from
 /// A size, offset or constant that must be the same on host and device.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LayoutConstant {
-    /// The C++ expression, e.g. `OFFSET(WarpTile, rest)`.
+    /// The C++ expression, e.g. `OFFSET(WarpTile, rest_quad)`.
     pub expression: String,
     /// Its value on the host.
     pub host: u32,
@@ -321,7 +321,8 @@ pub fn layout_constants() -> Vec<LayoutConstant> {
 
 /// The start of a source that evaluates the expressions of [`LayoutConstant`]s. NVRTC has no `offsetof`, so `OFFSET` is
 /// defined as its usual expansion.
-pub(crate) const PRELUDE: &str = "#include \"layout.cuh\"\n#define OFFSET(of, field) __INTADDR__(&(((of*)0)->field))\n";
+pub(crate) const PRELUDE: &str =
+    "#include \"layout.cuh\"\n#define OFFSET(type, field) __INTADDR__(&(((type*)0)->field))\n";
 
 /// Source of a kernel `layout_values` that writes the device's value of every layout constant, in order, to its only
 /// argument.

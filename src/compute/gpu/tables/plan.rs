@@ -86,8 +86,9 @@ pub struct DeformPlan {
     /// The kernels of the scene in launch order, except `apply`, which is last here and first in a partial step.
     pub kernels: Vec<KernelDescriptor>,
     pub buffers: Vec<BufferDescriptor>,
-    /// Bytes that each step copies to the device and back, without the vertices.
+    /// Bytes that a full step copies to the device.
     pub bytes_in: u64,
+    /// Bytes that each step copies back, without the vertices: six keys of four bytes per box.
     pub bytes_out: u64,
     /// Pinned bytes of the lists of a partial step; 0 for a scene whose steps are always full.
     pub change_list_bytes: u64,

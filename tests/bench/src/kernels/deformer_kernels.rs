@@ -132,7 +132,7 @@ impl DeformerBenchmark {
             let mut inputs = StepInputs::new(device, benchmark.deform.packer())?;
             let staging = match &mut staging {
                 Some(staging) => staging,
-                empty => empty.insert(inputs.staging(device)?),
+                empty => empty.insert(inputs.allocate_staging(device)?),
             };
             upload_step(device, (&mut inputs, staging), &header, state)?;
             benchmark.inputs.push(inputs);
@@ -150,7 +150,7 @@ impl DeformerBenchmark {
         let mut list = apply.allocate_list(device)?;
         let full_step = Header { last_full_step: 1, ..self.header() };
         for (inputs, state) in self.inputs.iter_mut().zip(states) {
-            let mut staging = inputs.staging(device)?;
+            let mut staging = inputs.allocate_staging(device)?;
             let lengths =
                 apply.write(&mut list, self.deform.packer(), state, ChangedDomains { changed, outdated: &[] })?;
             let ChangeListLengths { change_count, dirty_tile_count } = lengths.ok_or_else(too_many)?;

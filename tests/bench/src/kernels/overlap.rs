@@ -221,7 +221,7 @@ fn time_input_writes(
     steps: usize,
 ) -> Result<(u64, [f64; 2])> {
     let packer = Arc::new(InputPacker::sizes_only(scene));
-    let mut staging = StepInputs::new(device, &packer)?.staging(device)?;
+    let mut staging = StepInputs::new(device, &packer)?.allocate_staging(device)?;
     let words = staging.as_mut_slice()?;
     let mut writer = InputWriter::new(&packer);
     let bytes = size_of_val(words) as u64;

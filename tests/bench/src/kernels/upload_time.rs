@@ -42,7 +42,7 @@ impl KernelBenchmark for UploadBenchmark {
 /// `Fault` when the device fails; `Invalid` when `replays` is 0.
 pub fn time_upload(device: &Device, scene: &Arc<Scene>, state: &SceneState, replays: usize) -> Result<(u64, Timing)> {
     let mut inputs = StepInputs::new(device, &Arc::new(InputPacker::sizes_only(scene)))?;
-    let mut staging = inputs.staging(device)?;
+    let mut staging = inputs.allocate_staging(device)?;
     inputs.write(&mut staging, &Header::default(), state)?;
     let bytes = inputs.bytes();
     let benchmark = UploadBenchmark { inputs, staging };

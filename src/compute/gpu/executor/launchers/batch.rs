@@ -101,7 +101,7 @@ mod tests {
     use modalcast_model::backend_settings::BatchPolicy;
     use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState, StorageType};
 
-    /// A scene of random shapes with these (vertices, rank), each used by `instances` domains, and a random state.
+    /// A scene of random shapes with these (vertices, rank), and a random state. `instances` domains use each shape.
     fn ensemble(storage: StorageType, shapes: &[(usize, usize)], instances: usize) -> (Arc<Scene>, SceneState) {
         let shapes_scene =
             scene_and_state(&shapes.iter().map(|(vertices, rank)| (*vertices, *rank, 1)).collect::<Vec<_>>()).0;
@@ -164,10 +164,10 @@ mod tests {
         for (shapes, instances) in LOADS {
             let (scene, state) = ensemble(StorageType::F32, shapes, instances);
             let got = twin_of_batch(&Tables::of(&scene, &state));
-            for (domain, slot) in scene.layout.domains.iter().enumerate() {
-                for vertex in 0..slot.vertices {
-                    let got = &got[3 * (slot.first_vertex + vertex)..][..3];
-                    if slot.rank == 0 {
+            for (domain, layout) in scene.layout.domains.iter().enumerate() {
+                for vertex in 0..layout.vertices {
+                    let got = &got[3 * (layout.first_vertex + vertex)..][..3];
+                    if layout.rank == 0 {
                         assert!(
                             got.iter().all(|number| number.is_nan()),
                             "expected rigid domains to be left to `deform`"
@@ -189,9 +189,9 @@ mod tests {
             for (shapes, instances) in LOADS {
                 let (scene, state) = ensemble(storage, shapes, instances);
                 let got = twin_of_batch(&Tables::of(&scene, &state));
-                for (domain, slot) in scene.layout.domains.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
-                    for vertex in 0..slot.vertices {
-                        let got = &got[3 * (slot.first_vertex + vertex)..][..3];
+                for (domain, layout) in scene.layout.domains.iter().enumerate().filter(|(_, layout)| layout.rank > 0) {
+                    for vertex in 0..layout.vertices {
+                        let got = &got[3 * (layout.first_vertex + vertex)..][..3];
                         let expected = x_of(&scene, &state, domain, vertex);
                         let is_close =
                             got.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < tolerance);

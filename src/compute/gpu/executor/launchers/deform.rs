@@ -218,7 +218,8 @@ impl DeformKernel {
             mixed_quads: self.mixed_quads.address(),
             words: self.words.address(),
             rest_positions: self.rest_positions.address(),
-            // Quads without normals come first and have no storage. No tile with corners refers to them.
+            // The tables begin with the first quad that has normals: 48 bytes of normals and 64 bytes of tangents per
+            // quad. No tile with corners refers to an earlier quad.
             rest_normals: self.normals.address().wrapping_sub(48 * self.first_direction_quad),
             rest_tangents: self.tangents.address().wrapping_sub(64 * self.first_direction_quad),
             corner_offsets: self.corner_offsets.address(),
@@ -272,7 +273,8 @@ fn compile_list_function(device: &Device, kernel: &KernelDescriptor) -> Result<C
     compile(device, kernel, &list_defines)
 }
 
-/// Maximum number of blocks that loop over a tile list: as many as are resident on a large device.
+/// Maximum number of blocks that loop over a tile list: 12 resident blocks on each of 132 multiprocessors, the size of a
+/// large device.
 const MAX_LIST_BLOCKS: u32 = 132 * 12;
 
 /// Uploads U source by source, and collects the scales and factors of all shapes.

@@ -50,7 +50,7 @@ pub fn check_cut_outs(triangles: usize, cut_outs: &CutOuts) -> Result<()> {
     {
         return Err(invalid("material indices", format!("indices below {}", materials.len()), material_index));
     }
-    let image_indices = materials.iter().filter_map(|material_index| material_index.image);
+    let image_indices = materials.iter().filter_map(|material| material.image);
     if let Some(image) = image_indices.into_iter().find(|image| *image as usize >= images.len()) {
         return Err(invalid("materials", format!("image indices below {}", images.len()), image));
     }
@@ -62,10 +62,10 @@ pub fn check_cut_outs(triangles: usize, cut_outs: &CutOuts) -> Result<()> {
 
 /// Checks that the image has all mip levels, each with all its texels.
 fn check_image(image: &AlphaImage) -> Result<()> {
-    let levels = image.width.max(image.height).checked_ilog2().map_or(0, |levels| levels as usize + 1);
-    if image.width.min(image.height) == 0 || image.levels.len() != levels {
-        let size = format!("{levels} levels of {} x {} texels", image.width, image.height);
-        return Err(invalid("image", size, image.levels.len()));
+    let level_count = image.width.max(image.height).checked_ilog2().map_or(0, |last_level| last_level as usize + 1);
+    if image.width.min(image.height) == 0 || image.levels.len() != level_count {
+        let expected = format!("{level_count} levels of {} x {} texels", image.width, image.height);
+        return Err(invalid("image", expected, image.levels.len()));
     }
     for (level, texels) in image.levels.iter().enumerate() {
         let [width, height] = size_of_level(image, level);

@@ -113,7 +113,7 @@ impl AlphaTexture {
         texels: &[u8],
     ) -> Result<(), DriverError> {
         let mut level_array = std::ptr::null_mut();
-        // SAFETY: `to` is a live pointer, and the array has this level.
+        // SAFETY: `level_array` is a live pointer, and the array has this level.
         unsafe { sys::cuMipmappedArrayGetLevel(&mut level_array, self.array, level) }.result()?;
         let copy = sys::CUDA_MEMCPY2D_st {
             srcXInBytes: 0,
@@ -149,7 +149,7 @@ impl AlphaTexture {
             },
             flags: 0,
         };
-        let filter = sys::CUDA_TEXTURE_DESC_st {
+        let descriptor = sys::CUDA_TEXTURE_DESC_st {
             addressMode: [WRAP; 3],
             filterMode: LINEAR,
             flags: sys::CU_TRSF_NORMALIZED_COORDINATES,
@@ -164,7 +164,7 @@ impl AlphaTexture {
         let mut texture = 0;
         // SAFETY: `texture` is a live integer and the descriptors live for the call; a null view selects the whole
         // array.
-        unsafe { sys::cuTexObjectCreate(&mut texture, &resource, &filter, std::ptr::null()) }.result()?;
+        unsafe { sys::cuTexObjectCreate(&mut texture, &resource, &descriptor, std::ptr::null()) }.result()?;
         Ok(texture)
     }
 }

@@ -55,8 +55,8 @@ impl RasterVariant {
 
     /// Bytes of all samples of a window.
     pub const fn bytes(self, window: &Viewport) -> u64 {
-        let sample = if self.depth_only { size_of::<f32>() } else { size_of::<u64>() };
-        sample as u64 * window.pixel_count() as u64
+        let sample_bytes = if self.depth_only { size_of::<f32>() } else { size_of::<u64>() };
+        sample_bytes as u64 * window.pixel_count() as u64
     }
 }
 
@@ -110,7 +110,7 @@ mod tests {
 
     #[test]
     #[ignore = "needs NVRTC: deploy/check installs it"]
-    fn nvrtc_compiles_every_raster() {
+    fn nvrtc_compiles_every_raster_variant() {
         assert_compiles(SOURCE, &OPAQUE_FUNCTIONS, SERVER_WITHOUT_CUT_OUTS, &CAPABILITIES);
         assert_compiles(SOURCE, &FUNCTIONS, SERVER_WITH_CUT_OUTS, &CAPABILITIES);
         // The benchmarks run on the H200.

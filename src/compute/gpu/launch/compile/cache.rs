@@ -16,7 +16,8 @@ pub(super) struct CubinCache {
 }
 
 impl CubinCache {
-    /// The folder that the environment selects: MODALCAST_CACHE, or `modalcast` in XDG_CACHE_HOME or `~/.cache`.
+    /// The cache in the folder that the environment selects: MODALCAST_CACHE, or `modalcast` in XDG_CACHE_HOME or
+    /// `~/.cache`.
     pub(super) fn from_env() -> Self {
         Self { folder: cache_folder_from(|name| std::env::var_os(name)) }
     }
@@ -122,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn first_environment_variable_selects_the_folder() {
+    fn first_set_variable_selects_the_folder() {
         let variables = [("MODALCAST_CACHE", "/a"), ("XDG_CACHE_HOME", "/b"), ("HOME", "/c")];
         for (skipped, expected) in [(0, "/a"), (1, "/b/modalcast"), (2, "/c/.cache/modalcast")] {
             let lookup = |name: &str| {

@@ -4,7 +4,7 @@
 //!
 //! A shape has tiles of its own if it has more than `MAX_SHARED_QUADS` quads, or if it has modes and several domains use
 //! it. Its U is then stored once. The quads of other domains with the same number of chunks fill tiles together (mixed
-//! tiles), so that 200,000 leaves keep all lanes busy. Tiles with the most chunks come first, because a long tile that
+//! tiles), so that 200,000 small domains keep all lanes busy. Tiles with the most chunks come first, because a long tile that
 //! begins last would delay the end of the step. Tiles with vertices of batched domains come after all others: a full step
 //! leaves them to `batch`, and the tile list of a partial step refers to them.
 
@@ -97,7 +97,7 @@ pub(crate) fn has_rigid_normals(scene: &Scene) -> bool {
     !scene.features.exact_normals
 }
 
-/// What the domains of a mixed tile have in common.
+/// The number of chunks and the flags of a tile. All domains of a mixed tile have the same class.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct TileClass {
     chunks: usize,
@@ -278,13 +278,13 @@ impl WorkList {
 
     /// Items of a domain: its vertices, or its corners in a tile without vertices.
     fn item_range(&self, scene: &Scene, class: TileClass, domain: usize) -> ItemRange {
-        let (slot, shape) = (scene.layout.domains[domain], scene.domains[domain].shape);
+        let (layout, shape) = (scene.layout.domains[domain], scene.domains[domain].shape);
         if class.flags & TILE_VERTICES > 0 {
-            let (first_item, rest_quad) = (slot.first_vertex as u32, self.quads.vertex_quads[shape]);
-            ItemRange { item_count: slot.vertices, first_item, rest_quad }
+            let (first_item, rest_quad) = (layout.first_vertex as u32, self.quads.vertex_quads[shape]);
+            ItemRange { item_count: layout.vertices, first_item, rest_quad }
         } else {
-            let (first_item, rest_quad) = (slot.first_corner as u32, self.quads.corner_quads[shape]);
-            ItemRange { item_count: slot.corners, first_item, rest_quad }
+            let (first_item, rest_quad) = (layout.first_corner as u32, self.quads.corner_quads[shape]);
+            ItemRange { item_count: layout.corners, first_item, rest_quad }
         }
     }
 }
@@ -344,13 +344,18 @@ fn pending_tiles(scene: &Scene, corners_match: &[bool]) -> Vec<(TileClass, Pendi
         open_tile.quad_count += quads;
     };
     for (index, domain) in scene.domains.iter().enumerate() {
-        let (shape, slot) = (&scene.shapes[domain.shape], scene.layout.domains[index]);
+        let (shape, layout) = (&scene.shapes[domain.shape], scene.layout.domains[index]);
         let chunks = chunk_count(scene, shape);
         let computes_both = has_rigid_normals(scene) && corners_match[domain.shape];
         let flags = TILE_VERTICES | if computes_both { TILE_CORNERS } else { 0 };
-        add_items(index, TileClass { chunks, flags }, slot.vertices, shape_has_tiles[domain.shape]);
+        add_items(index, TileClass { chunks, flags }, layout.vertices, shape_has_tiles[domain.shape]);
         if has_rigid_normals(scene) && !computes_both {
-            add_items(index, TileClass { chunks: 0, flags: TILE_CORNERS }, slot.corners, has_own_tiles(slot.corners));
+            add_items(
+                index,
+                TileClass { chunks: 0, flags: TILE_CORNERS },
+                layout.corners,
+                has_own_tiles(layout.corners),
+            );
         }
     }
     tiles.extend(open_tiles.into_iter().map(|(class, tile)| (class, PendingTile::Mixed(tile.domains))));
@@ -359,7 +364,7 @@ fn pending_tiles(scene: &Scene, corners_match: &[bool]) -> Vec<(TileClass, Pendi
 
 /// Per domain, the wrapping offset from its first vertex to its first corner; empty when all offsets are zero.
 fn corner_offsets(scene: &Scene) -> Vec<u32> {
-    let offset = |slot: &DomainLayout| (slot.first_corner as u32).wrapping_sub(slot.first_vertex as u32);
+    let offset = |layout: &DomainLayout| (layout.first_corner as u32).wrapping_sub(layout.first_vertex as u32);
     let offsets: Vec<u32> = scene.layout.domains.iter().map(offset).collect();
     if has_rigid_normals(scene) && offsets.iter().any(|offset| *offset != 0) { offsets } else { Vec::new() }
 }

@@ -87,6 +87,7 @@ impl<'a> Warp<'a> {
         self.tables.work.batched.members[self.group.first_member as usize + index]
     }
 
+    /// Copies a stage of U to the ring: twelve rows (four chunks) of the words of the warp's quads.
     fn copy_stage(&mut self, stage: usize) {
         let ring_word = stage % STAGE_COUNT * STAGE_WORDS;
         self.ring[ring_word..][..STAGE_WORDS].fill(POISON);
@@ -99,6 +100,7 @@ impl<'a> Warp<'a> {
         }
     }
 
+    /// Decodes the entry of U at a byte of the ring.
     fn entry(&self, byte: usize) -> f32 {
         let bytes: &[u8] = bytemuck::cast_slice(&self.ring);
         let first_bytes = [bytes[byte], bytes.get(byte + 1).copied().unwrap_or(0)];
@@ -114,7 +116,7 @@ impl<'a> Warp<'a> {
     pub(super) fn sums(&mut self) -> Vec<[[f32; MAX_BATCH_SIZE]; 6]> {
         let chunks = self.group.chunk_count as usize;
         let chunk_modes = modes_per_chunk(self.tables.scene.deformation.storage);
-        let size = 4 / chunk_modes;
+        let entry_bytes = 4 / chunk_modes;
         let scales = &self.tables.loaded.scales[self.group.first_scale as usize..];
         let mut sums = vec![[[0.0_f32; MAX_BATCH_SIZE]; 6]; 32];
         (0..STAGE_COUNT).for_each(|stage| self.copy_stage(stage));
@@ -123,10 +125,10 @@ impl<'a> Warp<'a> {
                 let mode_index = (4 * stage + chunk) * chunk_modes + mode;
                 let scale = scales.get(self.tile * chunks * chunk_modes + mode_index).copied().unwrap_or(1.0);
                 for (lane, sums) in sums.iter_mut().enumerate() {
-                    let lane_byte = 16 * (stage % STAGE_COUNT * STAGE_WORDS + lane / 2) + 2 * size * (lane % 2);
+                    let lane_byte = 16 * (stage % STAGE_COUNT * STAGE_WORDS + lane / 2) + 2 * entry_bytes * (lane % 2);
                     for (axis, vertex) in (0..3).flat_map(|axis| (0..2).map(move |vertex| (axis, vertex))) {
-                        let byte = 4 * size * (3 * mode + axis);
-                        let entry_byte = byte / 16 * (16 * WARP_QUADS) + byte % 16 + vertex * size;
+                        let byte = 4 * entry_bytes * (3 * mode + axis);
+                        let entry_byte = byte / 16 * (16 * WARP_QUADS) + byte % 16 + vertex * entry_bytes;
                         let entry = self.entry(lane_byte + chunk * (3 * 16 * WARP_QUADS) + entry_byte);
                         let members = self.group.member_count as usize;
                         for (index, sum) in sums[2 * axis + vertex].iter_mut().enumerate().take(members) {
@@ -144,7 +146,7 @@ impl<'a> Warp<'a> {
     /// Positions of two domains as the warp stages them before the stores, `[domain][vertex][3]`.
     pub(super) fn staged(&self, sums: &[[[f32; MAX_BATCH_SIZE]; 6]], member: usize) -> Vec<f32> {
         let mut staged = vec![f32::NAN; 2 * 3 * WARP_VERTICES];
-        let tile_rest = 3 * (self.group.rest_quad as usize + TILE_QUADS * self.tile);
+        let first_rest_vector = 3 * (self.group.rest_quad as usize + TILE_QUADS * self.tile);
         for (lane, item) in (0..32).flat_map(|lane| (0..4).map(move |item| (lane, item))) {
             let (member_offset, vertex) = (item / 2, item % 2);
             if member + member_offset >= self.group.member_count as usize {
@@ -152,7 +154,7 @@ impl<'a> Warp<'a> {
             }
             let quad = self.warp_quad + (lane / 2).min(self.quads - 1);
             let deformed = [0, 1, 2].map(|axis| {
-                let rest = self.tables.loaded.rest_positions[tile_rest + axis * self.tile_quads + quad]
+                let rest = self.tables.loaded.rest_positions[first_rest_vector + axis * self.tile_quads + quad]
                     [2 * (lane % 2) + vertex];
                 rest + sums[lane][2 * axis + vertex][member + member_offset]
             });
@@ -165,10 +167,12 @@ impl<'a> Warp<'a> {
         staged
     }
 
+    /// Stores the staged positions of two members, or of one if `member` is the last. Uses the 16-byte stores of the kernel
+    /// under the same conditions.
     pub(super) fn store(&self, staged: &[f32], member: usize, positions: &mut [f32]) {
-        let mut put_number = |member: usize, number: usize, value: f32| {
-            let index = 3 * (self.member(member).first_vertex as usize + self.first_vertex) + number;
-            assert!(positions[index].is_nan(), "expected number {index} to be written once");
+        let mut put_component = |member: usize, component: usize, value: f32| {
+            let index = 3 * (self.member(member).first_vertex as usize + self.first_vertex) + component;
+            assert!(positions[index].is_nan(), "expected position component {index} to be written once");
             positions[index] = value;
         };
         let vertices = WARP_VERTICES.min(self.group.vertex_count as usize - self.first_vertex);
@@ -177,20 +181,21 @@ impl<'a> Warp<'a> {
             || (0..2).all(|member_offset| self.member(member + member_offset).first_vertex.is_multiple_of(4));
         if vertices == WARP_VERTICES && member + 1 < members && are_aligned() {
             for (lane, step) in (0..32).flat_map(|lane| (0..12).map(move |step| (lane, step))) {
-                let (word, component) = (step / 4, step % 4);
-                let (target_member, first_vertex) = match word {
+                let (word, word_component) = (step / 4, step % 4);
+                let (target_member, target_word) = match word {
                     0 => (member, lane),
                     1 if lane < 16 => (member, 32 + lane),
                     1 => (member + 1, lane - 16),
                     _ => (member + 1, 16 + lane),
                 };
-                put_number(target_member, 4 * first_vertex + component, staged[4 * (32 * word + lane) + component]);
+                let staged_component = staged[4 * (32 * word + lane) + word_component];
+                put_component(target_member, 4 * target_word + word_component, staged_component);
             }
             return;
         }
         for member_offset in (0..2).filter(|member_offset| member + member_offset < members) {
-            (0..3 * vertices).for_each(|number| {
-                put_number(member + member_offset, number, staged[member_offset * 3 * WARP_VERTICES + number])
+            (0..3 * vertices).for_each(|component| {
+                put_component(member + member_offset, component, staged[member_offset * 3 * WARP_VERTICES + component])
             });
         }
     }
