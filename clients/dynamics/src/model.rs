@@ -317,7 +317,7 @@ fn create_samples(domain: &Domain, selection: &SelectedVertices, mode_rows: Opti
 
 /// Creates the model of a domain without a joint, as if its coordinates were the first of the scene.
 fn create_domain_model(domain: &Domain, selection: &SelectedVertices, samples: Vec<Sample>) -> DomainModel {
-    let base_vertex = if samples.is_empty() { None } else { Some(base_vertex(domain)) };
+    let base_vertex = (!samples.is_empty()).then(|| base_vertex(domain));
     DomainModel {
         name: domain.name.clone(),
         rank: domain.rank,
@@ -330,7 +330,7 @@ fn create_domain_model(domain: &Domain, selection: &SelectedVertices, samples: V
         area: surface_area(domain),
         diagonal: bounds_diagonal(domain),
         base_sample: base_vertex
-            .and_then(|base_vertex_index| selection.vertices.iter().position(|vertex| *vertex == base_vertex_index)),
+            .and_then(|base_vertex| selection.vertices.iter().position(|vertex| *vertex == base_vertex)),
         samples,
         surface_sample_count: selection.surface_sample_count,
     }

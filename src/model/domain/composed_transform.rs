@@ -28,8 +28,8 @@ impl ComposedTransform {
     pub fn to_f32(&self) -> Transform {
         let Some(Transform(f)) = self.frame else { return self.root };
         let mut product = [0.0; 12];
-        for (t, out) in self.root.0.chunks_exact(4).zip(product.chunks_exact_mut(4)) {
-            for (column, out) in out.iter_mut().enumerate() {
+        for (t, product_row) in self.root.0.chunks_exact(4).zip(product.chunks_exact_mut(4)) {
+            for (column, out) in product_row.iter_mut().enumerate() {
                 let innermost_term = if column == 3 { t[2].mul_add(f[11], t[3]) } else { t[2] * f[8 + column] };
                 *out = t[0].mul_add(f[column], t[1].mul_add(f[4 + column], innermost_term));
             }

@@ -2,9 +2,10 @@
 //!
 //! Corners of one vertex whose rest normals agree within 0.1 degrees form a group: a texture seam splits corners but
 //! not groups, a hard edge splits both. The triangles adjacent to a group are stored as a ring: the group's vertex
-//! first, then the vertices around it. Two consecutive vertices around it are, in winding order, the other two vertices
-//! of one triangle, unless the second vertex has the flag [`RING_START`]. A closed fan of k triangles takes k + 2
-//! entries instead of the 2 k of a list of edges, and each vertex is read once instead of twice.
+//! first, then the fans of the vertices around it, if any. The first vertex of each fan has the flag [`RING_START`]. Two
+//! consecutive vertices of a fan form a triangle with the group's vertex, in winding order. A closed fan of k triangles
+//! repeats its first vertex at the end, so the ring takes k + 2 entries instead of the 2 k of a list of edges, and each
+//! vertex is read once instead of twice.
 //!
 //! Memory: 4 bytes per corner, and 20 bytes per group (ring offset, vertex and geometric normal). The vertices around a
 //! group take 4 (k + 1) bytes for k triangles in one fan, and at most 24 bytes per triangle if no two triangles of a

@@ -116,9 +116,9 @@ impl Camera {
             let horizontal = offset.dot(&right).abs() / (slope * aspect);
             offset.dot(&to_camera) + horizontal.max(offset.dot(&camera_up).abs() / slope)
         };
-        let required_distance = bounds.corners().iter().map(required_distance).fold(0.0, f64::max);
-        let required_distance = if required_distance > 0.0 { required_distance } else { 1.0 };
-        let eye = bounds.center() + to_camera * required_distance;
+        let max_distance = bounds.corners().iter().map(required_distance).fold(0.0, f64::max);
+        let camera_distance = if max_distance > 0.0 { max_distance } else { 1.0 };
+        let eye = bounds.center() + to_camera * camera_distance;
         let view = View::LookAt { eye: eye.coords.into(), target: bounds.center().coords.into(), up: up.into() };
         Self { view, lens: Lens::FieldOfView(field_of_view), near: 0.0, far: 0.0 }
     }

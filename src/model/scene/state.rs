@@ -73,23 +73,23 @@ impl SceneState {
         self.step = update.number;
         self.time = update.time;
         self.serial += 1;
-        let mut changed = Vec::new();
+        let mut changed_domains = Vec::new();
         for (domain, q) in update.coordinates() {
             let layout = scene.layout.domains[domain];
             self.q[layout.first_q..][..layout.rank].copy_from_slice(q);
             match scene.layout.domains_sharing_q.get(&layout.first_q) {
-                Some(domains_sharing_q) if layout.rank > 0 => changed.extend_from_slice(domains_sharing_q),
-                _ => changed.push(domain as u32),
+                Some(domains_sharing_q) if layout.rank > 0 => changed_domains.extend_from_slice(domains_sharing_q),
+                _ => changed_domains.push(domain as u32),
             }
         }
         for (domain, _) in &update.transforms {
-            changed.push(*domain);
-            changed.extend_from_slice(scene.transform_roots.followers_of(*domain as usize));
+            changed_domains.push(*domain);
+            changed_domains.extend_from_slice(scene.transform_roots.followers_of(*domain as usize));
         }
-        changed.sort_unstable();
-        changed.dedup();
+        changed_domains.sort_unstable();
+        changed_domains.dedup();
         let is_rebased = self.apply_transforms(&scene.transform_roots, update);
-        self.dirty_domains = if is_rebased { DirtyDomains::All } else { DirtyDomains::Some(changed) };
+        self.dirty_domains = if is_rebased { DirtyDomains::All } else { DirtyDomains::Some(changed_domains) };
     }
 
     /// Sets the transforms of a step. Returns true if transforms of other domains were rebased to another floating

@@ -22,6 +22,9 @@ const STRIP_LEFT: f32 = 0.93;
 /// Length of the petiole at the bottom of the image, as a fraction of the height.
 const PETIOLE_LENGTH: f32 = 0.13;
 
+/// Height of the tip of the blade, as a fraction of the height of the image.
+const TIP_HEIGHT: f32 = 0.985;
+
 /// Largest half-width of the blade, as a fraction of the width of [`LEAF_SPAN`].
 const MAX_HALF_WIDTH: f32 = 0.46;
 
@@ -61,17 +64,18 @@ pub(super) fn texture(name: &str, palette: &LeafColors, random: &mut SplitMix64)
 
 /// Color and coverage at the signed distance `x` from the midrib and the height `y` above the base of the petiole.
 fn shade_leaf(palette: &LeafColors, x: f32, y: f32) -> ([f32; 3], f32) {
-    let blade_fraction = (y - PETIOLE_LENGTH) / (0.985 - PETIOLE_LENGTH);
+    let blade_fraction = (y - PETIOLE_LENGTH) / (TIP_HEIGHT - PETIOLE_LENGTH);
     let distance = x.abs();
     let pixel_width = 1.2 / SIDE as f32;
-    let stalk_half_width = 0.016 * (1.0 - 0.85 * blade_fraction.max(0.0));
-    let stalk_coverage =
-        if blade_fraction < 0.9 { ((stalk_half_width - distance) / pixel_width + 0.5).clamp(0.0, 1.0) } else { 0.0 };
+    // The petiole continues as the midrib of the blade.
+    let midrib_half_width = 0.016 * (1.0 - 0.85 * blade_fraction.max(0.0));
+    let midrib_coverage =
+        if blade_fraction < 0.9 { ((midrib_half_width - distance) / pixel_width + 0.5).clamp(0.0, 1.0) } else { 0.0 };
     if blade_fraction <= 0.0 {
-        return (palette.stem, stalk_coverage);
+        return (palette.stem, midrib_coverage);
     }
     let blade_half_width = half_width(blade_fraction);
-    let coverage = ((blade_half_width - distance) / (1.6 * pixel_width) + 0.5).clamp(0.0, 1.0).max(stalk_coverage);
+    let coverage = ((blade_half_width - distance) / (1.6 * pixel_width) + 0.5).clamp(0.0, 1.0).max(midrib_coverage);
     let relative_distance = (distance / blade_half_width.max(1e-3)).min(1.2);
     let base_color = lerp_color(palette.blade, palette.edge, smoothstep(0.35, 1.1, relative_distance));
     // Between two side veins the blade bulges and appears lighter.
@@ -79,7 +83,7 @@ fn shade_leaf(palette: &LeafColors, x: f32, y: f32) -> ([f32; 3], f32) {
     let bulged_color = base_color.map(|channel| channel * (0.93 + 0.14 * bulge));
     let veined_color = lerp_color(bulged_color, palette.vein, 0.75 * vein_intensity);
     (
-        lerp_color(veined_color, palette.vein, smoothstep(1.9 * stalk_half_width, 0.6 * stalk_half_width, distance)),
+        lerp_color(veined_color, palette.vein, smoothstep(1.9 * midrib_half_width, 0.6 * midrib_half_width, distance)),
         coverage,
     )
 }

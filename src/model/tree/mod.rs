@@ -141,6 +141,7 @@ impl PartPlacer<'_> {
             let parent_from_child = joint_transform(&templates[template_index], child_joint, world_from_parent);
             let world_from_child = world_from_parent * parent_from_child;
             let child = &templates[child_joint.template_index];
+            // A name is a kind and the numbers of the joints from the trunk to the part, such as `leaf 3.2`.
             let parent_path = self.domains[parent]
                 .name
                 .split_once(' ')

@@ -69,7 +69,7 @@ impl PlantBuilder<'_> {
     /// such a leaflet is the leaf with the polyline of the same petiole or, if there is none, the shoot.
     fn build(mut self) -> Result<SceneParts> {
         let structure = self.structure;
-        for index in &structure.order {
+        for index in &structure.parent_first_order {
             let shoot = &structure.shoots[*index];
             let parent = structure.shoot(shoot.parent).map(Organ::Shoot);
             self.add_domain(Organ::Shoot(*index), format!("shoot {}", shoot.id), shoot.vertices[0], parent)?;

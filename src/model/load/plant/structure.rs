@@ -45,7 +45,7 @@ pub(super) struct PlantStructure {
     pub(super) shoots: Vec<Shoot>,
     pub(super) leaves: Vec<Leaf>,
     /// Indices of the shoots, every parent before its children.
-    pub(super) order: Vec<usize>,
+    pub(super) parent_first_order: Vec<usize>,
     /// Indices of the shoots by id.
     shoot_indices: HashMap<i64, usize>,
 }
@@ -67,8 +67,8 @@ impl PlantStructure {
             let given = format!("{} ids of {} shoots", shoot_indices.len(), file.shoots.len());
             return Err(invalid("shoots", "different ids", given));
         }
-        let order = topological_order(&file.shoots, &shoot_indices)?;
-        let structure = Self { objects, shoots: file.shoots, leaves: file.leaves, order, shoot_indices };
+        let parent_first_order = topological_order(&file.shoots, &shoot_indices)?;
+        let structure = Self { objects, shoots: file.shoots, leaves: file.leaves, parent_first_order, shoot_indices };
         structure.check_polylines()?;
         structure.check_leaves()?;
         Ok(structure)
@@ -83,6 +83,7 @@ impl PlantStructure {
         let shoots = self.shoots.iter().map(|shoot| (format!("shoot {}", shoot.id), &shoot.vertices[..]));
         let leaves = self.leaves.iter().flat_map(|leaf| {
             let polyline = leaf.petiole_vertices.as_deref().unwrap_or(std::slice::from_ref(&leaf.base));
+            // The base of a leaf is checked as a polyline of one point.
             let base_point = std::slice::from_ref(&leaf.base);
             [polyline, base_point].map(|polyline| (format!("leaf {}", leaf.object_id), polyline))
         });
@@ -186,7 +187,7 @@ mod tests {
     #[test]
     fn parent_shoots_precede_their_children() {
         let text = [shoot_json(7, 3), shoot_json(3, -1), shoot_json(9, 7), shoot_json(4, -1)].join(",");
-        assert_eq!(parse(&text, "").expect("a valid structure").order, [1, 3, 0, 2]);
+        assert_eq!(parse(&text, "").expect("a valid structure").parent_first_order, [1, 3, 0, 2]);
     }
 
     #[test]

@@ -72,7 +72,7 @@ fn changed_domains_include_those_that_share_coordinates() {
     let rest = SceneState::rest(&scene);
     assert_eq!((rest.serial, &rest.dirty_domains), (0, &DirtyDomains::All));
     let mut state = rest;
-    for (serial, (raw, changed)) in [
+    for (serial, (raw, changed_domains)) in [
         (coordinates_step(&[3, 0], &[0.0; 4]), vec![0, 3]),
         (coordinates_step(&[1], &[1.0, 2.0]), vec![1, 2, 4]),
         (coordinates_step(&[4], &[1.0, 2.0]), vec![1, 2, 4]),
@@ -87,7 +87,7 @@ fn changed_domains_include_those_that_share_coordinates() {
     .enumerate()
     {
         state.apply(&scene, &parse_step(&scene, &raw));
-        assert_eq!((state.serial, &state.dirty_domains), (serial as u64 + 1, &DirtyDomains::Some(changed)));
+        assert_eq!((state.serial, &state.dirty_domains), (serial as u64 + 1, &DirtyDomains::Some(changed_domains)));
     }
     state.mark_all_dirty();
     assert_eq!((state.serial, &state.dirty_domains), (9, &DirtyDomains::All));
@@ -97,10 +97,10 @@ fn changed_domains_include_those_that_share_coordinates() {
 #[test]
 fn changed_domains_are_complete_and_minimal() {
     let scene = scene(7);
-    let updated_fingerprints = |state: &SceneState, previous: &[f64], changed: &[u32]| {
+    let updated_fingerprints = |state: &SceneState, previous: &[f64], changed_domains: &[u32]| {
         let expected = fingerprints(&scene, state);
         let mut updated = previous.to_vec();
-        changed.iter().for_each(|domain| updated[*domain as usize] = expected[*domain as usize]);
+        changed_domains.iter().for_each(|domain| updated[*domain as usize] = expected[*domain as usize]);
         (updated, expected)
     };
     let mut state = SceneState::rest(&scene);
@@ -111,16 +111,16 @@ fn changed_domains_are_complete_and_minimal() {
         coordinates_step(&[4, 0], &[1.0, -1.0, 3.0, 4.0]),
     ] {
         state.apply(&scene, &parse_step(&scene, &raw));
-        let DirtyDomains::Some(changed) = &state.dirty_domains else { panic!("expected a list of domains") };
-        let (updated, expected) = updated_fingerprints(&state, &previous, changed);
+        let DirtyDomains::Some(changed_domains) = &state.dirty_domains else { panic!("expected a list of domains") };
+        let (updated, expected) = updated_fingerprints(&state, &previous, changed_domains);
         assert_eq!(updated, expected);
-        for removed in 0..changed.len() {
-            let mut incomplete_list = changed.clone();
+        for removed in 0..changed_domains.len() {
+            let mut incomplete_list = changed_domains.clone();
             incomplete_list.remove(removed);
             assert_ne!(
                 updated_fingerprints(&state, &previous, &incomplete_list).0,
                 expected,
-                "expected a wrong result without entry {removed} of {changed:?}"
+                "expected a wrong result without entry {removed} of {changed_domains:?}"
             );
         }
         previous = expected;
