@@ -7,7 +7,7 @@
 //     VALUES   [height][width][SAMPLES]  value times `scale`, and the cosine to the eye, 16 bits each. Both are 0
 //                                        without an id; otherwise the cosine is at least 1 / 65535.
 layout(local_size_x = WORKGROUP_SIZE) in;
-layout(location = 0) uniform int scale_bits;
+layout(location = 0) uniform int scale_bits; // `scale` as the bits of a float
 layout(std430, binding = 0) writeonly buffer Words { uint words[]; };
 #ifdef VALUES
 layout(binding = 24) uniform samplerBuffer values;

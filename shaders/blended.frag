@@ -21,8 +21,8 @@ void main() {
 #endif
     vec3 geometric_normal = safe_normalize(normal_world), normal = geometric_normal;
 #ifdef NORMAL_MAPS
-    vec3 bump = normal_texel(material.images.zw, uv_image).xyz;
-    if (material.images.z >= 0) normal = apply_normal_map(normal, tangent_world, bump);
+    vec3 normal_map_texel = normal_texel(material.images.zw, uv_image).xyz;
+    if (material.images.z >= 0) normal = apply_normal_map(normal, tangent_world, normal_map_texel);
 #endif
     normal = gl_FrontFacing ? normal : -normal;
 #ifdef OPAQUE_PARTS

@@ -55,7 +55,7 @@ vec3 shade_id(uint id, vec2 ndc, vec2 pixel_size) {
 vec3 shade_pixel(ivec2 pixel, ivec2 size, uint sample_ids[SAMPLES]) {
     vec2 pixel_size = 2.0 / vec2(size);
     PixelAccumulator sum = PixelAccumulator(vec3(0.0), vec3(0.0));
-    uint remaining = (1u << SAMPLES) - 1u;
+    uint remaining_samples = (1u << SAMPLES) - 1u;
 #ifdef OIT
     bool has_fragments = texelFetch(fragment_counts, pixel, 0).x > 0u;
 #endif
@@ -64,17 +64,17 @@ vec3 shade_pixel(ivec2 pixel, ivec2 size, uint sample_ids[SAMPLES]) {
     do {
         uint id = NO_ID;
         for (int sample_index = SAMPLES - 1; sample_index >= 0; sample_index--) {
-            if ((remaining >> sample_index & 1u) != 0u) id = sample_ids[sample_index];
+            if ((remaining_samples >> sample_index & 1u) != 0u) id = sample_ids[sample_index];
         }
-        uint matching = 0u;
+        uint matching_samples = 0u;
         vec2 position_sum = vec2(0.0);
         for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
-            if ((remaining >> sample_index & 1u) != 0u && sample_ids[sample_index] == id) {
-                matching |= 1u << sample_index;
+            if ((remaining_samples >> sample_index & 1u) != 0u && sample_ids[sample_index] == id) {
+                matching_samples |= 1u << sample_index;
                 position_sum += SAMPLE_POSITIONS[sample_index];
             }
         }
-        float count = float(bitCount(matching));
+        float count = float(bitCount(matching_samples));
         vec3 light = shade_id(id, (vec2(pixel) + position_sum / count) * pixel_size - 1.0, pixel_size);
 #ifdef BLEND_LAYERS
         for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
@@ -84,13 +84,13 @@ vec3 shade_pixel(ivec2 pixel, ivec2 size, uint sample_ids[SAMPLES]) {
 #else
             vec4 layer = texelFetch(layers, pixel, sample_index);
 #endif
-            if ((matching >> sample_index & 1u) != 0u) accumulate_sample(sum, layer.rgb + layer.a * light, 1.0);
+            if ((matching_samples >> sample_index & 1u) != 0u) accumulate_sample(sum, layer.rgb + layer.a * light, 1.0);
         }
 #else
         accumulate_sample(sum, light, count);
 #endif
-        remaining &= ~matching;
-    } while (remaining != 0u);
+        remaining_samples &= ~matching_samples;
+    } while (remaining_samples != 0u);
 #ifdef BLOOM
     imageStore(bloom_source, pixel, vec4(sum.bloom / float(SAMPLES), 1.0));
 #endif

@@ -13,7 +13,7 @@ void main() {
     ivec2 corner = ivec2(gl_WorkGroupID.xy) * ivec2(WORKGROUP_SIZE, OUTPUT_ROWS);
     // @SUMS
     // The first 2 RADIUS rows complete sums above the strip, which are not stored.
-    for (int first = 0; first < OUTPUT_ROWS + 2 * RADIUS; first += STEP_ROWS) {
+    for (int first_row = 0; first_row < OUTPUT_ROWS + 2 * RADIUS; first_row += STEP_ROWS) {
         // @LOAD
         memoryBarrierShared();
         barrier();

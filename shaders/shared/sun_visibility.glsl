@@ -24,15 +24,15 @@ vec2 receiver_plane_gradient(vec3 normal, int layer) {
 // Bias that compensates for ground depth leaking into the blurred mean near a contact line. The leak would pull the mean
 // towards the sun, although the ground casts no shadow. Let h be the height above the line in standard deviations of the
 // blur, and k the depth difference of surface and ground per standard deviation. The ground shifts the mean by
-// k (phi(h) - h Q(h)). The bias 0.4 k (1 - h / 2)^2 is an upper bound of it up to h = 1.9.
+// k (phi(h) - h Q(h)). The bias 0.4 k (1 - h / 2)^2 is an upper bound of this shift up to h = 1.9.
 float contact_bias(vec3 position, int layer, vec3 normal) {
     vec2 map_position = position.xy;
 #ifdef CASCADES
     map_position = from_cascade(map_position, layer);
 #endif
-    float height_depth = max(dot(frame.shadow_ground_plane.xy, map_position) + frame.shadow_ground_plane.z - position.z, 0.0);
+    float depth_above_ground = max(dot(frame.shadow_ground_plane.xy, map_position) + frame.shadow_ground_plane.z - position.z, 0.0);
     float gradient_difference = DEVIATION * length(receiver_plane_gradient(normal, layer) - receiver_plane_gradient(frame.up.xyz, layer));
-    float proximity = 1.0 - 0.5 * height_depth / max(gradient_difference, 1e-12);
+    float proximity = 1.0 - 0.5 * depth_above_ground / max(gradient_difference, 1e-12);
     return proximity > 0.0 ? 0.4 * gradient_difference * proximity * proximity : 0.0;
 }
 

@@ -29,14 +29,14 @@ vec4 shade_triangle(int triangle, vec2 ndc, vec2 pixel_size) {
     vec2 uv_ddx = finite_or_zero(corner_uvs * bary.ddx), uv_ddy = finite_or_zero(corner_uvs * bary.ddy);
 #endif
 #ifdef TEXTURES
-    vec4 color = color_texel(material.images.xy, uv, uv_ddx, uv_ddy);
-    if (material.images.x >= 0) tint = color;
+    vec4 texel = color_texel(material.images.xy, uv, uv_ddx, uv_ddy);
+    if (material.images.x >= 0) tint = texel;
 #endif
 #ifdef NORMAL_MAPS
     mat3x4 corner_tangents;
     for (int corner = 0; corner < 3; corner++) corner_tangents[corner] = texelFetch(tangents, corners[corner]);
-    vec3 bump = normal_texel(material.images.zw, uv, uv_ddx, uv_ddy).xyz;
-    if (material.images.z >= 0) shading_normal = apply_normal_map(shading_normal, corner_tangents * bary.weights, bump);
+    vec3 normal_map_texel = normal_texel(material.images.zw, uv, uv_ddx, uv_ddy).xyz;
+    if (material.images.z >= 0) shading_normal = apply_normal_map(shading_normal, corner_tangents * bary.weights, normal_map_texel);
 #endif
     shading_normal = bary.is_front_facing ? shading_normal : -shading_normal;
     vec3 light = phong(material, tint.rgb, shading_normal, geometric_normal, world * bary.weights);

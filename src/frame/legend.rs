@@ -108,14 +108,14 @@ impl Canvas<'_> {
         for (corner, incoming, outgoing) in corners {
             // The control points of the cubic Bézier curve that approximates a quarter circle lie 0.5523 radii from its
             // end points.
-            let control = (1.0 - 0.552_284_8) * radius;
+            let control_distance = (1.0 - 0.552_284_8) * radius;
             let start = offset_point(corner, incoming, -radius);
             let end = offset_point(corner, outgoing, radius);
             rasterizer.draw_line(previous_end, start);
             rasterizer.draw_cubic(
                 start,
-                offset_point(corner, incoming, -control),
-                offset_point(corner, outgoing, control),
+                offset_point(corner, incoming, -control_distance),
+                offset_point(corner, outgoing, control_distance),
                 end,
             );
             previous_end = end;

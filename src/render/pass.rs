@@ -195,7 +195,7 @@ impl FrameTimes {
     /// same name.
     pub(crate) fn of_passes(passes: &[(Pass, f64)]) -> Self {
         let passes_of = |stage: RenderStage| passes.iter().filter(move |(pass, _)| pass.stage() == stage);
-        let stage_ms = |stage: RenderStage| passes_of(stage).map(|(_, ms)| ms).fold(0.0, |stage_ms, ms| stage_ms + ms);
+        let stage_ms = |stage: RenderStage| passes_of(stage).map(|(_, ms)| ms).fold(0.0, |sum, ms| sum + ms);
         let timed_pass = |(pass, ms): &(Pass, f64)| (TimeKey::Pass(*pass), *ms);
         let mut times = vec![(TimeKey::Stage(RenderStage::Shadow), stage_ms(RenderStage::Shadow))];
         times.extend(passes_of(RenderStage::Shadow).filter(|(pass, _)| *pass != Pass::Shadow).map(timed_pass));

@@ -40,7 +40,7 @@ pub struct FrameParams {
     pub bounds: BoundingBox,
     /// Bounds of the same vertices in light space. The shadow map is fitted to them, or to the corners of `bounds` if
     /// there are none.
-    pub light: Option<OrientedBounds>,
+    pub light_bounds: Option<OrientedBounds>,
 }
 
 /// RGBA8 sRGB pixels of a frame, top row first.
@@ -53,7 +53,7 @@ pub struct FrameImage {
     pub raster_backends: RasterBackends,
 }
 
-/// Statistics of the last frame that was collected: the passes that ran and how many triangles they processed.
+/// Statistics of a frame: the passes that ran and how many triangles they processed.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct FrameStats {
     /// Passes in execution order. When several frames of one step share a shadow, only the first of them has "shadow"

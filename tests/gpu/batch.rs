@@ -93,7 +93,7 @@ fn gpu_multi_tile_blocks_have_the_bits_of_separate_domains() {
 /// Scenes with exact normals, normal maps, boxes and followers that also contain unbatched domains.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_batches_agree_with_every_feature_of_a_scene() {
+fn gpu_batches_have_the_bits_of_separate_domains_with_features() {
     let with_exact_normals = |storage| DeformationSettings { normals: NormalMethod::Exact, ..with_storage(storage) };
     let mixed_parts = |deformation: DeformationSettings, normal_maps: bool| {
         let mut random = Random(70);

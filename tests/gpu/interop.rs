@@ -65,12 +65,12 @@ fn gpu_shared_buffers_are_read_back_during_the_next_step() {
             (sharing_deformer.readback(VertexAttributes::VERTICES).expect("expected a readback to start"), want);
         if let Some((readback, want)) = pending.replace(readback_and_surface) {
             let got = sharing_deformer.wait_readback(&readback).expect("expected the readback to complete");
-            assert!(have_equal_bits(&got.positions, &want.positions), "step {seed}");
-            assert!(have_equal_bits(&got.normals, &want.normals), "step {seed}");
+            assert!(have_equal_bits(&got.positions, &want.positions), "the step before step {seed}");
+            assert!(have_equal_bits(&got.normals, &want.normals), "the step before step {seed}");
             let current = &pending.as_ref().expect("expected a pending readback").1;
             assert!(
                 !have_equal_bits(&got.positions, &current.positions),
-                "step {seed}: expected other positions than before"
+                "step {seed}: expected other positions than those of the step before"
             );
         }
     }
@@ -90,8 +90,13 @@ fn gpu_frames_of_shared_and_uploaded_buffers_are_equal() {
     );
     let mut sharing_deformer = open_deformer(&device, &scene, Some(shared_scene.vertex_buffers()));
     let bounds = sharing_deformer.deform(&state).expect("expected the step to succeed").bounds;
-    let params =
-        FrameParams { camera: Camera::fit_to_scene(&scene, 64, 64), width: 320, height: 240, bounds, light: None };
+    let params = FrameParams {
+        camera: Camera::fit_to_scene(&scene, 64, 64),
+        width: 320,
+        height: 240,
+        bounds,
+        light_bounds: None,
+    };
     let frame = renderer.draw(&shared_scene, &params).expect("expected a frame");
     renderer
         .upload(&uploaded_scene, sharing_deformer.surface().expect("expected a surface"))
@@ -126,7 +131,7 @@ fn gpu_frames_in_flight_keep_the_vertices_of_their_step() {
         width: 1920,
         height: 1080,
         bounds,
-        light: None,
+        light_bounds: None,
     };
     let (mut frames, mut expected_images) = (std::collections::VecDeque::new(), Vec::new());
     let mut images = Vec::new();

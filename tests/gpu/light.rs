@@ -37,14 +37,14 @@ fn gpu_light_bounds_equal_those_of_tile_boxes() {
         let mut deformer = cuda_deformer(&scene);
         for seed in 0..3 {
             let summary = deformer.deform(&scenes::random_state(&scene, seed)).expect("expected the step to succeed");
-            let (light, positions) = (
+            let (got, positions) = (
                 summary.oriented_bounds.expect("expected light-space bounds"),
                 &deformer.surface().expect("expected a surface").positions,
             );
             let (expected, tolerance) =
                 (bounds_in_light_space(&scene, positions, TILE_VERTICES), 4e-7 * coordinate_magnitude(&summary.bounds));
-            let (missing, excess) = (max_excess(&light, &expected), max_excess(&expected, &light));
-            assert!(missing <= 0.0 && excess <= tolerance, "n {vertices}: expected {expected:?}, got {light:?}");
+            let (missing, excess) = (max_excess(&got, &expected), max_excess(&expected, &got));
+            assert!(missing <= 0.0 && excess <= tolerance, "n {vertices}: expected {expected:?}, got {got:?}");
         }
         let rest_bounds = deformer
             .deform(&SceneState::rest(&scene))

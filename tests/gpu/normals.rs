@@ -57,11 +57,16 @@ fn tube(random: &mut Random, columns: u32, rows: u32, rank: usize) -> Shape {
 }
 
 /// A scene with exact normals, `instances` domains per shape, and optional normal maps.
-fn scene_with_exact_normals(shapes: Vec<Shape>, instances: usize, normal_maps: bool, rigid: bool) -> Arc<Scene> {
+fn scene_with_exact_normals(
+    shapes: Vec<Shape>,
+    instances: usize,
+    normal_maps: bool,
+    rigid_transforms: bool,
+) -> Arc<Scene> {
     let count = shapes.len();
     let mut parts = scenes::parts_of_shapes(shapes);
     parts.deformation.normals = NormalMethod::Exact;
-    parts.rigid_transforms = rigid;
+    parts.rigid_transforms = rigid_transforms;
     let material = if normal_maps { NORMAL_MAPPED } else { 0 };
     parts.domains = (0..instances * count).map(|index| new_domain(index % count, material)).collect();
     Scene::new(parts).expect("expected a valid scene")
@@ -164,8 +169,8 @@ fn gpu_exact_normals_equal_rigid_ones_without_deformation() {
     let comparison = compare_normals(&scene, &state, &mut deformer);
     // Rounded positions rotate a normal by about the rounding error divided by the size of a triangle.
     let assert_equal = |domain: usize, got: &[f32], want: &[f64], components: usize, limit: f64| {
-        let slot = scene.layout.domains[domain];
-        let (first, count) = (components * slot.first_corner, components * slot.corners);
+        let layout = scene.layout.domains[domain];
+        let (first, count) = (components * layout.first_corner, components * layout.corners);
         let want: Vec<[f64; 1]> = want[first..][..count].iter().map(|number| [*number]).collect();
         max_error(&got[first..][..count], &want, limit).unwrap_or_else(|error| panic!("domain {domain}: {error}"));
     };
@@ -216,8 +221,8 @@ fn gpu_exact_normals_are_unit_and_deterministic() {
         }
     }
     let normals_of = |domain: usize| {
-        let slot = scene.layout.domains[domain];
-        &first.normals[3 * slot.first_corner..][..3 * slot.corners]
+        let layout = scene.layout.domains[domain];
+        &first.normals[3 * layout.first_corner..][..3 * layout.corners]
     };
     assert!(
         have_equal_bits(normals_of(1), normals_of(3)) && have_equal_bits(normals_of(1), normals_of(5)),
@@ -270,7 +275,7 @@ fn gpu_exact_normals_survive_collapse_overflow_and_scale() {
                     offset,
                 ]);
                 let comparison = compare_normals(&scene, &state, &mut deformer);
-                let name = format!("scale {scale:e} far {offset:e} q {q:e}");
+                let name = format!("scale {scale:e}, offset {offset:e}, q {q:e}");
                 let assert_unit = |vector: &[f32]| {
                     let length = vector.iter().map(|number| number * number).sum::<f32>().sqrt();
                     assert!((length - 1.0).abs() < 1e-5, "{name}: {vector:?}");

@@ -82,8 +82,13 @@ fn draw_still(scene: &Arc<Scene>, state: &SceneState, uses_cuda: bool) -> StillI
     }
     // The near plane is far enough away that depth precision separates the surfaces.
     let camera = Camera { near: 1.0, far: 40.0, ..Camera::fit_to_scene(scene, SIZE[0], SIZE[1]) };
-    let params =
-        FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds: summary.bounds, light: summary.oriented_bounds };
+    let params = FrameParams {
+        camera,
+        width: SIZE[0],
+        height: SIZE[1],
+        bounds: summary.bounds,
+        light_bounds: summary.oriented_bounds,
+    };
     let image = renderer.draw(&buffers, &params).expect("expected a frame");
     let triangle_of =
         |id: &VisibilityId| if let VisibilityId::Triangle(index) = id { Some(*index as u32) } else { None };
@@ -192,7 +197,7 @@ fn gpu_shading_of_equal_ids_equals_opengl() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_cuda_frames_report_their_path_and_repeat_bits() {
+fn gpu_cuda_frames_report_their_rasterizer_and_repeat_bits() {
     let scene = scenes::random_scene(&[(3000, 12), (50, 0), (700, 3)], 5, true, false);
     let states = [scenes::random_state(&scene, 1), scenes::random_state(&scene, 2)];
     let [want, got, repeated] = [RasterPolicy::OpenGl, RasterPolicy::Cuda, RasterPolicy::Cuda]
@@ -233,7 +238,7 @@ fn gpu_cuda_frames_in_flight_keep_their_step() {
         in_flight.push_back(
             context
                 .begin_draw(&mut loaded_scene, &camera, FrameSize::new(SIZE[0], SIZE[1]))
-                .expect("expected a readback to start"),
+                .expect("expected the frame to start"),
         );
     }
     images.extend(
@@ -247,7 +252,7 @@ fn gpu_cuda_frames_in_flight_keep_their_step() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_ground_hides_geometry_below_on_both_paths() {
+fn gpu_ground_hides_geometry_below_with_both_rasterizers() {
     let [(_, scene, state), _] = scenes_and_states();
     let look = RenderSettings { shadow: None, antialias: Antialiasing::None, ..scene.look };
     let scene = Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene");
@@ -298,7 +303,7 @@ fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
 /// `RasterPolicy::Fastest` measures which rasterizer is faster.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_fastest_path_draws_frames_of_every_size() {
+fn gpu_fastest_rasterizer_draws_frames_of_every_size() {
     let scene = with_one_sample(&scenes::random_scene(&[(3000, 12), (700, 3)], 3, false, false));
     let mut context = open_device();
     let mut loaded_scene = context

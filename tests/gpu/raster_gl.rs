@@ -167,20 +167,22 @@ fn gpu_unknown_or_small_buffers_return_errors() {
     let context = GpuContext::open();
     let soup = all_soups().into_iter().find(|soup| soup.name == "a few pixels").expect("expected the named soup");
     let pixel_count = soup.viewport.pixel_count() as u64;
-    let unknown = |bytes| context.gl.buffer_handle(999_999, bytes);
-    let result =
-        CudaRasterizer::new(&context.device, soup_geometry(unknown(4 * soup.positions.len() as u64), &soup, None));
+    let unknown_buffer = |bytes| context.gl.buffer_handle(999_999, bytes);
+    let result = CudaRasterizer::new(
+        &context.device,
+        soup_geometry(unknown_buffer(4 * soup.positions.len() as u64), &soup, None),
+    );
     assert!(result.expect_err("expected an unknown-buffer error").to_string().contains("999999"));
     let (mut rasterizer, positions) = context.create_rasterizer(&soup, None);
     rasterizer
-        .draw(None, Some((&soup.viewport, &unknown(8 * pixel_count))))
+        .draw(None, Some((&soup.viewport, &unknown_buffer(8 * pixel_count))))
         .expect_err("expected an unknown-buffer error");
-    let small = context.gl.create_buffer(4 * pixel_count);
+    let small_target = context.gl.create_buffer(4 * pixel_count);
     rasterizer
-        .draw(None, Some((&soup.viewport, &small)))
+        .draw(None, Some((&soup.viewport, &small_target)))
         .expect_err("expected an error for a target that is too small");
     rasterizer
-        .draw(None, Some((&soup.viewport, &GlBuffer { bytes: 8 * pixel_count, ..small.clone() })))
+        .draw(None, Some((&soup.viewport, &GlBuffer { bytes: 8 * pixel_count, ..small_target.clone() })))
         .expect_err("expected an error for a target smaller than its stated size");
     let too_few_positions = GlBuffer { bytes: 3 * 4 * 2, ..positions };
     CudaRasterizer::new(&context.device, soup_geometry(too_few_positions, &soup, None))
@@ -193,7 +195,7 @@ fn gpu_unknown_or_small_buffers_return_errors() {
     );
     assert_eq!(
         count_differences(
-            &context.draw_depths(&mut rasterizer, &soup.viewport, &small),
+            &context.draw_depths(&mut rasterizer, &soup.viewport, &small_target),
             &two_sided_depths(&soup, None)
         ),
         0

@@ -78,11 +78,16 @@ pub(crate) fn parts_of_shapes(shapes: Vec<Shape>) -> SceneParts {
 }
 
 /// A scene of shapes (n, r) with `instances` domains per shape; with `normal_maps`, every other shape has a normal map.
-pub(crate) fn random_scene(shapes: &[(usize, usize)], instances: usize, normal_maps: bool, rigid: bool) -> Arc<Scene> {
+pub(crate) fn random_scene(
+    shapes: &[(usize, usize)],
+    instances: usize,
+    normal_maps: bool,
+    rigid_transforms: bool,
+) -> Arc<Scene> {
     let mut random = Random(shapes.len() as u64);
     let mut parts =
         parts_of_shapes(shapes.iter().map(|(vertices, rank)| random_shape(&mut random, *vertices, *rank)).collect());
-    parts.rigid_transforms = rigid;
+    parts.rigid_transforms = rigid_transforms;
     for _ in 0..instances {
         for index in 0..shapes.len() {
             let has_normal_map = normal_maps && index % 2 == 0;

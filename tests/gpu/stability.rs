@@ -252,8 +252,8 @@ fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
     dirty_state.mark_all_dirty();
     assert_eq!(partial_result.difference(&common::run_step(&mut deformer, &dirty_state)), None);
     let has_moved = |domain: usize| {
-        let slot = scene.layout.domains[domain];
-        let range = 3 * slot.first_vertex..3 * (slot.first_vertex + slot.vertices);
+        let layout = scene.layout.domains[domain];
+        let range = 3 * layout.first_vertex..3 * (layout.first_vertex + layout.vertices);
         result.surface.positions[range.clone()] != partial_result.surface.positions[range]
     };
     let moved_domains = (0..scene.domains.len()).filter(|domain| has_moved(*domain)).count();

@@ -16,7 +16,7 @@ fn texel_size(scene: &Scene, summary: &DeformSummary, uses_light_bounds: bool) -
         width: 64,
         height: 64,
         bounds: summary.bounds,
-        light: light_bounds,
+        light_bounds,
     };
     shadow_texel_axes(scene, &params).expect("expected a scene with a shadow").map(|side| side.norm())
 }

@@ -24,7 +24,7 @@ pub struct EglDevice {
     pub renderer: Option<String>,
     /// GL_VERSION; `None` if no context could be created.
     pub version: Option<String>,
-    /// Whether it draws on the CPU; as the device reports if no context could be created.
+    /// Whether the device draws on the CPU. This is what EGL reports if no context could be created.
     pub software: bool,
     /// Reason why no context could be created.
     pub problem: Option<String>,

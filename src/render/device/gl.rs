@@ -14,8 +14,8 @@ mod barrier;
 mod clear;
 mod debug;
 mod fence;
+mod fullscreen;
 mod indirect;
-mod layers;
 mod limits;
 mod object;
 mod staging;
@@ -176,9 +176,9 @@ impl Gl {
         }
         let reset_status = limits::has_reset_status(&functions).then(|| context.address("glGetGraphicsResetStatus"));
         // SAFETY: the function has this signature in OpenGL 4.5 and GL_KHR_robustness, one of which the context has.
-        let reset_status = reset_status.filter(|load_address| !load_address.is_null()).map(|load_address| unsafe {
-            std::mem::transmute::<*const std::ffi::c_void, GetResetStatus>(load_address)
-        });
+        let reset_status = reset_status
+            .filter(|address| !address.is_null())
+            .map(|address| unsafe { std::mem::transmute::<*const std::ffi::c_void, GetResetStatus>(address) });
         drop(current);
         Ok(Rc::new(Self {
             reset_status,
@@ -383,12 +383,12 @@ impl Gl {
     /// Creates a framebuffer of complete images.
     pub(crate) fn framebuffer(self: &Rc<Self>, color: Option<&Texture>, depth: &Texture) -> Result<Framebuffer> {
         let depth = Attachment { image: depth, layer: None };
-        self.attach_framebuffer(color.map(|image| Attachment { image, layer: None }), Some(depth))
+        self.create_framebuffer(color.map(|image| Attachment { image, layer: None }), Some(depth))
     }
 
     /// Creates a framebuffer with a color attachment and no depth attachment.
     pub(crate) fn color_framebuffer(self: &Rc<Self>, color: &Texture) -> Result<Framebuffer> {
-        self.attach_framebuffer(Some(Attachment { image: color, layer: None }), None)
+        self.create_framebuffer(Some(Attachment { image: color, layer: None }), None)
     }
 
     /// Creates a framebuffer whose only attachment, depth or color, is one layer of an array texture.
@@ -400,13 +400,13 @@ impl Gl {
     ) -> Result<Framebuffer> {
         let attachment = Attachment { image, layer: Some(layer) };
         if is_depth {
-            self.attach_framebuffer(None, Some(attachment))
+            self.create_framebuffer(None, Some(attachment))
         } else {
-            self.attach_framebuffer(Some(attachment), None)
+            self.create_framebuffer(Some(attachment), None)
         }
     }
 
-    fn attach_framebuffer(
+    fn create_framebuffer(
         self: &Rc<Self>,
         color: Option<Attachment<'_>>,
         depth: Option<Attachment<'_>>,

@@ -69,7 +69,7 @@ impl CullUniforms {
     }
 
     /// Numbers of workgroups, in x and y, of the dispatch over all blocks.
-    pub(crate) fn dispatch(&self) -> [u32; 2] {
+    pub(crate) fn dispatch_size(&self) -> [u32; 2] {
         [self.count[1].min(MAX_DISPATCH_WIDTH), self.count[1].div_ceil(MAX_DISPATCH_WIDTH)]
     }
 
@@ -127,7 +127,7 @@ mod tests {
     fn super_blocks_contain_consecutive_blocks_of_one_group() {
         let groups = CullUniforms::new(&[group(0, 1), group(1, 256 * 64 + 1), group(16386, 256)], 0.25);
         assert_eq!(groups.ranges[..3], [[0, 1, 0, 0], [1, 16385, 1, 64], [16386, 256, 66, 192]]);
-        assert_eq!((groups.count, groups.dispatch()), ([3, 67, 256, 0], [67, 1]));
+        assert_eq!((groups.count, groups.dispatch_size()), ([3, 67, 256, 0], [67, 1]));
         assert_eq!(groups.mask_bytes(), 256 * 32);
         let draws: Vec<u32> = bytemuck::pod_collect_to_vec(&groups.empty_draws());
         assert_eq!(draws.len(), 32 + 4);
@@ -142,7 +142,7 @@ mod tests {
     #[test]
     fn dispatch_of_many_blocks_covers_all_blocks_in_several_rows() {
         let groups = CullUniforms::new(&[group(0, 1 << 26)], 0.0);
-        let [columns, rows] = groups.dispatch();
+        let [columns, rows] = groups.dispatch_size();
         let blocks = (1 << 26) / WORKGROUP_SIZE;
         assert!(columns <= 65535);
         assert!(columns * rows >= blocks && columns * (rows - 1) < blocks);

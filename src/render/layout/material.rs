@@ -24,8 +24,8 @@ pub(crate) struct PackedMaterial {
 pub(crate) const MATERIAL_BYTES: usize = size_of::<PackedMaterial>();
 const _: () = assert!(MATERIAL_BYTES == 64, "PackedMaterial differs from shaders/shared/material.glsl");
 
-/// Packs the materials that triangles use; `images` are the color and the normal arrays.
-pub(crate) fn pack_materials(scene: &Scene, images: &[Vec<TextureArray>; 2]) -> Vec<PackedMaterial> {
+/// Packs the materials that triangles use. `texture_arrays` are those of colors and those of normals.
+pub(crate) fn pack_materials(scene: &Scene, texture_arrays: &[Vec<TextureArray>; 2]) -> Vec<PackedMaterial> {
     let pack_vec4 = |[r, g, b]: [f32; 3], w: f32| [r, g, b, w];
     let find_texture = |arrays: &[TextureArray], texture: Option<usize>| {
         let layer = texture.and_then(|texture| find_layer(arrays, texture));
@@ -37,8 +37,8 @@ pub(crate) fn pack_materials(scene: &Scene, images: &[Vec<TextureArray>; 2]) -> 
             AlphaMode::Blend => scene.look.opaque_alpha,
             AlphaMode::Opaque => 0.0,
         };
-        let [color_array, color_layer] = find_texture(&images[0], material.color_texture);
-        let [normal_array, normal_layer] = find_texture(&images[1], material.normal_texture);
+        let [color_array, color_layer] = find_texture(&texture_arrays[0], material.color_texture);
+        let [normal_array, normal_layer] = find_texture(&texture_arrays[1], material.normal_texture);
         PackedMaterial {
             ambient_array: pack_vec4(material.ambient, normal_array),
             diffuse_layer: pack_vec4(material.diffuse, normal_layer),

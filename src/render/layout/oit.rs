@@ -43,6 +43,7 @@ pub(crate) struct OitCounters {
 }
 
 pub(crate) const COUNTERS_HEADER_BYTES: usize = size_of::<OitCounters>();
+/// Byte offset of `commands` in [`OitCounters`].
 pub(crate) const COMMANDS_OFFSET: usize = 24;
 pub(crate) const COUNTERS_BYTES: usize = COUNTERS_HEADER_BYTES + 4 * BINS;
 const _: () = assert!(COUNTERS_HEADER_BYTES == 64, "OitCounters differs from shaders/shared/oit_lists.glsl");

@@ -319,7 +319,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_pass_has_its_own_accesses() {
+    fn accesses_are_in_the_order_of_the_passes() {
         assert_eq!(PASS_ACCESSES.map(|(pass, _)| pass), Pass::ALL);
     }
 
@@ -337,7 +337,7 @@ mod tests {
                 }
             }
         }
-        assert!(pairs > 100, "expected more than 100 pairs, got {pairs}");
+        assert!(pairs > 100, "expected more than 100 pairs of a writer and a reader, got {pairs}");
     }
 
     #[test]

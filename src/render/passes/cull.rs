@@ -51,7 +51,7 @@ const PYRAMID_TILE: u32 = 1 << LEVELS_PER_DISPATCH;
 
 /// Runs the bound culling program and compacts its result to lists. The caller has bound the inputs.
 fn compact_triangles(recorder: &PassRecorder<'_>, pass: Pass, culler: &TriangleCuller, compact: &Program) {
-    let [columns, rows] = culler.uniforms.dispatch();
+    let [columns, rows] = culler.uniforms.dispatch_size();
     recorder.gl.dispatch(columns, rows);
     recorder.barrier_within_pass(pass);
     compact.bind(None);

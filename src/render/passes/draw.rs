@@ -82,10 +82,10 @@ pub(super) fn draw_groups(
 /// Draws the triangles with one blend mode without back-face culling, in one call or in one call per culled list. The
 /// program is bound.
 pub(super) fn draw_double_sided(gl: &Gl, buffers: &SceneBuffers, draw: TriangleDraw<'_>) {
-    let has_fragments = draw.blend_mode != BlendMode::Opaque;
+    let has_fragment_shader = draw.blend_mode != BlendMode::Opaque;
     if draw.triangles == TriangleSet::All {
         let (first, count) = buffers.triangles(draw.blend_mode);
-        if has_fragments {
+        if has_fragment_shader {
             draw.program.set_first_triangle(first as u32);
         }
         if let Some(array) = buffers.vertex_array(draw.blend_mode) {
@@ -94,7 +94,7 @@ pub(super) fn draw_double_sided(gl: &Gl, buffers: &SceneBuffers, draw: TriangleD
         return;
     }
     for (index, group) in groups_of(buffers, draw.blend_mode) {
-        if has_fragments {
+        if has_fragment_shader {
             draw.program.set_first_triangle(first_triangle_of(group, draw.triangles));
         }
         draw_group(gl, buffers, index, draw.triangles);

@@ -30,8 +30,12 @@ use crate::uniforms::frame::FrameUniforms;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Camera, PixelRect, Scene};
 
-/// 32-bit words per pixel that `shaders/pick.comp` writes.
+/// 32-bit words per pixel that `shaders/pick.comp` writes: the id, three corners, their positions and their normals.
 const WORDS_PER_PIXEL: usize = 22;
+/// First word of the positions of the three corners, three words each.
+const POSITIONS_WORD: usize = 4;
+/// First word of the normals of the three corners, three words each.
+const NORMALS_WORD: usize = 13;
 /// Maximum width and height of the rectangle, in pixels.
 const MAX_SIDE: u32 = PixelRect::MAX_SIDE;
 const MAX_BYTES: u64 = 4 * WORDS_PER_PIXEL as u64 * MAX_SIDE as u64 * MAX_SIDE as u64;
@@ -144,15 +148,15 @@ impl Picker {
         })
     }
 
-    /// Waits for a pick, at most `limit`, and returns its hits row by row. Pixels without a triangle have no entry.
+    /// Waits for a pick, at most `timeout`, and returns its hits row by row. Pixels without a triangle have no entry.
     ///
     /// # Errors
     /// `Fault` when the device does not finish in time.
     pub(crate) fn finish(&mut self, pick: PendingPick, timeout: Duration) -> Result<Vec<PickHit>> {
         pick.fence.wait(Pass::Pick.name(), timeout)?;
         let [width, height] = pick.rectangle.size();
-        let words = WORDS_PER_PIXEL * width as usize * height as usize;
-        let words: Vec<u32> = bytemuck::pod_collect_to_vec(&pick.staging.read(4 * words)?);
+        let word_count = WORDS_PER_PIXEL * width as usize * height as usize;
+        let words: Vec<u32> = bytemuck::pod_collect_to_vec(&pick.staging.read(4 * word_count)?);
         let rays = PixelRays::new(&pick);
         let pixels = words.chunks_exact(WORDS_PER_PIXEL).zip(0..);
         let hits =
@@ -201,19 +205,19 @@ fn find_hit(pick: &PendingPick, rays: &PixelRays, words: &[u32], pixel: [u32; 2]
     let drawn_order = corners.map(|corner| {
         drawn_corners.iter().position(|drawn_corner| *drawn_corner == corner + first_corner).unwrap_or(0)
     });
-    let attribute = |first_word: usize, index: usize| {
+    let corner_vector = |first_word: usize, index: usize| {
         Vector3::from_fn(|axis, _| f64::from(f32::from_bits(words[first_word + 3 * index + axis])))
     };
     let ray = rays.through_pixel(pixel);
-    let camera_positions =
-        [0, 1, 2].map(|index| rays.camera_from_world.transform_point(&attribute(4, index).into()).coords);
+    let camera_positions = [0, 1, 2]
+        .map(|index| rays.camera_from_world.transform_point(&corner_vector(POSITIONS_WORD, index).into()).coords);
     let (barycentrics, is_front_facing) = intersect_triangle(&camera_positions, &ray);
     let barycentrics = Vector3::from(barycentrics);
     let interpolate = |first_word: usize| {
-        Matrix3::from_columns(&[attribute(first_word, 0), attribute(first_word, 1), attribute(first_word, 2)])
-            * barycentrics
+        Matrix3::from_columns(&[0, 1, 2].map(|index| corner_vector(first_word, index))) * barycentrics
     };
-    let normal = interpolate(13).try_normalize(1e-30).filter(|normal| normal.iter().all(|number| number.is_finite()));
+    let normal =
+        interpolate(NORMALS_WORD).try_normalize(1e-30).filter(|normal| normal.iter().all(|number| number.is_finite()));
     let normal = normal.unwrap_or_default();
     Some(PickHit {
         pixel: [pick.rectangle.x() + pixel[0], pick.rectangle.y() + pixel[1]],
@@ -221,7 +225,7 @@ fn find_hit(pick: &PendingPick, rays: &PixelRays, words: &[u32], pixel: [u32; 2]
         triangle,
         vertices: corners.map(|corner| mesh.corners().vertices[corner as usize]),
         barycentrics: drawn_order.map(|index| barycentrics[index]),
-        position: (interpolate(4) + Vector3::from(pick.origin)).into(),
+        position: (interpolate(POSITIONS_WORD) + Vector3::from(pick.origin)).into(),
         normal: if is_front_facing { normal } else { -normal }.into(),
         depth: -(Matrix3::from_columns(&camera_positions) * barycentrics).z,
     })

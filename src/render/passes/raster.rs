@@ -13,7 +13,7 @@ use modalcast_model::scene::Viewport;
 const IDS_IMAGE: u32 = 0;
 
 impl RasterPasses {
-    /// The pass whose name the draw of these passes has in statistics and times.
+    /// The pass under which statistics and times report the draw of these passes.
     pub(crate) const fn stats_pass(self) -> Pass {
         if self.shadow { Pass::RasterShadow } else { Pass::RasterVisibility }
     }

@@ -65,7 +65,7 @@ pub(crate) fn read_visibility(
     convert_ids(recorder, &target.readback_source, &word_pass)
 }
 
-/// Copies the pixels of a frame, then its list and culling statistics, to a staging buffer.
+/// Copies the pixels of a frame, then its fragment and culling counters, to a staging buffer.
 pub(crate) fn copy_frame(recorder: &PassRecorder<'_>, frame: &FrameContext<'_>, staging: &Buffer) -> Result<()> {
     let FrameContext { buffers, target, .. } = *frame;
     recorder.begin(Pass::Read);

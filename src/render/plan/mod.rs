@@ -64,7 +64,7 @@ pub struct RenderPlan {
 
 impl RenderPlan {
     /// Whether the shaders are compiled with a define.
-    pub fn defines(&self, name: &str) -> bool {
+    pub fn has_define(&self, name: &str) -> bool {
         self.defines.contains(&name)
     }
 

@@ -23,9 +23,9 @@ impl Renderer {
     ) -> Result<RasterBackends> {
         let Some(rasterizer) = &buffers.compute_rasterizer else { return Ok(RasterBackends::default()) };
         let supported_passes = rasterizer.enabled();
-        let fastest = self.find_fastest_passes(buffers, params, supported_passes);
+        let result = self.find_fastest_passes(buffers, params, supported_passes);
         let Some(rasterizer) = &buffers.compute_rasterizer else { return Ok(RasterBackends::default()) };
-        let fastest_passes = fastest.inspect_err(|_| rasterizer.enable(supported_passes))?;
+        let fastest_passes = result.inspect_err(|_| rasterizer.enable(supported_passes))?;
         rasterizer.enable(fastest_passes);
         if !fastest_passes.has_any() {
             buffers.compute_rasterizer = None;
@@ -66,8 +66,8 @@ impl Renderer {
         for _ in 0..TRIAL_FRAMES {
             buffers.shadow_cache.invalidate();
             // Without readback, the trial needs no staging buffer, which frames in flight may occupy.
-            let ticket = self.submit_without_readback(buffers, params)?;
-            times.push(self.read_image(ticket)?.times.drawing_ms());
+            let pending_frame = self.submit_without_readback(buffers, params)?;
+            times.push(self.read_image(pending_frame)?.times.drawing_ms());
         }
         times.remove(0);
         times.sort_by(f64::total_cmp);

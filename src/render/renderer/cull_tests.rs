@@ -67,7 +67,7 @@ fn draw_second_frame(scene: &Arc<Scene>, (original, replacement): (&str, &str)) 
     let view = View::LookAt { eye: [0.3, 0.2, 4.0], target: [0.1, 0.0, 0.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 90.0, fy: 90.0, cx: 32.0, cy: 32.0 };
     let camera = Camera { view, lens, near: 0.0, far: 0.0 };
-    let params = FrameParams { camera, width: 64, height: 64, bounds: scene.rest_bounds, light: None };
+    let params = FrameParams { camera, width: 64, height: 64, bounds: scene.rest_bounds, light_bounds: None };
     renderer.draw(&buffers, &params).expect("draws");
     let image = renderer.draw(&buffers, &params).expect("draws").rgba;
     assert!(renderer.stats().culled.is_some_and(|culled| culled.camera.culled() > 0));
@@ -88,7 +88,7 @@ fn culling_is_omitted_if_lists_exceed_the_buffer_limit() {
         assert_eq!((select_for(max_buffer_bytes), select_for(max_buffer_bytes - 1)), (culling, Culling::None));
         let limits = Limits { max_storage_bytes: max_buffer_bytes - 1, ..Limits::default() };
         let plan = ScenePlan::new(&scene, &limits, BlurMethod::Auto).report;
-        assert!(!plan.defines("CULLED") && !plan.passes.contains(&Pass::Cull));
+        assert!(!plan.has_define("CULLED") && !plan.passes.contains(&Pass::Cull));
         assert!(plan.omitted.iter().any(|feature| feature.feature == "culling"));
     }
 }
@@ -96,6 +96,7 @@ fn culling_is_omitted_if_lists_exceed_the_buffer_limit() {
 #[test]
 fn each_culling_test_that_removes_too_much_changes_the_image() {
     let scene = sheets();
+    // Replaces a word by itself: the original shader.
     let expected_image = draw_second_frame(&scene, ("shared", "shared"));
     for replacement in [
         ("is_below[axis] && lower_distance[axis] < -margin[axis]", "is_below[axis] && lower_distance[axis] < 2.0"),

@@ -29,8 +29,8 @@ impl Renderer {
     /// # Errors
     /// Errors of [`Self::submit`] and [`Self::map_pixels`].
     pub fn draw(&mut self, buffers: &SceneBuffers, params: &FrameParams) -> Result<FrameImage> {
-        let ticket = self.submit(buffers, params)?;
-        self.read_image(ticket)
+        let pending_frame = self.submit(buffers, params)?;
+        self.read_image(pending_frame)
     }
 
     /// Submits one frame of the current buffers; later changes of the buffers do not affect it. At most
@@ -56,18 +56,18 @@ impl Renderer {
     ///
     /// # Errors
     /// Errors of [`Self::map_pixels`].
-    pub fn read_image(&mut self, ticket: PendingFrame) -> Result<FrameImage> {
-        self.map_pixels(ticket).map(MappedPixels::into_image)
+    pub fn read_image(&mut self, pending_frame: PendingFrame) -> Result<FrameImage> {
+        self.map_pixels(pending_frame).map(MappedPixels::into_image)
     }
 
     /// Waits for a frame and maps its pixels, so that another thread can copy them.
     ///
     /// # Errors
     /// `Fault` with the pass that did not finish within the time limit, or with the OpenGL error.
-    pub fn map_pixels(&mut self, ticket: PendingFrame) -> Result<MappedPixels> {
+    pub fn map_pixels(&mut self, pending_frame: PendingFrame) -> Result<MappedPixels> {
         let _current = self.gl.make_current()?;
-        ticket.wait()?;
-        let PendingFrame { desc, slot, passes, mut stats, .. } = ticket;
+        pending_frame.wait()?;
+        let PendingFrame { desc, slot, passes, mut stats, .. } = pending_frame;
         let staging = slot.as_ref().and_then(ReadbackSlot::staging);
         if let Some(staging) = staging {
             let [oit_range, cull_range] = desc.readback_ranges().map(|range| range.start as usize..range.end as usize);
@@ -184,7 +184,7 @@ impl Renderer {
         self.gl.time_pass(pass.name(), self.frame_timeout, commands).map(|timer| (pass, timer))
     }
 
-    /// Copies the pixels, then the list and culling statistics, to the staging buffer.
+    /// Copies the pixels, then the fragment and culling counters, to the staging buffer.
     fn record_readback(
         &self,
         recorder: &PassRecorder<'_>,

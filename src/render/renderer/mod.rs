@@ -265,7 +265,7 @@ impl Renderer {
         readback::read_visibility(&recorder, target, &program, &staging)?;
         self.gl.wait("visibility readback", self.frame_timeout)?;
         let words = staging.read(bytes as usize)?;
-        let parse_id = |word: &[u8]| word.iter().rev().fold(0, |parse_id, byte| parse_id << 8 | u32::from(*byte));
+        let parse_id = |word: &[u8]| word.iter().rev().fold(0, |id, byte| id << 8 | u32::from(*byte));
         let sample_position = if frame.desc.samples > 1 { self.sample_positions[0] } else { [0.5; 2] };
         let size = [frame.desc.width, frame.desc.height];
         let sees_ground = |pixel: u32| frame.uniforms.ray_hits_ground(ndc_from_pixel(pixel, size, sample_position));
@@ -282,8 +282,8 @@ impl Renderer {
         if [params.width, params.height].iter().all(|side| (1..=limit).contains(side)) {
             return Ok(());
         }
-        let given = format!("{} x {}", params.width, params.height);
-        Err(invalid("frame.size", format!("1 to {limit} pixels a side"), given))
+        let got = format!("{} x {}", params.width, params.height);
+        Err(invalid("frame.size", format!("1 to {limit} pixels a side"), got))
     }
 
     /// Moves the target with this description to the end of the cache, and creates it if it is not cached.
@@ -312,8 +312,9 @@ fn check_length(name: &str, numbers: &[f32], expected: u64) -> Result<()> {
 /// relative to the pixel's lower left corner, 0 to 1.
 fn ndc_from_pixel(pixel: u32, [width, height]: [u32; 2], sample_position: [f32; 2]) -> [f64; 2] {
     let (column, row) = (pixel % width, height - 1 - pixel / width);
-    let to_ndc =
-        |pixel: u32, offset: f32, side: u32| 2.0 * (f64::from(pixel) + f64::from(offset)) / f64::from(side) - 1.0;
+    let to_ndc = |coordinate: u32, offset: f32, side: u32| {
+        2.0 * (f64::from(coordinate) + f64::from(offset)) / f64::from(side) - 1.0
+    };
     [to_ndc(column, sample_position[0], width), to_ndc(row, sample_position[1], height)]
 }
 

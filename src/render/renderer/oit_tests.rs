@@ -40,8 +40,9 @@ fn draw_glass(transparency: Transparency, alpha_mode: AlphaMode, post_depth_cove
     let buffers = renderer.load(&scene).expect("loads");
     renderer.upload(&buffers, &surface).expect("uploads");
     let camera = Camera::fit_to_scene(&scene, 64, 64);
-    let image =
-        renderer.draw(&buffers, &FrameParams { camera, width: 64, height: 64, bounds, light: None }).expect("draws");
+    let image = renderer
+        .draw(&buffers, &FrameParams { camera, width: 64, height: 64, bounds, light_bounds: None })
+        .expect("draws");
     (image.rgba, renderer)
 }
 
@@ -51,8 +52,8 @@ fn per_pixel_and_per_sample_fragments_give_the_same_image() {
     let (sample_shaded, sample_renderer) = draw_glass(Transparency::OrderIndependent, AlphaMode::Blend, false);
     let max_difference = pixel_shaded.iter().zip(&sample_shaded).map(|(a, b)| a.abs_diff(*b)).max();
     assert!(max_difference <= Some(2), "expected a difference of at most 2 levels, got {max_difference:?}");
-    let [pixel_fragments, sample_fragments] = [&pixel_renderer, &sample_renderer]
-        .map(|pixel_renderer| pixel_renderer.stats().oit.expect("list statistics").fragments);
+    let [pixel_fragments, sample_fragments] =
+        [&pixel_renderer, &sample_renderer].map(|renderer| renderer.stats().oit.expect("list statistics").fragments);
     assert!(
         !pixel_renderer.gl.limits.post_depth_coverage || sample_fragments > 3 * pixel_fragments,
         "expected different methods, got {pixel_fragments} and {sample_fragments} fragments"

@@ -15,7 +15,7 @@ use modalcast_model::error::{Error, Result};
 /// Bytes that a task copies: enough to hide the cost of starting the task.
 const COPY_CHUNK_BYTES: usize = 1 << 20;
 
-/// A frame in flight. Dropping the ticket abandons the frame.
+/// A frame in flight. Dropping it abandons the frame.
 #[derive(Debug)]
 pub struct PendingFrame {
     pub(super) desc: TargetDesc,
@@ -32,7 +32,7 @@ pub struct PendingFrame {
 }
 
 /// Pixels of a finished frame in a mapped staging buffer. Any thread may copy them. The ring cannot reuse the staging
-/// buffer before, so copy them soon.
+/// buffer while this value exists, so copy them soon.
 #[derive(Debug)]
 pub struct MappedPixels {
     pub(super) width: u32,
@@ -71,10 +71,10 @@ impl PendingFrame {
         let finished_count = self.passes.iter().take_while(|(_, timer)| timer.is_done()).count();
         let stage = self.passes.get(finished_count).map_or(stage, |(pass, _)| pass.name());
         let last_pass =
-            finished_count.checked_sub(1).map_or("none".into(), |last_pass| format!("'{}'", self.passes[last_pass].0));
+            finished_count.checked_sub(1).map_or("none".into(), |index| format!("'{}'", self.passes[index].0));
         Error::Fault {
             stage,
-            reason: format!("{reason} ({:?}); the last pass that it finished: {last_pass}", self.timeout),
+            reason: format!("{reason} (time limit {:?}); last finished pass: {last_pass}", self.timeout),
         }
     }
 }

@@ -43,7 +43,7 @@ fn surface(extra_width: f32) -> DeformedSurface {
 
 fn params(scene: &Scene, side: u32) -> FrameParams {
     let camera = Camera::fit_to_scene(scene, side, side);
-    FrameParams { camera, width: side, height: side, bounds: scene.rest_bounds, light: None }
+    FrameParams { camera, width: side, height: side, bounds: scene.rest_bounds, light_bounds: None }
 }
 
 /// Pixels of a surface drawn by a new renderer, and its number of blended fragments.
@@ -67,16 +67,16 @@ fn load_renderer() -> (Renderer, Arc<Scene>, SceneBuffers) {
 fn frames_in_flight_keep_their_vertices_and_counts() {
     let (mut renderer, scene, buffers) = load_renderer();
     let widths = [0.0, 0.2, 0.6];
-    let mut tickets = Vec::new();
+    let mut pending_frames = Vec::new();
     for extra_width in widths {
         renderer.upload(&buffers, &surface(extra_width)).expect("uploads");
-        tickets.push(renderer.submit(&buffers, &params(&scene, 64)).expect("submits"));
+        pending_frames.push(renderer.submit(&buffers, &params(&scene, 64)).expect("submits"));
     }
     // Last frame first: the host may wait in any order.
     let mut frames = Vec::new();
     for extra_width in widths.into_iter().rev() {
-        let ticket = tickets.pop().expect("a ticket");
-        let image = renderer.read_image(ticket).expect("draws");
+        let pending_frame = pending_frames.pop().expect("a pending frame");
+        let image = renderer.read_image(pending_frame).expect("draws");
         let (rgba, fragments) = draw_frame(extra_width);
         assert!(image.rgba == rgba, "{extra_width}");
         assert_eq!(renderer.stats().oit.expect("list statistics").fragments, fragments);
@@ -99,22 +99,22 @@ fn frames_in_flight_are_limited_per_target() {
     assert_eq!(staging_count(&renderer), 1);
     let unread: Vec<_> =
         (0..5).map(|_| renderer.submit_without_readback(&buffers, &params).expect("submits")).collect();
-    for ticket in unread {
-        assert!(renderer.read_image(ticket).expect("draws").rgba.is_empty());
+    for pending_frame in unread {
+        assert!(renderer.read_image(pending_frame).expect("draws").rgba.is_empty());
     }
     assert_eq!(staging_count(&renderer), 1, "a frame without readback needs no staging buffer");
-    let mut tickets: Vec<_> = (0..3).map(|_| renderer.submit(&buffers, &params).expect("submits")).collect();
+    let mut pending_frames: Vec<_> = (0..3).map(|_| renderer.submit(&buffers, &params).expect("submits")).collect();
     assert_eq!((staging_count(&renderer), MAX_FRAMES_IN_FLIGHT), (3, 3));
     let error = renderer.submit(&buffers, &params).expect_err("a full ring");
     assert_eq!(error, Error::Busy { queue: "frames in flight", limit: 3 });
     let smaller_params = FrameParams { width: 32, height: 32, ..params };
     renderer.draw(&buffers, &smaller_params).expect("a ring of its own");
-    let first_image = renderer.read_image(tickets.remove(0)).expect("draws");
-    tickets.push(renderer.submit(&buffers, &params).expect("a free slot"));
-    drop(tickets.remove(0));
-    tickets.push(renderer.submit(&buffers, &params).expect("the slot of the dropped ticket"));
-    for ticket in tickets {
-        assert!(renderer.read_image(ticket).expect("draws").rgba == first_image.rgba);
+    let first_image = renderer.read_image(pending_frames.remove(0)).expect("draws");
+    pending_frames.push(renderer.submit(&buffers, &params).expect("a free slot"));
+    drop(pending_frames.remove(0));
+    pending_frames.push(renderer.submit(&buffers, &params).expect("the slot of the dropped frame"));
+    for pending_frame in pending_frames {
+        assert!(renderer.read_image(pending_frame).expect("draws").rgba == first_image.rgba);
     }
     assert!(!renderer.read_visibility().expect("a staging buffer outside the ring").is_empty());
 }
@@ -126,19 +126,21 @@ fn timeout_names_the_pass_and_the_next_frame_is_drawn() {
     let passes =
         [Pass::Shadow, Pass::Blur, Pass::Visibility, Pass::Blended, Pass::Shade, Pass::Bloom, Pass::Encode, Pass::Read];
     for failing_index in 0..passes.len() {
-        let mut ticket = renderer.submit(&buffers, &params).expect("submits");
+        let mut pending_frame = renderer.submit(&buffers, &params).expect("submits");
         renderer.gl.wait("test", Duration::from_secs(60)).expect("a finished frame");
-        let timed: Vec<Pass> = ticket.passes.iter().map(|(pass, _)| *pass).collect();
+        let timed: Vec<Pass> = pending_frame.passes.iter().map(|(pass, _)| *pass).collect();
         assert_eq!(timed, passes);
-        ticket.fence = renderer.gl.broken_fence();
-        for (_, timer) in &mut ticket.passes[failing_index..] {
+        pending_frame.fence = renderer.gl.broken_fence();
+        for (_, timer) in &mut pending_frame.passes[failing_index..] {
             *timer = renderer.gl.unstarted_timer();
         }
-        assert!(ticket.is_ready(), "expected a timed-out frame to be ready");
-        let Err(Error::Fault { stage, reason }) = renderer.read_image(ticket) else { panic!("expected a fault") };
+        assert!(pending_frame.is_ready(), "expected a timed-out frame to be ready");
+        let Err(Error::Fault { stage, reason }) = renderer.read_image(pending_frame) else {
+            panic!("expected a fault")
+        };
         assert_eq!(stage, passes[failing_index].name());
         let last = if failing_index == 0 { "none".to_owned() } else { format!("'{}'", passes[failing_index - 1]) };
-        assert!(reason.ends_with(&format!("the last pass that it finished: {last}")), "{reason}");
+        assert!(reason.ends_with(&format!("; last finished pass: {last}")), "{reason}");
         // Discards the errors of querying objects that do not exist.
         renderer.gl.check("test").ok();
         renderer.draw(&buffers, &params).expect("draws");
@@ -161,21 +163,21 @@ fn failed_frame_drops_its_render_target() {
 fn frame_that_exceeds_its_time_limit_is_ready() {
     let (mut renderer, scene, buffers) = load_renderer();
     renderer.frame_timeout = Duration::from_millis(5);
-    let ticket = renderer.submit_without_readback(&buffers, &params(&scene, 64)).expect("submits");
-    ticket.is_ready();
+    let pending_frame = renderer.submit_without_readback(&buffers, &params(&scene, 64)).expect("submits");
+    pending_frame.is_ready();
     thread::sleep(Duration::from_millis(6));
-    assert!(ticket.time_left().is_zero() && ticket.is_ready_within(Duration::from_secs(60)));
+    assert!(pending_frame.time_left().is_zero() && pending_frame.is_ready_within(Duration::from_secs(60)));
 }
 
 #[test]
 fn frame_is_readable_after_its_target_was_freed() {
     let (mut renderer, scene, buffers) = load_renderer();
-    let ticket = renderer.submit(&buffers, &params(&scene, 64)).expect("submits");
+    let pending_frame = renderer.submit(&buffers, &params(&scene, 64)).expect("submits");
     for side in 32..40 {
         renderer.draw(&buffers, &params(&scene, side)).expect("draws");
     }
     assert!(renderer.targets.iter().all(|target| target.desc.width != 64));
-    let pixels = renderer.map_pixels(ticket).expect("draws");
+    let pixels = renderer.map_pixels(pending_frame).expect("draws");
     renderer.draw(&buffers, &params(&scene, 41)).expect("draws while the freed pixels are mapped");
     assert_eq!(renderer.gl.retired_buffer_count(), 1);
     assert!(pixels.into_image().rgba == draw_frame(0.0).0);
@@ -186,21 +188,21 @@ fn frame_is_readable_after_its_target_was_freed() {
 #[test]
 fn mapped_pixels_outlive_the_renderer() {
     let (mut renderer, scene, buffers) = load_renderer();
-    let ticket = renderer.submit(&buffers, &params(&scene, 64)).expect("submits");
-    let pixels = renderer.map_pixels(ticket).expect("draws");
+    let pending_frame = renderer.submit(&buffers, &params(&scene, 64)).expect("submits");
+    let pixels = renderer.map_pixels(pending_frame).expect("draws");
     drop(renderer);
     drop(buffers);
     assert!(pixels.into_image().rgba == draw_frame(0.0).0);
 }
 
 #[test]
-fn staging_memory_is_freed_after_another_thread_copied_it() {
+fn threads_copy_pixels_while_the_renderer_is_dropped() {
     let (expected_rgba, _) = draw_frame(0.0);
     let (mut renderer, scene, buffers) = load_renderer();
     let params = params(&scene, 64);
     let spawn_reader = |renderer: &mut Renderer, buffers: &SceneBuffers| {
-        let ticket = renderer.submit(buffers, &params).expect("submits");
-        let pixels = renderer.map_pixels(ticket).expect("draws");
+        let pending_frame = renderer.submit(buffers, &params).expect("submits");
+        let pixels = renderer.map_pixels(pending_frame).expect("draws");
         thread::spawn(move || {
             thread::sleep(Duration::from_millis(50));
             pixels.into_image()
@@ -223,8 +225,8 @@ fn submit_times_out_while_all_staging_buffers_are_mapped() {
     let params = params(&scene, 64);
     let mut mapped_frames = Vec::new();
     for _ in 0..3 {
-        let ticket = renderer.submit(&buffers, &params).expect("submits");
-        mapped_frames.push(renderer.map_pixels(ticket).expect("draws"));
+        let pending_frame = renderer.submit(&buffers, &params).expect("submits");
+        mapped_frames.push(renderer.map_pixels(pending_frame).expect("draws"));
     }
     renderer.frame_timeout = Duration::from_millis(20);
     assert!(matches!(renderer.submit(&buffers, &params), Err(Error::Busy { .. })));

@@ -92,10 +92,10 @@ impl RasterOutputs {
         options: &ShaderOptions,
         compile: &mut ProgramCompiler<'_>,
     ) -> Result<Self> {
-        let size = options.features.shadow.map_or(0, |shadow| u64::from(shadow.size));
+        let map_size = options.features.shadow.map_or(0, |shadow| u64::from(shadow.size));
         let shadow = match options.blur_from_buffer().filter(|_| passes.shadow) {
             Some(source) => {
-                let buffer = gl.buffer(4 * size * size, gl::STREAM_COPY, None)?;
+                let buffer = gl.buffer(4 * map_size * map_size, gl::STREAM_COPY, None)?;
                 Some(ShadowDepths { buffer, blur: compile(source)? })
             }
             None => None,

@@ -29,6 +29,7 @@ pub(crate) struct ScenePrograms {
     pub(crate) blur: Vec<Rc<Program>>,
     /// Draws shadow casters; one per blend mode.
     pub(crate) shadow: [Option<Rc<Program>>; 3],
+    /// Draws the ids of opaque triangles.
     pub(crate) opaque: Option<Rc<Program>>,
     pub(crate) ground: Option<Rc<Program>>,
     /// Culls shadow casters.
@@ -39,6 +40,7 @@ pub(crate) struct ScenePrograms {
 #[derive(Debug, Clone)]
 pub(crate) struct SampleCountPrograms {
     pub(crate) samples: u32,
+    /// Draws the ids of cut-out triangles.
     pub(crate) mask: Option<Rc<Program>>,
     /// Two-pass transparency: draws the opaque parts of blended triangles, if there may be any. `blended` draws the
     /// other parts.
@@ -63,6 +65,7 @@ pub(crate) struct CullPrograms {
 /// Further programs of occlusion culling.
 #[derive(Debug, Clone)]
 pub(crate) struct OcclusionPrograms {
+    /// Lists the triangles that were visible in the last frame.
     pub(crate) cull_previous: Rc<Program>,
     pub(crate) record_visible: Rc<Program>,
     /// Builds the first levels of the depth pyramid.
@@ -152,10 +155,11 @@ impl ScenePrograms {
     ) -> Result<Self> {
         let has_triangles = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
         let has_shadow = options.features.shadow.is_some();
-        let mut caster = |blend_mode: BlendMode| {
+        let mut compile_caster = |blend_mode: BlendMode| {
             compile_if(has_shadow && has_triangles(blend_mode), compile, || options.shadow(blend_mode))
         };
-        let shadow = [caster(BlendMode::Opaque)?, caster(BlendMode::Mask)?, caster(BlendMode::Blend)?];
+        let shadow =
+            [compile_caster(BlendMode::Opaque)?, compile_caster(BlendMode::Mask)?, compile_caster(BlendMode::Blend)?];
         let shadow_cull = match has_shadow && options.features.has_culling() {
             true => Some(ShadowCullPrograms {
                 cull_triangles: compile(options.cull_casters())?,

@@ -117,10 +117,10 @@ impl SceneBuffers {
         compile: &mut ProgramCompiler<'_>,
     ) -> Result<Self> {
         let ScenePlan { buffers: sizes, features, report: plan } = ScenePlan::new(scene, &gl.limits, blur_method);
-        let images = [arrays(scene, TextureRole::Color), arrays(scene, TextureRole::Normal)];
-        check_texture_limits(gl, scene, &images)?;
+        let texture_arrays = [arrays(scene, TextureRole::Color), arrays(scene, TextureRole::Normal)];
+        check_texture_limits(gl, scene, &texture_arrays)?;
         let mesh = Geometry::new(scene);
-        let buffers = allocate(gl, &sizes, &mesh, &pack_materials(scene, &images))?;
+        let buffers = allocate(gl, &sizes, &mesh, &pack_materials(scene, &texture_arrays))?;
         let allocation =
             |(name, buffer): (BufferName, &Buffer)| Allocation { name: name.to_string(), bytes: buffer.bytes };
         let mut plan_allocations: Vec<Allocation> = buffers.named().map(allocation).collect();
@@ -128,7 +128,7 @@ impl SceneBuffers {
         let SceneBufferSet { geometry, materials, uniforms, culling } = buffers;
         let options = ShaderOptions {
             features,
-            used_materials: material_uses(scene, &images),
+            used_materials: material_uses(scene, &texture_arrays),
             sample_positions: sample_positions.to_vec(),
             sample_resolve: post::sample_resolve(&scene.look),
             post_depth_coverage: gl.limits.post_depth_coverage,
@@ -144,7 +144,7 @@ impl SceneBuffers {
             }
             None => None,
         };
-        let [color_arrays, normal_arrays] = &images;
+        let [color_arrays, normal_arrays] = &texture_arrays;
         Ok(Self {
             compute_rasterizer: None,
             scene: Arc::clone(scene),
@@ -209,7 +209,7 @@ impl SceneBuffers {
     pub(crate) fn triangles(&self, blend_mode: BlendMode) -> (usize, usize) {
         let mut groups = self.groups.iter().filter(|group| group.blend_mode == blend_mode);
         let first_range = groups.next().map_or((0, 0), |group| (group.first_triangle, group.triangles));
-        groups.fold(first_range, |(first_range, count), group| (first_range, count + group.triangles))
+        groups.fold(first_range, |(first_triangle, count), group| (first_triangle, count + group.triangles))
     }
 
     /// Domain of a triangle, and its index in the mesh of the domain. `triangle` is an index in the draw order: an id
@@ -348,23 +348,24 @@ impl SceneBuffers {
 }
 
 /// Properties of the used materials that the shader sources depend on.
-fn material_uses(scene: &Scene, images: &[Vec<TextureArray>; 2]) -> Vec<MaterialUse> {
+fn material_uses(scene: &Scene, texture_arrays: &[Vec<TextureArray>; 2]) -> Vec<MaterialUse> {
     let array_of = |arrays: &[TextureArray], texture: Option<usize>| Some(find_layer(arrays, texture?)?.0);
     let material_use = |material: usize| {
         let material = &scene.materials[material];
         MaterialUse {
             blend_mode: blend_mode(material),
-            color_array: array_of(&images[0], material.color_texture),
-            normal_array: array_of(&images[1], material.normal_texture),
+            color_array: array_of(&texture_arrays[0], material.color_texture),
+            normal_array: array_of(&texture_arrays[1], material.normal_texture),
         }
     };
     used_materials(scene).into_iter().map(material_use).collect()
 }
 
 /// Checks the number and size of the texture arrays against the limits of the device.
-fn check_texture_limits(gl: &Gl, scene: &Scene, images: &[Vec<TextureArray>; 2]) -> Result<()> {
-    check_texture_budget(images)?;
-    let (reads, max_reads) = (FIXED_TEXTURE_READS + images[0].len() + images[1].len(), gl.limits.max_compute_textures);
+fn check_texture_limits(gl: &Gl, scene: &Scene, texture_arrays: &[Vec<TextureArray>; 2]) -> Result<()> {
+    check_texture_budget(texture_arrays)?;
+    let (reads, max_reads) =
+        (FIXED_TEXTURE_READS + texture_arrays[0].len() + texture_arrays[1].len(), gl.limits.max_compute_textures);
     if reads > max_reads as usize {
         return Err(gl::too_large("textures read by the shading", max_reads.into(), reads as u64));
     }

@@ -21,7 +21,7 @@ pub(crate) struct ShadowCache {
 pub(crate) struct ShadowKey {
     step: u64,
     bounds: BoundingBox,
-    light: Option<OrientedBounds>,
+    light_bounds: Option<OrientedBounds>,
     origin: [f64; 3],
 }
 
@@ -39,7 +39,7 @@ impl ShadowCache {
     /// Key of a map that does not depend on the camera; none if the step is unknown.
     pub(crate) fn key(&self, params: &FrameParams, origin: [f64; 3]) -> Option<ShadowKey> {
         let step = self.step.get()?;
-        Some(ShadowKey { step, bounds: params.bounds, light: params.light, origin })
+        Some(ShadowKey { step, bounds: params.bounds, light_bounds: params.light_bounds, origin })
     }
 
     /// Whether the map must be drawn to show this content.

@@ -66,8 +66,8 @@ impl TargetDesc {
         4 * u64::from(self.width) * u64::from(self.height)
     }
 
-    /// Byte ranges of the list and culling statistics, which follow the encoded frame in the staging buffer. They are
-    /// empty without lists or culling.
+    /// Byte ranges of the fragment counters and of the culling counters, which follow the encoded frame in the staging
+    /// buffer. They are empty without fragment lists or culling.
     pub(crate) fn readback_ranges(&self) -> [Range<u64>; 2] {
         let list_bytes =
             if matches!(self.blend_storage, BlendStorage::FragmentLists(_)) { COUNTERS_HEADER_BYTES as u64 } else { 0 };

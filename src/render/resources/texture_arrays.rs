@@ -35,12 +35,12 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &TextureArray, role: TextureR
         levels: array.levels(),
     })?;
     // Process few layers at a time, because mipmap chains take much host memory.
-    for (chunk, textures) in array.layers.chunks(8).enumerate() {
-        let build_chain = |layer: &usize| {
-            let cutoff = if role == TextureRole::Color { cutoff(scene, *layer) } else { None };
-            mip_levels(&scene.textures[*layer], array, role, cutoff)
+    for (chunk, texture_indices) in array.layers.chunks(8).enumerate() {
+        let build_chain = |index: &usize| {
+            let cutoff = if role == TextureRole::Color { cutoff(scene, *index) } else { None };
+            mip_levels(&scene.textures[*index], array, role, cutoff)
         };
-        let chains: Vec<Vec<Vec<u8>>> = textures.par_iter().map(build_chain).collect();
+        let chains: Vec<Vec<Vec<u8>>> = texture_indices.par_iter().map(build_chain).collect();
         for (offset, chain) in chains.iter().enumerate() {
             for (level, rgba) in chain.iter().enumerate() {
                 let size = [(array.width >> level).max(1), (array.height >> level).max(1)];

@@ -168,8 +168,8 @@ impl Geometry {
                 let is_reversed = material_properties.double_sided && winding_disagrees(mesh, *triangle);
                 let [a, b, c] = triangle.map(|corner| corner + layout.first_corner as u32);
                 self.triangles[*draw_index] = if is_mirrored == is_reversed { [a, b, c] } else { [a, c, b] };
-                if let Some(layout) = self.materials.get_mut(*draw_index) {
-                    *layout = material_indices[material];
+                if let Some(material_index) = self.materials.get_mut(*draw_index) {
+                    *material_index = material_indices[material];
                 }
                 *draw_index += 1;
             }
@@ -181,9 +181,13 @@ impl Geometry {
 fn spans<'a>(domain: &'a Domain, layout: &DomainLayout) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> + 'a {
     let count = layout.triangles;
     let single_range = domain.material_ranges.is_empty().then_some((domain.material, 0..count));
-    let range_ends = domain.material_ranges.iter().skip(1).map(|run| run.first_triangle).chain([count]);
-    let material_ranges =
-        domain.material_ranges.iter().zip(range_ends).map(|(run, end)| (run.material, run.first_triangle..end));
+    let range_ends =
+        domain.material_ranges.iter().skip(1).map(|material_range| material_range.first_triangle).chain([count]);
+    let material_ranges = domain
+        .material_ranges
+        .iter()
+        .zip(range_ends)
+        .map(|(material_range, end)| (material_range.material, material_range.first_triangle..end));
     single_range.into_iter().chain(material_ranges)
 }
 

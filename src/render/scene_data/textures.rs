@@ -79,8 +79,8 @@ pub(crate) fn arrays(scene: &Scene, role: TextureRole) -> Vec<TextureArray> {
 ///
 /// # Errors
 /// `Invalid` with the number of bytes and a list of the arrays, largest first.
-pub(crate) fn check_texture_budget(images: &[Vec<TextureArray>; 2]) -> Result<()> {
-    let mut arrays: Vec<&TextureArray> = images.iter().flatten().collect();
+pub(crate) fn check_texture_budget(texture_arrays: &[Vec<TextureArray>; 2]) -> Result<()> {
+    let mut arrays: Vec<&TextureArray> = texture_arrays.iter().flatten().collect();
     let bytes: u64 = arrays.iter().map(|array| array.bytes()).sum();
     if bytes <= MAX_TEXTURE_BYTES {
         return Ok(());

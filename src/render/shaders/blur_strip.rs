@@ -27,7 +27,7 @@ pub(crate) struct BlurStrip {
 }
 
 impl BlurStrip {
-    /// None if the kernel is too wide. A strip also processes 2 `radius` rows that it does not store, so large maps have
+    /// Fits a strip to the blur of a shadow map; none if the kernel is too wide. A strip also processes 2 `radius` rows that it does not store, so large maps have
     /// tall strips. Small maps have short strips, because the device needs many workgroups.
     pub(crate) fn fit(shadow: &ShadowSettings) -> Option<Self> {
         let radius = shadow.blur_radius();
@@ -68,7 +68,7 @@ impl BlurStrip {
         let row_pitch = columns + 2 * radius;
         let (mut loads, mut stores) = (String::new(), String::new());
         for row in 0..rows_per_step {
-            let texel = format!("corner + ivec2(lane, first + {row} - {radius})");
+            let texel = format!("corner + ivec2(lane, first_row + {row} - {radius})");
             writeln!(loads, "float depth{row} = centered_depth({texel}, side);").ok();
             writeln!(stores, "depths[buffer_offset + {} + lane] = depth{row};", row * row_pitch + radius).ok();
         }
@@ -83,7 +83,7 @@ impl BlurStrip {
             } else {
                 String::new()
             };
-            let texel = format!("corner + ivec2(column{index}, first + row{index}) - {radius}");
+            let texel = format!("corner + ivec2(column{index}, first_row + row{index}) - {radius}");
             writeln!(loads, "{guard}margin{index} = centered_depth({texel}, side);").ok();
             writeln!(
                 stores,
@@ -112,11 +112,11 @@ impl BlurStrip {
             }
             let last = row + 2 * radius;
             writeln!(text, "vec2 sum{last} = {} * blurred{row};", weight_at(last, row + radius)).ok();
-            let texel = format!("corner + ivec2(lane, first + {row} - {})", 2 * radius);
+            let texel = format!("corner + ivec2(lane, first_row + {row} - {})", 2 * radius);
             let first_complete = (2 * radius).saturating_sub(row);
             writeln!(
                 text,
-                "if (first >= {first_complete}) imageStore(destination, {texel}, vec4(sum{row}, 0.0, 0.0));"
+                "if (first_row >= {first_complete}) imageStore(destination, {texel}, vec4(sum{row}, 0.0, 0.0));"
             )
             .ok();
         }

@@ -226,7 +226,7 @@ pub(crate) fn vertex_and_fragment(vertex: String, fragment: String) -> Vec<(u32,
     vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)]
 }
 
-/// Number and row length of tiles, and the tile list.
+/// Side of a tile, row length of the dispatch over listed tiles, and the tile list.
 fn tile_list() -> String {
     format!("#define TILE {TILE}\n#define TILES_PER_ROW {TILE_ROW}u\n{TILE_LIST}")
 }
@@ -278,7 +278,7 @@ mod tests {
     use modalcast_model::scene::Scene;
 
     fn options(alpha_mode: AlphaMode) -> ShaderOptions {
-        let scene = Scene::new(squares(vec![Material { alpha_mode, ..Material::default() }])).expect("good");
+        let scene = Scene::new(squares(vec![Material { alpha_mode, ..Material::default() }])).expect("a valid scene");
         let plan =
             ScenePlan::new(&scene, &Limits { max_storage_bytes: u64::MAX, ..Limits::default() }, BlurMethod::Tiles);
         let sample_positions = vec![[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];

@@ -122,23 +122,32 @@ mod tests {
     fn box_params() -> LightBoxParams {
         let bounds = BoundingBox { min: [-50.0, 0.0, -50.0], max: [50.0, 5.0, 50.0] };
         let to_sun = Vector3::new(0.4, 0.8, 0.5).normalize();
-        LightBoxParams { to_sun, up: UpAxis::Y, bounds, light: None, ground: Some(0.0), size: 512.0, margin: 6.0 }
+        LightBoxParams {
+            to_sun,
+            up: UpAxis::Y,
+            bounds,
+            light_bounds: None,
+            ground: Some(0.0),
+            size: 512.0,
+            margin: 6.0,
+        }
     }
 
     fn params(angle: f64) -> FrameParams {
         let eye = [0.0, 2.0, 20.0];
         let view = View::LookAt { eye, target: [angle.sin(), 2.0, 20.0 - angle.cos()], up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, lens: Lens::FieldOfView(40.0), near: 0.1, far: 80.0 };
-        FrameParams { camera, width: 160, height: 90, bounds: box_params().bounds, light: None }
+        FrameParams { camera, width: 160, height: 90, bounds: box_params().bounds, light_bounds: None }
     }
 
     #[test]
-    fn split_depths_are_the_mean_of_ratios_and_lengths() {
+    fn split_depths_are_the_mean_of_both_split_schemes() {
         assert_eq!(split_depths(1.0, 16.0, 2), [6.25], "the mean of 4 and 8.5");
         let split_depths = split_depths(1.0, 81.0, 4);
-        let expected = [3.0, 9.0, 27.0].iter().zip([21.0, 41.0, 61.0]).map(|(ratio, even)| 0.5 * (ratio + even));
+        let (logarithmic, uniform) = ([3.0, 9.0, 27.0], [21.0, 41.0, 61.0]);
+        let expected = logarithmic.iter().zip(uniform).map(|(a, b)| 0.5 * (a + b));
         assert!(
-            split_depths.iter().zip(expected).all(|(cut, expected)| (cut - expected).abs() < 1e-12),
+            split_depths.iter().zip(expected).all(|(depth, expected)| (depth - expected).abs() < 1e-12),
             "{split_depths:?}"
         );
     }
@@ -166,10 +175,10 @@ mod tests {
                 let shift = (sides[axis].low - first_sides[axis].low) / texel;
                 assert!((shift - shift.round()).abs() < 1e-6, "moves by {shift} texels");
                 let center_coordinate = whole_box.axes[axis].dot(&center.coords);
-                let still_side = fit_cascade(&whole_box, &box_params, &(center, radius)).expect("a cascade")[axis];
+                let unmoved_side = fit_cascade(&whole_box, &box_params, &(center, radius)).expect("a cascade")[axis];
                 assert!(
-                    (center_coordinate - still_side.low - still_side.half_length).abs() + radius
-                        < still_side.half_length
+                    (center_coordinate - unmoved_side.low - unmoved_side.half_length).abs() + radius
+                        < unmoved_side.half_length
                 );
             }
         }

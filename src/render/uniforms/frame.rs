@@ -77,7 +77,7 @@ impl FrameUniforms {
                 shadow.alpha_threshold,
                 shadow.size as f32,
             ],
-            shadow_ground_plane: vec4_of(light_box.ground.into(), light_box.texel(f64::from(shadow.size))),
+            shadow_ground_plane: vec4_of(light_box.ground.into(), light_box.texel_side(f64::from(shadow.size))),
         };
         let numbers: &[f32] = bytemuck::cast_slice(std::slice::from_ref(&frame));
         match numbers.iter().all(|number| number.is_finite()) {
@@ -117,7 +117,7 @@ pub(crate) fn clip_from_positions(scene: &Scene, params: &FrameParams, origin: [
     clip_from_camera(scene, params, origin) * params.camera.relative_to(origin).camera_from_world()
 }
 
-/// Clip space of the shadow map from positions relative to `origin`; z = -1 is nearest to the sun.
+/// Matrix from positions relative to `origin` to the clip space of the shadow map; z = -1 is nearest to the sun.
 pub(crate) fn shadow_clip_from_positions(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
     let shadow_from_world = LightBox::fit(&light_box_params(scene, params, origin)).shadow_from_world;
     Matrix4::new_translation(&Vector3::repeat(-1.0)) * Matrix4::new_scaling(2.0) * shadow_from_world
@@ -131,7 +131,7 @@ fn finite_bounds(scene: &Scene, params: &FrameParams) -> BoundingBox {
 
 /// Light-space bounds of a frame; none if they or the world-space bounds overflowed.
 fn finite_light_bounds(params: &FrameParams) -> Option<OrientedBounds> {
-    params.light.filter(|light| light.is_valid() && params.bounds.is_finite())
+    params.light_bounds.filter(|light_bounds| light_bounds.is_valid() && params.bounds.is_finite())
 }
 
 /// Inputs of the light box, for positions relative to `origin`.
@@ -143,7 +143,7 @@ pub(crate) fn light_box_params(scene: &Scene, params: &FrameParams, origin: [f64
         to_sun: scene.look.to_sun(scene.up),
         up: scene.up,
         bounds,
-        light: finite_light_bounds(params),
+        light_bounds: finite_light_bounds(params),
         ground: scene.look.ground.map(|_| ground_height),
         size: f64::from(shadow.size),
         margin: f64::from(shadow.blur_radius()) + 1.0,
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn rest_bounds_move_along_but_keep_their_height() {
+    fn rest_bounds_follow_the_bounds_but_keep_their_height() {
         let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
         let rest_bounds = scene.rest_bounds;
         let shifted = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] + 5.0, corner[2] - 7.0];
@@ -272,7 +272,7 @@ mod tests {
         let max_coordinate = rest_bounds.min[up].abs().max(rest_bounds.max[up].abs());
         let is_behind = |lowering: f64, camera_height: f64, origin: f64| {
             let camera = Camera::fit_to_scene(&scene, 64, 64);
-            let mut params = FrameParams { camera, width: 64, height: 64, bounds: rest_bounds, light: None };
+            let mut params = FrameParams { camera, width: 64, height: 64, bounds: rest_bounds, light_bounds: None };
             params.bounds.min[up] -= lowering + origin;
             params.bounds.max[up] -= origin;
             let mut eye = [0.3, 0.4, 0.5];
@@ -299,7 +299,7 @@ mod tests {
             width: 64,
             height: 64,
             bounds: scene.rest_bounds,
-            light: None,
+            light_bounds: None,
         };
         let uniforms = FrameUniforms::new(&scene, &params, [0.0; 3]).expect("finite uniforms");
         let [x, y, z, must_rasterize_ground] = uniforms.to_sun;
@@ -314,8 +314,8 @@ mod tests {
             );
         }
         let light_bounds = OrientedBounds(BoundingBox { min: [-0.25; 3], max: [0.25; 3] });
-        let uniforms_with = |light| {
-            FrameUniforms::new(&scene, &FrameParams { light: Some(light), ..params }, [0.0; 3])
+        let uniforms_with = |light_bounds| {
+            FrameUniforms::new(&scene, &FrameParams { light_bounds: Some(light_bounds), ..params }, [0.0; 3])
                 .expect("finite uniforms")
         };
         assert_ne!(uniforms_with(light_bounds), uniforms, "expected an effect of valid light bounds");

@@ -36,7 +36,7 @@ pub(crate) struct LightBoxParams {
     pub(crate) up: UpAxis,
     pub(crate) bounds: BoundingBox,
     /// Light-space bounds of the same vertices; without them, the corners of `bounds` are used.
-    pub(crate) light: Option<OrientedBounds>,
+    pub(crate) light_bounds: Option<OrientedBounds>,
     /// Height of the ground along the up axis.
     pub(crate) ground: Option<f64>,
     /// Side of the map in texels.
@@ -74,7 +74,7 @@ impl LightBox {
     pub(crate) fn fit(params: &LightBoxParams) -> Self {
         let axes = light_axes(params.to_sun, params.up);
         let OrientedBounds(light_bounds) =
-            params.light.unwrap_or_else(|| OrientedBounds::enclosing(&axes, &params.bounds));
+            params.light_bounds.unwrap_or_else(|| OrientedBounds::enclosing(&axes, &params.bounds));
         let diagonal = diagonal(params);
         let sides = [0, 1].map(|axis: usize| {
             let (center, half_extent) = (
@@ -97,18 +97,18 @@ impl LightBox {
         let ground = ground_plane.map_or([0.0, 0.0, 1.0], |[a, b, c]| {
             let depth = |x: f64, y: f64| (near - (a * x + b * y + c)) / depth_extent;
             let [x, y] = sides;
-            let origin = depth(x.low, y.low);
+            let origin_depth = depth(x.low, y.low);
             [
-                depth(x.low + 2.0 * x.half_length, y.low) - origin,
-                depth(x.low, y.low + 2.0 * y.half_length) - origin,
-                origin,
+                depth(x.low + 2.0 * x.half_length, y.low) - origin_depth,
+                depth(x.low, y.low + 2.0 * y.half_length) - origin_depth,
+                origin_depth,
             ]
         });
         Self { shadow_from_world, ground, axes, sides }
     }
 
     /// Longer side of a texel, in scene units.
-    pub(crate) fn texel(&self, size: f64) -> f64 {
+    pub(crate) fn texel_side(&self, size: f64) -> f64 {
         2.0 * self.sides[0].half_length.max(self.sides[1].half_length) / size
     }
 }
@@ -155,7 +155,7 @@ mod tests {
             to_sun: to_sun.normalize(),
             up: UpAxis::Y,
             bounds,
-            light: None,
+            light_bounds: None,
             ground,
             size: 1024.0,
             margin: 6.0,
@@ -206,7 +206,8 @@ mod tests {
     fn light_bounds_give_a_smaller_box_that_contains_the_shadow() {
         for sun in [Vector3::new(0.4, 0.8, 0.5), Vector3::new(1.0, 0.3, 0.0), Vector3::new(-0.5, 0.6, 0.7)] {
             let (corner_params, points) = (test_params(sun, Some(-0.5)), ellipsoid_points([0.9, 1.4, 1.9]));
-            let params = LightBoxParams { light: measure_light_bounds(&corner_params, &points), ..corner_params };
+            let params =
+                LightBoxParams { light_bounds: measure_light_bounds(&corner_params, &points), ..corner_params };
             let (light_box, corner_box) = (LightBox::fit(&params), LightBox::fit(&corner_params));
             for point in points {
                 let shadow = point - params.to_sun * ((point.y + 0.5) / params.to_sun.y);
@@ -257,8 +258,9 @@ mod tests {
                 [1.0 + 0.05 * sway.sin(), 3.0 + 0.02 * (0.7 * sway).cos(), 2.0 + 1e-4 * f64::from(step)];
             let [x, y, z] = params.bounds.max;
             // A size that does not oscillate around a quantization step.
-            params.light = measure_light_bounds(&params, &ellipsoid_points([x, 0.5 * y, z].map(|scale| 0.95 * scale)))
-                .filter(|_| uses_light_bounds);
+            params.light_bounds =
+                measure_light_bounds(&params, &ellipsoid_points([x, 0.5 * y, z].map(|scale| 0.95 * scale)))
+                    .filter(|_| uses_light_bounds);
             let texel_position = map_position(&params).map(|number| number * params.size);
             let width = LightBox::fit(&params).sides[0].half_length + LightBox::fit(&params).sides[1].half_length;
             if let Some((previous_position, previous_width)) = previous {

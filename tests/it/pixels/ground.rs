@@ -69,7 +69,7 @@ impl Frame {
             .expect("expected the upload to succeed");
         let mut bounds = scene.rest_bounds;
         bounds.min[1] = min_y;
-        let params = FrameParams { camera, width: SIZE, height: SIZE, bounds, light: None };
+        let params = FrameParams { camera, width: SIZE, height: SIZE, bounds, light_bounds: None };
         let rgba = renderer.draw(&buffers, &params).expect("expected a frame").rgba;
         let passes = renderer.stats().passes.clone();
         let ids = renderer.read_visibility().expect("expected visibility ids");

@@ -37,7 +37,7 @@ impl PickHarness {
     }
 
     fn frame_params(&self, camera: Camera, size: u32) -> FrameParams {
-        FrameParams { camera, width: size, height: size, bounds: self.bounds, light: None }
+        FrameParams { camera, width: size, height: size, bounds: self.bounds, light_bounds: None }
     }
 
     /// Hits in a rectangle of a square image, given by its corner and size.

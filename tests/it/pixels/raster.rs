@@ -55,7 +55,9 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
         let buffers = renderer.load(&scene).expect("expected the scene to load");
         renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
         let [width, height] = SIZE;
-        renderer.draw(&buffers, &FrameParams { camera, width, height, bounds, light: None }).expect("expected a frame");
+        renderer
+            .draw(&buffers, &FrameParams { camera, width, height, bounds, light_bounds: None })
+            .expect("expected a frame");
         assert_eq!(renderer.stats().samples, 1);
         let source_triangle = |id: &VisibilityId| match id {
             VisibilityId::Triangle(index) => buffers.source_triangle(*index).map(|(_, triangle)| triangle as u32),

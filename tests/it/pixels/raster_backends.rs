@@ -129,8 +129,9 @@ fn draw_frame_with(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, 
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
     attach_backend(renderer, &mut buffers, backend);
     let [width, height] = SIZE;
-    let image =
-        renderer.draw(&buffers, &FrameParams { camera, width, height, bounds, light: None }).expect("expected a frame");
+    let image = renderer
+        .draw(&buffers, &FrameParams { camera, width, height, bounds, light_bounds: None })
+        .expect("expected a frame");
     let (ids, stats) = (renderer.read_visibility().expect("expected visibility ids"), renderer.stats().clone());
     let allocations = buffers.allocations().into_iter().map(|part| part.name).collect();
     DrawnFrame { image, ids, stats, allocations }
@@ -254,7 +255,7 @@ fn opengl_and_compute_frames_share_a_target() {
     });
     let [width, height] = SIZE;
     for (frame_index, x) in [-2.5, 2.5, 0.0, 1.0, -1.0].into_iter().enumerate() {
-        let params = FrameParams { camera: camera_at(x), width, height, bounds, light: None };
+        let params = FrameParams { camera: camera_at(x), width, height, bounds, light_bounds: None };
         let image = renderer.draw(&scene_buffers[frame_index % 2], &params).expect("expected a frame");
         let expected = draw_frame(
             &scene,
@@ -288,7 +289,7 @@ fn ground_hides_geometry_below_but_not_in_its_plane() {
         attach_backend(&mut renderer, &mut buffers, backend);
         let [width, height] = SIZE;
         renderer
-            .draw(&buffers, &FrameParams { camera: default_camera(), width, height, bounds, light: None })
+            .draw(&buffers, &FrameParams { camera: default_camera(), width, height, bounds, light_bounds: None })
             .expect("expected a frame");
         let domain = |id: &VisibilityId| match id {
             VisibilityId::Triangle(index) => buffers.source_triangle(*index).map(|(domain, _)| domain),
@@ -364,7 +365,13 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     let create_params = |eye: [f64; 3]| {
         let view = View::LookAt { eye, target: [0.0, 0.2, 0.0], up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, ..default_camera() };
-        FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds: summary.bounds, light: summary.oriented_bounds }
+        FrameParams {
+            camera,
+            width: SIZE[0],
+            height: SIZE[1],
+            bounds: summary.bounds,
+            light_bounds: summary.oriented_bounds,
+        }
     };
     let (first_params, second_params) = (create_params([1.4, 1.9, 4.0]), create_params([-2.0, 1.2, 3.0]));
     let unshared_image = renderer.draw(&buffers, &second_params).expect("expected a frame");
@@ -431,7 +438,7 @@ fn draw_with_failing_rasterizer(
         .attach_rasterizer(&mut buffers, |_| Ok(Box::new(rasterizer) as Box<dyn Rasterizer>))
         .expect("expected a rasterizer");
     let [width, height] = SIZE;
-    let params = FrameParams { camera: default_camera(), width, height, bounds: summary.bounds, light: None };
+    let params = FrameParams { camera: default_camera(), width, height, bounds: summary.bounds, light_bounds: None };
     let frames = (0..frame_count).map(|_| renderer.draw(&buffers, &params)).collect();
     (frames, draw_calls.get())
 }
@@ -504,7 +511,8 @@ fn rasterizer_is_compiled_when_the_scene_is_loaded() {
             requested_pipelines.get()
         );
         let [width, height] = SIZE;
-        let params = FrameParams { camera: default_camera(), width, height, bounds: summary.bounds, light: None };
+        let params =
+            FrameParams { camera: default_camera(), width, height, bounds: summary.bounds, light_bounds: None };
         let raster_backends = renderer.draw(&buffers, &params).expect("expected a frame").raster_backends;
         assert_eq!(raster_backends.visibility, Some(RasterBackend::OpenGl));
     }

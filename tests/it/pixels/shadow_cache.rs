@@ -38,7 +38,7 @@ fn cameras(scene: &Scene) -> [Camera; 2] {
 }
 
 fn frame_params(camera: Camera, bounds: BoundingBox) -> FrameParams {
-    FrameParams { camera, width: 64, height: 64, bounds, light: None }
+    FrameParams { camera, width: 64, height: 64, bounds, light_bounds: None }
 }
 
 fn count_shadow_passes(renderer: &Renderer) -> usize {
@@ -141,7 +141,7 @@ fn upload_bounds_or_origin_invalidate_the_shadow() {
         let axes = cut_out_scene.light_axes().expect("expected a scene with a shadow");
         let light_bounds = Some(OrientedBounds::enclosing(&axes, &bounds).expanded_by(expansion));
         renderer
-            .draw(&buffers, &FrameParams { light: light_bounds, ..frame_params(camera, bounds) })
+            .draw(&buffers, &FrameParams { light_bounds, ..frame_params(camera, bounds) })
             .expect("expected a frame");
         count_shadow_passes(&renderer)
     });

@@ -44,7 +44,7 @@ fn render_scene(meshes: &[Mesh], sun: [f32; 3], shadow: ShadowSettings, clip_pla
     let buffers = renderer.load(&scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
     renderer
-        .draw(&buffers, &FrameParams { camera, width: 32, height: 32, bounds, light: None })
+        .draw(&buffers, &FrameParams { camera, width: 32, height: 32, bounds, light_bounds: None })
         .expect("expected a frame")
 }
 
@@ -138,8 +138,13 @@ fn render_growing_bounds(scene: &std::sync::Arc<Scene>, has_light_bounds: bool) 
         let bounds = bounds_of_step(step);
         // Light bounds slightly larger than the light-space box of the scene bounds.
         let light_bounds = OrientedBounds::enclosing(&axes, &bounds).expanded_by(0.02 * bounds.diagonal());
-        let params =
-            FrameParams { camera, width: 96, height: 96, bounds, light: has_light_bounds.then_some(light_bounds) };
+        let params = FrameParams {
+            camera,
+            width: 96,
+            height: 96,
+            bounds,
+            light_bounds: has_light_bounds.then_some(light_bounds),
+        };
         renderer.draw(&buffers, &params).expect("expected a frame")
     };
     (0..60).map(&mut draw_frame).collect()

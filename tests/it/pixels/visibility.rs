@@ -276,7 +276,7 @@ fn render_with_normals(scene: &Arc<Scene>, normals: [f32; 3], tangents: [f32; 4]
     };
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
     let params =
-        FrameParams { camera: front_camera(64), width: 64, height: 64, bounds: scene.rest_bounds, light: None };
+        FrameParams { camera: front_camera(64), width: 64, height: 64, bounds: scene.rest_bounds, light_bounds: None };
     renderer.draw(&buffers, &params).expect("expected a frame").rgba
 }
 

@@ -142,11 +142,11 @@ mod tests {
             let (gl, _) = device::open(DevicePreference::Any).expect("EGL");
             for _ in 0..invalid_calls {
                 // SAFETY: the flag does not exist, and OpenGL rejects it.
-                unsafe { gl.functions().expect("current").enable(0xFFFF) }
-                assert!(gl.check("test").is_err(), "expected an error of OpenGL, too");
+                unsafe { gl.functions().expect("a current context").enable(0xFFFF) }
+                assert!(gl.check("test").is_err(), "expected the logged error also from `check`");
             }
             // SAFETY: waits for the commands, so that a driver with delayed messages has sent them.
-            unsafe { gl.functions().expect("current").finish() }
+            unsafe { gl.functions().expect("a current context").finish() }
         });
         String::from_utf8(lines.0.lock().expect("an unpoisoned lock").clone()).expect("text")
     }
@@ -213,11 +213,11 @@ mod tests {
         let gl = dispatcher::with_default(&dispatch, || device::open(DevicePreference::Any).expect("EGL").0);
         // SAFETY: the flag does not exist, and OpenGL rejects it; `finish` waits for the driver's messages.
         unsafe {
-            let functions = gl.functions().expect("current");
+            let functions = gl.functions().expect("a current context");
             functions.enable(0xFFFF);
             functions.finish();
         }
-        assert!(gl.check("test").is_err(), "expected an error of OpenGL, too");
+        assert!(gl.check("test").is_err(), "expected the logged error also from `check`");
         gl.check("test").expect("no error of later commands");
         assert!(panics.load(std::sync::atomic::Ordering::Relaxed) > 0, "expected a panic of the log");
     }

@@ -111,8 +111,8 @@ mod tests {
         let vertex_source = "#version 430 core\nvoid main() { gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2) - 1, \
                       0, 1); }";
         let fragment_source = format!(
-            "#version 430 core\nout vec4 colour;\nvoid main() {{ float x = gl_FragCoord.x; for (int i = 0; i < {iterations}; ++i) \
-             x = sin(x); colour = vec4(x); }}"
+            "#version 430 core\nout vec4 color;\nvoid main() {{ float x = gl_FragCoord.x; for (int i = 0; i < {iterations}; ++i) \
+             x = sin(x); color = vec4(x); }}"
         );
         let stages = [(glow::VERTEX_SHADER, vertex_source), (glow::FRAGMENT_SHADER, &fragment_source)];
         let program = gl.program("long", &stages).expect("compiles");

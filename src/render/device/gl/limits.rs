@@ -10,7 +10,7 @@ const SUBPIXEL_BITS: u32 = 0x0D50;
 pub(crate) struct Limits {
     pub(crate) renderer: String,
     pub(crate) version: String,
-    /// Whether it draws on the CPU.
+    /// Whether the context draws on the CPU.
     pub(crate) software: bool,
     /// Maximum side of textures and viewports, in pixels.
     pub(crate) max_side: u32,

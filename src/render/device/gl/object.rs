@@ -312,8 +312,8 @@ impl Program {
     }
 
     /// Sets the first triangle of the next draw (location 0). This must be the bound program.
-    pub(crate) fn set_first_triangle(&self, number: u32) {
-        self.set_uniform(0, number as i32);
+    pub(crate) fn set_first_triangle(&self, first_triangle: u32) {
+        self.set_uniform(0, first_triangle as i32);
     }
 
     /// Sets the phase of a program with several phases (location 1). This must be the bound program.

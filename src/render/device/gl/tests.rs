@@ -11,17 +11,17 @@ fn open() -> Rc<Gl> {
 
 fn is_buffer_alive(gl: &Rc<Gl>, name: glow::Buffer) -> bool {
     // SAFETY: a query without side effects.
-    unsafe { gl.functions().expect("current").is_buffer(name) }
+    unsafe { gl.functions().expect("a current context").is_buffer(name) }
 }
 
 #[test]
 fn guards_restore_the_previous_context_also_after_a_panic() {
     let (first, second) = (open(), open());
     assert!(second.context.is_current(), "expected the last opened context to stay current");
-    let guard = first.make_current().expect("current");
+    let guard = first.make_current().expect("a current context");
     assert!(first.context.is_current());
     {
-        let _nested = second.make_current().expect("current");
+        let _nested = second.make_current().expect("a current context");
         assert!(second.context.is_current());
     }
     assert!(first.context.is_current());
@@ -30,7 +30,7 @@ fn guards_restore_the_previous_context_also_after_a_panic() {
     first.check("test").expect("no error");
     assert!(second.context.is_current(), "expected a command to restore the context");
     let panicked = catch_unwind(AssertUnwindSafe(|| {
-        let _guard = first.make_current().expect("current");
+        let _guard = first.make_current().expect("a current context");
         assert!(first.context.is_current());
         panic!("injected");
     }));
@@ -142,10 +142,10 @@ fn panics_discard_the_errors_of_interrupted_commands() {
     let buffer = gl.buffer(4, STATIC_DRAW, None).expect("a buffer");
     let interrupt_commands = |has_guard: bool| {
         catch_unwind(AssertUnwindSafe(|| {
-            let _guard = has_guard.then(|| gl.make_current().expect("current"));
+            let _guard = has_guard.then(|| gl.make_current().expect("a current context"));
             buffer.write(&[0; 5]);
             // SAFETY: the flag does not exist, and OpenGL rejects it.
-            unsafe { gl.functions().expect("current").enable(0xFFFF) }
+            unsafe { gl.functions().expect("a current context").enable(0xFFFF) }
             panic!("injected");
         }))
         .expect_err("a panic");

@@ -125,7 +125,7 @@ impl Gl {
     /// A timer that is never done.
     pub(crate) fn unstarted_timer(self: &Rc<Self>) -> PassTimer {
         // SAFETY: a new name; reading a query that was never begun is an OpenGL error without a result.
-        let query = unsafe { self.functions().expect("current").create_query() }.expect("a query");
+        let query = unsafe { self.functions().expect("a current context").create_query() }.expect("a query");
         PassTimer::Query(Rc::clone(self), query)
     }
 }

@@ -29,7 +29,7 @@ pub(crate) fn coverage(image: &LinearImage, cutoff: f32) -> f32 {
     alphas.iter().filter(|alpha| **alpha >= cutoff).count() as f32 / alphas.len() as f32
 }
 
-/// Finds the cutoff for which the image has a coverage: the mean of the lowest covered and the highest uncovered alpha, so
+/// Finds the cutoff for which the image has the given coverage: the mean of the lowest covered and the highest uncovered alpha, so
 /// that no sample is close to the cutoff.
 fn find_threshold(image: &LinearImage, coverage: f32) -> f32 {
     let mut alphas = sample_alpha(image);
@@ -77,9 +77,9 @@ mod tests {
         let chain = mip_levels(texture, &array, TextureRole::Color, is_preserved.then_some(cutoff));
         let coverage_of = |(level, rgba): (usize, &Vec<u8>)| {
             let level_side = |side: u32| (side >> level).max(1);
-            let rgba = Texture::new("level", level_side(array.width), level_side(array.height), rgba.clone())
+            let level_texture = Texture::new("level", level_side(array.width), level_side(array.height), rgba.clone())
                 .expect("a valid texture");
-            coverage(&LinearImage::new(&rgba, TextureRole::Color), cutoff)
+            coverage(&LinearImage::new(&level_texture, TextureRole::Color), cutoff)
         };
         chain.iter().enumerate().map(coverage_of).collect()
     }

@@ -153,7 +153,13 @@ impl RenderHarness {
 
 impl LoadedScene {
     pub(super) fn frame_params(&self, camera: Camera, size: Size) -> FrameParams {
-        FrameParams { camera, width: size.width, height: size.height, bounds: self.bounds, light: self.light_box }
+        FrameParams {
+            camera,
+            width: size.width,
+            height: size.height,
+            bounds: self.bounds,
+            light_bounds: self.light_box,
+        }
     }
 
     /// Bounds of the last deformed vertices, in world and in light space.

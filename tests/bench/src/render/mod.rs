@@ -155,7 +155,7 @@ impl ShadowTexelSize {
             shadow_texel_axes(scene, frame_params).map(|axes| axes[0].norm().max(axes[1].norm()))
         };
         let vertex_fit_side = longer_side(frame_params)?;
-        let corner_fit_side = longer_side(&FrameParams { light: None, ..*frame_params })?;
+        let corner_fit_side = longer_side(&FrameParams { light_bounds: None, ..*frame_params })?;
         scene.look.shadow.map(|shadow| Self { map_size: shadow.size, vertex_fit_side, corner_fit_side })
     }
 }

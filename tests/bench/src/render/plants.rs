@@ -203,7 +203,7 @@ fn time_frame(
 ) -> Result<FrameTimes<f64>> {
     let elapsed_us = |begin: Instant| begin.elapsed().as_secs_f64() * 1e6;
     let frame_begin = Instant::now();
-    let DeformSummary { bounds, oriented_bounds: light, .. } = setup.deformer.deform(state)?;
+    let DeformSummary { bounds, oriented_bounds: light_bounds, .. } = setup.deformer.deform(state)?;
     let deform = elapsed_us(frame_begin);
     let begin = Instant::now();
     let mut upload = 0.0;
@@ -211,7 +211,7 @@ fn time_frame(
         harness.renderer.upload(&setup.buffers, setup.deformer.read(VertexAttributes::VERTICES)?)?;
         upload = elapsed_us(begin);
     }
-    let frame_params = FrameParams { camera, width: size.width, height: size.height, bounds, light };
+    let frame_params = FrameParams { camera, width: size.width, height: size.height, bounds, light_bounds };
     let image = harness.renderer.draw(&setup.buffers, &frame_params)?;
     let frame = elapsed_us(frame_begin);
     let render = 1e3 * image.times.drawing_ms();

@@ -135,10 +135,10 @@ impl FrameSource {
         let (second_surface, (second_bounds, second_light_box)) = deform(STILL_STEP + STEP_DISTANCE)?;
         let (first_surface, (first_bounds, first_light_box)) = deform(STILL_STEP)?;
         let camera = animation.camera(size);
-        let light = first_light_box.zip(second_light_box).map(|(first, second)| first.union(second));
+        let light_bounds = first_light_box.zip(second_light_box).map(|(first, second)| first.union(second));
         let frame_params = |camera: Camera| FrameParams {
             bounds: first_bounds.union(second_bounds),
-            light,
+            light_bounds,
             ..loaded_scene.frame_params(camera, size)
         };
         Ok(Self {

@@ -51,7 +51,7 @@ fn frame_params(bounds: BoundingBox, side: u32, from_above: bool) -> FrameParams
         near: 0.0,
         far: 0.0,
     };
-    FrameParams { camera, width: side, height: side, bounds, light: None }
+    FrameParams { camera, width: side, height: side, bounds, light_bounds: None }
 }
 
 fn trace_images(parts: SceneParts, from_above: bool, shadow_models: &[ShadowModel], side: u32) -> Vec<ReferenceImage> {
@@ -365,7 +365,7 @@ fn refitted_bvh_gives_the_same_images_as_a_rebuilt_one() {
     let size = Size { width: 48, height: 32 };
     let view = ReferenceView::new(
         &animation.scene,
-        &FrameParams { camera: animation.camera(size), width: 48, height: 32, bounds, light: None },
+        &FrameParams { camera: animation.camera(size), width: 48, height: 32, bounds, light_bounds: None },
     );
     let trace_hard_shadows =
         |ray_scene: &RayScene| trace_reference_images(ray_scene, &view, &[ShadowModel::Hard], SampleCounts::QUICK);
