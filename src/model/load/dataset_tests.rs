@@ -107,10 +107,7 @@ fn real_ball_is_rejected_with_declared_and_actual_size() {
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 fn real_almond_has_1447_domains_and_all_faces() {
-    let start = std::time::Instant::now();
     let scene = open_scene("plants/almond");
-    let seconds = start.elapsed().as_secs_f64();
-    assert!(seconds < 5.0, "expected less than 5 s, got {seconds} s");
     assert_eq!((scene.domains.len(), scene.layout.triangles), (1447, 37560));
     assert_eq!(scene.domains.iter().filter(|domain| domain.name.starts_with("shoot ")).count(), 139);
     assert_eq!(scene.domains.iter().filter(|domain| domain.attachment.is_none()).count(), 1);

@@ -101,7 +101,8 @@ fn check_index(line: usize, list_name: &str, index: u32, count: usize) -> Result
     if (index as usize) < count {
         return Ok(());
     }
-    Err(invalid(format!("line {line}: f: index of {list_name}"), format!("1 to {count}"), u64::from(index) + 1))
+    let expected = if count == 0 { format!("no index in a file without {list_name}") } else { format!("1 to {count}") };
+    Err(invalid(format!("line {line}: f: index of {list_name}"), expected, u64::from(index) + 1))
 }
 
 #[derive(Default)]
@@ -280,8 +281,8 @@ mod tests {
             ("f 1 2 4294967296", "line 4: f: v: index: expected 1 to 3 or -3 to -1, got 4294967296"),
             ("f 1 2 2147483648", "line 4: f: index of v: expected 1 to 3, got 2147483648"),
             ("f 1 2 99999999999999999999", "line 4: f: v: index: expected a whole number, got 99999999999999999999"),
-            ("f 1 2 3/1", "line 4: f: index of vt: expected 1 to 0, got 1"),
-            ("f 1 2 3//7", "line 4: f: index of vn: expected 1 to 0, got 7"),
+            ("f 1 2 3/1", "line 4: f: index of vt: expected no index in a file without vt, got 1"),
+            ("f 1 2 3//7", "line 4: f: index of vn: expected no index in a file without vn, got 7"),
             ("f 1 2 3/1/1/1", "line 4: f: expected corners of the form v, v/vt, v//vn or v/vt/vn, got 3/1/1/1"),
             ("f 1 2 /1", "line 4: f: expected corners of the form v, v/vt, v//vn or v/vt/vn, got /1"),
             ("f 1 2", "line 4: f: expected at least 3 corners, got 2"),
