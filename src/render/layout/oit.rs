@@ -19,10 +19,10 @@ pub(crate) const CURSORS_IMAGE: u32 = 2;
 pub(crate) const LAYERS_IMAGE: u32 = 3;
 /// Phase of the gather program that counts fragments.
 pub(crate) const PHASE_COUNT: i32 = 0;
-/// Phase of the gather program that stores fragments.
+/// Phase of the gather program that stores the fragments of pixels within the limit, and the nearest depths of others.
 pub(crate) const PHASE_FILL: i32 = 1;
-/// Phase of the gather program that adds the ids of the stored depths.
-pub(crate) const PHASE_JOIN_IDS: i32 = 2;
+/// Phase of the gather program that adds the ids of these nearest depths.
+pub(crate) const PHASE_FILL_IDS: i32 = 2;
 
 /// Counters and indirect draws of a frame. Twin of `OitCounters` in `shaders/shared/oit_lists.glsl`, up to its bins.
 #[repr(C)]

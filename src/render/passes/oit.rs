@@ -1,8 +1,10 @@
-//! Exact order-independent transparency: a list of all blended fragments of each pixel, in bounded memory.
+//! Order-independent transparency by a list of the blended fragments of each pixel. It is exact if all fragments fit the
+//! memory budget. Otherwise, each pixel stores at most `per_pixel_limit` fragments: the nearest ones.
 //!
 //! One pass counts the fragments, a prefix sum allocates a list for each pixel, and another pass fills the lists in any
-//! order. The lists are sorted by depth and id before blending, so the image does not depend on the order of the
-//! fragments.
+//! order. For pixels with more fragments than the limit, the first phase of this pass stores only depths, and a second
+//! phase adds their ids. The lists are sorted by depth and id before blending, so the image does not depend on the order
+//! of the fragments.
 
 use super::draw::{bind_shadow, draw_group, first_triangle_of, groups_of, triangle_set};
 use super::recorder::PassRecorder;
@@ -10,7 +12,7 @@ use crate::device::gl::{BufferCopy, ClearOp, Gl, PipelineState};
 use crate::layout::cull::command_offset;
 use crate::layout::oit::{
     COMMANDS_OFFSET, COUNTERS_BYTES, COUNTERS_HEADER_BYTES, HISTOGRAM_TILE, LAYERS_IMAGE, OitCounters, PHASE_COUNT,
-    PHASE_FILL, PHASE_JOIN_IDS, RECORD_BYTES,
+    PHASE_FILL, PHASE_FILL_IDS, RECORD_BYTES,
 };
 use crate::layout::{EMPTY_TILE_LIST, TILE};
 use crate::pass::Pass;
@@ -34,11 +36,11 @@ fn reset_counters(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
     bytes[..COUNTERS_HEADER_BYTES].copy_from_slice(bytemuck::bytes_of(&header));
     target.counters.write(&bytes);
     for (index, (group_index, _)) in groups_of(buffers, BlendMode::Blend).enumerate() {
-        // With culling, the number of indices is that of the culled list.
-        if let Some((_, culled_draws)) = buffers.visible_draws(BlendMode::Blend) {
+        // With culling, the number of indices is that of the visible triangles.
+        if let Some((_, visible_draws)) = buffers.visible_draws(BlendMode::Blend) {
             let target_offset = COMMANDS_OFFSET + size_of::<[u32; 5]>() * index;
             gl.copy(BufferCopy {
-                source: culled_draws,
+                source: visible_draws,
                 source_offset: command_offset(group_index) as u64,
                 target: &target.counters,
                 target_offset: target_offset as u64,
@@ -49,7 +51,8 @@ fn reset_counters(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
     target.tile_list.write(bytemuck::cast_slice(&EMPTY_TILE_LIST));
 }
 
-/// Draws the layers of the blended triangles. They are tested against the depth of the opaque triangles.
+/// Counts, allocates, stores and blends the fragments of the blended triangles. Fragments behind opaque triangles are
+/// discarded.
 pub(super) fn draw(
     recorder: &mut PassRecorder<'_>,
     buffers: &SceneBuffers,
@@ -76,7 +79,7 @@ pub(super) fn draw(
     recorder.begin(Pass::OitFill);
     gather.draw(recorder, PHASE_FILL);
     recorder.barrier_within_pass(Pass::OitFill);
-    gather.draw(recorder, PHASE_JOIN_IDS);
+    gather.draw(recorder, PHASE_FILL_IDS);
     recorder.finish(Pass::OitFill)?;
     recorder.begin(Pass::OitResolve);
     bind_shadow(buffers);
@@ -96,21 +99,22 @@ struct Gather<'a> {
 }
 
 impl Gather<'_> {
-    /// Draws one phase. In the last phase, indirect draws have no instances if all fragments fit.
+    /// Draws one phase. `PHASE_FILL_IDS` is needed only if the fragments exceed the budget: it is drawn indirectly, and the
+    /// allocate program otherwise sets its number of instances to 0.
     fn draw(&self, recorder: &mut PassRecorder<'_>, phase: i32) {
         let Self { buffers, target, programs, region } = *self;
-        let (gl, set) = (recorder.gl, triangle_set(buffers));
-        let culled_array = buffers.visible_draws(BlendMode::Blend).map(|(array, _)| array);
-        let Some(array) = culled_array.or_else(|| buffers.vertex_array(BlendMode::Blend)) else { return };
+        let (gl, triangles) = (recorder.gl, triangle_set(buffers));
+        let visible_array = buffers.visible_draws(BlendMode::Blend).map(|(array, _)| array);
+        let Some(array) = visible_array.or_else(|| buffers.vertex_array(BlendMode::Blend)) else { return };
         gl.begin_pass(&target.depth_fbo, region, ClearOp::Load);
         for (index, (group_index, group)) in groups_of(buffers, BlendMode::Blend).enumerate() {
             gl.set_pipeline_state(PipelineState { cull: !group.double_sided, ..PipelineState::default() });
-            programs.gather.bind(Some(first_triangle_of(group, set)));
+            programs.gather.bind(Some(first_triangle_of(group, triangles)));
             programs.gather.set_phase(phase);
-            if phase == PHASE_JOIN_IDS {
+            if phase == PHASE_FILL_IDS {
                 gl.draw_indexed_indirect(array, &target.counters, COMMANDS_OFFSET + size_of::<[u32; 5]>() * index);
             } else {
-                draw_group(gl, buffers, group_index, set);
+                draw_group(gl, buffers, group_index, triangles);
             }
             recorder.stats.draw_calls += 1;
         }
