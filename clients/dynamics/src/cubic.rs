@@ -182,9 +182,9 @@ pub(crate) mod tests {
         })
     }
 
-    /// Springs with the given eigenvalues. Neighbors have the potentials `quartic` (q_i - q_{i+1})^4 and
-    /// `cubic` q_i^2 q_{i+1}.
-    pub(crate) fn spring_chain(eigenvalues: &[f64], quartic: f64, cubic: f64) -> ReducedForce {
+    /// Springs with the given eigenvalues. Neighbors have the potentials `quartic_potential` (q_i - q_{i+1})^4 and
+    /// `cubic_potential` q_i^2 q_{i+1}.
+    pub(crate) fn spring_chain(eigenvalues: &[f64], quartic_potential: f64, cubic_potential: f64) -> ReducedForce {
         let rank = eigenvalues.len();
         let [_, quadratic_count, cubic_count] = monomial_counts(rank).expect("a supported rank");
         let linear = DMatrix::from_diagonal(&DVector::from_column_slice(eigenvalues));
@@ -203,10 +203,10 @@ pub(crate) mod tests {
             |i, j, k| cubic_monomials.iter().position(|monomial| *monomial == [i, j, k]).expect("a monomial");
         for i in 0..rank.saturating_sub(1) {
             let j = i + 1;
-            quadratic_block[i * quadratic_count + quadratic_column(i, j)] += 2.0 * cubic;
-            quadratic_block[j * quadratic_count + quadratic_column(i, i)] += cubic;
+            quadratic_block[i * quadratic_count + quadratic_column(i, j)] += 2.0 * cubic_potential;
+            quadratic_block[j * quadratic_count + quadratic_column(i, i)] += cubic_potential;
             // The force of the quartic potential is 4 (q_i - q_j)^3 on i, and its negative on j.
-            for (row, coefficient) in [(i, 4.0 * quartic), (j, -4.0 * quartic)] {
+            for (row, coefficient) in [(i, 4.0 * quartic_potential), (j, -4.0 * quartic_potential)] {
                 cubic_block[row * cubic_count + cubic_column(i, i, i)] += coefficient;
                 cubic_block[row * cubic_count + cubic_column(i, i, j)] -= 3.0 * coefficient;
                 cubic_block[row * cubic_count + cubic_column(i, j, j)] += 3.0 * coefficient;
@@ -320,7 +320,7 @@ pub(crate) mod tests {
 
     #[test]
     #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-    fn simple_bridge_has_a_lowest_frequency_of_one_hertz() {
+    fn unscaled_bridge_has_a_lowest_frequency_of_one_hertz() {
         let path = data_folder().join("vega/simpleBridge/simpleBridge.cub");
         let force = ReducedForce::read(&path).expect("a valid file");
         let lowest_eigenvalue = force.rest_stiffness().clone().symmetric_eigenvalues().min();

@@ -150,7 +150,7 @@ impl ReducedSystem {
         // The tolerance is relative to `max_energy`, so a spurious gain must not raise it.
         let max_energy = state.max_energy.max(self.energy(&next_state).min(balanced_energy(&next_state)));
         if energy_error <= ENERGY_TOLERANCE * max_energy {
-            // Limit the negative error of steps that lose energy, so that it cannot offset later gains.
+            // Limit the negative error of steps that lose energy, so that it offsets only small later gains.
             let energy_error = energy_error.max(-ENERGY_TOLERANCE * max_energy);
             return NewmarkState { energy_error, max_energy, ..next_state };
         }
@@ -368,11 +368,11 @@ mod tests {
             for step in 0..3000 {
                 let (start_load, end_load) = (load(step), load(step + 1));
                 let next = system.advance(&state, dt, LoadChange { start: &start_load, end: &end_load });
-                work += (start_load + end_load).dot(&(&next.q - &state.q)).abs();
+                work += 0.5 * (start_load + end_load).dot(&(&next.q - &state.q)).abs();
                 let energy = system.energy(&next);
                 assert!(
-                    energy.is_finite() && energy <= 2.0 * work + 1e-6,
-                    "dt {dt}, step {step}: expected an energy of at most twice the work {work}, got {energy}"
+                    energy.is_finite() && energy <= 4.0 * work + 1e-6,
+                    "dt {dt}, step {step}: expected an energy of at most four times the absolute work {work}, got {energy}"
                 );
                 state = next;
             }
@@ -408,7 +408,7 @@ mod tests {
 
     #[test]
     #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-    fn simple_bridge_starts_at_0_25_hz_and_stays_bounded() {
+    fn scaled_bridge_has_lowest_frequency_0_25_hz_and_stays_bounded() {
         let folder = data_folder().join("vega/simpleBridge");
         let force = ReducedForce::read(&folder.join("simpleBridge.cub")).expect("a readable file");
         let settings = VegaSettings::read(&folder.join("simpleBridge.config")).expect("a readable file");

@@ -152,12 +152,17 @@ impl FakeServer {
     /// Applies a step atomically, or returns the rejection.
     fn apply(&self, step: &v1::Step) -> Result<(), v1::Rejection> {
         let reject = |field, expected: String, given| Err(rejection(Some(step.number), field, expected, given));
-        let expected: usize = step.q_domains.iter().map(|index| self.rank(*index)).sum();
-        if step.q.len() != 4 * expected {
-            return reject("step.q", format!("{} bytes", 4 * expected), format!("{} bytes", step.q.len()));
+        let q_bytes = 4 * step.q_domains.iter().map(|index| self.rank(*index)).sum::<usize>();
+        if step.q.len() != q_bytes {
+            return reject("step.q", format!("{q_bytes} bytes"), format!("{} bytes", step.q.len()));
         }
-        if step.transforms.len() != 48 * step.transform_domains.len() {
-            return reject("step.transforms", "48 bytes each".into(), format!("{} bytes", step.transforms.len()));
+        let transform_bytes = 48 * step.transform_domains.len();
+        if step.transforms.len() != transform_bytes {
+            return reject(
+                "step.transforms",
+                format!("{transform_bytes} bytes"),
+                format!("{} bytes", step.transforms.len()),
+            );
         }
         let (q, transforms) = (decode_f32(&step.q), decode_f32(&step.transforms));
         if !q.iter().chain(&transforms).all(|number| number.is_finite()) {
