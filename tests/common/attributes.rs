@@ -15,7 +15,7 @@ use super::{
     StepResult, assert_displacements_within_bound, domains_beyond_displacement_bound, partial_steps, run_step,
     scene_of_shapes, strip_shape,
 };
-use crate::scenes::{self, NORMAL_MAPPED, Random};
+use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random};
 
 /// The same deformation with displacements and boxes.
 pub(crate) fn with_displacements_and_boxes(deformation: DeformationSettings) -> DeformationSettings {
@@ -56,7 +56,7 @@ fn create_scene(deformation: DeformationSettings, has_many_domains: bool) -> Arc
     let further_domains = if has_many_domains { vec![count - 1; 29] } else { (0..count).collect() };
     let domain = |(index, shape): (usize, usize)| Domain {
         name: format!("domain {index}"),
-        ..scenes::new_domain(shape, if has_many_domains { 0 } else { NORMAL_MAPPED })
+        ..scenes::new_domain(shape, if has_many_domains { scenes::PLAIN_MATERIAL } else { NORMAL_MAPPED_MATERIAL })
     };
     parts.domains = (0..count).chain(further_domains).enumerate().map(domain).collect();
     Scene::new(parts).expect("expected a valid scene")

@@ -14,7 +14,7 @@ use super::attributes::{find_wrong_box, with_displacements_and_boxes};
 use super::partial_steps::apply_random_step;
 use super::surfaces::max_abs_error;
 use super::{StepResult, assert_within_bound, domains_beyond_bound, run_step, strip_shape};
-use crate::scenes::{self, NORMAL_MAPPED, Random};
+use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random};
 
 /// Largest accepted error of a component of a unit vector. It is larger than for single transforms, because products of
 /// shears are worse conditioned.
@@ -52,7 +52,7 @@ pub(crate) fn follower_scene_parts(count: usize, deformation: DeformationSetting
             let parent = ((random.next_number().abs() * index as f32) as usize).min(index - 1);
             FollowConstraint { parent, frame: random_frame(&mut random, index, is_rigid) }
         });
-        let material = if index % 4 == 0 { NORMAL_MAPPED } else { 0 };
+        let material = if index % 4 == 0 { NORMAL_MAPPED_MATERIAL } else { scenes::PLAIN_MATERIAL };
         let name = format!("domain {index}");
         parts.domains.push(Domain { name, follows, ..scenes::new_domain(index * 3 % shape_count, material) });
     }
@@ -208,7 +208,7 @@ pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     let mut parts = scenes::parts_of_shapes(vec![strip_shape(&mut random, 50, 0)]);
     let frame = random.next_similarity(true);
     for follows in [None, Some(FollowConstraint { parent: 0, frame }), None] {
-        parts.domains.push(Domain { follows, ..scenes::new_domain(0, 0) });
+        parts.domains.push(Domain { follows, ..scenes::new_domain(0, scenes::PLAIN_MATERIAL) });
     }
     let scene = Scene::new(parts).expect("expected a valid scene");
     let mut state = SceneState::rest(&scene);
@@ -254,7 +254,7 @@ pub(crate) fn check_overflowing_frame_products<D: Deformer>(create_deformer: imp
         parts.rigid_transforms = is_rigid;
         let frame = scaled_linear_part(random.next_similarity(true), 1e25);
         for follows in [None, Some(FollowConstraint { parent: 0, frame })] {
-            parts.domains.push(Domain { follows, ..scenes::new_domain(0, 0) });
+            parts.domains.push(Domain { follows, ..scenes::new_domain(0, scenes::PLAIN_MATERIAL) });
         }
         let scene = Scene::new(parts).expect("expected a valid scene");
         let mut state = SceneState::rest(&scene);

@@ -67,23 +67,24 @@ fn max_tile_diagonal(positions: &[f32]) -> f64 {
 /// box of the scene bounds only by rounding.
 fn verify_light_bounds(name: &str, scene: &Scene, result: &StepResult) -> OrientedBounds {
     let light_box = result.light_bounds.expect("expected a scene with a shadow");
-    let (vertex_box, corner_box) =
-        (bounds_in_light_space(scene, &result.surface.positions, 1), bounds_of_corners(scene, &result.bounds));
+    let (vertex_box, scene_box) =
+        (bounds_in_light_space(scene, &result.surface.positions, 1), scene_box_in_light_space(scene, &result.bounds));
     let magnitude = coordinate_magnitude(&result.bounds);
     assert!(
         max_excess(&light_box, &vertex_box) <= 1e-12 * magnitude,
         "{name}: expected {light_box:?} to contain {vertex_box:?}"
     );
     assert!(
-        max_excess(&corner_box, &light_box) <= 4e-7 * magnitude,
-        "{name}: expected {light_box:?} within {corner_box:?}"
+        max_excess(&scene_box, &light_box) <= 4e-7 * magnitude,
+        "{name}: expected {light_box:?} within {scene_box:?}"
     );
     let shrunk_box = vertex_box.expanded_by(-1e-3 * result.bounds.diagonal());
     assert!(result.bounds.diagonal() == 0.0 || max_excess(&shrunk_box, &vertex_box) > 0.0, "{name}: negative control");
     light_box
 }
 
-fn bounds_of_corners(scene: &Scene, bounds: &BoundingBox) -> OrientedBounds {
+/// The smallest light-space box that contains the scene bounds.
+fn scene_box_in_light_space(scene: &Scene, bounds: &BoundingBox) -> OrientedBounds {
     OrientedBounds::enclosing(&scene.light_axes().expect("expected a scene with a shadow"), bounds)
 }
 
@@ -94,8 +95,22 @@ pub(crate) fn check_containment<D: Deformer>(create_deformer: impl Fn(&Arc<Scene
     let scenes = [
         ("coils", default_policy, coil_scene(DeformationSettings::default())),
         ("batched coils", BatchPolicy::Always, coil_scene(DeformationSettings::default())),
-        ("one vertex", default_policy, scenes::random_scene(&[(1, 1)], 1, false, true)),
-        ("small domains", default_policy, scenes::random_scene(&[(7, 3), (40, 0), (300, 5)], 5, false, false)),
+        (
+            "one vertex",
+            default_policy,
+            scenes::random_scene(
+                &[(1, 1)],
+                scenes::RandomSceneOptions { instances: 1, normal_maps: false, rigid_transforms: true },
+            ),
+        ),
+        (
+            "small domains",
+            default_policy,
+            scenes::random_scene(
+                &[(7, 3), (40, 0), (300, 5)],
+                scenes::RandomSceneOptions { instances: 5, normal_maps: false, rigid_transforms: false },
+            ),
+        ),
     ];
     for (name, batch_policy, scene) in scenes {
         let mut deformer = create_deformer(&scene, batch_policy);
@@ -116,8 +131,8 @@ pub(crate) fn check_tightness<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>)
     let scene = scene_of_shapes(vec![coil_shape(5000, 4)], 1, DeformationSettings::default(), false);
     let result = run_step(&mut create_deformer(&scene), &SceneState::rest(&scene));
     let light_box = verify_light_bounds("coil", &scene, &result);
-    let (vertex_box, corner_box) =
-        (bounds_in_light_space(&scene, &result.surface.positions, 1), bounds_of_corners(&scene, &result.bounds));
+    let (vertex_box, scene_box) =
+        (bounds_in_light_space(&scene, &result.surface.positions, 1), scene_box_in_light_space(&scene, &result.bounds));
     let tile_diagonal = max_tile_diagonal(&result.surface.positions);
     assert!(
         max_excess(&vertex_box, &light_box) < tile_diagonal,
@@ -126,27 +141,29 @@ pub(crate) fn check_tightness<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>)
     let volume = |OrientedBounds(bounds): &OrientedBounds| {
         (0..3).map(|axis| bounds.max[axis] - bounds.min[axis]).product::<f64>()
     };
-    let [light_volume, vertex_volume, corner_volume] =
-        [light_box, vertex_box, corner_box].map(|bounds| volume(&bounds));
+    let [light_volume, vertex_volume, scene_volume] = [light_box, vertex_box, scene_box].map(|bounds| volume(&bounds));
     eprintln!(
         "coil, volume relative to the box of the scene bounds: light bounds {:.3}, vertices {:.3}",
-        light_volume / corner_volume,
-        vertex_volume / corner_volume
+        light_volume / scene_volume,
+        vertex_volume / scene_volume
     );
-    assert!(light_volume < 0.5 * corner_volume && vertex_volume <= light_volume);
+    assert!(light_volume < 0.5 * scene_volume && vertex_volume <= light_volume);
 }
 
 /// A scene without a shadow has no light bounds. Light bounds of a step that overflows are invalid, for that step only.
 pub(crate) fn check_missing_shadow_and_overflow<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let mut parts = scenes::parts_of_shapes(vec![scenes::random_shape(&mut Random(3), 300, 2)]);
-    parts.domains = vec![scenes::new_domain(0, 0); 2];
+    parts.domains = vec![scenes::new_domain(0, scenes::PLAIN_MATERIAL); 2];
     parts.look.shadow = None;
     let unshadowed_scene = Scene::new(parts).expect("expected a valid scene");
     assert_eq!(
         run_step(&mut create_deformer(&unshadowed_scene), &SceneState::rest(&unshadowed_scene)).light_bounds,
         None
     );
-    let scene = scenes::random_scene(&[(300, 2)], 2, false, false);
+    let scene = scenes::random_scene(
+        &[(300, 2)],
+        scenes::RandomSceneOptions { instances: 2, normal_maps: false, rigid_transforms: false },
+    );
     let (mut deformer, valid_state) = (create_deformer(&scene), SceneState::rest(&scene));
     let valid_bounds = run_step(&mut deformer, &valid_state).light_bounds;
     assert!(valid_bounds.is_some_and(|light| light.is_valid()));

@@ -23,7 +23,7 @@ use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::domain::{Domain, Mesh, Shape};
 use modalcast_model::scene::{BoundingBox, DeformationSettings, OrientedBounds, Scene, SceneState};
 
-use crate::scenes::{self, NORMAL_MAPPED, Random};
+use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random};
 pub(crate) use error_bounds::{
     assert_displacements_within_bound, assert_within_bound, domains_beyond_bound, domains_beyond_displacement_bound,
 };
@@ -93,7 +93,7 @@ pub(crate) fn scene_of_shapes(
     let shape_count = shapes.len();
     let mut parts = scenes::parts_of_shapes(shapes);
     parts.deformation = deformation;
-    let material = if normal_maps { NORMAL_MAPPED } else { 0 };
+    let material = if normal_maps { NORMAL_MAPPED_MATERIAL } else { scenes::PLAIN_MATERIAL };
     let create_domain =
         |index: usize| Domain { name: format!("domain {index}"), ..scenes::new_domain(index % shape_count, material) };
     parts.domains = (0..instances * shape_count).map(create_domain).collect();

@@ -9,7 +9,7 @@ use modalcast_model::domain::{Domain, Shape};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType};
 
 use super::{StepResult, run_step, strip_shape};
-use crate::scenes::{self, NORMAL_MAPPED, Random};
+use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random};
 
 /// Shapes under test. Their vertex counts are not multiples of four (a quad). Small shapes share a tile, and the large
 /// shape has separate tiles.
@@ -23,8 +23,9 @@ fn tested_shapes() -> Vec<Shape> {
     ]
 }
 
-/// A scene with one domain of each shape under test between `before` and `after` domains of other shapes, and
-/// `instances` domains of a shape of four tiles. Also returns the index of the first domain under test.
+/// A scene with one domain of each shape under test. `preceding_count` domains of other shapes precede them, and
+/// `following_count` domains of other shapes and `instances` domains of a shape of four tiles follow. Also returns the
+/// index of the first domain under test.
 fn embedded_scene(
     deformation: DeformationSettings,
     (preceding_count, following_count): (usize, usize),
@@ -43,7 +44,7 @@ fn embedded_scene(
     parts.deformation = deformation;
     let create_domain = |(index, shape): (usize, usize)| Domain {
         name: format!("{index}"),
-        ..scenes::new_domain(shape, NORMAL_MAPPED)
+        ..scenes::new_domain(shape, NORMAL_MAPPED_MATERIAL)
     };
     parts.domains = (0..instanced_shape)
         .chain(std::iter::repeat_n(instanced_shape, instances))
@@ -54,7 +55,7 @@ fn embedded_scene(
     (Scene::new(parts).expect("expected a valid scene"), preceding_count)
 }
 
-/// A state with the values of `tested_state` for the domains from `first` on, and random values for the others.
+/// A state with the values of `tested_state` for the domains from `first_domain` on, and random values for the others.
 fn state_of(scene: &Scene, first_domain: usize, tested_state: &SceneState) -> SceneState {
     let mut state = scenes::random_state(scene, 63);
     let mut q = tested_state.q.iter();

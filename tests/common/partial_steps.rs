@@ -11,7 +11,7 @@ use modalcast_model::scene::{
 
 use super::attributes::{find_wrong_box, with_displacements_and_boxes};
 use super::{StepResult, run_step, strip_shape};
-use crate::scenes::{self, NORMAL_MAPPED, Random};
+use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random};
 
 /// A random step that sets the coordinates of `q_domains` and the transforms of `transform_domains`.
 fn random_step(scene: &Scene, random: &mut Random, q_domains: &[u32], transform_domains: &[u32]) -> StepUpdate {
@@ -65,11 +65,12 @@ fn mixed_scene(deformation: DeformationSettings, normal_maps: bool) -> Arc<Scene
     shapes.push(strip_shape(&mut random, 200, 0));
     shapes.push(strip_shape(&mut random, 40, 4));
     let mut domain_shapes: Vec<usize> = (0..29).collect();
-    // First a domain that shares the coordinates of another shape, then instances.
+    // The first of these shares the coordinates of a domain with another shape. The others are further instances.
     domain_shapes.extend([9, 28, 28, 28, 4, 4, 28, 28, 28, 0, 27]);
     let mut parts = scenes::parts_of_shapes(shapes);
     parts.deformation = deformation;
-    let material = |index: usize| if normal_maps && index % 3 != 1 { NORMAL_MAPPED } else { 0 };
+    let material =
+        |index: usize| if normal_maps && index % 3 != 1 { NORMAL_MAPPED_MATERIAL } else { scenes::PLAIN_MATERIAL };
     let domain = |(index, shape): (usize, usize)| Domain {
         name: format!("{index}"),
         ..scenes::new_domain(shape, material(index))

@@ -28,7 +28,10 @@ pub(crate) fn max_abs_error(actual: &[f32], expected: &[f64]) -> f64 {
 
 /// Positions, normals and tangents under a mirror, a shear, both, and a strongly anisotropic scale.
 pub(crate) fn check_shears_and_mirrors<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
-    let scene = scenes::random_scene(&[(40, 3), (200, 2)], 2, true, false);
+    let scene = scenes::random_scene(
+        &[(40, 3), (200, 2)],
+        scenes::RandomSceneOptions { instances: 2, normal_maps: true, rigid_transforms: false },
+    );
     let mut state = scenes::random_state(&scene, 6);
     let linear_parts: [[f32; 9]; 4] = [
         [-1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],

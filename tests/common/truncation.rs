@@ -56,7 +56,10 @@ pub(crate) fn check_error_budget<D: Deformer>(
             storage.name()
         );
         assert!(max_bound > BUDGET / 10.0, "expected truncated modes, got a largest bound of {max_bound}");
-        assert!(storage != StorageType::F32 || visible_states > 10, "negative control: {visible_states} states");
+        assert!(
+            storage != StorageType::F32 || visible_states > 10,
+            "negative control: expected more than 10 states with errors beyond the rounding bound, got {visible_states}"
+        );
     }
 }
 

@@ -107,7 +107,7 @@ fn gpu_batches_have_the_bits_of_separate_domains_with_features() {
         (parts.domains, parts.deformation) = (scene.domains.clone(), deformation);
         // A domain whose shape has no other instance.
         parts.shapes.push(scenes::random_shape(&mut random, 90, 9));
-        parts.domains.push(scenes::new_domain(sizes.len(), 0));
+        parts.domains.push(scenes::new_domain(sizes.len(), scenes::PLAIN_MATERIAL));
         parts
     };
     for (deformation, normal_maps) in [
@@ -154,7 +154,7 @@ fn gpu_batches_repair_intermediate_overflow() {
         assert_eq!(
             [0, 1].map(|domain| got.boxes[domain].is_finite()),
             [true, false],
-            "expected an overflow of domain 1 only"
+            "expected domain 1 to overflow, and domain 0 not to overflow"
         );
     }
 }

@@ -42,7 +42,10 @@ fn gpu_ordinal_beyond_the_last_device_is_rejected() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_dropped_deformers_release_their_memory() {
     let device = Device::open(0).expect("expected a CUDA device");
-    let scene = scenes::random_scene(&[(20_000, 30)], 2, true, false);
+    let scene = scenes::random_scene(
+        &[(20_000, 30)],
+        scenes::RandomSceneOptions { instances: 2, normal_maps: true, rigid_transforms: false },
+    );
     let state = scenes::random_state(&scene, 1);
     let deform_once = || {
         let mut deformer =

@@ -14,7 +14,7 @@ pub(crate) fn instanced_parts(
     deformation: DeformationSettings,
 ) -> SceneParts {
     let mut parts = scenes::parts_of_shapes(vec![scenes::random_shape(&mut Random(7), vertices, rank)]);
-    parts.domains = vec![scenes::new_domain(0, 0); domains];
+    parts.domains = vec![scenes::new_domain(0, scenes::PLAIN_MATERIAL); domains];
     parts.deformation = deformation;
     parts
 }

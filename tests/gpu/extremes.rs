@@ -8,7 +8,7 @@ use modalcast_model::scene::{Scene, SceneState};
 
 use crate::accuracy::{MAX_DIRECTION_ERROR, assert_equals_reference, have_equal_bits, max_error};
 use crate::reference_comparison::cuda_deformer;
-use crate::scenes::{self, NORMAL_MAPPED, Random};
+use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random};
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
@@ -16,15 +16,16 @@ fn gpu_vertices_with_zero_rows_do_not_move() {
     let mut random = Random(1);
     let shape = scenes::random_shape(&mut random, 700, 9);
     let mut entries = shape.modes.columns().to_vec();
-    for (row, entry) in entries.iter_mut().enumerate() {
-        // Zeros of both signs.
-        if (row % 2100 / 3).is_multiple_of(3) {
-            *entry = if row % 2 == 0 { 0.0 } else { -0.0 };
+    for (index, entry) in entries.iter_mut().enumerate() {
+        let vertex = index % 2100 / 3;
+        // Every third vertex has zero rows, with zeros of both signs.
+        if vertex.is_multiple_of(3) {
+            *entry = if index % 2 == 0 { 0.0 } else { -0.0 };
         }
     }
     let modes = Modes::from_columns(2100, 9, entries).expect("expected valid modes");
     let mut parts = scenes::parts_of_shapes(vec![Shape::new(shape.mesh, modes).expect("expected a valid shape")]);
-    parts.domains = vec![scenes::new_domain(0, 0), scenes::new_domain(0, 0)];
+    parts.domains = vec![scenes::new_domain(0, scenes::PLAIN_MATERIAL), scenes::new_domain(0, scenes::PLAIN_MATERIAL)];
     let scene = Scene::new(parts).expect("expected a valid scene");
     let mut deformer = cuda_deformer(&scene);
     let mut state = scenes::random_state(&scene, 2);
@@ -51,11 +52,12 @@ fn gpu_bounds_show_axis_and_sign_of_an_overflow() {
     column[3 * 517 + 1] = 2.0;
     let modes = Modes::from_columns(3000, 1, column).expect("expected valid modes");
     let mut parts = scenes::parts_of_shapes(vec![Shape::new(shape.mesh, modes).expect("expected a valid shape")]);
-    parts.domains = vec![scenes::new_domain(0, 0)];
+    parts.domains = vec![scenes::new_domain(0, scenes::PLAIN_MATERIAL)];
     let scene = Scene::new(parts).expect("expected a valid scene");
     let mut state = SceneState::rest(&scene);
     state.q[0] = f32::MAX;
-    // The first row is infinity minus infinity in f32, and finite in f64. The other rows overflow in f32.
+    // In f32 the first row is infinity minus infinity. The device then computes it in f64, where it is finite. The other
+    // rows exceed f32.
     state.transforms[0] = Transform([1.0, -1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0, 1.0, 5.0]);
     let bounds = cuda_deformer(&scene).deform(&state).expect("expected the step to succeed").bounds;
     assert!(bounds.min[0].is_finite() && bounds.max[0].is_finite(), "{bounds:?}");
@@ -81,14 +83,14 @@ fn gpu_directions_of_singular_transforms_equal_the_reference() {
     ];
     let mut random = Random(6);
     let mut parts = scenes::parts_of_shapes(vec![scenes::random_shape(&mut random, 40, 0)]);
-    parts.domains = vec![scenes::new_domain(0, NORMAL_MAPPED); linear_parts.len()];
+    parts.domains = vec![scenes::new_domain(0, NORMAL_MAPPED_MATERIAL); linear_parts.len()];
     let scene = Scene::new(parts).expect("expected a valid scene");
     let mut state = SceneState::rest(&scene);
     for (transform, [a, b, c, d, e, f, g, h, i]) in state.transforms.iter_mut().zip(linear_parts) {
         *transform = Transform([a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0]);
     }
     let mut deformer = cuda_deformer(&scene);
-    assert_equals_reference("edge transforms", &scene, &state, &mut deformer);
+    assert_equals_reference("singular, tiny and huge transforms", &scene, &state, &mut deformer);
     // Negative control: the normals at rest differ.
     let normals = &deformer.surface().expect("expected a surface").normals;
     let rest_normals = rigid_normals(&scene, &SceneState::rest(&scene));

@@ -19,7 +19,10 @@ fn open_deformer(device: &Arc<Device>, scene: &Arc<Scene>, buffers: Option<GlVer
 
 fn open_renderer() -> (Renderer, Arc<Device>, Arc<Scene>) {
     let renderer = Renderer::open(DevicePreference::Cuda(0)).expect("expected an OpenGL context on the CUDA device");
-    let scene = scenes::random_scene(&[(3000, 12), (50, 0), (7, 3)], 5, true, false);
+    let scene = scenes::random_scene(
+        &[(3000, 12), (50, 0), (7, 3)],
+        scenes::RandomSceneOptions { instances: 5, normal_maps: true, rigid_transforms: false },
+    );
     (renderer, Device::open(0).expect("expected a CUDA device"), scene)
 }
 
@@ -168,8 +171,12 @@ fn gpu_frames_in_flight_keep_the_vertices_of_their_step() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_unknown_or_small_buffers_fall_back_to_copies() {
     let (mut renderer, device, scene) = open_renderer();
-    let small_scene =
-        renderer.load(&scenes::random_scene(&[(4, 0)], 1, true, false)).expect("expected the scene to load");
+    let small_scene = renderer
+        .load(&scenes::random_scene(
+            &[(4, 0)],
+            scenes::RandomSceneOptions { instances: 1, normal_maps: true, rigid_transforms: false },
+        ))
+        .expect("expected the scene to load");
     let loaded_scene = renderer.load(&scene).expect("expected the scene to load");
     let GlVertexBuffers { positions, normals, .. } = loaded_scene.vertex_buffers();
     let unknown_buffers = GlVertexBuffers {

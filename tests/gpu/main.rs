@@ -6,6 +6,7 @@ mod accuracy;
 mod batch;
 #[path = "../common/mod.rs"]
 mod common;
+mod cuda_checks;
 mod device;
 #[expect(dead_code, reason = "shared with the benchmarks")]
 mod ensembles;
@@ -20,4 +21,3 @@ mod raster_gl;
 mod real;
 mod reference_comparison;
 mod scenes;
-mod stability;

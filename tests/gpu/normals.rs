@@ -11,7 +11,7 @@ use nalgebra::Vector3;
 
 use crate::accuracy::{MAX_DIRECTION_ERROR, have_equal_bits, max_error};
 use crate::reference_comparison::cuda_deformer;
-use crate::scenes::{self, NORMAL_MAPPED, Random, new_domain};
+use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random, new_domain};
 
 /// A tube of `columns` x `rows` vertices with a texture seam, a hard edge along every fifth row, and `rank` smooth
 /// modes.
@@ -67,7 +67,7 @@ fn scene_with_exact_normals(
     let mut parts = scenes::parts_of_shapes(shapes);
     parts.deformation.normals = NormalMethod::Exact;
     parts.rigid_transforms = rigid_transforms;
-    let material = if normal_maps { NORMAL_MAPPED } else { 0 };
+    let material = if normal_maps { NORMAL_MAPPED_MATERIAL } else { scenes::PLAIN_MATERIAL };
     parts.domains = (0..instances * count).map(|index| new_domain(index % count, material)).collect();
     Scene::new(parts).expect("expected a valid scene")
 }
@@ -251,7 +251,7 @@ fn gpu_seams_share_a_normal_and_hard_edges_stay_hard() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_exact_normals_survive_collapse_overflow_and_scale() {
+fn gpu_exact_normals_stay_unit_at_collapse_overflow_and_scale() {
     let mut random = Random(5);
     let scene = scene_with_exact_normals(vec![tube(&mut random, 16, 6, 2)], 1, true, false);
     let mut deformer = cuda_deformer(&scene);
@@ -300,7 +300,7 @@ fn gpu_exact_normals_of_a_million_corners_equal_the_reference() {
     let mut times = [NormalMethod::Rigid, NormalMethod::Exact].map(|normals| {
         let mut parts = scenes::parts_of_shapes(vec![shape.clone()]);
         parts.deformation.normals = normals;
-        parts.domains = vec![new_domain(0, 0)];
+        parts.domains = vec![new_domain(0, scenes::PLAIN_MATERIAL)];
         let scene = Scene::new(parts).expect("expected a valid scene");
         let state = scenes::random_state(&scene, 10);
         let mut deformer = cuda_deformer(&scene);

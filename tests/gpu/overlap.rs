@@ -40,7 +40,7 @@ fn follower_scene(deformation: DeformationSettings) -> Arc<Scene> {
     let domain = |index: usize| Domain {
         name: format!("domain {index}"),
         follows: (index >= 20).then(|| follow(index, &mut random)),
-        ..scenes::new_domain(index * 3 % 20, 0)
+        ..scenes::new_domain(index * 3 % 20, scenes::PLAIN_MATERIAL)
     };
     parts.domains = (0..60).map(domain).collect();
     Scene::new(parts).expect("expected a valid scene")
@@ -85,8 +85,8 @@ fn blocking_surfaces(scene: &Arc<Scene>, states: &[SceneState]) -> Vec<DeformedS
     states.iter().map(&mut deform_fully).collect()
 }
 
-/// Whether a readback has the bits of an expected surface without tangents.
-fn equals_ignoring_tangents(got: &DeformedSurface, want: &DeformedSurface) -> bool {
+/// Whether a readback has no tangents, and otherwise the bits of an expected surface.
+fn equals_without_tangents(got: &DeformedSurface, want: &DeformedSurface) -> bool {
     have_equal_bits(&got.positions, &want.positions)
         && have_equal_bits(&got.normals, &want.normals)
         && have_equal_bits(&got.displacements, &want.displacements)
@@ -110,7 +110,7 @@ impl Reader<'_> {
         while self.pending.len() > max_pending {
             let Some((step, readback)) = self.pending.pop_front() else { break };
             let surface = deformer.wait_readback(&readback).expect("expected the readback to complete");
-            assert!(equals_ignoring_tangents(&surface, &self.want[step]), "step {step}");
+            assert!(equals_without_tangents(&surface, &self.want[step]), "step {step}");
             // A second wait returns the same memory.
             assert!(Arc::ptr_eq(
                 &surface,
@@ -118,7 +118,7 @@ impl Reader<'_> {
             ));
             let other_step = (step + STEPS / 2) % self.want.len();
             assert!(
-                !equals_ignoring_tangents(&surface, &self.want[other_step]),
+                !equals_without_tangents(&surface, &self.want[other_step]),
                 "negative control with step {other_step}"
             );
             self.compared_count += 1;
@@ -175,7 +175,7 @@ fn gpu_overlapped_reads_equal_blocking_reads() {
             reader.compare(&mut deformer, 0);
             assert_eq!(reader.compared_count, (0..STEPS).filter(|step| ![3, 5].contains(&(step % 7))).count());
             assert_eq!(deformer.outputs(), 2, "expected a second output for overlapped readbacks");
-            assert!(equals_ignoring_tangents(
+            assert!(equals_without_tangents(
                 &without_tangents(deformer.surface().expect("expected a surface")),
                 &want[STEPS - 1]
             ));
@@ -248,7 +248,7 @@ fn gpu_steps_after_a_fault_are_computed_in_full() {
             deformer.finish().expect("expected a finished step");
         }
         assert!(
-            equals_ignoring_tangents(
+            equals_without_tangents(
                 &deformer.wait_readback(&readback).expect("expected the readback to complete"),
                 &want[step]
             ),
@@ -278,14 +278,14 @@ fn gpu_invalid_call_sequences_return_errors() {
     let foreign_readback = other_deformer.readback(VertexAttributes::VERTICES).expect("expected a readback to start");
     assert!(matches!(deformer.wait_readback(&foreign_readback), Err(Error::Fault { .. })));
     let own_readback = deformer.readback(VertexAttributes::VERTICES).expect("expected a readback to start");
-    assert!(equals_ignoring_tangents(
+    assert!(equals_without_tangents(
         &deformer.wait_readback(&own_readback).expect("expected the readback to complete"),
         &want[2]
     ));
     // Completed readbacks outlive the deformer.
     let outliving_surface = other_deformer.wait_readback(&foreign_readback).expect("expected the readback to complete");
     drop(other_deformer);
-    assert!(equals_ignoring_tangents(&outliving_surface, &want[0]));
+    assert!(equals_without_tangents(&outliving_surface, &want[0]));
 }
 
 #[test]
@@ -335,7 +335,7 @@ fn gpu_box_and_displacement_readers_need_no_second_output() {
                 boxes: want[step].boxes.clone(),
                 ..DeformedSurface::default()
             };
-            assert!(equals_ignoring_tangents(&got, &expected), "step {step}");
+            assert!(equals_without_tangents(&got, &expected), "step {step}");
             assert!(got.boxes != want[(step + STEPS / 2) % STEPS].boxes, "negative control");
         }
         assert_eq!(deformer.outputs(), 1, "expected no second output for boxes and displacements");

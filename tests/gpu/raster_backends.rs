@@ -109,7 +109,10 @@ fn draw_still(scene: &Arc<Scene>, state: &SceneState, uses_cuda: bool) -> StillI
 
 /// Random intersecting triangles in a random state, and the built-in tree with cut-out leaves at rest.
 fn scenes_and_states() -> [(&'static str, Arc<Scene>, SceneState); 2] {
-    let soup = scenes::random_scene(&[(3000, 12), (50, 0), (700, 3)], 5, true, false);
+    let soup = scenes::random_scene(
+        &[(3000, 12), (50, 0), (700, 3)],
+        scenes::RandomSceneOptions { instances: 5, normal_maps: true, rigid_transforms: false },
+    );
     let tree = modalcast_model::load::open("tree").expect("expected the built-in scene").scene;
     let (random_state, rest_state) = (scenes::random_state(&soup, 1), SceneState::rest(&tree));
     [("soup", soup, random_state), ("tree", tree, rest_state)]
@@ -198,7 +201,10 @@ fn gpu_shading_of_equal_ids_equals_opengl() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_cuda_frames_report_their_rasterizer_and_repeat_bits() {
-    let scene = scenes::random_scene(&[(3000, 12), (50, 0), (700, 3)], 5, true, false);
+    let scene = scenes::random_scene(
+        &[(3000, 12), (50, 0), (700, 3)],
+        scenes::RandomSceneOptions { instances: 5, normal_maps: true, rigid_transforms: false },
+    );
     let states = [scenes::random_state(&scene, 1), scenes::random_state(&scene, 2)];
     let [want, got, repeated] = [RasterPolicy::OpenGl, RasterPolicy::Cuda, RasterPolicy::Cuda]
         .map(|raster| draw_states(&scene, raster, &states));
@@ -216,7 +222,10 @@ fn gpu_cuda_frames_report_their_rasterizer_and_repeat_bits() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_cuda_frames_in_flight_keep_their_step() {
-    let scene = scenes::random_scene(&[(3000, 12), (700, 3)], 5, false, false);
+    let scene = scenes::random_scene(
+        &[(3000, 12), (700, 3)],
+        scenes::RandomSceneOptions { instances: 5, normal_maps: false, rigid_transforms: false },
+    );
     let states: Vec<SceneState> = (0..6).map(|seed| scenes::random_state(&scene, seed)).collect();
     let want = draw_states(&scene, RasterPolicy::Cuda, &states);
     let (mut context, cuda_scene) = (open_device(), with_one_sample(&scene));
@@ -275,7 +284,10 @@ fn gpu_ground_hides_geometry_below_with_both_rasterizers() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
-    let scene = with_one_sample(&scenes::random_scene(&[(3000, 12), (700, 3)], 3, false, false));
+    let scene = with_one_sample(&scenes::random_scene(
+        &[(3000, 12), (700, 3)],
+        scenes::RandomSceneOptions { instances: 3, normal_maps: false, rigid_transforms: false },
+    ));
     let draw =
         |context: &mut DeviceContext, loaded_scene: &mut modalcast::engine::LoadedScene, [width, height]: [u32; 2]| {
             let image = context
@@ -304,7 +316,10 @@ fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_fastest_rasterizer_draws_frames_of_every_size() {
-    let scene = with_one_sample(&scenes::random_scene(&[(3000, 12), (700, 3)], 3, false, false));
+    let scene = with_one_sample(&scenes::random_scene(
+        &[(3000, 12), (700, 3)],
+        scenes::RandomSceneOptions { instances: 3, normal_maps: false, rigid_transforms: false },
+    ));
     let mut context = open_device();
     let mut loaded_scene = context
         .load_scene(&scene, BackendSettings { raster: RasterPolicy::Fastest, ..BackendSettings::default() })

@@ -206,7 +206,10 @@ fn gpu_unknown_or_small_buffers_return_errors() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_positions_shared_with_a_deformer_are_drawn() {
     let mut context = GpuContext::open();
-    let scene = scenes::random_scene(&[(3000, 12), (50, 0), (7, 3)], 5, true, false);
+    let scene = scenes::random_scene(
+        &[(3000, 12), (50, 0), (7, 3)],
+        scenes::RandomSceneOptions { instances: 5, normal_maps: true, rigid_transforms: false },
+    );
     let buffers = context.gl.renderer.load(&scene).expect("expected the scene to load");
     let shared = buffers.vertex_buffers();
     let positions = shared.positions.clone();

@@ -8,7 +8,7 @@ use modalcast_model::deform::Deformer;
 use modalcast_model::scene::{Scene, SceneState};
 
 use crate::accuracy::{assert_equals_reference, have_equal_bits};
-use crate::scenes::{self, NORMAL_MAPPED, Random};
+use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random};
 
 pub(crate) fn cuda_deformer(scene: &Arc<Scene>) -> CudaDeformer {
     cuda_deformer_with_batches(scene, BatchPolicy::default())
@@ -22,10 +22,13 @@ pub(crate) fn cuda_deformer_with_batches(scene: &Arc<Scene>, batches: BatchPolic
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_deform_and_orient_equal_reference_at_every_size_and_rank() {
+fn gpu_vertices_equal_reference_at_every_size_and_rank() {
     for vertices in [1, 31, 32, 33, 257, 16085] {
         for rank in [0, 1, 3, 20, 31, 33, 64, 512] {
-            let scene = scenes::random_scene(&[(vertices, rank)], 3, rank % 2 == 1, false);
+            let scene = scenes::random_scene(
+                &[(vertices, rank)],
+                scenes::RandomSceneOptions { instances: 3, normal_maps: rank % 2 == 1, rigid_transforms: false },
+            );
             let mut deformer = cuda_deformer(&scene);
             assert_equals_reference(
                 &format!("n {vertices} r {rank}"),
@@ -39,17 +42,20 @@ fn gpu_deform_and_orient_equal_reference_at_every_size_and_rank() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_every_feature_combination_equals_its_twin() {
-    for (modes, normal_maps, rigid) in (0..8).map(|set| (set & 1 != 0, set & 2 != 0, set & 4 != 0)) {
+fn gpu_every_feature_combination_equals_the_reference() {
+    for (modes, normal_maps, rigid_transforms) in (0..8).map(|set| (set & 1 != 0, set & 2 != 0, set & 4 != 0)) {
         let rank = if modes { 5 } else { 0 };
-        let scene = scenes::random_scene(&[(300, rank), (40, 0), (7, rank)], 4, normal_maps, rigid);
+        let scene = scenes::random_scene(
+            &[(300, rank), (40, 0), (7, rank)],
+            scenes::RandomSceneOptions { instances: 4, normal_maps, rigid_transforms },
+        );
         assert_eq!(
             (scene.features.modes, scene.features.normal_maps, scene.features.shear),
-            (modes, normal_maps, !rigid)
+            (modes, normal_maps, !rigid_transforms)
         );
         let mut deformer = cuda_deformer(&scene);
         assert!(deformer.plan().launches() <= 4);
-        let name = format!("modes {modes} normal maps {normal_maps} rigid {rigid}");
+        let name = format!("modes {modes} normal maps {normal_maps} rigid {rigid_transforms}");
         assert_equals_reference(&name, &scene, &scenes::random_state(&scene, 9), &mut deformer);
         assert_eq!(deformer.surface().expect("expected a surface").tangents.is_empty(), !normal_maps);
     }
@@ -59,7 +65,10 @@ fn gpu_every_feature_combination_equals_its_twin() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_twenty_thousand_small_domains_take_three_launches() {
     let shapes: Vec<_> = (0..50).map(|index| (7, index % 5)).collect();
-    let scene = scenes::random_scene(&shapes, 400, true, false);
+    let scene = scenes::random_scene(
+        &shapes,
+        scenes::RandomSceneOptions { instances: 400, normal_maps: true, rigid_transforms: false },
+    );
     let mut deformer = cuda_deformer(&scene);
     assert_eq!((scene.domains.len(), deformer.plan().launches()), (20_000, 3));
     let state = scenes::random_state(&scene, 3);
@@ -70,7 +79,10 @@ fn gpu_twenty_thousand_small_domains_take_three_launches() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_a_million_vertices_equal_the_reference() {
-    let scene = scenes::random_scene(&[(1_000_000, 32)], 1, false, false);
+    let scene = scenes::random_scene(
+        &[(1_000_000, 32)],
+        scenes::RandomSceneOptions { instances: 1, normal_maps: false, rigid_transforms: false },
+    );
     let mut deformer = cuda_deformer(&scene);
     let state = scenes::random_state(&scene, 4);
     assert_equals_reference("n 1,000,000 r 32", &scene, &state, &mut deformer);
@@ -94,7 +106,7 @@ fn gpu_domains_with_shared_coordinates_move_alike() {
         scenes::random_shape(&mut random, 300, 4),
         scenes::random_shape(&mut random, 50, 2),
     ]);
-    parts.domains = [0, 1, 2, 1].map(|shape| scenes::new_domain(shape, NORMAL_MAPPED)).into();
+    parts.domains = [0, 1, 2, 1].map(|shape| scenes::new_domain(shape, NORMAL_MAPPED_MATERIAL)).into();
     parts.domains[1].shares_q_with = Some(0);
     parts.domains[3].shares_q_with = Some(1);
     let scene = Scene::new(parts).expect("expected a valid scene");
@@ -112,10 +124,13 @@ fn gpu_domains_with_shared_coordinates_move_alike() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_bits_do_not_depend_on_history_or_packing() {
-    let scene = scenes::random_scene(&[(1000, 37), (33, 5)], 4, true, false);
+    let scene = scenes::random_scene(
+        &[(1000, 37), (33, 5)],
+        scenes::RandomSceneOptions { instances: 4, normal_maps: true, rigid_transforms: false },
+    );
     let (mut state, other_state) = (scenes::random_state(&scene, 20), scenes::random_state(&scene, 21));
-    // The instances of the first shape have the same state. They differ in their packed position relative to block
-    // boundaries.
+    // The instances of the first shape have the same state. Their vertices start at different offsets within thread
+    // blocks.
     let q = state.q_of(&scene, 0).to_vec();
     for domain in [2, 4, 6] {
         state.transforms[domain] = state.transforms[0];

@@ -64,8 +64,10 @@ pub(crate) fn new_domain(shape: usize, material: usize) -> Domain {
     Domain { material, ..Domain::new(format!("shape {shape}"), shape) }
 }
 
-/// Index of the material with a normal map in [`parts_of_shapes`]. Material 0 has no normal map.
-pub(crate) const NORMAL_MAPPED: usize = 1;
+/// Index of the material without a normal map in [`parts_of_shapes`].
+pub(crate) const PLAIN_MATERIAL: usize = 0;
+/// Index of the material with a normal map in [`parts_of_shapes`].
+pub(crate) const NORMAL_MAPPED_MATERIAL: usize = 1;
 
 /// Scene parts with these shapes, two materials and no domains.
 pub(crate) fn parts_of_shapes(shapes: Vec<Shape>) -> SceneParts {
@@ -77,13 +79,20 @@ pub(crate) fn parts_of_shapes(shapes: Vec<Shape>) -> SceneParts {
     parts
 }
 
-/// A scene of shapes (n, r) with `instances` domains per shape; with `normal_maps`, every other shape has a normal map.
-pub(crate) fn random_scene(
-    shapes: &[(usize, usize)],
-    instances: usize,
-    normal_maps: bool,
-    rigid_transforms: bool,
-) -> Arc<Scene> {
+/// Options of [`random_scene`].
+#[derive(Clone, Copy)]
+pub(crate) struct RandomSceneOptions {
+    /// Number of domains per shape.
+    pub(crate) instances: usize,
+    /// Whether every other shape has a normal map.
+    pub(crate) normal_maps: bool,
+    /// Whether transforms must be rigid.
+    pub(crate) rigid_transforms: bool,
+}
+
+/// A scene of shapes (n, r).
+pub(crate) fn random_scene(shapes: &[(usize, usize)], options: RandomSceneOptions) -> Arc<Scene> {
+    let RandomSceneOptions { instances, normal_maps, rigid_transforms } = options;
     let mut random = Random(shapes.len() as u64);
     let mut parts =
         parts_of_shapes(shapes.iter().map(|(vertices, rank)| random_shape(&mut random, *vertices, *rank)).collect());
@@ -91,7 +100,7 @@ pub(crate) fn random_scene(
     for _ in 0..instances {
         for index in 0..shapes.len() {
             let has_normal_map = normal_maps && index % 2 == 0;
-            parts.domains.push(new_domain(index, if has_normal_map { NORMAL_MAPPED } else { 0 }));
+            parts.domains.push(new_domain(index, if has_normal_map { NORMAL_MAPPED_MATERIAL } else { PLAIN_MATERIAL }));
         }
     }
     Scene::new(parts).expect("expected a valid scene")

@@ -42,7 +42,7 @@ fn finite_sums_survive_intermediate_overflow() {
 }
 
 #[test]
-fn tiles_without_modes_ignore_q() {
+fn zero_tiles_do_not_move() {
     extreme_values::check_zero_tiles(cpu_deformer);
 }
 
@@ -134,7 +134,7 @@ fn followers_10000_km_away_keep_the_millimeter() {
 }
 
 #[test]
-fn overflowing_transform_products_keep_finite_vertices() {
+fn overflowing_frame_products_keep_finite_vertices() {
     followers::check_overflowing_frame_products(cpu_deformer);
 }
 

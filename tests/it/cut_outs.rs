@@ -24,14 +24,15 @@ fn ray_cast_uv(viewport: &Viewport, triangle: [[f64; 3]; 3], uvs: [[f64; 2]; 3],
     })
 }
 
-struct Case {
+/// A sample of a triangle whose footprint is tested.
+struct FootprintCase {
     triangle: [[f64; 3]; 3],
     uvs: [[f64; 2]; 3],
     pixel: [i32; 2],
     viewport: Viewport,
 }
 
-impl Case {
+impl FootprintCase {
     /// Largest error of the footprint's texture coordinates, and of their derivatives against central differences.
     fn max_errors(&self) -> (f64, f64) {
         let positions: Vec<f32> = self.triangle.as_flattened().iter().map(|number| *number as f32).collect();
@@ -64,7 +65,7 @@ fn footprints_match_ray_cast_texture_coordinates() {
         [(tilted_triangle, [[90, 60], [101, 70], [80, 66]]), (triangle_behind_eye, [[96, 80], [96, 120], [99, 100]])]
     {
         for pixel in pixels {
-            let (uv_error, derivative_error) = Case { triangle, uvs, pixel, viewport }.max_errors();
+            let (uv_error, derivative_error) = FootprintCase { triangle, uvs, pixel, viewport }.max_errors();
             max_errors = (max_errors.0.max(uv_error), max_errors.1.max(derivative_error));
         }
     }
@@ -173,8 +174,8 @@ fn sheet_reproduces_its_image_at_levels_0_and_1() {
     let mut random = crate::scenes::Random(3);
     let image = alpha_image(64, 64, |_, _, _| if random.next_number() < 0.0 { 0 } else { 255 });
     for level in [0, 1] {
-        let keys = sheet_soup(64 >> level, image.clone()).rasterize();
-        let is_covered: Vec<bool> = keys.ids().iter().map(Option::is_some).collect();
+        let visibility = sheet_soup(64 >> level, image.clone()).rasterize();
+        let is_covered: Vec<bool> = visibility.ids().iter().map(Option::is_some).collect();
         let is_opaque: Vec<bool> = image.levels[level].iter().map(|texel| *texel == 255).collect();
         assert!(is_covered == is_opaque, "level {level}");
     }

@@ -64,6 +64,7 @@ pub(crate) fn random_state(scene: &Scene) -> SceneState {
     state
 }
 
+/// Number of vertices and rank of each shape.
 const SIZES: [(usize, usize); 10] =
     [(1, 1), (3, 0), (31, 3), (32, 4), (33, 5), (257, 20), (256, 31), (1000, 33), (7, 512), (5000, 7)];
 

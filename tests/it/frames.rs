@@ -185,7 +185,8 @@ async fn invalid_pictures_are_rejected_and_deadlines_hold() {
     assert_eq!(render(&server, late_request).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
     let mut short_deadline =
         tonic::Request::new(v1::RenderFrameRequest { step: Some(RequestedStep::MinimumStep(1)), ..rgba_request() });
-    short_deadline.metadata_mut().insert("grpc-timeout", "60m".parse().expect("a header"));
+    // In this header, "m" means milliseconds.
+    short_deadline.metadata_mut().insert("grpc-timeout", "60m".parse().expect("expected a header value"));
     let result = async {
         let mut stream = server.frames().await.render_frame(short_deadline).await?.into_inner();
         stream.message().await

@@ -27,18 +27,18 @@ fn texel_size(scene: &Scene, summary: &DeformSummary, uses_light_bounds: bool) -
 fn fitted_shadow_texels_of_the_tree_have_half_the_area() {
     let scene = load::open("tree").expect("expected the built-in scene").scene;
     let state = SceneState::rest(&scene);
-    let vertex_fit = ReferenceDeformer::new(&scene)
+    let reference_summary = ReferenceDeformer::new(&scene)
         .with_bounding_axes(scene.light_axes())
         .deform(&state)
         .expect("expected the step to succeed");
-    let tile_fit = CpuDeformer::new(&scene)
+    let cpu_summary = CpuDeformer::new(&scene)
         .with_bounding_axes(scene.light_axes())
         .deform(&state)
         .expect("expected the step to succeed");
     let [corner_fit, tile_fit, vertex_fit] = [
-        texel_size(&scene, &vertex_fit, false),
-        texel_size(&scene, &tile_fit, true),
-        texel_size(&scene, &vertex_fit, true),
+        texel_size(&scene, &reference_summary, false),
+        texel_size(&scene, &cpu_summary, true),
+        texel_size(&scene, &reference_summary, true),
     ];
     eprintln!(
         "texel size of the tree, fitted to corners: {corner_fit:?}, to tiles: {tile_fit:?}, to vertices: {vertex_fit:?}"

@@ -67,13 +67,13 @@ async fn reduced_force_of_a_hit_matches_the_complete_modes() {
     let (server, client) = start_server("strips").await;
     let scene = strips();
     let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
-    let frac_1_sqrt_2 = std::f32::consts::FRAC_1_SQRT_2;
+    let sin_45_degrees = std::f32::consts::FRAC_1_SQRT_2;
     let steps = [
         step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3]),
         rigid_step(
             2,
             v1::TransformFormat::RigidF32,
-            &[(1, [0.0, 0.0, frac_1_sqrt_2, frac_1_sqrt_2], [1.0, 0.25, -0.5])],
+            &[(1, [0.0, 0.0, sin_45_degrees, sin_45_degrees], [1.0, 0.25, -0.5])],
         ),
     ];
     let rest_picks = client

@@ -67,12 +67,16 @@ impl RasterTraversal<'_> {
             self.warp_queue.push(triangle);
         } else {
             self.triangle_counts[2] += 1;
-            let (x, y) = (x0 / TILE_SIZE, y0 / TILE_SIZE);
-            let (columns, rows) = (x1 / TILE_SIZE - x + 1, y1 / TILE_SIZE - y + 1);
-            assert!(x < 256 && y < 256 && columns <= 256, "expected a box that fits into three bytes");
+            // The box of the triangle in tiles.
+            let (first_column, first_row) = (x0 / TILE_SIZE, y0 / TILE_SIZE);
+            let (columns, rows) = (x1 / TILE_SIZE - first_column + 1, y1 / TILE_SIZE - first_row + 1);
+            assert!(
+                first_column < 256 && first_row < 256 && columns <= 256,
+                "expected a box that fits into three bytes"
+            );
             let counts_before = self.packed_counts;
             self.packed_counts += 1 << TILE_COUNT_BITS | (columns * rows) as u64;
-            let packed_box = (x | y << 8 | (columns - 1) << 16) as u32;
+            let packed_box = (first_column | first_row << 8 | (columns - 1) << 16) as u32;
             assert_eq!((counts_before >> TILE_COUNT_BITS) as usize, self.tile_queue.len());
             let first_tile = counts_before & ((1 << TILE_COUNT_BITS) - 1);
             self.tile_queue.push(TileEntry { first_tile, triangle, packed_box });
@@ -271,16 +275,16 @@ fn fan_clipped_by_near_plane_covers_every_sample_once() {
 fn depth_ties_go_to_the_lower_id() {
     let square = |z: f32| [[-1.0, -1.0, z], [3.0, -1.0, z], [-1.0, 3.0, z]].concat();
     let positions = [square(0.5), square(0.5), square(0.25), square(0.25)].concat();
-    let drawn = |triangles: &[[u32; 3]]| {
+    let draw_ids_and_depths = |triangles: &[[u32; 3]]| {
         let mut raster = VisibilityBuffer::new(clip_space_viewport(4, 4));
         let group = DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None };
         raster.draw(&positions, triangles, group);
         (raster.ids(), raster.depths())
     };
     let [a, b, c, d] = [[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11]];
-    assert_eq!(drawn(&[a, b]), (vec![Some(0); 16], vec![0.75; 16]));
-    assert_eq!(drawn(&[a, c, b, d]), (vec![Some(1); 16], vec![0.625; 16]));
-    assert_eq!(drawn(&[]), (vec![None; 16], vec![1.0; 16]));
+    assert_eq!(draw_ids_and_depths(&[a, b]), (vec![Some(0); 16], vec![0.75; 16]));
+    assert_eq!(draw_ids_and_depths(&[a, c, b, d]), (vec![Some(1); 16], vec![0.625; 16]));
+    assert_eq!(draw_ids_and_depths(&[]), (vec![None; 16], vec![1.0; 16]));
 }
 
 #[test]

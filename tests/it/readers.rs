@@ -150,11 +150,11 @@ async fn subscribers_of_different_attributes_get_every_step() {
     let server = Server::start_default().await;
     server.open("attributes").await;
     let scene_handle = server.engine.find("attributes").expect("expected an open scene");
-    let none = VertexAttributes::default();
+    let no_attributes = VertexAttributes::default();
     let selections = [
-        VertexAttributes { positions: true, ..none },
-        VertexAttributes { boxes: true, ..none },
-        VertexAttributes { displacements: true, normals: true, ..none },
+        VertexAttributes { positions: true, ..no_attributes },
+        VertexAttributes { boxes: true, ..no_attributes },
+        VertexAttributes { displacements: true, normals: true, ..no_attributes },
     ];
     let mut subscriptions = Vec::new();
     for selection in selections {

@@ -56,11 +56,11 @@ fn assert_cpu_equals_reference(scene: &Arc<Scene>) {
     cpu.deform(&SceneState { q: vec![0.0; state.q.len()], ..state.clone() }).expect("expected the step to succeed");
     let rest_positions = cpu.surface().expect("expected a surface").positions.clone();
     let (mut zero_row_vertices, mut moved_vertices) = (0, 0);
-    for (domain, slot) in scene.layout.domains.iter().enumerate() {
+    for (domain, layout) in scene.layout.domains.iter().enumerate() {
         let modes = &scene.shape_of(domain).modes;
-        for vertex in 0..slot.vertices {
-            let range = 3 * (slot.first_vertex + vertex)..3 * (slot.first_vertex + vertex) + 3;
-            let has_zero_rows = (0..3).all(|axis| (0..slot.rank).all(|mode| modes.entry(vertex, axis, mode) == 0.0));
+        for vertex in 0..layout.vertices {
+            let range = 3 * (layout.first_vertex + vertex)..3 * (layout.first_vertex + vertex) + 3;
+            let has_zero_rows = (0..3).all(|axis| (0..layout.rank).all(|mode| modes.entry(vertex, axis, mode) == 0.0));
             let is_moved = deformed_positions[range.clone()] != rest_positions[range];
             assert!(!has_zero_rows || !is_moved, "expected vertex {vertex} of domain {domain} not to move");
             moved_vertices += usize::from(is_moved);

@@ -140,7 +140,7 @@ fn catalog_write_failure_fails_the_call() {
         scenes.delete_scene(delete_request()).await.expect("expected the deletion to succeed");
         let status = scenes.delete_scene(delete_request()).await.expect_err("expected an unknown-scene error");
         assert_eq!(status.code(), tonic::Code::NotFound, "{status:?}");
-        scenes.open_scene(open_request("sheet")).await.expect("expected an unused name");
+        scenes.open_scene(open_request("sheet")).await.expect("expected the name to be free after the deletion");
     });
 }
 

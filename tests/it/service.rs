@@ -60,7 +60,7 @@ async fn opening_after_a_concurrent_failure_is_registered() {
     with_timeout(second_opening).await.expect("expected the task not to panic").expect("expected the scene to open");
     server.engine.find("strips").expect("expected an open scene");
     server.engine.close("strips").await.expect("expected the scene to close");
-    server.engine.open("other", "strips").await.expect("expected an unused name");
+    server.engine.open("other", "strips").await.expect("expected the name to be free after closing");
 }
 
 /// Size limit of one message in bytes: a chunk of 1 MiB and its envelope.
@@ -138,7 +138,7 @@ async fn client_can_read_the_whole_scene() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn description_contains_follow_parents_and_frames() {
+async fn description_contains_followed_domains_and_frames() {
     let server = Server::start_default().await;
     server.open("twig").await;
     let (domains, _) = describe(&server, "twig", &[]).await;
@@ -146,7 +146,7 @@ async fn description_contains_follow_parents_and_frames() {
     assert_eq!(domains.iter().map(|domain| domain.follow_frame.len()).collect::<Vec<_>>(), [0, 0, 48, 48]);
     assert_eq!(
         domains[2].placement, domains[2].follow_frame,
-        "expected the frame as placement on a branch at its rest pose"
+        "expected the placement to equal the follow frame, because the followed domain is at the world origin"
     );
     assert_ne!(domains[3].placement, domains[3].follow_frame, "expected a world placement");
 }

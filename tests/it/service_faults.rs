@@ -190,31 +190,32 @@ async fn upload_below_minimum_rate_times_out() {
 /// Forwards connections until it is frozen. Then it keeps them open and forwards nothing.
 struct FreezableProxy {
     address: String,
-    is_frozen: Arc<watch::Sender<bool>>,
+    /// Sends whether the proxy is frozen.
+    freeze_sender: Arc<watch::Sender<bool>>,
 }
 
 impl FreezableProxy {
     async fn start(server_address: String) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("expected a free port");
         let address = format!("http://{}", listener.local_addr().expect("expected a socket address"));
-        let is_frozen = Arc::new(watch::Sender::new(false));
-        let freeze_signal = Arc::clone(&is_frozen);
+        let freeze_sender = Arc::new(watch::Sender::new(false));
+        let task_sender = Arc::clone(&freeze_sender);
         tokio::spawn(async move {
             while let Ok((mut client, _)) = listener.accept().await {
                 let mut upstream =
                     TcpStream::connect(&server_address).await.expect("expected a connection to the server");
-                let mut is_frozen = freeze_signal.subscribe();
+                let mut freeze_receiver = task_sender.subscribe();
                 tokio::spawn(async move {
                     tokio::select! {
                         _ = tokio::io::copy_bidirectional(&mut client, &mut upstream) => {}
-                        () = async { is_frozen.wait_for(|is_frozen| *is_frozen).await.map(drop).unwrap_or_default() } => {
+                        () = async { freeze_receiver.wait_for(|is_frozen| *is_frozen).await.map(drop).unwrap_or_default() } => {
                             tokio::time::sleep(TIMEOUT).await;
                         }
                     }
                 });
             }
         });
-        Self { address, is_frozen }
+        Self { address, freeze_sender }
     }
 
     async fn channel(&self) -> Channel {
@@ -226,6 +227,6 @@ impl FreezableProxy {
     }
 
     fn freeze(&self) {
-        self.is_frozen.send_replace(true);
+        self.freeze_sender.send_replace(true);
     }
 }

@@ -12,6 +12,7 @@ use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState,
 
 use crate::deformers::{TestRng, random_state, random_strip};
 
+/// Number of vertices and rank of each shape.
 const SIZES: [(usize, usize); 9] =
     [(1, 1), (1, 0), (7, 3), (129, 31), (1500, 33), (7, 512), (129, 0), (128, 6), (1500, 1)];
 
@@ -79,16 +80,16 @@ fn tile_bounds(scene: &Scene, state: &SceneState, deformer: &CpuDeformer, domain
 fn error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], deformer: &CpuDeformer) -> Vec<f64> {
     let expected = reference::deform(scene, state);
     let domain_ratio = |domain: usize| {
-        let slot = scene.layout.domains[domain];
+        let layout = scene.layout.domains[domain];
         let bounds = tile_bounds(scene, state, deformer, domain);
         let vertex_ratio = |vertex: usize| {
-            let packed_vertex = slot.first_vertex + vertex;
+            let packed_vertex = layout.first_vertex + vertex;
             let squared_error =
                 |axis: usize| (f64::from(positions[3 * packed_vertex + axis]) - expected[packed_vertex][axis]).powi(2);
             let ratio = (0..3).map(squared_error).sum::<f64>().sqrt() / bounds[vertex / (QUAD * TILE_QUADS)];
             if ratio.is_nan() { f64::INFINITY } else { ratio }
         };
-        (0..slot.vertices).map(vertex_ratio).fold(0.0, f64::max)
+        (0..layout.vertices).map(vertex_ratio).fold(0.0, f64::max)
     };
     (0..scene.domains.len()).map(domain_ratio).collect()
 }
@@ -142,10 +143,10 @@ fn positions_do_not_depend_on_threads_or_earlier_steps() {
         deform(&mut reused_deformer, &state);
         let mut random = TestRng(5);
         for step in 0..6 {
-            // Each step changes q of one domain and the transform of another. The last step changes nothing, the one
-            // before it all of q.
-            let slot = scene.layout.domains[[0, 4, 8, 3, 0, 0][step]];
-            let changed_q = if step == 4 { 0..state.q.len() } else { slot.first_q..slot.first_q + slot.rank };
+            // Steps 0 to 3 change q of one domain and one transform. Step 4 changes all of q and one transform, and
+            // step 5 changes nothing.
+            let layout = scene.layout.domains[[0, 4, 8, 3, 0, 0][step]];
+            let changed_q = if step == 4 { 0..state.q.len() } else { layout.first_q..layout.first_q + layout.rank };
             if step < 5 {
                 state.q[changed_q].iter_mut().for_each(|number| *number = random.next());
                 state.transforms[[1, 6, 10, 3, 5][step]].0[3] += 0.5;
@@ -162,11 +163,11 @@ fn positions_do_not_depend_on_threads_or_earlier_steps() {
                     "{storage:?}, step {step}, {threads} threads"
                 );
                 assert_eq!(summary.bounds, new_summary.bounds);
-                let (reused_deformer, new_deformer) = (
+                let (surface, new_surface) = (
                     reused_deformer.surface().expect("expected a surface"),
                     new_deformer.surface().expect("expected a surface"),
                 );
-                assert_eq!(reused_deformer.normals, new_deformer.normals);
+                assert_eq!(surface.normals, new_surface.normals);
             }
         }
     }
@@ -184,13 +185,14 @@ fn vertices_do_not_depend_on_the_tiling() {
     let first_columns: Vec<f32> = columns.chunks_exact(4500).flat_map(|column| column[..387].to_vec()).collect();
     for storage in [StorageType::F32, StorageType::F16, StorageType::Bf16] {
         let deformation = DeformationSettings { storage, ..DeformationSettings::default() };
-        let (large, small) = (
+        let (large_scene, small_scene) = (
             scene_from_columns(1500, columns.clone(), deformation),
             scene_from_columns(129, first_columns.clone(), deformation),
         );
-        let state = random_state(&large);
-        let [large, small] = [&large, &small].map(|scene| deform(&mut CpuDeformer::new(scene), &state).1);
-        assert_eq!(f32_bits(&large[..387]), f32_bits(&small), "{storage:?}");
+        let state = random_state(&large_scene);
+        let [large_positions, small_positions] =
+            [&large_scene, &small_scene].map(|scene| deform(&mut CpuDeformer::new(scene), &state).1);
+        assert_eq!(f32_bits(&large_positions[..387]), f32_bits(&small_positions), "{storage:?}");
     }
 }
 
@@ -246,7 +248,7 @@ fn finite_sums_survive_overflowing_terms() {
 #[test]
 fn truncation_budget_in_meters_holds_in_scene_units() {
     for unit in [1.0, 0.01] {
-        let mut parts = SceneParts::named("millimetres");
+        let mut parts = SceneParts::named("truncated");
         parts.unit = unit;
         parts.deformation.truncation = Some(1e-3);
         parts.materials = vec![Material::default()];

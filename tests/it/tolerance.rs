@@ -35,9 +35,9 @@ fn difference_detects_wrong_and_non_finite_numbers() {
     let expected = [1.0, 2.0];
     assert_eq!(find_difference(&[1.0, 2.0], &expected, tolerance), None);
     for actual in [&[1.0, 2.1][..], &[1.0, f32::NAN], &[1.0, f32::INFINITY], &[2.0, 1.0], &[1.0], &[]] {
-        assert!(find_difference(actual, &expected, tolerance).is_some(), "{actual:?} passed");
+        assert!(find_difference(actual, &expected, tolerance).is_some(), "expected a difference for {actual:?}");
     }
-    assert!(find_difference(&[], &[], tolerance).is_some(), "expected empty lists to fail");
+    assert!(find_difference(&[], &[], tolerance).is_some(), "expected a difference for empty lists");
     assert_eq!(max_distance(&[3.0, 0.0, f32::NAN], &[[0.0; 3]]), f64::INFINITY);
     assert!((max_distance(&[3.0, 4.0, 0.0], &[[0.0; 3]]) - 5.0).abs() < 1e-12);
 }

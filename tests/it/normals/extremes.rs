@@ -32,10 +32,10 @@ fn max_error_ratio(scene: &Scene, positions: &[[f64; 3]], normals: &[f32], refer
         }
     }
     let mut max_ratio = 0.0_f64;
-    for ((normals, reference_normals), (area_sum, rounding_sum)) in
+    for ((normal, reference_normal), (area_sum, rounding_sum)) in
         normals.chunks_exact(3).zip(reference_normals).zip(&corner_sums)
     {
-        let error = angle_degrees([0, 1, 2].map(|axis| f64::from(normals[axis])), *reference_normals).to_radians();
+        let error = angle_degrees([0, 1, 2].map(|axis| f64::from(normal[axis])), *reference_normal).to_radians();
         let ratio = error / (ROUNDING_BOUND * rounding_sum / area_sum.norm() + 2e-7);
         max_ratio = if ratio.is_nan() { f64::INFINITY } else { max_ratio.max(ratio) };
     }
@@ -88,12 +88,11 @@ fn zero_area_triangles_do_not_change_normals() {
         );
         scene(vec![shape_with_mode(mesh.expect("expected a valid mesh"), |[x, y, _]| [0.0, 0.0, x + 0.5 * y])])
     };
-    let (degenerate_scene, original_triangles) =
-        (scene_of_triangles(triangles), scene_of_triangles(original_triangles));
+    let (degenerate_scene, original_scene) = (scene_of_triangles(triangles), scene_of_triangles(original_triangles));
     let state = uniform_q_state(&degenerate_scene, 0.8);
     let (degenerate_result, original_result) = (
         reference_normals_and_tangents(&degenerate_scene, &state),
-        reference_normals_and_tangents(&original_triangles, &state),
+        reference_normals_and_tangents(&original_scene, &state),
     );
     for corner in 0..24 {
         assert!(angle_degrees(degenerate_result.0[corner], original_result.0[corner]) < 1e-5, "corner {corner}");

@@ -25,11 +25,11 @@ pub(crate) fn sheet(columns: u32, rows: u32) -> Mesh {
     let rest_positions: Vec<_> = grid.clone().map(|(x, y)| [x, y, 0.0]).collect();
     let uvs = grid.map(|(x, y)| [0.5 * x + 0.5, 0.5 - 0.5 * y]).collect();
     let normals = vec![UP; rest_positions.len()];
-    Mesh::from_indexed(rest_positions, normals, uvs, quads(columns, rows)).expect("expected a valid mesh")
+    Mesh::from_indexed(rest_positions, normals, uvs, grid_triangles(columns, rows)).expect("expected a valid mesh")
 }
 
 /// Two triangles per cell of a grid, all split along the same diagonal.
-pub(crate) fn quads(columns: u32, rows: u32) -> Vec<[u32; 3]> {
+pub(crate) fn grid_triangles(columns: u32, rows: u32) -> Vec<[u32; 3]> {
     let cells = (0..rows - 1).flat_map(|row| (0..columns - 1).map(move |column| row * columns + column));
     cells
         .flat_map(|corner| {
@@ -52,7 +52,7 @@ pub(crate) fn tube(columns: u32, rows: u32, tilt: f32) -> Mesh {
         corners.normals.push([angle.cos(), 0.0, -angle.sin()]);
         corners.uvs.push([column as f32 / columns as f32, 1.0 - row as f32]);
     }
-    Mesh::new(rest_positions.collect(), corners, quads(columns + 1, rows)).expect("expected a valid mesh")
+    Mesh::new(rest_positions.collect(), corners, grid_triangles(columns + 1, rows)).expect("expected a valid mesh")
 }
 
 /// A unit cube of 8 vertices and 24 corners; every edge is hard.

@@ -24,8 +24,8 @@ fn surface_bits(surface: &DeformedSurface) -> [Vec<u32>; 3] {
 
 /// Normals of one domain as bits.
 fn normal_bits(scene: &Scene, surface: &DeformedSurface, domain: usize) -> Vec<u32> {
-    let slot = scene.layout.domains[domain];
-    f32_bits(&surface.normals[3 * slot.first_corner..][..3 * slot.corners])
+    let layout = scene.layout.domains[domain];
+    f32_bits(&surface.normals[3 * layout.first_corner..][..3 * layout.corners])
 }
 
 /// Changes q of some domains, their transforms, or both, depending on the step. Returns the changed domains.
@@ -38,9 +38,9 @@ fn change_domains(scene: &Scene, state: &mut SceneState, step: usize, random: &m
         _ => vec![0, 2],
     };
     for domain in &domains {
-        let slot = scene.layout.domains[*domain];
+        let layout = scene.layout.domains[*domain];
         if step != 1 {
-            state.q[slot.first_q..][..slot.rank].iter_mut().for_each(|number| *number += random.next());
+            state.q[layout.first_q..][..layout.rank].iter_mut().for_each(|number| *number += random.next());
         }
         if step % 2 == 1 {
             state.transforms[*domain].0.iter_mut().for_each(|number| *number += 0.3 * random.next());

@@ -13,9 +13,9 @@ fn read_aov(builder: SceneBuilder, camera: Camera, size: u32, aov: Aov) -> AovIm
     let mut renderer = open_renderer();
     let mut buffers = renderer.load(&scene).expect("expected the scene to load");
     let mut surface = modalcast_model::deform::DeformedSurface::default();
-    for (domain, slot) in scene.domains.iter().zip(&scene.layout.domains) {
+    for (domain, layout) in scene.domains.iter().zip(&scene.layout.domains) {
         let mesh = &scene.shapes[domain.shape].mesh;
-        assert_eq!(slot.first_vertex, surface.positions.len() / 3);
+        assert_eq!(layout.first_vertex, surface.positions.len() / 3);
         surface.positions.extend(mesh.rest_positions().as_flattened());
         surface.normals.extend(mesh.corners().normals.as_flattened());
     }

@@ -115,8 +115,8 @@ fn mixed_builder(samples: u32, transparency: Transparency) -> SceneBuilder {
     for (seed, double_sided) in [(1, false), (2, true)] {
         // With several samples, a software renderer reads cut-out images at centroids that depend on hidden triangles;
         // see `Culling::Occlusion`.
-        let visible_image = (samples == 1 || !is_software()).then_some(leaf_image);
-        let leaves = Material { color_texture: visible_image, alpha: 0.75, ..material(mask, double_sided, [1.0; 3]) };
+        let leaf_texture = (samples == 1 || !is_software()).then_some(leaf_image);
+        let leaves = Material { color_texture: leaf_texture, alpha: 0.75, ..material(mask, double_sided, [1.0; 3]) };
         let glass = Material { alpha: 0.5, ..material(AlphaMode::Blend, double_sided, [0.2, 0.4, 0.9]) };
         builder = builder
             .add_domain(random_triangles(seed, 700, 3.0), material(AlphaMode::Opaque, double_sided, [0.8, 0.3, 0.2]))

@@ -85,8 +85,8 @@ fn reused_targets_render_like_a_fresh_renderer() {
             let expected_frame = draw_frame(&mut new_renderer, &new_buffers, camera, scene.rest_bounds);
             let frame = draw_frame(&mut reused_renderer, &buffers, camera, scene.rest_bounds);
             assert!(frame == expected_frame, "look {index} at {shift:?}");
-            let triangles = frame.ids.iter().filter(|id| matches!(id, VisibilityId::Triangle(_))).count();
-            assert_eq!(triangles > 100, shift[0] < 100.0, "look {index} at {shift:?}: {triangles} pixels");
+            let triangle_pixels = frame.ids.iter().filter(|id| matches!(id, VisibilityId::Triangle(_))).count();
+            assert_eq!(triangle_pixels > 100, shift[0] < 100.0, "look {index} at {shift:?}: {triangle_pixels} pixels");
             assert!(previous_frame.as_ref() != Some(&frame), "negative control: look {index} at {shift:?}");
             previous_frame = Some(frame);
         }

@@ -205,7 +205,7 @@ fn scene_far_from_the_origin_is_rendered() {
 }
 
 #[test]
-fn renderers_work_on_many_threads_and_two_on_one() {
+fn renderers_work_on_separate_and_on_shared_threads() {
     let draw_frame = || {
         let scene = default_look_builder().add_domain(floor_mesh(1.0, 0.5), Material::default()).build();
         render_square(&mut open_renderer(), &scene, Camera::fit_to_scene(&scene, 64, 64), 32).image.rgba

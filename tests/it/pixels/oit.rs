@@ -121,7 +121,7 @@ fn later_of_coplanar_layers_is_in_front() {
 }
 
 #[test]
-fn opaque_hides_glass_behind_and_shows_through_in_front() {
+fn glass_is_hidden_behind_opaque_and_blended_in_front() {
     let render_with = |z: f32| {
         render(
             &create_builder(Transparency::OrderIndependent, 4)
@@ -214,7 +214,7 @@ fn layer(depth_index: u32, count: u32) -> ([f32; 3], f32) {
     ([shade, 1.0 - shade, 0.5], 0.1 + 0.2 * shade)
 }
 
-/// The same stack; all layers but the nearest `layers` ones are fully transparent.
+/// A [`layer_stack`] in which all layers but the nearest `layers` ones are fully transparent.
 fn nearest_layers(count: u32, layers: u32) -> Arc<Scene> {
     let opacity_scale = |depth_index: u32| if depth_index >= count - layers { 1.0 } else { 0.0 };
     (0..count)

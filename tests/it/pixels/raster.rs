@@ -23,8 +23,14 @@ fn random_scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
     let mut random = Random(seed);
     let mut positions = Vec::new();
     for index in 0..1500 {
-        let size =
-            [0.02, 0.1, 0.5, 3.0][index % 4] * if index % 4 == 3 { f32::from(u8::from(index % 60 == 3)) } else { 1.0 };
+        // One triangle in 60 is large. The other triangles with the same remainder have no area.
+        let size = match index % 4 {
+            0 => 0.02,
+            1 => 0.1,
+            2 => 0.5,
+            _ if index % 60 == 3 => 3.0,
+            _ => 0.0,
+        };
         let center = random.next_triple().map(|number| 3.0 * number);
         for _ in 0..3 {
             let offset = random.next_triple();

@@ -1,10 +1,12 @@
 //! Coverage, Phong shading, normal maps, cut-outs, blending, the sky, and image orientation.
 
 use modalcast_model::domain::{AlphaMode, Material};
-use modalcast_model::scene::{Camera, Lens, Transparency, View};
+use modalcast_model::scene::{Camera, Lens, RenderSettings, Transparency, View};
 use nalgebra::Vector3;
 
-use super::harness::{SceneBuilder, facing_rectangle, front_camera, is_close, open_renderer, render, render_square};
+use super::harness::{
+    SceneBuilder, decode_srgb, facing_rectangle, front_camera, is_close, open_renderer, render, render_square,
+};
 
 fn matte_material(diffuse: [f32; 3]) -> Material {
     Material { diffuse, ambient: diffuse, ..Material::default() }
@@ -60,8 +62,7 @@ fn first_image_row_is_the_top_of_the_surface() {
 }
 
 /// Equation 3.12 in f64 with clamped dot products and unshadowed ambient light, for a surface that faces +Z.
-fn expected_phong(builder: &SceneBuilder, material: &Material, point: Vector3<f64>, eye: Vector3<f64>) -> [f64; 3] {
-    let look = &builder.parts.look;
+fn expected_phong(look: &RenderSettings, material: &Material, point: Vector3<f64>, eye: Vector3<f64>) -> [f64; 3] {
     let sun = Vector3::from(look.sun).cast::<f64>().normalize();
     let normal = Vector3::z();
     let to_eye = (eye - point).normalize();
@@ -90,16 +91,15 @@ fn phong_shading_equals_f64_arithmetic() {
         let mut builder = SceneBuilder::new();
         builder.parts.look.sun = sun;
         builder.parts.look.sunlight = [0.6, 0.7, 0.8];
-        let mut settings = SceneBuilder::new();
-        settings.parts.look = builder.parts.look;
+        let look = builder.parts.look;
         let frame = render(&builder.add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), material.clone()).build());
         let mut highlights = 0;
         for (x, y) in [(32, 32), (12, 20), (50, 45), (20, 50)] {
             let point = Vector3::new((f64::from(x) + 0.5 - 32.0) / 10.0, (32.0 - f64::from(y) - 0.5) / 10.0, 0.0);
-            let expected = expected_phong(&settings, &material, point, Vector3::new(0.0, 0.0, 10.0));
+            let expected = expected_phong(&look, &material, point, Vector3::new(0.0, 0.0, 10.0));
             assert!(is_close(frame.pixel(x, y), expected, 1.0), "{sun:?} ({x}, {y}): {:?}", frame.pixel(x, y));
             let matte = Material { specular: [0.0; 3], ..material.clone() };
-            let matte_color = expected_phong(&settings, &matte, point, Vector3::new(0.0, 0.0, 10.0));
+            let matte_color = expected_phong(&look, &matte, point, Vector3::new(0.0, 0.0, 10.0));
             highlights += usize::from(!is_close(frame.pixel(x, y), matte_color, 1.0));
         }
         assert_eq!(highlights > 0, has_highlight, "{sun:?}: {highlights} pixels with a highlight");
@@ -277,10 +277,11 @@ fn images_of_many_sizes_keep_their_materials() {
         colors.push([shade, 255 - shade, 0]);
     }
     let frame = render_square(&mut open_renderer(), &builder.build(), front_camera(64), 64);
-    let linear = |byte: u8| ((f64::from(byte) / 255.0 + 0.055) / 1.055).powf(2.4);
+
     for (index, [r, g, _]) in colors.into_iter().enumerate() {
         let pixel = frame.pixel(5 + 6 * index as u32 + 3, 32);
-        assert!(is_close(pixel, [0.75 * linear(r), 0.75 * linear(g), 0.0], 1.0), "image {index}: {pixel:?}");
+        let expected = [0.75 * decode_srgb(r), 0.75 * decode_srgb(g), 0.0];
+        assert!(is_close(pixel, expected, 1.0), "image {index}: {pixel:?}");
     }
 }
 

@@ -264,23 +264,36 @@ fn splits_give_near_shadows_finer_texels() {
     );
 }
 
+/// Passes and allocations of a scene that depend on its shadow method.
+#[derive(Debug, PartialEq)]
+struct ShadowResources {
+    has_blur_pass: bool,
+    textures: Vec<String>,
+    has_cascades: bool,
+}
+
 #[test]
 fn unused_shadow_resources_are_not_allocated() {
-    let allocations = |shadow: ShadowSettings| {
+    let resources_of = |shadow: ShadowSettings| {
         let square_scene = square_scene(shadow);
         let (frame, plan) = (render_edge(shadow), plan(&square_scene));
         assert_eq!(frame.stats.passes, planned_passes_above_ground(&square_scene), "expected the planned passes");
-        let textures: Vec<String> = plan.textures.iter().map(|allocation| allocation.name.clone()).collect();
-        let map_names: Vec<String> = textures.into_iter().filter(|name| name.starts_with("shadow")).collect();
-        let has_cascades = frame.allocations.iter().any(|allocation| allocation.name == "shadow cascades");
-        (frame.stats.passes.contains(&Pass::Blur), map_names, has_cascades)
+        let names = plan.textures.iter().map(|allocation| allocation.name.clone());
+        ShadowResources {
+            has_blur_pass: frame.stats.passes.contains(&Pass::Blur),
+            textures: names.filter(|name| name.starts_with("shadow")).collect(),
+            has_cascades: frame.allocations.iter().any(|allocation| allocation.name == "shadow cascades"),
+        }
     };
     let base = ShadowSettings { size: 64, ..ShadowSettings::default() };
-    let depth_only = vec!["shadow depth".to_string()];
     for method in [ShadowMethod::Standard, ShadowMethod::PercentageCloser] {
-        assert_eq!(allocations(ShadowSettings { method, ..base }), (false, depth_only.clone(), false));
+        let expected =
+            ShadowResources { has_blur_pass: false, textures: vec!["shadow depth".into()], has_cascades: false };
+        assert_eq!(resources_of(ShadowSettings { method, ..base }), expected);
     }
-    let depth_and_moments = vec!["shadow depth".to_string(), "shadow moments".to_string()];
-    assert_eq!(allocations(base), (true, depth_and_moments.clone(), false));
-    assert_eq!(allocations(ShadowSettings { splits: 2, ..base }), (true, depth_and_moments, true));
+    for (splits, has_cascades) in [(1, false), (2, true)] {
+        let textures = vec!["shadow depth".into(), "shadow moments".into()];
+        let expected = ShadowResources { has_blur_pass: true, textures, has_cascades };
+        assert_eq!(resources_of(ShadowSettings { splits, ..base }), expected);
+    }
 }

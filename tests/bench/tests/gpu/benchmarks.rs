@@ -122,7 +122,10 @@ fn check_single_kernel(ranks: &[usize]) {
     let device = Device::open(0).expect("expected a CUDA device");
     for rank in ranks.iter().copied() {
         for (vertices, normal_maps) in [(1, false), (33, true), (5003, false)] {
-            let scene = scenes::random_scene(&[(vertices, rank)], 1, normal_maps, false);
+            let scene = scenes::random_scene(
+                &[(vertices, rank)],
+                scenes::RandomSceneOptions { instances: 1, normal_maps, rigid_transforms: false },
+            );
             for part in [Part::Uq, Part::Whole] {
                 let benchmark = ThesisBenchmark::single(&device, &scene, &random_states(&scene), part)
                     .expect("expected a benchmark");
@@ -137,7 +140,10 @@ fn check_single_kernel(ranks: &[usize]) {
 fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
     let device = Device::open(0).expect("expected a CUDA device");
     let shapes: Vec<_> = (0..66).map(|index| (1 + index * 29 % 611, index % 33)).collect();
-    let scene = scenes::random_scene(&shapes, 2, true, false);
+    let scene = scenes::random_scene(
+        &shapes,
+        scenes::RandomSceneOptions { instances: 2, normal_maps: true, rigid_transforms: false },
+    );
     for split in KernelSplit::ALL {
         for part in [Part::Uq, Part::Whole] {
             let benchmark = ThesisBenchmark::multi(&device, &scene, &random_states(&scene), (split, part))
@@ -146,7 +152,10 @@ fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
             assert_eq!(benchmark.launches_per_step(), split.widths().len() + usize::from(part == Part::Whole));
         }
     }
-    let rigid_scene = scenes::random_scene(&[(40, 0)], 3, false, true);
+    let rigid_scene = scenes::random_scene(
+        &[(40, 0)],
+        scenes::RandomSceneOptions { instances: 3, normal_maps: false, rigid_transforms: true },
+    );
     let update_benchmark =
         ThesisBenchmark::multi(&device, &rigid_scene, &random_states(&rigid_scene), (KernelSplit::Two, Part::Whole))
             .expect("expected a benchmark");
@@ -158,9 +167,20 @@ fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
 fn gpu_cublas_matches_reference_with_every_product_kind() {
     let device = Device::open(0).expect("expected a CUDA device");
     let shapes: Vec<_> = (0..40).map(|index| (1 + index * 29 % 611, index * 7 % 65)).collect();
-    let mixed_scene = scenes::random_scene(&shapes, 2, false, false);
-    let (single_scene, instanced_scene) =
-        (scenes::random_scene(&[(5003, 30)], 1, false, false), scenes::random_scene(&[(5003, 32)], 16, false, false));
+    let mixed_scene = scenes::random_scene(
+        &shapes,
+        scenes::RandomSceneOptions { instances: 2, normal_maps: false, rigid_transforms: false },
+    );
+    let (single_scene, instanced_scene) = (
+        scenes::random_scene(
+            &[(5003, 30)],
+            scenes::RandomSceneOptions { instances: 1, normal_maps: false, rigid_transforms: false },
+        ),
+        scenes::random_scene(
+            &[(5003, 32)],
+            scenes::RandomSceneOptions { instances: 16, normal_maps: false, rigid_transforms: false },
+        ),
+    );
     for method in CublasMethod::ALL {
         let scene = match method {
             CublasMethod::SgemvColumns | CublasMethod::SgemvRows => &single_scene,
@@ -183,8 +203,16 @@ fn gpu_cublas_matches_reference_with_every_product_kind() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_thesis_kernels_reject_unsupported_scenes() {
     let device = Device::open(0).expect("expected a CUDA device");
-    let (high_rank_scene, two_domain_scene) =
-        (scenes::random_scene(&[(40, 33)], 1, false, false), scenes::random_scene(&[(40, 3)], 2, false, false));
+    let (high_rank_scene, two_domain_scene) = (
+        scenes::random_scene(
+            &[(40, 33)],
+            scenes::RandomSceneOptions { instances: 1, normal_maps: false, rigid_transforms: false },
+        ),
+        scenes::random_scene(
+            &[(40, 3)],
+            scenes::RandomSceneOptions { instances: 2, normal_maps: false, rigid_transforms: false },
+        ),
+    );
     let invalid_field = |result: Result<ThesisBenchmark, Error>| match result {
         Err(Error::Invalid { field, .. }) => field,
         other => panic!("expected an invalid field, got {other:?}"),

@@ -12,7 +12,7 @@ fn time_steps(name: &str, (vertices, rank): (usize, usize), instances: usize) ->
     let device = Device::open(0).expect("expected a CUDA device");
     let times_us = [true, false].map(|has_shadow| {
         let mut parts = scenes::parts_of_shapes(vec![scenes::random_shape(&mut Random(9), vertices, rank)]);
-        parts.domains = vec![scenes::new_domain(0, 0); instances];
+        parts.domains = vec![scenes::new_domain(0, scenes::PLAIN_MATERIAL); instances];
         parts.look.shadow = parts.look.shadow.filter(|_| has_shadow);
         let scene = Scene::new(parts).expect("expected a valid scene");
         let benchmark = DeformerBenchmark::new(

@@ -11,7 +11,10 @@ use crate::scenes;
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_overlapped_steps_are_faster_with_identical_vertices() {
     let device = Device::open(0).expect("expected a CUDA device");
-    let scene = scenes::random_scene(&[(200_000, 8), (7, 0), (40, 3)], 4, false, false);
+    let scene = scenes::random_scene(
+        &[(200_000, 8), (7, 0), (40, 3)],
+        scenes::RandomSceneOptions { instances: 4, normal_maps: false, rigid_transforms: false },
+    );
     let states: Vec<SceneState> = (0..4).map(|seed| scenes::random_state(&scene, seed)).collect();
     let workload = Workload::new("overlap".to_owned(), scene);
     let measurement = overlap(&device, &workload, &states, 50).expect("a measurement");

@@ -1,4 +1,4 @@
-//! Runs the checks of `tests/common` on the device, and checks of scenes too large for the CPU tests.
+//! Runs the checks of `tests/common` on the CUDA deformer, and tests scenes that are too large for the CPU tests.
 
 use modalcast::config::BackendChoice;
 use modalcast_compute::gpu::{BufferRole, CudaDeformer, KernelKind};
@@ -93,7 +93,7 @@ fn gpu_partial_steps_have_the_bits_of_full_steps() {
     partial_steps::check_partial_steps(cuda_deformer_with_batches);
 }
 
-/// Negative control of the test above: a step depends on its list of dirty domains.
+/// Negative control of the previous test: a step depends on its list of dirty domains.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_domain_missing_from_the_list_does_not_move() {
@@ -102,7 +102,7 @@ fn gpu_domain_missing_from_the_list_does_not_move() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_displacements_and_boxes_equal_their_twins() {
+fn gpu_displacements_are_within_bound_and_boxes_tight() {
     attributes::check_displacements_and_boxes(cuda_deformer);
 }
 
@@ -140,7 +140,10 @@ fn gpu_domain_bits_do_not_depend_on_neighbors() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_domain_of_four_million_vertices_is_within_its_bound() {
-    let scene = scenes::random_scene(&[(4_000_000, 2)], 1, false, false);
+    let scene = scenes::random_scene(
+        &[(4_000_000, 2)],
+        scenes::RandomSceneOptions { instances: 1, normal_maps: false, rigid_transforms: false },
+    );
     let mut state = scenes::random_state(&scene, 91);
     let mut deformer = cuda_deformer(&scene);
     let positions = common::run_step(&mut deformer, &state).surface.positions;
@@ -225,7 +228,11 @@ fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
         let frame = random.next_similarity(index % 5 == 0);
         let follows = (index >= 1000).then_some(FollowConstraint { parent, frame });
         let shape = if index < 1000 { 0 } else { 1 + index % 2 };
-        parts.domains.push(Domain { name: format!("domain {index}"), follows, ..scenes::new_domain(shape, 0) });
+        parts.domains.push(Domain {
+            name: format!("domain {index}"),
+            follows,
+            ..scenes::new_domain(shape, scenes::PLAIN_MATERIAL)
+        });
     }
     let scene = Scene::new(parts).expect("expected a valid scene");
     let mut deformer = cuda_deformer(&scene);
@@ -235,6 +242,7 @@ fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
         plan.bytes_in,
         plan.bytes(BufferRole::FollowerFrames)
     );
+    // A step copies its header, a transform of each branch, and six coordinates of each branch.
     assert_eq!((plan.launches(), plan.bytes_in), (3, 112 + 48 * 1000 + 4 * 6000));
     let mut state = scenes::random_state(&scene, 95);
     let result = common::run_step(&mut deformer, &state);
