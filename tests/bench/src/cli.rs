@@ -41,14 +41,16 @@ const EXAMPLES: &str = "Examples:
   modalcast report render --out report --quick";
 
 const LOADS: &str = "Loads:
-  single-P-R          one domain of 2^P vertices and R modes (table 4.4 of the thesis: P 14 to 22, R 10 to 30)
+  single-P-R          one domain of 2^P vertices and R modes (table 4.4 of the thesis: P is 14 to 22, R is 10 to 30)
   a, a-positions      one domain of 1.5 M vertices, r = 32, with normals and tangents, or without
-  b                   1,000 domains of 1,500 vertices, r mixed 0 to 64
+  b                   1,000 domains of 1,500 vertices, with r from 0 to 64
   c                   200,000 domains of 7 vertices, 95 % of them rigid
   cancel              one domain whose modes nearly cancel in pairs
   batch               16 instances of one domain of 2^18 vertices and 32 modes
   plant-1 .. plant-12 the plants of table 4.5 of the thesis
-  single, plants, all groups of them";
+  single              all loads single-P-R of table 4.4
+  plants              all loads plant-N
+  all                 every load";
 
 /// Error against run time of the deformation: validates every variant, then times it.
 ///
@@ -60,7 +62,7 @@ struct DeformArgs {
     /// Output folder; files of an earlier report there are replaced.
     #[arg(long)]
     out: PathBuf,
-    /// A scene: a built-in name, or a path to a model or a scene folder.
+    /// A scene of your own: a built-in name, or a path to a model or a scene folder.
     #[arg(long)]
     scene: Option<String>,
     /// Trajectory of the scene: a .csv of time,q0,q1,..., or a folder with q.npy as modalcast-sim --record writes it.
@@ -73,7 +75,7 @@ struct DeformArgs {
     /// Random states per load [default: 100, 10 with --quick].
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     seeds: Option<u32>,
-    /// Repetitions per median, at least 20 [default: 100, 20 with --quick].
+    /// Repetitions per median [default: 100, 20 with --quick]. Wall-clock times take at least 20.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     replays: Option<u32>,
     /// Upper limit of trajectory steps to validate [default: all].
@@ -108,14 +110,14 @@ pub fn run() -> u8 {
 fn run_deform(args: &DeformArgs) -> Outcome {
     let options = report_options(args)?;
     let on_progress = |progress: Progress<'_>| match progress {
-        Progress::Started(what) => {
-            tracing::info!(load = what, "measuring");
+        Progress::Started(workload) => {
+            tracing::info!(load = workload, "measuring");
             Ok(())
         }
         Progress::Measured(report) => report.write(&args.out),
     };
     let report = with_spinner("measuring", || deform(&options, &LocalMachine::open(), on_progress))?;
-    format_rows(&report).into_iter().for_each(print_line);
+    format_lines(&report).into_iter().for_each(print_line);
     print_line(format!("written to {}", args.out.display()));
     Ok(report.passed())
 }
@@ -123,7 +125,7 @@ fn run_deform(args: &DeformArgs) -> Outcome {
 fn report_options(args: &DeformArgs) -> Result<DeformReportOptions> {
     let mut sources = Vec::new();
     if let Some(source) = &args.scene {
-        sources.push(WorkloadSource::Scene { source: source.clone(), record: args.trajectory.clone() });
+        sources.push(WorkloadSource::Scene { source: source.clone(), recording: args.trajectory.clone() });
     }
     for name in &args.loads {
         sources.extend(WorkloadKind::parse(name)?.into_iter().map(WorkloadSource::Synthetic));
@@ -132,22 +134,23 @@ fn report_options(args: &DeformArgs) -> Result<DeformReportOptions> {
         sources.extend(WorkloadKind::all().into_iter().map(WorkloadSource::Synthetic));
     }
     let (seeds, replays, size) = if args.quick { (10, 20, Size::Quick) } else { (100, 100, Size::Full) };
-    let number = |option: Option<u32>, default: usize| option.map_or(default, |number| number as usize);
+    let count_or = |argument: Option<u32>, default: usize| argument.map_or(default, |count| count as usize);
     Ok(DeformReportOptions {
         sources,
-        seeds: number(args.seeds, seeds),
-        replays: number(args.replays, replays),
+        seeds: count_or(args.seeds, seeds),
+        replays: count_or(args.replays, replays),
         steps: args.steps.unwrap_or(usize::MAX),
         variants: args.variants.clone(),
         size,
     })
 }
 
-fn format_rows(report: &DeformReport) -> Vec<String> {
+/// The report as lines of text: remarks, a table of all rows, and failures.
+fn format_lines(report: &DeformReport) -> Vec<String> {
     let mut lines = report.remarks.clone();
     lines.push(format!(
         "{:<16}{:<24}{:<6}{:>14}{:>10}{:>16}{:>12}{:>10}",
-        "load", "variant", "cache", "median us", "GB/s", "largest m", "of bound", "passed"
+        "load", "variant", "cache", "median us", "GB/s", "max error m", "of bound", "passed"
     ));
     for row in &report.rows {
         let format_number =

@@ -1,4 +1,4 @@
-//! CUDA benchmark kernels as variants, and the selection of variants for a load.
+//! CUDA benchmark kernels as variants, and which of them a workload supports.
 
 use std::sync::Arc;
 
@@ -21,16 +21,16 @@ use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType
 /// Creates a kernel benchmark of a scene for the given states.
 type BenchmarkFactory = Box<dyn Fn(&Device, &Arc<Scene>, &[SceneState]) -> Result<Box<dyn KernelBenchmark>>>;
 
-/// The parts of a step that competing kernels launch, and the suffixes of the variants' names.
-const PARTS: [(kernels::Part, &str); 2] = [(kernels::Part::Uq, UQ), (kernels::Part::Whole, "")];
+/// The parts of a step that competing kernels launch, each with the suffix of the variant's name.
+const PARTS: [(kernels::Part, &str); 2] = [(kernels::Part::Uq, UQ_SUFFIX), (kernels::Part::Whole, "")];
 
 /// Name suffixes of variants that compute only a part of a step; their times are not comparable with whole steps.
-const UQ: &str = " Uq";
-const CHANGED: &str = ", 1 % changed";
+const UQ_SUFFIX: &str = " Uq";
+const ONE_PERCENT_CHANGED: &str = ", 1 % changed";
 
 /// Whether a variant of this name computes only a part of a step.
 pub(super) fn is_partial(name: &str) -> bool {
-    [UQ, CHANGED].iter().any(|ending| name.ends_with(ending))
+    [UQ_SUFFIX, ONE_PERCENT_CHANGED].iter().any(|ending| name.ends_with(ending))
 }
 
 /// A kernel benchmark as a variant. [`Variant::prepare`] creates the benchmark, because it needs the states.
@@ -49,15 +49,15 @@ struct BenchmarkVariant {
 pub(super) fn kernel_variants(
     device: &Arc<Device>,
     cache: &ErrorModelCache,
-    load: &Workload,
+    workload: &Workload,
     is_selected: VariantFilter<'_>,
 ) -> Vec<VariantCandidate> {
-    let scene = &load.scene;
+    let scene = &workload.scene;
     let candidate_for = |storage: StorageType, outputs: StepOutputs| -> VariantCandidate {
         // The kernel that computes u alone does not support batches.
-        let batches = if outputs == StepOutputs::Uq { BatchPolicy::Never } else { load.batches };
+        let batches = if outputs == StepOutputs::Uq { BatchPolicy::Never } else { workload.batches };
         let suffix = match outputs {
-            StepOutputs::Uq => UQ,
+            StepOutputs::Uq => UQ_SUFFIX,
             StepOutputs::Positions => " positions",
             StepOutputs::Whole => "",
         };
@@ -73,11 +73,11 @@ pub(super) fn kernel_variants(
     }
     for (name, deformation) in with_extra_outputs(scene) {
         let outputs = if has_normals(scene) { StepOutputs::Whole } else { StepOutputs::Positions };
-        let variant = StepVariant { name, deformation, batches: load.batches, outputs };
+        let variant = StepVariant { name, deformation, batches: workload.batches, outputs };
         candidates.push(variant.candidate(device, cache, is_selected));
     }
     if scene.domains.len() >= MIN_CHANGED_DOMAINS {
-        candidates.push(one_percent_changed(device, load, is_selected));
+        candidates.push(one_percent_changed(device, workload, is_selected));
     }
     if scene.features.modes {
         candidates.push(candidate_for(StorageType::F32, StepOutputs::Uq));
@@ -88,24 +88,26 @@ pub(super) fn kernel_variants(
     candidates
 }
 
-/// Deformations with an additional output for clients, by name; empty when the scene already has one of them.
+/// Deformations with displacements or boxes as an additional output, by name. Empty when the scene already has one of
+/// these outputs.
 fn with_extra_outputs(scene: &Scene) -> Vec<(String, DeformationSettings)> {
-    let plain = scene.deformation;
-    if plain.displacements || plain.boxes {
+    let default = scene.deformation;
+    if default.displacements || default.boxes {
         return Vec::new();
     }
-    let u = ("cuda f32, displacements kept".to_owned(), DeformationSettings { displacements: true, ..plain });
-    let boxes = ("cuda f32, boxes kept".to_owned(), DeformationSettings { boxes: true, ..plain });
-    vec![u, boxes]
+    let with_displacements =
+        ("cuda f32, displacements kept".to_owned(), DeformationSettings { displacements: true, ..default });
+    let with_boxes = ("cuda f32, boxes kept".to_owned(), DeformationSettings { boxes: true, ..default });
+    vec![with_displacements, with_boxes]
 }
 
-/// Whether a deformation truncates modes or sums with compensation, so that its kernel differs from the plain one.
-pub(super) fn needs_other_sum(deformation: &DeformationSettings) -> bool {
+/// Whether a deformation truncates modes or compensates sums. The kernel then differs from that of other deformations.
+pub(super) fn has_own_summation(deformation: &DeformationSettings) -> bool {
     deformation.truncation.is_some() || deformation.compensated
 }
 
-/// A full step of the deformer's own kernels. Kernel benchmarks have no history, so with truncation the modes of every
-/// state are selected independently.
+/// Settings of a variant that times full steps of the deformer's kernels. Kernel benchmarks keep no history, so
+/// truncation selects the modes of every state independently.
 pub(super) struct StepVariant {
     pub name: String,
     pub deformation: DeformationSettings,
@@ -127,28 +129,28 @@ impl StepVariant {
             let create: BenchmarkFactory = Box::new(move |device, scene, states| {
                 Ok(Box::new(DeformerBenchmark::new(device, scene, states, step)?))
             });
-            Ok(BenchmarkVariant::sharing(label, &scene, device, (cache.error_model(&scene), create)))
+            Ok(BenchmarkVariant::with_error_model(label, &scene, device, (cache.error_model(&scene), create)))
         })
     }
 }
 
-/// Minimum of domains for which a step that changes one domain in a hundred is measured.
+/// Minimum number of domains for which a step that changes one domain in a hundred is measured.
 const MIN_CHANGED_DOMAINS: usize = 400;
 
-/// A step that changes one domain in a hundred, evenly distributed over the domains.
-fn one_percent_changed(device: &Arc<Device>, load: &Workload, is_selected: VariantFilter<'_>) -> VariantCandidate {
-    let (scene, batches) = (&load.scene, load.batches);
-    let list: Vec<u32> = (0..scene.domains.len() as u32).step_by(100).collect();
-    let label = VariantLabel::new(format!("cuda f32 positions{CHANGED}"), Backend::Cuda, scene);
+/// A variant whose steps change every hundredth domain.
+fn one_percent_changed(device: &Arc<Device>, workload: &Workload, is_selected: VariantFilter<'_>) -> VariantCandidate {
+    let (scene, batches) = (&workload.scene, workload.batches);
+    let changed_domains: Vec<u32> = (0..scene.domains.len() as u32).step_by(100).collect();
+    let label = VariantLabel::new(format!("cuda f32 positions{ONE_PERCENT_CHANGED}"), Backend::Cuda, scene);
     let create: BenchmarkFactory = Box::new(move |device, scene, states| {
-        let step = BenchmarkStep { outputs: StepOutputs::Positions, batches, changed: Some(&list) };
+        let step = BenchmarkStep { outputs: StepOutputs::Positions, batches, changed: Some(&changed_domains) };
         Ok(Box::new(DeformerBenchmark::new(device, scene, states, step)?))
     });
     make_candidate(is_selected, label, |label| Ok(BenchmarkVariant::new(label, scene, device, create)))
 }
 
-/// Batched products of many q with one shape: in every storage type, in f32 without batches for comparison, and by
-/// tensor cores where U has 16 bits.
+/// Variants that multiply one U by the q of all its domains: batched in every storage type, unbatched in f32 for
+/// comparison, and by tensor cores where U is stored in 16 bits. Empty unless all domains share one shape.
 fn batch_variants(
     device: &Arc<Device>,
     cache: &ErrorModelCache,
@@ -159,7 +161,7 @@ fn batch_variants(
         return Vec::new();
     }
     let count = scene.domains.len();
-    let positions = |name: String, storage: StorageType, batches: BatchPolicy| {
+    let positions_candidate = |name: String, storage: StorageType, batches: BatchPolicy| {
         let deformation = DeformationSettings { storage, ..scene.deformation };
         StepVariant { name, deformation, batches, outputs: StepOutputs::Positions }.candidate(
             device,
@@ -168,9 +170,9 @@ fn batch_variants(
         )
     };
     let batched = |storage: StorageType| {
-        positions(format!("cuda batch of {count} {}", storage.name()), storage, BatchPolicy::Always)
+        positions_candidate(format!("cuda batch of {count} {}", storage.name()), storage, BatchPolicy::Always)
     };
-    let unbatched = positions(format!("cuda {count} apart f32"), StorageType::F32, BatchPolicy::Never);
+    let unbatched = positions_candidate(format!("cuda {count} apart f32"), StorageType::F32, BatchPolicy::Never);
     let tensor_core = |storage: StorageType| {
         let deformation = DeformationSettings { storage, ..scene.deformation };
         // Summation order and rounding differ from the deformer's, so the name marks it.
@@ -179,7 +181,7 @@ fn batch_variants(
             let scene = cache.scene(deformation)?;
             let create: BenchmarkFactory =
                 Box::new(|device, scene, states| Ok(Box::new(BatchMmaBenchmark::new(device, scene, states)?)));
-            Ok(BenchmarkVariant::sharing(
+            Ok(BenchmarkVariant::with_error_model(
                 label,
                 &scene,
                 device,
@@ -191,7 +193,7 @@ fn batch_variants(
     deformer_variants.chain([StorageType::F16, StorageType::Bf16].map(tensor_core)).collect()
 }
 
-/// cuBLAS: each kind of product that fits the scene, alone and with a plain vertex update.
+/// The cuBLAS methods that support the scene, each alone and followed by a plain vertex update.
 fn cublas_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
     let is_instanced = scene.domains.len() > 1 && scene.shapes.len() == 1;
     let supports_scene = |method: &CublasMethod| match method {
@@ -210,7 +212,8 @@ fn cublas_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: Varian
     CublasMethod::ALL.into_iter().filter(supports_scene).flat_map(candidates_of).collect()
 }
 
-/// The thesis's kernels: the single-domain kernel, or the grouped ones in all splits, which support up to 32 modes.
+/// The kernels of the thesis: the single-domain kernel, or the grouped kernels in all splits. Groups support up to 32
+/// modes.
 fn thesis_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
     let candidate = |name: String, create: BenchmarkFactory| {
         let label = VariantLabel::new(name, Backend::Cuda, scene);
@@ -228,7 +231,7 @@ fn thesis_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: Varian
         candidate(format!("thesis {} kernels{suffix}", split.widths().len()), create)
     };
     let max_rank = (0..scene.domains.len()).map(|domain| scene.rank_of(domain)).max().unwrap_or(0);
-    // Unfolded triangles do not contain a vertex that no triangle refers to.
+    // The vertex update computes unfolded triangles, so it omits a vertex that no triangle refers to.
     let parts = if refers_to_all_vertices(scene) { &PARTS[..] } else { &PARTS[..1] };
     match (scene.domains.len(), max_rank) {
         (1, _) => parts.iter().copied().map(single).collect(),
@@ -252,13 +255,13 @@ fn refers_to_all_vertices(scene: &Scene) -> bool {
     })
 }
 
-/// Whether some shape has more than the minimum of three corners, and so real normals.
+/// Whether the scene has normals to compute: some shape has more than the minimum of three corners.
 pub(super) fn has_normals(scene: &Scene) -> bool {
     scene.shapes.iter().any(|shape| shape.mesh.corners().vertices.len() > 3)
 }
 
-/// The formula of the traffic of an array of a kernel benchmark.
-fn formula(array: &str) -> &'static str {
+/// Formula of the memory traffic of an array, for the report. n is vertices, r modes, d domains.
+fn traffic_formula(array: &str) -> &'static str {
     match array {
         "U" => "as packed: entries of all modes and vertices, filled up to tiles",
         "U kept" => "as packed: the share of modes that are kept, mean over the domains and states that are timed",
@@ -271,10 +274,10 @@ fn formula(array: &str) -> &'static str {
 
 impl BenchmarkVariant {
     fn new(label: VariantLabel, scene: &Arc<Scene>, device: &Arc<Device>, create: BenchmarkFactory) -> Self {
-        Self::sharing(label, scene, device, (ErrorModel::of(scene), create))
+        Self::with_error_model(label, scene, device, (ErrorModel::of(scene), create))
     }
 
-    fn sharing(
+    fn with_error_model(
         label: VariantLabel,
         scene: &Arc<Scene>,
         device: &Arc<Device>,
@@ -314,7 +317,7 @@ impl Variant for BenchmarkVariant {
 
     fn traffic(&self) -> Vec<Operand> {
         let traffic = self.benchmark.as_ref().map_or_else(Vec::new, |benchmark| benchmark.traffic());
-        let operand = |ArrayTraffic { array, bytes }| Operand { name: array, formula: formula(array), bytes };
+        let operand = |ArrayTraffic { array, bytes }| Operand { name: array, formula: traffic_formula(array), bytes };
         traffic.into_iter().map(operand).collect()
     }
 

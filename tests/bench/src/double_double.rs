@@ -1,7 +1,7 @@
 //! Sums of products in twice the precision of f64 (double-double), for sums that cancel.
 //!
-//! Error-free transformations after Ogita, Rump and Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26
-//! (2005): the result is as if computed with 106 bits and rounded once.
+//! Uses the error-free transformations of Ogita, Rump and Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput.
+//! 26 (2005). The result is as if computed with 106 bits and rounded once.
 
 /// a + b as a rounded sum and its exact error (Knuth).
 pub(super) fn two_sum(a: f64, b: f64) -> (f64, f64) {
@@ -42,7 +42,8 @@ impl DoubleDouble {
 mod tests {
     use super::*;
 
-    fn sum(terms: &[(f64, f64)]) -> (f64, f64) {
+    /// The sum of products a b in double-double, and in f64.
+    fn sum_products(terms: &[(f64, f64)]) -> (f64, f64) {
         let mut double_double = DoubleDouble::default();
         terms.iter().for_each(|(a, b)| double_double.add(*a, *b));
         (double_double.value(), terms.iter().map(|(a, b)| a * b).sum())
@@ -50,11 +51,11 @@ mod tests {
 
     #[test]
     fn cancelling_sum_is_exact() {
-        let (double_double, plain) = sum(&[(1e20, 1.0), (3.0, 1.0), (-1e20, 1.0)]);
+        let (double_double, plain) = sum_products(&[(1e20, 1.0), (3.0, 1.0), (-1e20, 1.0)]);
         assert_eq!((double_double, plain), (3.0, 0.0));
         // (1 + e)(1 - e) - 1 is -e^2, which the rounded product has lost.
         let small = f64::EPSILON;
-        let (double_double, plain) = sum(&[(1.0 + small, 1.0 - small), (-1.0, 1.0)]);
+        let (double_double, plain) = sum_products(&[(1.0 + small, 1.0 - small), (-1.0, 1.0)]);
         assert_eq!(double_double, -small * small);
         assert_ne!(plain, double_double);
     }

@@ -20,14 +20,14 @@ const TILE: usize = QUAD * TILE_QUADS;
 #[derive(Debug)]
 pub struct ErrorModel {
     scene: Arc<Scene>,
-    /// StoredShape U per shape; empty when U is stored in f32.
+    /// Stored U of each shape; empty when U is stored in f32.
     stored: Arc<Vec<StoredShape>>,
     truncation: Option<TruncationState>,
     /// Whether tensor cores multiply, in which case each coordinate is split into two 16-bit numbers.
     uses_tensor_cores: bool,
 }
 
-/// StoredShape U of one shape, and the data that its error bounds need.
+/// Stored U of one shape, and the data that its error bounds need.
 #[derive(Debug)]
 struct StoredShape {
     tiles: TiledModes,
@@ -38,7 +38,7 @@ struct StoredShape {
 struct TruncationState {
     /// Error budget, scene units.
     budget: f64,
-    /// Per shape and mode: the farthest that a unit coordinate moves a vertex.
+    /// Per shape and mode: the largest displacement of a vertex by a coordinate of 1.
     max_row_norms: Vec<Vec<f64>>,
     /// Truncation state per domain.
     domains: Vec<Truncation>,
@@ -47,10 +47,10 @@ struct TruncationState {
 impl ErrorModel {
     /// The error model of a deformer that follows this scene's deformation.
     pub fn of(scene: &Arc<Scene>) -> Self {
-        Self::with(scene, Arc::new(store_shapes(scene)))
+        Self::with_stored_shapes(scene, Arc::new(store_shapes(scene)))
     }
 
-    fn with(scene: &Arc<Scene>, stored: Arc<Vec<StoredShape>>) -> Self {
+    fn with_stored_shapes(scene: &Arc<Scene>, stored: Arc<Vec<StoredShape>>) -> Self {
         let truncation =
             scene.deformation.truncation.filter(|_| scene.features.truncation).map(|meters| TruncationState {
                 budget: meters / scene.unit,
@@ -60,18 +60,18 @@ impl ErrorModel {
         Self { scene: Arc::clone(scene), stored, truncation, uses_tensor_cores: false }
     }
 
-    /// The same for sums by tensor cores. U must be stored in 16 bits.
+    /// This error model with sums computed by tensor cores. U must be stored in 16 bits.
     pub fn with_tensor_cores(self) -> Self {
         Self { uses_tensor_cores: true, ..self }
     }
 
-    /// Whether nothing is replaced. All such deformers share their bounds.
+    /// Whether nothing in x = T (x0 + U q) is replaced. All such deformers have the same bounds.
     pub fn is_exact(&self) -> bool {
-        !self.stores() && !self.truncates()
+        !self.has_stored_modes() && !self.truncates()
     }
 
     /// Whether U is stored in another type than f32.
-    pub fn stores(&self) -> bool {
+    pub fn has_stored_modes(&self) -> bool {
         !self.stored.is_empty()
     }
 
@@ -87,7 +87,7 @@ impl ErrorModel {
         }
     }
 
-    /// Advances truncation to a state: decides which modes are left out, given the previous states, as a deformer does.
+    /// Advances truncation to a state: selects the modes to omit, given the previous states, as a deformer does.
     pub fn follow(&mut self, state: &SceneState) {
         let Self { scene, truncation, .. } = self;
         if let Some(TruncationState { budget, max_row_norms, domains }) = truncation {
@@ -99,16 +99,16 @@ impl ErrorModel {
         }
     }
 
-    /// StoredShape U of a shape; `None` when it is stored in f32.
+    /// Stored U of a shape; `None` when it is stored in f32.
     pub(super) fn tiles(&self, shape: usize) -> Option<&TiledModes> {
         self.stored.get(shape).map(|stored| &stored.tiles)
     }
 
     /// Zeroes the coordinates of a domain's truncated modes.
     pub(super) fn truncate<T: Default + Copy>(&self, domain: usize, q: &mut [T]) {
-        if let Some(budget) = &self.truncation {
+        if let Some(truncation) = &self.truncation {
             let mut retained = vec![false; q.len()];
-            budget.domains[domain].retained().iter().for_each(|mode| retained[usize::from(*mode)] = true);
+            truncation.domains[domain].retained().iter().for_each(|mode| retained[usize::from(*mode)] = true);
             q.iter_mut().zip(retained).filter(|(_, retained)| !retained).for_each(|(q, _)| *q = T::default());
         }
     }
@@ -131,8 +131,8 @@ impl ErrorModel {
         }
     }
 
-    /// The packed coordinates as tensor cores read them, rounded to a pair of 16-bit numbers each; `None` when they are
-    /// read in f32.
+    /// The packed coordinates as tensor cores read them: each one rounded to the sum of two 16-bit numbers. `None` when
+    /// the deformer does not use tensor cores.
     pub(super) fn split_q(&self, q: &[f64]) -> Option<Vec<f64>> {
         let split_domain = |(domain, slot): (usize, &DomainLayout)| -> Vec<f64> {
             let factors = self.stored[self.scene.domains[domain].shape].tiles.factors();
@@ -152,7 +152,7 @@ impl ErrorModel {
     }
 }
 
-/// The shapes of a scene in its storage type; empty for f32.
+/// The shapes of a scene, stored in the scene's storage type; empty for f32.
 fn store_shapes(scene: &Scene) -> Vec<StoredShape> {
     let storage = scene.deformation.storage;
     let store_shape = |shape| {
@@ -166,8 +166,8 @@ fn store_shapes(scene: &Scene) -> Vec<StoredShape> {
     }
 }
 
-/// Cache of one scene under several deformations: variants with the same storage type share the stored U, and variants
-/// with the same deformation share their scene.
+/// Cache of one scene with several deformations. Variants with the same storage type share the stored U, and variants
+/// with the same deformation share the scene.
 #[derive(Debug)]
 pub struct ErrorModelCache {
     scene: Arc<Scene>,
@@ -196,7 +196,7 @@ impl ErrorModelCache {
         Ok(scene)
     }
 
-    /// The error model of a deformer of one of these scenes.
+    /// The error model of a deformer of a scene from [`Self::scene`].
     pub fn error_model(&self, scene: &Arc<Scene>) -> ErrorModel {
         let storage = scene.deformation.storage;
         let mut cached = self.stored.lock().unwrap_or_else(PoisonError::into_inner);
@@ -206,7 +206,7 @@ impl ErrorModelCache {
             cached.push((storage, Arc::clone(&stored)));
             stored
         });
-        ErrorModel::with(scene, stored)
+        ErrorModel::with_stored_shapes(scene, stored)
     }
 }
 
@@ -221,24 +221,24 @@ pub(super) struct DomainErrorBounds<'a> {
 }
 
 impl DomainErrorBounds<'_> {
-    /// Widens the bounds of consecutive vertices, from vertex `first` of the shape. On entry, `arithmetic` holds the
-    /// bounds of a sum of all modes in f32.
-    pub(super) fn widen_bounds<'b>(&self, first: usize, arithmetic: impl Iterator<Item = &'b mut f64>) {
-        let step = ErrorBoundInput { q: &self.q, transform: self.transform, compensated: self.compensated };
-        // Tile, its bounds, and the bound of its tensor core products.
+    /// Widens the bounds of consecutive vertices, from vertex `first` of the shape. On entry, `bounds` holds the bounds
+    /// of a sum of all modes in f32.
+    pub(super) fn widen_bounds<'b>(&self, first: usize, bounds: impl Iterator<Item = &'b mut f64>) {
+        let input = ErrorBoundInput { q: &self.q, transform: self.transform, compensated: self.compensated };
+        // The tile evaluated last, its bounds, and the bound of its tensor core products.
         let mut cached: Option<(usize, ErrorBound, f64)> = None;
-        for (vertex, bound) in arithmetic.enumerate() {
+        for (vertex, bound) in bounds.enumerate() {
             if let Some(error_model) = self.error_model {
                 let tile = (first + vertex) / TILE;
                 let evaluate_tile = || {
                     let products =
-                        self.products.map_or(0.0, |products| error_model.tensor_core_bound(tile, &step, products));
-                    (tile, error_model.tile(tile, &step), products)
+                        self.products.map_or(0.0, |products| error_model.tensor_core_bound(tile, &input, products));
+                    (tile, error_model.tile(tile, &input), products)
                 };
                 let (_, tile_bound, products) =
                     cached.filter(|(cached_tile, ..)| *cached_tile == tile).unwrap_or_else(evaluate_tile);
                 cached = Some((tile, tile_bound, products));
-                // StoredShape entries differ from U, so sums of them may be larger and round correspondingly more.
+                // Stored entries differ from U, so their sums may be larger and have larger rounding errors.
                 let stored = (tile_bound.storage + tile_bound.coordinates) * (1.0 + 1e-4);
                 *bound = (*bound + stored).min(tile_bound.total()) + products;
             }
@@ -254,9 +254,9 @@ mod tests {
     use crate::workloads::{Size, WorkloadKind};
 
     fn model_and_state(deformation: DeformationSettings) -> (ErrorModel, SceneState) {
-        let load = WorkloadKind::Single { power: 8, rank: 20 }.build(Size::Full).expect("expected a load");
-        let scene = with_deformation(&load.scene, deformation).expect("expected a scene");
-        (ErrorModel::of(&scene), WorkloadMotion::new(&load, None).random_state(0).state())
+        let workload = WorkloadKind::Single { power: 8, rank: 20 }.build(Size::Full).expect("expected a load");
+        let scene = with_deformation(&workload.scene, deformation).expect("expected a scene");
+        (ErrorModel::of(&scene), WorkloadMotion::new(&workload, None).random_state(0).state())
     }
 
     #[test]
@@ -270,68 +270,78 @@ mod tests {
 
     #[test]
     fn variants_share_stored_u_by_storage_type() {
-        let load = WorkloadKind::Single { power: 8, rank: 4 }.build(Size::Full).expect("expected a load");
-        let cache = ErrorModelCache::new(&load.scene);
-        let half = DeformationSettings { storage: StorageType::F16, ..DeformationSettings::default() };
-        let [one, two] = [half, half].map(|half| cache.scene(half).expect("expected a scene"));
-        assert!(Arc::ptr_eq(&one, &two) && !Arc::ptr_eq(&one, &load.scene));
-        assert!(Arc::ptr_eq(&cache.scene(load.scene.deformation).expect("expected the cached scene"), &load.scene));
-        let short = cache.scene(DeformationSettings { truncation: Some(0.01), ..half }).expect("expected a scene");
-        let made = [&one, &short].map(|scene| cache.error_model(scene));
-        assert!(Arc::ptr_eq(&made[0].stored, &made[1].stored) && made[0].stores());
-        assert!(made[1].truncates() && !made[0].truncates());
-        assert!(cache.error_model(&load.scene).is_exact());
+        let workload = WorkloadKind::Single { power: 8, rank: 4 }.build(Size::Full).expect("expected a load");
+        let cache = ErrorModelCache::new(&workload.scene);
+        let f16 = DeformationSettings { storage: StorageType::F16, ..DeformationSettings::default() };
+        let [first, second] = [f16, f16].map(|f16| cache.scene(f16).expect("expected a scene"));
+        assert!(Arc::ptr_eq(&first, &second) && !Arc::ptr_eq(&first, &workload.scene));
+        assert!(Arc::ptr_eq(
+            &cache.scene(workload.scene.deformation).expect("expected the cached scene"),
+            &workload.scene
+        ));
+        let truncated = cache.scene(DeformationSettings { truncation: Some(0.01), ..f16 }).expect("expected a scene");
+        let models = [&first, &truncated].map(|scene| cache.error_model(scene));
+        assert!(Arc::ptr_eq(&models[0].stored, &models[1].stored) && models[0].has_stored_modes());
+        assert!(models[1].truncates() && !models[0].truncates());
+        assert!(cache.error_model(&workload.scene).is_exact());
     }
 
     #[test]
     fn coarser_storage_widens_bounds_more() {
-        let widened = |storage| {
+        let widened_bound = |storage| {
             let (stored, state) = model_and_state(DeformationSettings { storage, ..DeformationSettings::default() });
             assert!(!stored.is_exact() && stored.tiles(0).is_some());
             let mut bounds = [1e-6; 256];
             stored.bounds(0, &state).widen_bounds(0, bounds.iter_mut());
             bounds[200]
         };
-        let [half, brain, eighth] = [StorageType::F16, StorageType::Bf16, StorageType::Int8].map(widened);
-        assert!(1e-5 < half && half < brain && half < eighth, "{half} {brain} {eighth}");
+        let [f16_bound, bf16_bound, int8_bound] =
+            [StorageType::F16, StorageType::Bf16, StorageType::Int8].map(widened_bound);
+        assert!(
+            1e-5 < f16_bound && f16_bound < bf16_bound && f16_bound < int8_bound,
+            "{f16_bound} {bf16_bound} {int8_bound}"
+        );
     }
 
     #[test]
     fn tensor_cores_widen_bounds_and_round_q_to_two_halves() {
         let (stored, state) =
             model_and_state(DeformationSettings { storage: StorageType::Bf16, ..DeformationSettings::default() });
-        let widened = |error_model: &ErrorModel| {
+        let widened_bound = |error_model: &ErrorModel| {
             let mut bounds = [1e-6];
             error_model.bounds(0, &state).widen_bounds(0, bounds.iter_mut());
             bounds[0]
         };
         let q: Vec<f64> = state.q.iter().map(|q| f64::from(*q)).collect();
-        let before = widened(&stored);
+        let storage_bound = widened_bound(&stored);
         assert_eq!(stored.split_q(&q), None);
-        let products = stored.with_tensor_cores();
-        let after = widened(&products);
-        assert!(before < after && after < 1.1 * before, "{before} {after}");
-        let rounded_q = products.split_q(&q).expect("expected rounded coordinates");
-        let largest = q.iter().fold(0.0, |largest: f64, q| largest.max(q.abs()));
-        let off = |of_own: f64| {
-            let off = |(half, q): (&f64, &f64)| (half - q).abs() <= of_own * q.abs() + 1e-9 * largest;
-            rounded_q.iter().zip(&q).all(off)
+        let tensor_core_model = stored.with_tensor_cores();
+        let tensor_core_bound = widened_bound(&tensor_core_model);
+        assert!(
+            storage_bound < tensor_core_bound && tensor_core_bound < 1.1 * storage_bound,
+            "{storage_bound} {tensor_core_bound}"
+        );
+        let rounded_q = tensor_core_model.split_q(&q).expect("expected rounded coordinates");
+        let max_q = q.iter().fold(0.0, |max_q: f64, q| max_q.max(q.abs()));
+        let is_within = |relative_error: f64| {
+            let is_within = |(half, q): (&f64, &f64)| (half - q).abs() <= relative_error * q.abs() + 1e-9 * max_q;
+            rounded_q.iter().zip(&q).all(is_within)
         };
-        assert!(off(2f64.powi(-16)) && !off(2f64.powi(-24)), "{rounded_q:?} {q:?}");
+        assert!(is_within(2f64.powi(-16)) && !is_within(2f64.powi(-24)), "{rounded_q:?} {q:?}");
     }
 
     #[test]
     fn truncates_small_modes_within_budget_after_first_state() {
         let (mut truncated, state) =
             model_and_state(DeformationSettings { truncation: Some(0.01), ..DeformationSettings::default() });
-        let count = |error_model: &ErrorModel| {
+        let count_nonzero_coordinates = |error_model: &ErrorModel| {
             let mut q = state.q.clone();
             error_model.truncate(0, &mut q);
             q.iter().filter(|q| **q != 0.0).count()
         };
-        assert_eq!(count(&truncated), 20);
+        assert_eq!(count_nonzero_coordinates(&truncated), 20);
         truncated.follow(&state);
-        assert!((1..20).contains(&count(&truncated)), "{}", count(&truncated));
+        assert!((1..20).contains(&count_nonzero_coordinates(&truncated)), "{}", count_nonzero_coordinates(&truncated));
         let mut bounds = [0.0];
         truncated.bounds(0, &state).widen_bounds(0, bounds.iter_mut());
         assert!(bounds[0] > 0.0 && bounds[0] <= 0.01, "{bounds:?}");

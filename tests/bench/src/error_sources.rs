@@ -12,15 +12,14 @@ use super::exact_positions::{ErrorModelTerms, positions};
 use super::exact_state::ExactState;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
 
-/// Displacement of a vertex by each source alone, meters.
+/// Displacement of vertices by each source of error alone, meters.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct ErrorSources {
-    /// Storage of U: decoded stored entries instead of U.
+    /// Storage of U: decoded entries instead of the exact ones.
     pub storage: ErrorNorms,
-    /// q rounded to f32 instead of the f64 of the physics process, and to pairs of 16-bit numbers where tensor cores
-    /// multiply.
+    /// Rounding of q to f32, and to pairs of 16-bit numbers for tensor cores.
     pub q: ErrorNorms,
-    /// The deformer's own f32 arithmetic: the sum over the modes, x0 and T, beyond one final rounding.
+    /// The f32 arithmetic of the deformer: the sum of modes, x0 and T, except for the final rounding of the position.
     pub accumulation: ErrorNorms,
     /// T rounded to f32.
     pub transform: ErrorNorms,
@@ -34,19 +33,21 @@ pub struct ErrorSources {
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct ErrorSourcesAccumulator([NormAccumulator; 6]);
 
-/// Reference positions of one truth that all variants share.
+/// Reference positions of one exact state, which all variants share.
 #[derive(Debug)]
 pub(super) struct SharedErrorSources {
     truth: ExactState,
-    /// The truth rounded to f32.
+    /// The exact state rounded to f32.
     rounded: ExactState,
-    /// Positions of the truth.
+    /// Positions of the exact state.
     exact: Vec<[f64; 3]>,
+    /// Error from rounding q alone.
     q: NormAccumulator,
+    /// Error from rounding T alone.
     transform: NormAccumulator,
     /// Positions with q and T rounded to f32, U exact and all modes.
     rounded_positions: Vec<[f64; 3]>,
-    /// Per storage type that a variant has requested so far.
+    /// Errors of the storage types that variants have requested so far.
     stored: Mutex<Vec<(StorageType, Arc<StorageError>)>>,
 }
 
@@ -60,7 +61,7 @@ struct StorageError {
 }
 
 impl SharedErrorSources {
-    /// Evaluates a truth and its rounding to f32 in f64.
+    /// Evaluates an exact state and `state`, its rounding to f32, in f64.
     pub(super) fn new(scene: &Scene, truth: ExactState, state: &SceneState) -> Self {
         let rounded = ExactState::of(state);
         let positions_of = |q: &[f64], transforms: &[[f64; 12]]| {
@@ -86,7 +87,7 @@ impl SharedErrorSources {
         stored
     }
 
-    /// Adds the sources of a variant's error at this truth. `got`: its positions, three f32 per vertex.
+    /// Adds the sources of a variant's error at this state. `got` holds the variant's positions, three f32 per vertex.
     pub(super) fn add_sources(
         &self,
         scene: &Scene,
@@ -94,39 +95,41 @@ impl SharedErrorSources {
         got: &[f32],
         accumulator: &mut ErrorSourcesAccumulator,
     ) {
-        let storage = Some(error_model).filter(|error_model| error_model.stores());
+        let storage = Some(error_model).filter(|error_model| error_model.has_stored_modes());
         let truncation = Some(error_model).filter(|error_model| error_model.truncates());
         let stored = storage.map(|error_model| self.storage_error(scene, error_model));
-        // Every source counts all vertices, even if it moves none of them.
-        let zero = distances(&self.exact, &self.exact);
-        let from_storage = stored.as_ref().map_or(zero, |stored| stored.norms);
-        // Truncation was decided from the rounded q; applying it to the unrounded q hardly changes the displacement.
-        let truncated = ErrorModelTerms { storage: None, truncation };
-        let from_truncation =
-            truncation.map_or(zero, |_| distances(&self.exact, &positions(scene, &self.truth, truncated)));
+        // A source that moves no vertex contributes a zero for each vertex.
+        let zero_norms = distances(&self.exact, &self.exact);
+        let storage_norms = stored.as_ref().map_or(zero_norms, |stored| stored.norms);
+        // The omitted modes were selected from the rounded q. Their displacement by the exact q is almost the same.
+        let truncation_only = ErrorModelTerms { storage: None, truncation };
+        let truncation_norms =
+            truncation.map_or(zero_norms, |_| distances(&self.exact, &positions(scene, &self.truth, truncation_only)));
         let split_q = error_model.split_q(&self.rounded.q);
         let positions_of = |q: &[f64], transforms: &[[f64; 12]], terms: ErrorModelTerms<'_>| {
             positions(scene, &ExactState { q: q.to_vec(), transforms: transforms.to_vec() }, terms)
         };
         let error_from_q =
             |q: &Vec<f64>| distances(&self.exact, &positions_of(q, &self.truth.transforms, ErrorModelTerms::default()));
-        let from_q = split_q.as_ref().map_or(self.q, error_from_q);
+        let q_norms = split_q.as_ref().map_or(self.q, error_from_q);
         let q = split_q.as_ref().unwrap_or(&self.rounded.q);
-        let differs = truncation.is_some() || split_q.is_some();
-        let replaced =
-            differs.then(|| positions_of(q, &self.rounded.transforms, ErrorModelTerms { storage, truncation }));
-        let emulated =
-            replaced.as_ref().or(stored.as_ref().map(|stored| &stored.positions)).unwrap_or(&self.rounded_positions);
+        let has_own_emulation = truncation.is_some() || split_q.is_some();
+        let own_emulation = has_own_emulation
+            .then(|| positions_of(q, &self.rounded.transforms, ErrorModelTerms { storage, truncation }));
+        let emulated = own_emulation
+            .as_ref()
+            .or(stored.as_ref().map(|stored| &stored.positions))
+            .unwrap_or(&self.rounded_positions);
         let rounded: Vec<[f64; 3]> =
             emulated.par_iter().map(|position| position.map(|number| f64::from(number as f32))).collect();
         let got: Vec<[f64; 3]> = got.as_chunks::<3>().0.par_iter().map(|position| position.map(f64::from)).collect();
         let norms = [
-            from_storage,
-            from_q,
+            storage_norms,
+            q_norms,
             distances(&rounded, &got),
             self.transform,
             distances(emulated, &rounded),
-            from_truncation,
+            truncation_norms,
         ];
         accumulator.0.iter_mut().zip(norms).for_each(|(sum, norms)| *sum = sum.join(norms));
     }
@@ -142,13 +145,14 @@ impl ErrorSourcesAccumulator {
 }
 
 /// Norms of the distances between corresponding positions.
-fn distances(one: &[[f64; 3]], other: &[[f64; 3]]) -> NormAccumulator {
+fn distances(first: &[[f64; 3]], second: &[[f64; 3]]) -> NormAccumulator {
     let distance = |vertex: usize| {
-        let square: f64 = one[vertex].iter().zip(other[vertex]).map(|(one, other)| (one - other).powi(2)).sum();
+        let square: f64 =
+            first[vertex].iter().zip(second[vertex]).map(|(first, second)| (first - second).powi(2)).sum();
         square.sqrt()
     };
     reduce_parallel(
-        one.len().min(other.len()),
+        first.len().min(second.len()),
         |vertex, norms: &mut NormAccumulator| norms.add(distance(vertex)),
         NormAccumulator::join,
     )
@@ -182,42 +186,51 @@ mod tests {
         accumulator.sources(1.0)
     }
 
-    /// A truth whose numbers f32 represents exactly, so that rounding moves nothing.
-    fn representable() -> ExactState {
+    /// A state whose numbers f32 represents exactly, so that rounding moves no vertex.
+    fn representable_truth() -> ExactState {
         let identity = modalcast_model::domain::Transform::IDENTITY.0.map(f64::from);
         ExactState { q: vec![1.0, 0.5], transforms: vec![identity] }
     }
 
     #[test]
     fn measures_each_source_alone() {
-        let plain = DeformationSettings::default;
-        let none = measure(plain(), &representable(), None);
+        let default = DeformationSettings::default;
+        let sources = measure(default(), &representable_truth(), None);
         assert!(
-            [none.storage, none.q, none.accumulation, none.transform, none.truncation] == [ErrorNorms::default(); 5]
+            [sources.storage, sources.q, sources.accumulation, sources.transform, sources.truncation]
+                == [ErrorNorms::default(); 5]
         );
-        assert!(none.origin.largest > 0.0 && none.origin.largest < 1e-6);
-        let found = measure(plain(), &ExactState { q: vec![1.0 + 2f64.powi(-30), 0.5], ..representable() }, None);
-        assert!(found.q.largest > 1e-10 && found.q.largest < 2e-9 && found.transform.largest == 0.0, "{found:?}");
-        let rotated =
-            ExactState { transforms: WorkloadMotion::new(&load(), None).random_state(0).transforms, ..representable() };
-        let found = measure(plain(), &rotated, None);
-        assert!(found.transform.largest > 1e-9 && found.q.largest == 0.0, "{found:?}");
-        let found = measure(DeformationSettings { storage: StorageType::Int8, ..plain() }, &representable(), None);
-        // Half a step of 1/127 on each axis for coordinates of 1.5 together, at most.
-        assert!(found.storage.largest > 1e-3 && found.storage.largest < 0.5 / 127.0 * 1.5 * 1.74, "{found:?}");
-        assert_eq!([found.accumulation, found.truncation], [ErrorNorms::default(); 2]);
+        assert!(sources.origin.largest > 0.0 && sources.origin.largest < 1e-6);
+        let sources =
+            measure(default(), &ExactState { q: vec![1.0 + 2f64.powi(-30), 0.5], ..representable_truth() }, None);
+        assert!(
+            sources.q.largest > 1e-10 && sources.q.largest < 2e-9 && sources.transform.largest == 0.0,
+            "{sources:?}"
+        );
+        let rotated = ExactState {
+            transforms: WorkloadMotion::new(&load(), None).random_state(0).transforms,
+            ..representable_truth()
+        };
+        let sources = measure(default(), &rotated, None);
+        assert!(sources.transform.largest > 1e-9 && sources.q.largest == 0.0, "{sources:?}");
+        let sources =
+            measure(DeformationSettings { storage: StorageType::Int8, ..default() }, &representable_truth(), None);
+        // Upper bound: half a step of 1/127 on each of three axes, for coordinates with the sum 1.5.
+        assert!(sources.storage.largest > 1e-3 && sources.storage.largest < 0.5 / 127.0 * 1.5 * 1.74, "{sources:?}");
+        assert_eq!([sources.accumulation, sources.truncation], [ErrorNorms::default(); 2]);
         // Mode 1 moves vertices by up to 0.5 sqrt(3). A mode is truncated if it moves no vertex by half the budget.
-        let found = measure(DeformationSettings { truncation: Some(1.75), ..plain() }, &representable(), None);
-        assert!(found.truncation.largest > 0.5 && found.truncation.largest <= 0.87, "{found:?}");
-        assert_eq!([found.accumulation, found.storage], [ErrorNorms::default(); 2]);
+        let sources =
+            measure(DeformationSettings { truncation: Some(1.75), ..default() }, &representable_truth(), None);
+        assert!(sources.truncation.largest > 0.5 && sources.truncation.largest <= 0.87, "{sources:?}");
+        assert_eq!([sources.accumulation, sources.storage], [ErrorNorms::default(); 2]);
     }
 
     #[test]
     fn counts_unexplained_error_as_accumulation() {
         let got = vec![1e3_f32; 3 * 256];
-        let found =
+        let sources =
             measure(DeformationSettings::default(), &WorkloadMotion::new(&load(), None).random_state(0), Some(&got));
-        assert!(found.accumulation.largest > 1e3, "{found:?}");
-        assert!(found.origin.largest < 1e-6);
+        assert!(sources.accumulation.largest > 1e3, "{sources:?}");
+        assert!(sources.origin.largest < 1e-6);
     }
 }

@@ -23,13 +23,13 @@ pub struct ReferenceVertex {
     pub position: [f64; 3],
     /// A-priori bound on the error of an f32 sum in any order, scene units.
     pub bound: f64,
-    /// Condition number sum |U q| / |u|: infinite where only u vanishes, 0 where every term does.
+    /// Condition number sum |U q| / |u|: infinite if u is 0 but some term is not, 0 if every term is 0.
     pub condition: f64,
 }
 
 /// Initial value of vertices that are not evaluated yet.
 const UNSET: ReferenceVertex = ReferenceVertex { position: [0.0; 3], bound: 0.0, condition: 0.0 };
-/// Roundings of an f32 sum beyond one per mode: adding x0, and separate products and sums in other orders.
+/// Roundings of an f32 sum beyond one per mode. They allow for the addition of x0, and for separate products and sums.
 const EXTRA_ROUNDINGS: usize = 3;
 /// Vertices per tile.
 const TILE: usize = 512;
@@ -40,16 +40,16 @@ const UNIT_ROUNDOFF: f64 = 1.0 / (1 << 24) as f64;
 /// Largest absolute error of one operation with a subnormal f32 result: half the smallest f32.
 const MAX_UNDERFLOW_ERROR: f64 = 7.1e-46;
 
-/// Selects which replacements of a deformer to apply.
+/// The approximations of a deformer to apply; `None` computes a term exactly.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ErrorModelTerms<'a> {
     /// Use U as this model stores it.
     pub storage: Option<&'a ErrorModel>,
-    /// Use only the modes that this model keeps.
+    /// Use only the modes that this model retains.
     pub truncation: Option<&'a ErrorModel>,
 }
 
-/// World positions of a truth in f64, three per vertex, scene units. Only the replacements in `terms` are applied.
+/// World positions of an exact state in f64, scene units. Only the approximations in `terms` are applied.
 pub fn positions(scene: &Scene, truth: &ExactState, terms: ErrorModelTerms<'_>) -> Vec<[f64; 3]> {
     map_tiles(scene, [0.0; 3], |domain, vertices, out| {
         let shape = scene.domains[domain].shape;
@@ -58,7 +58,7 @@ pub fn positions(scene: &Scene, truth: &ExactState, terms: ErrorModelTerms<'_>) 
             error_model.truncate(domain, &mut q);
         }
         let stored = terms.storage.and_then(|error_model| error_model.tiles(shape));
-        let entries = stored.map_or(Entries::Exact(&scene.shapes[shape].modes), Entries::Stored);
+        let entries = stored.map_or(ModeEntries::Exact(&scene.shapes[shape].modes), ModeEntries::Stored);
         let sums = sum_modes(vertices.clone(), entries, &q);
         let (rest, transform) =
             (&scene.shapes[shape].mesh.rest_positions()[vertices], truth.transform_of(scene, domain));
@@ -69,25 +69,26 @@ pub fn positions(scene: &Scene, truth: &ExactState, terms: ErrorModelTerms<'_>) 
     })
 }
 
-/// Exact positions at a state, with the bounds of a deformer that replaces nothing.
+/// Exact positions at a state, with the bounds of an exact deformer.
 pub fn reference_vertices(scene: &Scene, state: &SceneState) -> Vec<ReferenceVertex> {
     let truth = ExactState::of(state);
-    map_tiles(scene, UNSET, |domain, vertices, out| {
+    map_tiles(scene, UNSET, |domain, vertices, references| {
         let shape = &scene.shapes[scene.domains[domain].shape];
         let q = coordinates_of(scene, domain, &truth);
-        let sums = sum_modes(vertices.clone(), Entries::Exact(&shape.modes), q);
-        let (transform, size) = (truth.transform_of(scene, domain), truth.absolute_transform_of(scene, domain));
+        let sums = sum_modes(vertices.clone(), ModeEntries::Exact(&shape.modes), q);
+        let (transform, absolute_transform) =
+            (truth.transform_of(scene, domain), truth.absolute_transform_of(scene, domain));
         let (roundings, is_follower) = (q.len() + EXTRA_ROUNDINGS, scene.transform_roots.frame_of(domain).is_some());
         let rest = shape.mesh.rest_positions()[vertices].iter().map(|rest| rest.map(f64::from));
-        for ((rest, sum), out) in rest.zip(&sums).zip(out) {
+        for ((rest, sum), references) in rest.zip(&sums).zip(references) {
             let position = transform_point(&transform, std::array::from_fn(|axis| rest[axis] + sum.u[axis]));
-            let bound = bound((&size, is_follower), &rest, sum, roundings);
-            *out = ReferenceVertex { position, bound, condition: condition(sum) };
+            let bound = f32_error_bound((&absolute_transform, is_follower), &rest, sum, roundings);
+            *references = ReferenceVertex { position, bound, condition: condition_number(sum) };
         }
     })
 }
 
-/// Results of [`reference_vertices`] with bounds widened for a deformer with this error model. Reuses their sums.
+/// `references` with bounds widened for a deformer with this error model.
 pub fn widen_bounds(
     scene: &Scene,
     state: &SceneState,
@@ -105,28 +106,28 @@ pub fn widen_bounds(
 
 /// u and sum |U q| of one vertex, per axis.
 #[derive(Debug, Clone, Copy, Default)]
-struct Sum {
+struct ModalSum {
     u: [f64; 3],
     magnitude: [f64; 3],
 }
 
 /// Source of the entries of U.
 #[derive(Clone, Copy)]
-enum Entries<'a> {
+enum ModeEntries<'a> {
     Exact(&'a Modes),
     Stored(&'a TiledModes),
 }
 
-impl Entries<'_> {
-    fn at(&self, vertex: usize, axis: usize, mode: usize) -> f64 {
+impl ModeEntries<'_> {
+    fn entry(&self, vertex: usize, axis: usize, mode: usize) -> f64 {
         match self {
             Self::Exact(modes) => f64::from(modes.entry(vertex, axis, mode)),
             Self::Stored(tiles) => tiles.decode_entry(vertex, axis, mode),
         }
     }
 
-    /// Adds the terms of one mode to u and sum |U q| of each row of these vertices.
-    fn add(&self, vertices: &Range<usize>, (mode, q): (usize, f64), rows: &mut [(f64, f64)]) {
+    /// Adds the terms of one mode to the rows of these vertices. A row holds u and sum |U q|.
+    fn add_mode(&self, vertices: &Range<usize>, (mode, q): (usize, f64), rows: &mut [(f64, f64)]) {
         let add = |row: &mut (f64, f64), entry: f64| {
             let term = entry * q;
             row.0 += term;
@@ -155,20 +156,20 @@ fn coordinates_of<'a>(scene: &Scene, domain: usize, truth: &'a ExactState) -> &'
 }
 
 /// u and sum |U q| of consecutive vertices. Rows that cancel are summed in double-double.
-fn sum_modes(vertices: Range<usize>, entries: Entries<'_>, q: &[f64]) -> Vec<Sum> {
+fn sum_modes(vertices: Range<usize>, entries: ModeEntries<'_>, q: &[f64]) -> Vec<ModalSum> {
     let mut rows = vec![(0.0_f64, 0.0_f64); 3 * vertices.len()];
     for (mode, q) in q.iter().enumerate().filter(|(_, q)| **q != 0.0) {
-        entries.add(&vertices, (mode, *q), &mut rows);
+        entries.add_mode(&vertices, (mode, *q), &mut rows);
     }
     for (row, (u, magnitude)) in rows.iter_mut().enumerate() {
         if *magnitude > CANCELLING_CONDITION * u.abs() {
             let mut double_double = DoubleDouble::default();
             let (vertex, axis) = (vertices.start + row / 3, row % 3);
-            q.iter().enumerate().for_each(|(mode, q)| double_double.add(entries.at(vertex, axis, mode), *q));
+            q.iter().enumerate().for_each(|(mode, q)| double_double.add(entries.entry(vertex, axis, mode), *q));
             *u = double_double.value();
         }
     }
-    let vertex = |rows: &[(f64, f64); 3]| Sum { u: rows.map(|row| row.0), magnitude: rows.map(|row| row.1) };
+    let vertex = |rows: &[(f64, f64); 3]| ModalSum { u: rows.map(|row| row.0), magnitude: rows.map(|row| row.1) };
     rows.as_chunks().0.iter().map(vertex).collect()
 }
 
@@ -186,27 +187,32 @@ fn gamma(roundings: usize) -> f64 {
     relative_error / (1.0 - relative_error)
 }
 
-/// Error bound of T (x0 + u), scene units. `size` holds the absolute values of T; for a follower, T itself is a product
-/// of two transforms, which adds three roundings per entry.
-fn bound((size, is_follower): (&[f64; 12], bool), rest: &[f64; 3], sum: &Sum, roundings: usize) -> f64 {
+/// Error bound of T (x0 + u), scene units. `absolute_transform` holds the absolute values of T. For a follower, T is a
+/// product of two transforms, which adds three roundings per entry.
+fn f32_error_bound(
+    (absolute_transform, is_follower): (&[f64; 12], bool),
+    rest: &[f64; 3],
+    sum: &ModalSum,
+    roundings: usize,
+) -> f64 {
     let roundings_of_t = if is_follower { 3 } else { 0 };
     let magnitude: [f64; 3] = std::array::from_fn(|axis| rest[axis].abs() + sum.magnitude[axis]);
     let sum_error = magnitude.map(|magnitude| gamma(roundings) * magnitude + roundings as f64 * MAX_UNDERFLOW_ERROR);
     let row_bound = |row: usize| {
-        let entry = |axis: usize| size[4 * row + axis] * (1.0 + gamma(roundings_of_t));
+        let entry = |axis: usize| absolute_transform[4 * row + axis] * (1.0 + gamma(roundings_of_t));
         let propagated: f64 = (0..3).map(|axis| entry(axis) * sum_error[axis]).sum();
         let row_magnitude: f64 = (0..3).map(|axis| entry(axis) * (magnitude[axis] + sum_error[axis])).sum();
         let underflow: f64 =
             magnitude.iter().map(|magnitude| roundings_of_t as f64 * MAX_UNDERFLOW_ERROR * (1.0 + magnitude)).sum();
         propagated
-            + gamma(4 + roundings_of_t) * (row_magnitude + size[4 * row + 3])
+            + gamma(4 + roundings_of_t) * (row_magnitude + absolute_transform[4 * row + 3])
             + 4.0 * MAX_UNDERFLOW_ERROR
             + underflow
     };
     (0..3).map(|row| row_bound(row).powi(2)).sum::<f64>().sqrt()
 }
 
-fn condition(sum: &Sum) -> f64 {
+fn condition_number(sum: &ModalSum) -> f64 {
     let norm = |vector: &[f64; 3]| vector.iter().map(|number| number * number).sum::<f64>().sqrt();
     match (norm(&sum.magnitude), norm(&sum.u)) {
         (0.0, _) => 0.0,
@@ -214,15 +220,15 @@ fn condition(sum: &Sum) -> f64 {
     }
 }
 
-/// A tile of vertices of one domain, and its part of the output.
+/// A tile of vertices of one domain, and the part of the output that holds its values.
 struct Tile<'a, T> {
     domain: usize,
     vertices: Range<usize>,
     out: &'a mut [T],
 }
 
-/// Values of all vertices in packed order, computed tile by tile on all cores. `initial` is the value before.
-/// `compute` receives a domain, its vertices in the tile, and their values.
+/// Values of all vertices in packed order, computed tile by tile on all cores. `compute` receives a domain, its vertices
+/// in the tile, and their values, which are `initial` at first.
 fn map_tiles<T: Copy + Send + Sync>(
     scene: &Scene,
     initial: T,
@@ -251,57 +257,66 @@ mod tests {
     use crate::workloads::{Size, Workload, WorkloadKind};
     use modalcast_model::deform::Deformer as _;
 
-    fn loads() -> Vec<Workload> {
+    fn workloads() -> Vec<Workload> {
         [WorkloadKind::ManyDomains, WorkloadKind::TinyDomains, WorkloadKind::Cancelling, WorkloadKind::Plant(1)]
-            .map(|kind| kind.build(Size::Quick).expect("built"))
+            .map(|kind| kind.build(Size::Quick).expect("expected a workload"))
             .into()
     }
 
     #[test]
     fn positions_match_the_reference_deformer() {
-        for load in loads() {
-            let state = WorkloadMotion::new(&load, None).random_state(0).state();
-            let want = modalcast_compute::reference::deform(&load.scene, &state);
-            let got = positions(&load.scene, &ExactState::of(&state), ErrorModelTerms::default());
+        for workload in workloads() {
+            let state = WorkloadMotion::new(&workload, None).random_state(0).state();
+            let want = modalcast_compute::reference::deform(&workload.scene, &state);
+            let got = positions(&workload.scene, &ExactState::of(&state), ErrorModelTerms::default());
             let differences = want.as_flattened().iter().zip(got.as_flattened()).map(|(a, b)| (a - b).abs());
             assert_eq!(want.len(), got.len());
-            assert!(differences.fold(0.0, f64::max) <= 1e-14 * load.scene.rest_bounds.diagonal(), "{}", load.name);
+            assert!(
+                differences.fold(0.0, f64::max) <= 1e-14 * workload.scene.rest_bounds.diagonal(),
+                "{}",
+                workload.name
+            );
         }
     }
 
     #[test]
     fn f32_error_stays_within_bound_and_bound_is_not_loose() {
-        for load in loads() {
-            let motion = WorkloadMotion::new(&load, None);
-            let mut cpu = modalcast_compute::cpu::CpuDeformer::new(&load.scene);
-            let mut max_share = 0.0_f64;
+        for workload in workloads() {
+            let motion = WorkloadMotion::new(&workload, None);
+            let mut cpu = modalcast_compute::cpu::CpuDeformer::new(&workload.scene);
+            let mut max_of_bound = 0.0_f64;
             for seed in 0..4 {
                 let state = motion.random_state(seed).state();
                 cpu.deform(&state).expect("expected a deformation");
                 let surface = &cpu.surface().expect("expected a surface").positions;
-                for (got, want) in surface.as_chunks::<3>().0.iter().zip(reference_vertices(&load.scene, &state)) {
-                    let square: f64 =
+                for (got, want) in surface.as_chunks::<3>().0.iter().zip(reference_vertices(&workload.scene, &state)) {
+                    let squared_error: f64 =
                         got.iter().zip(want.position).map(|(got, want)| (f64::from(*got) - want).powi(2)).sum();
-                    max_share = max_share.max(square.sqrt() / want.bound);
+                    max_of_bound = max_of_bound.max(squared_error.sqrt() / want.bound);
                 }
             }
-            assert!((0.01..=1.0).contains(&max_share), "{}: {max_share}", load.name);
+            assert!((0.01..=1.0).contains(&max_of_bound), "{}: {max_of_bound}", workload.name);
         }
     }
 
     #[test]
     fn cancelling_sums_have_large_or_infinite_condition() {
-        let load = WorkloadKind::Cancelling.build(Size::Quick).expect("built");
-        let motion = WorkloadMotion::new(&load, None);
-        let median = |seed: usize| {
-            let references = reference_vertices(&load.scene, &motion.random_state(seed).state());
+        let workload = WorkloadKind::Cancelling.build(Size::Quick).expect("built");
+        let motion = WorkloadMotion::new(&workload, None);
+        let median_condition = |seed: usize| {
+            let references = reference_vertices(&workload.scene, &motion.random_state(seed).state());
             let mut conditions: Vec<f64> = references.iter().map(|reference| reference.condition).collect();
             conditions.sort_by(f64::total_cmp);
             conditions[conditions.len() / 2]
         };
-        assert!(median(1) > 1e3 && median(0) < 100.0, "{} {}", median(1), median(0));
-        let vanishing = Sum { u: [0.0; 3], magnitude: [1.0, 0.0, 0.0] };
-        assert_eq!((condition(&vanishing), condition(&Sum::default())), (f64::INFINITY, 0.0));
+        assert!(
+            median_condition(1) > 1e3 && median_condition(0) < 100.0,
+            "{} {}",
+            median_condition(1),
+            median_condition(0)
+        );
+        let vanishing = ModalSum { u: [0.0; 3], magnitude: [1.0, 0.0, 0.0] };
+        assert_eq!((condition_number(&vanishing), condition_number(&ModalSum::default())), (f64::INFINITY, 0.0));
     }
 
     #[test]
@@ -309,7 +324,7 @@ mod tests {
         let columns = vec![1.0, 1.0, 1.0, 2f32.powi(-30), 0.0, 0.0, -1.0, -1.0, -1.0];
         let modes = Modes::from_columns(3, 3, columns).expect("valid modes");
         // 1e10 + 2^-30 - 1e10: f64 has 53 bits, and 2^-30 is 63 binary places below 1e10.
-        let sums = sum_modes(0..1, Entries::Exact(&modes), &[1e10, 1.0, 1e10]);
+        let sums = sum_modes(0..1, ModeEntries::Exact(&modes), &[1e10, 1.0, 1e10]);
         assert_eq!(sums[0].u, [2f64.powi(-30), 0.0, 0.0]);
     }
 }

@@ -9,7 +9,7 @@ use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
 pub struct ExactState {
     /// Packed coordinates.
     pub q: Vec<f64>,
-    /// `world_from_domain` of each mover ([`modalcast_model::scene::TransformRoots`]), 3x4 row-major.
+    /// `world_from_domain` of each transform root ([`modalcast_model::scene::TransformRoots`]), 3x4 row-major.
     pub transforms: Vec<[f64; 12]>,
 }
 
@@ -31,7 +31,7 @@ impl ExactState {
         }
     }
 
-    /// A truth that equals a state exactly.
+    /// The exact state with the numbers of an f32 state.
     pub fn of(state: &SceneState) -> Self {
         Self {
             q: state.q.iter().map(|number| f64::from(*number)).collect(),
@@ -39,28 +39,28 @@ impl ExactState {
         }
     }
 
-    /// `world_from_domain` of a domain. For a follower, this is the product of its transform root's transform and its
-    /// frame.
+    /// `world_from_domain` of a domain. For a follower, this is the product of the transform of its root and its frame.
     pub fn transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
-        let mover = &self.transforms[scene.transform_roots.root_of(domain)];
+        let root_transform = &self.transforms[scene.transform_roots.root_of(domain)];
         match scene.transform_roots.frame_of(domain) {
-            None => *mover,
-            Some(frame) => product(mover, &frame.0.map(f64::from)),
+            None => *root_transform,
+            Some(frame) => multiply_transforms(root_transform, &frame.0.map(f64::from)),
         }
     }
 
-    /// The product of the absolute values. No entry of the exact product exceeds it in magnitude.
+    /// [`Self::transform_of`] with the absolute values of all factors. It bounds the magnitude of each entry of the
+    /// exact product.
     pub(super) fn absolute_transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
-        let mover = self.transforms[scene.transform_roots.root_of(domain)].map(f64::abs);
+        let root_transform = self.transforms[scene.transform_roots.root_of(domain)].map(f64::abs);
         match scene.transform_roots.frame_of(domain) {
-            None => mover,
-            Some(frame) => product(&mover, &frame.0.map(|entry| f64::from(entry.abs()))),
+            None => root_transform,
+            Some(frame) => multiply_transforms(&root_transform, &frame.0.map(|entry| f64::from(entry.abs()))),
         }
     }
 }
 
 /// The product of two affine transforms, 3x4 row-major.
-fn product(t: &[f64; 12], f: &[f64; 12]) -> [f64; 12] {
+fn multiply_transforms(t: &[f64; 12], f: &[f64; 12]) -> [f64; 12] {
     std::array::from_fn(|entry| {
         let (row, column) = (&t[entry / 4 * 4..][..4], entry % 4);
         let sum = row[0] * f[column] + row[1] * f[4 + column] + row[2] * f[8 + column];

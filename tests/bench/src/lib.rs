@@ -59,7 +59,7 @@ use validate::ConditionNumbers;
 use variant::Variant;
 use workloads::{Size, Workload, WorkloadKind};
 
-/// Name under which [`DeformReportOptions::variants`] selects the overlap benchmark: device-to-host readback of a step while the
+/// Name under which [`DeformReportOptions::variants`] selects the overlap benchmark, which reads a step back while the
 /// next step runs.
 const OVERLAP: &str = "cuda overlap";
 
@@ -70,11 +70,11 @@ const ROTATING_STATES: usize = 8;
 #[derive(Debug, Clone)]
 pub struct DeformReportOptions {
     pub sources: Vec<WorkloadSource>,
-    /// Random states per load.
+    /// Random states per workload.
     pub seeds: usize,
     /// Repetitions per median.
     pub replays: usize,
-    /// Upper limit of the steps taken from a trajectory.
+    /// Maximum number of trajectory steps to validate.
     pub steps: usize,
     /// Variants to measure: full names, or prefixes that end in `*`. An empty list selects all.
     pub variants: Vec<String>,
@@ -87,27 +87,28 @@ impl DeformReportOptions {
     }
 }
 
-/// Whether `name` is selected by a list of full names and prefixes that end in `*`; an empty list selects everything.
-fn is_selected(list: &[String], name: &str) -> bool {
+/// Whether one of the patterns selects `name`. A pattern is a full name, or a prefix that ends in `*`. An empty list
+/// selects everything.
+fn is_selected(patterns: &[String], name: &str) -> bool {
     let matches =
         |pattern: &String| pattern.strip_suffix('*').map_or(name == pattern, |prefix| name.starts_with(prefix));
-    list.is_empty() || list.iter().any(matches)
+    patterns.is_empty() || patterns.iter().any(matches)
 }
 
 /// Source of a scene.
 #[derive(Debug, Clone)]
 pub enum WorkloadSource {
     Synthetic(WorkloadKind),
-    /// A scene given on the command line and its recorded trajectory. Without `record`, a recording next to the scene
-    /// is used if there is one.
+    /// A scene given on the command line, and the path of its recorded trajectory. Without a path, the only recording
+    /// next to the scene is used, if there is one.
     Scene {
         source: String,
-        record: Option<PathBuf>,
+        recording: Option<PathBuf>,
     },
 }
 
 impl WorkloadSource {
-    /// Name for messages.
+    /// Name in messages.
     fn name(&self) -> String {
         match self {
             Self::Synthetic(kind) => kind.name(),
@@ -116,12 +117,14 @@ impl WorkloadSource {
     }
 }
 
-/// Facts of one load in a report.
+/// Sizes and properties of one workload in a report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct WorkloadSummary {
     pub name: String,
-    /// Whether the load has the full size that its name states; false for `--quick` builds and for scenes of the user.
-    pub full: bool,
+    /// Whether the workload has the full size that its name states. False for `--quick` builds and for scenes of the
+    /// user.
+    #[serde(rename = "full")]
+    pub is_full_size: bool,
     pub remarks: Vec<String>,
     pub vertices: usize,
     pub corners: usize,
@@ -132,11 +135,13 @@ pub struct WorkloadSummary {
     pub diagonal_meters: f64,
     /// Steps of the trajectory.
     pub steps: usize,
-    pub recorded: bool,
+    /// Whether the trajectory is recorded; otherwise it is synthetic.
+    #[serde(rename = "recorded")]
+    pub is_recorded: bool,
     pub condition: ConditionNumbers,
-    /// Upload of one whole step to the CUDA device: bytes and time.
+    /// Upload of one step to the CUDA device.
     pub ingest: Option<UploadTiming>,
-    /// Steps with readback of the vertices on the CUDA device, serial against overlapped.
+    /// Times of steps with readback of the vertices on the CUDA device, serial and overlapped.
     pub overlap: Option<Overlap>,
 }
 
@@ -145,7 +150,7 @@ pub struct WorkloadSummary {
 pub struct UploadTiming {
     pub bytes: u64,
     pub median_us: f64,
-    /// Measured time divided by the time that the same bytes take at this run's pinned host-to-device rate.
+    /// Measured time divided by the time that the same bytes take at the pinned host-to-device bandwidth of this run.
     pub of_pinned: f64,
 }
 
@@ -154,14 +159,17 @@ pub struct UploadTiming {
 pub struct DeformReport {
     #[serde(rename = "made")]
     pub provenance: Provenance,
-    /// Missing capabilities and the reasons, for the reader.
+    /// Capabilities that this machine lacks, each with the reason.
     pub remarks: Vec<String>,
+    /// Random states per workload.
     pub seeds: usize,
-    pub roofs: Vec<(Backend, MemoryBandwidth)>,
-    /// Host write rates into the pinned memory from which the CUDA device reads a step's values.
+    /// Peak memory bandwidth of each backend.
+    #[serde(rename = "roofs")]
+    pub memory_bandwidths: Vec<(Backend, MemoryBandwidth)>,
+    /// Times of host writes into the pinned memory from which the CUDA device reads a step's values.
     pub host_writes: Vec<HostWrite>,
     pub loads: Vec<WorkloadSummary>,
-    /// Requested loads that are not measured yet; empty when the report is complete.
+    /// Names of the requested workloads that are not measured yet. Empty when the report is complete.
     pub missing: Vec<String>,
     pub rows: Vec<DeformRow>,
     pub thesis: ThesisComparison,
@@ -174,100 +182,105 @@ pub struct DeformReport {
 pub enum Progress<'a> {
     /// Description of the measurement that starts now.
     Started(&'a str),
-    /// All results so far: one load more than in the previous event.
+    /// All results so far, with one more workload than in the previous event.
     Measured(&'a DeformReport),
 }
 
-/// Measures all requested loads and returns the report. `progress` is called when a load starts and after each load.
+/// Measures all requested workloads and returns the report. `progress` is called before and after each workload.
 ///
 /// # Errors
 /// Errors of loading a scene and of `progress`. Failures of a variant are recorded in the report instead.
 pub fn deform(
-    request: &DeformReportOptions,
-    bench: &dyn BenchTarget,
+    options: &DeformReportOptions,
+    target: &dyn BenchTarget,
     mut progress: impl FnMut(Progress<'_>) -> Result<()>,
 ) -> Result<DeformReport> {
     let mut measurements = Measurements::default();
-    if request.selects(OVERLAP) {
-        measurements.host_writes = bench.host_writes(request.replays);
+    if options.selects(OVERLAP) {
+        measurements.host_writes = target.host_writes(options.replays);
     }
-    let mut report = assemble_report(request, bench, &measurements);
-    for source in &request.sources {
-        let (load, motion) = open_workload(source, request.size)?;
-        let (vertices, domains) = (load.scene.layout.vertices, load.scene.domains.len());
-        progress(Progress::Started(&format!("{}: {vertices} vertices, {domains} domains", load.name)))?;
-        let (condition, rows) = measure_variants(request, bench, &load, &motion);
+    let mut report = assemble_report(options, target, &measurements);
+    for source in &options.sources {
+        let (workload, motion) = open_workload(source, options.size)?;
+        let (vertices, domains) = (workload.scene.layout.vertices, workload.scene.domains.len());
+        progress(Progress::Started(&format!("{}: {vertices} vertices, {domains} domains", workload.name)))?;
+        let (condition, rows) = measure_variants(options, target, &workload, &motion);
         measurements.rows.extend(rows);
-        let full = request.size == Size::Full && matches!(source, WorkloadSource::Synthetic(_));
-        let summary = summarize(&load, &motion, condition, full);
-        let overlap = measure_overlap(request, bench, &load, &motion, &mut measurements.failed);
-        measurements.loads.push(WorkloadSummary { ingest: bench.ingest(&load, request.replays), overlap, ..summary });
-        report = assemble_report(request, bench, &measurements);
+        let is_full_size = options.size == Size::Full && matches!(source, WorkloadSource::Synthetic(_));
+        let summary = summarize(&workload, &motion, condition, is_full_size);
+        let overlap = measure_overlap(options, target, &workload, &motion, &mut measurements.failed);
+        measurements.loads.push(WorkloadSummary {
+            ingest: target.ingest(&workload, options.replays),
+            overlap,
+            ..summary
+        });
+        report = assemble_report(options, target, &measurements);
         progress(Progress::Measured(&report))?;
     }
     Ok(report)
 }
 
-/// Results so far.
+/// Results of the workloads that are measured so far.
 #[derive(Default)]
 struct Measurements {
     host_writes: Vec<HostWrite>,
     loads: Vec<WorkloadSummary>,
     rows: Vec<DeformRow>,
-    /// Failures that belong to no row, such as those of the overlap benchmark.
+    /// Failures that belong to no row, such as those of the overlap benchmark. Each is `workload: variant: reason`.
     failed: Vec<String>,
 }
 
-/// Assembles the report from the loads measured so far. They are the first ones of `request.sources`.
+/// Assembles the report from the workloads measured so far, which are the first ones of `options.sources`.
 fn assemble_report(
-    request: &DeformReportOptions,
-    bench: &dyn BenchTarget,
+    options: &DeformReportOptions,
+    target: &dyn BenchTarget,
     measurements: &Measurements,
 ) -> DeformReport {
     let Measurements { loads, rows, .. } = measurements;
-    let is_full_size = |name: &str| loads.iter().any(|load: &WorkloadSummary| load.name == name && load.full);
-    let thesis = ThesisComparison::of(rows, is_full_size);
-    let describe = |row: &DeformRow| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
+    let is_full_size =
+        |name: &str| loads.iter().any(|workload: &WorkloadSummary| workload.name == name && workload.is_full_size);
+    let thesis = ThesisComparison::new(rows, is_full_size);
+    let describe_failure = |row: &DeformRow| format!("{}: {}: {}", row.load, row.name, row.faults.join("; "));
     let mut failed = measurements.failed.clone();
-    failed.extend(rows.iter().filter(|row| !row.passed && !row.is_skipped).map(describe));
-    // The rows for warm and cold caches repeat the same failure of one variant.
+    failed.extend(rows.iter().filter(|row| !row.passed && !row.is_skipped).map(describe_failure));
+    // A variant has one row for warm and one for cold caches. Both repeat its failure.
     failed.dedup();
-    let roofs = [Backend::Cpu, Backend::Cuda].map(|backend| (backend, bench.roofs(backend))).into();
+    let memory_bandwidths = [Backend::Cpu, Backend::Cuda].map(|backend| (backend, target.memory_bandwidth(backend)));
     DeformReport {
-        provenance: Provenance::here(),
-        remarks: bench.remarks(),
-        seeds: request.seeds,
-        roofs,
+        provenance: Provenance::collect(),
+        remarks: target.remarks(),
+        seeds: options.seeds,
+        memory_bandwidths: memory_bandwidths.into(),
         host_writes: measurements.host_writes.clone(),
         loads: loads.clone(),
-        missing: request.sources[loads.len()..].iter().map(WorkloadSource::name).collect(),
+        missing: options.sources[loads.len()..].iter().map(WorkloadSource::name).collect(),
         rows: rows.clone(),
         thesis,
         failed,
     }
 }
 
-/// Runs the overlap benchmark if it is requested. The report fails if its vertices differ from those of serial steps.
+/// Runs the overlap benchmark if it is selected. Appends to `failed` if its vertices differ from those of serial steps.
 fn measure_overlap(
-    request: &DeformReportOptions,
-    bench: &dyn BenchTarget,
-    load: &Workload,
+    options: &DeformReportOptions,
+    target: &dyn BenchTarget,
+    workload: &Workload,
     motion: &WorkloadMotion,
     failed: &mut Vec<String>,
 ) -> Option<Overlap> {
-    if !request.selects(OVERLAP) {
+    if !options.selects(OVERLAP) {
         return None;
     }
     let states: Vec<_> = (0..ROTATING_STATES).map(|seed| motion.random_state(seed).state()).collect();
-    match bench.overlap(load, &states, request.replays)? {
+    match target.overlap(workload, &states, options.replays)? {
         Ok(overlap) => {
             let differing = overlap.differing;
-            let failure = (differing > 0).then(|| format!("{}: {OVERLAP}: {differing} steps differ", load.name));
+            let failure = (differing > 0).then(|| format!("{}: {OVERLAP}: {differing} steps differ", workload.name));
             failed.extend(failure);
             Some(overlap)
         }
         Err(error) => {
-            failed.push(format!("{}: {OVERLAP}: {error}", load.name));
+            failed.push(format!("{}: {OVERLAP}: {error}", workload.name));
             None
         }
     }
@@ -276,31 +289,36 @@ fn measure_overlap(
 fn open_workload(source: &WorkloadSource, size: Size) -> Result<(Workload, WorkloadMotion)> {
     match source {
         WorkloadSource::Synthetic(kind) => {
-            let load = kind.build(size)?;
-            let motion = WorkloadMotion::new(&load, None);
-            Ok((load, motion))
+            let workload = kind.build(size)?;
+            let motion = WorkloadMotion::new(&workload, None);
+            Ok((workload, motion))
         }
-        WorkloadSource::Scene { source, record } => {
+        WorkloadSource::Scene { source, recording } => {
             let OpenedScene { scene, backends } = load::open(source)?;
-            let record = match record {
+            let recording = match recording {
                 Some(path) => Some(RecordedTrajectory::read(path, &scene)?),
                 None => RecordedTrajectory::find_next_to(source, &scene)?,
             };
             let remarks = scene.remarks.clone();
             let batches = backends.batches;
-            let load = Workload { batches, remarks, ..Workload::new(scene.name.clone(), scene) };
-            let motion = WorkloadMotion::new(&load, record);
-            Ok((load, motion))
+            let workload = Workload { batches, remarks, ..Workload::new(scene.name.clone(), scene) };
+            let motion = WorkloadMotion::new(&workload, recording);
+            Ok((workload, motion))
         }
     }
 }
 
-fn summarize(load: &Workload, motion: &WorkloadMotion, condition: ConditionNumbers, full: bool) -> WorkloadSummary {
-    let (scene, layout) = (&load.scene, &load.scene.layout);
+fn summarize(
+    workload: &Workload,
+    motion: &WorkloadMotion,
+    condition: ConditionNumbers,
+    is_full_size: bool,
+) -> WorkloadSummary {
+    let (scene, layout) = (&workload.scene, &workload.scene.layout);
     WorkloadSummary {
-        name: load.name.clone(),
-        full,
-        remarks: load.remarks.clone(),
+        name: workload.name.clone(),
+        is_full_size,
+        remarks: workload.remarks.clone(),
         vertices: layout.vertices,
         corners: layout.corners,
         triangles: layout.triangles,
@@ -308,37 +326,37 @@ fn summarize(load: &Workload, motion: &WorkloadMotion, condition: ConditionNumbe
         coordinates: layout.coordinates,
         diagonal_meters: scene.unit * scene.rest_bounds.diagonal(),
         steps: motion.steps(),
-        recorded: motion.is_recorded(),
+        is_recorded: motion.is_recorded(),
         condition,
         ingest: None,
         overlap: None,
     }
 }
 
-/// Validates all variants of a load together, then times the passing ones one after the other.
+/// Validates all variants of a workload together, then times each variant that passed.
 fn measure_variants(
-    request: &DeformReportOptions,
-    bench: &dyn BenchTarget,
-    load: &Workload,
+    options: &DeformReportOptions,
+    target: &dyn BenchTarget,
+    workload: &Workload,
     motion: &WorkloadMotion,
 ) -> (ConditionNumbers, Vec<DeformRow>) {
     let (mut variants, mut rows): (Vec<Box<dyn Variant>>, Vec<DeformRow>) = (Vec::new(), Vec::new());
-    let is_selected = |name: &str| request.selects(name);
+    let is_selected = |name: &str| options.selects(name);
     for (label, candidate) in
-        bench.variants(load, &is_selected).into_iter().filter(|(label, _)| is_selected(&label.name))
+        target.variants(workload, &is_selected).into_iter().filter(|(label, _)| is_selected(&label.name))
     {
         match candidate {
             Ok(variant) => variants.push(variant),
-            Err(error) => rows.push(DeformRow::not_created(&load.name, &label, &error)),
+            Err(error) => rows.push(DeformRow::not_created(&workload.name, &label, &error)),
         }
     }
-    let (results, condition) = validate::validate(load, motion, &mut variants, (request.seeds, request.steps));
+    let (results, condition) = validate::validate(workload, motion, &mut variants, (options.seeds, options.steps));
     let states: Vec<_> = (0..ROTATING_STATES).map(|seed| motion.random_state(seed).state()).collect();
     for (variant, result) in variants.iter_mut().zip(results) {
         for cache in [CacheState::Warm, CacheState::Cold] {
             let mut result = result.clone();
             let timing = match result.passed() {
-                true => variant.time(&states, cache, request.replays),
+                true => variant.time(&states, cache, options.replays),
                 false => Ok(None),
             };
             let timing = timing.unwrap_or_else(|error| {
@@ -347,8 +365,8 @@ fn measure_variants(
             });
             let (label, traffic) = (variant.label(), variant.traffic());
             let (launches, kernels) = (variant.launches_per_step(), variant.kernel_attributes());
-            let row = DeformRow::new(&load.name, label, result, traffic, (cache, timing));
-            rows.push(DeformRow { launches, kernels, ..row.relative_to(bench.roofs(label.backend)) });
+            let row = DeformRow::new(&workload.name, label, result, traffic, (cache, timing));
+            rows.push(DeformRow { launches, kernels, ..row.relative_to(target.memory_bandwidth(label.backend)) });
         }
     }
     (condition, rows)
@@ -361,8 +379,7 @@ impl DeformReport {
     }
 
     /// Writes `report.json`, `report.csv`, `report.md`, `report.svg` and `report.png` into a folder, which is created.
-    /// Each file is written under a temporary name and then renamed, so that an interrupted run leaves only complete
-    /// files.
+    /// Each file is written under a temporary name and then renamed, so that files with the final names are complete.
     pub fn write(&self, folder: &Path) -> Result<()> {
         std::fs::create_dir_all(folder).map_err(fault_in("report"))?;
         let svg = plot::draw_svg(self);

@@ -21,15 +21,15 @@ pub(super) fn markdown(report: &DeformReport) -> String {
         false => format!("\nFailed:\n\n- {}\n", report.failed.join("\n- ")),
     };
     text.push_str(&failures);
-    for load in &report.loads {
-        text.push_str(&load_section(load, report.rows.iter().filter(|row| row.load == load.name)));
+    for workload in &report.loads {
+        text.push_str(&load_section(workload, report.rows.iter().filter(|row| row.load == workload.name)));
     }
     text.push('\n');
     text.push_str(&report.thesis.markdown());
     text
 }
 
-const HEAD: [&str; 13] = [
+const COLUMNS: [&str; 13] = [
     "variant",
     "cache",
     "median us",
@@ -45,22 +45,22 @@ const HEAD: [&str; 13] = [
     "passed",
 ];
 
-fn load_section<'a>(load: &WorkloadSummary, rows: impl Iterator<Item = &'a DeformRow>) -> String {
+fn load_section<'a>(workload: &WorkloadSummary, rows: impl Iterator<Item = &'a DeformRow>) -> String {
     let WorkloadSummary {
-        name, vertices, corners, triangles, domains, coordinates, condition, steps, recorded, ..
-    } = load;
-    let trajectory = if *recorded { "recorded" } else { "made-up" };
+        name, vertices, corners, triangles, domains, coordinates, condition, steps, is_recorded, ..
+    } = workload;
+    let trajectory = if *is_recorded { "recorded" } else { "synthetic" };
     let mut text = format!(
         "\n## {name}\n\n{vertices} vertices, {corners} corners, {triangles} triangles, {domains} domains, \
          {coordinates} coordinates; {steps} {trajectory} steps; sum \\|U q\\| / \\|u\\|: median {:.3e}, largest {:.3e}.\n",
         condition.median, condition.largest
     );
-    if !load.remarks.is_empty() {
-        text.push_str(&format!("\n- {}\n", load.remarks.join("\n- ")));
+    if !workload.remarks.is_empty() {
+        text.push_str(&format!("\n- {}\n", workload.remarks.join("\n- ")));
     }
     text.push('\n');
-    text.push_str(&table(&HEAD, rows.map(cells)));
-    if let Some(overlap) = &load.overlap {
+    text.push_str(&table(&COLUMNS, rows.map(cells)));
+    if let Some(overlap) = &workload.overlap {
         text.push_str(&overlap_paragraph(overlap));
     }
     text
@@ -80,22 +80,22 @@ fn overlap_paragraph(overlap: &Overlap) -> String {
 }
 
 fn cells(row: &DeformRow) -> [String; 13] {
-    let number = |value: Option<f64>| value.map_or_else(dash, |value| format!("{value:.3}"));
-    let small = |value: Option<f64>| value.map_or_else(dash, |value| format!("{value:.2e}"));
+    let format_number = |value: Option<f64>| value.map_or_else(dash, |value| format!("{value:.3}"));
+    let format_small_number = |value: Option<f64>| value.map_or_else(dash, |value| format!("{value:.2e}"));
     let errors = row.validation.as_ref().map(|validation| validation.errors);
     [
         row.name.clone(),
         row.cache.name().into(),
-        number(row.timing.map(|timing| timing.median_us)),
+        format_number(row.timing.map(|timing| timing.median_us)),
         row.timing.map_or_else(dash, |timing| format!("{:.3} to {:.3}", timing.q1_us, timing.q3_us)),
         row.bytes.to_string(),
-        number(row.gbs),
-        number(row.of_copy),
-        number(row.of_read),
-        small(errors.map(|errors| errors.meters.largest)),
-        small(errors.map(|errors| errors.of_diagonal.largest)),
-        small(errors.and_then(|errors| Some(errors.pixels?.largest))),
-        number(errors.map(|errors| errors.of_bound)),
+        format_number(row.gbs),
+        format_number(row.of_copy),
+        format_number(row.of_read),
+        format_small_number(errors.map(|errors| errors.meters.largest)),
+        format_small_number(errors.map(|errors| errors.of_diagonal.largest)),
+        format_small_number(errors.and_then(|errors| Some(errors.pixels?.largest))),
+        format_number(errors.map(|errors| errors.of_bound)),
         match (row.passed, row.is_skipped) {
             (true, _) => "yes".into(),
             (false, true) => format!("left out: {}", row.faults.join("; ")),

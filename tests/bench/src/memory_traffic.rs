@@ -9,62 +9,71 @@ use modalcast_model::scene::{Scene, StorageType};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Operand {
     pub name: &'static str,
-    /// The formula: n vertices, f triangles, c corners, r modes, d domains; C chunks of K modes, Q quads of vertices.
+    /// Formula of the bytes. n is vertices, f triangles, c corners, r modes, d domains, C chunks of K modes, and Q quads
+    /// of vertices.
     pub formula: &'static str,
     pub bytes: u64,
 }
 
-/// Minimum of bytes that a step moves, for the scene's storage type and normals. Every operand counts once, shared
-/// shapes count once, and all modes count even with truncation.
-pub fn of_scene(scene: &Scene) -> Vec<Operand> {
+/// Minimum of bytes that a step reads and writes, for the scene's storage type and normals. Every operand and every
+/// shape counts once. All modes count, even with truncation.
+pub fn minimum_traffic(scene: &Scene) -> Vec<Operand> {
     let layout = &scene.layout;
-    let [mut entries, mut stored, mut scales, mut vertices, mut corners, mut triangles, mut tangents] = [0; 7];
-    let mut seen = vec![false; scene.shapes.len()];
+    let [
+        mut mode_entries,
+        mut stored_bytes,
+        mut scale_bytes,
+        mut rest_vertices,
+        mut corners,
+        mut triangles,
+        mut tangents,
+    ] = [0; 7];
+    let mut is_shape_counted = vec![false; scene.shapes.len()];
     for domain in &scene.domains {
-        if std::mem::replace(&mut seen[domain.shape], true) {
+        if std::mem::replace(&mut is_shape_counted[domain.shape], true) {
             continue;
         }
-        let (shape, per_chunk) = (&scene.shapes[domain.shape], modes_per_chunk(scene.deformation.storage));
-        let (rest, chunks) = (shape.mesh.rest_positions().len(), shape.modes.rank().div_ceil(per_chunk));
-        entries += shape.modes.columns().len();
-        stored += 48 * chunks * rest.div_ceil(QUAD);
-        scales += 4 * chunks * per_chunk * rest.div_ceil(QUAD * TILE_QUADS);
-        vertices += rest;
+        let (shape, chunk_modes) = (&scene.shapes[domain.shape], modes_per_chunk(scene.deformation.storage));
+        let (shape_vertices, chunks) = (shape.mesh.rest_positions().len(), shape.modes.rank().div_ceil(chunk_modes));
+        mode_entries += shape.modes.columns().len();
+        stored_bytes += 48 * chunks * shape_vertices.div_ceil(QUAD);
+        scale_bytes += 4 * chunks * chunk_modes * shape_vertices.div_ceil(QUAD * TILE_QUADS);
+        rest_vertices += shape_vertices;
         corners += shape.mesh.corners().normals.len();
         triangles += shape.mesh.triangles().len();
         tangents += shape.tangents().len();
     }
-    let mapped = if scene.features.normal_maps { layout.corners } else { 0 };
-    let (exact, storage) = (scene.features.exact_normals, scene.deformation.storage);
-    let only = |wanted: bool, bytes: usize| if wanted { bytes } else { 0 };
-    let part = |name, formula, bytes: usize| Operand { name, formula, bytes: bytes as u64 };
-    let parts = [
-        part("U", "4 x sum 3 n r", only(storage == StorageType::F32, 4 * entries)),
-        part("U", "48 x sum C Q", only(storage != StorageType::F32, stored)),
-        part("scales", "4 x sum C K tiles", only(storage == StorageType::Int8, scales)),
-        part("x0", "12 x sum n", 12 * vertices),
-        part("q", "4 x sum r", 4 * layout.coordinates),
-        part("T", "48 x d", 48 * layout.domains.len()),
-        part("x", "12 x sum n", 12 * layout.vertices),
-        part("x in", "12 x sum n", only(exact, 12 * layout.vertices)),
-        part("triangles", "12 x sum f + 4 x sum c", only(exact, 12 * triangles + 4 * corners)),
-        part("normals in", "12 x sum c", only(!exact, 12 * corners)),
-        part("normals out", "12 x sum c", 12 * layout.corners),
-        part("tangents in", "16 x sum c", 16 * tangents),
-        part("tangents out", "16 x sum c", 16 * mapped),
+    let tangent_corners = if scene.features.normal_maps { layout.corners } else { 0 };
+    let (has_exact_normals, storage) = (scene.features.exact_normals, scene.deformation.storage);
+    let bytes_if = |condition: bool, bytes: usize| if condition { bytes } else { 0 };
+    let operand = |name, formula, bytes: usize| Operand { name, formula, bytes: bytes as u64 };
+    let operands = [
+        operand("U", "4 x sum 3 n r", bytes_if(storage == StorageType::F32, 4 * mode_entries)),
+        operand("U", "48 x sum C Q", bytes_if(storage != StorageType::F32, stored_bytes)),
+        operand("scales", "4 x sum C K tiles", bytes_if(storage == StorageType::Int8, scale_bytes)),
+        operand("x0", "12 x sum n", 12 * rest_vertices),
+        operand("q", "4 x sum r", 4 * layout.coordinates),
+        operand("T", "48 x d", 48 * layout.domains.len()),
+        operand("x", "12 x sum n", 12 * layout.vertices),
+        operand("x in", "12 x sum n", bytes_if(has_exact_normals, 12 * layout.vertices)),
+        operand("triangles", "12 x sum f + 4 x sum c", bytes_if(has_exact_normals, 12 * triangles + 4 * corners)),
+        operand("normals in", "12 x sum c", bytes_if(!has_exact_normals, 12 * corners)),
+        operand("normals out", "12 x sum c", 12 * layout.corners),
+        operand("tangents in", "16 x sum c", 16 * tangents),
+        operand("tangents out", "16 x sum c", 16 * tangent_corners),
     ];
-    parts.into_iter().filter(|part| part.bytes > 0).collect()
+    operands.into_iter().filter(|operand| operand.bytes > 0).collect()
 }
 
-/// The formulas as one line of text: name: formula = bytes, for each part.
-pub fn line(parts: &[Operand]) -> String {
-    let part = |part: &Operand| format!("{}: {} = {}", part.name, part.formula, part.bytes);
-    parts.iter().map(part).collect::<Vec<_>>().join("; ")
+/// The operands as one line of text; each is `name: formula = bytes`.
+pub fn format_operands(operands: &[Operand]) -> String {
+    let format_operand = |operand: &Operand| format!("{}: {} = {}", operand.name, operand.formula, operand.bytes);
+    operands.iter().map(format_operand).collect::<Vec<_>>().join("; ")
 }
 
-/// Sum of all parts.
-pub fn total(parts: &[Operand]) -> u64 {
-    parts.iter().map(|part| part.bytes).sum()
+/// Sum of the bytes of all operands.
+pub fn total_bytes(operands: &[Operand]) -> u64 {
+    operands.iter().map(|operand| operand.bytes).sum()
 }
 
 #[cfg(test)]
@@ -75,21 +84,30 @@ mod tests {
 
     #[test]
     fn bytes_of_load_a_match_the_formulas() {
-        let scene = WorkloadKind::OneDomain { has_normal_map: true }.build(Size::Quick).expect("built").scene;
+        let scene =
+            WorkloadKind::OneDomain { has_normal_map: true }.build(Size::Quick).expect("expected a workload").scene;
         let (n, r) = (30_000, 32);
-        let want = 4 * 3 * n * r + 12 * n + 4 * r + 48 + 12 * n + 2 * 12 * n + 2 * 16 * n;
-        assert_eq!(total(&of_scene(&scene)), want);
-        let bare = WorkloadKind::OneDomain { has_normal_map: false }.build(Size::Quick).expect("built").scene;
-        assert_eq!(total(&of_scene(&bare)), 4 * 3 * n * r + 24 * n + 4 * r + 48 + 2 * 12 * 3);
-        let stored = |storage| {
-            let scene = with_deformation(&bare, DeformationSettings { storage, ..DeformationSettings::default() })
-                .expect("restated");
-            of_scene(&scene)[0].bytes
+        let expected = 4 * 3 * n * r + 12 * n + 4 * r + 48 + 12 * n + 2 * 12 * n + 2 * 16 * n;
+        assert_eq!(total_bytes(&minimum_traffic(&scene)), expected);
+        let plain_scene =
+            WorkloadKind::OneDomain { has_normal_map: false }.build(Size::Quick).expect("expected a workload").scene;
+        assert_eq!(total_bytes(&minimum_traffic(&plain_scene)), 4 * 3 * n * r + 24 * n + 4 * r + 48 + 2 * 12 * 3);
+        let bytes_of_u = |storage| {
+            let scene =
+                with_deformation(&plain_scene, DeformationSettings { storage, ..DeformationSettings::default() })
+                    .expect("expected a scene");
+            minimum_traffic(&scene)[0].bytes
         };
-        assert_eq!([StorageType::F16, StorageType::Int8].map(stored), [6 * n * r, 3 * n * r]);
-        let exact = DeformationSettings { normals: NormalMethod::Exact, ..DeformationSettings::default() };
-        let exact = of_scene(&with_deformation(&bare, exact).expect("restated"));
-        assert_eq!(total(&exact), total(&of_scene(&bare)) + 12 * n + 12 + 4 * 3 - 12 * 3);
-        assert!(line(&of_scene(&bare)).starts_with("U: 4 x sum 3 n r = 11520000; x0: 12 x sum n = 360000; "));
+        assert_eq!([StorageType::F16, StorageType::Int8].map(bytes_of_u), [6 * n * r, 3 * n * r]);
+        let exact_normals = DeformationSettings { normals: NormalMethod::Exact, ..DeformationSettings::default() };
+        let exact_normals = minimum_traffic(&with_deformation(&plain_scene, exact_normals).expect("expected a scene"));
+        assert_eq!(
+            total_bytes(&exact_normals),
+            total_bytes(&minimum_traffic(&plain_scene)) + 12 * n + 12 + 4 * 3 - 12 * 3
+        );
+        assert!(
+            format_operands(&minimum_traffic(&plain_scene))
+                .starts_with("U: 4 x sum 3 n r = 11520000; x0: 12 x sum n = 360000; ")
+        );
     }
 }

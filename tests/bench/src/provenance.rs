@@ -11,52 +11,53 @@ use modalcast_compute::gpu;
 pub struct Provenance {
     pub cpu: String,
     pub threads: usize,
-    /// CUDA devices with their memory, driver, CUDA and NVRTC versions, and the reason for each missing component.
+    /// CUDA devices with memory, versions of driver, CUDA and NVRTC, and the reason why a component is missing.
     pub cuda: gpu::Probe,
     pub version: &'static str,
     /// `MODALCAST_COMMIT`, otherwise git's HEAD in the current folder.
     pub commit: Option<String>,
     pub command: Vec<String>,
-    /// Version of this machine's Rust compiler, if there is one.
+    /// Version of `rustc` on this machine, if it is installed.
     pub toolchain: Option<String>,
-    /// Whether the build is optimized; times of other builds are not meaningful.
+    /// Whether the build is optimized. Times of other builds are not meaningful.
     pub release: bool,
     pub os: &'static str,
 }
 
 impl Provenance {
     /// Collects the data of this machine and process.
-    pub fn here() -> Self {
+    pub fn collect() -> Self {
         let commit = std::env::var("MODALCAST_COMMIT").ok().filter(|commit| !commit.is_empty());
         Self {
-            cpu: cpu(),
+            cpu: cpu_name(),
             threads: std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
             cuda: gpu::probe(),
             version: env!("CARGO_PKG_VERSION"),
-            commit: commit.or_else(|| output("git", &["rev-parse", "HEAD"])),
+            commit: commit.or_else(|| run_program("git", &["rev-parse", "HEAD"])),
             command: std::env::args().collect(),
-            toolchain: output("rustc", &["--version"]),
+            toolchain: run_program("rustc", &["--version"]),
             release: !cfg!(debug_assertions),
             os: std::env::consts::OS,
         }
     }
 
-    /// One line for titles.
+    /// Machine and devices as one line, for titles.
     pub fn line(&self) -> String {
         let devices: Vec<&str> = self.cuda.devices.iter().map(|device| device.name.as_str()).collect();
         let devices = if devices.is_empty() { "no CUDA device".into() } else { devices.join(", ") };
-        let built = if self.release { "" } else { ", unoptimised build" };
-        format!("{}, {} threads; {devices}{built}", self.cpu, self.threads)
+        let build_note = if self.release { "" } else { ", unoptimised build" };
+        format!("{}, {} threads; {devices}{build_note}", self.cpu, self.threads)
     }
 }
 
-/// A program's trimmed standard output; `None` when it cannot be started or fails.
-fn output(program: &str, arguments: &[&str]) -> Option<String> {
+/// Runs a program and returns its trimmed standard output; `None` when it cannot be started or fails.
+fn run_program(program: &str, arguments: &[&str]) -> Option<String> {
     let output = Command::new(program).args(arguments).output().ok().filter(|output| output.status.success())?;
     String::from_utf8(output.stdout).ok().map(|text| text.trim().to_owned())
 }
 
-fn cpu() -> String {
+/// Model name of the CPU according to Linux, otherwise its architecture.
+fn cpu_name() -> String {
     let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
     name.map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
@@ -68,16 +69,16 @@ mod tests {
 
     #[test]
     fn missing_or_failing_program_gives_no_output() {
-        assert_eq!(output("no-such-program", &[]), None);
-        assert_eq!(output("false", &[]), None);
-        assert_eq!(output("echo", &["x"]).as_deref(), Some("x"));
+        assert_eq!(run_program("no-such-program", &[]), None);
+        assert_eq!(run_program("false", &[]), None);
+        assert_eq!(run_program("echo", &["x"]).as_deref(), Some("x"));
     }
 
     #[test]
     fn line_names_cpu_threads_and_device() {
-        let here = Provenance::here();
-        assert!(here.threads >= 1 && !here.cpu.is_empty() && !here.command.is_empty());
-        let device = here.cuda.devices.first().map_or("no CUDA device", |device| &device.name);
-        assert!(here.line().contains(device) && here.line().contains("threads"), "{}", here.line());
+        let provenance = Provenance::collect();
+        assert!(provenance.threads >= 1 && !provenance.cpu.is_empty() && !provenance.command.is_empty());
+        let device = provenance.cuda.devices.first().map_or("no CUDA device", |device| &device.name);
+        assert!(provenance.line().contains(device) && provenance.line().contains("threads"), "{}", provenance.line());
     }
 }

@@ -12,17 +12,18 @@ use modalcast_model::scene::Scene;
 pub struct RecordedTrajectory {
     /// Packed coordinates of each step.
     q: Vec<Vec<f64>>,
-    /// `world_from_domain` of each mover per step, 12 numbers each. Empty if all domains stay at their placements.
+    /// Per step: `world_from_domain` of each transform root, 12 numbers each. Empty if all domains stay at their
+    /// placements.
     transforms: Vec<Vec<f64>>,
 }
 
 impl RecordedTrajectory {
-    /// Reads a `.csv` file with a header and the columns time, q0, q1, ..., or a folder with `q.npy` (steps x
-    /// coordinates) and, if the domains move, `transforms.npy` (steps x transform roots x 12), as `modalcast-sim` writes it.
-    /// Movers are the domains that have a transform.
+    /// Reads a recording: a `.csv` file with a header and the columns time, q0, q1, ..., or a folder as `modalcast-sim`
+    /// writes it. The folder holds `q.npy` (steps x coordinates) and, if the domains move, `transforms.npy` (steps x
+    /// transform roots x 12).
     ///
     /// # Errors
-    /// `NotFound`, or `Invalid` when the numbers do not fit the scene.
+    /// `NotFound` when a file is missing; `Invalid` when it cannot be parsed or does not match the scene.
     pub fn read(path: &Path, scene: &Scene) -> Result<Self> {
         let name = path.display().to_string();
         let record = match path.is_dir() {
@@ -47,21 +48,21 @@ impl RecordedTrajectory {
         let path = Path::new(source);
         let folder = if path.is_dir() { path } else { path.parent().unwrap_or(path) };
         let Ok(entries) = std::fs::read_dir(folder) else { return Ok(None) };
-        let is_record = |path: &std::path::PathBuf| path.to_string_lossy().ends_with(".q.csv");
-        let mut found: Vec<_> = entries.flatten().map(|entry| entry.path()).filter(is_record).collect();
-        match (found.pop(), found.is_empty()) {
-            (Some(only), true) if path.exists() => Self::read(&only, scene).map(Some),
+        let is_recording = |path: &std::path::PathBuf| path.to_string_lossy().ends_with(".q.csv");
+        let mut paths: Vec<_> = entries.flatten().map(|entry| entry.path()).filter(is_recording).collect();
+        match (paths.pop(), paths.is_empty()) {
+            (Some(path), true) if path.exists() => Self::read(&path, scene).map(Some),
             _ => Ok(None),
         }
     }
 
     fn validate(self, scene: &Scene) -> Result<Self> {
-        let check_lengths = |field: &str, list: &[Vec<f64>], length: usize| match list
+        let check_lengths = |field: &str, rows: &[Vec<f64>], length: usize| match rows
             .iter()
             .position(|row| row.len() != length)
         {
             None => Ok(()),
-            Some(index) => Err(invalid(format!("{field}[{index}]"), format!("{length} numbers"), list[index].len())),
+            Some(index) => Err(invalid(format!("{field}[{index}]"), format!("{length} numbers"), rows[index].len())),
         };
         if self.q.is_empty() {
             return Err(invalid("steps", "at least one", 0));
@@ -138,22 +139,22 @@ mod tests {
 
     #[test]
     fn columns_after_time_are_coordinates() {
-        let record = read("time,q0,q1\n0,1.5,-2\n1,3,4\n").expect("a valid record");
-        assert_eq!(record.steps(), 2);
-        assert_eq!(record.step(&scene(), 1).q, [3.0, 4.0]);
-        assert_eq!(record.step(&scene(), 1).transforms[0][0], 1.0, "at its placement");
+        let trajectory = read("time,q0,q1\n0,1.5,-2\n1,3,4\n").expect("a valid record");
+        assert_eq!(trajectory.steps(), 2);
+        assert_eq!(trajectory.step(&scene(), 1).q, [3.0, 4.0]);
+        assert_eq!(trajectory.step(&scene(), 1).transforms[0][0], 1.0, "at its placement");
     }
 
     #[test]
-    fn rejects_bad_records_with_the_reason() {
-        for (text, part) in [
+    fn rejects_bad_recordings_with_the_reason() {
+        for (text, reason) in [
             ("time,q0\n0,1\n", "q[0]: expected 2 numbers, got 1"),
             ("time,q0,q1\n", "steps: expected at least one"),
             ("time,q0,q1\n0,1,x\n", "expected rows of time,q0,q1"),
             ("time,q0,q1\n0,1,inf\n", "expected finite numbers"),
         ] {
-            let error = read(text).expect_err(part).to_string();
-            assert!(error.contains(part), "{error}");
+            let error = read(text).expect_err(reason).to_string();
+            assert!(error.contains(reason), "{error}");
         }
         assert!(matches!(RecordedTrajectory::read(Path::new("absent.csv"), &scene()), Err(Error::NotFound { .. })));
         assert_eq!(RecordedTrajectory::find_next_to("tree", &scene()), Ok(None));
@@ -175,8 +176,8 @@ mod tests {
         write("q.npy", "(2, 2)", &[1.0, 2.0, 3.0, 4.0]);
         let numbers: Vec<f32> = (0..24).map(|number| number as f32).collect();
         write("transforms.npy", "(2, 1, 12)", &numbers);
-        let record = RecordedTrajectory::read(folder.path(), &scene()).expect("a valid record");
-        let step = record.step(&scene(), 1);
+        let trajectory = RecordedTrajectory::read(folder.path(), &scene()).expect("a valid record");
+        let step = trajectory.step(&scene(), 1);
         assert_eq!((step.q, step.transforms[0][0]), (vec![3.0, 4.0], 12.0));
     }
 }

@@ -27,21 +27,22 @@ pub struct DeformRow {
     pub compensated: bool,
     pub cache: CacheState,
     pub passed: bool,
-    /// Reasons why it failed.
+    /// Reasons why the variant failed or was skipped.
     pub faults: Vec<String>,
-    /// Whether the variant was skipped because something that it needs is unavailable. It then does not count as
-    /// failed.
+    /// Whether the variant was skipped because the machine lacks something. A skipped variant does not count as failed.
     #[serde(rename = "left_out")]
     pub is_skipped: bool,
-    /// `None` when it failed, or cannot be timed with this cache.
+    /// `None` when the variant failed, or cannot be timed with this cache state.
     pub timing: Option<Timing>,
+    /// Minimum memory traffic of a step.
     pub bytes: u64,
+    /// The same traffic per operand.
     pub traffic: Vec<Operand>,
     /// Bytes divided by the median time, 10^9 per second.
     pub gbs: Option<f64>,
-    /// `gbs` divided by the best copy rate of the same run.
+    /// `gbs` divided by the peak copy bandwidth of the same run.
     pub of_copy: Option<f64>,
-    /// `gbs` divided by the best read rate of the same run.
+    /// `gbs` divided by the peak read bandwidth of the same run.
     pub of_read: Option<f64>,
     /// Kernel launches per step; 0 on the CPU.
     pub launches: usize,
@@ -61,7 +62,7 @@ impl DeformRow {
         traffic: Vec<Operand>,
         (cache, timing): (CacheState, Option<Timing>),
     ) -> Self {
-        let bytes = memory_traffic::total(&traffic);
+        let bytes = memory_traffic::total_bytes(&traffic);
         Self {
             cache,
             passed: validation.passed(),
@@ -108,15 +109,15 @@ impl DeformRow {
     }
 
     /// The row with its bandwidth divided by the peak bandwidths of the machine.
-    pub fn relative_to(mut self, roofs: MemoryBandwidth) -> Self {
-        let share = |roof: Option<f64>| Some(self.gbs? / roof.filter(|roof| *roof > 0.0)?);
-        (self.of_copy, self.of_read) = (share(roofs.copy_gbs), share(roofs.read_gbs));
+    pub fn relative_to(mut self, bandwidth: MemoryBandwidth) -> Self {
+        let fraction_of = |peak_gbs: Option<f64>| Some(self.gbs? / peak_gbs.filter(|peak_gbs| *peak_gbs > 0.0)?);
+        (self.of_copy, self.of_read) = (fraction_of(bandwidth.copy_gbs), fraction_of(bandwidth.read_gbs));
         self
     }
 
     /// Median time in microseconds and largest error as a fraction of the diagonal; `None` when the variant failed or
     /// was not timed.
-    pub fn point(&self) -> Option<(f64, f64)> {
+    pub fn time_and_error(&self) -> Option<(f64, f64)> {
         let validation = self.validation.as_ref().filter(|_| self.passed)?;
         Some((self.timing?.median_us, validation.errors.of_diagonal.largest))
     }
@@ -192,7 +193,7 @@ pub fn csv(rows: &[DeformRow]) -> Result<Vec<u8>> {
     for row in rows {
         let value = serde_json::to_value(row).map_err(fault_in("report"))?;
         let cell = |(name, pointer): (&str, &str)| match (name, value.pointer(pointer)) {
-            ("bytes_by_formula", _) => memory_traffic::line(&row.traffic),
+            ("bytes_by_formula", _) => memory_traffic::format_operands(&row.traffic),
             ("faults", _) => row.faults.join("; "),
             (_, None | Some(Value::Null)) => String::new(),
             (_, Some(Value::String(text))) => text.clone(),
@@ -203,8 +204,9 @@ pub fn csv(rows: &[DeformRow]) -> Result<Vec<u8>> {
     writer.into_inner().map_err(fault_in("report"))
 }
 
-/// Pareto front: indices of the points that no other point beats in both numbers, by ascending first number.
-pub fn pareto(points: &[(f64, f64)]) -> Vec<usize> {
+/// Pareto front of points whose numbers should both be small: indices of the points that no other point dominates, by
+/// ascending first number. Of equal points, one is on the front.
+pub fn pareto_front(points: &[(f64, f64)]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.sort_by(|a, b| points[*a].0.total_cmp(&points[*b].0).then(points[*a].1.total_cmp(&points[*b].1)));
     let mut min_second = f64::INFINITY;
@@ -224,7 +226,7 @@ pub(super) mod tests {
     use crate::errors::{ErrorNorms, OrientationErrors, PositionErrors};
 
     /// A row with these numbers; everything else is zero or empty.
-    pub(crate) fn row(load: &str, name: &str, cache: CacheState, (us, error): (f64, f64)) -> DeformRow {
+    pub(crate) fn row(load: &str, name: &str, cache: CacheState, (median_us, error): (f64, f64)) -> DeformRow {
         let label = VariantLabel { name: name.into(), backend: Backend::Cpu, deformation: Default::default() };
         let norms = ErrorNorms { largest: error, rms: error / 2.0 };
         let errors = PositionErrors {
@@ -246,7 +248,7 @@ pub(super) mod tests {
             faults: Vec::new(),
             is_skipped: false,
         };
-        let timing = Timing { median_us: us, q1_us: us, q3_us: us, replays: 20 };
+        let timing = Timing { median_us, q1_us: median_us, q3_us: median_us, replays: 20 };
         let traffic = vec![Operand { name: "U", formula: "4 x sum 3 n r", bytes: 2_000 }];
         DeformRow::new(load, &label, validation, traffic, (cache, Some(timing)))
     }
@@ -254,9 +256,9 @@ pub(super) mod tests {
     #[test]
     fn front_contains_exactly_the_pareto_optimal_points() {
         let points = [(1.0, 5.0), (2.0, 6.0), (3.0, 1.0), (3.0, 0.5), (4.0, 0.5), (0.5, 9.0)];
-        assert_eq!(pareto(&points), [5, 0, 3]);
-        assert_eq!(pareto(&[]), [0; 0]);
-        assert_eq!(pareto(&[(1.0, 1.0), (1.0, 1.0)]).len(), 1, "expected one of two equal points");
+        assert_eq!(pareto_front(&points), [5, 0, 3]);
+        assert_eq!(pareto_front(&[]), [0; 0]);
+        assert_eq!(pareto_front(&[(1.0, 1.0), (1.0, 1.0)]).len(), 1, "expected one of two equal points");
     }
 
     #[test]

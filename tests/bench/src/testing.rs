@@ -12,7 +12,7 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Scene, SceneState};
 
-/// Wraps another variant and adds an error to its last coordinate.
+/// Wraps another variant and adds an error to the last coordinate of its positions.
 pub(super) struct InaccurateVariant<V> {
     inner: V,
     error: f32,
@@ -54,13 +54,13 @@ impl<V: Variant> Variant for InaccurateVariant<V> {
     }
 }
 
-/// Emulates storage and truncation in f64 and rounds only the positions.
+/// Emulates storage and truncation in f64. Only the positions are rounded to f32.
 pub(super) struct EmulatedVariant {
     pub(super) label: VariantLabel,
     pub(super) scene: Arc<Scene>,
-    /// Error model that it applies.
+    /// Error model that the variant applies.
     pub(super) applied: ErrorModel,
-    /// Error model that it declares, which gives its bounds.
+    /// Error model that the variant declares, which determines its bounds.
     pub(super) declared: ErrorModel,
     pub(super) surface: DeformedSurface,
 }

@@ -7,7 +7,7 @@ use variant::{VariantCandidate, VariantFilter, make_candidate};
 
 /// A target with the CPU deformer, and with the same deformer plus a position error.
 struct CpuTarget {
-    error: f32,
+    position_error: f32,
 }
 
 impl BenchTarget for CpuTarget {
@@ -15,23 +15,24 @@ impl BenchTarget for CpuTarget {
         let label = |name: &str| VariantLabel::new(name, Backend::Cpu, &load.scene);
         let cpu =
             |label: VariantLabel| DeformerVariant::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
-        let inaccurate = |label: VariantLabel| Ok(InaccurateVariant::new(cpu(label), self.error));
+        let inaccurate = |label: VariantLabel| Ok(InaccurateVariant::new(cpu(label), self.position_error));
         vec![
             make_candidate(is_selected, label("accurate"), |label| Ok(cpu(label))),
             make_candidate(is_selected, label("inaccurate"), inaccurate),
         ]
     }
 
-    fn roofs(&self, _backend: Backend) -> MemoryBandwidth {
+    fn memory_bandwidth(&self, _backend: Backend) -> MemoryBandwidth {
         MemoryBandwidth { copy_gbs: Some(10.0), read_gbs: Some(12.0), ..MemoryBandwidth::default() }
     }
 }
 
-fn request(sources: Vec<WorkloadSource>) -> DeformReportOptions {
+fn report_options(sources: Vec<WorkloadSource>) -> DeformReportOptions {
     DeformReportOptions { sources, seeds: 3, replays: 20, steps: usize::MAX, variants: vec![], size: Size::Quick }
 }
 
-fn report(error: f32) -> DeformReport {
+/// Measures two workloads with the CPU target and checks the progress events.
+fn measure(position_error: f32) -> DeformReport {
     let sources = vec![
         WorkloadSource::Synthetic(WorkloadKind::Plant(1)),
         WorkloadSource::Synthetic(WorkloadKind::Single { power: 14, rank: 10 }),
@@ -44,7 +45,8 @@ fn report(error: f32) -> DeformReport {
         });
         Ok(())
     };
-    let report = deform(&request(sources), &CpuTarget { error }, on_progress).expect("expected a report");
+    let report =
+        deform(&report_options(sources), &CpuTarget { position_error }, on_progress).expect("expected a report");
     assert!(events[0].starts_with("plant-2: ") && events[2].starts_with("single-14-10: "), "{events:?}");
     assert_eq!([&events[1], &events[3]], ["4 [\"single-14-10\"]", "8 []"]);
     report
@@ -53,31 +55,31 @@ fn report(error: f32) -> DeformReport {
 #[test]
 fn interrupted_run_keeps_results_and_names_missing_loads() {
     let folder = tempfile::tempdir().expect("expected a folder");
-    let absent = WorkloadSource::Scene { source: "absent".into(), record: None };
-    let request = request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains), absent]);
+    let absent = WorkloadSource::Scene { source: "absent".into(), recording: None };
+    let report_options = report_options(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains), absent]);
     let write_report = |progress: Progress<'_>| match progress {
         Progress::Measured(report) => report.write(folder.path()),
         Progress::Started(_) => Ok(()),
     };
-    deform(&request, &CpuTarget { error: 0.0 }, write_report).expect_err("no such scene");
-    let json = std::fs::read(folder.path().join("report.json")).expect("written");
+    deform(&report_options, &CpuTarget { position_error: 0.0 }, write_report).expect_err("no such scene");
+    let json = std::fs::read(folder.path().join("report.json")).expect("expected a report file");
     let json: serde_json::Value = serde_json::from_slice(&json).expect("JSON");
     assert_eq!((&json["missing"][0], json["rows"].as_array().map(Vec::len)), (&"absent".into(), Some(4)));
-    let markdown = std::fs::read_to_string(folder.path().join("report.md")).expect("written");
+    let markdown = std::fs::read_to_string(folder.path().join("report.md")).expect("expected a report file");
     assert!(markdown.contains("Not measured yet: absent."), "{markdown}");
-    let mut names = std::fs::read_dir(folder.path()).expect("listed").map(|entry| entry.expect("one").file_name());
-    assert!(
-        names.all(|name| name.to_string_lossy().starts_with("report.") && !name.to_string_lossy().ends_with("part"))
-    );
+    for entry in std::fs::read_dir(folder.path()).expect("expected a folder") {
+        let name = entry.expect("expected an entry").file_name().to_string_lossy().into_owned();
+        assert!(name.starts_with("report.") && !name.ends_with("part"), "expected no temporary file, got {name}");
+    }
 }
 
 #[test]
 fn writes_all_report_files_and_reads_them_back() {
-    let report = report(0.0);
+    let report = measure(0.0);
     assert!(report.passed(), "{:?}", report.failed);
     let folder = tempfile::tempdir().expect("expected a folder");
     let out = folder.path().join("new");
-    report.write(&out).expect("written");
+    report.write(&out).expect("expected a report file");
     let read = |name: &str| std::fs::read(out.join(name)).expect(name);
     let json: serde_json::Value = serde_json::from_slice(&read("report.json")).expect("JSON");
     assert_eq!(json["rows"].as_array().map(Vec::len), Some(8), "two loads, two variants, two caches");
@@ -95,7 +97,7 @@ fn writes_all_report_files_and_reads_them_back() {
 
 #[test]
 fn inaccurate_variant_fails_report_and_is_not_timed() {
-    let report = report(0.01);
+    let report = measure(0.01);
     assert!(!report.passed());
     assert_eq!(report.failed.len(), 2);
     assert!(report.failed[0].starts_with("plant-2: inaccurate: "), "{:?}", report.failed);
@@ -114,7 +116,7 @@ fn variant_that_cannot_be_created_fails_report() {
         }
     }
     let report =
-        deform(&request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &BrokenTarget, |_| Ok(()))
+        deform(&report_options(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &BrokenTarget, |_| Ok(()))
             .expect("expected a report");
     assert_eq!(report.failed, ["c: lost: kernel: expected one that compiles, got none"]);
     assert!(plot::render_png(&plot::draw_svg(&report)).is_ok(), "an empty plot is still a plot");
@@ -131,8 +133,10 @@ fn unavailable_variant_is_skipped_without_failing_report() {
         }
     }
     let report =
-        deform(&request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &UnavailableTarget, |_| Ok(()))
-            .expect("expected a report");
+        deform(&report_options(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &UnavailableTarget, |_| {
+            Ok(())
+        })
+        .expect("expected a report");
     assert!(report.passed() && report.rows[0].is_skipped && !report.rows[0].passed);
     assert!(report.rows[0].faults[0].contains("not found"), "{:?}", report.rows[0].faults);
 }
@@ -180,27 +184,30 @@ fn overlap_fails_report_only_when_vertices_differ() {
     }
     let report_with = |differing, variants: &[&str]| {
         let variants = variants.iter().map(|name| (*name).to_owned()).collect();
-        let request =
-            DeformReportOptions { variants, ..request(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]) };
-        deform(&request, &OverlapTarget { differing }, |_| Ok(())).expect("expected a report")
+        let report_options = DeformReportOptions {
+            variants,
+            ..report_options(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)])
+        };
+        deform(&report_options, &OverlapTarget { differing }, |_| Ok(())).expect("expected a report")
     };
     assert_eq!(report_with(3, &[]).failed, ["c: cuda overlap: 3 steps differ"]);
-    let good = report_with(0, &["cuda overlap"]);
-    assert!(good.passed());
-    assert!(markdown::markdown(&good).contains("50.0 serially, 37.5"));
+    let passing = report_with(0, &["cuda overlap"]);
+    assert!(passing.passed());
+    assert!(markdown::markdown(&passing).contains("50.0 serially, 37.5"));
     assert_eq!(report_with(3, &["cpu*"]).loads[0].overlap, None, "the overlap is not selected");
 }
 
 #[test]
 fn user_scene_is_measured_under_its_own_name() {
-    let source = WorkloadSource::Scene { source: "tree".into(), record: None };
-    let report = deform(&request(vec![source]), &CpuTarget { error: 0.0 }, |_| Ok(())).expect("expected a report");
+    let source = WorkloadSource::Scene { source: "tree".into(), recording: None };
+    let report = deform(&report_options(vec![source]), &CpuTarget { position_error: 0.0 }, |_| Ok(()))
+        .expect("expected a report");
     assert!(report.passed(), "{:?}", report.failed);
-    assert_eq!((report.loads[0].name.as_str(), report.loads[0].recorded), ("tree", false));
+    assert_eq!((report.loads[0].name.as_str(), report.loads[0].is_recorded), ("tree", false));
     assert!(
         deform(
-            &request(vec![WorkloadSource::Scene { source: "absent".into(), record: None }]),
-            &CpuTarget { error: 0.0 },
+            &report_options(vec![WorkloadSource::Scene { source: "absent".into(), recording: None }]),
+            &CpuTarget { position_error: 0.0 },
             |_| Ok(())
         )
         .is_err()

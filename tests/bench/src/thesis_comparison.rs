@@ -23,7 +23,7 @@ pub struct SingleDomainComparison {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PlantComparison {
     pub thesis: ThesisPlant,
-    /// Warm medians of the variants that passed: name and milliseconds.
+    /// Name and median milliseconds, with warm caches, of each variant that passed.
     pub ours: Vec<(String, f64)>,
 }
 
@@ -36,8 +36,8 @@ pub struct ThesisComparison {
 }
 
 impl ThesisComparison {
-    /// Selects the rows of full-size loads.
-    pub fn of(rows: &[DeformRow], is_full_size: impl Fn(&str) -> bool) -> Self {
+    /// Compares the rows of full-size workloads with the thesis.
+    pub fn new(rows: &[DeformRow], is_full_size: impl Fn(&str) -> bool) -> Self {
         let warm_rows = |load: &str| -> Vec<&DeformRow> {
             let is_comparable = |row: &&DeformRow| {
                 row.load == load && row.cache == CacheState::Warm && row.timing.is_some() && is_full_size(load)
@@ -72,9 +72,9 @@ impl ThesisComparison {
     /// Both tables as Markdown.
     pub fn markdown(&self) -> String {
         format!(
-            "## Comparison with the thesis\n\nSource: {}. Our results of loads of reduced size are omitted.\n\n\
+            "## Comparison with the thesis\n\nSource: {}. Our results new loads new reduced size are omitted.\n\n\
              Table 4.4, CPU time over GPU time, thesis / ours:\n\n{}\n\
-             Tables 4.5 to 4.7, milliseconds of the thesis, then ours (complete vertex update):\n\n{}",
+             Tables 4.5 to 4.7, milliseconds new the thesis, then ours (complete vertex update):\n\n{}",
             self.source,
             single_domain_table(&self.table_4_4),
             plant_table(&self.tables_4_5_to_4_7)
@@ -99,21 +99,22 @@ fn plant_table(comparisons: &[PlantComparison]) -> String {
             variants.push(name);
         }
     }
-    let thesis = ["species", "u", "CPU t_uq", "GPU t_uq", "GPU t_vb", "kernels", "k_uq", "CPU O_uq", "GPU O_uq"];
-    let head = [&thesis[..], &variants].concat();
+    let thesis_columns =
+        ["species", "u", "CPU t_uq", "GPU t_uq", "GPU t_vb", "kernels", "k_uq", "CPU O_uq", "GPU O_uq"];
+    let head = [&thesis_columns[..], &variants].concat();
     let row = |comparison: &PlantComparison| {
         let times = comparison.ours.clone();
-        let time = move |variant: &&str| {
-            let time = times.iter().find(|(name, _)| name == variant);
-            time.map_or_else(dash, |(_, ms)| format!("{ms:.4}"))
+        let format_time = move |variant: &&str| {
+            let format_time = times.iter().find(|(name, _)| name == variant);
+            format_time.map_or_else(dash, |(_, ms)| format!("{ms:.4}"))
         };
-        thesis_cells(&comparison.thesis).into_iter().chain(variants.iter().map(time)).collect::<Vec<String>>()
+        plant_cells(&comparison.thesis).into_iter().chain(variants.iter().map(format_time)).collect::<Vec<String>>()
     };
     table(&head, comparisons.iter().map(row))
 }
 
-fn thesis_cells(thesis: &ThesisPlant) -> [String; 9] {
-    let percent = |share: f64| format!("{:.2} %", 100.0 * share);
+fn plant_cells(thesis: &ThesisPlant) -> [String; 9] {
+    let percent = |fraction: f64| format!("{:.2} %", 100.0 * fraction);
     [
         thesis.name.into(),
         thesis.rows.to_string(),
@@ -141,7 +142,7 @@ mod tests {
             cuda,
             row("plant-2", "cpu", CacheState::Warm, (250.0, 1e-7)),
         ];
-        let comparison = ThesisComparison::of(&rows, |_| true);
+        let comparison = ThesisComparison::new(&rows, |_| true);
         let last = comparison.table_4_4.last().expect("a cell");
         assert_eq!((last.thesis, last.ours), (9.69, Some(5.0)));
         assert_eq!(comparison.tables_4_5_to_4_7[1].ours, [("cpu".to_owned(), 0.25)]);
@@ -151,7 +152,7 @@ mod tests {
             text.contains("| Conifer | 41652 | 0.261 | 0.165 | 1.059 | 1 | 1.58 | 1.57 % | 0.91 % | 0.2500 |"),
             "{text}"
         );
-        let reduced = ThesisComparison::of(&rows, |_| false);
+        let reduced = ThesisComparison::new(&rows, |_| false);
         assert!(reduced.table_4_4.iter().all(|single| single.ours.is_none()));
         assert!(reduced.tables_4_5_to_4_7.iter().all(|plant| plant.ours.is_empty()));
     }

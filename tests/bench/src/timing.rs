@@ -11,10 +11,10 @@ use modalcast_model::error::Result;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum CacheState {
-    /// The previous step's data.
+    /// The caches hold data of the previous step.
     Warm,
-    /// No data of the step: a buffer larger than the last-level cache was written before. On a GPU, it was read, so that
-    /// the step does not pay for writing back dirty lines.
+    /// The caches hold no data of the step, because a buffer larger than the last-level cache was written before. On a
+    /// GPU, the buffer was read instead, so that the step does not write back dirty lines.
     Cold,
 }
 
@@ -41,8 +41,8 @@ pub struct Timing {
 pub const MIN_REPETITIONS: usize = 20;
 /// Time limit in seconds, after which no repetition beyond [`MIN_REPETITIONS`] starts.
 const TIME_BUDGET_S: f64 = 5.0;
-/// Minimum size of the sweep in bytes, also for machines that do not report their caches.
-const SWEEP: usize = 64 << 20;
+/// Minimum size of the buffer that evicts the caches. It also holds for machines that do not report their cache sizes.
+const MIN_FLUSH_BYTES: usize = 64 << 20;
 
 impl Timing {
     /// Median and quartiles of times in microseconds, in any order; `None` when there are none.
@@ -64,65 +64,67 @@ impl Timing {
         replays: usize,
         mut step: impl FnMut(usize) -> Result<()>,
     ) -> Result<Option<Self>> {
-        let mut sweep = (cache == CacheState::Cold).then(CacheFlush::new);
+        let mut cache_flush = (cache == CacheState::Cold).then(CacheFlush::new);
         step(0)?;
         let (start, mut times) = (Instant::now(), Vec::new());
         for replay in 0..replays.max(MIN_REPETITIONS) {
             if replay >= MIN_REPETITIONS && start.elapsed().as_secs_f64() > TIME_BUDGET_S {
                 break;
             }
-            if let Some(sweep) = &mut sweep {
-                sweep.run();
+            if let Some(cache_flush) = &mut cache_flush {
+                cache_flush.evict();
             }
-            let begin = Instant::now();
+            let step_start = Instant::now();
             step(1 + replay)?;
-            times.push(begin.elapsed().as_secs_f64() * 1e6);
+            times.push(step_start.elapsed().as_secs_f64() * 1e6);
         }
         Ok(Self::of(times))
     }
 }
 
-/// Quantile of numbers in any order, which are reordered: the median for a `share` of 0.5, the first quartile for 0.25.
+/// Quantile of numbers, which are reordered: the median for a `fraction` of 0.5, the first quartile for 0.25.
 /// Interpolates linearly between neighbors; `None` without numbers.
-pub fn quantile(numbers: &mut [f64], share: f64) -> Option<f64> {
-    let place = share * numbers.len().checked_sub(1)? as f64;
-    let (_, below, rest) = numbers.select_nth_unstable_by(place.floor() as usize, f64::total_cmp);
-    let above = rest.iter().copied().min_by(f64::total_cmp).unwrap_or(*below);
-    // Without a fraction the next number has no weight; it may be infinite.
-    Some(if place.fract() == 0.0 { *below } else { *below + (above - *below) * place.fract() })
+pub fn quantile(numbers: &mut [f64], fraction: f64) -> Option<f64> {
+    let position = fraction * numbers.len().checked_sub(1)? as f64;
+    let (_, lower, upper_numbers) = numbers.select_nth_unstable_by(position.floor() as usize, f64::total_cmp);
+    let upper = upper_numbers.iter().copied().min_by(f64::total_cmp).unwrap_or(*lower);
+    // At a whole position, the upper neighbor has no weight. It may be infinite, and 0 times infinity is NaN.
+    Some(if position.fract() == 0.0 { *lower } else { *lower + (upper - *lower) * position.fract() })
 }
 
-/// A buffer larger than the caches.
+/// A buffer of 64-bit words that is larger than the caches.
 struct CacheFlush(Vec<u64>);
 
 impl CacheFlush {
     fn new() -> Self {
-        // Every socket has its own last-level cache; twice its size, but at least [`SWEEP`], is enough in practice.
-        Self(vec![1; (2 * largest_cache()).max(SWEEP) / 8])
+        // Every socket has its own last-level cache, so the buffer is larger than that of one socket.
+        Self(vec![1; (2 * last_level_cache_bytes()).max(MIN_FLUSH_BYTES) / 8])
     }
 
-    /// Writes the whole buffer from all cores.
-    fn run(&mut self) {
-        let each = self.0.len().div_ceil(4 * rayon::current_num_threads()).max(1);
-        self.0.par_chunks_mut(each).for_each(|part| part.iter_mut().for_each(|word| *word = word.wrapping_add(1)));
+    /// Evicts other data from the caches by writing the whole buffer from all cores.
+    fn evict(&mut self) {
+        let chunk_length = self.0.len().div_ceil(4 * rayon::current_num_threads()).max(1);
+        self.0
+            .par_chunks_mut(chunk_length)
+            .for_each(|chunk| chunk.iter_mut().for_each(|word| *word = word.wrapping_add(1)));
     }
 }
 
 /// Bytes of the last-level cache according to Linux; 0 on other systems.
-fn largest_cache() -> usize {
-    let size = |index: usize| {
+fn last_level_cache_bytes() -> usize {
+    let cache_bytes = |index: usize| {
         let path = format!("/sys/devices/system/cpu/cpu0/cache/index{index}/size");
         let text = std::fs::read_to_string(path).ok()?;
         let text = text.trim();
-        let (number, unit) = text.split_at(text.find(|letter: char| !letter.is_ascii_digit()).unwrap_or(text.len()));
-        let unit = match unit {
+        let (number, suffix) = text.split_at(text.find(|letter: char| !letter.is_ascii_digit()).unwrap_or(text.len()));
+        let factor = match suffix {
             "K" => 1 << 10,
             "M" => 1 << 20,
             _ => 1,
         };
-        Some(number.parse::<usize>().ok()? * unit)
+        Some(number.parse::<usize>().ok()? * factor)
     };
-    (0..8).filter_map(size).max().unwrap_or(0)
+    (0..8).filter_map(cache_bytes).max().unwrap_or(0)
 }
 
 #[cfg(test)]
@@ -130,15 +132,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn median_and_quartiles_of_five_numbers_are_exact() {
-        let timing = Timing::of(vec![5.0, 1.0, 4.0, 2.0, 3.0]).expect("five");
+    fn median_and_quartiles_are_exact() {
+        let timing = Timing::of(vec![5.0, 1.0, 4.0, 2.0, 3.0]).expect("expected a timing");
         assert_eq!((timing.q1_us, timing.median_us, timing.q3_us, timing.replays), (2.0, 3.0, 4.0, 5));
         assert_eq!(Timing::of(vec![1.0, 2.0]).map(|timing| timing.median_us), Some(1.5));
         assert_eq!(Timing::of(vec![]), None);
-        let even = Timing::of(vec![4.0, 1.0, 2.0, 3.0]).expect("four");
-        assert_eq!(even, Timing { median_us: 2.5, q1_us: 1.75, q3_us: 3.25, replays: 4 });
-        let one = Timing::of(vec![7.0]).expect("one");
-        assert_eq!((one.q1_us, one.median_us, one.q3_us), (7.0, 7.0, 7.0));
+        let of_four = Timing::of(vec![4.0, 1.0, 2.0, 3.0]).expect("expected a timing");
+        assert_eq!(of_four, Timing { median_us: 2.5, q1_us: 1.75, q3_us: 3.25, replays: 4 });
+        let of_one = Timing::of(vec![7.0]).expect("expected a timing");
+        assert_eq!((of_one.q1_us, of_one.median_us, of_one.q3_us), (7.0, 7.0, 7.0));
     }
 
     #[test]
@@ -148,15 +150,16 @@ mod tests {
 
     #[test]
     fn times_at_least_20_runs_after_one_warm_up() {
-        for (cache, replays, want) in [(CacheState::Warm, 3, 20), (CacheState::Warm, 31, 31), (CacheState::Cold, 1, 20)]
+        for (cache, replays, expected) in
+            [(CacheState::Warm, 3, 20), (CacheState::Warm, 31, 31), (CacheState::Cold, 1, 20)]
         {
-            let mut runs = Vec::new();
-            let timing = Timing::by_wall_clock(cache, replays, |run| {
-                runs.push(run);
+            let mut repetitions = Vec::new();
+            let timing = Timing::by_wall_clock(cache, replays, |repetition| {
+                repetitions.push(repetition);
                 Ok(())
             });
-            assert_eq!(timing.expect("timed").map(|timing| timing.replays), Some(want));
-            assert_eq!(runs, (0..=want).collect::<Vec<_>>());
+            assert_eq!(timing.expect("expected a timing").map(|timing| timing.replays), Some(expected));
+            assert_eq!(repetitions, (0..=expected).collect::<Vec<_>>());
         }
     }
 

@@ -1,4 +1,4 @@
-//! Validation: the errors of all variants of one load, over random seeds and step by step along a trajectory.
+//! Validation: measures the errors of all variants of one workload at random states and along a trajectory.
 
 use std::ops::Range;
 use std::sync::{Arc, OnceLock};
@@ -22,17 +22,17 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::Error;
 use modalcast_model::scene::{Camera, DeformationSettings, NormalMethod, Scene, SceneState};
 
-/// Number of seeds for which the error is split into its sources. Each split takes five evaluations in f64.
+/// Number of random states for which the error is split into its sources. Each split takes five evaluations in f64.
 const SPLIT_SEEDS: usize = 4;
 
-/// Condition numbers of the modal sums of a load: sum |U q| / |u| per vertex.
+/// Condition numbers sum |U q| / |u| of the vertices of a workload.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct ConditionNumbers {
     /// Largest finite condition number.
     pub largest: f64,
     /// Median over the states of the median over the vertices that have modes.
     pub median: f64,
-    /// Number of vertices over all states whose nonzero terms sum to exactly zero.
+    /// Number of vertices, over all states, whose nonzero terms have the sum 0.
     pub infinite: u64,
 }
 
@@ -45,11 +45,11 @@ pub struct ValidationResult {
     pub step_meters: ErrorNorms,
     pub sources: ErrorSources,
     pub orientation: OrientationErrors,
-    /// Whether the same state gives bit-identical results when it is evaluated again.
+    /// Whether a second evaluation of the same state gives bit-identical results.
     pub repeatable: bool,
     /// Reasons why the variant failed; empty when it passed.
     pub faults: Vec<String>,
-    /// Whether the variant was skipped because something that it needs is unavailable on this machine.
+    /// Whether the variant was skipped because the machine lacks something.
     #[serde(rename = "left_out")]
     pub is_skipped: bool,
 }
@@ -101,7 +101,7 @@ struct Directions {
     tangents: Vec<[f64; 4]>,
 }
 
-/// The scenes that define the correct directions.
+/// The scenes that define the reference normals and tangents.
 struct NormalScenes<'a> {
     rigid: &'a Scene,
     /// The same scene with exact normals of the deformed surface; `None` when it has no modes or no normals.
@@ -134,8 +134,8 @@ impl<'a> StateSample<'a> {
         }
     }
 
-    /// Reference directions: by T alone, or, if `exact`, of the deformed surface. Computed at the first call and
-    /// cached.
+    /// Reference normals and tangents: rotated by T or, if `exact`, those of the deformed surface. The first call
+    /// computes and caches them.
     fn directions(&self, exact: bool) -> &Directions {
         match exact {
             true => self.exact.get_or_init(|| {
@@ -156,38 +156,38 @@ impl<'a> StateSample<'a> {
     }
 }
 
-/// Maximum number of vertices plus corners of the states that are evaluated together. A vertex takes 40 bytes and a
-/// corner up to 112.
+/// Maximum number of vertices plus corners of a group of states. A vertex takes 40 bytes and a corner up to 112.
 const MAX_GROUP_ITEMS: usize = 1 << 24;
 
 /// Validates the variants at `seeds` random states and at no more than `steps` states of the trajectory, at every
 /// vertex and corner. The reference values are computed once for all variants, in parallel over several states.
 pub fn validate(
-    load: &Workload,
+    workload: &Workload,
     motion: &WorkloadMotion,
     variants: &mut [Box<dyn Variant>],
     (seeds, steps): (usize, usize),
 ) -> (Vec<ValidationResult>, ConditionNumbers) {
-    let camera = Camera::fit_to_scene(&load.scene, IMAGE_SIZE.0, IMAGE_SIZE.1);
-    let error_scale = ErrorScale::new(&load.scene, &camera);
-    let truth =
+    let camera = Camera::fit_to_scene(&workload.scene, IMAGE_SIZE.0, IMAGE_SIZE.1);
+    let error_scale = ErrorScale::new(&workload.scene, &camera);
+    let exact_state =
         |index: usize| if index < seeds { motion.random_state(index) } else { motion.trajectory_state(index - seeds) };
-    let count = seeds + motion.steps().min(steps);
-    let states: Vec<SceneState> = (0..count).into_par_iter().map(|index| truth(index).state()).collect();
+    let state_count = seeds + motion.steps().min(steps);
+    let states: Vec<SceneState> = (0..state_count).into_par_iter().map(|index| exact_state(index).state()).collect();
     let mut checks: Vec<VariantCheck<'_>> =
         variants.iter_mut().map(|variant| VariantCheck::new(variant.as_mut(), &states)).collect();
-    let (scenes, mut conditions) = (NormalScenes::new(load), ConditionAccumulator::default());
-    // Which directions the variants needed at the first state. For the other states these are computed beforehand, in
-    // parallel.
-    let mut is_needed = [false; 2];
-    for group in groups(count, load.scene.layout.vertices + load.scene.layout.corners) {
+    let (scenes, mut conditions) = (NormalScenes::new(workload), ConditionAccumulator::default());
+    // Whether the variants needed rigid and exact directions at the first state. If so, they are computed in parallel
+    // for the groups of other states.
+    let mut needs_directions = [false; 2];
+    for group in group_states(state_count, workload.scene.layout.vertices + workload.scene.layout.corners) {
         let evaluate = |index: usize| {
             let sample = StateSample::new(&scenes, index, &states[index], index >= seeds);
-            for exact in [false, true].into_iter().filter(|exact| is_needed[usize::from(*exact)]) {
+            for exact in [false, true].into_iter().filter(|exact| needs_directions[usize::from(*exact)]) {
                 sample.directions(exact);
             }
-            let is_split = index < SPLIT_SEEDS.min(seeds);
-            let error_sources = is_split.then(|| SharedErrorSources::new(&load.scene, truth(index), &states[index]));
+            let has_error_sources = index < SPLIT_SEEDS.min(seeds);
+            let error_sources =
+                has_error_sources.then(|| SharedErrorSources::new(&workload.scene, exact_state(index), &states[index]));
             StateSample { error_sources, ..sample }
         };
         let samples: Vec<StateSample<'_>> = group.into_par_iter().map(evaluate).collect();
@@ -196,7 +196,7 @@ pub fn validate(
             checks.iter_mut().for_each(|check| check.add_sample(&error_scale, &sample));
             if sample.index == 0 {
                 let exact = checks.iter().any(|check| check.has_exact_normals());
-                is_needed = [sample.rigid.get().is_some(), exact];
+                needs_directions = [sample.rigid.get().is_some(), exact];
             }
         }
     }
@@ -204,10 +204,10 @@ pub fn validate(
     (checks.into_iter().map(|check| check.result(&error_scale)).collect(), conditions.finish())
 }
 
-/// Splits states 0 to `count` into groups that are evaluated together. The first state is its own group, because it
-/// shows which directions the others need.
-fn groups(count: usize, items: usize) -> impl Iterator<Item = Range<usize>> {
-    let group_size = (MAX_GROUP_ITEMS / items.max(1)).clamp(1, rayon::current_num_threads());
+/// Splits states 0 to `count` into groups that are evaluated together. The first state is a group of its own, because
+/// it shows which directions the other states need.
+fn group_states(count: usize, items_per_state: usize) -> impl Iterator<Item = Range<usize>> {
+    let group_size = (MAX_GROUP_ITEMS / items_per_state.max(1)).clamp(1, rayon::current_num_threads());
     let rest = (1..count).step_by(group_size).map(move |first| first..count.min(first + group_size));
     std::iter::once(0..count.min(1)).chain(rest)
 }
@@ -402,13 +402,13 @@ mod tests {
     use modalcast_model::scene::StorageType;
 
     fn validate_cpu(kind: WorkloadKind, error: f32) -> (ValidationResult, ConditionNumbers) {
-        let load = kind.build(Size::Quick).expect("expected a load");
-        let label = VariantLabel::new("cpu", Backend::Cpu, &load.scene);
-        let cpu = DeformerVariant::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
+        let workload = kind.build(Size::Quick).expect("expected a load");
+        let label = VariantLabel::new("cpu", Backend::Cpu, &workload.scene);
+        let cpu = DeformerVariant::new(label, &workload.scene, Box::new(CpuDeformer::new(&workload.scene)));
         let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(InaccurateVariant::new(cpu, error))];
-        let motion = WorkloadMotion::new(&load, None);
-        let (mut found, condition) = validate(&load, &motion, &mut variants, (4, usize::MAX));
-        (found.remove(0), condition)
+        let motion = WorkloadMotion::new(&workload, None);
+        let (mut results, condition) = validate(&workload, &motion, &mut variants, (4, usize::MAX));
+        (results.remove(0), condition)
     }
 
     #[test]
@@ -446,15 +446,15 @@ mod tests {
 
     /// Validates an emulated deformer that applies one deformation and declares another, which gives its bounds.
     fn emulate(applied: DeformationSettings, declared: DeformationSettings) -> ValidationResult {
-        let load = WorkloadKind::ManyDomains.build(Size::Quick).expect("expected a load");
+        let workload = WorkloadKind::ManyDomains.build(Size::Quick).expect("expected a load");
         let [applied_scene, declared_scene] = [applied, declared]
-            .map(|deformation| with_deformation(&load.scene, deformation).expect("expected a scene"));
+            .map(|deformation| with_deformation(&workload.scene, deformation).expect("expected a scene"));
         let label = VariantLabel::new("emulated", Backend::Cpu, &declared_scene);
         let (applied, declared) = (ErrorModel::of(&applied_scene), ErrorModel::of(&declared_scene));
         let emulated =
             EmulatedVariant { label, scene: declared_scene, applied, declared, surface: DeformedSurface::default() };
         let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(emulated)];
-        validate(&load, &WorkloadMotion::new(&load, None), &mut variants, (3, usize::MAX)).0.remove(0)
+        validate(&workload, &WorkloadMotion::new(&workload, None), &mut variants, (3, usize::MAX)).0.remove(0)
     }
 
     #[test]

@@ -34,23 +34,22 @@ pub trait Variant {
     /// The scene with this variant's deformation, which defines the correct normals.
     fn scene(&self) -> &Arc<Scene>;
 
-    /// The error model: what the variant replaces in x = T (x0 + U q). It gives the a-priori bound.
+    /// The variant's approximations in x = T (x0 + U q), which determine the a-priori bound.
     fn error_model(&self) -> &ErrorModel;
 
     /// Minimum memory traffic of a step per operand.
     fn traffic(&self) -> Vec<Operand>;
 
-    /// Receives all states that [`Self::surface`] will be called with.
+    /// Prepares for all states that [`Self::surface`] will receive.
     ///
     /// # Errors
-    /// `Fault` when the device fails; `Unavailable` when something that the variant needs is missing; other errors of
-    /// its construction.
+    /// `Fault` when the device fails; `Unavailable` when the machine lacks something; errors of creating a benchmark.
     fn prepare(&mut self, _states: &[SceneState]) -> Result<()> {
         Ok(())
     }
 
-    /// Deforms to `state`, which is the prepared state of this index. Normals and tangents are empty when the variant
-    /// computes none.
+    /// Deforms to `state`, which was passed to [`Self::prepare`] at this index. Normals and tangents are empty when the
+    /// variant computes none.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -87,7 +86,7 @@ impl DeformerVariant {
         Self::with_error_model(label, scene, ErrorModel::of(scene), deformer)
     }
 
-    /// Wraps a deformer whose error model exists.
+    /// Wraps a deformer with an error model that was created before.
     pub fn with_error_model(
         label: VariantLabel,
         scene: &Arc<Scene>,
@@ -112,7 +111,7 @@ impl Variant for DeformerVariant {
     }
 
     fn traffic(&self) -> Vec<Operand> {
-        memory_traffic::of_scene(&self.scene)
+        memory_traffic::minimum_traffic(&self.scene)
     }
 
     fn surface(&mut self, _state_index: usize, state: &SceneState) -> Result<&DeformedSurface> {
@@ -122,7 +121,7 @@ impl Variant for DeformerVariant {
     }
 
     fn time(&mut self, states: &[SceneState], cache: CacheState, replays: usize) -> Result<Option<Timing>> {
-        // The cache flush evicts the caches of the CPU, not those of a device.
+        // The flush evicts the caches of the CPU but not those of a device.
         if cache == CacheState::Cold && self.label.backend == Backend::Cuda {
             return Ok(None);
         }

@@ -66,7 +66,7 @@ pub struct Overlap {
 ///
 /// # Errors
 /// `Invalid` without states or steps; errors of creating a deformer; `Fault` when the device fails.
-pub fn overlap(device: &Arc<Device>, load: &Workload, states: &[SceneState], steps: usize) -> Result<Overlap> {
+pub fn measure_overlap(device: &Arc<Device>, load: &Workload, states: &[SceneState], steps: usize) -> Result<Overlap> {
     if states.is_empty() || steps == 0 {
         return Err(invalid("states and steps", "at least 1", format!("{} and {steps}", states.len())));
     }
@@ -272,7 +272,7 @@ pub struct HostWrite {
 ///
 /// # Errors
 /// `Invalid` when `replays` is 0; `Fault` when the driver cannot allocate memory.
-pub fn host_writes(device: &Device, replays: usize) -> Result<Vec<HostWrite>> {
+pub fn time_host_writes(device: &Device, replays: usize) -> Result<Vec<HostWrite>> {
     const MAX_BYTES: usize = 64 << 20;
     let mut staging = PinnedBuffer::<f32>::zeroed(device, MAX_BYTES / 4, PinnedUse::ToDevice)?;
     let dst = staging.as_mut_slice()?;

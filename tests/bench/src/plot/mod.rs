@@ -112,7 +112,7 @@ pub fn render_png(svg: &str) -> Result<Vec<u8>> {
 /// front.
 fn row_point(row: &DeformRow) -> Option<Point<'_>> {
     let is_filled = row.cache == CacheState::Warm;
-    let (time_us, error) = row.point()?;
+    let (time_us, error) = row.time_and_error()?;
     Some(Point { name: &row.name, time_us, error, is_filled, is_candidate: is_filled && !is_partial(&row.name) })
 }
 

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::axis::{self, Axis};
 use super::{PANEL_SIZE, write_text};
-use crate::table::pareto;
+use crate::table::pareto_front;
 use modalcast_model::deform::Backend;
 
 /// Margins of the plotted area for axis labels and the title.
@@ -124,7 +124,7 @@ impl<'a> Panel<'a> {
         let candidates: Vec<usize> = (0..self.points.len()).filter(|index| self.points[*index].is_candidate).collect();
         let points: Vec<(f64, f64)> =
             candidates.iter().map(|index| (self.points[*index].time_us, self.points[*index].error)).collect();
-        pareto(&points).into_iter().map(|index| candidates[index]).collect()
+        pareto_front(&points).into_iter().map(|index| candidates[index]).collect()
     }
 
     /// The plotted area within the margins.

@@ -77,7 +77,7 @@ pub fn time_scenes(options: &FrameTimeOptions, mut progress: impl FnMut(&str)) -
         files.push(file);
     }
     let renderer = harness.renderer.info().clone();
-    Ok(FrameTimeReport { provenance: Provenance::here(), renderer, size: options.size, scenes, files })
+    Ok(FrameTimeReport { provenance: Provenance::collect(), renderer, size: options.size, scenes, files })
 }
 
 fn time_scene(

@@ -220,7 +220,8 @@ pub fn render(options: &RenderReportOptions, mut progress: impl FnMut(&str)) -> 
     }
     let failed = rows.iter().filter(|row: &&RenderRow| !row.is_as_expected()).map(describe_failure);
     let failed = failed.chain(raster.iter().filter_map(RasterComparison::describe_fault)).collect();
-    let (provenance, renderer, bounds) = (Provenance::here(), harness.renderer.info().clone(), variants::ERROR_LIMITS);
+    let (provenance, renderer, bounds) =
+        (Provenance::collect(), harness.renderer.info().clone(), variants::ERROR_LIMITS);
     let blurs = BlurComparison::pair_rows(&rows);
     let size = options.size;
     Ok(RenderReport {

@@ -66,5 +66,5 @@ pub fn compare_rasterizers(options: &RenderReportOptions, mut progress: impl FnM
     let rows = raster_comparison::measure(&mut harness, &device, options, &mut progress)?;
     let frames = frame_comparison::measure(&mut harness, &device, options, &mut progress)?;
     let renderer = harness.renderer.info().clone();
-    Ok(RasterReport { provenance: Provenance::here(), renderer, size: options.size, rows, frames })
+    Ok(RasterReport { provenance: Provenance::collect(), renderer, size: options.size, rows, frames })
 }

@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use modalcast_bench::kernels::{
-    CublasBenchmark, CublasMethod, KernelBenchmark, KernelSplit, Part, ThesisBenchmark, empty_replay, roofs, time,
+    CublasBenchmark, CublasMethod, KernelBenchmark, KernelSplit, Part, ThesisBenchmark, empty_replay,
+    measure_bandwidth, time,
 };
 use modalcast_bench::timing::CacheState;
 use modalcast_compute::gpu::Device;
@@ -17,7 +18,7 @@ use crate::scenes;
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_memory_rates_are_plausible_and_empty_replay_takes_time() {
     let device = Device::open(0).expect("expected a CUDA device");
-    let bandwidths = roofs(&device).expect("memory bandwidths");
+    let bandwidths = measure_bandwidth(&device).expect("memory bandwidths");
     eprintln!("{}: {bandwidths:?}", device.name());
     assert!(
         bandwidths.copy_gbs > 20.0 && bandwidths.pinned_h2d_gbs > 1.0 && bandwidths.pinned_d2h_gbs > 1.0,

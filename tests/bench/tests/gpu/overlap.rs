@@ -1,6 +1,6 @@
 //! Steps with readback of the vertices, serial and overlapped.
 
-use modalcast_bench::kernels::{host_writes, overlap};
+use modalcast_bench::kernels::{measure_overlap, time_host_writes};
 use modalcast_bench::workloads::Workload;
 use modalcast_compute::gpu::Device;
 use modalcast_model::scene::SceneState;
@@ -17,7 +17,7 @@ fn gpu_overlapped_steps_are_faster_with_identical_vertices() {
     );
     let states: Vec<SceneState> = (0..4).map(|seed| scenes::random_state(&scene, seed)).collect();
     let workload = Workload::new("overlap".to_owned(), scene);
-    let measurement = overlap(&device, &workload, &states, 50).expect("a measurement");
+    let measurement = measure_overlap(&device, &workload, &states, 50).expect("a measurement");
     eprintln!("{measurement:#?}");
     assert_eq!(measurement.differing, 0);
     let times = [
@@ -38,8 +38,11 @@ fn gpu_overlapped_steps_are_faster_with_identical_vertices() {
         measurement.overlapped_us > 0.5 * measurement.ideal_us,
         "expected steps to take at least half of the ideal time"
     );
-    assert!(overlap(&device, &workload, &[], 5).is_err() && overlap(&device, &workload, &states, 0).is_err());
-    for write in host_writes(&device, 20).expect("measured writes") {
+    assert!(
+        measure_overlap(&device, &workload, &[], 5).is_err()
+            && measure_overlap(&device, &workload, &states, 0).is_err()
+    );
+    for write in time_host_writes(&device, 20).expect("measured writes") {
         eprintln!("{write:?}");
     }
 }

@@ -86,7 +86,7 @@ pub fn draw_figures(options: &FigureOptions, mut progress: impl FnMut(&str)) -> 
         draw_user_scene(&mut renderer, source)?;
     }
     let FigureRenderer { harness, size, figures, files } = renderer;
-    Ok(Figures { provenance: Provenance::here(), renderer: harness.renderer.info().clone(), size, figures, files })
+    Ok(Figures { provenance: Provenance::collect(), renderer: harness.renderer.info().clone(), size, figures, files })
 }
 
 /// The renderer and the figures drawn so far.

@@ -26,7 +26,7 @@ const EMPTY_REPLAYS: usize = 200;
 
 /// Measured peak bandwidths of the device.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Roofs {
+pub struct DeviceBandwidth {
     /// Best copy kernel, GB/s (1e9 bytes), read plus written.
     pub copy_gbs: f64,
     /// Best pure read, GB/s.
@@ -43,7 +43,7 @@ pub struct Roofs {
 ///
 /// # Errors
 /// `Unavailable` when NVRTC is missing; `Fault` when the device fails or `copy` does not copy.
-pub fn roofs(device: &Device) -> Result<Roofs> {
+pub fn measure_bandwidth(device: &Device) -> Result<DeviceBandwidth> {
     let (free, _) = device.memory()?;
     let max_tile_bytes = tile_bytes(16);
     let bytes = (MAX_BUFFER.min(free as u64 / 8) / max_tile_bytes).max(1) * max_tile_bytes;
@@ -64,7 +64,7 @@ pub fn roofs(device: &Device) -> Result<Roofs> {
     let (copy_gbs, read_gbs) = (max_bandwidth("copy", 2 * bytes)?, max_bandwidth("read", bytes)?);
     let empty_us = empty_replay(device, EMPTY_REPLAYS)?.median_us;
     let (pinned_h2d_gbs, pinned_d2h_gbs) = pinned_bandwidths(device)?;
-    Ok(Roofs { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs })
+    Ok(DeviceBandwidth { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs })
 }
 
 /// One variant of `copy` or `read`.
