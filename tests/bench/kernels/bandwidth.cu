@@ -2,7 +2,7 @@
 //   fill          writes pseudo-random words; one thread per word
 //   copy          copies `src` to `dst`: traffic is twice the size of a buffer
 //   read          reads all of `src`. A conditional store that never executes keeps the compiler from removing the loads.
-//   delay         blocks the stream for a time; one thread
+//   delay         delays the stream by a number of nanoseconds; one thread
 //   empty_kernel  does nothing; one thread
 // Launch of copy and read: BLOCK threads per block, LOADS vectors (uint4) per thread, one block per tile of BLOCK * LOADS
 // vectors; buffers are whole tiles. With STREAMING they use evict-first cache hints, otherwise the read-only cache.
@@ -30,7 +30,7 @@ __device__ void store(uint4* dst, uint4 vector) {
 #endif
 }
 
-// Index of the first vector of a thread. Its next vectors are BLOCK vectors apart, so that each load is coalesced.
+// Index of a thread's first vector. The vectors of a thread are BLOCK apart, so that each load of a warp is coalesced.
 __device__ size_t first_vector() {
     return (size_t)blockIdx.x * (BLOCK * LOADS) + threadIdx.x;
 }

@@ -9,16 +9,16 @@
 //   positions       [vertices][3] f32; domain b begins at vertex `first_vertices[b]`                     (out)
 // Launch: one block of WARPS warps per tile (tests/bench/src/kernels/batch_mma.rs). CPU twin: the tests of that file.
 //
-// The result is not bit-identical to `deform`: q keeps 22 bits (f16) or 16 (bf16), and a tensor core sums the 16
-// products of a step in its own order and with its own rounding. The launcher's bound covers both. Overflowing values
-// are not recomputed.
+// The result is not bit-identical to `deform`: q has 22 bits (f16) or 16 bits (bf16), and a tensor core sums the 16
+// products of a step in an order and with a rounding of its own. The a-priori bound covers both. Overflowing values are
+// not recomputed.
 //
-// Design. The U of a quad and a chunk is 12 rows (axis, vertex) of two modes. The fragment that mma.m16n8k16 takes from
-// a lane is rows g and g + 8 at columns 2 t + {0, 1} and 2 t + {8, 9}, with g = lane / 4 and t = lane % 4. The
-// assignment of rows and modes to these indices is free: a lane takes quad g and chunks t and t + 4, which are six
-// loads of 16 bytes in whole lines of 128, and has the fragments of six products after two byte permutations per
-// register. U does not pass through shared memory. The result is all 12 sums of quad g for a quarter of the domains, so
-// a lane computes the positions of whole vertices. The sums of 16 vectors, two steps of U and q take 160 registers: 12 warps per
+// Design. The U of a quad and a chunk has 12 rows (axis, vertex) of two modes. For mma.m16n8k16, a lane provides rows g
+// and g + 8 at columns 2 t + {0, 1} and 2 t + {8, 9}, with g = lane / 4 and t = lane % 4. Rows and modes may be assigned
+// to these indices in any way. Here a lane takes quad g and chunks t and t + 4. It loads them with six loads of 16 bytes,
+// in whole lines of 128 bytes, and forms the fragments of six products with two byte permutations per register. U does
+// not pass through shared memory. A lane receives all 12 sums of quad g for a quarter of the domains, so it computes the
+// positions of whole vertices. The sums of 16 domains, two steps of U, and q take 160 registers. This allows 12 warps per
 // multiprocessor, with 72 KB in flight.
 #if defined(STORE_BF16)
 #define OPERANDS "bf16.bf16"
@@ -39,13 +39,13 @@ constexpr unsigned MIN_BLOCKS_PER_SM = 3;
 constexpr unsigned MAX_DOMAINS = 32;
 constexpr unsigned GROUPS = BATCH_SIZE / 8; // of 8 domains
 
-// A warp covers group quads of a tile of 32; a step is group chunks of two modes.
+// A warp covers QUADS quads of a tile of 32. A step sums STEP_CHUNKS chunks of two modes.
 constexpr unsigned WARPS = 4;
 constexpr unsigned QUADS = 8;
 constexpr unsigned TILE = WARPS * QUADS;
 constexpr unsigned STEP_CHUNKS = 8;
-// float4 vectors per domain: those of its group quads of x, and the stride between domains. Two vectors of padding keep the lanes
-// of a quarter warp in different banks.
+// float4 per domain in the staging buffer: those of QUADS quads of positions, and the stride between domains. Two float4
+// of padding keep the lanes of a quarter warp in different banks.
 constexpr unsigned DOMAIN_VECTORS = 3 * QUADS;
 constexpr unsigned STRIDE = DOMAIN_VECTORS + 2;
 
@@ -76,7 +76,7 @@ struct WarpPart {
     unsigned tile_quads;   // quads of the tile
     unsigned rest_quad;    // the lane's quad of the shape
     unsigned first_vertex; // the warp's first vertex in the shape
-    unsigned numbers;      // coordinates of the warp's vertices; 0 without vertices
+    unsigned coordinates;      // coordinates of the warp's vertices; 0 without vertices
 };
 
 // A lane beyond the last quad reads that quad again; its results are not stored.
@@ -88,7 +88,7 @@ __device__ __forceinline__ WarpPart warp_part(const BatchMmaArgs& args) {
     part.words = args.words + 3 * (size_t)args.chunks * tile + quad;
     part.rest_quad = tile + quad;
     part.first_vertex = 4 * (tile + first_warp_quad);
-    part.numbers = args.vertices > part.first_vertex ? 3 * min(4 * QUADS, args.vertices - part.first_vertex) : 0;
+    part.coordinates = args.vertices > part.first_vertex ? 3 * min(4 * QUADS, args.vertices - part.first_vertex) : 0;
     return part;
 }
 
@@ -97,7 +97,7 @@ struct Chunk {
     unsigned words[12];
 };
 
-// Zeros beyond the last chunk, because NaN or infinity times a zero coordinate is not zero.
+// Loads zeros beyond the last chunk, because NaN or infinity times a zero coordinate is not zero.
 __device__ __forceinline__ void load_chunk(Chunk& chunk, const BatchMmaArgs& args, const WarpPart& part, unsigned index) {
 #pragma unroll
     for (unsigned plane = 0; plane < 3; ++plane) {
@@ -131,7 +131,7 @@ __device__ __forceinline__ void multiply(float (&sum)[4], const unsigned (&u)[4]
         : "r"(u[0]), "r"(u[1]), "r"(u[2]), "r"(u[3]), "r"(q0), "r"(q1));
 }
 
-// Adds the modes of a step. The rounding remainders of q come first, while the sums are small.
+// Adds the modes of a step to the sums. The rounding remainders of q are added first, because they are small.
 __device__ __forceinline__ void add_step(Sums& sums, const Step& step, const uint4* split_q) {
     uint4 q[GROUPS];
 #pragma unroll
@@ -186,27 +186,27 @@ __device__ __forceinline__ void stage_position(const BatchMmaArgs& args, const f
     const float x0[3][4] = {{rest[0].x, rest[0].y, rest[0].z, rest[0].w},
                             {rest[1].x, rest[1].y, rest[1].z, rest[1].w},
                             {rest[2].x, rest[2].y, rest[2].z, rest[2].w}};
-    float world[12];
+    float world_positions[12];
 #pragma unroll
     for (unsigned vertex = 0; vertex < 4; ++vertex) {
         const float x = x0[0][vertex] + u[0][vertex] * inverse_scale, y = x0[1][vertex] + u[1][vertex] * inverse_scale,
                     z = x0[2][vertex] + u[2][vertex] * inverse_scale;
-        world[3 * vertex] = transform_row(a, x, y, z);
-        world[3 * vertex + 1] = transform_row(b, x, y, z);
-        world[3 * vertex + 2] = transform_row(c, x, y, z);
+        world_positions[3 * vertex] = transform_row(a, x, y, z);
+        world_positions[3 * vertex + 1] = transform_row(b, x, y, z);
+        world_positions[3 * vertex + 2] = transform_row(c, x, y, z);
     }
 #pragma unroll
     for (unsigned i = 0; i < 3; ++i) {
-        staged[i] = make_float4(world[4 * i], world[4 * i + 1], world[4 * i + 2], world[4 * i + 3]);
+        staged[i] = make_float4(world_positions[4 * i], world_positions[4 * i + 1], world_positions[4 * i + 2], world_positions[4 * i + 3]);
     }
 }
 
-// Writes the staged positions of four domains, every second one from `domain` on: group lanes per domain, coalesced
-// into 128 bytes.
+// Writes the staged positions of four domains: `domain`, and every second one after it. Eight lanes write one domain, in
+// coalesced stores of 128 bytes.
 __device__ __forceinline__ void store_staged(const BatchMmaArgs& args, const WarpPart& part, unsigned domain,
                                       const float4* staged) {
-    const unsigned slot = lane_id() / 8;
-    domain += 2 * slot;
+    const unsigned staged_domain = lane_id() / 8;
+    domain += 2 * staged_domain;
     if (domain >= args.domains) {
         return;
     }
@@ -214,14 +214,14 @@ __device__ __forceinline__ void store_staged(const BatchMmaArgs& args, const War
 #pragma unroll
     for (unsigned i = 0; i < 3; ++i) {
         const unsigned vector = 8 * i + lane_id() % 8;
-        const float4 numbers = staged[STRIDE * slot + vector];
-        if (args.is_aligned && 4 * vector + 4 <= part.numbers) {
-            __stcs((float4*)dst + vector, numbers);
+        const float4 coordinates = staged[STRIDE * staged_domain + vector];
+        if (args.is_aligned && 4 * vector + 4 <= part.coordinates) {
+            __stcs((float4*)dst + vector, coordinates);
         } else {
-            const float components[4] = {numbers.x, numbers.y, numbers.z, numbers.w};
+            const float components[4] = {coordinates.x, coordinates.y, coordinates.z, coordinates.w};
 #pragma unroll
             for (unsigned k = 0; k < 4; ++k) {
-                if (4 * vector + k < part.numbers) {
+                if (4 * vector + k < part.coordinates) {
                     __stcs(dst + 4 * vector + k, components[k]);
                 }
             }
@@ -259,7 +259,7 @@ extern "C" __global__ void __launch_bounds__(32 * WARPS, MIN_BLOCKS_PER_SM) batc
 #if __CUDA_ARCH__ >= 800
     __shared__ float4 staged[WARPS][4 * STRIDE];
     const WarpPart part = warp_part(args);
-    if (part.numbers == 0) {
+    if (part.coordinates == 0) {
         return;
     }
     Sums sums = {};

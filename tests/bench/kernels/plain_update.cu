@@ -1,6 +1,6 @@
 // x = T (x0 + u) of every packed vertex, for a u that a library computed.
-//   slots       [domains] PlainSlot                                                                              (in)
-//   domains     [vertices] u32: the domain of each packed vertex; not read with SINGLE                           (in)
+//   domains     [domains] PlainDomain                                                                            (in)
+//   vertex_domains  [vertices] u32: the domain of each packed vertex; not read with SINGLE                       (in)
 //   rest        [vertices][3] f32                                                                                (in)
 //   transforms  [domains][3] float4: rows of T                                                                   (in)
 //   u           f32, three per vertex of a domain with modes                                                     (in)
@@ -10,16 +10,17 @@
 constexpr unsigned BLOCK = 256;
 constexpr unsigned long long RIGID = 0xffffffffffffffffull;
 
-struct PlainSlot {
+// Where the data of one domain begins.
+struct PlainDomain {
     unsigned long long first_u; // index into `u` in floats, or RIGID
-    unsigned first_vertex;      // packed
+    unsigned first_vertex;      // packed vertex
     unsigned reserved;
 };
-static_assert(sizeof(PlainSlot) == 16, "PlainSlot differs from tests/bench/src/kernels/plain_update.rs");
+static_assert(sizeof(PlainDomain) == 16, "PlainDomain differs from tests/bench/src/kernels/plain_update.rs");
 
 struct PlainArgs {
-    const PlainSlot* slots;
-    const unsigned* domains;
+    const PlainDomain* domains;
+    const unsigned* vertex_domains;
     const float* rest;
     const float4* transforms;
     const float* u;
@@ -37,13 +38,13 @@ extern "C" __global__ void __launch_bounds__(BLOCK) plain_update(const PlainArgs
 #ifdef SINGLE
     const unsigned domain = 0;
 #else
-    const unsigned domain = args.domains[vertex];
+    const unsigned domain = args.vertex_domains[vertex];
 #endif
-    const PlainSlot slot = args.slots[domain];
+    const PlainDomain plain_domain = args.domains[domain];
     const float* rest = args.rest + 3 * (size_t)vertex;
     float x = rest[0], y = rest[1], z = rest[2];
-    if (slot.first_u != RIGID) {
-        const float* u = args.u + slot.first_u + 3 * (size_t)(vertex - slot.first_vertex);
+    if (plain_domain.first_u != RIGID) {
+        const float* u = args.u + plain_domain.first_u + 3 * (size_t)(vertex - plain_domain.first_vertex);
         x += u[0];
         y += u[1];
         z += u[2];

@@ -1,10 +1,10 @@
 // BASELINE: u = U q of one domain as in chapter 3.2.1 of the thesis. For comparison only.
-//   lines   [lines][passes][32] float4: rows of U in groups of four modes; each line holds as many whole rows
-//           as fit into 32 lanes                                                                                 (in)
+//   lines   [lines][passes][32] float4: rows of U, four modes per float4; a line holds as many whole rows as
+//           fit into 32 lanes                                                                                    (in)
 //   q       [rank] f32                                                                                           (in)
 //   u       [vertices] float4, the fourth number is not written                                                  (out)
-// Launch: 256 threads per block, one warp per line, ceil(lines / 8) blocks. The text does not cover rows of more than
-// 32 float4 (rank above 128): here they take several passes, and so does equation 3.3.
+// Launch: 256 threads per block, one warp per line, ceil(lines / 8) blocks. The thesis does not cover rows of more than
+// 32 float4 (rank above 128). This kernel sums them in several passes and applies equation 3.3 to each pass.
 //
 // CPU twin: the tests of tests/bench/src/kernels/thesis/thesis_single.rs.
 constexpr unsigned LANES = 32;

@@ -1,7 +1,7 @@
 // BASELINE: the vertex update of chapter 3.2.3 of the thesis, x = T (x0 + u) and T applied to normals and tangents, for
 // the vertices of unfolded triangles. For comparison only.
-//   warps       [ceil(vertices / 64) * 8] uint4: the two domains whose vertices a warp covers, and the index of the
-//               first of its eight vertices that belongs to the second one; 8 when there is only one             (in)
+//   warps       [ceil(vertices / 64) * 8] uint4 per warp: two domains, and the first of the warp's eight vertices
+//               that belongs to the second domain, or 8 if all belong to the first one                           (in)
 //   sources     [vertices] u32: index into u, or RIGID                                                           (in)
 //   rest_*      [vertices] float4; the fourth number of a position is 1, of a direction 0; tangents with TANGENTS (in)
 //   transforms  [domains][4] float4: rows of T                                                                   (in)
@@ -42,8 +42,8 @@ extern "C" __global__ void __launch_bounds__(WARPS * LANES) thesis_update(const 
     __shared__ float rest_tangents[VERTICES][4];
 #endif
     const unsigned warp = threadIdx.x / LANES, lane = threadIdx.x % LANES;
-    const unsigned local = threadIdx.x / 4, element = lane % 4;
-    const unsigned vertex = blockIdx.x * VERTICES + local;
+    const unsigned local_vertex = threadIdx.x / 4, element = lane % 4;
+    const unsigned vertex = blockIdx.x * VERTICES + local_vertex;
     const size_t index = 4 * (size_t)vertex + element;
     const uint4 domains = args.warps[blockIdx.x * WARPS + warp];
     const unsigned domain = lane < 16 ? domains.x : domains.y;
@@ -54,19 +54,19 @@ extern "C" __global__ void __launch_bounds__(WARPS * LANES) thesis_update(const 
         if (source != RIGID) {
             position += args.u[4 * (size_t)source + element];
         }
-        rest_positions[local][element] = position;
-        rest_normals[local][element] = args.rest_normals[index];
+        rest_positions[local_vertex][element] = position;
+        rest_normals[local_vertex][element] = args.rest_normals[index];
 #ifdef TANGENTS
-        rest_tangents[local][element] = args.rest_tangents[index];
+        rest_tangents[local_vertex][element] = args.rest_tangents[index];
 #endif
     }
     __syncthreads();
     if (vertex < args.vertices) {
         const float* row = matrices[warp][lane / 4 < domains.z ? 0 : 1] + 4 * element;
-        args.positions[index] = dot4(row, rest_positions[local]);
-        args.normals[index] = dot4(row, rest_normals[local]);
+        args.positions[index] = dot4(row, rest_positions[local_vertex]);
+        args.normals[index] = dot4(row, rest_normals[local_vertex]);
 #ifdef TANGENTS
-        args.tangents[index] = dot4(row, rest_tangents[local]);
+        args.tangents[index] = dot4(row, rest_tangents[local_vertex]);
 #endif
     }
 }

@@ -1,4 +1,4 @@
-"""Times of both programs in one file, and their pictures side by side: ours, the peer's, and four times the difference."""
+"""Writes the times of both programs to peers.json, and images: ours, that of the peer, and four times the difference."""
 
 import json
 import struct
@@ -13,7 +13,7 @@ from mesh import write_png
 
 def read_png(path):
     """An RGB PNG of 8 bits without interlacing, as both programs write it."""
-    data, offset, body = Path(path).read_bytes(), 8, b""
+    data, offset, compressed = Path(path).read_bytes(), 8, b""
     while offset < len(data):
         length, kind = struct.unpack(">I4s", data[offset : offset + 8])
         chunk = data[offset + 8 : offset + 8 + length]
@@ -21,33 +21,34 @@ def read_png(path):
             width, height, depth, colour = struct.unpack(">IIBB", chunk[:10])
             assert (depth, colour) == (8, 2), f"{path}: expected 8-bit RGB, got {depth} bits of color type {colour}"
         elif kind == b"IDAT":
-            body += chunk
+            compressed += chunk
         offset += 12 + length
-    raw, stride = zlib.decompress(body), 3 * width
-    rows, last = np.zeros((height, stride), np.uint8), np.zeros(stride, np.uint8)
+    raw, stride = zlib.decompress(compressed), 3 * width
+    rows, above = np.zeros((height, stride), np.uint8), np.zeros(stride, np.uint8)
     for row in range(height):
-        kind, line = raw[row * (stride + 1)], np.frombuffer(raw, np.uint8, stride, row * (stride + 1) + 1).copy()
-        rows[row] = last = undo_filter(kind, line, last)
+        filter_type = raw[row * (stride + 1)]
+        line = np.frombuffer(raw, np.uint8, stride, row * (stride + 1) + 1).copy()
+        rows[row] = above = undo_filter(filter_type, line, above)
     return rows.reshape(height, width, 3)
 
 
-def undo_filter(kind, line, above):
-    """Reverses the PNG filter of one row."""
-    if kind == 0:
+def undo_filter(filter_type, line, above):
+    """Reverses the PNG filter of one row; `above` is the unfiltered row above it."""
+    if filter_type == 0:
         return line
-    if kind == 2:
+    if filter_type == 2:
         return line + above
     row, line, above = np.zeros(len(line) + 3, np.int64), line.astype(np.int64), above.astype(np.int64)
     # `row` starts with one zero pixel, so byte i of the row is row[i + 3].
     for i in range(len(line)):
-        left, corner = row[i], above[i - 3] if i >= 3 else 0
-        if kind == 1:
+        left, above_left = row[i], above[i - 3] if i >= 3 else 0
+        if filter_type == 1:
             prediction = left
-        elif kind == 3:
+        elif filter_type == 3:
             prediction = (left + above[i]) // 2
         else:
-            paeth = left + above[i] - corner
-            prediction = min((left, above[i], corner), key=lambda value: abs(paeth - value))
+            paeth = left + above[i] - above_left
+            prediction = min((left, above[i], above_left), key=lambda value: abs(paeth - value))
         row[i + 3] = (line[i] + prediction) & 255
     return row[3:].astype(np.uint8)
 
@@ -61,40 +62,40 @@ def main(out, folders):
     out, rounds = Path(out), []
     for folder in map(Path, folders):
         rounds.append(tuple(json.loads((folder / name).read_text()) for name in ("times.json", "peer.json")))
-    (ours, peer), last, rows = rounds[-1], Path(folders[-1]), []
+    (ours, peer), last_folder, rows = rounds[-1], Path(folders[-1]), []
     for index, scene in enumerate(ours["scenes"]):
         name = scene["name"]
-        own_image, peer_image = read_png(last / f"{name}.png"), read_png(last / f"{name}-peer.png")
-        difference = np.abs(own_image.astype(int) - peer_image).max(axis=2)
+        our_image, peer_image = read_png(last_folder / f"{name}.png"), read_png(last_folder / f"{name}-peer.png")
+        difference = np.abs(our_image.astype(int) - peer_image).max(axis=2)
         amplified = np.repeat(np.clip(4 * difference, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
-        write_png(out / f"{name}-beside.png", np.concatenate([own_image, peer_image, amplified], axis=1))
-        own_times = [own["scenes"][index]["whole"] for own, _ in rounds]
-        peer_times = [other["scenes"][name]["whole"] for _, other in rounds]
-        ratios = [other["median_us"] / own["median_us"] for own, other in zip(own_times, peer_times)]
+        write_png(out / f"{name}-beside.png", np.concatenate([our_image, peer_image, amplified], axis=1))
+        our_times = [our_round["scenes"][index]["whole"] for our_round, _ in rounds]
+        peer_times = [peer_round["scenes"][name]["whole"] for _, peer_round in rounds]
+        ratios = [peer_time["median_us"] / our_time["median_us"] for our_time, peer_time in zip(our_times, peer_times)]
         rows.append({
             "shadow": name, "triangles": scene["triangles"], "map": scene["look"]["shadow"]["size"], "samples": scene["samples"],
-            "ours_us": {"with_pixels": median_round(own_times)},
+            "ours_us": {"with_pixels": median_round(our_times)},
             "peer_us": {"with_pixels": median_round(peer_times)},
-            "rounds": [{"ours_us": own, "peer_us": other} for own, other in zip(own_times, peer_times)],
+            "rounds": [{"ours_us": our_time, "peer_us": peer_time} for our_time, peer_time in zip(our_times, peer_times)],
             "peer_over_ours": float(np.median(ratios)), "peer_over_ours_by_round": ratios,
             "mean_difference_of_255": float(difference.mean()), "pixels_apart_by_more_than_16": float((difference > 16).mean()),
         })
         print("%-10s ours %9.1f us, peer %9.1f us with pixels: %.2f times; mean difference %.2f of 255" % (
-            name, median_round(own_times)["median_us"], median_round(peer_times)["median_us"], rows[-1]["peer_over_ours"], difference.mean()))
+            name, median_round(our_times)["median_us"], median_round(peer_times)["median_us"], rows[-1]["peer_over_ours"], difference.mean()))
     provenance = ours["made"]
     report = {
-        "what": "one mesh, one view, a shadow map of equal size and 4 samples a pixel, by modalcast and by a plain moderngl "
-        "program; microseconds, by the wall clock around a frame and its pixels in host memory for both; with_pixels is the "
-        "middle of three rounds taken in turns, peer_over_ours the median of the ratios of the rounds",
+        "what": "Times of modalcast and of a plain moderngl program for one mesh and view, with shadow maps of equal size and "
+        "4 samples a pixel. Microseconds by the wall clock, of a frame with its pixels in host memory. The programs alternate "
+        "in three rounds: with_pixels is the round with the median time, peer_over_ours the median of the ratios.",
         "command": "tests/bench/peers/run", "commit": provenance["commit"], "size": ours["size"],
         "machine": {"cpu": provenance["cpu"], "threads": provenance["threads"], "release": provenance["release"]},
         "renderer": ours["renderer"], "peer": {key: peer[key] for key in ("renderer", "moderngl")},
         "differs": [
-            "ours shades each triangle once a pixel in compute from ids, the peer each triangle's fragments as they come",
-            "filtered: ours weighs 4 x 4 depths with a Gaussian of 0.33 texels, the peer 3 x 3 comparisons between 4 texels",
-            "ours samples images anisotropically where the device does; both have mip levels",
-            "ours snaps the light's box to texels and widens it by the blur; the peer fits the vertices once, before the clock",
-            "ours blends samples as light and then encodes, the peer encodes and then blends",
+            "modalcast shades each visible triangle of a pixel once, in a compute shader; the peer shades all fragments",
+            "filtered: modalcast weights 4 x 4 depths by a Gaussian of 0.33 texels; the peer takes 3 x 3 bilinear comparisons",
+            "modalcast filters images anisotropically if the device supports it; both programs use mip levels",
+            "modalcast fits the light's box in each frame, snaps it to texels and widens it by the blur; the peer fits it once",
+            "modalcast averages the samples of a pixel before the sRGB encoding, the peer after it",
         ],
         "rows": rows,
     }

@@ -1,8 +1,8 @@
 """A plain moderngl program that draws the scene of mesh.py with a shadow map and one forward pass.
 
-Reads times.json of `modalcast report render --scene`, takes camera, light and map size from it, and writes peer.json and
-a picture beside it for each shadow method. Times are medians, by the wall clock around a frame and its pixels in host
-memory, of as many frames as modalcast's.
+Camera, light and map size come from times.json of `modalcast report render --scene`. For each shadow method, the program
+writes an image and the times to the same folder (peer.json). Times are wall-clock times of a frame with its pixels in host
+memory. The number of frames is that of modalcast.
 """
 
 import json
@@ -15,7 +15,7 @@ import numpy as np
 
 from mesh import build_mesh, image, write_png
 
-BLUR_RADIUS = 5  # taps on each side of the Gaussian with a deviation of 1.5 texels, as in modalcast
+BLUR_RADIUS = 5  # texels on each side of the center, for a standard deviation of 1.5 texels as in modalcast
 
 DEPTH = """#version 430
 uniform mat4 map_from_world; in vec3 position;
@@ -57,8 +57,8 @@ void main() {
     colour = vec4(srgb(light.r), srgb(light.g), srgb(light.b), 1.0);
 }"""
 SUN_VISIBILITY = {
-    # Nine comparisons, each filtered between four texels by the sampler. The bias against acne is a constant and a slope
-    # in units of a texel's depth.
+    # Nine comparisons, each filtered between four texels by the sampler. The bias against shadow acne has a constant and a
+    # slope-scaled part. `limits.x` is the width of a texel in units of depth.
     "filtered": """uniform sampler2DShadow map;
 float sun_visibility(vec3 map_position, float cosine) {
     float slope = sqrt(1.0 - cosine * cosine) / max(cosine, 0.1), sum = 0.0;
@@ -67,7 +67,7 @@ float sun_visibility(vec3 map_position, float cosine) {
     for (int y = -1; y <= 1; y++) for (int x = -1; x <= 1; x++) sum += texture(map, map_position + vec3(vec2(x, y) * texel, 0.0));
     return sum / 9.0;
 }""",
-    # Chebyshev's bound with the minimum variance and the light bleeding reduction of modalcast.
+    # Chebyshev's bound, with the minimum variance (`limits.y`) and the light bleeding reduction (`limits.z`) of modalcast.
     "variance": """uniform sampler2D map;
 float sun_visibility(vec3 map_position, float cosine) {
     vec2 moments = texture(map, map_position.xy).rg;
@@ -80,7 +80,7 @@ float sun_visibility(vec3 map_position, float cosine) {
 
 
 def light_box(points, to_sun, size):
-    """An orthographic matrix whose box contains all points, and the width of a texel in units of its depth range."""
+    """An orthographic matrix whose box contains all points, and the width of a texel as a fraction of its depth range."""
     z = to_sun / np.linalg.norm(to_sun)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
@@ -98,7 +98,7 @@ def srgb(colour):
 
 
 class Peer:
-    """The programs, buffers and textures of one shadow method."""
+    """The shader programs, buffers and textures for one shadow method."""
 
     def __init__(self, gl, size, scene):
         self.gl, self.size, self.method = gl, size, scene["look"]["shadow"]["method"]

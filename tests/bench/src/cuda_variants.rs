@@ -337,7 +337,7 @@ impl Variant for BenchmarkVariant {
     }
 
     fn time(&mut self, _states: &[SceneState], cache: CacheState, replays: usize) -> Result<Option<Timing>> {
-        kernels::time(&self.device, self.benchmark()?, cache, replays).map(Some)
+        kernels::time_steps(&self.device, self.benchmark()?, cache, replays).map(Some)
     }
 
     fn launches_per_step(&self) -> usize {

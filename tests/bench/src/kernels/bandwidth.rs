@@ -1,4 +1,4 @@
-//! Launches `kernels/bandwidth.cu`: kernels that copy, read and fill device memory, and helpers for timing.
+//! Launches `kernels/bandwidth.cu`: kernels that copy, read and fill device memory, and kernels that help with timing.
 
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg as _};
 
@@ -9,10 +9,10 @@ use modalcast_model::error::{Result, fault_in};
 
 /// Threads per block.
 const BLOCK: u64 = 256;
-/// Bytes of the vectors (`uint4`) that `copy` and `read` access.
-const VECTOR: u64 = 16;
+/// Bytes of a `uint4`, the vector that `copy` and `read` access.
+const VECTOR_BYTES: u64 = 16;
 
-/// Macros of the `read` that evicts the L2. It must leave its lines in the cache, so it does not use streaming loads.
+/// Macros of the `read` that evicts the L2. Its lines must stay in the cache, so it does not use streaming loads.
 pub(super) const L2_FLUSH_DEFINES: &[&str] = &["LOADS=8"];
 /// Loads per thread of that `read`.
 pub(super) const L2_FLUSH_LOADS: u64 = 8;
@@ -36,13 +36,13 @@ pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
 
 /// Bytes that one block of `copy` or `read` covers.
 pub(super) const fn tile_bytes(loads: u64) -> u64 {
-    BLOCK * loads * VECTOR
+    BLOCK * loads * VECTOR_BYTES
 }
 
 /// Launches `copy` or `read` on two addresses.
 pub(super) fn launch(device: &Device, function: &CudaFunction, blocks: u32, buffers: [u64; 2]) -> Result<()> {
     let mut launch = device.stream().launch_builder(function);
-    // SAFETY: the kernel's arguments are two addresses; both callers pass buffers of `blocks` tiles.
+    // SAFETY: the arguments of the kernels are two addresses. All callers pass buffers of at least `blocks` tiles.
     unsafe { launch.arg(&buffers[0]).arg(&buffers[1]).launch(config(blocks)) }.map_err(fault_in("bandwidth"))?;
     Ok(())
 }
@@ -95,9 +95,9 @@ mod tests {
         assert!(loads.len() >= 6, "{loads:?}");
         for loads in loads {
             let bytes = 3 * tile_bytes(16);
-            let mut vectors = twin_of_copy(bytes / tile_bytes(loads), loads);
-            vectors.sort_unstable();
-            assert!(vectors.iter().copied().eq(0..bytes / VECTOR), "{loads} loads");
+            let mut vector_indices = twin_of_copy(bytes / tile_bytes(loads), loads);
+            vector_indices.sort_unstable();
+            assert!(vector_indices.iter().copied().eq(0..bytes / VECTOR_BYTES), "{loads} loads");
         }
     }
 

@@ -34,7 +34,7 @@ pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
 const MAX_DOMAINS: usize = 32;
 /// Warps per block. A block covers one tile.
 const WARPS: usize = 4;
-/// Modes per matrix product. One product is called a step of the sum over the modes.
+/// Modes per matrix product. A product is one step of the sum over all modes.
 const STEP_MODES: usize = 16;
 /// The first compute capability whose tensor cores support this product (m16n8k16).
 const AMPERE: (i32, i32) = (8, 0);
@@ -61,7 +61,7 @@ const _: () = assert!(size_of::<BatchMmaArgs>() == 192, "BatchMmaArgs differs fr
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
 unsafe impl DeviceRepr for BatchMmaArgs {}
 
-/// All domains of a scene with one shape, with the inputs of several steps.
+/// The kernel for all domains of a scene with one shape, and the inputs of several steps.
 #[derive(Debug)]
 pub struct BatchMmaBenchmark {
     name: String,
@@ -72,7 +72,7 @@ pub struct BatchMmaBenchmark {
     input_sets: InputSets,
     /// Kernel arguments with null addresses; [`Self::fill_args`] sets the addresses.
     args: BatchMmaArgs,
-    /// Number of vectors q that the kernel was compiled for.
+    /// Number of domains that the kernel was compiled for.
     batch_size: usize,
     tiles: u32,
     traffic: Vec<ArrayTraffic>,
@@ -142,9 +142,9 @@ impl KernelBenchmark for BatchMmaBenchmark {
         let mut launch = device.stream().launch_builder(&self.compiled.function);
         let config =
             LaunchConfig { grid_dim: (self.tiles, 1, 1), block_dim: (32 * WARPS as u32, 1, 1), shared_mem_bytes: 0 };
-        // SAFETY: `BatchMmaArgs` is the kernel's only argument. Tiles and x0 are those of the scene's one shape, with
-        // one block per tile. Split q, T and inverse scales hold as many vectors as the kernel was compiled for, and split q
-        // holds whole steps of modes. `positions` holds the shape's vertices from each domain's first vertex on.
+        // SAFETY: `BatchMmaArgs` is the kernel's only argument. Tiles and x0 belong to the scene's only shape, and each
+        // tile has one block. Split q, T and inverse scales have entries for as many domains as the kernel was compiled
+        // for, and split q holds whole steps of modes. `positions` has room for all vertices of every domain.
         unsafe { launch.arg(&args).launch(config) }.map_err(fault_in("batch_mma"))?;
         Ok(())
     }
@@ -177,11 +177,11 @@ fn check_scene(scene: &Scene) -> Result<()> {
     if count > MAX_DOMAINS {
         return Err(invalid("scene.domains", format!("at most {MAX_DOMAINS}"), count));
     }
-    if let Some(other) = scene.domains.iter().position(|domain| domain.shape != shape) {
+    if let Some(other_domain) = scene.domains.iter().position(|domain| domain.shape != shape) {
         return Err(invalid(
-            format!("domain {other}: shape"),
+            format!("domain {other_domain}: shape"),
             format!("{shape}, the shape of domain 0"),
-            scene.domains[other].shape,
+            scene.domains[other_domain].shape,
         ));
     }
     if scene.deformation.compensated {
@@ -211,7 +211,7 @@ const fn select_batch_size(domains: usize) -> (usize, Option<&'static str>) {
     }
 }
 
-/// q of each domain, times the factors of the modes, split into pairs of 16-bit numbers.
+/// q of each domain, multiplied by the factors of the modes and split into pairs of 16-bit numbers.
 fn split_coordinates(scene: &Scene, state: &SceneState, tiles: &TiledModes) -> Vec<SplitCoordinates> {
     let split_domain = |domain: usize| {
         let scaled_q = state.q_of(scene, domain).iter().zip(tiles.factors()).map(|(q, factor)| q * factor);
@@ -220,8 +220,8 @@ fn split_coordinates(scene: &Scene, state: &SceneState, tiles: &TiledModes) -> V
     (0..scene.domains.len()).map(split_domain).collect()
 }
 
-/// The fragments of q as each lane reads them: [step][batch_size / 8][lane][4] words. Words without a domain or mode are
-/// zero.
+/// The fragments of q in the order in which lanes read them: [step][batch_size / 8][lane][4] words. A word without a
+/// domain or mode is zero.
 fn pack_fragments(split_q: &[SplitCoordinates], rank: usize, batch_size: usize) -> Vec<u32> {
     let steps = rank.div_ceil(STEP_MODES);
     let mut words = Vec::with_capacity(steps * batch_size * 16);
@@ -240,7 +240,7 @@ fn pack_fragments(split_q: &[SplitCoordinates], rank: usize, batch_size: usize) 
     words
 }
 
-/// The transforms, then the scales that undo the scaling of q. Numbers without a domain are zero.
+/// The transforms of all domains, then the scales that undo the scaling of q. Entries beyond the last domain are zero.
 fn pack_transforms_and_scales(state: &SceneState, split_q: &[SplitCoordinates], batch_size: usize) -> Vec<f32> {
     let mut numbers: Vec<f32> = bytemuck::cast_slice(&state.transforms).to_vec();
     numbers.resize(12 * batch_size, 0.0);
@@ -263,7 +263,7 @@ fn args_without_addresses(scene: &Scene, chunks: usize) -> BatchMmaArgs {
     args
 }
 
-/// Minimum traffic of a launch. Scales of U are not counted, because 16-bit storage has none.
+/// Minimum traffic of a launch. 16-bit storage has no scales of U.
 fn minimum_traffic(scene: &Scene, tiles: &TiledModes) -> Vec<ArrayTraffic> {
     let (domains, vertices) = (scene.domains.len() as u64, scene.layout.vertices as u64);
     vec![
@@ -318,17 +318,17 @@ mod tests {
     ];
 
     /// CPU twin of `batch_mma`, warp by warp, with fragments, staging buffer and stores; sums in f64.
-    fn twin_of_batch_mma(inputs: &KernelInputs, numbers: usize) -> Vec<f32> {
-        let mut positions = vec![f32::NAN; numbers];
+    fn twin_of_batch_mma(inputs: &KernelInputs, coordinates: usize) -> Vec<f32> {
+        let mut positions = vec![f32::NAN; coordinates];
         let vertices = inputs.args.vertices as usize;
         for (tile, warp) in (0..inputs.tiles.count()).flat_map(|tile| (0..WARPS).map(move |warp| (tile, warp))) {
             let first_vertex = 4 * (TILE_QUADS * tile + QUADS * warp);
             if first_vertex < vertices {
                 let sums = sum_modes(inputs, tile, warp);
-                let numbers = 3 * (4 * QUADS).min(vertices - first_vertex);
+                let coordinates = 3 * (4 * QUADS).min(vertices - first_vertex);
                 (0..inputs.batch_size / 4).for_each(|pass| {
                     let staged = stage_positions(inputs, &sums, (tile, warp), pass);
-                    store_staged(inputs, &staged, StoreRange { first_vertex, numbers, pass }, &mut positions);
+                    store_staged(inputs, &staged, StoreRange { first_vertex, coordinates, pass }, &mut positions);
                 });
             }
         }

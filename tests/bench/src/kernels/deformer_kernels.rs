@@ -1,4 +1,4 @@
-//! Benchmarks the deformer's own kernels: the same launchers and tables, on inputs that are uploaded in advance.
+//! Benchmarks the kernels of the deformer with its launchers and tables, on inputs that are uploaded in advance.
 
 use std::sync::Arc;
 
@@ -19,7 +19,7 @@ use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::{Scene, SceneState};
 
-/// The part of a step to launch.
+/// The outputs that the launched kernels of a step compute.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum StepOutputs {
@@ -41,7 +41,7 @@ impl StepOutputs {
     }
 }
 
-/// The `cuda` deformer of a scene, with the inputs of several steps.
+/// The kernels of the CUDA deformer for a scene, with the inputs of several steps.
 #[derive(Debug)]
 pub struct DeformerBenchmark {
     name: String,
@@ -50,7 +50,7 @@ pub struct DeformerBenchmark {
     deform: DeformKernel,
     bounds: BoundsKernel,
     normals: Option<NormalsKernel>,
-    /// Whether steps change only listed domains.
+    /// Whether a step changes only some domains, which a list names.
     is_partial: bool,
     inputs: Vec<StepInputs>,
     outputs: DeviceBuffer,
@@ -76,7 +76,7 @@ impl BenchmarkStep<'_> {
     }
 }
 
-/// Counts of a step, for its memory traffic.
+/// Counts and bytes from which the memory traffic of a step is computed.
 #[derive(Debug, Clone, Copy)]
 struct StepCounts {
     vertices: u64,
@@ -143,22 +143,26 @@ impl DeformerBenchmark {
 
     /// Replaces each input set by that of a step that changes only these domains.
     fn apply_changes(&mut self, device: &Device, states: &[SceneState], changed: &[u32]) -> Result<()> {
-        let allowed = "a quarter of the domains at most, no truncation, and less work than a whole step";
-        let too_many = || invalid("changed", allowed, changed.len());
+        let requirement = "a quarter of the domains at most, no truncation, and less work than a whole step";
+        let too_many = || invalid("changed", requirement, changed.len());
         let mut apply =
             ApplyKernel::new(device, self.deform.packer(), self.plan.kernel(KernelKind::Apply).ok_or_else(too_many)?)?;
-        let mut list = apply.allocate_list(device)?;
+        let mut change_list = apply.allocate_list(device)?;
         let full_step = Header { last_full_step: 1, ..self.header() };
         for (inputs, state) in self.inputs.iter_mut().zip(states) {
             let mut staging = inputs.allocate_staging(device)?;
-            let lengths =
-                apply.write(&mut list, self.deform.packer(), state, ChangedDomains { changed, outdated: &[] })?;
+            let lengths = apply.write(
+                &mut change_list,
+                self.deform.packer(),
+                state,
+                ChangedDomains { changed, outdated: &[] },
+            )?;
             let ChangeListLengths { change_count, dirty_tile_count } = lengths.ok_or_else(too_many)?;
             let header = Header { output_step: 1, step: 2, change_count, dirty_tile_count, ..full_step };
             upload_step(device, (inputs, &mut staging), &header, state)?;
             // SAFETY: the lists were written above for the packer of `deform` and of the inputs, and the next statement
             // waits for the kernel.
-            unsafe { apply.launch(device, &list, inputs, &self.deform) }?;
+            unsafe { apply.launch(device, &change_list, inputs, &self.deform) }?;
             device.stream().synchronize().map_err(fault_in("upload"))?;
         }
         Ok(())
@@ -182,8 +186,8 @@ impl DeformerBenchmark {
         }
     }
 
-    /// Fraction of the chunks of modes that are summed, weighted by vertices, as a mean over the timed input sets; `None`
-    /// without truncation.
+    /// Fraction of the chunks of modes that truncation retains, weighted by vertices: the mean over the timed input sets.
+    /// `None` without truncation.
     fn retained_mode_share(&self) -> Option<f64> {
         let per_chunk = modes_per_chunk(self.scene.deformation.storage);
         let weighted_chunks = |chunks: &dyn Fn(usize) -> usize| -> f64 {
@@ -206,12 +210,12 @@ impl DeformerBenchmark {
     /// Computes the positions of all domains.
     fn launch_all_positions(&self, device: &Device, input_set: usize) -> Result<()> {
         // SAFETY: the inputs are whole steps of this scene, whose header has the addresses of `outputs`. `self` owns the
-        // inputs and the outputs, and device memory is released in the order of the stream.
+        // inputs and the outputs, and releasing device memory is stream-ordered.
         unsafe { self.deform.launch(device, self.inputs(input_set)) }
     }
 }
 
-/// Removes the macros of outputs that this part of a step does not compute.
+/// Removes the macros of outputs that are not requested.
 fn remove_defines(kernel: &mut KernelDescriptor, step_outputs: StepOutputs) {
     if step_outputs != StepOutputs::Whole {
         kernel.defines.retain(|define| !["RIGID_NORMALS", "CORNER_OFFSETS", "NORMAL_MAPS", "SHEAR"].contains(define));
@@ -241,10 +245,10 @@ fn output_bytes(plan: &DeformPlan) -> [u64; 4] {
         .map(|role| plan.bytes(role).next_multiple_of(16))
 }
 
-/// The counts of a step that changes these domains, or all of them.
+/// The counts of a step that changes these domains; `None` stands for all domains.
 fn count_step(scene: &Scene, plan: &DeformPlan, changed: Option<&[u32]>) -> StepCounts {
     let slots = &scene.layout.domains;
-    // With followers every domain reads the index of its transform root in addition to its own T or frame.
+    // With followers, every domain reads T or its frame (48 bytes) and the index of its transform root.
     let bytes_per_transform = if scene.features.followers { 56 } else { 48 };
     match changed {
         None => StepCounts {
@@ -254,15 +258,15 @@ fn count_step(scene: &Scene, plan: &DeformPlan, changed: Option<&[u32]>) -> Step
             mode_bytes: plan.bytes(BufferRole::ModeWords),
             rest_bytes: plan.bytes(BufferRole::RestPositions),
         },
-        Some(list) => {
-            let changed_slots = || list.iter().map(|domain| slots[*domain as usize]);
+        Some(changed_domains) => {
+            let changed_slots = || changed_domains.iter().map(|domain| slots[*domain as usize]);
             let mode_entries = |slot: modalcast_model::scene::DomainLayout| (slot.vertices * slot.rank) as u64;
             let all_entries: u64 = slots.iter().map(|slot| mode_entries(*slot)).sum();
             let changed_entries: u64 = changed_slots().map(mode_entries).sum();
             let vertices: u64 = changed_slots().map(|slot| slot.vertices as u64).sum();
             StepCounts {
                 vertices,
-                transform_bytes: bytes_per_transform * list.len() as u64,
+                transform_bytes: bytes_per_transform * changed_domains.len() as u64,
                 coordinates: changed_slots().map(|slot| slot.rank as u64).sum(),
                 mode_bytes: plan.bytes(BufferRole::ModeWords) * changed_entries / all_entries.max(1),
                 rest_bytes: 12 * vertices,
@@ -309,17 +313,17 @@ impl KernelBenchmark for DeformerBenchmark {
         }
         let slots = &self.scene.layout.domains;
         Ok(self.input_sets.compute_positions_on_host(|domain, vertex| {
-            let first = 3 * (slots[domain].first_vertex + vertex);
-            [numbers[first], numbers[first + 1], numbers[first + 2]]
+            let first_number = 3 * (slots[domain].first_vertex + vertex);
+            [numbers[first_number], numbers[first_number + 1], numbers[first_number + 2]]
         }))
     }
 
     fn traffic(&self) -> Vec<ArrayTraffic> {
         let StepCounts { vertices, coordinates, transform_bytes, mode_bytes, rest_bytes } = self.counts;
-        let retained = |share: f64| ArrayTraffic::new("U kept", (share * mode_bytes as f64) as u64);
-        let modes = self.retained_mode_share().map_or(ArrayTraffic::new("U", mode_bytes), retained);
+        let retained_traffic = |share: f64| ArrayTraffic::new("U kept", (share * mode_bytes as f64) as u64);
+        let mode_traffic = self.retained_mode_share().map_or(ArrayTraffic::new("U", mode_bytes), retained_traffic);
         let mut traffic = vec![
-            modes,
+            mode_traffic,
             ArrayTraffic::new("scales", self.plan.bytes(BufferRole::Scales)),
             ArrayTraffic::new("q", 4 * coordinates),
         ];

@@ -1,12 +1,12 @@
-//! Measures the peak bandwidth of device memory, and of transfers between host and device. The bandwidth of a deformer
-//! is compared with the peak of the same run.
+//! Measures the peak bandwidths of device memory and of transfers between host and device. Reports compare the
+//! bandwidth of a deformer with the peak of the same run.
 
 use cudarc::driver::{CudaFunction, result};
 use serde::Serialize;
 
 use super::bandwidth::{SOURCE, launch, random_buffer, tile_bytes, variants};
 use super::kernel_benchmark::KernelBenchmark;
-use super::timer::{EventPair, empty_replay, gigabytes_per_second, time};
+use super::timer::{EventPair, gigabytes_per_second, time_empty_kernel, time_steps};
 use crate::timing::{CacheState, Timing};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::{DeviceBuffer, PinnedBuffer, PinnedUse};
@@ -27,9 +27,9 @@ const EMPTY_REPLAYS: usize = 200;
 /// Measured peak bandwidths of the device.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct DeviceBandwidth {
-    /// Best copy kernel, GB/s (1e9 bytes), read plus written.
+    /// Fastest copy kernel, GB/s (1e9 bytes), read plus written.
     pub copy_gbs: f64,
-    /// Best pure read, GB/s.
+    /// Fastest pure read, GB/s.
     pub read_gbs: f64,
     /// Median time of a replay of a graph with one empty kernel, microseconds.
     pub empty_us: f64,
@@ -39,7 +39,8 @@ pub struct DeviceBandwidth {
     pub pinned_d2h_gbs: f64,
 }
 
-/// Measures the bandwidths of a device. `copy` and `read` process 4 GiB, or an eighth of the free memory if that is less.
+/// Measures the bandwidths of a device. `copy` and `read` process 4 GiB, or an eighth of the free memory if that is
+/// less.
 ///
 /// # Errors
 /// `Unavailable` when NVRTC is missing; `Fault` when the device fails or `copy` does not copy.
@@ -56,13 +57,13 @@ pub fn measure_bandwidth(device: &Device) -> Result<DeviceBandwidth> {
             if function == "copy" {
                 benchmark.check_copy(device, &src, &dst)?;
             }
-            let timing = time(device, &benchmark, CacheState::Warm, REPLAYS)?;
+            let timing = time_steps(device, &benchmark, CacheState::Warm, REPLAYS)?;
             max_gbs = max_gbs.max(gigabytes_per_second(traffic, timing.median_us));
         }
         Ok(max_gbs)
     };
     let (copy_gbs, read_gbs) = (max_bandwidth("copy", 2 * bytes)?, max_bandwidth("read", bytes)?);
-    let empty_us = empty_replay(device, EMPTY_REPLAYS)?.median_us;
+    let empty_us = time_empty_kernel(device, EMPTY_REPLAYS)?.median_us;
     let (pinned_h2d_gbs, pinned_d2h_gbs) = pinned_bandwidths(device)?;
     Ok(DeviceBandwidth { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs })
 }
@@ -91,7 +92,7 @@ impl CopyBenchmark {
         })
     }
 
-    /// Copies once and compares the first and last bytes, because a kernel that does nothing would seem fast.
+    /// Copies once and compares the first and last bytes, because a kernel that copies nothing would have a high rate.
     fn check_copy(&self, device: &Device, src: &DeviceBuffer, dst: &DeviceBuffer) -> Result<()> {
         const CHECKED_BYTES: usize = 4096;
         let last_offset = dst.bytes() - CHECKED_BYTES as u64;
@@ -143,7 +144,7 @@ fn pinned_bandwidths(device: &Device) -> Result<(f64, f64)> {
     let (device_address, stream) = (buffer.address(), device.stream().cu_stream());
     let mut measure_gbs = |copy: &mut dyn FnMut(&mut [u8]) -> Result<()>| -> Result<f64> {
         let mut times = Vec::with_capacity(PINNED_COPIES);
-        // The first copy is a warm-up and does not repetition.
+        // The first copy is a warm-up and is not timed.
         for repetition in 0..=PINNED_COPIES {
             let event_pair = EventPair::new(device)?;
             event_pair.record_around(device, || copy(host))?;

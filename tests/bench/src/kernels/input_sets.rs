@@ -48,7 +48,7 @@ pub(super) struct InputSets {
     states: Vec<SceneState>,
     q: DeviceBuffer,
     transforms: DeviceBuffer,
-    /// Bytes from one input set to the next, of q and of the transforms.
+    /// Bytes from one input set to the next, for q and for the transforms.
     strides: [u64; 2],
     /// Index of the input set that [`Self::select`] returned last.
     selected: Cell<usize>,
@@ -96,7 +96,7 @@ impl InputSets {
         self.states.len()
     }
 
-    /// Selects an input set, modulo their number, for [`Self::compute_positions_on_host`] and returns its addresses.
+    /// Selects an input set (modulo their number) for [`Self::compute_positions_on_host`] and returns its addresses.
     pub(super) fn select(&self, input_set: usize) -> InputAddresses {
         let input_set = input_set % self.states.len();
         self.selected.set(input_set);
@@ -105,7 +105,7 @@ impl InputSets {
     }
 
     /// x = T (x0 + u) of the selected input set, three f32 per vertex. Computed in f64 and rounded once, so that only the
-    /// error of u remains. `u` returns the displacement of a vertex (second argument) of a domain (first argument).
+    /// error of u remains. `u` returns the displacement for a domain and a vertex of this domain.
     pub(super) fn compute_positions_on_host(&self, u: impl Fn(usize, usize) -> [f32; 3] + Sync) -> Vec<f32> {
         let state = &self.states[self.selected.get()];
         let mut positions = Vec::with_capacity(3 * self.scene.layout.vertices);

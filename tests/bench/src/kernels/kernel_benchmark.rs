@@ -14,14 +14,15 @@ pub trait KernelBenchmark {
     /// Number of uploaded input sets, at least 1. [`Self::launch`] takes an index modulo this number.
     fn input_set_count(&self) -> usize;
 
-    /// Enqueues the kernels of one step on the device's stream, without copies or waiting, so that a graph can capture
-    /// them.
+    /// Enqueues the kernels of one step on the stream of the device. It neither copies nor waits, so that a graph can
+    /// capture it.
     ///
     /// # Errors
     /// `Fault` when the device fails.
     fn launch(&self, device: &Device, input_set: usize) -> Result<()>;
 
-    /// Computes the domains that a launch with this input set skips. Validation calls it before the launch.
+    /// Computes the positions of the domains that a launch with this input set skips. Validation calls it before the
+    /// launch.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -38,7 +39,7 @@ pub trait KernelBenchmark {
         Ok(Vec::new())
     }
 
-    /// Minimum memory traffic of one step per array. Its sum divided by the time is the reported bandwidth.
+    /// Minimum memory traffic of one step per array. The reported bandwidth is the sum divided by the time.
     fn traffic(&self) -> Vec<ArrayTraffic> {
         Vec::new()
     }
@@ -100,9 +101,9 @@ impl KernelAttributes {
 #[derive(Debug)]
 pub(super) struct BenchmarkSource {
     pub text: &'static str,
-    /// Its functions; [`CompiledKernel`] compiles the first one.
+    /// Names of the kernels; [`CompiledKernel`] compiles the first one.
     pub functions: &'static [&'static str],
-    /// All sets of macros that it is compiled with.
+    /// All sets of macros that the file is compiled with.
     pub define_sets: &'static [&'static [&'static str]],
 }
 

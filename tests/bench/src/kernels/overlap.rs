@@ -1,8 +1,8 @@
 //! Measures figure 3.1 of the thesis: steps with readback of the vertices, serial and overlapped.
 //!
 //! ```text
-//! serial:      write k, [copy in][kernels], [copy out], write k+1, ...
-//! overlapped:  while the device computes k+1, the host writes k+2 and k is copied out
+//! serial:      write step k, [copy in][kernels], [copy out], write step k+1, ...
+//! overlapped:  while the device computes step k+1, the host writes step k+2, and step k is copied out
 //! ```
 
 use std::collections::VecDeque;
@@ -40,7 +40,7 @@ pub struct Overlap {
     pub bytes_out: u64,
     /// Host write of a step's values to pinned memory on one core.
     pub write_one_core_us: f64,
-    /// The same write as the deformer does it, on several cores where that is faster.
+    /// The same write by the deformer, which uses several cores for large steps.
     pub write_us: f64,
     /// Device graph: upload, kernels, and readback of the bounds.
     pub graph_us: f64,
@@ -50,7 +50,7 @@ pub struct Overlap {
     pub step_us: f64,
     /// Time per step if every step is read back before the next is written.
     pub serial_us: f64,
-    /// Time per step if every readback starts with its step and is awaited after the next step, as in the server.
+    /// Time per step if the host waits for every readback after the next step, as the server does.
     pub fetched_us: f64,
     /// Time per step with two steps in flight, so that the host also writes while the device computes.
     pub overlapped_us: f64,
@@ -58,7 +58,7 @@ pub struct Overlap {
     pub gain: f64,
     /// Lower limit of an overlapped step: the longest of host write, graph and readback.
     pub ideal_us: f64,
-    /// Steps of the fetched and overlapped methods whose vertices differ from the serial ones in any bit; must be 0.
+    /// Steps of the other two methods whose vertices differ from the serial ones in any bit; must be 0.
     pub differing: usize,
 }
 
@@ -66,12 +66,17 @@ pub struct Overlap {
 ///
 /// # Errors
 /// `Invalid` without states or steps; errors of creating a deformer; `Fault` when the device fails.
-pub fn measure_overlap(device: &Arc<Device>, load: &Workload, states: &[SceneState], steps: usize) -> Result<Overlap> {
+pub fn measure_overlap(
+    device: &Arc<Device>,
+    workload: &Workload,
+    states: &[SceneState],
+    steps: usize,
+) -> Result<Overlap> {
     if states.is_empty() || steps == 0 {
         return Err(invalid("states and steps", "at least 1", format!("{} and {steps}", states.len())));
     }
-    let scene = &load.scene;
-    let options = CudaDeformerOptions { batches: load.batches, bounding_axes: scene.light_axes() };
+    let scene = &workload.scene;
+    let options = CudaDeformerOptions { batches: workload.batches, bounding_axes: scene.light_axes() };
     let mut deformer = CudaDeformer::new(device, scene, None, options)?;
     let differing = count_differing_steps(&mut deformer, states, steps)?;
     let mut times = [Vec::new(), Vec::new(), Vec::new()];
@@ -112,7 +117,7 @@ pub fn measure_overlap(device: &Arc<Device>, load: &Workload, states: &[SceneSta
 /// Receives the index and the surface of every step.
 type SurfaceCallback<'a> = &'a mut dyn FnMut(usize, &DeformedSurface);
 
-/// Reads every step back before the next.
+/// Reads every step back before the next one starts.
 fn run_serial(
     deformer: &mut CudaDeformer,
     states: &[SceneState],
@@ -127,7 +132,7 @@ fn run_serial(
     Ok(())
 }
 
-/// Awaits the readback of every step after the next step.
+/// Waits for the readback of every step after the next step.
 fn run_pipelined(
     deformer: &mut CudaDeformer,
     states: &[SceneState],
@@ -176,7 +181,7 @@ fn run_overlapped(
     Ok(())
 }
 
-/// Counts steps of the other two methods whose vertices differ from the serial ones, and missing steps.
+/// Number of pipelined and overlapped steps that are missing, or whose vertices differ from the serial ones.
 fn count_differing_steps(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize) -> Result<usize> {
     let mut want = Vec::new();
     run_serial(deformer, states, states.len(), &mut |_, surface| want.push(surface.clone()))?;
@@ -268,7 +273,7 @@ pub struct HostWrite {
     pub on_all_cores: bool,
 }
 
-/// Copy times for powers of two from 64 KiB to 64 MiB; they show from which size several cores are faster.
+/// Times host writes of 64 KiB to 64 MiB, in powers of two. The times show from which size several cores are faster.
 ///
 /// # Errors
 /// `Invalid` when `replays` is 0; `Fault` when the driver cannot allocate memory.

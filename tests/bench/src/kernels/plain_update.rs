@@ -21,10 +21,10 @@ const BLOCK: u32 = 256;
 /// Value of `first_u` for a domain without modes.
 const RIGID: u64 = u64::MAX;
 
-/// First float of a domain's u and its first packed vertex.
+/// Where the data of one domain begins: its first float of u and its first packed vertex.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
-struct PlainSlot {
+struct PlainDomain {
     first_u: u64,
     first_vertex: u32,
     reserved: u32,
@@ -34,8 +34,8 @@ struct PlainSlot {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct PlainArgs {
-    slots: u64,
     domains: u64,
+    vertex_domains: u64,
     rest: u64,
     transforms: u64,
     u: u64,
@@ -44,7 +44,7 @@ struct PlainArgs {
     reserved: u32,
 }
 
-const _: () = assert!(size_of::<PlainSlot>() == 16, "PlainSlot differs from kernels/plain_update.cu");
+const _: () = assert!(size_of::<PlainDomain>() == 16, "PlainDomain differs from kernels/plain_update.cu");
 const _: () = assert!(size_of::<PlainArgs>() == 56, "PlainArgs differs from kernels/plain_update.cu");
 
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
@@ -54,8 +54,9 @@ unsafe impl DeviceRepr for PlainArgs {}
 #[derive(Debug)]
 pub(super) struct PlainUpdate {
     compiled: CompiledKernel,
-    slots: DeviceBuffer,
-    domains: Option<DeviceBuffer>,
+    domains: DeviceBuffer,
+    /// The domain of each packed vertex; `None` for a scene of one domain.
+    vertex_domains: Option<DeviceBuffer>,
     rest: DeviceBuffer,
     positions: DeviceBuffer,
     vertices: usize,
@@ -69,12 +70,14 @@ impl PlainUpdate {
     pub(super) fn new(device: &Device, scene: &Scene, first_u: &[Option<u64>]) -> Result<Self> {
         let (is_single, vertices) = (scene.domains.len() == 1, scene.layout.vertices);
         let defines: &[&str] = if is_single { &["SINGLE"] } else { &[] };
-        let slots = scene.layout.domains.iter();
-        let u_bytes = slots.filter(|slot| slot.rank > 0).map(|slot| 12 * slot.vertices as u64).sum();
+        let u_bytes =
+            scene.layout.domains.iter().filter(|slot| slot.rank > 0).map(|slot| 12 * slot.vertices as u64).sum();
         Ok(Self {
             compiled: CompiledKernel::new(device, &SOURCE, defines)?,
-            slots: DeviceBuffer::upload(device, &pack_slots(scene, first_u))?,
-            domains: (!is_single).then(|| DeviceBuffer::upload(device, &domain_of_vertices(scene))).transpose()?,
+            domains: DeviceBuffer::upload(device, &pack_domains(scene, first_u))?,
+            vertex_domains: (!is_single)
+                .then(|| DeviceBuffer::upload(device, &domain_of_vertices(scene)))
+                .transpose()?,
             rest: DeviceBuffer::upload(device, &packed_rest(scene))?,
             positions: DeviceBuffer::zeroed(device, 12 * vertices as u64)?,
             vertices,
@@ -85,8 +88,8 @@ impl PlainUpdate {
 
     pub(super) fn launch(&self, device: &Device, transforms: u64, u: u64) -> Result<()> {
         let args = PlainArgs {
-            slots: self.slots.address(),
-            domains: self.domains.as_ref().map_or(0, |domains| domains.address()),
+            domains: self.domains.address(),
+            vertex_domains: self.vertex_domains.as_ref().map_or(0, |domains| domains.address()),
             rest: self.rest.address(),
             transforms,
             u,
@@ -111,7 +114,7 @@ impl PlainUpdate {
 
     pub(super) fn traffic(&self) -> Vec<ArrayTraffic> {
         let vertices = self.vertices as u64;
-        let domain_bytes = if self.domains.is_some() { 4 * vertices } else { 0 };
+        let domain_bytes = if self.vertex_domains.is_some() { 4 * vertices } else { 0 };
         vec![
             ArrayTraffic::new("x0", 12 * vertices),
             ArrayTraffic::new("domains of vertices", domain_bytes),
@@ -126,13 +129,13 @@ impl PlainUpdate {
     }
 }
 
-fn pack_slots(scene: &Scene, first_u: &[Option<u64>]) -> Vec<PlainSlot> {
-    let pack_slot = |(slot, first_u): (&modalcast_model::scene::DomainLayout, &Option<u64>)| PlainSlot {
+fn pack_domains(scene: &Scene, first_u: &[Option<u64>]) -> Vec<PlainDomain> {
+    let pack_domain = |(slot, first_u): (&modalcast_model::scene::DomainLayout, &Option<u64>)| PlainDomain {
         first_u: first_u.unwrap_or(RIGID),
         first_vertex: slot.first_vertex as u32,
         reserved: 0,
     };
-    scene.layout.domains.iter().zip(first_u).map(pack_slot).collect()
+    scene.layout.domains.iter().zip(first_u).map(pack_domain).collect()
 }
 
 /// The domain of each packed vertex.
@@ -155,18 +158,18 @@ mod tests {
 
     /// The kernel's tables.
     struct Tables {
-        slots: Vec<PlainSlot>,
-        domains: Vec<u32>,
+        domains: Vec<PlainDomain>,
+        vertex_domains: Vec<u32>,
         rest: Vec<f32>,
     }
 
     /// CPU twin of `plain_update`, for one vertex.
     fn twin_of_plain_update(tables: &Tables, t: &[f32], u: &[f32], vertex: usize) -> [f32; 3] {
-        let domain = tables.domains[vertex] as usize;
-        let slot = tables.slots[domain];
+        let domain = tables.vertex_domains[vertex] as usize;
+        let plain_domain = tables.domains[domain];
         let mut deformed: [f32; 3] = std::array::from_fn(|axis| tables.rest[3 * vertex + axis]);
-        if slot.first_u != RIGID {
-            let u = &u[slot.first_u as usize + 3 * (vertex - slot.first_vertex as usize)..];
+        if plain_domain.first_u != RIGID {
+            let u = &u[plain_domain.first_u as usize + 3 * (vertex - plain_domain.first_vertex as usize)..];
             deformed.iter_mut().zip(u).for_each(|(coordinate, u)| *coordinate += u);
         }
         std::array::from_fn(|axis| {
@@ -187,8 +190,8 @@ mod tests {
             }
         }
         let tables = Tables {
-            slots: pack_slots(&scene, &first_u),
-            domains: domain_of_vertices(&scene),
+            domains: pack_domains(&scene, &first_u),
+            vertex_domains: domain_of_vertices(&scene),
             rest: packed_rest(&scene),
         };
         let transforms: &[f32] = bytemuck::cast_slice(&state.transforms);
@@ -198,7 +201,10 @@ mod tests {
                 let got = twin_of_plain_update(&tables, transforms, &u, packed);
                 let want = position_of(&scene, &state, domain, vertex);
                 for (want, got) in want.iter().zip(got) {
-                    assert!((want - f64::from(got)).abs() < 1e-5, "domain {domain} vertex {vertex}: {got} not {want}");
+                    assert!(
+                        (want - f64::from(got)).abs() < 1e-5,
+                        "domain {domain}, vertex {vertex}: expected {want}, got {got}"
+                    );
                 }
                 // Negative control: the next vertex has another position.
                 let next = twin_of_plain_update(&tables, transforms, &u, (packed + 1) % 54);

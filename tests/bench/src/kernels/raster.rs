@@ -1,5 +1,5 @@
-//! Benchmarks the CUDA rasterizer. Positions and samples are device buffers of its own, so that it can be timed without
-//! OpenGL and its samples can be read back.
+//! Benchmarks the CUDA rasterizer without OpenGL. The benchmark owns the buffers of positions and samples, so samples can
+//! be read back.
 
 use super::kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 use modalcast_compute::gpu::Device;
@@ -15,7 +15,7 @@ use modalcast_model::scene::{DrawRange, Viewport};
 pub struct RasterMesh<'a> {
     /// World or camera-relative positions, three f32 per vertex.
     pub positions: &'a [f32],
-    /// Vertex indices; a triangle's id is its index here.
+    /// Vertex indices of each triangle. The id of a triangle is its index here.
     pub triangles: &'a [[u32; 3]],
     /// Ranges of triangles to draw, each with its cull mode.
     pub groups: &'a [DrawRange],
@@ -92,8 +92,8 @@ impl RasterBenchmark {
         })
     }
 
-    /// The samples of the last launch, row by row from the top: the bits of the depth, then the triangle; all ones
-    /// where nothing was drawn. Empty for depth-only targets.
+    /// The samples of the last launch, row by row from the top. A key holds the bits of the depth, then the triangle; it
+    /// is all ones where nothing was drawn. Empty for depth-only targets.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -141,8 +141,8 @@ impl KernelBenchmark for RasterBenchmark {
             positions: self.positions.address(),
             target: self.target.address(),
         };
-        // SAFETY: `new` checked mesh and groups; both buffers have the sizes of the pass, and device memory is
-        // released in the order of the stream.
+        // SAFETY: `new` checked mesh and groups. Both buffers have the sizes of the pass, and releasing device memory is
+        // stream-ordered.
         unsafe { self.pipeline.draw(device, &pass) }
     }
 

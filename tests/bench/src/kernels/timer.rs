@@ -12,11 +12,11 @@ use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::{DeviceBuffer, capture};
 use modalcast_model::error::{Result, fault_in, invalid};
 
-/// Replays that are enqueued together behind a kernel that delays the stream, so that the host's launch overhead does
-/// not affect the times. A stream holds about a thousand entries before it blocks the host.
+/// Replays that are enqueued while a kernel delays the stream, so that the launch overhead of the host does not affect
+/// the times. A stream holds about a thousand entries before it blocks the host.
 const BATCH_REPLAYS: usize = 25;
 
-/// Delay of the stream per replay of a batch, microseconds: longer than the host needs to enqueue a replay.
+/// Delay of the stream per replay of a batch, microseconds. The host enqueues a replay in less time.
 const DELAY_US: u64 = 40;
 
 /// Maximum number of input sets to rotate through.
@@ -28,38 +28,43 @@ const WARM_UP: Duration = Duration::from_millis(30);
 /// Size of the buffer that evicts the L2, in multiples of the L2 size.
 const L2_FLUSH_FACTOR: u64 = 4;
 
-/// Times the steps of a benchmark: one CUDA graph per input set, replayed in rotation, each replay between two events.
+/// Times steps of a benchmark. Each input set has a CUDA graph. The graphs are replayed in rotation, each replay between
+/// two events.
 ///
 /// # Errors
 /// `Invalid` when `replays` is 0; `Unavailable` when NVRTC is missing; `Fault` when the device fails or a launch cannot
 /// be captured.
-pub fn time(device: &Device, benchmark: &dyn KernelBenchmark, cache: CacheState, replays: usize) -> Result<Timing> {
+pub fn time_steps(
+    device: &Device,
+    benchmark: &dyn KernelBenchmark,
+    cache: CacheState,
+    replays: usize,
+) -> Result<Timing> {
     if replays == 0 {
         return Err(invalid("replays", "at least 1", 0));
     }
     let delay = StreamDelay::new(device)?;
     let l2_flush = matches!(cache, CacheState::Cold).then(|| L2Flush::new(device)).transpose()?;
-    // The first launch is outside of a graph: it loads code and allocates workspaces, neither of which a capture
-    // allows.
+    // The first launch loads code and allocates workspaces. A capture allows neither, so it precedes them.
     benchmark.launch(device, 0)?;
     let graph_count = benchmark.input_set_count().min(MAX_GRAPHS);
     let graphs =
         (0..graph_count).map(|input_set| capture_graph(device, benchmark, input_set)).collect::<Result<Vec<_>>>()?;
-    let begin = Instant::now();
-    while begin.elapsed() < WARM_UP {
+    let warm_up_start = Instant::now();
+    while warm_up_start.elapsed() < WARM_UP {
         graphs.iter().try_for_each(|graph| graph.launch().map_err(fault_in("replay")))?;
         device.stream().synchronize().map_err(fault_in("replay"))?;
     }
     let mut times = Vec::with_capacity(replays);
     while times.len() < replays {
         let batch_replays = BATCH_REPLAYS.min(replays - times.len());
-        let first = times.len();
+        let first_replay = times.len();
         let event_pairs: Vec<EventPair> = (0..batch_replays).map(|_| EventPair::new(device)).collect::<Result<_>>()?;
         delay.launch(device, DELAY_US * batch_replays as u64)?;
         for (index, event_pair) in event_pairs.iter().enumerate() {
             l2_flush.as_ref().map_or(Ok(()), |l2_flush| l2_flush.launch(device))?;
             event_pair.record_around(device, || {
-                graphs[(first + index) % graphs.len()].launch().map_err(fault_in("replay"))
+                graphs[(first_replay + index) % graphs.len()].launch().map_err(fault_in("replay"))
             })?;
         }
         device.stream().synchronize().map_err(fault_in("replay"))?;
@@ -73,8 +78,8 @@ pub fn time(device: &Device, benchmark: &dyn KernelBenchmark, cache: CacheState,
 /// Times a graph with one empty kernel: the lower limit of any step's time.
 ///
 /// # Errors
-/// Those of [`time`].
-pub fn empty_replay(device: &Device, replays: usize) -> Result<Timing> {
+/// Those of [`time_steps`].
+pub fn time_empty_kernel(device: &Device, replays: usize) -> Result<Timing> {
     struct EmptyBenchmark(CudaFunction);
     impl KernelBenchmark for EmptyBenchmark {
         fn name(&self) -> String {
@@ -94,7 +99,7 @@ pub fn empty_replay(device: &Device, replays: usize) -> Result<Timing> {
         }
     }
     let benchmark = EmptyBenchmark(device.function("empty_kernel", bandwidth::SOURCE.text, &[])?);
-    time(device, &benchmark, CacheState::Warm, replays)
+    time_steps(device, &benchmark, CacheState::Warm, replays)
 }
 
 const ONE_THREAD: LaunchConfig = LaunchConfig { grid_dim: (1, 1, 1), block_dim: (1, 1, 1), shared_mem_bytes: 0 };

@@ -3,14 +3,14 @@
 use std::sync::Arc;
 
 use super::kernel_benchmark::KernelBenchmark;
-use super::timer::time;
+use super::timer::time_steps;
 use crate::timing::{CacheState, Timing};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::step_input::{Header, InputPacker, InputPart, StagingBuffer, StepInputs};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Scene, SceneState};
 
-/// Uploads whole steps. It launches no kernel.
+/// Uploads the inputs of one step. It launches no kernel.
 struct UploadBenchmark {
     inputs: StepInputs,
     staging: StagingBuffer,
@@ -25,7 +25,7 @@ impl KernelBenchmark for UploadBenchmark {
         1
     }
 
-    fn launch(&self, device: &Device, _turn: usize) -> Result<()> {
+    fn launch(&self, device: &Device, _input_set: usize) -> Result<()> {
         // SAFETY: `time` waits for each replay, so no copy runs when `self` is dropped, and nothing writes the staging
         // buffer.
         unsafe { self.inputs.send(device, &self.staging, InputPart::All) }
@@ -36,7 +36,7 @@ impl KernelBenchmark for UploadBenchmark {
     }
 }
 
-/// Bytes of a whole step's values, and the time of a graph that only uploads them.
+/// Bytes of the inputs of one step, and the time of a graph that only uploads them.
 ///
 /// # Errors
 /// `Fault` when the device fails; `Invalid` when `replays` is 0.
@@ -46,5 +46,5 @@ pub fn time_upload(device: &Device, scene: &Arc<Scene>, state: &SceneState, repl
     inputs.write(&mut staging, &Header::default(), state)?;
     let bytes = inputs.bytes();
     let benchmark = UploadBenchmark { inputs, staging };
-    Ok((bytes, time(device, &benchmark, CacheState::Warm, replays)?))
+    Ok((bytes, time_steps(device, &benchmark, CacheState::Warm, replays)?))
 }

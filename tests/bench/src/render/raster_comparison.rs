@@ -271,7 +271,7 @@ impl RasterSetup {
         let time_pair = |name: &str, raster: &RasterBenchmark| {
             let opengl = passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
             let opengl = opengl.ok_or_else(|| fault_in("raster")(format!("expected a pass named {name}")))?;
-            let cuda = kernels::time(device, raster, CacheState::Warm, self.replays)?;
+            let cuda = kernels::time_steps(device, raster, CacheState::Warm, self.replays)?;
             Ok(TimingPair { opengl, cuda })
         };
         Ok(PassPairs {

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use modalcast_bench::kernels::{
-    BatchMmaBenchmark, BenchmarkStep, DeformerBenchmark, KernelBenchmark, StepOutputs, gigabytes_per_second, time,
+    BatchMmaBenchmark, BenchmarkStep, DeformerBenchmark, KernelBenchmark, StepOutputs, gigabytes_per_second, time_steps,
 };
 use modalcast_bench::timing::CacheState;
 use modalcast_compute::gpu::{CudaDeformerOptions, Device, KernelKind};
@@ -108,7 +108,7 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
 fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
     let device = Device::open(0).expect("a CUDA device");
     let measure = |benchmark: &dyn KernelBenchmark| {
-        let us = time(&device, benchmark, CacheState::Warm, 200).expect("a timing").median_us;
+        let us = time_steps(&device, benchmark, CacheState::Warm, 200).expect("a timing").median_us;
         let bytes: u64 = benchmark.traffic().iter().map(|traffic| traffic.bytes).sum();
         let bandwidth = gigabytes_per_second(bytes, us);
         eprintln!("{}: {us:.1} us, {bandwidth:.0} GB/s, {:?}", benchmark.name(), benchmark.kernel_attributes());
@@ -158,7 +158,7 @@ fn gpu_auto_mode_batches_where_it_is_faster() {
                 let step = BenchmarkStep { batches, ..BenchmarkStep::full(StepOutputs::Positions) };
                 let benchmark =
                     DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), step).expect("a benchmark");
-                time(&device, &benchmark, CacheState::Warm, 100).expect("a timing").median_us
+                time_steps(&device, &benchmark, CacheState::Warm, 100).expect("a timing").median_us
             };
             let [batch_us, separate_us] = [BatchPolicy::Always, BatchPolicy::Never].map(measure);
             let is_batch_chosen = modalcast_compute::gpu::plan(&scene, CudaDeformerOptions::default())

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use modalcast_bench::kernels::{
-    CublasBenchmark, CublasMethod, KernelBenchmark, KernelSplit, Part, ThesisBenchmark, empty_replay,
-    measure_bandwidth, time,
+    CublasBenchmark, CublasMethod, KernelBenchmark, KernelSplit, Part, ThesisBenchmark, measure_bandwidth,
+    time_empty_kernel, time_steps,
 };
 use modalcast_bench::timing::CacheState;
 use modalcast_compute::gpu::Device;
@@ -16,7 +16,7 @@ use crate::scenes;
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_memory_rates_are_plausible_and_empty_replay_takes_time() {
+fn gpu_memory_rates_are_plausible_and_time_empty_kernel_takes_time() {
     let device = Device::open(0).expect("expected a CUDA device");
     let bandwidths = measure_bandwidth(&device).expect("memory bandwidths");
     eprintln!("{}: {bandwidths:?}", device.name());
@@ -29,7 +29,7 @@ fn gpu_memory_rates_are_plausible_and_empty_replay_takes_time() {
         "expected reads about as fast as copies, got {bandwidths:?}"
     );
     assert!(bandwidths.pinned_h2d_gbs < bandwidths.copy_gbs, "{bandwidths:?}");
-    let replay_timing = empty_replay(&device, 100).expect("a timing");
+    let replay_timing = time_empty_kernel(&device, 100).expect("a timing");
     assert!(
         replay_timing.replays == 100
             && replay_timing.q1_us <= replay_timing.median_us
@@ -37,7 +37,7 @@ fn gpu_memory_rates_are_plausible_and_empty_replay_takes_time() {
         "{replay_timing:?}"
     );
     assert!((0.1..100.0).contains(&replay_timing.median_us), "{replay_timing:?}");
-    assert!(empty_replay(&device, 0).is_err());
+    assert!(time_empty_kernel(&device, 0).is_err());
 }
 
 /// Per packed vertex, whether a triangle refers to it. The thesis's kernels compute the corners of unfolded triangles,
@@ -91,7 +91,7 @@ fn check_benchmark(device: &Device, scene: &Arc<Scene>, states: &[SceneState], b
     for cache in [CacheState::Warm, CacheState::Cold] {
         benchmark.launch(device, 0).expect("expected a launch");
         let timing =
-            time(device, benchmark, cache, 10 * states.len()).unwrap_or_else(|error| panic!("{name}: {error}"));
+            time_steps(device, benchmark, cache, 10 * states.len()).unwrap_or_else(|error| panic!("{name}: {error}"));
         let positions = benchmark.positions(device).expect("positions");
         let last_state = &states[states.len() - 1];
         relative_error(scene, last_state, &positions).unwrap_or_else(|error| panic!("{name} replayed: {error}"));

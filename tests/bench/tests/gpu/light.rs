@@ -1,6 +1,6 @@
 //! Measures the cost of the light-space bounds in a step.
 
-use modalcast_bench::kernels::{BenchmarkStep, DeformerBenchmark, KernelBenchmark, StepOutputs, time};
+use modalcast_bench::kernels::{BenchmarkStep, DeformerBenchmark, KernelBenchmark, StepOutputs, time_steps};
 use modalcast_bench::timing::CacheState;
 use modalcast_compute::gpu::Device;
 use modalcast_model::scene::Scene;
@@ -8,7 +8,7 @@ use modalcast_model::scene::Scene;
 use crate::scenes::{self, Random};
 
 /// Times of a step with light-space bounds (for a shadow) and without, microseconds.
-fn time_steps(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64; 2] {
+fn measure_medians(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64; 2] {
     let device = Device::open(0).expect("expected a CUDA device");
     let times_us = [true, false].map(|has_shadow| {
         let mut parts = scenes::parts_of_shapes(vec![scenes::random_shape(&mut Random(9), vertices, rank)]);
@@ -26,7 +26,7 @@ fn time_steps(name: &str, (vertices, rank): (usize, usize), instances: usize) ->
             .kernel_attributes()
             .iter()
             .for_each(|attributes| eprintln!("{name}, shadow {has_shadow}: {attributes:?}"));
-        time(&device, &benchmark, CacheState::Warm, 300).expect("a timing").median_us
+        time_steps(&device, &benchmark, CacheState::Warm, 300).expect("a timing").median_us
     });
     eprintln!("{name}: {:.2} us per step with light-space bounds, {:.2} us without", times_us[0], times_us[1]);
     times_us
@@ -42,7 +42,7 @@ fn gpu_light_space_bounds_add_at_most_10_percent_and_5_us() {
         ("20,000 domains of 7", (7, 3), 20_000),
         ("200,000 domains of 60", (60, 0), 200_000),
     ] {
-        let [with, without] = time_steps(name, shape, instances);
+        let [with, without] = measure_medians(name, shape, instances);
         assert!(
             with > 0.0 && with < 1.1 * without + 5.0,
             "{name}: expected at most 10 % and 5 us more than {without} us, got {with} us"

@@ -45,8 +45,8 @@ impl KernelInputs {
     }
 }
 
-/// Adds a product of fragments as the PTX instruction set defines m16n8k16. Rows g and g + 8 of A and columns 2 t and 2 t +
-/// 1 of D belong to lane 4 g + t.
+/// Adds the product of fragments A and B to D as the PTX instruction m16n8k16 does. Lane 4 g + t holds rows g and g + 8
+/// of A, and columns 2 t and 2 t + 1 of D.
 fn multiply(inputs: &KernelInputs, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &mut [[f64; 4]; 32]) {
     let decode_half = |word: u32, index: usize| inputs.decode(word >> (16 * (index % 2)) & 0xffff);
     let entry_of_a = |row: usize, k: usize| decode_half(a[4 * (row % 8) + k % 8 / 2][row / 8 + 2 * (k / 8)], k);
@@ -59,7 +59,7 @@ fn multiply(inputs: &KernelInputs, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &m
     }
 }
 
-/// A quad of a tile, as a lane addresses it.
+/// The quad of a tile that a lane reads.
 #[derive(Clone, Copy)]
 struct TileQuad {
     /// First packed word of the tile.
@@ -71,11 +71,12 @@ struct TileQuad {
 }
 
 /// The twelve words of a lane's chunk; zeros beyond the last chunk.
-fn load_chunk(inputs: &KernelInputs, at: TileQuad, chunk: usize) -> [u32; 12] {
+fn load_chunk(inputs: &KernelInputs, tile_quad: TileQuad, chunk: usize) -> [u32; 12] {
     let mut words = [0; 12];
     if chunk < inputs.args.chunks as usize {
         let plane_word = |plane: usize| -> PackedWord {
-            inputs.tiles.packed_words()[at.first_word + (3 * chunk + plane) * at.tile_quads + at.quad]
+            inputs.tiles.packed_words()
+                [tile_quad.first_word + (3 * chunk + plane) * tile_quad.tile_quads + tile_quad.quad]
         };
         let bytes: Vec<u8> = (0..3).flat_map(|plane| plane_word(plane).0).collect();
         words = std::array::from_fn(|word| bytemuck::pod_read_unaligned(&bytes[4 * word..4 * word + 4]));
@@ -138,11 +139,11 @@ pub(super) fn stage_positions(
         let inverse_scale = inputs.transforms_and_scales[12 * inputs.batch_size + domain];
         let world: Vec<f32> = (0..4)
             .flat_map(|vertex| {
-                let bent = [0, 1, 2].map(|axis| {
+                let deformed = [0, 1, 2].map(|axis| {
                     let sum = sums[2 * axis + vertex / 2][pass / 2][lane][2 * (vertex % 2) + parity] as f32;
                     rest[4 * axis + vertex] + sum * inverse_scale
                 });
-                [0, 1, 2].map(|row| transformed_axis(&rows[4 * row..], bent))
+                [0, 1, 2].map(|row| transformed_axis(&rows[4 * row..], deformed))
             })
             .collect();
         for (i, components) in world.chunks_exact(4).enumerate() {
@@ -157,8 +158,8 @@ pub(super) fn stage_positions(
 pub(super) struct StoreRange {
     /// First vertex of the warp in the shape.
     pub first_vertex: usize,
-    /// Numbers of the warp's vertices, three each.
-    pub numbers: usize,
+    /// Coordinates of the warp's vertices: three per vertex.
+    pub coordinates: usize,
     pub pass: usize,
 }
 
@@ -167,7 +168,7 @@ pub(super) fn store_staged(inputs: &KernelInputs, staged: &[[f32; 4]], range: St
     for (lane, i) in (0..32).flat_map(|lane| (0..3).map(move |i| (lane, i))) {
         let domain = 8 * (range.pass / 2) + range.pass % 2 + 2 * (lane / 8);
         let vector = 8 * i + lane % 8;
-        let is_stored = |k: &usize| domain < inputs.args.domains as usize && 4 * vector + k < range.numbers;
+        let is_stored = |k: &usize| domain < inputs.args.domains as usize && 4 * vector + k < range.coordinates;
         for k in (0..4).filter(is_stored) {
             let first_vertex = inputs.args.first_vertices[domain] as usize + range.first_vertex;
             let index = 3 * first_vertex + 4 * vector + k;

@@ -12,19 +12,19 @@ use modalcast_model::scene::{Scene, SceneState};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum CublasMethod {
-    /// One domain, `sgemv`, U column-major.
+    /// One domain: `sgemv` with column-major U.
     SgemvColumns,
-    /// One domain, `sgemv`, U row-major.
+    /// One domain: `sgemv` with row-major U.
     SgemvRows,
-    /// All domains padded to the largest, one strided batched `sgemm`.
+    /// All domains padded to the largest one: one strided batched `sgemm`.
     Padded,
-    /// The same as one strided batched `sgemv`.
+    /// As `Padded`, with `sgemv`.
     PaddedGemv,
-    /// Domains of similar rank and size padded to a common size, with one strided batched `sgemm` per bucket.
+    /// Domains in buckets of similar rank and size, padded to a common size: one strided batched `sgemm` per bucket.
     Bucketed,
-    /// The same as strided batched `sgemv`.
+    /// As `Bucketed`, with `sgemv`.
     BucketedGemv,
-    /// No padding: one grouped batched `sgemm`, with a group per rank and size.
+    /// Domains in groups of equal rank and size, without padding: one grouped batched `sgemm`.
     Grouped,
     /// Domains that are instances of one shape: one `sgemm` with one column of q per domain.
     Instances,
@@ -57,13 +57,13 @@ impl CublasMethod {
         }
     }
 
-    /// Whether strided products use `sgemv` instead of `sgemm` with one column.
+    /// Whether strided batched products use `sgemv` instead of `sgemm` with one column.
     pub(super) const fn uses_strided_gemv(self) -> bool {
         matches!(self, Self::PaddedGemv | Self::BucketedGemv)
     }
 
-    /// Domains with equal keys share a batch. A bucket holds ranks up to the next multiple of 8 and sizes up to the
-    /// next power of two.
+    /// Key of a domain; domains with equal keys share a batch. Buckets round the rank up to a multiple of 8 and the size
+    /// up to a power of two.
     const fn batch_key(self, rows: usize, rank: usize) -> (usize, usize) {
         match self {
             Self::Bucketed | Self::BucketedGemv => (rank.next_multiple_of(8), rows.next_power_of_two()),
@@ -73,7 +73,7 @@ impl CublasMethod {
     }
 }
 
-/// Index of an operand of u = U q in arrays of three.
+/// An operand of u = U q, as an index of arrays with one entry per operand.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Operand {
     Matrix,
@@ -92,24 +92,24 @@ pub(super) struct GemmBatch {
 
 /// All products of a step.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct GemmBatches {
-    pub list: Vec<GemmBatch>,
+pub(super) struct GemmPlan {
+    pub batches: Vec<GemmBatch>,
     /// Total floats of U, q and u; indexed by [`Operand`].
     pub floats: [u64; 3],
 }
 
-impl GemmBatches {
+impl GemmPlan {
     /// Plans the products of a scene.
     ///
     /// # Errors
     /// `Invalid` when `method` does not support the scene, or the scene is too large for the library's 32-bit integers.
-    pub(super) fn plan(scene: &Scene, method: CublasMethod) -> Result<Self> {
+    pub(super) fn new(scene: &Scene, method: CublasMethod) -> Result<Self> {
         check_scene(scene, method)?;
         let mut groups: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
         for (domain, slot) in scene.layout.domains.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
             groups.entry(method.batch_key(3 * slot.vertices, slot.rank)).or_default().push(domain);
         }
-        let (mut list, mut floats) = (Vec::with_capacity(groups.len()), [0_u64; 3]);
+        let (mut batches, mut floats) = (Vec::with_capacity(groups.len()), [0_u64; 3]);
         for domains in groups.into_values() {
             let call = size_product(scene, method, &domains)?;
             let matrices = if method == CublasMethod::Instances { 1 } else { domains.len() as u64 };
@@ -119,15 +119,15 @@ impl GemmBatches {
                 // Batches are aligned to float4.
                 *total = (*total + stride.unsigned_abs() * count).next_multiple_of(4);
             }
-            list.push(GemmBatch { call, domains, offsets });
+            batches.push(GemmBatch { call, domains, offsets });
         }
-        Ok(Self { list, floats })
+        Ok(Self { batches, floats })
     }
 
     /// Offset of each domain's u, in floats; `None` for domains without modes.
     pub(super) fn u_offsets(&self, domains: usize) -> Vec<Option<u64>> {
         let mut offsets = vec![None; domains];
-        for batch in &self.list {
+        for batch in &self.batches {
             for (index, domain) in batch.domains.iter().enumerate() {
                 offsets[*domain] = Some(batch.offset(index, Operand::U));
             }
@@ -138,7 +138,7 @@ impl GemmBatches {
     /// The coordinates of all domains, padded with zeros.
     pub(super) fn pack_q(&self, scene: &Scene, state: &SceneState) -> Vec<f32> {
         let mut packed = vec![0.0; self.floats[Operand::Q as usize] as usize];
-        for batch in &self.list {
+        for batch in &self.batches {
             for (index, domain) in batch.domains.iter().enumerate() {
                 let q = state.q_of(scene, *domain);
                 packed[batch.offset(index, Operand::Q) as usize..][..q.len()].copy_from_slice(q);
@@ -178,7 +178,7 @@ fn size_product(scene: &Scene, method: CublasMethod, domains: &[usize]) -> Resul
     let slots = || domains.iter().map(|domain| scene.layout.domains[*domain]);
     let rows = slots().map(|slot| 3 * slot.vertices).max().unwrap_or(0);
     let rank = slots().map(|slot| slot.rank).max().unwrap_or(0);
-    // The library is fastest with columns aligned to 16 bytes; row-major storage has no gaps.
+    // cuBLAS is fastest with columns aligned to 16 bytes. Row-major storage has no gaps.
     let lead = if method == CublasMethod::SgemvRows { rows } else { rows.next_multiple_of(4) };
     let (columns, count) = if method == CublasMethod::Instances { (domains.len(), 1) } else { (1, domains.len()) };
     let strides = [lead as i64 * rank as i64, rank as i64, lead as i64];
@@ -232,22 +232,22 @@ mod tests {
         }
     }
 
-    fn check_products(scene: &Scene, state: &SceneState, method: CublasMethod) -> GemmBatches {
-        let batches = GemmBatches::plan(scene, method).expect("a supported scene");
+    fn check_products(scene: &Scene, state: &SceneState, method: CublasMethod) -> GemmPlan {
+        let plan = GemmPlan::new(scene, method).expect("a supported scene");
         let by_rows = method == CublasMethod::SgemvRows;
-        let mut matrices = vec![0.0; batches.floats[Operand::Matrix as usize] as usize];
-        for batch in &batches.list {
+        let mut matrices = vec![0.0; plan.floats[Operand::Matrix as usize] as usize];
+        for batch in &plan.batches {
             let matrix_count = if method == CublasMethod::Instances { 1 } else { batch.domains.len() };
             for (index, domain) in batch.domains.iter().enumerate().take(matrix_count) {
                 let matrix = batch.pack_matrix(scene, *domain, by_rows);
                 matrices[batch.offset(index, Operand::Matrix) as usize..][..matrix.len()].copy_from_slice(&matrix);
             }
         }
-        let (q, mut u) = (batches.pack_q(scene, state), vec![f32::NAN; batches.floats[Operand::U as usize] as usize]);
-        for batch in &batches.list {
+        let (q, mut u) = (plan.pack_q(scene, state), vec![f32::NAN; plan.floats[Operand::U as usize] as usize]);
+        for batch in &plan.batches {
             multiply(batch, by_rows, [&matrices, &q], &mut u);
         }
-        for (domain, offset) in batches.u_offsets(scene.domains.len()).iter().enumerate() {
+        for (domain, offset) in plan.u_offsets(scene.domains.len()).iter().enumerate() {
             assert_eq!(offset.is_some(), scene.rank_of(domain) > 0);
             let Some(offset) = offset else { continue };
             for vertex in 0..scene.layout.domains[domain].vertices {
@@ -257,61 +257,61 @@ mod tests {
                 }
             }
         }
-        batches
+        plan
     }
 
     #[test]
     fn every_method_gives_each_domain_its_u() {
         let shapes: Vec<_> = (0..30).map(|index| (1 + index * 11 % 40, index % 13, 1)).collect();
-        let (many, state) = scene_and_state(&shapes);
+        let (many_domains, state) = scene_and_state(&shapes);
         let deformable = shapes.iter().filter(|(_, rank, _)| *rank > 0);
         let unpadded: u64 = deformable.clone().map(|(vertices, rank, _)| (3 * vertices * rank) as u64).sum();
-        let matrix_floats = |method: CublasMethod| check_products(&many, &state, method).floats[0];
+        let matrix_floats = |method: CublasMethod| check_products(&many_domains, &state, method).floats[0];
         let (padded, bucketed, grouped) = (
             matrix_floats(CublasMethod::Padded),
             matrix_floats(CublasMethod::Bucketed),
             matrix_floats(CublasMethod::Grouped),
         );
         assert!(unpadded <= grouped && grouped < bucketed && bucketed < padded, "{grouped} {bucketed} {padded}");
-        assert_eq!(check_products(&many, &state, CublasMethod::Padded).list.len(), 1);
+        assert_eq!(check_products(&many_domains, &state, CublasMethod::Padded).batches.len(), 1);
         assert_eq!(
-            check_products(&many, &state, CublasMethod::Grouped).list.len(),
+            check_products(&many_domains, &state, CublasMethod::Grouped).batches.len(),
             deformable.count(),
             "expected a group per domain, because all sizes differ"
         );
-        let (one, state) = scene_and_state(&[(23, 10, 1)]);
+        let (one_domain, state) = scene_and_state(&[(23, 10, 1)]);
         for method in CublasMethod::ALL {
-            let batches = check_products(&one, &state, method);
-            assert_eq!(batches.list.len(), 1, "{}", method.name());
+            let plan = check_products(&one_domain, &state, method);
+            assert_eq!(plan.batches.len(), 1, "{}", method.name());
         }
     }
 
     #[test]
     fn instances_share_one_matrix_with_a_column_each() {
         use modalcast_model::scene::SceneParts;
-        let (one, _) = scene_and_state(&[(23, 10, 1)]);
+        let (one_domain, _) = scene_and_state(&[(23, 10, 1)]);
         let mut parts = SceneParts::named("instances");
-        parts.shapes = one.shapes.clone();
-        parts.materials = one.materials.clone();
-        parts.domains = vec![one.domains[0].clone(); 16];
+        parts.shapes = one_domain.shapes.clone();
+        parts.materials = one_domain.materials.clone();
+        parts.domains = vec![one_domain.domains[0].clone(); 16];
         let instances = Scene::new(parts).expect("a valid scene");
         let mut state = SceneState::rest(&instances);
         state.q.iter_mut().enumerate().for_each(|(index, q)| *q = (index as f32).sin());
-        let batches = check_products(&instances, &state, CublasMethod::Instances);
-        assert_eq!(batches.floats, [72 * 10, 160, 72 * 16]);
-        assert_eq!((batches.list[0].call.columns, batches.list[0].call.count), (16, 1));
+        let plan = check_products(&instances, &state, CublasMethod::Instances);
+        assert_eq!(plan.floats, [72 * 10, 160, 72 * 16]);
+        assert_eq!((plan.batches[0].call.columns, plan.batches[0].call.count), (16, 1));
     }
 
     #[test]
     fn rejects_unsupported_scenes_by_name() {
         let (two, _) = scene_and_state(&[(5, 2, 1), (5, 2, 1)]);
         for method in [CublasMethod::SgemvColumns, CublasMethod::SgemvRows, CublasMethod::Instances] {
-            let error = GemmBatches::plan(&two, method).expect_err("two shapes").to_string();
+            let error = GemmPlan::new(&two, method).expect_err("two shapes").to_string();
             assert!(error.starts_with("scene.domains") && error.contains(method.name()), "{error}");
         }
         let (rigid, _) = scene_and_state(&[(5, 0, 1)]);
         for method in CublasMethod::ALL {
-            assert!(GemmBatches::plan(&rigid, method).expect_err("no modes").to_string().starts_with("modes"));
+            assert!(GemmPlan::new(&rigid, method).expect_err("no modes").to_string().starts_with("modes"));
         }
     }
 }

@@ -25,10 +25,10 @@ const WORKSPACE_BYTES: u64 = 32 << 20;
 const NO_TRANSPOSE: cublasOperation_t = cublasOperation_t::CUBLAS_OP_N;
 const TRANSPOSE: cublasOperation_t = cublasOperation_t::CUBLAS_OP_T;
 
-/// cuBLAS, which stays loaded until the process ends.
+/// The loaded cuBLAS. It stays loaded until the process ends.
 struct CublasLibrary {
     library: Library,
-    /// cublasLt, loaded from the folder of a library off the search path.
+    /// cublasLt, if it was loaded from the folder of cuBLAS.
     _cublas_lt: Option<Library>,
 }
 
@@ -58,7 +58,7 @@ fn unavailable(reason: String) -> Error {
     Error::Unavailable { what: "cuBLAS", reason, remedy: REMEDY.into() }
 }
 
-/// Candidate paths of cuBLAS in order of preference. A path in MODALCAST_CUBLAS is the only candidate.
+/// Paths at which to look for cuBLAS, in order of preference. A path in MODALCAST_CUBLAS is the only one.
 fn candidates() -> Vec<PathBuf> {
     if let Some(path) = std::env::var_os("MODALCAST_CUBLAS").filter(|path| !path.is_empty()) {
         return vec![path.into()];
@@ -86,7 +86,7 @@ fn load(candidates: &[PathBuf]) -> Result<CublasLibrary> {
 
 impl CublasLibrary {
     fn open(path: &Path) -> Result<Self, libloading::Error> {
-        // cuBLAS needs cublasLt. Off the search path, the loader finds it only if it is loaded already.
+        // cuBLAS needs cublasLt. Outside of the search path, the loader finds cublasLt only if it is already loaded.
         let cublas_lt_path = |name: &str| Some(path.parent()?.join(name.replace("libcublas.", "libcublasLt.")));
         let cublas_lt_file =
             path.file_name().and_then(|name| cublas_lt_path(&name.to_string_lossy())).filter(|file| file.is_file());
@@ -96,8 +96,8 @@ impl CublasLibrary {
         Ok(Self { library, _cublas_lt: cublas_lt })
     }
 
-    /// Whether cudarc resolves its functions in this library. The system's loader identifies a library by its `SONAME`.
-    /// It returns this library unless an earlier name of cudarc's list exists on the search path.
+    /// Whether cudarc resolves its functions in this library. The system's loader identifies libraries by their
+    /// `SONAME`, so cudarc gets this library unless an earlier name in its list exists on the search path.
     fn is_used_by_cudarc(&self) -> bool {
         // SAFETY: as in `open`.
         if !unsafe { sys::is_culib_present() } {
@@ -109,13 +109,13 @@ impl CublasLibrary {
         create.is_some() && create == function_address(cudarc_library, CREATE)
     }
 
-    /// Whether this version has a function. cudarc panics when it calls a missing one.
+    /// Whether this version of cuBLAS has a function. cudarc panics when it calls a missing function.
     fn has_function(&self, function: &[u8]) -> bool {
         function_address(&self.library, function).is_some()
     }
 }
 
-/// Names of functions, terminated by zero as the system's loader expects them.
+/// Names of functions. The system's loader expects a terminating zero.
 const CREATE: &[u8] = b"cublasCreate_v2\0";
 const SGEMV_STRIDED: &[u8] = b"cublasSgemvStridedBatched\0";
 const SGEMM_GROUPED: &[u8] = b"cublasSgemmGroupedBatched\0";
@@ -141,7 +141,7 @@ pub(super) struct GemmCall {
     pub strides: [i64; 3],
 }
 
-/// Arguments of a grouped product: one entry per group on the host, and device arrays with one pointer per problem.
+/// Arguments of a grouped product: one entry per group on the host, and device arrays with one pointer per product.
 #[derive(Debug)]
 pub(super) struct GroupedGemm<'a> {
     pub groups: &'a [GemmCall],
@@ -266,10 +266,10 @@ impl<B> CublasHandle<B> {
         })
     }
 
-    /// Grouped products; each group has `count` problems of one size.
+    /// Grouped products. Each group has `count` products of one size.
     ///
     /// # Safety
-    /// The device arrays hold the device address of a matrix for each problem, in the order of the groups.
+    /// The device arrays hold the device address of a matrix for each product, in the order of the groups.
     pub(super) unsafe fn multiply_grouped(&self, call: &GroupedGemm) -> Result<()> {
         check_functions(true, false)?;
         let collect = |get_size: fn(&GemmCall) -> i32| call.groups.iter().map(get_size).collect::<Vec<i32>>();
@@ -334,7 +334,7 @@ mod tests {
         }
     }
 
-    /// No `gpu_` test, because the library can be loaded without a device.
+    /// The name has no prefix `gpu_`, because cuBLAS can be loaded without a device.
     #[test]
     #[ignore = "needs cuBLAS"]
     fn cudarc_uses_the_library_of_the_variable() {

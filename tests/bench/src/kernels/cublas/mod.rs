@@ -1,5 +1,5 @@
-//! cuBLAS as a competitor: u = U q as its products, each followed by a plain vertex update. Loaded at run time; only
-//! benchmarks use it.
+//! u = U q by cuBLAS, for comparison with our kernels, alone or followed by a plain vertex update. cuBLAS is loaded at
+//! run time; only benchmarks use it.
 
 mod batch;
 mod library;
@@ -12,7 +12,7 @@ use std::sync::Arc;
 use super::input_sets::{InputSets, Part};
 use super::kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 use super::plain_update::PlainUpdate;
-use batch::{GemmBatches, Operand};
+use batch::{GemmPlan, Operand};
 use library::{CublasHandle, GemmCall, GroupedGemm, check_functions};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::DeviceBuffer;
@@ -25,7 +25,7 @@ pub struct CublasBenchmark {
     cublas: CublasHandle<ProductBuffers>,
     method: CublasMethod,
     part: Part,
-    batches: GemmBatches,
+    plan: GemmPlan,
     update: Option<PlainUpdate>,
     /// Offset of each domain's u, in floats; `None` for domains without modes.
     u_offsets: Vec<Option<u64>>,
@@ -62,38 +62,37 @@ impl CublasBenchmark {
         states: &[SceneState],
         (method, part): (CublasMethod, Part),
     ) -> Result<Self> {
-        let batches = GemmBatches::plan(scene, method)?;
-        check_memory(device, &batches)?;
+        let plan = GemmPlan::new(scene, method)?;
+        check_memory(device, &plan)?;
         let is_grouped = method == CublasMethod::Grouped;
         check_functions(is_grouped, method.uses_strided_gemv())?;
-        let u_offsets = batches.u_offsets(scene.domains.len());
-        let matrices = upload_matrices(device, scene, &batches, method)?;
-        let u = DeviceBuffer::zeroed(device, 4 * batches.floats[Operand::U as usize])?;
+        let u_offsets = plan.u_offsets(scene.domains.len());
+        let matrices = upload_matrices(device, scene, &plan, method)?;
+        let u = DeviceBuffer::zeroed(device, 4 * plan.floats[Operand::U as usize])?;
         let transforms = |state: &SceneState| bytemuck::cast_slice(&state.world_transforms(scene)).to_vec();
-        let input_sets =
-            InputSets::new(device, scene, states, |state| [batches.pack_q(scene, state), transforms(state)])?;
-        let pointers = is_grouped.then(|| PointerArrays::new(device, &batches, [&matrices, &u], &input_sets));
+        let input_sets = InputSets::new(device, scene, states, |state| [plan.pack_q(scene, state), transforms(state)])?;
+        let pointers = is_grouped.then(|| PointerArrays::new(device, &plan, [&matrices, &u], &input_sets));
         let buffers = ProductBuffers { matrices, u, pointers: pointers.transpose()?, input_sets };
         let update = (part == Part::Whole).then(|| PlainUpdate::new(device, scene, &u_offsets)).transpose()?;
-        Ok(Self { cublas: CublasHandle::new(device, buffers)?, method, part, batches, update, u_offsets })
+        Ok(Self { cublas: CublasHandle::new(device, buffers)?, method, part, plan, update, u_offsets })
     }
 
     /// Enqueues u = U q of all domains. `q` is the address of the coordinates of this input set.
     fn multiply(&self, q: u64, input_set: usize) -> Result<()> {
         let ProductBuffers { matrices, u, input_sets, pointers } = &self.cublas.buffers;
         if let Some(pointers) = pointers {
-            let groups: Vec<GemmCall> = self.batches.list.iter().map(|batch| batch.call).collect();
+            let groups: Vec<GemmCall> = self.plan.batches.iter().map(|batch| batch.call).collect();
             let q = pointers.q.address() + 8 * pointers.product_count * (input_set % input_sets.count()) as u64;
             let pointers = [pointers.matrices.address(), q, pointers.u.address()];
             // SAFETY: the arrays have a pointer for each product, in the order of the groups, each to memory of the
-            // size that `GemmBatches` planned.
+            // size that `GemmPlan` planned.
             return unsafe { self.cublas.multiply_grouped(&GroupedGemm { groups: &groups, pointers }) };
         }
         let addresses = [matrices.address(), q, u.address()];
-        for batch in &self.batches.list {
+        for batch in &self.plan.batches {
             let operands: [u64; 3] = std::array::from_fn(|operand| addresses[operand] + 4 * batch.offsets[operand]);
-            // SAFETY: the three buffers have the sizes that `GemmBatches` planned, and this batch lies inside them. The
-            // products of the first three methods have a `count` of 1, and those of the first two have one column.
+            // SAFETY: the three buffers have the sizes that `GemmPlan` planned, and this batch lies inside them. The
+            // `count` is 1 for both gemv methods and for `Instances`. Both gemv methods have one column.
             unsafe {
                 match self.method {
                     CublasMethod::SgemvColumns | CublasMethod::SgemvRows => {
@@ -128,7 +127,7 @@ impl KernelBenchmark for CublasBenchmark {
         if let Some(update) = &self.update {
             return update.positions(device);
         }
-        let mut u = vec![0.0_f32; self.batches.floats[Operand::U as usize] as usize];
+        let mut u = vec![0.0_f32; self.plan.floats[Operand::U as usize] as usize];
         self.cublas.buffers.u.read(device, 0, &mut u)?;
         let u_offsets = &self.u_offsets;
         Ok(self.cublas.buffers.input_sets.compute_positions_on_host(|domain, vertex| {
@@ -139,7 +138,7 @@ impl KernelBenchmark for CublasBenchmark {
 
     /// Counts U as stored, padding included.
     fn traffic(&self) -> Vec<ArrayTraffic> {
-        let [matrices, q, u] = self.batches.floats.map(|floats| 4 * floats);
+        let [matrices, q, u] = self.plan.floats.map(|floats| 4 * floats);
         let mut traffic = vec![
             ArrayTraffic::new("U as stored", matrices),
             ArrayTraffic::new("q", q),
@@ -151,13 +150,13 @@ impl KernelBenchmark for CublasBenchmark {
         traffic
     }
 
-    /// Calls of the library, each of which may launch several kernels, plus the update.
+    /// Calls of cuBLAS plus the launch of the update. A call may launch several kernels.
     fn launches_per_step(&self) -> usize {
-        let calls = if self.cublas.buffers.pointers.is_some() { 1 } else { self.batches.list.len() };
+        let calls = if self.cublas.buffers.pointers.is_some() { 1 } else { self.plan.batches.len() };
         calls + usize::from(self.update.is_some())
     }
 
-    /// Attributes of the update alone, because the library's kernels are not accessible.
+    /// Attributes of the update alone. Those of the kernels of cuBLAS are not accessible.
     fn kernel_attributes(&self) -> Vec<KernelAttributes> {
         self.update.iter().map(|update| update.attributes().clone()).collect()
     }
@@ -166,12 +165,12 @@ impl KernelBenchmark for CublasBenchmark {
 impl PointerArrays {
     fn new(
         device: &Device,
-        batches: &GemmBatches,
+        plan: &GemmPlan,
         [matrices, u]: [&DeviceBuffer; 2],
         input_sets: &InputSets,
     ) -> Result<Self> {
         let products =
-            || batches.list.iter().flat_map(|batch| (0..batch.domains.len()).map(move |index| (batch, index)));
+            || plan.batches.iter().flat_map(|batch| (0..batch.domains.len()).map(move |index| (batch, index)));
         let pointers =
             |base: u64, operand: Operand| products().map(move |(batch, index)| base + 4 * batch.offset(index, operand));
         let q_pointers = |input_set: usize| pointers(input_sets.select(input_set).q, Operand::Q);
@@ -186,14 +185,9 @@ impl PointerArrays {
     }
 }
 
-fn upload_matrices(
-    device: &Device,
-    scene: &Scene,
-    batches: &GemmBatches,
-    method: CublasMethod,
-) -> Result<DeviceBuffer> {
-    let mut buffer = DeviceBuffer::zeroed(device, 4 * batches.floats[Operand::Matrix as usize])?;
-    for batch in &batches.list {
+fn upload_matrices(device: &Device, scene: &Scene, plan: &GemmPlan, method: CublasMethod) -> Result<DeviceBuffer> {
+    let mut buffer = DeviceBuffer::zeroed(device, 4 * plan.floats[Operand::Matrix as usize])?;
+    for batch in &plan.batches {
         let matrix_count = if method == CublasMethod::Instances { 1 } else { batch.domains.len() };
         for (index, domain) in batch.domains.iter().enumerate().take(matrix_count) {
             let matrix = batch.pack_matrix(scene, *domain, method == CublasMethod::SgemvRows);
@@ -207,9 +201,9 @@ fn upload_matrices(
 ///
 /// # Errors
 /// `Unavailable` when they do not fit.
-fn check_memory(device: &Device, batches: &GemmBatches) -> Result<()> {
+fn check_memory(device: &Device, plan: &GemmPlan) -> Result<()> {
     let (free, _) = device.memory()?;
-    let bytes: u64 = batches.floats.iter().map(|floats| 4 * floats).sum();
+    let bytes: u64 = plan.floats.iter().map(|floats| 4 * floats).sum();
     if bytes <= free as u64 {
         return Ok(());
     }

@@ -1,9 +1,9 @@
-//! The group concept of chapter 3.2.2: domains of different ranks are brought into one layout, so that one kernel
-//! computes all of them. No I/O.
+//! The group concept of chapter 3.2.2: one layout for domains of different ranks, so that one kernel computes all of
+//! them. No I/O.
 //!
-//! Notation of the text: n_vr is the number of float4 per row of U' ([`vectors_per_row`]); a warp holds n_g groups of w_g lanes;
-//! a group holds n_gg rows of one domain at a time. U'' (equations 3.5 and 3.6) has w_g columns and n' = ceil(3n /
-//! n_gg) rows. The text prints floor(3n / n_gg), which omits up to n_gg - 1 rows of U.
+//! Notation of the text: a row of U' has n_vr float4 ([`vectors_per_row`]). A warp holds n_g groups of w_g lanes. A
+//! group holds n_gg rows of one domain at a time. U'' (equations 3.5 and 3.6) has w_g columns and n' = ceil(3n / n_gg)
+//! rows. The text prints floor(3n / n_gg), which omits up to n_gg - 1 rows of U.
 
 use serde::Serialize;
 
@@ -19,15 +19,15 @@ pub(super) const MAX_RANK: usize = 32;
 /// Output index in the metadata of an idle lane.
 pub(super) const IDLE: u32 = u32::MAX;
 
-/// Number of kernels over which the domains are distributed by n_vr (figures 3.5 and 3.6).
+/// Number of kernels; n_vr determines which of them computes a domain (figures 3.5 and 3.6).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum KernelSplit {
-    /// All with w_g = 8.
+    /// w_g is 8 for all n_vr.
     One,
-    /// n_vr of 3, 5 and 6 with w_g = 6, the others with 8: the fastest in the text.
+    /// w_g is 6 for an n_vr of 3, 5 or 6, and otherwise 8. The fastest split in the text.
     Two,
-    /// n_vr of 3 and 6 with w_g = 6, 5 with 5, 7 with 7, the others with 8: no lane of a group is idle.
+    /// w_g is 6 for an n_vr of 3 or 6, 5 for 5, 7 for 7, and otherwise 8. No lane of a group is idle.
     Four,
 }
 
@@ -89,11 +89,11 @@ pub struct LaneCounts {
     pub idle: u64,
 }
 
-/// The lanes of each kernel of a split, computed from sizes alone.
+/// The lane counts of each kernel of a split, computed without packing.
 pub fn count_lanes(scene: &Scene, split: KernelSplit) -> Vec<LaneCounts> {
     let count_for_width = |width: &usize| {
         let (mut groups, mut busy_lanes) = (0, 0);
-        for slot in scene.layout.domains.iter().filter(|slot| is_of_width(split, *width, slot.rank)) {
+        for slot in scene.layout.domains.iter().filter(|slot| belongs_to_width(split, *width, slot.rank)) {
             groups += reshaped_rows(3 * slot.vertices, *width, vectors_per_row(slot.rank));
             busy_lanes += (3 * slot.vertices * vectors_per_row(slot.rank)) as u64;
         }
@@ -103,7 +103,7 @@ pub fn count_lanes(scene: &Scene, split: KernelSplit) -> Vec<LaneCounts> {
     split.widths().iter().map(count_for_width).filter(|counts| counts.all > 0).collect()
 }
 
-const fn is_of_width(split: KernelSplit, width: usize, rank: usize) -> bool {
+const fn belongs_to_width(split: KernelSplit, width: usize, rank: usize) -> bool {
     rank > 0 && split.width_of(vectors_per_row(rank)) == width
 }
 
@@ -140,7 +140,7 @@ pub(super) fn pack_q(scene: &Scene, state: &SceneState) -> Vec<f32> {
 }
 
 /// The k-th float4 of a row of U, padded with zeros.
-pub(super) fn row_vector(scene: &Scene, domain: usize, row: usize, k: usize) -> [f32; 4] {
+pub(super) fn pack_row_vector(scene: &Scene, domain: usize, row: usize, k: usize) -> [f32; 4] {
     let modes = &scene.shape_of(domain).modes;
     [0, 1, 2, 3].map(|component| match 4 * k + component {
         mode if mode < modes.rank() => modes.entry(row / 3, row % 3, mode),
@@ -171,20 +171,20 @@ pub(super) fn pack_groups(scene: &Scene, split: KernelSplit, width: usize) -> Pa
     let mut first_q = 0;
     for (domain, slot) in scene.layout.domains.iter().enumerate() {
         let n_vr = vectors_per_row(slot.rank);
-        let first_u = displacements.first_vertices[domain].filter(|_| is_of_width(split, width, slot.rank));
+        let first_u = displacements.first_vertices[domain].filter(|_| belongs_to_width(split, width, slot.rank));
         if let Some(first_u) = first_u {
             let rows = 3 * slot.vertices;
             let reshaped = reshaped_rows(rows, width, n_vr);
             for group in 0..reshaped {
                 packed.begin_group();
                 for lane in 0..width {
-                    let (part, k) = (lane / n_vr, lane % n_vr);
-                    let row = part * reshaped + group;
-                    let is_busy = part < rows_per_group(width, n_vr) && row < rows;
+                    let (row_of_group, k) = (lane / n_vr, lane % n_vr);
+                    let row = row_of_group * reshaped + group;
+                    let is_busy = row_of_group < rows_per_group(width, n_vr) && row < rows;
                     packed.push_lane(is_busy.then(|| {
                         let output = 4 * (first_u + row as u32 / 3) + row as u32 % 3;
                         let meta = [output, first_q + k as u32, n_vr as u32, 0];
-                        Lane { entry: row_vector(scene, domain, row, k), meta }
+                        Lane { entry: pack_row_vector(scene, domain, row, k), meta }
                     }));
                 }
             }
@@ -205,7 +205,7 @@ impl PackedGroups {
         self.meta.push(meta);
     }
 
-    /// Pads so that the next group lies in one warp.
+    /// Appends idle lanes so that the next group lies in one warp.
     fn begin_group(&mut self) {
         while self.meta.len() % WARP >= groups_per_warp(self.width) * self.width {
             self.push_lane(None);
@@ -233,8 +233,7 @@ mod tests {
             |split: KernelSplit| (1..=8).filter(|n_vr| idle_in_group(split, *n_vr) > 0).collect::<Vec<_>>();
         assert_eq!(widths_with_idle_lanes(KernelSplit::Two), [5, 7]);
         assert_eq!(widths_with_idle_lanes(KernelSplit::One), [3, 5, 6, 7]);
-        // Lanes outside of groups count as idle too: with w_g = 6 two per warp, as the text says of widths that do not
-        // divide 32.
+        // Lanes outside of groups are idle too. With w_g = 6 there are two per warp, because 6 does not divide 32.
         assert_eq!([1, 2, 4, 8].map(|n_vr| idle_lanes_per_warp(8, n_vr)), [0; 4]);
         assert_eq!([3, 6].map(|n_vr| idle_lanes_per_warp(6, n_vr)), [2, 2]);
         assert_eq!([idle_lanes_per_warp(6, 5), idle_lanes_per_warp(8, 5), idle_lanes_per_warp(5, 5)], [7, 12, 2]);
@@ -243,26 +242,32 @@ mod tests {
 
     #[test]
     fn floor_drops_rows_of_u_that_ceil_keeps() {
-        let covered_rows = |rows: usize, reshaped: usize, parts: usize| {
-            (0..parts)
-                .flat_map(|part| (0..reshaped).map(move |row| part * reshaped + row))
-                .filter(|r| *r < rows)
+        let covered_rows = |rows: usize, reshaped: usize, rows_of_group: usize| {
+            (0..rows_of_group)
+                .flat_map(|row_of_group| (0..reshaped).map(move |row| row_of_group * reshaped + row))
+                .filter(|row| *row < rows)
                 .count()
         };
         // Four vertices of rank 4 (n_vr = 1) in groups of eight: 12 rows of U fill one and a half rows of U''.
-        let parts = rows_per_group(8, 1);
-        assert_eq!((covered_rows(12, 12 / parts, parts), covered_rows(12, 12_usize.div_ceil(parts), parts)), (8, 12));
+        let rows_of_group = rows_per_group(8, 1);
+        assert_eq!(
+            (
+                covered_rows(12, 12 / rows_of_group, rows_of_group),
+                covered_rows(12, 12_usize.div_ceil(rows_of_group), rows_of_group)
+            ),
+            (8, 12)
+        );
         assert_eq!(reshaped_rows(12, 8, 1), 2);
-        let mut dropped = 0;
+        let mut dropped_cases = 0;
         for (vertices, n_vr) in (1..50).flat_map(|vertices| (1..=8).map(move |n_vr| (vertices, n_vr))) {
             for split in KernelSplit::ALL {
                 let (rows, width) = (3 * vertices, split.width_of(n_vr));
-                let parts = rows_per_group(width, n_vr);
-                assert_eq!(covered_rows(rows, reshaped_rows(rows, width, n_vr), parts), rows);
-                dropped += usize::from(covered_rows(rows, rows / parts, parts) < rows);
+                let rows_of_group = rows_per_group(width, n_vr);
+                assert_eq!(covered_rows(rows, reshaped_rows(rows, width, n_vr), rows_of_group), rows);
+                dropped_cases += usize::from(covered_rows(rows, rows / rows_of_group, rows_of_group) < rows);
             }
         }
-        assert!(dropped > 100, "expected floor to drop rows in over 100 cases, got {dropped}");
+        assert!(dropped_cases > 100, "expected floor to drop rows in over 100 cases, got {dropped_cases}");
     }
 
     #[test]
@@ -283,7 +288,10 @@ mod tests {
             all_counts.iter().map(|counts| counts.idle).sum::<u64>() as f64
                 / all_counts.iter().map(|counts| counts.all).sum::<u64>() as f64
         };
-        let [one, two] = [KernelSplit::One, KernelSplit::Two].map(idle_share);
-        assert!(two < one, "expected fewer idle lanes with two kernels, got {two} and {one}");
+        let [one_kernel, two_kernels] = [KernelSplit::One, KernelSplit::Two].map(idle_share);
+        assert!(
+            two_kernels < one_kernel,
+            "expected fewer idle lanes with two kernels, got {two_kernels} and {one_kernel}"
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! BASELINE. The kernels of the thesis's chapter 3.2 as its text describes them, for comparison with ours.
+//! BASELINE. The kernels of chapter 3.2 of the thesis, implemented as the text describes them, for comparison with ours.
 //!
 //! | file | chapter | contents |
 //! |---|---|---|
@@ -6,7 +6,7 @@
 //! | [`group`], [`thesis_multi`] | 3.2.2 | u = U q of many domains, in groups of lanes |
 //! | [`thesis_update`] | 3.2.3 | x = T (x0 + u), normals and tangents, of unfolded triangles |
 //!
-//! Here u stays in device memory. The text maps it into host memory, which over PCIe would measure the bus.
+//! Unlike in the text, u stays in device memory. In mapped host memory, the PCIe bus would limit the times.
 
 mod group;
 mod thesis_multi;
@@ -28,7 +28,7 @@ use thesis_multi::MultiDomainKernel;
 use thesis_single::SingleDomainKernel;
 use thesis_update::{UpdateKernel, transform_matrices};
 
-/// The kernels that compute u.
+/// The kernels that compute u = U q.
 #[derive(Debug)]
 enum UqKernel {
     Single(SingleDomainKernel),

@@ -1,6 +1,6 @@
 //! BASELINE. Launches `kernels/thesis_multi.cu`: u = U q of many domains in groups of lanes (chapter 3.2.2).
 //!
-//! The kernels of a split run one after the other. In the text they overlap in streams (figure 3.5).
+//! The kernels of a split run one after the other. In the text, they run concurrently in streams (figure 3.5).
 
 use cudarc::driver::{LaunchConfig, PushKernelArg as _};
 
@@ -108,15 +108,15 @@ mod tests {
 
     /// CPU twin of `thesis_multi`, thread by thread; counts the writes to each number of u.
     fn twin_of_thesis_multi(packed: &PackedGroups, q: &[f32], u: &mut [f32], write_counts: &mut [usize]) {
-        for first in (0..packed.meta.len()).step_by(WARP) {
-            let is_busy = |lane: &usize| packed.meta[first + lane][0] != IDLE;
+        for first_lane in (0..packed.meta.len()).step_by(WARP) {
+            let is_busy = |lane: &usize| packed.meta[first_lane + lane][0] != IDLE;
             let mut sub_sums = [0.0_f32; WARP];
             for lane in (0..WARP).filter(is_busy) {
-                let q = &q[4 * packed.meta[first + lane][1] as usize..][..4];
-                sub_sums[lane] = packed.entries[first + lane].iter().zip(q).map(|(entry, q)| entry * q).sum();
+                let q = &q[4 * packed.meta[first_lane + lane][1] as usize..][..4];
+                sub_sums[lane] = packed.entries[first_lane + lane].iter().zip(q).map(|(entry, q)| entry * q).sum();
             }
             for lane in (0..WARP).filter(is_busy) {
-                let [output, _, n_vr, _] = packed.meta[first + lane].map(|number| number as usize);
+                let [output, _, n_vr, _] = packed.meta[first_lane + lane].map(|number| number as usize);
                 if (lane % packed.width).is_multiple_of(n_vr) {
                     u[output] = sub_sums[lane..lane + n_vr].iter().sum();
                     write_counts[output] += 1;
@@ -137,16 +137,16 @@ mod tests {
                 twin_of_thesis_multi(&pack_groups(&scene, split, *width), &q, &mut u, &mut write_counts);
             }
             assert!(
-                write_counts.iter().enumerate().all(|(number, count)| *count == usize::from(number % 4 < 3)),
+                write_counts.iter().enumerate().all(|(index, count)| *count == usize::from(index % 4 < 3)),
                 "{split:?}"
             );
             let mut max_error = 0.0_f64;
-            for (domain, first) in
-                first_vertices.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?)))
+            for (domain, first_u) in
+                first_vertices.iter().enumerate().filter_map(|(domain, first_u)| Some((domain, (*first_u)?)))
             {
                 for vertex in 0..scene.layout.domains[domain].vertices {
                     let want = displacement_of(&scene, &state, domain, vertex);
-                    let got = &u[4 * (first as usize + vertex)..][..3];
+                    let got = &u[4 * (first_u as usize + vertex)..][..3];
                     max_error = want
                         .iter()
                         .zip(got)

@@ -3,7 +3,7 @@
 use cudarc::driver::{LaunchConfig, PushKernelArg as _};
 
 use super::super::kernel_benchmark::{ArrayTraffic, BenchmarkSource, CompiledKernel, KernelAttributes};
-use super::group::{BLOCK, WARP, row_vector, vectors_per_row};
+use super::group::{BLOCK, WARP, pack_row_vector, vectors_per_row};
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_model::error::{Result, fault_in, invalid};
@@ -15,7 +15,7 @@ pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
     define_sets: &[&[]],
 };
 
-/// Layout of rows of U in lines of 32 float4 (figure 3.3).
+/// Layout of the rows of U in lines of 32 float4 per pass (figure 3.3).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct RowLines {
     /// Rows of U, 3n.
@@ -43,7 +43,7 @@ impl RowLines {
             for (pass, lane) in (0..self.passes).flat_map(|pass| (0..WARP).map(move |lane| (pass, lane))) {
                 let (row, k) = (line * rows_per_line + lane / self.width, pass * WARP + lane % self.width);
                 let is_busy = lane < rows_per_line * self.width && row < self.rows && k < vectors_per_row(self.rank);
-                lines.push(if is_busy { row_vector(scene, 0, row, k) } else { [0.0; 4] });
+                lines.push(if is_busy { pack_row_vector(scene, 0, row, k) } else { [0.0; 4] });
             }
         }
         lines
@@ -167,7 +167,7 @@ mod tests {
         assert_eq!(distinct_indices(128), 128);
         // The 129th coordinate has the index of the second.
         assert!(distinct_indices(129) < 129);
-        // In the kernel's loop, index i * 32 + j takes q[4 j + i]: the inverse of the same map.
+        // The kernel stores q[4 j + i] at index i * 32 + j, which is the inverse of this map.
         assert!((0..128).all(|index| shared_index_of_q(4 * (index % 32) + index / 32) == index));
         for component in 0..4 {
             let banks: std::collections::BTreeSet<usize> =

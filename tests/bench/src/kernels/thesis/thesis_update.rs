@@ -23,8 +23,8 @@ const VERTICES_PER_BLOCK: usize = 64;
 /// Value of `sources` for a vertex without u.
 const RIGID: u32 = u32::MAX;
 
-/// Minimum number of triangles per domain that the text assumes, so that eight consecutive vertices belong to at most two
-/// domains.
+/// Minimum number of triangles per domain that the text assumes. With three triangles per domain, eight consecutive
+/// vertices belong to at most two domains.
 const MIN_TRIANGLES: usize = 3;
 
 /// Arguments of `thesis_update`; pointers are device addresses.
@@ -53,11 +53,11 @@ unsafe impl DeviceRepr for UpdateArgs {}
 /// The vertices of unfolded triangles: three per triangle, without sharing.
 #[derive(Debug, Default)]
 struct UnfoldedTriangles {
-    /// Per warp: its two domains, the first vertex of the second one, and 0.
+    /// Per warp: two domains, the first of its eight vertices that belongs to the second domain, and 0.
     warps: Vec<[u32; 4]>,
-    /// Index of the vertex in u, or [`RIGID`].
+    /// Index into u of each vertex, or [`RIGID`].
     sources: Vec<u32>,
-    /// The packed vertex of the scene's layout.
+    /// Packed vertex of each vertex in the scene's layout.
     targets: Vec<u32>,
     positions: Vec<[f32; 4]>,
     normals: Vec<[f32; 4]>,
@@ -88,7 +88,7 @@ impl UnfoldedTriangles {
                 domains.push(domain as u32);
             }
         }
-        unfolded.warps = domains.chunks(VERTICES_PER_WARP).map(warp_domains).collect();
+        unfolded.warps = domains.chunks(VERTICES_PER_WARP).map(warp_entry).collect();
         unfolded.warps.resize(
             domains.len().div_ceil(VERTICES_PER_BLOCK) * VERTICES_PER_BLOCK / VERTICES_PER_WARP,
             [0, 0, VERTICES_PER_WARP as u32, 0],
@@ -97,11 +97,13 @@ impl UnfoldedTriangles {
     }
 }
 
-/// The two domains of a warp, the first vertex of the second one, and 0.
-fn warp_domains(domains: &[u32]) -> [u32; 4] {
-    let first = domains[0];
-    let boundary = domains.iter().position(|domain| *domain != first);
-    boundary.map_or([first, first, VERTICES_PER_WARP as u32, 0], |vertex| [first, domains[vertex], vertex as u32, 0])
+/// The entry of [`UnfoldedTriangles::warps`] for a warp, from the domains of its vertices.
+fn warp_entry(domains: &[u32]) -> [u32; 4] {
+    let first_domain = domains[0];
+    let boundary = domains.iter().position(|domain| *domain != first_domain);
+    boundary.map_or([first_domain, first_domain, VERTICES_PER_WARP as u32, 0], |vertex| {
+        [first_domain, domains[vertex], vertex as u32, 0]
+    })
 }
 
 const fn float4([x, y, z]: [f32; 3], w: f32) -> [f32; 4] {
@@ -232,8 +234,8 @@ mod tests {
         let mut positions = vec![[f32::NAN; 4]; count];
         for thread in 0..count.div_ceil(VERTICES_PER_BLOCK) * BLOCK {
             let (vertex, element, warp) = (thread / 4, thread % 4, thread / 32);
-            let [first, second, split, _] = unfolded.warps[warp];
-            let domain = if (thread % 32 / 4) < split as usize { first } else { second };
+            let [first_domain, second_domain, first_of_second, _] = unfolded.warps[warp];
+            let domain = if (thread % 32 / 4) < first_of_second as usize { first_domain } else { second_domain };
             if vertex < count {
                 let mut rest = unfolded.positions[vertex];
                 if unfolded.sources[vertex] != RIGID {
@@ -256,10 +258,11 @@ mod tests {
         assert_eq!(unfolded.targets.len(), 3 * (3 + 3 + 30 + 3 + 3 + 5));
         let DisplacementLayout { first_vertices, vertex_count } = DisplacementLayout::of(&scene);
         let mut u = vec![[0.0_f32; 4]; vertex_count];
-        for (domain, first) in first_vertices.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?)))
+        for (domain, first_u) in
+            first_vertices.iter().enumerate().filter_map(|(domain, first_u)| Some((domain, (*first_u)?)))
         {
             for vertex in 0..scene.layout.domains[domain].vertices {
-                u[first as usize + vertex] =
+                u[first_u as usize + vertex] =
                     float4(displacement_of(&scene, &state, domain, vertex).map(|number| number as f32), 0.0);
             }
         }
@@ -284,9 +287,11 @@ mod tests {
         let (scene, _) = scene_and_state(&[(3, 0, 1); 50]);
         let unfolded = UnfoldedTriangles::of(&scene);
         let domain = |vertex: usize| unfolded.targets[vertex] / 3;
-        for (index, [first, second, split, _]) in unfolded.warps.iter().enumerate().take(450 / VERTICES_PER_WARP) {
+        for (index, [first_domain, second_domain, first_of_second, _]) in
+            unfolded.warps.iter().enumerate().take(450 / VERTICES_PER_WARP)
+        {
             for vertex in 0..VERTICES_PER_WARP {
-                let expected = if vertex < *split as usize { first } else { second };
+                let expected = if vertex < *first_of_second as usize { first_domain } else { second_domain };
                 assert_eq!(domain(VERTICES_PER_WARP * index + vertex), *expected);
             }
         }
