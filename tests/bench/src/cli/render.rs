@@ -10,7 +10,7 @@ use modalcast::cli::{Outcome, print_line};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::FrameSize;
 
-const LOADS: &str = "Loads:
+const WORKLOAD_HELP: &str = "Loads:
   square       a square that floats over the ground
   shelf        a shelf just above the ground, from nearby
   panes        three translucent panes, listed in the wrong order
@@ -35,7 +35,7 @@ Examples:
 /// for every variant, a strip of rendered, reference and difference image. Exit code 1 when a variant exceeds its error
 /// bounds.
 #[derive(Debug, clap::Args)]
-#[command(after_help = LOADS)]
+#[command(after_help = WORKLOAD_HELP)]
 pub(super) struct Args {
     /// Output folder; files of an earlier report there are replaced.
     #[arg(long)]
@@ -60,7 +60,7 @@ pub(super) struct Args {
     /// Draw the figures of the thesis's chapter 4.2 from our own scenes; nothing is measured.
     #[arg(long, conflicts_with_all = ["loads", "variants", "replays", "quick"])]
     figures: bool,
-    /// Measure only the CUDA rasterizer against OpenGL's bare passes, on the loads, a room and two triangles that fill
+    /// Measure only the CUDA rasterizer against OpenGL's minimal passes, on the loads, a room and two triangles that fill
     /// the frame. Writes raster.json and raster.md. Needs an NVIDIA GPU.
     #[arg(long, conflicts_with_all = ["variants", "figures", "scenes"])]
     raster: bool,
@@ -70,44 +70,45 @@ pub(super) struct Args {
     scenes: Vec<String>,
 }
 
-/// Default sizes: of the report, and of the figures' pictures.
-const USUAL: [FrameSize; 2] = [FrameSize { width: 640, height: 360 }, FrameSize { width: 640, height: 480 }];
+const DEFAULT_REPORT_SIZE: FrameSize = FrameSize { width: 640, height: 360 };
+const DEFAULT_FIGURE_SIZE: FrameSize = FrameSize { width: 640, height: 480 };
 
-/// Upper limit of a picture's side in pixels, because the references trace 16 to 64 samples per pixel.
-const LARGEST: u32 = 4096;
+/// Maximum width and height of a picture in pixels, because the references trace 16 to 64 samples per pixel.
+const MAX_SIDE: u32 = 4096;
 
 pub(super) fn run(args: &Args) -> Outcome {
     if args.figures {
-        return figures(args);
+        return run_figures(args);
     }
     if !args.scenes.is_empty() {
-        return timed(args);
+        return run_frame_times(args);
     }
-    let request = request(args)?;
+    let options = report_options(args)?;
     if args.raster {
-        return rasters(args, &request);
+        return run_raster_comparison(args, &options);
     }
-    let report = with_spinner("measuring", || render::render(&request, |what| tracing::info!(what, "measuring")))?;
+    let report = with_spinner("measuring", || render::render(&options, |what| tracing::info!(what, "measuring")))?;
     report.write(&args.out)?;
-    lines(&report).into_iter().for_each(print_line);
+    report_lines(&report).into_iter().for_each(print_line);
     print_line(format!("written to {}", args.out.display()));
     Ok(report.passed())
 }
 
-fn rasters(args: &Args, request: &RenderReportOptions) -> Outcome {
-    let rasters =
-        with_spinner("measuring", || render::compare_rasterizers(request, |what| tracing::info!(what, "measuring")))?;
-    rasters.write(&args.out)?;
-    rasters.rows.iter().for_each(|row| print_line(row.line()));
-    rasters.frames.iter().for_each(|row| print_line(row.line()));
+fn run_raster_comparison(args: &Args, options: &RenderReportOptions) -> Outcome {
+    let comparisons =
+        with_spinner("measuring", || render::compare_rasterizers(options, |what| tracing::info!(what, "measuring")))?;
+    comparisons.write(&args.out)?;
+    comparisons.rows.iter().for_each(|row| print_line(row.line()));
+    comparisons.frames.iter().for_each(|row| print_line(row.line()));
     print_line(format!("written to {}", args.out.display()));
-    Ok(rasters.passed())
+    Ok(comparisons.passed())
 }
 
-fn figures(args: &Args) -> Outcome {
-    let request = render::figures::FigureOptions { size: size(args, USUAL[1])?, scenes: args.scenes.clone() };
-    let hear = |what: &str| tracing::info!(what, "drawing");
-    let figures = with_spinner("drawing", || render::figures::draw_figures(&request, hear))?;
+fn run_figures(args: &Args) -> Outcome {
+    let options =
+        render::figures::FigureOptions { size: size(args, DEFAULT_FIGURE_SIZE)?, scenes: args.scenes.clone() };
+    let log_progress = |what: &str| tracing::info!(what, "drawing");
+    let figures = with_spinner("drawing", || render::figures::draw_figures(&options, log_progress))?;
     figures.write(&args.out)?;
     for figure in &figures.figures {
         print_line(format!("{:<6}{:<36}{}", figure.name, figure.file, figure.captions.join("; ")));
@@ -116,15 +117,18 @@ fn figures(args: &Args) -> Outcome {
     Ok(true)
 }
 
-fn timed(args: &Args) -> Outcome {
+fn run_frame_times(args: &Args) -> Outcome {
     let replays = args.replays.map_or(100, |replays| replays as usize);
-    let request =
-        render::frame_times::FrameTimeOptions { scenes: args.scenes.clone(), size: size(args, USUAL[0])?, replays };
-    let timed = with_spinner("measuring", || {
-        render::frame_times::time_scenes(&request, |what| tracing::info!(what, "timing"))
+    let options = render::frame_times::FrameTimeOptions {
+        scenes: args.scenes.clone(),
+        size: size(args, DEFAULT_REPORT_SIZE)?,
+        replays,
+    };
+    let frame_times = with_spinner("measuring", || {
+        render::frame_times::time_scenes(&options, |what| tracing::info!(what, "timing"))
     })?;
-    timed.write(&args.out)?;
-    for scene in &timed.scenes {
+    frame_times.write(&args.out)?;
+    for scene in &frame_times.scenes {
         let frame = scene.passes.iter().find(|pass| pass.name == "frame").map_or(0.0, |pass| pass.timing.median_us);
         print_line(format!(
             "{:<24}frame {frame:>12.1} us, with its pixels {:>12.1} us",
@@ -138,16 +142,16 @@ fn timed(args: &Args) -> Outcome {
 /// The requested or default size.
 ///
 /// # Errors
-/// `Invalid` when a side is not in 1 to [`LARGEST`].
-fn size(args: &Args, usual: FrameSize) -> Result<render::Size> {
-    let FrameSize { width, height } = args.size.unwrap_or(usual);
-    match [width, height].iter().all(|side| (1..=LARGEST).contains(side)) {
+/// `Invalid` when a side is not in 1 to [`MAX_SIDE`].
+fn size(args: &Args, default_size: FrameSize) -> Result<render::Size> {
+    let FrameSize { width, height } = args.size.unwrap_or(default_size);
+    match [width, height].iter().all(|side| (1..=MAX_SIDE).contains(side)) {
         true => Ok(render::Size { width, height }),
-        false => Err(invalid("size", format!("1 to {LARGEST} pixels a side"), FrameSize { width, height })),
+        false => Err(invalid("size", format!("1 to {MAX_SIDE} pixels a side"), FrameSize { width, height })),
     }
 }
 
-fn request(args: &Args) -> Result<RenderReportOptions> {
+fn report_options(args: &Args) -> Result<RenderReportOptions> {
     let (mut loads, mut plants) = (Vec::new(), Vec::new());
     for name in &args.loads {
         match plants_named(name) {
@@ -158,16 +162,16 @@ fn request(args: &Args) -> Result<RenderReportOptions> {
     if args.loads.is_empty() {
         (loads, plants) = (RenderWorkload::all(args.quick), (0..PLANTS.len()).collect());
     }
-    let request = RenderReportOptions {
+    let options = RenderReportOptions {
         loads,
         plants,
         variants: args.variants.clone(),
-        size: size(args, USUAL[0])?,
+        size: size(args, DEFAULT_REPORT_SIZE)?,
         quick: args.quick,
         replays: args.replays.map_or(if args.quick { 20 } else { 100 }, |replays| replays as usize),
     };
-    match request.selected_variants().is_empty() {
-        false => Ok(request),
+    match options.selected_variants().is_empty() {
+        false => Ok(options),
         true => {
             let names: Vec<String> = variants::all(false).into_iter().map(|variant| variant.name).collect();
             Err(invalid("variant", format!("one or more of: {}", names.join("; ")), args.variants.join("; ")))
@@ -184,20 +188,21 @@ fn plants_named(name: &str) -> Option<Vec<usize>> {
     (1..=PLANTS.len()).contains(&number).then(|| vec![number - 1])
 }
 
-fn lines(report: &RenderReport) -> Vec<String> {
-    let head = ["frame us", "colour", "of aim", "light", "penumbra", "bleeding", "flicker", "passed"];
-    let mut lines = vec![format!("{:<18}{:<40}{}", "load", "variant", head.map(|word| format!("{word:>10}")).concat())];
+fn report_lines(report: &RenderReport) -> Vec<String> {
+    let headings = ["frame us", "color", "intended", "light", "penumbra", "bleeding", "flicker", "passed"];
+    let mut lines =
+        vec![format!("{:<18}{:<40}{}", "load", "variant", headings.map(|word| format!("{word:>10}")).concat())];
     for row in &report.rows {
-        let show =
+        let format_number =
             |number: Option<f64>, digits: usize| number.map_or("-".into(), |number| format!("{number:.digits$}"));
         let cells = [
-            show(row.median_us(), 1),
-            show(Some(row.color_errors.mean), 3),
-            show(Some(row.intended_color_errors.mean), 3),
-            show(Some(row.intended_light_errors.all_pixels.mean), 4),
-            show(Some(row.intended_light_errors.penumbra.mean), 4),
-            show(row.intended_light_errors.umbra_visibility, 4),
-            show(row.flicker.map(|flicker| flicker.mean), 3),
+            format_number(row.median_us(), 1),
+            format_number(Some(row.color_errors.mean), 3),
+            format_number(Some(row.intended_color_errors.mean), 3),
+            format_number(Some(row.intended_light_errors.all_pixels.mean), 4),
+            format_number(Some(row.intended_light_errors.penumbra.mean), 4),
+            format_number(row.intended_light_errors.umbra_visibility, 4),
+            format_number(row.flicker.map(|flicker| flicker.mean), 3),
             match (row.passed, row.is_expected_to_fail) {
                 (true, _) => "yes".into(),
                 (false, true) => "as expected".into(),
@@ -207,8 +212,10 @@ fn lines(report: &RenderReport) -> Vec<String> {
         lines.push(format!("{:<18}{:<40}{}", row.load, row.name, cells.map(|cell| format!("{cell:>10}")).concat()));
     }
     lines.extend(report.readback.iter().map(|row| {
-        let (load, none, all, loss) = (&row.load, row.unread_fps, row.ring_fps, row.ring_loss);
-        format!("{load:<18}{none:.1} frames/s when none is read, {all:.1} when each is: {loss:.1} % fewer")
+        let (load, unread_fps, ring_fps, ring_loss) = (&row.load, row.unread_fps, row.ring_fps, row.ring_loss);
+        format!(
+            "{load:<18}{unread_fps:.1} frames/s when none is read, {ring_fps:.1} when each is: {ring_loss:.1} % fewer"
+        )
     }));
     for plant in &report.plants {
         lines.push(format!(
@@ -257,27 +264,37 @@ mod tests {
 
     #[test]
     fn defaults_to_all_loads_and_rejects_bad_names_and_sizes() {
-        let all = request(&args()).expect("fits");
-        assert_eq!((all.loads.len(), all.plants.len(), all.replays), (RenderWorkload::all(true).len(), 12, 20));
-        let plants = Args { loads: ["plant-3", "square", "plants"].map(String::from).to_vec(), ..args() };
-        let plants = request(&plants).expect("fits");
-        assert_eq!((plants.loads.len(), plants.plants.len(), plants.plants[0]), (1, 13, 2));
-        let named = Args { loads: vec!["square".into(), "triangles-10".into()], replays: Some(7), ..args() };
-        assert_eq!(request(&named).expect("fits").loads, [RenderWorkload::Square, RenderWorkload::Triangles(10)]);
-        // A quick run also includes the frame that the bare passes are compared with, if it is named.
+        let default_options = report_options(&args()).expect("valid options");
+        assert_eq!(
+            (default_options.loads.len(), default_options.plants.len(), default_options.replays),
+            (RenderWorkload::all(true).len(), 12, 20)
+        );
+        let plant_args = Args { loads: ["plant-3", "square", "plants"].map(String::from).to_vec(), ..args() };
+        let options = report_options(&plant_args).expect("valid options");
+        assert_eq!((options.loads.len(), options.plants.len(), options.plants[0]), (1, 13, 2));
+        let named_args = Args { loads: vec!["square".into(), "triangles-10".into()], replays: Some(7), ..args() };
+        assert_eq!(
+            report_options(&named_args).expect("valid options").loads,
+            [RenderWorkload::Square, RenderWorkload::Triangles(10)]
+        );
+        // A quick run also includes the frame that the minimal passes are compared with, if it is named.
         let variants = ["variance 4096, blur 1.5", "culling*"].map(String::from).to_vec();
-        let named = request(&Args { variants, ..args() }).expect("fits").selected_variants();
-        let names: Vec<&str> = named.iter().map(|variant| variant.name.as_str()).collect();
-        assert_eq!(names, ["variance 4096, blur 1.5", "culling none", "culling triangles", "culling depth"]);
-        assert_eq!(request(&args()).expect("fits").selected_variants().len(), variants::all(true).len());
-        for wrong in [
+        let selected_variants =
+            report_options(&Args { variants, ..args() }).expect("valid options").selected_variants();
+        let variant_names: Vec<&str> = selected_variants.iter().map(|variant| variant.name.as_str()).collect();
+        assert_eq!(variant_names, ["variance 4096, blur 1.5", "culling none", "culling triangles", "culling depth"]);
+        assert_eq!(
+            report_options(&args()).expect("valid options").selected_variants().len(),
+            variants::all(true).len()
+        );
+        for invalid_args in [
             Args { loads: vec!["cube".into()], ..args() },
             Args { loads: vec!["plant-13".into()], ..args() },
             Args { variants: vec!["varience*".into()], ..args() },
             Args { size: Some(FrameSize { width: 0, height: 5 }), ..args() },
             Args { size: Some(FrameSize { width: 5, height: 5000 }), ..args() },
         ] {
-            assert!(request(&wrong).is_err(), "{wrong:?}");
+            assert!(report_options(&invalid_args).is_err(), "{invalid_args:?}");
         }
     }
 }
