@@ -21,7 +21,7 @@ require_packages() {
 }
 
 # Fails if the Rust toolchain is missing or too old, and prints the command that installs it. The toolchain belongs to
-# the user, so this script does not install it.
+# the user, so this script does not install it. Installs a C compiler, which Rust needs for linking, if there is none.
 require_rust() {
     local required installed
     required=$(sed -n 's/^rust-version = "\(.*\)"/\1/p' Cargo.toml)

@@ -1,5 +1,5 @@
-//! Scene files over the wire: paths cannot leave the repository, the repository and uploads accept the same scene.toml,
-//! and a rejection names the invalid file.
+//! Scene files over the wire: paths cannot leave the repository, an uploaded scene.toml opens, and a rejection names the
+//! invalid file.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -94,7 +94,7 @@ async fn repository_paths_open_and_cannot_escape() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn uploaded_scene_toml_opens_like_one_of_the_repository() {
+async fn uploaded_scene_toml_opens_and_deforms() {
     let (state_folder, repository_folder) = (
         tempfile::tempdir().expect("expected a temporary folder"),
         tempfile::tempdir().expect("expected a temporary folder"),

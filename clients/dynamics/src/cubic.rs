@@ -2,8 +2,8 @@
 //! polynomial of degree three without a constant term. This module also computes its Jacobian and potential.
 //!
 //! File format: four little-endian i32 (r, then the numbers of monomials of degree one, two and three: r, r(r+1)/2 and
-//! r(r+1)(r+2)/6), followed by one f64 block per degree, row-major per force component. The monomials q_i q_j (i <= j)
-//! and q_i q_j q_k (i <= j <= k) are in lexicographic order.
+//! r(r+1)(r+2)/6), followed by one f64 matrix per degree, row-major, with one row per force component and one column per
+//! monomial. The monomials q_i q_j (i <= j) and q_i q_j q_k (i <= j <= k) are in lexicographic order.
 
 use std::path::Path;
 
@@ -28,7 +28,7 @@ pub struct ReducedForce {
 }
 
 impl ReducedForce {
-    /// Creates a force from its blocks, each row-major per force component.
+    /// Creates a force from its blocks, row-major matrices with one row per force component.
     ///
     /// # Errors
     /// `Invalid` if r is not 1 to 512, a block has the wrong length, or an entry is not finite.
@@ -182,9 +182,9 @@ pub(crate) mod tests {
         })
     }
 
-    /// Springs with the given eigenvalues. Neighbors have the potentials `quartic_potential` (q_i - q_{i+1})^4 and
-    /// `cubic_potential` q_i^2 q_{i+1}.
-    pub(crate) fn spring_chain(eigenvalues: &[f64], quartic_potential: f64, cubic_potential: f64) -> ReducedForce {
+    /// Springs with the given eigenvalues. Neighbors add the potentials a (q_i - q_{i+1})^4 and b q_i^2 q_{i+1} with
+    /// a = `quartic_coefficient` and b = `cubic_coefficient`.
+    pub(crate) fn spring_chain(eigenvalues: &[f64], quartic_coefficient: f64, cubic_coefficient: f64) -> ReducedForce {
         let rank = eigenvalues.len();
         let [_, quadratic_count, cubic_count] = monomial_counts(rank).expect("a supported rank");
         let linear = DMatrix::from_diagonal(&DVector::from_column_slice(eigenvalues));
@@ -203,10 +203,10 @@ pub(crate) mod tests {
             |i, j, k| cubic_monomials.iter().position(|monomial| *monomial == [i, j, k]).expect("a monomial");
         for i in 0..rank.saturating_sub(1) {
             let j = i + 1;
-            quadratic_block[i * quadratic_count + quadratic_column(i, j)] += 2.0 * cubic_potential;
-            quadratic_block[j * quadratic_count + quadratic_column(i, i)] += cubic_potential;
+            quadratic_block[i * quadratic_count + quadratic_column(i, j)] += 2.0 * cubic_coefficient;
+            quadratic_block[j * quadratic_count + quadratic_column(i, i)] += cubic_coefficient;
             // The force of the quartic potential is 4 (q_i - q_j)^3 on i, and its negative on j.
-            for (row, coefficient) in [(i, 4.0 * quartic_potential), (j, -4.0 * quartic_potential)] {
+            for (row, coefficient) in [(i, 4.0 * quartic_coefficient), (j, -4.0 * quartic_coefficient)] {
                 cubic_block[row * cubic_count + cubic_column(i, i, i)] += coefficient;
                 cubic_block[row * cubic_count + cubic_column(i, i, j)] -= 3.0 * coefficient;
                 cubic_block[row * cubic_count + cubic_column(i, j, j)] += 3.0 * coefficient;
@@ -320,7 +320,7 @@ pub(crate) mod tests {
 
     #[test]
     #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-    fn unscaled_bridge_has_a_lowest_frequency_of_one_hertz() {
+    fn lowest_frequency_of_the_bridge_file_is_one_hertz() {
         let path = data_folder().join("vega/simpleBridge/simpleBridge.cub");
         let force = ReducedForce::read(&path).expect("a valid file");
         let lowest_eigenvalue = force.rest_stiffness().clone().symmetric_eigenvalues().min();

@@ -92,7 +92,7 @@ impl Client {
         };
         let messages = self.replies(VertexServiceClient::new(self.channel.clone()).get_vertices(wire).await)?;
         let set = ChunkedReplies::new(messages, |message| message.chunk, self.max_reply_bytes).next().await;
-        set.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the first reply of vertices" }))
+        set.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the vertices of the step" }))
     }
 
     /// Subscribes to vertices. When this returns, the server has accepted the subscription.
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn displacements_and_boxes_follow_optional_vertices() {
+    fn decodes_displacements_and_boxes_with_and_without_positions() {
         let float_bytes = |first: u16, count: u16| (first..first + count).flat_map(|x| f32::from(x).to_le_bytes());
         let head = |position_bytes| v1::VertexHead {
             position_bytes,
@@ -282,9 +282,9 @@ mod tests {
         assert_eq!(set.displacements, [20.0, 21.0, 22.0]);
         let boxes = [[[30.0, 31.0, 32.0], [33.0, 34.0, 35.0]], [[36.0, 37.0, 38.0], [39.0, 40.0, 41.0]]];
         assert_eq!(set.boxes, boxes);
-        let set_without_vertices = decode_vertex_set(head(0), &reply[24..]).expect("a valid reply");
-        assert_eq!((set_without_vertices.displacements, set_without_vertices.boxes), (set.displacements, set.boxes));
-        assert!(set_without_vertices.positions.is_empty() && set_without_vertices.normals.is_empty());
+        let set_without_positions = decode_vertex_set(head(0), &reply[24..]).expect("a valid reply");
+        assert_eq!((set_without_positions.displacements, set_without_positions.boxes), (set.displacements, set.boxes));
+        assert!(set_without_positions.positions.is_empty() && set_without_positions.normals.is_empty());
     }
 
     #[test]

@@ -211,7 +211,7 @@ async fn upload_sends_every_file_under_its_relative_path() {
     client.upload_scene(folder.path(), "mine", "").await.expect("an upload");
     let expected =
         [("empty".into(), vec![]), ("maps/bark.png".into(), texture_bytes), ("scene.toml".into(), b"x".to_vec())];
-    assert_eq!(*server.uploads.lock().expect("lock"), expected);
+    assert_eq!(*server.uploaded_files.lock().expect("lock"), expected);
     assert!(matches!(client.upload_scene("/none".as_ref(), "mine", "").await, Err(Error::File { .. })));
 }
 

@@ -11,7 +11,7 @@ use modalcast_compute::gpu;
 pub struct Provenance {
     pub cpu: String,
     pub threads: usize,
-    /// CUDA devices with memory, versions of driver, CUDA and NVRTC, and the reason why a component is missing.
+    /// CUDA devices and their memory; the versions of the driver, CUDA and NVRTC; why a component is missing, if one is.
     pub cuda: gpu::Probe,
     pub version: &'static str,
     /// `MODALCAST_COMMIT`, otherwise git's HEAD in the current folder.

@@ -125,7 +125,7 @@ fn pick_follows_the_deformed_surface() {
     }
 }
 
-/// The four rectangles cover the image. The first one has the maximum size.
+/// Four pick rectangles cover the image. The first one has the maximum side of a pick, 64 pixels.
 #[test]
 fn picks_agree_with_the_visibility_of_the_frame() {
     let mut builder = SceneBuilder::new();
@@ -179,7 +179,8 @@ fn holes_glass_sky_and_ground_are_not_hit() {
     let cut_out_material =
         Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, color_texture: Some(image), ..Material::default() };
     let glass_material = Material { alpha_mode: AlphaMode::Blend, alpha: 0.9, ..Material::default() };
-    // The leaf is solid on its left half and open on its right half. The glass covers the upper half, in front of it.
+    // Domain 0, the cut-out, is solid on its left half and has a hole on its right half. Domain 1 is opaque, behind its lower
+    // half. Domain 2 is glass, in front of its upper half.
     let scene = builder
         .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), cut_out_material)
         .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 0.0, -1.0), Material::default())

@@ -23,7 +23,7 @@ pub(crate) struct FakeDomain {
 pub(crate) const IDENTITY: [f32; 12] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
 
 impl FakeDomain {
-    /// A domain at the origin with one corner per vertex.
+    /// A domain at the origin. Each vertex is one corner, that is, one vertex as drawn.
     pub(crate) fn new(index: u32, rest_positions: Vec<f32>, rank: u32, modes: Vec<f32>) -> Self {
         let vertices = (rest_positions.len() / 3) as u32;
         assert_eq!(modes.len(), rest_positions.len() * rank as usize, "expected 3n rows of U");
@@ -72,14 +72,17 @@ pub(crate) struct FakeServer {
     pub(crate) window: u32,
     /// Number of acknowledgements that may still be sent; unlimited unless a test restricts it.
     pub(crate) ack_permits: Semaphore,
+    /// The accepted steps.
     pub(crate) steps: Mutex<Vec<v1::Step>>,
-    pub(crate) uploads: Mutex<Vec<(String, Vec<u8>)>>,
+    /// Paths and bytes of the files of the last upload.
+    pub(crate) uploaded_files: Mutex<Vec<(String, Vec<u8>)>>,
     /// The state after each step, for the subscribers.
     pub(crate) outputs: broadcast::Sender<StepOutput>,
     state: Mutex<State>,
 }
 
 struct State {
+    /// Number of writers so far.
     run: u64,
     has_writer: bool,
     q: Vec<Vec<f32>>,
@@ -108,7 +111,7 @@ impl FakeServer {
             window: 8,
             ack_permits: Semaphore::new(Semaphore::MAX_PERMITS),
             steps: Mutex::default(),
-            uploads: Mutex::default(),
+            uploaded_files: Mutex::default(),
             outputs: broadcast::channel(1 << 14).0,
             state: Mutex::new(State { run: 0, has_writer: false, q, transforms, last_step: None }),
         }
@@ -135,7 +138,7 @@ impl FakeServer {
         }
     }
 
-    /// Acquires the writer lease. Fails if another run has it.
+    /// Acquires the writer lease. Returns the number of this writer, counted from 1. Fails if another writer has the lease.
     fn acquire_writer_lease(&self) -> Result<u64, v1::Rejection> {
         let mut state = self.state.lock().unwrap();
         if std::mem::replace(&mut state.has_writer, true) {

@@ -105,7 +105,7 @@ impl SceneService for FakeService {
                 Some(Part::Header(_)) | None => {}
             }
         }
-        *self.0.uploads.lock().unwrap() = files;
+        *self.0.uploaded_files.lock().unwrap() = files;
         Ok(Response::new(v1::UploadSceneResponse { scene: Some(self.0.info()) }))
     }
 

@@ -70,7 +70,7 @@ fn add_shared_data(forest: &mut SceneParts, species: &SceneParts) -> [usize; 2] 
 /// The tree in blossom: leaves of the material `light leaf` become petals, those of `leaf` become light green.
 ///
 /// # Errors
-/// Only those that the tree's own images would cause.
+/// Those of `Texture::new`. They do not occur, because each texture keeps its size.
 pub(super) fn build_blossoming_tree(tree: &SceneParts) -> Result<SceneParts> {
     let mut parts = SceneParts::named("peach tree");
     add_shared_data(&mut parts, tree);
