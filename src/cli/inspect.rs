@@ -45,10 +45,10 @@ pub(super) fn run(args: &Args) -> Outcome {
 fn shape_bytes(scene: &Scene, domain: usize) -> usize {
     let shape = scene.shape_of(domain);
     let corners = shape.mesh.corners();
-    let per_corner =
+    let bytes_per_corner =
         4 + 12 + if corners.uvs.is_empty() { 0 } else { 8 } + if shape.tangents().is_empty() { 0 } else { 16 };
     12 * shape.mesh.rest_positions().len()
-        + per_corner * corners.vertices.len()
+        + bytes_per_corner * corners.vertices.len()
         + 12 * shape.mesh.triangles().len()
         + 4 * shape.modes.columns().len()
         + shape.smoothing().map_or(0, |smoothing| smoothing.bytes() as usize)
@@ -163,8 +163,8 @@ fn text_lines(opened_scene: &OpenedScene) -> Vec<String> {
     let totals = totals(scene);
     let entries = totals.as_object().into_iter().flatten();
     lines.extend(entries.map(|(name, value)| format!("{:<28}{value:>16}", format!("total {name}"))));
-    let extent = scene.rest_bounds.diagonal();
-    lines.push(format!("up {:?}, unit {} m, diagonal {extent:.4}, origin {:?}", scene.up, scene.unit, scene.origin));
+    let diagonal = scene.rest_bounds.diagonal();
+    lines.push(format!("up {:?}, unit {} m, diagonal {diagonal:.4}, origin {:?}", scene.up, scene.unit, scene.origin));
     lines.extend(scene.remarks.iter().map(|remark| format!("remark: {remark}")));
     let flags = scene.features.flags().into_iter();
     let needed_features: Vec<&str> = flags.filter_map(|(name, is_needed)| is_needed.then_some(name)).collect();

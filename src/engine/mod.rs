@@ -359,11 +359,10 @@ impl Engine {
         upload: Option<Upload>,
     ) -> Result<SceneHandle> {
         let OpenedScene { scene, backends } = self.read_scene_files(name, provenance, upload).await?;
-        let (engine, scene_name, checkpoint_scene) = (self.clone(), name.to_owned(), Arc::clone(&scene));
-        let restored_state = run_blocking("checkpoint", move || {
-            Ok(engine.shared.services.checkpoints.load(&scene_name, &checkpoint_scene))
-        })
-        .await?;
+        let (engine, scene_name, shared_scene) = (self.clone(), name.to_owned(), Arc::clone(&scene));
+        let restored_state =
+            run_blocking("checkpoint", move || Ok(engine.shared.services.checkpoints.load(&scene_name, &shared_scene)))
+                .await?;
         let restored_state = restored_state.unwrap_or_else(|error| {
             tracing::warn!(scene = name, %error, "the checkpoint could not be loaded; the scene starts at rest");
             None

@@ -56,7 +56,8 @@ impl Registry {
         Self { max_scenes, entries: Mutex::new(BTreeMap::new()) }
     }
 
-    /// Reserves a name until [`Self::release`], or joins an existing reservation with the same provenance.
+    /// Reserves a name for a call that opens it, or joins an existing reservation with the same provenance. The call
+    /// ends with [`Self::release`].
     /// With `must_be_new` an existing reservation is an error.
     ///
     /// # Errors

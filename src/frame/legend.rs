@@ -204,7 +204,7 @@ fn compute_ticks(scale_max: f64) -> Vec<(f64, String)> {
         .collect()
 }
 
-/// Formats a number with at most three significant digits.
+/// Formats a number with at most three significant digits, or as an integer of four digits.
 fn format_tick_label(value: f64) -> String {
     if value == 0.0 {
         return "0".into();
@@ -242,7 +242,7 @@ mod tests {
         let legend = Legend { title: "|u| < 1 & more, m".into(), scale_max: 0.5 };
         for [width, height] in [[1280, 720], [300, 2000], [240, 160], [4000, 200]] {
             let mut rgba = vec![40; 4 * width as usize * height as usize];
-            draw(&mut rgba, [width, height], &legend).expect("a drawn legend");
+            draw(&mut rgba, [width, height], &legend).expect("expected a drawn legend");
             let pixels: Vec<&[u8]> = rgba.chunks_exact(4).collect();
             for position in [0.1, 0.5, 0.9] {
                 let color = viridis(position).map(|channel| 255.0 * channel);
@@ -259,7 +259,7 @@ mod tests {
     fn small_image_remains_unchanged() {
         let legend = Legend { title: String::new(), scale_max: 0.5 };
         let mut rgba = vec![40; 4 * 239 * 160];
-        draw(&mut rgba, [239, 160], &legend).expect("an unchanged image");
+        draw(&mut rgba, [239, 160], &legend).expect("expected an unchanged image");
         assert!(rgba.iter().all(|byte| *byte == 40));
     }
 }

@@ -9,13 +9,13 @@ pub use legend::{Legend, draw as draw_legend, nice_ceiling};
 
 use modalcast_model::error::Result;
 
-/// Converts an AOV of values to RGBA8 sRGB pixels with a legend. `words` are native-endian u32 with the layout of
-/// [`apply_colormap`], `samples` per pixel. `size` is the width and height in pixels.
+/// Converts an AOV of values to RGBA8 sRGB pixels with a legend. `word_bytes` contains native-endian u32 words with the
+/// layout of [`apply_colormap`], `samples` words per pixel. `size` is the width and height in pixels.
 ///
 /// # Errors
 /// `Fault` when the legend cannot be drawn.
-pub fn draw_color_map(words: &[u8], samples: u32, size: [u32; 2], legend: &Legend) -> Result<Vec<u8>> {
-    let words: Vec<u32> = bytemuck::pod_collect_to_vec(words);
+pub fn draw_color_map(word_bytes: &[u8], samples: u32, size: [u32; 2], legend: &Legend) -> Result<Vec<u8>> {
+    let words: Vec<u32> = bytemuck::pod_collect_to_vec(word_bytes);
     let mut rgba = apply_colormap(&words, samples as usize);
     draw_legend(&mut rgba, size, legend)?;
     Ok(rgba)
@@ -76,8 +76,8 @@ mod tests {
         let mut translucent_at_end = opaque.clone();
         translucent_at_end[4 * 5 * 3 - 1] = 254;
         for (pixels, has_alpha) in [(translucent, true), (opaque, false), (translucent_at_end, true)] {
-            let decoded =
-                image::load_from_memory(&encode_png(5, 3, &pixels).expect("an encoded PNG")).expect("a decodable PNG");
+            let decoded = image::load_from_memory(&encode_png(5, 3, &pixels).expect("expected an encoded PNG"))
+                .expect("expected a decodable PNG");
             assert_eq!(decoded.color().has_alpha(), has_alpha);
             let decoded = decoded.into_rgba8();
             assert_eq!((decoded.dimensions(), decoded.into_raw()), ((5, 3), pixels));

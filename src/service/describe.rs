@@ -55,36 +55,38 @@ pub(super) fn respond_with_modes(
     request: v1::ReadModesRequest,
     max_chunk_bytes: usize,
 ) -> Result<Response<ReplyStream<v1::ReadModesResponse>>> {
-    let count = scene_handle.scene.domains.len();
-    if request.domain as usize >= count {
-        return Err(invalid("domain", format!("an index below {count}"), request.domain));
+    let domain_count = scene_handle.scene.domains.len();
+    if request.domain as usize >= domain_count {
+        return Err(invalid("domain", format!("an index below {domain_count}"), request.domain));
     }
     let shape = scene_handle.scene.shape_of(request.domain as usize);
-    let (vertices, rank) = (shape.mesh.rest_positions().len(), shape.modes.rank());
+    let (vertex_count, rank) = (shape.mesh.rest_positions().len(), shape.modes.rank());
     // An empty list means all vertices.
-    let vertices_to_read = if request.vertices.is_empty() { (0..vertices as u32).collect() } else { request.vertices };
-    if vertices_to_read.len() > vertices {
-        return Err(invalid("vertices", format!("at most {vertices} indices"), vertices_to_read.len()));
+    let vertices_to_read =
+        if request.vertices.is_empty() { (0..vertex_count as u32).collect() } else { request.vertices };
+    if vertices_to_read.len() > vertex_count {
+        return Err(invalid("vertices", format!("at most {vertex_count} indices"), vertices_to_read.len()));
     }
-    if let Some(index) = vertices_to_read.iter().position(|vertex| *vertex as usize >= vertices) {
-        let expected = format!("an index below {vertices}");
+    if let Some(index) = vertices_to_read.iter().position(|vertex| *vertex as usize >= vertex_count) {
+        let expected = format!("an index below {vertex_count}");
         return Err(invalid(format!("vertices[{index}]"), expected, vertices_to_read[index]));
     }
     // Chunks end between vertices, so that only one chunk of rows is in memory at a time.
-    let row_bytes = 12 * rank;
-    let vertices_per_chunk = (max_chunk_bytes / row_bytes.max(1)).max(1);
-    let total = (row_bytes * vertices_to_read.len()) as u64;
+    let bytes_per_vertex = 12 * rank;
+    let vertices_per_chunk = (max_chunk_bytes / bytes_per_vertex.max(1)).max(1);
+    let total = (bytes_per_vertex * vertices_to_read.len()) as u64;
     Ok(respond(move |reply_sender: ReplySender<v1::ReadModesResponse>| async move {
         let modes = &scene_handle.scene.shape_of(request.domain as usize).modes;
+        // Without modes, one message without data is the reply.
         for (chunk_index, vertices_of_chunk) in
             vertices_to_read.chunks(if rank == 0 { vertices_to_read.len() } else { vertices_per_chunk }).enumerate()
         {
-            let row = |row: usize| (0..rank).map(move |mode| modes.column(mode)[row]);
+            let entries_of_row = |row: usize| (0..rank).map(move |mode| modes.column(mode)[row]);
             let rows = vertices_of_chunk
                 .iter()
                 .flat_map(|vertex| (0..3).map(move |component| 3 * *vertex as usize + component));
-            let data: Vec<u8> = rows.flat_map(row).flat_map(f32::to_le_bytes).collect();
-            let offset = (chunk_index * vertices_per_chunk * row_bytes) as u64;
+            let data: Vec<u8> = rows.flat_map(entries_of_row).flat_map(f32::to_le_bytes).collect();
+            let offset = (chunk_index * vertices_per_chunk * bytes_per_vertex) as u64;
             reply_sender.send(v1::ReadModesResponse { rank: rank as u32, offset, total, data: data.into() }).await?;
         }
         Ok(())

@@ -141,9 +141,11 @@ async fn receive_parts(
     mut parts: Streaming<v1::UploadSceneRequest>,
     upload: &mut Option<Upload>,
 ) -> Result<(), Status> {
-    let limit = engine.config().message_bytes;
+    let max_message_bytes = engine.config().message_bytes;
     let mut budget = UploadTimeBudget::new(engine.config().stall_timeout);
-    while let Some(request) = budget.wait(parts.message()).await?.map_err(|status| transport_status(status, limit))? {
+    while let Some(request) =
+        budget.wait(parts.message()).await?.map_err(|status| transport_status(status, max_message_bytes))?
+    {
         budget.refill(request.encoded_len());
         let part = request.part.ok_or_else(|| to_status(invalid("part", "header, file or chunk", "none")))?;
         *upload = Some(receive_part(engine, upload.take(), part).await.map_err(to_status)?);

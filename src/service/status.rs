@@ -9,10 +9,10 @@ use modalcast_model::error::Error;
 
 /// Limit in characters on each text of a rejection. Clients control parts of the text, and statuses are sent in HTTP/2
 /// headers.
-const MAX_FIELD_CHARS: usize = 512;
+const MAX_TEXT_CHARS: usize = 512;
 
 fn truncate_text(text: String) -> String {
-    match text.char_indices().nth(MAX_FIELD_CHARS) {
+    match text.char_indices().nth(MAX_TEXT_CHARS) {
         None => text,
         Some((end, _)) => format!("{}...", &text[..end]),
     }

@@ -65,14 +65,14 @@ where
     let end_permit = sender.clone().try_reserve_owned();
     let client_watch = sender.clone();
     let work = work(ReplySender(sender));
-    let work = tokio::spawn(async move {
+    let task = tokio::spawn(async move {
         tokio::select! {
             result = work => result,
             () = client_watch.closed() => Err(disconnected_status()),
         }
     });
     tokio::spawn(async move {
-        let result = work.await.unwrap_or_else(|_| Err(Status::internal("the call panicked in the server")));
+        let result = task.await.unwrap_or_else(|_| Err(Status::internal("the call panicked in the server")));
         if let (Err(status), Ok(end_permit)) = (result, end_permit) {
             end_permit.send(Err(status));
         }

@@ -63,7 +63,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let subscription =
             scene_handle.subscribe(OutputSpec::Vertices(selection.attributes), delivery).await.map_err(to_status)?;
         let vertex_stream =
-            VertexStream { selection, max_chunk_bytes: self.0.config().chunk_bytes, steps: request.steps };
+            VertexStream { selection, max_chunk_bytes: self.0.config().chunk_bytes, max_steps: request.steps };
         Ok(respond(move |reply_sender| {
             deadline.enforce("the vertex stream", vertex_stream.run(subscription, reply_sender))
         }))
@@ -75,7 +75,7 @@ struct VertexStream {
     selection: Arc<VertexSelection>,
     max_chunk_bytes: usize,
     /// Number of steps to send. 0 means no limit.
-    steps: u64,
+    max_steps: u64,
 }
 
 impl VertexStream {
@@ -85,7 +85,7 @@ impl VertexStream {
         reply_sender: ReplySender<v1::StreamVerticesResponse>,
     ) -> Result<(), Status> {
         let mut sent_steps = 0;
-        while self.steps == 0 || sent_steps < self.steps {
+        while self.max_steps == 0 || sent_steps < self.max_steps {
             let output = tokio::select! {
                 output = subscription.next() => output.map_err(to_status)?,
                 () = reply_sender.closed() => return Ok(()),

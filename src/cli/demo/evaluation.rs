@@ -195,29 +195,33 @@ impl MinimumMotion {
 /// A child domain and the ring of parent vertices that carries it.
 struct Joint {
     /// Index of the child's transform.
-    root: usize,
+    transform_index: usize,
     /// Vertices of the ring in the packed positions.
     ring: Vec<usize>,
 }
 
 impl Joint {
     /// The joints whose rest frame is at the center of their ring, so that the ring determines the expected position.
-    fn all(scene: &Scene, rest: &[[f64; 3]]) -> Vec<Self> {
+    fn all(scene: &Scene, rest_positions: &[[f64; 3]]) -> Vec<Self> {
         let state = SceneState::rest(scene);
         let diagonal = scene.rest_bounds.diagonal();
         let joint = |(child, domain): (usize, &modalcast_model::domain::Domain)| {
             let attachment = domain.attachment.as_ref().filter(|attachment| !attachment.rows.is_empty())?;
-            let root = scene.transform_roots.frame_of(child).is_none().then(|| scene.transform_roots.root_of(child))?;
+            let transform_index =
+                scene.transform_roots.frame_of(child).is_none().then(|| scene.transform_roots.root_of(child))?;
             let first_vertex = scene.layout.domains[attachment.parent].first_vertex;
-            let joint = Self { root, ring: attachment.rows.iter().map(|row| first_vertex + *row as usize).collect() };
-            let center = center(joint.ring.iter().map(|vertex| rest[*vertex]));
+            let joint = Self {
+                transform_index,
+                ring: attachment.rows.iter().map(|row| first_vertex + *row as usize).collect(),
+            };
+            let center = center(joint.ring.iter().map(|vertex| rest_positions[*vertex]));
             (distance(center, joint.origin(&state)) <= 1e-5 * diagonal).then_some(joint)
         };
         scene.domains.iter().enumerate().filter_map(joint).collect()
     }
 
     fn origin(&self, state: &SceneState) -> [f64; 3] {
-        state.transforms[self.root].translation().into()
+        state.transforms[self.transform_index].translation().into()
     }
 
     /// Distance in scene units of the child's sent origin from the center of the received ring.
@@ -307,6 +311,7 @@ mod tests {
         let unchanged_result = failed_checks(&|_| {});
         assert_eq!(unchanged_result, "a sway of 3 % of the height; a displacement of 2 % of the diagonal");
         assert!(failed_checks(&|run| run.frames_on_disk = 1).contains("2 frames"));
+        // Vertex 77 stands for any vertex.
         assert!(failed_checks(&|run| run.vertices.row_mut(1)[3 * 77] += 0.01).contains("vertices within"));
         assert!(failed_checks(&|run| run.vertices.row_mut(1)[3 * 77] = f32::NAN).contains("vertices within"));
         let child_domain =

@@ -40,17 +40,17 @@ impl StepRecords {
 
     /// The entries of the row of a step.
     pub(super) fn row(&self, step: usize) -> &[f32] {
-        let width = self.width();
-        &self.entries[step * width..][..width]
+        let row_length = self.row_length();
+        &self.entries[step * row_length..][..row_length]
     }
 
     #[cfg(test)]
     pub(super) fn row_mut(&mut self, step: usize) -> &mut [f32] {
-        let width = self.width();
-        &mut self.entries[step * width..][..width]
+        let row_length = self.row_length();
+        &mut self.entries[step * row_length..][..row_length]
     }
 
-    fn width(&self) -> usize {
+    fn row_length(&self) -> usize {
         self.shape[1..].iter().product()
     }
 }

@@ -56,10 +56,10 @@ type CreateDeformer = fn(&Arc<Scene>) -> Box<dyn Deformer>;
 #[derive(Debug)]
 pub struct DeviceContext {
     renderer: Result<Renderer>,
-    device: Option<Arc<gpu::Device>>,
+    cuda_device: Option<Arc<gpu::Device>>,
     info: EngineInfo,
     #[cfg(test)]
-    test_deformer: Option<CreateDeformer>,
+    create_test_deformer: Option<CreateDeformer>,
 }
 
 impl DeviceContext {
@@ -69,8 +69,8 @@ impl DeviceContext {
     /// `Unavailable` when CUDA is requested by name and cannot be opened. A missing renderer is an error only once a
     /// frame is requested.
     pub fn open(config: &Config) -> Result<Self> {
-        let (backend, device, device_label) = open_backend(config)?;
-        let renderer = open_renderer(config, device.is_some());
+        let (backend, cuda_device, device_label) = open_backend(config)?;
+        let renderer = open_renderer(config, cuda_device.is_some());
         let info = EngineInfo {
             backend,
             device: device_label,
@@ -78,10 +78,10 @@ impl DeviceContext {
         };
         Ok(Self {
             renderer,
-            device,
+            cuda_device,
             info,
             #[cfg(test)]
-            test_deformer: None,
+            create_test_deformer: None,
         })
     }
 
@@ -89,7 +89,7 @@ impl DeviceContext {
     #[cfg(test)]
     pub(in crate::engine) fn with_deformer(create: CreateDeformer) -> Result<Self> {
         let config = Config { backend: BackendChoice::Reference, renderer: RendererChoice::Off, ..Config::default() };
-        Ok(Self { test_deformer: Some(create), ..Self::open(&config)? })
+        Ok(Self { create_test_deformer: Some(create), ..Self::open(&config)? })
     }
 
     /// The backend in use.
@@ -133,10 +133,10 @@ impl DeviceContext {
         batches: BatchPolicy,
     ) -> Result<(Box<dyn Deformer>, Option<SceneBuffers>)> {
         #[cfg(test)]
-        if let Some(create_test_deformer) = self.test_deformer {
+        if let Some(create_test_deformer) = self.create_test_deformer {
             return Ok((create_test_deformer(scene), None));
         }
-        let device = match (self.device.clone(), self.info.backend) {
+        let device = match (self.cuda_device.clone(), self.info.backend) {
             (Some(device), Backend::Cuda) => device,
             (_, Backend::Reference) => {
                 return Ok((Box::new(ReferenceDeformer::new(scene).with_bounding_axes(scene.light_axes())), None));
@@ -161,12 +161,12 @@ impl DeviceContext {
     /// # Errors
     /// `DeviceLost`; the errors of drawing the measured frames.
     fn attach_rasterizer(&mut self, loaded_scene: &mut LoadedScene, policy: RasterPolicy) -> Result<()> {
-        let (Some(device), Ok(renderer)) = (&self.device, &mut self.renderer) else { return Ok(()) };
+        let (Some(device), Ok(renderer)) = (&self.cuda_device, &mut self.renderer) else { return Ok(()) };
         if policy == RasterPolicy::OpenGl || renderer.info().cuda_device.is_none() {
             return Ok(());
         }
         let create_rasterizer =
-            |mesh: RasterGeometry| Ok(Box::new(CudaRasterizer::new(device, mesh)?) as Box<dyn Rasterizer>);
+            |geometry: RasterGeometry| Ok(Box::new(CudaRasterizer::new(device, geometry)?) as Box<dyn Rasterizer>);
         match loaded_scene.attach_rasterizer(renderer, create_rasterizer) {
             Ok(()) => {}
             Err(error @ Error::DeviceLost { .. }) => return Err(error),

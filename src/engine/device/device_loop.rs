@@ -118,9 +118,9 @@ impl DeviceLoop {
             if matches!(command, Command::Quit) {
                 break;
             }
-            let older_readbacks = self.vertices.len();
+            let older_readback_count = self.vertices.len();
             run_caught(|| self.execute(command));
-            for _ in 0..older_readbacks {
+            for _ in 0..older_readback_count {
                 run_caught(|| self.finish_oldest_vertices());
             }
             while self.picks.is_oldest_ready(Duration::ZERO) {
@@ -249,7 +249,8 @@ impl DeviceLoop {
         }
     }
 
-    /// Answers one readback in flight. If only frames are in flight, waits for at most [`POLL_INTERVAL`].
+    /// Answers one readback in flight. Waits for vertices, or for a pick if no frame is in flight. Waits for a frame for
+    /// at most [`POLL_INTERVAL`], and answers nothing if the frame is not ready by then.
     fn finish_one(&mut self) {
         if !self.vertices.is_empty() {
             self.finish_oldest_vertices();

@@ -44,8 +44,9 @@ pub struct LoadedScene {
     scene: Arc<Scene>,
     deformer: Box<dyn Deformer>,
     buffers: Option<SceneBuffers>,
-    /// Whether the buffers hold the vertices of the last deformation.
-    has_current_vertices: bool,
+    /// Whether the vertices of the last deformation were uploaded to the buffers. Remains false if the deformer writes
+    /// the buffers itself.
+    buffers_are_current: bool,
     bounds: BoundingBox,
     /// Bounds of the same vertices in light space. `None` if the scene has no shadow.
     light_bounds: Option<OrientedBounds>,
@@ -70,7 +71,7 @@ impl LoadedScene {
             scene: Arc::clone(scene),
             deformer,
             buffers,
-            has_current_vertices: false,
+            buffers_are_current: false,
             bounds: scene.rest_bounds,
             light_bounds: None,
             current_state,
@@ -84,7 +85,7 @@ impl LoadedScene {
     /// # Errors
     /// `Invalid` when the rest state overflows; `Fault` of the device.
     pub(in crate::engine) fn deform_rest(&mut self) -> Result<()> {
-        let deformed = self.run(&Arc::clone(&self.current_state))?;
+        let deformed = self.run_deformer(&Arc::clone(&self.current_state))?;
         if !is_in_range(&deformed.bounds) {
             let expected = format!("vertices within {MAX_COORDINATE:e}");
             return Err(invalid("scene.rest", expected, format!("{:?}", deformed.bounds)));
@@ -114,11 +115,11 @@ impl LoadedScene {
 
     /// [`Self::deform`] of a shared state, without a copy.
     pub(in crate::engine) fn deform_shared(&mut self, state: &Arc<SceneState>) -> Result<DeformSummary> {
-        self.has_current_vertices = false;
-        let result = catch_unwind(AssertUnwindSafe(|| self.run(state)));
+        self.buffers_are_current = false;
+        let result = catch_unwind(AssertUnwindSafe(|| self.run_deformer(state)));
         if !matches!(result, Ok(Ok(_) | Err(Error::DeviceLost { .. }))) {
             // The output may be partially written, so restore it. If that fails too, the first error is more specific.
-            self.run(&Arc::clone(&self.current_state)).ok();
+            self.run_deformer(&Arc::clone(&self.current_state)).ok();
         }
         let deformed = result.unwrap_or_else(|panic| resume_unwind(panic))?;
         if is_in_range(&deformed.bounds) {
@@ -127,11 +128,11 @@ impl LoadedScene {
             return Ok(deformed);
         }
         let overflow_error = self.overflow_error(state);
-        self.run(&Arc::clone(&self.current_state))?;
+        self.run_deformer(&Arc::clone(&self.current_state))?;
         Err(overflow_error.unwrap_or_else(|error| error))
     }
 
-    fn run(&mut self, state: &SceneState) -> Result<DeformSummary> {
+    fn run_deformer(&mut self, state: &SceneState) -> Result<DeformSummary> {
         self.generation += 1;
         self.deformer.deform(state)
     }
@@ -220,11 +221,11 @@ impl LoadedScene {
             None => renderer.load(&self.scene)?,
         };
         let buffers = self.buffers.insert(buffers);
-        if self.has_current_vertices || writes_buffers_itself {
+        if self.buffers_are_current || writes_buffers_itself {
             return Ok(false);
         }
         renderer.upload(buffers, self.deformer.read(VertexAttributes::VERTICES)?)?;
-        self.has_current_vertices = true;
+        self.buffers_are_current = true;
         Ok(true)
     }
 

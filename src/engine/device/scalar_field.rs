@@ -11,7 +11,7 @@ use modalcast_model::scene::{Scene, SceneState};
 
 /// Lower bound of a fitted displacement scale, as a fraction of the scene's diagonal. Smaller displacements may be
 /// rounding errors.
-const MIN_DISPLACEMENT_SCALE: f64 = 1e-5;
+const MIN_SCALE_FRACTION: f64 = 1e-5;
 
 /// Returns `mode` if at least one domain of the scene has a mode with this index.
 ///
@@ -59,8 +59,8 @@ pub(in crate::engine) fn mode_shape_magnitudes(scene: &Scene, mode: usize) -> Ve
     let magnitudes = scene.domains.par_iter().zip(&scene.layout.domains).flat_map_iter(|(domain, domain_layout)| {
         let modes = &scene.shapes[domain.shape].modes;
         let column = if mode < modes.rank() { modes.column(mode) } else { &[] };
-        let norm = |row: &[f32]| Vector3::from_column_slice(row).cast::<f64>().norm();
-        let norms = column.chunks_exact(3).map(move |row| (scene.unit * norm(row)) as f32);
+        let norm = |mode_vector: &[f32]| Vector3::from_column_slice(mode_vector).cast::<f64>().norm();
+        let norms = column.chunks_exact(3).map(move |mode_vector| (scene.unit * norm(mode_vector)) as f32);
         norms.chain(std::iter::repeat(0.0)).take(domain_layout.vertices)
     });
     magnitudes.collect()
@@ -77,7 +77,7 @@ pub(in crate::engine) fn fit_legend(scene: &Scene, frame_output: FrameOutput, va
         FrameOutput::Displacement { scale_max } => (
             "displacement |u|, m".to_owned(),
             scale_max,
-            MIN_DISPLACEMENT_SCALE * scene.unit * scene.rest_bounds.diagonal(),
+            MIN_SCALE_FRACTION * scene.unit * scene.rest_bounds.diagonal(),
         ),
         _ => (String::new(), 0.0, 1e-30),
     };
@@ -93,7 +93,7 @@ mod tests {
 
     /// The second strip is placed by a rotation and a scale of 2 and is deformed by its first mode.
     #[test]
-    fn displacements_and_mode_shapes_have_the_norms_of_u() {
+    fn displacements_and_mode_shapes_match_the_entries_of_u() {
         let scene = testing::two_strips();
         let mut state = SceneState::rest(&scene);
         let rotation = nalgebra::Rotation3::from_euler_angles(0.4, 1.0, -0.3).into_inner();
@@ -108,12 +108,12 @@ mod tests {
         let modes = &scene.shapes[0].modes;
         let mut max_displacement = 0.0_f32;
         for vertex in 0..4 {
-            let row = Vector3::from_fn(|axis, _| modes.entry(vertex, axis, 0));
+            let mode_vector = Vector3::from_fn(|axis, _| modes.entry(vertex, axis, 0));
             let vertex_of_second = 4 + vertex;
-            assert!((mode_shape[vertex] - row.norm()).abs() < 1e-6);
+            assert!((mode_shape[vertex] - mode_vector.norm()).abs() < 1e-6);
             assert_eq!(mode_shape[vertex_of_second], mode_shape[vertex]);
             assert!(displacements[vertex] < 1e-6, "expected the first strip at rest, got {displacements:?}");
-            let expected = 2.0 * 0.75 * row.norm();
+            let expected = 2.0 * 0.75 * mode_vector.norm();
             let displacement = displacements[vertex_of_second];
             assert!((displacement - expected).abs() < 2e-6, "expected {expected}, got {displacement}");
             max_displacement = max_displacement.max(displacement);

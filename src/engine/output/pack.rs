@@ -167,9 +167,10 @@ fn push_origins(selection: &VertexSelection, origins: Option<&FloatingOrigins>, 
 
 fn pack(surface: &DeformedSurface, selection: &VertexSelection) -> Vec<u8> {
     let (layout, attributes): (&Layout, VertexAttributes) = (&selection.scene.layout, selection.attributes);
-    let corners: usize = if attributes.normals { selection.corners().map(|count| count as usize).sum() } else { 0 };
-    let other_bytes = selection.position_bytes() + selection.displacement_bytes() + selection.box_bytes();
-    let mut bytes = Vec::with_capacity(12 * corners + other_bytes as usize);
+    let corner_count: usize =
+        if attributes.normals { selection.corners().map(|count| count as usize).sum() } else { 0 };
+    let bytes_without_normals = selection.position_bytes() + selection.displacement_bytes() + selection.box_bytes();
+    let mut bytes = Vec::with_capacity(12 * corner_count + bytes_without_normals as usize);
     let mut append_attribute = |is_selected: bool, numbers: &[f32], range: &dyn Fn(&DomainLayout) -> (usize, usize)| {
         for domain in selection.domains.iter().filter(|_| is_selected) {
             let (first_vector, count) = range(&layout.domains[*domain as usize]);

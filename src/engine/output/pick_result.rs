@@ -22,9 +22,9 @@ pub struct PickResult {
 /// long on the task of the scene.
 pub(in crate::engine) fn with_transforms(state: &SceneState, scene: &Scene, hits: Vec<PickHit>) -> Vec<ModalHit> {
     let add_transform = |hit: PickHit| {
-        let rows = state.transform_of(scene, hit.domain).0;
+        let transform_entries = state.transform_of(scene, hit.domain).0;
         // The transform is 3 x 4, row-major. Its fourth column is the translation.
-        let linear = [0, 1, 2, 4, 5, 6, 8, 9, 10].map(|entry: usize| rows[entry]);
+        let linear = [0, 1, 2, 4, 5, 6, 8, 9, 10].map(|entry: usize| transform_entries[entry]);
         ModalHit { hit, linear, modes: Vec::new() }
     };
     hits.into_iter().map(add_transform).collect()

@@ -32,7 +32,7 @@ pub enum OutputSpec {
 pub enum FrameOutput {
     #[default]
     Color,
-    /// See [`modalcast_render::Aov`].
+    /// For this and the next two quantities, see [`modalcast_render::Aov`].
     Depth,
     Domains,
     Normals,

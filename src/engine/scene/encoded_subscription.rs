@@ -24,7 +24,7 @@ pub struct EncodedSubscription {
     encoder: FrameEncoder,
     format: FrameFormat,
     /// Number of frames that will still be taken from the subscription.
-    remaining: u64,
+    remaining_frames: u64,
     /// Oldest first.
     encodings: VecDeque<Encoding>,
     /// The error that ended the subscription. It is reported after the frames that are held.
@@ -45,10 +45,10 @@ impl Drop for Encoding {
 }
 
 impl EncodedSubscription {
-    /// Encodes the first `frames` frames of a subscription; 0 means all.
-    pub fn new(subscription: Subscription, encoder: FrameEncoder, format: FrameFormat, frames: u64) -> Self {
-        let remaining = if frames == 0 { u64::MAX } else { frames };
-        Self { subscription, encoder, format, remaining, encodings: VecDeque::new(), end_error: None }
+    /// Encodes the first `max_frames` frames of a subscription; 0 means all.
+    pub fn new(subscription: Subscription, encoder: FrameEncoder, format: FrameFormat, max_frames: u64) -> Self {
+        let remaining_frames = if max_frames == 0 { u64::MAX } else { max_frames };
+        Self { subscription, encoder, format, remaining_frames, encodings: VecDeque::new(), end_error: None }
     }
 
     /// Waits for the next frame. Returns `None` after the requested number of frames. Cancel-safe.
@@ -83,7 +83,7 @@ impl EncodedSubscription {
         };
         let pixel_bytes: usize = self.encodings.iter().map(|encoding| encoding.pixel_bytes).sum();
         let is_within_limits = self.encodings.len() < max_encodings && pixel_bytes < MAX_PIXEL_BYTES;
-        is_within_limits && self.remaining > 0 && self.end_error.is_none()
+        is_within_limits && self.remaining_frames > 0 && self.end_error.is_none()
     }
 
     fn start_encoding(&mut self, output: StepOutput) {
@@ -95,7 +95,7 @@ impl EncodedSubscription {
         let (encoder, format) = (self.encoder.clone(), self.format);
         let task = tokio::spawn(async move { encoder.encode(output, format).await });
         self.encodings.push_back(Encoding { task, pixel_bytes });
-        self.remaining -= 1;
+        self.remaining_frames -= 1;
     }
 }
 

@@ -7,11 +7,13 @@ use super::subscriber::Subscriber;
 use crate::engine::output::step_output::{OutputSpec, StepOutput};
 use modalcast_model::error::{Error, Result};
 
-/// The step that a single request asks for. Numbers refer to the current run.
+/// The step that a single request asks for. Step numbers refer to the current run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StepSelector {
     Current,
+    /// The step with this number.
     Exact(u64),
+    /// The current step, as soon as its number is at least this one.
     Minimum(u64),
 }
 
@@ -47,6 +49,7 @@ pub(super) enum Message {
     Request(StepRequest),
     Stop {
         error: Error,
+        /// Notified after the scene is freed.
         done: oneshot::Sender<()>,
     },
     /// Makes the actor panic.

@@ -41,14 +41,14 @@ pub(super) struct DeliveryMode {
 }
 
 impl OutputDelivery {
-    pub(super) fn new(scene: SceneOnDevice, device: DeviceHandle, config: &Config) -> Self {
+    pub(super) fn new(scene_on_device: SceneOnDevice, device: DeviceHandle, config: &Config) -> Self {
         Self {
             subscribers: Vec::new(),
             requests: Vec::new(),
             max_subscribers: config.max_subscribers,
             max_pending_requests: config.max_pending_requests,
             producer: OutputProducer {
-                scene,
+                scene_on_device,
                 device,
                 stall_timeout: config.stall_timeout,
                 readbacks: ReadbackQueue::default(),
@@ -143,7 +143,7 @@ impl OutputDelivery {
         }
         let DeliveryRound { vertex_recipients, started_frames, .. } = round;
         if !vertex_recipients.is_empty() {
-            let pending_vertices = self.producer.device.read_vertices(self.producer.scene.id, attributes);
+            let pending_vertices = self.producer.device.read_vertices(self.producer.scene_on_device.id, attributes);
             self.producer.readbacks.push(PendingReadback::new(
                 current,
                 Readback::Vertices(pending_vertices),
@@ -252,7 +252,7 @@ pub(super) struct SceneOnDevice {
 
 /// Produces outputs of the current step: draws, picks and copies. Owns the readbacks in flight.
 struct OutputProducer {
-    scene: SceneOnDevice,
+    scene_on_device: SceneOnDevice,
     device: DeviceHandle,
     stall_timeout: Duration,
     readbacks: ReadbackQueue,
@@ -305,7 +305,7 @@ impl OutputProducer {
         if round.started_frames.len() >= MAX_FRAMES_IN_FLIGHT {
             return false;
         }
-        let pending_image = self.device.begin_draw(self.scene.id, camera, size);
+        let pending_image = self.device.begin_draw(self.scene_on_device.id, camera, size);
         let readback = Readback::Frame(subscriber.spec, pending_image);
         let recipients = vec![Recipient::of(subscriber, step_count)];
         round.started_frames.push(PendingReadback::new(round.current, readback, recipients));
@@ -344,7 +344,7 @@ impl OutputProducer {
         let stalled_since = *subscriber.stalled_since.get_or_insert_with(Instant::now);
         let is_within_timeout = stalled_since.elapsed() < self.stall_timeout;
         if !is_within_timeout {
-            let (scene, seconds) = (&self.scene.name, self.stall_timeout.as_secs());
+            let (scene, seconds) = (&self.scene_on_device.name, self.stall_timeout.as_secs());
             tracing::warn!(scene, seconds, "a lossless subscriber did not read and is disconnected");
             let error = Error::Busy { queue: "queue of unread results of this subscriber", limit: LOSSLESS_CREDITS };
             subscriber.disconnect(error);
@@ -361,7 +361,7 @@ impl OutputProducer {
         other_attributes: VertexAttributes,
     ) -> Result<StepOutput> {
         let mut stages = current.stages.clone();
-        let (id, device) = (self.scene.id, &self.device);
+        let (id, device) = (self.scene_on_device.id, &self.device);
         let body = match *spec {
             OutputSpec::Frame { camera, size, frame_output: FrameOutput::Color } => {
                 let image = device.begin_draw(id, camera, size).wait().await?;
@@ -375,7 +375,7 @@ impl OutputProducer {
             }
             OutputSpec::Pick { camera, picture, rectangle } => {
                 let hits = device.pick(id, camera, picture, rectangle).await?;
-                OutputBody::Pick(with_transforms(&current.state, &self.scene.scene, hits))
+                OutputBody::Pick(with_transforms(&current.state, &self.scene_on_device.scene, hits))
             }
             OutputSpec::Vertices(attributes) => {
                 let CachedVertices { surface, copy_ms, .. } = self.copy_vertices(attributes, other_attributes).await?;
@@ -397,7 +397,10 @@ impl OutputProducer {
             (StepSelector::Current, _) => Ok(true),
             (StepSelector::Exact(requested), Some(current_number)) if current_number > requested => Err(Error::Gone {
                 what: "exact_step",
-                expected: format!("{current_number} (the current step of scene '{}') or later", self.scene.name),
+                expected: format!(
+                    "{current_number} (the current step of scene '{}') or later",
+                    self.scene_on_device.name
+                ),
                 given: requested.to_string(),
             }),
             (StepSelector::Exact(requested), Some(current_number)) => Ok(current_number == requested),
@@ -424,7 +427,7 @@ impl OutputProducer {
         // The cached attributes are copied again, so that alternating readers do not evict each other's attributes.
         let copied_attributes = self.cached_attributes().union(attributes).union(other_attributes);
         let CopiedVertices { surface, copy_ms } =
-            self.device.read_vertices(self.scene.id, copied_attributes).wait().await?;
+            self.device.read_vertices(self.scene_on_device.id, copied_attributes).wait().await?;
         Ok(self.cached.insert(CachedVertices { surface, attributes: copied_attributes, copy_ms }).clone())
     }
 }

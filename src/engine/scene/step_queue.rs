@@ -80,7 +80,7 @@ impl CompletedStep {
         Self { step_queue, stages }
     }
 
-    /// Whether subscribers may block the writer: it is lossless and still connected.
+    /// Whether subscribers may block the writer: only a writer that is lossless and still connected.
     pub(super) fn applies_back_pressure(&self) -> bool {
         self.step_queue.policy() == Policy::Lossless && !self.step_queue.is_closed()
     }
@@ -179,8 +179,8 @@ impl StepQueue {
             Err(error) => StepReport::Rejected { step, error },
         };
         // Under `latest` a writer may read reports slowly. A newer `Done` also reports the older steps, so it replaces
-        // the older `Done`. `Rejected` is never replaced. The first rejection beyond the window ends the queue, and
-        // reports from then on are dropped.
+        // the older `Done`. `Rejected` is never replaced. If more than `window` reports already wait, a further report
+        // that replaces none is dropped and ends the queue.
         let supersedes =
             matches!((state.reports.back(), &report), (Some(StepReport::Done { .. }), StepReport::Done { .. }));
         if state.reports.len() >= self.window && supersedes {

@@ -55,12 +55,12 @@ pub struct Upload {
 struct OpenFile {
     path: String,
     file: File,
-    /// Declared size.
-    bytes: u64,
+    /// Size that the client declared.
+    declared_bytes: u64,
     remaining_bytes: u64,
     hasher: Sha256,
-    /// Declared hash.
-    sha256: [u8; 32],
+    /// Hash that the client declared.
+    declared_sha256: [u8; 32],
 }
 
 impl Upload {
@@ -110,8 +110,14 @@ impl Upload {
             fs::create_dir_all(parent).map_err(path_conflict)?;
         }
         let file = File::create_new(&file_path).map_err(path_conflict)?;
-        self.open_file =
-            Some(OpenFile { path: path.into(), file, bytes, remaining_bytes: bytes, hasher: Sha256::new(), sha256 });
+        self.open_file = Some(OpenFile {
+            path: path.into(),
+            file,
+            declared_bytes: bytes,
+            remaining_bytes: bytes,
+            hasher: Sha256::new(),
+            declared_sha256: sha256,
+        });
         self.finish_file_if_complete()
     }
 
@@ -168,8 +174,12 @@ impl Upload {
     fn finish_file_if_complete(&mut self) -> Result<()> {
         let Some(open_file) = self.open_file.take_if(|open_file| open_file.remaining_bytes == 0) else { return Ok(()) };
         let given: [u8; 32] = open_file.hasher.finalize().into();
-        if given != open_file.sha256 {
-            return Err(invalid(format!("file.sha256 of '{}'", open_file.path), hex(&open_file.sha256), hex(&given)));
+        if given != open_file.declared_sha256 {
+            return Err(invalid(
+                format!("file.sha256 of '{}'", open_file.path),
+                hex(&open_file.declared_sha256),
+                hex(&given),
+            ));
         }
         Ok(())
     }
@@ -179,8 +189,12 @@ impl Upload {
         match &self.open_file {
             None => Ok(()),
             Some(open_file) => {
-                let given = format!("{} bytes", open_file.bytes - open_file.remaining_bytes);
-                Err(invalid(format!("file.bytes of '{}'", open_file.path), format!("{} bytes", open_file.bytes), given))
+                let given = format!("{} bytes", open_file.declared_bytes - open_file.remaining_bytes);
+                Err(invalid(
+                    format!("file.bytes of '{}'", open_file.path),
+                    format!("{} bytes", open_file.declared_bytes),
+                    given,
+                ))
             }
         }
     }
