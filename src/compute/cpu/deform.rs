@@ -98,34 +98,34 @@ fn deform_tile<const COMPENSATED: bool>(
     scratch: &mut Scratch,
     out: TileOutput,
 ) -> TileBounds {
-    let tiles = inputs.tiles_of(tile);
-    let layout = tiles.tile(tile.first_item() / MAX_TILE_VERTICES);
-    if tiles.rank() > 0 {
-        sum_modes::<COMPENSATED>(tiles, &layout, inputs.mode_selection(tile), scratch);
+    let tiled_modes = inputs.tiles_of(tile);
+    let layout = tiled_modes.tile(tile.first_item() / MAX_TILE_VERTICES);
+    if tiled_modes.rank() > 0 {
+        sum_modes::<COMPENSATED>(tiled_modes, &layout, inputs.mode_selection(tile), scratch);
     } else {
         scratch.sums[..12 * layout.quads].fill(0.0);
     }
-    let poison =
+    let zero_or_nan =
         out.displacements.map_or(0.0, |displacements| store_displacements(inputs, tile, &scratch.sums, displacements));
-    add_rest_positions(&tiles.rest()[layout.first_quad..][..layout.quads], &mut scratch.sums);
+    add_rest_positions(&tiled_modes.rest()[layout.first_quad..][..layout.quads], &mut scratch.sums);
     let transform = inputs.state.transform_of(inputs.scene, tile.domain());
     let tile_bounds = store_positions(&transform, &mut scratch.sums, 4 * layout.quads, out.positions);
     let tile_bounds =
         if tile_bounds.is_finite() { tile_bounds } else { repair_non_finite(inputs, tile, out.positions) };
-    tile_bounds.poison_with(poison)
+    tile_bounds.poison_with(zero_or_nan)
 }
 
 /// Copies the sums of a tile, `[axis][vertex]`, to the displacements of its vertices. Displacements that are not finite
 /// are repaired. Returns the result of [`repair_displacements`], else 0.
 #[inline(always)]
 fn store_displacements(inputs: &DeformInputs, tile: &DomainTile, sums: &TileVertices, out: &mut [f32]) -> f32 {
-    let width = tile.item_count().next_multiple_of(QUAD);
-    let mut poison = 0.0;
+    let axis_stride = tile.item_count().next_multiple_of(QUAD);
+    let mut zero_or_nan = 0.0;
     for (vertex, out) in out.chunks_exact_mut(3).enumerate() {
-        out.copy_from_slice(&[sums[vertex], sums[width + vertex], sums[2 * width + vertex]]);
-        poison += (out[0] + out[1] + out[2]) * 0.0;
+        out.copy_from_slice(&[sums[vertex], sums[axis_stride + vertex], sums[2 * axis_stride + vertex]]);
+        zero_or_nan += (out[0] + out[1] + out[2]) * 0.0;
     }
-    if poison == 0.0 { poison } else { repair_displacements(inputs, tile, out) }
+    if zero_or_nan == 0.0 { zero_or_nan } else { repair_displacements(inputs, tile, out) }
 }
 
 /// Sums the displacements that are not finite again in f64. Returns NaN if one of them still is not finite in f32, else
@@ -133,16 +133,16 @@ fn store_displacements(inputs: &DeformInputs, tile: &DomainTile, sums: &TileVert
 #[cold]
 #[inline(never)]
 fn repair_displacements(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32]) -> f32 {
-    let (tiles, q) = (inputs.tiles_of(tile), inputs.q_of(tile));
-    let mut poison = 0.0;
+    let (tiled_modes, q) = (inputs.tiles_of(tile), inputs.q_of(tile));
+    let mut zero_or_nan = 0.0;
     for (vertex, out) in out.chunks_exact_mut(3).enumerate() {
         if !out.iter().all(|number| number.is_finite()) {
-            let displacement = displacement_f64(tiles, q, tile.first_item() + vertex).map(|number| number as f32);
+            let displacement = displacement_f64(tiled_modes, q, tile.first_item() + vertex).map(|number| number as f32);
             out.copy_from_slice(&displacement);
         }
-        out.iter().for_each(|number| poison += number * 0.0);
+        out.iter().for_each(|number| zero_or_nan += number * 0.0);
     }
-    poison
+    zero_or_nan
 }
 
 impl<'a> DeformInputs<'a> {
@@ -169,8 +169,8 @@ impl<'a> DeformInputs<'a> {
 /// Adds x0 to the sums of a tile, `[axis][vertex]`.
 #[inline(always)]
 fn add_rest_positions(rest: &[[f32; 12]], sums: &mut TileVertices) {
-    let width = QUAD * rest.len();
-    for (axis, sums) in sums[..3 * width].chunks_exact_mut(width).enumerate() {
+    let axis_stride = QUAD * rest.len();
+    for (axis, sums) in sums[..3 * axis_stride].chunks_exact_mut(axis_stride).enumerate() {
         for (sums, quad) in sums.chunks_exact_mut(QUAD).zip(rest) {
             for (sum, rest) in sums.iter_mut().zip(&quad[QUAD * axis..][..QUAD]) {
                 *sum += *rest;
@@ -179,13 +179,18 @@ fn add_rest_positions(rest: &[[f32; 12]], sums: &mut TileVertices) {
     }
 }
 
-/// Writes the world positions of a tile. `deformed` is x0 + u as `[axis][vertex]` with `width` vertices per axis, and
-/// is overwritten.
+/// Writes the world positions of a tile. `deformed` is x0 + u as `[axis][vertex]` with `axis_stride` vertices per axis,
+/// and is overwritten.
 #[inline(always)]
-fn store_positions(transform: &Transform, deformed: &mut TileVertices, width: usize, out: &mut [f32]) -> TileBounds {
+fn store_positions(
+    transform: &Transform,
+    deformed: &mut TileVertices,
+    axis_stride: usize,
+    out: &mut [f32],
+) -> TileBounds {
     let t = transform.0;
-    let (x, yz) = deformed[..3 * width].split_at_mut(width);
-    let (y, z) = yz.split_at_mut(width);
+    let (x, yz) = deformed[..3 * axis_stride].split_at_mut(axis_stride);
+    let (y, z) = yz.split_at_mut(axis_stride);
     for ((x, y), z) in x.iter_mut().zip(y.iter_mut()).zip(z.iter_mut()) {
         // No closure here: it would be compiled without fused multiply-adds.
         let [a, b, c] = [*x, *y, *z];
@@ -205,13 +210,13 @@ fn store_positions(transform: &Transform, deformed: &mut TileVertices, width: us
 #[cold]
 #[inline(never)]
 fn repair_non_finite(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32]) -> TileBounds {
-    let tiles = inputs.tiles_of(tile);
+    let tiled_modes = inputs.tiles_of(tile);
     let transform = inputs.state.composed_transform(inputs.scene, tile.domain()).to_f64();
     let q = inputs.q_of(tile);
     let mut tile_bounds = TileBounds::EMPTY;
     for (vertex, out) in out.chunks_exact_mut(3).enumerate() {
         if !out.iter().all(|number| number.is_finite()) {
-            let deformed = deformed_position_f64(tiles, q, tile.first_item() + vertex);
+            let deformed = deformed_position_f64(tiled_modes, q, tile.first_item() + vertex);
             for (row, out) in out.iter_mut().enumerate() {
                 let [x, y, z, offset] = [0, 1, 2, 3].map(|column| transform[4 * row + column]);
                 *out = (x * deformed[0] + y * deformed[1] + z * deformed[2] + offset) as f32;
@@ -223,15 +228,15 @@ fn repair_non_finite(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32]) 
 }
 
 /// x0 + u of a vertex.
-fn deformed_position_f64(tiles: &TiledModes, q: &[f32], vertex: usize) -> [f64; 3] {
-    let displacement = displacement_f64(tiles, q, vertex);
-    [0, 1, 2].map(|axis| displacement[axis] + f64::from(tiles.rest()[vertex / QUAD][QUAD * axis + vertex % QUAD]))
+fn deformed_position_f64(tiled_modes: &TiledModes, q: &[f32], vertex: usize) -> [f64; 3] {
+    let displacement = displacement_f64(tiled_modes, q, vertex);
+    [0, 1, 2].map(|axis| displacement[axis] + f64::from(tiled_modes.rest()[vertex / QUAD][QUAD * axis + vertex % QUAD]))
 }
 
 /// u of a vertex.
-fn displacement_f64(tiles: &TiledModes, q: &[f32], vertex: usize) -> [f64; 3] {
+fn displacement_f64(tiled_modes: &TiledModes, q: &[f32], vertex: usize) -> [f64; 3] {
     [0, 1, 2].map(|axis| {
-        let mode_term = |(mode, q): (usize, &f32)| tiles.decode_entry(vertex, axis, mode) * f64::from(*q);
+        let mode_term = |(mode, q): (usize, &f32)| tiled_modes.decode_entry(vertex, axis, mode) * f64::from(*q);
         q.iter().enumerate().map(mode_term).sum::<f64>()
     })
 }

@@ -111,14 +111,14 @@ pub(super) fn add_chunks<D: Decode<GROUPS>, const GROUPS: usize, const MODES: us
     if quads % 2 == 1 {
         // Process the last quad twice and drop the second result.
         let mut padded_sums = [[0.0; 2 * QUAD]; 3];
-        let [a, b, c] = &mut padded_sums;
-        a[..QUAD].copy_from_slice(x_tail);
-        b[..QUAD].copy_from_slice(y_tail);
-        c[..QUAD].copy_from_slice(z_tail);
-        add_pair::<D, GROUPS, MODES, CHUNKS>(simd, &chunks, [quads - 1; 2], [a, b, c]);
-        x_tail.copy_from_slice(&a[..QUAD]);
-        y_tail.copy_from_slice(&b[..QUAD]);
-        z_tail.copy_from_slice(&c[..QUAD]);
+        let [x_sums, y_sums, z_sums] = &mut padded_sums;
+        x_sums[..QUAD].copy_from_slice(x_tail);
+        y_sums[..QUAD].copy_from_slice(y_tail);
+        z_sums[..QUAD].copy_from_slice(z_tail);
+        add_pair::<D, GROUPS, MODES, CHUNKS>(simd, &chunks, [quads - 1; 2], [x_sums, y_sums, z_sums]);
+        x_tail.copy_from_slice(&x_sums[..QUAD]);
+        y_tail.copy_from_slice(&y_sums[..QUAD]);
+        z_tail.copy_from_slice(&z_sums[..QUAD]);
     }
 }
 

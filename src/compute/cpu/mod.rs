@@ -64,7 +64,7 @@ impl CpuDeformer {
     /// Encodes U in the scene's storage type and allocates work lists and outputs.
     pub fn new(scene: &Arc<Scene>) -> Self {
         let layout = &scene.layout;
-        let tangent_numbers = if scene.features.normal_maps { 4 * layout.corners } else { 0 };
+        let tangent_length = if scene.features.normal_maps { 4 * layout.corners } else { 0 };
         let storage = scene.deformation.storage;
         let shapes: Vec<TiledModes> = scene.shapes.par_iter().map(|shape| TiledModes::new(shape, storage)).collect();
         let max_chunks = shapes.iter().map(TiledModes::chunks).max().unwrap_or(0);
@@ -82,7 +82,7 @@ impl CpuDeformer {
             surface: DeformedSurface {
                 positions: vec![0.0; 3 * layout.vertices],
                 normals: vec![0.0; 3 * layout.corners],
-                tangents: vec![0.0; tangent_numbers],
+                tangents: vec![0.0; tangent_length],
                 displacements: vec![0.0; if scene.features.displacements { 3 * layout.vertices } else { 0 }],
                 boxes: vec![BoundingBox::EMPTY; if scene.features.boxes { layout.domains.len() } else { 0 }],
             },

@@ -44,7 +44,7 @@ impl RetainedModes {
 
     /// Updates the domains that changed.
     pub(super) fn update(&mut self, scene: &Scene, state: &SceneState, changes: &ChangeTracker) {
-        let per_chunk = modes_per_chunk(scene.deformation.storage) as u16;
+        let chunk_modes = modes_per_chunk(scene.deformation.storage) as u16;
         let Self { budget, max_row_norms, domains } = self;
         let update_domain = |(domain, modes): (usize, &mut DomainModes)| {
             if modes.q.is_empty() || !changes.is_changed(domain) {
@@ -60,8 +60,8 @@ impl RetainedModes {
             modes.chunks.clear();
             for mode in modes.truncation.retained() {
                 modes.q[usize::from(*mode)] = q[usize::from(*mode)];
-                if modes.chunks.last() != Some(&(mode / per_chunk)) {
-                    modes.chunks.push(mode / per_chunk);
+                if modes.chunks.last() != Some(&(mode / chunk_modes)) {
+                    modes.chunks.push(mode / chunk_modes);
                 }
             }
         };

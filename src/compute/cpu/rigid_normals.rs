@@ -59,6 +59,7 @@ fn limit_entries(matrix: Matrix3<f64>) -> Matrix3<f32> {
     if max_entry > 0.0 { (matrix / max_entry).cast() } else { matrix.cast() }
 }
 
+/// The cofactors of A: its determinant times its inverse transpose.
 pub(super) fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
     let cofactor = |row: usize, column: usize| {
         let entry = |i: usize, j: usize| linear[((row + i) % 3, (column + j) % 3)];

@@ -17,6 +17,7 @@ pub(super) struct Scratch {
     pub(super) sums: TileVertices,
     /// Accumulated rounding errors; only for compensated sums.
     compensation: TileVertices,
+    /// Decoded entries of the modes that are added together.
     columns: Columns,
     /// q times the factors or scales of the modes.
     scaled_q: [f32; MAX_RANK],
@@ -42,36 +43,36 @@ pub(super) struct ModeSelection<'a> {
 /// Product, 2005, algorithm Dot2 with a fused multiply-add). The result is as accurate as a sum in twice the precision.
 #[inline(always)]
 pub(super) fn sum_modes<const COMPENSATED: bool>(
-    tiles: &TiledModes,
+    tiled_modes: &TiledModes,
     tile: &TileLayout,
     mode_selection: ModeSelection,
     scratch: &mut Scratch,
 ) {
     #[cfg(target_arch = "x86_64")]
     if let (false, Some(simd)) = (COMPENSATED, pulp::x86::V3::try_new()) {
-        return sum_fused(simd, tiles, tile, mode_selection, scratch);
+        return sum_fused(simd, tiled_modes, tile, mode_selection, scratch);
     }
-    sum_columns::<COMPENSATED>(tiles, tile, mode_selection, scratch);
+    sum_columns::<COMPENSATED>(tiled_modes, tile, mode_selection, scratch);
 }
 
 /// Decodes columns to scratch memory, then adds them.
 #[inline(always)]
 fn sum_columns<const COMPENSATED: bool>(
-    tiles: &TiledModes,
+    tiled_modes: &TiledModes,
     tile: &TileLayout,
     mode_selection: ModeSelection,
     scratch: &mut Scratch,
 ) {
     let Scratch { sums, compensation, columns, scaled_q } = scratch;
     let length = 12 * tile.quads;
-    scale_coordinates(tiles, tile, mode_selection.q, scaled_q);
+    scale_coordinates(tiled_modes, tile, mode_selection.q, scaled_q);
     let sums = &mut sums[..length];
     let compensation = &mut compensation[..if COMPENSATED { length } else { 0 }];
     sums.fill(0.0);
     compensation.fill(0.0);
     let mut accumulator = Sums::<COMPENSATED> { sums, compensation };
-    let chunks = TileChunks::of(tiles, tile, mode_selection, scaled_q);
-    match tiles.storage() {
+    let chunks = TileChunks::of(tiled_modes, tile, mode_selection, scaled_q);
+    match tiled_modes.storage() {
         StorageType::F32 => accumulator.add_f32(chunks),
         StorageType::F16 => accumulator.add_packed16(chunks, columns, decode::unpack_f16),
         StorageType::Bf16 => accumulator.add_packed16(chunks, columns, decode::unpack_bf16),
@@ -89,17 +90,17 @@ fn sum_columns<const COMPENSATED: bool>(
 #[inline(always)]
 fn sum_fused(
     simd: pulp::x86::V3,
-    tiles: &TiledModes,
+    tiled_modes: &TiledModes,
     tile: &TileLayout,
     mode_selection: ModeSelection,
     scratch: &mut Scratch,
 ) {
     let Scratch { sums, scaled_q, .. } = scratch;
-    scale_coordinates(tiles, tile, mode_selection.q, scaled_q);
+    scale_coordinates(tiled_modes, tile, mode_selection.q, scaled_q);
     let sums = &mut sums[..12 * tile.quads];
     sums.fill(0.0);
-    let chunks = TileChunks::of(tiles, tile, mode_selection, scaled_q);
-    match tiles.storage() {
+    let chunks = TileChunks::of(tiled_modes, tile, mode_selection, scaled_q);
+    match tiled_modes.storage() {
         StorageType::F32 => Sums::<false> { sums, compensation: &mut [] }.add_f32(chunks),
         StorageType::F16 => chunks.fuse_packed16::<fused::DecodeF16>(simd, sums),
         StorageType::Bf16 => chunks.fuse_packed16::<fused::DecodeBf16>(simd, sums),
@@ -109,12 +110,12 @@ fn sum_fused(
 
 /// Multiplies q by the factors or scales of the stored entries; each product is rounded once.
 #[inline(always)]
-fn scale_coordinates(tiles: &TiledModes, tile: &TileLayout, q: &[f32], scaled_q: &mut [f32; MAX_RANK]) {
+fn scale_coordinates(tiled_modes: &TiledModes, tile: &TileLayout, q: &[f32], scaled_q: &mut [f32; MAX_RANK]) {
     let rank = q.len();
-    let factors = match tiles.storage() {
+    let factors = match tiled_modes.storage() {
         StorageType::F32 => &[][..],
-        StorageType::F16 | StorageType::Bf16 => tiles.factors(),
-        StorageType::Int8 => &tiles.scales()[tile.first_scale..][..rank],
+        StorageType::F16 | StorageType::Bf16 => tiled_modes.factors(),
+        StorageType::Int8 => &tiled_modes.scales()[tile.first_scale..][..rank],
     };
     scaled_q[..rank].copy_from_slice(q);
     scaled_q[..rank].iter_mut().zip(factors).for_each(|(coordinate, factor)| *coordinate *= factor);
@@ -136,12 +137,13 @@ struct TileChunks<'a> {
 impl<'a> TileChunks<'a> {
     #[inline(always)]
     fn of(
-        tiles: &'a TiledModes,
+        tiled_modes: &'a TiledModes,
         tile: &TileLayout,
         mode_selection: ModeSelection<'a>,
         scaled_q: &'a [f32; MAX_RANK],
     ) -> Self {
-        let packed_words = &tiles.packed_words()[tile.first_packed_word..][..3 * tiles.chunks() * tile.quads];
+        let packed_words =
+            &tiled_modes.packed_words()[tile.first_packed_word..][..3 * tiled_modes.chunks() * tile.quads];
         Self { packed_words, quads: tile.quads, chunks: mode_selection.chunks, scaled_q }
     }
 
@@ -299,23 +301,23 @@ mod tests {
             let columns = (0..3 * vertices * rank).map(|index| entry(index, rng.next())).collect();
             let shape = shape_with_columns(vertices, rank, columns, &mut rng);
             for storage in StorageType::ALL {
-                let tiles = TiledModes::new(&shape, storage);
+                let tiled_modes = TiledModes::new(&shape, storage);
                 let mut q: Vec<f32> = (0..rank).map(|_| rng.next()).collect();
-                let per_chunk = crate::storage::modes_per_chunk(storage);
-                let all_chunks: Vec<u16> = (0..tiles.chunks() as u16).collect();
+                let chunk_modes = crate::storage::modes_per_chunk(storage);
+                let all_chunks: Vec<u16> = (0..tiled_modes.chunks() as u16).collect();
                 let even_chunks: Vec<u16> = all_chunks.iter().copied().filter(|chunk| chunk % 2 == 0).collect();
                 for chunks in [all_chunks, even_chunks] {
                     (0..rank)
-                        .filter(|mode| !chunks.contains(&((mode / per_chunk) as u16)))
+                        .filter(|mode| !chunks.contains(&((mode / chunk_modes) as u16)))
                         .for_each(|mode| q[mode] = 0.0);
                     let mode_selection = ModeSelection { q: &q, chunks: &chunks };
-                    for tile_index in 0..tiles.count() {
-                        let tile = tiles.tile(tile_index);
+                    for tile_index in 0..tiled_modes.count() {
+                        let tile = tiled_modes.tile(tile_index);
                         let (mut fused, mut columns) = (Scratch::new(), Scratch::new());
                         crate::cpu::simd::run_vectorized(|| {
-                            sum_modes::<false>(&tiles, &tile, mode_selection, &mut fused);
+                            sum_modes::<false>(&tiled_modes, &tile, mode_selection, &mut fused);
                         });
-                        sum_columns::<false>(&tiles, &tile, mode_selection, &mut columns);
+                        sum_columns::<false>(&tiled_modes, &tile, mode_selection, &mut columns);
                         let bits = |sums: &[f32]| sums.iter().map(|sum| sum.to_bits()).collect::<Vec<_>>();
                         assert_eq!(bits(&fused.sums), bits(&columns.sums), "{storage:?} {vertices} x {rank}");
                         if storage == StorageType::F32 && tile.vertices == 4 * tile.quads {

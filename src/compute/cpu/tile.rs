@@ -196,15 +196,16 @@ fn split_recursive<O: SplitOutput>(
 mod tests {
     use super::*;
 
-    const COUNTS: [usize; 5] = [0, 1, 256, 257, 767];
+    /// Number of items of each domain.
+    const ITEM_COUNTS: [usize; 5] = [0, 1, 256, 257, 767];
 
     #[test]
     fn tiles_cover_every_item_once_in_order() {
-        let mut work = WorkList::new(COUNTS.into_iter(), 256);
+        let mut work = WorkList::new(ITEM_COUNTS.into_iter(), 256);
         let tiles = work.select_changed(&ChangeTracker::with_all_changed()).to_vec();
         assert_eq!(tiles.iter().map(DomainTile::domain).collect::<Vec<_>>(), [1, 2, 3, 3, 4, 4, 4]);
         assert!(tiles.iter().all(|tile| tile.item_count() >= 1 && tile.item_count() <= 256));
-        let mut output = vec![0.0; 3 * COUNTS.iter().sum::<usize>()];
+        let mut output = vec![0.0; 3 * ITEM_COUNTS.iter().sum::<usize>()];
         let mut visits = vec![0; work.len()];
         let outputs = (PackedOutput::new(3, &mut output), PerTileOutput::new(&mut visits));
         split_recursive(work.select_changed(&ChangeTracker::with_all_changed()), outputs, 1, &|tiles,
@@ -217,21 +218,21 @@ mod tests {
                 *visits.value_of(tile) += 1;
             }
         });
-        let expected = COUNTS.iter().enumerate().flat_map(|(domain, count)| vec![1.0 + domain as f32; 3 * count]);
+        let expected = ITEM_COUNTS.iter().enumerate().flat_map(|(domain, count)| vec![1.0 + domain as f32; 3 * count]);
         assert!(output.into_iter().eq(expected));
         assert_eq!(visits, [1; 7]);
     }
 
     #[test]
     fn tiles_of_changed_domains_write_only_their_items() {
-        let mut work = WorkList::new(COUNTS.into_iter(), 256);
-        let mut output = vec![0.0; COUNTS.iter().sum::<usize>()];
+        let mut work = WorkList::new(ITEM_COUNTS.into_iter(), 256);
+        let mut output = vec![0.0; ITEM_COUNTS.iter().sum::<usize>()];
         let changes = ChangeTracker::with_changed(&[1, 3]);
         run_parallel(work.select_changed(&changes), PackedOutput::new(1, &mut output), &|tiles, mut numbers| {
             tiles.iter().for_each(|tile| numbers.numbers_of(tile).fill(1.0));
         });
         let value_of = |domain: usize| f32::from(u8::from([1, 3].contains(&domain)));
-        let expected = COUNTS.iter().enumerate().flat_map(|(domain, count)| vec![value_of(domain); *count]);
+        let expected = ITEM_COUNTS.iter().enumerate().flat_map(|(domain, count)| vec![value_of(domain); *count]);
         assert!(output.into_iter().eq(expected));
     }
 }

@@ -22,7 +22,7 @@ impl TileBounds {
     #[inline(always)]
     pub(super) fn of_axes(axes: [&[f32]; 3]) -> Self {
         let mut tile_bounds = Self::EMPTY;
-        let mut poison = 0.0;
+        let mut zero_or_nan = 0.0;
         for (axis, numbers) in axes.into_iter().enumerate() {
             let (mut min, mut max, mut sums) = ([f32::INFINITY; LANES], [f32::NEG_INFINITY; LANES], [0.0_f32; LANES]);
             let mut blocks = numbers.chunks_exact(LANES);
@@ -40,21 +40,21 @@ impl TileBounds {
             }
             tile_bounds.min[axis] = min.into_iter().fold(f32::INFINITY, f32::min);
             tile_bounds.max[axis] = max.into_iter().fold(f32::NEG_INFINITY, f32::max);
-            poison += sums.iter().sum::<f32>();
+            zero_or_nan += sums.iter().sum::<f32>();
         }
-        tile_bounds.add_poison(poison)
+        tile_bounds.add_zero_or_nan(zero_or_nan)
     }
 
     /// The smallest bounds that contain both.
     #[inline(always)]
     pub(super) fn union(self, other: Self) -> Self {
         // Empty bounds are infinite but not NaN, and must not make the union NaN.
-        let poison = if self.min[0].is_nan() || other.min[0].is_nan() { f32::NAN } else { 0.0 };
+        let zero_or_nan = if self.min[0].is_nan() || other.min[0].is_nan() { f32::NAN } else { 0.0 };
         Self {
             min: std::array::from_fn(|axis| self.min[axis].min(other.min[axis])),
             max: std::array::from_fn(|axis| self.max[axis].max(other.max[axis])),
         }
-        .add_poison(poison)
+        .add_zero_or_nan(zero_or_nan)
     }
 
     /// Whether all positions are finite, and there is at least one.
@@ -90,13 +90,13 @@ impl TileBounds {
     /// Makes the bounds NaN if `number` is not finite.
     #[inline(always)]
     pub(super) fn poison_with(self, number: f32) -> Self {
-        self.add_poison(number * 0.0)
+        self.add_zero_or_nan(number * 0.0)
     }
 
     /// Adds 0, which changes nothing, or NaN, which makes all bounds NaN.
     #[inline(always)]
-    fn add_poison(self, poison: f32) -> Self {
-        Self { min: self.min.map(|number| number + poison), max: self.max.map(|number| number + poison) }
+    fn add_zero_or_nan(self, zero_or_nan: f32) -> Self {
+        Self { min: self.min.map(|number| number + zero_or_nan), max: self.max.map(|number| number + zero_or_nan) }
     }
 }
 

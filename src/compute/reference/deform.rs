@@ -1,4 +1,5 @@
-//! x = T (x0 + U q), equation 3.9 of the thesis, for every vertex of every domain. Twin of `kernels/deform.cu`.
+//! x = T (x0 + U q), equation 3.9 of B. Wang's thesis (README.md), for every vertex of every domain. Twin of
+//! `kernels/deform.cu`.
 
 use modalcast_model::domain::Shape;
 use modalcast_model::scene::{Scene, SceneState};

@@ -227,6 +227,7 @@ fn transform_to_clip(window: &Viewport, position: &[f32]) -> [f32; 4] {
     })
 }
 
+/// Whether all corners are outside of the same plane of the view frustum.
 fn is_outside(corners: &[[f32; 4]; 3]) -> bool {
     let is_beyond = |axis: usize, sign: f32| corners.iter().all(|corner| sign * corner[axis] > corner[3]);
     (0..3).any(|axis| is_beyond(axis, 1.0) || is_beyond(axis, -1.0))
@@ -239,6 +240,7 @@ fn plane_distance(window: &Viewport, [x, y, z, w]: &[f32; 4], plane: usize) -> f
     [z + w, guard_x - x, guard_x + x, guard_y - y, guard_y + y][plane]
 }
 
+/// Clips a triangle to a convex polygon by the near plane and the guard band.
 fn clip(window: &Viewport, corners: &[[f32; 4]; 3]) -> Vec<[f32; 4]> {
     let mut polygon = corners.to_vec();
     for plane in 0..5 {
@@ -271,6 +273,7 @@ fn clip_edge(inner: &[f32; 4], outer: &[f32; 4], inner_distance: f32, outer_dist
     std::array::from_fn(|axis| inner[axis] + t * (outer[axis] - inner[axis]))
 }
 
+/// Divides a corner by w and rounds it to 1/256 pixel of the window.
 fn snap(window: &Viewport, [x, y, z, w]: &[f32; 4]) -> SnappedVertex {
     let [half_width, half_height] = window.half_size();
     let inverse_w = 1.0 / w;

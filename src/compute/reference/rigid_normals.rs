@@ -44,11 +44,13 @@ pub fn rigid_tangents(scene: &Scene, state: &SceneState) -> Vec<[f64; 4]> {
     tangents
 }
 
+/// The cofactors of A: its determinant times its inverse transpose.
 pub(super) fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
     let [a, b, c] = [0, 1, 2].map(|row| linear.row(row).transpose());
     Matrix3::from_rows(&[b.cross(&c).transpose(), c.cross(&a).transpose(), a.cross(&b).transpose()])
 }
 
+/// A vector divided by its length; +Z if the length is about zero.
 fn normalize_or_z(vector: Vector3<f64>) -> Vector3<f64> {
     vector.try_normalize(1e-300).unwrap_or_else(Vector3::z)
 }

@@ -94,9 +94,9 @@ struct ModeSums {
     /// Error from rounding scaled coordinates.
     coordinates: f64,
     /// Upper bound of the sum of the magnitudes of all terms.
-    magnitudes: f64,
+    magnitude_sum: f64,
     /// Number of terms that are not zero.
-    terms: f64,
+    term_count: f64,
 }
 
 /// Tables of one shape in one storage type from which bounds are computed.
@@ -139,8 +139,8 @@ impl ShapeErrorModel {
             let exact = coordinate * f64::from(mode.factor);
             let rounded = f64::from(q.abs() * mode.factor);
             sums.coordinates += stored_row_norm(mode) * (exact - rounded).abs();
-            sums.magnitudes += stored_row_norm(mode) * rounded;
-            sums.terms += 1.0;
+            sums.magnitude_sum += stored_row_norm(mode) * rounded;
+            sums.term_count += 1.0;
         }
         self.bound_from_sums(tile, input, sums)
     }
@@ -172,15 +172,19 @@ impl ShapeErrorModel {
     /// Computes the bounds of a tile from the sums over its modes.
     fn bound_from_sums(&self, tile: usize, input: &ErrorBoundInput, sums: ModeSums) -> ErrorBound {
         let storage = SQRT_3 * sums.storage * ROUND_UP;
-        let [coordinates, magnitudes, terms] =
-            [sums.coordinates, sums.magnitudes, sums.terms].map(|number| number * ROUND_UP);
+        let [coordinates, magnitude_sum, term_count] =
+            [sums.coordinates, sums.magnitude_sum, sums.term_count].map(|number| number * ROUND_UP);
         let accumulation = match input.compensated {
-            false => gamma(terms) * magnitudes + 2.0 * SQRT_3 * terms * UNDERFLOW,
-            true => UNIT_ROUNDOFF * magnitudes + gamma(terms).powi(2) * magnitudes + 10.0 * SQRT_3 * terms * UNDERFLOW,
+            false => gamma(term_count) * magnitude_sum + 2.0 * SQRT_3 * term_count * UNDERFLOW,
+            true => {
+                UNIT_ROUNDOFF * magnitude_sum
+                    + gamma(term_count).powi(2) * magnitude_sum
+                    + 10.0 * SQRT_3 * term_count * UNDERFLOW
+            }
         };
         // Maximum norm of x0 + u.
-        let max_deformed_norm = self.max_rest_norms[tile] + magnitudes + accumulation;
-        let rest = if terms > 0.0 { UNIT_ROUNDOFF * max_deformed_norm } else { 0.0 };
+        let max_deformed_norm = self.max_rest_norms[tile] + magnitude_sum + accumulation;
+        let rest = if term_count > 0.0 { UNIT_ROUNDOFF * max_deformed_norm } else { 0.0 };
         let (rounded_transform, norm) = (input.transform.to_f32(), norm(&input.transform));
         let linear_norm = rounded_transform.linear().norm() * ROUND_UP;
         let translation_norm = rounded_transform.translation().norm() * ROUND_UP;

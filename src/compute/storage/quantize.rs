@@ -100,12 +100,12 @@ fn write_planes<const SIZE: usize>(
     packed_words: &mut [PackedWord],
     encode: impl Fn(usize, f32) -> [u8; SIZE],
 ) {
-    let per_chunk = modes_per_chunk(storage);
+    let chunk_modes = modes_per_chunk(storage);
     for mode in 0..modes.rank() {
-        let first_word = 3 * (mode / per_chunk) * tile.quads;
+        let first_word = 3 * (mode / chunk_modes) * tile.quads;
         for (vertex, entries) in tile_entries(modes, tile, mode).chunks_exact(3).enumerate() {
             for (axis, entry) in entries.iter().enumerate() {
-                let byte = SIZE * ((mode % per_chunk * 3 + axis) * QUAD + vertex % QUAD);
+                let byte = SIZE * ((mode % chunk_modes * 3 + axis) * QUAD + vertex % QUAD);
                 let word = &mut packed_words[first_word + byte / 16 * tile.quads + vertex / QUAD];
                 word.0[byte % 16..][..SIZE].copy_from_slice(&encode(mode, *entry));
             }

@@ -175,6 +175,7 @@ mod tests {
     use super::*;
     use crate::testing::{TestRng, shape};
 
+    /// (vertices, rank) of the tested shapes.
     const SIZES: [(usize, usize); 12] = [
         (1, 1),
         (1, 0),

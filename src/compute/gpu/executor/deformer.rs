@@ -37,7 +37,7 @@ pub const MAX_STEPS_IN_FLIGHT: usize = 2;
 /// A submitted step.
 #[derive(Debug, Clone, Copy)]
 struct StepInFlight {
-    /// Index of its ring slot.
+    /// Index of its step slot.
     slot: usize,
     submitted: Instant,
 }
@@ -124,7 +124,7 @@ impl CudaDeformer {
     }
 
     /// The compiled kernels and allocated buffers. The plan excludes memory that is allocated on demand. The first fetch
-    /// of vertices concurrently with a step allocates the second output set. The second ring slot is allocated when two
+    /// of vertices concurrently with a step allocates the second output set. The second step slot is allocated when two
     /// steps are in flight.
     pub const fn plan(&self) -> &DeformPlan {
         &self.plan
@@ -187,7 +187,7 @@ impl CudaDeformer {
         self.step_slots[self.last_slot].launch(StepKind::Full)
     }
 
-    /// Writes the values of a step and starts its graph. Returns the ring slot.
+    /// Writes the values of a step and starts its graph. Returns the step slot.
     fn start(&mut self, state: &SceneState, submitted: Instant) -> Result<usize> {
         let _current = self.device.enter()?;
         let set = self.output_ring.next_output();
@@ -216,7 +216,8 @@ impl CudaDeformer {
         if target.is_being_read && !self.output.is_shared() {
             self.readbacks.wait_for_reads(&self.device, target.output)?;
         }
-        // A partial step keeps the other vertices, and the kernels of normals and boxes read the positions.
+        // A partial step does not write vertices of unchanged domains, and the kernels of normals and boxes read the
+        // positions, so the driver must not discard the contents.
         let keeps_contents = list_lengths.is_some() || kernels.normals.is_some() || kernels.bounds.boxes.is_some();
         let displacements = self.displacements.as_ref().map_or(0, DeviceBuffer::address);
         let header = Header { displacements, ..header };
@@ -241,7 +242,7 @@ impl CudaDeformer {
         Ok(slot_index)
     }
 
-    /// Returns a ring slot whose step has ended; allocates one if all are in flight.
+    /// Returns a step slot whose step has ended; allocates one if all are in flight.
     fn acquire_step_slot(&mut self) -> Result<usize> {
         let is_free = |slot: &usize| self.in_flight.iter().all(|step| step.slot != *slot);
         if let Some(slot) = (0..self.step_slots.len()).find(is_free) {

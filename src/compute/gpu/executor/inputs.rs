@@ -24,9 +24,9 @@ pub(crate) struct InputAddresses {
     pub q: u64,
     /// Per domain, the step that last changed it.
     pub change_steps: u64,
-    /// Per domain, the number of chunks that it sums; 0 without truncation.
+    /// Per domain, the number of chunks that it sums. Empty without truncation.
     pub retained_counts: u64,
-    /// The chunks that domains sum; 0 without truncation.
+    /// The chunks that domains sum. Empty without truncation.
     pub retained: u64,
 }
 
@@ -34,7 +34,8 @@ pub(crate) struct InputAddresses {
 #[derive(Debug)]
 pub struct StepInputs {
     writer: InputWriter,
-    buffer: DeviceBuffer,
+    /// Header, transforms, q, and with truncation the numbers and indices of the retained chunks.
+    values: DeviceBuffer,
     change_steps: DeviceBuffer,
     transform_links: DeviceBuffer,
     frames: DeviceBuffer,
@@ -62,7 +63,7 @@ impl StepInputs {
         let (scene, sizes) = (&packer.scene, InputSizes::of(&packer.scene, &packer.coordinates));
         Ok(Self {
             writer: InputWriter::new(packer),
-            buffer: DeviceBuffer::zeroed(device, sizes.total())?,
+            values: DeviceBuffer::zeroed(device, sizes.total())?,
             change_steps: DeviceBuffer::zeroed(device, 4 * scene.domains.len() as u64)?,
             transform_links: DeviceBuffer::upload(device, &transform_links(scene))?,
             frames: DeviceBuffer::upload(device, scene.transform_roots.frames())?,
@@ -79,7 +80,7 @@ impl StepInputs {
     }
 
     pub(crate) fn addresses(&self) -> InputAddresses {
-        let header = self.buffer.address();
+        let header = self.values.address();
         let transforms = header + size_of::<Header>() as u64;
         let q = transforms + self.sizes.transforms;
         let retained_counts = q + self.sizes.q;
@@ -120,8 +121,8 @@ impl StepInputs {
     /// `Fault` when `staging` is not a staging buffer of these inputs, or when the device fails.
     pub unsafe fn send(&self, device: &Device, staging: &StagingBuffer, part: InputPart) -> Result<()> {
         let bytes: &[u8] = bytemuck::cast_slice(staging.as_slice()?);
-        if bytes.len() as u64 != self.buffer.bytes() {
-            let reason = format!("expected a staging buffer of {} bytes, got {}", self.buffer.bytes(), bytes.len());
+        if bytes.len() as u64 != self.values.bytes() {
+            let reason = format!("expected a staging buffer of {} bytes, got {}", self.values.bytes(), bytes.len());
             return Err(Error::Fault { stage: "upload", reason });
         }
         let bytes = match part {
@@ -130,7 +131,7 @@ impl StepInputs {
         };
         let _current = device.enter()?;
         // SAFETY: both buffers have at least the size of `bytes`, as checked above. The caller keeps them alive.
-        unsafe { result::memcpy_htod_async(self.buffer.address(), bytes, device.stream().cu_stream()) }
+        unsafe { result::memcpy_htod_async(self.values.address(), bytes, device.stream().cu_stream()) }
             .map_err(cuda_error("upload"))
     }
 

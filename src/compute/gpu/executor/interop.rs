@@ -81,7 +81,7 @@ impl GlInterop {
             lost => lost,
         })?;
         let context = Arc::clone(device.context());
-        Ok(RegisteredBuffer { resource, buffer, map_flags: None, is_mapped: Cell::new(false), context })
+        Ok(RegisteredBuffer { resource, buffer, announced_access: None, is_mapped: Cell::new(false), context })
     }
 }
 
@@ -92,7 +92,7 @@ pub(super) struct RegisteredBuffer {
     resource: CUgraphicsResource,
     buffer: GlBuffer,
     /// The access that was last announced to the driver; `None` before the first mapping and after a failure.
-    map_flags: Option<MapAccess>,
+    announced_access: Option<MapAccess>,
     /// Whether the buffer is mapped. Outside of [`with_mapped`], this is true only if the last unmap failed.
     is_mapped: Cell<bool>,
     context: Arc<CudaContext>,
@@ -110,7 +110,7 @@ impl RegisteredBuffer {
             let reason = format!("buffer {} is still mapped: its last unmap failed", self.buffer.name);
             return Err(Error::Fault { stage: STAGE, reason });
         }
-        if self.map_flags == Some(access) {
+        if self.announced_access == Some(access) {
             return Ok(());
         }
         let flags = match access {
@@ -118,12 +118,12 @@ impl RegisteredBuffer {
             MapAccess::ReadWrite => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_NONE,
             MapAccess::Read => Flags::CU_GRAPHICS_MAP_RESOURCE_FLAGS_READ_ONLY,
         };
-        self.map_flags = None;
+        self.announced_access = None;
         // SAFETY: the resource is registered, and `is_mapped` shows that it is unmapped.
         unsafe { sys::cuGraphicsResourceSetMapFlags_v2(self.resource, flags as c_uint) }
             .result()
             .map_err(cuda_error(STAGE))?;
-        self.map_flags = Some(access);
+        self.announced_access = Some(access);
         Ok(())
     }
 
@@ -184,10 +184,10 @@ pub(super) fn with_mapped(
     .result()
     .map_err(cuda_error(STAGE))?;
     let buffers: Vec<&RegisteredBuffer> = mappings.iter().map(|mapping| &*mapping.buffer).collect();
-    let states: Vec<&Cell<bool>> = buffers.iter().map(|buffer| &buffer.is_mapped).collect();
+    let mapped_flags: Vec<&Cell<bool>> = buffers.iter().map(|buffer| &buffer.is_mapped).collect();
     let addresses = || buffers.iter().map(|buffer| buffer.address()).collect::<Result<Vec<u64>>>();
     run_mapped(
-        &states,
+        &mapped_flags,
         || work(&addresses()?),
         || {
             let count = resources.len() as c_uint;
@@ -200,16 +200,16 @@ pub(super) fn with_mapped(
     )
 }
 
-/// Runs `work` on mapped buffers, then `unmap`, also when `work` panics. Afterwards each of `states` is true if `unmap`
-/// failed and the buffers are still mapped, otherwise false.
+/// Runs `work` on mapped buffers, then `unmap`, also when `work` panics. Afterwards each of `mapped_flags` is true if
+/// `unmap` failed and the buffers are still mapped, otherwise false.
 fn run_mapped(
-    states: &[&Cell<bool>],
+    mapped_flags: &[&Cell<bool>],
     work: impl FnOnce() -> Result<()>,
     unmap: impl FnOnce() -> Result<()>,
 ) -> Result<()> {
-    let set_states = |is_mapped| states.iter().for_each(|state| state.set(is_mapped));
-    set_states(true);
-    let (work_result, unmap_result) = with_cleanup(work, || unmap().inspect(|()| set_states(false)));
+    let set_flags = |is_mapped| mapped_flags.iter().for_each(|flag| flag.set(is_mapped));
+    set_flags(true);
+    let (work_result, unmap_result) = with_cleanup(work, || unmap().inspect(|()| set_flags(false)));
     work_result.and(unmap_result)
 }
 
@@ -222,8 +222,8 @@ fn check_device(library: &Library, device: &Device) -> Result<()> {
     let get_devices = get_devices.map_err(|error| fault(error.to_string()))?;
     let (mut count, mut devices) = (0, [0; 16]);
     // SAFETY: `devices` has as many elements as the call receives in its third argument.
-    let query = unsafe { get_devices(&mut count, devices.as_mut_ptr(), devices.len() as c_uint, GL_DEVICE_LIST_ALL) };
-    query.result().map_err(|error| fault(format!("no current OpenGL context of a CUDA device: {error}")))?;
+    let status = unsafe { get_devices(&mut count, devices.as_mut_ptr(), devices.len() as c_uint, GL_DEVICE_LIST_ALL) };
+    status.result().map_err(|error| fault(format!("no current OpenGL context of a CUDA device: {error}")))?;
     let gl_devices = &devices[..devices.len().min(count as usize)];
     if gl_devices.contains(&device.context().cu_device()) {
         return Ok(());
@@ -238,10 +238,10 @@ mod tests {
 
     #[test]
     fn buffers_are_unmapped_after_errors_and_panics() {
-        let (first, second, unmaps) = (Cell::new(false), Cell::new(false), Cell::new(0));
+        let (first, second, unmap_calls) = (Cell::new(false), Cell::new(false), Cell::new(0));
         let run = |work: &dyn Fn() -> Result<()>, unmap_result: Result<()>| {
             let unmap = || {
-                unmaps.set(unmaps.get() + 1);
+                unmap_calls.set(unmap_calls.get() + 1);
                 unmap_result.clone()
             };
             let result = catch_unwind(AssertUnwindSafe(|| run_mapped(&[&first, &second], work, unmap)));
@@ -254,6 +254,6 @@ mod tests {
         let unmap_error = Err(fault_in(STAGE)("unmap"));
         let result = run(&|| Ok(()), unmap_error);
         assert!(matches!(result, (Ok(Err(_)), true, true)), "expected mapped buffers after a failed unmap");
-        assert_eq!(unmaps.get(), 4);
+        assert_eq!(unmap_calls.get(), 4);
     }
 }

@@ -7,7 +7,8 @@ use crate::gpu::tables::plan::{BufferRole, DeformPlan};
 use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::raster::{GlBuffer, GlVertexBuffers};
 
-/// Device addresses of the outputs, valid while the outputs are mapped. `tangents` is 0 if the scene has no tangents.
+/// Device addresses of the outputs. Those of OpenGL's buffers are valid only while the buffers are mapped. `tangents`
+/// is 0 if the scene has no tangents.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct OutputAddresses {
     pub positions: u64,
@@ -89,6 +90,7 @@ impl RegisteredOutputs {
                 bytes => Some(register_buffer(buffers.tangents.ok_or_else(missing_tangents)?, bytes)?),
             },
         };
+        // Map once, because mapping checks the sizes of the buffers.
         outputs.with_addresses(device, MapAccess::Read, |_| Ok(()))?;
         Ok(outputs)
     }

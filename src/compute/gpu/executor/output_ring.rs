@@ -19,15 +19,15 @@ pub(super) struct OutputRing {
     /// Whether the state of the current step directly follows the state on the device. Then its list of changes is
     /// complete.
     is_consecutive: bool,
-    /// Index of the output that the last step wrote.
-    current: usize,
+    /// Index of the output of the last step that began.
+    current_output: usize,
     outputs: Vec<OutputState>,
     /// Maximum number of outputs.
     max_outputs: usize,
     /// Maximum number of domains in a list of changes.
     max_changes: usize,
     /// Number of readbacks so far.
-    reads: u64,
+    read_count: u64,
 }
 
 /// Content of one output.
@@ -64,22 +64,26 @@ impl OutputRing {
             last_full_step: 0,
             serial: None,
             is_consecutive: false,
-            current: 0,
+            current_output: 0,
             outputs: vec![OutputState::default()],
             max_outputs,
             max_changes,
-            reads: 0,
+            read_count: 0,
         }
     }
 
     /// The output that the next step writes: the current one, or the other one while the current one is being read.
     pub(super) fn next_output(&self) -> usize {
-        if self.outputs[self.current].read_id.is_some() { (self.current + 1) % self.max_outputs } else { self.current }
+        if self.outputs[self.current_output].read_id.is_some() {
+            (self.current_output + 1) % self.max_outputs
+        } else {
+            self.current_output
+        }
     }
 
     /// Disables the second output, because the device has no memory for it.
     pub(super) fn forbid_more_outputs(&mut self) {
-        self.max_outputs = self.current + 1;
+        self.max_outputs = self.current_output + 1;
     }
 
     /// Begins a step of `state`, which writes [`Self::next_output`]. That output is not valid until [`Self::end_step`].
@@ -90,12 +94,12 @@ impl OutputRing {
             (self.last_step, self.last_full_step) = (0, 0);
         }
         self.last_step += 1;
-        self.current = self.next_output();
-        if self.outputs.len() <= self.current {
-            self.outputs.resize_with(self.current + 1, OutputState::default);
+        self.current_output = self.next_output();
+        if self.outputs.len() <= self.current_output {
+            self.outputs.resize_with(self.current_output + 1, OutputState::default);
         }
         self.is_consecutive = self.serial.take().is_some_and(|serial| serial.checked_add(1) == Some(state.serial));
-        let output_state = &mut self.outputs[self.current];
+        let output_state = &mut self.outputs[self.current_output];
         let (shown_step, dirty_domains) =
             (std::mem::take(&mut output_state.shown_step), output_state.dirty_domains.take());
         let fits_list = |dirty_domains: &Vec<u32>| match &state.dirty_domains {
@@ -106,7 +110,7 @@ impl OutputRing {
         };
         let dirty_domains = dirty_domains.filter(fits_list);
         StepTarget {
-            output: self.current,
+            output: self.current_output,
             is_being_read: output_state.read_id.is_some(),
             step: self.last_step,
             shown_step,
@@ -127,7 +131,7 @@ impl OutputRing {
     pub(super) fn end_step(&mut self, state: &SceneState) {
         self.serial = Some(state.serial);
         for (index, output) in self.outputs.iter_mut().enumerate() {
-            if index == self.current {
+            if index == self.current_output {
                 (output.shown_step, output.dirty_domains) = (self.last_step, Some(Vec::new()));
                 continue;
             }
@@ -144,14 +148,14 @@ impl OutputRing {
 
     /// The output that shows the last step; `None` if that step failed.
     pub(super) fn shown_output(&self) -> Option<usize> {
-        (self.outputs[self.current].shown_step > 0).then_some(self.current)
+        (self.outputs[self.current_output].shown_step > 0).then_some(self.current_output)
     }
 
     /// Begins a readback of the last output. Returns its number.
     pub(super) fn begin_read(&mut self) -> u64 {
-        self.reads += 1;
-        self.outputs[self.current].read_id = Some(self.reads);
-        self.reads
+        self.read_count += 1;
+        self.outputs[self.current_output].read_id = Some(self.read_count);
+        self.read_count
     }
 
     /// Records that the host has seen the end of a readback.
@@ -237,7 +241,7 @@ mod tests {
                 step(&mut output_ring, &state(serial, &[]));
                 output_ring.begin_read();
             }
-            let idle = 1 - output_ring.current;
+            let idle = 1 - output_ring.current_output;
             output_ring.end_read(4);
             for serial in 5..5 + steps {
                 assert_ne!(step(&mut output_ring, &state(serial, &[serial as u32])).output, idle);
@@ -290,9 +294,9 @@ mod tests {
             assert_eq!(step(&mut output_ring, &state(serial, &[])).dirty_domains, None, "state {serial}");
         }
         assert!(step(&mut output_ring, &state(3, &[])).dirty_domains.is_some());
-        let mut full_change = state(4, &[]);
-        full_change.dirty_domains = DirtyDomains::All;
-        assert_eq!(step(&mut output_ring, &full_change).dirty_domains, None);
+        let mut fully_changed_state = state(4, &[]);
+        fully_changed_state.dirty_domains = DirtyDomains::All;
+        assert_eq!(step(&mut output_ring, &fully_changed_state).dirty_domains, None);
         assert_eq!(output_ring.last_full_step, output_ring.last_step);
         output_ring.last_step = u32::MAX;
         let target = step(&mut output_ring, &state(5, &[]));

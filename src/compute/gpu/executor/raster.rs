@@ -38,7 +38,7 @@ const BLOCK_THREADS: u32 = 128;
 /// Blocks per multiprocessor of the kernels that loop over a queue: as many as are resident.
 const BLOCKS_PER_SM: u32 = 16;
 
-/// Each 32-bit word of a sample that no triangle covers.
+/// Each 32-bit word of an id sample that no triangle covers.
 const EMPTY_SAMPLE: u32 = u32::MAX;
 
 /// Arguments of all kernels; pointers are device addresses.
@@ -264,20 +264,22 @@ impl RasterPipeline {
     /// The target of the pass has the bytes of its window.
     unsafe fn clear(&self, device: &Device, pass: &RasterPass<'_>) -> Result<()> {
         let variant = pass.functions.variant;
-        let empty_sample = if variant.depth_only { 1.0_f32.to_bits() } else { EMPTY_SAMPLE };
+        let clear_word = if variant.depth_only { 1.0_f32.to_bits() } else { EMPTY_SAMPLE };
         let words = variant.bytes(pass.window) / 4;
         let counters = (self.counters.address(), 0, size_of::<RasterCounters>() as u64 / 4);
-        for (buffer, word, words) in [(pass.target, empty_sample, words), counters] {
+        for (address, word, word_count) in [(pass.target, clear_word, words), counters] {
             let stream = device.stream().cu_stream();
             // SAFETY: the counters are one `RasterCounters`, and the caller guarantees the target. The stream orders
             // the writes before their readers.
-            let result = unsafe { sys::cuMemsetD32Async(buffer, word, words as usize, stream) };
+            let result = unsafe { sys::cuMemsetD32Async(address, word, word_count as usize, stream) };
             result.result().map_err(cuda_error("raster"))?;
         }
         Ok(())
     }
 }
 
+/// Starts a kernel of `blocks` blocks on the device's stream.
+///
 /// # Safety
 /// The addresses in `args` are those of memory that the kernels may access.
 unsafe fn start(device: &Device, function: &CudaFunction, blocks: u32, args: RasterArgs) -> Result<()> {

@@ -1,4 +1,4 @@
-//! A ring slot: the memory of one step in flight. It holds the input values and lists, the pinned memory for the bounds
+//! A step slot: the memory of one step in flight. It holds the input values and lists, the pinned memory for the bounds
 //! that are read back, and the graphs that refer to this memory. A second slot is allocated when a step is submitted
 //! before the previous one has ended.
 

@@ -117,10 +117,11 @@ pub unsafe fn launch_kernel<T: Pod>(
         attrs: &mut attribute,
         numAttrs: u32::from(is_dependent),
     };
-    let mut pointers = [std::ptr::from_ref(args).cast_mut().cast::<c_void>()];
+    let mut argument_pointers = [std::ptr::from_ref(args).cast_mut().cast::<c_void>()];
     // SAFETY: the attribute and the argument outlive the call, which copies both; the caller guarantees the rest.
     unsafe {
-        sys::cuLaunchKernelEx(&config, function.cu_function(), pointers.as_mut_ptr(), std::ptr::null_mut()).result()
+        sys::cuLaunchKernelEx(&config, function.cu_function(), argument_pointers.as_mut_ptr(), std::ptr::null_mut())
+            .result()
     }
     .map_err(cuda_error("launch"))
 }

@@ -12,7 +12,7 @@ use modalcast_model::scene::{BoundingBox, Scene};
 /// Maximum number of tiles of a segment. Each tile has four boxes.
 const MAX_SEGMENT_TILES: u32 = 32;
 
-/// Keys of a box.
+/// Number of keys of a box.
 pub(crate) const BOX_KEYS: usize = 6;
 
 /// The segments of all domains, in the order of the domains.
@@ -20,6 +20,7 @@ pub(crate) fn box_segments(scene: &Scene, work: &WorkList) -> Vec<BoxSegment> {
     let mut segments = Vec::with_capacity(scene.domains.len());
     for (index, (tiles, layout)) in work.domain_tiles.iter().zip(&scene.layout.domains).enumerate() {
         let (domain, span) = (index as u32, tiles.vertices);
+        // In a mixed tile, which the domain shares with others, this bit field is 0.
         if work.tiles[span.first as usize].kind & LAST_QUAD_ITEMS == 0 {
             let (first_item, item_count) = (layout.first_vertex as u32, layout.vertices as u32);
             segments.push(BoxSegment { first_item, item_count, domain, is_vertex_range: 1 });

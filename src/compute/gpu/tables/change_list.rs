@@ -36,8 +36,8 @@ pub(crate) fn max_change_entries(scene: &Scene) -> usize {
     max_changed_domains(scene).min(domain_count)
 }
 
-/// Whether a changed domain needs no [`Change`], only new tiles: it follows another domain's transform, has no
-/// coordinates, and the scene keeps neither exact normals nor boxes, which read the step of the domain's last change.
+/// Whether the tiles of a changed domain are listed, but not the domain itself. This holds for a domain without modes
+/// that follows another domain's transform, unless exact normals or boxes need the step of its last change.
 fn needs_no_entry(scene: &Scene, domain: usize) -> bool {
     let features = scene.features;
     features.followers
@@ -120,7 +120,7 @@ impl ChangeListWriter {
         let domains_with_entry = domains.changed.iter().filter(|domain| !needs_no_entry(scene, **domain as usize));
         for (index, domain_id) in domains_with_entry.enumerate() {
             let (domain, first_new_q) = (*domain_id as usize, q_count);
-            // The kernel does not read the transform of a follower.
+            // The kernel ignores the transform in the entry of a follower; that of its root fills the place.
             let root = scene.transform_roots.root_of(domain);
             let transform: [u32; TRANSFORM_WORDS] = bytemuck::cast(state.transforms[root].0);
             transforms[TRANSFORM_WORDS * index..][..TRANSFORM_WORDS].copy_from_slice(&transform);

@@ -51,12 +51,12 @@ pub(crate) struct InputSizes {
 impl InputSizes {
     pub(crate) fn of(scene: &Scene, coordinates: &CoordinateLayout) -> Self {
         let domains = scene.domains.len() as u64;
-        let (truncation, per_chunk) = (scene.features.truncation, modes_per_chunk(scene.deformation.storage));
+        let (truncation, chunk_modes) = (scene.features.truncation, modes_per_chunk(scene.deformation.storage));
         Self {
             transforms: 48 * scene.transform_roots.count() as u64,
             q: 4 * coordinates.total as u64,
             retained_counts: if truncation { 4 * domains.next_multiple_of(4) } else { 0 },
-            retained: if truncation { 2 * (coordinates.total / per_chunk).next_multiple_of(8) as u64 } else { 0 },
+            retained: if truncation { 2 * (coordinates.total / chunk_modes).next_multiple_of(8) as u64 } else { 0 },
         }
     }
 
@@ -195,11 +195,11 @@ impl ChunkSelection {
     /// read with it and thus summed too.
     fn write(&mut self, packer: &InputPacker, state: &SceneState, writer: &mut SliceWriter) {
         let scene = &packer.scene;
-        let per_chunk = modes_per_chunk(scene.deformation.storage);
+        let chunk_modes = modes_per_chunk(scene.deformation.storage);
         self.counts.clear();
         self.counts.resize(scene.domains.len().next_multiple_of(4), 0);
         self.chunks.clear();
-        self.chunks.resize((packer.coordinates.total / per_chunk).next_multiple_of(8) / 2, 0);
+        self.chunks.resize((packer.coordinates.total / chunk_modes).next_multiple_of(8) / 2, 0);
         let chunks: &mut [u16] = bytemuck::cast_slice_mut(&mut self.chunks);
         self.bound = 0.0;
         let (max_row_norms, budget) = (&self.max_row_norms, self.budget);
@@ -214,10 +214,10 @@ impl ChunkSelection {
         self.truncations.par_iter_mut().enumerate().with_min_len(MIN_DOMAINS_PER_TASK).for_each(update_truncation);
         for (domain, truncation) in self.truncations.iter().enumerate() {
             self.bound = self.bound.max(truncation.bound());
-            let first_chunk = packer.coordinates.first_q[domain] as usize / per_chunk;
+            let first_chunk = packer.coordinates.first_q[domain] as usize / chunk_modes;
             let mut count = 0;
             for mode in truncation.retained() {
-                let chunk = mode / per_chunk as u16;
+                let chunk = mode / chunk_modes as u16;
                 if count == 0 || chunks[first_chunk + count - 1] != chunk {
                     chunks[first_chunk + count] = chunk;
                     count += 1;

@@ -72,6 +72,7 @@ mod tests {
     use super::super::test_scenes::scene;
     use super::*;
 
+    /// (vertices, rank) of each shape.
     const SHAPES: [(usize, usize); 4] = [(7, 2), (300, 0), (8, 5), (513, 1)];
 
     #[test]
@@ -94,8 +95,9 @@ mod tests {
 
     #[test]
     fn first_domains_bracket_the_domains_of_each_block() {
-        let scenes: [&[u32]; 5] = [&[1], &[256], &[255, 1, 1], &[7; 1000], &[1000, 3, 256, 512, 1, 700]];
-        for corner_counts in scenes {
+        let corner_counts_of_scenes: [&[u32]; 5] =
+            [&[1], &[256], &[255, 1, 1], &[7; 1000], &[1000, 3, 256, 512, 1, 700]];
+        for corner_counts in corner_counts_of_scenes {
             let first_corners: Vec<u32> =
                 corner_counts.iter().scan(0, |sum, count| Some(std::mem::replace(sum, *sum + count))).collect();
             let total: u32 = corner_counts.iter().sum();

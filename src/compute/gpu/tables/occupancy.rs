@@ -53,6 +53,7 @@ const MIN_BLOCKS: [MinBlocks; 22] = [
     row(&[], 16, 16),
 ];
 
+/// Number of resident blocks per multiprocessor for which a variant is compiled.
 fn min_blocks(defines: &[&str], capability: (i32, i32)) -> u32 {
     let has_all = |row: &&MinBlocks| row.macros.iter().all(|name| defines.contains(name));
     // The last row applies to every variant.

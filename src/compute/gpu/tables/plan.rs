@@ -26,6 +26,7 @@ pub enum BufferRole {
     Scales,
     /// The work of each warp, and the tile list of partial steps if the scene can have them.
     WarpTiles,
+    /// The quads of tiles that several domains share; with `Int8` also the index of each quad's first scale.
     MixedQuads,
     /// Per domain, offset from its first vertex to its first corner; only if an offset differs from zero.
     CornerOffsets,
@@ -172,6 +173,7 @@ fn plan_buffers(scene: &Scene, tables: &DeviceTables) -> Vec<BufferDescriptor> {
     buffers.into_iter().map(|(role, bytes)| BufferDescriptor { role, bytes }).collect()
 }
 
+/// The optional features that the scene does not use.
 fn list_omitted_features(scene: &Scene, tables: &DeviceTables) -> Vec<OmittedFeature> {
     let (features, layout) = (scene.features, &scene.layout);
     let is_batched = !tables.work.batched.blocks.is_empty();
@@ -213,12 +215,12 @@ impl DeformPlan {
         self.buffers.iter().map(|buffer| buffer.bytes).sum()
     }
 
-    /// The kernel of a launch, if the scene has it.
+    /// The kernel of this kind, if the scene has it.
     pub fn kernel(&self, kind: KernelKind) -> Option<&KernelDescriptor> {
         self.kernels.iter().find(|kernel| kernel.kind == kind)
     }
 
-    /// The kernel of a launch that every scene has.
+    /// The kernel of a kind that every scene has.
     pub fn require_kernel(&self, kind: KernelKind) -> Result<&KernelDescriptor> {
         let missing = || Error::Fault { stage: "plan", reason: format!("no kernel for {kind:?}") };
         self.kernel(kind).ok_or_else(missing)

@@ -12,11 +12,13 @@ pub(crate) struct RingTables {
     pub corner_groups: Vec<u32>,
     /// Offset of each group's ring, and the end of the last one.
     pub ring_offsets: Vec<u32>,
+    /// Entries of the rings of all groups: vertices of their shape, some with the flag `RING_START`.
     pub rings: Vec<u32>,
     /// Geometric normal of each group at rest, one plane per axis.
     pub group_normals: Vec<f32>,
 }
 
+/// The smoothing groups of each shape that has groups.
 fn smoothing_groups(scene: &Scene) -> impl Iterator<Item = &SmoothingGroups> {
     scene.shapes.iter().filter_map(Shape::smoothing)
 }

@@ -11,7 +11,7 @@ pub const PARALLEL_THRESHOLD: usize = 1 << 20;
 /// Words per parallel part: long contiguous writes, but enough parts for many cores.
 const PART_WORDS: usize = 1 << 15;
 
-/// Writes a list from front to back. It contains the part that is not written yet.
+/// Writes a list from front to back. The field is the part that is not yet written.
 pub(crate) struct SliceWriter<'a>(&'a mut [f32]);
 
 impl<'a> SliceWriter<'a> {
@@ -19,6 +19,7 @@ impl<'a> SliceWriter<'a> {
         Self(list)
     }
 
+    /// Writes `values` to the next words.
     pub(crate) fn put<T: Pod>(&mut self, values: &[T]) {
         let words: &[f32] = bytemuck::cast_slice(values);
         copy(self.take(words.len()), words);

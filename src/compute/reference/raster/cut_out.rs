@@ -87,6 +87,7 @@ fn sample_trilinear(image: &AlphaImage, footprint: &Footprint) -> f32 {
     lower_alpha + level.fract() * (upper_alpha - lower_alpha)
 }
 
+/// Bilinear filtering of one mip level, which repeats in both directions.
 fn bilinear(image: &AlphaImage, level: u32, uv: [f32; 2]) -> f32 {
     let texels = &image.levels[level as usize];
     let size = [image.width, image.height].map(|side| (side >> level).max(1));

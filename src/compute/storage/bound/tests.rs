@@ -31,6 +31,7 @@ fn sum_in_f32(shape: &Shape, tiles: &TiledModes, input: &ErrorBoundInput, axis_s
     (0..tiles.vertices()).map(position).collect()
 }
 
+/// World positions by f64 sums on the entries of U before their rounding to the storage type.
 fn positions_f64(shape: &Shape, input: &ErrorBoundInput) -> Vec<[f64; 3]> {
     let t = input.transform.to_f64();
     let position = |vertex: usize| {

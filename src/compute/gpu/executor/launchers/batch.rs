@@ -150,7 +150,7 @@ mod tests {
     }
 
     /// (vertices, rank) of the shapes of a scene, and the number of domains of each shape.
-    const LOADS: [(&[(usize, usize)], usize); 6] = [
+    const ENSEMBLES: [(&[(usize, usize)], usize); 6] = [
         (&[(1, 3), (63, 13)], 2),
         (&[(64, 4), (300, 0)], 16),
         (&[(65, 16), (128, 32), (7, 1)], 3),
@@ -161,7 +161,7 @@ mod tests {
 
     #[test]
     fn batch_positions_are_bit_identical_to_plain_sums() {
-        for (shapes, instances) in LOADS {
+        for (shapes, instances) in ENSEMBLES {
             let (scene, state) = ensemble(StorageType::F32, shapes, instances);
             let got = twin_of_batch(&Tables::of(&scene, &state));
             for (domain, layout) in scene.layout.domains.iter().enumerate() {
@@ -186,7 +186,7 @@ mod tests {
     #[test]
     fn batch_decodes_entries_of_every_storage() {
         for (storage, tolerance) in StorageType::ALL.into_iter().zip([1e-5, 1e-2, 8e-2, 8e-2]) {
-            for (shapes, instances) in LOADS {
+            for (shapes, instances) in ENSEMBLES {
                 let (scene, state) = ensemble(storage, shapes, instances);
                 let got = twin_of_batch(&Tables::of(&scene, &state));
                 for (domain, layout) in scene.layout.domains.iter().enumerate().filter(|(_, layout)| layout.rank > 0) {

@@ -64,7 +64,7 @@ pub struct DeformKernel {
     boxes: DeviceBuffer,
     /// Number of tiles.
     tile_count: u32,
-    /// Number of leading tiles that a full step computes.
+    /// Number of leading tiles that this kernel computes in a full step. `batch` computes the other tiles.
     full_step_tiles: u32,
     /// Index of the first quad that has normals.
     first_direction_quad: u64,
@@ -136,7 +136,7 @@ impl DeformKernel {
         })
     }
 
-    /// The layout of coordinates that the kernel expects.
+    /// The packer of input values in the layout that the kernels expect.
     pub const fn packer(&self) -> &Arc<InputPacker> {
         &self.packer
     }

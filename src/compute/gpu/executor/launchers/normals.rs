@@ -9,7 +9,7 @@ use crate::gpu::tables::layout::NormalsArgs;
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::Scene;
 
-/// The kernel and its constant tables.
+/// The kernel and its constant tables, which `NormalTables` and its `RingTables` document.
 #[derive(Debug)]
 pub struct NormalsKernel {
     function: CudaFunction,
@@ -22,8 +22,11 @@ pub struct NormalsKernel {
     ring_offsets: DeviceBuffer,
     rings: DeviceBuffer,
     group_normals: DeviceBuffer,
+    /// Number of corners of all domains.
     corner_count: u32,
+    /// Number of corners of all shapes.
     rest_corner_count: u32,
+    /// Number of smoothing groups of all shapes.
     group_count: u32,
 }
 

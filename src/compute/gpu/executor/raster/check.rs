@@ -21,14 +21,14 @@ pub fn check_mesh(vertices: u64, triangles: &[[u32; 3]], groups: &[DrawRange]) -
     if let Some(vertex) = triangles.as_flattened().iter().find(|vertex| u64::from(**vertex) >= vertices) {
         return Err(invalid("triangles", format!("vertices below {vertices}"), vertex));
     }
-    let mut end = 0;
+    let mut previous_end = 0;
     for group in groups {
         let group_end = group.first as usize + group.triangles as usize;
-        if (group.first as usize) < end || group_end > triangle_count {
+        if (group.first as usize) < previous_end || group_end > triangle_count {
             let expected = format!("ascending, disjoint groups within {triangle_count} triangles");
             return Err(invalid("groups", expected, format!("{group:?}")));
         }
-        end = group_end;
+        previous_end = group_end;
     }
     Ok(())
 }

@@ -115,7 +115,7 @@ impl CudaRasterizer {
         })
     }
 
-    /// Draws one or two windows, with all buffers mapped together.
+    /// Draws the depth pass, the id pass or both, with all buffers mapped together.
     fn draw_windows(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
         let Self { positions, depth: depth_pass, ids: id_pass, interop, pipeline, device } = self;
         let _current = device.enter()?;
@@ -151,7 +151,7 @@ impl CudaRasterizer {
 }
 
 impl Rasterizer for CudaRasterizer {
-    /// Draws the requested windows. After a failure the targets are unregistered.
+    /// Draws the requested passes. After a failure the targets are unregistered.
     fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
         let result = if depth.is_some() || ids.is_some() { self.draw_windows(depth, ids) } else { Ok(()) };
         if result.is_err() {

@@ -30,7 +30,7 @@ pub enum RasterGranularity {
 pub struct RasterVariant {
     /// Depth without ids, for shadow maps.
     pub depth_only: bool,
-    /// Whether to count triangles by path.
+    /// Whether to count triangles by `TriangleBin` of the kernels.
     pub count_triangles: bool,
     /// Ignored with `depth_only`, which always uses [`RasterGranularity::BySize`].
     pub granularity: RasterGranularity,
@@ -95,11 +95,11 @@ mod tests {
                     let variant = RasterVariant { depth_only, count_triangles, granularity };
                     let is_used_by_server =
                         !count_triangles && (depth_only || granularity == RasterGranularity::BySize);
-                    for (cut_outs, server_variants, benchmark_variants) in [
+                    for (has_cut_outs, server_variants, benchmark_variants) in [
                         (false, SERVER_WITHOUT_CUT_OUTS, BENCHMARK_WITHOUT_CUT_OUTS),
                         (true, SERVER_WITH_CUT_OUTS, BENCHMARK_WITH_CUT_OUTS),
                     ] {
-                        let defines = variant.defines(cut_outs);
+                        let defines = variant.defines(has_cut_outs);
                         let variants = if is_used_by_server { server_variants } else { benchmark_variants };
                         assert!(variants.contains(&defines.as_slice()), "{variant:?}");
                     }

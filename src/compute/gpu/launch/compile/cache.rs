@@ -40,9 +40,9 @@ impl CubinCache {
     /// Stores bytes under a key. The file is renamed into place, so it appears complete or not at all, and several
     /// servers may share the folder.
     pub(super) fn put(&self, key: &str, bytes: &[u8]) {
-        static COUNT: AtomicU64 = AtomicU64::new(0);
+        static TEMPORARY_FILE_COUNT: AtomicU64 = AtomicU64::new(0);
         let Some(path) = self.path(key) else { return };
-        let extension = format!("{}.{}.part", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let extension = format!("{}.{}.part", std::process::id(), TEMPORARY_FILE_COUNT.fetch_add(1, Ordering::Relaxed));
         let temporary_path = path.with_extension(extension);
         let content = [Sha256::digest(bytes).as_slice(), bytes].concat();
         let folder = path.parent().unwrap_or(&path);
@@ -62,9 +62,9 @@ impl CubinCache {
 }
 
 /// The key of a list of texts. It includes their lengths, so that no two lists share a key.
-pub(super) fn cache_key(cache_key_parts: &[&str]) -> String {
+pub(super) fn cache_key(texts: &[&str]) -> String {
     let mut hash = Sha256::new();
-    for text in cache_key_parts {
+    for text in texts {
         hash.update((text.len() as u64).to_le_bytes());
         hash.update(text);
     }
@@ -91,11 +91,11 @@ mod tests {
         assert_eq!(cache.get("key").as_deref(), Some(&b"machine code"[..]));
         let path = cache.path("key").expect("a folder");
         let mut bytes = std::fs::read(&path).expect("a stored kernel");
-        for damage in [bytes.len() - 1, 0] {
-            bytes[damage] ^= 1;
+        for damaged_byte in [bytes.len() - 1, 0] {
+            bytes[damaged_byte] ^= 1;
             std::fs::write(&path, &bytes).expect("a written file");
-            assert_eq!(cache.get("key"), None, "byte {damage} changed");
-            bytes[damage] ^= 1;
+            assert_eq!(cache.get("key"), None, "byte {damaged_byte} changed");
+            bytes[damaged_byte] ^= 1;
         }
         std::fs::write(&path, &bytes[..20]).expect("a written file");
         assert_eq!(cache.get("key"), None, "a truncated file");

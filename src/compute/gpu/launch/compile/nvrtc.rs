@@ -242,8 +242,8 @@ impl Drop for NvrtcProgram<'_> {
 
 /// Loads NVRTC's builtins library from the folder of NVRTC. NVRTC opens it by name without a path. The loader then finds
 /// it only in the search path, or if it is already loaded.
-fn load_builtins(nvrtc: &Path) -> Vec<Library> {
-    let folder = nvrtc.parent().filter(|folder| !folder.as_os_str().is_empty());
+fn load_builtins(nvrtc_path: &Path) -> Vec<Library> {
+    let folder = nvrtc_path.parent().filter(|folder| !folder.as_os_str().is_empty());
     let files = folder.map(entries).unwrap_or_default().into_iter();
     let is_builtins = |file: &PathBuf| {
         file.file_name().is_some_and(|name| name.to_string_lossy().starts_with("libnvrtc-builtins.so"))

@@ -64,7 +64,7 @@ pub(crate) struct WorkList {
     /// Per shape, whether one tile computes vertices and corners. False for batched shapes, whose vertices and corners are
     /// computed by different kernels.
     pub corners_match: Vec<bool>,
-    /// Number of leading tiles that a full step computes. It leaves the others to `batch`.
+    /// Number of leading tiles that `deform` computes in a full step. `batch` computes the others.
     pub full_step_tiles: usize,
     /// Of `full_step_tiles`, the number of leading tiles with vertices.
     pub vertex_tiles: usize,
@@ -115,18 +115,18 @@ enum PendingTile {
 
 impl WorkList {
     pub(crate) fn new(scene: &Scene, coordinates: &CoordinateLayout, policy: BatchPolicy) -> Self {
-        let is_batched_shape = batches::batched_shapes(scene, policy);
+        let shape_is_batched = batches::batched_shapes(scene, policy);
         let corners_match = scene
             .shapes
             .iter()
-            .zip(&is_batched_shape)
+            .zip(&shape_is_batched)
             .map(|(shape, is_batched)| !is_batched && corners_match_vertices(shape))
             .collect();
         let mut work = Self::empty(scene, corners_match);
         let mut pending_tiles = pending_tiles(scene, &work.corners_match);
         let has_vertices = |class: &TileClass| class.flags & TILE_VERTICES > 0;
         let is_batched = |class: &TileClass, tile: &PendingTile| match tile {
-            PendingTile::Owned { domain, .. } => has_vertices(class) && is_batched_shape[scene.domains[*domain].shape],
+            PendingTile::Owned { domain, .. } => has_vertices(class) && shape_is_batched[scene.domains[*domain].shape],
             PendingTile::Mixed(_) => false,
         };
         pending_tiles.sort_by_key(|(class, tile)| {
@@ -155,7 +155,7 @@ impl WorkList {
         if scene.deformation.storage != StorageType::Int8 {
             work.mixed_quad_scales.clear();
         }
-        work.batched = BatchTables::new(scene, (&work, coordinates), (&is_batched_shape, &first_words));
+        work.batched = BatchTables::new(scene, (&work, coordinates), (&shape_is_batched, &first_words));
         work
     }
 

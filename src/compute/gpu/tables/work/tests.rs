@@ -46,7 +46,7 @@ struct Quad {
     item_count: usize,
     /// First quad of the tile, or this quad in a mixed tile.
     rest_quad: u32,
-    /// Index of this quad behind `rest_quad`.
+    /// Index of this quad relative to `rest_quad`.
     quad_in_tile: usize,
     /// Quads between the components of x0.
     component_stride: usize,
@@ -114,7 +114,7 @@ fn check_work_list(scene: &Arc<Scene>) -> WorkList {
     let loaded = load_tables(scene, &work);
     assert_eq!(loaded.words.len() as u64, work.word_count);
     check_corners(scene, &work);
-    let per_chunk = modes_per_chunk(scene.deformation.storage);
+    let chunk_modes = modes_per_chunk(scene.deformation.storage);
     let mut tile_counts = vec![0; scene.layout.vertices];
     for (index, tile) in work.tiles.iter().enumerate().filter(|(_, tile)| tile.kind & TILE_VERTICES > 0) {
         assert!((1..=TILE_QUADS).contains(&usize::from(tile.quad_count)));
@@ -124,7 +124,7 @@ fn check_work_list(scene: &Arc<Scene>) -> WorkList {
             assert_eq!(quad.first_q, coordinates.first_q[quad.domain]);
             let span = work.domain_tiles[quad.domain].vertices;
             assert!((span.first..span.first + span.count).contains(&(index as u32)), "{span:?} lacks tile {index}");
-            assert_eq!(usize::from(tile.chunk_count), shape.modes.rank().div_ceil(per_chunk));
+            assert_eq!(usize::from(tile.chunk_count), shape.modes.rank().div_ceil(chunk_modes));
             for item in 0..quad.item_count {
                 let packed_vertex = quad.first_item as usize + item;
                 tile_counts[packed_vertex] += 1;
@@ -155,10 +155,10 @@ fn load_entry(
     [mode, axis, item]: [usize; 3],
 ) -> f32 {
     let storage = scene.deformation.storage;
-    let per_chunk = modes_per_chunk(storage);
-    let entry_bytes = 4 / per_chunk;
-    let byte_offset = ((mode % per_chunk * 3 + axis) * 4 + item) * entry_bytes;
-    let row = mode / per_chunk * 3 + byte_offset / 16;
+    let chunk_modes = modes_per_chunk(storage);
+    let entry_bytes = 4 / chunk_modes;
+    let byte_offset = ((mode % chunk_modes * 3 + axis) * 4 + item) * entry_bytes;
+    let row = mode / chunk_modes * 3 + byte_offset / 16;
     let word = tile.first_word as usize + row * usize::from(tile.quad_count) + quad_index;
     let bytes = &loaded.words[word].0[byte_offset % 16..][..entry_bytes];
     let stored = match storage {
@@ -171,6 +171,7 @@ fn load_entry(
     stored * factor.unwrap_or(1.0)
 }
 
+/// (vertices, rank) of each shape.
 const SHAPES: [(usize, usize); 7] = [(7, 2), (300, 0), (1, 5), (513, 1), (130, 33), (64, 2), (65, 2)];
 
 #[test]

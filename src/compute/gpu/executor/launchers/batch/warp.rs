@@ -56,11 +56,15 @@ pub(super) struct Warp<'a> {
     tables: &'a Tables,
     pub group: BatchGroup,
     tile: usize,
+    /// Index of the warp's first word of U.
     first_word: usize,
+    /// Number of quads of the tile.
     tile_quads: usize,
     /// Index of the warp's first quad in the tile.
     warp_quad: usize,
+    /// Number of quads of the warp.
     pub quads: usize,
+    /// Index of the warp's first vertex in its domain.
     first_vertex: usize,
     ring: Vec<PackedWord>,
 }
@@ -127,8 +131,8 @@ impl<'a> Warp<'a> {
                 for (lane, sums) in sums.iter_mut().enumerate() {
                     let lane_byte = 16 * (stage % STAGE_COUNT * STAGE_WORDS + lane / 2) + 2 * entry_bytes * (lane % 2);
                     for (axis, vertex) in (0..3).flat_map(|axis| (0..2).map(move |vertex| (axis, vertex))) {
-                        let byte = 4 * entry_bytes * (3 * mode + axis);
-                        let entry_byte = byte / 16 * (16 * WARP_QUADS) + byte % 16 + vertex * entry_bytes;
+                        let chunk_byte = 4 * entry_bytes * (3 * mode + axis);
+                        let entry_byte = chunk_byte / 16 * (16 * WARP_QUADS) + chunk_byte % 16 + vertex * entry_bytes;
                         let entry = self.entry(lane_byte + chunk * (3 * 16 * WARP_QUADS) + entry_byte);
                         let members = self.group.member_count as usize;
                         for (index, sum) in sums[2 * axis + vertex].iter_mut().enumerate().take(members) {
