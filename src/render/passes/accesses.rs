@@ -15,12 +15,14 @@ pub(super) enum Resource {
     ShadowDepth,
     /// Depth in a buffer, from the compute rasterizer.
     RasterShadowDepth,
-    /// Moments that are blurred in x.
+    /// Moments that are blurred in x only.
     HorizontalMoments,
     ShadowMoments,
     CullDraws,
+    /// Bitmap of the triangles that passed the culling tests.
     CullVisibleBits,
     CullCounters,
+    /// Bitmap of the triangles that were visible in the last frame.
     PreviouslyVisible,
     VisibleTriangleIds,
     VisibleIndices,
@@ -34,9 +36,10 @@ pub(super) enum Resource {
     OitCursors,
     OitRecords,
     OitCounters,
-    OitTiles,
+    OitTileList,
     OitLayers,
-    Tiles,
+    /// Tiles that the second shading pass shades.
+    ShadeTileList,
     SceneColor,
     BloomMips,
     /// Data to copy to the staging buffer: pixels, ids or AOV fields.
@@ -96,7 +99,7 @@ const VISIBLE_LISTS: Accesses = &[
     (Resource::VisibleTriangleIds, Access::Sampled),
 ];
 
-/// Reset, culling tests and compaction of the lists.
+/// Reset of the culled lists, culling tests and compaction of the lists.
 const LIST_TRIANGLES: Accesses = &[
     (Resource::CullDraws, Access::Transfer),
     (Resource::CullDraws, Access::StorageWrite),
@@ -123,7 +126,7 @@ const SHADING: Accesses = &[
 /// Ids and depth that a pass draws.
 const DRAW_IDS: Accesses = &[(Resource::Ids, Access::Attachment), (Resource::Depth, Access::Attachment)];
 
-/// Conversion of ids to words, and their copy.
+/// Conversion of ids to words, and copy of the words to a staging buffer.
 const READ_IDS: Accesses = &[
     (Resource::Ids, Access::Sampled),
     (Resource::Depth, Access::Sampled),
@@ -136,6 +139,7 @@ const READ_IDS: Accesses = &[
 const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
     (Pass::UniformUpload, &[&[(Resource::CullCounters, Access::Transfer)]]),
     (
+        // Also for a draw of both passes.
         Pass::RasterShadow,
         &[&[(Resource::RasterShadowDepth, Access::External), (Resource::RasterKeys, Access::External)]],
     ),
@@ -200,7 +204,7 @@ const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
             &[
                 (Resource::CullDraws, Access::Transfer),
                 (Resource::OitCounters, Access::Transfer),
-                (Resource::OitTiles, Access::Transfer),
+                (Resource::OitTileList, Access::Transfer),
                 (Resource::OitCounts, Access::Attachment),
                 (Resource::Depth, Access::Attachment),
                 (Resource::OitCounts, Access::ImageWrite),
@@ -214,7 +218,7 @@ const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
             (Resource::OitCounters, Access::StorageWrite),
             (Resource::OitRecords, Access::StorageWrite),
             (Resource::OitCursors, Access::ImageWrite),
-            (Resource::OitTiles, Access::StorageWrite),
+            (Resource::OitTileList, Access::StorageWrite),
         ]],
     ),
     (
@@ -236,8 +240,8 @@ const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
         &[
             SHADOW_LOOKUP,
             &[
-                (Resource::OitTiles, Access::Indirect),
-                (Resource::OitTiles, Access::StorageRead),
+                (Resource::OitTileList, Access::Indirect),
+                (Resource::OitTileList, Access::StorageRead),
                 (Resource::OitCounts, Access::ImageRead),
                 (Resource::OitCursors, Access::ImageRead),
                 (Resource::OitCounters, Access::StorageRead),
@@ -248,11 +252,19 @@ const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
     ),
     (
         Pass::Background,
-        &[SHADOW_LOOKUP, SHADING, &[(Resource::Tiles, Access::Transfer), (Resource::Tiles, Access::StorageWrite)]],
+        &[
+            SHADOW_LOOKUP,
+            SHADING,
+            &[(Resource::ShadeTileList, Access::Transfer), (Resource::ShadeTileList, Access::StorageWrite)],
+        ],
     ),
     (
         Pass::Shade,
-        &[SHADOW_LOOKUP, SHADING, &[(Resource::Tiles, Access::Indirect), (Resource::Tiles, Access::StorageRead)]],
+        &[
+            SHADOW_LOOKUP,
+            SHADING,
+            &[(Resource::ShadeTileList, Access::Indirect), (Resource::ShadeTileList, Access::StorageRead)],
+        ],
     ),
     (
         Pass::Bloom,
@@ -284,7 +296,7 @@ fn is_written_by_shaders(pass: Pass, resource: Resource) -> bool {
     accesses_of(pass).any(|(accessed, access)| accessed == resource && access.is_shader_write())
 }
 
-/// Barrier for these accesses. All barriers are computed here, so an experiment with other barriers needs one change.
+/// Barrier for these accesses. All barriers of passes are computed by this function.
 fn barrier_of(accesses: impl Iterator<Item = Access>) -> MemoryBarriers {
     accesses.fold(MemoryBarriers::NONE, |kinds, access| kinds | access.barrier())
 }

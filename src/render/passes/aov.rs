@@ -45,9 +45,9 @@ pub enum Aov {
 pub struct AovImage {
     pub width: u32,
     pub height: u32,
-    /// Samples per pixel, stored next to each other; 1 for all fields but values.
+    /// Samples per pixel, stored next to each other; always 1 except for [`Aov::Values`].
     pub samples: u32,
-    /// Little-endian on all supported machines.
+    /// The words in native byte order, which is little-endian on all supported machines.
     pub bytes: Vec<u8>,
     pub times: FrameTimes,
 }
@@ -70,7 +70,7 @@ struct AovTarget {
 }
 
 impl Aov {
-    /// Define that selects the field in `shaders/aov.comp`, which does not compute domains.
+    /// Preprocessor macro that selects the field in `shaders/aov.comp`; empty for domains, which another shader reads.
     const fn define(self) -> &'static str {
         match self {
             Self::Depth => "DEPTH",

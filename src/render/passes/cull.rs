@@ -20,12 +20,12 @@
 //! The occluders are drawn twice, the first time without ids. Drawing them once with ids, and then the other triangles,
 //! is not exact: at equal depths, the later triangle in draw order must win. Fragment shaders cannot read the current
 //! id, and a depth comparison in the shader would force per-sample shading. The depth is cleared between the two draws.
-//! Therefore the depths of both draws need to match only within the margin, not exactly.
+//! Therefore the depths of both draws need to match only within the margin of the occlusion test, not exactly.
 //!
 //! # Lists
 //! A list begins at the offset of its group. Its triangles are in draw order, because it is compacted with a prefix sum
-//! over bits instead of atomics. It contains vertex indices, so that triangles still share transformed vertices.
-//! Fragments get the id of their triangle with one texel fetch.
+//! over the bitmap of visible triangles, not with atomics. It contains vertex indices, so that triangles still share
+//! transformed vertices. Fragments get the id of their triangle with one texel fetch.
 
 use super::draw::{TriangleDraw, TriangleSet, bind_visibility, draw_groups};
 use super::recorder::{FrameContext, PassRecorder};
@@ -41,7 +41,7 @@ use crate::resources::target::RenderTarget;
 use crate::scene_data::geometry::BlendMode;
 use modalcast_model::error::Result;
 
-/// Side of the square of pixels whose ids a workgroup records.
+/// Side of the square of pixels whose triangles a workgroup records as visible.
 const RECORD_TILE: u32 = 8;
 /// Coarser levels that one dispatch adds to the depth pyramid.
 const LEVELS_PER_DISPATCH: u32 = 4;
@@ -49,8 +49,9 @@ const _: () = assert!(2 * LEVELS_PER_DISPATCH == MAX_LEVEL, "two dispatches must
 /// Side of the square of texels that a workgroup of the depth pyramid reduces.
 const PYRAMID_TILE: u32 = 1 << LEVELS_PER_DISPATCH;
 
-/// Runs the bound culling program and compacts its result to lists. The caller has bound the inputs.
-fn compact_triangles(recorder: &PassRecorder<'_>, pass: Pass, culler: &TriangleCuller, compact: &Program) {
+/// Runs the bound culling program, which marks visible triangles, and compacts these to lists. The caller has bound the
+/// inputs.
+fn cull_and_compact(recorder: &PassRecorder<'_>, pass: Pass, culler: &TriangleCuller, compact: &Program) {
     let [columns, rows] = culler.uniforms.dispatch_size();
     recorder.gl.dispatch(columns, rows);
     recorder.barrier_within_pass(pass);
@@ -78,7 +79,7 @@ pub(super) fn cull_shadow_casters(
     begin_lists(recorder, Pass::ShadowCull, culler);
     programs.cull_triangles.bind(Some(pack_size([size; 2])));
     set_layer(&programs.cull_triangles);
-    compact_triangles(recorder, Pass::ShadowCull, culler, &programs.compact);
+    cull_and_compact(recorder, Pass::ShadowCull, culler, &programs.compact);
     recorder.check(Pass::ShadowCull)
 }
 
@@ -89,7 +90,7 @@ pub(crate) fn cull_for_camera(recorder: &mut PassRecorder<'_>, frame: &FrameCont
     if let (Some(pyramid), Some(occlusion)) = (&target.depth_pyramid, &programs.occlusion) {
         begin_lists(recorder, Pass::Occluders, culler);
         occlusion.cull_previous.bind(None);
-        compact_triangles(recorder, Pass::Occluders, culler, &programs.compact);
+        cull_and_compact(recorder, Pass::Occluders, culler, &programs.compact);
         recorder.barrier_within_pass(Pass::Occluders);
         draw_occluders(recorder, frame, pyramid);
         build_pyramid(recorder, target, pyramid, occlusion);
@@ -100,11 +101,11 @@ pub(crate) fn cull_for_camera(recorder: &mut PassRecorder<'_>, frame: &FrameCont
         pyramid.bind();
     }
     programs.cull_triangles.bind(Some(pack_size([target.desc.width, target.desc.height])));
-    compact_triangles(recorder, Pass::Cull, culler, &programs.compact);
+    cull_and_compact(recorder, Pass::Cull, culler, &programs.compact);
     recorder.finish(Pass::Cull)
 }
 
-/// Draws the depth of the listed triangles.
+/// Draws the depth of the occluders, which the lists contain.
 fn draw_occluders(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, pyramid: &DepthPyramid) {
     let FrameContext { buffers, target, programs, .. } = *frame;
     let clear = ClearOp::Depth(Some(&target.dirty_regions.depth));

@@ -80,8 +80,9 @@ pub(super) fn draw_groups(
 }
 
 /// Draws the triangles with one blend mode without back-face culling, in one call or in one call per culled list. The
-/// program is bound.
+/// caller has bound the program.
 pub(super) fn draw_double_sided(gl: &Gl, buffers: &SceneBuffers, draw: TriangleDraw<'_>) {
+    // Only the fragment shader of cut-outs and blended triangles reads the uniform `first_triangle`.
     let has_fragment_shader = draw.blend_mode != BlendMode::Opaque;
     if draw.triangles == TriangleSet::All {
         let (first, count) = buffers.triangles(draw.blend_mode);
@@ -116,8 +117,8 @@ pub(super) const fn first_triangle_of(group: &DrawGroup, triangles: TriangleSet)
 }
 
 /// Draws a group, or the culled list of the group.
-pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, index: usize, triangles: TriangleSet) {
-    let group = buffers.groups[index];
+pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, group_index: usize, triangles: TriangleSet) {
+    let group = buffers.groups[group_index];
     match triangles {
         TriangleSet::All => {
             if let Some(array) = buffers.vertex_array(group.blend_mode) {
@@ -126,7 +127,7 @@ pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, index: usize, triangle
         }
         TriangleSet::Visible => {
             if let Some((array, draws)) = buffers.visible_draws(group.blend_mode) {
-                gl.draw_indexed_indirect(array, draws, command_offset(index));
+                gl.draw_indexed_indirect(array, draws, command_offset(group_index));
             }
         }
     }

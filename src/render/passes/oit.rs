@@ -23,10 +23,12 @@ use crate::resources::scene_buffers::SceneBuffers;
 use crate::scene_data::geometry::BlendMode;
 use modalcast_model::error::Result;
 
-/// Resets the counters. The number of records per pixel is unlimited until the allocation.
+/// Resets the counters, the draw commands of `PHASE_FILL_IDS` and the tile list. The number of records per pixel is
+/// unlimited until the allocation.
 fn reset_counters(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
     let mut commands = [[0; 5]; 2];
     for (command, (_, group)) in commands.iter_mut().zip(groups_of(buffers, BlendMode::Blend)) {
+        // A `DrawElementsIndirectCommand` without instances; the allocate program sets their number.
         *command = [3 * group.triangles as u32, 0, 3 * group.first_triangle as u32, 0, 0];
     }
     let budget = (target.records.bytes / RECORD_BYTES) as u32;
@@ -35,10 +37,10 @@ fn reset_counters(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
     let mut bytes = vec![0; COUNTERS_BYTES];
     bytes[..COUNTERS_HEADER_BYTES].copy_from_slice(bytemuck::bytes_of(&header));
     target.counters.write(&bytes);
-    for (index, (group_index, _)) in groups_of(buffers, BlendMode::Blend).enumerate() {
+    for (command_index, (group_index, _)) in groups_of(buffers, BlendMode::Blend).enumerate() {
         // With culling, the number of indices is that of the visible triangles.
         if let Some((_, visible_draws)) = buffers.visible_draws(BlendMode::Blend) {
-            let target_offset = COMMANDS_OFFSET + size_of::<[u32; 5]>() * index;
+            let target_offset = COMMANDS_OFFSET + size_of::<[u32; 5]>() * command_index;
             gl.copy(BufferCopy {
                 source: visible_draws,
                 source_offset: command_offset(group_index) as u64,
@@ -104,15 +106,19 @@ impl Gather<'_> {
     fn draw(&self, recorder: &mut PassRecorder<'_>, phase: i32) {
         let Self { buffers, target, programs, region } = *self;
         let (gl, triangles) = (recorder.gl, triangle_set(buffers));
-        let visible_array = buffers.visible_draws(BlendMode::Blend).map(|(array, _)| array);
-        let Some(array) = visible_array.or_else(|| buffers.vertex_array(BlendMode::Blend)) else { return };
+        let culled_vertex_array = buffers.visible_draws(BlendMode::Blend).map(|(vertex_array, _)| vertex_array);
+        let Some(vertex_array) = culled_vertex_array.or_else(|| buffers.vertex_array(BlendMode::Blend)) else { return };
         gl.begin_pass(&target.depth_fbo, region, ClearOp::Load);
-        for (index, (group_index, group)) in groups_of(buffers, BlendMode::Blend).enumerate() {
+        for (command_index, (group_index, group)) in groups_of(buffers, BlendMode::Blend).enumerate() {
             gl.set_pipeline_state(PipelineState { cull: !group.double_sided, ..PipelineState::default() });
             programs.gather.bind(Some(first_triangle_of(group, triangles)));
             programs.gather.set_phase(phase);
             if phase == PHASE_FILL_IDS {
-                gl.draw_indexed_indirect(array, &target.counters, COMMANDS_OFFSET + size_of::<[u32; 5]>() * index);
+                gl.draw_indexed_indirect(
+                    vertex_array,
+                    &target.counters,
+                    COMMANDS_OFFSET + size_of::<[u32; 5]>() * command_index,
+                );
             } else {
                 draw_group(gl, buffers, group_index, triangles);
             }

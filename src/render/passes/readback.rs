@@ -34,12 +34,12 @@ pub(super) struct WordPass<'a> {
 }
 
 impl IdTarget {
-    pub(super) fn new(gl: &Rc<Gl>, desc: TargetDesc, bytes: u64) -> Result<Self> {
+    pub(super) fn new(gl: &Rc<Gl>, desc: TargetDesc, readback_bytes: u64) -> Result<Self> {
         let (ids, depth) = (create_image(gl, desc, gl::R32UI)?, create_image(gl, desc, gl::DEPTH_COMPONENT32F)?);
         Ok(Self {
             framebuffer: gl.framebuffer(Some(&ids), &depth)?,
             ids,
-            readback_source: gl.buffer(bytes, gl::STREAM_COPY, None)?,
+            readback_source: gl.buffer(readback_bytes, gl::STREAM_COPY, None)?,
         })
     }
 

@@ -24,8 +24,8 @@ pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) ->
         oit.fragment_counts.bind(COUNT_UNIT);
     }
     target.scene_color.bind_image(COLOR_IMAGE);
-    if let Some(source) = target.bloom_mips.first() {
-        source.bind_image(BLOOM_IMAGE);
+    if let Some(finest_mip) = target.bloom_mips.first() {
+        finest_mip.bind_image(BLOOM_IMAGE);
     }
     target.tile_list.write(bytemuck::cast_slice(&EMPTY_TILE_LIST));
     target.tile_list.bind_storage(TILES_BINDING);

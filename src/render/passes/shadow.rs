@@ -50,6 +50,7 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> R
     let gl = recorder.gl;
     let mut programs: Vec<&Program> = buffers.programs.blur.iter().map(AsRef::as_ref).collect();
     recorder.begin(Pass::Blur);
+    // If the compute rasterizer drew the depth, the first blur program reads its buffer.
     if let (Some((depths, buffer_program)), Some(first_program)) =
         (buffers.shadow_rasterizer().and_then(ComputeRasterizer::blur_input), programs.first_mut())
     {
@@ -65,16 +66,16 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> R
                 gl.dispatch(workgroups[0], workgroups[1]);
             }
             ([x_program, y_program], Some(horizontal)) if blurred.framebuffers.is_empty() => {
-                let (size, run_count) = (map.shadow.size, map.shadow.size.div_ceil(TEXELS_PER_INVOCATION));
+                let (size, invocations_per_line) = (map.shadow.size, map.shadow.size.div_ceil(TEXELS_PER_INVOCATION));
                 // Wait until the previous layer has read `horizontal`.
                 recorder.barrier_within_pass(Pass::Blur);
                 bind_blur(x_program, &map.depth, map, layer);
                 horizontal.bind_image(DESTINATION_IMAGE);
-                gl.dispatch(run_count.div_ceil(WORKGROUP_SIZE), size);
+                gl.dispatch(invocations_per_line.div_ceil(WORKGROUP_SIZE), size);
                 recorder.barrier_within_pass(Pass::Blur);
                 bind_blur(y_program, horizontal, map, layer);
                 blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
-                gl.dispatch(size.div_ceil(WORKGROUP_SIZE), run_count);
+                gl.dispatch(size.div_ceil(WORKGROUP_SIZE), invocations_per_line);
             }
             ([x_program, y_program], Some(horizontal)) => {
                 gl.set_pipeline_state(PipelineState::default());

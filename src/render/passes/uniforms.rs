@@ -10,7 +10,7 @@ use crate::types::FrameParams;
 use crate::uniforms::cascades::ShadowCascades;
 use crate::uniforms::frame::{FrameUniforms, light_box_params};
 
-/// Writes and binds the uniforms of a frame.
+/// Writes and binds the uniforms of a frame, and resets its culling counters.
 pub(crate) fn upload(recorder: &PassRecorder<'_>, buffers: &SceneBuffers, params: &FrameParams, frame: &FrameUniforms) {
     recorder.begin(Pass::UniformUpload);
     upload_frame(buffers, frame);
@@ -23,7 +23,8 @@ pub(crate) fn upload(recorder: &PassRecorder<'_>, buffers: &SceneBuffers, params
     }
 }
 
-/// Writes and binds the uniforms of an output that is drawn without shadow and without culling.
+/// Writes the frame uniforms, and binds the buffers and textures of the scene. Outputs without shadow and culling need
+/// only this call.
 pub(super) fn upload_frame(buffers: &SceneBuffers, frame: &FrameUniforms) {
     buffers.uniforms.frame.write(bytemuck::bytes_of(frame));
     bind_scene(buffers);

@@ -139,7 +139,7 @@ impl Renderer {
         draws_ground: bool,
     ) -> Result<Vec<(Pass, PassTimer)>> {
         let buffers = frame.buffers;
-        let mut times = Vec::new();
+        let mut timers = Vec::new();
         let shadow_key = buffers.shadow_key(frame.params);
         if let Some((rasterizer, enabled)) = buffers.active_rasterizer() {
             let raster_passes =
@@ -147,7 +147,7 @@ impl Renderer {
             if raster_passes.has_any() {
                 let draw = || passes::raster::draw(recorder, frame, rasterizer, raster_passes);
                 match self.time_pass(raster_passes.stats_pass(), draw) {
-                    Ok(time) => times.push(time),
+                    Ok(timer) => timers.push(timer),
                     // OpenGL cannot draw on a lost device either.
                     Err(error @ Error::DeviceLost { .. }) => return Err(error),
                     Err(error) => rasterizer.disable(&error),
@@ -155,26 +155,26 @@ impl Renderer {
             }
         }
         buffers.shadow_cache.draw_if_stale(shadow_key, || {
-            times.push(self.time_pass(Pass::Shadow, || passes::shadow::draw_depth(recorder, buffers))?);
-            times.push(self.time_pass(Pass::Blur, || passes::shadow::blur(recorder, buffers))?);
+            timers.push(self.time_pass(Pass::Shadow, || passes::shadow::draw_depth(recorder, buffers))?);
+            timers.push(self.time_pass(Pass::Blur, || passes::shadow::blur(recorder, buffers))?);
             Ok(())
         })?;
         let rasterizer = buffers.visibility_rasterizer();
         if buffers.culler.is_some() && rasterizer.is_none() {
-            times.push(self.time_pass(Pass::Cull, || passes::cull::cull_for_camera(recorder, frame))?);
+            timers.push(self.time_pass(Pass::Cull, || passes::cull::cull_for_camera(recorder, frame))?);
         }
-        times.push(self.time_pass(Pass::Visibility, || match rasterizer {
+        timers.push(self.time_pass(Pass::Visibility, || match rasterizer {
             Some(rasterizer) => passes::raster::unpack(recorder, frame, rasterizer),
             None => passes::visibility::draw(recorder, frame, draws_ground),
         })?);
-        times.push(self.time_pass(Pass::Blended, || passes::blended::draw(recorder, frame))?);
-        times.push(self.time_pass(Pass::Shade, || passes::shade::draw(recorder, frame))?);
-        times.push(self.time_pass(Pass::Bloom, || passes::post::bloom(recorder, frame))?);
-        times.push(self.time_pass(Pass::Encode, || passes::post::encode(recorder, frame))?);
-        Ok(times)
+        timers.push(self.time_pass(Pass::Blended, || passes::blended::draw(recorder, frame))?);
+        timers.push(self.time_pass(Pass::Shade, || passes::shade::draw(recorder, frame))?);
+        timers.push(self.time_pass(Pass::Bloom, || passes::post::bloom(recorder, frame))?);
+        timers.push(self.time_pass(Pass::Encode, || passes::post::encode(recorder, frame))?);
+        Ok(timers)
     }
 
-    /// Times the passes that `commands` records under the name of one of them.
+    /// Times the passes that `commands` records. They are reported as `pass`, which is one of them.
     fn time_pass(&self, pass: Pass, commands: impl FnOnce() -> Result<()>) -> Result<(Pass, PassTimer)> {
         let commands = || {
             #[cfg(test)]
@@ -184,7 +184,7 @@ impl Renderer {
         self.gl.time_pass(pass.name(), self.frame_timeout, commands).map(|timer| (pass, timer))
     }
 
-    /// Copies the pixels, then the fragment and culling counters, to the staging buffer.
+    /// Copies the pixels, then the fragment and culling counters, to the staging buffer. Does nothing without a slot.
     fn record_readback(
         &self,
         recorder: &PassRecorder<'_>,

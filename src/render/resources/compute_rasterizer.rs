@@ -160,7 +160,7 @@ impl ComputeRasterizer {
         };
         let depths = depths.as_ref().map(|(shadow_viewport, buffer)| (*shadow_viewport, buffer));
         let keys = keys.as_ref().map(|(frame_viewport, buffer)| (*frame_viewport, buffer));
-        // A panic is converted to an error, so that the caller disables the rasterizer and OpenGL draws this frame, too.
+        // A panic is converted to an error, so that the caller disables the rasterizer and draws this frame with OpenGL.
         catch_unwind(AssertUnwindSafe(|| self.rasterizer.borrow_mut().draw(depths, keys)))
             .unwrap_or_else(|_| Err(fault_in("rasterize")("the compute rasterizer panicked")))
     }

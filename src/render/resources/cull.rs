@@ -1,4 +1,4 @@
-//! Lists of triangles that passed the culling tests.
+//! Device resources of triangle culling.
 
 use std::rc::Rc;
 
@@ -12,7 +12,8 @@ use crate::plan::buffers::CullBuffers;
 use crate::scene_data::geometry::{BlendMode, DrawGroup};
 use modalcast_model::error::Result;
 
-/// Lists of a culled scene, one per draw group, and the vertex arrays that draw them.
+/// Device resources of triangle culling: the buffers that the culling programs read and write, among them one list of
+/// visible triangles per draw group, and the vertex arrays that draw the lists.
 #[derive(Debug)]
 pub(crate) struct TriangleCuller {
     pub(crate) buffers: CullBuffers<Buffer>,
@@ -25,9 +26,9 @@ pub(crate) struct TriangleCuller {
 /// Vertex arrays whose index buffer contains the lists.
 #[derive(Debug)]
 pub(crate) struct CullVertexArrays {
-    /// For opaque triangles.
+    /// Attributes: positions only. Draws opaque triangles.
     pub(crate) position_array: VertexArray,
-    /// For cut-out and blended triangles; none without such triangles.
+    /// Attributes: all of each corner. Draws cut-out and blended triangles; none without such triangles.
     pub(crate) corner_array: Option<VertexArray>,
 }
 

@@ -33,7 +33,7 @@ impl DepthPyramid {
         Ok(Self { occluder_fbo: gl.framebuffer(None, depth)?, levels })
     }
 
-    /// Binds the levels for the programs that write or test them.
+    /// Binds the levels for the programs that build them or test triangles against them.
     pub(crate) fn bind(&self) {
         self.levels.bind_storage(PYRAMID_BINDING);
     }

@@ -1,7 +1,7 @@
 //! Fragment lists of exact order-independent transparency, in bounded memory.
 //!
-//! The memory budget is a number of fragments. When a frame has more, every pixel keeps at most the same number of its
-//! nearest fragments: the largest number for which all lists fit, up to 256. Dropped fragments are counted.
+//! The memory budget is a number of fragments. When a frame has more, each pixel keeps only its nearest fragments, up to
+//! a limit that all pixels share: the largest limit for which all lists fit, at most 256. Dropped fragments are counted.
 
 use std::rc::Rc;
 
@@ -22,7 +22,7 @@ const MIN_FRAGMENTS: u64 = 1 << 20;
 /// Images and buffers of exact transparency for one [`TargetDesc`].
 #[derive(Debug)]
 pub(crate) struct OitTarget {
-    /// Blended fragments of each pixel.
+    /// Number of blended fragments of each pixel.
     pub(crate) fragment_counts: Texture,
     /// Index of the next record of each pixel.
     pub(crate) cursors: Texture,
@@ -30,11 +30,15 @@ pub(crate) struct OitTarget {
     pub(crate) layers: Texture,
     /// Framebuffer to clear `fragment_counts`.
     pub(crate) counts_fbo: Framebuffer,
+    /// Dirty region of `fragment_counts`.
     pub(crate) dirty_region: DirtyRegion,
     /// Depth-only framebuffer for the depth test.
     pub(crate) depth_fbo: Framebuffer,
+    /// Fragments of all lists, one record each.
     pub(crate) records: Buffer,
+    /// Counters, and indirect draw commands for the ids.
     pub(crate) counters: Buffer,
+    /// Tiles with blended fragments, for an indirect dispatch.
     pub(crate) tile_list: Buffer,
 }
 

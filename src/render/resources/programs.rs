@@ -27,7 +27,7 @@ pub(crate) struct ProgramCache {
 pub(crate) struct ScenePrograms {
     /// In execution order; empty if the shadow map has no moments.
     pub(crate) blur: Vec<Rc<Program>>,
-    /// Draws shadow casters; one per blend mode.
+    /// Draws shadow casters; one each for opaque, cut-out and blended triangles.
     pub(crate) shadow: [Option<Rc<Program>>; 3],
     /// Draws the ids of opaque triangles.
     pub(crate) opaque: Option<Rc<Program>>,
@@ -84,6 +84,7 @@ pub(crate) struct ShadowCullPrograms {
 /// Programs of exact transparency.
 #[derive(Debug, Clone)]
 pub(crate) struct OitPrograms {
+    /// Counts or stores fragments, depending on its phase.
     pub(crate) gather: Rc<Program>,
     pub(crate) histogram: Rc<Program>,
     pub(crate) allocate: Rc<Program>,

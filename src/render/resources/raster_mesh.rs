@@ -28,9 +28,10 @@ fn cut_outs(scene: &Scene, geometry: &Geometry, anisotropy: f32) -> Option<CutOu
     let first_triangle = geometry.groups.iter().find(|group| group.blend_mode != BlendMode::Opaque)?.first_triangle;
     let uv_of = |corner: u32| geometry.uvs.get(corner as usize).copied().unwrap_or_default();
     let arrays = arrays(scene, TextureRole::Color);
-    let mut images: Vec<usize> = Vec::new();
-    let materials =
-        used_materials(scene).into_iter().map(|index| alpha_material(scene, &scene.materials[index], &mut images));
+    let mut image_textures: Vec<usize> = Vec::new();
+    let materials = used_materials(scene)
+        .into_iter()
+        .map(|index| alpha_material(scene, &scene.materials[index], &mut image_textures));
     Some(CutOuts {
         first: first_triangle as u32,
         uvs: geometry.triangles[first_triangle..].iter().map(|corners| corners.map(uv_of)).collect(),
@@ -39,13 +40,13 @@ fn cut_outs(scene: &Scene, geometry: &Geometry, anisotropy: f32) -> Option<CutOu
             None => vec![0; geometry.triangles.len() - first_triangle],
         },
         materials: materials.collect(),
-        images: images.iter().map(|texture| alpha_image(scene, &arrays, *texture)).collect(),
+        images: image_textures.iter().map(|texture| alpha_image(scene, &arrays, *texture)).collect(),
         anisotropy,
     })
 }
 
 /// Alpha properties of a material. Appends its texture to `images` if it is not in the list.
-fn alpha_material(scene: &Scene, material: &Material, images: &mut Vec<usize>) -> AlphaMaterial {
+fn alpha_material(scene: &Scene, material: &Material, image_textures: &mut Vec<usize>) -> AlphaMaterial {
     let cutoff = match material.alpha_mode {
         AlphaMode::Opaque => 0.0,
         AlphaMode::Mask { cutoff } => cutoff,
@@ -53,10 +54,10 @@ fn alpha_material(scene: &Scene, material: &Material, images: &mut Vec<usize>) -
     };
     let image_texture = material.color_texture.filter(|_| blend_mode(material) != BlendMode::Opaque);
     let image = image_texture.map(|texture| {
-        let position = images.iter().position(|image| *image == texture);
+        let position = image_textures.iter().position(|image| *image == texture);
         position.unwrap_or_else(|| {
-            images.push(texture);
-            images.len() - 1
+            image_textures.push(texture);
+            image_textures.len() - 1
         })
     });
     AlphaMaterial { alpha: material.alpha, cutoff, image: image.map(|image| image as u32) }

@@ -133,6 +133,7 @@ impl SceneBuffers {
             sample_resolve: post::sample_resolve(&scene.look),
             post_depth_coverage: gl.limits.post_depth_coverage,
         };
+        // A device without 4x multisampling has no sample positions.
         let samples = if sample_positions.is_empty() { 1 } else { scene.look.samples_per_pixel() };
         let culler = match culling {
             Some(culling) => {
@@ -426,15 +427,15 @@ const fn attribute(location: u32, buffer: &Buffer, components: i32, integer: boo
 }
 
 /// Vertex array of opaque triangles, which need positions only.
-fn position_array(gl: &Rc<Gl>, positions: &Buffer, index: &Buffer) -> Result<VertexArray> {
-    gl.vertex_array(Some(index), &[attribute(0, positions, 3, false)])
+fn position_array(gl: &Rc<Gl>, positions: &Buffer, indices: &Buffer) -> Result<VertexArray> {
+    gl.vertex_array(Some(indices), &[attribute(0, positions, 3, false)])
 }
 
 /// Vertex array over the corners of cut-out and blended triangles; none without such triangles.
-fn corner_array(gl: &Rc<Gl>, geometry: &GeometryBuffers<Buffer>, index: &Buffer) -> Result<Option<VertexArray>> {
+fn corner_array(gl: &Rc<Gl>, geometry: &GeometryBuffers<Buffer>, indices: &Buffer) -> Result<Option<VertexArray>> {
     let Some(vertices) = &geometry.corner_vertices else { return Ok(None) };
     let mut attributes = vec![attribute(0, vertices, 1, true), attribute(1, &geometry.normals, 3, false)];
     attributes.extend(geometry.uvs.as_ref().map(|buffer| attribute(2, buffer, 2, false)));
     attributes.extend(geometry.tangents.as_ref().map(|buffer| attribute(3, buffer, 4, false)));
-    gl.vertex_array(Some(index), &attributes).map(Some)
+    gl.vertex_array(Some(indices), &attributes).map(Some)
 }

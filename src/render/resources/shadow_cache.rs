@@ -47,8 +47,8 @@ impl ShadowCache {
         key.is_none() || key != self.content.get()
     }
 
-    /// Calls `draw` unless the map already shows this content, and returns whether it did. A map whose drawing failed
-    /// has no valid content.
+    /// Calls `draw` unless the map already shows this content, and returns whether the map was drawn. A map whose drawing
+    /// failed has no valid content.
     pub(crate) fn draw_if_stale(&self, key: Option<ShadowKey>, draw: impl FnOnce() -> Result<()>) -> Result<bool> {
         let is_stale = self.is_stale(key);
         self.content.take();

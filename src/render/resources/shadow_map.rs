@@ -72,7 +72,7 @@ impl BlurredMoments {
     }
 }
 
-/// Creates an image of the map's size with one array layer per cascade.
+/// Creates an array texture of the map's size.
 fn create_image(gl: &Rc<Gl>, shadow: &ShadowSettings, format: u32, filter: u32, layers: u32) -> Result<Texture> {
     let size = shadow.size;
     let target = gl::TEXTURE_2D_ARRAY;

@@ -26,7 +26,7 @@ pub(crate) struct RenderTarget {
     pub(crate) draw_region: Cell<Region>,
     pub(crate) blend_layer: Option<BlendLayer>,
     pub(crate) oit: Option<OitTarget>,
-    /// Tiles that see triangles, for an indirect dispatch.
+    /// Tiles in which triangles are visible, for an indirect dispatch.
     pub(crate) tile_list: Buffer,
     /// Shaded image: linear light per pixel.
     pub(crate) scene_color: Texture,
