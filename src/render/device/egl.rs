@@ -157,7 +157,7 @@ impl EglApi {
         }
     }
 
-    /// Ordinal of the CUDA device that a device is.
+    /// Ordinal of the CUDA device that corresponds to an EGL device.
     fn cuda_device(&self, device: EglHandle) -> Option<i32> {
         let mut value = -1_isize;
         // SAFETY: the device came from eglQueryDevicesEXT and the value outlives the call.

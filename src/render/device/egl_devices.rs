@@ -24,7 +24,7 @@ pub struct EglDevice {
     pub renderer: Option<String>,
     /// GL_VERSION; `None` if no context could be created.
     pub version: Option<String>,
-    /// Whether the device draws on the CPU. This is what EGL reports if no context could be created.
+    /// Whether the device draws on the CPU. If no context could be created, this is what EGL reports.
     pub software: bool,
     /// Reason why no context could be created.
     pub problem: Option<String>,
@@ -90,7 +90,7 @@ fn selection_error(preference: DevicePreference, attempts: &[String]) -> Error {
 }
 
 /// The candidates to try, best first. The flag states whether the context must draw in software (`true`) or on hardware
-/// (`false`).
+/// (`false`); `None` allows both.
 fn rank_candidates(candidates: Vec<Candidate>, preference: DevicePreference) -> Vec<(Candidate, Option<bool>)> {
     let hardware_rank = |candidate: &Candidate| match (candidate.cuda_device, &candidate.drm_node) {
         (Some(_), _) => 0,

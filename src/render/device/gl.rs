@@ -123,6 +123,7 @@ pub(crate) struct VertexAttribute<'a> {
     pub(crate) buffer: &'a Buffer,
     /// Number of 32-bit components.
     pub(crate) components: i32,
+    /// Whether the components are u32 instead of f32.
     pub(crate) integer: bool,
 }
 
@@ -158,6 +159,7 @@ pub(crate) struct PipelineState {
     pub(crate) depth_clamp: bool,
     /// Depth is offset away from the camera, so that surfaces in the same plane stay visible.
     pub(crate) polygon_offset: bool,
+    /// Back faces are not drawn.
     pub(crate) cull: bool,
     /// Colors are blended over the existing colors. Alpha accumulates the transmittance: the fraction of the background
     /// that remains visible.

@@ -1,5 +1,5 @@
-//! Ring of staging buffers for the readback of frames in one format. It grows on demand to [`MAX_FRAMES_IN_FLIGHT`]
-//! buffers.
+//! Ring of staging buffers for the readback of the frames of one render target. It grows on demand to
+//! [`MAX_FRAMES_IN_FLIGHT`] buffers.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
@@ -9,10 +9,10 @@ use std::time::Duration;
 use super::gl::{Gl, StagingBuffer};
 use modalcast_model::error::{Error, Result};
 
-/// Maximum number of frames of one format in flight.
+/// Maximum number of frames of one render target in flight.
 pub const MAX_FRAMES_IN_FLIGHT: usize = 3;
 
-/// The staging buffers of one format.
+/// The staging buffers of one render target.
 #[derive(Debug)]
 pub(crate) struct ReadbackRing {
     gl: Rc<Gl>,
@@ -65,7 +65,7 @@ impl ReadbackRing {
 }
 
 impl ReadbackSlot {
-    /// The staging buffer.
+    /// The staging buffer; present until the slot is dropped.
     pub(crate) fn staging(&self) -> Option<&StagingBuffer> {
         self.staging.as_ref()
     }

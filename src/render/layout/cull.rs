@@ -32,7 +32,7 @@ pub(crate) const INDICES_BINDING: u32 = 6;
 const MAX_DISPATCH_WIDTH: u32 = 1 << 15;
 /// Words of an indexed indirect draw command.
 const COMMAND_WORDS: usize = 5;
-/// Words of the draw buffer before the totals of the super blocks.
+/// Words of the draw buffer before the totals of the super blocks: the commands and two unused words.
 const TOTALS_OFFSET: usize = COMMAND_WORDS * MAX_GROUPS + 2;
 
 /// Uniform block of the groups. Twin of `GroupBlock` in `shaders/shared/cull.glsl`.
@@ -41,7 +41,7 @@ const TOTALS_OFFSET: usize = COMMAND_WORDS * MAX_GROUPS + 2;
 pub(crate) struct CullUniforms {
     /// Per group: first triangle, number of triangles, first workgroup, first block.
     ranges: [[u32; 4]; MAX_GROUPS],
-    /// Per group: whether it is single-sided, and whether it reads only vertices.
+    /// Per group: whether it is single-sided, and whether its triangles use vertices only, without corners.
     flags: [[u32; 4]; MAX_GROUPS],
     /// Numbers of groups, workgroups and blocks. Blocks are padded to super blocks.
     count: [u32; 4],
@@ -102,8 +102,8 @@ pub(crate) const fn command_offset(group: usize) -> usize {
 /// Parses the culling results of a frame.
 pub(crate) fn parse_counters(counters: &[u8]) -> FrameCullStats {
     let words: Vec<u32> = bytemuck::pod_collect_to_vec(counters);
-    let parse_view = |first: usize| {
-        let counter = |index: usize| words.get(first + index).copied().unwrap_or_default();
+    let parse_view = |first_counter: usize| {
+        let counter = |index: usize| words.get(first_counter + index).copied().unwrap_or_default();
         CullStats {
             visible: counter(0),
             outside_view: counter(1),

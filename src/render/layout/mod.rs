@@ -19,9 +19,13 @@ pub(crate) const TRIANGLE_VERTEX_UNIT: u32 = 18;
 pub(crate) const UV_UNIT: u32 = 19;
 pub(crate) const TANGENT_UNIT: u32 = 20;
 pub(crate) const ID_UNIT: u32 = 21;
+/// Light and transmittance of the blended triangles.
 pub(crate) const LAYER_UNIT: u32 = 22;
+/// Number of blended fragments of each pixel.
 pub(crate) const COUNT_UNIT: u32 = 23;
+/// Vertex values of AOV readbacks.
 pub(crate) const VALUE_UNIT: u32 = 24;
+/// Ids of the triangles in the culled lists.
 pub(crate) const TRIANGLE_ID_UNIT: u32 = 25;
 /// Depth of the samples whose ids are at [`ID_UNIT`].
 pub(crate) const DEPTH_UNIT: u32 = 26;
@@ -55,7 +59,7 @@ pub(crate) fn tile_list_bytes([width, height]: [u32; 2]) -> u64 {
     size_of_val(&EMPTY_TILE_LIST) as u64 + 4 * u64::from(width.div_ceil(TILE)) * u64::from(height.div_ceil(TILE))
 }
 
-/// Packs width and height into one word, as the shaders expect them.
+/// Packs width (lower 16 bits) and height into one word, as the shaders expect them.
 pub(crate) const fn pack_size([width, height]: [u32; 2]) -> u32 {
     width | height << 16
 }

@@ -38,7 +38,8 @@ pub(crate) struct OitCounters {
     pub(crate) allocated: u32,
     /// Maximum number of records.
     pub(crate) budget: u32,
-    /// Indirect draws: index count, instances, first index, base vertex, base instance.
+    /// Indirect draws of [`PHASE_FILL_IDS`], one per group of blended triangles: index count, instances, first index, base
+    /// vertex, base instance.
     pub(crate) commands: [[u32; 5]; 2],
 }
 

@@ -154,6 +154,7 @@ struct Readback<'a> {
     field: Aov,
     mask: Option<&'a Program>,
     program: &'a Program,
+    /// Bytes to copy to the staging buffer.
     bytes: u64,
 }
 

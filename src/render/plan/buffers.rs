@@ -4,7 +4,7 @@ use std::fmt;
 
 use modalcast_model::error::Result;
 
-/// A buffer of a scene. The order of the variants is the order of plans.
+/// A buffer of a scene. Plans list the buffers in the order of the variants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum BufferName {
     Positions,
@@ -49,6 +49,7 @@ pub(crate) struct GeometryBuffers<T> {
 /// Buffers of materials.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct MaterialBuffers<T> {
+    /// The materials that triangles use, one record each.
     pub(crate) materials: T,
     /// Index of the material of each triangle; only with several materials.
     pub(crate) triangle_materials: Option<T>,
@@ -68,6 +69,7 @@ pub(crate) struct CullBuffers<T> {
     pub(crate) uniforms: T,
     /// Indirect draws of the groups, then the number of visible triangles per super block.
     pub(crate) draws: T,
+    /// Results of the culling tests, for statistics.
     pub(crate) counters: T,
     /// One bit per triangle: whether it passed the culling tests.
     pub(crate) visible_bits: T,

@@ -60,14 +60,14 @@ pub(crate) fn cull_buffer_sizes(scene: &Scene, culling: Culling) -> Option<CullB
         return None;
     }
     let (uniforms, triangles) = (CullUniforms::new(&groups(scene).0, 0.0), scene.layout.triangles as u64);
-    let bits = uniforms.mask_bytes() as u64;
+    let bitmap_bytes = uniforms.mask_bytes() as u64;
     Some(CullBuffers {
         uniforms: size_of::<CullUniforms>() as u64,
         draws: uniforms.draws_bytes() as u64,
         counters: COUNTER_BYTES as u64,
-        visible_bits: bits,
+        visible_bits: bitmap_bytes,
         triangle_ids: 4 * triangles,
         indices: 12 * triangles,
-        previously_visible: (culling == Culling::Occlusion).then_some(bits),
+        previously_visible: (culling == Culling::Occlusion).then_some(bitmap_bytes),
     })
 }

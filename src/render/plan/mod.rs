@@ -50,8 +50,8 @@ pub struct RenderPlan {
     pub buffers: Vec<Allocation>,
     /// Textures of the scene, by name.
     pub textures: Vec<Allocation>,
-    /// Passes of a frame, in execution order. The ground pass runs only when the camera is above the ground and
-    /// something lies below it.
+    /// Passes of a frame, in execution order. The ground pass runs only when the camera is above the ground and a vertex
+    /// may be below the ground.
     pub passes: Vec<Pass>,
     /// Draw calls of the occluder, visibility and blend passes: at most fourteen, independent of the number of domains
     /// and materials.
@@ -97,9 +97,9 @@ impl ScenePlan {
         let culling = select_culling(scene, limits);
         let features = features(scene, blur_method.resolve(limits.software), culling);
         let buffers = buffer_sizes(scene, culling);
-        let named = buffers.named().map(|(name, bytes)| Allocation { name: name.to_string(), bytes: *bytes });
+        let allocations = buffers.named().map(|(name, bytes)| Allocation { name: name.to_string(), bytes: *bytes });
         let report = RenderPlan {
-            buffers: named.collect(),
+            buffers: allocations.collect(),
             textures: textures(scene, features.blur_method),
             passes: passes(scene, &groups, &features),
             draw_calls: draw_calls(scene, &groups) + occluder_draw_calls(&groups, culling),
@@ -159,12 +159,12 @@ fn occluder_draw_calls(groups: &[DrawGroup], culling: Culling) -> usize {
 /// Number of draw calls without the occluder pass. Order-independent transparency draws blended triangles in three
 /// phases, the third only on demand. Two-pass transparency draws their opaque parts in a second phase.
 fn draw_calls(scene: &Scene, groups: &[DrawGroup]) -> usize {
-    let blended = groups.iter().filter(|group| group.blend_mode == BlendMode::Blend).count();
+    let blended_groups = groups.iter().filter(|group| group.blend_mode == BlendMode::Blend).count();
     let phases = match scene.look.transparency {
         Transparency::OrderIndependent => 3,
         Transparency::TwoPass => 1 + usize::from(has_opaque_parts(scene)),
     };
-    groups.len() + (phases - 1) * blended
+    groups.len() + (phases - 1) * blended_groups
 }
 
 fn buffer_sizes(scene: &Scene, culling: Culling) -> SceneBufferSet<u64> {
@@ -236,7 +236,7 @@ fn omitted_features(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
     let shadow_bytes: u64 =
         shadow_allocations(&look.shadow.unwrap_or_default(), BlurMethod::Auto).map(|allocation| allocation.bytes).sum();
     let corner_bytes = |bytes: usize| (bytes * layout.corners) as u64;
-    let uvs = if features.textures || features.normal_maps { 0 } else { corner_bytes(8) };
+    let uv_bytes = if features.textures || features.normal_maps { 0 } else { corner_bytes(8) };
     let omit_unless = |is_needed: bool, feature, bytes, passes: &[Pass], shaders| {
         (!is_needed).then(|| OmittedFeature { feature, bytes, passes: passes.to_vec(), shaders })
     };
@@ -248,7 +248,7 @@ fn omitted_features(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
             &[],
             "no tangent frame, no normal map lookup",
         ),
-        omit_unless(features.textures, "textures", uvs, &[], "no color texture lookup"),
+        omit_unless(features.textures, "textures", uv_bytes, &[], "no color texture lookup"),
         omit_unless(features.mask, "mask", 0, &[], "no discard, no sample mask; depth needs no fragment shader"),
         omit_unless(
             features.blend,

@@ -12,7 +12,7 @@ const TRIAL_FRAMES: usize = 6;
 impl Renderer {
     /// Selects the fastest combination of OpenGL and the compute rasterizer for shadow map and visibility, and returns it.
     /// All combinations are timed, because the time of one pass depends on the rasterizer of the other. A compute
-    /// rasterizer that draws no pass is dropped. Without a compute rasterizer, no backends are returned.
+    /// rasterizer that draws no pass is dropped. Without a compute rasterizer, both fields of the result are none.
     ///
     /// # Errors
     /// Errors of drawing. The compute rasterizer then draws the same passes as before.

@@ -1,5 +1,5 @@
-//! Negative controls of culling: tests that remove too many triangles change the image. Also tests when culling is
-//! omitted.
+//! Negative controls of culling: a modified culling test that removes too many triangles must change the image. Another
+//! test checks when culling is omitted.
 
 use std::rc::Rc;
 use std::sync::Arc;
@@ -49,16 +49,16 @@ fn sheets() -> Arc<Scene> {
 fn draw_second_frame(scene: &Arc<Scene>, (original, replacement): (&str, &str)) -> Vec<u8> {
     let mut renderer = Renderer::open(DevicePreference::Any).expect("EGL and OpenGL 4.3");
     let (gl, sample_positions) = (Rc::clone(&renderer.gl), renderer.sample_positions.clone());
-    let mut is_found = false;
+    let mut has_original = false;
     let compile = &mut |mut source: ProgramSource| {
         for (_, text) in &mut source.stages {
-            is_found |= source.label.starts_with("cull triangles, 4") && text.contains(original);
+            has_original |= source.label.starts_with("cull triangles, 4") && text.contains(original);
             *text = text.replace(original, replacement);
         }
         renderer.programs.program(source)
     };
     let buffers = SceneBuffers::new(&gl, scene, &sample_positions, BlurMethod::Auto, compile).expect("loads");
-    assert!(is_found, "expected '{original}' in the shader");
+    assert!(has_original, "expected '{original}' in the shader");
     let corners = scene.shapes[0].mesh.corners();
     let (positions, normals) = (scene.shapes[0].mesh.rest_positions().as_flattened(), corners.normals.as_flattened());
     let surface =

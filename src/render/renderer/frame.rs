@@ -201,8 +201,8 @@ impl Renderer {
 fn must_draw_ground(buffers: &SceneBuffers, params: &FrameParams) -> bool {
     let scene = &buffers.scene;
     // The bounds of a rebased scene exclude distant domains.
-    let is_background = buffers.rebased.is_none() && ground_is_behind_scene(scene, params, buffers.origin);
-    scene.look.ground.is_some() && camera_is_above_ground(scene, params) && !is_background
+    let is_ground_behind_scene = buffers.rebased.is_none() && ground_is_behind_scene(scene, params, buffers.origin);
+    scene.look.ground.is_some() && camera_is_above_ground(scene, params) && !is_ground_behind_scene
 }
 
 /// Region of the frame that may show triangles or rasterized ground.

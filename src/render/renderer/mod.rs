@@ -110,7 +110,7 @@ impl Renderer {
         &self.info
     }
 
-    /// Statistics of the last frame that was collected.
+    /// Statistics of the last frame whose pixels were read or mapped.
     pub const fn stats(&self) -> &FrameStats {
         &self.stats
     }
@@ -264,12 +264,12 @@ impl Renderer {
         let recorder = PassRecorder { gl: &self.gl, stats: &mut FrameStats::default() };
         readback::read_visibility(&recorder, target, &program, &staging)?;
         self.gl.wait("visibility readback", self.frame_timeout)?;
-        let words = staging.read(bytes as usize)?;
+        let id_bytes = staging.read(bytes as usize)?;
         let parse_id = |word: &[u8]| word.iter().rev().fold(0, |id, byte| id << 8 | u32::from(*byte));
         let sample_position = if frame.desc.samples > 1 { self.sample_positions[0] } else { [0.5; 2] };
         let size = [frame.desc.width, frame.desc.height];
         let sees_ground = |pixel: u32| frame.uniforms.ray_hits_ground(ndc_from_pixel(pixel, size, sample_position));
-        let ids = words.chunks_exact(4).zip(0..).map(|(word, pixel)| match VisibilityId::from_id(parse_id(word)) {
+        let ids = id_bytes.chunks_exact(4).zip(0..).map(|(word, pixel)| match VisibilityId::from_id(parse_id(word)) {
             VisibilityId::Background if sees_ground(pixel) => VisibilityId::Ground,
             id => id,
         });

@@ -1,4 +1,4 @@
-//! Tests of frames in flight. Even on a software device, the renderer does not wait between passes.
+//! Tests of frames in flight. In these tests, the renderer does not wait between passes, even on a software device.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::rc::Rc;
@@ -97,9 +97,9 @@ fn frames_in_flight_are_limited_per_target() {
         renderer.draw(&buffers, &params).expect("draws");
     }
     assert_eq!(staging_count(&renderer), 1);
-    let unread: Vec<_> =
+    let unread_frames: Vec<_> =
         (0..5).map(|_| renderer.submit_without_readback(&buffers, &params).expect("submits")).collect();
-    for pending_frame in unread {
+    for pending_frame in unread_frames {
         assert!(renderer.read_image(pending_frame).expect("draws").rgba.is_empty());
     }
     assert_eq!(staging_count(&renderer), 1, "a frame without readback needs no staging buffer");
@@ -260,7 +260,7 @@ fn other_scenes_are_drawn_after_a_panic_within_a_frame() {
 }
 
 #[test]
-fn frames_without_their_context_are_errors_and_later_ones_are_drawn() {
+fn calls_fail_while_the_context_is_occupied_and_work_afterwards() {
     let (mut renderer, scene, buffers) = load_renderer();
     let expected_rgba = renderer.draw(&buffers, &params(&scene, 64)).expect("draws").rgba;
     let (mut other_renderer, _, other_buffers) = load_renderer();
@@ -280,6 +280,6 @@ fn frames_without_their_context_are_errors_and_later_ones_are_drawn() {
     drop(occupied_context);
     assert!(
         renderer.draw(&buffers, &params(&scene, 64)).expect("draws").rgba == expected_rgba,
-        "the upload was not issued"
+        "expected no effect of the failed upload"
     );
 }

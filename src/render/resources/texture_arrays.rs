@@ -35,16 +35,16 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &TextureArray, role: TextureR
         levels: array.levels(),
     })?;
     // Process few layers at a time, because mipmap chains take much host memory.
-    for (chunk, texture_indices) in array.layers.chunks(8).enumerate() {
+    for (chunk_index, texture_indices) in array.layers.chunks(8).enumerate() {
         let build_chain = |index: &usize| {
             let cutoff = if role == TextureRole::Color { cutoff(scene, *index) } else { None };
             mip_levels(&scene.textures[*index], array, role, cutoff)
         };
         let chains: Vec<Vec<Vec<u8>>> = texture_indices.par_iter().map(build_chain).collect();
-        for (offset, chain) in chains.iter().enumerate() {
+        for (index_in_chunk, chain) in chains.iter().enumerate() {
             for (level, rgba) in chain.iter().enumerate() {
                 let size = [(array.width >> level).max(1), (array.height >> level).max(1)];
-                texture.upload_pixels(level as u32, (8 * chunk + offset) as u32, size, rgba)?;
+                texture.upload_pixels(level as u32, (8 * chunk_index + index_in_chunk) as u32, size, rgba)?;
             }
         }
     }

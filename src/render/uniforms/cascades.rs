@@ -17,7 +17,9 @@ const MIN_NEAR_FRACTION: f64 = 1e-3;
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(crate) struct ShadowCascades {
+    /// Per cascade: scale and offset from coordinates of the whole map to those of the cascade.
     scale_offsets: [[f32; 4]; 4],
+    /// Per cascade: depth from the camera at which it ends; infinite for the last one.
     end_depths: [f32; 4],
 }
 

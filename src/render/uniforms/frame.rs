@@ -15,16 +15,23 @@ pub(crate) struct FrameUniforms {
     clip_from_world: [[f32; 4]; 4],
     shadow_from_world: [[f32; 4]; 4],
     world_from_ndc: [[f32; 4]; 4],
+    /// w: whether the camera is above a ground.
     eye: [f32; 4],
+    /// w: 0 if the ground is behind everything else, else 1.
     to_sun: [f32; 4],
     sunlight: [f32; 4],
     skylight: [f32; 4],
     zenith: [f32; 4],
     horizon: [f32; 4],
+    /// w: height of the ground.
     up: [f32; 4],
+    /// xyz: color. w: fade distance.
     ground: [f32; 4],
+    /// w: half the side of the ground's square.
     ground_center: [f32; 4],
+    /// Minimum variance, light bleeding reduction, alpha threshold, side of the map in texels.
     shadow: [f32; 4],
+    /// xyz: [`LightBox::ground`]. w: side of a texel in scene units.
     shadow_ground_plane: [f32; 4],
 }
 
@@ -270,16 +277,16 @@ mod tests {
         let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
         let (rest_bounds, up) = (scene.rest_bounds, scene.up.index());
         let max_coordinate = rest_bounds.min[up].abs().max(rest_bounds.max[up].abs());
-        let is_behind = |lowering: f64, camera_height: f64, origin: f64| {
+        let is_behind = |lowering: f64, camera_height: f64, origin_height: f64| {
             let camera = Camera::fit_to_scene(&scene, 64, 64);
             let mut params = FrameParams { camera, width: 64, height: 64, bounds: rest_bounds, light_bounds: None };
-            params.bounds.min[up] -= lowering + origin;
-            params.bounds.max[up] -= origin;
+            params.bounds.min[up] -= lowering + origin_height;
+            params.bounds.max[up] -= origin_height;
             let mut eye = [0.3, 0.4, 0.5];
             eye[up] = rest_bounds.min[up] + camera_height;
             params.camera.view = View::LookAt { eye, target: [0.1; 3], up: [0.6, 0.8, 0.0] };
             let mut position_origin = [0.0; 3];
-            position_origin[up] = origin;
+            position_origin[up] = origin_height;
             ground_is_behind_scene(&scene, &params, position_origin)
         };
         assert!(is_behind(0.0, 1.0, 0.0) && is_behind(-0.1, 1.0, 0.0) && is_behind(0.0, 1.0, 4096.0));

@@ -1,5 +1,5 @@
 //! Fits the shadow map to the deformed scene: a box in light space, and the matrix from world space to the map (section
-//! 3.3.1).
+//! 3.3.1 of the thesis).
 //!
 //! The z axis of light space is v_l, the direction to the sun; its y axis points up in the world. The box is
 //! axis-aligned in light space and symmetric about its center in x and y. It encloses the light-space bounds of the
@@ -21,7 +21,7 @@ pub(crate) struct LightBox {
     /// World space to the map: x and y are 0 to 1 across the map; z is 0 at the plane nearest to the sun and 1 at the
     /// farthest plane.
     pub(crate) shadow_from_world: Matrix4<f64>,
-    /// Depth of the ground at (x, y) of the map: a x + b y + c; (0, 0, 1) without a ground.
+    /// Coefficients a, b and c of the depth of the ground at (x, y) of the map: a x + b y + c; (0, 0, 1) without a ground.
     pub(crate) ground: [f64; 3],
     /// Axes x, y and z of light space.
     pub(crate) axes: [Vector3<f64>; 3],
@@ -49,7 +49,7 @@ pub(crate) struct LightBoxParams {
 /// changes in few discrete steps, and the span moves by whole texels. So shadows do not crawl.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct TexelSpan {
-    /// Lower end.
+    /// Lower end, as a coordinate along the axis in scene units.
     pub(crate) low: f64,
     pub(crate) half_length: f64,
 }
@@ -253,30 +253,31 @@ mod tests {
         let mut params = test_params(Vector3::new(0.4, 0.8, 0.5), Some(0.0));
         let (mut previous, mut max_movement, mut size_changes): (Option<([f64; 2], f64)>, f64, usize) = (None, 0.0, 0);
         for step in 0..400 {
-            let sway = f64::from(step) * 0.3;
+            let phase = f64::from(step) * 0.3;
             params.bounds.max =
-                [1.0 + 0.05 * sway.sin(), 3.0 + 0.02 * (0.7 * sway).cos(), 2.0 + 1e-4 * f64::from(step)];
+                [1.0 + 0.05 * phase.sin(), 3.0 + 0.02 * (0.7 * phase).cos(), 2.0 + 1e-4 * f64::from(step)];
             let [x, y, z] = params.bounds.max;
-            // A size that does not oscillate around a quantization step.
+            // Scaled so that the size does not oscillate around a quantization step.
             params.light_bounds =
                 measure_light_bounds(&params, &ellipsoid_points([x, 0.5 * y, z].map(|scale| 0.95 * scale)))
                     .filter(|_| uses_light_bounds);
             let texel_position = map_position(&params).map(|number| number * params.size);
-            let width = LightBox::fit(&params).sides[0].half_length + LightBox::fit(&params).sides[1].half_length;
-            if let Some((previous_position, previous_width)) = previous {
+            let half_length_sum =
+                LightBox::fit(&params).sides[0].half_length + LightBox::fit(&params).sides[1].half_length;
+            if let Some((previous_position, previous_half_length_sum)) = previous {
                 let movement = |axis: usize| {
                     (texel_position[axis]
                         - previous_position[axis]
                         - (texel_position[axis] - previous_position[axis]).round())
                     .abs()
                 };
-                if previous_width == width {
+                if previous_half_length_sum == half_length_sum {
                     max_movement = max_movement.max(movement(0)).max(movement(1))
                 } else {
                     size_changes += 1
                 }
             }
-            previous = Some((texel_position, width));
+            previous = Some((texel_position, half_length_sum));
         }
         (max_movement, size_changes)
     }

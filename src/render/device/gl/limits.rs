@@ -8,7 +8,9 @@ const SUBPIXEL_BITS: u32 = 0x0D50;
 /// Limits and features of an OpenGL context.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Limits {
+    /// GL_RENDERER.
     pub(crate) renderer: String,
+    /// GL_VERSION.
     pub(crate) version: String,
     /// Whether the context draws on the CPU.
     pub(crate) software: bool,
@@ -30,7 +32,7 @@ pub(crate) struct Limits {
     pub(crate) persistent_mapping: bool,
     /// Fractional bits of a vertex position in pixels, at least 4.
     pub(crate) subpixel_bits: u32,
-    /// Anisotropy that textures use; 1 if it is not supported or if a software rasterizer draws.
+    /// Maximum anisotropy of texture lookups; 1 if it is not supported or if a software rasterizer draws.
     pub(crate) anisotropy: f32,
 }
 

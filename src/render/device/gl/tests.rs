@@ -1,3 +1,5 @@
+//! Tests of the OpenGL layer: current contexts, ranges of buffers, ownership of names, timer queries and errors.
+
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Duration;
 
@@ -40,7 +42,7 @@ fn guards_restore_the_previous_context_also_after_a_panic() {
 }
 
 #[test]
-fn commands_without_their_context_are_errors_and_not_issued() {
+fn commands_are_not_issued_while_the_context_is_occupied() {
     let (gl, other) = (open(), open());
     let buffer = gl.buffer(4, STATIC_DRAW, Some(&[1, 2, 3, 4])).expect("a buffer");
     let leaked = gl.buffer(4, STATIC_DRAW, None).expect("a buffer");
