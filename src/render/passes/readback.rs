@@ -19,7 +19,7 @@ pub(super) struct IdTarget {
     pub(super) readback_source: Buffer,
 }
 
-/// Parameters of a conversion of ids to words.
+/// Parameters of a compute pass that converts ids to 32-bit words, and of the copy of the words.
 #[derive(Debug)]
 pub(super) struct WordPass<'a> {
     pub(super) pass: Pass,

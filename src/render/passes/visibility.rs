@@ -56,22 +56,22 @@ pub(super) fn draw_ids(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, 
         (BlendMode::Blend, ids.opaque_parts),
     ];
     let state = PipelineState { depth_write: true, ..PipelineState::default() };
-    let mut has_triangles = false;
+    let mut has_program = false;
     for (blend_mode, program) in programs {
         if let Some(program) = program {
             draw_groups(recorder, buffers, TriangleDraw { blend_mode, program, triangles: ids.triangles }, state);
-            has_triangles = true;
+            has_program = true;
         }
     }
-    if has_triangles {
+    if has_program {
         recorder.stats.passes.push(Pass::Visibility);
         recorder.stats.raster_backends.visibility = Some(RasterBackend::OpenGl);
     }
     recorder.check(Pass::Visibility)
 }
 
-/// Draws the ground into ids and depth of the bound framebuffer. A frame draws it only if something lies below it;
-/// otherwise the shading adds the ground.
+/// Draws the ground into ids and depth of the bound framebuffer. A frame draws it only if a vertex may be below the
+/// ground; otherwise the shading adds the ground.
 pub(super) fn draw_ground(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, params: &FrameParams) -> Result<()> {
     let Some(program) = buffers.programs.ground.as_ref().filter(|_| camera_is_above_ground(&buffers.scene, params))
     else {

@@ -42,6 +42,7 @@ pub struct SceneBuffers {
     /// Lists of visible triangles; present with culling.
     pub(crate) culler: Option<TriangleCuller>,
     pub(crate) buffer_textures: BufferTextures,
+    /// Triangles by blend mode and sidedness, in draw order.
     pub(crate) groups: Vec<DrawGroup>,
     /// Vertex array of opaque triangles.
     position_array: VertexArray,
@@ -58,6 +59,7 @@ pub struct SceneBuffers {
     /// Programs for the look's number of samples per pixel.
     sample_programs: SampleCountPrograms,
     options: ShaderOptions,
+    /// Maps ranges of the draw order to the meshes of the domains.
     pub(crate) spans: Rc<[TriangleSpan]>,
     /// Origin of the positions, in scene units from the scene's origin.
     pub(crate) origin: [f64; 3],
