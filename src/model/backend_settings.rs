@@ -1,5 +1,6 @@
 //! Settings of the backends: which implementation computes a scene, and how. They are not part of a
-//! [`Scene`](crate::scene::Scene), because they change run time and memory, but vertices and images only by rounding.
+//! [`Scene`](crate::scene::Scene), because they change run time and memory. They change vertices and images only by
+//! rounding, which includes the coverage of samples next to an edge.
 
 use crate::scene::{DeformationSettings, RenderSettings};
 

@@ -16,8 +16,7 @@ use crate::scene::{BoundingBox, OrientedBounds, SceneState};
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct DeformedSurface {
     /// World positions, three numbers per vertex, relative to the floating origin of their domain
-    /// ([`SceneState::origin_of`]). This is the scene's origin unless a step with f64 translations moved the domain far
-    /// from it.
+    /// ([`SceneState::origin_of`]). Before the first step with f64 translations, this is the scene's origin.
     pub positions: Vec<f32>,
     /// World-space unit normals, three numbers per corner.
     pub normals: Vec<f32>,
@@ -249,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn pending_readback_of_another_deformer_is_rejected() {
+    fn pending_readback_is_neither_returned_nor_printed() {
         let mut deformer = HostDeformer(DeformedSurface { positions: vec![1.0], ..DeformedSurface::default() });
         let ready = deformer.readback(VertexAttributes::ALL).expect("a ready readback");
         assert_eq!(deformer.wait_readback(&ready).expect("a complete readback").positions, [1.0]);

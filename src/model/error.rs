@@ -1,5 +1,5 @@
-//! The error type of all crates. Each variant is for one party that can act on the error: the caller, another client or
-//! the operator. It contains the values that this party needs.
+//! The error type of the server's crates. The variants distinguish what the caller can correct or retry, what the
+//! operator must repair, and failures of the server itself. Each contains the values that are needed to act on it.
 
 /// The error type of the server.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -19,7 +19,7 @@ pub enum Error {
     /// A queue is full. A later attempt may succeed.
     #[error("{queue} is full ({limit})")]
     Busy { queue: &'static str, limit: usize },
-    /// The caller's deadline expired first.
+    /// The caller's deadline expired before the result was available.
     #[error("{what}: expected within {ms} ms, got none")]
     Deadline { what: String, ms: u64 },
     /// A resource or program is missing; the operator must install, mount or free it.

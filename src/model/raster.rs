@@ -102,7 +102,8 @@ pub struct AlphaImage {
 pub type DrawTarget<'a> = (&'a Viewport, &'a GlBuffer);
 
 /// Draws one mesh. Buffer accesses are ordered with OpenGL commands before and after each call without blocking the
-/// host. The implementation may keep the position buffer and the target buffers registered, with their handles.
+/// host. Between calls, the implementation may keep the handles of the position buffer and the target buffers, and
+/// leave these buffers registered with CUDA.
 pub trait Rasterizer: std::fmt::Debug {
     /// Draws depths, ids, or both. One call for both is cheaper, because the switch from OpenGL to CUDA and back takes
     /// longer than either pass.

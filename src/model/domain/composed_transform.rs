@@ -1,5 +1,5 @@
-//! The world transform of a domain as a product, T = T_root F: a follower moves with its root domain, and F is the
-//! constant transform from the follower's frame to the root's frame.
+//! The world transform of a domain as a product, T = T_root F: a follower moves with its root domain, and F, the
+//! follower's frame, is the constant transform from the follower's coordinates to those of the root.
 
 use nalgebra::Matrix3;
 
@@ -67,7 +67,7 @@ mod tests {
     #[test]
     fn root_transform_is_applied_after_the_frame() {
         let composed_transform = ComposedTransform { root: T, frame: Some(F) };
-        // Small whole numbers and halves: every product and sum is exact in f32.
+        // Small multiples of 1/4: every product and sum is exact in f32.
         assert_eq!(composed_transform.to_f32(), T.compose(F));
         assert_eq!(composed_transform.to_f64(), T.compose(F).0.map(f64::from));
         assert_eq!(composed_transform.linear(), T.linear() * F.linear());

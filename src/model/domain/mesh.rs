@@ -138,7 +138,7 @@ mod tests {
     const SQUARE: [[f32; 3]; 4] = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
 
     #[test]
-    fn smooth_normals_of_a_flat_square_point_up() {
+    fn smooth_normals_of_a_square_in_the_xy_plane_are_z() {
         let normals = smooth_normals(&SQUARE, &[0, 1, 2, 3], &[[0, 1, 2], [0, 2, 3]]);
         assert_eq!(normals, [[0.0, 0.0, 1.0]; 4]);
     }

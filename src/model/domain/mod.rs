@@ -135,7 +135,7 @@ pub struct Domain {
 }
 
 impl Domain {
-    /// An unattached domain with material 0, at rest in the frame of the scene.
+    /// An unattached domain with material 0 and the identity as placement.
     pub fn new(name: impl Into<String>, shape: usize) -> Self {
         Self {
             name: name.into(),

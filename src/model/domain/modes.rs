@@ -110,11 +110,11 @@ mod tests {
 
     #[test]
     fn row_major_and_column_major_give_the_same_matrix() {
-        let rows = Modes::from_rows(3, 2, &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).expect("valid modes");
-        let columns = Modes::from_columns(3, 2, vec![1.0, 3.0, 5.0, 2.0, 4.0, 6.0]).expect("valid modes");
-        assert_eq!(rows, columns);
-        assert_eq!(rows.entry(0, 2, 1), 6.0);
-        assert_eq!(rows.column(1), [2.0, 4.0, 6.0]);
+        let modes_from_rows = Modes::from_rows(3, 2, &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).expect("valid modes");
+        let modes_from_columns = Modes::from_columns(3, 2, vec![1.0, 3.0, 5.0, 2.0, 4.0, 6.0]).expect("valid modes");
+        assert_eq!(modes_from_rows, modes_from_columns);
+        assert_eq!(modes_from_rows.entry(0, 2, 1), 6.0);
+        assert_eq!(modes_from_rows.column(1), [2.0, 4.0, 6.0]);
     }
 
     #[test]

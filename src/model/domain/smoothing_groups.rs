@@ -8,8 +8,8 @@
 //! vertex is read once instead of twice.
 //!
 //! Memory: 4 bytes per corner, and 20 bytes per group (ring offset, vertex and geometric normal). The vertices around a
-//! group take 4 (k + 1) bytes for k triangles in one fan, and at most 24 bytes per triangle if no two triangles of a
-//! group share an edge.
+//! group take 4 (k + 1) bytes for k triangles in one fan. The worst case is 24 bytes per triangle of the mesh, if no
+//! two triangles of a group share an edge.
 
 use nalgebra::Vector3;
 
@@ -21,7 +21,7 @@ pub const RING_START: u32 = 1 << 31;
 /// The largest number of triangles, over all shapes, whose rings a 32-bit index can address.
 pub const MAX_RING_TRIANGLES: usize = 1 << 28;
 
-/// The largest distance between rest normals of a group: the chord of 0.1 degrees.
+/// The largest distance of a rest normal from that of its group's representative: the chord of 0.1 degrees.
 const SAME_NORMAL_CHORD: f64 = 1.745_329e-3;
 
 /// A group whose area vectors cancel to less than this fraction of their total length has no geometric normal, for
@@ -106,8 +106,8 @@ fn group_representatives(mesh: &Mesh) -> Vec<u32> {
     let vertex = |corner: u32| corners.vertices[corner as usize];
     let normal = |corner: u32| corners.normals[corner as usize];
     let compare_normals = |a: u32, b: u32| {
-        let axes = normal(a).into_iter().zip(normal(b)).map(|(a, b)| a.total_cmp(&b));
-        axes.fold(std::cmp::Ordering::Equal, std::cmp::Ordering::then)
+        let orderings = normal(a).into_iter().zip(normal(b)).map(|(a, b)| a.total_cmp(&b));
+        orderings.fold(std::cmp::Ordering::Equal, std::cmp::Ordering::then)
     };
     let mut sorted_corners: Vec<u32> = (0..corners.vertices.len() as u32).collect();
     // Sorting makes the groups independent of the order of corners in a file.
@@ -219,6 +219,7 @@ impl FanBuilder {
         }
     }
 
+    /// Appends the fan that starts with an unused edge from `begin`. Appends nothing if there is none.
     fn append_fan(&mut self, edges: &[OppositeEdge], begin: u32, ring: &mut Vec<u32>) {
         let Some(mut end) = self.take_edge(edges, begin) else { return };
         ring.extend([begin | RING_START, end]);
@@ -245,8 +246,8 @@ mod tests {
 
     /// The opposite edges that a ring encodes, sorted.
     fn decode_ring(ring: &[u32]) -> Vec<OppositeEdge> {
-        let steps = ring[1..].windows(2).filter(|step| step[1] & RING_START == 0);
-        let mut edges: Vec<OppositeEdge> = steps.map(|step| (step[0] & !RING_START, step[1])).collect();
+        let vertex_pairs = ring[1..].windows(2).filter(|pair| pair[1] & RING_START == 0);
+        let mut edges: Vec<OppositeEdge> = vertex_pairs.map(|pair| (pair[0] & !RING_START, pair[1])).collect();
         edges.sort_unstable();
         edges
     }

@@ -33,7 +33,7 @@ impl Transform {
         }
     }
 
-    /// Rounds a transform from f64.
+    /// A transform from its linear part and translation, rounded to f32.
     pub fn from_parts(linear: &Matrix3<f64>, translation: &Vector3<f64>) -> Self {
         let mut entries = [0.0; 12];
         for row in 0..3 {
@@ -81,13 +81,13 @@ impl Transform {
         self.to_matrix().try_inverse().map(|matrix| Self::from_matrix(&matrix))
     }
 
-    /// Whether A is a rotation or reflection times a uniform scale, within `1e-4`. Normals then transform like
-    /// directions.
+    /// Whether A is a rotation or reflection times a uniform scale, within 1e-4 of the squared scale. Normals then
+    /// transform like directions.
     pub fn is_similarity(self) -> bool {
         let linear = self.linear();
         let gram = linear.transpose() * linear;
-        let scale = gram.trace() / 3.0;
-        (gram - Matrix3::identity() * scale).abs().max() <= 1e-4 * scale.max(f64::MIN_POSITIVE)
+        let squared_scale = gram.trace() / 3.0;
+        (gram - Matrix3::identity() * squared_scale).abs().max() <= 1e-4 * squared_scale.max(f64::MIN_POSITIVE)
     }
 }
 
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn shear_is_no_similarity_and_singular_has_no_inverse() {
+    fn shear_is_no_similarity_and_zero_transform_has_no_inverse() {
         let mut entries = Transform::IDENTITY.0;
         entries[1] = 0.1;
         assert!(!Transform(entries).is_similarity());

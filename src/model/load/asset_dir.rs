@@ -147,7 +147,7 @@ impl AssetDir {
     }
 }
 
-/// The folder of a relative path; `.` if it has none.
+/// The folder of a path; `.` if the path is only a file name.
 pub(super) fn parent_of(path: &str) -> &str {
     match path.rsplit_once('/') {
         Some(("", _)) => "/",
@@ -156,7 +156,7 @@ pub(super) fn parent_of(path: &str) -> &str {
     }
 }
 
-/// The last component of a relative path.
+/// The last component of a path.
 pub(super) fn file_name_of(path: &str) -> &str {
     path.rsplit_once('/').map_or(path, |(_, name)| name)
 }

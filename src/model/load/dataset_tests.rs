@@ -42,8 +42,8 @@ fn real_simple_bridge_keeps_the_numbering_of_its_file() {
     let corners = &scene.shapes[0].mesh.corners().vertices;
     let first_use_order: Vec<u32> =
         corners.iter().copied().filter(|vertex| !std::mem::replace(&mut is_seen[*vertex as usize], true)).collect();
-    let moved_count = first_use_order.iter().zip(0..).filter(|(vertex, index)| *vertex != index).count();
-    assert!(moved_count > 15_000, "{moved_count}");
+    let renumbered_count = first_use_order.iter().zip(0..).filter(|(vertex, index)| *vertex != index).count();
+    assert!(renumbered_count > 15_000, "expected the control to renumber most vertices, got {renumbered_count}");
     let text = std::fs::read_to_string(dataset_path("vega/simpleBridge/simpleBridge.obj")).expect("a readable file");
     let lines = text.lines().filter_map(|line| line.strip_prefix("v "));
     for (line, rest_position) in lines.zip(scene.shapes[0].mesh.rest_positions()) {
@@ -61,14 +61,14 @@ fn real_simple_bridge_keeps_the_numbering_of_its_file() {
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-fn real_a_has_vertices_that_no_face_uses() {
+fn real_model_a_has_vertices_that_no_face_uses() {
     let scene = open_scene("vega/A");
     let layout = scene.layout.domains[0];
     assert_eq!((layout.vertices, layout.triangles, layout.rank), (575, 834, 20));
-    let mut used: Vec<u32> = scene.shapes[0].mesh.corners().vertices.clone();
-    used.sort_unstable();
-    used.dedup();
-    assert_eq!(used.len(), 417);
+    let mut used_vertices: Vec<u32> = scene.shapes[0].mesh.corners().vertices.clone();
+    used_vertices.sort_unstable();
+    used_vertices.dedup();
+    assert_eq!(used_vertices.len(), 417);
 }
 
 #[test]
@@ -150,11 +150,11 @@ fn real_plants_have_the_bounds_of_their_file_and_compact_leaves() {
         // A petiole that is assigned to the wrong leaf is far from the frame of its domain.
         let max_distance = if name == "almond" { 0.2 } else { 0.4 };
         for (index, domain) in scene.domains.iter().enumerate().filter(|(_, domain)| domain.name.starts_with("leaf ")) {
-            let distance = |rest: &[f32; 3]| nalgebra::Vector3::from(*rest).norm();
-            let actual_distance = scene.shape_of(index).mesh.rest_positions().iter().map(distance).fold(0.0, f32::max);
+            let distance = |rest_position: &[f32; 3]| nalgebra::Vector3::from(*rest_position).norm();
+            let largest_distance = scene.shape_of(index).mesh.rest_positions().iter().map(distance).fold(0.0, f32::max);
             assert!(
-                actual_distance < max_distance,
-                "{name}: {}: expected below {max_distance}, got {actual_distance}",
+                largest_distance < max_distance,
+                "{name}: {}: expected below {max_distance}, got {largest_distance}",
                 domain.name
             );
         }
@@ -183,8 +183,8 @@ fn real_fern_is_masked_by_an_override_of_its_texture() {
     let scene = open_manifest(&format!("model = '{model}'\nmaterial.'*'.colour_texture = '{texture}'\n"))
         .expect("a valid scene");
     assert_eq!(scene.domains.len(), 4);
-    let color = scene.materials[0].color_texture.expect("a colour texture");
-    assert!(scene.textures[color].has_alpha() && scene.textures[color].width() == 1024);
+    let color_texture = scene.materials[0].color_texture.expect("a color texture");
+    assert!(scene.textures[color_texture].has_alpha() && scene.textures[color_texture].width() == 1024);
     assert!(matches!(scene.materials[0].alpha_mode, AlphaMode::Mask { .. }));
     assert_eq!(scene.textures.len(), 2, "expected the replaced texture to be removed");
 }

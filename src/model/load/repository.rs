@@ -14,6 +14,7 @@ const MAX_LISTED_NAMES: usize = 4096;
 /// The server's folder of scenes. Paths cannot leave it, because symbolic links are resolved before the check.
 #[derive(Debug, Clone)]
 pub struct SceneRepository {
+    /// The canonical path of the folder. `None`: the repository has only the built-in scenes.
     root: Option<PathBuf>,
 }
 
@@ -94,6 +95,8 @@ mod tests {
 
     const TRIANGLE: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
 
+    /// Writes files to the folder `root` inside a temporary folder. Returns the temporary folder and a repository of
+    /// `root`.
     fn repository(files: &[(&str, &str)]) -> (tempfile::TempDir, SceneRepository) {
         let outer = tempfile::tempdir().expect("a temporary folder");
         for (name, text) in files {

@@ -6,7 +6,8 @@ use super::asset_dir::{AssetDir, EntryKind, MAX_TEXT_BYTES};
 use crate::error::{Result, invalid};
 
 /// Numeric entries of a configuration that describe the dynamics.
-const KEYS: [&str; 4] = ["baseFrequency", "deformableObjectCompliance", "dampingMassCoef", "dampingStiffnessCoef"];
+const DYNAMICS_KEYS: [&str; 4] =
+    ["baseFrequency", "deformableObjectCompliance", "dampingMassCoef", "dampingStiffnessCoef"];
 
 /// Reads the notes on the OBJ file `name`: entries such as `vega.baseFrequency`, and the entry `vega.cubic` with the name
 /// of the file that contains the cubic force polynomials.
@@ -26,7 +27,7 @@ pub(super) fn read_notes(files: &AssetDir, name: &str) -> Result<BTreeMap<String
     }
     let bytes = files.read(&config_file, MAX_TEXT_BYTES)?;
     for (key, value) in parse_entries(&String::from_utf8_lossy(&bytes)) {
-        if KEYS.contains(&key) {
+        if DYNAMICS_KEYS.contains(&key) {
             if !value.parse::<f64>().is_ok_and(f64::is_finite) {
                 return Err(invalid(format!("file '{config_file}': {key}"), "a finite number", value));
             }

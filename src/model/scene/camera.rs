@@ -110,11 +110,12 @@ impl Camera {
         let aspect = f64::from(width.max(1)) / f64::from(height.max(1));
         let right = up.cross(&to_camera).normalize();
         let camera_up = to_camera.cross(&right);
-        // A corner is inside the view frustum if its depth is at least its larger lateral offset, divided by the slope.
+        // A corner is inside the view frustum if its depth is at least its vertical offset / slope and its horizontal
+        // offset / (slope * aspect).
         let required_distance = |corner: &Point3<f64>| {
             let offset = corner - bounds.center();
-            let horizontal = offset.dot(&right).abs() / (slope * aspect);
-            offset.dot(&to_camera) + horizontal.max(offset.dot(&camera_up).abs() / slope)
+            let depth_for_width = offset.dot(&right).abs() / (slope * aspect);
+            offset.dot(&to_camera) + depth_for_width.max(offset.dot(&camera_up).abs() / slope)
         };
         let max_distance = bounds.corners().iter().map(required_distance).fold(0.0, f64::max);
         let camera_distance = if max_distance > 0.0 { max_distance } else { 1.0 };
@@ -245,8 +246,8 @@ impl Camera {
         if self.far > 0.0 {
             return (self.near, self.far);
         }
-        let camera = self.camera_from_world();
-        let depth = |corner: &Point3<f64>| -camera.transform_point(corner).z;
+        let camera_from_world = self.camera_from_world();
+        let depth = |corner: &Point3<f64>| -camera_from_world.transform_point(corner).z;
         let depths = bounds.corners().map(|corner| depth(&corner));
         let farthest = depths.iter().copied().fold(0.0, f64::max);
         let nearest = depths.iter().copied().fold(f64::INFINITY, f64::min);
@@ -285,11 +286,11 @@ mod tests {
             let scene = block(size);
             let camera = Camera::fit_to_scene(&scene, width, height);
             let clip = camera.clip_from_camera(width, height, &scene.rest_bounds) * camera.camera_from_world();
-            let max_extent = scene.rest_bounds.corners().map(|corner| {
+            let extents = scene.rest_bounds.corners().map(|corner| {
                 let point = clip.transform_point(&corner);
                 point.x.abs().max(point.y.abs())
             });
-            let max_extent = max_extent.into_iter().fold(0.0, f64::max);
+            let max_extent = extents.into_iter().fold(0.0, f64::max);
             assert!((max_extent - IMAGE_FILL).abs() < 1e-6, "{size:?}: expected {IMAGE_FILL}, got {max_extent}");
         }
     }
@@ -319,6 +320,7 @@ mod tests {
         }
     }
 
+    /// A scene of one triangle whose bounding box has this size.
     fn block(size: [f32; 3]) -> std::sync::Arc<Scene> {
         use crate::domain::{Domain, Material, Mesh, Modes, Shape};
         let rest_positions = vec![[0.0; 3], size, [size[0], 0.0, 0.0]];

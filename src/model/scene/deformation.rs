@@ -3,7 +3,7 @@
 
 use crate::error::{Result, invalid};
 
-/// The storage type of the entries of U. Sums are always f32.
+/// The storage type of the entries of U. Sums over modes are always f32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum StorageType {

@@ -37,7 +37,7 @@ pub struct SceneFeatures {
 
 impl SceneFeatures {
     pub(super) fn from_parts(parts: &SceneParts) -> Self {
-        // Without modes, all options that concern modes are off.
+        // Without modes, exact normals, truncation and compensated sums have no effect, so they are off.
         let modes = parts.domains.iter().any(|domain| parts.shapes[domain.shape].modes.rank() > 0);
         Self {
             modes,
@@ -79,7 +79,7 @@ impl SceneFeatures {
     }
 }
 
-/// Whether the placement of a domain and, for a follower, its frame are similarities (without shear).
+/// Whether the placement of a domain and, for a follower, its frame have a uniform scale and no shear.
 fn has_similarity_transforms(domain: &Domain) -> bool {
     domain.placement.is_similarity() && domain.follows.is_none_or(|follow| follow.frame.is_similarity())
 }

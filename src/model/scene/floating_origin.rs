@@ -41,10 +41,10 @@ pub struct FloatingOrigins {
     outlier_count: usize,
     /// Number of translations set since the last search for a shared origin. A search is a pass over all domains. It is
     /// repeated only after as many translations as there are domains, so that its cost per translation is constant.
-    set_translation_count: usize,
+    translations_since_search: usize,
 }
 
-/// Equality ignores the counters: `outlier_count` follows from the other fields, and `set_translation_count` only
+/// Equality ignores the counters: `outlier_count` follows from the other fields, and `translations_since_search` only
 /// schedules searches.
 impl PartialEq for FloatingOrigins {
     fn eq(&self, other: &Self) -> bool {
@@ -62,7 +62,7 @@ impl FloatingOrigins {
     fn with_shared_origin(shared_origin: [f64; 3], translations: Vec<[f64; 3]>) -> Self {
         let outlier_count =
             translations.iter().filter(|translation| is_beyond_reach(shared_origin, **translation)).count();
-        Self { shared_origin, outlier_count, set_translation_count: translations.len(), translations }
+        Self { shared_origin, outlier_count, translations_since_search: translations.len(), translations }
     }
 
     /// Restores floating origins from the stored values of [`Self::shared_origin`] and [`Self::translations`].
@@ -124,7 +124,7 @@ impl FloatingOrigins {
         self.outlier_count -= usize::from(is_beyond_reach(shared_origin, *stored_translation));
         *stored_translation = translation;
         self.outlier_count += usize::from(is_beyond_reach(shared_origin, translation));
-        self.set_translation_count = self.set_translation_count.saturating_add(1);
+        self.translations_since_search = self.translations_since_search.saturating_add(1);
     }
 
     /// Moves the shared origin under three conditions: more than half of the domains are outliers, at least as many
@@ -133,10 +133,10 @@ impl FloatingOrigins {
     /// domains. If this function returns true, the caller must call [`Self::rebase_transform`] for every transform.
     pub(super) fn update_shared_origin(&mut self) -> bool {
         let root_count = self.translations.len();
-        if 2 * self.outlier_count <= root_count || self.set_translation_count < root_count {
+        if 2 * self.outlier_count <= root_count || self.translations_since_search < root_count {
             return false;
         }
-        self.set_translation_count = 0;
+        self.translations_since_search = 0;
         let median_along = |axis: usize| {
             let mut coordinates: Vec<f64> = self.translations.iter().map(|translation| translation[axis]).collect();
             *coordinates.select_nth_unstable_by(root_count / 2, f64::total_cmp).1
@@ -167,11 +167,11 @@ impl FloatingOrigins {
         let offsets: Vec<[f64; 3]> = (0..layouts.len()).map(offset).collect();
         let distance =
             |offset: &[f64; 3]| offset.iter().fold(0.0, |largest: f64, coordinate| largest.max(coordinate.abs()));
-        let nearest = offsets.iter().map(distance).fold(f64::INFINITY, f64::min);
+        let nearest_distance = offsets.iter().map(distance).fold(f64::INFINITY, f64::min);
         let mut rebased = Vec::with_capacity(positions.len());
         let mut bounds = BoundingBox::EMPTY;
         for (layout, offset) in layouts.iter().zip(&offsets) {
-            let is_near = distance(offset) <= ORIGIN_REACH + 4.0 * nearest;
+            let is_near = distance(offset) <= ORIGIN_REACH + 4.0 * nearest_distance;
             let domain_positions = &positions[3 * layout.first_vertex..][..3 * layout.vertices];
             for point in domain_positions.chunks_exact(3) {
                 let point: [f64; 3] = std::array::from_fn(|axis| f64::from(point[axis]) + offset[axis]);
@@ -185,7 +185,7 @@ impl FloatingOrigins {
     }
 }
 
-/// The possible floating origin nearest to a point.
+/// The grid point nearest to a point, which is its floating origin if it has one of its own.
 pub fn snap_to_origin_grid(point: [f64; 3]) -> [f64; 3] {
     point.map(|coordinate| (coordinate / ORIGIN_GRID).round() * ORIGIN_GRID)
 }

@@ -32,7 +32,7 @@ pub struct Layout {
     pub triangles: usize,
     /// Length of the packed q.
     pub coordinates: usize,
-    /// Domains of rank above 0 that share coordinates, ascending, by `first_q`. Empty if no domain shares coordinates.
+    /// For each `first_q` that several domains of rank above 0 share, these domains, ascending.
     pub domains_sharing_q: BTreeMap<usize, Vec<u32>>,
 }
 
@@ -65,7 +65,8 @@ impl Layout {
             layout.triangles += domain_layout.triangles;
             layout.coordinates += if shared_first_q.is_some() { 0 } else { rank };
             if let Some(other_domain) = domain.shares_q_with.filter(|_| rank > 0) {
-                // The list begins with the domain that owns the coordinates. It exists already if `twin` shares them.
+                // The list begins with the domain that owns the coordinates. If `other_domain` itself shares them, the
+                // list already exists.
                 layout
                     .domains_sharing_q
                     .entry(domain_layout.first_q)

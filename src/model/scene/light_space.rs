@@ -1,8 +1,9 @@
 //! Light space: the coordinate axes of the sun's shadow map (section 3.3.1 of the thesis), and bounding boxes along
 //! these axes.
 //!
-//! The thesis fits the shadow map to the eight corners of the world's axis-aligned bounding box. Here, the box in light
-//! space is tighter: it bounds the vertices, or the corners of the bounding boxes of small parts of the surface.
+//! With `ShadowFit::Corners`, the shadow map is fitted to the eight corners of the world-space bounding box, as in the
+//! thesis. With `ShadowFit::Vertices`, the box in light space is tighter: it bounds the vertices, or the corners of the
+//! bounding boxes of small parts of the surface.
 
 use nalgebra::Vector3;
 
@@ -14,8 +15,8 @@ use super::{BoundingBox, Scene, UpAxis};
 pub fn light_axes(to_sun: Vector3<f64>, up: UpAxis) -> [Vector3<f64>; 3] {
     let horizontal = up.vector().cross(&to_sun);
     let x = horizontal.try_normalize(1e-6).unwrap_or_else(|| {
-        let fallback = if to_sun.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
-        fallback.cross(&to_sun).normalize()
+        let fallback_axis = if to_sun.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
+        fallback_axis.cross(&to_sun).normalize()
     });
     [x, to_sun.cross(&x), to_sun]
 }
@@ -39,14 +40,15 @@ impl OrientedBounds {
 
     /// The smallest box along these axes that contains a world-space box. NaN and infinite coordinates yield NaN or
     /// infinite bounds. An empty box yields an empty box.
-    pub fn enclosing(axes: &[Vector3<f64>; 3], world: &BoundingBox) -> Self {
-        if world.min[0] > world.max[0] {
+    pub fn enclosing(axes: &[Vector3<f64>; 3], world_box: &BoundingBox) -> Self {
+        if world_box.min[0] > world_box.max[0] {
             return Self::EMPTY;
         }
         let bound = |axis: usize, is_upper: bool| {
             let contribution = |world_axis: usize| {
                 let component = axes[axis][world_axis];
-                component * if (component >= 0.0) == is_upper { world.max[world_axis] } else { world.min[world_axis] }
+                component
+                    * if (component >= 0.0) == is_upper { world_box.max[world_axis] } else { world_box.min[world_axis] }
             };
             contribution(0) + contribution(1) + contribution(2)
         };

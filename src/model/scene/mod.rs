@@ -73,7 +73,7 @@ pub struct SceneParts {
     pub deformation: DeformationSettings,
     /// Declares that no step will shear or non-uniformly scale a domain; a step that does is rejected.
     pub rigid_transforms: bool,
-    /// Warnings of the loader about input that it could not use, for `inspect` and the log.
+    /// Warnings about input that could not be used, for `inspect` and the log.
     pub remarks: Vec<String>,
 }
 
@@ -92,7 +92,9 @@ pub struct Scene {
     pub deformation: DeformationSettings,
     pub rigid_transforms: bool,
     pub remarks: Vec<String>,
+    /// The ranges of each domain in the packed buffers.
     pub layout: Layout,
+    /// The domains whose transforms steps can set, and the domains that follow them.
     pub transform_roots: TransformRoots,
     /// The optional features that the scene uses.
     pub features: SceneFeatures,
@@ -119,8 +121,8 @@ impl Scene {
         }
     }
 
-    /// Builds a scene: validates all references between the parts, and computes the layout, features, tangents and rest
-    /// bounds.
+    /// Builds a scene: validates the parts and the references between them, and computes everything that follows from
+    /// them.
     ///
     /// # Errors
     /// `Invalid` with the field and, for a field of a domain, the index of the domain.
@@ -296,8 +298,8 @@ fn drop_textures_without_uvs(parts: &mut SceneParts) {
     let mut untextured_materials: BTreeMap<usize, usize> = BTreeMap::new();
     let SceneParts { shapes, materials, domains, remarks, .. } = parts;
     for domain in domains.iter_mut().filter(|domain| shapes[domain.shape].mesh.corners().uvs.is_empty()) {
-        let material_ranges = domain.material_ranges.iter_mut().map(|range| &mut range.material);
-        for material_index in std::iter::once(&mut domain.material).chain(material_ranges) {
+        let range_materials = domain.material_ranges.iter_mut().map(|range| &mut range.material);
+        for material_index in std::iter::once(&mut domain.material).chain(range_materials) {
             let material = &materials[*material_index];
             if material.color_texture.is_none() && material.normal_texture.is_none() {
                 continue;
@@ -306,6 +308,7 @@ fn drop_textures_without_uvs(parts: &mut SceneParts) {
             *material_index = *untextured_materials.entry(*material_index).or_insert_with(|| {
                 let name = &material.name;
                 remarks.push(format!("textures of material '{name}' left out where there are no texture coordinates"));
+                // Without a texture, alpha is constant: the mask keeps either all fragments or none.
                 let alpha_mode = match material.alpha_mode {
                     AlphaMode::Mask { cutoff } if material.alpha >= cutoff => AlphaMode::Opaque,
                     alpha_mode => alpha_mode,

@@ -54,7 +54,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rectangle_must_be_inside_the_image_and_at_most_64_pixels() {
+    fn rectangle_is_limited_to_the_image_and_64_pixels_a_side() {
         let create = |corner, size| PixelRect::within([100, 80], corner, size).map_err(|error| error.to_string());
         for (corner, size) in [([0, 0], [1, 1]), ([99, 79], [1, 1]), ([36, 16], [64, 64])] {
             assert_eq!(create(corner, size).map(|rect| rect.size()), Ok(size));

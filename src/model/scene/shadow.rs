@@ -6,9 +6,9 @@ use crate::error::{Result, invalid};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ShadowMethod {
-    /// Variance shadow map (equation 3.10): Chebyshev's bound on blurred moments of depth. Soft edges, one lookup per
-    /// pixel. For a receiver with a single occluder the bound is exact: with `bleeding` 0, the half-dark contour is
-    /// within half a texel of the true edge. Where occluders overlap, light bleeds through.
+    /// Variance shadow map (equation 3.10 of the thesis): Chebyshev's bound on blurred moments of depth. Soft edges,
+    /// one lookup per pixel. For a receiver with a single occluder the bound is exact: with `bleeding` 0, the shadow is
+    /// half dark within half a texel of the true edge. Where occluders overlap, light bleeds through.
     #[default]
     Variance,
     /// Standard shadow map with one depth per texel. Hard edges, within half a texel of the true edge in the plane of
@@ -103,16 +103,16 @@ impl ShadowSettings {
         }
     }
 
-    /// Standard deviation, in texels, of the filter of a soft shadow map: the blur, and the bilinear lookup, which is a
-    /// tent filter of variance 1/6.
+    /// Standard deviation, in texels, of the filter of a soft shadow map: the blur combined with the bilinear lookup,
+    /// which is a tent filter of variance 1/6.
     pub fn filter_deviation(&self) -> f64 {
         (f64::from(self.blur).powi(2) + 1.0 / 6.0).sqrt()
     }
 
-    /// Upper bound of the variance that f32 rounding produces from equal depths m, |m| <= 1/2, blurred by N taps in x
-    /// and in y. With u = 2^-24, the products, sums and weights of two passes and the bilinear lookup change M2 <= 1/4
-    /// by at most (2 N + 6) u / 4 and M1 by at most (2 N + 5) u / 2, hence M1^2 by (N + 3) u. In total, the
-    /// variance is below (1.5 N + 5) u.
+    /// Upper bound of the variance M2 - M1^2 that f32 rounding produces from equal depths m, |m| <= 1/2. M1 and M2 are
+    /// the means of m and m^2, blurred by N taps in x and in y. With u = 2^-24, the products, sums and weights of two
+    /// passes and the bilinear lookup change M2 <= 1/4 by at most (2 N + 6) u / 4 and M1 by at most (2 N + 5) u / 2,
+    /// hence M1^2 by (N + 3) u. In total, the variance is below (1.5 N + 5) u.
     pub fn variance_floor(&self) -> f32 {
         let taps = 2 * self.blur_radius() + 1;
         (1.5 * taps as f32 + 5.0) * (0.5 * f32::EPSILON)
@@ -169,12 +169,13 @@ mod tests {
         }
     }
 
-    /// Blurs moments of equal depths m twice in f32, as the shaders do. Returns the largest |M2 - M1^2|.
+    /// Blurs the moments of equal depths m in x and then in y in f32, as the shaders do. Returns the largest
+    /// |M2 - M1^2|.
     fn largest_rounding_variance(shadow: &ShadowSettings) -> f32 {
         let radius = shadow.blur_radius() as i32;
-        let gaussian = |step: i32| (-0.5 * (f64::from(step) / f64::from(shadow.blur)).powi(2)).exp();
+        let gaussian = |offset: i32| (-0.5 * (f64::from(offset) / f64::from(shadow.blur)).powi(2)).exp();
         let weight_sum: f64 = (-radius..=radius).map(gaussian).sum();
-        let weights: Vec<f32> = (-radius..=radius).map(|step| (gaussian(step) / weight_sum) as f32).collect();
+        let weights: Vec<f32> = (-radius..=radius).map(|offset| (gaussian(offset) / weight_sum) as f32).collect();
         let blur = |value: f32| weights.iter().fold(0.0_f32, |sum, weight| sum + weight * value);
         let depths = (0..=20_000).map(|step| step as f32 / 20_000.0 - 0.5);
         depths

@@ -31,8 +31,7 @@ pub struct SceneState {
     /// All coordinates, packed as in [`super::Layout`].
     pub q: Vec<f32>,
     /// `world_from_domain` of each transform root ([`super::TransformRoots`]), relative to its floating origin
-    /// ([`Self::origin_of`]). The floating origin is the scene's origin unless a step with f64 translations moved the
-    /// domain far from it.
+    /// ([`Self::origin_of`]). Before the first step with f64 translations, all floating origins are the scene's origin.
     pub transforms: Vec<Transform>,
     /// The f64 translations and floating origins. Present after the first step with f64 translations.
     pub origins: Option<Arc<FloatingOrigins>>,
@@ -95,8 +94,8 @@ impl SceneState {
     /// Sets the transforms of a step. Returns true if transforms of other domains were rebased to another floating
     /// origin.
     fn apply_transforms(&mut self, transform_roots: &TransformRoots, update: &StepUpdate) -> bool {
-        let is_first_f64 = self.origins.is_none() && update.has_f64_translations();
-        if is_first_f64 {
+        let is_first_f64_step = self.origins.is_none() && update.has_f64_translations();
+        if is_first_f64_step {
             self.origins = Some(Arc::new(FloatingOrigins::from_transforms(&self.transforms)));
         }
         if update.transforms.is_empty() {
@@ -108,7 +107,7 @@ impl SceneState {
             }
             return false;
         };
-        let is_rebased = is_first_f64 && !origins.is_uniform();
+        let is_rebased = is_first_f64_step && !origins.is_uniform();
         for (domain, transform, translation) in update.transform_updates() {
             let root = transform_roots.root_of(domain);
             origins.set_translation(root, translation);

@@ -180,7 +180,8 @@ fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransfor
     Ok((transforms, translations))
 }
 
-/// Parses [`TransformFormat::Affine`], the only format that can contain shear, and rejects shear in rigid scenes.
+/// Parses [`TransformFormat::Affine`], the only format that can contain shear or a non-uniform scale, and rejects both
+/// in scenes without the feature `shear`.
 fn parse_affine(scene: &Scene, bytes: &[u8]) -> Result<ParsedTransform> {
     let (transform, translation) = transform_format::parse_affine(bytes)?;
     if !scene.features.shear && !transform.is_similarity() {

@@ -9,7 +9,7 @@ use crate::error::{Result, invalid};
 /// that a larger deviation is an error of the sender.
 const NORM_TOLERANCE: f64 = 1e-3;
 
-/// The largest f64 translation per axis, in scene units. Up to this distance, f64 rounds by at most 1.2e-4 units.
+/// The largest f64 translation per axis, in scene units. Up to there, f64 numbers are at most 1.3e-4 units apart.
 pub(super) const MAX_TRANSLATION: f64 = (1_u64 << 40) as f64;
 
 /// The encoding of the transforms of a step.
@@ -160,14 +160,14 @@ mod tests {
     }
 
     #[test]
-    fn too_distant_translations_are_rejected() {
+    fn distant_and_non_finite_translations_are_rejected() {
         let parse_at = |x: f64, origin: f64| {
             let translation = [x, 0.0, 0.0].map(|number| number.to_le_bytes().to_vec());
             parse_rigid_f64(&pack([0.0, 0.0, 0.0, 1.0], translation)[1..], [origin, 0.0, 0.0]).map(drop)
         };
         assert_eq!(parse_at(MAX_TRANSLATION, 0.0), Ok(()));
         for (x, origin) in [(2e12, 0.0), (2e12, 2e12), (1e12, -1e12), (f64::INFINITY, 0.0), (f64::NAN, 0.0)] {
-            let message = parse_at(x, origin).expect_err("too far").to_string();
+            let message = parse_at(x, origin).expect_err("an invalid translation").to_string();
             assert!(message.starts_with("translation[0]"), "{message}");
         }
     }

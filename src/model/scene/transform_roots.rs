@@ -1,5 +1,5 @@
-//! Transform roots and followers. A root is a domain whose transform steps can set. A follower moves with its root: a
-//! constant transform, its frame, maps coordinates of the follower to the root.
+//! Transform roots and followers. A root is a domain with a transform of its own, which steps can set. A follower moves
+//! with its root: a constant transform, its frame, maps coordinates of the follower to the root.
 
 use nalgebra::Matrix4;
 
@@ -34,8 +34,9 @@ impl TransformRoots {
     /// Frame index of a domain that follows no other.
     pub const NO_FRAME: u32 = u32::MAX;
 
-    /// Flattens chains of followers to their roots, and sets the placement of each follower accordingly. The domains
-    /// are validated, and parents precede their children. Products of frames are computed in f64 and rounded once.
+    /// Flattens chains of followers to their roots, and sets the placement of each follower to its root's placement
+    /// times its frame. The domains are validated, and parents precede their children. Products of frames are computed
+    /// in f64 and rounded once.
     ///
     /// # Errors
     /// `Invalid` with the domain whose frame or placement exceeds the range of f32.
@@ -52,12 +53,15 @@ impl TransformRoots {
                 table.domains.push(index as u32);
                 continue;
             };
-            let [root, parent_frame] = table.root_and_frame_indices[constraint.parent];
-            let frame = constraint.frame.to_matrix();
-            let frame = frames_f64.get(parent_frame as usize).map_or(frame, |parent_frame| parent_frame * frame);
+            let [root, parent_frame_index] = table.root_and_frame_indices[constraint.parent];
+            let parent_from_domain = constraint.frame.to_matrix();
+            // A parent that is a root has no frame: `NO_FRAME` is beyond the end of `frames_f64`.
+            let frame = frames_f64
+                .get(parent_frame_index as usize)
+                .map_or(parent_from_domain, |parent_frame| parent_frame * parent_from_domain);
             let rounded_frame = Transform::from_matrix(&frame);
-            let placement = domains[table.domains[root as usize] as usize].placement;
-            let placement = ComposedTransform { root: placement, frame: Some(rounded_frame) }.to_f32();
+            let root_placement = domains[table.domains[root as usize] as usize].placement;
+            let placement = ComposedTransform { root: root_placement, frame: Some(rounded_frame) }.to_f32();
             for (field, transform) in [("follows.frame", rounded_frame), ("placement", placement)] {
                 Transform::new(transform.0).map_err(|error| error.prefix_field(&format!("domain {index}: {field}")))?;
             }
@@ -121,23 +125,23 @@ impl FollowTable {
     /// Groups followers by their root, ascending within a group (counting sort).
     fn list_followers(&mut self) {
         let mut offsets = vec![0_u32; self.root_and_frame_indices.len() + 1];
-        let followers = || {
+        let enumerate_followers = || {
             self.root_and_frame_indices.iter().enumerate().filter(|(_, [_, frame])| *frame != TransformRoots::NO_FRAME)
         };
-        for (_, [root, _]) in followers() {
+        for (_, [root, _]) in enumerate_followers() {
             offsets[self.domains[*root as usize] as usize + 1] += 1;
         }
         for domain in 1..offsets.len() {
             offsets[domain] += offsets[domain - 1];
         }
         let mut next_offsets = offsets.clone();
-        let mut list = vec![0; self.frames.len()];
-        for (index, [root, _]) in followers() {
+        let mut grouped_followers = vec![0; self.frames.len()];
+        for (domain, [root, _]) in enumerate_followers() {
             let next_offset = &mut next_offsets[self.domains[*root as usize] as usize];
-            list[*next_offset as usize] = index as u32;
+            grouped_followers[*next_offset as usize] = domain as u32;
             *next_offset += 1;
         }
-        (self.offsets, self.followers) = (offsets, list);
+        (self.offsets, self.followers) = (offsets, grouped_followers);
     }
 }
 
@@ -213,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_frames_are_rounded_once() {
+    fn frames_of_chained_followers_are_rounded_once() {
         let mut parts = scene_with_followers(&[(1, 0), (2, 1)]);
         let frame = Transform(Transform::IDENTITY.0.map(|entry| entry / 3.0));
         for child in [1, 2] {

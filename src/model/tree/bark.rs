@@ -37,7 +37,7 @@ pub(super) fn textures(random: &mut SplitMix64) -> Result<[Texture; 2]> {
         let (u, v) = (column as f32 / SIDE as f32, row as f32 / SIDE as f32);
         let color = layers.color(u, v, heights[row * SIDE + column]);
         colors.extend(color.map(|channel| channel.clamp(0.0, 255.0) as u8));
-        normals.extend(normal(&heights, column, row).map(|axis| ((0.5 * axis + 0.5) * 255.0).round() as u8));
+        normals.extend(normal(&heights, column, row).map(|component| ((0.5 * component + 0.5) * 255.0).round() as u8));
         colors.push(255);
         normals.push(255);
     }
@@ -95,8 +95,8 @@ fn normal(heights: &[f32], column: usize, row: usize) -> [f32; 3] {
     let height = |column: usize, row: usize| heights[row % SIDE * SIDE + column % SIDE];
     let height_step_right = height(column + 1, row) - height(column + SIDE - 1, row);
     let height_step_up = height(column, row + SIDE - 1) - height(column, row + 1);
-    let slope = 0.5 * SIDE as f32 * RELIEF;
-    nalgebra::Vector3::new(-slope * height_step_right, -slope * height_step_up, 1.0).normalize().into()
+    let slope_scale = 0.5 * SIDE as f32 * RELIEF;
+    nalgebra::Vector3::new(-slope_scale * height_step_right, -slope_scale * height_step_up, 1.0).normalize().into()
 }
 
 #[cfg(test)]
@@ -105,8 +105,8 @@ mod tests {
 
     fn mean(texture: &Texture) -> [f64; 3] {
         let count = texture.rgba().len() as f64 / 4.0;
-        std::array::from_fn(|axis| {
-            texture.rgba().chunks_exact(4).map(|pixel| f64::from(pixel[axis])).sum::<f64>() / count
+        std::array::from_fn(|channel| {
+            texture.rgba().chunks_exact(4).map(|pixel| f64::from(pixel[channel])).sum::<f64>() / count
         })
     }
 

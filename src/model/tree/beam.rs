@@ -73,9 +73,10 @@ impl Beam {
         let factor = Cholesky::new(stiffness).ok_or_else(|| fault("the stiffness is not positive definite"))?.unpack();
         let singular_factor = || fault("the factor of the stiffness is singular");
         let half_transformed = factor.solve_lower_triangular(&mass).ok_or_else(singular_factor)?;
-        let flexibility = factor.solve_lower_triangular(&half_transformed.transpose()).ok_or_else(singular_factor)?;
-        let flexibility = (&flexibility + flexibility.transpose()) * 0.5;
-        let eigen = SymmetricEigen::try_new(flexibility, f64::EPSILON, 10_000)
+        let transformed_mass =
+            factor.solve_lower_triangular(&half_transformed.transpose()).ok_or_else(singular_factor)?;
+        let transformed_mass = (&transformed_mass + transformed_mass.transpose()) * 0.5;
+        let eigen = SymmetricEigen::try_new(transformed_mass, f64::EPSILON, 10_000)
             .ok_or_else(|| fault("the eigenvalue iteration did not converge"))?;
         let mut sorted_indices: Vec<usize> = (0..eigen.eigenvalues.len()).collect();
         sorted_indices.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
@@ -108,11 +109,11 @@ pub(super) mod tests {
         let orientation = nalgebra::Rotation3::from_euler_angles(0.4, 0.9, -1.3);
         let node_position = |index: usize| {
             let s = index as f64 / elements as f64;
-            let in_plane = match bend == 0.0 {
+            let local_position = match bend == 0.0 {
                 true => Vector3::new(0.0, s, 0.0),
                 false => Vector3::new((1.0 - (bend * s).cos()) / bend, (bend * s).sin() / bend, 0.1 * s * s),
             };
-            orientation * in_plane
+            orientation * local_position
         };
         let radius = |index: usize| radii[0] + (radii[1] - radii[0]) * index as f64 / elements as f64;
         Beam {

@@ -31,8 +31,8 @@ pub(super) struct GrowthParameters {
     pub(super) wander: f64,
 }
 
-/// A sampled curve with one sample per ring of the skin. Every `rings_per_element`-th sample is a node of the beam. Points and arc
-/// lengths are in meters.
+/// A sampled curve with one sample per ring of the skin. Every `rings_per_element`-th sample is a node of the beam.
+/// Points and arc lengths are in meters.
 #[derive(Debug, Clone)]
 pub(super) struct Centerline {
     pub(super) points: Vec<Vector3<f64>>,
@@ -116,8 +116,8 @@ impl Centerline {
 pub(super) fn part_orientation(y: &Vector3<f64>, up: &Vector3<f64>) -> Rotation3<f64> {
     let projected_up = up - y * y.dot(up);
     let z = projected_up.try_normalize(1e-6).unwrap_or_else(|| {
-        let fallback = if y.x.abs() < 0.9 { Vector3::x() } else { Vector3::z() };
-        (fallback - y * y.dot(&fallback)).normalize()
+        let fallback_axis = if y.x.abs() < 0.9 { Vector3::x() } else { Vector3::z() };
+        (fallback_axis - y * y.dot(&fallback_axis)).normalize()
     });
     Rotation3::from_basis_unchecked(&[y.cross(&z), *y, z])
 }

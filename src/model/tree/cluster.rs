@@ -15,10 +15,10 @@ const SHOOT: ElasticConstants = ElasticConstants { youngs_modulus: 3.0e9, shear_
 /// Fresh mass of a leaf in kg per m^2 of one side.
 const LEAF_MASS_PER_AREA: f64 = 0.17;
 
-/// The fraction of a card's area that the leaf outline covers.
+/// The fraction of a blade's area that the leaf in its image covers.
 const LEAF_COVERAGE: f64 = 0.55;
 
-/// Ratio of width to length of a leaf's card.
+/// Ratio of width to length of a blade.
 const LEAF_ASPECT: f64 = 0.62;
 
 /// Parameters of a leaf cluster. Lengths are in meters.
@@ -92,7 +92,7 @@ fn grow_cluster(parameters: ClusterParameters, random: &mut SplitMix64) -> PartT
         } else {
             0.16 + 0.84 * (leaf as f64 + random.next_unit() * 0.6) / leaf_count as f64
         };
-        // Leaves of a spray alternate between two sides. Leaves of a rosette follow the golden angle.
+        // Azimuths: leaves of a spray alternate between two sides, leaves of a rosette follow the golden angle.
         let azimuth = if is_flexible { std::f64::consts::PI * leaf as f64 } else { 2.4 * leaf as f64 };
         let azimuth = azimuth + random.uniform_symmetric(0.7);
         add_leaf(&mut template, fraction, azimuth, leaf_length * random.uniform(0.78, 1.12), random);
@@ -156,7 +156,7 @@ mod tests {
     fn mean_leaf_normal_points_to_the_light() {
         for template in leaf_clusters(&mut SplitMix64::new(9)) {
             let mesh = template.skin.build_mesh().expect("a valid mesh");
-            // The shoot's corners come first: five rings of four, and three at the tip.
+            // The shoot's corners come first: five rings of four (the seam repeats a corner), and three at the tip.
             let leaf_normals = &mesh.corners().normals[5 * 4 + 3..];
             let mean_z = leaf_normals.iter().map(|normal| normal[2]).sum::<f32>() / leaf_normals.len() as f32;
             assert!(mean_z > 0.5, "{mean_z}");

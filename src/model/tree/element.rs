@@ -9,7 +9,7 @@ use nalgebra::{Matrix3, Matrix4, SMatrix, Vector3};
 
 pub(super) type Matrix12 = SMatrix<f64, 12, 12>;
 
-/// Elastic constants (Pa) and density (kg/m^3) of the wood.
+/// Elastic constants (Pa) and density (kg/m^3) of wood or of a green shoot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct ElasticConstants {
     pub(super) youngs_modulus: f64,
@@ -52,25 +52,25 @@ pub(super) fn element_matrices(
     from: &Vector3<f64>,
     to: &Vector3<f64>,
     section: &Section,
-    wood: &ElasticConstants,
+    material: &ElasticConstants,
 ) -> (Matrix12, Matrix12) {
     let length = (to - from).norm();
     let mut local_from_global = Matrix12::zeros();
     for block in 0..4 {
         local_from_global.fixed_view_mut::<3, 3>(3 * block, 3 * block).copy_from(&element_axes(from, to));
     }
-    let (stiffness, mass) = (local_stiffness(length, section, wood), local_mass(length, section, wood));
+    let (stiffness, mass) = (local_stiffness(length, section, material), local_mass(length, section, material));
     (
         local_from_global.transpose() * stiffness * local_from_global,
         local_from_global.transpose() * mass * local_from_global,
     )
 }
 
-fn local_stiffness(l: f64, section: &Section, wood: &ElasticConstants) -> Matrix12 {
+fn local_stiffness(l: f64, section: &Section, material: &ElasticConstants) -> Matrix12 {
     let mut matrix = Matrix12::zeros();
     let block = [1.0, -1.0, -1.0, 1.0];
-    add_linear(&mut matrix, 0, block.map(|entry| entry * wood.youngs_modulus * section.area / l));
-    add_linear(&mut matrix, 3, block.map(|entry| entry * wood.shear_modulus * 2.0 * section.moment / l));
+    add_linear(&mut matrix, 0, block.map(|entry| entry * material.youngs_modulus * section.area / l));
+    add_linear(&mut matrix, 3, block.map(|entry| entry * material.shear_modulus * 2.0 * section.moment / l));
     #[rustfmt::skip]
     let bending = Matrix4::new(
         12.0,    6.0 * l,     -12.0,   6.0 * l,
@@ -78,15 +78,15 @@ fn local_stiffness(l: f64, section: &Section, wood: &ElasticConstants) -> Matrix
         -12.0,   -6.0 * l,    12.0,    -6.0 * l,
         6.0 * l, 2.0 * l * l, -6.0 * l, 4.0 * l * l,
     );
-    add_bending(&mut matrix, &(bending * (wood.youngs_modulus * section.moment / l.powi(3))));
+    add_bending(&mut matrix, &(bending * (material.youngs_modulus * section.moment / l.powi(3))));
     matrix
 }
 
-fn local_mass(l: f64, section: &Section, wood: &ElasticConstants) -> Matrix12 {
+fn local_mass(l: f64, section: &Section, material: &ElasticConstants) -> Matrix12 {
     let mut matrix = Matrix12::zeros();
     let block = [2.0, 1.0, 1.0, 2.0];
-    add_linear(&mut matrix, 0, block.map(|entry| entry * wood.density * section.area * l / 6.0));
-    add_linear(&mut matrix, 3, block.map(|entry| entry * wood.density * 2.0 * section.moment * l / 6.0));
+    add_linear(&mut matrix, 0, block.map(|entry| entry * material.density * section.area * l / 6.0));
+    add_linear(&mut matrix, 3, block.map(|entry| entry * material.density * 2.0 * section.moment * l / 6.0));
     #[rustfmt::skip]
     let bending = Matrix4::new(
         156.0,     22.0 * l,     54.0,      -13.0 * l,
@@ -94,7 +94,7 @@ fn local_mass(l: f64, section: &Section, wood: &ElasticConstants) -> Matrix12 {
         54.0,      13.0 * l,     156.0,     -22.0 * l,
         -13.0 * l, -3.0 * l * l, -22.0 * l, 4.0 * l * l,
     );
-    add_bending(&mut matrix, &(bending * (wood.density * section.area * l / 420.0)));
+    add_bending(&mut matrix, &(bending * (material.density * section.area * l / 420.0)));
     matrix
 }
 

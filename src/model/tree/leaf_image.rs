@@ -44,7 +44,7 @@ pub(super) struct LeafColors {
 ///
 /// # Errors
 /// None in practice, because the sizes are constants.
-pub(super) fn texture(name: &str, palette: &LeafColors, random: &mut SplitMix64) -> Result<Texture> {
+pub(super) fn texture(name: &str, colors: &LeafColors, random: &mut SplitMix64) -> Result<Texture> {
     let mottle_noise = [
         GradientNoise { cells: [7, 9], seed: random.next_bits() },
         GradientNoise { cells: [31, 37], seed: random.next_bits() },
@@ -55,7 +55,7 @@ pub(super) fn texture(name: &str, palette: &LeafColors, random: &mut SplitMix64)
         let v = ((pixel / SIDE) as f32 + 0.5) / SIDE as f32;
         let brightness = 1.0 + 0.08 * mottle_noise[0].sample(u, v) + 0.05 * mottle_noise[1].sample(u, v);
         let x = (u - LEAF_SPAN[0]) / (LEAF_SPAN[1] - LEAF_SPAN[0]) - 0.5;
-        let (color, coverage) = if u >= STRIP_LEFT { (palette.stem, 1.0) } else { shade_leaf(palette, x, 1.0 - v) };
+        let (color, coverage) = if u >= STRIP_LEFT { (colors.stem, 1.0) } else { shade_leaf(colors, x, 1.0 - v) };
         rgba.extend(color.map(|channel| (brightness * channel).clamp(0.0, 255.0) as u8));
         rgba.push((255.0 * coverage).round() as u8);
     }
@@ -63,7 +63,7 @@ pub(super) fn texture(name: &str, palette: &LeafColors, random: &mut SplitMix64)
 }
 
 /// Color and coverage at the signed distance `x` from the midrib and the height `y` above the base of the petiole.
-fn shade_leaf(palette: &LeafColors, x: f32, y: f32) -> ([f32; 3], f32) {
+fn shade_leaf(colors: &LeafColors, x: f32, y: f32) -> ([f32; 3], f32) {
     let blade_fraction = (y - PETIOLE_LENGTH) / (TIP_HEIGHT - PETIOLE_LENGTH);
     let distance = x.abs();
     let pixel_width = 1.2 / SIDE as f32;
@@ -72,18 +72,18 @@ fn shade_leaf(palette: &LeafColors, x: f32, y: f32) -> ([f32; 3], f32) {
     let midrib_coverage =
         if blade_fraction < 0.9 { ((midrib_half_width - distance) / pixel_width + 0.5).clamp(0.0, 1.0) } else { 0.0 };
     if blade_fraction <= 0.0 {
-        return (palette.stem, midrib_coverage);
+        return (colors.stem, midrib_coverage);
     }
     let blade_half_width = half_width(blade_fraction);
     let coverage = ((blade_half_width - distance) / (1.6 * pixel_width) + 0.5).clamp(0.0, 1.0).max(midrib_coverage);
     let relative_distance = (distance / blade_half_width.max(1e-3)).min(1.2);
-    let base_color = lerp_color(palette.blade, palette.edge, smoothstep(0.35, 1.1, relative_distance));
+    let base_color = lerp_color(colors.blade, colors.edge, smoothstep(0.35, 1.1, relative_distance));
     // Between two side veins the blade bulges and appears lighter.
     let (vein_intensity, bulge) = side_vein(blade_fraction, distance, relative_distance);
     let bulged_color = base_color.map(|channel| channel * (0.93 + 0.14 * bulge));
-    let veined_color = lerp_color(bulged_color, palette.vein, 0.75 * vein_intensity);
+    let veined_color = lerp_color(bulged_color, colors.vein, 0.75 * vein_intensity);
     (
-        lerp_color(veined_color, palette.vein, smoothstep(1.9 * midrib_half_width, 0.6 * midrib_half_width, distance)),
+        lerp_color(veined_color, colors.vein, smoothstep(1.9 * midrib_half_width, 0.6 * midrib_half_width, distance)),
         coverage,
     )
 }
@@ -122,8 +122,8 @@ mod tests {
     fn leaf_covers_part_of_the_image_and_the_strip_is_opaque() {
         let image = texture("leaf", &PALETTE, &mut SplitMix64::new(1)).expect("a valid texture");
         let is_opaque = |pixel: usize| image.rgba()[4 * pixel + 3] >= 128;
-        let leaf_fraction = (0..SIDE * SIDE).filter(|pixel| is_opaque(*pixel)).count() as f64 / (SIDE * SIDE) as f64;
-        assert!((0.2..0.8).contains(&leaf_fraction), "{leaf_fraction} of the image is leaf");
+        let opaque_fraction = (0..SIDE * SIDE).filter(|pixel| is_opaque(*pixel)).count() as f64 / (SIDE * SIDE) as f64;
+        assert!((0.2..0.8).contains(&opaque_fraction), "{opaque_fraction} of the image is opaque");
         let strip_column = (STEM_U * SIDE as f32) as usize;
         assert!((0..SIDE).all(|row| is_opaque(row * SIDE + strip_column)));
         assert!(!is_opaque(0) && is_opaque(SIDE / 2 * SIDE + (0.45 * SIDE as f32) as usize));

@@ -43,10 +43,10 @@ impl Default for TreeParameters {
 }
 
 /// Index of the bark material. The leaf materials follow it.
-const BARK: usize = 0;
+const BARK_MATERIAL: usize = 0;
 
 /// The two leaf materials: shaded and sunlit leaves.
-const LEAVES: [(&str, leaf_image::LeafColors); 2] = [
+const LEAF_MATERIALS: [(&str, leaf_image::LeafColors); 2] = [
     (
         "leaf",
         leaf_image::LeafColors {
@@ -103,7 +103,7 @@ fn add_materials(parts: &mut SceneParts, random: &mut SplitMix64) -> Result<()> 
         normal_texture: Some(1),
         ..Material::default()
     });
-    for (name, palette) in &LEAVES {
+    for (name, colors) in &LEAF_MATERIALS {
         parts.materials.push(Material {
             name: (*name).into(),
             specular: [0.10, 0.11, 0.08],
@@ -113,7 +113,7 @@ fn add_materials(parts: &mut SceneParts, random: &mut SplitMix64) -> Result<()> 
             double_sided: true,
             ..Material::default()
         });
-        parts.textures.push(leaf_image::texture(name, palette, random)?);
+        parts.textures.push(leaf_image::texture(name, colors, random)?);
     }
     Ok(())
 }
@@ -130,7 +130,7 @@ impl PartPlacer<'_> {
     /// Places the trunk, which is the last template, and all parts that it carries.
     fn place_trunk(&mut self) {
         let trunk = self.templates.len() - 1;
-        self.domains.push(self.create_domain("trunk".into(), trunk, BARK, Transform::IDENTITY));
+        self.domains.push(self.create_domain("trunk".into(), trunk, BARK_MATERIAL, Transform::IDENTITY));
         self.place_children(0, trunk, &Isometry3::identity());
     }
 
@@ -147,8 +147,8 @@ impl PartPlacer<'_> {
                 .split_once(' ')
                 .map_or(String::new(), |(_, parent_path)| format!("{parent_path}."));
             let (kind, material) = match child.kind {
-                PartKind::Leaf => ("leaf", BARK + 1 + usize::from(self.random.next_unit() < 0.35)),
-                PartKind::Trunk | PartKind::Branch => ("branch", BARK),
+                PartKind::Leaf => ("leaf", BARK_MATERIAL + 1 + usize::from(self.random.next_unit() < 0.35)),
+                PartKind::Trunk | PartKind::Branch => ("branch", BARK_MATERIAL),
             };
             let placement = Transform::from_matrix(&world_from_child.to_homogeneous());
             let mut domain = self.create_domain(

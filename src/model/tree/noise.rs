@@ -27,8 +27,8 @@ impl GradientNoise {
 
     /// The pseudo-random gradient at a grid point, of about unit length.
     fn gradient(&self, column: i32, row: i32) -> (f32, f32) {
-        let cell_key = column.rem_euclid(self.cells[0]) as u64 | (row.rem_euclid(self.cells[1]) as u64) << 32;
-        let angle_fraction = (mix64(cell_key ^ self.seed) >> 40) as f32 / (1_u32 << 24) as f32;
+        let grid_point_key = column.rem_euclid(self.cells[0]) as u64 | (row.rem_euclid(self.cells[1]) as u64) << 32;
+        let angle_fraction = (mix64(grid_point_key ^ self.seed) >> 40) as f32 / (1_u32 << 24) as f32;
         // Parabolas approximate the sine and cosine of the gradient's angle, because they are cheaper. The argument is
         // the angle as a fraction of a full turn.
         let parabolic_sine = |angle_fraction: f32| {

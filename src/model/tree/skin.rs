@@ -13,6 +13,7 @@ pub(super) struct SkinBuilder {
     pub(super) rest_positions: Vec<[f32; 3]>,
     /// One station per vertex.
     pub(super) stations: Vec<Station>,
+    /// The vertex of each corner.
     corners: Vec<u32>,
     uvs: Vec<[f32; 2]>,
     triangles: Vec<[u32; 3]>,
@@ -38,7 +39,7 @@ pub(super) enum UvMapping {
     Strip { u: f32 },
 }
 
-/// A leaf blade: a card that is folded along its midrib and curled along its length.
+/// A leaf blade: a textured rectangle that is folded along its midrib and curled along its length.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Blade {
     pub(super) base: Vector3<f64>,
@@ -60,7 +61,7 @@ pub(super) struct Blade {
 const BLADE_ROWS: usize = 2;
 
 /// The bark texture scales with the radius of a branch, but not below this radius (meters).
-const MIN_RADIUS: f64 = 0.012;
+const MIN_TEXTURE_RADIUS: f64 = 0.012;
 
 impl SkinBuilder {
     /// Builds the mesh, with smooth normals.
@@ -84,7 +85,7 @@ impl SkinBuilder {
         let mut circumferences = 0.0;
         for ring in 0..=last_ring {
             if ring > 0 {
-                let radius = (0.5 * (tube.radii[ring] + tube.radii[ring - 1])).max(MIN_RADIUS);
+                let radius = (0.5 * (tube.radii[ring] + tube.radii[ring - 1])).max(MIN_TEXTURE_RADIUS);
                 circumferences += (centerline.arc_lengths[ring] - centerline.arc_lengths[ring - 1])
                     / (std::f64::consts::TAU * radius);
             }
@@ -109,7 +110,7 @@ impl SkinBuilder {
             }
         }
         let last_ring_corner = first_corner + (last_ring * (sides + 1)) as u32;
-        let circumferences = circumferences + tube.radii[last_ring] / (std::f64::consts::TAU * MIN_RADIUS);
+        let circumferences = circumferences + tube.radii[last_ring] / (std::f64::consts::TAU * MIN_TEXTURE_RADIUS);
         for side in 0..sides {
             let tip_corner = self.corners.len() as u32;
             self.corners.push(self.rest_positions.len() as u32 - 1);
@@ -240,9 +241,9 @@ mod tests {
             let mean = ring_positions.sum::<Vector3<f64>>() / 9.0;
             assert!((mean - centerline.points[ring]).norm() < 1e-6);
         }
-        for (corner, normal) in mesh.corners().vertices.iter().zip(&mesh.corners().normals) {
+        for (vertex, normal) in mesh.corners().vertices.iter().zip(&mesh.corners().normals) {
             let (position, ring) =
-                (Vector3::from(mesh.rest_positions()[*corner as usize]).cast::<f64>(), *corner as usize / 9);
+                (Vector3::from(mesh.rest_positions()[*vertex as usize]).cast::<f64>(), *vertex as usize / 9);
             let center = if ring > 12 { centerline.points[12] } else { centerline.points[ring] };
             let outward_component = (position - center).normalize().dot(&Vector3::from(*normal).cast());
             assert!(outward_component > 0.3, "expected an outward normal, got {normal:?}");

@@ -83,25 +83,26 @@ fn grow_trunk(random: &mut SplitMix64) -> PartTemplate {
     let mut template = wooden_part(PartKind::Trunk, centerline, radii, [24, 10]);
     template.damping = 0.05;
     let phases = [random.uniform(0.0, TAU), random.uniform(0.0, TAU), random.uniform(0.0, TAU)];
-    template.add_skin(UvMapping::Bark { repeats: 2 }, |arc, angle| {
+    template.add_skin(UvMapping::Bark { repeats: 2 }, |arc_length, angle| {
         // Roots extend outwards at the ground. Above them, the trunk is slightly uneven.
         let root_swelling = 0.20 * (5.0 * angle + phases[0]).cos() + 0.10 * (3.0 * angle + phases[1]).cos();
-        let unevenness = 0.025 * (2.0 * angle + phases[2] + 1.7 * arc).cos() + 0.018 * (4.0 * angle - 2.3 * arc).cos();
-        1.0 + root_swelling * (-arc / 0.30).exp() + unevenness
+        let unevenness =
+            0.025 * (2.0 * angle + phases[2] + 1.7 * arc_length).cos() + 0.018 * (4.0 * angle - 2.3 * arc_length).cos();
+        1.0 + root_swelling * (-arc_length / 0.30).exp() + unevenness
     });
     template
 }
 
 /// Ring, direction and length of a bough. Boughs are long and level at the bottom, short and steep at the top.
 fn choose_bough_joint(trunk: &PartTemplate, index: usize, random: &mut SplitMix64) -> (usize, Vector3<f64>, f64) {
-    let height = (index as f64 + random.uniform_symmetric(0.25)) / (BOUGH_COUNT - 1) as f64;
+    let crown_fraction = (index as f64 + random.uniform_symmetric(0.25)) / (BOUGH_COUNT - 1) as f64;
     let ring = trunk
         .centerline
-        .ring_at(CROWN_RANGE[0] + (CROWN_RANGE[1] - CROWN_RANGE[0]) * height.clamp(0.0, 1.0).powf(1.06));
+        .ring_at(CROWN_RANGE[0] + (CROWN_RANGE[1] - CROWN_RANGE[0]) * crown_fraction.clamp(0.0, 1.0).powf(1.06));
     let side =
         perpendicular_at(&trunk.centerline, ring, GOLDEN_ANGLE * (index as f64 + 0.8) + random.uniform_symmetric(0.3));
-    let angle = 1.22 - 0.74 * height + random.uniform_symmetric(0.12);
-    let crown_profile = (1.0 - ((height - 0.28) / 0.75).powi(2)).max(0.0).sqrt();
+    let angle = 1.22 - 0.74 * crown_fraction + random.uniform_symmetric(0.12);
+    let crown_profile = (1.0 - ((crown_fraction - 0.28) / 0.75).powi(2)).max(0.0).sqrt();
     (
         ring,
         trunk.centerline.branch_direction(ring, angle, &side),
@@ -177,7 +178,8 @@ fn grow_twig(length: f64, leaves: &[PartTemplate], random: &mut SplitMix64) -> P
     template
 }
 
-/// Attaches leaf clusters at fractions of the length. A cluster at the tip continues the branch.
+/// Attaches leaf clusters at fractions of the length. A cluster at the tip continues the branch. `leaves` is the start
+/// of the list of templates, so that its indices are template indices.
 fn attach_leaf_clusters(
     template: &mut PartTemplate,
     fractions: &[f64],

@@ -42,6 +42,7 @@ pub(super) struct PartTemplate {
     pub(super) centerline: Centerline,
     /// One radius per ring, meters.
     pub(super) radii: Vec<f64>,
+    /// Number of vertices per ring.
     pub(super) sides: usize,
     pub(super) skin: SkinBuilder,
     pub(super) elastic: ElasticConstants,
@@ -73,7 +74,7 @@ impl PartTemplate {
         (ring * self.sides..(ring + 1) * self.sides).map(|row| row as u32).collect()
     }
 
-    /// Adds a tube around the centerline.
+    /// Adds a tube around the centerline. For `radius_factor`, see [`SkinBuilder::add_tube`].
     pub(super) fn add_skin(&mut self, uv_mapping: UvMapping, radius_factor: impl Fn(f64, f64) -> f64) {
         let tube = Tube { centerline: &self.centerline, radii: &self.radii, sides: self.sides, uv_mapping };
         self.skin.add_tube(&tube, radius_factor);
@@ -188,8 +189,8 @@ mod tests {
                 let dofs: Vec<f64> = beam_modes.mode_shapes.column(mode).iter().copied().collect();
                 let max_entry = beam_modes.mode_shapes.column(mode).amax();
                 for ring in 1..template.centerline.points.len() {
-                    let section = section_motion(&beam.nodes, &dofs, station(&template.centerline, ring));
-                    let expected = section.displacement_of(&template.centerline.points[ring]);
+                    let motion = section_motion(&beam.nodes, &dofs, station(&template.centerline, ring));
+                    let expected = motion.displacement_of(&template.centerline.points[ring]);
                     assert!((ring_mean(ring, mode) - expected).norm() <= 1e-6 * max_entry, "ring {ring}");
                 }
                 // Counterexample: neighboring rings move differently.

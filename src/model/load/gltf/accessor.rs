@@ -8,6 +8,7 @@ use super::document::{Accessor, Document, Sparse};
 use super::get_element;
 use crate::error::{Result, invalid};
 
+// Component types of glTF.
 const U8: u64 = 5121;
 const U16: u64 = 5123;
 const U32: u64 = 5125;

@@ -101,10 +101,10 @@ impl GltfAssembler<'_> {
             {
                 return Err(invalid("weights", format!("{target_count} (one per morph target)"), weight_count));
             }
-            let in_primitive = |error: crate::error::Error| {
+            let add_primitive_location = |error: crate::error::Error| {
                 error.prefix_field(&format!("meshes[{mesh_index}].primitives[{primitive_index}]"))
             };
-            let Some(loaded) = self.load_primitive(mesh_index, primitive_index).map_err(in_primitive)? else {
+            let Some(loaded) = self.load_primitive(mesh_index, primitive_index).map_err(add_primitive_location)? else {
                 continue;
             };
             if self.domains.len() == MAX_DOMAINS {

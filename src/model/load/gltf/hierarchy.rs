@@ -39,12 +39,12 @@ pub(super) fn flatten_hierarchy(document: &Document, remarks: &mut ImportRemarks
     let Some(scene) = document.scene.or((!document.scenes.is_empty()).then_some(0)) else {
         return compute_matrices(document, &all_nodes);
     };
-    let nodes = &get_element(&document.scenes, scene, "scene")?.nodes;
+    let root_nodes = &get_element(&document.scenes, scene, "scene")?.nodes;
     if document.scenes.len() > 1 {
         remarks.add(format!("only scene {scene} of {} scenes is loaded", document.scenes.len()));
     }
-    check_roots(nodes, &parents).map_err(|error| error.prefix_field(&format!("scenes[{scene}]")))?;
-    compute_matrices(document, &preorder(&document.nodes, nodes))
+    check_roots(root_nodes, &parents).map_err(|error| error.prefix_field(&format!("scenes[{scene}]")))?;
+    compute_matrices(document, &preorder(&document.nodes, root_nodes))
 }
 
 /// The parent of each node.
@@ -68,9 +68,9 @@ fn find_parents(document: &Document) -> Result<Vec<Option<usize>>> {
 }
 
 /// Checks that the root nodes of a scene exist, have no parent and are different.
-fn check_roots(nodes: &[usize], parents: &[Option<usize>]) -> Result<()> {
+fn check_roots(root_nodes: &[usize], parents: &[Option<usize>]) -> Result<()> {
     let mut is_listed = vec![false; parents.len()];
-    for (root_index, node) in nodes.iter().enumerate() {
+    for (root_index, node) in root_nodes.iter().enumerate() {
         let field = || format!("nodes[{root_index}]");
         match parents.get(*node) {
             None => return Err(invalid(field(), format!("an index below {}", parents.len()), node)),

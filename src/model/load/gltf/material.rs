@@ -33,12 +33,12 @@ pub(super) struct MaterialConverter<'a> {
     pub(super) materials: Vec<Material>,
     /// Indices in `materials` by key. A key is the index in the document (`None` for the default material) and whether
     /// the primitive has texture coordinates.
-    converted: HashMap<(Option<usize>, bool), usize>,
+    material_indices: HashMap<(Option<usize>, bool), usize>,
 }
 
 impl<'a> MaterialConverter<'a> {
     pub(super) fn new(document: &'a Document, texture_loader: TextureLoader<'a>) -> Self {
-        Self { document, texture_loader, materials: Vec::new(), converted: HashMap::new() }
+        Self { document, texture_loader, materials: Vec::new(), material_indices: HashMap::new() }
     }
 
     /// The set of texture coordinates of a material: that of the base color texture, otherwise that of the normal map,
@@ -64,7 +64,7 @@ impl<'a> MaterialConverter<'a> {
         has_uvs: bool,
         remarks: &mut ImportRemarks,
     ) -> Result<usize> {
-        if let Some(index) = self.converted.get(&(material, has_uvs)) {
+        if let Some(index) = self.material_indices.get(&(material, has_uvs)) {
             return Ok(*index);
         }
         let phong_material = match material {
@@ -76,7 +76,7 @@ impl<'a> MaterialConverter<'a> {
             }
         };
         self.materials.push(phong_material);
-        self.converted.insert((material, has_uvs), self.materials.len() - 1);
+        self.material_indices.insert((material, has_uvs), self.materials.len() - 1);
         Ok(self.materials.len() - 1)
     }
 

@@ -32,7 +32,8 @@ const MAX_FILE_BYTES: u64 = 1 << 29;
 
 /// Name prefixes of extensions that affect only the appearance of surfaces and lights. The geometry is correct without
 /// them.
-const APPEARANCE_EXTENSIONS: [&str; 4] = ["KHR_materials_", "KHR_texture_transform", "KHR_lights_punctual", "KHR_xmp"];
+const APPEARANCE_EXTENSION_PREFIXES: [&str; 4] =
+    ["KHR_materials_", "KHR_texture_transform", "KHR_lights_punctual", "KHR_xmp"];
 
 /// Reads the glTF or GLB file `path`. Its buffers and images must be in the file itself or in or below its folder.
 ///
@@ -71,7 +72,8 @@ fn check_version(document: &document::Document) -> Result<()> {
 }
 
 fn check_extensions(document: &document::Document, remarks: &mut ImportRemarks) -> Result<()> {
-    let affects_only_appearance = |name: &str| APPEARANCE_EXTENSIONS.iter().any(|prefix| name.starts_with(prefix));
+    let affects_only_appearance =
+        |name: &str| APPEARANCE_EXTENSION_PREFIXES.iter().any(|prefix| name.starts_with(prefix));
     for (index, name) in document.extensions_required.iter().enumerate() {
         if !affects_only_appearance(name) {
             let field = format!("extensionsRequired[{index}]");

@@ -30,11 +30,12 @@ pub(super) fn convert_primitive(
         remarks.add("primitives of points or lines are ignored".into());
         return Ok(None);
     }
-    let positions = primitive.attributes.get("POSITION");
-    let positions = *positions.ok_or_else(|| invalid("attributes.POSITION", "an accessor", "none"))?;
+    let position_accessor = primitive.attributes.get("POSITION");
+    let position_accessor = *position_accessor.ok_or_else(|| invalid("attributes.POSITION", "an accessor", "none"))?;
     let format = AttributeFormat { allows_integers: false, count: None };
-    let rest_positions =
-        reader.decode_vectors::<3>(positions, format).map_err(|error| error.prefix_field("attributes.POSITION"))?;
+    let rest_positions = reader
+        .decode_vectors::<3>(position_accessor, format)
+        .map_err(|error| error.prefix_field("attributes.POSITION"))?;
     let modes = read_modes(reader, primitive, rest_positions.len(), remarks)?;
     let mesh = read_mesh(reader, primitive, rest_positions, uv_set)?;
     if primitive.attributes.contains_key("COLOR_0") {

@@ -8,7 +8,7 @@ const MAX_REMARKS: usize = 64;
 pub(super) struct ImportRemarks {
     remarks: Vec<String>,
     /// Number of remarks that exceeded the limit.
-    suppressed: usize,
+    suppressed_count: usize,
 }
 
 impl ImportRemarks {
@@ -18,14 +18,14 @@ impl ImportRemarks {
         match self.remarks.contains(&remark) {
             true => {}
             false if self.remarks.len() < MAX_REMARKS => self.remarks.push(remark),
-            false => self.suppressed += 1,
+            false => self.suppressed_count += 1,
         }
     }
 
     /// All remarks, then a message with the number of remarks that exceeded the limit.
     pub(super) fn into_list(mut self) -> Vec<String> {
-        if self.suppressed > 0 {
-            self.remarks.push(format!("and {} more remarks", self.suppressed));
+        if self.suppressed_count > 0 {
+            self.remarks.push(format!("and {} more remarks", self.suppressed_count));
         }
         self.remarks
     }

@@ -86,10 +86,10 @@ impl<'a> TextureLoader<'a> {
     }
 
     fn decode(&self, image: usize) -> Result<Texture> {
-        let in_image = |error: crate::error::Error| error.prefix_field(&format!("images[{image}]"));
-        let encoded = self.buffers.image(image).map_err(in_image)?;
-        let texture = Texture::decode(self.name(image), &encoded).map_err(in_image)?;
-        self.buffers.charge_budget(texture.rgba().len() as u64).map_err(in_image)?;
+        let add_image_location = |error: crate::error::Error| error.prefix_field(&format!("images[{image}]"));
+        let encoded = self.buffers.image(image).map_err(add_image_location)?;
+        let texture = Texture::decode(self.name(image), &encoded).map_err(add_image_location)?;
+        self.buffers.charge_budget(texture.rgba().len() as u64).map_err(add_image_location)?;
         Ok(texture)
     }
 

@@ -79,6 +79,7 @@ struct LoadedModel {
     domains: Vec<Domain>,
 }
 
+/// Adds the entries of a manifest to a scene, one after another.
 struct ManifestAssembler<'a> {
     files: &'a AssetDir,
     manifest: &'a Manifest,

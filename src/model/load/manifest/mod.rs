@@ -6,7 +6,7 @@
 //! up = "y"                   # x, y or z; default: up axis of the first model
 //! unit = 1.0                 # meters per scene unit; default: unit of the first model
 //! origin = [0.0, 0.0, 0.0]   # world position of the scene's origin, to which all transforms are relative; meters
-//! transforms = "rigid"       # declares that no step shears or scales; default: "affine"
+//! transforms = "rigid"       # declares that no step shears or scales non-uniformly; default: "affine"
 //! shadows = true             # false: no shadow map
 //! ground = true              # false: no ground plane; look.ground.colour is its color
 //! look.sunlight = [1.0, 0.9, 0.8]   # also sun (direction), skylight, zenith, horizon; linear colors

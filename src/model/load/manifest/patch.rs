@@ -54,14 +54,15 @@ impl MaterialPatch {
             self.color_texture.as_deref().map(|path| load_texture(path, "colour_texture")).transpose()?;
         let normal_texture =
             self.normal_texture.as_deref().map(|path| load_texture(path, "normal_texture")).transpose()?;
-        let has_alpha = color_texture.flatten().and_then(|index| lookup.texture(index)).is_some_and(Texture::has_alpha);
+        let new_texture_has_alpha =
+            color_texture.flatten().and_then(|index| lookup.texture(index)).is_some_and(Texture::has_alpha);
         let alpha_mode = match (self.alpha_mode, material.alpha_mode) {
             (Some(AlphaModeKey::Opaque), _) => AlphaMode::Opaque,
             (Some(AlphaModeKey::Blend), _) => AlphaMode::Blend,
             (Some(AlphaModeKey::Mask), AlphaMode::Mask { cutoff }) => AlphaMode::Mask { cutoff },
             (Some(AlphaModeKey::Mask), _) => AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF },
             (None, AlphaMode::Opaque) if self.alpha.is_some_and(|alpha| alpha < 1.0) => AlphaMode::Blend,
-            (None, AlphaMode::Opaque) if has_alpha => AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF },
+            (None, AlphaMode::Opaque) if new_texture_has_alpha => AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF },
             (None, alpha_mode) => alpha_mode,
         };
         let alpha_mode = match (alpha_mode, self.cutoff) {
@@ -100,7 +101,8 @@ mod tests {
         }
     }
 
-    /// Applies the overrides in `text` to `material`. There are the textures "solid" (0) and "leaf" (1, transparent).
+    /// Applies the overrides in `text` to `material`. The scene has the textures "solid" (index 0, opaque) and "leaf"
+    /// (index 1, transparent).
     fn patch_material(text: &str, mut material: Material) -> Result<Material> {
         let texture = |name: &str, alpha: u8| Texture::new(name, 1, 1, vec![1, 2, 3, alpha]).expect("a valid texture");
         let patch: MaterialPatch = toml::from_str(text).map_err(|error| invalid("toml", "a patch", error.message()))?;

@@ -27,6 +27,8 @@ enum Scale {
 }
 
 impl Placement {
+    /// The transform that the keys describe.
+    ///
     /// # Errors
     /// `Invalid` with the keys if they conflict or one is missing, and with the entry of the matrix if a number is not
     /// finite.

@@ -12,9 +12,9 @@ use crate::domain::Modes;
 use crate::error::{Result, invalid};
 
 /// Name endings of mode files in order of preference: binary files before text files, which have fewer digits.
-const EXTENSIONS: [&str; 5] = [".URendering.float", ".U.float", ".npy", ".safetensors", "modes.txt"];
+const NAME_ENDINGS: [&str; 5] = [".URendering.float", ".U.float", ".npy", ".safetensors", "modes.txt"];
 
-/// Reads the modes in `name`. The extension determines the format.
+/// Reads the modes in the file `name`. The extension determines the format.
 ///
 /// # Errors
 /// `Invalid` with the file, and the expected and given value.
@@ -43,15 +43,15 @@ fn parse_npy(bytes: &[u8]) -> Result<Modes> {
 /// Finds the modes of the OBJ file `name` in its folder, if any.
 ///
 /// A file belongs to the OBJ file if its name consists of the OBJ file's name (without `.obj` and `.derived`), optionally
-/// `.U`, and one of the first four [`EXTENSIONS`]. If there is no such file and no other OBJ file in the folder, any file
-/// with one of the [`EXTENSIONS`] is accepted. The order of the extensions decides between several files.
+/// `.U`, and one of the first four [`NAME_ENDINGS`]. If there is no such file and no other OBJ file in the folder, any
+/// file with one of the [`NAME_ENDINGS`] is accepted. The order of the endings decides between several files.
 ///
 /// # Errors
 /// `Invalid` with the candidates if several files have the same ending.
 pub(super) fn find_sidecar(files: &AssetDir, name: &str) -> Result<Option<String>> {
     let stem = name.strip_suffix(".obj").unwrap_or(name);
     let stem = stem.strip_suffix(".derived").unwrap_or(stem);
-    for ending in &EXTENSIONS[..4] {
+    for ending in &NAME_ENDINGS[..4] {
         for infix in ["", ".U"] {
             let candidate = format!("{stem}{infix}{ending}");
             if files.kind(&candidate)? == Some(EntryKind::File) {
@@ -64,7 +64,7 @@ pub(super) fn find_sidecar(files: &AssetDir, name: &str) -> Result<Option<String
     if names.iter().filter(|name| name.ends_with(".obj")).count() != 1 {
         return Ok(None);
     }
-    for ending in EXTENSIONS {
+    for ending in NAME_ENDINGS {
         // `q.npy` and `*.q.npy` contain coordinates, not modes.
         let is_candidate = |name: &&String| name.ends_with(ending) && *name != "q.npy" && !name.ends_with(".q.npy");
         let candidates: Vec<&String> = names.iter().filter(is_candidate).collect();

@@ -1,7 +1,7 @@
 //! Parser of NumPy's `.npy` files to arrays of f32.
 //!
 //! The parser of the header only finds known keys. A general parser of Python literals would recurse as deep as brackets
-//! nest and could overflow the stack, because a header may have up to 4 GiB.
+//! nest, so that a header with many brackets could overflow the stack.
 
 use crate::error::{Error, Result, invalid};
 

@@ -46,6 +46,7 @@ struct UsedVertices {
     origin: [f64; 3],
 }
 
+/// Collects the corners and triangles of the faces of one mesh.
 struct ObjMeshBuilder<'a> {
     obj: &'a ObjFile,
     /// `None` if the mesh has all vertices of the file.
@@ -136,10 +137,10 @@ impl<'a> ObjMeshBuilder<'a> {
         if let Some(file_normals) = self.corners.iter().map(|corner| file_normal(corner).copied()).collect() {
             return file_normals;
         }
-        let smooth = smooth_normals(&self.rest_positions, &self.corner_vertices, &self.triangles);
+        let corner_smooth_normals = smooth_normals(&self.rest_positions, &self.corner_vertices, &self.triangles);
         self.corners
             .iter()
-            .zip(smooth)
+            .zip(corner_smooth_normals)
             .map(|(corner, smooth_normal)| file_normal(corner).copied().unwrap_or(smooth_normal))
             .collect()
     }

@@ -45,7 +45,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<BTreeMap<String, MtlMaterial>> {
 }
 
 impl MtlMaterial {
-    fn parse_statement(&mut self, key: &[u8], line: &[u8], name: &str) -> Result<()> {
+    fn parse_statement(&mut self, key: &[u8], line: &[u8], material_name: &str) -> Result<()> {
         match key.to_ascii_lowercase().as_slice() {
             b"ka" => self.ambient = Some(parse_color(line)?),
             b"kd" => self.diffuse = Some(parse_color(line)?),
@@ -53,9 +53,9 @@ impl MtlMaterial {
             b"ns" => self.exponent = Some(parse_last_number(line)?),
             b"d" => self.opacity = Some(parse_last_number(line)?),
             b"tr" => self.opacity = Some(1.0 - parse_last_number(line)?),
-            b"map_kd" => self.color_map = self.parse_image_path(line, name)?,
-            b"map_d" => self.alpha_map = self.parse_image_path(line, name)?,
-            b"norm" | b"map_bump" | b"bump" => self.normal_map = self.parse_image_path(line, name)?,
+            b"map_kd" => self.color_map = self.parse_image_path(line, material_name)?,
+            b"map_d" => self.alpha_map = self.parse_image_path(line, material_name)?,
+            b"norm" | b"map_bump" | b"bump" => self.normal_map = self.parse_image_path(line, material_name)?,
             // Ambient maps repeat the color map. Illumination models and all other statements have no equivalent in
             // `Material`.
             _ => {}
@@ -64,7 +64,7 @@ impl MtlMaterial {
     }
 
     /// The path after the options of an image statement.
-    fn parse_image_path(&mut self, line: &[u8], name: &str) -> Result<Option<String>> {
+    fn parse_image_path(&mut self, line: &[u8], material_name: &str) -> Result<Option<String>> {
         let text = text_after_key(line);
         let mut remainder = text.as_str();
         while let Some((option, text_after_option)) = remainder.strip_prefix('-').map(split_first_word) {
@@ -74,7 +74,7 @@ impl MtlMaterial {
                 "blendu" | "blendv" | "cc" | "clamp" | "bm" | "boost" | "imfchan" | "texres" | "type" => 1,
                 _ => return Err(invalid("option", "an image option of MTL", format!("-{option}"))),
             };
-            let remark = format!("material '{name}': image option '-{option}' is not used");
+            let remark = format!("material '{material_name}': image option '-{option}' is not used");
             if !self.remarks.contains(&remark) {
                 self.remarks.push(remark);
             }

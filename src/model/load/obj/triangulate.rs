@@ -5,8 +5,8 @@ use nalgebra::{Vector2, Vector3};
 /// The largest polygon that is triangulated by ear clipping, which takes cubic time. Larger ones are split into a fan.
 const MAX_EAR_CLIPPING_CORNERS: usize = 256;
 
-/// Splits a polygon into triangles with its winding, as indices of `points`. There are always two fewer triangles than
-/// points.
+/// Splits a polygon into triangles with the polygon's winding, as indices into `points`. There are always two fewer
+/// triangles than points.
 ///
 /// If all triangles of the fan from the first corner have the polygon's orientation, the fan is used. Otherwise a quad
 /// is split along its other diagonal, and a larger polygon by ear clipping in the plane of its normal (Newell's

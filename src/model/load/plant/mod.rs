@@ -35,14 +35,14 @@ pub(super) fn read(files: &AssetDir, stem: &str) -> Result<SceneParts> {
         .map_err(|error| error.prefix_field(&file_field(&structure_file)))?;
     let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem) };
     obj::add_materials(&obj, files, &mut parts)?;
-    let mut faces: HashMap<Organ, Vec<usize>> = HashMap::new();
+    let mut faces_by_organ: HashMap<Organ, Vec<usize>> = HashMap::new();
     for (face, object_id) in object_ids.iter().enumerate() {
         // Always `Some`, because `assign_organs` received every object that has faces.
         if let Some(organ) = organs.get(object_id) {
-            faces.entry(*organ).or_default().push(face);
+            faces_by_organ.entry(*organ).or_default().push(face);
         }
     }
-    PlantBuilder { obj: &obj, structure: &structure, faces, organ_domains: HashMap::new(), parts }.build()
+    PlantBuilder { obj: &obj, structure: &structure, faces_by_organ, organ_domains: HashMap::new(), parts }.build()
 }
 
 /// The positions of the corners of each object.
@@ -58,7 +58,7 @@ fn positions_by_object(obj: &ObjFile, object_ids: &[u64]) -> BTreeMap<u64, Vec<[
 struct PlantBuilder<'a> {
     obj: &'a ObjFile,
     structure: &'a PlantStructure,
-    faces: HashMap<Organ, Vec<usize>>,
+    faces_by_organ: HashMap<Organ, Vec<usize>>,
     /// Index and origin of the domain of each organ so far.
     organ_domains: HashMap<Organ, (usize, [f64; 3])>,
     parts: SceneParts,
@@ -92,7 +92,7 @@ impl PlantBuilder<'_> {
     }
 
     fn add_domain(&mut self, organ: Organ, name: String, origin: [f64; 3], parent: Option<Organ>) -> Result<()> {
-        let faces = self.faces.remove(&organ).unwrap_or_default();
+        let faces = self.faces_by_organ.remove(&organ).unwrap_or_default();
         let obj_mesh = obj::build_faces(self.obj, &faces, origin).map_err(|error| error.prefix_field(&name))?;
         self.parts.shapes.push(Shape::new(obj_mesh.mesh, Modes::rigid())?);
         let attachment =

@@ -81,20 +81,23 @@ fn mean_point(points: impl Iterator<Item = Vector3<f64>>) -> Vector3<f64> {
 }
 
 fn nearest_leaf(centers: &[(usize, Vector3<f64>)], point: Vector3<f64>) -> Option<Organ> {
-    let distance = |(_, petiole_center): &&(usize, Vector3<f64>)| (petiole_center - point).norm_squared();
-    centers.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).map(|(leaf, _)| Organ::Leaf(*leaf))
+    let squared_distance = |(_, petiole_center): &&(usize, Vector3<f64>)| (petiole_center - point).norm_squared();
+    centers
+        .iter()
+        .min_by(|a, b| squared_distance(a).total_cmp(&squared_distance(b)))
+        .map(|(leaf, _)| Organ::Leaf(*leaf))
 }
 
 /// The shoot whose polyline is nearest to any of the points.
 fn nearest_shoot(structure: &PlantStructure, points: &[[f32; 3]]) -> Option<Organ> {
     let stride = points.len().div_ceil(MAX_SAMPLED_POINTS).max(1);
     let points: Vec<Vector3<f64>> = points.iter().step_by(stride).map(|point| Vector3::from(*point).cast()).collect();
-    let distance = |shoot: &usize| {
+    let squared_distance = |shoot: &usize| {
         let polyline = &structure.shoots[*shoot].vertices;
         points.iter().map(|point| squared_distance_to_polyline(polyline, point)).fold(f64::INFINITY, f64::min)
     };
-    let distances = (0..structure.shoots.len()).map(|shoot| (distance(&shoot), shoot));
-    distances.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, shoot)| Organ::Shoot(shoot))
+    let squared_distances = (0..structure.shoots.len()).map(|shoot| (squared_distance(&shoot), shoot));
+    squared_distances.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, shoot)| Organ::Shoot(shoot))
 }
 
 /// Squared distance of a point to a polyline.

@@ -152,7 +152,7 @@ fn near_translations_keep_the_scene_origin() {
 #[test]
 fn distant_domain_has_its_own_floating_origin() {
     let scene = scene(3);
-    // On the grid, 9766 is nearest to 1e7 / ORIGIN_GRID, and 977 to 1e6 / ORIGIN_GRID.
+    // The grid point nearest to 1e7 is 9766 * ORIGIN_GRID, and the one nearest to 1e6 is 977 * ORIGIN_GRID.
     let position = [1e7 + 0.001, -1e7 - 0.002, 3.0];
     let mut state = state_after(&scene, &[f64_step(&[2], &[position])]);
     assert_eq!(state.dirty_domains, DirtyDomains::Some(vec![2]));
@@ -177,7 +177,7 @@ fn distant_domain_has_its_own_floating_origin() {
 fn shared_origin_follows_the_majority_of_the_domains() {
     let scene = scene(5);
     let distant_positions = |shift: f64| [0.0, 1.0, 2.0, 3.0].map(|offset| [shift + offset, 0.25, -shift]);
-    // Two of five distant domains are outliers. Four of five move the shared origin.
+    // Of five domains, two distant ones become outliers; four distant ones move the shared origin.
     let steps = [f64_step(&[0, 1], &distant_positions(1e7)[..2]), f64_step(&[2, 3], &distant_positions(1e7)[2..])];
     let state = state_after(&scene, &steps[..1]);
     assert_eq!(
@@ -196,7 +196,7 @@ fn shared_origin_follows_the_majority_of_the_domains() {
         assert_eq!(state.origin_of(domain), [9766.0 * ORIGIN_GRID, 0.0, -9766.0 * ORIGIN_GRID]);
         assert_eq!(world_position(&state, domain), *expected);
     }
-    // Within reach, the shared origin remains. Beyond, it moves.
+    // The shared origin remains while the domains are within its reach, and moves when they are beyond it.
     state.apply(&scene, &parse_step(&scene, &f64_step(&[0, 1, 2, 3], &distant_positions(1e7 + 4000.0))));
     assert_eq!(
         (state.origin_of(0), &state.dirty_domains),

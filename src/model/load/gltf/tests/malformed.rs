@@ -19,18 +19,18 @@ fn complete_model() -> Model {
     let indices = model.add_accessor(bytemuck::cast_slice(&[0_u16, 1, 2]), U16, "SCALAR", 3);
     let target = model.add_floats("VEC3", 3, &[0.25; 9]);
     let sparse_indices = model.add_view(&[0, 2]);
-    let values = model.add_view(bytemuck::cast_slice(&[1.0_f32; 6]));
+    let sparse_values = model.add_view(bytemuck::cast_slice(&[1.0_f32; 6]));
     let sparse = json!({
         "componentType": F32, "type": "VEC3", "count": 3,
         "sparse": {
             "count": 2,
             "indices": {"bufferView": sparse_indices, "componentType": 5121},
-            "values": {"bufferView": values}
+            "values": {"bufferView": sparse_values}
         }
     });
-    let sparse = push(&mut model.json["accessors"], sparse);
+    let sparse_accessor = push(&mut model.json["accessors"], sparse);
     model.primitive()["indices"] = indices.into();
-    model.primitive()["targets"] = json!([{"POSITION": target}, {"POSITION": sparse}]);
+    model.primitive()["targets"] = json!([{"POSITION": target}, {"POSITION": sparse_accessor}]);
     model.json["meshes"][0]["weights"] = json!([0.5, 0.25]);
     push(&mut model.json["nodes"], json!({"children": [0], "translation": [1, 2, 3]}));
     model.with("/scenes/0/nodes", json!([1]))
@@ -179,9 +179,9 @@ fn mode_and_memory_limits_are_checked_before_allocation() {
     for (remaining_budget, is_enough) in [(100, false), (10_000, true)] {
         let buffers = GltfBuffers::load(&document, &folder, Some(&model.bin)).expect("valid buffers");
         buffers.charge_budget(MEMORY_BUDGET - remaining_budget).expect("within the budget");
-        let parts = assemble::assemble("model", &document, &buffers, ImportRemarks::default());
-        assert_eq!(parts.is_ok(), is_enough);
-        assert!(is_enough || parts.is_err_and(|error| error.to_string().contains("decoded size: expected at most")));
+        let result = assemble::assemble("model", &document, &buffers, ImportRemarks::default());
+        assert_eq!(result.is_ok(), is_enough);
+        assert!(is_enough || result.is_err_and(|error| error.to_string().contains("decoded size: expected at most")));
     }
 }
 
@@ -252,7 +252,7 @@ fn mutated_glb_never_causes_a_panic() {
     let glb = complete_model().to_glb();
     let digit_offsets: Vec<usize> = (20..glb.len()).filter(|offset| glb[*offset].is_ascii_digit()).collect();
     let mut random = XorShift(0x9E37_79B9_7F4A_7C15);
-    let (mut accepted, mut rejected) = (0, 0);
+    let (mut accepted_count, mut rejected_count) = (0, 0);
     for round in 0..6000 {
         let mut bytes = glb.clone();
         for _ in 0..=random.next_below(3) {
@@ -264,14 +264,17 @@ fn mutated_glb_never_causes_a_panic() {
         }
         match super::super::parse(&files, "mutant", &bytes) {
             Ok(parts) => {
-                accepted += 1;
+                accepted_count += 1;
                 // Validation must not panic either; its result does not matter.
                 let _ = Scene::new(parts);
             }
-            Err(_) => rejected += 1,
+            Err(_) => rejected_count += 1,
         }
     }
-    assert!(accepted > 300 && rejected > 300, "control: expected over 300 each, got {accepted} and {rejected}");
+    assert!(
+        accepted_count > 300 && rejected_count > 300,
+        "control: expected over 300 each, got {accepted_count} and {rejected_count}"
+    );
 }
 
 #[test]

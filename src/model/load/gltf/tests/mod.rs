@@ -112,17 +112,17 @@ fn morphed_triangle() -> Model {
     let mut model = Model::triangle();
     let dense = model.add_floats("VEC3", 3, &[0.0, 0.0, 1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 3.0]);
     let sparse_indices = model.add_view(&[2]);
-    let values = model.add_view(bytemuck::cast_slice(&[0.5_f32, -0.5, 0.25]));
+    let sparse_values = model.add_view(bytemuck::cast_slice(&[0.5_f32, -0.5, 0.25]));
     let sparse = json!({
         "componentType": F32, "type": "VEC3", "count": 3,
         "sparse": {
             "count": 1,
             "indices": {"bufferView": sparse_indices, "componentType": U8},
-            "values": {"bufferView": values}
+            "values": {"bufferView": sparse_values}
         }
     });
-    let sparse = push(&mut model.json["accessors"], sparse);
-    model.primitive()["targets"] = json!([{"POSITION": dense, "NORMAL": dense}, {"POSITION": sparse}]);
+    let sparse_accessor = push(&mut model.json["accessors"], sparse);
+    model.primitive()["targets"] = json!([{"POSITION": dense, "NORMAL": dense}, {"POSITION": sparse_accessor}]);
     model
 }
 
