@@ -81,8 +81,8 @@ impl Transform {
         self.to_matrix().try_inverse().map(|matrix| Self::from_matrix(&matrix))
     }
 
-    /// Whether A is a rotation or reflection times a uniform scale, within 1e-4 of the squared scale. Normals then
-    /// transform like directions.
+    /// Whether A is a rotation or reflection times a uniform scale s: A^T A deviates from s^2 I by at most 1e-4 s^2 per
+    /// entry. Normals then transform like directions.
     pub fn is_similarity(self) -> bool {
         let linear = self.linear();
         let gram = linear.transpose() * linear;

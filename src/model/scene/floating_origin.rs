@@ -94,7 +94,7 @@ impl FloatingOrigins {
         &self.translations
     }
 
-    /// Whether all domains use the shared origin.
+    /// Whether all domains use the shared origin, so that there are no outliers.
     pub const fn is_uniform(&self) -> bool {
         self.outlier_count == 0
     }
@@ -109,7 +109,8 @@ impl FloatingOrigins {
         }
     }
 
-    /// Replaces the translation of `transform` by the root's translation relative to its floating origin, rounded once.
+    /// Replaces the translation of `transform` by the root's stored translation, relative to its floating origin and
+    /// rounded once. The previous translation does not matter.
     pub(super) fn rebase_transform(&self, root: usize, mut transform: Transform) -> Transform {
         let relative_translation = subtract(self.translations[root], self.origin_of(root));
         for (row, coordinate) in transform.0.chunks_exact_mut(4).zip(relative_translation) {

@@ -31,7 +31,8 @@ pub struct SceneState {
     /// All coordinates, packed as in [`super::Layout`].
     pub q: Vec<f32>,
     /// `world_from_domain` of each transform root ([`super::TransformRoots`]), relative to its floating origin
-    /// ([`Self::origin_of`]). Before the first step with f64 translations, all floating origins are the scene's origin.
+    /// ([`Self::origin_of`]). Before the first step with f64 translations, every floating origin is the scene's origin;
+    /// [`FloatingOrigins`] chooses the later ones.
     pub transforms: Vec<Transform>,
     /// The f64 translations and floating origins. Present after the first step with f64 translations.
     pub origins: Option<Arc<FloatingOrigins>>,
@@ -67,7 +68,8 @@ impl SceneState {
 
     /// Applies a step. Domains that the step does not contain keep their values. The cost is proportional to the number
     /// of domains in the step, their followers, and the domains that share their q. The first step with f64
-    /// translations, and the rare steps that search for a new shared origin, also visit all transform roots.
+    /// translations also visits all transform roots. So do the rare later steps in which [`FloatingOrigins`] searches
+    /// for a floating origin that more roots can share.
     pub fn apply(&mut self, scene: &Scene, update: &StepUpdate) {
         self.step = update.number;
         self.time = update.time;
@@ -107,6 +109,7 @@ impl SceneState {
             }
             return false;
         };
+        // If all roots use the scene's origin, the transforms of other domains are relative to it already.
         let is_rebased = is_first_f64_step && !origins.is_uniform();
         for (domain, transform, translation) in update.transform_updates() {
             let root = transform_roots.root_of(domain);
@@ -115,6 +118,7 @@ impl SceneState {
         }
         let is_rebased = origins.update_shared_origin() || is_rebased;
         if is_rebased {
+            // Each transform gets its stored f64 translation relative to the floating origin of its root.
             for (root, transform) in self.transforms.iter_mut().enumerate() {
                 *transform = origins.rebase_transform(root, *transform);
             }
@@ -128,7 +132,8 @@ impl SceneState {
         self.origins.as_ref().map_or([0.0; 3], |origins| origins.origin_of(root))
     }
 
-    /// The transform of a domain's root, relative to the root's floating origin, and the frame of a follower.
+    /// The transform of a domain's root, relative to the root's floating origin, and, if the domain is a follower,
+    /// `root_from_domain`.
     pub fn composed_transform(&self, scene: &Scene, domain: usize) -> ComposedTransform {
         ComposedTransform {
             root: self.transforms[scene.transform_roots.root_of(domain)],
