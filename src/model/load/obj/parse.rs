@@ -115,7 +115,7 @@ struct Parser {
     /// Indices in [`ObjFile::materials`] by name.
     material_indices: HashMap<String, usize>,
     /// Number of statements per unsupported key.
-    unsupported_statement_counts: BTreeMap<String, usize>,
+    unsupported_counts: BTreeMap<String, usize>,
 }
 
 impl Parser {
@@ -135,9 +135,7 @@ impl Parser {
             b"mtllib" => self.obj.libraries.push(text_after_key(line)),
             // Groups and smoothing groups do not affect geometry: normals come from the file or are computed.
             b"o" | b"g" | b"s" => {}
-            other => {
-                *self.unsupported_statement_counts.entry(String::from_utf8_lossy(other).into_owned()).or_default() += 1
-            }
+            other => *self.unsupported_counts.entry(String::from_utf8_lossy(other).into_owned()).or_default() += 1,
         }
         Ok(())
     }
@@ -186,7 +184,7 @@ impl Parser {
     fn finish(mut self) -> Result<ObjFile> {
         self.obj.check_faces()?;
         let remark = |(key, count): (&String, &usize)| format!("{count} statements '{key}' are not used");
-        self.obj.remarks.extend(self.unsupported_statement_counts.iter().take(16).map(remark));
+        self.obj.remarks.extend(self.unsupported_counts.iter().take(16).map(remark));
         Ok(self.obj)
     }
 }
