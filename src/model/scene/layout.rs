@@ -23,7 +23,7 @@ pub struct DomainLayout {
     pub rank: usize,
 }
 
-/// The packed ranges of all domains and the totals.
+/// The packed ranges of all domains, and the total numbers of vertices, corners, triangles and coordinates.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Layout {
     pub domains: Vec<DomainLayout>,

@@ -69,6 +69,7 @@ pub struct SceneParts {
     pub unit: f64,
     /// World position of the scene's origin in meters. Transforms are relative to the scene's origin.
     pub origin: [f64; 3],
+    /// Lights, shadow, ground, sky and rasterization: the table `look` of a scene file.
     pub look: RenderSettings,
     pub deformation: DeformationSettings,
     /// Declares that no step will shear or non-uniformly scale a domain; a step that does is rejected.

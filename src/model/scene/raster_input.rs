@@ -70,7 +70,9 @@ pub enum CullMode {
 /// A contiguous range of triangles with one cull mode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DrawRange {
+    /// Index of the first triangle.
     pub first: u32,
+    /// Number of triangles.
     pub triangles: u32,
     pub cull_mode: CullMode,
 }
