@@ -28,7 +28,7 @@ const BAR: Rectangle = Rectangle { left: 26.0, top: 34.0, width: 278.0, height: 
 /// sRGB of text and ticks.
 const TEXT_COLOR: [u8; 3] = [0x1a; 3];
 
-/// Draws the legend into the lower left corner of RGBA8 pixels, top row first. An image smaller than [`MIN_SIZE`] remains
+/// Draws the legend into the lower left corner of RGBA8 pixels, top row first. An image smaller than `MIN_SIZE` remains
 /// unchanged.
 ///
 /// # Errors
