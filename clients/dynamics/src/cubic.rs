@@ -306,7 +306,7 @@ pub(crate) mod tests {
 
     #[test]
     #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-    fn vega_forces_are_gradients_and_vanish_at_rest() {
+    fn real_forces_are_gradients_and_vanish_at_rest() {
         for name in ["simpleBridge", "A"] {
             let path = data_folder().join(format!("vega/{name}/{name}.cub"));
             let force = ReducedForce::read(&path).expect("a valid file");
@@ -320,7 +320,7 @@ pub(crate) mod tests {
 
     #[test]
     #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-    fn lowest_frequency_of_the_bridge_file_is_one_hertz() {
+    fn real_bridge_file_has_lowest_frequency_of_one_hertz() {
         let path = data_folder().join("vega/simpleBridge/simpleBridge.cub");
         let force = ReducedForce::read(&path).expect("a valid file");
         let lowest_eigenvalue = force.rest_stiffness().clone().symmetric_eigenvalues().min();

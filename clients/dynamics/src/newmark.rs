@@ -408,7 +408,7 @@ mod tests {
 
     #[test]
     #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-    fn scaled_bridge_has_lowest_frequency_0_25_hz_and_stays_bounded() {
+    fn real_bridge_scaled_to_0_25_hz_stays_bounded() {
         let folder = data_folder().join("vega/simpleBridge");
         let force = ReducedForce::read(&folder.join("simpleBridge.cub")).expect("a readable file");
         let settings = VegaSettings::read(&folder.join("simpleBridge.config")).expect("a readable file");

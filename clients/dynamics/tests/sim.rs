@@ -212,7 +212,7 @@ fn vega_domain(name: &str) -> FakeDomain {
 
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-async fn vega_models_deflect_as_requested_and_stay_bounded() {
+async fn real_models_deflect_as_requested_and_stay_bounded() {
     for (name, expected_hertz) in [("simpleBridge", 0.25), ("A", 37.68 * 0.02)] {
         let url = serve(Arc::new(FakeServer::new(vec![vega_domain(name)]))).await;
         let files = vega_folder(name).display().to_string();
