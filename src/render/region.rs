@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn region_is_the_whole_frame_for_bounds_behind_the_eye_or_overflow() {
+    fn bounds_behind_the_eye_or_overflow_give_the_whole_frame() {
         let (bounds, _) = sample_cube([0.0; 3], 0.5);
         let whole = Region::whole(FRAME);
         let eye_inside = clip_from_world([0.1, 0.2, 0.3], [0.0; 3], &bounds);

@@ -14,6 +14,14 @@ type Variant = (Vec<&'static str>, (i32, i32));
 /// Macros of `deform` that are not features of a scene.
 const LAUNCHER_DEFINES: [&str; 1] = ["TILE_LIST"];
 
+/// The compute capability of the H200, which all tested variants are compiled for.
+const SM_90: (i32, i32) = (9, 0);
+
+/// The other capabilities, which only some variants are compiled for.
+fn other_capabilities() -> impl Iterator<Item = (i32, i32)> {
+    CAPABILITIES.into_iter().filter(|capability| *capability != SM_90)
+}
+
 /// The macros of each storage type of U; f32 has none.
 fn storage_variants() -> impl Iterator<Item = Vec<&'static str>> {
     std::iter::once(Vec::new()).chain(kernels::STORAGE_DEFINES.map(|storage| vec![storage]))
@@ -27,9 +35,8 @@ fn subsets(macros: &[&'static str]) -> Vec<Vec<&'static str>> {
 
 /// Tested variants of `deform`. All combinations of its features would take hours.
 fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
-    let sm_90 = (9, 0);
     let mut variants: Vec<Variant> =
-        features.iter().chain(&LAUNCHER_DEFINES).map(|feature| (vec![*feature], sm_90)).collect();
+        features.iter().chain(&LAUNCHER_DEFINES).map(|feature| (vec![*feature], SM_90)).collect();
     // The sum, the items per lane and the kind of normals determine most registers. Kernels for tile lists always have
     // one item per lane.
     let lane_defines: [&[&str]; 3] = [&[], &["ONE_ITEM_PER_LANE"], &["ONE_ITEM_PER_LANE", "TILE_LIST"]];
@@ -43,7 +50,7 @@ fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
         for (lane, normals) in
             lane_defines.iter().flat_map(|lane| normal_defines.iter().map(move |normals| (lane, normals)))
         {
-            variants.push(([sum, lane, normals, others].concat(), sm_90));
+            variants.push(([sum, lane, normals, others].concat(), SM_90));
         }
     };
     for others in subsets(&["DISPLACEMENTS", "FOLLOWERS"]) {
@@ -66,9 +73,9 @@ fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
     for storage in storage_variants() {
         let smallest = [&["MODES"], storage.as_slice()].concat();
         let largest = [features, &LAUNCHER_DEFINES, &storage].concat();
-        variants.push(([smallest.as_slice(), &["DISPLACEMENTS", "DISPLACEMENTS_ONLY"]].concat(), sm_90));
-        variants.push((largest.clone(), sm_90));
-        for capability in [(7, 5), (8, 0), (12, 0)] {
+        variants.push(([smallest.as_slice(), &["DISPLACEMENTS", "DISPLACEMENTS_ONLY"]].concat(), SM_90));
+        variants.push((largest.clone(), SM_90));
+        for capability in other_capabilities() {
             variants.extend([&smallest, &largest].map(|defines| (defines.clone(), capability)));
         }
     }
@@ -81,10 +88,9 @@ fn batch_variants(features: &[&'static str]) -> Vec<Variant> {
     let sm_90_variants = subsets(features)
         .into_iter()
         .filter(has_one_size)
-        .flat_map(|set| storage_variants().map(move |storage| ([set.clone(), storage].concat(), (9, 0))));
-    let other_variants = [(7, 5), (8, 0), (12, 0)]
-        .into_iter()
-        .flat_map(|capability| storage_variants().map(move |storage| (storage, capability)));
+        .flat_map(|set| storage_variants().map(move |storage| ([set.clone(), storage].concat(), SM_90)));
+    let other_variants =
+        other_capabilities().flat_map(|capability| storage_variants().map(move |storage| (storage, capability)));
     sm_90_variants.chain(other_variants).collect()
 }
 
@@ -166,7 +172,7 @@ const ALTERNATIVES: [(&str, &str); 5] = [
 #[ignore = "needs NVRTC: deploy/check installs it"]
 fn nvrtc_omits_the_code_of_unused_features() {
     for kernel in kernels::KERNELS {
-        let cubin_bytes = |defines: &[&'static str]| compile(&kernel, defines, (9, 0)).cubin.len();
+        let cubin_bytes = |defines: &[&'static str]| compile(&kernel, defines, SM_90).cubin.len();
         assert_eq!(cubin_bytes(&["UNKNOWN"]), cubin_bytes(&[]), "expected an unknown macro to change nothing");
         for feature in kernel.features.iter().filter(|feature| !ALTERNATIVES.contains(&(kernel.name, feature))) {
             let is_feature =

@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn overflowed_bounds_are_replaced_and_overflowed_cameras_rejected() {
+    fn overflowed_bounds_are_replaced_overflowed_cameras_rejected() {
         let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
         let mut params = FrameParams {
             camera: Camera::fit_to_scene(&scene, 64, 64),

@@ -7,7 +7,7 @@ use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{BoundingBox, Camera, Culling, RenderSettings, Scene, Transparency};
 use modalcast_render::{FrameParams, Renderer, SceneBuffers, VisibilityId};
 
-use super::harness::{SceneBuilder, facing_rectangle, front_camera, open_renderer};
+use super::harness::{SceneBuilder, colored_material, facing_rectangle, front_camera, glass_material, open_renderer};
 
 const SIZE: u32 = 96;
 
@@ -15,18 +15,11 @@ const SIZE: u32 = 96;
 fn test_scene(modify: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
     let mut builder = SceneBuilder::new();
     modify(&mut builder.parts.look);
-    let cut_out_image = builder.add_texture(8, 8, |x, y| [200, 220, 90, if (x + y) % 2 == 0 { 255 } else { 0 }]);
-    let colored_material = |diffuse: [f32; 3]| Material { diffuse, double_sided: true, ..Material::default() };
-    let glass_material = Material { alpha_mode: AlphaMode::Blend, alpha: 0.4, ..colored_material([0.2, 0.9, 0.3]) };
-    let leaf_material = Material {
-        alpha_mode: AlphaMode::Mask { cutoff: 0.5 },
-        color_texture: Some(cut_out_image),
-        ..colored_material([1.0; 3])
-    };
+    let leaf_material = builder.create_leaf_material();
     let builder = builder.add_domain(facing_rectangle(-1.0, -1.0, 0.3, 0.3, -0.5), colored_material([0.9, 0.2, 0.2]));
     builder
         .add_domain(facing_rectangle(-0.4, -0.6, 0.9, 0.7, 0.0), leaf_material)
-        .add_domain(facing_rectangle(0.0, 0.0, 1.0, 1.0, 0.5), glass_material)
+        .add_domain(facing_rectangle(0.0, 0.0, 1.0, 1.0, 0.5), glass_material())
         .build()
 }
 

@@ -3,13 +3,12 @@
 use std::sync::Arc;
 
 use modalcast_model::deform::DeformedSurface;
-use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{
     Bloom, Camera, Culling, Ground, Lens, RenderSettings, Scene, ShadowSettings, Transparency, View,
 };
 use modalcast_render::{FrameParams, Pass, Renderer, VisibilityId};
 
-use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, open_renderer};
+use super::harness::{SceneBuilder, colored_material, facing_rectangle, floor_mesh, glass_material, open_renderer};
 
 const SIZE: u32 = 96;
 
@@ -21,19 +20,12 @@ fn test_scene(modify: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
     look.sun = [2.0, 3.0, 1.0];
     look.ground = Some(Ground { color: [0.5, 0.4, 0.3] });
     modify(look);
-    let cut_out_image = builder.add_texture(8, 8, |x, y| [200, 220, 90, if (x + y) % 2 == 0 { 255 } else { 0 }]);
-    let colored_material = |diffuse: [f32; 3]| Material { diffuse, double_sided: true, ..Material::default() };
-    let glass_material = Material { alpha_mode: AlphaMode::Blend, alpha: 0.4, ..colored_material([0.2, 0.9, 0.3]) };
-    let leaf_material = Material {
-        alpha_mode: AlphaMode::Mask { cutoff: 0.5 },
-        color_texture: Some(cut_out_image),
-        ..colored_material([1.0; 3])
-    };
+    let leaf_material = builder.create_leaf_material();
     let builder = builder
         .add_domain(floor_mesh(1.5, 0.0), colored_material([0.9, 0.2, 0.2]))
         .add_domain(facing_rectangle(-2.0, 0.0, -0.5, 1.5, -0.3), colored_material([0.4; 3]));
     builder
-        .add_domain(facing_rectangle(-1.0, 0.0, 2.5, 1.0, 0.8), glass_material)
+        .add_domain(facing_rectangle(-1.0, 0.0, 2.5, 1.0, 0.8), glass_material())
         .add_domain(facing_rectangle(0.5, 1.1, 1.5, 2.1, 0.0), leaf_material)
         .build()
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformSummary, Deformer as _};
-use modalcast_model::domain::{Domain, Material, Mesh, Modes, Shape, Texture};
+use modalcast_model::domain::{AlphaMode, Domain, Material, Mesh, Modes, Shape, Texture};
 use modalcast_model::scene::{Camera, Lens, Scene, SceneParts, SceneState, View};
 use modalcast_render::{Allocation, DevicePreference, FrameImage, FrameParams, FrameStats, Pass, Renderer, plan};
 
@@ -18,6 +18,16 @@ pub(super) struct RenderedFrame {
     pub(super) image: FrameImage,
     pub(super) stats: FrameStats,
     pub(super) allocations: Vec<Allocation>,
+}
+
+/// A double-sided opaque material without texture.
+pub(super) fn colored_material(diffuse: [f32; 3]) -> Material {
+    Material { diffuse, double_sided: true, ..Material::default() }
+}
+
+/// A green blended material.
+pub(super) fn glass_material() -> Material {
+    Material { alpha_mode: AlphaMode::Blend, alpha: 0.4, ..colored_material([0.2, 0.9, 0.3]) }
 }
 
 impl SceneBuilder {
@@ -38,6 +48,13 @@ impl SceneBuilder {
         let rgba = (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).flat_map(|(x, y)| pixel(x, y)).collect();
         self.parts.textures.push(Texture::new("test", width, height, rgba).expect("expected a valid texture"));
         self.parts.textures.len() - 1
+    }
+
+    /// Adds a texture of 8 x 8 pixels with alpha in a checkerboard pattern. Returns a cut-out material with it.
+    pub(super) fn create_leaf_material(&mut self) -> Material {
+        let image = self.add_texture(8, 8, |x, y| [200, 220, 90, if (x + y) % 2 == 0 { 255 } else { 0 }]);
+        let alpha_mode = AlphaMode::Mask { cutoff: 0.5 };
+        Material { alpha_mode, color_texture: Some(image), ..colored_material([1.0; 3]) }
     }
 
     /// Adds a rigid domain with a new shape and a new material.

@@ -16,7 +16,7 @@ use crate::scenes;
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_memory_rates_are_plausible_and_time_empty_kernel_takes_time() {
+fn gpu_memory_rates_are_plausible_and_empty_kernels_take_time() {
     let device = Device::open(0).expect("expected a CUDA device");
     let bandwidths = measure_bandwidth(&device).expect("memory bandwidths");
     eprintln!("{}: {bandwidths:?}", device.name());
