@@ -13,7 +13,7 @@ fn main() {
         collect_files(Path::new(source), &mut paths);
     }
     paths.sort();
-    // FNV-1a, 64 bits.
+    // The hash FNV-1a, 64 bits, with its standard offset basis and prime.
     let hash = paths
         .iter()
         .flat_map(|path| fs::read(path).unwrap_or_default())

@@ -13,7 +13,7 @@ require_packages() {
         dpkg-query -W -f '${Status}' "$package" 2>/dev/null | grep -q 'ok installed' || missing+=("$package")
     done
     [ ${#missing[@]} -eq 0 ] && return
-    command -v apt-get >/dev/null || fail "missing packages (names of Debian): ${missing[*]}"
+    command -v apt-get >/dev/null || fail "missing packages (Debian names): ${missing[*]}"
     [ "$(id -u)" -eq 0 ] || fail "missing packages. Install them with: sudo apt-get install ${missing[*]}"
     say "Installing ${missing[*]}"
     apt-get update -qq

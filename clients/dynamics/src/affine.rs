@@ -66,9 +66,12 @@ pub fn fit_rigid_transform(rest: &[Vector3<f64>], current: &[Vector3<f64>]) -> A
 
 /// The proper rotation nearest to a 3x3 correlation matrix; the identity if two of its singular values vanish.
 fn nearest_rotation(correlation: &Matrix3<f64>) -> Matrix3<f64> {
-    let svd = correlation.svd(true, true);
+    let (compute_u, compute_v) = (true, true);
+    let svd = correlation.svd(compute_u, compute_v);
     let (Some(left), Some(right)) = (svd.u, svd.v_t) else { return Matrix3::identity() };
     let singular_values = svd.singular_values;
+    // Singular values are sums of squared distances. With this tolerance, points count as collinear if they are more
+    // than 3e4 times as long as wide.
     let has_rank_two = singular_values[0].is_normal() && singular_values[1] > 1e-9 * singular_values[0];
     if !has_rank_two {
         return Matrix3::identity();

@@ -1,8 +1,8 @@
 //! A bridge under a pulsating load: reduced StVK forces, integrated by implicit Newmark.
 //!
-//! The load acts on the middle of the bridge, spread evenly over the samples there. Its strength is calibrated so that
-//! the deflection at equilibrium is a given fraction of the diagonal of the scene's rest bounds. The run starts at
-//! this equilibrium. The load then pulsates as (1 + cos) / 2.
+//! The load acts on the middle of the bridge, spread evenly over the sampled vertices there. Its strength is calibrated
+//! so that the deflection at equilibrium is a given fraction of the diagonal of the scene's rest bounds. The run starts
+//! at this equilibrium. The load then pulsates as (1 + cos) / 2.
 
 use std::f64::consts::TAU;
 
@@ -203,8 +203,8 @@ fn max_sample_displacement(domain: &DomainModel, q: &DVector<f64>) -> f64 {
     domain.samples.iter().map(|sample| sample.displacement(q.as_slice()).norm()).fold(0.0, f64::max)
 }
 
-/// Finds the strength of the load whose equilibrium has the target deflection (scene units). The load is increased in
-/// steps, each solved from the previous equilibrium, and then bisected.
+/// Finds the strength of the load whose equilibrium has the target deflection (scene units). Increases the strength
+/// until the deflection reaches the target, then bisects. Each solve starts from the equilibrium of a smaller load.
 fn calibrate_load(
     system: &ReducedSystem,
     domain: &DomainModel,
@@ -223,6 +223,7 @@ fn calibrate_load(
     }
     let (mut low_strength, mut high_strength) = (0.0, 0.1 * target_deflection / probe_deflection * probe_strength);
     let (mut q_low, mut q_high) = (rest_q.clone(), rest_q);
+    // 60 increases multiply the strength by up to 1.3^60, about 7 million.
     for _ in 0..60 {
         q_high = solve(high_strength, &q_low);
         if max_sample_displacement(domain, &q_high) >= target_deflection {
@@ -231,6 +232,7 @@ fn calibrate_load(
         (low_strength, q_low) = (high_strength, q_high.clone());
         high_strength *= 1.3;
     }
+    // 40 bisections reduce the interval by a factor of 1e12.
     for _ in 0..40 {
         let middle_strength = 0.5 * (low_strength + high_strength);
         let q = solve(middle_strength, &q_low);
@@ -252,7 +254,8 @@ mod tests {
     const OPTIONS: BridgeOptions =
         BridgeOptions { dt: 1.0 / 60.0, deflection_fraction: 0.03, period: 2.0, load_direction: LoadDirection::Across };
 
-    /// A bridge whose deforming domain has two modes, like the force.
+    /// A bridge whose deforming domain has two modes, as many as the force: two springs with the eigenvalues 40 and 90
+    /// (rad/s)^2, coupled by a quartic (30) and a cubic (4) potential.
     fn two_mode_bridge() -> BridgeScenario {
         let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);
         BridgeScenario::new(four_domain_model(), force, &VegaSettings::default(), OPTIONS).expect("a valid scenario")
@@ -265,6 +268,7 @@ mod tests {
         assert!((deflection - 0.03).abs() <= 1e-6, "expected 0.03, got {deflection}");
         let (mut first_values, mut last_values) = (StepValues::default(), StepValues::default());
         bridge.compute_next_step(&mut first_values).expect("the first step");
+        // The first step is the equilibrium. Its coordinates are rounded to f32.
         assert!(bridge.peak_displacement / bridge.model.diagonal() >= 0.0299);
         (0..40).for_each(|_| bridge.compute_next_step(&mut last_values).expect("the next step"));
         assert!(first_values.q != last_values.q && first_values.transforms == last_values.transforms);

@@ -45,7 +45,7 @@ pub(crate) enum Command {
         #[command(flatten)]
         load: LoadOptions,
     },
-    /// Moves one coordinate after another; rocks a rigid scene.
+    /// Moves one coordinate after another; rocks a scene without coordinates.
     #[command(after_help = EXAMPLES)]
     Sweep {
         #[command(flatten)]

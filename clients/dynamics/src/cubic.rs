@@ -173,7 +173,7 @@ fn monomial_counts(rank: usize) -> Option<[usize; 3]> {
 pub(crate) mod tests {
     use super::*;
 
-    /// Pseudorandom numbers from -1 to 1, the same for the same seed.
+    /// Pseudorandom numbers from -1 to 1, the same for the same seed (Knuth's linear congruential generator MMIX).
     pub(crate) fn random_vector(seed: u64, count: usize) -> DVector<f64> {
         let mut state = seed;
         DVector::from_fn(count, |_, _| {
@@ -260,6 +260,7 @@ pub(crate) mod tests {
             let q = random_vector(seed, 4);
             let JacobianErrors { difference, asymmetry } = jacobian_errors(&force, &q);
             assert!(difference <= 1e-8 && asymmetry <= 1e-14, "difference {difference}, asymmetry {asymmetry}");
+            // Euler's theorem, without the homogeneous terms: the derivative of V along q is q . f(q).
             let slope = (force.potential(&(&q * (1.0 + 1e-6))) - force.potential(&(&q * (1.0 - 1e-6)))) / 2e-6;
             assert!((slope - q.dot(&force.force(&q))).abs() <= 1e-6 * slope.abs().max(1.0), "{slope}");
         }
@@ -273,6 +274,7 @@ pub(crate) mod tests {
     #[test]
     fn truncated_oversized_and_invalid_files_are_rejected() {
         let valid_file = encode_file(&spring_chain(&[1.0, 2.0], 0.1, 0.1));
+        // The header has r in bytes 0 to 3, then the three counts in bytes 4 to 7, 8 to 11 and 12 to 15.
         let replace_byte = |index: usize, byte: u8| {
             let mut bytes = valid_file.clone();
             bytes[index] = byte;

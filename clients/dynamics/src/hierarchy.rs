@@ -42,8 +42,8 @@ fn deformed_attachment(parent: &DomainModel, joint: &Joint, q: &[f64]) -> Affine
     fit_rigid_transform(&rest, &current).compose(&joint.parent_from_child)
 }
 
-/// Measures how far joints open. It compares the distances between a child's base vertex and the attachment vertices of
-/// its parent with the same distances at rest.
+/// Measures how far joints open: by how much the distances between a child's base vertex and the attachment vertices of
+/// its parent differ from their values at rest. The base vertex is the vertex nearest to the domain's origin.
 #[derive(Debug, Clone)]
 pub struct JointGapMeter {
     /// Distances at rest, per domain and attachment vertex.
@@ -66,8 +66,8 @@ impl JointGapMeter {
     }
 }
 
-/// Per domain: the distances between its base and the attachment vertices of its parent. Without attachment vertices:
-/// the distance between its base and the position that `parent_from_child` gives.
+/// Per domain: the distances between its base vertex and the attachment vertices of its parent. Without attachment
+/// vertices: the distance between its base vertex and the place of this vertex according to `parent_from_child`.
 fn joint_distances(model: &Model, q: &[f64], world_from_domain: &[AffineTransform]) -> Vec<Vec<f64>> {
     let domain_distances = |(domain, transform): (&DomainModel, &AffineTransform)| {
         let Some(joint) = &domain.joint else { return vec![] };
@@ -133,6 +133,7 @@ pub(crate) mod tests {
     pub(crate) fn four_domain_model() -> Model {
         let tilt = AffineTransform::rotation_about(&Vector3::z(), -0.9, &Vector3::zeros());
         let parent_from_child = AffineTransform { translation: Vector3::y(), ..tilt };
+        // The last of the five sections has the vertices 24 to 29.
         let joint = |parent| Some(Joint { parent, parent_from_child, attachment_samples: (24..30).collect() });
         let mut domains = vec![beam(0.05, None, AffineTransform::identity(), 0)];
         for parent in 0..2 {

@@ -63,7 +63,7 @@ async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
         // The first signal ends the run after the current step. A later Ctrl-C exits at once, even if the server
         // stalls.
         if tokio::signal::ctrl_c().await.is_ok() {
-            std::process::exit(130);
+            std::process::exit(130); // The convention for a program that SIGINT (signal 2) ends: 128 + 2.
         }
     });
     let options = RunOptions {
@@ -148,8 +148,8 @@ fn create_bridge_scenario(model: Model, files: &ForceFileOptions, options: Bridg
     Ok(Box::new(BridgeScenario::new(model, ReducedForce::read(&force_path)?, &settings, options)?))
 }
 
-/// Finds the file of reduced forces. It is the first of these that is given: `--cubic`, the file in `--files` that the
-/// note `vega.cubic` of a domain names, and the only .cub file in `--files`.
+/// Finds the file of reduced forces: the file of `--cubic`, else the file in `--files` that the note `vega.cubic` of a
+/// domain names, else the only .cub file in `--files`. `None` if there is no file or the choice is not unique.
 fn find_force_file(model: &Model, files: &ForceFileOptions) -> Option<PathBuf> {
     if let Some(path) = &files.cubic {
         return Some(path.clone());

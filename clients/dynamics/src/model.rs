@@ -11,10 +11,11 @@ use nalgebra::Vector3;
 use crate::affine::AffineTransform;
 use crate::error::{Result, invalid_input};
 
-/// Maximum number of entries of U that the surface samples of all domains have together.
+/// Maximum number of entries of U in the surface samples of all domains together: 64 MiB of f64.
 const MAX_MODE_ENTRIES: usize = 8 << 20;
 
-/// Number of surface samples per domain that `MAX_MODE_ENTRIES` does not reduce. A smaller domain has all its vertices.
+/// Minimum number of surface samples per domain, even if `MAX_MODE_ENTRIES` is exceeded. A domain with fewer vertices
+/// has all of them as samples.
 const MIN_SURFACE_SAMPLES: usize = 8;
 
 /// A vertex at which the dynamics measures displacements or applies loads.
@@ -44,7 +45,7 @@ pub struct DomainModel {
     /// Index of the domain's first coordinate in the vector of all coordinates. Domains that share coordinates have the
     /// same index.
     pub first_coordinate: usize,
-    /// Whether steps carry the coordinates of this domain. False if it shares those of an earlier domain.
+    /// Whether steps carry coordinates for this domain. False if it shares the coordinates of an earlier domain.
     pub owns_q: bool,
     /// `world_from_domain` at rest.
     pub placement: AffineTransform,
@@ -93,12 +94,12 @@ impl Sample {
         Vector3::from_fn(|component, _| self.row(component, q.len()).iter().zip(q).map(|(entry, q)| entry * q).sum())
     }
 
-    /// One row of U.
+    /// The row of U of one component (0, 1, 2 for x, y, z) of this vertex.
     pub fn row(&self, component: usize, rank: usize) -> &[f64] {
         &self.mode_rows[component * rank..][..rank]
     }
 
-    /// One column of the three rows of U.
+    /// The displacement of this vertex per unit of one coordinate: a column of the three rows of U.
     pub fn column(&self, mode: usize, rank: usize) -> Vector3<f64> {
         Vector3::from_fn(|component, _| self.mode_rows[component * rank + mode])
     }
@@ -127,8 +128,8 @@ impl DomainModel {
 }
 
 impl Model {
-    /// Reads a scene from its server. `max_surface_samples` limits the surface samples per domain. The limit is
-    /// reduced, to no less than 8, so that the surface samples of all domains have at most 8 Mi entries of U.
+    /// Reads a scene from its server. `max_surface_samples` limits the surface samples per domain. A lower limit, but at
+    /// least 8, applies if the samples of all domains would have more than 8 Mi entries of U.
     ///
     /// # Errors
     /// `Client` as for the calls; `Invalid` if the description contradicts itself.
@@ -315,7 +316,7 @@ fn create_samples(domain: &Domain, selection: &SelectedVertices, mode_rows: Opti
     selection.vertices.iter().enumerate().map(sample).collect()
 }
 
-/// Creates the model of a domain without a joint, as if its coordinates were the first of the scene.
+/// Creates the model of a domain. The caller sets `joint`, `first_coordinate` and `owns_q`.
 fn create_domain_model(domain: &Domain, selection: &SelectedVertices, samples: Vec<Sample>) -> DomainModel {
     let base_vertex = (!samples.is_empty()).then(|| base_vertex(domain));
     DomainModel {

@@ -30,8 +30,15 @@ const MAX_NEWTON_STEPS: usize = 60;
 /// Maximum number of step lengths that a line search tries. Each is half of the previous one.
 const MAX_LINE_SEARCH_STEPS: usize = 50;
 
-/// Maximum energy error, as a fraction of the highest energy so far.
+/// Maximum energy error, as a fraction of the highest energy so far. See the module documentation.
 const ENERGY_TOLERANCE: f64 = 0.02;
+
+/// Constant c1 of Armijo's condition for a sufficient decrease. 1e-4 is its usual value (Nocedal and Wright, Numerical
+/// Optimization, 3.1).
+const ARMIJO_CONSTANT: f64 = 1e-4;
+
+/// Relative changes below this value are rounding errors: some hundred times the precision of f64.
+const ROUNDING_TOLERANCE: f64 = 1e-13;
 
 /// The reduced equations of motion: r coordinates, unit mass.
 #[derive(Debug, Clone)]
@@ -210,19 +217,19 @@ impl ReducedSystem {
             }
             // Near the minimum, rounding hides the decrease, so a point with a smaller gradient is also accepted.
             let inertial_scale = objective.inertia_coefficient * (&q - &objective.predicted_q).norm_squared();
-            let rounding_error = 1e-13 * (objective_value.abs() + inertial_scale);
+            let rounding_error = ROUNDING_TOLERANCE * (objective_value.abs() + inertial_scale);
             let mut step_length = 1.0;
             let accepted_point = (0..MAX_LINE_SEARCH_STEPS).find_map(|_| {
                 let next_q = &q + &direction * step_length;
                 let next_objective_value = self.objective_value(objective, &next_q);
-                let satisfies_armijo = next_objective_value <= objective_value + 1e-4 * step_length * slope;
+                let satisfies_armijo = next_objective_value <= objective_value + ARMIJO_CONSTANT * step_length * slope;
                 let reduces_gradient = next_objective_value <= objective_value + rounding_error
                     && self.objective_gradient(objective, &next_q).norm() < gradient.norm();
                 step_length *= 0.5;
                 (satisfies_armijo || reduces_gradient).then_some((next_q, next_objective_value))
             });
             let Some((next_q, next_objective_value)) = accepted_point else { return q };
-            let has_converged = (&next_q - &q).norm() <= 1e-13 * next_q.norm().max(f64::MIN_POSITIVE);
+            let has_converged = (&next_q - &q).norm() <= ROUNDING_TOLERANCE * next_q.norm().max(f64::MIN_POSITIVE);
             (q, objective_value) = (next_q, next_objective_value);
             if has_converged {
                 return q;
@@ -263,6 +270,7 @@ impl ReducedSystem {
         let stiffness = (&jacobian + jacobian.transpose()) * (0.5 * self.scale);
         let hessian =
             &identity * objective.inertia_coefficient + &self.damping * objective.velocity_coefficient + stiffness;
+        // The shift grows from 1e-6 of the largest entry by a factor of 10 per attempt.
         let mut shift = 0.0;
         for _ in 0..40 {
             if let Some(cholesky) = Cholesky::new(&hessian + &identity * shift) {
@@ -292,14 +300,19 @@ mod tests {
         ReducedSystem::new(force, &VegaSettings::default()).expect("a positive definite stiffness")
     }
 
-    /// Deflects and releases two coupled hardening springs. Returns the system and its state after `steps_per_second`
-    /// steps, which is one second.
+    /// Two springs with the eigenvalues 40 and 90 (rad/s)^2. A quartic potential (30) couples and hardens them, a cubic
+    /// one (4) makes them asymmetric.
+    fn two_springs() -> ReducedForce {
+        spring_chain(&[40.0, 90.0], 30.0, 4.0)
+    }
+
+    /// Deflects and releases [`two_springs`]. Returns the system and its state after one second.
     fn simulate_release(steps_per_second: u32) -> (ReducedSystem, NewmarkState) {
-        let system = undamped_system(spring_chain(&[40.0, 90.0], 30.0, 4.0));
+        let system = undamped_system(two_springs());
         let no_load = DVector::zeros(2);
         let dt = 1.0 / f64::from(steps_per_second);
         let mut state = system.static_state(DVector::from_column_slice(&[0.8, -0.3]));
-        // The load of this equilibrium is released, so the initial acceleration is -f(q).
+        // The load that holds this state is released, so the initial acceleration is -f(q).
         state.a = -system.force.force(&state.q);
         let final_state =
             (0..steps_per_second).fold(state, |state, _| system.advance(&state, dt, constant_load(&no_load)));
@@ -326,8 +339,7 @@ mod tests {
             system.energy(&final_state) / initial_energy
         );
         let settings = VegaSettings { damping_mass: 0.5, damping_stiffness: 0.01, ..VegaSettings::default() };
-        let damped_system = ReducedSystem::new(spring_chain(&[40.0, 90.0], 30.0, 4.0), &settings)
-            .expect("a positive definite stiffness");
+        let damped_system = ReducedSystem::new(two_springs(), &settings).expect("a positive definite stiffness");
         let no_load = DVector::zeros(2);
         let mut state = damped_system.static_state(DVector::from_column_slice(&[0.8, -0.3]));
         for _ in 0..2000 {
@@ -341,8 +353,7 @@ mod tests {
     #[test]
     fn steady_load_converges_to_the_equilibrium() {
         let settings = VegaSettings { damping_mass: 4.0, ..VegaSettings::default() };
-        let system = ReducedSystem::new(spring_chain(&[40.0, 90.0], 30.0, 4.0), &settings)
-            .expect("a positive definite stiffness");
+        let system = ReducedSystem::new(two_springs(), &settings).expect("a positive definite stiffness");
         let load = DVector::from_column_slice(&[12.0, -3.0]);
         let equilibrium = system.solve_equilibrium(&load, &DVector::zeros(2));
         assert!((system.force.force(&equilibrium) - &load).norm() <= 1e-9);
@@ -359,9 +370,10 @@ mod tests {
         let eigenvalues: Vec<f64> = hertz.iter().map(|hertz| eigenvalue(*hertz)).collect();
         let system = undamped_system(spring_chain(&eigenvalues, 1e3, 0.2));
         for dt in [1e-3, 0.05, 1.0, 10.0] {
+            // Explicit (central difference) integration is stable for omega dt < 2.
             assert!(
                 dt * eigenvalues[4].sqrt() > 2.0 * 10.0,
-                "the step must exceed the stability limit of explicit integration"
+                "control: expected ten times the stability limit of explicit integration"
             );
             let load = |step: u32| random_vector(u64::from(step), 5) * 0.5;
             let (mut state, mut work) = (system.rest_state(), 0.0_f64);
@@ -413,6 +425,7 @@ mod tests {
         let force = ReducedForce::read(&folder.join("simpleBridge.cub")).expect("a readable file");
         let settings = VegaSettings::read(&folder.join("simpleBridge.config")).expect("a readable file");
         let system = ReducedSystem::new(force, &settings).expect("a positive definite stiffness");
+        // The lowest frequency of the .cub file is 1 Hz, and the .config file has the base frequency 0.25.
         assert!((system.frequencies()[0] - 0.25).abs() <= 2.5e-4, "{:?}", system.frequencies());
         for dt in [1.0 / 60.0, 1.0, 20.0] {
             let peak_load = random_vector(3, 20) * 5.0;

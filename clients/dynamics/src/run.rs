@@ -103,6 +103,7 @@ pub async fn drive_scene(
         scenario.compute_next_step(&mut current_values)?;
         let time = step_number as f64 * options.dt;
         if options.realtime {
+            // Adding `Duration::MAX` itself would overflow.
             let due_time = start + Duration::try_from_secs_f64(time).unwrap_or(Duration::MAX / 4);
             tokio::time::sleep_until(due_time.into()).await;
         }
@@ -247,7 +248,7 @@ mod tests {
     use crate::hierarchy::tests::four_domain_model;
 
     #[test]
-    fn first_step_sends_all_values_and_later_steps_changes() {
+    fn later_steps_send_only_changed_values() {
         let model = four_domain_model();
         let rest_values = StepValues { q: vec![0.0; 6], transforms: vec![[0.0; 12]; 4] };
         let encode_step = |last_sent_values, current_values| {
@@ -255,8 +256,10 @@ mod tests {
         };
         let all_values = encode_step(None, &rest_values);
         assert_eq!((all_values.q_domains, all_values.transform_domains), (vec![0, 1, 2], vec![0, 1, 2, 3]));
-        assert_eq!((all_values.q.len(), all_values.transforms.len()), (24, 192));
+        // Six coordinates and four 3x4 matrices in f32.
+        assert_eq!((all_values.q.len(), all_values.transforms.len()), (6 * 4, 4 * 48));
         let mut changed_values = rest_values.clone();
+        // Coordinate 3 belongs to domain 1.
         (changed_values.q[3], changed_values.transforms[3][7]) = (1.0, 2.0);
         let changes = encode_step(Some(&rest_values), &changed_values);
         assert_eq!((changes.q_domains, changes.transform_domains), (vec![1], vec![3]));

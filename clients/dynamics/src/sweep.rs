@@ -64,8 +64,9 @@ impl SweepScenario {
         Self { model, options, steps_per_coordinate, amplitudes, next_step: 0, peak_displacement: 0.0 }
     }
 
-    /// The sine of a coordinate at `coordinate_step` (0 to `steps_per_coordinate` - 1), divided by the largest value
-    /// that it has at any step.
+    /// The sine of a coordinate at `coordinate_step` (0 to `steps_per_coordinate` - 1), divided by its largest value at
+    /// any step. The sine is evaluated in the middle of each step. With one step per coordinate it is 0 there, and the
+    /// result is 1.
     fn normalized_sine(&self, coordinate_step: u64) -> f64 {
         let sine_at = |step: u64| (TAU * (step as f64 + 0.5) / self.steps_per_coordinate as f64).sin();
         let max_sine = (0..self.steps_per_coordinate).map(sine_at).fold(0.0, f64::max);

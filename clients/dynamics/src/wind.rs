@@ -14,7 +14,8 @@ struct Gust {
     amplitude: f64,
 }
 
-/// The gusts. Their periods have no simple ratios, so that the sum repeats only after a long time.
+/// The gusts; their amplitudes add up to 1. Their periods have no simple ratios, so that the sum repeats only after a
+/// long time.
 const GUSTS: [Gust; 5] = [
     Gust { period: 0.83, amplitude: 0.30 },
     Gust { period: 1.31, amplitude: 0.30 },
@@ -22,6 +23,12 @@ const GUSTS: [Gust; 5] = [
     Gust { period: 3.71, amplitude: 0.12 },
     Gust { period: 6.43, amplitude: 0.06 },
 ];
+
+/// The downwind channel of [`Wind::turbulence`].
+pub const DOWNWIND_CHANNEL: u64 = 0;
+
+/// The crosswind channel of [`Wind::turbulence`].
+pub const CROSSWIND_CHANNEL: u64 = 1;
 
 /// Time at which all gusts peak together at distance 0, in seconds.
 const PEAK_TIME: f64 = 0.55;
@@ -51,21 +58,23 @@ pub struct WindPressure {
 
 impl Wind {
     /// The pressure at `time` (seconds) on a domain. `downwind_position` is the domain's position along the wind, in
-    /// scene units. The pressure is 0 at time 0.
+    /// scene units. The pressure is 0 at time 0. Its downwind component consists of a steady part (0.55), gusts (at most
+    /// 0.45) and turbulence (at most 0.15).
     pub fn pressure(&self, time: f64, domain: usize, downwind_position: f64) -> WindPressure {
         let onset_factor = smoothstep(time / RISE_TIME);
         let gust_time = time - PEAK_TIME - self.delay_per_length * downwind_position;
         let gust_sum: f64 = GUSTS.iter().map(|gust| gust.amplitude * (TAU * gust_time / gust.period).cos()).sum();
         WindPressure {
-            downwind: onset_factor * (0.55 + 0.45 * gust_sum + 0.15 * self.turbulence(time, domain, 0)),
-            crosswind: onset_factor * 0.25 * self.turbulence(time, domain, 1),
+            downwind: onset_factor * (0.55 + 0.45 * gust_sum + 0.15 * self.turbulence(time, domain, DOWNWIND_CHANNEL)),
+            crosswind: onset_factor * 0.25 * self.turbulence(time, domain, CROSSWIND_CHANNEL),
         }
     }
 
     /// Turbulence from -1 to 1: the mean of three sines. Their frequencies (0.3 to 2 Hz) and phases are random per
-    /// domain and channel. Channel 0 is downwind, channel 1 crosswind.
+    /// domain and channel ([`DOWNWIND_CHANNEL`] or [`CROSSWIND_CHANNEL`]).
     pub fn turbulence(&self, time: f64, domain: usize, channel: u64) -> f64 {
         let sine = |index: u64| {
+            // A different counter for each domain, channel and sine, and for its frequency and phase.
             let counter = (domain as u64) * 16 + channel * 8 + 2 * index;
             let hertz = 0.3 + 1.7 * hash_to_unit(self.seed, counter);
             (TAU * (hertz * time + hash_to_unit(self.seed, counter + 1))).sin()
@@ -106,6 +115,7 @@ mod tests {
             assert_ne!(pressure, other_wind.pressure(time, 3, 0.5), "seeds 1 and 2 at {time} s");
             max_pressure = max_pressure.max(pressure.downwind.abs()).max(pressure.crosswind.abs());
         }
+        // The largest possible pressure is 0.55 + 0.45 + 0.15 = 1.15.
         assert!(max_pressure <= 1.2, "expected at most 1.2, got {max_pressure}");
     }
 
@@ -115,7 +125,7 @@ mod tests {
         let peak_step = |downwind_position: f64| {
             let gust_pressure = |step: &i32| {
                 let time = f64::from(*step) * 0.01;
-                wind.pressure(time, 0, downwind_position).downwind - 0.15 * wind.turbulence(time, 0, 0)
+                wind.pressure(time, 0, downwind_position).downwind - 0.15 * wind.turbulence(time, 0, DOWNWIND_CHANNEL)
             };
             (40..300).max_by(|a, b| gust_pressure(a).total_cmp(&gust_pressure(b))).unwrap_or(0)
         };

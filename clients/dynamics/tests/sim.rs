@@ -29,6 +29,7 @@ fn beam(index: u32, radius: f32) -> FakeDomain {
 /// A server with a trunk, two generations of branches and a rigid leaf. Each is tilted and attached to the last section
 /// of the previous one.
 fn tree_server() -> FakeServer {
+    // A rotation about z by atan(0.6 / 0.8), and a translation to the end of the parent, (0, 1, 0).
     let (sine, cosine) = (0.6_f32, 0.8_f32);
     let parent_from_child = [cosine, sine, 0.0, 0.0, -sine, cosine, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0];
     let mut domains = vec![];
@@ -37,12 +38,14 @@ fn tree_server() -> FakeServer {
         let radius = 0.05 / (index + 1) as f32;
         let mut domain = beam(index, radius);
         if index == 3 {
+            // The leaf: one triangle without modes.
             domain = FakeDomain::new(3, vec![0.0, 0.0, 0.0, 0.1, 0.2, 0.0, -0.1, 0.2, 0.0], 0, vec![]);
         }
         if index > 0 {
             placement = compose(&placement, &parent_from_child);
             domain.wire.parent = Some(index - 1);
             domain.wire.attachment_frame = pack(&parent_from_child).into();
+            // The last of the nine sections.
             domain.wire.attachment_rows = (48..54).collect();
         }
         domain.wire.placement = pack(&placement).into();
@@ -119,10 +122,13 @@ async fn tree_sways_and_subscribers_receive_closed_joints() {
     let report = sim_output.report();
     assert_eq!((report["steps_sent"].as_u64(), report["rejected"].as_u64()), (Some(90), Some(0)));
     let sway = report["crown_sway_of_height"].as_f64().expect("a number");
+    // The default of --sway is 0.05.
     assert!((0.03..0.1).contains(&sway), "{sway}");
     assert!(report["joint_gap_of_diagonal"].as_f64().expect("a number") <= 1e-3);
+    // The fake server reports 1.5 ms for every step.
     assert_eq!(report["stages_ms"]["deform"].as_f64(), Some(1.5));
     let (q, transforms) = (read_npy(&folder.path().join("q.npy")), read_npy(&folder.path().join("transforms.npy")));
+    // 90 steps of six coordinates and four 3x4 transforms.
     assert_eq!((q.len(), transforms.len()), (90 * 6, 90 * 4 * 12));
     let bounds = &server.bounds;
     let diagonal = (0..3).map(|axis| (bounds[axis + 3] - bounds[axis]).powi(2)).sum::<f64>().sqrt();
@@ -213,6 +219,7 @@ fn vega_domain(name: &str) -> FakeDomain {
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 async fn real_models_deflect_as_requested_and_stay_bounded() {
+    // The lowest frequency of the .cub file (1 Hz and 37.68 Hz) times the base frequency of the .config file.
     for (name, expected_hertz) in [("simpleBridge", 0.25), ("A", 37.68 * 0.02)] {
         let url = serve(Arc::new(FakeServer::new(vec![vega_domain(name)]))).await;
         let files = vega_folder(name).display().to_string();

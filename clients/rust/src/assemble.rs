@@ -26,7 +26,7 @@ pub(crate) fn decode<T: Pod>(field: &str, bytes: &[u8]) -> Result<Vec<T>> {
     Ok(bytemuck::pod_collect_to_vec(bytes))
 }
 
-/// The messages of a server stream. Its errors contain the server's URL.
+/// The messages of a server stream. An error contains the server's URL.
 pub(crate) struct Replies<M> {
     messages: tonic::Streaming<M>,
     url: Arc<str>,
@@ -56,7 +56,7 @@ pub(crate) struct Chunk<H> {
     pub(crate) data: Bytes,
 }
 
-/// A chunk in its wire format, with the types of its head and of the reply that its chunks form.
+/// A chunk in its wire format. The first chunk of a reply has a `Head`, and all its chunks together form a `Reply`.
 pub(crate) trait WireChunk: Sized {
     type Head;
     type Reply;
@@ -194,10 +194,12 @@ impl<M, C: WireChunk> ChunkedReplies<M, C> {
 mod tests {
     use super::*;
 
-    fn chunk(head: Option<u64>, offset: u64, data: &'static [u8]) -> Chunk<()> {
-        Chunk { head: head.map(|total| ((), total)), offset, data: Bytes::from_static(data) }
+    /// A chunk with an empty head. `total` is `None` for all chunks of a reply but the first one.
+    fn chunk(total: Option<u64>, offset: u64, data: &'static [u8]) -> Chunk<()> {
+        Chunk { head: total.map(|total| ((), total)), offset, data: Bytes::from_static(data) }
     }
 
+    /// Assembles replies of at most 8 bytes.
     fn assemble(chunks: Vec<Chunk<()>>) -> Result<Vec<Bytes>> {
         let mut assembler = Assembler::new("frame", 8);
         let mut replies = vec![];

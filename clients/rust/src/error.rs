@@ -40,7 +40,7 @@ pub enum Error {
     /// The server rejected a call with a gRPC status. `rejection` is present if the server sent details.
     #[error("rejected ({code:?}): {message}")]
     Status { code: tonic::Code, message: String, rejection: Option<Box<Rejection>> },
-    /// The server sent a rejection on a step stream: of one step, which does not end the stream, or of the stream.
+    /// The server rejected a step, or the opening of a step stream. A rejected step does not end the stream.
     #[error("rejected: {0}")]
     Rejected(Box<Rejection>),
     /// The reply of the server contradicts itself or the wire contract.
@@ -98,8 +98,8 @@ impl Error {
 }
 
 /// Whether the connection failed. tonic reports a broken connection as `Unknown` or `Unavailable` with a cause; a status
-/// sent by the server has no cause. `Unavailable` without details comes from a proxy that cannot reach the server,
-/// because the server adds details to this code.
+/// sent by the server has no cause. The server adds details to every `Unavailable`. A status with this code but without
+/// details therefore comes from a proxy that cannot reach the server.
 fn is_connection_lost(status: &tonic::Status) -> bool {
     let has_cause = std::error::Error::source(status).is_some();
     match status.code() {

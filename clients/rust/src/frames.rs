@@ -25,11 +25,11 @@ pub enum FrameFormat {
     #[default]
     Png,
     Rgba,
-    /// Little-endian f32, one per pixel; only and always for [`Output::Depth`].
+    /// Little-endian f32, one per pixel: the only format of [`Output::Depth`].
     F32,
-    /// Little-endian u32, one per pixel; only and always for [`Output::Domains`].
+    /// Little-endian u32, one per pixel: the only format of [`Output::Domains`].
     U32,
-    /// Little-endian f32, three per pixel; only and always for [`Output::Normals`].
+    /// Little-endian f32, three per pixel: the only format of [`Output::Normals`].
     F32x3,
 }
 
@@ -250,7 +250,7 @@ impl From<Picture> for v1::Picture {
             Output::Displacement { scale_max } => (v1::Output::Displacement, 0, scale_max),
             Output::ModeShape { mode, scale_max } => (v1::Output::ModeShape, mode, scale_max),
         };
-        // Depth, domains and normals have a single format each, which the server chooses.
+        // `Unspecified` selects the only format of depth, domains and normals, and PNG for the other outputs.
         let format = match (picture.output, picture.format) {
             (Output::Depth | Output::Domains | Output::Normals, _) | (_, FrameFormat::Png) => v1::Format::Unspecified,
             (_, FrameFormat::Rgba) => v1::Format::Rgba,

@@ -1,5 +1,5 @@
-//! Writes NumPy files of f32 rows incrementally. The header has space for the largest number of rows. `finish` rewrites
-//! it with the final number.
+//! Writes NumPy files of f32 rows incrementally. The header has space for the largest number of rows.
+//! [`Writer::finish`] rewrites the header with the final number.
 
 use std::fs::File;
 use std::io::{BufWriter, Seek as _, SeekFrom, Write as _};
@@ -10,6 +10,9 @@ use crate::error::{Error, Result};
 /// The start of a file of format version 1.0. The length of the rest of the header follows as u16.
 const MAGIC: &[u8] = b"\x93NUMPY\x01\x00";
 
+/// Size of the magic string and of the length of the rest of the header.
+const PREFIX_BYTES: usize = MAGIC.len() + size_of::<u16>();
+
 /// The format pads the header with spaces and a newline, so that the data starts at a multiple of 64 bytes.
 const ALIGNMENT: usize = 64;
 
@@ -19,7 +22,7 @@ pub struct Writer {
     file: BufWriter<File>,
     /// Shape of one row.
     shape: Vec<usize>,
-    /// Size of the whole header.
+    /// Size of the whole header, magic string included.
     header_bytes: usize,
     row_count: u64,
 }
@@ -31,7 +34,7 @@ impl Writer {
     /// `File` if it cannot be written, or if the shape has so many axes that it exceeds the header of version 1.0.
     pub fn create(path: &Path, shape: &[usize]) -> Result<Self> {
         let header_bytes = compute_header_bytes(shape);
-        if header_bytes - MAGIC.len() - 2 > usize::from(u16::MAX) {
+        if header_bytes - PREFIX_BYTES > usize::from(u16::MAX) {
             let reason = format!("expected a shape that fits a NumPy 1.0 header, got {} axes", shape.len());
             return Err(Error::file(path, reason));
         }
@@ -67,10 +70,9 @@ impl Writer {
         Ok(self.row_count)
     }
 
-    /// Writes magic, version, length, dictionary, padding and newline. The size is `header_bytes` for every number of
-    /// rows.
+    /// Writes the magic string, length, dictionary, padding and newline: `header_bytes` bytes for every number of rows.
     fn write_header(&mut self) -> Result<()> {
-        let length = self.header_bytes - MAGIC.len() - 2;
+        let length = self.header_bytes - PREFIX_BYTES;
         let mut header = MAGIC.to_vec();
         header.extend((length as u16).to_le_bytes());
         header.extend(format_dictionary(self.row_count, &self.shape).into_bytes());
@@ -84,9 +86,9 @@ impl Writer {
     }
 }
 
-/// Size of the header with the largest number of rows; at least 128 bytes.
+/// Size of the header with the largest number of rows; at least 128 bytes, the usual size of NumPy's own headers.
 fn compute_header_bytes(shape: &[usize]) -> usize {
-    let bytes = MAGIC.len() + 2 + format_dictionary(u64::MAX, shape).len() + 1;
+    let bytes = PREFIX_BYTES + format_dictionary(u64::MAX, shape).len() + 1;
     bytes.next_multiple_of(ALIGNMENT).max(2 * ALIGNMENT)
 }
 
@@ -113,9 +115,9 @@ mod tests {
     /// Splits a file into the text of its header and its data by the length that the header states.
     fn split_file(file: &[u8]) -> (&str, &[u8]) {
         let length = usize::from(u16::from_le_bytes([file[8], file[9]]));
-        let (header, data) = file.split_at(10 + length);
+        let (header, data) = file.split_at(PREFIX_BYTES + length);
         assert_eq!((&header[..8], header.len() % ALIGNMENT, header.last()), (MAGIC, 0, Some(&b'\n')));
-        (std::str::from_utf8(&header[10..]).expect("text"), data)
+        (std::str::from_utf8(&header[PREFIX_BYTES..]).expect("text"), data)
     }
 
     #[test]
@@ -123,6 +125,7 @@ mod tests {
         let row = [1.0, 2.0, 3.0, 4.0, 5.0, -6.0];
         let file = write_file(&[2, 3], &[&row, &row]);
         let (text, data) = split_file(&file);
+        // A header of 128 bytes, and two rows of six f32.
         assert_eq!((file.len(), data), (128 + 48, bytemuck::cast_slice(&[row, row].concat())));
         assert!(text.contains("'shape': (2, 2, 3,)") && text.contains("'<f4'"), "{text}");
     }
@@ -132,11 +135,12 @@ mod tests {
         let shape = [vec![1; 30], vec![2]].concat();
         let file = write_file(&shape, &[&[1.5, -2.5]]);
         let (text, data) = split_file(&file);
+        // A header of 128 bytes has space for a text of 128 - 10 - 1 = 117 characters.
         assert!(text.trim_end().len() > 117, "expected a header of more than 128 bytes, got: {text}");
         assert_eq!(data, bytemuck::cast_slice(&[1.5_f32, -2.5]));
         assert!(text.starts_with(&format_dictionary(1, &shape)), "{text}");
         for row_count in [0, 9, 10, u64::MAX] {
-            assert!(10 + format_dictionary(row_count, &shape).len() < compute_header_bytes(&shape));
+            assert!(PREFIX_BYTES + format_dictionary(row_count, &shape).len() < compute_header_bytes(&shape));
         }
     }
 

@@ -11,7 +11,8 @@ use crate::frames::Picture;
 use crate::request::StepRequest;
 use crate::stages::{self, StageTimes};
 
-/// Maximum number of hits of a reply: the server accepts at most 64 x 64 pixels. It bounds memory if a stream never ends.
+/// Maximum number of hits of a reply, because the server accepts at most 64 x 64 pixels. The limit bounds memory if a
+/// stream never ends.
 const MAX_HITS: usize = 64 * 64;
 
 /// A request for the surface points in a small rectangle of a picture.
@@ -136,6 +137,7 @@ impl Client {
 }
 
 fn decode_hit(wire: v1::Hit) -> Result<Hit> {
+    // Three rows of `rank` f32.
     let mode_bytes = 12 * wire.rank as usize;
     if !wire.modes.is_empty() && wire.modes.len() != mode_bytes {
         return Err(malformed_reply("hit.modes", format!("none or {mode_bytes} bytes"), wire.modes.len()));

@@ -16,8 +16,8 @@ pub enum StepSelector {
 }
 
 impl StepSelector {
-    /// Converts to the `step` of a wire request. Each request message has its own type for it; `exact` and `minimum`
-    /// are its variants.
+    /// Converts to the field `step` of a wire request. Each request message has its own type `S` of this field; `exact`
+    /// and `minimum` construct its variants.
     pub(crate) fn to_wire<S>(self, exact: fn(u64) -> S, minimum: fn(u64) -> S) -> Option<S> {
         match self {
             Self::Current => None,
@@ -128,6 +128,7 @@ mod tests {
     fn step_selector_converts_to_the_variants_of_each_message() {
         use v1::{get_vertices_request, render_frame_request};
         let request = StepRequest::new("toy", ()).minimum_step(3).exact_step(7).deadline_ms(20);
+        // The last selector wins.
         assert_eq!((request.step, request.deadline_ms), (StepSelector::Exact(7), 20));
         let frame_step = |step: StepSelector| {
             step.to_wire(render_frame_request::Step::ExactStep, render_frame_request::Step::MinimumStep)

@@ -31,6 +31,8 @@ pub struct Domain {
     pub vertex_count: usize,
     /// r, the number of modes: U has r columns.
     pub rank: usize,
+    /// Number of corners. A corner is a vertex with one normal and one pair of texture coordinates; a vertex may have
+    /// several corners.
     pub corner_count: usize,
     pub triangle_count: usize,
     pub attachment: Option<Attachment>,
@@ -72,8 +74,8 @@ pub struct ModeRows {
 }
 
 impl ModeRows {
-    /// The 3 x r rows of the requested vertex with this ordinal, row-major; empty if r is 0. `None` if fewer vertices were
-    /// requested.
+    /// The three rows of one requested vertex, r entries each; empty if r is 0. `ordinal` is the vertex's position in the
+    /// request. `None` if fewer vertices were requested.
     pub fn rows_of(&self, ordinal: usize) -> Option<&[f32]> {
         let start = ordinal.checked_mul(3 * self.rank)?;
         self.rows.get(start..)?.get(..3 * self.rank)
@@ -134,6 +136,7 @@ impl Client {
         }
         // U of a rigid domain is empty, and the server may then send no message.
         let (rank, bytes) = complete_reply.unwrap_or((0, Bytes::new()));
+        // Three rows of `rank` f32.
         let vertex_bytes = 12 * u64::from(rank);
         let expected_bytes = vertex_bytes.saturating_mul(vertices.len() as u64);
         if !vertices.is_empty() && bytes.len() as u64 != expected_bytes {

@@ -14,7 +14,7 @@ pub(crate) fn from_wire(wire: Vec<v1::StageTime>) -> StageTimes {
     wire.into_iter().map(|time| (time.stage, time.milliseconds)).collect()
 }
 
-/// The times of each stage over many replies. Only the first 65536 times of a stage are stored.
+/// The times of each stage over many replies. Only the first 65,536 times of a stage are stored.
 #[derive(Debug, Clone, Default)]
 pub struct StageSamples(BTreeMap<String, Vec<f32>>);
 

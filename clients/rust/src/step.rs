@@ -158,6 +158,7 @@ mod tests {
         let bytes: Vec<u8> = [1.0_f32, -2.0, 0.25].iter().flat_map(|number| number.to_le_bytes()).collect();
         assert_eq!(wire.q, bytes);
         assert_eq!((&wire.transform_domains, wire.transforms.len()), (&vec![1], 48));
+        // Entry 3 of the matrix: the x component of the translation.
         assert_eq!(wire.transforms[12..16], 5.0_f32.to_le_bytes());
         assert_eq!(wire.transform_format(), v1::TransformFormat::Unspecified);
     }
@@ -174,12 +175,14 @@ mod tests {
             (wire.transform_domains.as_slice(), wire.transform_format()),
             ([4, 2].as_slice(), v1::TransformFormat::RigidF32)
         );
+        // The y component of the rotation, and the z component of the translation.
         assert_eq!(
             (&wire.transforms[4..8], &wire.transforms[24..28]),
             (&0.6_f32.to_le_bytes()[..], &3.0_f32.to_le_bytes()[..])
         );
         let wire = Step::new(0, 0.0).domain_transform(1, &rigid_f64).to_wire();
         assert_eq!((wire.transforms.len(), wire.transform_format()), (40, v1::TransformFormat::RigidF64));
+        // The real part of the rotation, and the x component of the translation.
         assert_eq!(
             (&wire.transforms[12..16], &wire.transforms[16..24]),
             (&0.8_f32.to_le_bytes()[..], &1e7_f64.to_le_bytes()[..])

@@ -67,7 +67,7 @@ struct Progress {
     acks: VecDeque<Ack>,
     /// Rejections that have not been reported to the caller.
     rejections: VecDeque<Rejection>,
-    /// Whether the stream has ended, and its error if the server did not close it.
+    /// `None` while the stream is open. `Some(None)` after the server has closed it, `Some(Some(error))` after it failed.
     end: Option<Option<Error>>,
 }
 
@@ -98,13 +98,14 @@ impl Client {
             Policy::Lossless => v1::Policy::Lossless,
             Policy::Latest => v1::Policy::Latest,
         };
+        // When the queue is full, sending a step waits.
         let (requests, queue) = mpsc::channel(64);
         let open = v1::OpenDrive { scene: scene.to_owned(), policy: policy.into(), window };
         let open_request = v1::DriveSceneRequest { kind: Some(RequestKind::Open(open)) };
         requests
             .send(open_request)
             .await
-            .map_err(|_| Error::StreamEnded { awaited_reply: "the reply to its opening" })?;
+            .map_err(|_| Error::StreamEnded { awaited_reply: "the reply to the open request" })?;
         let mut service = v1::step_service_client::StepServiceClient::new(self.channel.clone());
         let mut replies = self.replies(service.drive_scene(ReceiverStream::new(queue)).await)?;
         let opened = match replies.next().await?.and_then(|reply| reply.kind) {
@@ -113,7 +114,7 @@ impl Client {
             Some(ResponseKind::Ack(_)) => {
                 return Err(malformed_reply("drive.opened", "`opened` first", "an acknowledgement"));
             }
-            None => return Err(Error::StreamEnded { awaited_reply: "the reply to its opening" }),
+            None => return Err(Error::StreamEnded { awaited_reply: "the reply to the open request" }),
         };
         let progress = Arc::new(Mutex::new(Progress::default()));
         let (change_sender, progress_changes) = watch::channel(());
@@ -273,7 +274,7 @@ impl Progress {
         );
     }
 
-    /// Removes the rejected step from the steps in flight. If several have its number, it is the oldest one.
+    /// Removes the rejected step from the steps in flight: the oldest one with its number.
     fn reject(&mut self, rejection: Rejection) {
         if let Some(index) = self.in_flight.iter().position(|step| Some(*step) == rejection.step) {
             self.in_flight.remove(index);

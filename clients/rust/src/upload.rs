@@ -15,7 +15,7 @@ use v1::upload_scene_request::Part;
 use crate::client::Client;
 use crate::error::{Error, Result, malformed_reply};
 
-/// Bytes per message: far below 4 MiB, the default limit of gRPC.
+/// Bytes of file content per message: far below 4 MiB, the default limit of gRPC.
 const CHUNK_BYTES: usize = 512 << 10;
 
 /// Maximum depth of nested folders. Deeper ones are an error, so that a cyclic link does not cause an endless recursion.
@@ -46,6 +46,7 @@ impl Client {
                 .map_err(|_| Error::file(path, format!("expected fewer than 2^32 files, got {}", files.len())))?,
             total_bytes: files.iter().map(|file| file.header.bytes).sum(),
         };
+        // When the queue is full, reading the files waits.
         let (sender, queue) = mpsc::channel(4);
         let send_task = tokio::task::spawn_blocking(move || send_files(&sender, header, &files));
         let reply = self.reply(self.scenes().upload_scene(ReceiverStream::new(queue)).await);

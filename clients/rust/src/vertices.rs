@@ -255,6 +255,7 @@ mod tests {
         assert_eq!((set.domain_origins.len(), set.domain_origin(1)), (0, [1.0, 2.0, 3.0]));
     }
 
+    /// A valid reply has 12 bytes of positions, optionally 12 bytes of normals, and 0 or 48 bytes of origins.
     #[test]
     fn malformed_origins_report_their_field() {
         for (origin_bytes, length, field) in
@@ -289,6 +290,7 @@ mod tests {
 
     #[test]
     fn malformed_sizes_report_their_field() {
+        // With positions, normals, displacements and boxes, a valid reply has 12 + 12 + 12 + 48 = 84 bytes.
         for (position_bytes, displacement_bytes, box_bytes, field) in [
             (0, 12, 24, "box_bytes"),
             (0, 24, 48, "displacement_bytes"),

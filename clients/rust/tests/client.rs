@@ -12,7 +12,7 @@ use modalcast_client::{
 use modalcast_client::{VertexRequest, VertexSelection, VertexStreamRequest};
 use tokio::sync::Semaphore;
 
-/// One domain with two modes. Every entry of x0 and U is computed from its index.
+/// A server of the scene `toy`: one domain with two modes. Entry i of x0 is i, and entry i of U is i mod 1000.
 fn one_domain_server(vertices: usize) -> FakeServer {
     let rest_positions = (0..3 * vertices).map(|index| index as f32).collect();
     let modes = (0..6 * vertices).map(|index| (index % 1000) as f32).collect();
@@ -62,6 +62,7 @@ async fn frame_above_4_mib_arrives_complete_and_names_its_step() {
     let request = FrameRequest::new("toy", picture(1920, 1080)).minimum_step(5);
     let frame = client.render_frame(&request).await.expect("a frame");
     assert_eq!((frame.step.number, frame.width, frame.bytes.len()), (5, 1920, 1920 * 1080 * 4));
+    // The fake server fills a frame with the step number and reports fixed stage times and rasterizers.
     assert!(frame.bytes.iter().all(|byte| *byte == 5));
     assert_eq!(frame.stages, [("draw".to_owned(), 2.0)]);
     assert_eq!((frame.shadow_drawn_by, frame.visibility_drawn_by), (None, Some(DrawnBy::Cuda)));
@@ -235,6 +236,7 @@ fn list_dependencies(package: &str) -> Vec<String> {
 
 #[test]
 fn client_depends_on_neither_cuda_nor_opengl() {
+    // The server, `modalcast`, is in the list because it depends on the others.
     let gpu_packages = ["cudarc", "glow", "khronos-egl", "modalcast"];
     let count_gpu_dependencies = |package| {
         let dependencies = list_dependencies(package);
@@ -286,6 +288,7 @@ async fn fetch_saves_files_and_exits_with_documented_codes() {
     assert_eq!(output.exit_code, 0, "{}", output.stderr);
     let (ready, json) = output.stdout.trim().split_once('\n').expect("two lines");
     let summary: serde_json::Value = serde_json::from_str(json).expect("JSON");
+    // The fake server reports 2 ms for the stage `draw`, and fills a frame with the low byte of the step number.
     assert_eq!((ready, &summary["frames"], summary["stages_ms"]["draw"].as_f64()), ("ready", &3.into(), Some(2.0)));
     for (index, step) in summary["steps"].as_array().expect("steps").iter().enumerate() {
         let bytes = std::fs::read(format!("{frames}/frame_{index:05}.rgba")).expect("a frame");
@@ -293,7 +296,7 @@ async fn fetch_saves_files_and_exits_with_documented_codes() {
     }
     let output = run_fetch(&url, &["vertices", "--scene", "toy", "--count", "2", "--out", &vertices]).await;
     assert_eq!(output.exit_code, 0, "{}", output.stderr);
-    // A header of 128 bytes, and two steps of four positions.
+    // A header of 128 bytes, and two steps of four positions (three f32 each).
     assert_eq!(std::fs::read(&vertices).expect("a file").len(), 128 + 2 * 48);
     send_task.abort();
     let frame_path = path("one.rgba");

@@ -27,6 +27,7 @@ impl FakeDomain {
     pub(crate) fn new(index: u32, rest_positions: Vec<f32>, rank: u32, modes: Vec<f32>) -> Self {
         let vertices = (rest_positions.len() / 3) as u32;
         assert_eq!(modes.len(), rest_positions.len() * rank as usize, "expected 3n rows of U");
+        // A triangle strip: triangle i has the corners i, i + 1 and i + 2.
         let indices: Vec<u32> =
             (0..vertices.saturating_sub(2)).flat_map(|first_vertex| first_vertex..first_vertex + 3).collect();
         let wire = v1::DomainDescription {
@@ -68,7 +69,9 @@ pub(crate) struct StepOutput {
 /// The only scene of the fake server, `toy`, and the requests that it received.
 pub(crate) struct FakeServer {
     pub(crate) domains: Vec<FakeDomain>,
+    /// Rest bounds: minimum x, y, z, then maximum x, y, z.
     pub(crate) bounds: [f64; 6],
+    /// The largest window of a step stream.
     pub(crate) window: u32,
     /// Number of acknowledgements that may still be sent; unlimited unless a test restricts it.
     pub(crate) ack_permits: Semaphore,
@@ -112,6 +115,7 @@ impl FakeServer {
             ack_permits: Semaphore::new(Semaphore::MAX_PERMITS),
             steps: Mutex::default(),
             uploaded_files: Mutex::default(),
+            // More steps than any test sends, so that no subscriber misses one.
             outputs: broadcast::channel(1 << 14).0,
             state: Mutex::new(State { run: 0, has_writer: false, q, transforms, last_step: None }),
         }

@@ -19,6 +19,7 @@ use v1::vertex_service_server::{VertexService, VertexServiceServer};
 
 use super::{FakeServer, StepOutput, pack, rejection, rejection_status};
 
+/// Maximum size of a chunk of a reply, as on the real server.
 const CHUNK_BYTES: usize = 1 << 20;
 
 type ResponseStream<T> = Pin<Box<dyn tokio_stream::Stream<Item = Result<T, Status>> + Send>>;
@@ -35,6 +36,7 @@ pub(crate) async fn serve(fake_server: Arc<FakeServer>) -> String {
 #[derive(Clone)]
 struct FakeService(Arc<FakeServer>);
 
+/// Routes calls to the five services by their path.
 #[derive(Clone)]
 struct Router(FakeService);
 
@@ -61,6 +63,7 @@ impl Service<http::Request<tonic::body::Body>> for Router {
 }
 
 impl FakeService {
+    /// The only scene and source is `toy`.
     fn check_scene(&self, scene: &str) -> Result<(), Status> {
         if scene == "toy" {
             return Ok(());

@@ -13,7 +13,7 @@ Examples:
   modalcast-fetch --server http://10.0.0.2:50051 info
 
 `frames`, and `vertices` with --count, print the line `ready` on standard output when the server has accepted the
-subscription. It then receives every step of a physics process that starts after that line.
+subscription. The program then receives every step of a physics process that starts after that line.
 
 Exit codes: 0 done; 1 rejected by the server; 2 invalid command line; 3 connection failed or lost; 4 local file error;
 5 malformed, truncated or late reply.";
@@ -218,7 +218,7 @@ pub(crate) struct VerticesOptions {
     /// NumPy file for positions, float32, steps x vertices x 3.
     #[arg(long, value_name = "FILE.npy")]
     pub(crate) out: PathBuf,
-    /// NumPy file for normals, float32, steps x corners x 3.
+    /// NumPy file for normals, float32, steps x corners x 3. A vertex has one corner per normal.
     #[arg(long, value_name = "FILE.npy")]
     pub(crate) normals: Option<PathBuf>,
     /// NumPy file for u = U q, float32, steps x vertices x 3. Requires deform.displacements in scene.toml.

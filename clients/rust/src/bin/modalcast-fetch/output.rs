@@ -12,6 +12,7 @@ use crate::cli::SceneOptions;
 pub(crate) struct ReceivedReply<'a> {
     pub(crate) step_id: StepId,
     pub(crate) bytes: u64,
+    /// Number of steps skipped since the previous reply.
     pub(crate) skipped: u64,
     pub(crate) stages: &'a StageTimes,
 }
@@ -65,8 +66,8 @@ impl Summary {
         if seconds > 0.0 { (self.step_numbers.len() - 1) as f64 / seconds } else { 0.0 }
     }
 
-    /// Prints the summary. The JSON contains `reply_noun` as the key of the number of replies, beside `steps`, the list of
-    /// step numbers, and `origin`, the world position of the vertex origin in meters.
+    /// Prints the summary. In the JSON, `reply_noun` is the key of the number of replies, and `steps` lists their step
+    /// numbers. `origin` is the world position of the vertex origin in meters; `None` for frames.
     pub(crate) fn print(self, reply_noun: &str, out: &std::path::Path, origin: Option<Vec<f64>>, as_json: bool) {
         let rate = self.replies_per_second();
         let medians = self.stages.medians();
@@ -185,6 +186,7 @@ mod tests {
         }
         let start = summary.start;
         let time = |seconds| start + std::time::Duration::from_secs(seconds);
+        // Two intervals between three replies take 4 s.
         summary.reply_times = Some(ReplyTimes { first: time(60), last: time(64) });
         assert_eq!(summary.replies_per_second(), 0.5);
     }
