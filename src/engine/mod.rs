@@ -229,8 +229,8 @@ impl Engine {
     /// # Errors
     /// `Invalid` naming the missing or malformed file; `Taken` when another scene was opened under the name since
     /// [`Self::begin_upload`].
-    pub async fn finish_upload(&self, mut upload: Upload) -> Result<Arc<SceneHandle>> {
-        let check_upload = move || match upload.finish() {
+    pub async fn finish_upload(&self, upload: Upload) -> Result<Arc<SceneHandle>> {
+        let check_upload = move || match upload.check_complete() {
             Ok(()) => Ok(upload),
             Err(error) => {
                 upload.discard();
@@ -323,7 +323,9 @@ impl Engine {
         self.check_running()?;
         let engine = self.clone();
         let work = async move {
-            let entry = engine.shared.registry.reserve(&name, &provenance, upload.is_some())?;
+            // An upload must not join the opening of another scene.
+            let must_be_new = upload.is_some();
+            let entry = engine.shared.registry.reserve(&name, &provenance, must_be_new)?;
             let opened = entry.get_or_open(|| engine.open_or_discard(name.clone(), provenance, upload)).await;
             engine.shared.registry.release(&name, &entry);
             // The scene may have failed before the registry had its handle.
@@ -491,6 +493,7 @@ mod tests {
         (engine, faulty_scene, control_scene)
     }
 
+    /// A step that sets the two coordinates of the first domain to `q` and 0.
     fn step(number: u64, q: f32) -> RawStepUpdate {
         let q = bytes::Bytes::copy_from_slice(bytemuck::cast_slice(&[q, 0.0]));
         RawStepUpdate { number, q_domains: vec![0], q, ..RawStepUpdate::default() }

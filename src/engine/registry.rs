@@ -56,9 +56,8 @@ impl Registry {
         Self { max_scenes, entries: Mutex::new(BTreeMap::new()) }
     }
 
-    /// Reserves a name for a call that opens it, or joins an existing reservation with the same provenance. The call
-    /// ends with [`Self::release`].
-    /// With `must_be_new` an existing reservation is an error.
+    /// Reserves a name for a call that opens it, or joins an existing reservation with the same provenance. With
+    /// `must_be_new` an existing reservation is an error. The call ends with [`Self::release`].
     ///
     /// # Errors
     /// `Taken` when the name is reserved for another provenance, `Busy` when too many scenes are open.

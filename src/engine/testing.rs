@@ -26,7 +26,7 @@ fn strips(deformation: DeformationSettings) -> Arc<Scene> {
     let rest_positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
     let (normals, triangles) = (vec![[0.0, 0.0, 1.0]; 4], vec![[0, 1, 2], [0, 2, 3]]);
     let mesh = Mesh::from_indexed(rest_positions, normals, vec![], triangles).expect("expected a valid mesh");
-    // U has 12 rows and 2 columns.
+    // U has 12 rows (4 vertices) and 2 columns. Every fifth entry is not zero, so that the columns differ.
     let entries = (0..24).map(|index| if index % 5 == 0 { 0.5 } else { 0.0 }).collect();
     let modes = Modes::from_columns(12, 2, entries).expect("expected valid modes");
     let shape = Shape::new(mesh, modes).expect("expected a valid shape");
@@ -38,7 +38,7 @@ fn strips(deformation: DeformationSettings) -> Arc<Scene> {
         .expect("expected a valid scene")
 }
 
-/// A fault that [`FaultyDeformer`] injects after it was given a state whose first coordinate is [`Self::q`].
+/// A fault of [`FaultyDeformer`]. A state whose first coordinate is [`Self::q`] triggers it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum InjectedFault {
     PanicInDeform,
@@ -75,7 +75,7 @@ impl Deformer for FaultyDeformer {
         Backend::Reference
     }
 
-    /// Selects the fault of the state. Faults in readbacks are injected by the later calls.
+    /// Selects the fault of the state. `readback` and `wait_readback` inject their faults later.
     fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
         self.fault = InjectedFault::ALL.into_iter().find(|fault| state.q[0] == fault.q());
         match self.fault {

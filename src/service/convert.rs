@@ -17,7 +17,12 @@ mod output;
 const MAX_REMARK_BYTES: usize = 64 << 10;
 
 /// The public description of an open scene.
-pub(super) fn wire_scene_info(scene_handle: &SceneHandle, with_remarks: bool) -> v1::SceneInfo {
+pub(super) fn wire_scene_info(scene_handle: &SceneHandle) -> v1::SceneInfo {
+    v1::SceneInfo { remarks: list_remarks(&scene_handle.scene), ..wire_scene_summary(scene_handle) }
+}
+
+/// The public description of an open scene without its remarks.
+pub(super) fn wire_scene_summary(scene_handle: &SceneHandle) -> v1::SceneInfo {
     let scene = &scene_handle.scene;
     let layout = &scene.layout;
     let bounds = scene.rest_bounds;
@@ -35,11 +40,11 @@ pub(super) fn wire_scene_info(scene_handle: &SceneHandle, with_remarks: bool) ->
         bounds: [bounds.min, bounds.max].concat(),
         affine: scene.features.shear,
         last_step: scene_handle.last_step().map(wire_step_id),
-        remarks: if with_remarks { list_remarks(scene) } else { Vec::new() },
+        remarks: Vec::new(),
     }
 }
 
-/// A limit on the encoded size of a list of strings.
+/// The remaining bytes of a limit on the encoded size of a list of strings.
 pub(super) struct ByteBudget(usize);
 
 impl ByteBudget {
@@ -182,7 +187,7 @@ pub(super) const fn wire_format(format: FrameFormat) -> v1::Format {
     }
 }
 
-/// Implements the conversion of the optional `step` of a request. A macro, because each request has its own `Step`
+/// Converts the optional `step` of a request to a [`StepSelector`]. A macro, because each request has its own `Step`
 /// type.
 macro_rules! step_selector_from {
     ($($step:path),+) => {$(

@@ -15,7 +15,7 @@ use crate::engine::{SceneHandle, validate_domains};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::Scene;
 
-/// Limit on the arrays of one request: the number of different arrays.
+/// Limit on the arrays of one request: the number of variants of `v1::Array` without `Unspecified`.
 const MAX_ARRAYS: usize = 5;
 
 /// Replies with the descriptions of the selected domains and with the requested arrays.
@@ -30,7 +30,7 @@ pub(super) fn respond_with_description(
         return Err(invalid("arrays", format!("at most {MAX_ARRAYS}"), arrays.len()));
     }
     Ok(respond(move |reply_sender| async move {
-        reply_sender.send(response_with(Part::Scene(wire_scene_info(&scene_handle, true)))).await?;
+        reply_sender.send(response_with(Part::Scene(wire_scene_info(&scene_handle)))).await?;
         send_descriptions(&scene_handle.scene, &domains, max_chunk_bytes, &reply_sender).await?;
         for domain in domains {
             for array in &arrays {
@@ -71,16 +71,16 @@ pub(super) fn respond_with_modes(
         let expected = format!("an index below {vertex_count}");
         return Err(invalid(format!("vertices[{index}]"), expected, vertices_to_read[index]));
     }
-    // Chunks end between vertices, so that only one chunk of rows is in memory at a time.
+    // Three rows of `rank` f32.
     let bytes_per_vertex = 12 * rank;
-    let vertices_per_chunk = (max_chunk_bytes / bytes_per_vertex.max(1)).max(1);
+    // A chunk has whole vertices, and only one chunk is in memory at a time. Without modes, one message without data is
+    // the reply.
+    let vertices_per_chunk =
+        if rank == 0 { vertices_to_read.len() } else { (max_chunk_bytes / bytes_per_vertex).max(1) };
     let total = (bytes_per_vertex * vertices_to_read.len()) as u64;
     Ok(respond(move |reply_sender: ReplySender<v1::ReadModesResponse>| async move {
         let modes = &scene_handle.scene.shape_of(request.domain as usize).modes;
-        // Without modes, one message without data is the reply.
-        for (chunk_index, vertices_of_chunk) in
-            vertices_to_read.chunks(if rank == 0 { vertices_to_read.len() } else { vertices_per_chunk }).enumerate()
-        {
+        for (chunk_index, vertices_of_chunk) in vertices_to_read.chunks(vertices_per_chunk).enumerate() {
             let entries_of_row = |row: usize| (0..rank).map(move |mode| modes.column(mode)[row]);
             let rows = vertices_of_chunk
                 .iter()

@@ -27,6 +27,7 @@ const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(50);
 pub(super) struct Connection {
     stream: TcpStream,
     remote: SocketAddr,
+    /// Counts against the limit on connections until the connection is dropped.
     _permit: OwnedSemaphorePermit,
 }
 

@@ -99,16 +99,20 @@ async fn set_health(health: &HealthReporter, is_serving: bool) {
     use tonic_health::ServingStatus::{NotServing, Serving};
     let status = if is_serving { Serving } else { NotServing };
     let services = ["SceneService", "StepService", "FrameService", "VertexService", "ServerService"];
+    // The empty name stands for the whole server.
     for name in services.map(|service| format!("modalcast.v1.{service}")).into_iter().chain([String::new()]) {
         health.set_service_status(name, status).await;
     }
 }
 
-/// The transport. Every limit is set explicitly, because the library's defaults disable some of them.
+/// The transport. Every limit is set explicitly, because the library's defaults disable some of them. Sizes are in
+/// bytes.
 fn transport(config: &Config) -> Server {
     Server::builder()
+        // A connection may have 128 open calls. The server handles 64 of them at a time.
         .max_concurrent_streams(128)
         .concurrency_limit_per_connection(64)
+        // A client that opens and resets more streams than this (a rapid-reset attack) is disconnected.
         .http2_max_local_error_reset_streams(Some(1024))
         .http2_max_pending_accept_reset_streams(Some(100))
         .http2_max_header_list_size(16 << 10)

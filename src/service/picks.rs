@@ -10,7 +10,7 @@ use super::stream::{Deadline, ReplyStream, respond};
 use crate::engine::{Engine, ModalHit, PickResult, StepSelector, resolve_picks};
 use modalcast_model::scene::Scene;
 
-/// Upper bound on the size of a hit without its modes, in bytes.
+/// Upper bound on the encoded size of a hit without its modes, in bytes.
 const MAX_HIT_BYTES: usize = 256;
 
 /// Answers one pick request.
@@ -48,7 +48,7 @@ fn split_reply(picks: &PickResult, scene: &Scene, max_chunk_bytes: usize) -> Vec
     let mut responses = vec![v1::PickResponse { head: Some(head), hits: Vec::new() }];
     let mut response_bytes = 0;
     for modal_hit in &picks.hits {
-        let hit_bytes = MAX_HIT_BYTES + 4 * modal_hit.modes.len();
+        let hit_bytes = MAX_HIT_BYTES + size_of_val(modal_hit.modes.as_slice());
         if response_bytes > 0 && response_bytes + hit_bytes > max_chunk_bytes {
             responses.push(v1::PickResponse::default());
             response_bytes = 0;

@@ -7,7 +7,7 @@ use modalcast_proto::v1::upload_scene_request::Part;
 use prost::Message as _;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::convert::{ByteBudget, parse_upload_header, wire_scene_info};
+use super::convert::{ByteBudget, parse_upload_header, wire_scene_info, wire_scene_summary};
 use super::describe;
 use super::status::{to_status, transport_status};
 use super::stream::{ReplyStream, catch_panic};
@@ -17,7 +17,7 @@ use modalcast_model::error::{Error, Result, fault_in, invalid};
 /// Limit in bytes on the source names in one list.
 const MAX_SOURCE_BYTES: usize = 512 << 10;
 
-/// The lowest sustained upload rate that the server accepts, in bytes per second.
+/// The lowest sustained upload rate that the server accepts, in bytes per second: 32 KiB/s.
 const MIN_UPLOAD_RATE: f64 = 32768.0;
 
 /// Implementation of `SceneService`.
@@ -33,7 +33,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         let v1::OpenSceneRequest { source, scene } = request.into_inner();
         catch_panic(async move {
             let scene_handle = engine.open(&source, &scene).await?;
-            Ok(v1::OpenSceneResponse { scene: Some(wire_scene_info(&scene_handle, true)) })
+            Ok(v1::OpenSceneResponse { scene: Some(wire_scene_info(&scene_handle)) })
         })
         .await
     }
@@ -54,7 +54,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         let engine = self.0.clone();
         catch_panic(async move {
             let scene_handle = engine.finish_upload(upload).await?;
-            Ok(v1::UploadSceneResponse { scene: Some(wire_scene_info(&scene_handle, true)) })
+            Ok(v1::UploadSceneResponse { scene: Some(wire_scene_info(&scene_handle)) })
         })
         .await
     }
@@ -62,7 +62,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
     async fn list_scenes(&self, _: Request<v1::ListScenesRequest>) -> Result<Response<v1::ListScenesResponse>, Status> {
         let engine = self.0.clone();
         catch_panic(async move {
-            let scenes = engine.list().iter().map(|scene_handle| wire_scene_info(scene_handle, false)).collect();
+            let scenes = engine.list().iter().map(|scene_handle| wire_scene_summary(scene_handle)).collect();
             let mut budget = ByteBudget::new(MAX_SOURCE_BYTES);
             let sources = engine.sources().await?.into_iter().take_while(|source| budget.take_string(source)).collect();
             Ok(v1::ListScenesResponse { scenes, sources })
@@ -121,9 +121,9 @@ impl UploadTimeBudget {
     /// `DEADLINE_EXCEEDED` when the budget is used up.
     async fn wait<T>(&mut self, part: impl Future<Output = T>) -> Result<T, Status> {
         let begin = Instant::now();
-        let deadline_error = |_| Error::Deadline { what: "the upload".into(), ms: self.max_wait.as_millis() as u64 };
-        let part =
-            tokio::time::timeout(self.remaining, part).await.map_err(|elapsed| to_status(deadline_error(elapsed)))?;
+        let ms = self.max_wait.as_millis() as u64;
+        let deadline_status = |_| to_status(Error::Deadline { what: "the upload".into(), ms });
+        let part = tokio::time::timeout(self.remaining, part).await.map_err(deadline_status)?;
         self.remaining = self.remaining.saturating_sub(begin.elapsed());
         Ok(part)
     }

@@ -45,10 +45,12 @@ impl v1::step_service_server::StepService for StepServiceImpl {
 /// The state of one step stream.
 struct DriveSession {
     engine: Engine,
+    /// Address of the client, for errors.
     peer: String,
     inbound: Streaming<v1::DriveSceneRequest>,
     /// The writer lease, once it is acquired.
     writer: Option<WriterSession>,
+    /// Replies that are not sent yet, oldest first.
     replies: VecDeque<v1::DriveSceneResponse>,
 }
 
@@ -61,6 +63,7 @@ impl DriveSession {
             if !is_receiving && is_drained && self.replies.is_empty() {
                 return Ok(());
             }
+            // Without capacity, reports wait in the step queue.
             let has_reply_capacity = self.replies.len() < MAX_PENDING_REPLIES;
             tokio::select! {
                 message = self.inbound.message(), if is_receiving => match message {
@@ -114,7 +117,7 @@ impl DriveSession {
             run: writer.run,
             policy: wire_policy(writer.policy).into(),
             window: writer.window,
-            scene: Some(wire_scene_info(&scene_handle, true)),
+            scene: Some(wire_scene_info(&scene_handle)),
         };
         self.writer = Some(writer);
         self.replies.push_back(v1::DriveSceneResponse { kind: Some(ResponseKind::Opened(opened)) });

@@ -52,9 +52,8 @@ fn disconnected_status() -> Status {
     Status::cancelled("the client has disconnected")
 }
 
-/// Creates a reply stream to which `work` sends messages. An error of `work` ends the stream; capacity of the channel
-/// is reserved for it. When the client disconnects, `work` is dropped at its next await, so that its resources are
-/// released.
+/// Creates a reply stream to which `work` sends messages. An error of `work` ends the stream. When the client
+/// disconnects, `work` is dropped at its next await, so that its resources are released.
 pub(super) fn respond<T, W, F>(work: W) -> Response<ReplyStream<T>>
 where
     T: Send + 'static,
@@ -62,19 +61,20 @@ where
     F: Future<Output = Result<(), Status>> + Send + 'static,
 {
     let (sender, replies) = mpsc::channel(REPLY_CAPACITY + 1);
-    let end_permit = sender.clone().try_reserve_owned();
-    let client_watch = sender.clone();
+    // Reserved for the error of `work`, so that it can be sent even if the channel is full.
+    let error_permit = sender.clone().try_reserve_owned();
+    let disconnect_watch = sender.clone();
     let work = work(ReplySender(sender));
     let task = tokio::spawn(async move {
         tokio::select! {
             result = work => result,
-            () = client_watch.closed() => Err(disconnected_status()),
+            () = disconnect_watch.closed() => Err(disconnected_status()),
         }
     });
     tokio::spawn(async move {
         let result = task.await.unwrap_or_else(|_| Err(Status::internal("the call panicked in the server")));
-        if let (Err(status), Ok(end_permit)) = (result, end_permit) {
-            end_permit.send(Err(status));
+        if let (Err(status), Ok(error_permit)) = (result, error_permit) {
+            error_permit.send(Err(status));
         }
     });
     Response::new(Box::pin(ReceiverStream::new(replies)))
@@ -90,8 +90,8 @@ pub(super) async fn catch_panic<T: Send + 'static>(
     }
 }
 
-/// Splits a reply into chunks of at most `max_chunk_bytes` bytes, each with its offset. An empty reply is one empty
-/// chunk.
+/// Splits a reply into chunks of at most `max_chunk_bytes` bytes, each with its offset in bytes. An empty reply is one
+/// empty chunk.
 pub(super) fn split_into_chunks(bytes: Bytes, max_chunk_bytes: usize) -> impl Iterator<Item = (u64, Bytes)> {
     let chunk_starts = (0..bytes.len().max(1)).step_by(max_chunk_bytes.max(1));
     chunk_starts.map(move |start| (start as u64, bytes.slice(start..bytes.len().min(start + max_chunk_bytes))))
@@ -217,12 +217,14 @@ mod tests {
         };
         let request_ms = |metadata: &MetadataMap, ms: u32| limit_ms(Deadline::of_request(metadata, ms, &config));
         let no_metadata = MetadataMap::new();
+        // The default of the configuration is 30 s, and its maximum is 600 s.
         assert_eq!(request_ms(&no_metadata, 0), Some(30_000));
         assert_eq!(request_ms(&no_metadata, 80), Some(80));
         assert_eq!(request_ms(&no_metadata, u32::MAX), Some(600_000));
         assert_eq!(request_ms(&metadata("50m"), 80), Some(50));
         assert_eq!(request_ms(&metadata("2S"), 80), Some(80));
         assert_eq!(request_ms(&metadata("99H"), 0), Some(600_000));
+        // A stream has no default and no maximum.
         let stream_ms = |metadata: &MetadataMap| limit_ms(Deadline::of_stream(metadata));
         assert_eq!(stream_ms(&no_metadata), None);
         assert_eq!(stream_ms(&metadata("2S")), Some(2000));

@@ -128,8 +128,8 @@ impl DomainModel {
 }
 
 impl Model {
-    /// Reads a scene from its server. `max_surface_samples` limits the surface samples per domain. A lower limit, but at
-    /// least 8, applies if the samples of all domains would have more than 8 Mi entries of U.
+    /// Reads a scene from its server. `max_surface_samples` limits the surface samples per domain. A lower limit of at
+    /// least 8 applies if the samples of all domains would have more than 8 Mi entries of U.
     ///
     /// # Errors
     /// `Client` as for the calls; `Invalid` if the description contradicts itself.

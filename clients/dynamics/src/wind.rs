@@ -58,8 +58,8 @@ pub struct WindPressure {
 
 impl Wind {
     /// The pressure at `time` (seconds) on a domain. `downwind_position` is the domain's position along the wind, in
-    /// scene units. The pressure is 0 at time 0. Its downwind component consists of a steady part (0.55), gusts (at most
-    /// 0.45) and turbulence (at most 0.15).
+    /// scene units. The pressure is 0 at time 0. Its downwind component consists of a steady part (0.55), gusts (at
+    /// most 0.45) and turbulence (at most 0.15).
     pub fn pressure(&self, time: f64, domain: usize, downwind_position: f64) -> WindPressure {
         let onset_factor = smoothstep(time / RISE_TIME);
         let gust_time = time - PEAK_TIME - self.delay_per_length * downwind_position;

@@ -74,8 +74,8 @@ pub struct ModeRows {
 }
 
 impl ModeRows {
-    /// The three rows of one requested vertex, r entries each; empty if r is 0. `ordinal` is the vertex's position in the
-    /// request. `None` if fewer vertices were requested.
+    /// The three rows of one requested vertex, r entries each; empty if r is 0. `ordinal` is the vertex's position in
+    /// the request. `None` if fewer vertices were requested.
     pub fn rows_of(&self, ordinal: usize) -> Option<&[f32]> {
         let start = ordinal.checked_mul(3 * self.rank)?;
         self.rows.get(start..)?.get(..3 * self.rank)

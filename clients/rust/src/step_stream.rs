@@ -67,7 +67,8 @@ struct Progress {
     acks: VecDeque<Ack>,
     /// Rejections that have not been reported to the caller.
     rejections: VecDeque<Rejection>,
-    /// `None` while the stream is open. `Some(None)` after the server has closed it, `Some(Some(error))` after it failed.
+    /// `None` while the stream is open. `Some(None)` after the server has closed it; `Some(Some(error))` after it has
+    /// failed.
     end: Option<Option<Error>>,
 }
 

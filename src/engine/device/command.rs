@@ -53,9 +53,11 @@ pub(in crate::engine) enum Command {
         frame_output: FrameOutput,
         reply: Reply<(AovImage, Option<Legend>)>,
     },
+    /// Finds the surface points at the pixels of a rectangle.
     Pick {
         id: SceneId,
         camera: Camera,
+        /// Size of the picture that contains the rectangle.
         picture: FrameSize,
         rectangle: PixelRect,
         reply: Reply<Vec<PickHit>>,
@@ -77,7 +79,7 @@ pub(in crate::engine) enum Command {
 impl Command {
     /// Answers the command with an error instead of executing it.
     pub(super) fn reply_error(self, error: Error) {
-        // A failed send means that the caller no longer waits.
+        // A failed send means that the caller no longer waits. `map_err(drop)` gives all arms the same type.
         match self {
             Self::LoadScene { reply, .. } | Self::UnloadScene { reply, .. } => reply.send(Err(error)).ok(),
             Self::Deform { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),

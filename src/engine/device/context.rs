@@ -278,7 +278,7 @@ impl DeviceContext {
         self.renderer.as_mut().map_err(|error| error.clone())?.finish_pick(pending_pick)
     }
 
-    /// Creates buffers that CUDA can map. Returns `None` unless the renderer runs on a CUDA device.
+    /// Creates OpenGL buffers that CUDA can map. Returns `None` unless the renderer runs on a CUDA device.
     fn create_shareable_buffers(&mut self, scene: &Arc<Scene>) -> Result<Option<SceneBuffers>> {
         match &mut self.renderer {
             Ok(renderer) if renderer.info().cuda_device.is_some() => renderer.load(scene).map(Some),
@@ -324,7 +324,7 @@ fn open_renderer(config: &Config, uses_cuda: bool) -> Result<Renderer> {
         RendererChoice::Software => Renderer::open(DevicePreference::Software),
         RendererChoice::Auto if uses_cuda => {
             let ordinal = i32::try_from(config.cuda_device).unwrap_or(i32::MAX);
-            // A driver without EGL can still deform. Another OpenGL device then draws the frames.
+            // A CUDA driver without EGL can deform but not draw. Another OpenGL device then draws the frames.
             Renderer::open(DevicePreference::Cuda(ordinal)).or_else(|_| Renderer::open(DevicePreference::Any))
         }
         RendererChoice::Auto => Renderer::open(DevicePreference::Any),

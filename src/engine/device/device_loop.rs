@@ -3,8 +3,8 @@
 //! Frames, picks and vertex readbacks are answered asynchronously, each type from its own bounded queue
 //! ([`InFlightQueue`]). After each command the loop waits for the vertex readbacks that were started before this
 //! command and answers them. It also answers the picks and frames that are ready. Readbacks that the command starts
-//! overlap with the next one. AOVs are read back while their command is executed, because the renderer has no
-//! asynchronous readback for them. AOVs are therefore never in flight.
+//! overlap with the next command. AOVs (arbitrary output variables: depth, normals and others) are never in flight:
+//! the renderer has no asynchronous readback for them.
 //!
 //! Frames pass through the renderer's ring buffer. The loop submits a frame, executes the commands after it, and
 //! answers the frame once the device has drawn it, or before the next submission when every ring slot is in flight. Two
@@ -35,19 +35,21 @@ use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Camera, FrameSize, PixelRect};
 use modalcast_render::{FrameImage, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
 
-/// How long the thread waits for a frame before it polls the command queue again.
+/// How long the thread waits for a frame before it checks the command queue again.
 const POLL_INTERVAL: Duration = Duration::from_micros(100);
 /// Threads that copy pixels.
 const COPY_THREADS: usize = 2;
 /// Picks in flight. A further pick first waits for the oldest one.
 const MAX_PICKS_IN_FLIGHT: usize = 16;
-/// Vertex readbacks in flight: one of the last command, and one of the command before it.
+/// Vertex readbacks in flight: one of the current command, and one of the command before it.
 const MAX_VERTEX_READBACKS_IN_FLIGHT: usize = 2;
 
 /// State owned by the device thread: the device context, the loaded scenes and the readbacks in flight.
 pub(super) struct DeviceLoop {
     context: DeviceContext,
+    /// Records the loss of the device.
     loss: DeviceLossSender,
+    /// Threads that copy pixels of frames.
     copy_pool: ThreadPool,
     scenes: HashMap<SceneId, LoadedScene>,
     vertices: InFlightQueue<PendingVertices, CopiedVertices>,
@@ -322,7 +324,7 @@ mod tests {
     const POSITIONS: VertexAttributes =
         VertexAttributes { positions: true, normals: false, displacements: false, boxes: false };
 
-    /// Starts a device thread and loads two scenes.
+    /// Starts a device thread whose deformer injects faults, and loads two scenes.
     async fn start_with_two_scenes() -> (DeviceHandle, Arc<Scene>) {
         let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);
         let handle = DeviceThread::start(2, open_device).await.expect("expected a device thread").handle;

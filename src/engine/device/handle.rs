@@ -23,6 +23,7 @@ use modalcast_render::{AovImage, FrameImage, MAX_FRAMES_IN_FLIGHT, PickHit};
 #[derive(Debug, Clone)]
 pub(in crate::engine) struct DeviceHandle {
     commands: mpsc::Sender<Command>,
+    /// Capacity of the command queue, for errors.
     capacity: usize,
     loss: DeviceLoss,
 }
@@ -43,9 +44,9 @@ impl DeviceThread {
         open_scenes: usize,
         open_device: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
     ) -> Result<Self> {
-        // A scene queues at most MAX_FRAMES_IN_FLIGHT frames, one copy and the next step. Opening a scene queues one
-        // command more, and 8 commands are a reserve. The queue is therefore full only if more than `open_scenes`
-        // scenes use the device.
+        // A scene queues at most MAX_FRAMES_IN_FLIGHT frames, one vertex readback, the next step and the command that
+        // opens it. 8 commands are a reserve. The queue is therefore full only if more than `open_scenes` scenes use
+        // the device.
         let capacity = (3 + MAX_FRAMES_IN_FLIGHT) * open_scenes + 8;
         let (commands, inbox) = mpsc::channel(capacity);
         let (info_sender, info_receiver) = oneshot::channel();

@@ -27,7 +27,7 @@ pub(in crate::engine) struct BufferContents {
     /// Bounds of the vertices in light space. `None` in a camera-relative frame, because the deformer computed them
     /// relative to the domains' floating origins.
     light_bounds: Option<OrientedBounds>,
-    /// Whether filling the buffers included an upload of vertices.
+    /// Whether vertices were uploaded to fill the buffers.
     pub(in crate::engine) is_uploaded: bool,
 }
 
@@ -52,8 +52,8 @@ pub struct LoadedScene {
     light_bounds: Option<OrientedBounds>,
     /// The state that the deformer's output shows.
     current_state: Arc<SceneState>,
-    /// Number of deformations, including rejected states and the deformations that undo them, since each one changes
-    /// the content of the buffers.
+    /// Number of deformations. Includes rejected states and the deformations that undo them, because each deformation
+    /// changes the content of the buffers.
     generation: u64,
     /// The color map whose values are in the buffers.
     cached_color_map: Option<(FrameOutput, Legend)>,
@@ -157,8 +157,8 @@ impl LoadedScene {
         let origins = match &self.current_state.origins {
             Some(origins) if !origins.is_uniform() => Arc::clone(origins),
             // All domains have the same origin, so the deformer's output is drawn unchanged.
-            origins => {
-                buffers.set_origin(origins.as_ref().map_or([0.0; 3], |origins| origins.shared_origin()));
+            uniform_origins => {
+                buffers.set_origin(uniform_origins.as_ref().map_or([0.0; 3], |origins| origins.shared_origin()));
                 buffers.set_step(self.generation);
                 return Ok(BufferContents { bounds: self.bounds, light_bounds: self.light_bounds, is_uploaded });
             }
@@ -253,8 +253,8 @@ impl LoadedScene {
         self.buffers.as_ref().ok_or_else(no_buffers_error)
     }
 
-    /// Drops the deformer and returns the buffers. CUDA may have registered the buffers for the deformer, so the
-    /// deformer must not outlive them.
+    /// Drops the deformer and returns the buffers. The deformer may have registered the buffers with CUDA, so it must
+    /// be dropped before the buffers are deleted.
     pub(in crate::engine) fn into_buffers(self) -> Option<SceneBuffers> {
         drop(self.deformer);
         self.buffers

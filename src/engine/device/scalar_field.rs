@@ -13,23 +13,28 @@ use modalcast_model::scene::{Scene, SceneState};
 /// rounding errors.
 const MIN_SCALE_FRACTION: f64 = 1e-5;
 
+/// Limits of the end of a scale. A client may request the same range.
+const MIN_SCALE: f64 = 1e-30;
+const MAX_SCALE: f64 = 1e30;
+
 /// Returns `mode` if at least one domain of the scene has a mode with this index.
 ///
 /// # Errors
 /// `Invalid` when every domain has fewer modes.
 pub fn validate_mode(scene: &Scene, mode: u32) -> Result<u32> {
     let max_rank = scene.layout.domains.iter().map(|domain| domain.rank).max().unwrap_or(0);
-    match (mode as usize) < max_rank {
-        true => Ok(mode),
-        false => Err(invalid("picture.mode", format!("an index below {max_rank}"), mode)),
+    if (mode as usize) < max_rank {
+        Ok(mode)
+    } else {
+        Err(invalid("picture.mode", format!("an index below {max_rank}"), mode))
     }
 }
 
 /// |u| of every vertex in meters: the distance of its deformed position from T x0, the position that it has if the
 /// domain is rigid.
 ///
-/// T x0 and the difference are computed in f64, so the error is that of the deformer's positions. Those are f32
-/// relative to the domain's floating origin: one kilometer from it the error is up to 0.1 mm.
+/// T x0 and the difference are computed in f64, so the error is the error of the deformer's positions. These positions
+/// are f32 relative to the domain's floating origin: one kilometer from the origin the error is up to 0.1 mm.
 pub(in crate::engine) fn displacement_magnitudes(
     scene: &Scene,
     state: &SceneState,
@@ -39,6 +44,7 @@ pub(in crate::engine) fn displacement_magnitudes(
     let magnitudes = domains.flat_map_iter(|(index, (domain, domain_layout))| {
         let world_from_domain = state.composed_transform(scene, index);
         let (linear, entries) = (world_from_domain.linear(), world_from_domain.to_f64());
+        // The fourth column of the row-major 3x4 matrix.
         let translation = Vector3::new(entries[3], entries[7], entries[11]);
         let deformed_positions =
             surface.positions[3 * domain_layout.first_vertex..][..3 * domain_layout.vertices].chunks_exact(3);
@@ -72,17 +78,17 @@ pub(in crate::engine) fn fit_legend(scene: &Scene, frame_output: FrameOutput, va
     let max_value = f64::from(values.iter().copied().fold(0.0, f32::max));
     let (title, requested_max, min_scale_max) = match frame_output {
         FrameOutput::ModeShape { mode, scale_max } => {
-            (format!("shape of mode {mode}, m per unit of q"), scale_max, 1e-30)
+            (format!("shape of mode {mode}, m per unit of q"), scale_max, MIN_SCALE)
         }
         FrameOutput::Displacement { scale_max } => (
             "displacement |u|, m".to_owned(),
             scale_max,
             MIN_SCALE_FRACTION * scene.unit * scene.rest_bounds.diagonal(),
         ),
-        _ => (String::new(), 0.0, 1e-30),
+        _ => (String::new(), 0.0, MIN_SCALE),
     };
     let scale_max = if requested_max > 0.0 { requested_max } else { nice_ceiling(max_value.max(min_scale_max)) };
-    Legend { title, scale_max: scale_max.clamp(1e-30, 1e30) }
+    Legend { title, scale_max: scale_max.clamp(MIN_SCALE, MAX_SCALE) }
 }
 
 #[cfg(test)]
@@ -113,6 +119,7 @@ mod tests {
             assert!((mode_shape[vertex] - mode_vector.norm()).abs() < 1e-6);
             assert_eq!(mode_shape[vertex_of_second], mode_shape[vertex]);
             assert!(displacements[vertex] < 1e-6, "expected the first strip at rest, got {displacements:?}");
+            // The scale of the transform times the coordinate.
             let expected = 2.0 * 0.75 * mode_vector.norm();
             let displacement = displacements[vertex_of_second];
             assert!((displacement - expected).abs() < 2e-6, "expected {expected}, got {displacement}");
@@ -123,6 +130,7 @@ mod tests {
             fit_legend(&scene, FrameOutput::Displacement { scale_max }, displacements).scale_max
         };
         let fitted_max = legend_max(0.0, &displacements);
+        // The scale ends at 1, 2, 2.5 or 5 times a power of ten; neighbors differ by at most a factor of 2.
         assert!(fitted_max >= f64::from(max_displacement) && fitted_max <= 2.5 * f64::from(max_displacement));
         assert_eq!(legend_max(3.0, &displacements), 3.0);
         let max_of_rounding_errors = legend_max(0.0, &[1e-9]);

@@ -12,6 +12,7 @@ pub struct ColorFrame {
     pub height: u32,
     /// RGBA8 sRGB, top row first.
     pub rgba: Bytes,
+    /// The rasterizers that drew the frame.
     pub(super) raster_backends: RasterBackends,
     /// The PNG and the milliseconds that encoding took.
     pub(super) png: OnceCell<(Bytes, f64)>,

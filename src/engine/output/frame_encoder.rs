@@ -34,6 +34,7 @@ pub enum FrameFormat {
 #[derive(Debug, Clone)]
 pub struct EncodedOutput {
     pub step: StepId,
+    /// Steps that the subscriber skipped since its last output.
     pub skipped: u64,
     pub stages: StageTimes,
     /// The rasterizers that drew a color frame; default for other results.
@@ -92,8 +93,8 @@ impl FrameEncoder {
         Ok(EncodedOutput { step: output.step, skipped: output.skipped, stages, raster_backends, bytes })
     }
 
-    /// Returns the PNG of a frame and the milliseconds that encoding took. The first caller encodes it. If that caller
-    /// is cancelled, the next one encodes it.
+    /// Returns the PNG of a frame and the milliseconds that encoding took. The first caller encodes the frame. If this
+    /// caller is cancelled, the next caller encodes the frame.
     async fn encode_png_once(&self, frame: &Arc<ColorFrame>) -> Result<(Bytes, f64)> {
         let encode_png = || {
             let frame = Arc::clone(frame);
@@ -118,6 +119,7 @@ impl FrameEncoder {
 /// Draws a color map with its legend and encodes it.
 fn encode_color_map(image: &AovImage, legend: &Legend, format: FrameFormat) -> Result<Vec<u8>> {
     let size = [image.width, image.height];
+    // `samples` is the number of samples per pixel.
     let rgba = frame::draw_color_map(&image.bytes, image.samples, size, legend)?;
     if format == FrameFormat::Png { frame::encode_png(size[0], size[1], &rgba) } else { Ok(rgba) }
 }

@@ -15,8 +15,14 @@ use modalcast_render::RasterBackends;
 // Vertices are copied in memory order, and the wire format is little-endian.
 const _: () = assert!(cfg!(target_endian = "little"), "expected a little-endian target");
 
-/// Limit on the domains of one vertex reply, because the first message contains two counts per domain.
+/// Limit on the domains of one vertex reply. It bounds the first message, which contains two counts per domain.
 const MAX_DOMAINS: usize = 65_536;
+
+/// Size of a vector: 3 f32.
+const VECTOR_BYTES: usize = 12;
+
+/// Size of a domain's box: 6 f32.
+const BOX_BYTES: u64 = 24;
 
 /// Vertices as bytes, and the origin of their positions.
 #[derive(Debug, Clone)]
@@ -27,9 +33,6 @@ pub struct PackedVertices {
     /// Size in bytes of the per-domain origins at the end of the reply; 0 if `origin` applies to all selected domains.
     pub origin_bytes: u64,
 }
-
-/// Bytes of a domain's box: 6 f32.
-const BOX_BYTES: u64 = 24;
 
 /// The domains and vertex attributes that a client selects.
 #[derive(Debug, Clone)]
@@ -70,19 +73,19 @@ impl VertexSelection {
         if self.attributes.boxes { BOX_BYTES * self.domains.len() as u64 } else { 0 }
     }
 
-    /// Size in bytes of one vector (3 f32) per vertex of the selected domains.
+    /// Size in bytes of one vector per vertex of the selected domains.
     fn vector_bytes(&self) -> u64 {
-        self.vertices().map(|count| 12 * u64::from(count)).sum()
+        self.vertex_counts().map(|count| VECTOR_BYTES as u64 * u64::from(count)).sum()
     }
 
     /// Vertex count of each selected domain.
-    pub fn vertices(&self) -> impl Iterator<Item = u32> {
+    pub fn vertex_counts(&self) -> impl Iterator<Item = u32> {
         let domain_layouts = &self.scene.layout.domains;
         self.domains.iter().map(|domain| domain_layouts[*domain as usize].vertices as u32)
     }
 
     /// Corner count of each selected domain.
-    pub fn corners(&self) -> impl Iterator<Item = u32> {
+    pub fn corner_counts(&self) -> impl Iterator<Item = u32> {
         let domain_layouts = &self.scene.layout.domains;
         self.domains.iter().map(|domain| domain_layouts[*domain as usize].corners as u32)
     }
@@ -155,6 +158,7 @@ fn push_origins(selection: &VertexSelection, origins: Option<&FloatingOrigins>, 
     let scene = &selection.scene;
     let to_meters = |origin: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * origin[axis]);
     let Some(origins) = origins else { return scene.origin };
+    // A domain that follows another one has the origin of its transform root.
     let domain_origins =
         || selection.domains.iter().map(|domain| origins.origin_of(scene.transform_roots.root_of(*domain as usize)));
     if domain_origins().any(|origin| origin != origins.shared_origin()) {
@@ -168,9 +172,10 @@ fn push_origins(selection: &VertexSelection, origins: Option<&FloatingOrigins>, 
 fn pack(surface: &DeformedSurface, selection: &VertexSelection) -> Vec<u8> {
     let (layout, attributes): (&Layout, VertexAttributes) = (&selection.scene.layout, selection.attributes);
     let corner_count: usize =
-        if attributes.normals { selection.corners().map(|count| count as usize).sum() } else { 0 };
+        if attributes.normals { selection.corner_counts().map(|count| count as usize).sum() } else { 0 };
     let bytes_without_normals = selection.position_bytes() + selection.displacement_bytes() + selection.box_bytes();
-    let mut bytes = Vec::with_capacity(12 * corner_count + bytes_without_normals as usize);
+    let mut bytes = Vec::with_capacity(VECTOR_BYTES * corner_count + bytes_without_normals as usize);
+    // `range` gives the index of a domain's first vector in `numbers`, and the number of its vectors.
     let mut append_attribute = |is_selected: bool, numbers: &[f32], range: &dyn Fn(&DomainLayout) -> (usize, usize)| {
         for domain in selection.domains.iter().filter(|_| is_selected) {
             let (first_vector, count) = range(&layout.domains[*domain as usize]);
@@ -209,6 +214,7 @@ mod tests {
             normals: numbers_from(100.0, 24),
             ..DeformedSurface::default()
         };
+        // Each strip has four vertices and four corners: 12 numbers of positions and 12 of normals.
         let selection =
             VertexSelection::new(&scene, vec![1], VertexAttributes::VERTICES).expect("expected a valid selection");
         let floats: Vec<f32> = bytemuck::pod_collect_to_vec(&pack(&surface, &selection));

@@ -1,5 +1,5 @@
-//! The result of a pick, with the data that a client needs to apply a force at the point: the rows of U and the linear
-//! part A of the transform.
+//! The result of a pick, with the data that a client needs to apply a force at the point: the rows of U, and A, the
+//! linear part of the transform.
 
 use std::sync::Arc;
 

@@ -76,6 +76,7 @@ pub(super) struct ActorParams {
 /// The current writer of a scene.
 struct Writer {
     step_queue: Arc<StepQueue>,
+    /// Address of the client, for errors.
     peer: String,
     acquired_at: Instant,
 }
@@ -124,6 +125,7 @@ pub(super) struct SceneActor {
     delivery: OutputDelivery,
     checkpoints: SceneCheckpoints,
     last_step: watch::Sender<Option<StepId>>,
+    /// See [`ActorParams::wake`].
     wake: Arc<Notify>,
     failure: Arc<OnceLock<Error>>,
     on_failure: Box<dyn FnOnce() + Send>,
@@ -144,7 +146,7 @@ impl SceneActor {
             run: state.run,
             writer: None,
             phase: StepPhase::Idle,
-            current: CurrentStep::on_open(state),
+            current: CurrentStep::of_opened_scene(state),
             last_step,
             wake,
             failure,
@@ -239,7 +241,7 @@ impl SceneActor {
                 self.checkpoints.save(&state);
                 self.last_step.send_replace(Some(StepId::of(&state)));
                 self.current = CurrentStep { state, step_count: self.current.step_count + 1 + merged, stages };
-                self.delivery.begin_step();
+                self.delivery.drop_cached_vertices();
                 self.phase = StepPhase::Delivering(CompletedStep::new(step_queue, self.current.stages.clone()));
             }
             Err(error) => {
@@ -277,7 +279,7 @@ impl SceneActor {
         self.run += 1;
         let step_queue = Arc::new(StepQueue::new(policy, window, Arc::clone(&self.wake)));
         self.writer = Some(Writer { step_queue: Arc::clone(&step_queue), peer, acquired_at: Instant::now() });
-        Ok(AcquiredLease { lease: WriterLease(step_queue), run: self.run })
+        Ok(AcquiredLease { lease: WriterLease { step_queue }, run: self.run })
     }
 
     /// Whether another step is queued. If so, readbacks of the current step are only started and overlap with the

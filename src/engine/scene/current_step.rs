@@ -18,7 +18,8 @@ pub(super) struct CurrentStep {
 
 impl CurrentStep {
     /// The step of a scene that is opened with a restored state or the rest state.
-    pub(super) fn on_open(state: Arc<SceneState>) -> Self {
+    pub(super) fn of_opened_scene(state: Arc<SceneState>) -> Self {
+        // A restored state counts as one step. The rest state has the run 0 and is no step.
         let step_count = u64::from(state.run > 0);
         Self { state, step_count, stages: Vec::new() }
     }

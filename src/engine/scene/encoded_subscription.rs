@@ -15,9 +15,8 @@ const MAX_PIXEL_BYTES: usize = 128 << 20;
 /// is sent. Further frames would only add latency.
 const MAX_LATEST_ENCODINGS: usize = 2;
 
-/// The encoded frames of a [`Subscription`], in the same order. At most one frame per core is held of a lossless
-/// subscription. While the client does not read frames, the subscription is not read either and applies back-pressure
-/// to the writer.
+/// The encoded frames of a [`Subscription`], in the same order. A lossless stream holds at most one frame per core.
+/// While the client does not read frames, the subscription is not read either and applies back-pressure to the writer.
 #[derive(Debug)]
 pub struct EncodedSubscription {
     subscription: Subscription,
@@ -27,7 +26,7 @@ pub struct EncodedSubscription {
     remaining_frames: u64,
     /// Oldest first.
     encodings: VecDeque<Encoding>,
-    /// The error that ended the subscription. It is reported after the frames that are held.
+    /// The error that ended the subscription. It is reported after the frames in `encodings`.
     end_error: Option<Error>,
 }
 

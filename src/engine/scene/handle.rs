@@ -31,9 +31,11 @@ pub struct SceneHandle {
     id: SceneId,
     /// The reason why no frame can be drawn. `None` if frames can be drawn.
     frames_unavailable: Option<Error>,
+    /// Limit on the steps that a writer may leave unacknowledged.
     max_window: u32,
     mailbox: mpsc::Sender<Message>,
     last_step: watch::Receiver<Option<StepId>>,
+    /// Wakes the actor when a subscription grants a credit or is dropped.
     wake: Arc<Notify>,
     is_stopping: AtomicBool,
     /// The error with which the scene has failed.
@@ -225,14 +227,14 @@ impl WriterSession {
     /// Validates and queues a step. A rejected step has no effect.
     ///
     /// # Errors
-    /// `Invalid` for a malformed step or one beyond the window; or the error with which the server ended the stream.
+    /// `Invalid` for a malformed step or a step beyond the window; the error with which the server ended the stream.
     pub fn push_step(&mut self, raw: &RawStepUpdate) -> Result<()> {
         let begin = Instant::now();
         if let Some(last_number) = self.last_number.filter(|last_number| raw.number <= *last_number) {
             return Err(invalid("step.number", format!("a number above {last_number}"), raw.number));
         }
         let update = StepUpdate::parse(&self.scene, raw)?;
-        self.lease.0.push(QueuedStep::new(update, ms_since(begin)))?;
+        self.lease.step_queue.push(QueuedStep::new(update, ms_since(begin)))?;
         self.last_number = Some(raw.number);
         Ok(())
     }
@@ -242,16 +244,17 @@ impl WriterSession {
     /// # Errors
     /// The error with which the server ended the stream, after all reports.
     pub async fn next_report(&self) -> Result<StepReport> {
-        self.lease.0.next_report().await
+        self.lease.step_queue.next_report().await
     }
 
     /// Whether every accepted step is reported and every report is taken.
     pub fn is_drained(&self) -> bool {
-        self.lease.0.is_drained()
+        self.lease.step_queue.is_drained()
     }
 
     /// Whether the server has ended the stream.
     pub fn is_ended(&self) -> bool {
-        self.lease.0.is_closed()
+        // The lease is held, so only an error of the server can have closed the queue.
+        self.lease.step_queue.is_closed()
     }
 }

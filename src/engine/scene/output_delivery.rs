@@ -52,7 +52,7 @@ impl OutputDelivery {
                 device,
                 stall_timeout: config.stall_timeout,
                 readbacks: ReadbackQueue::default(),
-                cached: None,
+                cached_vertices: None,
             },
         }
     }
@@ -68,7 +68,7 @@ impl OutputDelivery {
             return Err(Error::Busy { queue: "subscribers of the scene", limit });
         }
         let receives_current = subscriber.delivery == Delivery::Latest && current.state.run > 0;
-        subscriber.delivered_count =
+        subscriber.delivered_step_count =
             if receives_current { current.step_count.saturating_sub(1) } else { current.step_count };
         self.subscribers.push(subscriber);
         Ok(())
@@ -89,7 +89,7 @@ impl OutputDelivery {
     /// Whether a lossless subscriber has not received the current step.
     pub(super) fn has_unserved_lossless(&self, current: &CurrentStep) -> bool {
         let lacks_current_step = |subscriber: &Subscriber| {
-            subscriber.delivery == Delivery::Lossless && subscriber.delivered_count < current.step_count
+            subscriber.delivery == Delivery::Lossless && subscriber.delivered_step_count < current.step_count
         };
         self.subscribers.iter().any(lacks_current_step)
     }
@@ -181,7 +181,7 @@ impl OutputDelivery {
         result
     }
 
-    /// Acknowledges the current step, or schedules that for the delivery of its last readback in flight.
+    /// Acknowledges the current step after its last readback in flight, or now if it has none.
     pub(super) async fn acknowledge(&mut self, current: &CurrentStep, step: CompletedStep) {
         if let Some(step) = self.producer.readbacks.attach_acknowledgement(current.step_count, step) {
             self.flush().await;
@@ -190,8 +190,8 @@ impl OutputDelivery {
     }
 
     /// Drops the cached vertices of the previous step.
-    pub(super) fn begin_step(&mut self) {
-        self.producer.cached = None;
+    pub(super) fn drop_cached_vertices(&mut self) {
+        self.producer.cached_vertices = None;
     }
 
     /// Ends every subscription and every request with `error`.
@@ -220,7 +220,7 @@ impl OutputDelivery {
 fn attributes_for(subscriber: &Subscriber, current: &CurrentStep) -> Option<VertexAttributes> {
     match subscriber.spec {
         OutputSpec::Vertices(attributes)
-            if subscriber.delivered_count < current.step_count && subscriber.has_credit() =>
+            if subscriber.delivered_step_count < current.step_count && subscriber.has_credit() =>
         {
             Some(attributes)
         }
@@ -234,7 +234,7 @@ struct DeliveryRound<'a> {
     mode: DeliveryMode,
     /// Union of the vertex attributes that all subscribers request.
     attributes: VertexAttributes,
-    /// Whether one copy of `attributes` is started for all `vertex_recipients` at the end of the round.
+    /// Whether the round ends by starting one copy of `attributes` for all `vertex_recipients`.
     starts_shared_copy: bool,
     vertex_recipients: Vec<Recipient>,
     /// Frames that this round started.
@@ -257,7 +257,7 @@ struct OutputProducer {
     stall_timeout: Duration,
     readbacks: ReadbackQueue,
     /// Vertices of the current step in host memory, cached for later requests and subscribers.
-    cached: Option<CachedVertices>,
+    cached_vertices: Option<CachedVertices>,
 }
 
 /// Vertices in host memory.
@@ -274,10 +274,10 @@ impl OutputProducer {
     /// Delivers the current step to one subscriber, or starts the delivery. Returns false if the subscriber must be
     /// dropped.
     async fn serve(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
-        // `round.attributes` lacks the attributes of a subscriber that gained its credit after the round had begun.
+        // `round.attributes` lacks the attributes of a subscriber that received its credit after the round had begun.
         let is_covered = |attributes: VertexAttributes| round.attributes.contains(attributes);
         if round.starts_shared_copy && attributes_for(subscriber, round.current).is_some_and(is_covered) {
-            round.vertex_recipients.push(Recipient::of(subscriber, round.current.step_count));
+            round.vertex_recipients.push(Recipient::take_credit_of(subscriber, round.current.step_count));
             return true;
         }
         if round.mode.overlaps_next_step && self.start_frame(subscriber, round) {
@@ -294,12 +294,12 @@ impl OutputProducer {
             return false;
         };
         let step_count = round.current.step_count;
-        if subscriber.delivered_count == step_count || !subscriber.has_credit() {
+        if subscriber.delivered_step_count == step_count || !subscriber.has_credit() {
             return false;
         }
         let has_same_view = |pending: &&mut PendingReadback| pending.is_frame_of(step_count, &subscriber.spec);
         if let Some(pending_frame) = self.readbacks.iter_mut().chain(&mut round.started_frames).find(has_same_view) {
-            pending_frame.add_recipient(Recipient::of(subscriber, step_count));
+            pending_frame.add_recipient(Recipient::take_credit_of(subscriber, step_count));
             return true;
         }
         if round.started_frames.len() >= MAX_FRAMES_IN_FLIGHT {
@@ -307,7 +307,7 @@ impl OutputProducer {
         }
         let pending_image = self.device.begin_draw(self.scene_on_device.id, camera, size);
         let readback = Readback::Frame(subscriber.spec, pending_image);
-        let recipients = vec![Recipient::of(subscriber, step_count)];
+        let recipients = vec![Recipient::take_credit_of(subscriber, step_count)];
         round.started_frames.push(PendingReadback::new(round.current, readback, recipients));
         true
     }
@@ -315,7 +315,7 @@ impl OutputProducer {
     /// Produces the current step for one subscriber and delivers it. Returns false if the subscriber must be dropped.
     async fn serve_now(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
         let current = round.current;
-        if subscriber.delivered_count == current.step_count {
+        if subscriber.delivered_step_count == current.step_count {
             return true;
         }
         if !subscriber.has_credit() {
@@ -411,7 +411,7 @@ impl OutputProducer {
 
     /// The attributes of the current vertices that are cached in host memory.
     fn cached_attributes(&self) -> VertexAttributes {
-        self.cached.as_ref().map_or(VertexAttributes::default(), |cached| cached.attributes)
+        self.cached_vertices.as_ref().map_or(VertexAttributes::default(), |cached| cached.attributes)
     }
 
     /// Returns the current vertices with at least the given attributes. They are copied from the device once per step
@@ -421,14 +421,15 @@ impl OutputProducer {
         attributes: VertexAttributes,
         other_attributes: VertexAttributes,
     ) -> Result<CachedVertices> {
-        if let Some(cached) = self.cached.as_ref().filter(|cached| cached.attributes.contains(attributes)) {
+        if let Some(cached) = self.cached_vertices.as_ref().filter(|cached| cached.attributes.contains(attributes)) {
             return Ok(cached.clone());
         }
         // The cached attributes are copied again, so that alternating readers do not evict each other's attributes.
         let copied_attributes = self.cached_attributes().union(attributes).union(other_attributes);
         let CopiedVertices { surface, copy_ms } =
             self.device.read_vertices(self.scene_on_device.id, copied_attributes).wait().await?;
-        Ok(self.cached.insert(CachedVertices { surface, attributes: copied_attributes, copy_ms }).clone())
+        let copied = CachedVertices { surface, attributes: copied_attributes, copy_ms };
+        Ok(self.cached_vertices.insert(copied).clone())
     }
 }
 
@@ -521,6 +522,7 @@ mod tests {
         timeout(Duration::ZERO, slow_subscription.next()).await.expect_err("expected no frame yet");
         let (mut delivery, mut device) = delivery_to(vec![slow_subscriber]);
         delivery.serve_subscribers(&current_step(1), WITH_NEXT_STEP).await;
+        // A generous timeout, because the request must arrive. The shorter ones below wait for requests that may not.
         let first_request = next_draw_request(&mut device, 10_000).await.expect("expected the first frame");
         delivery.subscribers.push(fast_subscriber);
         let second_step = current_step(2);

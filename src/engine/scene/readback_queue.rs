@@ -11,9 +11,9 @@
 //! ```
 //!
 //! A deformer that writes into OpenGL buffers cannot overlap with frames on the device: mapping the buffers is ordered
-//! after all OpenGL commands issued before (`gpu::interop`), including the readback of frame k. Only the host's work
-//! overlaps. Step k+1 is recorded and submitted while frame k is drawn, and starts on the device as soon as frame k is
-//! read. Frame k is copied out, encoded and sent while frame k+1 is drawn.
+//! after all OpenGL commands issued before, including the readback of frame k. Only the host's work overlaps. Step k+1
+//! is recorded and submitted while frame k is drawn, and starts on the device as soon as frame k is read. Frame k is
+//! copied out, encoded and sent while frame k+1 is drawn.
 //!
 //! ```text
 //! device    [draw k][read k][deform k+1] [draw k+1][read k+1][deform k+2]
@@ -67,8 +67,8 @@ pub(super) struct Recipient {
 }
 
 impl Recipient {
-    /// Takes one of the subscriber's credits for the result of the scene's `step_count`-th step.
-    pub(super) fn of(subscriber: &mut Subscriber, step_count: u64) -> Self {
+    /// Takes one of the subscriber's credits, and marks the scene's `step_count`-th step as delivered to it.
+    pub(super) fn take_credit_of(subscriber: &mut Subscriber, step_count: u64) -> Self {
         Self { skipped: subscriber.mark_delivered(step_count), permit: subscriber.take_permit() }
     }
 }

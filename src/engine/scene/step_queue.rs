@@ -27,6 +27,7 @@ pub(in crate::engine) struct QueuedStep {
     pub update: StepUpdate,
     /// Number of older steps that were merged into this one.
     pub merged: u64,
+    /// Milliseconds that parsing the step took.
     parse_ms: f64,
     queued_at: Instant,
 }
@@ -60,6 +61,7 @@ pub enum StepReport {
 #[derive(Debug)]
 pub(in crate::engine) struct StepQueue {
     policy: Policy,
+    /// Maximum number of steps that are queued, in progress, or whose report the writer has not taken.
     window: usize,
     state: Mutex<QueueState>,
     /// Wakes the scene: a step was queued or the queue was closed.
@@ -94,11 +96,13 @@ impl CompletedStep {
 /// The writer's lease on a scene. Dropping it closes the queue and admits the next writer. A reply that carries the
 /// lease is dropped if the client has disconnected, which also releases the lease.
 #[derive(Debug)]
-pub(in crate::engine) struct WriterLease(pub Arc<StepQueue>);
+pub(in crate::engine) struct WriterLease {
+    pub step_queue: Arc<StepQueue>,
+}
 
 impl Drop for WriterLease {
     fn drop(&mut self) {
-        self.0.close();
+        self.step_queue.close();
     }
 }
 
@@ -111,9 +115,8 @@ struct QueueState {
     reports: VecDeque<StepReport>,
     /// Number of steps that were merged into later ones.
     skipped: u64,
-    /// Whether the writer has dropped its lease.
-    is_closed: bool,
-    /// The error with which the server ended the queue.
+    is_lease_dropped: bool,
+    /// The error with which the scene ended the queue.
     end_error: Option<Error>,
 }
 
@@ -178,12 +181,12 @@ impl StepQueue {
             Ok(stages) => StepReport::Done { step, skipped, stages },
             Err(error) => StepReport::Rejected { step, error },
         };
-        // Under `latest` a writer may read reports slowly. A newer `Done` also reports the older steps, so it replaces
-        // the older `Done`. `Rejected` is never replaced. If more than `window` reports already wait, a further report
-        // that replaces none is dropped and ends the queue.
-        let supersedes =
+        // Under `latest` a writer may read reports slowly. A `Done` also covers the older steps, so it replaces a
+        // waiting `Done` once `window` reports wait. `Rejected` is never replaced. If more than `window` reports wait,
+        // a further report that replaces none is dropped and ends the queue.
+        let replaces_newest =
             matches!((state.reports.back(), &report), (Some(StepReport::Done { .. }), StepReport::Done { .. }));
-        if state.reports.len() >= self.window && supersedes {
+        if state.reports.len() >= self.window && replaces_newest {
             state.reports.pop_back();
         }
         if state.reports.len() > self.window {
@@ -222,17 +225,18 @@ impl StepQueue {
     /// Called when the writer drops its lease. Drops the queued steps.
     pub(in crate::engine) fn close(&self) {
         let mut state = self.lock();
-        state.is_closed = true;
+        state.is_lease_dropped = true;
         state.queued.clear();
         self.scene_wake.notify_one();
     }
 
+    /// Whether the writer has dropped its lease or the queue has ended with an error.
     pub(in crate::engine) fn is_closed(&self) -> bool {
         let state = self.lock();
-        state.is_closed || state.end_error.is_some()
+        state.is_lease_dropped || state.end_error.is_some()
     }
 
-    /// Ends the queue with an error from the scene. Drops the queued steps.
+    /// Ends the queue with an error, which the writer receives after its reports. Drops the queued steps.
     pub(in crate::engine) fn end(&self, error: Error) {
         let mut state = self.lock();
         state.end_error.get_or_insert(error);
@@ -260,6 +264,7 @@ mod tests {
     use crate::engine::testing;
     use modalcast_model::scene::{RawStepUpdate, SceneState};
 
+    /// A step that sets the two coordinates of one strip.
     fn step(number: u64, domain: u32, q: [f32; 2]) -> QueuedStep {
         let scene = testing::two_strips();
         let q = bytes::Bytes::copy_from_slice(bytemuck::cast_slice(&q));
@@ -312,6 +317,7 @@ mod tests {
                 rejected => panic!("expected a completed step, got {rejected:?}"),
             }
         }
+        // The window of two reports holds the first one and the newest one, which replaced the reports in between.
         assert_eq!(reported_numbers, [1, 9]);
     }
 

@@ -14,7 +14,7 @@ use tokio::sync::{Notify, mpsc, watch};
 use crate::engine::output::step_output::{OutputSpec, StepOutput};
 use modalcast_model::error::{Error, Result, fault_in};
 
-/// Results that a lossless subscriber may leave unread before it blocks the writer.
+/// Results that a lossless subscriber may leave unread before it blocks the writer. Also the capacity of the channel.
 pub(super) const LOSSLESS_CREDITS: usize = 2;
 
 /// Which steps a subscriber receives.
@@ -41,9 +41,10 @@ pub(in crate::engine) struct Subscriber {
     pub spec: OutputSpec,
     pub delivery: Delivery,
     /// The scene's step count at this subscriber's last result.
-    pub delivered_count: u64,
+    pub delivered_step_count: u64,
     /// When this subscriber began to block the writer.
     pub stalled_since: Option<Instant>,
+    /// Number of results that may be sent now. The subscription grants credits.
     credits: Arc<AtomicUsize>,
     results: mpsc::Sender<Result<StepOutput>>,
     /// Whether an error was sent, which ends the subscription.
@@ -88,8 +89,8 @@ impl Subscriber {
 
     /// Records the delivery of the scene's `step_count`-th step. Returns how many steps the subscriber has skipped.
     pub(in crate::engine) fn mark_delivered(&mut self, step_count: u64) -> u64 {
-        let skipped = step_count - self.delivered_count - 1;
-        self.delivered_count = step_count;
+        let skipped = step_count - self.delivered_step_count - 1;
+        self.delivered_step_count = step_count;
         self.stalled_since = None;
         skipped
     }
@@ -134,7 +135,7 @@ impl Subscription {
         let subscriber = Subscriber {
             spec,
             delivery,
-            delivered_count: 0,
+            delivered_step_count: 0,
             stalled_since: None,
             credits: Arc::clone(&credits),
             results: result_sender,

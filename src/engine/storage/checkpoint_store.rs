@@ -31,6 +31,10 @@ const MAGIC_ORIGINS: &[u8; 8] = b"MCSTEP02";
 /// The magic number and five numbers of 8 bytes.
 const HEADER_BYTES: usize = 8 + 5 * 8;
 const HASH_BYTES: usize = 32;
+/// Size of a transform: 12 f32.
+const TRANSFORM_BYTES: usize = 48;
+/// Size of an origin or a translation: 3 f64.
+const POINT_BYTES: usize = 24;
 
 /// Writes checkpoints in the background.
 #[derive(Debug)]
@@ -87,6 +91,7 @@ impl CheckpointStore {
         let _files = lock(&self.shared.file_lock);
         // A scene that failed and is opened again may have a state that is not on disk yet.
         if let Some(state) = lock(&self.shared.pending).dirty.get(name) {
+            // Decoding checks that the state matches the scene.
             return decode(&encode(state), scene).map(Some);
         }
         match fs::read(checkpoint_path(&self.folder, name)) {
@@ -142,6 +147,7 @@ impl Drop for CheckpointStore {
 fn write_loop(shared: &Shared, folder: &Path) {
     loop {
         let has_no_work = |pending: &mut PendingWrites| pending.dirty.is_empty() && !pending.is_stopping;
+        // Wait for work. Drop the lock before `file_lock` is acquired, because of the lock order.
         drop(
             shared.change_signal.wait_while(lock(&shared.pending), has_no_work).unwrap_or_else(PoisonError::into_inner),
         );
@@ -173,7 +179,8 @@ fn checkpoint_path(folder: &Path, name: &str) -> PathBuf {
 }
 
 fn encode(state: &SceneState) -> Vec<u8> {
-    let mut bytes = Vec::with_capacity(HEADER_BYTES + 4 * state.q.len() + 48 * state.transforms.len() + HASH_BYTES);
+    let size = HEADER_BYTES + 4 * state.q.len() + TRANSFORM_BYTES * state.transforms.len() + HASH_BYTES;
+    let mut bytes = Vec::with_capacity(size);
     bytes.extend_from_slice(if state.origins.is_some() { MAGIC_ORIGINS } else { MAGIC });
     bytes.extend_from_slice(&state.run.to_le_bytes());
     bytes.extend_from_slice(&state.step.to_le_bytes());
@@ -195,9 +202,10 @@ fn encode(state: &SceneState) -> Vec<u8> {
 fn decode(bytes: &[u8], scene: &Scene) -> Result<SceneState> {
     let rest_state = SceneState::rest(scene);
     let has_origins = bytes.starts_with(MAGIC_ORIGINS);
-    let origin_bytes = if has_origins { 24 * (1 + rest_state.transforms.len()) } else { 0 };
-    let file_size =
-        HEADER_BYTES + 4 * rest_state.q.len() + 48 * rest_state.transforms.len() + origin_bytes + HASH_BYTES;
+    let origin_bytes = if has_origins { POINT_BYTES * (1 + rest_state.transforms.len()) } else { 0 };
+    let q_bytes = 4 * rest_state.q.len();
+    let transform_bytes = TRANSFORM_BYTES * rest_state.transforms.len();
+    let file_size = HEADER_BYTES + q_bytes + transform_bytes + origin_bytes + HASH_BYTES;
     if bytes.len() != file_size {
         return Err(invalid(
             "checkpoint",
@@ -209,7 +217,7 @@ fn decode(bytes: &[u8], scene: &Scene) -> Result<SceneState> {
     if Sha256::digest(body).as_slice() != hash || !(has_origins || body.starts_with(MAGIC)) {
         return Err(invalid("checkpoint", "bytes that match their SHA-256", "a damaged file"));
     }
-    // The magic number is word 0.
+    // The words of 8 bytes in the header: magic number, run, step, time, and the two counts.
     let word = |index: usize| {
         let mut word = [0; 8];
         word.copy_from_slice(&body[8 * index..8 * index + 8]);
@@ -220,8 +228,8 @@ fn decode(bytes: &[u8], scene: &Scene) -> Result<SceneState> {
         let expected = format!("{} coordinates and {} transforms", rest_state.q.len(), rest_state.transforms.len());
         return Err(invalid("checkpoint", expected, format!("{counts:?}")));
     }
-    let (q, transforms_and_origins) = body[HEADER_BYTES..].split_at(4 * rest_state.q.len());
-    let (transforms, origins) = transforms_and_origins.split_at(48 * rest_state.transforms.len());
+    let (q, transforms_and_origins) = body[HEADER_BYTES..].split_at(q_bytes);
+    let (transforms, origins) = transforms_and_origins.split_at(transform_bytes);
     let f32_from_bytes = |word: &[u8]| f32::from_le_bytes([word[0], word[1], word[2], word[3]]);
     let transform = |bytes: &[u8]| Transform(std::array::from_fn(|entry| f32_from_bytes(&bytes[4 * entry..])));
     Ok(SceneState {
@@ -229,13 +237,13 @@ fn decode(bytes: &[u8], scene: &Scene) -> Result<SceneState> {
         step: u64::from_le_bytes(word(2)),
         time: f64::from_le_bytes(word(3)),
         q: q.chunks_exact(4).map(f32_from_bytes).collect(),
-        transforms: transforms.chunks_exact(48).map(transform).collect(),
+        transforms: transforms.chunks_exact(TRANSFORM_BYTES).map(transform).collect(),
         origins: if has_origins { Some(Arc::new(decode_origins(origins)?)) } else { None },
         ..rest_state
     })
 }
 
-/// Decodes the shared origin (24 bytes), then the translations (24 bytes each).
+/// Decodes the shared origin, then the translations.
 fn decode_origins(bytes: &[u8]) -> Result<FloatingOrigins> {
     let point_from_bytes = |bytes: &[u8]| {
         std::array::from_fn(|axis| {
@@ -244,8 +252,9 @@ fn decode_origins(bytes: &[u8]) -> Result<FloatingOrigins> {
             f64::from_le_bytes(word)
         })
     };
-    let (shared, translations) = bytes.split_at(24);
-    FloatingOrigins::restore(point_from_bytes(shared), translations.chunks_exact(24).map(point_from_bytes).collect())
+    let (shared, translations) = bytes.split_at(POINT_BYTES);
+    let translations = translations.chunks_exact(POINT_BYTES).map(point_from_bytes).collect();
+    FloatingOrigins::restore(point_from_bytes(shared), translations)
 }
 
 #[cfg(test)]
@@ -266,6 +275,7 @@ mod tests {
         let state = deformed_state(&scene);
         let bytes = encode(&state);
         assert_eq!(decode(&bytes, &scene).expect("expected a valid checkpoint"), state);
+        // A byte of the magic number, of the run, of q and of the hash.
         for index in [0, 9, HEADER_BYTES + 2, bytes.len() - 1] {
             let mut damaged_bytes = bytes.clone();
             damaged_bytes[index] ^= 1;
@@ -299,7 +309,7 @@ mod tests {
             state,
             "control: expected states with different origins to differ"
         );
-        assert!(decode(&bytes[..bytes.len() - 24], &scene).is_err());
+        assert!(decode(&bytes[..bytes.len() - POINT_BYTES], &scene).is_err());
     }
 
     #[test]

@@ -144,7 +144,7 @@ impl Upload {
     ///
     /// # Errors
     /// `Invalid` naming the header field or file that does not match.
-    pub(in crate::engine) fn finish(&mut self) -> Result<()> {
+    pub(in crate::engine) fn check_complete(&self) -> Result<()> {
         self.check_file_complete()?;
         if self.paths.len() != self.header.files as usize {
             return Err(invalid("header.files", self.header.files.to_string(), self.paths.len()));
@@ -260,7 +260,7 @@ mod tests {
         upload.write_chunk(b"he").expect("expected an accepted chunk");
         upload.write_chunk(b"llo").expect("expected an accepted chunk");
         upload.begin_file("empty", 0, &sha256_of(b"")).expect("expected a new file");
-        upload.finish().expect("expected a complete upload");
+        upload.check_complete().expect("expected a complete upload");
         upload.commit(&folder.path().join("target")).expect("expected to move the folder");
         assert_eq!(fs::read(folder.path().join("target/a/b.txt")).expect("expected the file"), b"hello");
         assert_eq!(fs::read_dir(folder.path()).expect("expected a folder").count(), 1);
@@ -297,6 +297,7 @@ mod tests {
     fn wrong_sizes_and_hashes_are_rejected_and_leave_no_files() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         type UploadCalls = fn(&mut Upload) -> Result<()>;
+        // The header declares one file and 4 bytes.
         let calls: [(UploadCalls, &str); 7] = [
             (|upload| upload.begin_file("a", 5, &sha256_of(b"")), "header.total_bytes"),
             (|upload| upload.begin_file("a", 4, b"short"), "file.sha256"),
@@ -306,8 +307,8 @@ mod tests {
                 |upload| upload.begin_file("a", 1, &sha256_of(b"x")).and_then(|()| upload.write_chunk(b"y")),
                 "file.sha256",
             ),
-            (|upload| upload.begin_file("a", 1, &sha256_of(b"x")).and_then(|()| upload.finish()), "file.bytes"),
-            (Upload::finish, "header.files"),
+            (|upload| upload.begin_file("a", 1, &sha256_of(b"x")).and_then(|()| upload.check_complete()), "file.bytes"),
+            (|upload| upload.check_complete(), "header.files"),
         ];
         for (call, field) in calls {
             let mut upload = begin_upload(folder.path(), 1, 4);

@@ -6,7 +6,7 @@ use crate::engine::{FrameFormat, FrameOutput, validate_mode};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::Scene;
 
-/// The end of a color map's scale must be below this value and at least its inverse.
+/// Limit on the end of a color map's scale. The lower limit is 1 / `MAX_SCALE`.
 const MAX_SCALE: f64 = 1e30;
 
 /// Parses the output and the format of a picture. Fails if the output does not have this format.
