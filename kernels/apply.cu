@@ -5,7 +5,8 @@
 //   new_transforms   [change_count][3] float4                                                           (in)
 //   new_q            the coordinates of the changed domains, packed                                     (in)
 //   dirty_tiles      [dirty_tile_count] u32: the tiles that contain a changed domain                    (in)
-//   transform_links  with FOLLOWERS: per domain its transform root and the index of its frame           (in)
+//   transform_links  with FOLLOWERS: per domain its transform root (the domain whose transform it uses), and the
+//                    index of its frame, or NO_FRAME for a root                                         (in)
 //   transforms       [transform roots][3] float4                                                        (out)
 //   q                packed coordinates of all domains                                                  (out)
 //   change_steps     [domains] u32: the step that last changed a domain                                 (out)
@@ -19,7 +20,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) apply(const __grid_constant_
     for (unsigned index = blockIdx.x * (BLOCK / 32) + threadIdx.x / 32; index < change_count; index += warp_count) {
         const Change change = args.changes[index];
 #ifdef FOLLOWERS
-        // A follower has no transform of its own. Its entry updates only its coordinates and its change step.
+        // A follower has a frame but no transform of its own. Its entry updates only its coordinates and its change step.
         const TransformLink link = args.transform_links[change.domain];
         const unsigned root = link.root;
         const bool has_transform = link.frame == NO_FRAME;

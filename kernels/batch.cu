@@ -21,8 +21,8 @@
 // - With two vertices per lane, it loads 16 + 6 numbers for 96 multiply-adds: 22 cycles of loads, 24 of arithmetic. This is
 //   balanced. (Entries of 2 bytes take no more cycles, although they use only half of the 16 bytes of a quad.)
 // A lane thus has 96 sums and about 128 registers, which limits a multiprocessor to 16 warps. So few warps saturate the
-// memory bandwidth only if loads in flight need no registers. Therefore U is copied to shared memory asynchronously, STAGES
-// stages of 3 KB ahead per warp. That is 144 KB per multiprocessor, and a latency of 1 us at 5 TB/s needs 38 KB.
+// memory bandwidth only if loads in flight need no registers. Therefore each warp copies U to shared memory asynchronously,
+// RING_STAGES stages of 3 KB ahead. That is 144 KB per multiprocessor, and a latency of 1 us at 5 TB/s needs 38 KB.
 #include "batch_load.cuh"
 #include "ordered_float.cuh"
 
@@ -36,7 +36,7 @@ constexpr unsigned MIN_BLOCKS_PER_SM = 6;
 constexpr unsigned MIN_BLOCKS_PER_SM = 4;
 #endif
 
-// Number of chunks whose loads and sums are interleaved, so that they have at least two modes.
+// Unroll factor of the loop over chunks. The compiler then interleaves the loads and sums of at least two modes.
 constexpr unsigned CHUNK_UNROLL = CHUNK_MODES < 2 ? 2 : 1;
 
 // One axis of a lane's two vertices.
@@ -97,14 +97,14 @@ __device__ __forceinline__ void add_chunk(Sums& sums, const char* chunk, const f
     }
 }
 
-// Sums all modes, stage by stage. At the start, copies of STAGES stages are in flight. With 16-bit entries all registers
+// Sums all modes, stage by stage. At the start, copies of RING_STAGES stages are in flight. With 16-bit entries all registers
 // are in use, and the stage counter spills to local memory: a few bytes, once per stage.
 __device__ __forceinline__ void sum_modes(const WarpSlice& slice, WarpStorage& storage, const float4* q, Sums& sums) {
     const unsigned lane_offset = 16 * (lane_id() / 2) + 2 * ENTRY_BYTES * (lane_id() % 2);
 #pragma unroll 1
     for (unsigned stage = 0; STAGE_CHUNKS * stage < slice.chunk_count; ++stage) {
-        cp_async_wait<STAGES - 1>();
-        const char* chunk = (const char*)(storage.ring + stage % STAGES * STAGE_WORDS) + lane_offset;
+        cp_async_wait<RING_STAGES - 1>();
+        const char* chunk = (const char*)(storage.ring + stage % RING_STAGES * STAGE_WORDS) + lane_offset;
         const unsigned chunk_count = min(STAGE_CHUNKS, slice.chunk_count - STAGE_CHUNKS * stage);
 #pragma unroll CHUNK_UNROLL
         for (unsigned i = 0; i < chunk_count; ++i) {
@@ -113,8 +113,8 @@ __device__ __forceinline__ void sum_modes(const WarpSlice& slice, WarpStorage& s
             q += CHUNK_MODES * (BATCH_SIZE / 4);
         }
         __syncwarp();
-        if (STAGE_CHUNKS * (stage + STAGES) < slice.chunk_count) {
-            copy_stage(slice, storage, stage + STAGES);
+        if (STAGE_CHUNKS * (stage + RING_STAGES) < slice.chunk_count) {
+            copy_stage(slice, storage, stage + RING_STAGES);
         }
         cp_async_commit();
     }
@@ -136,7 +136,7 @@ __device__ __forceinline__ unsigned count_lane_vertices(const WarpSlice& slice) 
     return slice.vertex_count > 2 * lane_id() ? min(2u, slice.vertex_count - 2 * lane_id()) : 0;
 }
 
-// Address of a member's two boxes of half a tile, among the four boxes per tile that `deform` writes.
+// Address of the two boxes of this warp's half of a tile, among the four boxes per tile that `deform` writes.
 __device__ __forceinline__ unsigned* warp_box_keys(const BatchArgs& args, const WarpSlice& slice, const BatchMember& member) {
     return args.boxes + 24 * (size_t)(member.first_tile + slice.tile) + 12 * (threadIdx.x / 32);
 }
@@ -162,8 +162,8 @@ __device__ __forceinline__ void stage_member(const RestPositionPair& rest, const
 }
 
 // Computes the boxes of the two staged members. Each half warp reduces one member, with four vertices per lane. After
-// the first exchange a lane has either the lower or the upper sides, so later exchanges move three numbers. The boxes
-// ignore NaN; `repair_non_finite` replaces them if a position is not finite.
+// the first exchange a lane has either the lower or the upper sides, so later exchanges move three numbers. A box ignores
+// NaN. If a position is not finite, `repair_non_finite` computes the boxes again.
 __device__ __forceinline__ void write_two_boxes(const BatchArgs& args, WarpSlice& slice, const BlockStorage& block,
                                                 unsigned first_member, const float4* staged) {
     const float NEGATIVE_INFINITY = __uint_as_float(0xff800000u);
@@ -296,8 +296,8 @@ __device__ __forceinline__ void write_box(const BatchArgs& args, const WarpSlice
     }
 }
 
-// Recomputes the non-finite positions of a warp in the output, and the boxes of all members. NaN has the largest key, so it
-// marks the box.
+// Recomputes the positions of a warp that are not finite, and the boxes of all members. Reads and writes the output. NaN has
+// the largest key, so a position with a NaN gives a box with a NaN.
 __device__ __noinline__ void repair_non_finite(const BatchArgs& args, const BlockStorage& block, const float* q) {
     const WarpSlice& slice = block.slices[threadIdx.x / 32];
     const unsigned vertex_count = count_lane_vertices(slice);
@@ -321,7 +321,7 @@ __device__ __noinline__ void repair_non_finite(const BatchArgs& args, const Bloc
     }
 }
 
-// Computes the slice of this warp. Its copies are in flight.
+// Computes the slice of this warp. The caller has started the copies of its U and x0.
 __device__ __forceinline__ void compute_slice(const BatchArgs& args, uint4* shared) {
     WarpStorage& storage = warp_storage(shared);
     BlockStorage& block = block_storage(shared);
@@ -356,7 +356,7 @@ extern "C" __global__ void __launch_bounds__(32 * WARPS, MIN_BLOCKS_PER_SM) batc
         if (slice.quad_count > 0) {
             compute_slice(args, shared);
         }
-        // Restore from shared memory, because the sums occupy all registers.
+        // Read `work` again from shared memory, because the sums occupied all registers.
         work = {slice.group, slice.tile + 1, slice.end_tile, 0};
         is_first = false;
         __syncwarp();

@@ -15,14 +15,15 @@ constexpr unsigned BATCH_SIZE = 16;
 constexpr unsigned WARPS = 2;
 constexpr unsigned WARP_QUADS = TILE_QUADS / WARPS;
 constexpr unsigned WARP_VERTICES = 4 * WARP_QUADS;
-// U passes through a ring buffer in stages of STAGE_CHUNKS chunks, with STAGES stages in flight. Words have 16 bytes.
+// U passes through a ring buffer with a capacity of RING_STAGES stages. A stage is STAGE_CHUNKS chunks of all quads of the
+// warp. A word has 16 bytes.
 constexpr unsigned STAGE_CHUNKS = 4;
-constexpr unsigned STAGES = 3;
-constexpr unsigned STAGE_QUAD_WORDS = 3 * STAGE_CHUNKS; // per quad
+constexpr unsigned RING_STAGES = 3;
+constexpr unsigned STAGE_QUAD_WORDS = 3 * STAGE_CHUNKS; // words of a stage per quad
 constexpr unsigned STAGE_WORDS = STAGE_QUAD_WORDS * WARP_QUADS;
 // Shared memory of a warp.
 struct WarpStorage {
-    uint4 ring[STAGES * STAGE_WORDS]; // stages of U, later the staging buffer of x
+    uint4 ring[RING_STAGES * STAGE_WORDS]; // stages of U, later the staging buffer of x
     float4 rest_positions[3 * WARP_QUADS];
 };
 static_assert(sizeof(WarpStorage) == 9984, "WarpStorage differs from src/compute/gpu/tables/kernels.rs");
@@ -31,7 +32,7 @@ __device__ __forceinline__ unsigned lane_id() {
     return threadIdx.x % 32;
 }
 
-// Starts an asynchronous copy of 16 bytes to shared memory if `is_enabled`. `cp_async_wait` waits for its completion.
+// If `is_enabled`, starts an asynchronous copy of 16 bytes to shared memory. `cp_async_wait` waits for its completion.
 __device__ __forceinline__ void cp_async_copy(void* destination, const void* source, bool is_enabled) {
 #if __CUDA_ARCH__ >= 800
     const unsigned shared = (unsigned)__cvta_generic_to_shared(destination);
@@ -53,7 +54,7 @@ __device__ __forceinline__ void cp_async_commit() {
 #endif
 }
 
-// Waits until all copy groups but the last PENDING_GROUPS are visible to the warp.
+// Waits until the results of all copy groups except the last PENDING_GROUPS are visible to the warp.
 template <unsigned PENDING_GROUPS>
 __device__ __forceinline__ void cp_async_wait() {
 #if __CUDA_ARCH__ >= 800
@@ -79,11 +80,12 @@ struct WarpSlice {
     unsigned end_tile;       // one past the block's last tile
     unsigned has_non_finite; // 1 if a result is not finite
     unsigned group;
-    float* positions; // output of the slice for a domain whose first packed vertex is 0
+    float* positions; // address of `first_vertex` in the output of a domain whose `BatchMember::first_vertex` is 0
 };
 
-// Shared memory of a block behind that of its warps. Missing members have zeros. The array q [modes][BATCH_SIZE] f32
-// follows, with STORE_INT8 multiplied by the scales of the tile.
+// Shared memory of a block, after the `WarpStorage` of its warps. In a group with fewer than BATCH_SIZE members, the unused
+// entries are zero. After this struct follows the array q, [modes][BATCH_SIZE] f32; with STORE_INT8, q is multiplied by the
+// scales of the tile.
 struct BlockStorage {
     Affine transforms[BATCH_SIZE];
     BatchMember members[BATCH_SIZE];
@@ -104,6 +106,7 @@ __device__ __forceinline__ float4* shared_q(uint4* shared) {
     return (float4*)(&block_storage(shared) + 1);
 }
 
+// This warp's part of a tile. `tile` counts from the first tile of the group's shape.
 __device__ __forceinline__ WarpSlice load_warp_slice(const BatchArgs& args, unsigned group, unsigned tile, unsigned end_tile) {
     // The two halves of a `BatchGroup`, with its fields in the order of layout.cuh.
     const uint4 low_words = __ldg((const uint4*)(args.groups + group));
@@ -133,7 +136,7 @@ __device__ __forceinline__ WarpSlice load_warp_slice(const BatchArgs& args, unsi
 __device__ __forceinline__ void copy_stage(const WarpSlice& slice, WarpStorage& storage, unsigned stage) {
     constexpr unsigned WORDS_PER_COPY = 32 / WARP_QUADS, COPY_COUNT = STAGE_WORDS / 32;
     const unsigned quad_word = STAGE_QUAD_WORDS * stage + lane_id() / WARP_QUADS;
-    uint4* destination = storage.ring + stage % STAGES * STAGE_WORDS + lane_id();
+    uint4* destination = storage.ring + stage % RING_STAGES * STAGE_WORDS + lane_id();
     if (slice.tile_quads == TILE_QUADS && STAGE_QUAD_WORDS * (stage + 1) <= 3 * slice.chunk_count) {
         // The common case, with strides that are compile-time constants.
         const uint4* source = slice.words + quad_word * TILE_QUADS + lane_id() % WARP_QUADS;
@@ -154,6 +157,7 @@ __device__ __forceinline__ void copy_stage(const WarpSlice& slice, WarpStorage& 
 
 // Starts the copies of x0, [axis][WARP_QUADS].
 __device__ __forceinline__ void copy_rest(const WarpSlice& slice, WarpStorage& storage) {
+    // Every lane takes two iterations, so that the loop can be unrolled. Copies beyond the end of x0 are disabled.
 #pragma unroll
     for (unsigned i = lane_id(); i < lane_id() + 3 * WARP_QUADS; i += 32) {
         const float4* source =
@@ -182,7 +186,7 @@ __device__ __forceinline__ unsigned load_members(const BatchArgs& args, const Wa
     return member.first_q;
 }
 
-// Loads all modes of q of this thread's member.
+// Loads all modes of q of this thread's member. The threads of a member share the modes.
 __device__ __forceinline__ void load_q(const BatchArgs& args, const WarpSlice& slice, unsigned first_q, float* q) {
     const unsigned member_index = threadIdx.x / THREADS_PER_MEMBER, mode_count = slice.chunk_count * CHUNK_MODES;
 #pragma unroll 8
@@ -206,7 +210,7 @@ __device__ __forceinline__ void load_tile_async(const BatchArgs& args, const War
         // x0 belongs to the first copy group. The copy groups of stages beyond the last chunk are empty.
         copy_rest(slice, warp_storage(shared));
 #pragma unroll
-        for (unsigned stage = 0; stage < STAGES; ++stage) {
+        for (unsigned stage = 0; stage < RING_STAGES; ++stage) {
             copy_stage(slice, warp_storage(shared), stage);
             cp_async_commit();
         }

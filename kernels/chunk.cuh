@@ -20,7 +20,8 @@ __device__ __forceinline__ float decode_bits(unsigned bits) {
 #elif defined(STORE_BF16)
     return __uint_as_float(bits << 16);
 #elif defined(STORE_INT8)
-    // The byte is placed in the mantissa of 2^23, which gives 2^23 + byte; the entry is byte - 128. Both steps are exact.
+    // 0x4b000000 is the float 2^23. The selector 0x7650 replaces its lowest byte by byte 0 of `bits`, which gives
+    // 2^23 + byte. The entry is byte - 128, so 2^23 + 128 = 8388736 is subtracted. Both steps are exact.
     return __uint_as_float(__byte_perm(bits, 0x4b000000u, 0x7650u)) - 8388736.0f;
 #else
     return __uint_as_float(bits);
@@ -31,6 +32,7 @@ __device__ __forceinline__ float decode_bits(unsigned bits) {
 __device__ __forceinline__ float decode_entry(const unsigned (&registers)[12], unsigned entry) {
     const unsigned bits = registers[entry / CHUNK_MODES];
 #if defined(STORE_INT8)
+    // As in `decode_bits`, with byte `entry % 4` instead of byte 0.
     return __uint_as_float(__byte_perm(bits, 0x4b000000u, 0x7650u | entry % 4)) - 8388736.0f;
 #else
     return decode_bits(entry % CHUNK_MODES == 0 ? bits : bits >> 16);

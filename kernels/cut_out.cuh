@@ -66,6 +66,7 @@ struct AlphaTest {
     }
 
     __device__ float sample_alpha(const RasterArgs& args, int column, int row) const {
+        // The size of a pixel in normalized device coordinates: 2 / width, 2 / height.
         const float step_x = __frcp_rn(args.half_width), step_y = __frcp_rn(args.half_height);
         const float sample_x = add_rn(mul_rn(add_rn((float)column, 0.5f), step_x), -1.0f);
         const float sample_y = add_rn(1.0f, -mul_rn(add_rn((float)row, 0.5f), step_y));
@@ -88,8 +89,9 @@ struct AlphaTest {
         const float inverse_weight_sum = __frcp_rn(sum3(weight_a, weight_b, weight_c));
         float2 uv = {mul_rn(sum3(mul_rn(weight_a, u[0]), mul_rn(weight_b, u[1]), mul_rn(weight_c, u[2])), inverse_weight_sum),
                      mul_rn(sum3(mul_rn(weight_a, v[0]), mul_rn(weight_b, v[1]), mul_rn(weight_c, v[2])), inverse_weight_sum)};
-        // Derivatives of uv by the pixel in x and y: sums of the derivatives of the weights, times the texture coordinates
-        // of the corners relative to those of the sample.
+        // Derivatives of uv by column and row: sums of the derivatives of the weights, times the texture coordinates of the
+        // corners relative to those of the sample. `sample_y` decreases with the row, which cancels the minus sign of the
+        // derivative by y.
         float2 uv_dx = {0.0f, 0.0f}, uv_dy = {0.0f, 0.0f};
 #pragma unroll
         for (unsigned i = 0; i < 3; ++i) {

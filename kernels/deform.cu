@@ -8,15 +8,17 @@
 //   rest_tangents    with RIGID_NORMALS and NORMAL_MAPS: rest tangents in the same layout, but with four
 //                    components: x, y, z and the sign of the bitangent                                           (in)
 //   corner_offsets   with CORNER_OFFSETS: per domain, offset from a packed vertex to its packed corner           (in)
-//   transforms       [roots][3] float4: the rows of world_from_domain, relative to the state's origin            (in)
-//   transform_links  with FOLLOWERS: per domain its transform root and the index of its frame                    (in)
-//   frames           with FOLLOWERS: [followers][3] float4, the rows of root_from_domain; without FOLLOWERS, every
-//                    domain is a transform root                                                                  (in)
+//   transforms       [roots][3] float4: the rows of T of each transform root, relative to its floating origin (an
+//                    f64 point that stays on the host)                                                           (in)
+//   transform_links  with FOLLOWERS: per domain its transform root (the domain whose T it uses), and the index of
+//                    its frame, or NO_FRAME for a root                                                           (in)
+//   frames           with FOLLOWERS: [followers][3] float4, the rows of each follower's constant transform to its
+//                    root. Without FOLLOWERS, every domain is a root                                             (in)
 //   q                packed coordinates; with STORE_F16 and STORE_BF16 multiplied by the factor of their mode    (in)
 //   scales           with STORE_INT8: per tile of U and mode                                                     (in)
 //   retained_counts, retained  with MODE_TRUNCATION: per domain the number of chunks to sum, and their ascending
 //                    indices                                                                                     (in)
-//   tile_list        with TILE_LIST: the tiles to compute, their number is in the header; without, all tiles     (in)
+//   tile_list        with TILE_LIST: the tiles to compute, whose number is in the header                         (in)
 //   positions        [vertices][3] f32, address in the header                                                    (out)
 //   normals          [corners][3] f32, address in the header                                                     (out)
 //   tangents         [corners] float4, address in the header                                                     (out)
@@ -25,6 +27,8 @@
 //   boxes            [tiles][4][6] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z                         (out)
 // Launch: WARPS warps per block, WARPS_PER_TILE warps for each of `tile_count` tiles; with TILE_LIST any number of blocks.
 // CPU twin: src/compute/reference/deform.rs.
+// Further macros: MODES (a domain has modes), SHEAR (a transform may have shear or a non-uniform scale), ONE_ITEM_PER_LANE
+// (a tile has four warps instead of one) and COMPENSATED_SUM (at `Sums`).
 //
 // Determinism: each vertex sums its modes in order, from +0, by fused multiply-adds, independent of the tile and the
 // lane, so runs agree bit by bit. A result that is not finite in f32 is computed again in f64, so the output is not finite
@@ -34,7 +38,8 @@
 #include "ordered_float.cuh"
 #include "rigid_normals.cuh"
 
-// Maximum number of chunks that a lane loads before it sums the first.
+// Maximum number of chunks that a lane loads before it sums the first. A lane with one item loads a quarter of a chunk, so
+// it has registers for more chunks.
 #ifdef ONE_ITEM_PER_LANE
 #define PREFETCH_CHUNKS (16 / CHUNK_MODES)
 #else
@@ -111,7 +116,7 @@ struct Sums {
     }
 };
 
-// A lane's part of a chunk. `load` reads it from the quad's first word of the chunk.
+// A lane's part of a chunk. The `words` of `load` point to the first word of the lane's quad in the chunk.
 #ifdef ONE_ITEM_PER_LANE
 struct Chunk {
     float entries[3 * CHUNK_MODES];
@@ -176,8 +181,8 @@ struct ChunkIndices {
     }
 };
 
-// Adds the COUNT chunks that begin at index `i` of `chunk_indices`, and advances `i`. Loads all of them before it sums the
-// first.
+// Adds COUNT chunks, from index `i` of `chunk_indices` on, and advances `i`. Loads all COUNT chunks before it sums the first
+// one.
 template <unsigned COUNT>
 __device__ __forceinline__ void sum_chunks(const DeformArgs& args, const LaneSlice& slice,
                                            const ChunkIndices& chunk_indices, unsigned& i, Sums& sums) {
@@ -235,8 +240,8 @@ __device__ __forceinline__ void sum_modes_f64(const DeformArgs& args, const Lane
     }
 }
 
-// Computes x of one vertex of this lane in f64 and rounds it once. This recovers a finite result of which an f32 intermediate
-// overflowed.
+// Computes x of one vertex of this lane in f64 and rounds it once. The result can be finite although an intermediate value
+// overflowed in f32.
 __device__ __noinline__ float3 position_f64(const DeformArgs& args, unsigned tile, unsigned tile_warp, unsigned vertex) {
     const LaneSlice slice = load_lane_slice(args, tile, tile_warp);
     const float* rest_position = item_pointer(args.rest_positions, slice, 3);
@@ -269,7 +274,8 @@ __device__ __noinline__ void repair_displacement(const DeformArgs& args, unsigne
 }
 #endif
 
-// Computes the six sides of the box of a lane's positions, as keys. Positions beyond `count` are replaced by the first one.
+// Computes the bounding box of a lane's positions, as six `float_to_ordered` keys. Positions beyond `count` are replaced by
+// the first position.
 __device__ __forceinline__ void compute_lane_box_keys(const float (&positions)[FLOATS_PER_LANE], unsigned count,
                                                       unsigned (&keys)[6]) {
 #pragma unroll
@@ -286,8 +292,8 @@ __device__ __forceinline__ void compute_lane_box_keys(const float (&positions)[F
     }
 }
 
-// Recomputes the non-finite ones of `count` staged positions in f64, and the keys of the lane's box. NaN has the largest
-// key, so it marks the box.
+// Recomputes those of `count` staged positions that are not finite, in f64. Then computes the keys of the lane's box. NaN
+// has the largest key, so a position with a NaN gives a box with a NaN.
 __device__ __noinline__ void repair_non_finite(const DeformArgs& args, unsigned tile, unsigned tile_warp,
                                                float* positions, unsigned count, unsigned (&keys)[6]) {
     for (unsigned side = 0; side < 6; ++side) {
@@ -409,7 +415,7 @@ __device__ __forceinline__ void compute_tile(const DeformArgs& args, WarpShared&
         inputs.load(args, slice);
 #endif
 #ifdef RIGID_NORMALS
-        // Load before the positions are stored, so that both transfers are in flight together.
+        // Load the normals before the positions are stored, so that the load and the store are in flight together.
         if (slice.kind & TILE_CORNERS) {
             normals.load(args, slice);
         }

@@ -56,7 +56,8 @@ __device__ inline double determinant_sign(const Mat3d& m) {
 }
 
 // v / |v|, or +Z if v is zero. v is first multiplied by the power of two that brings its largest component into [1, 2).
-// This rounds nothing.
+// This rounds nothing. A number with the exponent bits e is at least 2^(e - 1023), so the power of two has the exponent bits
+// 1023 - (e - 1023) = 2046 - e.
 __device__ inline float3 normalize(const double3& v) {
     const double max_component = fmax(fmax(fabs(v.x), fabs(v.y)), fabs(v.z));
     if (!(max_component > 0.0)) {

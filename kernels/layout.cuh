@@ -1,16 +1,19 @@
 // Structs and constants that host and kernels share. Twin: src/compute/gpu/tables/layout.rs; tests compare the size of every
-// struct and the offset of every field.
+// struct and the offset of every field. The first comment of a kernel describes the arrays of its arguments.
+//
+// A quad is 4 consecutive vertices of one domain. A mixed tile has quads of several domains. The packed index of a vertex,
+// corner or coordinate counts those of all preceding domains too.
 #pragma once
 
 // Threads per block of `apply`, `bounds` and `normals`, and packed corners per block of `normals`.
 constexpr unsigned BLOCK = 256;
-// Maximum number of quads (4 vertices of one domain) of a tile, which is the work of one warp.
+// Maximum number of quads of a tile, which is the work of one warp.
 constexpr unsigned TILE_QUADS = 32;
 // `first_tangent` of a shape without tangents.
 constexpr unsigned NO_TANGENTS = 0xffffffffu;
 // `first_corner_group` of a shape without smoothing groups.
 constexpr unsigned NO_GROUPS = 0xffffffffu;
-// Flag of the first vertex of each fan of a ring.
+// Flag of a ring entry that is the first vertex of a fan (normals.cu).
 constexpr unsigned RING_START = 0x80000000u;
 
 // `TransformLink::frame` of a domain that is its own transform root.
@@ -44,7 +47,7 @@ constexpr unsigned TILE_CORNERS = 16;
 // The work of one warp: up to 32 quads and their part of U, [chunk_count][3][quad_count] words of 16 bytes.
 struct WarpTile {
     unsigned long long first_word; // first word of U
-    unsigned first_item;           // first packed vertex or corner; in a mixed tile, first entry of `mixed_quads`
+    unsigned first_item;           // packed index of the first item; in a mixed tile, first entry of `mixed_quads`
     unsigned rest_quad;            // first quad of x0, normals and tangents
     unsigned domain;
     unsigned first_q;
@@ -57,7 +60,7 @@ static_assert(sizeof(WarpTile) == 32, "WarpTile differs from src/compute/gpu/tab
 
 // A quad of a mixed tile.
 struct MixedQuad {
-    unsigned first_item;    // first packed vertex or corner
+    unsigned first_item;    // packed index of the first item
     unsigned rest_quad;     // quad of x0, normals and tangents
     unsigned packed_domain; // 4 * index of the domain + number of items - 1
     unsigned first_q;
@@ -68,9 +71,9 @@ static_assert(sizeof(MixedQuad) == 16, "MixedQuad differs from src/compute/gpu/t
 struct NormalSlot {
     unsigned first_corner; // packed corner
     unsigned first_normal; // in `rest_normals`
-    unsigned first_tangent;
+    unsigned first_tangent; // in `rest_tangents`, or NO_TANGENTS
     unsigned first_vertex; // packed vertex
-    unsigned first_corner_group;
+    unsigned first_corner_group; // in `corner_groups`, or NO_GROUPS
 };
 static_assert(sizeof(NormalSlot) == 20, "NormalSlot differs from src/compute/gpu/tables/layout.rs");
 
@@ -138,7 +141,7 @@ static_assert(sizeof(BatchMember) == 16, "BatchMember differs from src/compute/g
 // The work of one block of `batch`.
 struct BatchBlock {
     unsigned group;
-    unsigned first_tile; // first tile of the block, in its shape
+    unsigned first_tile; // first tile of the block, counted from the first tile of the shape
     unsigned end_tile;   // one past the last tile
     unsigned reserved;
 };
@@ -238,8 +241,8 @@ __device__ inline unsigned find_domain(const NormalSlot* slots, const unsigned* 
     return low;
 }
 
-// Writes three floats per item of the block as one contiguous range, so that warps write whole sectors. The caller must
-// synchronize the block between writing `staged` and this call.
+// Writes three floats per item of the block as one contiguous range, so that warps write whole 32-byte sectors. The caller
+// must synchronize the block between writing `staged` and this call.
 __device__ inline void store_triples(float* packed, const float* staged, unsigned item_count) {
     const unsigned first_item = blockIdx.x * BLOCK;
     const unsigned float_count = 3 * min(BLOCK, item_count - first_item);

@@ -25,7 +25,8 @@
 #include "dependent_launch.cuh"
 #include "direction.cuh"
 
-// An area vector is defined if it is longer than this fraction of its rounding scale B, as in the twin.
+// 2^-18: the area vector of a group is defined if it is longer than this fraction of B, which bounds its rounding error. The
+// twin has the derivation.
 constexpr double RESOLUTION = 1.0 / 262144.0;
 // Two unit vectors are opposite if the squared length of their sum is below this, as in the twin.
 constexpr float MIN_BISECTOR_SQUARED_LENGTH = 1e-10f;
@@ -58,13 +59,14 @@ __device__ double l1_norm(const double3& v) {
     return fabs(v.x) + fabs(v.y) + fabs(v.z);
 }
 
-// The sum of the area vectors of a group's triangles, and its rounding scale B as the twin defines it.
+// The area vectors of a group's triangles. A triangle with the edges e and f from the center c has the area vector e x f.
 struct Area {
     double3 sum;
+    // B: the sum of l (l + |c|) over both edges of each triangle, for the length l of an edge, in the L1 norm.
     double rounding_scale;
 };
 
-// The first entry of a ring is the center; the others are the vertices of the fans around it. There must be at least two.
+// The first entry of a ring is the center. The other entries are the vertices of the fans around it.
 __device__ Area sum_areas(const unsigned* ring, const unsigned* end, const float* positions) {
     const double3 center = load_position(positions, __ldg(ring));
     const double center_norm = l1_norm(center);
@@ -138,8 +140,8 @@ __device__ float3 normalize(const float3& v) {
     return multiply(v, 1.0f / sqrtf(dot(v, v)));
 }
 
-// The normalized tangent without its component along the normal; if that is zero, any unit vector perpendicular to the
-// normal.
+// The normalized tangent without its component along the normal. If the tangent is parallel to the normal (within 1e-6
+// rad), any unit vector perpendicular to the normal.
 __device__ float3 orthogonalize(const float3& tangent, const float3& normal) {
     const float3 perpendicular = add_scaled(tangent, normal, -dot(normal, tangent));
     if (dot(perpendicular, perpendicular) > 1e-12f) {

@@ -1,7 +1,8 @@
 // Order-preserving integer keys of floats, so that integer maxima give float maxima. Twin: src/compute/gpu/tables/box_keys.rs.
 #pragma once
 
-// The key of a number. Keys increase with x and are never 0. x must not be NaN.
+// The key of a number: its bits with the sign bit inverted, or all bits inverted if it is negative. Keys increase with x and
+// are never 0. x must not be NaN.
 __device__ inline unsigned non_nan_to_ordered(float x) {
     const unsigned bits = __float_as_uint(x);
     return bits ^ (unsigned)((int)bits >> 31 | (int)0x80000000u);

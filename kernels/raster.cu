@@ -1,12 +1,12 @@
-// Compute rasterizer: one sample per pixel. For each sample it finds the minimum depth and the id of that triangle, by one
-// atomic minimum of both. The result does not depend on the order of execution.
+// Compute rasterizer: one sample per pixel. For each sample it finds the minimum depth and the index of the triangle with
+// that depth, by an atomic minimum of `depth << 32 | triangle`. The result does not depend on the order of execution.
 //   raster           a thread per triangle of a range: culls it, draws it if its rectangle has few samples, or queues it
 //   raster_cut_outs  the same for cut-out triangles
 //   raster_warps     a warp per triangle of the medium queue
 //   raster_tiles     a warp per tile of a triangle of the large queue, or per strip of a tile if there are few tiles; also
 //                    draws clipped triangles
 // Macros:
-//   DEPTH_ONLY          the target is f32 depth without ids: a shadow map
+//   DEPTH_ONLY          the target is f32 depth without triangle indices: a shadow map
 //   CUT_OUTS            triangles from `first_cut_out` on are cut-outs, which pass an alpha test before the atomic
 //   COUNT_TRIANGLES     count the triangles per `TriangleBin`
 //   MAX_THREAD_SAMPLES  maximum number of samples in the rectangle of a triangle that a thread draws
@@ -25,7 +25,7 @@
 
 constexpr unsigned BLOCK = 128, WARPS = BLOCK / 32;
 constexpr int TILE_SIZE = 64;
-constexpr unsigned MAX_STRIP_SPLITS = 3;  // a tile is halved into strips at most so many times
+constexpr unsigned MAX_STRIP_SPLITS = 3;  // a tile is halved at most three times, into strips of 8 rows
 constexpr unsigned TILE_COUNT_BITS = 40;  // of `RasterCounters::large_count`
 
 // The bin of a triangle and its setup. Fields from `is_flipped` on are valid only for unclipped triangles.
@@ -41,7 +41,8 @@ __device__ inline bool is_empty(const PixelRect& rect) {
     return rect.x0 > rect.x1 || rect.y0 > rect.y1;
 }
 
-// Culls a triangle by its area and its samples, or returns LARGE.
+// Culls a triangle by its area and its samples. Returns LARGE if the triangle is not culled; `setup_unclipped` may replace
+// this by a smaller bin.
 __device__ inline TriangleBin classify_by_area(const RasterArgs& args, long long doubled_area, const PixelRect& rect) {
     return doubled_area == 0                                ? DEGENERATE
            : args.culls_back_faces == 1 && doubled_area > 0 ? BACK_FACING
@@ -75,8 +76,8 @@ __device__ inline void setup_unclipped(const RasterArgs& args, const float4 (&co
     binned.doubled_area = doubled_area(a, b, c);
     binned.bin = classify_by_area(args, binned.doubled_area, binned.rect);
     if (binned.bin == LARGE && x1 - x0 <= MAX_WARP_EXTENT && y1 - y0 <= MAX_WARP_EXTENT) {
-        const int samples = (binned.rect.x1 - binned.rect.x0 + 1) * (binned.rect.y1 - binned.rect.y0 + 1);
-        binned.bin = samples <= MAX_THREAD_SAMPLES ? SMALL : MEDIUM;
+        const int sample_count = (binned.rect.x1 - binned.rect.x0 + 1) * (binned.rect.y1 - binned.rect.y0 + 1);
+        binned.bin = sample_count <= MAX_THREAD_SAMPLES ? SMALL : MEDIUM;
     }
     binned.is_flipped = binned.doubled_area < 0;
     binned.doubled_area = binned.is_flipped ? -binned.doubled_area : binned.doubled_area;
@@ -147,6 +148,7 @@ __device__ inline void push_large(const RasterArgs& args, const PixelRect& rect,
     ((LargeTriangle*)args.large_queue)[previous >> TILE_COUNT_BITS] = entry;
 }
 
+// Counts the bins of all lanes of a warp. All lanes must call this.
 __device__ inline void count_bins(const RasterArgs& args, TriangleBin bin) {
 #ifdef COUNT_TRIANGLES
     for (unsigned bin_index = 0; bin_index < NO_BIN; ++bin_index) {
@@ -158,6 +160,7 @@ __device__ inline void count_bins(const RasterArgs& args, TriangleBin bin) {
 #endif
 }
 
+// Culls, draws or queues this thread's triangle.
 template <typename AlphaTestPolicy>
 __device__ inline void draw_range(const RasterArgs& args) {
     const unsigned index = blockIdx.x * BLOCK + threadIdx.x, triangle = args.first_triangle + index;
@@ -187,6 +190,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) raster_cut_outs(const __grid
 }
 #endif
 
+// Draws a triangle with a warp, which tests 8 x 4 samples at a time.
 template <typename AlphaTestPolicy>
 __device__ inline void draw_medium(const RasterArgs& args, unsigned triangle) {
     float4 corners[3];
@@ -214,6 +218,7 @@ __device__ inline bool is_cut_out(const RasterArgs& args, unsigned triangle) {
 #endif
 }
 
+// At least four resident blocks per multiprocessor limit the registers.
 extern "C" __global__ void __launch_bounds__(BLOCK, 4) raster_warps(const __grid_constant__ RasterArgs args) {
     const unsigned queue_length = ((const RasterCounters*)args.counters)->medium_count, warp_count = gridDim.x * WARPS;
     for (unsigned index = blockIdx.x * WARPS + threadIdx.x / 32; index < queue_length; index += warp_count) {
@@ -226,7 +231,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK, 4) raster_warps(const __grid
     }
 }
 
-// Finds the last entry whose first tile is at or before `tile`. The warp tests 32 entries at a time.
+// Finds the last entry of the large queue whose first tile is at or before `tile`, the index of a tile among the tiles of
+// all entries. The warp tests 32 entries at a time.
 __device__ inline LargeTriangle find_large_triangle(const RasterArgs& args, unsigned entry_count, unsigned long long tile) {
     const LargeTriangle* queue = (const LargeTriangle*)args.large_queue;
     unsigned low = 0, high = entry_count;
@@ -265,6 +271,7 @@ __device__ inline bool is_outside_edge(const SnappedVertex& edge_start, const Sn
     return TriangleSetup<long long>::edge_function(edge_start, edge_end, x, y) < min_covered_edge;
 }
 
+// Draws the part of a triangle inside `rect` with a warp, which tests 8 x 4 samples at a time.
 template <typename AlphaTestPolicy>
 __device__ inline void draw_tile(const RasterArgs& args, const AlphaTestPolicy& alpha_test,
                                  const TriangleSetup<long long>& setup, const PixelRect& rect, unsigned triangle) {
@@ -298,8 +305,8 @@ struct TileJob {
     unsigned triangle;
 };
 
-// A tile takes 128 iterations of a warp. If there are fewer tiles than warps, one tile would determine the run time, so
-// tiles are split into strips.
+// A warp needs 128 iterations for a whole tile of 64 x 64 samples. If there are fewer tiles than warps, one tile would
+// determine the run time, so tiles are split into strips.
 __device__ inline void schedule_tiles(const RasterArgs& args, TileSchedule& schedule) {
     const unsigned long long large_count = ((const RasterCounters*)args.counters)->large_count;
     const unsigned long long tile_count = large_count & ((1ull << TILE_COUNT_BITS) - 1);
@@ -323,8 +330,8 @@ __device__ inline void load_tile_job(const RasterArgs& args, const TileSchedule&
     job.triangle = entry.triangle;
 }
 
-// Draws a polygon as a fan of triangles, which have the orientation of the polygon. Rounding may invert a triangle; it then
-// covers no sample that the other triangles do not cover.
+// Draws a polygon as a fan of triangles, which have the orientation of the polygon. Rounding may invert a triangle. It is
+// then skipped, because the other triangles cover all of its samples.
 template <typename AlphaTestPolicy>
 __device__ inline void draw_fan(const RasterArgs& args, const TileJob& job) {
     const ClippedPolygon& polygon = job.polygon;
@@ -339,6 +346,7 @@ __device__ inline void draw_fan(const RasterArgs& args, const TileJob& job) {
     }
 }
 
+// At least five resident blocks per multiprocessor limit the registers.
 extern "C" __global__ void __launch_bounds__(BLOCK, 5) raster_tiles(const __grid_constant__ RasterArgs args) {
     __shared__ TileSchedule schedule;
     __shared__ TileJob jobs[WARPS];

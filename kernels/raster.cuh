@@ -1,21 +1,21 @@
 // Triangle setup of the compute rasterizer: corners in clip space, clipping, snapping to 1/256 pixel, edge functions
 // and depth. Every float sum and product is rounded separately (no fused multiply-add), so that host and device give
-// the same bits. In window coordinates y points down, and the first sample is at (1/2, 1/2). Twin:
-// src/compute/reference/raster.rs.
+// the same bits. In window coordinates y points down, and the first sample is at (1/2, 1/2). raster.cu describes the macros
+// DEPTH_ONLY and CUT_OUTS. Twin: src/compute/reference/raster.rs.
 #pragma once
 
 constexpr int SUBPIXEL_STEPS = 256;  // per pixel
 constexpr unsigned MAX_CORNERS = 8;  // three, and at most one more for each of the five clip planes
-constexpr float MIN_W = 0x1p-100f;   // for a smaller w, 1 / w may overflow
+constexpr float MIN_W = 0x1p-100f;   // 1 / w overflows below about 2^-128; the rest is a margin
 
 // Device addresses and parameters of a launch. Twin: src/compute/gpu/executor/raster.rs.
 struct RasterArgs {
     unsigned long long positions;        // [vertices][3] f32
     unsigned long long triangles;        // [triangles][3] u32: vertices
     unsigned long long target;           // [height][width] u64: depth << 32 | triangle; with DEPTH_ONLY f32: depth (in, out)
-    unsigned long long medium_queue;     // [triangles] u32: triangles that warps draw                           (out, in)
-    unsigned long long large_queue;      // [triangles] LargeTriangle: triangles that are drawn by tiles         (out, in)
-    unsigned long long counters;         // RasterCounters                                                       (in, out)
+    unsigned long long medium_queue;     // [triangles] u32: triangles that `raster` leaves to `raster_warps`
+    unsigned long long large_queue;      // [triangles] LargeTriangle: triangles that `raster` leaves to `raster_tiles`
+    unsigned long long counters;         // RasterCounters: lengths of the queues
     unsigned long long uvs;              // with CUT_OUTS: [triangles - first_cut_out][3][2] f32
     unsigned long long material_indices; // with CUT_OUTS: [triangles - first_cut_out] u32: indices into `materials`
     unsigned long long materials;        // with CUT_OUTS: AlphaMaterial
@@ -37,11 +37,11 @@ struct LargeTriangle {
 
 struct RasterCounters {
     unsigned medium_count, pad;
-    unsigned long long large_count; // number of entries << TILE_COUNT_BITS | number of tiles
-    unsigned bin_counts[8];         // by TriangleBin
+    unsigned long long large_count; // number of entries << TILE_COUNT_BITS (raster.cu) | number of tiles of all entries
+    unsigned bin_counts[8];         // by TriangleBin, only with COUNT_TRIANGLES
 };
 
-// How a triangle is drawn (the first three), or why it is not.
+// How a triangle is drawn (the first three), or why it is not drawn. NO_BIN: the thread has no triangle.
 enum TriangleBin { SMALL, MEDIUM, LARGE, NOT_FINITE, OUTSIDE_FRUSTUM, DEGENERATE, BACK_FACING, NO_SAMPLE, NO_BIN };
 
 struct SnappedVertex {
@@ -92,7 +92,7 @@ __device__ inline bool is_finite(float4 v) {
     return fabsf(v.x) <= MAX_FINITE && fabsf(v.y) <= MAX_FINITE && fabsf(v.z) <= MAX_FINITE && fabsf(v.w) <= MAX_FINITE;
 }
 
-// Whether all three corners lie outside one plane of the view frustum.
+// Whether one plane of the view frustum has all three corners on its outer side.
 __device__ inline bool is_outside(const float4 (&corners)[3]) {
     return (corners[0].x > corners[0].w && corners[1].x > corners[1].w && corners[2].x > corners[2].w) ||
            (corners[0].x < -corners[0].w && corners[1].x < -corners[1].w && corners[2].x < -corners[2].w) ||
@@ -179,7 +179,9 @@ __device__ inline long long doubled_area(const SnappedVertex& a, const SnappedVe
     return (long long)(b.x - a.x) * (c.y - a.y) - (long long)(b.y - a.y) * (c.x - a.x);
 }
 
-// The samples inside a rectangle in 1/256 pixel, clipped to the window.
+// The samples inside a rectangle in 1/256 pixel, clipped to the window. The sample of column c is at x = 256 c + 128. The
+// first column at or after x0 is therefore ceil((x0 - 128) / 256), and the last one at or before x1 is
+// floor((x1 - 128) / 256).
 __device__ inline PixelRect pixel_rect(const RasterArgs& args, int x0, int y0, int x1, int y1) {
     constexpr int HALF_PIXEL = SUBPIXEL_STEPS / 2;
     return {max(0, (x0 + HALF_PIXEL - 1) >> 8), max(0, (y0 + HALF_PIXEL - 1) >> 8),
@@ -214,9 +216,9 @@ template <typename EdgeInt>
 struct TriangleSetup {
     SnappedVertex a, b, c;
     float inverse_area, depth_ab, depth_ac; // depth_ab and depth_ac: depth differences from a to b and from a to c
-    int min_edge_a, min_edge_b, min_edge_c; // per corner, `min_covered_edge` of the opposite edge
+    int min_edge_a, min_edge_b, min_edge_c; // `min_covered_edge` of the edge opposite to a, b and c
 
-    // Minimum of the edge function at samples that count as covered: 0 includes samples on a top or left edge.
+    // Minimum of the edge function at covered samples: 0 for a top or left edge, which includes samples on the edge, else 1.
     __device__ static int min_covered_edge(const SnappedVertex& start, const SnappedVertex& end) {
         return end.y < start.y || (end.y == start.y && end.x > start.x) ? 0 : 1;
     }
@@ -235,6 +237,7 @@ struct TriangleSetup {
         min_edge_c = min_covered_edge(a, b);
     }
 
+    // Twice the area of the triangle (start, end, (x, y)): positive on the inner side of the edge.
     __device__ static EdgeInt edge_function(const SnappedVertex& start, const SnappedVertex& end, int x, int y) {
         return (EdgeInt)(end.x - start.x) * (y - start.y) - (EdgeInt)(end.y - start.y) * (x - start.x);
     }
@@ -253,8 +256,9 @@ struct TriangleSetup {
     }
 };
 
-// Depths are not negative, so their bits have the order of the numbers. The plain read may be stale, but the target only
-// decreases, so if the comparison fails the atomic would change nothing. The alpha of a hidden sample is not read.
+// Writes a sample if it is nearer than the target's. Depths are not negative, so their bits have the order of the numbers.
+// The plain read may be stale, but the target only decreases: if the comparison fails, the atomic would change nothing. The
+// alpha texture is read only for samples that pass the comparison.
 template <typename AlphaTestPolicy>
 __device__ inline void write_sample(const RasterArgs& args, const AlphaTestPolicy& alpha_test, int column, int row,
                                     float depth, unsigned triangle) {

@@ -2,20 +2,22 @@
 // thesis). Normals are transformed by the inverse transpose of A, tangents by A. A reflection flips the sign of the
 // bitangent. CPU twin: src/compute/reference/rigid_normals.rs.
 //
-// A lane's matrix is scaled by a power of two so that its largest entry is about 1. If a transformed direction is shorter
-// than a tenth, it has lost precision in f32 and is computed again in f64.
+// A lane's matrix is scaled by a power of two so that its largest entry is about 1. If a transformed unit vector is then
+// shorter than 0.1, it has lost precision in f32 and is computed again in f64. deform.cu includes this file and describes
+// the macros.
 #pragma once
 #include "warp_tile.cuh"
 #include "direction.cuh"
 
-// A transformed direction whose squared length is at most this has lost too much precision to cancellation.
+// A transformed direction with at most this squared length (0.1^2) has lost too much precision to cancellation.
 constexpr float MIN_SQUARED_LENGTH = 0.01f;
 
 struct Mat3f {
     float3 row0, row1, row2;
 };
 
-// The power of two that scales a positive number to [1, 2), or as near as f32 allows.
+// The power of two that scales a positive number to [1, 2), or as near as f32 allows. A number with the exponent bits e has
+// the exponent e - 127, so the power of two has the exponent bits 127 - (e - 127) = 254 - e.
 __device__ __forceinline__ float power_of_two_scale(float max_entry) {
     const unsigned exponent = __float_as_uint(max_entry) >> 23;
     return __uint_as_float(max(254 - (int)exponent, 1) << 23);
@@ -59,7 +61,8 @@ __device__ __forceinline__ Mat3f load_scaled_linear_part(const Transforms& trans
 }
 
 #ifdef SHEAR
-// The matrix scaled by a power of two so that its largest entry is in [1, 2), rounded once to f32.
+// The matrix scaled by a power of two so that its largest entry is in [1, 2), rounded once to f32. As in
+// `power_of_two_scale`, but for f64, whose exponent bias is 1023: 2046 = 2 * 1023.
 __device__ __forceinline__ Mat3f to_scaled_mat3f(const Mat3d& m) {
     const double row0_max = fmax(fmax(fabs(m.row0.x), fabs(m.row0.y)), fabs(m.row0.z));
     const double row1_max = fmax(fmax(fabs(m.row1.x), fabs(m.row1.y)), fabs(m.row1.z));
@@ -79,9 +82,9 @@ __device__ __forceinline__ Mat3d signed_cofactors(const Mat3d& m) {
 #endif
 
 // Repeats the transformation in f64 for the corners in the bit mask `imprecise_corners`. The other corners of the lane
-// keep their results, so that the result of a corner does not depend on its lane. `rest_directions` is the x component of
-// the lane's first direction, and y follows `axis_stride` floats later. `component_count` is 3 for normals and 4 for
-// tangents.
+// keep their results, so that the result of a corner does not depend on its lane. `rest_directions` points to the x
+// component of the lane's first direction; its y component is `axis_stride` floats later. `component_count` is 3 for normals
+// and 4 for tangents.
 __device__ __noinline__ void retransform_directions_f64(Transforms transforms, unsigned domain,
                                                         const float* rest_directions, unsigned axis_stride,
                                         float* staged_directions, unsigned imprecise_corners, unsigned component_count) {
@@ -175,6 +178,7 @@ __device__ __forceinline__ void write_rigid_directions(const DeformArgs& args, O
                                                        const LaneSlice& slice, const RestNormals& rest_normals) {
     unsigned first_corner = slice.first_item;
 #ifdef CORNER_OFFSETS
+    // `first_item` is then the packed index of a vertex.
     if (slice.kind & TILE_VERTICES) {
         first_corner += __ldg(args.corner_offsets + slice.domain);
     }

@@ -1,5 +1,6 @@
-// The transform T of a domain. With FOLLOWERS, T of a follower is the transform of its transform root times a constant
-// frame. CPU twin: src/model/domain/composed_transform.rs, which defines the order of operations; results are bit-identical.
+// The transform T of a domain. With FOLLOWERS, T of a follower is the transform of its transform root times its frame, a
+// constant transform from the follower to the root. CPU twin: src/model/domain/composed_transform.rs, which defines the
+// order of operations; results are bit-identical.
 #pragma once
 #include "layout.cuh"
 
@@ -37,11 +38,12 @@ __device__ __forceinline__ TransformLink load_transform_link(const Transforms& t
     return {link.x, link.y};
 }
 
-// A row of T times a column (x, y, z) of the frame F.
+// A row of T times a column (x, y, z) of the linear part of the frame F.
 __device__ __forceinline__ float dot_row_column(const float4& t, float x, float y, float z) {
     return fmaf(t.x, x, fmaf(t.y, y, __fmul_rn(t.z, z)));
 }
 
+// A row of T times F.
 __device__ __forceinline__ float4 compose_row(const float4& t, const Affine& f) {
     return make_float4(dot_row_column(t, f.row0.x, f.row1.x, f.row2.x), dot_row_column(t, f.row0.y, f.row1.y, f.row2.y),
                        dot_row_column(t, f.row0.z, f.row1.z, f.row2.z), fmaf(t.x, f.row0.w,

@@ -28,12 +28,13 @@ struct LaneSlice {
     unsigned domain;
     unsigned warp_item_count;  // items of the warp in a tile of one domain; 0 in a mixed tile
     unsigned rest_quad;        // quad of x0, normals and tangents: first quad of the tile, or the lane's quad in a mixed tile
-    unsigned component_stride; // float4 vectors from one component of a quad to the next
+    unsigned component_stride; // number of float4 vectors from one component of a quad to the next component
     unsigned first_q;
     unsigned first_scale;
 };
 
-// A lane without an item has `item_count` 0 and reads quad 0. `tile_warp` is the index of the warp in its tile.
+// This lane's part of a tile. A lane without an item has `item_count` 0 and reads quad 0. `tile_warp` is the index of the
+// warp in its tile.
 __device__ __forceinline__ LaneSlice load_lane_slice(const DeformArgs& args, unsigned tile, unsigned tile_warp) {
     // The two halves of a `WarpTile`; below, `quad_words` is a `MixedQuad`. Their fields are in the order of layout.cuh.
     const uint4 low_words = __ldg((const uint4*)(args.tiles + tile));
@@ -107,14 +108,15 @@ __device__ __forceinline__ void stage_triples(OutputStaging& staging, const Lane
     staging.item_ranges[lane_id()] = make_uint2(first_item, slice.item_count);
 }
 
-// Stores the staged triples so that whole sectors are written. The items of a tile of one domain are contiguous; they are
-// written with 16 bytes per lane if aligned.
+// Stores the staged triples so that whole 32-byte sectors are written. The items of a tile of one domain are contiguous. A
+// lane writes 16 bytes at a time if the output is aligned, else 4 bytes.
 __device__ __forceinline__ void store_staged_triples(float* packed, OutputStaging& staging, const LaneSlice& slice) {
     __syncwarp();
     if (slice.kind & LAST_QUAD_ITEMS) {
         const unsigned first_item = staging.item_ranges[0].x, float_count = 3 * slice.warp_item_count;
         float* output = packed + 3 * (size_t)first_item;
         const unsigned vector_count = first_item % 4 == 0 ? float_count / 4 : 0;
+        // The loop has a constant bound, the vectors of a full warp (32 * FLOATS_PER_LANE / 4), so that it can be unrolled.
 #pragma unroll
         for (unsigned i = lane_id(); i < 8 * FLOATS_PER_LANE; i += 32) {
             if (i < vector_count) {
