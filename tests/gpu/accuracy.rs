@@ -41,6 +41,7 @@ pub(crate) fn assert_equals_reference(
     let reference_positions = modalcast_compute::reference::deform(scene, state);
     let mut bounds = BoundingBox::EMPTY;
     reference_positions.iter().for_each(|position| bounds.include(*position));
+    // At least the smallest normal f32, so that a scene of one point has a tolerance.
     let diagonal = bounds.diagonal().max(f64::from(f32::MIN_POSITIVE));
     let position_error = max_error(&surface.positions, &reference_positions, MAX_POSITION_ERROR * diagonal)
         .unwrap_or_else(|error| panic!("{name}: {error}"));

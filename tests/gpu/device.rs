@@ -61,6 +61,7 @@ fn gpu_dropped_deformers_release_their_memory() {
         deform_once();
     }
     let (free_after, _) = device.memory().expect("expected the free memory");
+    // If every deformer leaked, 200 times its memory would be missing.
     assert!(
         (free_before as u64) < free_after as u64 + 8 * bytes,
         "expected about {free_before} free bytes after 200 scenes, got {free_after}"

@@ -17,6 +17,7 @@ fn gpu_vertices_with_zero_rows_do_not_move() {
     let shape = scenes::random_shape(&mut random, 700, 9);
     let mut entries = shape.modes.columns().to_vec();
     for (index, entry) in entries.iter_mut().enumerate() {
+        // U has 2100 rows, three per vertex.
         let vertex = index % 2100 / 3;
         // Every third vertex has zero rows, with zeros of both signs.
         if vertex.is_multiple_of(3) {
@@ -47,6 +48,7 @@ fn gpu_vertices_with_zero_rows_do_not_move() {
 fn gpu_bounds_show_axis_and_sign_of_an_overflow() {
     let mut random = Random(4);
     let shape = scenes::random_shape(&mut random, 1000, 1);
+    // The only mode moves one vertex along x and y.
     let mut column = vec![0.0; 3000];
     column[3 * 517] = 2.0;
     column[3 * 517 + 1] = 2.0;
@@ -70,14 +72,17 @@ fn gpu_bounds_show_axis_and_sign_of_an_overflow() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_directions_of_singular_transforms_equal_the_reference() {
     let linear_parts: [[f32; 9]; 10] = [
+        // Singular: projections, zero, and two parallel rows.
         [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
         [-1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
         [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
         [0.0; 9],
         [1.0, 2.0, 3.0, 2.0, 4.0, 6.0, 0.0, 0.0, 1.0],
+        // Tiny, huge and denormal.
         [1e-30, 0.0, 0.0, 0.0, 3e-30, 1e-30, 0.0, 0.0, 2e-30],
         [1e30, 2e29, 0.0, 0.0, 3e30, 1e30, 0.0, 0.0, -2e30],
         [1e-40, 0.0, 0.0, 0.0, 2e-40, 0.0, 1e-41, 0.0, 1e-40],
+        // Nearly singular.
         [1.0, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1.0],
         [0.3, 0.5, -0.2, 0.300_000_03, 0.5, -0.2, 0.1, -0.7, 0.4],
     ];

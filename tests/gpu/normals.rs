@@ -11,7 +11,7 @@ use nalgebra::Vector3;
 
 use crate::accuracy::{MAX_DIRECTION_ERROR, have_equal_bits, max_error};
 use crate::reference_comparison::cuda_deformer;
-use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random, new_domain};
+use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random, RandomSceneOptions, new_domain};
 
 /// A tube of `columns` x `rows` vertices with a texture seam, a hard edge along every fifth row, and `rank` smooth
 /// modes.
@@ -27,8 +27,10 @@ fn tube(random: &mut Random, columns: u32, rows: u32, rank: usize) -> Shape {
     };
     let rest: Vec<_> = (0..rows).flat_map(|row| (0..columns).map(move |column| position(row, column))).collect();
     let mut corners = Corners::default();
-    for (row, is_lower) in (0..rows).flat_map(|row| [(row, true), (row, false)]) {
-        let normal_y = if row % 5 == 0 && !is_lower { 0.4 } else { 0.0 };
+    // A row of vertices has two rows of corners: the first for the triangles below it, the second for those above it. Where
+    // their normals differ, the row is a hard edge. A row of corners has one more column than vertices, for the seam.
+    for (row, is_below) in (0..rows).flat_map(|row| [(row, true), (row, false)]) {
+        let normal_y = if row % 5 == 0 && !is_below { 0.4 } else { 0.0 };
         for column in 0..=columns {
             let angle = column_angle(column % columns);
             corners.vertices.push(row * columns + column % columns);
@@ -56,13 +58,9 @@ fn tube(random: &mut Random, columns: u32, rows: u32, rank: usize) -> Shape {
         .expect("expected a valid shape")
 }
 
-/// A scene with exact normals, `instances` domains per shape, and optional normal maps.
-fn scene_with_exact_normals(
-    shapes: Vec<Shape>,
-    instances: usize,
-    normal_maps: bool,
-    rigid_transforms: bool,
-) -> Arc<Scene> {
+/// A scene with exact normals. `normal_maps` of the options applies to all shapes.
+fn scene_with_exact_normals(shapes: Vec<Shape>, options: RandomSceneOptions) -> Arc<Scene> {
+    let RandomSceneOptions { instances, normal_maps, rigid_transforms } = options;
     let count = shapes.len();
     let mut parts = scenes::parts_of_shapes(shapes);
     parts.deformation.normals = NormalMethod::Exact;
@@ -123,7 +121,10 @@ fn assert_equals_reference(name: &str, scene: &Scene, state: &SceneState, deform
 #[test]
 fn test_scenes_bend_but_do_not_fold() {
     for (seed, columns, rows, rank) in [(1, 16, 9, 3), (4, 24, 12, 3), (5, 16, 6, 2), (6, 70, 72, 8)] {
-        let scene = scene_with_exact_normals(vec![tube(&mut Random(seed), columns, rows, rank)], 3, true, false);
+        let scene = scene_with_exact_normals(
+            vec![tube(&mut Random(seed), columns, rows, rank)],
+            RandomSceneOptions { instances: 3, normal_maps: true, rigid_transforms: false },
+        );
         for seed in 5..11 {
             let state = scenes::random_state(&scene, seed);
             let mut cpu = modalcast_compute::cpu::CpuDeformer::new(&scene);
@@ -145,12 +146,13 @@ fn gpu_exact_normals_equal_the_reference() {
     let mut random = Random(1);
     let shapes = [(16, 9, 3), (5, 2, 1), (40, 31, 12)];
     let shapes: Vec<_> = shapes.map(|(columns, rows, rank)| tube(&mut random, columns, rows, rank)).into();
-    for (normal_maps, rigid) in [(false, false), (false, true), (true, false), (true, true)] {
-        let scene = scene_with_exact_normals(shapes.clone(), 4, normal_maps, rigid);
+    for (normal_maps, rigid_transforms) in [(false, false), (false, true), (true, false), (true, true)] {
+        let options = RandomSceneOptions { instances: 4, normal_maps, rigid_transforms };
+        let scene = scene_with_exact_normals(shapes.clone(), options);
         let mut deformer = cuda_deformer(&scene);
         assert!(deformer.plan().kernels.iter().any(|kernel| kernel.name == "normals"));
         assert!(deformer.plan().bytes(BufferRole::RingTables) > 0);
-        let name = format!("normal maps {normal_maps}, rigid {rigid}");
+        let name = format!("normal maps {normal_maps}, rigid transforms {rigid_transforms}");
         assert_equals_reference(&name, &scene, &scenes::random_state(&scene, 5), &mut deformer);
         assert_eq!(deformer.surface().expect("expected a surface").tangents.is_empty(), !normal_maps);
     }
@@ -162,12 +164,14 @@ fn gpu_exact_normals_equal_the_reference() {
 fn gpu_exact_normals_equal_rigid_ones_without_deformation() {
     let mut random = Random(2);
     let (modal_shape, rigid_shape) = (tube(&mut random, 20, 11, 2), tube(&mut random, 9, 7, 0));
-    let scene = scene_with_exact_normals(vec![modal_shape, rigid_shape], 3, true, false);
+    let scene = scene_with_exact_normals(
+        vec![modal_shape, rigid_shape],
+        RandomSceneOptions { instances: 3, normal_maps: true, rigid_transforms: false },
+    );
     let mut deformer = cuda_deformer(&scene);
     let mut state = scenes::random_state(&scene, 6);
     state.q.fill(0.0);
     let comparison = compare_normals(&scene, &state, &mut deformer);
-    // Rounded positions rotate a normal by about the rounding error divided by the size of a triangle.
     let assert_equal = |domain: usize, got: &[f32], want: &[f64], components: usize, limit: f64| {
         let layout = scene.layout.domains[domain];
         let (first, count) = (components * layout.first_corner, components * layout.corners);
@@ -177,6 +181,8 @@ fn gpu_exact_normals_equal_rigid_ones_without_deformation() {
     let (normals, tangents) = (rigid_normals(&scene, &state).into_flattened(), rigid_tangents(&scene, &state));
     let tangents = tangents.into_flattened();
     for domain in 0..scene.domains.len() {
+        // In a shape with modes, rounded positions rotate a normal by about the rounding error divided by the size of a
+        // triangle.
         let limit = if domain % 2 == 0 { 1e-3 } else { MAX_DIRECTION_ERROR };
         assert_equal(domain, &comparison.normals, &normals, 3, limit);
         assert_equal(domain, &comparison.tangents, &tangents, 4, limit);
@@ -194,9 +200,7 @@ fn gpu_exact_normals_are_unit_and_deterministic() {
     let mut random = Random(3);
     let scene = scene_with_exact_normals(
         vec![scenes::random_shape(&mut random, 700, 9), tube(&mut random, 33, 8, 5)],
-        3,
-        true,
-        false,
+        RandomSceneOptions { instances: 3, normal_maps: true, rigid_transforms: false },
     );
     let (mut state, other_state) = (scenes::random_state(&scene, 7), scenes::random_state(&scene, 8));
     let q = state.q_of(&scene, 1).to_vec();
@@ -234,10 +238,14 @@ fn gpu_exact_normals_are_unit_and_deterministic() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_seams_share_a_normal_and_hard_edges_stay_hard() {
     let mut random = Random(4);
-    let scene = scene_with_exact_normals(vec![tube(&mut random, 24, 12, 3)], 1, false, false);
+    let scene = scene_with_exact_normals(
+        vec![tube(&mut random, 24, 12, 3)],
+        RandomSceneOptions { instances: 1, normal_maps: false, rigid_transforms: false },
+    );
     let mut deformer = cuda_deformer(&scene);
     deformer.deform(&scenes::random_state(&scene, 9)).expect("expected the step to succeed");
     let normals = &deformer.surface().expect("expected a surface").normals;
+    // A row of corners has 25 columns. Corner rows 2 r and 2 r + 1 belong to row r of the tube.
     let normal_at = |corner_row: usize, column: usize| &normals[3 * (25 * corner_row + column)..][..3];
     for corner_row in 1..23 {
         assert!(have_equal_bits(normal_at(corner_row, 0), normal_at(corner_row, 24)), "corner row {corner_row}");
@@ -253,7 +261,10 @@ fn gpu_seams_share_a_normal_and_hard_edges_stay_hard() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_exact_normals_stay_unit_at_collapse_overflow_and_scale() {
     let mut random = Random(5);
-    let scene = scene_with_exact_normals(vec![tube(&mut random, 16, 6, 2)], 1, true, false);
+    let scene = scene_with_exact_normals(
+        vec![tube(&mut random, 16, 6, 2)],
+        RandomSceneOptions { instances: 1, normal_maps: true, rigid_transforms: false },
+    );
     let mut deformer = cuda_deformer(&scene);
     for scale in [1e-40, 1e-30, 1e-20, 1.0, 1e18, 1e30, 1e37_f32] {
         for offset in [0.0, 1e7] {

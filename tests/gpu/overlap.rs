@@ -85,7 +85,7 @@ fn blocking_surfaces(scene: &Arc<Scene>, states: &[SceneState]) -> Vec<DeformedS
     states.iter().map(&mut deform_fully).collect()
 }
 
-/// Whether a readback has no tangents, and otherwise the bits of an expected surface.
+/// Whether a readback has no tangents, and its other attributes have the bits of `want`.
 fn equals_without_tangents(got: &DeformedSurface, want: &DeformedSurface) -> bool {
     have_equal_bits(&got.positions, &want.positions)
         && have_equal_bits(&got.normals, &want.normals)

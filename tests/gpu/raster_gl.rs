@@ -1,4 +1,5 @@
-//! The CUDA rasterizer on OpenGL buffers, compared with the reference rasterizer.
+//! The CUDA rasterizer on OpenGL buffers, compared with the reference rasterizer. A soup is a list of triangles that are
+//! hard to rasterize, with a viewport.
 
 use std::sync::Arc;
 
@@ -31,12 +32,13 @@ impl GpuContext {
         (CudaRasterizer::new(&self.device, geometry).expect("expected a rasterizer"), positions)
     }
 
+    /// The key of each sample: the bits of its depth, then the index of its triangle.
     fn draw_ids(&self, rasterizer: &mut CudaRasterizer, viewport: &Viewport, target: &GlBuffer) -> Vec<u64> {
         rasterizer.draw(None, Some((viewport, target))).expect("expected a frame");
         self.gl.read(target, viewport.pixel_count())
     }
 
-    /// The bits of the depths.
+    /// The bits of the depth of each sample.
     fn draw_depths(&self, rasterizer: &mut CudaRasterizer, viewport: &Viewport, target: &GlBuffer) -> Vec<u32> {
         rasterizer.draw(Some((viewport, target)), None).expect("expected a frame");
         self.gl.read(target, viewport.pixel_count())
@@ -72,18 +74,21 @@ fn gpu_samples_have_the_bits_of_the_reference() {
     for soup in all_soups() {
         let (mut rasterizer, positions) = context.create_rasterizer(&soup, None);
         let pixel_count = soup.viewport.pixel_count() as u64;
-        let (keys, depths) = (context.gl.create_buffer(8 * pixel_count), context.gl.create_buffer(4 * pixel_count));
+        let (id_target, depth_target) =
+            (context.gl.create_buffer(8 * pixel_count), context.gl.create_buffer(4 * pixel_count));
         let (want, want_depths) = (soup.rasterize(), two_sided_depths(&soup, None));
         back_faces += count_differences(&want_depths, &want.depths().into_iter().map(f32::to_bits).collect::<Vec<_>>());
         for run in 0..3 {
-            let got = context.draw_ids(&mut rasterizer, &soup.viewport, &keys);
+            let got = context.draw_ids(&mut rasterizer, &soup.viewport, &id_target);
             assert_eq!(count_differences(&got, &want.keys), 0, "{}, run {run}", soup.name);
-            let got = context.draw_depths(&mut rasterizer, &soup.viewport, &depths);
+            let got = context.draw_depths(&mut rasterizer, &soup.viewport, &depth_target);
             assert_eq!(count_differences(&got, &want_depths), 0, "{}, depth, run {run}", soup.name);
         }
+        // CUDA releases the buffers before OpenGL deletes them.
         drop(rasterizer);
-        drop((positions, keys, depths));
+        drop((positions, id_target, depth_target));
     }
+    // Only the depth pass draws the back faces of all triangles.
     assert!(back_faces > 1000, "control: expected more than 1000 samples of back faces, got {back_faces}");
 }
 
@@ -114,15 +119,16 @@ fn gpu_positions_written_by_opengl_need_no_wait() {
     let context = GpuContext::open();
     let mut soup = all_soups().into_iter().find(|soup| soup.name == "a few pixels").expect("expected the named soup");
     let (mut rasterizer, positions) = context.create_rasterizer(&soup, None);
-    let keys = context.gl.create_buffer(8 * soup.viewport.pixel_count() as u64);
+    let id_target = context.gl.create_buffer(8 * soup.viewport.pixel_count() as u64);
     let mut previous_keys = Vec::new();
     for step in 0..20 {
+        // Moves each coordinate by -0.03 to 0.03.
         soup.positions
             .iter_mut()
             .enumerate()
             .for_each(|(index, number)| *number += 0.01 * ((index + step) % 7) as f32 - 0.03);
         context.gl.write(&positions, &soup.positions);
-        let got = context.draw_ids(&mut rasterizer, &soup.viewport, &keys);
+        let got = context.draw_ids(&mut rasterizer, &soup.viewport, &id_target);
         assert_eq!(count_differences(&got, &soup.rasterize().keys), 0, "step {step}");
         assert!(got != previous_keys, "step {step}: expected other samples than before");
         previous_keys = got;
@@ -138,11 +144,11 @@ fn gpu_targets_may_be_resized_and_reuse_buffer_names() {
     let (mut rasterizer, _) = context.create_rasterizer(&soup, None);
     for (width, height) in [(64, 64), (640, 480), (640, 480), (33, 7), (1, 1), (640, 480)] {
         soup.viewport = clip_space_viewport(width, height);
-        let keys = context.gl.create_buffer(8 * soup.viewport.pixel_count() as u64);
+        let id_target = context.gl.create_buffer(8 * soup.viewport.pixel_count() as u64);
         let want = soup.rasterize();
         for _ in 0..2 {
             assert_eq!(
-                count_differences(&context.draw_ids(&mut rasterizer, &soup.viewport, &keys), &want.keys),
+                count_differences(&context.draw_ids(&mut rasterizer, &soup.viewport, &id_target), &want.keys),
                 0,
                 "{width} x {height}"
             );
@@ -151,10 +157,10 @@ fn gpu_targets_may_be_resized_and_reuse_buffer_names() {
     // Two registered targets that alternate; one is larger than needed.
     let buffers =
         [0, 100].map(|extra_bytes| context.gl.create_buffer(8 * soup.viewport.pixel_count() as u64 + extra_bytes));
-    for keys in [&buffers[0], &buffers[1], &buffers[0], &buffers[1]] {
-        context.gl.write(keys, &vec![0_u64; soup.viewport.pixel_count()]);
+    for id_target in [&buffers[0], &buffers[1], &buffers[0], &buffers[1]] {
+        context.gl.write(id_target, &vec![0_u64; soup.viewport.pixel_count()]);
         assert_eq!(
-            count_differences(&context.draw_ids(&mut rasterizer, &soup.viewport, keys), &soup.rasterize().keys),
+            count_differences(&context.draw_ids(&mut rasterizer, &soup.viewport, id_target), &soup.rasterize().keys),
             0
         );
     }
@@ -167,6 +173,7 @@ fn gpu_unknown_or_small_buffers_return_errors() {
     let context = GpuContext::open();
     let soup = all_soups().into_iter().find(|soup| soup.name == "a few pixels").expect("expected the named soup");
     let pixel_count = soup.viewport.pixel_count() as u64;
+    // OpenGL has no buffer of this name.
     let unknown_buffer = |bytes| context.gl.buffer_handle(999_999, bytes);
     let result = CudaRasterizer::new(
         &context.device,
@@ -184,12 +191,13 @@ fn gpu_unknown_or_small_buffers_return_errors() {
     rasterizer
         .draw(None, Some((&soup.viewport, &GlBuffer { bytes: 8 * pixel_count, ..small_target.clone() })))
         .expect_err("expected an error for a target smaller than its stated size");
-    let too_few_positions = GlBuffer { bytes: 3 * 4 * 2, ..positions };
+    // The positions of two vertices.
+    let too_few_positions = GlBuffer { bytes: 2 * size_of::<[f32; 3]>() as u64, ..positions };
     CudaRasterizer::new(&context.device, soup_geometry(too_few_positions, &soup, None))
         .expect_err("expected an error for vertices beyond the buffer");
-    let keys = context.gl.create_buffer(8 * pixel_count);
+    let id_target = context.gl.create_buffer(8 * pixel_count);
     assert_eq!(
-        count_differences(&context.draw_ids(&mut rasterizer, &soup.viewport, &keys), &soup.rasterize().keys),
+        count_differences(&context.draw_ids(&mut rasterizer, &soup.viewport, &id_target), &soup.rasterize().keys),
         0,
         "after errors"
     );
@@ -228,10 +236,10 @@ fn gpu_positions_shared_with_a_deformer_are_drawn() {
     let mut rasterizer = CudaRasterizer::new(&context.device, geometry)
         .expect("expected a rasterizer on a buffer that the deformer registered");
     let viewport = clip_space_viewport(300, 200);
-    let keys = context.gl.create_buffer(8 * viewport.pixel_count() as u64);
+    let id_target = context.gl.create_buffer(8 * viewport.pixel_count() as u64);
     for seed in 0..10 {
         deformer.deform(&scenes::random_state(&scene, seed)).expect("expected the step to succeed");
-        let got = context.draw_ids(&mut rasterizer, &viewport, &keys);
+        let got = context.draw_ids(&mut rasterizer, &viewport, &id_target);
         let mut want = VisibilityBuffer::new(viewport);
         want.draw(&deformer.surface().expect("expected a surface").positions, &triangles, all_triangles);
         assert_eq!(count_differences(&got, &want.keys), 0, "step {seed}");

@@ -54,6 +54,7 @@ fn gpu_every_feature_combination_equals_the_reference() {
             (modes, normal_maps, !rigid_transforms)
         );
         let mut deformer = cuda_deformer(&scene);
+        // `deform`, `bounds` and at most two of `batch`, `normals` and `apply`.
         assert!(deformer.plan().launches() <= 4);
         let name = format!("modes {modes} normal maps {normal_maps} rigid {rigid_transforms}");
         assert_equals_reference(&name, &scene, &scenes::random_state(&scene, 9), &mut deformer);
@@ -70,6 +71,7 @@ fn gpu_twenty_thousand_small_domains_take_three_launches() {
         scenes::RandomSceneOptions { instances: 400, normal_maps: true, rigid_transforms: false },
     );
     let mut deformer = cuda_deformer(&scene);
+    // The launches are `deform`, `bounds`, and `apply` or `batch`.
     assert_eq!((scene.domains.len(), deformer.plan().launches()), (20_000, 3));
     let state = scenes::random_state(&scene, 3);
     assert_equals_reference("20,000 domains", &scene, &state, &mut deformer);
@@ -99,7 +101,7 @@ fn print_step_time(name: &str, deformer: &mut CudaDeformer, state: &SceneState) 
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_domains_with_shared_coordinates_move_alike() {
+fn gpu_domains_with_shared_q_and_equal_transforms_are_equal() {
     let mut random = Random(11);
     let mut parts = scenes::parts_of_shapes(vec![
         scenes::random_shape(&mut random, 100, 4),
@@ -116,8 +118,9 @@ fn gpu_domains_with_shared_coordinates_move_alike() {
     let mut deformer = cuda_deformer(&scene);
     assert_equals_reference("shared q", &scene, &state, &mut deformer);
     let positions = &deformer.surface().expect("expected a surface").positions;
+    // Both domains have the shape with 300 vertices.
     let [first, second] =
-        [1, 3].map(|domain: usize| &positions[3 * scene.layout.domains[domain].first_vertex..][..900]);
+        [1, 3].map(|domain: usize| &positions[3 * scene.layout.domains[domain].first_vertex..][..3 * 300]);
     assert!(have_equal_bits(first, second));
 }
 
@@ -152,8 +155,8 @@ fn gpu_bits_do_not_depend_on_history_or_packing() {
         assert!(have_equal_bits(&first.normals, &surface.normals));
         assert!(have_equal_bits(&first.tangents, &surface.tangents));
     }
-    let positions = |domain: usize| &first.positions[3 * scene.layout.domains[domain].first_vertex..][..3000];
+    let positions_of = |domain: usize| &first.positions[3 * scene.layout.domains[domain].first_vertex..][..3 * 1000];
     for domain in [2, 4, 6] {
-        assert!(have_equal_bits(positions(0), positions(domain)), "instance {domain}");
+        assert!(have_equal_bits(positions_of(0), positions_of(domain)), "domain {domain}");
     }
 }

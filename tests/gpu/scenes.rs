@@ -90,7 +90,7 @@ pub(crate) struct RandomSceneOptions {
     pub(crate) rigid_transforms: bool,
 }
 
-/// A scene of shapes (n, r).
+/// A scene of random shapes, each given by its number of vertices and its rank.
 pub(crate) fn random_scene(shapes: &[(usize, usize)], options: RandomSceneOptions) -> Arc<Scene> {
     let RandomSceneOptions { instances, normal_maps, rigid_transforms } = options;
     let mut random = Random(shapes.len() as u64);
