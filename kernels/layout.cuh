@@ -1,8 +1,8 @@
 // Structs and constants that host and kernels share. Twin: src/compute/gpu/tables/layout.rs; tests compare the size of every
 // struct and the offset of every field. The first comment of a kernel describes the arrays of its arguments.
 //
-// A quad is 4 consecutive vertices of one domain. A mixed tile has quads of several domains. The packed index of a vertex,
-// corner or coordinate counts those of all preceding domains too.
+// A quad is 4 consecutive vertices or corners of one domain. A mixed tile has quads of several domains. The packed index of
+// a vertex, corner or coordinate counts those of all preceding domains too.
 #pragma once
 
 // Threads per block of `apply`, `bounds` and `normals`, and packed corners per block of `normals`.

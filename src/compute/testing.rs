@@ -10,7 +10,7 @@ pub use crate::gpu::{CAPABILITIES, CompiledVariant, assert_compiles};
 use modalcast_model::domain::{Corners, Domain, Material, Mesh, Modes, Shape};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState};
 
-/// Deterministic random numbers from -1 to 1.
+/// Deterministic random numbers from -1 to 1: the linear congruential generator of Knuth's MMIX.
 #[derive(Debug)]
 pub struct TestRng(pub u64);
 

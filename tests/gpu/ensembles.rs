@@ -19,6 +19,7 @@ pub(crate) fn instanced_parts(
     parts
 }
 
+/// Default deformation settings with this storage of U.
 pub(crate) fn with_storage(storage: StorageType) -> DeformationSettings {
     DeformationSettings { storage, ..DeformationSettings::default() }
 }

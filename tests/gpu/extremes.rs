@@ -58,8 +58,8 @@ fn gpu_bounds_show_axis_and_sign_of_an_overflow() {
     let scene = Scene::new(parts).expect("expected a valid scene");
     let mut state = SceneState::rest(&scene);
     state.q[0] = f32::MAX;
-    // In f32 the first row is infinity minus infinity. The device then computes it in f64, where it is finite. The other
-    // rows exceed f32.
+    // In f32 the first row is infinity minus infinity. The device then computes it in f64, where it is finite. The
+    // other rows exceed f32.
     state.transforms[0] = Transform([1.0, -1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0, 1.0, 5.0]);
     let bounds = cuda_deformer(&scene).deform(&state).expect("expected the step to succeed").bounds;
     assert!(bounds.min[0].is_finite() && bounds.max[0].is_finite(), "{bounds:?}");

@@ -27,8 +27,8 @@ fn tube(random: &mut Random, columns: u32, rows: u32, rank: usize) -> Shape {
     };
     let rest: Vec<_> = (0..rows).flat_map(|row| (0..columns).map(move |column| position(row, column))).collect();
     let mut corners = Corners::default();
-    // A row of vertices has two rows of corners: the first for the triangles below it, the second for those above it. Where
-    // their normals differ, the row is a hard edge. A row of corners has one more column than vertices, for the seam.
+    // A row of vertices has two rows of corners: one for the triangles below it, then one for the triangles above it.
+    // Where their normals differ, the row is a hard edge. A row of corners has one more column, for the seam.
     for (row, is_below) in (0..rows).flat_map(|row| [(row, true), (row, false)]) {
         let normal_y = if row % 5 == 0 && !is_below { 0.4 } else { 0.0 };
         for column in 0..=columns {

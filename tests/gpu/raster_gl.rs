@@ -1,5 +1,5 @@
-//! The CUDA rasterizer on OpenGL buffers, compared with the reference rasterizer. A soup is a list of triangles that are
-//! hard to rasterize, with a viewport.
+//! The CUDA rasterizer on OpenGL buffers, compared with the reference rasterizer. A soup is a list of triangles that
+//! are hard to rasterize, with a viewport.
 
 use std::sync::Arc;
 

@@ -19,8 +19,8 @@ pub(super) fn unpack_f16(packed_words: &[PackedWord], columns: &mut [f32]) {
 /// Decodes a finite f16 without a branch and without subnormal operands, which would be slow.
 #[inline(always)]
 fn decode_f16(bits: u16) -> f32 {
-    // Change the exponent's bias from 15 to 127. A subnormal m 2^-24 becomes x = 2^-15 + m 2^-25, which 2 x - 2^-14
-    // corrects. For all other numbers, 2 x - 2^-14 is at least x.
+    // Change the exponent's bias from 15 to 127 = 15 + 112. A subnormal m 2^-24 becomes x = 2^-15 + m 2^-25, which
+    // 2 x - 2^-14 corrects. For all other numbers, 2 x - 2^-14 is at least x.
     let bits = u32::from(bits);
     let x = f32::from_bits((bits << 13 & 0x0fff_e000) + (112 << 23));
     let corrected = x.mul_add(2.0, -MIN_NORMAL_F16);
@@ -45,6 +45,7 @@ pub(super) fn unpack_bf16(packed_words: &[PackedWord], columns: &mut [f32]) {
 #[inline(always)]
 pub(super) fn unpack_int8(packed_words: &[PackedWord], columns: &mut [f32]) {
     let quads = packed_words.len() / 3;
+    // Separate the four groups of four bytes in each packed word, as `deinterleave` does for 16-bit entries.
     let mut buffer = [0_u32; 12 * TILE_QUADS];
     let buffer = &mut buffer[..12 * quads];
     for (packed_words, groups) in packed_words.chunks_exact(quads).zip(buffer.chunks_exact_mut(4 * quads)) {
@@ -66,6 +67,7 @@ pub(super) fn unpack_int8(packed_words: &[PackedWord], columns: &mut [f32]) {
 #[inline(always)]
 fn deinterleave<'a>(packed_words: &[PackedWord], buffer: &'a mut [u64; 6 * TILE_QUADS]) -> &'a [u64] {
     let quads = packed_words.len() / 3;
+    // Three planes of two groups per quad.
     let buffer = &mut buffer[..6 * quads];
     for (packed_words, groups) in packed_words.chunks_exact(quads).zip(buffer.chunks_exact_mut(2 * quads)) {
         let (a, b) = groups.split_at_mut(quads);

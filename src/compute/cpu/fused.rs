@@ -31,7 +31,8 @@ impl Decode<2> for DecodeF16 {
         let mut groups = [simd.avx._mm256_set1_ps(0.0); 2];
         for (group, target) in groups.iter_mut().enumerate() {
             let bits = simd.avx2._mm256_shuffle_epi8(packed_words, cast(SHUFFLE_16_BIT[group]));
-            // The algorithm of `decode::decode_f16`.
+            // The algorithm of `decode::decode_f16`. Its shift by 13 to the left is a shift by 3 to the right here,
+            // because the entry is in the upper 16 bits.
             let mantissa_mask = simd.avx._mm256_set1_epi32(0x0fff_e000);
             let magnitude = simd.avx2._mm256_and_si256(simd.avx2._mm256_srli_epi32::<3>(bits), mantissa_mask);
             let x = cast(simd.avx2._mm256_add_epi32(magnitude, simd.avx._mm256_set1_epi32(112 << 23)));

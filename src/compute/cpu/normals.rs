@@ -12,7 +12,7 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{RING_START, SmoothingGroups};
 use modalcast_model::scene::{Scene, SceneState};
 
-/// As in the twin: the fraction of B that an area must exceed.
+/// 2^-18, as in the twin: the area of a group must exceed this fraction of its rounding scale.
 const RESOLUTION: f64 = 1.0 / 262_144.0;
 
 /// As in the twin: squared length below which the sum of two unit vectors counts as zero.
@@ -93,7 +93,7 @@ impl<'a> DeformedDomain<'a> {
         })
     }
 
-    /// The sum of the area vectors around a ring, and its rounding scale B as the twin defines it.
+    /// The sum of the area vectors around a ring, and its rounding scale: the number B of the twin's documentation.
     fn sum_areas(&self, ring: &[u32]) -> (Vector3<f64>, f64) {
         let position = |entry: u32| to_vector(&self.positions[3 * (entry & !RING_START) as usize..]);
         let center = position(ring[0]);

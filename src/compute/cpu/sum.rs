@@ -162,6 +162,7 @@ impl<'a> TileChunks<'a> {
 
 #[cfg(target_arch = "x86_64")]
 impl TileChunks<'_> {
+    /// Adds the chunks of a 16-bit type, two at a time. A plane has two groups, and a chunk has two modes.
     #[inline(always)]
     fn fuse_packed16<D: fused::Decode<2>>(&self, simd: pulp::x86::V3, sums: &mut [f32]) {
         let with_scaled_q = |chunk: u16| (self.chunk(chunk), self.scaled_q(chunk));
@@ -174,6 +175,7 @@ impl TileChunks<'_> {
         }
     }
 
+    /// Adds the chunks of `Int8`. A plane has four groups, and a chunk has four modes.
     #[inline(always)]
     fn fuse_int8(&self, simd: pulp::x86::V3, sums: &mut [f32]) {
         for chunk in self.chunks {

@@ -208,11 +208,8 @@ mod tests {
         let mut output = vec![0.0; 3 * ITEM_COUNTS.iter().sum::<usize>()];
         let mut visits = vec![0; work.len()];
         let outputs = (PackedOutput::new(3, &mut output), PerTileOutput::new(&mut visits));
-        split_recursive(work.select_changed(&ChangeTracker::with_all_changed()), outputs, 1, &|tiles,
-                                                                                               (
-            mut numbers,
-            mut visits,
-        )| {
+        split_recursive(&tiles, outputs, 1, &|tiles, outputs| {
+            let (mut numbers, mut visits) = outputs;
             for tile in tiles {
                 numbers.numbers_of(tile).iter_mut().for_each(|number| *number += 1.0 + tile.domain as f32);
                 *visits.value_of(tile) += 1;

@@ -59,8 +59,8 @@ fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
     for storage in storage_variants() {
         let sum = |options: &[&'static str]| [&["MODES"], storage.as_slice(), options].concat();
         let all_options = ["MODE_TRUNCATION", "COMPENSATED_SUM"];
-        // Both 16-bit types decode with the same registers. For one of them, the sums between the smallest and the largest
-        // are omitted.
+        // Both 16-bit types decode with the same registers. For one of them, the sums between the smallest and the
+        // largest are omitted.
         let mut option_sets = subsets(&all_options);
         option_sets.retain(|options| storage != ["STORE_BF16"] || options.len() != 1);
         for options in &option_sets {
@@ -119,10 +119,10 @@ fn compile(kernel: &KernelSource, defines: &[&str], capability: (i32, i32)) -> C
 fn nvrtc_compiles_every_kernel_without_spilling() {
     for kernel in kernels::KERNELS {
         let variants = match kernel.name {
-            "deform" => deform_variants,
-            "batch" => batch_variants,
-            _ => all_variants,
-        }(kernel.features);
+            "deform" => deform_variants(kernel.features),
+            "batch" => batch_variants(kernel.features),
+            _ => all_variants(kernel.features),
+        };
         let describe_spill = |(variant, compiled): (&Variant, CompiledVariant)| {
             let spill_bytes = compiled.spill_bytes();
             // `sum_modes` of batch.cu may spill its stage counter.

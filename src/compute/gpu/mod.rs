@@ -1,10 +1,10 @@
 //! The CUDA backend, in three tiers: `launch` (access to the device), `tables` (tables and plan of a scene; pure) and
 //! `executor` (deformer and rasterizer).
 //!
-//! The kernels are in `kernels/*.cu`. NVRTC compiles them at run time for the present device, with only the features that
-//! the scene uses ([`plan()`]). A disk cache keeps the machine code. A step is one CUDA graph: a host-to-device copy, at
-//! most four kernel launches for any number of domains, and a readback of the bounds. The kernels write directly to
-//! OpenGL's buffers if the driver can share them.
+//! The kernels are in `kernels/*.cu`. NVRTC compiles them at run time for the present device, with only the features
+//! that the scene uses ([`plan()`]). A disk cache keeps the machine code. A step is one CUDA graph: a host-to-device
+//! copy, at most four kernel launches for any number of domains, and a readback of the bounds. The kernels write
+//! directly to OpenGL's buffers if the driver can share them.
 //!
 //! ```text
 //! inputs -> [apply or batch] -> deform -> bounds -> [normals] -> readback of the bounds
@@ -32,8 +32,8 @@ pub use tables::device_tables::CudaDeformerOptions;
 pub use tables::layout::{LayoutConstant, layout_constants};
 pub use tables::plan::{BufferDescriptor, BufferRole, DeformPlan, OmittedFeature, plan};
 
-/// The launchers of the kernels, for programs that measure single kernels. The launch functions are unsafe: the header of
-/// a step's values contains the addresses of its outputs.
+/// The launchers of the kernels, for programs that measure single kernels. The launch functions are unsafe: the header
+/// of a step's values contains the addresses of its outputs.
 pub mod launchers {
     pub use super::executor::launchers::apply::{ApplyKernel, ChangeListBuffer};
     pub use super::executor::launchers::bounds::BoundsKernel;

@@ -6,11 +6,12 @@
 //! area vectors are. The current sum uses the positions x of this step. The exact normal is the rigid normal of
 //! `reference/rigid_normals.rs`, rotated by the smallest rotation that takes the direction of the rest sum to that of
 //! the current sum. It follows that
-//! - at q = 0 it is the rigid normal, also if the author smoothed, weighted or tilted the rest normals;
+//! - at q = 0 the exact normal is the rigid normal, even if the author smoothed, weighted or tilted rest normals;
 //! - where rest normals are those of the triangles, it is the area-weighted normal of the deformed triangles;
-//! - where rest normals oppose the winding, it is the opposite of that normal: a rotation that takes g to h takes -g to
-//!   -h;
-//! - a mirroring T needs no special case: it transforms both sums alike, and the rigid normal has its sign;
+//! - where rest normals oppose the winding, it is the opposite of the area-weighted normal: a rotation that takes g to
+//!   h takes -g to -h;
+//! - a mirroring T needs no special case: T transforms both sums alike, and the rigid normal has the sign of its
+//!   determinant;
 //! - corners of one group with the same rest normal keep a common normal: seams stay closed and hard edges stay hard.
 //!
 //! A tangent is rotated by the same rotation, then made orthogonal to the new normal. The bitangent keeps its sign, or
@@ -24,11 +25,12 @@
 //! - its group has no area at rest, or areas that cancel;
 //! - the area of its group in this step is not above [`RESOLUTION`] times B.
 //!
-//! B is the sum of l (l + w) over both edges of each triangle. l is the sum of an edge's absolute components, and w
-//! that of the position of the group. Rounding positions to f32 moves an edge by at most 2^-23 (l + w), and so the sum
-//! of area vectors by at most 2^-23 B. For positions that were rounded once, the direction of the sum is therefore off
-//! by at most asin(2^-23 B / |sum|) < 1.8 degrees. A rotation that rounding alone could cause is not applied. A domain
-//! of one meter at 10^7 meters thus has rigid normals, unless the scene's origin is near it.
+//! B is the sum of l (l + w) over the two edges of each triangle that meet at the group's vertex. l is the sum of the
+//! absolute components of an edge, and w that of the vertex. Rounding positions to f32 moves an edge by at most 2^-23
+//! (l + w), and so the sum of area vectors by at most 2^-23 B. For positions that were rounded once, the direction of
+//! the sum is therefore off by at most asin(2^-23 B / |sum|) < asin(2^-5) < 1.8 degrees. A rotation that rounding alone
+//! could cause is not applied. A domain of one meter at 10^7 meters thus has rigid normals, unless the scene's origin
+//! is near it.
 //!
 //! Close to half a turn the axis of the smallest rotation is ill-conditioned. Rest normals that differ from the
 //! geometric ones by an angle d may be off by 2 d there. At half a turn, the component perpendicular to the normal is
@@ -127,11 +129,12 @@ fn for_each_rotated_corner(
             let group = *group as usize;
             let has_normal = smoothing.normals()[group] != [0.0; 3];
             let is_resolved = current_areas[group].sum.norm() > RESOLUTION * current_areas[group].rounding_scale;
-            let directions =
-                (normalize_scaled(area_transform * rest_areas[group].sum), normalize_scaled(current_areas[group].sum));
-            if let (true, (Some(rest_direction), Some(current_direction))) = (has_normal && is_resolved, directions) {
-                process(layout.first_corner + corner, &ShortestArc { rest_direction, current_direction });
+            if !has_normal || !is_resolved {
+                continue;
             }
+            let Some(rest_direction) = normalize_scaled(area_transform * rest_areas[group].sum) else { continue };
+            let Some(current_direction) = normalize_scaled(current_areas[group].sum) else { continue };
+            process(layout.first_corner + corner, &ShortestArc { rest_direction, current_direction });
         }
     }
 }

@@ -16,7 +16,7 @@ use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
 /// Subpixel steps per pixel.
 const SUBPIXEL_STEPS: i32 = 256;
-/// The smallest w by which clip coordinates are divided.
+/// 2^-100: the smallest w by which clip coordinates are divided. 1 / w overflows below about 2^-128.
 const MIN_W: f32 = f32::from_bits((127 - 100) << 23);
 
 /// Key of a sample that no triangle covers.
@@ -85,7 +85,7 @@ impl VisibilityBuffer {
         let window = self.window;
         self.draw_filtered(positions, triangles, group, |triangle, pixel| {
             let corners = corners(&window, positions, triangles[triangle as usize]);
-            cut_out::passes_alpha_test(cut_outs, &window, (triangle, &corners), pixel)
+            cut_out::passes_alpha_test(cut_outs, &window, triangle, &corners, pixel)
         });
     }
 
@@ -233,8 +233,8 @@ fn is_outside(corners: &[[f32; 4]; 3]) -> bool {
     (0..3).any(|axis| is_beyond(axis, 1.0) || is_beyond(axis, -1.0))
 }
 
-/// Signed distance to a plane, not negative on the inner side. Plane 0 is the near plane, the others are the sides of
-/// the guard band.
+/// Signed distance to a plane, not negative on the inner side. Plane 0 is the near plane; planes 1 to 4 are the sides
+/// of the guard band.
 fn plane_distance(window: &Viewport, [x, y, z, w]: &[f32; 4], plane: usize) -> f32 {
     let [guard_x, guard_y] = window.guard_band().map(|guard| guard * w);
     [z + w, guard_x - x, guard_x + x, guard_y - y, guard_y + y][plane]
@@ -283,7 +283,9 @@ fn snap(window: &Viewport, [x, y, z, w]: &[f32; 4]) -> SnappedVertex {
     SnappedVertex { x: to_subpixels(window_x), y: to_subpixels(window_y), z: z * inverse_w * 0.5 + 0.5 }
 }
 
-/// The samples in the bounding box of the corners, clipped to the window.
+/// The samples in the bounding box of the corners, clipped to the window. The sample of column c is at x = 256 c + 128.
+/// The first column at or after x0 is therefore ceil((x0 - 128) / 256), and the last one at or before x1 is
+/// floor((x1 - 128) / 256).
 fn samples(window: &Viewport, corners: &[SnappedVertex]) -> PixelRect {
     let sample_range = |coordinate_of: fn(&SnappedVertex) -> i32, window_side: u32| {
         let coordinates = || corners.iter().map(coordinate_of);

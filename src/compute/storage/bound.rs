@@ -1,11 +1,11 @@
 //! A-priori bounds of the error of a deformer's x, one number per source of error.
 //!
 //! The sum of a vertex is a chain of fused multiply-adds from +0 over its modes in ascending order, then `+ x0`, then
-//! three fused multiply-adds per row of T, all in f32. With u = 2^-24 and gamma_k = k u / (1 - k u), the error of a
-//! chain of k roundings is at most gamma_k times the sum of the magnitudes of its terms (Higham, Accuracy and Stability
-//! of Numerical Algorithms, 2nd ed., 2002, sections 2.2 and 3.1), plus 2^-150 for every rounding that underflows. The
-//! error of a compensated sum is at most u |s| + gamma_k^2 sum|terms| (Ogita, Rump, Oishi, Accurate Sum and Dot
-//! Product, 2005, proposition 5.5), plus 5 k 2^-149.
+//! three fused multiply-adds per row of T, all in f32. With the unit roundoff e = 2^-24 and gamma_k = k e / (1 - k e),
+//! the error of a chain of k roundings is at most gamma_k times the sum of the magnitudes of its terms (Higham,
+//! Accuracy and Stability of Numerical Algorithms, 2nd ed., 2002, sections 2.2 and 3.1), plus 2^-150 for every rounding
+//! that underflows. The error of a compensated sum s is at most e |s| + gamma_k^2 sum|terms| (Ogita, Rump, Oishi,
+//! Accurate Sum and Dot Product, 2005, proposition 5.5), plus 5 k 2^-149.
 //!
 //! T of a follower is a product T_m F of the transform T_m of its root and its frame F. [`ComposedTransform::to_f32`]
 //! defines its rounding: three roundings per entry. The error of an entry of the linear part is at most
@@ -23,7 +23,7 @@ use modalcast_model::scene::StorageType;
 
 /// Safety factor: more than the rounding error of the few thousand f64 operations of a bound.
 const ROUND_UP: f64 = 1.0 + 1e-12;
-/// u, the unit roundoff of f32.
+/// e, the unit roundoff of f32.
 const UNIT_ROUNDOFF: f64 = 1.0 / (1 << 24) as f64;
 /// 2^-150, half of the smallest f32.
 const UNDERFLOW: f64 = f64::from_bits((1023 - 150) << 52);
@@ -32,7 +32,7 @@ const SQRT_3: f64 = 1.732_050_807_568_878;
 /// Maximum error of a vertex of one tile or domain by source, in scene units.
 #[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
 pub struct ErrorBound {
-    /// Rounding of the entries of U to the storage type: `sum_j |q_j| step_j / 2` over the modes j, per axis.
+    /// Rounding of the entries of U to the storage type, by at most half a step each.
     pub storage: f64,
     /// Rounding of q times the factor or scale of a mode.
     pub coordinates: f64,
@@ -174,6 +174,7 @@ impl ShapeErrorModel {
         let storage = SQRT_3 * sums.storage * ROUND_UP;
         let [coordinates, magnitude_sum, term_count] =
             [sums.coordinates, sums.magnitude_sum, sums.term_count].map(|number| number * ROUND_UP);
+        // The factor 2 of underflow errors covers their growth by later roundings.
         let accumulation = match input.compensated {
             false => gamma(term_count) * magnitude_sum + 2.0 * SQRT_3 * term_count * UNDERFLOW,
             true => {
@@ -252,6 +253,7 @@ fn spectral_norm(transform: &Transform) -> f64 {
     } else {
         mean
     };
+    // The last factor covers the rounding errors of the formula.
     eigenvalue.sqrt() * max_entry * (1.0 + 5e-8)
 }
 
@@ -294,14 +296,14 @@ fn factor(tiles: &TiledModes, tile: usize, mode: usize) -> f32 {
 /// Maximum rounding error of an entry of a tile in the storage type; `max_entry` is the tile's largest magnitude.
 fn half_step(tiles: &TiledModes, tile: usize, mode: usize, max_entry: f32) -> f64 {
     let factor = f64::from(factor(tiles, tile, mode));
-    // Half the spacing is 2^-11 (f16) or 2^-8 (bf16) times the power of two at or below the entry. Both types have a
-    // smallest spacing.
+    // Half the spacing is 2^-11 (f16) or 2^-8 (bf16) times the power of two at or below the entry. The smallest spacing
+    // of f16 is 2^-24, that of bf16 is 2^-133.
     let power_of_two = f64::exp2(f64::from(super::quantize::floor_log2(max_entry)));
     match tiles.storage() {
         _ if max_entry == 0.0 => 0.0,
         StorageType::F32 => 0.0,
         StorageType::F16 => (power_of_two * f64::exp2(-11.0)).max(factor * f64::exp2(-25.0)),
-        // The smallest spacing, not half of it: the value may be rounded twice, first to f32.
+        // The smallest spacing, and not half of it, because the value may be rounded twice: to f32, then to bf16.
         StorageType::Bf16 => (power_of_two * f64::exp2(-8.0)).max(factor * f64::exp2(-133.0)),
         StorageType::Int8 => factor / 2.0 * ROUND_UP,
     }

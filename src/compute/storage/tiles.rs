@@ -156,11 +156,11 @@ impl TiledModes {
         let (quad, tile) = (vertex / QUAD, vertex / QUAD / TILE_QUADS);
         let layout = self.tile(tile);
         let element = (mode % chunk_modes * 3 + axis) * QUAD + vertex % QUAD;
-        let size = 4 / chunk_modes;
-        let (plane, byte) = (element * size / 16, element * size % 16);
+        let entry_bytes = 4 / chunk_modes;
+        let (plane, byte) = (element * entry_bytes / 16, element * entry_bytes % 16);
         let word =
             layout.first_packed_word + (mode / chunk_modes * 3 + plane) * layout.quads + quad - layout.first_quad;
-        let bytes = &self.packed_words[word].0[byte..byte + size];
+        let bytes = &self.packed_words[word].0[byte..byte + entry_bytes];
         match self.storage {
             StorageType::F32 => f64::from(bytemuck::pod_read_unaligned::<f32>(bytes)),
             StorageType::F16 => f16::from_ne_bytes([bytes[0], bytes[1]]).to_f64() * f64::from(self.factors[mode]),

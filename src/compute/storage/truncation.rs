@@ -1,13 +1,14 @@
 //! Modal truncation: the modes that can be left out at a step's q, and a bound of the resulting error.
 //!
-//! Leaving out the modes D moves no vertex by more than `||A||_2 sum_{j in D} |q_j| max_i ||U_ij||_2`, by the triangle
-//! inequality and the norm of A. Hysteresis prevents popping of a mode whose q oscillates around a limit. A mode is
+//! Leaving out a set D of modes moves no vertex by more than `||A||_2 sum_{j in D} |q_j| max_i ||U_ij||_2`, where A is
+//! the linear part of T, and U_ij is the block of three entries of vertex i and mode j. This follows from the triangle
+//! inequality. Hysteresis prevents popping of a mode whose q oscillates around a limit. A mode is
 //! truncated only while all truncated modes together stay within half the budget. It is restored when they exceed the
 //! whole budget.
 
 use modalcast_model::domain::Modes;
 
-/// Safety factor: more than the rounding error of 513 additions and three products in f64.
+/// Safety factor: more than the rounding error of three products and of one addition per mode in f64.
 const ROUND_UP: f64 = 1.0 + 1e-12;
 
 /// `max_i ||U_ij||_2` per mode j, rounded up: the largest displacement of a vertex by the mode, in scene units per unit

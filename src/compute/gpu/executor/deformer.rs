@@ -123,9 +123,9 @@ impl CudaDeformer {
         })
     }
 
-    /// The compiled kernels and allocated buffers. The plan excludes memory that is allocated on demand. The first fetch
-    /// of vertices concurrently with a step allocates the second output set. The second step slot is allocated when two
-    /// steps are in flight.
+    /// The compiled kernels and allocated buffers. The plan excludes memory that is allocated on demand. The first
+    /// fetch of vertices concurrently with a step allocates the second output set. The second step slot is allocated
+    /// when two steps are in flight.
     pub const fn plan(&self) -> &DeformPlan {
         &self.plan
     }

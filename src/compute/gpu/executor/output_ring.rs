@@ -1,5 +1,5 @@
-//! Double buffering of the outputs: chooses the output (an output set of `output`) that a step writes, and records which
-//! domains of an output are outdated. It does not access the device.
+//! Double buffering of the outputs: chooses the output (an output set of `output`) that a step writes, and records
+//! which domains of an output are outdated. It does not access the device.
 //!
 //! While the host copies one output, the next step writes another, so neither waits. The other output shows an older
 //! step. The ring records which domains have changed since then, and the step computes them again together with its own
@@ -180,7 +180,7 @@ mod tests {
 
     /// A state that follows the previous one by these changes.
     fn state(serial: u64, changed: &[u32]) -> SceneState {
-        let mut state = SceneState::rest(&scene(&[(7, 1)], false, false));
+        let mut state = SceneState::rest(&scene(&[(7, 1)]));
         (state.serial, state.dirty_domains) = (serial, DirtyDomains::Some(changed.to_vec()));
         state
     }

@@ -35,13 +35,13 @@ use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
 /// Threads per block.
 const BLOCK_THREADS: u32 = 128;
-/// Blocks per multiprocessor of the kernels that loop over a queue: as many as are resident.
+/// Blocks per multiprocessor of the kernels that loop over a queue: at most 2048 threads are resident.
 const BLOCKS_PER_SM: u32 = 16;
 
 /// Each 32-bit word of an id sample that no triangle covers.
 const EMPTY_SAMPLE: u32 = u32::MAX;
 
-/// Arguments of all kernels; pointers are device addresses.
+/// Arguments of all kernels; pointers are device addresses. `kernels/raster.cuh` documents the fields.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct RasterArgs {

@@ -10,8 +10,9 @@ use super::device::Device;
 use super::error::cuda_error;
 use modalcast_model::error::{Error, Result};
 
-/// Captures the work that `submit` submits to the device's stream, without running it. The capture also ends when `submit`
-/// returns an error or panics. Otherwise the stream would stay in capture mode and refuse the work of all scenes.
+/// Captures the work that `submit` submits to the device's stream, without running it. The capture also ends when
+/// `submit` returns an error or panics. Otherwise the stream would stay in capture mode and refuse the work of all
+/// scenes.
 ///
 /// The graph refers to the memory that the work uses. The caller launches it only while that memory exists.
 ///

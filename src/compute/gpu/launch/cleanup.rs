@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use cudarc::driver::CudaStream;
 
-/// Guard that waits for a stream on drop, unless [`Self::disarm`] was called. It covers submitted work that nothing else
-/// waits for yet.
+/// Guard that waits for a stream on drop, unless [`Self::disarm`] was called. It covers submitted work that nothing
+/// else waits for yet.
 #[must_use]
 pub(crate) struct WaitForStream(Option<Arc<CudaStream>>);
 

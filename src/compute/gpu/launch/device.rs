@@ -13,7 +13,8 @@ use modalcast_model::error::{Error, Result};
 /// Minimum CUDA driver version, as cuDriverGetVersion counts (12.0).
 const MIN_DRIVER_VERSION: i32 = 12_000;
 
-/// A CUDA device. One stream orders all work. Only the readback of vertices has a stream of its own, which events order.
+/// A CUDA device. One stream orders all work. Only the readback of vertices has a stream of its own, which events
+/// order.
 #[derive(Debug)]
 pub struct Device {
     context: Arc<CudaContext>,
@@ -43,8 +44,8 @@ impl Device {
 
     fn with_context(ordinal: usize) -> Result<Arc<Self>, DriverError> {
         let context = CudaContext::new(ordinal)?;
-        // SAFETY: event tracking orders accesses from several streams. It is not needed: the stream below orders all work,
-        // and `readback` orders the copies of its second stream by its own events.
+        // SAFETY: event tracking orders accesses from several streams. It is not needed: the stream below orders all
+        // work, and `readback` orders the copies of its second stream by its own events.
         unsafe { context.disable_event_tracking() };
         let stream = context.new_stream()?;
         let name = context.name()?;

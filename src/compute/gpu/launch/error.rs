@@ -1,5 +1,5 @@
-//! Converts errors of the CUDA driver to [`Error`]. Distinguishes a lost device from a fault after which the device still
-//! works.
+//! Converts errors of the CUDA driver to [`Error`]. Distinguishes a lost device from a fault after which the device
+//! still works.
 
 use cudarc::driver::DriverError;
 use cudarc::driver::sys::CUresult;
@@ -56,7 +56,8 @@ mod tests {
         }
     }
 
-    /// The test creates the error itself: the text of a `DriverError` comes from the driver library, which may be missing.
+    /// The test creates the error itself: the text of a `DriverError` comes from the driver library, which may be
+    /// missing.
     #[test]
     fn lost_device_error_names_the_remedy() {
         let error = Error::DeviceLost { stage: "deform", reason: "illegal address".into() };

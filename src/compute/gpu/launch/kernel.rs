@@ -87,9 +87,9 @@ pub enum LaunchOrder {
 /// Launches `function` on the device's stream. `args` is its only argument.
 ///
 /// # Safety
-/// The kernel has one argument, a struct with the layout of `T`. Each address in it refers to device or pinned memory of
-/// at least the size that the kernel accesses, which exists until the kernel has ended. A kernel that is launched with
-/// [`LaunchOrder::Dependent`] calls `wait_for_prerequisite_grids` before it accesses memory.
+/// The kernel has one argument, a struct with the layout of `T`. Each address in it refers to device or pinned memory
+/// of at least the size that the kernel accesses, which exists until the kernel has ended. A kernel that is launched
+/// with [`LaunchOrder::Dependent`] calls `wait_for_prerequisite_grids` before it accesses memory.
 ///
 /// # Errors
 /// `Fault` when the driver refuses the launch.

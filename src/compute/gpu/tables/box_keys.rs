@@ -1,5 +1,5 @@
-//! Boxes as the kernels write them: the maxima of -x, -y, -z, x, y, z as integer keys, which have the order of the numbers.
-//! Pure.
+//! Boxes as the kernels write them: the maxima of -x, -y, -z, x, y, z as integer keys, which have the order of the
+//! numbers. Pure.
 
 use nalgebra::Vector3;
 
@@ -14,8 +14,8 @@ pub(crate) fn axes_to_f32(axes: Option<[Vector3<f64>; 3]>) -> [f32; 9] {
 /// The bounds along the bounding axes, from the last six of twelve keys; `None` when there are only six keys.
 ///
 /// The kernel rounds its sums outward, but its axes are f32. A component of a unit vector in f32 has an error of at
-/// most 2^-25, so each bound has an error of at most 2^-25 times the sum of the largest absolute x, y and z. This function
-/// widens the bounds by twice that.
+/// most 2^-25, so each bound has an error of at most 2^-25 times the sum of the largest absolute x, y and z. This
+/// function widens the bounds by twice that.
 pub(crate) fn oriented_bounds_from_keys(keys: &[u32]) -> Option<OrientedBounds> {
     let (world, oriented) = keys.split_at_checked(6).filter(|(_, oriented)| oriented.len() == 6)?;
     let world = bounds_from_keys(world);
@@ -33,8 +33,8 @@ pub(crate) fn bounds_from_keys(keys: &[u32]) -> BoundingBox {
     bounds
 }
 
-/// Twin of `ordered_to_float` in `kernels/ordered_float.cuh`, the inverse of `float_to_ordered`. Key 0, which no number has,
-/// gives NaN.
+/// Twin of `ordered_to_float` in `kernels/ordered_float.cuh`, the inverse of `float_to_ordered`. Key 0, which no number
+/// has, gives NaN.
 fn ordered_to_float(key: u32) -> f32 {
     f32::from_bits(if key >> 31 == 1 { key & 0x7fff_ffff } else { !key })
 }

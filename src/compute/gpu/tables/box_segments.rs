@@ -1,7 +1,7 @@
 //! Bounding boxes per domain: the segments that `bounds` reduces to boxes, and their union per domain. Pure.
 //!
-//! A domain with tiles of its own is split into segments of tiles, whose boxes `deform` computed. A domain that shares a
-//! tile is one segment, a range of its positions. So one domain of millions of vertices keeps as many threads busy as
+//! A domain with tiles of its own is split into segments of tiles, whose boxes `deform` computed. A domain that shares
+//! a tile is one segment, a range of its positions. So one domain of millions of vertices keeps as many threads busy as
 //! 200,000 small domains. The host unites the few boxes of a large domain.
 
 use super::box_keys::bounds_from_keys;
@@ -41,8 +41,8 @@ pub(crate) const fn box_bytes(segment_count: usize) -> u64 {
     (segment_count * 4 * BOX_KEYS) as u64
 }
 
-/// Computes one box per domain. `domains` has the domain of each segment, in ascending order, and `keys` the box of each
-/// segment.
+/// Computes one box per domain. `domains` has the domain of each segment, in ascending order, and `keys` the box of
+/// each segment.
 pub(crate) fn unite_boxes(domains: &[u32], keys: &[u32], boxes: &mut Vec<BoundingBox>) {
     boxes.clear();
     for (domain, keys) in domains.iter().zip(keys.chunks_exact(BOX_KEYS)) {
@@ -86,7 +86,7 @@ mod tests {
     #[test]
     fn every_vertex_lies_in_one_segment_of_its_domain() {
         let sizes = [(7, 2), (64, 0), (65, 3), (128, 1), (129, 0), (9_000, 4), (1, 1)];
-        for scene in [scene(&sizes, false, false), scene_without_sharing(&sizes)] {
+        for scene in [scene(&sizes), scene_without_sharing(&sizes)] {
             let work = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::default());
             let segments = box_segments(&scene, &work);
             let is_vertex_range = |segment: &BoxSegment| segment.is_vertex_range == 1;
@@ -102,7 +102,8 @@ mod tests {
 
     #[test]
     fn segment_boxes_unite_per_domain_and_nan_propagates() {
-        // Keys of -x and x: `float_to_ordered` sets the sign bit of positive numbers and inverts all bits of negative ones.
+        // Keys of -x and x: `float_to_ordered` sets the sign bit of positive numbers and inverts all bits of negative
+        // ones.
         let key = |x: f32| if x.is_sign_negative() { !x.to_bits() } else { x.to_bits() | 1 << 31 };
         let cube_keys = |min: f32, max: f32| [[key(-min); 3], [key(max); 3]].concat();
         let keys = [cube_keys(-1.0, 2.0), cube_keys(0.5, 0.75), cube_keys(-3.0, 0.25)].concat();

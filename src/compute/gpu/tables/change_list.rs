@@ -9,8 +9,8 @@ use super::input_packing::InputPacker;
 use super::layout::Change;
 use modalcast_model::scene::{Scene, SceneState};
 
-/// A partial step changes at most 1 / `MAX_CHANGED_DIVISOR` of the domains. With more changes, copying the whole state is
-/// faster.
+/// A partial step changes at most 1 / `MAX_CHANGED_DIVISOR` of the domains. With more changes, copying the whole state
+/// is faster.
 const MAX_CHANGED_DIVISOR: usize = 4;
 
 /// Lengths of the lists of a step.
@@ -24,26 +24,24 @@ pub struct ChangeListLengths {
 const CHANGE_WORDS: usize = size_of::<Change>() / 4;
 const TRANSFORM_WORDS: usize = 12;
 
-/// Maximum number of changed domains in a partial step. 0 if all steps are full, because the scene has too few domains or
-/// truncates modes. The set of truncated modes depends on q and is uploaded only with the whole state.
+/// Maximum number of changed domains in a partial step. 0 if all steps are full, because the scene has too few domains
+/// or truncates modes. The set of truncated modes depends on q and is uploaded only with the whole state.
 pub(crate) const fn max_changed_domains(scene: &Scene) -> usize {
     if scene.features.truncation { 0 } else { scene.domains.len() / MAX_CHANGED_DIVISOR }
 }
 
 /// Maximum number of [`Change`]s of a partial step.
 pub(crate) fn max_change_entries(scene: &Scene) -> usize {
-    let domain_count = (0..scene.domains.len()).filter(|domain| !needs_no_entry(scene, *domain)).count();
+    let domain_count = (0..scene.domains.len()).filter(|domain| needs_entry(scene, *domain)).count();
     max_changed_domains(scene).min(domain_count)
 }
 
-/// Whether the tiles of a changed domain are listed, but not the domain itself. This holds for a domain without modes
-/// that follows another domain's transform, unless exact normals or boxes need the step of its last change.
-fn needs_no_entry(scene: &Scene, domain: usize) -> bool {
+/// Whether a changed domain needs a [`Change`]. A follower without modes has neither a transform nor coordinates of its
+/// own, so only its tiles are listed. But exact normals and boxes need the step of its last change.
+fn needs_entry(scene: &Scene, domain: usize) -> bool {
     let features = scene.features;
-    features.followers
-        && !(features.exact_normals || features.boxes)
-        && scene.layout.domains[domain].rank == 0
-        && scene.transform_roots.frame_of(domain).is_some()
+    let has_own_values = || scene.layout.domains[domain].rank > 0 || scene.transform_roots.frame_of(domain).is_none();
+    !features.followers || features.exact_normals || features.boxes || has_own_values()
 }
 
 /// Offsets of the lists in the memory of a partial step, in words. The changes have offset 0.
@@ -117,10 +115,10 @@ impl ChangeListWriter {
         let (words, q) = words.split_at_mut(layout.q);
         let (changes, transforms) = words.split_at_mut(layout.transforms);
         let (mut q_count, mut change_count) = (0, 0);
-        let domains_with_entry = domains.changed.iter().filter(|domain| !needs_no_entry(scene, **domain as usize));
+        let domains_with_entry = domains.changed.iter().filter(|domain| needs_entry(scene, **domain as usize));
         for (index, domain_id) in domains_with_entry.enumerate() {
             let (domain, first_new_q) = (*domain_id as usize, q_count);
-            // The kernel ignores the transform in the entry of a follower; that of its root fills the place.
+            // In the entry of a follower, the kernel ignores the transform. The transform of its root fills the place.
             let root = scene.transform_roots.root_of(domain);
             let transform: [u32; TRANSFORM_WORDS] = bytemuck::cast(state.transforms[root].0);
             transforms[TRANSFORM_WORDS * index..][..TRANSFORM_WORDS].copy_from_slice(&transform);

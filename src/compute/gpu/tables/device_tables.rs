@@ -27,8 +27,8 @@ impl CudaDeformerOptions {
     }
 }
 
-/// The constant tables of a scene, built once for the plan and the upload. U itself is packed during its upload, because
-/// it is large.
+/// The constant tables of a scene, built once for the plan and the upload. U itself is packed during its upload,
+/// because it is large.
 #[derive(Debug)]
 pub struct DeviceTables {
     pub(crate) coordinates: CoordinateLayout,

@@ -4,8 +4,8 @@
 //! ```text
 //! [header][transforms: 12 f32 per transform root][q, padded to whole chunks of modes][retained counts][retained chunks]
 //! ```
-//! With truncation, each domain has the number and the indices of its retained chunks. Without truncation, these two parts
-//! are empty. The pinned memory is write-combined: the host writes it from front to back and never reads it.
+//! With truncation, each domain has the number and the indices of its retained chunks. Without truncation, these two
+//! parts are empty. The pinned memory is write-combined: the host writes it from front to back and never reads it.
 
 use std::sync::Arc;
 
@@ -34,12 +34,12 @@ pub(crate) struct DirtyTileLayout {
     pub domain_tiles: Vec<DomainTiles>,
     /// Number of all tiles.
     pub tile_count: usize,
-    /// Cost of a full step in tiles of `deform`, the limit of a partial step. A tile of a batch counts as several, because
-    /// `batch` computes it for every member.
+    /// Cost of a full step in tiles of `deform`, the limit of a partial step. A tile of a batch counts as several,
+    /// because `batch` computes it for every member.
     pub full_step_cost: usize,
 }
 
-/// Sizes of the parts behind the header in bytes, in buffer order. Each is a multiple of 16 bytes.
+/// Sizes in bytes of the parts after the header, in buffer order. Each is a multiple of 16 bytes.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct InputSizes {
     pub transforms: u64,
@@ -191,8 +191,8 @@ impl ChunkSelection {
         }
     }
 
-    /// Selects and writes the retained chunks: those with at least one retained mode. The other modes of such a chunk are
-    /// read with it and thus summed too.
+    /// Selects and writes the retained chunks: those with at least one retained mode. The other modes of such a chunk
+    /// are read with it and thus summed too.
     fn write(&mut self, packer: &InputPacker, state: &SceneState, writer: &mut SliceWriter) {
         let scene = &packer.scene;
         let chunk_modes = modes_per_chunk(scene.deformation.storage);
@@ -270,14 +270,15 @@ mod tests {
         let f16 = DeformationSettings { storage: StorageType::F16, ..DeformationSettings::default() };
         for (shapes, cores) in [(3, 1), (3, 4), (20_000, 1), (20_000, 4)] {
             let sizes: Vec<(usize, usize)> = (0..shapes).map(|shape| (7, shape % 20)).collect();
-            for scene in [scene(&sizes, false, false), scene_with_deformation(&sizes, f16)] {
+            for scene in [scene(&sizes), scene_with_deformation(&sizes, f16)] {
                 let (packer, state) = (packer_with_factors(&scene), state_with_distinct_values(&scene));
                 let mut words = vec![f32::NAN; InputSizes::of(&scene, &packer.coordinates).total() as usize / 4];
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(cores).build().expect("a thread pool");
                 pool.install(|| InputWriter::new(&packer).write(&mut words, &Header::default(), &state));
                 let mut expected = expected_words(&packer, &state);
                 assert!(words == expected, "{shapes} shapes, {cores} cores");
-                expected[24] += 1.0;
+                let changed_word = 24;
+                expected[changed_word] += 1.0;
                 assert!(words != expected, "control: expected the comparison to detect a changed word");
             }
         }

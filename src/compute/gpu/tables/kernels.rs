@@ -2,11 +2,11 @@
 
 use super::change_list::max_change_entries;
 use super::device_tables::DeviceTables;
-use super::layout::BLOCK;
+use super::layout::{BLOCK, WARP_THREADS};
 use super::work::batches::{BatchTables, MAX_BATCH_SIZE};
 use super::work::{WorkList, has_rigid_normals};
 use crate::gpu::launch::{KernelDescriptor, KernelKind, KernelSource, KernelText};
-use crate::storage::{TILE_QUADS, modes_per_chunk};
+use crate::storage::modes_per_chunk;
 use modalcast_model::scene::{Scene, StorageType};
 
 /// All kernels of a step.
@@ -78,16 +78,16 @@ pub(crate) const fn has_one_item_per_lane(work: &WorkList) -> bool {
     work.full_step_tiles < MIN_FOUR_ITEM_TILES
 }
 
-/// Threads per block of `deform`: 32 * WARPS of its source, which the launcher verifies.
+/// Threads per block of `deform`: those of WARPS warps, a constant of its source. The launcher verifies the number.
 fn block_threads(defines: &[&str]) -> u32 {
     let has_one_warp = ["MODES", "SHEAR", "TILE_LIST"].iter().any(|name| defines.contains(name));
-    TILE_QUADS as u32 * if has_one_warp { 1 } else { 2 }
+    WARP_THREADS * if has_one_warp { 1 } else { 2 }
 }
 
 /// Number of blocks of `deform` for a number of tiles.
 pub(crate) fn deform_blocks(kernel: &KernelDescriptor, tile_count: usize) -> u32 {
     let warps = tile_count * if kernel.defines.contains(&"ONE_ITEM_PER_LANE") { 4 } else { 1 };
-    warps.div_ceil(kernel.threads as usize / TILE_QUADS) as u32
+    warps.div_ceil((kernel.threads / WARP_THREADS) as usize) as u32
 }
 
 /// The kernels of a scene in launch order, except `apply`, which is last.
@@ -119,7 +119,7 @@ pub(crate) fn plan_kernels(scene: &Scene, tables: &DeviceTables) -> Vec<KernelDe
     }
     let max_changes = max_change_entries(scene);
     if max_changes > 0 {
-        let apply_blocks = max_changes.div_ceil(BLOCK as usize / 32).min(MAX_GRID_BLOCKS);
+        let apply_blocks = max_changes.div_ceil((BLOCK / WARP_THREADS) as usize).min(MAX_GRID_BLOCKS);
         kernels.push(describe(KernelKind::Apply, &apply, apply_blocks));
     }
     kernels
@@ -159,8 +159,8 @@ fn deform_defines(scene: &Scene, work: &WorkList) -> Vec<&'static str> {
     defines.chain(storage_define(scene.deformation.storage).filter(|_| features.modes)).collect()
 }
 
-/// Two blocks per multiprocessor of a large device. The maximum grids of kernels that loop over lists are multiples or
-/// fractions of this number.
+/// Two blocks on each of 132 multiprocessors, the size of a large device. The maximum grids of kernels that loop over
+/// lists are multiples or fractions of this number.
 const MAX_GRID_BLOCKS: usize = 264;
 
 /// The kernel `batch` of a scene with batches.
@@ -173,7 +173,7 @@ fn describe_batch(scene: &Scene, batched: &BatchTables, source: KernelSource) ->
         name: source.name,
         defines: defines.collect(),
         blocks: batched.blocks.len() as u32,
-        threads: 32 * BATCH_WARPS as u32,
+        threads: WARP_THREADS * BATCH_WARPS as u32,
         source: KernelText(source.source),
     }
 }

@@ -10,6 +10,9 @@ use modalcast_model::scene::TransformRoots;
 /// Threads per block of `apply`, `bounds` and `normals`, and packed corners per block of `normals`.
 pub(crate) const BLOCK: u32 = 256;
 
+/// Threads per warp.
+pub(crate) const WARP_THREADS: u32 = 32;
+
 /// `first_tangent` of a shape without tangents.
 pub(crate) const NO_TANGENTS: u32 = u32::MAX;
 
@@ -19,8 +22,8 @@ pub(crate) const NO_GROUPS: u32 = u32::MAX;
 /// [`TransformLink::frame`] of a domain that is its own transform root.
 pub(crate) const NO_FRAME: u32 = TransformRoots::NO_FRAME;
 
-/// Bit fields of [`WarpTile::kind`]: the number of items of the last quad (0 in a mixed tile), and whether the tile computes
-/// vertices and corners.
+/// Bit fields of [`WarpTile::kind`]: the number of items of the last quad (0 in a mixed tile), and whether the tile
+/// computes vertices and corners.
 pub(crate) const LAST_QUAD_ITEMS: u8 = 7;
 pub(crate) const TILE_VERTICES: u8 = 8;
 pub(crate) const TILE_CORNERS: u8 = 16;

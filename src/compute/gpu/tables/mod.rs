@@ -1,5 +1,5 @@
-//! The tables of a scene on the device, the plan of its kernels and buffers, and the input values of its steps. Pure: tested
-//! without a GPU.
+//! The tables of a scene on the device, the plan of its kernels and buffers, and the input values of its steps. Pure:
+//! tested without a GPU.
 //!
 //! | file | content |
 //! |---|---|

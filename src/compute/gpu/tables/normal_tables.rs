@@ -30,8 +30,8 @@ pub(crate) fn corner_slots(scene: &Scene) -> Vec<CornerSlot> {
     scene.domains.iter().zip(&scene.layout.domains).map(corner_slot).collect()
 }
 
-/// Per block of [`BLOCK`] corners, the domain of its first corner; the last entry is the last domain. `first_corners` has
-/// the first corner of each domain, in ascending order.
+/// Per block of [`BLOCK`] corners, the domain of its first corner; the last entry is the last domain. `first_corners`
+/// has the first corner of each domain, in ascending order.
 pub(crate) fn first_domains(first_corners: impl Iterator<Item = u32>, corner_count: usize) -> Vec<u32> {
     let mut block_domains: Vec<u32> = Vec::with_capacity(corner_count.div_ceil(BLOCK as usize) + 1);
     let mut last_domain = 0;
@@ -69,7 +69,7 @@ pub(crate) fn rest_tangents(scene: &Scene) -> Vec<[f32; 4]> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::test_scenes::scene;
+    use super::super::test_scenes::scene_with_normal_map;
     use super::*;
 
     /// (vertices, rank) of each shape.
@@ -77,7 +77,7 @@ mod tests {
 
     #[test]
     fn instances_share_normals_but_not_corners() {
-        let scene = scene(&SHAPES, true, false);
+        let scene = scene_with_normal_map(&SHAPES);
         let slots = corner_slots(&scene);
         assert_eq!(slots[0].first_normal, slots[1].first_normal);
         assert_ne!(slots[0].first_corner, slots[1].first_corner);

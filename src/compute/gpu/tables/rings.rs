@@ -23,8 +23,8 @@ fn smoothing_groups(scene: &Scene) -> impl Iterator<Item = &SmoothingGroups> {
     scene.shapes.iter().filter_map(Shape::smoothing)
 }
 
-/// Bytes that [`RingTables::corner_groups`] would need in a scene with exact normals. The size of its rings is unknown until
-/// they are built.
+/// Bytes that [`RingTables::corner_groups`] would need in a scene with exact normals. The size of its rings is unknown
+/// until they are built.
 pub(crate) fn possible_corner_group_bytes(scene: &Scene) -> u64 {
     let shapes = scene.shapes.iter().filter(|shape| shape.modes.rank() > 0);
     shapes.map(|shape| 4 * shape.mesh.corners().vertices.len() as u64).sum()

@@ -1,12 +1,13 @@
-//! Writes staging buffers: pinned, write-combined host memory, which the host writes from front to back and never reads.
+//! Writes staging buffers: pinned, write-combined host memory, which the host writes from front to back and never
+//! reads.
 
 use std::ops::Range;
 
 use bytemuck::Pod;
 use rayon::prelude::*;
 
-/// Lists of at least so many bytes are written by several cores. `report deform` measures one and several cores below and
-/// above this limit (`host_writes`).
+/// Lists of at least so many bytes are written by several cores. The benchmark `modalcast report deform` measures one
+/// and several cores below and above this limit (table `host_writes`).
 pub const PARALLEL_THRESHOLD: usize = 1 << 20;
 /// Words per parallel part: long contiguous writes, but enough parts for many cores.
 const PART_WORDS: usize = 1 << 15;
@@ -48,8 +49,9 @@ pub fn parallel_copy(target: &mut [f32], source: &[f32]) {
     parts.for_each(|(target, source)| target.copy_from_slice(source));
 }
 
-/// Fills a list of items with `fill(items, part)`, where `items` are the indices of the items of a part. Item i begins at
-/// word `item_offsets[i]`; the offsets ascend. A large list is split between items into parts that several cores fill.
+/// Fills a list of items with `fill(items, part)`, where `items` are the indices of the items of a part. Item i begins
+/// at word `item_offsets[i]`; the offsets ascend. A large list is split between items into parts that several cores
+/// fill.
 pub(crate) fn fill_parts(list: &mut [f32], item_offsets: &[u32], fill: impl Fn(Range<usize>, &mut [f32]) + Sync) {
     if size_of_val(list) < PARALLEL_THRESHOLD {
         fill(0..item_offsets.len(), list);

@@ -1,5 +1,5 @@
-//! Small scenes for tests. `shapes` lists the number of vertices and the rank of each shape. Unless stated otherwise, two
-//! domains use each shape, and the corners of a shape differ from its vertices.
+//! Small scenes for tests. `shapes` lists the number of vertices and the rank of each shape. Unless stated otherwise,
+//! two domains use each shape, and the corners of a shape differ from its vertices.
 
 use std::sync::Arc;
 
@@ -23,14 +23,26 @@ fn domain(shape: usize, material: usize) -> Domain {
     Domain { material, ..Domain::new(String::new(), shape) }
 }
 
-/// A scene. `normal_maps`: whether the last shape has a normal map. `rigid`: whether transforms have no shear.
-pub(crate) fn scene(shapes: &[(usize, usize)], normal_maps: bool, rigid: bool) -> Arc<Scene> {
-    Scene::new(parts(shapes, normal_maps, rigid)).expect("a scene")
+/// A scene with default settings, whose transforms may have shear.
+pub(crate) fn scene(shapes: &[(usize, usize)]) -> Arc<Scene> {
+    Scene::new(parts(shapes)).expect("a scene")
 }
 
-/// A scene whose domains follow the first one.
+/// A scene whose transforms must be rigid.
+pub(crate) fn rigid_scene(shapes: &[(usize, usize)]) -> Arc<Scene> {
+    Scene::new(SceneParts { rigid_transforms: true, ..parts(shapes) }).expect("a scene")
+}
+
+/// A scene whose last shape has a normal map.
+pub(crate) fn scene_with_normal_map(shapes: &[(usize, usize)]) -> Arc<Scene> {
+    let mut parts = parts(shapes);
+    parts.materials[1].normal_texture = Some(0);
+    Scene::new(parts).expect("a scene")
+}
+
+/// A scene with rigid transforms, in which all other domains follow the first one.
 pub(crate) fn scene_with_followers(shapes: &[(usize, usize)], deformation: DeformationSettings) -> Arc<Scene> {
-    let mut parts = parts(shapes, false, true);
+    let mut parts = SceneParts { rigid_transforms: true, ..parts(shapes) };
     parts.deformation = deformation;
     let follow = FollowConstraint { parent: 0, frame: Transform::IDENTITY };
     parts.domains.iter_mut().skip(1).for_each(|domain| domain.follows = Some(follow));
@@ -39,42 +51,42 @@ pub(crate) fn scene_with_followers(shapes: &[(usize, usize)], deformation: Defor
 
 /// A scene whose U is stored as `storage`.
 pub(crate) fn scene_with_storage(shapes: &[(usize, usize)], storage: StorageType) -> Arc<Scene> {
-    let mut parts = parts(shapes, false, false);
+    let mut parts = parts(shapes);
     parts.deformation.storage = storage;
     Scene::new(parts).expect("a scene")
 }
 
 /// A scene with these deformation settings.
 pub(crate) fn scene_with_deformation(shapes: &[(usize, usize)], deformation: DeformationSettings) -> Arc<Scene> {
-    let mut parts = parts(shapes, false, false);
+    let mut parts = parts(shapes);
     parts.deformation = deformation;
     Scene::new(parts).expect("a scene")
 }
 
 /// A scene with exact normals.
 pub(crate) fn scene_with_exact_normals(shapes: &[(usize, usize)]) -> Arc<Scene> {
-    let mut parts = parts(shapes, false, false);
+    let mut parts = parts(shapes);
     parts.deformation.normals = NormalMethod::Exact;
     Scene::new(parts).expect("a scene")
 }
 
 /// A scene that keeps displacements and boxes for readers.
 pub(crate) fn scene_with_readbacks(shapes: &[(usize, usize)]) -> Arc<Scene> {
-    let mut parts = parts(shapes, false, false);
+    let mut parts = parts(shapes);
     (parts.deformation.displacements, parts.deformation.boxes) = (true, true);
     Scene::new(parts).expect("a scene")
 }
 
 /// A scene without a shadow.
 pub(crate) fn scene_without_shadow(shapes: &[(usize, usize)]) -> Arc<Scene> {
-    let mut parts = parts(shapes, false, false);
+    let mut parts = parts(shapes);
     parts.look.shadow = None;
     Scene::new(parts).expect("a scene")
 }
 
 /// A scene whose shapes have vertex i as corner i.
 pub(crate) fn scene_with_matching_corners(shapes: &[(usize, usize)]) -> Arc<Scene> {
-    let mut parts = parts(shapes, false, false);
+    let mut parts = parts(shapes);
     for shape in &mut parts.shapes {
         let (rest_positions, corners) = (shape.mesh.rest_positions().to_vec(), shape.mesh.corners());
         let vertex_count = rest_positions.len();
@@ -87,17 +99,16 @@ pub(crate) fn scene_with_matching_corners(shapes: &[(usize, usize)]) -> Arc<Scen
 
 /// A scene where one domain uses each shape.
 pub(crate) fn scene_without_sharing(shapes: &[(usize, usize)]) -> Arc<Scene> {
-    let mut parts = parts(shapes, false, false);
+    let mut parts = parts(shapes);
     parts.domains = (0..shapes.len()).map(|index| domain(index, 0)).collect();
     Scene::new(parts).expect("a scene")
 }
 
-fn parts(shapes: &[(usize, usize)], normal_maps: bool, rigid: bool) -> SceneParts {
+fn parts(shapes: &[(usize, usize)]) -> SceneParts {
     let mut parts = SceneParts::named("test");
-    parts.rigid_transforms = rigid;
     parts.shapes = shapes.iter().map(|(vertices, rank)| shape(*vertices, *rank)).collect();
-    let last_material = Material { normal_texture: normal_maps.then_some(0), ..Material::default() };
-    parts.materials = vec![Material::default(), last_material];
+    // The second material is that of the last shape.
+    parts.materials = vec![Material::default(), Material::default()];
     parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255]).expect("a texture")];
     let last_shape = shapes.len() - 1;
     let shape_indices = (0..2 * shapes.len()).map(|index| index / 2);

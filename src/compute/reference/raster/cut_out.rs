@@ -31,6 +31,7 @@ pub fn footprint(
     let x = corners.map(|[x, _, _, w]| x - sample[0] * w);
     let y = corners.map(|[_, y, _, w]| y - sample[1] * w);
     let w = corners.map(|[.., w]| w);
+    // The cross product of two lists of one number per corner.
     let cross = |a: &[f32; 3], b: &[f32; 3]| {
         [0, 1, 2].map(|index| {
             let (j, k) = ((index + 1) % 3, (index + 2) % 3);
@@ -45,9 +46,11 @@ pub fn footprint(
     let sum = |terms: [f32; 3]| terms[0] + terms[1] + terms[2];
     let uv = [0, 1].map(|axis| sum([0, 1, 2].map(|index| weights[index] * uvs[index][axis])) * weight_scale);
     // Derivatives of the weights, times the differences between the texture coordinates of the corners and the sample.
-    let uv_derivative = |weight_rates: [f32; 3], pixel_step: f32| {
+    // y of the sample decreases with the row, which cancels the minus sign of the derivatives by y.
+    let uv_derivative = |weight_derivatives: [f32; 3], pixel_step: f32| {
         [0, 1].map(|axis| {
-            sum([0, 1, 2].map(|index| weight_rates[index] * (uvs[index][axis] - uv[axis]))) * (pixel_step * inverse_sum)
+            let terms = [0, 1, 2].map(|index| weight_derivatives[index] * (uvs[index][axis] - uv[axis]));
+            sum(terms) * (pixel_step * inverse_sum)
         })
     };
     let (duv_dx, duv_dy) = (uv_derivative(cross(&y, &w), pixel_step[0]), uv_derivative(cross(&x, &w), pixel_step[1]));
@@ -63,11 +66,13 @@ pub fn alpha(cut_outs: &CutOuts, triangle: u32, footprint: &Footprint) -> f32 {
     material.alpha * texture_alpha
 }
 
-/// Whether a triangle keeps a pixel's sample; always true for triangles before the first cut-out.
+/// Whether a triangle with these corners in clip space covers a pixel's sample. Always true for triangles before the
+/// first cut-out.
 pub(super) fn passes_alpha_test(
     cut_outs: &CutOuts,
     window: &Viewport,
-    (triangle, corners): (u32, &[[f32; 4]; 3]),
+    triangle: u32,
+    corners: &[[f32; 4]; 3],
     pixel: [i32; 2],
 ) -> bool {
     let Some(cut_out) = triangle.checked_sub(cut_outs.first) else { return true };

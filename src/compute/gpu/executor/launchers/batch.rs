@@ -126,8 +126,8 @@ mod tests {
             .blocks
             .iter()
             .flat_map(|block| (block.first_tile..block.end_tile).map(|tile| (block.group, tile)));
-        for (tile, warp) in tiles.flat_map(|tile| [0, 1].map(|warp| (tile, warp))) {
-            let mut warp = Warp::new(tables, tile, warp);
+        for (group_and_tile, warp) in tiles.flat_map(|group_and_tile| [0, 1].map(|warp| (group_and_tile, warp))) {
+            let mut warp = Warp::new(tables, group_and_tile, warp);
             if warp.quads > 0 {
                 let sums = warp.sums();
                 for member in (0..warp.group.member_count as usize).step_by(2) {

@@ -75,9 +75,9 @@ impl BoundsKernel {
             bounding_axes: axes_to_f32(self.axes),
             reserved: 0,
         };
-        // SAFETY: the kernel's only argument is a `BoundsArgs`. `boxes` has six words for each of `box_count` boxes, and
-        // `segment_boxes` has six for each segment. Segments refer to boxes, vertices and domains of the same scene.
-        // The kernel calls `wait_for_prerequisite_grids` before it accesses memory.
+        // SAFETY: the kernel's only argument is a `BoundsArgs`. `boxes` has six words for each of `box_count` boxes,
+        // and `segment_boxes` has six for each segment. Segments refer to boxes, vertices and domains of the same
+        // scene. The kernel calls `wait_for_prerequisite_grids` before it accesses memory.
         unsafe { launch_kernel(device, &self.function, self.config, LaunchOrder::Dependent, &args) }
     }
 }

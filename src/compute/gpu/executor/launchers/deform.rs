@@ -12,10 +12,10 @@ use crate::gpu::launch::{Device, DeviceBuffer, KernelDescriptor, LaunchOrder, la
 use crate::gpu::tables::device_tables::DeviceTables;
 use crate::gpu::tables::input_packing::{DirtyTileLayout, InputPacker};
 use crate::gpu::tables::kernels::deform_blocks;
-use crate::gpu::tables::layout::{BoxSegment, DeformArgs};
+use crate::gpu::tables::layout::{BoxSegment, DeformArgs, WARP_THREADS};
 use crate::gpu::tables::occupancy::deform_tuning;
 use crate::gpu::tables::work::{WordSource, WorkList, mix_tiles};
-use crate::storage::{PackedWord, TILE_QUADS, TiledModes};
+use crate::storage::{PackedWord, TiledModes};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::Scene;
 
@@ -185,7 +185,8 @@ impl DeformKernel {
         unsafe { self.launch_variant(device, inputs, &self.function, self.config) }
     }
 
-    /// Starts the kernel on the tiles of the list, whose length is in the header.
+    /// Starts the kernel on the tiles of the list, whose length is in the header. A block has one warp, and a tile has
+    /// four warps, as in the function for tile lists.
     ///
     /// # Safety
     /// As [`Self::launch`]; in addition, `apply` has written the list of that step.
@@ -194,7 +195,7 @@ impl DeformKernel {
     /// `Fault` when the scene's steps are always full, or when the device fails.
     pub unsafe fn launch_tile_list(&self, device: &Device, inputs: &StepInputs) -> Result<()> {
         let grid_dim = ((4 * self.tile_count).min(MAX_LIST_BLOCKS), 1, 1);
-        let config = LaunchConfig { grid_dim, block_dim: (TILE_QUADS as u32, 1, 1), shared_mem_bytes: 0 };
+        let config = LaunchConfig { grid_dim, block_dim: (WARP_THREADS, 1, 1), shared_mem_bytes: 0 };
         let missing_function =
             || Error::Fault { stage: "deform", reason: "expected a scene with partial steps".into() };
         let function = self.list_function.as_ref().ok_or_else(missing_function)?;
@@ -273,8 +274,8 @@ fn compile_list_function(device: &Device, kernel: &KernelDescriptor) -> Result<C
     compile(device, kernel, &list_defines)
 }
 
-/// Maximum number of blocks that loop over a tile list: 12 resident blocks on each of 132 multiprocessors, the size of a
-/// large device.
+/// Maximum number of blocks that loop over a tile list: 12 resident blocks on each of 132 multiprocessors, the size of
+/// a large device.
 const MAX_LIST_BLOCKS: u32 = 132 * 12;
 
 /// Uploads U source by source, and collects the scales and factors of all shapes.

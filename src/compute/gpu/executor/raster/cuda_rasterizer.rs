@@ -3,9 +3,7 @@
 use std::sync::Arc;
 
 use super::super::interop::{GlInterop, MapAccess, Mapping, RegisteredBuffer, with_mapped};
-use super::{
-    RasterFunctions, RasterGranularity, RasterPass, RasterPipeline, RasterVariant, check_cut_outs, check_mesh,
-};
+use super::{RasterFunctions, RasterPass, RasterPipeline, RasterVariant, check_cut_outs, check_mesh};
 use crate::gpu::launch::Device;
 use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::raster::{DrawTarget, GlBuffer, RasterGeometry, Rasterizer};
@@ -43,8 +41,7 @@ struct PreparedPass<'a> {
 }
 
 impl PassState {
-    const fn new(depth_only: bool, groups: Vec<DrawRange>) -> Self {
-        let variant = RasterVariant { depth_only, count_triangles: false, granularity: RasterGranularity::BySize };
+    const fn new(variant: RasterVariant, groups: Vec<DrawRange>) -> Self {
         Self { target: None, functions: None, variant, groups }
     }
 
@@ -105,10 +102,11 @@ impl CudaRasterizer {
         let _current = device.enter()?;
         let interop = GlInterop::open(device, &mesh.positions)?;
         let all_triangles = DrawRange { first: 0, triangles: mesh.triangles.len() as u32, cull_mode: CullMode::None };
+        let depth_variant = RasterVariant { depth_only: true, ..RasterVariant::default() };
         Ok(Self {
             positions: interop.register(device, mesh.positions)?,
-            depth: PassState::new(true, vec![all_triangles]),
-            ids: PassState::new(false, mesh.groups),
+            depth: PassState::new(depth_variant, vec![all_triangles]),
+            ids: PassState::new(RasterVariant::default(), mesh.groups),
             interop,
             pipeline: RasterPipeline::new(device, &mesh.triangles, cut_outs.as_ref())?,
             device: Arc::clone(device),

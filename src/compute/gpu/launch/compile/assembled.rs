@@ -35,7 +35,8 @@ fn spill_bytes(log: &str) -> usize {
     texts[..texts.len() - 1].iter().map(|text| last_number(text).expect("a number of bytes")).sum()
 }
 
-/// Compute capabilities that the tests compile for: the oldest supported one, A100, H100 and H200, and consumer Blackwell.
+/// Compute capabilities that the tests compile for: the oldest supported one, A100, H100 and H200, and consumer
+/// Blackwell.
 pub const CAPABILITIES: [(i32, i32); 4] = [(7, 5), (8, 0), (9, 0), (12, 0)];
 
 /// Compiles a source with each list of macros for each capability. Panics when a variant does not compile, lacks one of

@@ -9,7 +9,8 @@ use sha2::{Digest as _, Sha256};
 
 const DIGEST_BYTES: usize = 32;
 
-/// The cache. Without a folder it stores nothing. A file contains the SHA-256 of the machine code, then the machine code.
+/// The cache. Without a folder it stores nothing. A file contains the SHA-256 of the machine code, then the machine
+/// code.
 #[derive(Debug, Clone)]
 pub(super) struct CubinCache {
     folder: Option<PathBuf>,

@@ -240,8 +240,8 @@ impl Drop for NvrtcProgram<'_> {
     }
 }
 
-/// Loads NVRTC's builtins library from the folder of NVRTC. NVRTC opens it by name without a path. The loader then finds
-/// it only in the search path, or if it is already loaded.
+/// Loads NVRTC's builtins library from the folder of NVRTC. NVRTC opens it by name without a path. The loader then
+/// finds it only in the search path, or if it is already loaded.
 fn load_builtins(nvrtc_path: &Path) -> Vec<Library> {
     let folder = nvrtc_path.parent().filter(|folder| !folder.as_os_str().is_empty());
     let files = folder.map(entries).unwrap_or_default().into_iter();
@@ -256,6 +256,9 @@ fn c_strings<'a>(texts: impl IntoIterator<Item = &'a str>) -> Result<Vec<CString
     texts.into_iter().map(|text| CString::new(text).map_err(fault_in("compile"))).collect()
 }
 
+/// Maximum depth of the folder in a wheel that contains the library, for example `nvidia/cu13/lib`, with a margin.
+const MAX_WHEEL_DEPTH: usize = 5;
+
 /// Candidate paths of NVRTC, best first. If MODALCAST_NVRTC is set, it is the only candidate.
 fn candidates() -> Vec<PathBuf> {
     if let Some(path) = std::env::var_os("MODALCAST_NVRTC").filter(|path| !path.is_empty()) {
@@ -263,10 +266,11 @@ fn candidates() -> Vec<PathBuf> {
     }
     let mut paths: Vec<PathBuf> = ["libnvrtc.so.13", "libnvrtc.so"].map(PathBuf::from).into();
     let executable = std::env::current_exe().ok();
+    // The folder of the program and the three above, which include the repository of `target/release/modalcast`.
     let parent_folders = executable.iter().flat_map(|path| path.ancestors().skip(1).take(4));
     // Never search the working directory: starting the server in some folder must not execute a library in it.
     for folder in parent_folders {
-        find_libraries(&folder.join(".tools/nvrtc"), 5, &mut paths);
+        find_libraries(&folder.join(".tools/nvrtc"), MAX_WHEEL_DEPTH, &mut paths);
     }
     for toolkit in entries(Path::new("/usr/local")) {
         if toolkit.file_name().is_some_and(|name| name.to_string_lossy().starts_with("cuda")) {
@@ -310,7 +314,7 @@ mod tests {
         std::fs::create_dir_all(broken.parent().expect("a parent")).expect("a folder");
         std::fs::write(&broken, b"no library").expect("a file");
         let mut paths = Vec::new();
-        find_libraries(folder.path(), 5, &mut paths);
+        find_libraries(folder.path(), MAX_WHEEL_DEPTH, &mut paths);
         assert_eq!(paths, std::slice::from_ref(&broken));
         let error = Nvrtc::find(&paths).expect_err("a broken library").to_string();
         assert!(error.contains(&broken.display().to_string()), "{error}");

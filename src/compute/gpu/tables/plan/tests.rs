@@ -3,8 +3,8 @@
 use super::super::kernels::storage_define;
 use super::super::rings::RingTables;
 use super::super::test_scenes::{
-    scene, scene_with_deformation, scene_with_exact_normals, scene_with_followers, scene_with_readbacks,
-    scene_with_storage, scene_without_shadow,
+    rigid_scene, scene, scene_with_deformation, scene_with_exact_normals, scene_with_followers, scene_with_normal_map,
+    scene_with_readbacks, scene_with_storage, scene_without_shadow,
 };
 use super::super::work::{CoordinateLayout, WorkList};
 use super::*;
@@ -22,7 +22,7 @@ fn defines(plan: &DeformPlan) -> Vec<(&str, Vec<&str>)> {
 
 #[test]
 fn unused_features_are_not_compiled_or_stored() {
-    let minimal = plan(&scene(&[(7, 0), (300, 0)], false, true));
+    let minimal = plan(&rigid_scene(&[(7, 0), (300, 0)]));
     assert_eq!(
         defines(&minimal),
         [
@@ -42,7 +42,7 @@ fn unused_features_are_not_compiled_or_stored() {
 
 #[test]
 fn used_features_are_compiled_and_stored() {
-    let full = plan(&scene(&[(7, 2), (300, 0)], true, false));
+    let full = plan(&scene_with_normal_map(&[(7, 2), (300, 0)]));
     assert_eq!(
         full.kernels[0].defines,
         ["MODES", "ONE_ITEM_PER_LANE", "RIGID_NORMALS", "CORNER_OFFSETS", "NORMAL_MAPS", "SHEAR"]
@@ -56,7 +56,7 @@ fn used_features_are_compiled_and_stored() {
 #[test]
 fn followers_upload_no_transforms_but_keep_frames() {
     let sizes = [(7, 2), (300, 0)];
-    let independent = plan(&scene(&sizes, false, true));
+    let independent = plan(&rigid_scene(&sizes));
     let followers = plan(&scene_with_followers(&sizes, DeformationSettings::default()));
     assert_eq!(independent.bytes_in, 112 + 48 * 4 + 4 * 4);
     assert_eq!(followers.bytes_in, 112 + 48 + 4 * 4, "three of four domains follow");
@@ -159,7 +159,7 @@ fn shadow_adds_oriented_bounds_but_no_kernel() {
 
 #[test]
 fn launches_do_not_grow_with_the_number_of_domains() {
-    let (two_domains, many_domains) = (scene(&[(7, 1)], false, false), scene(&[(7, 1); 3000], false, false));
+    let (two_domains, many_domains) = (scene(&[(7, 1)]), scene(&[(7, 1); 3000]));
     // Two domains are too few for partial steps, which launch `apply`.
     assert_eq!((plan(&two_domains).launches(), plan(&many_domains).launches()), (2, 3));
 }
@@ -172,15 +172,15 @@ fn scenes_without_partial_steps_have_no_change_lists() {
         plan.change_list_bytes > 0
     };
     // Two instances of each shape.
-    assert!(!has_lists(&scene(&[(7, 1)], false, false)), "a quarter of two domains is less than one domain");
-    assert!(has_lists(&scene(&[(7, 1), (7, 1)], false, false)));
+    assert!(!has_lists(&scene(&[(7, 1)])), "a quarter of two domains is less than one domain");
+    assert!(has_lists(&scene(&[(7, 1), (7, 1)])));
     let truncated = DeformationSettings { truncation: Some(0.1), ..DeformationSettings::default() };
     assert!(!has_lists(&scene_with_deformation(&[(7, 1), (7, 1)], truncated)), "truncation requires full steps");
 }
 
 #[test]
 fn planned_bytes_equal_the_bytes_of_the_tables() {
-    let scene = scene(&[(7, 2), (300, 0), (513, 4)], true, false);
+    let scene = scene_with_normal_map(&[(7, 2), (300, 0), (513, 4)]);
     let plan = plan(&scene);
     let work = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::default());
     for (role, bytes) in [

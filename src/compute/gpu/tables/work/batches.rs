@@ -10,8 +10,8 @@ use modalcast_model::scene::Scene;
 /// Maximum number of domains of a group.
 pub(crate) const MAX_BATCH_SIZE: usize = 16;
 
-/// With `BatchPolicy::Auto`, a shape has batches when its U has at least so many bytes, about a third of a large device's
-/// L2 cache. On an H200, `batch` and `deform` took the same time for two domains with a U of 20 MB.
+/// With `BatchPolicy::Auto`, a shape has batches when its U has at least so many bytes, about a third of a large
+/// device's L2 cache. On an H200, `batch` and `deform` took the same time for two domains with a U of 20 MB.
 const MIN_SHAPE_BYTES: u64 = 16 << 20;
 /// A shape also has batches when all its domains together would read at least so many bytes of U. Below both limits it
 /// is faster to read U again from the cache, because a batch uses few warps for a long time. On an H200, `batch` and
@@ -59,12 +59,14 @@ impl BatchTables {
         self.blocks.iter().map(|block| (block.end_tile - block.first_tile) as usize).sum()
     }
 
-    /// Groups the domains of an existing work list. Per shape, `is_batched` tells whether it has batches, and `first_words`
-    /// is its first word.
+    /// Groups the domains of an existing work list. Per shape, `is_batched` tells whether it has batches, and
+    /// `first_words` is its first word of U.
     pub(crate) fn new(
         scene: &Scene,
-        (work, coordinates): (&WorkList, &CoordinateLayout),
-        (is_batched, first_words): (&[bool], &[Option<u64>]),
+        work: &WorkList,
+        coordinates: &CoordinateLayout,
+        is_batched: &[bool],
+        first_words: &[Option<u64>],
     ) -> Self {
         let mut shape_indices: Vec<usize> = (0..scene.shapes.len()).filter(|shape| is_batched[*shape]).collect();
         shape_indices.sort_by_key(|shape| std::cmp::Reverse(chunk_count(scene, &scene.shapes[*shape])));

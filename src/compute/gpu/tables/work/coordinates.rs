@@ -3,8 +3,8 @@
 use crate::storage::modes_per_chunk;
 use modalcast_model::scene::{DomainLayout, Scene, StorageType};
 
-/// Offsets of the coordinates of each domain on the device. The coordinates of a domain are padded to whole chunks unless
-/// the layout of the scene's state is used.
+/// Offsets of the coordinates of each domain on the device. The coordinates of a domain are padded to whole chunks
+/// unless the layout of the scene's state is used.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct CoordinateLayout {
     /// Per domain, the offset of its first coordinate.
@@ -18,8 +18,8 @@ pub(crate) struct CoordinateLayout {
 impl CoordinateLayout {
     pub(crate) fn new(scene: &Scene) -> Self {
         let storage = scene.deformation.storage;
-        // Domains may share coordinates. Factors belong to a shape and retained chunks to a domain, so with either of them
-        // each domain has its own coordinates on the device.
+        // Domains may share coordinates. Factors belong to a shape and retained chunks to a domain, so with either of
+        // them each domain has its own coordinates on the device.
         if storage == StorageType::F32 && !scene.features.truncation {
             let first_q = scene.layout.domains.iter().map(|layout| layout.first_q as u32).collect();
             return Self { first_q, total: scene.layout.coordinates.next_multiple_of(4), is_scene_order: true };

@@ -2,11 +2,11 @@
 //!
 //! The items of a tile are vertices or corners. Where corner i of a shape is its vertex i, one tile computes both.
 //!
-//! A shape has tiles of its own if it has more than `MAX_SHARED_QUADS` quads, or if it has modes and several domains use
-//! it. Its U is then stored once. The quads of other domains with the same number of chunks fill tiles together (mixed
-//! tiles), so that 200,000 small domains keep all lanes busy. Tiles with the most chunks come first, because a long tile that
-//! begins last would delay the end of the step. Tiles with vertices of batched domains come after all others: a full step
-//! leaves them to `batch`, and the tile list of a partial step refers to them.
+//! A shape has tiles of its own if it has more than `MAX_SHARED_QUADS` quads, or if it has modes and several domains
+//! use it. Its U is then stored once. The quads of other domains with the same number of chunks fill tiles together
+//! (mixed tiles), so that 200,000 small domains keep all lanes busy. Tiles with the most chunks come first, because a
+//! long tile that begins last would delay the end of the step. Tiles with vertices of batched domains come after all
+//! others: a full step leaves them to `batch`, and the tile list of a partial step refers to them.
 
 pub(crate) mod batches;
 mod coordinates;
@@ -61,8 +61,8 @@ pub(crate) struct DomainTiles {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct WorkList {
     pub tiles: Vec<WarpTile>,
-    /// Per shape, whether one tile computes vertices and corners. False for batched shapes, whose vertices and corners are
-    /// computed by different kernels.
+    /// Per shape, whether one tile computes vertices and corners. False for batched shapes, whose vertices and corners
+    /// are computed by different kernels.
     pub corners_match: Vec<bool>,
     /// Number of leading tiles that `deform` computes in a full step. `batch` computes the others.
     pub full_step_tiles: usize,
@@ -142,7 +142,7 @@ impl WorkList {
                     let shape_word =
                         work.allocate_words(scene, scene.domains[domain].shape, class.chunks, &mut first_words);
                     let first_word = shape_word + (3 * class.chunks * TILE_QUADS * tile) as u64;
-                    let warp_tile = work.tile_of_domain(scene, coordinates, class, (domain, tile));
+                    let warp_tile = work.tile_of_domain(scene, coordinates, class, domain, tile);
                     work.tiles.push(WarpTile { first_word, ..warp_tile });
                     work.record_tile(domain, class, index);
                 }
@@ -155,7 +155,7 @@ impl WorkList {
         if scene.deformation.storage != StorageType::Int8 {
             work.mixed_quad_scales.clear();
         }
-        work.batched = BatchTables::new(scene, (&work, coordinates), (&shape_is_batched, &first_words));
+        work.batched = BatchTables::new(scene, &work, coordinates, &shape_is_batched, &first_words);
         work
     }
 
@@ -216,13 +216,14 @@ impl WorkList {
         span.count += 1;
     }
 
-    /// A tile of one domain, without its first word.
+    /// The `tile`-th tile of a domain, without its first word.
     fn tile_of_domain(
         &self,
         scene: &Scene,
         coordinates: &CoordinateLayout,
         class: TileClass,
-        (domain, tile): (usize, usize),
+        domain: usize,
+        tile: usize,
     ) -> WarpTile {
         let range = self.item_range(scene, class, domain);
         let remaining_items = range.item_count - QUAD * TILE_QUADS * tile;
@@ -377,8 +378,8 @@ fn chunk_count(scene: &Scene, shape: &Shape) -> usize {
     shape.modes.rank().div_ceil(modes_per_chunk(scene.deformation.storage))
 }
 
-/// U of a mixed tile, `[chunk][3][quad]` over the quads of all shapes. Each shape has one tile `[chunk][3][quad]`, and all
-/// have the same number of chunks.
+/// U of a mixed tile, `[chunk][3][quad]` over the quads of all shapes. Each shape has one tile `[chunk][3][quad]`, and
+/// all have the same number of chunks.
 pub(crate) fn mix_tiles(shapes: &[TiledModes]) -> Vec<PackedWord> {
     let row_count = 3 * shapes.first().map_or(0, TiledModes::chunks);
     let mut words = Vec::with_capacity(shapes.iter().map(|tiles| tiles.packed_words().len()).sum());

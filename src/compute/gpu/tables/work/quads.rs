@@ -27,29 +27,22 @@ impl QuadLayout {
     /// `corners_match`: per shape, whether one tile computes vertices and corners.
     pub(crate) fn new(scene: &Scene, corners_match: &[bool]) -> Self {
         let has_rigid_normals = has_rigid_normals(scene);
-        // Appends the quads of one kind and returns the first quad of each shape. `item_count` is `None` for shapes
-        // without quads of this kind.
-        let append_quads = |item_count: &dyn Fn(&Shape, bool) -> Option<usize>, quad_count: &mut u64| -> Vec<u32> {
-            let append_shape = |(shape, corners_match): (&Shape, &bool)| {
-                let first_quad = *quad_count;
-                *quad_count += item_count(shape, *corners_match).map_or(0, |items| items.div_ceil(QUAD)) as u64;
-                first_quad as u32
-            };
-            scene.shapes.iter().zip(corners_match).map(append_shape).collect()
-        };
+        let shapes = || scene.shapes.iter().zip(corners_match);
         let vertex_count = |shape: &Shape| shape.mesh.rest_positions().len();
         let corner_count = |shape: &Shape| shape.mesh.corners().vertices.len();
+        // Per shape, its number of items in quads of kinds 1, 2 and 3.
+        let unmatched_vertex_counts =
+            shapes().map(|(shape, corners_match)| if *corners_match { 0 } else { vertex_count(shape) });
+        let matching_counts =
+            shapes().map(|(shape, corners_match)| if *corners_match { vertex_count(shape) } else { 0 });
+        let unmatched_corner_counts = shapes()
+            .map(|(shape, corners_match)| if has_rigid_normals && !*corners_match { corner_count(shape) } else { 0 });
         let mut quad_count = 0;
-        let unmatched_vertices =
-            append_quads(&|shape, corners_match| (!corners_match).then(|| vertex_count(shape)), &mut quad_count);
+        let unmatched_vertices = append_quads(unmatched_vertex_counts, &mut quad_count);
         let first_direction_quad = quad_count;
-        let matching_items =
-            append_quads(&|shape, corners_match| corners_match.then(|| vertex_count(shape)), &mut quad_count);
+        let matching_items = append_quads(matching_counts, &mut quad_count);
         let position_quad_count = quad_count;
-        let unmatched_corners = append_quads(
-            &|shape, corners_match| (has_rigid_normals && !corners_match).then(|| corner_count(shape)),
-            &mut quad_count,
-        );
+        let unmatched_corners = append_quads(unmatched_corner_counts, &mut quad_count);
         let select = |unmatched: &[u32]| {
             let shapes = corners_match.iter().zip(&matching_items).zip(unmatched);
             shapes.map(|((corners_match, matching), other)| if *corners_match { *matching } else { *other }).collect()
@@ -62,6 +55,16 @@ impl QuadLayout {
             quad_count,
         }
     }
+}
+
+/// Appends the quads of each shape, and returns the first quad of each.
+fn append_quads(item_counts: impl Iterator<Item = usize>, quad_count: &mut u64) -> Vec<u32> {
+    let append_shape = |item_count: usize| {
+        let first_quad = *quad_count;
+        *quad_count += item_count.div_ceil(QUAD) as u64;
+        first_quad as u32
+    };
+    item_counts.map(append_shape).collect()
 }
 
 /// x0 of all shapes, three float4 per quad.
@@ -100,8 +103,8 @@ pub(crate) fn rest_directions(scene: &Scene, work: &WorkList) -> [Vec<[f32; 4]>;
     [normals, tangents]
 }
 
-/// Quads of N components as the kernel reads them: `[N][quads of the tile]` float4 per tile of one domain, or `[N]` float4
-/// per quad of a mixed tile.
+/// Quads of N components as the kernel reads them: `[N][quads of the tile]` float4 per tile of one domain, or `[N]`
+/// float4 per quad of a mixed tile.
 fn arrange_for_tiles<const N: usize>(quads: &[[[f32; 4]; N]], has_own_tiles: bool) -> Vec<[f32; 4]> {
     if !has_own_tiles {
         return quads.as_flattened().to_vec();

@@ -187,10 +187,10 @@ fn small_domains_share_tiles_unless_they_share_modes() {
         work.tiles.iter().filter(|tile| tile.kind & TILE_VERTICES > 0).copied().collect()
     };
     // Two domains of each shape. With modes they share U and have tiles of their own.
-    let work = check_work_list(&scene(&[(7, 0); 40], false, false));
+    let work = check_work_list(&scene(&[(7, 0); 40]));
     assert_eq!(vertex_tiles(&work).len(), 80 * 2 / 32);
     assert!(vertex_tiles(&work).iter().all(|tile| (tile.kind & LAST_QUAD_ITEMS, tile.quad_count) == (0, 32)));
-    let work = check_work_list(&scene(&[(7, 3); 40], false, false));
+    let work = check_work_list(&scene(&[(7, 3); 40]));
     assert_eq!((vertex_tiles(&work).len(), work.word_count), (80, 40 * 2 * 3 * 3));
     let work = check_work_list(&scene_without_sharing(&[(7, 3); 80]));
     assert_eq!((vertex_tiles(&work).len(), work.word_count), (80 * 2 / 32, 80 * 2 * 3 * 3));

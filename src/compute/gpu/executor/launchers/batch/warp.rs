@@ -17,10 +17,12 @@ use modalcast_model::scene::{Scene, SceneState, StorageType};
 const WARP_QUADS: usize = TILE_QUADS / BATCH_WARPS;
 /// Vertices of a warp.
 const WARP_VERTICES: usize = 4 * WARP_QUADS;
-/// 16-byte words of a stage.
-const STAGE_WORDS: usize = 12 * WARP_QUADS;
+/// Chunks of modes of a stage.
+const STAGE_CHUNKS: usize = 4;
+/// 16-byte words of a stage: three per chunk and quad.
+const STAGE_WORDS: usize = 3 * STAGE_CHUNKS * WARP_QUADS;
 /// Stages of the ring.
-const STAGE_COUNT: usize = 3;
+const RING_STAGES: usize = 3;
 /// Content of memory that no result may depend on: a NaN in every storage type except `Int8`.
 const POISON: PackedWord = PackedWord([0xff; 16]);
 
@@ -83,7 +85,7 @@ impl<'a> Warp<'a> {
             warp_quad,
             quads: tile_quads.saturating_sub(warp_quad).min(WARP_QUADS),
             first_vertex: 4 * (TILE_QUADS * tile + warp_quad),
-            ring: vec![POISON; STAGE_COUNT * STAGE_WORDS],
+            ring: vec![POISON; RING_STAGES * STAGE_WORDS],
         }
     }
 
@@ -91,12 +93,12 @@ impl<'a> Warp<'a> {
         self.tables.work.batched.members[self.group.first_member as usize + index]
     }
 
-    /// Copies a stage of U to the ring: twelve rows (four chunks) of the words of the warp's quads.
+    /// Copies a stage of U to the ring: `3 * STAGE_CHUNKS` rows of the words of the warp's quads.
     fn copy_stage(&mut self, stage: usize) {
-        let ring_word = stage % STAGE_COUNT * STAGE_WORDS;
+        let ring_word = stage % RING_STAGES * STAGE_WORDS;
         self.ring[ring_word..][..STAGE_WORDS].fill(POISON);
         for (lane, step) in (0..32).flat_map(|lane| (0..STAGE_WORDS / 32).map(move |step| (lane, step))) {
-            let row = 12 * stage + lane / WARP_QUADS + step * (32 / WARP_QUADS);
+            let row = 3 * STAGE_CHUNKS * stage + lane / WARP_QUADS + step * (32 / WARP_QUADS);
             if row < 3 * self.group.chunk_count as usize {
                 let word = self.first_word + row * self.tile_quads + (lane % WARP_QUADS).min(self.quads - 1);
                 self.ring[ring_word + lane + 32 * step] = self.tables.loaded.words[word];
@@ -123,13 +125,14 @@ impl<'a> Warp<'a> {
         let entry_bytes = 4 / chunk_modes;
         let scales = &self.tables.loaded.scales[self.group.first_scale as usize..];
         let mut sums = vec![[[0.0_f32; MAX_BATCH_SIZE]; 6]; 32];
-        (0..STAGE_COUNT).for_each(|stage| self.copy_stage(stage));
-        for stage in 0..chunks.div_ceil(4) {
-            for (chunk, mode) in (0..4.min(chunks - 4 * stage)).flat_map(|c| (0..chunk_modes).map(move |m| (c, m))) {
-                let mode_index = (4 * stage + chunk) * chunk_modes + mode;
+        (0..RING_STAGES).for_each(|stage| self.copy_stage(stage));
+        for stage in 0..chunks.div_ceil(STAGE_CHUNKS) {
+            let stage_chunks = 0..STAGE_CHUNKS.min(chunks - STAGE_CHUNKS * stage);
+            for (chunk, mode) in stage_chunks.flat_map(|chunk| (0..chunk_modes).map(move |mode| (chunk, mode))) {
+                let mode_index = (STAGE_CHUNKS * stage + chunk) * chunk_modes + mode;
                 let scale = scales.get(self.tile * chunks * chunk_modes + mode_index).copied().unwrap_or(1.0);
                 for (lane, sums) in sums.iter_mut().enumerate() {
-                    let lane_byte = 16 * (stage % STAGE_COUNT * STAGE_WORDS + lane / 2) + 2 * entry_bytes * (lane % 2);
+                    let lane_byte = 16 * (stage % RING_STAGES * STAGE_WORDS + lane / 2) + 2 * entry_bytes * (lane % 2);
                     for (axis, vertex) in (0..3).flat_map(|axis| (0..2).map(move |vertex| (axis, vertex))) {
                         let chunk_byte = 4 * entry_bytes * (3 * mode + axis);
                         let entry_byte = chunk_byte / 16 * (16 * WARP_QUADS) + chunk_byte % 16 + vertex * entry_bytes;
@@ -142,7 +145,7 @@ impl<'a> Warp<'a> {
                     }
                 }
             }
-            self.copy_stage(stage + STAGE_COUNT);
+            self.copy_stage(stage + RING_STAGES);
         }
         sums
     }
@@ -171,8 +174,8 @@ impl<'a> Warp<'a> {
         staged
     }
 
-    /// Stores the staged positions of two members, or of one if `member` is the last. Uses the 16-byte stores of the kernel
-    /// under the same conditions.
+    /// Stores the staged positions of two members, or of one if `member` is the last. Uses the 16-byte stores of the
+    /// kernel under the same conditions.
     pub(super) fn store(&self, staged: &[f32], member: usize, positions: &mut [f32]) {
         let mut put_component = |member: usize, component: usize, value: f32| {
             let index = 3 * (self.member(member).first_vertex as usize + self.first_vertex) + component;
