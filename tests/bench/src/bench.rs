@@ -17,15 +17,15 @@ use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{DeformationSettings, NormalMethod, Scene, SceneState, StorageType};
 
-/// Peak memory bandwidths of a backend, measured in the same run, in 10^9 bytes per second. `None` where a bandwidth was
-/// not measured.
+/// Peak memory bandwidths of a backend in 10^9 bytes per second, and its launch overhead, measured in the same run.
+/// `None` where a value was not measured.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct MemoryBandwidth {
     /// Fastest copy: bytes read plus bytes written.
     pub copy_gbs: Option<f64>,
     /// Fastest pure read.
     pub read_gbs: Option<f64>,
-    /// Replay of a graph with one empty kernel, microseconds.
+    /// Launch overhead: replay of a graph with one empty kernel, microseconds.
     pub empty_us: Option<f64>,
     /// Copies from pinned host memory to the device.
     pub pinned_h2d_gbs: Option<f64>,
@@ -33,9 +33,9 @@ pub struct MemoryBandwidth {
     pub pinned_d2h_gbs: Option<f64>,
 }
 
-/// The hardware or test double that a report measures: creates variants and measures bandwidths.
+/// Creates the variants of a machine and measures its bandwidths. Tests implement it without hardware.
 pub trait BenchTarget {
-    /// The variants of a workload. A variant that `is_selected` rejects need not be created.
+    /// The variants of a workload. `is_selected` takes a variant's name; a variant that it rejects need not be created.
     fn variants(&self, workload: &Workload, is_selected: VariantFilter<'_>) -> Vec<VariantCandidate>;
 
     /// Peak memory bandwidth of a backend.
@@ -44,7 +44,7 @@ pub trait BenchTarget {
     }
 
     /// Times the upload of a step's values to the device; `None` without a device.
-    fn ingest(&self, _load: &Workload, _replays: usize) -> Option<UploadTiming> {
+    fn time_upload(&self, _workload: &Workload, _replays: usize) -> Option<UploadTiming> {
         None
     }
 
@@ -52,12 +52,17 @@ pub trait BenchTarget {
     ///
     /// # Errors
     /// Those of [`kernels::measure_overlap`].
-    fn overlap(&self, _load: &Workload, _states: &[SceneState], _steps: usize) -> Option<Result<kernels::Overlap>> {
+    fn measure_overlap(
+        &self,
+        _workload: &Workload,
+        _states: &[SceneState],
+        _steps: usize,
+    ) -> Option<Result<kernels::Overlap>> {
         None
     }
 
     /// Times of host writes into the pinned memory that is uploaded to the CUDA device; empty without a device.
-    fn host_writes(&self, _replays: usize) -> Vec<kernels::HostWrite> {
+    fn time_host_writes(&self, _replays: usize) -> Vec<kernels::HostWrite> {
         Vec::new()
     }
 
@@ -133,7 +138,7 @@ impl BenchTarget for LocalMachine {
             candidates.push(candidate("reference f64", Backend::Reference, scene.deformation, &reference));
         }
         if let Ok(device) = &self.device {
-            // A complete step of the server: upload of q and T, kernels, readback of the bounds.
+            // A complete step of the server: upload of q and T, kernels, readback of the bounding boxes.
             let cuda = |scene: &Arc<Scene>| -> DeformerResult {
                 let options = CudaDeformerOptions { batches: workload.batches, bounding_axes: scene.light_axes() };
                 Ok(Box::new(CudaDeformer::new(device, scene, None, options)?))
@@ -142,9 +147,10 @@ impl BenchTarget for LocalMachine {
             if let Some(exact) = exact_normals(scene) {
                 candidates.push(candidate("cuda f32 step, exact normals", Backend::Cuda, exact, &cuda));
             }
+            // The other alternatives are exact normals (above) and storage types (`kernel_variants`).
             for (name, deformation) in alternative_deformations(scene)
                 .into_iter()
-                .filter(|(_, deformation)| cuda_variants::has_own_summation(deformation))
+                .filter(|(_, deformation)| cuda_variants::truncates_or_compensates(deformation))
             {
                 candidates.push(candidate(&format!("cuda {name} step"), Backend::Cuda, deformation, &cuda));
                 let variant = StepVariant {
@@ -164,19 +170,25 @@ impl BenchTarget for LocalMachine {
         if backend == Backend::Cuda { self.cuda } else { self.cpu }
     }
 
-    fn ingest(&self, workload: &Workload, replays: usize) -> Option<UploadTiming> {
+    fn time_upload(&self, workload: &Workload, replays: usize) -> Option<UploadTiming> {
         let device = self.device.as_ref().ok()?;
         let (bytes, timing) =
             kernels::time_upload(device, &workload.scene, &SceneState::rest(&workload.scene), replays).ok()?;
-        let copy_us = bytes as f64 / (1e3 * self.cuda.pinned_h2d_gbs?);
-        Some(UploadTiming { bytes, median_us: timing.median_us, of_pinned: timing.median_us / copy_us })
+        // 1 GB/s is 1e3 bytes per microsecond.
+        let pinned_copy_us = bytes as f64 / (1e3 * self.cuda.pinned_h2d_gbs?);
+        Some(UploadTiming { bytes, median_us: timing.median_us, of_pinned: timing.median_us / pinned_copy_us })
     }
 
-    fn overlap(&self, workload: &Workload, states: &[SceneState], steps: usize) -> Option<Result<kernels::Overlap>> {
+    fn measure_overlap(
+        &self,
+        workload: &Workload,
+        states: &[SceneState],
+        steps: usize,
+    ) -> Option<Result<kernels::Overlap>> {
         Some(kernels::measure_overlap(self.device.as_ref().ok()?, workload, states, steps))
     }
 
-    fn host_writes(&self, replays: usize) -> Vec<kernels::HostWrite> {
+    fn time_host_writes(&self, replays: usize) -> Vec<kernels::HostWrite> {
         let time_writes = |device: &Arc<Device>| kernels::time_host_writes(device, replays).ok();
         self.device.as_ref().ok().and_then(time_writes).unwrap_or_default()
     }
@@ -187,37 +199,38 @@ impl BenchTarget for LocalMachine {
     }
 }
 
-/// Error budgets of mode truncation, as fractions of the scene's diagonal.
-const BUDGETS: [(&str, f64); 3] = [("1e-6", 1e-6), ("1e-5", 1e-5), ("1e-4", 1e-4)];
+/// Error budgets of mode truncation as fractions of the scene's diagonal, each with its text in variant names.
+const TRUNCATION_BUDGETS: [(&str, f64); 3] = [("1e-6", 1e-6), ("1e-5", 1e-5), ("1e-4", 1e-4)];
 
-/// Approximate, compensated and exact-normal deformations to measure in addition to the scene's own, by name. Empty when
-/// the scene has no modes or does not have the default deformation.
+/// Deformations to measure in addition to the scene's own, by name: other storage types, truncation, compensated
+/// summation and exact normals. Empty when the scene has no modes or does not have the default deformation.
 fn alternative_deformations(scene: &Scene) -> Vec<(String, DeformationSettings)> {
     let default = scene.deformation;
     if !scene.features.modes || default != DeformationSettings::default() {
         return Vec::new();
     }
     let diagonal = scene.unit * scene.rest_bounds.diagonal();
-    let store =
+    let with_storage =
         |storage: &StorageType| (storage.name().to_owned(), DeformationSettings { storage: *storage, ..default });
-    let truncate = |(name, fraction): &(&str, f64)| {
+    let with_truncation = |(name, fraction): &(&str, f64)| {
         (format!("f32 truncated {name}"), DeformationSettings { truncation: Some(fraction * diagonal), ..default })
     };
     let compensated = ("f32 compensated".to_owned(), DeformationSettings { compensated: true, ..default });
     let exact = exact_normals(scene).map(|exact| ("f32 exact normals".to_owned(), exact));
-    let stored = StorageType::ALL[1..].iter().map(store);
-    stored.chain(BUDGETS.iter().map(truncate)).chain([compensated]).chain(exact).collect()
+    // The first storage type is f32, the default.
+    let stored = StorageType::ALL[1..].iter().map(with_storage);
+    stored.chain(TRUNCATION_BUDGETS.iter().map(with_truncation)).chain([compensated]).chain(exact).collect()
 }
 
-/// The deformation with exact normals of the deformed surface, for scenes with modes and normals that use rigid
-/// normals.
+/// The scene's deformation with exact instead of rigid normals. `None` when the scene has no modes, no normals, or
+/// already exact normals.
 fn exact_normals(scene: &Scene) -> Option<DeformationSettings> {
     let has_rigid_normals =
         scene.features.modes && cuda_variants::has_normals(scene) && scene.deformation.normals == NormalMethod::Rigid;
     has_rigid_normals.then_some(DeformationSettings { normals: NormalMethod::Exact, ..scene.deformation })
 }
 
-/// Count of numbers in U and x0 of all domains.
+/// Count of numbers in U and x0 of all domains: x0 and each mode have three numbers per vertex.
 fn count_rest_and_mode_numbers(scene: &Scene) -> usize {
     scene.layout.domains.iter().map(|slot| 3 * slot.vertices * (1 + slot.rank)).sum()
 }
@@ -246,6 +259,7 @@ mod tests {
 
     #[test]
     fn skips_reference_on_large_scenes() {
+        // U and x0 have 3 x 21 x 2^18 = 16.5 M numbers, more than MAX_REFERENCE_NUMBERS = 8.4 M.
         let workload = WorkloadKind::Single { power: 18, rank: 20 }.build(Size::Full).expect("expected a workload");
         assert!(
             LocalMachine::open().variants(&workload, &|_| true).iter().all(|(label, _)| label.name != "reference f64")

@@ -17,7 +17,7 @@ use modalcast_model::error::Result;
 #[derive(Debug, Parser)]
 #[command(name = "modalcast report", version, after_help = format!("{EXAMPLES}\n\n{EXIT_CODES}"))]
 struct Cli {
-    /// Print the build that this program belongs to, then exit.
+    /// Print the hash of the sources that this program was built from, then exit.
     #[arg(long)]
     build: bool,
     #[command(subcommand)]
@@ -48,9 +48,11 @@ const LOADS: &str = "Loads:
   cancel              one domain whose modes nearly cancel in pairs
   batch               16 instances of one domain of 2^18 vertices and 32 modes
   plant-1 .. plant-12 the plants of table 4.5 of the thesis
+  plant-N-follows     the same plant with leaves that follow branches, so that only branches have a T
   single              all loads single-P-R of table 4.4
   plants              all loads plant-N
-  all                 every load";
+  follows             all loads plant-N-follows
+  all                 every load, but of plant-N-follows only the plant with the most domains";
 
 /// Error against run time of the deformation: validates every variant, then times it.
 ///
@@ -78,7 +80,7 @@ struct DeformArgs {
     /// Repetitions per median [default: 100, 20 with --quick]. Wall-clock times take at least 20.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     replays: Option<u32>,
-    /// Upper limit of trajectory steps to validate [default: all].
+    /// Validate at most this number of trajectory steps [default: all].
     #[arg(long)]
     steps: Option<usize>,
     /// Measure only this variant, or all variants with this prefix: "cuda*"; repeatable.
@@ -102,7 +104,7 @@ pub fn run() -> u8 {
         Some(ReportCommand::Render(args)) => render::run(args),
         None => {
             Cli::command().print_help().ok(); // A closed stdout is no error.
-            return 2;
+            return 2; // As clap exits after invalid arguments.
         }
     })
 }
@@ -133,12 +135,13 @@ fn report_options(args: &DeformArgs) -> Result<DeformReportOptions> {
     if sources.is_empty() {
         sources.extend(WorkloadKind::all().into_iter().map(WorkloadSource::Synthetic));
     }
-    let (seeds, replays, size) = if args.quick { (10, 20, Size::Quick) } else { (100, 100, Size::Full) };
+    let (default_seeds, default_replays, size) =
+        if args.quick { (10, 20, Size::Quick) } else { (100, 100, Size::Full) };
     let count_or = |argument: Option<u32>, default: usize| argument.map_or(default, |count| count as usize);
     Ok(DeformReportOptions {
         sources,
-        seeds: count_or(args.seeds, seeds),
-        replays: count_or(args.replays, replays),
+        seeds: count_or(args.seeds, default_seeds),
+        replays: count_or(args.replays, default_replays),
         steps: args.steps.unwrap_or(usize::MAX),
         variants: args.variants.clone(),
         size,
@@ -209,6 +212,7 @@ mod tests {
     #[test]
     fn combines_scene_and_loads_and_rejects_unknown_load() {
         let both = DeformArgs { scene: Some("tree".into()), loads: vec!["plants".into(), "c".into()], ..args() };
+        // The tree, the twelve plants, and c.
         assert_eq!(report_options(&both).expect("valid arguments").sources.len(), 14);
         let wrong = report_options(&DeformArgs { loads: vec!["d".into()], ..args() }).expect_err("no such load");
         assert!(wrong.to_string().starts_with("load: expected single-P-R"), "{wrong}");

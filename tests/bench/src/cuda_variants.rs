@@ -1,4 +1,4 @@
-//! CUDA benchmark kernels as variants, and which of them a workload supports.
+//! Makes variants of the CUDA kernel benchmarks that a workload supports.
 
 use std::sync::Arc;
 
@@ -21,15 +21,17 @@ use modalcast_model::scene::{DeformationSettings, Scene, SceneState, StorageType
 /// Creates a kernel benchmark of a scene for the given states.
 type BenchmarkFactory = Box<dyn Fn(&Device, &Arc<Scene>, &[SceneState]) -> Result<Box<dyn KernelBenchmark>>>;
 
-/// The parts of a step that competing kernels launch, each with the suffix of the variant's name.
-const PARTS: [(kernels::Part, &str); 2] = [(kernels::Part::Uq, UQ_SUFFIX), (kernels::Part::Whole, "")];
-
-/// Name suffixes of variants that compute only a part of a step; their times are not comparable with whole steps.
+/// Name suffix of variants that compute only u = U q.
 const UQ_SUFFIX: &str = " Uq";
+/// Name suffix of the variant that changes one domain in a hundred.
 const ONE_PERCENT_CHANGED: &str = ", 1 % changed";
 
-/// Whether a variant of this name computes only a part of a step.
-pub(super) fn is_partial(name: &str) -> bool {
+/// The parts of a step that are measured of cuBLAS and of the kernels of the thesis, each with the name suffix of its
+/// variant.
+const PARTS: [(kernels::Part, &str); 2] = [(kernels::Part::Uq, UQ_SUFFIX), (kernels::Part::Whole, "")];
+
+/// Whether the variant of this name computes only a part of a step. Its time is not comparable with whole steps.
+pub(super) fn is_partial_step(name: &str) -> bool {
     [UQ_SUFFIX, ONE_PERCENT_CHANGED].iter().any(|ending| name.ends_with(ending))
 }
 
@@ -40,12 +42,13 @@ struct BenchmarkVariant {
     error_model: ErrorModel,
     device: Arc<Device>,
     create_benchmark: BenchmarkFactory,
+    /// Present after [`Variant::prepare`].
     benchmark: Option<Box<dyn KernelBenchmark>>,
     surface: DeformedSurface,
 }
 
-/// All kernel benchmarks of a scene as variants: our kernels in every storage type, and the competing kernels that
-/// support the scene.
+/// All kernel benchmarks of a scene as variants: the server's kernels in every storage type, and those kernels of the
+/// thesis and of cuBLAS that support the scene.
 pub(super) fn kernel_variants(
     device: &Arc<Device>,
     cache: &ErrorModelCache,
@@ -76,7 +79,7 @@ pub(super) fn kernel_variants(
         let variant = StepVariant { name, deformation, batches: workload.batches, outputs };
         candidates.push(variant.candidate(device, cache, is_selected));
     }
-    if scene.domains.len() >= MIN_CHANGED_DOMAINS {
+    if scene.domains.len() >= MIN_DOMAINS_FOR_ONE_PERCENT {
         candidates.push(one_percent_changed(device, workload, is_selected));
     }
     if scene.features.modes {
@@ -101,13 +104,13 @@ fn with_extra_outputs(scene: &Scene) -> Vec<(String, DeformationSettings)> {
     vec![with_displacements, with_boxes]
 }
 
-/// Whether a deformation truncates modes or compensates sums. The kernel then differs from that of other deformations.
-pub(super) fn has_own_summation(deformation: &DeformationSettings) -> bool {
+/// Whether a deformation truncates modes or compensates sums, for which the deformer has separate kernels.
+pub(super) fn truncates_or_compensates(deformation: &DeformationSettings) -> bool {
     deformation.truncation.is_some() || deformation.compensated
 }
 
-/// Settings of a variant that times full steps of the deformer's kernels. Kernel benchmarks keep no history, so
-/// truncation selects the modes of every state independently.
+/// Settings of a variant that times the deformer's kernels on full steps. With truncation, it selects the modes of
+/// every state independently of earlier states.
 pub(super) struct StepVariant {
     pub name: String,
     pub deformation: DeformationSettings,
@@ -134,8 +137,8 @@ impl StepVariant {
     }
 }
 
-/// Minimum number of domains for which a step that changes one domain in a hundred is measured.
-const MIN_CHANGED_DOMAINS: usize = 400;
+/// Minimum number of domains for [`one_percent_changed`], so that at least four domains change.
+const MIN_DOMAINS_FOR_ONE_PERCENT: usize = 400;
 
 /// A variant whose steps change every hundredth domain.
 fn one_percent_changed(device: &Arc<Device>, workload: &Workload, is_selected: VariantFilter<'_>) -> VariantCandidate {
@@ -150,7 +153,8 @@ fn one_percent_changed(device: &Arc<Device>, workload: &Workload, is_selected: V
 }
 
 /// Variants that multiply one U by the q of all its domains: batched in every storage type, unbatched in f32 for
-/// comparison, and by tensor cores where U is stored in 16 bits. Empty unless all domains share one shape.
+/// comparison, and by tensor cores where U is stored in 16 bits. Empty unless there are several domains and all share
+/// one shape.
 fn batch_variants(
     device: &Arc<Device>,
     cache: &ErrorModelCache,
@@ -175,7 +179,7 @@ fn batch_variants(
     let unbatched = positions_candidate(format!("cuda {count} apart f32"), StorageType::F32, BatchPolicy::Never);
     let tensor_core = |storage: StorageType| {
         let deformation = DeformationSettings { storage, ..scene.deformation };
-        // Summation order and rounding differ from the deformer's, so the name marks it.
+        // "mma" marks tensor cores, whose summation order and rounding differ from the deformer's.
         let name = format!("cuda batch of {count} {} mma", storage.name());
         make_candidate(is_selected, VariantLabel { name, backend: Backend::Cuda, deformation }, |label| {
             let scene = cache.scene(deformation)?;
@@ -212,8 +216,8 @@ fn cublas_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: Varian
     CublasMethod::ALL.into_iter().filter(supports_scene).flat_map(candidates_of).collect()
 }
 
-/// The kernels of the thesis: the single-domain kernel, or the grouped kernels in all splits. Groups support up to 32
-/// modes.
+/// The kernels of the thesis. A scene of one domain uses the single-domain kernel. A scene of several domains uses the
+/// grouped kernels, which support up to 32 modes, in every split of the domains among 1, 2 or 4 kernels.
 fn thesis_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
     let candidate = |name: String, create: BenchmarkFactory| {
         let label = VariantLabel::new(name, Backend::Cuda, scene);
@@ -231,7 +235,7 @@ fn thesis_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: Varian
         candidate(format!("thesis {} kernels{suffix}", split.widths().len()), create)
     };
     let max_rank = (0..scene.domains.len()).map(|domain| scene.rank_of(domain)).max().unwrap_or(0);
-    // The vertex update computes unfolded triangles, so it omits a vertex that no triangle refers to.
+    // The vertex update writes triangle corners and omits vertices without triangle. Then only u = U q is measured.
     let parts = if refers_to_all_vertices(scene) { &PARTS[..] } else { &PARTS[..1] };
     match (scene.domains.len(), max_rank) {
         (1, _) => parts.iter().copied().map(single).collect(),
@@ -255,7 +259,8 @@ fn refers_to_all_vertices(scene: &Scene) -> bool {
     })
 }
 
-/// Whether the scene has normals to compute: some shape has more than the minimum of three corners.
+/// Whether the scene has normals to compute. Workloads that measure positions only have the minimum of three corners
+/// per shape.
 pub(super) fn has_normals(scene: &Scene) -> bool {
     scene.shapes.iter().any(|shape| shape.mesh.corners().vertices.len() > 3)
 }
@@ -273,6 +278,7 @@ fn traffic_formula(array: &str) -> &'static str {
 }
 
 impl BenchmarkVariant {
+    /// A variant whose error model follows from the scene.
     fn new(label: VariantLabel, scene: &Arc<Scene>, device: &Arc<Device>, create: BenchmarkFactory) -> Self {
         Self::with_error_model(label, scene, device, (ErrorModel::of(scene), create))
     }
@@ -295,6 +301,7 @@ impl BenchmarkVariant {
         }
     }
 
+    /// The benchmark that [`Variant::prepare`] created.
     fn benchmark(&self) -> Result<&dyn KernelBenchmark> {
         let unprepared =
             || Error::Fault { stage: "benchmark", reason: format!("{} was not prepared", self.label.name) };
@@ -327,8 +334,8 @@ impl Variant for BenchmarkVariant {
     }
 
     fn surface(&mut self, state_index: usize, state: &SceneState) -> Result<&DeformedSurface> {
-        self.error_model.reset();
-        self.error_model.follow(state);
+        self.error_model.reset_truncation();
+        self.error_model.update_truncation(state);
         let benchmark = self.benchmark()?;
         benchmark.compute_skipped_domains(&self.device, state_index)?;
         benchmark.launch(&self.device, state_index)?;

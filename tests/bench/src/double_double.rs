@@ -6,8 +6,10 @@
 /// a + b as a rounded sum and its exact error (Knuth).
 pub(super) fn two_sum(a: f64, b: f64) -> (f64, f64) {
     let sum = a + b;
-    let from_b = sum - a;
-    (sum, (a - (sum - from_b)) + (b - from_b))
+    // The parts of a and b that the rounded sum contains.
+    let b_part = sum - a;
+    let a_part = sum - b_part;
+    (sum, (a - a_part) + (b - b_part))
 }
 
 /// a b as a rounded product and its exact error.

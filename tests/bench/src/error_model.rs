@@ -23,7 +23,7 @@ pub struct ErrorModel {
     /// Stored U of each shape; empty when U is stored in f32.
     stored: Arc<Vec<StoredShape>>,
     truncation: Option<TruncationState>,
-    /// Whether tensor cores multiply, in which case each coordinate is split into two 16-bit numbers.
+    /// Whether tensor cores compute U q. Each coordinate is then split into two 16-bit numbers.
     uses_tensor_cores: bool,
 }
 
@@ -34,6 +34,7 @@ struct StoredShape {
     error_model: ShapeErrorModel,
 }
 
+/// The modes that truncation omits now, and the data that selects them.
 #[derive(Debug)]
 struct TruncationState {
     /// Error budget, scene units.
@@ -80,17 +81,18 @@ impl ErrorModel {
         self.truncation.is_some()
     }
 
-    /// Resets the truncation history, so that the next state is decided independently.
-    pub fn reset(&mut self) {
+    /// Forgets the truncation of earlier states, which otherwise influences that of the next state.
+    pub fn reset_truncation(&mut self) {
         if let Some(TruncationState { domains, .. }) = &mut self.truncation {
             domains.iter_mut().for_each(Truncation::reset);
         }
     }
 
-    /// Advances truncation to a state: selects the modes to omit, given the previous states, as a deformer does.
-    pub fn follow(&mut self, state: &SceneState) {
+    /// Selects the modes to omit at a state, as a deformer does after the same earlier states.
+    pub fn update_truncation(&mut self, state: &SceneState) {
         let Self { scene, truncation, .. } = self;
         if let Some(TruncationState { budget, max_row_norms, domains }) = truncation {
+            // Tasks of 64 domains, because scheduling a task costs more than one domain.
             domains.par_iter_mut().enumerate().with_min_len(64).for_each(|(domain, truncation)| {
                 let max_row_norms = &max_row_norms[scene.domains[domain].shape];
                 let norm = norm(&state.composed_transform(scene, domain));
@@ -117,7 +119,7 @@ impl ErrorModel {
     pub(super) fn bounds(&self, domain: usize, state: &SceneState) -> DomainErrorBounds<'_> {
         let mut q = state.q_of(&self.scene, domain).to_vec();
         self.truncate(domain, &mut q);
-        let truncation = self.truncation.as_ref().map_or(0.0, |budget| budget.domains[domain].bound());
+        let truncation = self.truncation.as_ref().map_or(0.0, |truncation| truncation.domains[domain].bound());
         let error_model = self.stored.get(self.scene.domains[domain].shape).map(|stored| &stored.error_model);
         DomainErrorBounds {
             error_model,
@@ -125,7 +127,7 @@ impl ErrorModel {
             transform: state.composed_transform(&self.scene, domain),
             compensated: self.scene.deformation.compensated,
             truncation,
-            products: self
+            tensor_core_error: self
                 .uses_tensor_cores
                 .then(|| TensorCoreError::of(self.scene.deformation.storage, self.scene.rank_of(domain))),
         }
@@ -135,6 +137,7 @@ impl ErrorModel {
     /// the deformer does not use tensor cores.
     pub(super) fn split_q(&self, q: &[f64]) -> Option<Vec<f64>> {
         let split_domain = |(domain, slot): (usize, &DomainLayout)| -> Vec<f64> {
+            // U is stored divided by the factor of each mode, so tensor cores multiply it by q times the factor.
             let factors = self.stored[self.scene.domains[domain].shape].tiles.factors();
             let scaled_q = q[slot.first_q..][..slot.rank].iter().zip(factors).map(|(q, factor)| *q as f32 * factor);
             let split = SplitCoordinates::new(&scaled_q.collect::<Vec<_>>(), self.scene.deformation.storage);
@@ -171,7 +174,9 @@ fn store_shapes(scene: &Scene) -> Vec<StoredShape> {
 #[derive(Debug)]
 pub struct ErrorModelCache {
     scene: Arc<Scene>,
+    /// `scene` with each deformation that was requested so far.
     scenes: Mutex<Vec<(DeformationSettings, Arc<Scene>)>>,
+    /// Stored U of each shape for each storage type that was requested so far.
     stored: Mutex<Vec<(StorageType, Arc<Vec<StoredShape>>)>>,
 }
 
@@ -210,14 +215,16 @@ impl ErrorModelCache {
     }
 }
 
-/// A-priori bounds of one domain on the displacement caused by the replacements, in scene units.
+/// A-priori bounds on the errors of one domain's vertices by the approximations of an [`ErrorModel`], in scene units.
 pub(super) struct DomainErrorBounds<'a> {
     error_model: Option<&'a ShapeErrorModel>,
     q: Vec<f32>,
     transform: modalcast_model::domain::ComposedTransform,
     compensated: bool,
+    /// Bound on the error of the truncated modes.
     truncation: f64,
-    products: Option<TensorCoreError>,
+    /// Relative errors of tensor cores; `None` if the deformer does not use them.
+    tensor_core_error: Option<TensorCoreError>,
 }
 
 impl DomainErrorBounds<'_> {
@@ -225,22 +232,23 @@ impl DomainErrorBounds<'_> {
     /// of a sum of all modes in f32.
     pub(super) fn widen_bounds<'b>(&self, first: usize, bounds: impl Iterator<Item = &'b mut f64>) {
         let input = ErrorBoundInput { q: &self.q, transform: self.transform, compensated: self.compensated };
-        // The tile evaluated last, its bounds, and the bound of its tensor core products.
+        // The tile evaluated last, its bounds, and the bound of its tensor core errors.
         let mut cached: Option<(usize, ErrorBound, f64)> = None;
         for (vertex, bound) in bounds.enumerate() {
             if let Some(error_model) = self.error_model {
                 let tile = (first + vertex) / TILE;
                 let evaluate_tile = || {
-                    let products =
-                        self.products.map_or(0.0, |products| error_model.tensor_core_bound(tile, &input, products));
-                    (tile, error_model.tile(tile, &input), products)
+                    let tensor_core_bound =
+                        self.tensor_core_error.map_or(0.0, |error| error_model.tensor_core_bound(tile, &input, error));
+                    (tile, error_model.tile(tile, &input), tensor_core_bound)
                 };
-                let (_, tile_bound, products) =
+                let (_, tile_bound, tensor_core_bound) =
                     cached.filter(|(cached_tile, ..)| *cached_tile == tile).unwrap_or_else(evaluate_tile);
-                cached = Some((tile, tile_bound, products));
-                // Stored entries differ from U, so their sums may be larger and have larger rounding errors.
+                cached = Some((tile, tile_bound, tensor_core_bound));
+                // Rounding errors of the sum grow with the stored entries. 1e-4 exceeds their relative growth: 512
+                // modes, the maximum, have about 520 roundings of 6e-8 each.
                 let stored = (tile_bound.storage + tile_bound.coordinates) * (1.0 + 1e-4);
-                *bound = (*bound + stored).min(tile_bound.total()) + products;
+                *bound = (*bound + stored).min(tile_bound.total()) + tensor_core_bound;
             }
             *bound += self.truncation;
         }
@@ -304,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn tensor_cores_widen_bounds_and_round_q_to_two_halves() {
+    fn tensor_cores_widen_bounds_and_round_q_to_two_bf16() {
         let (stored, state) =
             model_and_state(DeformationSettings { storage: StorageType::Bf16, ..DeformationSettings::default() });
         let widened_bound = |error_model: &ErrorModel| {
@@ -324,9 +332,11 @@ mod tests {
         let rounded_q = tensor_core_model.split_q(&q).expect("expected rounded coordinates");
         let max_q = q.iter().fold(0.0, |max_q: f64, q| max_q.max(q.abs()));
         let is_within = |relative_error: f64| {
-            let is_within = |(half, q): (&f64, &f64)| (half - q).abs() <= relative_error * q.abs() + 1e-9 * max_q;
-            rounded_q.iter().zip(&q).all(is_within)
+            // 1e-9 of the largest coordinate allows for underflow of small coordinates.
+            let is_close = |(rounded, q): (&f64, &f64)| (rounded - q).abs() <= relative_error * q.abs() + 1e-9 * max_q;
+            rounded_q.iter().zip(&q).all(is_close)
         };
+        // Two bf16 of 8 bits each represent 16 bits, fewer than the 24 bits of f32.
         assert!(is_within(2f64.powi(-16)) && !is_within(2f64.powi(-24)), "{rounded_q:?} {q:?}");
     }
 
@@ -340,7 +350,7 @@ mod tests {
             q.iter().filter(|q| **q != 0.0).count()
         };
         assert_eq!(count_nonzero_coordinates(&truncated), 20);
-        truncated.follow(&state);
+        truncated.update_truncation(&state);
         assert!((1..20).contains(&count_nonzero_coordinates(&truncated)), "{}", count_nonzero_coordinates(&truncated));
         let mut bounds = [0.0];
         truncated.bounds(0, &state).widen_bounds(0, bounds.iter_mut());

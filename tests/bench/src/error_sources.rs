@@ -1,5 +1,5 @@
-//! Splits an error into its sources: each term of x = T (x0 + U q) is exchanged alone, with everything else exact in
-//! f64.
+//! Splits the error of a variant into its sources. Each approximation of x = T (x0 + U q) is applied alone, with
+//! everything else exact in f64.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -12,7 +12,7 @@ use super::exact_positions::{ErrorModelTerms, positions};
 use super::exact_state::ExactState;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
 
-/// Displacement of vertices by each source of error alone, meters.
+/// Position errors by each source alone, meters.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct ErrorSources {
     /// Storage of U: decoded entries instead of the exact ones.
@@ -36,22 +36,24 @@ pub(super) struct ErrorSourcesAccumulator([NormAccumulator; 6]);
 /// Reference positions of one exact state, which all variants share.
 #[derive(Debug)]
 pub(super) struct SharedErrorSources {
+    /// The exact state.
     truth: ExactState,
     /// The exact state rounded to f32.
     rounded: ExactState,
     /// Positions of the exact state.
-    exact: Vec<[f64; 3]>,
+    exact_positions: Vec<[f64; 3]>,
     /// Error from rounding q alone.
-    q: NormAccumulator,
+    q_norms: NormAccumulator,
     /// Error from rounding T alone.
-    transform: NormAccumulator,
+    transform_norms: NormAccumulator,
     /// Positions with q and T rounded to f32, U exact and all modes.
     rounded_positions: Vec<[f64; 3]>,
     /// Errors of the storage types that variants have requested so far.
-    stored: Mutex<Vec<(StorageType, Arc<StorageError>)>>,
+    storage_errors: Mutex<Vec<(StorageType, Arc<StorageError>)>>,
 }
 
-/// Positions that variants of one storage type without truncation share.
+/// Error and positions of one storage type. All variants with this storage type share the error, and those without
+/// truncation also the positions.
 #[derive(Debug)]
 struct StorageError {
     /// Error of the storage alone.
@@ -64,24 +66,25 @@ impl SharedErrorSources {
     /// Evaluates an exact state and `state`, its rounding to f32, in f64.
     pub(super) fn new(scene: &Scene, truth: ExactState, state: &SceneState) -> Self {
         let rounded = ExactState::of(state);
-        let positions_of = |q: &[f64], transforms: &[[f64; 12]]| {
-            positions(scene, &ExactState { q: q.to_vec(), transforms: transforms.to_vec() }, ErrorModelTerms::default())
-        };
-        let exact = positions_of(&truth.q, &truth.transforms);
-        let q = distances(&exact, &positions_of(&rounded.q, &truth.transforms));
-        let transform = distances(&exact, &positions_of(&truth.q, &rounded.transforms));
+        let positions_of =
+            |q: &[f64], transforms: &[[f64; 12]]| positions_at(scene, q, transforms, ErrorModelTerms::default());
+        let exact_positions = positions_of(&truth.q, &truth.transforms);
+        let q_norms = distances(&exact_positions, &positions_of(&rounded.q, &truth.transforms));
+        let transform_norms = distances(&exact_positions, &positions_of(&truth.q, &rounded.transforms));
         let rounded_positions = positions_of(&rounded.q, &rounded.transforms);
-        Self { truth, rounded, exact, q, transform, rounded_positions, stored: Mutex::default() }
+        let storage_errors = Mutex::default();
+        Self { truth, rounded, exact_positions, q_norms, transform_norms, rounded_positions, storage_errors }
     }
 
+    /// The error of a variant's storage type, computed at the first request.
     fn storage_error(&self, scene: &Scene, error_model: &ErrorModel) -> Arc<StorageError> {
         let (storage, mut cached) =
-            (scene.deformation.storage, self.stored.lock().unwrap_or_else(PoisonError::into_inner));
-        if let Some((_, stored)) = cached.iter().find(|(cached, _)| *cached == storage) {
+            (scene.deformation.storage, self.storage_errors.lock().unwrap_or_else(PoisonError::into_inner));
+        if let Some((_, stored)) = cached.iter().find(|(cached_storage, _)| *cached_storage == storage) {
             return Arc::clone(stored);
         }
         let terms = ErrorModelTerms { storage: Some(error_model), truncation: None };
-        let norms = distances(&self.exact, &positions(scene, &self.truth, terms));
+        let norms = distances(&self.exact_positions, &positions(scene, &self.truth, terms));
         let stored = Arc::new(StorageError { norms, positions: positions(scene, &self.rounded, terms) });
         cached.push((storage, Arc::clone(&stored)));
         stored
@@ -99,36 +102,37 @@ impl SharedErrorSources {
         let truncation = Some(error_model).filter(|error_model| error_model.truncates());
         let stored = storage.map(|error_model| self.storage_error(scene, error_model));
         // A source that moves no vertex contributes a zero for each vertex.
-        let zero_norms = distances(&self.exact, &self.exact);
+        let zero_norms = distances(&self.exact_positions, &self.exact_positions);
         let storage_norms = stored.as_ref().map_or(zero_norms, |stored| stored.norms);
         // The omitted modes were selected from the rounded q. Their displacement by the exact q is almost the same.
         let truncation_only = ErrorModelTerms { storage: None, truncation };
-        let truncation_norms =
-            truncation.map_or(zero_norms, |_| distances(&self.exact, &positions(scene, &self.truth, truncation_only)));
+        let truncation_norms = truncation
+            .map_or(zero_norms, |_| distances(&self.exact_positions, &positions(scene, &self.truth, truncation_only)));
         let split_q = error_model.split_q(&self.rounded.q);
-        let positions_of = |q: &[f64], transforms: &[[f64; 12]], terms: ErrorModelTerms<'_>| {
-            positions(scene, &ExactState { q: q.to_vec(), transforms: transforms.to_vec() }, terms)
+        let error_from_q = |q: &Vec<f64>| {
+            let moved_positions = positions_at(scene, q, &self.truth.transforms, ErrorModelTerms::default());
+            distances(&self.exact_positions, &moved_positions)
         };
-        let error_from_q =
-            |q: &Vec<f64>| distances(&self.exact, &positions_of(q, &self.truth.transforms, ErrorModelTerms::default()));
-        let q_norms = split_q.as_ref().map_or(self.q, error_from_q);
+        let q_norms = split_q.as_ref().map_or(self.q_norms, error_from_q);
         let q = split_q.as_ref().unwrap_or(&self.rounded.q);
-        let has_own_emulation = truncation.is_some() || split_q.is_some();
-        let own_emulation = has_own_emulation
-            .then(|| positions_of(q, &self.rounded.transforms, ErrorModelTerms { storage, truncation }));
-        let emulated = own_emulation
+        // Positions with all approximations except f32 arithmetic. Only variants that truncate modes or split q need
+        // positions of their own.
+        let needs_own_positions = truncation.is_some() || split_q.is_some();
+        let own_positions = needs_own_positions
+            .then(|| positions_at(scene, q, &self.rounded.transforms, ErrorModelTerms { storage, truncation }));
+        let approximate_positions = own_positions
             .as_ref()
             .or(stored.as_ref().map(|stored| &stored.positions))
             .unwrap_or(&self.rounded_positions);
         let rounded: Vec<[f64; 3]> =
-            emulated.par_iter().map(|position| position.map(|number| f64::from(number as f32))).collect();
+            approximate_positions.par_iter().map(|position| position.map(|number| f64::from(number as f32))).collect();
         let got: Vec<[f64; 3]> = got.as_chunks::<3>().0.par_iter().map(|position| position.map(f64::from)).collect();
         let norms = [
             storage_norms,
             q_norms,
             distances(&rounded, &got),
-            self.transform,
-            distances(emulated, &rounded),
+            self.transform_norms,
+            distances(approximate_positions, &rounded),
             truncation_norms,
         ];
         accumulator.0.iter_mut().zip(norms).for_each(|(sum, norms)| *sum = sum.join(norms));
@@ -142,6 +146,11 @@ impl ErrorSourcesAccumulator {
             self.0.map(|norms| norms.norms(unit).unwrap_or_default());
         ErrorSources { storage, q, accumulation, transform, origin, truncation }
     }
+}
+
+/// Positions of these coordinates and transforms.
+fn positions_at(scene: &Scene, q: &[f64], transforms: &[[f64; 12]], terms: ErrorModelTerms<'_>) -> Vec<[f64; 3]> {
+    positions(scene, &ExactState { q: q.to_vec(), transforms: transforms.to_vec() }, terms)
 }
 
 /// Norms of the distances between corresponding positions.
@@ -169,10 +178,11 @@ mod tests {
         WorkloadKind::Single { power: 8, rank: 2 }.build(Size::Full).expect("expected a load")
     }
 
+    /// The sources of the error of `got`, or of a variant that computes in f64 and rounds only its positions.
     fn measure(deformation: DeformationSettings, truth: &ExactState, got: Option<&[f32]>) -> ErrorSources {
         let (scene, state) = (with_deformation(&load().scene, deformation).expect("expected a scene"), truth.state());
         let mut error_model = ErrorModel::of(&scene);
-        error_model.follow(&state);
+        error_model.update_truncation(&state);
         let terms = ErrorModelTerms { storage: Some(&error_model), truncation: Some(&error_model) };
         let emulated = positions(&scene, &ExactState::of(&state), terms);
         let emulated: Vec<f32> = emulated.as_flattened().iter().map(|number| *number as f32).collect();
@@ -201,6 +211,7 @@ mod tests {
                 == [ErrorNorms::default(); 5]
         );
         assert!(sources.origin.largest > 0.0 && sources.origin.largest < 1e-6);
+        // f32 rounds 2^-30 off. Entries of U are at most 1, so a vertex moves by at most 2^-30 sqrt(3) = 1.6e-9.
         let sources =
             measure(default(), &ExactState { q: vec![1.0 + 2f64.powi(-30), 0.5], ..representable_truth() }, None);
         assert!(
@@ -215,10 +226,11 @@ mod tests {
         assert!(sources.transform.largest > 1e-9 && sources.q.largest == 0.0, "{sources:?}");
         let sources =
             measure(DeformationSettings { storage: StorageType::Int8, ..default() }, &representable_truth(), None);
-        // Upper bound: half a step of 1/127 on each of three axes, for coordinates with the sum 1.5.
+        // Upper bound: half a step of 1/127 for coordinates with the sum 1.5, on three axes: sqrt(3) < 1.74.
         assert!(sources.storage.largest > 1e-3 && sources.storage.largest < 0.5 / 127.0 * 1.5 * 1.74, "{sources:?}");
         assert_eq!([sources.accumulation, sources.truncation], [ErrorNorms::default(); 2]);
-        // Mode 1 moves vertices by up to 0.5 sqrt(3). A mode is truncated if it moves no vertex by half the budget.
+        // Modes with a total displacement below half of the budget, 0.875, are truncated. Mode 0 moves vertices by up
+        // to sqrt(3) = 1.73, mode 1 by up to 0.5 sqrt(3) = 0.866.
         let sources =
             measure(DeformationSettings { truncation: Some(1.75), ..default() }, &representable_truth(), None);
         assert!(sources.truncation.largest > 0.5 && sources.truncation.largest <= 0.87, "{sources:?}");
@@ -227,6 +239,7 @@ mod tests {
 
     #[test]
     fn counts_unexplained_error_as_accumulation() {
+        // The load has 2^8 vertices near the origin. All positions are wrong by about (1e3, 1e3, 1e3).
         let got = vec![1e3_f32; 3 * 256];
         let sources =
             measure(DeformationSettings::default(), &WorkloadMotion::new(&load(), None).random_state(0), Some(&got));

@@ -17,6 +17,7 @@ pub struct ErrorScale {
     unit: f64,
     /// Diagonal of the scene at rest, meters.
     diagonal: f64,
+    /// Projection of the camera in whose image pixel errors are measured.
     clip_from_world: Matrix4<f64>,
 }
 
@@ -33,14 +34,14 @@ impl ErrorScale {
     }
 
     /// Pixels between the projections of two points; `None` when one is not in front of the camera.
-    fn pixel_distance(&self, one: [f64; 3], other: [f64; 3]) -> Option<f64> {
+    fn pixel_distance(&self, first: [f64; 3], second: [f64; 3]) -> Option<f64> {
         let project = |point: [f64; 3]| {
             let clip = self.clip_from_world * Point3::from(point).to_homogeneous();
             let half_size = [f64::from(IMAGE_SIZE.0) / 2.0, f64::from(IMAGE_SIZE.1) / 2.0];
             (clip.w > 0.0).then(|| [clip.x / clip.w * half_size[0], clip.y / clip.w * half_size[1]])
         };
-        let (one, other) = (project(one)?, project(other)?);
-        Some((one[0] - other[0]).hypot(one[1] - other[1]))
+        let (first, second) = (project(first)?, project(second)?);
+        Some((first[0] - second[0]).hypot(first[1] - second[1]))
     }
 }
 
@@ -51,7 +52,7 @@ pub struct ErrorNorms {
     pub rms: f64,
 }
 
-/// Accumulator for a [`ErrorNorms`].
+/// Accumulator for [`ErrorNorms`].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct NormAccumulator {
     largest: f64,
@@ -87,9 +88,9 @@ pub struct PositionErrors {
     /// Lengths of the error vectors.
     #[serde(rename = "metres")]
     pub meters: ErrorNorms,
-    /// The same as fractions of the diagonal of the scene at rest.
+    /// `meters` divided by the diagonal of the scene at rest.
     pub of_diagonal: ErrorNorms,
-    /// The same in pixels of an image of [`IMAGE_SIZE`] pixels that frames the scene.
+    /// Projected errors in an image of [`IMAGE_SIZE`] pixels that frames the scene.
     pub pixels: Option<ErrorNorms>,
     /// Mean signed error along each axis, meters.
     #[serde(rename = "bias_metres")]
@@ -126,6 +127,7 @@ impl PositionErrorAccumulator {
         *self = Self { states: 1, ..sums }.join(*self);
     }
 
+    /// Adds a vertex. A position that is not finite only counts as such.
     fn add_vertex(&mut self, error_scale: &ErrorScale, got: [f32; 3], want: &ReferenceVertex) {
         let got = got.map(f64::from);
         let not_finite = got.iter().filter(|number| !number.is_finite()).count();
@@ -196,8 +198,8 @@ pub(super) fn step_errors(got: [&[f32]; 2], want: [&[ReferenceVertex]; 2]) -> No
     reduce_parallel(count, |index, norms: &mut NormAccumulator| norms.add(error(index)), NormAccumulator::join)
 }
 
-/// Parallel reduction of items 0 to `count`. Blocks have a fixed size and are joined in order, so that the result does not
-/// depend on the thread count.
+/// Parallel reduction of items 0 to `count`. Blocks have a fixed size and are joined in order, so that the result does
+/// not depend on the thread count.
 pub(super) fn reduce_parallel<T: Default + Send>(
     count: usize,
     add: impl Fn(usize, &mut T) + Sync,
@@ -223,7 +225,7 @@ pub struct OrientationErrors {
     /// Against the normals of the deformed surface, whichever normals the variant defines.
     pub normals_to_surface_degrees: Option<ErrorNorms>,
     pub tangents_degrees: Option<ErrorNorms>,
-    /// |n . t|, which is 0 when they are orthogonal.
+    /// |n . t| of normal and tangent, which should be 0.
     pub normal_dot_tangent: Option<ErrorNorms>,
     /// Directions that are not finite or have a length of at most 0.5, and bitangent signs that are wrong.
     pub broken: u64,
@@ -252,8 +254,8 @@ impl OrientationErrorAccumulator {
         *self = self.join(reduce_parallel(got.len().min(want.len()), add_corner, Self::join));
     }
 
-    /// Adds the angles between normals, three f32 per corner, and those of the deformed surface.
-    pub fn add_to_surface(&mut self, got: &[f32], want: &[[f64; 3]]) {
+    /// Adds the angles between normals, three f32 per corner, and the normals of the deformed surface.
+    pub fn add_normals_to_surface(&mut self, got: &[f32], want: &[[f64; 3]]) {
         let got = got.as_chunks::<3>().0;
         let add_corner = |corner: usize, sums: &mut Self| {
             angle_degrees(got[corner].map(f64::from), want[corner])
@@ -307,12 +309,12 @@ impl OrientationErrorAccumulator {
     }
 }
 
-/// The angle between two directions; `None` when it is not finite or either is no longer than 0.5. Uses atan2, which is
-/// accurate for small angles, where the arc cosine loses precision.
-fn angle_degrees(one: [f64; 3], other: [f64; 3]) -> Option<f64> {
-    let (one, other) = (Vector3::from(one), Vector3::from(other));
-    let angle = one.cross(&other).norm().atan2(one.dot(&other)).to_degrees();
-    (angle.is_finite() && one.norm() > 0.5 && other.norm() > 0.5).then_some(angle)
+/// The angle between two directions, which should be unit vectors. `None` when it is not finite, or when a length is at
+/// most 0.5, such as that of a zero vector. Uses atan2, because the arc cosine is inaccurate for small angles.
+fn angle_degrees(first: [f64; 3], second: [f64; 3]) -> Option<f64> {
+    let (first, second) = (Vector3::from(first), Vector3::from(second));
+    let angle = first.cross(&second).norm().atan2(first.dot(&second)).to_degrees();
+    (angle.is_finite() && first.norm() > 0.5 && second.norm() > 0.5).then_some(angle)
 }
 
 fn norm(vector: [f64; 3]) -> f64 {
@@ -324,8 +326,9 @@ mod tests {
     use super::*;
     use modalcast_model::scene::{Lens, View};
 
-    /// A scale for which one pixel is a hundredth of a unit at the target.
-    fn centimeter_pixels() -> ErrorScale {
+    /// A scale with 2 meters per scene unit. One pixel is 0.01 scene units at the target: its distance of 10 divided by
+    /// the focal length of 1000 pixels.
+    fn scale_of_2_meters_and_100_pixels() -> ErrorScale {
         let scene = modalcast_model::load::open("tree").expect("the tree").scene;
         let view = View::LookAt { eye: [0.0, 0.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
         let (width, height) = (f64::from(IMAGE_SIZE.0), f64::from(IMAGE_SIZE.1));
@@ -340,9 +343,10 @@ mod tests {
 
     #[test]
     fn given_surface_has_the_expected_errors() {
-        let error_scale = centimeter_pixels();
+        let error_scale = scale_of_2_meters_and_100_pixels();
         let mut accumulator = PositionErrorAccumulator::default();
-        // The error vectors are (3, 4, 0) and zero: lengths 5 and 0.
+        // The error vectors are (3, 4, 0) and zero. Their lengths are 5 and 0 scene units, or 10 m and 0. The first one
+        // takes 500 pixels.
         accumulator.add(
             &error_scale,
             &[3.0, 4.0, 0.0, 1.0, 1.0, 1.0],
@@ -367,7 +371,7 @@ mod tests {
 
     #[test]
     fn error_above_its_own_bound_fails_despite_larger_bounds() {
-        let error_scale = centimeter_pixels();
+        let error_scale = scale_of_2_meters_and_100_pixels();
         let mut accumulator = PositionErrorAccumulator::default();
         let want = [reference([0.0; 3], 1.0), reference([0.0; 3], 100.0)];
         accumulator.add(&error_scale, &[1.1, 0.0, 0.0, 0.0, 0.0, 0.0], &want);
@@ -379,7 +383,7 @@ mod tests {
 
     #[test]
     fn point_behind_camera_has_no_pixel_error() {
-        let error_scale = centimeter_pixels();
+        let error_scale = scale_of_2_meters_and_100_pixels();
         assert_eq!(error_scale.pixel_distance([0.0, 0.0, 11.0], [0.0; 3]), None);
         let distance = error_scale.pixel_distance([0.01, 0.0, 0.0], [0.0; 3]).expect("expected a distance");
         assert!((distance - 1.0).abs() < 1e-12, "{distance}");
@@ -412,6 +416,7 @@ mod tests {
         let got = [1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0];
         accumulator.add_tangents(&got, &want, &[0.6, 0.8, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
         accumulator.add_normals(&[f32::NAN, 0.0, 0.0], &[[1.0, 0.0, 0.0]]);
+        // Broken: the sign of the second tangent, and the normal. The third corner has no reference tangent.
         let found = accumulator.orientation();
         assert_eq!((found.broken, found.tangents_degrees), (2, Some(ErrorNorms::default())));
         let dot = found.normal_dot_tangent.expect("expected dot products").largest;

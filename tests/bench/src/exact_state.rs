@@ -1,5 +1,5 @@
-//! A state in f64. A physics process computes in f64 and sends f32. Errors are therefore measured against the f64 state,
-//! and a deformer receives its rounding.
+//! A state in f64. A physics process computes in f64 and sends f32. Errors are therefore measured against the f64
+//! state, and a deformer receives that state rounded to f32.
 
 use modalcast_model::domain::Transform;
 use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
@@ -60,10 +60,10 @@ impl ExactState {
 }
 
 /// The product of two affine transforms, 3x4 row-major.
-fn multiply_transforms(t: &[f64; 12], f: &[f64; 12]) -> [f64; 12] {
+fn multiply_transforms(left: &[f64; 12], right: &[f64; 12]) -> [f64; 12] {
     std::array::from_fn(|entry| {
-        let (row, column) = (&t[entry / 4 * 4..][..4], entry % 4);
-        let sum = row[0] * f[column] + row[1] * f[4 + column] + row[2] * f[8 + column];
+        let (row, column) = (&left[entry / 4 * 4..][..4], entry % 4);
+        let sum = row[0] * right[column] + row[1] * right[4 + column] + row[2] * right[8 + column];
         if column == 3 { sum + row[3] } else { sum }
     })
 }

@@ -6,8 +6,8 @@
 //!
 //! - [`workloads`] and [`motion`]: seeded synthetic scenes, modal coordinates and transforms;
 //!   [`recorded_trajectory`]: recorded trajectories.
-//! - [`exact_positions`], [`error_model`] and `double_double`: reference positions in f64 with single terms of the error model
-//!   exchanged, and a-priori bounds. [`errors`] and [`error_sources`] measure variants against them.
+//! - [`exact_positions`], [`error_model`] and `double_double`: reference positions in f64, on request with the
+//!   approximations of a variant, and a-priori bounds. [`errors`] and [`error_sources`] measure variants against them.
 //! - [`variant`] and [`mod@bench`]: the variants to measure. A new variant implements [`variant::Variant`], and a
 //!   [`bench::BenchTarget`] offers it.
 //! - [`table`], [`thesis_comparison`], [`plot`]: the output.
@@ -63,7 +63,7 @@ use workloads::{Size, Workload, WorkloadKind};
 /// next step runs.
 const OVERLAP: &str = "cuda overlap";
 
-/// Number of states that timed steps rotate through.
+/// Number of states that timed steps rotate through, so that consecutive steps have different inputs.
 const ROTATING_STATES: usize = 8;
 
 /// Settings of a report: scenes, sample counts and variants.
@@ -140,7 +140,8 @@ pub struct WorkloadSummary {
     pub is_recorded: bool,
     pub condition: ConditionNumbers,
     /// Upload of one step to the CUDA device.
-    pub ingest: Option<UploadTiming>,
+    #[serde(rename = "ingest")]
+    pub upload: Option<UploadTiming>,
     /// Times of steps with readback of the vertices on the CUDA device, serial and overlapped.
     pub overlap: Option<Overlap>,
 }
@@ -150,7 +151,7 @@ pub struct WorkloadSummary {
 pub struct UploadTiming {
     pub bytes: u64,
     pub median_us: f64,
-    /// Measured time divided by the time that the same bytes take at the pinned host-to-device bandwidth of this run.
+    /// `median_us` divided by the time of a copy of the same bytes at the pinned host-to-device bandwidth of this run.
     pub of_pinned: f64,
 }
 
@@ -197,7 +198,7 @@ pub fn deform(
 ) -> Result<DeformReport> {
     let mut measurements = Measurements::default();
     if options.selects(OVERLAP) {
-        measurements.host_writes = target.host_writes(options.replays);
+        measurements.host_writes = target.time_host_writes(options.replays);
     }
     let mut report = assemble_report(options, target, &measurements);
     for source in &options.sources {
@@ -210,7 +211,7 @@ pub fn deform(
         let summary = summarize(&workload, &motion, condition, is_full_size);
         let overlap = measure_overlap(options, target, &workload, &motion, &mut measurements.failed);
         measurements.loads.push(WorkloadSummary {
-            ingest: target.ingest(&workload, options.replays),
+            upload: target.time_upload(&workload, options.replays),
             overlap,
             ..summary
         });
@@ -260,7 +261,8 @@ fn assemble_report(
     }
 }
 
-/// Runs the overlap benchmark if it is selected. Appends to `failed` if its vertices differ from those of serial steps.
+/// Runs the overlap benchmark if it is selected. Appends to `failed` if the benchmark fails, or if the vertices of
+/// overlapped steps differ from those of serial steps.
 fn measure_overlap(
     options: &DeformReportOptions,
     target: &dyn BenchTarget,
@@ -272,7 +274,7 @@ fn measure_overlap(
         return None;
     }
     let states: Vec<_> = (0..ROTATING_STATES).map(|seed| motion.random_state(seed).state()).collect();
-    match target.overlap(workload, &states, options.replays)? {
+    match target.measure_overlap(workload, &states, options.replays)? {
         Ok(overlap) => {
             let differing = overlap.differing;
             let failure = (differing > 0).then(|| format!("{}: {OVERLAP}: {differing} steps differ", workload.name));
@@ -286,6 +288,7 @@ fn measure_overlap(
     }
 }
 
+/// Builds or loads a scene, and its motion.
 fn open_workload(source: &WorkloadSource, size: Size) -> Result<(Workload, WorkloadMotion)> {
     match source {
         WorkloadSource::Synthetic(kind) => {
@@ -328,7 +331,7 @@ fn summarize(
         steps: motion.steps(),
         is_recorded: motion.is_recorded(),
         condition,
-        ingest: None,
+        upload: None,
         overlap: None,
     }
 }
@@ -354,6 +357,7 @@ fn measure_variants(
     let states: Vec<_> = (0..ROTATING_STATES).map(|seed| motion.random_state(seed).state()).collect();
     for (variant, result) in variants.iter_mut().zip(results) {
         for cache in [CacheState::Warm, CacheState::Cold] {
+            // An error of timing counts only for the row of this cache state.
             let mut result = result.clone();
             let timing = match result.passed() {
                 true => variant.time(&states, cache, options.replays),

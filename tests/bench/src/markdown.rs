@@ -22,7 +22,7 @@ pub(super) fn markdown(report: &DeformReport) -> String {
     };
     text.push_str(&failures);
     for workload in &report.loads {
-        text.push_str(&load_section(workload, report.rows.iter().filter(|row| row.load == workload.name)));
+        text.push_str(&workload_section(workload, report.rows.iter().filter(|row| row.load == workload.name)));
     }
     text.push('\n');
     text.push_str(&report.thesis.markdown());
@@ -45,7 +45,8 @@ const COLUMNS: [&str; 13] = [
     "passed",
 ];
 
-fn load_section<'a>(workload: &WorkloadSummary, rows: impl Iterator<Item = &'a DeformRow>) -> String {
+/// The section of a workload: its sizes, the table of its variants, and the overlap benchmark.
+fn workload_section<'a>(workload: &WorkloadSummary, rows: impl Iterator<Item = &'a DeformRow>) -> String {
     let WorkloadSummary {
         name, vertices, corners, triangles, domains, coordinates, condition, steps, is_recorded, ..
     } = workload;
@@ -59,14 +60,14 @@ fn load_section<'a>(workload: &WorkloadSummary, rows: impl Iterator<Item = &'a D
         text.push_str(&format!("\n- {}\n", workload.remarks.join("\n- ")));
     }
     text.push('\n');
-    text.push_str(&table(&COLUMNS, rows.map(cells)));
+    text.push_str(&table(&COLUMNS, rows.map(row_cells)));
     if let Some(overlap) = &workload.overlap {
         text.push_str(&overlap_paragraph(overlap));
     }
     text
 }
 
-/// The time per step if the host reads every step back, serially and overlapped.
+/// The times per step when the host reads every step back.
 fn overlap_paragraph(overlap: &Overlap) -> String {
     let Overlap { write_one_core_us, write_us, cores, graph_us, copy_out_us, step_us, .. } = overlap;
     let Overlap { serial_us, fetched_us, overlapped_us, gain, ideal_us, differing, .. } = overlap;
@@ -79,7 +80,8 @@ fn overlap_paragraph(overlap: &Overlap) -> String {
     )
 }
 
-fn cells(row: &DeformRow) -> [String; 13] {
+/// The cells of a row, in the order of [`COLUMNS`].
+fn row_cells(row: &DeformRow) -> [String; 13] {
     let format_number = |value: Option<f64>| value.map_or_else(dash, |value| format!("{value:.3}"));
     let format_small_number = |value: Option<f64>| value.map_or_else(dash, |value| format!("{value:.2e}"));
     let errors = row.validation.as_ref().map(|validation| validation.errors);

@@ -9,14 +9,14 @@ use modalcast_model::scene::{Scene, StorageType};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Operand {
     pub name: &'static str,
-    /// Formula of the bytes. n is vertices, f triangles, c corners, r modes, d domains, C chunks of K modes, and Q quads
-    /// of vertices.
+    /// Formula of the bytes. n is vertices, f triangles, c corners, r modes, d domains, C chunks of K modes, and Q quads:
+    /// groups of four vertices.
     pub formula: &'static str,
     pub bytes: u64,
 }
 
-/// Minimum of bytes that a step reads and writes, for the scene's storage type and normals. Every operand and every
-/// shape counts once. All modes count, even with truncation.
+/// Minimum number of bytes that a step reads and writes, for the scene's storage type and normals. Every operand counts
+/// once, and every shape once for all domains that use it. All modes count, even with truncation.
 pub fn minimum_traffic(scene: &Scene) -> Vec<Operand> {
     let layout = &scene.layout;
     let [
@@ -36,7 +36,9 @@ pub fn minimum_traffic(scene: &Scene) -> Vec<Operand> {
         let (shape, chunk_modes) = (&scene.shapes[domain.shape], modes_per_chunk(scene.deformation.storage));
         let (shape_vertices, chunks) = (shape.mesh.rest_positions().len(), shape.modes.rank().div_ceil(chunk_modes));
         mode_entries += shape.modes.columns().len();
+        // A chunk holds the modes whose entries take 4 bytes per row, or 48 bytes for the 12 rows of a quad.
         stored_bytes += 48 * chunks * shape_vertices.div_ceil(QUAD);
+        // One f32 per tile and mode, including the padding modes of the last chunk.
         scale_bytes += 4 * chunks * chunk_modes * shape_vertices.div_ceil(QUAD * TILE_QUADS);
         rest_vertices += shape_vertices;
         corners += shape.mesh.corners().normals.len();
@@ -87,10 +89,12 @@ mod tests {
         let scene =
             WorkloadKind::OneDomain { has_normal_map: true }.build(Size::Quick).expect("expected a workload").scene;
         let (n, r) = (30_000, 32);
+        // U, x0, q, T and x; normals and tangents are read and written.
         let expected = 4 * 3 * n * r + 12 * n + 4 * r + 48 + 12 * n + 2 * 12 * n + 2 * 16 * n;
         assert_eq!(total_bytes(&minimum_traffic(&scene)), expected);
         let plain_scene =
             WorkloadKind::OneDomain { has_normal_map: false }.build(Size::Quick).expect("expected a workload").scene;
+        // Without normal map, the scene has only three corners and no tangents. 24 n is x0 and x.
         assert_eq!(total_bytes(&minimum_traffic(&plain_scene)), 4 * 3 * n * r + 24 * n + 4 * r + 48 + 2 * 12 * 3);
         let bytes_of_u = |storage| {
             let scene =
@@ -101,6 +105,7 @@ mod tests {
         assert_eq!([StorageType::F16, StorageType::Int8].map(bytes_of_u), [6 * n * r, 3 * n * r]);
         let exact_normals = DeformationSettings { normals: NormalMethod::Exact, ..DeformationSettings::default() };
         let exact_normals = minimum_traffic(&with_deformation(&plain_scene, exact_normals).expect("expected a scene"));
+        // Exact normals read x, one triangle and the vertex index of its three corners instead of three rest normals.
         assert_eq!(
             total_bytes(&exact_normals),
             total_bytes(&minimum_traffic(&plain_scene)) + 12 * n + 12 + 4 * 3 - 12 * 3

@@ -24,7 +24,7 @@ const MAX_RELATIVE_SHIFT: f64 = 0.05;
 const TRAJECTORY_STEPS: usize = 24;
 /// Seconds between steps.
 const DT: f64 = 1.0 / 60.0;
-/// Frequency of the slowest mode of a synthetic trajectory.
+/// Frequency of the slowest mode of a synthetic trajectory, and of the rotation of its domains.
 const SLOWEST_MODE_HZ: f64 = 1.0;
 
 /// All motions of one workload.
@@ -41,6 +41,7 @@ pub struct WorkloadMotion {
 /// Distribution of one modal coordinate.
 #[derive(Debug, Clone, Copy)]
 struct ModeSpread {
+    /// Standard deviation of the coordinate.
     deviation: f64,
     /// Frequency relative to the domain's slowest mode.
     relative_frequency: f64,
@@ -48,7 +49,7 @@ struct ModeSpread {
 
 impl WorkloadMotion {
     /// Motions of a workload. As in a stiff object, amplitudes are inversely proportional to frequencies. Frequencies
-    /// follow from the eigenvalues. In domains without eigenvalues the frequency of mode j (from 1) is proportional to j.
+    /// follow from the eigenvalues. Without eigenvalues, the frequency of mode j (from 1) is proportional to j.
     pub fn new(workload: &Workload, recorded_trajectory: Option<RecordedTrajectory>) -> Self {
         let scene = &workload.scene;
         let mut spreads = vec![ModeSpread { deviation: 0.0, relative_frequency: 1.0 }; scene.layout.coordinates];
@@ -60,10 +61,11 @@ impl WorkloadMotion {
         Self { scene: Arc::clone(scene), is_paired: workload.is_paired, spreads, recorded_trajectory }
     }
 
-    /// The random state of a seed: Gaussian coordinates and small rigid motions. With odd seeds, displacements nearly
-    /// cancel, which amplifies rounding errors. The terms that cancel are paired modes, or those of one random row per
-    /// domain if modes are not paired.
+    /// The random state of a seed: Gaussian coordinates and small rigid motions. With odd seeds, the terms of U q
+    /// nearly cancel, which amplifies rounding errors: in all rows of U if modes are paired, otherwise in one random
+    /// row per domain.
     pub fn random_state(&self, seed: usize) -> ExactState {
+        // The odd multiplier is 2^64 divided by the golden ratio. It turns consecutive seeds into distant ones.
         let mut rng = Rng::with_seed(0x5EED ^ (seed as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
         let mut q: Vec<f64> = self.spreads.iter().map(|spread| spread.deviation * random_normal(&mut rng)).collect();
         if seed % 2 == 1 {
@@ -90,6 +92,7 @@ impl WorkloadMotion {
             return trajectory.step(&self.scene, step);
         }
         let time = step as f64 * DT;
+        // All steps use the same amplitudes and phases, and hence the same seed.
         let mut rng = Rng::with_seed(0x7EA7);
         let oscillation = |spread: &ModeSpread| {
             let (amplitude, phase) = (spread.deviation * random_normal(&mut rng), TAU * rng.f64());
@@ -97,8 +100,10 @@ impl WorkloadMotion {
         };
         let q = self.spreads.iter().map(oscillation).collect();
         let transform = |domain: u32| {
+            // The index of a domain, as an angle in radians, gives each domain its own phase and axis.
             let (phase, domain) = (f64::from(domain), domain as usize);
             let angle = MAX_ROTATION * (TAU * SLOWEST_MODE_HZ * time + phase).sin();
+            // The vector has the length sqrt(2). The factor 0.5 below keeps the rotation within MAX_ROTATION.
             let axis_angle = Vector3::new(phase.sin(), 1.0, phase.cos()) * angle;
             move_placement(&self.scene, domain, &Rotation3::new(axis_angle * 0.5).into_inner(), &Vector3::zeros())
         };
@@ -107,6 +112,7 @@ impl WorkloadMotion {
 
     /// A random transform of a domain near its placement.
     fn random_transform(&self, domain: usize, rng: &mut Rng) -> [f64; 12] {
+        // Components of at most max_length / sqrt(3) keep the length within max_length.
         let mut random_vector =
             |max_length: f64| Vector3::from_fn(|_, _| max_length * (2.0 * rng.f64() - 1.0) / 3f64.sqrt());
         let axis_angle = random_vector(MAX_ROTATION);
@@ -114,7 +120,7 @@ impl WorkloadMotion {
         move_placement(&self.scene, domain, &Rotation3::new(axis_angle).into_inner(), &translation)
     }
 
-    /// Changes coordinates so that displacements nearly cancel: paired modes, or the terms of one random row per domain.
+    /// Changes coordinates so that the terms of U q nearly cancel, as described at [`Self::random_state`].
     fn cancel_displacements(&self, q: &mut [f64], rng: &mut Rng) {
         for (domain, slot) in self.scene.layout.domains.iter().enumerate() {
             let domain_q = &mut q[slot.first_q..][..slot.rank];
@@ -124,8 +130,10 @@ impl WorkloadMotion {
                 let modes = &self.scene.shape_of(domain).modes;
                 let row = rng.usize(0..3 * slot.vertices);
                 let entry = |mode: usize| f64::from(modes.entry(row / 3, row % 3, mode));
-                let largest_mode =
-                    (0..slot.rank).max_by(|a, b| entry(*a).abs().total_cmp(&entry(*b).abs())).unwrap_or(0);
+                let largest_mode = (0..slot.rank)
+                    .max_by(|first, second| entry(*first).abs().total_cmp(&entry(*second).abs()))
+                    .unwrap_or(0);
+                // The mode with the largest entry of the row cancels the sum of the other terms.
                 let remaining_displacement: f64 =
                     (0..slot.rank).filter(|mode| *mode != largest_mode).map(|mode| entry(mode) * domain_q[mode]).sum();
                 // A row of zeros, as of a clamped vertex, cancels already.
@@ -137,12 +145,13 @@ impl WorkloadMotion {
     }
 }
 
-/// The distribution of each mode of a domain.
+/// The distribution of each coordinate of a domain.
 fn mode_spreads(scene: &Scene, domain: usize) -> Vec<ModeSpread> {
     let (modes, eigenvalues) = (&scene.shape_of(domain).modes, &scene.domains[domain].metadata.eigenvalues);
     let min_eigenvalue = eigenvalues.first().copied().filter(|value| *value > 0.0 && eigenvalues.len() == modes.rank());
     let amplitude = RELATIVE_AMPLITUDE * diagonal(scene, domain);
     let mode_spread = |mode: usize| {
+        // An eigenvalue is the square of an angular frequency.
         let relative_frequency = min_eigenvalue
             .map_or((mode + 1) as f64, |min_eigenvalue| (eigenvalues[mode] / min_eigenvalue).max(1.0).sqrt());
         let max_entry = modes.column(mode).iter().fold(0.0_f32, |max, entry| max.max(entry.abs()));
@@ -190,6 +199,7 @@ mod tests {
         let draws: Vec<f64> = (0..20_000).map(|_| random_normal(&mut rng)).collect();
         let mean = draws.iter().sum::<f64>() / 2e4;
         let variance = draws.iter().map(|draw| draw * draw).sum::<f64>() / 2e4;
+        // At least four standard errors: 1 / sqrt(20,000) for the mean, sqrt(2 / 20,000) for the variance.
         assert!(mean.abs() < 0.03 && (variance - 1.0).abs() < 0.05, "mean {mean}, variance {variance}");
     }
 
@@ -215,6 +225,7 @@ mod tests {
             };
             (0..3 * modes.vertices()).map(row_condition).fold(0.0, f64::max)
         };
+        // A sum of f64 that cancels leaves only rounding errors of about 1e-16.
         assert!(max_condition(1) > 1e12, "expected a row that cancels, got condition {}", max_condition(1));
         assert!(max_condition(0) < 1e6, "expected no row that cancels, got condition {}", max_condition(0));
     }
@@ -222,6 +233,7 @@ mod tests {
     #[test]
     fn slow_modes_are_large_and_consecutive_steps_are_close() {
         let motion = motion(WorkloadKind::OneDomain { has_normal_map: false });
+        // Without eigenvalues, the frequency of the last of 32 modes is 32 times that of the first.
         assert!(motion.spreads[0].deviation > 10.0 * motion.spreads[31].deviation);
         let [first_state, second_state] = [0, 1].map(|step| motion.trajectory_state(step));
         assert_ne!(first_state, second_state);

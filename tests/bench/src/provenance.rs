@@ -11,8 +11,9 @@ use modalcast_compute::gpu;
 pub struct Provenance {
     pub cpu: String,
     pub threads: usize,
-    /// CUDA devices and their memory; the versions of the driver, CUDA and NVRTC; why a component is missing, if one is.
+    /// CUDA devices and their memory; versions of the driver, CUDA and NVRTC; the reason for a missing component.
     pub cuda: gpu::Probe,
+    /// Version of this crate.
     pub version: &'static str,
     /// `MODALCAST_COMMIT`, otherwise git's HEAD in the current folder.
     pub commit: Option<String>,
@@ -41,7 +42,7 @@ impl Provenance {
         }
     }
 
-    /// Machine and devices as one line, for titles.
+    /// CPU, threads and CUDA devices as one line, for titles.
     pub fn line(&self) -> String {
         let devices: Vec<&str> = self.cuda.devices.iter().map(|device| device.name.as_str()).collect();
         let devices = if devices.is_empty() { "no CUDA device".into() } else { devices.join(", ") };

@@ -26,7 +26,7 @@ impl RecordedTrajectory {
     /// `NotFound` when a file is missing; `Invalid` when it cannot be parsed or does not match the scene.
     pub fn read(path: &Path, scene: &Scene) -> Result<Self> {
         let name = path.display().to_string();
-        let record = match path.is_dir() {
+        let trajectory = match path.is_dir() {
             true => Self {
                 q: read_npy_rows(&path.join("q.npy"))?,
                 transforms: match path.join("transforms.npy") {
@@ -36,7 +36,7 @@ impl RecordedTrajectory {
             },
             false => Self { q: read_csv_rows(path)?, transforms: Vec::new() },
         };
-        record.validate(scene).map_err(|error| error.prefix_field(&name))
+        trajectory.validate(scene).map_err(|error| error.prefix_field(&name))
     }
 
     /// The recording next to a scene: the only file in its folder that ends in `.q.csv`. `None` when there is no such
@@ -57,12 +57,11 @@ impl RecordedTrajectory {
     }
 
     fn validate(self, scene: &Scene) -> Result<Self> {
-        let check_lengths = |field: &str, rows: &[Vec<f64>], length: usize| match rows
-            .iter()
-            .position(|row| row.len() != length)
-        {
-            None => Ok(()),
-            Some(index) => Err(invalid(format!("{field}[{index}]"), format!("{length} numbers"), rows[index].len())),
+        let check_lengths = |field: &str, rows: &[Vec<f64>], length: usize| {
+            let mismatched = rows.iter().enumerate().find(|(_, row)| row.len() != length);
+            mismatched.map_or(Ok(()), |(index, row)| {
+                Err(invalid(format!("{field}[{index}]"), format!("{length} numbers"), row.len()))
+            })
         };
         if self.q.is_empty() {
             return Err(invalid("steps", "at least one", 0));
@@ -82,13 +81,14 @@ impl RecordedTrajectory {
         self.q.len()
     }
 
+    /// The exact state at a step.
     pub(super) fn step(&self, scene: &Scene, step: usize) -> ExactState {
         let placement = |domain: u32| scene.domains[domain as usize].placement.0.map(f64::from);
-        let rest_transforms = || scene.transform_roots.domains().map(placement).collect();
+        let placements = || scene.transform_roots.domains().map(placement).collect();
         let recorded_transforms = |row: &Vec<f64>| row.as_chunks().0.to_vec();
         ExactState {
             q: self.q[step].clone(),
-            transforms: self.transforms.get(step).map_or_else(rest_transforms, recorded_transforms),
+            transforms: self.transforms.get(step).map_or_else(placements, recorded_transforms),
         }
     }
 }
@@ -114,8 +114,11 @@ fn read_csv_rows(path: &Path) -> Result<Vec<Vec<f64>>> {
         false => invalid(path.display().to_string(), "rows of time,q0,q1,...", error),
     };
     let mut reader = csv::Reader::from_path(path).map_err(to_error)?;
-    let row = |row: Result<Vec<f64>, csv::Error>| row.map(|row| row[1.min(row.len())..].to_vec()).map_err(to_error);
-    reader.deserialize().map(row).collect()
+    let without_time = |row: Result<Vec<f64>, csv::Error>| -> Result<Vec<f64>> {
+        let row = row.map_err(to_error)?;
+        Ok(row.into_iter().skip(1).collect())
+    };
+    reader.deserialize().map(without_time).collect()
 }
 
 #[cfg(test)]
@@ -123,10 +126,12 @@ mod tests {
     use super::*;
     use crate::workloads::{Size, WorkloadKind};
 
+    /// A scene of one domain with two modes.
     fn scene() -> std::sync::Arc<Scene> {
         WorkloadKind::Single { power: 6, rank: 2 }.build(Size::Full).expect("built").scene
     }
 
+    /// Reads a CSV file with this text by its path and by [`RecordedTrajectory::find_next_to`], which must agree.
     fn read(text: &str) -> Result<RecordedTrajectory> {
         let folder = tempfile::tempdir().expect("expected a folder");
         let path = folder.path().join("x.q.csv");
@@ -165,6 +170,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("expected a folder");
         let write = |name: &str, shape: &str, numbers: &[f32]| {
             let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
+            // Magic, version and header length take 10 bytes. The header pads them to a multiple of 64.
             header.push_str(&" ".repeat(63 - (header.len() + 10) % 64));
             header.push('\n');
             let mut bytes = b"\x93NUMPY\x01\x00".to_vec();

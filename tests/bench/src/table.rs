@@ -71,6 +71,7 @@ impl DeformRow {
             timing,
             bytes,
             traffic,
+            // 1 GB/s is 1e3 bytes per microsecond.
             gbs: timing.map(|timing| bytes as f64 / timing.median_us / 1e3),
             validation: Some(validation),
             ..Self::empty(load, label)
@@ -83,6 +84,7 @@ impl DeformRow {
         Self { faults: vec![error.to_string()], is_skipped, ..Self::empty(load, label) }
     }
 
+    /// A row without results.
     fn empty(load: &str, label: &VariantLabel) -> Self {
         Self {
             load: load.into(),
@@ -123,7 +125,8 @@ impl DeformRow {
     }
 }
 
-/// Columns of `report.csv`: name, and JSON pointer of the value in a row of `report.json`.
+/// Columns of `report.csv`: name, and JSON pointer of the value in a row of `report.json`. The pointer is empty for
+/// columns that `csv` computes.
 const COLUMNS: [(&str, &str); 56] = [
     ("load", "/load"),
     ("variant", "/name"),
@@ -204,8 +207,8 @@ pub fn csv(rows: &[DeformRow]) -> Result<Vec<u8>> {
     writer.into_inner().map_err(fault_in("report"))
 }
 
-/// Pareto front of points whose numbers should both be small: indices of the points that no other point dominates, by
-/// ascending first number. Of equal points, one is on the front.
+/// Pareto front of points whose numbers should both be small. Returns the indices of the points that no other point
+/// dominates, by ascending first number. Of equal points, only one is on the front.
 pub fn pareto_front(points: &[(f64, f64)]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.sort_by(|a, b| points[*a].0.total_cmp(&points[*b].0).then(points[*a].1.total_cmp(&points[*b].1)));
@@ -225,7 +228,8 @@ pub(super) mod tests {
     use crate::error_sources::ErrorSources;
     use crate::errors::{ErrorNorms, OrientationErrors, PositionErrors};
 
-    /// A row with these numbers; everything else is zero or empty.
+    /// A row with 2,000 bytes of traffic, this median time and this largest error in meters and as a fraction of the
+    /// diagonal.
     pub(crate) fn row(load: &str, name: &str, cache: CacheState, (median_us, error): (f64, f64)) -> DeformRow {
         let label = VariantLabel { name: name.into(), backend: Backend::Cpu, deformation: Default::default() };
         let norms = ErrorNorms { largest: error, rms: error / 2.0 };

@@ -83,8 +83,8 @@ impl Variant for EmulatedVariant {
     }
 
     fn surface(&mut self, _state_index: usize, state: &SceneState) -> Result<&DeformedSurface> {
-        self.applied.follow(state);
-        self.declared.follow(state);
+        self.applied.update_truncation(state);
+        self.declared.update_truncation(state);
         let terms = ErrorModelTerms { storage: Some(&self.applied), truncation: Some(&self.applied) };
         let positions = positions(&self.scene, &ExactState::of(state), terms);
         self.surface.positions = positions.as_flattened().iter().map(|number| *number as f32).collect();

@@ -1,3 +1,5 @@
+//! Tests of complete reports with small workloads.
+
 use super::*;
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_model::error::invalid;
@@ -11,10 +13,10 @@ struct CpuTarget {
 }
 
 impl BenchTarget for CpuTarget {
-    fn variants(&self, load: &Workload, is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
-        let label = |name: &str| VariantLabel::new(name, Backend::Cpu, &load.scene);
-        let cpu =
-            |label: VariantLabel| DeformerVariant::new(label, &load.scene, Box::new(CpuDeformer::new(&load.scene)));
+    fn variants(&self, workload: &Workload, is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
+        let scene = &workload.scene;
+        let label = |name: &str| VariantLabel::new(name, Backend::Cpu, scene);
+        let cpu = |label: VariantLabel| DeformerVariant::new(label, scene, Box::new(CpuDeformer::new(scene)));
         let inaccurate = |label: VariantLabel| Ok(InaccurateVariant::new(cpu(label), self.position_error));
         vec![
             make_candidate(is_selected, label("accurate"), |label| Ok(cpu(label))),
@@ -40,13 +42,14 @@ fn measure(position_error: f32) -> DeformReport {
     let mut events = Vec::new();
     let on_progress = |progress: Progress<'_>| {
         events.push(match progress {
-            Progress::Started(what) => what.to_owned(),
+            Progress::Started(description) => description.to_owned(),
             Progress::Measured(report) => format!("{} {:?}", report.rows.len(), report.missing),
         });
         Ok(())
     };
     let report =
         deform(&report_options(sources), &CpuTarget { position_error }, on_progress).expect("expected a report");
+    // Names count plants from 1. A workload has four rows: two variants with warm and with cold caches.
     assert!(events[0].starts_with("plant-2: ") && events[2].starts_with("single-14-10: "), "{events:?}");
     assert_eq!([&events[1], &events[3]], ["4 [\"single-14-10\"]", "8 []"]);
     report
@@ -82,9 +85,9 @@ fn writes_all_report_files_and_reads_them_back() {
     report.write(&out).expect("expected a report file");
     let read = |name: &str| std::fs::read(out.join(name)).expect(name);
     let json: serde_json::Value = serde_json::from_slice(&read("report.json")).expect("JSON");
-    assert_eq!(json["rows"].as_array().map(Vec::len), Some(8), "two loads, two variants, two caches");
+    assert_eq!(json["rows"].as_array().map(Vec::len), Some(8), "expected a row per load, variant and cache state");
     assert_eq!(json["rows"][0]["passed"], true);
-    assert!(json["rows"][0]["of_read"].as_f64().expect("a share") > 0.0);
+    assert!(json["rows"][0]["of_read"].as_f64().expect("expected a fraction") > 0.0);
     assert_eq!(json["made"]["version"], env!("CARGO_PKG_VERSION"));
     assert_eq!(json["thesis"]["tables_4_5_to_4_7"].as_array().map(Vec::len), Some(12));
     let records = csv::Reader::from_reader(read("report.csv").as_slice()).records().count();
@@ -110,8 +113,8 @@ fn inaccurate_variant_fails_report_and_is_not_timed() {
 fn variant_that_cannot_be_created_fails_report() {
     struct BrokenTarget;
     impl BenchTarget for BrokenTarget {
-        fn variants(&self, load: &Workload, _is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
-            let label = VariantLabel::new("lost", Backend::Cuda, &load.scene);
+        fn variants(&self, workload: &Workload, _is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
+            let label = VariantLabel::new("lost", Backend::Cuda, &workload.scene);
             vec![(label, Err(invalid("kernel", "one that compiles", "none")))]
         }
     }
@@ -119,15 +122,15 @@ fn variant_that_cannot_be_created_fails_report() {
         deform(&report_options(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &BrokenTarget, |_| Ok(()))
             .expect("expected a report");
     assert_eq!(report.failed, ["c: lost: kernel: expected one that compiles, got none"]);
-    assert!(plot::render_png(&plot::draw_svg(&report)).is_ok(), "an empty plot is still a plot");
+    assert!(plot::render_png(&plot::draw_svg(&report)).is_ok(), "expected a plot without points");
 }
 
 #[test]
 fn unavailable_variant_is_skipped_without_failing_report() {
     struct UnavailableTarget;
     impl BenchTarget for UnavailableTarget {
-        fn variants(&self, load: &Workload, _is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
-            let label = VariantLabel::new("peer", Backend::Cuda, &load.scene);
+        fn variants(&self, workload: &Workload, _is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
+            let label = VariantLabel::new("peer", Backend::Cuda, &workload.scene);
             let (reason, remedy) = ("not found".into(), "install it".into());
             vec![(label, Err(modalcast_model::error::Error::Unavailable { what: "a library", reason, remedy }))]
         }
@@ -147,13 +150,13 @@ fn overlap_fails_report_only_when_vertices_differ() {
         differing: usize,
     }
     impl BenchTarget for OverlapTarget {
-        fn variants(&self, _load: &Workload, _is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
+        fn variants(&self, _workload: &Workload, _is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
             Vec::new()
         }
 
-        fn overlap(
+        fn measure_overlap(
             &self,
-            _load: &Workload,
+            _workload: &Workload,
             states: &[modalcast_model::scene::SceneState],
             steps: usize,
         ) -> Option<Result<Overlap>> {
@@ -193,8 +196,9 @@ fn overlap_fails_report_only_when_vertices_differ() {
     assert_eq!(report_with(3, &[]).failed, ["c: cuda overlap: 3 steps differ"]);
     let passing = report_with(0, &["cuda overlap"]);
     assert!(passing.passed());
+    // serial_us and fetched_us.
     assert!(markdown::markdown(&passing).contains("50.0 serially, 37.5"));
-    assert_eq!(report_with(3, &["cpu*"]).loads[0].overlap, None, "the overlap is not selected");
+    assert_eq!(report_with(3, &["cpu*"]).loads[0].overlap, None, "expected no overlap, which is not selected");
 }
 
 #[test]

@@ -4,17 +4,19 @@
 
 use serde::Serialize;
 
-/// Powers of two of the vertex counts of table 4.4, in the order of its columns.
+/// Binary logarithms of the vertex counts of table 4.4, in the order of its columns.
 pub const POWERS: [u32; 5] = [14, 16, 18, 20, 22];
 
 /// Modes of table 4.4, in the order of its rows.
 pub const RANKS: [usize; 3] = [10, 20, 30];
 
-/// Table 4.4: CPU time over GPU time of u = U q of one domain; a row per rank, a column per power of two.
+/// Table 4.4: CPU time over GPU time of u = U q of one domain; a row per entry of [`RANKS`], a column per entry of
+/// [`POWERS`].
 pub const CPU_OVER_GPU: [[f64; 5]; 3] =
     [[2.53, 0.68, 1.44, 1.6, 1.77], [6.47, 2.76, 5.01, 6.54, 7.04], [5.32, 3.67, 6.60, 8.02, 9.69]];
 
-/// One plant of tables 4.5 to 4.7. Times are milliseconds, occupations are fractions of the frame time.
+/// One plant of tables 4.5 to 4.7. Times are in milliseconds. An occupation is the fraction of the frame time that a
+/// computation takes.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ThesisPlant {
     pub name: &'static str,
@@ -24,8 +26,9 @@ pub struct ThesisPlant {
     pub faces: usize,
     /// Table 4.5, v': vertices after unfolding the triangles.
     pub unfolded: usize,
-    /// Table 4.5, d and d': domains, and those with modes.
+    /// Table 4.5, d: domains.
     pub domains: usize,
+    /// Table 4.5, d': domains with modes.
     pub deformable: usize,
     /// Table 4.5, r: modes of all domains.
     pub modes: usize,
@@ -41,26 +44,30 @@ pub struct ThesisPlant {
     pub kernels: usize,
     /// Table 4.7, `k_uq`: `t_uq` of the CPU over that of the GPU.
     pub speedup_uq: f64,
-    /// Table 4.7, `O_uq` of the CPU.
+    /// Table 4.7, `O_uq` of the CPU: occupation by Uq.
     pub cpu_occupation: f64,
     /// Table 4.7, `O_uq` of the GPU.
     pub gpu_occupation: f64,
+    /// Times with rendering.
     pub drawn: ThesisRenderTimes,
 }
 
 /// The rendering columns of tables 4.6 and 4.7.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ThesisRenderTimes {
-    /// Table 4.6, FPS and `t_vbr` (vertex updating with rendering) of the CPU.
+    /// Table 4.6, FPS of the CPU.
     pub cpu_fps: f64,
+    /// Table 4.6, `t_vbr` of the CPU: vertex updating with rendering.
     pub cpu_vbr_ms: f64,
-    /// Table 4.6, FPS and `t_vbr` of the GPU.
+    /// Table 4.6, FPS of the GPU.
     pub gpu_fps: f64,
+    /// Table 4.6, `t_vbr` of the GPU.
     pub gpu_vbr_ms: f64,
     /// Table 4.6, s: GPU memory in megabytes.
     pub gpu_mb: f64,
-    /// Table 4.7, `O_vbr` of the CPU and of the GPU.
+    /// Table 4.7, `O_vbr` of the CPU: occupation by vertex updating with rendering.
     pub cpu_vbr_occupation: f64,
+    /// Table 4.7, `O_vbr` of the GPU.
     pub gpu_vbr_occupation: f64,
 }
 
@@ -72,6 +79,7 @@ type TimeColumns = [f64; 6];
 /// FPS and `t_vbr` of the CPU, FPS, `t_vbr` and s of the GPU (table 4.6), `O_vbr` of both in per cent (table 4.7).
 type RenderColumns = [f64; 7];
 
+/// A plant from its rows of the three tables.
 const fn plant(
     name: &'static str,
     counts: SizeColumns,
@@ -134,13 +142,16 @@ mod tests {
     #[test]
     fn printed_speedups_are_quotients_of_printed_times() {
         for plant in PLANTS {
+            // One unit of the last printed digit is 0.01.
             let quotient = plant.cpu_uq_ms / plant.gpu_uq_ms;
             assert!((quotient - plant.speedup_uq).abs() <= 0.011, "{}: {quotient}", plant.name);
         }
     }
 
     #[test]
-    fn printed_occupations_equal_t_vbr_times_fps() {
+    fn printed_speedups_and_occupations_follow_from_t_vbr() {
+        // Printed quotients of `t_vbr` of the CPU and of the GPU. They have two digits after the point; occupations are
+        // percentages with two digits after the point.
         let speedups = [1.16, 3.48, 40.40, 15.54, 11.41, 27.29, 16.23, 24.96, 19.34, 79.36, 47.58, 19.71];
         for (plant, speedup) in PLANTS.iter().zip(speedups) {
             let ThesisRenderTimes { cpu_vbr_ms, cpu_fps, cpu_vbr_occupation, .. } = plant.drawn;

@@ -7,10 +7,12 @@ use super::table::DeformRow;
 use super::thesis::{CPU_OVER_GPU, PLANTS, POWERS, RANKS, ThesisPlant};
 use super::timing::CacheState;
 use modalcast_model::deform::Backend;
+use modalcast_model::scene::StorageType;
 
 /// One cell of table 4.4 with our result.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SingleDomainComparison {
+    /// Binary logarithm of the number of vertices.
     pub power: u32,
     pub rank: usize,
     /// Table 4.4: CPU time over GPU time.
@@ -49,7 +51,7 @@ impl ThesisComparison {
             let timed_rows = warm_rows(&format!("single-{power}-{rank}"));
             let fastest_us = |backend: Backend| {
                 let is_exact = |row: &&&DeformRow| {
-                    row.backend == backend && row.storage == Default::default() && row.truncation_meters.is_none()
+                    row.backend == backend && row.storage == StorageType::F32 && row.truncation_meters.is_none()
                 };
                 timed_rows.iter().filter(is_exact).filter_map(|row| Some(row.timing?.median_us)).min_by(f64::total_cmp)
             };
@@ -58,8 +60,8 @@ impl ThesisComparison {
         };
         let cells = (0..RANKS.len()).flat_map(|row| (0..POWERS.len()).map(move |column| (row, column)));
         let compare_plant = |(index, thesis): (usize, ThesisPlant)| {
-            let ours = warm_rows(&format!("plant-{}", index + 1)).into_iter();
-            let ours = ours.filter_map(|row| Some((row.name.clone(), row.timing?.median_us / 1e3)));
+            let timed_rows = warm_rows(&format!("plant-{}", index + 1)).into_iter();
+            let ours = timed_rows.filter_map(|row| Some((row.name.clone(), row.timing?.median_us / 1e3)));
             PlantComparison { thesis, ours: ours.collect() }
         };
         Self {
@@ -72,9 +74,9 @@ impl ThesisComparison {
     /// Both tables as Markdown.
     pub fn markdown(&self) -> String {
         format!(
-            "## Comparison with the thesis\n\nSource: {}. Our results new loads new reduced size are omitted.\n\n\
+            "## Comparison with the thesis\n\nSource: {}. Our results for loads of reduced size are omitted.\n\n\
              Table 4.4, CPU time over GPU time, thesis / ours:\n\n{}\n\
-             Tables 4.5 to 4.7, milliseconds new the thesis, then ours (complete vertex update):\n\n{}",
+             Tables 4.5 to 4.7, milliseconds of the thesis, then ours (complete vertex update):\n\n{}",
             self.source,
             single_domain_table(&self.table_4_4),
             plant_table(&self.tables_4_5_to_4_7)
@@ -105,8 +107,8 @@ fn plant_table(comparisons: &[PlantComparison]) -> String {
     let row = |comparison: &PlantComparison| {
         let times = comparison.ours.clone();
         let format_time = move |variant: &&str| {
-            let format_time = times.iter().find(|(name, _)| name == variant);
-            format_time.map_or_else(dash, |(_, ms)| format!("{ms:.4}"))
+            let time = times.iter().find(|(name, _)| name == variant);
+            time.map_or_else(dash, |(_, ms)| format!("{ms:.4}"))
         };
         plant_cells(&comparison.thesis).into_iter().chain(variants.iter().map(format_time)).collect::<Vec<String>>()
     };

@@ -37,11 +37,11 @@ pub struct Timing {
     pub replays: usize,
 }
 
-/// Minimum of repetitions for a median.
+/// Minimum number of repetitions for a median.
 pub const MIN_REPETITIONS: usize = 20;
 /// Time limit in seconds, after which no repetition beyond [`MIN_REPETITIONS`] starts.
 const TIME_BUDGET_S: f64 = 5.0;
-/// Minimum size of the buffer that evicts the caches. It also holds for machines that do not report their cache sizes.
+/// Minimum size of the buffer that evicts the caches, for machines that do not report their cache sizes.
 const MIN_FLUSH_BYTES: usize = 64 << 20;
 
 impl Timing {
@@ -55,7 +55,8 @@ impl Timing {
         })
     }
 
-    /// Times `step`, called with 0, 1, 2, ..., by the wall clock: one untimed run, then [`MIN_REPETITIONS`] to `replays` runs.
+    /// Times `step`, called with 0, 1, 2, ..., by the wall clock: one untimed run, then [`MIN_REPETITIONS`] to
+    /// `replays` runs.
     ///
     /// # Errors
     /// Errors of `step`.
@@ -97,12 +98,14 @@ struct CacheFlush(Vec<u64>);
 
 impl CacheFlush {
     fn new() -> Self {
-        // Every socket has its own last-level cache, so the buffer is larger than that of one socket.
-        Self(vec![1; (2 * last_level_cache_bytes()).max(MIN_FLUSH_BYTES) / 8])
+        // Twice the last-level cache of one socket, because another socket may have a cache of its own.
+        let bytes = (2 * last_level_cache_bytes()).max(MIN_FLUSH_BYTES);
+        Self(vec![1; bytes / size_of::<u64>()])
     }
 
     /// Evicts other data from the caches by writing the whole buffer from all cores.
     fn evict(&mut self) {
+        // Four chunks per thread balance the load.
         let chunk_length = self.0.len().div_ceil(4 * rayon::current_num_threads()).max(1);
         self.0
             .par_chunks_mut(chunk_length)
@@ -124,6 +127,7 @@ fn last_level_cache_bytes() -> usize {
         };
         Some(number.parse::<usize>().ok()? * factor)
     };
+    // Linux lists fewer than eight caches per core. The last-level cache is the largest.
     (0..8).filter_map(cache_bytes).max().unwrap_or(0)
 }
 
@@ -165,7 +169,7 @@ mod tests {
 
     #[test]
     fn failing_step_ends_timing() {
-        let fault = modalcast_model::error::invalid("x", "y", "z");
-        assert_eq!(Timing::by_wall_clock(CacheState::Warm, 20, |_| Err(fault.clone())), Err(fault));
+        let error = modalcast_model::error::invalid("x", "y", "z");
+        assert_eq!(Timing::by_wall_clock(CacheState::Warm, 20, |_| Err(error.clone())), Err(error));
     }
 }

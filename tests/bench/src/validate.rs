@@ -22,7 +22,8 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::Error;
 use modalcast_model::scene::{Camera, DeformationSettings, NormalMethod, Scene, SceneState};
 
-/// Number of random states for which the error is split into its sources. Each split takes five evaluations in f64.
+/// Number of random states for which the error is split into its sources. Few, because each split takes five
+/// evaluations in f64.
 const SPLIT_SEEDS: usize = 4;
 
 /// Condition numbers sum |U q| / |u| of the vertices of a workload.
@@ -32,7 +33,7 @@ pub struct ConditionNumbers {
     pub largest: f64,
     /// Median over the states of the median over the vertices that have modes.
     pub median: f64,
-    /// Number of vertices, over all states, whose nonzero terms have the sum 0.
+    /// Number of vertices, over all states, with u = 0 although some term of U q is not 0.
     pub infinite: u64,
 }
 
@@ -89,7 +90,9 @@ struct StateSample<'a> {
     condition: StateCondition,
     /// Present for the states whose error is split into its sources.
     error_sources: Option<SharedErrorSources>,
+    /// Normals and tangents that are rotated by T, computed on first use.
     rigid: OnceLock<Directions>,
+    /// Normals and tangents of the deformed surface, computed on first use.
     exact: OnceLock<Directions>,
     /// Whether the state is a step of the trajectory.
     is_trajectory_step: bool,
@@ -103,17 +106,19 @@ struct Directions {
 
 /// The scenes that define the reference normals and tangents.
 struct NormalScenes<'a> {
+    /// The scene of the workload.
     rigid: &'a Scene,
     /// The same scene with exact normals of the deformed surface; `None` when it has no modes or no normals.
     exact: Option<Arc<Scene>>,
 }
 
 impl<'a> NormalScenes<'a> {
-    fn new(load: &'a Workload) -> Self {
-        let exact_normals = DeformationSettings { normals: NormalMethod::Exact, ..load.scene.deformation };
-        let has_exact_normals = load.scene.features.modes && has_normals(&load.scene);
-        let exact = has_exact_normals.then(|| with_deformation(&load.scene, exact_normals)).and_then(Result::ok);
-        Self { rigid: &load.scene, exact }
+    fn new(workload: &'a Workload) -> Self {
+        let scene = &workload.scene;
+        let exact_normals = DeformationSettings { normals: NormalMethod::Exact, ..scene.deformation };
+        let has_exact_normals = scene.features.modes && has_normals(scene);
+        let exact = has_exact_normals.then(|| with_deformation(scene, exact_normals)).and_then(Result::ok);
+        Self { rigid: scene, exact }
     }
 }
 
@@ -134,29 +139,31 @@ impl<'a> StateSample<'a> {
         }
     }
 
-    /// Reference normals and tangents: rotated by T or, if `exact`, those of the deformed surface. The first call
-    /// computes and caches them.
-    fn directions(&self, exact: bool) -> &Directions {
-        match exact {
-            true => self.exact.get_or_init(|| {
-                let (scene, positions) =
-                    (self.scenes.exact.as_deref().unwrap_or(self.scenes.rigid), positions_of(&self.references));
-                let normals = || reference::exact_normals(scene, self.state, &positions);
-                let tangents = || reference::exact_tangents(scene, self.state, &positions);
-                let (normals, tangents) = rayon::join(normals, tangents);
-                Directions { normals, tangents }
-            }),
-            false => self.rigid.get_or_init(|| {
-                let normals = || reference::rigid_normals(self.scenes.rigid, self.state);
-                let (normals, tangents) =
-                    rayon::join(normals, || reference::rigid_tangents(self.scenes.rigid, self.state));
-                Directions { normals, tangents }
-            }),
-        }
+    /// Reference normals and tangents that are rotated by T.
+    fn rigid_directions(&self) -> &Directions {
+        self.rigid.get_or_init(|| {
+            let normals = || reference::rigid_normals(self.scenes.rigid, self.state);
+            let tangents = || reference::rigid_tangents(self.scenes.rigid, self.state);
+            let (normals, tangents) = rayon::join(normals, tangents);
+            Directions { normals, tangents }
+        })
+    }
+
+    /// Reference normals and tangents of the deformed surface.
+    fn exact_directions(&self) -> &Directions {
+        self.exact.get_or_init(|| {
+            let (scene, positions) =
+                (self.scenes.exact.as_deref().unwrap_or(self.scenes.rigid), positions_of(&self.references));
+            let normals = || reference::exact_normals(scene, self.state, &positions);
+            let tangents = || reference::exact_tangents(scene, self.state, &positions);
+            let (normals, tangents) = rayon::join(normals, tangents);
+            Directions { normals, tangents }
+        })
     }
 }
 
-/// Maximum number of vertices plus corners of a group of states. A vertex takes 40 bytes and a corner up to 112.
+/// Maximum number of vertices plus corners of a group of states. A vertex takes 40 bytes and a corner up to 112, so a
+/// group takes at most 1.9 GB.
 const MAX_GROUP_ITEMS: usize = 1 << 24;
 
 /// Validates the variants at `seeds` random states and at no more than `steps` states of the trajectory, at every
@@ -176,14 +183,16 @@ pub fn validate(
     let mut checks: Vec<VariantCheck<'_>> =
         variants.iter_mut().map(|variant| VariantCheck::new(variant.as_mut(), &states)).collect();
     let (scenes, mut conditions) = (NormalScenes::new(workload), ConditionAccumulator::default());
-    // Whether the variants needed rigid and exact directions at the first state. If so, they are computed in parallel
-    // for the groups of other states.
-    let mut needs_directions = [false; 2];
+    // Directions that variants need at the first state are computed in parallel for the groups of later states.
+    let (mut needs_rigid_directions, mut needs_exact_directions) = (false, false);
     for group in group_states(state_count, workload.scene.layout.vertices + workload.scene.layout.corners) {
         let evaluate = |index: usize| {
             let sample = StateSample::new(&scenes, index, &states[index], index >= seeds);
-            for exact in [false, true].into_iter().filter(|exact| needs_directions[usize::from(*exact)]) {
-                sample.directions(exact);
+            if needs_rigid_directions {
+                sample.rigid_directions();
+            }
+            if needs_exact_directions {
+                sample.exact_directions();
             }
             let has_error_sources = index < SPLIT_SEEDS.min(seeds);
             let error_sources =
@@ -195,8 +204,8 @@ pub fn validate(
             conditions.add(&sample.condition);
             checks.iter_mut().for_each(|check| check.add_sample(&error_scale, &sample));
             if sample.index == 0 {
-                let exact = checks.iter().any(|check| check.has_exact_normals());
-                needs_directions = [sample.rigid.get().is_some(), exact];
+                needs_rigid_directions = sample.rigid.get().is_some();
+                needs_exact_directions = checks.iter().any(|check| check.has_exact_normals());
             }
         }
     }
@@ -232,6 +241,7 @@ impl<'a> VariantCheck<'a> {
         }
     }
 
+    /// Deforms to the state of a sample and adds the errors. Does nothing after a failure.
     fn add_sample(&mut self, error_scale: &ErrorScale, sample: &StateSample<'_>) {
         if self.fault.is_some() {
             return;
@@ -268,6 +278,7 @@ impl<'a> VariantCheck<'a> {
             self.steps =
                 self.steps.join(step_errors([positions, &self.surface.positions], [references, &sample.references]));
         }
+        // The buffer of the previous positions is reused for the next surface.
         let (mut positions, _) = self.previous.take().unwrap_or_default();
         std::mem::swap(&mut positions, &mut self.surface.positions);
         self.previous = Some((positions, Arc::clone(&sample.references)));
@@ -303,10 +314,11 @@ impl<'a> VariantCheck<'a> {
         if normals.is_empty() {
             return;
         }
-        let want = sample.directions(self.variant.scene().features.exact_normals);
+        let has_exact_normals = self.variant.scene().features.exact_normals;
+        let want = if has_exact_normals { sample.exact_directions() } else { sample.rigid_directions() };
         self.orientation.add_normals(normals, &want.normals);
         if sample.error_sources.is_some() && sample.scenes.exact.is_some() {
-            self.orientation.add_to_surface(normals, &sample.directions(true).normals);
+            self.orientation.add_normals_to_surface(normals, &sample.exact_directions().normals);
         }
         self.orientation.add_tangents(tangents, &want.tangents, normals);
     }
@@ -320,7 +332,10 @@ impl<'a> VariantCheck<'a> {
                 .push(format!("error of {of_bound:.3} times its a-priori bound, {not_finite} coordinates not finite"));
         }
         if orientation.broken > 0 {
-            faults.push(format!("{} normals or tangents are not unit vectors", orientation.broken));
+            faults.push(format!(
+                "{} normals or tangents are not finite, too short or of the wrong sign",
+                orientation.broken
+            ));
         }
         ValidationResult {
             errors,
@@ -401,6 +416,7 @@ mod tests {
     use modalcast_model::deform::Backend;
     use modalcast_model::scene::StorageType;
 
+    /// Validates the CPU deformer with `error` added to its last coordinate, at four random states and the trajectory.
     fn validate_cpu(kind: WorkloadKind, error: f32) -> (ValidationResult, ConditionNumbers) {
         let workload = kind.build(Size::Quick).expect("expected a load");
         let label = VariantLabel::new("cpu", Backend::Cpu, &workload.scene);
@@ -415,7 +431,7 @@ mod tests {
     fn cpu_passes_all_loads_and_fills_all_results() {
         let (found, condition) = validate_cpu(WorkloadKind::OneDomain { has_normal_map: true }, 0.0);
         assert!(found.passed() && found.repeatable, "{:?}", found.faults);
-        assert_eq!(found.errors.states, 4 + 24);
+        assert_eq!(found.errors.states, 4 + 24, "expected the random states and the steps of the trajectory");
         assert!(found.errors.meters.largest > 0.0 && found.errors.of_diagonal.largest < 1e-6, "{found:?}");
         assert!(found.step_meters.largest > 0.0 && found.step_meters.largest < 2e-6, "{found:?}");
         let normals = found.orientation.normals_degrees.expect("expected normals");

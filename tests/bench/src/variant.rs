@@ -115,7 +115,7 @@ impl Variant for DeformerVariant {
     }
 
     fn surface(&mut self, _state_index: usize, state: &SceneState) -> Result<&DeformedSurface> {
-        self.error_model.follow(state);
+        self.error_model.update_truncation(state);
         self.deformer.deform(state)?;
         self.deformer.surface()
     }

@@ -46,8 +46,8 @@ pub(super) struct Args {
     /// Measure only this variant, or all variants with this prefix: "variance 512*"; repeatable.
     #[arg(long = "variant", value_name = "GLOB")]
     variants: Vec<String>,
-    /// Size of still pictures in pixels [default: 640x360]; moving pictures have a quarter of it on each side. With
-    /// --figures the size of single pictures [default: 640x480].
+    /// Width and height of still pictures in pixels [default: 640x360]. Moving pictures have a quarter of the width and
+    /// of the height. With --figures, the size of each picture [default: 640x480].
     #[arg(long)]
     size: Option<FrameSize>,
     /// Frames per median, at least 20 [default: 100, 20 with --quick].
@@ -60,8 +60,8 @@ pub(super) struct Args {
     /// Draw the figures of the thesis's chapter 4.2 from our own scenes; nothing is measured.
     #[arg(long, conflicts_with_all = ["loads", "variants", "replays", "quick"])]
     figures: bool,
-    /// Measure only the CUDA rasterizer against OpenGL's minimal passes, on the loads, a room and two triangles that fill
-    /// the frame. Writes raster.json and raster.md. Needs an NVIDIA GPU.
+    /// Measure only the CUDA rasterizer against OpenGL's minimal passes, on the loads, a room and two triangles that
+    /// fill the frame. Writes raster.json and raster.md. Needs an NVIDIA GPU.
     #[arg(long, conflicts_with_all = ["variants", "figures", "scenes"])]
     raster: bool,
     /// A scene of your own, a path to a model or a scene folder; repeatable. With --figures, also draws a picture of
@@ -76,6 +76,7 @@ const DEFAULT_FIGURE_SIZE: FrameSize = FrameSize { width: 640, height: 480 };
 /// Maximum width and height of a picture in pixels, because the references trace 16 to 64 samples per pixel.
 const MAX_SIDE: u32 = 4096;
 
+/// Runs the report, or the measurement or drawing that an option selects instead.
 pub(super) fn run(args: &Args) -> Outcome {
     if args.figures {
         return run_figures(args);
@@ -124,14 +125,13 @@ fn run_frame_times(args: &Args) -> Outcome {
         size: size(args, DEFAULT_REPORT_SIZE)?,
         replays,
     };
-    let frame_times = with_spinner("measuring", || {
-        render::frame_times::time_scenes(&options, |what| tracing::info!(what, "timing"))
-    })?;
+    let log_progress = |what: &str| tracing::info!(what, "timing");
+    let frame_times = with_spinner("measuring", || render::frame_times::time_scenes(&options, log_progress))?;
     frame_times.write(&args.out)?;
     for scene in &frame_times.scenes {
-        let frame = scene.passes.iter().find(|pass| pass.name == "frame").map_or(0.0, |pass| pass.timing.median_us);
+        let frame_us = scene.passes.iter().find(|pass| pass.name == "frame").map_or(0.0, |pass| pass.timing.median_us);
         print_line(format!(
-            "{:<24}frame {frame:>12.1} us, with its pixels {:>12.1} us",
+            "{:<24}frame {frame_us:>12.1} us, with its pixels {:>12.1} us",
             scene.name, scene.wall_clock.median_us
         ));
     }
@@ -179,7 +179,7 @@ fn report_options(args: &Args) -> Result<RenderReportOptions> {
     }
 }
 
-/// Indices from 0 of the plants that a name selects; `None` when the name is no plant's.
+/// Indices from 0 of the plants that a name selects; `None` when the name selects no plant.
 fn plants_named(name: &str) -> Option<Vec<usize>> {
     if name == "plants" {
         return Some((0..PLANTS.len()).collect());
@@ -188,7 +188,9 @@ fn plants_named(name: &str) -> Option<Vec<usize>> {
     (1..=PLANTS.len()).contains(&number).then(|| vec![number - 1])
 }
 
+/// The report as lines of text: rows, readback, plants, minimal passes, rasterizers and failures.
 fn report_lines(report: &RenderReport) -> Vec<String> {
+    // "color" compares with hard shadows; "intended" to "bleeding" compare with the variant's intended result.
     let headings = ["frame us", "color", "intended", "light", "penumbra", "bleeding", "flicker", "passed"];
     let mut lines =
         vec![format!("{:<18}{:<40}{}", "load", "variant", headings.map(|word| format!("{word:>10}")).concat())];
@@ -214,7 +216,7 @@ fn report_lines(report: &RenderReport) -> Vec<String> {
     lines.extend(report.readback.iter().map(|row| {
         let (load, unread_fps, ring_fps, ring_loss) = (&row.load, row.unread_fps, row.ring_fps, row.ring_loss);
         format!(
-            "{load:<18}{unread_fps:.1} frames/s when none is read, {ring_fps:.1} when each is: {ring_loss:.1} % fewer"
+            "{load:<18}{unread_fps:.1} frames/s without readback, {ring_fps:.1} with readback: {ring_loss:.1} % fewer"
         )
     }));
     for plant in &report.plants {
@@ -270,6 +272,7 @@ mod tests {
             (RenderWorkload::all(true).len(), 12, 20)
         );
         let plant_args = Args { loads: ["plant-3", "square", "plants"].map(String::from).to_vec(), ..args() };
+        // The twelve plants and once more plant-3, whose index is 2.
         let options = report_options(&plant_args).expect("valid options");
         assert_eq!((options.loads.len(), options.plants.len(), options.plants[0]), (1, 13, 2));
         let named_args = Args { loads: vec!["square".into(), "triangles-10".into()], replays: Some(7), ..args() };
@@ -277,7 +280,7 @@ mod tests {
             report_options(&named_args).expect("valid options").loads,
             [RenderWorkload::Square, RenderWorkload::Triangles(10)]
         );
-        // A quick run also includes the frame that the minimal passes are compared with, if it is named.
+        // A quick run also includes variants that are named in full.
         let variants = ["variance 4096, blur 1.5", "culling*"].map(String::from).to_vec();
         let selected_variants =
             report_options(&Args { variants, ..args() }).expect("valid options").selected_variants();

@@ -13,7 +13,7 @@ pub(super) struct Axis {
 
 /// Margin beyond the smallest and largest value, decades.
 const VALUE_MARGIN: f64 = 0.25;
-/// Minimum length of an axis, decades.
+/// Minimum length of an axis, decades, so that an axis has at least three ticks.
 const MIN_SPAN: f64 = 1.2;
 
 impl Axis {
@@ -45,7 +45,9 @@ impl Axis {
     /// Tick values: powers of ten. Short axes also have ticks at 2 and 5 times each power; long axes skip powers.
     pub(super) fn ticks(&self) -> Vec<f64> {
         let span = self.max_log - self.min_log;
+        // Up to 2.2 decades have at most seven ticks with these multiples.
         let multiples: &[f64] = if span < 2.2 { &[1.0, 2.0, 5.0] } else { &[1.0] };
+        // An axis with powers of ten only has about seven ticks.
         let decade_step = (span / 7.0).ceil().max(1.0) as i32;
         let decades = (self.min_log.floor() as i32)..=(self.max_log.ceil() as i32);
         let decades = decades.filter(|decade| decade.rem_euclid(decade_step) == 0);
@@ -57,7 +59,8 @@ impl Axis {
     }
 }
 
-/// Formats microseconds with a suitable unit.
+/// Formats microseconds with a suitable unit. The limits are slightly below powers of ten, so that a tick at 1 ms
+/// appears as such despite its rounding error.
 pub(super) fn format_time(us: f64) -> String {
     let (value, unit) = match us {
         us if us < 0.999 => (us * 1e3, "ns"),

@@ -9,7 +9,7 @@ pub(super) mod panel;
 use std::fmt::Write as _;
 
 use super::DeformReport;
-use super::cuda_variants::is_partial;
+use super::cuda_variants::is_partial_step;
 use super::table::DeformRow;
 use super::timing::CacheState;
 use modalcast_model::deform::Backend;
@@ -18,7 +18,7 @@ use panel::{MarkerStyle, Panel, Point};
 
 /// Pixels of the PNG per unit of the SVG.
 const SCALE: f32 = 2.0;
-/// Width and height of a panel.
+/// Width and height of a panel. All lengths are in SVG units.
 pub(super) const PANEL_SIZE: (f64, f64) = (440.0, 320.0);
 /// Outer margin of the plot.
 pub(super) const MARGIN: f64 = 24.0;
@@ -113,7 +113,7 @@ pub fn render_png(svg: &str) -> Result<Vec<u8>> {
 fn row_point(row: &DeformRow) -> Option<Point<'_>> {
     let is_filled = row.cache == CacheState::Warm;
     let (time_us, error) = row.time_and_error()?;
-    Some(Point { name: &row.name, time_us, error, is_filled, is_candidate: is_filled && !is_partial(&row.name) })
+    Some(Point { name: &row.name, time_us, error, is_filled, is_candidate: is_filled && !is_partial_step(&row.name) })
 }
 
 /// Each variant once with its backend, in the order of the rows.
@@ -127,6 +127,7 @@ fn list_variants(rows: &[DeformRow]) -> Vec<(&str, Backend)> {
     variants
 }
 
+/// The marker of a variant: a color per variant, which repeats after [`COLORS`] with another shape.
 fn marker_style(variants: &[(&str, Backend)], name: &str) -> MarkerStyle {
     let index = variants.iter().position(|(variant, _)| *variant == name).unwrap_or(0);
     let backend = variants.get(index).map_or(Backend::Cpu, |(_, backend)| *backend);
@@ -194,6 +195,7 @@ mod tests {
 
     #[test]
     fn thirty_six_cuda_variants_have_distinct_markers() {
+        // Twelve colors, each with three shapes.
         let names: Vec<String> = (0..36).map(|index| index.to_string()).collect();
         let variants: Vec<(&str, Backend)> = names.iter().map(|name| (name.as_str(), Backend::Cuda)).collect();
         let styles: Vec<MarkerStyle> = names.iter().map(|name| marker_style(&variants, name)).collect();

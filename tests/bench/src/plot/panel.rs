@@ -7,7 +7,7 @@ use super::{PANEL_SIZE, write_text};
 use crate::table::pareto_front;
 use modalcast_model::deform::Backend;
 
-/// Margins of the plotted area for axis labels and the title.
+/// Margins of the plotted area for axis labels and the title, SVG units.
 const LEFT_MARGIN: f64 = 66.0;
 const RIGHT_MARGIN: f64 = 18.0;
 const TOP_MARGIN: f64 = 34.0;
@@ -15,7 +15,7 @@ const BOTTOM_MARGIN: f64 = 52.0;
 /// Font size of point labels.
 const LABEL_SIZE: f64 = 11.0;
 
-/// A rectangle in pixels, with y downwards.
+/// A rectangle in SVG units, with y downwards.
 #[derive(Debug, Clone, Copy)]
 struct Rectangle {
     x: f64,
@@ -46,10 +46,11 @@ pub(crate) struct Point<'a> {
     pub(crate) name: &'a str,
     /// Median time, microseconds.
     pub(crate) time_us: f64,
+    /// Error in the unit of the y axis.
     pub(crate) error: f64,
-    /// Whether its marker is filled; filled markers are drawn on top.
+    /// Whether the marker is filled; filled markers are drawn on top.
     pub(crate) is_filled: bool,
-    /// Whether it is a candidate for the Pareto front.
+    /// Whether the point may be on the Pareto front.
     pub(crate) is_candidate: bool,
 }
 
@@ -70,6 +71,7 @@ impl<'a> Panel<'a> {
         let x_range = (corner.0 + LEFT_MARGIN, corner.0 + PANEL_SIZE.0 - RIGHT_MARGIN);
         // The smallest error is at the bottom.
         let y_range = (corner.1 + PANEL_SIZE.1 - BOTTOM_MARGIN, corner.1 + TOP_MARGIN);
+        // The ranges (1 us to 1 ms, 1e-8 to 1e-6) are those of a panel without points.
         let time_axis = Axis::new(points.iter().map(|point| point.time_us), (1.0, 1e3), x_range);
         let error_axis = Axis::new(points.iter().map(|point| point.error), (1e-8, 1e-6), y_range);
         Self { corner, title, axis_labels, points, time_axis, error_axis }
@@ -184,6 +186,7 @@ impl<'a> Panel<'a> {
         front: &[usize],
         marker_style: &impl Fn(&str) -> MarkerStyle,
     ) {
+        // Areas of markers and of the labels drawn so far.
         let mut occupied: Vec<Rectangle> =
             positions.iter().map(|(x, y)| Rectangle { x: x - 7.0, y: y - 7.0, width: 14.0, height: 14.0 }).collect();
         let has_few_points = self.points.len() <= 8;
@@ -225,7 +228,7 @@ impl<'a> Panel<'a> {
     }
 }
 
-/// Approximate width of a text in `DejaVu Sans`.
+/// Approximate width of a text in `DejaVu Sans`, whose letters are 0.61 of the font size wide on average.
 pub(crate) fn text_width(text: &str, font_size: f64) -> f64 {
     0.61 * font_size * text.chars().count() as f64
 }
@@ -270,6 +273,7 @@ mod tests {
 
     #[test]
     fn front_has_only_candidates_and_labels_do_not_overlap() {
+        // Arguments: name, is_filled, is_candidate, time_us, error.
         let point =
             |name, is_filled, is_candidate, time_us, error| Point { name, time_us, error, is_filled, is_candidate };
         let points = vec![

@@ -7,9 +7,10 @@ use super::patch::{PatchSpec, PatchTopology, QUICK_DIVISOR, build_patch_scene, b
 use super::{Size, Workload, WorkloadKind, plant};
 use modalcast_model::error::Result;
 
-/// Builds a workload of any kind.
+/// Builds a workload of any kind. Plants are built in [`plant`].
 pub(super) fn build(kind: WorkloadKind, size: Size) -> Result<Workload> {
     let reduce_if_quick = |number: usize| if size == Size::Quick { number.div_ceil(QUICK_DIVISOR) } else { number };
+    // The patch of a workload with one domain. It has one corner per vertex.
     let sheet_patch = |vertices, rank| PatchSpec {
         vertices,
         rank,
@@ -18,6 +19,7 @@ pub(super) fn build(kind: WorkloadKind, size: Size) -> Result<Workload> {
         size: 1.0,
         seed: part_seed(&kind.name(), 0),
     };
+    // Workloads that measure positions only have no more corners than a mesh needs.
     let with_one_triangle =
         |patch: PatchSpec| PatchSpec { corners: 3, triangles: PatchTopology::SingleTriangle, ..patch };
     let (patches, has_normal_map) = match kind {
@@ -50,7 +52,7 @@ pub(super) fn build(kind: WorkloadKind, size: Size) -> Result<Workload> {
     Ok(Workload { is_paired, remarks, ..Workload::new(kind.name(), scene) })
 }
 
-/// `count` patches. `random_size` returns the number of vertices and the rank of one.
+/// `count` patches. `random_size` returns the number of vertices and the rank of a patch.
 fn random_patches(
     kind: WorkloadKind,
     count: usize,
@@ -64,8 +66,8 @@ fn random_patches(
     (0..count).map(patch).collect()
 }
 
-/// Rank 0 to 64, 17 on average. With x uniform in [0, 1), 65 x^p has the mean 65 / (p + 1), here 17.5, and rounding down
-/// subtracts one half on average.
+/// Rank 0 to 64, 17 on average. With x uniform in [0, 1), 65 x^p has the mean 65 / (p + 1), here 17.5, and rounding
+/// down subtracts one half on average.
 fn mixed_rank(rng: &mut Rng) -> usize {
     (65.0 * rng.f64().powf(65.0 / 17.5 - 1.0)) as usize
 }
@@ -100,6 +102,7 @@ mod tests {
     fn workload_a_has_tangents_unless_named_a_positions() {
         let build_scene = |kind: WorkloadKind| kind.build(Size::Quick).expect("a workload").scene;
         let scene = build_scene(WorkloadKind::OneDomain { has_normal_map: true });
+        // 1.5 M vertices divided by QUICK_DIVISOR.
         assert!(scene.features.normal_maps && scene.layout.corners == 30_000 && scene.layout.vertices == 30_000);
         assert!(scene.layout.triangles > 59_000, "expected two triangles per cell, got {}", scene.layout.triangles);
         let positions_only = build_scene(WorkloadKind::OneDomain { has_normal_map: false });

@@ -12,8 +12,8 @@
 //! | `plant-1` to `plant-12` | the plants of table 4.5 |
 //! | `plant-1-follows` to `plant-12-follows` | the same plants; leaves follow branches, so only branches have a T |
 //!
-//! `single`, `plants` and `follows` select all workloads of a group. `all` selects all workloads, but of `follows` only the
-//! plant with the most domains.
+//! `single`, `plants` and `follows` select all workloads of a group. `all` selects all workloads, but of `follows` only
+//! the plant with the most domains.
 
 mod build;
 mod patch;
@@ -37,16 +37,13 @@ pub enum Size {
 /// Identifies a synthetic scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WorkloadKind {
-    /// 2^power vertices, `rank` modes.
-    Single {
-        power: u32,
-        rank: usize,
-    },
+    /// One domain of 2^power vertices and `rank` modes.
+    Single { power: u32, rank: usize },
     /// One large domain; with normals and tangents if it has a normal map.
-    OneDomain {
-        has_normal_map: bool,
-    },
+    OneDomain { has_normal_map: bool },
+    /// 1,000 domains of 1,500 vertices.
     ManyDomains,
+    /// 200,000 domains of 7 vertices.
     TinyDomains,
     /// One domain whose modes nearly cancel in pairs.
     Cancelling,
@@ -63,12 +60,12 @@ pub enum WorkloadKind {
 pub struct Workload {
     pub name: String,
     pub scene: Arc<Scene>,
-    /// Batching in the CUDA deformer.
+    /// Whether the CUDA deformer batches domains that share a U.
     pub batches: BatchPolicy,
     /// Whether modes 2k and 2k + 1 are nearly equal, so that opposite coordinates nearly cancel.
     pub is_paired: bool,
     /// Index into the thesis's plants, if the scene is one of them.
-    pub species: Option<usize>,
+    pub thesis_plant: Option<usize>,
     /// Deviations from the size that the name states.
     pub remarks: Vec<String>,
 }
@@ -76,7 +73,7 @@ pub struct Workload {
 impl Workload {
     /// A workload with the default batching, without paired modes and remarks.
     pub fn new(name: String, scene: Arc<Scene>) -> Self {
-        Self { name, scene, batches: BatchPolicy::default(), is_paired: false, species: None, remarks: Vec::new() }
+        Self { name, scene, batches: BatchPolicy::default(), is_paired: false, thesis_plant: None, remarks: Vec::new() }
     }
 }
 
@@ -98,6 +95,7 @@ impl WorkloadKind {
         kinds
     }
 
+    /// All workloads of table 4.4.
     fn singles() -> Vec<Self> {
         RANKS.iter().flat_map(|rank| POWERS.map(|power| Self::Single { power, rank: *rank })).collect()
     }
@@ -178,6 +176,7 @@ mod tests {
         for kind in WorkloadKind::all() {
             assert_eq!(WorkloadKind::parse(&kind.name()), Ok(vec![kind]));
         }
+        // Twelve plants; five powers times three ranks.
         assert_eq!(WorkloadKind::parse("plants").map(|list| list.len()), Ok(12));
         assert_eq!(WorkloadKind::parse("follows").map(|list| list.len()), Ok(12));
         assert_eq!(WorkloadKind::parse("single").map(|list| list.len()), Ok(15));

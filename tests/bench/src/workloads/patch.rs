@@ -23,6 +23,7 @@ pub(super) struct PatchSpec {
     pub(super) triangles: PatchTopology,
     /// Edge length of the patch, scene units.
     pub(super) size: f32,
+    /// Seed of the positions and modes.
     pub(super) seed: u64,
 }
 
@@ -75,6 +76,7 @@ pub(super) fn build_shape(patch: &PatchSpec, is_paired: bool) -> Result<Shape> {
 
 /// Triangles as indices of corners. `columns`: vertices per row of the grid.
 fn patch_triangles(patch: &PatchSpec, columns: usize) -> Vec<[u32; 3]> {
+    // Indices are taken modulo `corners`: a patch may have fewer than three corners, and a strip may start again.
     let corners = patch.corners as u32;
     match patch.triangles {
         PatchTopology::SingleTriangle => vec![[0, 1 % corners, 2 % corners]],
@@ -106,8 +108,8 @@ fn patch_triangles(patch: &PatchSpec, columns: usize) -> Vec<[u32; 3]> {
     }
 }
 
-/// Modes with entries uniform in [-1, 1). If `is_paired`, each odd column equals its left neighbor up to a relative
-/// difference of at most 5e-5.
+/// Modes with entries uniform in [-1, 1); every column has its own seed. If `is_paired`, each odd column equals its
+/// left neighbor up to a relative difference of at most 5e-5.
 fn random_modes(patch: &PatchSpec, is_paired: bool) -> Result<Modes> {
     let rows = 3 * patch.vertices;
     if patch.rank == 0 {
@@ -137,8 +139,10 @@ pub(super) fn build_patch_scene(
     count: usize,
     has_normal_map: bool,
 ) -> Result<std::sync::Arc<Scene>> {
+    // No patch has this index.
     let mut rng = Rng::with_seed(part_seed(&name, usize::MAX));
     let side = (count as f64).cbrt().ceil() as usize;
+    // Patches of several domains have edges of at most 0.1.
     let spacing = if count > 1 { 0.15 } else { 0.0 };
     let domain = |index: usize| {
         let position = [index % side, index / side % side, index / side / side].map(|cell| cell as f64 * spacing);
@@ -151,12 +155,14 @@ pub(super) fn build_patch_scene(
     let domains = (0..count).map(domain).collect();
     let mut parts = SceneParts::named(name);
     if has_normal_map {
+        // RGBA of the undisturbed normal (0, 0, 1).
         parts.textures = vec![Texture::new("flat", 1, 1, vec![128, 128, 255, 255])?];
     }
     parts.materials = vec![Material { normal_texture: has_normal_map.then_some(0), ..Material::default() }];
     Scene::new(SceneParts { shapes, domains, rigid_transforms: true, ..parts })
 }
 
+/// A rotation by three random Euler angles.
 fn random_rotation(rng: &mut Rng) -> Rotation3<f64> {
     let angle = |rng: &mut Rng| std::f64::consts::TAU * rng.f64();
     Rotation3::from_euler_angles(angle(rng), angle(rng), angle(rng))

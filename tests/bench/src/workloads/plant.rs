@@ -1,5 +1,5 @@
-//! Builds the plants of table 4.5 with arbitrary shapes. The counts are those of the table: v, f (triangles), d (domains),
-//! d' (domains with modes), number of modes, and u.
+//! Builds the plants of table 4.5 with arbitrary shapes. The counts are those of the table: v, f (triangles), d
+//! (domains), d' (domains with modes), number of modes, and u.
 //!
 //! u counts the rows of all U: three per vertex with modes. v counts the render vertices, which are a different set.
 //! Domains with modes are branches. They have u / 3 vertices in total; their render vertices are corners that are
@@ -18,7 +18,7 @@ use modalcast_model::scene::Scene;
 
 /// Maximum number of render vertices of a leaf. A leaf has fewer if the plant's total is too small.
 const MAX_LEAF_VERTICES: usize = 4;
-/// Maximum number of triangles of a leaf, with the same exception.
+/// Maximum number of triangles of a leaf. A leaf has fewer if the plant's total is too small.
 const MAX_LEAF_TRIANGLES: usize = 2;
 
 /// Builds plant `index` of the thesis.
@@ -29,7 +29,11 @@ pub(super) fn build_plant(index: usize, size: Size) -> Result<Workload> {
     let shapes = patches.par_iter().map(|patch| build_shape(patch, false)).collect::<Result<Vec<_>>>()?;
     let name = format!("plant-{}", index + 1);
     let scene = build_patch_scene(name.clone(), shapes, counts.domains, false)?;
-    Ok(Workload { species: Some(index), remarks: describe_counts(&table_row, &counts), ..Workload::new(name, scene) })
+    Ok(Workload {
+        thesis_plant: Some(index),
+        remarks: describe_counts(&table_row, &counts),
+        ..Workload::new(name, scene)
+    })
 }
 
 /// The same plant with its leaves distributed over its branches. Each leaf follows a branch and keeps its placement at
@@ -53,7 +57,7 @@ pub(super) fn build_following_plant(index: usize, size: Size) -> Result<Workload
     remarks
         .push(format!("{leaf_count} leaves follow {branch_count} branches: {} bytes of T per step", 48 * branch_count));
     // Not comparable with the thesis, which sends a transform for every leaf.
-    Ok(Workload { name, scene: Scene::new(parts)?, species: None, remarks, ..workload })
+    Ok(Workload { name, scene: Scene::new(parts)?, thesis_plant: None, remarks, ..workload })
 }
 
 /// All counts divided by [`QUICK_DIVISOR`], but not below the minimum that the domains need.
@@ -64,9 +68,10 @@ fn reduce_counts(table_row: &ThesisPlant) -> ThesisPlant {
     ThesisPlant {
         deformable,
         domains,
-        vertices: reduce(table_row.vertices, 4 * domains),
-        faces: reduce(table_row.faces, 2 * domains),
+        vertices: reduce(table_row.vertices, MAX_LEAF_VERTICES * domains),
+        faces: reduce(table_row.faces, MAX_LEAF_TRIANGLES * domains),
         modes: reduce(table_row.modes, deformable),
+        // Three vertices per branch, with three rows each.
         rows: reduce(table_row.rows, 9 * deformable),
         ..*table_row
     }
@@ -94,7 +99,8 @@ fn describe_counts(table_row: &ThesisPlant, counts: &ThesisPlant) -> Vec<String>
     remarks
 }
 
-/// Render vertices and triangles of one leaf: all leaves together get at most four fifths of the plant's.
+/// Numbers of render vertices and triangles of one leaf. All leaves together have at most four fifths of those of the
+/// plant, unless a leaf would then have none.
 fn leaf_size(counts: &ThesisPlant) -> (usize, usize) {
     let leaves = counts.domains - counts.deformable;
     let leaf_share = |total: usize, maximum: usize| (4 * total / 5).checked_div(leaves).unwrap_or(0).clamp(1, maximum);
@@ -193,7 +199,7 @@ mod tests {
                     domain.placement.0.iter().zip(follower.placement.0).map(|(entry, other)| (entry - other).abs());
                 assert!(differences.fold(0.0, f32::max) < 1e-5, "{}", domain.name);
             }
-            assert!(!following.scene.features.shear && following.species.is_none());
+            assert!(!following.scene.features.shear && following.thesis_plant.is_none());
         }
     }
 
@@ -202,6 +208,7 @@ mod tests {
         for (index, plant) in PLANTS.iter().enumerate() {
             let workload = build_plant(index, Size::Quick).expect("a plant");
             assert!(count_contents(&workload).iter().all(|count| *count > 0), "{}", workload.name);
+            // Far fewer than the rows / 3 vertices that the branches of a full plant have.
             assert!(workload.scene.layout.vertices <= plant.rows / 20, "{}", workload.name);
             assert!(workload.remarks.iter().any(|remark| remark.contains("quick")), "{:?}", workload.remarks);
         }
