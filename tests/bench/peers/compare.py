@@ -1,4 +1,6 @@
-"""Writes the times of both programs to peers.json, and images: ours, that of the peer, and four times the difference."""
+"""Compares the two programs. Writes their times to peers.json, and an image per scene with three parts side by side: the
+frame of modalcast, the frame of the peer, and four times their difference.
+"""
 
 import json
 import struct
@@ -12,7 +14,7 @@ from mesh import write_png
 
 
 def read_png(path):
-    """An RGB PNG of 8 bits without interlacing, as both programs write it."""
+    """Decodes an 8-bit RGB PNG without interlacing, as both programs write it."""
     data, offset, compressed = Path(path).read_bytes(), 8, b""
     while offset < len(data):
         length, kind = struct.unpack(">I4s", data[offset : offset + 8])
@@ -33,7 +35,10 @@ def read_png(path):
 
 
 def undo_filter(filter_type, line, above):
-    """Reverses the PNG filter of one row; `above` is the unfiltered row above it."""
+    """Reverses the PNG filter of one row; `above` is the unfiltered row above it.
+
+    Filter types: 0 none, 1 left neighbor, 2 row above, 3 mean of both, 4 Paeth.
+    """
     if filter_type == 0:
         return line
     if filter_type == 2:
@@ -54,11 +59,12 @@ def undo_filter(filter_type, line, above):
 
 
 def median_round(timings):
-    """The timing of the round with the median of the medians."""
+    """The timing of the round whose median time is the median of all rounds."""
     return sorted(timings, key=lambda timing: timing["median_us"])[len(timings) // 2]
 
 
 def main(out, folders):
+    """Compares the rounds in `folders`, one folder each. The images are those of the last round."""
     out, rounds = Path(out), []
     for folder in map(Path, folders):
         rounds.append(tuple(json.loads((folder / name).read_text()) for name in ("times.json", "peer.json")))

@@ -15,12 +15,13 @@ import numpy as np
 
 from mesh import build_mesh, image, write_png
 
-BLUR_RADIUS = 5  # texels on each side of the center, for a standard deviation of 1.5 texels as in modalcast
+BLUR_RADIUS = 5  # texels on each side of the center: over three times the standard deviation of 1.5 texels in modalcast
 
 DEPTH = """#version 430
 uniform mat4 map_from_world; in vec3 position;
 void main() { gl_Position = map_from_world * vec4(position, 1.0); }"""
 EMPTY = "#version 430\nvoid main() {}"
+# Moments of the depth relative to 0.5, which lose less precision than those of the depth itself.
 MOMENTS = "#version 430\nout vec2 moments; void main() { float m = gl_FragCoord.z - 0.5; moments = vec2(m, m * m); }"
 FULL_SCREEN = """#version 430
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }"""
@@ -80,7 +81,10 @@ float sun_visibility(vec3 map_position, float cosine) {
 
 
 def light_box(points, to_sun, size):
-    """An orthographic matrix whose box contains all points, and the width of a texel as a fraction of its depth range."""
+    """An orthographic matrix whose box contains all points, and the width of a texel as a fraction of the box's depth.
+
+    `size` is the width of the shadow map in texels.
+    """
     z = to_sun / np.linalg.norm(to_sun)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
@@ -94,6 +98,7 @@ def light_box(points, to_sun, size):
 
 
 def srgb(colour):
+    """The sRGB encoding of a linear color."""
     return [12.92 * c if c <= 0.0031308 else 1.055 * c ** (1 / 2.4) - 0.055 for c in colour]
 
 
@@ -105,16 +110,15 @@ class Peer:
         look, shadow = scene["look"], scene["look"]["shadow"]
         points, normals, uvs, triangles = build_mesh()
         box, texel = light_box(points, np.array(scene["to_sun"]), shadow["size"])
-        clip = np.array(scene["clip_from_world"]).reshape(4, 4)
         self.clear = srgb(look["horizon"])
         index = gl.buffer(triangles.astype("u4").tobytes())
         position = gl.buffer(points.astype("f4").tobytes())
-        rest = gl.buffer(np.concatenate([normals, uvs], axis=1).astype("f4").tobytes())
+        attributes = gl.buffer(np.concatenate([normals, uvs], axis=1).astype("f4").tobytes())
         variance = self.method == "variance"
         depth = gl.program(vertex_shader=DEPTH, fragment_shader=MOMENTS if variance else EMPTY)
         paint = gl.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT % SUN_VISIBILITY[self.method])
         self.casters = gl.vertex_array(depth, [(position, "3f", "position")], index)
-        self.surfaces = gl.vertex_array(paint, [(position, "3f", "position"), (rest, "3f 2f", "normal", "uv")], index)
+        self.surfaces = gl.vertex_array(paint, [(position, "3f", "position"), (attributes, "3f 2f", "normal", "uv")], index)
         side = (shadow["size"], shadow["size"])
         self.depth = gl.depth_texture(side)
         self.depth.compare_func, self.depth.repeat_x, self.depth.repeat_y = "<=", False, False
@@ -123,6 +127,7 @@ class Peer:
         if variance:
             self.map, self.blur_target = gl.texture(side, 2, dtype="f4"), gl.texture(side, 2, dtype="f4")
             self.map.repeat_x = self.map.repeat_y = False
+            # Targets of the shadow map, of its horizontal blur and of its vertical blur.
             self.framebuffers = [gl.framebuffer([self.map], self.depth), gl.framebuffer([self.blur_target]), gl.framebuffer([self.map])]
             weights = np.exp(-0.5 * (np.arange(-BLUR_RADIUS, BLUR_RADIUS + 1) / shadow["blur"]) ** 2)
             self.blur = gl.program(vertex_shader=FULL_SCREEN, fragment_shader=BLUR)
@@ -131,17 +136,20 @@ class Peer:
         else:
             self.framebuffers = [gl.framebuffer(depth_attachment=self.depth)]
         cloth = image()
+        # 0x8C41 is GL_SRGB8.
         self.cloth = gl.texture(cloth.shape[1::-1], 3, cloth.tobytes(), alignment=1, internal_format=0x8C41)
         self.cloth.build_mipmaps()
         self.cloth.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
         samples = scene["samples"]
         self.frame = gl.framebuffer([gl.renderbuffer(size, 4, samples=samples)], gl.depth_renderbuffer(size, samples=samples))
         self.resolved = gl.framebuffer([gl.renderbuffer(size, 4)])
-        column = lambda matrix: tuple(matrix.T.ravel())
-        depth["map_from_world"].value = column(box)
+        column_major = lambda matrix: tuple(matrix.T.ravel())
+        depth["map_from_world"].value = column_major(box)
+        # Width of a texel in units of depth, minimum variance, light bleeding reduction, unused.
         limits = (texel, max(shadow["least_variance"], 1e-6), shadow["bleeding"], 0.0)
+        # Both matrices are in column-major order.
         uniforms = {
-            "clip_from_world": tuple(clip.ravel()), "map_from_world": column(box), "eye": scene["eye"],
+            "clip_from_world": tuple(scene["clip_from_world"]), "map_from_world": column_major(box), "eye": scene["eye"],
             "to_sun": scene["to_sun"], "sunlight": look["sunlight"], "skylight": look["skylight"],
             "limits": limits, "cloth": 0, "map": 1,
         }
@@ -154,6 +162,7 @@ class Peer:
         gl = self.gl
         gl.enable_only(moderngl.DEPTH_TEST)
         self.framebuffers[0].use()
+        # The moments of the far plane: 1 - 0.5, and its square.
         self.framebuffers[0].clear(0.5, 0.25, depth=1.0)
         self.casters.render()
         if self.blur_target:
@@ -173,15 +182,18 @@ class Peer:
         gl.copy_framebuffer(self.resolved, self.frame)
 
     def pixels(self):
+        """Reads the RGBA pixels of the last frame, bottom row first."""
         return self.resolved.read(components=4, alignment=1)
 
 
 def quartiles(times):
+    """Median and quartiles of times in microseconds."""
     q1, median, q3 = np.percentile(times, [25, 50, 75])
     return {"median_us": median, "q1_us": q1, "q3_us": q3, "replays": len(times)}
 
 
 def measure(peer, replays):
+    """Times frames with their pixels in host memory, after three frames that are not timed."""
     times = []
     for _ in range(3):
         peer.draw()

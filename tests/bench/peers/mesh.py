@@ -1,6 +1,7 @@
-"""The scene that both programs draw: a field of hills, a knot above it, one image; OBJ, MTL, PNG and two scene files.
+"""Builds the scene that both programs draw: a field of hills, a knot above it, and one image for both.
 
-Both programs read these files, so that both draw the same triangles in the same order.
+Writes it as OBJ, MTL, PNG and two scene files for modalcast. The peer calls `build_mesh` and `image`, so that both programs
+draw the same triangles in the same order.
 """
 
 import struct
@@ -12,7 +13,7 @@ import numpy as np
 
 FIELD = 320  # cells along each side of the field
 KNOT = (900, 40)  # cells along the knot and around it
-IMAGE = 512
+IMAGE = 512  # width and height in pixels
 
 LOOK = """model = 'mesh.obj'
 ground = false
@@ -31,7 +32,7 @@ SHADOWS = {
 
 
 def grid(points, rows, columns):
-    """Two triangles for each cell of a grid of points, and normals by area."""
+    """Two triangles for each cell of a grid of points, and area-weighted vertex normals."""
     index = lambda row, column: row * (columns + 1) + column
     row, column = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
     a, b, c, d = index(row, column), index(row, column + 1), index(row + 1, column + 1), index(row + 1, column)
@@ -46,6 +47,7 @@ def grid(points, rows, columns):
 
 
 def hills():
+    """Positions, normals, texture coordinates and triangles of the field."""
     v, u = np.meshgrid(np.linspace(0, 1, FIELD + 1), np.linspace(0, 1, FIELD + 1), indexing="ij")
     x, z = 6 * (u - 0.5), 6 * (v - 0.5)
     y = 0.16 * np.sin(2.1 * x + 1.3 * z) + 0.11 * np.sin(3.1 * z - 1.7 * x) + 0.02 * np.sin(9 * x + 7 * z)
@@ -55,6 +57,7 @@ def hills():
 
 
 def knot():
+    """Positions, normals, texture coordinates and triangles of the knot: a tube along a trefoil curve."""
     segments, sides = KNOT
     t = np.linspace(0, 2 * np.pi, segments + 1)
     curve = lambda t: np.stack(
@@ -76,6 +79,7 @@ def knot():
 
 
 def image():
+    """The RGB image of the cloth, which repeats without seams."""
     v, u = np.meshgrid((np.arange(IMAGE) + 0.5) / IMAGE, (np.arange(IMAGE) + 0.5) / IMAGE, indexing="ij")
     wave = lambda periods: 0.5 + 0.5 * np.sin(2 * np.pi * periods)
     light = 0.45 + 0.4 * wave(4 * u + wave(2 * v)) * wave(4 * v + wave(2 * u)) + 0.15 * wave(32 * u) * wave(32 * v)
@@ -84,6 +88,7 @@ def image():
 
 
 def write_png(path, rgb):
+    """Writes an 8-bit RGB array of shape (height, width, 3)."""
     height, width, _ = rgb.shape
     rows = np.concatenate([np.zeros((height, 1), np.uint8), rgb.reshape(height, -1)], axis=1).tobytes()
     chunk = lambda kind, data: struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -104,6 +109,7 @@ def build_mesh():
 
 
 def write(folder):
+    """Writes all files of the scene."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     points, normals, uvs, triangles = build_mesh()

@@ -9,8 +9,8 @@ use modalcast_model::scene::{Scene, StorageType};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Operand {
     pub name: &'static str,
-    /// Formula of the bytes. n is vertices, f triangles, c corners, r modes, d domains, C chunks of K modes, and Q quads:
-    /// groups of four vertices.
+    /// Formula of the bytes. n is vertices, f triangles, c corners, r modes, d domains, C chunks of K modes, and Q quads
+    /// (groups of four vertices).
     pub formula: &'static str,
     pub bytes: u64,
 }
