@@ -3,23 +3,26 @@
 //   rest            x0, [quads][12] f32: 4 x, 4 y, 4 z                                                   (in)
 //   transforms      [BATCH_SIZE][3] float4: the rows of T; zeros where there is no domain                (in)
 //   inverse_scales  [BATCH_SIZE] f32: powers of two that undo the scaling of q                           (in)
-//   split_q         q as two 16-bit numbers each, [steps][BATCH_SIZE / 8][32 lanes] words of 16 bytes: for
-//                   vector lane / 4 the modes 2 (lane % 4) + {0, 1} and + {8, 9} of the step, first the
-//                   rounded q, then the rounded remainder                                                (in)
+//   split_q         every coordinate as a pair of 16-bit numbers: the rounded coordinate, and the rounded
+//                   remainder. [steps][BATCH_SIZE / 8][32 lanes] words of 16 bytes. The word of a lane
+//                   belongs to domain lane / 4 of the group of 8, and to the modes 2 (lane % 4) + {0, 1, 8, 9}
+//                   of the step; first the four rounded coordinates, then the four remainders            (in)
 //   positions       [vertices][3] f32; domain b begins at vertex `first_vertices[b]`                     (out)
 // Launch: one block of WARPS warps per tile (tests/bench/src/kernels/batch_mma.rs). CPU twin: the tests of that file.
 //
-// The result is not bit-identical to `deform`: q has 22 bits (f16) or 16 bits (bf16), and a tensor core sums the 16
-// products of a step in an order and with a rounding of its own. The a-priori bound covers both. Overflowing values are
-// not recomputed.
+// The sum over all modes takes steps of 16 modes, with one matrix product (mma.m16n8k16) per step.
 //
-// Design. The U of a quad and a chunk has 12 rows (axis, vertex) of two modes. For mma.m16n8k16, a lane provides rows g
-// and g + 8 at columns 2 t + {0, 1} and 2 t + {8, 9}, with g = lane / 4 and t = lane % 4. Rows and modes may be assigned
-// to these indices in any way. Here a lane takes quad g and chunks t and t + 4. It loads them with six loads of 16 bytes,
-// in whole lines of 128 bytes, and forms the fragments of six products with two byte permutations per register. U does
-// not pass through shared memory. A lane receives all 12 sums of quad g for a quarter of the domains, so it computes the
-// positions of whole vertices. The sums of 16 domains, two steps of U, and q take 160 registers. This allows 12 warps per
-// multiprocessor, with 72 KB in flight.
+// The result is not bit-identical to that of `deform`: q has 22 bits (f16) or 16 bits (bf16), and a tensor core sums the
+// 16 products of a step in its own order and with its own rounding. The a-priori error bound covers both. Unlike `deform`,
+// this kernel does not recompute overflowing sums in f64.
+//
+// Design. The U of a quad (four vertices) and a chunk (two modes) has 12 rows (axis, vertex) and two columns. For
+// mma.m16n8k16, a lane provides rows g and g + 8 at columns 2 t + {0, 1, 8, 9}, with g = lane / 4 and t = lane % 4. The
+// sums do not depend on which vertices and modes these rows and columns stand for. Here a lane provides quad g and chunks
+// t and t + 4. It loads both chunks with six loads of 16 bytes, in whole lines of 128 bytes. It forms the fragments of
+// six products with one byte permutation per register. U does not pass through shared memory. A lane receives all 12 sums
+// of quad g for a quarter of the domains, so it computes the positions of whole vertices. The sums of 16 domains, two
+// steps of U, and q take 160 registers. This allows 12 warps per multiprocessor, with 72 KB in flight.
 #if defined(STORE_BF16)
 #define OPERANDS "bf16.bf16"
 #else
@@ -37,17 +40,15 @@ constexpr unsigned BATCH_SIZE = 16;
 constexpr unsigned MIN_BLOCKS_PER_SM = 3;
 #endif
 constexpr unsigned MAX_DOMAINS = 32;
-constexpr unsigned GROUPS = BATCH_SIZE / 8; // of 8 domains
+constexpr unsigned GROUPS = BATCH_SIZE / 8; // groups of 8 domains, the columns of one product
 
-// A warp covers QUADS quads of a tile of 32. A step sums STEP_CHUNKS chunks of two modes.
-constexpr unsigned WARPS = 4;
-constexpr unsigned QUADS = 8;
-constexpr unsigned TILE = WARPS * QUADS;
-constexpr unsigned STEP_CHUNKS = 8;
-// float4 per domain in the staging buffer: those of QUADS quads of positions, and the stride between domains. Two float4
-// of padding keep the lanes of a quarter warp in different banks.
-constexpr unsigned DOMAIN_VECTORS = 3 * QUADS;
-constexpr unsigned STRIDE = DOMAIN_VECTORS + 2;
+constexpr unsigned WARPS = 4;                // per block
+constexpr unsigned QUADS = 8;                // per warp
+constexpr unsigned TILE_QUADS = WARPS * QUADS;
+constexpr unsigned STEP_CHUNKS = 8;          // chunks of two modes per step
+// float4 per domain in the staging buffer: three per quad, and two of padding, which keep the lanes of a quarter warp in
+// different banks.
+constexpr unsigned STRIDE = 3 * QUADS + 2;
 
 // Twin: tests/bench/src/kernels/batch_mma.rs.
 struct BatchMmaArgs {
@@ -57,7 +58,7 @@ struct BatchMmaArgs {
     const float* inverse_scales;
     const uint4* split_q;
     float* positions;
-    unsigned first_vertices[MAX_DOMAINS]; // packed vertex of each domain
+    unsigned first_vertices[MAX_DOMAINS]; // index of each domain's first vertex in `positions`
     unsigned domains;
     unsigned vertices; // of the shape
     unsigned chunks;
@@ -70,29 +71,30 @@ __device__ __forceinline__ unsigned lane_id() {
     return threadIdx.x % 32;
 }
 
-// The part of a tile that a warp covers.
+// The part of a tile that a warp computes.
 struct WarpPart {
     const uint4* words;    // words of the lane's quad
-    unsigned tile_quads;   // quads of the tile
-    unsigned rest_quad;    // the lane's quad of the shape
-    unsigned first_vertex; // the warp's first vertex in the shape
-    unsigned coordinates;      // coordinates of the warp's vertices; 0 without vertices
+    unsigned tile_quads;   // number of quads of the tile
+    unsigned rest_quad;    // index of the lane's quad in the shape
+    unsigned first_vertex; // index of the warp's first vertex in the shape
+    unsigned coordinates;  // number of coordinates of the warp's vertices, three per vertex
 };
 
 // A lane beyond the last quad reads that quad again; its results are not stored.
 __device__ __forceinline__ WarpPart warp_part(const BatchMmaArgs& args) {
-    const unsigned tile = TILE * blockIdx.x, first_warp_quad = QUADS * (threadIdx.x / 32);
+    const unsigned first_tile_quad = TILE_QUADS * blockIdx.x, first_warp_quad = QUADS * (threadIdx.x / 32);
     WarpPart part;
-    part.tile_quads = min(TILE, (args.vertices + 3) / 4 - tile);
+    part.tile_quads = min(TILE_QUADS, (args.vertices + 3) / 4 - first_tile_quad);
     const unsigned quad = min(first_warp_quad + lane_id() / 4, part.tile_quads - 1);
-    part.words = args.words + 3 * (size_t)args.chunks * tile + quad;
-    part.rest_quad = tile + quad;
-    part.first_vertex = 4 * (tile + first_warp_quad);
+    part.words = args.words + 3 * (size_t)args.chunks * first_tile_quad + quad;
+    part.rest_quad = first_tile_quad + quad;
+    part.first_vertex = 4 * (first_tile_quad + first_warp_quad);
     part.coordinates = args.vertices > part.first_vertex ? 3 * min(4 * QUADS, args.vertices - part.first_vertex) : 0;
     return part;
 }
 
-// Two modes of a quad: words 2 axis + {0, 1} of the first mode, then of the second, each word with two vertices.
+// Two modes of a quad. Word 2 axis + pair holds a pair of vertices for the first mode, word 6 + 2 axis + pair for the
+// second mode.
 struct Chunk {
     unsigned words[12];
 };
@@ -110,7 +112,7 @@ __device__ __forceinline__ void load_chunk(Chunk& chunk, const BatchMmaArgs& arg
     }
 }
 
-// Both chunks of a lane in a step.
+// The two chunks that a lane provides for a step.
 struct Step {
     Chunk low, high;
 };
@@ -121,7 +123,7 @@ __device__ __forceinline__ void load_step(Step& step, const BatchMmaArgs& args, 
     load_chunk(step.high, args, part, chunk + 4);
 }
 
-// [2 axis + pair of vertices][group of 8 domains][2 (vertex of the pair) + parity of the domain]
+// [2 axis + pair of vertices][group of 8 domains][2 (vertex in the pair) + parity of the domain]
 typedef float Sums[6][GROUPS][4];
 
 __device__ __forceinline__ void multiply(float (&sum)[4], const unsigned (&u)[4], unsigned q0, unsigned q1) {
@@ -141,6 +143,7 @@ __device__ __forceinline__ void add_step(Sums& sums, const Step& step, const uin
 #pragma unroll
     for (unsigned row = 0; row < 6; ++row) {
         const unsigned *low = step.low.words, *high = step.high.words;
+        // 0x5410 selects the first vertex of the pair in both modes, 0x7632 the second vertex.
         const unsigned u[4] = {
             __byte_perm(low[row], low[6 + row], 0x5410),
             __byte_perm(low[row], low[6 + row], 0x7632),
@@ -155,7 +158,7 @@ __device__ __forceinline__ void add_step(Sums& sums, const Step& step, const uin
     }
 }
 
-// Sums all modes with the loads of two steps in flight.
+// Sums all modes. The loads of two steps are in flight.
 __device__ __forceinline__ void sum_modes(const BatchMmaArgs& args, const WarpPart& part, Sums& sums) {
     const unsigned steps = (args.chunks + STEP_CHUNKS - 1) / STEP_CHUNKS;
     const uint4* split_q = args.split_q;
@@ -178,8 +181,8 @@ __device__ __forceinline__ float transform_row(const float4& row, float x, float
     return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
 }
 
-// Computes x of the lane's quad for one domain and writes it to the staging buffer, 48 bytes.
-__device__ __forceinline__ void stage_position(const BatchMmaArgs& args, const float4 (&rest)[3], const float (&u)[3][4],
+// Computes the positions of the lane's quad for one domain and writes them to the staging buffer, 48 bytes.
+__device__ __forceinline__ void stage_positions(const BatchMmaArgs& args, const float4 (&rest)[3], const float (&u)[3][4],
                                       unsigned domain, float4* staged) {
     const float4 *rows = args.transforms + 3 * domain, a = __ldg(rows), b = __ldg(rows + 1), c = __ldg(rows + 2);
     const float inverse_scale = __ldg(args.inverse_scales + domain);
@@ -201,12 +204,11 @@ __device__ __forceinline__ void stage_position(const BatchMmaArgs& args, const f
     }
 }
 
-// Writes the staged positions of four domains: `domain`, and every second one after it. Eight lanes write one domain, in
+// Writes the staged positions of four domains: `first_domain` plus 0, 2, 4 and 6. Eight lanes write one domain, in
 // coalesced stores of 128 bytes.
-__device__ __forceinline__ void store_staged(const BatchMmaArgs& args, const WarpPart& part, unsigned domain,
+__device__ __forceinline__ void store_staged(const BatchMmaArgs& args, const WarpPart& part, unsigned first_domain,
                                       const float4* staged) {
-    const unsigned staged_domain = lane_id() / 8;
-    domain += 2 * staged_domain;
+    const unsigned domain_pair = lane_id() / 8, domain = first_domain + 2 * domain_pair;
     if (domain >= args.domains) {
         return;
     }
@@ -214,7 +216,7 @@ __device__ __forceinline__ void store_staged(const BatchMmaArgs& args, const War
 #pragma unroll
     for (unsigned i = 0; i < 3; ++i) {
         const unsigned vector = 8 * i + lane_id() % 8;
-        const float4 coordinates = staged[STRIDE * staged_domain + vector];
+        const float4 coordinates = staged[STRIDE * domain_pair + vector];
         if (args.is_aligned && 4 * vector + 4 <= part.coordinates) {
             __stcs((float4*)dst + vector, coordinates);
         } else {
@@ -229,13 +231,14 @@ __device__ __forceinline__ void store_staged(const BatchMmaArgs& args, const War
     }
 }
 
+// Computes and writes the positions of all domains, four domains at a time.
 __device__ __forceinline__ void store_positions(const BatchMmaArgs& args, const WarpPart& part, const Sums& sums, float4* staged) {
     float4 rest[3];
 #pragma unroll
     for (unsigned axis = 0; axis < 3; ++axis) {
         rest[axis] = __ldg(args.rest + 3 * (size_t)part.rest_quad + axis);
     }
-    const unsigned quad = lane_id() / 4, pair = lane_id() % 4;
+    const unsigned quad = lane_id() / 4, domain_pair = lane_id() % 4;
 #pragma unroll
     for (unsigned group = 0; group < GROUPS; ++group) {
 #pragma unroll
@@ -243,12 +246,13 @@ __device__ __forceinline__ void store_positions(const BatchMmaArgs& args, const 
             float u[3][4];
 #pragma unroll
             for (unsigned i = 0; i < 12; ++i) {
-                u[i / 4][i % 4] = sums[2 * (i / 4) + i % 4 / 2][group][2 * (i % 2) + parity];
+                const unsigned axis = i / 4, vertex = i % 4;
+                u[axis][vertex] = sums[2 * axis + vertex / 2][group][2 * (vertex % 2) + parity];
             }
-            const unsigned domain = 8 * group + parity;
-            stage_position(args, rest, u, domain + 2 * pair, staged + STRIDE * pair + 3 * quad);
+            const unsigned first_domain = 8 * group + parity;
+            stage_positions(args, rest, u, first_domain + 2 * domain_pair, staged + STRIDE * domain_pair + 3 * quad);
             __syncwarp();
-            store_staged(args, part, domain, staged);
+            store_staged(args, part, first_domain, staged);
             __syncwarp();
         }
     }

@@ -1,19 +1,19 @@
-// x = T (x0 + u) of every packed vertex, for a u that a library computed.
-//   domains     [domains] PlainDomain                                                                            (in)
-//   vertex_domains  [vertices] u32: the domain of each packed vertex; not read with SINGLE                       (in)
-//   rest        [vertices][3] f32                                                                                (in)
-//   transforms  [domains][3] float4: rows of T                                                                   (in)
-//   u           f32, three per vertex of a domain with modes                                                     (in)
-//   positions   [vertices][3] f32                                                                                (out)
-// Launch: 256 threads per block, one thread per vertex.
+// x = T (x0 + u) of every vertex of every domain, for a u that cuBLAS computed.
+//   domains         [domains] PlainDomain                                                                        (in)
+//   vertex_domains  [vertices] u32: the domain of each vertex; not read with SINGLE (scenes of one domain)       (in)
+//   rest            x0, [vertices][3] f32                                                                        (in)
+//   transforms      [domains][3] float4: rows of T                                                               (in)
+//   u               f32, three per vertex of a domain with modes                                                 (in)
+//   positions       x, [vertices][3] f32                                                                         (out)
+// Launch: BLOCK threads per block, one thread per vertex.
 // CPU twin: the tests of tests/bench/src/kernels/plain_update.rs.
 constexpr unsigned BLOCK = 256;
-constexpr unsigned long long RIGID = 0xffffffffffffffffull;
+constexpr unsigned long long RIGID = 0xffffffffffffffffull; // `first_u` of a domain without modes
 
 // Where the data of one domain begins.
 struct PlainDomain {
     unsigned long long first_u; // index into `u` in floats, or RIGID
-    unsigned first_vertex;      // packed vertex
+    unsigned first_vertex;      // index among the vertices of all domains
     unsigned reserved;
 };
 static_assert(sizeof(PlainDomain) == 16, "PlainDomain differs from tests/bench/src/kernels/plain_update.rs");

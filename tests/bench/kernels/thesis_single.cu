@@ -1,8 +1,8 @@
 // BASELINE: u = U q of one domain as in chapter 3.2.1 of the thesis. For comparison only.
-//   lines   [lines][passes][32] float4: rows of U, four modes per float4; a line holds as many whole rows as
-//           fit into 32 lanes                                                                                    (in)
+//   lines   [lines][passes][32] float4: rows of U, four modes per float4. A line holds as many whole rows as
+//           fit into 32 lanes. It has one pass, or several if a row has more than 32 float4                      (in)
 //   q       [rank] f32                                                                                           (in)
-//   u       [vertices] float4, the fourth number is not written                                                  (out)
+//   u       [vertices] float4; the fourth number is not written                                                  (out)
 // Launch: 256 threads per block, one warp per line, ceil(lines / 8) blocks. The thesis does not cover rows of more than
 // 32 float4 (rank above 128). This kernel sums them in several passes and applies equation 3.3 to each pass.
 //
@@ -16,10 +16,10 @@ extern "C" __global__ void __launch_bounds__(WARPS * LANES)
     __shared__ float shared_q[MAX_RANK];
     __shared__ float sub_sums[WARPS][LANES];
     const unsigned n_vr = (rank + 3) / 4;                       // float4 per row
-    const unsigned width = min(n_vr, LANES);                   // lanes per row
-    const unsigned rows_per_line = LANES / width;                // n_g
+    const unsigned width = min(n_vr, LANES);                    // lanes per row
+    const unsigned rows_per_line = LANES / width;               // n_g in the thesis
     const unsigned passes = (n_vr + LANES - 1) / LANES;
-    // Thread (i, j) loads q[4 j + i] to the index of equation 3.3, which is i * 32 + j.
+    // Loads q[4 j + i] to index i * 32 + j (equation 3.3), separately for each pass of 128 modes.
     for (unsigned index = threadIdx.x; index < passes * 4 * LANES; index += WARPS * LANES) {
         const unsigned mode = index / 128 * 128 + 4 * (index % LANES) + index / LANES % 4;
         shared_q[index] = mode < rank ? q[mode] : 0.0f;
@@ -42,6 +42,7 @@ extern "C" __global__ void __launch_bounds__(WARPS * LANES)
     }
     sub_sums[warp][lane] = sum; // equation 3.4
     __syncwarp();
+    // The first lane of a row adds the sums of all lanes of the row.
     if (is_busy && lane % width == 0) {
         float total = 0.0f;
         for (unsigned k = 0; k < width; ++k) {

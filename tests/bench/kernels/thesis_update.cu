@@ -1,17 +1,19 @@
-// BASELINE: the vertex update of chapter 3.2.3 of the thesis, x = T (x0 + u) and T applied to normals and tangents, for
-// the vertices of unfolded triangles. For comparison only.
-//   warps       [ceil(vertices / 64) * 8] uint4 per warp: two domains, and the first of the warp's eight vertices
-//               that belongs to the second domain, or 8 if all belong to the first one                           (in)
-//   sources     [vertices] u32: index into u, or RIGID                                                           (in)
-//   rest_*      [vertices] float4; the fourth number of a position is 1, of a direction 0; tangents with TANGENTS (in)
+// BASELINE: the vertex update of chapter 3.2.3 of the thesis: x = T (x0 + u), and T applied to normals and tangents. The
+// triangles are unfolded: they share no vertices. For comparison only.
+//   warps       [ceil(vertices / 64) * 8] uint4 per warp: its two domains, the first of its eight vertices that
+//               belongs to the second domain (8 if none does), and an unused number                              (in)
+//   sources     [vertices] u32: index into u, or RIGID for a vertex without modes                                (in)
+//   rest_positions, rest_normals, and with TANGENTS rest_tangents
+//               [vertices] float4; the fourth number of a position is 1, of a direction 0                        (in)
 //   transforms  [domains][4] float4: rows of T                                                                   (in)
-//   u           float4                                                                                           (in)
+//   u           float4 per vertex of the domains with modes                                                      (in)
 //   positions, normals, tangents  [vertices] float4                                                              (out)
-// Launch: 256 threads per block, four threads per vertex, one number each; ceil(vertices / 64) blocks.
+// Launch: 256 threads per block, four threads per vertex; ceil(vertices / 64) blocks. A thread computes one element of
+// the vertex's float4.
 // CPU twin: the tests of tests/bench/src/kernels/thesis/thesis_update.rs.
 constexpr unsigned LANES = 32;
 constexpr unsigned WARPS = 8;
-constexpr unsigned VERTICES = WARPS * LANES / 4; // per block: n_vb
+constexpr unsigned VERTICES = WARPS * LANES / 4; // per block; n_vb in the thesis
 constexpr unsigned RIGID = 0xffffffffu;
 
 struct UpdateArgs {
@@ -45,8 +47,10 @@ extern "C" __global__ void __launch_bounds__(WARPS * LANES) thesis_update(const 
     const unsigned local_vertex = threadIdx.x / 4, element = lane % 4;
     const unsigned vertex = blockIdx.x * VERTICES + local_vertex;
     const size_t index = 4 * (size_t)vertex + element;
-    const uint4 domains = args.warps[blockIdx.x * WARPS + warp];
-    const unsigned domain = lane < 16 ? domains.x : domains.y;
+    const uint4 warp_domains = args.warps[blockIdx.x * WARPS + warp];
+    const unsigned first_vertex_of_second = warp_domains.z;
+    // 16 lanes load the matrix of the first domain, and 16 lanes that of the second domain.
+    const unsigned domain = lane < 16 ? warp_domains.x : warp_domains.y;
     matrices[warp][lane / 16][lane % 16] = args.transforms[16 * (size_t)domain + lane % 16];
     if (vertex < args.vertices) {
         float position = args.rest_positions[index];
@@ -62,7 +66,7 @@ extern "C" __global__ void __launch_bounds__(WARPS * LANES) thesis_update(const 
     }
     __syncthreads();
     if (vertex < args.vertices) {
-        const float* row = matrices[warp][lane / 4 < domains.z ? 0 : 1] + 4 * element;
+        const float* row = matrices[warp][lane / 4 < first_vertex_of_second ? 0 : 1] + 4 * element;
         args.positions[index] = dot4(row, rest_positions[local_vertex]);
         args.normals[index] = dot4(row, rest_normals[local_vertex]);
 #ifdef TANGENTS

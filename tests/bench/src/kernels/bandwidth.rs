@@ -12,15 +12,17 @@ const BLOCK: u64 = 256;
 /// Bytes of a `uint4`, the vector that `copy` and `read` access.
 const VECTOR_BYTES: u64 = 16;
 
-/// Macros of the `read` that evicts the L2. Its lines must stay in the cache, so it does not use streaming loads.
+/// Macros of the variant of `read` that evicts the L2 cache. The lines that it reads must stay in the cache, so it does
+/// not use streaming loads.
 pub(super) const L2_FLUSH_DEFINES: &[&str] = &["LOADS=8"];
-/// Loads per thread of that `read`.
+/// Loads per thread of that variant.
 pub(super) const L2_FLUSH_LOADS: u64 = 8;
 
 pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
     text: include_str!("../../kernels/bandwidth.cu"),
     functions: &["copy", "read", "fill", "delay", "empty_kernel"],
     define_sets: &[
+        // For `fill`, `delay` and `empty_kernel`, which use no macros.
         &[],
         &["LOADS=1", "STREAMING"],
         &["LOADS=2", "STREAMING"],
@@ -34,12 +36,12 @@ pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
     ],
 };
 
-/// Bytes that one block of `copy` or `read` covers.
+/// Bytes that one block of `copy` or `read` processes, with `loads` loads per thread.
 pub(super) const fn tile_bytes(loads: u64) -> u64 {
     BLOCK * loads * VECTOR_BYTES
 }
 
-/// Launches `copy` or `read` on two addresses.
+/// Launches `copy` or `read`. `buffers` are the device addresses of the source and the destination.
 pub(super) fn launch(device: &Device, function: &CudaFunction, blocks: u32, buffers: [u64; 2]) -> Result<()> {
     let mut launch = device.stream().launch_builder(function);
     // SAFETY: the arguments of the kernels are two addresses. All callers pass buffers of at least `blocks` tiles.
@@ -92,8 +94,9 @@ mod tests {
     #[test]
     fn copies_every_vector_once_for_any_loads_per_thread() {
         let loads: Vec<u64> = variants().map(|(loads, _)| loads).collect();
-        assert!(loads.len() >= 6, "{loads:?}");
+        assert!(loads.len() >= 6, "expected at least 6 variants, got {loads:?}");
         for loads in loads {
+            // Whole tiles for all numbers of loads, because each divides 16.
             let bytes = 3 * tile_bytes(16);
             let mut vector_indices = twin_of_copy(bytes / tile_bytes(loads), loads);
             vector_indices.sort_unstable();
@@ -102,9 +105,11 @@ mod tests {
     }
 
     #[test]
-    fn filled_words_differ_and_never_trigger_the_write_of_read() {
+    fn filled_words_differ_and_are_never_all_ones() {
         let words: std::collections::BTreeSet<u32> = (0..4096).map(twin_of_fill).collect();
+        // The finalizer of MurmurHash3 is a bijection, but `fill` clears the top bit, so a few words may coincide.
         assert!(words.len() > 4090);
+        // `read` writes only if it reads a word of all ones.
         assert!(words.iter().all(|word| *word != u32::MAX));
     }
 

@@ -1,7 +1,7 @@
 //! Launches `kernels/batch_mma.cu`: x = T_b (x0 + U q_b) for up to 32 domains b of one shape, by tensor cores.
 //!
-//! The server does not use it, because its summation order differs from the deformer's and it rounds each coordinate to
-//! a pair of 16-bit numbers.
+//! The server does not use this kernel, because its summation order differs from that of `deform`, and because it
+//! rounds each coordinate of q to a pair of 16-bit numbers.
 
 use std::sync::Arc;
 
@@ -32,14 +32,14 @@ pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
 
 /// Maximum number of domains per launch.
 const MAX_DOMAINS: usize = 32;
-/// Warps per block. A block covers one tile.
+/// Warps per block. A block computes one tile.
 const WARPS: usize = 4;
-/// Modes per matrix product. A product is one step of the sum over all modes.
+/// Modes per matrix product (the k of m16n8k16). The kernel sums all modes in steps, one product per step.
 const STEP_MODES: usize = 16;
-/// The first compute capability whose tensor cores support this product (m16n8k16).
+/// The first compute capability whose tensor cores have the instruction m16n8k16.
 const AMPERE: (i32, i32) = (8, 0);
 
-/// Arguments of `batch_mma`; pointers are device addresses.
+/// Arguments of `batch_mma`; pointers are device addresses. The kernel file describes the arrays.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct BatchMmaArgs {
@@ -66,7 +66,9 @@ unsafe impl DeviceRepr for BatchMmaArgs {}
 pub struct BatchMmaBenchmark {
     name: String,
     compiled: CompiledKernel,
+    /// U, in packed words of 16 bytes.
     words: DeviceBuffer,
+    /// x0.
     rest: DeviceBuffer,
     positions: DeviceBuffer,
     input_sets: InputSets,
@@ -83,8 +85,8 @@ impl BatchMmaBenchmark {
     ///
     /// # Errors
     /// `Invalid` when the scene is not 1 to 32 domains of one shape, has followers, does not store U in 16 bits or
-    /// requests compensated sums, or when there is no state; `Unavailable` when the device has no such tensor cores or
-    /// NVRTC is missing; `Fault` when the device fails.
+    /// requests compensated sums, or when there is no state; `Unavailable` when the device's compute capability is
+    /// below 8.0 or NVRTC is missing; `Fault` when the device fails.
     pub fn new(device: &Device, scene: &Arc<Scene>, states: &[SceneState]) -> Result<Self> {
         check_scene(scene)?;
         let storage = scene.deformation.storage;
@@ -120,6 +122,7 @@ impl BatchMmaBenchmark {
             words: self.words.address(),
             rest: self.rest.address(),
             transforms: inputs.transforms,
+            // The inverse scales follow the transforms, which have 48 bytes per domain.
             inverse_scales: inputs.transforms + 48 * self.batch_size as u64,
             split_q: inputs.q,
             positions: self.positions.address(),
@@ -198,11 +201,13 @@ fn check_device(device: &Device) -> Result<()> {
     if (major, minor) >= AMPERE {
         return Ok(());
     }
-    let reason = format!("{} has capability {major}.{minor}", device.name());
-    Err(Error::Unavailable { what: "a batch by tensor cores", reason, remedy: "Use a device of 8.0 or above".into() })
+    let reason = format!("{} has compute capability {major}.{minor}", device.name());
+    let remedy = "Use a device of compute capability 8.0 or above".into();
+    Err(Error::Unavailable { what: "a batch by tensor cores", reason, remedy })
 }
 
-/// The smallest compiled batch size for this number of domains, and the macro that selects it.
+/// The smallest compiled batch size for this number of domains, and the macro that selects it. Without a macro, the
+/// kernel has a batch size of 16.
 const fn select_batch_size(domains: usize) -> (usize, Option<&'static str>) {
     match domains {
         0..=8 => (8, Some("BATCH_8")),
@@ -220,21 +225,24 @@ fn split_coordinates(scene: &Scene, state: &SceneState, tiles: &TiledModes) -> V
     (0..scene.domains.len()).map(split_domain).collect()
 }
 
-/// The fragments of q in the order in which lanes read them: [step][batch_size / 8][lane][4] words. A word without a
-/// domain or mode is zero.
+/// The fragments of q in the order in which lanes read them: [step][batch_size / 8][lane][4] words. A word holds the
+/// 16-bit numbers of two modes. Numbers beyond the last domain or mode are zero.
 fn pack_fragments(split_q: &[SplitCoordinates], rank: usize, batch_size: usize) -> Vec<u32> {
     let steps = rank.div_ceil(STEP_MODES);
-    let mut words = Vec::with_capacity(steps * batch_size * 16);
+    // A step has a pair of 16-bit numbers for each domain and mode: one word of 32 bits.
+    let mut words = Vec::with_capacity(steps * batch_size * STEP_MODES);
     for (step, group) in (0..steps).flat_map(|step| (0..batch_size / 8).map(move |group| (step, group))) {
         for lane in 0..32 {
-            let (domain, first) = (8 * group + lane / 4, STEP_MODES * step + 2 * (lane % 4));
-            // `half` 0 is the rounded coordinate, 1 the rounded remainder.
-            let half_bits = |mode: usize, half: usize| {
+            let (domain, first_mode) = (8 * group + lane / 4, STEP_MODES * step + 2 * (lane % 4));
+            // Index 0 of a pair is the rounded coordinate, index 1 the rounded remainder.
+            let number_bits = |mode: usize, pair_index: usize| {
                 let domain_q = split_q.get(domain).filter(|_| mode < rank);
-                u32::from(domain_q.map_or(0, |domain_q| domain_q.pair(mode)[half]))
+                u32::from(domain_q.map_or(0, |domain_q| domain_q.pair(mode)[pair_index]))
             };
-            let word = |mode: usize, half: usize| half_bits(mode, half) | half_bits(mode + 1, half) << 16;
-            words.extend([word(first, 0), word(first + 8, 0), word(first, 1), word(first + 8, 1)]);
+            let word = |mode: usize, pair_index: usize| {
+                number_bits(mode, pair_index) | number_bits(mode + 1, pair_index) << 16
+            };
+            words.extend([word(first_mode, 0), word(first_mode + 8, 0), word(first_mode, 1), word(first_mode + 8, 1)]);
         }
     }
     words
@@ -263,7 +271,7 @@ fn args_without_addresses(scene: &Scene, chunks: usize) -> BatchMmaArgs {
     args
 }
 
-/// Minimum traffic of a launch. 16-bit storage has no scales of U.
+/// Minimum memory traffic of a launch, in bytes.
 fn minimum_traffic(scene: &Scene, tiles: &TiledModes) -> Vec<ArrayTraffic> {
     let (domains, vertices) = (scene.domains.len() as u64, scene.layout.vertices as u64);
     vec![
@@ -287,12 +295,13 @@ mod tests {
     use modalcast_compute::testing::{TestRng, position_of, scene_and_state};
     use modalcast_model::scene::SceneParts;
 
+    /// A scene whose domains share one random shape, and a random state. All numbers are from -1 to 1.
     fn instanced_scene(vertices: usize, rank: usize, domains: usize, storage: StorageType) -> (Arc<Scene>, SceneState) {
-        let (one, _) = scene_and_state(&[(vertices, rank, 1)]);
+        let (single_scene, _) = scene_and_state(&[(vertices, rank, 1)]);
         let mut parts = SceneParts::named("instances");
-        parts.shapes = vec![one.shapes[0].clone()];
-        parts.materials = one.materials.clone();
-        parts.domains = vec![one.domains[0].clone(); domains];
+        parts.shapes = vec![single_scene.shapes[0].clone()];
+        parts.materials = single_scene.materials.clone();
+        parts.domains = vec![single_scene.domains[0].clone(); domains];
         parts.deformation.storage = storage;
         let scene = Scene::new(parts).expect("a valid scene");
         let (mut random, mut state) = (TestRng(domains as u64), SceneState::rest(&scene));
@@ -302,7 +311,7 @@ mod tests {
     }
 
     /// Vertices, modes and domains.
-    const SIZES: [(usize, usize, usize); 12] = [
+    const SIZES: [(usize, usize, usize); 14] = [
         (1, 3, 1),
         (4, 1, 16),
         (63, 13, 2),
@@ -315,17 +324,19 @@ mod tests {
         (256, 33, 7),
         (261, 12, 9),
         (320, 50, 13),
+        (70, 31, 32),
+        (33, 40, 17),
     ];
 
     /// CPU twin of `batch_mma`, warp by warp, with fragments, staging buffer and stores; sums in f64.
-    fn twin_of_batch_mma(inputs: &KernelInputs, coordinates: usize) -> Vec<f32> {
-        let mut positions = vec![f32::NAN; coordinates];
+    fn twin_of_batch_mma(inputs: &KernelInputs, coordinate_count: usize) -> Vec<f32> {
+        let mut positions = vec![f32::NAN; coordinate_count];
         let vertices = inputs.args.vertices as usize;
         for (tile, warp) in (0..inputs.tiles.count()).flat_map(|tile| (0..WARPS).map(move |warp| (tile, warp))) {
-            let first_vertex = 4 * (TILE_QUADS * tile + QUADS * warp);
+            let first_vertex = QUAD * (TILE_QUADS * tile + QUADS * warp);
             if first_vertex < vertices {
                 let sums = sum_modes(inputs, tile, warp);
-                let coordinates = 3 * (4 * QUADS).min(vertices - first_vertex);
+                let coordinates = 3 * (QUAD * QUADS).min(vertices - first_vertex);
                 (0..inputs.batch_size / 4).for_each(|pass| {
                     let staged = stage_positions(inputs, &sums, (tile, warp), pass);
                     store_staged(inputs, &staged, StoreRange { first_vertex, coordinates, pass }, &mut positions);
@@ -336,24 +347,25 @@ mod tests {
     }
 
     #[test]
-    fn writes_each_position_once_from_its_inputs() {
-        for storage in [StorageType::F16, StorageType::Bf16] {
-            for (vertices, rank, domains) in SIZES.into_iter().chain([(70, 31, 32), (33, 40, 17)]) {
+    fn twin_writes_each_position_once_from_its_inputs() {
+        // q has a relative error of up to 2^-22 in f16 and 2^-16 in bf16. The tolerances are about 16 and 6 times as
+        // large, for sums over up to 50 modes and for f32 rounding.
+        for (storage, tolerance) in [(StorageType::F16, 4e-6), (StorageType::Bf16, 1e-4)] {
+            for (vertices, rank, domains) in SIZES {
                 let (scene, state) = instanced_scene(vertices, rank, domains, storage);
                 let inputs = KernelInputs::pack(&scene, &state);
                 let positions = twin_of_batch_mma(&inputs, 3 * scene.layout.vertices);
-                for (packed, got) in positions.chunks_exact(3).enumerate() {
-                    let (domain, vertex) = (packed / vertices, packed % vertices);
-                    // Compare with the result for stored U; only the rounding of q and f32 remains.
+                for (packed_vertex, got) in positions.chunks_exact(3).enumerate() {
+                    let (domain, vertex) = (packed_vertex / vertices, packed_vertex % vertices);
+                    // The expected position uses U as stored, so that the rounding of U is not part of the error.
                     let want = stored_position(&scene, &state, &inputs.tiles, (domain, vertex));
-                    let tolerance = if storage == StorageType::F16 { 4e-6 } else { 1e-4 };
                     let is_close = got.iter().zip(want).all(|(got, want)| (f64::from(*got) - want).abs() < tolerance);
-                    assert!(is_close, "{storage:?} {vertices} {rank} {domains}: expected {want:?}, got {got:?}");
+                    assert!(is_close, "{storage:?} n {vertices} r {rank} d {domains}: expected {want:?}, got {got:?}");
                     // Negative control: the next vertex of the next domain has another position.
                     let next = position_of(&scene, &state, (domain + 1) % domains, (vertex + 1) % vertices);
-                    let is_only_position = domains == 1 && vertices == 1;
+                    let is_only_vertex = domains == 1 && vertices == 1;
                     let differs = got.iter().zip(next).any(|(got, next)| (f64::from(*got) - next).abs() > 1e-3);
-                    assert!(is_only_position || differs, "expected another position at the next vertex");
+                    assert!(is_only_vertex || differs, "expected another position at the next vertex");
                 }
             }
         }

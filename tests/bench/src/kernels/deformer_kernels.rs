@@ -1,4 +1,4 @@
-//! Benchmarks the kernels of the deformer with its launchers and tables, on inputs that are uploaded in advance.
+//! Benchmarks the kernels of the CUDA deformer, with its own launchers and tables. Inputs are uploaded in advance.
 
 use std::sync::Arc;
 
@@ -23,7 +23,8 @@ use modalcast_model::scene::{Scene, SceneState};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum StepOutputs {
-    /// u = U q alone, for scenes without batches. For validation, the host computes x = T (x0 + u) in f64.
+    /// u = U q alone. Batches (domains that share U and are computed together) are not supported. For validation, the
+    /// host computes x = T (x0 + u) in f64.
     Uq,
     /// Positions, and a bounding box per warp.
     Positions,
@@ -50,10 +51,13 @@ pub struct DeformerBenchmark {
     deform: DeformKernel,
     bounds: BoundsKernel,
     normals: Option<NormalsKernel>,
-    /// Whether a step changes only some domains, which a list names.
+    /// Whether a step changes only some of the domains.
     is_partial: bool,
-    inputs: Vec<StepInputs>,
+    /// One per input set.
+    step_inputs: Vec<StepInputs>,
+    /// Positions, normals, tangents and displacements, one after the other.
     outputs: DeviceBuffer,
+    /// Computes positions on the host for [`StepOutputs::Uq`]. Its device buffers are empty.
     input_sets: InputSets,
     plan: DeformPlan,
     counts: StepCounts,
@@ -90,8 +94,8 @@ impl DeformerBenchmark {
     /// Packs and uploads the scene and the values of each state.
     ///
     /// # Errors
-    /// `Invalid` when there is no state, [`StepOutputs::Uq`] is requested for a scene with batches, or the list of changes
-    /// is too long for a partial step; `Unavailable` when NVRTC is missing; `Fault` when the device fails.
+    /// `Invalid` when there is no state, [`StepOutputs::Uq`] is requested for a scene with batches, or the list of
+    /// changes is too long for a partial step; `Unavailable` when NVRTC is missing; `Fault` when the device fails.
     pub fn new(device: &Device, scene: &Arc<Scene>, states: &[SceneState], step: BenchmarkStep<'_>) -> Result<Self> {
         let BenchmarkStep { outputs: step_outputs, batches, changed } = step;
         let options = CudaDeformerOptions { batches, bounding_axes: scene.light_axes() };
@@ -119,7 +123,7 @@ impl DeformerBenchmark {
             )?,
             normals,
             is_partial: changed.is_some(),
-            inputs: Vec::new(),
+            step_inputs: Vec::new(),
             outputs,
             input_sets: InputSets::new(device, scene, states, |_| [Vec::new(), Vec::new()])?,
             counts: count_step(scene, &plan, changed),
@@ -128,6 +132,7 @@ impl DeformerBenchmark {
         };
         let mut staging = None;
         for state in states {
+            // Step 1 computes all domains.
             let header = Header { last_full_step: 1, step: 1, ..benchmark.header() };
             let mut inputs = StepInputs::new(device, benchmark.deform.packer())?;
             let staging = match &mut staging {
@@ -135,7 +140,7 @@ impl DeformerBenchmark {
                 empty => empty.insert(inputs.allocate_staging(device)?),
             };
             upload_step(device, (&mut inputs, staging), &header, state)?;
-            benchmark.inputs.push(inputs);
+            benchmark.step_inputs.push(inputs);
         }
         changed.map_or(Ok(()), |changed| benchmark.apply_changes(device, states, changed))?;
         Ok(benchmark)
@@ -149,7 +154,7 @@ impl DeformerBenchmark {
             ApplyKernel::new(device, self.deform.packer(), self.plan.kernel(KernelKind::Apply).ok_or_else(too_many)?)?;
         let mut change_list = apply.allocate_list(device)?;
         let full_step = Header { last_full_step: 1, ..self.header() };
-        for (inputs, state) in self.inputs.iter_mut().zip(states) {
+        for (inputs, state) in self.step_inputs.iter_mut().zip(states) {
             let mut staging = inputs.allocate_staging(device)?;
             let lengths = apply.write(
                 &mut change_list,
@@ -158,10 +163,11 @@ impl DeformerBenchmark {
                 ChangedDomains { changed, outdated: &[] },
             )?;
             let ChangeListLengths { change_count, dirty_tile_count } = lengths.ok_or_else(too_many)?;
+            // The output shows step 1. Step 2 changes the listed domains.
             let header = Header { output_step: 1, step: 2, change_count, dirty_tile_count, ..full_step };
             upload_step(device, (inputs, &mut staging), &header, state)?;
-            // SAFETY: the lists were written above for the packer of `deform` and of the inputs, and the next statement
-            // waits for the kernel.
+            // SAFETY: `change_list` was written above with the packer that `deform` and `inputs` use. The next
+            // statement waits for the kernel.
             unsafe { apply.launch(device, &change_list, inputs, &self.deform) }?;
             device.stream().synchronize().map_err(fault_in("upload"))?;
         }
@@ -186,36 +192,36 @@ impl DeformerBenchmark {
         }
     }
 
-    /// Fraction of the chunks of modes that truncation retains, weighted by vertices: the mean over the timed input sets.
-    /// `None` without truncation.
+    /// Fraction of the chunks of modes that truncation retains, weighted by vertices: the mean over the timed input
+    /// sets. `None` without truncation.
     fn retained_mode_share(&self) -> Option<f64> {
         let per_chunk = modes_per_chunk(self.scene.deformation.storage);
-        let weighted_chunks = |chunks: &dyn Fn(usize) -> usize| -> f64 {
+        let weighted_sum = |chunk_count_of: &dyn Fn(usize) -> usize| -> f64 {
             let slots = self.scene.layout.domains.iter().enumerate();
-            slots.map(|(domain, slot)| slot.vertices as f64 * chunks(domain) as f64).sum()
+            slots.map(|(domain, slot)| slot.vertices as f64 * chunk_count_of(domain) as f64).sum()
         };
-        let all_chunks = weighted_chunks(&|domain| self.scene.rank_of(domain).div_ceil(per_chunk));
-        let shares = self.inputs.iter().take(MAX_GRAPHS).map(|inputs| {
+        let all_chunks = weighted_sum(&|domain| self.scene.rank_of(domain).div_ceil(per_chunk));
+        let shares = self.step_inputs.iter().take(MAX_GRAPHS).map(|inputs| {
             let retained = inputs.retained_chunk_counts()?;
-            Some(weighted_chunks(&|domain| retained[domain] as usize) / all_chunks.max(1.0))
+            Some(weighted_sum(&|domain| retained[domain] as usize) / all_chunks.max(1.0))
         });
         let shares: Vec<f64> = shares.collect::<Option<_>>()?;
         Some(shares.iter().sum::<f64>() / shares.len().max(1) as f64)
     }
 
-    fn inputs(&self, input_set: usize) -> &StepInputs {
-        &self.inputs[input_set % self.inputs.len()]
+    fn step_inputs(&self, input_set: usize) -> &StepInputs {
+        &self.step_inputs[input_set % self.step_inputs.len()]
     }
 
     /// Computes the positions of all domains.
     fn launch_all_positions(&self, device: &Device, input_set: usize) -> Result<()> {
-        // SAFETY: the inputs are whole steps of this scene, whose header has the addresses of `outputs`. `self` owns the
-        // inputs and the outputs, and releasing device memory is stream-ordered.
-        unsafe { self.deform.launch(device, self.inputs(input_set)) }
+        // SAFETY: the inputs hold all values of a step of this scene, and the addresses of `outputs` in their header.
+        // `self` owns the inputs and the outputs, and releasing device memory is stream-ordered.
+        unsafe { self.deform.launch(device, self.step_inputs(input_set)) }
     }
 }
 
-/// Removes the macros of outputs that are not requested.
+/// Removes the macros of outputs that are not requested, and adds those of [`StepOutputs::Uq`].
 fn remove_defines(kernel: &mut KernelDescriptor, step_outputs: StepOutputs) {
     if step_outputs != StepOutputs::Whole {
         kernel.defines.retain(|define| !["RIGID_NORMALS", "CORNER_OFFSETS", "NORMAL_MAPS", "SHEAR"].contains(define));
@@ -245,10 +251,11 @@ fn output_bytes(plan: &DeformPlan) -> [u64; 4] {
         .map(|role| plan.bytes(role).next_multiple_of(16))
 }
 
-/// The counts of a step that changes these domains; `None` stands for all domains.
+/// The counts of a step that changes the domains `changed`; `None` means all domains.
 fn count_step(scene: &Scene, plan: &DeformPlan, changed: Option<&[u32]>) -> StepCounts {
     let slots = &scene.layout.domains;
-    // With followers, every domain reads T or its frame (48 bytes) and the index of its transform root.
+    // A domain reads 48 bytes: its T, or its frame if it follows another domain. In scenes with followers, it also
+    // reads its transform link, 8 bytes.
     let bytes_per_transform = if scene.features.followers { 56 } else { 48 };
     match changed {
         None => StepCounts {
@@ -281,7 +288,7 @@ impl KernelBenchmark for DeformerBenchmark {
     }
 
     fn input_set_count(&self) -> usize {
-        self.inputs.len()
+        self.step_inputs.len()
     }
 
     fn compute_skipped_domains(&self, device: &Device, input_set: usize) -> Result<()> {
@@ -289,7 +296,7 @@ impl KernelBenchmark for DeformerBenchmark {
     }
 
     fn launch(&self, device: &Device, input_set: usize) -> Result<()> {
-        let inputs = self.inputs(input_set);
+        let inputs = self.step_inputs(input_set);
         self.input_sets.select(input_set);
         if self.is_partial {
             // SAFETY: as in `launch_all_positions`; `apply` has written the tile list.

@@ -12,7 +12,7 @@ use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::{DeviceBuffer, PinnedBuffer, PinnedUse};
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 
-/// Maximum size of the buffers of `copy` and `read`, bytes.
+/// Maximum size of the buffers of `copy` and `read`, bytes: many times the size of any L2 cache.
 const MAX_BUFFER: u64 = 4 << 30;
 
 /// Bytes of a copy between pinned host memory and the device.
@@ -20,8 +20,9 @@ const PINNED_BYTES: usize = 64 << 20;
 /// Number of timed pinned copies.
 const PINNED_COPIES: usize = 15;
 
-/// Timed replays of each variant of `copy` and `read`, and of the empty kernel.
+/// Timed replays of each variant of `copy` and `read`.
 const REPLAYS: usize = 20;
+/// Timed replays of the empty kernel.
 const EMPTY_REPLAYS: usize = 200;
 
 /// Measured peak bandwidths of the device.
@@ -46,6 +47,7 @@ pub struct DeviceBandwidth {
 /// `Unavailable` when NVRTC is missing; `Fault` when the device fails or `copy` does not copy.
 pub fn measure_bandwidth(device: &Device) -> Result<DeviceBandwidth> {
     let (free, _) = device.memory()?;
+    // Variants have up to 16 loads per thread. A buffer of whole tiles of 16 loads has whole tiles of every variant.
     let max_tile_bytes = tile_bytes(16);
     let bytes = (MAX_BUFFER.min(free as u64 / 8) / max_tile_bytes).max(1) * max_tile_bytes;
     let src = random_buffer(device, bytes)?;
@@ -53,7 +55,8 @@ pub fn measure_bandwidth(device: &Device) -> Result<DeviceBandwidth> {
     let max_bandwidth = |function: &'static str, traffic: u64| -> Result<f64> {
         let mut max_gbs = 0.0_f64;
         for (loads, defines) in variants() {
-            let benchmark = CopyBenchmark::new(device, function, defines, [&src, &dst], bytes / tile_bytes(loads))?;
+            let benchmark =
+                BandwidthBenchmark::new(device, function, defines, [&src, &dst], bytes / tile_bytes(loads))?;
             if function == "copy" {
                 benchmark.check_copy(device, &src, &dst)?;
             }
@@ -69,14 +72,15 @@ pub fn measure_bandwidth(device: &Device) -> Result<DeviceBandwidth> {
 }
 
 /// One variant of `copy` or `read`.
-struct CopyBenchmark {
+struct BandwidthBenchmark {
     function: CudaFunction,
     name: String,
+    /// Device addresses of the source and the destination.
     buffers: [u64; 2],
     blocks: u32,
 }
 
-impl CopyBenchmark {
+impl BandwidthBenchmark {
     fn new(
         device: &Device,
         function: &str,
@@ -92,7 +96,7 @@ impl CopyBenchmark {
         })
     }
 
-    /// Copies once and compares the first and last bytes, because a kernel that copies nothing would have a high rate.
+    /// Runs `copy` once and compares the first and last bytes, because a kernel that copies nothing would look fast.
     fn check_copy(&self, device: &Device, src: &DeviceBuffer, dst: &DeviceBuffer) -> Result<()> {
         const CHECKED_BYTES: usize = 4096;
         let last_offset = dst.bytes() - CHECKED_BYTES as u64;
@@ -116,7 +120,7 @@ impl CopyBenchmark {
     }
 }
 
-impl KernelBenchmark for CopyBenchmark {
+impl KernelBenchmark for BandwidthBenchmark {
     fn name(&self) -> String {
         self.name.clone()
     }
@@ -139,6 +143,7 @@ fn pinned_bandwidths(device: &Device) -> Result<(f64, f64)> {
     let to_fault = fault_in("pinned copy");
     let mut host = PinnedBuffer::<u8>::zeroed(device, PINNED_BYTES, PinnedUse::FromDevice)?;
     let host = host.as_mut_slice()?;
+    // Not zeros, because copies of zeros may be faster.
     host.fill(0x5a);
     let buffer = DeviceBuffer::zeroed(device, PINNED_BYTES as u64)?;
     let (device_address, stream) = (buffer.address(), device.stream().cu_stream());
@@ -156,8 +161,8 @@ fn pinned_bandwidths(device: &Device) -> Result<(f64, f64)> {
         let timing = Timing::of(times).ok_or_else(|| invalid("replays", "at least 1", 0))?;
         Ok(gigabytes_per_second(PINNED_BYTES as u64, timing.median_us))
     };
-    // SAFETY: `buffer` and `host` have equal sizes. `microseconds` waits for each copy, so the copy ends before the next
-    // one starts and before either buffer is dropped.
+    // SAFETY: `buffer` and `host` have equal sizes. `microseconds` waits for each copy, so the copy ends before the
+    // next one starts and before either buffer is dropped.
     let to_device =
         measure_gbs(&mut |host| unsafe { result::memcpy_htod_async(device_address, host, stream) }.map_err(&to_fault))?;
     // SAFETY: as above.

@@ -31,7 +31,7 @@ impl Part {
     }
 }
 
-/// Minimum number of vertices per parallel task on the host.
+/// Minimum number of vertices per parallel task on the host, so that scheduling takes little of its time.
 const MIN_TASK_VERTICES: usize = 4096;
 
 /// Device addresses of one input set.
@@ -55,7 +55,8 @@ pub(super) struct InputSets {
 }
 
 impl InputSets {
-    /// Uploads q and transforms of each state as packed by `pack`, which must return equal lengths for all states.
+    /// Uploads the inputs of each state. `pack` returns q and the transforms of a state as the kernel reads them; their
+    /// lengths must be equal for all states.
     ///
     /// # Errors
     /// `Invalid` when there is no state or a state does not fit the scene; `Fault` when the device fails.
@@ -82,7 +83,7 @@ impl InputSets {
             let packed = pack(state);
             for (numbers, packed_numbers) in [&mut q, &mut transforms].into_iter().zip(packed) {
                 numbers.extend_from_slice(&packed_numbers);
-                // Each input set is aligned to float4.
+                // Each input set begins at a multiple of 16 bytes.
                 numbers.resize(numbers.len().next_multiple_of(4), 0.0);
             }
         }
@@ -96,7 +97,8 @@ impl InputSets {
         self.states.len()
     }
 
-    /// Selects an input set (modulo their number) for [`Self::compute_positions_on_host`] and returns its addresses.
+    /// Returns the addresses of an input set, and selects it for [`Self::compute_positions_on_host`]. The index is
+    /// taken modulo the number of input sets.
     pub(super) fn select(&self, input_set: usize) -> InputAddresses {
         let input_set = input_set % self.states.len();
         self.selected.set(input_set);
@@ -104,8 +106,9 @@ impl InputSets {
         InputAddresses { q: self.q.address() + q_offset, transforms: self.transforms.address() + transforms_offset }
     }
 
-    /// x = T (x0 + u) of the selected input set, three f32 per vertex. Computed in f64 and rounded once, so that only the
-    /// error of u remains. `u` returns the displacement for a domain and a vertex of this domain.
+    /// x = T (x0 + u) of the selected input set, three f32 per vertex. Each coordinate is computed in f64 and rounded
+    /// once, so that only the error of u remains. `u` returns the displacement of a vertex, given its domain and its
+    /// index there.
     pub(super) fn compute_positions_on_host(&self, u: impl Fn(usize, usize) -> [f32; 3] + Sync) -> Vec<f32> {
         let state = &self.states[self.selected.get()];
         let mut positions = Vec::with_capacity(3 * self.scene.layout.vertices);
@@ -115,8 +118,9 @@ impl InputSets {
             let transform_vertex = |(vertex, rest): (usize, &[f32; 3])| {
                 let u = u(domain, vertex);
                 let [x, y, z] = [0, 1, 2].map(|axis| f64::from(rest[axis]) + f64::from(u[axis]));
-                let row = |row: usize| t[4 * row] * x + t[4 * row + 1] * y + t[4 * row + 2] * z + t[4 * row + 3];
-                [0, 1, 2].map(|axis| row(axis) as f32)
+                let transformed =
+                    |row: usize| t[4 * row] * x + t[4 * row + 1] * y + t[4 * row + 2] * z + t[4 * row + 3];
+                [0, 1, 2].map(|axis| transformed(axis) as f32)
             };
             let rest = self.scene.shape_of(domain).mesh.rest_positions().par_iter().enumerate();
             rest.with_min_len(MIN_TASK_VERTICES).map(transform_vertex).collect_into_vec(&mut domain_positions);

@@ -1,4 +1,5 @@
-//! The trait of benchmarked kernels. Inputs are uploaded in advance, so that only kernels are timed.
+//! The trait of benchmarked kernels, and their compilation. Inputs are uploaded in advance, so that only kernels are
+//! timed.
 
 use cudarc::driver::CudaFunction;
 use serde::Serialize;
@@ -14,7 +15,7 @@ pub trait KernelBenchmark {
     /// Number of uploaded input sets, at least 1. [`Self::launch`] takes an index modulo this number.
     fn input_set_count(&self) -> usize;
 
-    /// Enqueues the kernels of one step on the stream of the device. It neither copies nor waits, so that a graph can
+    /// Enqueues the kernels of one step on the stream of the device. The call does not wait, so that a graph can
     /// capture it.
     ///
     /// # Errors
@@ -39,7 +40,8 @@ pub trait KernelBenchmark {
         Ok(Vec::new())
     }
 
-    /// Minimum memory traffic of one step per array. The reported bandwidth is the sum divided by the time.
+    /// Minimum memory traffic of one step for each array. The reported bandwidth is the sum of all arrays divided by
+    /// the time.
     fn traffic(&self) -> Vec<ArrayTraffic> {
         Vec::new()
     }
@@ -101,7 +103,7 @@ impl KernelAttributes {
 #[derive(Debug)]
 pub(super) struct BenchmarkSource {
     pub text: &'static str,
-    /// Names of the kernels; [`CompiledKernel`] compiles the first one.
+    /// Names of the kernels. [`CompiledKernel`] compiles only the first one.
     pub functions: &'static [&'static str],
     /// All sets of macros that the file is compiled with.
     pub define_sets: &'static [&'static [&'static str]],
@@ -115,7 +117,7 @@ pub(super) struct CompiledKernel {
 }
 
 impl CompiledKernel {
-    /// Compiles the first function of a file with one set of macros.
+    /// Compiles the first kernel of a file with one set of macros.
     pub(super) fn new(device: &Device, source: &BenchmarkSource, defines: &[&str]) -> Result<Self> {
         let function = source.functions[0];
         let compiled = device.function(function, source.text, defines)?;

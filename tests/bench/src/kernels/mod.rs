@@ -1,5 +1,6 @@
-//! Benchmark kernels and their launchers; the server uses none of them. Each implements `KernelBenchmark`: its kernels
-//! are timed without copies, and its positions are validated.
+//! Benchmarks of CUDA kernels: the server's own kernels on inputs that are uploaded in advance, and kernels that the
+//! server does not use. A benchmark implements `KernelBenchmark`, by which its kernels are timed and its positions are
+//! validated.
 //!
 //! | file | contents |
 //! |---|---|
@@ -8,12 +9,12 @@
 //! | `timer` | timing by CUDA graphs and events |
 //! | `bandwidth` | kernels that copy, read and fill device memory |
 //! | `device_bandwidth` | peak bandwidths of the device, for comparison |
-//! | `deformer_kernels` | the deformer's own kernels |
-//! | `batch_mma` | many vectors q of one U by tensor cores, with their own summation order and rounding |
+//! | `deformer_kernels` | the server's kernels that deform |
+//! | `batch_mma` | one U times many vectors q, by tensor cores |
 //! | `upload` | host-to-device upload of a step's values |
 //! | `overlap` | steps with readback by the host, serial and overlapped |
-//! | `cublas`, `plain_update` | products by cuBLAS, and the vertex update that follows them |
-//! | `raster` | the CUDA rasterizer with its own positions and samples |
+//! | `cublas`, `plain_update` | u = U q by cuBLAS, and the update x = T (x0 + u) that follows it |
+//! | `raster` | the server's CUDA rasterizer, without OpenGL |
 //! | `thesis` | the kernels of the thesis |
 
 mod bandwidth;

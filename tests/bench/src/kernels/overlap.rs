@@ -1,4 +1,4 @@
-//! Measures figure 3.1 of the thesis: steps with readback of the vertices, serial and overlapped.
+//! Measures steps with readback of the vertices, serial and overlapped as in figure 3.1 of the thesis.
 //!
 //! ```text
 //! serial:      write step k, [copy in][kernels], [copy out], write step k+1, ...
@@ -25,7 +25,7 @@ use modalcast_model::deform::{DeformedSurface, Deformer as _, VertexAttributes};
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::{Scene, SceneState};
 
-/// Rounds over all steps per method. The methods alternate; the median over the rounds is reported.
+/// Rounds per method. A round runs all steps. The methods alternate, and the median of the rounds is reported.
 const ROUNDS: usize = 5;
 
 /// Times of one step and of its parts, microseconds.
@@ -35,6 +35,7 @@ pub struct Overlap {
     pub steps: usize,
     /// Threads that write the inputs.
     pub cores: usize,
+    /// Bytes of a step's inputs.
     pub bytes_in: u64,
     /// Bytes of positions and normals.
     pub bytes_out: u64,
@@ -48,17 +49,20 @@ pub struct Overlap {
     pub copy_out_us: f64,
     /// A complete step without readback of the vertices.
     pub step_us: f64,
-    /// Time per step if every step is read back before the next is written.
+    /// Time per step if every step is read back before the next step is written (`run_serial`).
     pub serial_us: f64,
-    /// Time per step if the host waits for every readback after the next step, as the server does.
+    /// Time per step if the host starts the next step before it waits for a readback, as the server does
+    /// (`run_pipelined`).
     pub fetched_us: f64,
-    /// Time per step with two steps in flight, so that the host also writes while the device computes.
+    /// Time per step with two steps in flight, so that the host also writes inputs while the device computes
+    /// (`run_overlapped`).
     pub overlapped_us: f64,
     /// `serial_us` divided by `overlapped_us`.
     pub gain: f64,
     /// Lower limit of an overlapped step: the longest of host write, graph and readback.
     pub ideal_us: f64,
-    /// Steps of the other two methods whose vertices differ from the serial ones in any bit; must be 0.
+    /// Number of pipelined and overlapped steps that are missing, or whose vertices differ in any bit from the serial
+    /// ones; must be 0.
     pub differing: usize,
 }
 
@@ -132,7 +136,7 @@ fn run_serial(
     Ok(())
 }
 
-/// Waits for the readback of every step after the next step.
+/// Starts every step before it waits for the readback of the previous one.
 fn run_pipelined(
     deformer: &mut CudaDeformer,
     states: &[SceneState],
@@ -155,7 +159,8 @@ fn run_pipelined(
     Ok(())
 }
 
-/// Keeps [`MAX_STEPS_IN_FLIGHT`] steps in flight.
+/// Keeps [`MAX_STEPS_IN_FLIGHT`] steps in flight. Every iteration finishes the oldest step, submits a step, and waits
+/// for the readback of the finished step.
 fn run_overlapped(
     deformer: &mut CudaDeformer,
     states: &[SceneState],
@@ -172,7 +177,9 @@ fn run_overlapped(
             deformer.submit(&states[step % states.len()])?;
             readbacks.push_back(deformer.readback(VertexAttributes::VERTICES)?);
         }
-        if let (Some(finished_step), true) = (finished_step, readbacks.len() > MAX_STEPS_IN_FLIGHT || step >= steps)
+        let is_oldest_finished = readbacks.len() > MAX_STEPS_IN_FLIGHT || step >= steps;
+        if let Some(finished_step) = finished_step
+            && is_oldest_finished
             && let Some(readback) = readbacks.pop_front()
         {
             on_surface(finished_step, &*deformer.wait_readback(&readback)?);
@@ -203,7 +210,7 @@ fn have_equal_bits(one: &DeformedSurface, other: &DeformedSurface) -> bool {
     are_equal(&one.positions, &other.positions) && are_equal(&one.normals, &other.normals)
 }
 
-/// Median times of a step without readback, and of the readback alone.
+/// Median times of a step without readback, and of the readback alone, microseconds.
 fn time_step_and_readback(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize) -> Result<[f64; 2]> {
     let [mut step_times, mut readback_times] = [Vec::new(), Vec::new()];
     for step in 0..steps {
@@ -218,7 +225,7 @@ fn time_step_and_readback(deformer: &mut CudaDeformer, states: &[SceneState], st
     Ok([step_times, readback_times].map(median))
 }
 
-/// Bytes of a step's values, and median times of writing them on one core and on all.
+/// Bytes of a step's inputs, and the median times in microseconds of writing them on one core and on all cores.
 fn time_input_writes(
     device: &Device,
     scene: &Arc<Scene>,
@@ -244,7 +251,7 @@ fn time_input_writes(
     Ok((bytes, [single_thread.install(&mut measure), measure()]))
 }
 
-/// Median time of the last step's graph alone, between two events.
+/// Median time in microseconds of the last step's graph, which is replayed between two events.
 fn time_graph(device: &Device, deformer: &CudaDeformer, steps: usize) -> Result<f64> {
     let mut times = Vec::with_capacity(steps);
     for _ in 0..steps {
@@ -273,7 +280,8 @@ pub struct HostWrite {
     pub on_all_cores: bool,
 }
 
-/// Times host writes of 64 KiB to 64 MiB, in powers of two. The times show from which size several cores are faster.
+/// Times host writes of 64 KiB to 64 MiB, in powers of two. The times show from which size on all cores are faster than
+/// one.
 ///
 /// # Errors
 /// `Invalid` when `replays` is 0; `Fault` when the driver cannot allocate memory.

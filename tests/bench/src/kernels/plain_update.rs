@@ -1,4 +1,4 @@
-//! Launches `kernels/plain_update.cu`: x = T (x0 + u) for a u that a library computed.
+//! Launches `kernels/plain_update.cu`: x = T (x0 + u) for a u that cuBLAS computed.
 
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::{DeviceRepr, LaunchConfig, PushKernelArg as _};
@@ -15,13 +15,14 @@ pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
     define_sets: &[&[], &["SINGLE"]],
 };
 
-/// Threads per block, each for one vertex.
+/// Threads per block. A thread computes one vertex.
 const BLOCK: u32 = 256;
 
 /// Value of `first_u` for a domain without modes.
 const RIGID: u64 = u64::MAX;
 
-/// Where the data of one domain begins: its first float of u and its first packed vertex.
+/// Where the data of one domain begins: the index of its first float in u, and of its first vertex among those of all
+/// domains.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 struct PlainDomain {
@@ -55,7 +56,7 @@ unsafe impl DeviceRepr for PlainArgs {}
 pub(super) struct PlainUpdate {
     compiled: CompiledKernel,
     domains: DeviceBuffer,
-    /// The domain of each packed vertex; `None` for a scene of one domain.
+    /// The domain of each vertex; `None` for a scene of one domain.
     vertex_domains: Option<DeviceBuffer>,
     rest: DeviceBuffer,
     positions: DeviceBuffer,
@@ -100,8 +101,8 @@ impl PlainUpdate {
         let blocks = args.vertices.div_ceil(BLOCK);
         let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK, 1, 1), shared_mem_bytes: 0 };
         let mut launch = device.stream().launch_builder(&self.compiled.function);
-        // SAFETY: `PlainArgs` is the kernel's only argument. Its tables belong to one scene, and the caller provides
-        // three floats of u for each vertex of a domain that has a `first_u`.
+        // SAFETY: `PlainArgs` is the kernel's only argument. Its tables belong to one scene. The caller provides three
+        // floats of u for each vertex of a domain with modes.
         unsafe { launch.arg(&args).launch(config) }.map_err(fault_in("plain_update"))?;
         Ok(())
     }
@@ -138,13 +139,13 @@ fn pack_domains(scene: &Scene, first_u: &[Option<u64>]) -> Vec<PlainDomain> {
     scene.layout.domains.iter().zip(first_u).map(pack_domain).collect()
 }
 
-/// The domain of each packed vertex.
+/// The domain of each vertex.
 fn domain_of_vertices(scene: &Scene) -> Vec<u32> {
     let slots = scene.layout.domains.iter().enumerate();
     slots.flat_map(|(domain, slot)| std::iter::repeat_n(domain as u32, slot.vertices)).collect()
 }
 
-/// Rest positions of all domains in packed order.
+/// Rest positions of all domains, one domain after the other.
 fn packed_rest(scene: &Scene) -> Vec<f32> {
     let shapes = (0..scene.domains.len()).map(|domain| scene.shape_of(domain));
     shapes.flat_map(|shape| shape.mesh.rest_positions().as_flattened()).copied().collect()
@@ -164,7 +165,7 @@ mod tests {
     }
 
     /// CPU twin of `plain_update`, for one vertex.
-    fn twin_of_plain_update(tables: &Tables, t: &[f32], u: &[f32], vertex: usize) -> [f32; 3] {
+    fn twin_of_plain_update(tables: &Tables, transforms: &[f32], u: &[f32], vertex: usize) -> [f32; 3] {
         let domain = tables.vertex_domains[vertex] as usize;
         let plain_domain = tables.domains[domain];
         let mut deformed: [f32; 3] = std::array::from_fn(|axis| tables.rest[3 * vertex + axis]);
@@ -173,16 +174,18 @@ mod tests {
             deformed.iter_mut().zip(u).for_each(|(coordinate, u)| *coordinate += u);
         }
         std::array::from_fn(|axis| {
-            let row = &t[12 * domain + 4 * axis..][..4];
+            let row = &transforms[12 * domain + 4 * axis..][..4];
             row[0].mul_add(deformed[0], row[1].mul_add(deformed[1], row[2].mul_add(deformed[2], row[3])))
         })
     }
 
     #[test]
     fn twin_computes_positions_wherever_u_is_stored() {
+        // Vertices, modes and triangles of each domain.
         let (scene, state) = scene_and_state(&[(5, 2, 1), (9, 0, 2), (40, 7, 30)]);
+        // u of the first domain follows that of the last one, with unused floats before and between them.
         let first_u = [Some(200), None, Some(3)];
-        let mut u = vec![f32::NAN; 215];
+        let mut u = vec![f32::NAN; 200 + 3 * 5];
         for (domain, first) in first_u.iter().enumerate().filter_map(|(domain, first)| Some((domain, (*first)?))) {
             for vertex in 0..scene.layout.domains[domain].vertices {
                 let displacement = displacement_of(&scene, &state, domain, vertex).map(|number| number as f32);
@@ -197,8 +200,8 @@ mod tests {
         let transforms: &[f32] = bytemuck::cast_slice(&state.transforms);
         for (domain, slot) in scene.layout.domains.iter().enumerate() {
             for vertex in 0..slot.vertices {
-                let packed = slot.first_vertex + vertex;
-                let got = twin_of_plain_update(&tables, transforms, &u, packed);
+                let packed_vertex = slot.first_vertex + vertex;
+                let got = twin_of_plain_update(&tables, transforms, &u, packed_vertex);
                 let want = position_of(&scene, &state, domain, vertex);
                 for (want, got) in want.iter().zip(got) {
                     assert!(
@@ -207,7 +210,8 @@ mod tests {
                     );
                 }
                 // Negative control: the next vertex has another position.
-                let next = twin_of_plain_update(&tables, transforms, &u, (packed + 1) % 54);
+                let next_vertex = (packed_vertex + 1) % scene.layout.vertices;
+                let next = twin_of_plain_update(&tables, transforms, &u, next_vertex);
                 assert_ne!(next, want.map(|number| number as f32));
             }
         }

@@ -1,5 +1,5 @@
-//! Benchmarks the CUDA rasterizer without OpenGL. The benchmark owns the buffers of positions and samples, so samples can
-//! be read back.
+//! Benchmarks the CUDA rasterizer without OpenGL. The benchmark owns the buffers of positions and samples, so that the
+//! samples can be read back.
 
 use super::kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 use modalcast_compute::gpu::Device;
@@ -22,7 +22,8 @@ pub struct RasterMesh<'a> {
     pub cut_outs: Option<&'a CutOuts>,
 }
 
-/// Triangle counts by outcome.
+/// Number of triangles by outcome. The rasterizer draws a triangle by a thread, by a warp or in tiles, depending on its
+/// size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RasterCounts {
     /// Drawn by one thread.
@@ -53,7 +54,7 @@ pub struct RasterBenchmark {
     positions: DeviceBuffer,
     target: DeviceBuffer,
     pipeline: RasterPipeline,
-    window: Viewport,
+    viewport: Viewport,
     traffic: Vec<ArrayTraffic>,
 }
 
@@ -61,9 +62,9 @@ impl RasterBenchmark {
     /// Compiles the kernels and uploads the mesh.
     ///
     /// # Errors
-    /// `Invalid` when there are 2^24 triangles or more, a triangle refers to no vertex, or a group to no triangle;
+    /// `Invalid` when there are 2^24 triangles or more, or an index of a vertex or of a triangle is out of range;
     /// `Unavailable` when NVRTC is missing; `Fault` when the device fails.
-    pub fn new(device: &Device, mesh: RasterMesh<'_>, window: Viewport, variant: RasterVariant) -> Result<Self> {
+    pub fn new(device: &Device, mesh: RasterMesh<'_>, viewport: Viewport, variant: RasterVariant) -> Result<Self> {
         check_mesh(mesh.positions.len() as u64 / 3, mesh.triangles, mesh.groups)?;
         if let Some(cut_outs) = mesh.cut_outs {
             check_cut_outs(mesh.triangles.len(), cut_outs)?;
@@ -74,7 +75,7 @@ impl RasterBenchmark {
             .with_names()
             .map(|(name, function)| KernelAttributes::query(name, function))
             .collect::<Result<_>>()?;
-        let (target_bytes, triangle_bytes) = (variant.bytes(&window), size_of_val(mesh.triangles) as u64);
+        let (target_bytes, triangle_bytes) = (variant.bytes(&viewport), size_of_val(mesh.triangles) as u64);
         Ok(Self {
             variant,
             functions,
@@ -83,7 +84,7 @@ impl RasterBenchmark {
             positions: DeviceBuffer::upload(device, mesh.positions)?,
             target: DeviceBuffer::zeroed(device, target_bytes)?,
             pipeline,
-            window,
+            viewport,
             traffic: vec![
                 ArrayTraffic::new("samples", target_bytes),
                 ArrayTraffic::new("x", size_of_val(mesh.positions) as u64),
@@ -92,13 +93,14 @@ impl RasterBenchmark {
         })
     }
 
-    /// The samples of the last launch, row by row from the top. A key holds the bits of the depth, then the triangle; it
-    /// is all ones where nothing was drawn. Empty for depth-only targets.
+    /// The samples of the last launch, row by row from the top; empty for depth-only targets. The upper 32 bits of a
+    /// key are the bits of the depth, the lower 32 bits the id of the triangle. A key is all ones where nothing was
+    /// drawn.
     ///
     /// # Errors
     /// `Fault` when the device fails.
     pub fn keys(&self, device: &Device) -> Result<Vec<u64>> {
-        let mut keys = vec![0; if self.variant.depth_only { 0 } else { self.window.pixel_count() }];
+        let mut keys = vec![0; if self.variant.depth_only { 0 } else { self.viewport.pixel_count() }];
         self.target.read(device, 0, &mut keys)?;
         Ok(keys)
     }
@@ -108,7 +110,7 @@ impl RasterBenchmark {
     /// # Errors
     /// `Fault` when the device fails.
     pub fn depths(&self, device: &Device) -> Result<Vec<f32>> {
-        let mut depths = vec![0.0; if self.variant.depth_only { self.window.pixel_count() } else { 0 }];
+        let mut depths = vec![0.0; if self.variant.depth_only { self.viewport.pixel_count() } else { 0 }];
         self.target.read(device, 0, &mut depths)?;
         Ok(depths)
     }
@@ -125,7 +127,7 @@ impl RasterBenchmark {
 
 impl KernelBenchmark for RasterBenchmark {
     fn name(&self) -> String {
-        let [width, height] = self.window.size();
+        let [width, height] = self.viewport.size();
         format!("raster {} {width}x{height}", if self.variant.depth_only { "depth" } else { "ids" })
     }
 
@@ -137,12 +139,12 @@ impl KernelBenchmark for RasterBenchmark {
         let pass = RasterPass {
             functions: &self.functions,
             groups: &self.groups,
-            window: &self.window,
+            window: &self.viewport,
             positions: self.positions.address(),
             target: self.target.address(),
         };
-        // SAFETY: `new` checked mesh and groups. Both buffers have the sizes of the pass, and releasing device memory is
-        // stream-ordered.
+        // SAFETY: `new` checked mesh and groups. Both buffers have the sizes of the pass, and releasing device memory
+        // is stream-ordered.
         unsafe { self.pipeline.draw(device, &pass) }
     }
 

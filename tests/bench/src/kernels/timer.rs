@@ -13,23 +13,24 @@ use modalcast_compute::gpu::launch::{DeviceBuffer, capture};
 use modalcast_model::error::{Result, fault_in, invalid};
 
 /// Replays that are enqueued while a kernel delays the stream, so that the launch overhead of the host does not affect
-/// the times. A stream holds about a thousand entries before it blocks the host.
+/// the times. A replay adds up to four entries to the stream: an L2 flush, a graph and two events. A stream holds about
+/// a thousand entries before it blocks the host.
 const BATCH_REPLAYS: usize = 25;
 
 /// Delay of the stream per replay of a batch, microseconds. The host enqueues a replay in less time.
 const DELAY_US: u64 = 40;
 
-/// Maximum number of input sets to rotate through.
+/// Maximum number of graphs that the replays rotate through. Each graph has its own input set.
 pub(super) const MAX_GRAPHS: usize = 8;
 
 /// Warm-up time before timing, so that the device reaches its clock rates.
 const WARM_UP: Duration = Duration::from_millis(30);
 
-/// Size of the buffer that evicts the L2, in multiples of the L2 size.
+/// Size of the buffer that evicts the L2 cache, in multiples of the size of the cache.
 const L2_FLUSH_FACTOR: u64 = 4;
 
-/// Times steps of a benchmark. Each input set has a CUDA graph. The graphs are replayed in rotation, each replay between
-/// two events.
+/// Times steps of a benchmark. Each input set has a CUDA graph. The graphs are replayed in rotation. An event before
+/// and an event after each replay measure its time.
 ///
 /// # Errors
 /// `Invalid` when `replays` is 0; `Unavailable` when NVRTC is missing; `Fault` when the device fails or a launch cannot
@@ -45,7 +46,8 @@ pub fn time_steps(
     }
     let delay = StreamDelay::new(device)?;
     let l2_flush = matches!(cache, CacheState::Cold).then(|| L2Flush::new(device)).transpose()?;
-    // The first launch loads code and allocates workspaces. A capture allows neither, so it precedes them.
+    // The first launch loads code and allocates workspaces. A capture allows neither, so this launch precedes the
+    // captures.
     benchmark.launch(device, 0)?;
     let graph_count = benchmark.input_set_count().min(MAX_GRAPHS);
     let graphs =
@@ -104,7 +106,7 @@ pub fn time_empty_kernel(device: &Device, replays: usize) -> Result<Timing> {
 
 const ONE_THREAD: LaunchConfig = LaunchConfig { grid_dim: (1, 1, 1), block_dim: (1, 1, 1), shared_mem_bytes: 0 };
 
-/// Captures one step as a graph and uploads it.
+/// Captures one step as a graph and uploads the graph.
 fn capture_graph(device: &Device, benchmark: &dyn KernelBenchmark, input_set: usize) -> Result<CudaGraph> {
     let graph = capture(device, || benchmark.launch(device, input_set))?;
     graph.upload().map_err(fault_in("capture"))?;
@@ -144,8 +146,8 @@ impl StreamDelay {
         device.function("delay", bandwidth::SOURCE.text, &[]).map(Self)
     }
 
-    fn launch(&self, device: &Device, us: u64) -> Result<()> {
-        let nanoseconds = 1000 * us;
+    fn launch(&self, device: &Device, delay_us: u64) -> Result<()> {
+        let nanoseconds = 1000 * delay_us;
         let mut launch = device.stream().launch_builder(&self.0);
         // SAFETY: the kernel's only argument is a number of nanoseconds; it touches no memory.
         unsafe { launch.arg(&nanoseconds).launch(ONE_THREAD) }.map_err(fault_in("replay"))?;
@@ -153,7 +155,7 @@ impl StreamDelay {
     }
 }
 
-/// Evicts the L2 by reading a buffer that nothing else uses.
+/// Evicts the L2 cache by reading a buffer that no benchmark uses.
 struct L2Flush {
     function: CudaFunction,
     buffer: DeviceBuffer,
@@ -173,7 +175,7 @@ impl L2Flush {
     }
 
     fn launch(&self, device: &Device) -> Result<()> {
-        // `read` stores only if all bits that it read are ones. The buffer holds zeros, so it can be both input and output.
+        // `read` stores only if it reads all ones. The buffer holds zeros, so it can be both source and destination.
         let buffer = self.buffer.address();
         bandwidth::launch(device, &self.function, self.blocks, [buffer, buffer])
     }

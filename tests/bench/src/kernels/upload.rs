@@ -18,7 +18,7 @@ struct UploadBenchmark {
 
 impl KernelBenchmark for UploadBenchmark {
     fn name(&self) -> String {
-        "ingest".into()
+        "upload".into()
     }
 
     fn input_set_count(&self) -> usize {
@@ -26,8 +26,8 @@ impl KernelBenchmark for UploadBenchmark {
     }
 
     fn launch(&self, device: &Device, _input_set: usize) -> Result<()> {
-        // SAFETY: `time` waits for each replay, so no copy runs when `self` is dropped, and nothing writes the staging
-        // buffer.
+        // SAFETY: `time_steps` waits for all replays, so no copy runs when `self` is dropped. Nothing writes the
+        // staging buffer meanwhile.
         unsafe { self.inputs.send(device, &self.staging, InputPart::All) }
     }
 

@@ -1,4 +1,5 @@
-//! Batches of coordinate vectors with one U: tensor cores against their error bound, and the cost of batches.
+//! Batches, which multiply one U by the vectors q of many domains: errors of tensor cores against their bound, and run
+//! times.
 
 use std::sync::Arc;
 
@@ -16,8 +17,8 @@ use crate::accuracy::have_equal_bits;
 use crate::ensembles::{build_scene, instanced_parts, random_states, with_storage};
 use crate::scenes;
 
-/// Largest ratio of a vertex's error to the bound of its tile. The bound covers U in 16 bits, q as pairs of 16-bit
-/// numbers, and the rounding of the tensor cores' sums.
+/// Largest ratio of a vertex's error to the error bound of its tile. The bound covers the rounding of U to 16 bits, of
+/// q to pairs of 16-bit numbers, and of the tensor cores' sums.
 fn max_error_over_bound(scene: &Scene, state: &SceneState, positions: &[f32]) -> f64 {
     let (shape, storage) = (scene.shape_of(0), scene.deformation.storage);
     let tiles = TiledModes::new(shape, storage);
@@ -47,7 +48,7 @@ fn max_error_over_bound(scene: &Scene, state: &SceneState, positions: &[f32]) ->
 fn gpu_tensor_core_batches_stay_within_their_bound() {
     let device = Device::open(0).expect("a CUDA device");
     for storage in [StorageType::F16, StorageType::Bf16] {
-        for (vertices, rank, count) in [
+        for (vertices, rank, domains) in [
             (1, 3, 1),
             (33, 0, 2),
             (64, 1, 16),
@@ -58,7 +59,7 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
             (2000, 32, 16),
             (5003, 512, 13),
         ] {
-            let scene = build_scene(instanced_parts(vertices, rank, count, with_storage(storage)));
+            let scene = build_scene(instanced_parts(vertices, rank, domains, with_storage(storage)));
             let states = random_states(&scene);
             let batch = BatchMmaBenchmark::new(&device, &scene, &states).expect("a benchmark");
             let name = format!("{} n {vertices} r {rank}", batch.name());
@@ -85,7 +86,7 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
                 );
             }
             for attributes in batch.kernel_attributes() {
-                assert!(attributes.local_bytes == 0, "{name}: {attributes:?}");
+                assert!(attributes.local_bytes == 0, "{name}: expected no register spills, got {attributes:?}");
             }
         }
     }
@@ -107,7 +108,7 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
     let device = Device::open(0).expect("a CUDA device");
-    let measure = |benchmark: &dyn KernelBenchmark| {
+    let measure_us = |benchmark: &dyn KernelBenchmark| {
         let us = time_steps(&device, benchmark, CacheState::Warm, 200).expect("a timing").median_us;
         let bytes: u64 = benchmark.traffic().iter().map(|traffic| traffic.bytes).sum();
         let bandwidth = gigabytes_per_second(bytes, us);
@@ -118,16 +119,16 @@ fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
         let step = BenchmarkStep { batches: BatchPolicy::Always, ..BenchmarkStep::full(StepOutputs::Positions) };
         let scene = build_scene(instanced_parts(1_500_000, 32, 1, with_storage(storage)));
         let state = scenes::random_state(&scene, 1);
-        let single_us = measure(&DeformerBenchmark::new(&device, &scene, &[state], step).expect("a benchmark"));
+        let single_us = measure_us(&DeformerBenchmark::new(&device, &scene, &[state], step).expect("a benchmark"));
         let scene = build_scene(instanced_parts(1_500_000, 32, 16, with_storage(storage)));
         let state = scenes::random_state(&scene, 1);
         let batch = DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), step).expect("a benchmark");
         assert_eq!(batch.kernel_attributes()[0].name, "batch");
-        let batch_us = measure(&batch);
+        let batch_us = measure_us(&batch);
         eprintln!("{}: {:.2} times as long as one vector", storage.name(), batch_us / single_us);
         assert!(batch_us < 8.0 * single_us, "{storage:?}: expected less than 8 x {single_us} us, got {batch_us} us");
         if matches!(storage, StorageType::F16 | StorageType::Bf16) {
-            let tensor_core_us = measure(&BatchMmaBenchmark::new(&device, &scene, &[state]).expect("a benchmark"));
+            let tensor_core_us = measure_us(&BatchMmaBenchmark::new(&device, &scene, &[state]).expect("a benchmark"));
             eprintln!(
                 "{} by tensor cores: {:.2} times as long as one vector",
                 storage.name(),
@@ -147,34 +148,35 @@ fn gpu_auto_mode_batches_where_it_is_faster() {
     let device = Device::open(0).expect("a CUDA device");
     let mut slow_choices = Vec::new();
     for (vertices, rank) in [(1000, 32), (4000, 32), (16_000, 8), (16_000, 32), (64_000, 32), (500_000, 32)] {
-        for count in [2, 3, 4, 8, 16, 64] {
-            // Skips 64 instances of 500,000 vertices only.
-            if vertices * count * rank > 1 << 29 {
+        for domains in [2, 3, 4, 8, 16, 64] {
+            // Skips only the largest scene: 64 instances of 500,000 vertices.
+            if vertices * domains * rank > 1 << 29 {
                 continue;
             }
-            let scene = build_scene(instanced_parts(vertices, rank, count, DeformationSettings::default()));
+            let scene = build_scene(instanced_parts(vertices, rank, domains, DeformationSettings::default()));
             let state = scenes::random_state(&scene, 1);
-            let measure = |batches: BatchPolicy| {
+            let measure_us = |batches: BatchPolicy| {
                 let step = BenchmarkStep { batches, ..BenchmarkStep::full(StepOutputs::Positions) };
                 let benchmark =
                     DeformerBenchmark::new(&device, &scene, std::slice::from_ref(&state), step).expect("a benchmark");
                 time_steps(&device, &benchmark, CacheState::Warm, 100).expect("a timing").median_us
             };
-            let [batch_us, separate_us] = [BatchPolicy::Always, BatchPolicy::Never].map(measure);
+            let [batch_us, separate_us] = [BatchPolicy::Always, BatchPolicy::Never].map(measure_us);
             let is_batch_chosen = modalcast_compute::gpu::plan(&scene, CudaDeformerOptions::default())
                 .kernel(KernelKind::Batch)
                 .is_some();
             eprintln!(
-                "n {vertices} r {rank} x {count}: {batch_us:.1} us batched, {separate_us:.1} us separate, \
+                "n {vertices} r {rank} x {domains}: {batch_us:.1} us batched, {separate_us:.1} us separate, \
                  batched by auto: {is_batch_chosen}"
             );
             let (chosen_us, rejected_us) =
                 if is_batch_chosen { (batch_us, separate_us) } else { (separate_us, batch_us) };
+            // The margins of 50 % and 2 us are larger than the noise of a timing.
             if chosen_us > 1.5 * rejected_us + 2.0 {
-                slow_choices.push((vertices, rank, count, chosen_us, rejected_us));
+                slow_choices.push((vertices, rank, domains, chosen_us, rejected_us));
             }
         }
     }
-    // Entries are (vertices, rank, vectors, us of the choice, us of the alternative).
+    // Entries are (vertices, rank, domains, us of the choice, us of the alternative).
     assert!(slow_choices.is_empty(), "expected no slow choice, got {slow_choices:?}");
 }

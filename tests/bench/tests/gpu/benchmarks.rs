@@ -20,6 +20,7 @@ fn gpu_memory_rates_are_plausible_and_empty_kernels_take_time() {
     let device = Device::open(0).expect("expected a CUDA device");
     let bandwidths = measure_bandwidth(&device).expect("memory bandwidths");
     eprintln!("{}: {bandwidths:?}", device.name());
+    // The limits in this test are loose, so that every supported GPU meets them.
     assert!(
         bandwidths.copy_gbs > 20.0 && bandwidths.pinned_h2d_gbs > 1.0 && bandwidths.pinned_d2h_gbs > 1.0,
         "{bandwidths:?}"
@@ -40,8 +41,8 @@ fn gpu_memory_rates_are_plausible_and_empty_kernels_take_time() {
     assert!(time_empty_kernel(&device, 0).is_err());
 }
 
-/// Per packed vertex, whether a triangle refers to it. The thesis's kernels compute the corners of unfolded triangles,
-/// so they do not compute other vertices.
+/// For each vertex of the scene, whether a triangle refers to it. The vertex update of the thesis computes no other
+/// vertices.
 fn find_referenced_vertices(scene: &Scene) -> Vec<bool> {
     let mut is_referenced = vec![false; scene.layout.vertices];
     for (domain, slot) in scene.layout.domains.iter().enumerate() {
@@ -53,7 +54,8 @@ fn find_referenced_vertices(scene: &Scene) -> Vec<bool> {
     is_referenced
 }
 
-/// Largest error of a benchmark's positions, over the vertices that a triangle refers to, as a fraction of the diagonal.
+/// Largest error of a benchmark's positions as a fraction of the scene's diagonal. Vertices that no triangle refers to
+/// are not compared. `Err` if the error exceeds the tolerance.
 fn relative_error(scene: &Scene, state: &SceneState, positions: &[f32]) -> Result<f64, String> {
     let (is_referenced, reference_positions) =
         (find_referenced_vertices(scene), modalcast_compute::reference::deform(scene, state));
@@ -62,7 +64,7 @@ fn relative_error(scene: &Scene, state: &SceneState, positions: &[f32]) -> Resul
     }
     let mut bounds = BoundingBox::EMPTY;
     reference_positions.iter().for_each(|position| bounds.include(*position));
-    // A single vertex has diagonal 0, so the diagonal is at least 1. Shapes fit into a cube of side 2.
+    // The diagonal of a single vertex is 0. The minimum of 1 has the size of a shape, which fits into a cube of side 2.
     let diagonal = bounds.diagonal().max(1.0);
     let is_compared = |vertex: &usize| is_referenced[*vertex];
     let compared_positions: Vec<f32> =
@@ -72,7 +74,7 @@ fn relative_error(scene: &Scene, state: &SceneState, positions: &[f32]) -> Resul
     max_error(&compared_positions, &reference_positions, MAX_POSITION_ERROR * diagonal).map(|error| error / diagonal)
 }
 
-/// Checks every input set of a benchmark, launched directly and replayed.
+/// Checks the positions of every input set after a launch, and of the last input set after the replays of a timing.
 fn check_benchmark(device: &Device, scene: &Arc<Scene>, states: &[SceneState], benchmark: &dyn KernelBenchmark) {
     let name = benchmark.name();
     assert_eq!(benchmark.input_set_count(), states.len(), "{name}");
@@ -87,7 +89,7 @@ fn check_benchmark(device: &Device, scene: &Arc<Scene>, states: &[SceneState], b
         );
         eprintln!("{name} input set {input_set}: {error:.2e} of the diagonal");
     }
-    // The last replay runs the last input set.
+    // The replays rotate through the input sets, so the last replay runs the last input set.
     for cache in [CacheState::Warm, CacheState::Cold] {
         benchmark.launch(device, 0).expect("expected a launch");
         let timing =
@@ -99,7 +101,10 @@ fn check_benchmark(device: &Device, scene: &Arc<Scene>, states: &[SceneState], b
     }
     assert!(benchmark.traffic().iter().map(|traffic| traffic.bytes).sum::<u64>() > 0, "{name}");
     for attributes in benchmark.kernel_attributes() {
-        assert!(attributes.registers > 0 && attributes.local_bytes == 0, "{name}: {attributes:?}");
+        assert!(
+            attributes.registers > 0 && attributes.local_bytes == 0,
+            "{name}: expected no register spills, got {attributes:?}"
+        );
     }
 }
 
@@ -140,6 +145,7 @@ fn check_single_kernel(ranks: &[usize]) {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
     let device = Device::open(0).expect("expected a CUDA device");
+    // Vertices and modes: every rank from 0 to 32 twice.
     let shapes: Vec<_> = (0..66).map(|index| (1 + index * 29 % 611, index % 33)).collect();
     let scene = scenes::random_scene(
         &shapes,
@@ -153,6 +159,7 @@ fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
             assert_eq!(benchmark.launches_per_step(), split.widths().len() + usize::from(part == Part::Whole));
         }
     }
+    // Without modes, only the vertex update is launched.
     let rigid_scene = scenes::random_scene(
         &[(40, 0)],
         scenes::RandomSceneOptions { instances: 3, normal_maps: false, rigid_transforms: true },
@@ -167,6 +174,7 @@ fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_cublas_matches_reference_with_every_product_kind() {
     let device = Device::open(0).expect("expected a CUDA device");
+    // Vertices and modes; ranks are from 0 to 64.
     let shapes: Vec<_> = (0..40).map(|index| (1 + index * 29 % 611, index * 7 % 65)).collect();
     let mixed_scene = scenes::random_scene(
         &shapes,

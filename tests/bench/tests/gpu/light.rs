@@ -1,4 +1,4 @@
-//! Measures the cost of the light-space bounds in a step.
+//! Measures what the light-space bounds of a shadow map add to the time of a step.
 
 use modalcast_bench::kernels::{BenchmarkStep, DeformerBenchmark, KernelBenchmark, StepOutputs, time_steps};
 use modalcast_bench::timing::CacheState;
@@ -7,8 +7,8 @@ use modalcast_model::scene::Scene;
 
 use crate::scenes::{self, Random};
 
-/// Times of a step with light-space bounds (for a shadow) and without, microseconds.
-fn measure_medians(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64; 2] {
+/// Median times of a step in microseconds: with light-space bounds (of a scene with a shadow), and without.
+fn measure_step_us(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64; 2] {
     let device = Device::open(0).expect("expected a CUDA device");
     let times_us = [true, false].map(|has_shadow| {
         let mut parts = scenes::parts_of_shapes(vec![scenes::random_shape(&mut Random(9), vertices, rank)]);
@@ -42,10 +42,10 @@ fn gpu_light_space_bounds_add_at_most_10_percent_and_5_us() {
         ("20,000 domains of 7", (7, 3), 20_000),
         ("200,000 domains of 60", (60, 0), 200_000),
     ] {
-        let [with, without] = measure_medians(name, shape, instances);
+        let [with_us, without_us] = measure_step_us(name, shape, instances);
         assert!(
-            with > 0.0 && with < 1.1 * without + 5.0,
-            "{name}: expected at most 10 % and 5 us more than {without} us, got {with} us"
+            with_us > 0.0 && with_us < 1.1 * without_us + 5.0,
+            "{name}: expected at most 10 % and 5 us more than {without_us} us, got {with_us} us"
         );
     }
 }

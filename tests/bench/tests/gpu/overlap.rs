@@ -34,9 +34,10 @@ fn gpu_overlapped_steps_are_faster_with_identical_vertices() {
         measurement.overlapped_us < measurement.serial_us,
         "expected overlapped steps to be faster than serial ones"
     );
+    // The ideal time is a lower limit, but its parts are measured separately. The factor allows for noise.
     assert!(
         measurement.overlapped_us > 0.5 * measurement.ideal_us,
-        "expected steps to take at least half of the ideal time"
+        "expected overlapped steps to take at least half of the ideal time"
     );
     assert!(
         measure_overlap(&device, &workload, &[], 5).is_err()

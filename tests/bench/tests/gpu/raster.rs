@@ -17,7 +17,8 @@ fn launch_raster(device: &Device, soup: &Soup, variant: RasterVariant) -> Raster
     raster
 }
 
-/// Numbers of triangles that the definition drops, by reason, and the number that it draws.
+/// Number of triangles that the CPU definition drops, by reason in the order of [`RasterCounts`], and number of
+/// triangles that it draws.
 fn count_expected_triangles(soup: &Soup) -> ([u32; 5], u32) {
     let (mut counts_by_reason, mut drawn) = ([0; 5], 0);
     for group in &soup.groups {
@@ -86,6 +87,7 @@ fn gpu_counts_every_triangle_once_at_every_granularity() {
         totals_by_size.iter().all(|triangles| *triangles > 10),
         "expected more than 10 triangles of every size class, got {totals_by_size:?}"
     );
+    // Without `count_triangles`, a soup with drawn triangles gives zeros.
     let counts = launch_raster(&device, &all_soups()[1], RasterVariant::default()).counts(&device).expect("counts");
     assert_eq!(counts, RasterCounts::default(), "expected zeros without `count_triangles`");
 }
@@ -103,6 +105,7 @@ fn gpu_ids_of_scenes_match_opengl_and_both_are_timed() {
     };
     let report = compare_rasterizers(&options, |_| {}).expect("expected a report");
     report.rows.iter().for_each(|row| eprintln!("{}", row.line()));
+    // The two workloads, and the two that every report has: a room, and a screen of two triangles that fill the frame.
     assert_eq!(report.rows.len(), 4);
     for row in &report.rows {
         let passes = row.passes.unwrap_or_else(|| panic!("expected a timed row, got {row:?}"));
@@ -112,7 +115,7 @@ fn gpu_ids_of_scenes_match_opengl_and_both_are_timed() {
     let triangle_counts = |name: &str| report.rows.iter().find(|row| row.load == name).expect("a row").in_frame;
     assert!(
         triangle_counts("room").dropped > 1000,
-        "expected many dropped triangles behind the eye, got {:?}",
+        "room: expected many dropped triangles behind the eye, got {:?}",
         triangle_counts("room")
     );
     assert_eq!(triangle_counts("screen").large, 2);

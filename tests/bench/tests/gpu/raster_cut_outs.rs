@@ -1,5 +1,6 @@
-//! Compares cut-outs of the CUDA rasterizer with their CPU definition, with every granularity. Results are bit-identical
-//! where filtering has no effect. With filtering, samples near the alpha threshold may differ.
+//! Compares cut-outs (alpha-tested triangles) of the CUDA rasterizer with their CPU definition, with every granularity.
+//! Results are bit-identical where texture filtering has no effect. With filtering, samples near the alpha threshold
+//! may differ.
 
 use modalcast_bench::kernels::{KernelBenchmark as _, RasterBenchmark, RasterMesh};
 use modalcast_compute::gpu::{Device, RasterGranularity, RasterVariant};
@@ -7,10 +8,11 @@ use modalcast_compute::gpu::{Device, RasterGranularity, RasterVariant};
 use crate::cut_outs::{CutOutSoup, alpha_image, floor_soup, sheet_soup, uniform_cut_out_soups};
 use crate::scenes::Random;
 
-/// Tolerance of the alpha threshold. The hardware interpolates texels and levels with 8-bit weights (CUDA C++
-/// programming guide, "Texture fetching"), so three interpolations have an error of up to 3/256. The hardware's logarithm
-/// for the level is assumed to be accurate to a sixteenth of a level. Alpha of the floor's image differs by at most one
-/// half between levels, so this adds up to 1/32.
+/// Samples whose alpha is closer to the threshold may differ. The tolerance exceeds the sum of two errors, 11/256:
+/// * The hardware interpolates texels and levels with 8-bit weights (CUDA C++ programming guide, "Texture fetching").
+///   Three interpolations have an error of up to 3/256.
+/// * The hardware's mip level is assumed to be accurate to 1/16. Alpha of the floor's image differs by at most 1/2
+///   between levels, so the error is at most 1/32.
 const TOLERANCE: f32 = 1.0 / 16.0;
 
 const GRANULARITIES: [RasterGranularity; 3] =
@@ -64,17 +66,21 @@ fn gpu_uniform_images_match_the_definition_bitwise() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_sheet_samples_its_image_and_mip_level_exactly() {
+fn gpu_sheet_covers_opaque_texels_of_its_mip_level() {
     let device = Device::open(0).expect("expected a CUDA device");
     let mut random = Random(3);
     let image = alpha_image(64, 64, |_, _, _| if random.next_number() < 0.0 { 0 } else { 255 });
     for level in [0, 1] {
         for granularity in GRANULARITIES {
+            // The sheet fills a viewport of the size of the level, so each sample is the center of a texel.
             let cut_out_soup = sheet_soup(64 >> level, image.clone());
             let coverage: Vec<bool> =
                 read_keys(&device, &cut_out_soup, granularity).iter().map(|key| *key != u64::MAX).collect();
             let expected_coverage: Vec<bool> = image.levels[level].iter().map(|texel| *texel == 255).collect();
-            assert!(coverage == expected_coverage, "level {level} with {granularity:?}: expected the texels' coverage");
+            assert!(
+                coverage == expected_coverage,
+                "level {level} with {granularity:?}: expected the opaque texels to be covered"
+            );
             assert!(coverage.iter().rev().ne(&expected_coverage), "control: expected reversed samples to differ");
         }
     }
@@ -98,7 +104,7 @@ fn gpu_perspective_floor_matches_the_definition() {
     eprintln!("floor: {differing} of {} samples differ, {ambiguous} are ambiguous", keys.len());
     assert_eq!(differing, 0, "{ambiguous} of {} samples are ambiguous", keys.len());
     assert!(ambiguous < keys.len() / 8, "expected few ambiguous samples, got {ambiguous} of {}", keys.len());
-    // Controls: another threshold, and texture coordinates that are off by a tenth.
+    // Controls: another threshold, and a u coordinate that is off by 0.1.
     cut_out_soup.cut_outs.materials[0].cutoff += 4.0 * TOLERANCE;
     assert!(count_differing_samples(&cut_out_soup, &keys).0 > 100);
     cut_out_soup.cut_outs.materials[0].cutoff -= 4.0 * TOLERANCE;
@@ -119,7 +125,12 @@ fn gpu_split_floor_matches_the_definition_at_every_granularity() {
         let cut_out_soup = floor_soup(divisions);
         let keys = read_keys(&device, &cut_out_soup, granularity);
         let (differing, ambiguous) = count_differing_samples(&cut_out_soup, &keys);
-        assert_eq!(differing, 0, "{divisions} divisions, {granularity:?}: {ambiguous} of {} are ambiguous", keys.len());
+        assert_eq!(
+            differing,
+            0,
+            "{divisions} divisions, {granularity:?}: {ambiguous} of {} samples are ambiguous",
+            keys.len()
+        );
         assert!(ambiguous < keys.len() / 8, "expected few ambiguous samples, got {ambiguous} of {}", keys.len());
     }
 }

@@ -1,4 +1,5 @@
-//! The complete report with a CUDA device: every variant is within its bound, and every workload has timed CUDA variants.
+//! The complete deformation report with a CUDA device: every variant is within its error bound, and every workload has
+//! timed CUDA variants.
 
 use modalcast_bench::bench::LocalMachine;
 use modalcast_bench::workloads::{Size, WorkloadKind};
@@ -11,6 +12,7 @@ fn gpu_all_variants_of_quick_workloads_pass_and_are_timed() {
     let names = ["single-14-20", "a", "a-positions", "b", "c", "cancel", "batch", "plant-2", "plant-5"];
     let kinds = names.iter().flat_map(|name| WorkloadKind::parse(name).expect("workloads"));
     let sources = kinds.map(WorkloadSource::Synthetic).collect();
+    // All steps and all variants.
     let (steps, variants) = (usize::MAX, Vec::new());
     let options = DeformReportOptions { sources, seeds: 4, replays: 20, steps, variants, size: Size::Quick };
     let report = deform(&options, &LocalMachine::open(), |_| Ok(())).expect("expected a report");

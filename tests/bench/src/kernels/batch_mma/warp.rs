@@ -1,4 +1,4 @@
-//! CPU twin of one warp of `kernels/batch_mma.cu` in lockstep: fragments, staging buffer and stores. Sums are f64.
+//! CPU twin of one warp of `kernels/batch_mma.cu`: fragments, staging buffer and stores of all 32 lanes. Sums are f64.
 
 use super::{
     BatchMmaArgs, STEP_MODES, args_without_addresses, pack_fragments, pack_transforms_and_scales, select_batch_size,
@@ -8,15 +8,16 @@ use modalcast_compute::storage::{PackedWord, TiledModes};
 use modalcast_compute::testing::transformed_axis;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
 
-/// Quads of vertices per warp.
+/// Quads (of four vertices) per warp.
 pub(super) const QUADS: usize = 8;
-/// float4 from one domain to the next in the staging buffer; two of them are padding.
+/// float4 per domain in the staging buffer: three per quad, and two of padding.
 const STRIDE: usize = 3 * QUADS + 2;
 
 /// The kernel's inputs.
 pub(super) struct KernelInputs {
     pub tiles: TiledModes,
     pub args: BatchMmaArgs,
+    /// q as [`pack_fragments`] packs it.
     fragments: Vec<u32>,
     /// Transforms, then inverse scales.
     transforms_and_scales: Vec<f32>,
@@ -37,6 +38,7 @@ impl KernelInputs {
         }
     }
 
+    /// The 16-bit number with these bits.
     fn decode(&self, bits: u32) -> f64 {
         match self.tiles.storage() {
             StorageType::F16 => half::f16::from_bits(bits as u16).to_f64(),
@@ -45,8 +47,9 @@ impl KernelInputs {
     }
 }
 
-/// Adds the product of fragments A and B to D as the PTX instruction m16n8k16 does. Lane 4 g + t holds rows g and g + 8
-/// of A, and columns 2 t and 2 t + 1 of D.
+/// Adds the product of fragments A and B to D, as the PTX instruction `mma.m16n8k16` does. The PTX manual defines which
+/// lane holds which entries ("Matrix Fragments for mma.m16n8k16"). Lane 4 g + t holds rows g and g + 8 of A and D,
+/// column g of B, and columns 2 t and 2 t + 1 of D.
 fn multiply(inputs: &KernelInputs, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &mut [[f64; 4]; 32]) {
     let decode_half = |word: u32, index: usize| inputs.decode(word >> (16 * (index % 2)) & 0xffff);
     let entry_of_a = |row: usize, k: usize| decode_half(a[4 * (row % 8) + k % 8 / 2][row / 8 + 2 * (k / 8)], k);
@@ -54,7 +57,7 @@ fn multiply(inputs: &KernelInputs, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &m
     for (lane, sums) in d.iter_mut().enumerate() {
         for (i, sum) in sums.iter_mut().enumerate() {
             let (row, column) = (lane / 4 + 8 * (i / 2), 2 * (lane % 4) + i % 2);
-            *sum += (0..16).map(|k| entry_of_a(row, k) * entry_of_b(k, column)).sum::<f64>();
+            *sum += (0..STEP_MODES).map(|k| entry_of_a(row, k) * entry_of_b(k, column)).sum::<f64>();
         }
     }
 }
@@ -70,7 +73,7 @@ struct TileQuad {
     quad: usize,
 }
 
-/// The twelve words of a lane's chunk; zeros beyond the last chunk.
+/// A chunk of one quad, 48 bytes, as twelve words of 32 bits; zeros beyond the last chunk.
 fn load_chunk(inputs: &KernelInputs, tile_quad: TileQuad, chunk: usize) -> [u32; 12] {
     let mut words = [0; 12];
     if chunk < inputs.args.chunks as usize {
@@ -84,7 +87,7 @@ fn load_chunk(inputs: &KernelInputs, tile_quad: TileQuad, chunk: usize) -> [u32;
     words
 }
 
-/// Accumulators: [row][group of 8 domains][lane][4].
+/// Accumulators: [2 axis + pair of vertices][group of 8 domains][lane][entry of D].
 pub(super) type AccumulatorFragments = Vec<Vec<[[f64; 4]; 32]>>;
 
 /// The sums over all modes for the quads of one warp.
@@ -101,19 +104,22 @@ pub(super) fn sum_modes(inputs: &KernelInputs, tile: usize, warp: usize) -> Accu
                 [0, 4].map(|offset| load_chunk(inputs, tile_quad, 8 * step + lane % 4 + offset))
             })
             .collect();
+        // Words 0 to 5 of a chunk belong to its first mode, words 6 to 11 to its second mode. Each word holds a pair of
+        // vertices. A register of A holds both modes of one vertex.
         for (row, sums) in sums.iter_mut().enumerate() {
-            let low_halves = |words: &[u32; 12]| words[row] & 0xffff | words[6 + row] << 16;
-            let high_halves = |words: &[u32; 12]| words[row] >> 16 | words[6 + row] & 0xffff_0000;
+            let first_vertex = |words: &[u32; 12]| words[row] & 0xffff | words[6 + row] << 16;
+            let second_vertex = |words: &[u32; 12]| words[row] >> 16 | words[6 + row] & 0xffff_0000;
             let a: [[u32; 4]; 32] = std::array::from_fn(|lane| {
-                let [first, second] = &chunks[lane];
-                [low_halves(first), high_halves(first), low_halves(second), high_halves(second)]
+                let [low, high] = &chunks[lane];
+                [first_vertex(low), second_vertex(low), first_vertex(high), second_vertex(high)]
             });
             for (group, sums) in sums.iter_mut().enumerate() {
                 let word = |lane: usize, index: usize| {
                     inputs.fragments[4 * (32 * (group_count * step + group) + lane) + index]
                 };
-                for half in [2, 0] {
-                    let b = std::array::from_fn(|lane| [word(lane, half), word(lane, half + 1)]);
+                // Words 2 and 3 hold the rounding remainders of q, which are added first.
+                for first_word in [2, 0] {
+                    let b = std::array::from_fn(|lane| [word(lane, first_word), word(lane, first_word + 1)]);
                     multiply(inputs, &a, &b, sums);
                 }
             }
@@ -122,7 +128,8 @@ pub(super) fn sum_modes(inputs: &KernelInputs, tile: usize, warp: usize) -> Accu
     sums
 }
 
-/// The staging buffer of one warp after a pass. A pass stages the positions of four domains.
+/// The staging buffer of one warp after a pass. A pass stages the positions of four domains: those of equal parity in a
+/// group of 8.
 pub(super) fn stage_positions(
     inputs: &KernelInputs,
     sums: &AccumulatorFragments,
@@ -131,9 +138,9 @@ pub(super) fn stage_positions(
 ) -> Vec<[f32; 4]> {
     let mut staged = vec![[f32::NAN; 4]; 4 * STRIDE];
     let layout = inputs.tiles.tile(tile);
-    for (quad, pair) in (0..QUADS).flat_map(|quad| (0..4).map(move |pair| (quad, pair))) {
-        let (lane, parity) = (4 * quad + pair, pass % 2);
-        let domain = 8 * (pass / 2) + parity + 2 * pair;
+    for (quad, domain_pair) in (0..QUADS).flat_map(|quad| (0..4).map(move |domain_pair| (quad, domain_pair))) {
+        let (lane, parity) = (4 * quad + domain_pair, pass % 2);
+        let domain = 8 * (pass / 2) + 2 * domain_pair + parity;
         let rest = inputs.tiles.rest()[layout.first_quad + (QUADS * warp + quad).min(layout.quads - 1)];
         let rows = &inputs.transforms_and_scales[12 * domain..][..12];
         let inverse_scale = inputs.transforms_and_scales[12 * inputs.batch_size + domain];
@@ -147,7 +154,7 @@ pub(super) fn stage_positions(
             })
             .collect();
         for (i, components) in world.chunks_exact(4).enumerate() {
-            staged[STRIDE * pair + 3 * quad + i] = [components[0], components[1], components[2], components[3]];
+            staged[STRIDE * domain_pair + 3 * quad + i] = [components[0], components[1], components[2], components[3]];
         }
     }
     staged
@@ -166,14 +173,15 @@ pub(super) struct StoreRange {
 /// Copies the staged positions of four domains to their packed vertices.
 pub(super) fn store_staged(inputs: &KernelInputs, staged: &[[f32; 4]], range: StoreRange, positions: &mut [f32]) {
     for (lane, i) in (0..32).flat_map(|lane| (0..3).map(move |i| (lane, i))) {
-        let domain = 8 * (range.pass / 2) + range.pass % 2 + 2 * (lane / 8);
-        let vector = 8 * i + lane % 8;
-        let is_stored = |k: &usize| domain < inputs.args.domains as usize && 4 * vector + k < range.coordinates;
-        for k in (0..4).filter(is_stored) {
+        let (domain_pair, vector) = (lane / 8, 8 * i + lane % 8);
+        let domain = 8 * (range.pass / 2) + 2 * domain_pair + range.pass % 2;
+        let is_stored =
+            |component: &usize| domain < inputs.args.domains as usize && 4 * vector + component < range.coordinates;
+        for component in (0..4).filter(is_stored) {
             let first_vertex = inputs.args.first_vertices[domain] as usize + range.first_vertex;
-            let index = 3 * first_vertex + 4 * vector + k;
-            assert!(positions[index].is_nan(), "expected one write to number {index}, got two");
-            positions[index] = staged[STRIDE * (lane / 8) + vector][k];
+            let index = 3 * first_vertex + 4 * vector + component;
+            assert!(positions[index].is_nan(), "expected one write to coordinate {index}, got two");
+            positions[index] = staged[STRIDE * domain_pair + vector][component];
         }
     }
 }

@@ -1,4 +1,5 @@
-//! Plans the cuBLAS products of a scene: which domains share a batch, their padding, and their memory layout. No I/O.
+//! Plans the cuBLAS products of a scene: which domains share a batch, their padding, and their memory layout. Pure
+//! functions.
 
 use std::collections::BTreeMap;
 
@@ -18,11 +19,11 @@ pub enum CublasMethod {
     SgemvRows,
     /// All domains padded to the largest one: one strided batched `sgemm`.
     Padded,
-    /// As `Padded`, with `sgemv`.
+    /// As `Padded`, but one strided batched `sgemv`.
     PaddedGemv,
     /// Domains in buckets of similar rank and size, padded to a common size: one strided batched `sgemm` per bucket.
     Bucketed,
-    /// As `Bucketed`, with `sgemv`.
+    /// As `Bucketed`, but one strided batched `sgemv` per bucket.
     BucketedGemv,
     /// Domains in groups of equal rank and size, without padding: one grouped batched `sgemm`.
     Grouped,
@@ -62,8 +63,8 @@ impl CublasMethod {
         matches!(self, Self::PaddedGemv | Self::BucketedGemv)
     }
 
-    /// Key of a domain; domains with equal keys share a batch. Buckets round the rank up to a multiple of 8 and the size
-    /// up to a power of two.
+    /// Key of a domain: rank and number of rows, both rounded. Domains with equal keys share a batch. Buckets round the
+    /// rank up to a multiple of 8 and the rows up to a power of two. Methods with a single batch have a constant key.
     const fn batch_key(self, rows: usize, rank: usize) -> (usize, usize) {
         match self {
             Self::Bucketed | Self::BucketedGemv => (rank.next_multiple_of(8), rows.next_power_of_two()),
@@ -85,6 +86,7 @@ pub(super) enum Operand {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct GemmBatch {
     pub call: GemmCall,
+    /// The domain of each product. With [`CublasMethod::Instances`], the domain of each column of the only product.
     pub domains: Vec<usize>,
     /// Offsets of the first U, q and u, in floats; indexed by [`Operand`].
     pub offsets: [u64; 3],
@@ -102,7 +104,7 @@ impl GemmPlan {
     /// Plans the products of a scene.
     ///
     /// # Errors
-    /// `Invalid` when `method` does not support the scene, or the scene is too large for the library's 32-bit integers.
+    /// `Invalid` when `method` does not support the scene, or the scene is too large for the 32-bit integers of cuBLAS.
     pub(super) fn new(scene: &Scene, method: CublasMethod) -> Result<Self> {
         check_scene(scene, method)?;
         let mut groups: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
@@ -116,7 +118,7 @@ impl GemmPlan {
             let counts = [matrices, domains.len() as u64, domains.len() as u64];
             let offsets = floats;
             for ((total, stride), count) in floats.iter_mut().zip(call.strides).zip(counts) {
-                // Batches are aligned to float4.
+                // Every batch begins at a multiple of 16 bytes.
                 *total = (*total + stride.unsigned_abs() * count).next_multiple_of(4);
             }
             batches.push(GemmBatch { call, domains, offsets });
@@ -154,7 +156,7 @@ impl GemmBatch {
         self.offsets[operand as usize] + self.call.strides[operand as usize].unsigned_abs() * index as u64
     }
 
-    /// U of one domain in the product's layout, padded with zeros.
+    /// U of one domain: row-major if `by_rows`, otherwise column-major and padded with zeros to the size of the batch.
     pub(super) fn pack_matrix(&self, scene: &Scene, domain: usize, by_rows: bool) -> Vec<f32> {
         let modes = &scene.shape_of(domain).modes;
         let (rows, rank) = (3 * modes.vertices(), modes.rank());
@@ -178,7 +180,7 @@ fn size_product(scene: &Scene, method: CublasMethod, domains: &[usize]) -> Resul
     let slots = || domains.iter().map(|domain| scene.layout.domains[*domain]);
     let rows = slots().map(|slot| 3 * slot.vertices).max().unwrap_or(0);
     let rank = slots().map(|slot| slot.rank).max().unwrap_or(0);
-    // cuBLAS is fastest with columns aligned to 16 bytes. Row-major storage has no gaps.
+    // cuBLAS is fastest with columns aligned to 16 bytes. Row-major storage has no padding.
     let lead = if method == CublasMethod::SgemvRows { rows } else { rows.next_multiple_of(4) };
     let (columns, count) = if method == CublasMethod::Instances { (domains.len(), 1) } else { (1, domains.len()) };
     let strides = [lead as i64 * rank as i64, rank as i64, lead as i64];
@@ -213,7 +215,8 @@ mod tests {
     use super::*;
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
-    /// Emulates cuBLAS on a batch: C = A B for strided column-major matrices.
+    /// Emulates cuBLAS on a batch: C = A B for strided matrices. A is row-major if `by_rows`; all others are
+    /// column-major.
     fn multiply(batch: &GemmBatch, by_rows: bool, [a, b]: [&[f32]; 2], c: &mut [f32]) {
         let GemmCall { rows, inner, columns, lead, count, strides } = batch.call;
         let element = |first: u64, stride: i64, index: i32| first as usize + stride as usize * index as usize;
@@ -232,11 +235,13 @@ mod tests {
         }
     }
 
+    /// Compares u of every domain with U q in f64, and returns the plan.
     fn check_products(scene: &Scene, state: &SceneState, method: CublasMethod) -> GemmPlan {
         let plan = GemmPlan::new(scene, method).expect("a supported scene");
         let by_rows = method == CublasMethod::SgemvRows;
         let mut matrices = vec![0.0; plan.floats[Operand::Matrix as usize] as usize];
         for batch in &plan.batches {
+            // Instances of one shape share one U.
             let matrix_count = if method == CublasMethod::Instances { 1 } else { batch.domains.len() };
             for (index, domain) in batch.domains.iter().enumerate().take(matrix_count) {
                 let matrix = batch.pack_matrix(scene, *domain, by_rows);
@@ -253,6 +258,7 @@ mod tests {
             for vertex in 0..scene.layout.domains[domain].vertices {
                 for (axis, want) in displacement_of(scene, state, domain, vertex).iter().enumerate() {
                     let got = f64::from(u[*offset as usize + 3 * vertex + axis]);
+                    // f32 sums of up to 12 products of numbers from -1 to 1.
                     assert!((got - want).abs() < 1e-4, "{} domain {domain} vertex {vertex}", method.name());
                 }
             }
@@ -262,11 +268,13 @@ mod tests {
 
     #[test]
     fn every_method_gives_each_domain_its_u() {
+        // Vertices, modes and triangles of each domain.
         let shapes: Vec<_> = (0..30).map(|index| (1 + index * 11 % 40, index % 13, 1)).collect();
         let (many_domains, state) = scene_and_state(&shapes);
         let deformable = shapes.iter().filter(|(_, rank, _)| *rank > 0);
         let unpadded: u64 = deformable.clone().map(|(vertices, rank, _)| (3 * vertices * rank) as u64).sum();
-        let matrix_floats = |method: CublasMethod| check_products(&many_domains, &state, method).floats[0];
+        let matrix_floats =
+            |method: CublasMethod| check_products(&many_domains, &state, method).floats[Operand::Matrix as usize];
         let (padded, bucketed, grouped) = (
             matrix_floats(CublasMethod::Padded),
             matrix_floats(CublasMethod::Bucketed),
@@ -298,15 +306,16 @@ mod tests {
         let mut state = SceneState::rest(&instances);
         state.q.iter_mut().enumerate().for_each(|(index, q)| *q = (index as f32).sin());
         let plan = check_products(&instances, &state, CublasMethod::Instances);
-        assert_eq!(plan.floats, [72 * 10, 160, 72 * 16]);
+        // The 3 x 23 = 69 rows are padded to 72. There is one U of 10 columns; q and u have 16 columns.
+        assert_eq!(plan.floats, [72 * 10, 10 * 16, 72 * 16]);
         assert_eq!((plan.batches[0].call.columns, plan.batches[0].call.count), (16, 1));
     }
 
     #[test]
-    fn rejects_unsupported_scenes_by_name() {
-        let (two, _) = scene_and_state(&[(5, 2, 1), (5, 2, 1)]);
+    fn rejects_unsupported_scenes_and_names_the_field() {
+        let (two_shapes, _) = scene_and_state(&[(5, 2, 1), (5, 2, 1)]);
         for method in [CublasMethod::SgemvColumns, CublasMethod::SgemvRows, CublasMethod::Instances] {
-            let error = GemmPlan::new(&two, method).expect_err("two shapes").to_string();
+            let error = GemmPlan::new(&two_shapes, method).expect_err("two shapes").to_string();
             assert!(error.starts_with("scene.domains") && error.contains(method.name()), "{error}");
         }
         let (rigid, _) = scene_and_state(&[(5, 0, 1)]);

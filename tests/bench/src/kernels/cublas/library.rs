@@ -1,8 +1,8 @@
 //! Loads cuBLAS at run time and wraps its handle. Only benchmarks use it, so the server does not depend on it.
 //!
-//! The functions are those of cudarc. cudarc searches the library by its name only and panics if it finds none.
+//! cuBLAS is called through cudarc. cudarc looks for the library by its name only and panics if it finds none.
 //! Therefore [`load`] loads the library first, from the path in `MODALCAST_CUBLAS` if it is set, and checks that cudarc
-//! uses the same one.
+//! uses the same library.
 
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -58,7 +58,8 @@ fn unavailable(reason: String) -> Error {
     Error::Unavailable { what: "cuBLAS", reason, remedy: REMEDY.into() }
 }
 
-/// Paths at which to look for cuBLAS, in order of preference. A path in MODALCAST_CUBLAS is the only one.
+/// Paths at which to look for cuBLAS, in order of preference. If MODALCAST_CUBLAS is set, its path is the only
+/// candidate.
 fn candidates() -> Vec<PathBuf> {
     if let Some(path) = std::env::var_os("MODALCAST_CUBLAS").filter(|path| !path.is_empty()) {
         return vec![path.into()];
@@ -90,20 +91,21 @@ impl CublasLibrary {
         let cublas_lt_path = |name: &str| Some(path.parent()?.join(name.replace("libcublas.", "libcublasLt.")));
         let cublas_lt_file =
             path.file_name().and_then(|name| cublas_lt_path(&name.to_string_lossy())).filter(|file| file.is_file());
-        // SAFETY: the libraries' initializers only set them up; the operator chooses the name or path.
+        // SAFETY: the initializers of cuBLAS and cublasLt have no preconditions. The operator chooses the name or path.
         let (cublas_lt, library) =
             unsafe { (cublas_lt_file.and_then(|file| Library::new(file).ok()), Library::new(path)?) };
         Ok(Self { library, _cublas_lt: cublas_lt })
     }
 
     /// Whether cudarc resolves its functions in this library. The system's loader identifies libraries by their
-    /// `SONAME`, so cudarc gets this library unless an earlier name in its list exists on the search path.
+    /// `SONAME`. cudarc thus gets this library, unless the search path has a library with a name that cudarc tries
+    /// earlier.
     fn is_used_by_cudarc(&self) -> bool {
         // SAFETY: as in `open`.
         if !unsafe { sys::is_culib_present() } {
             return false;
         }
-        // SAFETY: a library is present, so `culib` does not panic; it runs the initializers of a cuBLAS.
+        // SAFETY: a library is present, so `culib` does not panic. It runs initializers, as `open` does.
         let cudarc_library = unsafe { sys::culib() };
         let create = function_address(&self.library, CREATE);
         create.is_some() && create == function_address(cudarc_library, CREATE)
@@ -115,7 +117,7 @@ impl CublasLibrary {
     }
 }
 
-/// Names of functions. The system's loader expects a terminating zero.
+/// Names of functions in cuBLAS, with the terminating zero that the system's loader expects.
 const CREATE: &[u8] = b"cublasCreate_v2\0";
 const SGEMV_STRIDED: &[u8] = b"cublasSgemvStridedBatched\0";
 const SGEMM_GROUPED: &[u8] = b"cublasSgemmGroupedBatched\0";
@@ -168,7 +170,7 @@ impl<B> std::fmt::Debug for CublasHandle<B> {
 const ONE: f32 = 1.0;
 const ZERO: f32 = 0.0;
 
-/// Loads cuBLAS and checks that this version has the grouped and strided functions, if they are needed.
+/// Loads cuBLAS and checks that this version has the functions for grouped products and strided `sgemv`, if needed.
 ///
 /// # Errors
 /// `Unavailable` when cuBLAS or such a function is missing.
@@ -241,7 +243,8 @@ impl<B> CublasHandle<B> {
     /// Strided batched products: `sgemm`, or `sgemv` if `use_gemv`.
     ///
     /// # Safety
-    /// The addresses are those of `count` matrices with the sizes and strides in `call`; with `use_gemv`, its `columns` is 1.
+    /// The addresses are those of `count` matrices with the sizes and strides in `call`; with `use_gemv`, its `columns`
+    /// is 1.
     pub(super) unsafe fn multiply_strided(&self, call: GemmCall, use_gemv: bool, [a, b, c]: [u64; 3]) -> Result<()> {
         let GemmCall { rows, inner, columns, lead, count, strides: [stride_a, stride_b, stride_c] } = call;
         let (handle, transpose) = (self.handle, NO_TRANSPOSE);
@@ -334,10 +337,10 @@ mod tests {
         }
     }
 
-    /// The name has no prefix `gpu_`, because cuBLAS can be loaded without a device.
+    /// The name of this test has no prefix `gpu_`, because cuBLAS can be loaded without a device.
     #[test]
     #[ignore = "needs cuBLAS"]
-    fn cudarc_uses_the_library_of_the_variable() {
+    fn cudarc_uses_the_library_of_the_environment_variable() {
         let path = PathBuf::from(std::env::var_os("MODALCAST_CUBLAS").expect("MODALCAST_CUBLAS"));
         let library = load(&[path]).map_err(|error| error.to_string()).expect("cuBLAS");
         assert!(

@@ -37,15 +37,16 @@ struct ProductBuffers {
     matrices: DeviceBuffer,
     u: DeviceBuffer,
     input_sets: InputSets,
-    /// Present for [`CublasMethod::Grouped`].
+    /// Only for [`CublasMethod::Grouped`].
     pointers: Option<PointerArrays>,
 }
 
-/// Device arrays with one pointer per product: to U, to u, and to q for each input set.
+/// Device arrays of pointers to the operands, in the order of the products.
 #[derive(Debug)]
 struct PointerArrays {
     matrices: DeviceBuffer,
     u: DeviceBuffer,
+    /// The pointers of all input sets, one input set after the other.
     q: DeviceBuffer,
     product_count: u64,
 }
@@ -54,8 +55,8 @@ impl CublasBenchmark {
     /// Packs and uploads a scene for one method.
     ///
     /// # Errors
-    /// `Invalid` when `method` does not support the scene, or there is no state; `Unavailable` when cuBLAS is missing or
-    /// too old, or the device has too little memory; `Fault` when the device fails.
+    /// `Invalid` when `method` does not support the scene, or there is no state; `Unavailable` when cuBLAS is missing
+    /// or too old, or the device has too little memory; `Fault` when the device fails.
     pub fn new(
         device: &Device,
         scene: &Arc<Scene>,
@@ -82,6 +83,7 @@ impl CublasBenchmark {
         let ProductBuffers { matrices, u, input_sets, pointers } = &self.cublas.buffers;
         if let Some(pointers) = pointers {
             let groups: Vec<GemmCall> = self.plan.batches.iter().map(|batch| batch.call).collect();
+            // A pointer has 8 bytes.
             let q = pointers.q.address() + 8 * pointers.product_count * (input_set % input_sets.count()) as u64;
             let pointers = [pointers.matrices.address(), q, pointers.u.address()];
             // SAFETY: the arrays have a pointer for each product, in the order of the groups, each to memory of the
@@ -145,18 +147,20 @@ impl KernelBenchmark for CublasBenchmark {
             ArrayTraffic::new("u written", u),
         ];
         let pointers = self.cublas.buffers.pointers.iter();
-        traffic.extend(pointers.map(|pointers| ArrayTraffic::new("pointers", 24 * pointers.product_count)));
+        // A product has three pointers of 8 bytes.
+        traffic.extend(pointers.map(|pointers| ArrayTraffic::new("pointers", 3 * 8 * pointers.product_count)));
         traffic.extend(self.update.iter().flat_map(PlainUpdate::traffic));
         traffic
     }
 
-    /// Calls of cuBLAS plus the launch of the update. A call may launch several kernels.
+    /// Calls of cuBLAS plus the launch of the update. A call counts as one launch, although it may launch several
+    /// kernels.
     fn launches_per_step(&self) -> usize {
         let calls = if self.cublas.buffers.pointers.is_some() { 1 } else { self.plan.batches.len() };
         calls + usize::from(self.update.is_some())
     }
 
-    /// Attributes of the update alone. Those of the kernels of cuBLAS are not accessible.
+    /// Attributes of the update alone. The kernels of cuBLAS are not accessible.
     fn kernel_attributes(&self) -> Vec<KernelAttributes> {
         self.update.iter().map(|update| update.attributes().clone()).collect()
     }
@@ -169,6 +173,7 @@ impl PointerArrays {
         [matrices, u]: [&DeviceBuffer; 2],
         input_sets: &InputSets,
     ) -> Result<Self> {
+        // Each product as its batch and its index in the batch.
         let products =
             || plan.batches.iter().flat_map(|batch| (0..batch.domains.len()).map(move |index| (batch, index)));
         let pointers =
@@ -188,6 +193,7 @@ impl PointerArrays {
 fn upload_matrices(device: &Device, scene: &Scene, plan: &GemmPlan, method: CublasMethod) -> Result<DeviceBuffer> {
     let mut buffer = DeviceBuffer::zeroed(device, 4 * plan.floats[Operand::Matrix as usize])?;
     for batch in &plan.batches {
+        // Instances of one shape share one U.
         let matrix_count = if method == CublasMethod::Instances { 1 } else { batch.domains.len() };
         for (index, domain) in batch.domains.iter().enumerate().take(matrix_count) {
             let matrix = batch.pack_matrix(scene, *domain, method == CublasMethod::SgemvRows);
@@ -207,6 +213,6 @@ fn check_memory(device: &Device, plan: &GemmPlan) -> Result<()> {
     if bytes <= free as u64 {
         return Ok(());
     }
-    let reason = format!("the products need {bytes} bytes, {free} are free on {}", device.name());
+    let reason = format!("the products need {bytes} bytes, but {free} are free on {}", device.name());
     Err(Error::Unavailable { what: "GPU memory", reason, remedy: "Do not select this variant for this scene".into() })
 }

@@ -1,31 +1,36 @@
-//! The group concept of chapter 3.2.2: one layout for domains of different ranks, so that one kernel computes all of
-//! them. No I/O.
+//! The groups of chapter 3.2.2: one layout of U for domains of different ranks, so that one kernel computes all of
+//! them. Pure functions.
 //!
-//! Notation of the text: a row of U' has n_vr float4 ([`vectors_per_row`]). A warp holds n_g groups of w_g lanes. A
-//! group holds n_gg rows of one domain at a time. U'' (equations 3.5 and 3.6) has w_g columns and n' = ceil(3n / n_gg)
-//! rows. The text prints floor(3n / n_gg), which omits up to n_gg - 1 rows of U.
+//! Notation of the thesis, for a domain of n vertices:
+//! * U' is U with every row padded to n_vr float4 ([`vectors_per_row`]).
+//! * A warp has n_g groups of w_g lanes. A lane multiplies one float4, so a group computes n_gg rows of U' at a time.
+//! * U'' (equations 3.5 and 3.6) has n' = ceil(3n / n_gg) rows of w_g float4, one row per group. Row i of U'' holds the
+//!   rows i, i + n', i + 2 n', ... of U'. The thesis prints n' = floor(3n / n_gg), which omits up to n_gg - 1 rows of
+//!   U.
 
 use serde::Serialize;
 
 use modalcast_model::scene::{Scene, SceneState};
 
-/// Lanes per warp, and threads per block.
+/// Lanes per warp.
 pub(super) const WARP: usize = 32;
+/// Threads per block.
 pub(super) const BLOCK: usize = 256;
 
-/// Maximum rank that the text's groups support.
+/// Maximum rank that groups support: a row of U' has at most eight float4, one for each lane of the widest group.
 pub(super) const MAX_RANK: usize = 32;
 
-/// Output index in the metadata of an idle lane.
+/// Output index of an idle lane, which multiplies nothing.
 pub(super) const IDLE: u32 = u32::MAX;
 
-/// Number of kernels; n_vr determines which of them computes a domain (figures 3.5 and 3.6).
+/// Number of kernels. Each kernel has one group width w_g. The n_vr of a domain determines its kernel (figures 3.5 and
+/// 3.6).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum KernelSplit {
     /// w_g is 8 for all n_vr.
     One,
-    /// w_g is 6 for an n_vr of 3, 5 or 6, and otherwise 8. The fastest split in the text.
+    /// w_g is 6 for an n_vr of 3, 5 or 6, and otherwise 8. The fastest split in the thesis.
     Two,
     /// w_g is 6 for an n_vr of 3 or 6, 5 for 5, 7 for 7, and otherwise 8. No lane of a group is idle.
     Four,
@@ -44,7 +49,7 @@ impl KernelSplit {
         }
     }
 
-    /// w_g of a domain whose rows are n_vr (1 to 8) float4.
+    /// w_g of a domain, from its n_vr (1 to 8).
     pub const fn width_of(self, n_vr: usize) -> usize {
         match (self, n_vr) {
             (Self::Two, 3 | 5 | 6) | (Self::Four, 3 | 6) => 6,
@@ -64,32 +69,33 @@ const fn groups_per_warp(width: usize) -> usize {
     WARP / width
 }
 
-/// n_gg: rows of U that a group computes at a time.
+/// n_gg: rows of U' that a group computes at a time.
 const fn rows_per_group(width: usize, n_vr: usize) -> usize {
     width / n_vr
 }
 
-/// n': rows of U'' for `rows` = 3n rows of U.
+/// n': rows of U'' for `rows` = 3n rows of U. It is also the number of groups.
 const fn reshaped_rows(rows: usize, width: usize, n_vr: usize) -> usize {
     rows.div_ceil(rows_per_group(width, n_vr))
 }
 
-/// Idle lanes of a full warp, for groups of `width` lanes on rows of `n_vr` float4.
+/// Idle lanes of a full warp, for groups of `width` lanes and rows of `n_vr` float4: 32 - n_g n_gg n_vr.
 pub const fn idle_lanes_per_warp(width: usize, n_vr: usize) -> usize {
     WARP - groups_per_warp(width) * rows_per_group(width, n_vr) * n_vr
 }
 
-/// Lanes that one kernel launches, and the number of idle ones.
+/// Numbers of lanes that one kernel launches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct LaneCounts {
-    /// w_g.
+    /// w_g, lanes per group.
     pub width: usize,
-    /// Launched lanes.
+    /// All lanes, with those that fill up the last warp and block.
     pub all: u64,
+    /// Lanes that multiply nothing.
     pub idle: u64,
 }
 
-/// The lane counts of each kernel of a split, computed without packing.
+/// The lane counts of each kernel of a split. U is not packed for this.
 pub fn count_lanes(scene: &Scene, split: KernelSplit) -> Vec<LaneCounts> {
     let count_for_width = |width: &usize| {
         let (mut groups, mut busy_lanes) = (0, 0);
@@ -107,10 +113,10 @@ const fn belongs_to_width(split: KernelSplit, width: usize, rank: usize) -> bool
     rank > 0 && split.width_of(vectors_per_row(rank)) == width
 }
 
-/// Layout of u: the vertices of all domains with modes.
+/// Layout of u: one float4 per vertex of the domains with modes, one domain after the other.
 #[derive(Debug)]
 pub(super) struct DisplacementLayout {
-    /// First vertex of each domain's u; `None` without modes.
+    /// Index of the first vertex of each domain in u; `None` for domains without modes.
     pub first_vertices: Vec<Option<u32>>,
     /// Number of vertices that have a u.
     pub vertex_count: usize,
@@ -148,18 +154,22 @@ pub(super) fn pack_row_vector(scene: &Scene, domain: usize, row: usize, k: usize
     })
 }
 
-/// A float4 of U'' and the metadata of one lane.
+/// The inputs of one lane.
 struct Lane {
+    /// A float4 of U''.
     entry: [f32; 4],
+    /// As in [`PackedGroups::meta`].
     meta: [u32; 4],
 }
 
-/// Inputs of one kernel: a float4 of U'' and the metadata of each lane.
+/// The inputs of all lanes of one kernel.
 #[derive(Debug)]
 pub(super) struct PackedGroups {
+    /// w_g, lanes per group.
     pub width: usize,
+    /// Per lane a float4 of U''.
     pub entries: Vec<[f32; 4]>,
-    /// Per lane: output index in u (floats) or [`IDLE`], input index in q (float4), n_vr, unused.
+    /// Per lane: index of its result in u (in floats) or [`IDLE`], index of its input in q (in float4), n_vr, unused.
     pub meta: Vec<[u32; 4]>,
 }
 
@@ -174,12 +184,12 @@ pub(super) fn pack_groups(scene: &Scene, split: KernelSplit, width: usize) -> Pa
         let first_u = displacements.first_vertices[domain].filter(|_| belongs_to_width(split, width, slot.rank));
         if let Some(first_u) = first_u {
             let rows = 3 * slot.vertices;
-            let reshaped = reshaped_rows(rows, width, n_vr);
-            for group in 0..reshaped {
+            let group_count = reshaped_rows(rows, width, n_vr);
+            for group in 0..group_count {
                 packed.begin_group();
                 for lane in 0..width {
                     let (row_of_group, k) = (lane / n_vr, lane % n_vr);
-                    let row = row_of_group * reshaped + group;
+                    let row = row_of_group * group_count + group;
                     let is_busy = row_of_group < rows_per_group(width, n_vr) && row < rows;
                     packed.push_lane(is_busy.then(|| {
                         let output = 4 * (first_u + row as u32 / 3) + row as u32 % 3;
@@ -205,7 +215,7 @@ impl PackedGroups {
         self.meta.push(meta);
     }
 
-    /// Appends idle lanes so that the next group lies in one warp.
+    /// Appends idle lanes if the warp has no room for another group.
     fn begin_group(&mut self) {
         while self.meta.len() % WARP >= groups_per_warp(self.width) * self.width {
             self.push_lane(None);
@@ -224,16 +234,17 @@ mod tests {
     use modalcast_compute::testing::scene_and_state;
 
     #[test]
-    fn only_four_kernels_leave_no_idle_lane_in_groups() {
+    fn only_the_split_into_four_leaves_no_idle_lane_in_groups() {
         let idle_in_group = |split: KernelSplit, n_vr: usize| split.width_of(n_vr) % n_vr;
         for n_vr in 1..=8 {
             assert_eq!(idle_in_group(KernelSplit::Four, n_vr), 0, "n_vr {n_vr}");
         }
-        let widths_with_idle_lanes =
+        let n_vr_with_idle_lanes =
             |split: KernelSplit| (1..=8).filter(|n_vr| idle_in_group(split, *n_vr) > 0).collect::<Vec<_>>();
-        assert_eq!(widths_with_idle_lanes(KernelSplit::Two), [5, 7]);
-        assert_eq!(widths_with_idle_lanes(KernelSplit::One), [3, 5, 6, 7]);
-        // Lanes outside of groups are idle too. With w_g = 6 there are two per warp, because 6 does not divide 32.
+        assert_eq!(n_vr_with_idle_lanes(KernelSplit::Two), [5, 7]);
+        assert_eq!(n_vr_with_idle_lanes(KernelSplit::One), [3, 5, 6, 7]);
+        // A warp also has idle lanes outside of groups if w_g does not divide 32: two with w_g = 6 or 5, four with w_g
+        // = 7.
         assert_eq!([1, 2, 4, 8].map(|n_vr| idle_lanes_per_warp(8, n_vr)), [0; 4]);
         assert_eq!([3, 6].map(|n_vr| idle_lanes_per_warp(6, n_vr)), [2, 2]);
         assert_eq!([idle_lanes_per_warp(6, 5), idle_lanes_per_warp(8, 5), idle_lanes_per_warp(5, 5)], [7, 12, 2]);
@@ -242,29 +253,25 @@ mod tests {
 
     #[test]
     fn floor_drops_rows_of_u_that_ceil_keeps() {
-        let covered_rows = |rows: usize, reshaped: usize, rows_of_group: usize| {
-            (0..rows_of_group)
-                .flat_map(|row_of_group| (0..reshaped).map(move |row| row_of_group * reshaped + row))
+        // Number of rows of U in a U'' of `group_count` rows.
+        let covered_rows = |rows: usize, group_count: usize, n_gg: usize| {
+            (0..n_gg)
+                .flat_map(|row_of_group| (0..group_count).map(move |group| row_of_group * group_count + group))
                 .filter(|row| *row < rows)
                 .count()
         };
         // Four vertices of rank 4 (n_vr = 1) in groups of eight: 12 rows of U fill one and a half rows of U''.
-        let rows_of_group = rows_per_group(8, 1);
-        assert_eq!(
-            (
-                covered_rows(12, 12 / rows_of_group, rows_of_group),
-                covered_rows(12, 12_usize.div_ceil(rows_of_group), rows_of_group)
-            ),
-            (8, 12)
-        );
+        let n_gg = rows_per_group(8, 1);
+        assert_eq!(covered_rows(12, 12 / n_gg, n_gg), 8, "with floor");
+        assert_eq!(covered_rows(12, 12_usize.div_ceil(n_gg), n_gg), 12, "with ceil");
         assert_eq!(reshaped_rows(12, 8, 1), 2);
         let mut dropped_cases = 0;
         for (vertices, n_vr) in (1..50).flat_map(|vertices| (1..=8).map(move |n_vr| (vertices, n_vr))) {
             for split in KernelSplit::ALL {
                 let (rows, width) = (3 * vertices, split.width_of(n_vr));
-                let rows_of_group = rows_per_group(width, n_vr);
-                assert_eq!(covered_rows(rows, reshaped_rows(rows, width, n_vr), rows_of_group), rows);
-                dropped_cases += usize::from(covered_rows(rows, rows / rows_of_group, rows_of_group) < rows);
+                let n_gg = rows_per_group(width, n_vr);
+                assert_eq!(covered_rows(rows, reshaped_rows(rows, width, n_vr), n_gg), rows);
+                dropped_cases += usize::from(covered_rows(rows, rows / n_gg, n_gg) < rows);
             }
         }
         assert!(dropped_cases > 100, "expected floor to drop rows in over 100 cases, got {dropped_cases}");
@@ -272,6 +279,7 @@ mod tests {
 
     #[test]
     fn lane_counts_match_the_packing() {
+        // Vertices, modes and triangles of each domain.
         let shapes: Vec<_> = (0..40).map(|index| (1 + index * 7 % 50, index % 33, 1)).collect();
         let (scene, _) = scene_and_state(&shapes);
         for split in KernelSplit::ALL {
@@ -291,7 +299,7 @@ mod tests {
         let [one_kernel, two_kernels] = [KernelSplit::One, KernelSplit::Two].map(idle_share);
         assert!(
             two_kernels < one_kernel,
-            "expected fewer idle lanes with two kernels, got {two_kernels} and {one_kernel}"
+            "expected a smaller share of idle lanes with two kernels, got {two_kernels} and {one_kernel}"
         );
     }
 }

@@ -1,12 +1,13 @@
-//! BASELINE. The kernels of chapter 3.2 of the thesis, implemented as the text describes them, for comparison with ours.
+//! BASELINE. The kernels of chapter 3.2 of the thesis, implemented as the thesis describes them, for comparison with
+//! the server's kernels.
 //!
 //! | file | chapter | contents |
 //! |---|---|---|
 //! | [`thesis_single`] | 3.2.1 | u = U q of one domain, four multiplications per thread |
 //! | [`group`], [`thesis_multi`] | 3.2.2 | u = U q of many domains, in groups of lanes |
-//! | [`thesis_update`] | 3.2.3 | x = T (x0 + u), normals and tangents, of unfolded triangles |
+//! | [`thesis_update`] | 3.2.3 | x = T (x0 + u), normals and tangents, of triangles that share no vertices |
 //!
-//! Unlike in the text, u stays in device memory. In mapped host memory, the PCIe bus would limit the times.
+//! Unlike in the thesis, u stays in device memory. In mapped host memory, the PCIe bus would limit the times.
 
 mod group;
 mod thesis_multi;
@@ -60,7 +61,7 @@ impl ThesisBenchmark {
         Self::new(device, scene, states, (part.benchmark_name("thesis_single"), uq, part))
     }
 
-    /// The grouped kernels, followed by the vertex update for [`Part::Whole`].
+    /// The kernels for many domains, followed by the vertex update for [`Part::Whole`].
     ///
     /// # Errors
     /// `Invalid` when a domain has more than 32 modes, [`Part::Uq`] is requested and no domain has modes, or there is
@@ -120,7 +121,8 @@ impl KernelBenchmark for ThesisBenchmark {
         self.update.as_ref().map_or(Ok(()), |update| update.launch(device, inputs.transforms, u))
     }
 
-    /// For [`Part::Whole`], a vertex that no triangle refers to is NaN, because unfolded triangles do not contain it.
+    /// For [`Part::Whole`], a vertex that no triangle refers to is NaN, because the vertex update computes the vertices
+    /// of triangles only.
     fn positions(&self, device: &Device) -> Result<Vec<f32>> {
         if let Some(update) = &self.update {
             return update.positions(device, self.vertices);

@@ -1,6 +1,6 @@
 //! BASELINE. Launches `kernels/thesis_multi.cu`: u = U q of many domains in groups of lanes (chapter 3.2.2).
 //!
-//! The kernels of a split run one after the other. In the text, they run concurrently in streams (figure 3.5).
+//! The kernels of a split run one after the other. In the thesis, they run concurrently in streams (figure 3.5).
 
 use cudarc::driver::{LaunchConfig, PushKernelArg as _};
 
@@ -31,7 +31,7 @@ struct GroupKernel {
 #[derive(Debug)]
 pub(super) struct MultiDomainKernel {
     kernels: Vec<GroupKernel>,
-    /// Rows of U of all domains.
+    /// Number of rows of U, over all domains with modes.
     rows: u64,
 }
 
@@ -71,9 +71,9 @@ impl MultiDomainKernel {
             let (entries, meta) = (kernel.entries.address(), kernel.meta.address());
             let mut launch = device.stream().launch_builder(&kernel.compiled.function);
             launch.arg(&entries).arg(&meta).arg(&q).arg(&u);
-            // SAFETY: these are the kernel's arguments. Entries and metadata have a float4 and a uint4 for each thread
-            // of the whole blocks. The indices in the metadata are inside of `u` and `q`, because `pack_groups` made all of
-            // them from one scene.
+            // SAFETY: these are the kernel's arguments. Entries and metadata have a float4 and a uint4 for each thread,
+            // because `pack_groups` fills whole blocks. It takes all indices in the metadata from one scene, so they
+            // are inside of `u` and `q`.
             unsafe { launch.launch(config) }.map_err(fault_in("thesis_multi"))?;
         }
         Ok(())
@@ -127,18 +127,19 @@ mod tests {
 
     #[test]
     fn twin_writes_every_row_once_with_any_split() {
+        // Vertices, modes and triangles of each domain.
         let shapes: Vec<_> = (0..70).map(|index| (1 + index * 11 % 40, index % 33, 1)).collect();
         let (scene, state) = scene_and_state(&shapes);
-        let DisplacementLayout { first_vertices, vertex_count: vertices } = DisplacementLayout::of(&scene);
+        let DisplacementLayout { first_vertices, vertex_count } = DisplacementLayout::of(&scene);
         let q = pack_q(&scene, &state);
         for split in KernelSplit::ALL {
-            let (mut u, mut write_counts) = (vec![f32::NAN; 4 * vertices], vec![0; 4 * vertices]);
+            let (mut u, mut write_counts) = (vec![f32::NAN; 4 * vertex_count], vec![0; 4 * vertex_count]);
             for width in split.widths() {
                 twin_of_thesis_multi(&pack_groups(&scene, split, *width), &q, &mut u, &mut write_counts);
             }
             assert!(
                 write_counts.iter().enumerate().all(|(index, count)| *count == usize::from(index % 4 < 3)),
-                "{split:?}"
+                "{split:?}: expected one write to x, y and z of each vertex, and none to the fourth number"
             );
             let mut max_error = 0.0_f64;
             for (domain, first_u) in
@@ -154,6 +155,7 @@ mod tests {
                         .fold(max_error, f64::max);
                 }
             }
+            // Sums of up to 32 products differ between f32 and f64. An error of 0 would mean that nothing was compared.
             assert!(max_error > 0.0 && max_error < 1e-5, "{split:?}: {max_error}");
         }
     }

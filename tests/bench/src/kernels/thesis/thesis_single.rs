@@ -15,17 +15,18 @@ pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
     define_sets: &[&[]],
 };
 
-/// Layout of the rows of U in lines of 32 float4 per pass (figure 3.3).
+/// Layout of U in lines (figure 3.3). A warp computes one line, which holds as many whole rows as fit into 32 lanes.
+/// Rows of more than 32 float4 take several passes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct RowLines {
-    /// Rows of U, 3n.
+    /// Number of rows of U: three per vertex.
     rows: usize,
     rank: usize,
-    /// Lanes per row: n_vr, limited to a warp.
+    /// Lanes per row: n_vr (float4 per row), at most 32.
     width: usize,
-    /// Passes over a row that is longer than a warp.
+    /// Passes per line: n_vr / 32, rounded up.
     passes: usize,
-    /// Number of lines; each has `passes` times 32 float4.
+    /// Number of lines; each has 32 float4 per pass.
     lines: usize,
 }
 
@@ -35,7 +36,7 @@ impl RowLines {
         Self { rows, rank, width, passes: vectors_per_row(rank).div_ceil(WARP), lines: rows.div_ceil(WARP / width) }
     }
 
-    /// The packed lines, in order.
+    /// The lines as the kernel reads them; idle lanes hold zeros.
     fn pack(self, scene: &Scene) -> Vec<[f32; 4]> {
         let rows_per_line = WARP / self.width;
         let mut lines = Vec::with_capacity(self.lines * self.passes * WARP);
@@ -79,8 +80,9 @@ impl SingleDomainKernel {
         let (lines, rank, rows) = (self.packed_lines.address(), self.layout.rank as u32, self.layout.rows as u32);
         let mut launch = device.stream().launch_builder(&self.compiled.function);
         launch.arg(&lines).arg(&q).arg(&u).arg(&rank).arg(&rows);
-        // SAFETY: these are the kernel's arguments. `packed_lines` has every line of `layout`, `q` as many floats as the rank
-        // of the scene's only domain, and `u` a float4 per vertex; warps beyond the last row access none of them.
+        // SAFETY: these are the kernel's arguments. `packed_lines` has every line of `layout`. `q` has as many floats
+        // as the rank of the scene's only domain, and `u` has a float4 per vertex. Warps beyond the last line read no
+        // line and write no u.
         unsafe { launch.launch(config) }.map_err(fault_in("thesis_single"))?;
         Ok(())
     }
@@ -105,7 +107,7 @@ mod tests {
     use super::*;
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
-    /// Index of q_i in shared memory, in floats (equation 3.3).
+    /// Index of q_i in shared memory, in floats (equation 3.3), for i below 128.
     const fn shared_index_of_q(i: usize) -> usize {
         i % 4 * 32 + i / 4
     }
@@ -114,8 +116,9 @@ mod tests {
     fn twin_of_thesis_single(lines: &[[f32; 4]], q: &[f32], rows: usize) -> Vec<f32> {
         let (rank, width) = (q.len(), vectors_per_row(q.len()).min(WARP));
         let (rows_per_line, passes) = (WARP / width, vectors_per_row(rank).div_ceil(WARP));
-        let mut shared_q = [f32::NAN; 512];
+        let mut shared_q = [f32::NAN; modalcast_model::domain::MAX_RANK];
         for (index, shared) in shared_q.iter_mut().enumerate().take(passes * 4 * WARP) {
+            // A pass has 4 x 32 = 128 modes. Within a pass, this is the inverse of equation 3.3.
             let mode = index / 128 * 128 + 4 * (index % WARP) + index / WARP % 4;
             *shared = q.get(mode).copied().unwrap_or(0.0);
         }
@@ -140,18 +143,21 @@ mod tests {
 
     #[test]
     fn twin_sums_every_row_for_any_rank() {
+        const VERTICES: usize = 23;
+        const ROWS: usize = 3 * VERTICES;
         for rank in [1, 3, 4, 5, 9, 10, 20, 30, 31, 32, 33, 127, 128, 129, 300, 512] {
-            let (scene, state) = scene_and_state(&[(23, rank, 1)]);
-            let lines = RowLines::new(23, rank).pack(&scene);
+            let (scene, state) = scene_and_state(&[(VERTICES, rank, 1)]);
+            let lines = RowLines::new(VERTICES, rank).pack(&scene);
             let max_error = |q: &[f32]| {
-                let u = twin_of_thesis_single(&lines, q, 69);
+                let u = twin_of_thesis_single(&lines, q, ROWS);
                 let error = |row: usize| {
                     let want = displacement_of(&scene, &state, 0, row / 3)[row % 3];
                     let error = (f64::from(u[4 * (row / 3) + row % 3]) - want).abs();
                     if error.is_nan() { f64::INFINITY } else { error }
                 };
-                (0..69).map(error).fold(0.0, f64::max)
+                (0..ROWS).map(error).fold(0.0, f64::max)
             };
+            // f32 sums of up to 512 products of numbers from -1 to 1.
             assert!(max_error(&state.q) < 1e-4, "rank {rank}: {}", max_error(&state.q));
             // Negative control: another coordinate changes u.
             let mut changed_q = state.q.clone();
@@ -167,7 +173,7 @@ mod tests {
         assert_eq!(distinct_indices(128), 128);
         // The 129th coordinate has the index of the second.
         assert!(distinct_indices(129) < 129);
-        // The kernel stores q[4 j + i] at index i * 32 + j, which is the inverse of this map.
+        // The kernel stores q[4 j + i] at index i * 32 + j, as this function does.
         assert!((0..128).all(|index| shared_index_of_q(4 * (index % 32) + index / 32) == index));
         for component in 0..4 {
             let banks: std::collections::BTreeSet<usize> =
@@ -178,7 +184,7 @@ mod tests {
 
     #[test]
     fn line_holds_complete_rows_and_is_128_byte_aligned() {
-        // r = 30 of figure 3.2: eight lanes per row, four rows per warp.
+        // A rank of 30 as in figure 3.2: eight lanes per row, four rows per line. Four vertices have 12 rows.
         let lines = RowLines::new(4, 30);
         assert_eq!((lines.width, lines.passes, lines.lines), (8, 1, 3));
         assert_eq!(WARP * size_of::<[f32; 4]>() % 128, 0);

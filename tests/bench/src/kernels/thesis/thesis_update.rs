@@ -1,4 +1,5 @@
-//! BASELINE. Launches `kernels/thesis_update.cu`: the vertex update of unfolded triangles (chapter 3.2.3).
+//! BASELINE. Launches `kernels/thesis_update.cu`: the vertex update of unfolded triangles, which share no vertices
+//! (chapter 3.2.3).
 
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::{DeviceRepr, LaunchConfig, PushKernelArg as _};
@@ -16,15 +17,16 @@ pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
     define_sets: &[&[], &["TANGENTS"]],
 };
 
-/// Vertices per warp and per block; four threads compute one vertex.
+/// Vertices per warp. Four threads compute one vertex.
 const VERTICES_PER_WARP: usize = 8;
+/// Vertices per block.
 const VERTICES_PER_BLOCK: usize = 64;
 
 /// Value of `sources` for a vertex without u.
 const RIGID: u32 = u32::MAX;
 
-/// Minimum number of triangles per domain that the text assumes. With three triangles per domain, eight consecutive
-/// vertices belong to at most two domains.
+/// Minimum number of triangles per domain that the thesis assumes. Three triangles have nine vertices, so the eight
+/// consecutive vertices of a warp belong to at most two domains.
 const MIN_TRIANGLES: usize = 3;
 
 /// Arguments of `thesis_update`; pointers are device addresses.
@@ -53,11 +55,12 @@ unsafe impl DeviceRepr for UpdateArgs {}
 /// The vertices of unfolded triangles: three per triangle, without sharing.
 #[derive(Debug, Default)]
 struct UnfoldedTriangles {
-    /// Per warp: two domains, the first of its eight vertices that belongs to the second domain, and 0.
+    /// Per warp: its two domains, the first of its eight vertices that belongs to the second domain (8 if none does),
+    /// and 0.
     warps: Vec<[u32; 4]>,
     /// Index into u of each vertex, or [`RIGID`].
     sources: Vec<u32>,
-    /// Packed vertex of each vertex in the scene's layout.
+    /// The packed vertex (in the scene's layout) that each unfolded vertex is a copy of.
     targets: Vec<u32>,
     positions: Vec<[f32; 4]>,
     normals: Vec<[f32; 4]>,
@@ -65,7 +68,7 @@ struct UnfoldedTriangles {
 }
 
 impl UnfoldedTriangles {
-    /// Unfolds all triangles. A domain with fewer than three triangles repeats its last one.
+    /// Unfolds all triangles. A domain with fewer than three triangles repeats its last triangle.
     fn of(scene: &Scene) -> Self {
         let displacements = DisplacementLayout::of(scene);
         let mut unfolded = Self::default();
@@ -178,9 +181,9 @@ impl UpdateKernel {
         let blocks = vertices.div_ceil(VERTICES_PER_BLOCK) as u32;
         let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (BLOCK as u32, 1, 1), shared_mem_bytes: 0 };
         let mut launch = device.stream().launch_builder(&self.compiled.function);
-        // SAFETY: `UpdateArgs` is the kernel's only argument. Its tables belong to one scene, as built by
-        // `UnfoldedTriangles::of`: sources are inside of `u`, domains inside of `transforms`, and the outputs have a float4 for
-        // every vertex.
+        // SAFETY: `UpdateArgs` is the kernel's only argument. `UnfoldedTriangles::of` built its tables from one scene:
+        // sources are inside of `u`, and domains are inside of `transforms`. The outputs have a float4 for every
+        // vertex.
         unsafe { launch.arg(&args).launch(config) }.map_err(fault_in("thesis_update"))?;
         Ok(())
     }
@@ -198,6 +201,7 @@ impl UpdateKernel {
         let attribute_count = if self.has_tangents { 3 } else { 2 };
         vec![
             ArrayTraffic::new("unfolded rest state", 16 * attribute_count * vertices),
+            // A vertex has a source of 4 bytes. A warp has 16 bytes for 8 vertices: 2 bytes per vertex.
             ArrayTraffic::new(
                 "sources and domains of vertices",
                 4 * vertices + 2 * vertices.next_multiple_of(VERTICES_PER_BLOCK as u64),
@@ -250,11 +254,12 @@ mod tests {
 
     #[test]
     fn twin_computes_all_vertices_of_triangles_and_no_others() {
-        // The triangles of the first domain refer to 3 of its 5 vertices. It has one triangle where the text assumes
-        // three.
+        // Vertices, modes and triangles of each domain. The first domain has one triangle, where the thesis assumes at
+        // least three. This triangle refers to 3 of the 5 vertices.
         let shapes = [(5, 2, 1), (9, 0, 2), (40, 7, 30), (4, 0, 1), (6, 3, 2), (3, 1, 5)];
         let (scene, state) = scene_and_state(&shapes);
         let unfolded = UnfoldedTriangles::of(&scene);
+        // Every domain has at least three triangles.
         assert_eq!(unfolded.targets.len(), 3 * (3 + 3 + 30 + 3 + 3 + 5));
         let DisplacementLayout { first_vertices, vertex_count } = DisplacementLayout::of(&scene);
         let mut u = vec![[0.0_f32; 4]; vertex_count];
@@ -274,28 +279,32 @@ mod tests {
                 let got = &folded[3 * (slot.first_vertex + vertex)..][..3];
                 nan_count += usize::from(got[0].is_nan());
                 for (want, got) in position_of(&scene, &state, domain, vertex).iter().zip(got) {
+                    // The triangles of the test scene refer to consecutive vertices.
                     let is_corner = vertex < 3 * shapes[domain].2;
                     assert_eq!((want - f64::from(*got)).abs() < 1e-5, is_corner, "domain {domain} vertex {vertex}");
                 }
             }
         }
-        assert_eq!(nan_count, 2 + 3 + 1, "vertices that no triangle refers to");
+        // The first, second and fourth domain have vertices that no triangle refers to.
+        assert_eq!(nan_count, 2 + 3 + 1);
     }
 
     #[test]
     fn three_triangles_per_domain_fit_two_matrices_per_warp() {
+        // 50 domains of one triangle, each of which becomes three triangles with 9 unfolded vertices.
+        const UNFOLDED_VERTICES: usize = 50 * 9;
         let (scene, _) = scene_and_state(&[(3, 0, 1); 50]);
         let unfolded = UnfoldedTriangles::of(&scene);
         let domain = |vertex: usize| unfolded.targets[vertex] / 3;
         for (index, [first_domain, second_domain, first_of_second, _]) in
-            unfolded.warps.iter().enumerate().take(450 / VERTICES_PER_WARP)
+            unfolded.warps.iter().enumerate().take(UNFOLDED_VERTICES / VERTICES_PER_WARP)
         {
             for vertex in 0..VERTICES_PER_WARP {
                 let expected = if vertex < *first_of_second as usize { first_domain } else { second_domain };
                 assert_eq!(domain(VERTICES_PER_WARP * index + vertex), *expected);
             }
         }
-        assert_eq!(unfolded.warps.len(), 450_usize.div_ceil(VERTICES_PER_BLOCK) * 8);
+        assert_eq!(unfolded.warps.len(), UNFOLDED_VERTICES.div_ceil(VERTICES_PER_BLOCK) * 8);
     }
 
     #[test]
