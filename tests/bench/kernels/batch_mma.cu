@@ -1,5 +1,5 @@
 // x = T_b (x0 + U q_b) for up to BATCH_SIZE domains b of one shape, by tensor cores.
-//   words           U in 16 bits per entry, per tile [chunks][3][width] words of 16 bytes (chunk.cuh)    (in)
+//   words           U in 16 bits per entry, per tile [chunks][3][tile_quads] words of 16 bytes (chunk.cuh)  (in)
 //   rest            x0, [quads][12] f32: 4 x, 4 y, 4 z                                                   (in)
 //   transforms      [BATCH_SIZE][3] float4: the rows of T; zeros where there is no domain                (in)
 //   inverse_scales  [BATCH_SIZE] f32: powers of two that undo the scaling of q                           (in)
@@ -59,9 +59,9 @@ struct BatchMmaArgs {
     const uint4* split_q;
     float* positions;
     unsigned first_vertices[MAX_DOMAINS]; // index of each domain's first vertex in `positions`
-    unsigned domains;
-    unsigned vertices; // of the shape
-    unsigned chunks;
+    unsigned domains;    // number of domains
+    unsigned vertices;   // number of vertices of the shape
+    unsigned chunks;     // number of chunks of modes
     unsigned is_aligned; // whether every domain's positions are 16-byte aligned
 };
 static_assert(sizeof(BatchMmaArgs) == 192, "BatchMmaArgs differs from tests/bench/src/kernels/batch_mma.rs");
@@ -184,7 +184,8 @@ __device__ __forceinline__ float transform_row(const float4& row, float x, float
 // Computes the positions of the lane's quad for one domain and writes them to the staging buffer, 48 bytes.
 __device__ __forceinline__ void stage_positions(const BatchMmaArgs& args, const float4 (&rest)[3], const float (&u)[3][4],
                                       unsigned domain, float4* staged) {
-    const float4 *rows = args.transforms + 3 * domain, a = __ldg(rows), b = __ldg(rows + 1), c = __ldg(rows + 2);
+    const float4* rows = args.transforms + 3 * domain;
+    const float4 x_row = __ldg(rows), y_row = __ldg(rows + 1), z_row = __ldg(rows + 2);
     const float inverse_scale = __ldg(args.inverse_scales + domain);
     const float x0[3][4] = {{rest[0].x, rest[0].y, rest[0].z, rest[0].w},
                             {rest[1].x, rest[1].y, rest[1].z, rest[1].w},
@@ -194,13 +195,14 @@ __device__ __forceinline__ void stage_positions(const BatchMmaArgs& args, const 
     for (unsigned vertex = 0; vertex < 4; ++vertex) {
         const float x = x0[0][vertex] + u[0][vertex] * inverse_scale, y = x0[1][vertex] + u[1][vertex] * inverse_scale,
                     z = x0[2][vertex] + u[2][vertex] * inverse_scale;
-        world_positions[3 * vertex] = transform_row(a, x, y, z);
-        world_positions[3 * vertex + 1] = transform_row(b, x, y, z);
-        world_positions[3 * vertex + 2] = transform_row(c, x, y, z);
+        world_positions[3 * vertex] = transform_row(x_row, x, y, z);
+        world_positions[3 * vertex + 1] = transform_row(y_row, x, y, z);
+        world_positions[3 * vertex + 2] = transform_row(z_row, x, y, z);
     }
 #pragma unroll
     for (unsigned i = 0; i < 3; ++i) {
-        staged[i] = make_float4(world_positions[4 * i], world_positions[4 * i + 1], world_positions[4 * i + 2], world_positions[4 * i + 3]);
+        staged[i] = make_float4(world_positions[4 * i], world_positions[4 * i + 1], world_positions[4 * i + 2],
+                                world_positions[4 * i + 3]);
     }
 }
 
@@ -232,7 +234,8 @@ __device__ __forceinline__ void store_staged(const BatchMmaArgs& args, const War
 }
 
 // Computes and writes the positions of all domains, four domains at a time.
-__device__ __forceinline__ void store_positions(const BatchMmaArgs& args, const WarpPart& part, const Sums& sums, float4* staged) {
+__device__ __forceinline__ void store_positions(const BatchMmaArgs& args, const WarpPart& part, const Sums& sums,
+                                         float4* staged) {
     float4 rest[3];
 #pragma unroll
     for (unsigned axis = 0; axis < 3; ++axis) {
@@ -259,7 +262,8 @@ __device__ __forceinline__ void store_positions(const BatchMmaArgs& args, const 
 }
 #endif
 
-extern "C" __global__ void __launch_bounds__(32 * WARPS, MIN_BLOCKS_PER_SM) batch_mma(const __grid_constant__ BatchMmaArgs args) {
+extern "C" __global__ void __launch_bounds__(32 * WARPS, MIN_BLOCKS_PER_SM)
+    batch_mma(const __grid_constant__ BatchMmaArgs args) {
 #if __CUDA_ARCH__ >= 800
     __shared__ float4 staged[WARPS][4 * STRIDE];
     const WarpPart part = warp_part(args);

@@ -36,7 +36,8 @@ extern "C" __global__ void __launch_bounds__(WARPS * LANES)
             if (pass * LANES + k < n_vr) {
                 const float4 entry = lines[((size_t)line * passes + pass) * LANES + lane];
                 const float* q_part = shared_q + pass * 4 * LANES + k;
-                sum += entry.x * q_part[0] + entry.y * q_part[LANES] + entry.z * q_part[2 * LANES] + entry.w * q_part[3 * LANES];
+                sum += entry.x * q_part[0] + entry.y * q_part[LANES] + entry.z * q_part[2 * LANES] +
+                       entry.w * q_part[3 * LANES];
             }
         }
     }

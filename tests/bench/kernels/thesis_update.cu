@@ -6,7 +6,7 @@
 //   rest_positions, rest_normals, and with TANGENTS rest_tangents
 //               [vertices] float4; the fourth number of a position is 1, of a direction 0                        (in)
 //   transforms  [domains][4] float4: rows of T                                                                   (in)
-//   u           float4 per vertex of the domains with modes                                                      (in)
+//   u           float4 per vertex of the domains with modes; the fourth number is 0                              (in)
 //   positions, normals, tangents  [vertices] float4                                                              (out)
 // Launch: 256 threads per block, four threads per vertex; ceil(vertices / 64) blocks. A thread computes one element of
 // the vertex's float4.
@@ -48,7 +48,8 @@ extern "C" __global__ void __launch_bounds__(WARPS * LANES) thesis_update(const 
     const unsigned vertex = blockIdx.x * VERTICES + local_vertex;
     const size_t index = 4 * (size_t)vertex + element;
     const uint4 warp_domains = args.warps[blockIdx.x * WARPS + warp];
-    const unsigned first_vertex_of_second = warp_domains.z;
+    // Index in the warp of the first vertex of the second domain.
+    const unsigned first_of_second = warp_domains.z;
     // 16 lanes load the matrix of the first domain, and 16 lanes that of the second domain.
     const unsigned domain = lane < 16 ? warp_domains.x : warp_domains.y;
     matrices[warp][lane / 16][lane % 16] = args.transforms[16 * (size_t)domain + lane % 16];
@@ -66,7 +67,7 @@ extern "C" __global__ void __launch_bounds__(WARPS * LANES) thesis_update(const 
     }
     __syncthreads();
     if (vertex < args.vertices) {
-        const float* row = matrices[warp][lane / 4 < first_vertex_of_second ? 0 : 1] + 4 * element;
+        const float* row = matrices[warp][lane / 4 < first_of_second ? 0 : 1] + 4 * element;
         args.positions[index] = dot4(row, rest_positions[local_vertex]);
         args.normals[index] = dot4(row, rest_normals[local_vertex]);
 #ifdef TANGENTS

@@ -1,4 +1,5 @@
-//! Benchmarks the kernels of the CUDA deformer, with its own launchers and tables. Inputs are uploaded in advance.
+//! Benchmarks the kernels of the CUDA deformer, with the deformer's launchers and tables. Inputs are uploaded in
+//! advance.
 
 use std::sync::Arc;
 

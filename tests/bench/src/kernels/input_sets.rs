@@ -31,7 +31,7 @@ impl Part {
     }
 }
 
-/// Minimum number of vertices per parallel task on the host, so that scheduling takes little of its time.
+/// Minimum number of vertices per parallel task on the host, so that scheduling costs little.
 const MIN_TASK_VERTICES: usize = 4096;
 
 /// Device addresses of one input set.
@@ -107,8 +107,8 @@ impl InputSets {
     }
 
     /// x = T (x0 + u) of the selected input set, three f32 per vertex. Each coordinate is computed in f64 and rounded
-    /// once, so that only the error of u remains. `u` returns the displacement of a vertex, given its domain and its
-    /// index there.
+    /// once, so that only the error of u remains. `u` returns the displacement of a vertex. Its arguments are the
+    /// domain and the index of the vertex in the domain.
     pub(super) fn compute_positions_on_host(&self, u: impl Fn(usize, usize) -> [f32; 3] + Sync) -> Vec<f32> {
         let state = &self.states[self.selected.get()];
         let mut positions = Vec::with_capacity(3 * self.scene.layout.vertices);

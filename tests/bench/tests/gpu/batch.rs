@@ -69,8 +69,8 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
                 let error_over_bound = max_error_over_bound(&scene, state, &positions);
                 assert!(
                     error_over_bound <= 1.0,
-                    "{name} input set {input_set}: expected an error within the bound, got {error_over_bound} times the \
-                     bound"
+                    "{name} input set {input_set}: expected an error within the bound, got {error_over_bound} times \
+                     the bound"
                 );
                 let next_error_over_bound =
                     max_error_over_bound(&scene, &states[(input_set + 1) % states.len()], &positions);

@@ -64,7 +64,8 @@ fn relative_error(scene: &Scene, state: &SceneState, positions: &[f32]) -> Resul
     }
     let mut bounds = BoundingBox::EMPTY;
     reference_positions.iter().for_each(|position| bounds.include(*position));
-    // The diagonal of a single vertex is 0. The minimum of 1 has the size of a shape, which fits into a cube of side 2.
+    // A single vertex has a diagonal of 0. The tolerance then refers to 1, half the side of the cube that contains
+    // every shape.
     let diagonal = bounds.diagonal().max(1.0);
     let is_compared = |vertex: &usize| is_referenced[*vertex];
     let compared_positions: Vec<f32> =

@@ -1,4 +1,5 @@
-//! Compares the CUDA rasterizer with its CPU definition: samples are bit-identical with every granularity.
+//! Compares the CUDA rasterizer with its CPU definition. Samples are bit-identical with every granularity: triangles
+//! are drawn by a thread, a warp or in tiles depending on their size, or all by warps, or all in tiles.
 
 use modalcast_bench::kernels::{KernelBenchmark as _, RasterBenchmark, RasterCounts, RasterMesh};
 use modalcast_bench::render::workloads::RenderWorkload;

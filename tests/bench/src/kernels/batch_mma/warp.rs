@@ -51,12 +51,14 @@ impl KernelInputs {
 /// lane holds which entries ("Matrix Fragments for mma.m16n8k16"). Lane 4 g + t holds rows g and g + 8 of A and D,
 /// column g of B, and columns 2 t and 2 t + 1 of D.
 fn multiply(inputs: &KernelInputs, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &mut [[f64; 4]; 32]) {
-    let decode_half = |word: u32, index: usize| inputs.decode(word >> (16 * (index % 2)) & 0xffff);
-    let entry_of_a = |row: usize, k: usize| decode_half(a[4 * (row % 8) + k % 8 / 2][row / 8 + 2 * (k / 8)], k);
-    let entry_of_b = |k: usize, column: usize| decode_half(b[4 * column + k % 8 / 2][k / 8], k);
+    // A register holds two numbers: that of an even k in the lower half, that of an odd k in the upper half.
+    let decode_half = |register: u32, k: usize| inputs.decode(register >> (16 * (k % 2)) & 0xffff);
+    let lane_of = |row_or_column: usize, k: usize| 4 * (row_or_column % 8) + k % 8 / 2;
+    let entry_of_a = |row: usize, k: usize| decode_half(a[lane_of(row, k)][row / 8 + 2 * (k / 8)], k);
+    let entry_of_b = |k: usize, column: usize| decode_half(b[lane_of(column, k)][k / 8], k);
     for (lane, sums) in d.iter_mut().enumerate() {
-        for (i, sum) in sums.iter_mut().enumerate() {
-            let (row, column) = (lane / 4 + 8 * (i / 2), 2 * (lane % 4) + i % 2);
+        for (entry, sum) in sums.iter_mut().enumerate() {
+            let (row, column) = (lane / 4 + 8 * (entry / 2), 2 * (lane % 4) + entry % 2);
             *sum += (0..STEP_MODES).map(|k| entry_of_a(row, k) * entry_of_b(k, column)).sum::<f64>();
         }
     }
@@ -65,11 +67,11 @@ fn multiply(inputs: &KernelInputs, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &m
 /// The quad of a tile that a lane reads.
 #[derive(Clone, Copy)]
 struct TileQuad {
-    /// First packed word of the tile.
+    /// Index of the tile's first packed word.
     first_word: usize,
-    /// Quads of the tile.
+    /// Number of quads of the tile.
     tile_quads: usize,
-    /// Quad in the tile.
+    /// Index of the quad in the tile.
     quad: usize,
 }
 

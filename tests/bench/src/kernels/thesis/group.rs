@@ -5,8 +5,7 @@
 //! * U' is U with every row padded to n_vr float4 ([`vectors_per_row`]).
 //! * A warp has n_g groups of w_g lanes. A lane multiplies one float4, so a group computes n_gg rows of U' at a time.
 //! * U'' (equations 3.5 and 3.6) has n' = ceil(3n / n_gg) rows of w_g float4, one row per group. Row i of U'' holds the
-//!   rows i, i + n', i + 2 n', ... of U'. The thesis prints n' = floor(3n / n_gg), which omits up to n_gg - 1 rows of
-//!   U.
+//!   rows i, i + n', i + 2 n', ... of U'. The thesis prints n' = floor(3n / n_gg), which omits up to n_gg - 1 rows.
 
 use serde::Serialize;
 
@@ -89,7 +88,7 @@ pub const fn idle_lanes_per_warp(width: usize, n_vr: usize) -> usize {
 pub struct LaneCounts {
     /// w_g, lanes per group.
     pub width: usize,
-    /// All lanes, with those that fill up the last warp and block.
+    /// All lanes, including those that fill up the last warp and block.
     pub all: u64,
     /// Lanes that multiply nothing.
     pub idle: u64,
@@ -243,8 +242,8 @@ mod tests {
             |split: KernelSplit| (1..=8).filter(|n_vr| idle_in_group(split, *n_vr) > 0).collect::<Vec<_>>();
         assert_eq!(n_vr_with_idle_lanes(KernelSplit::Two), [5, 7]);
         assert_eq!(n_vr_with_idle_lanes(KernelSplit::One), [3, 5, 6, 7]);
-        // A warp also has idle lanes outside of groups if w_g does not divide 32: two with w_g = 6 or 5, four with w_g
-        // = 7.
+        // If w_g does not divide 32, a warp also has idle lanes outside of groups: two with a w_g of 5 or 6, four with
+        // 7.
         assert_eq!([1, 2, 4, 8].map(|n_vr| idle_lanes_per_warp(8, n_vr)), [0; 4]);
         assert_eq!([3, 6].map(|n_vr| idle_lanes_per_warp(6, n_vr)), [2, 2]);
         assert_eq!([idle_lanes_per_warp(6, 5), idle_lanes_per_warp(8, 5), idle_lanes_per_warp(5, 5)], [7, 12, 2]);
