@@ -22,7 +22,7 @@ pub struct RasterMesh<'a> {
     pub cut_outs: Option<&'a CutOuts>,
 }
 
-/// Number of triangles by outcome. The rasterizer draws a triangle by a thread, by a warp or in tiles, depending on its
+/// Number of triangles by outcome. A thread, a warp or several warps draw a triangle, depending on its
 /// size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RasterCounts {

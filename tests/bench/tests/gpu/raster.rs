@@ -1,5 +1,6 @@
-//! Compares the CUDA rasterizer with its CPU definition. Samples are bit-identical with every granularity: triangles
-//! are drawn by a thread, a warp or in tiles depending on their size, or all by warps, or all in tiles.
+//! Compares the CUDA rasterizer with its CPU definition. Samples are bit-identical with every granularity: a thread
+//! draws a small triangle (`BySize`), or warps draw small triangles too (`Warps`), or all are divided into tiles
+//! (`Tiles`).
 
 use modalcast_bench::kernels::{KernelBenchmark as _, RasterBenchmark, RasterCounts, RasterMesh};
 use modalcast_bench::render::workloads::RenderWorkload;

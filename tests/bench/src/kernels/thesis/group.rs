@@ -242,8 +242,8 @@ mod tests {
             |split: KernelSplit| (1..=8).filter(|n_vr| idle_in_group(split, *n_vr) > 0).collect::<Vec<_>>();
         assert_eq!(n_vr_with_idle_lanes(KernelSplit::Two), [5, 7]);
         assert_eq!(n_vr_with_idle_lanes(KernelSplit::One), [3, 5, 6, 7]);
-        // If w_g does not divide 32, a warp also has idle lanes outside of groups: two with a w_g of 5 or 6, four with
-        // 7.
+        // If w_g does not divide 32, a warp also has lanes outside of groups, which are idle: two with a w_g of 5 or 6,
+        // four with 7.
         assert_eq!([1, 2, 4, 8].map(|n_vr| idle_lanes_per_warp(8, n_vr)), [0; 4]);
         assert_eq!([3, 6].map(|n_vr| idle_lanes_per_warp(6, n_vr)), [2, 2]);
         assert_eq!([idle_lanes_per_warp(6, 5), idle_lanes_per_warp(8, 5), idle_lanes_per_warp(5, 5)], [7, 12, 2]);
