@@ -23,13 +23,14 @@ pub struct BlurComparison {
     pub ratio: f64,
 }
 
-/// Required speedup of compute over fragments at 4096 texels per side on an H200.
+/// Target speedup of compute over fragments for a map of 4096 texels per side on an H200. The report prints the target
+/// and does not check it.
 pub(super) const MIN_SPEEDUP: f64 = 40.0;
-/// Time limit of compute for the same map, microseconds.
+/// Target time of compute for the same map, microseconds; printed and not checked either.
 pub(super) const MAX_COMPUTE_US: f64 = 200.0;
 
 impl BlurComparison {
-    /// Compares the times of each map that was timed with both methods.
+    /// One comparison per map that was timed with both methods.
     pub(super) fn pair_rows(rows: &[RenderRow]) -> Vec<Self> {
         let uses_fragments = |row: &RenderRow| row.blur_method == BlurMethod::Fragments;
         let fragment_rows = rows.iter().filter(|row| uses_fragments(row)).filter_map(|row| Some((row, row.shadow?)));
@@ -101,6 +102,7 @@ mod tests {
             render_row("b", (1024, BlurMethod::Fragments), 50.0),
         ];
         let [comparison] = &BlurComparison::pair_rows(&rows)[..] else { panic!("expected one map with both methods") };
+        // The kernel of a blur of 2.3 texels has a radius of ceil(3 x 2.3) = 7 texels and 2 x 7 + 1 = 15 taps.
         assert_eq!((comparison.load.as_str(), comparison.size, comparison.taps), ("a", 4096, 15));
         assert_eq!((comparison.compute_us, comparison.fragments_us, comparison.ratio), (200.0, 9000.0, 45.0));
     }

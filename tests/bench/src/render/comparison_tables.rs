@@ -26,20 +26,21 @@ fn minimal_passes_section(rows: &[MinimalPasses]) -> String {
         "load",
         "triangles",
         "depth pass us",
-        "of",
+        "map side",
         "visibility pass us",
         "samples",
         "frame without culling us",
-        "beyond us",
-        "frame as the load culls us",
-        "beyond us",
+        "excess us",
+        "frame with the scene's culling us",
+        "excess us",
     ];
     let mut text = format!(
-        "\n## Bare passes\n\nThe same scene in the same run, stripped to one opaque material without culling, images and \
-         cut-outs. One draw of all triangles writes the depth of the shadow map, another one the ids and depth of the frame. \
-         For comparison: frames with a variance map of the same size, and their time beyond both passes. Without culling \
-         this is to be at most {MAX_EXCESS_US} us for 3,000,000 triangles and a map of 4096 on an H200 at 1920 x 1080. A \
-         frame with culling draws fewer triangles than the passes.\n\n"
+        "\n## Minimal passes\n\nThe same scene in the same run, stripped to one opaque material without culling, \
+         images and cut-outs. One draw of all triangles writes the depth of the shadow map; a second draw writes the ids \
+         and depth of the frame. For comparison: frames with a variance map of the same size, and the excess of their time \
+         over both passes. The target for the excess without culling is at most {MAX_EXCESS_US} us for 3,000,000 \
+         triangles and a map of 4096 on an H200 at 1920 x 1080. A frame with culling draws fewer triangles than the \
+         passes.\n\n"
     );
     let row = |passes: &MinimalPasses| {
         let format_us = |us: f64| format!("{us:.1}");
@@ -72,7 +73,7 @@ pub(super) fn raster_section(comparisons: &[RasterComparison]) -> String {
         "depth us: OpenGL",
         "CUDA",
         "speedup",
-        "of",
+        "map side",
         "ids us: OpenGL",
         "CUDA",
         "speedup",
@@ -80,9 +81,9 @@ pub(super) fn raster_section(comparisons: &[RasterComparison]) -> String {
         "triangles in the frame",
     ];
     let mut text = format!(
-        "\n## Raster\n\nThe bare passes with one sample per pixel, by OpenGL and by the CUDA kernels, in the same run. \
-         Passes are not timed if more than {} % of the ids differ. Triangles: drawn by a thread + by a warp + tile by \
-         tile; dropped because they cover no sample; dropped for another reason.\n\n",
+        "\n## Raster\n\nThe minimal passes with one sample per pixel, by OpenGL and by the CUDA kernels, in the same \
+         run. Passes are not timed if more than {} % of the ids differ. Triangles: drawn by a thread + by a warp + \
+         tile by tile; dropped because they cover no sample; dropped for another reason.\n\n",
         100.0 * MAX_DIFFERING_FRACTION
     );
     let row = |raster: &RasterComparison| {
@@ -94,17 +95,12 @@ pub(super) fn raster_section(comparisons: &[RasterComparison]) -> String {
             Some(pair) => {
                 [pair.opengl.median_us, pair.cuda.median_us, pair.ratio()].map(|number| format!("{number:.1}"))
             }
-            None => [(); 3].map(|()| dash()),
+            None => std::array::from_fn(|_| dash()),
         };
-        let sizes = [
-            raster.load.clone(),
-            raster.triangles.to_string(),
-            format!("{} of {}", raster.differing_ids, raster.samples),
-        ];
-        let cells = sizes
-            .into_iter()
-            .chain(pair_cells(raster.passes.map(|passes| passes.depth)))
-            .chain([raster.map_size.to_string()]);
+        let differing_ids = format!("{} of {}", raster.differing_ids, raster.samples);
+        let cells = [raster.load.clone(), raster.triangles.to_string(), differing_ids].into_iter();
+        let cells = cells.chain(pair_cells(raster.passes.map(|passes| passes.depth)));
+        let cells = cells.chain([raster.map_size.to_string()]);
         let cells = cells.chain(pair_cells(raster.passes.map(|passes| passes.visibility)));
         cells.chain([format_counts(raster.in_map), format_counts(raster.in_frame)])
     };
@@ -119,7 +115,7 @@ fn blur_section(comparisons: &[BlurComparison]) -> String {
     let header = ["load", "map", "taps", "compute us", "fragments us", "speedup"];
     let mut text = format!(
         "\n## Moments and blur\n\nThe same moment map from the same depth, by the fastest compute shader and by two passes \
-         of fragment shaders. At 4096 on an H200, compute is to take at most {MAX_COMPUTE_US} us and to be at least \
+         of fragment shaders. Targets for compute at 4096 on an H200: at most {MAX_COMPUTE_US} us, and at least \
          {MIN_SPEEDUP} times as fast.\n\n"
     );
     let row = |blur: &BlurComparison| {

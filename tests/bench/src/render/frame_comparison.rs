@@ -1,5 +1,6 @@
 //! Compares whole frames with the OpenGL and the CUDA rasterizer in one run. Both draw the scene with its materials, a
-//! variance shadow map and one sample per pixel with FXAA. Ids and colors are compared before the frames are timed.
+//! variance shadow map and one sample per pixel with FXAA. Frames with CUDA are timed only if both rasterizers agree on
+//! the ids of the visible triangles in nearly all pixels.
 
 use std::sync::Arc;
 
@@ -33,11 +34,11 @@ pub struct FrameComparison {
     /// Rasterizer of each pass when CUDA is available.
     #[serde(rename = "paths")]
     pub raster_backends: RasterBackends,
-    /// Pixels whose id differs from OpenGL's.
+    /// Pixels whose visible triangle differs from OpenGL's.
     #[serde(rename = "differing")]
     pub differing_ids: usize,
     pub pixels: usize,
-    /// Color differences from OpenGL's image, of 255.
+    /// Color differences from OpenGL's image, 0 to 255.
     #[serde(rename = "colours")]
     pub color_errors: ErrorDistribution,
     /// Times of OpenGL with automatic culling; "frame" is the sum without readback.
@@ -64,7 +65,8 @@ impl FrameComparison {
             passes.iter().map(pass_time).collect::<Vec<_>>().join(", ")
         };
         format!(
-            "{:<18}opengl: {}; cuda: {}; {:.1} times as fast; {} of {} ids differ, pixels by {:.3} of 255 on average, {} at most",
+            "{:<18}opengl: {}; cuda: {}; {:.1} times as fast; {} of {} ids differ, colors by {:.3} of 255 on average, \
+             {} at most",
             self.load,
             pass_times(&self.opengl),
             self.cuda.as_deref().map_or("not timed".into(), pass_times),
@@ -183,14 +185,12 @@ impl FrameSetup {
     }
 }
 
-/// Describes why frames were not timed.
+/// One message per comparison whose frames were not timed with CUDA.
 pub(super) fn describe_faults(comparisons: &[FrameComparison]) -> Vec<String> {
-    let untimed_comparisons = comparisons.iter().filter(|comparison| comparison.cuda.is_none());
-    untimed_comparisons
-        .map(|frame| {
-            format!("{}: expected equal ids, {} of {} pixels differ", frame.load, frame.differing_ids, frame.pixels)
-        })
-        .collect()
+    let describe = |FrameComparison { load, differing_ids, pixels, .. }: &FrameComparison| {
+        format!("{load}: expected equal ids, {differing_ids} of {pixels} pixels differ")
+    };
+    comparisons.iter().filter(|comparison| comparison.cuda.is_none()).map(describe).collect()
 }
 
 /// The section of whole frames in `raster.md`.
@@ -205,7 +205,7 @@ pub(super) fn markdown(comparisons: &[FrameComparison]) -> String {
         "frame us: OpenGL",
         "CUDA",
         "speedup",
-        "raster",
+        "raster shadow",
         "shadow",
         "blur",
         "visibility",
@@ -218,8 +218,9 @@ pub(super) fn markdown(comparisons: &[FrameComparison]) -> String {
     ];
     let mut text = format!(
         "\n## Whole frames\n\nOne sample per pixel with FXAA, by OpenGL with automatic culling and by the CUDA \
-         rasterizer where it supports the pass, in the same run. Times of passes: OpenGL / CUDA, us; \"raster\" is \
-         CUDA time within \"shadow\", as is \"blur\". A load is not timed if more than {} % of its ids differ.\n\n",
+         rasterizer where it supports the pass, in the same run. Times of passes: OpenGL / CUDA, us. \"shadow\" \
+         includes \"raster shadow\" (by CUDA only) and \"blur\". A frame is not timed with CUDA if more than {} % of \
+         its ids differ.\n\n",
         100.0 * MAX_DIFFERING_FRACTION
     );
     let row = |frame: &FrameComparison| {
@@ -242,7 +243,7 @@ pub(super) fn markdown(comparisons: &[FrameComparison]) -> String {
             [frame.load.clone(), frame.triangles.to_string(), frame.map_size.to_string(), frame.taps.to_string()];
         let frame_times = [cuda_passes.join(", "), format_median(&frame.opengl, "frame"), format_median(cuda, "frame")];
         let ratio = frame.ratio().map_or_else(dash, |ratio| format!("{ratio:.1}"));
-        let passes = ["raster", "shadow", "blur", "visibility", "shade", "encode"].map(format_both_times);
+        let passes = ["raster shadow", "shadow", "blur", "visibility", "shade", "encode"].map(format_both_times);
         let ids = format!("{} of {}", frame.differing_ids, frame.pixels);
         let colors = [frame.color_errors.mean, frame.color_errors.p99, frame.color_errors.max]
             .map(|error| format!("{error:.3}"));

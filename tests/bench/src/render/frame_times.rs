@@ -32,15 +32,17 @@ pub struct SceneFrameTimes {
     pub name: String,
     pub vertices: usize,
     pub triangles: usize,
+    /// Render settings, with the keys of the table `look` in `scene.toml`.
     pub look: LookTable,
     /// Samples per pixel.
     pub samples: u32,
     /// Rasterizers that drew the passes.
     #[serde(rename = "paths")]
     pub raster_backends: RasterBackends,
-    /// Column-major matrix of the camera, which frames the scene.
+    /// Matrix from world to clip space, column-major. The camera frames the scene.
     pub clip_from_world: Vec<f64>,
     pub eye: [f64; 3],
+    /// Unit vector towards the sun.
     pub to_sun: [f64; 3],
     /// Times per pass; "frame" is the sum without readback.
     pub passes: Vec<PassTime>,
@@ -139,7 +141,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn times_a_scene_and_records_a_centering_matrix() {
+    fn timed_scene_has_a_matrix_that_maps_its_center_to_0() {
         let options =
             FrameTimeOptions { scenes: vec!["tree".into()], size: Size { width: 32, height: 24 }, replays: 1 };
         let report = time_scenes(&options, |_| {}).expect("a report");

@@ -27,14 +27,15 @@ pub struct Size {
     pub height: u32,
 }
 
-/// Time of one render pass.
+/// Time of one render pass or stage, or of a whole frame.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PassTime {
+    /// A name of `modalcast_render`'s passes and stages, or "frame" for all passes except the readback.
     pub name: &'static str,
     pub timing: Timing,
 }
 
-/// Warm-up time before timing starts.
+/// Warm-up time before timing starts, for the reasons in [`RenderHarness::warm_up`].
 pub(super) const WARM_UP: Duration = Duration::from_millis(500);
 
 /// Owns the renderer and draws scenes.
@@ -47,8 +48,9 @@ pub(super) struct LoadedScene {
     scene: Arc<Scene>,
     pub(super) buffers: SceneBuffers,
     deformer: CpuDeformer,
-    /// Bounds of the last deformed vertices, in world space and in light space.
+    /// Bounds of the last deformed vertices in world space.
     bounds: BoundingBox,
+    /// Bounds of the same vertices in light space.
     light_box: Option<OrientedBounds>,
 }
 
@@ -73,7 +75,8 @@ impl RenderHarness {
         self.renderer.attach_rasterizer(&mut loaded_scene.buffers, create)
     }
 
-    /// Selects the rasterizers of a deformed scene by `policy`. Without a CUDA device OpenGL draws all passes.
+    /// Selects the rasterizers of a deformed scene by `policy`. `Fastest` draws `camera`'s frame to measure both
+    /// rasterizers. Without a CUDA device, OpenGL draws all passes.
     ///
     /// # Errors
     /// Errors of the device and of drawing.
@@ -104,8 +107,8 @@ impl RenderHarness {
         self.renderer.draw(&loaded_scene.buffers, &loaded_scene.frame_params(camera, size))
     }
 
-    /// Draws the same frame repeatedly and returns the times per pass. The entry "frame" is the sum of all passes except
-    /// the readback.
+    /// Draws the same frame repeatedly and returns the times per pass. The first entry, "frame", is the sum of all
+    /// passes except the readback.
     pub(super) fn time_passes(
         &mut self,
         loaded_scene: &LoadedScene,
@@ -113,25 +116,25 @@ impl RenderHarness {
         size: Size,
         replays: usize,
     ) -> Result<Vec<PassTime>> {
-        let mut samples_by_pass: Vec<(&'static str, Vec<f64>)> = vec![("frame", Vec::new())];
+        let mut us_by_pass: Vec<(&'static str, Vec<f64>)> = vec![("frame", Vec::new())];
         self.warm_up(loaded_scene, camera, size)?;
         for _ in 0..replays.max(MIN_REPETITIONS) {
             let image = self.draw(loaded_scene, camera, size)?;
-            samples_by_pass[0].1.push(1e3 * image.times.drawing_ms());
+            us_by_pass[0].1.push(1e3 * image.times.drawing_ms());
             for (key, ms) in image.times.iter() {
                 let name = key.name();
-                match samples_by_pass.iter_mut().find(|(pass, _)| *pass == name) {
-                    Some((_, samples)) => samples.push(1e3 * ms),
-                    None => samples_by_pass.push((name, vec![1e3 * ms])),
+                match us_by_pass.iter_mut().find(|(pass, _)| *pass == name) {
+                    Some((_, times_us)) => times_us.push(1e3 * ms),
+                    None => us_by_pass.push((name, vec![1e3 * ms])),
                 }
             }
         }
-        let pass_time = |(name, samples): (&'static str, Vec<f64>)| {
-            Timing::of(samples)
+        let pass_time = |(name, times_us): (&'static str, Vec<f64>)| {
+            Timing::of(times_us)
                 .map(|timing| PassTime { name, timing })
                 .ok_or_else(|| fault_in("time")("expected at least one frame, got none"))
         };
-        samples_by_pass.into_iter().map(pass_time).collect()
+        us_by_pass.into_iter().map(pass_time).collect()
     }
 
     /// Draws until times are stable. The first frame of a size compiles shaders and allocates textures, and the clock

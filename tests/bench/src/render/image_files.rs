@@ -15,7 +15,7 @@ pub struct ImageFile {
 /// Factor by which difference images are amplified.
 const DIFFERENCE_GAIN: f32 = 4.0;
 
-/// Encodes a reference image. `colors`: sRGB of 255, top row first.
+/// Encodes a reference image. `colors` are sRGB, 0 to 255, top row first.
 pub(super) fn encode_reference(name: &str, size: Size, colors: &[[f32; 3]]) -> Result<ImageFile> {
     let rgb = colors.iter().flat_map(|color| color.map(to_byte)).collect();
     encode_png(name, (size.width, size.height), rgb)
@@ -27,6 +27,7 @@ pub(super) fn encode_strip(name: &str, size: Size, (rendered, reference): (&[u8]
     let width = size.width as usize;
     let amplified: Vec<u8> =
         differences(rendered, reference).map(|difference| to_byte(DIFFERENCE_GAIN * difference)).collect();
+    // Three images with three bytes per pixel.
     let mut rgb = Vec::with_capacity(9 * reference.len());
     for row in 0..size.height as usize {
         let (begin, end) = (row * width, (row + 1) * width);
@@ -63,8 +64,8 @@ fn to_byte(level: f32) -> u8 {
 }
 
 fn encode_png(name: &str, (width, height): (u32, u32), rgb: Vec<u8>) -> Result<ImageFile> {
-    let fault = || fault_in("pictures")("expected three bytes per pixel of the image");
-    let image = image::RgbImage::from_raw(width, height, rgb).ok_or_else(fault)?;
+    let size_fault = || fault_in("pictures")("expected three bytes per pixel of the image");
+    let image = image::RgbImage::from_raw(width, height, rgb).ok_or_else(size_fault)?;
     let mut png = std::io::Cursor::new(Vec::new());
     image::DynamicImage::from(image).write_to(&mut png, image::ImageFormat::Png).map_err(fault_in("pictures"))?;
     Ok(ImageFile { name: format!("{name}.png"), png: png.into_inner() })

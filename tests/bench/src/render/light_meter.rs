@@ -54,6 +54,7 @@ pub(super) fn meter_scene(scene: &Scene) -> Result<Arc<Scene>> {
 /// Sun visibility per pixel from frames of [`meter_scene`] with and without shadows, both RGBA. At [`MIN_SUNLIGHT`] the
 /// resolution of 8-bit sRGB is 1 %; brighter pixels have a better resolution.
 pub(super) fn read_sun_visibility(shadowed: &[u8], unshadowed: &[u8]) -> Vec<Option<f32>> {
+    // The frames are gray, so one channel is enough.
     let sunlight = |pixel: &[u8]| linear_from_srgb(f64::from(pixel[1]) / 255.0);
     let pairs = shadowed.chunks_exact(4).zip(unshadowed.chunks_exact(4));
     pairs

@@ -17,9 +17,9 @@ pub(super) fn markdown(report: &RenderReport) -> String {
     let bounds = report.bounds;
     text.push_str(&match report.failed.is_empty() {
         true => format!(
-            "\nEvery variant is within its bounds against its intended result: mean color error {} of 255, mean sun \
-             visibility error {}; mean sun visibility {} in the umbra (rows may have a lower bound); {} lost outside of shadows. \
-             Variants that are expected to exceed their bounds do.\n",
+            "\nEvery variant is within its bounds against its intended result, except for the variants that are \
+             expected to exceed them. The bounds: mean color error {} of 255; mean sun visibility error {}; mean sun \
+             visibility in the umbra {} (lower for some rows); mean sun visibility lost outside of shadows {}.\n",
             bounds.mean_color, bounds.mean_light, bounds.bleeding, bounds.lost_visibility
         ),
         false => format!("\nFailed:\n\n- {}\n", report.failed.join("\n- ")),
@@ -33,21 +33,21 @@ pub(super) fn markdown(report: &RenderReport) -> String {
 }
 
 /// Meaning of the columns of [`HEADER`].
-const EXPLANATION: &str = "Colors are compared in sRGB, of 255, by the largest difference of the three channels: \
-against hard shadow rays, and against the intended result (no shadow, or the hard shadow filtered by the blur's \
-footprint). Light is the sun visibility, compared with the same two references. Bleeding is the mean sun visibility \
-in the umbra of the intended result. Flicker is the change of the error from step to step. `frame` is the time of all \
-passes except the readback. Culling passes the `listed` triangles to the rasterizer; `hidden` triangles are occluded by \
-the depth of the last frame.\n";
+const EXPLANATION: &str = "Color errors are the largest difference of the three sRGB channels, 0 to 255. `colour` \
+columns compare with hard shadow rays, `intended colour` with the intended result of the variant: no shadow, a hard \
+shadow, or the hard shadow filtered by the blur's footprint. `intended light`, `penumbra` and `bleeding` compare the \
+sun visibility with the intended result; `bleeding` is the mean sun visibility in the umbra. `flicker` is the change \
+of the color error from step to step. `frame` is the time of all passes except the readback. Culling passes the \
+`listed` triangles to the rasterizer; `hidden` triangles are occluded by the depth of the last frame.\n";
 
 const HEADER: [&str; 25] = [
     "variant",
     "frame us",
     "quartiles us",
     "shadow us",
-    "thereof blur us",
+    "of which blur us",
     "draw us",
-    "thereof cull us",
+    "of which cull us",
     "visibility us",
     "blended us",
     "shade us",

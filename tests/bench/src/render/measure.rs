@@ -22,7 +22,7 @@ use modalcast_model::error::Result;
 use modalcast_model::scene::{Camera, Culling, RenderSettings, Scene, ShadowSettings};
 use modalcast_render::{BlurMethod, FrameCullStats, FrameImage, shadow_texel_axes};
 
-/// Step of the motion that still images show.
+/// Step of the motion that still images show. Any step at which the modes are displaced would do.
 pub(super) const STILL_STEP: usize = 10;
 /// Steps over which flicker is measured.
 const FLICKER_STEPS: usize = 60;
@@ -32,7 +32,9 @@ const MOVING_SIZE_DIVISOR: u32 = 4;
 /// Results of one variant on one workload.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RenderRow {
+    /// Name of the workload.
     pub load: String,
+    /// Name of the variant.
     pub name: String,
     pub method: ShadowVariant,
     pub shadow: Option<ShadowSettings>,
@@ -50,7 +52,7 @@ pub struct RenderRow {
     /// Whether the variant is expected to fail. The report fails if it passes.
     #[serde(rename = "to_fail")]
     pub is_expected_to_fail: bool,
-    /// Reasons why it failed.
+    /// Messages about the bounds that the variant exceeds.
     pub faults: Vec<String>,
     /// Color errors against the reference with hard shadows, which is exact for a point light.
     #[serde(rename = "colour")]
@@ -77,7 +79,9 @@ pub struct RenderRow {
     pub shadow_bytes: u64,
     /// Part of `bytes` for color and normal images, with all mip levels.
     pub image_bytes: u64,
+    /// Samples per pixel of the frame.
     pub samples: u32,
+    /// Draw calls of the visibility and blended passes.
     pub draws: usize,
     /// Culling counts of the last timed frame, where triangles are culled.
     #[serde(rename = "culled")]
@@ -112,12 +116,13 @@ struct WorkloadContext<'a> {
     camera: Camera,
     variants: Vec<RenderVariant>,
     references: References,
-    /// Light-meter frame of the still scene without shadows.
+    /// Frame of the still scene with white surfaces and without shadows; see [`light_meter`].
     unshadowed: FrameImage,
     moving: MovingReferences,
 }
 
-/// References of the moving scene per step, unshadowed and with hard shadows, or the reason why they were not traced.
+/// References of the moving scene: one pair per step, unshadowed and with hard shadows. Otherwise the reason why they
+/// were not traced.
 type MovingReferences = std::result::Result<Vec<[ReferenceImage; 2]>, String>;
 
 /// All results of one workload.
@@ -189,6 +194,7 @@ fn trace_references(
     }
     let mut images = trace_reference_images(&ray_scene, &view, &shadow_models, sample_counts(options));
     harness.unload(loaded_scene);
+    // The first image has hard shadows; the other images are the intended results, in the order of the variants.
     let intended_images = images.split_off(1);
     Ok(References {
         hard_image: images.pop().unwrap_or_default(),
@@ -229,9 +235,10 @@ fn trace_moving_references(
             None => RayScene::new(&animation.scene, loaded_scene.surface()?),
         };
         let counts = SampleCounts { taps: 1, ..SampleCounts::QUICK };
-        if let Ok(pair) =
-            trace_reference_images(&ray_scene, &view, &[ShadowModel::Unshadowed, ShadowModel::Hard], counts).try_into()
-        {
+        let step_images =
+            trace_reference_images(&ray_scene, &view, &[ShadowModel::Unshadowed, ShadowModel::Hard], counts);
+        // The conversion cannot fail, because two shadow models give two images.
+        if let Ok(pair) = step_images.try_into() {
             images.push(pair);
         }
         previous_scene = Some(ray_scene);
@@ -241,7 +248,10 @@ fn trace_moving_references(
         }
     }
     harness.unload(loaded_scene);
-    Ok(stop_reason.map_or(Ok(images), Err))
+    Ok(match stop_reason {
+        Some(reason) => Err(reason),
+        None => Ok(images),
+    })
 }
 
 /// Draws the still image of a scene.
@@ -317,8 +327,8 @@ impl WorkloadContext<'_> {
         Ok((row, file))
     }
 
-    /// Times the passes of the scene stripped to its mesh. For the baselines, frames have the largest shadow map among
-    /// the timed rows whose other shadow settings are the defaults.
+    /// Times the passes of the scene stripped to its mesh, and the frames that they are compared with. The shadow map
+    /// is the largest of the timed rows that differ from the default shadow settings by the size of the map only.
     fn time_minimal_passes(&self, harness: &mut RenderHarness, rows: &[RenderRow]) -> Result<Option<MinimalPasses>> {
         let timed_default_shadow = |row: &RenderRow| {
             let is_default =
@@ -350,10 +360,10 @@ impl WorkloadContext<'_> {
             without_culling: self.frame_baseline(harness, rows, (shadow, Culling::None))?,
             with_scene_culling: self.frame_baseline(harness, rows, (shadow, self.animation.scene.look.culling))?,
         };
-        Ok(Some(passes.with_frame_differences()))
+        Ok(Some(passes.with_frame_excess()))
     }
 
-    /// Time of a frame with this shadow map and culling, from an existing row or measured now.
+    /// Time of a frame with this shadow map and culling: that of a row with the same settings, or measured now.
     fn frame_baseline(
         &self,
         harness: &mut RenderHarness,
@@ -361,11 +371,12 @@ impl WorkloadContext<'_> {
         (shadow, culling): (ShadowSettings, Culling),
     ) -> Result<FrameBaseline> {
         // A row with automatic culling counts as not culled if no triangles were culled.
-        let has_settings = |row: &&RenderRow| {
-            let has_culling = row.culling == culling || culling == Culling::None && row.cull_stats.is_none();
-            row.shadow == Some(shadow) && has_culling
+        let has_same_settings = |row: &&RenderRow| {
+            let has_same_culling = row.culling == culling || culling == Culling::None && row.cull_stats.is_none();
+            row.shadow == Some(shadow) && has_same_culling
         };
-        let timed_row = rows.iter().filter(has_settings).find_map(|row| Some((row.name.clone(), row.median_us()?)));
+        let timed_row =
+            rows.iter().filter(has_same_settings).find_map(|row| Some((row.name.clone(), row.median_us()?)));
         let (name, frame_us) = match timed_row {
             Some(name_and_time) => name_and_time,
             None => {
@@ -430,7 +441,7 @@ impl WorkloadContext<'_> {
         }
     }
 
-    /// The flicker of a variant, or the reason why it was skipped.
+    /// The flicker of a variant, or the reason why the measurement was skipped.
     fn measure_flicker(
         &self,
         harness: &mut RenderHarness,
@@ -496,6 +507,7 @@ mod tests {
 
     #[test]
     fn detects_missing_dark_or_displaced_small_shadows() {
+        // The sun visibility of 1000 pixels: 0 in a shadow of ten pixels and 1 elsewhere.
         let visibility_with_shadow = |first_pixel: usize| -> Vec<Option<f32>> {
             (0..1000)
                 .map(|pixel| Some(if (first_pixel..first_pixel + 10).contains(&pixel) { 0.0 } else { 1.0 }))
@@ -514,7 +526,9 @@ mod tests {
             Vec::<String>::new(),
             "a displacement by a fifth of the shadow's width is within the bound"
         );
-        for visibility in [visibility_with_shadow(200), vec![Some(1.0); 1000], visibility_with_shadow(105)] {
+        let (displaced_shadow, no_shadow) = (visibility_with_shadow(200), vec![Some(1.0); 1000]);
+        let half_displaced_shadow = visibility_with_shadow(105);
+        for visibility in [displaced_shadow, no_shadow, half_displaced_shadow] {
             assert!(
                 find_faults(&visibility)[0].starts_with("mean sun visibility in the umbra"),
                 "{:?}",

@@ -4,9 +4,11 @@
 
 use serde::Serialize;
 
-/// A reference pixel is in the penumbra when its sun visibility is from this to one minus this.
+/// A reference pixel is in the penumbra when its sun visibility is between this value and 1 minus this value. A single
+/// sample of 64 changes the sun visibility by less than this value.
 const MIN_PENUMBRA_VISIBILITY: f32 = 0.02;
-/// A reference pixel is in the umbra when its sun visibility is at most this.
+/// A reference pixel is in the umbra when its sun visibility is at most this value, which allows for rounding. It is
+/// outside of shadows when its sun visibility is at least 1 minus this value.
 const MAX_UMBRA_VISIBILITY: f32 = 1e-6;
 
 /// Mean, 99th percentile and maximum of a set of numbers; all 0 for an empty set.
@@ -36,7 +38,7 @@ pub fn compare_colors(rendered: &[u8], reference: &[[f32; 3]]) -> ErrorDistribut
     ErrorDistribution::from_values(differences(rendered, reference).collect())
 }
 
-/// The largest difference of the three channels, per pixel.
+/// The largest difference of the three color channels, per pixel.
 pub fn differences<'a>(rendered: &'a [u8], reference: &'a [[f32; 3]]) -> impl Iterator<Item = f32> + 'a {
     let largest_difference = |(pixel, expected): (&[u8], &[f32; 3])| {
         pixel.iter().zip(expected).map(|(byte, value)| (f32::from(*byte) - value).abs()).fold(0.0, f32::max)
@@ -144,6 +146,7 @@ mod tests {
 
     #[test]
     fn shifted_ramp_errs_by_its_slope_only_on_the_ramp() {
+        // The sun visibility rises from 0 at pixel 40 + shift to 1 at pixel 60 + shift, by 1/20 per pixel.
         let ramp = |shift: i32| -> Vec<Option<f32>> {
             (0..100).map(|pixel| Some(((pixel - 40 - shift) as f32 / 20.0).clamp(0.0, 1.0))).collect()
         };
@@ -158,6 +161,7 @@ mod tests {
             (shifted_errors.penumbra.max - 0.1).abs() < 1e-6 && shifted_errors.penumbra.mean > 0.09,
             "{shifted_errors:?}"
         );
+        // The shift darkens the 100 pixels by 2 in total.
         assert!(
             (shifted_errors.all_pixels.mean - 0.02).abs() < 1e-6 && (shifted_errors.bias + 0.02).abs() < 1e-6,
             "{shifted_errors:?}"

@@ -37,7 +37,7 @@ pub struct MinimalPasses {
 /// A frame of the renderer with the same map, for comparison with both passes.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FrameBaseline {
-    /// Description of the variant.
+    /// The variant and its culling.
     pub name: String,
     /// Time of the frame, microseconds.
     pub frame_us: f64,
@@ -48,7 +48,7 @@ pub struct FrameBaseline {
 
 impl MinimalPasses {
     /// Fills in each frame's excess over both passes.
-    pub(super) fn with_frame_differences(mut self) -> Self {
+    pub(super) fn with_frame_excess(mut self) -> Self {
         let sum_us = self.depth.median_us + self.visibility.median_us;
         for frame in [&mut self.without_culling, &mut self.with_scene_culling] {
             frame.excess_us = frame.frame_us - sum_us;
@@ -57,7 +57,8 @@ impl MinimalPasses {
     }
 }
 
-/// Limit of a frame's excess over both passes, microseconds: three million triangles without culling on an H200.
+/// Target for a frame's excess over both passes, microseconds: three million triangles without culling on an H200. The
+/// report prints the target and does not check it.
 pub(super) const MAX_EXCESS_US: f64 = 600.0;
 
 /// The scene with one material and a standard shadow map of `map_size` texels per side.
@@ -76,7 +77,8 @@ pub(super) fn strip_to_mesh(scene: &Scene, map_size: u32) -> Result<Arc<Scene>> 
     Scene::new(parts)
 }
 
-/// Whether a frame had a shadow pass without blur and one draw of ids. Draws of the shadow pass are not counted.
+/// Whether the shadow pass of a frame was followed by one draw of ids, without a blur between them. `draw_calls` does
+/// not count the draws of the shadow pass.
 pub(super) fn is_minimal(stats: &FrameStats) -> bool {
     stats.draw_calls == 1 && stats.passes.starts_with(&[Pass::Shadow, Pass::Visibility])
 }

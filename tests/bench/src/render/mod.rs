@@ -1,16 +1,16 @@
 //! Benchmarks of error against run time for the renderer: compares the images of every variant with brute-force
 //! ray-cast references.
 //!
-//! Each variant is validated before it is timed: if its error against its intended result exceeds a stated bound, it is
-//! not timed, and the report names it and fails. Some variants are expected to fail; the report also fails if such a
-//! variant passes.
+//! Each variant is validated before it is timed. Its intended result is a reference with the same kind of shadow: none,
+//! hard or filtered. A variant whose error against its intended result exceeds a bound is not timed, and the report
+//! names the variant and fails. Some variants are expected to fail; the report also fails if such a variant passes.
 //!
 //! - [`workloads`], [`variants`]: the scenes, and the ways to draw them.
 //! - `ray_scene`, `reference_material`, `reference_texture`, `reference_view`, `shade`, `sample_pattern`,
 //!   `reference_image`: the references, with 64 samples per pixel, in f64 except for the boxes of the BVH. Each sample
 //!   sees its nearest opaque or cut-out surface and the transparent surfaces in front of it, sorted by depth. Shadows
 //!   are cast by one ray per sample to the sun, or by rays that are distributed over the footprint of the blur.
-//! - `harness`, `light_meter`: frames of the renderer, and their sun visibility.
+//! - `harness`, `light_meter`: draw and time frames of the renderer, and measure their sun visibility.
 //! - `readback`: frames per second when each frame is read back.
 //! - [`metrics`]: errors, light bleeding, flicker.
 //! - `minimal_passes`: times of the depth and visibility passes of the scene stripped to its mesh.
@@ -21,6 +21,7 @@
 //! - [`plants`]: the plants of table 4.5, deformed and drawn.
 //! - [`frame_times`]: frame times of user-supplied scenes, for comparison with other programs.
 //! - [`figures`]: reproduces figures of the thesis.
+//! - `output`, `markdown`, `comparison_tables`, `raster_report`, `plot`, `image_files`: the files of a report.
 
 mod blur_comparison;
 mod comparison_tables;
@@ -85,7 +86,7 @@ pub struct RenderReportOptions {
     /// Variants to measure: full names, or prefixes that end in `*`. An empty list selects all.
     pub variants: Vec<String>,
     pub size: Size,
-    /// Uses fewer variants, samples and triangles, for machines with few cores.
+    /// Whether to use fewer variants, samples and triangles, for machines with few cores.
     pub quick: bool,
     /// Frames per median.
     pub replays: usize,
@@ -99,12 +100,11 @@ impl RenderReportOptions {
 
     /// The variants to measure. A quick run has fewer, but includes every variant that is named in full.
     pub fn selected_variants(&self) -> Vec<RenderVariant> {
-        let (quick_variants, mut selected_variants) = (variants::all(self.quick), variants::all(false));
+        let (run_variants, mut selected_variants) = (variants::all(self.quick), variants::all(false));
         selected_variants.retain(|variant| {
             let is_named = self.variants.contains(&variant.name);
-            is_named
-                || is_selected(&self.variants, &variant.name)
-                    && quick_variants.iter().any(|quick| quick.name == variant.name)
+            let is_in_run = run_variants.iter().any(|candidate| candidate.name == variant.name);
+            is_named || is_selected(&self.variants, &variant.name) && is_in_run
         });
         selected_variants
     }
@@ -119,7 +119,7 @@ pub struct RenderWorkloadSummary {
     pub domains: usize,
     /// Samples per pixel of the references.
     pub samples: usize,
-    /// Rays to the sun per sample of a filtered shadow.
+    /// Rays to the sun per sample of a reference with filtered shadows.
     pub taps: usize,
     /// Time to trace all references of the still image.
     pub reference_ms: f64,

@@ -4,17 +4,20 @@
 //!
 //!   uv' = (uv - floor uv) s,  s = ((w - 1) / (w_t - 1), (h - 1) / (h_t - 1))
 //!
-//! The renderer uses an array per size class, without a scale. For the comparison, a scene is rebuilt so that the
-//! renderer reproduces the thesis's method: images are repeated to the common size, and the corners of every triangle
-//! have the coordinates of the equation. The equation wraps the coordinates of each fragment. To wrap those of triangles
-//! is equivalent if no triangle crosses the edge of its image.
+//! w x h is the size of an image, w_t x h_t the size of the array.
+//!
+//! The renderer uses an array per size class (images of equal or similar size), without a scale. For the comparison, a
+//! scene is rebuilt so that the renderer reproduces the thesis's method: images are repeated to the size of the array,
+//! and the corners of every triangle have the coordinates of the equation. The equation wraps the coordinates of each
+//! fragment. Wrapping the coordinates of each triangle is equivalent if no triangle crosses the edge of its image.
 //!
 //! The scale of the equation does not reach the last column and row of an image. [`Packing::CorrectedRepetition`] uses
-//! s = (w / w_t, h / h_t) instead. On the `images` workload, it has a slightly smaller error than one array per size class:
-//! 3.93 compared with 4.24 of 255, with software rendering at 640 x 360. The workload shows each image on a panel, above a
-//! floor. It has seven image sizes and the renderer six arrays: the two smallest images, 16 x 16 and 25 x 15, share an
-//! array of 25 x 16 and are stretched to this size. On their panels, where a texel covers several pixels, the error of size
-//! classes is larger by up to 7 of 255. On the floor it is smaller by up to 0.5 of 255.
+//! s = (w / w_t, h / h_t) instead. On the `images` workload, its error is slightly smaller than that of size classes:
+//! 3.93 compared with 4.24 of 255, with software rendering at 640 x 360. The workload shows each image on a panel,
+//! above a floor. It has seven image sizes and the renderer six arrays: the two smallest images, 16 x 16 and 25 x 15,
+//! share an array of 25 x 16 and are stretched to this size. On their panels, where a texel covers several pixels, the
+//! error of size classes is larger by up to 7 of 255. On the floor, the error of size classes is smaller by up to 0.5
+//! of 255.
 
 use std::sync::Arc;
 
@@ -77,11 +80,12 @@ fn uv_scale(texture: &Texture, layer_size: [u32; 2], packing: Packing) -> [f32; 
     } as f32)
 }
 
-/// The image repeated until it fills this size.
+/// The image, repeated until it fills `width` x `height` texels.
 fn fill_by_repetition(texture: &Texture, [width, height]: [u32; 2]) -> Result<Texture> {
     let (columns, rows) = (texture.width() as usize, texture.height() as usize);
     let texel_bytes = |index: usize| {
-        let (x, y) = (index % width as usize % columns, index / width as usize % rows);
+        let (layer_x, layer_y) = (index % width as usize, index / width as usize);
+        let (x, y) = (layer_x % columns, layer_y % rows);
         let first_byte = 4 * (y * columns + x);
         texture.rgba()[first_byte..first_byte + 4].iter().copied()
     };
@@ -126,6 +130,7 @@ mod tests {
     #[test]
     fn repeats_small_images_and_scales_uvs_by_equation_3_13() {
         let scene = RenderWorkload::Images.build().expect("a workload").scene;
+        // The largest image has 128 x 128 texels, so this is the size of the array.
         let [printed_scene, corrected_scene] = [Packing::PrintedRepetition, Packing::CorrectedRepetition]
             .map(|packing| pack_images(&scene, packing).expect("a packed scene"));
         let small_index = scene

@@ -34,6 +34,7 @@ pub struct PlantResult {
     /// Whether the plant has the size of its row in table 4.5. The results are comparable only if it has.
     #[serde(rename = "full")]
     pub is_full_size: bool,
+    /// How the plant differs from its row in table 4.5.
     pub remarks: Vec<String>,
     pub backend: Backend,
     /// Whether the deformer writes the renderer's buffers, so that vertices do not pass through the host.
@@ -60,14 +61,14 @@ pub struct PlantResult {
     pub bytes: u64,
 }
 
-/// Number of states, which the frames use in turn.
+/// Number of different states that the frames cycle through.
 const STATES: usize = 8;
 
 /// A plant's deformer and renderer buffers. The deformer is dropped first, because it may write the buffers.
 struct PlantSetup {
     deformer: Box<dyn Deformer>,
-    /// Device bytes of the deformer in addition to the buffers.
-    bytes: u64,
+    /// Device bytes of the deformer, without shared buffers.
+    deformer_bytes: u64,
     buffers: SceneBuffers,
 }
 
@@ -86,9 +87,9 @@ pub(super) fn measure(
     let states = motion_states(&Workload { scene: Arc::clone(&scene), ..workload.clone() });
     let mut setup = create_setup(harness, device, &scene)?;
     let timings = time_frames(harness, &mut setup, &scene, options, &states)?;
-    let PlantSetup { deformer, bytes, buffers } = setup;
+    let PlantSetup { deformer, deformer_bytes, buffers } = setup;
     let (backend, shares_buffers) = (deformer.backend(), deformer.shares_buffers());
-    let bytes = bytes + buffers.plan().bytes();
+    let bytes = deformer_bytes + buffers.plan().bytes();
     drop(deformer);
     harness.renderer.unload(buffers);
     Ok(PlantResult {
@@ -127,17 +128,17 @@ fn create_setup(harness: &mut RenderHarness, device: Option<&Arc<Device>>, scene
     let Some(device) = device else {
         return Ok(PlantSetup {
             deformer: Box::new(CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())),
-            bytes: 0,
+            deformer_bytes: 0,
             buffers,
         });
     };
-    let renderer_device = harness.renderer.info().cuda_device.map(|ordinal| usize::try_from(ordinal).ok());
-    let is_shared = renderer_device == Some(Some(device.ordinal()));
-    let vertex_buffers = if is_shared { Some(buffers.vertex_buffers()) } else { None };
+    let renderer_device = harness.renderer.info().cuda_device.and_then(|ordinal| usize::try_from(ordinal).ok());
+    let is_same_device = renderer_device == Some(device.ordinal());
+    let vertex_buffers = if is_same_device { Some(buffers.vertex_buffers()) } else { None };
     let deformer =
         CudaDeformer::new(device, scene, vertex_buffers, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))?;
     Ok(PlantSetup {
-        bytes: unshared_bytes(deformer.plan(), deformer.shares_buffers()),
+        deformer_bytes: unshared_bytes(deformer.plan(), deformer.shares_buffers()),
         deformer: Box::new(deformer),
         buffers,
     })
@@ -172,7 +173,7 @@ fn time_frames(
     let camera = Camera::fit_to_scene(scene, size.width, size.height);
     let begin = Instant::now();
     let mut warm_up_frames = 0;
-    // The first frames compile shaders and allocate textures, and the clock rates of the device rise.
+    // The first frames compile shaders and allocate textures, and the clock rates of an idle device rise slowly.
     while warm_up_frames < 2 || (!harness.renderer.info().software && begin.elapsed() < super::harness::WARM_UP) {
         time_frame(harness, setup, (camera, size), &states[warm_up_frames % states.len()])?;
         warm_up_frames += 1;
@@ -233,12 +234,14 @@ mod tests {
             quick: true,
             replays: 1,
         };
+        // Plant 1 is the conifer of table 4.5.
         let plant = measure(&mut harness, None, &options, 1).expect("a result");
         assert_eq!(
             (plant.thesis.name, plant.is_full_size, plant.backend, plant.shares_buffers),
             ("Conifer", false, Backend::Cpu, false)
         );
         assert!(plant.vbr.median_us > plant.deform.median_us && plant.render.median_us > 0.0);
+        // Each frame takes at least t_vbr. Half of it is a margin for the render time, which has another clock.
         assert!(plant.frame.median_us >= plant.vbr.median_us * 0.5 && plant.bytes > 0);
         assert!((plant.occupation - plant.vbr.median_us / plant.frame.median_us).abs() < 1e-12);
         assert!((plant.fps * plant.frame.median_us - 1e6).abs() < 1.0);
@@ -249,7 +252,8 @@ mod tests {
     fn shared_output_buffers_count_once() {
         let scene = WorkloadKind::Plant(0).build(WorkloadSize::Quick).expect("a workload").scene;
         let plan = gpu::plan(&scene, CudaDeformerOptions::with_bounding_axes(scene.light_axes()));
-        let outputs = 12 * (scene.layout.vertices + scene.layout.corners) as u64;
-        assert_eq!(unshared_bytes(&plan, false) - unshared_bytes(&plan, true), outputs);
+        // 12 bytes per position of a vertex and per normal of a corner; the plant has no tangents.
+        let output_bytes = 12 * (scene.layout.vertices + scene.layout.corners) as u64;
+        assert_eq!(unshared_bytes(&plan, false) - unshared_bytes(&plan, true), output_bytes);
     }
 }

@@ -64,8 +64,8 @@ fn row_point(row: &RenderRow) -> Option<Point<'_>> {
     Some(Point { name: &row.name, time_us, error, is_filled: true, is_candidate: true })
 }
 
-/// Color and shape of a variant's marker: circles for the first colors, then squares and triangles. The backend only
-/// selects the shape here.
+/// Color and shape of a variant's marker: circles until all colors are used, then squares and triangles. `backend` and
+/// `color_reuse` select the shape.
 fn marker_style(variants: &[&str], name: &str) -> MarkerStyle {
     let index = variants.iter().position(|variant| *variant == name).unwrap_or(0);
     let (backend, color_reuse) = match index / COLORS.len() {

@@ -1,5 +1,6 @@
-//! Compares the CUDA rasterizer with OpenGL in one run on two passes: ids with depth, and depth only. The scene is
-//! stripped to its mesh and has one sample per pixel. Ids are compared before the passes are timed.
+//! Compares the CUDA rasterizer with OpenGL in one run on two passes: ids with depth, and depth only. An id names the
+//! visible triangle of a sample. The scene is stripped to its mesh and has one sample per pixel. The passes are timed
+//! only if both rasterizers agree on nearly all ids.
 
 use std::sync::Arc;
 
@@ -19,8 +20,8 @@ use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::{Camera, CullMode, DrawRange, RenderSettings, Scene, SceneParts, SceneState, Viewport};
 use modalcast_render::{FrameParams, VisibilityId, shadow_clip_from_world};
 
-/// Largest fraction of samples whose ids may differ from OpenGL's. Ids differ at edges and depth ties. If more ids differ,
-/// the passes are not timed.
+/// Largest fraction of samples whose ids may differ from OpenGL's. If more ids differ, no speedup is measured. Correct
+/// rasterizers differ only at edges and depth ties, which are a small part of a frame.
 pub(super) const MAX_DIFFERING_FRACTION: f64 = 0.01;
 
 /// Both passes by both rasterizers on one workload.
@@ -94,9 +95,7 @@ impl RasterComparison {
             .is_none()
             .then(|| format!("{load}: raster: expected equal ids, {differing_ids} of {samples} samples differ"))
     }
-}
 
-impl RasterComparison {
     /// The results as one line of text.
     pub fn line(&self) -> String {
         let format_pair = |pair: TimingPair| {
@@ -206,14 +205,13 @@ impl RasterSetup {
         let draw_ranges = [DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None }];
         let mesh = RasterMesh { positions: &positions, triangles: &triangles, groups: &draw_ranges, cut_outs: None };
         let (frame_viewport, map_viewport) = (self.frame_viewport(&frame_params)?, self.map_viewport(&frame_params)?);
-        let [frame_raster, map_raster] =
-            [(frame_viewport, false), (map_viewport, true)].map(|(viewport, depth_only)| {
-                RasterBenchmark::new(device, mesh, viewport, RasterVariant { depth_only, ..RasterVariant::default() })
-            });
-        let (frame_raster, map_raster) = (frame_raster?, map_raster?);
+        let frame_variant = RasterVariant::default();
+        let map_variant = RasterVariant { depth_only: true, ..RasterVariant::default() };
+        let frame_raster = RasterBenchmark::new(device, mesh, frame_viewport, frame_variant)?;
+        let map_raster = RasterBenchmark::new(device, mesh, map_viewport, map_variant)?;
         frame_raster.launch(device, 0)?;
         let keys = frame_raster.keys(device)?;
-        // The lower 32 bits of a key are the triangle.
+        // A key has the depth in its upper and the triangle in its lower 32 bits.
         let differing_ids = keys.iter().zip(&ids).filter(|(key, id)| **key as u32 != **id).count();
         let is_accepted = differing_ids as f64 <= MAX_DIFFERING_FRACTION * ids.len() as f64;
         let passes = if is_accepted {
@@ -228,19 +226,21 @@ impl RasterSetup {
             differing_ids,
             samples: ids.len(),
             passes,
-            in_frame: count_triangles(device, mesh, frame_viewport, false)?,
-            in_map: count_triangles(device, mesh, map_viewport, true)?,
+            in_frame: count_triangles(device, mesh, frame_viewport, frame_variant)?,
+            in_map: count_triangles(device, mesh, map_viewport, map_variant)?,
         })
     }
 
-    /// Converts ids that OpenGL drew to indices of packed triangles; `u32::MAX` where it drew no triangle.
+    /// Converts ids that OpenGL drew to indices into the triangles of all domains in order, as CUDA numbers them.
+    /// `u32::MAX` where OpenGL drew no triangle.
     fn packed_ids(&self, visibility: &[VisibilityId], loaded_scene: &LoadedScene) -> Vec<u32> {
-        let domain_slots = &self.scene.layout.domains;
+        let domain_layouts = &self.scene.layout.domains;
         let source_triangle = |id: &VisibilityId| match id {
             VisibilityId::Triangle(triangle) => loaded_scene.buffers.source_triangle(*triangle),
             _ => None,
         };
-        let packed_index = |(domain, triangle): (usize, usize)| (domain_slots[domain].first_triangle + triangle) as u32;
+        let packed_index =
+            |(domain, triangle): (usize, usize)| (domain_layouts[domain].first_triangle + triangle) as u32;
         visibility.iter().map(|id| source_triangle(id).map_or(u32::MAX, packed_index)).collect()
     }
 
@@ -265,7 +265,7 @@ impl RasterSetup {
         harness: &mut RenderHarness,
         loaded_scene: &LoadedScene,
         device: &Device,
-        cuda_rasters: [&RasterBenchmark; 2],
+        [depth_raster, visibility_raster]: [&RasterBenchmark; 2],
     ) -> Result<PassPairs> {
         let passes = harness.time_passes(loaded_scene, self.camera, self.size, self.replays)?;
         let time_pair = |name: &str, raster: &RasterBenchmark| {
@@ -275,8 +275,8 @@ impl RasterSetup {
             Ok(TimingPair { opengl, cuda })
         };
         Ok(PassPairs {
-            depth: time_pair("shadow", cuda_rasters[0])?,
-            visibility: time_pair("visibility", cuda_rasters[1])?,
+            depth: time_pair("shadow", depth_raster)?,
+            visibility: time_pair("visibility", visibility_raster)?,
         })
     }
 }
@@ -286,14 +286,9 @@ fn count_triangles(
     device: &Device,
     mesh: RasterMesh<'_>,
     viewport: Viewport,
-    depth_only: bool,
+    variant: RasterVariant,
 ) -> Result<TriangleCounts> {
-    let raster = RasterBenchmark::new(
-        device,
-        mesh,
-        viewport,
-        RasterVariant { depth_only, count_triangles: true, ..RasterVariant::default() },
-    )?;
+    let raster = RasterBenchmark::new(device, mesh, viewport, RasterVariant { count_triangles: true, ..variant })?;
     raster.launch(device, 0)?;
     Ok(raster.counts(device)?.into())
 }
@@ -303,7 +298,8 @@ mod tests {
     use super::*;
     use modalcast_render::Renderer;
 
-    /// At each sample, the bounding box of the triangle that OpenGL drew contains the sample.
+    /// The viewport of the CUDA rasterizer projects the triangle of each OpenGL id to a bounding box that contains the
+    /// sample of the id.
     #[test]
     fn viewports_and_triangles_match_the_opengl_frame() {
         let mut harness = RenderHarness::open().expect("OpenGL");
@@ -333,21 +329,24 @@ mod tests {
             loaded_scene.surface().expect("a surface").positions.clone(),
         );
         let triangles = setup.scene.triangle_vertices();
+        // Row-major.
         let clip_from_world = viewport.clip_from_positions();
-        let clip_coordinate = |row: usize, p: [f32; 3]| {
-            (0..3).map(|axis| clip_from_world[4 * row + axis] * p[axis]).sum::<f32>() + clip_from_world[4 * row + 3]
+        let clip_coordinate = |row: usize, point: [f32; 3]| {
+            (0..3).map(|axis| clip_from_world[4 * row + axis] * point[axis]).sum::<f32>() + clip_from_world[4 * row + 3]
         };
-        // Each bounding box contains its sample within half a pixel.
         let mut contained_samples = 0;
         for (pixel, id) in ids.iter().enumerate() {
             let corners =
                 triangles[*id as usize].map(|vertex| [0, 1, 2].map(|axis| positions[3 * vertex as usize + axis]));
-            let [x, y] = [0, 1].map(|axis| corners.map(|p| clip_coordinate(axis, p) / clip_coordinate(3, p)));
+            // Normalized device coordinates of the three corners.
+            let [x, y] =
+                [0, 1].map(|axis| corners.map(|point| clip_coordinate(axis, point) / clip_coordinate(3, point)));
             let sample = [(pixel % 160) as f32 + 0.5, (pixel / 160) as f32 + 0.5];
             let contains_sample = |corners: [f32; 3], center: f32, tolerance: f32| {
                 corners.iter().any(|corner| *corner <= center + tolerance)
                     && corners.iter().any(|corner| *corner >= center - tolerance)
             };
+            // The frame of 160 x 90 pixels extends from -1 to 1; the tolerance is half a pixel.
             let is_inside = contains_sample(x, sample[0] / 80.0 - 1.0, 1.0 / 160.0)
                 && contains_sample(y, 1.0 - sample[1] / 45.0, 1.0 / 90.0);
             contained_samples += usize::from(is_inside);
@@ -355,11 +354,12 @@ mod tests {
         assert_eq!(contained_samples, ids.len());
         let map = setup.map_viewport(&frame_params).expect("a viewport of the map");
         assert_eq!(map.size(), [1024; 2]);
-        let is_inside = |p: &[f32]| {
-            (0..3).all(|axis| {
-                let clip_from_world = map.clip_from_positions();
-                let coordinate: f32 =
-                    (0..3).map(|k| clip_from_world[4 * axis + k] * p[k]).sum::<f32>() + clip_from_world[4 * axis + 3];
+        // The projection of the map is orthographic, so that w is 1.
+        let clip_from_world = map.clip_from_positions();
+        let is_inside = |point: &[f32]| {
+            (0..3).all(|row| {
+                let coordinate: f32 = (0..3).map(|axis| clip_from_world[4 * row + axis] * point[axis]).sum::<f32>()
+                    + clip_from_world[4 * row + 3];
                 coordinate.abs() <= 1.0
             })
         };

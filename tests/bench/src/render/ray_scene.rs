@@ -1,8 +1,8 @@
 //! The ray-cast scene of the references: deformed triangles in a bounding volume hierarchy (BVH), and ray queries.
 //!
-//! Triangle tests are f64. Boxes are f32 and padded, so a box test may give false positives but no false negatives. In
-//! the BVH, positions are relative to the center of the scene and rays begin near the scene, so that rounding errors are
-//! below the padding.
+//! Triangle tests are f64. Boxes are f32 and padded, so that a box test may give false positives but no false
+//! negatives. Positions in the BVH are relative to the center of the scene, and rays begin near the scene. Rounding
+//! errors are therefore below the padding.
 
 use nalgebra::Vector3;
 use obvhs::aabb::Aabb;
@@ -17,7 +17,8 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::Mesh;
 use modalcast_model::scene::{BoundingBox, Scene};
 
-/// Padding of boxes as a fraction of the scene's radius.
+/// Padding of boxes as a fraction of the scene's radius. f32 rounds a coordinate of up to two radii by at most 6e-8
+/// radii; the padding also covers the rounding of the box test.
 const PADDING: f64 = 2e-6;
 
 /// Minimum number of triangles per parallel task.
@@ -41,9 +42,9 @@ impl Ray {
 pub(super) struct Triangle {
     pub(super) first_corner: Vector3<f64>,
     pub(super) edges: [Vector3<f64>; 2],
-    /// Indices of the corners in the packed normals, in winding order.
+    /// Indices of the corners in [`RayScene::normals`], in winding order.
     pub(super) corner_indices: [u32; 3],
-    /// Index in the packed triangles, which breaks depth ties.
+    /// Index in the triangles of all domains in order. It breaks depth ties.
     pub(super) packed_index: u32,
     /// Index into [`RayScene::materials`].
     pub(super) material: u32,
@@ -65,9 +66,13 @@ pub(super) struct Hit {
 pub(super) struct RayScene {
     pub(super) triangles: Vec<Triangle>,
     pub(super) materials: Vec<ReferenceMaterial>,
+    /// One normal per corner.
     pub(super) normals: Vec<Vector3<f64>>,
+    /// One tangent per corner: direction, and sign of the bitangent. Empty without normal maps.
     pub(super) tangents: Vec<[f64; 4]>,
+    /// Texture coordinates per corner.
     pub(super) uvs: Vec<[f64; 2]>,
+    /// Center and radius of a bounding sphere.
     pub(super) center: Vector3<f64>,
     pub(super) radius: f64,
     /// Whether any triangle is blended.
@@ -87,7 +92,7 @@ impl Boundable for PaddedTriangle<'_> {
         let Self { triangle, center, padding } = self;
         let [a, b, c] = triangle.points().map(|point| point - *center);
         let (min_corner, max_corner) = (a.inf(&b).inf(&c).add_scalar(-padding), a.sup(&b).sup(&c).add_scalar(*padding));
-        let to_f32 = |v: Vector3<f64>| glam::Vec3A::new(v.x as f32, v.y as f32, v.z as f32);
+        let to_f32 = |point: Vector3<f64>| glam::Vec3A::new(point.x as f32, point.y as f32, point.z as f32);
         Aabb::new(to_f32(min_corner), to_f32(max_corner))
     }
 }
@@ -102,7 +107,7 @@ impl Triangle {
         self.edges[0].cross(&self.edges[1]).try_normalize(0.0).unwrap_or_default()
     }
 
-    /// Intersection test by Möller and Trumbore. Points on an edge are inside. `index` is that of the triangle in
+    /// Intersection test by Möller and Trumbore. Points on an edge are inside. `index` is the index of this triangle in
     /// [`RayScene::triangles`].
     fn intersect(&self, index: usize, ray: &Ray) -> Option<Hit> {
         let direction_cross_edge = ray.direction.cross(&self.edges[1]);
@@ -178,7 +183,9 @@ impl RayScene {
         Self { triangles: ordered_triangles, normals, tangents, center, radius, bvh, ..self }
     }
 
-    /// The ray relative to the BVH's center in f32, and the parameter t at its start.
+    /// The part of a ray from `min_t` to `max_t` in f32, relative to the center of the scene, and the t at its start. A
+    /// ray from afar starts 1.5 radii before its point that is closest to the center, which is still outside of the
+    /// scene.
     fn box_ray(&self, ray: &Ray, min_t: f64, max_t: f64) -> (BoxRay, f64) {
         let length_squared = ray.direction.norm_squared();
         let closest_t = ray.direction.dot(&(self.center - ray.origin)) / length_squared;
@@ -197,12 +204,13 @@ impl RayScene {
     ) -> Option<Hit> {
         let (box_ray, begin_t) = self.box_ray(ray, min_t, max_t);
         let mut nearest: Option<Hit> = None;
+        // The closure returns the distance of an accepted hit, which shortens the BVH's ray, or infinity.
         self.bvh.ray_traverse(box_ray, &mut RayHit::none(), |_, index| {
             let is_in_range = |t: f64| t >= min_t && t <= max_t && nearest.is_none_or(|nearest| t <= nearest.t);
             let Some(hit) = self.triangles[index].intersect(index, ray).filter(|hit| is_in_range(hit.t)) else {
                 return f32::INFINITY;
             };
-            // Within the range t <= other.t, so the index decides only if both are equal.
+            // `is_in_range` excludes hit.t > other.t, so the index decides only between equal distances.
             let precedes = |other: Hit| hit.t < other.t || self.packed_index(&hit) < self.packed_index(&other);
             if !nearest.is_none_or(precedes) || !accepts(&hit) {
                 return f32::INFINITY;
@@ -228,7 +236,8 @@ impl RayScene {
         hits
     }
 
-    /// Whether two hits are the same point on a shared edge of their triangles.
+    /// Whether two hits are the same point on a shared edge of their triangles. The tolerances of 1e-9 allow for
+    /// rounding.
     fn are_same_hit(&self, first: &Hit, second: &Hit) -> bool {
         let is_on_edge = |hit: &Hit| hit.u.min(hit.v).min(1.0 - hit.u - hit.v) < 1e-9;
         if (first.t - second.t).abs() > 1e-9 * first.t.abs() || !is_on_edge(first) || !is_on_edge(second) {
@@ -243,11 +252,12 @@ impl RayScene {
     pub(super) fn is_occluded(&self, ray: &Ray, min_t: f64, receiver: Option<usize>) -> bool {
         let (box_ray, _) = self.box_ray(ray, min_t, f64::MAX);
         let box_ray = BoxRay { tmax: f32::MAX, ..box_ray };
-        let find_occluder = |index: usize| {
-            let hit = self.triangles[index].intersect(index, ray).filter(|hit| hit.t > min_t)?;
-            (receiver != Some(index) && self.casts_shadow(&hit)).then_some(hit)
+        let occludes = |index: usize| {
+            let hit = self.triangles[index].intersect(index, ray).filter(|hit| hit.t > min_t);
+            receiver != Some(index) && hit.is_some_and(|hit| self.casts_shadow(&hit))
         };
-        !self.bvh.ray_traverse_miss(box_ray, |_, index| find_occluder(index).map_or(f32::INFINITY, |_| 0.0))
+        // Any finite distance ends the traversal.
+        !self.bvh.ray_traverse_miss(box_ray, |_, index| if occludes(index) { 0.0 } else { f32::INFINITY })
     }
 
     /// Intersection of a ray with one triangle.
@@ -264,7 +274,7 @@ impl RayScene {
         &self.materials[self.triangles[hit.triangle].material as usize]
     }
 
-    /// Whether a hit is opaque: neither on a culled back face, nor cut out, nor blended.
+    /// Whether a hit is opaque: not on the back of a single-sided material, not cut out and not blended.
     pub(super) fn is_opaque(&self, hit: &Hit) -> bool {
         let material = self.material(hit);
         let is_visible_side = hit.is_front || material.double_sided;
@@ -299,7 +309,7 @@ impl RayScene {
     }
 }
 
-/// Center and radius of a bounding sphere.
+/// Center and radius of a bounding sphere; the radius is always positive.
 fn bounding_sphere(triangles: &[Triangle]) -> (Vector3<f64>, f64) {
     let include = |mut bounds: BoundingBox, triangle: &Triangle| {
         triangle.points().iter().for_each(|point| bounds.include((*point).into()));
@@ -325,17 +335,17 @@ fn tangents(surface: &DeformedSurface) -> Vec<[f64; 4]> {
 /// Texture coordinates per corner; (0, 0) where a mesh has none.
 fn uvs(scene: &Scene) -> Vec<[f64; 2]> {
     let mut uvs = Vec::with_capacity(scene.layout.corners);
-    for (domain, slot) in scene.domains.iter().zip(&scene.layout.domains) {
+    for (domain, domain_layout) in scene.domains.iter().zip(&scene.layout.domains) {
         let mesh_uvs = &scene.shapes[domain.shape].mesh.corners().uvs;
         uvs.extend(mesh_uvs.iter().map(|uv| uv.map(f64::from)));
-        uvs.resize(slot.first_corner + slot.corners, [0.0; 2]);
+        uvs.resize(domain_layout.first_corner + domain_layout.corners, [0.0; 2]);
     }
     uvs
 }
 
 fn triangles(scene: &Scene, surface: &DeformedSurface) -> Vec<Triangle> {
     let domain_triangles = |index: usize| {
-        let (domain, slot) = (&scene.domains[index], scene.layout.domains[index]);
+        let (domain, domain_layout) = (&scene.domains[index], scene.layout.domains[index]);
         let mesh = &scene.shape_of(index).mesh;
         let is_mirrored = domain.placement.linear().determinant() < 0.0;
         let vertices = &mesh.corners().vertices;
@@ -346,9 +356,10 @@ fn triangles(scene: &Scene, surface: &DeformedSurface) -> Vec<Triangle> {
                 // The front side of a double-sided triangle is the side that its rest normals point to.
                 let is_reversed = scene.materials[material].double_sided && is_winding_reversed(mesh, *corners);
                 let [a, b, c] = *corners;
+                // A mirrored placement reverses the winding too; both reversals cancel.
                 let corners = if is_mirrored == is_reversed { [a, b, c] } else { [a, c, b] };
                 let point = |corner: u32| {
-                    let first_coordinate = 3 * (slot.first_vertex + vertices[corner as usize] as usize);
+                    let first_coordinate = 3 * (domain_layout.first_vertex + vertices[corner as usize] as usize);
                     let position = &surface.positions[first_coordinate..first_coordinate + 3];
                     Vector3::new(position[0], position[1], position[2]).cast::<f64>()
                 };
@@ -357,8 +368,8 @@ fn triangles(scene: &Scene, surface: &DeformedSurface) -> Vec<Triangle> {
                 is_finite.then(|| Triangle {
                     first_corner: a,
                     edges: [b - a, c - a],
-                    corner_indices: corners.map(|corner| corner + slot.first_corner as u32),
-                    packed_index: (slot.first_triangle + triangle) as u32,
+                    corner_indices: corners.map(|corner| corner + domain_layout.first_corner as u32),
+                    packed_index: (domain_layout.first_triangle + triangle) as u32,
                     material: material as u32,
                 })
             },

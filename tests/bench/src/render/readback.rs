@@ -2,12 +2,12 @@
 //! each frame, and with asynchronous readbacks through the ring while the next frames are drawn.
 //!
 //! All three methods keep at most as many frames in flight as the ring has slots, so that they differ only in the
-//! readback. Rounds of the three methods alternate, and the medians over the rounds are compared. Two of the methods,
-//! without readback and through the ring, are also measured with a moving scene: the vertices of another step are
-//! uploaded before every frame.
+//! readback. Rounds of the three methods alternate, and the medians over the rounds are compared. The methods without
+//! readback and through the ring are also measured with a moving scene: the vertices of another step are uploaded
+//! before every frame.
 //!
-//! Frames are validated before they are timed: frames of two alternating cameras are read through the ring and must
-//! equal, in order, the frames of blocking readbacks, with and without uploads between them.
+//! The readback is validated before it is timed. Frames of two alternating cameras are read through the ring and must
+//! equal, in order, the frames of blocking readbacks. This is checked with and without uploads between the frames.
 
 use std::collections::VecDeque;
 use std::sync::mpsc::{self, SyncSender};
@@ -36,6 +36,7 @@ pub struct ReadbackRates {
     pub size: Size,
     /// Frames per round.
     pub frames: usize,
+    /// Rate without readback.
     pub unread_fps: f64,
     #[serde(rename = "at_once_fps")]
     pub blocking_fps: f64,
@@ -60,7 +61,7 @@ struct FrameSource {
     surfaces: Option<[DeformedSurface; 2]>,
 }
 
-/// Distance in steps between the two uploaded states.
+/// Steps between the two uploaded states. Any distance at which the vertices differ would do.
 const STEP_DISTANCE: usize = 7;
 
 /// Readback method.
@@ -228,9 +229,10 @@ fn measure_round(
     }
     let received = receiver_thread.join().map_err(|_| fault_in("readback")("the receiving thread panicked"))?;
     let seconds = begin.elapsed().as_secs_f64();
-    match received == if mode == ReadbackMode::Unread { 0 } else { frames } {
+    let expected = if mode == ReadbackMode::Unread { 0 } else { frames };
+    match received == expected {
         true => Ok(frames as f64 / seconds),
-        false => Err(fault_in("readback")(format!("expected {frames} frames, got {received}"))),
+        false => Err(fault_in("readback")(format!("expected {expected} frames, got {received}"))),
     }
 }
 
@@ -242,9 +244,11 @@ fn draw_pipelined(
     source: &FrameSource,
     (frames, sender): (usize, Option<SyncSender<(usize, FrameImage)>>),
 ) -> Result<()> {
+    // Tickets of the frames in flight, oldest first. The last iterations submit nothing and read the remaining frames.
     let mut tickets = VecDeque::new();
     for frame in 0..frames + MAX_FRAMES_IN_FLIGHT {
-        if let Some(ticket) = if frame < MAX_FRAMES_IN_FLIGHT { None } else { tickets.pop_front() } {
+        let finished_ticket = if frame < MAX_FRAMES_IN_FLIGHT { None } else { tickets.pop_front() };
+        if let Some(ticket) = finished_ticket {
             let pixels = harness.renderer.map_pixels(ticket)?;
             if let Some(sender) = sender.clone() {
                 rayon::spawn(move || {
@@ -312,6 +316,7 @@ mod tests {
         assert!(rates.ring_loss < 100.0 && rates.blocking_loss < 100.0 && rates.frames >= 20);
         let markdown = readback_section(std::slice::from_ref(&rates));
         assert!(markdown.lines().any(|line| line.contains("square") && line.contains('%')), "{markdown}");
+        // The loss is 100 (1 - 0.95) with the rounding of f64.
         assert_eq!((loss(200.0, 190.0), median(vec![3.0, 1.0, 2.0])), (5.000000000000004, 2.0));
     }
 

@@ -19,7 +19,7 @@ pub(super) enum ShadowModel {
     Hard,
     /// Fraction of unoccluded rays. The ray origins have a Gaussian distribution in the plane perpendicular to the
     /// light; each of the two vectors is one standard deviation. Origins are projected onto the receiver's tangent plane.
-    /// Casters nearer than half of the origin's offset are ignored, because at this distance they are the receiver.
+    /// Casters within half of the origin's offset are ignored, because they are probably the curved receiver itself.
     Filtered([Vector3<f64>; 2]),
 }
 
@@ -32,7 +32,7 @@ pub(super) struct ReferenceImage {
     pub(super) sun_visibility: Vec<Option<f32>>,
 }
 
-/// Minimum unshadowed sunlight, of 1, for which sun visibility is defined.
+/// Minimum unshadowed sunlight for which sun visibility is defined, as a fraction of the maximum.
 pub(super) const MIN_SUNLIGHT: f64 = 0.1;
 
 /// Sample counts of a reference.
@@ -47,7 +47,7 @@ pub(super) struct SampleCounts {
 impl SampleCounts {
     /// 64 samples per pixel.
     pub(super) const FULL: Self = Self { samples_per_side: 8, taps: 1 };
-    /// A quarter of the samples, for machines with few cores.
+    /// A quarter of the samples, for machines with few cores. Filtered shadows still have 64 rays per pixel.
     pub(super) const QUICK: Self = Self { samples_per_side: 4, taps: 4 };
 }
 
@@ -59,6 +59,7 @@ pub(super) fn trace_reference_images(
     counts: SampleCounts,
 ) -> Vec<ReferenceImage> {
     let samples = sample_pattern::pixel_samples(counts.samples_per_side);
+    // Per pixel and shadow model: color and sun visibility.
     let pixels: Vec<Vec<([f32; 3], Option<f32>)>> = (0..view.width * view.height)
         .into_par_iter()
         .map(|pixel| {
@@ -101,7 +102,7 @@ fn trace_pixel(
     let mut sums = vec![PixelSum::default(); shadow_models.len()];
     for (index, [dx, dy]) in samples.iter().enumerate() {
         let layers = trace_layers(ray_scene, view, &view.ray(f64::from(x) + dx, f64::from(y) + dy));
-        // The number of samples is a power of two, so every odd stride visits all points. With this stride, neighboring
+        // The number of samples is a power of two, so an odd stride visits all points. With the stride 37, neighboring
         // samples get points that are far from each other.
         let sun_samples: Vec<[f64; 2]> =
             (0..taps).map(|tap| gaussian_samples[((index * 37 + 11) % samples.len()) * taps + tap]).collect();
@@ -170,6 +171,7 @@ fn sun_visibility(
     shadow_model: ShadowModel,
     gaussian_samples: &[[f64; 2]],
 ) -> f64 {
+    // The offset of 1e-9 radii excludes hits at the origin.
     let is_occluded = |origin: Vector3<f64>, min_t: f64| {
         ray_scene.is_occluded(&Ray { origin, direction: view.to_sun }, min_t + 1e-9 * ray_scene.radius, point.triangle)
     };
@@ -177,6 +179,7 @@ fn sun_visibility(
         ShadowModel::Unshadowed => 1.0,
         ShadowModel::Hard => f64::from(u8::from(!is_occluded(point.point, 0.0))),
         ShadowModel::Filtered([x_axis, y_axis]) => {
+            // The lower bound limits the height of an origin above a receiver that the sun grazes.
             let cosine = point.geometric_normal.dot(&view.to_sun).max(0.05);
             let unoccluded_samples = gaussian_samples.iter().filter(|[x, y]| {
                 let offset = x_axis * *x + y_axis * *y;

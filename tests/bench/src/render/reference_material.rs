@@ -39,6 +39,7 @@ pub(super) struct ReferenceMaterial {
 impl ReferenceMaterial {
     /// Converts the materials of a scene. Each texture is decoded once per role.
     pub(super) fn from_scene(scene: &Scene) -> Vec<Self> {
+        // The key is the index of the texture, and whether it is a color texture.
         let mut textures: BTreeMap<(usize, bool), Arc<ReferenceTexture>> = BTreeMap::new();
         let mut decode_texture = |texture: Option<usize>, role: TextureRole| {
             texture.map(|index| {

@@ -7,7 +7,7 @@ use modalcast_model::domain::Texture;
 pub(super) enum TextureRole {
     /// sRGB colors; the color of fully transparent texels is ignored.
     Color,
-    /// Tangent-space normals, bytes divided by 255.
+    /// Tangent-space normals. The channels are decoded to byte / 255, from 0 to 1.
     Normal,
 }
 
@@ -89,6 +89,7 @@ pub(super) fn srgb_from_linear(linear: f64) -> f64 {
 mod tests {
     use super::*;
 
+    /// An opaque red texel, and to its right a transparent green texel.
     fn texture_of_two_texels(role: TextureRole) -> ReferenceTexture {
         ReferenceTexture::new(&Texture::new("two", 2, 1, vec![255, 0, 0, 255, 0, 255, 0, 0]).expect("a texture"), role)
     }
@@ -117,6 +118,7 @@ mod tests {
         for value in [0.0, 0.001, 0.0031308, 0.2, 0.5, 1.0] {
             assert!((linear_from_srgb(srgb_from_linear(value)) - value).abs() < 1e-7, "{value}");
         }
+        // 1.055 x 0.5^(1 / 2.4) - 0.055.
         assert!((srgb_from_linear(0.5) - 0.735_356_98).abs() < 1e-6);
     }
 }

@@ -13,7 +13,7 @@ pub(super) struct ReferenceView {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) eye: Vector3<f64>,
-    /// Depths of the near and far plane along the camera's axis.
+    /// Depths of the near and of the far plane along the camera's axis.
     pub(super) depth_range: (f64, f64),
     pub(super) to_sun: Vector3<f64>,
     pub(super) sunlight: Vector3<f64>,
@@ -56,6 +56,8 @@ impl ReferenceView {
             frame_params.height,
             &frame_params.bounds.union(scene.rest_bounds),
         );
+        // In OpenGL's projection with planes n and f, the scale is (f + n) / (n - f) and the shift 2 f n / (n - f).
+        // Hence n = shift / (scale - 1) and f = shift / (scale + 1).
         let (depth_scale, depth_shift) = (clip_from_camera[(2, 2)], clip_from_camera[(2, 3)]);
         let eye = frame_params.camera.eye();
         let up_axis = scene.up.index();
@@ -87,8 +89,8 @@ impl ReferenceView {
         Ray { origin: self.eye, direction: self.world_from_camera * direction }
     }
 
-    /// The sky color in a direction: interpolated from horizon to zenith by 1 - exp(-6 s s / (s + 0.06)), with s the
-    /// sine of the elevation.
+    /// The sky color in a direction, as in `shaders/shared/sky.glsl`: interpolated from horizon to zenith by
+    /// 1 - exp(-6 s s / (s + 0.06)), with s the sine of the elevation.
     pub(super) fn sky_color(&self, direction: &Vector3<f64>) -> Vector3<f64> {
         let sine = direction.normalize().dot(&self.up).max(0.0);
         let zenith_weight = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
@@ -103,11 +105,12 @@ impl ReferenceView {
         (slope < 0.0 && t > 0.0 && t.is_finite()).then_some(t)
     }
 
-    /// Fraction of the ground color that remains in the haze: 1 below the scene, 0 at the horizon.
+    /// Fraction of the ground color that remains in the haze: exp(-(d / fade distance)^2) at distance d from the center
+    /// of the ground. It is 1 below the scene and 0 at the horizon.
     pub(super) fn ground_visibility(&self, point: &Vector3<f64>) -> f64 {
-        let squared_distance =
+        let relative_distance_squared =
             |plane: GroundPlane| (point - plane.center).norm_squared() / (plane.fade_distance * plane.fade_distance);
-        self.ground.map_or(0.0, |plane| (-squared_distance(plane)).exp())
+        self.ground.map_or(0.0, |plane| (-relative_distance_squared(plane)).exp())
     }
 
     /// The colors of the ground and of the haze.
@@ -117,8 +120,8 @@ impl ReferenceView {
 }
 
 impl GroundPlane {
-    /// A plane at the lowest rest position. The fade distance is 3.5 times the larger of the scene's diagonal and the
-    /// horizontal distance of the eye.
+    /// A plane at the lowest rest position. As in the renderer, the fade distance is 3.5 times the larger of the
+    /// scene's diagonal and the horizontal distance of the eye.
     fn new(scene: &Scene, eye: Vector3<f64>, color: Vector3<f64>) -> Self {
         let (rest_bounds, up_axis) = (scene.rest_bounds, scene.up.index());
         let height = rest_bounds.min[up_axis];

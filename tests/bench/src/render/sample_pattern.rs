@@ -18,6 +18,7 @@ pub(super) fn pixel_samples(side: usize) -> Vec<[f64; 2]> {
 /// errors of neighboring pixels are uncorrelated.
 pub(super) fn gaussian_samples(count: usize, shift: [f64; 2]) -> Vec<[f64; 2]> {
     let point = |index: usize| {
+        // The reversed bits divided by 2^32.
         let radical_inverse = f64::from((index as u32).reverse_bits()) / 4_294_967_296.0;
         let quantile = ((index as f64 + 0.5) / count as f64 + shift[0]).fract();
         let angle = TAU * (radical_inverse + shift[1]);
@@ -28,7 +29,7 @@ pub(super) fn gaussian_samples(count: usize, shift: [f64; 2]) -> Vec<[f64; 2]> {
     (0..count).map(point).collect()
 }
 
-/// Two pseudo-random numbers in [0, 1) per pixel, by the hash of `SplitMix64`.
+/// Two pseudo-random numbers in [0, 1) per pixel, with the constants of the generator `SplitMix64`.
 pub(super) fn pixel_shift(x: u32, y: u32) -> [f64; 2] {
     let mix_bits = |mut word: u64| {
         word = (word ^ (word >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -36,6 +37,7 @@ pub(super) fn pixel_shift(x: u32, y: u32) -> [f64; 2] {
         word ^ (word >> 31)
     };
     let seed = mix_bits((u64::from(x) << 32 | u64::from(y)).wrapping_add(0x9E37_79B9_7F4A_7C15));
+    // The upper 24 bits of each word.
     [seed >> 40, mix_bits(seed) >> 40].map(|bits| bits as f64 / (1_u64 << 24) as f64)
 }
 

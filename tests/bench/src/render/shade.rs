@@ -1,7 +1,10 @@
-//! Phong shading by equation 3.12, as in the shaders but in f64. The radiance towards the eye is split into an ambient
-//! part and a part from the sun.
+//! Phong shading by equation 3.12 of the thesis, as in the shaders but in f64. The radiance towards the eye is split
+//! into an ambient part and a part from the sun.
 //!
 //!   C = skylight Ca + s_f sunlight ((n . v_l) Cd + (v_e' . v_l)^k Cs),  v_e' = 2 (v_e . n) n - v_e
+//!
+//! Ca, Cd and Cs are the ambient, diffuse and specular color, k is the exponent, s_f the sun visibility, n the normal,
+//! and v_l and v_e are unit vectors to the sun and to the eye.
 
 use nalgebra::Vector3;
 

@@ -21,7 +21,7 @@ use modalcast_model::domain::{AlphaMode, Material, Mesh, Texture};
 use modalcast_model::scene::{BoundingBox, Camera, Ground, Lens, Scene, SceneParts, SceneState, View};
 use modalcast_render::FrameParams;
 
-/// A scene without domains, sky and ground; the sun is behind the camera.
+/// A scene without domains, ground and shadow, with a black sky. The sun shines along -z.
 fn empty_parts() -> SceneParts {
     let mut parts = SceneParts::named("test");
     (parts.look.shadow, parts.look.ground) = (None, None);
@@ -40,11 +40,22 @@ fn deform_at_rest(scene: &Arc<Scene>) -> (DeformedSurface, BoundingBox) {
     (deformer.surface().expect("a surface").clone(), bounds)
 }
 
-/// Parameters of a square frame with ten pixels per unit in the plane z = 0, or y = 0 when seen from above. The origin
-/// is at the center of the frame.
-fn frame_params(bounds: BoundingBox, side: u32, from_above: bool) -> FrameParams {
+/// Position of the camera, ten units from the origin, which is at the center of the frame.
+#[derive(Clone, Copy)]
+enum Viewpoint {
+    /// On the z axis.
+    Front,
+    /// On the y axis.
+    Above,
+}
+
+/// Parameters of a square frame with ten pixels per unit in the plane z = 0, or y = 0 when seen from above.
+fn frame_params(bounds: BoundingBox, side: u32, viewpoint: Viewpoint) -> FrameParams {
     let center = f64::from(side) / 2.0;
-    let (eye, up) = if from_above { ([0.0, 10.0, 0.0], [0.0, 0.0, -1.0]) } else { ([0.0, 0.0, 10.0], [0.0, 1.0, 0.0]) };
+    let (eye, up) = match viewpoint {
+        Viewpoint::Front => ([0.0, 0.0, 10.0], [0.0, 1.0, 0.0]),
+        Viewpoint::Above => ([0.0, 10.0, 0.0], [0.0, 0.0, -1.0]),
+    };
     let camera = Camera {
         view: View::LookAt { eye, target: [0.0; 3], up },
         lens: Lens::Intrinsics { fx: 100.0, fy: 100.0, cx: center, cy: center },
@@ -54,13 +65,20 @@ fn frame_params(bounds: BoundingBox, side: u32, from_above: bool) -> FrameParams
     FrameParams { camera, width: side, height: side, bounds, light_bounds: None }
 }
 
-fn trace_images(parts: SceneParts, from_above: bool, shadow_models: &[ShadowModel], side: u32) -> Vec<ReferenceImage> {
+/// Traces one image of `side` x `side` pixels per shadow model.
+fn trace_images(
+    parts: SceneParts,
+    viewpoint: Viewpoint,
+    shadow_models: &[ShadowModel],
+    side: u32,
+) -> Vec<ReferenceImage> {
     let scene = Scene::new(parts).expect("a valid scene");
     let (surface, bounds) = deform_at_rest(&scene);
-    let view = ReferenceView::new(&scene, &frame_params(bounds, side, from_above));
+    let view = ReferenceView::new(&scene, &frame_params(bounds, side, viewpoint));
     trace_reference_images(&RayScene::new(&scene, &surface), &view, shadow_models, SampleCounts::FULL)
 }
 
+/// The linear color of a pixel; `pixel` counts row by row from the top left.
 fn linear_color(image: &ReferenceImage, pixel: usize) -> Vector3<f64> {
     Vector3::from(image.colors[pixel]).map(|level| linear_from_srgb(f64::from(level) / 255.0))
 }
@@ -69,15 +87,15 @@ fn linear_color(image: &ReferenceImage, pixel: usize) -> Vector3<f64> {
 fn pixels_are_as_bright_as_their_covered_area() {
     let mut parts = empty_parts();
     let white = Material { ambient: [1.0; 3], diffuse: [0.0; 3], ..Material::default() };
-    // 10.35 by 7.8 pixels; the left edge bisects a column of pixels.
+    // 10.35 by 7.8 pixels. The left edge is 16 - 5.5 = 10.5 pixels from the left and bisects column 10.
     add_rigid_domain(&mut parts, "square", upright_square([-0.55, -0.38, 0.485, 0.4], 0.0), white).expect("a domain");
     parts.look.skylight = [1.0; 3];
-    let image = trace_images(parts, false, &[ShadowModel::Unshadowed], 32).remove(0);
+    let image = trace_images(parts, Viewpoint::Front, &[ShadowModel::Unshadowed], 32).remove(0);
     let area: f64 = (0..32 * 32).map(|pixel| linear_color(&image, pixel).x).sum();
     assert!((area - 10.35 * 7.8).abs() < 0.25, "expected an area of 10.35 x 7.8, got {area}");
-    let half_covered = linear_color(&image, 16 * 32 + 10).x;
-    assert!((half_covered - 0.5).abs() < 1e-6, "{half_covered}");
-    assert_eq!((linear_color(&image, 16 * 32 + 9).x, linear_color(&image, 16 * 32 + 12).x.round()), (0.0, 1.0));
+    let brightness = |column: usize| linear_color(&image, 16 * 32 + column).x;
+    assert!((brightness(10) - 0.5).abs() < 1e-6, "{}", brightness(10));
+    assert_eq!((brightness(9), brightness(12).round()), (0.0, 1.0), "outside and inside of the square");
 }
 
 #[test]
@@ -92,8 +110,9 @@ fn shades_one_pixel_by_equation_3_12() {
     };
     add_rigid_domain(&mut parts, "square", upright_square([-3.0, -3.0, 3.0, 3.0], 0.0), material).expect("a domain");
     parts.look.sun = [3.0, 0.0, 4.0];
-    let image = trace_images(parts, false, &[ShadowModel::Unshadowed], 41).remove(0);
-    // The center of the middle pixel is the origin, so the eye is straight ahead and v_e' is n.
+    let image = trace_images(parts, Viewpoint::Front, &[ShadowModel::Unshadowed], 41).remove(0);
+    // The center of the middle pixel is the origin, so the eye is straight ahead and v_e' is n. The unit vector to the
+    // sun is [0.6, 0, 0.8].
     let cosine: f64 = 0.8;
     let expected = [(0.2, 0.5, 0.3), (0.4, 0.25, 0.2), (0.6, 0.1, 0.1)]
         .map(|(ambient, diffuse, specular)| 0.25 * ambient + 0.5 * (cosine * diffuse + cosine.powi(3) * specular));
@@ -105,15 +124,16 @@ fn shades_one_pixel_by_equation_3_12() {
 
 #[test]
 fn back_face_is_visible_only_if_double_sided() {
-    let center_color = |double_sided: bool| {
+    let center_brightness = |double_sided: bool| {
         let mut parts = empty_parts();
         let rear_square =
             quad([[1.0, -1.0, 0.0], [-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, 1.0, 0.0]], [0.0, 0.0, -1.0]);
         let material = Material { double_sided, ..Material::default() };
         add_rigid_domain(&mut parts, "square", rear_square.expect("a square"), material).expect("a domain");
-        linear_color(&trace_images(parts, false, &[ShadowModel::Unshadowed], 9).remove(0), 40).x
+        linear_color(&trace_images(parts, Viewpoint::Front, &[ShadowModel::Unshadowed], 9).remove(0), 4 * 9 + 4).x
     };
-    assert!((center_color(true) - 0.75).abs() < 1e-6 && center_color(false) == 0.0);
+    // 0.25 of skylight and 0.5 of sunlight on a white material.
+    assert!((center_brightness(true) - 0.75).abs() < 1e-6 && center_brightness(false) == 0.0);
 }
 
 #[test]
@@ -129,16 +149,17 @@ fn sorts_transparent_layers_by_depth_in_any_domain_order() {
         let background = Material { ambient: [0.0, 0.0, 1.0], diffuse: [0.0; 3], ..Material::default() };
         add_rigid_domain(&mut parts, "background", upright_square([-2.0, -2.0, 2.0, 2.0], -0.5), background)
             .expect("a domain");
-        linear_color(&trace_images(parts, false, &[ShadowModel::Unshadowed], 9).remove(0), 40)
+        linear_color(&trace_images(parts, Viewpoint::Front, &[ShadowModel::Unshadowed], 9).remove(0), 4 * 9 + 4)
     };
+    // The front pane has the alpha 0.5. Half of the rest is the second pane and half the blue background.
     let red_in_front = center_color([0.5, 0.0]);
     assert!((red_in_front - Vector3::new(0.5, 0.25, 0.25)).norm() < 1e-6, "{red_in_front}");
     let green_in_front = center_color([0.0, 0.5]);
     assert!((green_in_front - Vector3::new(0.25, 0.5, 0.25)).norm() < 1e-6, "{green_in_front}");
 }
 
-/// A ground seen from above with the edge of a shadow at `x = 0.3`. The caster is outside of the image. A small square
-/// at height 0 keeps the ground there.
+/// A ground seen from above with the edge of a shadow at `x = 0.3`. The caster is outside of the image. The ground is
+/// at the lowest vertex, so a small square sets its height to 0.
 fn shadow_edge(caster: Material) -> SceneParts {
     let mut parts = empty_parts();
     parts.look.ground = Some(Ground { color: [1.0; 3] });
@@ -148,7 +169,7 @@ fn shadow_edge(caster: Material) -> SceneParts {
     let uvs = vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]];
     let mesh = Mesh::from_indexed(positions.to_vec(), vec![[0.0, 1.0, 0.0]; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]);
     add_rigid_domain(&mut parts, "caster", mesh.expect("a square"), caster).expect("a domain");
-    add_rigid_domain(&mut parts, "peg", horizontal_square(0.01, 0.0).expect("a square"), Material::default())
+    add_rigid_domain(&mut parts, "ground level", horizontal_square(0.01, 0.0).expect("a square"), Material::default())
         .expect("a domain");
     parts
 }
@@ -158,8 +179,8 @@ fn hard_and_gaussian_shadow_edges_match_the_formula() {
     // Deviations of 0.4 in the plane perpendicular to the light: 0.4 / 0.8 on the ground along x.
     let filter_axes = [Vector3::new(4.0, -3.0, 0.0) / 5.0 * 0.4, Vector3::z() * 0.4];
     let shadow_models = [ShadowModel::Hard, ShadowModel::Filtered(filter_axes), ShadowModel::Unshadowed];
-    let [hard, filtered, unshadowed]: [ReferenceImage; 3] =
-        trace_images(shadow_edge(Material::default()), true, &shadow_models, 40).try_into().expect("three images");
+    let images = trace_images(shadow_edge(Material::default()), Viewpoint::Above, &shadow_models, 40);
+    let [hard, filtered, unshadowed]: [ReferenceImage; 3] = images.try_into().expect("three images");
     let visibility = |image: &ReferenceImage, column: usize| {
         f64::from(image.sun_visibility[20 * 40 + column].expect("defined sun visibility"))
     };
@@ -168,6 +189,7 @@ fn hard_and_gaussian_shadow_edges_match_the_formula() {
     assert_eq!((visibility(&hard, 22), visibility(&hard, 23)), (1.0, 0.0));
     let deviation = 10.0 * 0.4 / 0.8;
     for column in 4..40 {
+        // The rays of one pixel give a noisy visibility; the mean of 16 rows is within a smaller tolerance.
         let normalized_offset = (column as f64 + 0.5 - 23.0) / deviation;
         let expected = 0.5 * (1.0 - erf(normalized_offset / 2f64.sqrt()));
         let mean: f64 = (12..28)
@@ -196,7 +218,8 @@ fn cut_outs_and_glass_cast_shadows_above_alpha_threshold() {
     let is_in_shadow = |alpha_mode: AlphaMode, alpha: f32, texel_alpha: u8| {
         let mut parts = shadow_edge(Material { alpha_mode, alpha, color_texture: Some(0), ..Material::default() });
         parts.textures.push(Texture::new("leaf", 1, 1, vec![255, 255, 255, texel_alpha]).expect("a texture"));
-        let image = trace_images(parts, true, &[ShadowModel::Hard], 40).remove(0);
+        let image = trace_images(parts, Viewpoint::Above, &[ShadowModel::Hard], 40).remove(0);
+        // Column 38 is to the right of the shadow's edge, that is, in the shadow.
         image.sun_visibility[20 * 40 + 38].expect("defined sun visibility") == 0.0
     };
     let mask = AlphaMode::Mask { cutoff: 0.5 };
@@ -284,7 +307,7 @@ fn report_measures_selected_variants_and_writes_files() {
     assert!(
         filtered.shadow_bytes == 20 * 512 * 512 && filtered.bytes > unshadowed.bytes && unshadowed.shadow_bytes == 0
     );
-    // Flicker is measured between 60 images of 24 x 13 pixels.
+    // Flicker is measured over the 59 changes between 60 images of a quarter of the size, 24 x 13 pixels.
     for row in &report.rows {
         assert!(row.median_us().expect("frame times") > 0.0 && row.flicker.expect("flicker").count == 59 * 24 * 13);
     }
@@ -292,7 +315,7 @@ fn report_measures_selected_variants_and_writes_files() {
     report.write(folder.path()).expect("report files");
     let read_file = |name: &str| std::fs::read(folder.path().join(name)).expect(name);
     let json: serde_json::Value = serde_json::from_slice(&read_file("report.json")).expect("JSON");
-    assert_eq!(json["rows"][1]["shadow"]["size"], 512);
+    assert_eq!(json["rows"][1]["shadow"]["size"], 512, "the variance map");
     assert_eq!(json["rows"][1]["passes"][0]["name"], "frame");
     let mut csv_reader = csv::Reader::from_reader(std::io::Cursor::new(read_file("report.csv")));
     let frame_column =

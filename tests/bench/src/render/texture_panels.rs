@@ -25,6 +25,7 @@ pub(super) fn build_panels() -> Result<SceneParts> {
     let mut parts = SceneParts::named("images");
     for (index, size) in SIZES.iter().enumerate() {
         let (column, row) = (index % 3, index / 3);
+        // Panels of side 1 with gaps of 0.1.
         let corner = [1.1 * column as f32 - 1.6, 0.1 + 1.1 * row as f32, 0.0];
         let mesh = repeated_quads(corner, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], PANEL_REPETITIONS)?;
         add_panel(&mut parts, &format!("panel {} x {}", size[0], size[1]), mesh, *size)?;
@@ -48,8 +49,9 @@ fn repeated_quads(corner: [f32; 3], sides: [[f32; 3]; 2], repetitions: usize) ->
         let [u, v] = [u, v].map(|index| index as f32 / repetitions as f32);
         std::array::from_fn(|axis| corner[axis] + u * sides[0][axis] + v * sides[1][axis])
     };
-    let (mut positions, mut uvs, mut triangles): (Vec<[f32; 3]>, _, Vec<[u32; 3]>) =
-        (Vec::new(), Vec::new(), Vec::new());
+    let mut positions: Vec<[f32; 3]> = Vec::new();
+    let mut triangles: Vec<[u32; 3]> = Vec::new();
+    let mut uvs = Vec::new();
     for (column, row) in (0..repetitions * repetitions).map(|cell| (cell % repetitions, cell / repetitions)) {
         let first_corner = positions.len() as u32;
         for (u, v) in [(0, 0), (1, 0), (1, 1), (0, 1)] {
@@ -61,6 +63,7 @@ fn repeated_quads(corner: [f32; 3], sides: [[f32; 3]; 2], repetitions: usize) ->
             [first_corner, first_corner + 2, first_corner + 3],
         ]);
     }
+    // The second side of an upright panel points up, and that of the floor is horizontal.
     let normal = if sides[1][1] > 0.0 { [0.0, 0.0, 1.0] } else { [0.0, 1.0, 0.0] };
     let normals = vec![normal; positions.len()];
     Mesh::from_indexed(positions, normals, uvs, triangles)

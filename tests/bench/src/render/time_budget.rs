@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 /// Time budget of all steps of a moving scene; references and the frames of each variant have one budget each.
 pub(super) const STEP_TIME_BUDGET: Duration = Duration::from_secs(60);
 
-/// Timer of a sequence of steps with a budget.
+/// Timer that stops a sequence of steps if the sequence would exceed its budget.
 pub(super) struct TimeBudget {
     budget: Duration,
     steps: usize,

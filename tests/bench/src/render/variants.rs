@@ -69,17 +69,17 @@ pub struct RenderVariant {
     pub intended_reference: ReferenceKind,
 }
 
-/// Twice the errors of small images with many leaves, where each leaf covers a pixel or two. All other errors are far
-/// smaller. A missing or displaced shadow exceeds `bleeding` or `lost_visibility` even if it covers a small part of the
-/// image.
+/// Twice the measured errors of small images with many leaves, where each leaf covers a pixel or two. The errors of all
+/// other images are far smaller. A missing or displaced shadow exceeds `bleeding` or `lost_visibility` even if it
+/// covers a small part of the image.
 pub(super) const ERROR_LIMITS: ErrorLimits =
     ErrorLimits { mean_color: 16.0, mean_light: 0.2, bleeding: 0.25, lost_visibility: 0.25 };
 /// Bound on light bleeding of a filtered map where no two casters overlap: Chebyshev's bound is exact there, and only
 /// rounding remains.
 const EXACT_BLEEDING_LIMIT: f64 = 0.01;
 /// Bound on the mean light error of the shelf. Its shadow fills half of the image and is narrower than the widest blur.
-/// Within that blur the depths of the ground vary as much as the height of the shelf above it, so most of the sunlight
-/// leaks into the shadow.
+/// Within the footprint of this blur, the depth of the ground varies by as much as the height of the shelf. Therefore
+/// most of the sunlight leaks into the shadow.
 const SHELF_MEAN_LIGHT_LIMIT: f64 = 0.4;
 
 /// Sides of shadow maps, texels.
@@ -186,7 +186,8 @@ impl RenderVariant {
         Self { blur_method, ..Self::with_soft_shadow(name, ShadowVariant::Variance, shadow) }
     }
 
-    /// Cascaded maps, sharper near the camera. The intended result is the hard shadow.
+    /// Cascaded maps, which are sharper near the camera. The intended result is the hard shadow, because the width of
+    /// the blur varies with the cascade.
     fn with_splits(size: u32, splits: u32) -> Self {
         let shadow = ShadowSettings { size, splits, ..ShadowSettings::default() };
         let name = format!("variance {size}, {splits} splits");
@@ -306,6 +307,7 @@ mod tests {
             let variants = all(quick);
             let names: std::collections::BTreeSet<&str> =
                 variants.iter().map(|variant| variant.name.as_str()).collect();
+            // The numbers of variants in `all`.
             assert_eq!((names.len(), variants.len()), if quick { (17, 17) } else { (50, 50) });
             for variant in &variants {
                 let settings = variant.settings(RenderSettings::default());
@@ -314,13 +316,13 @@ mod tests {
                 let expected = RenderSettings { shadow: None, transparency, culling, ..RenderSettings::default() };
                 assert_eq!(RenderSettings { shadow: None, ..settings }, expected);
                 let (has_transparency, has_packing) = (variant.transparency.is_some(), variant.packing.is_some());
-                let is_applicable = [RenderWorkload::Panes, RenderWorkload::Tree, RenderWorkload::Images]
+                let applies_to = [RenderWorkload::Panes, RenderWorkload::Tree, RenderWorkload::Images]
                     .map(|workload| variant.is_applicable(workload));
                 let has_culling = variant.culling.is_some();
                 assert_eq!(
-                    is_applicable,
+                    applies_to,
                     [!has_packing && !has_culling, !has_packing && !has_transparency, has_packing],
-                    "{}",
+                    "panes, tree and images with {}",
                     variant.name
                 );
                 assert_eq!(settings.shadow.is_none(), variant.intended_reference == ReferenceKind::Unshadowed);

@@ -39,8 +39,9 @@ pub enum RenderWorkload {
     Triangles(usize),
 }
 
-/// Default triangle counts of the field in a full and in a quick run.
-const FIELD_TRIANGLES: (usize, usize) = (1_000_000, 50_000);
+/// Default triangle counts of the field.
+const FULL_FIELD_TRIANGLES: usize = 1_000_000;
+const QUICK_FIELD_TRIANGLES: usize = 50_000;
 /// Largest triangle count that a name may request.
 const MAX_TRIANGLES: usize = 8_000_000;
 
@@ -64,7 +65,7 @@ const SWAY_AMPLITUDE: f64 = 0.2;
 impl RenderWorkload {
     /// Every workload, in the order of the report.
     pub fn all(quick: bool) -> Vec<Self> {
-        let field = Self::Triangles(if quick { FIELD_TRIANGLES.1 } else { FIELD_TRIANGLES.0 });
+        let field = Self::Triangles(if quick { QUICK_FIELD_TRIANGLES } else { FULL_FIELD_TRIANGLES });
         vec![Self::Square, Self::Shelf, Self::Panes, Self::Images, Self::Tree, Self::Grove, field]
     }
 
@@ -151,6 +152,7 @@ impl AnimatedScene {
         let mut state = SceneState::rest(&self.scene);
         add_sway(&mut state, &self.motion, step);
         if let Some(domain) = self.sliding_domain {
+            // Half a turn per second.
             let (radius, angle) = (SLIDE_RADIUS * self.scene.rest_bounds.diagonal(), TAU * 0.5 * step as f64 * DT);
             let from_y_up = self.scene.up.rotation_from_y_up();
             let offset = from_y_up * Vector3::new(radius * angle.sin(), 0.0, radius * (1.0 - angle.cos()));
@@ -169,7 +171,7 @@ fn add_sway(state: &mut SceneState, motion: &WorkloadMotion, step: usize) {
     }
 }
 
-/// State of a scene in a light wind.
+/// State of a scene in a light wind, at a step at which the modes are displaced.
 pub(super) fn swaying_state(scene: &Arc<Scene>) -> SceneState {
     let workload = Workload::new(scene.name.clone(), Arc::clone(scene));
     let mut state = SceneState::rest(scene);
@@ -191,6 +193,7 @@ pub(super) fn horizontal_square(half_side: f32, height: f32) -> Result<Mesh> {
 
 /// A room of about 10,000 triangles seen from inside. It fills the frame and is used by the rasterizer benchmarks only.
 pub(super) fn room_mesh() -> Result<(Mesh, Camera)> {
+    // Cells per side of a wall: 6 walls of 29 x 29 cells with 2 triangles each have 10,092 triangles.
     const CELLS: u32 = 29;
     let (mut positions, mut normals, mut triangles) = (Vec::new(), Vec::new(), Vec::new());
     for (axis, side) in (0..3).flat_map(|axis| [(axis, -1.0_f32), (axis, 1.0)]) {
@@ -231,7 +234,7 @@ fn two_sided_material(diffuse: [f32; 3]) -> Material {
     }
 }
 
-/// Builds a square of 1.4 units at height 1. The ground is at the lowest vertex; a slab keeps it at height 0.
+/// Builds a square of 1.4 units at height 1. The ground is at the lowest vertex, so a slab sets its height to 0.
 fn build_square() -> Result<SceneParts> {
     let mut parts = SceneParts::named("square");
     add_rigid_domain(&mut parts, "slab", horizontal_square(1.6, 0.0)?, two_sided_material([0.75, 0.72, 0.68]))?;
@@ -243,8 +246,8 @@ fn build_square() -> Result<SceneParts> {
 /// x of the shelf's edge, where the visible part of its shadow begins.
 const SHELF_EDGE: f32 = -3.5;
 
-/// Builds a square of two units, 0.03 above the ground; its shadow extends 0.09 beyond it. Two slabs keep the ground at
-/// height 0 and widen the scene, so that the shadow is near the end of the depth range.
+/// Builds a square of two units, 0.03 above the ground; its shadow extends 0.09 beyond its edge. Two slabs set the
+/// ground to height 0 and widen the scene, so that the shadow is near one end of the depth range.
 fn build_shelf() -> Result<SceneParts> {
     let mut parts = SceneParts::named("shelf");
     let square_at = |half_side: f32, height: f32, x: f32, z: f32| {
@@ -399,6 +402,7 @@ mod tests {
         assert_eq!(moved_state.transforms[0], rest_state.transforms[0]);
         let shift = (moved_state.transforms[1].translation() - rest_state.transforms[1].translation()).norm();
         let radius = SLIDE_RADIUS * animation.scene.rest_bounds.diagonal();
+        // Step 30, after half a second, is a quarter of the circle from step 0.
         assert!((shift - radius * 2f64.sqrt()).abs() < 1e-6, "expected a shift of sqrt(2) x {radius}, got {shift}");
     }
 }

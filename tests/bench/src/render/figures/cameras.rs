@@ -16,8 +16,8 @@ fn look_at(eye: Vector3<f64>, target: Vector3<f64>, field_of_view: f64) -> Camer
     Camera { view, lens: Lens::FieldOfView(field_of_view), near: 0.0, far: 0.0 }
 }
 
-/// Frames a scene from the front, slightly from the right. `elevation` is the height of the eye relative to the
-/// horizontal distance, approximately.
+/// Frames a scene from the front, slightly from the right. `elevation` is the approximate ratio of the height of the
+/// eye to its horizontal distance.
 pub(super) fn frame_scene(scene: &Scene, size: Size, elevation: f64) -> Camera {
     let to_eye = Vector3::new(0.30, elevation, 0.95).normalize();
     let right = Vector3::y().cross(&to_eye).normalize();
@@ -56,7 +56,7 @@ pub(super) fn trunk_closeup() -> Camera {
 pub(super) fn frame_shadow(scene: &Scene) -> Camera {
     let to_sun = scene.look.to_sun(scene.up);
     let height = scene.rest_bounds.max[1];
-    // The shadow of the center of the crown on the ground.
+    // The shadow of the center of the crown, which is at about 0.55 of the tree's height, on the ground.
     let crown_shadow = Vector3::new(-to_sun.x, 0.0, -to_sun.z) * (0.55 * height / to_sun.y);
     look_at(crown_shadow + Vector3::new(1.2, 4.2, 6.4), crown_shadow + Vector3::new(0.3, 0.0, 0.4), 38.0)
 }

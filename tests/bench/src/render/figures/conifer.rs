@@ -85,7 +85,7 @@ const TRUNK_RINGS: usize = 24;
 /// Generates a conifer. `bark` is a color image and its normal map; both are seamless.
 ///
 /// # Errors
-/// None in practice for the sizes in this module.
+/// None for the species in this module.
 pub(super) fn build(parameters: &ConiferParameters, bark: [&Texture; 2]) -> Result<SceneParts> {
     let mut parts = SceneParts::named(parameters.name);
     parts.textures =
@@ -115,7 +115,7 @@ pub(super) fn build(parameters: &ConiferParameters, bark: [&Texture; 2]) -> Resu
             parts.domains.push(bough_domain(name, bough_placement(parameters, [whorl, bough], &mut rng)));
         }
     }
-    // The leader: one bough that points up.
+    // The leader: one bough of length 0.45 that points up and ends near the stated height.
     let top_translation = Translation3::new(0.0, parameters.height - 0.42, 0.0).to_homogeneous();
     let upright_rotation = Rotation3::from_axis_angle(&Vector3::z_axis(), 0.25 * TAU).to_homogeneous();
     parts.domains.push(bough_domain("leader".into(), top_translation * upright_rotation * Matrix4::new_scaling(0.45)));
@@ -132,6 +132,7 @@ fn bough_placement(parameters: &ConiferParameters, [whorl, bough]: [usize; 2], r
     let height_fraction = ((whorl as f64 + random_offset(0.4)) / parameters.whorls as f64).clamp(0.0, 1.0);
     let height = parameters.bare_height + (parameters.height - parameters.bare_height - 0.25) * height_fraction;
     let length = parameters.bough_length * (1.0 - height_fraction).powf(0.8) * (1.0 + random_offset(0.16)) + 0.2;
+    // Successive whorls are rotated by about the golden angle, 2.4 radians.
     let azimuth = TAU * (bough as f64 + random_offset(0.32)) / parameters.boughs as f64 + 2.4 * whorl as f64;
     let elevation = 0.55 * height_fraction * height_fraction + random_offset(0.08);
     let rotation = Rotation3::from_axis_angle(&Vector3::y_axis(), azimuth)
@@ -190,6 +191,7 @@ struct Spray {
 
 /// A bough: sprays on both sides of its stem and along the stem. The stem extends along +X, rises, and then sags.
 fn bough_mesh(parameters: &ConiferParameters) -> Result<Mesh> {
+    // A random sequence other than that of the placements in `build`.
     let mut rng = Rng::with_seed(parameters.seed ^ 0xB0);
     let mut random_offset = |max: f64| max * (2.0 * rng.f64() - 1.0);
     let stem_point = |t: f64| Vector3::new(t, parameters.rise * t - parameters.sag * t * t, 0.0);

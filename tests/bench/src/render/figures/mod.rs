@@ -185,6 +185,7 @@ fn draw_single_trees(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Re
             with_large_shadow_map(plants.tree.look),
         ))
     };
+    // Rotations in radians.
     let rotated_plants = [(&plants.tree, 0.6), (&plants.peach, 2.9), (&plants.fir, 0.0), (&plants.hemlock, 0.0)];
     let scenes = rotated_plants.map(build_scene);
     let names = ["broad-leaved tree", "peach tree", "fir", "eastern hemlock"];

@@ -39,8 +39,10 @@ pub(super) fn draw_texture(color: [f32; 3], seed: u64) -> Result<Texture> {
                 (coverage, brightness) = (needle_coverage, needle.brightness);
             }
         }
+        // Half of the twig's thickness is 1.9 pixels, plus half a pixel of antialiasing.
         let twig_coverage = (2.4 - (position[1] - 0.5 * HEIGHT as f32).abs()).clamp(0.0, 1.0);
         let is_within_twig_length = position[0] < TWIG_LENGTH;
+        // The twig is brown.
         let [r, g, b] = if twig_coverage > coverage && is_within_twig_length {
             [96.0, 78.0, 58.0]
         } else {
@@ -88,7 +90,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn spray_has_needles_and_holes_and_is_deterministic() {
+    fn texture_is_partly_opaque_and_depends_on_the_seed_only() {
         let image = draw_texture([60.0, 100.0, 60.0], 3).expect("a texture");
         let opaque_texels = image.rgba().chunks_exact(4).filter(|texel| texel[3] > 127).count() as f64;
         let opaque_fraction = opaque_texels / (WIDTH * HEIGHT) as f64;
