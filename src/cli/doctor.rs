@@ -55,8 +55,8 @@ fn deforms_on_cuda() -> bool {
 fn text_lines(report: &Value) -> Vec<String> {
     let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
     let mut lines = Vec::new();
-    let mut push_line = |name: &str, value: &Value, missing: &str| {
-        let displayed = if value.is_null() { missing.to_owned() } else { text(value) };
+    let mut push_line = |name: &str, value: &Value, text_if_null: &str| {
+        let displayed = if value.is_null() { text_if_null.to_owned() } else { text(value) };
         lines.push(format!("{name:<18}{displayed}"));
     };
     let cuda = &report["cuda"];

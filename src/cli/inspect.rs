@@ -1,5 +1,5 @@
-//! `modalcast inspect`: prints the content of a scene, the features that it uses, and the memory and passes that are
-//! saved because the other features are omitted.
+//! `modalcast inspect`: prints the content of a scene, the features that it uses, and the memory and passes that the
+//! omission of unused features saves.
 
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -45,6 +45,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 fn shape_bytes(scene: &Scene, domain: usize) -> usize {
     let shape = scene.shape_of(domain);
     let corners = shape.mesh.corners();
+    // Vertex index, normal, texture coordinates and tangent.
     let bytes_per_corner =
         4 + 12 + if corners.uvs.is_empty() { 0 } else { 8 } + if shape.tangents().is_empty() { 0 } else { 16 };
     12 * shape.mesh.rest_positions().len()
@@ -54,7 +55,7 @@ fn shape_bytes(scene: &Scene, domain: usize) -> usize {
         + shape.smoothing().map_or(0, |smoothing| smoothing.bytes() as usize)
 }
 
-/// The JSON output. Fields of a struct cannot repeat a key, unlike the entries of `json!`.
+/// The JSON output. A struct cannot contain a key twice, whereas `json!` would accept it.
 #[derive(Serialize)]
 struct SceneReport<'a> {
     scene: &'a str,
@@ -76,6 +77,7 @@ struct SceneReport<'a> {
     domains: Vec<DomainReport<'a>>,
 }
 
+/// One domain in the JSON output.
 #[derive(Serialize)]
 struct DomainReport<'a> {
     name: &'a str,
@@ -83,9 +85,12 @@ struct DomainReport<'a> {
     rank: usize,
     triangles: usize,
     corners: usize,
+    /// Host memory of the domain's shape.
     bytes: usize,
     shape: usize,
+    /// Index of the domain on the other side of the joint.
     parent: Option<usize>,
+    /// Index of the domain whose transform this domain follows.
     follows: Option<usize>,
     material: &'a str,
 }

@@ -39,12 +39,12 @@ Exit codes:
   1  a check failed (doctor: no frame can be drawn; demo: a criterion is not met; report: a variant exceeds its error
      bound)
   2  invalid command line
-  3  invalid input; the message names the field, the expected value and the actual one
+  3  invalid input; the message names the field, the expected and the given value
   4  not found
   5  a resource or a program is missing or in use; the message names it
   6  error of the server or the device";
 
-/// Result of a command: whether the check that it performs passed, or an error.
+/// Result of a command: whether its check passed, or an error. Commands without a check return `true`.
 pub type Outcome = modalcast_model::error::Result<bool>;
 
 /// Runs the command line and returns the process's exit code.

@@ -116,6 +116,7 @@ fn render_color_map(
     frame::encode_png(args.size.width, args.size.height, &rgba)
 }
 
+/// The camera of the options. Its near and far planes, both 0, are fitted to the scene.
 fn camera(args: &Args, scene: &Scene) -> Camera {
     let (Some(eye), Some(target)) = (args.eye, args.target) else {
         return Camera::fit_to_scene(scene, args.size.width, args.size.height);
@@ -133,7 +134,7 @@ fn read_coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
         return Err(Error::NotFound { what: "q", given: path.display().to_string() });
     }
     let file_bytes = fs::metadata(path).map_err(|error| invalid(&field, "a .npy file", error))?.len();
-    // The size of f64 entries and the longest .npy header. Checked before the file is read into memory.
+    // Entries of f64 and at most 64 KiB of header. The size is checked before the file is read into memory.
     let max_bytes = 8 * scene.layout.coordinates as u64 + 65536;
     if file_bytes > max_bytes {
         return Err(invalid(&field, format!("{expected}: at most {max_bytes} bytes"), format!("{file_bytes} bytes")));

@@ -31,11 +31,11 @@ pub(super) fn run(args: &Args) -> Outcome {
     let program_path = own_path.with_file_name(PROGRAM);
     check_build(&program_path)?;
     let status = Command::new(&program_path).args(&args.arguments).status().map_err(fault_in("report"))?;
-    // `modalcast-report` uses the same exit codes.
+    // `modalcast-report` uses the same exit codes. It has none if a signal ended it, which is a fault: 6.
     std::process::exit(status.code().unwrap_or(6));
 }
 
-/// Fails if the program is missing or was built from other sources, because it would not measure this server.
+/// Fails if the program is missing or was built from other sources, because it would then not measure this server.
 fn check_build(program_path: &Path) -> Result<()> {
     let unavailable = |reason: String| Error::Unavailable {
         what: PROGRAM,

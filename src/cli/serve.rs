@@ -76,6 +76,7 @@ impl Args {
             frame_side: self.frame_side,
             open_scenes: self.open_scenes,
             window: self.window,
+            // The default window must not exceed the largest window that a client may request.
             max_window: defaults.max_window.max(self.window),
             upload_bytes: self.upload_bytes,
             deadline: Duration::from_millis(self.deadline_ms),
@@ -128,7 +129,8 @@ async fn shutdown_signal() {
         }
         Err(error) => {
             tracing::warn!("SIGTERM cannot be handled: {error}");
-            interrupt.await.ok(); // If Ctrl-C cannot be handled either, returns at once, so that the server stops.
+            // If Ctrl-C cannot be handled either, this returns immediately and the server stops.
+            interrupt.await.ok();
         }
     }
 }

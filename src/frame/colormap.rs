@@ -16,6 +16,7 @@ pub fn viridis(fraction: f32) -> [f32; 3] {
         [-5.435_456, 4.645_852_6, 26.312_435],
     ];
     let fraction = fraction.clamp(0.0, 1.0);
+    // Horner's method per channel.
     [0, 1, 2].map(|channel| {
         let value = COEFFICIENTS.iter().rev().fold(0.0, |value, coefficients| value * fraction + coefficients[channel]);
         value.clamp(0.0, 1.0)
@@ -27,9 +28,9 @@ const BACKGROUND: f32 = 0.87;
 /// The fraction of the light that does not depend on the orientation of the surface.
 const AMBIENT_FRACTION: f32 = 0.62;
 
-/// Converts the samples of an AOV of values to RGBA8 sRGB. A sample is one word: 0 for the background; otherwise the
-/// value as a fraction of the axis in the lower 16 bits, and the cosine of the angle between normal and view direction
-/// in the upper 16 bits, both scaled by 65535.
+/// Converts the samples of an AOV of values to RGBA8 sRGB. A sample is one word, 0 for the background. Otherwise its
+/// lower 16 bits are the value as a fraction of the axis, and its upper 16 bits are the cosine of the angle between
+/// normal and view direction. Both are scaled by 65535.
 ///
 /// A surface that faces the camera has exactly the viridis color. An inclined surface has up to 38 % less light, so that
 /// the shape is visible. A pixel is the mean of its samples in linear light.
@@ -100,12 +101,14 @@ mod tests {
     #[test]
     fn apply_colormap_shades_surfaces_and_averages_samples() {
         let facing_word = |value: u32| 0xFFFF_0000 | value;
+        // The value is 0, as in the first pixel; the cosine is nearly 0.
         let edge_on_word = 0x0001_0000;
         let rgba = apply_colormap(&[facing_word(0), facing_word(65535), 0, edge_on_word], 1);
         let expected = |fraction: f32| viridis(fraction).map(|channel| (255.0 * channel).round() as u8);
         assert_eq!((&rgba[..3], &rgba[4..7]), (&expected(0.0)[..], &expected(1.0)[..]));
         assert_eq!(rgba[8], rgba[9], "expected a gray background");
-        assert!(rgba[14] < rgba[2] && rgba[14] > rgba[2] / 2, "expected a darker color, but not black");
+        let (facing_blue, edge_on_blue) = (rgba[2], rgba[4 * 3 + 2]);
+        assert!(edge_on_blue < facing_blue && edge_on_blue > facing_blue / 2, "expected a darker color, but not black");
         let mean = apply_colormap(&[0, facing_word(0)], 2);
         assert!(mean[0] < rgba[8] && mean[0] > rgba[0], "expected a color between background and surface");
     }

@@ -23,6 +23,12 @@ const BOX_WIDTH: f32 = 330.0;
 const BOX_HEIGHT: f32 = 84.0;
 /// Pixels per layout unit at which labels are just readable.
 const MIN_PIXELS_PER_UNIT: f32 = 0.62;
+/// Radius of the box's corners, in layout units.
+const CORNER_RADIUS: f32 = 6.0;
+const BOX_OPACITY: f32 = 0.86;
+/// Font sizes in layout units.
+const TITLE_FONT_SIZE: f32 = 15.0;
+const LABEL_FONT_SIZE: f32 = 13.0;
 /// The color bar inside the box.
 const BAR: Rectangle = Rectangle { left: 26.0, top: 34.0, width: 278.0, height: 16.0 };
 /// sRGB of text and ticks.
@@ -38,6 +44,7 @@ pub fn draw(rgba: &mut [u8], [width, height]: [u32; 2], legend: &Legend) -> Resu
         return Ok(());
     }
     let font = FontRef::try_from_slice(dejavu::sans::regular()).map_err(fault_in("legend"))?;
+    // The factor 1.15 leaves room for the margins beside the box.
     let pixels_per_unit = (height as f32 / 720.0).max(MIN_PIXELS_PER_UNIT).min(width as f32 / (1.15 * BOX_WIDTH));
     let box_size = [(BOX_WIDTH * pixels_per_unit).ceil() as usize, (BOX_HEIGHT * pixels_per_unit).ceil() as usize];
     let margin = (12.0 * pixels_per_unit) as usize;
@@ -45,15 +52,15 @@ pub fn draw(rgba: &mut [u8], [width, height]: [u32; 2], legend: &Legend) -> Resu
     let mut canvas = Canvas { rgba, width: width as usize, box_origin, box_size, pixels_per_unit, font };
 
     let background = Rectangle { left: 0.0, top: 0.0, width: BOX_WIDTH, height: BOX_HEIGHT };
-    canvas.fill_rectangle(&background, 6.0, 0.86, |_| [255; 3]);
-    canvas.draw_text(&legend.title, Baseline { x: BAR.left, y: 23.0, is_centered: false }, 15.0);
+    canvas.fill_rectangle(&background, CORNER_RADIUS, BOX_OPACITY, |_| [255; 3]);
+    canvas.draw_text(&legend.title, Baseline { x: BAR.left, y: 23.0, is_centered: false }, TITLE_FONT_SIZE);
     canvas.fill_rectangle(&BAR, 0.0, 1.0, |x| {
         viridis((x - BAR.left) / BAR.width).map(|channel| (255.0 * channel).round() as u8)
     });
     for (position, label) in compute_ticks(legend.scale_max) {
         let (x, y) = (BAR.left + position as f32 * BAR.width, BAR.top + BAR.height);
         canvas.fill_rectangle(&Rectangle { left: x - 0.6, top: y, width: 1.2, height: 5.0 }, 0.0, 1.0, |_| TEXT_COLOR);
-        canvas.draw_text(&label, Baseline { x, y: y + 19.0, is_centered: true }, 13.0);
+        canvas.draw_text(&label, Baseline { x, y: y + 19.0, is_centered: true }, LABEL_FONT_SIZE);
     }
     Ok(())
 }
@@ -87,7 +94,8 @@ struct Canvas<'a> {
 }
 
 impl Canvas<'_> {
-    /// Fills a rectangle with rounded corners, antialiased. `color` maps x in layout units to sRGB.
+    /// Fills a rectangle with rounded corners, antialiased. `radius` is in layout units, and 0 gives sharp corners.
+    /// `color` maps x in layout units to sRGB.
     fn fill_rectangle(&mut self, rectangle: &Rectangle, radius: f32, opacity: f32, color: impl Fn(f32) -> [u8; 3]) {
         let mut rasterizer = Rasterizer::new(self.box_size[0], self.box_size[1]);
         let [left, top] = [rectangle.left * self.pixels_per_unit, rectangle.top * self.pixels_per_unit];
@@ -106,8 +114,8 @@ impl Canvas<'_> {
         };
         let mut previous_end = offset_point(point(left, top), point(1.0, 0.0), radius);
         for (corner, incoming, outgoing) in corners {
-            // The control points of the cubic Bézier curve that approximates a quarter circle lie 0.5523 radii from its
-            // end points.
+            // The control points of the cubic Bézier curve that approximates a quarter circle are 0.5523 radii from its
+            // end points: 4/3 tan(pi/8).
             let control_distance = (1.0 - 0.552_284_8) * radius;
             let start = offset_point(corner, incoming, -radius);
             let end = offset_point(corner, outgoing, radius);
@@ -181,11 +189,12 @@ pub fn nice_ceiling(value: f64) -> f64 {
     }
     let decade = 10f64.powi(value.log10().floor() as i32);
     let candidates = [1.0, 2.0, 2.5, 5.0, 10.0].map(|candidate| candidate * decade);
-    // The relative tolerance prevents that rounding errors raise 0.2 to 0.25.
+    // Without the relative tolerance, a rounding error could raise 0.2 to 0.25.
     candidates.into_iter().find(|candidate| *candidate >= value * (1.0 - 1e-9)).unwrap_or(10.0 * decade)
 }
 
-/// Tick positions from 0 to 1 and their labels: three to five equal intervals from 0 to `scale_max`.
+/// Tick positions from 0 to 1 and their labels: three to five equal intervals from 0 to `scale_max`. The number
+/// of intervals is chosen so that the labels are round.
 fn compute_ticks(scale_max: f64) -> Vec<(f64, String)> {
     let significand = scale_max / 10f64.powi(scale_max.log10().floor() as i32);
     let is_close_to = |candidate: f64| (significand - candidate).abs() < 1e-6;

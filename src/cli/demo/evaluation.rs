@@ -8,10 +8,11 @@ use modalcast_model::domain::Transform;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Scene, SceneState};
 
-/// Tolerance for the error of received vertices, as a fraction of the scene's diagonal.
+/// Tolerance for the error of received vertices, as a fraction of the scene's diagonal. The README guarantees it.
 const MAX_RELATIVE_ERROR: f64 = 1e-5;
 
-/// Tolerance for the gap of a joint, as a fraction of the scene's diagonal.
+/// Tolerance for [`Joint::gap`], as a fraction of the scene's diagonal. The gap is not exactly 0, because the physics
+/// process fits the transform of a child to a ring of displaced vertices.
 const MAX_RELATIVE_GAP: f64 = 1e-3;
 
 /// The measured results of a demo.
@@ -30,8 +31,7 @@ pub(super) struct Evaluation {
     relative_displacement: f64,
     /// Largest distance from the rest position in the top tenth of the scene, as a fraction of the scene's height.
     sway: f64,
-    /// Largest distance of a child's origin from the displaced center of its ring, as a fraction of the diagonal.
-    /// `None` without joints.
+    /// Largest [`Joint::gap`], as a fraction of the diagonal. `None` without joints.
     joint_gap: Option<f64>,
     min_motion: MinimumMotion,
     /// Number of frames on disk.
@@ -77,7 +77,7 @@ impl Evaluation {
             backend: string_field(&run.server, "backend"),
             renderer: string_field(&run.server, "renderer"),
             steps,
-            steps_per_second: run.sim["steps_per_second"].as_f64().unwrap_or(f64::NAN),
+            steps_per_second: run.physics["steps_per_second"].as_f64().unwrap_or(f64::NAN),
             stages: median_stage_ms(&run.frames),
             error,
             relative_error: error / diagonal,
@@ -177,9 +177,11 @@ impl TopRegion {
     }
 }
 
-/// Minimum motion that a demo must show, as fractions of the diagonal and the height.
+/// Minimum motion that a demo must show. A demo whose scene does not move fails.
 struct MinimumMotion {
+    /// As a fraction of the diagonal.
     displacement: f64,
+    /// As a fraction of the height.
     sway: f64,
 }
 
@@ -201,12 +203,14 @@ struct Joint {
 }
 
 impl Joint {
-    /// The joints whose rest frame is at the center of their ring, so that the ring determines the expected position.
+    /// The joints whose child has its origin at the center of the ring at rest. Only these joints have an expected gap
+    /// of 0.
     fn all(scene: &Scene, rest_positions: &[[f64; 3]]) -> Vec<Self> {
         let state = SceneState::rest(scene);
         let diagonal = scene.rest_bounds.diagonal();
         let joint = |(child, domain): (usize, &modalcast_model::domain::Domain)| {
             let attachment = domain.attachment.as_ref().filter(|attachment| !attachment.rows.is_empty())?;
+            // A child that follows another domain has no transform of its own.
             let transform_index =
                 scene.transform_roots.frame_of(child).is_none().then(|| scene.transform_roots.root_of(child))?;
             let first_vertex = scene.layout.domains[attachment.parent].first_vertex;
@@ -215,11 +219,13 @@ impl Joint {
                 ring: attachment.rows.iter().map(|row| first_vertex + *row as usize).collect(),
             };
             let center = center(joint.ring.iter().map(|vertex| rest_positions[*vertex]));
+            // The tolerance allows for the f32 rounding of rest positions.
             (distance(center, joint.origin(&state)) <= 1e-5 * diagonal).then_some(joint)
         };
         scene.domains.iter().enumerate().filter_map(joint).collect()
     }
 
+    /// World position of the child's origin.
     fn origin(&self, state: &SceneState) -> [f64; 3] {
         state.transforms[self.transform_index].translation().into()
     }
@@ -252,7 +258,7 @@ fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
 }
 
-/// The larger of two values. If `b` is NaN, infinity, so that an invalid position fails the checks.
+/// The larger of two values, or infinity if `b` is NaN, so that an invalid position fails the checks.
 fn max_or_infinity(a: f64, b: f64) -> f64 {
     if b.is_nan() { f64::INFINITY } else { a.max(b) }
 }
@@ -291,7 +297,7 @@ mod tests {
         let repeat_row = |row: Vec<f32>| [row.clone(), row];
         DemoRun {
             frames: json!({}),
-            sim: json!({}),
+            physics: json!({}),
             server: json!({}),
             q: StepRecords::from_rows(&[scene.layout.coordinates], &repeat_row(vec![0.0; scene.layout.coordinates])),
             transforms: StepRecords::from_rows(&[domains, 12], &repeat_row(transforms)),
@@ -316,6 +322,7 @@ mod tests {
         assert!(failed_checks(&|run| run.vertices.row_mut(1)[3 * 77] = f32::NAN).contains("vertices within"));
         let child_domain =
             scene.domains.iter().position(|domain| domain.attachment.is_some()).expect("expected an attached domain");
+        // Entry 3 of a row-major 3x4 transform is the translation along x.
         assert!(
             failed_checks(&|run| run.transforms.row_mut(1)[12 * child_domain + 3] += 0.1).contains("joints within")
         );

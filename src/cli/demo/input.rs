@@ -15,8 +15,10 @@ pub(super) struct DemoScene {
     pub(super) source: String,
     /// The server's repository. `None` for a built-in scene.
     pub(super) repository: Option<PathBuf>,
-    /// Vega's cubic polynomial and configuration, if the model's folder contains exactly one file of each kind.
+    /// Vega's cubic polynomial of the internal forces (`.cub`), if the model's folder contains exactly one such
+    /// file.
     pub(super) cubic: Option<PathBuf>,
+    /// Vega's simulation settings (`.config`), if the model's folder contains exactly one such file.
     pub(super) vega_config: Option<PathBuf>,
 }
 
@@ -27,8 +29,7 @@ impl DemoScene {
     /// Those of loading the scene.
     pub(super) fn find(source: &str) -> Result<Self> {
         let scene = with_spinner("loading", || load::open(source))?.scene;
-        let path = Path::new(source);
-        let Some(path) = path.canonicalize().ok().filter(|_| path.exists()) else {
+        let Ok(path) = Path::new(source).canonicalize() else {
             return Ok(Self { scene, source: source.into(), repository: None, cubic: None, vega_config: None });
         };
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();

@@ -57,7 +57,7 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args) -> Outcome {
     let input = DemoScene::find(&args.scene)?;
-    // Contains the temporary files of the processes. Dropping it removes the folder.
+    // For the temporary files of the processes. The folder is removed when this value is dropped.
     let temporary_folder = tempfile::tempdir().map_err(fault_in("demo"))?;
     let demo_run = run_processes(args, &input, temporary_folder.path())?;
     let evaluation =
@@ -90,15 +90,16 @@ struct DemoRun {
     /// JSON output of the client that receives frames.
     frames: serde_json::Value,
     /// JSON output of the physics process.
-    sim: serde_json::Value,
+    physics: serde_json::Value,
     /// JSON description of the server.
     server: serde_json::Value,
-    /// Shape (steps, coordinates), as sent by the physics process.
+    /// Reduced coordinates as sent by the physics process; shape (steps, coordinates).
     q: StepRecords,
-    /// Shape (steps, domains, 12), as sent by the physics process.
+    /// Row-major 3x4 transforms as sent by the physics process; shape (steps, domains, 12).
     transforms: StepRecords,
-    /// Shape (steps, vertices, 3), as received over the network.
+    /// Vertex positions as received over the network; shape (steps, vertices, 3).
     vertices: StepRecords,
+    /// Number of frame files in the output folder.
     frames_on_disk: usize,
 }
 
@@ -147,9 +148,10 @@ fn run_processes(args: &Args, input: &DemoScene, temporary_folder: &std::path::P
     if let Some(path) = &config {
         flags.extend(["--config", path.as_str()]);
     }
-    let physics = Process::start("physics", &program_path("modalcast-sim")?, &[&flags[..], &common_flags].concat())?;
+    let physics_process =
+        Process::start("physics", &program_path("modalcast-sim")?, &[&flags[..], &common_flags].concat())?;
 
-    let sim = physics.finish(deadline)?;
+    let physics = physics_process.finish(deadline)?;
     let frames = frame_client.finish(deadline)?;
     vertex_client.finish(deadline)?;
     let info_client = Process::start("info", &program_path("modalcast-fetch")?, &["info", "--server", &url, "--json"])?;
@@ -158,7 +160,7 @@ fn run_processes(args: &Args, input: &DemoScene, temporary_folder: &std::path::P
     let record_folder = temporary_folder.join("record");
     Ok(DemoRun {
         frames,
-        sim,
+        physics,
         server: server_info,
         q: StepRecords::read(&record_folder.join("q.npy"))?,
         transforms: StepRecords::read(&record_folder.join("transforms.npy"))?,
@@ -186,7 +188,7 @@ fn frame_files(folder: &std::path::Path) -> Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// Whether this is a file name that `modalcast-fetch frames` writes.
+/// Whether `modalcast-fetch frames` writes files of this name: at least five digits between prefix and extension.
 fn is_frame(name: &str) -> bool {
     let number = name.strip_prefix("frame_").and_then(|rest| rest.strip_suffix(".png"));
     number.is_some_and(|number| number.len() >= 5 && number.bytes().all(|digit| digit.is_ascii_digit()))

@@ -92,7 +92,7 @@ impl Process {
     /// Sends SIGTERM and waits for at most 15 s. If the process is still running then, dropping it kills it.
     pub(super) fn stop(&mut self) {
         if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw) {
-            kill_process(pid, Signal::TERM).ok(); // Fails only if it has already exited.
+            kill_process(pid, Signal::TERM).ok(); // Fails only if the process has already exited.
         }
         let deadline = Instant::now() + Duration::from_secs(15);
         while Instant::now() < deadline && matches!(self.child.try_wait(), Ok(None)) {
@@ -100,7 +100,7 @@ impl Process {
         }
     }
 
-    /// Waits for the next output line. `prefix` is that of the awaited line, for errors.
+    /// Waits for the next output line. `prefix` names the line that the caller waits for, in errors.
     fn next_line(&mut self, deadline: Instant, prefix: &str) -> Result<String> {
         self.next_line_or_end(deadline, &format!("the line '{prefix}'"))?.ok_or_else(|| {
             let status = self.child.wait().map(|status| status.to_string()).unwrap_or_default();
@@ -108,8 +108,8 @@ impl Process {
         })
     }
 
-    /// Waits for the next output line. Returns `None` when the process has closed its output. `what` names the awaited
-    /// output in errors.
+    /// Waits for the next output line. Returns `None` when the process has closed its output. `what` names the output
+    /// that the caller waits for, in errors.
     fn next_line_or_end(&self, deadline: Instant, what: &str) -> Result<Option<String>> {
         match self.lines.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
             Ok(line) => Ok(Some(line)),

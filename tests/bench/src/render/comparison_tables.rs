@@ -36,11 +36,11 @@ fn minimal_passes_section(rows: &[MinimalPasses]) -> String {
     ];
     let mut text = format!(
         "\n## Minimal passes\n\nThe same scene in the same run, stripped to one opaque material without culling, \
-         images and cut-outs. One draw of all triangles writes the depth of the shadow map; a second draw writes the ids \
-         and depth of the frame. For comparison: frames with a variance map of the same size, and the excess of their time \
-         over both passes. The target for the excess without culling is at most {MAX_EXCESS_US} us for 3,000,000 \
-         triangles and a map of 4096 on an H200 at 1920 x 1080. A frame with culling draws fewer triangles than the \
-         passes.\n\n"
+         images and cut-outs. One draw of all triangles writes the depth of the shadow map; a second draw writes the \
+         ids and depth of the frame. For comparison: frames with a variance map of the same size, and the excess of \
+         their time over both passes. The target for the excess without culling is at most {MAX_EXCESS_US} us for \
+         3,000,000 triangles and a map of 4096 on an H200 at 1920 x 1080. A frame with culling draws fewer triangles \
+         than the passes.\n\n"
     );
     let row = |passes: &MinimalPasses| {
         let format_us = |us: f64| format!("{us:.1}");

@@ -100,11 +100,11 @@ impl RenderReportOptions {
 
     /// The variants to measure. A quick run has fewer, but includes every variant that is named in full.
     pub fn selected_variants(&self) -> Vec<RenderVariant> {
-        let (run_variants, mut selected_variants) = (variants::all(self.quick), variants::all(false));
+        let (available_variants, mut selected_variants) = (variants::all(self.quick), variants::all(false));
         selected_variants.retain(|variant| {
             let is_named = self.variants.contains(&variant.name);
-            let is_in_run = run_variants.iter().any(|candidate| candidate.name == variant.name);
-            is_named || is_selected(&self.variants, &variant.name) && is_in_run
+            let is_available = available_variants.iter().any(|candidate| candidate.name == variant.name);
+            is_named || is_selected(&self.variants, &variant.name) && is_available
         });
         selected_variants
     }
