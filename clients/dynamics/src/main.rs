@@ -158,6 +158,9 @@ fn find_force_file(model: &Model, files: &ForceFileOptions) -> Option<PathBuf> {
     let notes = model.domains.iter().filter_map(|domain| domain.notes.get("vega.cubic"));
     let paths_in_notes = notes.filter_map(|note| Path::new(note).file_name()).map(|name| folder.join(name));
     let mut candidates: Vec<PathBuf> = paths_in_notes.filter(|path| path.is_file()).collect();
+    // Several domains may name the same file.
+    candidates.sort();
+    candidates.dedup();
     if candidates.is_empty() {
         let paths = folder.read_dir().ok()?.filter_map(|entry| Some(entry.ok()?.path()));
         candidates = paths.filter(|path| path.extension().is_some_and(|extension| extension == "cub")).collect();

@@ -248,8 +248,9 @@ fn sent_state(scene: &Scene, run: &DemoRun, step: usize) -> SceneState {
     let mut state = SceneState::rest(scene);
     state.q = run.q.row(step).to_vec();
     let (sent_transforms, _) = run.transforms.row(step).as_chunks::<12>();
-    for (transform, sent_transform) in state.transforms.iter_mut().zip(sent_transforms) {
-        *transform = Transform(*sent_transform);
+    // The record has a transform for each domain, the state only for domains that follow no other domain.
+    for (transform, domain) in state.transforms.iter_mut().zip(scene.transform_roots.domains()) {
+        *transform = Transform(sent_transforms[domain as usize]);
     }
     state
 }

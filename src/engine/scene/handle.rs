@@ -251,10 +251,4 @@ impl WriterSession {
     pub fn is_drained(&self) -> bool {
         self.lease.step_queue.is_drained()
     }
-
-    /// Whether the server has ended the stream.
-    pub fn is_ended(&self) -> bool {
-        // The lease is held, so only an error of the server can have closed the queue.
-        self.lease.step_queue.is_closed()
-    }
 }
