@@ -70,7 +70,7 @@ __device__ __forceinline__ void compute_segment_boxes(const BoundsArgs& args) {
 }
 #endif
 
-// Keys of `Header::bounds` that are computed.
+// Keys of `StepHeader::bounds` that are computed.
 #ifdef ORIENTED_BOUNDS
 constexpr unsigned KEY_COUNT = 12;
 #else

@@ -20,7 +20,7 @@ constexpr unsigned RING_START = 0x80000000u;
 constexpr unsigned NO_FRAME = 0xffffffffu;
 
 // Start of the upload of a step: output addresses, and which parts to compute.
-struct Header {
+struct StepHeader {
     float* positions;
     float* normals;
     float4* tangents;
@@ -35,7 +35,7 @@ struct Header {
     // The host sends zeros.
     unsigned bounds[12];
 };
-static_assert(sizeof(Header) == 112, "Header differs from src/compute/gpu/tables/layout.rs");
+static_assert(sizeof(StepHeader) == 112, "StepHeader differs from src/compute/gpu/tables/layout.rs");
 
 // Bit fields of `WarpTile::kind`: the number of items of the last quad (0 in a mixed tile), whether the tile computes
 // positions, and whether it computes normals and tangents. A tile with both flags computes corner i of a shape together
@@ -94,7 +94,7 @@ struct TransformLink {
 static_assert(sizeof(TransformLink) == 8, "TransformLink differs from src/compute/gpu/tables/layout.rs");
 
 struct DeformArgs {
-    const Header* header;
+    const StepHeader* header;
     const WarpTile* tiles;
     const MixedQuad* mixed_quads;
     const uint4* words;
@@ -148,7 +148,7 @@ struct BatchBlock {
 static_assert(sizeof(BatchBlock) == 16, "BatchBlock differs from src/compute/gpu/tables/layout.rs");
 
 struct BatchArgs {
-    const Header* header;
+    const StepHeader* header;
     const BatchBlock* blocks;
     const BatchGroup* groups;
     const BatchMember* members;
@@ -173,7 +173,7 @@ struct BoxSegment {
 static_assert(sizeof(BoxSegment) == 16, "BoxSegment differs from src/compute/gpu/tables/layout.rs");
 
 struct BoundsArgs {
-    Header* header;
+    StepHeader* header;
     const unsigned* boxes;
     const BoxSegment* segments;
     const unsigned* change_steps;
@@ -186,7 +186,7 @@ struct BoundsArgs {
 static_assert(sizeof(BoundsArgs) == 88, "BoundsArgs differs from src/compute/gpu/tables/layout.rs");
 
 struct ApplyArgs {
-    const Header* header;
+    const StepHeader* header;
     const Change* changes;
     const float4* new_transforms;
     const float* new_q;
@@ -200,7 +200,7 @@ struct ApplyArgs {
 static_assert(sizeof(ApplyArgs) == 80, "ApplyArgs differs from src/compute/gpu/tables/layout.rs");
 
 struct NormalsArgs {
-    const Header* header;
+    const StepHeader* header;
     const NormalSlot* slots;
     const unsigned* first_domains;
     const float* rest_normals;
@@ -221,7 +221,7 @@ struct NormalsArgs {
 static_assert(sizeof(NormalsArgs) == 120, "NormalsArgs differs from src/compute/gpu/tables/layout.rs");
 
 // Whether a domain changed after the output buffers were last written.
-__device__ inline bool is_dirty(const Header* header, const unsigned* change_steps, unsigned domain) {
+__device__ inline bool is_dirty(const StepHeader* header, const unsigned* change_steps, unsigned domain) {
     return max(__ldg(&header->last_full_step), __ldg(change_steps + domain)) > __ldg(&header->output_step);
 }
 

@@ -9,7 +9,7 @@ use super::{Outcome, print_line};
 use crate::config::{BackendChoice, Config, RendererChoice};
 use crate::engine::{DeviceContext, FrameOutput, LoadedScene, validate_mode};
 use crate::frame;
-use modalcast_model::error::{Error, Result, fault_in, invalid};
+use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::load::{self, OpenedScene};
 use modalcast_model::scene::{Camera, FrameSize, Lens, Scene, SceneState, View};
 
@@ -111,7 +111,7 @@ fn render_color_map(
 ) -> Result<Vec<u8>> {
     let scene = Arc::clone(loaded_scene.scene());
     let (aov, legend) = device.render_aov(loaded_scene, &camera(args, &scene), args.size, frame_output)?;
-    let legend = legend.ok_or_else(|| fault_in("encode")("expected a legend of the color map"))?;
+    let legend = legend.ok_or_else(|| fault("encode", "expected a legend of the color map"))?;
     let rgba = frame::draw_color_map(&aov.bytes, aov.samples, args.size.to_array(), &legend)?;
     frame::encode_png(args.size.width, args.size.height, &rgba)
 }

@@ -101,7 +101,7 @@ impl Deformer for FaultyDeformer {
         let index = self
             .readbacks
             .iter()
-            .position(|surface| readback.is_of(surface))
+            .position(|surface| readback.writes_to(surface))
             .expect("expected a readback of this deformer");
         Ok(self.readbacks.swap_remove(index))
     }

@@ -183,7 +183,7 @@ impl Canvas<'_> {
 
 /// Rounds up to 1, 2, 2.5 or 5 times a power of ten, so that the axis has readable ticks. Returns 1 unless `value` is
 /// finite and positive.
-pub fn nice_ceiling(value: f64) -> f64 {
+pub fn round_up_scale(value: f64) -> f64 {
     if !(value.is_finite() && value > 0.0) {
         return 1.0;
     }
@@ -234,7 +234,7 @@ mod tests {
 
     #[test]
     fn nice_ceiling_and_ticks_give_round_numbers() {
-        let rounded = [0.013, 0.2, 0.21, 3.0, 7.0, 1e-9, 1e9, 0.0, f64::NAN].map(nice_ceiling);
+        let rounded = [0.013, 0.2, 0.21, 3.0, 7.0, 1e-9, 1e9, 0.0, f64::NAN].map(round_up_scale);
         for (actual, expected) in rounded.iter().zip([0.02, 0.2, 0.25, 5.0, 10.0, 1e-9, 1e9, 1.0, 1.0]) {
             assert!((actual / expected - 1.0).abs() < 1e-9, "expected {expected}, got {actual}");
         }

@@ -5,7 +5,7 @@ mod colormap;
 mod legend;
 
 pub use colormap::{apply_colormap, viridis};
-pub use legend::{Legend, draw as draw_legend, nice_ceiling};
+pub use legend::{Legend, draw as draw_legend, round_up_scale};
 
 use modalcast_model::error::Result;
 

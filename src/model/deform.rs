@@ -9,7 +9,7 @@
 
 use std::sync::Arc;
 
-use crate::error::{Result, fault_in};
+use crate::error::{Result, fault};
 use crate::scene::{BoundingBox, OrientedBounds, SceneState};
 
 /// Deformed vertices of a whole scene, packed as in [`Layout`](crate::scene::Layout).
@@ -56,7 +56,7 @@ pub struct VertexAttributes {
 
 impl VertexAttributes {
     /// The attributes that are needed for drawing.
-    pub const VERTICES: Self = Self { positions: true, normals: true, displacements: false, boxes: false };
+    pub const POSITIONS_AND_NORMALS: Self = Self { positions: true, normals: true, displacements: false, boxes: false };
     /// Every attribute.
     pub const ALL: Self = Self { positions: true, normals: true, displacements: true, boxes: true };
 
@@ -97,7 +97,7 @@ impl std::fmt::Debug for VertexReadback {
 }
 
 impl VertexReadback {
-    /// A readback in flight. The deformer identifies it by [`Self::is_of`].
+    /// A readback in flight. The deformer identifies it by [`Self::writes_to`].
     pub const fn pending(surface: Arc<DeformedSurface>) -> Self {
         Self { surface, is_ready: false }
     }
@@ -113,7 +113,7 @@ impl VertexReadback {
     }
 
     /// Whether this readback writes to `surface`.
-    pub fn is_of(&self, surface: &Arc<DeformedSurface>) -> bool {
+    pub fn writes_to(&self, surface: &Arc<DeformedSurface>) -> bool {
         Arc::ptr_eq(&self.surface, surface)
     }
 
@@ -192,7 +192,7 @@ pub trait Deformer {
     ///
     /// # Errors
     /// As for [`Self::surface`].
-    fn read(&mut self, _attributes: VertexAttributes) -> Result<&DeformedSurface> {
+    fn surface_with(&mut self, _attributes: VertexAttributes) -> Result<&DeformedSurface> {
         self.surface()
     }
 
@@ -211,7 +211,7 @@ pub trait Deformer {
     /// # Errors
     /// `Fault` if the copy from the device fails, or if another deformer started the readback.
     fn wait_readback(&mut self, readback: &VertexReadback) -> Result<Arc<DeformedSurface>> {
-        readback.completed_surface().cloned().ok_or_else(|| fault_in("readback")("another deformer started it"))
+        readback.completed_surface().cloned().ok_or_else(|| fault("readback", "another deformer started it"))
     }
 }
 
@@ -223,10 +223,13 @@ mod tests {
     fn contains_compares_attribute_sets() {
         let boxes = VertexAttributes { boxes: true, ..VertexAttributes::default() };
         assert!(
-            VertexAttributes::ALL.contains(VertexAttributes::VERTICES.union(boxes))
-                && VertexAttributes::VERTICES.union(boxes).contains(boxes)
+            VertexAttributes::ALL.contains(VertexAttributes::POSITIONS_AND_NORMALS.union(boxes))
+                && VertexAttributes::POSITIONS_AND_NORMALS.union(boxes).contains(boxes)
         );
-        assert!(!VertexAttributes::VERTICES.contains(boxes) && !boxes.contains(VertexAttributes::VERTICES));
+        assert!(
+            !VertexAttributes::POSITIONS_AND_NORMALS.contains(boxes)
+                && !boxes.contains(VertexAttributes::POSITIONS_AND_NORMALS)
+        );
         assert!(boxes.contains(VertexAttributes::default()) && !VertexAttributes::default().contains(boxes));
     }
 

@@ -42,9 +42,14 @@ pub fn invalid(field: impl Into<String>, expected: impl Into<String>, given: imp
     Error::Invalid { field: field.into(), expected: expected.into(), given: given.to_string() }
 }
 
+/// An [`Error::Fault`] of `stage`.
+pub fn fault(stage: &'static str, reason: impl ToString) -> Error {
+    Error::Fault { stage, reason: reason.to_string() }
+}
+
 /// Converts any library error to an [`Error::Fault`] of `stage`, for use with `map_err`.
 pub fn fault_in<E: std::fmt::Display>(stage: &'static str) -> impl Fn(E) -> Error {
-    move |error| Error::Fault { stage, reason: error.to_string() }
+    move |error| fault(stage, error)
 }
 
 impl Error {

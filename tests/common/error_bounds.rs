@@ -12,7 +12,7 @@ const TILE_VERTICES: usize = QUAD * TILE_QUADS;
 /// bound is increased by `truncation_bound`, in scene units.
 fn position_error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], truncation_bound: f64) -> Vec<f64> {
     let bound = |model: &ShapeErrorModel, tile: usize, step: &ErrorBoundInput| {
-        model.tile(tile, step).total() + truncation_bound
+        model.tile_bound(tile, step).total() + truncation_bound
     };
     error_ratios(scene, state, Comparison { actual: positions, expected: &reference::deform(scene, state) }, bound)
 }
@@ -21,7 +21,7 @@ fn position_error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], t
 /// finite.
 fn displacement_error_ratios(scene: &Scene, state: &SceneState, displacements: &[f32]) -> Vec<f64> {
     let bound = |model: &ShapeErrorModel, tile: usize, step: &ErrorBoundInput| {
-        model.displacement(tile, step.q, step.compensated)
+        model.displacement_bound(tile, step.q, step.compensated)
     };
     let expected = reference::displacements(scene, state);
     error_ratios(scene, state, Comparison { actual: displacements, expected: &expected }, bound)

@@ -265,7 +265,7 @@ fn gpu_invalid_call_sequences_return_errors() {
     let want = blocking_surfaces(&scene, &states[..3]);
     let (mut deformer, mut other_deformer) = (cuda_deformer(&scene), cuda_deformer(&scene));
     assert!(
-        matches!(deformer.readback(VertexAttributes::VERTICES), Err(Error::Fault { .. })),
+        matches!(deformer.readback(VertexAttributes::POSITIONS_AND_NORMALS), Err(Error::Fault { .. })),
         "expected no surface before the first step"
     );
     assert!(matches!(deformer.finish(), Err(Error::Fault { .. })));
@@ -275,9 +275,11 @@ fn gpu_invalid_call_sequences_return_errors() {
     // `deform` waits for the steps in flight.
     deformer.deform(&states[2]).expect("expected the step to succeed");
     other_deformer.deform(&states[0]).expect("expected the step to succeed");
-    let foreign_readback = other_deformer.readback(VertexAttributes::VERTICES).expect("expected a readback to start");
+    let foreign_readback =
+        other_deformer.readback(VertexAttributes::POSITIONS_AND_NORMALS).expect("expected a readback to start");
     assert!(matches!(deformer.wait_readback(&foreign_readback), Err(Error::Fault { .. })));
-    let own_readback = deformer.readback(VertexAttributes::VERTICES).expect("expected a readback to start");
+    let own_readback =
+        deformer.readback(VertexAttributes::POSITIONS_AND_NORMALS).expect("expected a readback to start");
     assert!(equals_without_tangents(
         &deformer.wait_readback(&own_readback).expect("expected the readback to complete"),
         &want[2]

@@ -17,7 +17,7 @@ fn vertex_request(scene: &str) -> v1::GetVerticesRequest {
 /// Subscribes to positions and normals of all domains of the open scene "strips".
 async fn subscribe_vertices(server: &Server, delivery: Delivery) -> Subscription {
     let scene = server.engine.find("strips").expect("expected an open scene");
-    let spec = OutputSpec::Vertices(VertexAttributes::VERTICES);
+    let spec = OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS);
     scene.subscribe(spec, delivery).await.expect("expected a subscription")
 }
 
@@ -290,7 +290,9 @@ async fn requests_wait_for_exact_and_minimum_steps() {
     let scene_handle = server.engine.find("strips").expect("expected an open scene");
     let mut pending_requests =
         [StepSelector::Exact(2), StepSelector::Minimum(3), StepSelector::Exact(5)].map(|selector| {
-            Box::pin(scene_handle.request_output(selector, OutputSpec::Vertices(VertexAttributes::VERTICES)))
+            Box::pin(
+                scene_handle.request_output(selector, OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS)),
+            )
         });
     for pending_request in &mut pending_requests {
         // One poll registers the request.

@@ -211,8 +211,11 @@ impl Joint {
         let joint = |(child, domain): (usize, &modalcast_model::domain::Domain)| {
             let attachment = domain.attachment.as_ref().filter(|attachment| !attachment.rows.is_empty())?;
             // A child that follows another domain has no transform of its own.
-            let transform_index =
-                scene.transform_roots.frame_of(child).is_none().then(|| scene.transform_roots.root_of(child))?;
+            let transform_index = scene
+                .transform_roots
+                .root_from_domain(child)
+                .is_none()
+                .then(|| scene.transform_roots.root_of(child))?;
             let first_vertex = scene.layout.domains[attachment.parent].first_vertex;
             let joint = Self {
                 transform_index,

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result, fault, fault_in};
 
 /// Buffered output lines per child. A child that prints more lines blocks until lines are read. The children of a demo
 /// print fewer.
@@ -51,9 +51,9 @@ impl Process {
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .spawn()
-            .map_err(|error| fault_in("demo")(format!("{}: {error}", program_path.display())))?;
+            .map_err(|error| fault("demo", format!("{}: {error}", program_path.display())))?;
         let (line_sender, lines) = sync_channel(LINE_CAPACITY);
-        let output = child.stdout.take().ok_or_else(|| fault_in("demo")("expected a pipe for standard output"))?;
+        let output = child.stdout.take().ok_or_else(|| fault("demo", "expected a pipe for standard output"))?;
         std::thread::spawn(move || {
             for line in BufReader::new(output).lines().map_while(std::io::Result::ok) {
                 if line_sender.send(line).is_err() {
@@ -82,10 +82,10 @@ impl Process {
         }
         let status = self.child.wait().map_err(fault_in("demo"))?;
         if !status.success() {
-            return Err(fault_in("demo")(format!("{} ended with {status}", self.name)));
+            return Err(fault("demo", format!("{} ended with {status}", self.name)));
         }
         serde_json::from_str(&last_line).map_err(|error| {
-            fault_in("demo")(format!("{}: expected a line of JSON, got '{last_line}': {error}", self.name))
+            fault("demo", format!("{}: expected a line of JSON, got '{last_line}': {error}", self.name))
         })
     }
 
@@ -104,7 +104,7 @@ impl Process {
     fn next_line(&mut self, deadline: Instant, prefix: &str) -> Result<String> {
         self.next_line_or_end(deadline, &format!("the line '{prefix}'"))?.ok_or_else(|| {
             let status = self.child.wait().map(|status| status.to_string()).unwrap_or_default();
-            fault_in("demo")(format!("{} ended with {status} before it printed '{prefix}'", self.name))
+            fault("demo", format!("{} ended with {status} before it printed '{prefix}'", self.name))
         })
     }
 

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use modalcast_model::error::{Result, fault_in, invalid};
+use modalcast_model::error::{Result, fault, invalid};
 use modalcast_model::load::parse_numpy;
 
 /// Rows of f32, one per step, in C order.
@@ -20,7 +20,7 @@ impl StepRecords {
     /// `Fault` if the file cannot be read; `Invalid` if it does not contain an array in C order.
     pub(super) fn read(path: &Path) -> Result<Self> {
         let path_text = path.display().to_string();
-        let bytes = std::fs::read(path).map_err(|error| fault_in("demo")(format!("{path_text}: {error}")))?;
+        let bytes = std::fs::read(path).map_err(|error| fault("demo", format!("{path_text}: {error}")))?;
         let array = parse_numpy(&bytes).map_err(|error| error.prefix_field(&path_text))?;
         if array.fortran_order || array.shape.is_empty() {
             return Err(invalid(path_text, "an array of steps in C order", format!("the shape {:?}", array.shape)));

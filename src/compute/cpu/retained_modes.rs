@@ -53,7 +53,11 @@ impl RetainedModes {
             let q = state.q_of(scene, domain);
             let max_row_norms = &max_row_norms[scene.domains[domain].shape];
             modes.truncation.update(
-                TruncationInput { q, max_row_norms, norm: bound::norm(&state.composed_transform(scene, domain)) },
+                TruncationInput {
+                    q,
+                    max_row_norms,
+                    norm: bound::linear_norm_bound(&state.composed_transform(scene, domain)),
+                },
                 *budget,
             );
             modes.q.fill(0.0);

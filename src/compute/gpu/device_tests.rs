@@ -82,7 +82,7 @@ fn lose_device() {
         CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).expect("a deformer");
     first_deformer.deform(&state).expect("a step");
     second_deformer.deform(&state).expect("a step");
-    let pending = second_deformer.readback(VertexAttributes::VERTICES).expect("a pending readback");
+    let pending = second_deformer.readback(VertexAttributes::POSITIONS_AND_NORMALS).expect("a pending readback");
     let source = "extern \"C\" __global__ void trap(unsigned long long) { asm(\"trap;\"); }";
     let function = device.function("trap", source, &[]).expect("a compiled kernel");
     let config = LaunchConfig { grid_dim: (1, 1, 1), block_dim: (1, 1, 1), shared_mem_bytes: 0 };

@@ -50,6 +50,6 @@ pub mod launchers {
 pub mod step_input {
     pub use super::executor::inputs::{InputPart, StagingBuffer, StepInputs};
     pub use super::tables::input_packing::{InputPacker, InputWriter};
-    pub use super::tables::layout::Header;
+    pub use super::tables::layout::StepHeader;
     pub use super::tables::staging::{PARALLEL_THRESHOLD, parallel_copy};
 }

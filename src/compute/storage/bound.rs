@@ -126,7 +126,7 @@ impl ShapeErrorModel {
     }
 
     /// Bounds of the vertices of tile `tile`.
-    pub fn tile(&self, tile: usize, input: &ErrorBoundInput) -> ErrorBound {
+    pub fn tile_bound(&self, tile: usize, input: &ErrorBoundInput) -> ErrorBound {
         let modes = &self.modes[self.rank * tile..][..self.rank];
         let mut sums = ModeSums::default();
         for (mode, q) in modes.iter().zip(input.q) {
@@ -154,18 +154,20 @@ impl ShapeErrorModel {
             let relative_error = scaled_coordinate((mode, q)) * (error.coordinate + error.sum);
             stored_row_norm(mode) * (relative_error + error.floor * largest)
         };
-        modes().map(mode_error).sum::<f64>() * norm(&input.transform) * ROUND_UP
+        modes().map(mode_error).sum::<f64>() * linear_norm_bound(&input.transform) * ROUND_UP
     }
 
     /// Bounds of all vertices.
-    pub fn domain(&self, input: &ErrorBoundInput) -> ErrorBound {
-        (0..self.max_rest_norms.len()).map(|tile| self.tile(tile, input)).fold(ErrorBound::default(), ErrorBound::max)
+    pub fn domain_bound(&self, input: &ErrorBoundInput) -> ErrorBound {
+        (0..self.max_rest_norms.len())
+            .map(|tile| self.tile_bound(tile, input))
+            .fold(ErrorBound::default(), ErrorBound::max)
     }
 
     /// Maximum error of u at the vertices of a tile, in scene units of the domain; independent of x0 and T.
-    pub fn displacement(&self, tile: usize, q: &[f32], compensated: bool) -> f64 {
+    pub fn displacement_bound(&self, tile: usize, q: &[f32], compensated: bool) -> f64 {
         let input = ErrorBoundInput { q, transform: Transform::IDENTITY.into(), compensated };
-        let ErrorBound { storage, coordinates, accumulation, .. } = self.tile(tile, &input);
+        let ErrorBound { storage, coordinates, accumulation, .. } = self.tile_bound(tile, &input);
         (storage + coordinates + accumulation) * ROUND_UP
     }
 
@@ -186,7 +188,7 @@ impl ShapeErrorModel {
         // Maximum norm of x0 + u.
         let max_deformed_norm = self.max_rest_norms[tile] + magnitude_sum + accumulation;
         let rest = if term_count > 0.0 { UNIT_ROUNDOFF * max_deformed_norm } else { 0.0 };
-        let (rounded_transform, norm) = (input.transform.to_f32(), norm(&input.transform));
+        let (rounded_transform, norm) = (input.transform.to_f32(), linear_norm_bound(&input.transform));
         let linear_norm = rounded_transform.linear().norm() * ROUND_UP;
         let translation_norm = rounded_transform.translation().norm() * ROUND_UP;
         let frame_error = frame_rounding_error(&input.transform);
@@ -229,7 +231,7 @@ fn frame_rounding_error(transform: &ComposedTransform) -> FrameError {
 
 /// Upper bound of `||A||_2` for the exact A and for A as deformers round it. The bound is too large by at most a
 /// relative 1e-7, and for a follower also by the rounding error of the product with its frame.
-pub fn norm(transform: &ComposedTransform) -> f64 {
+pub fn linear_norm_bound(transform: &ComposedTransform) -> f64 {
     (spectral_norm(&transform.to_f32()) + frame_rounding_error(transform).linear) * ROUND_UP
 }
 

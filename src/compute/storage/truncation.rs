@@ -27,7 +27,7 @@ pub struct TruncationInput<'a> {
     pub q: &'a [f32],
     /// From [`max_row_norms`].
     pub max_row_norms: &'a [f64],
-    /// Upper bound of `||A||_2`, from [`super::bound::norm`].
+    /// Upper bound of `||A||_2`, from [`super::bound::linear_norm_bound`].
     pub norm: f64,
 }
 

@@ -31,7 +31,7 @@ use super::in_flight::{InFlight, InFlightQueue, Pollable};
 use super::loaded_scene::LoadedScene;
 use crate::telemetry::ms_since;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault, fault_in};
 use modalcast_model::scene::{Camera, FrameSize, PixelRect};
 use modalcast_render::{FrameImage, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
 
@@ -305,7 +305,7 @@ impl DeviceLoop {
 }
 
 fn find_scene(scenes: &mut HashMap<SceneId, LoadedScene>, id: SceneId) -> Result<&mut LoadedScene> {
-    scenes.get_mut(&id).ok_or_else(|| fault_in("device")(format!("scene {id} is not loaded")))
+    scenes.get_mut(&id).ok_or_else(|| fault("device", format!("scene {id} is not loaded")))
 }
 
 #[cfg(test)]

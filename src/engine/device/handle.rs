@@ -15,7 +15,7 @@ use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result, fault, fault_in};
 use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
 use modalcast_render::{AovImage, FrameImage, MAX_FRAMES_IN_FLIGHT, PickHit};
 
@@ -186,5 +186,5 @@ impl<T> PendingReply<T> {
 
 /// The error for a dropped reply channel.
 fn no_answer_error() -> Error {
-    fault_in("device")("the command panicked or the device thread has ended")
+    fault("device", "the command panicked or the device thread has ended")
 }

@@ -8,7 +8,7 @@ use super::scalar_field;
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
-use modalcast_model::error::{Error, Result, fault_in, invalid};
+use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{BoundingBox, Camera, FrameSize, OrientedBounds, Scene, SceneState, snap_to_origin_grid};
 use modalcast_render::{FrameParams, Renderer, SceneBuffers};
@@ -164,7 +164,7 @@ impl LoadedScene {
             }
         };
         let camera_origin = snap_to_origin_grid(camera.eye().into());
-        let positions = &self.deformer.read(VertexAttributes::VERTICES)?.positions;
+        let positions = &self.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?.positions;
         let (positions, bounds) = origins.rebase_positions(camera_origin, &self.scene, positions);
         renderer.upload_rebased(buffers, &positions, camera_origin)?;
         Ok(BufferContents { bounds, light_bounds: None, is_uploaded: true })
@@ -200,7 +200,7 @@ impl LoadedScene {
             FrameOutput::Displacement { .. } => scalar_field::displacement_magnitudes(
                 &self.scene,
                 &self.current_state,
-                self.deformer.read(VertexAttributes::VERTICES)?,
+                self.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?,
             ),
             FrameOutput::Color | FrameOutput::Depth | FrameOutput::Domains | FrameOutput::Normals => return Ok(None),
         };
@@ -224,7 +224,7 @@ impl LoadedScene {
         if self.buffers_are_current || writes_buffers_itself {
             return Ok(false);
         }
-        renderer.upload(buffers, self.deformer.read(VertexAttributes::VERTICES)?)?;
+        renderer.upload(buffers, self.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?)?;
         self.buffers_are_current = true;
         Ok(true)
     }
@@ -263,7 +263,7 @@ impl LoadedScene {
     /// Creates the error that names the domain of the first vertex out of range.
     fn overflow_error(&mut self, state: &SceneState) -> Result<Error> {
         let scene = Arc::clone(&self.scene);
-        let surface = self.deformer.read(VertexAttributes {
+        let surface = self.deformer.surface_with(VertexAttributes {
             positions: true,
             displacements: true,
             ..VertexAttributes::default()
@@ -286,7 +286,7 @@ impl LoadedScene {
 }
 
 fn no_buffers_error() -> Error {
-    fault_in("draw")("the scene has no buffers")
+    fault("draw", "the scene has no buffers")
 }
 
 fn is_in_range(bounds: &BoundingBox) -> bool {

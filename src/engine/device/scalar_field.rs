@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use crate::engine::output::step_output::FrameOutput;
-use crate::frame::{Legend, nice_ceiling};
+use crate::frame::{Legend, round_up_scale};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Scene, SceneState};
@@ -87,7 +87,7 @@ pub(in crate::engine) fn fit_legend(scene: &Scene, frame_output: FrameOutput, va
         ),
         _ => (String::new(), 0.0, MIN_SCALE),
     };
-    let scale_max = if requested_max > 0.0 { requested_max } else { nice_ceiling(max_value.max(min_scale_max)) };
+    let scale_max = if requested_max > 0.0 { requested_max } else { round_up_scale(max_value.max(min_scale_max)) };
     Legend { title, scale_max: scale_max.clamp(MIN_SCALE, MAX_SCALE) }
 }
 

@@ -13,7 +13,7 @@ use super::step_output::{OutputBody, StepId, StepOutput};
 use crate::engine::blocking::run_blocking;
 use crate::frame::{self, Legend};
 use crate::telemetry::{Stage, StageTimes, ms_since};
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault, fault_in};
 use modalcast_render::{AovImage, RasterBackends};
 
 /// Wire format of pixels. Multi-byte values are little-endian; the top row comes first.
@@ -86,7 +86,7 @@ impl FrameEncoder {
             }
             OutputBody::Aov(image, None) => (image.bytes.into(), None),
             OutputBody::Vertices(_) | OutputBody::Pick(_) => {
-                return Err(fault_in("encode")("expected a frame, got vertices or a pick"));
+                return Err(fault("encode", "expected a frame, got vertices or a pick"));
             }
         };
         stages.extend(ms.map(|ms| (Stage::Encode, ms)));

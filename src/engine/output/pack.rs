@@ -8,7 +8,7 @@ use super::step_output::{OutputBody, StepOutput};
 use crate::engine::blocking::run_blocking;
 use crate::telemetry::{Stage, ms_since};
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
-use modalcast_model::error::{Result, fault_in, invalid};
+use modalcast_model::error::{Result, fault, invalid};
 use modalcast_model::scene::{BoundingBox, DomainLayout, FloatingOrigins, Layout, Scene};
 use modalcast_render::RasterBackends;
 
@@ -134,7 +134,7 @@ pub fn validate_domains(field: &str, scene: &Scene, domains: Vec<u32>) -> Result
 /// `Fault` when `output` does not contain vertices.
 pub async fn pack_vertices(output: StepOutput, selection: &Arc<VertexSelection>) -> Result<PackedVertices> {
     let OutputBody::Vertices(surface) = output.body else {
-        return Err(fault_in("copy")("expected vertices, got another output"));
+        return Err(fault("copy", "expected vertices, got another output"));
     };
     let mut stages = output.stages;
     let begin = Instant::now();
@@ -215,8 +215,8 @@ mod tests {
             ..DeformedSurface::default()
         };
         // Each strip has four vertices and four corners: 12 numbers of positions and 12 of normals.
-        let selection =
-            VertexSelection::new(&scene, vec![1], VertexAttributes::VERTICES).expect("expected a valid selection");
+        let selection = VertexSelection::new(&scene, vec![1], VertexAttributes::POSITIONS_AND_NORMALS)
+            .expect("expected a valid selection");
         let floats: Vec<f32> = bytemuck::pod_collect_to_vec(&pack(&surface, &selection));
         assert_eq!(floats, [numbers_from(12.0, 12), numbers_from(112.0, 12)].concat());
         assert_eq!(selection.position_bytes(), 48);
@@ -229,12 +229,12 @@ mod tests {
     #[test]
     fn invalid_index_lists_are_rejected() {
         let scene = testing::two_strips();
-        let error = VertexSelection::new(&scene, vec![0, 2], VertexAttributes::VERTICES)
+        let error = VertexSelection::new(&scene, vec![0, 2], VertexAttributes::POSITIONS_AND_NORMALS)
             .expect_err("expected an index out of range")
             .to_string();
         assert!(error.starts_with("selection.domains[1]: expected an index below 2, got 2"), "{error}");
         let longer_than_the_scene = vec![0; 3];
-        assert!(VertexSelection::new(&scene, longer_than_the_scene, VertexAttributes::VERTICES).is_err());
+        assert!(VertexSelection::new(&scene, longer_than_the_scene, VertexAttributes::POSITIONS_AND_NORMALS).is_err());
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use super::step_output::{ModalHit, OutputBody, StepId, StepOutput};
 use crate::engine::blocking::run_blocking;
 use crate::telemetry::StageTimes;
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault};
 use modalcast_model::scene::{Scene, SceneState};
 use modalcast_render::PickHit;
 
@@ -36,7 +36,7 @@ pub(in crate::engine) fn with_transforms(state: &SceneState, scene: &Scene, hits
 /// `Fault` when `output` is not a pick.
 pub async fn resolve_picks(output: StepOutput, scene: &Arc<Scene>, with_modes: bool) -> Result<PickResult> {
     let OutputBody::Pick(mut hits) = output.body else {
-        return Err(fault_in("pick")("expected a pick, got another output"));
+        return Err(fault("pick", "expected a pick, got another output"));
     };
     let scene = Arc::clone(scene);
     let add_modes = move || {

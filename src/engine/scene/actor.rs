@@ -46,7 +46,7 @@ use crate::engine::output::step_output::StepId;
 use crate::engine::storage::checkpoint_store::{CheckpointStore, SceneCheckpoints};
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::deform::DeformSummary;
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::scene::{Scene, SceneState};
 
 /// Services that all scenes share.
@@ -158,7 +158,7 @@ impl SceneActor {
     pub(super) async fn run(mut self, mut mailbox: mpsc::Receiver<Message>) {
         let end = catch_unwind_async(self.serve(&mut mailbox)).await.unwrap_or_else(|_| {
             tracing::error!(scene = self.name, "the task of the scene panicked; the scene is closed");
-            ActorEnd::Panicked(fault_in("scene")("the task of the scene panicked. Open the scene again"))
+            ActorEnd::Panicked(fault("scene", "the task of the scene panicked. Open the scene again"))
         });
         self.close(end, mailbox).await;
     }

@@ -120,7 +120,7 @@ mod tests {
     use modalcast_model::deform::VertexAttributes;
 
     fn subscribe(delivery: Delivery) -> (Subscriber, Subscription) {
-        Subscription::new(OutputSpec::Vertices(VertexAttributes::VERTICES), delivery, Arc::default())
+        Subscription::new(OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS), delivery, Arc::default())
     }
 
     fn send_frame(subscriber: &Subscriber, frame: StepOutput) {

@@ -144,7 +144,7 @@ impl StepQueue {
                 state.skipped += 1;
                 let merged = previous.merged + 1;
                 state.queued.push_back(QueuedStep {
-                    update: step.update.merged_after(&previous.update),
+                    update: step.update.merged_with_older(&previous.update),
                     merged,
                     ..step
                 });

@@ -12,7 +12,7 @@ use std::time::Instant;
 use tokio::sync::{Notify, mpsc, watch};
 
 use crate::engine::output::step_output::{OutputSpec, StepOutput};
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result, fault};
 
 /// Results that a lossless subscriber may leave unread before it blocks the writer. Also the capacity of the channel.
 pub(super) const LOSSLESS_CREDITS: usize = 2;
@@ -186,7 +186,7 @@ impl Subscription {
 
     fn end_error(&self) -> Error {
         let end = self.end.borrow();
-        end.as_ref().map_or_else(|| fault_in("scene")("the scene ended without an error"), |end| end.error.clone())
+        end.as_ref().map_or_else(|| fault("scene", "the scene ended without an error"), |end| end.error.clone())
     }
 }
 
@@ -210,7 +210,7 @@ mod tests {
     }
 
     fn subscribe(delivery: Delivery) -> (Subscriber, Subscription) {
-        Subscription::new(OutputSpec::Vertices(VertexAttributes::VERTICES), delivery, Arc::default())
+        Subscription::new(OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS), delivery, Arc::default())
     }
 
     #[tokio::test]

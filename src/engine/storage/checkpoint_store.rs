@@ -15,7 +15,7 @@ use sha2::{Digest as _, Sha256};
 use super::atomic_file::write_atomic;
 use crate::engine::lock::lock;
 use modalcast_model::domain::Transform;
-use modalcast_model::error::{Result, fault_in, invalid};
+use modalcast_model::error::{Result, fault, fault_in, invalid};
 use modalcast_model::scene::{FloatingOrigins, Scene, SceneState};
 
 /// Pause between two rounds of writes.
@@ -97,7 +97,7 @@ impl CheckpointStore {
         match fs::read(checkpoint_path(&self.folder, name)) {
             Ok(bytes) => decode(&bytes, scene).map(Some),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(error) => Err(fault_in("reading a checkpoint")(error)),
+            Err(error) => Err(fault("reading a checkpoint", error)),
         }
     }
 

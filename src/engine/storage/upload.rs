@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::OwnedSemaphorePermit;
 
-use modalcast_model::error::{Result, fault_in, invalid};
+use modalcast_model::error::{Result, fault, fault_in, invalid};
 
 /// Limit on the length of a path in bytes.
 const MAX_PATH_BYTES: usize = 240;
@@ -104,7 +104,7 @@ impl Upload {
             ErrorKind::AlreadyExists | ErrorKind::NotADirectory | ErrorKind::InvalidFilename => {
                 invalid("file.path", "a path that does not conflict with another file", path)
             }
-            _ => fault_in("upload")(error),
+            _ => fault("upload", error),
         };
         if let Some(parent) = file_path.parent() {
             fs::create_dir_all(parent).map_err(path_conflict)?;

@@ -137,7 +137,7 @@ impl SceneState {
     pub fn composed_transform(&self, scene: &Scene, domain: usize) -> ComposedTransform {
         ComposedTransform {
             root: self.transforms[scene.transform_roots.root_of(domain)],
-            frame: scene.transform_roots.frame_of(domain),
+            frame: scene.transform_roots.root_from_domain(domain),
         }
     }
 

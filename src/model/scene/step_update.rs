@@ -85,7 +85,7 @@ impl StepUpdate {
     }
 
     /// Merges this step with an older one. Applying the result equals applying both in order.
-    pub fn merged_after(self, older: &Self) -> Self {
+    pub fn merged_with_older(self, older: &Self) -> Self {
         let mut coordinates: BTreeMap<u32, &[f32]> = BTreeMap::new();
         let mut transforms = BTreeMap::new();
         // A newer f32 translation of a domain replaces an older f64 translation.

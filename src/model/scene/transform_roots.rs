@@ -86,7 +86,7 @@ impl TransformRoots {
     }
 
     /// `root_from_domain` of a follower; `None` for a root.
-    pub fn frame_of(&self, domain: usize) -> Option<Transform> {
+    pub fn root_from_domain(&self, domain: usize) -> Option<Transform> {
         self.table
             .as_ref()
             .and_then(|table| table.frames.get(table.root_and_frame_indices[domain][1] as usize).copied())
@@ -206,7 +206,7 @@ mod tests {
         let transform_roots = &scene.transform_roots;
         assert_eq!((transform_roots.count(), transform_roots.domains().collect::<Vec<_>>()), (2, vec![0, 3]));
         assert_eq!([0, 1, 2, 3, 4].map(|domain| transform_roots.root_of(domain)), [0, 0, 0, 1, 1]);
-        let frames = [0, 1, 2, 3, 4].map(|domain| transform_roots.frame_of(domain));
+        let frames = [0, 1, 2, 3, 4].map(|domain| transform_roots.root_from_domain(domain));
         assert_eq!(frames, [None, Some(translate_x(1.0)), Some(translate_x(3.0)), None, Some(translate_x(3.0))]);
         assert_eq!(
             [0, 1, 2, 3, 4].map(|domain| transform_roots.followers_of(domain).to_vec()),
@@ -225,7 +225,7 @@ mod tests {
         }
         let scene = Scene::new(parts).expect("a scene");
         let expected = (f64::from(1.0_f32 / 3.0) * f64::from(1.0_f32 / 3.0)) as f32;
-        assert_eq!(scene.transform_roots.frame_of(2).expect("a follower").0[0], expected);
+        assert_eq!(scene.transform_roots.root_from_domain(2).expect("a follower").0[0], expected);
     }
 
     #[test]
@@ -233,7 +233,11 @@ mod tests {
         let scene = Scene::new(scene_with_followers(&[])).expect("a scene");
         assert_eq!((scene.transform_roots.table.as_ref(), scene.transform_roots.count()), (None, 5));
         assert_eq!(
-            (scene.transform_roots.root_of(3), scene.transform_roots.frame_of(3), scene.transform_roots.domain(3)),
+            (
+                scene.transform_roots.root_of(3),
+                scene.transform_roots.root_from_domain(3),
+                scene.transform_roots.domain(3)
+            ),
             (3, None, 3)
         );
         assert!(scene.transform_roots.followers_of(3).is_empty() && !scene.features.followers);

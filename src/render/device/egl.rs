@@ -11,7 +11,7 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use khronos_egl as egl;
 
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result, fault, fault_in};
 
 type Instance = egl::DynamicInstance<egl::EGL1_4>;
 type EglHandle = *mut c_void;
@@ -244,7 +244,7 @@ impl Context {
         instance.initialize(display).map_err(fault_in("EGL initialize"))?;
         let extensions = instance.query_string(Some(display), egl::EXTENSIONS).map_err(&to_fault)?.to_string_lossy();
         if !extensions.contains("EGL_KHR_surfaceless_context") {
-            return Err(fault_in("EGL context")("expected the extension EGL_KHR_surfaceless_context"));
+            return Err(fault("EGL context", "expected the extension EGL_KHR_surfaceless_context"));
         }
         instance.bind_api(egl::OPENGL_API).map_err(&to_fault)?;
         let config = choose_config(instance, display)?;
@@ -334,7 +334,7 @@ fn choose_config(instance: &Instance, display: egl::Display) -> Result<egl::Conf
             return Ok(config);
         }
     }
-    Err(fault_in("EGL config")("expected a config for desktop OpenGL, got none"))
+    Err(fault("EGL config", "expected a config for desktop OpenGL, got none"))
 }
 
 #[cfg(test)]

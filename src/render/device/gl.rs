@@ -37,7 +37,7 @@ pub(crate) use self::object::{Buffer, Framebuffer, Program, Texture, TextureDesc
 pub(crate) use self::staging::{ReadbackView, StagingBuffer};
 pub(crate) use self::timer::PassTimer;
 use super::egl::{Context, CurrentContext};
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result, fault, fault_in};
 
 /// OpenGL constants that other modules use.
 pub(crate) use glow::{
@@ -248,18 +248,18 @@ impl Gl {
     /// `DeviceLost` when the context is lost.
     pub(crate) fn check(&self, stage: &'static str) -> Result<()> {
         if let Some(reason) = self.skipped_error.take() {
-            return Err(fault_in(stage)(reason));
+            return Err(fault(stage, reason));
         }
         let gl = self.functions().map_err(fault_in(stage))?;
         // SAFETY: a query without side effects on memory; the context is current.
         match unsafe { gl.get_error() } {
             glow::NO_ERROR => Ok(()),
-            glow::OUT_OF_MEMORY => Err(fault_in(stage)("OpenGL is out of memory")),
+            glow::OUT_OF_MEMORY => Err(fault(stage, "OpenGL is out of memory")),
             glow::CONTEXT_LOST => Err(self.loss(stage).unwrap_or_else(|| {
                 let reason = "OpenGL reports a lost context".into();
                 Error::DeviceLost { stage, reason }
             })),
-            error => Err(fault_in(stage)(format!("OpenGL error 0x{error:04X}"))),
+            error => Err(fault(stage, format!("OpenGL error 0x{error:04X}"))),
         }
     }
 
@@ -362,7 +362,7 @@ impl Gl {
     /// Compiles and links a program from pairs of shader stage and source.
     pub(crate) fn program(self: &Rc<Self>, label: &str, stages: &[(u32, &str)]) -> Result<Program> {
         let gl = self.functions()?;
-        let to_fault = |log: String| fault_in("shader")(format!("{label}: {log}"));
+        let to_fault = |log: String| fault("shader", format!("{label}: {log}"));
         // SAFETY: new objects; the shaders are flagged for deletion and live until the program is deleted.
         unsafe {
             let name = gl.create_program().map_err(fault_in("shader"))?;
@@ -436,9 +436,7 @@ impl Gl {
         };
         match status {
             glow::FRAMEBUFFER_COMPLETE => self.check("framebuffer").map(|()| framebuffer),
-            status => {
-                Err(fault_in("framebuffer")(format!("expected a complete framebuffer, got status 0x{status:04X}")))
-            }
+            status => Err(fault("framebuffer", format!("expected a complete framebuffer, got status 0x{status:04X}"))),
         }
     }
 
@@ -477,7 +475,7 @@ impl Gl {
         let gl = self.functions()?;
         let address = self.context.address("glGetMultisamplefv");
         if address.is_null() {
-            return Err(fault_in("samples")("glGetMultisamplefv is missing"));
+            return Err(fault("samples", "glGetMultisamplefv is missing"));
         }
         // SAFETY: the address is that of glGetMultisamplefv, which has this signature and writes two floats.
         unsafe {

@@ -22,7 +22,7 @@ use crate::scene_data::geometry;
 use crate::shaders;
 use crate::types::{FrameParams, FrameStats, VisibilityId};
 use crate::uniforms::frame::FrameUniforms;
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault};
 
 /// Attribute to read back. Blended triangles are ignored. The ground is part of the depth only; the other fields ignore
 /// it.
@@ -113,7 +113,7 @@ impl AovReader {
         let bytes = 4 * words_per_pixel * u64::from(desc.width) * u64::from(desc.height);
         upload_frame(buffers, &uniforms);
         if let Aov::Values { .. } = field {
-            let values = buffers.values.as_ref().ok_or_else(|| fault_in("aov")("no values were uploaded"))?;
+            let values = buffers.values.as_ref().ok_or_else(|| fault("aov", "no values were uploaded"))?;
             values.view.bind(VALUE_UNIT);
         }
         let mut recorder = PassRecorder { gl: &gl, stats: &mut FrameStats::default() };

@@ -21,7 +21,7 @@ use crate::resources::scene_buffers::SceneBuffers;
 use crate::resources::target_desc::TargetDesc;
 use crate::types::{FrameImage, FrameParams, FrameStats, RasterBackend};
 use crate::uniforms::frame::{FrameUniforms, camera_is_above_ground, clip_from_positions, ground_is_behind_scene};
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result, fault};
 
 impl Renderer {
     /// Draws one frame of the current buffers and waits for its pixels.
@@ -104,12 +104,12 @@ impl Renderer {
         let desc = TargetDesc { culling: buffers.culling(), ..desc };
         self.ensure_target(desc)?;
         let programs = buffers.sample_programs(desc.samples, &mut |source| self.programs.program(source))?;
-        let Some(target) = self.targets.last() else { return Err(fault_in("draw")("no target")) };
+        let Some(target) = self.targets.last() else { return Err(fault("draw", "no target")) };
         let slot = if is_read { Some(target.readback_ring.acquire(self.frame_timeout)?) } else { None };
         // If a pass fails or panics, the images are undefined. The target is removed from the cache until all passes are
         // recorded.
         self.last_frame = None;
-        let Some(target) = self.targets.pop() else { return Err(fault_in("draw")("no target")) };
+        let Some(target) = self.targets.pop() else { return Err(fault("draw", "no target")) };
         let draws_ground = must_draw_ground(buffers, params);
         target.draw_region.set(draw_region(buffers, params, draws_ground));
         let mut stats = FrameStats { samples: desc.samples, ..FrameStats::default() };

@@ -28,7 +28,7 @@ use crate::shaders;
 use crate::types::{BlurMethod, DevicePreference, FrameParams, FrameStats, RendererInfo, VisibilityId};
 use crate::uniforms::frame::FrameUniforms;
 use modalcast_model::deform::DeformedSurface;
-use modalcast_model::error::{Result, fault_in, invalid};
+use modalcast_model::error::{Result, fault, invalid};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{PixelRect, Scene};
 
@@ -254,7 +254,7 @@ impl Renderer {
     /// `Fault` if no frame was drawn, its images were freed, or the device does not finish in time.
     pub fn read_visibility(&mut self) -> Result<Vec<VisibilityId>> {
         let _current = self.gl.make_current()?;
-        let no_frame = || fault_in("visibility readback")("no frame was drawn, or its images were freed");
+        let no_frame = || fault("visibility readback", "no frame was drawn, or its images were freed");
         let frame = self.last_frame.as_ref().ok_or_else(no_frame)?;
         let program = self.programs.program(shaders::readback::visibility_readback(frame.desc.samples))?;
         let target = self.targets.iter().find(|target| target.desc == frame.desc).ok_or_else(no_frame)?;
@@ -305,7 +305,7 @@ fn check_length(name: &str, numbers: &[f32], expected: u64) -> Result<()> {
     if numbers.len() as u64 == expected {
         return Ok(());
     }
-    Err(fault_in("upload")(format!("expected {expected} numbers of {name}, got {}", numbers.len())))
+    Err(fault("upload", format!("expected {expected} numbers of {name}, got {}", numbers.len())))
 }
 
 /// Normalized device coordinates of a point in a pixel. `pixel` counts row by row from the top left. `sample_position` is

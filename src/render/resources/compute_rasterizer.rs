@@ -11,7 +11,7 @@ use std::rc::Rc;
 use super::programs::ProgramCompiler;
 use crate::device::gl::{self, Buffer, Gl, Program};
 use crate::shaders::ShaderOptions;
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::raster::{GlBuffer, Rasterizer};
 use modalcast_model::scene::{Scene, Viewport};
 
@@ -162,7 +162,7 @@ impl ComputeRasterizer {
         let keys = keys.as_ref().map(|(frame_viewport, buffer)| (*frame_viewport, buffer));
         // A panic is converted to an error, so that the caller disables the rasterizer and draws this frame with OpenGL.
         catch_unwind(AssertUnwindSafe(|| self.rasterizer.borrow_mut().draw(depths, keys)))
-            .unwrap_or_else(|_| Err(fault_in("rasterize")("the compute rasterizer panicked")))
+            .unwrap_or_else(|_| Err(fault("rasterize", "the compute rasterizer panicked")))
     }
 
     /// Input buffer and program of the first blur pass; none without shadow output.

@@ -28,7 +28,7 @@ const ONE_PERCENT_CHANGED: &str = ", 1 % changed";
 
 /// The parts of a step that are measured of cuBLAS and of the kernels of the thesis, each with the name suffix of its
 /// variant.
-const PARTS: [(kernels::Part, &str); 2] = [(kernels::Part::Uq, UQ_SUFFIX), (kernels::Part::Whole, "")];
+const PARTS: [(kernels::StepPart, &str); 2] = [(kernels::StepPart::Uq, UQ_SUFFIX), (kernels::StepPart::Whole, "")];
 
 /// Whether the variant of this name computes only a part of a step. Its time is not comparable with whole steps.
 pub(super) fn is_partial_step(name: &str) -> bool {
@@ -205,7 +205,7 @@ fn cublas_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: Varian
         CublasMethod::Instances => is_instanced,
         _ => scene.domains.len() > 1,
     };
-    let candidate = |method: CublasMethod, (part, suffix): (kernels::Part, &str)| {
+    let candidate = |method: CublasMethod, (part, suffix): (kernels::StepPart, &str)| {
         let label = VariantLabel::new(format!("{}{suffix}", method.name().replace('_', " ")), Backend::Cuda, scene);
         let create: BenchmarkFactory = Box::new(move |device, scene, states| {
             Ok(Box::new(CublasBenchmark::new(device, scene, states, (method, part))?))
@@ -223,12 +223,12 @@ fn thesis_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: Varian
         let label = VariantLabel::new(name, Backend::Cuda, scene);
         make_candidate(is_selected, label, |label| Ok(BenchmarkVariant::new(label, scene, device, create)))
     };
-    let single = |(part, suffix): (kernels::Part, &str)| {
+    let single = |(part, suffix): (kernels::StepPart, &str)| {
         let create: BenchmarkFactory =
             Box::new(move |device, scene, states| Ok(Box::new(ThesisBenchmark::single(device, scene, states, part)?)));
         candidate(format!("thesis single{suffix}"), create)
     };
-    let multi = |split: KernelSplit, (part, suffix): (kernels::Part, &str)| {
+    let multi = |split: KernelSplit, (part, suffix): (kernels::StepPart, &str)| {
         let create: BenchmarkFactory = Box::new(move |device, scene, states| {
             Ok(Box::new(ThesisBenchmark::multi(device, scene, states, (split, part))?))
         });

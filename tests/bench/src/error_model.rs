@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use rayon::prelude::*;
 
 use super::workloads::with_deformation;
-use modalcast_compute::storage::bound::{ErrorBound, ErrorBoundInput, ShapeErrorModel, norm};
+use modalcast_compute::storage::bound::{ErrorBound, ErrorBoundInput, ShapeErrorModel, linear_norm_bound};
 use modalcast_compute::storage::{
     QUAD, SplitCoordinates, TILE_QUADS, TensorCoreError, TiledModes, Truncation, TruncationInput, max_row_norms,
 };
@@ -95,7 +95,7 @@ impl ErrorModel {
             // Tasks of 64 domains, because scheduling a task costs more than one domain.
             domains.par_iter_mut().enumerate().with_min_len(64).for_each(|(domain, truncation)| {
                 let max_row_norms = &max_row_norms[scene.domains[domain].shape];
-                let norm = norm(&state.composed_transform(scene, domain));
+                let norm = linear_norm_bound(&state.composed_transform(scene, domain));
                 truncation.update(TruncationInput { q: state.q_of(scene, domain), max_row_norms, norm }, *budget);
             });
         }

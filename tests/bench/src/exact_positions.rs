@@ -81,7 +81,8 @@ pub fn reference_vertices(scene: &Scene, state: &SceneState) -> Vec<ReferenceVer
         let sums = sum_modes(vertices.clone(), ModeEntries::Exact(&shape.modes), q);
         let (transform, absolute_transform) =
             (truth.transform_of(scene, domain), truth.absolute_transform_of(scene, domain));
-        let (roundings, is_follower) = (q.len() + EXTRA_ROUNDINGS, scene.transform_roots.frame_of(domain).is_some());
+        let (roundings, is_follower) =
+            (q.len() + EXTRA_ROUNDINGS, scene.transform_roots.root_from_domain(domain).is_some());
         let rest = shape.mesh.rest_positions()[vertices].iter().map(|rest| rest.map(f64::from));
         for ((rest, sum), references) in rest.zip(&sums).zip(references) {
             let position = transform_point(&transform, std::array::from_fn(|axis| rest[axis] + sum.u[axis]));

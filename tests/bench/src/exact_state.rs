@@ -42,7 +42,7 @@ impl ExactState {
     /// `world_from_domain` of a domain. For a follower, this is the product of the transform of its root and its frame.
     pub fn transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
         let root_transform = &self.transforms[scene.transform_roots.root_of(domain)];
-        match scene.transform_roots.frame_of(domain) {
+        match scene.transform_roots.root_from_domain(domain) {
             None => *root_transform,
             Some(frame) => multiply_transforms(root_transform, &frame.0.map(f64::from)),
         }
@@ -52,7 +52,7 @@ impl ExactState {
     /// exact product.
     pub(super) fn absolute_transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
         let root_transform = self.transforms[scene.transform_roots.root_of(domain)].map(f64::abs);
-        match scene.transform_roots.frame_of(domain) {
+        match scene.transform_roots.root_from_domain(domain) {
             None => root_transform,
             Some(frame) => multiply_transforms(&root_transform, &frame.0.map(|entry| f64::from(entry.abs()))),
         }

@@ -24,7 +24,7 @@ use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, DeviceBuffer, KernelKind};
 use crate::gpu::tables::change_list::{ChangeListLengths, ChangedDomains, max_changed_domains};
 use crate::gpu::tables::device_tables::{CudaDeformerOptions, DeviceTables};
-use crate::gpu::tables::layout::Header;
+use crate::gpu::tables::layout::StepHeader;
 use crate::gpu::tables::plan::{BufferRole, DeformPlan, plan_from_tables};
 use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
 use modalcast_model::error::{Error, Result};
@@ -220,12 +220,12 @@ impl CudaDeformer {
         // positions, so the driver must not discard the contents.
         let keeps_contents = list_lengths.is_some() || kernels.normals.is_some() || kernels.bounds.boxes.is_some();
         let displacements = self.displacements.as_ref().map_or(0, DeviceBuffer::address);
-        let header = Header { displacements, ..header };
+        let header = StepHeader { displacements, ..header };
         let access = if keeps_contents { MapAccess::ReadWrite } else { MapAccess::WriteDiscard };
         step_slot.host_ms = submitted.elapsed().as_secs_f64() * 1e3;
         self.output.with_addresses(&self.device, OutputAccess { set: target.output, access }, |addresses| {
             step_slot.record_mapped(&self.device)?;
-            let header = Header {
+            let header = StepHeader {
                 positions: addresses.positions,
                 normals: addresses.normals,
                 tangents: addresses.tangents,
@@ -294,9 +294,11 @@ impl CudaDeformer {
     /// Copies to `surface` those of the requested attributes of the last step that it does not yet have.
     fn download_attributes(&mut self, attributes: VertexAttributes) -> Result<()> {
         let host_attributes = self.host_attributes;
-        if (attributes.positions || attributes.normals) && !host_attributes.contains(VertexAttributes::VERTICES) {
+        if (attributes.positions || attributes.normals)
+            && !host_attributes.contains(VertexAttributes::POSITIONS_AND_NORMALS)
+        {
             self.download_vertices()?;
-            self.host_attributes = self.host_attributes.union(VertexAttributes::VERTICES);
+            self.host_attributes = self.host_attributes.union(VertexAttributes::POSITIONS_AND_NORMALS);
         }
         if attributes.displacements && !host_attributes.displacements {
             self.download_displacements()?;
@@ -329,15 +331,15 @@ impl CudaDeformer {
 }
 
 /// The header of a step, without the addresses of its outputs.
-fn header(target: &StepTarget, list_lengths: Option<ChangeListLengths>, last_full_step: u32) -> Header {
+fn header(target: &StepTarget, list_lengths: Option<ChangeListLengths>, last_full_step: u32) -> StepHeader {
     let lengths = list_lengths.unwrap_or_default();
-    Header {
+    StepHeader {
         output_step: if list_lengths.is_some() { target.shown_step } else { 0 },
         last_full_step,
         step: target.step,
         change_count: lengths.change_count,
         dirty_tile_count: lengths.dirty_tile_count,
-        ..Header::default()
+        ..StepHeader::default()
     }
 }
 
@@ -365,10 +367,10 @@ impl Deformer for CudaDeformer {
     }
 
     fn surface(&mut self) -> Result<&DeformedSurface> {
-        self.read(VertexAttributes::ALL)
+        self.surface_with(VertexAttributes::ALL)
     }
 
-    fn read(&mut self, attributes: VertexAttributes) -> Result<&DeformedSurface> {
+    fn surface_with(&mut self, attributes: VertexAttributes) -> Result<&DeformedSurface> {
         self.download_attributes(attributes)?;
         Ok(self.surface.surface())
     }

@@ -7,7 +7,7 @@ use cudarc::driver::result;
 use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, DeviceBuffer, PinnedBuffer, PinnedUse};
 use crate::gpu::tables::input_packing::{InputPacker, InputSizes, InputWriter, transform_links};
-use crate::gpu::tables::layout::Header;
+use crate::gpu::tables::layout::StepHeader;
 use crate::gpu::tables::staging::SliceWriter;
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::SceneState;
@@ -81,7 +81,7 @@ impl StepInputs {
 
     pub(crate) fn addresses(&self) -> InputAddresses {
         let header = self.values.address();
-        let transforms = header + size_of::<Header>() as u64;
+        let transforms = header + size_of::<StepHeader>() as u64;
         let q = transforms + self.sizes.transforms;
         let retained_counts = q + self.sizes.q;
         InputAddresses {
@@ -100,13 +100,13 @@ impl StepInputs {
     ///
     /// # Errors
     /// `Fault` when the device fails.
-    pub fn write(&mut self, staging: &mut StagingBuffer, header: &Header, state: &SceneState) -> Result<()> {
+    pub fn write(&mut self, staging: &mut StagingBuffer, header: &StepHeader, state: &SceneState) -> Result<()> {
         self.writer.write(staging.as_mut_slice()?, header, state);
         Ok(())
     }
 
     /// Writes only the header.
-    pub(crate) fn write_header(staging: &mut StagingBuffer, header: &Header) -> Result<()> {
+    pub(crate) fn write_header(staging: &mut StagingBuffer, header: &StepHeader) -> Result<()> {
         SliceWriter::new(staging.as_mut_slice()?).put(std::slice::from_ref(header));
         Ok(())
     }
@@ -126,7 +126,7 @@ impl StepInputs {
             return Err(Error::Fault { stage: "upload", reason });
         }
         let bytes = match part {
-            InputPart::Header => &bytes[..size_of::<Header>()],
+            InputPart::Header => &bytes[..size_of::<StepHeader>()],
             InputPart::All => bytes,
         };
         let _current = device.enter()?;

@@ -19,7 +19,7 @@ use crate::gpu::launch::Device;
 use crate::gpu::launch::cleanup::with_cleanup;
 use crate::gpu::launch::context::CurrentContext;
 use crate::gpu::launch::error::cuda_error;
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result, fault, fault_in};
 use modalcast_model::raster::GlBuffer;
 
 const STAGE: &str = "interop";
@@ -139,7 +139,7 @@ impl RegisteredBuffer {
             .result()
             .map_err(cuda_error(STAGE))?;
         if (bytes as u64) < expected {
-            return Err(fault_in(STAGE)(format!("buffer {name}: expected {expected} bytes, got {bytes}")));
+            return Err(fault(STAGE, format!("buffer {name}: expected {expected} bytes, got {bytes}")));
         }
         Ok(address)
     }
@@ -247,11 +247,11 @@ mod tests {
             let result = catch_unwind(AssertUnwindSafe(|| run_mapped(&[&first, &second], work, unmap)));
             (result, first.get(), second.get())
         };
-        let check_mapped = || if first.get() && second.get() { Ok(()) } else { Err(fault_in("work")("not mapped")) };
+        let check_mapped = || if first.get() && second.get() { Ok(()) } else { Err(fault("work", "not mapped")) };
         assert!(matches!(run(&check_mapped, Ok(())), (Ok(Ok(())), false, false)));
-        assert!(matches!(run(&|| Err(fault_in("work")("wrong")), Ok(())), (Ok(Err(_)), false, false)));
+        assert!(matches!(run(&|| Err(fault("work", "wrong")), Ok(())), (Ok(Err(_)), false, false)));
         assert!(matches!(run(&|| panic!("injected"), Ok(())), (Err(_), false, false)));
-        let unmap_error = Err(fault_in(STAGE)("unmap"));
+        let unmap_error = Err(fault(STAGE, "unmap"));
         let result = run(&|| Ok(()), unmap_error);
         assert!(matches!(result, (Ok(Err(_)), true, true)), "expected mapped buffers after a failed unmap");
         assert_eq!(unmap_calls.get(), 4);

@@ -4,7 +4,7 @@ use super::interop::{GlInterop, MapAccess, Mapping, RegisteredBuffer, with_mappe
 use super::pinned_surface::SurfaceLists;
 use crate::gpu::launch::{Device, DeviceBuffer, download};
 use crate::gpu::tables::plan::{BufferRole, DeformPlan};
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::raster::{GlBuffer, GlVertexBuffers};
 
 /// Device addresses of the outputs. Those of OpenGL's buffers are valid only while the buffers are mapped. `tangents`
@@ -78,7 +78,7 @@ impl RegisteredOutputs {
     /// # Errors
     /// `Fault` with the buffer that cannot be registered. No buffer remains registered.
     fn register(device: &Device, buffers: GlVertexBuffers, sizes: [u64; 3]) -> Result<Self> {
-        let missing_tangents = || fault_in("interop")("expected an OpenGL buffer for tangents, got none");
+        let missing_tangents = || fault("interop", "expected an OpenGL buffer for tangents, got none");
         let [positions, normals, tangents] = sizes;
         let interop = GlInterop::open(device, &buffers.positions)?;
         let register_buffer = |buffer, bytes| interop.register(device, GlBuffer { bytes, ..buffer });
@@ -199,7 +199,7 @@ impl OutputBuffers {
     pub(super) fn owned_addresses(&self, set: usize) -> Result<OutputAddresses> {
         match self {
             Self::Owned(sets) => Ok(sets[set].addresses()),
-            Self::Shared(_) => Err(fault_in("fetch")("expected buffers of the deformer, got OpenGL's buffers")),
+            Self::Shared(_) => Err(fault("fetch", "expected buffers of the deformer, got OpenGL's buffers")),
         }
     }
 }

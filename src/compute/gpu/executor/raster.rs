@@ -29,7 +29,7 @@ use self::variant::{FUNCTIONS, OPAQUE_FUNCTIONS, SOURCE};
 pub use self::variant::{RasterGranularity, RasterVariant};
 use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, DeviceBuffer, LaunchOrder, launch_kernel};
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault};
 use modalcast_model::raster::CutOuts;
 use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
@@ -100,7 +100,7 @@ impl RasterFunctions {
     pub fn new(device: &Device, variant: RasterVariant, has_cut_outs: bool) -> Result<Self> {
         let names: &[&str] = if has_cut_outs { &FUNCTIONS } else { &OPAQUE_FUNCTIONS };
         let mut functions = device.functions(names, SOURCE, &variant.defines(has_cut_outs))?.into_iter();
-        let mut next = || functions.next().ok_or_else(|| fault_in("load kernel")("expected another function"));
+        let mut next = || functions.next().ok_or_else(|| fault("load kernel", "expected another function"));
         Ok(Self {
             variant,
             raster: next()?,

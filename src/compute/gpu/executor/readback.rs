@@ -207,7 +207,7 @@ impl ReadbackPool {
 
     /// Waits for a copy. Returns its surface and the number of its readback.
     pub(super) fn wait(&self, readback: &VertexReadback) -> Result<(Arc<DeformedSurface>, Option<u64>)> {
-        let slot = self.slots.iter().find(|slot| readback.is_of(slot.surface.surface()));
+        let slot = self.slots.iter().find(|slot| readback.writes_to(slot.surface.surface()));
         let unknown_readback = || Error::Fault { stage: STAGE, reason: "expected a readback of this deformer".into() };
         let slot = slot.ok_or_else(unknown_readback)?;
         slot.ready.synchronize().map_err(cuda_error(STAGE))?;

@@ -13,7 +13,7 @@ use super::launchers::normals::NormalsKernel;
 use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, PinnedBuffer, PinnedUse, capture};
 use crate::gpu::tables::box_keys::{bounds_from_keys, oriented_bounds_from_keys};
-use crate::gpu::tables::layout::Header;
+use crate::gpu::tables::layout::StepHeader;
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{BoundingBox, OrientedBounds};
 
@@ -135,7 +135,7 @@ impl StepSubmission<'_> {
             kernels.bounds.launch(device, inputs, &kernels.deform)?;
             kernels.normals.as_ref().map_or(Ok(()), |normals| normals.launch(device, inputs))?;
         }
-        let bounds_address = inputs.addresses().header + std::mem::offset_of!(Header, bounds) as u64;
+        let bounds_address = inputs.addresses().header + std::mem::offset_of!(StepHeader, bounds) as u64;
         let keys = bounds_keys.as_mut_slice()?;
         // SAFETY: the header has twelve words of bounds and `keys` at most as many. The deformer waits for the step
         // before it reads or drops them.

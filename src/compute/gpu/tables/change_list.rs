@@ -40,7 +40,8 @@ pub(crate) fn max_change_entries(scene: &Scene) -> usize {
 /// own, so only its tiles are listed. But exact normals and boxes need the step of its last change.
 fn needs_entry(scene: &Scene, domain: usize) -> bool {
     let features = scene.features;
-    let has_own_values = || scene.layout.domains[domain].rank > 0 || scene.transform_roots.frame_of(domain).is_none();
+    let has_own_values =
+        || scene.layout.domains[domain].rank > 0 || scene.transform_roots.root_from_domain(domain).is_none();
     !features.followers || features.exact_normals || features.boxes || has_own_values()
 }
 

@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::layout::{Header, TransformLink};
+use super::layout::{StepHeader, TransformLink};
 use super::staging::{SliceWriter, fill_parts};
 use super::work::{CoordinateLayout, DomainTiles};
 use crate::storage::{Truncation, TruncationInput, bound, max_row_norms, modes_per_chunk};
@@ -61,7 +61,7 @@ impl InputSizes {
     }
 
     pub(crate) const fn total(self) -> u64 {
-        size_of::<Header>() as u64 + self.transforms + self.q + self.retained_counts + self.retained
+        size_of::<StepHeader>() as u64 + self.transforms + self.q + self.retained_counts + self.retained
     }
 }
 
@@ -81,7 +81,7 @@ impl InputWriter {
     }
 
     /// Writes a full step to `buffer`, which has `InputSizes::total` bytes.
-    pub fn write(&mut self, buffer: &mut [f32], header: &Header, state: &SceneState) {
+    pub fn write(&mut self, buffer: &mut [f32], header: &StepHeader, state: &SceneState) {
         let mut writer = SliceWriter::new(buffer);
         writer.put(std::slice::from_ref(header));
         writer.put(&state.transforms);
@@ -207,7 +207,7 @@ impl ChunkSelection {
             // Without modes nothing can be truncated, and the norm of T does not matter.
             if scene.rank_of(domain) > 0 {
                 let max_row_norms = &max_row_norms[scene.domains[domain].shape];
-                let norm = bound::norm(&state.composed_transform(scene, domain));
+                let norm = bound::linear_norm_bound(&state.composed_transform(scene, domain));
                 truncation.update(TruncationInput { q: state.q_of(scene, domain), max_row_norms, norm }, budget);
             }
         };
@@ -252,7 +252,7 @@ mod tests {
     /// The words of a step by a sequential reference implementation.
     fn expected_words(packer: &InputPacker, state: &SceneState) -> Vec<f32> {
         let scene = &packer.scene;
-        let mut words = vec![0.0; size_of::<Header>() / 4];
+        let mut words = vec![0.0; size_of::<StepHeader>() / 4];
         words.extend(state.transforms.iter().flat_map(|transform| transform.0));
         let q_offset = words.len();
         words.resize(q_offset + packer.coordinates.total, 0.0);
@@ -274,7 +274,7 @@ mod tests {
                 let (packer, state) = (packer_with_factors(&scene), state_with_distinct_values(&scene));
                 let mut words = vec![f32::NAN; InputSizes::of(&scene, &packer.coordinates).total() as usize / 4];
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(cores).build().expect("a thread pool");
-                pool.install(|| InputWriter::new(&packer).write(&mut words, &Header::default(), &state));
+                pool.install(|| InputWriter::new(&packer).write(&mut words, &StepHeader::default(), &state));
                 let mut expected = expected_words(&packer, &state);
                 assert!(words == expected, "{shapes} shapes, {cores} cores");
                 let changed_word = 24;

@@ -31,7 +31,7 @@ pub(crate) const TILE_CORNERS: u8 = 16;
 /// The start of a step's inputs; pointers are device addresses.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
-pub struct Header {
+pub struct StepHeader {
     pub positions: u64,
     pub normals: u64,
     pub tangents: u64,
@@ -240,7 +240,7 @@ pub(crate) struct NormalsArgs {
     pub reserved: u32,
 }
 
-const _: () = assert!(size_of::<Header>() == 112, "Header differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<StepHeader>() == 112, "StepHeader differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<WarpTile>() == 32, "WarpTile differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<MixedQuad>() == 16, "MixedQuad differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Change>() == 16, "Change differs from kernels/layout.cuh");
@@ -280,7 +280,7 @@ macro_rules! layout_constants {
 /// Every size, offset and constant that host and device share, with the host's value.
 pub fn layout_constants() -> Vec<LayoutConstant> {
     let mut list = layout_constants! {
-        Header {
+        StepHeader {
             positions, normals, tangents, displacements, output_step, last_full_step, step, change_count, dirty_tile_count,
             reserved, bounds
         }

@@ -61,7 +61,7 @@ fn error_ratios(shape: &Shape, storage: StorageType, input: &ErrorBoundInput) ->
     let model = ShapeErrorModel::new(shape, &tiles);
     let expected = positions_f64(shape, input);
     let bounds = |tile: usize| model.tile(tile, input).total();
-    assert!((0..tiles.count()).all(|tile| bounds(tile) <= model.domain(input).total()));
+    assert!((0..tiles.count()).all(|tile| bounds(tile) <= model.domain_bound(input).total()));
     [0, 1].map(|axis_shift| max_error_ratio(&sum_in_f32(shape, &tiles, input, axis_shift), &expected, bounds))
 }
 
@@ -94,7 +94,7 @@ fn bound_of_a_follower_holds_and_fails_for_a_wrong_frame() {
         let input = |transform| ErrorBoundInput { q: &q, transform, compensated: false };
         let follower = ComposedTransform { root, frame: Some(frame) };
         let tiles = TiledModes::new(&shape, StorageType::F32);
-        let bound = ShapeErrorModel::new(&shape, &tiles).domain(&input(follower));
+        let bound = ShapeErrorModel::new(&shape, &tiles).domain_bound(&input(follower));
         let expected = positions_f64(&shape, &input(follower));
         let ratio = |transform: ComposedTransform| {
             max_error_ratio(&sum_in_f32(&shape, &tiles, &input(transform), 0), &expected, |_| bound.total())
@@ -150,7 +150,7 @@ fn f16_columns_of_very_different_scales_keep_their_precision() {
         let q: Vec<f32> = (0..4).map(|other| if other == mode { 1.0 / scale(mode) } else { 0.0 }).collect();
         let input = ErrorBoundInput { q: &q, transform: Transform::IDENTITY.into(), compensated: false };
         assert!(error_ratios(&shape, StorageType::F16, &input)[0] <= 1.0);
-        assert!(ShapeErrorModel::new(&shape, &tiles).domain(&input).storage <= 1e-3, "mode {mode}");
+        assert!(ShapeErrorModel::new(&shape, &tiles).domain_bound(&input).storage <= 1e-3, "mode {mode}");
     }
 }
 
@@ -197,7 +197,7 @@ fn bounds_are_zero_for_sources_without_error() {
     let q = [0.3; 6];
     let bound = |storage, q: &[f32]| {
         let model = ShapeErrorModel::new(&shape, &TiledModes::new(&shape, storage));
-        model.domain(&ErrorBoundInput { q, transform: Transform::IDENTITY.into(), compensated: false })
+        model.domain_bound(&ErrorBoundInput { q, transform: Transform::IDENTITY.into(), compensated: false })
     };
     let f32_bound = bound(StorageType::F32, &q);
     assert_eq!((f32_bound.storage, f32_bound.coordinates), (0.0, 0.0));

@@ -246,7 +246,7 @@ fn merged_step_gives_the_state_of_all_its_steps() {
     let merged = steps
         .iter()
         .map(|raw| parse_step(&scene, raw))
-        .reduce(|older, newer| newer.merged_after(&older))
+        .reduce(|older, newer| newer.merged_with_older(&older))
         .expect("at least one step");
     let mut merged_state = SceneState::rest(&scene);
     merged_state.apply(&scene, &merged);

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use glow::HasContext as _;
 
 use super::Gl;
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault, fault_in};
 
 /// A fence: signaled once all commands before it are complete.
 #[derive(Debug)]
@@ -56,7 +56,7 @@ impl Fence {
         let start = Instant::now();
         while !self.poll(stage, limit.saturating_sub(start.elapsed()))? {
             if start.elapsed() >= limit {
-                return Err(fault_in(stage)(format!("the device did not finish within {limit:?}")));
+                return Err(fault(stage, format!("the device did not finish within {limit:?}")));
             }
         }
         Ok(())
@@ -74,7 +74,7 @@ impl Fence {
         match status {
             glow::ALREADY_SIGNALED | glow::CONDITION_SATISFIED => Ok(true),
             glow::TIMEOUT_EXPIRED => Ok(false),
-            _ => Err(self.gl.loss(stage).unwrap_or_else(|| fault_in(stage)("the wait for the device failed"))),
+            _ => Err(self.gl.loss(stage).unwrap_or_else(|| fault(stage, "the wait for the device failed"))),
         }
     }
 }

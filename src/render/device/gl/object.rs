@@ -6,7 +6,7 @@ use std::rc::Rc;
 use glow::HasContext as _;
 
 use super::Gl;
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault};
 use modalcast_model::raster::{GlBuffer, GlBufferOwner};
 
 /// A buffer object of fixed size.
@@ -93,7 +93,7 @@ impl<'a> ReadMapping<'a> {
             gl.map_buffer_range(glow::COPY_READ_BUFFER, 0, bytes as i32, glow::MAP_READ_BIT)
         };
         if pointer.is_null() {
-            return Err(fault_in("read")("the buffer cannot be mapped"));
+            return Err(fault("read", "the buffer cannot be mapped"));
         }
         Ok(Self { gl, name, pointer, bytes })
     }
@@ -156,7 +156,7 @@ impl Buffer {
     /// `Fault` when the buffer is smaller or cannot be mapped.
     pub(crate) fn read(&self, bytes: usize) -> Result<Vec<u8>> {
         if bytes as u64 > self.bytes {
-            return Err(fault_in("read")(format!("expected at most {} bytes, got {bytes}", self.bytes)));
+            return Err(fault("read", format!("expected at most {} bytes, got {bytes}", self.bytes)));
         }
         if bytes == 0 {
             return Ok(Vec::new());
@@ -226,10 +226,10 @@ impl Texture {
     pub(crate) fn upload_pixels(&self, level: u32, layer: u32, size: [u32; 2], rgba: &[u8]) -> Result<()> {
         let [width, height] = size.map(|side| side as i32);
         if rgba.len() != 4 * width as usize * height as usize {
-            return Err(fault_in("texture")(format!(
-                "expected {width} x {height} pixels of 4 bytes, got {} bytes",
-                rgba.len()
-            )));
+            return Err(fault(
+                "texture",
+                format!("expected {width} x {height} pixels of 4 bytes, got {} bytes", rgba.len()),
+            ));
         }
         let gl = self.gl().functions()?;
         let pixels = glow::PixelUnpackData::Slice(Some(rgba));

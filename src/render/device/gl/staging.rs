@@ -11,7 +11,7 @@ use glow::HasContext as _;
 
 use super::object::BufferObject;
 use super::{Buffer, Gl};
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault, fault_in};
 
 /// A buffer that the device writes and the host reads.
 #[derive(Debug)]
@@ -67,7 +67,7 @@ impl Gl {
         };
         self.check("readback")?;
         if mapping.is_null() {
-            return Err(fault_in("readback")(format!("cannot map {bytes} bytes")));
+            return Err(fault("readback", format!("cannot map {bytes} bytes")));
         }
         Ok(StagingBuffer { buffer, mapping: Some(mapping.cast_const()), reader })
     }
@@ -89,7 +89,7 @@ impl StagingBuffer {
     /// `Fault` when the buffer is smaller or cannot be mapped.
     pub(crate) fn view(&self, bytes: usize) -> Result<ReadbackView> {
         if bytes as u64 > self.buffer.bytes {
-            return Err(fault_in("readback")(format!("expected at most {} bytes, got {bytes}", self.buffer.bytes)));
+            return Err(fault("readback", format!("expected at most {} bytes, got {bytes}", self.buffer.bytes)));
         }
         let Some(pointer) = self.mapping else { return self.buffer.read(bytes).map(ReadbackView::Copied) };
         // No message is sent. The disconnect signals that the reader is done.
@@ -114,7 +114,7 @@ impl StagingBuffer {
         view.bytes()
             .get(range)
             .map(<[u8]>::to_vec)
-            .ok_or_else(|| fault_in("readback")("expected a range that does not end before its start"))
+            .ok_or_else(|| fault("readback", "expected a range that does not end before its start"))
     }
 }
 

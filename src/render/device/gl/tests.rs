@@ -128,7 +128,7 @@ fn timer_queries_end_when_their_commands_fail_or_panic() {
     let mut gl = open();
     Rc::get_mut(&mut gl).expect("not shared").limits.software = false;
     let time_commands = |commands: &dyn Fn() -> Result<()>| gl.time_pass("test", Duration::from_secs(60), commands);
-    time_commands(&|| Err(fault_in("test")("injected"))).expect_err("the error of the commands");
+    time_commands(&|| Err(fault("test", "injected"))).expect_err("the error of the commands");
     assert!(catch_unwind(AssertUnwindSafe(|| time_commands(&|| panic!("injected")))).is_err());
     let timer = time_commands(&|| Ok(())).expect("a timer");
     gl.wait("test", Duration::from_secs(60)).expect("completed commands");

@@ -13,7 +13,7 @@ use modalcast_compute::gpu::launchers::{
     ApplyKernel, BoundsKernel, ChangeListLengths, ChangedDomains, DeformKernel, DeviceTables, NormalsKernel,
     PositionKernels, plan_from_tables,
 };
-use modalcast_compute::gpu::step_input::{Header, InputPart, StagingBuffer, StepInputs};
+use modalcast_compute::gpu::step_input::{InputPart, StagingBuffer, StepHeader, StepInputs};
 use modalcast_compute::gpu::{BufferRole, CudaDeformerOptions, DeformPlan, Device, KernelDescriptor, KernelKind};
 use modalcast_compute::storage::modes_per_chunk;
 use modalcast_model::backend_settings::BatchPolicy;
@@ -134,7 +134,7 @@ impl DeformerBenchmark {
         let mut staging = None;
         for state in states {
             // Step 1 computes all domains.
-            let header = Header { last_full_step: 1, step: 1, ..benchmark.header() };
+            let header = StepHeader { last_full_step: 1, step: 1, ..benchmark.header() };
             let mut inputs = StepInputs::new(device, benchmark.deform.packer())?;
             let staging = match &mut staging {
                 Some(staging) => staging,
@@ -154,7 +154,7 @@ impl DeformerBenchmark {
         let mut apply =
             ApplyKernel::new(device, self.deform.packer(), self.plan.kernel(KernelKind::Apply).ok_or_else(too_many)?)?;
         let mut change_list = apply.allocate_list(device)?;
-        let full_step = Header { last_full_step: 1, ..self.header() };
+        let full_step = StepHeader { last_full_step: 1, ..self.header() };
         for (inputs, state) in self.step_inputs.iter_mut().zip(states) {
             let mut staging = inputs.allocate_staging(device)?;
             let lengths = apply.write(
@@ -165,7 +165,7 @@ impl DeformerBenchmark {
             )?;
             let ChangeListLengths { change_count, dirty_tile_count } = lengths.ok_or_else(too_many)?;
             // The output shows step 1. Step 2 changes the listed domains.
-            let header = Header { output_step: 1, step: 2, change_count, dirty_tile_count, ..full_step };
+            let header = StepHeader { output_step: 1, step: 2, change_count, dirty_tile_count, ..full_step };
             upload_step(device, (inputs, &mut staging), &header, state)?;
             // SAFETY: `change_list` was written above with the packer that `deform` and `inputs` use. The next
             // statement waits for the kernel.
@@ -175,11 +175,11 @@ impl DeformerBenchmark {
         Ok(())
     }
 
-    fn header(&self) -> Header {
+    fn header(&self) -> StepHeader {
         let [positions, normals, tangents, _] = output_bytes(&self.plan);
         let base = self.outputs.address();
         debug_assert!(positions + normals + tangents > 0);
-        Header {
+        StepHeader {
             positions: base,
             normals: base + positions,
             tangents: base + positions + normals,
@@ -189,7 +189,7 @@ impl DeformerBenchmark {
             } else {
                 base + positions + normals + tangents
             },
-            ..Header::default()
+            ..StepHeader::default()
         }
     }
 
@@ -237,7 +237,7 @@ fn remove_defines(kernel: &mut KernelDescriptor, step_outputs: StepOutputs) {
 fn upload_step(
     device: &Device,
     (inputs, staging): (&mut StepInputs, &mut StagingBuffer),
-    header: &Header,
+    header: &StepHeader,
     state: &SceneState,
 ) -> Result<()> {
     inputs.write(staging, header, state)?;

@@ -14,14 +14,14 @@ use modalcast_model::scene::{Scene, SceneState};
 /// The part of a step that a kernel benchmark launches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Part {
+pub enum StepPart {
     /// u = U q alone. For validation, the host computes x = T (x0 + u) in f64.
     Uq,
     /// u = U q and the vertex update.
     Whole,
 }
 
-impl Part {
+impl StepPart {
     /// The name of a benchmark that launches this part.
     pub(super) fn benchmark_name(self, name: &str) -> String {
         match self {

@@ -35,7 +35,7 @@ pub use batch_mma::BatchMmaBenchmark;
 pub use cublas::{CublasBenchmark, CublasMethod, cublas_version};
 pub use deformer_kernels::{BenchmarkStep, DeformerBenchmark, StepOutputs};
 pub use device_bandwidth::{DeviceBandwidth, measure_bandwidth};
-pub use input_sets::Part;
+pub use input_sets::StepPart;
 pub use kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 pub use overlap::{HostWrite, Overlap, measure_overlap, time_host_writes};
 pub use raster::{RasterBenchmark, RasterCounts, RasterMesh};

@@ -18,7 +18,7 @@ use crate::workloads::Workload;
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::{PinnedBuffer, PinnedUse};
 use modalcast_compute::gpu::step_input::{
-    Header, InputPacker, InputWriter, PARALLEL_THRESHOLD, StepInputs, parallel_copy,
+    InputPacker, InputWriter, PARALLEL_THRESHOLD, StepHeader, StepInputs, parallel_copy,
 };
 use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, MAX_STEPS_IN_FLIGHT};
 use modalcast_model::deform::{DeformedSurface, Deformer as _, VertexAttributes};
@@ -97,7 +97,7 @@ pub fn measure_overlap(
     let [step_us, copy_out_us] = time_step_and_readback(&mut deformer, states, steps)?;
     let (bytes_in, [write_one_core_us, write_us]) = time_input_writes(device, scene, states, steps)?;
     let graph_us = time_graph(device, &deformer, steps)?;
-    let readback = deformer.readback(VertexAttributes::VERTICES)?;
+    let readback = deformer.readback(VertexAttributes::POSITIONS_AND_NORMALS)?;
     let surface = deformer.wait_readback(&readback)?;
     Ok(Overlap {
         steps,
@@ -130,7 +130,7 @@ fn run_serial(
 ) -> Result<()> {
     for step in 0..steps {
         deformer.deform(&states[step % states.len()])?;
-        let readback = deformer.readback(VertexAttributes::VERTICES)?;
+        let readback = deformer.readback(VertexAttributes::POSITIONS_AND_NORMALS)?;
         on_surface(step, &*deformer.wait_readback(&readback)?);
     }
     Ok(())
@@ -148,7 +148,7 @@ fn run_pipelined(
         let current = match step < steps {
             true => {
                 deformer.deform(&states[step % states.len()])?;
-                Some(deformer.readback(VertexAttributes::VERTICES)?)
+                Some(deformer.readback(VertexAttributes::POSITIONS_AND_NORMALS)?)
             }
             false => None,
         };
@@ -175,7 +175,7 @@ fn run_overlapped(
         }
         if step < steps {
             deformer.submit(&states[step % states.len()])?;
-            readbacks.push_back(deformer.readback(VertexAttributes::VERTICES)?);
+            readbacks.push_back(deformer.readback(VertexAttributes::POSITIONS_AND_NORMALS)?);
         }
         let is_oldest_finished = readbacks.len() > MAX_STEPS_IN_FLIGHT || step >= steps;
         if let Some(finished_step) = finished_step
@@ -218,7 +218,7 @@ fn time_step_and_readback(deformer: &mut CudaDeformer, states: &[SceneState], st
         deformer.deform(&states[step % states.len()])?;
         step_times.push(elapsed_us(begin));
         let begin = Instant::now();
-        let readback = deformer.readback(VertexAttributes::VERTICES)?;
+        let readback = deformer.readback(VertexAttributes::POSITIONS_AND_NORMALS)?;
         deformer.wait_readback(&readback)?;
         readback_times.push(elapsed_us(begin));
     }
@@ -240,7 +240,7 @@ fn time_input_writes(
     let mut measure = move || {
         let mut time_write = |step: usize| {
             let begin = Instant::now();
-            writer.write(words, &Header::default(), &states[step % states.len()]);
+            writer.write(words, &StepHeader::default(), &states[step % states.len()]);
             elapsed_us(begin)
         };
         // Warm-up.

@@ -6,7 +6,7 @@ use super::kernel_benchmark::KernelBenchmark;
 use super::timer::time_steps;
 use crate::timing::{CacheState, Timing};
 use modalcast_compute::gpu::Device;
-use modalcast_compute::gpu::step_input::{Header, InputPacker, InputPart, StagingBuffer, StepInputs};
+use modalcast_compute::gpu::step_input::{InputPacker, InputPart, StagingBuffer, StepHeader, StepInputs};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Scene, SceneState};
 
@@ -43,7 +43,7 @@ impl KernelBenchmark for UploadBenchmark {
 pub fn time_upload(device: &Device, scene: &Arc<Scene>, state: &SceneState, replays: usize) -> Result<(u64, Timing)> {
     let mut inputs = StepInputs::new(device, &Arc::new(InputPacker::sizes_only(scene)))?;
     let mut staging = inputs.allocate_staging(device)?;
-    inputs.write(&mut staging, &Header::default(), state)?;
+    inputs.write(&mut staging, &StepHeader::default(), state)?;
     let bytes = inputs.bytes();
     let benchmark = UploadBenchmark { inputs, staging };
     Ok((bytes, time_steps(device, &benchmark, CacheState::Warm, replays)?))

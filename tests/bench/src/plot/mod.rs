@@ -13,7 +13,7 @@ use super::cuda_variants::is_partial_step;
 use super::table::DeformRow;
 use super::timing::CacheState;
 use modalcast_model::deform::Backend;
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault, fault_in};
 use panel::{MarkerStyle, Panel, Point};
 
 /// Pixels of the PNG per unit of the SVG.
@@ -95,7 +95,7 @@ pub fn render_png(svg: &str) -> Result<Vec<u8>> {
     fonts.load_font_data(dejavu::sans::bold().to_vec());
     let tree = resvg::usvg::Tree::from_str(svg, &options).map_err(fault_in("plot"))?;
     let [width, height] = [tree.size().width(), tree.size().height()].map(|side| (side * SCALE).ceil() as u32);
-    let too_large = || fault_in("plot")(format!("{width} x {height} pixels exceed the available memory"));
+    let too_large = || fault("plot", format!("{width} x {height} pixels exceed the available memory"));
     let mut pixels = resvg::tiny_skia::Pixmap::new(width, height).ok_or_else(too_large)?;
     resvg::render(&tree, resvg::tiny_skia::Transform::from_scale(SCALE, SCALE), &mut pixels.as_mut());
     // The background is opaque, so premultiplied colors equal straight ones.

@@ -11,7 +11,7 @@ use super::image_files::{self, ImageFile};
 use crate::provenance::Provenance;
 use crate::timing::{MIN_REPETITIONS, Timing};
 use modalcast_model::backend_settings::LookTable;
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault, fault_in};
 use modalcast_model::load::{self, OpenedScene};
 use modalcast_model::scene::{Camera, SceneState};
 use modalcast_render::{RasterBackends, RendererInfo};
@@ -115,8 +115,7 @@ fn time_scene(
         eye: camera.eye().into(),
         to_sun: scene.look.to_sun(scene.up).into(),
         passes,
-        wall_clock: Timing::of(wall_clock_us)
-            .ok_or_else(|| fault_in("time")("expected at least one frame, got none"))?,
+        wall_clock: Timing::of(wall_clock_us).ok_or_else(|| fault("time", "expected at least one frame, got none"))?,
         picture: file.name.clone(),
     };
     harness.unload(loaded_scene);

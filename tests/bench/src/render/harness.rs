@@ -10,7 +10,7 @@ use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{CudaRasterizer, Device};
 use modalcast_model::backend_settings::RasterPolicy;
 use modalcast_model::deform::{DeformedSurface, Deformer};
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{BoundingBox, Camera, OrientedBounds, Scene, SceneState};
 use modalcast_render::{DevicePreference, FrameImage, FrameParams, Renderer, SceneBuffers};
@@ -132,7 +132,7 @@ impl RenderHarness {
         let pass_time = |(name, times_us): (&'static str, Vec<f64>)| {
             Timing::of(times_us)
                 .map(|timing| PassTime { name, timing })
-                .ok_or_else(|| fault_in("time")("expected at least one frame, got none"))
+                .ok_or_else(|| fault("time", "expected at least one frame, got none"))
         };
         us_by_pass.into_iter().map(pass_time).collect()
     }

@@ -2,7 +2,7 @@
 
 use super::harness::Size;
 use super::metrics::differences;
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault, fault_in};
 
 /// An encoded image file.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -64,7 +64,7 @@ fn to_byte(level: f32) -> u8 {
 }
 
 fn encode_png(name: &str, (width, height): (u32, u32), rgb: Vec<u8>) -> Result<ImageFile> {
-    let size_fault = || fault_in("pictures")("expected three bytes per pixel of the image");
+    let size_fault = || fault("pictures", "expected three bytes per pixel of the image");
     let image = image::RgbImage::from_raw(width, height, rgb).ok_or_else(size_fault)?;
     let mut png = std::io::Cursor::new(Vec::new());
     image::DynamicImage::from(image).write_to(&mut png, image::ImageFormat::Png).map_err(fault_in("pictures"))?;

@@ -22,7 +22,7 @@ use crate::workloads::{Size as WorkloadSize, Workload, WorkloadKind};
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{self, BufferRole, CudaDeformer, CudaDeformerOptions, Device};
 use modalcast_model::deform::{Backend, DeformSummary, Deformer, VertexAttributes};
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault};
 use modalcast_model::scene::{Camera, RenderSettings, Scene, SceneState, ShadowSettings};
 use modalcast_render::{FrameParams, SceneBuffers};
 
@@ -184,7 +184,7 @@ fn time_frames(
     }
     let timing = |time: fn(&FrameTimes<f64>) -> f64| {
         let values = samples.iter().map(time).collect();
-        Timing::of(values).ok_or_else(|| fault_in("plants")("expected at least one frame, got none"))
+        Timing::of(values).ok_or_else(|| fault("plants", "expected at least one frame, got none"))
     };
     Ok(FrameTimes {
         deform: timing(|times| times.deform)?,
@@ -209,7 +209,9 @@ fn time_frame(
     let begin = Instant::now();
     let mut upload = 0.0;
     if !setup.deformer.shares_buffers() {
-        harness.renderer.upload(&setup.buffers, setup.deformer.read(VertexAttributes::VERTICES)?)?;
+        harness
+            .renderer
+            .upload(&setup.buffers, setup.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?)?;
         upload = elapsed_us(begin);
     }
     let frame_params = FrameParams { camera, width: size.width, height: size.height, bounds, light_bounds };

@@ -16,7 +16,7 @@ use crate::kernels;
 use crate::kernels::{KernelBenchmark as _, RasterBenchmark, RasterCounts, RasterMesh};
 use crate::timing::{CacheState, MIN_REPETITIONS, Timing};
 use modalcast_compute::gpu::{Device, RasterVariant};
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault};
 use modalcast_model::scene::{Camera, CullMode, DrawRange, RenderSettings, Scene, SceneParts, SceneState, Viewport};
 use modalcast_render::{FrameParams, VisibilityId, shadow_clip_from_world};
 
@@ -256,7 +256,7 @@ impl RasterSetup {
 
     fn map_viewport(&self, frame_params: &FrameParams) -> Result<Viewport> {
         let clip_from_world: Matrix4<f64> = shadow_clip_from_world(&self.scene, frame_params)
-            .ok_or_else(|| fault_in("raster")("expected a scene with a shadow map"))?;
+            .ok_or_else(|| fault("raster", "expected a scene with a shadow map"))?;
         Viewport::new(&clip_from_world, self.map_size, self.map_size)
     }
 
@@ -270,7 +270,7 @@ impl RasterSetup {
         let passes = harness.time_passes(loaded_scene, self.camera, self.size, self.replays)?;
         let time_pair = |name: &str, raster: &RasterBenchmark| {
             let opengl = passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
-            let opengl = opengl.ok_or_else(|| fault_in("raster")(format!("expected a pass named {name}")))?;
+            let opengl = opengl.ok_or_else(|| fault("raster", format!("expected a pass named {name}")))?;
             let cuda = kernels::time_steps(device, raster, CacheState::Warm, self.replays)?;
             Ok(TimingPair { opengl, cuda })
         };

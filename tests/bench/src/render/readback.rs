@@ -22,7 +22,7 @@ use super::workloads::{AnimatedScene, RenderWorkload};
 use crate::markdown_table::table;
 use crate::timing::{MIN_REPETITIONS, quantile};
 use modalcast_model::deform::DeformedSurface;
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault, fault_in};
 use modalcast_model::scene::{Camera, View};
 use modalcast_render::{FrameImage, FrameParams, MAX_FRAMES_IN_FLIGHT};
 
@@ -188,7 +188,8 @@ fn validate(harness: &mut RenderHarness, loaded_scene: &LoadedScene, source: &Fr
 /// Checks that all frames were received. Even frames must equal the first expected image and odd frames the second.
 fn check_frames(expected: &[FrameImage; 2], received: &[(usize, FrameImage)], frames: usize) -> Result<()> {
     if expected[0].rgba == expected[1].rgba {
-        return Err(fault_in("readback")(
+        return Err(fault(
+            "readback",
             "expected two cameras with different images, got equal ones: swapped frames would not be detected",
         ));
     }
@@ -196,8 +197,8 @@ fn check_frames(expected: &[FrameImage; 2], received: &[(usize, FrameImage)], fr
     let differing = received.iter().filter(|(frame, image)| image.rgba != expected[frame % 2].rgba).count();
     match (received_numbers.len() == frames && received.len() == frames, differing) {
         (true, 0) => Ok(()),
-        (false, _) => Err(fault_in("readback")(format!("expected {frames} frames, got {}", received_numbers.len()))),
-        _ => Err(fault_in("readback")(format!("expected frames equal to blocking readbacks, {differing} differ"))),
+        (false, _) => Err(fault("readback", format!("expected {frames} frames, got {}", received_numbers.len()))),
+        _ => Err(fault("readback", format!("expected frames equal to blocking readbacks, {differing} differ"))),
     }
 }
 
@@ -227,12 +228,12 @@ fn measure_round(
         }
         ReadbackMode::Ring => draw_pipelined(harness, loaded_scene, source, (frames, Some(frame_sender)))?,
     }
-    let received = receiver_thread.join().map_err(|_| fault_in("readback")("the receiving thread panicked"))?;
+    let received = receiver_thread.join().map_err(|_| fault("readback", "the receiving thread panicked"))?;
     let seconds = begin.elapsed().as_secs_f64();
     let expected = if mode == ReadbackMode::Unread { 0 } else { frames };
     match received == expected {
         true => Ok(frames as f64 / seconds),
-        false => Err(fault_in("readback")(format!("expected {expected} frames, got {received}"))),
+        false => Err(fault("readback", format!("expected {expected} frames, got {received}"))),
     }
 }
 

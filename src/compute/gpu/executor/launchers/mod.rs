@@ -2,7 +2,7 @@
 //! its kernel on the device.
 //!
 //! The launch functions are unsafe, because the header of a step's values contains the addresses of its outputs
-//! (`Header`), which only the caller knows.
+//! (`StepHeader`), which only the caller knows.
 
 pub(crate) mod apply;
 mod batch;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::super::interop::{GlInterop, MapAccess, Mapping, RegisteredBuffer, with_mapped};
 use super::{RasterFunctions, RasterPass, RasterPipeline, RasterVariant, check_cut_outs, check_mesh};
 use crate::gpu::launch::Device;
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::raster::{DrawTarget, GlBuffer, RasterGeometry, Rasterizer};
 use modalcast_model::scene::{CullMode, DrawRange};
 
@@ -70,7 +70,7 @@ impl PassState {
             Some(registered) => registered,
             None => interop.register(device, target.clone())?,
         };
-        let missing_functions = || fault_in("raster")("expected compiled kernels");
+        let missing_functions = || fault("raster", "expected compiled kernels");
         Ok(PreparedPass {
             functions: self.functions.as_ref().ok_or_else(missing_functions)?,
             groups: &self.groups,

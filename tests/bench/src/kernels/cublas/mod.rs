@@ -9,7 +9,7 @@ pub use library::cublas_version;
 
 use std::sync::Arc;
 
-use super::input_sets::{InputSets, Part};
+use super::input_sets::{InputSets, StepPart};
 use super::kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 use super::plain_update::PlainUpdate;
 use batch::{GemmPlan, Operand};
@@ -24,7 +24,7 @@ use modalcast_model::scene::{Scene, SceneState};
 pub struct CublasBenchmark {
     cublas: CublasHandle<ProductBuffers>,
     method: CublasMethod,
-    part: Part,
+    part: StepPart,
     plan: GemmPlan,
     update: Option<PlainUpdate>,
     /// Offset of each domain's u, in floats; `None` for domains without modes.
@@ -61,7 +61,7 @@ impl CublasBenchmark {
         device: &Device,
         scene: &Arc<Scene>,
         states: &[SceneState],
-        (method, part): (CublasMethod, Part),
+        (method, part): (CublasMethod, StepPart),
     ) -> Result<Self> {
         let plan = GemmPlan::new(scene, method)?;
         check_memory(device, &plan)?;
@@ -74,7 +74,7 @@ impl CublasBenchmark {
         let input_sets = InputSets::new(device, scene, states, |state| [plan.pack_q(scene, state), transforms(state)])?;
         let pointers = is_grouped.then(|| PointerArrays::new(device, &plan, [&matrices, &u], &input_sets));
         let buffers = ProductBuffers { matrices, u, pointers: pointers.transpose()?, input_sets };
-        let update = (part == Part::Whole).then(|| PlainUpdate::new(device, scene, &u_offsets)).transpose()?;
+        let update = (part == StepPart::Whole).then(|| PlainUpdate::new(device, scene, &u_offsets)).transpose()?;
         Ok(Self { cublas: CublasHandle::new(device, buffers)?, method, part, plan, update, u_offsets })
     }
 

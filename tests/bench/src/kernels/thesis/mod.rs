@@ -18,7 +18,7 @@ pub use group::{KernelSplit, LaneCounts, count_lanes, idle_lanes_per_warp};
 
 use std::sync::Arc;
 
-use super::input_sets::{InputSets, Part};
+use super::input_sets::{InputSets, StepPart};
 use super::kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 use group::{DisplacementLayout, pack_q};
 use modalcast_compute::gpu::Device;
@@ -51,28 +51,28 @@ pub struct ThesisBenchmark {
 }
 
 impl ThesisBenchmark {
-    /// The single-domain kernel, followed by the vertex update for [`Part::Whole`].
+    /// The single-domain kernel, followed by the vertex update for [`StepPart::Whole`].
     ///
     /// # Errors
     /// `Invalid` when the scene is not one domain with modes, or there is no state; `Unavailable` when NVRTC is
     /// missing; `Fault` when the device fails.
-    pub fn single(device: &Device, scene: &Arc<Scene>, states: &[SceneState], part: Part) -> Result<Self> {
+    pub fn single(device: &Device, scene: &Arc<Scene>, states: &[SceneState], part: StepPart) -> Result<Self> {
         let uq = UqKernel::Single(SingleDomainKernel::new(device, scene)?);
         Self::new(device, scene, states, (part.benchmark_name("thesis_single"), uq, part))
     }
 
-    /// The kernels for many domains, followed by the vertex update for [`Part::Whole`].
+    /// The kernels for many domains, followed by the vertex update for [`StepPart::Whole`].
     ///
     /// # Errors
-    /// `Invalid` when a domain has more than 32 modes, [`Part::Uq`] is requested and no domain has modes, or there is
+    /// `Invalid` when a domain has more than 32 modes, [`StepPart::Uq`] is requested and no domain has modes, or there is
     /// no state; `Unavailable` when NVRTC is missing; `Fault` when the device fails.
     pub fn multi(
         device: &Device,
         scene: &Arc<Scene>,
         states: &[SceneState],
-        (split, part): (KernelSplit, Part),
+        (split, part): (KernelSplit, StepPart),
     ) -> Result<Self> {
-        if part == Part::Uq && !scene.features.modes {
+        if part == StepPart::Uq && !scene.features.modes {
             return Err(invalid("modes", "at least 1 for u = U q alone", 0));
         }
         let uq = UqKernel::Multi(MultiDomainKernel::new(device, scene, split)?);
@@ -84,10 +84,10 @@ impl ThesisBenchmark {
         device: &Device,
         scene: &Arc<Scene>,
         states: &[SceneState],
-        (name, uq, part): (String, UqKernel, Part),
+        (name, uq, part): (String, UqKernel, StepPart),
     ) -> Result<Self> {
         let displacements = DisplacementLayout::of(scene);
-        let update = (part == Part::Whole).then(|| UpdateKernel::new(device, scene)).transpose()?;
+        let update = (part == StepPart::Whole).then(|| UpdateKernel::new(device, scene)).transpose()?;
         Ok(Self {
             name,
             uq,
@@ -121,7 +121,7 @@ impl KernelBenchmark for ThesisBenchmark {
         self.update.as_ref().map_or(Ok(()), |update| update.launch(device, inputs.transforms, u))
     }
 
-    /// For [`Part::Whole`], a vertex that no triangle refers to is NaN, because the vertex update computes the vertices
+    /// For [`StepPart::Whole`], a vertex that no triangle refers to is NaN, because the vertex update computes the vertices
     /// of triangles only.
     fn positions(&self, device: &Device) -> Result<Vec<f32>> {
         if let Some(update) = &self.update {

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use crate::render::harness::Size;
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Result, fault};
 use modalcast_model::scene::{Camera, Lens, Scene, View};
 
 /// Fraction of the image that a scene may fill; the rest is for shadows.
@@ -71,6 +71,6 @@ pub(super) fn leaf_closeup(scene: &Scene) -> Result<Camera> {
     let nearest_leaf = leaves
         .map(|domain| domain.placement.translation())
         .max_by(|a, b| a.dot(&to_viewer).total_cmp(&b.dot(&to_viewer)))
-        .ok_or_else(|| fault_in("figures")("expected a tree with leaves"))?;
+        .ok_or_else(|| fault("figures", "expected a tree with leaves"))?;
     Ok(look_at(nearest_leaf + Vector3::new(0.25, 0.25, 1.35), nearest_leaf, 36.0))
 }

@@ -21,7 +21,7 @@ use super::image_files::{self, ImageFile};
 use super::{light_meter, workloads};
 use crate::provenance::Provenance;
 use modalcast_model::domain::{AlphaMode, Texture};
-use modalcast_model::error::{Result, fault_in, invalid};
+use modalcast_model::error::{Result, fault, fault_in, invalid};
 use modalcast_model::load;
 use modalcast_model::scene::{Camera, RenderSettings, Scene, SceneParts, ShadowMethod, ShadowSettings};
 use modalcast_render::RendererInfo;
@@ -120,9 +120,8 @@ impl FigurePlants {
 /// Color and normal images of the tree's bark, which the conifers share.
 fn bark_textures(tree: &SceneParts) -> Result<[&Texture; 2]> {
     let images = tree.materials.iter().find_map(|material| material.color_texture.zip(material.normal_texture));
-    let (color, normal) = images.ok_or_else(|| {
-        fault_in("figures")("expected a material with color and normal textures in the built-in tree")
-    })?;
+    let (color, normal) = images
+        .ok_or_else(|| fault("figures", "expected a material with color and normal textures in the built-in tree"))?;
     Ok([&tree.textures[color], &tree.textures[normal]])
 }
 
