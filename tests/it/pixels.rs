@@ -1,5 +1,5 @@
-//! Rendered pixels compared with arithmetic; most tests have a negative control. Runs on any EGL driver, including
-//! Mesa's llvmpipe.
+//! Rendered pixels compared with arithmetic. Most tests have a negative control: a changed input that must change the
+//! result. The tests run on any EGL driver, including Mesa's llvmpipe.
 
 mod aov;
 mod below_ground;

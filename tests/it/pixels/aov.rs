@@ -1,4 +1,5 @@
-//! AOV readbacks (depth, domains, normals, values) compared with arithmetic.
+//! Readbacks of AOVs (arbitrary output variables: depth, domain indices, normals and vertex values), compared with
+//! arithmetic.
 
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Ground, Lens, View};
@@ -7,7 +8,7 @@ use nalgebra::Vector3;
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer};
 
-/// Reads an AOV of a scene at rest in a square image.
+/// Reads an AOV of a scene at rest in a square image. For [`Aov::Values`], the value of each vertex is its x.
 fn read_aov(builder: SceneBuilder, camera: Camera, size: u32, aov: Aov) -> AovImage {
     let scene = builder.build();
     let mut renderer = open_renderer();
@@ -34,16 +35,20 @@ fn decode_f32(image: &AovImage) -> Vec<f32> {
     bytemuck::pod_collect_to_vec(&image.bytes)
 }
 
+/// A camera for 64 x 64 pixels that looks down at the plane y = 0 from height 5.
 fn oblique_camera() -> Camera {
     let view = View::LookAt { eye: [3.0, 5.0, 4.0], target: [0.0, 0.0, -6.0], up: [0.0, 1.0, 0.0] };
     Camera { view, lens: Lens::Intrinsics { fx: 60.0, fy: 60.0, cx: 32.0, cy: 32.0 }, near: 0.0, far: 0.0 }
 }
 
-/// Depth along the view axis where the ray of a pixel intersects the plane y = 0; `None` for rays that do not go down.
+/// Depth along the view axis where the ray of a pixel of [`oblique_camera`] intersects the plane y = 0; `None` for rays
+/// that do not go down.
 fn depth_of_floor(x: u32, y: u32) -> Option<f64> {
+    // From the eye to the target of the camera.
     let forward = Vector3::new(-3.0, -5.0, -10.0_f64).normalize();
     let right = forward.cross(&Vector3::y()).normalize();
     let up = right.cross(&forward);
+    // The component of the ray along `forward` is 1, so its parameter is the depth.
     let ray = forward + (f64::from(x) + 0.5 - 32.0) / 60.0 * right + (32.0 - f64::from(y) - 0.5) / 60.0 * up;
     (ray.y < 0.0).then(|| -5.0 / ray.y)
 }
@@ -51,12 +56,13 @@ fn depth_of_floor(x: u32, y: u32) -> Option<f64> {
 /// Depth is infinite in pixels without a surface.
 #[test]
 fn depth_is_in_meters_along_the_view_axis() {
-    for (ground, unit) in [(false, 1.0), (true, 0.5)] {
+    // `unit` is in meters per scene unit.
+    for (has_ground, unit) in [(false, 1.0), (true, 0.5)] {
         let mut builder = SceneBuilder::new();
         builder.parts.unit = unit;
-        builder.parts.look.ground = ground.then(Ground::default);
-        // With a ground the square is small, so that most pixels show the ground.
-        let half_side = if ground { 1.0 } else { 40.0 };
+        builder.parts.look.ground = has_ground.then(Ground::default);
+        // With a ground, the square is small, so that most pixels show the ground.
+        let half_side = if has_ground { 1.0 } else { 40.0 };
         let image = read_aov(
             builder.add_domain(floor_mesh(half_side, 0.0), Material::default()),
             oblique_camera(),
@@ -74,10 +80,11 @@ fn depth_is_in_meters_along_the_view_axis() {
             }
         }
         assert!(covered_pixels > 2000 && max_error < 1e-4, "{covered_pixels} pixels, relative error {max_error:e}");
-        assert!(decode_f32(&image)[0] == f32::INFINITY || ground, "expected infinite depth in the sky");
+        assert_eq!(decode_f32(&image)[0], f32::INFINITY, "expected infinite depth in the sky at the top left");
     }
 }
 
+/// Opaque domain 2 is drawn before cut-out domain 1. Blended domain 0 is ignored.
 #[test]
 fn domain_indices_do_not_depend_on_the_drawing_order() {
     let cut_out_material = Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, ..Material::default() };
@@ -87,8 +94,9 @@ fn domain_indices_do_not_depend_on_the_drawing_order() {
         .add_domain(facing_rectangle(-2.0, 0.0, -1.0, 1.0, 0.0), cut_out_material)
         .add_domain(facing_rectangle(1.0, 0.0, 2.0, 1.0, 0.0), Material::default());
     let ids: Vec<u32> = bytemuck::pod_collect_to_vec(&read_aov(builder, front_camera(64), 64, Aov::Domains).bytes);
-    assert_eq!([ids[64 * 26 + 17], ids[64 * 26 + 47], ids[64 * 26 + 32]], [1, 2, u32::MAX]);
-    assert_eq!(ids.iter().filter(|id| **id == 1).count(), 100, "expected 10 x 10 pixels");
+    let id_at = |x: usize, y: usize| ids[64 * y + x];
+    assert_eq!([id_at(17, 26), id_at(47, 26), id_at(32, 26)], [1, 2, u32::MAX]);
+    assert_eq!(ids.iter().filter(|id| **id == 1).count(), 100, "expected 10 x 10 pixels of domain 1");
 }
 
 #[test]
@@ -99,6 +107,7 @@ fn normals_face_the_viewer_and_are_zero_elsewhere() {
     let normals =
         decode_f32(&read_aov(builder, Camera { view: view_from_behind, ..front_camera(64) }, 64, Aov::Normals));
     let normal_at = |x: usize, y: usize| &normals[3 * (64 * y + x)..][..3];
+    // Seen from behind, the square covers columns 32 to 51.
     assert_eq!((normal_at(40, 30), normal_at(20, 30)), (&[0.0, 0.0, -1.0][..], &[0.0; 3][..]));
     let mut builder = SceneBuilder::new();
     builder.parts.look.ground = Some(Ground::default());
@@ -108,12 +117,12 @@ fn normals_face_the_viewer_and_are_zero_elsewhere() {
         64,
         Aov::Normals,
     ));
-    assert_eq!(&normals[3 * (64 * 63 + 32)..][..3], [0.0; 3], "expected zeros on the ground");
+    let bottom_center = &normals[3 * (64 * 63 + 32)..][..3];
+    assert_eq!(bottom_center, [0.0; 3], "expected zeros on the ground");
 }
 
 #[test]
 fn values_are_interpolated_linearly_and_clamped() {
-    // The value of each vertex is its x.
     for (samples, largest) in [(1, 2.0), (4, 1.0)] {
         let mut builder = SceneBuilder::new();
         builder.parts.look.samples = samples;
@@ -125,17 +134,21 @@ fn values_are_interpolated_linearly_and_clamped() {
         );
         assert_eq!(frame.samples, samples);
         let image_samples: Vec<u32> = bytemuck::pod_collect_to_vec(&frame.bytes);
+        // The square covers columns 12 to 51; its border is excluded.
         for x in 13..51_usize {
             let pixel_samples = &image_samples[samples as usize * (64 * 30 + x)..][..samples as usize];
             let mean = pixel_samples.iter().map(|sample| f64::from(sample & 0xFFFF) / 65535.0).sum::<f64>()
                 / f64::from(samples);
             let expected = ((x as f64 + 0.5 - 32.0) / 10.0 / f64::from(largest)).clamp(0.0, 1.0);
-            // Near the clamped ends, the samples of one pixel may mix clamped and linear values.
+            // A value is stored in 16 bits, in steps of 1.5e-5. Near 0 and 1, clamping some samples of a pixel changes
+            // their mean.
             let tolerance = if (0.05..0.95).contains(&expected) { 1e-4 } else { 0.1 };
             assert!((mean - expected).abs() < tolerance, "{x}: expected {expected}, got {mean}");
-            assert!(pixel_samples.iter().all(|sample| sample >> 16 > 60000), "expected full coverage");
+            // The upper 16 bits are the cosine between the normal and the direction to the eye, at least 0.98 here.
+            assert!(pixel_samples.iter().all(|sample| sample >> 16 > 60000), "expected a cosine above 60000 / 65535");
         }
-        assert!(image_samples[..samples as usize * 64 * 5].iter().all(|sample| *sample == 0));
+        let top_rows = &image_samples[..samples as usize * 64 * 5];
+        assert!(top_rows.iter().all(|sample| *sample == 0), "expected zeros above the square");
     }
 }
 

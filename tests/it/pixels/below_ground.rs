@@ -1,4 +1,5 @@
-//! Geometry below the ground plane: the depth AOV includes the ground; the other AOVs and picks ignore it.
+//! Geometry below the ground plane. Depth readbacks include the ground. All other AOV (arbitrary output variable)
+//! readbacks and picks ignore the ground.
 
 use std::sync::Arc;
 
@@ -26,8 +27,17 @@ fn camera_above_ground() -> Camera {
     Camera { view: View::LookAt { eye: [0.0, 3.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] }, ..front_camera(SIZE) }
 }
 
-/// The 32-bit words of an AOV and the picks of all pixels, with the wall lowered by half of its height.
-fn read_aov_and_picks(scene: &Arc<Scene>, aov: Aov) -> (Vec<u32>, Vec<PickHit>) {
+/// Readbacks of all pixels.
+#[derive(Debug, PartialEq)]
+struct Readbacks {
+    /// The 32-bit words of an AOV.
+    aov_words: Vec<u32>,
+    hits: Vec<PickHit>,
+}
+
+/// Reads back an AOV and picks, with the wall lowered by half of its height. The wall then covers about 1,050 pixels,
+/// half of them below the ground.
+fn read_aov_and_picks(scene: &Arc<Scene>, aov: Aov) -> Readbacks {
     let mut state = SceneState::rest(scene);
     state.transforms[0] = Transform::from_matrix(&Matrix4::new_translation(&Vector3::new(0.0, -1.5, 0.0)));
     let mut deformer = ReferenceDeformer::new(scene);
@@ -41,36 +51,37 @@ fn read_aov_and_picks(scene: &Arc<Scene>, aov: Aov) -> (Vec<u32>, Vec<PickHit>) 
         bytemuck::pod_collect_to_vec(&renderer.render_aov(&buffers, &params, aov).expect("expected AOVs").bytes);
     let full_image = PixelRect::within([SIZE; 2], [0; 2], [SIZE; 2]).expect("expected a valid rectangle");
     let pick = renderer.begin_pick(&buffers, &params, full_image).expect("expected a pick to start");
-    (aov_words, renderer.finish_pick(pick).expect("expected hits"))
+    Readbacks { aov_words, hits: renderer.finish_pick(pick).expect("expected hits") }
 }
 
 #[test]
-fn aovs_and_picks_below_the_ground_ignore_the_ground() {
+fn picks_and_aovs_other_than_depth_ignore_the_ground() {
     for (samples, aov) in
         [(1, Aov::Domains), (1, Aov::Normals), (1, Aov::Values { largest: 1.0 }), (4, Aov::Values { largest: 1.0 })]
     {
-        let [results_with_ground, results_without_ground] =
+        let [with_ground, without_ground] =
             [Some(Ground::default()), None].map(|ground| read_aov_and_picks(&wall_scene(samples, ground), aov));
-        assert_eq!(results_with_ground, results_without_ground, "{aov:?}, {samples} samples");
-        assert!(results_with_ground.1.len() > 900, "{aov:?}: {} pixels picked", results_with_ground.1.len());
-        let below_ground = results_with_ground.1.iter().filter(|hit| hit.position[1] < 0.0).count();
+        assert_eq!(with_ground, without_ground, "{aov:?}, {samples} samples");
+        assert!(with_ground.hits.len() > 900, "{aov:?}: {} pixels picked", with_ground.hits.len());
+        let below_ground = with_ground.hits.iter().filter(|hit| hit.position[1] < 0.0).count();
         assert!(below_ground > 400, "{aov:?}: {below_ground} pixels below the ground");
     }
 }
 
 #[test]
 fn depth_includes_the_ground() {
-    let [words_with_ground, words_without_ground] =
-        [Some(Ground::default()), None].map(|ground| read_aov_and_picks(&wall_scene(1, ground), Aov::Depth).0);
-    let count_infinite =
-        |aov_words: &[u32]| aov_words.iter().filter(|word| f32::from_bits(**word) == f32::INFINITY).count();
+    let [depths_with_ground, depths_without_ground] = [Some(Ground::default()), None].map(|ground| {
+        let aov_words = read_aov_and_picks(&wall_scene(1, ground), Aov::Depth).aov_words;
+        aov_words.into_iter().map(f32::from_bits).collect::<Vec<f32>>()
+    });
+    let count_infinite = |depths: &[f32]| depths.iter().filter(|depth| **depth == f32::INFINITY).count();
     assert!(
-        count_infinite(&words_without_ground) > count_infinite(&words_with_ground) + 1000,
+        count_infinite(&depths_without_ground) > count_infinite(&depths_with_ground) + 1000,
         "expected the depth of the ground beside the wall"
     );
-    let nearer_pixels = words_with_ground.iter().zip(&words_without_ground).filter(|words| {
-        let (ground_depth, wall_depth) = (f32::from_bits(*words.0), f32::from_bits(*words.1));
-        wall_depth.is_finite() && ground_depth < wall_depth
-    });
+    let nearer_pixels = depths_with_ground
+        .iter()
+        .zip(&depths_without_ground)
+        .filter(|(with_ground, wall_depth)| wall_depth.is_finite() && with_ground < wall_depth);
     assert!(nearer_pixels.count() > 400, "expected the depth of the ground in front of the lower part of the wall");
 }

@@ -1,4 +1,5 @@
-//! Test that the almond tree has the same image with and without culling. It prints the times of the passes.
+//! Test that a scanned almond tree has the same image with and without culling. The test prints the times of the
+//! passes.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -12,6 +13,7 @@ use modalcast_render::{FrameCullStats, FrameParams, FrameTimes, Renderer};
 
 use super::harness::open_renderer;
 
+/// Width and height of a frame in pixels.
 const SIZE: [u32; 2] = [1920, 1080];
 const FRAME_COUNT: usize = 9;
 
@@ -20,7 +22,7 @@ fn replace_look(scene: &Scene, look: RenderSettings) -> Arc<Scene> {
     Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene")
 }
 
-/// The result of [`FRAME_COUNT`] equal frames.
+/// The result of [`FRAME_COUNT`] identical frames.
 struct DrawnFrames {
     rgba: Vec<u8>,
     /// Names of some passes and their median times in milliseconds.
@@ -28,6 +30,7 @@ struct DrawnFrames {
     cull_stats: Option<FrameCullStats>,
 }
 
+/// Draws [`FRAME_COUNT`] frames of the scene at rest and asserts that they are identical.
 fn draw_frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> DrawnFrames {
     let mut deformer = ReferenceDeformer::new(scene);
     let bounds = deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed").bounds;
@@ -40,6 +43,7 @@ fn draw_frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> DrawnFrames {
     assert!(images.iter().all(|image| image.rgba == images[0].rgba), "expected identical frames");
     let median_time = |name: &'static str| {
         let pass_time = |times: &FrameTimes| times.iter().find(|(key, _)| key.name() == name).map_or(0.0, |(_, ms)| ms);
+        // The first frame is excluded, because occlusion culling needs a previous frame.
         let mut times: Vec<f64> = images[1..].iter().map(|image| pass_time(&image.times)).collect();
         times.sort_by(f64::total_cmp);
         (name, times[times.len() / 2])
@@ -52,7 +56,7 @@ fn draw_frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> DrawnFrames {
 
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-fn real_almond_with_culling_is_the_same_picture() {
+fn real_almond_has_the_same_image_with_culling() {
     let data_folder = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
     let scene = modalcast_model::load::open(&data_folder.join("plants/almond").to_string_lossy())
         .expect("expected the almond tree")
@@ -64,6 +68,7 @@ fn real_almond_with_culling_is_the_same_picture() {
             shadow: Some(ShadowSettings { size: 2048, ..ShadowSettings::default() }),
             ..scene.look
         };
+        // Set by the first culling mode, `Culling::None`.
         let mut unculled_image = None;
         for culling in [Culling::None, Culling::Triangles, Culling::Occlusion] {
             let DrawnFrames { rgba, pass_times, cull_stats } =

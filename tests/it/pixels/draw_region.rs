@@ -1,5 +1,5 @@
-//! Frames draw and clear only the region that their scene can cover. Pixels of earlier frames outside of it never become
-//! visible.
+//! A frame draws and clears only the region of the image that the bounds of its scene can cover. Pixels that earlier
+//! frames drew outside this region never become visible.
 
 use std::sync::Arc;
 
@@ -9,12 +9,14 @@ use modalcast_render::{FrameParams, Renderer, SceneBuffers, VisibilityId};
 
 use super::harness::{SceneBuilder, colored_material, facing_rectangle, front_camera, glass_material, open_renderer};
 
+/// Side of a frame in pixels.
 const SIZE: u32 = 96;
 
-/// An opaque square, a cut-out leaf in front of it, and a glass pane in front of the leaf.
-fn test_scene(modify: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
+/// An opaque square, a cut-out leaf in front of it, and a glass pane in front of the leaf. `modify_look` changes the
+/// render settings.
+fn test_scene(modify_look: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
     let mut builder = SceneBuilder::new();
-    modify(&mut builder.parts.look);
+    modify_look(&mut builder.parts.look);
     let leaf_material = builder.create_leaf_material();
     let builder = builder.add_domain(facing_rectangle(-1.0, -1.0, 0.3, 0.3, -0.5), colored_material([0.9, 0.2, 0.2]));
     builder
@@ -36,7 +38,7 @@ fn load_at_rest(renderer: &mut Renderer, scene: &Arc<Scene>) -> SceneBuffers {
     buffers
 }
 
-/// The camera with its principal point shifted by this many pixels.
+/// [`front_camera`] with its principal point shifted by `[x, y]` pixels, which shifts the scene in the image.
 fn shifted_camera([x, y]: [f64; 2]) -> Camera {
     let mut camera = front_camera(SIZE);
     if let modalcast_model::scene::Lens::Intrinsics { cx, cy, .. } = &mut camera.lens {
@@ -48,6 +50,7 @@ fn shifted_camera([x, y]: [f64; 2]) -> Camera {
 #[derive(PartialEq)]
 struct Frame {
     rgba: Vec<u8>,
+    /// Id of the first sample of each pixel.
     ids: Vec<VisibilityId>,
 }
 
@@ -59,7 +62,7 @@ fn draw_frame(renderer: &mut Renderer, buffers: &SceneBuffers, camera: Camera, b
 
 #[test]
 fn reused_targets_render_like_a_fresh_renderer() {
-    let looks: [fn(&mut RenderSettings); 6] = [
+    let look_changes: [fn(&mut RenderSettings); 6] = [
         |look| look.samples = 1,
         |_| {},
         |look| look.transparency = Transparency::TwoPass,
@@ -67,9 +70,10 @@ fn reused_targets_render_like_a_fresh_renderer() {
         |look| look.culling = Culling::Occlusion,
         |look| (look.culling, look.samples) = (Culling::Occlusion, 1),
     ];
+    // The shift by 500 pixels moves the scene out of the image.
     let shifts = [[0.0; 2], [30.0, 20.0], [-25.0, -30.0], [500.0, 0.0], [20.0, -20.0], [0.0; 2]];
-    for (index, look) in looks.into_iter().enumerate() {
-        let scene = test_scene(look);
+    for (index, modify_look) in look_changes.into_iter().enumerate() {
+        let scene = test_scene(modify_look);
         let (mut reused_renderer, mut previous_frame) = (open_renderer(), None::<Frame>);
         let buffers = load_at_rest(&mut reused_renderer, &scene);
         for shift in shifts {
@@ -79,8 +83,12 @@ fn reused_targets_render_like_a_fresh_renderer() {
             let frame = draw_frame(&mut reused_renderer, &buffers, camera, scene.rest_bounds);
             assert!(frame == expected_frame, "look {index} at {shift:?}");
             let triangle_pixels = frame.ids.iter().filter(|id| matches!(id, VisibilityId::Triangle(_))).count();
-            assert_eq!(triangle_pixels > 100, shift[0] < 100.0, "look {index} at {shift:?}: {triangle_pixels} pixels");
-            assert!(previous_frame.as_ref() != Some(&frame), "negative control: look {index} at {shift:?}");
+            let is_in_image = shift[0] < 500.0;
+            assert_eq!(triangle_pixels > 100, is_in_image, "look {index} at {shift:?}: {triangle_pixels} pixels");
+            assert!(
+                previous_frame.as_ref() != Some(&frame),
+                "negative control: expected the shift to change the frame, look {index} at {shift:?}"
+            );
             previous_frame = Some(frame);
         }
     }
@@ -98,10 +106,9 @@ fn scenes_sharing_a_target_do_not_affect_each_other() {
             wall.clone(),
         )
     });
-    let (scenes, mut shared_renderer) = (
-        [test_scene(|_| {}), builder.add_domain(facing_rectangle(-0.8, 0.1, 0.8, 0.4, 0.6), glass).build()],
-        open_renderer(),
-    );
+    let other_scene = builder.add_domain(facing_rectangle(-0.8, 0.1, 0.8, 0.4, 0.6), glass).build();
+    let scenes = [test_scene(|_| {}), other_scene];
+    let mut shared_renderer = open_renderer();
     let buffers = [0, 1].map(|index| load_at_rest(&mut shared_renderer, &scenes[index]));
     for (frame_index, shift) in [[0.0; 2], [30.0, 20.0], [-25.0, -30.0], [12.0, 3.0]].into_iter().enumerate() {
         let (index, mut new_renderer) = (frame_index % 2, open_renderer());
@@ -121,8 +128,8 @@ fn geometry_outside_the_bounds_leaves_no_stale_pixels() {
         let scene = test_scene(|look| look.transparency = transparency);
         let mut renderer = open_renderer();
         let buffers = load_at_rest(&mut renderer, &scene);
-        // These bounds cut the scene on all sides. With the two shifts, the cuts lie within and at the border of a quad
-        // of 2 x 2 pixels.
+        // These bounds are smaller than the scene on all sides. With the two shifts, the edges of the drawn region lie
+        // inside and at the border of a quad of 2 x 2 pixels.
         let small_bounds = BoundingBox { min: [-0.3, -0.3, -0.5], max: [0.1, 0.2, -0.4] };
         let mut draw = |shift: [f64; 2]| draw_frame(&mut renderer, &buffers, shifted_camera(shift), small_bounds);
         for shift in [[0.0; 2], [1.0; 2]] {
@@ -137,7 +144,7 @@ fn geometry_outside_the_bounds_leaves_no_stale_pixels() {
 }
 
 #[test]
-fn nothing_is_drawn_outside_the_given_bounds() {
+fn bounds_limit_drawing_unless_they_are_nan() {
     let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
     let buffers = load_at_rest(&mut renderer, &scene);
     let mut count_triangle_pixels = |bounds: BoundingBox| {

@@ -14,7 +14,7 @@ use modalcast_render::FrameImage;
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh};
 
-/// Far position: not on the grid of floating origins, and not representable in f32.
+/// A position that is not on the grid of floating origins ([`ORIGIN_GRID`]) and not representable in f32.
 const FAR_POSITION: [f64; 3] = [1e7 + 1.3, 0.0, -1e7 - 2.7];
 
 fn open_context() -> DeviceContext {
@@ -23,9 +23,10 @@ fn open_context() -> DeviceContext {
 
 /// The rest state with some domains moved by an f64 translation.
 fn move_domains(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> SceneState {
+    // `RigidF64`: a quaternion (x, y, z, w) in f32, here the identity, then a translation in f64.
     let transform_bytes = || {
-        let rotation = [0.0, 0.0, 0.0, 1.0_f32].into_iter().flat_map(f32::to_le_bytes);
-        rotation.chain([x, y, z].into_iter().flat_map(f64::to_le_bytes))
+        let quaternion = [0.0, 0.0, 0.0, 1.0_f32].into_iter().flat_map(f32::to_le_bytes);
+        quaternion.chain([x, y, z].into_iter().flat_map(f64::to_le_bytes))
     };
     let raw_update = RawStepUpdate {
         transform_domains: domains.to_vec(),
@@ -53,11 +54,22 @@ fn draw_frame(context: &mut DeviceContext, scene: &Arc<Scene>, state: &SceneStat
     image
 }
 
-/// Largest difference of two images in levels, and number of pixels that differ by more than one level.
-fn max_difference(left: &FrameImage, right: &FrameImage) -> (u8, usize) {
+/// Difference of two images.
+struct ImageDifference {
+    /// Largest difference of a channel, in levels of 255.
+    max_levels: u8,
+    /// Number of pixels that differ by more than one level.
+    different_pixels: usize,
+}
+
+fn compare_images(left: &FrameImage, right: &FrameImage) -> ImageDifference {
     let pairs = left.rgba.chunks_exact(4).zip(right.rgba.chunks_exact(4));
-    let levels = |(a, b): (&[u8], &[u8])| a.iter().zip(b).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
-    pairs.map(levels).fold((0, 0), |(max, count), levels| (max.max(levels), count + usize::from(levels > 1)))
+    let pixel_difference = |(a, b): (&[u8], &[u8])| a.iter().zip(b).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
+    let pixel_differences: Vec<u8> = pairs.map(pixel_difference).collect();
+    ImageDifference {
+        max_levels: pixel_differences.iter().copied().max().unwrap_or(0),
+        different_pixels: pixel_differences.iter().filter(|levels| **levels > 1).count(),
+    }
 }
 
 /// A table over the ground, with the default look and the given shadow.
@@ -74,11 +86,11 @@ fn table_scene(shadow: Option<ShadowSettings>) -> Arc<Scene> {
 #[test]
 fn far_scene_renders_like_the_scene_at_the_origin() {
     let mut context = open_context();
-    // Texels of a shadow map are aligned to a grid, so the edge of a shadow looks the same only after a move by
-    // multiples of the grid.
+    // About ten thousand kilometers in each direction. Texels of a shadow map are aligned to a grid that is fixed in
+    // the world. So the edge of a shadow looks the same only after a move by multiples of the texel size.
     let grid_position = [9766.0 * ORIGIN_GRID, 0.0, -9767.0 * ORIGIN_GRID];
-    // Off the grid, positions round differently, by 1/500 pixel. A sample closer than that to an edge may change sides,
-    // which affects at most one pixel in a thousand.
+    // Off the grid, rounding moves positions by up to 1/500 pixel. A sample that is closer to an edge may change sides,
+    // which affects at most one pixel in a thousand: 9 of 96 x 96.
     let base = ShadowSettings::default();
     let cases = [
         (Some(base), grid_position, 0),
@@ -93,25 +105,22 @@ fn far_scene_renders_like_the_scene_at_the_origin() {
         let far_state = move_domains(&scene, &[0, 1], position);
         assert!(far_state.origins.as_ref().is_some_and(|origins| origins.is_uniform()));
         let far_frame = draw_frame(&mut context, &scene, &far_state, &camera_at(position));
-        let (max, count) = max_difference(&origin_frame, &far_frame);
-        assert!(count <= max_different_pixels, "{count} pixels differ at {position:?}, by up to {max} levels");
+        let ImageDifference { max_levels, different_pixels } = compare_images(&origin_frame, &far_frame);
+        assert!(
+            different_pixels <= max_different_pixels,
+            "{different_pixels} pixels differ at {position:?}, by up to {max_levels} levels"
+        );
     }
     let scene = table_scene(None);
     let origin_frame = draw_frame(&mut context, &scene, &SceneState::rest(&scene), &camera_at([0.0; 3]));
     let far_state = move_domains(&scene, &[0, 1], FAR_POSITION);
-    // Negative controls: a camera position rounded to f32, and a camera moved by 0.1 units.
     let rounded_position = FAR_POSITION.map(|number| f64::from(number as f32));
-    assert!(
-        max_difference(&origin_frame, &draw_frame(&mut context, &scene, &far_state, &camera_at(rounded_position))).0
-            > 8
-    );
-    assert!(
-        max_difference(
-            &origin_frame,
-            &draw_frame(&mut context, &scene, &far_state, &camera_at([FAR_POSITION[0] + 0.1, 0.0, FAR_POSITION[2]]))
-        )
-        .0 > 8
-    );
+    let moved_position = [FAR_POSITION[0] + 0.1, 0.0, FAR_POSITION[2]];
+    for (position, change) in [(rounded_position, "rounded to f32"), (moved_position, "moved by 0.1")] {
+        let frame = draw_frame(&mut context, &scene, &far_state, &camera_at(position));
+        let difference = compare_images(&origin_frame, &frame);
+        assert!(difference.max_levels > 8, "negative control: expected another image of a camera position {change}");
+    }
 }
 
 /// A camera near one of two distant domains sees only that domain.
@@ -127,32 +136,29 @@ fn distant_domains_are_seen_by_nearby_cameras() {
     let mut draw_at_rest =
         |scene: &Arc<Scene>| draw_frame(&mut context, scene, &SceneState::rest(scene), &camera_at([0.0; 3]));
     let frames = [draw_at_rest(&gray_scene), draw_at_rest(&red_scene), draw_at_rest(&scene)];
+    // Indices in `frames`.
+    let (gray, red, both) = (0, 1, 2);
     let separated_state = move_domains(&scene, &[1], FAR_POSITION);
     assert!(separated_state.origins.as_ref().is_some_and(|origins| !origins.is_uniform()));
     let mut loaded_scene = context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
-    let mut compare_with_single = |state: &SceneState, target| {
+    // Draws the scene of both domains and returns the largest difference from each of `frames`, in levels.
+    let mut compare_with_frames = |state: &SceneState, target| {
         loaded_scene.deform(state).expect("expected the step to succeed");
         let image =
             context.draw(&mut loaded_scene, &camera_at(target), FrameSize::new(96, 96)).expect("expected a frame");
-        [0, 1, 2].map(|index| max_difference(&image, &frames[index]).0)
+        [gray, red, both].map(|index| compare_images(&image, &frames[index]).max_levels)
     };
-    // Whether the image equals the frame with the index `expected` and neither of the others.
-    let equals_only = |max_differences: [u8; 3], expected: usize| {
-        (0..3).all(|index| (max_differences[index] <= 1) == (index == expected))
-    };
+    // Whether an image equals only the frame with the index `expected`.
+    let equals_only =
+        |differences: [u8; 3], expected: usize| (0..3).all(|index| (differences[index] <= 1) == (index == expected));
     // Twice, because no frame may contain pixels of an earlier frame.
     for _ in 0..2 {
-        let max_differences = [
-            compare_with_single(&separated_state, FAR_POSITION),
-            compare_with_single(&separated_state, [0.0; 3]),
-            compare_with_single(&SceneState::rest(&scene), [0.0; 3]),
-        ];
-        assert!(
-            equals_only(max_differences[0], 1)
-                && equals_only(max_differences[1], 0)
-                && equals_only(max_differences[2], 2),
-            "{max_differences:?}"
-        );
+        let far_differences = compare_with_frames(&separated_state, FAR_POSITION);
+        let origin_differences = compare_with_frames(&separated_state, [0.0; 3]);
+        let rest_differences = compare_with_frames(&SceneState::rest(&scene), [0.0; 3]);
+        assert!(equals_only(far_differences, red), "expected the red domain, got {far_differences:?}");
+        assert!(equals_only(origin_differences, gray), "expected the gray domain, got {origin_differences:?}");
+        assert!(equals_only(rest_differences, both), "expected both domains, got {rest_differences:?}");
     }
     context.unload_scene(loaded_scene);
 }

@@ -1,4 +1,5 @@
-//! For samples without a triangle, the ground is intersected analytically. The result equals that of the ground pass.
+//! The ground is rasterized by a pass of its own only if geometry may be below it. Otherwise the shading intersects the
+//! view rays of samples without a triangle with the ground plane. Both ways give the same image.
 
 use std::sync::Arc;
 
@@ -10,16 +11,18 @@ use modalcast_render::{FrameParams, Pass, Renderer, VisibilityId};
 
 use super::harness::{SceneBuilder, colored_material, facing_rectangle, floor_mesh, glass_material, open_renderer};
 
+/// Side of a frame in pixels.
 const SIZE: u32 = 96;
 
-/// A wall and a glass pane that stand on the ground, a red square that lies on it, and a cut-out leaf above.
-fn test_scene(modify: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
+/// A wall and a glass pane that stand on the ground, a red square that lies on it, and a cut-out leaf above it.
+/// `modify_look` changes the render settings.
+fn test_scene(modify_look: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
     let mut builder = SceneBuilder::new();
     let look = &mut builder.parts.look;
     (look.zenith, look.horizon) = ([0.1, 0.3, 0.8], [0.7, 0.8, 0.9]);
     look.sun = [2.0, 3.0, 1.0];
     look.ground = Some(Ground { color: [0.5, 0.4, 0.3] });
-    modify(look);
+    modify_look(look);
     let leaf_material = builder.create_leaf_material();
     let builder = builder
         .add_domain(floor_mesh(1.5, 0.0), colored_material([0.9, 0.2, 0.2]))
@@ -37,13 +40,14 @@ fn camera_at(eye: [f64; 3]) -> Camera {
 
 struct Frame {
     rgba: Vec<u8>,
+    /// Id of the first sample of each pixel.
     ids: Vec<VisibilityId>,
     passes: Vec<Pass>,
 }
 
 impl Frame {
-    /// Renders the scene at rest, lowered by `lowering`, with bounds that begin at `min_y`.
-    fn new(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, (lowering, min_y): (f32, f64)) -> Self {
+    /// Renders the scene at rest, lowered by `lowering`, with `min_y` as the lower bound in y.
+    fn new(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, lowering: f32, min_y: f64) -> Self {
         let buffers = renderer.load(scene).expect("expected the scene to load");
         let collect_from_meshes = |attribute: fn(&modalcast_model::domain::Mesh) -> &[[f32; 3]]| -> Vec<f32> {
             scene
@@ -73,24 +77,24 @@ impl Frame {
         self.passes.contains(&Pass::Ground)
     }
 
-    /// Number of pixels whose colors differ by more than two levels, and number of samples whose ids differ.
+    /// Number of pixels whose colors differ by more than two levels, and number of pixels whose ids differ.
     fn count_differences(&self, other: &Self) -> [usize; 2] {
         let pixels = self.rgba.chunks_exact(4).zip(other.rgba.chunks_exact(4));
-        let is_different = |(left, other): &(&[u8], &[u8])| left.iter().zip(*other).any(|(a, b)| a.abs_diff(*b) > 2);
+        let is_different = |(left, right): &(&[u8], &[u8])| left.iter().zip(*right).any(|(a, b)| a.abs_diff(*b) > 2);
         [
             pixels.filter(is_different).count(),
-            self.ids.iter().zip(&other.ids).filter(|(left, other)| left != other).count(),
+            self.ids.iter().zip(&other.ids).filter(|(left, right)| left != right).count(),
         ]
     }
 }
 
-/// Lower bound in y that requires the ground pass. It is far enough below the ground to exceed rounding, but too close to
-/// affect the shadow map or the depth range.
+/// Lower bound in y that requires the ground pass. It is farther below the ground than the tolerance for rounding,
+/// which is about 1e-6 here, and too close to the ground to affect the shadow map or the depth range.
 const BELOW_GROUND: f64 = -1e-5;
 
 #[test]
 fn analytic_ground_equals_drawn_ground() {
-    let looks: [fn(&mut RenderSettings); 6] = [
+    let look_changes: [fn(&mut RenderSettings); 6] = [
         |_| {},
         |look| look.samples = 1,
         |look| look.shadow = Some(ShadowSettings { size: 256, ..ShadowSettings::default() }),
@@ -99,17 +103,17 @@ fn analytic_ground_equals_drawn_ground() {
         |look| look.bloom = Some(Bloom::default()),
     ];
     let mut renderer = open_renderer();
-    for (index, look) in looks.into_iter().enumerate() {
-        let scene = test_scene(look);
+    for (index, modify_look) in look_changes.into_iter().enumerate() {
+        let scene = test_scene(modify_look);
         for eye in [[0.5, 1.0, 7.0], [3.0, 4.0, 5.0], [-4.0, 0.05, 1.0], [0.0, 0.8, 60.0]] {
-            let mut draw_frame = |min_y: f64| Frame::new(&mut renderer, &scene, camera_at(eye), (0.0, min_y));
+            let mut draw_frame = |min_y: f64| Frame::new(&mut renderer, &scene, camera_at(eye), 0.0, min_y);
             let (analytic_frame, drawn_frame) = (draw_frame(0.0), draw_frame(BELOW_GROUND));
             assert_eq!([analytic_frame.draws_ground(), drawn_frame.draws_ground()], [false, true]);
-            // Samples at the horizon may round to the ground or to the sky, which have the same color there.
+            // Rounding may assign a sample at the horizon to the ground or to the sky, which have the same color there.
             let [colors, ids] = analytic_frame.count_differences(&drawn_frame);
             assert!(
                 colors == 0 && ids <= 2,
-                "look {index} from {eye:?}: {colors} colors and {ids} ids of {}",
+                "look {index} from {eye:?}: {colors} colors and {ids} ids of {} pixels differ",
                 SIZE * SIZE
             );
             let ground_pixels = analytic_frame.ids.iter().filter(|id| **id == VisibilityId::Ground).count();
@@ -118,17 +122,18 @@ fn analytic_ground_equals_drawn_ground() {
     }
 }
 
-/// Overflowed bounds require the ground pass, because geometry may be below the ground.
+/// Bounds that overflowed to NaN also require the ground pass.
 #[test]
 fn ground_hides_geometry_below_and_is_one_sided() {
     let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
     let camera = camera_at([0.5, 1.0, 7.0]);
     let mut draw_frame =
-        |camera: Camera, lowering: f32, min_y: f64| Frame::new(&mut renderer, &scene, camera, (lowering, min_y));
+        |camera: Camera, lowering: f32, min_y: f64| Frame::new(&mut renderer, &scene, camera, lowering, min_y);
     let (frame_with_pass, frame_without_pass) = (draw_frame(camera, 0.7, -0.7), draw_frame(camera, 0.7, 0.0));
     assert_eq!([frame_with_pass.draws_ground(), frame_without_pass.draws_ground()], [true, false]);
     let [colors, ids] = frame_without_pass.count_differences(&frame_with_pass);
     assert!(colors > 200 && ids > 100, "negative control: {colors} colors and {ids} ids differ");
+    // The camera is below the ground, which is not visible from there.
     let frame_from_below = draw_frame(camera_at([0.5, -1.0, 7.0]), 0.0, 0.0);
     assert!(!frame_from_below.draws_ground() && frame_from_below.ids.iter().all(|id| *id != VisibilityId::Ground));
     let nan_bounds_frame = draw_frame(camera, 0.0, f64::NAN);
@@ -140,11 +145,11 @@ fn geometry_on_the_ground_is_visible_despite_rounding() {
     let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
     let camera = camera_at([1.0, 5.0, 4.0]);
     // Rounding lowers the scene and its bounds by 4e-7.
-    let frame = Frame::new(&mut renderer, &scene, camera, (4e-7, -4e-7));
+    let frame = Frame::new(&mut renderer, &scene, camera, 4e-7, -4e-7);
     assert!(!frame.draws_ground());
-    let frame_with_pass = Frame::new(&mut renderer, &scene, camera, (4e-7, BELOW_GROUND));
+    let frame_with_pass = Frame::new(&mut renderer, &scene, camera, 4e-7, BELOW_GROUND);
     let [colors, ids] = frame.count_differences(&frame_with_pass);
-    assert!(frame_with_pass.draws_ground() && colors == 0 && ids <= 2, "{colors} colors and {ids} ids");
+    assert!(frame_with_pass.draws_ground() && colors == 0 && ids <= 2, "{colors} colors and {ids} ids differ");
     let red_pixels = frame.rgba.chunks_exact(4).filter(|pixel| pixel[0] > pixel[1].saturating_add(30)).count();
     assert!(red_pixels > 300, "{red_pixels} pixels of the red square");
 }

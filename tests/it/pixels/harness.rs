@@ -8,7 +8,8 @@ use modalcast_model::domain::{AlphaMode, Domain, Material, Mesh, Modes, Shape, T
 use modalcast_model::scene::{Camera, Lens, Scene, SceneParts, SceneState, View};
 use modalcast_render::{Allocation, DevicePreference, FrameImage, FrameParams, FrameStats, Pass, Renderer, plan};
 
-/// Builder for a scene without shadow and ground, with a black sky, and with the sun behind the camera.
+/// Builder for a scene without shadow and ground, with a black sky, and with the sun in the direction +Z, behind
+/// [`front_camera`]. A white surface that faces +Z has the linear color 0.25 (skylight) + 0.5 (sunlight) = 0.75.
 pub(super) struct SceneBuilder {
     pub(super) parts: SceneParts,
 }
@@ -25,7 +26,7 @@ pub(super) fn colored_material(diffuse: [f32; 3]) -> Material {
     Material { diffuse, double_sided: true, ..Material::default() }
 }
 
-/// A green blended material.
+/// A green blended material with alpha 0.4.
 pub(super) fn glass_material() -> Material {
     Material { alpha_mode: AlphaMode::Blend, alpha: 0.4, ..colored_material([0.2, 0.9, 0.3]) }
 }
@@ -50,7 +51,7 @@ impl SceneBuilder {
         self.parts.textures.len() - 1
     }
 
-    /// Adds a texture of 8 x 8 pixels with alpha in a checkerboard pattern. Returns a cut-out material with it.
+    /// Adds a texture of 8 x 8 pixels whose alpha is a checkerboard. Returns a cut-out material with this texture.
     pub(super) fn create_leaf_material(&mut self) -> Material {
         let image = self.add_texture(8, 8, |x, y| [200, 220, 90, if (x + y) % 2 == 0 { 255 } else { 0 }]);
         let alpha_mode = AlphaMode::Mask { cutoff: 0.5 };
@@ -95,7 +96,8 @@ fn rectangle(positions: Vec<[f32; 3]>, normal: [f32; 3]) -> Mesh {
     Mesh::from_indexed(positions, vec![normal; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("expected a valid mesh")
 }
 
-/// A camera at z = 10 with ten pixels per unit in the plane z = 0 and the origin at the center of the image.
+/// A camera at z = 10 with ten pixels per unit in the plane z = 0 and the origin at the center of the image. `size` is
+/// the side of the image in pixels. Clip planes of 0 are fitted to the bounds.
 pub(super) fn front_camera(size: u32) -> Camera {
     let center = f64::from(size) / 2.0;
     Camera {
@@ -163,7 +165,7 @@ pub(super) fn planned_passes_above_ground(scene: &Scene) -> Vec<Pass> {
     plan(scene).passes.into_iter().filter(|pass| *pass != Pass::Ground).collect()
 }
 
-/// The sRGB level, in 0 to 255, of a linear value.
+/// The sRGB level (IEC 61966-2-1), in 0 to 255 and not rounded, of a linear value.
 pub(super) fn encode_srgb(linear: f64) -> f64 {
     let linear = linear.clamp(0.0, 1.0);
     255.0 * if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
@@ -175,7 +177,7 @@ pub(super) fn decode_srgb(level: u8) -> f64 {
     if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
 }
 
-/// Whether a pixel is within `tolerance` levels of a linear color.
+/// Whether each channel of a pixel is within `tolerance` sRGB levels of a linear color.
 pub(super) fn is_close(pixel: [u8; 3], linear: [f64; 3], tolerance: f64) -> bool {
     pixel.iter().zip(linear).all(|(byte, value)| (f64::from(*byte) - encode_srgb(value)).abs() <= tolerance)
 }

@@ -38,6 +38,7 @@ fn unused_features_allocate_and_run_nothing() {
     let normal_mapped = Material { normal_texture: Some(image), ..Material::default() };
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.5, ..Material::default() };
     let mut builder = builder.add_domain(floor_mesh(1.0, -0.5), normal_mapped).add_domain(floor_mesh(1.0, -0.3), glass);
+    // More opaque domains; they add no buffers and no passes.
     for index in 0..8 {
         builder = builder.add_domain(floor_mesh(0.1, -0.2 + 0.01 * index as f32), Material::default());
     }
@@ -80,6 +81,7 @@ fn draw_calls_do_not_grow_with_domains_and_materials() {
         }
         render(&builder.build()).stats.draw_calls
     };
+    // One draw call for all single-sided domains, and one for all double-sided domains.
     assert_eq!((draw_calls(1), draw_calls(2), draw_calls(9), draw_calls(60)), (1, 2, 2, 2));
 }
 
@@ -102,7 +104,7 @@ fn empty_and_oversized_frames_are_rejected() {
     assert_eq!(renderer.draw(&buffers, &params).expect("expected a frame of one pixel").rgba.len(), 4);
 }
 
-/// A frame too large for multisampling is drawn with one sample per pixel, and cut-outs stay transparent.
+/// In the large frame, cut-outs stay transparent.
 #[test]
 fn frame_too_large_for_msaa_is_drawn_with_one_sample() {
     let mut builder = SceneBuilder::new();
@@ -111,6 +113,8 @@ fn frame_too_large_for_msaa_is_drawn_with_one_sample() {
     let leaf = Material { color_texture: Some(image), alpha_mode, ..Material::default() };
     let scene = builder.add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), leaf).build();
     let mut renderer = open_renderer();
+    // 3400 x 3400 pixels exceed the limit of multisampling, 11 x 2^20 pixels. The field of view of 12 degrees is
+    // slightly wider than the square. The left half of the square is cut out.
     let side = 3400;
     let mut camera = front_camera(side);
     camera.lens = modalcast_model::scene::Lens::FieldOfView(12.0);
@@ -129,7 +133,8 @@ fn frames_are_deterministic() {
     let first_frame = render_square(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96);
     assert!(
         first_frame.image.rgba
-            == render_square(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96).image.rgba
+            == render_square(&mut renderer, &scene, Camera::fit_to_scene(&scene, 64, 64), 96).image.rgba,
+        "expected the same image in the same context"
     );
     assert!(
         first_frame.image.rgba
@@ -174,7 +179,7 @@ fn overflowed_vertices_leave_no_black_pixels() {
     let buffers = renderer.load(&scene).expect("expected the scene to load");
     for value in [f32::NAN, f32::INFINITY, f32::MAX, -f32::MAX] {
         let mut positions: Vec<f32> = scene.shapes[0].mesh.rest_positions().as_flattened().to_vec();
-        positions[6..9].fill(value);
+        positions[6..9].fill(value); // the third vertex
         let surface = DeformedSurface { positions, normals: [0.0, 0.0, 1.0].repeat(4), ..DeformedSurface::default() };
         renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
         let bounds = BoundingBox { min: [f64::NAN; 3], max: [f64::NAN; 3] };
@@ -196,6 +201,7 @@ fn scene_far_from_the_origin_is_rendered() {
         .parts;
     for domain in &mut parts.domains {
         let mut placement = Transform::IDENTITY;
+        // The translation is the last column of the row-major 3 x 4 matrix.
         (placement.0[3], placement.0[7], placement.0[11]) = (1e7, 1e7, -1e7);
         domain.placement = placement;
     }
@@ -243,6 +249,7 @@ fn devices_are_listed_and_unknown_ones_rejected() {
     for device in &device_list {
         assert_eq!(device.renderer.is_none(), device.problem.is_some(), "{device:?}");
     }
+    // No machine has a CUDA device 4711. The error names the vendor file of NVIDIA's EGL driver, which may be missing.
     let error = Renderer::open(DevicePreference::Cuda(4711)).expect_err("expected an unknown-device error").to_string();
     assert!(error.contains("CUDA device 4711") && error.contains("10_nvidia.json"), "{error}");
     if device_list.iter().any(|device| device.software && device.renderer.is_some()) {

@@ -1,4 +1,5 @@
-//! Overlapping blended triangles: order-independent with exact transparency, and in scene order with two passes.
+//! Overlapping blended triangles: with order-independent transparency (OIT), the order in the scene does not affect the
+//! image; with two-pass transparency, triangles are blended in scene order.
 
 use std::sync::Arc;
 
@@ -10,7 +11,7 @@ use super::harness::{
     RenderedFrame, SceneBuilder, facing_rectangle, front_camera, is_close, open_renderer, render, render_square,
 };
 
-/// A material lit by ambient light alone, so that colors appear unchanged.
+/// A material lit by skylight alone. As the skylight of [`create_builder`] is 1, the material appears in its color.
 fn unlit_material(ambient: [f32; 3]) -> Material {
     Material { ambient, diffuse: [0.0; 3], ..Material::default() }
 }
@@ -26,14 +27,14 @@ fn create_builder(transparency: Transparency, samples: u32) -> SceneBuilder {
     builder
 }
 
-/// A pane of 40 x 40 pixels at depth z.
+/// A pane at depth z. In every depth, it covers 40 x 40 = 1600 pixels at the center of a [`front_camera`] image.
 fn pane(z: f32) -> Mesh {
-    // Farther panes are larger, so that all cover the same pixels.
+    // The camera is at z = 10. At z = 0, four units are 40 pixels.
     let half_side = 2.0 * (10.0 - z) / 10.0;
     facing_rectangle(-half_side, -half_side, half_side, half_side, z)
 }
 
-/// Blends layers from the farthest to the nearest over black.
+/// Blends layers of a color and an alpha over black. The first layer is the farthest.
 fn blend(layers: &[([f32; 3], f32)]) -> [f64; 3] {
     layers.iter().fold([0.0; 3], |below, (color, alpha)| {
         let mix =
@@ -65,7 +66,10 @@ fn two_layers_blend_exactly_in_either_order() {
         };
         for is_near_first in [false, true] {
             let pixel = render_with(Transparency::OrderIndependent, is_near_first);
-            assert!(is_close(pixel, expected, 1.0), "{samples}, {is_near_first}: {pixel:?}");
+            assert!(
+                is_close(pixel, expected, 1.0),
+                "{samples} samples, near pane first in the scene {is_near_first}: {pixel:?}"
+            );
         }
         assert!(
             is_close(render_with(Transparency::TwoPass, false), expected, 1.0),
@@ -80,8 +84,9 @@ fn two_layers_blend_exactly_in_either_order() {
 
 /// Three planes that intersect each other, added in the given order.
 fn render_crossing_planes(transparency: Transparency, order: [usize; 3]) -> Vec<u8> {
-    let tilted_plane = |x: f32, y: f32| {
-        let corner = |[u, v]: [f32; 2]| [2.0 * u, 2.0 * v, x * u + y * v + 0.013 * x];
+    // The offset by 0.013 times the slope gives the planes different depths at the image center.
+    let tilted_plane = |slope_x: f32, slope_y: f32| {
+        let corner = |[u, v]: [f32; 2]| [2.0 * u, 2.0 * v, slope_x * u + slope_y * v + 0.013 * slope_x];
         let positions = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]].map(corner).to_vec();
         Mesh::from_indexed(positions, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
             .expect("expected a valid mesh")
@@ -93,9 +98,10 @@ fn render_crossing_planes(transparency: Transparency, order: [usize; 3]) -> Vec<
     render(&order.into_iter().fold(create_builder(transparency, 4), add_plane).build()).image.rgba
 }
 
-/// Negative control: with two passes the picture depends on the order.
+/// Negative control: with two passes, the image depends on the order.
 #[test]
 fn crossing_layers_do_not_depend_on_the_order() {
+    // The last order is the reverse of the first.
     let orders = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
     let expected_image = render_crossing_planes(Transparency::OrderIndependent, orders[0]);
     for order in &orders[1..] {
@@ -166,6 +172,8 @@ fn cut_outs_and_glass_keep_their_depth_order() {
 
 #[test]
 fn edges_of_glass_and_opaque_surfaces_are_multisampled() {
+    // `edge_position` is the right edge of a strip within pixel column 32. The strip covers this fraction of the
+    // column.
     for (edge_position, coverage) in [(0.25_f32, 0.25), (0.5, 0.5), (0.75, 0.75)] {
         let strip = || facing_rectangle(-1.0, -1.0, 0.1 * edge_position, 1.0, 0.0);
         let render_with = |builder: SceneBuilder| render(&builder.build()).pixel(32, 30);
@@ -181,9 +189,10 @@ fn edges_of_glass_and_opaque_surfaces_are_multisampled() {
         let expected = RED.map(|channel| coverage + (1.0 - coverage) * 0.5 * f64::from(channel));
         assert!(is_close(opaque_pixel, expected, 1.0), "{edge_position}: {opaque_pixel:?} instead of {expected:?}");
     }
+    // This strip covers a quarter of the pixel, but not its center.
     let builder = create_builder(Transparency::OrderIndependent, 1)
         .add_domain(facing_rectangle(-1.0, -1.0, 0.025, 1.0, 0.0), glass_material([1.0; 3], 0.5));
-    assert_eq!(render(&builder.build()).pixel(32, 30), [0; 3], "negative control: one sample");
+    assert_eq!(render(&builder.build()).pixel(32, 30), [0; 3], "negative control: one sample at the pixel center");
 }
 
 #[test]
@@ -193,14 +202,14 @@ fn triangles_of_one_pane_show_no_seam() {
     );
     assert_eq!(frame.count_pixels(|pixel| is_close(pixel, [0.5; 3], 1.0)), 1600);
     assert_eq!(frame.count_pixels(|pixel| pixel == [0; 3]), 64 * 64 - 1600);
-    assert_eq!(oit_stats(&frame).max_per_pixel, 2, "expected both triangles on the diagonal");
+    assert_eq!(oit_stats(&frame).max_per_pixel, 2, "expected fragments of both triangles on the diagonal");
 }
 
-/// A stack of layers with different colors and opacities. `order` maps the index of a layer in the scene to its index in
-/// depth, counted from the farthest.
-fn layer_stack(count: u32, order: impl Fn(u32) -> u32, modify: impl Fn(&mut SceneBuilder)) -> Arc<Scene> {
+/// A stack of layers with different colors and opacities. `order` maps the index of a layer in the scene to its index
+/// in depth, counted from the farthest.
+fn layer_stack(count: u32, order: impl Fn(u32) -> u32, modify_builder: impl Fn(&mut SceneBuilder)) -> Arc<Scene> {
     let mut builder = create_builder(Transparency::OrderIndependent, 1);
-    modify(&mut builder);
+    modify_builder(&mut builder);
     (0..count).fold(builder, |builder, index| add_layer(builder, order(index), count, 1.0)).build()
 }
 
@@ -209,14 +218,15 @@ fn add_layer(builder: SceneBuilder, depth_index: u32, count: u32, opacity_scale:
     builder.add_domain(pane(-3.0 + 0.05 * depth_index as f32), glass_material(color, opacity_scale * alpha))
 }
 
+/// Color and alpha of a layer of a stack of `count` layers.
 fn layer(depth_index: u32, count: u32) -> ([f32; 3], f32) {
     let shade = depth_index as f32 / count as f32;
     ([shade, 1.0 - shade, 0.5], 0.1 + 0.2 * shade)
 }
 
-/// A [`layer_stack`] in which all layers but the nearest `layers` ones are fully transparent.
-fn nearest_layers(count: u32, layers: u32) -> Arc<Scene> {
-    let opacity_scale = |depth_index: u32| if depth_index >= count - layers { 1.0 } else { 0.0 };
+/// A stack of `count` layers of which only the nearest `visible_count` are not fully transparent.
+fn nearest_layers(count: u32, visible_count: u32) -> Arc<Scene> {
+    let opacity_scale = |depth_index: u32| if depth_index >= count - visible_count { 1.0 } else { 0.0 };
     (0..count)
         .fold(create_builder(Transparency::OrderIndependent, 1), |builder, depth_index| {
             add_layer(builder, depth_index, count, opacity_scale(depth_index))
@@ -226,6 +236,8 @@ fn nearest_layers(count: u32, layers: u32) -> Arc<Scene> {
 
 #[test]
 fn long_fragment_lists_are_sorted() {
+    // Lists of up to 32 fragments are sorted by insertion sort, longer lists by heap sort. No count is a multiple of 7,
+    // so that `index * 7 % count` is a permutation.
     for count in [31, 32, 33, 34, 61, 97] {
         let sorted_frame = render(&layer_stack(count, |index| index, |_| ()));
         let shuffled_frame = render(&layer_stack(count, |index| index * 7 % count, |_| ()));
@@ -238,10 +250,11 @@ fn long_fragment_lists_are_sorted() {
         assert!(
             shuffled_frame.image.rgba == sorted_frame.image.rgba
                 && reversed_frame.image.rgba == sorted_frame.image.rgba,
-            "{count}"
+            "{count} layers"
         );
         let layers: Vec<_> = (0..count).map(|depth_index| layer(depth_index, count)).collect();
-        assert!(is_close(sorted_frame.pixel(20, 40), blend(&layers), 1.0), "{count}: {:?}", sorted_frame.pixel(20, 40));
+        let pixel = sorted_frame.pixel(20, 40);
+        assert!(is_close(pixel, blend(&layers), 1.0), "{count} layers: {pixel:?}");
     }
 }
 
@@ -252,19 +265,24 @@ fn fragments_over_budget_keep_the_nearest() {
         render(&layer_stack(10, order, |builder| builder.parts.look.fragments = budget))
     };
     let complete_frame = render_limited(None, |index| index);
+    // Ten layers of 1600 pixels are 16,000 fragments. The limit is the budget divided by 1600 pixels, rounded down.
     for (budget, per_pixel_limit) in [(8000, 5), (9599, 5), (9600, 6), (1600, 1), (1599, 0), (1, 0)] {
         let frame = render_limited(Some(budget), |index| index);
         let stored = 1600 * u64::from(per_pixel_limit);
         assert_eq!(
             oit_stats(&frame),
             OitStats { fragments: 16000, stored, max_per_pixel: 10, per_pixel_limit: Some(per_pixel_limit) },
-            "{budget}"
+            "budget {budget}"
         );
         let nearest_frame = render(&nearest_layers(10, per_pixel_limit));
-        assert!(frame.image.rgba == nearest_frame.image.rgba, "{budget}");
+        assert!(frame.image.rgba == nearest_frame.image.rgba, "budget {budget}");
+        // The reverse order and a permutation.
         for order in [(|index| 9 - index) as fn(u32) -> u32, |index| index * 3 % 10] {
             let reordered_frame = render_limited(Some(budget), order);
-            assert!(reordered_frame.image.rgba == frame.image.rgba && reordered_frame.stats == frame.stats, "{budget}");
+            assert!(
+                reordered_frame.image.rgba == frame.image.rgba && reordered_frame.stats == frame.stats,
+                "budget {budget}"
+            );
         }
         assert!(frame.image.rgba != complete_frame.image.rgba, "negative control: expected missing fragments");
     }
@@ -279,6 +297,7 @@ fn fragments_over_budget_keep_the_nearest() {
 fn latest_of_coplanar_layers_are_kept_over_budget() {
     let colors = [RED, GREEN, BLUE, RED, GREEN];
     let mut builder = create_builder(Transparency::OrderIndependent, 1);
+    // Two fragments for each of the 1600 pixels.
     builder.parts.look.fragments = Some(3200);
     let add_pane = |builder: SceneBuilder, color: [f32; 3]| builder.add_domain(pane(0.0), glass_material(color, 0.5));
     let frame = render(&colors.into_iter().fold(builder, add_pane).build());
@@ -306,6 +325,7 @@ fn scene_over_budget_is_deterministic() {
 
 #[test]
 fn two_passes_draw_alpha_above_threshold_as_opaque() {
+    // A leaf whose left half has alpha 128 / 255 and whose right half has alpha 1.
     let render_with = |opaque_alpha: f32| {
         let mut builder = create_builder(Transparency::TwoPass, 4);
         builder.parts.look.opaque_alpha = opaque_alpha;
@@ -314,6 +334,7 @@ fn two_passes_draw_alpha_above_threshold_as_opaque() {
         // The farther pane comes later in the scene, so only the depth test keeps it behind.
         render(&builder.add_domain(pane(0.0), leaf).add_domain(pane(-1.0), glass_material(RED, 0.5)).build())
     };
+    // No alpha reaches the threshold of 1.5, so that all fragments are blended in scene order.
     let (split_frame, unsplit_frame) = (render_with(0.95), render_with(1.5));
     assert!(is_close(split_frame.pixel(42, 30), GREEN.map(f64::from), 1.0), "{:?}", split_frame.pixel(42, 30));
     assert!(
@@ -322,7 +343,7 @@ fn two_passes_draw_alpha_above_threshold_as_opaque() {
         unsplit_frame.pixel(42, 30)
     );
     let blended_color = blend(&[(GREEN, 128.0 / 255.0), (RED, 0.5)]);
-    // This pixel is near the center of the half-transparent texel.
+    // Pixel (22, 30) is near the center of the half-transparent texel.
     assert!(
         is_close(split_frame.pixel(22, 30), blended_color, 2.0),
         "expected blending in scene order, got {:?}",

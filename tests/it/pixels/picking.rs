@@ -4,14 +4,15 @@ use std::sync::Arc;
 
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
-use modalcast_model::domain::{AlphaMode, Domain, Material, Mesh, Modes, Shape, Transform};
+use modalcast_model::domain::{AlphaMode, Material, Mesh, Modes, Shape};
 use modalcast_model::scene::{BoundingBox, Camera, Ground, Lens, PixelRect, Scene, SceneState, View};
 use modalcast_render::{FrameParams, PickHit, Renderer, SceneBuffers, VisibilityId};
 use nalgebra::Vector3;
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer};
 
-/// Tolerance of hit positions in units. They are computed in f64 on the f32 triangle.
+/// Tolerance of hit positions in scene units. Positions are computed in f64 from f32 vertices, so that only the
+/// vertices are rounded to f32.
 const TOLERANCE: f64 = 1e-6;
 
 struct PickHarness {
@@ -40,7 +41,7 @@ impl PickHarness {
         FrameParams { camera, width: size, height: size, bounds: self.bounds, light_bounds: None }
     }
 
-    /// Hits in a rectangle of a square image, given by its corner and size.
+    /// Hits in the rectangle with the top left pixel `corner` and this size, in a square image with side `image_size`.
     fn pick(&mut self, camera: Camera, image_size: u32, corner: [u32; 2], size: [u32; 2]) -> Vec<PickHit> {
         let rectangle = PixelRect::within([image_size; 2], corner, size).expect("expected a valid rectangle");
         let frame_params = self.frame_params(camera, image_size);
@@ -49,11 +50,13 @@ impl PickHarness {
     }
 }
 
+/// Largest difference of two vectors in any component.
 fn max_difference(left: [f64; 3], right: [f64; 3]) -> f64 {
     (Vector3::from(left) - Vector3::from(right)).abs().max()
 }
 
-/// Intersection of the ray through the center of a pixel of [`front_camera`]`(64)` with the plane z = 0.
+/// Intersection of the plane z = 0 with the ray through the center of a pixel of [`front_camera`]`(64)`, which has ten
+/// pixels per unit there.
 fn plane_point(x: u32, y: u32) -> [f64; 3] {
     [(f64::from(x) + 0.5 - 32.0) / 10.0, (32.0 - f64::from(y) - 0.5) / 10.0, 0.0]
 }
@@ -62,6 +65,7 @@ fn plane_point(x: u32, y: u32) -> [f64; 3] {
 fn pick_has_domain_triangle_position_normal_and_depth() {
     let builder = SceneBuilder::new().add_domain(facing_rectangle(-3.0, -3.0, -2.5, -2.5, 0.0), Material::default());
     let scene = builder.add_domain(facing_rectangle(-2.0, -1.0, 2.0, 1.0, 0.0), Material::default()).build();
+    // The pixel shows domain 1.
     let hits = PickHarness::at_rest(&scene).pick(front_camera(64), 64, [40, 30], [1, 1]);
     let [hit] = &hits[..] else { panic!("expected one hit, got {hits:?}") };
     let [x, y, _] = plane_point(40, 30);
@@ -85,11 +89,11 @@ fn pick_has_domain_triangle_position_normal_and_depth() {
 fn mirrored_domains_keep_vertex_order_in_picks() {
     let double_sided = Material { double_sided: true, ..Material::default() };
     let mut builder = SceneBuilder::new().add_domain(facing_rectangle(-2.0, -1.0, 2.0, 1.0, 0.0), double_sided);
-    builder.parts.domains[0].placement.0[0] = -1.0;
+    builder.parts.domains[0].placement.0[0] = -1.0; // mirrors x
     let scene = builder.build();
     let mut harness = PickHarness::at_rest(&scene);
     let hit = harness.pick(front_camera(64), 64, [24, 34], [1, 1]).remove(0);
-    // The point on the mesh is mirrored in x.
+    // The barycentric coordinates are those of `pick_has_domain_triangle_position_normal_and_depth`, with -x for x.
     let [x, y, _] = plane_point(24, 34);
     assert_eq!(hit.vertices, [0, 1, 2]);
     assert!(
@@ -106,6 +110,7 @@ fn mirrored_domains_keep_vertex_order_in_picks() {
 #[test]
 fn pick_follows_the_deformed_surface() {
     let mesh = facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0);
+    // One mode, which moves the four vertices along z.
     let columns = (0..12).map(|row| if row % 3 == 2 { 1.0 } else { 0.0 }).collect();
     let mut builder = SceneBuilder::new().add_domain(mesh.clone(), Material::default());
     builder.parts.shapes[0] = Shape::new(mesh, Modes::from_columns(12, 1, columns).expect("expected valid modes"))
@@ -116,7 +121,7 @@ fn pick_follows_the_deformed_surface() {
         state.q[0] = q;
         let hit = PickHarness::with_state(&scene, &state).pick(front_camera(64), 64, [36, 27], [1, 1]).remove(0);
         let (z, [x, y, _]) = (f64::from(q), plane_point(36, 27));
-        // The ray from (0, 0, 10) intersects the plane at this z instead of the plane z = 0.
+        // The ray from the eye at (0, 0, 10) through (x, y, 0) intersects the mesh, which is now at depth z.
         let expected = [x * (10.0 - z) / 10.0, y * (10.0 - z) / 10.0, z];
         assert!(
             max_difference(hit.position, expected) < TOLERANCE && (hit.depth - 10.0 + z).abs() < TOLERANCE,
@@ -166,12 +171,12 @@ fn picks_agree_with_the_visibility_of_the_frame() {
         assert!(mismatches <= 5, "expected at most 5 different pixels of 10000, got {mismatches}");
         assert!(
             misses > 500 && hits_per_domain.iter().all(|count| *count > 100),
-            "negative control: {misses} {hits_per_domain:?}"
+            "negative control: expected misses and hits of all domains, got {misses} misses, hits {hits_per_domain:?}"
         );
     }
 }
 
-/// Holes of cut-outs, glass, sky and ground are not hit. A surface behind a hole is hit.
+/// A surface behind a hole is hit.
 #[test]
 fn holes_glass_sky_and_ground_are_not_hit() {
     let mut builder = SceneBuilder::new();
@@ -179,8 +184,8 @@ fn holes_glass_sky_and_ground_are_not_hit() {
     let cut_out_material =
         Material { alpha_mode: AlphaMode::Mask { cutoff: 0.5 }, color_texture: Some(image), ..Material::default() };
     let glass_material = Material { alpha_mode: AlphaMode::Blend, alpha: 0.9, ..Material::default() };
-    // Domain 0, the cut-out, is solid on its left half and has a hole on its right half. Domain 1 is opaque, behind its lower
-    // half. Domain 2 is glass, in front of its upper half.
+    // Domain 0 is a cut-out whose left half is solid and whose right half is a hole. Domain 1 is opaque and lies behind
+    // the lower half of the cut-out. Domain 2 is glass and lies in front of the upper half.
     let scene = builder
         .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), cut_out_material)
         .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 0.0, -1.0), Material::default())
@@ -189,6 +194,7 @@ fn holes_glass_sky_and_ground_are_not_hit() {
     let mut harness = PickHarness::at_rest(&scene);
     let mut picked_domain =
         |x: u32, y: u32| harness.pick(front_camera(64), 64, [x, y], [1, 1]).first().map(|hit| hit.domain);
+    // Solid half behind glass, hole behind glass, hole in front of domain 1, sky.
     assert_eq!(
         [picked_domain(22, 22), picked_domain(42, 22), picked_domain(42, 42), picked_domain(2, 2)],
         [Some(0), None, Some(1), None]
@@ -231,9 +237,9 @@ fn concurrent_picks_finish_in_any_order() {
     }
 }
 
-/// Picks of rebased scenes have world positions. Zero or NaN normals give a zero normal.
+/// Picks of scenes with a distant origin return world positions. Zero or NaN normals give a zero normal.
 #[test]
-fn picks_of_rebased_scenes_and_bad_normals_are_finite() {
+fn picks_with_a_distant_origin_or_bad_normals_are_finite() {
     let scene =
         SceneBuilder::new().add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).build();
     let mut harness = PickHarness::at_rest(&scene);
@@ -242,7 +248,8 @@ fn picks_of_rebased_scenes_and_bad_normals_are_finite() {
     let view = View::LookAt { eye: [1e7, 0.0, 10.0 - 1e7], target: origin, up: [0.0, 1.0, 0.0] };
     let hit = harness.pick(Camera { view, ..front_camera(64) }, 64, [36, 30], [1, 1]).remove(0);
     let [x, y, _] = plane_point(36, 30);
-    assert!(max_difference(hit.position, [1e7 + x, y, -1e7]) < 2e-6, "{hit:?}");
+    // Twice the tolerance, because rays at coordinates of 1e7 also have rounding errors in f64.
+    assert!(max_difference(hit.position, [1e7 + x, y, -1e7]) < 2.0 * TOLERANCE, "{hit:?}");
     harness.buffers.set_origin([0.0; 3]);
     for normals in [[0.0_f32; 3], [f32::NAN; 3]] {
         let positions = scene.shapes[0].mesh.rest_positions().as_flattened().to_vec();
@@ -262,8 +269,7 @@ fn tiny_triangle_near_the_camera_is_picked() {
         vec![],
         vec![[0, 1, 2]],
     );
-    let mut builder = SceneBuilder::new().add_domain(mesh.expect("expected a valid mesh"), Material::default());
-    builder.parts.domains[0] = Domain { placement: Transform::IDENTITY, ..builder.parts.domains[0].clone() };
+    let builder = SceneBuilder::new().add_domain(mesh.expect("expected a valid mesh"), Material::default());
     let view = View::LookAt { eye: [2e-7, 2e-7, 2e-6], target: [2e-7, 2e-7, 0.0], up: [0.0, 1.0, 0.0] };
     let camera = Camera { view, near: 1e-6, far: 1e9, ..front_camera(64) };
     let hit = PickHarness::at_rest(&builder.build()).pick(camera, 64, [31, 31], [1, 1]).remove(0);

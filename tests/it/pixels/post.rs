@@ -11,23 +11,27 @@ use super::harness::{
     planned_passes_above_ground, render, render_sized, render_square,
 };
 
-/// A builder with one sample per pixel. Surfaces of [`white_material`] have the linear color `light`.
-fn builder_with_light(light: [f32; 3], modify: impl FnOnce(RenderSettings) -> RenderSettings) -> SceneBuilder {
+/// A builder with one sample per pixel. Surfaces of [`white_material`] have the linear color `light`. `modify_look`
+/// changes the render settings.
+fn builder_with_light(light: [f32; 3], modify_look: impl FnOnce(RenderSettings) -> RenderSettings) -> SceneBuilder {
     let mut builder = SceneBuilder::new();
     builder.parts.look.skylight = light;
     builder.parts.look.samples = 1;
-    builder.parts.look = modify(builder.parts.look);
+    builder.parts.look = modify_look(builder.parts.look);
     builder
 }
 
+/// A material lit by skylight alone.
 fn white_material() -> Material {
     Material { ambient: [1.0; 3], diffuse: [0.0; 3], ..Material::default() }
 }
 
+/// The curve of [`ToneMapping::Reinhard`].
 fn reinhard(light: f64) -> f64 {
     light / (1.0 + light)
 }
 
+/// The curve of [`ToneMapping::Aces`].
 fn aces(light: f64) -> f64 {
     light * (2.51 * light + 0.03) / (light * (2.43 * light + 0.59) + 0.14)
 }
@@ -42,7 +46,8 @@ fn tone_curves_have_their_known_values() {
         )
         .pixel(32, 32)
     };
-    // Only the light of 1e30 exceeds this threshold, so the bloom pass only inverts the tone curve and applies it again.
+    // For light below the threshold, the bloom pass only inverts the tone curve and applies it again. Light of 1e30
+    // exceeds the threshold and remains white.
     let idle_bloom = Some(Bloom { threshold: 1000.0, ..Bloom::default() });
     for light in [[0.01, 0.18, 0.5], [1.0, 2.0, 8.0], [0.0, 30.0, 1e30]] {
         let linear_light = light.map(f64::from);
@@ -52,7 +57,6 @@ fn tone_curves_have_their_known_values() {
                 (ToneMapping::Aces, linear_light.map(aces)),
                 (ToneMapping::None, linear_light),
             ] {
-                let expected = expected.map(|value| if value.is_finite() { value } else { 1.0 });
                 let pixel = render_with(light, &|look| RenderSettings { tone, bloom, ..look });
                 assert!(is_close(pixel, expected, 1.0), "{tone:?}, {bloom:?}, {light:?}: {pixel:?}");
             }
@@ -71,7 +75,7 @@ fn tone_curves_have_their_known_values() {
     );
 }
 
-/// Sum and centroid of the red light; the centroid is in pixels from the top left.
+/// Sum of the linear red values of all pixels, and centroid of the red light in pixels from the top left.
 fn sum_and_centroid(frame: &RenderedFrame) -> (f64, [f64; 2]) {
     let (mut sum, mut moment) = (0.0, [0.0; 2]);
     for y in 0..frame.image.height {
@@ -95,7 +99,7 @@ fn bloom_of_one_pixel_keeps_its_light_and_centroid() {
         render_sized(&mut open_renderer(), &scene, front_camera(64), size)
     };
     let full_bloom = |threshold: f32, levels: u32| Some(Bloom { threshold, strength: 1.0, levels });
-    // The blurred pixels end below white, so that the picture contains all of their light.
+    // Blurred pixels stay below white, so that no light is clipped. The sum tolerance of 1 % is for rounding to 8 bits.
     for (size, levels, light, threshold) in
         [([64, 64], 3, 8.0, 0.0), ([61, 67], 3, 8.0, 0.0), ([64, 64], 1, 8.0, 0.0), ([64, 64], 2, 1.2, 0.6)]
     {
@@ -110,6 +114,7 @@ fn bloom_of_one_pixel_keeps_its_light_and_centroid() {
     }
     let (sum, _) = sum_and_centroid(&render_with(8.0, None, [64, 64]));
     assert!((sum - 1.0).abs() < 1e-9, "negative control: expected one white pixel without bloom, got a sum of {sum}");
+    // One level spreads the pixel to 2 x 2 texels of half the resolution, and these to 6 x 6 pixels.
     let count_lit = |levels| render_with(8.0, full_bloom(0.0, levels), [64, 64]).count_pixels(|pixel| pixel != [0; 3]);
     assert!(count_lit(1) == 36 && count_lit(3) > 200, "{} and {} pixels", count_lit(1), count_lit(3));
 }
@@ -117,11 +122,10 @@ fn bloom_of_one_pixel_keeps_its_light_and_centroid() {
 #[test]
 fn bloom_is_symmetric_and_respects_its_threshold() {
     let square = facing_rectangle(-0.1, -0.1, 0.1, 0.1, 0.0);
-    let bloom = |threshold| {
-        RenderSettings { bloom: Some(Bloom { threshold, strength: 0.8, levels: 4 }), ..RenderSettings::default() }.bloom
+    let builder = |threshold: f32| {
+        let bloom = Some(Bloom { threshold, strength: 0.8, levels: 4 });
+        builder_with_light([30.0, 12.0, 5.0], |look| RenderSettings { bloom, ..look })
     };
-    let builder =
-        |threshold| builder_with_light([30.0, 12.0, 5.0], |look| RenderSettings { bloom: bloom(threshold), ..look });
     let frame = render(&builder(1.0).add_domain(square.clone(), white_material()).build());
     for (x, y) in (0..32).flat_map(|x| (0..32).map(move |y| (x, y))) {
         let pixel = frame.pixel(x, y);
@@ -132,6 +136,7 @@ fn bloom_is_symmetric_and_respects_its_threshold() {
             );
         }
     }
+    // Beside the square, which covers columns 31 and 32.
     let [r, g, b] = frame.pixel(36, 32);
     assert!(r > g && g > b && b > 0, "expected bloom with the hue of its light, got {r} {g} {b}");
     let unbloomed_frame = render(
@@ -144,14 +149,15 @@ fn bloom_is_symmetric_and_respects_its_threshold() {
     assert!(frame.image.rgba != unbloomed_frame.image.rgba, "negative control: expected bloom to change the image");
 }
 
-/// The tone curve (here a clamp) is applied to each sample before the samples of a pixel are averaged. Bloom uses the light
-/// of the samples before tone mapping.
+/// Each sample is tone-mapped (here clamped to 1) before the samples of a pixel are averaged. Bloom uses the light of
+/// the samples before tone mapping.
 #[test]
 fn bright_edges_stay_antialiased_with_bloom() {
     let render_with = |bloom: Option<Bloom>| {
         let builder = builder_with_light([50.0; 3], |look| RenderSettings { bloom, samples: 4, ..look });
         let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.25, ambient: [0.0; 3], ..white_material() };
-        // The lamp covers the right half of the pixels of column 32. Its upper half is behind dark glass.
+        // A lamp that covers the right half of the pixels of column 32. The upper half of the lamp is behind dark
+        // glass, but still brighter than white.
         let scene = builder
             .add_domain(facing_rectangle(0.05, -2.0, 2.0, 2.0, 0.0), white_material())
             .add_domain(facing_rectangle(-2.0, 0.0, 2.0, 2.0, 0.1), glass);
@@ -174,7 +180,8 @@ fn bright_edges_stay_antialiased_with_bloom() {
     );
 }
 
-/// Renders a white rhombus with slanted edges on gray to `scale` times 64 pixels per side.
+/// Renders a white rhombus with slanted edges in front of a gray background. The image has `scale` times 64 pixels per
+/// side.
 fn render_rhombus(antialias: Antialiasing, samples: u32, scale: u32) -> RenderedFrame {
     let positions = vec![[-2.1, -1.37, 0.0], [1.63, -2.23, 0.0], [2.17, 1.41, 0.0], [-1.57, 2.29, 0.0]];
     let mesh = Mesh::from_indexed(positions, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
@@ -192,14 +199,15 @@ fn render_rhombus(antialias: Antialiasing, samples: u32, scale: u32) -> Rendered
     )
 }
 
-/// Mean difference from the average linear light of 8 x 8 reference pixels, in levels.
+/// Mean difference from a reference of 8 times the resolution, in levels. A pixel is compared with the average linear
+/// light of its 8 x 8 reference pixels.
 fn mean_error(frame: &RenderedFrame, reference: &RenderedFrame) -> f64 {
     let expected_level = |x: u32, y: u32| {
         let light = |i: u32| decode_srgb(reference.pixel(8 * x + i % 8, 8 * y + i / 8)[0]);
         encode_srgb((0..64).map(light).sum::<f64>() / 64.0)
     };
     let error = |(x, y): (u32, u32)| (f64::from(frame.pixel(x, y)[0]) - expected_level(x, y)).abs();
-    (0..64).flat_map(|y| (0..64).map(move |x| (x, y))).map(error).sum::<f64>() / 4096.0
+    (0..64).flat_map(|y| (0..64).map(move |x| (x, y))).map(error).sum::<f64>() / (64.0 * 64.0)
 }
 
 #[test]
@@ -211,18 +219,20 @@ fn fxaa_smooths_slanted_edges_and_keeps_flat_areas() {
         [&aliased_frame, &fxaa_frame, &render_rhombus(Antialiasing::Msaa, 4, 1)]
             .map(|frame| mean_error(frame, &reference));
     assert_eq!((aliased_frame.stats.samples, fxaa_frame.stats.samples), (1, 1));
+    // FXAA must remove more than half of the error, MSAA at least 40 %.
     assert!(
         fxaa_error < 0.45 * aliased_error,
         "error in levels: one sample {aliased_error}, FXAA {fxaa_error}, MSAA {msaa_error}"
     );
+    assert!(msaa_error < 0.6 * aliased_error, "error in levels: one sample {aliased_error}, MSAA {msaa_error}");
     assert!(
-        msaa_error < 0.6 * aliased_error,
-        "expected a smaller error with MSAA, got {msaa_error} and {aliased_error}"
+        render_rhombus(Antialiasing::Msaa, 1, 1).image.rgba == aliased_frame.image.rgba,
+        "expected no antialiasing by MSAA with one sample"
     );
-    assert!(render_rhombus(Antialiasing::Msaa, 1, 1).image.rgba == aliased_frame.image.rgba);
     let mut changed_pixels = 0;
     for (x, y) in (1..63).flat_map(|x| (1..63).map(move |y| (x, y))) {
         let pixel = aliased_frame.pixel(x, y);
+        // The 3 x 3 pixels around the pixel have one color.
         let is_flat = (0..9).all(|i| aliased_frame.pixel(x + i % 3 - 1, y + i / 3 - 1) == pixel);
         assert!(!is_flat || fxaa_frame.pixel(x, y) == pixel, "({x}, {y}): expected no change in a uniform area");
         changed_pixels += usize::from(fxaa_frame.pixel(x, y) != pixel);
@@ -230,20 +240,25 @@ fn fxaa_smooths_slanted_edges_and_keeps_flat_areas() {
     assert!(changed_pixels > 100, "negative control: expected changed edges, got {changed_pixels} pixels");
 }
 
-/// Renders a sky whose values lie between two levels in each channel.
+/// Linear colors of the sky: close to each other, and between two levels in each channel.
+const SKY_ZENITH: [f64; 3] = [0.2985, 0.06, 0.41];
+const SKY_HORIZON: [f64; 3] = [0.2988, 0.0601, 0.4103];
+
+/// Renders the sky from [`SKY_HORIZON`] to [`SKY_ZENITH`].
 fn render_sky(dither: bool) -> RenderedFrame {
     let mut builder = builder_with_light([0.0; 3], |look| RenderSettings { dither, ..look });
-    (builder.parts.look.zenith, builder.parts.look.horizon) = ([0.2985, 0.06, 0.41], [0.2988, 0.0601, 0.4103]);
+    let look = &mut builder.parts.look;
+    (look.zenith, look.horizon) = (SKY_ZENITH.map(|channel| channel as f32), SKY_HORIZON.map(|channel| channel as f32));
     render(&builder.add_domain(facing_rectangle(-0.1, -3.2, 0.1, -3.1, 0.0), white_material()).build())
 }
 
-/// Unrounded level of a channel of [`render_sky`].
+/// Unrounded level of a channel of [`render_sky`], by the formula of `shaders/shared/sky.glsl`.
 fn exact_sky_level(x: u32, y: u32, channel: usize) -> f64 {
     let direction =
         nalgebra::Vector3::new((f64::from(x) - 31.5) / 100.0, (31.5 - f64::from(y)) / 100.0, -1.0).normalize();
     let sine = direction.y.max(0.0);
     let weight = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
-    let (horizon, zenith) = ([0.2988, 0.0601, 0.4103][channel], [0.2985, 0.06, 0.41][channel]);
+    let (horizon, zenith) = (SKY_HORIZON[channel], SKY_ZENITH[channel]);
     encode_srgb(horizon + weight * (zenith - horizon))
 }
 
@@ -255,11 +270,12 @@ fn dithering_stays_within_one_level_and_keeps_the_mean() {
         let (a, b) = (undithered_frame.pixel(x, y), dithered_frame.pixel(x, y));
         assert!((0..3).all(|channel| a[channel].abs_diff(b[channel]) <= 1), "({x}, {y})");
     }
-    // Only blocks of the upper half: below the horizon, the sky has one color.
+    // Largest mean error of a block of 8 x 8 pixels, the size of the dither pattern, in levels. Only blocks of the
+    // upper half of the image are used, because the sky below the horizon has one color.
     let max_block_bias = |frame: &RenderedFrame, channel: usize| {
-        let block_bias = |block_index: (u32, u32)| {
+        let block_bias = |(block_x, block_y): (u32, u32)| {
             let error = |i: u32| {
-                let (x, y) = (8 * block_index.0 + i % 8, 8 * block_index.1 + i / 8);
+                let (x, y) = (8 * block_x + i % 8, 8 * block_y + i / 8);
                 f64::from(frame.pixel(x, y)[channel]) - exact_sky_level(x, y, channel)
             };
             ((0..64).map(error).sum::<f64>() / 64.0).abs()
@@ -274,6 +290,7 @@ fn dithering_stays_within_one_level_and_keeps_the_mean() {
             "channel {channel}: {dithered_bias} levels with dithering, {undithered_bias} without"
         );
     }
+    // Black and white are exact levels; 2 is clamped to white.
     let render_representable = |dither| {
         let builder = builder_with_light([1.0, 0.0, 2.0], |look| RenderSettings { dither, ..look });
         render(&builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), white_material()).build()).image.rgba
@@ -281,6 +298,7 @@ fn dithering_stays_within_one_level_and_keeps_the_mean() {
     assert!(render_representable(true) == render_representable(false), "expected no change of representable levels");
 }
 
+/// Enables all post-processing.
 fn with_all_effects(look: RenderSettings) -> RenderSettings {
     let bloom = Some(Bloom { threshold: 0.3, ..Bloom::default() });
     RenderSettings {
@@ -324,6 +342,8 @@ fn nan_and_infinite_light_affect_no_other_pixel() {
     for tone in [ToneMapping::None, ToneMapping::Reinhard, ToneMapping::Aces] {
         for bloom in [None, Some(Bloom { threshold: 0.9, strength: 1.0, levels: 8 })] {
             let mut builder = builder_with_light([0.25; 3], |look| RenderSettings { tone, bloom, ..look });
+            // Diffuse and specular light together overflow to infinity on the lamp. The white square faces the sun, but
+            // reflects skylight alone.
             builder.parts.look.sunlight = [3e38; 3];
             let lamp = Material { diffuse: [1.0; 3], specular: [1.0; 3], shininess: 1.0, ..white_material() };
             let scene = builder
@@ -334,6 +354,7 @@ fn nan_and_infinite_light_affect_no_other_pixel() {
             let mut deformer = ReferenceDeformer::new(&scene);
             let bounds = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed").bounds;
             let rest_surface = deformer.surface().expect("expected a surface").clone();
+            // Renders the scene with this normal at the four corners of the lamp.
             let mut render_with = |normal: [f32; 3]| {
                 let mut surface = DeformedSurface { normals: rest_surface.normals.clone(), ..rest_surface.clone() };
                 surface.normals[..12].copy_from_slice(&normal.repeat(4));
@@ -346,6 +367,7 @@ fn nan_and_infinite_light_affect_no_other_pixel() {
             };
 
             let lit_frame = render_with([0.0, 0.0, 1.0]);
+            // Pixel (7, 57) shows the lamp, (32, 32) the white square, and (60, 3) the black sky.
             assert!(
                 lit_frame.pixel(7, 57).iter().all(|level| *level > 250),
                 "{tone:?} {bloom:?}: {:?}",

@@ -1,4 +1,5 @@
-//! The reference rasterizer compared with OpenGL: ids differ only where depths tie or where a sample lies on an edge.
+//! The reference rasterizer compared with OpenGL: triangle ids differ only where two triangles have equal depth or
+//! where a sample lies on an edge.
 
 use std::sync::Arc;
 
@@ -14,16 +15,18 @@ use super::harness::{SceneBuilder, open_renderer};
 use crate::common::exact_triangle::{ExactTriangle, compare_ids};
 use crate::scenes::Random;
 
+/// Width and height of a frame in pixels.
 const SIZE: [u32; 2] = [320, 240];
-/// Depths tie below this difference: each rasterizer has a depth precision of 24 bits.
+/// Depths with at most this difference count as equal: one rounding step of 2^-24 for each of the two rasterizers.
 const DEPTH_TOLERANCE: f64 = 2.0 / (1 << 24) as f64;
 
-/// A scene of one domain with triangles of many sizes around and behind the eye, and its triangles.
+/// A scene of one domain with triangles of many sizes, some of them behind the eye. Also returns the vertex indices of
+/// the triangles.
 fn random_scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
     let mut random = Random(seed);
     let mut positions = Vec::new();
     for index in 0..1500 {
-        // One triangle in 60 is large. The other triangles with the same remainder have no area.
+        // One triangle in four has no area, except that one in 60 is large instead.
         let size = match index % 4 {
             0 => 0.02,
             1 => 0.1,
@@ -65,12 +68,13 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
             .draw(&buffers, &FrameParams { camera, width, height, bounds, light_bounds: None })
             .expect("expected a frame");
         assert_eq!(renderer.stats().samples, 1);
-        let source_triangle = |id: &VisibilityId| match id {
+        // Index of a visible triangle in the mesh.
+        let triangle_index = |id: &VisibilityId| match id {
             VisibilityId::Triangle(index) => buffers.source_triangle(*index).map(|(_, triangle)| triangle as u32),
             _ => None,
         };
         let opengl_ids: Vec<Option<u32>> =
-            renderer.read_visibility().expect("expected visibility ids").iter().map(source_triangle).collect();
+            renderer.read_visibility().expect("expected visibility ids").iter().map(triangle_index).collect();
         renderer.unload(buffers);
 
         let clip = camera.clip_from_camera(width, height, &bounds) * camera.camera_from_world();
@@ -80,8 +84,8 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
         let rasterize_ids = |clip: &Matrix4<f64>| {
             let mut raster =
                 VisibilityBuffer::new(Viewport::new(clip, width, height).expect("expected a valid viewport"));
-            let group = DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None };
-            raster.draw(&surface.positions, &triangles, group);
+            let all_triangles = DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None };
+            raster.draw(&surface.positions, &triangles, all_triangles);
             raster.ids()
         };
         let differences = compare_ids(&rasterize_ids(&clip), &opengl_ids, &exact_triangles, SIZE[0], DEPTH_TOLERANCE);
@@ -90,10 +94,11 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
         assert!(covered_samples > 5000 && differences.wrong == 0, "{covered_samples} covered samples, {differences:?}");
         assert!(differences.edges + differences.ties < covered_samples / 100, "{differences:?}");
 
+        // The image is two units wide in normalized device coordinates.
         let mut shift = Matrix4::identity();
         shift[(0, 3)] = 0.1 / f64::from(width);
         let shifted_differences =
             compare_ids(&rasterize_ids(&(shift * clip)), &opengl_ids, &exact_triangles, SIZE[0], DEPTH_TOLERANCE);
-        assert!(shifted_differences.wrong > 5, "negative control: shifted by 1/20 pixel: {shifted_differences:?}");
+        assert!(shifted_differences.wrong > 5, "negative control, shifted by 1/20 pixel: {shifted_differences:?}");
     }
 }

@@ -1,5 +1,6 @@
-//! Frames drawn by a compute rasterizer instead of OpenGL; the tests use the reference rasterizer. Images equal those of
-//! OpenGL up to a few samples on edges, and each frame reports the rasterizer that drew it.
+//! Frames drawn by a compute rasterizer instead of OpenGL. The compute rasterizer of these tests is the reference
+//! rasterizer; the renderer reports every compute rasterizer as [`RasterBackend::Cuda`]. Images equal those of OpenGL
+//! up to a few samples on edges, and each frame reports the rasterizer that drew it.
 
 use std::cell::Cell;
 use std::rc::Rc;
@@ -48,6 +49,7 @@ impl ReferenceRasterizer {
         Self { mesh, gl, x_offset }
     }
 
+    /// Reads the deformed positions from their OpenGL buffer.
     fn positions(&self) -> Vec<f32> {
         let GlBuffer { name, bytes, .. } = self.mesh.positions;
         let mut positions = vec![0_f32; bytes as usize / 4];
@@ -82,7 +84,7 @@ impl ReferenceRasterizer {
 }
 
 impl Rasterizer for ReferenceRasterizer {
-    fn precompile(&mut self, _: bool, _: bool) -> Result<()> {
+    fn precompile(&mut self, _depth: bool, _ids: bool) -> Result<()> {
         Ok(())
     }
 
@@ -98,10 +100,10 @@ impl Rasterizer for ReferenceRasterizer {
 }
 
 fn native_buffer(name: u32) -> glow::Buffer {
-    glow::NativeBuffer(std::num::NonZeroU32::new(name).expect("expected a name"))
+    glow::NativeBuffer(std::num::NonZeroU32::new(name).expect("expected a nonzero buffer name"))
 }
 
-/// The rasterizer of a scene.
+/// The rasterizer that a scene uses.
 #[derive(Clone, Copy, PartialEq)]
 enum Backend {
     OpenGl,
@@ -111,11 +113,14 @@ enum Backend {
 
 struct DrawnFrame {
     image: FrameImage,
+    /// Id of the first sample of each pixel.
     ids: Vec<VisibilityId>,
     stats: FrameStats,
+    /// Names of the scene's buffers.
     allocations: Vec<String>,
 }
 
+/// Width and height of a frame in pixels.
 const SIZE: [u32; 2] = [192, 128];
 
 fn draw_frame(scene: &Arc<Scene>, camera: Camera, backend: Backend) -> DrawnFrame {
@@ -133,10 +138,11 @@ fn draw_frame_with(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, 
         .draw(&buffers, &FrameParams { camera, width, height, bounds, light_bounds: None })
         .expect("expected a frame");
     let (ids, stats) = (renderer.read_visibility().expect("expected visibility ids"), renderer.stats().clone());
-    let allocations = buffers.allocations().into_iter().map(|part| part.name).collect();
+    let allocations = buffers.allocations().into_iter().map(|allocation| allocation.name).collect();
     DrawnFrame { image, ids, stats, allocations }
 }
 
+/// Makes the scene of `buffers` use the rasterizer.
 fn attach_backend(renderer: &mut Renderer, buffers: &mut SceneBuffers, backend: Backend) {
     if let Backend::Compute(x_offset) = backend {
         let create_rasterizer =
@@ -145,7 +151,7 @@ fn attach_backend(renderer: &mut Renderer, buffers: &mut SceneBuffers, backend: 
     }
 }
 
-/// A wall, a horizontal square above the ground and a square in the plane of the ground.
+/// Domain 0 is a wall, domain 1 a horizontal square above the ground, and domain 2 a square in the plane of the ground.
 fn yard_builder(shadow: Option<ShadowSettings>, samples: u32) -> SceneBuilder {
     let mut builder = SceneBuilder::new();
     let defaults = modalcast_model::scene::RenderSettings::default();
@@ -165,7 +171,7 @@ fn default_camera() -> Camera {
     Camera { view, lens: Lens::FieldOfView(38.0), near: 0.1, far: 60.0 }
 }
 
-/// Number of items that differ.
+/// Number of positions at which two slices of equal length differ.
 fn count_differences<T: PartialEq>(left: &[T], right: &[T]) -> usize {
     left.iter().zip(right).filter(|(left, right)| left != right).count()
 }
@@ -175,7 +181,7 @@ fn count_different_bytes(left: &FrameImage, right: &FrameImage) -> usize {
     left.rgba.iter().zip(&right.rgba).filter(|(left, right)| left.abs_diff(**right) > 4).count()
 }
 
-/// Compares frames with ground and shadow, for every blur implementation.
+/// Compares frames with ground and shadow, for every blur method.
 #[test]
 fn compute_rasterized_frame_equals_opengl() {
     for blur_method in [BlurMethod::Tiles, BlurMethod::Rows, BlurMethod::Fragments] {
@@ -212,6 +218,7 @@ fn compute_rasterized_frame_equals_opengl() {
             count_ids(|id| *id == VisibilityId::Ground) > 5000
                 && count_ids(|id| matches!(id, VisibilityId::Triangle(_))) > 2000
         );
+        // Only samples on edges may differ: a few of 192 x 128.
         let (different_ids, different_bytes) = (
             count_differences(&compute_frame.ids, &opengl_frame.ids),
             count_different_bytes(&compute_frame.image, &opengl_frame.image),
@@ -220,6 +227,7 @@ fn compute_rasterized_frame_equals_opengl() {
             different_ids <= 12 && different_bytes <= 60,
             "{blur_method:?}: {different_ids} ids, {different_bytes} bytes differ"
         );
+        // The image is two units wide in normalized device coordinates: 0.02 units are 1.92 pixels.
         let shifted_frame = draw_frame(Backend::Compute(0.02));
         let (different_ids, different_bytes) = (
             count_differences(&shifted_frame.ids, &opengl_frame.ids),
@@ -275,11 +283,12 @@ fn opengl_and_compute_frames_share_a_target() {
 #[test]
 fn ground_hides_geometry_below_but_not_in_its_plane() {
     let scene = yard_builder(None, 1).build();
+    // Domain of each pixel, with the wall and the floating square lowered by `lowering`.
     let visible_domains = |backend: Backend, lowering: f32| {
         let (mut renderer, mut deformer) = (open_renderer(), ReferenceDeformer::new(&scene));
         let mut state = SceneState::rest(&scene);
         for domain in 0..2 {
-            state.transforms[domain].0[7] -= lowering;
+            state.transforms[domain].0[7] -= lowering; // y of the translation
         }
         let bounds = deformer.deform(&state).expect("expected the step to succeed").bounds;
         let mut buffers = renderer.load(&scene).expect("expected the scene to load");
@@ -300,6 +309,7 @@ fn ground_hides_geometry_below_but_not_in_its_plane() {
     };
     let count =
         |domains: &[Option<usize>], domain: usize| domains.iter().filter(|visible| **visible == Some(domain)).count();
+    // A lowering of 0.8 puts the floating square, at height 0.7, below the ground.
     let (above_ground, opengl_domains, compute_domains) = (
         visible_domains(Backend::OpenGl, 0.0),
         visible_domains(Backend::OpenGl, 0.8),
@@ -307,7 +317,7 @@ fn ground_hides_geometry_below_but_not_in_its_plane() {
     );
     assert!(
         count_differences(&compute_domains, &opengl_domains) <= 8,
-        "{} samples differ",
+        "expected at most 8 different samples on edges, got {}",
         count_differences(&compute_domains, &opengl_domains)
     );
     assert!(
@@ -327,6 +337,7 @@ fn ground_hides_geometry_below_but_not_in_its_plane() {
 
 #[test]
 fn opengl_draws_frames_that_compute_does_not_support() {
+    // The rasterizers of a scene with a compute rasterizer attached.
     let raster_backends = |builder: SceneBuilder| {
         draw_frame(&builder.build(), default_camera(), Backend::Compute(0.0)).stats.raster_backends
     };
@@ -401,10 +412,10 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     buffers.set_origin([0.0; 3]);
     let (restored_image, _) = draw(&mut renderer, &buffers, &second_params);
     assert_eq!(restored_image.raster_backends.visibility, Some(RasterBackend::Cuda));
-    assert!(restored_image.rgba == unshared_image.rgba, "expected the first image again");
+    assert!(restored_image.rgba == unshared_image.rgba, "expected the image before the upload again");
 }
 
-/// A rasterizer whose draw calls always fail.
+/// A rasterizer whose draw calls return the result of `failure`.
 #[derive(Debug)]
 struct FailingRasterizer {
     failure: fn() -> Result<()>,
@@ -412,11 +423,11 @@ struct FailingRasterizer {
 }
 
 impl Rasterizer for FailingRasterizer {
-    fn precompile(&mut self, _: bool, _: bool) -> Result<()> {
+    fn precompile(&mut self, _depth: bool, _ids: bool) -> Result<()> {
         Ok(())
     }
 
-    fn draw(&mut self, _: Option<DrawTarget<'_>>, _: Option<DrawTarget<'_>>) -> Result<()> {
+    fn draw(&mut self, _depth: Option<DrawTarget<'_>>, _ids: Option<DrawTarget<'_>>) -> Result<()> {
         self.draw_calls.set(self.draw_calls.get() + 1);
         (self.failure)()
     }
@@ -460,7 +471,8 @@ fn failing_rasterizer_falls_back_to_opengl() {
     }
 }
 
-/// A lost device is reported, so that the server closes its scenes. OpenGL does not draw on it.
+/// The loss of a device is reported as an error, so that the server closes the scenes of the device. OpenGL does not
+/// draw the frame instead.
 #[test]
 fn rasterizer_on_a_lost_device_fails_the_frame() {
     let scene = yard_builder(None, 1).build();
@@ -473,17 +485,20 @@ fn rasterizer_on_a_lost_device_fails_the_frame() {
     );
 }
 
-/// A rasterizer without a compiler. It records the pipelines that it was asked to compile.
+/// A rasterizer whose compilation fails.
 #[derive(Debug)]
-struct UncompiledRasterizer(Rc<Cell<[bool; 2]>>);
+struct UncompiledRasterizer {
+    /// Whether the renderer requested the pipelines for shadow depths and for ids.
+    requested_pipelines: Rc<Cell<[bool; 2]>>,
+}
 
 impl Rasterizer for UncompiledRasterizer {
     fn precompile(&mut self, depth: bool, ids: bool) -> Result<()> {
-        self.0.set([depth, ids]);
+        self.requested_pipelines.set([depth, ids]);
         Err(invalid("raster", "a compiler", "none"))
     }
 
-    fn draw(&mut self, _: Option<DrawTarget<'_>>, _: Option<DrawTarget<'_>>) -> Result<()> {
+    fn draw(&mut self, _depth: Option<DrawTarget<'_>>, _ids: Option<DrawTarget<'_>>) -> Result<()> {
         panic!("expected no draw call after a failed compilation");
     }
 }
@@ -492,6 +507,7 @@ impl Rasterizer for UncompiledRasterizer {
 #[test]
 fn rasterizer_is_compiled_when_the_scene_is_loaded() {
     let shadow = Some(ShadowSettings { size: 128, ..ShadowSettings::default() });
+    // Pipelines for shadow depths and for ids. Ids need one sample per pixel.
     for (shadow, samples, expected_pipelines) in
         [(shadow, 1, [true; 2]), (shadow, 4, [true, false]), (None, 1, [false, true])]
     {
@@ -503,7 +519,7 @@ fn rasterizer_is_compiled_when_the_scene_is_loaded() {
             .upload(&buffers, deformer.surface().expect("expected a surface"))
             .expect("expected the upload to succeed");
         let requested_pipelines = Rc::default();
-        let rasterizer = UncompiledRasterizer(Rc::clone(&requested_pipelines));
+        let rasterizer = UncompiledRasterizer { requested_pipelines: Rc::clone(&requested_pipelines) };
         let result = renderer.attach_rasterizer(&mut buffers, |_| Ok(Box::new(rasterizer) as Box<dyn Rasterizer>));
         assert!(
             result.is_err() && requested_pipelines.get() == expected_pipelines,

@@ -8,10 +8,12 @@ use super::harness::{
     SceneBuilder, decode_srgb, facing_rectangle, front_camera, is_close, open_renderer, render, render_square,
 };
 
+/// A material without highlight. A surface that faces the sun has 0.25 (skylight) + 0.5 (sunlight) = 0.75 of its color.
 fn matte_material(diffuse: [f32; 3]) -> Material {
     Material { diffuse, ambient: diffuse, ..Material::default() }
 }
 
+/// The sRGB level of linear 0.5 is 187.5.
 #[test]
 fn is_close_rejects_other_colors_and_nan() {
     assert!(is_close([188, 188, 188], [0.5; 3], 1.0));
@@ -48,12 +50,13 @@ fn first_row_is_the_top_and_first_column_the_left() {
 }
 
 #[test]
-fn first_image_row_is_the_top_of_the_surface() {
+fn first_texture_row_is_the_top_of_the_surface() {
     let mut builder = SceneBuilder::new();
     let image = builder.add_texture(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 0, 255]);
     let material = Material { color_texture: Some(image), ..Material::default() };
     let frame = render(&builder.add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), material).build());
-    // These four pixels show the centers of the four texels.
+    // These four pixels show the centers of the four texels. The colors are red and green, each either 0 or lit: level
+    // 225.
     for (x, y, color) in [(17, 17, [0.0, 0.0]), (46, 17, [1.0, 0.0]), (17, 46, [0.0, 1.0]), (46, 46, [1.0, 1.0])] {
         let [r, g, b] = frame.pixel(x, y);
         assert!(b == 0, "{x} {y}");
@@ -61,7 +64,8 @@ fn first_image_row_is_the_top_of_the_surface() {
     }
 }
 
-/// Equation 3.12 in f64 with clamped dot products and unshadowed ambient light, for a surface that faces +Z.
+/// Equation 3.12 of the thesis in f64, with clamped dot products and unshadowed ambient light, for a surface that faces
+/// +Z.
 fn expected_phong(look: &RenderSettings, material: &Material, point: Vector3<f64>, eye: Vector3<f64>) -> [f64; 3] {
     let sun = Vector3::from(look.sun).cast::<f64>().normalize();
     let normal = Vector3::z();
@@ -98,6 +102,7 @@ fn phong_shading_equals_f64_arithmetic() {
             let point = Vector3::new((f64::from(x) + 0.5 - 32.0) / 10.0, (32.0 - f64::from(y) - 0.5) / 10.0, 0.0);
             let expected = expected_phong(&look, &material, point, Vector3::new(0.0, 0.0, 10.0));
             assert!(is_close(frame.pixel(x, y), expected, 1.0), "{sun:?} ({x}, {y}): {:?}", frame.pixel(x, y));
+            // The pixel has a highlight if its color differs from that of a matte material.
             let matte = Material { specular: [0.0; 3], ..material.clone() };
             let matte_color = expected_phong(&look, &matte, point, Vector3::new(0.0, 0.0, 10.0));
             highlights += usize::from(!is_close(frame.pixel(x, y), matte_color, 1.0));
@@ -106,6 +111,7 @@ fn phong_shading_equals_f64_arithmetic() {
     }
 }
 
+/// The formula is that of `shaders/shared/sky.glsl`.
 #[test]
 fn sky_gradient_equals_its_formula() {
     let mut builder = SceneBuilder::new();
@@ -136,13 +142,16 @@ fn normal_map_changes_shading_and_a_flat_one_does_not() {
         let material = Material { normal_texture: image, ..matte_material([1.0; 3]) };
         render(&builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), material).build())
     };
-    let expected = |facing: f64| [0.25 + 0.5 * facing; 3];
+    // Color for a cosine between the normal and the direction to the sun, (0.6, 0, 0.8).
+    let expected = |cosine: f64| [0.25 + 0.5 * cosine; 3];
     assert!(is_close(render_with(None).pixel(32, 32), expected(0.8), 1.0));
     assert!(
         is_close(render_with(Some([128, 128, 255, 255])).pixel(32, 32), expected(0.8), 1.0),
         "expected no effect of a flat normal map"
     );
-    // Tangent space: x along u, y against v, z along the normal. 0.6 and 0.8 are encoded in steps of 1/127.
+    // Tangent space: x along u, y against v, z along the normal. Components are encoded as 128 + 127 n, so 204 is 0.6,
+    // 52 is -0.6, and 230 is 0.8. The cosine is 0.36 + 0.64 for a normal (0.6, 0, 0.8), -0.36 + 0.64 for (-0.6, 0,
+    // 0.8), and 0.64 for (0, 0.6, 0.8).
     assert!(
         is_close(render_with(Some([204, 128, 230, 255])).pixel(32, 32), expected(1.0), 1.0),
         "expected a brighter surface with the normal tilted towards the sun"
@@ -167,6 +176,7 @@ fn plus_y_of_a_normal_map_points_up_the_image() {
         let material = Material { normal_texture: Some(image), ..matte_material([1.0; 3]) };
         render(&builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), material).build()).pixel(32, 32)
     };
+    // The encoded normals are (0, 0.6, 0.8), towards the sun, and (0, -0.6, 0.8), with a cosine of -0.36 + 0.64.
     assert!(is_close(render_with(204), [0.75; 3], 1.0) && is_close(render_with(52), [0.25 + 0.5 * 0.28; 3], 2.0));
 }
 
@@ -195,7 +205,6 @@ fn cut_out_shows_the_background_and_opaque_does_not() {
 fn two_blended_layers_equal_arithmetic() {
     let render_layers = |near_alpha: f32, far_alpha: f32, alpha_mode: AlphaMode| {
         let layer = |diffuse, alpha| Material { alpha, alpha_mode, ..matte_material(diffuse) };
-        // Layers are blended in scene order, so the farther one comes first.
         let scene = SceneBuilder::new()
             .add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, -2.0), matte_material([0.2, 0.2, 1.0]))
             .add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, -1.0), layer([0.0, 1.0, 0.0], far_alpha))
@@ -203,11 +212,11 @@ fn two_blended_layers_equal_arithmetic() {
             .build();
         render(&scene)
     };
+    // The blue background, then the green far layer, then the red near layer.
     let expected = |near_alpha: f64, far_alpha: f64| {
-        let background = [0.2, 0.2, 1.0].map(|channel| channel * (1.0 - far_alpha));
-        let behind_near =
-            [background[0], background[1] + far_alpha, background[2]].map(|channel| channel * (1.0 - near_alpha));
-        [behind_near[0] + near_alpha, behind_near[1], behind_near[2]].map(|channel| 0.75 * channel)
+        let [r, g, b] = [0.2, 0.2, 1.0].map(|channel| channel * (1.0 - far_alpha));
+        let [r, g, b] = [r, g + far_alpha, b].map(|channel| channel * (1.0 - near_alpha));
+        [r + near_alpha, g, b].map(|channel| 0.75 * channel)
     };
     let frame = render_layers(0.25, 0.5, AlphaMode::Blend);
     assert!(is_close(frame.pixel(32, 32), expected(0.25, 0.5), 1.0), "{:?}", frame.pixel(32, 32));
@@ -235,7 +244,7 @@ fn two_pass_blending_writes_no_depth() {
             .build();
         render(&scene).pixel(32, 32)
     };
-    // The pass writes no depth, so the later layer is blended over the earlier one at any distance.
+    // The second pane is blended over the first one, also behind it: 0.5 of green, and 0.25 of red.
     for second_z in [-1.0, 1.0] {
         assert!(
             is_close(render_with(second_z), [0.75 * 0.25, 0.75 * 0.5, 0.0], 1.0),
@@ -265,7 +274,7 @@ fn only_double_sided_back_faces_are_drawn() {
 }
 
 #[test]
-fn images_of_many_sizes_keep_their_materials() {
+fn textures_of_many_sizes_keep_their_materials() {
     let mut builder = SceneBuilder::new();
     let mut colors = Vec::new();
     for index in 0..9_u32 {
@@ -279,9 +288,10 @@ fn images_of_many_sizes_keep_their_materials() {
     let frame = render_square(&mut open_renderer(), &builder.build(), front_camera(64), 64);
 
     for (index, [r, g, _]) in colors.into_iter().enumerate() {
+        // Each rectangle is 6 pixels wide; the first one begins at column 5.
         let pixel = frame.pixel(5 + 6 * index as u32 + 3, 32);
         let expected = [0.75 * decode_srgb(r), 0.75 * decode_srgb(g), 0.0];
-        assert!(is_close(pixel, expected, 1.0), "image {index}: {pixel:?}");
+        assert!(is_close(pixel, expected, 1.0), "texture {index}: {pixel:?}");
     }
 }
 
@@ -291,7 +301,8 @@ fn intrinsics_set_principal_point_and_scale_per_axis() {
         SceneBuilder::new().add_domain(facing_rectangle(0.0, 0.0, 1.0, 1.0, 0.0), matte_material([1.0; 3])).build();
     let lens = Lens::Intrinsics { fx: 200.0, fy: 100.0, cx: 10.0, cy: 50.0 };
     let frame = render_square(&mut open_renderer(), &scene, Camera { lens, ..front_camera(64) }, 64);
-    assert_eq!(frame.count_pixels(|pixel| pixel != [0; 3]), 200);
+    // At distance 10, a unit is 20 pixels wide and 10 pixels high.
+    assert_eq!(frame.count_pixels(|pixel| pixel != [0; 3]), 20 * 10);
     assert!(frame.pixel(10, 49) != [0; 3] && frame.pixel(29, 40) != [0; 3]);
     assert!(frame.pixel(9, 49) == [0; 3] && frame.pixel(10, 50) == [0; 3] && frame.pixel(30, 40) == [0; 3]);
 }

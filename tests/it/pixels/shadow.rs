@@ -1,4 +1,4 @@
-//! Shadows of the variance shadow map on the ground.
+//! Shadows of the default shadow map, a variance shadow map, on the ground.
 
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Ground, Lens, ShadowSettings, UpAxis, View};
@@ -9,13 +9,14 @@ use super::harness::{
     RenderedFrame, SceneBuilder, facing_rectangle, floor_mesh, is_close, open_renderer, render_square,
 };
 
-/// A builder with ground, a shadow map, and the sun straight above.
+/// A builder with ground, a shadow map without light-bleeding reduction, and the sun straight above.
 pub(super) fn create_builder() -> SceneBuilder {
     let mut builder = SceneBuilder::new();
     builder.parts.look.sun = [0.0, 1.0, 0.0];
     builder.parts.look.ground = Some(Ground { color: [0.8; 3] });
     builder.parts.look.shadow = Some(ShadowSettings { size: 512, bleeding: 0.0, ..ShadowSettings::default() });
-    // Two small squares outside of the image keep the ground at height 0 and widen the bounds.
+    // Two small squares outside the image of `render_from_above`. Their lower edges set the height of the ground to 0.
+    // They extend the bounds to -5.1 and 5.1 in x and to -5 and 5 in z.
     builder
         .add_domain(facing_rectangle(5.0, 0.0, 5.1, 0.1, 5.0), Material::default())
         .add_domain(facing_rectangle(-5.1, 0.0, -5.0, 0.1, -5.0), Material::default())
@@ -32,13 +33,15 @@ fn render_from_above(builder: SceneBuilder) -> RenderedFrame {
     render_square(&mut open_renderer(), &builder.build(), camera, 64)
 }
 
-/// Renders from above a floating square of two units per side and its shadow. The sun comes from the side, so that the
+/// Renders from above the shadow of the square that [`with_square`] adds. The sun comes from the side, so that the
 /// square does not hide its shadow.
 fn render_square_shadow(builder: SceneBuilder, alpha_mode: AlphaMode, alpha: f32) -> RenderedFrame {
     render_from_above(with_square(builder, alpha_mode, alpha))
 }
 
-/// Adds the square, whose shadow on the ground covers x and z of -1 to 1.
+/// Adds a square with a side of two units at height 4, and tilts the sun so that the shadow of the square on the ground
+/// covers x and z of -1 to 1. The cosine between the sun and the up axis is 4/5. For materials that use alpha, the
+/// center of the square is a hole of half its side.
 pub(super) fn with_square(mut builder: SceneBuilder, alpha_mode: AlphaMode, alpha: f32) -> SceneBuilder {
     builder.parts.look.sun = [3.0, 4.0, 0.0];
     let is_in_hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
@@ -57,8 +60,9 @@ pub(super) fn with_square(mut builder: SceneBuilder, alpha_mode: AlphaMode, alph
     builder.add_domain(mesh.expect("expected a valid mesh"), material)
 }
 
-/// Linear color of the ground near the center, for a sun visibility and the cosine of the angle of incidence. The haze
-/// is negligible there, and the horizon is black.
+/// Linear color of the ground near the center: the ground's color 0.8 times skylight 0.25 plus sunlight 0.5.
+/// `visibility` is the fraction of sunlight that arrives, `cosine` that of the angle of incidence. The blend into the
+/// horizon's color is negligible near the center.
 fn ground_color(visibility: f64, cosine: f64) -> [f64; 3] {
     [0.8 * (0.25 + 0.5 * visibility * cosine); 3]
 }
@@ -82,6 +86,7 @@ fn shadow_of_a_floating_square_has_only_ambient_light() {
         "expected sunlight beside the shadow, got {:?}",
         frame.pixel(12, 32)
     );
+    // Level 150 is between the ground in the shadow, level 124, and the lit ground, level 191.
     let dark_pixels = frame.count_pixels(|[r, ..]| f64::from(r) < 150.0);
     assert!((330..=470).contains(&dark_pixels), "expected about 20 x 20 dark pixels, got {dark_pixels}");
 
@@ -102,7 +107,7 @@ fn shadow_of_a_floating_square_has_only_ambient_light() {
 }
 
 #[test]
-fn shadow_removes_everything_but_ambient_light() {
+fn shadow_removes_diffuse_and_specular_light() {
     let floor = Material { ambient: [0.9, 0.5, 0.2], specular: [0.5; 3], shininess: 1.0, ..Material::default() };
     let frame = render_square_shadow(create_builder().add_domain(floor_mesh(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
     assert!(is_close(frame.pixel(32, 32), [0.25 * 0.9, 0.25 * 0.5, 0.25 * 0.2], 1.0), "{:?}", frame.pixel(32, 32));
@@ -114,17 +119,18 @@ fn shadow_removes_everything_but_ambient_light() {
     );
 }
 
-/// The ambient term that the thesis prints equals that of the renderer only in sunlight of the sky's color. In the shadow
-/// the printed term is black.
+/// Outside the shadow, the ambient term that the thesis prints equals that of the renderer only if sunlight and
+/// skylight have the same color. In the shadow, the printed term is black.
 #[test]
 fn ambient_term_is_lit_by_the_sky_and_not_as_printed() {
-    // Without a highlight, equation 3.12 as printed is s_f I_l (C_a + (n . v_l) C_d): the sun also lights C_a, and the
-    // shadow removes that light. In this renderer the sky lights C_a, and the shadow does not remove it.
+    // Without a highlight, equation 3.12 as printed is s_f I_l (C_a + (n . v_l) C_d), with the sun visibility s_f, the
+    // sunlight I_l, and the ambient and diffuse colors C_a and C_d. There, sunlight times s_f lights C_a. In this
+    // renderer, skylight lights C_a, independent of s_f.
     let (ambient, diffuse, cosine) = ([0.4, 0.2, 0.1], [0.3_f32, 0.5, 0.7], 0.8);
     let color = |ambient_light: f64, sunlight: f64| {
         std::array::from_fn(|channel| {
-            let [a, d] = [ambient, diffuse].map(|color| f64::from(color[channel]));
-            ambient_light * a + sunlight * cosine * d
+            let [ambient, diffuse] = [ambient, diffuse].map(|color| f64::from(color[channel]));
+            ambient_light * ambient + sunlight * cosine * diffuse
         })
     };
     for skylight in [0.5, 0.2] {
@@ -139,10 +145,10 @@ fn ambient_term_is_lit_by_the_sky_and_not_as_printed() {
                 is_close(pixel, expected_color, 1.0),
                 "sky {skylight}, sun {visibility}: {pixel:?}, expected {expected_color:?}"
             );
-            let is_equal = skylight == 0.5 && visibility == 1.0;
+            let is_printed_color = skylight == 0.5 && visibility == 1.0;
             assert_eq!(
                 is_close(pixel, printed_color, 1.0),
-                is_equal,
+                is_printed_color,
                 "sky {skylight}, sun {visibility}: {pixel:?}, printed {printed_color:?}"
             );
         }
@@ -169,12 +175,16 @@ fn shadow_of_a_cut_out_has_its_hole() {
     );
 }
 
+/// The default threshold, [`ShadowSettings::alpha_threshold`], is 0.5.
 #[test]
 fn blended_surface_casts_above_the_alpha_threshold() {
     let frame_above_threshold = render_square_shadow(create_builder(), AlphaMode::Blend, 0.6);
     assert!(
         is_close(frame_above_threshold.pixel(24, 32), ground_color(0.0, 0.8), 4.0)
-            && is_close(frame_above_threshold.pixel(32, 32), ground_color(1.0, 0.8), 4.0)
+            && is_close(frame_above_threshold.pixel(32, 32), ground_color(1.0, 0.8), 4.0),
+        "expected a shadow with a hole, got {:?} in the shadow and {:?} in the hole",
+        frame_above_threshold.pixel(24, 32),
+        frame_above_threshold.pixel(32, 32)
     );
     let frame_below_threshold = render_square_shadow(create_builder(), AlphaMode::Blend, 0.4);
     assert!(
@@ -184,20 +194,27 @@ fn blended_surface_casts_above_the_alpha_threshold() {
     );
 }
 
-/// Also with light bleeding reduction, which is applied to the bound.
+/// Light-bleeding reduction is applied to the bound.
 #[test]
 fn unblurred_texel_gives_the_chebyshev_bound() {
-    // A square at height 4 that covers the whole map. The near and far planes of the light lie 1 % of the diagonal of
-    // 14.97 beyond square and ground, rounded outwards to multiples of 1/8.
+    // The caster is a square at height 4 that covers the whole map. With an alpha of 0 and an alpha threshold of 0, the
+    // square casts a shadow, but the camera sees the ground through it.
     let render_with = |least_variance: f32, bleeding: f32| {
         let mut builder = create_builder();
-        builder.parts.look.shadow =
-            Some(ShadowSettings { size: 64, blur: 0.0, least_variance, bleeding, ..ShadowSettings::default() });
+        builder.parts.look.shadow = Some(ShadowSettings {
+            size: 64,
+            blur: 0.0,
+            least_variance,
+            bleeding,
+            alpha_threshold: 0.0,
+            ..ShadowSettings::default()
+        });
         let transparent_material = Material { alpha_mode: AlphaMode::Blend, alpha: 0.0, ..Material::default() };
-        builder.parts.look.shadow =
-            builder.parts.look.shadow.map(|shadow| ShadowSettings { alpha_threshold: 0.0, ..shadow });
         render_from_above(builder.add_domain(floor_mesh(5.1, 4.0), transparent_material)).pixel(32, 32)
     };
+    // Height of the square as a fraction of the depth range. The near plane is 1 % of the bounds' diagonal, which is
+    // 14.97, above the square, and the far plane is as much below the ground. Both are rounded outwards to multiples of
+    // 1/8: heights 4.25 and -0.25.
     let depth_difference = 4.0 / (4.25 + 0.25);
     for (least_variance, bleeding) in [(0.5_f32, 0.0_f32), (0.1, 0.0), (0.5, 0.2), (0.02, 0.3)] {
         let variance = f64::from(least_variance);
@@ -220,12 +237,14 @@ fn blur_widens_the_edge_of_a_shadow() {
         builder.parts.look.shadow =
             Some(ShadowSettings { size: 256, blur, bleeding: 0.0, ..ShadowSettings::default() });
         let frame = render_square_shadow(builder, AlphaMode::Opaque, 1.0);
-        let row: Vec<f64> = (8..56).map(|y| f64::from(frame.pixel(32, y)[0])).collect();
-        let (dark_level, light_level) = (row[24], row[0]);
-        let penumbra_pixels = row.iter().filter(|byte| **byte > dark_level + 4.0 && **byte < light_level - 4.0).count();
+        // Rows 8 to 55 of the image column through the center of the shadow.
+        let levels: Vec<f64> = (8..56).map(|y| f64::from(frame.pixel(32, y)[0])).collect();
+        let (dark_level, light_level) = (levels[24], levels[0]);
+        let penumbra_pixels =
+            levels.iter().filter(|level| **level > dark_level + 4.0 && **level < light_level - 4.0).count();
         assert!(
-            row[..20].windows(2).all(|pair| pair[0] >= pair[1] - 1.0),
-            "expected decreasing light towards the center, got {row:?}"
+            levels[..20].windows(2).all(|pair| pair[0] >= pair[1] - 1.0),
+            "expected decreasing light towards the center, got {levels:?}"
         );
         penumbra_pixels
     };
@@ -258,7 +277,7 @@ fn floor_in_the_plane_of_the_ground_covers_it() {
                 .add_domain(floor_mesh(1.5, height), Material { ambient: [1.0, 0.0, 0.0], ..unlit_material() }),
         );
         let floor_pixels = frame.count_pixels(|[r, g, b]| r > 100 && g < 10 && b < 10);
-        assert_eq!(floor_pixels, 900, "floor at height {height}");
+        assert_eq!(floor_pixels, 30 * 30, "floor at height {height}");
     }
 }
 
@@ -294,5 +313,8 @@ fn every_up_axis_gives_the_same_picture() {
         assert!(different_bytes < 60, "{up:?}: {different_bytes} bytes differ");
     }
     let ground_pixel = y_up_frame.pixel(32, 60);
-    assert!(y_up_frame.count_pixels(|pixel| pixel == ground_pixel) < 4000, "expected geometry in the image");
+    assert!(
+        y_up_frame.count_pixels(|pixel| pixel == ground_pixel) < 4000,
+        "expected other colors than that of the ground in the 64 x 64 pixels"
+    );
 }

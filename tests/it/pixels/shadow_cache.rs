@@ -1,4 +1,4 @@
-//! Frames of one step share its shadow map, and equal frames that are rendered separately.
+//! Frames of one step share one shadow map. They equal frames for which the shadow map is drawn anew.
 
 use std::sync::Arc;
 
@@ -14,14 +14,14 @@ use modalcast_render::{FrameParams, Pass, Renderer, SceneBuffers};
 use super::harness::open_renderer;
 use super::shadow::{create_builder, with_square};
 
-/// A cut-out square and an opaque square that float above the ground.
-fn cut_out_scene(splits: u32) -> Arc<Scene> {
+/// A cut-out square and an opaque square that float above the ground. `splits` is the number of cascades.
+fn create_scene(splits: u32) -> Arc<Scene> {
     let mut builder = with_square(create_builder(), AlphaMode::Mask { cutoff: 0.5 }, 1.0);
     builder.parts.look.shadow = Some(ShadowSettings { size: 256, splits, ..ShadowSettings::default() });
     builder.add_domain(super::harness::floor_mesh(0.5, 2.0), Material::default()).build()
 }
 
-/// The surface and the bounds at rest, shifted along x.
+/// The surface and the bounds at rest, shifted along x by `shift`.
 fn shifted_surface(scene: &Arc<Scene>, shift: f32) -> (DeformedSurface, BoundingBox) {
     let mut deformer = ReferenceDeformer::new(scene);
     let mut bounds = deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed").bounds;
@@ -56,10 +56,12 @@ fn render_with_new_renderer(scene: &Arc<Scene>, shift: f32, camera: Camera) -> V
 
 struct Frame {
     rgba: Vec<u8>,
+    /// Number of passes that drew or blurred the shadow map.
     shadow_passes: usize,
 }
 
-/// Frames of both cameras at two steps. `set_step` may set the step number.
+/// Frames of both cameras at step 1, at rest, and at step 2, shifted. `set_step` may pass the step number to the
+/// buffers.
 fn render_two_steps(scene: &Arc<Scene>, set_step: impl Fn(&SceneBuffers, u64)) -> Vec<Frame> {
     let mut renderer = open_renderer();
     let buffers = renderer.load(scene).expect("expected the scene to load");
@@ -82,14 +84,14 @@ fn pass_counts(frames: &[Frame]) -> Vec<usize> {
 
 #[test]
 fn cameras_of_one_step_share_its_shadow() {
-    let cut_out_scene = cut_out_scene(1);
-    let frames = render_two_steps(&cut_out_scene, SceneBuffers::set_step);
+    let scene = create_scene(1);
+    let frames = render_two_steps(&scene, SceneBuffers::set_step);
     assert_eq!(pass_counts(&frames), [2, 0, 2, 0], "expected shadow and blur once per step");
-    let [first_camera, second_camera] = cameras(&cut_out_scene);
+    let [first_camera, second_camera] = cameras(&scene);
     for (frame, (shift, camera)) in
         frames.iter().zip([(0.0, first_camera), (0.0, second_camera), (0.7, first_camera), (0.7, second_camera)])
     {
-        assert!(frame.rgba == render_with_new_renderer(&cut_out_scene, shift, camera), "{shift}");
+        assert!(frame.rgba == render_with_new_renderer(&scene, shift, camera), "{shift}");
     }
     assert!(
         frames[0].rgba != frames[1].rgba && frames[1].rgba != frames[3].rgba,
@@ -97,30 +99,31 @@ fn cameras_of_one_step_share_its_shadow() {
     );
 }
 
-/// The shadow map is drawn for each frame if it depends on the view or if the step has no number. It is also redrawn if
-/// the bounds change under the same step number.
+/// Each frame draws the shadow map if the map depends on the view, as with cascades, or if the step has no number. The
+/// map is also drawn again if the bounds change and the step number does not.
 #[test]
 fn view_dependent_shadows_are_drawn_for_each_frame() {
     assert_eq!(
-        pass_counts(&render_two_steps(&cut_out_scene(1), |_, _| ())),
+        pass_counts(&render_two_steps(&create_scene(1), |_, _| ())),
         [2; 4],
         "expected a shadow map per frame without a step number"
     );
     assert_eq!(
-        pass_counts(&render_two_steps(&cut_out_scene(2), SceneBuffers::set_step)),
+        pass_counts(&render_two_steps(&create_scene(2), SceneBuffers::set_step)),
         [2; 4],
         "expected a shadow map per frame with splits"
     );
-    let frames = render_two_steps(&cut_out_scene(1), |buffers, _| buffers.set_step(7));
+    // Both steps have the number 7.
+    let frames = render_two_steps(&create_scene(1), |buffers, _| buffers.set_step(7));
     assert_eq!(pass_counts(&frames), [2, 0, 2, 0], "expected a shadow map per step with other bounds");
 }
 
 #[test]
 fn upload_bounds_or_origin_invalidate_the_shadow() {
-    let cut_out_scene = cut_out_scene(1);
+    let scene = create_scene(1);
     let mut renderer = open_renderer();
-    let mut buffers = renderer.load(&cut_out_scene).expect("expected the scene to load");
-    let ((surface, bounds), [camera, _]) = (shifted_surface(&cut_out_scene, 0.0), cameras(&cut_out_scene));
+    let mut buffers = renderer.load(&scene).expect("expected the scene to load");
+    let ((surface, bounds), [camera, _]) = (shifted_surface(&scene, 0.0), cameras(&scene));
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
     buffers.set_step(1);
     let draw = |renderer: &mut Renderer, buffers: &SceneBuffers, bounds| {
@@ -135,38 +138,39 @@ fn upload_bounds_or_origin_invalidate_the_shadow() {
     assert_eq!(
         [nan_bounds, nan_bounds].map(|bounds| draw(&mut renderer, &buffers, bounds)),
         [2, 2],
-        "expected a new shadow in each frame with NaN bounds"
+        "expected a new shadow map in each frame with NaN bounds"
     );
     let light_bounds_passes = [0.0, 0.0, 0.5, 0.5].map(|expansion| {
-        let axes = cut_out_scene.light_axes().expect("expected a scene with a shadow");
+        let axes = scene.light_axes().expect("expected a scene with a shadow");
         let light_bounds = Some(OrientedBounds::enclosing(&axes, &bounds).expanded_by(expansion));
         renderer
             .draw(&buffers, &FrameParams { light_bounds, ..frame_params(camera, bounds) })
             .expect("expected a frame");
         count_shadow_passes(&renderer)
     });
-    assert_eq!(light_bounds_passes, [2, 0, 2, 0], "expected a shadow for other light bounds");
+    assert_eq!(light_bounds_passes, [2, 0, 2, 0], "expected a new shadow map for other light bounds");
     buffers.set_origin([1024.0, 0.0, 0.0]);
     assert_eq!([bounds, bounds].map(|bounds| draw(&mut renderer, &buffers, bounds)), [2, 0]);
+    // An upload clears the step number, so that every later frame draws its shadow map.
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
     assert_eq!([bounds, bounds].map(|bounds| draw(&mut renderer, &buffers, bounds)), [2, 2]);
 }
 
 #[test]
 fn frames_of_an_engine_step_share_its_shadow() {
-    let cut_out_scene = cut_out_scene(1);
+    let scene = create_scene(1);
     let mut context = DeviceContext::open(&Config { backend: BackendChoice::Cpu, ..Config::default() })
         .expect("expected a device context");
-    let mut loaded_scene =
-        context.load_scene(&cut_out_scene, BackendSettings::default()).expect("expected the scene to load");
+    let mut loaded_scene = context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
     let draw_frames = |context: &mut DeviceContext, loaded_scene: &mut modalcast::engine::LoadedScene| {
-        cameras(&cut_out_scene).map(|camera| {
+        cameras(&scene).map(|camera| {
             let rgba = context.draw(loaded_scene, &camera, FrameSize::new(64, 64)).expect("expected a frame").rgba;
             let passes = context.stats().expect("expected a frame").passes.clone();
+            // Without the blur pass.
             Frame { rgba, shadow_passes: passes.iter().filter(|pass| **pass == Pass::Shadow).count() }
         })
     };
-    let mut state = SceneState::rest(&cut_out_scene);
+    let mut state = SceneState::rest(&scene);
     loaded_scene.deform(&state).expect("expected the step to succeed");
     let first_frames = draw_frames(&mut context, &mut loaded_scene);
     assert_eq!(pass_counts(&first_frames), [1, 0]);
@@ -175,8 +179,9 @@ fn frames_of_an_engine_step_share_its_shadow() {
         [0, 0],
         "expected no shadow pass for the same step"
     );
-    let last_domain = cut_out_scene.domains.len() - 1;
-    let valid_state = state.clone();
+    // The first step moves the last domain to x = 2, the second step moves it so far that its positions overflow.
+    let last_domain = scene.domains.len() - 1;
+    let rest_state = state.clone();
     state.transforms[last_domain].0[3] = 2.0;
     loaded_scene.deform(&state).expect("expected the step to succeed");
     let second_frames = draw_frames(&mut context, &mut loaded_scene);
@@ -188,11 +193,11 @@ fn frames_of_an_engine_step_share_its_shadow() {
         third_frames[0].rgba == second_frames[0].rgba && third_frames[1].rgba == second_frames[1].rgba,
         "expected frames of the last valid step"
     );
-    loaded_scene.deform(&valid_state).expect("expected the step to succeed");
+    loaded_scene.deform(&rest_state).expect("expected the step to succeed");
     let fourth_frames = draw_frames(&mut context, &mut loaded_scene);
     assert!(
         fourth_frames[0].rgba == first_frames[0].rgba && fourth_frames[0].rgba != second_frames[0].rgba,
-        "negative control: the frames of the second step differ"
+        "expected the frame at rest again, unlike the frame of the moved domain (negative control)"
     );
     context.unload_scene(loaded_scene);
 }

@@ -1,4 +1,4 @@
-//! Extreme suns, cameras and scenes with every kind of shadow map, and temporal stability of shadows.
+//! Sun directions, cameras and scenes at their limits with every kind of shadow map, and temporal stability of shadows.
 
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::Deformer as _;
@@ -10,6 +10,7 @@ use modalcast_render::{FrameImage, FrameParams};
 
 use super::harness::{SceneBuilder, floor_mesh, open_renderer};
 
+/// Every kind of shadow map. The last map is smaller than its blur kernel.
 fn shadow_settings() -> [ShadowSettings; 5] {
     let base = ShadowSettings { size: 128, ..ShadowSettings::default() };
     [
@@ -26,7 +27,8 @@ fn triangle(corners: [[f32; 3]; 3]) -> Mesh {
         .expect("expected a valid mesh")
 }
 
-/// Renders meshes with this sun and shadow map. The sky is bright and lights everything, so that no valid pixel is black.
+/// Renders meshes with this sun and shadow map. The default sky is bright and lights all surfaces, so that only NaN
+/// gives black pixels. `clip_planes` are the near and far distances; without them, both are fitted to the bounds.
 fn render_scene(meshes: &[Mesh], sun: [f32; 3], shadow: ShadowSettings, clip_planes: Option<(f64, f64)>) -> FrameImage {
     let mut builder = SceneBuilder::new();
     builder.parts.look = RenderSettings { sun, shadow: Some(shadow), ..RenderSettings::default() };
@@ -56,14 +58,14 @@ fn count_black(image: &FrameImage) -> usize {
 fn extreme_suns_cameras_and_scenes_have_no_nan_pixel() {
     let triangle_mesh = [triangle([[0.0, 0.5, 0.0], [1.0, 0.5, 0.0], [0.0, 1.0, 1.0]])];
     let point_mesh = [triangle([[5.0, 2.0, 5.0]; 3])];
-    let edge_on_mesh = [triangle([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])];
+    let upright_mesh = [triangle([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])];
     let far_mesh = [triangle([[1e7, 0.5, 0.0], [1e7 + 2.0, 0.5, 0.0], [1e7, 1.0, 2.0]])];
     let square_meshes = Vec::from([floor_mesh(2.0, 0.0), floor_mesh(1.0, 1.0)]);
     let scenes: [(&[Mesh], &str); 5] = [
         (&triangle_mesh, "one triangle"),
         (&point_mesh, "one point"),
-        (&edge_on_mesh, "edge on"),
-        (&far_mesh, "far away"),
+        (&upright_mesh, "triangle in the plane x = 0"),
+        (&far_mesh, "far from the origin"),
         (&square_meshes, "two squares"),
     ];
     let suns = [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1e-4, 0.2], [0.3, -1.0, 0.2], [0.4, 0.8, 0.5]];
@@ -100,24 +102,26 @@ fn static_shadow_does_not_flicker_while_bounds_grow() {
         let scene = table_scene(ShadowSettings { method, ..base });
         for has_light_bounds in [false, true] {
             let frames = render_growing_bounds(&scene, has_light_bounds);
-            let changes: Vec<usize> = frames.windows(2).map(|pair| count_different(&pair[0], &pair[1])).collect();
+            let changes: Vec<usize> =
+                frames.windows(2).map(|pair| count_different_pixels(&pair[0], &pair[1])).collect();
             let changed_steps = changes.iter().filter(|change| **change > 0).count();
-            // Over 60 frames the bounds grow by 0.25 scene units along x and by 0.125 along z. The size of the map is
-            // quantized, and each side and the depth range cross two quantization steps. A tightly fitted map would
-            // change the image in every frame.
+            // Over 60 frames the bounds grow by 0.25 scene units along x and by 0.125 along z. The extent of the map is
+            // quantized. Each of its sides and its depth range grow by two quantization steps in all, and each step
+            // changes the image once. A map that is not quantized would change the image in every frame.
             assert!(
                 changed_steps <= 10,
                 "{method:?}: expected at most 10 changed frames, got {changed_steps}: {changes:?}"
             );
             assert!(
-                count_different(&frames[0], &frames[59]) > 0,
+                count_different_pixels(&frames[0], &frames[59]) > 0,
                 "negative control: expected a different image of the largest bounds"
             );
         }
     }
 }
 
-/// Renders 60 frames of a scene at rest with growing bounds, and with light-space bounds if `has_light_bounds`.
+/// Renders 60 frames of a scene at rest. The bounds grow from frame to frame. With `has_light_bounds`, the frames also
+/// have light-space bounds.
 fn render_growing_bounds(scene: &std::sync::Arc<Scene>, has_light_bounds: bool) -> Vec<FrameImage> {
     let mut deformer = ReferenceDeformer::new(scene);
     let rest_bounds = deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed").bounds;
@@ -126,16 +130,17 @@ fn render_growing_bounds(scene: &std::sync::Arc<Scene>, has_light_bounds: bool) 
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
     let view = View::LookAt { eye: [3.0, 4.0, 5.0], target: [-0.3, 0.0, -0.3], up: [0.0, 1.0, 0.0] };
     let camera = Camera { view, lens: Lens::FieldOfView(30.0), near: 1.0, far: 30.0 };
-    let bounds_of_step = |step: u32| {
-        let growth = 0.125 * f64::from(step) / 59.0;
+    // Frame 59 is the last.
+    let bounds_of_frame = |frame: u32| {
+        let growth = 0.125 * f64::from(frame) / 59.0;
         BoundingBox {
             min: rest_bounds.min,
             max: [rest_bounds.max[0] * (1.0 + 2.0 * growth), rest_bounds.max[1], rest_bounds.max[2] * (1.0 + growth)],
         }
     };
     let axes = scene.light_axes().expect("expected a scene with a shadow");
-    let mut draw_frame = |step: u32| {
-        let bounds = bounds_of_step(step);
+    let mut draw_frame = |frame: u32| {
+        let bounds = bounds_of_frame(frame);
         // Light bounds slightly larger than the light-space box of the scene bounds.
         let light_bounds = OrientedBounds::enclosing(&axes, &bounds).expanded_by(0.02 * bounds.diagonal());
         let params = FrameParams {
@@ -151,7 +156,7 @@ fn render_growing_bounds(scene: &std::sync::Arc<Scene>, has_light_bounds: bool) 
 }
 
 /// Number of pixels that differ by more than one level.
-fn count_different(left: &FrameImage, right: &FrameImage) -> usize {
+fn count_different_pixels(left: &FrameImage, right: &FrameImage) -> usize {
     let pairs = left.rgba.chunks_exact(4).zip(right.rgba.chunks_exact(4));
     pairs.filter(|(a, b)| a.iter().zip(*b).any(|(a, b)| a.abs_diff(*b) > 1)).count()
 }
