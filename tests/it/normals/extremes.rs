@@ -1,4 +1,5 @@
-//! Exact normals of extreme surfaces: without area, far from the origin, tiny, huge, overflowing or folded.
+//! Exact normals of surfaces that are collapsed, far from the origin, tiny, huge, overflowing or rotated by half a
+//! turn.
 
 use modalcast_compute::reference;
 use modalcast_model::scene::Scene;
@@ -10,16 +11,19 @@ use super::fixtures::{
 };
 use super::{MAX_ANGLE_DEGREES, linear_parts, parabola};
 
-/// Bound of the relative rounding error of a position: two f32 units in the last place, because the CPU rounds its sum
-/// several times.
+/// Bound of the relative rounding error of a position, 2 x 2^-23. It is larger than that of a single rounding, because
+/// the CPU deformer rounds several times.
 const ROUNDING_BOUND: f64 = 2.0 / 8_388_608.0;
 
-/// Largest ratio of the angular error of a corner to its bound; see `reference/normals.rs`.
+/// Largest ratio of the angular error of a normal to its bound. The bound and the letters l and w are those of
+/// "Fallback" in `src/compute/reference/normals.rs`; l and m belong to the two edges of a triangle at a corner.
 fn max_error_ratio(scene: &Scene, positions: &[[f64; 3]], normals: &[f32], reference_normals: &[[f64; 3]]) -> f64 {
     let mesh = &scene.shapes[0].mesh;
+    // Per corner: the sum of the area vectors of its triangles, and the sum B of their rounding bounds.
     let mut corner_sums = vec![(Vector3::zeros(), 0.0); reference_normals.len()];
     for triangle in mesh.triangles() {
         for corner in 0..3 {
+            // The corner of the triangle `offset` places after `corner`.
             let position = |offset: usize| {
                 Vector3::from(positions[mesh.corners().vertices[triangle[(corner + offset) % 3] as usize] as usize])
             };
@@ -36,6 +40,7 @@ fn max_error_ratio(scene: &Scene, positions: &[[f64; 3]], normals: &[f32], refer
         normals.chunks_exact(3).zip(reference_normals).zip(&corner_sums)
     {
         let error = angle_degrees([0, 1, 2].map(|axis| f64::from(normal[axis])), *reference_normal).to_radians();
+        // 2e-7 is for rounding the normal itself to f32.
         let ratio = error / (ROUNDING_BOUND * rounding_sum / area_sum.norm() + 2e-7);
         max_ratio = if ratio.is_nan() { f64::INFINITY } else { max_ratio.max(ratio) };
     }
@@ -43,7 +48,7 @@ fn max_error_ratio(scene: &Scene, positions: &[[f64; 3]], normals: &[f32], refer
 }
 
 /// A sheet collapsed to a line or to a point keeps its rigid normals. A sheet that is almost collapsed has the normals
-/// of its folded surface.
+/// of its deformed surface.
 #[test]
 fn collapsed_sheet_keeps_its_rigid_normals() {
     let collapse =
@@ -60,12 +65,12 @@ fn collapsed_sheet_keeps_its_rigid_normals() {
             assert!(surface.tangents.iter().all(|number| number.is_finite()));
         }
     }
-    // Almost collapsed to a line: a thousandth of the width is left, and the normals follow the folded surface.
-    let folded_scene = scene(vec![shape_with_mode(sheet(9, 9), |[x, _, _]| [-0.999 * x, 0.0, 0.002 * x])]);
-    let (normals, _) = reference_normals_and_tangents(&folded_scene, &uniform_q_state(&folded_scene, 1.0));
+    // Almost collapsed to a line: x becomes 0.001 x and z becomes 0.002 x, so that the normal is (-0.002, 0, 0.001).
+    let narrow_scene = scene(vec![shape_with_mode(sheet(9, 9), |[x, _, _]| [-0.999 * x, 0.0, 0.002 * x])]);
+    let (normals, _) = reference_normals_and_tangents(&narrow_scene, &uniform_q_state(&narrow_scene, 1.0));
     assert!(normals.iter().all(|normal| angle_degrees(*normal, [-0.002, 0.0, 0.001]) < 0.01));
     assert!(
-        max_angle_degrees(&deform_on_cpu(&folded_scene, &uniform_q_state(&folded_scene, 1.0)).normals, &normals) < 0.1
+        max_angle_degrees(&deform_on_cpu(&narrow_scene, &uniform_q_state(&narrow_scene, 1.0)).normals, &normals) < 0.1
     );
 }
 
@@ -75,7 +80,8 @@ fn zero_area_triangles_do_not_change_normals() {
     let mesh = sheet(5, 5);
     let mut triangles = mesh.triangles().to_vec();
     let (original_triangles, corners) = (triangles.clone(), mesh.corners().clone());
-    // The added triangles are collinear in x or repeat vertices. No remaining triangle contains corner 24.
+    // The added triangles have collinear corners (a part of the first row) or repeated corners. No remaining triangle
+    // contains corner 24, the last one.
     triangles.extend([[0, 1, 3], [6, 6, 7], [8, 8, 8]]);
     triangles.retain(|triangle| !triangle.contains(&24));
     let scene_of_triangles = |triangles: Vec<[u32; 3]>| {
@@ -90,17 +96,15 @@ fn zero_area_triangles_do_not_change_normals() {
     };
     let (degenerate_scene, original_scene) = (scene_of_triangles(triangles), scene_of_triangles(original_triangles));
     let state = uniform_q_state(&degenerate_scene, 0.8);
-    let (degenerate_result, original_result) = (
-        reference_normals_and_tangents(&degenerate_scene, &state),
-        reference_normals_and_tangents(&original_scene, &state),
-    );
+    let (degenerate_normals, _) = reference_normals_and_tangents(&degenerate_scene, &state);
+    let (original_normals, _) = reference_normals_and_tangents(&original_scene, &state);
     for corner in 0..24 {
-        assert!(angle_degrees(degenerate_result.0[corner], original_result.0[corner]) < 1e-5, "corner {corner}");
+        assert!(angle_degrees(degenerate_normals[corner], original_normals[corner]) < 1e-5, "corner {corner}");
     }
-    assert_eq!(degenerate_result.0[24], [0.0, 0.0, 1.0]);
-    assert!(angle_degrees(original_result.0[24], degenerate_result.0[24]) > 30.0);
+    assert_eq!(degenerate_normals[24], [0.0, 0.0, 1.0], "expected the rest normal");
+    assert!(angle_degrees(original_normals[24], degenerate_normals[24]) > 30.0, "negative control: original triangles");
     assert!(
-        max_angle_degrees(&deform_on_cpu(&degenerate_scene, &state).normals, &degenerate_result.0) < MAX_ANGLE_DEGREES
+        max_angle_degrees(&deform_on_cpu(&degenerate_scene, &state).normals, &degenerate_normals) < MAX_ANGLE_DEGREES
     );
 }
 
@@ -129,11 +133,12 @@ fn normals_do_not_depend_on_the_scale_of_a_domain() {
     }
 }
 
-/// Domains so small that the rounding of far positions hides their shape fall back to rigid normals.
+/// Small domains, whose shape is lost when their positions are rounded to f32, have rigid normals.
 #[test]
 fn normals_far_from_the_origin_stay_within_their_bound() {
     let scene = scene(vec![shape_with_mode(tube(24, 6, 0.0), |[x, y, _]| [0.2 * y * y, 0.1 * x, 0.3 * x * y])]);
     let translation = [1e7, -1e7, 1e7];
+    // `size` scales the domain. `keeps_shape` is false if the rounding of positions at 1e7 hides its shape.
     for (size, keeps_shape) in [(1e6, true), (1e5, true), (1.0, false), (1e-3, false)] {
         for linear in linear_parts() {
             let state = state(&scene, 0.3, linear * size, translation);
@@ -166,8 +171,9 @@ fn overflow_and_half_turns_give_unit_normals() {
             }
         }
     }
-    // The mode rotates the tube by 180 degrees about y. The tube has 16 sides, so a normal differs from the normal of an
-    // adjacent triangle by at most 11.25 degrees, and the rotation of a normal by at most twice that angle.
+    // At q = 1, the mode rotates the tube by 180 degrees about y. The tube has 16 sides, so that a rest normal differs
+    // from the normals of its triangles by at most 11.25 degrees. Close to half a turn, the error of the rotation is at
+    // most twice that angle.
     let (normals, _) = reference_normals_and_tangents(&scene, &uniform_q_state(&scene, 1.0));
     for (normal, rest_normal) in normals.iter().zip(&scene.shapes[0].mesh.corners().normals) {
         assert!(angle_degrees(*normal, rest_normal.map(f64::from)) >= 180.0 - 22.5);

@@ -8,6 +8,7 @@ use modalcast_model::domain::{Corners, Domain, Material, Mesh, Modes, Shape, Tex
 use modalcast_model::scene::{NormalMethod, Scene, SceneParts, SceneState};
 use nalgebra::{Matrix3, Vector3};
 
+/// Rest normal of a sheet.
 pub(crate) const UP: [f32; 3] = [0.0, 0.0, 1.0];
 
 /// A shape with one mode. `displacement` returns its displacement at a rest position.
@@ -38,8 +39,9 @@ pub(crate) fn grid_triangles(columns: u32, rows: u32) -> Vec<[u32; 3]> {
         .collect()
 }
 
-/// A tube about y. Its first and last columns of corners share one line of vertices, as at a seam of texture
-/// coordinates. The normals of the last column are rotated by `tilt` degrees.
+/// A tube about y with `columns` sides and `rows` rings of vertices. A row has one corner more than vertices: its first
+/// and its last corner share a vertex, as at a seam of texture coordinates. The normals of the last corners are rotated
+/// by `tilt` degrees.
 pub(crate) fn tube(columns: u32, rows: u32, tilt: f32) -> Mesh {
     let column_angle = |column: u32| column as f32 / columns as f32 * std::f32::consts::TAU;
     let rest_positions = (0..rows).flat_map(|row| {
@@ -55,16 +57,16 @@ pub(crate) fn tube(columns: u32, rows: u32, tilt: f32) -> Mesh {
     Mesh::new(rest_positions.collect(), corners, grid_triangles(columns + 1, rows)).expect("expected a valid mesh")
 }
 
-/// A unit cube of 8 vertices and 24 corners; every edge is hard.
+/// A unit cube of 8 vertices and 24 corners, four for each face; every edge is hard.
 pub(crate) fn cube() -> Mesh {
+    // Bit `axis` of the index of a vertex is its coordinate on that axis.
     let rest_positions = (0..8_u8).map(|vertex| [0, 1, 2].map(|axis| f32::from(vertex >> axis & 1))).collect();
     let (mut corners, mut triangles) = (Corners::default(), Vec::new());
+    // The face with coordinate `side` on `axis`.
     for (axis, side) in (0..3_usize).flat_map(|axis| [(axis, 0_u32), (axis, 1)]) {
-        let (second_axis, third_axis) = (1_u32 << ((axis + 1) % 3), 1_u32 << ((axis + 2) % 3));
+        let (second_bit, third_bit) = (1_u32 << ((axis + 1) % 3), 1_u32 << ((axis + 2) % 3));
         let first_corner = corners.vertices.len() as u32;
-        corners
-            .vertices
-            .extend([0, second_axis, second_axis | third_axis, third_axis].map(|vertex| vertex | side << axis));
+        corners.vertices.extend([0, second_bit, second_bit | third_bit, third_bit].map(|vertex| vertex | side << axis));
         let mut normal = [0.0; 3];
         normal[axis] = if side == 1 { 1.0 } else { -1.0 };
         corners.normals.extend([normal; 4]);
@@ -74,7 +76,8 @@ pub(crate) fn cube() -> Mesh {
     Mesh::new(rest_positions, corners, triangles).expect("expected a valid mesh")
 }
 
-/// A unit sphere of 8 x 4^level triangles with area-weighted normals.
+/// A unit sphere of 8 x 4^level triangles with area-weighted normals: an octahedron whose triangles are split `level`
+/// times.
 pub(crate) fn sphere(level: u32) -> Mesh {
     let mut triangles: Vec<[Vector3<f64>; 3]> = octahedron_faces();
     for _ in 0..level {
@@ -85,6 +88,7 @@ pub(crate) fn sphere(level: u32) -> Mesh {
         triangles = triangles.into_iter().flat_map(split_triangle).collect();
     }
     let mut rest_positions: Vec<[f32; 3]> = Vec::new();
+    // Index of the vertex at a position; adds the vertex if there is none.
     let mut vertex_index = |position: Vector3<f64>| {
         let position: [f32; 3] = position.cast::<f32>().into();
         let is_near = |other: &[f32; 3]| (0..3).all(|axis| (other[axis] - position[axis]).abs() < 1e-5);
@@ -99,7 +103,7 @@ pub(crate) fn sphere(level: u32) -> Mesh {
     Mesh::from_indexed(rest_positions, normals, vec![], triangles).expect("expected a valid mesh")
 }
 
-/// The faces of an octahedron.
+/// The faces of an octahedron, one per octant, with counterclockwise corners.
 fn octahedron_faces() -> Vec<[Vector3<f64>; 3]> {
     let signs = (0..8).map(|bits| [0, 1, 2].map(|axis| if bits >> axis & 1 == 1 { -1.0 } else { 1.0 }));
     let triangle = |[x, y, z]: [f64; 3]| {
@@ -125,7 +129,7 @@ pub(crate) fn scene_with_normals(shapes: Vec<Shape>, normals: NormalMethod) -> A
     Scene::new(parts).expect("expected a valid scene")
 }
 
-/// A state in which every coordinate is q and every transform has the given linear part and translation.
+/// A state in which every reduced coordinate is q and every transform has the given linear part and translation.
 pub(crate) fn state(scene: &Scene, q: f32, linear: Matrix3<f64>, translation: [f64; 3]) -> SceneState {
     let mut state = SceneState::rest(scene);
     state.q.fill(q);
@@ -133,7 +137,7 @@ pub(crate) fn state(scene: &Scene, q: f32, linear: Matrix3<f64>, translation: [f
     state
 }
 
-/// The rest state with every coordinate set to q.
+/// The rest state with every reduced coordinate set to q.
 pub(crate) fn uniform_q_state(scene: &Scene, q: f32) -> SceneState {
     state(scene, q, Matrix3::identity(), [0.0; 3])
 }

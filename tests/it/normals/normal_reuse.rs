@@ -1,4 +1,5 @@
-//! Exact normals of unchanged domains are reused between steps and equal those of a fresh deformer.
+//! The CPU deformer reuses the exact normals of domains that a step does not change. The normals equal those of a new
+//! deformer.
 
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer};
@@ -8,7 +9,7 @@ use super::fixtures::{cube, scene, shape_with_mode, sheet, sphere, state, tube};
 use super::linear_parts;
 use crate::deformers::TestRng;
 
-/// A nonlinear displacement.
+/// A nonlinear mode.
 fn wave([x, y, z]: [f32; 3]) -> [f32; 3] {
     [0.3 * y * z, 0.2 * x * x, (2.0 * x + y).sin() + 0.4 * z]
 }
@@ -28,7 +29,8 @@ fn normal_bits(scene: &Scene, surface: &DeformedSurface, domain: usize) -> Vec<u
     f32_bits(&surface.normals[3 * layout.first_corner..][..3 * layout.corners])
 }
 
-/// Changes q of some domains, their transforms, or both, depending on the step. Returns the changed domains.
+/// Changes some domains and returns them. Step 0 changes q of domain 3, step 1 the transform of domain 1, step 2
+/// nothing, step 3 q and the transforms of all domains, and step 4 q of domains 0 and 2.
 fn change_domains(scene: &Scene, state: &mut SceneState, step: usize, random: &mut TestRng) -> Vec<usize> {
     let domains = match step {
         0 => vec![3],
@@ -49,7 +51,8 @@ fn change_domains(scene: &Scene, state: &mut SceneState, step: usize, random: &m
     domains
 }
 
-/// After each step, positions, normals and tangents have the bits of a new deformer with any number of threads.
+/// After each step, positions, normals and tangents are bit-identical to those of a new deformer with any number of
+/// threads.
 #[test]
 fn unchanged_domains_keep_their_normals() {
     let meshes = [sheet(33, 30), cube(), tube(40, 20, 0.0), sphere(3), sheet(2, 2)];

@@ -303,7 +303,7 @@ fn huge_triangles_and_a_lone_triangle_are_not_culled() {
 const HALF_HIDDEN_TRIANGLES: u32 = 32 * 32 + 2;
 
 /// A grid of 32 x 32 small triangles, and a square of two triangles in front of it that hides half of the grid.
-fn half_hidden_builder(culling: Culling) -> SceneBuilder {
+fn half_hidden_builder() -> SceneBuilder {
     let small_triangle = |index: usize| {
         let (x, y) = ((index % 32) as f32 * 0.25 - 4.0, (index / 32) as f32 * 0.25 - 4.0);
         [[x + 0.02, y + 0.02, -1.0], [x + 0.22, y + 0.02, -1.0], [x + 0.02, y + 0.22, -1.0]]
@@ -315,13 +315,13 @@ fn half_hidden_builder(culling: Culling) -> SceneBuilder {
             facing_rectangle(-4.5, -4.5, 0.0, 4.5, 0.0),
             material(AlphaMode::Opaque, SINGLE_SIDED, [0.1, 0.2, 0.9]),
         );
-    (builder.parts.look.samples, builder.parts.look.culling) = (1, culling);
+    builder.parts.look.samples = 1;
     builder
 }
 
 #[test]
 fn hidden_count_equals_triangles_behind_the_square() {
-    let mut harness = CullHarness::new(half_hidden_builder(Culling::Occlusion), Culling::Occlusion);
+    let mut harness = CullHarness::new(half_hidden_builder(), Culling::Occlusion);
     let first_stats = harness.draw(front_camera(128), [128, 128]).culled().camera;
     assert_eq!((first_stats.occluded, first_stats.visible), (0, HALF_HIDDEN_TRIANGLES));
     let second_stats = harness.draw(front_camera(128), [128, 128]).culled().camera;
@@ -436,7 +436,7 @@ fn picks_aovs_and_rebased_frames_do_not_depend_on_culling() {
 
 #[test]
 fn small_scene_with_default_culling_has_no_culling_buffers() {
-    let default_harness = CullHarness::new(half_hidden_builder(Culling::Auto), Culling::Auto);
+    let default_harness = CullHarness::new(half_hidden_builder(), Culling::Auto);
     assert!(
         default_harness
             .buffers

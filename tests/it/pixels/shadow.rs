@@ -60,9 +60,9 @@ pub(super) fn with_square(mut builder: SceneBuilder, alpha_mode: AlphaMode, alph
     builder.add_domain(mesh.expect("expected a valid mesh"), material)
 }
 
-/// Linear color of the ground near the center: the ground's color 0.8 times skylight 0.25 plus sunlight 0.5.
-/// `visibility` is the fraction of sunlight that arrives, `cosine` that of the angle of incidence. The blend into the
-/// horizon's color is negligible near the center.
+/// Linear color of the ground near the center, where the blend into the color of the horizon is negligible. The ground
+/// has the color 0.8, skylight is 0.25 and sunlight 0.5. `visibility` is the fraction of sunlight that arrives, and
+/// `cosine` is the cosine of its angle of incidence.
 fn ground_color(visibility: f64, cosine: f64) -> [f64; 3] {
     [0.8 * (0.25 + 0.5 * visibility * cosine); 3]
 }

@@ -179,13 +179,13 @@ fn frames_of_an_engine_step_share_its_shadow() {
         [0, 0],
         "expected no shadow pass for the same step"
     );
-    // The first step moves the last domain to x = 2, the second step moves it so far that its positions overflow.
     let last_domain = scene.domains.len() - 1;
     let rest_state = state.clone();
-    state.transforms[last_domain].0[3] = 2.0;
+    state.transforms[last_domain].0[3] = 2.0; // x of the translation
     loaded_scene.deform(&state).expect("expected the step to succeed");
     let second_frames = draw_frames(&mut context, &mut loaded_scene);
     assert_eq!(pass_counts(&second_frames), [1, 0], "expected a shadow pass for a new step");
+    // A step that fails, because the positions overflow.
     state.transforms[last_domain].0[3] = 1e30;
     loaded_scene.deform(&state).expect_err("expected an overflow error");
     let third_frames = draw_frames(&mut context, &mut loaded_scene);
@@ -197,7 +197,7 @@ fn frames_of_an_engine_step_share_its_shadow() {
     let fourth_frames = draw_frames(&mut context, &mut loaded_scene);
     assert!(
         fourth_frames[0].rgba == first_frames[0].rgba && fourth_frames[0].rgba != second_frames[0].rgba,
-        "expected the frame at rest again, unlike the frame of the moved domain (negative control)"
+        "expected the frame at rest again, and as negative control another frame of the moved domain"
     );
     context.unload_scene(loaded_scene);
 }

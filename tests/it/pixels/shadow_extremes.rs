@@ -104,17 +104,17 @@ fn static_shadow_does_not_flicker_while_bounds_grow() {
             let frames = render_growing_bounds(&scene, has_light_bounds);
             let changes: Vec<usize> =
                 frames.windows(2).map(|pair| count_different_pixels(&pair[0], &pair[1])).collect();
-            let changed_steps = changes.iter().filter(|change| **change > 0).count();
+            let changed_frames = changes.iter().filter(|change| **change > 0).count();
             // Over 60 frames the bounds grow by 0.25 scene units along x and by 0.125 along z. The extent of the map is
-            // quantized. Each of its sides and its depth range grow by two quantization steps in all, and each step
-            // changes the image once. A map that is not quantized would change the image in every frame.
+            // quantized: each of its two sides and its depth range grow in two steps, and each step changes one frame.
+            // A map that is not quantized would change every frame.
             assert!(
-                changed_steps <= 10,
-                "{method:?}: expected at most 10 changed frames, got {changed_steps}: {changes:?}"
+                changed_frames <= 10,
+                "{method:?}: expected at most 10 changed frames, got {changed_frames}: {changes:?}"
             );
             assert!(
                 count_different_pixels(&frames[0], &frames[59]) > 0,
-                "negative control: expected a different image of the largest bounds"
+                "negative control: expected a different image with the largest bounds"
             );
         }
     }

@@ -1,5 +1,5 @@
-//! The ground and the shadow map: the ground receives shadows but never casts. Tests cover the border of the map and
-//! the contact line of a wall.
+//! The ground and the shadow map. The ground receives shadows and casts none. The tests cover the border of the map and
+//! the line where a wall meets the ground.
 
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Lens, ShadowMethod, ShadowSettings, View};
@@ -8,7 +8,8 @@ use modalcast_render::{BlurMethod, Renderer};
 use super::harness::{RenderedFrame, facing_rectangle, is_close, open_renderer, render_square};
 use super::shadow::{create_builder, with_square};
 
-/// Renders from above the part of the ground that the shadow map covers, with the given shadow map or none.
+/// Renders from above the part of the ground that the shadow map covers. With `has_caster`, a square above the ground
+/// casts a shadow.
 fn render_ground(renderer: &mut Renderer, shadow: Option<ShadowSettings>, has_caster: bool) -> RenderedFrame {
     let mut builder = create_builder();
     builder.parts.look.sun = [3.0, 4.0, 0.0];
@@ -30,6 +31,7 @@ fn ground_is_lit_at_the_border_of_the_map() {
         (BlurMethod::Auto, ShadowSettings { splits: 2, ..base }),
     ];
     let unshadowed = render_ground(&mut open_renderer(), None, false);
+    // Number of bytes that differ by more than two levels.
     let count_differences = |frame: &RenderedFrame| {
         let pairs = frame.image.rgba.iter().zip(&unshadowed.image.rgba);
         pairs.filter(|(shadowed, unshadowed)| unshadowed.abs_diff(**shadowed) > 2).count()
@@ -45,7 +47,8 @@ fn ground_is_lit_at_the_border_of_the_map() {
     );
 }
 
-/// Numbers of pixels of a wall on the ground: those that are not fully lit, and those that are not fully dark.
+/// Renders a wall on the ground. Returns the number of its pixels that are not fully lit, and the number of its pixels
+/// that are not fully dark. With `is_shaded`, the shadow of a caster covers the wall.
 fn count_wall_pixels(shadow: ShadowSettings, is_shaded: bool) -> [usize; 2] {
     let mut builder = create_builder();
     builder.parts.look.sun = [0.0, 3.0, 4.0];
@@ -60,8 +63,10 @@ fn count_wall_pixels(shadow: ShadowSettings, is_shaded: bool) -> [usize; 2] {
     let frame = render_square(&mut open_renderer(), &builder.build(), Camera { view, lens, near: 0.0, far: 0.0 }, 64);
     // The wall covers 20 x 20 pixels at the center; its border pixels are excluded.
     let wall_pixels = || (23..41).flat_map(|y| (23..41).map(move |x| (x, y)));
+    // Number of pixels with another color than that of `light`.
     let count_other =
         |light: f64| wall_pixels().filter(|(x, y)| !is_close(frame.pixel(*x, *y), [light; 3], 2.0)).count();
+    // Skylight is 0.25 and sunlight 0.5. The cosine between the sun and the normal of the wall is 4/5.
     [count_other(0.25 + 0.5 * 0.8), count_other(0.25)]
 }
 

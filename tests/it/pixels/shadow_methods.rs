@@ -1,4 +1,5 @@
-//! The shadow of a straight edge on the ground for every shadow method, compared with f64 arithmetic.
+//! The shadow of a straight edge on the ground for every shadow method, compared with f64 arithmetic. The edge is the
+//! line z = 1 on the ground, where the shadow of the square of [`with_square`] ends.
 
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Camera, Lens, MomentFormat, Scene, ShadowMethod, ShadowSettings, View};
@@ -11,16 +12,18 @@ use super::shadow::{create_builder, with_square};
 
 /// Pixels per unit of the ground in the image of the edge.
 const PIXELS_PER_UNIT: f64 = 100.0;
-/// Half the extent of the light box across the edge: the bounds extend to 5 there and are rounded up to the next multiple
-/// of 4 / 16.
+/// Half the extent of the light box along z, across the edge. The bounds extend to z = 5. The box rounds lengths from 4
+/// to 8 up to the next larger multiple of 4 / 16.
 const LIGHT_BOX_HALF_EXTENT: f64 = 5.25;
 
+/// A variance shadow map with a blur of 2 texels.
 fn variance_settings() -> ShadowSettings {
     ShadowSettings { size: 256, blur: 2.0, bleeding: 0.0, ..ShadowSettings::default() }
 }
 
-/// Side of a shadow map texel across the edge, in units. `empty_border` texels at each border contain no caster.
+/// Side of a shadow map texel along z, in scene units. The light box fits the map without its empty border.
 fn texel_size(shadow: &ShadowSettings) -> f64 {
+    // Texels at each border that contain no caster.
     let empty_border = f64::from(shadow.blur_radius()) + 1.0;
     2.0 * LIGHT_BOX_HALF_EXTENT / (f64::from(shadow.size) - 2.0 * empty_border)
 }
@@ -31,12 +34,12 @@ fn square_scene(shadow: ShadowSettings) -> std::sync::Arc<Scene> {
     with_square(builder, AlphaMode::Opaque, 1.0).build()
 }
 
-/// Renders from straight above the edge at z = 1 of the shadow of the square.
+/// Renders the edge from straight above. Row 32 of the image begins at the edge.
 fn render_edge(shadow: ShadowSettings) -> RenderedFrame {
     render_edge_with_blur(BlurMethod::Auto, shadow)
 }
 
-/// [`render_edge`] with this implementation of the blur.
+/// [`render_edge`] with this blur method.
 fn render_edge_with_blur(blur_method: BlurMethod, shadow: ShadowSettings) -> RenderedFrame {
     let mut renderer = open_renderer();
     renderer.set_blur_method(blur_method);
@@ -50,11 +53,14 @@ fn ground_z(row: u32) -> f64 {
     1.0 + (f64::from(row) + 0.5 - 32.0) / PIXELS_PER_UNIT
 }
 
-/// Fraction of the sun's light that reaches the ground in a pixel.
+/// Fraction of the sun's light that reaches the ground in a pixel. The color of the ground is 0.8, skylight is 0.25,
+/// sunlight 0.5, and the cosine of the angle of incidence 0.8.
 fn sun_visibility([level, ..]: [u8; 3]) -> f64 {
-    (decode_srgb(level) / 0.8 - 0.25) / (0.5 * 0.8)
+    let (ground_color, cosine) = (0.8, 0.8);
+    (decode_srgb(level) / ground_color - 0.25) / (0.5 * cosine)
 }
 
+/// Sun visibility of the pixels of an image column, from top to bottom.
 fn visibility_profile(frame: &RenderedFrame, column: u32) -> Vec<f64> {
     (0..64).map(|row| sun_visibility(frame.pixel(column, row))).collect()
 }
@@ -66,7 +72,7 @@ fn expected_visibility(shadow: &ShadowSettings, z: f64) -> f64 {
     let gaussian =
         |step: i64| if step == 0 { 1.0 } else { (-0.5 * (step as f64 / f64::from(shadow.blur)).powi(2)).exp() };
     let sum: f64 = (-radius..=radius).map(gaussian).sum();
-    // Texel edges are at multiples of the texel size from the origin.
+    // 1 if the center of a texel is beyond the edge at z = 1, else 0. Texel borders are at multiples of the texel size.
     let is_lit = |index: i64| f64::from(u8::from((index as f64 + 0.5) * texel_size > 1.0));
     let blurred = |index: i64| (-radius..=radius).map(|step| gaussian(step) / sum * is_lit(index + step)).sum::<f64>();
     let texel_position = z / texel_size - 0.5;
@@ -74,7 +80,7 @@ fn expected_visibility(shadow: &ShadowSettings, z: f64) -> f64 {
     (1.0 - fraction) * blurred(texel_position.floor() as i64) + fraction * blurred(texel_position.floor() as i64 + 1)
 }
 
-/// The fraction of sunlight is correct to about 0.01 for every blur implementation.
+/// Tests percentage-closer filtering, and variance maps with every blur method.
 #[test]
 fn filtered_and_variance_maps_give_the_blurred_edge() {
     let base = variance_settings();
@@ -89,11 +95,13 @@ fn filtered_and_variance_maps_give_the_blurred_edge() {
     ];
     for (method, shadow) in cases {
         let visibility = visibility_profile(&render_edge_with_blur(method, shadow), 32);
+        // Largest error in the middle column, if the edge were shifted by `-shift`.
         let max_error = |shift: f64| {
             let error =
                 |row: u32| (visibility[row as usize] - expected_visibility(&shadow, ground_z(row) + shift)).abs();
             (0..64).map(error).fold(0.0, f64::max)
         };
+        // One level of 255 is 0.019 of the sunlight at most, so that rounding to a level is off by 0.0095 at most.
         assert!(
             max_error(0.0) < 0.012,
             "{method:?}, {shadow:?}: expected a maximum error below 0.012, got {}",
@@ -104,8 +112,9 @@ fn filtered_and_variance_maps_give_the_blurred_edge() {
 }
 
 #[test]
-fn all_blur_implementations_agree() {
-    // Blurs of up to 8 texels use strips, which are taller in larger maps; wider blurs use tiles.
+fn all_blur_methods_agree() {
+    // `BlurMethod::Tiles` processes blurs of up to 8 texels in strips, which are taller in larger maps, and wider blurs
+    // in tiles.
     for (blur, size) in [(0.0, 200), (1.5, 200), (4.0, 200), (8.0, 200), (9.0, 200), (16.0, 200), (2.3, 1100)] {
         let [tiles, rows, fragments] = [BlurMethod::Tiles, BlurMethod::Rows, BlurMethod::Fragments].map(|method| {
             render_edge_with_blur(method, ShadowSettings { size, blur, ..variance_settings() }).image.rgba
@@ -113,17 +122,18 @@ fn all_blur_implementations_agree() {
         let max_difference = |other: &[u8]| tiles.iter().zip(other).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0);
         assert!(
             max_difference(&rows) <= 1 && max_difference(&fragments) <= 1,
-            "blur {blur}: {} {}",
+            "blur {blur}: rows differ from tiles by {} levels, fragments by {}",
             max_difference(&rows),
             max_difference(&fragments)
         );
-        let wider =
+        // One texel wider, or narrower for 16, the largest blur.
+        let other_blur =
             render_edge(ShadowSettings { size, blur: (blur + 1.0).min(15.0), ..variance_settings() }).image.rgba;
-        assert!(max_difference(&wider) > 1, "negative control: expected a different image with a wider blur");
+        assert!(max_difference(&other_blur) > 1, "negative control: expected a different image with another blur");
     }
 }
 
-/// z where half of the sunlight arrives.
+/// z where half of the sunlight arrives, interpolated linearly between two rows.
 fn edge_z(visibility_profile: &[f64]) -> f64 {
     let row = visibility_profile
         .iter()
@@ -136,8 +146,9 @@ fn edge_z(visibility_profile: &[f64]) -> f64 {
 #[test]
 fn shadow_edges_are_within_their_stated_distance() {
     let base = variance_settings();
-    // The tolerance is half a texel, for the sampling of the caster. Bleeding reduction moves the edge outwards by
-    // 0.2533 standard deviations of the blur.
+    // Expected distances are in texels. Bleeding reduction by 0.2 maps the bound 0.6 to half of the sunlight. The
+    // normal distribution reaches 0.6 at 0.2533 standard deviations, and the standard deviation of the blur is 2
+    // texels.
     let cases = [
         (ShadowSettings { method: ShadowMethod::Standard, ..base }, 0.0),
         (ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }, 0.0),
@@ -149,6 +160,7 @@ fn shadow_edges_are_within_their_stated_distance() {
         for (shadow, expected_offset) in cases {
             let shadow = ShadowSettings { size, ..shadow };
             let offset = (edge_z(&visibility_profile(&render_edge(shadow), 32)) - 1.0) / texel_size(&shadow);
+            // The tolerance is half a texel, for the sampling of the caster, and one pixel.
             let pixel = 1.0 / PIXELS_PER_UNIT / texel_size(&shadow);
             assert!(
                 (offset - expected_offset).abs() <= 0.5 + pixel,
@@ -178,16 +190,16 @@ fn only_standard_maps_have_hard_edges() {
     }
 }
 
-/// Number of pixels of a lit square with the wrong brightness. The square has six units per side, casts a shadow and
-/// receives shadows.
+/// Number of pixels of a square that are not fully lit. The square has six units per side at height 2, casts a shadow
+/// and receives shadows. `casters` are added to the scene.
 fn count_self_shadowed(casters: &[Mesh], shadow: ShadowSettings, sun: [f32; 3]) -> usize {
     let mut builder = create_builder();
     (builder.parts.look.shadow, builder.parts.look.sun) = (Some(shadow), sun);
     let builder = casters.iter().fold(builder, |builder, mesh| builder.add_domain(mesh.clone(), Material::default()));
-    let square_scene = builder.add_domain(floor_mesh(3.0, 2.0), Material::default()).build();
+    let scene = builder.add_domain(floor_mesh(3.0, 2.0), Material::default()).build();
     let view = View::LookAt { eye: [0.0, 20.0, 0.0], target: [0.0; 3], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 200.0, fy: 200.0, cx: 32.0, cy: 32.0 };
-    let frame = render_square(&mut open_renderer(), &square_scene, Camera { view, lens, near: 0.0, far: 0.0 }, 64);
+    let frame = render_square(&mut open_renderer(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 64);
     let cosine = nalgebra::Vector3::from(sun).cast::<f64>().normalize().y;
     let inner_pixels = (8..56).flat_map(|y| (8..56).map(move |x| (x, y)));
     inner_pixels.filter(|(x, y)| !is_close(frame.pixel(*x, *y), [0.25 + 0.5 * cosine; 3], 2.0)).count()
@@ -220,15 +232,17 @@ fn count_lit_in_umbra(moments: MomentFormat) -> usize {
     let mut builder = create_builder();
     builder.parts.look.shadow = Some(ShadowSettings { size: 2048, blur: 0.5, moments, ..ShadowSettings::default() });
     builder.parts.look.sun = [3.0, 1.0, 0.0];
-    // The square is far from the center of the depth range, where f16 is coarse. Its shadow extends 0.09 beyond it.
+    // The square is far from the center of the depth range, where f16 is coarse. With the sun at (3, 1, 0) and the
+    // square at height 0.03, the shadow extends 0.09 beyond the edge of the square at x = -3.5. The camera shows a part
+    // of it: 64 pixels of 0.001 around x = -3.545.
     let mut positions = floor_mesh(1.0, 0.03).rest_positions().to_vec();
     positions.iter_mut().for_each(|vertex| vertex[0] -= 2.5);
     let mesh = Mesh::from_indexed(positions, vec![[0.0, 1.0, 0.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])
         .expect("expected a valid mesh");
-    let square_scene = builder.add_domain(mesh, Material { double_sided: true, ..Material::default() }).build();
+    let scene = builder.add_domain(mesh, Material { double_sided: true, ..Material::default() }).build();
     let view = View::LookAt { eye: [-3.545, 20.0, 0.0], target: [-3.545, 0.0, 0.0], up: [0.0, 0.0, -1.0] };
     let lens = Lens::Intrinsics { fx: 2e4, fy: 2e4, cx: 32.0, cy: 32.0 };
-    let frame = render_square(&mut open_renderer(), &square_scene, Camera { view, lens, near: 0.0, far: 0.0 }, 64);
+    let frame = render_square(&mut open_renderer(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 64);
     let umbra_color = [0.8 * 0.25; 3];
     (0..64 * 64).filter(|pixel| !is_close(frame.pixel(pixel % 64, pixel / 64), umbra_color, 3.0)).count()
 }
@@ -241,26 +255,26 @@ fn f16_moments_leak_light_near_the_caster() {
     assert!(lit_pixels > 400, "expected more than 400 lit pixels of 4096, got {lit_pixels}");
 }
 
-/// Number of half-lit pixels in the middle column of a close-up of the edge of the shadow.
+/// Number of half-lit pixels in the middle column of a close-up of the edge, with `splits` cascades.
 fn count_half_lit(splits: u32) -> usize {
     let view = View::LookAt { eye: [0.0, 2.0, 4.0], target: [0.0, 0.0, 1.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 400.0, fy: 400.0, cx: 64.0, cy: 64.0 };
-    let square_scene = square_scene(ShadowSettings { size: 64, splits, ..variance_settings() });
-    let frame = render_square(&mut open_renderer(), &square_scene, Camera { view, lens, near: 0.0, far: 0.0 }, 128);
+    let scene = square_scene(ShadowSettings { size: 64, splits, ..variance_settings() });
+    let frame = render_square(&mut open_renderer(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 128);
     let column: Vec<f64> = (0..128).map(|row| sun_visibility(frame.pixel(64, row))).collect();
     assert!(
         column[0] < 0.1 && column[127] > 0.9,
-        "{splits} maps: expected a dark first row and a lit last row, got {column:?}"
+        "{splits} cascades: expected a dark first row and a lit last row, got {column:?}"
     );
     column.iter().filter(|sun_visibility| (0.1..0.9).contains(*sun_visibility)).count()
 }
 
 #[test]
 fn splits_give_near_shadows_finer_texels() {
-    let (single_map, four_maps) = (count_half_lit(1), count_half_lit(4));
+    let (pixels_of_one_map, pixels_of_four_maps) = (count_half_lit(1), count_half_lit(4));
     assert!(
-        single_map > 30 && four_maps > 0 && 3 * four_maps <= single_map,
-        "{single_map} pixels with one map, {four_maps} with four"
+        pixels_of_one_map > 30 && pixels_of_four_maps > 0 && 3 * pixels_of_four_maps <= pixels_of_one_map,
+        "{pixels_of_one_map} half-lit pixels with one map, {pixels_of_four_maps} with four"
     );
 }
 
@@ -275,9 +289,9 @@ struct ShadowResources {
 #[test]
 fn unused_shadow_resources_are_not_allocated() {
     let resources_of = |shadow: ShadowSettings| {
-        let square_scene = square_scene(shadow);
-        let (frame, plan) = (render_edge(shadow), plan(&square_scene));
-        assert_eq!(frame.stats.passes, planned_passes_above_ground(&square_scene), "expected the planned passes");
+        let scene = square_scene(shadow);
+        let (frame, plan) = (render_edge(shadow), plan(&scene));
+        assert_eq!(frame.stats.passes, planned_passes_above_ground(&scene), "expected the planned passes");
         let names = plan.textures.iter().map(|allocation| allocation.name.clone());
         ShadowResources {
             has_blur_pass: frame.stats.passes.contains(&Pass::Blur),
