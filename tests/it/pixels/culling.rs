@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{
-    Camera, Culling, Ground, Lens, PixelRect, Scene, ShadowMethod, ShadowSettings, Transparency, View,
+    BoundingBox, Camera, Culling, Ground, Lens, PixelRect, Scene, ShadowMethod, ShadowSettings, Transparency, View,
 };
 use modalcast_render::{
     Aov, FrameCullStats, FrameParams, FrameStats, Pass, PickHit, Renderer, SceneBuffers, VisibilityId,
@@ -39,6 +39,8 @@ struct CullHarness {
     renderer: Renderer,
     buffers: SceneBuffers,
     scene: Arc<Scene>,
+    /// Bounds that a frame is drawn with.
+    bounds: BoundingBox,
 }
 
 impl CullHarness {
@@ -47,12 +49,13 @@ impl CullHarness {
         builder.parts.look.culling = culling;
         let (scene, mut renderer) = (builder.build(), open_renderer());
         let buffers = renderer.load(&scene).expect("expected the scene to load");
-        let mut harness = Self { renderer, buffers, scene };
+        let bounds = scene.rest_bounds;
+        let mut harness = Self { renderer, buffers, scene, bounds };
         harness.move_vertices(|point| point);
         harness
     }
 
-    /// Moves every vertex to a function of its rest position.
+    /// Moves every vertex to a function of its rest position. The bounds stay as they are.
     fn move_vertices(&mut self, position: impl Fn([f32; 3]) -> [f32; 3]) {
         let mut surface = DeformedSurface::default();
         for domain in &self.scene.domains {
@@ -63,9 +66,8 @@ impl CullHarness {
         self.renderer.upload(&self.buffers, &surface).expect("expected the upload to succeed");
     }
 
-    /// Draws with the rest bounds of the scene, also if vertices have moved.
     fn draw(&mut self, camera: Camera, [width, height]: [u32; 2]) -> Frame {
-        let params = FrameParams { camera, width, height, bounds: self.scene.rest_bounds, light_bounds: None };
+        let params = FrameParams { camera, width, height, bounds: self.bounds, light_bounds: None };
         let rgba = self.renderer.draw(&self.buffers, &params).expect("expected a frame").rgba;
         let stats = self.renderer.stats().clone();
         Frame { rgba, ids: self.renderer.read_visibility().expect("expected visibility ids"), stats }
@@ -262,11 +264,15 @@ fn culling_handles_non_finite_and_huge_positions() {
 fn culling_handles_far_scenes_and_extreme_clip_planes() {
     // Clip planes of 0 are fitted to the bounds.
     for (shift, near, far) in [(1e4, 0.0, 0.0), (1e7, 0.0, 0.0), (0.0, 1e-6, 1e9), (0.0, 8.9, 9.1)] {
-        assert_same_frames(&|| mixed_builder(4, Transparency::OrderIndependent), &|harness| {
+        let frames = assert_same_frames(&|| mixed_builder(4, Transparency::OrderIndependent), &|harness| {
             harness.move_vertices(|[x, y, z]| [x + shift as f32, y, z]);
+            harness.bounds.min[0] += shift;
+            harness.bounds.max[0] += shift;
             let camera = Camera { near, far, ..camera_at([shift, 1.0, 9.0], [shift, 0.0, 0.0]) };
             (0..3).map(|_| harness.draw(camera, [SIZE, SIZE])).collect()
         });
+        let triangle_pixels = frames[2].ids.iter().filter(|id| matches!(id, VisibilityId::Triangle(_))).count();
+        assert!(triangle_pixels > 0, "expected triangles at a shift of {shift}, near {near}, far {far}");
     }
 }
 
