@@ -17,7 +17,7 @@ use super::{
 };
 use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random};
 
-/// The same deformation with displacements and boxes.
+/// The given settings, with displacements and boxes enabled.
 pub(crate) fn with_displacements_and_boxes(deformation: DeformationSettings) -> DeformationSettings {
     DeformationSettings { displacements: true, boxes: true, ..deformation }
 }
@@ -33,8 +33,9 @@ pub(crate) fn find_wrong_box(scene: &Scene, result: &StepResult) -> Option<usize
     (0..layouts.len()).find(|domain| result.surface.boxes[*domain] != position_bounds(*domain))
 }
 
-/// Number of vertices and rank of each shape. There is every kind of tile: shared by domains, used by one domain, and
-/// several per domain. With `has_many_domains`, there are so many tiles that a lane computes four vertices.
+/// Number of vertices and rank of each shape. A tile has at most 128 vertices: small domains share a tile, and large
+/// domains have several. With `has_many_domains`, there are so many tiles that a lane (a GPU thread) computes four
+/// vertices instead of one.
 fn shape_sizes(has_many_domains: bool) -> Vec<(usize, usize)> {
     if has_many_domains {
         return (0..900).map(|index| (3 + index % 9, index % 4)).chain([(4097, 0), (5000, 3)]).collect();
@@ -42,28 +43,30 @@ fn shape_sizes(has_many_domains: bool) -> Vec<(usize, usize)> {
     vec![(1, 3), (7, 2), (9, 0), (31, 1), (64, 5), (65, 0), (130, 33), (1, 0), (300, 4)]
 }
 
-/// A scene with two domains per shape. With `has_many_domains`, a scene with one domain per shape and 29 further domains
-/// of the last shape.
+/// A scene with two domains per shape. With `has_many_domains`, the scene has one domain per shape and 29 further
+/// domains of the last shape. Every other shape has more corners than vertices.
 fn create_scene(deformation: DeformationSettings, has_many_domains: bool) -> Arc<Scene> {
     let mut random = Random(101);
-    let shape = |(index, (vertices, rank)): (usize, (usize, usize))| match index % 2 {
+    let create_shape = |(index, (vertices, rank)): (usize, (usize, usize))| match index % 2 {
         0 => strip_shape(&mut random, vertices, rank),
         _ => scenes::random_shape(&mut random, vertices, rank),
     };
-    let mut parts = scenes::parts_of_shapes(shape_sizes(has_many_domains).into_iter().enumerate().map(shape).collect());
+    let shapes = shape_sizes(has_many_domains).into_iter().enumerate().map(create_shape).collect();
+    let mut parts = scenes::parts_of_shapes(shapes);
     parts.deformation = deformation;
-    let count = parts.shapes.len();
-    let further_domains = if has_many_domains { vec![count - 1; 29] } else { (0..count).collect() };
-    let domain = |(index, shape): (usize, usize)| Domain {
+    let shape_count = parts.shapes.len();
+    let further_shapes = if has_many_domains { vec![shape_count - 1; 29] } else { (0..shape_count).collect() };
+    let create_domain = |(index, shape): (usize, usize)| Domain {
         name: format!("domain {index}"),
         ..scenes::new_domain(shape, if has_many_domains { scenes::PLAIN_MATERIAL } else { NORMAL_MAPPED_MATERIAL })
     };
-    parts.domains = (0..count).chain(further_domains).enumerate().map(domain).collect();
+    parts.domains = (0..shape_count).chain(further_shapes).enumerate().map(create_domain).collect();
     Scene::new(parts).expect("expected a valid scene")
 }
 
 /// Displacements are within their bound, boxes are tight, and vertices have the same bits as without these attributes.
 pub(crate) fn check_displacements_and_boxes<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    // Each storage type has two small scenes and one scene with many domains.
     for (storage, compensated, has_many_domains) in StorageType::ALL.into_iter().flat_map(|storage| {
         [(storage, false, false), (storage, true, false), (storage, storage == StorageType::Bf16, true)]
     }) {
@@ -76,16 +79,18 @@ pub(crate) fn check_displacements_and_boxes<D: Deformer>(create_deformer: impl F
         assert_eq!(has_one_item_per_lane(&scene), !has_many_domains);
         let name = format!("{}, compensated {compensated}, {} domains", storage.name(), scene.domains.len());
         assert!(plain_result.surface.displacements.is_empty() && plain_result.surface.boxes.is_empty(), "{name}");
-        let mut result_vertices = result.clone();
-        (result_vertices.surface.displacements, result_vertices.surface.boxes) = (vec![], vec![]);
+        let mut result_without_attributes = result.clone();
+        result_without_attributes.surface.displacements.clear();
+        result_without_attributes.surface.boxes.clear();
         assert_eq!(
-            result_vertices.difference(&plain_result),
+            result_without_attributes.difference(&plain_result),
             None,
             "{name}: expected the same vertices with and without attributes"
         );
         assert_displacements_within_bound(&name, &scene, &state, &result.surface.displacements);
         assert_eq!(find_wrong_box(&scene, &result), None, "{name}");
-        // Negative control: the opposite q exceeds the bound of each domain with modes. Other domains have zeros.
+        // Negative control: with the opposite q, every domain with modes exceeds its bound. The displacements of the
+        // other domains are zero for every q.
         let mut negated_state = state.clone();
         negated_state.q.iter_mut().for_each(|number| *number = -*number);
         let modal_domains: Vec<usize> = (0..scene.domains.len()).filter(|domain| scene.rank_of(*domain) > 0).collect();
@@ -94,6 +99,7 @@ pub(crate) fn check_displacements_and_boxes<D: Deformer>(create_deformer: impl F
             modal_domains,
             "{name}"
         );
+        // Negative control: a moved vertex of domain 3 makes the box of domain 3 wrong.
         let mut modified = result.clone();
         modified.surface.positions[3 * scene.layout.domains[3].first_vertex] += 100.0;
         assert_eq!(find_wrong_box(&scene, &modified), Some(3), "{name}");
@@ -104,16 +110,18 @@ pub(crate) fn check_displacements_and_boxes<D: Deformer>(create_deformer: impl F
 pub(crate) fn check_scene_without_modes<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(103);
     let shapes = vec![strip_shape(&mut random, 7, 0), scenes::random_shape(&mut random, 300, 0)];
-    let scene = scene_of_shapes(shapes, 2, with_displacements_and_boxes(DeformationSettings::default()), false);
+    let (deformation, normal_maps) = (with_displacements_and_boxes(DeformationSettings::default()), false);
+    let scene = scene_of_shapes(shapes, 2, deformation, normal_maps);
     assert!(!scene.features.modes && scene.features.displacements);
     let result = run_step(&mut create_deformer(&scene), &scenes::random_state(&scene, 104));
     assert_eq!(result.surface.displacements, vec![0.0; 3 * scene.layout.vertices]);
     assert_eq!(find_wrong_box(&scene, &result), None);
 }
 
-/// Reading some attributes returns those of the last step, and the other attributes can be read afterwards.
+/// A read of some attributes returns their values in the last step. All attributes can be read afterwards.
 pub(crate) fn check_separate_reads<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
-    let scene = create_scene(with_displacements_and_boxes(DeformationSettings::default()), false);
+    let has_many_domains = false;
+    let scene = create_scene(with_displacements_and_boxes(DeformationSettings::default()), has_many_domains);
     let (mut deformer, mut random) = (create_deformer(&scene), Random(105));
     let mut state = scenes::random_state(&scene, 106);
     let mut previous = run_step(&mut deformer, &state);
@@ -127,10 +135,12 @@ pub(crate) fn check_separate_reads<D: Deformer>(create_deformer: impl Fn(&Arc<Sc
     .into_iter()
     .enumerate()
     {
-        partial_steps::apply_random_step(&scene, &mut state, &mut random, &[1, 6, step as u32 + 8], &[2, 6]);
+        let (q_domains, transform_domains) = ([1, 6, step as u32 + 8], [2, 6]);
+        partial_steps::apply_random_step(&scene, &mut state, &mut random, &q_domains, &transform_domains);
         let expected = run_step(&mut create_deformer(&scene), &state);
         deformer.deform(&state).expect("expected the step to succeed");
         let actual = deformer.read(requested).expect("expected a surface").clone();
+        // The comparison with the previous step excludes a read that returns old values.
         let [new_surface, old_surface] = [&expected.surface, &previous.surface];
         if requested.boxes {
             assert!(actual.boxes == new_surface.boxes && new_surface.boxes != old_surface.boxes, "step {step}");
@@ -158,17 +168,21 @@ pub(crate) fn check_separate_reads<D: Deformer>(create_deformer: impl Fn(&Arc<Sc
 /// A readback returns the requested attributes of its own step and no others. Several requests for the same step
 /// succeed, and readbacks remain valid when later steps are computed.
 pub(crate) fn check_separate_readbacks<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
-    let scene = create_scene(with_displacements_and_boxes(DeformationSettings::default()), false);
+    let has_many_domains = false;
+    let scene = create_scene(with_displacements_and_boxes(DeformationSettings::default()), has_many_domains);
     let (mut deformer, mut random, mut state) =
         (create_deformer(&scene), Random(108), scenes::random_state(&scene, 109));
     let mut pending = Vec::new();
     for step in 0..20 {
-        partial_steps::apply_random_step(&scene, &mut state, &mut random, &[1, 6, step % 4 + 8], &[2, 6]);
+        let (q_domains, transform_domains) = ([1, 6, step % 4 + 8], [2, 6]);
+        partial_steps::apply_random_step(&scene, &mut state, &mut random, &q_domains, &transform_domains);
         let expected = run_step(&mut create_deformer(&scene), &state).surface;
         deformer.deform(&state).expect("expected the step to succeed");
+        // Three requests per step. The formulas only vary the combinations of the four attributes.
         let requests = [step, step / 4 * 3 + 1, step * 7 + 2].map(|bits| attributes_of_bits(bits as usize % 16));
         let readbacks =
             requests.map(|requested| (requested, deformer.readback(requested).expect("expected a readback to start")));
+        // Check the readbacks of the previous step while those of this step are in flight.
         for (expected, readbacks) in std::mem::replace(&mut pending, vec![(expected, readbacks)]) {
             for (requested, readback) in readbacks.iter().rev() {
                 let actual = deformer.wait_readback(readback).expect("expected the readback to complete");
@@ -182,7 +196,7 @@ pub(crate) fn check_separate_readbacks<D: Deformer>(create_deformer: impl Fn(&Ar
                     ),
                     (requested.boxes, actual.boxes == expected.boxes, actual.boxes.is_empty()),
                 ];
-                // A request may also receive attributes that an earlier request for the same step included.
+                // An attribute that is not requested is empty, unless another request for the same step includes it.
                 let is_valid =
                     |(requested, is_equal, is_empty): &(bool, bool, bool)| *is_equal || !requested && *is_empty;
                 assert!(
@@ -193,31 +207,32 @@ pub(crate) fn check_separate_readbacks<D: Deformer>(create_deformer: impl Fn(&Ar
         }
     }
     // Negative control: the next step has other attributes.
-    let (last_surface, _) = pending.pop().expect("expected a valid step");
-    partial_steps::apply_random_step(&scene, &mut state, &mut random, &[1, 6], &[2, 6]);
+    let (last_surface, _) = pending.pop().expect("expected a readback of the last step");
+    let (q_domains, transform_domains) = ([1, 6], [2, 6]);
+    partial_steps::apply_random_step(&scene, &mut state, &mut random, &q_domains, &transform_domains);
     let next_surface = run_step(&mut deformer, &state).surface;
     assert!(last_surface.positions != next_surface.positions && last_surface.normals != next_surface.normals);
     assert!(last_surface.displacements != next_surface.displacements && last_surface.boxes != next_surface.boxes);
 }
 
-/// The combination of attributes given by the lowest four bits.
+/// The attributes whose bit is set; `bits` is less than 16.
 fn attributes_of_bits(bits: usize) -> VertexAttributes {
     let bit = |index: usize| bits >> index & 1 == 1;
     VertexAttributes { positions: bit(0), normals: bit(1), displacements: bit(2), boxes: bit(3) }
 }
 
-/// A scene with u = (q0 + q1, q0 + q1, q2) at every vertex.
+/// A scene with u = (q0 + q1, q0 + q1, q2) at each of five vertices.
 fn scene_of_ones(deformation: DeformationSettings) -> Arc<Scene> {
     let column = |row: [f32; 3]| row.repeat(5);
     let columns = [column([1.0, 1.0, 0.0]), column([1.0, 1.0, 0.0]), column([0.0, 0.0, 1.0])].concat();
     scene_from_columns(5, columns, deformation)
 }
 
-/// A transform whose scale is so small that x is finite where u overflows.
+/// Scales by 1e-6, so that x is finite where u overflows.
 const TINY_SCALE: Transform = Transform([1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 0.0, 1e-6, 0.0]);
 
-/// A displacement in the range of f32 survives intermediate overflow. One that overflows is reported, even if x is
-/// finite.
+/// A displacement that overflows is reported, even if x is finite. A displacement in the range of f32 is correct, even
+/// if partial sums overflow.
 pub(crate) fn check_displacement_overflow<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     for (storage, compensated) in StorageType::ALL.into_iter().flat_map(|storage| [(storage, false), (storage, true)]) {
         let deformation = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
@@ -227,7 +242,7 @@ pub(crate) fn check_displacement_overflow<D: Deformer>(create_deformer: impl Fn(
         let (mut plain_deformer, mut deformer) = (create_deformer(&plain_scene), create_deformer(&scene));
         let mut state = SceneState::rest(&scene);
         state.transforms[0] = TINY_SCALE;
-        // u is 6e38, which exceeds f32.
+        // u is 6e38; the largest f32 is 3.4e38.
         state.q = vec![3e38, 3e38, 0.75];
         assert!(run_step(&mut plain_deformer, &state).bounds.is_finite(), "{name}: expected a finite x");
         assert!(
@@ -239,7 +254,7 @@ pub(crate) fn check_displacement_overflow<D: Deformer>(create_deformer: impl Fn(
         assert!(result.bounds.is_finite() && find_wrong_box(&scene, &result).is_none(), "{name}: {:?}", result.bounds);
         assert_displacements_within_bound(&name, &scene, &state, &result.surface.displacements);
     }
-    // Partial sums overflow although the total is finite.
+    // u = (q0 + q1 + q2 + q3) (1, -1, 0.5). The partial sum q0 + q1 is 6e38 and overflows, the total is 5e37.
     let row = [1.0_f32, -1.0, 0.5].repeat(5);
     let scene = scene_from_columns(
         5,
@@ -263,11 +278,13 @@ pub(crate) fn check_displacement_overflow<D: Deformer>(create_deformer: impl Fn(
 pub(crate) fn check_displacement_overflow_rejection(backend: BackendChoice) {
     let config = Config { backend, renderer: RendererChoice::Off, ..Config::default() };
     let mut context = DeviceContext::open(&config).expect("expected a device context");
-    let scene = create_scene(with_displacements_and_boxes(DeformationSettings::default()), false);
+    let has_many_domains = false;
+    let scene = create_scene(with_displacements_and_boxes(DeformationSettings::default()), has_many_domains);
     let (mut loaded_scene, mut random) =
         (context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load"), Random(107));
     let mut valid_state = SceneState::rest(&scene);
-    partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[1, 4], &[4]);
+    let (q_domains, transform_domains) = ([1, 4], [4]);
+    partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &q_domains, &transform_domains);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
     let valid_surface = loaded_scene.surface().expect("expected a surface").clone();
     for domain in [4, 6] {
@@ -279,6 +296,7 @@ pub(crate) fn check_displacement_overflow_rejection(backend: BackendChoice) {
             &[domain as u32],
             &[domain as u32],
         );
+        // A scale of 1e-24 keeps x finite, so that only u overflows.
         overflowing_state.transforms[domain] = Transform(TINY_SCALE.0.map(|entry| entry * 1e-18));
         let layout = scene.layout.domains[domain];
         overflowing_state.q[layout.first_q..][..layout.rank].fill(f32::MAX);
@@ -287,6 +305,7 @@ pub(crate) fn check_displacement_overflow_rejection(backend: BackendChoice) {
         assert!(error.starts_with(&format!("step.q of domain 'domain {domain}'")), "{error}");
         assert_eq!(loaded_scene.surface().expect("expected a surface"), &valid_surface);
     }
+    // The next valid step sets only q of domain 8.
     partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[8], &[]);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
     assert_ne!(

@@ -1,4 +1,5 @@
-//! Triangle soups with alpha-tested triangles, and the samples where two texture filters may disagree.
+//! Triangle soups (lists of triangles) with cut-outs: triangles whose samples are discarded where the alpha of an image
+//! is below a cutoff. Also finds the samples where two texture filters may disagree.
 
 use modalcast_compute::reference::raster::cut_out::{alpha, footprint};
 use modalcast_compute::reference::raster::{VisibilityBuffer, clipped_polygon, corners, depth_at, fan_triangles};
@@ -23,20 +24,22 @@ impl CutOutSoup {
         raster
     }
 
-    /// Whether each sample has an alpha value within `tolerance` of its threshold.
+    /// For each sample of the viewport, whether the alpha of any cut-out triangle at the sample is within `tolerance`
+    /// of its cutoff.
     pub(crate) fn ambiguous_samples(&self, tolerance: f32) -> Vec<bool> {
         let (soup, cut_outs) = (&self.soup, &self.cut_outs);
         let mut is_ambiguous = vec![false; soup.viewport.pixel_count()];
         for (triangle, cull_mode) in soup.groups.iter().flat_map(|group| {
             (group.first..group.first + group.triangles).map(move |triangle| (triangle, group.cull_mode))
         }) {
-            let Some(cut_out) = triangle.checked_sub(cut_outs.first) else { continue };
+            let Some(cut_out_index) = triangle.checked_sub(cut_outs.first) else { continue };
             let vertices = soup.triangles[triangle as usize];
             let Ok(clipped_polygon) = clipped_polygon(&soup.viewport, &soup.positions, vertices, cull_mode) else {
                 continue;
             };
-            let (corners, uvs) = (corners(&soup.viewport, &soup.positions, vertices), &cut_outs.uvs[cut_out as usize]);
-            let cutoff = cut_outs.materials[cut_outs.material_indices[cut_out as usize] as usize].cutoff;
+            let (corners, uvs) =
+                (corners(&soup.viewport, &soup.positions, vertices), &cut_outs.uvs[cut_out_index as usize]);
+            let cutoff = cut_outs.materials[cut_outs.material_indices[cut_out_index as usize] as usize].cutoff;
             let [x0, y0, x1, y1] = clipped_polygon.samples;
             for clipped_triangle in fan_triangles(&clipped_polygon) {
                 for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
@@ -62,10 +65,11 @@ pub(crate) fn alpha_image(width: u32, height: u32, mut texel: impl FnMut(u32, u3
     AlphaImage { width, height, levels: levels.collect() }
 }
 
-/// All soups with uniform images or without images, so that the result does not depend on the texture filter. The last
-/// two thirds of the triangles are alpha-tested.
+/// [`all_soups`] with cut-outs: the last two thirds of the triangles are alpha-tested. Each image has one alpha value,
+/// so that the result does not depend on the texture filter.
 pub(crate) fn uniform_cut_out_soups() -> Vec<CutOutSoup> {
     let mut random = Random(21);
+    // Image 0 is transparent, image 1 is opaque.
     let material = |alpha, cutoff, image| AlphaMaterial { alpha, cutoff, image };
     let materials = vec![
         material(1.0, 0.5, Some(0)),
@@ -80,6 +84,7 @@ pub(crate) fn uniform_cut_out_soups() -> Vec<CutOutSoup> {
     let add_cut_outs = |soup: Soup| {
         let first = soup.triangles.len() as u32 / 3;
         let count = soup.triangles.len() - first as usize;
+        // Texture coordinates in -3 to 3, so that the images repeat.
         let mut random_uv = || [random.next_number(), random.next_number()].map(|coordinate| 3.0 * coordinate);
         let uvs = (0..count).map(|_| [random_uv(), random_uv(), random_uv()]).collect();
         let material_indices = (0..count).map(|index| (index % materials.len()) as u32).collect();
@@ -89,15 +94,15 @@ pub(crate) fn uniform_cut_out_soups() -> Vec<CutOutSoup> {
     all_soups().into_iter().map(add_cut_outs).collect()
 }
 
-/// Two triangles that fill a viewport of `side` x `side` pixels with one image; u grows to the right, v downwards. If the
-/// viewport has the size of the image, each sample is the center of a texel.
+/// Two triangles that fill a viewport of `side` x `side` pixels with one image; u grows to the right, v downwards. If
+/// the viewport has the size of the image, each sample is the center of a texel.
 pub(crate) fn sheet_soup(side: u32, image: AlphaImage) -> CutOutSoup {
     let positions = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]].map(|[x, y]| [x, y, 0.0]).concat();
     let triangles = vec![[0, 1, 2], [0, 2, 3]];
-    let uv = |corner: u32| [[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]][corner as usize];
+    let uv_of_vertex = |vertex: u32| [[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]][vertex as usize];
     let cut_outs = CutOuts {
         first: 0,
-        uvs: triangles.iter().map(|corners: &[u32; 3]| corners.map(uv)).collect(),
+        uvs: triangles.iter().map(|vertices: &[u32; 3]| vertices.map(uv_of_vertex)).collect(),
         material_indices: vec![0; 2],
         materials: vec![AlphaMaterial { alpha: 1.0, cutoff: 0.5, image: Some(0) }],
         images: vec![image],
@@ -110,9 +115,10 @@ pub(crate) fn sheet_soup(side: u32, image: AlphaImage) -> CutOutSoup {
     }
 }
 
-/// A floor one unit below the camera, split into `divisions` x `divisions` rectangles, and an opaque wall at its far end.
-/// The floor extends behind the camera. Its image is smooth, so that filters of low precision differ little.
+/// A floor one unit below the camera, split into `divisions` x `divisions` rectangles, and an opaque wall at its far
+/// end. The floor extends behind the camera. Its image is smooth, so that filters of low precision differ little.
 pub(crate) fn floor_soup(divisions: u32) -> CutOutSoup {
+    // Vertices 0 to 3 and triangles 0 and 1 are the wall.
     let mut positions = [[-20.0, -9.0, -20.5], [20.0, -9.0, -20.5], [20.0, 9.0, -20.5], [-20.0, 9.0, -20.5]].concat();
     let mut triangles = vec![[0, 1, 2], [0, 2, 3]];
     let fraction = |index: u32| index as f32 / divisions as f32;
@@ -120,10 +126,9 @@ pub(crate) fn floor_soup(divisions: u32) -> CutOutSoup {
     positions.extend(grid.flat_map(|(x, z)| [18.0 * fraction(x) - 9.0, -1.0, 9.0 - 29.0 * fraction(z)]));
     let mut uvs = Vec::new();
     for (column, row) in (0..divisions).flat_map(|row| (0..divisions).map(move |column| (column, row))) {
-        let corners =
-            [(0, 0), (1, 0), (1, 1), (0, 1)].map(|(next_column, next_row)| (column + next_column, row + next_row));
-        for vertex_order in [[0, 1, 2], [0, 2, 3]] {
-            let corners = vertex_order.map(|corner: usize| corners[corner]);
+        let corners = [(0, 0), (1, 0), (1, 1), (0, 1)].map(|(right, down)| (column + right, row + down));
+        for corner_indices in [[0, 1, 2], [0, 2, 3]] {
+            let corners = corner_indices.map(|index: usize| corners[index]);
             triangles.push(corners.map(|(x, z)| 4 + z * (divisions + 1) + x));
             uvs.push(corners.map(|(x, z)| [3.0 * fraction(x), 5.0 * fraction(z)]));
         }
@@ -144,7 +149,8 @@ pub(crate) fn floor_soup(divisions: u32) -> CutOutSoup {
     CutOutSoup { soup: Soup { name: "floor", positions, triangles, groups, viewport }, cut_outs }
 }
 
-/// One sine wave per axis. The amplitude differs per mip level, so that reading a wrong level is detected.
+/// The sum of one sine wave per axis. The amplitude differs per mip level, so that tests detect a read of a wrong
+/// level.
 fn wave_image() -> AlphaImage {
     let sine = |texel: u32, side: u32| (std::f32::consts::TAU * (texel as f32 + 0.5) / side as f32).sin();
     alpha_image(64, 32, |level, column, row| {

@@ -1,4 +1,5 @@
-//! Comparison of positions and displacements with the f64 reference, relative to their a-priori error bounds.
+//! Comparison of positions and displacements with the f64 reference, relative to their a-priori error bounds. An error
+//! ratio is an error divided by its bound.
 
 use modalcast_compute::reference;
 use modalcast_compute::storage::bound::{ErrorBoundInput, ShapeErrorModel};
@@ -27,7 +28,8 @@ fn displacement_error_ratios(scene: &Scene, state: &SceneState, displacements: &
     error_ratios(scene, state, Comparison { actual: displacements, expected: &expected }, bound)
 }
 
-/// Vectors of all packed vertices. `actual` contains three numbers per vertex, `expected` the vectors of the reference.
+/// Positions or displacements of all packed vertices. `actual` has three numbers per vertex; `expected` is the
+/// reference.
 struct Comparison<'a> {
     actual: &'a [f32],
     expected: &'a [[f64; 3]],
@@ -41,7 +43,8 @@ impl Comparison<'_> {
     }
 }
 
-/// Largest error of each domain relative to the bound of its tile.
+/// Largest error ratio of each domain. `bound` computes the bound of a tile from the error model of its shape, the
+/// index of the tile and the step.
 fn error_ratios(
     scene: &Scene,
     state: &SceneState,
@@ -93,6 +96,7 @@ pub(crate) fn assert_displacements_within_bound(name: &str, scene: &Scene, state
     assert_ratios(&format!("{name}, u"), scene, &displacement_error_ratios(scene, state, displacements));
 }
 
+/// Prints the largest ratio, and panics if it exceeds 1.
 fn assert_ratios(name: &str, scene: &Scene, ratios: &[f64]) {
     let max_domain = (0..ratios.len()).max_by(|a, b| ratios[*a].total_cmp(&ratios[*b])).expect("at least one domain");
     let (ratio, domain_name) = (ratios[max_domain], &scene.domains[max_domain].name);
@@ -100,7 +104,7 @@ fn assert_ratios(name: &str, scene: &Scene, ratios: &[f64]) {
     assert!(ratio <= 1.0, "{name}: expected an error within the bound, got {ratio} of the bound in '{domain_name}'");
 }
 
-/// Domains with a displacement error that exceeds its bound.
+/// Indices of the domains with a displacement error that exceeds its bound.
 pub(crate) fn domains_beyond_displacement_bound(
     scene: &Scene,
     state: &SceneState,
@@ -109,7 +113,7 @@ pub(crate) fn domains_beyond_displacement_bound(
     domains_beyond(&displacement_error_ratios(scene, state, displacements))
 }
 
-/// Domains with a position error that exceeds its bound.
+/// Indices of the domains with a position error that exceeds its bound.
 pub(crate) fn domains_beyond_bound(
     scene: &Scene,
     state: &SceneState,
@@ -127,10 +131,13 @@ fn domains_beyond(ratios: &[f64]) -> Vec<usize> {
 fn error_bounds_reject_wrong_and_non_finite_vertices() {
     let mut random = crate::scenes::Random(1);
     let shapes = vec![super::strip_shape(&mut random, 130, 3), super::strip_shape(&mut random, 7, 0)];
-    let scene = super::scene_of_shapes(shapes, 1, Default::default(), false);
+    let normal_maps = false;
+    let scene = super::scene_of_shapes(shapes, 1, Default::default(), normal_maps);
     let state = crate::scenes::random_state(&scene, 2);
     let positions: Vec<f32> = reference::deform(&scene, &state).as_flattened().iter().map(|x| *x as f32).collect();
     assert_eq!(domains_beyond_bound(&scene, &state, &positions, 0.0), [0; 0]);
+    // Vertices 0 to 129 belong to domain 0. Its second tile begins at vertex 128. Vertices from 130 on belong to domain
+    // 1.
     for (index, wrong_number) in [(3 * 129, f32::NAN), (3 * 129, f32::INFINITY), (3 * 129 + 2, 0.125), (0, 7.0)] {
         let mut modified = positions.clone();
         modified[index] = wrong_number;
@@ -139,13 +146,14 @@ fn error_bounds_reject_wrong_and_non_finite_vertices() {
     let mut wrong_positions = positions;
     wrong_positions[3 * 136] += 1e-3;
     assert_eq!(domains_beyond_bound(&scene, &state, &wrong_positions, 0.0), [1]);
-    let displacements = reference::displacements(&scene, &state);
-    let displacements: Vec<f32> = displacements.as_flattened().iter().map(|u| *u as f32).collect();
+    let displacements: Vec<f32> =
+        reference::displacements(&scene, &state).as_flattened().iter().map(|u| *u as f32).collect();
     assert_eq!(domains_beyond_displacement_bound(&scene, &state, &displacements), [0; 0]);
     for (index, wrong_number, domain) in [(5, f32::NAN, 0), (3 * 129, 0.125, 0), (3 * 136, 1e-30, 1)] {
         let mut modified = displacements.clone();
         modified[index] = wrong_number;
         assert_eq!(domains_beyond_displacement_bound(&scene, &state, &modified), [domain], "{wrong_number}");
     }
+    // A truncation bound of 2e-3 permits the error of 1e-3.
     assert_eq!(domains_beyond_bound(&scene, &state, &wrong_positions, 2e-3), [0; 0]);
 }

@@ -1,14 +1,14 @@
-//! Comparison of the ids of two rasterizers. They may draw different triangles at samples on an edge and at samples with
-//! equal depths. Arithmetic in f64 finds these samples.
+//! Comparison of the triangle ids that two rasterizers draw. The ids may differ at samples on an edge and at samples
+//! where two triangles have equal depths. This module finds these samples in f64.
 
 use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
-/// Grid spacing of snapped corners in pixels.
+/// Grid spacing of snapped corners in pixels: rasterizers round corners to 8 sub-pixel bits.
 const SNAP_STEP: f64 = 1.0 / 256.0;
 
-/// A triangle in homogeneous window coordinates (x, y in pixels times w), with the precision of f64.
+/// A triangle in homogeneous window coordinates (x w, y w, w), with x and y in pixels.
 pub(crate) struct ExactTriangle {
-    /// Edge functions: the dot product with (x, y, 1) is zero on the edge.
+    /// Edge functions as vectors: the dot product with a sample (x, y, 1) is zero on the edge.
     edges: [Vector3<f64>; 3],
     /// Clip-space z of the corners.
     depths: Vector3<f64>,
@@ -25,18 +25,18 @@ impl ExactTriangle {
             corners.map(|corner| clip * Vector4::new(corner[0].into(), corner[1].into(), corner[2].into(), 1.0));
         let [half_width, half_height] = size.map(|side| 0.5 * f64::from(side));
         let [a, b, c] = clip_corners.map(|v| Vector3::new(half_width * (v.x + v.w), half_height * (v.w - v.y), v.w));
-        let component_vector =
+        let component_of_corners =
             |component: fn(&Vector4<f64>) -> f64| Vector3::from(clip_corners.each_ref().map(component));
         let signed_area = Matrix3::from_columns(&[a, b, c]).determinant();
         Self {
             edges: [b.cross(&c), c.cross(&a), a.cross(&b)],
-            depths: component_vector(|v| v.z),
-            weights: component_vector(|v| v.w),
+            depths: component_of_corners(|corner| corner.z),
+            weights: component_of_corners(|corner| corner.w),
             signed_area,
         }
     }
 
-    /// Distances to the edges in pixels, positive inside.
+    /// Signed distances of a sample (x, y, 1) to the edges in pixels, positive inside.
     pub(crate) fn distances(&self, sample: Vector3<f64>) -> [f64; 3] {
         self.edges.map(|edge| self.signed_area.signum() * edge.dot(&sample) / edge.xy().norm())
     }
@@ -55,19 +55,19 @@ impl ExactTriangle {
     }
 }
 
-/// Number of differing samples by reason.
+/// Number of samples with different ids, by reason.
 #[derive(Debug, Default, PartialEq)]
 pub(crate) struct Differences {
-    /// Samples on an edge of one of the two triangles.
+    /// Samples on an edge of either triangle.
     pub(crate) edges: usize,
     /// Samples where both triangles have the same depth within the tolerance.
     pub(crate) ties: usize,
-    /// Other samples.
+    /// Samples without either reason: one rasterizer is wrong.
     pub(crate) wrong: usize,
 }
 
-/// Compares the triangle indices that two rasterizers draw in a viewport of `width` pixels. Depths tie if they differ by
-/// at most `depth_tolerance`.
+/// Compares the ids that two rasterizers draw in a viewport of `width` pixels. An id is an index in `triangles`, and
+/// `None` is the background. Depths tie if they differ by at most `depth_tolerance`.
 pub(crate) fn compare_ids(
     actual_ids: &[Option<u32>],
     expected_ids: &[Option<u32>],

@@ -1,4 +1,5 @@
-//! Domains that follow others by constant frames: T = T_root F.
+//! Followers: domains with the transform T = T_root F, where T_root is the transform of another domain (the transform
+//! root) and F is a constant frame.
 
 use std::sync::Arc;
 
@@ -24,10 +25,11 @@ const MAX_DIRECTION_ERROR: f64 = 1e-4;
 const SIZES: [(usize, usize); 9] =
     [(1, 0), (1, 3), (7, 0), (31, 1), (33, 4), (130, 31), (257, 0), (300, 33), (2000, 2)];
 
-/// A similarity transform. A transform with an index divisible by 3 is mirrored. Unless `is_rigid`, a transform with an
-/// even index is also sheared.
+/// A similarity transform for the follower with this index. It is mirrored if the index is divisible by 3. Unless
+/// `is_rigid`, it is sheared if the index is even.
 fn random_frame(random: &mut Random, index: usize, is_rigid: bool) -> Transform {
-    let mut frame = random.next_similarity(index.is_multiple_of(3));
+    let is_mirrored = index.is_multiple_of(3);
+    let mut frame = random.next_similarity(is_mirrored);
     if !is_rigid && index.is_multiple_of(2) {
         frame.0[1] += 0.3 * random.next_number();
         frame.0[8] -= 0.2 * random.next_number();
@@ -35,8 +37,8 @@ fn random_frame(random: &mut Random, index: usize, is_rigid: bool) -> Transform 
     frame
 }
 
-/// A scene in which one third of the domains are transform roots. Each other domain follows an earlier domain, either a
-/// root or a follower.
+/// Parts of a scene with `count` domains. The indices divisible by 3 are transform roots. Each other domain follows a
+/// random earlier domain, which is a root or a follower. With `is_rigid`, no transform may have shear.
 pub(crate) fn follower_scene_parts(count: usize, deformation: DeformationSettings, is_rigid: bool) -> SceneParts {
     let mut random = Random(count as u64);
     let mut shapes: Vec<Shape> =
@@ -59,8 +61,8 @@ pub(crate) fn follower_scene_parts(count: usize, deformation: DeformationSetting
     parts
 }
 
-/// The same scene with a transform root in place of each follower, and a state with the q of `state` and the given
-/// transform of each domain.
+/// A scene of the same parts in which every domain is a transform root, and a state with the q of `state` and with
+/// `transform(domain)` as the transform of each domain.
 fn without_followers(
     mut parts: SceneParts,
     state: &SceneState,
@@ -74,18 +76,19 @@ fn without_followers(
     (scene, root_state)
 }
 
-/// Largest errors of normals and tangents.
+/// Largest error of a component of a normal, and of a component of a tangent.
 fn direction_errors(result: &StepResult, scene: &Scene, state: &SceneState) -> [f64; 2] {
     let normals = max_abs_error(&result.surface.normals, rigid_normals(scene, state).as_flattened());
     [normals, max_abs_error(&result.surface.tangents, rigid_tangents(scene, state).as_flattened())]
 }
 
-/// Mirrored, sheared and chained frames of small and large shapes for every storage type.
+/// Followers with mirrored, sheared and chained frames are within their error bounds for every storage type. They have
+/// the same bits as transform roots with the same composed transform.
 pub(crate) fn check_frames<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     for (storage, is_rigid) in StorageType::ALL.into_iter().flat_map(|storage| [(storage, false), (storage, true)]) {
         let name = format!("followers, {}, rigid {is_rigid}", storage.name());
-        let parts =
-            || follower_scene_parts(45, DeformationSettings { storage, ..DeformationSettings::default() }, is_rigid);
+        let deformation = DeformationSettings { storage, ..DeformationSettings::default() };
+        let parts = || follower_scene_parts(45, deformation, is_rigid);
         let scene = Scene::new(parts()).expect("expected a valid scene");
         assert_eq!((scene.transform_roots.count(), scene.features.shear), (15, !is_rigid));
         let state = scenes::random_state(&scene, 61);
@@ -94,7 +97,7 @@ pub(crate) fn check_frames<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) ->
         let errors = direction_errors(&result, &scene, &state);
         eprintln!("{name}: error of normals {:.2e}, of tangents {:.2e}", errors[0], errors[1]);
         assert!(errors.iter().all(|error| *error <= MAX_DIRECTION_ERROR), "{name}: {errors:?}");
-        // A transform root with the composed transform of the follower has the same bits.
+        // A root with the composed transform of the follower has the same bits.
         let (root_scene, root_state) = without_followers(parts(), &state, |domain| state.transform_of(&scene, domain));
         let root_result = run_step(&mut create_deformer(&root_scene), &root_state);
         assert!(
@@ -131,7 +134,7 @@ fn changed_domains(scene: &Scene, q_domains: &[u32], transform_domains: &[u32]) 
     (0..scene.domains.len() as u32).filter(is_changed).collect()
 }
 
-/// A partial step that moves some roots and deforms some followers gives the bits of a full step.
+/// A partial step that sets the transforms of some roots and q of some domains gives the bits of a full step.
 pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let default = DeformationSettings::default();
     for deformation in [
@@ -142,7 +145,8 @@ pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn
         DeformationSettings { truncation: Some(0.2), storage: StorageType::F16, ..default },
     ] {
         let name = format!("{deformation:?}");
-        let scene = Scene::new(follower_scene_parts(120, deformation, false)).expect("expected a valid scene");
+        let is_rigid = false;
+        let scene = Scene::new(follower_scene_parts(120, deformation, is_rigid)).expect("expected a valid scene");
         let (mut partial_deformer, mut full_deformer) = (create_deformer(&scene), create_deformer(&scene));
         let (mut state, mut random) = (scenes::random_state(&scene, 63), Random(62));
         let mut previous_result = run_step(&mut partial_deformer, &state);
@@ -150,6 +154,7 @@ pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn
         let roots: Vec<u32> = scene.transform_roots.domains().collect();
         let mut partial_steps = 0;
         for step in 0..12 {
+            // No, one or two of the 40 roots, or all of them in step 7.
             let two_roots = [roots[(step * 5 + 20) % 40], roots[(step * 11 + 39) % 40]];
             let transform_domains = if step == 7 { &roots[..] } else { &two_roots[..step % 3] };
             let q_domains: &[u32] = if step % 4 == 1 { &[1, 5, 64] } else { &[] };
@@ -173,7 +178,7 @@ pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn
                     .all(|domain| moved_domains.contains(domain))
             );
             assert!(!scene.features.boxes || find_wrong_box(&scene, &result).is_none(), "step {step}");
-            // A partial step changes at most a quarter of the domains.
+            // Deformers compute a step as a partial step if it changes at most a quarter of the domains.
             partial_steps += usize::from(!expected_domains.is_empty() && expected_domains.len() <= 30);
             previous_result = result;
         }
@@ -201,12 +206,13 @@ fn far_step(domain: u32, translation: [f64; 3]) -> RawStepUpdate {
     }
 }
 
-/// The positions of a follower are relative to the floating origin of its root, so a far follower is as precise as one near
-/// the scene's origin.
+/// The positions of a follower are relative to the floating origin of its root, so a far follower is as precise as one
+/// near the scene's origin.
 pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(64);
     let mut parts = scenes::parts_of_shapes(vec![strip_shape(&mut random, 50, 0)]);
-    let frame = random.next_similarity(true);
+    let is_mirrored = true;
+    let frame = random.next_similarity(is_mirrored);
     for follows in [None, Some(FollowConstraint { parent: 0, frame }), None] {
         parts.domains.push(Domain { follows, ..scenes::new_domain(0, scenes::PLAIN_MATERIAL) });
     }
@@ -217,6 +223,7 @@ pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     assert_eq!((scene.transform_roots.root_of(1), state.transforms.len()), (0, 2));
     let result = run_step(&mut create_deformer(&scene), &state);
     let (layout, origin) = (scene.layout.domains[1], state.origin_of(scene.transform_roots.root_of(1)));
+    // The second error is that of world positions rounded to f32.
     let [mut max_error, mut max_f32_error] = [0.0_f64; 2];
     for (vertex, rest_position) in scene.shape_of(1).mesh.rest_positions().iter().enumerate() {
         let position_in_root = frame.to_matrix().transform_point(&nalgebra::Point3::from(*rest_position).cast());
@@ -235,7 +242,8 @@ pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     );
 }
 
-/// The product T F exceeds the range of f32, but tiny rest positions keep the deformed positions in range.
+/// Positions are finite and correct if entries of T_root F exceed f32: both have a scale of 1e25, and rest positions of
+/// 1e-20 keep x in range.
 pub(crate) fn check_overflowing_frame_products<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(65);
     let rest_positions: Vec<[f32; 3]> =
@@ -243,6 +251,7 @@ pub(crate) fn check_overflowing_frame_products<D: Deformer>(create_deformer: imp
     let normals = (0..37).map(|_| random.next_triple()).collect();
     let triangles = (0..35).map(|index| [index, index + 1, index + 2]).collect();
     let mesh = Mesh::from_indexed(rest_positions, normals, vec![], triangles).expect("expected a valid mesh");
+    // The translation is zero.
     let scaled_linear_part = |transform: Transform, scale: f32| {
         let mut entries = transform.0.map(|entry| entry * scale);
         [3, 7, 11].into_iter().for_each(|index| entries[index] = 0.0);
@@ -252,13 +261,14 @@ pub(crate) fn check_overflowing_frame_products<D: Deformer>(create_deformer: imp
         let mut parts =
             scenes::parts_of_shapes(vec![Shape::new(mesh.clone(), Modes::rigid()).expect("expected a valid shape")]);
         parts.rigid_transforms = is_rigid;
-        let frame = scaled_linear_part(random.next_similarity(true), 1e25);
+        let is_mirrored = true;
+        let frame = scaled_linear_part(random.next_similarity(is_mirrored), 1e25);
         for follows in [None, Some(FollowConstraint { parent: 0, frame })] {
             parts.domains.push(Domain { follows, ..scenes::new_domain(0, scenes::PLAIN_MATERIAL) });
         }
         let scene = Scene::new(parts).expect("expected a valid scene");
         let mut state = SceneState::rest(&scene);
-        state.transforms[0] = scaled_linear_part(random.next_similarity(false), 1e25);
+        state.transforms[0] = scaled_linear_part(random.next_similarity(!is_mirrored), 1e25);
         assert!(!state.transform_of(&scene, 1).0[0].is_finite(), "expected a product beyond f32");
         let result = run_step(&mut create_deformer(&scene), &state);
         assert!(result.bounds.is_finite());
@@ -269,7 +279,7 @@ pub(crate) fn check_overflowing_frame_products<D: Deformer>(create_deformer: imp
             .fold(0.0_f64, |max_coordinate, coordinate| max_coordinate.max(coordinate.abs()));
         let error = max_abs_error(&result.surface.positions, expected.as_flattened()) / max_coordinate;
         assert!(error <= 1e-6, "expected a relative error of at most 1e-6, got {error}");
-        let [normals, _] = direction_errors(&result, &scene, &state);
-        assert!(normals <= MAX_DIRECTION_ERROR, "expected at most {MAX_DIRECTION_ERROR}, got {normals}");
+        let [normal_error, _] = direction_errors(&result, &scene, &state);
+        assert!(normal_error <= MAX_DIRECTION_ERROR, "expected at most {MAX_DIRECTION_ERROR}, got {normal_error}");
     }
 }

@@ -1,4 +1,5 @@
-//! Light-space bounds: they contain every vertex, they are tight, and a scene without a shadow has none.
+//! Light-space bounds of a step: a box along the axes of light space, to which the shadow map is fitted. The box
+//! contains every vertex and is tight. A scene without a shadow has none.
 
 use std::sync::Arc;
 
@@ -13,8 +14,8 @@ use crate::scenes::{self, Random};
 /// Vertices per tile; each tile contributes one box.
 pub(crate) const TILE_VERTICES: usize = 128;
 
-/// A thin coil along the diagonal of a cube of side 2, bent by smooth waves. The box of each of its tiles is small,
-/// while the box of the whole coil is not.
+/// A thin coil along the diagonal of a cube of side 2, with sine waves as modes. The box of each of its tiles is small,
+/// but the box of the whole coil is not.
 pub(crate) fn coil_shape(vertices: usize, rank: usize) -> Shape {
     let fraction = |vertex: usize| vertex as f32 / vertices as f32;
     let position = |vertex: usize| {
@@ -22,8 +23,10 @@ pub(crate) fn coil_shape(vertices: usize, rank: usize) -> Shape {
         [t + 0.02 * angle.cos(), t + 0.02 * angle.sin(), t]
     };
     let rest_positions: Vec<[f32; 3]> = (0..vertices).map(position).collect();
-    let entry_value =
-        |entry: usize| 0.05 * ((entry / (3 * vertices) + 1) as f32 * 3.0 * fraction(entry / 3 % vertices)).sin();
+    let entry_value = |entry: usize| {
+        let (mode, vertex) = (entry / (3 * vertices), entry / 3 % vertices);
+        0.05 * ((mode + 1) as f32 * 3.0 * fraction(vertex)).sin()
+    };
     let modes = Modes::from_columns(3 * vertices, rank, (0..3 * vertices * rank).map(entry_value).collect())
         .expect("expected valid modes");
     let last_vertex = vertices as u32 - 1;
@@ -36,24 +39,27 @@ pub(crate) fn coil_shape(vertices: usize, rank: usize) -> Shape {
 
 /// Coils that fill tiles of their own and coils that share tiles.
 pub(crate) fn coil_scene(deformation: DeformationSettings) -> Arc<Scene> {
-    scene_of_shapes(vec![coil_shape(5000, 4), coil_shape(700, 2), coil_shape(9, 1)], 2, deformation, false)
+    let normal_maps = false;
+    scene_of_shapes(vec![coil_shape(5000, 4), coil_shape(700, 2), coil_shape(9, 1)], 2, deformation, normal_maps)
 }
 
-/// The smallest light-space box that contains the bounding boxes of all tiles of `tile_vertices` packed positions.
+/// The smallest light-space box that contains the world-space bounding boxes of all tiles, for tiles of `tile_vertices`
+/// packed positions. With tiles of one position, the box is that of the vertices.
 pub(crate) fn bounds_in_light_space(scene: &Scene, positions: &[f32], tile_vertices: usize) -> OrientedBounds {
     let axes = scene.light_axes().expect("expected a scene with a shadow");
     let tile_box = |positions: &[f32]| OrientedBounds::enclosing(&axes, &BoundingBox::from_positions(positions));
     positions.chunks(3 * tile_vertices).map(tile_box).fold(OrientedBounds::EMPTY, OrientedBounds::union)
 }
 
-/// Distance by which `inner` exceeds `outer`, or NaN if either contains a NaN.
+/// Largest distance by which a side of `inner` lies outside of `outer`; NaN if either box contains a NaN.
 pub(crate) fn max_excess(outer: &OrientedBounds, inner: &OrientedBounds) -> f64 {
     let excesses =
         (0..3).flat_map(|axis| [outer.0.min[axis] - inner.0.min[axis], inner.0.max[axis] - outer.0.max[axis]]);
     excesses.fold(0.0, |max: f64, excess| if excess.is_nan() || max.is_nan() { f64::NAN } else { max.max(excess) })
 }
 
-/// Sum of the largest absolute coordinates; the rounding error of f32 is proportional to it.
+/// Sum over the axes of the largest absolute coordinate. The rounding error of light-space coordinates is proportional
+/// to it.
 pub(crate) fn coordinate_magnitude(bounds: &BoundingBox) -> f64 {
     bounds.min.iter().zip(&bounds.max).map(|(min, max)| min.abs().max(max.abs())).sum()
 }
@@ -63,21 +69,24 @@ fn max_tile_diagonal(positions: &[f32]) -> f64 {
     positions.chunks(3 * TILE_VERTICES).map(|tile| BoundingBox::from_positions(tile).diagonal()).fold(0.0, f64::max)
 }
 
-/// Returns the light-space bounds of a step. Asserts that they contain every vertex, and that they exceed the light-space
-/// box of the scene bounds only by rounding.
+/// Returns the light-space bounds of a step. Asserts that they contain every vertex, and that they exceed the
+/// light-space box of the scene bounds only by rounding.
 fn verify_light_bounds(name: &str, scene: &Scene, result: &StepResult) -> OrientedBounds {
     let light_box = result.light_bounds.expect("expected a scene with a shadow");
     let (vertex_box, scene_box) =
         (bounds_in_light_space(scene, &result.surface.positions, 1), scene_box_in_light_space(scene, &result.bounds));
     let magnitude = coordinate_magnitude(&result.bounds);
+    // A tolerance for f64 rounding.
     assert!(
         max_excess(&light_box, &vertex_box) <= 1e-12 * magnitude,
         "{name}: expected {light_box:?} to contain {vertex_box:?}"
     );
+    // A tolerance for f32 rounding.
     assert!(
         max_excess(&scene_box, &light_box) <= 4e-7 * magnitude,
         "{name}: expected {light_box:?} within {scene_box:?}"
     );
+    // The scene of one vertex has no diagonal.
     let shrunk_box = vertex_box.expanded_by(-1e-3 * result.bounds.diagonal());
     assert!(result.bounds.diagonal() == 0.0 || max_excess(&shrunk_box, &vertex_box) > 0.0, "{name}: negative control");
     light_box
@@ -92,7 +101,7 @@ fn scene_box_in_light_space(scene: &Scene, bounds: &BoundingBox) -> OrientedBoun
 /// scene with several domains per tile.
 pub(crate) fn check_containment<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>, BatchPolicy) -> D) {
     let default_policy = BatchPolicy::default();
-    let scenes = [
+    let cases = [
         ("coils", default_policy, coil_scene(DeformationSettings::default())),
         ("batched coils", BatchPolicy::Always, coil_scene(DeformationSettings::default())),
         (
@@ -112,7 +121,7 @@ pub(crate) fn check_containment<D: Deformer>(create_deformer: impl Fn(&Arc<Scene
             ),
         ),
     ];
-    for (name, batch_policy, scene) in scenes {
+    for (name, batch_policy, scene) in cases {
         let mut deformer = create_deformer(&scene, batch_policy);
         for seed in 0..3 {
             let mut state = scenes::random_state(&scene, seed);
@@ -128,7 +137,8 @@ pub(crate) fn check_containment<D: Deformer>(create_deformer: impl Fn(&Arc<Scene
 /// Light bounds of a thin scene have less than half the volume of the light-space box of the scene bounds, and exceed
 /// the vertices by less than the diagonal of a tile.
 pub(crate) fn check_tightness<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
-    let scene = scene_of_shapes(vec![coil_shape(5000, 4)], 1, DeformationSettings::default(), false);
+    let normal_maps = false;
+    let scene = scene_of_shapes(vec![coil_shape(5000, 4)], 1, DeformationSettings::default(), normal_maps);
     let result = run_step(&mut create_deformer(&scene), &SceneState::rest(&scene));
     let light_box = verify_light_bounds("coil", &scene, &result);
     let (vertex_box, scene_box) =
@@ -150,7 +160,8 @@ pub(crate) fn check_tightness<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>)
     assert!(light_volume < 0.5 * scene_volume && vertex_volume <= light_volume);
 }
 
-/// A scene without a shadow has no light bounds. Light bounds of a step that overflows are invalid, for that step only.
+/// A scene without a shadow has no light bounds. A step that overflows has invalid light bounds, and the next step has
+/// valid ones.
 pub(crate) fn check_missing_shadow_and_overflow<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let mut parts = scenes::parts_of_shapes(vec![scenes::random_shape(&mut Random(3), 300, 2)]);
     parts.domains = vec![scenes::new_domain(0, scenes::PLAIN_MATERIAL); 2];

@@ -1,6 +1,7 @@
-//! Checks that every deformer must pass: extreme values, partial steps, followers and optional attributes. Each check
-//! takes a function that creates the deformer of a scene, and prints the measured errors. `tests/it` runs all checks on
-//! the CPU, `tests/gpu` on the GPU.
+//! Checks that every deformer must pass, such as those of extreme values, partial steps, followers and optional
+//! attributes. Each check takes a function that creates the deformer of a scene, and prints the measured errors.
+//! `tests/it` runs all checks on the CPU, `tests/gpu` on the GPU. The modules `cut_outs`, `exact_triangle` and `soups`
+//! are for tests of rasterizers.
 
 pub(crate) mod attributes;
 #[allow(dead_code, reason = "each test binary uses a part")]
@@ -31,6 +32,7 @@ pub(crate) use error_bounds::{
 /// The results of a step.
 #[derive(Debug, Clone)]
 pub(crate) struct StepResult {
+    /// Axis-aligned bounds of all vertices.
     pub(crate) bounds: BoundingBox,
     /// Light-space bounds; `None` for a scene without a shadow.
     pub(crate) light_bounds: Option<OrientedBounds>,
@@ -45,7 +47,8 @@ pub(crate) fn run_step(deformer: &mut dyn Deformer, state: &SceneState) -> StepR
 }
 
 impl StepResult {
-    /// Describes the first difference in vertex bits, boxes or bounds. Light-space bounds are not compared.
+    /// Describes the first difference in the bits of a vertex attribute, in the boxes or in the bounds; `None` if there
+    /// is none. Light-space bounds are not compared.
     pub(crate) fn difference(&self, other: &Self) -> Option<String> {
         let attribute_lists = |result: &Self| {
             let DeformedSurface { positions, normals, tangents, displacements, .. } = result.surface.clone();
@@ -59,7 +62,7 @@ impl StepResult {
                 (0..numbers.len()).find(|index| numbers[*index].to_bits() != other_numbers[*index].to_bits())
             {
                 return Some(format!(
-                    "{name}s differ at number {index}: {} and {}",
+                    "{name}s differ at index {index}: {} and {}",
                     numbers[index], other_numbers[index]
                 ));
             }
@@ -71,7 +74,7 @@ impl StepResult {
     }
 }
 
-/// A strip of triangles between random vertices with coordinates in -1 to 1. Its corner i is its vertex i.
+/// A strip of triangles between random vertices with coordinates in -1 to 1. Corner i of the mesh is at vertex i.
 pub(crate) fn strip_shape(random: &mut Random, vertices: usize, rank: usize) -> Shape {
     let shape = scenes::random_shape(random, vertices, rank);
     let normals = (0..vertices).map(|_| random.next_triple()).collect();
@@ -83,7 +86,8 @@ pub(crate) fn strip_shape(random: &mut Random, vertices: usize, rank: usize) -> 
     Shape::new(mesh, shape.modes).expect("a valid shape")
 }
 
-/// A scene with `instances` domains per shape. Domain i is named "domain i" and has shape i % (number of shapes).
+/// A scene with `instances` domains per shape. Domain i is named "domain i" and has shape i % (number of shapes). With
+/// `normal_maps`, all domains have a normal map.
 pub(crate) fn scene_of_shapes(
     shapes: Vec<Shape>,
     instances: usize,

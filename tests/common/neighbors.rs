@@ -23,21 +23,25 @@ fn tested_shapes() -> Vec<Shape> {
     ]
 }
 
-/// A scene with one domain of each shape under test. `preceding_count` domains of other shapes precede them, and
-/// `following_count` domains of other shapes and `instances` domains of a shape of four tiles follow. Also returns the
-/// index of the first domain under test.
-fn embedded_scene(
-    deformation: DeformationSettings,
-    (preceding_count, following_count): (usize, usize),
+/// Number of the other domains in the scene of the domains under test.
+#[derive(Clone, Copy, Default)]
+struct Neighbors {
+    /// Domains before the domains under test, each with a shape of its own.
+    preceding: usize,
+    /// Domains after the domains under test, each with a shape of its own.
+    following: usize,
+    /// Domains at the end of the scene that share one shape of four tiles.
     instances: usize,
-) -> (Arc<Scene>, usize) {
+}
+
+/// A scene with one domain of each shape under test, and its neighbors. The first domain under test has the index
+/// `preceding`.
+fn embedded_scene(deformation: DeformationSettings, neighbors: Neighbors) -> Arc<Scene> {
+    let Neighbors { preceding, following, instances } = neighbors;
     let mut random = Random(62);
-    let mut shapes: Vec<Shape> = (0..preceding_count + following_count)
-        .map(|index| strip_shape(&mut random, 3 + index % 6, index % 6))
-        .collect();
-    let shapes_under_test = tested_shapes();
-    let tested_count = shapes_under_test.len();
-    shapes.splice(preceding_count..preceding_count, shapes_under_test);
+    let mut shapes: Vec<Shape> =
+        (0..preceding + following).map(|index| strip_shape(&mut random, 3 + index % 6, index % 6)).collect();
+    shapes.splice(preceding..preceding, tested_shapes());
     shapes.push(strip_shape(&mut random, 500, 2));
     let instanced_shape = shapes.len() - 1;
     let mut parts = scenes::parts_of_shapes(shapes);
@@ -51,11 +55,11 @@ fn embedded_scene(
         .enumerate()
         .map(create_domain)
         .collect();
-    assert!(preceding_count + tested_count <= parts.domains.len());
-    (Scene::new(parts).expect("expected a valid scene"), preceding_count)
+    Scene::new(parts).expect("expected a valid scene")
 }
 
-/// A state with the values of `tested_state` for the domains from `first_domain` on, and random values for the others.
+/// A state with the q and transforms of `tested_state` for the domains from `first_domain` on, and random values for
+/// the other domains.
 fn state_of(scene: &Scene, first_domain: usize, tested_state: &SceneState) -> SceneState {
     let mut state = scenes::random_state(scene, 63);
     let mut q = tested_state.q.iter();
@@ -81,7 +85,7 @@ fn bits_of(result: &StepResult, scene: &Scene, domain: usize) -> [Vec<u32>; 3] {
     .map(|numbers| numbers.iter().map(|number| number.to_bits()).collect())
 }
 
-/// Whether the GPU plan has so few tiles that each lane computes one vertex instead of four.
+/// Whether the scene has so few tiles that each lane (a GPU thread) computes one vertex instead of four.
 pub(crate) fn has_one_item_per_lane(scene: &Scene) -> bool {
     plan(scene, CudaDeformerOptions::default())
         .kernel(KernelKind::Deform)
@@ -90,22 +94,22 @@ pub(crate) fn has_one_item_per_lane(scene: &Scene) -> bool {
         .contains(&"ONE_ITEM_PER_LANE")
 }
 
-/// Compares the bits of the domains under test in a separate scene, among a thousand other domains, and with 270 further
-/// instances of a large shape.
+/// The domains under test have the same bits alone, among a thousand other domains, and with 270 further instances of a
+/// large shape. The instances change the kernel variant ([`has_one_item_per_lane`]).
 pub(crate) fn check_independence_of_neighbors<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     for (storage, compensated) in StorageType::ALL.map(|storage| (storage, storage == StorageType::Bf16)) {
         let deformation = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
-        let (small_scene, _) = embedded_scene(deformation, (0, 0), 0);
+        let small_scene = embedded_scene(deformation, Neighbors::default());
         let tested_state = scenes::random_state(&small_scene, 64);
         let expected = run_step(&mut create_deformer(&small_scene), &tested_state);
         let name = storage.name();
-        for (neighbor_counts, instance_count, is_one_item_expected) in [((500, 500), 0, true), ((501, 499), 270, false)]
-        {
-            let (scene, first_domain) = embedded_scene(deformation, neighbor_counts, instance_count);
-            assert_eq!(
-                (has_one_item_per_lane(&small_scene), has_one_item_per_lane(&scene)),
-                (true, is_one_item_expected)
-            );
+        assert!(has_one_item_per_lane(&small_scene));
+        for neighbors in [
+            Neighbors { preceding: 500, following: 500, instances: 0 },
+            Neighbors { preceding: 501, following: 499, instances: 270 },
+        ] {
+            let (scene, first_domain) = (embedded_scene(deformation, neighbors), neighbors.preceding);
+            assert_eq!(has_one_item_per_lane(&scene), neighbors.instances == 0);
             let (mut deformer, state) = (create_deformer(&scene), state_of(&scene, first_domain, &tested_state));
             let actual = run_step(&mut deformer, &state);
             for index in 0..tested_state.transforms.len() {
@@ -117,7 +121,7 @@ pub(crate) fn check_independence_of_neighbors<D: Deformer>(create_deformer: impl
                     scene.domains.len()
                 );
             }
-            // Negative control: another state gives other bits. It does not affect later steps.
+            // Negative control: another state gives other bits. That state does not affect the next step.
             let other_result = run_step(&mut deformer, &scenes::random_state(&scene, 65));
             assert!(bits_of(&other_result, &scene, first_domain) != bits_of(&expected, &small_scene, 0));
             assert_eq!(run_step(&mut deformer, &state).difference(&actual), None, "{name}: same state again");

@@ -1,4 +1,4 @@
-//! Steps that overflow: they are rejected with the name of the domain, and they do not affect later steps.
+//! A step that overflows is rejected with the name of the domain, and does not affect later steps.
 
 use std::sync::Arc;
 
@@ -21,10 +21,12 @@ fn test_scene(storage: StorageType) -> Arc<Scene> {
         strip_shape(&mut random, 9, 3),
         scenes::random_shape(&mut random, 30, 0),
     ];
-    scene_of_shapes(shapes, 2, DeformationSettings { storage, ..DeformationSettings::default() }, true)
+    let (instances, normal_maps) = (2, true);
+    let deformation = DeformationSettings { storage, ..DeformationSettings::default() };
+    scene_of_shapes(shapes, instances, deformation, normal_maps)
 }
 
-/// A transform so large that T x overflows f32 if the sum x0 + U q does not.
+/// A transform so large that T (x0 + U q) overflows f32 even if x0 + U q does not.
 const LARGE_SHEAR: Transform = Transform([1e3, -2e3, 1e3, 0.0, 1e3, 1e3, -3e3, 0.0, -1e3, 1e3, 1e3, 0.0]);
 
 /// A step that overflows gives bounds that are not finite. The next valid step equals that of a new deformer.
@@ -37,6 +39,7 @@ pub(crate) fn check_overflow_affects_one_step<D: Deformer>(create_deformer: impl
         assert!(previous_result.bounds.is_finite());
         for coordinate in [f32::MAX, -f32::MAX] {
             let mut overflowing_state = valid_state.clone();
+            // A partial step that sets q and the transform of domain 1.
             partial_steps::apply_random_step(&scene, &mut overflowing_state, &mut random, &[1], &[1]);
             let first_q = scene.layout.domains[1].first_q;
             overflowing_state.q[first_q..first_q + 2].fill(coordinate);
@@ -46,7 +49,7 @@ pub(crate) fn check_overflow_affects_one_step<D: Deformer>(create_deformer: impl
                 "{}: {coordinate:e}",
                 storage.name()
             );
-            // The next valid state has no overflow in its history, and its step changes another domain.
+            // The valid state does not contain the overflowing step. Its next step sets q of domain 2 only.
             partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[2], &[]);
             let result = run_step(&mut deformer, &valid_state);
             assert!(result.bounds.is_finite() && result.difference(&previous_result).is_some());
@@ -68,9 +71,11 @@ pub(crate) fn check_overflow_rejection(backend: BackendChoice) {
     let (mut loaded_scene, mut random) =
         (context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load"), Random(74));
     let mut valid_state = SceneState::rest(&scene);
-    partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[0, 5], &[5]);
+    let (q_domains, transform_domains) = ([0, 5], [5]);
+    partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &q_domains, &transform_domains);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
     let valid_surface = loaded_scene.surface().expect("expected a surface").clone();
+    // The engine rejects coordinates of vertices beyond 1e18, so 1e30 is rejected although it does not overflow.
     for (domain, coordinate) in [(5, f32::MAX), (2, -f32::MAX), (5, 1e30)] {
         let mut overflowing_state = valid_state.clone();
         partial_steps::apply_random_step(&scene, &mut overflowing_state, &mut random, &[domain], &[]);
@@ -81,7 +86,7 @@ pub(crate) fn check_overflow_rejection(backend: BackendChoice) {
         assert_eq!(loaded_scene.surface().expect("expected a surface"), &valid_surface);
         assert!(loaded_scene.bounds().is_finite());
     }
-    // The next step applies to the last valid step.
+    // The next step applies to the last valid state. It sets q of domain 6 only.
     partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[6], &[]);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
     let next_surface = loaded_scene.surface().expect("expected a surface").clone();

@@ -13,16 +13,20 @@ use super::attributes::{find_wrong_box, with_displacements_and_boxes};
 use super::{StepResult, run_step, strip_shape};
 use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random};
 
-/// A random step that sets the coordinates of `q_domains` and the transforms of `transform_domains`.
+/// A step that sets the coordinates of `q_domains` and the transforms of `transform_domains` to random values.
+/// Transforms are mirrored, sheared (if the scene permits shear) and rotated, in turn.
 fn random_step(scene: &Scene, random: &mut Random, q_domains: &[u32], transform_domains: &[u32]) -> StepUpdate {
     let coordinates: usize = q_domains.iter().map(|domain| scene.rank_of(*domain as usize)).sum();
     let q: Vec<f32> = (0..coordinates).map(|_| random.next_number()).collect();
-    let transform = |domain: &u32| match domain % 3 {
-        0 => random.next_similarity(true).0,
-        1 if scene.features.shear => random.next_shear().0,
-        _ => random.next_similarity(false).0,
+    let random_transform = |domain: &u32| {
+        let is_mirrored = domain % 3 == 0;
+        if domain % 3 == 1 && scene.features.shear {
+            random.next_shear().0
+        } else {
+            random.next_similarity(is_mirrored).0
+        }
     };
-    let transforms: Vec<f32> = transform_domains.iter().flat_map(transform).collect();
+    let transforms: Vec<f32> = transform_domains.iter().flat_map(random_transform).collect();
     let to_bytes =
         |numbers: Vec<f32>| -> bytes::Bytes { numbers.iter().flat_map(|number| number.to_le_bytes()).collect() };
     let raw = RawStepUpdate {
@@ -46,17 +50,17 @@ pub(crate) fn apply_random_step(
     state.apply(scene, &random_step(scene, random, q_domains, transform_domains));
 }
 
-/// A domain of several tiles.
-const LARGE: u32 = 26;
-/// A domain without modes.
-const RIGID: u32 = 27;
-/// A domain that shares the coordinates of the domain before it.
-const SHARER: u32 = 29;
+/// Index of a domain of several tiles in [`mixed_scene`].
+const LARGE_DOMAIN: u32 = 26;
+/// Index of a domain without modes.
+const RIGID_DOMAIN: u32 = 27;
+/// Index of a domain that shares the coordinates of the domain before it.
+const SHARING_DOMAIN: u32 = 29;
 /// Number of domains of [`mixed_scene`]. A step that changes more than a quarter of them is computed in full.
-const DOMAINS: u32 = 40;
+const DOMAIN_COUNT: u32 = 40;
 
-/// A scene of small domains of many ranks, with and without separate corners. It also has a large domain, a domain
-/// without modes, instances, and domains of one or two shapes that share coordinates.
+/// A scene of small domains of many ranks. Some shapes have more corners than vertices. The scene also has a large
+/// domain, a domain without modes, several domains of one shape, and domains that share coordinates.
 fn mixed_scene(deformation: DeformationSettings, normal_maps: bool) -> Arc<Scene> {
     let mut random = Random(50);
     let mut shapes: Vec<Shape> = (0..20).map(|index| strip_shape(&mut random, 5 + index % 9, index % 5)).collect();
@@ -65,34 +69,35 @@ fn mixed_scene(deformation: DeformationSettings, normal_maps: bool) -> Arc<Scene
     shapes.push(strip_shape(&mut random, 200, 0));
     shapes.push(strip_shape(&mut random, 40, 4));
     let mut domain_shapes: Vec<usize> = (0..29).collect();
-    // The first of these shares the coordinates of a domain with another shape. The others are further instances.
+    // Shapes of domains 29 to 39. Domain 29 shares the coordinates of domain 28, which has another shape of the same
+    // rank. Domains 31 and 34 share the coordinates of a domain of their own shape.
     domain_shapes.extend([9, 28, 28, 28, 4, 4, 28, 28, 28, 0, 27]);
     let mut parts = scenes::parts_of_shapes(shapes);
     parts.deformation = deformation;
     let material =
         |index: usize| if normal_maps && index % 3 != 1 { NORMAL_MAPPED_MATERIAL } else { scenes::PLAIN_MATERIAL };
-    let domain = |(index, shape): (usize, usize)| Domain {
+    let create_domain = |(index, shape): (usize, usize)| Domain {
         name: format!("{index}"),
         ..scenes::new_domain(shape, material(index))
     };
-    parts.domains = domain_shapes.into_iter().enumerate().map(domain).collect();
-    parts.domains[SHARER as usize].shares_q_with = Some(28);
+    parts.domains = domain_shapes.into_iter().enumerate().map(create_domain).collect();
+    parts.domains[SHARING_DOMAIN as usize].shares_q_with = Some(28);
     parts.domains[31].shares_q_with = Some(28);
     parts.domains[34].shares_q_with = Some(33);
     let scene = Scene::new(parts).expect("expected a valid scene");
-    assert_eq!(scene.domains.len(), DOMAINS as usize);
+    assert_eq!(scene.domains.len(), DOMAIN_COUNT as usize);
     scene
 }
 
-/// Event between two deformed states.
+/// What happens between two steps of the test sequence.
 #[derive(Clone, Copy, PartialEq)]
 enum Interruption {
-    None,
+    Nothing,
     /// A step is applied but its state is not deformed.
     SkippedStep,
     /// A state that overflows is deformed, then the previous state is deformed again.
     Overflow,
-    /// A state with another history is deformed.
+    /// A state that results from other steps is deformed.
     OtherHistory,
 }
 
@@ -105,49 +110,52 @@ struct ScriptedStep {
 }
 
 fn scripted_steps() -> Vec<ScriptedStep> {
-    use Interruption::{None, OtherHistory, Overflow, SkippedStep};
-    let all_domains: Vec<u32> = (0..DOMAINS).collect();
-    let quarter_of_domains = (0..DOMAINS / 4).collect();
-    let more_than_quarter = (3..4 + DOMAINS / 4).collect();
+    use Interruption::{Nothing, OtherHistory, Overflow, SkippedStep};
+    let all_domains: Vec<u32> = (0..DOMAIN_COUNT).collect();
+    let quarter_of_domains = (0..DOMAIN_COUNT / 4).collect();
+    let more_than_quarter = (3..4 + DOMAIN_COUNT / 4).collect();
+    // Each tuple has the fields of a `ScriptedStep`.
     let create_step =
         |(q_domains, transform_domains, interruption)| ScriptedStep { q_domains, transform_domains, interruption };
     [
-        (vec![], vec![], None),
-        (vec![3], vec![], None),
-        (vec![], vec![3], None),
-        (vec![3], vec![3], None),
-        (vec![], vec![RIGID], None),
-        (vec![LARGE], vec![1], None),
-        (all_domains.clone(), all_domains, None),
-        (vec![22, 24], vec![22], None),
-        (vec![SHARER - 1], vec![], None),
-        (vec![SHARER], vec![SHARER], None),
-        (quarter_of_domains, vec![], None),
-        (vec![], more_than_quarter, None),
-        (vec![], vec![], None),
+        (vec![], vec![], Nothing),
+        (vec![3], vec![], Nothing),
+        (vec![], vec![3], Nothing),
+        (vec![3], vec![3], Nothing),
+        (vec![], vec![RIGID_DOMAIN], Nothing),
+        (vec![LARGE_DOMAIN], vec![1], Nothing),
+        (all_domains.clone(), all_domains, Nothing),
+        (vec![22, 24], vec![22], Nothing),
+        (vec![SHARING_DOMAIN - 1], vec![], Nothing),
+        (vec![SHARING_DOMAIN], vec![SHARING_DOMAIN], Nothing),
+        (quarter_of_domains, vec![], Nothing),
+        (vec![], more_than_quarter, Nothing),
+        (vec![], vec![], Nothing),
         (vec![7], vec![], SkippedStep),
-        (vec![8, 33], vec![9], None),
-        (vec![LARGE], vec![], Overflow),
-        (vec![30], vec![32], None),
+        (vec![8, 33], vec![9], Nothing),
+        (vec![LARGE_DOMAIN], vec![], Overflow),
+        (vec![30], vec![32], Nothing),
         (vec![11], vec![], OtherHistory),
-        (vec![11, 38], vec![LARGE, 39], None),
+        (vec![11, 38], vec![LARGE_DOMAIN, 39], Nothing),
         (vec![], vec![], OtherHistory),
     ]
     .map(create_step)
     .into()
 }
 
-/// A deformer that computes only changed domains, and one that receives the same states with every domain marked dirty.
+/// Two deformers that receive the same states. `partial` computes only the changed domains. For `full`, every domain is
+/// marked dirty.
 struct DeformerPair<D> {
     partial: D,
     full: D,
     scene: Arc<Scene>,
-    /// Number of deformed states.
+    /// Number of states that were deformed so far.
     states: usize,
 }
 
 impl<D: Deformer> DeformerPair<D> {
-    /// Deforms a state with both deformers, compares the results and returns that of the partial step.
+    /// Deforms a state with both deformers, compares the two results and returns the result of `partial`. `name` names
+    /// the test case.
     fn deform(&mut self, state: &SceneState, name: &str) -> StepResult {
         let mut dirty_state = state.clone();
         dirty_state.mark_all_dirty();
@@ -170,6 +178,7 @@ impl<D: Deformer> DeformerPair<D> {
     }
 }
 
+/// Applies the scripted steps to a [`DeformerPair`].
 fn compare_scripted_steps<D: Deformer>(name: &str, scene: &Arc<Scene>, create_deformer: &impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(51);
     let mut deformers = DeformerPair {
@@ -182,8 +191,8 @@ fn compare_scripted_steps<D: Deformer>(name: &str, scene: &Arc<Scene>, create_de
     let (mut previous_result, mut changed_steps) = (deformers.deform(&state, name), 0);
     for ScriptedStep { q_domains, transform_domains, interruption } in scripted_steps() {
         match interruption {
-            Interruption::None => {}
-            Interruption::SkippedStep => apply_random_step(scene, &mut state, &mut random, &[5, 6], &[RIGID]),
+            Interruption::Nothing => {}
+            Interruption::SkippedStep => apply_random_step(scene, &mut state, &mut random, &[5, 6], &[RIGID_DOMAIN]),
             Interruption::Overflow => {
                 let mut overflowing_state = state.clone();
                 apply_random_step(scene, &mut overflowing_state, &mut random, &[12], &[4]);
@@ -197,7 +206,8 @@ fn compare_scripted_steps<D: Deformer>(name: &str, scene: &Arc<Scene>, create_de
             }
             Interruption::OtherHistory => {
                 apply_random_step(scene, &mut other_state, &mut random, &[2], &[]);
-                assert!(deformers.deform(&other_state, name).difference(&previous_result).is_some());
+                let other_result = deformers.deform(&other_state, name);
+                assert!(other_result.difference(&previous_result).is_some(), "{name}: expected another result");
             }
         }
         apply_random_step(scene, &mut state, &mut random, &q_domains, &transform_domains);
@@ -214,7 +224,7 @@ fn compare_scripted_steps<D: Deformer>(name: &str, scene: &Arc<Scene>, create_de
         let new_result = run_step(&mut create_deformer(scene), &state);
         assert_eq!(new_result.difference(&previous_result), None, "{name}: a new deformer");
     }
-    eprintln!("{name}: {} states, {changed_steps} of them after changes, have equal bits", deformers.states);
+    eprintln!("{name}: {} states have equal bits, {changed_steps} of them after a step with changes", deformers.states);
 }
 
 /// Runs the scripted steps for every storage type and every deformation feature, and with batches.
@@ -248,19 +258,22 @@ pub(crate) fn check_partial_steps<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     ] {
         let name = format!("batched {deformation:?}");
         let create_deformer = |scene: &Arc<Scene>| create_deformer(scene, BatchPolicy::Always);
-        compare_scripted_steps(&name, &mixed_scene(deformation, true), &create_deformer);
+        let normal_maps = true;
+        compare_scripted_steps(&name, &mixed_scene(deformation, normal_maps), &create_deformer);
     }
 }
 
 /// Whether a deformer skips a changed domain that is missing from the state's list of dirty domains. Asserts that a
 /// listed domain is computed.
 pub(crate) fn relies_on_dirty_list<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) -> bool {
-    let scene = mixed_scene(DeformationSettings::default(), false);
+    let normal_maps = false;
+    let scene = mixed_scene(DeformationSettings::default(), normal_maps);
     let mut deformer = create_deformer(&scene);
     let mut state = scenes::random_state(&scene, 54);
     let previous_positions = run_step(&mut deformer, &state).surface.positions;
-    apply_random_step(&scene, &mut state, &mut Random(55), &[LARGE, 3], &[]);
-    assert_eq!(state.dirty_domains, DirtyDomains::Some(vec![3, LARGE]));
+    // The step sets q of two domains. Then one of the two is removed from the list.
+    apply_random_step(&scene, &mut state, &mut Random(55), &[LARGE_DOMAIN, 3], &[]);
+    assert_eq!(state.dirty_domains, DirtyDomains::Some(vec![3, LARGE_DOMAIN]));
     state.dirty_domains = DirtyDomains::Some(vec![3]);
     let positions = run_step(&mut deformer, &state).surface.positions;
     let is_unchanged = |domain: u32| {
@@ -269,5 +282,5 @@ pub(crate) fn relies_on_dirty_list<D: Deformer>(create_deformer: impl Fn(&Arc<Sc
         previous_positions[range.clone()] == positions[range]
     };
     assert!(!is_unchanged(3), "expected the listed domain to be computed");
-    is_unchanged(LARGE)
+    is_unchanged(LARGE_DOMAIN)
 }

@@ -1,4 +1,5 @@
-//! Triangle soups that are hard to rasterize, and their viewports.
+//! Triangle soups that are hard to rasterize, and their viewports. A soup is a list of triangles that need not form a
+//! surface.
 
 use modalcast_compute::reference::raster::VisibilityBuffer;
 use modalcast_model::scene::{CullMode, DrawRange, Viewport};
@@ -9,13 +10,16 @@ use crate::scenes::Random;
 /// Triangles and the viewport that they are drawn in.
 pub(crate) struct Soup {
     pub(crate) name: &'static str,
+    /// Three numbers per vertex.
     pub(crate) positions: Vec<f32>,
     pub(crate) triangles: Vec<[u32; 3]>,
+    /// Ranges of triangles with the same cull mode.
     pub(crate) groups: Vec<DrawRange>,
     pub(crate) viewport: Viewport,
 }
 
 impl Soup {
+    /// The first half of the triangles is drawn without culling, the second half with culling of back faces.
     fn new(name: &'static str, positions: Vec<f32>, triangles: Vec<[u32; 3]>, viewport: Viewport) -> Self {
         let first_half = triangles.len() as u32 / 2;
         let second_half = triangles.len() as u32 - first_half;
@@ -52,7 +56,7 @@ pub(crate) fn perspective_viewport(width: u32, height: u32, near: f64, far: f64)
     Viewport::new(&clip.to_homogeneous(), width, height).expect("expected a valid viewport")
 }
 
-/// A viewport whose scene coordinates are clip space.
+/// A viewport that uses positions as clip-space coordinates.
 pub(crate) fn clip_space_viewport(width: u32, height: u32) -> Viewport {
     Viewport::new(&Matrix4::identity(), width, height).expect("expected a valid viewport")
 }
@@ -86,7 +90,7 @@ pub(crate) fn fan_soup(viewport: Viewport) -> Soup {
     soup
 }
 
-/// Mostly triangles without area, with repeated vertices or collinear corners. The others have an area.
+/// Triangles with a repeated vertex or collinear corners, which have no area, and a few triangles with an area.
 fn degenerate_soup() -> Soup {
     let mut positions = scattered_triangles(&mut Random(9), 8, 0.8, [0.6; 3]);
     positions.extend([[-0.9, -0.9, 0.0], [0.0, 0.0, 0.1], [0.9, 0.9, 0.2]].concat());
@@ -97,11 +101,11 @@ fn degenerate_soup() -> Soup {
     Soup::new("degenerate", positions, triangles.collect(), clip_space_viewport(160, 90))
 }
 
-/// All soups.
+/// All soups, each with one difficulty that its name states.
 pub(crate) fn all_soups() -> Vec<Soup> {
-    let mut random = Random(5);
-    let random = &mut random;
+    let random = &mut Random(5);
     let mut non_finite = scattered_triangles(random, 600, 1.0, [0.3; 3]);
+    // Each value replaces about every 61st coordinate.
     for (index, value) in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX].into_iter().enumerate() {
         (index..non_finite.len()).step_by(61 + index).for_each(|coordinate| non_finite[coordinate] = value);
     }
@@ -115,6 +119,7 @@ pub(crate) fn all_soups() -> Vec<Soup> {
         scattered_triangles(random, 300, 3.0, [2.0; 3]).into_iter().map(|coordinate| coordinate + 1e7).collect();
     let positions_behind = scattered_triangles(random, 100, 1.0, [0.5; 3]);
     let positions_behind = positions_behind.chunks_exact(3).flat_map(|p| [p[0], p[1], p[2] + 5.0]).collect();
+    // `extent` and `size` are those of `scattered_triangles`.
     let mut scattered_soup = |name, count, extent, size, viewport| {
         Soup::with_separate_triangles(name, scattered_triangles(random, count, extent, size), viewport)
     };

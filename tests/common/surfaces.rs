@@ -1,4 +1,4 @@
-//! Normals and tangents in extreme cases.
+//! Normals and tangents under shears and mirrors, and of triangles without area.
 
 use std::sync::Arc;
 
@@ -10,10 +10,11 @@ use modalcast_model::scene::{DeformationSettings, NormalMethod, Scene, SceneStat
 use super::{assert_within_bound, run_step, scene_of_shapes};
 use crate::scenes::{self, Random};
 
-/// Largest accepted error of a component of a unit vector.
+/// Largest accepted error of a component of a unit vector. It is about 300 times the rounding error of f32 (6e-8),
+/// because shears amplify rounding errors.
 const MAX_DIRECTION_ERROR: f64 = 2e-5;
 
-/// Largest absolute difference; infinite for a NaN or if the lengths differ.
+/// Largest absolute difference of two lists; infinite for a NaN or if the lengths of the lists differ.
 pub(crate) fn max_abs_error(actual: &[f32], expected: &[f64]) -> f64 {
     let error = |(actual, expected): (&f32, &f64)| {
         let error = (f64::from(*actual) - expected).abs();
@@ -26,13 +27,14 @@ pub(crate) fn max_abs_error(actual: &[f32], expected: &[f64]) -> f64 {
     }
 }
 
-/// Positions, normals and tangents under a mirror, a shear, both, and a strongly anisotropic scale.
+/// Positions, normals and tangents equal the reference under a mirror, a shear, both, and a strongly anisotropic scale.
 pub(crate) fn check_shears_and_mirrors<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let scene = scenes::random_scene(
         &[(40, 3), (200, 2)],
         scenes::RandomSceneOptions { instances: 2, normal_maps: true, rigid_transforms: false },
     );
     let mut state = scenes::random_state(&scene, 6);
+    // Row-major 3 x 3 matrices.
     let linear_parts: [[f32; 9]; 4] = [
         [-1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         [1.0, 0.7, -0.2, 0.0, 0.5, 0.4, 0.1, 0.0, 1.5],
@@ -66,6 +68,7 @@ type UvsFn = fn(usize) -> Vec<[f32; 2]>;
 
 /// Meshes whose triangles have no area, with and without texture coordinates.
 fn zero_area_meshes() -> Vec<Mesh> {
+    // One point, a line, and a parabola whose triangles repeat a vertex.
     let position_functions: [PositionFn; 3] =
         [|_| [0.5, -0.25, 1.0], |index| [index as f32, 0.0, 0.0], |index| [index as f32, (index * index) as f32, 1.0]];
     let triangle_functions: [TriangleFn; 3] = [
@@ -73,6 +76,7 @@ fn zero_area_meshes() -> Vec<Mesh> {
         |index| [index, index + 1, index + 2],
         |index| [index, index, index + index % 2],
     ];
+    // No texture coordinates, one point, and a line.
     let uv_functions: [UvsFn; 3] =
         [|_| vec![], |count| vec![[0.5, 0.5]; count], |count| (0..count).map(|index| [index as f32, 0.0]).collect()];
     let mut meshes = Vec::new();
@@ -90,13 +94,14 @@ fn zero_area_meshes() -> Vec<Mesh> {
     meshes
 }
 
-/// Whether the first three of every `width` numbers form a unit vector.
+/// Whether every vector has length 1. Each vector has `width` numbers, of which the first three are x, y and z.
 fn are_unit_vectors(components: &[f32], width: usize) -> bool {
     let length = |vector: &[f32]| vector[..3].iter().map(|component| component * component).sum::<f32>().sqrt();
     components.chunks_exact(width).all(|vector| (length(vector) - 1.0).abs() < 1e-5)
 }
 
-/// Triangles or texture coordinates without area, and missing texture coordinates, give unit normals and tangents.
+/// Triangles without area have unit normals. Their tangents have length 1 too, also if the texture coordinates have no
+/// area. Without texture coordinates, tangents are zero.
 pub(crate) fn check_zero_area_and_missing_uvs<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     assert!(are_unit_vectors(&[0.6, 0.8, 0.0], 3));
     assert!(!are_unit_vectors(&[0.0; 3], 3) && !are_unit_vectors(&[f32::NAN; 3], 3));
@@ -106,8 +111,8 @@ pub(crate) fn check_zero_area_and_missing_uvs<D: Deformer>(create_deformer: impl
         .map(|mesh| Shape::new(mesh, modes.clone()).expect("expected a valid shape"))
         .collect();
     for normals in [NormalMethod::Rigid, NormalMethod::Exact] {
-        let scene =
-            scene_of_shapes(shapes.clone(), 1, DeformationSettings { normals, ..DeformationSettings::default() }, true);
+        let (deformation, normal_maps) = (DeformationSettings { normals, ..DeformationSettings::default() }, true);
+        let scene = scene_of_shapes(shapes.clone(), 1, deformation, normal_maps);
         let mut deformer = create_deformer(&scene);
         for scale in [0.0, 1e-30, 1.0, 1e15] {
             let mut state = scenes::random_state(&scene, 8);

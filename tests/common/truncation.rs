@@ -1,4 +1,4 @@
-//! Mode truncation within an error budget.
+//! Mode truncation: a deformer omits modes that together move no vertex by more than an error budget.
 
 use std::sync::Arc;
 
@@ -12,9 +12,9 @@ use crate::scenes::{self, Random};
 /// Truncation budget in meters. The scenes of this file have a unit of one meter.
 const BUDGET: f64 = 0.02;
 
-/// Deforms twenty random states. Each state changes two domains. Errors are within their bounds plus the truncation
-/// bound, and the truncation bound is within the budget. `truncation_bound` returns the bound of a deformer, in scene
-/// units.
+/// Deforms twenty random states; each changes two domains. Errors are within the rounding bound plus the truncation
+/// bound, and the truncation bound is within the budget. `truncation_bound` returns the largest error that the
+/// truncated modes of the last step can cause, in scene units.
 pub(crate) fn check_error_budget<D: Deformer>(
     create_deformer: impl Fn(&Arc<Scene>) -> D,
     truncation_bound: impl Fn(&D, &Scene) -> f64,
@@ -28,11 +28,12 @@ pub(crate) fn check_error_budget<D: Deformer>(
             strip_shape(&mut random, 60, 0),
         ];
         let deformation = DeformationSettings { storage, truncation: Some(BUDGET), ..DeformationSettings::default() };
-        let scene = scene_of_shapes(shapes, 2, deformation, false);
-        assert_eq!(scene.unit, 1.0);
+        let normal_maps = false;
+        let scene = scene_of_shapes(shapes, 2, deformation, normal_maps);
+        assert_eq!(scene.unit, 1.0, "expected a unit of one meter");
         let (mut deformer, mut state) = (create_deformer(&scene), scenes::random_state(&scene, 82));
         run_step(&mut deformer, &state);
-        let (mut max_bound, mut visible_states) = (0.0_f64, 0);
+        let (mut max_bound, mut states_beyond_rounding) = (0.0_f64, 0);
         for step in 0..20 {
             let domains = [step % 8, (step + 5) % 8];
             partial_steps::apply_random_step(&scene, &mut state, &mut random, &domains, &domains);
@@ -48,29 +49,31 @@ pub(crate) fn check_error_budget<D: Deformer>(
             let name = format!("{}, state {step}, truncation bound {bound:.2e}", storage.name());
             assert_within_bound(&name, &scene, &state, &positions, bound);
             max_bound = max_bound.max(bound);
-            visible_states += usize::from(!domains_beyond_bound(&scene, &state, &positions, 0.0).is_empty());
+            states_beyond_rounding += usize::from(!domains_beyond_bound(&scene, &state, &positions, 0.0).is_empty());
         }
         eprintln!(
-            "{}: truncation bound at most {max_bound:.2e} of {BUDGET}, beyond the rounding bound in {visible_states} of 20 \
-             states",
+            "{}: truncation bound at most {max_bound:.2e} of {BUDGET}, beyond the rounding bound in \
+             {states_beyond_rounding} of 20 states",
             storage.name()
         );
         assert!(max_bound > BUDGET / 10.0, "expected truncated modes, got a largest bound of {max_bound}");
+        // Rounding to the other storage types may hide the truncation error.
         assert!(
-            storage != StorageType::F32 || visible_states > 10,
-            "negative control: expected more than 10 states with errors beyond the rounding bound, got {visible_states}"
+            storage != StorageType::F32 || states_beyond_rounding > 10,
+            "negative control: expected errors beyond rounding in more than 10 states, got {states_beyond_rounding}"
         );
     }
 }
 
-/// Number of times that one of two modes is truncated or restored while its amplitude oscillates around half of the
-/// budget.
+/// Number of times that a mode is truncated or restored while its amplitude oscillates between 0.4 and 0.6 of the
+/// budget. `deform` returns the positions of a state.
 fn count_mode_toggles(storage: StorageType, mut deform: impl FnMut(&Arc<Scene>, &SceneState) -> Vec<f32>) -> usize {
     let (vertices, rank, oscillating_mode) = (5, 8, 4);
     let mut columns = vec![0.0; 3 * vertices * rank];
     for vertex in 0..vertices {
+        // Mode 0 moves every vertex along y, the oscillating mode moves it along x. All modes of a chunk with a
+        // retained mode are summed. A chunk has at most four modes, so mode 4 is in another chunk than mode 0.
         columns[3 * vertex + 1] = 1.0;
-        // A chunk is summed with all of its modes. This mode is in another chunk than mode 0 for every storage type.
         columns[3 * vertices * oscillating_mode + 3 * vertex] = 1.0;
     }
     let scene = scene_from_columns(
@@ -94,8 +97,8 @@ fn count_mode_toggles(storage: StorageType, mut deform: impl FnMut(&Arc<Scene>, 
     toggles
 }
 
-/// Hysteresis: a mode near the limit remains truncated. Negative control: with a new deformer per step, the mode is
-/// truncated and restored many times.
+/// Hysteresis: modes are truncated below half of the budget and restored above the whole budget, so an oscillation
+/// around one half truncates a mode at most once. Negative control: a new deformer per step has no hysteresis.
 pub(crate) fn check_hysteresis<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     for storage in StorageType::ALL {
         let mut deformer: Option<D> = None;
